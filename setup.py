@@ -1,0 +1,40 @@
+"""The ROS package thinmap_ros: nodes and tools."""
+
+from glob import glob
+
+from setuptools import find_packages, setup
+
+NAME = 'thinmap_ros'
+NODES = [
+    'sim', 'grid_mapper', 'topology_builder', 'localizer', 'explorer', 'navigator', 'recorder', 'bag_player',
+    'demo_monitor',
+]
+TOOLS = ['replay', 'explore_world', 'carmen_to_bag', 'map_to_graph', 'demo', 'warm_up']
+
+setup(
+    name=NAME,
+    version='0.1.0',
+    packages=find_packages(include=[NAME, f'{NAME}.*']),
+    package_data={NAME: ['py.typed']},
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
+        (f'share/{NAME}', ['package.xml']),
+        (f'share/{NAME}/config', glob('config/*.yaml')),
+        (f'share/{NAME}/worlds', glob('worlds/*.yaml')),
+    ],
+    install_requires=['matplotlib', 'mcap', 'numba', 'numpy', 'pillow', 'pyyaml', 'rosbags', 'scipy', 'tqdm'],
+    extras_require={
+        'viewer': ['rerun-sdk'],
+        'test': ['hypothesis', 'opencv-contrib-python-headless', 'psutil', 'pytest', 'pytest-timeout', 'scikit-image'],
+    },
+    python_requires='>=3.11',
+    zip_safe=False,
+    maintainer='thinmap maintainers',
+    maintainer_email='maintainers@thinmap.invalid',
+    description='Thinning-based topological mapping, exploration and SLAM for robots with one 2D laser scanner.',
+    license='Apache-2.0',
+    entry_points={
+        'console_scripts': [f'{node} = {NAME}.nodes.{node}:main' for node in NODES]
+        + [f'{tool} = {NAME}.tools.{tool}:main' for tool in TOOLS]
+    },
+)

@@ -1,0 +1,31 @@
+"""What all tests share."""
+
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+ROOT = Path(__file__).resolve().parent.parent
+SHARED = ROOT.parent / 'shared'
+
+# How long an example takes says more about the machine than about the code.
+settings.register_profile('thinmap', deadline=None, print_blob=True)
+settings.load_profile('thinmap')
+
+
+@pytest.fixture(scope='session')
+def shared_data() -> Path:
+    """The folder of real logs and worlds beside the project."""
+    if not SHARED.exists():
+        pytest.skip('needs the real logs and worlds of ../shared/data, which is not there')
+    return SHARED / 'data'
+
+
+@pytest.fixture
+def ros_domain(monkeypatch: pytest.MonkeyPatch) -> int:
+    """A ROS domain that no other process of this machine's tests uses, for the processes that a test starts."""
+    domain = 1 + os.getpid() % 100
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(domain))
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    return domain

@@ -1,0 +1,1 @@
+"""thinmap: thinning-based topological mapping, exploration and SLAM for robots with one 2D laser scanner."""
