@@ -1,0 +1,163 @@
+"""The grid's Bayes update: against a plain reference, and what it must never do."""
+
+import math
+
+import numpy as np
+import pytest
+
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, log_odds
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import pose
+
+STEP = math.radians(1.0)
+
+
+def scan_of(ranges, **changes):
+    ranges = np.asarray(ranges, dtype=float)
+    fields = {'angle_min_rad': -math.pi / 2, 'angle_increment_rad': STEP, 'range_min_m': 0.1, 'range_max_m': 8.0}
+    return Scan.create(0, ranges, **(fields | changes))
+
+
+def percent(grid, x, y):
+    return int(grid.window(x, y, 0.1).cells[0, 0])
+
+
+def reference(scan, T, config):
+    """Cells passed and hit by sampling each beam finely: slow, obvious, and blind only at corners of cells."""
+    passed, hit = set(), set()
+    for r, angle in zip(scan.ranges_m, scan.angles_rad + T[2], strict=True):
+        reach = min(r, config.usable_range_m) if r < scan.range_max_m else config.no_return_range_m
+        along = np.arange(0.0, reach, 0.002)
+        cells = np.floor(np.column_stack([T[1] + along * math.sin(angle), T[0] + along * math.cos(angle)]) / 0.1)
+        passed |= {tuple(c) for c in cells.astype(int).tolist()}
+        if r < min(scan.range_max_m, config.usable_range_m):
+            hit.add((math.floor((T[1] + r * math.sin(angle)) / 0.1), math.floor((T[0] + r * math.cos(angle)) / 0.1)))
+    return passed - hit, hit
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_one_scan_marks_what_a_finely_sampled_reference_marks(seed):
+    rng = np.random.default_rng(seed)
+    scan = scan_of(np.where(rng.random(181) < 0.1, np.inf, rng.uniform(0.3, 7.0, 181)))
+    T = np.array([*rng.uniform(-3, 3, 2), rng.uniform(-3, 3)])
+    config = OccupancyConfig()
+    grid = OccupancyGrid(config)
+    grid.update(scan, T)
+    passed, hit = reference(scan, T, config)
+    patch = grid.patch()
+    offset = np.round([patch.frame.origin_y / 0.1, patch.frame.origin_x / 0.1]).astype(int)
+    found_hit = {tuple((c + offset).tolist()) for c in np.argwhere(patch.cells >= 65)}
+    found_passed = {tuple((c + offset).tolist()) for c in np.argwhere((patch.cells >= 0) & (patch.cells < 65))}
+    assert found_hit == hit
+    # A beam cuts the corner of a cell by less than the reference's step now and then, and some neighbours of these
+    # random ranges look like a surface.
+    assert len(found_passed ^ passed) <= 0.02 * len(passed)
+
+
+def test_each_cell_counts_once_a_scan_and_is_clamped():
+    config = OccupancyConfig()
+    grid = OccupancyGrid(config)
+    wall = scan_of(np.full(181, 1.0))
+    grid.update(wall, pose(0.05, 0.05, 0))
+    once = 100 / (1 + math.exp(-log_odds(config.p_free)))
+    assert percent(grid, 0.25, 0.05) == round(once)
+    for _ in range(50):
+        grid.update(wall, pose(0.05, 0.05, 0))
+    assert percent(grid, 0.25, 0.05) == round(100 * config.p_lowest)
+    assert percent(grid, 1.05, 0.05) == round(100 * config.p_highest)
+
+
+def test_a_wall_that_went_away_is_unlearned():
+    grid = OccupancyGrid()
+    for _ in range(100):
+        grid.update(scan_of(np.full(181, 1.0)), pose(0.05, 0.05, 0))
+    for _ in range(12):
+        grid.update(scan_of(np.full(181, 2.0)), pose(0.05, 0.05, 0))
+    assert grid.window(1.05, 0.05, 0.1).free.all()
+
+
+def test_nothing_is_said_of_what_lies_beyond_a_hit():
+    grid = OccupancyGrid()
+    grid.update(scan_of(np.full(181, 1.0)), pose(0.05, 0.05, 0))
+    assert percent(grid, 1.35, 0.05) == -1
+    assert percent(grid, -0.55, 0.05) == -1
+
+
+@pytest.mark.parametrize('value', [np.nan, 0.0, -1.0, 0.05, -np.inf])
+def test_invalid_beams_change_nothing(value):
+    grid = OccupancyGrid()
+    grid.update(scan_of(np.full(181, value)), pose(0, 0, 0))
+    assert grid.patch().unknown.all()
+
+
+def test_a_beam_without_return_frees_up_to_the_configured_range():
+    grid = OccupancyGrid(OccupancyConfig(no_return_range_m=3.0))
+    for _ in range(2):
+        grid.update(scan_of(np.full(181, np.inf)), pose(0.05, 0.05, 0))
+    assert grid.window(2.85, 0.05, 0.1).free.all()
+    assert percent(grid, 3.25, 0.05) == -1
+    assert not grid.patch().occupied.any()
+
+
+def test_a_hit_beyond_the_usable_range_frees_the_way_and_marks_no_wall():
+    grid = OccupancyGrid(OccupancyConfig(usable_range_m=3.0))
+    for _ in range(2):
+        grid.update(scan_of(np.full(181, 5.0)), pose(0.05, 0.05, 0))
+    assert grid.window(2.85, 0.05, 0.1).free.all()
+    assert not grid.patch().occupied.any()
+
+
+def test_the_map_grows_in_any_direction_in_memory_proportional_to_what_was_seen():
+    grid = OccupancyGrid()
+    for x, y in [(0, 0), (500, 0), (-300, 400), (0, -900)]:
+        grid.update(scan_of(np.full(181, 1.0)), pose(x + 0.05, y + 0.05, 0))
+        assert percent(grid, x + 1.05, y + 0.05) == 80
+    assert grid._tiles.used <= 16
+    assert percent(grid, 1.05, 0.05) == 80
+
+
+def test_a_pose_that_is_not_finite_changes_nothing():
+    grid = OccupancyGrid()
+    grid.update(scan_of(np.full(181, 1.0)), np.array([np.nan, 0.0, 0.0]))
+    assert grid.patch().unknown.all()
+
+
+def test_a_window_is_aligned_with_the_map_and_unknown_where_nothing_is():
+    grid = OccupancyGrid()
+    grid.update(scan_of(np.full(181, 1.0)), pose(0.05, 0.05, 0))
+    window = grid.window(0.32, -0.17, 10.0)
+    assert window.shape == (100, 100)
+    assert window.frame.origin_x / 0.1 == pytest.approx(round(window.frame.origin_x / 0.1))
+    assert grid.window(1000.0, 0.0, 1.0).unknown.all()
+
+
+def test_a_saved_map_goes_on_where_it_was():
+    grid = OccupancyGrid()
+    for _ in range(3):
+        grid.update(scan_of(np.full(181, 1.0)), pose(0.05, 0.05, 0))
+    again = OccupancyGrid.from_patch(grid.patch())
+    np.testing.assert_array_equal(again.patch().cells, grid.patch().cells)
+    again.update(scan_of(np.full(181, 2.0)), pose(0.05, 0.05, 0))
+    assert percent(again, 2.05, 0.05) == 80
+
+
+def test_a_map_of_another_resolution_is_refused():
+    patch = OccupancyGrid(OccupancyConfig(resolution_m=0.05)).patch()
+    with pytest.raises(InputError, match='resolution'):
+        OccupancyGrid.from_patch(GridPatch(patch.frame, patch.cells))
+
+
+def test_beams_that_graze_a_wall_do_not_erase_it():
+    """A wall along y = 1.03, in the middle of its cells, passed at a distance again and again."""
+    grid = OccupancyGrid()
+    angles = -math.pi / 2 + STEP * np.arange(181)
+    for x in np.arange(-6.0, 0.0, 0.05):
+        with np.errstate(divide='ignore'):
+            ranges = np.where(np.sin(angles) > 0.0, (1.03 - 0.4) / np.sin(angles), np.inf)
+        grid.update(scan_of(np.where(ranges < 8.0, ranges, np.inf)), pose(x, 0.4, 0))
+    row = grid.window(0.0, 1.05, 8.0)
+    wall = row.cells[row.frame.cells_of(np.array([[0.0, 1.05]]))[0][0]]
+    columns = row.frame.cells_of(np.array([[-3.5, 1.05], [2.0, 1.05]]))[:, 1]
+    assert (wall[columns[0] : columns[1]] >= 65).all()

@@ -1,0 +1,77 @@
+"""Odometry at the stamp of a scan, whatever order things come in."""
+
+import math
+
+import numpy as np
+import pytest
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.odometry import OdometryBuffer, ScanPairing
+from thinmap_ros.core.scan import Scan
+
+SECOND = 1_000_000_000
+
+
+def scan_at(stamp_ns):
+    return Scan.create(stamp_ns, [1.0], 0.0, 0.1, 0.1, 8.0)
+
+
+def filled(*stamps):
+    buffer = OdometryBuffer()
+    for stamp in stamps:
+        buffer.add(stamp, se2.pose(stamp / SECOND, 0, 0))
+    return buffer
+
+
+def test_a_pose_on_a_sample_is_that_sample_and_between_two_is_interpolated():
+    buffer = filled(0, SECOND)
+    assert buffer.at(SECOND)[0] == 1.0
+    assert buffer.at(SECOND // 4)[0] == pytest.approx(0.25)
+
+
+def test_outside_of_what_is_known_there_is_no_pose():
+    buffer = filled(SECOND, 2 * SECOND)
+    assert buffer.at(SECOND - 1) is None
+    assert buffer.at(2 * SECOND + 1) is None
+    assert OdometryBuffer().at(0) is None
+
+
+def test_a_late_sample_takes_its_place():
+    buffer = filled(0, 2 * SECOND, SECOND)
+    assert buffer.latest_stamp_ns == 2 * SECOND
+    assert buffer.at(3 * SECOND // 2)[0] == pytest.approx(1.5)
+
+
+def test_a_clock_set_back_starts_anew():
+    buffer = filled(100 * SECOND, 5 * SECOND)
+    assert buffer.latest_stamp_ns == 5 * SECOND
+
+
+def test_old_samples_are_forgotten():
+    buffer = filled(*(i * SECOND // 100 for i in range(5000)))
+    assert buffer.at(0) is None
+    assert buffer.at(49 * SECOND)[0] == pytest.approx(49.0)
+
+
+def test_nan_is_refused():
+    with pytest.raises(InputError, match='finite'):
+        OdometryBuffer().add(0, np.array([math.nan, 0, 0]))
+
+
+def test_a_scan_waits_for_odometry_as_new_as_itself():
+    pairing = ScanPairing()
+    assert pairing.add_odometry(0, se2.pose(0, 0, 0)) == []
+    assert pairing.add_scan(scan_at(SECOND)) == []
+    ((scan, T_odom_base),) = pairing.add_odometry(2 * SECOND, se2.pose(2, 0, 0))
+    assert scan.stamp_ns == SECOND
+    assert T_odom_base[0] == pytest.approx(1.0)
+
+
+def test_scans_older_than_all_odometry_and_too_many_waiting_are_dropped_and_counted():
+    pairing = ScanPairing(capacity=2)
+    pairing.add_odometry(10 * SECOND, se2.pose(0, 0, 0))
+    assert pairing.add_scan(scan_at(9 * SECOND)) == []
+    for stamp in (11, 12, 13):
+        pairing.add_scan(scan_at(stamp * SECOND))
+    assert pairing.dropped == 2

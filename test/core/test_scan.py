@@ -1,0 +1,50 @@
+"""Which beams say what."""
+
+import math
+
+import numpy as np
+import pytest
+
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.scan import Scan
+
+
+def scan_of(ranges, **changes):
+    fields = {'angle_min_rad': -math.pi / 2, 'angle_increment_rad': 0.1, 'range_min_m': 0.1, 'range_max_m': 8.0}
+    return Scan.create(5, ranges, **(fields | changes))
+
+
+def test_only_ranges_within_the_limits_are_hits():
+    scan = scan_of([np.nan, np.inf, -np.inf, 0.0, -1.0, 0.05, 0.2, 7.9, 8.0, 81.83])
+    np.testing.assert_array_equal(np.flatnonzero(scan.hit), [6, 7])
+    np.testing.assert_array_equal(np.flatnonzero(scan.no_return), [1, 8, 9])
+
+
+def test_a_zero_range_is_no_hit_even_where_the_sensor_claims_to_measure_it():
+    assert not scan_of([0.0], range_min_m=0.0).hit.any()
+
+
+def test_points_follow_the_mount_of_a_clockwise_laser():
+    scan = scan_of(
+        [2.0, 3.0], angle_min_rad=math.pi / 2, angle_increment_rad=-math.pi / 2, T_base_laser=np.array([1, 0, 0])
+    )
+    np.testing.assert_allclose(scan.points_base(), [[1, 2], [4, 0]], atol=1e-6)
+
+
+def test_values_are_those_of_a_laserscan_message():
+    scan = scan_of([1.234567891], angle_increment_rad=math.radians(1))
+    assert scan.ranges_m[0] == float(np.float32(1.234567891))
+    assert scan.angle_increment_rad == float(np.float32(math.radians(1)))
+
+
+def test_an_empty_scan_has_no_points():
+    assert scan_of([]).points_base().shape == (0, 2)
+
+
+@pytest.mark.parametrize(
+    'changes',
+    [{'angle_min_rad': math.nan}, {'range_max_m': 0.05}, {'range_min_m': -1.0}, {'angle_increment_rad': math.inf}],
+)
+def test_geometry_that_is_none_is_refused(changes):
+    with pytest.raises(InputError, match='expected'):
+        scan_of([1.0], **changes)

@@ -1,0 +1,48 @@
+"""Planar poses: group laws and conventions."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from thinmap_ros.core import se2
+
+number = st.floats(-50.0, 50.0)
+poses = st.builds(se2.pose, number, number, st.floats(-10.0, 10.0))
+
+
+@given(st.floats(-1e4, 1e4))
+def test_wrap_lands_in_the_half_open_interval_and_keeps_the_direction(angle):
+    wrapped = se2.wrap(angle)
+    assert -math.pi < wrapped <= math.pi
+    assert math.cos(wrapped) == pytest.approx(math.cos(angle), abs=1e-9)
+    assert math.sin(wrapped) == pytest.approx(math.sin(angle), abs=1e-9)
+
+
+def test_wrap_of_an_array_equals_wrap_of_each_and_keeps_pi():
+    angles = np.linspace(-20.0, 20.0, 101)
+    np.testing.assert_allclose(se2.wrap(angles), [se2.wrap(a) for a in angles])
+    assert se2.wrap(math.pi) == math.pi
+    assert se2.wrap(-math.pi) == math.pi
+
+
+@given(poses, poses)
+def test_between_undoes_compose(a, b):
+    np.testing.assert_allclose(se2.compose(a, se2.between(a, b))[:2], b[:2], atol=1e-9)
+    assert abs(se2.wrap(float(se2.compose(a, se2.between(a, b))[2] - b[2]))) < 1e-9
+
+
+@given(poses, poses)
+def test_points_move_like_poses(a, b):
+    np.testing.assert_allclose(se2.transform_points(a, b[None, :2])[0], se2.compose(a, b)[:2], atol=1e-9)
+
+
+def test_a_step_ahead_of_a_robot_facing_north_goes_north():
+    np.testing.assert_allclose(se2.compose(se2.pose(1, 2, math.pi / 2), se2.pose(1, 0, 0))[:2], [1, 3])
+
+
+def test_interpolation_turns_the_shorter_way():
+    middle = se2.interpolate(se2.pose(0, 0, 3.0), se2.pose(2, 0, -3.0), 0.5)
+    np.testing.assert_allclose(middle, [1.0, 0.0, math.pi])

@@ -1,0 +1,1 @@
+"""Occupancy grids: where the cells are, what the laser says of them, and the one ray traversal."""

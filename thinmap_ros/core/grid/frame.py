@@ -1,0 +1,36 @@
+"""Where the cells of a grid lie in the world."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core.se2 import Array
+
+
+@dataclass(frozen=True)
+class GridFrame:
+    """A lattice of square cells: world point <-> cell (row, col).
+
+    origin_x, origin_y: lower left corner of cell (0, 0), m; resolution: edge of a cell, m. Row 0 has the lowest y,
+    as in nav_msgs/OccupancyGrid.
+    """
+
+    origin_x: float
+    origin_y: float
+    resolution: float
+
+    def cells_of(self, points: Array) -> NDArray[np.int64]:
+        """Cells (N, 2) as (row, col) that hold the points (N, 2)."""
+        scaled = (np.atleast_2d(points) - (self.origin_x, self.origin_y)) / self.resolution
+        return np.floor(scaled[:, ::-1]).astype(np.int64)
+
+    def centres_of(self, cells: NDArray[np.int64]) -> Array:
+        """World points (N, 2) at the centres of the cells (N, 2) given as (row, col)."""
+        centres = np.atleast_2d(cells)[:, ::-1].astype(np.float64) + 0.5
+        return np.asarray(centres * self.resolution + np.array([self.origin_x, self.origin_y]))
+
+    def shifted(self, rows: int, cols: int) -> 'GridFrame':
+        """The same lattice with cell (rows, cols) as its new cell (0, 0)."""
+        x, y = self.origin_x + cols * self.resolution, self.origin_y + rows * self.resolution
+        return GridFrame(x, y, self.resolution)

@@ -1,0 +1,51 @@
+"""A rectangle of map cells with its place in the world."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.se2 import Array
+
+UNKNOWN = -1
+# map_server's thresholds, in percent.
+FREE_AT_MOST = 25
+OCCUPIED_AT_LEAST = 65
+
+
+@dataclass(frozen=True, eq=False)
+class GridPatch:
+    """Cells (H, W) int8 as in nav_msgs/OccupancyGrid: -1 unknown, else 0..100 % occupied; row 0 has the lowest y.
+
+    A cell up to 25 % is free, from 65 % occupied; what lies between counts as unknown.
+    """
+
+    frame: GridFrame
+    cells: NDArray[np.int8]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return (self.cells.shape[0], self.cells.shape[1])
+
+    @cached_property
+    def free(self) -> NDArray[np.bool_]:
+        """Cells known to be free, (H, W)."""
+        return (self.cells >= 0) & (self.cells <= FREE_AT_MOST)
+
+    @cached_property
+    def occupied(self) -> NDArray[np.bool_]:
+        """Cells known to be occupied, (H, W)."""
+        return self.cells >= OCCUPIED_AT_LEAST
+
+    @cached_property
+    def unknown(self) -> NDArray[np.bool_]:
+        """Cells that are neither free nor occupied, (H, W)."""
+        return ~(self.free | self.occupied)
+
+    def contains(self, points: Array) -> NDArray[np.bool_]:
+        """Which of the points (N, 2) lie inside, (N,)."""
+        cells = self.frame.cells_of(points)
+        return np.asarray(np.all((cells >= 0) & (cells < self.shape), axis=1))

@@ -1,0 +1,61 @@
+"""Planar poses [x m, y m, theta rad] as float64 arrays; T_a_b is the pose of frame b seen from frame a."""
+
+import math
+from typing import overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@overload
+def wrap(angle: float) -> float: ...
+@overload
+def wrap(angle: Array) -> Array: ...
+def wrap(angle: float | Array) -> float | Array:
+    """Angle(s) brought into (-pi, pi], rad."""
+    if isinstance(angle, np.ndarray):
+        return np.pi - np.mod(np.pi - angle, 2.0 * np.pi)
+    return math.pi - (math.pi - angle) % (2.0 * math.pi)
+
+
+def pose(x: float, y: float, theta: float) -> Array:
+    """Pose array (3,) with its heading wrapped."""
+    return np.array([x, y, wrap(float(theta))])
+
+
+def compose(T_a_b: Array, T_b_c: Array) -> Array:
+    """Pose of c in a: T_a_b o T_b_c, (3,)."""
+    c, s = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    return pose(
+        T_a_b[0] + c * T_b_c[0] - s * T_b_c[1], T_a_b[1] + s * T_b_c[0] + c * T_b_c[1], T_a_b[2] + T_b_c[2]
+    )
+
+
+def invert(T_a_b: Array) -> Array:
+    """Pose of a in b, (3,)."""
+    c, s = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    return pose(-c * T_a_b[0] - s * T_a_b[1], s * T_a_b[0] - c * T_a_b[1], -T_a_b[2])
+
+
+def between(T_a_b: Array, T_a_c: Array) -> Array:
+    """Pose of c in b, both given in a: invert(T_a_b) o T_a_c, (3,)."""
+    return compose(invert(T_a_b), T_a_c)
+
+
+def transform_points(T_a_b: Array, points_b: Array) -> Array:
+    """Points (N, 2) given in b, expressed in a, (N, 2)."""
+    c, s = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    return np.asarray(points_b @ np.array([[c, s], [-s, c]]) + T_a_b[:2])
+
+
+def interpolate(T_a: Array, T_b: Array, share: float) -> Array:
+    """Pose on the straight way from T_a (share 0) to T_b (share 1), heading turned the shorter way."""
+    x, y = T_a[:2] + share * (T_b[:2] - T_a[:2])
+    return pose(x, y, T_a[2] + share * wrap(float(T_b[2] - T_a[2])))
+
+
+def is_finite(T: Array) -> bool:
+    """Whether all three numbers of a pose are finite."""
+    return bool(np.isfinite(T).all())
