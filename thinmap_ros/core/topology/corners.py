@@ -1,0 +1,97 @@
+"""Corner nodes: where a chain of cells has to be broken so that straight lines stay where the robot fits."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core.jit import inlined, kernel
+from thinmap_ros.core.se2 import Array
+
+Cells = NDArray[np.int64]
+
+
+def corner_indices(cells: Cells, room: Array) -> Cells:
+    """Indices into a chain's cells (K, 2) at which corner nodes stand, in order, the chain's ends left out.
+
+    room (K,): how far, in cells, the robot's centre may leave each cell in any direction (clearance less radius).
+    Where the straight line between two neighbouring nodes is blocked, the cell farthest from it becomes a node,
+    again and again until every line is clear. A line counts as clear when each cell it touches lies within `room`
+    of a cell of the very piece it stands for: by the triangle inequality the robot then fits everywhere on it, and
+    no grid has to be kept to know this. A closed chain is always broken.
+    Source: exploration paper section 2.2, Fig. 3(c) and (d).
+    """
+    broken = _split(np.ascontiguousarray(cells), np.maximum(room, 0.0))
+    found: Cells = np.flatnonzero(broken)
+    return found
+
+
+@inlined
+def _held(cells: Cells, room: Array, first: int, last: int, hint: int, row: int, col: int) -> int:
+    """A member of the piece within whose room a cell lies, or -1; `hint` and those after it are tried first."""
+    for k in range(hint, last + 1):
+        if (cells[k, 0] - row) ** 2 + (cells[k, 1] - col) ** 2 <= room[k] ** 2:
+            return k
+    for k in range(first, hint):
+        if (cells[k, 0] - row) ** 2 + (cells[k, 1] - col) ** 2 <= room[k] ** 2:
+            return k
+    return -1
+
+
+@inlined
+def _is_clear(cells: Cells, room: Array, first: int, last: int) -> bool:
+    """Whether every cell that the line between two members touches is held; at a cell's corner, both beside it."""
+    row, col = cells[first, 0], cells[first, 1]
+    rows, cols = abs(cells[last, 0] - row), abs(cells[last, 1] - col)
+    up = 1 if cells[last, 0] > row else -1
+    right = 1 if cells[last, 1] > col else -1
+    i = j = 0
+    hint = first
+    while i < rows or j < cols:
+        side = (1 + 2 * j) * rows - (1 + 2 * i) * cols
+        if side == 0:
+            if _held(cells, room, first, last, hint, row + up * (i + 1), col + right * j) < 0:
+                return False
+            if _held(cells, room, first, last, hint, row + up * i, col + right * (j + 1)) < 0:
+                return False
+        i += side >= 0
+        j += side <= 0
+        hint = _held(cells, room, first, last, hint, row + up * i, col + right * j)
+        if hint < 0:
+            return False
+    return True
+
+
+@inlined
+def _farthest(cells: Cells, first: int, last: int) -> int:
+    """The member strictly between two others that is farthest from the straight piece that joins them."""
+    d_row, d_col = cells[last, 0] - cells[first, 0], cells[last, 1] - cells[first, 1]
+    squared = d_row * d_row + d_col * d_col
+    best, best_distance = (first + last) // 2, 1e-9
+    for k in range(first + 1, last):
+        row, col = cells[k, 0] - cells[first, 0], cells[k, 1] - cells[first, 1]
+        share = 0.0 if squared == 0 else min(max((row * d_row + col * d_col) / squared, 0.0), 1.0)
+        distance = (row - share * d_row) ** 2 + (col - share * d_col) ** 2
+        if distance > best_distance + 1e-9:
+            best, best_distance = k, distance
+    return best
+
+
+@kernel
+def _split(cells: Cells, room: Array) -> NDArray[np.bool_]:
+    broken = np.zeros(cells.shape[0], dtype=np.bool_)
+    stack = np.empty((cells.shape[0] + 1, 2), dtype=np.int64)
+    stack[0, 0], stack[0, 1] = 0, cells.shape[0] - 1
+    count = 1
+    while count > 0:
+        count -= 1
+        first, last = stack[count, 0], stack[count, 1]
+        if last - first < 2:
+            continue
+        closed = cells[first, 0] == cells[last, 0] and cells[first, 1] == cells[last, 1]
+        if not closed and _is_clear(cells, room, first, last):
+            continue
+        middle = _farthest(cells, first, last)
+        broken[middle] = True
+        stack[count, 0], stack[count, 1] = first, middle
+        stack[count + 1, 0], stack[count + 1, 1] = middle, last
+        count += 2
+    return broken

@@ -1,0 +1,146 @@
+"""Ids that stay with a place: the global map's nodes and edges, brought up to date with what the atlas holds."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.topology.atlas import Atlas
+from thinmap_ros.core.topology.config import TopologyConfig
+from thinmap_ros.core.topology.corners import corner_indices
+from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
+from thinmap_ros.core.topology.skeleton import edge_of, kind_of, node_of
+from thinmap_ros.core.topology.web import Chain, room_along
+
+_NEW = 0  # id of a node that has none yet
+_OTHER_KIND = 0.5  # share of same_place_m by which a node of another kind counts as farther away
+Place = tuple[int, int]  # spot, -1; or chain, index of a corner
+
+
+class Registry:
+    """Which node stands for which spot or corner, and which edges for which chain.
+
+    `map` is changed in place, and only where the atlas changed.
+    """
+
+    def __init__(self, config: TopologyConfig, lattice: GridFrame) -> None:
+        self.map = TopologicalMap()
+        self._config = config
+        self._lattice = lattice
+        self._next_id = 1
+        self._nodes: dict[Place, int] = {}
+        self._breaks: dict[int, list[int]] = {}
+        self._edges: dict[int, list[int]] = {}
+        self._pieces: dict[int, Chain] = {}
+
+    def refresh(self, atlas: Atlas) -> None:
+        """Follow the changes of the atlas since the last call.
+
+        A new node takes over the id of one that is gone and lay within same_place_m: nearest pairs first, and one of
+        another kind counts as farther away unless it was in the same cell. An edge between two nodes keeps its id.
+        """
+        spots, chains = atlas.take_changes()
+        old = self._withdraw_edges(chains)
+        old_nodes = self._withdraw_nodes(atlas, spots, chains)
+        places = self._places(atlas, spots, chains)
+        self._name([(place, node) for place, node in places if place not in self._nodes], old_nodes)
+        for place, node in places:
+            self.map.put_node(replace(node, id=self._nodes[place]))
+        for number in sorted(chains & atlas.chains.keys()):
+            self._put_edges(atlas, number, old)
+        for edge in old:
+            del self._pieces[edge.id]
+
+    def _withdraw_edges(self, chains: set[int]) -> list[Edge]:
+        """Take the edges of chains that changed out of the map."""
+        old = [self.map.edges[edge] for number in chains for edge in self._edges.pop(number, [])]
+        for edge in old:
+            self.map.drop_edge(edge.id)
+        return old
+
+    def _withdraw_nodes(self, atlas: Atlas, spots: set[int], chains: set[int]) -> list[Node]:
+        """Take the nodes of spots that are gone, and the corners of chains that changed, out of the map."""
+        places = [(spot, -1) for spot in spots - atlas.spots.keys()]
+        places += [(number, k) for number in chains for k in self._breaks.pop(number, [])]
+        old = [self.map.nodes[self._nodes.pop(place)] for place in sorted(places) if place in self._nodes]
+        for node in old:
+            self.map.drop_node(node.id)
+        return old
+
+    def _places(self, atlas: Atlas, spots: set[int], chains: set[int]) -> list[tuple[Place, Node]]:
+        """Spots and corners that are new or may have changed, as nodes yet without id."""
+        places = []
+        for spot in sorted(spots & atlas.spots.keys()):
+            cell, squared = atlas.spots[spot].cell, atlas.spots[spot].squared
+            places.append(((spot, -1), node_of(_NEW, kind_of(atlas, spot), cell, squared, self._lattice)))
+        radius = self._config.robot_radius_m / self._lattice.resolution
+        for number in sorted(chains & atlas.chains.keys()):
+            chain = atlas.chains[number]
+            self._breaks[number] = corner_indices(chain.cells, room_along(chain, radius)).tolist()
+            for k in self._breaks[number]:
+                row, col = chain.cells[k].tolist()
+                node = node_of(_NEW, NodeKind.CORNER, (row, col), int(chain.squared[k]), self._lattice)
+                places.append(((number, k), node))
+        return places
+
+    def _name(self, fresh: list[tuple[Place, Node]], old: list[Node]) -> None:
+        """Give ids to new places: those of old nodes where they continue them, new ones to the rest."""
+        for i, j in self._continued([node for _, node in fresh], old):
+            self._nodes[fresh[i][0]] = old[j].id
+        for place, _ in fresh:
+            if place not in self._nodes:
+                self._nodes[place] = self._new_id()
+
+    def _continued(self, fresh: list[Node], old: list[Node]) -> list[tuple[int, int]]:
+        """Pairs (index of a new node, index of the old one that it continues), each used once."""
+        if not fresh or not old:
+            return []
+        new_xy, old_xy = (np.array([(node.x, node.y) for node in nodes]) for nodes in (fresh, old))
+        kinds = np.array([node.kind for node in fresh])[:, None] != np.array([node.kind for node in old])
+        distance = np.hypot(*np.moveaxis(new_xy[:, None] - old_xy, 2, 0))
+        limit = self._config.same_place_m
+        moved = distance > 0.1 * self._lattice.resolution
+        cost = distance + (_OTHER_KIND * limit) * (kinds & moved)
+        pairs = np.argwhere(distance <= limit)
+        used_new: set[int] = set()
+        used_old: set[int] = set()
+        found = []
+        for i, j in pairs[np.argsort(cost[pairs[:, 0], pairs[:, 1]], kind='stable')].tolist():
+            if i not in used_new and j not in used_old:
+                used_new.add(i)
+                used_old.add(j)
+                found.append((i, j))
+        return found
+
+    def _put_edges(self, atlas: Atlas, number: int, old: list[Edge]) -> None:
+        """Put the edges of a chain into the map; each takes over the id of an old one between the same nodes."""
+        chain, breaks = atlas.chains[number], self._breaks[number]
+        ids = [self._nodes[chain.a, -1], *(self._nodes[number, k] for k in breaks), self._nodes[chain.b, -1]]
+        stops = [0, *breaks, len(chain.cells) - 1]
+        self._edges[number] = []
+        for (first, last), (a, b) in zip(pairwise(stops), pairwise(ids), strict=True):
+            edge = self._edge(a, b, chain.part(first, last), old)
+            self.map.put_edge(edge)
+            self._edges[number].append(edge.id)
+
+    def _edge(self, a: int, b: int, piece: Chain, old: list[Edge]) -> Edge:
+        """The edge along a piece of chain: an old one if it ran just there, else a new one, with an old id if any."""
+        same = [k for k, edge in enumerate(old) if {edge.a, edge.b} == {a, b}]
+        for k in same:
+            known = self._pieces[old[k].id]
+            same_cells = old[k].a == a and np.array_equal(known.cells, piece.cells)
+            if same_cells and known.squared.min() == piece.squared.min():
+                return old.pop(k)
+        edge_id = 0
+        if same:
+            middle = piece.cells[len(piece.cells) // 2]
+            middles = [self._pieces[old[k].id].cells[len(old[k].path) // 2] for k in same]
+            edge_id = old.pop(same[int(np.abs(np.array(middles) - middle).sum(axis=1).argmin())]).id
+        edge = edge_of(edge_id or self._new_id(), a, b, piece, self._lattice)
+        self._pieces[edge.id] = piece
+        return edge
+
+    def _new_id(self) -> int:
+        self._next_id += 1
+        return self._next_id - 1

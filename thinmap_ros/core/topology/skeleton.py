@@ -1,0 +1,143 @@
+"""Skeleton of the free space -> end, branch and corner nodes, and edges with their cell paths."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.topology.config import TopologyConfig
+from thinmap_ros.core.topology.corners import corner_indices
+from thinmap_ros.core.topology.free_space import column_distance, known_free, reachable, squared_clearance
+from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
+from thinmap_ros.core.topology.thinning import thin
+from thinmap_ros.core.topology.tracing import trace
+from thinmap_ros.core.topology.web import Chain, Limits, Promise, Spot, Web, room_along, simplify
+
+Mask = NDArray[np.bool_]
+Cells = NDArray[np.int64]
+Measure = Callable[[Cells], Cells]
+_LOOKS_OUT = 3  # cells at the rim of the known that make a spot look out
+_FARTHER = 1.0  # cells beyond the clearance in which they lie
+
+
+def extract(free_cells: Mask, patch: GridPatch, config: TopologyConfig) -> TopologicalMap:
+    """Topological map of the free space of a patch.
+
+    free_cells (H, W) bool: where the robot can stand (`select_free_space`). Ids count from 1: nodes, then edges.
+    A part of the free space that thinning erases whole keeps one node, at its roomiest cell.
+    Source: exploration paper section 2.2.
+    """
+    known = known_free(patch, config)
+    distance = column_distance(known)
+    web = web_of(skeleton_of(free_cells, distance), lambda cells: squared_clearance(distance, cells))
+    promising = looks_out(known, patch.occupied, rim_is_unknown=False)
+    simplify(web, set(web.spots), promising, Limits.of(config, patch.frame.resolution))
+    return map_of(web, patch.frame, config)
+
+
+def skeleton_of(free_cells: Mask, distance: NDArray[np.int16]) -> Mask:
+    """Thinned free cells; each part that thinning erases whole (2 x 2 blobs and what shrinks to one) keeps a cell."""
+    skeleton = thin(free_cells)
+    lost = free_cells & ~reachable(free_cells, np.argwhere(skeleton))
+    while lost.any():
+        part = np.argwhere(reachable(lost, np.argwhere(lost)[:1]))
+        row, col = part[int(squared_clearance(distance, part).argmax())]
+        skeleton[row, col] = True
+        lost[part[:, 0], part[:, 1]] = False
+    return skeleton
+
+
+def web_of(skeleton: Mask, measure: Measure, pinned: Mask | None = None) -> Web:
+    """Spots and chains of a skeleton (H, W).
+
+    measure: squared clearances of cells (N, 2); pinned (H, W): cells that become spots.
+    """
+    web = Web()
+    nodes, ends, paths = trace(skeleton, pinned)
+    cells = np.concatenate([nodes, *paths])
+    squared = measure(cells)
+    at_nodes = zip(nodes.tolist(), squared[: len(nodes)].tolist(), strict=True)
+    spots = [web.add_spot(Spot((row, col), room)) for (row, col), room in at_nodes]
+    start = len(nodes)
+    for (a, b), path in zip(ends.tolist(), paths, strict=True):
+        end = start + len(path)
+        web.add_chain(Chain(spots[a], spots[b], path, squared[start:end]))
+        start = end
+    return web
+
+
+def drawing_of(web: Web, shape: tuple[int, int]) -> Mask:
+    """The cells of all spots and chains of a web, (H, W)."""
+    drawing = np.zeros(shape, dtype=np.bool_)
+    for spot in web.spots.values():
+        drawing[spot.cell] = True
+    for chain in web.chains.values():
+        drawing[chain.cells[:, 0], chain.cells[:, 1]] = True
+    return drawing
+
+
+def looks_out(known: Mask, occupied: Mask, rim_is_unknown: bool) -> Promise:
+    """Whether the free space round a spot borders on the unknown: its clearance ends there and not at an obstacle.
+
+    known, occupied (H, W): free and occupied cells; rim_is_unknown: what lies outside the array.
+    """
+    padded = np.pad(~(known | occupied), 1, constant_values=rim_is_unknown)
+    beside = padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:]
+    frontier = known & beside
+
+    def promising(spot: Spot) -> bool:
+        reach = math.sqrt(spot.squared) + _FARTHER
+        first_row, first_col = (max(math.ceil(place - reach), 0) for place in spot.cell)
+        near = frontier[first_row : int(spot.cell[0] + reach) + 1, first_col : int(spot.cell[1] + reach) + 1]
+        rows, cols = np.nonzero(near)
+        squared = (rows + (first_row - spot.cell[0])) ** 2 + (cols + (first_col - spot.cell[1])) ** 2
+        return int(np.count_nonzero(squared <= reach**2)) >= _LOOKS_OUT
+
+    return promising
+
+
+def map_of(web: Web, frame: GridFrame, config: TopologyConfig) -> TopologicalMap:
+    """The topological map of a web, with corner nodes; ids count from 1: nodes, then edges."""
+    result = TopologicalMap()
+    radius = config.robot_radius_m / frame.resolution
+    numbers = {spot: number for number, spot in enumerate(web.spots, 1)}
+    for spot, number in numbers.items():
+        result.put_node(node_of(number, kind_of(web, spot), web.spots[spot].cell, web.spots[spot].squared, frame))
+    pieces: list[tuple[Chain, int, int, int, int]] = []
+    for chain in web.chains.values():
+        breaks = corner_indices(chain.cells, room_along(chain, radius)).tolist()
+        ids = [numbers[chain.a]]
+        for index in breaks:
+            ids.append(len(result.nodes) + 1)
+            row, col = chain.cells[index].tolist()
+            result.put_node(node_of(ids[-1], NodeKind.CORNER, (row, col), int(chain.squared[index]), frame))
+        ids.append(numbers[chain.b])
+        stops = [0, *breaks, len(chain.cells) - 1]
+        pieces += [(chain, *part) for part in zip(stops[:-1], stops[1:], ids[:-1], ids[1:], strict=True)]
+    for number, (chain, first, last, a, b) in enumerate(pieces, len(result.nodes) + 1):
+        result.put_edge(edge_of(number, a, b, chain.part(first, last), frame))
+    return result
+
+
+def kind_of(web: Web, spot: int) -> NodeKind:
+    """End with one chain or none, branch with three or more; the one spot of a ring is a corner of it."""
+    degree = web.degree(spot)
+    if degree < 2:
+        return NodeKind.END
+    return NodeKind.CORNER if degree == 2 else NodeKind.BRANCH
+
+
+def node_of(number: int, kind: NodeKind, cell: tuple[int, int], squared: int, frame: GridFrame) -> Node:
+    """Node at the centre of a cell."""
+    x = frame.origin_x + (cell[1] + 0.5) * frame.resolution
+    y = frame.origin_y + (cell[0] + 0.5) * frame.resolution
+    return Node(number, kind, x, y, math.sqrt(squared) * frame.resolution)
+
+
+def edge_of(number: int, a: int, b: int, piece: Chain, frame: GridFrame) -> Edge:
+    """Edge from node a to node b along a piece of chain."""
+    clearance = math.sqrt(int(piece.squared.min())) * frame.resolution
+    return Edge(number, a, b, frame.centres_of(piece.cells), piece.length() * frame.resolution, clearance)
