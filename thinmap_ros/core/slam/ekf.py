@@ -1,0 +1,207 @@
+"""EKF-SLAM over a pose and line features: the conventional filter.
+
+Source: EKF-SLAM/TI paper section 2, eqs. (1)-(11). State [x, y, theta, r_1, alpha_1, r_2, alpha_2, ...].
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.se2 import Array, wrap
+from thinmap_ros.core.slam.models import motion_jacobians, observe_line, place_line
+
+
+class EkfSlam:
+    """The filter. Features are addressed by their place in the state, 0 to count - 1."""
+
+    def __init__(self, T_map_base: Array, covariance: Array) -> None:
+        self._x: Array = np.zeros(3 + 2 * 32)
+        self._P: Array = np.zeros((self._x.size, self._x.size))
+        self.count = 0
+        self.set_pose(T_map_base, covariance)
+
+    @property
+    def size(self) -> int:
+        """Numbers in the state."""
+        return 3 + 2 * self.count
+
+    @property
+    def pose(self) -> Array:
+        """T_map_base (3,), a copy."""
+        return self._x[:3].copy()
+
+    @property
+    def pose_covariance(self) -> Array:
+        """Covariance (3, 3) of the pose, a copy."""
+        return self._P[:3, :3].copy()
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of the whole state, a copy."""
+        return self._P[: self.size, : self.size].copy()
+
+    @property
+    def lines(self) -> Array:
+        """Lines (count, 2) as (r, alpha), a view of the state."""
+        return self._x[3 : self.size].reshape(-1, 2)
+
+    def line_covariances(self) -> Array:
+        """Covariances (count, 2, 2) of the lines."""
+        at = 3 + 2 * np.arange(self.count)[:, None] + np.arange(2)
+        return np.asarray(self._P[at[:, :, None], at[:, None, :]])
+
+    def set_pose(self, T_map_base: Array, covariance: Array) -> None:
+        """Put the robot at a pose (3,) with covariance (3, 3) that has nothing to do with the features."""
+        n = self.size
+        self._x[:3] = T_map_base
+        self._x[2] = wrap(float(T_map_base[2]))
+        self._P[:3, :n], self._P[:n, :3] = 0.0, 0.0
+        self._P[:3, :3] = 0.5 * (covariance + covariance.T)
+
+    def predict(self, T_map_base: Array, increment: Array, increment_covariance: Array) -> None:
+        """Move to T_map_base = pose o increment, with the covariance (3, 3) of the increment. Eqs. (10), (11).
+
+        Only the pose moves, so only the pose's rows and columns of P change.
+        """
+        F_x, F_u = motion_jacobians(self._x[:3], increment)
+        n = self.size
+        self._P[:3, 3:n] = F_x @ self._P[:3, 3:n]
+        self._P[3:n, :3] = self._P[:3, 3:n].T
+        own = F_x @ self._P[:3, :3] @ F_x.T + F_u @ increment_covariance @ F_u.T
+        self._P[:3, :3] = 0.5 * (own + own.T)
+        self._x[:3] = T_map_base
+
+    def innovations(self, index: int) -> tuple[Array, Array, Array]:
+        """Expected observation (2,) of a feature, H P H' (2, 2), and H (2, 5) by pose and line."""
+        expected, by_pose, by_line = observe_line(self._x[:3], self.lines[index])
+        at = [0, 1, 2, 3 + 2 * index, 4 + 2 * index]
+        H = np.hstack([by_pose, by_line])
+        return expected, H @ self._P[np.ix_(at, at)] @ H.T, H
+
+    def update(self, indices: NDArray[np.int64], z: Array, R: Array) -> bool:
+        """Correct by features (M,) seen as lines z (M, 2) with covariances R (M, 2, 2). Eqs. (6)-(9).
+
+        Returns False, and changes nothing, where the numbers do not make an update. H has five nonzero columns
+        a line, so H P takes these rows only.
+        """
+        if len(indices) == 0:
+            return True
+        n, m = self.size, 2 * len(indices)
+        v, S, HP = np.empty(m), np.zeros((m, m)), np.empty((m, n))
+        P = self._P[:n, :n]
+        jacobians = []
+        for k, index in enumerate(indices):
+            rows, at = slice(2 * k, 2 * k + 2), slice(3 + 2 * index, 5 + 2 * index)
+            expected, by_pose, by_line = observe_line(self._x[:3], self._x[at])
+            v[rows] = _difference(z[k], expected)
+            HP[rows] = by_pose @ P[:3] + by_line @ P[at]
+            jacobians.append((at, by_pose, by_line))
+        for k, (at, by_pose, by_line) in enumerate(jacobians):
+            rows = slice(2 * k, 2 * k + 2)
+            S[:, rows] = HP[:, :3] @ by_pose.T + HP[:, at] @ by_line.T
+            S[rows, rows] += R[k]
+        return self._correct(v, S, HP)
+
+    def tie(self, kept: int, dropped: int, covariance: Array) -> bool:
+        """Let two features be one wall: their difference is 0 up to a covariance (2, 2); whether that could be done."""
+        n, a, b = self.size, 3 + 2 * kept, 3 + 2 * dropped
+        v, S = self.difference(kept, dropped)
+        return self._correct(-v, S + covariance, self._P[a : a + 2, :n] - self._P[b : b + 2, :n])
+
+    def difference(self, a: int, b: int) -> tuple[Array, Array]:
+        """Line a less line b, (2,), and the covariance (2, 2) of that."""
+        at_a, at_b = slice(3 + 2 * a, 5 + 2 * a), slice(3 + 2 * b, 5 + 2 * b)
+        cross = self._P[at_a, at_b]
+        S = self._P[at_a, at_a] + self._P[at_b, at_b] - cross - cross.T
+        return _difference(self._x[at_a], self._x[at_b]), S
+
+    def add(self, seen: Array, covariance: Array) -> int:
+        """Take up a line seen as (r, alpha) as a new feature; returns its index."""
+        n = self.size
+        self._reserve(n + 2)
+        line, by_pose, by_seen = place_line(self._x[:3], seen)
+        self._x[n : n + 2] = line
+        self._P[n : n + 2, :n] = by_pose @ self._P[:3, :n]
+        self._P[:n, n : n + 2] = self._P[n : n + 2, :n].T
+        own = by_pose @ self._P[:3, :3] @ by_pose.T + by_seen @ covariance @ by_seen.T
+        self._P[n : n + 2, n : n + 2] = 0.5 * (own + own.T)
+        self.count += 1
+        return self.count - 1
+
+    def remove(self, index: int) -> None:
+        """Drop a feature; those behind it move up by one."""
+        keep = np.delete(np.arange(self.size), [3 + 2 * index, 4 + 2 * index])
+        n = keep.size
+        self._x[:n] = self._x[keep]
+        self._P[:n, :n] = self._P[np.ix_(keep, keep)]
+        self.count -= 1
+
+    def _correct(self, v: Array, S: Array, HP: Array) -> bool:
+        """Eqs. (6)-(9): x += K v and P -= K (H P), from innovation v (M,), its covariance S (M, M) and HP (M, size)."""
+        taken = bool(_correct(0.5 * (S + S.T), HP, v, self._x, self._P))
+        if taken:
+            self._normalise()
+        return taken
+
+    def _reserve(self, size: int) -> None:
+        if size <= self._x.size:
+            return
+        wider = max(size, 2 * self._x.size)
+        x, P = np.zeros(wider), np.zeros((wider, wider))
+        n = self.size
+        x[:n], P[:n, :n] = self._x[:n], self._P[:n, :n]
+        self._x, self._P = x, P
+
+    def _normalise(self) -> None:
+        """Headings into (-pi, pi], and r >= 0: a line whose r went below zero is the same line seen from behind."""
+        self._x[2] = wrap(float(self._x[2]))
+        lines, n = self.lines, self.size
+        for index in np.flatnonzero(lines[:, 0] < 0.0):
+            lines[index] = -lines[index, 0], lines[index, 1] + np.pi
+            at = 3 + 2 * int(index)
+            self._P[at, :n] *= -1.0
+            self._P[:n, at] *= -1.0
+        lines[:, 1] = wrap(lines[:, 1])
+
+
+def _difference(seen: Array, expected: Array) -> Array:
+    return np.array([seen[0] - expected[0], wrap(float(seen[1] - expected[1]))])
+
+
+@kernel
+def _correct(S: Array, HP: Array, v: Array, x: Array, P: Array) -> bool:
+    """Correct x and P in place; returns False, with x and P untouched, where S is not positive.
+
+    With S = L L', W = L^-1 H P and w = L^-1 v the gain need not be formed: K v = W' w, and K (H P) = W' W, which is
+    symmetric to the last bit. S, HP and v are used up.
+    """
+    m, n = HP.shape
+    for j in range(m):
+        for k in range(j):
+            for i in range(j, m):
+                S[i, j] -= S[i, k] * S[j, k]
+        if not S[j, j] > 1e-18 or not math.isfinite(S[j, j]):
+            return False
+        root = math.sqrt(S[j, j])
+        for i in range(j, m):
+            S[i, j] /= root
+    for i in range(m):
+        for k in range(i):
+            v[i] -= S[i, k] * v[k]
+            for c in range(n):
+                HP[i, c] -= S[i, k] * HP[k, c]
+        v[i] /= S[i, i]
+        for c in range(n):
+            HP[i, c] /= S[i, i]
+        if not math.isfinite(v[i]):
+            return False
+    for i in range(n):
+        row = P[i]
+        for k in range(m):
+            weight = HP[k, i]
+            x[i] += weight * v[k]
+            for j in range(n):
+                row[j] -= weight * HP[k, j]
+    return True

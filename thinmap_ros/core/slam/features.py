@@ -1,0 +1,64 @@
+"""What is kept of a line feature beside its place in the filter's state, and where it lies along its line."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from thinmap_ros.core.se2 import Array
+
+
+@dataclass(eq=False)
+class Feature:
+    """A feature's id, the interval [low, high] (m) seen of its line, and from where (2,) it was first seen, map frame.
+
+    Positions along a line are counted from the foot of the perpendicular from the map's origin, to its left.
+    """
+
+    id: int
+    low: float
+    high: float
+    seen_from: Array
+
+
+@dataclass(frozen=True, eq=False)
+class LineFeature:
+    """A feature as others see it: id, (r, alpha) with covariance (2, 2), and its ends (2,) each, m, map frame."""
+
+    id: int
+    r_m: float
+    alpha_rad: float
+    covariance: Array
+    start: Array
+    end: Array
+
+
+def normals_of(lines: Array) -> Array:
+    """Unit normals (N, 2) of lines (N, 2) as (r, alpha)."""
+    return np.column_stack([np.cos(lines[:, 1]), np.sin(lines[:, 1])])
+
+
+def tangents_of(lines: Array) -> Array:
+    """Directions (N, 2) in which positions along lines (N, 2) grow: their normals turned to the left."""
+    return np.column_stack([-np.sin(lines[:, 1]), np.cos(lines[:, 1])])
+
+
+def sides_of(lines: Array, points: Array) -> Array:
+    """Side of each line (N, 2) on which its point (N, 2), or one point (2,), lies: 1 the origin's, -1 beyond."""
+    return np.where(lines[:, 0] - (normals_of(lines) * points).sum(axis=1) >= 0.0, 1.0, -1.0)
+
+
+def interval(line: Array, points: Array) -> tuple[float, float]:
+    """Where along a line (r, alpha) points (M, 2) lie: lowest and highest position."""
+    along = points @ tangents_of(line[None])[0]
+    return float(along.min()), float(along.max())
+
+
+def point_on(line: Array, position: float) -> Array:
+    """Point (2,) at a position along a line (r, alpha)."""
+    return np.asarray(line[0] * normals_of(line[None])[0] + position * tangents_of(line[None])[0])
+
+
+def as_seen(feature: Feature, line: Array, covariance: Array) -> LineFeature:
+    """The feature with its line (r, alpha) of the present state, for others."""
+    low, high = point_on(line, feature.low), point_on(line, feature.high)
+    return LineFeature(feature.id, float(line[0]), float(line[1]), covariance, low, high)

@@ -1,0 +1,189 @@
+"""The localizer: one step for each scan, live and offline."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.config import parameter
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.ekf import EkfSlam
+from thinmap_ros.core.slam.feature_map import FeatureConfig, FeatureMap
+from thinmap_ros.core.slam.features import LineFeature
+from thinmap_ros.core.slam.lines import LineConfig, Lines, extract_lines, no_lines
+from thinmap_ros.core.slam.models import MotionConfig, odometry_covariance, rotation
+from thinmap_ros.core.slam.scan_matching import Match, MatchConfig, ScanMatcher
+
+_START_SIGMAS = (1e-4, 1e-4, 1e-4)  # the map begins where the robot stands: no doubt, but not singular
+_LONGEST_STEP_M = 5.0  # between two scans the wheels cannot go farther: the odometry was set anew
+_NEW_GROUND = 0.3  # where less of a scan than this lies on what is known, there is nothing to contradict
+_LOST_SIGMA_M = 1.0  # a robot in doubt by more than this does not know where it is
+
+
+@dataclass(frozen=True)
+class LocalizerConfig(MotionConfig, MatchConfig, LineConfig, FeatureConfig):
+    """Parameters of the localizer and of its parts.
+
+    slam: full runs the filter over all line features; off leaves them out, and the covariance of the pose is then what
+    the match with the map of points leaves open, without the drift of that map.
+    """
+
+    slam: str = parameter('full', 'full: EKF over all line features; off: scan matching alone', choices=('full', 'off'))
+    start_x_m: float = parameter(0.0, 'where the robot starts in the map, m')
+    start_y_m: float = parameter(0.0, 'where the robot starts in the map, m')
+    start_yaw_rad: float = parameter(0.0, 'heading at the start, rad')
+    look_distance_m: float = parameter(0.1, 'the map learns after so much way, m', low=0.0, high=5.0)
+    look_turn_rad: float = parameter(0.1, 'or after such a turn, rad', low=0.0, high=3.0)
+    lost_scans: int = parameter(5, 'lost after so many scans in a row that do not fit', low=1, high=1000)
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What a step found: T_map_base (3,) with covariance (3, 3), T_map_odom (3,), and how it was found.
+
+    observed, matched: lines of this scan, and those found among the features (both 0 where the robot stands still and
+    the scan has nothing new to say); match_quality: share of the scan's points on known ground that fit the map.
+    """
+
+    T_map_base: Array
+    covariance: Array
+    T_map_odom: Array
+    observed: int = 0
+    matched: int = 0
+    n_features: int = 0
+    match_quality: float = 0.0
+    lost: bool = False
+
+
+class Localizer:
+    """Line-feature EKF-SLAM whose prediction is odometry sharpened by matching the scan with the map of points.
+
+    Source: EKF-SLAM/TI paper section 2. Input that is not finite is refused and counted in `refused`: the robot is
+    then taken to be where it was.
+    """
+
+    def __init__(self, config: LocalizerConfig | None = None) -> None:
+        self.config = config or LocalizerConfig()
+        self.refused = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: the next scan is the first, at the configured start."""
+        start = se2.pose(self.config.start_x_m, self.config.start_y_m, self.config.start_yaw_rad)
+        self._ekf = EkfSlam(start, np.diag(np.square(_START_SIGMAS)))
+        self._feature_map = FeatureMap(self.config)
+        self._matcher = ScanMatcher(self.config)
+        self._T_odom_base: Array | None = None
+        self._T_last_look: Array | None = None
+        # What has been added to the doubt of the pose since a scan last fitted the map.
+        self._doubt = np.zeros((3, 3))
+        self._placed_by_hand = False
+        self._misfits = 0
+
+    def set_pose(self, T_map_base: Array, covariance: Array) -> None:
+        """Put the robot at a pose (3,) with covariance (3, 3) in the map that it has; the next scans settle it."""
+        if not (se2.is_finite(T_map_base) and np.isfinite(covariance).all()):
+            self.refused += 1
+            return
+        floor = np.diag(np.square(_START_SIGMAS))
+        self._ekf.set_pose(T_map_base, covariance + floor)
+        self._doubt = covariance + floor
+        self._placed_by_hand, self._misfits = True, 0
+
+    @property
+    def features(self) -> list[LineFeature]:
+        """The line features of the map."""
+        return self._feature_map.listed(self._ekf)
+
+    def step(self, scan: Scan, T_odom_base: Array) -> Estimate:
+        """Take in a scan with the odometry pose (3,) at its stamp."""
+        increment, increment_covariance = self._odometry(T_odom_base)
+        points_base, laser_base = self._seen(scan)
+        match = self._predict(points_base, laser_base, increment, increment_covariance)
+        lines, matched = no_lines(), 0
+        if self._has_news() and not self._is_lost():
+            laser_map = se2.transform_points(self._ekf.pose, laser_base[None])[0]
+            lines, matched = self._correct(scan, laser_map)
+            if match.good or match.overlap < _NEW_GROUND:
+                points_map = se2.transform_points(self._ekf.pose, points_base)
+                self._matcher.add(points_map, laser_map)
+                self._T_last_look = self._ekf.pose
+        return self._estimate(match, lines, matched)
+
+    def _odometry(self, T_odom_base: Array) -> tuple[Array, Array]:
+        """Input u of eq. (10): the increment (3,) since the last scan, and its covariance (3, 3)."""
+        last, increment = self._T_odom_base, np.zeros(3)
+        if se2.is_finite(T_odom_base):
+            self._T_odom_base = np.array(T_odom_base, dtype=np.float64)
+            if last is None:
+                return increment, np.diag(np.square(_START_SIGMAS))
+            increment = se2.between(last, self._T_odom_base)
+        if not se2.is_finite(T_odom_base) or math.hypot(increment[0], increment[1]) > _LONGEST_STEP_M:
+            self.refused += 1
+            increment = np.zeros(3)
+        return increment, odometry_covariance(increment, self.config)
+
+    def _seen(self, scan: Scan) -> tuple[Array, Array]:
+        """Points (N, 2) that can be matched and the laser's place (2,), robot frame."""
+        if not se2.is_finite(scan.T_base_laser):
+            self.refused += 1
+            return np.empty((0, 2)), np.zeros(2)
+        near = scan.ranges_m[scan.hit] < self.config.match_range_m
+        return np.ascontiguousarray(scan.points_base()[near]), np.ascontiguousarray(scan.T_base_laser[:2])
+
+    def _predict(self, points_base: Array, laser_base: Array, increment: Array, covariance: Array) -> Match:
+        """Eqs. (10), (11): the increment is the odometry's, or where the scan fits the map, that of the match."""
+        pose = self._ekf.pose
+        turn = rotation(float(pose[2]))
+        predicted = se2.compose(pose, increment)
+        self._doubt = self._doubt + turn @ covariance @ turn.T
+        match = self._matcher.match(points_base, laser_base, predicted, self._doubt)
+        if match.good:
+            self._doubt, self._misfits = np.zeros((3, 3)), 0
+            increment, covariance = se2.between(pose, match.T_map_base), turn.T @ match.covariance @ turn
+            predicted = match.T_map_base
+        elif match.overlap >= _NEW_GROUND:
+            self._misfits += 1
+        if match.good and (self._placed_by_hand or self.config.slam == 'off'):
+            self._ekf.set_pose(match.T_map_base, match.covariance)
+            self._placed_by_hand = False
+        else:
+            self._ekf.predict(predicted, increment, covariance)
+        return match
+
+    def _correct(self, scan: Scan, laser_map: Array) -> tuple[Lines, int]:
+        """Eqs. (6)-(9) with the lines of the scan; how many of them were known."""
+        if self.config.slam == 'off' or not se2.is_finite(scan.T_base_laser):
+            return no_lines(), 0
+        lines = extract_lines(scan, self.config)
+        matched, taken = self._feature_map.observe(self._ekf, lines, laser_map)
+        self.refused += not taken
+        return lines, matched
+
+    def _has_news(self) -> bool:
+        """Whether the robot has moved since it last learned: looks from one place err alike, and prove nothing anew."""
+        if self._T_last_look is None:
+            return True
+        moved = se2.between(self._T_last_look, self._ekf.pose)
+        far = math.hypot(moved[0], moved[1]) >= self.config.look_distance_m
+        return far or abs(float(moved[2])) >= self.config.look_turn_rad
+
+    def _is_lost(self) -> bool:
+        in_doubt = max(self._ekf.pose_covariance[0, 0], self._ekf.pose_covariance[1, 1]) > _LOST_SIGMA_M**2
+        return self._misfits >= self.config.lost_scans or bool(in_doubt)
+
+    def _estimate(self, match: Match, lines: Lines, matched: int) -> Estimate:
+        T_map_base = self._ekf.pose
+        T_odom_base = np.zeros(3) if self._T_odom_base is None else self._T_odom_base
+        return Estimate(
+            T_map_base,
+            self._ekf.pose_covariance,
+            se2.compose(T_map_base, se2.invert(T_odom_base)),
+            len(lines),
+            matched,
+            len(self._feature_map),
+            match.fit,
+            self._is_lost(),
+        )

@@ -1,0 +1,119 @@
+"""A map of laser points: for each small cell their mean, and the surface that it makes with its neighbours.
+
+Means keep what an occupancy grid rounds off: a wall's place is known to a fraction of a cell. Memory is proportional
+to what was seen, because cells lie in tiles that exist only where points fell.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core.grid.tiles import NO_TILE, TILE, TileStore
+from thinmap_ros.core.jit import inlined, kernel
+from thinmap_ros.core.se2 import Array
+
+# What a cell holds: points counted, their mean (m, map frame), the unit normal of the surface there, towards where it
+# was seen from, and how loose the surface is: 0 a wall, up to 1 clutter, _UNFORMED where there are too few points.
+COUNT, MEAN_X, MEAN_Y, CENTRE_X, CENTRE_Y, NORMAL_X, NORMAL_Y, LOOSE = range(8)
+UNFORMED = 2.0
+_SHIFT, _MASK = 6, TILE - 1
+_FEWEST_CELLS = 3
+_FLAT = 0.1  # ratio of the variances across and along a surface up to which it is a wall
+
+
+class PointMap:
+    """Points by cell; `tiles.pool[slot, row, col]` is a cell."""
+
+    def __init__(self, cell_m: float, most: float) -> None:
+        """cell_m: edge of a cell; most: points that a cell's mean remembers, so that it follows what moved."""
+        self.cell_m = cell_m
+        self.tiles = TileStore(np.float32, (8,))
+        self._most = most
+
+    @property
+    def corner(self) -> NDArray[np.int64]:
+        """Cell (row, col) at which the directory of tiles begins, (2,)."""
+        return np.array([self.tiles.first_row, self.tiles.first_col], dtype=np.int64) * TILE
+
+    def add(self, points_map: Array, seen_from: Array) -> None:
+        """Take in points (N, 2) seen from a place (2,), all in the map frame."""
+        if len(points_map) == 0:
+            return
+        cells = np.floor(points_map[:, ::-1] / self.cell_m).astype(np.int64)
+        tiles = np.unique(cells // TILE, axis=0)
+        low, high = tiles.min(axis=0), tiles.max(axis=0)
+        self.tiles.reach(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+        self.tiles.ensure(tiles)
+        cells -= self.corner
+        _add(self.tiles.pool, self.tiles.directory, cells, points_map, seen_from, self._most)
+
+
+@inlined
+def slot_of(directory: NDArray[np.int32], row: int, col: int) -> int:
+    """Slot of the tile in which a cell lies, counted from the directory's first cell, or NO_TILE."""
+    tile_row, tile_col = row >> _SHIFT, col >> _SHIFT
+    if tile_row < 0 or tile_col < 0 or tile_row >= directory.shape[0] or tile_col >= directory.shape[1]:
+        return NO_TILE
+    return int(directory[tile_row, tile_col])
+
+
+@kernel
+def _add(
+    pool: NDArray[np.float32],
+    directory: NDArray[np.int32],
+    cells: NDArray[np.int64],
+    points: Array,
+    seen_from: Array,
+    most: float,
+) -> None:
+    """Count the points into their cells, then form the surface of each cell that was touched."""
+    for i in range(points.shape[0]):
+        row, col = cells[i, 0], cells[i, 1]
+        cell = pool[directory[row >> _SHIFT, col >> _SHIFT], row & _MASK, col & _MASK]
+        cell[COUNT] = min(cell[COUNT] + 1.0, most)
+        cell[MEAN_X] += (points[i, 0] - cell[MEAN_X]) / cell[COUNT]
+        cell[MEAN_Y] += (points[i, 1] - cell[MEAN_Y]) / cell[COUNT]
+    for i in range(points.shape[0]):
+        row, col = cells[i, 0], cells[i, 1]
+        # Far away the beams are wide apart: where the small neighbourhood is too empty, a wider one is asked.
+        for reach in (3, 6):
+            x, y, nx, ny, loose = _surface(pool, directory, row, col, reach)
+            if loose != UNFORMED:
+                break
+        cell = pool[directory[row >> _SHIFT, col >> _SHIFT], row & _MASK, col & _MASK]
+        if nx * (seen_from[0] - cell[MEAN_X]) + ny * (seen_from[1] - cell[MEAN_Y]) < 0.0:
+            nx, ny = -nx, -ny
+        cell[CENTRE_X], cell[CENTRE_Y] = cell[MEAN_X] + x, cell[MEAN_Y] + y
+        cell[NORMAL_X], cell[NORMAL_Y], cell[LOOSE] = nx, ny, loose
+
+
+@kernel
+def _surface(
+    pool: NDArray[np.float32], directory: NDArray[np.int32], row: int, col: int, reach: int
+) -> tuple[float, float, float, float, float]:
+    """Normal and looseness of what the means around a cell make: the directions of least and most variance."""
+    base = pool[slot_of(directory, row, col), row & _MASK, col & _MASK]
+    count, sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for r in range(row - reach, row + reach + 1):
+        for c in range(col - reach, col + reach + 1):
+            slot = slot_of(directory, r, c)
+            if slot == NO_TILE:
+                continue
+            cell = pool[slot, r & _MASK, c & _MASK]
+            if cell[COUNT] > 0.0:
+                dx, dy = cell[MEAN_X] - base[MEAN_X], cell[MEAN_Y] - base[MEAN_Y]
+                count += 1.0
+                sx += dx
+                sy += dy
+                sxx += dx * dx
+                sxy += dx * dy
+                syy += dy * dy
+    if count < _FEWEST_CELLS:
+        return 0.0, 0.0, 1.0, 0.0, UNFORMED
+    xx, xy, yy = sxx - sx * sx / count, sxy - sx * sy / count, syy - sy * sy / count
+    spread = math.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
+    small, large = 0.5 * (xx + yy) - spread, 0.5 * (xx + yy) + spread
+    angle = 0.5 * math.atan2(-2.0 * xy, yy - xx)
+    ratio = small / max(large, 1e-12)
+    return sx / count, sy / count, math.cos(angle), math.sin(angle), ratio if ratio > _FLAT else 0.0

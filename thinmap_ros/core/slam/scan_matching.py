@@ -1,0 +1,324 @@
+"""A scan against the map of points: laser odometry that sharpens the prediction.
+
+Gauss-Newton on the distances of the scan's points from the surfaces that the map's points make near them, with Cauchy
+weights, and the odometry as a prior: where the walls leave a direction open, as along a corridor, the odometry decides.
+Source: Censi, "An ICP variant using a point-to-line metric", 2008; the search after Olson, "Real-time correlative scan
+matching", 2009.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.grid.tiles import NO_TILE, TILE
+from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.se2 import Array, wrap
+from thinmap_ros.core.slam.point_map import (
+    CENTRE_X,
+    CENTRE_Y,
+    COUNT,
+    LOOSE,
+    MEAN_X,
+    MEAN_Y,
+    NORMAL_X,
+    NORMAL_Y,
+    UNFORMED,
+    PointMap,
+    slot_of,
+)
+
+_MASK = TILE - 1
+_ROUNDS = 20
+_WIDE_ROUNDS = 3  # rounds in which far neighbours and larger errors still count
+_LEAST_OVERLAP = 0.3  # share of the scan that has to lie where the map knows something, for a fit to be judged
+_FEWEST_POINTS = 10
+
+
+@dataclass(frozen=True)
+class MatchConfig(Config):
+    """Parameters of the point map and of scan matching."""
+
+    match_cell_m: float = parameter(0.05, 'edge of a cell of the point map, m', low=0.01, high=0.5)
+    match_range_m: float = parameter(30.0, 'farther points are not matched, m', low=1.0, high=200.0)
+    match_memory: float = parameter(30.0, 'points that the mean of a cell remembers', low=1.0, high=1e6)
+    match_reach_m: float = parameter(0.6, 'points look for their surface within, m', low=0.05, high=2.0)
+    match_sigma_m: float = parameter(
+        0.03, 'doubt of a point on its surface (1 sigma), m; above range noise, as points err together', low=0.001
+    )
+    match_outlier_m: float = parameter(0.1, 'points this far from their surface count half, m', low=0.001, high=1.0)
+    match_inlier_m: float = parameter(0.1, 'points this near to their surface fit, m', low=0.001, high=1.0)
+    match_good_fit: float = parameter(
+        0.85, 'share of points that fit below which the surroundings are searched', low=0.0, high=1.0
+    )
+    match_least_fit: float = parameter(0.65, 'share of points that fit below which a match fails', low=0.0, high=1.0)
+    search_m: float = parameter(0.5, 'after a failed match: how far to search, m', low=0.0, high=3.0)
+    search_deg: float = parameter(30.0, 'after a failed match: how far to turn, degrees', low=0.0, high=180.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """A matched pose T_map_base (3,) and its covariance (3, 3), map frame.
+
+    fit: of the points that lie where the map knows something, the share that lies on its surfaces; overlap: the share
+    of the points that lie there at all; good: whether the pose can be trusted.
+    """
+
+    T_map_base: Array
+    covariance: Array
+    fit: float
+    overlap: float
+    good: bool
+
+
+class ScanMatcher:
+    """Keeps the map of points, and finds the pose at which a scan fits it."""
+
+    def __init__(self, config: MatchConfig) -> None:
+        self.config = config
+        self.map = PointMap(config.match_cell_m, config.match_memory)
+
+    def add(self, points_map: Array, seen_from: Array) -> None:
+        """Take points (N, 2) seen from a place (2,) into the map, map frame."""
+        self.map.add(points_map, seen_from)
+
+    def match(self, points_base: Array, laser_base: Array, prior: Array, covariance: Array) -> Match:
+        """Pose at which points (N, 2), in the order of the beams, fit the map near a prior pose (3,).
+
+        laser_base (2,): where the laser sits on the robot; covariance (3, 3) of the prior, in the map frame. Where
+        the fit is poor, the surroundings are searched. Without points or map, the prior is given back, as not good.
+        """
+        if len(points_base) < _FEWEST_POINTS or self.map.tiles.used == 0:
+            return Match(prior, covariance, 0.0, 0.0, False)
+        scan = np.column_stack([points_base, _shares(points_base, self.config.match_cell_m)])
+        match = self._refine(scan, laser_base, prior, prior, covariance)
+        if match.overlap >= _LEAST_OVERLAP and match.fit < self.config.match_good_fit:
+            match = self._search(scan, laser_base, prior, covariance, match)
+        return match
+
+    def _search(self, scan: Array, laser_base: Array, prior: Array, covariance: Array, poor: Match) -> Match:
+        """The better of a poor match and of what the search around the prior leads to."""
+        config, tiles = self.config, self.map.tiles
+        shifts = np.arange(-config.search_m, config.search_m + 1e-9, 2.0 * config.match_cell_m)
+        turns = np.radians(np.arange(-config.search_deg, config.search_deg + 1e-9, 2.0))
+        sparse = np.ascontiguousarray(scan[:: max(1, len(scan) // 60)])
+        start = _search(
+            sparse, prior, shifts, turns, tiles.pool, tiles.directory, self.map.corner, config.match_cell_m
+        )
+        # What is searched for is what the prior missed: it must not hold the pose back.
+        wide = covariance + np.diag(np.square([config.search_m, config.search_m, math.radians(config.search_deg)]))
+        found = self._refine(scan, laser_base, start, prior, wide)
+        return found if found.fit > poor.fit else poor
+
+    def _refine(self, scan: Array, laser_base: Array, start: Array, prior: Array, covariance: Array) -> Match:
+        config, tiles = self.config, self.map.tiles
+        limits = np.array(
+            [config.match_cell_m, config.match_reach_m, config.match_sigma_m, config.match_outlier_m]
+            + [config.match_inlier_m]
+        )
+        information: Array = np.linalg.inv(covariance).astype(np.float64)
+        pose, posterior, shares = _align(
+            scan, laser_base, start, prior, information, tiles.pool, tiles.directory, self.map.corner, limits
+        )
+        overlap, fit = shares[1] / shares[0], shares[2] / max(shares[1], 1e-9)
+        if not np.isfinite(pose).all():
+            return Match(prior, covariance, 0.0, float(overlap), False)
+        pose[2] = wrap(float(pose[2]))
+        good = overlap >= _LEAST_OVERLAP and fit >= config.match_least_fit
+        return Match(pose, np.linalg.inv(posterior).astype(np.float64), float(fit), float(overlap), bool(good))
+
+
+def _shares(points: Array, cell_m: float) -> Array:
+    """Weight (N,) of each point: beams that crowd on near surfaces count no more than the surface is long."""
+    steps = np.hypot(*np.diff(points, axis=0).T)
+    around = np.minimum(np.append(steps, np.inf), np.append(np.inf, steps))
+    return np.asarray(np.clip(around / cell_m, 0.05, 1.0))
+
+
+@kernel
+def _nearest(
+    x: float,
+    y: float,
+    laser_x: float,
+    laser_y: float,
+    pool: NDArray[np.float32],
+    directory: NDArray[np.int32],
+    corner: NDArray[np.int64],
+    cell_m: float,
+    reach: int,
+) -> tuple[int, int, int]:
+    """Cell whose mean is nearest to a point, ring by ring up to a reach in cells: slot (NO_TILE: none), row, col.
+
+    Walls that were seen only from their other side are passed over.
+    """
+    row, col = int(math.floor(y / cell_m)) - corner[0], int(math.floor(x / cell_m)) - corner[1]
+    best_slot, best_row, best_col, best = NO_TILE, 0, 0, np.inf
+    for ring in range(reach + 1):
+        if best < (max(ring - 1, 0) * cell_m) ** 2:
+            break
+        for r in range(row - ring, row + ring + 1):
+            stride = 1 if ring == 0 or abs(r - row) == ring else 2 * ring
+            for c in range(col - ring, col + ring + 1, stride):
+                slot = slot_of(directory, r, c)
+                if slot == NO_TILE:
+                    continue
+                cell = pool[slot, r & _MASK, c & _MASK]
+                if cell[COUNT] == 0.0:
+                    continue
+                dx, dy = cell[MEAN_X] - x, cell[MEAN_Y] - y
+                squared = dx * dx + dy * dy
+                if squared >= best:
+                    continue
+                facing = cell[NORMAL_X] * (laser_x - x) + cell[NORMAL_Y] * (laser_y - y)
+                if cell[LOOSE] == 0.0 and facing < 0.0:
+                    continue
+                best_slot, best_row, best_col, best = slot, r & _MASK, c & _MASK, squared
+    return best_slot, best_row, best_col
+
+
+@kernel
+def _prior_terms(
+    pose: Array, prior: Array, prior_information: Array, information: Array, gradient: Array
+) -> None:
+    """Start the normal equations with the prior; it counts less the farther the pose is from it, as wheels slip."""
+    turn = math.atan2(math.sin(prior[2] - pose[2]), math.cos(prior[2] - pose[2]))
+    off = (prior[0] - pose[0], prior[1] - pose[1], turn)
+    squared = 0.0
+    for a in range(3):
+        gradient[a] = 0.0
+        for b in range(3):
+            gradient[a] += prior_information[a, b] * off[b]
+        squared += off[a] * gradient[a]
+    weight = 1.0 / (1.0 + squared / 9.0)
+    for a in range(3):
+        gradient[a] *= weight
+        for b in range(3):
+            information[a, b] = weight * prior_information[a, b]
+
+
+@kernel
+def _solve(A: Array, b: Array) -> tuple[float, float, float]:
+    """Solution of a symmetric positive system of three equations, by its Cholesky factor."""
+    l00 = math.sqrt(A[0, 0])
+    l10, l20 = A[1, 0] / l00, A[2, 0] / l00
+    l11 = math.sqrt(A[1, 1] - l10 * l10)
+    l21 = (A[2, 1] - l20 * l10) / l11
+    l22 = math.sqrt(A[2, 2] - l20 * l20 - l21 * l21)
+    y0 = b[0] / l00
+    y1 = (b[1] - l10 * y0) / l11
+    y2 = (b[2] - l20 * y0 - l21 * y1) / l22
+    x2 = y2 / l22
+    x1 = (y1 - l21 * x2) / l11
+    return (y0 - l10 * x1 - l20 * x2) / l00, x1, x2
+
+
+@kernel
+def _add_term(
+    weight: float, across: float, error: float, nx: float, ny: float, information: Array, gradient: Array
+) -> None:
+    """Add one measured direction (nx, ny) with its error; across: how the direction moves with the heading."""
+    jacobian = (nx, ny, across)
+    for a in range(3):
+        gradient[a] += weight * jacobian[a] * error
+        for b in range(3):
+            information[a, b] += weight * jacobian[a] * jacobian[b]
+
+
+@kernel
+def _align(
+    scan: Array,
+    laser_base: Array,
+    start: Array,
+    prior: Array,
+    prior_information: Array,
+    pool: NDArray[np.float32],
+    directory: NDArray[np.int32],
+    corner: NDArray[np.int64],
+    limits: Array,
+) -> tuple[Array, Array, Array]:
+    """Pose (3,), its information (3, 3), and the weights (3,) of all points, of those near the map, of those on it.
+
+    scan (N, 3): x, y, weight in the robot frame; limits: cell, reach, sigma, outlier and inlier distance, m.
+    """
+    cell_m, reach, sigma, outlier, inlier = limits
+    pose, information, gradient, shares = start.copy(), np.zeros((3, 3)), np.zeros(3), np.zeros(3)
+    for iteration in range(_ROUNDS):
+        wide = iteration < _WIDE_ROUNDS
+        cells = int(math.ceil(reach / cell_m)) if wide else int(math.ceil(0.5 * reach / cell_m))
+        scale = 3.0 * outlier if wide else outlier
+        _prior_terms(pose, prior, prior_information, information, gradient)
+        cos, sin = math.cos(pose[2]), math.sin(pose[2])
+        laser_x = pose[0] + cos * laser_base[0] - sin * laser_base[1]
+        laser_y = pose[1] + sin * laser_base[0] + cos * laser_base[1]
+        shares[:] = 0.0
+        for i in range(scan.shape[0]):
+            px, py = cos * scan[i, 0] - sin * scan[i, 1], sin * scan[i, 0] + cos * scan[i, 1]
+            x, y = px + pose[0], py + pose[1]
+            shares[0] += scan[i, 2]
+            slot, row, col = _nearest(x, y, laser_x, laser_y, pool, directory, corner, cell_m, cells)
+            if slot == NO_TILE:
+                continue
+            cell = pool[slot, row, col]
+            loose = np.float64(cell[LOOSE])
+            if loose == UNFORMED:
+                continue
+            nx, ny = np.float64(cell[NORMAL_X]), np.float64(cell[NORMAL_Y])
+            off_x, off_y = cell[CENTRE_X] - x, cell[CENTRE_Y] - y
+            error, slide = nx * off_x + ny * off_y, -ny * off_x + nx * off_y
+            squared = error * error + loose * slide * slide
+            shares[1] += scan[i, 2]
+            shares[2] += scan[i, 2] * (squared < inlier * inlier)
+            weight = scan[i, 2] / (sigma * sigma * (1.0 + squared / (scale * scale)))
+            _add_term(weight, nx * -py + ny * px, error, nx, ny, information, gradient)
+            if loose > 0.0:
+                _add_term(weight * loose, ny * py + nx * px, slide, -ny, nx, information, gradient)
+        dx, dy, turn = _solve(information, gradient)
+        pose[0], pose[1], pose[2] = pose[0] + dx, pose[1] + dy, pose[2] + turn
+        if not wide and abs(dx) + abs(dy) < 2e-4 and abs(turn) < 1e-4:
+            break
+    return pose, information, shares
+
+
+@kernel
+def _search(
+    scan: Array,
+    centre: Array,
+    shifts: Array,
+    turns: Array,
+    pool: NDArray[np.float32],
+    directory: NDArray[np.int32],
+    corner: NDArray[np.int64],
+    cell_m: float,
+) -> Array:
+    """The pose (3,) around a centre at which most points fall on or beside cells that hold points."""
+    best, best_score = centre.copy(), -np.inf
+    for turn in turns:
+        cos, sin = math.cos(centre[2] + turn), math.sin(centre[2] + turn)
+        for dx in shifts:
+            for dy in shifts:
+                # Of poses that fit alike the one nearer to the centre.
+                score = -5.0 * (dx * dx + dy * dy + turn * turn)
+                for k in range(scan.shape[0]):
+                    x = centre[0] + dx + cos * scan[k, 0] - sin * scan[k, 1]
+                    y = centre[1] + dy + sin * scan[k, 0] + cos * scan[k, 1]
+                    row = int(math.floor(y / cell_m)) - corner[0]
+                    col = int(math.floor(x / cell_m)) - corner[1]
+                    score += _beside(pool, directory, row, col)
+                if score > best_score:
+                    best_score = score
+                    best[0], best[1], best[2] = centre[0] + dx, centre[1] + dy, centre[2] + turn
+    return best
+
+
+@kernel
+def _beside(pool: NDArray[np.float32], directory: NDArray[np.int32], row: int, col: int) -> float:
+    """1 where a cell or one of its eight neighbours holds points, else 0."""
+    found = 0.0
+    for r in range(row - 1, row + 2):
+        for c in range(col - 1, col + 2):
+            slot = slot_of(directory, r, c)
+            if slot != NO_TILE and pool[slot, r & _MASK, c & _MASK, COUNT] > 0.0:
+                found = 1.0
+    return found
