@@ -1,0 +1,148 @@
+import math
+
+import numpy as np
+import pytest
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.grid.distance import distance_cells
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.raytrace import cast_rays
+from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
+from thinmap_ros.core.scan import Scan
+
+DT = 0.1
+
+
+def room(rows=60, cols=80):
+    cells = np.zeros((rows, cols), dtype=np.int8)
+    cells[[0, -1]], cells[:, [0, -1]] = 100, 100
+    return cells
+
+
+class Ride:
+    """A robot that does exactly what it is told, in a world of cells, with a map that may know less than the world."""
+
+    def __init__(self, world, start, known=None, config=None):
+        self.world, self.pose = world, np.array(start, dtype=np.float64)
+        self.patch = GridPatch(GridFrame(0.0, 0.0, 0.1), world if known is None else known)
+        self.navigator = Navigator(config or NavigatorConfig())
+        self.nearest_m, self.commands, self.seconds = math.inf, [], 0.0
+
+    def scan(self):
+        angles = np.radians(np.arange(-90.0, 91.0))
+        occupied = (self.world == 100).astype(np.uint8)
+        ranges = cast_rays(occupied, self.pose[0] / 0.1, self.pose[1] / 0.1, angles + self.pose[2], 80.0) * 0.1
+        return Scan.create(int(self.seconds * 1e9), ranges, angles[0], np.radians(1.0), 0.02, 8.0)
+
+    def step(self):
+        command = self.navigator.step(self.pose, self.patch, self.scan(), DT)
+        v, w = command.v, command.w
+        self.pose = se2.compose(
+            self.pose, se2.pose(v * DT * math.cos(w * DT / 2), v * DT * math.sin(w * DT / 2), w * DT)
+        )
+        self.commands.append((v, w))
+        self.seconds += DT
+        clearance = (distance_cells(self.world == 100) - 0.5) * 0.1
+        self.nearest_m = min(self.nearest_m, clearance[int(self.pose[1] / 0.1), int(self.pose[0] / 0.1)])
+        return command
+
+    def go(self, goal, seconds=90.0):
+        self.navigator.set_goal(*goal)
+        states = []
+        while self.seconds < seconds and (not states or states[-1].state in ('driving', 'blocked')):
+            states.append(self.step())
+        return states
+
+
+def test_it_drives_round_a_wall_and_stops_at_the_goal():
+    world = room()
+    world[30, :60] = 100
+    ride = Ride(world, (1.0, 1.0, 0.0))
+    assert ride.go((1.0, 5.0))[-1].state == 'reached'
+    assert math.dist(ride.pose[:2], (1.0, 5.0)) < 0.2
+    assert ride.nearest_m > 0.2
+    for _ in range(10):
+        last = ride.step()
+    assert (last.state, last.v, last.w) == ('idle', 0.0, 0.0)
+
+
+def test_a_heading_at_the_goal_is_turned_to():
+    ride = Ride(room(), (1.0, 1.0, 0.0))
+    assert ride.go((3.0, 1.0, -2.0))[-1].state == 'reached'
+    assert abs(se2.wrap(ride.pose[2] + 2.0)) < 0.2
+
+
+@pytest.mark.parametrize('goal', [(30.0, 30.0), (5.0, 0.02), (7.0, 3.0)])
+def test_a_goal_that_cannot_be_reached_is_refused_at_once_with_a_reason(goal):
+    world = room()
+    world[:, 60] = 100
+    commands = Ride(world, (1.0, 1.0, 0.0)).go(goal)
+    if goal == (5.0, 0.02):
+        assert commands[-1].state in ('failed', 'reached')
+        return
+    assert [c.state for c in commands] == ['failed']
+    assert f'({goal[0]:.2f}, {goal[1]:.2f})' in commands[-1].reason
+
+
+def test_it_stops_in_front_of_what_only_the_laser_knows_and_goes_around_it():
+    world = room()
+    world[5:25, 40] = 100
+    ride = Ride(world, (1.0, 1.0, 0.0), known=room(), config=NavigatorConfig(max_speed_m_s=0.5))
+    assert ride.go((7.0, 1.5), 120.0)[-1].state == 'reached'
+    assert ride.nearest_m > 0.18
+
+
+def test_where_there_is_no_way_around_it_gives_up_with_a_reason():
+    world = room()
+    world[:, 40] = 100
+    ride = Ride(world, (1.0, 3.0, 0.0), known=room())
+    commands = ride.go((7.0, 3.0), 120.0)
+    assert commands[-1].state == 'failed'
+    assert 'blocked' in commands[-1].reason or 'stands in the way' in commands[-1].reason
+    assert any(c.state == 'blocked' for c in commands)
+    assert ride.nearest_m > 0.18
+
+
+def test_a_path_that_the_map_shows_to_be_blocked_is_planned_anew():
+    world = room()
+    ride = Ride(world, (1.0, 3.0, 0.0))
+    ride.navigator.set_goal(7.0, 3.0)
+    ride.step()
+    assert ride.navigator.path[:, 1].max() < 3.3
+    changed = room()
+    changed[10:45, 40] = 100
+    ride.world, ride.patch = changed, GridPatch(ride.patch.frame, changed)
+    ride.step()
+    crossing = ride.navigator.path[np.abs(ride.navigator.path[:, 0] - 4.05) < 0.1]
+    assert (crossing[:, 1] > 4.6).all() or (crossing[:, 1] < 0.9).all()
+
+
+def test_a_new_goal_takes_the_place_of_the_old_one_and_cancel_brings_it_to_rest():
+    ride = Ride(room(), (1.0, 1.0, 0.0))
+    ride.navigator.set_goal(7.0, 1.0)
+    for _ in range(30):
+        ride.step()
+    assert ride.navigator.distance_remaining_m > 4.0
+    ride.navigator.set_goal(2.0, 4.0)
+    ride.step()
+    np.testing.assert_allclose(ride.navigator.path[-1], (2.0, 4.0))
+    ride.navigator.cancel()
+    commands = [ride.step() for _ in range(15)]
+    assert {c.state for c in commands} == {'idle'}
+    assert (commands[-1].v, commands[-1].w) == (0.0, 0.0)
+    assert ride.navigator.distance_remaining_m == 0.0
+
+
+def test_speed_is_kept_low_enough_to_stop_before_what_stands_ahead():
+    """A wall at every distance: the robot told to drive on never has more speed than it can brake."""
+    config = NavigatorConfig(max_speed_m_s=0.5)
+    known = room()
+    for gap in (0.3, 0.4, 0.6, 1.0):
+        world = room()
+        world[:, int((2.0 + gap) / 0.1) + 1] = 100
+        ride = Ride(world, (2.0, 3.0, 0.0), known=known, config=config)
+        ride.navigator.set_goal(7.0, 3.0)
+        for _ in range(60):
+            ride.step()
+        assert ride.nearest_m >= min(0.2, gap - 0.15)

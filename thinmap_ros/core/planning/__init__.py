@@ -1,0 +1,1 @@
+"""Ways through the known: along edges of the topological map, over the cells of the grid, and how to drive them."""

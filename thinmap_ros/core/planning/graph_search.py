@@ -1,0 +1,183 @@
+"""A* over the topological map, from any point to any point.
+
+Source: topological map paper section 3.2: the length of the edges is the cost of a path.
+"""
+
+import heapq
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.graph import Edge, TopologicalMap
+
+
+@dataclass(frozen=True)
+class Route:
+    """A way along edges: the nodes in order, the edges between them, and its whole length in m."""
+
+    node_ids: tuple[int, ...]
+    edge_ids: tuple[int, ...]
+    cost_m: float
+
+
+@dataclass(frozen=True)
+class Access:
+    """Where a point joins the graph: the edge and the index into its path nearest to it, or a lone node.
+
+    approach_m: straight distance from the point to there; to_node_m: from the point, over there, to the nodes.
+    """
+
+    edge_id: int | None
+    index: int
+    approach_m: float
+    to_node_m: dict[int, float]
+
+
+def shortest_path(topology: TopologicalMap, start_id: int, goal_id: int) -> Route | None:
+    """Shortest way from node to node by A*; None where the map joins them by no edges.
+
+    The straight distance to the goal never exceeds the way along edges, as long as edges are as long as their paths.
+    """
+    goal = topology.nodes[goal_id]
+    reached_by: dict[int, tuple[int, int]] = {}
+    costs = {start_id: 0.0}
+    open_nodes = [(0.0, start_id)]
+    closed: set[int] = set()
+    while open_nodes:
+        _, node_id = heapq.heappop(open_nodes)
+        if node_id == goal_id:
+            return _route(start_id, goal_id, reached_by, costs[goal_id])
+        if node_id in closed:
+            continue
+        closed.add(node_id)
+        for edge in topology.edges_at(node_id):
+            other = edge.other(node_id)
+            cost = costs[node_id] + edge.length_m
+            if cost < costs.get(other, np.inf):
+                costs[other], reached_by[other] = cost, (node_id, edge.id)
+                there = topology.nodes[other]
+                rest = ((there.x - goal.x) ** 2 + (there.y - goal.y) ** 2) ** 0.5
+                heapq.heappush(open_nodes, (cost + rest, other))
+    return None
+
+
+def access(topology: TopologicalMap, x: float, y: float) -> Access | None:
+    """How a point (m, map frame) joins the graph; None where the map is empty."""
+    found = topology.nearest_edge_point(x, y)
+    node = topology.nearest_node(x, y)
+    if node is None:
+        return None
+    to_node = ((node.x - x) ** 2 + (node.y - y) ** 2) ** 0.5
+    if found is None or to_node < found[2] - 1e-9:
+        return Access(None, 0, to_node, {node.id: to_node})
+    edge_id, index, approach = found
+    edge = topology.edges[edge_id]
+    along = _along(edge)
+    ends: dict[int, float] = {}
+    for node_id, length in ((edge.a, along[index]), (edge.b, along[-1] - along[index])):
+        ends[node_id] = min(ends.get(node_id, np.inf), approach + float(length))
+    return Access(edge_id, index, approach, ends)
+
+
+def costs_from(topology: TopologicalMap, x: float, y: float) -> dict[int, float]:
+    """Length of the shortest way from a point (m, map frame) to every node that it is joined with, m."""
+    start = access(topology, x, y)
+    if start is None:
+        return {}
+    costs = dict(start.to_node_m)
+    open_nodes = [(cost, node_id) for node_id, cost in costs.items()]
+    heapq.heapify(open_nodes)
+    closed: set[int] = set()
+    while open_nodes:
+        cost, node_id = heapq.heappop(open_nodes)
+        if node_id in closed:
+            continue
+        closed.add(node_id)
+        for edge in topology.edges_at(node_id):
+            other = edge.other(node_id)
+            if cost + edge.length_m < costs.get(other, np.inf):
+                costs[other] = cost + edge.length_m
+                heapq.heappush(open_nodes, (costs[other], other))
+    return costs
+
+
+def path_points(topology: TopologicalMap, route: Route) -> Array:
+    """Points (K, 2) of a route from its first node to its last, m, map frame; where edges meet, each point once."""
+    first = topology.nodes[route.node_ids[0]]
+    parts = [np.array([[first.x, first.y]])]
+    for node_id, edge_id in zip(route.node_ids, route.edge_ids, strict=False):
+        parts.append(_leaving(topology.edges[edge_id], node_id)[1:])
+    return np.concatenate(parts)
+
+
+def path_between(
+    topology: TopologicalMap, start_xy: tuple[float, float], goal_xy: tuple[float, float]
+) -> Array | None:
+    """Way (K, 2) along edges between any two points, m, map frame: from each straight to the nearest edge.
+
+    None where the map is empty or does not join them.
+    """
+    start, goal = access(topology, *start_xy), access(topology, *goal_xy)
+    if start is None or goal is None:
+        return None
+    best: tuple[float, Array] | None = None
+    for cost, middle in _ways(topology, start, goal):
+        if best is None or cost < best[0]:
+            best = (cost, middle)
+    if best is None:
+        return None
+    return np.concatenate([[start_xy], best[1], [goal_xy]])
+
+
+def _ways(topology: TopologicalMap, start: Access, goal: Access) -> Iterator[tuple[float, Array]]:
+    """Over each node that the start joins to each that the goal joins; and straight along an edge that both lie on."""
+    if start.edge_id is not None and start.edge_id == goal.edge_id:
+        edge = topology.edges[start.edge_id]
+        piece = _piece(edge, start.index, goal.index)
+        yield start.approach_m + goal.approach_m + _length(piece), piece
+    for a, to_a in start.to_node_m.items():
+        for b, to_b in goal.to_node_m.items():
+            route = shortest_path(topology, a, b)
+            if route is not None:
+                parts = [_to_node(topology, start, a), path_points(topology, route), _to_node(topology, goal, b)[::-1]]
+                yield to_a + route.cost_m + to_b, np.concatenate(parts)
+
+
+def _to_node(topology: TopologicalMap, point: Access, node_id: int) -> Array:
+    """Points from where a point joins an edge up to, without, one of the edge's nodes."""
+    if point.edge_id is None:
+        return np.empty((0, 2))
+    edge = topology.edges[point.edge_id]
+    last = 0 if node_id == edge.a else len(edge.path) - 1
+    if edge.a == edge.b and point.index > len(edge.path) // 2:
+        last = len(edge.path) - 1
+    return _piece(edge, point.index, last)[:-1]
+
+
+def _piece(edge: Edge, first: int, last: int) -> Array:
+    """Path points from one index to another, both included, in that order."""
+    return edge.path[first : last + 1] if first <= last else edge.path[last : first + 1][::-1]
+
+
+def _leaving(edge: Edge, node_id: int) -> Array:
+    return edge.path if node_id == edge.a else edge.path[::-1]
+
+
+def _along(edge: Edge) -> Array:
+    """Length along the path from its beginning to each of its points."""
+    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(edge.path, axis=0).T))])
+
+
+def _length(points: Array) -> float:
+    return float(np.hypot(*np.diff(points, axis=0).T).sum())
+
+
+def _route(start_id: int, goal_id: int, reached_by: dict[int, tuple[int, int]], cost: float) -> Route:
+    nodes, edges = [goal_id], []
+    while nodes[-1] != start_id:
+        node_id, edge_id = reached_by[nodes[-1]]
+        nodes.append(node_id)
+        edges.append(edge_id)
+    return Route(tuple(nodes[::-1]), tuple(edges[::-1]), cost)

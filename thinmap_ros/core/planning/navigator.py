@@ -1,0 +1,234 @@
+"""Goal in, velocity commands out: plans by wavefront, follows, replans, and stops in front of what the laser sees."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.config import parameter
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.planning.follower import Follower, FollowerConfig
+from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+
+_CHECK_AHEAD_M = 4.0
+_SWEEP_STEP_M = 0.03
+_CREEP_M_S = 0.02
+_AIM_RAD = 0.1
+_OVERLAY_M = 2.5
+# A goal that does not get this much nearer between so many standstills is given up.
+_PROGRESS_M = 0.5
+_STANDSTILLS = 5
+
+
+@dataclass(frozen=True)
+class NavigatorConfig(WavefrontConfig, FollowerConfig):
+    """Parameters of planning and following, and when a goal counts as reached or is given up."""
+
+    body_radius_m: float = parameter(0.24, 'nothing that the laser sees may come this near, m', low=0.0, high=5.0)
+    reaction_s: float = parameter(0.3, 'time from a measurement until the robot brakes, s', low=0.0, high=5.0)
+    goal_tolerance_m: float = parameter(0.15, 'a goal this near is reached, m', low=0.01, high=5.0)
+    heading_tolerance_rad: float = parameter(0.15, 'a heading this near is reached, rad', low=0.01, high=3.2)
+    replan_s: float = parameter(5.0, 'a path is planned anew after this time, s', low=0.1, high=1000.0)
+    blocked_s: float = parameter(8.0, 'a goal is given up after this time at a standstill, s', low=0.1, high=1000.0)
+
+
+@dataclass(frozen=True)
+class Command:
+    """What to do until the next step: speed v (m/s), turn rate w (rad/s), and how the goal stands.
+
+    state: 'idle', 'driving', 'blocked', 'reached' or 'failed'; reason: why blocked or failed, in words.
+    """
+
+    v: float
+    w: float
+    state: str
+    reason: str = ''
+
+
+class Navigator:
+    """Drives to one goal at a time; a new goal takes the place of the old one without a stop."""
+
+    def __init__(self, config: NavigatorConfig | None = None) -> None:
+        self.config = config or NavigatorConfig()
+        self.path: Array | None = None
+        self._follower = Follower(self.config)
+        self._goal: tuple[float, float] | None = None
+        self._heading_rad: float | None = None
+        self._path_age_s = 0.0
+        self._blocked_s = 0.0
+        self._remaining_m = 0.0
+        self._standstills = 0
+        self._nearest_m = math.inf
+        self._patch: GridPatch | None = None
+        self._scan: Scan | None = None
+        self._points_map: Array = np.empty((0, 2))
+
+    @property
+    def distance_remaining_m(self) -> float:
+        """Length of the path still to be driven, m; 0 without a path."""
+        return self._remaining_m
+
+    def set_goal(self, x: float, y: float, theta: float | None = None) -> None:
+        """Take a goal in the map frame, m; with a heading (rad) only where that matters."""
+        self._goal, self._heading_rad = (x, y), theta
+        self.path, self._path_age_s, self._blocked_s, self._remaining_m = None, 0.0, 0.0, 0.0
+        self._standstills, self._nearest_m = 0, math.inf
+
+    def cancel(self) -> None:
+        """Forget the goal; the next steps bring the robot to rest."""
+        self._goal, self.path, self._remaining_m = None, None, 0.0
+
+    def step(self, T_map_base: Array, patch: GridPatch, scan: Scan | None, dt_s: float) -> Command:
+        """Command for the next dt_s from the pose (3,), the map as known now, and the newest scan.
+
+        The scan's points keep the place where they were first seen, so the same scan may be given again while the robot
+        moves on.
+        """
+        self._look(T_map_base, scan)
+        if self._goal is None:
+            return Command(*self._follower.stop(dt_s), 'idle')
+        if math.dist(self._goal, T_map_base[:2]) <= self.config.goal_tolerance_m:
+            return self._arrive(T_map_base, dt_s)
+        if self._must_plan(T_map_base, patch, dt_s):
+            reason = self._plan(T_map_base, patch)
+            if reason:
+                return self._wait(reason, dt_s)
+        return self._drive(T_map_base, dt_s)
+
+    def _look(self, T_map_base: Array, scan: Scan | None) -> None:
+        if scan is not None and scan is not self._scan:
+            self._scan = scan
+            self._points_map = se2.transform_points(T_map_base, scan.points_base())
+
+    def _arrive(self, T_map_base: Array, dt_s: float) -> Command:
+        self._remaining_m = 0.0
+        if self._heading_rad is not None:
+            error = se2.wrap(self._heading_rad - float(T_map_base[2]))
+            if abs(error) > self.config.heading_tolerance_rad:
+                return Command(*self._follower.turn_to(T_map_base, self._heading_rad, dt_s), 'driving')
+        self.cancel()
+        return Command(*self._follower.stop(dt_s), 'reached')
+
+    def _must_plan(self, T_map_base: Array, patch: GridPatch, dt_s: float) -> bool:
+        changed, self._patch = patch is not self._patch, patch
+        self._path_age_s += dt_s
+        if self.path is None or self._path_age_s >= self.config.replan_s:
+            return True
+        squared = np.square(self.path - T_map_base[:2]).sum(axis=1)
+        nearest = int(squared.argmin())
+        strayed = squared[nearest] > (2.0 * self.config.lookahead_m) ** 2
+        return bool(strayed or (changed and self._is_blocked(self.path[nearest:], patch)))
+
+    def _is_blocked(self, path: Array, patch: GridPatch) -> bool:
+        """Whether an obstacle has come nearer to the next metres of the path than the robot's radius."""
+        resolution = patch.frame.resolution
+        cells = patch.frame.cells_of(path[: max(1, int(2.0 * _CHECK_AHEAD_M / resolution))])
+        low, high = cells.min(axis=0), cells.max(axis=0)
+        reach = math.ceil(self.config.robot_radius_m / resolution)
+        low = np.maximum(low - reach, 0)
+        found = np.argwhere(patch.occupied[low[0] : high[0] + reach + 1, low[1] : high[1] + reach + 1])
+        if found.size == 0:
+            return False
+        squared = np.square((found + low)[:, None] - np.unique(cells, axis=0)[None]).sum(axis=2)
+        return bool(squared.min() < (self.config.robot_radius_m / resolution - 1e-6) ** 2)
+
+    def _plan(self, T_map_base: Array, patch: GridPatch) -> str:
+        """Plan anew; returns why there is no path, or nothing. In front of an obstacle its points count as walls."""
+        assert self._goal is not None
+        if self._blocked_s > 0.0:
+            patch = self._with_points(T_map_base, patch)
+        path = plan(patch, (float(T_map_base[0]), float(T_map_base[1])), self._goal, self.config)
+        first = self.path is None
+        self._path_age_s = 0.0
+        if path is None:
+            self.path = None
+            where = f'({self._goal[0]:.2f}, {self._goal[1]:.2f})'
+            return f'no way to {where}' if first and self._blocked_s == 0.0 else f'the way to {where} is blocked'
+        self.path = path
+        return ''
+
+    def _with_points(self, T_map_base: Array, patch: GridPatch) -> GridPatch:
+        near = np.square(self._points_map - T_map_base[:2]).sum(axis=1) < _OVERLAY_M**2
+        points = self._points_map[near]
+        marked = patch.cells.copy()
+        if len(points):
+            cells = patch.frame.cells_of(points[patch.contains(points)])
+            marked[cells[:, 0], cells[:, 1]] = 100
+        return GridPatch(patch.frame, marked)
+
+    def _wait(self, reason: str, dt_s: float) -> Command:
+        """Stand still; give the goal up where there never was a way, or after blocked_s."""
+        never = reason.startswith('no way')
+        self._blocked_s += dt_s
+        self._remaining_m = 0.0
+        if never or self._blocked_s > self.config.blocked_s:
+            self.cancel()
+            return Command(*self._follower.stop(dt_s), 'failed', reason)
+        return Command(*self._follower.stop(dt_s), 'blocked', reason)
+
+    def _drive(self, T_map_base: Array, dt_s: float) -> Command:
+        assert self.path is not None
+        nearest = int(np.square(self.path - T_map_base[:2]).sum(axis=1).argmin())
+        self._remaining_m = float(np.hypot(*np.diff(self.path[nearest:], axis=0).T).sum())
+        if self._remaining_m < self._nearest_m - _PROGRESS_M:
+            self._standstills, self._nearest_m = 0, self._remaining_m
+        v, w = self._follower.command(T_map_base, self.path, dt_s)
+        if v <= 0.0:
+            return Command(v, w, 'driving')
+        allowed = self._safe_speed(T_map_base, v, w)
+        if allowed >= v:
+            self._blocked_s = 0.0
+            return Command(v, w, 'driving')
+        # Slower on the same arc.
+        slow = self._follower.slowed(allowed, w * allowed / v)
+        if allowed > _CREEP_M_S:
+            return Command(*slow, 'driving')
+        return self._face_obstacle(T_map_base, dt_s)
+
+    def _face_obstacle(self, T_map_base: Array, dt_s: float) -> Command:
+        """Right in front of something: turn along the path if that helps, else plan around it, else give up."""
+        assert self.path is not None
+        self._standstills += self._blocked_s == 0.0
+        self._blocked_s += dt_s
+        if self._blocked_s > self.config.blocked_s or self._standstills > _STANDSTILLS:
+            self.cancel()
+            return Command(*self._follower.slowed(0.0, 0.0), 'failed', 'something stands in the way')
+        heading = self._heading_of_path(T_map_base)
+        if abs(se2.wrap(heading - float(T_map_base[2]))) > _AIM_RAD:
+            return Command(*self._follower.turn_to(T_map_base, heading, dt_s), 'driving')
+        self._path_age_s = max(self._path_age_s, self.config.replan_s - 0.5)
+        return Command(*self._follower.slowed(0.0, 0.0), 'blocked', 'something stands in the way')
+
+    def _heading_of_path(self, T_map_base: Array) -> float:
+        assert self.path is not None
+        nearest = int(np.square(self.path - T_map_base[:2]).sum(axis=1).argmin())
+        ahead = self.path[min(nearest + 3, len(self.path) - 1)]
+        return math.atan2(ahead[1] - T_map_base[1], ahead[0] - T_map_base[0])
+
+    def _safe_speed(self, T_map_base: Array, v: float, w: float) -> float:
+        """Highest speed up to v from which the robot still stops before its body touches a point of the scan."""
+        braking = self.config.max_acceleration_m_s2
+        needed = v * self.config.reaction_s + v * v / (2.0 * braking)
+        free_m = self._free_length(T_map_base, w / v, needed)
+        late = self.config.reaction_s
+        return min(v, braking * (math.sqrt(late * late + 2.0 * free_m / braking) - late))
+
+    def _free_length(self, T_map_base: Array, curvature: float, length_m: float) -> float:
+        """How far the body can be moved along an arc before a point comes nearer than its radius, up to length_m."""
+        points = se2.transform_points(se2.invert(T_map_base), self._points_map)
+        radius = self.config.body_radius_m
+        points = points[np.square(points).sum(axis=1) < (length_m + radius) ** 2]
+        if len(points) == 0:
+            return length_m
+        steps = np.linspace(0.0, length_m, math.ceil(length_m / _SWEEP_STEP_M) + 1)
+        turns = curvature * steps
+        along = steps * np.sinc(turns / (2.0 * np.pi))
+        centres = np.column_stack([along * np.cos(turns / 2.0), along * np.sin(turns / 2.0)])
+        distances = np.hypot(*(centres[:, None] - points[None]).transpose(2, 0, 1))
+        # A point that is too near already only forbids to come still nearer.
+        limit = np.minimum(radius, distances[0] - 0.005)
+        blocked = (distances < limit).any(axis=1)
+        return float(steps[max(int(blocked.argmax()) - 1, 0)]) if blocked.any() else length_m

@@ -1,0 +1,287 @@
+"""The gradient method: the cheapest way from every cell to the goal, and the path down its slope.
+
+F(P) = sum I(p_i) + sum A(p_i, p_i+1): the intrinsic cost I falls from `keep_weight` at the closest allowed distance to
+an obstacle to zero at `keep_m`, the adjacency cost A is the distance moved. The wave is carried on from cell to cell by
+solving |grad F| = 1 + I, so that ways in all directions are measured alike, not only along rows, columns and diagonals.
+Source: topological map paper section 3.2; Konolige, "A gradient method for realtime robot control", 2000; Sethian,
+"A fast marching level set method for monotonically advancing fronts", 1996.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.grid.distance import distance_cells
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.config import TopologyConfig
+from thinmap_ros.core.topology.free_space import known_free
+
+Mask = NDArray[np.bool_]
+_ESCAPE_COST = 10.0
+_STEP_CELLS = 0.5
+# Distances are whole cells times the resolution: rounding must not close a passage as wide as the robot.
+_HAIR_M = 1e-6
+
+
+@dataclass(frozen=True)
+class WavefrontConfig(Config):
+    """What a path may cross and what it should rather avoid."""
+
+    robot_radius_m: float = parameter(0.25, 'radius of the robot: its centre comes no closer, m', low=0.0, high=5.0)
+    keep_m: float = parameter(0.6, 'distance to obstacles from which on they cost nothing, m', low=0.0, high=10.0)
+    keep_weight: float = parameter(2.0, 'cost of a metre right beside an obstacle, in metres', low=0.0, high=100.0)
+    unknown: str = parameter('forbidden', 'unknown space in a path', choices=('forbidden', 'costly'))
+    unknown_weight: float = parameter(3.0, 'cost of a metre of unknown space, in metres', low=0.0, high=1000.0)
+    goal_slack_m: float = parameter(0.3, 'a goal too near to an obstacle may move this far, m', low=0.0, high=5.0)
+    escape_m: float = parameter(0.6, 'a start too near to an obstacle is let out this far, m', low=0.0, high=5.0)
+
+
+def plan(
+    patch: GridPatch, start_xy: tuple[float, float], goal_xy: tuple[float, float], config: WavefrontConfig
+) -> Array | None:
+    """Path (K, 2) of points from start to goal, m, map frame, about half a cell apart; None where there is none.
+
+    The path ends at the goal, or at the allowed cell nearest to it within goal_slack_m.
+    """
+    cells = patch.frame.cells_of(np.array([start_xy, goal_xy]))
+    if not patch.contains(np.array([start_xy, goal_xy])).all():
+        return None
+    cost = cost_of_cells(patch, config)
+    start, wished = (int(cells[0, 0]), int(cells[0, 1])), (int(cells[1, 0]), int(cells[1, 1]))
+    goal = nearest_true(np.isfinite(cost), wished, config.goal_slack_m / patch.frame.resolution)
+    if goal is None:
+        return None
+    if not math.isfinite(cost[start]):
+        _let_out(cost, patch.occupied, start, config.escape_m / patch.frame.resolution)
+    field = navigation_function(cost, goal, start)
+    if not math.isfinite(field[start]):
+        return None
+    path = descend(field, *_in_cells(patch, start_xy), *goal) * patch.frame.resolution
+    path += (patch.frame.origin_x, patch.frame.origin_y)
+    path[0] = start_xy
+    return np.concatenate([path, [goal_xy]]) if goal == wished else path
+
+
+def cost_of_cells(patch: GridPatch, config: WavefrontConfig) -> Array:
+    """Cost of moving one unit of distance in each cell (H, W): 1 + I; inf where the robot's centre may not be."""
+    resolution = patch.frame.resolution
+    free = known_free(patch, TopologyConfig(robot_radius_m=config.robot_radius_m))
+    solid = ~free if config.unknown == 'forbidden' else patch.occupied
+    distance_m = distance_from(solid) * resolution
+    allowed = distance_m >= config.robot_radius_m - _HAIR_M
+    spread = max(config.keep_m - config.robot_radius_m, 1e-6)
+    nearness = np.clip((config.keep_m - distance_m) / spread, 0.0, 1.0)
+    cost = np.where(allowed, 1.0 + config.keep_weight * nearness * nearness, np.inf)
+    if config.unknown == 'costly':
+        cost += np.where(free, 0.0, config.unknown_weight)
+    return np.ascontiguousarray(cost)
+
+
+def distance_from(solid: Mask) -> Array:
+    """Distance, in cells between centres, from each cell (H, W) to the nearest solid one; outside all is solid."""
+    return distance_cells(np.pad(solid, 1, constant_values=True))[1:-1, 1:-1]
+
+
+def standing_places(free: Mask, radius_m: float, resolution: float) -> Mask:
+    """Cells (H, W) in which the centre of a robot of a radius may be; all that is not free counts as solid."""
+    return np.asarray(distance_from(~free) * resolution >= radius_m - _HAIR_M)
+
+
+def navigation_function(cost: Array, goal: tuple[int, int], start: tuple[int, int] | None = None) -> Array:
+    """Cheapest cost F, in cells, from each cell (H, W) to the goal (row, col); inf where there is no way.
+
+    With a start (row, col), the wave stops a little after it has got there, and cells farther off stay inf.
+    """
+    row, col = (-1, -1) if start is None else start
+    return np.asarray(_march(cost, goal[0], goal[1], row, col))
+
+
+def descend(field: Array, x: float, y: float, goal_row: int, goal_col: int) -> Array:
+    """Path (K, 2) down the slope of a navigation function (H, W), in cells (x, y), from a point to a cell's centre."""
+    return np.asarray(_descend(field, x, y, goal_row, goal_col))
+
+
+def _in_cells(patch: GridPatch, xy: tuple[float, float]) -> tuple[float, float]:
+    frame = patch.frame
+    return (xy[0] - frame.origin_x) / frame.resolution, (xy[1] - frame.origin_y) / frame.resolution
+
+
+def nearest_true(allowed: Mask, cell: tuple[int, int], reach: float) -> tuple[int, int] | None:
+    """The true cell nearest to one that lies anywhere, if there is one within a distance of `reach` cells."""
+    whole = math.floor(reach)
+    top, left = max(cell[0] - whole, 0), max(cell[1] - whole, 0)
+    part = allowed[top : max(cell[0] + whole + 1, 0), left : max(cell[1] + whole + 1, 0)]
+    near = np.argwhere(part) + (top, left)
+    squared = np.square(near - cell).sum(axis=1)
+    if near.size == 0 or squared.min() > reach * reach:
+        return None
+    best = near[squared.argmin()]
+    return int(best[0]), int(best[1])
+
+
+def _let_out(cost: Array, occupied: Mask, start: tuple[int, int], reach: float) -> None:
+    """Open the forbidden cells around a start, at a high cost: a robot that stands there has to get away somehow.
+
+    Not those that are occupied, but for the robot's own cell: where the robot is, nothing else can be.
+    """
+    whole = math.ceil(reach)
+    rows = slice(max(start[0] - whole, 0), start[0] + whole + 1)
+    cols = slice(max(start[1] - whole, 0), start[1] + whole + 1)
+    part = cost[rows, cols]
+    row, col = np.ogrid[rows.start : rows.start + part.shape[0], cols.start : cols.start + part.shape[1]]
+    disc = np.hypot(row - start[0], col - start[1]) <= reach
+    part[disc & ~np.isfinite(part) & ~occupied[rows, cols]] = _ESCAPE_COST
+    cost[start] = min(cost[start], _ESCAPE_COST)
+
+
+@kernel
+def _push(
+    keys: Array, cells: NDArray[np.int64], count: int, key: float, cell: int
+) -> None:
+    place = count
+    while place > 0:
+        parent = (place - 1) // 2
+        if keys[parent] <= key:
+            break
+        keys[place], cells[place] = keys[parent], cells[parent]
+        place = parent
+    keys[place], cells[place] = key, cell
+
+
+@kernel
+def _drop_first(keys: Array, cells: NDArray[np.int64], count: int) -> None:
+    """Take the smallest key out of a binary heap of `count` entries."""
+    key, cell = keys[count - 1], cells[count - 1]
+    place = 0
+    while True:
+        child = 2 * place + 1
+        if child >= count - 1:
+            break
+        if child + 1 < count - 1 and keys[child + 1] < keys[child]:
+            child += 1
+        if key <= keys[child]:
+            break
+        keys[place], cells[place] = keys[child], cells[child]
+        place = child
+    keys[place], cells[place] = key, cell
+
+
+@kernel
+def _march(cost: Array, goal_row: int, goal_col: int, start_row: int, start_col: int) -> Array:
+    rows, cols = cost.shape
+    field = np.full((rows, cols), np.inf)
+    done = np.zeros((rows, cols), dtype=np.bool_)
+    keys = np.empty(4 * rows * cols + 1)
+    cells = np.empty(4 * rows * cols + 1, dtype=np.int64)
+    field[goal_row, goal_col] = 0.0
+    keys[0], cells[0] = 0.0, goal_row * cols + goal_col
+    count = 1
+    stop = np.inf
+    while count > 0 and keys[0] <= stop:
+        row, col = cells[0] // cols, cells[0] % cols
+        _drop_first(keys, cells, count)
+        count -= 1
+        if done[row, col]:
+            continue
+        done[row, col] = True
+        if row == start_row and col == start_col:
+            # A few cells more, so that the slope at the start is that of the finished field.
+            stop = field[row, col] + 3.0 * cost[row, col]
+        for side in range(4):
+            r, c = row + (side == 0) - (side == 1), col + (side == 2) - (side == 3)
+            if r < 0 or r >= rows or c < 0 or c >= cols or done[r, c] or cost[r, c] == np.inf:
+                continue
+            across, along = np.inf, np.inf
+            if r > 0:
+                across = field[r - 1, c]
+            if r < rows - 1:
+                across = min(across, field[r + 1, c])
+            if c > 0:
+                along = field[r, c - 1]
+            if c < cols - 1:
+                along = min(along, field[r, c + 1])
+            low, gap, f = min(across, along), abs(across - along), cost[r, c]
+            value = low + f
+            if gap < f:
+                value = 0.5 * (across + along + math.sqrt(2.0 * f * f - gap * gap))
+            if value < field[r, c]:
+                field[r, c] = value
+                _push(keys, cells, count, value, r * cols + c)
+                count += 1
+    return field
+
+
+@kernel
+def _slope(field: Array, row: int, col: int, out: Array) -> bool:
+    """Downhill direction (x, y) in a cell from its lower neighbours; False where there is none."""
+    rows, cols = field.shape
+    here = field[row, col]
+    out[0], out[1] = 0.0, 0.0
+    if here == np.inf:
+        return False
+    left = field[row, col - 1] if col > 0 else np.inf
+    right = field[row, col + 1] if col < cols - 1 else np.inf
+    below = field[row - 1, col] if row > 0 else np.inf
+    above = field[row + 1, col] if row < rows - 1 else np.inf
+    if min(left, right) < here:
+        out[0] = here - right if right < left else left - here
+    if min(below, above) < here:
+        out[1] = here - above if above < below else below - here
+    length = math.hypot(out[0], out[1])
+    if length == 0.0:
+        return False
+    out[0], out[1] = out[0] / length, out[1] / length
+    return True
+
+
+@kernel
+def _lowest_around(field: Array, row: int, col: int) -> tuple[int, int]:
+    """The lowest of the eight neighbours; over a corner only where both cells beside it are open."""
+    rows, cols = field.shape
+    best_row, best_col = row, col
+    for r in range(max(row - 1, 0), min(row + 2, rows)):
+        for c in range(max(col - 1, 0), min(col + 2, cols)):
+            if field[row, c] < np.inf and field[r, col] < np.inf and field[r, c] < field[best_row, best_col]:
+                best_row, best_col = r, c
+    return best_row, best_col
+
+
+@kernel
+def _descend(field: Array, x: float, y: float, goal_row: int, goal_col: int) -> Array:
+    """Half a cell at a time along the slope, blended over the four nearest cells.
+
+    Every cell entered lies lower than the one left; where the slope would not lead to one (beside walls, and
+    wherever it has led nowhere for some steps), the path goes to the centre of the lowest neighbour.
+    """
+    rows, cols = field.shape
+    path = np.empty((8 * field.size + 8, 2))
+    slope = np.empty(2)
+    path[0, 0], path[0, 1] = x, y
+    row, col = int(math.floor(y)), int(math.floor(x))
+    count, stays = 1, 0
+    while (row != goal_row or col != goal_col) and count < path.shape[0] - 1:
+        dx, dy = 0.0, 0.0
+        first_row, first_col = int(math.floor(y - 0.5)), int(math.floor(x - 0.5))
+        for r in range(max(first_row, 0), min(first_row + 2, rows)):
+            for c in range(max(first_col, 0), min(first_col + 2, cols)):
+                if _slope(field, r, c, slope):
+                    share = (1.0 - abs(x - c - 0.5)) * (1.0 - abs(y - r - 0.5))
+                    dx, dy = dx + share * slope[0], dy + share * slope[1]
+        length = max(math.hypot(dx, dy), 1e-9)
+        next_x, next_y = x + _STEP_CELLS * dx / length, y + _STEP_CELLS * dy / length
+        r, c = int(math.floor(next_y)), int(math.floor(next_x))
+        stays = stays + 1 if r == row and c == col else 0
+        inside = 0 <= r < rows and 0 <= c < cols
+        if stays > 3 or not inside or (stays == 0 and not field[r, c] < field[row, col]):
+            r, c = _lowest_around(field, row, col)
+            next_x, next_y, stays = c + 0.5, r + 0.5, 0
+        x, y, row, col = next_x, next_y, r, c
+        path[count, 0], path[count, 1] = x, y
+        count += 1
+    path[count, 0], path[count, 1] = goal_col + 0.5, goal_row + 0.5
+    return path[: count + 1].copy()
