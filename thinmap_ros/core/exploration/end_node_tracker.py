@@ -1,0 +1,194 @@
+"""Follows end nodes from scan to scan and gathers the evidence for their position probability.
+
+What the paper leaves open, and how it is settled here:
+
+- *Independent evidence.* A look at a node counts only if, since the last look that counted, the robot has moved
+  `look_move_m` or the bearing to the node has turned by `look_turn_deg`. A robot that stands still learns nothing new.
+- *Which looks.* The node lies in the laser's field of view and range, and all cells between are free.
+- *Moved nodes.* A node that is farther than `moved_m` from where its evidence began loses all of it: the looks were
+  about another place.
+- *Which node continues which.* The topological map's ids decide. An end node with a new id takes over the evidence of
+  one that vanished at the same scan within `moved_m`; so a merged node keeps that of the nearest one.
+- *Rim of the range, and of the known.* A skeleton also ends where only knowledge ends. In mode `open_border`, a node
+  with unknown space at its neighbourhood's border (see `open_borders`) is not made more reliable by any look (R is at
+  most 0.5), and one without any cannot move any more: that counts as one look of reliability `closed_reliability`.
+  In mode `paper` the looks are all there is.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.exploration.position_probability import (
+    angle_difference,
+    angle_index,
+    bayes_update,
+    distance_index,
+    nearest_distance,
+    reliability,
+)
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.raytrace import line_is_clear
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+
+PRIOR = 0.5
+_NEUTRAL = 0.5
+
+
+@dataclass(frozen=True)
+class TrackerConfig(Config):
+    """Which looks count, and what becomes of a node's evidence."""
+
+    mode: str = parameter('open_border', 'what a node is judged by', choices=('open_border', 'paper'))
+    look_move_m: float = parameter(0.5, 'a look counts after the robot has moved this far, m', low=0.0, high=10.0)
+    look_turn_deg: float = parameter(15.0, 'or the bearing to the node has turned this far, deg', low=0.0, high=180.0)
+    moved_m: float = parameter(0.4, 'a node that moved farther loses its evidence, m', low=0.0, high=10.0)
+    closed_reliability: float = parameter(
+        0.95, 'reliability of a node without unknown space around', low=0.5, high=0.999
+    )
+
+
+@dataclass
+class Track:
+    """An end node and its evidence: place (x, y) m, where the evidence began, and the looks that counted."""
+
+    node_id: int
+    x: float
+    y: float
+    began_at: tuple[float, float]
+    probability: float = PRIOR
+    distances_m: list[float] = field(default_factory=list)
+    bearings_rad: list[float] = field(default_factory=list)
+    last_seen_from: tuple[float, float] | None = None
+    closed: bool = False
+
+    @property
+    def smallest_distance_m(self) -> float:
+        """Nearest place of the looks that counted, m; inf before the first."""
+        return min(self.distances_m, default=math.inf)
+
+    @property
+    def angle_span_deg(self) -> float:
+        """Largest difference between the bearings of the looks that counted, degrees."""
+        return angle_difference(np.array(self.bearings_rad)) if self.bearings_rad else 0.0
+
+    @property
+    def distance_index(self) -> float:
+        """D of equation (1); 0 before the first look."""
+        return distance_index(self.smallest_distance_m) if self.distances_m else 0.0
+
+    @property
+    def angle_index(self) -> float:
+        """A of equation (4)."""
+        return angle_index(self.angle_span_deg)
+
+    def forget(self) -> None:
+        """Begin anew at the present place."""
+        self.began_at, self.probability, self.last_seen_from, self.closed = (self.x, self.y), PRIOR, None, False
+        self.distances_m, self.bearings_rad = [], []
+
+
+class EndNodeTracker:
+    """The end nodes of the topological map by id, each with its position probability."""
+
+    def __init__(self, config: TrackerConfig | None = None) -> None:
+        self.config = config or TrackerConfig()
+        self.tracks: dict[int, Track] = {}
+
+    def follow(self, places: dict[int, tuple[float, float]]) -> dict[int, int]:
+        """Take in where the end nodes (id -> x, y in m) are now: tracks move, appear and vanish with them.
+
+        Returns the new id of each node that lives on under another one.
+        """
+        lost = {i: track for i, track in self.tracks.items() if i not in places}
+        tracks, renamed = {}, {}
+        for node_id, (x, y) in places.items():
+            track = self.tracks.get(node_id)
+            if track is None:
+                track = self._heir(lost, x, y) or Track(node_id, x, y, (x, y))
+                if track.node_id != node_id:
+                    renamed[track.node_id], track.node_id = node_id, node_id
+            track.x, track.y = x, y
+            if math.dist((x, y), track.began_at) > self.config.moved_m:
+                track.forget()
+            tracks[node_id] = track
+        self.tracks = tracks
+        return renamed
+
+    def look(
+        self, scan: Scan, T_map_base: Array, free: NDArray[np.bool_], frame: GridFrame, open_ids: set[int]
+    ) -> None:
+        """Update the probability of each node that this scan sees.
+
+        free (H, W) bool: cells in `frame` through which one can see; open_ids: nodes with unknown space around
+        (used in mode open_border only).
+        """
+        T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
+        for track in self.tracks.values():
+            if self._sees(scan, T_map_laser, track, free, frame) and self._is_news(track, T_map_laser):
+                self._count(track, T_map_laser, track.node_id in open_ids)
+        if self.config.mode == 'open_border':
+            for track in self.tracks.values():
+                self._judge_border(track, track.node_id in open_ids)
+
+    def _heir(self, lost: dict[int, Track], x: float, y: float) -> Track | None:
+        """The nearest vanished track within moved_m; each is inherited once."""
+        near = min(lost.values(), key=lambda track: math.dist((x, y), (track.x, track.y)), default=None)
+        if near is None or math.dist((x, y), (near.x, near.y)) > self.config.moved_m:
+            return None
+        return lost.pop(near.node_id)
+
+    def _sees(
+        self, scan: Scan, T_map_laser: Array, track: Track, free: NDArray[np.bool_], frame: GridFrame
+    ) -> bool:
+        dx, dy = track.x - T_map_laser[0], track.y - T_map_laser[1]
+        if math.hypot(dx, dy) >= scan.range_max_m or not in_field_of_view(scan, T_map_laser, dx, dy):
+            return False
+        cells = frame.cells_of(np.array([T_map_laser[:2], [track.x, track.y]]))
+        return bool(line_is_clear(free, *(int(v) for v in cells.ravel())))
+
+    def _is_news(self, track: Track, T_map_laser: Array) -> bool:
+        if track.last_seen_from is None:
+            return True
+        if math.dist(track.last_seen_from, T_map_laser[:2]) >= self.config.look_move_m:
+            return True
+        turned = se2.wrap(_bearing(track, T_map_laser) - track.bearings_rad[-1])
+        return abs(turned) >= math.radians(self.config.look_turn_deg)
+
+    def _count(self, track: Track, T_map_laser: Array, is_open: bool) -> None:
+        """Equations (1) to (10) for one look."""
+        track.last_seen_from = (float(T_map_laser[0]), float(T_map_laser[1]))
+        track.distances_m.append(math.dist((track.x, track.y), track.last_seen_from))
+        track.bearings_rad.append(_bearing(track, T_map_laser))
+        value = reliability(nearest_distance(np.array(track.distances_m)), track.angle_span_deg)
+        if self.config.mode == 'open_border' and is_open:
+            value = min(value, _NEUTRAL)
+        track.probability = bayes_update(track.probability, value)
+
+    def _judge_border(self, track: Track, is_open: bool) -> None:
+        """Closing counts once; a node that has opened again is as doubtful as at first."""
+        if is_open and track.closed:
+            track.forget()
+        elif not is_open and not track.closed:
+            # What far looks said against the node is settled by the map: nothing is left that could move it.
+            track.probability = bayes_update(max(track.probability, PRIOR), self.config.closed_reliability)
+        track.closed = not is_open
+
+
+def in_field_of_view(scan: Scan, T_map_laser: Array, dx: float, dy: float) -> bool:
+    """Whether the direction (dx, dy) in the map frame lies between the first and the last beam of a scan."""
+    last = scan.angle_min_rad + scan.angle_increment_rad * (scan.ranges_m.size - 1)
+    low, high = min(scan.angle_min_rad, last), max(scan.angle_min_rad, last)
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    off = se2.wrap(math.atan2(dy, dx) - float(T_map_laser[2]) - middle)
+    return abs(off) <= half + abs(scan.angle_increment_rad)
+
+
+def _bearing(track: Track, T_map_laser: Array) -> float:
+    """Angle of the vector from robot to node in the global frame, rad."""
+    return math.atan2(track.y - T_map_laser[1], track.x - T_map_laser[0])
