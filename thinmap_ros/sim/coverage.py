@@ -1,0 +1,119 @@
+"""How much of what could be seen is known.
+
+Coverage is the share of the free cells that a sensor of a range could see, by line of sight, from some place that a
+robot of a radius can reach from its start, that the map holds as free.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.raytrace import axis_setup
+from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.sim.world import World
+
+CELL_M = 0.1
+_RAY_SPACING_M = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Coverable:
+    """Free cells (H, W) bool, 10 cm wide in the world frame, that could be seen."""
+
+    cells: NDArray[np.bool_]
+    frame: GridFrame
+
+    @property
+    def area_m2(self) -> float:
+        """Area of all of them."""
+        return float(self.cells.sum()) * self.frame.resolution**2
+
+    def share_known(self, patch: GridPatch, T_world_map: Array | None = None) -> float:
+        """Coverage: the share of these cells at whose centres the map is free.
+
+        T_world_map (3,): where the map's frame lies in the world; None: they are the same.
+        """
+        centres = self.frame.centres_of(np.argwhere(self.cells))
+        if len(centres) == 0:
+            return 1.0
+        if T_world_map is not None:
+            centres = se2.transform_points(se2.invert(T_world_map), centres)
+        inside = patch.contains(centres)
+        at = patch.frame.cells_of(centres[inside])
+        return float(patch.free[at[:, 0], at[:, 1]].sum()) / len(centres)
+
+
+def coverable(world: World, start: Array, radius_m: float, range_m: float) -> Coverable:
+    """All that a robot of a radius, from its start (3,), could come to see all around with a sensor of a range.
+
+    Every place in the world's own cells where the robot can stand is taken; none is left out for speed. Sight goes
+    both ways, so each free cell looks around for such a place and stops at the first: most stand on one. Rays are
+    5 cm apart at the full range: a gap narrower than that, that far away, may be missed.
+    Raises InputError where the robot does not fit at its start.
+    """
+    reached = _reachable_from(world, start, radius_m)
+    # The lattice of maps: its lines go through the world's origin.
+    low = np.floor(np.array([world.frame.origin_x, world.frame.origin_y]) / CELL_M + 1e-6) * CELL_M
+    frame = GridFrame(float(low[0]), float(low[1]), CELL_M)
+    rows, cols = world.occupied.shape
+    last = frame.cells_of(world.frame.centres_of(np.array([[rows - 1, cols - 1]])))[0]
+    cells = np.argwhere(_without_solids(world, frame, (int(last[0]) + 1, int(last[1]) + 1)))
+    places = (frame.centres_of(cells) - (world.frame.origin_x, world.frame.origin_y)) / world.frame.resolution
+    angles = np.arange(0.0, 2.0 * math.pi, _RAY_SPACING_M / max(range_m, 1.0))
+    seen = _look_around(world.occupied, reached, places, angles, range_m / world.frame.resolution)
+    coverable_cells = np.zeros(tuple(last + 1), dtype=np.bool_)
+    coverable_cells[cells[:, 0], cells[:, 1]] = seen
+    return Coverable(coverable_cells, frame)
+
+
+def _reachable_from(world: World, start: Array, radius_m: float) -> NDArray[np.bool_]:
+    """Cells of the world (H, W) at whose centres the robot can stand, connected with the one that it starts in."""
+    from scipy import ndimage
+
+    standing = world.wall_distance_m > radius_m
+    row, col = world.frame.cells_of(start[None, :2])[0]
+    rows, cols = standing.shape
+    if not (0 <= row < rows and 0 <= col < cols and standing[row, col]):
+        raise InputError(f'{world.name}: start {start[:2].tolist()}: a robot of {radius_m} m does not fit there')
+    labels, _ = ndimage.label(standing)
+    return np.asarray(labels == labels[row, col])
+
+
+def _without_solids(world: World, frame: GridFrame, shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Cells without anything solid in them, (H, W)."""
+    solid = frame.cells_of(world.frame.centres_of(np.argwhere(world.occupied)))
+    free = np.ones(shape, dtype=np.bool_)
+    free[solid[:, 0], solid[:, 1]] = False
+    return free
+
+
+@kernel
+def _look_around(
+    solid: NDArray[np.uint8], wanted: NDArray[np.bool_], places: Array, angles: Array, max_cells: float
+) -> NDArray[np.bool_]:
+    """Whether a ray from each place (N, 2), as x and y in cells, meets a wanted cell before a solid one."""
+    rows, cols = solid.shape
+    found = np.zeros(len(places), dtype=np.bool_)
+    for i in range(len(places)):
+        for k in range(angles.size):
+            col, step_x, next_x, delta_x = axis_setup(places[i, 0], math.cos(angles[k]))
+            row, step_y, next_y, delta_y = axis_setup(places[i, 1], math.sin(angles[k]))
+            travelled = 0.0
+            while travelled <= max_cells and 0 <= row < rows and 0 <= col < cols and not solid[row, col]:
+                if wanted[row, col]:
+                    found[i] = True
+                    break
+                if next_x < next_y:
+                    travelled, next_x, col = next_x, next_x + delta_x, col + step_x
+                else:
+                    travelled, next_y, row = next_y, next_y + delta_y, row + step_y
+            if found[i]:
+                break
+    return found

@@ -1,0 +1,78 @@
+"""A SICK LMS200: 181 beams over 180 degrees, with range noise and mixed pixels."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.grid.raytrace import cast_rays
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.sim.world import World
+
+
+@dataclass(frozen=True)
+class Lms200Config(Config):
+    """A planar laser scanner; the defaults are those of an LMS200 in its 8 m mode."""
+
+    beams: int = parameter(181, 'beams of a scan', low=2, high=10_000)
+    field_of_view_deg: float = parameter(180.0, 'angle between first and last beam, degrees', low=0.0, high=360.0)
+    range_min_m: float = parameter(0.05, 'nearest range, m', low=0.0, high=10.0)
+    range_max_m: float = parameter(8.0, 'farthest range, m', low=0.1, high=200.0)
+    rate_hz: float = parameter(5.0, 'scans a second', low=0.1, high=20.0)
+    noise_m: float = parameter(0.01, 'range noise, 1 sigma, m', low=0.0, high=1.0)
+    rounding_m: float = parameter(0.001, 'ranges are whole multiples of this, m', low=0.0, high=0.1)
+    mixed_pixels: float = parameter(0.3, 'share of depth edges that give a range in between', low=0.0, high=1.0)
+    edge_m: float = parameter(0.3, 'neighbouring beams that differ by more make a depth edge, m', low=0.01, high=10.0)
+    mount_x_m: float = parameter(0.0, 'laser ahead of the robot centre, m', low=-2.0, high=2.0)
+
+
+class Lms200:
+    """Makes scans of a world; what no beam meets within the range reads +inf (REP 117)."""
+
+    def __init__(self, config: Lms200Config, seed: int) -> None:
+        self.config = config
+        self.T_base_laser = np.array([config.mount_x_m, 0.0, 0.0])
+        full_circle = config.field_of_view_deg >= 360.0
+        intervals = config.beams if full_circle else config.beams - 1
+        self._increment = math.radians(config.field_of_view_deg) / intervals
+        self._angle_min = -math.radians(config.field_of_view_deg) / 2.0
+        self._rng = np.random.default_rng(seed)
+
+    def scan(self, world: World, T_world_base: Array, stamp_ns: int) -> Scan:
+        """Scan from a robot pose (3,) in the world."""
+        exact = self._exact(world, se2.compose(T_world_base, self.T_base_laser))
+        ranges = self._mix(exact) + self._rng.normal(0.0, self.config.noise_m, exact.size)
+        if self.config.rounding_m > 0.0:
+            ranges = np.round(ranges / self.config.rounding_m) * self.config.rounding_m
+        ranges = np.where(np.isfinite(ranges) & (ranges < self.config.range_max_m), ranges, np.inf)
+        return Scan.create(
+            stamp_ns,
+            ranges,
+            self._angle_min,
+            self._increment,
+            self.config.range_min_m,
+            self.config.range_max_m,
+            self.T_base_laser,
+        )
+
+    def _exact(self, world: World, T_world_laser: Array) -> Array:
+        resolution = world.frame.resolution
+        x = (T_world_laser[0] - world.frame.origin_x) / resolution
+        y = (T_world_laser[1] - world.frame.origin_y) / resolution
+        angles = T_world_laser[2] + self._angle_min + self._increment * np.arange(self.config.beams)
+        return cast_rays(world.occupied, x, y, angles, self.config.range_max_m / resolution) * resolution
+
+    def _mix(self, ranges: Array) -> Array:
+        """Mixed pixels: at a depth edge a beam's spot falls on both surfaces, and the range lies in between."""
+        nearer, farther = np.minimum(ranges[:-1], ranges[1:]), np.maximum(ranges[:-1], ranges[1:])
+        with np.errstate(invalid='ignore'):
+            edge = np.isfinite(farther) & (farther - nearer > self.config.edge_m)
+        mixed = edge & (self._rng.random(edge.size) < self.config.mixed_pixels)
+        share = self._rng.random(edge.size)
+        result = ranges.copy()
+        with np.errstate(invalid='ignore'):
+            result[:-1] = np.where(mixed, nearer + share * (farther - nearer), result[:-1])
+        return result
