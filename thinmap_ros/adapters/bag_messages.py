@@ -1,0 +1,52 @@
+"""Messages as a bag gives them (rosbags' own classes, not those of ROS) -> core values."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
+
+_SECOND_NS = 1_000_000_000
+
+
+def stamp_ns(message: Any) -> int:
+    """Stamp of a message's header, ns."""
+    return int(message.header.stamp.sec) * _SECOND_NS + int(message.header.stamp.nanosec)
+
+
+def yaw(q: Any) -> float:
+    """Heading of a quaternion, rad."""
+    return math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
+
+
+def pose(message: Any) -> Array:
+    """Planar pose (3,) of a geometry_msgs/Pose."""
+    return se2.pose(message.position.x, message.position.y, yaw(message.orientation))
+
+
+def patch(message: Any) -> GridPatch:
+    """Cells of a nav_msgs/OccupancyGrid."""
+    info = message.info
+    frame = GridFrame(info.origin.position.x, info.origin.position.y, round(float(info.resolution), 6))
+    return GridPatch(frame, np.asarray(message.data, dtype=np.int8).reshape(info.height, info.width))
+
+
+def topology(message: Any) -> TopologicalMap:
+    """Graph of a thinmap_msgs/TopologicalMap."""
+    nodes = [
+        Node(int(n.id), NodeKind(n.kind), n.position.x, n.position.y, float(n.clearance_m)) for n in message.nodes
+    ]
+    edges = [
+        Edge(int(e.id), int(e.node_a), int(e.node_b), _points(e.path), float(e.length_m), float(e.clearance_m))
+        for e in message.edges
+    ]
+    return TopologicalMap(nodes, edges)
+
+
+def _points(path: Any) -> Array:
+    return np.array([[p.x, p.y] for p in path], dtype=np.float64).reshape(-1, 2)

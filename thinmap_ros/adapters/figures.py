@@ -1,0 +1,81 @@
+"""Pictures of maps."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thinmap_ros.adapters.files import written_aside
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+# Okabe and Ito's colours: told apart by everyone; each kind of node has a shape of its own as well.
+_NODES = {NodeKind.END: ('o', '#D55E00'), NodeKind.BRANCH: ('s', '#0072B2'), NodeKind.CORNER: ('^', '#E69F00')}
+_EDGE, _ESTIMATE, _TRUTH = '#009E73', '#CC79A7', '#56B4E9'
+
+
+def summary_figure(
+    path: Path,
+    patch: GridPatch,
+    topology: TopologicalMap,
+    estimated: Array,
+    true: Array | None = None,
+    title: str = '',
+) -> None:
+    """Write a PNG: map, skeleton, nodes by kind, and the paths (N, 2 or more columns) as estimated and as driven."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    height, width = (count * patch.frame.resolution for count in patch.shape)
+    scale = 9.0 / max(height, width)
+    figure = Figure(figsize=(width * scale + 1.2, height * scale + 1.6), dpi=110, layout='constrained')
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    _draw_map(axes, patch)
+    _draw_graph(axes, topology)
+    if true is not None and len(true):
+        axes.plot(true[:, 0], true[:, 1], '-', color=_TRUTH, linewidth=2.5, label='path driven', zorder=2)
+    if len(estimated):
+        axes.plot(
+            estimated[:, 0], estimated[:, 1], '-', color=_ESTIMATE, linewidth=1.0, label='path estimated', zorder=3
+        )
+        axes.plot(*estimated[0, :2], marker='*', color='black', markersize=11, linestyle='', label='start', zorder=6)
+    axes.set(xlabel='x (m)', ylabel='y (m)', title=title, aspect='equal')
+    axes.legend(loc='upper center', bbox_to_anchor=(0.5, -0.07), ncols=4, fontsize=8, frameon=False)
+    with written_aside(path) as aside:
+        figure.savefig(aside, format='png')
+
+
+def _draw_map(axes: 'Axes', patch: GridPatch) -> None:
+    shade = np.full(patch.shape, 0.8)
+    shade[patch.free], shade[patch.occupied] = 1.0, 0.0
+    frame = patch.frame
+    right = frame.origin_x + patch.shape[1] * frame.resolution
+    top = frame.origin_y + patch.shape[0] * frame.resolution
+    axes.imshow(
+        shade,
+        cmap='gray',
+        vmin=0.0,
+        vmax=1.0,
+        origin='lower',
+        extent=(frame.origin_x, right, frame.origin_y, top),
+        interpolation='nearest',
+    )
+
+
+def _draw_graph(axes: 'Axes', topology: TopologicalMap) -> None:
+    for i, edge in enumerate(topology.edges.values()):
+        label = 'skeleton' if i == 0 else None
+        axes.plot(edge.path[:, 0], edge.path[:, 1], '-', color=_EDGE, linewidth=1.2, label=label, zorder=4)
+    for kind, (marker, colour) in _NODES.items():
+        places = np.array([n.position for n in topology.nodes.values() if n.kind == kind]).reshape(-1, 2)
+        if len(places):
+            label = f'{kind.name.lower()} nodes'
+            axes.plot(
+                *places.T, marker, color=colour, markersize=5, markeredgecolor='black', markeredgewidth=0.4,
+                linestyle='', label=label, zorder=5,
+            )

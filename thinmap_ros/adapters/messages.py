@@ -1,0 +1,236 @@
+"""ROS messages <-> core values; nothing else knows the layout of a message."""
+
+import math
+from array import array
+from collections.abc import Sequence
+
+import numpy as np
+from builtin_interfaces.msg import Duration, Time
+from geometry_msgs.msg import (
+    Point,
+    Point32,
+    Pose,
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    Quaternion,
+    TransformStamped,
+    Twist,
+)
+from nav_msgs.msg import OccupancyGrid, Odometry, Path
+from sensor_msgs.msg import LaserScan
+from std_msgs.msg import Header
+
+from thinmap_msgs.msg import TopologicalEdge, TopologicalNode
+from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
+from thinmap_ros.core import se2
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
+
+SECOND_NS = 1_000_000_000
+
+
+def stamp_ns(stamp: Time) -> int:
+    """Time message as whole nanoseconds."""
+    return int(stamp.sec) * SECOND_NS + int(stamp.nanosec)
+
+
+def time_msg(ns: int) -> Time:
+    """Whole nanoseconds as a time message."""
+    return Time(sec=ns // SECOND_NS, nanosec=ns % SECOND_NS)
+
+
+def duration_msg(seconds: float) -> Duration:
+    """Duration message of seconds."""
+    ns = round(max(seconds, 0.0) * SECOND_NS)
+    return Duration(sec=ns // SECOND_NS, nanosec=ns % SECOND_NS)
+
+
+def seconds(duration: Duration) -> float:
+    """Duration message as seconds."""
+    return float(duration.sec) + float(duration.nanosec) / SECOND_NS
+
+
+def header(frame_id: str, ns: int) -> Header:
+    """Header with frame and stamp."""
+    return Header(frame_id=frame_id, stamp=time_msg(ns))
+
+
+def scan_from(message: LaserScan, T_base_laser: Array) -> Scan:
+    """Scan from its message and the laser's pose on the robot. Raises InputError as `Scan.create`."""
+    return Scan.create(
+        stamp_ns(message.header.stamp),
+        np.frombuffer(message.ranges, dtype=np.float32),
+        message.angle_min,
+        message.angle_increment,
+        message.range_min,
+        message.range_max,
+        T_base_laser,
+    )
+
+
+def scan_msg(scan: Scan, frame_id: str, scan_time_s: float) -> LaserScan:
+    """Message of a scan."""
+    ranges = array('f')
+    ranges.frombytes(scan.ranges_m.astype(np.float32).tobytes())
+    return LaserScan(
+        header=header(frame_id, scan.stamp_ns),
+        angle_min=scan.angle_min_rad,
+        angle_max=scan.angle_min_rad + scan.angle_increment_rad * (scan.ranges_m.size - 1),
+        angle_increment=scan.angle_increment_rad,
+        range_min=scan.range_min_m,
+        range_max=scan.range_max_m,
+        scan_time=scan_time_s,
+        ranges=ranges,
+    )
+
+
+def yaw_of(q: Quaternion) -> float:
+    """Heading of a rotation, rad. Raises InputError where it is no rotation (norm not 1)."""
+    norm = math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
+    if not abs(norm - 1.0) < 0.01:
+        raise InputError(f'quaternion ({q.x}, {q.y}, {q.z}, {q.w}): expected norm 1, not {norm}')
+    return math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
+
+
+def quaternion_msg(yaw_rad: float) -> Quaternion:
+    """Rotation about z."""
+    return Quaternion(z=math.sin(yaw_rad / 2.0), w=math.cos(yaw_rad / 2.0))
+
+
+def pose_from(message: Pose) -> Array:
+    """Planar pose (3,). Raises InputError where it is not finite or no rotation."""
+    T = se2.pose(message.position.x, message.position.y, yaw_of(message.orientation))
+    if not se2.is_finite(T):
+        raise InputError(f'pose {T.tolist()}: expected finite numbers')
+    return T
+
+
+def pose_msg(T: Array) -> Pose:
+    """Planar pose (3,) as a message."""
+    return Pose(position=Point(x=float(T[0]), y=float(T[1])), orientation=quaternion_msg(float(T[2])))
+
+
+def pose_stamped_msg(T: Array, frame_id: str, ns: int) -> PoseStamped:
+    """Planar pose (3,) in a frame at a time."""
+    return PoseStamped(header=header(frame_id, ns), pose=pose_msg(T))
+
+
+def pose_with_covariance_msg(T: Array, covariance: Array, frame_id: str, ns: int) -> PoseWithCovarianceStamped:
+    """Planar pose (3,) with its covariance (3, 3) over x, y, theta."""
+    message = PoseWithCovarianceStamped(header=header(frame_id, ns))
+    message.pose.pose = pose_msg(T)
+    full = np.zeros((6, 6))
+    full[np.ix_((0, 1, 5), (0, 1, 5))] = covariance
+    message.pose.covariance = full.ravel()
+    return message
+
+
+def covariance_from(message: PoseWithCovarianceStamped) -> Array:
+    """Covariance (3, 3) over x, y, theta."""
+    full = np.asarray(message.pose.covariance).reshape(6, 6)
+    return np.ascontiguousarray(full[np.ix_((0, 1, 5), (0, 1, 5))])
+
+
+def odometry_msg(T: Array, velocity: tuple[float, float], frames: tuple[str, str], ns: int) -> Odometry:
+    """Odometry: pose (3,), (v m/s, w rad/s), (frame, child frame)."""
+    message = Odometry(header=header(frames[0], ns), child_frame_id=frames[1])
+    message.pose.pose = pose_msg(T)
+    message.twist.twist.linear.x, message.twist.twist.angular.z = velocity
+    return message
+
+
+def twist_msg(v: float, w: float) -> Twist:
+    """Velocity command: v m/s ahead, w rad/s to the left."""
+    message = Twist()
+    message.linear.x, message.angular.z = v, w
+    return message
+
+
+def transform_msg(T: Array, frame_id: str, child_frame_id: str, ns: int) -> TransformStamped:
+    """Planar transform (3,)."""
+    message = TransformStamped(header=header(frame_id, ns), child_frame_id=child_frame_id)
+    message.transform.translation.x, message.transform.translation.y = float(T[0]), float(T[1])
+    message.transform.rotation = quaternion_msg(float(T[2]))
+    return message
+
+
+def path_msg(points: Array, frame_id: str, ns: int) -> Path:
+    """Path through points (N, 2) or poses (N, 3)."""
+    poses = points if points.shape[1] == 3 else np.column_stack([points, np.zeros(len(points))])
+    return Path(header=header(frame_id, ns), poses=[pose_stamped_msg(T, frame_id, ns) for T in poses])
+
+
+def grid_msg(patch: GridPatch, frame_id: str, ns: int) -> OccupancyGrid:
+    """Map message of a patch."""
+    message = OccupancyGrid(header=header(frame_id, ns))
+    message.info.map_load_time = time_msg(ns)
+    message.info.resolution = patch.frame.resolution
+    message.info.height, message.info.width = patch.shape
+    message.info.origin = pose_msg(np.array([patch.frame.origin_x, patch.frame.origin_y, 0.0]))
+    data = array('b')
+    data.frombytes(np.ascontiguousarray(patch.cells).tobytes())
+    message.data = data
+    return message
+
+
+def patch_from(message: OccupancyGrid) -> GridPatch:
+    """Patch of a map message. Raises InputError where size and data do not fit, or the map is turned."""
+    info = message.info
+    # The message carries a float32; 0.1 has to be the same 0.1 on both sides.
+    resolution = round(float(info.resolution), 6)
+    if len(message.data) != info.width * info.height or not resolution > 0.0:
+        raise InputError(
+            f'map of {info.width} x {info.height} cells of {resolution} m with {len(message.data)} values: '
+            'expected a value for each cell and a resolution above 0'
+        )
+    origin = pose_from(info.origin)
+    if abs(origin[2]) > 1e-6:
+        raise InputError(f'map turned by {origin[2]} rad: expected an origin without rotation')
+    cells = np.frombuffer(message.data, dtype=np.int8).reshape(info.height, info.width)
+    return GridPatch(GridFrame(float(origin[0]), float(origin[1]), resolution), cells)
+
+
+def topology_msg(topology: TopologicalMap, frame_id: str, ns: int) -> TopologicalMapMsg:
+    """Message of a topological map."""
+    return TopologicalMapMsg(
+        header=header(frame_id, ns),
+        nodes=[_node_msg(node) for node in topology.nodes.values()],
+        edges=[_edge_msg(edge) for edge in topology.edges.values()],
+    )
+
+
+def _node_msg(node: Node) -> TopologicalNode:
+    return TopologicalNode(
+        id=node.id, kind=int(node.kind), position=Point(x=node.x, y=node.y), clearance_m=node.clearance_m
+    )
+
+
+def _edge_msg(edge: Edge) -> TopologicalEdge:
+    return TopologicalEdge(
+        id=edge.id,
+        node_a=edge.a,
+        node_b=edge.b,
+        length_m=edge.length_m,
+        clearance_m=edge.clearance_m,
+        path=[Point32(x=x, y=y) for x, y in edge.path.tolist()],
+    )
+
+
+def topology_from(message: TopologicalMapMsg) -> TopologicalMap:
+    """Topological map of a message."""
+    nodes = [
+        Node(n.id, NodeKind(n.kind), n.position.x, n.position.y, float(n.clearance_m)) for n in message.nodes
+    ]
+    edges = [
+        Edge(e.id, e.node_a, e.node_b, _points(e.path), float(e.length_m), float(e.clearance_m))
+        for e in message.edges
+    ]
+    return TopologicalMap(nodes, edges)
+
+
+def _points(path: Sequence[Point32]) -> Array:
+    return np.array([[p.x, p.y] for p in path], dtype=np.float64).reshape(-1, 2)

@@ -1,0 +1,59 @@
+"""Config dataclasses of core <-> declared ROS parameters: one home for each default, seen from ROS."""
+
+import dataclasses
+from typing import Any, TypeVar
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.node import Node
+
+from thinmap_ros.core.config import Config
+from thinmap_ros.core.errors import ConfigError
+
+AnyConfig = TypeVar('AnyConfig', bound=Config)
+
+
+def declare(node: Node, config: type[AnyConfig]) -> AnyConfig:
+    """Declare each field of a config as a read-only parameter of the node, and return the config as it was set.
+
+    Raises ConfigError where a value is outside its range or of the wrong type.
+    """
+    values = {}
+    for field in dataclasses.fields(config):
+        descriptor = _descriptor(field)
+        try:
+            values[field.name] = node.declare_parameter(field.name, field.default, descriptor).value
+        except Exception as error:  # rclpy has a class of its own for each way in which a value can be wrong
+            raise ConfigError(f'parameter {field.name} of node {node.get_name()}: {error}') from error
+    return config(**values)
+
+
+def declare_value(node: Node, name: str, default: Any, description: str) -> Any:
+    """Declare one read-only parameter that belongs to the node itself, and return its value."""
+    descriptor = ParameterDescriptor(description=description, read_only=True)
+    try:
+        return node.declare_parameter(name, default, descriptor).value
+    except Exception as error:
+        raise ConfigError(f'parameter {name} of node {node.get_name()}: {error}') from error
+
+
+def check_unknown(node: Node) -> None:
+    """Raise ConfigError where a parameter was given that the node does not have: a typo must not go unseen."""
+    given = node._parameter_overrides  # rclpy has no public way to see what was given but never declared
+    unknown = sorted(name for name in given if not node.has_parameter(name))
+    if unknown:
+        known = ', '.join(sorted(name for name in node._parameters if not name.startswith('qos_overrides')))
+        raise ConfigError(f'node {node.get_name()} has no parameter {", ".join(unknown)}; it has: {known}')
+
+
+def _descriptor(field: 'dataclasses.Field[Any]') -> ParameterDescriptor:
+    description, low, high, choices = (field.metadata[k] for k in ('description', 'low', 'high', 'choices'))
+    descriptor = ParameterDescriptor(description=description, read_only=True)
+    if choices is not None:
+        descriptor.additional_constraints = 'one of: ' + ', '.join(choices)
+    if low is None or high is None or isinstance(field.default, bool):
+        return descriptor
+    if isinstance(field.default, int):
+        descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=1)]
+    elif isinstance(field.default, float):
+        descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
+    return descriptor

@@ -1,0 +1,82 @@
+"""How a node process starts, spins and ends."""
+
+import ctypes
+import gc
+import mmap
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from thinmap_ros.core.errors import ThinmapError
+
+
+def run(make_node: Callable[[], Node]) -> None:
+    """Make a node and spin it until SIGINT or SIGTERM; the process ends with 0, or 2 on a refused start.
+
+    A node may have a method `close()`: it is called last, whatever ended the node.
+    """
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, _stop)
+    node = None
+    try:
+        node = make_node()
+        release_compiler_pages()
+        _spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except ThinmapError as error:
+        print(f'error: {error}', file=sys.stderr)
+        sys.exit(2)
+    finally:
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, signal.SIG_IGN)  # ending is short: a second signal must not cut it off
+        if node is not None:
+            getattr(node, 'close', lambda: None)()
+            node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def _spin(node: Node) -> None:
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    while rclpy.ok() and not getattr(node, 'finished', False):
+        # A bounded wait: Python sees signals only between calls.
+        executor.spin_once(timeout_sec=0.25)
+
+
+def _stop(number: int, frame: object) -> None:
+    raise KeyboardInterrupt
+
+
+def release_compiler_pages() -> None:
+    """Give back the memory pages of the kernels' compiler: its library, some 100 MB, is idle once they are loaded.
+
+    Only mappings without a page of the process's own are dropped: the system reads them again from the library's
+    file whenever they are needed. Where there is no /proc, nothing happens.
+    """
+    gc.collect()
+    smaps = Path('/proc/self/smaps')
+    if not smaps.exists():
+        return
+    libc = ctypes.CDLL(None)
+    for first, last in _clean_mappings(smaps.read_text(), 'llvmlite'):
+        libc.madvise(ctypes.c_void_p(first), ctypes.c_size_t(last - first), mmap.MADV_DONTNEED)
+
+
+def _clean_mappings(smaps: str, name: str) -> Iterator[tuple[int, int]]:
+    """Address ranges of the mappings of a file of which no page was changed."""
+    header = ''
+    for line in smaps.splitlines():
+        key = line.split(maxsplit=1)[0]
+        if not key.endswith(':'):
+            header = line
+        elif key == 'Anonymous:' and name in header and int(line.split()[1]) == 0:
+            first, last = header.split(maxsplit=1)[0].split('-')
+            yield int(first, 16), int(last, 16)

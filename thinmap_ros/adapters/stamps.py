@@ -1,0 +1,39 @@
+"""Two streams that speak of the same scans, brought together by stamp."""
+
+from collections import OrderedDict
+from typing import Generic, TypeVar
+
+Left = TypeVar('Left')
+Right = TypeVar('Right')
+
+
+class StampMatcher(Generic[Left, Right]):
+    """Pairs the messages of two topics that carry exactly the same stamp, whichever comes first.
+
+    What finds no partner within `capacity` later messages is dropped.
+    """
+
+    def __init__(self, capacity: int = 50) -> None:
+        self._lefts: OrderedDict[int, Left] = OrderedDict()
+        self._rights: OrderedDict[int, Right] = OrderedDict()
+        self._capacity = capacity
+
+    def left(self, stamp_ns: int, value: Left) -> tuple[Left, Right] | None:
+        """Take a message of the first topic; returns the pair if it is complete now."""
+        partner = self._rights.pop(stamp_ns, None)
+        if partner is not None:
+            return value, partner
+        self._lefts[stamp_ns] = value
+        if len(self._lefts) > self._capacity:
+            self._lefts.popitem(last=False)
+        return None
+
+    def right(self, stamp_ns: int, value: Right) -> tuple[Left, Right] | None:
+        """Take a message of the second topic; returns the pair if it is complete now."""
+        partner = self._lefts.pop(stamp_ns, None)
+        if partner is not None:
+            return partner, value
+        self._rights[stamp_ns] = value
+        if len(self._rights) > self._capacity:
+            self._rights.popitem(last=False)
+        return None

@@ -1,0 +1,78 @@
+"""The nodes' wiring without ROS: scan and odometry in, pose, grid and topology out."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from time import perf_counter
+
+from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.localizer import Estimate, Localizer, LocalizerConfig
+from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig
+
+
+@dataclass(frozen=True)
+class WindowConfig(Config):
+    """The part of the map around the robot that is thinned at every scan."""
+
+    window_m: float = parameter(10.0, 'edge of the local map around the robot, m', low=2.0, high=100.0)
+
+
+@dataclass(frozen=True)
+class PipelineConfig:
+    """Parameters of all stages."""
+
+    localizer: LocalizerConfig = field(default_factory=LocalizerConfig)
+    grid: OccupancyConfig = field(default_factory=OccupancyConfig)
+    window: WindowConfig = field(default_factory=WindowConfig)
+    topology: TopologyConfig = field(default_factory=TopologyConfig)
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What came of one scan: the pose, the window of the map around it, and the window's topological map."""
+
+    estimate: Estimate
+    window: GridPatch
+    local_topology: TopologicalMap
+
+
+class Pipeline:
+    """Localizer, grid and topology, one after the other, for every scan: what the live graph does in three nodes.
+
+    `pose_source` takes the place of the localizer where poses are known from elsewhere (a simulator's truth).
+    """
+
+    def __init__(
+        self,
+        config: PipelineConfig | None = None,
+        pose_source: Callable[[Scan, Array], Estimate] | None = None,
+    ) -> None:
+        self.config = config or PipelineConfig()
+        self.localizer = Localizer(self.config.localizer)
+        self.grid = OccupancyGrid(self.config.grid)
+        self.topology = TopologyBuilder(self.config.topology)
+        self.stage_seconds: dict[str, list[float]] = {}
+        self._locate = pose_source or self.localizer.step
+
+    def step(self, scan: Scan, T_odom_base: Array) -> Step:
+        """Take in one scan with the odometry pose (3,) at its stamp."""
+        with self._timed('localizer'):
+            estimate = self._locate(scan, T_odom_base)
+        with self._timed('grid'):
+            self.grid.update(scan, estimate.T_map_base)
+            x, y = estimate.T_map_base[:2]
+            window = self.grid.window(x, y, self.config.window.window_m)
+        with self._timed('topology'):
+            local_topology = self.topology.update(window, estimate.T_map_base)
+        return Step(estimate, window, local_topology)
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        started = perf_counter()
+        yield
+        self.stage_seconds.setdefault(stage, []).append(perf_counter() - started)
