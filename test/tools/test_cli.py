@@ -1,0 +1,78 @@
+"""What all command line programs do alike."""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thinmap_ros.adapters.bags import BagLog
+from thinmap_ros.adapters.carmen import CarmenLog, LaserOptions
+from thinmap_ros.core.errors import ConfigError, InputError
+from thinmap_ros.tools import cli
+
+
+def ends_with(monkeypatch: pytest.MonkeyPatch, error: BaseException | None) -> object:
+    def work(arguments: argparse.Namespace) -> None:
+        if error is not None:
+            raise error
+
+    monkeypatch.setattr('sys.argv', ['prog'])
+    try:
+        cli.run(work, argparse.ArgumentParser(prog='prog'))
+    except SystemExit as end:
+        return end.code
+    return 0
+
+
+@pytest.mark.parametrize(
+    ('error', 'code', 'said'),
+    [
+        (None, 0, ''),
+        (InputError('a.log:3: x: expected y'), 2, 'prog: error: a.log:3: x: expected y\n'),
+        (ConfigError('several\nlines'), 2, 'prog: error: several lines\n'),
+        (OSError(28, 'No space left on device'), 2, 'prog: error: [Errno 28] No space left on device\n'),
+        (KeyboardInterrupt(), 130, 'prog: interrupted\n'),
+    ],
+)
+def test_how_programs_end(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    error: BaseException | None,
+    code: int,
+    said: str,
+) -> None:
+    assert ends_with(monkeypatch, error) == code
+    assert capsys.readouterr().err == said
+
+
+def parse(*words: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    cli.add_log_options(parser)
+    return parser.parse_args(words)
+
+
+def test_an_option_that_is_not_given_is_the_configs() -> None:
+    assert cli.config_from(parse('a.clf'), LaserOptions) == LaserOptions()
+    given = cli.config_from(parse('a.clf', '--max-range-m', '25', '--start-angle-deg=-110'), LaserOptions)
+    assert given == LaserOptions(max_range_m=25.0, start_angle_deg=-110.0)
+
+
+def test_a_value_out_of_range_is_an_error() -> None:
+    with pytest.raises(ConfigError, match='max_range_m'):
+        cli.config_from(parse('a.clf', '--max-range-m', '-1'), LaserOptions)
+
+
+def test_logs_and_bags_are_told_apart(tmp_path: Path) -> None:
+    assert isinstance(cli.open_log(parse('a.clf')), CarmenLog)
+    assert isinstance(cli.open_log(parse('a.mcap')), BagLog)
+    bag = cli.open_log(parse(str(tmp_path), '--scan-topic', '/front', '--base-frame', 'base'))
+    assert isinstance(bag, BagLog)
+    assert (bag.scan_topic, bag.base_frame, bag.T_base_laser) == ('/front', 'base', None)
+
+
+@pytest.mark.parametrize(('word', 'offset'), [('--offset-m=0.78', 0.78), ('--offset-m=0', 0.0)])
+def test_an_offset_that_is_given_comes_before_tf_static(tmp_path: Path, word: str, offset: float) -> None:
+    bag = cli.open_log(parse(str(tmp_path), word))
+    assert isinstance(bag, BagLog) and bag.T_base_laser is not None
+    assert np.array_equal(bag.T_base_laser, [offset, 0.0, 0.0])

@@ -1,0 +1,1 @@
+"""One thin rclpy node a file: convert, call core, publish."""

@@ -1,0 +1,104 @@
+"""Asks for an exploration, shows how it goes in one progress bar, and writes down how it ended."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from nav_msgs.msg import OccupancyGrid
+from rclpy.action import ActionClient
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.task import Future
+from tqdm import tqdm
+
+from thinmap_msgs.action import Explore
+from thinmap_msgs.msg import ExplorationStatus
+from thinmap_ros.adapters import messages, parameters, qos, resources, runtime
+from thinmap_ros.adapters.files import write_text
+from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.sim.coverage import coverable
+from thinmap_ros.sim.pioneer import PRESETS
+from thinmap_ros.sim.world import World
+
+_LOOK_PERIOD_S = 0.5
+
+
+@dataclass(frozen=True)
+class DemoMonitorConfig(Config):
+    """Parameters of the monitor."""
+
+    world: str = parameter('room_10x10', 'world whose coverage is shown')
+    robot: str = parameter('2dx', 'which Pioneer', choices=tuple(PRESETS))
+    range_max_m: float = parameter(8.0, "the laser's range, m", low=0.1, high=200.0)
+    time_limit_s: float = parameter(0.0, 'simulated time after which the exploration ends; 0: none, s', low=0.0)
+    result: str = parameter('', 'JSON file for the result')
+
+
+class DemoMonitorNode(Node):
+    """Client of the action explore."""
+
+    def __init__(self) -> None:
+        super().__init__('demo_monitor')
+        self._config = parameters.declare(self, DemoMonitorConfig)
+        parameters.check_unknown(self)
+        world = World.load(resources.world_path(self._config.world))
+        radius = PRESETS[self._config.robot].radius_m
+        self._coverable = coverable(world, world.start, radius, self._config.range_max_m)
+        self._coverage = 0.0
+        self._asked = False
+        self.finished = False
+        self._bar = tqdm(total=100.0, bar_format='{desc:<48}|{bar}| {n:5.1f} % seen  {postfix}', leave=True)
+        self._bar.set_description_str('waiting for the nodes')
+        self._explore = ActionClient(self, Explore, 'explore')
+        self.create_subscription(OccupancyGrid, 'map', self._on_map, qos.LATCHED)
+        self.create_timer(_LOOK_PERIOD_S, self._ask, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def close(self) -> None:
+        """End the bar, so that what is printed next begins on a line of its own."""
+        self._bar.close()
+
+    def _ask(self) -> None:
+        if self._asked or not self._explore.server_is_ready():
+            return
+        self._asked = True
+        goal = Explore.Goal(time_limit_s=self._config.time_limit_s)
+        self._explore.send_goal_async(goal, self._on_feedback).add_done_callback(self._on_accepted)
+
+    def _on_accepted(self, future: Future) -> None:
+        future.result().get_result_async().add_done_callback(self._on_result)
+
+    def _on_map(self, message: OccupancyGrid) -> None:
+        self._coverage = self._coverable.share_known(messages.patch_from(message))
+
+    def _on_feedback(self, message: Explore.Impl.FeedbackMessage) -> None:
+        self._show(message.feedback.status)
+
+    def _show(self, status: ExplorationStatus) -> None:
+        target = f'to end node {status.target}' if status.has_target else 'looking around'
+        self._bar.set_description_str(target if status.state == ExplorationStatus.EXPLORING else status.reason)
+        self._bar.set_postfix_str(f'{status.distance_m:.1f} m, {messages.seconds(status.time):.0f} s')
+        self._bar.n = 100.0 * self._coverage
+        self._bar.refresh()
+
+    def _on_result(self, future: Future) -> None:
+        status: ExplorationStatus = future.result().result.status
+        self._show(status)
+        if self._config.result:
+            end_ns = messages.stamp_ns(status.header.stamp)
+            content = {
+                'finished': status.reason_code in (ExplorationStatus.ALL_RESOLVED, ExplorationStatus.NOTHING_REACHABLE),
+                'reason': status.reason,
+                'start_ns': end_ns - round(1e9 * messages.seconds(status.time)),
+                'end_ns': end_ns,
+            }
+            write_text(Path(self._config.result), json.dumps(content) + '\n')
+        self.finished = True
+
+
+def main() -> None:
+    """Run the node."""
+    runtime.run(DemoMonitorNode)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,287 @@
+"""Exploration: end nodes that may still move are visited until none is left."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from geometry_msgs.msg import Point, PoseWithCovarianceStamped
+from nav_msgs.msg import OccupancyGrid
+from rclpy.action import ActionClient
+from rclpy.action.client import ClientGoalHandle
+from rclpy.node import Node
+from rclpy.task import Future
+from sensor_msgs.msg import LaserScan
+
+from thinmap_msgs.action import Explore, NavigateToPose
+from thinmap_msgs.msg import EndNode as EndNodeMsg
+from thinmap_msgs.msg import EndNodeArray, ExplorationStatus, SlamStatus, TopologicalMap
+from thinmap_ros.adapters import messages, parameters, qos, runtime
+from thinmap_ros.adapters.actions import Outcome, SingleGoalServer
+from thinmap_ros.adapters.stamps import StampMatcher
+from thinmap_ros.adapters.transforms import LaserMount
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.exploration.area import fenced
+from thinmap_ros.core.exploration.explorer import Decision, EndNode, Explorer, ExplorerConfig
+from thinmap_ros.core.exploration.session import Budget, Odometer
+from thinmap_ros.core.grid.mirror import MapMirror
+from thinmap_ros.core.se2 import Array, wrap
+
+_WARN_PERIOD_S = 5.0
+_FEEDBACK_PERIOD_S = 1.0
+_SILENCE_S = 10.0
+_LOST_S = 10.0
+_SAME_GOAL_M, _SAME_GOAL_RAD = 0.1, 0.2
+_GIVE_UP_HOME = 3
+
+
+class ExplorerNode(Node):
+    """Maps, /topology, /pose and /scan in; goals for the navigator, /end_nodes and /exploration_status out."""
+
+    def __init__(self) -> None:
+        super().__init__('explorer')
+        self._config = parameters.declare(self, ExplorerConfig)
+        self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
+        self._mount = LaserMount(self)
+        parameters.check_unknown(self)
+        self._map = MapMirror()
+        self._topology = messages.topology_from(TopologicalMap())
+        self._matcher: StampMatcher[LaserScan, Array] = StampMatcher()
+        self._T_map_base: Array | None = None
+        self._heard_at = self._tracked_at = 0.0
+        self._goal_sent: Array | None = None
+        self._handle: ClientGoalHandle | None = None
+        self._begin(Explore.Goal())
+        self._state = ExplorationStatus.IDLE
+        self._make_topics()
+
+    def _make_topics(self) -> None:
+        self._end_nodes = self.create_publisher(EndNodeArray, 'end_nodes', qos.LATCHED)
+        self._status = self.create_publisher(ExplorationStatus, 'exploration_status', qos.LATCHED)
+        self.create_subscription(TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
+        self.create_subscription(OccupancyGrid, 'map', self._on_map, qos.LATCHED)
+        self.create_subscription(OccupancyGrid, 'local_map', self._on_window, qos.LATCHED)
+        self.create_subscription(PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
+        self.create_subscription(LaserScan, 'scan', self._on_scan, qos.SENSOR)
+        self.create_subscription(SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
+        self._navigator = ActionClient(self, NavigateToPose, 'navigate_to_pose')
+        self._goals = SingleGoalServer(self, Explore, 'explore', self._begin, self._on_cancel, self._preempted)
+        self.create_timer(_FEEDBACK_PERIOD_S, self._every_second)
+
+    def _begin(self, goal: Explore.Goal) -> None:
+        self._goal = goal
+        self._polygon = np.array([[p.x, p.y] for p in goal.area.points], dtype=np.float64).reshape(-1, 2)
+        self._explorer = Explorer(self._config)
+        self._odometer = Odometer()
+        self._budget = Budget(goal.time_limit_s, goal.distance_limit_m, goal.area_limit_m2)
+        self._decision: Decision | None = None
+        self._state = ExplorationStatus.EXPLORING
+        self._ending = (ExplorationStatus.NONE, '')
+        self._cancel_asked = False
+        self._failed_homes = 0
+        self._begun_at = self._heard_at = self._tracked_at = self._now()
+
+    def _now(self) -> float:
+        return float(self.get_clock().now().nanoseconds) / 1e9
+
+    # What is heard.
+
+    def _on_topology(self, message: TopologicalMap) -> None:
+        self._topology = messages.topology_from(message)
+
+    def _on_map(self, message: OccupancyGrid) -> None:
+        try:
+            self._map.replace(messages.patch_from(message))
+        except InputError as error:
+            self.get_logger().warning(f'map: {error}', throttle_duration_sec=_WARN_PERIOD_S)
+
+    def _on_window(self, message: OccupancyGrid) -> None:
+        try:
+            self._map.paste(messages.patch_from(message))
+        except InputError as error:
+            self.get_logger().warning(f'local_map: {error}', throttle_duration_sec=_WARN_PERIOD_S)
+
+    def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
+        try:
+            T_map_base = messages.pose_from(message.pose.pose)
+        except InputError as error:
+            self.get_logger().warning(f'pose: {error}', throttle_duration_sec=_WARN_PERIOD_S)
+            return
+        self._take(self._matcher.right(messages.stamp_ns(message.header.stamp), T_map_base))
+
+    def _on_scan(self, message: LaserScan) -> None:
+        self._heard_at = self._now()
+        self._take(self._matcher.left(messages.stamp_ns(message.header.stamp), message))
+
+    def _on_slam_status(self, message: SlamStatus) -> None:
+        if message.state == SlamStatus.TRACKING:
+            self._tracked_at = self._now()
+
+    def _on_cancel(self) -> None:
+        self._cancel_asked = True
+
+    # What is done.
+
+    def _take(self, pair: tuple[LaserScan, Array] | None) -> None:
+        if pair is None:
+            return
+        message, self._T_map_base = pair
+        T_base_laser = self._mount.pose(message.header.frame_id)
+        if not self._goals.active or T_base_laser is None or self._map.patch is None:
+            return
+        self._odometer.add(self._T_map_base)
+        if self._state != ExplorationStatus.EXPLORING:
+            return
+        try:
+            scan = messages.scan_from(message, T_base_laser)
+        except InputError as error:
+            self.get_logger().warning(f'scan: {error}', throttle_duration_sec=_WARN_PERIOD_S)
+            return
+        patch = self._map.patch if len(self._polygon) < 3 else fenced(self._map.patch, self._polygon)
+        self._decision = self._explorer.step(self._topology, patch, scan, self._T_map_base)
+        self._publish_end_nodes(self._decision, message)
+        if self._decision.finished:
+            self._conclude(int(self._decision.code), self._decision.reason)
+        elif self._decision.target is not None:
+            self._drive_to(self._decision.target.goal)
+
+    def _every_second(self) -> None:
+        if not self._goals.active:
+            return
+        now = self._now()
+        if self._cancel_asked:
+            self._end(ExplorationStatus.CANCELLED, 'cancelled')
+            return
+        if now - self._heard_at > _SILENCE_S:
+            self._end(ExplorationStatus.SENSOR_SILENT, f'no scan for {_SILENCE_S:.0f} s')
+            return
+        if now - self._tracked_at > _LOST_S:
+            self._end(ExplorationStatus.LOCALIZATION_LOST, f'the pose has been lost for {_LOST_S:.0f} s')
+            return
+        area = 0.0 if self._decision is None else self._decision.known_area_m2
+        used_up = self._budget.used_up(now - self._begun_at, self._odometer.distance_m, area)
+        if used_up and self._state == ExplorationStatus.EXPLORING:
+            self._conclude(ExplorationStatus.BUDGET, used_up)
+        status = self._status_msg()
+        self._status.publish(status)
+        self._goals.feedback(Explore.Feedback(status=status, end_nodes=self._end_nodes_msg()))
+
+    def _conclude(self, code: int, reason: str) -> None:
+        """Exploring is over; what is left is the way home, if that was asked for."""
+        self._ending = (code, reason)
+        if self._goal.return_home and self._odometer.start is not None:
+            self._state = ExplorationStatus.RETURNING
+            self._drive_to(self._odometer.start)
+        else:
+            self._end(code, reason)
+
+    def _end(self, code: int, reason: str) -> None:
+        if self._handle is not None:
+            self._handle.cancel_goal_async()
+        self._handle = self._goal_sent = None
+        self._ending, self._state = (code, reason), ExplorationStatus.FINISHED
+        status = self._status_msg()
+        self._status.publish(status)
+        good = code in (ExplorationStatus.ALL_RESOLVED, ExplorationStatus.BUDGET, ExplorationStatus.NOTHING_REACHABLE)
+        outcome = Outcome.SUCCEEDED if good else Outcome.ABORTED
+        outcome = Outcome.CANCELED if code == ExplorationStatus.CANCELLED else outcome
+        self.get_logger().info(f'finished: {reason}')
+        self._goals.finish(outcome, Explore.Result(status=status))
+
+    def _preempted(self) -> Explore.Result:
+        self._ending = (ExplorationStatus.CANCELLED, 'replaced by a newer goal')
+        return Explore.Result(status=self._status_msg())
+
+    # Driving, by the navigator.
+
+    def _drive_to(self, goal: Array) -> None:
+        if self._goal_sent is not None:
+            near = math.dist(goal[:2], self._goal_sent[:2]) <= _SAME_GOAL_M
+            if near and abs(wrap(float(goal[2] - self._goal_sent[2]))) <= _SAME_GOAL_RAD:
+                return
+        if not self._navigator.server_is_ready():
+            self.get_logger().warning('no navigator yet', throttle_duration_sec=_WARN_PERIOD_S)
+            return
+        self._goal_sent = goal
+        request = NavigateToPose.Goal(use_heading=True)
+        request.pose = messages.pose_stamped_msg(goal, self._map_frame, self.get_clock().now().nanoseconds)
+        self._navigator.send_goal_async(request).add_done_callback(lambda f: self._on_accepted(f, goal))
+
+    def _on_accepted(self, future: Future, goal: Array) -> None:
+        handle = future.result()
+        if goal is not self._goal_sent:
+            if handle.accepted:
+                handle.cancel_goal_async()  # meanwhile another goal was chosen, or the exploration ended
+            return
+        if not handle.accepted:
+            self._goal_sent = None
+            return
+        self._handle = handle
+        handle.get_result_async().add_done_callback(lambda f: self._on_arrived(f, goal))
+
+    def _on_arrived(self, future: Future, goal: Array) -> None:
+        if goal is not self._goal_sent:
+            return  # an answer to a goal that was replaced
+        result: NavigateToPose.Result = future.result().result
+        self._goal_sent = self._handle = None
+        if self._state == ExplorationStatus.RETURNING:
+            self._failed_homes += not result.success
+            if result.success or self._failed_homes >= _GIVE_UP_HOME:
+                not_home = '' if result.success else f'; not home: {result.reason}'
+                self._end(self._ending[0], self._ending[1] + not_home)
+            else:
+                self._drive_to(goal)
+        elif not result.success:
+            self._explorer.fail_target(result.reason)
+
+    # What is told.
+
+    def _publish_end_nodes(self, decision: Decision, scan: LaserScan) -> None:
+        end_nodes = [_end_node_msg(node) for node in decision.end_nodes]
+        header = messages.header(self._map_frame, messages.stamp_ns(scan.header.stamp))
+        self._end_nodes.publish(EndNodeArray(header=header, end_nodes=end_nodes))
+
+    def _end_nodes_msg(self) -> EndNodeArray:
+        nodes = [] if self._decision is None else [_end_node_msg(node) for node in self._decision.end_nodes]
+        header = messages.header(self._map_frame, self.get_clock().now().nanoseconds)
+        return EndNodeArray(header=header, end_nodes=nodes)
+
+    def _status_msg(self) -> ExplorationStatus:
+        now_ns = self.get_clock().now().nanoseconds
+        status = ExplorationStatus(header=messages.header(self._map_frame, now_ns), state=self._state)
+        status.reason_code, status.reason = self._ending
+        status.distance_m = self._odometer.distance_m
+        status.time = messages.duration_msg(self._now() - self._begun_at)
+        if self._decision is not None:
+            target = self._decision.target
+            status.coverage_estimate = self._decision.coverage_estimate
+            status.known_area_m2 = self._decision.known_area_m2
+            status.reason = status.reason or self._decision.reason
+            status.end_nodes_left = sum(1 for n in self._decision.end_nodes if n.open_border_m > 0.0)
+            if target is not None:
+                status.has_target, status.target = True, target.node_id
+                status.target_position = Point(x=target.x, y=target.y)
+        return status
+
+
+def _end_node_msg(node: EndNode) -> EndNodeMsg:
+    far = node.smallest_distance_m if math.isfinite(node.smallest_distance_m) else 0.0
+    node = replace(node, smallest_distance_m=far)
+    return EndNodeMsg(
+        node_id=node.node_id,
+        position=Point(x=node.x, y=node.y),
+        position_probability=node.probability,
+        distance_index=node.distance_index,
+        angle_index=node.angle_index,
+        smallest_distance_m=node.smallest_distance_m,
+        angle_span_deg=node.angle_span_deg,
+        is_target=node.is_target,
+    )
+
+
+def main() -> None:
+    """Run the node."""
+    runtime.run(ExplorerNode)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,88 @@
+"""The occupancy grid: each scan drawn in at the pose that the localizer found for it."""
+
+from pathlib import Path
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import OccupancyGrid as OccupancyGridMsg
+from rclpy.node import Node
+from sensor_msgs.msg import LaserScan
+
+from thinmap_msgs.srv import SaveMap
+from thinmap_ros.adapters import map_files, messages, parameters, qos, runtime
+from thinmap_ros.adapters.stamps import StampMatcher
+from thinmap_ros.adapters.transforms import LaserMount
+from thinmap_ros.core.errors import InputError, ThinmapError
+from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.pipeline import WindowConfig
+
+_WARN_PERIOD_S = 5.0
+
+
+class GridMapperNode(Node):
+    """/scan and /pose in; /map once a second and /local_map at every scan out; service save_map."""
+
+    def __init__(self) -> None:
+        super().__init__('grid_mapper')
+        self._grid = OccupancyGrid(parameters.declare(self, OccupancyConfig))
+        self._window_m = parameters.declare(self, WindowConfig).window_m
+        self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
+        self._mount = LaserMount(self)
+        parameters.check_unknown(self)
+        self._matcher: StampMatcher[LaserScan, Array] = StampMatcher()
+        self._latest_ns: int | None = None
+        self._map = self.create_publisher(OccupancyGridMsg, 'map', qos.LATCHED)
+        self._local_map = self.create_publisher(OccupancyGridMsg, 'local_map', qos.LATCHED)
+        self.create_subscription(PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
+        self.create_subscription(LaserScan, 'scan', self._on_scan, qos.SENSOR)
+        self.create_service(SaveMap, 'save_map', self._on_save)
+        self.create_timer(1.0, self._publish_map)
+
+    def _on_scan(self, message: LaserScan) -> None:
+        self._take(self._matcher.left(messages.stamp_ns(message.header.stamp), message))
+
+    def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
+        try:
+            T_map_base = messages.pose_from(message.pose.pose)
+        except InputError as error:
+            self.get_logger().warning(f'pose: {error}', throttle_duration_sec=_WARN_PERIOD_S)
+            return
+        self._take(self._matcher.right(messages.stamp_ns(message.header.stamp), T_map_base))
+
+    def _take(self, pair: tuple[LaserScan, Array] | None) -> None:
+        if pair is None:
+            return
+        message, T_map_base = pair
+        T_base_laser = self._mount.pose(message.header.frame_id)
+        if T_base_laser is None:
+            return  # the localizer, which gave the pose, knows where the laser is: the transform is on its way
+        try:
+            scan = messages.scan_from(message, T_base_laser)
+        except InputError as error:
+            self.get_logger().warning(f'scan: {error}', throttle_duration_sec=_WARN_PERIOD_S)
+            return
+        self._grid.update(scan, T_map_base)
+        self._latest_ns = scan.stamp_ns
+        window = self._grid.window(T_map_base[0], T_map_base[1], self._window_m)
+        self._local_map.publish(messages.grid_msg(window, self._map_frame, scan.stamp_ns))
+
+    def _publish_map(self) -> None:
+        if self._latest_ns is not None:
+            self._map.publish(messages.grid_msg(self._grid.patch(), self._map_frame, self._latest_ns))
+
+    def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
+        try:
+            written = map_files.write_map(Path(request.path), self._grid.patch())
+            response.success, response.message = True, f'saved {written}'
+        except (ThinmapError, OSError) as error:
+            response.success, response.message = False, str(error)
+        return response
+
+
+def main() -> None:
+    """Run the node."""
+    runtime.run(GridMapperNode)
+
+
+if __name__ == '__main__':
+    main()

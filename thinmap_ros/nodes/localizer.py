@@ -1,0 +1,125 @@
+"""Where the robot is: each scan, with the odometry at its stamp, through one step of the localizer."""
+
+from time import perf_counter
+
+from geometry_msgs.msg import Point, PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from sensor_msgs.msg import LaserScan
+from tf2_msgs.msg import TFMessage
+
+from thinmap_msgs.msg import LineFeature, LineFeatureArray, SlamStatus
+from thinmap_ros.adapters import messages, parameters, qos, runtime
+from thinmap_ros.adapters.transforms import LaserMount
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.odometry import ScanPairing
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.features import LineFeature as Feature
+from thinmap_ros.core.slam.localizer import Estimate, Localizer, LocalizerConfig
+
+_WARN_PERIOD_S = 5.0
+
+
+class LocalizerNode(Node):
+    """/scan and /odom in; /pose, map -> odom on /tf, /line_features and /slam_status out."""
+
+    def __init__(self) -> None:
+        super().__init__('localizer')
+        self._localizer = Localizer(parameters.declare(self, LocalizerConfig))
+        self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
+        self._odom_frame = parameters.declare_value(self, 'odom_frame', 'odom', 'frame of the odometry')
+        self._mount = LaserMount(self)
+        parameters.check_unknown(self)
+        self._pairing = ScanPairing()
+        self._pose = self.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
+        self._tf = self.create_publisher(TFMessage, '/tf', qos.STREAM)
+        self._features = self.create_publisher(LineFeatureArray, 'line_features', qos.LATCHED)
+        self._status = self.create_publisher(SlamStatus, 'slam_status', qos.STREAM)
+        self.create_subscription(Odometry, 'odom', self._on_odometry, qos.STREAM)
+        self.create_subscription(LaserScan, 'scan', self._on_scan, qos.SENSOR)
+        self.create_subscription(PoseWithCovarianceStamped, 'initialpose', self._on_initial_pose, qos.STREAM)
+
+    def _on_odometry(self, message: Odometry) -> None:
+        try:
+            stamp_ns = messages.stamp_ns(message.header.stamp)
+            ready = self._pairing.add_odometry(stamp_ns, messages.pose_from(message.pose.pose))
+        except InputError as error:
+            self.get_logger().warning(f'odom: {error}', throttle_duration_sec=_WARN_PERIOD_S)
+            return
+        self._take(ready)
+
+    def _on_scan(self, message: LaserScan) -> None:
+        T_base_laser = self._mount.pose(message.header.frame_id)
+        if T_base_laser is None:
+            self.get_logger().warning(
+                f'scan in frame "{message.header.frame_id}": no static transform from the robot to it; publish one '
+                'on /tf_static or set the parameter laser_pose',
+                throttle_duration_sec=_WARN_PERIOD_S,
+            )
+            return
+        try:
+            scan = messages.scan_from(message, T_base_laser)
+        except InputError as error:
+            self.get_logger().warning(f'scan: {error}', throttle_duration_sec=_WARN_PERIOD_S)
+            return
+        self._take(self._pairing.add_scan(scan))
+
+    def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
+        try:
+            T_map_base = messages.pose_from(message.pose.pose)
+        except InputError as error:
+            self.get_logger().error(f'initialpose: {error}')
+            return
+        self._localizer.set_pose(T_map_base, messages.covariance_from(message))
+
+    def _take(self, ready: list[tuple[Scan, Array]]) -> None:
+        for scan, T_odom_base in ready:
+            started = perf_counter()
+            estimate = self._localizer.step(scan, T_odom_base)
+            self._publish(scan.stamp_ns, estimate, 1000.0 * (perf_counter() - started))
+
+    def _publish(self, ns: int, estimate: Estimate, step_ms: float) -> None:
+        pose = messages.pose_with_covariance_msg(
+            estimate.T_map_base, estimate.covariance, self._map_frame, ns
+        )
+        self._pose.publish(pose)
+        transform = messages.transform_msg(estimate.T_map_odom, self._map_frame, self._odom_frame, ns)
+        self._tf.publish(TFMessage(transforms=[transform]))
+        header = messages.header(self._map_frame, ns)
+        features = [_feature_msg(feature) for feature in self._localizer.features]
+        self._features.publish(LineFeatureArray(header=header, features=features))
+        self._status.publish(
+            SlamStatus(
+                header=header,
+                state=SlamStatus.LOST if estimate.lost else SlamStatus.TRACKING,
+                features=len(features),
+                local_features=len(features),
+                observed=estimate.observed,
+                matched=estimate.matched,
+                refused=self._localizer.refused,
+                match_quality=estimate.match_quality,
+                step_time_ms=step_ms,
+            )
+        )
+
+
+def _feature_msg(feature: Feature) -> LineFeature:
+    return LineFeature(
+        id=feature.id,
+        r_m=feature.r_m,
+        alpha_rad=feature.alpha_rad,
+        covariance=feature.covariance.ravel(),
+        start=Point(x=float(feature.start[0]), y=float(feature.start[1])),
+        end=Point(x=float(feature.end[0]), y=float(feature.end[1])),
+        in_local_area=True,
+    )
+
+
+def main() -> None:
+    """Run the node."""
+    runtime.run(LocalizerNode)
+
+
+if __name__ == '__main__':
+    main()

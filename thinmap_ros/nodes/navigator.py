@@ -1,0 +1,176 @@
+"""Driving: goals in, velocity commands out, along wavefront paths on the map."""
+
+import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
+from nav_msgs.msg import OccupancyGrid, Odometry, Path
+from rclpy.node import Node
+from sensor_msgs.msg import LaserScan
+
+from thinmap_msgs.action import NavigateToPose
+from thinmap_ros.adapters import messages, parameters, qos, runtime
+from thinmap_ros.adapters.actions import Outcome, SingleGoalServer
+from thinmap_ros.adapters.transforms import LaserMount
+from thinmap_ros.core import se2
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.mirror import MapMirror
+from thinmap_ros.core.odometry import OdometryBuffer
+from thinmap_ros.core.planning.navigator import Command, Navigator, NavigatorConfig
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+
+_WARN_PERIOD_S = 5.0
+_CONTROL_PERIOD_S = 0.1
+_SILENCE_NS = 500_000_000
+
+
+class NavigatorNode(Node):
+    """/pose, /odom, /scan and the maps in; /cmd_vel and /plan out; action navigate_to_pose."""
+
+    def __init__(self) -> None:
+        super().__init__('navigator')
+        self._navigator = Navigator(parameters.declare(self, NavigatorConfig))
+        self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
+        self._mount = LaserMount(self)
+        parameters.check_unknown(self)
+        self._map = MapMirror()
+        self._odometry = OdometryBuffer()
+        self._T_map_odom: Array | None = None
+        self._T_odom_base: Array | None = None
+        self._scan: Scan | None = None
+        self._shown_path: Array | None = None
+        self._cancel_asked = False
+        self._cmd_vel = self.create_publisher(Twist, 'cmd_vel', qos.STREAM)
+        self._plan = self.create_publisher(Path, 'plan', qos.LATCHED)
+        self.create_subscription(Odometry, 'odom', self._on_odometry, qos.STREAM)
+        self.create_subscription(PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
+        self.create_subscription(LaserScan, 'scan', self._on_scan, qos.SENSOR)
+        self.create_subscription(OccupancyGrid, 'map', self._on_map, qos.LATCHED)
+        self.create_subscription(OccupancyGrid, 'local_map', self._on_window, qos.LATCHED)
+        self._goals = SingleGoalServer(
+            self, NavigateToPose, 'navigate_to_pose', self._on_goal, self._on_cancel, _preempted
+        )
+        self.create_timer(_CONTROL_PERIOD_S, self._control)
+
+    def close(self) -> None:
+        """Stop the robot: the last thing the node does."""
+        self._cmd_vel.publish(messages.twist_msg(0.0, 0.0))
+
+    def _on_odometry(self, message: Odometry) -> None:
+        try:
+            self._T_odom_base = messages.pose_from(message.pose.pose)
+            self._odometry.add(messages.stamp_ns(message.header.stamp), self._T_odom_base)
+        except InputError as error:
+            self.get_logger().warning(f'odom: {error}', throttle_duration_sec=_WARN_PERIOD_S)
+
+    def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
+        T_odom_base = self._odometry.at(messages.stamp_ns(message.header.stamp))
+        if T_odom_base is None:
+            return
+        try:
+            T_map_base = messages.pose_from(message.pose.pose)
+        except InputError as error:
+            self.get_logger().warning(f'pose: {error}', throttle_duration_sec=_WARN_PERIOD_S)
+            return
+        self._T_map_odom = se2.compose(T_map_base, se2.invert(T_odom_base))
+
+    def _on_scan(self, message: LaserScan) -> None:
+        T_base_laser = self._mount.pose(message.header.frame_id)
+        if T_base_laser is None:
+            return
+        try:
+            self._scan = messages.scan_from(message, T_base_laser)
+        except InputError as error:
+            self.get_logger().warning(f'scan: {error}', throttle_duration_sec=_WARN_PERIOD_S)
+
+    def _on_map(self, message: OccupancyGrid) -> None:
+        try:
+            self._map.replace(messages.patch_from(message))
+        except InputError as error:
+            self.get_logger().warning(f'map: {error}', throttle_duration_sec=_WARN_PERIOD_S)
+
+    def _on_window(self, message: OccupancyGrid) -> None:
+        try:
+            self._map.paste(messages.patch_from(message))
+        except InputError as error:
+            self.get_logger().warning(f'local_map: {error}', throttle_duration_sec=_WARN_PERIOD_S)
+
+    def _on_goal(self, request: NavigateToPose.Goal) -> None:
+        try:
+            goal = messages.pose_from(request.pose.pose)
+        except InputError as error:
+            self._end(Outcome.ABORTED, f'goal: {error}')
+            return
+        if request.pose.header.frame_id not in ('', self._map_frame):
+            reason = f'goal in frame "{request.pose.header.frame_id}": expected "{self._map_frame}"'
+            self._end(Outcome.ABORTED, reason)
+            return
+        self._cancel_asked = False
+        self._navigator.set_goal(float(goal[0]), float(goal[1]), float(goal[2]) if request.use_heading else None)
+
+    def _on_cancel(self) -> None:
+        self._cancel_asked = True
+
+    def _control(self) -> None:
+        if not self._goals.active:
+            return
+        if self._cancel_asked:
+            self._end(Outcome.CANCELED, 'cancelled')
+            return
+        command = self._command()
+        if command is None:
+            return
+        self._cmd_vel.publish(messages.twist_msg(command.v, command.w))
+        self._show_path()
+        if command.state == 'reached':
+            self._end(Outcome.SUCCEEDED, 'goal reached')
+        elif command.state == 'failed':
+            self._end(Outcome.ABORTED, command.reason)
+        else:
+            self._tell(command)
+
+    def _command(self) -> Command | None:
+        """What the navigator says now; a stop while the laser is silent; None before everything is known."""
+        if self._map.patch is None or self._scan is None or self._T_map_odom is None or self._T_odom_base is None:
+            self.get_logger().warning(
+                'goal waits: no map, scan, pose or odometry yet', throttle_duration_sec=_WARN_PERIOD_S
+            )
+            return None
+        latest = self._odometry.latest_stamp_ns
+        if latest is not None and latest - self._scan.stamp_ns > _SILENCE_NS:
+            self.get_logger().warning('laser silent: standing still', throttle_duration_sec=_WARN_PERIOD_S)
+            return Command(0.0, 0.0, 'blocked', 'laser silent')
+        T_map_base = se2.compose(self._T_map_odom, self._T_odom_base)
+        return self._navigator.step(T_map_base, self._map.patch, self._scan, _CONTROL_PERIOD_S)
+
+    def _show_path(self) -> None:
+        path = self._navigator.path
+        if path is not None and path is not self._shown_path:
+            self._shown_path = path
+            ns = self.get_clock().now().nanoseconds
+            self._plan.publish(messages.path_msg(np.asarray(path), self._map_frame, ns))
+
+    def _tell(self, command: Command) -> None:
+        feedback = NavigateToPose.Feedback()
+        feedback.state = command.state
+        feedback.distance_remaining_m = self._navigator.distance_remaining_m
+        self._goals.feedback(feedback)
+
+    def _end(self, outcome: Outcome, reason: str) -> None:
+        self._navigator.cancel()
+        self._cmd_vel.publish(messages.twist_msg(0.0, 0.0))
+        self._goals.finish(
+            outcome, NavigateToPose.Result(success=outcome is Outcome.SUCCEEDED, reason=reason)
+        )
+
+
+def _preempted() -> NavigateToPose.Result:
+    return NavigateToPose.Result(success=False, reason='replaced by a newer goal')
+
+
+def main() -> None:
+    """Run the node."""
+    runtime.run(NavigatorNode)
+
+
+if __name__ == '__main__':
+    main()

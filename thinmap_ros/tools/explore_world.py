@@ -1,0 +1,229 @@
+"""Explore a world in the simulator without a ROS graph, faster than real time: map, graph, path, picture and report."""
+
+import argparse
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from tqdm import tqdm
+
+from thinmap_ros.adapters import figures, graph_files, map_files, trajectory_files
+from thinmap_ros.adapters.files import write_text
+from thinmap_ros.core import se2
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.exploration.explorer import Decision, Explorer, ExplorerConfig
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.localizer import Estimate, LocalizerConfig
+from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.pipeline import Pipeline, PipelineConfig
+from thinmap_ros.sim.coverage import Coverable, coverable
+from thinmap_ros.sim.lms200 import Lms200Config
+from thinmap_ros.sim.pioneer import PRESETS
+from thinmap_ros.sim.runner import STEP_NS, Moment, Simulation
+from thinmap_ros.sim.world import World
+from thinmap_ros.tools import cli
+from thinmap_ros.tools.report import Ending, EndNodeCensus, exploration_report
+
+_CONTROL_STEPS = 2
+_MEASURE_SCANS = 5
+
+
+class Strategy(Protocol):
+    """What decides where to go: ours, and everything that it is compared with."""
+
+    def step(self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array) -> Decision:
+        """Say where to go, from the graph, the whole map and a scan made at a pose (3,)."""
+
+    def fail_target(self, reason: str) -> None:
+        """Hear that the present target could not be reached."""
+
+
+STRATEGIES: dict[str, Callable[[], Strategy]] = {
+    'position_probability': lambda: Explorer(ExplorerConfig()),
+    'paper': lambda: Explorer(ExplorerConfig(mode='paper')),
+}
+
+
+@dataclass(eq=False)
+class Log:
+    """What happened, scan by scan: stamps, poses (3,) true and estimated; coverage over time; end nodes met."""
+
+    stamps_ns: list[int] = field(default_factory=list)
+    true_poses: list[Array] = field(default_factory=list)
+    poses: list[Array] = field(default_factory=list)
+    coverage: list[tuple[float, float]] = field(default_factory=list)
+    census: EndNodeCensus = field(default_factory=EndNodeCensus)
+
+
+class ClosedLoop:
+    """Simulator, pipeline, strategy and navigator, each called in turn as the live graph would."""
+
+    def __init__(self, simulation: Simulation, pipeline: Pipeline, strategy: Strategy, navigator: Navigator) -> None:
+        self.simulation = simulation
+        self.pipeline = pipeline
+        self.strategy = strategy
+        self.navigator = navigator
+        self.log = Log()
+        self.decision: Decision | None = None
+        self._patch: GridPatch | None = None
+        self._scan: Scan | None = None
+        self._goal: Array | None = None
+        self._T_map_odom = np.zeros(3)
+        self._command = (0.0, 0.0)
+
+    def run(self, goal: Coverable, limit_s: float, show: Callable[[float, float], None]) -> Ending:
+        """Explore until the strategy is finished or the time is up; show is told time (s) and coverage now and then."""
+        moment, steps = self.simulation.sense(), 0
+        while moment.stamp_ns < limit_s * 1e9:
+            if moment.scan is not None:
+                self._take(moment.scan, moment.T_odom_base)
+                if len(self.log.poses) % _MEASURE_SCANS == 1:
+                    show(*self._measure(goal))
+                if self.decision is not None and self.decision.finished:
+                    break
+            if steps % _CONTROL_STEPS == 0:
+                self._control(moment)
+            moment, steps = self.simulation.step(*self._command), steps + 1
+        show(*self._measure(goal))
+        finished = self.decision is not None and self.decision.finished
+        reason = self.decision.reason if self.decision is not None and finished else f'time limit of {limit_s:.0f} s'
+        return Ending(finished, reason, self.simulation.robot.collisions)
+
+    def _take(self, scan: Scan, T_odom_base: Array) -> None:
+        """One scan through localization, map and graph to a decision."""
+        estimate = self.pipeline.step(scan, T_odom_base).estimate
+        self._scan, self._T_map_odom = scan, estimate.T_map_odom
+        self._patch = self.pipeline.grid.patch()
+        self.decision = self.strategy.step(self.pipeline.topology.map, self._patch, scan, estimate.T_map_base)
+        self.log.stamps_ns.append(scan.stamp_ns)
+        self.log.poses.append(estimate.T_map_base)
+        self.log.true_poses.append(self.simulation.robot.T_world_base)
+        self.log.census.take(self.decision.end_nodes, estimate.T_map_base)
+        target = self.decision.target
+        if target is None:
+            self.navigator.cancel()
+            self._goal = None
+        elif self._goal is None or not np.array_equal(target.goal, self._goal):
+            self._goal = target.goal
+            self.navigator.set_goal(*(float(number) for number in target.goal))
+
+    def _control(self, moment: Moment) -> None:
+        if self._patch is None:
+            return
+        T_map_base = se2.compose(self._T_map_odom, moment.T_odom_base)
+        command = self.navigator.step(T_map_base, self._patch, self._scan, _CONTROL_STEPS * STEP_NS / 1e9)
+        self._command = (command.v, command.w)
+        if command.state == 'failed':
+            self.strategy.fail_target(command.reason)
+        if command.state in ('failed', 'reached'):
+            self._goal = None
+
+    def _measure(self, goal: Coverable) -> tuple[float, float]:
+        seconds = self.simulation.stamp_ns / 1e9
+        self.log.coverage.append((seconds, goal.share_known(self.pipeline.grid.patch())))
+        return self.log.coverage[-1]
+
+
+def true_pose_source(simulation: Simulation) -> Callable[[Scan, Array], Estimate]:
+    """Takes the localizer's place: the simulator's own pose."""
+
+    def locate(scan: Scan, T_odom_base: Array) -> Estimate:
+        T_map_base = simulation.robot.T_world_base
+        return Estimate(T_map_base, np.zeros((3, 3)), se2.compose(T_map_base, se2.invert(T_odom_base)))
+
+    return locate
+
+
+def make_loop(world: World, start: Array, arguments: argparse.Namespace) -> ClosedLoop:
+    """All parts as the arguments (strategy, robot, laser, seed, speed, localization) want them."""
+    robot = PRESETS[arguments.robot]
+    simulation = Simulation(world, start, robot, cli.config_from(arguments, Lms200Config), arguments.seed)
+    x, y, theta = (float(number) for number in start)
+    localizer = LocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=theta)
+    source = true_pose_source(simulation) if arguments.localization == 'truth' else None
+    pipeline = Pipeline(PipelineConfig(localizer=localizer), source)
+    navigator = Navigator(NavigatorConfig(max_speed_m_s=arguments.speed))
+    return ClosedLoop(simulation, pipeline, STRATEGIES[arguments.strategy](), navigator)
+
+
+def write_outputs(loop: ClosedLoop, ending: Ending, folder: Path, wall_s: float) -> dict[str, Any]:
+    """Write all files into a folder; returns the report."""
+    log, pipeline = loop.log, loop.pipeline
+    patch, topology = pipeline.grid.patch(), pipeline.topology.map
+    poses, true_poses = np.array(log.poses), np.array(log.true_poses)
+    folder.mkdir(parents=True, exist_ok=True)
+    trajectory_files.write_tum(folder / 'trajectory.tum', log.stamps_ns, log.poses)
+    map_files.write_map(folder / 'map', patch)
+    graph_files.write_geojson(folder / 'topology.geojson', topology)
+    report = exploration_report(
+        ending, np.array(log.stamps_ns) / 1e9, true_poses, poses, np.array(log.coverage), log.census
+    )
+    report['world'], report['wall_s'] = loop.simulation.world.name, round(wall_s, 3)
+    title = f'{report["world"]}: {report["coverage"]:.1%} in {report["time"]:.0f} s, {report["distance"]:.0f} m'
+    figures.summary_figure(folder / 'summary.png', patch, topology, poses, true_poses, title=title)
+    write_text(folder / 'report.json', json.dumps(report, indent=2) + '\n')
+    return report
+
+
+def _start(world: World, given: str | None) -> Array:
+    if given is None:
+        if not np.isfinite(world.start).all():
+            raise InputError(f'{world.name}: the world names no start: give one with --start=X,Y,THETA')
+        return world.start
+    try:
+        x, y, theta = (float(word) for word in given.split(','))
+    except ValueError:
+        raise InputError(f'--start={given}: expected three numbers X,Y,THETA (m, m, rad)') from None
+    if not all(math.isfinite(number) for number in (x, y, theta)):
+        raise InputError(f'--start={given}: expected finite numbers')
+    return se2.pose(x, y, theta)
+
+
+def _work(arguments: argparse.Namespace) -> None:
+    world = World.load(arguments.world)
+    start = _start(world, arguments.start)
+    loop = make_loop(world, start, arguments)
+    goal = coverable(world, start, PRESETS[arguments.robot].radius_m, arguments.range_max_m)
+    began = time.perf_counter()
+    with tqdm(total=100, unit='%', disable=arguments.quiet, bar_format='{l_bar}{bar}| {postfix}') as bar:
+
+        def show(seconds: float, coverage: float) -> None:
+            bar.set_postfix_str(f'{seconds:.0f} s simulated', refresh=False)
+            bar.update(100.0 * coverage - bar.n)
+
+        ending = loop.run(goal, arguments.time_limit, show)
+    report = write_outputs(loop, ending, arguments.out, time.perf_counter() - began)
+    how = 'finished' if ending.finished else 'not finished'
+    print(
+        f'{arguments.out}: {how} ({ending.reason}), coverage {report["coverage"]:.1%}, {report["distance"]:.1f} m, '
+        f'{report["time"]:.0f} s simulated in {report["wall_s"]:.1f} s, {ending.collisions} collisions'
+    )
+
+
+def main() -> None:
+    """Run the program."""
+    parser = argparse.ArgumentParser(prog='explore_world', description=__doc__)
+    parser.add_argument('world', type=Path, help='world YAML or map_server YAML')
+    parser.add_argument('-o', '--out', type=Path, required=True, help='folder for the results')
+    parser.add_argument('--strategy', default='position_probability', choices=sorted(STRATEGIES))
+    parser.add_argument('--start', help="X,Y,THETA in m, m, rad; without it the world's own")
+    parser.add_argument('--seed', type=int, default=0, help='decides all noise (default 0)')
+    parser.add_argument('--speed', type=float, default=0.2, help='speed limit, m/s (default 0.2)')
+    parser.add_argument('--localization', default='truth', choices=('truth', 'slam'))
+    parser.add_argument('--robot', default='2dx', choices=sorted(PRESETS))
+    parser.add_argument('--time-limit', type=float, default=20_000.0, help='simulated time to give up at, s')
+    parser.add_argument('--quiet', action='store_true', help='no progress bar')
+    cli.add_config(parser, Lms200Config, ['beams', 'field_of_view_deg', 'range_max_m'])
+    cli.run(_work, parser)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,132 @@
+"""A log or bag through localizer, grid and topology, as fast as it goes: trajectory, map, graph, report and picture."""
+
+import argparse
+import json
+import resource
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from thinmap_ros.adapters import figures, graph_files, map_files, trajectory_files
+from thinmap_ros.adapters.events import Log, OdometryEvent
+from thinmap_ros.adapters.files import write_text
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.occupancy import OccupancyConfig
+from thinmap_ros.core.odometry import ScanPairing
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.localizer import LocalizerConfig
+from thinmap_ros.pipeline import Pipeline, PipelineConfig
+from thinmap_ros.tools import cli
+
+
+@dataclass(eq=False)
+class Replay:
+    """What came of a log: the pipeline at its end, and the pose (3,) of every scan."""
+
+    pipeline: Pipeline
+    stamps_ns: list[int] = field(default_factory=list)
+    poses: list[Array] = field(default_factory=list)
+    local_features: list[int] = field(default_factory=list)
+    skipped: int = 0
+    first_skipped: str = ''
+
+
+def replay(log: Log, config: PipelineConfig, show_progress: bool = False) -> Replay:
+    """Play a log through the pipeline. Raises InputError where the log has nothing to play."""
+    result = Replay(Pipeline(config))
+    pairing = ScanPairing()
+    for event in tqdm(log.events(), unit=' events', disable=not show_progress):
+        if isinstance(event, OdometryEvent):
+            ready = pairing.add_odometry(event.stamp_ns, event.T_odom_base)
+        else:
+            ready = pairing.add_scan(event.scan)
+        for scan, T_odom_base in ready:
+            step = result.pipeline.step(scan, T_odom_base)
+            result.stamps_ns.append(scan.stamp_ns)
+            result.poses.append(step.estimate.T_map_base)
+            result.local_features.append(step.estimate.matched)
+    result.skipped = log.skipped.count + pairing.dropped + pairing.waiting
+    result.first_skipped = log.skipped.first
+    if not result.poses:
+        raise InputError(f'no scan with odometry around its stamp; {result.skipped} skipped')
+    return result
+
+
+def write_outputs(result: Replay, folder: Path, title: str, seconds: tuple[float, float]) -> dict[str, Any]:
+    """Write all files into a folder; seconds: wall and CPU time taken. Returns the report."""
+    pipeline = result.pipeline
+    patch, poses = pipeline.grid.patch(), np.array(result.poses)
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in ('trajectory.tum', 'trajectory_final.tum'):
+        trajectory_files.write_tum(folder / name, result.stamps_ns, result.poses)
+    map_files.write_map(folder / 'map', patch)
+    graph_files.write_geojson(folder / 'topology.geojson', pipeline.topology.map)
+    figures.summary_figure(folder / 'summary.png', patch, pipeline.topology.map, poses, title=title)
+    report = _report(result, poses, seconds)
+    write_text(folder / 'report.json', json.dumps(report, indent=2) + '\n')
+    return report
+
+
+def _report(result: Replay, poses: Array, seconds: tuple[float, float]) -> dict[str, Any]:
+    stages = {name: np.array(taken) for name, taken in result.pipeline.stage_seconds.items()}
+    stages['all'] = np.sum(list(stages.values()), axis=0)
+    return {
+        'scans': len(poses),
+        'skipped': result.skipped,
+        'first_skipped': result.first_skipped,
+        'wall_s': round(seconds[0], 3),
+        'cpu_s': round(seconds[1], 3),
+        'peak_mb': round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+        'ms_per_scan': {name: _spread(1000.0 * taken) for name, taken in stages.items()},
+        'features': len(result.pipeline.localizer.features),
+        'features_local_median': float(np.median(result.local_features)),
+        'refused': result.pipeline.localizer.refused,
+        'distance': round(float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum()), 3),
+        'nodes': len(result.pipeline.topology.map.nodes),
+        'edges': len(result.pipeline.topology.map.edges),
+    }
+
+
+def _spread(milliseconds: Array) -> dict[str, float]:
+    return {
+        'median': round(float(np.median(milliseconds)), 3),
+        'p95': round(float(np.percentile(milliseconds, 95)), 3),
+        'max': round(float(milliseconds.max()), 3),
+    }
+
+
+def _work(arguments: argparse.Namespace) -> None:
+    config = PipelineConfig(
+        localizer=cli.config_from(arguments, LocalizerConfig), grid=cli.config_from(arguments, OccupancyConfig)
+    )
+    wall, cpu = time.perf_counter(), time.process_time()
+    result = replay(cli.open_log(arguments), config, show_progress=not arguments.quiet)
+    seconds = (time.perf_counter() - wall, time.process_time() - cpu)
+    title = f'{arguments.log.name}: {len(result.poses)} scans'
+    report = write_outputs(result, arguments.out, title, seconds)
+    skipped = f', {result.skipped} skipped' if result.skipped else ''
+    if result.first_skipped:
+        skipped += f' (first: {result.first_skipped})'
+    print(
+        f'{arguments.out}: {report["scans"]} scans{skipped}, {report["distance"]:.1f} m, '
+        f'{report["ms_per_scan"]["all"]["median"]:.1f} ms a scan'
+    )
+
+
+def main() -> None:
+    """Run the program."""
+    parser = argparse.ArgumentParser(prog='replay', description=__doc__)
+    cli.add_log_options(parser)
+    parser.add_argument('-o', '--out', type=Path, required=True, help='folder for the results')
+    parser.add_argument('--quiet', action='store_true', help='no progress bar')
+    cli.add_config(parser, LocalizerConfig, ['slam'])
+    cli.add_config(parser, OccupancyConfig, ['resolution_m', 'no_return_range_m', 'usable_range_m'])
+    cli.run(_work, parser)
+
+
+if __name__ == '__main__':
+    main()
