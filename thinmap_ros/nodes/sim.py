@@ -14,6 +14,7 @@ from std_msgs.msg import UInt32
 from tf2_msgs.msg import TFMessage
 
 from thinmap_ros.adapters import messages, parameters, qos, resources, runtime
+from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import ConfigError
@@ -50,7 +51,7 @@ class SimNode(Node):
         self._config = parameters.declare(self, SimConfig)
         laser = parameters.declare(self, Lms200Config)
         parameters.check_unknown(self)
-        world = World.load(resources.world_path(self._config.world))
+        world = World.from_patch(*read_world(resources.world_path(self._config.world)))
         start = _start(self._config.start, world)
         self._sim = Simulation(world, start, PRESETS[self._config.robot], laser, self._config.seed)
         self._scan_time_s = 1.0 / laser.rate_hz

@@ -15,10 +15,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from thinmap_ros.adapters import resources
+from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.sim.pioneer import PRESETS
-from thinmap_ros.sim.world import World
 from thinmap_ros.tools import cli, demo_results
 
 _PATIENCE_S = 1.2
@@ -141,7 +141,7 @@ def _work(arguments: argparse.Namespace) -> None:
     if arguments.view and importlib.util.find_spec('rerun') is None:
         raise InputError('--view: rerun is not installed: pip install "thinmap_ros[viewer]"')
     world = resources.world_path(arguments.world)
-    start = World.load(world).start
+    _, _, start = read_world(world)
     signal.signal(signal.SIGTERM, _raise_interrupt)
     _prepare(arguments.out)
     _choose_domain()

@@ -10,6 +10,7 @@ import numpy as np
 from thinmap_ros.adapters import bag_messages, figures, graph_files, map_files, trajectory_files
 from thinmap_ros.adapters.bags import Bag
 from thinmap_ros.adapters.files import write_text
+from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.position_probability import NEAR_M
@@ -70,7 +71,7 @@ def read(path: Path) -> Recording:
 def write(out: Path, world_file: Path, robot: str, result: dict[str, Any]) -> dict[str, Any]:
     """Write map, graph, trajectory, picture and report of the run in out/bag; returns the report."""
     recording = read(out / 'bag')
-    world = World.load(world_file)
+    world = World.from_patch(*read_world(world_file))
     start = next(iter(recording.true.values()))
     seen = coverable(world, start, PRESETS[robot].radius_m, recording.range_max_m)
     report = _report(recording, seen, result)

@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from thinmap_ros.adapters import figures, graph_files, map_files, trajectory_files
 from thinmap_ros.adapters.files import write_text
+from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.explorer import Decision, Explorer, ExplorerConfig
@@ -188,7 +189,7 @@ def _start(world: World, given: str | None) -> Array:
 
 
 def _work(arguments: argparse.Namespace) -> None:
-    world = World.load(arguments.world)
+    world = World.from_patch(*read_world(arguments.world))
     start = _start(world, arguments.start)
     loop = make_loop(world, start, arguments)
     goal = coverable(world, start, PRESETS[arguments.robot].radius_m, arguments.range_max_m)

@@ -3,6 +3,7 @@
 import numpy as np
 
 from thinmap_ros.adapters import resources
+from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.pipeline import Pipeline
@@ -17,7 +18,7 @@ _STEPS = 100
 
 def main() -> None:
     """Drive for a few seconds through everything that is compiled."""
-    world = World.load(resources.world_path('room_10x10'))
+    world = World.from_patch(*read_world(resources.world_path('room_10x10')))
     simulation = Simulation(world, world.start, PRESETS['2dx'], Lms200Config(), 0)
     pipeline, explorer, navigator = Pipeline(), Explorer(ExplorerConfig()), Navigator(NavigatorConfig())
     coverable(world, world.start, 0.3, 1.0)
