@@ -25,9 +25,10 @@ ROOMS |= {
     'sim': ALL_CORE | {'sim'},
     'baselines': ALL_CORE | {'baselines'},
     'pipeline': ALL_CORE | {'pipeline'},
+    'warm_up': ALL_CORE,
     'adapters': ALL_CORE | {'adapters'},
 }
-BELOW = ALL_CORE | {'sim', 'baselines', 'pipeline', 'adapters'}
+BELOW = ALL_CORE | {'sim', 'baselines', 'pipeline', 'warm_up', 'adapters'}
 ROOMS |= {'nodes': BELOW | {'nodes'}, 'tools': BELOW | {'tools'}}
 
 OUTSIDE = {'rclpy', 'rosbags', 'mcap', 'rerun', 'matplotlib', 'ament_index_python', 'PIL', 'yaml', 'networkx'}

@@ -9,6 +9,7 @@ from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
 from thinmap_msgs.msg import LineFeature, LineFeatureArray, SlamStatus
+from thinmap_ros import warm_up
 from thinmap_ros.adapters import messages, parameters, qos, runtime
 from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.core.errors import InputError
@@ -31,6 +32,7 @@ class LocalizerNode(Node):
         self._odom_frame = parameters.declare_value(self, 'odom_frame', 'odom', 'frame of the odometry')
         self._mount = LaserMount(self)
         parameters.check_unknown(self)
+        warm_up.localizer()
         self._pairing = ScanPairing()
         self._pose = self.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
         self._tf = self.create_publisher(TFMessage, '/tf', qos.STREAM)

@@ -5,6 +5,7 @@ from nav_msgs.msg import OccupancyGrid
 from rclpy.node import Node
 
 from thinmap_msgs.msg import TopologicalMap
+from thinmap_ros import warm_up
 from thinmap_ros.adapters import messages, parameters, qos, runtime
 from thinmap_ros.adapters.stamps import StampMatcher
 from thinmap_ros.core.errors import InputError
@@ -23,6 +24,7 @@ class TopologyBuilderNode(Node):
         self._builder = TopologyBuilder(parameters.declare(self, TopologyConfig))
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
         parameters.check_unknown(self)
+        warm_up.topology_builder()
         self._matcher: StampMatcher[GridPatch, Array] = StampMatcher()
         self._local = self.create_publisher(TopologicalMap, 'local_topology', qos.LATCHED)
         self._global = self.create_publisher(TopologicalMap, 'topology', qos.LATCHED)
