@@ -6,6 +6,7 @@ from pathlib import Path
 from time import monotonic
 
 from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock as ClockMsg
@@ -17,6 +18,7 @@ from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import ConfigError, InputError
 
 _TICK_S = 0.002
+_ACKNOWLEDGE = Duration(seconds=1.0)
 _LOCKSTEP_PATIENCE_S = 2.0
 _SCAN = 'sensor_msgs/msg/LaserScan'
 
@@ -65,7 +67,9 @@ class BagPlayerNode(Node):
         self.create_timer(_TICK_S, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def close(self) -> None:
-        """Say what was done."""
+        """See the last messages through to those who listen, and say what was done."""
+        for publisher in self._publishers_by_topic.values():
+            publisher.wait_for_all_acked(_ACKNOWLEDGE)
         self.get_logger().info(f'{self._config.bag}: {self.sent} messages sent')
 
     def _chosen(self) -> set[str]:
