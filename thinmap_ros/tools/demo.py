@@ -95,7 +95,7 @@ def explore(arguments: argparse.Namespace, world: Path, start: Array) -> None:
     try:
         for name in _NODES:
             processes.start(name, sim_time + extra.get(name, []))
-        lockstep = ['-p', 'lockstep:=true', '-p', f'hold_for_subscribers:={_SCAN_LISTENERS}']
+        lockstep = ['-p', 'lockstep:=local_topology', '-p', f'hold_for_subscribers:={_SCAN_LISTENERS}']
         clock = ['-p', f'rate:={arguments.rate}', '-p', f'seed:={arguments.seed}']
         where = ['-p', f'start:={start[0]},{start[1]},{start[2]}']
         processes.start('sim', common + lockstep + clock + where)
