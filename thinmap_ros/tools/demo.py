@@ -55,8 +55,9 @@ class Processes:
         return next((name for name, process in self.running.items() if process.poll() is not None), None)
 
     def stop(self) -> None:
-        """SIGINT to every group, and SIGKILL to those that are still there a little later."""
-        self._signal(signal.SIGINT)
+        """SIGTERM to every group, and SIGKILL to those that are still there a little later."""
+        # Unlike SIGINT it ends a process without a word that is still importing.
+        self._signal(signal.SIGTERM)
         until = time.monotonic() + _PATIENCE_S
         while time.monotonic() < until and any(p.poll() is None for p in self.running.values()):
             time.sleep(_SLEEP_S)
@@ -73,7 +74,7 @@ class Processes:
 
 def _die_with_parent() -> None:
     """However the demo itself ends, its nodes do not stay behind (Linux)."""
-    ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGINT)
+    ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGTERM)
 
 
 def _raise_interrupt(number: int, frame: object) -> None:
