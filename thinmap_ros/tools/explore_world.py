@@ -17,6 +17,7 @@ from thinmap_ros.adapters.files import write_text
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.explorer import Decision, Explorer, ExplorerConfig
+from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.scan import Scan
@@ -106,7 +107,7 @@ class ClosedLoop:
         self.log.stamps_ns.append(scan.stamp_ns)
         self.log.poses.append(estimate.T_map_base)
         self.log.true_poses.append(self.simulation.robot.T_world_base)
-        self.log.census.take(self.decision.end_nodes, estimate.T_map_base)
+        self.log.census.take([(n.node_id, n.x, n.y) for n in self.decision.end_nodes], estimate.T_map_base)
         target = self.decision.target
         if target is None:
             self.navigator.cancel()
@@ -144,12 +145,14 @@ def true_pose_source(simulation: Simulation) -> Callable[[Scan, Array], Estimate
 
 def make_loop(world: World, start: Array, arguments: argparse.Namespace) -> ClosedLoop:
     """All parts as the arguments (strategy, robot, laser, seed, speed, localization) want them."""
-    robot = PRESETS[arguments.robot]
-    simulation = Simulation(world, start, robot, cli.config_from(arguments, Lms200Config), arguments.seed)
+    robot, laser = PRESETS[arguments.robot], cli.config_from(arguments, Lms200Config)
+    simulation = Simulation(world, start, robot, laser, arguments.seed)
     x, y, theta = (float(number) for number in start)
     localizer = LocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=theta)
     source = true_pose_source(simulation) if arguments.localization == 'truth' else None
-    pipeline = Pipeline(PipelineConfig(localizer=localizer), source)
+    # A beam that met nothing has seen as far as this laser can.
+    grid = OccupancyConfig(no_return_range_m=laser.range_max_m)
+    pipeline = Pipeline(PipelineConfig(localizer=localizer, grid=grid), source)
     navigator = Navigator(NavigatorConfig(max_speed_m_s=arguments.speed))
     return ClosedLoop(simulation, pipeline, STRATEGIES[arguments.strategy](), navigator)
 
@@ -191,7 +194,8 @@ def _work(arguments: argparse.Namespace) -> None:
     world = World.load(arguments.world)
     start = _start(world, arguments.start)
     loop = make_loop(world, start, arguments)
-    goal = coverable(world, start, PRESETS[arguments.robot].radius_m, arguments.range_max_m)
+    laser = cli.config_from(arguments, Lms200Config)
+    goal = coverable(world, start, PRESETS[arguments.robot].radius_m, laser.range_max_m)
     began = time.perf_counter()
     with tqdm(total=100, unit='%', disable=arguments.quiet, bar_format='{l_bar}{bar}| {postfix}') as bar:
 

@@ -53,14 +53,12 @@ def plan(
         return None
     cost = cost_of_cells(patch, config)
     start, wished = (int(cells[0, 0]), int(cells[0, 1])), (int(cells[1, 0]), int(cells[1, 1]))
-    goal = nearest_true(np.isfinite(cost), wished, config.goal_slack_m / patch.frame.resolution)
-    if goal is None:
-        return None
     if not math.isfinite(cost[start]):
         _let_out(cost, patch.occupied, start, config.escape_m / patch.frame.resolution)
-    field = navigation_function(cost, goal, start)
-    if not math.isfinite(field[start]):
+    goal = nearest_true(reached_from(np.isfinite(cost), start), wished, config.goal_slack_m / patch.frame.resolution)
+    if goal is None:
         return None
+    field = navigation_function(cost, goal, start)
     path = descend(field, *_in_cells(patch, start_xy), *goal) * patch.frame.resolution
     path += (patch.frame.origin_x, patch.frame.origin_y)
     path[0] = start_xy
@@ -101,6 +99,11 @@ def navigation_function(cost: Array, goal: tuple[int, int], start: tuple[int, in
     return np.asarray(_march(cost, goal[0], goal[1], row, col))
 
 
+def reached_from(allowed: Mask, start: tuple[int, int]) -> Mask:
+    """Allowed cells (H, W) to which the wave can get from a start (row, col): over edges of cells, not corners."""
+    return np.asarray(_reached_from(allowed, start[0], start[1]))
+
+
 def descend(field: Array, x: float, y: float, goal_row: int, goal_col: int) -> Array:
     """Path (K, 2) down the slope of a navigation function (H, W), in cells (x, y), from a point to a cell's centre."""
     return np.asarray(_descend(field, x, y, goal_row, goal_col))
@@ -137,6 +140,27 @@ def _let_out(cost: Array, occupied: Mask, start: tuple[int, int], reach: float) 
     disc = np.hypot(row - start[0], col - start[1]) <= reach
     part[disc & ~np.isfinite(part) & ~occupied[rows, cols]] = _ESCAPE_COST
     cost[start] = min(cost[start], _ESCAPE_COST)
+
+
+@kernel
+def _reached_from(allowed: Mask, start_row: int, start_col: int) -> Mask:
+    rows, cols = allowed.shape
+    found = np.zeros((rows, cols), dtype=np.bool_)
+    stack = np.empty(rows * cols + 1, dtype=np.int64)
+    count = 0
+    if allowed[start_row, start_col]:
+        found[start_row, start_col] = True
+        stack[0], count = start_row * cols + start_col, 1
+    while count > 0:
+        count -= 1
+        row, col = stack[count] // cols, stack[count] % cols
+        for side in range(4):
+            r, c = row + (side == 0) - (side == 1), col + (side == 2) - (side == 3)
+            if 0 <= r < rows and 0 <= c < cols and allowed[r, c] and not found[r, c]:
+                found[r, c] = True
+                stack[count] = r * cols + c
+                count += 1
+    return found
 
 
 @kernel
