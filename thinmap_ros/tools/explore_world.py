@@ -14,6 +14,13 @@ from tqdm import tqdm
 
 from thinmap_ros.adapters import figures, graph_files, map_files, trajectory_files
 from thinmap_ros.adapters.files import write_text
+from thinmap_ros.baselines.exploration import (
+    DistanceAdvantage,
+    ExploreLite,
+    InformationGain,
+    NearestFrontier,
+    VisitAllEndNodes,
+)
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.explorer import Decision, Explorer, ExplorerConfig
@@ -35,6 +42,8 @@ from thinmap_ros.tools.report import Ending, EndNodeCensus, exploration_report
 
 _CONTROL_STEPS = 2
 _MEASURE_SCANS = 5
+# At the survey's pace; thinning costs more than all else together.
+_SCANS_PER_GRAPH = 5
 
 
 class Strategy(Protocol):
@@ -50,6 +59,11 @@ class Strategy(Protocol):
 STRATEGIES: dict[str, Callable[[], Strategy]] = {
     'position_probability': lambda: Explorer(ExplorerConfig()),
     'paper': lambda: Explorer(ExplorerConfig(mode='paper')),
+    'nearest_frontier': NearestFrontier,
+    'visit_all_end_nodes': VisitAllEndNodes,
+    'explore_lite': ExploreLite,
+    'information_gain': InformationGain,
+    'distance_advantage': DistanceAdvantage,
 }
 
 
@@ -152,7 +166,7 @@ def make_loop(world: World, start: Array, arguments: argparse.Namespace) -> Clos
     source = true_pose_source(simulation) if arguments.localization == 'truth' else None
     # A beam that met nothing has seen as far as this laser can.
     grid = OccupancyConfig(no_return_range_m=laser.range_max_m)
-    pipeline = Pipeline(PipelineConfig(localizer=localizer, grid=grid), source)
+    pipeline = Pipeline(PipelineConfig(localizer=localizer, grid=grid, scans_per_graph=_SCANS_PER_GRAPH), source)
     navigator = Navigator(NavigatorConfig(max_speed_m_s=arguments.speed))
     return ClosedLoop(simulation, pipeline, STRATEGIES[arguments.strategy](), navigator)
 

@@ -71,7 +71,7 @@ def test_updates_near_the_robot_give_what_a_new_look_at_the_whole_map_gives():
 def test_a_map_that_grows_on_all_sides_keeps_what_was_exhausted():
     borders = borders_of(half_known())
     gone = np.argwhere(borders.mask)[:10]
-    borders.exhaust(gone)
+    borders.exhaust(gone, (1.95, 0.15))
     grown = np.pad(half_known(), ((5, 3), (4, 6)), constant_values=-1)
     borders.update(patch_of(grown, FRAME.shifted(-5, -4)), (1.0, 1.5), 0.5)
     moved = gone + (5, 4)
@@ -129,3 +129,11 @@ def test_looking_elsewhere_or_past_a_wall_is_no_look(hidden):
     for _ in range(5):
         borders.examine((1.5, 1.5), 2.0, ALL_ROUND if hidden else away)
     assert (borders.mask == before).all()
+
+
+def test_a_long_border_is_given_up_in_part_only():
+    borders = borders_of(half_known())
+    borders.exhaust(np.argwhere(borders.mask), (1.55, 0.55))
+    left = np.flatnonzero(borders.mask[:, 19])
+    assert left.min() == pytest.approx(5 + 13, abs=2)
+    assert left.max() == 28

@@ -27,7 +27,7 @@ from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.planning.graph_search import access, costs_from
-from thinmap_ros.core.planning.wavefront import nearest_true, reached_from, standing_places
+from thinmap_ros.core.planning.wavefront import nearest_true, places_in_reach
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
@@ -38,7 +38,7 @@ _DETOUR = 3.0
 _CHANGED_MARGIN_M = 1.0
 _SUCCESSOR_M = 1.5
 _NEAR_VISIT_M = 0.3
-_SEED_M = 1.5
+_ESCAPE_M = 0.6
 _NEAR_HEADING_RAD = 0.35
 _STEADY_RAD = 0.6
 _TRIES = 3
@@ -275,11 +275,8 @@ class Explorer:
 
     def _reachable(self, T_map_base: Array) -> NDArray[np.bool_]:
         """Cells on which the robot can stand and to which it can get."""
-        frame = self.borders.frame
-        standing = standing_places(self.borders.free, self.config.robot_radius_m, frame.resolution)
-        row, col = (int(v) for v in frame.cells_of(T_map_base[None, :2])[0])
-        seed = nearest_true(standing, (row, col), _SEED_M / frame.resolution)
-        return np.zeros_like(standing) if seed is None else reached_from(standing, seed)
+        xy = (float(T_map_base[0]), float(T_map_base[1]))
+        return places_in_reach(self.borders.free, self.borders.frame, xy, self.config.robot_radius_m, _ESCAPE_M)
 
     def _ids_of_stand_ins(self, middles: list[tuple[float, float]]) -> list[int]:
         """Each keeps the id of the nearest earlier one within a metre; no id is given twice."""
@@ -332,7 +329,7 @@ class Explorer:
         memory.at_goal = 0
         node_id = candidate.track.node_id
         if node_id >= FIRST_STAND_IN_ID:
-            self.borders.exhaust(candidate.cells)
+            self.borders.exhaust(candidate.cells, (float(T_map_base[0]), float(T_map_base[1])))
         else:
             memory.visited[node_id] = (candidate.track.x, candidate.track.y)
         del worth[node_id]
