@@ -13,7 +13,6 @@ from thinmap_ros.adapters.files import write_text
 from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.exploration.position_probability import NEAR_M
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
@@ -105,9 +104,6 @@ def _report(recording: Recording, seen: Coverable, result: dict[str, Any]) -> di
 def _census(recording: Recording) -> EndNodeCensus:
     census = EndNodeCensus()
     for ns, nodes in recording.end_nodes:
-        T_map_base = recording.estimated.get(ns)
-        for node_id, x, y in nodes:
-            census.seen.add(node_id)
-            if T_map_base is not None and np.hypot(x - T_map_base[0], y - T_map_base[1]) < NEAR_M:
-                census.visited.add(node_id)
+        if ns in recording.estimated:
+            census.take(nodes, recording.estimated[ns])
     return census
