@@ -107,15 +107,19 @@ class EkfSlam:
     def tie(self, kept: int, dropped: int, covariance: Array) -> bool:
         """Let two features be one wall: their difference is 0 up to a covariance (2, 2); whether that could be done."""
         n, a, b = self.size, 3 + 2 * kept, 3 + 2 * dropped
-        v, S = self.difference(kept, dropped)
-        return self._correct(-v, S + covariance, self._P[a : a + 2, :n] - self._P[b : b + 2, :n])
+        v, S, signs = self.difference(kept, dropped)
+        return self._correct(-v, S + covariance, self._P[a : a + 2, :n] - signs[:, None] * self._P[b : b + 2, :n])
 
-    def difference(self, a: int, b: int) -> tuple[Array, Array]:
-        """Line a less line b, (2,), and the covariance (2, 2) of that."""
+    def difference(self, a: int, b: int) -> tuple[Array, Array, Array]:
+        """Line a less line b, (2,), its covariance (2, 2), and the signs (2,) with which b's r and alpha count.
+
+        (r, alpha) and (-r, alpha + pi) are one line; b is taken in the form that is nearer to a.
+        """
         at_a, at_b = slice(3 + 2 * a, 5 + 2 * a), slice(3 + 2 * b, 5 + 2 * b)
-        cross = self._P[at_a, at_b]
-        S = self._P[at_a, at_a] + self._P[at_b, at_b] - cross - cross.T
-        return _difference(self._x[at_a], self._x[at_b]), S
+        v, signs = line_difference(self._x[at_a], self._x[at_b])
+        cross = self._P[at_a, at_b] * signs
+        S = self._P[at_a, at_a] + signs[:, None] * self._P[at_b, at_b] * signs - cross - cross.T
+        return v, S, signs
 
     def add(self, seen: Array, covariance: Array) -> int:
         """Take up a line seen as (r, alpha) as a new feature; returns its index."""
@@ -155,19 +159,21 @@ class EkfSlam:
         self._x, self._P = x, P
 
     def _normalise(self) -> None:
-        """Headings into (-pi, pi], and r >= 0: a line whose r went below zero is the same line seen from behind."""
+        """Angles into (-pi, pi]. An r below zero stays: turning the line round would turn its ends with it."""
         self._x[2] = wrap(float(self._x[2]))
-        lines, n = self.lines, self.size
-        for index in np.flatnonzero(lines[:, 0] < 0.0):
-            lines[index] = -lines[index, 0], lines[index, 1] + np.pi
-            at = 3 + 2 * int(index)
-            self._P[at, :n] *= -1.0
-            self._P[:n, at] *= -1.0
-        lines[:, 1] = wrap(lines[:, 1])
+        self.lines[:, 1] = wrap(self.lines[:, 1])
 
 
 def _difference(seen: Array, expected: Array) -> Array:
     return np.array([seen[0] - expected[0], wrap(float(seen[1] - expected[1]))])
+
+
+def line_difference(a: Array, b: Array) -> tuple[Array, Array]:
+    """Line a (r, alpha) less line b, in the form of b that is nearer, and the signs (2,) of b's r and alpha in it."""
+    v = _difference(a, b)
+    if abs(v[1]) <= 0.5 * math.pi:
+        return v, np.ones(2)
+    return np.array([a[0] + b[0], wrap(float(v[1] + math.pi))]), np.array([-1.0, 1.0])
 
 
 @kernel

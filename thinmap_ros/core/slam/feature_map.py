@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.config import parameter
-from thinmap_ros.core.se2 import Array, transform_points, wrap
+from thinmap_ros.core.se2 import Array, transform_points
 from thinmap_ros.core.slam.association import AssociationConfig, associate, mahalanobis, meeting
-from thinmap_ros.core.slam.ekf import EkfSlam
-from thinmap_ros.core.slam.features import Feature, LineFeature, as_seen, interval
+from thinmap_ros.core.slam.ekf import EkfSlam, line_difference
+from thinmap_ros.core.slam.features import Feature, LineFeature, as_seen, interval, point_on
 from thinmap_ros.core.slam.lines import Lines
 from thinmap_ros.core.slam.models import place_line
 
@@ -100,14 +100,13 @@ class FeatureMap:
         return None
 
     def _is_one_wall(self, ekf: EkfSlam, a: int, b: int) -> bool:
-        v, S = ekf.difference(a, b)
+        v, S, _ = ekf.difference(a, b)
         apart = np.abs(self._ends(ekf, b) @ (np.cos(ekf.lines[a, 1]), np.sin(ekf.lines[a, 1])) - ekf.lines[a, 0])
         close = apart.max() <= 3.0 * self._config.wall_sigma_m
         return bool(close) and mahalanobis(v, S + self._wall) <= self._config.gate
 
     def _ends(self, ekf: EkfSlam, index: int) -> Array:
-        seen = as_seen(self._features[index], ekf.lines[index], np.empty((2, 2)))
-        return np.stack([seen.start, seen.end])
+        return _ends_of(self._features[index], ekf.lines[index])
 
     def _unite(self, ekf: EkfSlam, kept: int, dropped: int) -> None:
         feature = self._features[kept]
@@ -124,9 +123,9 @@ class FeatureMap:
                 continue
             self._candidates.remove(candidate)
             if not self._is_known(ekf, candidate):
-                ekf.add(z, covariance)
-                candidate.span.id = self._next_id
-                self._features.append(candidate.span)
+                index = ekf.add(z, covariance)
+                span = interval(ekf.lines[index], _ends_of(candidate.span, candidate.line))
+                self._features.append(Feature(self._next_id, *span, candidate.span.seen_from))
                 self._next_id += 1
         oldest = self._looks - self._config.patience
         self._candidates = [c for c in self._candidates if c.last_look >= oldest]
@@ -142,9 +141,9 @@ class FeatureMap:
             S = 2.0 * by_seen @ covariance @ by_seen.T
             for index in np.flatnonzero(near):
                 candidate = self._candidates[index]
-                v = line - candidate.line
-                if mahalanobis(np.array([v[0], wrap(float(v[1]))]), S) <= self._config.gate:
-                    return self._seen_again(candidate, line, ends_map)
+                v, signs = line_difference(line, candidate.line)
+                if mahalanobis(v, S) <= self._config.gate:
+                    return self._seen_again(candidate, v + signs * candidate.line, ends_map)
         span = Feature(0, *interval(line, ends_map), laser_map)
         self._candidates.append(_Candidate(line, span, 1, self._looks))
         return self._candidates[-1]
@@ -161,10 +160,14 @@ class FeatureMap:
         if not self._features:
             return False
         span = candidate.span
-        seen = as_seen(span, candidate.line, np.empty((2, 2)))
-        middle = 0.5 * (seen.start + seen.end)
-        reach = 0.25 * (seen.end - seen.start)
+        start, end = _ends_of(span, candidate.line)
+        middle, reach = 0.5 * (start + end), 0.25 * (end - start)
         ends = np.stack([middle - reach, middle + reach])
         near = meeting(ekf.lines, self._features, ends[None], span.seen_from, 0.0)[0]
         normals = np.column_stack([np.cos(ekf.lines[:, 1]), np.sin(ekf.lines[:, 1])])
         return bool(np.any(near & (np.abs(normals @ middle - ekf.lines[:, 0]) <= 3.0 * self._config.wall_sigma_m)))
+
+
+def _ends_of(feature: Feature, line: Array) -> Array:
+    """Ends (2, 2) of a feature on its line (r, alpha), map frame."""
+    return np.stack([point_on(line, feature.low), point_on(line, feature.high)])

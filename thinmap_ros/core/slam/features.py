@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, wrap
 
 
 @dataclass(eq=False)
@@ -22,7 +22,7 @@ class Feature:
 
 @dataclass(frozen=True, eq=False)
 class LineFeature:
-    """A feature as others see it: id, (r, alpha) with covariance (2, 2), and its ends (2,) each, m, map frame."""
+    """A feature as others see it: id, (r >= 0, alpha) with covariance (2, 2), and its ends (2,) each, m, map frame."""
 
     id: int
     r_m: float
@@ -59,6 +59,9 @@ def point_on(line: Array, position: float) -> Array:
 
 
 def as_seen(feature: Feature, line: Array, covariance: Array) -> LineFeature:
-    """The feature with its line (r, alpha) of the present state, for others."""
+    """The feature with its line (r, alpha) of the present state, for others: in the form with r >= 0."""
     low, high = point_on(line, feature.low), point_on(line, feature.high)
-    return LineFeature(feature.id, float(line[0]), float(line[1]), covariance, low, high)
+    if line[0] < 0.0:
+        signs = np.array([-1.0, 1.0])
+        line, covariance = np.array([-line[0], line[1] + np.pi]), signs[:, None] * covariance * signs
+    return LineFeature(feature.id, float(line[0]), wrap(float(line[1])), covariance, low, high)

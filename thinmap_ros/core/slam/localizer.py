@@ -19,6 +19,7 @@ from thinmap_ros.core.slam.scan_matching import Match, MatchConfig, ScanMatcher
 _START_SIGMAS = (1e-4, 1e-4, 1e-4)  # the map begins where the robot stands: no doubt, but not singular
 _LONGEST_STEP_M = 5.0  # between two scans the wheels cannot go farther: the odometry was set anew
 _NEW_GROUND = 0.3  # where less of a scan than this lies on what is known, there is nothing to contradict
+_NEW_GROUND_M, _NEW_GROUND_RAD = 0.6, 0.6  # and that is so only this far from where the map last learned
 _LOST_SIGMA_M = 1.0  # a robot in doubt by more than this does not know where it is
 
 
@@ -106,7 +107,7 @@ class Localizer:
         if self._has_news() and not self._is_lost():
             laser_map = se2.transform_points(self._ekf.pose, laser_base[None])[0]
             lines, matched = self._correct(scan, laser_map)
-            if match.good or match.overlap < _NEW_GROUND:
+            if match.good or self._on_new_ground(match):
                 points_map = se2.transform_points(self._ekf.pose, points_base)
                 self._matcher.add(points_map, laser_map)
                 self._T_last_look = self._ekf.pose
@@ -144,7 +145,7 @@ class Localizer:
             self._doubt, self._misfits = np.zeros((3, 3)), 0
             increment, covariance = se2.between(pose, match.T_map_base), turn.T @ match.covariance @ turn
             predicted = match.T_map_base
-        elif match.overlap >= _NEW_GROUND:
+        elif not self._on_new_ground(match):
             self._misfits += 1
         if match.good and (self._placed_by_hand or self.config.slam == 'off'):
             self._ekf.set_pose(match.T_map_base, match.covariance)
@@ -164,11 +165,21 @@ class Localizer:
 
     def _has_news(self) -> bool:
         """Whether the robot has moved since it last learned: looks from one place err alike, and prove nothing anew."""
+        return self._moved(self.config.look_distance_m, self.config.look_turn_rad)
+
+    def _on_new_ground(self, match: Match) -> bool:
+        """Whether a scan that lies on little that is known can be explained by where the robot has come to.
+
+        Near the place where the map last learned, most of a scan has been seen before.
+        """
+        return match.overlap < _NEW_GROUND and self._moved(_NEW_GROUND_M, _NEW_GROUND_RAD)
+
+    def _moved(self, distance_m: float, turn_rad: float) -> bool:
+        """Whether the robot is that far from the last place at which the map learned."""
         if self._T_last_look is None:
             return True
         moved = se2.between(self._T_last_look, self._ekf.pose)
-        far = math.hypot(moved[0], moved[1]) >= self.config.look_distance_m
-        return far or abs(float(moved[2])) >= self.config.look_turn_rad
+        return math.hypot(moved[0], moved[1]) >= distance_m or abs(float(moved[2])) >= turn_rad
 
     def _is_lost(self) -> bool:
         in_doubt = max(self._ekf.pose_covariance[0, 0], self._ekf.pose_covariance[1, 1]) > _LOST_SIGMA_M**2
