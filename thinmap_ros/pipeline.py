@@ -69,6 +69,7 @@ class Pipeline:
             window = self.grid.window(x, y, self.config.window.window_m)
         with self._timed('topology'):
             local_topology = self.topology.update(window, estimate.T_map_base)
+            self.localizer.set_topology(self.topology.map)
         return Step(estimate, window, local_topology)
 
     @contextmanager

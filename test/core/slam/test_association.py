@@ -10,12 +10,14 @@ from slam_room import ROOM, drive, scan_in
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam.association import AssociationConfig, associate, mahalanobis
 from thinmap_ros.core.slam.ekf import EkfSlam
+from thinmap_ros.core.slam.ekf_ti import CompressedEkf
 from thinmap_ros.core.slam.feature_map import FeatureConfig, FeatureMap
 from thinmap_ros.core.slam.features import Feature
 from thinmap_ros.core.slam.lines import LineConfig, Lines, extract_lines
 
 R = np.diag([0.02**2, 0.01**2])
 SURE = 1e-8 * np.eye(3)
+BLIND = scan_in(np.array([[1e3, -1.0, 1e3, 1.0]]), np.zeros(3))  # a scan that says nothing about what is gone
 
 
 def seen_lines(*walls):
@@ -32,9 +34,9 @@ def seen_lines(*walls):
 def known(walls, pose=(0.0, 0.0, 0.0), P=SURE):
     """A filter that knows some walls, and the features beside it."""
     lines = seen_lines(*walls)
-    ekf = EkfSlam(np.array(pose), P)
-    features = FeatureMap(FeatureConfig(sightings=1))
-    features.observe(ekf, lines, np.array(pose[:2]))
+    ekf = CompressedEkf(np.array(pose), P)
+    features = FeatureMap(FeatureConfig(sightings=1), local_areas=False)
+    features.observe(ekf, lines, BLIND)
     return ekf, features
 
 
@@ -74,35 +76,36 @@ def test_a_line_fits_only_where_the_gate_says_so():
 
 def test_the_two_faces_of_a_thin_wall_are_two_features():
     ekf, features = known([[[2.0, -2.0], [2.0, 2.0]]])
-    ekf.set_pose(np.array([4.0, 0.0, math.pi]), SURE)
+    ekf.local.set_pose(np.array([4.0, 0.0, math.pi]), SURE)
     for _ in range(3):
-        features.observe(ekf, seen_lines([[1.95, -2.0], [1.95, 2.0]]), np.array([4.0, 0.0]))
+        features.observe(ekf, seen_lines([[1.95, -2.0], [1.95, 2.0]]), BLIND)
     faces = sorted(f.r_m for f in features.listed(ekf))
     assert faces == pytest.approx([2.0, 2.05], abs=0.01)
 
 
 def test_a_feature_enters_after_several_sightings_and_keeps_its_id():
-    ekf, features = EkfSlam(np.zeros(3), SURE), FeatureMap(FeatureConfig(sightings=3))
+    ekf, features = CompressedEkf(np.zeros(3), SURE), FeatureMap(FeatureConfig(sightings=3), local_areas=False)
     wall = seen_lines([[2.0, -1.0], [2.0, 1.0]])
     counts = []
     for _ in range(5):
-        features.observe(ekf, wall, np.zeros(2))
+        features.observe(ekf, wall, BLIND)
         counts.append(len(features))
     assert counts == [0, 0, 1, 1, 1]
     (only,) = features.listed(ekf)
-    features.observe(ekf, seen_lines([[2.0, -1.0], [2.0, 2.5]]), np.zeros(2))
+    features.observe(ekf, seen_lines([[2.0, -1.0], [2.0, 2.5]]), BLIND)
     (grown,) = features.listed(ekf)
     assert grown.id == only.id
     assert {round(float(p[1]), 1) for p in (grown.start, grown.end)} == {-1.0, 2.5}
 
 
 def test_what_was_seen_once_and_then_no_more_is_forgotten():
-    ekf, features = EkfSlam(np.zeros(3), SURE), FeatureMap(FeatureConfig(sightings=2, patience=3))
+    ekf = CompressedEkf(np.zeros(3), SURE)
+    features = FeatureMap(FeatureConfig(sightings=2, patience=3), local_areas=False)
     passer_by, wall = seen_lines([[1.0, -0.5], [1.0, 0.5]]), seen_lines([[4.0, -1.0], [4.0, 1.0]])
-    features.observe(ekf, passer_by, np.zeros(2))
+    features.observe(ekf, passer_by, BLIND)
     for _ in range(5):
-        features.observe(ekf, wall, np.zeros(2))
-    features.observe(ekf, passer_by, np.zeros(2))
+        features.observe(ekf, wall, BLIND)
+    features.observe(ekf, passer_by, BLIND)
     assert [round(f.r_m) for f in features.listed(ekf)] == [4]
 
 
@@ -110,19 +113,21 @@ def test_two_features_that_turn_out_to_be_one_wall_merge():
     ekf, features = known([[[2.0, -3.0], [2.0, -1.0]], [[2.0, 1.0], [2.0, 3.0]], [[-1.0, 2.0], [1.0, 2.0]]])
     first = min(f.id for f in features.listed(ekf))
     assert len(features) == 3
-    features.observe(ekf, seen_lines([[2.0, -1.5], [2.0, 1.5]]), np.zeros(2))
-    assert len(features) == 2 == ekf.count
+    features.observe(ekf, seen_lines([[2.0, -1.5], [2.0, 1.5]]), BLIND)
+    assert len(features) == 2 == len(ekf)
     (long,) = [f for f in features.listed(ekf) if f.id == first]
     assert sorted([long.start[1], long.end[1]]) == pytest.approx([-3.0, 3.0], abs=0.02)
 
 
-def test_a_drive_through_a_room_finds_its_walls_once(rng):
+@pytest.mark.parametrize('local_areas', [False, True])
+def test_a_drive_through_a_room_finds_its_walls_once(rng, local_areas):
     """All features are walls, and no wall is there twice."""
     truths = [truth for truth, _ in drive(500, rng, np.array([2.0, 2.0, 0.0]))][::3]
-    ekf, features = EkfSlam(truths[0], SURE), FeatureMap(FeatureConfig())
+    ekf, features = CompressedEkf(truths[0], SURE), FeatureMap(FeatureConfig(), local_areas)
     for truth in truths:
-        ekf.set_pose(truth, SURE)
-        features.observe(ekf, extract_lines(scan_in(ROOM, truth, rng), LineConfig()), truth[:2])
+        ekf.local.set_pose(truth, SURE)
+        scan = scan_in(ROOM, truth, rng)
+        features.observe(ekf, extract_lines(scan, LineConfig()), scan)
     walls = [wall_of(feature) for feature in features.listed(ekf)]
     assert -1 not in walls
     assert len(walls) >= 7
@@ -144,6 +149,27 @@ def wall_of(feature):
 def test_features_follow_the_filter_not_the_robot():
     ekf, features = known([[[2.0, -1.0], [2.0, 1.0]]])
     before = features.listed(ekf)[0]
-    ekf.set_pose(se2.pose(1.0, 0.5, 0.3), SURE)
+    ekf.local.set_pose(se2.pose(1.0, 0.5, 0.3), SURE)
     after = features.listed(ekf)[0]
     np.testing.assert_array_equal(before.start, after.start)
+
+
+def test_a_door_that_opens_leaves_the_map_and_a_wall_behind_a_person_does_not():
+    door, far = [[2.0, -1.0], [2.0, 1.0]], [[5.0, -3.0], [5.0, 3.0]]
+    ekf, features = known([door])
+    person = np.array([[1.0, -0.8, 1.0, 0.8], [*far[0], *far[1]]])
+    for _ in range(10):
+        features.observe(ekf, seen_lines(far), scan_in(person, np.zeros(3)))
+    assert sorted(round(f.r_m) for f in features.listed(ekf)) == [2, 5]
+    for _ in range(FeatureConfig().misses):
+        assert len(features) == 2
+        features.observe(ekf, seen_lines(far), scan_in(person[1:], np.zeros(3)))
+    assert [round(f.r_m) for f in features.listed(ekf)] == [5] == [f.id + 3 for f in features.listed(ekf)]
+    assert len(ekf) == 1
+
+
+def test_glass_is_not_taken_for_an_open_door():
+    ekf, features = known([[[2.0, -1.0], [2.0, 1.0]]])
+    for _ in range(20):
+        features.observe(ekf, seen_lines(), BLIND)
+    assert len(features) == 1

@@ -50,7 +50,8 @@ class Pair:
     def assert_same(self):
         mean, covariance = self.local.settle()
         at = np.concatenate([np.arange(3)] + [3 + 2 * self.ids.index(i) + np.arange(2) for i in self.local.ids])
-        x, P = (self.whole.mean, self.whole.covariance) if isinstance(self.whole, EkfSlam) else (self.whole.x, self.whole.P)
+        conventional = isinstance(self.whole, EkfSlam)
+        x, P = (self.whole.mean, self.whole.covariance) if conventional else (self.whole.x, self.whole.P)
         np.testing.assert_allclose(mean, x[at], atol=1e-9)
         np.testing.assert_allclose(covariance, P[np.ix_(at, at)], atol=1e-9)
 

@@ -27,7 +27,7 @@ def errors_of(rows):
     return np.array([se2.between(truth, estimate.T_map_base) for truth, estimate, _ in rows])
 
 
-@pytest.mark.parametrize('slam', ['full', 'off'])
+@pytest.mark.parametrize('slam', ['ti', 'full', 'off'])
 def test_a_drive_round_the_room_stays_on_its_path(slam):
     rows, localizer = driven(900, slam=slam)
     off = errors_of(rows)
@@ -37,7 +37,16 @@ def test_a_drive_round_the_room_stays_on_its_path(slam):
     assert np.hypot(*odometry[-1, :2]) > 0.3
     assert not any(estimate.lost for _, estimate, _ in rows)
     assert localizer.refused == 0
-    assert (len(localizer.features) > 5) == (slam == 'full')
+    assert (len(localizer.features) > 5) == (slam != 'off')
+
+
+def test_local_areas_cost_no_accuracy():
+    """The path with the features of the local area, and with all."""
+    local, whole = driven(900, slam='ti')[0], driven(900, slam='full')[0]
+    apart = np.array([a.T_map_base - b.T_map_base for (_, a, _), (_, b, _) in zip(local, whole, strict=True)])
+    assert np.sqrt(np.mean(apart[:, 0] ** 2 + apart[:, 1] ** 2)) < 0.005
+    assert all(estimate.n_local <= estimate.n_features for _, estimate, _ in local)
+    assert all(estimate.n_local == estimate.n_features for _, estimate, _ in whole)
 
 
 def test_the_estimate_is_told_in_a_consistent_way():

@@ -140,8 +140,9 @@ def _carrying(pose: Array, lines: Array, covariance: Array, carried: int) -> Ekf
 class _Store:
     """Mean and covariance of all features as of the last fold, the latter with a few terms -W' W still to be added.
 
-    Terms are worked off in sweeps over rows and columns, from the first to the last. A sweep takes what is there when it begins; what comes meanwhile waits
-    for the next. Rows and columns that are written are up to date, so the terms are zero there from then on.
+    Terms are worked off in sweeps over rows and columns, from the first to the last. A sweep takes what is there when
+    it begins; what comes meanwhile waits for the next. Rows and columns that are written are up to date, so the terms
+    are zero there from then on.
     """
 
     def __init__(self) -> None:
@@ -210,7 +211,7 @@ class _Store:
             self._sweeping, self._waiting, self._row = self._waiting, self._sweeping, 0
         if len(self._sweeping) == 0:
             return
-        # Rows grow shorter to the diagonal: a step's share is one of the triangle. Shares are saved up for whole blocks.
+        # Rows grow shorter to the diagonal, so a step's share is one of the triangle; shares are saved up for a block.
         end, a = 2 * self._used, self._row
         self._due += 0.5 * end * end / _SWEEP_STEPS
         if self._due < _BLOCK * (end - a) and self._due < 0.5 * (end - a) ** 2:
