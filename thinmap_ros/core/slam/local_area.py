@@ -98,11 +98,13 @@ class LocalArea:
     def _hand_over(self, gone: dict[int, Array]) -> None:
         """Features of nodes that are no more go to the nodes nearest to where those were, (2,)."""
         features = {node_id: self._features_at.pop(node_id) for node_id in gone}
+        for node_id, left in features.items():
+            for feature_id in left:
+                self._nodes_of[feature_id].discard(node_id)
         for node_id, place in gone.items():
             heir = self._topology.nearest_node(float(place[0]), float(place[1]))
-            for feature_id in features[node_id]:
-                self._nodes_of[feature_id].discard(node_id)
-                if heir is not None:
+            if heir is not None:
+                for feature_id in features[node_id]:
                     self._put(feature_id, heir.id)
 
     def _put(self, feature_id: int, node_id: int) -> None:
