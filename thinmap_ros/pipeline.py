@@ -76,7 +76,9 @@ class Pipeline:
     def _thin(self, T_map_base: Array) -> tuple[GridPatch, TopologicalMap]:
         with self._timed('topology'):
             window = self.grid.window(T_map_base[0], T_map_base[1], self.config.window.window_m)
-            return window, self.topology.update(window, T_map_base)
+            local_topology = self.topology.update(window, T_map_base)
+            self.localizer.set_topology(self.topology.map)
+        return window, local_topology
 
     @contextmanager
     def _timed(self, stage: str) -> Iterator[None]:

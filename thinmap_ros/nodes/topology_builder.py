@@ -53,8 +53,9 @@ class TopologyBuilderNode(Node):
         if pair is None:
             return
         local = self._builder.update(*pair)
-        self._local.publish(messages.topology_msg(local, self._map_frame, stamp_ns))
+        # The local map comes last: who hears it knows that all of this scan is said.
         self._global.publish(messages.topology_msg(self._builder.map, self._map_frame, stamp_ns))
+        self._local.publish(messages.topology_msg(local, self._map_frame, stamp_ns))
 
 
 def main() -> None:
