@@ -1,4 +1,4 @@
-"""The robot's working memory: the last windows of the grid, on one lattice, in a rectangle that moves along."""
+"""The robot's working memory: the last windows of the grid, on one lattice, in a square that moves along."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,9 @@ from thinmap_ros.core.topology.config import TopologyConfig
 
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.int64]
+States = NDArray[np.int8]
+FREE, OCCUPIED = np.int8(0), np.int8(100)
+_NEVER = np.int8(-2)  # never in a window, or forgotten
 _OFF_LATTICE = 1e-3  # of a cell: windows that lie worse than this do not belong to the same grid
 
 
@@ -19,36 +22,54 @@ class Surroundings:
     """What the windows of the last places showed, within memory_m round the newest one: bounded, whatever the map.
 
     Thinning near the rim of a window differs from thinning the whole map. With what lies round the window at hand,
-    the skeleton goes on over its rim as it was drawn before.
+    context_m wide, the skeleton goes on over its rim as it would in a map of the whole. The cells are kept in a square
+    array whose indices wrap round, so that nothing is moved when the robot moves.
     """
 
     def __init__(self, first: GridPatch, config: TopologyConfig) -> None:
+        resolution = first.frame.resolution
         self.lattice = first.frame
-        self.margin = round(config.memory_m / first.frame.resolution)
-        self._depth = round(config.margin_m / first.frame.resolution)
-        self.row, self.col = 0, 0
-        self._cells: NDArray[np.int8] = np.full((1, 1), UNKNOWN, dtype=np.int8)
-        self._seen: Mask = np.zeros((1, 1), dtype=np.bool_)
+        self.margin = round(config.context_m / resolution)
+        self._depth = round(config.margin_m / resolution)
+        self._size = max(first.shape) + 2 * max(round(config.memory_m / resolution), self.margin)
+        self._memory: States = np.full((self._size, self._size), _NEVER, dtype=np.int8)
+        self._low = (0, 0)
+        self.box = Box(0, 0, 1, 1)
+        self._cells: States = np.full((1, 1), _NEVER, dtype=np.int8)
 
     def take(self, window: GridPatch) -> None:
         """Move to a new window and take its cells over.
 
-        Raises InputError where its cells do not lie on those of the first window.
+        Raises InputError where its cells do not lie on those of the first window, or it is larger than that one was.
         """
         row, col = self._place_of(window.frame)
-        row, col = row - self.margin, col - self.margin
         rows, cols = (size + 2 * self.margin for size in window.shape)
-        cells, seen = np.full((rows, cols), UNKNOWN, dtype=np.int8), np.zeros((rows, cols), dtype=np.bool_)
-        target, source = _overlap((row, col, rows, cols), (self.row, self.col, *self._cells.shape))
-        cells[target], seen[target] = self._cells[source], self._seen[source]
-        inner = (slice(self.margin, rows - self.margin), slice(self.margin, cols - self.margin))
-        cells[inner], seen[inner] = window.cells, True
-        self.row, self.col, self._cells, self._seen = row, col, cells, seen
+        if max(rows, cols) > self._size:
+            raise InputError(f'window of {window.shape} cells: expected the size of the first one')
+        self._move_to(row, col, window.shape)
+        states = np.where(window.free, FREE, np.where(window.occupied, OCCUPIED, np.int8(UNKNOWN)))
+        for cells, memory in self._parts(Box(row, col, *window.shape)):
+            self._memory[memory] = states[cells]
+        self.box = Box(row - self.margin, col - self.margin, rows, cols)
+        self._cells = np.empty((rows, cols), dtype=np.int8)
+        for cells, memory in self._parts(self.box):
+            self._cells[cells] = self._memory[memory]
 
-    @property
-    def box(self) -> Box:
-        """The cells that are remembered, on the lattice of the first window."""
-        return Box(self.row, self.col, *self._cells.shape)
+    def _move_to(self, row: int, col: int, shape: tuple[int, int]) -> None:
+        """Put the remembered square round a window, and forget what it has left behind."""
+        low = (row - (self._size - shape[0]) // 2, col - (self._size - shape[1]) // 2)
+        for axis in (0, 1):
+            step = low[axis] - self._low[axis]
+            count = min(abs(step), self._size)
+            first = low[axis] + self._size - count if step > 0 else low[axis]
+            for _, lines in _wrapped(first, count, self._size):
+                self._memory[lines if axis == 0 else (slice(None), lines)] = _NEVER
+        self._low = low
+
+    def _parts(self, box: Box) -> list[tuple[tuple[slice, slice], tuple[slice, slice]]]:
+        """The up to four blocks of a rectangle: where they lie in it, and where in the memory."""
+        rows, cols = _wrapped(box.row, box.rows, self._size), _wrapped(box.col, box.cols, self._size)
+        return [((r, c), (at_r, at_c)) for r, at_r in rows for c, at_c in cols]
 
     def redrawn(self, painted: Mask) -> Mask:
         """Where the new skeleton takes the old one's place: the window, away from places known but not remembered.
@@ -64,7 +85,7 @@ class Surroundings:
     @property
     def inner(self) -> tuple[slice, slice]:
         """Where the newest window lies in the box."""
-        rows, cols = self._cells.shape
+        rows, cols = self.box.rows, self.box.cols
         return (slice(self.margin, rows - self.margin), slice(self.margin, cols - self.margin))
 
     def patch(self, skeleton: Cells, squared: Cells) -> tuple[GridPatch, Mask]:
@@ -75,8 +96,9 @@ class Surroundings:
         other cell is enough for that.
         """
         cells = self._cells.copy()
-        painted = _paint(cells, self._seen, (skeleton - (self.row, self.col))[::2], squared[::2])
-        return GridPatch(self.lattice.shifted(self.row, self.col), cells), painted
+        painted = _paint(cells, (skeleton - (self.box.row, self.box.col))[::2], squared[::2])
+        cells[cells == _NEVER] = UNKNOWN
+        return GridPatch(self.lattice.shifted(self.box.row, self.box.col), cells), painted
 
     def _place_of(self, frame: GridFrame) -> tuple[int, int]:
         if frame.resolution != self.lattice.resolution:
@@ -89,24 +111,16 @@ class Surroundings:
         return round(row), round(col)
 
 
-def _overlap(
-    new: tuple[int, int, int, int], old: tuple[int, int, int, int]
-) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """Slices of the cells that two rectangles (row, col, rows, cols) share, in the new one and in the old one."""
-    target, source = [], []
-    for axis in (0, 1):
-        low = max(new[axis], old[axis])
-        high = max(low, min(new[axis] + new[axis + 2], old[axis] + old[axis + 2]))
-        target.append(slice(low - new[axis], high - new[axis]))
-        source.append(slice(low - old[axis], high - old[axis]))
-    if target[0].start >= target[0].stop or target[1].start >= target[1].stop:
-        nothing = (slice(0, 0), slice(0, 0))
-        return nothing, nothing
-    return (target[0], target[1]), (source[0], source[1])
+def _wrapped(first: int, count: int, size: int) -> list[tuple[slice, slice]]:
+    """The one or two runs of `count` indices from `first` on in a ring of `size`: in the run, and in the ring."""
+    at = first % size
+    head = min(count, size - at)
+    runs = [(slice(0, head), slice(at, at + head))]
+    return runs if head == count else [*runs, (slice(head, count), slice(0, count - head))]
 
 
 @kernel
-def _paint(cells: NDArray[np.int8], seen: Mask, centres: Cells, squared: Cells) -> Mask:
+def _paint(cells: States, centres: Cells, squared: Cells) -> Mask:
     """Mark as free all cells never seen that lie nearer to one of the centres (N, 2) than its clearance; say which."""
     rows, cols = cells.shape
     painted = np.zeros((rows, cols), dtype=np.bool_)
@@ -115,9 +129,12 @@ def _paint(cells: NDArray[np.int8], seen: Mask, centres: Cells, squared: Cells) 
         reach = int(np.sqrt(squared[i]))
         for r in range(max(row - reach, 0), min(row + reach + 1, rows)):
             for c in range(max(col - reach, 0), min(col + reach + 1, cols)):
-                if not seen[r, c] and (r - row) ** 2 + (c - col) ** 2 < squared[i]:
-                    cells[r, c] = 0
+                if cells[r, c] == _NEVER and (r - row) ** 2 + (c - col) ** 2 < squared[i]:
                     painted[r, c] = True
+    for row in range(rows):
+        for col in range(cols):
+            if painted[row, col]:
+                cells[row, col] = FREE
     return painted
 
 

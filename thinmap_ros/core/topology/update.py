@@ -121,7 +121,7 @@ class _View:
         known = known_free(patch, config)
         distance = column_distance(known)
         room = standing_room(distance, config.robot_radius_m / patch.frame.resolution)
-        seeds = known_skeleton[0] - (around.row, around.col)
+        seeds = known_skeleton[0] - (around.box.row, around.box.col)
         seed = nearest_cell(room, patch, robot_xy, config.seed_reach_m)
         self.robot: Cells = np.empty((0, 2), dtype=np.int64) if seed is None else seed[None]
         self.free = reachable(room, np.concatenate((seeds, self.robot)))

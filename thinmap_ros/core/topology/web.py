@@ -273,10 +273,13 @@ def _adds_nothing(web: Web, number: int, base: int, radius: float) -> bool:
     """Whether a spur lies in the room round other chains, those at its base and at the next spots, altogether."""
     near = {spot for other in web.chains_at(base) for spot in (web.chains[other].a, web.chains[other].b)}
     others = [web.chains[other] for other in web.chains_among(near) if other != number]
-    covered = np.zeros(len(web.chains[number].cells), dtype=np.bool_)
-    for chain in others:
-        _cover(web.chains[number].cells, chain.cells, chain.squared, radius, covered)
-    return bool(covered.all())
+    if not others:
+        return False
+    # From the tip on: that is where most spurs stand out.
+    spur = web.chains[number].starting_at(base).cells[::-1]
+    cells = np.concatenate([chain.cells for chain in others])
+    squared = np.concatenate([chain.squared for chain in others])
+    return bool(_is_covered(np.ascontiguousarray(spur), cells, squared, radius))
 
 
 def _as_spur(web: Web, chain: Chain) -> tuple[int, int] | None:
@@ -313,12 +316,16 @@ def room_along(chain: Chain, radius_cells: float) -> Array:
 
 
 @kernel
-def _cover(cells: Cells, others: Cells, squared: Cells, radius: float, covered: Mask) -> None:
-    """Mark which cells (N, 2) lie in the room round the others (M, 2), whose squared clearances are given, (M,)."""
+def _is_covered(cells: Cells, others: Cells, squared: Cells, radius: float) -> bool:
+    """Whether all cells (N, 2) lie in the room round the others (M, 2), whose squared clearances are given, (M,)."""
     room = np.sqrt(squared) - radius
     for i in range(cells.shape[0]):
+        covered = False
         for j in range(others.shape[0]):
-            if covered[i]:
+            row, col = cells[i, 0] - others[j, 0], cells[i, 1] - others[j, 1]
+            if room[j] >= 0.0 and row * row + col * col <= room[j] * room[j]:
+                covered = True
                 break
-            if room[j] >= 0.0 and (cells[i, 0] - others[j, 0]) ** 2 + (cells[i, 1] - others[j, 1]) ** 2 <= room[j] ** 2:
-                covered[i] = True
+        if not covered:
+            return False
+    return True

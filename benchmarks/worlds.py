@@ -1,0 +1,33 @@
+"""Real floors and random worlds to measure on: map_server maps in a folder, with places to start from."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.sim.world import World
+
+WORLDS = Path(__file__).resolve().parent.parent.parent / 'shared' / 'data' / 'worlds'
+
+
+@dataclass(frozen=True, eq=False)
+class Floor:
+    """A world and the poses (N, 3) in it from which a robot may start."""
+
+    name: str
+    path: Path
+    world: World
+    starts: Array
+
+
+def floors(folder: Path, wanted: str = '') -> list[Floor]:
+    """All worlds of a folder whose name holds `wanted`, the largest last."""
+    known = json.loads((folder / 'worlds.json').read_text(encoding='utf-8'))
+    names = sorted((name for name in known if wanted in name), key=lambda name: float(known[name]['free_area_m2']))
+    found = []
+    for name in names:
+        path = folder / f'{name}.yaml'
+        found.append(Floor(name, path, World.load(path), np.array(known[name]['starts'])))
+    return found
