@@ -24,17 +24,18 @@ class WindowConfig(Config):
 
 @dataclass(frozen=True)
 class PipelineConfig:
-    """Parameters of all stages."""
+    """Parameters of all stages; scans_per_graph: the graph is brought up to date with every so many scans."""
 
     localizer: LocalizerConfig = field(default_factory=LocalizerConfig)
     grid: OccupancyConfig = field(default_factory=OccupancyConfig)
     window: WindowConfig = field(default_factory=WindowConfig)
     topology: TopologyConfig = field(default_factory=TopologyConfig)
+    scans_per_graph: int = 1
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What came of one scan: the pose, the window of the map around it, and the window's topological map."""
+    """What came of one scan: the pose, and the window of the map and its topological map, as they were last."""
 
     estimate: Estimate
     window: GridPatch
@@ -57,6 +58,8 @@ class Pipeline:
         self.grid = OccupancyGrid(self.config.grid)
         self.topology = TopologyBuilder(self.config.topology)
         self.stage_seconds: dict[str, list[float]] = {}
+        self._scans = 0
+        self._last: tuple[GridPatch, TopologicalMap] | None = None
         self._locate = pose_source or self.localizer.step
 
     def step(self, scan: Scan, T_odom_base: Array) -> Step:
@@ -65,11 +68,17 @@ class Pipeline:
             estimate = self._locate(scan, T_odom_base)
         with self._timed('grid'):
             self.grid.update(scan, estimate.T_map_base)
-            x, y = estimate.T_map_base[:2]
-            window = self.grid.window(x, y, self.config.window.window_m)
+        if self._last is None or self._scans % self.config.scans_per_graph == 0:
+            self._last = self._thin(estimate.T_map_base)
+        self._scans += 1
+        return Step(estimate, *self._last)
+
+    def _thin(self, T_map_base: Array) -> tuple[GridPatch, TopologicalMap]:
         with self._timed('topology'):
-            local_topology = self.topology.update(window, estimate.T_map_base)
-        return Step(estimate, window, local_topology)
+            window = self.grid.window(T_map_base[0], T_map_base[1], self.config.window.window_m)
+            local_topology = self.topology.update(window, T_map_base)
+            self.localizer.set_topology(self.topology.map)
+        return window, local_topology
 
     @contextmanager
     def _timed(self, stage: str) -> Iterator[None]:

@@ -43,8 +43,14 @@ def test_an_empty_scan_has_no_points():
 
 @pytest.mark.parametrize(
     'changes',
-    [{'angle_min_rad': math.nan}, {'range_max_m': 0.05}, {'range_min_m': -1.0}, {'angle_increment_rad': math.inf}],
+    [
+        {'angle_min_rad': math.nan},
+        {'range_max_m': 0.05},
+        {'range_min_m': -1.0},
+        {'angle_increment_rad': math.inf},
+        {'angle_increment_rad': 0.0},
+    ],
 )
 def test_geometry_that_is_none_is_refused(changes):
     with pytest.raises(InputError, match='expected'):
-        scan_of([1.0], **changes)
+        scan_of([1.0, 1.0], **changes)

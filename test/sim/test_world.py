@@ -8,6 +8,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.sim.world import World
 
@@ -20,10 +21,14 @@ BOX = {
 }
 
 
-def load(tmp_path: Path, **changes: object) -> World:
+def load(path: Path) -> World:
+    return World.from_patch(*read_world(path))
+
+
+def box(tmp_path: Path, **changes: object) -> World:
     path = tmp_path / 'w.yaml'
     path.write_text(yaml.safe_dump(BOX | changes))
-    return World.load(path)
+    return load(path)
 
 
 def is_solid(world: World, x: float, y: float) -> bool:
@@ -32,7 +37,7 @@ def is_solid(world: World, x: float, y: float) -> bool:
 
 
 def test_walls_have_their_thickness(tmp_path: Path) -> None:
-    world = load(tmp_path)
+    world = box(tmp_path)
     assert not is_solid(world, 2.0, 1.5)
     for x, y in [(2.0, 0.04), (2.0, -0.04), (3.96, 1.0), (4.04, 1.0), (4.04, 3.04), (-0.04, -0.04)]:
         assert is_solid(world, x, y), (x, y)
@@ -41,7 +46,7 @@ def test_walls_have_their_thickness(tmp_path: Path) -> None:
 
 
 def test_every_axis_parallel_wall_of_the_room_is_equally_thick() -> None:
-    world = World.load(ROOM)
+    world = load(ROOM)
     for x, y, along in [(3.5, 1.0, 0), (6.5, 8.0, 0), (1.0, 6.0, 1), (9.0, 3.4, 1), (0.0, 5.0, 0), (5.0, 10.0, 1)]:
         row, col = world.frame.cells_of(np.array([[x, y]]))[0]
         across = world.occupied[row, col - 10 : col + 10] if along == 0 else world.occupied[row - 10 : row + 10, col]
@@ -51,7 +56,7 @@ def test_every_axis_parallel_wall_of_the_room_is_equally_thick() -> None:
 def test_a_slanting_wall_lets_no_ray_through(tmp_path: Path) -> None:
     from thinmap_ros.core.grid.raytrace import cast_rays
 
-    world = load(tmp_path, walls=[*BOX['walls'], [[0, 0], [4, 3]]])
+    world = box(tmp_path, walls=[*BOX['walls'], [[0, 0], [4, 3]]])
     x, y = (np.array([1.0, 2.0]) - (world.frame.origin_x, world.frame.origin_y)) / 0.05
     angles = np.linspace(-np.pi, np.pi, 4001)
     reach = cast_rays(world.occupied, x, y, angles, 200.0) * 0.05
@@ -60,11 +65,11 @@ def test_a_slanting_wall_lets_no_ray_through(tmp_path: Path) -> None:
 
 
 def test_solids_are_filled(tmp_path: Path) -> None:
-    world = load(tmp_path, solids=[[[1, 1], [2, 1], [2, 2], [1, 2]], [[3, 1], [3.5, 1], [3.25, 2]]])
+    world = box(tmp_path, solids=[[[1, 1], [2, 1], [2, 2], [1, 2]], [[3, 1], [3.5, 1], [3.25, 2]]])
     inside = [(1.02, 1.02), (1.98, 1.98), (1.5, 1.5), (3.25, 1.5)]
     assert all(is_solid(world, x, y) for x, y in inside)
     assert not any(is_solid(world, x, y) for x, y in [(0.98, 1.5), (2.02, 1.5), (3.05, 1.8), (3.45, 1.8)])
-    area_m2 = (int(world.occupied.sum()) - int(load(tmp_path).occupied.sum())) * 0.05**2
+    area_m2 = (int(world.occupied.sum()) - int(box(tmp_path).occupied.sum())) * 0.05**2
     assert area_m2 == pytest.approx(1.25, abs=0.02)
 
 
@@ -92,12 +97,12 @@ def _box_world() -> World:
         import tempfile
 
         with tempfile.TemporaryDirectory() as folder:
-            _BOXES.append(load(Path(folder)))
+            _BOXES.append(box(Path(folder)))
     return _BOXES[0]
 
 
 def test_the_room_is_the_papers(tmp_path: Path) -> None:
-    world = World.load(ROOM)
+    world = load(ROOM)
     assert world.name == 'room_10x10'
     assert world.frame.resolution == 0.02
     assert world.is_clear(*world.start[:2], 0.3)
@@ -108,7 +113,7 @@ def test_the_room_is_the_papers(tmp_path: Path) -> None:
 def test_passages_of_the_room_are_a_metre_wide() -> None:
     from scipy import ndimage
 
-    world = World.load(ROOM)
+    world = load(ROOM)
     wide, _ = ndimage.label(world.wall_distance_m > 0.5)
     corners = [(1.5, 1.5), (1.0, 9.0), (9.0, 9.0), (9.0, 1.0), (5.0, 1.0), (1.0, 5.0)]
     places = world.frame.cells_of(np.array(corners))
@@ -136,7 +141,7 @@ def test_passages_of_the_room_are_a_metre_wide() -> None:
 )
 def test_what_is_wrong_is_said(tmp_path: Path, change: dict[str, object], said: str) -> None:
     with np.errstate(all='ignore'), pytest.raises(InputError, match=said) as error:
-        load(tmp_path, **change)
+        box(tmp_path, **change)
     assert str(tmp_path / 'w.yaml') in str(error.value)
     assert '\n' not in str(error.value)
 
@@ -146,15 +151,15 @@ def test_text_that_is_no_world(tmp_path: Path, text: str) -> None:
     path = tmp_path / 'w.yaml'
     path.write_text(text)
     with pytest.raises(InputError, match=r'w\.yaml'):
-        World.load(path)
+        load(path)
 
 
 def test_no_file_and_no_text(tmp_path: Path) -> None:
     with pytest.raises(InputError, match='No such file'):
-        World.load(tmp_path / 'none.yaml')
+        load(tmp_path / 'none.yaml')
     (tmp_path / 'b.yaml').write_bytes(b'\xff\xfe\x00')
     with pytest.raises(InputError, match=r'b\.yaml'):
-        World.load(tmp_path / 'b.yaml')
+        load(tmp_path / 'b.yaml')
 
 
 def test_a_map_is_a_world(tmp_path: Path) -> None:
@@ -167,7 +172,7 @@ def test_a_map_is_a_world(tmp_path: Path) -> None:
     (tmp_path / 'm.yaml').write_text(
         'image: m.pgm\nresolution: 0.1\norigin: [-1.0, 2.0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n'
     )
-    world = World.load(tmp_path / 'm.yaml')
+    world = load(tmp_path / 'm.yaml')
     assert world.occupied.shape == (20, 30)
     assert world.occupied[17, 5] == 1, 'unknown is solid, and rows are turned over'
     assert world.occupied[2, 5] == 0

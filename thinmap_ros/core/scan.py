@@ -40,7 +40,8 @@ class Scan:
     ) -> 'Scan':
         """Make a scan, rounded to float32 as sensor_msgs/LaserScan is: text log, bag and live agree bit for bit.
 
-        Raises InputError where the geometry is no geometry: NaN angles, an empty or negative range interval.
+        Raises InputError where the geometry is no geometry: NaN angles, beams without an angle between them, an empty
+        or negative range interval.
         """
         ranges = np.asarray(ranges_m, dtype=np.float32).astype(np.float64)
         first, step, low, high = (
@@ -49,6 +50,8 @@ class Scan:
         if ranges.ndim != 1 or not np.isfinite([first, step, low]).all() or np.isnan(high):
             limits = f'angles {first}, {step}, range {low} to {high}'
             raise InputError(f'scan at {stamp_ns} ns: {limits}: expected finite numbers')
+        if step == 0.0 and ranges.size > 1:
+            raise InputError(f'scan at {stamp_ns} ns: {ranges.size} beams, increment 0: expected an angle between them')
         if not 0.0 <= low < high:
             raise InputError(f'scan at {stamp_ns} ns: range {low} to {high} m: expected 0 <= min < max')
         T_base_laser = np.zeros(3) if T_base_laser is None else np.asarray(T_base_laser, dtype=np.float64)

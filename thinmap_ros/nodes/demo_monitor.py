@@ -15,6 +15,7 @@ from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import ExplorationStatus
 from thinmap_ros.adapters import messages, parameters, qos, resources, runtime
 from thinmap_ros.adapters.files import write_text
+from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.sim.coverage import coverable
 from thinmap_ros.sim.pioneer import PRESETS
@@ -41,7 +42,7 @@ class DemoMonitorNode(Node):
         super().__init__('demo_monitor')
         self._config = parameters.declare(self, DemoMonitorConfig)
         parameters.check_unknown(self)
-        world = World.load(resources.world_path(self._config.world))
+        world = World.from_patch(*read_world(resources.world_path(self._config.world)))
         radius = PRESETS[self._config.robot].radius_m
         self._coverable = coverable(world, world.start, radius, self._config.range_max_m)
         self._coverage = 0.0

@@ -15,6 +15,7 @@ from sensor_msgs.msg import LaserScan
 from thinmap_msgs.action import Explore, NavigateToPose
 from thinmap_msgs.msg import EndNode as EndNodeMsg
 from thinmap_msgs.msg import EndNodeArray, ExplorationStatus, SlamStatus, TopologicalMap
+from thinmap_ros import warm_up
 from thinmap_ros.adapters import messages, parameters, qos, runtime
 from thinmap_ros.adapters.actions import Outcome, SingleGoalServer
 from thinmap_ros.adapters.stamps import StampMatcher
@@ -43,6 +44,7 @@ class ExplorerNode(Node):
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
         self._mount = LaserMount(self)
         parameters.check_unknown(self)
+        warm_up.explorer()
         self._map = MapMirror()
         self._topology = messages.topology_from(TopologicalMap())
         self._matcher: StampMatcher[LaserScan, Array] = StampMatcher()

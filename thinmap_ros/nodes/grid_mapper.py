@@ -8,6 +8,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.srv import SaveMap
+from thinmap_ros import warm_up
 from thinmap_ros.adapters import map_files, messages, parameters, qos, runtime
 from thinmap_ros.adapters.stamps import StampMatcher
 from thinmap_ros.adapters.transforms import LaserMount
@@ -29,6 +30,7 @@ class GridMapperNode(Node):
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
         self._mount = LaserMount(self)
         parameters.check_unknown(self)
+        warm_up.grid_mapper()
         self._matcher: StampMatcher[LaserScan, Array] = StampMatcher()
         self._latest_ns: int | None = None
         self._map = self.create_publisher(OccupancyGridMsg, 'map', qos.LATCHED)

@@ -8,7 +8,8 @@ from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
-from thinmap_msgs.msg import LineFeature, LineFeatureArray, SlamStatus
+from thinmap_msgs.msg import LineFeature, LineFeatureArray, SlamStatus, TopologicalMap
+from thinmap_ros import warm_up
 from thinmap_ros.adapters import messages, parameters, qos, runtime
 from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.core.errors import InputError
@@ -31,11 +32,14 @@ class LocalizerNode(Node):
         self._odom_frame = parameters.declare_value(self, 'odom_frame', 'odom', 'frame of the odometry')
         self._mount = LaserMount(self)
         parameters.check_unknown(self)
+        warm_up.localizer()
         self._pairing = ScanPairing()
         self._pose = self.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
         self._tf = self.create_publisher(TFMessage, '/tf', qos.STREAM)
         self._features = self.create_publisher(LineFeatureArray, 'line_features', qos.LATCHED)
         self._status = self.create_publisher(SlamStatus, 'slam_status', qos.STREAM)
+        # Before the scans: of messages that wait together, the executor takes the graph of the last scan first.
+        self.create_subscription(TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
         self.create_subscription(Odometry, 'odom', self._on_odometry, qos.STREAM)
         self.create_subscription(LaserScan, 'scan', self._on_scan, qos.SENSOR)
         self.create_subscription(PoseWithCovarianceStamped, 'initialpose', self._on_initial_pose, qos.STREAM)
@@ -73,6 +77,12 @@ class LocalizerNode(Node):
             return
         self._localizer.set_pose(T_map_base, messages.covariance_from(message))
 
+    def _on_topology(self, message: TopologicalMap) -> None:
+        try:
+            self._localizer.set_topology(messages.topology_from(message))
+        except InputError as error:
+            self.get_logger().warning(f'topology: {error}', throttle_duration_sec=_WARN_PERIOD_S)
+
     def _take(self, ready: list[tuple[Scan, Array]]) -> None:
         for scan, T_odom_base in ready:
             started = perf_counter()
@@ -94,7 +104,7 @@ class LocalizerNode(Node):
                 header=header,
                 state=SlamStatus.LOST if estimate.lost else SlamStatus.TRACKING,
                 features=len(features),
-                local_features=len(features),
+                local_features=estimate.n_local,
                 observed=estimate.observed,
                 matched=estimate.matched,
                 refused=self._localizer.refused,
@@ -112,7 +122,8 @@ def _feature_msg(feature: Feature) -> LineFeature:
         covariance=feature.covariance.ravel(),
         start=Point(x=float(feature.start[0]), y=float(feature.start[1])),
         end=Point(x=float(feature.end[0]), y=float(feature.end[1])),
-        in_local_area=True,
+        node_ids=feature.nodes,
+        in_local_area=feature.local,
     )
 
 

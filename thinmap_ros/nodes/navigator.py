@@ -7,6 +7,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.action import NavigateToPose
+from thinmap_ros import warm_up
 from thinmap_ros.adapters import messages, parameters, qos, runtime
 from thinmap_ros.adapters.actions import Outcome, SingleGoalServer
 from thinmap_ros.adapters.transforms import LaserMount
@@ -32,6 +33,7 @@ class NavigatorNode(Node):
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
         self._mount = LaserMount(self)
         parameters.check_unknown(self)
+        warm_up.navigator()
         self._map = MapMirror()
         self._odometry = OdometryBuffer()
         self._T_map_odom: Array | None = None

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from time import monotonic
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
+from geometry_msgs.msg import PoseStamped, Twist
 from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -14,6 +14,8 @@ from std_msgs.msg import UInt32
 from tf2_msgs.msg import TFMessage
 
 from thinmap_ros.adapters import messages, parameters, qos, resources, runtime
+from thinmap_ros.adapters.lockstep import NONE, TOPICS, Lockstep
+from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import ConfigError
@@ -24,7 +26,6 @@ from thinmap_ros.sim.runner import STEP_NS, Moment, Simulation
 from thinmap_ros.sim.world import World
 
 _COMMAND_TIMEOUT_NS = 500_000_000
-_LOCKSTEP_PATIENCE_S = 2.0
 _REPEAT_S = 0.25
 
 
@@ -37,7 +38,7 @@ class SimConfig(Config):
     start: str = parameter('', 'start as "x,y,theta" (m, m, rad); empty: the one of the world')
     seed: int = parameter(0, 'decides all noise', low=0, high=2**31 - 1)
     rate: float = parameter(1.0, 'simulated seconds a second', low=0.01, high=1000.0)
-    lockstep: bool = parameter(False, 'wait for /pose of each scan: nothing is lost at high rates')
+    lockstep: str = parameter(NONE, 'wait for what each scan leads to: nothing is lost at high rates', choices=TOPICS)
     hold_for_subscribers: int = parameter(0, 'time stands still until /scan has so many subscribers', low=0, high=100)
     publish_tf: bool = parameter(True, 'publish odom -> base_link and base_link -> laser')
 
@@ -50,14 +51,14 @@ class SimNode(Node):
         self._config = parameters.declare(self, SimConfig)
         laser = parameters.declare(self, Lms200Config)
         parameters.check_unknown(self)
-        world = World.load(resources.world_path(self._config.world))
+        world = World.from_patch(*read_world(resources.world_path(self._config.world)))
         start = _start(self._config.start, world)
         self._sim = Simulation(world, start, PRESETS[self._config.robot], laser, self._config.seed)
         self._scan_time_s = 1.0 / laser.rate_hz
         self._command, self._command_ns = (0.0, 0.0), 0
-        self._awaited_ns: int | None = None
+        self._lockstep = Lockstep(self, self._config.lockstep)
         self._last_scan: LaserScan | None = None
-        self._asked_at = 0.0
+        self._repeated_at = 0.0
         self._running = False
         self._told_collisions = -1
         self._make_topics()
@@ -74,16 +75,11 @@ class SimNode(Node):
         self._tf = self.create_publisher(TFMessage, '/tf', qos.STREAM)
         self._tf_static = self.create_publisher(TFMessage, '/tf_static', qos.STATIC_TRANSFORMS)
         self.create_subscription(Twist, 'cmd_vel', self._on_command, qos.STREAM)
-        self.create_subscription(PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
 
     def _on_command(self, message: Twist) -> None:
         if np.isfinite([message.linear.x, message.angular.z]).all():
             self._command = (message.linear.x, message.angular.z)
             self._command_ns = self._sim.stamp_ns
-
-    def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
-        if self._awaited_ns is not None and messages.stamp_ns(message.header.stamp) >= self._awaited_ns:
-            self._awaited_ns = None
 
     def _tick(self) -> None:
         if not self._running:
@@ -92,26 +88,21 @@ class SimNode(Node):
             self._running = True
             self._publish(self._sim.sense())
             return
-        if self._awaited_ns is not None and self._waits():
+        if self._lockstep.waits and self._waits():
             return
         # As a robot's own controller does: without a fresh command it stops.
         fresh = self._sim.stamp_ns - self._command_ns <= _COMMAND_TIMEOUT_NS
         self._publish(self._sim.step(*(self._command if fresh else (0.0, 0.0))))
 
     def _waits(self) -> bool:
-        """Whether time has to stand still for the pose of the last scan. The first scan is repeated until then."""
-        waited = monotonic() - self._asked_at
-        if self._awaited_ns == 0:
-            if waited > _REPEAT_S and self._last_scan is not None:
-                self._asked_at = monotonic()
-                self._publish_clock(0)
-                self._scan.publish(self._last_scan)
-                self._odom.publish(self._odometry(self._sim.sense()))
-            return True
-        if waited > _LOCKSTEP_PATIENCE_S:
-            self.get_logger().warning('no /pose for the last scan: going on without it')
-            self._awaited_ns = None
-            return False
+        """Whether time has to stand still for the last scan. The first one is repeated until somebody answers."""
+        if self._sim.stamp_ns > 0:
+            return not self._lockstep.give_up()
+        if monotonic() - self._repeated_at > _REPEAT_S and self._last_scan is not None:
+            self._repeated_at = monotonic()
+            self._publish_clock(0)
+            self._scan.publish(self._last_scan)
+            self._odom.publish(self._odometry(self._sim.sense()))
         return True
 
     def _publish(self, moment: Moment) -> None:
@@ -128,8 +119,8 @@ class SimNode(Node):
         if moment.scan is not None:
             self._last_scan = messages.scan_msg(moment.scan, 'laser', self._scan_time_s)
             self._scan.publish(self._last_scan)
-            if self._config.lockstep:
-                self._awaited_ns, self._asked_at = moment.stamp_ns, monotonic()
+            self._lockstep.sent(moment.stamp_ns)
+            self._repeated_at = monotonic()
 
     def _publish_clock(self, ns: int) -> None:
         self._clock_topic.publish(ClockMsg(clock=messages.time_msg(ns)))

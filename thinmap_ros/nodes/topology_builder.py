@@ -5,6 +5,7 @@ from nav_msgs.msg import OccupancyGrid
 from rclpy.node import Node
 
 from thinmap_msgs.msg import TopologicalMap
+from thinmap_ros import warm_up
 from thinmap_ros.adapters import messages, parameters, qos, runtime
 from thinmap_ros.adapters.stamps import StampMatcher
 from thinmap_ros.core.errors import InputError
@@ -23,6 +24,7 @@ class TopologyBuilderNode(Node):
         self._builder = TopologyBuilder(parameters.declare(self, TopologyConfig))
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
         parameters.check_unknown(self)
+        warm_up.topology_builder()
         self._matcher: StampMatcher[GridPatch, Array] = StampMatcher()
         self._local = self.create_publisher(TopologicalMap, 'local_topology', qos.LATCHED)
         self._global = self.create_publisher(TopologicalMap, 'topology', qos.LATCHED)
@@ -51,8 +53,9 @@ class TopologyBuilderNode(Node):
         if pair is None:
             return
         local = self._builder.update(*pair)
-        self._local.publish(messages.topology_msg(local, self._map_frame, stamp_ns))
+        # The local map comes last: who hears it knows that all of this scan is said.
         self._global.publish(messages.topology_msg(self._builder.map, self._map_frame, stamp_ns))
+        self._local.publish(messages.topology_msg(local, self._map_frame, stamp_ns))
 
 
 def main() -> None:

@@ -6,6 +6,7 @@ robot of a radius can reach from its start, that the map holds as free.
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,14 +41,19 @@ class Coverable:
 
         T_world_map (3,): where the map's frame lies in the world; None: they are the same.
         """
-        centres = self.frame.centres_of(np.argwhere(self.cells))
+        centres = self._centres
         if len(centres) == 0:
             return 1.0
         if T_world_map is not None:
             centres = se2.transform_points(se2.invert(T_world_map), centres)
-        inside = patch.contains(centres)
-        at = patch.frame.cells_of(centres[inside])
-        return float(patch.free[at[:, 0], at[:, 1]].sum()) / len(centres)
+        at = patch.frame.cells_of(centres)
+        rows, cols = patch.shape
+        inside = (at[:, 0] >= 0) & (at[:, 0] < rows) & (at[:, 1] >= 0) & (at[:, 1] < cols)
+        return float(patch.free[at[inside, 0], at[inside, 1]].sum()) / len(centres)
+
+    @cached_property
+    def _centres(self) -> Array:
+        return self.frame.centres_of(np.argwhere(self.cells))
 
 
 def coverable(world: World, start: Array, radius_m: float, range_m: float) -> Coverable:

@@ -15,10 +15,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from thinmap_ros.adapters import resources
+from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.sim.pioneer import PRESETS
-from thinmap_ros.sim.world import World
 from thinmap_ros.tools import cli, demo_results
 
 _PATIENCE_S = 1.2
@@ -55,8 +55,9 @@ class Processes:
         return next((name for name, process in self.running.items() if process.poll() is not None), None)
 
     def stop(self) -> None:
-        """SIGINT to every group, and SIGKILL to those that are still there a little later."""
-        self._signal(signal.SIGINT)
+        """SIGTERM to every group, and SIGKILL to those that are still there a little later."""
+        # Unlike SIGINT it ends a process without a word that is still importing.
+        self._signal(signal.SIGTERM)
         until = time.monotonic() + _PATIENCE_S
         while time.monotonic() < until and any(p.poll() is None for p in self.running.values()):
             time.sleep(_SLEEP_S)
@@ -73,7 +74,7 @@ class Processes:
 
 def _die_with_parent() -> None:
     """However the demo itself ends, its nodes do not stay behind (Linux)."""
-    ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGINT)
+    ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGTERM)
 
 
 def _raise_interrupt(number: int, frame: object) -> None:
@@ -95,7 +96,7 @@ def explore(arguments: argparse.Namespace, world: Path, start: Array) -> None:
     try:
         for name in _NODES:
             processes.start(name, sim_time + extra.get(name, []))
-        lockstep = ['-p', 'lockstep:=true', '-p', f'hold_for_subscribers:={_SCAN_LISTENERS}']
+        lockstep = ['-p', 'lockstep:=local_topology', '-p', f'hold_for_subscribers:={_SCAN_LISTENERS}']
         clock = ['-p', f'rate:={arguments.rate}', '-p', f'seed:={arguments.seed}']
         where = ['-p', f'start:={start[0]},{start[1]},{start[2]}']
         processes.start('sim', common + lockstep + clock + where)
@@ -141,7 +142,7 @@ def _work(arguments: argparse.Namespace) -> None:
     if arguments.view and importlib.util.find_spec('rerun') is None:
         raise InputError('--view: rerun is not installed: pip install "thinmap_ros[viewer]"')
     world = resources.world_path(arguments.world)
-    start = World.load(world).start
+    _, _, start = read_world(world)
     signal.signal(signal.SIGTERM, _raise_interrupt)
     _prepare(arguments.out)
     _choose_domain()

@@ -10,9 +10,9 @@ import numpy as np
 from thinmap_ros.adapters import bag_messages, figures, graph_files, map_files, trajectory_files
 from thinmap_ros.adapters.bags import Bag
 from thinmap_ros.adapters.files import write_text
+from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.exploration.position_probability import NEAR_M
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
@@ -70,7 +70,7 @@ def read(path: Path) -> Recording:
 def write(out: Path, world_file: Path, robot: str, result: dict[str, Any]) -> dict[str, Any]:
     """Write map, graph, trajectory, picture and report of the run in out/bag; returns the report."""
     recording = read(out / 'bag')
-    world = World.load(world_file)
+    world = World.from_patch(*read_world(world_file))
     start = next(iter(recording.true.values()))
     seen = coverable(world, start, PRESETS[robot].radius_m, recording.range_max_m)
     report = _report(recording, seen, result)
@@ -104,9 +104,6 @@ def _report(recording: Recording, seen: Coverable, result: dict[str, Any]) -> di
 def _census(recording: Recording) -> EndNodeCensus:
     census = EndNodeCensus()
     for ns, nodes in recording.end_nodes:
-        T_map_base = recording.estimated.get(ns)
-        for node_id, x, y in nodes:
-            census.seen.add(node_id)
-            if T_map_base is not None and np.hypot(x - T_map_base[0], y - T_map_base[1]) < NEAR_M:
-                census.visited.add(node_id)
+        if ns in recording.estimated:
+            census.take(nodes, recording.estimated[ns])
     return census

@@ -14,9 +14,18 @@ from tqdm import tqdm
 
 from thinmap_ros.adapters import figures, graph_files, map_files, trajectory_files
 from thinmap_ros.adapters.files import write_text
+from thinmap_ros.adapters.world_files import read_world
+from thinmap_ros.baselines.exploration import (
+    DistanceAdvantage,
+    ExploreLite,
+    InformationGain,
+    NearestFrontier,
+    VisitAllEndNodes,
+)
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.explorer import Decision, Explorer, ExplorerConfig
+from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.scan import Scan
@@ -34,6 +43,8 @@ from thinmap_ros.tools.report import Ending, EndNodeCensus, exploration_report
 
 _CONTROL_STEPS = 2
 _MEASURE_SCANS = 5
+# At the survey's pace; thinning costs more than all else together.
+_SCANS_PER_GRAPH = 5
 
 
 class Strategy(Protocol):
@@ -49,6 +60,11 @@ class Strategy(Protocol):
 STRATEGIES: dict[str, Callable[[], Strategy]] = {
     'position_probability': lambda: Explorer(ExplorerConfig()),
     'paper': lambda: Explorer(ExplorerConfig(mode='paper')),
+    'nearest_frontier': NearestFrontier,
+    'visit_all_end_nodes': VisitAllEndNodes,
+    'explore_lite': ExploreLite,
+    'information_gain': InformationGain,
+    'distance_advantage': DistanceAdvantage,
 }
 
 
@@ -106,7 +122,7 @@ class ClosedLoop:
         self.log.stamps_ns.append(scan.stamp_ns)
         self.log.poses.append(estimate.T_map_base)
         self.log.true_poses.append(self.simulation.robot.T_world_base)
-        self.log.census.take(self.decision.end_nodes, estimate.T_map_base)
+        self.log.census.take([(n.node_id, n.x, n.y) for n in self.decision.end_nodes], estimate.T_map_base)
         target = self.decision.target
         if target is None:
             self.navigator.cancel()
@@ -144,12 +160,14 @@ def true_pose_source(simulation: Simulation) -> Callable[[Scan, Array], Estimate
 
 def make_loop(world: World, start: Array, arguments: argparse.Namespace) -> ClosedLoop:
     """All parts as the arguments (strategy, robot, laser, seed, speed, localization) want them."""
-    robot = PRESETS[arguments.robot]
-    simulation = Simulation(world, start, robot, cli.config_from(arguments, Lms200Config), arguments.seed)
+    robot, laser = PRESETS[arguments.robot], cli.config_from(arguments, Lms200Config)
+    simulation = Simulation(world, start, robot, laser, arguments.seed)
     x, y, theta = (float(number) for number in start)
     localizer = LocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=theta)
     source = true_pose_source(simulation) if arguments.localization == 'truth' else None
-    pipeline = Pipeline(PipelineConfig(localizer=localizer), source)
+    # A beam that met nothing has seen as far as this laser can.
+    grid = OccupancyConfig(no_return_range_m=laser.range_max_m)
+    pipeline = Pipeline(PipelineConfig(localizer=localizer, grid=grid, scans_per_graph=_SCANS_PER_GRAPH), source)
     navigator = Navigator(NavigatorConfig(max_speed_m_s=arguments.speed))
     return ClosedLoop(simulation, pipeline, STRATEGIES[arguments.strategy](), navigator)
 
@@ -188,10 +206,11 @@ def _start(world: World, given: str | None) -> Array:
 
 
 def _work(arguments: argparse.Namespace) -> None:
-    world = World.load(arguments.world)
+    world = World.from_patch(*read_world(arguments.world))
     start = _start(world, arguments.start)
     loop = make_loop(world, start, arguments)
-    goal = coverable(world, start, PRESETS[arguments.robot].radius_m, arguments.range_max_m)
+    laser = cli.config_from(arguments, Lms200Config)
+    goal = coverable(world, start, PRESETS[arguments.robot].radius_m, laser.range_max_m)
     began = time.perf_counter()
     with tqdm(total=100, unit='%', disable=arguments.quiet, bar_format='{l_bar}{bar}| {postfix}') as bar:
 

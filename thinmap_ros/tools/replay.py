@@ -48,7 +48,7 @@ def replay(log: Log, config: PipelineConfig, show_progress: bool = False) -> Rep
             step = result.pipeline.step(scan, T_odom_base)
             result.stamps_ns.append(scan.stamp_ns)
             result.poses.append(step.estimate.T_map_base)
-            result.local_features.append(step.estimate.matched)
+            result.local_features.append(step.estimate.n_local)
     result.skipped = log.skipped.count + pairing.dropped + pairing.waiting
     result.first_skipped = log.skipped.first
     if not result.poses:

@@ -1,31 +1,70 @@
 """The numbers that sum up an exploration, from plain arrays: the same for the simulator and for the live graph."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from thinmap_ros.core.exploration.explorer import EndNode
 from thinmap_ros.core.exploration.position_probability import NEAR_M
 from thinmap_ros.core.se2 import Array
 
 MILESTONES = (0.90, 0.95, 0.98, 0.99)
+SAME_PLACE_M = 1.0
+FEWEST_SIGHTINGS = 5
 
 
-@dataclass
+@dataclass(eq=False)
+class _Place:
+    """A place where an end node was: where it is or was last (m), under which id, how often seen, whether come near."""
+
+    node_id: int
+    x: float
+    y: float
+    sightings: int = 0
+    visited: bool = False
+
+
 class EndNodeCensus:
-    """Which end nodes there ever were, and to which of them the robot came near."""
+    """At how many places there were end nodes, and to how many of them the robot came near.
 
-    seen: set[int] = field(default_factory=set)
-    visited: set[int] = field(default_factory=set)
+    An end node wanders as the map grows, and may come and go under new ids: one that appears within SAME_PLACE_M of
+    where another one was last, and is no more, continues that one. One that did not last for FEWEST_SIGHTINGS
+    decisions is not counted.
+    """
 
-    def take(self, end_nodes: Sequence[EndNode], T_map_base: Array) -> None:
-        """Count the end nodes of a decision made at a pose (3,); nearer than 0.5 m is a visit (equation (2))."""
-        for node in end_nodes:
-            self.seen.add(node.node_id)
-            if (node.x - T_map_base[0]) ** 2 + (node.y - T_map_base[1]) ** 2 < NEAR_M**2:
-                self.visited.add(node.node_id)
+    def __init__(self) -> None:
+        self._places: list[_Place] = []
+
+    @property
+    def seen(self) -> int:
+        """Places where an end node lasted."""
+        return sum(place.sightings >= FEWEST_SIGHTINGS for place in self._places)
+
+    @property
+    def visited(self) -> int:
+        """Those of them to which the robot came near."""
+        return sum(place.visited and place.sightings >= FEWEST_SIGHTINGS for place in self._places)
+
+    def take(self, end_nodes: Iterable[tuple[int, float, float]], T_map_base: Array) -> None:
+        """Count the end nodes (id, x, y in m) known at a pose (3,); nearer than 0.5 m is a visit (equation (2))."""
+        nodes = {node_id: (x, y) for node_id, x, y in end_nodes}
+        alive = {place.node_id: place for place in self._places if place.node_id in nodes}
+        idle = [place for place in self._places if place.node_id not in nodes]
+        for node_id, (x, y) in nodes.items():
+            place = alive.get(node_id) or self._continued(idle, x, y)
+            place.node_id, place.x, place.y = node_id, x, y
+            place.sightings += 1
+            place.visited |= math.dist((x, y), T_map_base[:2]) < NEAR_M
+
+    def _continued(self, idle: list[_Place], x: float, y: float) -> _Place:
+        near = min(idle, key=lambda place: math.dist((x, y), (place.x, place.y)), default=None)
+        if near is not None and math.dist((x, y), (near.x, near.y)) <= SAME_PLACE_M:
+            idle.remove(near)
+            return near
+        self._places.append(_Place(0, x, y))
+        return self._places[-1]
 
 
 @dataclass(frozen=True)
@@ -63,8 +102,8 @@ def exploration_report(
         'distance_at': distances_at,
         'time_at': times_at,
         'collisions': ending.collisions,
-        'end_nodes_seen': len(census.seen),
-        'end_nodes_visited': len(census.visited),
+        'end_nodes_seen': census.seen,
+        'end_nodes_visited': census.visited,
         'pose_rmse': round(float(np.sqrt(np.mean(errors**2))), 5),
         'turned_rad': round(float(np.abs(_turns(true_poses)).sum()), 2),
     }

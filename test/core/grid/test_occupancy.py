@@ -27,7 +27,8 @@ def percent(grid, x, y):
 def reference(scan, T, config):
     """Cells passed and hit by sampling each beam finely: slow, obvious, and blind only at corners of cells."""
     passed, hit = set(), set()
-    for r, angle in zip(scan.ranges_m, scan.angles_rad + T[2], strict=True):
+    ranges = np.where(scan.hit, scan.ranges_m + config.surface_depth_m, scan.ranges_m)
+    for r, angle in zip(ranges, scan.angles_rad + T[2], strict=True):
         reach = min(r, config.usable_range_m) if r < scan.range_max_m else config.no_return_range_m
         along = np.arange(0.0, reach, 0.002)
         cells = np.floor(np.column_stack([T[1] + along * math.sin(angle), T[0] + along * math.cos(angle)]) / 0.1)
@@ -161,3 +162,17 @@ def test_beams_that_graze_a_wall_do_not_erase_it():
     wall = row.cells[row.frame.cells_of(np.array([[0.0, 1.05]]))[0][0]]
     columns = row.frame.cells_of(np.array([[-3.5, 1.05], [2.0, 1.05]]))[:, 1]
     assert (wall[columns[0] : columns[1]] >= 65).all()
+
+
+def test_a_wall_on_the_border_of_two_cells_leaves_the_one_in_front_free():
+    grid, rng = OccupancyGrid(), np.random.default_rng(4)
+    bearings = np.radians(np.arange(-90.0, 91.0))
+    for _ in range(30):
+        # A wall along x = 2.0, seen with 1 cm of noise.
+        with np.errstate(divide='ignore'):
+            ranges = 2.0 / np.cos(bearings) + rng.normal(0.0, 0.01, 181)
+        grid.update(scan_of(np.where(np.abs(bearings) < 0.8, ranges, np.nan)), pose(0.0, 0.05, 0.0))
+    beside = [percent(grid, 1.95, y) for y in np.arange(-1.45, 1.5, 0.1)]
+    behind = [percent(grid, 2.05, y) for y in np.arange(-1.45, 1.5, 0.1)]
+    assert max(beside) <= 25
+    assert min(behind) >= 65

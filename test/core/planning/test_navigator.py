@@ -146,3 +146,13 @@ def test_speed_is_kept_low_enough_to_stop_before_what_stands_ahead():
         for _ in range(60):
             ride.step()
         assert ride.nearest_m >= min(0.2, gap - 0.15)
+
+
+@pytest.mark.parametrize('dt_s', [0.01, 0.02, 0.05, 0.1, 0.2])
+def test_it_sets_out_in_free_space_however_often_it_is_asked(dt_s):
+    navigator, patch = Navigator(), GridPatch(GridFrame(0.0, 0.0, 0.1), room())
+    scan = Scan.create(0, np.full(181, 3.0), -math.pi / 2, math.pi / 180, 0.02, 8.0)
+    navigator.set_goal(6.0, 3.0)
+    commands = [navigator.step(np.array([2.0, 3.0, 0.0]), patch, scan, dt_s) for _ in range(100)]
+    assert all(command.state == 'driving' for command in commands)
+    assert commands[-1].v == pytest.approx(0.2)

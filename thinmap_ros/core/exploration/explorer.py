@@ -27,10 +27,9 @@ from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.planning.graph_search import access, costs_from
-from thinmap_ros.core.planning.wavefront import nearest_true, standing_places
+from thinmap_ros.core.planning.wavefront import nearest_true, places_in_reach
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.topology.free_space import reachable
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
 
 Cells = NDArray[np.int64]
@@ -39,9 +38,11 @@ _DETOUR = 3.0
 _CHANGED_MARGIN_M = 1.0
 _SUCCESSOR_M = 1.5
 _NEAR_VISIT_M = 0.3
-_SEED_M = 1.5
+_ESCAPE_M = 0.6
 _NEAR_HEADING_RAD = 0.35
 _STEADY_RAD = 0.6
+_TRIES = 3
+_PAUSE_S = 5.0
 
 
 class FinishCode(IntEnum):
@@ -211,13 +212,14 @@ class Explorer:
     def _survey(self, T_map_base: Array) -> list[_Candidate]:
         """End nodes with their borders, and stand-ins for the borders that no end node sees."""
         cells, numbers, _ = self.borders.stretches()
-        owners = self._owners(cells)
+        reached = self._reachable(T_map_base)
+        owners = self._owners(cells, reached)
         candidates = []
         for node_id, track in self.tracker.tracks.items():
             own = cells[owners == node_id]
             if len(own) or (self.config.mode == 'paper' and node_id not in self._memory.visited):
                 candidates.append(_Candidate(track, own, self._goal_at(track, own, T_map_base)))
-        return candidates + self._stand_in(cells[owners < 0], numbers[owners < 0], T_map_base)
+        return candidates + self._stand_in(cells[owners < 0], numbers[owners < 0], reached, T_map_base)
 
     def _rename(self, renamed: dict[int, int]) -> None:
         """What is remembered of a node goes with it when it gets another id."""
@@ -226,28 +228,41 @@ class Explorer:
         memory.failed = {renamed.get(i, i): failure for i, failure in memory.failed.items()}
         memory.visited = {renamed.get(i, i): place for i, place in memory.visited.items()}
 
-    def _owners(self, cells: Cells) -> Cells:
-        """Id of the end node to which each border cell belongs, or -1; not one that was visited in vain."""
+    def _owners(self, cells: Cells, reached: NDArray[np.bool_]) -> Cells:
+        """Id of the end node to which each border cell belongs, or -1.
+
+        Not one that was visited in vain, nor one to which the robot cannot get: the graph remembers a passage that the
+        map, as it is now, no longer shows.
+        """
         memory = self._memory
         for node_id, place in list(memory.visited.items()):
             track = self.tracker.tracks.get(node_id)
             if track is None or math.dist(place, (track.x, track.y)) > self.config.moved_m:
                 del memory.visited[node_id]
-        ids = np.array([i for i in self.tracker.tracks if i not in memory.visited], dtype=np.int64)
+        ids = np.array([i for i in self.tracker.tracks if self._can_own(i, reached)], dtype=np.int64)
         if ids.size == 0 or len(cells) == 0:
             return np.full(len(cells), -1, dtype=np.int64)
         places = np.array([(self.tracker.tracks[int(i)].x, self.tracker.tracks[int(i)].y) for i in ids])
         index = self.borders.owners(cells, self.borders.frame.cells_of(places), self.config.attach_m)
         return np.where(index < 0, -1, ids[index])
 
-    def _stand_in(self, cells: Cells, numbers: NDArray[np.int32], T_map_base: Array) -> list[_Candidate]:
+    def _can_own(self, node_id: int, reached: NDArray[np.bool_]) -> bool:
+        if node_id in self._memory.visited:
+            return False
+        track = self.tracker.tracks[node_id]
+        row, col = (int(v) for v in self.borders.frame.cells_of(np.array([[track.x, track.y]]))[0])
+        return nearest_true(reached, (row, col), _NEAR_VISIT_M / self.borders.frame.resolution) is not None
+
+    def _stand_in(
+        self, cells: Cells, numbers: NDArray[np.int32], reached: NDArray[np.bool_], T_map_base: Array
+    ) -> list[_Candidate]:
         """One candidate for each stretch of border left over that can be looked at from somewhere."""
         found: list[tuple[Cells, Array]] = []
         if len(cells) and self.config.mode == 'open_border':
-            allowed, xy = self._reachable(T_map_base), (float(T_map_base[0]), float(T_map_base[1]))
+            xy = (float(T_map_base[0]), float(T_map_base[1]))
             for number in np.unique(numbers):
                 stretch = cells[numbers == number]
-                place = self.borders.place_to_look(stretch, allowed, self.config.attach_m, xy)
+                place = self.borders.place_to_look(stretch, reached, self.config.attach_m, xy)
                 if place is not None:
                     found.append((stretch, place))
         middles = [self._middle(stretch) for stretch, _ in found]
@@ -260,11 +275,8 @@ class Explorer:
 
     def _reachable(self, T_map_base: Array) -> NDArray[np.bool_]:
         """Cells on which the robot can stand and to which it can get."""
-        frame = self.borders.frame
-        standing = standing_places(self.borders.free, self.config.robot_radius_m, frame.resolution)
-        row, col = (int(v) for v in frame.cells_of(T_map_base[None, :2])[0])
-        seed = nearest_true(standing, (row, col), _SEED_M / frame.resolution)
-        return reachable(standing, np.empty((0, 2), dtype=np.int64) if seed is None else np.array([seed]))
+        xy = (float(T_map_base[0]), float(T_map_base[1]))
+        return places_in_reach(self.borders.free, self.borders.frame, xy, self.config.robot_radius_m, _ESCAPE_M)
 
     def _ids_of_stand_ins(self, middles: list[tuple[float, float]]) -> list[int]:
         """Each keeps the id of the nearest earlier one within a metre; no id is given twice."""
@@ -317,7 +329,7 @@ class Explorer:
         memory.at_goal = 0
         node_id = candidate.track.node_id
         if node_id >= FIRST_STAND_IN_ID:
-            self.borders.exhaust(candidate.cells)
+            self.borders.exhaust(candidate.cells, (float(T_map_base[0]), float(T_map_base[1])))
         else:
             memory.visited[node_id] = (candidate.track.x, candidate.track.y)
         del worth[node_id]
@@ -328,9 +340,9 @@ class Explorer:
         self._forget_failures(worth)
         open_to_try = {i: c for i, c in worth.items() if i not in memory.failed}
         if not open_to_try:
-            # Before the end, everything that failed once is tried once more.
-            open_to_try = {i: c for i, c in worth.items() if memory.failed[i].times < 2}
-        memory.nothing_left = 0 if open_to_try else memory.nothing_left + 1
+            open_to_try = {i: c for i, c in worth.items() if self._may_retry(memory.failed[i])}
+        waits = any(memory.failed[i].times < _TRIES for i in worth if i in memory.failed)
+        memory.nothing_left = 0 if open_to_try or waits else memory.nothing_left + 1
         if not open_to_try:
             memory.target = None
             return None
@@ -339,13 +351,18 @@ class Explorer:
         costs = self._costs(topology, open_to_try, T_map_base)
         if not memory.first_choice_made:
             memory.first_choice_made = True
-            memory.target = min(open_to_try, key=lambda i: _turn_to(T_map_base, open_to_try[i].goal))
+            faced = min(open_to_try, key=lambda i: _turn_to(T_map_base, open_to_try[i].goal))
+            return self._go_for(open_to_try[faced])
         best = min(costs, key=lambda i: costs[i])
         if memory.target not in costs:
             memory.target = self._successor(open_to_try)
         if memory.target is None or costs[best] < self.config.switch_share * costs[memory.target] - _CHANGED_MARGIN_M:
             memory.target = best
         return self._go_for(open_to_try[memory.target])
+
+    def _may_retry(self, failure: _Failure) -> bool:
+        """Before the end, whatever failed is tried again, each time after a pause: a door may be free by then."""
+        return failure.times < _TRIES and self._stamp_ns - failure.stamp_ns > _PAUSE_S * 1e9
 
     def _go_for(self, chosen: _Candidate) -> int:
         """Make a candidate the target; its goal stays where it was for as long as it is about the same."""
@@ -368,10 +385,8 @@ class Explorer:
         for node_id, failure in list(memory.failed.items()):
             track = self._track(node_id)
             gone = node_id not in worth or track is None
-            if gone or (track and math.dist((track.x, track.y), failure.at) > _CHANGED_MARGIN_M):
-                del memory.failed[node_id]
-            elif failure.times < 2 and self._stamp_ns - failure.stamp_ns > self.config.retry_s * 1e9:
-                failure.times, failure.stamp_ns = failure.times, self._stamp_ns
+            moved = track is not None and math.dist((track.x, track.y), failure.at) > _CHANGED_MARGIN_M
+            if gone or moved or self._stamp_ns - failure.stamp_ns > self.config.retry_s * 1e9:
                 del memory.failed[node_id]
 
     def _costs(self, topology: TopologicalMap, worth: dict[int, _Candidate], T_map_base: Array) -> dict[int, float]:

@@ -22,6 +22,7 @@ Mask = NDArray[np.bool_]
 Cells = NDArray[np.int64]
 _LOOKS = 3
 _SLACK = 5
+_PART_M = 1.0
 
 
 class OpenBorders:
@@ -65,10 +66,15 @@ class OpenBorders:
         _examine(self.mask, self.free, self._looks, int(row), int(col), reach, faces)
         self.mask &= self._looks < _LOOKS
 
-    def exhaust(self, cells: Cells) -> None:
-        """Give up border cells (N, 2) for good."""
-        self._looks[cells[:, 0], cells[:, 1]] = _LOOKS
-        self.mask[cells[:, 0], cells[:, 1]] = False
+    def exhaust(self, cells: Cells, xy: tuple[float, float]) -> None:
+        """Give up border cells (N, 2) for good: those about as near to a point, m, as the nearest of them.
+
+        A long border is seen from one place in part only.
+        """
+        away_m = np.hypot(*(self.frame.centres_of(cells) - xy).T)
+        gone = cells[away_m <= away_m.min(initial=np.inf) + _PART_M]
+        self._looks[gone[:, 0], gone[:, 1]] = _LOOKS
+        self.mask[gone[:, 0], gone[:, 1]] = False
 
     def stretches(self) -> tuple[Cells, NDArray[np.int32], int]:
         """Border cells (N, 2) in stretches long enough, the number of their stretch (N,), and how many there are."""

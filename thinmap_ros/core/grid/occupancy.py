@@ -39,6 +39,9 @@ class OccupancyConfig(Config):
     no_return_range_m: float = parameter(
         8.0, 'a beam without return frees up to here (0: nothing), m', low=0.0, high=200.0
     )
+    surface_depth_m: float = parameter(
+        0.03, 'what a beam met fills the cell this far behind the measured surface, m', low=0.0, high=0.5
+    )
 
 
 def log_odds(probability: float) -> float:
@@ -50,9 +53,11 @@ class OccupancyGrid:
     """A map of any extent, in tiles that exist only where something was seen.
 
     The inverse sensor model: cells along a beam are free, its end is occupied, nothing is said of what lies
-    beyond; each cell is counted once a scan, and a cell in which any beam of the scan ends counts as occupied. Beams
-    that graze a wall pass through the cells in which it stands, long before they end: a cell on the line between the
-    ends of neighbouring beams that lie on one surface is therefore never counted as free.
+    beyond. The end is taken surface_depth_m behind the measured surface, where the solid is: with a wall on the border
+    of two cells, noise would otherwise fill the free one in front of it half the time. Each cell is counted once a
+    scan, and a cell in which any beam of the scan ends counts as occupied. Beams that graze a wall pass through the
+    cells in which it stands, long before they end: a cell on the line between the ends of neighbouring beams that lie
+    on one surface is therefore never counted as free.
     Source: topological map paper section 2.1 (binary local map), exploration paper section 2.1 (Bayes update).
     """
 
@@ -127,7 +132,7 @@ class OccupancyGrid:
         """How far each beam reaches, in cells (0: says nothing), and whether it ends in something."""
         usable = self.config.usable_range_m
         hits = scan.hit & (scan.ranges_m < usable)
-        reach = np.where(scan.hit, np.minimum(scan.ranges_m, usable), 0.0)
+        reach = np.where(scan.hit, np.minimum(scan.ranges_m + self.config.surface_depth_m * hits, usable), 0.0)
         without_return = min(self.config.no_return_range_m, scan.range_max_m, usable)
         return np.where(scan.no_return, without_return, reach) / self.frame.resolution, hits
 

@@ -16,6 +16,7 @@ from thinmap_ros.core.se2 import Array
 _CHECK_AHEAD_M = 4.0
 _SWEEP_STEP_M = 0.03
 _CREEP_M_S = 0.02
+_ROUNDING_M_S = 1e-9
 _AIM_RAD = 0.1
 _OVERLAY_M = 2.5
 # A goal that does not get this much nearer between so many standstills is given up.
@@ -179,7 +180,7 @@ class Navigator:
         if v <= 0.0:
             return Command(v, w, 'driving')
         allowed = self._safe_speed(T_map_base, v, w)
-        if allowed >= v:
+        if allowed >= v - _ROUNDING_M_S:
             self._blocked_s = 0.0
             return Command(v, w, 'driving')
         # Slower on the same arc.

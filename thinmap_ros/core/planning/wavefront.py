@@ -9,12 +9,14 @@ Source: topological map paper section 3.2; Konolige, "A gradient method for real
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.grid.distance import distance_cells
+from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.se2 import Array
@@ -53,14 +55,12 @@ def plan(
         return None
     cost = cost_of_cells(patch, config)
     start, wished = (int(cells[0, 0]), int(cells[0, 1])), (int(cells[1, 0]), int(cells[1, 1]))
-    goal = nearest_true(np.isfinite(cost), wished, config.goal_slack_m / patch.frame.resolution)
-    if goal is None:
-        return None
     if not math.isfinite(cost[start]):
         _let_out(cost, patch.occupied, start, config.escape_m / patch.frame.resolution)
-    field = navigation_function(cost, goal, start)
-    if not math.isfinite(field[start]):
+    goal = nearest_true(reached_from(np.isfinite(cost), start), wished, config.goal_slack_m / patch.frame.resolution)
+    if goal is None:
         return None
+    field = navigation_function(cost, goal, start)
     path = descend(field, *_in_cells(patch, start_xy), *goal) * patch.frame.resolution
     path += (patch.frame.origin_x, patch.frame.origin_y)
     path[0] = start_xy
@@ -92,6 +92,24 @@ def standing_places(free: Mask, radius_m: float, resolution: float) -> Mask:
     return np.asarray(distance_from(~free) * resolution >= radius_m - _HAIR_M)
 
 
+def places_in_reach(free: Mask, frame: GridFrame, xy: tuple[float, float], radius_m: float, escape_m: float) -> Mask:
+    """Standing places (H, W) to which a robot of a radius can get from a point (m).
+
+    Where it stands too near to something it is let out over free cells up to escape_m away, as a path would.
+    """
+    standing = standing_places(free, radius_m, frame.resolution)
+    row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
+    if not (0 <= row < free.shape[0] and 0 <= col < free.shape[1]):
+        return np.zeros_like(standing)
+    ways = standing
+    if not standing[row, col]:
+        ways = standing.copy()
+        part, disc = _disc(ways, (row, col), escape_m / frame.resolution)
+        ways[part] |= disc & free[part]
+        ways[row, col] = True
+    return reached_from(ways, (row, col)) & standing
+
+
 def navigation_function(cost: Array, goal: tuple[int, int], start: tuple[int, int] | None = None) -> Array:
     """Cheapest cost F, in cells, from each cell (H, W) to the goal (row, col); inf where there is no way.
 
@@ -99,6 +117,11 @@ def navigation_function(cost: Array, goal: tuple[int, int], start: tuple[int, in
     """
     row, col = (-1, -1) if start is None else start
     return np.asarray(_march(cost, goal[0], goal[1], row, col))
+
+
+def reached_from(allowed: Mask, start: tuple[int, int]) -> Mask:
+    """Allowed cells (H, W) to which the wave can get from a start (row, col): over edges of cells, not corners."""
+    return np.asarray(_reached_from(allowed, start[0], start[1]))
 
 
 def descend(field: Array, x: float, y: float, goal_row: int, goal_col: int) -> Array:
@@ -129,14 +152,40 @@ def _let_out(cost: Array, occupied: Mask, start: tuple[int, int], reach: float) 
 
     Not those that are occupied, but for the robot's own cell: where the robot is, nothing else can be.
     """
-    whole = math.ceil(reach)
-    rows = slice(max(start[0] - whole, 0), start[0] + whole + 1)
-    cols = slice(max(start[1] - whole, 0), start[1] + whole + 1)
-    part = cost[rows, cols]
-    row, col = np.ogrid[rows.start : rows.start + part.shape[0], cols.start : cols.start + part.shape[1]]
-    disc = np.hypot(row - start[0], col - start[1]) <= reach
-    part[disc & ~np.isfinite(part) & ~occupied[rows, cols]] = _ESCAPE_COST
+    where, disc = _disc(cost, start, reach)
+    part = cost[where]
+    part[disc & ~np.isfinite(part) & ~occupied[where]] = _ESCAPE_COST
     cost[start] = min(cost[start], _ESCAPE_COST)
+
+
+def _disc(of: NDArray[Any], centre: tuple[int, int], reach: float) -> tuple[tuple[slice, slice], Mask]:
+    """The part of an array (H, W) round a cell, and which of its cells lie within reach."""
+    whole = math.ceil(reach)
+    rows = slice(max(centre[0] - whole, 0), min(centre[0] + whole + 1, of.shape[0]))
+    cols = slice(max(centre[1] - whole, 0), min(centre[1] + whole + 1, of.shape[1]))
+    row, col = np.ogrid[rows, cols]
+    return (rows, cols), np.asarray(np.hypot(row - centre[0], col - centre[1]) <= reach)
+
+
+@kernel
+def _reached_from(allowed: Mask, start_row: int, start_col: int) -> Mask:
+    rows, cols = allowed.shape
+    found = np.zeros((rows, cols), dtype=np.bool_)
+    stack = np.empty(rows * cols + 1, dtype=np.int64)
+    count = 0
+    if allowed[start_row, start_col]:
+        found[start_row, start_col] = True
+        stack[0], count = start_row * cols + start_col, 1
+    while count > 0:
+        count -= 1
+        row, col = stack[count] // cols, stack[count] % cols
+        for side in range(4):
+            r, c = row + (side == 0) - (side == 1), col + (side == 2) - (side == 3)
+            if 0 <= r < rows and 0 <= c < cols and allowed[r, c] and not found[r, c]:
+                found[r, c] = True
+                stack[count] = r * cols + c
+                count += 1
+    return found
 
 
 @kernel

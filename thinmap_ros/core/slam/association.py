@@ -75,7 +75,7 @@ def meeting(
 def mahalanobis(v: Array, S: Array) -> float:
     """Squared Mahalanobis distance v' S^-1 v of a (2,) and a (2, 2); inf where S is not positive."""
     determinant = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
-    if not determinant > 0.0:
+    if not (determinant > 0.0 and S[0, 0] > 0.0):
         return math.inf
     squares = v[0] * v[0] * S[1, 1] + v[1] * v[1] * S[0, 0] - v[0] * v[1] * (S[0, 1] + S[1, 0])
     return float(squares / determinant)

@@ -14,10 +14,15 @@ from thinmap_ros.core.slam.models import motion_jacobians, observe_line, place_l
 
 
 class EkfSlam:
-    """The filter. Features are addressed by their place in the state, 0 to count - 1."""
+    """The filter. Features are addressed by their place in the state, 0 to count - 1.
 
-    def __init__(self, T_map_base: Array, covariance: Array) -> None:
-        self._x: Array = np.zeros(3 + 2 * 32)
+    Between pose and features the state may hold `carried` numbers that no observation sees and no motion moves; whoever
+    wants to know what the updates did to other quantities lets them stand for these (see ekf_ti).
+    """
+
+    def __init__(self, T_map_base: Array, covariance: Array, carried: int = 0) -> None:
+        self.first = 3 + carried  # where the features begin
+        self._x: Array = np.zeros(self.first + 2 * 32)
         self._P: Array = np.zeros((self._x.size, self._x.size))
         self.count = 0
         self.set_pose(T_map_base, covariance)
@@ -25,7 +30,7 @@ class EkfSlam:
     @property
     def size(self) -> int:
         """Numbers in the state."""
-        return 3 + 2 * self.count
+        return self.first + 2 * self.count
 
     @property
     def pose(self) -> Array:
@@ -45,12 +50,28 @@ class EkfSlam:
     @property
     def lines(self) -> Array:
         """Lines (count, 2) as (r, alpha), a view of the state."""
-        return self._x[3 : self.size].reshape(-1, 2)
+        return self._x[self.first : self.size].reshape(-1, 2)
+
+    @property
+    def mean(self) -> Array:
+        """The whole state, a copy."""
+        return self._x[: self.size].copy()
+
+    def place(self, index: int) -> slice:
+        """Where a feature stands in the state."""
+        return slice(self.first + 2 * index, self.first + 2 * index + 2)
 
     def line_covariances(self) -> Array:
         """Covariances (count, 2, 2) of the lines."""
-        at = 3 + 2 * np.arange(self.count)[:, None] + np.arange(2)
+        at = self.first + 2 * np.arange(self.count)[:, None] + np.arange(2)
         return np.asarray(self._P[at[:, :, None], at[:, None, :]])
+
+    def set_state(self, mean: Array, covariance: Array) -> None:
+        """Take a whole state (size,) with its covariance; what follows pose and carried numbers are features."""
+        n = mean.size
+        self._reserve(n)
+        self.count = (n - self.first) // 2
+        self._x[:n], self._P[:n, :n] = mean, covariance
 
     def set_pose(self, T_map_base: Array, covariance: Array) -> None:
         """Put the robot at a pose (3,) with covariance (3, 3) that has nothing to do with the features."""
@@ -76,7 +97,8 @@ class EkfSlam:
     def innovations(self, index: int) -> tuple[Array, Array, Array]:
         """Expected observation (2,) of a feature, H P H' (2, 2), and H (2, 5) by pose and line."""
         expected, by_pose, by_line = observe_line(self._x[:3], self.lines[index])
-        at = [0, 1, 2, 3 + 2 * index, 4 + 2 * index]
+        first = self.first + 2 * index
+        at = [0, 1, 2, first, first + 1]
         H = np.hstack([by_pose, by_line])
         return expected, H @ self._P[np.ix_(at, at)] @ H.T, H
 
@@ -93,7 +115,7 @@ class EkfSlam:
         P = self._P[:n, :n]
         jacobians = []
         for k, index in enumerate(indices):
-            rows, at = slice(2 * k, 2 * k + 2), slice(3 + 2 * index, 5 + 2 * index)
+            rows, at = slice(2 * k, 2 * k + 2), self.place(int(index))
             expected, by_pose, by_line = observe_line(self._x[:3], self._x[at])
             v[rows] = _difference(z[k], expected)
             HP[rows] = by_pose @ P[:3] + by_line @ P[at]
@@ -106,16 +128,20 @@ class EkfSlam:
 
     def tie(self, kept: int, dropped: int, covariance: Array) -> bool:
         """Let two features be one wall: their difference is 0 up to a covariance (2, 2); whether that could be done."""
-        n, a, b = self.size, 3 + 2 * kept, 3 + 2 * dropped
-        v, S = self.difference(kept, dropped)
-        return self._correct(-v, S + covariance, self._P[a : a + 2, :n] - self._P[b : b + 2, :n])
+        n, a, b = self.size, self.place(kept), self.place(dropped)
+        v, S, signs = self.difference(kept, dropped)
+        return self._correct(-v, S + covariance, self._P[a, :n] - signs[:, None] * self._P[b, :n])
 
-    def difference(self, a: int, b: int) -> tuple[Array, Array]:
-        """Line a less line b, (2,), and the covariance (2, 2) of that."""
-        at_a, at_b = slice(3 + 2 * a, 5 + 2 * a), slice(3 + 2 * b, 5 + 2 * b)
-        cross = self._P[at_a, at_b]
-        S = self._P[at_a, at_a] + self._P[at_b, at_b] - cross - cross.T
-        return _difference(self._x[at_a], self._x[at_b]), S
+    def difference(self, a: int, b: int) -> tuple[Array, Array, Array]:
+        """Line a less line b, (2,), its covariance (2, 2), and the signs (2,) with which b's r and alpha count.
+
+        (r, alpha) and (-r, alpha + pi) are one line; b is taken in the form that is nearer to a.
+        """
+        at_a, at_b = self.place(a), self.place(b)
+        v, signs = line_difference(self._x[at_a], self._x[at_b])
+        cross = self._P[at_a, at_b] * signs
+        S = self._P[at_a, at_a] + signs[:, None] * self._P[at_b, at_b] * signs - cross - cross.T
+        return v, S, signs
 
     def add(self, seen: Array, covariance: Array) -> int:
         """Take up a line seen as (r, alpha) as a new feature; returns its index."""
@@ -132,7 +158,7 @@ class EkfSlam:
 
     def remove(self, index: int) -> None:
         """Drop a feature; those behind it move up by one."""
-        keep = np.delete(np.arange(self.size), [3 + 2 * index, 4 + 2 * index])
+        keep = np.delete(np.arange(self.size), np.r_[self.place(index)])
         n = keep.size
         self._x[:n] = self._x[keep]
         self._P[:n, :n] = self._P[np.ix_(keep, keep)]
@@ -155,19 +181,21 @@ class EkfSlam:
         self._x, self._P = x, P
 
     def _normalise(self) -> None:
-        """Headings into (-pi, pi], and r >= 0: a line whose r went below zero is the same line seen from behind."""
+        """Angles into (-pi, pi]. An r below zero stays: turning the line round would turn its ends with it."""
         self._x[2] = wrap(float(self._x[2]))
-        lines, n = self.lines, self.size
-        for index in np.flatnonzero(lines[:, 0] < 0.0):
-            lines[index] = -lines[index, 0], lines[index, 1] + np.pi
-            at = 3 + 2 * int(index)
-            self._P[at, :n] *= -1.0
-            self._P[:n, at] *= -1.0
-        lines[:, 1] = wrap(lines[:, 1])
+        self.lines[:, 1] = wrap(self.lines[:, 1])
 
 
 def _difference(seen: Array, expected: Array) -> Array:
     return np.array([seen[0] - expected[0], wrap(float(seen[1] - expected[1]))])
+
+
+def line_difference(a: Array, b: Array) -> tuple[Array, Array]:
+    """Line a (r, alpha) less line b, in the form of b that is nearer, and the signs (2,) of b's r and alpha in it."""
+    v = _difference(a, b)
+    if abs(v[1]) <= 0.5 * math.pi:
+        return v, np.ones(2)
+    return np.array([a[0] + b[0], wrap(float(v[1] + math.pi))]), np.array([-1.0, 1.0])
 
 
 @kernel

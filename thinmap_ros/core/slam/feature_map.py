@@ -1,21 +1,28 @@
-"""The line features of the map and their care: how one enters, grows, and is found to be another one.
+"""The line features of the map and their care: how one enters, grows, is found to be another one, and leaves.
 
-Source: EKF-SLAM/TI paper section 2; the paper does not say when a feature enters, so that is ours: after several
-sightings from different places, because a feature that was only clutter would stay in the state for ever.
+Source: EKF-SLAM/TI paper sections 2 and 4. The paper does not say when a feature enters or leaves; here it enters
+after several sightings from different places, because what was only clutter would stay in the state for ever, and
+leaves when several looks went through where it should be.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.config import parameter
-from thinmap_ros.core.se2 import Array, transform_points, wrap
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import transform_points
 from thinmap_ros.core.slam.association import AssociationConfig, associate, mahalanobis, meeting
-from thinmap_ros.core.slam.ekf import EkfSlam
-from thinmap_ros.core.slam.features import Feature, LineFeature, as_seen, interval
+from thinmap_ros.core.slam.candidates import Candidate, Candidates
+from thinmap_ros.core.slam.ekf_ti import CompressedEkf
+from thinmap_ros.core.slam.features import Feature, LineFeature, as_seen, ends_of, interval, normals_of
 from thinmap_ros.core.slam.lines import Lines
-from thinmap_ros.core.slam.models import place_line
+from thinmap_ros.core.slam.local_area import LocalArea
+from thinmap_ros.core.slam.visibility import seen_through
+
+_SPARE = 8  # features that the local area may hold beyond those it should
 
 
 @dataclass(frozen=True)
@@ -26,145 +33,145 @@ class FeatureConfig(AssociationConfig):
     wall_sigma_rad: float = parameter(0.006, 'how far real walls are from straight lines, rad', low=0.0, high=0.5)
     sightings: int = parameter(4, 'a line enters the map after so many sightings', low=1, high=100)
     patience: int = parameter(15, 'a candidate not seen for so many looks is dropped', low=1, high=10_000)
-
-
-@dataclass(eq=False)
-class _Candidate:
-    """A line seen that is no feature yet: line (r, alpha) and interval as seen last, in the map."""
-
-    line: Array
-    span: Feature
-    sightings: int
-    last_look: int
+    misses: int = parameter(5, 'a feature seen through by so many looks in a row leaves the map', low=1, high=1000)
 
 
 class FeatureMap:
-    """The features beside the filter's state, in the same order, and the candidates that may become features."""
+    """All features by id, in which of them the filter's local area consists, and the lines that may become features.
 
-    def __init__(self, config: FeatureConfig) -> None:
-        self._config = config
+    With local areas (EKF-SLAM/TI) association and update take the features of the local area; without, all.
+    """
+
+    def __init__(self, config: FeatureConfig, local_areas: bool) -> None:
+        self.area = LocalArea()
+        self._config, self._local_areas = config, local_areas
         self._wall = np.diag(np.square([config.wall_sigma_m, config.wall_sigma_rad]))
-        self._features: list[Feature] = []
-        self._candidates: list[_Candidate] = []
-        self._looks = 0
+        self._features: dict[int, Feature] = {}
+        self._candidates = Candidates(config.sightings, config.patience, config.gate, config.gap_m)
+        # Features outside the local area that the robot turned out to see.
+        self._called: set[int] = set()
         self._next_id = 1
 
     def __len__(self) -> int:
         return len(self._features)
 
-    def listed(self, ekf: EkfSlam) -> list[LineFeature]:
+    def listed(self, ekf: CompressedEkf) -> list[LineFeature]:
         """The features as others see them."""
-        covariances = ekf.line_covariances()
+        lines, covariances, local = ekf.lines(), ekf.line_covariances(), set(ekf.area)
         return [
-            as_seen(feature, ekf.lines[i].copy(), covariances[i]) for i, feature in enumerate(self._features)
+            as_seen(feature, lines[i].copy(), covariances[i], self.area.nodes_of(i), i in local)
+            for i, feature in self._features.items()
         ]
 
-    def observe(self, ekf: EkfSlam, lines: Lines, laser_map: Array) -> tuple[int, bool]:
-        """Associate and correct the filter by the lines of a scan seen from a place (2,), then look after the features.
+    def observe(self, ekf: CompressedEkf, lines: Lines, scan: Scan) -> tuple[int, bool]:
+        """Associate and correct the filter by the lines of a scan, then look after the features.
 
         Returns how many were matched, and whether the filter took the update.
         """
-        self._looks += 1
+        if self._local_areas:
+            self._choose_area(ekf, scan)
         lines = Lines(lines.z, lines.covariances + self._wall, lines.ends)
-        chosen = associate(ekf, self._features, lines, laser_map, self._config)
+        laser_map = transform_points(ekf.local.pose, scan.T_base_laser[None, :2])[0]
+        chosen = associate(ekf.local, self._local(ekf), lines, laser_map, self._config)
         matched, unknown = np.flatnonzero(chosen >= 0), np.flatnonzero(chosen < 0)
-        taken = ekf.update(chosen[matched], lines.z[matched], lines.covariances[matched])
-        self._grow(ekf, chosen[matched], lines.chosen(matched))
-        self._merge(ekf, chosen[matched])
-        self._take_up(ekf, lines.chosen(unknown), laser_map)
+        taken = ekf.local.update(chosen[matched], lines.z[matched], lines.covariances[matched])
+        seen = self._grow(ekf, chosen[matched], lines.chosen(matched))
+        ripe = self._candidates.take(ekf.local.pose, lines.chosen(unknown), laser_map)
+        self._miss(ekf, seen, scan)
+        self._merge(ekf, seen)
+        new = [i for candidate in ripe for i in self._take_up(ekf, candidate)]
+        self.area.store(ekf.local.pose, [i for i in (*seen, *new) if i in self._features])
         return len(matched), taken
 
-    def _grow(self, ekf: EkfSlam, indices: NDArray[np.int64], lines: Lines) -> None:
-        """Features become as long as what was seen of them."""
+    def _local(self, ekf: CompressedEkf) -> list[Feature]:
+        return [self._features[i] for i in ekf.area]
+
+    def _choose_area(self, ekf: CompressedEkf, scan: Scan) -> None:
+        """Have the filter enter the area of the robot, when it lacks something of it or holds much that is not."""
+        half_view = 0.5 * abs(scan.angle_increment_rad) * scan.ranges_m.size
+        wanted = self.area.features_near(ekf.local.pose, half_view) | self._called
+        if not wanted <= set(ekf.area) or len(ekf.area) > len(wanted) + _SPARE:
+            ekf.enter(sorted(wanted))
+            self._called.clear()
+
+    def _grow(self, ekf: CompressedEkf, indices: NDArray[np.int64], lines: Lines) -> list[int]:
+        """Features become as long as what was seen of them; returns the ids of these."""
         for index, ends in zip(indices, lines.ends, strict=True):
-            feature = self._features[index]
-            low, high = interval(ekf.lines[index], transform_points(ekf.pose, ends))
-            feature.low, feature.high = min(feature.low, low), max(feature.high, high)
+            feature = self._features[ekf.area[index]]
+            feature.grow(*interval(ekf.local.lines[index], transform_points(ekf.local.pose, ends)))
+            feature.missed = 0
+        return [ekf.area[i] for i in np.unique(indices)]
 
-    def _merge(self, ekf: EkfSlam, indices: NDArray[np.int64]) -> None:
+    def _miss(self, ekf: CompressedEkf, seen: Iterable[int], scan: Scan) -> None:
+        """Features that the scan went through, time and again, leave."""
+        through = seen_through(scan, ekf.local.pose, ekf.local.lines, self._local(ekf))
+        for feature_id in [i for i, gone in zip(ekf.area, through, strict=True) if gone and i not in seen]:
+            self._features[feature_id].missed += 1
+            if self._features[feature_id].missed >= self._config.misses:
+                self._drop(ekf, feature_id, None)
+
+    def _merge(self, ekf: CompressedEkf, seen: Iterable[int]) -> None:
         """Of the features just seen, those that turn out to be another one are tied to it in the filter and go."""
-        for feature in [self._features[i] for i in np.unique(indices)]:
-            if feature in self._features:
-                kept = self._features.index(feature)
-                twin = self._twin(ekf, kept)
-                if twin is not None and ekf.tie(min(kept, twin), max(kept, twin), self._wall):
-                    self._unite(ekf, min(kept, twin), max(kept, twin))
+        for feature_id in seen:
+            twin = self._twin(ekf, feature_id) if feature_id in self._features else None
+            if twin is None:
+                continue
+            kept, dropped = min(feature_id, twin), max(feature_id, twin)
+            a, b = ekf.area.index(kept), ekf.area.index(dropped)
+            if ekf.local.tie(a, b, self._wall):
+                ends = ends_of(self._features[dropped], ekf.local.lines[b])
+                self._features[kept].grow(*interval(ekf.local.lines[a], ends))
+                self._drop(ekf, dropped, kept)
 
-    def _twin(self, ekf: EkfSlam, index: int) -> int | None:
+    def _twin(self, ekf: CompressedEkf, feature_id: int) -> int | None:
         """Another feature that passes for the same wall: it meets this one, and their difference passes the gate."""
-        ends = self._ends(ekf, index)
-        near = meeting(ekf.lines, self._features, ends[None], self._features[index].seen_from, 0.0)[0]
+        index, lines = ekf.area.index(feature_id), ekf.local.lines
+        ends = ends_of(self._features[feature_id], lines[index])
+        near = meeting(lines, self._local(ekf), ends[None], self._features[feature_id].seen_from, 0.0)[0]
         for other in np.flatnonzero(near):
             if other != index and self._is_one_wall(ekf, index, int(other)):
-                return int(other)
+                return ekf.area[other]
         return None
 
-    def _is_one_wall(self, ekf: EkfSlam, a: int, b: int) -> bool:
-        v, S = ekf.difference(a, b)
-        apart = np.abs(self._ends(ekf, b) @ (np.cos(ekf.lines[a, 1]), np.sin(ekf.lines[a, 1])) - ekf.lines[a, 0])
-        close = apart.max() <= 3.0 * self._config.wall_sigma_m
-        return bool(close) and mahalanobis(v, S + self._wall) <= self._config.gate
+    def _is_one_wall(self, ekf: CompressedEkf, a: int, b: int) -> bool:
+        v, S, _ = ekf.local.difference(a, b)
+        ends = ends_of(self._features[ekf.area[b]], ekf.local.lines[b])
+        apart = np.abs(ends @ normals_of(ekf.local.lines[[a]])[0] - ekf.local.lines[a, 0]).max()
+        return bool(apart <= self._near) and mahalanobis(v, S + self._wall) <= self._config.gate
 
-    def _ends(self, ekf: EkfSlam, index: int) -> Array:
-        seen = as_seen(self._features[index], ekf.lines[index], np.empty((2, 2)))
-        return np.stack([seen.start, seen.end])
+    @property
+    def _near(self) -> float:
+        """Distance between two lines that may yet be one wall, m."""
+        return 3.0 * self._config.wall_sigma_m
 
-    def _unite(self, ekf: EkfSlam, kept: int, dropped: int) -> None:
-        feature = self._features[kept]
-        low, high = interval(ekf.lines[kept], self._ends(ekf, dropped))
-        feature.low, feature.high = min(feature.low, low), max(feature.high, high)
-        ekf.remove(dropped)
-        del self._features[dropped]
+    def _drop(self, ekf: CompressedEkf, feature_id: int, heir: int | None) -> None:
+        ekf.remove(ekf.area.index(feature_id))
+        self.area.forget(feature_id, heir)
+        self._called.discard(feature_id)
+        del self._features[feature_id]
 
-    def _take_up(self, ekf: EkfSlam, lines: Lines, laser_map: Array) -> None:
-        """Lines seen often enough at the same place become features."""
-        for z, covariance, ends in zip(lines.z, lines.covariances, lines.ends, strict=True):
-            candidate = self._candidate(ekf.pose, z, covariance, transform_points(ekf.pose, ends), laser_map)
-            if candidate.sightings < self._config.sightings:
-                continue
-            self._candidates.remove(candidate)
-            if not self._is_known(ekf, candidate):
-                ekf.add(z, covariance)
-                candidate.span.id = self._next_id
-                self._features.append(candidate.span)
-                self._next_id += 1
-        oldest = self._looks - self._config.patience
-        self._candidates = [c for c in self._candidates if c.last_look >= oldest]
+    def _take_up(self, ekf: CompressedEkf, candidate: Candidate) -> list[int]:
+        """Make a line a feature, unless it is one that the map has elsewhere; returns the id of the new feature."""
+        known = self._covering(ekf, candidate)
+        if known:
+            self._called |= known - set(ekf.area)
+            return []
+        feature_id, self._next_id = self._next_id, self._next_id + 1
+        index = ekf.add(feature_id, candidate.z, candidate.covariance)
+        span = interval(ekf.local.lines[index], ends_of(candidate.span, candidate.line))
+        self._features[feature_id] = Feature(feature_id, *span, candidate.span.seen_from)
+        return [feature_id]
 
-    def _candidate(self, pose: Array, z: Array, covariance: Array, ends_map: Array, laser_map: Array) -> _Candidate:
-        """The candidate that a seen line continues, brought up to date, or a new one."""
-        line, _, by_seen = place_line(pose, z)
-        if self._candidates:
-            placed = np.array([c.line for c in self._candidates])
-            spans = [c.span for c in self._candidates]
-            near = meeting(placed, spans, ends_map[None], laser_map, self._config.gap_m)[0]
-            # Two looks at one line differ by the noise of both; the robot hardly moved in between.
-            S = 2.0 * by_seen @ covariance @ by_seen.T
-            for index in np.flatnonzero(near):
-                candidate = self._candidates[index]
-                v = line - candidate.line
-                if mahalanobis(np.array([v[0], wrap(float(v[1]))]), S) <= self._config.gate:
-                    return self._seen_again(candidate, line, ends_map)
-        span = Feature(0, *interval(line, ends_map), laser_map)
-        self._candidates.append(_Candidate(line, span, 1, self._looks))
-        return self._candidates[-1]
-
-    def _seen_again(self, candidate: _Candidate, line: Array, ends_map: Array) -> _Candidate:
-        low, high = interval(line, ends_map)
-        candidate.span.low, candidate.span.high = min(candidate.span.low, low), max(candidate.span.high, high)
-        candidate.line, candidate.last_look = line, self._looks
-        candidate.sightings += 1
-        return candidate
-
-    def _is_known(self, ekf: EkfSlam, candidate: _Candidate) -> bool:
-        """Whether a feature covers the candidate's place, though it failed the gate: two for one wall help nobody."""
+    def _covering(self, ekf: CompressedEkf, candidate: Candidate) -> set[int]:
+        """Features that cover the candidate's place, though it failed the gate: two for one wall help nobody."""
         if not self._features:
-            return False
-        span = candidate.span
-        seen = as_seen(span, candidate.line, np.empty((2, 2)))
-        middle = 0.5 * (seen.start + seen.end)
-        reach = 0.25 * (seen.end - seen.start)
+            return set()
+        known = ekf.lines()
+        ids, lines = np.array(list(known)), np.array(list(known.values()))
+        start, end = ends_of(candidate.span, candidate.line)
+        middle, reach = 0.5 * (start + end), 0.25 * (end - start)
+        features = [self._features[i] for i in known]
         ends = np.stack([middle - reach, middle + reach])
-        near = meeting(ekf.lines, self._features, ends[None], span.seen_from, 0.0)[0]
-        normals = np.column_stack([np.cos(ekf.lines[:, 1]), np.sin(ekf.lines[:, 1])])
-        return bool(np.any(near & (np.abs(normals @ middle - ekf.lines[:, 0]) <= 3.0 * self._config.wall_sigma_m)))
+        near = meeting(lines, features, ends[None], candidate.span.seen_from, 0.0)[0]
+        near &= np.abs(normals_of(lines) @ middle - lines[:, 0]) <= self._near
+        return set(ids[near].tolist())

@@ -4,25 +4,34 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, wrap
 
 
 @dataclass(eq=False)
 class Feature:
     """A feature's id, the interval [low, high] (m) seen of its line, and from where (2,) it was first seen, map frame.
 
-    Positions along a line are counted from the foot of the perpendicular from the map's origin, to its left.
+    Positions along a line are counted from the foot of the perpendicular from the map's origin, to its left. missed
+    counts the looks in a row that should have met the feature and did not.
     """
 
     id: int
     low: float
     high: float
     seen_from: Array
+    missed: int = 0
+
+    def grow(self, low: float, high: float) -> None:
+        """Become as long as to hold another interval of the line, m."""
+        self.low, self.high = min(self.low, low), max(self.high, high)
 
 
 @dataclass(frozen=True, eq=False)
 class LineFeature:
-    """A feature as others see it: id, (r, alpha) with covariance (2, 2), and its ends (2,) each, m, map frame."""
+    """A feature as others see it: id, (r >= 0, alpha) with covariance (2, 2), and its ends (2,) each, m, map frame.
+
+    nodes: ids of the topological nodes at which it is stored; local: whether it is in the local area now.
+    """
 
     id: int
     r_m: float
@@ -30,6 +39,8 @@ class LineFeature:
     covariance: Array
     start: Array
     end: Array
+    nodes: list[int]
+    local: bool
 
 
 def normals_of(lines: Array) -> Array:
@@ -58,7 +69,15 @@ def point_on(line: Array, position: float) -> Array:
     return np.asarray(line[0] * normals_of(line[None])[0] + position * tangents_of(line[None])[0])
 
 
-def as_seen(feature: Feature, line: Array, covariance: Array) -> LineFeature:
-    """The feature with its line (r, alpha) of the present state, for others."""
-    low, high = point_on(line, feature.low), point_on(line, feature.high)
-    return LineFeature(feature.id, float(line[0]), float(line[1]), covariance, low, high)
+def ends_of(feature: Feature, line: Array) -> Array:
+    """Ends (2, 2) of a feature on its line (r, alpha), map frame."""
+    return np.stack([point_on(line, feature.low), point_on(line, feature.high)])
+
+
+def as_seen(feature: Feature, line: Array, covariance: Array, nodes: list[int], local: bool) -> LineFeature:
+    """The feature with its line (r, alpha) of the present state, for others: in the form with r >= 0."""
+    start, end = ends_of(feature, line)
+    if line[0] < 0.0:
+        signs = np.array([-1.0, 1.0])
+        line, covariance = np.array([-line[0], line[1] + np.pi]), signs[:, None] * covariance * signs
+    return LineFeature(feature.id, float(line[0]), wrap(float(line[1])), covariance, start, end, nodes, local)

@@ -10,15 +10,18 @@ from thinmap_ros.core.config import parameter
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.ekf import EkfSlam
+from thinmap_ros.core.slam.ekf_ti import CompressedEkf
 from thinmap_ros.core.slam.feature_map import FeatureConfig, FeatureMap
 from thinmap_ros.core.slam.features import LineFeature
 from thinmap_ros.core.slam.lines import LineConfig, Lines, extract_lines, no_lines
 from thinmap_ros.core.slam.models import MotionConfig, odometry_covariance, rotation
 from thinmap_ros.core.slam.scan_matching import Match, MatchConfig, ScanMatcher
+from thinmap_ros.core.topology.graph import TopologicalMap
 
 _START_SIGMAS = (1e-4, 1e-4, 1e-4)  # the map begins where the robot stands: no doubt, but not singular
 _LONGEST_STEP_M = 5.0  # between two scans the wheels cannot go farther: the odometry was set anew
 _NEW_GROUND = 0.3  # where less of a scan than this lies on what is known, there is nothing to contradict
+_NEW_GROUND_M, _NEW_GROUND_RAD = 0.6, 0.6  # and that is so only this far from where the map last learned
 _LOST_SIGMA_M = 1.0  # a robot in doubt by more than this does not know where it is
 
 
@@ -26,11 +29,16 @@ _LOST_SIGMA_M = 1.0  # a robot in doubt by more than this does not know where it
 class LocalizerConfig(MotionConfig, MatchConfig, LineConfig, FeatureConfig):
     """Parameters of the localizer and of its parts.
 
-    slam: full runs the filter over all line features; off leaves them out, and the covariance of the pose is then what
-    the match with the map of points leaves open, without the drift of that map.
+    slam: ti runs the filter over the line features of the local area, and full, for the same estimate, over all; off
+    leaves them out, and the covariance of the pose is then what the match with the map of points leaves open, without
+    the drift of that map.
     """
 
-    slam: str = parameter('full', 'full: EKF over all line features; off: scan matching alone', choices=('full', 'off'))
+    slam: str = parameter(
+        'ti',
+        'ti: EKF over line features, local by topology; full: EKF over all; off: scan matching alone',
+        choices=('ti', 'full', 'off'),
+    )
     start_x_m: float = parameter(0.0, 'where the robot starts in the map, m')
     start_y_m: float = parameter(0.0, 'where the robot starts in the map, m')
     start_yaw_rad: float = parameter(0.0, 'heading at the start, rad')
@@ -44,7 +52,8 @@ class Estimate:
     """What a step found: T_map_base (3,) with covariance (3, 3), T_map_odom (3,), and how it was found.
 
     observed, matched: lines of this scan, and those found among the features (both 0 where the robot stands still and
-    the scan has nothing new to say); match_quality: share of the scan's points on known ground that fit the map.
+    the scan has nothing new to say); n_features, n_local: features in the map, and in the local area; match_quality:
+    share of the scan's points on known ground that fit the map.
     """
 
     T_map_base: Array
@@ -53,6 +62,7 @@ class Estimate:
     observed: int = 0
     matched: int = 0
     n_features: int = 0
+    n_local: int = 0
     match_quality: float = 0.0
     lost: bool = False
 
@@ -72,8 +82,8 @@ class Localizer:
     def reset(self) -> None:
         """Forget everything: the next scan is the first, at the configured start."""
         start = se2.pose(self.config.start_x_m, self.config.start_y_m, self.config.start_yaw_rad)
-        self._ekf = EkfSlam(start, np.diag(np.square(_START_SIGMAS)))
-        self._feature_map = FeatureMap(self.config)
+        self._filter = CompressedEkf(start, np.diag(np.square(_START_SIGMAS)))
+        self._feature_map = FeatureMap(self.config, local_areas=self.config.slam == 'ti')
         self._matcher = ScanMatcher(self.config)
         self._T_odom_base: Array | None = None
         self._T_last_look: Array | None = None
@@ -95,7 +105,16 @@ class Localizer:
     @property
     def features(self) -> list[LineFeature]:
         """The line features of the map."""
-        return self._feature_map.listed(self._ekf)
+        return self._feature_map.listed(self._filter)
+
+    @property
+    def _ekf(self) -> EkfSlam:
+        """The filter of the pose and the local features."""
+        return self._filter.local
+
+    def set_topology(self, topology: TopologicalMap) -> None:
+        """Take the topological map by which features are stored; until one is known, the robot's own way serves."""
+        self._feature_map.area.set_topology(topology)
 
     def step(self, scan: Scan, T_odom_base: Array) -> Estimate:
         """Take in a scan with the odometry pose (3,) at its stamp."""
@@ -105,11 +124,12 @@ class Localizer:
         lines, matched = no_lines(), 0
         if self._has_news() and not self._is_lost():
             laser_map = se2.transform_points(self._ekf.pose, laser_base[None])[0]
-            lines, matched = self._correct(scan, laser_map)
-            if match.good or match.overlap < _NEW_GROUND:
+            lines, matched = self._correct(scan)
+            if match.good or self._on_new_ground(match):
                 points_map = se2.transform_points(self._ekf.pose, points_base)
                 self._matcher.add(points_map, laser_map)
                 self._T_last_look = self._ekf.pose
+        self._filter.work_off()
         return self._estimate(match, lines, matched)
 
     def _odometry(self, T_odom_base: Array) -> tuple[Array, Array]:
@@ -144,7 +164,7 @@ class Localizer:
             self._doubt, self._misfits = np.zeros((3, 3)), 0
             increment, covariance = se2.between(pose, match.T_map_base), turn.T @ match.covariance @ turn
             predicted = match.T_map_base
-        elif match.overlap >= _NEW_GROUND:
+        elif not self._on_new_ground(match):
             self._misfits += 1
         if match.good and (self._placed_by_hand or self.config.slam == 'off'):
             self._ekf.set_pose(match.T_map_base, match.covariance)
@@ -153,22 +173,32 @@ class Localizer:
             self._ekf.predict(predicted, increment, covariance)
         return match
 
-    def _correct(self, scan: Scan, laser_map: Array) -> tuple[Lines, int]:
+    def _correct(self, scan: Scan) -> tuple[Lines, int]:
         """Eqs. (6)-(9) with the lines of the scan; how many of them were known."""
         if self.config.slam == 'off' or not se2.is_finite(scan.T_base_laser):
             return no_lines(), 0
         lines = extract_lines(scan, self.config)
-        matched, taken = self._feature_map.observe(self._ekf, lines, laser_map)
+        matched, taken = self._feature_map.observe(self._filter, lines, scan)
         self.refused += not taken
         return lines, matched
 
     def _has_news(self) -> bool:
         """Whether the robot has moved since it last learned: looks from one place err alike, and prove nothing anew."""
+        return self._moved(self.config.look_distance_m, self.config.look_turn_rad)
+
+    def _on_new_ground(self, match: Match) -> bool:
+        """Whether a scan that lies on little that is known can be explained by where the robot has come to.
+
+        Near the place where the map last learned, most of a scan has been seen before.
+        """
+        return match.overlap < _NEW_GROUND and self._moved(_NEW_GROUND_M, _NEW_GROUND_RAD)
+
+    def _moved(self, distance_m: float, turn_rad: float) -> bool:
+        """Whether the robot is that far from the last place at which the map learned."""
         if self._T_last_look is None:
             return True
         moved = se2.between(self._T_last_look, self._ekf.pose)
-        far = math.hypot(moved[0], moved[1]) >= self.config.look_distance_m
-        return far or abs(float(moved[2])) >= self.config.look_turn_rad
+        return math.hypot(moved[0], moved[1]) >= distance_m or abs(float(moved[2])) >= turn_rad
 
     def _is_lost(self) -> bool:
         in_doubt = max(self._ekf.pose_covariance[0, 0], self._ekf.pose_covariance[1, 1]) > _LOST_SIGMA_M**2
@@ -184,6 +214,7 @@ class Localizer:
             len(lines),
             matched,
             len(self._feature_map),
+            len(self._filter.area),
             match.fit,
             self._is_lost(),
         )

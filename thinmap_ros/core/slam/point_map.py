@@ -19,7 +19,8 @@ COUNT, MEAN_X, MEAN_Y, CENTRE_X, CENTRE_Y, NORMAL_X, NORMAL_Y, LOOSE = range(8)
 UNFORMED = 2.0
 _SHIFT, _MASK = 6, TILE - 1
 _FEWEST_CELLS = 3
-_FLAT = 0.1  # ratio of the variances across and along a surface up to which it is a wall
+_FLAT = 0.3  # ratio of the variances across and along a surface up to which it is a wall
+_THIN_M, _LONG_M = 0.015, 0.03  # so is what is no wider than noise (1 sigma) but longer: far away points are few
 
 
 class PointMap:
@@ -78,7 +79,7 @@ def _add(
         row, col = cells[i, 0], cells[i, 1]
         # Far away the beams are wide apart: where the small neighbourhood is too empty, a wider one is asked.
         for reach in (3, 6):
-            x, y, nx, ny, loose = _surface(pool, directory, row, col, reach)
+            x, y, nx, ny, loose = _surface(pool, directory, row, col, reach, seen_from)
             if loose != UNFORMED:
                 break
         cell = pool[directory[row >> _SHIFT, col >> _SHIFT], row & _MASK, col & _MASK]
@@ -90,9 +91,17 @@ def _add(
 
 @kernel
 def _surface(
-    pool: NDArray[np.float32], directory: NDArray[np.int32], row: int, col: int, reach: int
+    pool: NDArray[np.float32],
+    directory: NDArray[np.int32],
+    row: int,
+    col: int,
+    reach: int,
+    seen_from: Array,
 ) -> tuple[float, float, float, float, float]:
-    """Normal and looseness of what the means around a cell make: the directions of least and most variance."""
+    """Centre, normal and looseness of what the means around a cell make: their directions of least and most variance.
+
+    Walls seen only from their other side are left out: the two faces of a thin wall are two surfaces.
+    """
     base = pool[slot_of(directory, row, col), row & _MASK, col & _MASK]
     count, sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for r in range(row - reach, row + reach + 1):
@@ -101,7 +110,9 @@ def _surface(
             if slot == NO_TILE:
                 continue
             cell = pool[slot, r & _MASK, c & _MASK]
-            if cell[COUNT] > 0.0:
+            own = r == row and c == col
+            away = cell[NORMAL_X] * (seen_from[0] - cell[MEAN_X]) + cell[NORMAL_Y] * (seen_from[1] - cell[MEAN_Y])
+            if cell[COUNT] > 0.0 and (own or cell[LOOSE] > 0.0 or away >= 0.0):
                 dx, dy = cell[MEAN_X] - base[MEAN_X], cell[MEAN_Y] - base[MEAN_Y]
                 count += 1.0
                 sx += dx
@@ -116,4 +127,7 @@ def _surface(
     small, large = 0.5 * (xx + yy) - spread, 0.5 * (xx + yy) + spread
     angle = 0.5 * math.atan2(-2.0 * xy, yy - xx)
     ratio = small / max(large, 1e-12)
-    return sx / count, sy / count, math.cos(angle), math.sin(angle), ratio if ratio > _FLAT else 0.0
+    if ratio > _FLAT and large < count * _LONG_M**2:
+        return 0.0, 0.0, 1.0, 0.0, UNFORMED
+    wall = ratio <= _FLAT or small <= count * _THIN_M**2
+    return sx / count, sy / count, math.cos(angle), math.sin(angle), 0.0 if wall else ratio

@@ -186,6 +186,7 @@ def simplify(
     while _drop_spurs(web, spots, promising, limits):
         pass
     _merge_close(web, spots, limits.join)
+    _drop_hollow(web, spots, limits.radius)
     for spot in sorted(spots):
         web.dissolve(spot)
     _move_rings(web, spots)
@@ -202,6 +203,31 @@ def _merge_close(web: Web, spots: set[int], limit: float) -> None:
         if web.degree(chain.a) < 3 or web.degree(chain.b) < 3:
             continue
         web.merge(number, chain.a if web.spots[chain.a].squared >= web.spots[chain.b].squared else chain.b)
+
+
+def _drop_hollow(web: Web, spots: set[int], radius: float) -> None:
+    """Drop what closes a ring round nothing; of chains side by side the shortest stays.
+
+    A ring keeps the robot's radius from what it goes round, so it encloses a disc of that radius at least. What
+    encloses less is left over from sewing and from drawing branches together: a way there and back, or one way twice.
+    """
+    # Cells lie up to half a cell beside the true ring; round a single cell goes a ring of area 2.
+    least = max(math.pi * (radius - 0.5) ** 2, 1.0)
+    side_by_side: dict[tuple[int, int], list[Chain]] = {}
+    for _, number in sorted((web.chains[n].length(), n) for n in web.chains_among(spots)):
+        chain = web.chains[number]
+        kept = side_by_side.setdefault((min(chain.a, chain.b), max(chain.a, chain.b)), [])
+        back = [other.starting_at(chain.b).cells[1:] for other in kept] if chain.a != chain.b else [chain.cells[:0]]
+        if any(_area(np.concatenate((chain.cells, way))) < least for way in back):
+            web.drop_chain(number)
+        else:
+            kept.append(chain)
+
+
+def _area(ring: Cells) -> float:
+    """Area, in cells, inside a closed way along cells (K, 2): Gauss's shoelace formula."""
+    rows, cols = ring.T
+    return abs(float(rows @ np.roll(cols, -1) - cols @ np.roll(rows, -1))) / 2.0
 
 
 def _drop_spurs(

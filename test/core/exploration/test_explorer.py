@@ -1,0 +1,166 @@
+"""The explorer in small worlds: it sees all, stops by itself, says why, and does not waver."""
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.exploration.explorer import FIRST_STAND_IN_ID, Decision, Explorer, ExplorerConfig, FinishCode
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.occupancy import OccupancyGrid
+from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
+from thinmap_ros.core.topology.update import TopologyBuilder
+from thinmap_ros.sim.coverage import coverable
+from thinmap_ros.sim.lms200 import Lms200Config
+from thinmap_ros.sim.pioneer import PRESETS
+from thinmap_ros.sim.runner import Simulation
+from thinmap_ros.sim.world import World
+
+START = np.array([1.0, 1.0, 0.0])
+
+
+def world_of(walls=(), size=(60, 60)):
+    """A walled floor, 0.1 m a cell, with inner walls given as (rows, cols) slices."""
+    cells = np.zeros(size, dtype=np.uint8)
+    cells[[0, -1]], cells[:, [0, -1]] = 1, 1
+    for rows, cols in walls:
+        cells[rows, cols] = 1
+    return World('floor', cells, GridFrame(0.0, 0.0, 0.1), START)
+
+
+def two_rooms():
+    """A door of 1 m joins a room with a second one in which a screen hides a corner."""
+    return world_of([(slice(0, 25), 30), (slice(35, 60), 30), (slice(40, 42), slice(40, 60))])
+
+
+class Run:
+    """An exploration with known poses; fails(decision) says which targets the navigator shall refuse."""
+
+    def __init__(self, world, config=None, seed=1, fails=None, start=START):
+        self.world, self.fails = world, fails or (lambda decision: False)
+        self.simulation = Simulation(world, start, PRESETS['2dx'], Lms200Config(), seed)
+        self.grid, self.topology = OccupancyGrid(), TopologyBuilder()
+        self.explorer = Explorer(config)
+        self.navigator = Navigator(NavigatorConfig(max_speed_m_s=0.5))
+        self.decisions: list[Decision] = []
+        self.poses: list[np.ndarray] = []
+        self.scan = self.goal = None
+
+    def look(self, scan):
+        pose = self.simulation.robot.T_world_base
+        self.grid.update(scan, pose)
+        self.topology.update(self.grid.window(pose[0], pose[1], 10.0), pose)
+        decision = self.explorer.step(self.topology.map, self.grid.patch(), scan, pose)
+        self.decisions.append(decision)
+        self.poses.append(pose)
+        self.scan = scan
+        if decision.target is None:
+            self.navigator.cancel()
+            self.goal = None
+        elif self.fails(decision):
+            self.explorer.fail_target('no way')
+        elif self.goal is None or not np.array_equal(decision.target.goal, self.goal):
+            self.goal = decision.target.goal
+            self.navigator.set_goal(*map(float, self.goal))
+        return decision
+
+    def go(self, seconds=300.0):
+        moment = self.simulation.sense()
+        while moment.stamp_ns < seconds * 1e9:
+            if moment.scan is not None and self.look(moment.scan).finished:
+                break
+            command = self.navigator.step(self.simulation.robot.T_world_base, self.grid.patch(), self.scan, 0.05)
+            if command.state == 'failed':
+                self.explorer.fail_target(command.reason)
+            if command.state in ('reached', 'failed'):
+                self.goal = None
+            moment = self.simulation.step(command.v, command.w)
+        return self
+
+    @property
+    def last(self):
+        return self.decisions[-1]
+
+    def coverage(self):
+        return coverable(self.world, START, 0.22, 8.0).share_known(self.grid.patch())
+
+
+@cache
+def finished_run():
+    return Run(two_rooms()).go()
+
+
+def test_it_sees_all_and_stops_by_itself_without_a_touch():
+    run = finished_run()
+    assert run.last.finished
+    assert run.last.code == FinishCode.ALL_RESOLVED
+    assert run.last.reason == 'all end nodes resolved'
+    assert run.last.target is None
+    assert run.coverage() >= 0.99
+    assert run.simulation.robot.collisions == 0
+
+
+def test_at_the_end_every_end_node_is_reliable_and_none_has_a_border():
+    nodes = finished_run().last.end_nodes
+    assert nodes
+    assert min(node.probability for node in nodes if node.node_id < FIRST_STAND_IN_ID) >= ExplorerConfig().threshold
+    assert all(node.open_border_m == 0.0 for node in nodes)
+
+
+def test_what_is_told_is_told_consistently():
+    for decision in finished_run().decisions:
+        targets = [node for node in decision.end_nodes if node.is_target]
+        assert (targets == []) if decision.target is None else (targets == [decision.target])
+        assert 0.0 <= decision.coverage_estimate <= 1.0
+        assert len({node.node_id for node in decision.end_nodes}) == len(decision.end_nodes)
+    areas = [decision.known_area_m2 for decision in finished_run().decisions]
+    assert areas[-1] == pytest.approx(33.0, abs=2.0)
+    assert finished_run().last.coverage_estimate == 1.0
+
+
+def test_some_end_nodes_are_never_visited():
+    run = finished_run()
+    nodes = [node for node in run.last.end_nodes if node.node_id < FIRST_STAND_IN_ID]
+    poses = np.array(run.poses)
+    nearest = [np.hypot(poses[:, 0] - node.x, poses[:, 1] - node.y).min() for node in nodes]
+    assert max(nearest) > 0.5
+
+
+def test_it_decides_the_same_every_time():
+    again = Run(two_rooms()).go()
+    assert len(again.decisions) == len(finished_run().decisions)
+    assert np.array_equal(np.array(again.poses), np.array(finished_run().poses))
+
+
+@pytest.mark.parametrize('theta', [0.0, 1.5])
+def test_the_first_target_is_the_one_that_the_robot_faces(theta):
+    run = Run(two_rooms(), start=se2.pose(1.0, 1.0, theta)).go(2.0)
+    first = next(decision for decision in run.decisions if decision.target is not None)
+    turns = {
+        node.node_id: abs(se2.wrap(math.atan2(node.goal[1] - 1.0, node.goal[0] - 1.0) - theta))
+        for node in first.end_nodes if node.open_border_m > 0.0
+    }
+    assert turns[first.target.node_id] == min(turns.values())
+
+
+def test_a_target_that_cannot_be_reached_is_put_aside_tried_again_and_named_at_the_end():
+    refused = []
+
+    def refuse(decision):
+        refused.append(decision.target.node_id)
+        return True
+
+    run = Run(two_rooms(), fails=refuse).go(60.0)
+    assert run.last.finished
+    assert run.last.code == FinishCode.NOTHING_REACHABLE
+    assert run.last.unreachable
+    assert max(refused.count(node_id) for node_id in run.last.unreachable) >= 2
+    assert not np.hypot(*(np.array(run.poses)[:, :2] - START[:2]).T).any()
+
+
+def test_the_literal_scheme_stops_by_itself_too():
+    run = Run(two_rooms(), ExplorerConfig(mode='paper')).go(600.0)
+    assert run.last.finished
+    assert run.simulation.robot.collisions == 0

@@ -1,0 +1,175 @@
+"""Which line is which feature, and what becomes a feature at all."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+from slam_room import ROOM, drive, scan_in
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.slam.association import AssociationConfig, associate, mahalanobis
+from thinmap_ros.core.slam.ekf import EkfSlam
+from thinmap_ros.core.slam.ekf_ti import CompressedEkf
+from thinmap_ros.core.slam.feature_map import FeatureConfig, FeatureMap
+from thinmap_ros.core.slam.features import Feature
+from thinmap_ros.core.slam.lines import LineConfig, Lines, extract_lines
+
+R = np.diag([0.02**2, 0.01**2])
+SURE = 1e-8 * np.eye(3)
+BLIND = scan_in(np.array([[1e3, -1.0, 1e3, 1.0]]), np.zeros(3))  # a scan that says nothing about what is gone
+
+
+def seen_lines(*walls):
+    """Lines of a scan from walls given by their end points, robot frame."""
+    ends = np.array(walls, dtype=float).reshape(-1, 2, 2)
+    along = ends[:, 1] - ends[:, 0]
+    normals = np.column_stack([-along[:, 1], along[:, 0]]) / np.hypot(*along.T)[:, None]
+    r = (normals * ends[:, 0]).sum(axis=1)
+    normals = np.where(r[:, None] < 0.0, -normals, normals)
+    z = np.column_stack([np.abs(r), np.arctan2(normals[:, 1], normals[:, 0])])
+    return Lines(z, np.tile(R, (len(z), 1, 1)), ends)
+
+
+def known(walls, pose=(0.0, 0.0, 0.0), P=SURE):
+    """A filter that knows some walls, and the features beside it."""
+    lines = seen_lines(*walls)
+    ekf = CompressedEkf(np.array(pose), P)
+    features = FeatureMap(FeatureConfig(sightings=1), local_areas=False)
+    features.observe(ekf, lines, BLIND)
+    return ekf, features
+
+
+def test_the_gate_lets_95_of_100_true_matches_pass(rng):
+    S = np.array([[4e-4, 1e-4], [1e-4, 3e-4]])
+    distances = [mahalanobis(v, S) for v in rng.multivariate_normal([0.0, 0.0], S, 4000)]
+    assert np.mean(np.array(distances) <= AssociationConfig().gate) == pytest.approx(0.95, abs=0.01)
+    assert AssociationConfig().gate == pytest.approx(chi2.ppf(0.95, 2), abs=0.01)
+    v = np.array([0.03, -0.02])
+    assert mahalanobis(v, S) == pytest.approx(v @ np.linalg.solve(S, v))
+    assert mahalanobis(v, -S) == math.inf
+    assert mahalanobis(v, np.zeros((2, 2))) == math.inf
+
+
+def chosen(walls, seen, gap_m=0.3):
+    ekf = EkfSlam(np.zeros(3), SURE)
+    features = []
+    for line, ends in zip(seen_lines(*walls).z, np.array(walls).reshape(-1, 2, 2), strict=True):
+        ekf.add(line, 1e-6 * np.eye(2))
+        along = ends @ [-math.sin(line[1]), math.cos(line[1])]
+        features.append(Feature(1, along.min(), along.max(), np.zeros(2)))
+    return associate(ekf, features, seen_lines(*seen), np.zeros(2), AssociationConfig(gap_m=gap_m)).tolist()
+
+
+def test_collinear_walls_of_two_rooms_are_two():
+    assert chosen([[[2, 1], [2, 3]], [[2, -3], [2, -1]]], [[[2, -2.5], [2, -1.2]], [[2, 1.5], [2, 2]]]) == [1, 0]
+    assert chosen([[[2, 1], [2, 3]]], [[[2, -3], [2, -1]]]) == [-1]
+    assert chosen([[[2, 1], [2, 3]]], [[[2, -3], [2, -1]]], gap_m=2.5) == [0]
+
+
+def test_a_line_fits_only_where_the_gate_says_so():
+    assert chosen([[[2, -1], [2, 1]]], [[[2.03, -1], [2.03, 1]]]) == [0]
+    assert chosen([[[2, -1], [2, 1]]], [[[2.2, -1], [2.2, 1]]]) == [-1]
+    assert chosen([[[2, -1], [2, 1]]], [[[2.2, -1], [1.8, 1]]]) == [-1]
+    assert chosen([], [[[2, -1], [2, 1]]]) == [-1]
+
+
+def test_the_two_faces_of_a_thin_wall_are_two_features():
+    ekf, features = known([[[2.0, -2.0], [2.0, 2.0]]])
+    ekf.local.set_pose(np.array([4.0, 0.0, math.pi]), SURE)
+    for _ in range(3):
+        features.observe(ekf, seen_lines([[1.95, -2.0], [1.95, 2.0]]), BLIND)
+    faces = sorted(f.r_m for f in features.listed(ekf))
+    assert faces == pytest.approx([2.0, 2.05], abs=0.01)
+
+
+def test_a_feature_enters_after_several_sightings_and_keeps_its_id():
+    ekf, features = CompressedEkf(np.zeros(3), SURE), FeatureMap(FeatureConfig(sightings=3), local_areas=False)
+    wall = seen_lines([[2.0, -1.0], [2.0, 1.0]])
+    counts = []
+    for _ in range(5):
+        features.observe(ekf, wall, BLIND)
+        counts.append(len(features))
+    assert counts == [0, 0, 1, 1, 1]
+    (only,) = features.listed(ekf)
+    features.observe(ekf, seen_lines([[2.0, -1.0], [2.0, 2.5]]), BLIND)
+    (grown,) = features.listed(ekf)
+    assert grown.id == only.id
+    assert {round(float(p[1]), 1) for p in (grown.start, grown.end)} == {-1.0, 2.5}
+
+
+def test_what_was_seen_once_and_then_no_more_is_forgotten():
+    ekf = CompressedEkf(np.zeros(3), SURE)
+    features = FeatureMap(FeatureConfig(sightings=2, patience=3), local_areas=False)
+    passer_by, wall = seen_lines([[1.0, -0.5], [1.0, 0.5]]), seen_lines([[4.0, -1.0], [4.0, 1.0]])
+    features.observe(ekf, passer_by, BLIND)
+    for _ in range(5):
+        features.observe(ekf, wall, BLIND)
+    features.observe(ekf, passer_by, BLIND)
+    assert [round(f.r_m) for f in features.listed(ekf)] == [4]
+
+
+def test_two_features_that_turn_out_to_be_one_wall_merge():
+    ekf, features = known([[[2.0, -3.0], [2.0, -1.0]], [[2.0, 1.0], [2.0, 3.0]], [[-1.0, 2.0], [1.0, 2.0]]])
+    first = min(f.id for f in features.listed(ekf))
+    assert len(features) == 3
+    features.observe(ekf, seen_lines([[2.0, -1.5], [2.0, 1.5]]), BLIND)
+    assert len(features) == 2 == len(ekf)
+    (long,) = [f for f in features.listed(ekf) if f.id == first]
+    assert sorted([long.start[1], long.end[1]]) == pytest.approx([-3.0, 3.0], abs=0.02)
+
+
+@pytest.mark.parametrize('local_areas', [False, True])
+def test_a_drive_through_a_room_finds_its_walls_once(rng, local_areas):
+    """All features are walls, and no wall is there twice."""
+    truths = [truth for truth, _ in drive(500, rng, np.array([2.0, 2.0, 0.0]))][::3]
+    ekf, features = CompressedEkf(truths[0], SURE), FeatureMap(FeatureConfig(), local_areas)
+    for truth in truths:
+        ekf.local.set_pose(truth, SURE)
+        scan = scan_in(ROOM, truth, rng)
+        features.observe(ekf, extract_lines(scan, LineConfig()), scan)
+    walls = [wall_of(feature) for feature in features.listed(ekf)]
+    assert -1 not in walls
+    assert len(walls) >= 7
+    inner = (4, 5)  # these have two faces
+    assert all(walls.count(w) <= (2 if w in inner else 1) for w in walls)
+
+
+def wall_of(feature):
+    for index, wall in enumerate(ROOM):
+        along = (wall[2:] - wall[:2]) / np.hypot(*(wall[2:] - wall[:2]))
+        off = [abs((end - wall[:2]) @ [-along[1], along[0]]) for end in (feature.start, feature.end)]
+        inside = [-0.2 < (end - wall[:2]) @ along < np.hypot(*(wall[2:] - wall[:2])) + 0.2
+                  for end in (feature.start, feature.end)]  # fmt: skip
+        if max(off) < 0.06 and all(inside):
+            return index
+    return -1
+
+
+def test_features_follow_the_filter_not_the_robot():
+    ekf, features = known([[[2.0, -1.0], [2.0, 1.0]]])
+    before = features.listed(ekf)[0]
+    ekf.local.set_pose(se2.pose(1.0, 0.5, 0.3), SURE)
+    after = features.listed(ekf)[0]
+    np.testing.assert_array_equal(before.start, after.start)
+
+
+def test_a_door_that_opens_leaves_the_map_and_a_wall_behind_a_person_does_not():
+    door, far = [[2.0, -1.0], [2.0, 1.0]], [[5.0, -3.0], [5.0, 3.0]]
+    ekf, features = known([door])
+    person = np.array([[1.0, -0.8, 1.0, 0.8], [*far[0], *far[1]]])
+    for _ in range(10):
+        features.observe(ekf, seen_lines(far), scan_in(person, np.zeros(3)))
+    assert sorted(round(f.r_m) for f in features.listed(ekf)) == [2, 5]
+    for _ in range(FeatureConfig().misses):
+        assert len(features) == 2
+        features.observe(ekf, seen_lines(far), scan_in(person[1:], np.zeros(3)))
+    assert [round(f.r_m) for f in features.listed(ekf)] == [5] == [f.id + 3 for f in features.listed(ekf)]
+    assert len(ekf) == 1
+
+
+def test_glass_is_not_taken_for_an_open_door():
+    ekf, features = known([[[2.0, -1.0], [2.0, 1.0]]])
+    for _ in range(20):
+        features.observe(ekf, seen_lines(), BLIND)
+    assert len(features) == 1

@@ -1,0 +1,177 @@
+"""The localizer in a simulated room, and what it does with input that is wrong."""
+
+import numpy as np
+import pytest
+from slam_room import ROOM, drive, scan_in
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
+
+START = np.array([2.0, 2.0, 0.0])
+AT_START = {'start_x_m': 2.0, 'start_y_m': 2.0}
+
+
+def driven(steps, seed=3, every=2, **config):
+    """Truth, estimate and odometry at each scan of a drive, and the localizer."""
+    rng = np.random.default_rng(seed)
+    localizer = Localizer(LocalizerConfig(**{**AT_START, **config}))
+    rows = []
+    for i, (truth, odom) in enumerate(drive(steps, rng, START)):
+        if i % every == 0:
+            rows.append((truth, localizer.step(scan_in(ROOM, truth, rng, i * 200_000_000), odom), odom))
+    return rows, localizer
+
+
+def errors_of(rows):
+    return np.array([se2.between(truth, estimate.T_map_base) for truth, estimate, _ in rows])
+
+
+@pytest.mark.parametrize('slam', ['ti', 'full', 'off'])
+def test_a_drive_round_the_room_stays_on_its_path(slam):
+    rows, localizer = driven(900, slam=slam)
+    off = errors_of(rows)
+    assert np.sqrt(np.mean(off[:, 0] ** 2 + off[:, 1] ** 2)) < 0.03
+    assert np.sqrt(np.mean(off[:, 2] ** 2)) < np.radians(0.5)
+    odometry = np.array([se2.between(truth, se2.compose(START, odom)) for truth, _, odom in rows])
+    assert np.hypot(*odometry[-1, :2]) > 0.3
+    assert not any(estimate.lost for _, estimate, _ in rows)
+    assert localizer.refused == 0
+    assert (len(localizer.features) > 5) == (slam != 'off')
+
+
+def test_local_areas_cost_no_accuracy():
+    """The path with the features of the local area, and with all."""
+    local, whole = driven(900, slam='ti')[0], driven(900, slam='full')[0]
+    apart = np.array([a.T_map_base - b.T_map_base for (_, a, _), (_, b, _) in zip(local, whole, strict=True)])
+    assert np.sqrt(np.mean(apart[:, 0] ** 2 + apart[:, 1] ** 2)) < 0.005
+    assert all(estimate.n_local <= estimate.n_features for _, estimate, _ in local)
+    assert all(estimate.n_local == estimate.n_features for _, estimate, _ in whole)
+
+
+def test_the_estimate_is_told_in_a_consistent_way():
+    rows, _ = driven(200)
+    for _, estimate, odom in rows:
+        np.testing.assert_allclose(se2.compose(estimate.T_map_odom, odom), estimate.T_map_base, atol=1e-9)
+        np.testing.assert_allclose(estimate.covariance, estimate.covariance.T)
+        assert np.linalg.eigvalsh(estimate.covariance).min() > 0.0
+        assert estimate.matched <= estimate.observed
+        assert 0.0 <= estimate.match_quality <= 1.0
+
+
+def test_the_same_input_gives_the_same_output():
+    first, second = (np.array([e.T_map_base for _, e, _ in driven(120)[0]]) for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+def test_a_robot_that_stands_still_learns_nothing():
+    rng = np.random.default_rng(1)
+    localizer = Localizer(LocalizerConfig(**AT_START))
+    estimates = [localizer.step(scan_in(ROOM, START, rng), np.zeros(3)) for _ in range(60)]
+    assert estimates[0].observed > 0
+    assert all(e.observed == 0 for e in estimates[1:])
+    poses = np.array([e.T_map_base for e in estimates])
+    assert np.abs(poses - START).max() < 0.02
+    assert not localizer.features
+
+
+@pytest.mark.parametrize('odom', [[np.nan, 0.0, 0.0], [0.0, np.inf, 0.0], [50.0, 0.0, 0.0]])
+def test_nonsense_of_the_odometry_is_refused_and_counted(odom):
+    rng = np.random.default_rng(2)
+    rows, localizer = driven(60)
+    truth, before, last = rows[-1]
+    estimate = localizer.step(scan_in(ROOM, truth, rng), np.array(odom))
+    assert localizer.refused == 1
+    assert np.abs(se2.between(before.T_map_base, estimate.T_map_base)).max() < 0.02
+    assert np.isfinite(estimate.covariance).all()
+    if not np.isfinite(odom).all():
+        later = localizer.step(scan_in(ROOM, truth, rng), last)
+        assert np.abs(se2.between(before.T_map_base, later.T_map_base)).max() < 0.02
+
+
+@pytest.mark.parametrize('value', [np.nan, np.inf, 0.0, -1.0, 1e9])
+def test_a_scan_of_nothing_leaves_the_odometry(value):
+    rows, localizer = driven(60)
+    _, before, odom = rows[-1]
+    blind = Scan.create(0, np.full(181, value), -1.57, 0.0175, 0.05, 8.0)
+    ahead = se2.pose(0.3, 0.0, 0.1)
+    estimate = localizer.step(blind, se2.compose(odom, ahead))
+    np.testing.assert_allclose(se2.between(before.T_map_base, estimate.T_map_base), ahead, atol=1e-9)
+    assert np.trace(estimate.covariance) > np.trace(before.covariance)
+
+
+def test_a_laser_whose_place_is_not_known_is_refused():
+    localizer = Localizer(LocalizerConfig(**AT_START))
+    scan = scan_in(ROOM, START)
+    lost = Scan(0, scan.ranges_m, -1.57, 0.0175, 0.05, 8.0, np.array([np.nan, 0.0, 0.0]))
+    np.testing.assert_allclose(localizer.step(lost, np.zeros(3)).T_map_base, START)
+    assert localizer.refused == 1
+
+
+def test_wheels_that_slip_are_caught_by_the_walls():
+    """Jumps of 0.3 m or 10 degrees in the odometry, now and then."""
+    rng = np.random.default_rng(4)
+    localizer, worst = Localizer(LocalizerConfig(**AT_START)), 0.0
+    measured, last = np.zeros(3), np.zeros(3)
+    for i, (truth, odom) in enumerate(drive(700, rng, START)):
+        measured, last = se2.compose(measured, se2.between(last, odom)), odom
+        if i % 100 == 60:
+            slip = se2.pose(0.3, 0.0, 0.0) if i % 200 == 60 else se2.pose(0.0, 0.0, np.radians(10.0))
+            measured = se2.compose(measured, slip)
+        estimate = localizer.step(scan_in(ROOM, truth, rng), measured)
+        worst = max(worst, float(np.hypot(*(estimate.T_map_base - truth)[:2])))
+    assert worst < 0.1
+
+
+def test_stuck_odometry_for_two_seconds_is_made_up_by_the_walls():
+    rng = np.random.default_rng(6)
+    localizer, stuck, worst = Localizer(LocalizerConfig(**AT_START)), np.zeros(3), 0.0
+    for i, (truth, odom) in enumerate(drive(400, rng, START)):
+        if not 200 <= i < 210:
+            stuck = odom
+        estimate = localizer.step(scan_in(ROOM, truth, rng), stuck)
+        worst = max(worst, float(np.hypot(*(estimate.T_map_base - truth)[:2])))
+    assert worst < 0.1
+
+
+def test_people_walking_through_do_not_carry_the_robot_along():
+    rng = np.random.default_rng(7)
+    localizer, worst = Localizer(LocalizerConfig(**AT_START)), 0.0
+    for i, (truth, odom) in enumerate(drive(500, rng, START)):
+        legs = []
+        for k in range(3):
+            at = truth[:2] + [1.5 * np.cos(0.05 * i + 2.0 * k), 1.5 * np.sin(0.05 * i + 2.0 * k)]
+            legs += [[at[0] - 0.15, at[1], at[0] + 0.15, at[1]], [at[0], at[1] - 0.15, at[0], at[1] + 0.15]]
+        estimate = localizer.step(scan_in(np.vstack([ROOM, legs]), truth, rng), odom)
+        worst = max(worst, float(np.hypot(*(estimate.T_map_base - truth)[:2])))
+    assert worst < 0.1
+
+
+def test_a_robot_carried_away_says_that_it_is_lost():
+    """Set down where nothing fits: the scans no longer lie on the map, and the estimate admits it."""
+    rng = np.random.default_rng(8)
+    rows, localizer = driven(300)
+    _, _, odom = rows[-1]
+    scans = [Scan.create(0, rng.uniform(0.5, 4.0, 181), -1.57, 0.0175, 0.05, 8.0) for _ in range(12)]
+    estimates = [localizer.step(scan, odom) for scan in scans]
+    assert estimates[-1].lost
+    assert not estimates[0].lost
+
+
+def test_a_pose_that_is_set_is_settled_by_the_walls():
+    rng = np.random.default_rng(9)
+    rows, localizer = driven(300)
+    truth, _, odom = rows[-1]
+    localizer.set_pose(truth + [0.1, -0.1, 0.05], np.diag([0.04, 0.04, 0.01]))
+    estimate = localizer.step(scan_in(ROOM, truth, rng), odom)
+    assert np.hypot(*(estimate.T_map_base - truth)[:2]) < 0.03
+    localizer.set_pose(np.array([np.nan, 0.0, 0.0]), np.eye(3))
+    assert localizer.refused == 1
+
+
+def test_after_a_reset_the_map_is_empty():
+    rows, localizer = driven(200)
+    localizer.reset()
+    assert not localizer.features
+    estimate = localizer.step(scan_in(ROOM, START), rows[-1][2])
+    np.testing.assert_allclose(estimate.T_map_base, START)

@@ -1,0 +1,113 @@
+"""Scans against the map of points: back to the true pose, honest where the walls leave a direction open."""
+
+import math
+
+import numpy as np
+import pytest
+from slam_room import ROOM, scan_in
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.slam.point_map import CENTRE_X, COUNT, LOOSE, NORMAL_X, NORMAL_Y, PointMap
+from thinmap_ros.core.slam.scan_matching import MatchConfig, ScanMatcher
+
+TRUTH = np.array([2.0, 2.0, 0.3])
+DOUBT = np.diag([0.1, 0.1, 0.1]) ** 2
+CORRIDOR = np.array([[-50.0, -1.0, 50.0, -1.0], [50.0, 1.0, -50.0, 1.0]])
+
+
+def matcher_of(segments, poses, rng):
+    matcher = ScanMatcher(MatchConfig())
+    for pose in poses:
+        scan = scan_in(segments, pose, rng)
+        matcher.add(se2.transform_points(pose, scan.points_base()), pose[:2])
+    return matcher
+
+
+def around(pose, number, rng):
+    return [pose + rng.normal(0.0, [0.2, 0.2, 0.2]) for _ in range(number)]
+
+
+def test_the_pose_is_found_from_a_prior_beside_it(rng):
+    matcher = matcher_of(ROOM, around(TRUTH, 15, rng), rng)
+    errors = []
+    for _ in range(30):
+        scan = scan_in(ROOM, TRUTH, rng)
+        prior = TRUTH + rng.normal(0.0, [0.08, 0.08, 0.06])
+        match = matcher.match(scan.points_base(), np.zeros(2), prior, DOUBT)
+        assert match.good
+        assert match.fit > 0.9
+        errors.append(match.T_map_base - TRUTH)
+    assert np.sqrt(np.mean(np.square(errors), axis=0)).max() < 0.012
+
+
+def test_a_prior_far_off_is_searched_for(rng):
+    matcher = matcher_of(ROOM, around(TRUTH, 15, rng), rng)
+    found = 0
+    for turn in np.radians([-12.0, -8.0, 8.0, 12.0]):
+        for shift in ([0.3, 0.25], [-0.3, 0.3]):
+            scan = scan_in(ROOM, TRUTH, rng)
+            match = matcher.match(scan.points_base(), np.zeros(2), TRUTH + [*shift, turn], DOUBT)
+            found += match.good and np.hypot(*(match.T_map_base - TRUTH)[:2]) < 0.05
+    assert found >= 7
+
+
+def test_along_a_corridor_the_odometry_decides(rng):
+    matcher = matcher_of(CORRIDOR, [np.array([x, 0.0, 0.0]) for x in np.linspace(-1, 1, 12)], rng)
+    prior = np.array([0.1, 0.06, 0.02])
+    match = matcher.match(scan_in(CORRIDOR, np.zeros(3), rng).points_base(), np.zeros(2), prior, DOUBT)
+    assert match.good
+    assert abs(match.T_map_base[0] - 0.1) < 0.03
+    assert abs(match.T_map_base[1]) < 0.01
+    assert match.covariance[0, 0] > 0.1 * DOUBT[0, 0]
+    assert match.covariance[1, 1] < 0.01 * DOUBT[1, 1]
+
+
+def test_another_place_is_no_good_fit(rng):
+    matcher = matcher_of(ROOM, around(TRUTH, 15, rng), rng)
+    clutter = np.column_stack([rng.uniform(0.5, 4.0, 150), rng.uniform(-3.0, 3.0, 150)])
+    assert not matcher.match(clutter, np.zeros(2), TRUTH, DOUBT).good
+
+
+def test_without_points_or_map_the_prior_is_given_back(rng):
+    empty = ScanMatcher(MatchConfig()).match(np.ones((100, 2)), np.zeros(2), TRUTH, DOUBT)
+    blind = matcher_of(ROOM, [TRUTH], rng).match(np.empty((0, 2)), np.zeros(2), TRUTH, DOUBT)
+    for match in (empty, blind):
+        assert not match.good
+        np.testing.assert_array_equal(match.T_map_base, TRUTH)
+        np.testing.assert_array_equal(match.covariance, DOUBT)
+
+
+def test_a_thin_wall_is_matched_by_the_face_that_is_seen(rng):
+    """From the far side of a wall 10 cm thick the near face must not draw the scan through the wall."""
+    faces = np.array([[2.0, -3.0, 2.0, 3.0], [2.1, -3.0, 2.1, 3.0], [0.0, -3.0, 5.0, -3.0], [0.0, 3.0, 5.0, 3.0]])
+    west, east = np.zeros(3), np.array([4.0, 0.0, math.pi])
+    matcher = matcher_of(faces[[0, 2, 3]], around(west, 15, rng), rng)
+    scan = scan_in(faces[[1, 2, 3]], east, rng)
+    for _ in range(15):
+        matcher.add(se2.transform_points(east, scan.points_base()), east[:2])
+    match = matcher.match(scan_in(faces[[1, 2, 3]], east, rng).points_base(), np.zeros(2), east, DOUBT)
+    assert abs(match.T_map_base[0] - 4.0) < 0.01
+
+
+@pytest.mark.parametrize('angle', np.linspace(0.0, math.pi, 7))
+def test_surfaces_of_the_point_map_have_the_wall_s_normal(rng, angle):
+    normal = np.array([math.cos(angle), math.sin(angle)])
+    along = np.array([-normal[1], normal[0]])
+    points = 3.0 * normal + np.linspace(-1.0, 1.0, 400)[:, None] * along + rng.normal(0.0, 0.01, (400, 1)) * normal
+    point_map = PointMap(0.05, 30.0)
+    point_map.add(points, np.zeros(2))
+    cells = point_map.tiles.pool.reshape(-1, 8)
+    cells = cells[(cells[:, COUNT] > 0.0) & (np.abs(cells[:, CENTRE_X : CENTRE_X + 2] @ along) < 0.7)]
+    assert len(cells) > 20
+    assert (cells[:, LOOSE] == 0.0).all()
+    # Turned towards where it was seen from.
+    assert (cells[:, NORMAL_X : NORMAL_Y + 1] @ normal < -0.97).all()
+    assert np.abs(cells[:, CENTRE_X : CENTRE_X + 2] @ normal - 3.0).max() < 0.015
+
+
+def test_the_point_map_forgets_what_has_moved():
+    point_map = PointMap(0.05, 10.0)
+    for x in [1.01] * 50 + [1.04] * 50:
+        point_map.add(np.array([[x, 0.02]]), np.zeros(2))
+    cells = point_map.tiles.pool.reshape(-1, 8)
+    assert cells[cells[:, COUNT] > 0.0, 1] == pytest.approx([1.04], abs=0.003)

@@ -1,0 +1,105 @@
+"""A live ROS graph for a test: real node processes on a private domain, and a client beside them."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import rclpy
+from rclpy.action import ActionClient
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+from thinmap_ros.adapters import qos
+
+# Generous: a test waits for what it wants, and fails only where that never comes.
+PATIENCE_S = 60.0
+
+
+class Graph:
+    """Node processes, and a node of the test's own that listens and asks."""
+
+    def __init__(self, domain: int, folder: Path) -> None:
+        self.folder, self.processes = folder, {}
+        self.context = Context()
+        rclpy.init(context=self.context, domain_id=domain)
+        self.node = Node('test_client', context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+
+    def start(self, name: str, **parameters: Any) -> subprocess.Popen[bytes]:
+        command = [sys.executable, '-m', f'thinmap_ros.nodes.{name}', '--ros-args']
+        for key, value in parameters.items():
+            text = f"'{value}'" if isinstance(value, str) else str(value).lower()
+            command += ['-p', f'{key}:={text}']
+        log = (self.folder / f'{name}.log').open('wb')
+        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, start_new_session=True)
+        log.close()
+        self.processes[name] = process
+        return process
+
+    def log(self, name: str) -> str:
+        return (self.folder / f'{name}.log').read_text()
+
+    def heard(self, topic: str, kind: type, profile: QoSProfile = qos.STREAM) -> list[Any]:
+        """List that fills with the messages of a topic as the test spins."""
+        messages: list[Any] = []
+        self.node.create_subscription(kind, topic, messages.append, profile)
+        return messages
+
+    def until(self, condition: Callable[[], Any], what: str, seconds: float = PATIENCE_S) -> None:
+        end = time.monotonic() + seconds
+        while not condition():
+            self.executor.spin_once(timeout_sec=0.05)
+            for name, process in self.processes.items():
+                if process.poll() not in (None, 0):
+                    pytest.fail(f'{name} ended with {process.returncode}: {self.log(name)}')
+            if time.monotonic() > end:
+                logs = '\n'.join(f'{name}: {self.log(name)[-2000:]}' for name in self.processes)
+                pytest.fail(f'never came: {what}\n{logs}')
+
+    def call(self, kind: type, name: str, request: Any) -> Any:
+        client = self.node.create_client(kind, name)
+        self.until(client.service_is_ready, f'service {name}')
+        future = client.call_async(request)
+        self.until(future.done, f'answer of {name}')
+        return future.result()
+
+    def act(self, kind: type, name: str, goal: Any) -> Any:
+        """Result of an action's goal, with status."""
+        client = ActionClient(self.node, kind, name)
+        self.until(client.server_is_ready, f'action {name}')
+        accepted = client.send_goal_async(goal)
+        self.until(accepted.done, f'{name} takes the goal')
+        ended = accepted.result().get_result_async()
+        self.until(ended.done, f'{name} ends', 120.0)
+        return ended.result()
+
+    def stop(self, name: str, number: int = signal.SIGINT) -> int:
+        """Exit code of a node after a signal."""
+        process = self.processes.pop(name)
+        process.send_signal(number)
+        return process.wait(timeout=PATIENCE_S)
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
+        for process in self.processes.values():
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+@pytest.fixture
+def graph(ros_domain: int, tmp_path: Path) -> Iterator[Graph]:
+    live = Graph(ros_domain, tmp_path)
+    yield live
+    live.close()

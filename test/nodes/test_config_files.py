@@ -1,0 +1,106 @@
+"""config/*.yaml says for people what the nodes declare: every parameter, its default, its meaning.
+
+THINMAP_WRITE_CONFIG=1 writes the files anew from what is declared.
+"""
+
+import importlib
+import os
+import textwrap
+from pathlib import Path
+
+import pytest
+import rclpy
+import yaml
+
+from thinmap_ros.adapters.bags import BagWriter
+from thinmap_ros.core.errors import ConfigError
+
+ROOT = Path(__file__).resolve().parents[2]
+NODES = sorted(path.stem for path in (ROOT / 'thinmap_ros' / 'nodes').glob('[a-z]*.py'))
+# What rclpy declares in every node of its own accord.
+OF_EVERY_NODE = {'start_type_description_service'}
+OWN_WORDS = {'use_sim_time': 'follow /clock instead of the time of the machine'}
+
+
+def node_class(name):
+    module = importlib.import_module(f'thinmap_ros.nodes.{name}')
+    classes = [c for c in vars(module).values() if isinstance(c, type) and c.__module__ == module.__name__]
+    (found,) = [c for c in classes if issubclass(c, rclpy.node.Node)]
+    return found
+
+
+@pytest.fixture
+def declared(ros_domain, tmp_path, monkeypatch):
+    """Value and descriptor of each parameter of a node, by name, as it starts with some arguments."""
+    monkeypatch.chdir(tmp_path)
+    BagWriter(tmp_path / 'some_bag', live=True).close()
+
+    def start(name, *arguments):
+        rclpy.init(args=['--ros-args', *arguments])
+        try:
+            node = node_class(name)()
+            names = [n for n in node._parameters if n not in OF_EVERY_NODE and not n.startswith('qos_overrides')]
+            found = {n: (node.get_parameter(n).value, node.describe_parameter(n)) for n in names}
+            getattr(node, 'close', lambda: None)()
+            node.destroy_node()
+            return found
+        finally:
+            rclpy.shutdown()
+
+    return start
+
+
+def described(name, value, descriptor):
+    text = OWN_WORDS.get(name, descriptor.description)
+    limits = [*descriptor.floating_point_range, *descriptor.integer_range]
+    if limits:
+        text += f'; {limits[0].from_value:g} to {limits[0].to_value:g}'
+    if descriptor.additional_constraints:
+        text += f'; {descriptor.additional_constraints}'
+    assert text, f'{name} has no description'
+    lines = textwrap.wrap(text, 112, initial_indent='    # ', subsequent_indent='    # ')
+    return [*lines, '    ' + yaml.safe_dump({name: value}).strip()]
+
+
+def file_text(name, parameters):
+    lines = [f'# Parameters of the node {name}, with their defaults:', '#   ros2 run thinmap_ros']
+    lines[1] += f' {name} --ros-args --params-file config/{name}.yaml'
+    lines += ['/**:', '  ros__parameters:']
+    for parameter, (value, descriptor) in parameters.items():
+        lines += described(parameter, value, descriptor)
+    return '\n'.join(lines) + '\n'
+
+
+@pytest.mark.parametrize('name', NODES)
+def test_config_file_says_what_the_node_declares(declared, name):
+    path = ROOT / 'config' / f'{name}.yaml'
+    needed = ['-p', 'bag:=some_bag'] if name == 'bag_player' else []
+    parameters = declared(name, *needed)
+    if needed:
+        parameters['bag'] = ('', parameters['bag'][1])
+    text = file_text(name, parameters)
+    if 'THINMAP_WRITE_CONFIG' in os.environ:
+        path.write_text(text)
+    assert path.read_text() == text, f'{path.name}: see the top of {__file__} for how to write it anew'
+
+
+@pytest.mark.parametrize('name', NODES)
+def test_node_takes_its_config_file(declared, tmp_path, name):
+    values = yaml.safe_load((ROOT / 'config' / f'{name}.yaml').read_text())['/**']['ros__parameters']
+    # A value that is no default proves that the file is read at all.
+    values['use_sim_time'] = True
+    if name == 'bag_player':
+        values['bag'] = 'some_bag'
+    (tmp_path / 'given.yaml').write_text(yaml.safe_dump({'/**': {'ros__parameters': values}}))
+    found = declared(name, '--params-file', str(tmp_path / 'given.yaml'))
+    assert {n: value for n, (value, _) in found.items()} == values
+
+
+def test_unknown_key_of_a_file_is_an_error(declared, tmp_path):
+    (tmp_path / 'given.yaml').write_text(yaml.safe_dump({'/**': {'ros__parameters': {'windwo_m': 3.0}}}))
+    with pytest.raises(ConfigError, match=r'no parameter windwo_m; it has: .*window_m'):
+        declared('grid_mapper', '--params-file', str(tmp_path / 'given.yaml'))
+
+
+def test_there_is_a_file_for_each_node_and_no_other():
+    assert sorted(path.stem for path in (ROOT / 'config').glob('*')) == NODES

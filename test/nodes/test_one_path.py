@@ -1,0 +1,82 @@
+"""One path: a log through `replay`, the same as a bag, and that bag played into the live nodes, give the same.
+
+Equal means: poses to 1e-9 m and rad (a live pose travels as a quaternion), and maps equal cell by cell.
+"""
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseWithCovarianceStamped
+
+from thinmap_msgs.srv import SaveMap
+from thinmap_ros.adapters import map_files, messages, resources
+from thinmap_ros.adapters.bags import BagLog
+from thinmap_ros.adapters.carmen import CarmenLog, LaserOptions
+from thinmap_ros.adapters.events import OdometryEvent, ScanEvent, Skipped
+from thinmap_ros.adapters.world_files import read_world
+from thinmap_ros.pipeline import PipelineConfig
+from thinmap_ros.sim.lms200 import Lms200Config
+from thinmap_ros.sim.pioneer import PRESETS
+from thinmap_ros.sim.runner import Simulation
+from thinmap_ros.sim.world import World
+from thinmap_ros.tools.carmen_to_bag import convert
+from thinmap_ros.tools.replay import replay
+
+pytestmark = pytest.mark.live
+
+
+class SimulatedLog:
+    """What a robot senses that drives in circles through the room."""
+
+    def __init__(self):
+        self.skipped = Skipped()
+
+    def events(self):
+        world = World.from_patch(*read_world(resources.world_path('room_10x10')))
+        simulation = Simulation(world, world.start, PRESETS['2dx'], Lms200Config(), 5)
+        moment = simulation.sense()
+        for _ in range(400):
+            yield OdometryEvent(moment.stamp_ns, moment.T_odom_base)
+            if moment.scan is not None:
+                yield ScanEvent(moment.scan)
+            moment = simulation.step(0.2, 0.25)
+
+
+def assert_same(one, other):
+    assert one.stamps_ns == other.stamps_ns
+    assert np.abs(np.array(one.poses) - np.array(other.poses)).max() <= 1e-9
+    patches = one.pipeline.grid.patch(), other.pipeline.grid.patch()
+    assert np.array_equal(patches[0].cells, patches[1].cells)
+
+
+def assert_live_is_same(graph, bag, expected, tmp_path):
+    poses = graph.heard('pose', PoseWithCovarianceStamped)
+    for name in ('localizer', 'grid_mapper', 'topology_builder'):
+        graph.start(name, use_sim_time=True)
+    graph.until(lambda: graph.node.count_subscribers('local_map') == 1, 'nodes')
+    player = graph.start('bag_player', bag=str(bag), rate=1000.0, lockstep='local_topology', wait_for_subscribers=2)
+    graph.until(lambda: player.poll() == 0 and len(poses) == len(expected.poses), 'a pose for each scan', 170.0)
+    assert [messages.stamp_ns(pose.header.stamp) for pose in poses] == expected.stamps_ns
+    live = np.array([messages.pose_from(pose.pose.pose) for pose in poses])
+    assert np.abs(live - expected.poses).max() <= 1e-9
+    response = graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(tmp_path / 'live')))
+    assert response.success, response.message
+    map_files.write_map(tmp_path / 'replayed', expected.pipeline.grid.patch())
+    assert (tmp_path / 'live.pgm').read_bytes() == (tmp_path / 'replayed.pgm').read_bytes()
+
+
+def test_simulated_log_bag_and_live_graph_agree(graph, tmp_path):
+    from_log = replay(SimulatedLog(), PipelineConfig())
+    convert(SimulatedLog(), tmp_path / 'bag')
+    from_bag = replay(BagLog(tmp_path / 'bag'), PipelineConfig())
+    assert len(from_log.poses) == 100
+    assert_same(from_log, from_bag)
+    assert_live_is_same(graph, tmp_path / 'bag', from_log, tmp_path)
+
+
+def test_real_log_bag_and_live_graph_agree(graph, shared_data, tmp_path):
+    log = CarmenLog(shared_data / 'logs' / 'sena' / 'log.clf', LaserOptions(offset_m=0.78))
+    from_log = replay(log, PipelineConfig())
+    convert(log, tmp_path / 'bag')
+    from_bag = replay(BagLog(tmp_path / 'bag'), PipelineConfig())
+    assert_same(from_log, from_bag)
+    assert_live_is_same(graph, tmp_path / 'bag', from_log, tmp_path)

@@ -1,0 +1,186 @@
+"""replay as a program: its files, its figures, and one line for whatever cannot be replayed."""
+
+import gzip
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from thinmap_ros.adapters import map_files
+from thinmap_ros.adapters.bags import BagWriter
+from thinmap_ros.adapters.carmen import CarmenLog, LaserOptions
+from thinmap_ros.tools.carmen_to_bag import convert
+
+TRAJECTORIES = {'trajectory.tum', 'trajectory_final.tum'}
+FILES = TRAJECTORIES | {'map.pgm', 'map.yaml', 'topology.geojson', 'summary.png', 'report.json'}
+BEAMS = 181
+
+
+def run(*arguments):
+    command = [sys.executable, '-m', 'thinmap_ros.tools.replay', *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True)
+
+
+def box_ranges(x, theta, half=3.0):
+    """What a laser sees in a square room around the origin."""
+    angles = theta + np.radians(np.arange(BEAMS) - 90.0)
+    to_x = (np.sign(np.cos(angles)) * half - x) / np.cos(angles)
+    to_y = half / np.abs(np.sin(angles) + 1e-12)
+    return np.minimum(np.abs(to_x), to_y)
+
+
+def carmen_lines(scans=30, beams=BEAMS, start_s=0.0):
+    lines = ['# a robot that drives along x through a square room']
+    for k in range(scans):
+        x, stamp = 0.03 * k, start_s + 0.2 * k
+        readings = ' '.join(f'{r:.3f}' for r in box_ranges(x, 0.0)[:beams])
+        tail = f'{x:.4f} 0 0 {x:.4f} 0 0 {stamp:.3f} robot {stamp:.3f}'
+        lines += [f'ODOM {x:.4f} 0 0 0.15 0 0 {stamp:.3f} robot {stamp:.3f}', f'FLASER {beams} {readings} {tail}']
+    return lines
+
+
+@pytest.fixture
+def log(tmp_path):
+    path = tmp_path / 'log.clf'
+    path.write_text('\n'.join(carmen_lines()) + '\n')
+    return path
+
+
+@pytest.mark.parametrize('form', ['plain', 'gzip', 'bag', 'mcap'])
+def test_files_and_figures(log, tmp_path, form):
+    if form == 'gzip':
+        packed = tmp_path / 'log.clf.gz'
+        packed.write_bytes(gzip.compress(log.read_bytes()))
+        log = packed
+    elif form != 'plain':
+        bag = tmp_path / ('bag' if form == 'bag' else 'bag.mcap')
+        convert(CarmenLog(log, LaserOptions()), bag)
+        log = bag
+    out = tmp_path / 'out'
+    done = run(log, '-o', out)
+    assert done.returncode == 0, done.stderr
+    assert {path.name for path in out.iterdir()} == FILES
+    report = json.loads((out / 'report.json').read_text())
+    assert (report['scans'], report['skipped']) == (30, 0)
+    assert report['distance'] == pytest.approx(0.87, abs=0.05)
+    assert set(report['ms_per_scan']) == {'localizer', 'grid', 'topology', 'all'}
+    trajectory = np.loadtxt(out / 'trajectory.tum')
+    assert trajectory.shape == (30, 8)
+    assert np.abs(trajectory[:, 1] - 0.03 * np.arange(30)).max() < 0.03
+    patch = map_files.read_map(out / 'map.yaml')
+    wall = patch.frame.cells_of(np.array([[3.0, 0.0]]))[0]
+    assert patch.occupied[wall[0], wall[1] - 1 : wall[1] + 2].any()
+
+
+def without_scans():
+    return [line for line in carmen_lines() if not line.startswith('FLASER')]
+
+
+def bag_without_odometry(path):
+    with BagWriter(path) as writer:
+        types = writer.typestore.types
+        time = types['builtin_interfaces/msg/Time'](sec=1, nanosec=0)
+        header = types['std_msgs/msg/Header'](stamp=time, frame_id='laser')
+        ranges = np.full(BEAMS, 2.0, dtype=np.float32)
+        scan = types['sensor_msgs/msg/LaserScan'](
+            header=header, angle_min=-1.57, angle_max=1.57, angle_increment=0.01745, time_increment=0.0, scan_time=0.0,
+            range_min=0.0, range_max=8.0, ranges=ranges, intensities=ranges[:0],
+        )  # fmt: skip
+        writer.write('/scan', 'sensor_msgs/msg/LaserScan', 1_000_000_000, scan)
+
+
+BAD = {
+    'missing': (lambda path: None, ['No such file']),
+    'empty': (lambda path: path.write_text(''), ['scan']),
+    'binary': (lambda path: path.write_bytes(bytes(range(256)) * 20), ['log']),
+    'without scans': (lambda path: path.write_text('\n'.join(without_scans())), ['scan']),
+    'one line without an end': (lambda path: path.write_text(carmen_lines()[2][:300]), ['scan']),
+    'folder': (lambda path: path.mkdir(), ['log']),
+}
+
+
+@pytest.mark.parametrize('case', BAD)
+def test_what_cannot_be_replayed_is_said_in_one_line(tmp_path, case):
+    make, words = BAD[case]
+    path = tmp_path / 'some.log'
+    make(path)
+    done = run(path, '-o', tmp_path / 'out')
+    assert done.returncode == 2
+    (line,) = [line for line in done.stderr.splitlines() if line.strip() and 'events' not in line]
+    assert 'some.log' in line
+    assert all(word in line for word in words), line
+    assert not (tmp_path / 'out').exists(), 'nothing is written of a log that could not be replayed'
+
+
+def test_bag_without_odometry_names_its_topics(tmp_path):
+    bag_without_odometry(tmp_path / 'bag')
+    done = run(tmp_path / 'bag', '-o', tmp_path / 'out')
+    assert done.returncode == 2
+    assert 'nav_msgs/msg/Odometry' in done.stderr and '/scan' in done.stderr
+    assert 'Traceback' not in done.stderr
+
+
+def test_bad_lines_are_counted_and_the_first_is_named(tmp_path):
+    lines = carmen_lines()
+    lines[10] = lines[10][: len(lines[10]) // 2]  # cut in the middle
+    lines[20] = lines[20].replace('FLASER 181', 'FLASER 95', 1)  # says 95 beams, has 181
+    path = tmp_path / 'some.log'
+    path.write_text('\n'.join(lines))
+    done = run(path, '-o', tmp_path / 'out', '--quiet')
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / 'out' / 'report.json').read_text())
+    assert (report['scans'], report['skipped']) == (28, 2)
+    assert 'some.log:11: ' in report['first_skipped']
+    assert '2 skipped' in done.stdout and 'some.log:11: ' in done.stdout
+
+
+def test_beam_counts_may_change(tmp_path):
+    path = tmp_path / 'some.log'
+    path.write_text('\n'.join(carmen_lines(10) + carmen_lines(10, beams=91, start_s=2.0)))
+    done = run(path, '-o', tmp_path / 'out', '--quiet')
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / 'out' / 'report.json').read_text())
+    assert report['scans'] + report['skipped'] == 20
+    assert report['scans'] >= 10
+
+
+def test_stamps_that_jump_back_do_no_harm(tmp_path):
+    path = tmp_path / 'some.log'
+    lines = carmen_lines()
+    path.write_text('\n'.join(lines[:41] + lines[21:]))
+    done = run(path, '-o', tmp_path / 'out', '--quiet')
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / 'out' / 'report.json').read_text())
+    assert report['scans'] + report['skipped'] == 40
+    # As in the file: a robot's clock is set back now and then, and its log goes on.
+    assert report['scans'] >= 38
+    poses = np.loadtxt(tmp_path / 'out' / 'trajectory.tum')
+    assert np.isfinite(poses).all()
+    assert np.abs(poses[:, 1]).max() < 1.0
+
+
+@pytest.mark.parametrize('arguments', [['--slam', 'magic'], ['--resolution-m', '0'], ['--offset-m', 'nan'], []])
+def test_wrong_options_end_with_two(log, tmp_path, arguments):
+    out = [] if not arguments else ['-o', tmp_path / 'out']
+    done = run(log, *out, *arguments)
+    assert done.returncode == 2
+    assert 'Traceback' not in done.stderr and done.stderr.strip()
+
+
+def test_unwritable_place_is_said(log):
+    done = run(log, '-o', '/proc/nowhere')
+    assert done.returncode == 2
+    assert '/proc/nowhere' in done.stderr and 'Traceback' not in done.stderr
+
+
+@pytest.mark.slow
+def test_real_office_log(shared_data, tmp_path):
+    log = shared_data / 'logs' / 'mrpt_office' / 'log.clf'
+    options = ['--start-angle-deg', '-110.0', '--step-deg', '0.352', '--offset-m', '0.16', '--max-range-m', '24.9']
+    done = run(log, '-o', tmp_path / 'out', '--quiet', *options)
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / 'out' / 'report.json').read_text())
+    assert report['scans'] > 400
+    assert report['nodes'] > 5

@@ -1,0 +1,1 @@
+"""What the papers compare with, and what others run: each behind the same protocol as ours."""

@@ -1,0 +1,263 @@
+"""Exploration as others do it: which frontier, or which end node, next.
+
+All of them run on the same map, drive by the same navigator, choose anew once a second and as soon as what they drive
+to is seen, and stop when nothing is left to choose from. What differs is the choice.
+"""
+
+import math
+from abc import ABC, abstractmethod
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.baselines.frontiers import Frontier, FrontierMap
+from thinmap_ros.core import se2
+from thinmap_ros.core.exploration.explorer import Decision, EndNode, FinishCode
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.raytrace import axis_setup
+from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.planning.graph_search import costs_from
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
+
+_SURVEY_NS = 1_000_000_000
+_AT_GOAL_M, _AT_GOAL_RAD = 0.3, 0.35
+_LOOKS = 3
+_TRIES = 3
+_SAME_PLACE_M = 1.0
+_VISIT_M = 0.5
+
+
+class FrontierExplorer(ABC):
+    """Drives to one frontier after the other until none is left that can be reached."""
+
+    def __init__(self) -> None:
+        self.map = FrontierMap()
+        self.target: Frontier | None = None
+        self._survey_ns = 0
+        self._frame = self.map.borders.frame
+        self._at_goal = self._nothing_left = self._number = 0
+        self._failures: list[tuple[float, float]] = []
+
+    @abstractmethod
+    def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
+        """Cost of each frontier, (N,), from a pose (3,): the cheapest is next."""
+
+    def step(self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array) -> Decision:
+        """Say where to go; see tools/explore_world.Strategy."""
+        self.map.update(patch, scan, T_map_base)
+        self._give_up_what_was_looked_at(T_map_base)
+        if self._is_due(scan.stamp_ns):
+            self._survey_ns, self._frame = scan.stamp_ns, self.map.borders.frame
+            self._choose(T_map_base)
+        self._nothing_left = self._nothing_left + 1 if self.target is None else 0
+        return _decision(topology, self.target, self._number, self._nothing_left >= _LOOKS, bool(self._failures))
+
+    def fail_target(self, reason: str) -> None:
+        """Remember where a target could not be reached."""
+        if self.target is not None:
+            self._failures.append((float(self.target.place[0]), float(self.target.place[1])))
+        self.target = None
+
+    def _is_due(self, stamp_ns: int) -> bool:
+        gone = self.target is None or self._frame != self.map.borders.frame or not self.map.is_open(self.target)
+        return gone or stamp_ns - self._survey_ns >= _SURVEY_NS
+
+    def _choose(self, T_map_base: Array) -> None:
+        left = [f for f in self.map.find(T_map_base) if self._tries(f) < _TRIES]
+        fewest = min((self._tries(f) for f in left), default=0)
+        left = [f for f in left if self._tries(f) == fewest]
+        before, self.target = self.target, None
+        if left:
+            best = left[int(np.argmin(self.costs(left, T_map_base)))]
+            if before is None or math.dist(before.middle, best.middle) > _SAME_PLACE_M:
+                self._number += 1
+            near = before is not None and math.dist(before.place, best.place) < _AT_GOAL_M
+            # A goal that hardly moved stays where it is: the robot would otherwise set out anew once a second.
+            self.target = Frontier(best.cells, best.middle, before.place, best.way_m) if near and before else best
+
+    def _tries(self, frontier: Frontier) -> int:
+        return sum(math.dist(frontier.place, place) <= _SAME_PLACE_M for place in self._failures)
+
+    def _give_up_what_was_looked_at(self, T_map_base: Array) -> None:
+        """What is still unknown although the robot stands there and looks has nothing more to show."""
+        if self.target is None or self._frame != self.map.borders.frame:
+            return
+        goal = self.target.goal
+        near = math.dist(T_map_base[:2], goal[:2]) <= _AT_GOAL_M
+        self._at_goal = self._at_goal + 1 if near and _turn(T_map_base, goal[2]) <= _AT_GOAL_RAD else 0
+        if self._at_goal >= _LOOKS:
+            self.map.borders.exhaust(self.target.cells, (float(T_map_base[0]), float(T_map_base[1])))
+            self.target, self._at_goal = None, 0
+
+
+class NearestFrontier(FrontierExplorer):
+    """The frontier with the shortest way over the grid.
+
+    Source: Yamauchi, "A frontier-based approach for autonomous exploration", 1997; Holz et al., "Evaluating the
+    efficiency of frontier-based exploration strategies", 2010 (choosing anew when the frontier is gone).
+    """
+
+    def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
+        """Way to each."""
+        return np.array([f.way_m for f in frontiers])
+
+
+class ExploreLite(FrontierExplorer):
+    """explore_lite's cost: potential_scale * straight distance - gain_scale * size, both scaled by the cell size.
+
+    Scales as in its launch file; size in cells, distance that of the nearest frontier cell, m; it drives to the
+    frontier's middle. Source: Hörner, "Map-merging for multi-robot system", 2016, package explore_lite.
+    """
+
+    potential_scale = 3.0
+    gain_scale = 1.0
+
+    def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
+        """Distance against size."""
+        frame = self.map.borders.frame
+        nearest = [np.hypot(*(frame.centres_of(f.cells) - T_map_base[:2]).T).min() for f in frontiers]
+        sizes = [len(f.cells) for f in frontiers]
+        return (self.potential_scale * np.array(nearest) - self.gain_scale * np.array(sizes)) * frame.resolution
+
+
+class InformationGain(FrontierExplorer):
+    """The greatest area that could be seen from a place, discounted by the way there: A exp(-lambda L).
+
+    Source: Gonzalez-Banos and Latombe, "Navigation strategies for exploring indoor environments", 2002.
+    """
+
+    discount_per_m = 0.2
+    range_m = 8.0
+
+    def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
+        """Less the discounted gain."""
+        assert self.map.patch is not None
+        frame = self.map.borders.frame
+        cells = frame.cells_of(np.array([f.place for f in frontiers]))
+        areas = _unknown_in_sight(self.map.patch.cells, cells, self.range_m / frame.resolution)
+        return -(areas + 1.0) * np.exp(-self.discount_per_m * np.array([f.way_m for f in frontiers]))
+
+
+class DistanceAdvantage(FrontierExplorer):
+    """The frontier for which now is the best time: near to the robot, and far from where it would be otherwise.
+
+    Cost: the way from the robot less the mean way from the other frontiers, from which it would have to be come back
+    to later.
+    """
+
+    def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
+        """Less the advantage."""
+        ways = np.array([f.way_m for f in frontiers])
+        places = np.array([f.place for f in frontiers])
+        if len(frontiers) < 2:
+            return ways
+        between = np.array([self.map.ways(place, places) for place in places])
+        between = np.where(np.isfinite(between), between, 0.0)
+        return np.asarray(ways - between.sum(axis=0) / (len(frontiers) - 1))
+
+
+class VisitAllEndNodes(NearestFrontier):
+    """The nearest end node that was not visited yet, by A* on the graph, until all were: exploration along a GVG.
+
+    Frontiers that no end node leads to are visited at the end, the nearest first.
+    Source: Choset and Nagatani, "Topological simultaneous localization and mapping (SLAM)", 2001.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._visited: list[tuple[float, float]] = []
+        self._end_node: tuple[int, Array] | None = None
+
+    def step(self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array) -> Decision:
+        """End nodes first; what frontiers there are is looked after meanwhile."""
+        node = self._next_end_node(topology, T_map_base)
+        if node is None:
+            self._end_node = None
+            return super().step(topology, patch, scan, T_map_base)
+        self.map.update(patch, scan, T_map_base)
+        if self._end_node is None or not _is_near(self._end_node[1], node[1]):
+            self._number += 1
+            self._end_node = node
+        return _decision(topology, self._end_node[1], self._number, False, False)
+
+    def fail_target(self, reason: str) -> None:
+        """An end node that cannot be reached counts as visited."""
+        if self._end_node is None:
+            super().fail_target(reason)
+        else:
+            self._visited.append((float(self._end_node[1][0]), float(self._end_node[1][1])))
+            self._end_node = None
+
+    def _next_end_node(self, topology: TopologicalMap, T_map_base: Array) -> tuple[int, Array] | None:
+        ends = [node for node in topology.nodes.values() if node.kind == NodeKind.END]
+        self._visited += [
+            (node.x, node.y) for node in ends
+            if math.dist((node.x, node.y), T_map_base[:2]) < _VISIT_M and not self._was_visited(node.x, node.y)
+        ]
+        left = {node.id: node for node in ends if not self._was_visited(node.x, node.y)}
+        if not left:
+            return None
+        costs = costs_from(topology, float(T_map_base[0]), float(T_map_base[1]))
+        best = min(left.values(), key=lambda node: costs.get(node.id, math.inf))
+        if not math.isfinite(costs.get(best.id, math.inf)):
+            return None
+        heading = math.atan2(best.y - T_map_base[1], best.x - T_map_base[0])
+        return best.id, se2.pose(best.x, best.y, heading)
+
+    def _was_visited(self, x: float, y: float) -> bool:
+        return any(math.dist((x, y), place) < _VISIT_M for place in self._visited)
+
+
+def _is_near(a: Array, b: Array) -> bool:
+    return math.dist(a[:2], b[:2]) < _AT_GOAL_M
+
+
+def _turn(T_map_base: Array, heading_rad: float) -> float:
+    return abs(se2.wrap(float(heading_rad - T_map_base[2])))
+
+
+def _decision(
+    topology: TopologicalMap, target: Frontier | Array | None, number: int, finished: bool, failures: bool
+) -> Decision:
+    """What is common to all: the graph's end nodes are told of, though nobody asked for their probability."""
+    nodes = [
+        _end_node(node.id, se2.pose(node.x, node.y, 0.0), False)
+        for node in topology.nodes.values() if node.kind == NodeKind.END
+    ]
+    goal = target.goal if isinstance(target, Frontier) else target
+    chosen = None if goal is None else _end_node(-number, goal, True)
+    code, reason = FinishCode.NONE, 'something is left'
+    if finished:
+        code = FinishCode.NOTHING_REACHABLE if failures else FinishCode.ALL_RESOLVED
+        reason = 'what is left cannot be reached' if failures else 'nothing is left'
+    return Decision(chosen, finished, reason, code, nodes, [], 0.0, 0.0)
+
+
+def _end_node(node_id: int, goal: Array, is_target: bool) -> EndNode:
+    x, y = float(goal[0]), float(goal[1])
+    return EndNode(node_id, x, y, 0.5, 0.0, 0.0, math.inf, 0.0, 0.0, is_target, goal)
+
+
+@kernel
+def _unknown_in_sight(cells: NDArray[np.int8], places: NDArray[np.int64], reach: float) -> NDArray[np.float64]:
+    """Unknown cells on rays (one a degree) from each place (N, 2) until something known to be occupied, (N,)."""
+    rows, cols = cells.shape
+    areas = np.zeros(places.shape[0])
+    seen = np.full((rows, cols), -1, dtype=np.int32)
+    for i in range(places.shape[0]):
+        for degree in range(360):
+            angle = math.radians(float(degree))
+            col, step_x, next_x, delta_x = axis_setup(places[i, 1] + 0.5, math.cos(angle))
+            row, step_y, next_y, delta_y = axis_setup(places[i, 0] + 0.5, math.sin(angle))
+            travelled = 0.0
+            while travelled <= reach and 0 <= row < rows and 0 <= col < cols and cells[row, col] < 65:
+                if cells[row, col] < 0 and seen[row, col] != i:
+                    seen[row, col] = i
+                    areas[i] += 1.0
+                if next_x < next_y:
+                    travelled, next_x, col = next_x, next_x + delta_x, col + step_x
+                else:
+                    travelled, next_y, row = next_y, next_y + delta_y, row + step_y
+    return areas

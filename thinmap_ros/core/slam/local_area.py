@@ -1,0 +1,146 @@
+"""Topological information: which features matter where the robot is.
+
+Features are stored at the nodes near which they were seen. The local area of a robot are the features of its node and
+of the nodes that edges join to it, but for those that it cannot see.
+Source: EKF-SLAM/TI paper section 4, Fig. 6-8.
+"""
+
+import math
+
+import numpy as np
+
+from thinmap_ros.core.se2 import Array, wrap
+from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
+
+_AS_NEAR_M = 1.0  # nodes farther than the nearest by no more than this are about as near
+_TURN_M_RAD = 0.5  # way that the robot could have gone while it turns by a radian
+_TRAIL_M = 3.0  # where no topology is known, the robot's own way is one, with nodes this far apart
+
+
+class LocalArea:
+    """Features by the topological nodes near which they were seen.
+
+    Until `set_topology` has given it nodes, nodes are laid along the robot's way.
+    """
+
+    def __init__(self) -> None:
+        self._topology = TopologicalMap()
+        self._trail: _Trail | None = _Trail(self._topology)
+        self._features_at: dict[int, set[int]] = {}
+        self._nodes_of: dict[int, set[int]] = {}
+        # Ids and places of all nodes, as they were when the robot was at a place (2,).
+        self._ids: list[int] = []
+        self._places: Array = np.empty((0, 2))
+        self._listed_at: Array = np.full(2, np.inf)
+
+    def set_topology(self, topology: TopologicalMap) -> None:
+        """Take the topological map in use from now on. It is only read, and may be changed by its owner."""
+        if topology is self._topology or not topology.nodes:
+            return
+        before = self._topology
+        self._topology, self._trail = topology, None
+        self._hand_over({i: before.nodes[i].position for i in self._features_at if i in before.nodes})
+        self._listed_at = np.full(2, np.inf)
+
+    def nodes_of(self, feature_id: int) -> list[int]:
+        """Ids of the nodes at which a feature is stored."""
+        return sorted(self._nodes_of.get(feature_id, ()))
+
+    def store(self, T_map_base: Array, feature_ids: list[int]) -> None:
+        """Store features that were seen from a pose (3,) at its node."""
+        if self._trail is not None and self._trail.follow(T_map_base):
+            self._list_nodes(T_map_base)
+        node = self._node_at(T_map_base)
+        if node is not None:
+            for feature_id in feature_ids:
+                self._put(feature_id, node)
+
+    def forget(self, feature_id: int, heir: int | None = None) -> None:
+        """Drop a feature everywhere; where it has become another one, heir, that is stored in its place."""
+        for node_id in self._nodes_of.pop(feature_id, set()):
+            self._features_at[node_id].discard(feature_id)
+            if heir is not None:
+                self._put(heir, node_id)
+
+    def features_near(self, T_map_base: Array, half_view_rad: float) -> set[int]:
+        """Features of the local area at a pose (3,); half_view_rad: how far to either side the laser sees."""
+        here = self._node_at(T_map_base)
+        if here is None:
+            return set()
+        found = set(self._features_at.get(here, ()))
+        for node_id in self._topology.neighbours(here):
+            bearing, distance = _from_robot(T_map_base, self._topology.nodes[node_id].position)
+            if abs(bearing) <= half_view_rad or distance <= _AS_NEAR_M:
+                found |= self._features_at.get(node_id, set())
+        return found
+
+    def _node_at(self, T_map_base: Array) -> int | None:
+        """The nearest node; of those about as near, the one that the robot reaches sooner as it is headed."""
+        if math.dist(T_map_base[:2], self._listed_at) > _AS_NEAR_M:
+            self._list_nodes(T_map_base)
+        distances = np.hypot(*(self._places - T_map_base[:2]).T)
+        cost, best = math.inf, None
+        for i in np.flatnonzero(distances <= distances.min(initial=np.inf) + _AS_NEAR_M):
+            bearing, distance = _from_robot(T_map_base, self._places[i])
+            if distance + _TURN_M_RAD * abs(bearing) < cost and self._ids[i] in self._topology.nodes:
+                cost, best = distance + _TURN_M_RAD * abs(bearing), self._ids[i]
+        return best
+
+    def _list_nodes(self, T_map_base: Array) -> None:
+        """Note all nodes anew. Once a metre is enough, and keeps a step's cost out of the size of the building."""
+        before = dict(zip(self._ids, self._places, strict=True))
+        nodes = self._topology.nodes
+        self._ids = list(nodes)
+        self._places = np.array([(n.x, n.y) for n in nodes.values()]).reshape(-1, 2)
+        self._listed_at = T_map_base[:2].copy()
+        self._hand_over({i: place for i, place in before.items() if i in self._features_at and i not in nodes})
+
+    def _hand_over(self, gone: dict[int, Array]) -> None:
+        """Features of nodes that are no more go to the nodes nearest to where those were, (2,)."""
+        features = {node_id: self._features_at.pop(node_id) for node_id in gone}
+        for node_id, left in features.items():
+            for feature_id in left:
+                self._nodes_of[feature_id].discard(node_id)
+        for node_id, place in gone.items():
+            heir = self._topology.nearest_node(float(place[0]), float(place[1]))
+            if heir is not None:
+                for feature_id in features[node_id]:
+                    self._put(feature_id, heir.id)
+
+    def _put(self, feature_id: int, node_id: int) -> None:
+        self._features_at.setdefault(node_id, set()).add(feature_id)
+        self._nodes_of.setdefault(feature_id, set()).add(node_id)
+
+
+class _Trail:
+    """Nodes along the robot's way, in a map that is given; coming back to one, the robot is there again."""
+
+    def __init__(self, topology: TopologicalMap) -> None:
+        self._map = topology
+        self._last: int | None = None
+        self._next_id = 1
+
+    def follow(self, T_map_base: Array) -> bool:
+        """Take in where the robot is now, (3,); whether nodes or edges came of it."""
+        x, y = float(T_map_base[0]), float(T_map_base[1])
+        node, last = self._map.nearest_node(x, y), self._last
+        known = len(self._map.nodes) + len(self._map.edges)
+        if node is None or math.dist(node.position, (x, y)) > _TRAIL_M:
+            node = Node(self._take_id(), NodeKind.CORNER, x, y, 0.0)
+            self._map.put_node(node)
+        if last is not None and last != node.id and node.id not in self._map.neighbours(last):
+            path = np.array([self._map.nodes[last].position, node.position])
+            length = math.dist(*path)
+            self._map.put_edge(Edge(self._take_id(), last, node.id, path, length, 0.0))
+        self._last = node.id
+        return len(self._map.nodes) + len(self._map.edges) != known
+
+    def _take_id(self) -> int:
+        self._next_id += 1
+        return self._next_id - 1
+
+
+def _from_robot(T_map_base: Array, place: Array) -> tuple[float, float]:
+    """Bearing (rad, robot frame) and distance of a place (2,)."""
+    dx, dy = float(place[0] - T_map_base[0]), float(place[1] - T_map_base[1])
+    return wrap(math.atan2(dy, dx) - float(T_map_base[2])), math.hypot(dx, dy)

@@ -1,0 +1,37 @@
+"""Features that should be seen and are not: a door that has opened, a box that was carried off."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array, compose
+from thinmap_ros.core.slam.features import Feature, normals_of, tangents_of
+
+_BEYOND_M = 0.3  # a beam that ends this far behind a wall went through where the wall should be
+_END_M = 0.15  # nothing is expected of the ends of a feature
+_FEWEST_BEAMS = 8
+_SHARE = 0.7  # of the beams that come as far as the feature
+_FLATTEST = 0.17  # least sine of the angle between beam and wall
+
+
+def seen_through(scan: Scan, T_map_base: Array, lines: Array, features: list[Feature]) -> NDArray[np.bool_]:
+    """For each feature with its line (N, 2) whether the scan shows that it is no longer there, (N,).
+
+    Most of the beams that should have met it, and enough of them, end well behind it. Beams that return nothing tell
+    nothing: glass and black walls do that as well.
+    """
+    if not features:
+        return np.zeros(0, dtype=np.bool_)
+    T_map_laser = compose(T_map_base, scan.T_base_laser)
+    angles = scan.angles_rad[scan.hit] + T_map_laser[2]
+    beams = np.column_stack([np.cos(angles), np.sin(angles)])
+    towards = beams @ normals_of(lines).T
+    with np.errstate(divide='ignore', invalid='ignore'):
+        expected = (lines[:, 0] - normals_of(lines) @ T_map_laser[:2]) / towards
+        along = tangents_of(lines) @ T_map_laser[:2] + expected * (beams @ tangents_of(lines).T)
+    low, high = np.array([(f.low, f.high) for f in features]).T
+    aimed = (expected > 0.0) & (np.abs(towards) > _FLATTEST) & (along > low + _END_M) & (along < high - _END_M)
+    ranges = scan.ranges_m[scan.hit][:, None]
+    through = (aimed & (ranges > expected + _BEYOND_M)).sum(axis=0)
+    reaching = (aimed & (ranges > expected - _BEYOND_M)).sum(axis=0)
+    return np.asarray((through >= _FEWEST_BEAMS) & (through > _SHARE * reaching))

@@ -1,0 +1,88 @@
+"""A rehearsal of each algorithm in a small room, so that no kernel has to be compiled or loaded during a real step.
+
+A node rehearses before it listens: on a robot the first seconds would otherwise be spent standing still, and in a
+simulation that runs faster than real time many more.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.exploration.explorer import Explorer
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.occupancy import OccupancyGrid
+from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
+from thinmap_ros.core.grid.raytrace import cast_rays
+from thinmap_ros.core.planning.navigator import Navigator
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.localizer import Localizer
+from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig, build
+
+_CELL_M, _RANGE_M, _BEAMS = 0.1, 8.0, 181
+_ROOM_CELLS, _PASSAGE = 80, slice(30, 50)
+_SCANS, _PERIOD_S, _STEP_M, _TURN_RAD = 12, 0.2, 0.12, 0.11
+
+
+def localizer() -> None:
+    """Rehearse localization."""
+    rehearsed = Localizer()
+    for scan, T_map_base in _drive():
+        rehearsed.step(scan, T_map_base)
+
+
+def grid_mapper() -> None:
+    """Rehearse the map update and its windows."""
+    rehearsed = OccupancyGrid()
+    for scan, T_map_base in _drive():
+        rehearsed.update(scan, T_map_base)
+        rehearsed.window(T_map_base[0], T_map_base[1], 10.0)
+    rehearsed.patch()
+
+
+def topology_builder() -> None:
+    """Rehearse thinning and the merging of local maps."""
+    grid, rehearsed = OccupancyGrid(), TopologyBuilder()
+    for scan, T_map_base in _drive():
+        grid.update(scan, T_map_base)
+        rehearsed.update(grid.window(T_map_base[0], T_map_base[1], 10.0), T_map_base)
+
+
+def explorer() -> None:
+    """Rehearse the choice of an end node in a room of which a part is unknown."""
+    patch, rehearsed = _room(), Explorer()
+    topology = build(patch, (2.0, 2.0), TopologyConfig())
+    for scan, T_map_base in _drive():
+        rehearsed.step(topology, patch, scan, T_map_base)
+
+
+def navigator() -> None:
+    """Rehearse planning and driving."""
+    patch, rehearsed = _room(), Navigator()
+    rehearsed.set_goal(4.0, 3.0, 0.0)
+    for scan, T_map_base in _drive():
+        rehearsed.step(T_map_base, patch, scan, _PERIOD_S)
+
+
+def _room() -> GridPatch:
+    """A room with a pillar, and a passage into the unknown."""
+    cells = np.zeros((_ROOM_CELLS, _ROOM_CELLS), dtype=np.int8)
+    cells[[0, -1]], cells[:, [0, -1]] = 100, 100
+    cells[40:46, 40:46] = 100
+    cells[_PASSAGE, -1], cells[:, -20:-1] = 0, UNKNOWN
+    return GridPatch(GridFrame(0.0, 0.0, _CELL_M), cells)
+
+
+def _drive() -> Iterator[tuple[Scan, Array]]:
+    """Scans along an arc through the room, each with its pose (3,)."""
+    occupied = _room().occupied.astype(np.uint8)
+    step = np.radians(180.0 / (_BEAMS - 1))
+    angles = step * np.arange(_BEAMS) - np.pi / 2.0
+    T_map_base = se2.pose(2.0, 2.0, 0.3)
+    for k in range(_SCANS):
+        x, y = T_map_base[:2] / _CELL_M
+        ranges = _CELL_M * cast_rays(occupied, x, y, angles + T_map_base[2], _RANGE_M / _CELL_M)
+        scan = Scan.create(round(1e9 * _PERIOD_S * k), ranges, float(angles[0]), float(step), 0.05, _RANGE_M)
+        yield scan, T_map_base
+        T_map_base = se2.compose(T_map_base, se2.pose(_STEP_M, 0.0, _TURN_RAD))
