@@ -1,7 +1,9 @@
 """Occupancy grid: log odds of each cell, updated by Bayes' rule from laser scans."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,6 +86,31 @@ class OccupancyGrid:
         clamped = np.clip(patch.cells / 100.0, grid.config.p_lowest, grid.config.p_highest)
         odds = np.round(_SCALE * np.log(clamped / (1.0 - clamped))).astype(np.int16)
         grid._tiles.write(0, 0, np.where(patch.cells == UNKNOWN, 0, odds).astype(np.int16))
+        return grid
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """All that the grid knows, exactly, as arrays by name; `from_state` makes the same grid of it."""
+        return {
+            'frame': self.frame.as_array(),
+            'tiles': self._tiles.places(),
+            'log_odds': self._tiles.pool[: self._tiles.used].copy(),
+        }
+
+    @staticmethod
+    def from_state(state: Mapping[str, NDArray[Any]], config: OccupancyConfig | None = None) -> 'OccupancyGrid':
+        """Grid that goes on from the `state` of another. Raises InputError where it is no such state."""
+        try:
+            frame, tiles, odds = (state[key] for key in ('frame', 'tiles', 'log_odds'))
+            origin_x, origin_y, resolution = frame.astype(np.float64).tolist()
+        except (KeyError, ValueError, TypeError) as error:
+            raise InputError(f'saved grid: {error}: expected frame, tiles and log_odds') from error
+        if tiles.shape != (len(odds), 2) or odds.shape[1:] != (TILE, TILE) or odds.dtype != np.int16:
+            raise InputError(f'saved grid: {tiles.shape} tiles, {odds.shape} log odds: expected one array a tile')
+        if np.abs(odds.astype(np.int64)).max(initial=0) > _LIMIT:
+            raise InputError(f'saved grid: log odds up to {np.abs(odds).max()}: expected at most {_LIMIT}')
+        grid = OccupancyGrid(config, GridFrame(origin_x, origin_y, resolution))
+        for (row, col), cells in zip(tiles.tolist(), odds, strict=True):
+            grid._tiles.write(row * TILE, col * TILE, cells)
         return grid
 
     def update(self, scan: Scan, T_map_base: Array) -> None:
