@@ -45,6 +45,11 @@ class Box:
         """The first row and col after it."""
         return (self.row + self.rows, self.col + self.cols)
 
+    def meets(self, other: 'Box') -> bool:
+        """Whether the two share a cell or touch."""
+        rows = self.row <= other.end[0] and other.row <= self.end[0]
+        return rows and self.col <= other.end[1] and other.col <= self.end[1]
+
     def around(self, cells: Cells, rim: int, limit: 'Box') -> 'Box':
         """The smallest box that holds this one and some cells (N, 2) with a rim, but ends at the limit."""
         low = np.maximum(np.minimum((self.row, self.col), cells.min(axis=0) - rim), (limit.row, limit.col))

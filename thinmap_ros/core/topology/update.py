@@ -15,6 +15,7 @@ from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.free_space import (
     column_distance,
     known_free,
+    label,
     nearest_cell,
     reachable,
     select_free_space,
@@ -32,7 +33,8 @@ __all__ = ['TopologyBuilder', 'TopologyConfig', 'build']
 
 Cells = NDArray[np.int64]
 _STRIDE_M = 1.0  # between poses at which the map is built anew
-_PAD = 10  # cells round what changed that are drawn anew with it
+_PAD = 6  # cells round what changed that are drawn anew with it
+_APART = 16  # cells between changes that are drawn anew each for itself
 
 
 def build(patch: GridPatch, seed_xy: tuple[float, float] | None, config: TopologyConfig) -> TopologicalMap:
@@ -127,7 +129,7 @@ class TopologyBuilder:
 
     def _merge(self, view: '_View', known: tuple[Cells, Cells], box: Box) -> None:
         """Put the skeleton of the window into the atlas where it differs from what was there."""
-        low = (box.row, box.col)
+        low = np.array([box.row, box.col])
         old = np.zeros((box.rows, box.cols), dtype=np.int64)
         rows, cols = (known[0] - low).T
         old[rows, cols] = known[1]
@@ -140,28 +142,45 @@ class TopologyBuilder:
         added = np.argwhere(stitched & (squared == 0))
         squared[added[:, 0], added[:, 1]] = view.measure(added)
         squared[~stitched] = 0
-        changed = np.argwhere(squared != old)
-        if len(changed):
-            self._redraw(view, squared, changed, box)
-
-    def _redraw(self, view: '_View', squared: Cells, changed: Cells, box: Box) -> None:
-        """Draw the atlas anew round the cells (N, 2) of a box that changed, and clean up there.
-
-        squared (H, W): the whole skeleton as it is to be: squared clearances, 0 elsewhere.
-        """
-        low = np.array([box.row, box.col])
-        row, col = (changed[0] + low).tolist()
-        part = self._atlas.calm(Box(row, col, 1, 1).around(changed + low, _PAD, box), box)
-        corner = np.array([part.row, part.col])
-        inner = tuple(slice(at, at + size) for at, size in zip(corner - low, (part.rows, part.cols), strict=True))
-        there = np.ascontiguousarray(squared[inner])
-        cut = self._atlas.cut_out(part)
-        pinned = np.zeros(there.shape, dtype=np.bool_)
-        anchors = np.array(list(cut.anchors), dtype=np.int64).reshape(-1, 2) - corner
-        pinned[anchors[:, 0], anchors[:, 1]] = True
-        web = web_of(there > 0, lambda cells: there[cells[:, 0], cells[:, 1]], pinned)
-        touched = self._atlas.graft(web, part, cut.anchors) | cut.touched
+        touched: set[int] = set()
+        for part in self._places_to_redraw(squared != old, box):
+            corner = np.array([part.row, part.col]) - low
+            inner = tuple(slice(at, at + size) for at, size in zip(corner, (part.rows, part.cols), strict=True))
+            touched |= self._redraw(np.ascontiguousarray(squared[inner]), part)
         simplify(self._atlas, touched, lambda spot: view.is_promising(spot, box), view.limits)
+
+    def _places_to_redraw(self, changed: NDArray[np.bool_], box: Box) -> list[Box]:
+        """Rectangles of the lattice that hold what changed in a box (H, W), apart from each other."""
+        cells = np.argwhere(changed)
+        blocks = cells // _APART
+        coarse = np.zeros((box.rows // _APART + 1, box.cols // _APART + 1), dtype=np.bool_)
+        coarse[blocks[:, 0], blocks[:, 1]] = True
+        numbers, sizes = label(coarse)
+        groups = numbers[blocks[:, 0], blocks[:, 1]]
+        places: list[Box] = []
+        for number in range(1, len(sizes)):
+            group = cells[groups == number] + (box.row, box.col)
+            row, col = group[0].tolist()
+            place = self._atlas.calm(Box(row, col, 1, 1).around(group, _PAD, box), box)
+            while beside := [other for other in places if place.meets(other)]:
+                places = [other for other in places if other not in beside]
+                corners = [(other.row, other.col) for other in beside]
+                ends = [(other.row + other.rows - 1, other.col + other.cols - 1) for other in beside]
+                place = self._atlas.calm(place.around(np.array(corners + ends), 0, box), box)
+            places.append(place)
+        return places
+
+    def _redraw(self, squared: Cells, place: Box) -> set[int]:
+        """Draw the atlas anew in a place; returns the spots that were touched.
+
+        squared (H, W): the skeleton as it is to be: squared clearances, 0 elsewhere.
+        """
+        cut = self._atlas.cut_out(place)
+        pinned = np.zeros(squared.shape, dtype=np.bool_)
+        anchors = np.array(list(cut.anchors), dtype=np.int64).reshape(-1, 2) - (place.row, place.col)
+        pinned[anchors[:, 0], anchors[:, 1]] = True
+        web = web_of(squared > 0, lambda cells: squared[cells[:, 0], cells[:, 1]], pinned)
+        return self._atlas.graft(web, place, cut.anchors) | cut.touched
 
     def _local(self, view: '_View', window: GridPatch) -> TopologicalMap:
         """The window's own part of the new skeleton as a map."""
