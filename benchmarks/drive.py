@@ -11,8 +11,8 @@ from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.se2 import Array, pose, wrap
-from thinmap_ros.core.topology.graph import TopologicalMap
-from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig
+from thinmap_ros.core.topology.graph import Node, TopologicalMap
+from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig, build
 from thinmap_ros.sim.lms200 import Lms200, Lms200Config
 from thinmap_ros.sim.world import World
 
@@ -58,22 +58,22 @@ class Drive:
         for T in poses:
             self.step(T)
 
-    def _compare(self, before: dict[int, 'object'], T: Array) -> None:
+    def _compare(self, before: dict[int, Node], T: Array) -> None:
         """Count the nodes in view whose place still has a node, and those of them that kept their id."""
         after = self.builder.map.nodes
         places = np.array([node.position for node in after.values()]).reshape(-1, 2)
         for number, node in before.items():
-            if max(abs(node.x - T[0]), abs(node.y - T[1])) > _IN_VIEW_M:  # type: ignore[attr-defined]
+            if max(abs(node.x - T[0]), abs(node.y - T[1])) > _IN_VIEW_M:
                 continue
-            still = bool((np.hypot(*(places - node.position).T) <= 0.5).any())  # type: ignore[attr-defined]
+            still = bool((np.hypot(*(places - node.position).T) <= 0.5).any())
             self.ledger.asked += still
             self.ledger.kept += still and number in after
 
 
 def tour(world: World, start: Array, radius_m: float, goals: int, seed: int) -> list[Array]:
-    """Poses (3,) of a drive that visits the place of the world farthest from all that it has been near, and again.
+    """Poses (3,) of a drive that goes to the place of the world farthest from where it has been, again and again.
 
-    Source of the ways: the wavefront planner on the world itself, kept 0.6 m from walls where there is room.
+    The ways are the wavefront planner's on the world itself: 0.6 m from walls where there is room.
     """
     rng = np.random.default_rng(seed)
     cells = np.where(world.occupied != 0, np.int8(100), np.int8(0))
@@ -119,7 +119,5 @@ def _along(T: Array, way: Array) -> list[Array]:
 
 def final_map(drive: Drive, start: Array | None) -> TopologicalMap:
     """The batch map of the grid at the end, of all parts or of that round a start."""
-    from thinmap_ros.core.topology.update import build
-
     seed_xy = None if start is None else (float(start[0]), float(start[1]))
     return build(drive.grid.patch(), seed_xy, drive.builder.config)

@@ -82,11 +82,11 @@ class GridPaths:
 def completeness(
     patch: GridPatch, graph: TopologicalMap, radius_m: float, pairs: int, seed: int
 ) -> tuple[float, float]:
-    """Share of random reachable pairs of cells joined through the graph, and the mean ratio of path lengths.
+    """Share of random reachable pairs of cells joined through the graph, and the mean length against the best.
 
-    From a cell the robot goes over the grid to one of the nearest nodes (the way counts) or straight to the other
-    cell where that is shorter, then along straight lines between nodes. The other length is that of the shortest way
-    over cells with the same clearance.
+    From a cell the robot goes over the grid to one of the nearest nodes (the way counts), then along straight lines
+    between nodes. The best way is the shortest one over cells with the same clearance. Means are over all pairs that
+    are joined.
     """
     paths = GridPaths(clearance_m(patch) >= radius_m - 1e-9)
     rng = np.random.default_rng(seed)
@@ -96,17 +96,16 @@ def completeness(
     places = patch.frame.cells_of(np.array([graph.nodes[k].position for k in order]))
     at_nodes = paths.numbers[places[:, 0], places[:, 1]]
     between = csgraph.dijkstra(_straight_lines(graph, order, patch.frame.resolution), directed=False)
-    joined, ratios = 0, []
+    found, best = [], []
     for source, target in zip(sources.tolist(), targets, strict=True):
         from_source, from_target = paths.lengths_from(source), paths.lengths_from(target)
-        best = float(from_source[target])
         first, last = (_nearest(lengths, at_nodes) for lengths in (from_source, from_target))
         ways = from_source[at_nodes[first], None] + between[np.ix_(first, last)] + from_target[at_nodes[last]]
         length = float(ways.min(initial=np.inf))
         if math.isfinite(length):
-            joined += 1
-            ratios.append(max(min(length, math.inf), 1.0) / max(best, 1.0))
-    return joined / pairs, float(np.mean(ratios)) if ratios else math.inf
+            found.append(length)
+            best.append(float(from_source[target]))
+    return len(found) / pairs, sum(found) / max(sum(best), 1.0)
 
 
 def _nearest(lengths: Array, at_nodes: NDArray[np.int64]) -> NDArray[np.int64]:

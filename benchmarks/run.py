@@ -1,0 +1,34 @@
+"""All benchmarks: python -m benchmarks.run [thinning mapping graphs online] [--quick] [--worlds DIR]."""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+from benchmarks import graphs, mapping, online, thinning
+from benchmarks.table import Row, show
+from benchmarks.worlds import WORLDS
+
+_ALL: dict[str, Callable[[Path, bool], list[Row]]] = {
+    'thinning': lambda worlds, quick: thinning.run(quick),
+    'mapping': mapping.run,
+    'graphs': graphs.run,
+    'online': online.run,
+}
+
+
+def main() -> None:
+    """Run the benchmarks that are named, or all."""
+    parser = argparse.ArgumentParser(prog='benchmarks.run', description='Benchmarks of grid, thinning and topology')
+    parser.add_argument('names', nargs='*', help=f'some of {", ".join(_ALL)} (default: all)')
+    parser.add_argument('--quick', action='store_true', help='fewer worlds, pairs and scans: a minute or two')
+    parser.add_argument('--worlds', type=Path, default=WORLDS, help=f'folder with worlds.json (default {WORLDS})')
+    arguments = parser.parse_args()
+    if unknown := set(arguments.names) - set(_ALL):
+        parser.error(f'unknown benchmark {sorted(unknown)[0]}: expected some of {", ".join(_ALL)}')
+    for name in arguments.names or _ALL:
+        print(f'-- {name}')
+        show(_ALL[name](arguments.worlds, arguments.quick))
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,17 @@
+"""Times that can be compared: the best of several runs, taken in turns."""
+
+import time
+from collections.abc import Callable
+
+
+def best_seconds(works: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
+    """Shortest time of each work over some rounds; all take turns, so that a busy machine is busy for all."""
+    for work in works.values():
+        work()  # compile, fill caches
+    best = dict.fromkeys(works, float('inf'))
+    for _ in range(rounds):
+        for name, work in works.items():
+            started = time.perf_counter()
+            work()
+            best[name] = min(best[name], time.perf_counter() - started)
+    return best
