@@ -132,6 +132,37 @@ def test_a_recording_that_cannot_be_written_is_refused(tmp_path):
         View(tmp_path)
 
 
+@needs_rerun
+@pytest.mark.skipif(sys.platform != 'linux', reason='screens are found by these variables on Linux')
+def test_viewer_without_a_screen_is_refused(tmp_path, monkeypatch):
+    monkeypatch.delenv('DISPLAY', raising=False)
+    monkeypatch.delenv('WAYLAND_DISPLAY', raising=False)
+    with pytest.raises(InputError, match='no screen'):
+        View(tmp_path / 'a.rrd', spawn=True)
+    assert not list(tmp_path.iterdir())
+
+
+@needs_rerun
+def test_viewer_is_sent_what_the_file_holds_and_ends_with_the_view(tmp_path, monkeypatch):
+    # The real program, told to write down what it receives where it would open a window.
+    received, stand_in = tmp_path / 'received.rrd', tmp_path / 'viewer'
+    stand_in.write_text(f'#!/bin/sh\nexec "{rerun_view._viewer_program()}" --save "{received}" "$@"\n')
+    stand_in.chmod(0o755)
+    monkeypatch.setattr(rerun_view, '_viewer_program', lambda: str(stand_in))
+    monkeypatch.setenv('DISPLAY', ':none')
+    view = View(tmp_path / 'a.rrd', spawn=True)
+    viewer = view._viewer
+    for i in range(10):
+        view.number(START + i * S, 'coverage/estimate', 0.1 * i)
+    assert viewer.poll() is None
+    view.close()
+    assert viewer.poll() is not None
+    rows, _ = read_back(tmp_path / 'a.rrd')
+    assert len(rows['/plots/coverage/estimate']) == 10
+    # It is ended, not asked to finish its file: what matters is that it was reached.
+    assert received.stat().st_size > 0
+
+
 def write_bag(path):
     with BagWriter(path) as bag:
         types = bag.typestore.types

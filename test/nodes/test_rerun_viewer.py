@@ -1,5 +1,7 @@
 """The viewer as a process: it writes what it hears, and ends well."""
 
+from pathlib import Path
+
 import pytest
 from geometry_msgs.msg import PoseStamped
 
@@ -9,7 +11,7 @@ pytestmark = pytest.mark.live
 
 
 def test_without_anything_to_show_it_says_so_and_ends_on_a_signal(graph):
-    graph.start('rerun_viewer')
+    graph.start('rerun_viewer', spawn=False)
     graph.until(lambda: 'nothing is shown' in graph.log('rerun_viewer'), 'the warning')
     assert graph.stop('rerun_viewer') == 0
 
@@ -19,7 +21,7 @@ def test_recording_can_be_read_after_a_signal(graph, tmp_path):
     from rerun.chunk import RrdReader
 
     path = tmp_path / 'live.rrd'
-    graph.start('rerun_viewer', recording=str(path))
+    graph.start('rerun_viewer', recording=str(path), spawn=False)
     truth = graph.node.create_publisher(PoseStamped, 'ground_truth', qos.STREAM)
     graph.until(lambda: truth.get_subscription_count() == 1, 'the viewer listens')
     for i in range(5):
@@ -34,7 +36,9 @@ def test_recording_can_be_read_after_a_signal(graph, tmp_path):
 
 
 @pytest.mark.skipif(rerun_view.is_installed(), reason='says what happens where rerun is not installed; it is')
-def test_without_rerun_the_start_ends_with_one_clear_line(graph, tmp_path):
-    process = graph.start('rerun_viewer', recording=str(tmp_path / 'live.rrd'))
+@pytest.mark.parametrize('parameters', [{}, {'recording': 'live.rrd', 'spawn': False}])
+def test_without_rerun_the_start_ends_with_one_clear_line(graph, parameters):
+    process = graph.start('rerun_viewer', **parameters)
     assert process.wait(timeout=60.0) == 2
     assert graph.log('rerun_viewer').strip().splitlines()[-1].startswith('error: rerun is not installed')
+    assert not Path('live.rrd').exists()

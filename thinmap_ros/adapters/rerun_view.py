@@ -1,6 +1,11 @@
 """Core values shown in rerun, live or in an .rrd file. rerun is optional: it is the extra `viewer`."""
 
+import contextlib
 import importlib.util
+import os
+import socket
+import subprocess
+import sys
 import uuid
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +25,9 @@ _APPLICATION, _TIMELINE = 'thinmap', 'time'
 # What is large is drawn at most so often, and a trail grows by steps of so much: a recording grows slowly.
 _PERIOD_NS = 1_000_000_000
 _TRAIL_STEP_M = 0.05
-_MEMORY_LIMIT = '1GB'
+_MEMORY_LIMIT, _SERVER_MEMORY_LIMIT = '1GB', '256MB'
+_LOCALHOST = '127.0.0.1'
+_FLUSH_S = 0.8
 _OUTLINE, _UNKNOWN_GREY = 33, 205
 _SIGMA2_95 = 5.991  # chi-square, 95 %, 2 degrees of freedom
 _ODOMETRY, _SCAN, _LINE, _PLAN, _TARGET = '#999999', '#D55E00', '#0072B2', '#F0E442', '#F0E442'
@@ -30,7 +37,7 @@ _Z = {
     'skeleton': 0.02, 'lines': 0.03, 'odometry': 0.04, 'truth': 0.05, 'estimate': 0.06, 'plan': 0.07, 'nodes': 0.08,
     'end_nodes': 0.09, 'target': 0.1, 'covariance': 0.11, 'robot': 0.12,
 }
-_PLOTS = {'coverage': 'coverage', 'error': 'pose error', 'step_ms': 'step time, ms'}
+_PLOTS = {'coverage': 'coverage', 'distance_m': 'distance, m', 'error': 'pose error', 'step_ms': 'step time, ms'}
 
 
 def is_installed() -> bool:
@@ -86,12 +93,16 @@ class View(NullView):
     """
 
     def __init__(self, recording: Path | None = None, spawn: bool = False) -> None:
-        """Begin a recording. Raises InputError where rerun is missing, or the file cannot be written."""
+        """Begin a recording.
+
+        Raises InputError where rerun is missing, the file cannot be written, or there is no screen for the viewer.
+        """
         self._rr = _rerun()
-        self._stream = self._rr.RecordingStream(_APPLICATION, recording_id=uuid.uuid4())
-        # A recording says when things were, not when they were drawn.
-        self._stream.set_log_time_enabled(False)
-        self._stream.set_log_tick_enabled(False)
+        self._recording = recording
+        self._viewer: subprocess.Popen[bytes] | None = None
+        # A stream of its own for each: a viewer that hangs must not keep the file from being finished.
+        self._files: list[Any] = []
+        self._shown: list[Any] = []
         self._first_ns: int | None = None
         self._drawn_ns: dict[str, int] = {}
         self._waiting: dict[str, tuple[int, Callable[[], None]]] = {}
@@ -99,7 +110,10 @@ class View(NullView):
         self._target = np.zeros((0, 2))
         self._patch: GridPatch | None = None
         self._framed = False
-        self._open(recording, spawn)
+        if spawn:
+            self._open_viewer()
+        if recording is not None:
+            self._open_file(recording)
         self._log_static()
 
     def grid(self, ns: int, patch: GridPatch) -> None:
@@ -208,42 +222,66 @@ class View(NullView):
         self._log('map/target', points)
 
     def number(self, ns: int, name: str, value: float) -> None:
-        """Continue the curve `plot/name`, the plots being `coverage`, `error` and `step_ms`."""
+        """Continue the curve `plot/name`, the plots being `coverage`, `distance_m`, `error` and `step_ms`."""
         self._at(ns)
         self._log(f'plots/{name}', self._rr.Scalars([value]))
 
     def close(self) -> None:
-        """Draw what still waits and finish the file, which then opens with the whole map in view."""
+        """Draw what still waits, finish the file, which then opens with the whole map in view, and end the viewer.
+
+        Raises InputError where the file could not be written to its end.
+        """
         for name in list(self._waiting):
             self._draw(name)
         if self._patch is not None:
             self._send_blueprint()
-        self._stream.flush(timeout_sec=0.8)
-        self._stream.disconnect()
-
-    def _open(self, recording: Path | None, spawn: bool) -> None:
-        rr, sinks = self._rr, []
         try:
-            if recording is not None:
-                recording.parent.mkdir(parents=True, exist_ok=True)
-                sinks.append(rr.FileSink(str(recording)))
-            if spawn:
-                # It belongs to whoever opened it: a signal to the process's group ends it too.
-                rr.spawn(
-                    connect=False, memory_limit=_MEMORY_LIMIT, hide_welcome_screen=True, detach_process=False,
-                    executable_path=_viewer_program(),
-                )
-                sinks.append(rr.GrpcSink())
-            self._stream.set_sinks(*sinks)
+            for file in self._files:
+                _finish(file)
+        except RuntimeError as error:
+            raise InputError(f'{self._recording}: rerun: {" ".join(str(error).split())}') from error
+        finally:
+            # After the file: a viewer that was closed makes its stream wait for it.
+            for shown in self._shown:
+                with contextlib.suppress(RuntimeError):
+                    _finish(shown)
+            if self._viewer is not None:
+                self._viewer.terminate()
+                self._viewer.wait()
+
+    def _new_stream(self, sink: Any) -> Any:
+        stream = self._rr.RecordingStream(_APPLICATION, recording_id=uuid.uuid4())
+        # A recording says when things were, not when they were drawn.
+        stream.set_log_time_enabled(False)
+        stream.set_log_tick_enabled(False)
+        stream.set_sinks(sink)
+        return stream
+
+    def _open_file(self, path: Path) -> None:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._files.append(self._new_stream(self._rr.FileSink(str(path))))
         except (OSError, RuntimeError) as error:
-            what = 'viewer' if recording is None else str(recording)
-            raise InputError(f'{what}: rerun: {" ".join(str(error).split())}') from error
+            raise InputError(f'{path}: rerun: {" ".join(str(error).split())}') from error
+
+    def _open_viewer(self) -> None:
+        """Start a viewer of our own, which listens to this machine only and ends with us."""
+        if sys.platform == 'linux' and not (os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY')):
+            raise InputError('no screen for the viewer: neither DISPLAY nor WAYLAND_DISPLAY is set')
+        port = _free_port()
+        command = [_viewer_program(), '--bind', _LOCALHOST, '--port', str(port), '--memory-limit', _MEMORY_LIMIT]
+        command += ['--server-memory-limit', _SERVER_MEMORY_LIMIT, '--hide-welcome-screen', '--expect-data-soon']
+        try:
+            self._viewer = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+        except OSError as error:
+            raise InputError(f'{command[0]}: {error.strerror or error}: expected the viewer of rerun') from error
+        self._shown.append(self._new_stream(self._rr.GrpcSink(f'rerun+http://{_LOCALHOST}:{port}/proxy')))
 
     def _log_static(self) -> None:
         rr = self._rr
-        self._stream.log('map', rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        self._log('map', rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         body = rr.Arrows3D(vectors=[[0.45, 0.0, 0.0]], colors=[[0, 0, 0]], radii=[0.04])
-        self._stream.log('map/robot/heading', body, static=True)
+        self._log('map/robot/heading', body, static=True)
 
     def _send_blueprint(self) -> None:
         """Map large, curves beside it; the eye a little south of straight above, high enough to see the whole map."""
@@ -258,7 +296,8 @@ class View(NullView):
         scene = rrb.Spatial3DView(origin='map', name='map', eye_controls=eye, overrides=trails)
         curves = [rrb.TimeSeriesView(origin=f'plots/{plot}', name=name) for plot, name in _PLOTS.items()]
         layout = rrb.Horizontal(scene, rrb.Vertical(*curves), column_shares=[3, 1])
-        self._stream.send_blueprint(rrb.Blueprint(layout, collapse_panels=True))
+        for stream in (*self._files, *self._shown):
+            stream.send_blueprint(rrb.Blueprint(layout, collapse_panels=True))
 
     def _now_and_then(self, name: str, ns: int, draw: Callable[[], None]) -> None:
         """Draw now, or, where this was drawn a moment ago, let the newest wait for its turn."""
@@ -276,10 +315,12 @@ class View(NullView):
     def _at(self, ns: int) -> None:
         if self._first_ns is None:
             self._first_ns = ns
-        self._stream.set_time(_TIMELINE, duration=np.timedelta64(ns - self._first_ns, 'ns'))
+        for stream in (*self._files, *self._shown):
+            stream.set_time(_TIMELINE, duration=np.timedelta64(ns - self._first_ns, 'ns'))
 
-    def _log(self, entity: str, value: Any) -> None:
-        self._stream.log(entity, value)
+    def _log(self, entity: str, value: Any, static: bool = False) -> None:
+        for stream in (*self._files, *self._shown):
+            stream.log(entity, value, static=static)
 
 
 def _rerun() -> Any:
@@ -291,11 +332,25 @@ def _rerun() -> Any:
     return rerun
 
 
-def _viewer_program() -> str | None:
+def _viewer_program() -> str:
     """The viewer that came with the library, which need not be on the PATH."""
     spec = importlib.util.find_spec('rerun_cli')
     program = Path(spec.origin).with_name('rerun') if spec is not None and spec.origin else None
-    return str(program) if program is not None and program.exists() else None
+    return str(program) if program is not None and program.exists() else 'rerun'
+
+
+def _free_port() -> int:
+    """A port of its own for each viewer: two runs at once do not draw into each other's picture."""
+    with socket.socket() as probe:
+        probe.bind((_LOCALHOST, 0))
+        return int(probe.getsockname()[1])
+
+
+def _finish(stream: Any) -> None:
+    try:
+        stream.flush(timeout_sec=_FLUSH_S)
+    finally:
+        stream.disconnect()
 
 
 def _shade(patch: GridPatch) -> NDArray[np.uint8]:

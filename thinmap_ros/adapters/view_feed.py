@@ -108,6 +108,7 @@ class Feed:
         place = message.target_position
         self._view.target(ns, np.array([place.x, place.y]) if message.has_target else None)
         self._view.number(ns, 'coverage/estimate', float(message.coverage_estimate))
+        self._view.number(ns, 'distance_m/driven', float(message.distance_m))
 
     def _on_slam(self, ns: int, message: Any) -> None:
         self._view.number(ns, 'step_ms/localizer', float(message.step_time_ms))

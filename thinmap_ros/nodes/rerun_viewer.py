@@ -40,7 +40,7 @@ class RerunViewerConfig(Config):
     """Parameters of the viewer."""
 
     recording: str = parameter('', 'file to write (.rrd); empty: none')
-    spawn: bool = parameter(False, 'open the viewer')
+    spawn: bool = parameter(True, 'open the viewer')
 
 
 class RerunViewerNode(Node):

@@ -101,7 +101,7 @@ def explore(arguments: argparse.Namespace, world: Path, start: Array) -> None:
         processes.start('sim', common + lockstep + clock + where)
         limit = ['-p', f'time_limit_s:={arguments.time_limit}', '-p', f'result:={out / "result.json"}']
         if arguments.view:
-            processes.start('rerun_viewer', [*sim_time, '-p', 'spawn:=true'])
+            processes.start('rerun_viewer', sim_time)
         processes.start('demo_monitor', sim_time + common + limit, quiet=False)
         _wait(processes)
     finally:

@@ -1,6 +1,7 @@
 """What a run of the live graph leaves behind, read back from its bag."""
 
 import json
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -89,6 +90,8 @@ def write(out: Path, world_file: Path, robot: str, result: dict[str, Any]) -> di
     figures.summary_figure(out / 'summary.png', patch, recording.topology, estimated, true, title)
     if rerun_view.is_installed():
         recording_from_bag(out / 'bag', out / 'recording.rrd')
+    else:
+        print('no recording.rrd: rerun is not installed (pip install "thinmap_ros[viewer]")', file=sys.stderr)
     write_text(out / 'report.json', json.dumps(report, indent=2) + '\n')
     return report
 
