@@ -59,7 +59,7 @@ def test_it_is_what_the_route_server_reads(tmp_path: Path) -> None:
             assert line[-1] == nodes[end]['geometry']['coordinates']
             ways.add((f['properties']['metadata']['edge'], start, end))
     assert {(2, 1, 3), (2, 3, 1), (4, 3, 1), (4, 1, 3), (9, 1, 7), (9, 7, 1), (5, 7, 7)} == ways
-    assert nodes[3]['properties']['metadata'] == {'kind': 'end', 'clearance_m': 0.4}
+    assert nodes[3]['properties']['metadata'] == {'kind': 'end', 'clearance': 0.4}
 
 
 def test_round_trip(tmp_path: Path) -> None:

@@ -1,30 +1,77 @@
-"""A map_server map becomes a route graph."""
+"""A map_server map becomes a route graph: places and passages that a robot can drive straight between."""
 
 import argparse
+import math
+import sys
 from pathlib import Path
 
-from thinmap_ros.adapters import graph_files, map_files
+import numpy as np
+
+from thinmap_ros.adapters import figures, graph_files, map_files
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.topology.update import TopologyConfig, build
 from thinmap_ros.tools import cli
 
+_DEFAULTS = TopologyConfig()
+
+
+def _start(given: str | None) -> tuple[float, float] | None:
+    if given is None:
+        return None
+    try:
+        x, y = (float(word) for word in given.split(','))
+    except ValueError:
+        x = y = math.nan
+    if not (math.isfinite(x) and math.isfinite(y)):
+        raise InputError(f'--start={given}: expected two finite numbers X,Y (m, map frame)')
+    return x, y
+
+
+def _config(arguments: argparse.Namespace) -> TopologyConfig:
+    """Robot and pruning as the arguments want them: what keeps a greater clearance is a wider robot."""
+    radius = arguments.robot_radius if arguments.min_clearance is None else arguments.min_clearance
+    if radius < arguments.robot_radius:
+        raise InputError(
+            f'--min-clearance {radius}: expected at least the robot radius ({arguments.robot_radius} m)'
+        )
+    return TopologyConfig(robot_radius_m=radius, spur_m=arguments.prune)
+
 
 def _work(arguments: argparse.Namespace) -> None:
-    if arguments.out.suffix != '.geojson':
-        raise InputError(f'{arguments.out}: expected a name that ends in .geojson')
-    config = TopologyConfig(robot_radius_m=arguments.robot_radius)
-    topology = build(map_files.read_map(arguments.map), None, config)
-    graph_files.write_geojson(arguments.out, topology)
-    print(f'{arguments.out}: {len(topology.nodes)} nodes, {len(topology.edges)} edges')
+    graph_files.writer_of(arguments.out)  # a wrong name is said before any work
+    if arguments.picture is not None and arguments.picture.suffix != '.png':
+        raise InputError(f'{arguments.picture}: expected a name that ends in .png')
+    start, config = _start(arguments.start), _config(arguments)
+    patch = map_files.read_map(arguments.map)
+    topology = build(patch, start, config)
+    graph_files.write_graph(arguments.out, topology)
+    if arguments.picture is not None:
+        figures.summary_figure(arguments.picture, patch, topology, np.empty((0, 2)), title=arguments.map.stem)
+    if not topology.nodes:
+        place = 'no free place' if start is None else f'no free place round {start}'
+        print(
+            f'map_to_graph: warning: {arguments.map}: {place} for a robot of {config.robot_radius_m} m radius: '
+            'the graph is empty',
+            file=sys.stderr,
+        )
+    parts = len(topology.components())
+    print(f'{arguments.out}: {len(topology.nodes)} nodes, {len(topology.edges)} edges, connected parts: {parts}')
 
 
 def main() -> None:
     """Run the program."""
-    default = TopologyConfig().robot_radius_m
     parser = argparse.ArgumentParser(prog='map_to_graph', description=__doc__)
     parser.add_argument('map', type=Path, help='map_server YAML file')
-    parser.add_argument('-o', '--out', type=Path, required=True, help='FILE.geojson, for Nav2 route server')
-    parser.add_argument('--robot-radius', type=float, default=default, help=f'm (default {default})')
+    out_help = 'FILE.geojson (Nav2 route server), .graphml, or .tmap2.yaml (topological_navigation)'
+    parser.add_argument('-o', '--out', type=Path, required=True, help=out_help)
+    radius = _DEFAULTS.robot_radius_m
+    parser.add_argument('--robot-radius', type=float, default=radius, help=f'm (default {radius})')
+    clearance_help = 'how far nodes and edges stay from obstacles, m (default: the robot radius)'
+    parser.add_argument('--min-clearance', type=float, help=clearance_help)
+    prune_help = f'a branch must bring the robot farther than this to count, m (default {_DEFAULTS.spur_m})'
+    parser.add_argument('--prune', type=float, default=_DEFAULTS.spur_m, help=prune_help)
+    parser.add_argument('--start', help='X,Y in m: only what a robot can reach from there (default: all parts)')
+    parser.add_argument('--picture', type=Path, help='FILE.png: the graph drawn on the map')
     cli.run(_work, parser)
 
 

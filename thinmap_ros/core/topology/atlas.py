@@ -10,6 +10,7 @@ from thinmap_ros.core.topology.web import Chain, Spot, Web
 Cells = NDArray[np.int64]
 _BLOCK = 6  # chains are listed by blocks of 2**6 cells
 _STRIDE = 16  # of which every so many cells are asked; a search looks as far around
+_RIM = 4  # cells at the border of a cut in which no spot may lie
 
 
 @dataclass
@@ -42,6 +43,12 @@ class Box:
     def end(self) -> tuple[int, int]:
         """The first row and col after it."""
         return (self.row + self.rows, self.col + self.cols)
+
+    def around(self, cells: Cells, rim: int, limit: 'Box') -> 'Box':
+        """The smallest box that holds this one and some cells (N, 2) with a rim, but ends at the limit."""
+        low = np.maximum(np.minimum((self.row, self.col), cells.min(axis=0) - rim), (limit.row, limit.col))
+        high = np.minimum(np.maximum(self.end, cells.max(axis=0) + rim + 1), limit.end)
+        return Box(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
 
 
 class Atlas(Web):
@@ -136,8 +143,7 @@ class Atlas(Web):
 
     def _keep_outside(self, chain: Chain, inside: NDArray[np.bool_], cut: Cut) -> None:
         """Put back the runs of a chain that lie outside, each with the cells inside that it hangs on."""
-        changes = np.flatnonzero(np.diff(np.concatenate(([True], inside, [True])).astype(np.int8)))
-        for first, end in zip(changes[::2].tolist(), changes[1::2].tolist(), strict=True):
+        for first, end in _runs(~inside):
             piece = chain.part(max(first - 1, 0), min(end, len(inside) - 1))
             piece.a = chain.a if first == 0 else self._anchor(piece, 0, cut)
             piece.b = chain.b if end == len(inside) else self._anchor(piece, -1, cut)
@@ -161,19 +167,60 @@ class Atlas(Web):
             self.add_chain(Chain(numbers[chain.a], numbers[chain.b], cells, chain.squared))
         return set(numbers.values())
 
-    def joined(self, spots: list[int]) -> list[list[int]]:
-        """Indices into a list of spots, grouped by which hang together."""
-        index_of = {spot: index for index, spot in enumerate(spots)}
-        groups = []
-        while index_of:
-            spot, index = index_of.popitem()
-            group, seen, open_spots = [index], {spot}, [spot]
-            while open_spots:
-                at = open_spots.pop()
-                for to in {self.chains[number].other(at) for number in self.chains_at(at)} - seen:
-                    seen.add(to)
-                    open_spots.append(to)
-                    if to in index_of:
-                        group.append(index_of.pop(to))
-            groups.append(group)
-        return groups
+    def calm(self, box: Box, limit: Box) -> Box:
+        """A box, made larger until no spot lies at its border: there, chains that are cut would touch each other."""
+        while True:
+            reach = Box(box.row - _RIM, box.col - _RIM, box.rows + 2 * _RIM, box.cols + 2 * _RIM)
+            inner = Box(box.row + _RIM, box.col + _RIM, box.rows - 2 * _RIM, box.cols - 2 * _RIM)
+            ends = {spot for number in self._near(reach) for spot in (self.chains[number].a, self.chains[number].b)}
+            cells = np.array([self.spots[spot].cell for spot in ends], dtype=np.int64).reshape(-1, 2)
+            cells = cells[reach.holds(cells) & ~inner.holds(cells)]
+            wider = box.around(cells, _RIM + 1, limit) if len(cells) else box
+            if wider == box:
+                return box
+            box = wider
+
+    def joined_outside(self, box: Box, parts: NDArray[np.int32]) -> list[set[int]]:
+        """Numbers in `parts` (H, W), drawn on the cells of a box, that chains outside the box join."""
+        links: dict[int, set[int]] = {}
+        for number, chain in self.chains.items():
+            inside = np.zeros(len(chain.cells), dtype=np.bool_)
+            if self._touches(number, box):
+                inside = box.holds(chain.cells)
+            for first, end in _runs(~inside):
+                # Spots are told from part numbers by their sign.
+                a = -chain.a if first == 0 else int(parts[tuple(chain.cells[first - 1] - (box.row, box.col))])
+                b = -chain.b if end == len(inside) else int(parts[tuple(chain.cells[end] - (box.row, box.col))])
+                links.setdefault(a, set()).add(b)
+                links.setdefault(b, set()).add(a)
+        links.pop(0, None)
+        return [{at for at in group if at > 0} for group in _hanging_together(links)]
+
+    def _touches(self, number: int, box: Box) -> bool:
+        end_row, end_col = box.end
+        rows = (box.row - _STRIDE >> _BLOCK, end_row + _STRIDE >> _BLOCK)
+        cols = (box.col - _STRIDE >> _BLOCK, end_col + _STRIDE >> _BLOCK)
+        blocks = self._blocks_of[number]
+        return any(rows[0] <= row <= rows[1] and cols[0] <= col <= cols[1] for row, col in blocks)
+
+
+def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """First index and end of each run of true values."""
+    changes = np.flatnonzero(np.diff(np.concatenate(([False], mask, [False])).astype(np.int8)))
+    return list(zip(changes[::2].tolist(), changes[1::2].tolist(), strict=True))
+
+
+def _hanging_together(links: dict[int, set[int]]) -> list[set[int]]:
+    """Groups of what is linked, directly or by others; 0 links nothing."""
+    groups, left = [], set(links)
+    while left:
+        group: set[int] = set()
+        open_ends = [left.pop()]
+        while open_ends:
+            at = open_ends.pop()
+            group.add(at)
+            found = (links[at] & left) - {0}
+            left -= found
+            open_ends.extend(found)
+        groups.append(group)
+    return groups

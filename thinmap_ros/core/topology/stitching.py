@@ -13,7 +13,7 @@ from thinmap_ros.core.topology.thinning import thin
 
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.int64]
-Grouping = Callable[[], list[list[int]]]
+Grouping = Callable[[NDArray[np.int32]], list[set[int]]]
 _TRIES = 40  # nearest skeleton cells that an anchor looks at
 
 
@@ -22,8 +22,7 @@ class Seam:
     """The surroundings of the window, all on one array of cells.
 
     new (H, W): skeleton of all that is free; old (H, W): the known skeleton; window (H, W): where the new one takes
-    the old one's place; free (H, W): the robot can stand there; robot: its cell, (1, 2), or none, (0, 2); anchors
-    (N, 2): old cells from which chains go on outside.
+    the old one's place; free (H, W): the robot can stand there; robot: its cell, (1, 2), or none, (0, 2).
     """
 
     new: Mask
@@ -31,7 +30,6 @@ class Seam:
     window: Mask
     free: Mask
     robot: Cells
-    anchors: Cells
 
 
 def stitch(seam: Seam, joined_outside: Grouping) -> Mask:
@@ -42,7 +40,7 @@ def stitch(seam: Seam, joined_outside: Grouping) -> Mask:
     that are joined neither by the skeleton nor outside, but by free cells, are joined by the shortest way over these.
     Loops round nothing but free cells, which all this may leave, are drawn together to one line. A new part that the
     robot cannot reach within the surroundings, and that hangs on nothing old, is left out: it is only the corner of
-    another place. joined_outside: says which anchors (by index) hang together outside, asked only where it matters.
+    another place. joined_outside: says which numbered parts hang together outside, asked only where it matters.
     """
     drawn, kept = seam.new & seam.window, seam.old & ~seam.window
     result = drawn | kept
@@ -51,13 +49,20 @@ def stitch(seam: Seam, joined_outside: Grouping) -> Mask:
         _draw_line(result, seam.free, end, targets)
     parts, sizes = label(result)
     if len(sizes) > 2:
-        _bridge_parts(result, seam.free, parts, len(sizes) - 1, seam.anchors, joined_outside())
+        if _share_free_space(parts, label(seam.free)[0]):
+            _bridge_parts(result, seam.free, parts, len(sizes) - 1, joined_outside(parts))
         result &= _held(result, kept | reachable(seam.free, seam.robot))
         sizes = label(result)[1]
     if euler_number(result) < len(sizes) - 1 and _fill_empty_loops(result, seam.free):
         result = thin(result)
-    result[seam.anchors[:, 0], seam.anchors[:, 1]] = True
     return result
+
+
+def _share_free_space(parts: NDArray[np.int32], free_parts: NDArray[np.int32]) -> bool:
+    """Whether two parts of a skeleton lie in one part of the free space."""
+    both = (parts > 0) & (free_parts > 0)
+    pairs = np.unique(np.stack([parts[both], free_parts[both]]), axis=1)
+    return bool(np.unique(pairs[1]).size < pairs.shape[1])
 
 
 @kernel
@@ -82,13 +87,13 @@ def _loose(cells: Mask, removed: Mask, others: Mask) -> Cells:
 
 
 def _bridge_parts(
-    result: Mask, free: Mask, parts: NDArray[np.int32], count: int, anchors: Cells, outside: list[list[int]]
+    result: Mask, free: Mask, parts: NDArray[np.int32], count: int, outside: list[set[int]]
 ) -> None:
     """Join, in place, the parts that free cells join and that do not hang together outside."""
     owner = np.arange(count + 1)
     for group in outside:
-        numbers = owner[parts[anchors[group, 0], anchors[group, 1]]]
-        owner[np.isin(owner, numbers)] = numbers[0]
+        numbers = sorted(group)
+        owner[numbers] = numbers[:1]
     for number in np.unique(owner[1:])[:-1]:
         owner[owner == number] = _draw_way(result, free, owner[parts], number)
 

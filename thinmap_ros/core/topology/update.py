@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.topology.atlas import Atlas
+from thinmap_ros.core.topology.atlas import Atlas, Box
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.free_space import (
     column_distance,
@@ -26,6 +26,7 @@ from thinmap_ros.core.topology.web import Limits, Spot, simplify
 __all__ = ['TopologyBuilder', 'TopologyConfig', 'build']
 
 Cells = NDArray[np.int64]
+_PAD = 10  # cells round what changed that are drawn anew with it
 
 
 def build(patch: GridPatch, seed_xy: tuple[float, float] | None, config: TopologyConfig) -> TopologicalMap:
@@ -67,35 +68,47 @@ class TopologyBuilder:
         around.take(window)
         known = self._atlas.within(around.box)
         view = _View(around, known, (float(T_map_base[0]), float(T_map_base[1])), self.config)
-        self._merge(view, known, around)
+        self._merge(view, known, around.box)
         self._registry.refresh(self._atlas)
         return self._local(view, window, around.margin)
 
-    def _merge(self, view: '_View', known: tuple[Cells, Cells], around: Surroundings) -> None:
-        """Put the skeleton of the window into the atlas, in the place of what was there, and clean up at the seam."""
-        box = around.box
-        cut = self._atlas.cut_out(box)
-        spots = list(cut.anchors.values())
-        anchors = np.array(list(cut.anchors), dtype=np.int64).reshape(-1, 2) - (box.row, box.col)
-        rows, cols = (known[0] - (box.row, box.col)).T
+    def _merge(self, view: '_View', known: tuple[Cells, Cells], box: Box) -> None:
+        """Put the skeleton of the window into the atlas where it differs from what was there."""
+        low = (box.row, box.col)
         old = np.zeros((box.rows, box.cols), dtype=np.int64)
-        old[rows, cols] = np.maximum(known[1], 1)
-        window, pinned = view.redrawn, np.zeros(old.shape, dtype=np.bool_)
+        rows, cols = (known[0] - low).T
+        old[rows, cols] = known[1]
+        fresh = view.fresh()
+        if np.array_equal(fresh, np.where(view.redrawn, old, 0)):
+            return
+        seam = Seam(fresh > 0, old > 0, view.redrawn, view.free, view.robot)
+        stitched = stitch(seam, lambda parts: self._atlas.joined_outside(box, parts))
+        squared = np.where(view.redrawn, fresh, old)
+        added = np.argwhere(stitched & (squared == 0))
+        squared[added[:, 0], added[:, 1]] = view.measure(added)
+        squared[~stitched] = 0
+        changed = np.argwhere(squared != old)
+        if len(changed):
+            self._redraw(view, squared, changed, box)
+
+    def _redraw(self, view: '_View', squared: Cells, changed: Cells, box: Box) -> None:
+        """Draw the atlas anew round the cells (N, 2) of a box that changed, and clean up there.
+
+        squared (H, W): the whole skeleton as it is to be: squared clearances, 0 elsewhere.
+        """
+        low = np.array([box.row, box.col])
+        row, col = (changed[0] + low).tolist()
+        part = self._atlas.calm(Box(row, col, 1, 1).around(changed + low, _PAD, box), box)
+        corner = np.array([part.row, part.col])
+        inner = tuple(slice(at, at + size) for at, size in zip(corner - low, (part.rows, part.cols), strict=True))
+        there = np.ascontiguousarray(squared[inner])
+        cut = self._atlas.cut_out(part)
+        pinned = np.zeros(there.shape, dtype=np.bool_)
+        anchors = np.array(list(cut.anchors), dtype=np.int64).reshape(-1, 2) - corner
         pinned[anchors[:, 0], anchors[:, 1]] = True
-        seam = Seam(view.skeleton, old > 0, window, view.free, view.robot, anchors)
-        stitched = stitch(seam, lambda: self._atlas.joined(spots))
-
-        def measure(cells: Cells) -> Cells:
-            # Near the rim of what is remembered, clearance looks smaller than it was seen to be.
-            seen_before = np.where(window[cells[:, 0], cells[:, 1]], 0, old[cells[:, 0], cells[:, 1]])
-            return np.maximum(view.measure(cells), seen_before)
-
-        def promising(spot: Spot) -> bool:
-            inside = bool(box.holds(np.array(spot.cell)))
-            return not inside or view.promising(Spot((spot.cell[0] - box.row, spot.cell[1] - box.col), spot.squared))
-
-        touched = self._atlas.graft(web_of(stitched, measure, pinned), box, cut.anchors) | cut.touched
-        simplify(self._atlas, touched, promising, view.limits)
+        web = web_of(there > 0, lambda cells: there[cells[:, 0], cells[:, 1]], pinned)
+        touched = self._atlas.graft(web, part, cut.anchors) | cut.touched
+        simplify(self._atlas, touched, lambda spot: view.is_promising(spot, box), view.limits)
 
     def _local(self, view: '_View', window: GridPatch, margin: int) -> TopologicalMap:
         """The window's own part of the new skeleton as a map."""
@@ -126,8 +139,20 @@ class _View:
         self.robot: Cells = np.empty((0, 2), dtype=np.int64) if seed is None else seed[None]
         self.free = reachable(room, np.concatenate((seeds, self.robot)))
         self.measure: Measure = lambda cells: squared_clearance(distance, cells)
-        self.promising = looks_out(known, patch.occupied, rim_is_unknown=True)
+        self._looks_out = looks_out(known, patch.occupied, rim_is_unknown=True)
         self.limits = Limits.of(config, patch.frame.resolution)
         web = web_of(skeleton_of(self.free, distance), self.measure)
-        simplify(web, set(web.spots), self.promising, self.limits)
+        simplify(web, set(web.spots), self._looks_out, self.limits)
         self.skeleton = drawing_of(web, patch.shape)
+
+    def fresh(self) -> Cells:
+        """Squared clearances (H, W) of the new skeleton where it is to take the old one's place, 0 elsewhere."""
+        squared = np.zeros(self.skeleton.shape, dtype=np.int64)
+        cells = np.argwhere(self.skeleton & self.redrawn)
+        squared[cells[:, 0], cells[:, 1]] = self.measure(cells)
+        return squared
+
+    def is_promising(self, spot: Spot, box: Box) -> bool:
+        """Whether a spot on the lattice looks into the unknown; those outside the box may."""
+        inside = bool(box.holds(np.array(spot.cell)))
+        return not inside or self._looks_out(Spot((spot.cell[0] - box.row, spot.cell[1] - box.col), spot.squared))

@@ -1,0 +1,164 @@
+"""The program map_to_graph: any map_server map in, a route graph out, or one line on what is wrong."""
+
+import json
+from pathlib import Path
+
+import networkx
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from thinmap_ros.tools import map_to_graph
+
+YAML = {
+    'image': 'm.png',
+    'resolution': 0.1,
+    'origin': [-1.0, 2.0, 0.0],
+    'negate': 0,
+    'occupied_thresh': 0.65,
+    'free_thresh': 0.196,
+}
+
+
+def corridors() -> np.ndarray:
+    """A T of corridors 1 m wide, grey values, the first row on top."""
+    grey = np.zeros((60, 90), dtype=np.uint8)
+    grey[10:20, 10:80] = grey[10:35, 40:50] = 254
+    return grey
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
+    monkeypatch.setattr('sys.argv', ['map_to_graph', *map(str, words)])
+    try:
+        map_to_graph.main()
+    except SystemExit as end:
+        return int(end.code or 0)
+    return 0
+
+
+def written(tmp_path: Path, grey: np.ndarray, **changes: object) -> Path:
+    Image.fromarray(grey).save(tmp_path / 'm.png')
+    path = tmp_path / 'm.yaml'
+    path.write_text(yaml.safe_dump({k: v for k, v in (YAML | changes).items() if v is not None}))
+    return path
+
+
+def test_three_formats_and_a_picture_of_one_graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = written(tmp_path, corridors())
+    for name in ('g.geojson', 'g.graphml', 'g.tmap2.yaml'):
+        assert run(monkeypatch, path, '-o', tmp_path / name, '--picture', tmp_path / 'g.png') == 0
+    features = json.loads((tmp_path / 'g.geojson').read_text())['features']
+    points = {f['properties']['id']: f['geometry']['coordinates'] for f in features if 'startid' not in f['properties']}
+    graph = networkx.read_graphml(tmp_path / 'g.graphml', node_type=int)
+    assert {k: [d['x'], d['y']] for k, d in graph.nodes.items()} == points
+    assert sorted(d['kind'] for d in graph.nodes.values()) == ['branch', 'end', 'end', 'end']
+    assert all(d['clearance'] >= 0.25 and d['length'] > 1.0 for d in graph.edges.values())
+    tmap2 = yaml.safe_load((tmp_path / 'g.tmap2.yaml').read_text())
+    places = {n['node']['name']: n['node']['pose']['position'] for n in tmap2['nodes']}
+    assert {k: [at['x'], at['y']] for k, at in places.items()} == {f'NODE{k}': v for k, v in points.items()}
+    ways = {(n['node']['name'], e['node']) for n in tmap2['nodes'] for e in n['node']['edges']}
+    assert ways == {(f'NODE{a}', f'NODE{b}') for k, n in graph.edges for a, b in ((k, n), (n, k))}
+    ids = [e['edge_id'] for n in tmap2['nodes'] for e in n['node']['edges']]
+    assert len(set(ids)) == len(ids) == 6
+    assert Image.open(tmp_path / 'g.png').size[0] > 300
+
+
+def test_options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, out = written(tmp_path, corridors()), tmp_path / 'g.graphml'
+
+    def nodes(*words: object) -> int:
+        assert run(monkeypatch, path, '-o', out, *words) == 0
+        return len(networkx.read_graphml(out))
+
+    assert nodes() == 4
+    assert nodes('--robot-radius', 0.6) == 0
+    assert nodes('--min-clearance', 0.6) == 0
+    assert nodes('--prune', 2.0) == 2
+    assert nodes('--start=3.0,6.5') == 4
+    assert nodes('--start=-50,0') == 0
+
+
+@pytest.mark.parametrize(
+    ('words', 'said'),
+    [
+        (['-o', 'g.svg'], '.geojson'),
+        (['-o', 'g.graphml', '--robot-radius', '-1'], 'robot_radius_m'),
+        (['-o', 'g.graphml', '--robot-radius', 'nan'], 'robot_radius_m'),
+        (['-o', 'g.graphml', '--min-clearance', '0.1'], 'min-clearance'),
+        (['-o', 'g.graphml', '--start', 'here'], 'start'),
+        (['-o', 'g.graphml', '--picture', 'g.jpg'], '.png'),
+    ],
+)
+def test_wrong_options(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], words: list[str], said: str
+) -> None:
+    path = written(tmp_path, corridors())
+    monkeypatch.chdir(tmp_path)
+    assert run(monkeypatch, path, *words) == 2
+    error = capsys.readouterr().err
+    assert error.count('\n') == 1 and said in error
+    assert not list(tmp_path.glob('g.*'))
+
+
+@pytest.mark.parametrize('value', [0, 205, 254])
+def test_maps_of_one_value(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], value: int
+) -> None:
+    path = written(tmp_path, np.full((50, 80), value, dtype=np.uint8))
+    assert run(monkeypatch, path, '-o', tmp_path / 'g.geojson') == 0
+    warned = 'warning' in capsys.readouterr().err
+    features = json.loads((tmp_path / 'g.geojson').read_text())['features']
+    assert warned == (value != 254)
+    assert len(features) == 0 if warned else len(features) > 0
+
+
+@pytest.mark.parametrize(
+    'changes',
+    [
+        {'image': 'missing.png'},
+        {'image': 'm.yaml'},
+        {'image': None},
+        {'resolution': 0},
+        {'resolution': -0.1},
+        {'resolution': float('nan')},
+        {'resolution': None},
+        {'origin': [0.0, 0.0, 0.3]},
+        {'origin': [0.0, float('nan'), 0.0]},
+        {'mode': 'colour'},
+    ],
+)
+def test_bad_maps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], changes: dict[str, object]
+) -> None:
+    path = written(tmp_path, corridors(), **changes)
+    assert run(monkeypatch, path, '-o', tmp_path / 'g.geojson') == 2
+    error = capsys.readouterr().err
+    assert error.startswith('map_to_graph: error: ') and error.count('\n') == 1
+    assert not (tmp_path / 'g.geojson').exists()
+
+
+@pytest.mark.parametrize('content', [b'P5\n0 0\n255\n', b'P5\n5 0\n255\n', b'', b'P5\n10 10\n255\n123'])
+def test_images_of_no_size_or_cut_short(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], content: bytes
+) -> None:
+    path = written(tmp_path, corridors(), image='m.pgm')
+    (tmp_path / 'm.pgm').write_bytes(content)
+    assert run(monkeypatch, path, '-o', tmp_path / 'g.geojson') == 2
+    assert 'm.pgm' in capsys.readouterr().err
+
+
+def test_a_map_that_is_not_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(monkeypatch, tmp_path / 'no.yaml', '-o', tmp_path / 'g.geojson') == 2
+    assert 'no.yaml' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('deep', [False, True])
+def test_colour_and_16_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, deep: bool) -> None:
+    grey = corridors()
+    picture = grey.astype(np.uint16) * 257 if deep else np.stack([grey] * 3, axis=-1)
+    path = written(tmp_path, picture)
+    assert run(monkeypatch, path, '-o', tmp_path / 'g.graphml') == 0
+    assert len(networkx.read_graphml(tmp_path / 'g.graphml')) == 4
