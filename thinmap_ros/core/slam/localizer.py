@@ -23,7 +23,7 @@ _START_SIGMAS = (1e-4, 1e-4, 1e-4)  # the map begins where the robot stands: no 
 _LONGEST_STEP_M = 5.0  # between two scans the wheels cannot go farther: the odometry was set anew
 _NEW_GROUND = 0.3  # where less of a scan than this lies on what is known, there is nothing to contradict
 _NEW_GROUND_M, _NEW_GROUND_RAD = 0.6, 0.6  # and that is so only this far from where the map last learned
-_LEAP_M, _LEAP_RAD = 0.2, 0.15  # a scan puts the robot this far from where the wheels did: one of them is wrong
+_LEAP_M, _LEAP_RAD = 0.4, 0.4  # a scan puts the robot this far from where the wheels did: one of them is wrong
 _LOST_SIGMA_M = 1.0  # a robot in doubt by more than this does not know where it is
 
 
