@@ -9,7 +9,7 @@ NODES = [
     'sim', 'grid_mapper', 'topology_builder', 'localizer', 'explorer', 'navigator', 'recorder', 'bag_player',
     'demo_monitor', 'rerun_viewer',
 ]
-TOOLS = ['replay', 'explore_world', 'carmen_to_bag', 'map_to_graph', 'demo', 'warm_up']
+TOOLS = ['replay', 'explore_world', 'compare_exploration', 'carmen_to_bag', 'map_to_graph', 'demo', 'warm_up']
 
 setup(
     name=NAME,

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.sim.world import World
 
@@ -29,5 +30,5 @@ def floors(folder: Path, wanted: str = '') -> list[Floor]:
     found = []
     for name in names:
         path = folder / f'{name}.yaml'
-        found.append(Floor(name, path, World.load(path), np.array(known[name]['starts'])))
+        found.append(Floor(name, path, World.from_patch(*read_world(path)), np.array(known[name]['starts'])))
     return found

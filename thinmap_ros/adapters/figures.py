@@ -1,7 +1,8 @@
 """Pictures of maps."""
 
+from collections import defaultdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -79,3 +80,31 @@ def _draw_graph(axes: 'Axes', topology: TopologicalMap) -> None:
                 *places.T, marker, color=colours.NODES[kind], markersize=5, markeredgecolor='black',
                 markeredgewidth=0.4, linestyle='', label=label, zorder=5,
             )
+
+
+def coverage_figure(path: Path, reports: list[dict[str, Any]]) -> None:
+    """Write a PNG: coverage over distance by strategy, the mean over all runs that reports (with `curve`) tell of.
+
+    A run's distance is given as a share of the mean distance of all strategies from the same world and start.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    lengths: dict[tuple[str, int], list[float]] = defaultdict(list)
+    for report in reports:
+        lengths[report['world'], report['start_number']].append(report['distance'])
+    shares = np.linspace(0.0, 1.5, 151)
+    curves: dict[str, list[Array]] = defaultdict(list)
+    for report in reports:
+        unit = max(float(np.mean(lengths[report['world'], report['start_number']])), 1e-9)
+        _, along, coverage = np.array(report['curve']).T
+        curves[report['strategy']].append(np.interp(shares * unit, along, coverage))
+    figure = Figure(figsize=(8.0, 5.0), dpi=110, layout='constrained')
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    for strategy, runs in sorted(curves.items()):
+        axes.plot(shares, 100.0 * np.mean(runs, axis=0), label=f'{strategy} ({len(runs)})')
+    axes.set(xlabel='distance, of the mean of all strategies', ylabel='coverage (%)', ylim=(0.0, 101.0))
+    axes.legend(fontsize=8, frameon=False)
+    with written_aside(path) as aside:
+        figure.savefig(aside, format='png')

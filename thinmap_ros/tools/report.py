@@ -83,7 +83,8 @@ def exploration_report(
 
     times_s (N,): from the start on; true_poses, estimated_poses (N, 3): at these times, in the same frame; coverage
     (M, 2): time in s and coverage, 0 to 1, whenever it was measured. distance and the times and distances at which a
-    coverage was first measured are of the true path, in m and s; None where it was not reached.
+    coverage was first measured are of the true path, in m and s; None where it was not reached. curve: time, distance
+    and coverage whenever it was measured.
     """
     steps = np.hypot(*np.diff(true_poses[:, :2], axis=0).T)
     along = np.concatenate([[0.0], np.cumsum(steps)])
@@ -106,6 +107,10 @@ def exploration_report(
         'end_nodes_visited': census.visited,
         'pose_rmse': round(float(np.sqrt(np.mean(errors**2))), 5),
         'turned_rad': round(float(np.abs(_turns(true_poses)).sum()), 2),
+        'curve': [
+            [round(float(time), 2), round(float(np.interp(time, times_s, along)), 2), round(float(share), 4)]
+            for time, share in coverage
+        ],
     }
 
 

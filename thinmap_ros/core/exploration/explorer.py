@@ -23,10 +23,12 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.config import parameter
 from thinmap_ros.core.exploration.end_node_tracker import EndNodeTracker, Track, TrackerConfig
 from thinmap_ros.core.exploration.open_borders import OpenBorders
+from thinmap_ros.core.exploration.tour import tours_by_first
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.planning.graph_search import access, costs_from
+from thinmap_ros.core.planning.grid_search import WayTable
 from thinmap_ros.core.planning.wavefront import nearest_true, places_in_reach
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -42,6 +44,8 @@ _ESCAPE_M = 0.6
 _NEAR_HEADING_RAD = 0.35
 _STEADY_RAD = 0.6
 _TRIES = 3
+_SURVEY_AGAIN_S = 0.4
+_COARSE_M, _FORGET_S = 0.2, 20.0
 _PAUSE_S = 5.0
 
 
@@ -59,11 +63,15 @@ class ExplorerConfig(TrackerConfig):
 
     threshold: float = parameter(0.9, 'an end node as probable as this needs no visit', low=0.5, high=0.999)
     robot_radius_m: float = parameter(0.25, 'radius of the robot, m', low=0.0, high=5.0)
-    shortest_border_m: float = parameter(0.4, 'a shorter border is a missing beam, m', low=0.0, high=5.0)
+    small_border_m: float = parameter(1.5, 'behind a shorter border not much is expected, m', low=0.0, high=50.0)
+    wait_weight: float = parameter(0.15, 'cost of a metre until a target is reached, m', low=0.0, high=10.0)
+    small_wait_weight: float = parameter(0.5, 'the same, for one with a small border', low=0.0, high=10.0)
+    wait_m: float = parameter(30.0, 'a target farther off than this along the tour waits no more, m', low=0.0, high=1e3)
+    shortest_border_m: float = parameter(0.5, 'a shorter border is a missing beam, m', low=0.0, high=5.0)
     attach_m: float = parameter(3.0, 'a border belongs to an end node in sight within this, m', low=0.1, high=50.0)
     close_look_m: float = parameter(2.0, 'unknown in plain sight this near stays unknown, m', low=0.0, high=50.0)
     turn_cost_m_rad: float = parameter(0.2, 'path length that a turn by one radian costs, m', low=0.0, high=10.0)
-    switch_share: float = parameter(0.6, 'another target must cost less than this share', low=0.0, high=1.0)
+    switch_m: float = parameter(2.0, 'another target must save this much of the way, m', low=0.0, high=100.0)
     retry_s: float = parameter(60.0, 'a target that failed is tried again after this time, s', low=0.0, high=1e5)
     survey_s: float = parameter(1.0, 'borders are assigned anew after this time, s', low=0.0, high=60.0)
     behind_m: float = parameter(2.0, 'depth of unknown space expected behind a border, m', low=0.0, high=50.0)
@@ -153,6 +161,8 @@ class Explorer:
         self.tracker = EndNodeTracker(self.config)
         self.borders = OpenBorders(self.config.shortest_border_m)
         self._stand_ins = EndNodeTracker(self.config)
+        self._reached = self.borders.mask
+        self._ways = WayTable(_COARSE_M, _FORGET_S)
         self._memory = _Memory()
         self._stamp_ns = 0
         self._last_survey = _Survey(self.borders.frame, 0, [])
@@ -195,7 +205,8 @@ class Explorer:
         last = self._last_survey
         if last.frame == self.borders.frame and self._stamp_ns - last.stamp_ns < self.config.survey_s * 1e9:
             left = [c for c in map(self._still_open, last.candidates) if c is not None]
-            if any(c.track.node_id == self._memory.target for c in left):
+            hasty = self._stamp_ns - last.stamp_ns < _SURVEY_AGAIN_S * 1e9
+            if any(c.track.node_id == self._memory.target for c in left) or (hasty and left):
                 return left
         self._last_survey = _Survey(self.borders.frame, self._stamp_ns, self._survey(T_map_base))
         return self._last_survey.candidates
@@ -212,7 +223,7 @@ class Explorer:
     def _survey(self, T_map_base: Array) -> list[_Candidate]:
         """End nodes with their borders, and stand-ins for the borders that no end node sees."""
         cells, numbers, _ = self.borders.stretches()
-        reached = self._reachable(T_map_base)
+        self._reached = reached = self._reachable(T_map_base)
         owners = self._owners(cells, reached)
         candidates = []
         for node_id, track in self.tracker.tracks.items():
@@ -348,7 +359,7 @@ class Explorer:
             return None
         if memory.target in open_to_try and self._last_survey.stamp_ns != self._stamp_ns:
             return self._go_for(open_to_try[memory.target])  # costs are weighed anew once a survey
-        costs = self._costs(topology, open_to_try, T_map_base)
+        costs = (self._tours if self.config.mode == 'open_border' else self._costs)(topology, open_to_try, T_map_base)
         if not memory.first_choice_made:
             memory.first_choice_made = True
             faced = min(open_to_try, key=lambda i: _turn_to(T_map_base, open_to_try[i].goal))
@@ -356,7 +367,7 @@ class Explorer:
         best = min(costs, key=lambda i: costs[i])
         if memory.target not in costs:
             memory.target = self._successor(open_to_try)
-        if memory.target is None or costs[best] < self.config.switch_share * costs[memory.target] - _CHANGED_MARGIN_M:
+        if memory.target is None or costs[best] < costs[memory.target] - self.config.switch_m:
             memory.target = best
         return self._go_for(open_to_try[memory.target])
 
@@ -403,6 +414,20 @@ class Explorer:
             turn = _turn_to(T_map_base, candidate.goal) if straight > _NEAR_VISIT_M else 0.0
             costs[node_id] = (_DETOUR * straight if way is None else way) + self.config.turn_cost_m_rad * turn
         return costs
+
+    def _tours(self, topology: TopologicalMap, worth: dict[int, _Candidate], T_map_base: Array) -> dict[int, float]:
+        """Length of the tour through all that is left, m, by what comes first; a turn on the spot counts as well."""
+        ids = list(worth)
+        points = np.array([*(worth[i].goal[:2] for i in ids), T_map_base[:2]])
+        table = self._ways.update(self._reached, self._last_survey.frame, points, self._stamp_ns)
+        straight = np.hypot(*(points[:, None] - points[None]).transpose(2, 0, 1))
+        table = np.maximum(np.where(np.isfinite(table), table, _DETOUR * straight), straight)
+        turns = np.array([_turn_to(T_map_base, worth[i].goal) for i in ids]) * (straight[-1, :-1] > _NEAR_VISIT_M)
+        first = table[-1, :-1] + self.config.turn_cost_m_rad * turns
+        lengths = np.array([len(worth[i].cells) * self.borders.frame.resolution for i in ids])
+        small = lengths < self.config.small_border_m
+        weights = np.where(small, self.config.small_wait_weight, self.config.wait_weight)
+        return dict(zip(ids, tours_by_first(first, table[:-1, :-1], weights, self.config.wait_m).tolist(), strict=True))
 
     def _way_to(self, topology: TopologicalMap, goal: tuple[float, float], to_nodes: dict[int, float]) -> float | None:
         joins = access(topology, *goal)
