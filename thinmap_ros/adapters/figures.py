@@ -48,7 +48,7 @@ def summary_figure(
     axes.set(xlabel='x (m)', ylabel='y (m)', title=title, aspect='equal')
     axes.legend(loc='upper center', bbox_to_anchor=(0.5, -0.07), ncols=4, fontsize=8, frameon=False)
     with written_aside(path) as aside:
-        figure.savefig(aside, format='png')
+        figure.savefig(aside, format='png', bbox_inches='tight')
 
 
 def _draw_map(axes: 'Axes', patch: GridPatch) -> None:
@@ -107,4 +107,4 @@ def coverage_figure(path: Path, reports: list[dict[str, Any]]) -> None:
     axes.set(xlabel='distance, of the mean of all strategies', ylabel='coverage (%)', ylim=(0.0, 101.0))
     axes.legend(fontsize=8, frameon=False)
     with written_aside(path) as aside:
-        figure.savefig(aside, format='png')
+        figure.savefig(aside, format='png', bbox_inches='tight')
