@@ -34,3 +34,7 @@ class GridFrame:
         """The same lattice with cell (rows, cols) as its new cell (0, 0)."""
         x, y = self.origin_x + cols * self.resolution, self.origin_y + rows * self.resolution
         return GridFrame(x, y, self.resolution)
+
+    def as_array(self) -> Array:
+        """Origin x, origin y and resolution, (3,), m."""
+        return np.array([self.origin_x, self.origin_y, self.resolution])

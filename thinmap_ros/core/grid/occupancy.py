@@ -1,7 +1,9 @@
 """Occupancy grid: log odds of each cell, updated by Bayes' rule from laser scans."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +23,7 @@ from thinmap_ros.core.se2 import Array
 _SCALE = 1000.0
 _LIMIT = 6000
 _FREE, _HIT, _SURFACE = 1, 2, 4
+_TILE_BITS = TILE.bit_length() - 1
 # Three neighbouring beams show one surface if the middle range is this near to what the others foretell, m.
 _FLAT_M = 0.06
 _LONGEST_SURFACE_M = 3.0
@@ -70,9 +73,11 @@ class OccupancyGrid:
             )
         self._tiles = TileStore()
         self._percent = _percent_table()
-        self._marks: NDArray[np.uint8] = np.zeros((1, 1), dtype=np.uint8)
-        steps = [self.config.p_free, self.config.p_occupied, self.config.p_lowest, self.config.p_highest]
-        self._steps = np.array([round(_SCALE * log_odds(p)) for p in steps], dtype=np.int64)
+        self._marks: NDArray[np.uint8] = np.zeros(1, dtype=np.uint8)
+        self._touched: NDArray[np.int64] = np.empty(1, dtype=np.int64)
+        self._fan: tuple[int, float, float] = (0, 0.0, 0.0)
+        self._cosines = self._sines = np.empty(0)
+        self._steps = _steps(self.config)
 
     @staticmethod
     def from_patch(patch: GridPatch, config: OccupancyConfig | None = None) -> 'OccupancyGrid':
@@ -86,24 +91,62 @@ class OccupancyGrid:
         grid._tiles.write(0, 0, np.where(patch.cells == UNKNOWN, 0, odds).astype(np.int16))
         return grid
 
+    def state(self) -> dict[str, NDArray[Any]]:
+        """All that the grid knows, exactly, as arrays by name; `from_state` makes the same grid of it."""
+        return {
+            'frame': self.frame.as_array(),
+            'tiles': self._tiles.places(),
+            'log_odds': self._tiles.pool[: self._tiles.used].copy(),
+        }
+
+    @staticmethod
+    def from_state(state: Mapping[str, NDArray[Any]], config: OccupancyConfig | None = None) -> 'OccupancyGrid':
+        """Grid that goes on from the `state` of another. Raises InputError where it is no such state."""
+        try:
+            frame, tiles, odds = (state[key] for key in ('frame', 'tiles', 'log_odds'))
+            origin_x, origin_y, resolution = frame.astype(np.float64).tolist()
+        except (KeyError, ValueError, TypeError) as error:
+            raise InputError(f'saved grid: {error}: expected frame, tiles and log_odds') from error
+        if tiles.shape != (len(odds), 2) or odds.shape[1:] != (TILE, TILE) or odds.dtype != np.int16:
+            raise InputError(f'saved grid: {tiles.shape} tiles, {odds.shape} log odds: expected one array a tile')
+        if np.abs(odds.astype(np.int64)).max(initial=0) > _LIMIT:
+            raise InputError(f'saved grid: log odds up to {np.abs(odds).max()}: expected at most {_LIMIT}')
+        grid = OccupancyGrid(config, GridFrame(origin_x, origin_y, resolution))
+        for (row, col), cells in zip(tiles.tolist(), odds, strict=True):
+            grid._tiles.write(row * TILE, col * TILE, cells)
+        return grid
+
     def update(self, scan: Scan, T_map_base: Array) -> None:
         """Take in a scan made at a robot pose T_map_base (3,)."""
         T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
-        reach, ends_in_hit = self._beams(scan)
-        if not reach.any() or not se2.is_finite(T_map_laser):
+        if scan.ranges_m.size == 0 or not se2.is_finite(T_map_laser):
             return
-        x = (T_map_laser[0] - self.frame.origin_x) / self.frame.resolution
-        y = (T_map_laser[1] - self.frame.origin_y) / self.frame.resolution
-        radius = int(reach.max()) + 2
-        row, col = math.floor(y) - radius, math.floor(x) - radius
-        shift = (2 * radius).bit_length()
-        marks = self._cleared_marks(1 << shift)
-        angles, surface = scan.angles_rad + T_map_laser[2], _surfaces(scan, ends_in_hit)
-        touched = _mark(marks, shift, x - col, y - row, angles, reach, ends_in_hit, surface)
-        self._make_tiles(row, col, shift, touched)
-        tiles = self._tiles
+        resolution, usable = self.frame.resolution, self.config.usable_range_m
+        x = (float(T_map_laser[0]) - self.frame.origin_x) / resolution
+        y = (float(T_map_laser[1]) - self.frame.origin_y) / resolution
+        depth = self.config.surface_depth_m
+        longest = min(usable, max(scan.range_max_m + depth, self.config.no_return_range_m))
+        radius = math.ceil(longest / resolution) + 2
+        row, col, shift = math.floor(y) - radius, math.floor(x) - radius, (2 * radius).bit_length()
+        marks, touched = self._scratch(shift)
+        cosines, sines = self._directions(scan, float(T_map_laser[2]))
+        limits = (usable, min(self.config.no_return_range_m, scan.range_max_m, usable), depth, resolution)
+        bend = 2.0 * math.cos(scan.angle_increment_rad)
+        beams = (scan.ranges_m, scan.hit, scan.no_return)
+        count = _mark(marks, shift, touched, x - col, y - row, cosines, sines, *beams, *limits, bend)
+        self._add(row, col, shift, touched[:count])
+
+    def _add(self, row: int, col: int, shift: int, touched: NDArray[np.int64]) -> None:
+        """Add what is marked to the tiles; (row, col): cell (0, 0) of the marks. Makes the tiles that do not exist."""
+        tiles, last = self._tiles, 1 << shift
+        tiles.reach(row // TILE, col // TILE, (row + last) // TILE, (col + last) // TILE)
         corner = (row - tiles.first_row * TILE, col - tiles.first_col * TILE)
-        _apply(tiles.pool, tiles.directory, *corner, marks, shift, touched, self._steps)
+        left = _apply(tiles.pool, tiles.directory, *corner, self._marks, shift, touched, self._steps)
+        if left:
+            needed = np.zeros(tiles.directory.shape, dtype=np.bool_)
+            _flag_tiles(needed, touched[:left], shift, *corner)
+            tiles.ensure(np.argwhere(needed) + (tiles.first_row, tiles.first_col))
+            _apply(tiles.pool, tiles.directory, *corner, self._marks, shift, touched[:left], self._steps)
 
     def window(self, x: float, y: float, size_m: float) -> GridPatch:
         """Square of size_m around a point, aligned with the cells, copied out of the tiles it touches."""
@@ -128,43 +171,29 @@ class OccupancyGrid:
         odds = self._tiles.read(row, col, rows, cols)
         return GridPatch(self.frame.shifted(row, col), self._percent[odds.astype(np.int64) + _LIMIT])
 
-    def _beams(self, scan: Scan) -> tuple[Array, NDArray[np.bool_]]:
-        """How far each beam reaches, in cells (0: says nothing), and whether it ends in something."""
-        usable = self.config.usable_range_m
-        hits = scan.hit & (scan.ranges_m < usable)
-        reach = np.where(scan.hit, np.minimum(scan.ranges_m + self.config.surface_depth_m * hits, usable), 0.0)
-        without_return = min(self.config.no_return_range_m, scan.range_max_m, usable)
-        return np.where(scan.no_return, without_return, reach) / self.frame.resolution, hits
+    def _scratch(self, shift: int) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+        """Marks of at least 2**shift rows and columns, and a list as long: kept between scans, `_apply` clears them."""
+        size = 1 << (2 * shift)
+        if self._marks.size != size:
+            self._marks, self._touched = np.zeros(size, dtype=np.uint8), np.empty(size + 1, dtype=np.int64)
+        return self._marks, self._touched
 
-    def _cleared_marks(self, size: int) -> NDArray[np.uint8]:
-        """Scratch of at least the asked size; it is kept between scans, and `_apply` leaves it cleared."""
-        if self._marks.shape[0] != size:
-            self._marks = np.zeros((size, size), dtype=np.uint8)
-        return self._marks
-
-    def _make_tiles(self, row: int, col: int, shift: int, touched: NDArray[np.int64]) -> None:
-        first, last = (row // TILE, col // TILE), ((row + (1 << shift)) // TILE, (col + (1 << shift)) // TILE)
-        self._tiles.reach(*first, *last)
-        needed = np.zeros((last[0] - first[0] + 1, last[1] - first[1] + 1), dtype=np.bool_)
-        _flag_tiles(needed, touched, shift, row - first[0] * TILE, col - first[1] * TILE)
-        self._tiles.ensure(np.argwhere(needed) + first)
+    def _directions(self, scan: Scan, heading: float) -> tuple[Array, Array]:
+        """Cosine and sine of each beam's direction in the map, (N,); those in the laser's frame are kept."""
+        fan = (scan.ranges_m.size, scan.angle_min_rad, scan.angle_increment_rad)
+        if fan != self._fan:
+            self._fan, self._cosines, self._sines = fan, np.cos(scan.angles_rad), np.sin(scan.angles_rad)
+        c, s = math.cos(heading), math.sin(heading)
+        return c * self._cosines - s * self._sines, s * self._cosines + c * self._sines
 
 
-def _surfaces(scan: Scan, ends_in_hit: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Whether one surface goes from the end of each beam to that of the next, (N,); never after the last."""
-    surface = np.zeros(scan.ranges_m.size, dtype=np.bool_)
-    if surface.size < 3:
-        return surface
-    # On a straight line 1 / range is a sine of the bearing: the two outer ranges foretell the one between, also where
-    # the wall is grazed and its points lie almost behind each other.
-    ranges = np.where(ends_in_hit, scan.ranges_m, 1.0)
-    before, between, after = ranges[:-2], ranges[1:-1], ranges[2:]
-    foretold = 2.0 * math.cos(scan.angle_increment_rad) * before * after / (before + after)
-    hits = ends_in_hit[:-2] & ends_in_hit[1:-1] & ends_in_hit[2:]
-    flat = hits & (np.abs(between - foretold) < _FLAT_M) & (np.abs(after - before) < _LONGEST_SURFACE_M)
-    surface[:-2] |= flat
-    surface[1:-1] |= flat
-    return surface
+def _steps(config: OccupancyConfig) -> NDArray[np.int64]:
+    """What each of the eight combinations of marks adds to the log odds, and the lowest and highest log odds, (10,)."""
+    free, hit, low, high = (
+        round(_SCALE * log_odds(p)) for p in (config.p_free, config.p_occupied, config.p_lowest, config.p_highest)
+    )
+    added = [hit if marks & _HIT else 0 if marks & _SURFACE else free for marks in range(8)]
+    return np.array([*added, low, high], dtype=np.int64)
 
 
 def _percent_table() -> NDArray[np.int8]:
@@ -205,50 +234,76 @@ def _stroke(
     return count
 
 
+@inlined
+def _is_flat(ranges: Array, hit: NDArray[np.bool_], usable: float, bend: float, i: int) -> bool:
+    """Whether a beam and those beside it end on one surface.
+
+    On a straight line 1 / range is a sine of the bearing: the two outer ranges foretell the one between, also where
+    the wall is grazed and its points lie almost behind each other. bend: twice the cosine of the angle between beams.
+    """
+    if i < 1 or i > ranges.size - 2 or not (hit[i - 1] and hit[i] and hit[i + 1]):
+        return False
+    before, between, after = ranges[i - 1], ranges[i], ranges[i + 1]
+    if max(before, between, after) >= usable:
+        return False
+    flat: bool = abs(between - bend * before * after / (before + after)) < _FLAT_M
+    return flat and abs(after - before) < _LONGEST_SURFACE_M
+
+
 @kernel
 def _mark(
-    marks: NDArray[np.uint8],
+    cells: NDArray[np.uint8],
     shift: int,
+    touched: NDArray[np.int64],
     x: float,
     y: float,
-    angles: Array,
-    reach: Array,
-    ends_in_hit: NDArray[np.bool_],
-    surface: NDArray[np.bool_],
-) -> NDArray[np.int64]:
+    cosines: Array,
+    sines: Array,
+    ranges: Array,
+    hit: NDArray[np.bool_],
+    no_return: NDArray[np.bool_],
+    usable: float,
+    without_return: float,
+    depth: float,
+    resolution: float,
+    bend: float,
+) -> int:
     """Mark each cell that a scan speaks of as passed, hit, or on a surface, and list the marked cells once each.
 
-    marks (S, S): zeros, S = 2**shift, large enough for every beam; x, y, reach: in cells of `marks`; surface (N,):
-    whether one surface goes from the end of a beam to that of the next. Returns flat indices, which a power of two as
-    row length makes cheap to take apart.
+    cells (S * S,): zeros, S = 2**shift rows and columns, large enough for every beam; touched: the list, whose length
+    is returned; x, y: the laser, in cells; cosines, sines, ranges (m), hit, no_return (N,): the beams; usable,
+    without_return (m): how far beams tell something, and those without return; depth (m): how far behind its range a
+    beam ends. Flat indices with a power of two as row length are cheap to take apart.
     """
-    cells = marks.ravel()
-    touched = np.empty(cells.size + 1, dtype=np.int64)
     count = 0
     last = (x, y)
-    for i in range(angles.size):
-        if reach[i] <= 0.0:
-            continue
-        end = (x + reach[i] * math.cos(angles[i]), y + reach[i] * math.sin(angles[i]))
-        count = _stroke(cells, shift, (x, y), end, _FREE, touched, count)
-        index = (int(math.floor(end[1])) << shift) + int(math.floor(end[0]))
-        touched[count] = index
-        count += cells[index] == 0
-        cells[index] |= _HIT if ends_in_hit[i] else _FREE
-        if i > 0 and surface[i - 1]:
-            count = _stroke(cells, shift, last, end, _SURFACE, touched, count)
-        last = end
-    return touched[:count]
+    flat_before = False
+    for i in range(ranges.size):
+        flat = _is_flat(ranges, hit, usable, bend, i)
+        ends_in_hit = hit[i] and ranges[i] < usable
+        length = min(ranges[i] + (depth if ends_in_hit else 0.0), usable) if hit[i] else 0.0
+        length = without_return if no_return[i] else length
+        if length > 0.0:
+            reach = length / resolution
+            end = (x + reach * cosines[i], y + reach * sines[i])
+            count = _stroke(cells, shift, (x, y), end, _FREE, touched, count)
+            index = (int(math.floor(end[1])) << shift) + int(math.floor(end[0]))
+            touched[count] = index
+            count += cells[index] == 0
+            cells[index] |= _HIT if ends_in_hit else _FREE
+            if flat_before or flat:
+                count = _stroke(cells, shift, last, end, _SURFACE, touched, count)
+            last = end
+        flat_before = flat
+    return count
 
 
 @kernel
-def _flag_tiles(
-    needed: NDArray[np.bool_], touched: NDArray[np.int64], shift: int, row: int, col: int
-) -> None:
+def _flag_tiles(needed: NDArray[np.bool_], touched: NDArray[np.int64], shift: int, row: int, col: int) -> None:
     """Flag the tiles in which the listed cells lie; (row, col): cell (0, 0) of the marks from the first tile on."""
     mask = (1 << shift) - 1
     for index in touched:
-        needed[(row + (index >> shift)) // TILE, (col + (index & mask)) // TILE] = True
+        needed[(row + (index >> shift)) >> _TILE_BITS, (col + (index & mask)) >> _TILE_BITS] = True
 
 
 @kernel
@@ -257,25 +312,33 @@ def _apply(
     directory: NDArray[np.int32],
     row: int,
     col: int,
-    marks: NDArray[np.uint8],
+    cells: NDArray[np.uint8],
     shift: int,
     touched: NDArray[np.int64],
     steps: NDArray[np.int64],
-) -> None:
-    """Add the log odds of each marked cell, clamped, and clear its mark.
+) -> int:
+    """Add the log odds of each marked cell, clamped, and clear its mark; where no tile is, leave it and list it anew.
 
     (row, col): cell (0, 0) of the marks, counted from the directory's first cell on; never negative within it.
+    Returns how many cells are left at the beginning of the list.
     """
-    cells = marks.ravel()
-    mask = (1 << shift) - 1
+    odds_of = pool.ravel()
+    mask, inner, left = (1 << shift) - 1, TILE - 1, 0
+    low, high = steps[8], steps[9]
     for index in touched:
         cell_row, cell_col = row + (index >> shift), col + (index & mask)
-        slot = directory[cell_row // TILE, cell_col // TILE]
-        hit, surface = cells[index] & _HIT, cells[index] & _SURFACE
-        cells[index] = 0
-        if surface and not hit:
+        slot = np.int64(directory[cell_row >> _TILE_BITS, cell_col >> _TILE_BITS])
+        if slot < 0:
+            touched[left] = index
+            left += 1
             continue
-        odds = pool[slot, cell_row % TILE, cell_col % TILE] + (steps[1] if hit else steps[0])
+        step = steps[cells[index]]
+        cells[index] = 0
+        if step == 0:
+            continue
+        at = (((slot << _TILE_BITS) + (cell_row & inner)) << _TILE_BITS) + (cell_col & inner)
+        odds = odds_of[at] + step
         # 0 is kept for cells never seen: a cell that comes back to even odds stays a thousandth off.
         odds = 1 if odds == 0 else odds
-        pool[slot, cell_row % TILE, cell_col % TILE] = min(max(odds, steps[2]), steps[3])
+        odds_of[at] = min(max(odds, low), high)
+    return left

@@ -54,6 +54,12 @@ class TileStore:
                 self.directory[place] = self.used
                 self.used += 1
 
+    def places(self) -> NDArray[np.int64]:
+        """Tile coordinates (N, 2) as (row, col) of the tiles in the order of their slots."""
+        found = np.argwhere(self.directory != NO_TILE)
+        order = np.argsort(self.directory[found[:, 0], found[:, 1]])
+        return np.asarray(found[order] + (self.first_row, self.first_col), dtype=np.int64)
+
     def bounds(self) -> tuple[int, int, int, int] | None:
         """First row, first col, end row, end col, in cells, of the rectangle of existing tiles; None if empty."""
         rows, cols = np.nonzero(self.directory != NO_TILE)

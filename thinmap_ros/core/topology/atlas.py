@@ -1,5 +1,6 @@
 """The global web: spots and chains on one unbounded lattice, found by place without looking at all of them."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,6 +45,11 @@ class Box:
         """The first row and col after it."""
         return (self.row + self.rows, self.col + self.cols)
 
+    def meets(self, other: 'Box') -> bool:
+        """Whether the two share a cell or touch."""
+        rows = self.row <= other.end[0] and other.row <= self.end[0]
+        return rows and self.col <= other.end[1] and other.col <= self.end[1]
+
     def around(self, cells: Cells, rim: int, limit: 'Box') -> 'Box':
         """The smallest box that holds this one and some cells (N, 2) with a rim, but ends at the limit."""
         low = np.maximum(np.minimum((self.row, self.col), cells.min(axis=0) - rim), (limit.row, limit.col))
@@ -61,6 +67,34 @@ class Atlas(Web):
         self.lone: set[int] = set()
         self._changed_spots: set[int] = set()
         self._changed_chains: set[int] = set()
+
+    def state(self) -> dict[str, Cells]:
+        """Spots (number, row, col, squared clearance), chains (number, a, b, cells) and their cells, as arrays."""
+        spots = [(number, *spot.cell, spot.squared) for number, spot in self.spots.items()]
+        chains = [(number, chain.a, chain.b, len(chain.cells)) for number, chain in self.chains.items()]
+        cells = [np.column_stack([chain.cells, chain.squared]) for chain in self.chains.values()]
+        return {
+            'spots': np.array(spots, dtype=np.int64).reshape(-1, 4),
+            'chains': np.array(chains, dtype=np.int64).reshape(-1, 4),
+            'cells': np.concatenate([np.empty((0, 3), dtype=np.int64), *cells]),
+            'next': np.array([self._next]),
+        }
+
+    @staticmethod
+    def from_state(state: Mapping[str, Cells]) -> 'Atlas':
+        """The web that another one's `state` describes, with the same numbers."""
+        atlas = Atlas()
+        for number, row, col, squared in state['spots'].tolist():
+            atlas._next = number - 1
+            atlas.add_spot(Spot((row, col), squared))
+        start = 0
+        for number, a, b, count in state['chains'].tolist():
+            part = state['cells'][start : start + count]
+            atlas._next, start = number - 1, start + count
+            atlas.add_chain(Chain(a, b, np.ascontiguousarray(part[:, :2]), np.ascontiguousarray(part[:, 2])))
+        atlas._next = int(state['next'][0])
+        atlas.take_changes()
+        return atlas
 
     def take_changes(self) -> tuple[set[int], set[int]]:
         """Numbers of the spots and chains that came, went or (spots) got other chains since the last call."""

@@ -192,28 +192,37 @@ def _flood(left: Mask, seeds: Cells) -> Mask:
     return found
 
 
-@kernel
 def label(cells: Mask) -> tuple[NDArray[np.int32], Cells]:
     """Number of the part (joined over edges and corners) of each true cell, 0 elsewhere; cells in each part."""
-    rows, cols = cells.shape
-    labels = np.zeros((rows, cols), dtype=np.int32)
-    sizes = np.zeros(cells.size // 2 + 2, dtype=np.int64)
-    stack = np.empty(cells.size + 1, dtype=np.int64)
+    framed = np.full((cells.shape[0] + 2, cells.shape[1] + 2), -1, dtype=np.int32)
+    framed[1:-1, 1:-1] = np.where(cells, 0, -1)
+    sizes = _label(framed)
+    return np.maximum(framed[1:-1, 1:-1], 0), sizes
+
+
+@kernel
+def _label(framed: NDArray[np.int32]) -> Cells:
+    """Number, in place, the parts of the cells that are 0, row after row; the others are -1, so is the border."""
+    cols = framed.shape[1]
+    flat = framed.ravel()
+    steps = np.array([-cols - 1, -cols, -cols + 1, -1, 1, cols - 1, cols, cols + 1], dtype=np.int64)
+    sizes = np.zeros(flat.size // 2 + 2, dtype=np.int64)
+    stack = np.empty(flat.size, dtype=np.int64)
     last = 0
-    for start in range(cells.size):
-        if not cells[start // cols, start % cols] or labels[start // cols, start % cols]:
+    for start in range(flat.size):
+        if flat[start] != 0:
             continue
         last += 1
-        labels[start // cols, start % cols] = last
+        flat[start] = last
         stack[0], count = start, 1
         while count > 0:
             count -= 1
+            at = stack[count]
             sizes[last] += 1
-            row, col = stack[count] // cols, stack[count] % cols
-            for r in range(max(row - 1, 0), min(row + 2, rows)):
-                for c in range(max(col - 1, 0), min(col + 2, cols)):
-                    if cells[r, c] and not labels[r, c]:
-                        labels[r, c] = last
-                        stack[count] = r * cols + c
-                        count += 1
-    return labels, sizes[: last + 1]
+            for step in steps:
+                to = at + step
+                if flat[to] == 0:
+                    flat[to] = last
+                    stack[count] = to
+                    count += 1
+    return sizes[: last + 1]

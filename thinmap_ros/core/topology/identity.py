@@ -1,9 +1,11 @@
 """Ids that stay with a place: the global map's nodes and edges, brought up to date with what the atlas holds."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.topology.atlas import Atlas
@@ -33,6 +35,38 @@ class Registry:
         self._breaks: dict[int, list[int]] = {}
         self._edges: dict[int, list[int]] = {}
         self._pieces: dict[int, Chain] = {}
+        self._heritage: tuple[list[Node], list[Edge]] = ([], [])
+
+    def state(self) -> dict[str, NDArray[np.int64]]:
+        """Which ids stand for what: places (spot or chain, index, node id), edges (chain, edge id), the next id."""
+        places = [(*place, node) for place, node in self._nodes.items()]
+        edges = [(chain, edge) for chain, ids in self._edges.items() for edge in ids]
+        return {
+            'places': np.array(places, dtype=np.int64).reshape(-1, 3),
+            'edges': np.array(edges, dtype=np.int64).reshape(-1, 2),
+            'next_id': np.array([self._next_id]),
+        }
+
+    def restore(self, atlas: Atlas, state: Mapping[str, NDArray[np.int64]]) -> None:
+        """Give an atlas the ids that the `state` of the registry beside it names."""
+        self._nodes = {(owner, index): node for owner, index, node in state['places'].tolist()}
+        self._next_id = int(state['next_id'][0])
+        for place, node in self._places(atlas, set(atlas.spots), set(atlas.chains)):
+            self.map.put_node(replace(node, id=self._nodes[place]))
+        ids: dict[int, list[int]] = {}
+        for chain, edge in state['edges'].tolist():
+            ids.setdefault(chain, []).append(edge)
+        for number in atlas.chains:
+            self._edges[number] = ids[number]
+            for edge_id, (a, b, piece) in zip(ids[number], self._pieces_of(atlas, number), strict=True):
+                self.map.put_edge(edge_of(edge_id, a, b, piece, self._lattice))
+                self._pieces[edge_id] = piece
+
+    def inherit(self, other: 'Registry', nodes: list[Node]) -> None:
+        """Let the next `refresh` name places and edges after those of another registry, its nodes moved meanwhile."""
+        self._next_id = other._next_id
+        self._heritage = nodes, list(other.map.edges.values())
+        self._pieces = {edge: other._pieces[edge] for edge in other.map.edges}
 
     def refresh(self, atlas: Atlas) -> None:
         """Follow the changes of the atlas since the last call.
@@ -41,8 +75,9 @@ class Registry:
         another kind counts as farther away unless it was in the same cell. An edge between two nodes keeps its id.
         """
         spots, chains = atlas.take_changes()
-        old = self._withdraw_edges(chains)
-        old_nodes = self._withdraw_nodes(atlas, spots, chains)
+        old = self._withdraw_edges(chains) + self._heritage[1]
+        old_nodes = self._withdraw_nodes(atlas, spots, chains) + self._heritage[0]
+        self._heritage = [], []
         places = self._places(atlas, spots, chains)
         self._name([(place, node) for place, node in places if place not in self._nodes], old_nodes)
         for place, node in places:
@@ -115,14 +150,19 @@ class Registry:
 
     def _put_edges(self, atlas: Atlas, number: int, old: list[Edge]) -> None:
         """Put the edges of a chain into the map; each takes over the id of an old one between the same nodes."""
+        self._edges[number] = []
+        for a, b, piece in self._pieces_of(atlas, number):
+            edge = self._edge(a, b, piece, old)
+            self.map.put_edge(edge)
+            self._edges[number].append(edge.id)
+
+    def _pieces_of(self, atlas: Atlas, number: int) -> list[tuple[int, int, Chain]]:
+        """The pieces of a chain between its nodes, and the ids of these."""
         chain, breaks = atlas.chains[number], self._breaks[number]
         ids = [self._nodes[chain.a, -1], *(self._nodes[number, k] for k in breaks), self._nodes[chain.b, -1]]
         stops = [0, *breaks, len(chain.cells) - 1]
-        self._edges[number] = []
-        for (first, last), (a, b) in zip(pairwise(stops), pairwise(ids), strict=True):
-            edge = self._edge(a, b, chain.part(first, last), old)
-            self.map.put_edge(edge)
-            self._edges[number].append(edge.id)
+        ends = zip(pairwise(ids), pairwise(stops), strict=True)
+        return [(a, b, chain.part(first, last)) for (a, b), (first, last) in ends]
 
     def _edge(self, a: int, b: int, piece: Chain, old: list[Edge]) -> Edge:
         """The edge along a piece of chain: an old one if it ran just there, else a new one, with an old id if any."""

@@ -49,7 +49,8 @@ def stitch(seam: Seam, joined_outside: Grouping) -> Mask:
         _draw_line(result, seam.free, end, targets)
     parts, sizes = label(result)
     if len(sizes) > 2:
-        if _share_free_space(parts, label(seam.free)[0]):
+        free_parts, free_sizes = label(seam.free)
+        if _share_free_space(parts, free_parts, len(free_sizes)):
             _bridge_parts(result, seam.free, parts, len(sizes) - 1, joined_outside(parts))
         result &= _held(result, kept | reachable(seam.free, seam.robot))
         sizes = label(result)[1]
@@ -58,11 +59,18 @@ def stitch(seam: Seam, joined_outside: Grouping) -> Mask:
     return result
 
 
-def _share_free_space(parts: NDArray[np.int32], free_parts: NDArray[np.int32]) -> bool:
-    """Whether two parts of a skeleton lie in one part of the free space."""
-    both = (parts > 0) & (free_parts > 0)
-    pairs = np.unique(np.stack([parts[both], free_parts[both]]), axis=1)
-    return bool(np.unique(pairs[1]).size < pairs.shape[1])
+@kernel
+def _share_free_space(parts: NDArray[np.int32], free_parts: NDArray[np.int32], count: int) -> bool:
+    """Whether two parts of a skeleton lie in one of the `count` - 1 parts of the free space."""
+    owner = np.zeros(count, dtype=np.int32)
+    for row in range(parts.shape[0]):
+        for col in range(parts.shape[1]):
+            part, place = parts[row, col], free_parts[row, col]
+            if part > 0 and place > 0:
+                if owner[place] > 0 and owner[place] != part:
+                    return True
+                owner[place] = part
+    return False
 
 
 @kernel
@@ -170,30 +178,36 @@ def euler_number(cells: Mask) -> int:
     return total // 4
 
 
-@kernel
 def _fill_empty_loops(skeleton: Mask, free: Mask) -> bool:
     """Fill, in place, what lies within loops of a skeleton where all of it is free; returns whether there are any."""
-    rows, cols = skeleton.shape
-    seen = skeleton.copy()
-    stack = np.empty(skeleton.size + 1, dtype=np.int64)
-    filled = False
-    for start in range(skeleton.size):
-        if seen[start // cols, start % cols]:
-            continue
-        seen[start // cols, start % cols] = True
-        stack[0], size, head, empty = start, 1, 0, True
-        while head < size:
-            row, col = stack[head] // cols, stack[head] % cols
-            head += 1
-            if row == 0 or col == 0 or row == rows - 1 or col == cols - 1:
-                empty = False
-            empty &= free[row, col]
-            for r, c in ((row - 1, col), (row + 1, col), (row, col - 1), (row, col + 1)):
-                if 0 <= r < rows and 0 <= c < cols and not seen[r, c]:
-                    seen[r, c], stack[size] = True, r * cols + c
-                    size += 1
-        if empty:
-            filled = True
-            for at in stack[:size]:
-                skeleton[at // cols, at % cols] = True
-    return filled
+    framed = np.zeros((skeleton.shape[0] + 2, skeleton.shape[1] + 2), dtype=np.bool_)
+    framed[1:-1, 1:-1] = free & ~skeleton
+    solid = np.ones_like(framed)
+    solid[1:-1, 1:-1] = ~free & ~skeleton
+    _drain(framed, solid)
+    empty = framed[1:-1, 1:-1]
+    skeleton |= empty
+    return bool(empty.any())
+
+
+@kernel
+def _drain(left: Mask, solid: Mask) -> None:
+    """Clear, in place, the true cells that are joined to a solid one over edges; the border is solid and not left."""
+    cols = left.shape[1]
+    flat, walls = left.ravel(), solid.ravel()
+    steps = np.array([-cols, -1, 1, cols], dtype=np.int64)
+    stack = np.empty(flat.size, dtype=np.int64)
+    count = 0
+    for at in range(flat.size):
+        if flat[at] and (walls[at - cols] or walls[at - 1] or walls[at + 1] or walls[at + cols]):
+            flat[at] = False
+            stack[count] = at
+            count += 1
+    while count > 0:
+        count -= 1
+        at = stack[count]
+        for step in steps:
+            if flat[at + step]:
+                flat[at + step] = False
+                stack[count] = at + step
+                count += 1

@@ -1,5 +1,8 @@
 """The robot's working memory: the last windows of the grid, on one lattice, in a square that moves along."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,12 +29,14 @@ class Surroundings:
     array whose indices wrap round, so that nothing is moved when the robot moves.
     """
 
-    def __init__(self, first: GridPatch, config: TopologyConfig) -> None:
-        resolution = first.frame.resolution
-        self.lattice = first.frame
+    def __init__(self, lattice: GridFrame, window: tuple[int, int], config: TopologyConfig) -> None:
+        """Begin on the cells of a lattice, for windows of at most so many rows and columns."""
+        resolution = lattice.resolution
+        self.lattice = lattice
         self.margin = round(config.context_m / resolution)
         self._depth = round(config.margin_m / resolution)
-        self._size = max(first.shape) + 2 * max(round(config.memory_m / resolution), self.margin)
+        self._reach = max(round(config.memory_m / resolution), self.margin)
+        self._size = max(window) + 2 * self._reach
         self._memory: States = np.full((self._size, self._size), _NEVER, dtype=np.int8)
         self._low = (0, 0)
         self.box = Box(0, 0, 1, 1)
@@ -54,6 +59,27 @@ class Surroundings:
         self._cells = np.empty((rows, cols), dtype=np.int8)
         for cells, memory in self._parts(self.box):
             self._cells[cells] = self._memory[memory]
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """What is remembered, and where, as arrays."""
+        return {
+            'memory': self._memory.copy(),
+            'low': np.array(self._low),
+            'lattice': self.lattice.as_array(),
+            'reach': np.array(self._reach),
+        }
+
+    @staticmethod
+    def from_state(state: Mapping[str, NDArray[Any]], config: TopologyConfig) -> 'Surroundings':
+        """What another one's `state` describes. Raises InputError where it does not fit the configuration."""
+        memory, reach = state['memory'], int(state['reach'])
+        window = memory.shape[0] - 2 * reach
+        around = Surroundings(GridFrame(*state['lattice'].tolist()), (window, window), config)
+        if memory.shape != around._memory.shape:
+            raise InputError(f'saved surroundings {reach} cells wide: expected {around._reach} (memory_m, context_m)')
+        around._memory = memory.astype(np.int8)
+        around._low = (int(state['low'][0]), int(state['low'][1]))
+        return around
 
     def _move_to(self, row: int, col: int, shape: tuple[int, int]) -> None:
         """Put the remembered square round a window, and forget what it has left behind."""

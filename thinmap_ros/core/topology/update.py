@@ -1,22 +1,28 @@
 """Local topological maps, one a scan, merged into the global one."""
 
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, invert, transform_points
 from thinmap_ros.core.topology.atlas import Atlas, Box
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.free_space import (
     column_distance,
     known_free,
+    label,
     nearest_cell,
     reachable,
     select_free_space,
     squared_clearance,
     standing_room,
 )
-from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.graph import Node, TopologicalMap
 from thinmap_ros.core.topology.identity import Registry
 from thinmap_ros.core.topology.skeleton import Measure, drawing_of, extract, looks_out, map_of, skeleton_of, web_of
 from thinmap_ros.core.topology.stitching import Seam, stitch
@@ -26,7 +32,9 @@ from thinmap_ros.core.topology.web import Limits, Spot, simplify
 __all__ = ['TopologyBuilder', 'TopologyConfig', 'build']
 
 Cells = NDArray[np.int64]
-_PAD = 10  # cells round what changed that are drawn anew with it
+_STRIDE_M = 1.0  # between poses at which the map is built anew
+_PAD = 6  # cells round what changed that are drawn anew with it
+_APART = 16  # cells between changes that are drawn anew each for itself
 
 
 def build(patch: GridPatch, seed_xy: tuple[float, float] | None, config: TopologyConfig) -> TopologicalMap:
@@ -61,20 +69,67 @@ class TopologyBuilder:
 
         Windows must lie on the cells of one lattice. Raises InputError where they do not, or the pose is not finite.
         """
+        view = self._take(window, T_map_base)
+        self._registry = self._registry or Registry(self.config, window.frame)
+        self._registry.refresh(self._atlas)
+        return self._local(view, window)
+
+    def rebuild(self, window_at: Callable[[float, float], GridPatch], before: Array, after: Array) -> None:
+        """Build the map anew after the robot's past poses (N, 3) were corrected, nodes carried along.
+
+        before, after: the same poses as they were known and as they are known now; window_at: the window round a
+        point (x, y, m) of the grid as it has been drawn anew. A node keeps its id where the new map has a node at the
+        place to which the pose nearest to it took it. Edges between the same two nodes keep theirs.
+        """
+        old = self._registry
+        self._atlas, self._surroundings, self._registry = Atlas(), None, None
+        for T in _thinned_out(after):
+            self._take(window_at(float(T[0]), float(T[1])), T)
+        if self._surroundings is None:
+            return
+        self._registry = Registry(self.config, self._surroundings.lattice)
+        if old is not None:
+            self._registry.inherit(old, _carried_along(list(old.map.nodes.values()), before, after))
+        self._registry.refresh(self._atlas)
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """All that the builder knows as arrays by name, empty before the first window; `from_state` goes on from it."""
         if self._surroundings is None or self._registry is None:
-            self._surroundings = Surroundings(window, self.config)
-            self._registry = Registry(self.config, window.frame)
+            return {}
+        return self._surroundings.state() | self._atlas.state() | self._registry.state()
+
+    @staticmethod
+    def from_state(state: Mapping[str, NDArray[Any]], config: TopologyConfig | None = None) -> 'TopologyBuilder':
+        """Builder that goes on from the `state` of another one with the same configuration.
+
+        Raises InputError where it is no such state.
+        """
+        builder = TopologyBuilder(config)
+        if not state:
+            return builder
+        try:
+            builder._surroundings = Surroundings.from_state(state, builder.config)
+            builder._atlas = Atlas.from_state(state)
+            builder._registry = Registry(builder.config, builder._surroundings.lattice)
+            builder._registry.restore(builder._atlas, state)
+        except (KeyError, ValueError, TypeError, IndexError, ZeroDivisionError) as error:
+            raise InputError(f'saved topology: {type(error).__name__} {error}: expected what was saved') from error
+        return builder
+
+    def _take(self, window: GridPatch, T_map_base: Array) -> '_View':
+        """Look at a window and bring the atlas up to date."""
+        if self._surroundings is None:
+            self._surroundings = Surroundings(window.frame, window.shape, self.config)
         around = self._surroundings
         around.take(window)
         known = self._atlas.within(around.box)
         view = _View(around, known, (float(T_map_base[0]), float(T_map_base[1])), self.config)
         self._merge(view, known, around.box)
-        self._registry.refresh(self._atlas)
-        return self._local(view, window, around.margin)
+        return view
 
     def _merge(self, view: '_View', known: tuple[Cells, Cells], box: Box) -> None:
         """Put the skeleton of the window into the atlas where it differs from what was there."""
-        low = (box.row, box.col)
+        low = np.array([box.row, box.col])
         old = np.zeros((box.rows, box.cols), dtype=np.int64)
         rows, cols = (known[0] - low).T
         old[rows, cols] = known[1]
@@ -87,36 +142,73 @@ class TopologyBuilder:
         added = np.argwhere(stitched & (squared == 0))
         squared[added[:, 0], added[:, 1]] = view.measure(added)
         squared[~stitched] = 0
-        changed = np.argwhere(squared != old)
-        if len(changed):
-            self._redraw(view, squared, changed, box)
-
-    def _redraw(self, view: '_View', squared: Cells, changed: Cells, box: Box) -> None:
-        """Draw the atlas anew round the cells (N, 2) of a box that changed, and clean up there.
-
-        squared (H, W): the whole skeleton as it is to be: squared clearances, 0 elsewhere.
-        """
-        low = np.array([box.row, box.col])
-        row, col = (changed[0] + low).tolist()
-        part = self._atlas.calm(Box(row, col, 1, 1).around(changed + low, _PAD, box), box)
-        corner = np.array([part.row, part.col])
-        inner = tuple(slice(at, at + size) for at, size in zip(corner - low, (part.rows, part.cols), strict=True))
-        there = np.ascontiguousarray(squared[inner])
-        cut = self._atlas.cut_out(part)
-        pinned = np.zeros(there.shape, dtype=np.bool_)
-        anchors = np.array(list(cut.anchors), dtype=np.int64).reshape(-1, 2) - corner
-        pinned[anchors[:, 0], anchors[:, 1]] = True
-        web = web_of(there > 0, lambda cells: there[cells[:, 0], cells[:, 1]], pinned)
-        touched = self._atlas.graft(web, part, cut.anchors) | cut.touched
+        touched: set[int] = set()
+        for part in self._places_to_redraw(squared != old, box):
+            corner = np.array([part.row, part.col]) - low
+            inner = tuple(slice(at, at + size) for at, size in zip(corner, (part.rows, part.cols), strict=True))
+            touched |= self._redraw(np.ascontiguousarray(squared[inner]), part)
         simplify(self._atlas, touched, lambda spot: view.is_promising(spot, box), view.limits)
 
-    def _local(self, view: '_View', window: GridPatch, margin: int) -> TopologicalMap:
+    def _places_to_redraw(self, changed: NDArray[np.bool_], box: Box) -> list[Box]:
+        """Rectangles of the lattice that hold what changed in a box (H, W), apart from each other."""
+        cells = np.argwhere(changed)
+        blocks = cells // _APART
+        coarse = np.zeros((box.rows // _APART + 1, box.cols // _APART + 1), dtype=np.bool_)
+        coarse[blocks[:, 0], blocks[:, 1]] = True
+        numbers, sizes = label(coarse)
+        groups = numbers[blocks[:, 0], blocks[:, 1]]
+        places: list[Box] = []
+        for number in range(1, len(sizes)):
+            group = cells[groups == number] + (box.row, box.col)
+            row, col = group[0].tolist()
+            place = self._atlas.calm(Box(row, col, 1, 1).around(group, _PAD, box), box)
+            while beside := [other for other in places if place.meets(other)]:
+                places = [other for other in places if other not in beside]
+                corners = [(other.row, other.col) for other in beside]
+                ends = [(other.row + other.rows - 1, other.col + other.cols - 1) for other in beside]
+                place = self._atlas.calm(place.around(np.array(corners + ends), 0, box), box)
+            places.append(place)
+        return places
+
+    def _redraw(self, squared: Cells, place: Box) -> set[int]:
+        """Draw the atlas anew in a place; returns the spots that were touched.
+
+        squared (H, W): the skeleton as it is to be: squared clearances, 0 elsewhere.
+        """
+        cut = self._atlas.cut_out(place)
+        pinned = np.zeros(squared.shape, dtype=np.bool_)
+        anchors = np.array(list(cut.anchors), dtype=np.int64).reshape(-1, 2) - (place.row, place.col)
+        pinned[anchors[:, 0], anchors[:, 1]] = True
+        web = web_of(squared > 0, lambda cells: squared[cells[:, 0], cells[:, 1]], pinned)
+        return self._atlas.graft(web, place, cut.anchors) | cut.touched
+
+    def _local(self, view: '_View', window: GridPatch) -> TopologicalMap:
         """The window's own part of the new skeleton as a map."""
+        margin = (view.skeleton.shape[0] - window.shape[0]) // 2
         inner = slice(margin, margin + window.shape[0]), slice(margin, margin + window.shape[1])
         shown = web_of(view.skeleton[inner], lambda cells: view.measure(cells + margin))
         for spot in list(shown.spots):
             shown.dissolve(spot)
         return map_of(shown, window.frame, self.config)
+
+
+def _thinned_out(poses: Array) -> Array:
+    """Some of the poses (N, 3), in order: the first, each that lies _STRIDE_M from the last one taken, and the last."""
+    taken = [0] if len(poses) else []
+    for k in range(1, len(poses)):
+        if k == len(poses) - 1 or np.hypot(*(poses[k, :2] - poses[taken[-1], :2])) >= _STRIDE_M:
+            taken.append(k)
+    return poses[taken]
+
+
+def _carried_along(nodes: list[Node], before: Array, after: Array) -> list[Node]:
+    """Nodes, each moved as the pose nearest to it was."""
+    moved = []
+    for node in nodes:
+        k = int(((before[:, :2] - node.position) ** 2).sum(axis=1).argmin())
+        place = transform_points(after[k], transform_points(invert(before[k]), node.position[None]))[0]
+        moved.append(replace(node, x=float(place[0]), y=float(place[1])))
+    return moved
 
 
 class _View:

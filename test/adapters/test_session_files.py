@@ -1,0 +1,139 @@
+"""Saved sessions: work goes on as if it had never stopped."""
+
+import math
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thinmap_ros.adapters.session_files import read_grid, read_topology, write_grid, write_topology
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
+from thinmap_ros.core.se2 import Array, pose
+from thinmap_ros.core.topology.config import TopologyConfig
+from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.core.topology.update import TopologyBuilder
+from thinmap_ros.sim.lms200 import Lms200, Lms200Config
+from thinmap_ros.sim.world import World
+
+
+def building() -> World:
+    """Corridors round a block, with a room to the left."""
+    occupied = np.ones((120, 300), dtype=np.uint8)
+    occupied[10:110, 110:290] = occupied[50:70, 80:110] = occupied[30:90, 10:80] = 0
+    occupied[35:85, 140:260] = 1
+    return World('building', occupied, GridFrame(0.0, 0.0, 0.1), pose(12.5, 6.0, 0.0))
+
+
+def way() -> list[Array]:
+    corners = [(3.0, 6.0), (12.5, 6.0), (12.5, 10.0), (27.5, 10.0), (27.5, 2.0), (12.5, 2.0), (12.5, 6.0), (3.0, 6.0)]
+    poses = []
+    for (x, y), (to_x, to_y) in pairwise(corners):
+        heading, steps = math.atan2(to_y - y, to_x - x), int(math.hypot(to_x - x, to_y - y) / 0.25)
+        poses += [pose(x + k / steps * (to_x - x), y + k / steps * (to_y - y), heading) for k in range(steps)]
+    return poses
+
+
+def drive(grid: OccupancyGrid, builder: TopologyBuilder, poses: list[Array], seed: int) -> None:
+    laser, world = Lms200(Lms200Config(), seed), building()
+    for k, T in enumerate(poses):
+        grid.update(laser.scan(world, T, k), T)
+        builder.update(grid.window(T[0], T[1], 10.0), T)
+
+
+def assert_same(one: TopologicalMap, other: TopologicalMap) -> None:
+    assert one.nodes == other.nodes
+    assert one.edges.keys() == other.edges.keys()
+    for number, edge in one.edges.items():
+        twin = other.edges[number]
+        assert (edge.a, edge.b, edge.length_m, edge.clearance_m) == (twin.a, twin.b, twin.length_m, twin.clearance_m)
+        assert np.array_equal(edge.path, twin.path)
+
+
+def test_work_goes_on_as_if_it_had_never_stopped(tmp_path: Path) -> None:
+    grid, builder = OccupancyGrid(), TopologyBuilder()
+    poses = way()
+    drive(grid, builder, poses[:120], 0)
+    write_grid(tmp_path / 'a.grid.npz', grid)
+    write_topology(tmp_path / 'a.topology.npz', builder)
+    again, restored = read_grid(tmp_path / 'a.grid.npz'), read_topology(tmp_path / 'a.topology.npz')
+    assert len(builder.map.nodes) > 2
+    assert_same(builder.map, restored.map)
+    drive(grid, builder, poses[120:], 1)
+    drive(again, restored, poses[120:], 1)
+    assert np.array_equal(grid.patch().cells, again.patch().cells) and grid.patch().frame == again.patch().frame
+    assert_same(builder.map, restored.map)
+    for key, array in grid.state().items():
+        assert np.array_equal(array, again.state()[key]) or key in ('tiles', 'log_odds')
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_nothing_seen_yet(tmp_path: Path) -> None:
+    write_grid(tmp_path / 'a.npz', OccupancyGrid())
+    write_topology(tmp_path / 'b.npz', TopologyBuilder())
+    assert read_grid(tmp_path / 'a.npz').patch().unknown.all()
+    assert not read_topology(tmp_path / 'b.npz').map.nodes
+
+
+def test_what_does_not_fit_is_said(tmp_path: Path) -> None:
+    grid, builder = OccupancyGrid(), TopologyBuilder()
+    drive(grid, builder, way()[:5], 0)
+    write_grid(tmp_path / 'a.npz', grid)
+    write_topology(tmp_path / 'b.npz', builder)
+    for path in (tmp_path / 'b.npz', tmp_path / 'no.npz'):
+        with pytest.raises(InputError, match='npz'):
+            read_grid(path)
+    with pytest.raises(InputError, match='expected a saved topology'):
+        read_topology(tmp_path / 'a.npz')
+    with pytest.raises(InputError, match='resolution'):
+        read_grid(tmp_path / 'a.npz', OccupancyConfig(resolution_m=0.05))
+    with pytest.raises(InputError, match='memory_m'):
+        read_topology(tmp_path / 'b.npz', TopologyConfig(memory_m=20.0))
+
+
+@pytest.mark.parametrize('seed', range(30))
+def test_damaged_files(tmp_path: Path, seed: int) -> None:
+    write_topology(tmp_path / 'b.npz', TopologyBuilder())
+    whole, rng = bytearray((tmp_path / 'b.npz').read_bytes()), np.random.default_rng(seed)
+    for at in rng.integers(0, len(whole), 5):
+        whole[at] = rng.integers(0, 256)
+    (tmp_path / 'b.npz').write_bytes(whole[: rng.integers(0, len(whole))])
+    with pytest.raises(InputError) as error:
+        read_topology(tmp_path / 'b.npz')
+    assert '\n' not in str(error.value)
+
+
+def test_a_corrected_past_moves_the_nodes_and_they_keep_their_ids() -> None:
+    """The robot's heading was wrong by a little more with each metre; then a loop was closed."""
+    world, poses = building(), way()
+    believed = [pose(T[0] + 0.004 * k, T[1] + 0.002 * k, T[2]) for k, T in enumerate(poses)]
+    drifted, corrected = OccupancyGrid(), OccupancyGrid()
+    builder, straight = TopologyBuilder(), TopologyBuilder()
+    laser = Lms200(Lms200Config(), 0)
+    for k, (T, wrong) in enumerate(zip(poses, believed, strict=True)):
+        scan = laser.scan(world, T, k)
+        drifted.update(scan, wrong)
+        corrected.update(scan, T)
+        builder.update(drifted.window(wrong[0], wrong[1], 10.0), wrong)
+        straight.update(corrected.window(T[0], T[1], 10.0), T)
+    before = dict(builder.map.nodes)
+    builder.rebuild(lambda x, y: corrected.window(x, y, 10.0), np.array(believed), np.array(poses))
+    after, wanted = builder.map, straight.map
+    places = np.array([node.position for node in wanted.nodes.values()])
+    near = [np.hypot(*(places - node.position).T).min() <= 0.5 for node in after.nodes.values()]
+    assert np.mean(near) >= 0.8
+    assert len(after.edges) - len(after.nodes) == len(wanted.edges) - len(wanted.nodes)
+    kept = before.keys() & after.nodes.keys()
+    assert len(kept) >= len(after.nodes) / 2
+    # Where a place of the wrong map is no more, its node's number is not given to another place.
+    shift = [np.hypot(*(after.nodes[k].position - before[k].position)) for k in kept]
+    assert max(shift) <= 2.0
+    builder.update(corrected.window(poses[-1][0], poses[-1][1], 10.0), poses[-1])
+
+
+def test_a_correction_before_the_first_window() -> None:
+    builder = TopologyBuilder()
+    builder.rebuild(lambda x, y: OccupancyGrid().window(x, y, 10.0), np.empty((0, 3)), np.empty((0, 3)))
+    assert not builder.map.nodes
