@@ -24,9 +24,10 @@ _AROUND = 4  # keyframes to either side that make a submap
 _AGAIN_M = 8.0  # so much way lies between leaving a place and coming back to it
 _VISITS = 3  # earlier visits to a place with which a scan is matched
 _TURN_M_RAD = 1.0  # a radian of turn makes two scans as different as so many metres
-_STEP_SIGMAS = (0.01, 0.01, 0.004)  # of a step from one keyframe to the next, m and rad
+# Bounds of the error of a step from one keyframe to the next, in m and in rad.
+_STEP_M, _STEP_RAD = (0.002, 0.02), (0.0002, 0.02)
 _LEAP_SIGMAS = (0.1, 0.1, 0.05)  # the same where wheels and walls contradicted each other
-_MATCH_SIGMAS = (0.02, 0.02, 0.006)  # matches err together, by more than each says of itself
+_MATCH_SIGMAS = (0.04, 0.04, 0.02)  # matches err together, by more than each says of itself
 _PRIOR_SIGMAS = (0.3, 0.3, 0.15)
 _LEAST_OVERLAP, _LEAST_FIT = 0.5, 0.85
 
@@ -55,7 +56,9 @@ class Loops:
 
     def __init__(self, config: LoopConfig, matching: MatchConfig) -> None:
         self.keyframes: list[Keyframe] = []
-        self.measured: list[Measured] = []
+        self.matched: list[Measured] = []
+        self._steps: list[Array] = []  # from each keyframe to the next, as the localizer saw it
+        self._leaps: set[int] = set()  # of these, those where wheels and walls contradict each other
         self._config, self._matching = config, matching
         self._jobs: deque[tuple[int, int]] = deque()
         self._leapt = False
@@ -72,10 +75,9 @@ class Loops:
         k = len(self.keyframes)
         self.keyframes.append(Keyframe(scan, points_base, T_map_base, way))
         if k > 0:
-            sigmas = _LEAP_SIGMAS if self._leapt else _STEP_SIGMAS
-            step = se2.between(self.keyframes[k - 1].T_map_base, T_map_base)
-            self.measured.append(Measured(k - 1, k, step, np.diag(1.0 / np.square(sigmas)), False))
+            self._steps.append(se2.between(self.keyframes[k - 1].T_map_base, T_map_base))
             if self._leapt:
+                self._leaps.add(k - 1)
                 self._jobs.append((k - 1, k))
             self._jobs.extend((j, k) for j in self._earlier_visits(k))
         self._leapt = False
@@ -87,13 +89,31 @@ class Loops:
             match = self._match(j, k)
             if match.overlap >= _LEAST_OVERLAP and match.fit >= _LEAST_FIT:
                 covariance = match.covariance + np.diag(np.square(_MATCH_SIGMAS))
-                self.measured.append(Measured(j, k, match.T_map_base, np.linalg.inv(covariance), True))
+                self.matched.append(Measured(j, k, match.T_map_base, np.linalg.inv(covariance), True))
 
     def relaxed(self) -> Array:
         """Poses (N, 3) of the keyframes that agree best with all measurements."""
         while self._jobs:
             self.work_off()
-        return relax(np.array([k.T_map_base for k in self.keyframes]).reshape(-1, 3), self.measured)
+        poses = np.array([k.T_map_base for k in self.keyframes]).reshape(-1, 3)
+        usual, leap = (np.diag(1.0 / np.square(sigmas)) for sigmas in (self._step_sigmas(poses), _LEAP_SIGMAS))
+        steps = [
+            Measured(k, k + 1, step, leap if k in self._leaps else usual, False) for k, step in enumerate(self._steps)
+        ]
+        return relax(poses, steps + self.matched)
+
+    def _step_sigmas(self, poses: Array) -> Array:
+        """How much a step adds to the drift, (3,), as told by what loops find after many steps.
+
+        A localizer that holds on to its map adds next to nothing. To believe in more would let small errors of the
+        matches bend a path that is straight.
+        """
+        found = [(_off(poses, m), m.b - m.a) for m in self.matched if m.b - m.a > 1]
+        squared = np.array([np.square(off) / number for off, number in found]).reshape(-1, 3)
+        if len(squared) == 0:
+            return np.array([_STEP_M[0], _STEP_M[0], _STEP_RAD[0]])
+        along = float(np.clip(math.sqrt(0.5 * np.median(squared[:, 0] + squared[:, 1])), *_STEP_M))
+        return np.array([along, along, np.clip(math.sqrt(np.median(squared[:, 2])), *_STEP_RAD)])
 
     def _way_to(self, T_map_base: Array) -> float | None:
         """Length of the path up to a pose; None where it is too near to the last keyframe to be one."""
@@ -131,3 +151,9 @@ class Loops:
         return matcher.match(
             here.points_base, np.ascontiguousarray(here.scan.T_base_laser[:2]), prior, np.diag(np.square(_PRIOR_SIGMAS))
         )
+
+
+def _off(poses: Array, measured: Measured) -> Array:
+    """What a match says of two poses less what the poses (N, 3) say themselves, (3,)."""
+    off = measured.T_a_b - se2.between(poses[measured.a], poses[measured.b])
+    return np.array([off[0], off[1], se2.wrap(float(off[2]))])
