@@ -39,7 +39,7 @@ from thinmap_ros.sim.pioneer import PRESETS
 from thinmap_ros.sim.runner import STEP_NS, Moment, Simulation
 from thinmap_ros.sim.world import World
 from thinmap_ros.tools import cli
-from thinmap_ros.tools.report import Ending, EndNodeCensus, exploration_report
+from thinmap_ros.tools.report import Ending, EndNodeCensus, TargetLog, exploration_report
 
 _CONTROL_STEPS = 2
 _MEASURE_SCANS = 5
@@ -77,6 +77,8 @@ class Log:
     poses: list[Array] = field(default_factory=list)
     coverage: list[tuple[float, float]] = field(default_factory=list)
     census: EndNodeCensus = field(default_factory=EndNodeCensus)
+    decision_s: list[float] = field(default_factory=list)
+    targets: TargetLog = field(default_factory=TargetLog)
 
 
 class ClosedLoop:
@@ -118,12 +120,15 @@ class ClosedLoop:
         estimate = self.pipeline.step(scan, T_odom_base).estimate
         self._scan, self._T_map_odom = scan, estimate.T_map_odom
         self._patch = self.pipeline.grid.patch()
+        began = time.perf_counter()
         self.decision = self.strategy.step(self.pipeline.topology.map, self._patch, scan, estimate.T_map_base)
+        self.log.decision_s.append(time.perf_counter() - began)
         self.log.stamps_ns.append(scan.stamp_ns)
         self.log.poses.append(estimate.T_map_base)
         self.log.true_poses.append(self.simulation.robot.T_world_base)
         self.log.census.take([(n.node_id, n.x, n.y) for n in self.decision.end_nodes], estimate.T_map_base)
         target = self.decision.target
+        self.log.targets.take(None if target is None else target.goal)
         if target is None:
             self.navigator.cancel()
             self._goal = None
@@ -202,6 +207,9 @@ def explore(
         ending, np.array(log.stamps_ns) / 1e9, np.array(log.true_poses), np.array(log.poses), np.array(log.coverage),
         log.census,
     )
+    report['target_changes'], report['reversals'] = log.targets.changes, log.targets.reversals
+    milliseconds = 1e3 * np.array(log.decision_s)
+    report['decision_ms'] = {'median': round(float(np.median(milliseconds)), 2), 'max': round(milliseconds.max(), 2)}
     report['world'], report['strategy'], report['wall_s'] = world.name, options.strategy, round(wall_s, 3)
     return loop, report
 

@@ -67,6 +67,25 @@ class EndNodeCensus:
         return self._places[-1]
 
 
+class TargetLog:
+    """How often the target changed, and how often it went back to the one before: oscillation."""
+
+    def __init__(self) -> None:
+        self.changes = self.reversals = 0
+        self._last: list[tuple[float, float]] = []
+
+    def take(self, goal: Array | None) -> None:
+        """Take the goal (x, y, ...), m, of a decision; one less than SAME_PLACE_M from the last is the same."""
+        if goal is None:
+            return
+        at = (float(goal[0]), float(goal[1]))
+        if self._last and math.dist(at, self._last[-1]) <= SAME_PLACE_M:
+            return
+        self.changes += bool(self._last)
+        self.reversals += len(self._last) > 1 and math.dist(at, self._last[-2]) <= SAME_PLACE_M
+        self._last = [*self._last[-1:], at]
+
+
 @dataclass(frozen=True)
 class Ending:
     """How an exploration ended: whether by itself, why, and how often the robot touched something."""

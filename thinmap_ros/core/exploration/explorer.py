@@ -47,6 +47,7 @@ _TRIES = 3
 _SURVEY_AGAIN_S = 0.4
 _COARSE_M, _FORGET_S = 0.2, 20.0
 _PAUSE_S = 5.0
+_FADE = 10.0
 
 
 class FinishCode(IntEnum):
@@ -135,7 +136,7 @@ class _Survey:
 class _Failure:
     at: tuple[float, float]
     stamp_ns: int
-    times: int = 1
+    times: int = 0
 
 
 @dataclass
@@ -146,7 +147,7 @@ class _Memory:
     target_at: tuple[float, float] = (math.inf, math.inf)
     goal: Array = field(default_factory=lambda: np.full(3, np.inf))
     first_choice_made: bool = False
-    failed: dict[int, _Failure] = field(default_factory=dict)
+    failed: list[_Failure] = field(default_factory=list)
     visited: dict[int, tuple[float, float]] = field(default_factory=dict)
     at_goal: int = 0
     nothing_left: int = 0
@@ -191,9 +192,11 @@ class Explorer:
         track = None if target is None else self._track(target)
         if target is None or track is None:
             return
-        earlier = self._memory.failed.get(target)
-        times = 1 if earlier is None else earlier.times + 1
-        self._memory.failed[target] = _Failure((track.x, track.y), self._stamp_ns, times)
+        failure = self._failure_of(track)
+        if failure is None:
+            failure = _Failure((track.x, track.y), self._stamp_ns)
+            self._memory.failed.append(failure)
+        failure.times, failure.stamp_ns = failure.times + 1, self._stamp_ns
         self._memory.target = None
 
     # What there is to choose from.
@@ -236,7 +239,6 @@ class Explorer:
         """What is remembered of a node goes with it when it gets another id."""
         memory = self._memory
         memory.target = renamed.get(memory.target or 0, memory.target)
-        memory.failed = {renamed.get(i, i): failure for i, failure in memory.failed.items()}
         memory.visited = {renamed.get(i, i): place for i, place in memory.visited.items()}
 
     def _owners(self, cells: Cells, reached: NDArray[np.bool_]) -> Cells:
@@ -348,11 +350,8 @@ class Explorer:
 
     def _choose(self, topology: TopologicalMap, worth: dict[int, _Candidate], T_map_base: Array) -> int | None:
         memory = self._memory
-        self._forget_failures(worth)
-        open_to_try = {i: c for i, c in worth.items() if i not in memory.failed}
-        if not open_to_try:
-            open_to_try = {i: c for i, c in worth.items() if self._may_retry(memory.failed[i])}
-        waits = any(memory.failed[i].times < _TRIES for i in worth if i in memory.failed)
+        open_to_try = self._to_try(worth)
+        waits = any(failure.times < _TRIES for failure in map(self._failure_of_candidate, worth.values()) if failure)
         memory.nothing_left = 0 if open_to_try or waits else memory.nothing_left + 1
         if not open_to_try:
             memory.target = None
@@ -371,9 +370,35 @@ class Explorer:
             memory.target = best
         return self._go_for(open_to_try[memory.target])
 
-    def _may_retry(self, failure: _Failure) -> bool:
-        """Before the end, whatever failed is tried again, each time after a pause: a door may be free by then."""
-        return failure.times < _TRIES and self._stamp_ns - failure.stamp_ns > _PAUSE_S * 1e9
+    def _to_try(self, worth: dict[int, _Candidate]) -> dict[int, _Candidate]:
+        """Candidates at whose places nothing failed, or a while ago; else, before the end, those that failed least.
+
+        The latter after a pause: a door may be free by then. What failed too often is tried no more, unless so much
+        else is left to do that the failure fades from memory.
+        """
+        failures = {i: self._failure_of_candidate(candidate) for i, candidate in worth.items()}
+
+        def left(pause_s: float) -> dict[int, _Candidate]:
+            now, open_to_try = self._stamp_ns, {}
+            for i, failure in failures.items():
+                if failure is None or (failure.times < _TRIES and now - failure.stamp_ns > pause_s * 1e9):
+                    open_to_try[i] = worth[i]
+            return open_to_try
+
+        first = left(self.config.retry_s)
+        if not first:
+            return left(_PAUSE_S)
+        fade_ns = _FADE * self.config.retry_s * 1e9
+        self._memory.failed = [f for f in self._memory.failed if self._stamp_ns - f.stamp_ns < fade_ns]
+        return first
+
+    def _failure_of_candidate(self, candidate: _Candidate) -> _Failure | None:
+        return self._failure_of(candidate.track)
+
+    def _failure_of(self, track: Track) -> _Failure | None:
+        """What failed at about the place of a track; ids of nodes come and go, places stay."""
+        near = min(self._memory.failed, key=lambda f: math.dist(f.at, (track.x, track.y)), default=None)
+        return near if near and math.dist(near.at, (track.x, track.y)) <= _CHANGED_MARGIN_M else None
 
     def _go_for(self, chosen: _Candidate) -> int:
         """Make a candidate the target; its goal stays where it was for as long as it is about the same."""
@@ -389,16 +414,6 @@ class Explorer:
         near = min(worth.values(), key=lambda c: math.dist(at, (c.track.x, c.track.y)))
         within = math.dist(at, (near.track.x, near.track.y)) <= _SUCCESSOR_M
         return near.track.node_id if within else None
-
-    def _forget_failures(self, worth: dict[int, _Candidate]) -> None:
-        """A failure counts for retry_s, and only while the node stays where it was."""
-        memory = self._memory
-        for node_id, failure in list(memory.failed.items()):
-            track = self._track(node_id)
-            gone = node_id not in worth or track is None
-            moved = track is not None and math.dist((track.x, track.y), failure.at) > _CHANGED_MARGIN_M
-            if gone or moved or self._stamp_ns - failure.stamp_ns > self.config.retry_s * 1e9:
-                del memory.failed[node_id]
 
     def _costs(self, topology: TopologicalMap, worth: dict[int, _Candidate], T_map_base: Array) -> dict[int, float]:
         """Path cost to each candidate's goal, m: along the graph, and the first turn."""
@@ -450,7 +465,7 @@ class Explorer:
         tracks = [*self.tracker.tracks.values(), *self._stand_ins.tracks.values()]
         goals = {} if target is None else {target: self._memory.goal}
         end_nodes = [_end_node(t, by_id.get(t.node_id), goals.get(t.node_id), resolution) for t in tracks]
-        unreachable = sorted(self._memory.failed)
+        unreachable = sorted(i for i, candidate in worth.items() if self._failure_of_candidate(candidate))
         finished = self._memory.nothing_left >= 3
         code, reason = _verdict(finished, unreachable, len(worth))
         known = float(np.count_nonzero(self.borders.free)) * resolution**2
