@@ -7,9 +7,9 @@ from setuptools import find_packages, setup
 NAME = 'thinmap_ros'
 NODES = [
     'sim', 'grid_mapper', 'topology_builder', 'localizer', 'explorer', 'navigator', 'recorder', 'bag_player',
-    'demo_monitor',
+    'demo_monitor', 'rerun_viewer',
 ]
-TOOLS = ['replay', 'explore_world', 'carmen_to_bag', 'map_to_graph', 'demo', 'warm_up']
+TOOLS = ['replay', 'explore_world', 'compare_exploration', 'carmen_to_bag', 'map_to_graph', 'demo', 'warm_up']
 
 setup(
     name=NAME,
@@ -24,7 +24,7 @@ setup(
     ],
     install_requires=['matplotlib', 'mcap', 'numba', 'numpy', 'pillow', 'pyyaml', 'rosbags', 'scipy', 'tqdm'],
     extras_require={
-        'viewer': ['rerun-sdk'],
+        'viewer': ['rerun-sdk>=0.41,<0.42'],  # its interface changes with each minor version
         'test': ['hypothesis', 'opencv-contrib-python-headless', 'psutil', 'pytest', 'pytest-timeout', 'scikit-image'],
     },
     python_requires='>=3.11',

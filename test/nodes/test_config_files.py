@@ -3,7 +3,9 @@
 THINMAP_WRITE_CONFIG=1 writes the files anew from what is declared.
 """
 
+import dataclasses
 import importlib
+import json
 import os
 import textwrap
 from pathlib import Path
@@ -19,6 +21,8 @@ ROOT = Path(__file__).resolve().parents[2]
 NODES = sorted(path.stem for path in (ROOT / 'thinmap_ros' / 'nodes').glob('[a-z]*.py'))
 # What rclpy declares in every node of its own accord.
 OF_EVERY_NODE = {'start_type_description_service'}
+# What a node must be told here that is not its default: a bag that exists; a test opens no window.
+NEEDED = {'bag_player': {'bag': 'some_bag'}, 'rerun_viewer': {'spawn': False}}
 OWN_WORDS = {'use_sim_time': 'follow /clock instead of the time of the machine'}
 
 
@@ -27,6 +31,14 @@ def node_class(name):
     classes = [c for c in vars(module).values() if isinstance(c, type) and c.__module__ == module.__name__]
     (found,) = [c for c in classes if issubclass(c, rclpy.node.Node)]
     return found
+
+
+def default_of(name, key):
+    """Default of a field of the config that a node's own module has."""
+    module = importlib.import_module(f'thinmap_ros.nodes.{name}')
+    configs = [c for c in vars(module).values() if dataclasses.is_dataclass(c) and c.__module__ == module.__name__]
+    (default,) = [field.default for c in configs for field in dataclasses.fields(c) if field.name == key]
+    return default
 
 
 @pytest.fixture
@@ -74,10 +86,11 @@ def file_text(name, parameters):
 @pytest.mark.parametrize('name', NODES)
 def test_config_file_says_what_the_node_declares(declared, name):
     path = ROOT / 'config' / f'{name}.yaml'
-    needed = ['-p', 'bag:=some_bag'] if name == 'bag_player' else []
-    parameters = declared(name, *needed)
-    if needed:
-        parameters['bag'] = ('', parameters['bag'][1])
+    needed = NEEDED.get(name, {})
+    arguments = [word for key, value in needed.items() for word in ('-p', f'{key}:={json.dumps(value)}')]
+    parameters = declared(name, *arguments)
+    for key in needed:
+        parameters[key] = (default_of(name, key), parameters[key][1])
     text = file_text(name, parameters)
     if 'THINMAP_WRITE_CONFIG' in os.environ:
         path.write_text(text)
@@ -89,8 +102,7 @@ def test_node_takes_its_config_file(declared, tmp_path, name):
     values = yaml.safe_load((ROOT / 'config' / f'{name}.yaml').read_text())['/**']['ros__parameters']
     # A value that is no default proves that the file is read at all.
     values['use_sim_time'] = True
-    if name == 'bag_player':
-        values['bag'] = 'some_bag'
+    values |= NEEDED.get(name, {})
     (tmp_path / 'given.yaml').write_text(yaml.safe_dump({'/**': {'ros__parameters': values}}))
     found = declared(name, '--params-file', str(tmp_path / 'given.yaml'))
     assert {n: value for n, (value, _) in found.items()} == values

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from thinmap_ros.tools.report import FEWEST_SIGHTINGS, Ending, EndNodeCensus, exploration_report
+from thinmap_ros.tools.report import FEWEST_SIGHTINGS, Ending, EndNodeCensus, TargetLog, exploration_report
 
 AFAR = np.array([100.0, 100.0, 0.0])
 
@@ -62,3 +62,18 @@ def test_milestones_are_when_a_coverage_was_first_measured_and_none_where_it_nev
     assert report['time_at'] == {'0.90': 4.0, '0.95': 6.0, '0.98': 10.0, '0.99': None}
     assert report['distance_at'] == {'0.90': 2.0, '0.95': 3.0, '0.98': 5.0, '0.99': None}
     json.dumps(report)
+
+
+@pytest.mark.parametrize(
+    ('places', 'changes', 'reversals'),
+    [
+        ([0.0, 0.3, 0.6, None, 0.5], 0, 0),
+        ([0.0, 5.0, 10.0], 2, 0),
+        ([0.0, 5.0, 0.2, 5.1, 9.0], 4, 2),
+    ],
+)
+def test_a_target_that_goes_back_to_the_one_before_is_a_reversal(places, changes, reversals):
+    log = TargetLog()
+    for place in places:
+        log.take(None if place is None else np.array([place, 1.0, 0.0]))
+    assert (log.changes, log.reversals) == (changes, reversals)

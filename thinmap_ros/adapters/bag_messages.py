@@ -1,4 +1,4 @@
-"""Messages as a bag gives them (rosbags' own classes, not those of ROS) -> core values."""
+"""Messages as a bag gives them (rosbags' own classes, which have the fields of ROS's) -> core values."""
 
 import math
 from typing import Any

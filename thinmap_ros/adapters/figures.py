@@ -1,10 +1,12 @@
 """Pictures of maps."""
 
+from collections import defaultdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from thinmap_ros.adapters import colours
 from thinmap_ros.adapters.files import written_aside
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
@@ -13,9 +15,8 @@ from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Okabe and Ito's colours: told apart by everyone; each kind of node has a shape of its own as well.
-_NODES = {NodeKind.END: ('o', '#D55E00'), NodeKind.BRANCH: ('s', '#0072B2'), NodeKind.CORNER: ('^', '#E69F00')}
-_EDGE, _ESTIMATE, _TRUTH = '#009E73', '#CC79A7', '#56B4E9'
+# Each kind of node has a shape of its own as well as a colour.
+_MARKERS = {NodeKind.END: 'o', NodeKind.BRANCH: 's', NodeKind.CORNER: '^'}
 
 
 def summary_figure(
@@ -38,16 +39,16 @@ def summary_figure(
     _draw_map(axes, patch)
     _draw_graph(axes, topology)
     if true is not None and len(true):
-        axes.plot(true[:, 0], true[:, 1], '-', color=_TRUTH, linewidth=2.5, label='path driven', zorder=2)
+        axes.plot(true[:, 0], true[:, 1], '-', color=colours.TRUTH, linewidth=2.5, label='path driven', zorder=2)
     if len(estimated):
         axes.plot(
-            estimated[:, 0], estimated[:, 1], '-', color=_ESTIMATE, linewidth=1.0, label='path estimated', zorder=3
+            *estimated[:, :2].T, '-', color=colours.ESTIMATE, linewidth=1.0, label='path estimated', zorder=3
         )
         axes.plot(*estimated[0, :2], marker='*', color='black', markersize=11, linestyle='', label='start', zorder=6)
     axes.set(xlabel='x (m)', ylabel='y (m)', title=title, aspect='equal')
     axes.legend(loc='upper center', bbox_to_anchor=(0.5, -0.07), ncols=4, fontsize=8, frameon=False)
     with written_aside(path) as aside:
-        figure.savefig(aside, format='png')
+        figure.savefig(aside, format='png', bbox_inches='tight')
 
 
 def _draw_map(axes: 'Axes', patch: GridPatch) -> None:
@@ -70,12 +71,40 @@ def _draw_map(axes: 'Axes', patch: GridPatch) -> None:
 def _draw_graph(axes: 'Axes', topology: TopologicalMap) -> None:
     for i, edge in enumerate(topology.edges.values()):
         label = 'skeleton' if i == 0 else None
-        axes.plot(edge.path[:, 0], edge.path[:, 1], '-', color=_EDGE, linewidth=1.2, label=label, zorder=4)
-    for kind, (marker, colour) in _NODES.items():
+        axes.plot(edge.path[:, 0], edge.path[:, 1], '-', color=colours.EDGE, linewidth=1.2, label=label, zorder=4)
+    for kind, marker in _MARKERS.items():
         places = np.array([n.position for n in topology.nodes.values() if n.kind == kind]).reshape(-1, 2)
         if len(places):
             label = f'{kind.name.lower()} nodes'
             axes.plot(
-                *places.T, marker, color=colour, markersize=5, markeredgecolor='black', markeredgewidth=0.4,
-                linestyle='', label=label, zorder=5,
+                *places.T, marker, color=colours.NODES[kind], markersize=5, markeredgecolor='black',
+                markeredgewidth=0.4, linestyle='', label=label, zorder=5,
             )
+
+
+def coverage_figure(path: Path, reports: list[dict[str, Any]]) -> None:
+    """Write a PNG: coverage over distance by strategy, the mean over all runs that reports (with `curve`) tell of.
+
+    A run's distance is given as a share of the mean distance of all strategies from the same world and start.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    lengths: dict[tuple[str, int], list[float]] = defaultdict(list)
+    for report in reports:
+        lengths[report['world'], report['start_number']].append(report['distance'])
+    shares = np.linspace(0.0, 1.5, 151)
+    curves: dict[str, list[Array]] = defaultdict(list)
+    for report in reports:
+        unit = max(float(np.mean(lengths[report['world'], report['start_number']])), 1e-9)
+        _, along, coverage = np.array(report['curve']).T
+        curves[report['strategy']].append(np.interp(shares * unit, along, coverage))
+    figure = Figure(figsize=(8.0, 5.0), dpi=110, layout='constrained')
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    for strategy, runs in sorted(curves.items()):
+        axes.plot(shares, 100.0 * np.mean(runs, axis=0), label=f'{strategy} ({len(runs)})')
+    axes.set(xlabel='distance, of the mean of all strategies', ylabel='coverage (%)', ylim=(0.0, 101.0))
+    axes.legend(fontsize=8, frameon=False)
+    with written_aside(path) as aside:
+        figure.savefig(aside, format='png', bbox_inches='tight')

@@ -221,7 +221,14 @@ def _edge_msg(edge: Edge) -> TopologicalEdge:
 
 
 def topology_from(message: TopologicalMapMsg) -> TopologicalMap:
-    """Topological map of a message."""
+    """Topological map of a message. Raises InputError where a kind is unknown, or an edge leads to no node."""
+    known = {n.id for n in message.nodes}
+    for node in message.nodes:
+        if node.kind not in list(NodeKind):
+            raise InputError(f'node {node.id}: kind {node.kind}: expected one of {[int(kind) for kind in NodeKind]}')
+    for edge in message.edges:
+        if not {edge.node_a, edge.node_b} <= known:
+            raise InputError(f'edge {edge.id} from node {edge.node_a} to {edge.node_b}: expected nodes of this map')
     nodes = [
         Node(n.id, NodeKind(n.kind), n.position.x, n.position.y, float(n.clearance_m)) for n in message.nodes
     ]

@@ -16,7 +16,7 @@ from thinmap_ros.core.se2 import Array
 
 Cells = NDArray[np.int64]
 RADIUS_M = 0.25
-SHORTEST_M = 0.4
+SHORTEST_M = 0.5
 _REACH_M = 3.0
 _CLOSE_LOOK_M = 2.0
 _ESCAPE_M = 0.6

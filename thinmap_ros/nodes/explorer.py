@@ -18,9 +18,9 @@ from thinmap_msgs.msg import EndNodeArray, ExplorationStatus, SlamStatus, Topolo
 from thinmap_ros import warm_up
 from thinmap_ros.adapters import messages, parameters, qos, runtime
 from thinmap_ros.adapters.actions import Outcome, SingleGoalServer
+from thinmap_ros.adapters.listening import listen
 from thinmap_ros.adapters.stamps import StampMatcher
 from thinmap_ros.adapters.transforms import LaserMount
-from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.area import fenced
 from thinmap_ros.core.exploration.explorer import Decision, EndNode, Explorer, ExplorerConfig
 from thinmap_ros.core.exploration.session import Budget, Odometer
@@ -59,12 +59,12 @@ class ExplorerNode(Node):
     def _make_topics(self) -> None:
         self._end_nodes = self.create_publisher(EndNodeArray, 'end_nodes', qos.LATCHED)
         self._status = self.create_publisher(ExplorationStatus, 'exploration_status', qos.LATCHED)
-        self.create_subscription(TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
-        self.create_subscription(OccupancyGrid, 'map', self._on_map, qos.LATCHED)
-        self.create_subscription(OccupancyGrid, 'local_map', self._on_window, qos.LATCHED)
-        self.create_subscription(PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
-        self.create_subscription(LaserScan, 'scan', self._on_scan, qos.SENSOR)
-        self.create_subscription(SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
+        listen(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
+        listen(self, OccupancyGrid, 'map', self._on_map, qos.LATCHED)
+        listen(self, OccupancyGrid, 'local_map', self._on_window, qos.LATCHED)
+        listen(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
+        listen(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
+        listen(self, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
         self._navigator = ActionClient(self, NavigateToPose, 'navigate_to_pose')
         self._goals = SingleGoalServer(self, Explore, 'explore', self._begin, self._on_cancel, self._preempted)
         self.create_timer(_FEEDBACK_PERIOD_S, self._every_second)
@@ -91,23 +91,13 @@ class ExplorerNode(Node):
         self._topology = messages.topology_from(message)
 
     def _on_map(self, message: OccupancyGrid) -> None:
-        try:
-            self._map.replace(messages.patch_from(message))
-        except InputError as error:
-            self.get_logger().warning(f'map: {error}', throttle_duration_sec=_WARN_PERIOD_S)
+        self._map.replace(messages.patch_from(message))
 
     def _on_window(self, message: OccupancyGrid) -> None:
-        try:
-            self._map.paste(messages.patch_from(message))
-        except InputError as error:
-            self.get_logger().warning(f'local_map: {error}', throttle_duration_sec=_WARN_PERIOD_S)
+        self._map.paste(messages.patch_from(message))
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
-        try:
-            T_map_base = messages.pose_from(message.pose.pose)
-        except InputError as error:
-            self.get_logger().warning(f'pose: {error}', throttle_duration_sec=_WARN_PERIOD_S)
-            return
+        T_map_base = messages.pose_from(message.pose.pose)
         self._take(self._matcher.right(messages.stamp_ns(message.header.stamp), T_map_base))
 
     def _on_scan(self, message: LaserScan) -> None:
@@ -133,11 +123,7 @@ class ExplorerNode(Node):
         self._odometer.add(self._T_map_base)
         if self._state != ExplorationStatus.EXPLORING:
             return
-        try:
-            scan = messages.scan_from(message, T_base_laser)
-        except InputError as error:
-            self.get_logger().warning(f'scan: {error}', throttle_duration_sec=_WARN_PERIOD_S)
-            return
+        scan = messages.scan_from(message, T_base_laser)
         patch = self._map.patch if len(self._polygon) < 3 else fenced(self._map.patch, self._polygon)
         self._decision = self._explorer.step(self._topology, patch, scan, self._T_map_base)
         self._publish_end_nodes(self._decision, message)

@@ -10,14 +10,13 @@ from sensor_msgs.msg import LaserScan
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros import warm_up
 from thinmap_ros.adapters import map_files, messages, parameters, qos, runtime
+from thinmap_ros.adapters.listening import listen
 from thinmap_ros.adapters.stamps import StampMatcher
 from thinmap_ros.adapters.transforms import LaserMount
-from thinmap_ros.core.errors import InputError, ThinmapError
+from thinmap_ros.core.errors import ThinmapError
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.pipeline import WindowConfig
-
-_WARN_PERIOD_S = 5.0
 
 
 class GridMapperNode(Node):
@@ -35,8 +34,8 @@ class GridMapperNode(Node):
         self._latest_ns: int | None = None
         self._map = self.create_publisher(OccupancyGridMsg, 'map', qos.LATCHED)
         self._local_map = self.create_publisher(OccupancyGridMsg, 'local_map', qos.LATCHED)
-        self.create_subscription(PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
-        self.create_subscription(LaserScan, 'scan', self._on_scan, qos.SENSOR)
+        listen(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
+        listen(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
         self.create_service(SaveMap, 'save_map', self._on_save)
         self.create_timer(1.0, self._publish_map)
 
@@ -44,11 +43,7 @@ class GridMapperNode(Node):
         self._take(self._matcher.left(messages.stamp_ns(message.header.stamp), message))
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
-        try:
-            T_map_base = messages.pose_from(message.pose.pose)
-        except InputError as error:
-            self.get_logger().warning(f'pose: {error}', throttle_duration_sec=_WARN_PERIOD_S)
-            return
+        T_map_base = messages.pose_from(message.pose.pose)
         self._take(self._matcher.right(messages.stamp_ns(message.header.stamp), T_map_base))
 
     def _take(self, pair: tuple[LaserScan, Array] | None) -> None:
@@ -58,11 +53,7 @@ class GridMapperNode(Node):
         T_base_laser = self._mount.pose(message.header.frame_id)
         if T_base_laser is None:
             return  # the localizer, which gave the pose, knows where the laser is: the transform is on its way
-        try:
-            scan = messages.scan_from(message, T_base_laser)
-        except InputError as error:
-            self.get_logger().warning(f'scan: {error}', throttle_duration_sec=_WARN_PERIOD_S)
-            return
+        scan = messages.scan_from(message, T_base_laser)
         self._grid.update(scan, T_map_base)
         self._latest_ns = scan.stamp_ns
         window = self._grid.window(T_map_base[0], T_map_base[1], self._window_m)

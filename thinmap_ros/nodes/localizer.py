@@ -11,8 +11,8 @@ from tf2_msgs.msg import TFMessage
 from thinmap_msgs.msg import LineFeature, LineFeatureArray, SlamStatus, TopologicalMap
 from thinmap_ros import warm_up
 from thinmap_ros.adapters import messages, parameters, qos, runtime
+from thinmap_ros.adapters.listening import listen
 from thinmap_ros.adapters.transforms import LaserMount
-from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.odometry import ScanPairing
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -39,18 +39,14 @@ class LocalizerNode(Node):
         self._features = self.create_publisher(LineFeatureArray, 'line_features', qos.LATCHED)
         self._status = self.create_publisher(SlamStatus, 'slam_status', qos.STREAM)
         # Before the scans: of messages that wait together, the executor takes the graph of the last scan first.
-        self.create_subscription(TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
-        self.create_subscription(Odometry, 'odom', self._on_odometry, qos.STREAM)
-        self.create_subscription(LaserScan, 'scan', self._on_scan, qos.SENSOR)
-        self.create_subscription(PoseWithCovarianceStamped, 'initialpose', self._on_initial_pose, qos.STREAM)
+        listen(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
+        listen(self, Odometry, 'odom', self._on_odometry, qos.STREAM)
+        listen(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
+        listen(self, PoseWithCovarianceStamped, 'initialpose', self._on_initial_pose, qos.STREAM)
 
     def _on_odometry(self, message: Odometry) -> None:
-        try:
-            stamp_ns = messages.stamp_ns(message.header.stamp)
-            ready = self._pairing.add_odometry(stamp_ns, messages.pose_from(message.pose.pose))
-        except InputError as error:
-            self.get_logger().warning(f'odom: {error}', throttle_duration_sec=_WARN_PERIOD_S)
-            return
+        stamp_ns = messages.stamp_ns(message.header.stamp)
+        ready = self._pairing.add_odometry(stamp_ns, messages.pose_from(message.pose.pose))
         self._take(ready)
 
     def _on_scan(self, message: LaserScan) -> None:
@@ -62,26 +58,14 @@ class LocalizerNode(Node):
                 throttle_duration_sec=_WARN_PERIOD_S,
             )
             return
-        try:
-            scan = messages.scan_from(message, T_base_laser)
-        except InputError as error:
-            self.get_logger().warning(f'scan: {error}', throttle_duration_sec=_WARN_PERIOD_S)
-            return
+        scan = messages.scan_from(message, T_base_laser)
         self._take(self._pairing.add_scan(scan))
 
     def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
-        try:
-            T_map_base = messages.pose_from(message.pose.pose)
-        except InputError as error:
-            self.get_logger().error(f'initialpose: {error}')
-            return
-        self._localizer.set_pose(T_map_base, messages.covariance_from(message))
+        self._localizer.set_pose(messages.pose_from(message.pose.pose), messages.covariance_from(message))
 
     def _on_topology(self, message: TopologicalMap) -> None:
-        try:
-            self._localizer.set_topology(messages.topology_from(message))
-        except InputError as error:
-            self.get_logger().warning(f'topology: {error}', throttle_duration_sec=_WARN_PERIOD_S)
+        self._localizer.set_topology(messages.topology_from(message))
 
     def _take(self, ready: list[tuple[Scan, Array]]) -> None:
         for scan, T_odom_base in ready:

@@ -10,6 +10,7 @@ from thinmap_msgs.action import NavigateToPose
 from thinmap_ros import warm_up
 from thinmap_ros.adapters import messages, parameters, qos, runtime
 from thinmap_ros.adapters.actions import Outcome, SingleGoalServer
+from thinmap_ros.adapters.listening import listen
 from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
@@ -43,11 +44,11 @@ class NavigatorNode(Node):
         self._cancel_asked = False
         self._cmd_vel = self.create_publisher(Twist, 'cmd_vel', qos.STREAM)
         self._plan = self.create_publisher(Path, 'plan', qos.LATCHED)
-        self.create_subscription(Odometry, 'odom', self._on_odometry, qos.STREAM)
-        self.create_subscription(PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
-        self.create_subscription(LaserScan, 'scan', self._on_scan, qos.SENSOR)
-        self.create_subscription(OccupancyGrid, 'map', self._on_map, qos.LATCHED)
-        self.create_subscription(OccupancyGrid, 'local_map', self._on_window, qos.LATCHED)
+        listen(self, Odometry, 'odom', self._on_odometry, qos.STREAM)
+        listen(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
+        listen(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
+        listen(self, OccupancyGrid, 'map', self._on_map, qos.LATCHED)
+        listen(self, OccupancyGrid, 'local_map', self._on_window, qos.LATCHED)
         self._goals = SingleGoalServer(
             self, NavigateToPose, 'navigate_to_pose', self._on_goal, self._on_cancel, _preempted
         )
@@ -58,43 +59,27 @@ class NavigatorNode(Node):
         self._cmd_vel.publish(messages.twist_msg(0.0, 0.0))
 
     def _on_odometry(self, message: Odometry) -> None:
-        try:
-            self._T_odom_base = messages.pose_from(message.pose.pose)
-            self._odometry.add(messages.stamp_ns(message.header.stamp), self._T_odom_base)
-        except InputError as error:
-            self.get_logger().warning(f'odom: {error}', throttle_duration_sec=_WARN_PERIOD_S)
+        self._T_odom_base = messages.pose_from(message.pose.pose)
+        self._odometry.add(messages.stamp_ns(message.header.stamp), self._T_odom_base)
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         T_odom_base = self._odometry.at(messages.stamp_ns(message.header.stamp))
         if T_odom_base is None:
             return
-        try:
-            T_map_base = messages.pose_from(message.pose.pose)
-        except InputError as error:
-            self.get_logger().warning(f'pose: {error}', throttle_duration_sec=_WARN_PERIOD_S)
-            return
+        T_map_base = messages.pose_from(message.pose.pose)
         self._T_map_odom = se2.compose(T_map_base, se2.invert(T_odom_base))
 
     def _on_scan(self, message: LaserScan) -> None:
         T_base_laser = self._mount.pose(message.header.frame_id)
         if T_base_laser is None:
             return
-        try:
-            self._scan = messages.scan_from(message, T_base_laser)
-        except InputError as error:
-            self.get_logger().warning(f'scan: {error}', throttle_duration_sec=_WARN_PERIOD_S)
+        self._scan = messages.scan_from(message, T_base_laser)
 
     def _on_map(self, message: OccupancyGrid) -> None:
-        try:
-            self._map.replace(messages.patch_from(message))
-        except InputError as error:
-            self.get_logger().warning(f'map: {error}', throttle_duration_sec=_WARN_PERIOD_S)
+        self._map.replace(messages.patch_from(message))
 
     def _on_window(self, message: OccupancyGrid) -> None:
-        try:
-            self._map.paste(messages.patch_from(message))
-        except InputError as error:
-            self.get_logger().warning(f'local_map: {error}', throttle_duration_sec=_WARN_PERIOD_S)
+        self._map.paste(messages.patch_from(message))
 
     def _on_goal(self, request: NavigateToPose.Goal) -> None:
         try:

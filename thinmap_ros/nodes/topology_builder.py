@@ -7,13 +7,11 @@ from rclpy.node import Node
 from thinmap_msgs.msg import TopologicalMap
 from thinmap_ros import warm_up
 from thinmap_ros.adapters import messages, parameters, qos, runtime
+from thinmap_ros.adapters.listening import listen
 from thinmap_ros.adapters.stamps import StampMatcher
-from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig
-
-_WARN_PERIOD_S = 5.0
 
 
 class TopologyBuilderNode(Node):
@@ -28,25 +26,17 @@ class TopologyBuilderNode(Node):
         self._matcher: StampMatcher[GridPatch, Array] = StampMatcher()
         self._local = self.create_publisher(TopologicalMap, 'local_topology', qos.LATCHED)
         self._global = self.create_publisher(TopologicalMap, 'topology', qos.LATCHED)
-        self.create_subscription(OccupancyGrid, 'local_map', self._on_window, qos.STREAM)
-        self.create_subscription(PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
+        listen(self, OccupancyGrid, 'local_map', self._on_window, qos.STREAM)
+        listen(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
 
     def _on_window(self, message: OccupancyGrid) -> None:
         stamp_ns = messages.stamp_ns(message.header.stamp)
-        try:
-            pair = self._matcher.left(stamp_ns, messages.patch_from(message))
-        except InputError as error:
-            self.get_logger().warning(f'local_map: {error}', throttle_duration_sec=_WARN_PERIOD_S)
-            return
+        pair = self._matcher.left(stamp_ns, messages.patch_from(message))
         self._take(stamp_ns, pair)
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         stamp_ns = messages.stamp_ns(message.header.stamp)
-        try:
-            pair = self._matcher.right(stamp_ns, messages.pose_from(message.pose.pose))
-        except InputError as error:
-            self.get_logger().warning(f'pose: {error}', throttle_duration_sec=_WARN_PERIOD_S)
-            return
+        pair = self._matcher.right(stamp_ns, messages.pose_from(message.pose.pose))
         self._take(stamp_ns, pair)
 
     def _take(self, stamp_ns: int, pair: tuple[GridPatch, Array] | None) -> None:

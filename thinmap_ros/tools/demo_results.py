@@ -1,15 +1,17 @@
 """What a run of the live graph leaves behind, read back from its bag."""
 
 import json
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from thinmap_ros.adapters import bag_messages, figures, graph_files, map_files, trajectory_files
+from thinmap_ros.adapters import bag_messages, figures, graph_files, map_files, rerun_view, trajectory_files
 from thinmap_ros.adapters.bags import Bag
 from thinmap_ros.adapters.files import write_text
+from thinmap_ros.adapters.view_feed import recording_from_bag
 from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
@@ -68,7 +70,10 @@ def read(path: Path) -> Recording:
 
 
 def write(out: Path, world_file: Path, robot: str, result: dict[str, Any]) -> dict[str, Any]:
-    """Write map, graph, trajectory, picture and report of the run in out/bag; returns the report."""
+    """Write map, graph, trajectory, picture, report and, with rerun, recording of the run in out/bag.
+
+    Returns the report.
+    """
     recording = read(out / 'bag')
     world = World.from_patch(*read_world(world_file))
     start = next(iter(recording.true.values()))
@@ -82,6 +87,10 @@ def write(out: Path, world_file: Path, robot: str, result: dict[str, Any]) -> di
     true = np.array(list(recording.true.values()))
     title = f'{world.name}: {100.0 * report["coverage"]:.1f} % seen, {report["distance"]:.1f} m, {report["time"]:.0f} s'
     figures.summary_figure(out / 'summary.png', patch, recording.topology, estimated, true, title)
+    if rerun_view.is_installed():
+        recording_from_bag(out / 'bag', out / 'recording.rrd')
+    else:
+        print('no recording.rrd: rerun is not installed (pip install "thinmap_ros[viewer]")', file=sys.stderr)
     write_text(out / 'report.json', json.dumps(report, indent=2) + '\n')
     return report
 

@@ -39,7 +39,7 @@ from thinmap_ros.sim.pioneer import PRESETS
 from thinmap_ros.sim.runner import STEP_NS, Moment, Simulation
 from thinmap_ros.sim.world import World
 from thinmap_ros.tools import cli
-from thinmap_ros.tools.report import Ending, EndNodeCensus, exploration_report
+from thinmap_ros.tools.report import Ending, EndNodeCensus, TargetLog, exploration_report
 
 _CONTROL_STEPS = 2
 _MEASURE_SCANS = 5
@@ -77,6 +77,8 @@ class Log:
     poses: list[Array] = field(default_factory=list)
     coverage: list[tuple[float, float]] = field(default_factory=list)
     census: EndNodeCensus = field(default_factory=EndNodeCensus)
+    decision_s: list[float] = field(default_factory=list)
+    targets: TargetLog = field(default_factory=TargetLog)
 
 
 class ClosedLoop:
@@ -118,12 +120,15 @@ class ClosedLoop:
         estimate = self.pipeline.step(scan, T_odom_base).estimate
         self._scan, self._T_map_odom = scan, estimate.T_map_odom
         self._patch = self.pipeline.grid.patch()
+        began = time.perf_counter()
         self.decision = self.strategy.step(self.pipeline.topology.map, self._patch, scan, estimate.T_map_base)
+        self.log.decision_s.append(time.perf_counter() - began)
         self.log.stamps_ns.append(scan.stamp_ns)
         self.log.poses.append(estimate.T_map_base)
         self.log.true_poses.append(self.simulation.robot.T_world_base)
         self.log.census.take([(n.node_id, n.x, n.y) for n in self.decision.end_nodes], estimate.T_map_base)
         target = self.decision.target
+        self.log.targets.take(None if target is None else target.goal)
         if target is None:
             self.navigator.cancel()
             self._goal = None
@@ -158,37 +163,69 @@ def true_pose_source(simulation: Simulation) -> Callable[[Scan, Array], Estimate
     return locate
 
 
-def make_loop(world: World, start: Array, arguments: argparse.Namespace) -> ClosedLoop:
-    """All parts as the arguments (strategy, robot, laser, seed, speed, localization) want them."""
-    robot, laser = PRESETS[arguments.robot], cli.config_from(arguments, Lms200Config)
-    simulation = Simulation(world, start, robot, laser, arguments.seed)
+@dataclass(frozen=True)
+class Options:
+    """What an exploration is run with, beside world and start."""
+
+    strategy: str = 'position_probability'
+    seed: int = 0
+    speed_m_s: float = 0.2
+    localization: str = 'truth'
+    robot: str = '2dx'
+    laser: Lms200Config = field(default_factory=Lms200Config)
+    time_limit_s: float = 20_000.0
+
+
+def make_loop(world: World, start: Array, options: Options) -> ClosedLoop:
+    """All parts as the options want them."""
+    simulation = Simulation(world, start, PRESETS[options.robot], options.laser, options.seed)
     x, y, theta = (float(number) for number in start)
     localizer = LocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=theta)
-    source = true_pose_source(simulation) if arguments.localization == 'truth' else None
+    source = true_pose_source(simulation) if options.localization == 'truth' else None
     # A beam that met nothing has seen as far as this laser can.
-    grid = OccupancyConfig(no_return_range_m=laser.range_max_m)
+    grid = OccupancyConfig(no_return_range_m=options.laser.range_max_m)
     pipeline = Pipeline(PipelineConfig(localizer=localizer, grid=grid, scans_per_graph=_SCANS_PER_GRAPH), source)
-    navigator = Navigator(NavigatorConfig(max_speed_m_s=arguments.speed))
-    return ClosedLoop(simulation, pipeline, STRATEGIES[arguments.strategy](), navigator)
+    navigator = Navigator(NavigatorConfig(max_speed_m_s=options.speed_m_s))
+    return ClosedLoop(simulation, pipeline, STRATEGIES[options.strategy](), navigator)
 
 
-def write_outputs(loop: ClosedLoop, ending: Ending, folder: Path, wall_s: float) -> dict[str, Any]:
-    """Write all files into a folder; returns the report."""
+def nothing_to_show(seconds: float, coverage: float) -> None:
+    """Take the place of a progress bar."""
+
+
+def explore(
+    world: World, start: Array, options: Options, show: Callable[[float, float], None] = nothing_to_show
+) -> tuple[ClosedLoop, dict[str, Any]]:
+    """Explore a world from a start (3,); returns what is left of it and the report."""
+    loop = make_loop(world, start, options)
+    goal = coverable(world, start, PRESETS[options.robot].radius_m, options.laser.range_max_m)
+    began = time.perf_counter()
+    ending = loop.run(goal, options.time_limit_s, show)
+    wall_s = time.perf_counter() - began
+    log = loop.log
+    report = exploration_report(
+        ending, np.array(log.stamps_ns) / 1e9, np.array(log.true_poses), np.array(log.poses), np.array(log.coverage),
+        log.census,
+    )
+    report['target_changes'], report['reversals'] = log.targets.changes, log.targets.reversals
+    milliseconds = 1e3 * np.array(log.decision_s)
+    report['decision_ms'] = {'median': round(float(np.median(milliseconds)), 2), 'max': round(milliseconds.max(), 2)}
+    report['world'], report['strategy'], report['wall_s'] = world.name, options.strategy, round(wall_s, 3)
+    return loop, report
+
+
+def write_outputs(loop: ClosedLoop, report: dict[str, Any], folder: Path) -> None:
+    """Write all files into a folder."""
     log, pipeline = loop.log, loop.pipeline
     patch, topology = pipeline.grid.patch(), pipeline.topology.map
-    poses, true_poses = np.array(log.poses), np.array(log.true_poses)
     folder.mkdir(parents=True, exist_ok=True)
     trajectory_files.write_tum(folder / 'trajectory.tum', log.stamps_ns, log.poses)
     map_files.write_map(folder / 'map', patch)
     graph_files.write_geojson(folder / 'topology.geojson', topology)
-    report = exploration_report(
-        ending, np.array(log.stamps_ns) / 1e9, true_poses, poses, np.array(log.coverage), log.census
-    )
-    report['world'], report['wall_s'] = loop.simulation.world.name, round(wall_s, 3)
     title = f'{report["world"]}: {report["coverage"]:.1%} in {report["time"]:.0f} s, {report["distance"]:.0f} m'
+    poses, true_poses = np.array(log.poses), np.array(log.true_poses)
     figures.summary_figure(folder / 'summary.png', patch, topology, poses, true_poses, title=title)
     write_text(folder / 'report.json', json.dumps(report, indent=2) + '\n')
-    return report
 
 
 def _start(world: World, given: str | None) -> Array:
@@ -205,25 +242,45 @@ def _start(world: World, given: str | None) -> Array:
     return se2.pose(x, y, theta)
 
 
+def options_from(arguments: argparse.Namespace, strategy: str) -> Options:
+    """Options as given on the command line (see add_options), for one strategy."""
+    return Options(
+        strategy=strategy,
+        seed=arguments.seed,
+        speed_m_s=arguments.speed,
+        localization=arguments.localization,
+        robot=arguments.robot,
+        laser=cli.config_from(arguments, Lms200Config),
+        time_limit_s=arguments.time_limit,
+    )
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that every run in a simulated world has."""
+    parser.add_argument('--seed', type=int, default=0, help='decides all noise (default 0)')
+    parser.add_argument('--speed', type=float, default=0.2, help='speed limit, m/s (default 0.2)')
+    parser.add_argument('--localization', default='truth', choices=('truth', 'slam'))
+    parser.add_argument('--robot', default='2dx', choices=sorted(PRESETS))
+    parser.add_argument('--time-limit', type=float, default=20_000.0, help='simulated time to give up at, s')
+    parser.add_argument('--quiet', action='store_true', help='no progress bar')
+    cli.add_config(parser, Lms200Config, ['beams', 'field_of_view_deg', 'range_max_m'])
+
+
 def _work(arguments: argparse.Namespace) -> None:
     world = World.from_patch(*read_world(arguments.world))
-    start = _start(world, arguments.start)
-    loop = make_loop(world, start, arguments)
-    laser = cli.config_from(arguments, Lms200Config)
-    goal = coverable(world, start, PRESETS[arguments.robot].radius_m, laser.range_max_m)
-    began = time.perf_counter()
+    options = options_from(arguments, arguments.strategy)
     with tqdm(total=100, unit='%', disable=arguments.quiet, bar_format='{l_bar}{bar}| {postfix}') as bar:
 
         def show(seconds: float, coverage: float) -> None:
             bar.set_postfix_str(f'{seconds:.0f} s simulated', refresh=False)
             bar.update(100.0 * coverage - bar.n)
 
-        ending = loop.run(goal, arguments.time_limit, show)
-    report = write_outputs(loop, ending, arguments.out, time.perf_counter() - began)
-    how = 'finished' if ending.finished else 'not finished'
+        loop, report = explore(world, _start(world, arguments.start), options, show)
+    write_outputs(loop, report, arguments.out)
+    how = 'finished' if report['finished'] else 'not finished'
     print(
-        f'{arguments.out}: {how} ({ending.reason}), coverage {report["coverage"]:.1%}, {report["distance"]:.1f} m, '
-        f'{report["time"]:.0f} s simulated in {report["wall_s"]:.1f} s, {ending.collisions} collisions'
+        f'{arguments.out}: {how} ({report["reason"]}), coverage {report["coverage"]:.1%}, {report["distance"]:.1f} m, '
+        f'{report["time"]:.0f} s simulated in {report["wall_s"]:.1f} s, {report["collisions"]} collisions'
     )
 
 
@@ -234,13 +291,7 @@ def main() -> None:
     parser.add_argument('-o', '--out', type=Path, required=True, help='folder for the results')
     parser.add_argument('--strategy', default='position_probability', choices=sorted(STRATEGIES))
     parser.add_argument('--start', help="X,Y,THETA in m, m, rad; without it the world's own")
-    parser.add_argument('--seed', type=int, default=0, help='decides all noise (default 0)')
-    parser.add_argument('--speed', type=float, default=0.2, help='speed limit, m/s (default 0.2)')
-    parser.add_argument('--localization', default='truth', choices=('truth', 'slam'))
-    parser.add_argument('--robot', default='2dx', choices=sorted(PRESETS))
-    parser.add_argument('--time-limit', type=float, default=20_000.0, help='simulated time to give up at, s')
-    parser.add_argument('--quiet', action='store_true', help='no progress bar')
-    cli.add_config(parser, Lms200Config, ['beams', 'field_of_view_deg', 'range_max_m'])
+    add_options(parser)
     cli.run(_work, parser)
 
 

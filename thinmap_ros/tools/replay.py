@@ -61,8 +61,9 @@ def write_outputs(result: Replay, folder: Path, title: str, seconds: tuple[float
     pipeline = result.pipeline
     patch, poses = pipeline.grid.patch(), np.array(result.poses)
     folder.mkdir(parents=True, exist_ok=True)
-    for name in ('trajectory.tum', 'trajectory_final.tum'):
-        trajectory_files.write_tum(folder / name, result.stamps_ns, result.poses)
+    trajectory_files.write_tum(folder / 'trajectory.tum', result.stamps_ns, result.poses)
+    final = list(pipeline.localizer.corrected_path())
+    trajectory_files.write_tum(folder / 'trajectory_final.tum', result.stamps_ns, final)
     map_files.write_map(folder / 'map', patch)
     graph_files.write_geojson(folder / 'topology.geojson', pipeline.topology.map)
     figures.summary_figure(folder / 'summary.png', patch, pipeline.topology.map, poses, title=title)

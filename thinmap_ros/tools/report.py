@@ -67,6 +67,25 @@ class EndNodeCensus:
         return self._places[-1]
 
 
+class TargetLog:
+    """How often the target changed, and how often it went back to the one before: oscillation."""
+
+    def __init__(self) -> None:
+        self.changes = self.reversals = 0
+        self._last: list[tuple[float, float]] = []
+
+    def take(self, goal: Array | None) -> None:
+        """Take the goal (x, y, ...), m, of a decision; one less than SAME_PLACE_M from the last is the same."""
+        if goal is None:
+            return
+        at = (float(goal[0]), float(goal[1]))
+        if self._last and math.dist(at, self._last[-1]) <= SAME_PLACE_M:
+            return
+        self.changes += bool(self._last)
+        self.reversals += len(self._last) > 1 and math.dist(at, self._last[-2]) <= SAME_PLACE_M
+        self._last = [*self._last[-1:], at]
+
+
 @dataclass(frozen=True)
 class Ending:
     """How an exploration ended: whether by itself, why, and how often the robot touched something."""
@@ -83,7 +102,8 @@ def exploration_report(
 
     times_s (N,): from the start on; true_poses, estimated_poses (N, 3): at these times, in the same frame; coverage
     (M, 2): time in s and coverage, 0 to 1, whenever it was measured. distance and the times and distances at which a
-    coverage was first measured are of the true path, in m and s; None where it was not reached.
+    coverage was first measured are of the true path, in m and s; None where it was not reached. curve: time, distance
+    and coverage whenever it was measured.
     """
     steps = np.hypot(*np.diff(true_poses[:, :2], axis=0).T)
     along = np.concatenate([[0.0], np.cumsum(steps)])
@@ -106,6 +126,10 @@ def exploration_report(
         'end_nodes_visited': census.visited,
         'pose_rmse': round(float(np.sqrt(np.mean(errors**2))), 5),
         'turned_rad': round(float(np.abs(_turns(true_poses)).sum()), 2),
+        'curve': [
+            [round(float(time), 2), round(float(np.interp(time, times_s, along)), 2), round(float(share), 4)]
+            for time, share in coverage
+        ],
     }
 
 

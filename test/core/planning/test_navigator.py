@@ -156,3 +156,22 @@ def test_it_sets_out_in_free_space_however_often_it_is_asked(dt_s):
     commands = [navigator.step(np.array([2.0, 3.0, 0.0]), patch, scan, dt_s) for _ in range(100)]
     assert all(command.state == 'driving' for command in commands)
     assert commands[-1].v == pytest.approx(0.2)
+
+
+def test_it_remembers_what_is_beside_it_where_the_laser_does_not_look():
+    navigator, patch = Navigator(), GridPatch(GridFrame(0.0, 0.0, 0.1), room())
+
+    def look(pose, ranges, stamp):
+        scan = Scan.create(stamp, ranges, -math.pi / 2, math.pi / 180, 0.02, 8.0)
+        navigator.step(np.array(pose), patch, scan, DT)
+        return navigator._points_map
+
+    ahead = np.full(181, np.inf)
+    ahead[90] = 0.5
+    assert np.allclose(look((2.0, 3.0, 0.0), ahead, 0), [[2.5, 3.0]], atol=1e-6)
+    # Turned away from it: it is still there; looked at again and gone: it is forgotten.
+    assert np.allclose(look((2.0, 3.0, 2.5), np.full(181, np.inf), 1), [[2.5, 3.0]], atol=1e-6)
+    assert len(look((2.0, 3.0, 0.5), np.full(181, np.inf), 2)) == 0
+    # What is left behind is forgotten too.
+    look((2.0, 3.0, 0.0), ahead, 3)
+    assert len(look((3.6, 3.0, 0.0), np.full(181, np.inf), 4)) == 0

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from slam_room import ROOM, drive, scan_in
+from slam_room import BLIND, ROOM, drive, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam.association import AssociationConfig, associate, mahalanobis
@@ -17,7 +17,6 @@ from thinmap_ros.core.slam.lines import LineConfig, Lines, extract_lines
 
 R = np.diag([0.02**2, 0.01**2])
 SURE = 1e-8 * np.eye(3)
-BLIND = scan_in(np.array([[1e3, -1.0, 1e3, 1.0]]), np.zeros(3))  # a scan that says nothing about what is gone
 
 
 def seen_lines(*walls):

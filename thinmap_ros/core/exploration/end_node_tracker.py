@@ -55,7 +55,10 @@ class TrackerConfig(Config):
 
 @dataclass
 class Track:
-    """An end node and its evidence: place (x, y) m, where the evidence began, and the looks that counted."""
+    """An end node and its evidence: place (x, y) m, where the evidence began, and the looks that counted.
+
+    angle_span_deg: largest difference between the bearings of these looks.
+    """
 
     node_id: int
     x: float
@@ -64,6 +67,7 @@ class Track:
     probability: float = PRIOR
     distances_m: list[float] = field(default_factory=list)
     bearings_rad: list[float] = field(default_factory=list)
+    angle_span_deg: float = 0.0
     last_seen_from: tuple[float, float] | None = None
     closed: bool = False
 
@@ -71,11 +75,6 @@ class Track:
     def smallest_distance_m(self) -> float:
         """Nearest place of the looks that counted, m; inf before the first."""
         return min(self.distances_m, default=math.inf)
-
-    @property
-    def angle_span_deg(self) -> float:
-        """Largest difference between the bearings of the looks that counted, degrees."""
-        return angle_difference(np.array(self.bearings_rad)) if self.bearings_rad else 0.0
 
     @property
     def distance_index(self) -> float:
@@ -90,7 +89,7 @@ class Track:
     def forget(self) -> None:
         """Begin anew at the present place."""
         self.began_at, self.probability, self.last_seen_from, self.closed = (self.x, self.y), PRIOR, None, False
-        self.distances_m, self.bearings_rad = [], []
+        self.distances_m, self.bearings_rad, self.angle_span_deg = [], [], 0.0
 
 
 class EndNodeTracker:
@@ -165,6 +164,7 @@ class EndNodeTracker:
         track.last_seen_from = (float(T_map_laser[0]), float(T_map_laser[1]))
         track.distances_m.append(math.dist((track.x, track.y), track.last_seen_from))
         track.bearings_rad.append(_bearing(track, T_map_laser))
+        track.angle_span_deg = angle_difference(np.array(track.bearings_rad))
         value = reliability(nearest_distance(np.array(track.distances_m)), track.angle_span_deg)
         if self.config.mode == 'open_border' and is_open:
             value = min(value, _NEUTRAL)

@@ -23,10 +23,12 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.config import parameter
 from thinmap_ros.core.exploration.end_node_tracker import EndNodeTracker, Track, TrackerConfig
 from thinmap_ros.core.exploration.open_borders import OpenBorders
+from thinmap_ros.core.exploration.tour import tours_by_first
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.planning.graph_search import access, costs_from
+from thinmap_ros.core.planning.grid_search import WayTable
 from thinmap_ros.core.planning.wavefront import nearest_true, places_in_reach
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -42,7 +44,10 @@ _ESCAPE_M = 0.6
 _NEAR_HEADING_RAD = 0.35
 _STEADY_RAD = 0.6
 _TRIES = 3
+_SURVEY_AGAIN_S = 0.4
+_COARSE_M, _FORGET_S = 0.2, 20.0
 _PAUSE_S = 5.0
+_FADE = 10.0
 
 
 class FinishCode(IntEnum):
@@ -59,11 +64,15 @@ class ExplorerConfig(TrackerConfig):
 
     threshold: float = parameter(0.9, 'an end node as probable as this needs no visit', low=0.5, high=0.999)
     robot_radius_m: float = parameter(0.25, 'radius of the robot, m', low=0.0, high=5.0)
-    shortest_border_m: float = parameter(0.4, 'a shorter border is a missing beam, m', low=0.0, high=5.0)
+    small_border_m: float = parameter(1.5, 'behind a shorter border not much is expected, m', low=0.0, high=50.0)
+    wait_weight: float = parameter(0.15, 'cost of a metre until a target is reached, m', low=0.0, high=10.0)
+    small_wait_weight: float = parameter(0.5, 'the same, for one with a small border', low=0.0, high=10.0)
+    wait_m: float = parameter(30.0, 'a target farther off than this along the tour waits no more, m', low=0.0, high=1e3)
+    shortest_border_m: float = parameter(0.5, 'a shorter border is a missing beam, m', low=0.0, high=5.0)
     attach_m: float = parameter(3.0, 'a border belongs to an end node in sight within this, m', low=0.1, high=50.0)
     close_look_m: float = parameter(2.0, 'unknown in plain sight this near stays unknown, m', low=0.0, high=50.0)
     turn_cost_m_rad: float = parameter(0.2, 'path length that a turn by one radian costs, m', low=0.0, high=10.0)
-    switch_share: float = parameter(0.6, 'another target must cost less than this share', low=0.0, high=1.0)
+    switch_m: float = parameter(2.0, 'another target must save this much of the way, m', low=0.0, high=100.0)
     retry_s: float = parameter(60.0, 'a target that failed is tried again after this time, s', low=0.0, high=1e5)
     survey_s: float = parameter(1.0, 'borders are assigned anew after this time, s', low=0.0, high=60.0)
     behind_m: float = parameter(2.0, 'depth of unknown space expected behind a border, m', low=0.0, high=50.0)
@@ -127,7 +136,7 @@ class _Survey:
 class _Failure:
     at: tuple[float, float]
     stamp_ns: int
-    times: int = 1
+    times: int = 0
 
 
 @dataclass
@@ -138,7 +147,7 @@ class _Memory:
     target_at: tuple[float, float] = (math.inf, math.inf)
     goal: Array = field(default_factory=lambda: np.full(3, np.inf))
     first_choice_made: bool = False
-    failed: dict[int, _Failure] = field(default_factory=dict)
+    failed: list[_Failure] = field(default_factory=list)
     visited: dict[int, tuple[float, float]] = field(default_factory=dict)
     at_goal: int = 0
     nothing_left: int = 0
@@ -153,6 +162,8 @@ class Explorer:
         self.tracker = EndNodeTracker(self.config)
         self.borders = OpenBorders(self.config.shortest_border_m)
         self._stand_ins = EndNodeTracker(self.config)
+        self._reached = self.borders.mask
+        self._ways = WayTable(_COARSE_M, _FORGET_S)
         self._memory = _Memory()
         self._stamp_ns = 0
         self._last_survey = _Survey(self.borders.frame, 0, [])
@@ -181,9 +192,11 @@ class Explorer:
         track = None if target is None else self._track(target)
         if target is None or track is None:
             return
-        earlier = self._memory.failed.get(target)
-        times = 1 if earlier is None else earlier.times + 1
-        self._memory.failed[target] = _Failure((track.x, track.y), self._stamp_ns, times)
+        failure = self._failure_of(track)
+        if failure is None:
+            failure = _Failure((track.x, track.y), self._stamp_ns)
+            self._memory.failed.append(failure)
+        failure.times, failure.stamp_ns = failure.times + 1, self._stamp_ns
         self._memory.target = None
 
     # What there is to choose from.
@@ -195,7 +208,8 @@ class Explorer:
         last = self._last_survey
         if last.frame == self.borders.frame and self._stamp_ns - last.stamp_ns < self.config.survey_s * 1e9:
             left = [c for c in map(self._still_open, last.candidates) if c is not None]
-            if any(c.track.node_id == self._memory.target for c in left):
+            hasty = self._stamp_ns - last.stamp_ns < _SURVEY_AGAIN_S * 1e9
+            if any(c.track.node_id == self._memory.target for c in left) or (hasty and left):
                 return left
         self._last_survey = _Survey(self.borders.frame, self._stamp_ns, self._survey(T_map_base))
         return self._last_survey.candidates
@@ -212,7 +226,7 @@ class Explorer:
     def _survey(self, T_map_base: Array) -> list[_Candidate]:
         """End nodes with their borders, and stand-ins for the borders that no end node sees."""
         cells, numbers, _ = self.borders.stretches()
-        reached = self._reachable(T_map_base)
+        self._reached = reached = self._reachable(T_map_base)
         owners = self._owners(cells, reached)
         candidates = []
         for node_id, track in self.tracker.tracks.items():
@@ -225,7 +239,6 @@ class Explorer:
         """What is remembered of a node goes with it when it gets another id."""
         memory = self._memory
         memory.target = renamed.get(memory.target or 0, memory.target)
-        memory.failed = {renamed.get(i, i): failure for i, failure in memory.failed.items()}
         memory.visited = {renamed.get(i, i): place for i, place in memory.visited.items()}
 
     def _owners(self, cells: Cells, reached: NDArray[np.bool_]) -> Cells:
@@ -337,18 +350,15 @@ class Explorer:
 
     def _choose(self, topology: TopologicalMap, worth: dict[int, _Candidate], T_map_base: Array) -> int | None:
         memory = self._memory
-        self._forget_failures(worth)
-        open_to_try = {i: c for i, c in worth.items() if i not in memory.failed}
-        if not open_to_try:
-            open_to_try = {i: c for i, c in worth.items() if self._may_retry(memory.failed[i])}
-        waits = any(memory.failed[i].times < _TRIES for i in worth if i in memory.failed)
+        open_to_try = self._to_try(worth)
+        waits = any(failure.times < _TRIES for failure in map(self._failure_of_candidate, worth.values()) if failure)
         memory.nothing_left = 0 if open_to_try or waits else memory.nothing_left + 1
         if not open_to_try:
             memory.target = None
             return None
         if memory.target in open_to_try and self._last_survey.stamp_ns != self._stamp_ns:
             return self._go_for(open_to_try[memory.target])  # costs are weighed anew once a survey
-        costs = self._costs(topology, open_to_try, T_map_base)
+        costs = (self._tours if self.config.mode == 'open_border' else self._costs)(topology, open_to_try, T_map_base)
         if not memory.first_choice_made:
             memory.first_choice_made = True
             faced = min(open_to_try, key=lambda i: _turn_to(T_map_base, open_to_try[i].goal))
@@ -356,13 +366,39 @@ class Explorer:
         best = min(costs, key=lambda i: costs[i])
         if memory.target not in costs:
             memory.target = self._successor(open_to_try)
-        if memory.target is None or costs[best] < self.config.switch_share * costs[memory.target] - _CHANGED_MARGIN_M:
+        if memory.target is None or costs[best] < costs[memory.target] - self.config.switch_m:
             memory.target = best
         return self._go_for(open_to_try[memory.target])
 
-    def _may_retry(self, failure: _Failure) -> bool:
-        """Before the end, whatever failed is tried again, each time after a pause: a door may be free by then."""
-        return failure.times < _TRIES and self._stamp_ns - failure.stamp_ns > _PAUSE_S * 1e9
+    def _to_try(self, worth: dict[int, _Candidate]) -> dict[int, _Candidate]:
+        """Candidates at whose places nothing failed, or a while ago; else, before the end, those that failed least.
+
+        The latter after a pause: a door may be free by then. What failed too often is tried no more, unless so much
+        else is left to do that the failure fades from memory.
+        """
+        failures = {i: self._failure_of_candidate(candidate) for i, candidate in worth.items()}
+
+        def left(pause_s: float) -> dict[int, _Candidate]:
+            now, open_to_try = self._stamp_ns, {}
+            for i, failure in failures.items():
+                if failure is None or (failure.times < _TRIES and now - failure.stamp_ns > pause_s * 1e9):
+                    open_to_try[i] = worth[i]
+            return open_to_try
+
+        first = left(self.config.retry_s)
+        if not first:
+            return left(_PAUSE_S)
+        fade_ns = _FADE * self.config.retry_s * 1e9
+        self._memory.failed = [f for f in self._memory.failed if self._stamp_ns - f.stamp_ns < fade_ns]
+        return first
+
+    def _failure_of_candidate(self, candidate: _Candidate) -> _Failure | None:
+        return self._failure_of(candidate.track)
+
+    def _failure_of(self, track: Track) -> _Failure | None:
+        """What failed at about the place of a track; ids of nodes come and go, places stay."""
+        near = min(self._memory.failed, key=lambda f: math.dist(f.at, (track.x, track.y)), default=None)
+        return near if near and math.dist(near.at, (track.x, track.y)) <= _CHANGED_MARGIN_M else None
 
     def _go_for(self, chosen: _Candidate) -> int:
         """Make a candidate the target; its goal stays where it was for as long as it is about the same."""
@@ -379,16 +415,6 @@ class Explorer:
         within = math.dist(at, (near.track.x, near.track.y)) <= _SUCCESSOR_M
         return near.track.node_id if within else None
 
-    def _forget_failures(self, worth: dict[int, _Candidate]) -> None:
-        """A failure counts for retry_s, and only while the node stays where it was."""
-        memory = self._memory
-        for node_id, failure in list(memory.failed.items()):
-            track = self._track(node_id)
-            gone = node_id not in worth or track is None
-            moved = track is not None and math.dist((track.x, track.y), failure.at) > _CHANGED_MARGIN_M
-            if gone or moved or self._stamp_ns - failure.stamp_ns > self.config.retry_s * 1e9:
-                del memory.failed[node_id]
-
     def _costs(self, topology: TopologicalMap, worth: dict[int, _Candidate], T_map_base: Array) -> dict[int, float]:
         """Path cost to each candidate's goal, m: along the graph, and the first turn."""
         x, y = float(T_map_base[0]), float(T_map_base[1])
@@ -403,6 +429,20 @@ class Explorer:
             turn = _turn_to(T_map_base, candidate.goal) if straight > _NEAR_VISIT_M else 0.0
             costs[node_id] = (_DETOUR * straight if way is None else way) + self.config.turn_cost_m_rad * turn
         return costs
+
+    def _tours(self, topology: TopologicalMap, worth: dict[int, _Candidate], T_map_base: Array) -> dict[int, float]:
+        """Length of the tour through all that is left, m, by what comes first; a turn on the spot counts as well."""
+        ids = list(worth)
+        points = np.array([*(worth[i].goal[:2] for i in ids), T_map_base[:2]])
+        table = self._ways.update(self._reached, self._last_survey.frame, points, self._stamp_ns)
+        straight = np.hypot(*(points[:, None] - points[None]).transpose(2, 0, 1))
+        table = np.maximum(np.where(np.isfinite(table), table, _DETOUR * straight), straight)
+        turns = np.array([_turn_to(T_map_base, worth[i].goal) for i in ids]) * (straight[-1, :-1] > _NEAR_VISIT_M)
+        first = table[-1, :-1] + self.config.turn_cost_m_rad * turns
+        lengths = np.array([len(worth[i].cells) * self.borders.frame.resolution for i in ids])
+        small = lengths < self.config.small_border_m
+        weights = np.where(small, self.config.small_wait_weight, self.config.wait_weight)
+        return dict(zip(ids, tours_by_first(first, table[:-1, :-1], weights, self.config.wait_m).tolist(), strict=True))
 
     def _way_to(self, topology: TopologicalMap, goal: tuple[float, float], to_nodes: dict[int, float]) -> float | None:
         joins = access(topology, *goal)
@@ -425,7 +465,7 @@ class Explorer:
         tracks = [*self.tracker.tracks.values(), *self._stand_ins.tracks.values()]
         goals = {} if target is None else {target: self._memory.goal}
         end_nodes = [_end_node(t, by_id.get(t.node_id), goals.get(t.node_id), resolution) for t in tracks]
-        unreachable = sorted(self._memory.failed)
+        unreachable = sorted(i for i, candidate in worth.items() if self._failure_of_candidate(candidate))
         finished = self._memory.nothing_left >= 3
         code, reason = _verdict(finished, unreachable, len(worth))
         known = float(np.count_nonzero(self.borders.free)) * resolution**2

@@ -11,36 +11,65 @@ from numpy.typing import NDArray
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.se2 import Array
 
-_ROUNDS = 20
+Places = NDArray[np.int64]
+_ROUNDS = 10
 
 
-def tours_by_first(from_start: Array, between: Array) -> Array:
-    """Length of a short open tour through all N places for each of them that could come first, (N,).
+def tours_by_first(from_start: Array, between: Array, wait_weights: Array, wait_m: float) -> Array:
+    """Cost of a good open tour through all N places for each of them that could come first, (N,).
 
-    from_start (N,): way from the robot to each place; between (N, N): ways between them, symmetric; all finite.
+    The cost is the tour's length, and for each place its weight times the way until it is reached, at most wait_m: what
+    lies near is better done now, since what comes to light on the way may change the tour.
+    from_start (N,): way from the robot to each place; between (N, N): ways between them, symmetric; all finite;
+    wait_weights (N,).
     """
-    return np.asarray(_tours_by_first(np.ascontiguousarray(from_start), np.ascontiguousarray(between)))
-
-
-@kernel
-def _tours_by_first(from_start: Array, between: Array) -> Array:
+    from_start, between = np.ascontiguousarray(from_start), np.ascontiguousarray(between)
     count = from_start.size
-    lengths = np.empty(count)
-    order = np.empty(count, dtype=np.int64)
-    for first in range(count):
-        _nearest_next(order, first, between)
-        for _ in range(_ROUNDS):
-            if not (_turn_pieces(order, between) or _move_places(order, between)):
-                break
-        length = from_start[first]
-        for k in range(1, count):
-            length += between[order[k - 1], order[k]]
-        lengths[first] = length
-    return lengths
+    return np.array([_best_tour(from_start, between, first, wait_weights, wait_m) for first in range(count)])
 
 
 @kernel
-def _nearest_next(order: NDArray[np.int64], first: int, between: Array) -> None:
+def _cost(order: Places, from_start: Array, between: Array, weights: Array, most: float) -> float:
+    along = from_start[order[0]]
+    waits = weights[order[0]] * min(along, most)
+    for k in range(1, order.size):
+        along += between[order[k - 1], order[k]]
+        waits += weights[order[k]] * min(along, most)
+    return float(along + waits)
+
+
+@kernel
+def _best_tour(from_start: Array, between: Array, first: int, weights: Array, most: float) -> float:
+    """Begin with the nearest next, always; then turn pieces and move places as long as that helps."""
+    count = from_start.size
+    order = np.empty(count, dtype=np.int64)
+    _nearest_next(order, first, between)
+    best = _cost(order, from_start, between, weights, most)
+    for _ in range(_ROUNDS):
+        before = best
+        for i in range(1, count):
+            for j in range(1, count):
+                tried = order.copy()
+                if i < j:
+                    tried[i : j + 1] = order[i : j + 1][::-1]
+                elif i > j:
+                    tried[j], tried[j + 1 : i + 1] = order[i], order[j:i]
+                cost = _cost(tried, from_start, between, weights, most)
+                if cost < best - 1e-9:
+                    best, order = cost, tried
+                if i < j:
+                    tried = order.copy()
+                    tried[j], tried[i:j] = order[i], order[i + 1 : j + 1]
+                    cost = _cost(tried, from_start, between, weights, most)
+                    if cost < best - 1e-9:
+                        best, order = cost, tried
+        if best >= before:
+            break
+    return best
+
+
+@kernel
+def _nearest_next(order: Places, first: int, between: Array) -> None:
     """Begin with one place and go on to the nearest that is left, always."""
     count = order.size
     left = np.ones(count, dtype=np.bool_)
@@ -51,48 +80,3 @@ def _nearest_next(order: NDArray[np.int64], first: int, between: Array) -> None:
             if left[i] and (best < 0 or between[order[k - 1], i] < between[order[k - 1], best]):
                 best = i
         order[k], left[best] = best, False
-
-
-@kernel
-def _turn_pieces(order: NDArray[np.int64], between: Array) -> bool:
-    """2-opt: turn pieces round where that shortens the tour; the first place stays."""
-    count, better = order.size, False
-    for i in range(1, count - 1):
-        for j in range(i + 1, count):
-            gain = between[order[i - 1], order[i]] - between[order[i - 1], order[j]]
-            if j + 1 < count:
-                gain += between[order[j], order[j + 1]] - between[order[i], order[j + 1]]
-            if gain > 1e-9:
-                order[i : j + 1] = order[i : j + 1][::-1].copy()
-                better = True
-    return better
-
-
-@kernel
-def _move_places(order: NDArray[np.int64], between: Array) -> bool:
-    """Move single places to where they are less of a detour; the first place stays."""
-    count, better = order.size, False
-    for i in range(1, count):
-        place = order[i]
-        saved = between[order[i - 1], place]
-        if i + 1 < count:
-            saved += between[place, order[i + 1]] - between[order[i - 1], order[i + 1]]
-        best, at = saved - 1e-9, -1
-        for j in range(count):
-            if j == i or j == i - 1:
-                continue
-            added = between[order[j], place]
-            if j + 1 < count:
-                added += between[place, order[j + 1]] - between[order[j], order[j + 1]]
-            if added < best:
-                best, at = added, j
-        if at >= 0:
-            # order[at] is the place after which it goes.
-            if at > i:
-                order[i:at] = order[i + 1 : at + 1].copy()
-                order[at] = place
-            else:
-                order[at + 2 : i + 1] = order[at + 1 : i].copy()
-                order[at + 1] = place
-            better = True
-    return better

@@ -8,11 +8,13 @@ transformations in digital images", 1986.
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.se2 import Array
 
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.int64]
+Key = tuple[int, int]
 _STRAIGHT, _DIAGONAL, _BUCKETS = 5, 7, 8
 _FAR = 2**31 - 1
 
@@ -31,7 +33,45 @@ def coarse(allowed: Mask, factor: int) -> Mask:
     rows, cols = (-(-size // factor) for size in allowed.shape)
     whole = np.zeros((rows * factor, cols * factor), dtype=np.bool_)
     whole[: allowed.shape[0], : allowed.shape[1]] = allowed
-    return np.asarray(whole.reshape(rows, factor, cols, factor).any(axis=(1, 3)))
+    result = np.zeros((rows, cols), dtype=np.bool_)
+    for row in range(factor):
+        for col in range(factor):
+            result |= whole[row::factor, col::factor]
+    return result
+
+
+class WayTable:
+    """Ways between places of a map that grows, on a coarse grid, remembered for a while: most places stay."""
+
+    def __init__(self, cell_m: float, forget_s: float) -> None:
+        self._cell_m = cell_m
+        self._forget_ns = forget_s * 1e9
+        self._known: dict[frozenset[Key], tuple[int, float]] = {}
+
+    def update(self, allowed: Mask, frame: GridFrame, places: Array, stamp_ns: int) -> Array:
+        """Lengths of the ways, m, between all places (N, 2), m, over the allowed cells (H, W) of a frame, (N, N).
+
+        inf where there is none.
+        """
+        factor = max(1, round(self._cell_m / frame.resolution))
+        # Squares on a lattice that stays when the frame grows.
+        shift = [round(origin / frame.resolution) % factor for origin in (frame.origin_y, frame.origin_x)]
+        ways = coarse(np.pad(allowed, ((shift[0], 0), (shift[1], 0))), factor)
+        cells = (frame.cells_of(places) + shift) // factor
+        first = (round(frame.origin_y / frame.resolution) // factor, round(frame.origin_x / frame.resolution) // factor)
+        keys = [(int(row), int(col)) for row, col in cells + first]
+        pairs = {frozenset((a, b)) for i, a in enumerate(keys) for b in keys[:i]}
+        self._known = {
+            pair: known for pair, known in self._known.items()
+            if pair in pairs and stamp_ns - known[0] < self._forget_ns
+        }
+        for i, key in enumerate(keys):
+            missing = [j for j in range(i) if keys[j] != key and frozenset((key, keys[j])) not in self._known]
+            if missing:
+                found = ways_from(ways, (int(cells[i, 0]), int(cells[i, 1])), cells[missing])
+                for j, way in zip(missing, (found * frame.resolution * factor).tolist(), strict=True):
+                    self._known[frozenset((key, keys[j]))] = (stamp_ns, way)
+        return np.array([[0.0 if a == b else self._known[frozenset((a, b))][1] for b in keys] for a in keys])
 
 
 @kernel

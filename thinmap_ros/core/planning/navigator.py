@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import parameter
@@ -19,6 +20,7 @@ _CREEP_M_S = 0.02
 _ROUNDING_M_S = 1e-9
 _AIM_RAD = 0.1
 _OVERLAY_M = 2.5
+_REMEMBERED_M = 1.0
 # A goal that does not get this much nearer between so many standstills is given up.
 _PROGRESS_M = 0.5
 _STANDSTILLS = 5
@@ -100,9 +102,16 @@ class Navigator:
         return self._drive(T_map_base, dt_s)
 
     def _look(self, T_map_base: Array, scan: Scan | None) -> None:
+        """Take a new scan's points; of earlier ones those stay that are near, where this scan does not look.
+
+        A laser that looks ahead only does not see the corner any more round which the robot is turning.
+        """
         if scan is not None and scan is not self._scan:
             self._scan = scan
-            self._points_map = se2.transform_points(T_map_base, scan.points_base())
+            near = np.square(self._points_map - T_map_base[:2]).sum(axis=1) < _REMEMBERED_M**2
+            hidden = self._points_map[near]
+            hidden = hidden[~_in_view(scan, se2.compose(T_map_base, scan.T_base_laser), hidden)]
+            self._points_map = np.concatenate([se2.transform_points(T_map_base, scan.points_base()), hidden])
 
     def _arrive(self, T_map_base: Array, dt_s: float) -> Command:
         self._remaining_m = 0.0
@@ -233,3 +242,11 @@ class Navigator:
         limit = np.minimum(radius, distances[0] - 0.005)
         blocked = (distances < limit).any(axis=1)
         return float(steps[max(int(blocked.argmax()) - 1, 0)]) if blocked.any() else length_m
+
+
+def _in_view(scan: Scan, T_map_laser: Array, points_map: Array) -> NDArray[np.bool_]:
+    """Which points (N, 2) lie between the first and the last beam of a scan, (N,)."""
+    last = scan.angle_min_rad + scan.angle_increment_rad * (scan.ranges_m.size - 1)
+    dx, dy = (points_map - T_map_laser[:2]).T
+    off = se2.wrap(np.arctan2(dy, dx) - T_map_laser[2] - 0.5 * (scan.angle_min_rad + last))
+    return np.asarray(np.abs(off) <= 0.5 * abs(last - scan.angle_min_rad))

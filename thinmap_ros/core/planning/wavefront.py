@@ -21,7 +21,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.config import TopologyConfig
-from thinmap_ros.core.topology.free_space import known_free
+from thinmap_ros.core.topology.free_space import column_distance, known_free, standing_room
 
 Mask = NDArray[np.bool_]
 _ESCAPE_COST = 10.0
@@ -89,7 +89,7 @@ def distance_from(solid: Mask) -> Array:
 
 def standing_places(free: Mask, radius_m: float, resolution: float) -> Mask:
     """Cells (H, W) in which the centre of a robot of a radius may be; all that is not free counts as solid."""
-    return np.asarray(distance_from(~free) * resolution >= radius_m - _HAIR_M)
+    return standing_room(column_distance(free), radius_m / resolution)
 
 
 def places_in_reach(free: Mask, frame: GridFrame, xy: tuple[float, float], radius_m: float, escape_m: float) -> Mask:

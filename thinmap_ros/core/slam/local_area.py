@@ -34,13 +34,17 @@ class LocalArea:
         self._listed_at: Array = np.full(2, np.inf)
 
     def set_topology(self, topology: TopologicalMap) -> None:
-        """Take the topological map in use from now on. It is only read, and may be changed by its owner."""
-        if topology is self._topology or not topology.nodes:
+        """Take the topological map in use from now on: a newer state of the same map, or the map itself, changed.
+
+        Either way features at nodes that are no more are handed on when nodes are listed next.
+        """
+        if not topology.nodes:
             return
-        before = self._topology
+        before, trail = self._topology, self._trail
         self._topology, self._trail = topology, None
-        self._hand_over({i: before.nodes[i].position for i in self._features_at if i in before.nodes})
-        self._listed_at = np.full(2, np.inf)
+        if trail is not None:
+            self._hand_over({i: before.nodes[i].position for i in self._features_at})
+            self._listed_at = np.full(2, np.inf)
 
     def nodes_of(self, feature_id: int) -> list[int]:
         """Ids of the nodes at which a feature is stored."""

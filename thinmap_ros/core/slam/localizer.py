@@ -14,6 +14,7 @@ from thinmap_ros.core.slam.ekf_ti import CompressedEkf
 from thinmap_ros.core.slam.feature_map import FeatureConfig, FeatureMap
 from thinmap_ros.core.slam.features import LineFeature
 from thinmap_ros.core.slam.lines import LineConfig, Lines, extract_lines, no_lines
+from thinmap_ros.core.slam.loops import LoopConfig, Loops
 from thinmap_ros.core.slam.models import MotionConfig, odometry_covariance, rotation
 from thinmap_ros.core.slam.scan_matching import Match, MatchConfig, ScanMatcher
 from thinmap_ros.core.topology.graph import TopologicalMap
@@ -22,11 +23,12 @@ _START_SIGMAS = (1e-4, 1e-4, 1e-4)  # the map begins where the robot stands: no 
 _LONGEST_STEP_M = 5.0  # between two scans the wheels cannot go farther: the odometry was set anew
 _NEW_GROUND = 0.3  # where less of a scan than this lies on what is known, there is nothing to contradict
 _NEW_GROUND_M, _NEW_GROUND_RAD = 0.6, 0.6  # and that is so only this far from where the map last learned
+_LEAP_M, _LEAP_RAD = 0.4, 0.4  # a scan puts the robot this far from where the wheels did: one of them is wrong
 _LOST_SIGMA_M = 1.0  # a robot in doubt by more than this does not know where it is
 
 
 @dataclass(frozen=True)
-class LocalizerConfig(MotionConfig, MatchConfig, LineConfig, FeatureConfig):
+class LocalizerConfig(MotionConfig, MatchConfig, LineConfig, FeatureConfig, LoopConfig):
     """Parameters of the localizer and of its parts.
 
     slam: ti runs the filter over the line features of the local area, and full, for the same estimate, over all; off
@@ -85,6 +87,9 @@ class Localizer:
         self._filter = CompressedEkf(start, np.diag(np.square(_START_SIGMAS)))
         self._feature_map = FeatureMap(self.config, local_areas=self.config.slam == 'ti')
         self._matcher = ScanMatcher(self.config)
+        self._loops = Loops(self.config, self.config)
+        # Of every step, which keyframe came before it, and the pose.
+        self._path: list[tuple[int, Array]] = []
         self._T_odom_base: Array | None = None
         self._T_last_look: Array | None = None
         # What has been added to the doubt of the pose since a scan last fitted the map.
@@ -120,6 +125,7 @@ class Localizer:
         """Take in a scan with the odometry pose (3,) at its stamp."""
         increment, increment_covariance = self._odometry(T_odom_base)
         points_base, laser_base = self._seen(scan)
+        expected = se2.compose(self._ekf.pose, increment)
         match = self._predict(points_base, laser_base, increment, increment_covariance)
         lines, matched = no_lines(), 0
         if self._has_news() and not self._is_lost():
@@ -129,8 +135,22 @@ class Localizer:
                 points_map = se2.transform_points(self._ekf.pose, points_base)
                 self._matcher.add(points_map, laser_map)
                 self._T_last_look = self._ekf.pose
+                self._loops.follow(scan, points_base, self._ekf.pose, _is_leap(expected, self._ekf.pose))
         self._filter.work_off()
+        self._loops.work_off()
+        self._path.append((len(self._loops.keyframes) - 1, self._ekf.pose))
         return self._estimate(match, lines, matched)
+
+    def corrected_path(self) -> Array:
+        """Poses (N, 3) of all steps since the beginning, as they look now, after all corrections."""
+        live = np.array([f.T_map_base for f in self._loops.keyframes]).reshape(-1, 3)
+        relaxed = self._loops.relaxed()
+        path = [T if k < 0 else se2.compose(relaxed[k], se2.between(live[k], T)) for k, T in self._path]
+        return np.array(path).reshape(-1, 3)
+
+    def corrected_scans(self) -> list[tuple[Scan, Array]]:
+        """The scans that were kept, each with its pose (3,) after all corrections: what a map can be drawn from."""
+        return [(f.scan, T) for f, T in zip(self._loops.keyframes, self._loops.relaxed(), strict=True)]
 
     def _odometry(self, T_odom_base: Array) -> tuple[Array, Array]:
         """Input u of eq. (10): the increment (3,) since the last scan, and its covariance (3, 3)."""
@@ -218,3 +238,8 @@ class Localizer:
             match.fit,
             self._is_lost(),
         )
+
+
+def _is_leap(expected: Array, found: Array) -> bool:
+    off = se2.between(expected, found)
+    return math.hypot(off[0], off[1]) > _LEAP_M or abs(float(off[2])) > _LEAP_RAD

@@ -1,0 +1,115 @@
+"""Every strategy that ours is compared with: each finishes a small world by itself, and chooses as it says."""
+
+import math
+
+import numpy as np
+import pytest
+
+from thinmap_ros.baselines.exploration import (
+    DistanceAdvantage,
+    ExploreLite,
+    FrontierExplorer,
+    InformationGain,
+    NearestFrontier,
+)
+from thinmap_ros.baselines.frontiers import Frontier
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.sim.world import World
+from thinmap_ros.tools.explore_world import STRATEGIES, Options, explore
+
+START = np.array([1.0, 1.0, 0.0])
+
+
+def two_rooms() -> World:
+    cells = np.zeros((60, 90), dtype=np.uint8)
+    cells[[0, -1]], cells[:, [0, -1]] = 1, 1
+    cells[:25, 40:42], cells[35:, 40:42], cells[40:42, 60:] = 1, 1, 1
+    return World('two_rooms', cells, GridFrame(0.0, 0.0, 0.1), START)
+
+
+@pytest.mark.parametrize('strategy', sorted(set(STRATEGIES) - {'paper'}))
+def test_each_strategy_sees_all_stops_by_itself_and_touches_nothing(strategy: str) -> None:
+    _, report = explore(two_rooms(), START, Options(strategy=strategy, speed_m_s=0.5, time_limit_s=600.0))
+    assert report['finished']
+    assert report['coverage'] >= 0.99
+    assert report['collisions'] == 0
+    assert report['end_nodes_seen'] >= report['end_nodes_visited']
+
+
+def test_the_literal_scheme_stops_by_itself() -> None:
+    _, report = explore(two_rooms(), START, Options(strategy='paper', speed_m_s=0.5, time_limit_s=600.0))
+    assert report['finished']
+    assert report['collisions'] == 0
+
+
+def after_a_look(strategy: FrontierExplorer, cells: np.ndarray, pose: np.ndarray) -> list[Frontier]:
+    """Frontiers of a map as the strategy sees them from a pose."""
+    scan = Scan.create(0, np.full(181, np.nan), -math.pi / 2, math.pi / 180, 0.05, 8.0)
+    strategy.map.update(GridPatch(GridFrame(0.0, 0.0, 0.1), cells.astype(np.int8)), scan, pose)
+    return strategy.map.find(pose)
+
+
+def corridor() -> np.ndarray:
+    """A corridor of 16 m, open at both ends, with a wide opening to the right half of its upper side."""
+    cells = np.full((80, 160), -1)
+    cells[30:50] = 0
+    cells[29], cells[50, :120], cells[50:60, 120:150] = 100, 100, 0
+    return cells
+
+
+POSE = np.array([4.0, 4.0, 0.0])
+
+
+def choice(strategy: FrontierExplorer) -> np.ndarray:
+    frontiers = after_a_look(strategy, corridor(), POSE)
+    assert len(frontiers) >= 2
+    return np.asarray(frontiers[int(np.argmin(strategy.costs(frontiers, POSE)))].middle)
+
+
+def test_the_nearest_frontier_is_the_one_at_the_near_end() -> None:
+    assert choice(NearestFrontier())[0] < 1.0
+
+
+def test_explore_lite_and_information_gain_go_for_more_where_it_is_not_much_farther() -> None:
+    near_the_middle = np.array([7.5, 4.0, 0.0])
+    lite = ExploreLite()
+    frontiers = after_a_look(lite, corridor(), near_the_middle)
+    sizes = np.array([len(frontier.cells) for frontier in frontiers])
+    equal = np.array([frontier.way_m for frontier in frontiers])
+    costs = lite.costs(frontiers, near_the_middle)
+    assert costs[sizes.argmax()] < costs[sizes.argmin()] + 0.3 * np.ptp(equal)
+    gain = InformationGain()
+    frontiers = after_a_look(gain, corridor(), near_the_middle)
+    values = -gain.costs(frontiers, near_the_middle)
+    assert (values > 0.0).all()
+
+
+def test_the_advantage_of_a_frontier_grows_with_the_way_back_to_it() -> None:
+    strategy = DistanceAdvantage()
+    frontiers = after_a_look(strategy, corridor(), POSE)
+    ways = np.array([frontier.way_m for frontier in frontiers])
+    costs = strategy.costs(frontiers, POSE)
+    assert (costs < ways).all()
+    nearest_end = int(ways.argmin())
+    assert costs.argmin() == nearest_end
+
+
+def test_a_target_that_fails_is_left_for_later_and_the_end_says_so() -> None:
+    strategy, pose = NearestFrontier(), POSE
+    scan = Scan.create(0, np.full(181, np.nan), -math.pi / 2, math.pi / 180, 0.05, 8.0)
+    patch = GridPatch(GridFrame(0.0, 0.0, 0.1), corridor().astype(np.int8))
+    topology = explore(two_rooms(), START, Options(time_limit_s=1.0))[0].pipeline.topology.map
+    tried = []
+    for i in range(40):
+        decision = strategy.step(topology, patch, Scan.create(i * 10**9, scan.ranges_m, -1.57, 0.0174, 0.05, 8.0), pose)
+        if decision.finished:
+            break
+        if decision.target is not None:
+            tried.append(round(decision.target.x))
+            strategy.fail_target('no way')
+    assert decision.finished
+    assert decision.reason == 'what is left cannot be reached'
+    assert tried[0] != tried[1]
+    assert len(tried) >= 3 * len(set(tried))

@@ -1,0 +1,87 @@
+"""Lengths of ways over the grid, against Dijkstra's algorithm as it is in the books."""
+
+import heapq
+import math
+
+import numpy as np
+import pytest
+
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.planning.grid_search import WayTable, coarse, ways_from
+
+
+def dijkstra(allowed, start):
+    steps = {start: 0}
+    queue = [(0, start)]
+    while queue:
+        now, (row, col) = heapq.heappop(queue)
+        if now > steps[row, col]:
+            continue
+        for dr, dc in [(dr, dc) for dr in (-1, 0, 1) for dc in (-1, 0, 1) if dr or dc]:
+            r, c = row + dr, col + dc
+            inside = 0 <= r < allowed.shape[0] and 0 <= c < allowed.shape[1]
+            if inside and allowed[r, c] and allowed[r, col] and allowed[row, c]:
+                reached = now + (7 if dr and dc else 5)
+                if reached < steps.get((r, c), math.inf):
+                    steps[r, c] = reached
+                    heapq.heappush(queue, (reached, (r, c)))
+    return steps
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_ways_are_those_of_dijkstra(seed):
+    rng = np.random.default_rng(seed)
+    allowed = rng.random((40, 50)) < 0.75
+    allowed[20, 20] = True
+    goals = np.argwhere(np.ones_like(allowed))
+    expected = dijkstra(allowed, (20, 20))
+    found = ways_from(allowed, (20, 20), goals)
+    assert found.tolist() == [expected.get((r, c), math.inf) / 5 for r, c in goals.tolist()]
+
+
+def test_few_goals_give_what_all_give_and_places_outside_cannot_be_reached():
+    allowed = np.random.default_rng(9).random((30, 30)) < 0.8
+    allowed[3, 3] = True
+    everywhere = np.argwhere(np.ones_like(allowed))
+    whole = ways_from(allowed, (3, 3), everywhere)
+    for i in (0, 77, 450, 899):
+        assert ways_from(allowed, (3, 3), everywhere[[i]])[0] == whole[i]
+    assert ways_from(allowed, (3, 3), np.array([[-1, 3], [3, 30]])).tolist() == [math.inf, math.inf]
+
+
+def test_ways_are_at_most_a_twelfth_longer_than_straight_ones():
+    goals = np.argwhere(np.ones((60, 60), dtype=np.bool_))[1:]
+    ratio = ways_from(np.ones((60, 60), dtype=np.bool_), (0, 0), goals) / np.hypot(*goals.T)
+    assert ratio.min() > 0.98
+    assert ratio.max() < 1.0 + 1.0 / 12.0
+
+
+def test_a_coarse_square_is_set_where_any_of_its_cells_is():
+    mask = np.zeros((5, 7), dtype=np.bool_)
+    mask[4, 6] = mask[1, 2] = True
+    assert np.argwhere(coarse(mask, 2)).tolist() == [[0, 1], [2, 3]]
+
+
+def test_a_table_of_ways_stays_true_while_the_map_grows_to_all_sides():
+    table = WayTable(0.2, 1e9)
+    frame, allowed = GridFrame(0.3, -0.5, 0.1), np.ones((60, 80), dtype=np.bool_)
+    allowed[28:33, :70] = False
+    places = np.array([[1.05, 1.05], [1.05, 4.05], [7.05, 1.05], [7.95, 4.95]])
+    first = table.update(allowed, frame, places, 0)
+    assert np.allclose(first, first.T)
+    assert first[0, 1] > 12.0
+    grown = np.pad(allowed, ((3, 5), (7, 2)))
+    fresh = WayTable(0.2, 1e9).update(grown, frame.shifted(-3, -7), places, 0)
+    assert np.allclose(table.update(grown, frame.shifted(-3, -7), places, 5), first)
+    assert np.abs(fresh - first).max() < 0.7
+
+
+def test_a_way_is_found_anew_once_it_is_old():
+    table = WayTable(0.2, 10.0)
+    allowed, frame = np.ones((60, 60), dtype=np.bool_), GridFrame(0.0, 0.0, 0.1)
+    allowed[28:33, 4:] = False
+    places = np.array([[5.0, 1.0], [5.0, 5.0]])
+    before = table.update(allowed, frame, places, 0)[0, 1]
+    allowed[:] = True
+    assert table.update(allowed, frame, places, 5_000_000_000)[0, 1] == before
+    assert table.update(allowed, frame, places, 15_000_000_000)[0, 1] == pytest.approx(4.0, abs=0.3)

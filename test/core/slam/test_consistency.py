@@ -1,0 +1,93 @@
+"""Consistency: the errors of the pose are as large as the filter says, step by step, over many runs."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+from slam_room import BLIND
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.slam.ekf_ti import CompressedEkf
+from thinmap_ros.core.slam.feature_map import FeatureConfig, FeatureMap
+from thinmap_ros.core.slam.lines import Lines
+from thinmap_ros.core.slam.models import MotionConfig, observe_line, odometry_covariance
+
+FEATURES = FeatureConfig()
+# What wheels leave open after scan matching.
+MOTION = MotionConfig(
+    odom_distance_sigma=0.02, odom_turn_sigma=0.03, odom_drift_sigma=0.01, odom_slip_m=0.002, odom_slip_rad=0.002
+)
+SEEN = np.diag([0.01**2, 0.005**2])
+WALL = np.diag(np.square([FEATURES.wall_sigma_m, FEATURES.wall_sigma_rad]))
+RANGE_M = 8.0
+
+
+def floor():
+    """Two rows of rooms along a corridor of 40 m: walls as end points (N, 2, 2)."""
+    walls = [[[0.0, y], [40.0, y]] for y in (0.0, 10.0)]
+    for x in np.arange(0.0, 41.0, 5.0):
+        walls += [[[x, 0.0], [x, 4.0]], [[x, 6.0], [x, 10.0]]]
+    for x in np.arange(0.0, 40.0, 5.0):
+        walls += [[[x + 0.2, y], [x + 3.5, y]] for y in (4.0, 6.0)]
+    return np.array(walls)
+
+
+WALLS = floor()
+NORMALS = np.column_stack([-(WALLS[:, 1] - WALLS[:, 0])[:, 1], (WALLS[:, 1] - WALLS[:, 0])[:, 0]])
+NORMALS = NORMALS / np.hypot(*NORMALS.T)[:, None]
+TRUE_LINES = np.column_stack([(NORMALS * WALLS[:, 0]).sum(axis=1), np.arctan2(NORMALS[:, 1], NORMALS[:, 0])])
+
+
+def look(rng, truth):
+    """Noisy lines of the walls whose middle is in range and ahead."""
+    middles = WALLS.mean(axis=1)
+    # Of long walls, the part beside the robot.
+    middles[:2, 0] = truth[0]
+    off = se2.transform_points(se2.invert(truth), middles)
+    seen = np.flatnonzero((np.hypot(*off.T) < RANGE_M) & (off[:, 0] > -0.5))
+    z = np.array([observe_line(truth, TRUE_LINES[i])[0] for i in seen]).reshape(-1, 2)
+    seen, z = seen[z[:, 0] > 0.3], z[z[:, 0] > 0.3]
+    z = z + rng.multivariate_normal([0.0, 0.0], SEEN + WALL, len(z))
+    ends = np.array([se2.transform_points(se2.invert(truth), WALLS[i]) for i in seen]).reshape(-1, 2, 2)
+    return Lines(z, np.tile(SEEN, (len(z), 1, 1)), ends)
+
+
+def nees_of_a_run(seed, local_areas, looks):
+    """Squared error of the pose, in sigmas, at each look of a drive up and down the corridor."""
+    rng = np.random.default_rng(seed)
+    truth = np.array([2.0, 5.0, 0.0])
+    ekf, features, found = CompressedEkf(truth, 1e-8 * np.eye(3)), FeatureMap(FEATURES, local_areas), []
+    for step in range(looks):
+        turning = step % 120 >= 110
+        increment = np.array([0.0 if turning else 0.3, 0.0, math.pi / 10.0 if turning else 0.0])
+        truth = se2.compose(truth, increment)
+        Q = odometry_covariance(increment, MOTION)
+        measured = increment + rng.multivariate_normal(np.zeros(3), Q)
+        ekf.local.predict(se2.compose(ekf.local.pose, measured), measured, Q)
+        features.observe(ekf, look(rng, truth), BLIND)
+        ekf.work_off()
+        error = ekf.local.pose - truth
+        error[2] = se2.wrap(float(error[2]))
+        found.append(error @ np.linalg.solve(ekf.local.pose_covariance, error))
+    return found
+
+
+def share_inside(runs, looks, local_areas):
+    nees = np.mean([nees_of_a_run(seed, local_areas, looks) for seed in range(runs)], axis=0)
+    low, high = chi2.ppf([0.025, 0.975], 3 * runs) / runs
+    return float(np.mean((nees >= low) & (nees <= high))), float(nees.mean())
+
+
+@pytest.mark.parametrize('local_areas', [True, False])
+def test_the_errors_are_as_large_as_the_filter_says(local_areas):
+    inside, mean = share_inside(8, 120, local_areas)
+    assert inside >= 0.85
+    assert 2.0 < mean < 4.2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('local_areas', [True, False])
+def test_fifty_runs_stay_inside_the_band_of_95_percent(local_areas):
+    inside, _ = share_inside(50, 240, local_areas)
+    assert inside >= 0.9

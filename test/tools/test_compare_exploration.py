@@ -1,0 +1,93 @@
+"""Strategies x worlds x starts into one table: resumable, paired, and the same on a cluster."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from thinmap_ros.tools.comparison import markdown, saved
+
+ROOT = Path(__file__).resolve().parents[2]
+WORLD = {
+    'resolution': 0.05, 'wall_thickness': 0.1, 'start': [1.0, 1.0, 0.0],
+    'walls': [[[0, 0], [4, 0], [4, 3], [0, 3], [0, 0]], [[2.2, 0], [2.2, 1.6]]],
+}
+
+
+def report(strategy: str, world: str, start: int, distance: float) -> dict[str, object]:
+    return {
+        'strategy': strategy, 'world': world, 'start_number': start, 'distance': distance, 'time': 2.0 * distance,
+        'turned_rad': 5.0, 'coverage': 0.995, 'finished': True, 'collisions': 0, 'end_nodes_seen': 4,
+        'end_nodes_visited': 1, 'wall_s': 1.0,
+    }
+
+
+def test_savings_are_paired_by_world_and_start() -> None:
+    ours = {('a', 0): report('x', 'a', 0, 50.0), ('a', 1): report('x', 'a', 1, 90.0)}
+    ours['b', 0] = report('x', 'b', 0, 1.0)
+    others = {('a', 0): report('y', 'a', 0, 100.0), ('a', 1): report('y', 'a', 1, 100.0)}
+    assert saved(ours, others, 'distance').tolist() == pytest.approx([-0.5, -0.1])
+
+
+def test_the_table_has_a_row_for_each_strategy_and_says_what_ours_saves() -> None:
+    reports = [report('position_probability', 'a', i, 80.0) for i in range(3)]
+    reports += [report('nearest_frontier', 'a', i, 100.0) for i in range(3)]
+    table = markdown(reports)
+    assert '| nearest_frontier | 3 | 3 | 99.50% | 99.50% | 0 | 100.0 ± 0.0 |' in table
+    assert '| nearest_frontier | 3 | -20.0% ± 0.0% | -20.0% ± 0.0% | +0.0% ± 0.0% | 3 |' in table
+
+
+def compare(*words: str) -> 'subprocess.CompletedProcess[str]':
+    command = [sys.executable, '-m', 'thinmap_ros.tools.compare_exploration', *words, '--quiet']
+    environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
+    return subprocess.run(command, capture_output=True, text=True, timeout=170, env=environment, cwd=ROOT, check=False)
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Path:
+    path = tmp_path / 'worlds' / 'closet.yaml'
+    path.parent.mkdir()
+    path.write_text(yaml.safe_dump(WORLD))
+    return path
+
+
+def test_it_runs_all_writes_all_and_goes_on_where_it_was(world: Path, tmp_path: Path) -> None:
+    out = tmp_path / 'out'
+    words = [str(world), '-o', str(out), '--processes', '1', '--strategies', 'position_probability', 'nearest_frontier']
+    result = compare(*words)
+    assert result.returncode == 0, result.stderr
+    assert (out / 'coverage.png').stat().st_size > 0
+    assert (out / 'table.md').read_text() in result.stdout
+    files = sorted((out / 'runs').rglob('report.json'))
+    assert len(files) == 2
+    # What is there is not run again: the table is made of it.
+    changed = json.loads(files[0].read_text()) | {'distance': 1234.5}
+    files[0].write_text(json.dumps(changed))
+    stamp = files[1].stat().st_mtime_ns
+    files[1].unlink()
+    again = compare(*words)
+    assert '1234.5' in again.stdout
+    assert files[1].stat().st_mtime_ns > stamp
+
+
+def test_a_world_without_start_is_told_in_one_line(world: Path, tmp_path: Path) -> None:
+    result = compare(str(tmp_path / 'nowhere.yaml'), '-o', str(tmp_path / 'out'))
+    assert result.returncode == 2
+    assert result.stderr.count('\n') == 1
+
+
+def test_a_cluster_gives_what_one_machine_gives(world: Path, tmp_path: Path) -> None:
+    distributed = pytest.importorskip('distributed')
+    words = [str(world), '--strategies', 'nearest_frontier']
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
+        there = compare(*words, '-o', str(tmp_path / 'there'), '--scheduler', cluster.scheduler_address)
+    assert there.returncode == 0, there.stderr
+    assert compare(*words, '-o', str(tmp_path / 'here'), '--processes', '1').returncode == 0
+    reports = [json.loads(next((tmp_path / name).rglob('report.json')).read_text()) for name in ('there', 'here')]
+    for one in reports:
+        del one['wall_s'], one['decision_ms']
+    assert reports[0] == reports[1]

@@ -1,0 +1,6 @@
+"""Colours of pictures and views: Okabe and Ito's, told apart by everyone."""
+
+from thinmap_ros.core.topology.graph import NodeKind
+
+NODES = {NodeKind.END: '#D55E00', NodeKind.BRANCH: '#0072B2', NodeKind.CORNER: '#E69F00'}
+EDGE, ESTIMATE, TRUTH = '#009E73', '#CC79A7', '#56B4E9'

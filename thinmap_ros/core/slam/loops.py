@@ -1,0 +1,159 @@
+"""Loops: coming back by another way, noticed, verified, and what it means for the whole path.
+
+Along the path a scan is kept now and then. Where the path has been near before, it is matched with the scans kept
+there; only what fits well counts. What the localizer says of neighbours on the path, and the matches of the others,
+make a graph of poses that is relaxed. A keyframe costs its scan, its pose and a few measurements in memory, and a few
+matches in time, one a step. Source: Lu and Milios, "Globally consistent range scan alignment for environment mapping",
+1997; for the graph see pose_graph.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.pose_graph import Measured, relax
+from thinmap_ros.core.slam.scan_matching import Match, MatchConfig, ScanMatcher
+
+_AROUND = 4  # keyframes to either side that make a submap
+_AGAIN_M = 8.0  # so much way lies between leaving a place and coming back to it
+_VISITS = 3  # earlier visits to a place with which a scan is matched
+_TURN_M_RAD = 1.0  # a radian of turn makes two scans as different as so many metres
+# Bounds of the error of a step from one keyframe to the next, in m and in rad.
+_STEP_M, _STEP_RAD = (0.002, 0.02), (0.0002, 0.02)
+_LEAP_SIGMAS = (0.1, 0.1, 0.05)  # the same where wheels and walls contradicted each other
+_MATCH_SIGMAS = (0.04, 0.04, 0.02)  # matches err together, by more than each says of itself
+_PRIOR_SIGMAS = (0.3, 0.3, 0.15)
+_LEAST_OVERLAP, _LEAST_FIT = 0.5, 0.85
+
+
+@dataclass(frozen=True)
+class LoopConfig(Config):
+    """Parameters of keyframes and loops."""
+
+    keyframe_m: float = parameter(0.7, 'a scan is kept after so much way, m', low=0.1, high=10.0)
+    keyframe_rad: float = parameter(0.7, 'or after such a turn, rad', low=0.1, high=3.2)
+    loop_reach_m: float = parameter(2.0, 'places nearer than this are matched, m', low=0.1, high=20.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframe:
+    """A scan that was kept, its points (N, 2) in the robot frame, the pose (3,) then, and the way up to there."""
+
+    scan: Scan
+    points_base: Array
+    T_map_base: Array
+    way_m: float
+
+
+class Loops:
+    """The kept scans and the graph of their poses."""
+
+    def __init__(self, config: LoopConfig, matching: MatchConfig) -> None:
+        self.keyframes: list[Keyframe] = []
+        self.matched: list[Measured] = []
+        self._steps: list[Array] = []  # from each keyframe to the next, as the localizer saw it
+        self._leaps: set[int] = set()  # of these, those where wheels and walls contradict each other
+        self._config, self._matching = config, matching
+        self._jobs: deque[tuple[int, int]] = deque()
+        self._leapt = False
+
+    def follow(self, scan: Scan, points_base: Array, T_map_base: Array, leapt: bool) -> None:
+        """Take in a scan that fits the map at a pose (3,), with its points (N, 2).
+
+        leapt: whether the pose is not where the wheels said, so that one of them is wrong.
+        """
+        self._leapt |= leapt
+        way = self._way_to(T_map_base)
+        if way is None:
+            return
+        k = len(self.keyframes)
+        self.keyframes.append(Keyframe(scan, points_base, T_map_base, way))
+        if k > 0:
+            self._steps.append(se2.between(self.keyframes[k - 1].T_map_base, T_map_base))
+            if self._leapt:
+                self._leaps.add(k - 1)
+                self._jobs.append((k - 1, k))
+            self._jobs.extend((j, k) for j in self._earlier_visits(k))
+        self._leapt = False
+
+    def work_off(self) -> None:
+        """Do one of the matches that are due; to be called once a step."""
+        if self._jobs:
+            j, k = self._jobs.popleft()
+            match = self._match(j, k)
+            if match.overlap >= _LEAST_OVERLAP and match.fit >= _LEAST_FIT:
+                covariance = match.covariance + np.diag(np.square(_MATCH_SIGMAS))
+                self.matched.append(Measured(j, k, match.T_map_base, np.linalg.inv(covariance), True))
+
+    def relaxed(self) -> Array:
+        """Poses (N, 3) of the keyframes that agree best with all measurements."""
+        while self._jobs:
+            self.work_off()
+        poses = np.array([k.T_map_base for k in self.keyframes]).reshape(-1, 3)
+        usual, leap = (np.diag(1.0 / np.square(sigmas)) for sigmas in (self._step_sigmas(poses), _LEAP_SIGMAS))
+        steps = [
+            Measured(k, k + 1, step, leap if k in self._leaps else usual, False) for k, step in enumerate(self._steps)
+        ]
+        return relax(poses, steps + self.matched)
+
+    def _step_sigmas(self, poses: Array) -> Array:
+        """How much a step adds to the drift, (3,), as told by what loops find after many steps.
+
+        A localizer that holds on to its map adds next to nothing. To believe in more would let small errors of the
+        matches bend a path that is straight.
+        """
+        found = [(_off(poses, m), m.b - m.a) for m in self.matched if m.b - m.a > 1]
+        squared = np.array([np.square(off) / number for off, number in found]).reshape(-1, 3)
+        if len(squared) == 0:
+            return np.array([_STEP_M[0], _STEP_M[0], _STEP_RAD[0]])
+        along = float(np.clip(math.sqrt(0.5 * np.median(squared[:, 0] + squared[:, 1])), *_STEP_M))
+        return np.array([along, along, np.clip(math.sqrt(np.median(squared[:, 2])), *_STEP_RAD)])
+
+    def _way_to(self, T_map_base: Array) -> float | None:
+        """Length of the path up to a pose; None where it is too near to the last keyframe to be one."""
+        if not self.keyframes:
+            return 0.0
+        last = self.keyframes[-1]
+        moved = se2.between(last.T_map_base, T_map_base)
+        distance = math.hypot(moved[0], moved[1])
+        if distance < self._config.keyframe_m and abs(float(moved[2])) < self._config.keyframe_rad:
+            return None
+        return last.way_m + distance
+
+    def _earlier_visits(self, k: int) -> list[int]:
+        """The keyframe most like this one of each of the earlier visits to the place, the likest first."""
+        here = self.keyframes[k]
+        poses, ways = np.array([f.T_map_base for f in self.keyframes]), np.array([f.way_m for f in self.keyframes])
+        distances = np.hypot(*(poses[:, :2] - here.T_map_base[:2]).T)
+        unlike = distances + _TURN_M_RAD * np.abs(se2.wrap(poses[:, 2] - here.T_map_base[2]))
+        unlike[(distances > self._config.loop_reach_m) | (ways > here.way_m - _AGAIN_M)] = np.inf
+        found: list[int] = []
+        while len(found) < _VISITS and np.isfinite(unlike).any():
+            found.append(int(unlike.argmin()))
+            unlike[np.abs(ways - ways[found[-1]]) < _AGAIN_M] = np.inf
+        return found
+
+    def _match(self, j: int, k: int) -> Match:
+        """Keyframe k matched with j and those around it, in the frame of j."""
+        matcher = ScanMatcher(self._matching)
+        base, here = self.keyframes[j].T_map_base, self.keyframes[k]
+        for frame in self.keyframes[max(0, j - _AROUND) : min(j + _AROUND + 1, k)]:
+            T = se2.between(base, frame.T_map_base)
+            laser = se2.transform_points(T, frame.scan.T_base_laser[None, :2])[0]
+            matcher.add(se2.transform_points(T, frame.points_base), laser)
+        prior = se2.between(base, here.T_map_base)
+        return matcher.match(
+            here.points_base, np.ascontiguousarray(here.scan.T_base_laser[:2]), prior, np.diag(np.square(_PRIOR_SIGMAS))
+        )
+
+
+def _off(poses: Array, measured: Measured) -> Array:
+    """What a match says of two poses less what the poses (N, 3) say themselves, (3,)."""
+    off = measured.T_a_b - se2.between(poses[measured.a], poses[measured.b])
+    return np.array([off[0], off[1], se2.wrap(float(off[2]))])

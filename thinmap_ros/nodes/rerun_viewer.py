@@ -1,0 +1,85 @@
+"""Everything that the graph says about the map and the robot, shown in rerun and written to an .rrd file."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from nav_msgs.msg import OccupancyGrid, Odometry
+from nav_msgs.msg import Path as PathMsg
+from rclpy.node import Node
+from sensor_msgs.msg import LaserScan
+
+from thinmap_msgs.msg import EndNodeArray, ExplorationStatus, LineFeatureArray, SlamStatus, TopologicalMap
+from thinmap_ros.adapters import parameters, qos, runtime
+from thinmap_ros.adapters.rerun_view import NullView, View
+from thinmap_ros.adapters.transforms import LaserMount
+from thinmap_ros.adapters.view_feed import Feed
+from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.errors import InputError
+
+_WARN_PERIOD_S = 5.0
+_TOPICS = {
+    'map': (OccupancyGrid, qos.LATCHED),
+    'scan': (LaserScan, qos.SENSOR),
+    'pose': (PoseWithCovarianceStamped, qos.STREAM),
+    'odom': (Odometry, qos.STREAM),
+    'ground_truth': (PoseStamped, qos.STREAM),
+    'topology': (TopologicalMap, qos.LATCHED),
+    'end_nodes': (EndNodeArray, qos.LATCHED),
+    'line_features': (LineFeatureArray, qos.LATCHED),
+    'plan': (PathMsg, qos.LATCHED),
+    'exploration_status': (ExplorationStatus, qos.LATCHED),
+    'slam_status': (SlamStatus, qos.STREAM),
+}
+
+
+@dataclass(frozen=True)
+class RerunViewerConfig(Config):
+    """Parameters of the viewer."""
+
+    recording: str = parameter('', 'file to write (.rrd); empty: none')
+    spawn: bool = parameter(True, 'open the viewer')
+
+
+class RerunViewerNode(Node):
+    """/map, /scan, /pose, /odom, /ground_truth, /topology, ... in; a picture out."""
+
+    def __init__(self) -> None:
+        super().__init__('rerun_viewer')
+        config = parameters.declare(self, RerunViewerConfig)
+        mount = LaserMount(self)
+        parameters.check_unknown(self)
+        self._view = self._open(config)
+        self._feed = Feed(self._view, mount.pose)
+        for topic, (kind, profile) in _TOPICS.items():
+            self.create_subscription(kind, topic, self._takes(topic), profile)
+
+    def close(self) -> None:
+        """Finish the recording."""
+        self._view.close()
+
+    def _open(self, config: RerunViewerConfig) -> NullView:
+        if config.recording or config.spawn:
+            return View(Path(config.recording) if config.recording else None, config.spawn)
+        self.get_logger().warning('neither recording nor spawn is set: nothing is shown')
+        return NullView()
+
+    def _takes(self, topic: str) -> Callable[[Any], None]:
+        def take(message: Any) -> None:
+            try:
+                self._feed.take(topic, message)
+            except InputError as error:
+                self.get_logger().warning(f'{topic}: {error}', throttle_duration_sec=_WARN_PERIOD_S)
+
+        return take
+
+
+def main() -> None:
+    """Run the node."""
+    runtime.run(RerunViewerNode)
+
+
+if __name__ == '__main__':
+    main()

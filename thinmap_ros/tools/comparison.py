@@ -1,0 +1,69 @@
+"""Reports of many explorations, paired by world and start, as one table."""
+
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+
+from thinmap_ros.core.se2 import Array
+
+Report = dict[str, Any]
+OURS = 'position_probability'
+_NORMAL_95 = 1.96
+
+
+def markdown(reports: list[Report]) -> str:
+    """Tables of means (and spread over runs) by strategy, and of what ours saves, run by run."""
+    by_strategy: dict[str, dict[tuple[str, int], Report]] = defaultdict(dict)
+    for report in reports:
+        by_strategy[report['strategy']][report['world'], report['start_number']] = report
+    lines = [
+        '| strategy | runs | stopped | coverage least | coverage mean | collisions | distance m | time s | turned rad '
+        '| end nodes visited / seen | x real time |',
+        '|---|---|---|---|---|---|---|---|---|---|---|',
+    ]
+    lines += [_row(name, list(runs.values())) for name, runs in sorted(by_strategy.items())]
+    others = sorted(set(by_strategy) - {OURS})
+    if OURS in by_strategy and others:
+        lines += [
+            '', f'{OURS} against each, paired by world and start (mean, 95 % interval; in how many it is shorter):',
+            '', '| against | pairs | distance | time | turns | shorter in |', '|---|---|---|---|---|---|',
+        ]
+        lines += [_paired(name, by_strategy[OURS], by_strategy[name]) for name in others]
+    return '\n'.join(lines) + '\n'
+
+
+def saved(ours: dict[tuple[str, int], Report], others: dict[tuple[str, int], Report], key: str) -> Array:
+    """Ours / other - 1 of a quantity for each world and start that both have, (N,)."""
+    common = sorted(ours.keys() & others.keys())
+    return np.array([ours[pair][key] / others[pair][key] - 1.0 for pair in common])
+
+
+def _row(name: str, runs: list[Report]) -> str:
+    coverage = [run['coverage'] for run in runs]
+    speed = sum(run['time'] for run in runs) / max(sum(run['wall_s'] for run in runs), 1e-9)
+    visited, seen = (sum(run[key] for run in runs) for key in ('end_nodes_visited', 'end_nodes_seen'))
+    return (
+        f'| {name} | {len(runs)} | {sum(run["finished"] for run in runs)} | {min(coverage):.2%} '
+        f'| {np.mean(coverage):.2%} | {sum(run["collisions"] for run in runs)} | {_spread(runs, "distance")} '
+        f'| {_spread(runs, "time")} | {_spread(runs, "turned_rad")} | {visited} / {seen} | {speed:.0f} |'
+    )
+
+
+def _spread(runs: list[Report], key: str) -> str:
+    """Mean of a quantity, and the mean over worlds of its standard deviation over starts."""
+    by_world: dict[str, list[float]] = defaultdict(list)
+    for run in runs:
+        by_world[run['world']].append(run[key])
+    spread = np.mean([np.std(values) for values in by_world.values()])
+    return f'{np.mean([run[key] for run in runs]):.1f} ± {spread:.1f}'
+
+
+def _paired(name: str, ours: dict[tuple[str, int], Report], others: dict[tuple[str, int], Report]) -> str:
+    shares = {key: saved(ours, others, key) for key in ('distance', 'time', 'turned_rad')}
+    cells = []
+    for values in shares.values():
+        half = _NORMAL_95 * values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
+        cells.append(f'{values.mean():+.1%} ± {half:.1%}' if len(values) else '')
+    distances = shares['distance']
+    return f'| {name} | {len(distances)} | ' + ' | '.join(cells) + f' | {int((distances < 0.0).sum())} |'
