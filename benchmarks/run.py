@@ -9,7 +9,7 @@ from benchmarks.table import Row, show
 from benchmarks.worlds import WORLDS
 
 _ALL: dict[str, Callable[[Path, bool], list[Row]]] = {
-    'thinning': lambda worlds, quick: thinning.run(quick),
+    'thinning': thinning.run,
     'mapping': mapping.run,
     'graphs': graphs.run,
     'online': online.run,

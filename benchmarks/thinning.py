@@ -1,5 +1,7 @@
 """Thinning against scikit-image, OpenCV, a copy of the mask and a distance transform, in one run."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -7,27 +9,18 @@ from skimage.morphology import skeletonize
 
 from benchmarks.table import Row, at_least, at_most
 from benchmarks.timing import best_seconds
+from benchmarks.worlds import floors
 from thinmap_ros.core.topology.thinning import thin
 
 Mask = NDArray[np.bool_]
 _FASTER = {400: (20.0, 40.0), 1000: (50.0, 100.0), 4000: (50.0, 100.0)}
 
 
-def floor_like(side: int, seed: int = 0) -> Mask:
-    """Free space of a made-up building: rooms of 3 to 12 m with doors, 10 cm a cell, and bumps on the walls."""
-    rng = np.random.default_rng(seed)
-    free = np.ones((side, side), dtype=np.bool_)
-    for axis in (0, 1):
-        at = 0
-        while at < side:
-            wall = free[at : at + 3] if axis == 0 else free[:, at : at + 3].T
-            wall[:] = False
-            for door in rng.integers(0, side, max(side // 60, 1)):
-                wall[:, door : door + 10] = True
-            at += int(rng.integers(30, 120))
-    free &= rng.random((side, side)) > 0.0005
-    free[:1], free[-1:], free[:, :1], free[:, -1:] = False, False, False, False
-    return free
+def floor_of(worlds: Path, side: int) -> Mask:
+    """Free cells of a real floor, laid side by side until the size is reached."""
+    free = floors(worlds, 'kth/50052749')[0].world.occupied == 0
+    rows, cols = free.shape
+    return np.ascontiguousarray(np.tile(free, (-(-side // rows), -(-side // cols)))[:side, :side])
 
 
 def padded_opencv(free: Mask) -> Mask:
@@ -36,12 +29,12 @@ def padded_opencv(free: Mask) -> Mask:
     return np.asarray(cv2.ximgproc.thinning(padded, thinningType=cv2.ximgproc.THINNING_ZHANGSUEN)[1:-1, 1:-1] > 0)
 
 
-def run(quick: bool) -> list[Row]:
+def run(worlds: Path, quick: bool) -> list[Row]:
     """Rows for each size."""
     rows = []
     cv2.setNumThreads(1)
     for side in (400, 1000) if quick else (400, 1000, 4000):
-        free = floor_like(side)
+        free = floor_of(worlds, side)
         assert np.array_equal(thin(free), padded_opencv(free)), 'thinning is not that of the paper'
         grey = free.astype(np.uint8)
         fast = best_seconds(
