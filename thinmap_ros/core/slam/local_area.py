@@ -13,6 +13,8 @@ from thinmap_ros.core.se2 import Array, wrap
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 
 _AS_NEAR_M = 1.0  # nodes farther than the nearest by no more than this are about as near
+_REACH_M = 8.0  # nodes along edges matter up to here, and the first one of every edge
+_BESIDE_M = 2.0  # what lies this near is not behind the robot
 _TURN_M_RAD = 0.5  # way that the robot could have gone while it turns by a radian
 _TRAIL_M = 3.0  # where no topology is known, the robot's own way is one, with nodes this far apart
 
@@ -72,11 +74,27 @@ class LocalArea:
         if here is None:
             return set()
         found = set(self._features_at.get(here, ()))
-        for node_id in self._topology.neighbours(here):
+        for node_id in self._along_edges(here):
             bearing, distance = _from_robot(T_map_base, self._topology.nodes[node_id].position)
-            if abs(bearing) <= half_view_rad or distance <= _AS_NEAR_M:
+            if abs(bearing) <= half_view_rad or distance <= _BESIDE_M:
                 found |= self._features_at.get(node_id, set())
         return found
+
+    def _along_edges(self, here: int) -> list[int]:
+        """Nodes that edges join to one, and those farther on that are still within reach along edges."""
+        ways = {here: 0.0}
+        open_ids = [here]
+        while open_ids:
+            node_id = min(open_ids, key=ways.__getitem__)
+            open_ids.remove(node_id)
+            for edge in self._topology.edges_at(node_id):
+                way = ways[node_id] + edge.length_m
+                if node_id != here and way > _REACH_M:
+                    continue
+                if edge.other(node_id) not in ways:
+                    open_ids.append(edge.other(node_id))
+                ways[edge.other(node_id)] = min(way, ways.get(edge.other(node_id), way))
+        return [i for i in ways if i != here]
 
     def _node_at(self, T_map_base: Array) -> int | None:
         """The nearest node; of those about as near, the one that the robot reaches sooner as it is headed."""
