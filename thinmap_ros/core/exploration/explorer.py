@@ -44,7 +44,6 @@ _ESCAPE_M = 0.6
 _NEAR_HEADING_RAD = 0.35
 _STEADY_RAD = 0.6
 _TRIES = 3
-_SURVEY_AGAIN_S = 0.4
 _COARSE_M, _FORGET_S = 0.2, 20.0
 _PAUSE_S = 5.0
 _FADE = 10.0
@@ -72,6 +71,7 @@ class ExplorerConfig(TrackerConfig):
     attach_m: float = parameter(3.0, 'a border belongs to an end node in sight within this, m', low=0.1, high=50.0)
     close_look_m: float = parameter(2.0, 'unknown in plain sight this near stays unknown, m', low=0.0, high=50.0)
     turn_cost_m_rad: float = parameter(0.2, 'path length that a turn by one radian costs, m', low=0.0, high=10.0)
+    switch_share: float = parameter(0.1, 'and this share of it', low=0.0, high=1.0)
     switch_m: float = parameter(2.0, 'another target must save this much of the way, m', low=0.0, high=100.0)
     retry_s: float = parameter(60.0, 'a target that failed is tried again after this time, s', low=0.0, high=1e5)
     survey_s: float = parameter(1.0, 'borders are assigned anew after this time, s', low=0.0, high=60.0)
@@ -208,8 +208,7 @@ class Explorer:
         last = self._last_survey
         if last.frame == self.borders.frame and self._stamp_ns - last.stamp_ns < self.config.survey_s * 1e9:
             left = [c for c in map(self._still_open, last.candidates) if c is not None]
-            hasty = self._stamp_ns - last.stamp_ns < _SURVEY_AGAIN_S * 1e9
-            if any(c.track.node_id == self._memory.target for c in left) or (hasty and left):
+            if any(c.track.node_id == self._memory.target for c in left):
                 return left
         self._last_survey = _Survey(self.borders.frame, self._stamp_ns, self._survey(T_map_base))
         return self._last_survey.candidates
@@ -227,7 +226,7 @@ class Explorer:
         """End nodes with their borders, and stand-ins for the borders that no end node sees."""
         cells, numbers, _ = self.borders.stretches()
         self._reached = reached = self._reachable(T_map_base)
-        owners = self._owners(cells, reached)
+        owners = self._without_scraps(self._owners(cells, reached), numbers)
         candidates = []
         for node_id, track in self.tracker.tracks.items():
             own = cells[owners == node_id]
@@ -258,6 +257,20 @@ class Explorer:
         places = np.array([(self.tracker.tracks[int(i)].x, self.tracker.tracks[int(i)].y) for i in ids])
         index = self.borders.owners(cells, self.borders.frame.cells_of(places), self.config.attach_m)
         return np.where(index < 0, -1, ids[index])
+
+    def _without_scraps(self, owners: Cells, numbers: NDArray[np.int32]) -> Cells:
+        """Owners (N,) of border cells, such that no owner holds less of a stretch than would count as a border.
+
+        Such a scrap goes to whoever holds most of the stretch: it would be a target that is none at the next scan.
+        """
+        fewest = round(self.config.shortest_border_m / self.borders.frame.resolution)
+        owners = owners.copy()
+        for number in np.unique(numbers):
+            where = np.flatnonzero(numbers == number)
+            ids, inverse, counts = np.unique(owners[where], return_inverse=True, return_counts=True)
+            scraps = counts[inverse] < fewest
+            owners[where[scraps]] = ids[counts.argmax()]
+        return owners
 
     def _can_own(self, node_id: int, reached: NDArray[np.bool_]) -> bool:
         if node_id in self._memory.visited:
@@ -357,18 +370,22 @@ class Explorer:
             memory.target = None
             return None
         if memory.target in open_to_try and self._last_survey.stamp_ns != self._stamp_ns:
-            return self._go_for(open_to_try[memory.target])  # costs are weighed anew once a survey
+            return self._go_for(open_to_try[memory.target], T_map_base)  # costs are weighed anew once a survey
         costs = (self._tours if self.config.mode == 'open_border' else self._costs)(topology, open_to_try, T_map_base)
         if not memory.first_choice_made:
             memory.first_choice_made = True
             faced = min(open_to_try, key=lambda i: _turn_to(T_map_base, open_to_try[i].goal))
-            return self._go_for(open_to_try[faced])
+            return self._go_for(open_to_try[faced], T_map_base)
         best = min(costs, key=lambda i: costs[i])
         if memory.target not in costs:
             memory.target = self._successor(open_to_try)
-        if memory.target is None or costs[best] < costs[memory.target] - self.config.switch_m:
+        if memory.target is None or costs[best] < costs[memory.target] - self._margin(costs[memory.target]):
             memory.target = best
-        return self._go_for(open_to_try[memory.target])
+        return self._go_for(open_to_try[memory.target], T_map_base)
+
+    def _margin(self, cost: float) -> float:
+        """What another target must save, m: plans change with every scan, and whoever turns back gains nothing."""
+        return max(self.config.switch_m, self.config.switch_share * cost)
 
     def _to_try(self, worth: dict[int, _Candidate]) -> dict[int, _Candidate]:
         """Candidates at whose places nothing failed, or a while ago; else, before the end, those that failed least.
@@ -400,20 +417,32 @@ class Explorer:
         near = min(self._memory.failed, key=lambda f: math.dist(f.at, (track.x, track.y)), default=None)
         return near if near and math.dist(near.at, (track.x, track.y)) <= _CHANGED_MARGIN_M else None
 
-    def _go_for(self, chosen: _Candidate) -> int:
-        """Make a candidate the target; its goal stays where it was for as long as it is about the same."""
+    def _go_for(self, chosen: _Candidate, T_map_base: Array) -> int:
+        """Make a candidate the target; until the robot is there its goal stays, if it is still about the same border.
+
+        Borders change hands between nodes from one survey to the next, and the place to look at them from with that.
+        """
         memory = self._memory
-        memory.target, memory.target_at = chosen.track.node_id, (chosen.track.x, chosen.track.y)
-        if not _about_same(chosen.goal, memory.goal):
+        at = self._border_of(chosen)
+        same = max(math.dist(at, memory.target_at), math.dist(chosen.goal[:2], memory.goal[:2])) <= _SUCCESSOR_M
+        on_the_way = same and math.dist(T_map_base[:2], memory.goal[:2]) > _NEAR_VISIT_M
+        memory.target, memory.target_at = chosen.track.node_id, at
+        if not (on_the_way or _about_same(chosen.goal, memory.goal)):
             memory.goal = chosen.goal
         return chosen.track.node_id
 
+    def _border_of(self, candidate: _Candidate) -> tuple[float, float]:
+        """Where the border of a candidate is, m; where the node itself is if it has none."""
+        if len(candidate.cells) == 0:
+            return candidate.track.x, candidate.track.y
+        return self._middle(candidate.cells)
+
     def _successor(self, worth: dict[int, _Candidate]) -> int | None:
-        """Where the target vanished: what is now open nearest to its place, since that is what it stood for."""
+        """Where the target vanished: whose border is now nearest to the one that the target stood for."""
         at = self._memory.target_at
-        near = min(worth.values(), key=lambda c: math.dist(at, (c.track.x, c.track.y)))
-        within = math.dist(at, (near.track.x, near.track.y)) <= _SUCCESSOR_M
-        return near.track.node_id if within else None
+        away = {i: math.dist(at, self._border_of(candidate)) for i, candidate in worth.items()}
+        near = min(away, key=lambda i: away[i])
+        return near if away[near] <= _SUCCESSOR_M else None
 
     def _costs(self, topology: TopologicalMap, worth: dict[int, _Candidate], T_map_base: Array) -> dict[int, float]:
         """Path cost to each candidate's goal, m: along the graph, and the first turn."""
