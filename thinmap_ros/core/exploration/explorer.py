@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import parameter
 from thinmap_ros.core.exploration.end_node_tracker import EndNodeTracker, Track, TrackerConfig
-from thinmap_ros.core.exploration.open_borders import OpenBorders
+from thinmap_ros.core.exploration.open_borders import OpenBorders, directions_of_view
 from thinmap_ros.core.exploration.tour import tours_by_first
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
@@ -176,7 +176,7 @@ class Explorer:
         self._stamp_ns = scan.stamp_ns
         xy = (float(T_map_base[0]), float(T_map_base[1]))
         self.borders.update(patch, xy, scan.range_max_m + 0.5)
-        self.borders.examine(xy, self.config.close_look_m, _faces(scan, T_map_base))
+        self.borders.examine(xy, self.config.close_look_m, directions_of_view(scan, T_map_base))
         candidates = self._candidates(topology, T_map_base)
         open_ids = {c.track.node_id for c in candidates}
         self.tracker.look(scan, T_map_base, self.borders.free, patch.frame, open_ids)
@@ -527,13 +527,6 @@ def _end_node(track: Track, candidate: _Candidate | None, target_goal: Array | N
         is_target=target_goal is not None,
         goal=goal if target_goal is None else target_goal,
     )
-
-
-def _faces(scan: Scan, T_map_base: Array) -> Array:
-    """First and last direction of view, rad, map frame, the first the smaller."""
-    last = scan.angle_min_rad + scan.angle_increment_rad * (scan.ranges_m.size - 1)
-    heading = float(T_map_base[2] + scan.T_base_laser[2])
-    return np.array([heading + min(scan.angle_min_rad, last), heading + max(scan.angle_min_rad, last)])
 
 
 def _facing(place: Array, towards: tuple[float, float]) -> Array:
