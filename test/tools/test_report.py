@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from thinmap_ros.core.exploration.explorer import FIRST_STAND_IN_ID
 from thinmap_ros.tools.report import FEWEST_SIGHTINGS, Ending, EndNodeCensus, TargetLog, exploration_report
 
 AFAR = np.array([100.0, 100.0, 0.0])
@@ -34,6 +35,10 @@ def test_what_did_not_last_is_not_counted():
     blink, stay = (1, 5.0, 5.0), (2, 0.0, 0.0)
     decisions = [[blink, stay]] * (FEWEST_SIGHTINGS - 1) + [[stay]]
     assert census_of(*decisions).seen == 1
+
+
+def test_what_stands_in_for_a_border_is_no_end_node():
+    assert census_of(*([[(FIRST_STAND_IN_ID, 0.0, 0.0), (1, 5.0, 5.0)]] * 10)).seen == 1
 
 
 def test_a_visit_is_nearer_than_half_a_metre():

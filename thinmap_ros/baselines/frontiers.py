@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.exploration.open_borders import OpenBorders
+from thinmap_ros.core.exploration.open_borders import OpenBorders, directions_of_view
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.grid_search import coarse, ways_from
 from thinmap_ros.core.planning.wavefront import places_in_reach
@@ -55,7 +55,7 @@ class FrontierMap:
         self.patch = patch
         xy = (float(T_map_base[0]), float(T_map_base[1]))
         self.borders.update(patch, xy, scan.range_max_m + 0.5)
-        self.borders.examine(xy, _CLOSE_LOOK_M, faces(scan, T_map_base))
+        self.borders.examine(xy, _CLOSE_LOOK_M, directions_of_view(scan, T_map_base))
 
     def is_open(self, frontier: Frontier) -> bool:
         """Whether enough of a frontier, found on this very patch's frame, is left."""
@@ -90,10 +90,3 @@ class FrontierMap:
     def _middle(self, cells: Cells) -> Array:
         cell = cells[np.square(cells - cells.mean(axis=0)).sum(axis=1).argmin()]
         return np.asarray(self.borders.frame.centres_of(cell[None])[0])
-
-
-def faces(scan: Scan, T_map_base: Array) -> Array:
-    """First and last direction of view, rad, map frame, the first the smaller, (2,)."""
-    last = scan.angle_min_rad + scan.angle_increment_rad * (scan.ranges_m.size - 1)
-    heading = float(T_map_base[2] + scan.T_base_laser[2])
-    return np.array([heading + min(scan.angle_min_rad, last), heading + max(scan.angle_min_rad, last)])

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from thinmap_ros.core.exploration.explorer import FIRST_STAND_IN_ID
 from thinmap_ros.core.exploration.position_probability import NEAR_M
 from thinmap_ros.core.se2 import Array
 
@@ -31,7 +32,7 @@ class EndNodeCensus:
 
     An end node wanders as the map grows, and may come and go under new ids: one that appears within SAME_PLACE_M of
     where another one was last, and is no more, continues that one. One that did not last for FEWEST_SIGHTINGS
-    decisions is not counted.
+    decisions is not counted, and neither are what stands in for borders that no end node sees.
     """
 
     def __init__(self) -> None:
@@ -49,7 +50,7 @@ class EndNodeCensus:
 
     def take(self, end_nodes: Iterable[tuple[int, float, float]], T_map_base: Array) -> None:
         """Count the end nodes (id, x, y in m) known at a pose (3,); nearer than 0.5 m is a visit (equation (2))."""
-        nodes = {node_id: (x, y) for node_id, x, y in end_nodes}
+        nodes = {node_id: (x, y) for node_id, x, y in end_nodes if node_id < FIRST_STAND_IN_ID}
         alive = {place.node_id: place for place in self._places if place.node_id in nodes}
         idle = [place for place in self._places if place.node_id not in nodes]
         for node_id, (x, y) in nodes.items():

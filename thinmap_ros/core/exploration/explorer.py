@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import parameter
 from thinmap_ros.core.exploration.end_node_tracker import EndNodeTracker, Track, TrackerConfig
-from thinmap_ros.core.exploration.open_borders import OpenBorders
+from thinmap_ros.core.exploration.open_borders import OpenBorders, directions_of_view
 from thinmap_ros.core.exploration.tour import tours_by_first
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
@@ -64,9 +64,9 @@ class ExplorerConfig(TrackerConfig):
     threshold: float = parameter(0.9, 'an end node as probable as this needs no visit', low=0.5, high=0.999)
     robot_radius_m: float = parameter(0.25, 'radius of the robot, m', low=0.0, high=5.0)
     small_border_m: float = parameter(1.5, 'behind a shorter border not much is expected, m', low=0.0, high=50.0)
-    wait_weight: float = parameter(0.15, 'cost of a metre until a target is reached, m', low=0.0, high=10.0)
-    small_wait_weight: float = parameter(0.5, 'the same, for one with a small border', low=0.0, high=10.0)
-    wait_m: float = parameter(30.0, 'a target farther off than this along the tour waits no more, m', low=0.0, high=1e3)
+    wait_weight: float = parameter(0.5, 'cost of a metre until a target is reached, m', low=0.0, high=10.0)
+    small_wait_weight: float = parameter(2.0, 'the same, for one with a small border', low=0.0, high=10.0)
+    wait_m: float = parameter(15.0, 'a target farther off than this along the tour waits no more, m', low=0.0, high=1e3)
     shortest_border_m: float = parameter(0.5, 'a shorter border is a missing beam, m', low=0.0, high=5.0)
     attach_m: float = parameter(3.0, 'a border belongs to an end node in sight within this, m', low=0.1, high=50.0)
     close_look_m: float = parameter(2.0, 'unknown in plain sight this near stays unknown, m', low=0.0, high=50.0)
@@ -176,7 +176,7 @@ class Explorer:
         self._stamp_ns = scan.stamp_ns
         xy = (float(T_map_base[0]), float(T_map_base[1]))
         self.borders.update(patch, xy, scan.range_max_m + 0.5)
-        self.borders.examine(xy, self.config.close_look_m, _faces(scan, T_map_base))
+        self.borders.examine(xy, self.config.close_look_m, directions_of_view(scan, T_map_base))
         candidates = self._candidates(topology, T_map_base)
         open_ids = {c.track.node_id for c in candidates}
         self.tracker.look(scan, T_map_base, self.borders.free, patch.frame, open_ids)
@@ -527,13 +527,6 @@ def _end_node(track: Track, candidate: _Candidate | None, target_goal: Array | N
         is_target=target_goal is not None,
         goal=goal if target_goal is None else target_goal,
     )
-
-
-def _faces(scan: Scan, T_map_base: Array) -> Array:
-    """First and last direction of view, rad, map frame, the first the smaller."""
-    last = scan.angle_min_rad + scan.angle_increment_rad * (scan.ranges_m.size - 1)
-    heading = float(T_map_base[2] + scan.T_base_laser[2])
-    return np.array([heading + min(scan.angle_min_rad, last), heading + max(scan.angle_min_rad, last)])
 
 
 def _facing(place: Array, towards: tuple[float, float]) -> Array:

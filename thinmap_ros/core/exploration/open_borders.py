@@ -14,6 +14,7 @@ from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.free_space import known_free, label
@@ -116,6 +117,13 @@ class OpenBorders:
             mask[rows, cols] = self.mask[from_rows, from_cols]
             looks[rows, cols] = self._looks[from_rows, from_cols]
         self.frame, self.free, self.mask, self._looks = patch.frame, free, mask, looks
+
+
+def directions_of_view(scan: Scan, T_map_base: Array) -> Array:
+    """First and last direction of view of a scan at a pose (3,), rad, map frame, the first the smaller, (2,)."""
+    last = scan.angle_min_rad + scan.angle_increment_rad * (scan.ranges_m.size - 1)
+    heading = float(T_map_base[2] + scan.T_base_laser[2])
+    return np.array([heading + min(scan.angle_min_rad, last), heading + max(scan.angle_min_rad, last)])
 
 
 def _overlap(offset: int, old: int, new: int) -> tuple[slice, slice]:
