@@ -8,6 +8,7 @@ import pytest
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, log_odds
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.raytrace import cast_rays
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import pose
 
@@ -176,3 +177,39 @@ def test_a_wall_on_the_border_of_two_cells_leaves_the_one_in_front_free():
     behind = [percent(grid, 2.05, y) for y in np.arange(-1.45, 1.5, 0.1)]
     assert max(beside) <= 25
     assert min(behind) >= 65
+
+
+def seen_from(x, y, heading, wall_y, solid=True):
+    """Scan of a laser that sees a wall from (0, wall_y) to (2.4, wall_y), 0.1 m thick, before one at x = -1."""
+    world = np.zeros((500, 500), dtype=np.uint8)
+    world[:, 75:80] = 1
+    if solid:
+        world[round((wall_y + 1.95) / 0.02) : round((wall_y + 2.05) / 0.02), 100:220] = 1
+    angles = math.radians(-90.0) + STEP * np.arange(181)
+    ranges = 0.02 * cast_rays(world, (x + 2.0) / 0.02, (y + 2.0) / 0.02, angles + heading, 400.0)
+    return scan_of(np.where(ranges < 8.0, ranges, np.inf))
+
+
+@pytest.mark.parametrize('y', [1.98, 2.0, 2.02])
+def test_looking_along_a_wall_does_not_erase_it(y):
+    grid = OccupancyGrid()
+    for _ in range(20):
+        grid.update(seen_from(1.5, 0.5, math.pi / 2, 2.0), pose(1.5, 0.5, math.pi / 2))
+    wall = np.column_stack([np.arange(0.25, 2.3, 0.1), np.full(21, 1.95)])
+    before = grid.patch()
+    assert before.occupied[tuple(before.frame.cells_of(wall).T)].all()
+    for heading in np.radians(np.linspace(170.0, 190.0, 60)):
+        grid.update(seen_from(5.3, y, heading, 2.0), pose(5.3, y, heading))
+    after = grid.patch()
+    assert after.occupied[tuple(after.frame.cells_of(wall).T)].mean() > 0.9
+
+
+def test_a_long_wall_that_went_away_is_unlearned_by_beams_that_cross_it():
+    grid = OccupancyGrid()
+    for _ in range(20):
+        grid.update(seen_from(1.5, 0.5, math.pi / 2, 2.0), pose(1.5, 0.5, math.pi / 2))
+    for x in np.linspace(0.5, 2.5, 30):
+        grid.update(seen_from(x, 0.5, math.pi / 2, 2.0, solid=False), pose(x, 0.5, math.pi / 2))
+    wall = np.column_stack([np.arange(0.25, 2.3, 0.1), np.full(21, 1.95)])
+    patch = grid.patch()
+    assert patch.free[tuple(patch.frame.cells_of(wall).T)].all()

@@ -27,6 +27,9 @@ _TILE_BITS = TILE.bit_length() - 1
 # Three neighbouring beams show one surface if the middle range is this near to what the others foretell, m.
 _FLAT_M = 0.06
 _LONGEST_SURFACE_M = 3.0
+# What a beam passes through is no wall; but where it passes through this much of one, it grazes a face of the wall.
+_GRAZED_M = 0.4
+_SURELY_OCCUPIED = 0.9
 
 
 @dataclass(frozen=True)
@@ -59,8 +62,10 @@ class OccupancyGrid:
     beyond. The end is taken surface_depth_m behind the measured surface, where the solid is: with a wall on the border
     of two cells, noise would otherwise fill the free one in front of it half the time. Each cell is counted once a
     scan, and a cell in which any beam of the scan ends counts as occupied. Beams that graze a wall pass through the
-    cells in which it stands, long before they end: a cell on the line between the ends of neighbouring beams that lie
-    on one surface is therefore never counted as free.
+    cells in which it stands, long before they end, or without ending there at all. A cell on the line between the ends
+    of neighbouring beams that lie on one surface is therefore never counted as free; nor is a cell that is surely
+    occupied, as are others in line with it along the beam, for 0.4 m: nothing that thick is looked through. What was
+    taken away is still unlearned, by the beams that cross it.
     Source: topological map paper section 2.1 (binary local map), exploration paper section 2.1 (Bayes update).
     """
 
@@ -134,13 +139,20 @@ class OccupancyGrid:
         bend = 2.0 * math.cos(scan.angle_increment_rad)
         beams = (scan.ranges_m, scan.hit, scan.no_return)
         count = _mark(marks, shift, touched, x - col, y - row, cosines, sines, *beams, *limits, bend)
-        self._add(row, col, shift, touched[:count])
+        self._add(row, col, shift, touched[:count], (x - col, y - row))
 
-    def _add(self, row: int, col: int, shift: int, touched: NDArray[np.int64]) -> None:
-        """Add what is marked to the tiles; (row, col): cell (0, 0) of the marks. Makes the tiles that do not exist."""
+    def _add(
+        self, row: int, col: int, shift: int, touched: NDArray[np.int64], laser: tuple[float, float]
+    ) -> None:
+        """Add what is marked to the tiles, and make those that do not exist.
+
+        (row, col): cell (0, 0) of the marks; laser: its place (x, y) in cells from there.
+        """
         tiles, last = self._tiles, 1 << shift
         tiles.reach(row // TILE, col // TILE, (row + last) // TILE, (col + last) // TILE)
         corner = (row - tiles.first_row * TILE, col - tiles.first_col * TILE)
+        grazed = max(3, round(_GRAZED_M / self.frame.resolution))
+        _spare(tiles.pool, tiles.directory, *corner, self._marks, shift, touched, laser, self._steps, grazed)
         left = _apply(tiles.pool, tiles.directory, *corner, self._marks, shift, touched, self._steps)
         if left:
             needed = np.zeros(tiles.directory.shape, dtype=np.bool_)
@@ -188,12 +200,13 @@ class OccupancyGrid:
 
 
 def _steps(config: OccupancyConfig) -> NDArray[np.int64]:
-    """What each of the eight combinations of marks adds to the log odds, and the lowest and highest log odds, (10,)."""
+    """What each of the eight combinations of marks adds to the log odds; lowest, highest and sure log odds, (11,)."""
     free, hit, low, high = (
         round(_SCALE * log_odds(p)) for p in (config.p_free, config.p_occupied, config.p_lowest, config.p_highest)
     )
     added = [hit if marks & _HIT else 0 if marks & _SURFACE else free for marks in range(8)]
-    return np.array([*added, low, high], dtype=np.int64)
+    sure = min(round(_SCALE * log_odds(_SURELY_OCCUPIED)), high)
+    return np.array([*added, low, high, sure], dtype=np.int64)
 
 
 def _percent_table() -> NDArray[np.int8]:
@@ -304,6 +317,71 @@ def _flag_tiles(needed: NDArray[np.bool_], touched: NDArray[np.int64], shift: in
     mask = (1 << shift) - 1
     for index in touched:
         needed[(row + (index >> shift)) >> _TILE_BITS, (col + (index & mask)) >> _TILE_BITS] = True
+
+
+@inlined
+def _odds_at(pool: NDArray[np.int16], directory: NDArray[np.int32], row: int, col: int) -> int:
+    """Log odds of a cell, counted from the directory's first one on; 0 where no tile is."""
+    tile_row, tile_col = row >> _TILE_BITS, col >> _TILE_BITS
+    if tile_row < 0 or tile_col < 0 or tile_row >= directory.shape[0] or tile_col >= directory.shape[1]:
+        return 0
+    slot = directory[tile_row, tile_col]
+    return 0 if slot < 0 else int(pool[slot, row & (TILE - 1), col & (TILE - 1)])
+
+
+@inlined
+def _run_of(
+    pool: NDArray[np.int16],
+    directory: NDArray[np.int32],
+    row: int,
+    col: int,
+    away: tuple[float, float],
+    sure: int,
+    enough: int,
+) -> int:
+    """How many surely occupied cells lie in line with one along a beam, itself among them; counted up to `enough`.
+
+    away: (x, y) from the laser to the cell, in cells.
+    """
+    longest = max(abs(away[0]), abs(away[1]), 1e-9)
+    step_x, step_y = away[0] / longest, away[1] / longest
+    run = 1
+    for sign in (-1, 1):
+        k = 1
+        while run < enough:
+            at_row, at_col = row + round(sign * k * step_y), col + round(sign * k * step_x)
+            if _odds_at(pool, directory, at_row, at_col) < sure:
+                break
+            run, k = run + 1, k + 1
+    return run
+
+
+@kernel
+def _spare(
+    pool: NDArray[np.int16],
+    directory: NDArray[np.int32],
+    row: int,
+    col: int,
+    cells: NDArray[np.uint8],
+    shift: int,
+    touched: NDArray[np.int64],
+    laser: tuple[float, float],
+    steps: NDArray[np.int64],
+    grazed: int,
+) -> None:
+    """Mark as surface what beams only passed, but what is surely occupied for as many cells as `grazed` along them.
+
+    (row, col): cell (0, 0) of the marks, counted from the directory's first cell on; laser: (x, y) in cells of them.
+    """
+    mask, sure = (1 << shift) - 1, steps[10]
+    for index in touched:
+        if cells[index] != _FREE:
+            continue
+        in_row, in_col = index >> shift, index & mask
+        if _odds_at(pool, directory, row + in_row, col + in_col) >= sure:
+            away = (in_col + 0.5 - laser[0], in_row + 0.5 - laser[1])
+            if _run_of(pool, directory, row + in_row, col + in_col, away, sure, grazed) >= grazed:
+                cells[index] |= _SURFACE
 
 
 @kernel
