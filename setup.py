@@ -24,6 +24,7 @@ setup(
     ],
     install_requires=['matplotlib', 'mcap', 'numba', 'numpy', 'pillow', 'pyyaml', 'rosbags', 'scipy', 'tqdm'],
     extras_require={
+        'cluster': ['distributed'],
         'viewer': ['rerun-sdk>=0.41,<0.42'],  # its interface changes with each minor version
         'test': ['hypothesis', 'opencv-contrib-python-headless', 'psutil', 'pytest', 'pytest-timeout', 'scikit-image'],
     },

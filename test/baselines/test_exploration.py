@@ -38,9 +38,10 @@ def test_each_strategy_sees_all_stops_by_itself_and_touches_nothing(strategy: st
     assert report['end_nodes_seen'] >= report['end_nodes_visited']
 
 
-def test_the_literal_scheme_stops_by_itself() -> None:
+def test_the_literal_scheme_sets_out_and_stops_by_itself() -> None:
     _, report = explore(two_rooms(), START, Options(strategy='paper', speed_m_s=0.5, time_limit_s=600.0))
     assert report['finished']
+    assert report['distance'] > 1.0
     assert report['collisions'] == 0
 
 

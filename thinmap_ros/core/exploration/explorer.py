@@ -165,7 +165,7 @@ class Explorer:
         self._reached = self.borders.mask
         self._ways = WayTable(_COARSE_M, _FORGET_S)
         self._memory = _Memory()
-        self._stamp_ns = 0
+        self._stamp_ns, self._began_ns = 0, 2**63
         self._last_survey = _Survey(self.borders.frame, 0, [])
 
     def step(self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array) -> Decision:
@@ -174,6 +174,7 @@ class Explorer:
         patch: the whole map, on one lattice from step to step. Deterministic; call it once a scan.
         """
         self._stamp_ns = scan.stamp_ns
+        self._began_ns = min(self._began_ns, self._stamp_ns)
         xy = (float(T_map_base[0]), float(T_map_base[1]))
         self.borders.update(patch, xy, scan.range_max_m + 0.5)
         self.borders.examine(xy, self.config.close_look_m, directions_of_view(scan, T_map_base))
@@ -365,6 +366,8 @@ class Explorer:
         memory = self._memory
         open_to_try = self._to_try(worth)
         waits = any(failure.times < _TRIES for failure in map(self._failure_of_candidate, worth.values()) if failure)
+        # The first scans are not a graph yet.
+        waits |= not topology.nodes and self._stamp_ns - self._began_ns < _PAUSE_S * 1e9
         memory.nothing_left = 0 if open_to_try or waits else memory.nothing_left + 1
         if not open_to_try:
             memory.target = None
