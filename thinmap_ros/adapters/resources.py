@@ -26,13 +26,13 @@ def message_definitions(package: str) -> dict[str, str]:
     """Texts of a package's message definitions by full name, for bags. Empty where the package is not there."""
     try:
         folder = Path(get_package_share_directory(package)) / 'msg'
-    except PackageNotFoundError:
+    except (PackageNotFoundError, OSError):
         return {}
     return {f'{package}/msg/{file.stem}': file.read_text() for file in sorted(folder.glob('*.msg'))}
 
 
 def _worlds() -> dict[str, Path]:
     folders = [Path(__file__).parents[2] / 'worlds']
-    with contextlib.suppress(PackageNotFoundError):  # used from the source tree, without an installed package
+    with contextlib.suppress(PackageNotFoundError, OSError):  # from the source tree: not installed, or no ROS sourced
         folders.append(Path(get_package_share_directory('thinmap_ros')) / 'worlds')
     return {file.stem: file for folder in folders for file in folder.glob('*.yaml')}
