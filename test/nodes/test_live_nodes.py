@@ -114,7 +114,7 @@ def test_bad_messages_are_refused_in_words_and_nothing_dies(graph):
     bad_ns = int(said[0] * 1e9)
     graph.until(lambda: good_again() and stamps(poses)[-1] > bad_ns, 'poses after bad messages')
     assert all(np.isfinite([p.pose.pose.position.x, *p.pose.covariance]).all() for p in poses)
-    assert graph.stop('localizer') == 0
+    assert graph.stop('localizer') == 0, graph.log('localizer')
 
 
 @pytest.mark.parametrize(

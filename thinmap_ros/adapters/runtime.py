@@ -3,10 +3,13 @@
 import ctypes
 import gc
 import mmap
+import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -15,6 +18,8 @@ from rclpy.signals import SignalHandlerOptions
 
 from thinmap_ros.core.errors import ThinmapError
 
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
 
 def run(make_node: Callable[[], Node]) -> None:
     """Make a node and spin it until SIGINT or SIGTERM; the process ends with 0, or 2 on a refused start.
@@ -22,21 +27,19 @@ def run(make_node: Callable[[], Node]) -> None:
     A node may have a method `close()`: it is called last, whatever ended the node.
     """
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, _stop)
+    _on_signals(_leave)
     node = None
     try:
         node = make_node()
         release_compiler_pages()
         _spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
+    except ExternalShutdownException:
         pass
     except ThinmapError as error:
         print(f'error: {error}', file=sys.stderr)
         sys.exit(2)
     finally:
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, signal.SIG_IGN)  # ending is short: a second signal must not cut it off
+        _on_signals(signal.SIG_IGN)  # ending is short: a second signal must not cut it off
         if node is not None:
             getattr(node, 'close', lambda: None)()
             node.destroy_node()
@@ -44,15 +47,24 @@ def run(make_node: Callable[[], Node]) -> None:
 
 
 def _spin(node: Node) -> None:
+    asked = threading.Event()
+    # Only noted: an exception raised just anywhere comes out of compiled code as another error, or gets lost in it.
+    _on_signals(lambda number, frame: asked.set())
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    while rclpy.ok() and not getattr(node, 'finished', False):
+    while rclpy.ok() and not asked.is_set() and not getattr(node, 'finished', False):
         # A bounded wait: Python sees signals only between calls.
         executor.spin_once(timeout_sec=0.25)
 
 
-def _stop(number: int, frame: object) -> None:
-    raise KeyboardInterrupt
+def _on_signals(handler: Any) -> None:
+    for number in _SIGNALS:
+        signal.signal(number, handler)
+
+
+def _leave(number: int, frame: object) -> None:
+    """End at once: a node that does not listen yet has nothing to finish."""
+    os._exit(0)
 
 
 def release_compiler_pages() -> None:
