@@ -5,21 +5,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from time import perf_counter
 
-from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
+from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, WindowConfig
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import Estimate, Localizer, LocalizerConfig
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig
-
-
-@dataclass(frozen=True)
-class WindowConfig(Config):
-    """The part of the map around the robot that is thinned at every scan."""
-
-    window_m: float = parameter(10.0, 'edge of the local map around the robot, m', low=2.0, high=100.0)
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,8 @@
 """A rehearsal of each algorithm in a small room, so that no kernel has to be compiled or loaded during a real step.
 
 A node rehearses before it listens: on a robot the first seconds would otherwise be spent standing still, and in a
-simulation that runs faster than real time many more.
+simulation that runs faster than real time many more. Each rehearsal imports what it needs, so that a node does not
+carry the compiled code of the others.
 """
 
 from collections.abc import Iterator
@@ -9,16 +10,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
 from thinmap_ros.core.grid.raytrace import cast_rays
-from thinmap_ros.core.planning.navigator import Navigator
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import Localizer
-from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig, build
 
 _CELL_M, _RANGE_M, _BEAMS = 0.1, 8.0, 181
 _ROOM_CELLS, _PASSAGE = 80, slice(30, 50)
@@ -27,6 +23,8 @@ _SCANS, _PERIOD_S, _STEP_M, _TURN_RAD = 12, 0.2, 0.12, 0.11
 
 def localizer() -> None:
     """Rehearse localization."""
+    from thinmap_ros.core.slam.localizer import Localizer
+
     rehearsed = Localizer()
     for scan, T_map_base in _drive():
         rehearsed.step(scan, T_map_base)
@@ -34,6 +32,8 @@ def localizer() -> None:
 
 def grid_mapper() -> None:
     """Rehearse the map update and its windows."""
+    from thinmap_ros.core.grid.occupancy import OccupancyGrid
+
     rehearsed = OccupancyGrid()
     for scan, T_map_base in _drive():
         rehearsed.update(scan, T_map_base)
@@ -43,6 +43,9 @@ def grid_mapper() -> None:
 
 def topology_builder() -> None:
     """Rehearse thinning and the merging of local maps."""
+    from thinmap_ros.core.grid.occupancy import OccupancyGrid
+    from thinmap_ros.core.topology.update import TopologyBuilder
+
     grid, rehearsed = OccupancyGrid(), TopologyBuilder()
     for scan, T_map_base in _drive():
         grid.update(scan, T_map_base)
@@ -51,6 +54,9 @@ def topology_builder() -> None:
 
 def explorer() -> None:
     """Rehearse the choice of an end node in a room of which a part is unknown."""
+    from thinmap_ros.core.exploration.explorer import Explorer
+    from thinmap_ros.core.topology.update import TopologyConfig, build
+
     patch, rehearsed = _room(), Explorer()
     topology = build(patch, (2.0, 2.0), TopologyConfig())
     for scan, T_map_base in _drive():
@@ -59,6 +65,8 @@ def explorer() -> None:
 
 def navigator() -> None:
     """Rehearse planning and driving."""
+    from thinmap_ros.core.planning.navigator import Navigator
+
     patch, rehearsed = _room(), Navigator()
     rehearsed.set_goal(4.0, 3.0, 0.0)
     for scan, T_map_base in _drive():

@@ -20,6 +20,7 @@ from thinmap_ros.adapters.bags import Bag
 pytestmark = pytest.mark.live
 START = '2.0,2.0,0.0'
 AT_START = {'start_x_m': 2.0, 'start_y_m': 2.0, 'start_yaw_rad': 0.0}
+SCAN_PERIOD_NS = 200_000_000
 
 
 def stamps(heard):
@@ -58,7 +59,8 @@ def test_a_scan_becomes_a_pose_a_map_and_a_graph(graph, tmp_path):
     graph.start('topology_builder', use_sim_time=True)
     graph.start('sim', start=START, rate=4.0, lockstep='local_topology', hold_for_subscribers=3)
     graph.until(lambda: len(local_maps) > 8, 'local maps')
-    assert set(stamps(poses)) <= set(stamps(scans))
+    # Not set against the scans heard here: sensor data may be lost on the way to one listener and not to another.
+    assert not np.mod(np.array(stamps(poses)) - stamps(scans)[0], SCAN_PERIOD_NS).any()
     assert poses[-1].header.frame_id == 'map'
     assert np.hypot(poses[-1].pose.pose.position.x - 2.0, poses[-1].pose.pose.position.y - 2.0) < 0.05
     assert status[-1].state == SlamStatus.TRACKING
@@ -104,6 +106,7 @@ def test_bad_messages_are_refused_in_words_and_nothing_dies(graph):
         return len(poses) > 2
 
     graph.until(good_again, 'poses')
+
     def bad_again():
         for bad in ({'x': float('nan')}, {'x': 0.0, 'increment': 0.0}, {'x': 0.0, 'count': 0}, {'x': 1e300}):
             said[0] += 0.2

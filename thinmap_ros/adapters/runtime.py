@@ -9,6 +9,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import rclpy
@@ -18,6 +19,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from thinmap_ros.core.errors import ThinmapError
 
+_RELEASE_S = 3.0
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -52,9 +54,14 @@ def _spin(node: Node) -> None:
     _on_signals(lambda number, frame: asked.set())
     executor = SingleThreadedExecutor()
     executor.add_node(node)
+    released_at, wait_s = monotonic(), _RELEASE_S
     while rclpy.ok() and not asked.is_set() and not getattr(node, 'finished', False):
         # A bounded wait: Python sees signals only between calls.
         executor.spin_once(timeout_sec=0.25)
+        # Kernels that only a real message calls for bring the compiler back; ever less often.
+        if monotonic() - released_at > wait_s:
+            release_compiler_pages()
+            released_at, wait_s = monotonic(), 2.0 * wait_s
 
 
 def _on_signals(handler: Any) -> None:
@@ -78,6 +85,8 @@ def release_compiler_pages() -> None:
     if not smaps.exists():
         return
     libc = ctypes.CDLL(None)
+    if hasattr(libc, 'malloc_trim'):
+        libc.malloc_trim(0)
     for first, last in _clean_mappings(smaps.read_text(), 'llvmlite'):
         libc.madvise(ctypes.c_void_p(first), ctypes.c_size_t(last - first), mmap.MADV_DONTNEED)
 

@@ -14,9 +14,8 @@ from thinmap_ros.adapters.listening import listen
 from thinmap_ros.adapters.stamps import StampMatcher
 from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.core.errors import ThinmapError
-from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
+from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, WindowConfig
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.pipeline import WindowConfig
 
 
 class GridMapperNode(Node):

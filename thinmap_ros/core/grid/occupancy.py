@@ -55,6 +55,13 @@ def log_odds(probability: float) -> float:
     return math.log(probability / (1.0 - probability))
 
 
+@dataclass(frozen=True)
+class WindowConfig(Config):
+    """The part of the map around the robot that is thinned at every scan."""
+
+    window_m: float = parameter(10.0, 'edge of the local map around the robot, m', low=2.0, high=100.0)
+
+
 class OccupancyGrid:
     """A map of any extent, in tiles that exist only where something was seen.
 

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.linalg import spsolve
 
 from thinmap_ros.core.se2 import Array, wrap
 
@@ -78,6 +76,10 @@ def _linearise(poses: Array, edges: _Edges) -> tuple[Array, Array, Array]:
 
 def _step(edges: _Edges, e: Array, by_a: Array, by_b: Array, W: Array) -> Array:
     """Gauss-Newton step (N - 1, 3) of all poses but the first, from errors, Jacobians and weights (M, 3, 3)."""
+    # Here, not above: a live localizer never comes here, and these libraries take 18 MB.
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.linalg import spsolve
+
     number = int(max(edges.a.max(), edges.b.max())) + 1
     size = 3 * number
     gradient = np.zeros((number, 3))
