@@ -75,7 +75,8 @@ class DemoMonitorNode(Node):
         self._show(message.feedback.status)
 
     def _show(self, status: ExplorationStatus) -> None:
-        target = f'to end node {status.target}' if status.has_target else 'looking around'
+        place = status.target_position
+        target = f'to the end node at {place.x:.1f}, {place.y:.1f}' if status.has_target else 'looking around'
         self._bar.set_description_str(target if status.state == ExplorationStatus.EXPLORING else status.reason)
         self._bar.set_postfix_str(f'{status.distance_m:.1f} m, {messages.seconds(status.time):.0f} s')
         self._bar.n = 100.0 * self._coverage
