@@ -10,7 +10,6 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import Estimate, Localizer, LocalizerConfig
-from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig
 
 
@@ -27,11 +26,10 @@ class PipelineConfig:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What came of one scan: the pose, and the window of the map and its topological map, as they were last."""
+    """What came of one scan: the pose, and the window of the map as it was thinned last."""
 
     estimate: Estimate
     window: GridPatch
-    local_topology: TopologicalMap
 
 
 class Pipeline:
@@ -51,7 +49,7 @@ class Pipeline:
         self.topology = TopologyBuilder(self.config.topology)
         self.stage_seconds: dict[str, list[float]] = {}
         self._scans = 0
-        self._last: tuple[GridPatch, TopologicalMap] | None = None
+        self._window: GridPatch | None = None
         self._locate = pose_source or self.localizer.step
 
     def step(self, scan: Scan, T_odom_base: Array) -> Step:
@@ -60,17 +58,17 @@ class Pipeline:
             estimate = self._locate(scan, T_odom_base)
         with self._timed('grid'):
             self.grid.update(scan, estimate.T_map_base)
-        if self._last is None or self._scans % self.config.scans_per_graph == 0:
-            self._last = self._thin(estimate.T_map_base)
+        if self._window is None or self._scans % self.config.scans_per_graph == 0:
+            self._window = self._thin(estimate.T_map_base)
         self._scans += 1
-        return Step(estimate, *self._last)
+        return Step(estimate, self._window)
 
-    def _thin(self, T_map_base: Array) -> tuple[GridPatch, TopologicalMap]:
+    def _thin(self, T_map_base: Array) -> GridPatch:
         with self._timed('topology'):
             window = self.grid.window(T_map_base[0], T_map_base[1], self.config.window.window_m)
-            local_topology = self.topology.update(window, T_map_base)
-            self.localizer.set_topology(self.topology.map)
-        return window, local_topology
+            if self.topology.update(window, T_map_base):
+                self.localizer.set_topology(self.topology.map)
+        return window
 
     @contextmanager
     def _timed(self, stage: str) -> Iterator[None]:

@@ -50,6 +50,7 @@ def topology_builder() -> None:
     for scan, T_map_base in _drive():
         grid.update(scan, T_map_base)
         rehearsed.update(grid.window(T_map_base[0], T_map_base[1], 10.0), T_map_base)
+        rehearsed.local_map()
 
 
 def explorer() -> None:

@@ -42,10 +42,10 @@ class TopologyBuilderNode(Node):
     def _take(self, stamp_ns: int, pair: tuple[GridPatch, Array] | None) -> None:
         if pair is None:
             return
-        local = self._builder.update(*pair)
+        if self._builder.update(*pair):
+            self._global.publish(messages.topology_msg(self._builder.map, self._map_frame, stamp_ns))
         # The local map comes last: who hears it knows that all of this scan is said.
-        self._global.publish(messages.topology_msg(self._builder.map, self._map_frame, stamp_ns))
-        self._local.publish(messages.topology_msg(local, self._map_frame, stamp_ns))
+        self._local.publish(messages.topology_msg(self._builder.local_map(), self._map_frame, stamp_ns))
 
 
 def main() -> None:

@@ -27,8 +27,10 @@ class GridFrame:
 
     def centres_of(self, cells: NDArray[np.int64]) -> Array:
         """World points (N, 2) at the centres of the cells (N, 2) given as (row, col)."""
-        centres = np.atleast_2d(cells)[:, ::-1].astype(np.float64) + 0.5
-        return np.asarray(centres * self.resolution + np.array([self.origin_x, self.origin_y]))
+        centres = np.empty(cells.shape)
+        centres[:, 0] = (cells[:, 1] + 0.5) * self.resolution + self.origin_x
+        centres[:, 1] = (cells[:, 0] + 0.5) * self.resolution + self.origin_y
+        return centres
 
     def shifted(self, rows: int, cols: int) -> 'GridFrame':
         """The same lattice with cell (rows, cols) as its new cell (0, 0)."""

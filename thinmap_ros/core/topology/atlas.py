@@ -1,11 +1,13 @@
 """The global web: spots and chains on one unbounded lattice, found by place without looking at all of them."""
 
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.topology.web import Chain, Spot, Web
 
 Cells = NDArray[np.int64]
@@ -39,6 +41,10 @@ class Box:
         """Which of the cells (..., 2) lie in it."""
         inside: NDArray[np.bool_] = np.all((cells >= (self.row, self.col)) & (cells < self.end), axis=-1)
         return inside
+
+    def has(self, cell: tuple[int, int]) -> bool:
+        """Whether a cell lies in it."""
+        return 0 <= cell[0] - self.row < self.rows and 0 <= cell[1] - self.col < self.cols
 
     @property
     def end(self) -> tuple[int, int]:
@@ -154,15 +160,15 @@ class Atlas(Web):
     def cut_out(self, box: Box) -> Cut:
         """Take out all that lies in a box; chains that cross its border end at an anchor just inside."""
         cut = Cut({}, set())
-        inner_spots = {spot for spot in self.lone if box.holds(np.array(self.spots[spot].cell))}
+        inner_spots = {spot for spot in self.lone if box.has(self.spots[spot].cell)}
         for number in sorted(self._near(box)):
             chain = self.chains[number]
-            inside = box.holds(chain.cells)
-            if not inside.any():
+            outside = _runs_outside(chain.cells, box)
+            if outside == [(0, len(chain.cells))]:
                 continue
             self.drop_chain(number)
-            inner_spots |= {spot for spot, held in ((chain.a, inside[0]), (chain.b, inside[-1])) if held}
-            self._keep_outside(chain, inside, cut)
+            inner_spots |= {spot for spot in (chain.a, chain.b) if box.has(self.spots[spot].cell)}
+            self._keep(chain, outside, cut)
         for spot in inner_spots:
             self.drop_spot(spot)
         return cut
@@ -175,12 +181,13 @@ class Atlas(Web):
                 found |= self._blocks.get((r, c), set())
         return found
 
-    def _keep_outside(self, chain: Chain, inside: NDArray[np.bool_], cut: Cut) -> None:
+    def _keep(self, chain: Chain, outside: list[tuple[int, int]], cut: Cut) -> None:
         """Put back the runs of a chain that lie outside, each with the cells inside that it hangs on."""
-        for first, end in _runs(~inside):
-            piece = chain.part(max(first - 1, 0), min(end, len(inside) - 1))
+        count = len(chain.cells)
+        for first, end in outside:
+            piece = chain.part(max(first - 1, 0), min(end, count - 1))
             piece.a = chain.a if first == 0 else self._anchor(piece, 0, cut)
-            piece.b = chain.b if end == len(inside) else self._anchor(piece, -1, cut)
+            piece.b = chain.b if end == count else self._anchor(piece, -1, cut)
             cut.touched |= {piece.a, piece.b}
             self.add_chain(piece)
 
@@ -207,54 +214,67 @@ class Atlas(Web):
             reach = Box(box.row - _RIM, box.col - _RIM, box.rows + 2 * _RIM, box.cols + 2 * _RIM)
             inner = Box(box.row + _RIM, box.col + _RIM, box.rows - 2 * _RIM, box.cols - 2 * _RIM)
             ends = {spot for number in self._near(reach) for spot in (self.chains[number].a, self.chains[number].b)}
-            cells = np.array([self.spots[spot].cell for spot in ends], dtype=np.int64).reshape(-1, 2)
-            cells = cells[reach.holds(cells) & ~inner.holds(cells)]
-            wider = box.around(cells, _RIM + 1, limit) if len(cells) else box
+            cells = [self.spots[spot].cell for spot in ends]
+            cells = [cell for cell in cells if reach.has(cell) and not inner.has(cell)]
+            wider = box.around(np.array(cells), _RIM + 1, limit) if cells else box
             if wider == box:
                 return box
             box = wider
 
     def joined_outside(self, box: Box, parts: NDArray[np.int32]) -> list[set[int]]:
-        """Numbers in `parts` (H, W), drawn on the cells of a box, that chains outside the box join."""
+        """Numbers in `parts` (H, W), drawn on the cells of a box, that chains outside the box join.
+
+        Looks no farther from the box than it takes to find all parts that go on outside, wherever that is possible.
+        """
+        near = self._near(box)
+        links = self._links(near, box, parts)
+        left = {at for at in links if at > 0}
+        groups = []
+        while left:
+            group, open_ends = {left.pop()}, deque[int]()
+            open_ends.extend(group)
+            seen = {0, *group}
+            while open_ends and left:
+                at = open_ends.popleft()
+                found = links.get(at, set()) - seen
+                if at < 0:
+                    found |= {-self.chains[n].other(-at) for n in self._at[-at] if n not in near} - seen
+                seen |= found
+                open_ends.extend(found)
+                group |= found & left
+                left -= found
+            groups.append(group)
+        return groups
+
+    def _links(self, near: set[int], box: Box, parts: NDArray[np.int32]) -> dict[int, set[int]]:
+        """What the runs of some chains outside a box join: parts (positive numbers, 0: none) and spots (negative)."""
         links: dict[int, set[int]] = {}
-        for number, chain in self.chains.items():
-            inside = np.zeros(len(chain.cells), dtype=np.bool_)
-            if self._touches(number, box):
-                inside = box.holds(chain.cells)
-            for first, end in _runs(~inside):
-                # Spots are told from part numbers by their sign.
+        for number in near:
+            chain = self.chains[number]
+            for first, end in _runs_outside(chain.cells, box):
                 a = -chain.a if first == 0 else int(parts[tuple(chain.cells[first - 1] - (box.row, box.col))])
-                b = -chain.b if end == len(inside) else int(parts[tuple(chain.cells[end] - (box.row, box.col))])
+                b = -chain.b if end == len(chain.cells) else int(parts[tuple(chain.cells[end] - (box.row, box.col))])
                 links.setdefault(a, set()).add(b)
                 links.setdefault(b, set()).add(a)
-        links.pop(0, None)
-        return [{at for at in group if at > 0} for group in _hanging_together(links)]
-
-    def _touches(self, number: int, box: Box) -> bool:
-        end_row, end_col = box.end
-        rows = (box.row - _STRIDE >> _BLOCK, end_row + _STRIDE >> _BLOCK)
-        cols = (box.col - _STRIDE >> _BLOCK, end_col + _STRIDE >> _BLOCK)
-        blocks = self._blocks_of[number]
-        return any(rows[0] <= row <= rows[1] and cols[0] <= col <= cols[1] for row, col in blocks)
+        return links
 
 
-def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """First index and end of each run of true values."""
-    changes = np.flatnonzero(np.diff(np.concatenate(([False], mask, [False])).astype(np.int8)))
-    return list(zip(changes[::2].tolist(), changes[1::2].tolist(), strict=True))
+def _runs_outside(cells: Cells, box: Box) -> list[tuple[int, int]]:
+    """First index and end of each run of cells (K, 2) that lie outside a box."""
+    runs: list[tuple[int, int]] = _runs(cells, box.row, box.col, *box.end).tolist()
+    return [(first, end) for first, end in runs]
 
 
-def _hanging_together(links: dict[int, set[int]]) -> list[set[int]]:
-    """Groups of what is linked, directly or by others; 0 links nothing."""
-    groups, left = [], set(links)
-    while left:
-        group: set[int] = set()
-        open_ends = [left.pop()]
-        while open_ends:
-            at = open_ends.pop()
-            group.add(at)
-            found = (links[at] & left) - {0}
-            left -= found
-            open_ends.extend(found)
-        groups.append(group)
-    return groups
+@kernel
+def _runs(cells: Cells, row: int, col: int, end_row: int, end_col: int) -> Cells:
+    runs = np.empty((cells.shape[0] // 2 + 1, 2), dtype=np.int64)
+    count, was_outside = 0, False
+    for k in range(cells.shape[0]):
+        outside = not (row <= cells[k, 0] < end_row and col <= cells[k, 1] < end_col)
+        if outside and not was_outside:
+            runs[count, 0] = k
+            count += 1
+        if outside:
+            runs[count - 1, 1] = k + 1
+        was_outside = outside
+    return runs[:count]

@@ -162,7 +162,8 @@ def reachable(cells: Mask, seeds: Cells) -> Mask:
     """The true cells that are joined to one of the seeds (N, 2), over edges and corners."""
     left = np.zeros((cells.shape[0] + 2, cells.shape[1] + 2), dtype=np.bool_)
     left[1:-1, 1:-1] = cells
-    return _flood(left, (seeds[:, 0] + 1) * left.shape[1] + seeds[:, 1] + 1)[1:-1, 1:-1]
+    found = _flood(left, (seeds[:, 0] + 1) * left.shape[1] + seeds[:, 1] + 1)
+    return np.ascontiguousarray(found[1:-1, 1:-1])
 
 
 @kernel
@@ -193,36 +194,58 @@ def _flood(left: Mask, seeds: Cells) -> Mask:
 
 
 def label(cells: Mask) -> tuple[NDArray[np.int32], Cells]:
-    """Number of the part (joined over edges and corners) of each true cell, 0 elsewhere; cells in each part."""
-    framed = np.full((cells.shape[0] + 2, cells.shape[1] + 2), -1, dtype=np.int32)
-    framed[1:-1, 1:-1] = np.where(cells, 0, -1)
-    sizes = _label(framed)
-    return np.maximum(framed[1:-1, 1:-1], 0), sizes
+    """Number of the part (joined over edges and corners) of each true cell, 0 elsewhere; cells in each part.
+
+    Parts are numbered in the order of their first cells, row after row.
+    """
+    numbers: NDArray[np.int32]
+    numbers, sizes = _label(np.ascontiguousarray(cells))
+    return numbers, sizes
 
 
 @kernel
-def _label(framed: NDArray[np.int32]) -> Cells:
-    """Number, in place, the parts of the cells that are 0, row after row; the others are -1, so is the border."""
-    cols = framed.shape[1]
-    flat = framed.ravel()
+def _label(cells: Mask) -> tuple[NDArray[np.int32], Cells]:
+    rows, cols = cells.shape[0], cells.shape[1] + 2
+    # -1: to be numbered; the empty border saves the walk all questions about the rim.
+    framed = np.zeros((rows + 2, cols), dtype=np.int32)
+    for row in range(rows):
+        for col in range(cols - 2):
+            framed[row + 1, col + 1] = -np.int32(cells[row, col])
+    numbers = framed.ravel()
     steps = np.array([-cols - 1, -cols, -cols + 1, -1, 1, cols - 1, cols, cols + 1], dtype=np.int64)
-    sizes = np.zeros(flat.size // 2 + 2, dtype=np.int64)
-    stack = np.empty(flat.size, dtype=np.int64)
+    sizes = np.zeros(numbers.size // 4 + 2, dtype=np.int64)
+    stack = np.empty(numbers.size, dtype=np.int64)
     last = 0
-    for start in range(flat.size):
-        if flat[start] != 0:
+    for start in range(numbers.size):
+        if numbers[start] >= 0:
             continue
         last += 1
-        flat[start] = last
-        stack[0], count = start, 1
+        numbers[start], stack[0], count = last, start, 1
         while count > 0:
             count -= 1
             at = stack[count]
             sizes[last] += 1
             for step in steps:
                 to = at + step
-                if flat[to] == 0:
-                    flat[to] = last
-                    stack[count] = to
+                if numbers[to] < 0:
+                    numbers[to], stack[count] = last, to
                     count += 1
-    return sizes[: last + 1]
+    return np.ascontiguousarray(framed[1:-1, 1:-1]), sizes[: last + 1].copy()
+
+
+@kernel
+def true_cells(mask: Mask) -> Cells:
+    """The true cells (N, 2) of a mask (H, W), row after row."""
+    rows, cols = mask.shape
+    count = 0
+    for row in range(rows):
+        for col in range(cols):
+            count += mask[row, col]
+    cells = np.empty((count, 2), dtype=np.int64)
+    count = 0
+    for row in range(rows):
+        for col in range(cols):
+            if mask[row, col]:
+                cells[count, 0], cells[count, 1] = row, col
+                count += 1
+    return cells

@@ -18,6 +18,7 @@ from thinmap_ros.core.topology.web import Chain, room_along
 _NEW = 0  # id of a node that has none yet
 _OTHER_KIND = 0.5  # share of same_place_m by which a node of another kind counts as farther away
 Place = tuple[int, int]  # spot, -1; or chain, index of a corner
+OldEdges = dict[tuple[int, int], list[Edge]]  # by the ids of their nodes, the lower one first
 
 
 class Registry:
@@ -68,14 +69,17 @@ class Registry:
         self._heritage = nodes, list(other.map.edges.values())
         self._pieces = {edge: other._pieces[edge] for edge in other.map.edges}
 
-    def refresh(self, atlas: Atlas) -> None:
-        """Follow the changes of the atlas since the last call.
+    def refresh(self, atlas: Atlas) -> bool:
+        """Follow the changes of the atlas since the last call; returns whether there were any.
 
         A new node takes over the id of one that is gone and lay within same_place_m: nearest pairs first, and one of
         another kind counts as farther away unless it was in the same cell. An edge between two nodes keeps its id.
         """
         spots, chains = atlas.take_changes()
-        old = self._withdraw_edges(chains) + self._heritage[1]
+        changed = bool(spots or chains)
+        old: OldEdges = {}
+        for edge in self._withdraw_edges(chains) + self._heritage[1]:
+            old.setdefault((min(edge.a, edge.b), max(edge.a, edge.b)), []).append(edge)
         old_nodes = self._withdraw_nodes(atlas, spots, chains) + self._heritage[0]
         self._heritage = [], []
         places = self._places(atlas, spots, chains)
@@ -84,8 +88,10 @@ class Registry:
             self.map.put_node(replace(node, id=self._nodes[place]))
         for number in sorted(chains & atlas.chains.keys()):
             self._put_edges(atlas, number, old)
-        for edge in old:
-            del self._pieces[edge.id]
+        for left in old.values():
+            for edge in left:
+                del self._pieces[edge.id]
+        return changed
 
     def _withdraw_edges(self, chains: set[int]) -> list[Edge]:
         """Take the edges of chains that changed out of the map."""
@@ -148,7 +154,7 @@ class Registry:
                 found.append((i, j))
         return found
 
-    def _put_edges(self, atlas: Atlas, number: int, old: list[Edge]) -> None:
+    def _put_edges(self, atlas: Atlas, number: int, old: OldEdges) -> None:
         """Put the edges of a chain into the map; each takes over the id of an old one between the same nodes."""
         self._edges[number] = []
         for a, b, piece in self._pieces_of(atlas, number):
@@ -164,19 +170,19 @@ class Registry:
         ends = zip(pairwise(ids), pairwise(stops), strict=True)
         return [(a, b, chain.part(first, last)) for (a, b), (first, last) in ends]
 
-    def _edge(self, a: int, b: int, piece: Chain, old: list[Edge]) -> Edge:
+    def _edge(self, a: int, b: int, piece: Chain, old: OldEdges) -> Edge:
         """The edge along a piece of chain: an old one if it ran just there, else a new one, with an old id if any."""
-        same = [k for k, edge in enumerate(old) if {edge.a, edge.b} == {a, b}]
-        for k in same:
-            known = self._pieces[old[k].id]
-            same_cells = old[k].a == a and np.array_equal(known.cells, piece.cells)
+        same = old.get((min(a, b), max(a, b)), [])
+        for k, edge in enumerate(same):
+            known = self._pieces[edge.id]
+            same_cells = edge.a == a and np.array_equal(known.cells, piece.cells)
             if same_cells and known.squared.min() == piece.squared.min():
-                return old.pop(k)
+                return same.pop(k)
         edge_id = 0
         if same:
             middle = piece.cells[len(piece.cells) // 2]
-            middles = [self._pieces[old[k].id].cells[len(old[k].path) // 2] for k in same]
-            edge_id = old.pop(same[int(np.abs(np.array(middles) - middle).sum(axis=1).argmin())]).id
+            middles = [self._pieces[edge.id].cells[len(edge.path) // 2] for edge in same]
+            edge_id = same.pop(int(np.abs(np.array(middles) - middle).sum(axis=1).argmin())).id
         edge = edge_of(edge_id or self._new_id(), a, b, piece, self._lattice)
         self._pieces[edge.id] = piece
         return edge

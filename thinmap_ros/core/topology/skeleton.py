@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.corners import corner_indices
-from thinmap_ros.core.topology.free_space import column_distance, known_free, reachable, squared_clearance
+from thinmap_ros.core.topology.free_space import column_distance, known_free, reachable, squared_clearance, true_cells
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.core.topology.thinning import thin
 from thinmap_ros.core.topology.tracing import trace
@@ -41,7 +42,7 @@ def extract(free_cells: Mask, patch: GridPatch, config: TopologyConfig) -> Topol
 def skeleton_of(free_cells: Mask, distance: NDArray[np.int16]) -> Mask:
     """Thinned free cells; each part that thinning erases whole (2 x 2 blobs and what shrinks to one) keeps a cell."""
     skeleton = thin(free_cells)
-    lost = free_cells & ~reachable(free_cells, np.argwhere(skeleton))
+    lost = free_cells & ~reachable(free_cells, true_cells(skeleton))
     while lost.any():
         part = np.argwhere(reachable(lost, np.argwhere(lost)[:1]))
         row, col = part[int(squared_clearance(distance, part).argmax())]
@@ -89,14 +90,19 @@ def looks_out(known: Mask, occupied: Mask, rim_is_unknown: bool) -> Promise:
     frontier = known & beside
 
     def promising(spot: Spot) -> bool:
-        reach = math.sqrt(spot.squared) + _FARTHER
-        first_row, first_col = (max(math.ceil(place - reach), 0) for place in spot.cell)
-        near = frontier[first_row : int(spot.cell[0] + reach) + 1, first_col : int(spot.cell[1] + reach) + 1]
-        rows, cols = np.nonzero(near)
-        squared = (rows + (first_row - spot.cell[0])) ** 2 + (cols + (first_col - spot.cell[1])) ** 2
-        return int(np.count_nonzero(squared <= reach**2)) >= _LOOKS_OUT
+        return _count_near(frontier, *spot.cell, math.sqrt(spot.squared) + _FARTHER) >= _LOOKS_OUT
 
     return promising
+
+
+@kernel
+def _count_near(cells: Mask, row: int, col: int, reach: float) -> int:
+    """True cells (H, W) within some cells of a place."""
+    count = 0
+    for r in range(max(math.ceil(row - reach), 0), min(int(row + reach) + 1, cells.shape[0])):
+        for c in range(max(math.ceil(col - reach), 0), min(int(col + reach) + 1, cells.shape[1])):
+            count += cells[r, c] and (r - row) ** 2 + (c - col) ** 2 <= reach**2
+    return count
 
 
 def map_of(web: Web, frame: GridFrame, config: TopologyConfig) -> TopologicalMap:
@@ -140,4 +146,4 @@ def node_of(number: int, kind: NodeKind, cell: tuple[int, int], squared: int, fr
 def edge_of(number: int, a: int, b: int, piece: Chain, frame: GridFrame) -> Edge:
     """Edge from node a to node b along a piece of chain."""
     clearance = math.sqrt(int(piece.squared.min())) * frame.resolution
-    return Edge(number, a, b, frame.centres_of(piece.cells), piece.length() * frame.resolution, clearance)
+    return Edge(number, a, b, frame.centres_of(piece.cells), piece.length * frame.resolution, clearance)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.jit import kernel
-from thinmap_ros.core.topology.free_space import label, reachable
+from thinmap_ros.core.topology.free_space import label, true_cells
 from thinmap_ros.core.topology.thinning import thin
 
 Mask = NDArray[np.bool_]
@@ -44,7 +44,7 @@ def stitch(seam: Seam, joined_outside: Grouping) -> Mask:
     """
     drawn, kept = seam.new & seam.window, seam.old & ~seam.window
     result = drawn | kept
-    targets = np.argwhere(drawn)
+    targets = true_cells(drawn)
     for end in _loose(kept, seam.old & seam.window, drawn):
         _draw_line(result, seam.free, end, targets)
     parts, sizes = label(result)
@@ -52,7 +52,8 @@ def stitch(seam: Seam, joined_outside: Grouping) -> Mask:
         free_parts, free_sizes = label(seam.free)
         if _share_free_space(parts, free_parts, len(free_sizes)):
             _bridge_parts(result, seam.free, parts, len(sizes) - 1, joined_outside(parts))
-        result &= _held(result, kept | reachable(seam.free, seam.robot))
+            parts, sizes = label(result)
+        result &= _held(result, parts, len(sizes), kept | _part_of(seam.robot, free_parts, len(free_sizes)))
         sizes = label(result)[1]
     if euler_number(result) < len(sizes) - 1 and _fill_empty_loops(result, seam.free):
         result = thin(result)
@@ -106,10 +107,17 @@ def _bridge_parts(
         owner[owner == number] = _draw_way(result, free, owner[parts], number)
 
 
-def _held(result: Mask, held: Mask) -> Mask:
-    """Cells of the parts that have a cell in `held`."""
-    parts, sizes = label(result)
-    keep = np.zeros(len(sizes), dtype=np.bool_)
+def _part_of(places: Cells, parts: NDArray[np.int32], count: int) -> Mask:
+    """Cells of those of the `count` - 1 parts in which some places (N, 2) lie."""
+    chosen = np.zeros(count, dtype=np.bool_)
+    chosen[parts[places[:, 0], places[:, 1]]] = True
+    chosen[0] = False
+    return chosen[parts]
+
+
+def _held(result: Mask, parts: NDArray[np.int32], count: int, held: Mask) -> Mask:
+    """Cells of those of the `count` - 1 parts of the result that have a cell in `held`."""
+    keep = np.zeros(count, dtype=np.bool_)
     keep[parts[result & held]] = True
     return keep[parts]
 

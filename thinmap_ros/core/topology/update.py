@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.se2 import Array, invert, transform_points
 from thinmap_ros.core.topology.atlas import Atlas, Box
 from thinmap_ros.core.topology.config import TopologyConfig
@@ -21,6 +22,7 @@ from thinmap_ros.core.topology.free_space import (
     select_free_space,
     squared_clearance,
     standing_room,
+    true_cells,
 )
 from thinmap_ros.core.topology.graph import Node, TopologicalMap
 from thinmap_ros.core.topology.identity import Registry
@@ -58,21 +60,32 @@ class TopologyBuilder:
         self._surroundings: Surroundings | None = None
         self._registry: Registry | None = None
         self._empty = TopologicalMap()
+        self._newest: tuple[_View, GridPatch] | None = None
 
     @property
     def map(self) -> TopologicalMap:
         """The global map. It is changed in place by `update`; take a copy to keep a state."""
         return self._empty if self._registry is None else self._registry.map
 
-    def update(self, window: GridPatch, T_map_base: Array) -> TopologicalMap:
-        """Take in the window round the robot at pose T_map_base (3,); returns the window's own map, ids from 1.
+    def update(self, window: GridPatch, T_map_base: Array) -> bool:
+        """Take in the window round the robot at pose T_map_base (3,); returns whether the map changed.
 
         Windows must lie on the cells of one lattice. Raises InputError where they do not, or the pose is not finite.
         """
-        view = self._take(window, T_map_base)
+        self._newest = self._take(window, T_map_base), window
         self._registry = self._registry or Registry(self.config, window.frame)
-        self._registry.refresh(self._atlas)
-        return self._local(view, window)
+        return self._registry.refresh(self._atlas)
+
+    def local_map(self) -> TopologicalMap:
+        """The newest window's own map, ids from 1: its part of the skeleton, not merged with anything."""
+        if self._newest is None:
+            return TopologicalMap()
+        view, window = self._newest
+        margin = (view.skeleton.shape[0] - window.shape[0]) // 2
+        inner = slice(margin, margin + window.shape[0]), slice(margin, margin + window.shape[1])
+        shown = web_of(view.skeleton[inner], lambda cells: view.measure(cells + margin))
+        shown.dissolve_all(set(shown.spots))
+        return map_of(shown, window.frame, self.config)
 
     def rebuild(self, window_at: Callable[[float, float], GridPatch], before: Array, after: Array) -> None:
         """Build the map anew after the robot's past poses (N, 3) were corrected, nodes carried along.
@@ -130,18 +143,14 @@ class TopologyBuilder:
     def _merge(self, view: '_View', known: tuple[Cells, Cells], box: Box) -> None:
         """Put the skeleton of the window into the atlas where it differs from what was there."""
         low = np.array([box.row, box.col])
-        old = np.zeros((box.rows, box.cols), dtype=np.int64)
-        rows, cols = (known[0] - low).T
-        old[rows, cols] = known[1]
-        fresh = view.fresh()
-        if np.array_equal(fresh, np.where(view.redrawn, old, 0)):
+        old, fresh = _raster(known[0] - low, known[1], box.rows, box.cols), view.fresh()
+        if _agree(fresh, old, view.redrawn):
             return
         seam = Seam(fresh > 0, old > 0, view.redrawn, view.free, view.robot)
         stitched = stitch(seam, lambda parts: self._atlas.joined_outside(box, parts))
-        squared = np.where(view.redrawn, fresh, old)
-        added = np.argwhere(stitched & (squared == 0))
+        squared = np.where(stitched, np.where(view.redrawn, fresh, old), 0)
+        added = true_cells(stitched & (squared == 0))
         squared[added[:, 0], added[:, 1]] = view.measure(added)
-        squared[~stitched] = 0
         touched: set[int] = set()
         for part in self._places_to_redraw(squared != old, box):
             corner = np.array([part.row, part.col]) - low
@@ -151,7 +160,7 @@ class TopologyBuilder:
 
     def _places_to_redraw(self, changed: NDArray[np.bool_], box: Box) -> list[Box]:
         """Rectangles of the lattice that hold what changed in a box (H, W), apart from each other."""
-        cells = np.argwhere(changed)
+        cells = true_cells(changed)
         blocks = cells // _APART
         coarse = np.zeros((box.rows // _APART + 1, box.cols // _APART + 1), dtype=np.bool_)
         coarse[blocks[:, 0], blocks[:, 1]] = True
@@ -182,14 +191,24 @@ class TopologyBuilder:
         web = web_of(squared > 0, lambda cells: squared[cells[:, 0], cells[:, 1]], pinned)
         return self._atlas.graft(web, place, cut.anchors) | cut.touched
 
-    def _local(self, view: '_View', window: GridPatch) -> TopologicalMap:
-        """The window's own part of the new skeleton as a map."""
-        margin = (view.skeleton.shape[0] - window.shape[0]) // 2
-        inner = slice(margin, margin + window.shape[0]), slice(margin, margin + window.shape[1])
-        shown = web_of(view.skeleton[inner], lambda cells: view.measure(cells + margin))
-        for spot in list(shown.spots):
-            shown.dissolve(spot)
-        return map_of(shown, window.frame, self.config)
+
+@kernel
+def _raster(cells: Cells, values: Cells, rows: int, cols: int) -> Cells:
+    """Values (N,) at their cells (N, 2) of an array (rows, cols), 0 elsewhere."""
+    raster = np.zeros((rows, cols), dtype=np.int64)
+    for k in range(cells.shape[0]):
+        raster[cells[k, 0], cells[k, 1]] = values[k]
+    return raster
+
+
+@kernel
+def _agree(fresh: Cells, old: Cells, where: NDArray[np.bool_]) -> bool:
+    """Whether two arrays (H, W) are the same at some cells, and the first one is 0 at all others."""
+    for row in range(fresh.shape[0]):
+        for col in range(fresh.shape[1]):
+            if fresh[row, col] != (old[row, col] if where[row, col] else 0):
+                return False
+    return True
 
 
 def _thinned_out(poses: Array) -> Array:
@@ -239,12 +258,10 @@ class _View:
 
     def fresh(self) -> Cells:
         """Squared clearances (H, W) of the new skeleton where it is to take the old one's place, 0 elsewhere."""
-        squared = np.zeros(self.skeleton.shape, dtype=np.int64)
-        cells = np.argwhere(self.skeleton & self.redrawn)
-        squared[cells[:, 0], cells[:, 1]] = self.measure(cells)
-        return squared
+        cells = true_cells(self.skeleton & self.redrawn)
+        return _raster(cells, self.measure(cells), *self.skeleton.shape)
 
     def is_promising(self, spot: Spot, box: Box) -> bool:
         """Whether a spot on the lattice looks into the unknown; those outside the box may."""
-        inside = bool(box.holds(np.array(spot.cell)))
-        return not inside or self._looks_out(Spot((spot.cell[0] - box.row, spot.cell[1] - box.col), spot.squared))
+        row, col = spot.cell
+        return not box.has(spot.cell) or self._looks_out(Spot((row - box.row, col - box.col), spot.squared))

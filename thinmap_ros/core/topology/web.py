@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +55,7 @@ class Chain:
         piece = slice(first, last + 1)
         return Chain(self.a, self.b, self.cells[piece], self.squared[piece])
 
+    @cached_property
     def length(self) -> float:
         """Length along the cells, in cells."""
         return path_length(self.cells)
@@ -155,6 +157,11 @@ class Web:
         self.drop_spot(spot)
         self.add_chain((one if one.b == spot else one.reversed()).joined(two.starting_at(spot)))
 
+    def dissolve_all(self, spots: set[int]) -> None:
+        """Dissolve some spots, in order."""
+        for spot in sorted(spot for spot in spots if len(self._at.get(spot, ())) == 2):
+            self.dissolve(spot)
+
     def merge(self, number: int, kept: int) -> None:
         """Draw the two ends of a chain together at one of them; the other's chains get the way between."""
         chain = self.chains[number].starting_at(kept)
@@ -181,21 +188,19 @@ def simplify(
 
     promising: whether the tip of a branch looks into the unknown.
     """
-    for spot in sorted(spots):
-        web.dissolve(spot)
+    web.dissolve_all(spots)
     while _drop_spurs(web, spots, promising, limits):
         pass
     _merge_close(web, spots, limits.join)
     _drop_hollow(web, spots, limits.radius)
-    for spot in sorted(spots):
-        web.dissolve(spot)
+    web.dissolve_all(spots)
     _move_rings(web, spots)
 
 
 def _merge_close(web: Web, spots: set[int], limit: float) -> None:
     """Make one branch of two that are joined by a short chain, shortest first; the roomier place stays."""
     candidates = [n for n in web.chains_among(spots) if len(web.chains[n].cells) <= limit + 1.0]
-    open_numbers = sorted((web.chains[n].length(), n) for n in candidates)
+    open_numbers = sorted((web.chains[n].length, n) for n in candidates)
     for length, number in open_numbers:
         chain = web.chains.get(number)
         if chain is None or length > limit or chain.a == chain.b:
@@ -213,15 +218,21 @@ def _drop_hollow(web: Web, spots: set[int], radius: float) -> None:
     """
     # Cells lie up to half a cell beside the true ring; round a single cell goes a ring of area 2.
     least = max(math.pi * (radius - 0.5) ** 2, 1.0)
-    side_by_side: dict[tuple[int, int], list[Chain]] = {}
-    for _, number in sorted((web.chains[n].length(), n) for n in web.chains_among(spots)):
+    side_by_side: dict[tuple[int, int], list[int]] = {}
+    for number in web.chains_among(spots):
         chain = web.chains[number]
-        kept = side_by_side.setdefault((min(chain.a, chain.b), max(chain.a, chain.b)), [])
-        back = [other.starting_at(chain.b).cells[1:] for other in kept] if chain.a != chain.b else [chain.cells[:0]]
-        if any(_area(np.concatenate((chain.cells, way))) < least for way in back):
-            web.drop_chain(number)
-        else:
-            kept.append(chain)
+        side_by_side.setdefault((min(chain.a, chain.b), max(chain.a, chain.b)), []).append(number)
+    for (a, b), numbers in side_by_side.items():
+        kept: list[Chain] = []
+        # Most chains are alone, and need no length.
+        ordered = sorted(numbers, key=lambda n: (web.chains[n].length, n)) if len(numbers) > 1 else numbers
+        for number in ordered:
+            chain = web.chains[number]
+            back = [other.starting_at(chain.b).cells[1:] for other in kept] if a != b else [chain.cells[:0]]
+            if any(_area(np.concatenate((chain.cells, way))) < least for way in back):
+                web.drop_chain(number)
+            else:
+                kept.append(chain)
 
 
 def _area(ring: Cells) -> float:
@@ -254,7 +265,7 @@ def _drop_spurs(
             continue
         tip, base = spur
         tip_room, base_room = (math.sqrt(web.spots[spot].squared) - radius for spot in (tip, base))
-        adds = chain.length() + tip_room - base_room
+        adds = chain.length + tip_room - base_room
         seen = adds <= limits.spur_ratio * base_room and not promising(web.spots[tip])
         if adds <= limits.spur or seen:
             gone.append((number, tip, base))
@@ -264,8 +275,7 @@ def _drop_spurs(
     for number, tip, _ in gone:
         web.drop_chain(number)
         web.drop_spot(tip)
-    for base in sorted({base for _, _, base in gone}):
-        web.dissolve(base)
+    web.dissolve_all({base for _, _, base in gone})
     return bool(gone)
 
 
