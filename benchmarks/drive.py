@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
+from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, WindowConfig
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.se2 import Array, pose, wrap
@@ -16,7 +16,7 @@ from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig, bu
 from thinmap_ros.sim.lms200 import Lms200, Lms200Config
 from thinmap_ros.sim.world import World
 
-WINDOW_M = 10.0
+WINDOW_M = WindowConfig().window_m
 _STEP_M = 0.1  # between scans: half a metre a second at 5 Hz
 _TURN_RAD = 0.3
 _TRIES = 40

@@ -57,9 +57,11 @@ def log_odds(probability: float) -> float:
 
 @dataclass(frozen=True)
 class WindowConfig(Config):
-    """The part of the map around the robot that is thinned at every scan."""
+    """The part of the map around the robot that a scan changes."""
 
-    window_m: float = parameter(10.0, 'edge of the local map around the robot, m', low=2.0, high=100.0)
+    window_m: float = parameter(
+        16.0, 'edge of the local map around the robot, m: best twice what the laser reaches', low=2.0, high=100.0
+    )
 
 
 class OccupancyGrid:

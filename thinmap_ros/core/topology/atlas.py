@@ -51,6 +51,20 @@ class Box:
         """The first row and col after it."""
         return (self.row + self.rows, self.col + self.cols)
 
+    def grown(self, rim: int) -> 'Box':
+        """The same with a rim round it, or less a rim where it is negative."""
+        return Box(self.row - rim, self.col - rim, self.rows + 2 * rim, self.cols + 2 * rim)
+
+    def middle(self, size: int) -> 'Box':
+        """The square of at most so many rows and columns in its middle."""
+        rows, cols = max(self.rows - size, 0) // 2, max(self.cols - size, 0) // 2
+        return Box(self.row + rows, self.col + cols, min(self.rows, size), min(self.cols, size))
+
+    def within(self, outer: 'Box') -> tuple[slice, slice]:
+        """Where it lies in an array of the outer one's cells."""
+        row, col = self.row - outer.row, self.col - outer.col
+        return slice(row, row + self.rows), slice(col, col + self.cols)
+
     def meets(self, other: 'Box') -> bool:
         """Whether the two share a cell or touch."""
         rows = self.row <= other.end[0] and other.row <= self.end[0]
@@ -211,8 +225,7 @@ class Atlas(Web):
     def calm(self, box: Box, limit: Box) -> Box:
         """A box, made larger until no spot lies at its border: there, chains that are cut would touch each other."""
         while True:
-            reach = Box(box.row - _RIM, box.col - _RIM, box.rows + 2 * _RIM, box.cols + 2 * _RIM)
-            inner = Box(box.row + _RIM, box.col + _RIM, box.rows - 2 * _RIM, box.cols - 2 * _RIM)
+            reach, inner = box.grown(_RIM), box.grown(-_RIM)
             ends = {spot for number in self._near(reach) for spot in (self.chains[number].a, self.chains[number].b)}
             cells = [self.spots[spot].cell for spot in ends]
             cells = [cell for cell in cells if reach.has(cell) and not inner.has(cell)]

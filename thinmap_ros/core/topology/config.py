@@ -17,8 +17,11 @@ class TopologyConfig(Config):
         0.5, 'a branch to a known wall must also bring it farther than this share of the free radius', low=0.0, high=5.0
     )
     join_m: float = parameter(0.4, 'branch nodes closer than this along the skeleton are one, m', low=0.0, high=5.0)
-    context_m: float = parameter(6.0, 'width of what is thinned with the window round it, m', low=0.0, high=50.0)
-    memory_m: float = parameter(50.0, 'how far round the window past ones are remembered, m', low=0.0, high=200.0)
+    near_m: float = parameter(
+        10.0, 'edge of the square round the robot that is thinned at every scan, m', low=2.0, high=50.0
+    )
+    context_m: float = parameter(6.0, 'width of what is thinned with it all round, m', low=0.0, high=50.0)
+    memory_m: float = parameter(50.0, 'how far round a window past ones are remembered, m', low=0.0, high=200.0)
     margin_m: float = parameter(
         2.0, 'how far from places known before, but out of sight, the old skeleton stays, m', low=0.0, high=50.0
     )

@@ -27,36 +27,42 @@ class Surroundings:
     Thinning near the rim of a window differs from thinning the whole map. With what lies round the window at hand,
     context_m wide, the skeleton goes on over its rim as it would in a map of the whole. The cells are kept in a square
     array whose indices wrap round, so that nothing is moved when the robot moves.
+
+    `near` is the near part of the window, `inner` that part or all of it, whichever is to be thinned now, and `box`
+    the same with its context.
     """
 
     def __init__(self, lattice: GridFrame, window: tuple[int, int], config: TopologyConfig) -> None:
         """Begin on the cells of a lattice, for windows of at most so many rows and columns."""
         resolution = lattice.resolution
         self.lattice = lattice
-        self.margin = round(config.context_m / resolution)
+        self._margin = round(config.context_m / resolution)
+        self._near = round(config.near_m / resolution)
         self._depth = round(config.margin_m / resolution)
-        self._reach = max(round(config.memory_m / resolution), self.margin)
+        self._reach = max(round(config.memory_m / resolution), self._margin)
         self._size = max(window) + 2 * self._reach
         self._memory: States = np.full((self._size, self._size), _NEVER, dtype=np.int8)
         self._low = (0, 0)
-        self.box = Box(0, 0, 1, 1)
+        self.box = self.inner = self.near = Box(0, 0, 1, 1)
         self._cells: States = np.full((1, 1), _NEVER, dtype=np.int8)
 
-    def take(self, window: GridPatch) -> None:
-        """Move to a new window and take its cells over.
+    def take(self, window: GridPatch, wide: bool) -> None:
+        """Move to a new window and take its cells over; wide: all of it is to be thinned, not the near part only.
 
         Raises InputError where its cells do not lie on those of the first window, or it is larger than that one was.
         """
         row, col = self._place_of(window.frame)
-        rows, cols = (size + 2 * self.margin for size in window.shape)
-        if max(rows, cols) > self._size:
+        whole = Box(row, col, *window.shape)
+        if max(window.shape) + 2 * self._margin > self._size:
             raise InputError(f'window of {window.shape} cells: expected the size of the first one')
         self._move_to(row, col, window.shape)
         states = np.where(window.free, FREE, np.where(window.occupied, OCCUPIED, np.int8(UNKNOWN)))
-        for cells, memory in self._parts(Box(row, col, *window.shape)):
+        for cells, memory in self._parts(whole):
             self._memory[memory] = states[cells]
-        self.box = Box(row - self.margin, col - self.margin, rows, cols)
-        self._cells = np.empty((rows, cols), dtype=np.int8)
+        self.near = whole.middle(self._near)
+        self.inner = whole if wide else self.near
+        self.box = self.inner.grown(self._margin)
+        self._cells = np.empty((self.box.rows, self.box.cols), dtype=np.int8)
         for cells, memory in self._parts(self.box):
             self._cells[cells] = self._memory[memory]
 
@@ -98,21 +104,15 @@ class Surroundings:
         return [((r, c), (at_r, at_c)) for r, at_r in rows for c, at_c in cols]
 
     def redrawn(self, painted: Mask) -> Mask:
-        """Where the new skeleton takes the old one's place: the window, away from places known but not remembered.
+        """Where the new skeleton takes the old one's place: the inner part, away from places known but not remembered.
 
         painted (H, W): from `patch`. There the new skeleton rests on the outline of the old one only.
         """
         result = np.zeros_like(painted)
-        result[self.inner] = True
+        result[self.inner.within(self.box)] = True
         if painted.any():
             result &= ~_dilated(_dilated(painted, self._depth).T, self._depth).T
         return result
-
-    @property
-    def inner(self) -> tuple[slice, slice]:
-        """Where the newest window lies in the box."""
-        rows, cols = self.box.rows, self.box.cols
-        return (slice(self.margin, rows - self.margin), slice(self.margin, cols - self.margin))
 
     def patch(self, skeleton: Cells, squared: Cells) -> tuple[GridPatch, Mask]:
         """The remembered cells; where nothing is, what the known skeleton says; and a mask (H, W) of the latter.

@@ -34,6 +34,7 @@ from thinmap_ros.core.topology.web import Limits, Spot, simplify
 __all__ = ['TopologyBuilder', 'TopologyConfig', 'build']
 
 Cells = NDArray[np.int64]
+_WIDE_EVERY = 5  # scans: what lies farther from the robot changes more slowly
 _STRIDE_M = 1.0  # between poses at which the map is built anew
 _PAD = 6  # cells round what changed that are drawn anew with it
 _APART = 16  # cells between changes that are drawn anew each for itself
@@ -47,9 +48,10 @@ def build(patch: GridPatch, seed_xy: tuple[float, float] | None, config: Topolog
 class TopologyBuilder:
     """The global topological map, kept up to date by looking only at the surroundings of the robot.
 
-    At each scan the window is thinned, together with what is remembered round it, and its part of the global map is
-    drawn anew from that: all that lay in the window is cut out, the new skeleton put in its place and joined to the
-    chains that go on outside, and nodes and edges are found again there as in a map of its own. So a node at a
+    At each scan the near part of the window is thinned, together with what is remembered round it, and every few
+    scans all of the window, so that what only the far ends of the beams change is drawn in too. Its part of the
+    global map is drawn anew from that: all that lay there is cut out, the new skeleton put in its place and joined to
+    the chains that go on outside, and nodes and edges are found again there as in a map of its own. So a node at a
     window's rim is gone as soon as the window has moved on, and no grid of the whole is needed.
     Source: topological map paper section 2.2, Fig. 5 and 8.
     """
@@ -60,7 +62,8 @@ class TopologyBuilder:
         self._surroundings: Surroundings | None = None
         self._registry: Registry | None = None
         self._empty = TopologicalMap()
-        self._newest: tuple[_View, GridPatch] | None = None
+        self._view: _View | None = None
+        self._taken = 0
 
     @property
     def map(self) -> TopologicalMap:
@@ -72,20 +75,20 @@ class TopologyBuilder:
 
         Windows must lie on the cells of one lattice. Raises InputError where they do not, or the pose is not finite.
         """
-        self._newest = self._take(window, T_map_base), window
+        self._view = self._take(window, T_map_base, wide=self._taken % _WIDE_EVERY == 0)
+        self._taken += 1
         self._registry = self._registry or Registry(self.config, window.frame)
         return self._registry.refresh(self._atlas)
 
     def local_map(self) -> TopologicalMap:
-        """The newest window's own map, ids from 1: its part of the skeleton, not merged with anything."""
-        if self._newest is None:
+        """The map of what is near in the newest window, near_m wide, not merged with anything; ids from 1."""
+        view, around = self._view, self._surroundings
+        if view is None or around is None:
             return TopologicalMap()
-        view, window = self._newest
-        margin = (view.skeleton.shape[0] - window.shape[0]) // 2
-        inner = slice(margin, margin + window.shape[0]), slice(margin, margin + window.shape[1])
-        shown = web_of(view.skeleton[inner], lambda cells: view.measure(cells + margin))
+        low = np.array([around.near.row - around.box.row, around.near.col - around.box.col])
+        shown = web_of(view.skeleton[around.near.within(around.box)], lambda cells: view.measure(cells + low))
         shown.dissolve_all(set(shown.spots))
-        return map_of(shown, window.frame, self.config)
+        return map_of(shown, around.lattice.shifted(around.near.row, around.near.col), self.config)
 
     def rebuild(self, window_at: Callable[[float, float], GridPatch], before: Array, after: Array) -> None:
         """Build the map anew after the robot's past poses (N, 3) were corrected, nodes carried along.
@@ -97,7 +100,7 @@ class TopologyBuilder:
         old = self._registry
         self._atlas, self._surroundings, self._registry = Atlas(), None, None
         for T in _thinned_out(after):
-            self._take(window_at(float(T[0]), float(T[1])), T)
+            self._take(window_at(float(T[0]), float(T[1])), T, wide=True)
         if self._surroundings is None:
             return
         self._registry = Registry(self.config, self._surroundings.lattice)
@@ -109,7 +112,8 @@ class TopologyBuilder:
         """All that the builder knows as arrays by name, empty before the first window; `from_state` goes on from it."""
         if self._surroundings is None or self._registry is None:
             return {}
-        return self._surroundings.state() | self._atlas.state() | self._registry.state()
+        own = {'taken': np.array(self._taken)}
+        return own | self._surroundings.state() | self._atlas.state() | self._registry.state()
 
     @staticmethod
     def from_state(state: Mapping[str, NDArray[Any]], config: TopologyConfig | None = None) -> 'TopologyBuilder':
@@ -123,18 +127,19 @@ class TopologyBuilder:
         try:
             builder._surroundings = Surroundings.from_state(state, builder.config)
             builder._atlas = Atlas.from_state(state)
+            builder._taken = int(state['taken'])
             builder._registry = Registry(builder.config, builder._surroundings.lattice)
             builder._registry.restore(builder._atlas, state)
         except (KeyError, ValueError, TypeError, IndexError, ZeroDivisionError) as error:
             raise InputError(f'saved topology: {type(error).__name__} {error}: expected what was saved') from error
         return builder
 
-    def _take(self, window: GridPatch, T_map_base: Array) -> '_View':
+    def _take(self, window: GridPatch, T_map_base: Array, wide: bool) -> '_View':
         """Look at a window and bring the atlas up to date."""
         if self._surroundings is None:
             self._surroundings = Surroundings(window.frame, window.shape, self.config)
         around = self._surroundings
-        around.take(window)
+        around.take(window, wide)
         known = self._atlas.within(around.box)
         view = _View(around, known, (float(T_map_base[0]), float(T_map_base[1])), self.config)
         self._merge(view, known, around.box)
@@ -153,9 +158,7 @@ class TopologyBuilder:
         squared[added[:, 0], added[:, 1]] = view.measure(added)
         touched: set[int] = set()
         for part in self._places_to_redraw(squared != old, box):
-            corner = np.array([part.row, part.col]) - low
-            inner = tuple(slice(at, at + size) for at, size in zip(corner, (part.rows, part.cols), strict=True))
-            touched |= self._redraw(np.ascontiguousarray(squared[inner]), part)
+            touched |= self._redraw(np.ascontiguousarray(squared[part.within(box)]), part)
         simplify(self._atlas, touched, lambda spot: view.is_promising(spot, box), view.limits)
 
     def _places_to_redraw(self, changed: NDArray[np.bool_], box: Box) -> list[Box]:
