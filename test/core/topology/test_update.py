@@ -71,6 +71,21 @@ def test_a_drive_leads_to_the_map_of_the_whole():
     assert len(cells) <= 1.1 * len(np.unique(cells, axis=0)) + 20
 
 
+def test_what_only_the_far_ends_of_beams_change_is_drawn_in_too():
+    patch, here = building(), [(5.0, 12.0)]
+    builder = TopologyBuilder()
+    ((open_window, T),) = windows(patch, here, size=160)
+    builder.update(open_window, T)
+    far = [node for node in builder.map.nodes.values() if abs(node.y - 12.0) > 6.0]
+    assert far, 'the window beyond the near part is drawn'
+    patch.cells[40:60, 40:90] = 100  # the corner of the corridors, 6 to 8 m away
+    ((window, T),) = windows(patch, here, size=160)
+    for _ in range(5):
+        builder.update(window, T)
+    assert not any(4.0 < node.x < 9.0 and 4.0 < node.y < 6.0 for node in builder.map.nodes.values())
+    assert all(abs(node.x - 5.0) <= 5.0 and abs(node.y - 12.0) <= 5.0 for node in builder.local_map().nodes.values())
+
+
 def test_ids_stay_while_nothing_changes():
     patch, builder = building(), TopologyBuilder()
     way = legs((5, 5), (5, 17), (16, 17), (16, 5), (5, 5))
