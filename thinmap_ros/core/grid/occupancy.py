@@ -118,6 +118,8 @@ class OccupancyGrid:
             origin_x, origin_y, resolution = frame.astype(np.float64).tolist()
         except (KeyError, ValueError, TypeError) as error:
             raise InputError(f'saved grid: {error}: expected frame, tiles and log_odds') from error
+        if not np.isfinite([origin_x, origin_y, resolution]).all() or tiles.dtype != np.int64:
+            raise InputError(f'saved grid: frame {frame}, tiles of {tiles.dtype}: expected finite numbers, whole ones')
         if tiles.shape != (len(odds), 2) or odds.shape[1:] != (TILE, TILE) or odds.dtype != np.int16:
             raise InputError(f'saved grid: {tiles.shape} tiles, {odds.shape} log odds: expected one array a tile')
         if np.abs(odds.astype(np.int64)).max(initial=0) > _LIMIT:
