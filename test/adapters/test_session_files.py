@@ -7,7 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thinmap_ros.adapters.session_files import read_grid, read_topology, write_grid, write_topology
+from thinmap_ros.adapters.map_files import write_map
+from thinmap_ros.adapters.session_files import (
+    has_topology,
+    load_grid,
+    load_topology,
+    read_grid,
+    read_topology,
+    save_grid,
+    save_topology,
+    stem_of,
+    write_grid,
+    write_topology,
+)
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
@@ -91,6 +103,52 @@ def test_what_does_not_fit_is_said(tmp_path: Path) -> None:
         read_grid(tmp_path / 'a.npz', OccupancyConfig(resolution_m=0.05))
     with pytest.raises(InputError, match='memory_m'):
         read_topology(tmp_path / 'b.npz', TopologyConfig(memory_m=20.0))
+
+
+@pytest.mark.parametrize('end', ['', '.grid.npz', '.topology.npz', '.yaml', '.pgm'])
+def test_a_session_is_named_by_its_stem_or_one_of_its_files(tmp_path: Path, end: str) -> None:
+    grid, builder = OccupancyGrid(), TopologyBuilder()
+    drive(grid, builder, way()[:5], 0)
+    path = str(tmp_path / 'v1.2' / 'room.one') + end
+    assert not has_topology(path)
+    save_grid(path, grid)
+    save_topology(path, builder)
+    assert {file.name for file in (tmp_path / 'v1.2').iterdir()} == {
+        f'room.one{each}' for each in ('.grid.npz', '.topology.npz', '.yaml', '.pgm')
+    }
+    assert has_topology(path)
+    assert np.array_equal(load_grid(path).state()['log_odds'], grid.state()['log_odds'])
+    assert_same(load_topology(path, None, 0.1).map, builder.map)
+    with pytest.raises(InputError, match=r'room.one.topology.npz: made from 0.1 m a cell: expected 0.05 m'):
+        load_topology(path, None, 0.05)
+
+
+@pytest.mark.parametrize('path', ['', '.', '/', '.yaml', 'a\0b'])
+def test_what_names_no_session(path: str) -> None:
+    with pytest.raises(InputError, match='expected the path'):
+        stem_of(path)
+
+
+def test_a_map_is_read_where_there_is_no_saved_grid_and_only_there(tmp_path: Path) -> None:
+    grid = OccupancyGrid()
+    drive(grid, TopologyBuilder(), way()[:5], 0)
+    write_map(tmp_path / 'a', grid.patch())
+    assert load_grid(str(tmp_path / 'a')).patch().occupied.sum() == grid.patch().occupied.sum() > 50
+    with pytest.raises(InputError, match='resolution_m'):
+        load_grid(str(tmp_path / 'a.yaml'), OccupancyConfig(resolution_m=0.05))
+    with pytest.raises(InputError, match=r'a.grid.npz: No such file'):
+        load_grid(str(tmp_path / 'a.grid.npz'))
+    (tmp_path / 'a.grid.npz').write_bytes(b'no archive')
+    with pytest.raises(InputError, match=r'a.grid.npz: .*expected a saved grid'):
+        load_grid(str(tmp_path / 'a'))
+    with pytest.raises(InputError, match=r'neither b.grid.npz nor b.yaml'):
+        load_grid(str(tmp_path / 'b'))
+
+
+@pytest.mark.parametrize('wrong', [{'frame': np.array([0.0, np.nan, 0.1])}, {'tiles': np.zeros((0, 2))}])
+def test_a_grid_of_nonsense_is_refused(wrong: dict[str, Array]) -> None:
+    with pytest.raises(InputError, match='expected finite numbers'):
+        OccupancyGrid.from_state(OccupancyGrid().state() | wrong)
 
 
 @pytest.mark.parametrize('seed', range(30))

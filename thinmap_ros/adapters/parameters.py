@@ -36,6 +36,11 @@ def declare_value(node: Node, name: str, default: Any, description: str) -> Any:
         raise ConfigError(f'parameter {name} of node {node.get_name()}: {error}') from error
 
 
+def declare_session(node: Node) -> str:
+    """Declare the parameter `session` and return its value."""
+    return str(declare_value(node, 'session', '', 'path STEM of a saved session to go on from; empty: begin anew'))
+
+
 def check_unknown(node: Node) -> None:
     """Raise ConfigError where a parameter was given that the node does not have: a typo must not go unseen."""
     given = node._parameter_overrides  # rclpy has no public way to see what was given but never declared

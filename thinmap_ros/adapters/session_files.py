@@ -1,4 +1,8 @@
-"""Saved sessions: grid and topological map with all that their builders know, so that work goes on where it was."""
+"""Saved sessions: grid and topological map with all that their builders know, so that work goes on where it was.
+
+A session has a path STEM: STEM.grid.npz holds the grid, STEM.pgm and STEM.yaml the same as a map_server map, and
+STEM.topology.npz the graph with its ids.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -8,12 +12,75 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.adapters.files import written_aside
+from thinmap_ros.adapters.map_files import read_map, write_map
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig
 
 _FORMAT = 'thinmap_format'
 _GRID, _TOPOLOGY = 'grid 1', 'topology 1'
+_GRID_END, _TOPOLOGY_END, _MAP_END = '.grid.npz', '.topology.npz', '.yaml'
+
+
+def stem_of(path: str) -> Path:
+    """STEM of a session, given as such or as one of its files; absolute, as nodes may have been started elsewhere.
+
+    Raises InputError where it names nothing.
+    """
+    for end in (_GRID_END, _TOPOLOGY_END, _MAP_END, '.pgm'):
+        path = path.removesuffix(end)
+    if not Path(path).name or '\0' in path:
+        raise InputError(f'{path!r}: expected the path of a session, without the endings of its files')
+    return Path(path).absolute()
+
+
+def save_grid(path: str, grid: OccupancyGrid) -> str:
+    """Write STEM.pgm, STEM.yaml and STEM.grid.npz; returns what was written. Raises OSError where that fails."""
+    stem = stem_of(path)
+    write_grid(_named(stem, _GRID_END), grid)
+    write_map(stem, grid.patch())
+    return f'{stem}.pgm, {_MAP_END} and {_GRID_END}'
+
+
+def load_grid(path: str, config: OccupancyConfig | None = None) -> OccupancyGrid:
+    """Read STEM.grid.npz or, where that is not there, STEM.yaml and its image, which may be any map_server map.
+
+    Raises InputError where there is neither, or one is broken or of another resolution.
+    """
+    stem = stem_of(path)
+    exact, description = _named(stem, _GRID_END), _named(stem, _MAP_END)
+    if _is_there(exact) or path.endswith(_GRID_END):
+        return read_grid(exact, config)
+    if not _is_there(description):
+        raise InputError(f'{stem}: neither {exact.name} nor {description.name} is there')
+    patch = read_map(description)
+    try:
+        return OccupancyGrid.from_patch(patch, config)
+    except InputError as error:
+        raise InputError(f'{description}: {error}') from error
+
+
+def save_topology(path: str, builder: TopologyBuilder) -> str:
+    """Write STEM.topology.npz; returns its name. Raises OSError where that fails."""
+    file = _named(stem_of(path), _TOPOLOGY_END)
+    write_topology(file, builder)
+    return str(file)
+
+
+def load_topology(
+    path: str, config: TopologyConfig | None = None, resolution_m: float | None = None
+) -> TopologyBuilder:
+    """Read STEM.topology.npz. Raises InputError as `read_topology`, and where its cells are not of the resolution."""
+    file = _named(stem_of(path), _TOPOLOGY_END)
+    builder = read_topology(file, config)
+    if None not in (resolution_m, builder.resolution_m) and builder.resolution_m != resolution_m:
+        raise InputError(f'{file}: made from {builder.resolution_m} m a cell: expected {resolution_m} m')
+    return builder
+
+
+def has_topology(path: str) -> bool:
+    """Whether a session has a graph."""
+    return _is_there(_named(stem_of(path), _TOPOLOGY_END))
 
 
 def write_grid(path: Path, grid: OccupancyGrid) -> None:
@@ -40,6 +107,17 @@ def read_topology(path: Path, config: TopologyConfig | None = None) -> TopologyB
         return TopologyBuilder.from_state(_read(path, _TOPOLOGY), config)
     except InputError as error:
         raise InputError(f'{path}: {error}') from error
+
+
+def _named(stem: Path, end: str) -> Path:
+    return stem.with_name(stem.name + end)
+
+
+def _is_there(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError as error:
+        raise InputError(f'{path}: {error.strerror or error}') from error
 
 
 def _write(path: Path, what: str, arrays: Mapping[str, NDArray[Any]]) -> None:

@@ -1,33 +1,37 @@
 """The occupancy grid: each scan drawn in at the pose that the localizer found for it."""
 
-from pathlib import Path
-
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid as OccupancyGridMsg
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
-from thinmap_msgs.srv import SaveMap
+from thinmap_msgs.srv import LoadMap, SaveMap
 from thinmap_ros import warm_up
-from thinmap_ros.adapters import map_files, messages, parameters, qos, runtime
+from thinmap_ros.adapters import messages, parameters, qos, runtime, session_files
 from thinmap_ros.adapters.listening import listen
+from thinmap_ros.adapters.services import answer, ask
 from thinmap_ros.adapters.stamps import StampMatcher
 from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.core.errors import ThinmapError
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, WindowConfig
 from thinmap_ros.core.se2 import Array
 
+_NO_BUILDER = 'no graph: there is no topology_builder'
+
 
 class GridMapperNode(Node):
-    """/scan and /pose in; /map once a second and /local_map at every scan out; service save_map."""
+    """/scan and /pose in; /map once a second and /local_map at every scan out; services save_map and load_map."""
 
     def __init__(self) -> None:
         super().__init__('grid_mapper')
-        self._grid = OccupancyGrid(parameters.declare(self, OccupancyConfig))
+        self._config = parameters.declare(self, OccupancyConfig)
         self._window_m = parameters.declare(self, WindowConfig).window_m
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
         self._mount = LaserMount(self)
+        session = parameters.declare_session(self)
         parameters.check_unknown(self)
+        self._grid = session_files.load_grid(session, self._config) if session else OccupancyGrid(self._config)
         warm_up.grid_mapper()
         self._matcher: StampMatcher[LaserScan, Array] = StampMatcher()
         self._latest_ns: int | None = None
@@ -35,8 +39,15 @@ class GridMapperNode(Node):
         self._local_map = self.create_publisher(OccupancyGridMsg, 'local_map', qos.LATCHED)
         listen(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
         listen(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
-        self.create_service(SaveMap, 'save_map', self._on_save)
+        # Mapping goes on while a map is saved, and waits while one is loaded: nothing gets into the wrong graph.
+        aside = ReentrantCallbackGroup()
+        self.create_service(SaveMap, 'save_map', self._on_save, callback_group=aside)
+        self.create_service(LoadMap, 'load_map', self._on_load)
+        self._save_topology = self.create_client(SaveMap, 'save_topology', callback_group=aside)
+        self._load_topology = self.create_client(LoadMap, 'load_topology', callback_group=aside)
         self.create_timer(1.0, self._publish_map)
+        if session:
+            self._take_over(self._grid)
 
     def _on_scan(self, message: LaserScan) -> None:
         self._take(self._matcher.left(messages.stamp_ns(message.header.stamp), message))
@@ -62,12 +73,34 @@ class GridMapperNode(Node):
         if self._latest_ns is not None:
             self._map.publish(messages.grid_msg(self._grid.patch(), self._map_frame, self._latest_ns))
 
-    def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
+    def _take_over(self, grid: OccupancyGrid) -> None:
+        self._grid, self._latest_ns = grid, self._latest_ns or self.get_clock().now().nanoseconds
+        self._publish_map()
+
+    async def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
+        answer(response, lambda: f'saved {session_files.save_grid(request.path, self._grid)}')
+        if not response.success:
+            return response
+        path = str(session_files.stem_of(request.path))
+        graph = await ask(self, self._save_topology, SaveMap.Request(path=path))
+        response.success = graph is None or graph.success
+        response.message += f'; {_NO_BUILDER if graph is None else graph.message}'
+        return response
+
+    async def _on_load(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:
+        """Take over grid and graph, or neither."""
         try:
-            written = map_files.write_map(Path(request.path), self._grid.patch())
-            response.success, response.message = True, f'saved {written}'
-        except (ThinmapError, OSError) as error:
+            grid = session_files.load_grid(request.path, self._config)
+            path = str(session_files.stem_of(request.path)) if session_files.has_topology(request.path) else ''
+        except ThinmapError as error:
             response.success, response.message = False, str(error)
+            return response
+        graph = await ask(self, self._load_topology, LoadMap.Request(path=path))
+        response.success = graph is None or graph.success
+        response.message = _NO_BUILDER if graph is None else graph.message
+        if response.success:
+            self._take_over(grid)
+            response.message = f'grid taken over; {response.message}'
         return response
 
 

@@ -5,9 +5,11 @@ from nav_msgs.msg import OccupancyGrid
 from rclpy.node import Node
 
 from thinmap_msgs.msg import TopologicalMap
+from thinmap_msgs.srv import LoadMap, SaveMap
 from thinmap_ros import warm_up
-from thinmap_ros.adapters import messages, parameters, qos, runtime
+from thinmap_ros.adapters import messages, parameters, qos, runtime, session_files
 from thinmap_ros.adapters.listening import listen
+from thinmap_ros.adapters.services import answer
 from thinmap_ros.adapters.stamps import StampMatcher
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
@@ -15,19 +17,25 @@ from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig
 
 
 class TopologyBuilderNode(Node):
-    """/local_map and /pose in; /local_topology and /topology out."""
+    """/local_map and /pose in; /local_topology and /topology out; services save_topology and load_topology."""
 
     def __init__(self) -> None:
         super().__init__('topology_builder')
-        self._builder = TopologyBuilder(parameters.declare(self, TopologyConfig))
+        self._config = parameters.declare(self, TopologyConfig)
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
+        session = parameters.declare_session(self)
         parameters.check_unknown(self)
+        self._builder = session_files.load_topology(session, self._config) if session else TopologyBuilder(self._config)
         warm_up.topology_builder()
         self._matcher: StampMatcher[GridPatch, Array] = StampMatcher()
         self._local = self.create_publisher(TopologicalMap, 'local_topology', qos.LATCHED)
         self._global = self.create_publisher(TopologicalMap, 'topology', qos.LATCHED)
         listen(self, OccupancyGrid, 'local_map', self._on_window, qos.STREAM)
         listen(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
+        self.create_service(SaveMap, 'save_topology', self._on_save)
+        self.create_service(LoadMap, 'load_topology', self._on_load)
+        if session:
+            self._publish(self.get_clock().now().nanoseconds)
 
     def _on_window(self, message: OccupancyGrid) -> None:
         stamp_ns = messages.stamp_ns(message.header.stamp)
@@ -43,9 +51,27 @@ class TopologyBuilderNode(Node):
         if pair is None:
             return
         if self._builder.update(*pair):
-            self._global.publish(messages.topology_msg(self._builder.map, self._map_frame, stamp_ns))
+            self._publish(stamp_ns)
         # The local map comes last: who hears it knows that all of this scan is said.
         self._local.publish(messages.topology_msg(self._builder.local_map(), self._map_frame, stamp_ns))
+
+    def _publish(self, stamp_ns: int) -> None:
+        self._global.publish(messages.topology_msg(self._builder.map, self._map_frame, stamp_ns))
+
+    def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
+        return answer(response, lambda: f'saved {session_files.save_topology(request.path, self._builder)}')
+
+    def _on_load(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:
+        return answer(response, lambda: self._load(request.path))
+
+    def _load(self, path: str) -> str:
+        """Take over what was saved; what is on its way from before is forgotten."""
+        loaded = TopologyBuilder(self._config)
+        if path:
+            loaded = session_files.load_topology(path, self._config, self._builder.resolution_m)
+        self._builder, self._matcher = loaded, StampMatcher()
+        self._publish(self.get_clock().now().nanoseconds)
+        return f'graph of {len(loaded.map.nodes)} nodes' if path else 'the graph begins anew'
 
 
 def main() -> None:

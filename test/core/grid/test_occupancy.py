@@ -4,13 +4,15 @@ import math
 
 import numpy as np
 import pytest
+from plain_grid import PlainGrid
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, log_odds
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import cast_rays
+from thinmap_ros.core.grid.tiles import TILE
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.se2 import pose
+from thinmap_ros.core.se2 import compose, pose
 
 STEP = math.radians(1.0)
 
@@ -213,3 +215,47 @@ def test_a_long_wall_that_went_away_is_unlearned_by_beams_that_cross_it():
     wall = np.column_stack([np.arange(0.25, 2.3, 0.1), np.full(21, 1.95)])
     patch = grid.patch()
     assert patch.free[tuple(patch.frame.cells_of(wall).T)].all()
+
+
+def drive_through_clutter(seed, scans=25):
+    """Scans on a curve through a room with posts and walls, some of their beams lost, spoilt or without return."""
+    rng = np.random.default_rng(seed)
+    world = np.zeros((600, 600), dtype=np.uint8)
+    world[[0, -1]], world[:, [0, -1]], world[300:305, 100:420] = 1, 1, 1
+    for row, col in rng.integers(0, 580, (25, 2)):
+        world[row : row + 8, col : col + 8] = 1
+    T = pose(4.0, 4.0, 0.3)
+    angles = math.radians(-90.0) + STEP * np.arange(181)
+    for _ in range(scans):
+        ranges = 0.02 * cast_rays(world, T[0] / 0.02, T[1] / 0.02, angles + T[2], 500.0) + rng.normal(0.0, 0.01, 181)
+        spoilt = rng.random(181) < 0.05
+        ranges[spoilt] = rng.choice([np.nan, np.inf, -np.inf, 0.0, -1.0, 0.01, 7.99, 8.0, 1e9], spoilt.sum())
+        yield scan_of(ranges, T_base_laser=pose(0.1, -0.02, 0.01)), T
+        T = compose(T, pose(0.1, 0.0, 0.06))
+
+
+def known_cells(grid):
+    """Log odds by (row, col) of all the cells that a grid has seen."""
+    state = grid.state()
+    cells = [(tile, *at) for tile, odds in enumerate(state['log_odds']) for at in np.argwhere(odds).tolist()]
+    first = (TILE * state['tiles']).tolist()
+    return {(first[t][0] + r, first[t][1] + c): int(state['log_odds'][t, r, c]) for t, r, c in cells}
+
+
+@pytest.mark.parametrize(
+    ('seed', 'config'),
+    [
+        (0, OccupancyConfig()),
+        (1, OccupancyConfig(resolution_m=0.05, no_return_range_m=2.0, surface_depth_m=0.0)),
+        (2, OccupancyConfig(resolution_m=0.25, usable_range_m=3.0)),
+    ],
+)
+def test_all_cells_are_those_of_the_plain_grid_bit_for_bit(seed, config):
+    grid, plain = OccupancyGrid(config), PlainGrid(config)
+    for scan, T in drive_through_clutter(seed):
+        # The way back, too: into columns and rows that are negative.
+        for at in (T, np.array([-T[0], -T[1], T[2] + math.pi])):
+            grid.update(scan, at)
+            plain.update(scan, at)
+    assert known_cells(grid) == plain.odds
+    assert not grid._news.any()

@@ -5,8 +5,9 @@ import math
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+from plain_grid import crossed
 
-from thinmap_ros.core.grid.raytrace import cast_rays, line_is_clear
+from thinmap_ros.core.grid.raytrace import cast_rays, fill_segment, line_is_clear
 
 
 def room(rows=40, cols=60):
@@ -63,3 +64,27 @@ def test_a_line_is_blocked_by_a_wall_and_by_the_rim():
     assert not line_is_clear(free, 2, 0, 3, 8)
     assert line_is_clear(free, 0, 0, 8, 3)
     assert not line_is_clear(free, 2, 2, 2, 9)
+
+
+places = st.tuples(st.floats(1.0, 18.99), st.floats(1.0, 23.99))
+
+
+@given(places, places)
+def test_a_filled_segment_joins_its_ends_through_the_cells_that_it_crosses(start, end):
+    sheet = np.zeros((25, 20), dtype=np.int16)
+    fill_segment(sheet.ravel(), 20, start, end, 7)
+    filled = {tuple(cell) for cell in np.argwhere(sheet == 7).tolist()}
+    ends = [(math.floor(y), math.floor(x)) for x, y in (start, end)]
+    assert filled.issuperset(ends)
+    assert len(filled) == np.count_nonzero(sheet)
+    # Cells that differ are cut by so little that rounding decides: the segment passes their corners.
+    for row, col in filled ^ crossed(start, end).union(ends):
+        assert distance_to_segment(col, row, start, end) < 1e-6
+
+
+def distance_to_segment(col, row, start, end):
+    """The least distance of a cell's corners from a segment, in cells."""
+    corners = np.array([[col, row], [col + 1, row], [col, row + 1], [col + 1, row + 1]], dtype=float)
+    along = np.subtract(end, start)
+    share = np.clip((corners - start) @ along / max(along @ along, 1e-300), 0.0, 1.0)
+    return np.linalg.norm(corners - start - share[:, None] * along, axis=1).min()

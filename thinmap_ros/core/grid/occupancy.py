@@ -13,7 +13,7 @@ from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
-from thinmap_ros.core.grid.raytrace import axis_setup
+from thinmap_ros.core.grid.raytrace import fill_segment
 from thinmap_ros.core.grid.tiles import TILE, TileStore
 from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.scan import Scan
@@ -22,7 +22,6 @@ from thinmap_ros.core.se2 import Array
 # Log odds are kept as whole thousandths in int16: small, exact to add, and the same on every machine.
 _SCALE = 1000.0
 _LIMIT = 6000
-_FREE, _HIT, _SURFACE = 1, 2, 4
 _TILE_BITS = TILE.bit_length() - 1
 # Three neighbouring beams show one surface if the middle range is this near to what the others foretell, m.
 _FLAT_M = 0.06
@@ -87,11 +86,11 @@ class OccupancyGrid:
             )
         self._tiles = TileStore()
         self._percent = _percent_table()
-        self._marks: NDArray[np.uint8] = np.zeros(1, dtype=np.uint8)
-        self._touched: NDArray[np.int64] = np.empty(1, dtype=np.int64)
+        self._news: NDArray[np.int16] = np.zeros((0, 0), dtype=np.int16)
         self._fan: tuple[int, float, float] = (0, 0.0, 0.0)
         self._cosines = self._sines = np.empty(0)
         self._steps = _steps(self.config)
+        self._grazed = max(3, round(_GRAZED_M / self.frame.resolution))
 
     @staticmethod
     def from_patch(patch: GridPatch, config: OccupancyConfig | None = None) -> 'OccupancyGrid':
@@ -121,6 +120,8 @@ class OccupancyGrid:
             origin_x, origin_y, resolution = frame.astype(np.float64).tolist()
         except (KeyError, ValueError, TypeError) as error:
             raise InputError(f'saved grid: {error}: expected frame, tiles and log_odds') from error
+        if not np.isfinite([origin_x, origin_y, resolution]).all() or tiles.dtype != np.int64:
+            raise InputError(f'saved grid: frame {frame}, tiles of {tiles.dtype}: expected finite numbers, whole ones')
         if tiles.shape != (len(odds), 2) or odds.shape[1:] != (TILE, TILE) or odds.dtype != np.int16:
             raise InputError(f'saved grid: {tiles.shape} tiles, {odds.shape} log odds: expected one array a tile')
         if np.abs(odds.astype(np.int64)).max(initial=0) > _LIMIT:
@@ -135,39 +136,33 @@ class OccupancyGrid:
         T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
         if scan.ranges_m.size == 0 or not se2.is_finite(T_map_laser):
             return
-        resolution, usable = self.frame.resolution, self.config.usable_range_m
+        resolution, usable, depth = self.frame.resolution, self.config.usable_range_m, self.config.surface_depth_m
         x = (float(T_map_laser[0]) - self.frame.origin_x) / resolution
         y = (float(T_map_laser[1]) - self.frame.origin_y) / resolution
-        depth = self.config.surface_depth_m
-        longest = min(usable, max(scan.range_max_m + depth, self.config.no_return_range_m))
-        radius = math.ceil(longest / resolution) + 2
-        row, col, shift = math.floor(y) - radius, math.floor(x) - radius, (2 * radius).bit_length()
-        marks, touched = self._scratch(shift)
-        cosines, sines = self._directions(scan, float(T_map_laser[2]))
-        limits = (usable, min(self.config.no_return_range_m, scan.range_max_m, usable), depth, resolution)
-        bend = 2.0 * math.cos(scan.angle_increment_rad)
-        beams = (scan.ranges_m, scan.hit, scan.no_return)
-        count = _mark(marks, shift, touched, x - col, y - row, cosines, sines, *beams, *limits, bend)
-        self._add(row, col, shift, touched[:count], (x - col, y - row))
+        without_return = min(self.config.no_return_range_m, scan.range_max_m, usable)
+        radius = math.ceil(min(usable, scan.range_max_m + depth) / resolution) + 2
+        tile_row, tile_col = (math.floor(y) - radius) // TILE, (math.floor(x) - radius) // TILE
+        laser = (x - tile_col * TILE, y - tile_row * TILE)
+        news = self._sheet(radius)
+        self._follow(scan)
+        heading, bend = float(T_map_laser[2]), 2.0 * math.cos(scan.angle_increment_rad)
+        turn = (math.cos(heading), math.sin(heading))
+        beams = (scan.ranges_m, scan.hit, scan.no_return, self._cosines, self._sines)
+        box = _draw(news, laser, turn, *beams, (usable, without_return, depth, resolution, bend), self._steps)
+        self._merge(tile_row, tile_col, box, laser)
 
-    def _add(
-        self, row: int, col: int, shift: int, touched: NDArray[np.int64], laser: tuple[float, float]
+    def _merge(
+        self, tile_row: int, tile_col: int, box: tuple[int, int, int, int], laser: tuple[float, float]
     ) -> None:
-        """Add what is marked to the tiles, and make those that do not exist.
-
-        (row, col): cell (0, 0) of the marks; laser: its place (x, y) in cells from there.
-        """
-        tiles, last = self._tiles, 1 << shift
-        tiles.reach(row // TILE, col // TILE, (row + last) // TILE, (col + last) // TILE)
-        corner = (row - tiles.first_row * TILE, col - tiles.first_col * TILE)
-        grazed = max(3, round(_GRAZED_M / self.frame.resolution))
-        _spare(tiles.pool, tiles.directory, *corner, self._marks, shift, touched, laser, self._steps, grazed)
-        left = _apply(tiles.pool, tiles.directory, *corner, self._marks, shift, touched, self._steps)
-        if left:
-            needed = np.zeros(tiles.directory.shape, dtype=np.bool_)
-            _flag_tiles(needed, touched[:left], shift, *corner)
-            tiles.ensure(np.argwhere(needed) + (tiles.first_row, tiles.first_col))
-            _apply(tiles.pool, tiles.directory, *corner, self._marks, shift, touched[:left], self._steps)
+        """Add the news to the tiles, and make those that do not exist; (tile_row, tile_col): where the news begin."""
+        tiles = self._tiles
+        last_row, last_col = tile_row + (box[1] >> _TILE_BITS), tile_col + (box[3] >> _TILE_BITS)
+        tiles.reach(tile_row, tile_col, last_row, last_col)
+        place = (tile_row - tiles.first_row, tile_col - tiles.first_col)
+        _spare(tiles.pool, tiles.directory, place, self._news, box, laser, self._steps, self._grazed)
+        if _apply(tiles.pool, tiles.directory, place, self._news, box, self._steps):
+            tiles.ensure(_tiles_of(self._news, box) + (tile_row, tile_col))
+            _apply(tiles.pool, tiles.directory, place, self._news, box, self._steps)
 
     def window(self, x: float, y: float, size_m: float) -> GridPatch:
         """Square of size_m around a point, aligned with the cells, copied out of the tiles it touches."""
@@ -192,30 +187,31 @@ class OccupancyGrid:
         odds = self._tiles.read(row, col, rows, cols)
         return GridPatch(self.frame.shifted(row, col), self._percent[odds.astype(np.int64) + _LIMIT])
 
-    def _scratch(self, shift: int) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-        """Marks of at least 2**shift rows and columns, and a list as long: kept between scans, `_apply` clears them."""
-        size = 1 << (2 * shift)
-        if self._marks.size != size:
-            self._marks, self._touched = np.zeros(size, dtype=np.uint8), np.empty(size + 1, dtype=np.int64)
-        return self._marks, self._touched
+    def _sheet(self, radius: int) -> NDArray[np.int16]:
+        """Zeros for what a scan adds, whole tiles that hold `radius` cells around any cell: kept, `_apply` clears it.
 
-    def _directions(self, scan: Scan, heading: float) -> tuple[Array, Array]:
-        """Cosine and sine of each beam's direction in the map, (N,); those in the laser's frame are kept."""
+        Its rows are longer than the tiles by one line of the processor's cache: with a power of two, cells above each
+        other would compete for the same few lines.
+        """
+        tiles = (2 * radius) // TILE + 2
+        if self._news.shape[0] != tiles * TILE:
+            self._news = np.zeros((tiles * TILE, tiles * TILE + 32), dtype=np.int16)
+        return self._news
+
+    def _follow(self, scan: Scan) -> None:
+        """Keep the cosines and sines of the beams' bearings for the next scan of the same laser."""
         fan = (scan.ranges_m.size, scan.angle_min_rad, scan.angle_increment_rad)
         if fan != self._fan:
             self._fan, self._cosines, self._sines = fan, np.cos(scan.angles_rad), np.sin(scan.angles_rad)
-        c, s = math.cos(heading), math.sin(heading)
-        return c * self._cosines - s * self._sines, s * self._cosines + c * self._sines
 
 
-def _steps(config: OccupancyConfig) -> NDArray[np.int64]:
-    """What each of the eight combinations of marks adds to the log odds; lowest, highest and sure log odds, (11,)."""
+def _steps(config: OccupancyConfig) -> NDArray[np.int16]:
+    """What a cell gains that a beam passed, or in which one ended; lowest, highest and sure log odds, (5,)."""
     free, hit, low, high = (
         round(_SCALE * log_odds(p)) for p in (config.p_free, config.p_occupied, config.p_lowest, config.p_highest)
     )
-    added = [hit if marks & _HIT else 0 if marks & _SURFACE else free for marks in range(8)]
     sure = min(round(_SCALE * log_odds(_SURELY_OCCUPIED)), high)
-    return np.array([*added, low, high, sure], dtype=np.int64)
+    return np.array([free, hit, low, high, sure], dtype=np.int16)
 
 
 def _percent_table() -> NDArray[np.int8]:
@@ -224,36 +220,6 @@ def _percent_table() -> NDArray[np.int8]:
     table = np.round(100.0 / (1.0 + np.exp(-odds))).astype(np.int8)
     table[_LIMIT] = UNKNOWN
     return table
-
-
-@inlined
-def _stroke(
-    cells: NDArray[np.uint8],
-    shift: int,
-    start: tuple[float, float],
-    end: tuple[float, float],
-    mark: int,
-    touched: NDArray[np.int64],
-    count: int,
-) -> int:
-    """Mark the cells from one point (x, y) to another, without the last; returns the length of the list `touched`."""
-    d_x, d_y = end[0] - start[0], end[1] - start[1]
-    length = max(math.sqrt(d_x * d_x + d_y * d_y), 1e-9)
-    col, step_x, next_x, delta_x = axis_setup(start[0], d_x / length)
-    row, step_y, next_y, delta_y = axis_setup(start[1], d_y / length)
-    index = (row << shift) + col
-    step_y *= 1 << shift
-    # As many border crossings as rows and columns lie between, so no test for the end; the choice of the next border
-    # is written without a branch, because the processor could only guess it.
-    for _ in range(abs(int(math.floor(end[1])) - row) + abs(int(math.floor(end[0])) - col)):
-        touched[count] = index
-        count += cells[index] == 0
-        cells[index] |= mark
-        across = next_x < next_y
-        index += step_x if across else step_y
-        next_x += delta_x if across else 0.0
-        next_y += 0.0 if across else delta_y
-    return count
 
 
 @inlined
@@ -273,59 +239,64 @@ def _is_flat(ranges: Array, hit: NDArray[np.bool_], usable: float, bend: float, 
 
 
 @kernel
-def _mark(
-    cells: NDArray[np.uint8],
-    shift: int,
-    touched: NDArray[np.int64],
-    x: float,
-    y: float,
-    cosines: Array,
-    sines: Array,
+def _draw(
+    news: NDArray[np.int16],
+    laser: tuple[float, float],
+    turn: tuple[float, float],
     ranges: Array,
     hit: NDArray[np.bool_],
     no_return: NDArray[np.bool_],
-    usable: float,
-    without_return: float,
-    depth: float,
-    resolution: float,
-    bend: float,
-) -> int:
-    """Mark each cell that a scan speaks of as passed, hit, or on a surface, and list the marked cells once each.
+    cosines: Array,
+    sines: Array,
+    limits: tuple[float, float, float, float, float],
+    steps: NDArray[np.int16],
+) -> tuple[int, int, int, int]:
+    """Draw what a scan adds to each cell: what beams passed, over it the surfaces (nothing), over these their ends.
 
-    cells (S * S,): zeros, S = 2**shift rows and columns, large enough for every beam; touched: the list, whose length
-    is returned; x, y: the laser, in cells; cosines, sines, ranges (m), hit, no_return (N,): the beams; usable,
-    without_return (m): how far beams tell something, and those without return; depth (m): how far behind its range a
-    beam ends. Flat indices with a power of two as row length are cheap to take apart.
+    news (H, W): zeros, large enough for every beam; laser: (x, y) in cells from there; turn: cosine and sine of its
+    heading; ranges (m), hit, no_return, cosines, sines (N,): the beams, bearings in the laser's frame; limits: how far
+    beams tell something, and those without return, how far behind its range a beam ends, edge of a cell, all m, and
+    the `bend` of `_is_flat`. Returns first and last row, first and last column of the box that holds all that is drawn.
     """
-    count = 0
-    last = (x, y)
-    flat_before = False
+    usable, without_return, depth, resolution, bend = limits
+    cells, width = news.ravel(), news.shape[1]
+    ends = np.empty((ranges.size, 2))
+    low_x, low_y, high_x, high_y = laser[0], laser[1], laser[0], laser[1]
     for i in range(ranges.size):
+        length = min(ranges[i] + depth if ranges[i] < usable else usable, usable) if hit[i] else 0.0
+        reach = (without_return if no_return[i] else length) / resolution
+        x = laser[0] + reach * (turn[0] * cosines[i] - turn[1] * sines[i])
+        y = laser[1] + reach * (turn[1] * cosines[i] + turn[0] * sines[i])
+        ends[i, 0], ends[i, 1] = x, y
+        if reach > 0.0:
+            fill_segment(cells, width, laser, (x, y), steps[0])
+            low_x, low_y, high_x, high_y = min(low_x, x), min(low_y, y), max(high_x, x), max(high_y, y)
+    _draw_ends(cells, width, ends, ranges, hit, usable, bend, steps[1])
+    # One more on each side: a coordinate in fixed point may come to lie just beyond a border.
+    return int(low_y) - 1, int(high_y) + 1, int(low_x) - 1, int(high_x) + 1
+
+
+@inlined
+def _draw_ends(
+    cells: NDArray[np.int16],
+    width: int,
+    ends: Array,
+    ranges: Array,
+    hit: NDArray[np.bool_],
+    usable: float,
+    bend: float,
+    step: int,
+) -> None:
+    """Draw what the beams of a scan met over what they passed: the surfaces between their ends, then the ends."""
+    flat_before = False
+    for i in range(1, ranges.size):
         flat = _is_flat(ranges, hit, usable, bend, i)
-        ends_in_hit = hit[i] and ranges[i] < usable
-        length = min(ranges[i] + (depth if ends_in_hit else 0.0), usable) if hit[i] else 0.0
-        length = without_return if no_return[i] else length
-        if length > 0.0:
-            reach = length / resolution
-            end = (x + reach * cosines[i], y + reach * sines[i])
-            count = _stroke(cells, shift, (x, y), end, _FREE, touched, count)
-            index = (int(math.floor(end[1])) << shift) + int(math.floor(end[0]))
-            touched[count] = index
-            count += cells[index] == 0
-            cells[index] |= _HIT if ends_in_hit else _FREE
-            if flat_before or flat:
-                count = _stroke(cells, shift, last, end, _SURFACE, touched, count)
-            last = end
+        if flat or flat_before:
+            fill_segment(cells, width, (ends[i - 1, 0], ends[i - 1, 1]), (ends[i, 0], ends[i, 1]), 0)
         flat_before = flat
-    return count
-
-
-@kernel
-def _flag_tiles(needed: NDArray[np.bool_], touched: NDArray[np.int64], shift: int, row: int, col: int) -> None:
-    """Flag the tiles in which the listed cells lie; (row, col): cell (0, 0) of the marks from the first tile on."""
-    mask = (1 << shift) - 1
-    for index in touched:
-        needed[(row + (index >> shift)) >> _TILE_BITS, (col + (index & mask)) >> _TILE_BITS] = True
+    for i in range(ranges.size):
+        if hit[i] and ranges[i] < usable:
+            cells[int(ends[i, 1]) * width + int(ends[i, 0])] = step
 
 
 @inlined
@@ -365,67 +336,80 @@ def _run_of(
     return run
 
 
+@inlined
+def _holds(news: NDArray[np.int16], odds: NDArray[np.int16], sure: int) -> bool:
+    """Whether beams passed a cell of a strip of TILE that is surely occupied."""
+    found = 0
+    for k in range(TILE):
+        found |= (news[k] < 0) & (odds[k] >= sure)
+    return found != 0
+
+
 @kernel
 def _spare(
     pool: NDArray[np.int16],
     directory: NDArray[np.int32],
-    row: int,
-    col: int,
-    cells: NDArray[np.uint8],
-    shift: int,
-    touched: NDArray[np.int64],
+    place: tuple[int, int],
+    news: NDArray[np.int16],
+    box: tuple[int, int, int, int],
     laser: tuple[float, float],
-    steps: NDArray[np.int64],
+    steps: NDArray[np.int16],
     grazed: int,
 ) -> None:
-    """Mark as surface what beams only passed, but what is surely occupied for as many cells as `grazed` along them.
+    """Take back what beams only passed, but what is surely occupied for as many cells as `grazed` along them.
 
-    (row, col): cell (0, 0) of the marks, counted from the directory's first cell on; laser: (x, y) in cells of them.
+    place: (row, col) in the directory of the tile in which the news begin; laser: (x, y) in cells of them.
     """
-    mask, sure = (1 << shift) - 1, steps[10]
-    for index in touched:
-        if cells[index] != _FREE:
-            continue
-        in_row, in_col = index >> shift, index & mask
-        if _odds_at(pool, directory, row + in_row, col + in_col) >= sure:
-            away = (in_col + 0.5 - laser[0], in_row + 0.5 - laser[1])
-            if _run_of(pool, directory, row + in_row, col + in_col, away, sure, grazed) >= grazed:
-                cells[index] |= _SURFACE
+    sure, top, left = steps[4], place[0] * TILE, place[1] * TILE
+    for row in range(box[0], box[1] + 1):
+        for tile in range(box[2] >> _TILE_BITS, (box[3] >> _TILE_BITS) + 1):
+            slot, first = directory[place[0] + (row >> _TILE_BITS), place[1] + tile], tile * TILE
+            if slot < 0:
+                continue
+            added, odds = news[row, first : first + TILE], pool[slot, row & (TILE - 1)]
+            if _holds(added, odds, sure):
+                for k in range(TILE):
+                    if added[k] < 0 and odds[k] >= sure:
+                        away = (first + k + 0.5 - laser[0], row + 0.5 - laser[1])
+                        run = _run_of(pool, directory, top + row, left + first + k, away, sure, grazed)
+                        added[k] = 0 if run >= grazed else added[k]
 
 
 @kernel
 def _apply(
     pool: NDArray[np.int16],
     directory: NDArray[np.int32],
-    row: int,
-    col: int,
-    cells: NDArray[np.uint8],
-    shift: int,
-    touched: NDArray[np.int64],
-    steps: NDArray[np.int64],
-) -> int:
-    """Add the log odds of each marked cell, clamped, and clear its mark; where no tile is, leave it and list it anew.
+    place: tuple[int, int],
+    news: NDArray[np.int16],
+    box: tuple[int, int, int, int],
+    steps: NDArray[np.int16],
+) -> bool:
+    """Add the news to the log odds, clamped, and clear them; returns whether some are left, where no tile is.
 
-    (row, col): cell (0, 0) of the marks, counted from the directory's first cell on; never negative within it.
-    Returns how many cells are left at the beginning of the list.
+    Strip after strip of a tile, cell after cell without a branch: the compiler makes 16 or more additions one.
     """
-    odds_of = pool.ravel()
-    mask, inner, left = (1 << shift) - 1, TILE - 1, 0
-    low, high = steps[8], steps[9]
-    for index in touched:
-        cell_row, cell_col = row + (index >> shift), col + (index & mask)
-        slot = np.int64(directory[cell_row >> _TILE_BITS, cell_col >> _TILE_BITS])
-        if slot < 0:
-            touched[left] = index
-            left += 1
-            continue
-        step = steps[cells[index]]
-        cells[index] = 0
-        if step == 0:
-            continue
-        at = (((slot << _TILE_BITS) + (cell_row & inner)) << _TILE_BITS) + (cell_col & inner)
-        odds = odds_of[at] + step
-        # 0 is kept for cells never seen: a cell that comes back to even odds stays a thousandth off.
-        odds = 1 if odds == 0 else odds
-        odds_of[at] = min(max(odds, low), high)
-    return left
+    missing = False
+    low, high, one, none = steps[2], steps[3], np.int16(1), np.int16(0)
+    for row in range(box[0], box[1] + 1):
+        for tile in range(box[2] >> _TILE_BITS, (box[3] >> _TILE_BITS) + 1):
+            slot = directory[place[0] + (row >> _TILE_BITS), place[1] + tile]
+            added = news[row, tile * TILE : tile * TILE + TILE]
+            if slot < 0:
+                missing = missing or bool(added.any())
+                continue
+            odds = pool[slot, row & (TILE - 1)]
+            for k in range(TILE):
+                # 0 is kept for cells never seen: a cell that comes back to even odds stays a thousandth off.
+                total = np.int16(odds[k] + added[k])
+                total = one if total == none else total
+                total = low if total < low else total
+                total = high if total > high else total
+                odds[k] = odds[k] if added[k] == none else total
+                added[k] = none
+    return missing
+
+
+def _tiles_of(news: NDArray[np.int16], box: tuple[int, int, int, int]) -> NDArray[np.int64]:
+    """Tiles (N, 2), from that in which the news begin, for which there are news."""
+    rows, cols = np.nonzero(news[: box[1] + 1])
+    return np.unique(np.column_stack([rows // TILE, cols // TILE]), axis=0)

@@ -70,6 +70,11 @@ class TopologyBuilder:
         """The global map. It is changed in place by `update`; take a copy to keep a state."""
         return self._empty if self._registry is None else self._registry.map
 
+    @property
+    def resolution_m(self) -> float | None:
+        """Edge of a cell of the windows, m; None before the first one."""
+        return None if self._surroundings is None else self._surroundings.lattice.resolution
+
     def update(self, window: GridPatch, T_map_base: Array) -> bool:
         """Take in the window round the robot at pose T_map_base (3,); returns whether the map changed.
 

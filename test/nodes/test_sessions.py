@@ -1,0 +1,193 @@
+"""Sessions on a live graph: what was saved is there again after a new start, and mapping goes on from it."""
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseStamped, Twist
+from nav_msgs.msg import OccupancyGrid as OccupancyGridMsg
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.task import Future
+
+from thinmap_msgs.msg import TopologicalMap
+from thinmap_msgs.srv import LoadMap, SaveMap
+from thinmap_ros.adapters import map_files, messages, qos, session_files
+from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
+from thinmap_ros.core.se2 import pose
+from thinmap_ros.core.topology.update import TopologyBuilder
+from thinmap_ros.sim.lms200 import Lms200, Lms200Config
+from thinmap_ros.sim.world import World
+
+pytestmark = pytest.mark.live
+MAPPERS = ('grid_mapper', 'topology_builder')
+
+
+def places(topology):
+    """Kind and place by id."""
+    return {n.id: (n.kind, n.position.x, n.position.y) for n in topology.nodes}
+
+
+def heard_maps(graph):
+    return (
+        graph.heard('map', OccupancyGridMsg, qos.LATCHED),
+        graph.heard('topology', TopologicalMap, qos.LATCHED),
+        graph.heard('local_topology', TopologicalMap, qos.LATCHED),
+    )
+
+
+def drive(graph, x, y, yaw, metres):
+    """Nodes of a robot that stands at a place, driven until it has made its way; then the robot alone is stopped."""
+    truth = graph.heard('ground_truth', PoseStamped)
+    graph.start('localizer', use_sim_time=True, start_x_m=x, start_y_m=y, start_yaw_rad=yaw)
+    graph.start('sim', start=f'{x},{y},{yaw}', rate=4.0, lockstep='local_topology', hold_for_subscribers=2)
+    commands = graph.node.create_publisher(Twist, 'cmd_vel', 10)
+    forward = Twist()
+    forward.linear.x = 0.3
+
+    def far_enough():
+        commands.publish(forward)
+        return truth and np.hypot(truth[-1].pose.position.x - x, truth[-1].pose.position.y - y) > metres
+
+    graph.until(far_enough, 'the robot makes its way')
+    T = messages.pose_from(truth[-1].pose)
+    assert graph.stop('sim') == graph.stop('localizer') == 0
+    return T
+
+
+def test_ids_and_cells_are_the_same_tomorrow_and_mapping_goes_on(graph, tmp_path):
+    maps, graphs, local = heard_maps(graph)
+    for name in MAPPERS:
+        graph.start(name, use_sim_time=True)
+    T = drive(graph, 2.0, 2.0, 0.9, 1.5)
+    stem = tmp_path / 'today' / 'room'
+    response = graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(stem)))
+    assert response.success, response.message
+    assert all(word in response.message for word in ('.pgm', '.yaml', '.grid.npz', '.topology.npz'))
+    ends = ['.grid.npz', '.pgm', '.topology.npz', '.yaml']
+    assert sorted(file.name for file in stem.parent.iterdir()) == [f'room{end}' for end in ends]
+    for name in MAPPERS:
+        assert graph.stop(name) == 0
+    before, edges = places(graphs[-1]), {edge.id for edge in graphs[-1].edges}
+    saved = session_files.load_grid(str(stem)).patch()
+    assert len(before) > 3
+    maps.clear(), graphs.clear(), local.clear()
+    for name in MAPPERS:
+        graph.start(name, use_sim_time=True, session=str(stem))
+    graph.until(lambda: maps and graphs, 'the saved map and graph, without a scan')
+    assert not local
+    assert places(graphs[-1]) == before and {edge.id for edge in graphs[-1].edges} == edges
+    assert np.array_equal(messages.patch_from(maps[-1]).cells, saved.cells)
+    drive(graph, *T.tolist(), 1.0)
+    # Mapping has gone on from there: more is known, what stayed has its number, and no number is given twice.
+    assert (messages.patch_from(maps[-1]).cells >= 0).sum() >= (saved.cells >= 0).sum()
+    after = places(graphs[-1])
+    stayed = [k for k in before.keys() & after.keys() if np.hypot(*np.subtract(before[k], after[k])[1:]) < 0.5]
+    assert len(stayed) >= len(before) / 2
+    assert all(k > max(before.keys() | edges) for k in after.keys() - before.keys())
+
+
+def room_of(resolution=0.1):
+    """Grid and graph of a room of 6 x 6 m as seen from its middle."""
+    occupied = np.zeros((60, 60), dtype=np.uint8)
+    occupied[[0, -1]], occupied[:, [0, -1]], occupied[20:25, 35:40] = 1, 1, 1
+    grid, builder = OccupancyGrid(OccupancyConfig(resolution_m=resolution)), TopologyBuilder()
+    world = World('room', occupied, OccupancyGrid().frame, pose(2.0, 2.0, 0.0))
+    laser = Lms200(Lms200Config(), 1)
+    for k in range(12):
+        T = pose(2.0 + 0.1 * k, 3.0, 0.4 * k)
+        grid.update(laser.scan(world, T, k), T)
+        builder.update(grid.window(T[0], T[1], 10.0), T)
+    return grid, builder
+
+
+def save(stem, grid, builder=None):
+    session_files.save_grid(str(stem), grid)
+    if builder is not None:
+        session_files.save_topology(str(stem), builder)
+
+
+def write_bad_sessions(folder, grid, builder):
+    """Sessions that cannot be loaded: what is to be said of each, by its name."""
+    save(folder / 'fine', *room_of(0.05))
+    save(folder / 'cut', grid, builder)
+    save(folder / 'half', grid, builder)
+    (folder / 'cut.grid.npz').write_bytes((folder / 'cut.grid.npz').read_bytes()[:-200])
+    (folder / 'half.topology.npz').write_bytes((folder / 'half.topology.npz').read_bytes()[:300])
+    map_files.write_map(folder / 'fine_map', room_of(0.05)[0].patch())
+    save(folder / 'mixed', grid, room_of(0.05)[1])
+    return {
+        'fine': 'expected 0.1 m',
+        'fine_map.yaml': 'expected 0.1 m',
+        'cut': 'cut.grid.npz',
+        'half': 'half.topology.npz',
+        'mixed': 'mixed.topology.npz',
+        'nowhere': 'nowhere.yaml',
+        'nowhere.grid.npz': 'nowhere.grid.npz',
+        '': 'expected the path',
+    }
+
+
+def test_sessions_are_loaded_into_running_nodes_or_refused_in_words(graph, tmp_path):
+    grid, builder = room_of()
+    save(tmp_path / 'room', grid, builder)
+    maps, graphs, _ = heard_maps(graph)
+    graph.start('grid_mapper')
+    response = graph.call(LoadMap, 'load_map', LoadMap.Request(path=str(tmp_path / 'room.grid.npz')))
+    assert response.success and 'no topology_builder' in response.message
+    response = graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(tmp_path / 'alone')))
+    assert response.success and 'no topology_builder' in response.message
+    assert not (tmp_path / 'alone.topology.npz').exists()
+    graph.start('topology_builder')
+
+    def load(name):
+        path = str(tmp_path / name) if name else ''
+        return graph.call(LoadMap, 'load_map', LoadMap.Request(path=path))
+
+    graph.until(lambda: 'no topology_builder' not in load('room').message, 'the mapper sees the builder')
+    graph.until(lambda: maps and graphs and graphs[-1].nodes, 'map and graph, published at once')
+    expected = places(messages.topology_msg(builder.map, 'map', 0))
+    assert places(graphs[-1]) == expected
+    for name, said in write_bad_sessions(tmp_path, grid, builder).items():
+        response = load(name)
+        assert not response.success and said in response.message, (name, response.message)
+    response = graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(tmp_path / 'again')))
+    assert response.success, response.message
+    assert places(graphs[-1]) == expected
+    again = session_files.load_grid(str(tmp_path / 'again'))
+    assert np.array_equal(again.state()['log_odds'], grid.state()['log_odds'])
+    assert session_files.load_topology(str(tmp_path / 'again')).map.nodes == builder.map.nodes
+    # Any map_server map will do; no graph belongs to it.
+    map_files.write_map(tmp_path / 'map', grid.patch())
+    response = load('map.yaml')
+    assert response.success and 'anew' in response.message
+    graph.until(lambda: not graphs[-1].nodes, 'an empty graph')
+    known = messages.patch_from(maps[-1])
+    assert np.array_equal(known.occupied, grid.patch().occupied)
+    for name in MAPPERS:
+        assert graph.stop(name) == 0
+
+
+def test_a_builder_that_does_not_answer_is_said_and_the_mapper_goes_on(graph, tmp_path):
+    async def never(request, response):
+        await Future()
+
+    asked = graph.node.create_service(SaveMap, 'save_topology', never, callback_group=ReentrantCallbackGroup())
+    graph.start('grid_mapper')
+    # Asked before the two have found each other, the mapper sees no builder.
+    answers = []
+
+    def save_again():
+        answers.append(graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(tmp_path / 'room'))))
+        return not answers[-1].success
+
+    graph.until(save_again, 'the mapper asks')
+    assert 'save_topology: no answer' in answers[-1].message
+    assert (tmp_path / 'room.grid.npz').exists()
+    graph.node.destroy_service(asked)
+    assert graph.stop('grid_mapper') == 0
+
+
+@pytest.mark.parametrize('name', MAPPERS)
+def test_a_session_that_is_not_there_ends_the_start_with_one_clear_line(graph, name):
+    process = graph.start(name, session='/nowhere/room')
+    assert process.wait(timeout=60.0) == 2
+    lines = graph.log(name).strip().splitlines()
+    assert '/nowhere/room' in lines[-1] and 'Traceback' not in graph.log(name)
