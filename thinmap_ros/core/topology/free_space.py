@@ -65,6 +65,9 @@ def nearest_cell(
     if not (math.isfinite(xy[0]) and math.isfinite(xy[1])):
         raise InputError(f'seed {xy}: expected finite coordinates')
     centre = patch.frame.cells_of(np.array([xy]))[0]
+    if np.all((centre >= 0) & (centre < cells.shape)) and cells[centre[0], centre[1]]:
+        own: Cells = centre
+        return own
     reach = math.ceil(reach_m / patch.frame.resolution)
     low = np.maximum(centre - reach, 0)
     found = np.argwhere(cells[low[0] : max(centre[0] + reach + 1, 0), low[1] : max(centre[1] + reach + 1, 0)]) + low
@@ -236,16 +239,12 @@ def _label(cells: Mask) -> tuple[NDArray[np.int32], Cells]:
 @kernel
 def true_cells(mask: Mask) -> Cells:
     """The true cells (N, 2) of a mask (H, W), row after row."""
-    rows, cols = mask.shape
+    # Room for all; the system provides only what is written to.
+    cells = np.empty((mask.size, 2), dtype=np.int64)
     count = 0
-    for row in range(rows):
-        for col in range(cols):
-            count += mask[row, col]
-    cells = np.empty((count, 2), dtype=np.int64)
-    count = 0
-    for row in range(rows):
-        for col in range(cols):
+    for row in range(mask.shape[0]):
+        for col in range(mask.shape[1]):
             if mask[row, col]:
                 cells[count, 0], cells[count, 1] = row, col
                 count += 1
-    return cells
+    return cells[:count].copy()

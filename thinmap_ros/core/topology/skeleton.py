@@ -85,14 +85,29 @@ def looks_out(known: Mask, occupied: Mask, rim_is_unknown: bool) -> Promise:
 
     known, occupied (H, W): free and occupied cells; rim_is_unknown: what lies outside the array.
     """
-    padded = np.pad(~(known | occupied), 1, constant_values=rim_is_unknown)
-    beside = padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:]
-    frontier = known & beside
+    frontier = _frontier(known, occupied, rim_is_unknown)
 
     def promising(spot: Spot) -> bool:
         return _count_near(frontier, *spot.cell, math.sqrt(spot.squared) + _FARTHER) >= _LOOKS_OUT
 
     return promising
+
+
+@kernel
+def _frontier(known: Mask, occupied: Mask, rim_is_unknown: bool) -> Mask:
+    """Free cells (H, W) with an unknown one beside them."""
+    rows, cols = known.shape
+    unknown = np.full((rows + 2, cols + 2), rim_is_unknown)
+    for row in range(rows):
+        for col in range(cols):
+            unknown[row + 1, col + 1] = not (known[row, col] | occupied[row, col])
+    frontier = np.empty((rows, cols), dtype=np.bool_)
+    for row in range(rows):
+        for col in range(cols):
+            beside = unknown[row, col + 1] | unknown[row + 2, col + 1]
+            beside |= unknown[row + 1, col] | unknown[row + 1, col + 2]
+            frontier[row, col] = known[row, col] & beside
+    return frontier
 
 
 @kernel

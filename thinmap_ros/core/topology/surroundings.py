@@ -18,6 +18,7 @@ Cells = NDArray[np.int64]
 States = NDArray[np.int8]
 FREE, OCCUPIED = np.int8(0), np.int8(100)
 _NEVER = np.int8(-2)  # never in a window, or forgotten
+_BLOCK = 3  # painting looks first at blocks of 2**3 cells
 _OFF_LATTICE = 1e-3  # of a cell: windows that lie worse than this do not belong to the same grid
 
 
@@ -150,9 +151,16 @@ def _paint(cells: States, centres: Cells, squared: Cells) -> Mask:
     """Mark as free all cells never seen that lie nearer to one of the centres (N, 2) than its clearance; say which."""
     rows, cols = cells.shape
     painted = np.zeros((rows, cols), dtype=np.bool_)
+    gaps = np.zeros(((rows >> _BLOCK) + 1, (cols >> _BLOCK) + 1), dtype=np.bool_)
+    for row in range(rows):
+        for col in range(cols):
+            gaps[row >> _BLOCK, col >> _BLOCK] |= cells[row, col] == _NEVER
     for i in range(centres.shape[0]):
         row, col = centres[i, 0], centres[i, 1]
         reach = int(np.sqrt(squared[i]))
+        low_row, low_col = max(row - reach, 0) >> _BLOCK, max(col - reach, 0) >> _BLOCK
+        if not np.any(gaps[low_row : (row + reach >> _BLOCK) + 1, low_col : (col + reach >> _BLOCK) + 1]):
+            continue
         for r in range(max(row - reach, 0), min(row + reach + 1, rows)):
             for c in range(max(col - reach, 0), min(col + reach + 1, cols)):
                 if cells[r, c] == _NEVER and (r - row) ** 2 + (c - col) ** 2 < squared[i]:
