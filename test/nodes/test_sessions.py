@@ -135,6 +135,11 @@ def test_sessions_are_loaded_into_running_nodes_or_refused_in_words(graph, tmp_p
     response = graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(tmp_path / 'alone')))
     assert response.success and 'no topology_builder' in response.message
     assert not (tmp_path / 'alone.topology.npz').exists()
+    # The graph of an earlier grid must not be loaded with the new one.
+    response = graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(tmp_path / 'room')))
+    assert response.success and 'room.topology.npz.old' in response.message
+    assert (tmp_path / 'room.topology.npz.old').exists() and not (tmp_path / 'room.topology.npz').exists()
+    save(tmp_path / 'room', grid, builder)
     graph.start('topology_builder')
 
     def load(name):

@@ -83,6 +83,16 @@ def has_topology(path: str) -> bool:
     return _is_there(_named(stem_of(path), _TOPOLOGY_END))
 
 
+def set_topology_aside(path: str) -> str:
+    """Keep a graph that was saved with an earlier grid as STEM.topology.npz.old; returns what was done, or ''."""
+    file = _named(stem_of(path), _TOPOLOGY_END)
+    if not _is_there(file):
+        return ''
+    aside = file.with_name(f'{file.name}.old')
+    file.replace(aside)
+    return f'; the graph of an earlier grid is now {aside}'
+
+
 def write_grid(path: Path, grid: OccupancyGrid) -> None:
     """Write a grid with its exact log odds (NumPy archive), whole or not at all."""
     _write(path, _GRID, grid.state())

@@ -83,8 +83,10 @@ class GridMapperNode(Node):
             return response
         path = str(session_files.stem_of(request.path))
         graph = await ask(self, self._save_topology, SaveMap.Request(path=path))
-        response.success = graph is None or graph.success
-        response.message += f'; {_NO_BUILDER if graph is None else graph.message}'
+        if graph is None:
+            saved = response.message
+            return answer(response, lambda: f'{saved}; {_NO_BUILDER}{session_files.set_topology_aside(path)}')
+        response.success, response.message = graph.success, f'{response.message}; {graph.message}'
         return response
 
     async def _on_load(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:
