@@ -1,5 +1,6 @@
 """map_to_graph on real floors: time, number of nodes, drivable, complete."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 from benchmarks.measures import completeness, drivable_share
@@ -14,9 +15,8 @@ _SECONDS = {'kth/50052751': 0.1, 'kth/50037764_PLAN1': 0.5}
 _MOST_NODES = 635 / 5  # SWAGGER: 635 on a floor of 256 x 786
 
 
-def run(worlds: Path, quick: bool) -> list[Row]:
-    """Rows for each world."""
-    rows = []
+def run(worlds: Path, quick: bool) -> Iterator[Row]:
+    """Rows for each world, as they come."""
     config = TopologyConfig()
     for floor in floors(worlds, 'kth' if quick else ''):
 
@@ -24,14 +24,13 @@ def run(worlds: Path, quick: bool) -> list[Row]:
             return build(read_map(path), None, config)
 
         graph, patch = work(), read_map(floor.path)
-        rows.append(Row(floor.name, f'{len(graph.nodes)} nodes'))
+        yield Row(floor.name, f'{len(graph.nodes)} nodes')
         if floor.name in _SECONDS:
             seconds = best_seconds({'work': work}, 5)['work']
-            rows.append(at_most('  map to graph', seconds, _SECONDS[floor.name], 's'))
+            yield at_most('  map to graph', seconds, _SECONDS[floor.name], 's')
         if floor.name == 'kth/50052751':
-            rows.append(at_most('  nodes', len(graph.nodes), _MOST_NODES))
-        rows.append(at_least('  drivable edges', drivable_share(patch, graph, config.robot_radius_m), 1.0))
+            yield at_most('  nodes', len(graph.nodes), _MOST_NODES)
+        yield at_least('  drivable edges', drivable_share(patch, graph, config.robot_radius_m), 1.0)
         joined, ratio = completeness(patch, graph, config.robot_radius_m, 50 if quick else 1000, 0)
-        rows.append(at_least('  reachable pairs joined', joined, 0.995))
-        rows.append(at_most('  length of ways, sum against best on the grid', ratio, 1.15))
-    return rows
+        yield at_least('  reachable pairs joined', joined, 0.995)
+        yield at_most('  length of ways, sum against best on the grid', ratio, 1.15)

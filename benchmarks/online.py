@@ -1,5 +1,6 @@
 """A drive through worlds: time of a cycle, the global graph against the batch graph of the same grid, ids that stay."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,8 @@ _WARM_UP = 20
 _RUN = 6000  # scans in 20 min
 
 
-def run(worlds: Path, quick: bool) -> list[Row]:
-    """Rows for each world."""
-    rows = []
+def run(worlds: Path, quick: bool) -> Iterator[Row]:
+    """Rows for each world, as they come."""
     for name in _QUICK if quick else _WORLDS:
         floor = floors(worlds, name)[0]
         poses = tour(floor.world, floor.starts[0], 0.25, 8 if quick else 40, 0)
@@ -26,7 +26,7 @@ def run(worlds: Path, quick: bool) -> list[Row]:
         tenth = len(milliseconds) // 10
         graph, batch = drive.builder.map, final_map(drive, floor.starts[0])
         there, back = agreement(graph, batch, 0.5)
-        rows += [
+        yield from [
             Row(name, f'{len(poses)} scans', '', None),
             at_most('  cycle, median', float(np.median(milliseconds)), 2.0, 'ms'),
             at_most('  cycle, longest', float(milliseconds.max()), 10.0, 'ms'),
@@ -42,7 +42,6 @@ def run(worlds: Path, quick: bool) -> list[Row]:
             at_least('  nodes in view that keep their ids', drive.ledger.kept / max(drive.ledger.asked, 1), 0.99),
             at_least('  drivable edges', drivable_share(drive.grid.patch(), graph, 0.25), 1.0),
         ]
-    return rows
 
 
 def _components(found: int, wanted: int) -> Row:

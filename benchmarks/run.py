@@ -1,14 +1,14 @@
 """All benchmarks: python -m benchmarks.run [thinning mapping graphs online] [--quick] [--worlds DIR]."""
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from benchmarks import graphs, mapping, online, thinning
 from benchmarks.table import Row, show
 from benchmarks.worlds import WORLDS
 
-_ALL: dict[str, Callable[[Path, bool], list[Row]]] = {
+_ALL: dict[str, Callable[[Path, bool], Iterable[Row]]] = {
     'thinning': thinning.run,
     'mapping': mapping.run,
     'graphs': graphs.run,

@@ -1,5 +1,6 @@
 """Results as rows: what was measured, the value, and what it should be."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 
@@ -23,8 +24,8 @@ def at_least(what: str, value: float, limit: float, unit: str = '') -> Row:
     return Row(what, f'{value:.4g} {unit}'.strip(), f'at least {limit:g} {unit}'.strip(), value >= limit)
 
 
-def show(rows: list[Row]) -> None:
-    """Print rows under each other."""
+def show(rows: Iterable[Row]) -> None:
+    """Print rows under each other, each as soon as it is there."""
     for row in rows:
         verdict = {True: 'ok', False: 'MISSED', None: ''}[row.good]
         print(f'{row.what:<58} {row.value:>16}  {row.target:<18} {verdict}', flush=True)

@@ -1,5 +1,6 @@
 """Thinning against scikit-image, OpenCV, a copy of the mask and a distance transform, in one run."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -29,9 +30,8 @@ def padded_opencv(free: Mask) -> Mask:
     return np.asarray(cv2.ximgproc.thinning(padded, thinningType=cv2.ximgproc.THINNING_ZHANGSUEN)[1:-1, 1:-1] > 0)
 
 
-def run(worlds: Path, quick: bool) -> list[Row]:
+def run(worlds: Path, quick: bool) -> Iterator[Row]:
     """Rows for each size."""
-    rows = []
     cv2.setNumThreads(1)
     for side in (400, 1000) if quick else (400, 1000, 4000):
         free = floor_of(worlds, side)
@@ -49,10 +49,9 @@ def run(worlds: Path, quick: bool) -> list[Row]:
             {'skimage': lambda free=free: skeletonize(free), 'opencv': lambda free=free: padded_opencv(free)},
             rounds=3 if side <= 1000 else 1,
         )
-        rows.append(Row(f'thin {side} x {side}', f'{1e3 * fast["thin"]:.2f} ms'))
+        yield Row(f'thin {side} x {side}', f'{1e3 * fast["thin"]:.2f} ms')
         for name, limit in zip(('skimage', 'opencv'), _FASTER[side], strict=True):
-            rows.append(at_least(f'  times faster than {name}', slow[name] / fast['thin'], limit))
+            yield at_least(f'  times faster than {name}', slow[name] / fast['thin'], limit)
         if side == 1000:
-            rows.append(at_most('  in copies of the mask', fast['thin'] / fast['copy'], 60.0))
-            rows.append(at_most('  in distance transforms (L2, 5)', fast['thin'] / fast['distance'], 0.5))
-    return rows
+            yield at_most('  in copies of the mask', fast['thin'] / fast['copy'], 60.0)
+            yield at_most('  in distance transforms (L2, 5)', fast['thin'] / fast['distance'], 0.5)
