@@ -6,9 +6,12 @@ from numpy.typing import NDArray
 from thinmap_ros.core.jit import inlined, kernel
 
 Words = NDArray[np.uint64]
+Cells = NDArray[np.int64]
 Index = np.uintp  # unsigned: compiled code then asks no question about indices below zero
 _WORD = 64
 _LANES = 4  # words that processors work on at once
+_BAND = 8  # rows that are looked at together
+_TOP, _ANY, _BOTTOM = 0, 1, 2  # where in a band: in its first row, in any, in its last
 
 
 def thin(free: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -77,63 +80,80 @@ def _find(words: Words, first: Index, count: Index, stride: Index, north: bool, 
 def _thin_words(words: Words, stride: int) -> None:
     """Delete in place, `stride` words a row, until nothing changes.
 
-    A word is looked at only when a word in it or beside it changed in one of the last two sub-iterations: before
-    that, the same sub-iteration has already seen these very cells and left them. In a row, the words from the first
-    to the last such one are looked at together, so that the compiler can treat several at a time.
+    A cell is looked at only when one beside it, or itself, changed in one of the last two sub-iterations: before that,
+    the same sub-iteration has already seen these very cells and left them. Rows are looked at in bands, from the first
+    to the last column of words with such a cell, so that the compiler can treat several words at a time.
     """
-    rows = (words.size - _LANES) // stride
-    deleted = np.empty(words.size, dtype=np.uint64)
-    # Of the last two sub-iterations: the rows beside changes, and the columns of the changes there (first, end).
-    active, counts = np.empty((2, rows), dtype=np.int64), np.zeros(2, dtype=np.int64)
-    first, end = np.full((2, rows), stride, dtype=np.int64), np.zeros((2, rows), dtype=np.int64)
-    stamps = np.full(rows, -1, dtype=np.int64)
-    due = np.empty((rows, 2), dtype=np.int64)
-    for row in range(1, rows - 1):
-        for which in range(2):
-            active[which, counts[which]], counts[which] = row, counts[which] + 1
-            low, high = _trimmed(words, row * stride + 1, (row + 1) * stride - 1)
-            first[which, row], end[which, row] = low - row * stride, high - row * stride
+    rows = (words.size - _LANES) // stride - 2
+    bands = -(-rows // _BAND)
+    deleted = np.zeros(words.size, dtype=np.uint64)
+    # Of the last two sub-iterations: bands (from 1 on) that changed; first column of the changes there, and their end.
+    active, counts = np.empty((2, bands), dtype=np.int64), np.zeros(2, dtype=np.int64)
+    first, end = np.full((2, bands + 2, 3), stride, dtype=np.int64), np.zeros((2, bands + 2, 3), dtype=np.int64)
+    first[:, 1:-1], end[:, 1:-1] = 1, stride - 1
+    active[:], counts[:] = np.arange(1, bands + 1), bands
+    stamps, due = np.full(bands + 2, -1, dtype=np.int64), np.empty((bands, 3), dtype=np.int64)
     turn = 0
     while counts[0] + counts[1] > 0:
         total = 0
         for which in range(2):
-            for row in active[which, : counts[which]]:
-                if stamps[row] == turn:
-                    continue
-                stamps[row] = turn
-                low = row * stride + max(min(first[0, row], first[1, row]) - 1, 1)
-                high = row * stride + min(max(end[0, row], end[1, row]) + 1, stride - 1)
-                due[total, 0], due[total, 1] = low, high
-                total += 1
-        for low, high in due[:total]:
+            for middle in active[which, : counts[which]]:
+                for band in range(max(middle - 1, 1), min(middle + 2, bands + 1)):
+                    if stamps[band] < turn:
+                        stamps[band], due[total, 0] = turn, band
+                        due[total, 1], due[total, 2] = _columns(first, end, band, stride)
+                        total += due[total, 1] < due[total, 2]
+        for i in range(total):
+            band, low, high = due[i, 0], due[i, 1], due[i, 2]
             count = Index((high - low + _LANES - 1) // _LANES * _LANES)
-            if turn % 2 == 0:
-                _find(words, Index(low), count, Index(stride), True, deleted)
-            else:
-                _find(words, Index(low), count, Index(stride), False, deleted)
+            for row in range((band - 1) * _BAND + 1, min(band * _BAND, rows) + 1):
+                if turn % 2 == 0:
+                    _find(words, Index(row * stride + low), count, Index(stride), True, deleted)
+                else:
+                    _find(words, Index(row * stride + low), count, Index(stride), False, deleted)
         which = turn % 2
-        for row in active[which, : counts[which]]:
-            first[which, row], end[which, row] = stride, 0
+        for band in active[which, : counts[which]]:
+            first[which, band], end[which, band] = stride, 0
         counts[which] = 0
-        for low, high in due[:total]:
-            low, high = _trimmed(deleted, low, high)
-            for at in range(low, high):
-                words[at] &= ~deleted[at]
-            if low < high:
-                middle = low // stride
-                for row in range(max(middle - 1, 1), min(middle + 2, rows - 1)):
-                    if end[which, row] == 0:
-                        active[which, counts[which]], counts[which] = row, counts[which] + 1
-                    first[which, row] = min(first[which, row], low - middle * stride)
-                    end[which, row] = max(end[which, row], high - middle * stride)
+        for i in range(total):
+            band, low, high = due[i, 0], due[i, 1], due[i, 2]
+            top, bottom = (band - 1) * _BAND + 1, min(band * _BAND, rows)
+            for row in range(top, bottom + 1):
+                columns = _delete(words, deleted, row * stride, low, high)
+                _widen(first[which, band], end[which, band], _ANY, columns)
+                if row == top:
+                    _widen(first[which, band], end[which, band], _TOP, columns)
+                if row == bottom:
+                    _widen(first[which, band], end[which, band], _BOTTOM, columns)
+            active[which, counts[which]] = band
+            counts[which] += end[which, band, _ANY] > 0
         turn += 1
 
 
 @inlined
-def _trimmed(words: Words, low: int, high: int) -> tuple[int, int]:
-    """A range without the empty words at its ends."""
-    while low < high and words[low] == 0:
+def _columns(first: Cells, end: Cells, band: int, stride: int) -> tuple[int, int]:
+    """First column of words, and the end of those, that changes touch in a band or in the rows next to it."""
+    low, high = stride, 0
+    for which in range(2):
+        low = min(low, first[which, band - 1, _BOTTOM], first[which, band, _ANY], first[which, band + 1, _TOP])
+        high = max(high, end[which, band - 1, _BOTTOM], end[which, band, _ANY], end[which, band + 1, _TOP])
+    return max(low - 1, 1), min(high + 1, stride - 1)
+
+
+@inlined
+def _delete(words: Words, deleted: Words, row_start: int, low: int, high: int) -> tuple[int, int]:
+    """Delete bits in some columns of a row; returns the first column that changes, and the end of those."""
+    while low < high and deleted[row_start + low] == 0:
         low += 1
-    while low < high and words[high - 1] == 0:
+    while low < high and deleted[row_start + high - 1] == 0:
         high -= 1
+    for at in range(Index(row_start + low), Index(row_start + high)):
+        words[at] &= ~deleted[at]
     return low, high
+
+
+@inlined
+def _widen(first: Cells, end: Cells, place: int, columns: tuple[int, int]) -> None:
+    if columns[0] < columns[1]:
+        first[place] = min(first[place], columns[0])
+        end[place] = max(end[place], columns[1])
