@@ -1,6 +1,7 @@
 """What all tests share."""
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,10 @@ SHARED = next((up / 'shared' for up in ROOT.parents if (up / 'shared' / 'data').
 # How long an example takes says more about the machine than about the code; the same examples every time.
 settings.register_profile('thinmap', deadline=None, derandomize=True)
 settings.load_profile('thinmap')
+
+# A shell's job in the background is born deaf to Ctrl-C, and so would be the programs that tests start and interrupt.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope='session')
