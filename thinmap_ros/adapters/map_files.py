@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from PIL import Image
 
 from thinmap_ros.adapters.files import read_yaml, write_text, written_aside
 from thinmap_ros.core.errors import InputError
@@ -20,6 +19,8 @@ _FAR_M = 1e7
 
 def write_map(stem: Path, patch: GridPatch) -> Path:
     """Write STEM.pgm and STEM.yaml (trinary mode); returns the path of the YAML file."""
+    from PIL import Image  # here: most nodes that could write or read a map never do
+
     grey = np.full(patch.shape, _GREY_UNKNOWN, dtype=np.uint8)
     grey[patch.free] = _GREY_FREE
     grey[patch.occupied] = _GREY_OCCUPIED
@@ -85,6 +86,8 @@ def _origin(path: Path, content: dict[str, Any]) -> list[float]:
 
 def _darkness(path: Path, image: Path, negate: bool) -> NDArray[np.float64]:
     """How dark each pixel is, 0 to 1, first row on top; NaN where it is transparent."""
+    from PIL import Image
+
     try:
         with Image.open(image) as opened:
             opened.load()

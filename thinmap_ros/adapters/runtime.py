@@ -20,6 +20,7 @@ from rclpy.signals import SignalHandlerOptions
 from thinmap_ros.core.errors import ThinmapError
 
 _RELEASE_S = 3.0
+_RELEASE_BYTES = 4e6
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -54,14 +55,16 @@ def _spin(node: Node) -> None:
     _on_signals(lambda number, frame: asked.set())
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    released_at, wait_s = monotonic(), _RELEASE_S
+    looked_at, least = monotonic(), _shared_bytes()
     while rclpy.ok() and not asked.is_set() and not getattr(node, 'finished', False):
         # A bounded wait: Python sees signals only between calls.
         executor.spin_once(timeout_sec=0.25)
-        # Kernels that only a real message calls for bring the compiler back; ever less often.
-        if monotonic() - released_at > wait_s:
-            release_compiler_pages()
-            released_at, wait_s = monotonic(), 2.0 * wait_s
+        # Kernels that only a real message calls for bring the compiler back.
+        if monotonic() - looked_at > _RELEASE_S:
+            if _shared_bytes() > least + _RELEASE_BYTES:
+                release_compiler_pages()
+                least = _shared_bytes()
+            looked_at = monotonic()
 
 
 def _on_signals(handler: Any) -> None:
@@ -72,6 +75,12 @@ def _on_signals(handler: Any) -> None:
 def _leave(number: int, frame: object) -> None:
     """End at once: a node that does not listen yet has nothing to finish."""
     os._exit(0)
+
+
+def _shared_bytes() -> int:
+    """Memory that the process has from files, as libraries are; 0 where there is no /proc."""
+    statm = Path('/proc/self/statm')
+    return int(statm.read_text().split()[2]) * mmap.PAGESIZE if statm.exists() else 0
 
 
 def release_compiler_pages() -> None:
