@@ -20,21 +20,25 @@ KEYS = {
     'yaml': 'python3-yaml',
     'rosbags': 'python3-rosbags-pip',
     'mcap': 'python3-mcap-pip',
+    'cv2': 'python3-opencv',
 }
 # Optional, and named in setup.py as extras.
 EXTRAS = {'rerun', 'dask', 'distributed'}
 
 
-def test_every_import_has_its_key_in_package_xml():
-    wanted = set()
-    for path in PACKAGE.rglob('*.py'):
+@pytest.mark.parametrize(
+    ('folder', 'tags'), [('thinmap_ros', ('depend', 'exec_depend')), ('test', ('depend', 'exec_depend', 'test_depend'))]
+)
+def test_every_import_has_its_key_in_package_xml(folder, tags):
+    wanted, own = set(), {'thinmap_ros'} | {path.stem for path in (ROOT / 'test').rglob('*.py')}
+    for path in (ROOT / folder).rglob('*.py'):
         for node in ast.walk(ast.parse(path.read_text())):
             names = [n.name for n in node.names] if isinstance(node, ast.Import) else []
             names += [node.module] if isinstance(node, ast.ImportFrom) else []
             wanted |= {name.split('.')[0] for name in names}
-    wanted -= set(sys.stdlib_module_names) | {'thinmap_ros'} | EXTRAS
+    wanted -= set(sys.stdlib_module_names) | own | EXTRAS
     tree = ElementTree.parse(ROOT / 'package.xml')
-    keys = {element.text for tag in ('depend', 'exec_depend') for element in tree.iter(tag)}
+    keys = {element.text for tag in tags for element in tree.iter(tag)}
     missing = {name for name in wanted if KEYS.get(name, name) not in keys and f'python3-{name}' not in keys}
     assert not missing
 

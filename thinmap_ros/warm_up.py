@@ -32,24 +32,24 @@ def localizer() -> None:
 
 def grid_mapper() -> None:
     """Rehearse the map update and its windows."""
-    from thinmap_ros.core.grid.occupancy import OccupancyGrid
+    from thinmap_ros.core.grid.occupancy import OccupancyGrid, WindowConfig
 
     rehearsed = OccupancyGrid()
     for scan, T_map_base in _drive():
         rehearsed.update(scan, T_map_base)
-        rehearsed.window(T_map_base[0], T_map_base[1], 10.0)
+        rehearsed.window(T_map_base[0], T_map_base[1], WindowConfig().window_m)
     rehearsed.patch()
 
 
 def topology_builder() -> None:
     """Rehearse thinning and the merging of local maps."""
-    from thinmap_ros.core.grid.occupancy import OccupancyGrid
+    from thinmap_ros.core.grid.occupancy import OccupancyGrid, WindowConfig
     from thinmap_ros.core.topology.update import TopologyBuilder
 
     grid, rehearsed = OccupancyGrid(), TopologyBuilder()
     for scan, T_map_base in _drive():
         grid.update(scan, T_map_base)
-        rehearsed.update(grid.window(T_map_base[0], T_map_base[1], 10.0), T_map_base)
+        rehearsed.update(grid.window(T_map_base[0], T_map_base[1], WindowConfig().window_m), T_map_base)
         rehearsed.local_map()
 
 

@@ -117,14 +117,8 @@ def _thin_words(words: Words, stride: int) -> None:
         counts[which] = 0
         for i in range(total):
             band, low, high = due[i, 0], due[i, 1], due[i, 2]
-            top, bottom = (band - 1) * _BAND + 1, min(band * _BAND, rows)
-            for row in range(top, bottom + 1):
-                columns = _delete(words, deleted, row * stride, low, high)
-                _widen(first[which, band], end[which, band], _ANY, columns)
-                if row == top:
-                    _widen(first[which, band], end[which, band], _TOP, columns)
-                if row == bottom:
-                    _widen(first[which, band], end[which, band], _BOTTOM, columns)
+            rim = (band - 1) * _BAND + 1, min(band * _BAND, rows)
+            _delete_band(words, deleted, stride, rim, (low, high), first[which, band], end[which, band])
             active[which, counts[which]] = band
             counts[which] += end[which, band, _ANY] > 0
         turn += 1
@@ -138,6 +132,26 @@ def _columns(first: Cells, end: Cells, band: int, stride: int) -> tuple[int, int
         low = min(low, first[which, band - 1, _BOTTOM], first[which, band, _ANY], first[which, band + 1, _TOP])
         high = max(high, end[which, band - 1, _BOTTOM], end[which, band, _ANY], end[which, band + 1, _TOP])
     return max(low - 1, 1), min(high + 1, stride - 1)
+
+
+@inlined
+def _delete_band(
+    words: Words,
+    deleted: Words,
+    stride: int,
+    rim: tuple[int, int],
+    columns: tuple[int, int],
+    first: Cells,
+    end: Cells,
+) -> None:
+    """Delete bits in some columns of a band, rows rim[0] to rim[1]; notes which columns change in `first` and `end`."""
+    for row in range(rim[0], rim[1] + 1):
+        changed = _delete(words, deleted, row * stride, columns[0], columns[1])
+        _widen(first, end, _ANY, changed)
+        if row == rim[0]:
+            _widen(first, end, _TOP, changed)
+        if row == rim[1]:
+            _widen(first, end, _BOTTOM, changed)
 
 
 @inlined
