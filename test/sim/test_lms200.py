@@ -113,10 +113,20 @@ def test_mixed_pixels_lie_between_the_two_surfaces_and_only_at_edges() -> None:
         moved = np.flatnonzero(ranges != exact)
         changed[moved] = True
         for beam in moved:
-            low, high = sorted(exact[beam : beam + 2])
-            assert high - low > 0.3
-            assert low <= ranges[beam] <= high
-    assert changed.sum() == 2, 'the pillar has two edges'
+            around = exact[beam - 1 : beam + 2]
+            assert np.ptp(around) > 0.3
+            assert around.min() <= ranges[beam] <= around.max()
+    assert changed.sum() == 4, 'the pillar has two edges, with a beam on either side'
+
+
+def test_mixed_pixels_favour_neither_side() -> None:
+    """A pillar straight ahead: what its left edge does on average, its right edge does as well."""
+    world, pose = box(pillar=True), np.array([1.0, 2.0, 0.0])
+    laser = Lms200(Lms200Config(noise_m=0.0, rounding_m=0.0, mixed_pixels=1.0), 1)
+    mean = np.mean([laser.scan(world, pose, i).ranges_m for i in range(1000)], axis=0)
+    off = mean - Lms200(EXACT, 0).scan(world, pose, 0).ranges_m
+    assert np.abs(off).max() > 0.3
+    np.testing.assert_allclose(off, off[::-1], atol=0.1)
 
 
 def test_mixed_pixels_come_as_often_as_said() -> None:

@@ -12,6 +12,8 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.sim.world import World
 
+_FLATTEST_RAD = math.radians(10.0)  # neighbouring beams on a wall seen at this angle are no depth edge
+
 
 @dataclass(frozen=True)
 class Lms200Config(Config):
@@ -66,13 +68,17 @@ class Lms200:
         return cast_rays(world.occupied, x, y, angles, self.config.range_max_m / resolution) * resolution
 
     def _mix(self, ranges: Array) -> Array:
-        """Mixed pixels: at a depth edge a beam's spot falls on both surfaces, and the range lies in between."""
+        """Mixed pixels: at a depth edge a beam's spot falls on both surfaces, and the range lies in between.
+
+        Of the two beams beside an edge it is the one or the other: were it always the same one, the pixels of a left
+        and a right wall would be off to the same side.
+        """
         nearer, farther = np.minimum(ranges[:-1], ranges[1:]), np.maximum(ranges[:-1], ranges[1:])
+        along_a_wall = nearer * self._increment / math.sin(_FLATTEST_RAD)
         with np.errstate(invalid='ignore'):
-            edge = np.isfinite(farther) & (farther - nearer > self.config.edge_m)
-        mixed = edge & (self._rng.random(edge.size) < self.config.mixed_pixels)
-        share = self._rng.random(edge.size)
+            edge = np.isfinite(farther) & (farther - nearer > np.maximum(self.config.edge_m, along_a_wall))
+        mixed = np.flatnonzero(edge & (self._rng.random(edge.size) < self.config.mixed_pixels))
+        share, side = self._rng.random(mixed.size), self._rng.integers(0, 2, mixed.size)
         result = ranges.copy()
-        with np.errstate(invalid='ignore'):
-            result[:-1] = np.where(mixed, nearer + share * (farther - nearer), result[:-1])
+        result[mixed + side] = nearer[mixed] + share * (farther[mixed] - nearer[mixed])
         return result

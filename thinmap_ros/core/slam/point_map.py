@@ -15,12 +15,17 @@ from thinmap_ros.core.se2 import Array
 
 # What a cell holds: points counted, their mean (m, map frame), the unit normal of the surface there, towards where it
 # was seen from, and how loose the surface is: 0 a wall, up to 1 clutter, _UNFORMED where there are too few points.
-COUNT, MEAN_X, MEAN_Y, CENTRE_X, CENTRE_Y, NORMAL_X, NORMAL_Y, LOOSE = range(8)
+COUNT, MEAN_X, MEAN_Y, CENTRE_X, CENTRE_Y, NORMAL_X, NORMAL_Y, LOOSE, DENSE = range(9)
 UNFORMED = 2.0
 _SHIFT, _MASK = 6, TILE - 1
 _FEWEST_CELLS = 3
-_FLAT = 0.3  # ratio of the variances across and along a surface up to which it is a wall
-_THIN_M, _LONG_M = 0.015, 0.03  # so is what is no wider than noise (1 sigma) but longer: far away points are few
+DENSE_M = 0.3  # gap between neighbouring beams up to which points show more than a plane
+_MOST_WEIGHT = 4.0  # of a cell's mean, in points: walls are not flat to the millimetre
+_REACHES = (8, 4)  # cells to each side that are asked for a wall: far ones tell its direction better
+_NOISE_M = 0.01  # of a point, 1 sigma
+_THIN_M = 0.02  # a wall is no wider than this (1 sigma)
+_TILT_RAD = math.radians(2.0)  # doubt of a normal (1 sigma) above which it says nothing
+_FIRM = 4.0  # points that clutter has to consist of
 
 
 class PointMap:
@@ -29,7 +34,7 @@ class PointMap:
     def __init__(self, cell_m: float, most: float) -> None:
         """cell_m: edge of a cell; most: points that a cell's mean remembers, so that it follows what moved."""
         self.cell_m = cell_m
-        self.tiles = TileStore(np.float32, (8,))
+        self.tiles = TileStore(np.float32, (9,))
         self._most = most
 
     @property
@@ -47,7 +52,14 @@ class PointMap:
         self.tiles.reach(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
         self.tiles.ensure(tiles)
         cells -= self.corner
-        _add(self.tiles.pool, self.tiles.directory, cells, points_map, seen_from, self._most)
+        dense = gaps(points_map) < DENSE_M
+        _add(self.tiles.pool, self.tiles.directory, cells, points_map, dense, seen_from, self._most)
+
+
+def gaps(points: Array) -> Array:
+    """Distance (N,) of each point, in the order of the beams, from the nearer of its neighbours; inf for one alone."""
+    steps = np.hypot(*np.diff(points, axis=0).T)
+    return np.asarray(np.minimum(np.append(steps, np.inf), np.append(np.inf, steps)))
 
 
 @inlined
@@ -65,6 +77,7 @@ def _add(
     directory: NDArray[np.int32],
     cells: NDArray[np.int64],
     points: Array,
+    dense: NDArray[np.bool_],
     seen_from: Array,
     most: float,
 ) -> None:
@@ -73,14 +86,14 @@ def _add(
         row, col = cells[i, 0], cells[i, 1]
         cell = pool[directory[row >> _SHIFT, col >> _SHIFT], row & _MASK, col & _MASK]
         cell[COUNT] = min(cell[COUNT] + 1.0, most)
+        cell[DENSE] += dense[i]
         cell[MEAN_X] += (points[i, 0] - cell[MEAN_X]) / cell[COUNT]
         cell[MEAN_Y] += (points[i, 1] - cell[MEAN_Y]) / cell[COUNT]
     for i in range(points.shape[0]):
         row, col = cells[i, 0], cells[i, 1]
-        # Far away the beams are wide apart: where the small neighbourhood is too empty, a wider one is asked.
-        for reach in (3, 6):
+        for reach in _REACHES:
             x, y, nx, ny, loose = _surface(pool, directory, row, col, reach, seen_from)
-            if loose != UNFORMED:
+            if loose == 0.0:
                 break
         cell = pool[directory[row >> _SHIFT, col >> _SHIFT], row & _MASK, col & _MASK]
         if nx * (seen_from[0] - cell[MEAN_X]) + ny * (seen_from[1] - cell[MEAN_Y]) < 0.0:
@@ -103,7 +116,7 @@ def _surface(
     Walls seen only from their other side are left out: the two faces of a thin wall are two surfaces.
     """
     base = pool[slot_of(directory, row, col), row & _MASK, col & _MASK]
-    count, sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    cells, firm, count, sx, sy, sxx, sxy, syy = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for r in range(row - reach, row + reach + 1):
         for c in range(col - reach, col + reach + 1):
             slot = slot_of(directory, r, c)
@@ -114,20 +127,23 @@ def _surface(
             away = cell[NORMAL_X] * (seen_from[0] - cell[MEAN_X]) + cell[NORMAL_Y] * (seen_from[1] - cell[MEAN_Y])
             if cell[COUNT] > 0.0 and (own or cell[LOOSE] > 0.0 or away >= 0.0):
                 dx, dy = cell[MEAN_X] - base[MEAN_X], cell[MEAN_Y] - base[MEAN_Y]
-                count += 1.0
-                sx += dx
-                sy += dy
-                sxx += dx * dx
-                sxy += dx * dy
-                syy += dy * dy
-    if count < _FEWEST_CELLS:
+                weight = min(cell[COUNT], _MOST_WEIGHT)
+                cells += 1
+                firm += min(cell[DENSE], _MOST_WEIGHT)
+                count += weight
+                sx += weight * dx
+                sy += weight * dy
+                sxx += weight * dx * dx
+                sxy += weight * dx * dy
+                syy += weight * dy * dy
+    if cells < _FEWEST_CELLS:
         return 0.0, 0.0, 1.0, 0.0, UNFORMED
     xx, xy, yy = sxx - sx * sx / count, sxy - sx * sy / count, syy - sy * sy / count
     spread = math.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
     small, large = 0.5 * (xx + yy) - spread, 0.5 * (xx + yy) + spread
     angle = 0.5 * math.atan2(-2.0 * xy, yy - xx)
-    ratio = small / max(large, 1e-12)
-    if ratio > _FLAT and large < count * _LONG_M**2:
-        return 0.0, 0.0, 1.0, 0.0, UNFORMED
-    wall = ratio <= _FLAT or small <= count * _THIN_M**2
-    return sx / count, sy / count, math.cos(angle), math.sin(angle), 0.0 if wall else ratio
+    if small <= count * _THIN_M**2:
+        loose = 0.0 if max(small / count, _NOISE_M**2) <= large * _TILT_RAD**2 else UNFORMED
+    else:
+        loose = small / large if firm >= _FIRM else UNFORMED
+    return sx / count, sy / count, math.cos(angle), math.sin(angle), loose

@@ -20,6 +20,7 @@ from thinmap_ros.core.slam.point_map import (
     CENTRE_X,
     CENTRE_Y,
     COUNT,
+    DENSE_M,
     LOOSE,
     MEAN_X,
     MEAN_Y,
@@ -27,6 +28,7 @@ from thinmap_ros.core.slam.point_map import (
     NORMAL_Y,
     UNFORMED,
     PointMap,
+    gaps,
     slot_of,
 )
 
@@ -92,7 +94,8 @@ class ScanMatcher:
         """
         if len(points_base) < _FEWEST_POINTS or self.map.tiles.used == 0:
             return Match(prior, covariance, 0.0, 0.0, False)
-        scan = np.column_stack([points_base, _shares(points_base, self.config.match_cell_m)])
+        around = gaps(points_base)
+        scan = np.column_stack([points_base, np.clip(around / self.config.match_cell_m, 0.05, 1.0), around < DENSE_M])
         match = self._refine(scan, laser_base, prior, prior, covariance)
         if match.overlap >= _LEAST_OVERLAP and match.fit < self.config.match_good_fit:
             match = self._search(scan, laser_base, prior, covariance, match)
@@ -128,13 +131,6 @@ class ScanMatcher:
         pose[2] = wrap(float(pose[2]))
         good = overlap >= _LEAST_OVERLAP and fit >= config.match_least_fit
         return Match(pose, np.linalg.inv(posterior).astype(np.float64), float(fit), float(overlap), bool(good))
-
-
-def _shares(points: Array, cell_m: float) -> Array:
-    """Weight (N,) of each point: beams that crowd on near surfaces count no more than the surface is long."""
-    steps = np.hypot(*np.diff(points, axis=0).T)
-    around = np.minimum(np.append(steps, np.inf), np.append(np.inf, steps))
-    return np.asarray(np.clip(around / cell_m, 0.05, 1.0))
 
 
 @kernel
@@ -272,8 +268,8 @@ def _align(
             shares[2] += scan[i, 2] * (squared < inlier * inlier)
             weight = scan[i, 2] / (sigma * sigma * (1.0 + squared / (scale * scale)))
             _add_term(weight, nx * -py + ny * px, error, nx, ny, information, gradient)
-            if loose > 0.0:
-                _add_term(weight * loose, ny * py + nx * px, slide, -ny, nx, information, gradient)
+            if loose > 0.0 and scan[i, 3] > 0.0:
+                _add_term(0.25 * weight * loose, ny * py + nx * px, slide, -ny, nx, information, gradient)
         dx, dy, turn = _solve(information, gradient)
         pose[0], pose[1], pose[2] = pose[0] + dx, pose[1] + dy, pose[2] + turn
         if not wide and abs(dx) + abs(dy) < 2e-4 and abs(turn) < 1e-4:
