@@ -5,6 +5,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from time import perf_counter
 
+import numpy as np
+
+from thinmap_ros.core.grid.history import GridHistory
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, WindowConfig
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
@@ -51,13 +54,19 @@ class Pipeline:
         self._scans = 0
         self._window: GridPatch | None = None
         self._locate = pose_source or self.localizer.step
+        # Poses that are known from elsewhere are never corrected.
+        self._history = None if pose_source else GridHistory()
 
     def step(self, scan: Scan, T_odom_base: Array) -> Step:
         """Take in one scan with the odometry pose (3,) at its stamp."""
         with self._timed('localizer'):
             estimate = self._locate(scan, T_odom_base)
+        if self._history is not None and estimate.correction is not None:
+            self._rebuild(self._history, scan.stamp_ns)
         with self._timed('grid'):
             self.grid.update(scan, estimate.T_map_base)
+        if self._history is not None:
+            self._history.add(scan, estimate.T_map_base)
         if self._window is None or self._scans % self.config.scans_per_graph == 0:
             self._window = self._thin(estimate.T_map_base)
         self._scans += 1
@@ -69,6 +78,18 @@ class Pipeline:
             if self.topology.update(window, T_map_base):
                 self.localizer.set_topology(self.topology.map)
         return window
+
+    def _rebuild(self, history: GridHistory, since_ns: int) -> None:
+        """A loop was closed: grid and topology are made anew from what was seen at the poses as they are known now."""
+        keyframes = self.localizer.keyframes
+        stamps = np.array([frame.scan.stamp_ns for frame in keyframes])
+        before = history.poses()
+        with self._timed('rebuild'):
+            history.correct(stamps, np.array([frame.T_map_base for frame in keyframes]), since_ns)
+            self.grid = history.draw(self.grid)
+            size = self.config.window.window_m
+            self.topology.rebuild(lambda x, y: self.grid.window(x, y, size), before, history.poses())
+            self.localizer.set_topology(self.topology.map)
 
     @contextmanager
     def _timed(self, stage: str) -> Iterator[None]:

@@ -74,6 +74,7 @@ def write_outputs(result: Replay, folder: Path, title: str, seconds: tuple[float
 
 def _report(result: Replay, poses: Array, seconds: tuple[float, float]) -> dict[str, Any]:
     stages = {name: np.array(taken) for name, taken in result.pipeline.stage_seconds.items()}
+    rebuilds = stages.pop('rebuild', np.zeros(0))
     stages['all'] = np.sum(list(stages.values()), axis=0)
     return {
         'scans': len(poses),
@@ -82,6 +83,8 @@ def _report(result: Replay, poses: Array, seconds: tuple[float, float]) -> dict[
         'wall_s': round(seconds[0], 3),
         'cpu_s': round(seconds[1], 3),
         'peak_mb': round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+        'loops_closed': rebuilds.size,
+        'rebuild_ms': round(1000.0 * float(rebuilds.max(initial=0.0)), 1),
         'ms_per_scan': {name: _spread(1000.0 * taken) for name, taken in stages.items()},
         'features': len(result.pipeline.localizer.features),
         'features_local_median': float(np.median(result.local_features)),

@@ -81,6 +81,11 @@ class EkfSlam:
         self._P[:3, :n], self._P[:n, :3] = 0.0, 0.0
         self._P[:3, :3] = 0.5 * (covariance + covariance.T)
 
+    def move_pose(self, T_map_base: Array) -> None:
+        """Put the robot at a pose (3,), as doubtful, and as bound to the features, as it was."""
+        self._x[:3] = T_map_base
+        self._x[2] = wrap(float(T_map_base[2]))
+
     def predict(self, T_map_base: Array, increment: Array, increment_covariance: Array) -> None:
         """Move to T_map_base = pose o increment, with the covariance (3, 3) of the increment. Eqs. (10), (11).
 

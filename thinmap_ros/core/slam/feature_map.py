@@ -11,15 +11,25 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core import se2
 from thinmap_ros.core.config import parameter
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import transform_points
 from thinmap_ros.core.slam.association import AssociationConfig, associate, mahalanobis, meeting
 from thinmap_ros.core.slam.candidates import Candidate, Candidates
 from thinmap_ros.core.slam.ekf_ti import CompressedEkf
-from thinmap_ros.core.slam.features import Feature, LineFeature, as_seen, ends_of, interval, normals_of
+from thinmap_ros.core.slam.features import (
+    Feature,
+    LineFeature,
+    as_seen,
+    ends_of,
+    interval,
+    moved_line,
+    normals_of,
+)
 from thinmap_ros.core.slam.lines import Lines
 from thinmap_ros.core.slam.local_area import LocalArea
+from thinmap_ros.core.slam.loops import Correction
 from thinmap_ros.core.slam.visibility import seen_through
 
 _SPARE = 8  # features that the local area may hold beyond those it should
@@ -82,6 +92,23 @@ class FeatureMap:
         new = [i for candidate in ripe for i in self._take_up(ekf, candidate)]
         self.area.store(ekf.local.pose, [i for i in (*seen, *new) if i in self._features])
         return len(matched), taken
+
+    def move(self, ekf: CompressedEkf, correction: Correction) -> None:
+        """Take the features where the keyframes nearest to where they were first seen from have gone.
+
+        How doubtful they are stays as it was. Two that turn out to be one wall are merged when they are seen next.
+        """
+        places, moved = correction.before[:, :2], {}
+        for feature_id, line in ekf.lines().items():
+            feature = self._features[feature_id]
+            k = int(np.hypot(*(places - feature.seen_from).T).argmin())
+            T = se2.compose(correction.after[k], se2.invert(correction.before[k]))
+            ends = transform_points(T, ends_of(feature, line))
+            moved[feature_id] = moved_line(T, line)
+            feature.low, feature.high = interval(moved[feature_id], ends)
+            feature.seen_from = transform_points(T, feature.seen_from[None])[0]
+        ekf.move(moved)
+        self._candidates.forget()
 
     def _local(self, ekf: CompressedEkf) -> list[Feature]:
         return [self._features[i] for i in ekf.area]

@@ -14,7 +14,7 @@ from thinmap_ros.core.slam.ekf_ti import CompressedEkf
 from thinmap_ros.core.slam.feature_map import FeatureConfig, FeatureMap
 from thinmap_ros.core.slam.features import LineFeature
 from thinmap_ros.core.slam.lines import LineConfig, Lines, extract_lines, no_lines
-from thinmap_ros.core.slam.loops import LoopConfig, Loops
+from thinmap_ros.core.slam.loops import Correction, Keyframe, LoopConfig, Loops
 from thinmap_ros.core.slam.models import MotionConfig, odometry_covariance, rotation
 from thinmap_ros.core.slam.scan_matching import Match, MatchConfig, ScanMatcher
 from thinmap_ros.core.topology.graph import TopologicalMap
@@ -24,6 +24,8 @@ _LONGEST_STEP_M = 5.0  # between two scans the wheels cannot go farther: the odo
 _NEW_GROUND = 0.3  # where less of a scan than this lies on what is known, there is nothing to contradict
 _NEW_GROUND_M, _NEW_GROUND_RAD = 0.6, 0.6  # and that is so only this far from where the map last learned
 _LEAP_M, _LEAP_RAD = 0.4, 0.4  # a scan puts the robot this far from where the wheels did: one of them is wrong
+_OF_LATE_M = 15.0  # way in which the drift is as good as nothing
+_REDRAWN_AT_ONCE, _REDRAWN_A_STEP = 60, 3  # keyframes drawn anew when a loop was closed, and in each step after it
 _LOST_SIGMA_M = 1.0  # a robot in doubt by more than this does not know where it is
 
 
@@ -55,7 +57,8 @@ class Estimate:
 
     observed, matched: lines of this scan, and those found among the features (both 0 where the robot stands still and
     the scan has nothing new to say); n_features, n_local: features in the map, and in the local area; match_quality:
-    share of the scan's points on known ground that fit the map.
+    share of the scan's points on known ground that fit the map. correction: where a loop was closed in this step, what
+    it did to the keyframes; T_map_base is then the corrected pose.
     """
 
     T_map_base: Array
@@ -67,6 +70,7 @@ class Estimate:
     n_local: int = 0
     match_quality: float = 0.0
     lost: bool = False
+    correction: Correction | None = None
 
 
 class Localizer:
@@ -88,8 +92,11 @@ class Localizer:
         self._feature_map = FeatureMap(self.config, local_areas=self.config.slam == 'ti')
         self._matcher = ScanMatcher(self.config)
         self._loops = Loops(self.config, self.config)
-        # Of every step, which keyframe came before it, and the pose.
+        # Of every step, which keyframe came before it, and the pose from there.
         self._path: list[tuple[int, Array]] = []
+        self._way_m = 0.0
+        # Keyframes from which the map of points has still to be drawn anew.
+        self._redraw: list[int] = []
         self._T_odom_base: Array | None = None
         self._T_last_look: Array | None = None
         # What has been added to the doubt of the pose since a scan last fitted the map.
@@ -126,6 +133,10 @@ class Localizer:
         increment, increment_covariance = self._odometry(T_odom_base)
         points_base, laser_base = self._seen(scan)
         expected = se2.compose(self._ekf.pose, increment)
+        self._way_m += math.hypot(increment[0], increment[1])
+        self._matcher.map.way_m = self._way_m
+        # Until it is known that old and new agree here, a scan is matched with what was seen of late.
+        self._matcher.map.since_m = -math.inf if self._loops.agreed else self._way_m - _OF_LATE_M
         match = self._predict(points_base, laser_base, increment, increment_covariance)
         lines, matched = no_lines(), 0
         if self._has_news() and not self._is_lost():
@@ -138,19 +149,52 @@ class Localizer:
                 self._loops.follow(scan, points_base, self._ekf.pose, _is_leap(expected, self._ekf.pose))
         self._filter.work_off()
         self._loops.work_off()
-        self._path.append((len(self._loops.keyframes) - 1, self._ekf.pose))
-        return self._estimate(match, lines, matched)
+        correction = self._loops.close()
+        if correction is not None:
+            self._apply(correction)
+        self._redraw_some(_REDRAWN_A_STEP)
+        k = len(self._loops.keyframes) - 1
+        pose = self._ekf.pose
+        self._path.append((k, pose if k < 0 else se2.between(self._loops.keyframes[k].T_map_base, pose)))
+        return self._estimate(match, lines, matched, correction)
 
     def corrected_path(self) -> Array:
         """Poses (N, 3) of all steps since the beginning, as they look now, after all corrections."""
-        live = np.array([f.T_map_base for f in self._loops.keyframes]).reshape(-1, 3)
         relaxed = self._loops.relaxed()
-        path = [T if k < 0 else se2.compose(relaxed[k], se2.between(live[k], T)) for k, T in self._path]
+        path = [T if k < 0 else se2.compose(relaxed[k], T) for k, T in self._path]
         return np.array(path).reshape(-1, 3)
+
+    @property
+    def keyframes(self) -> list[Keyframe]:
+        """The scans that were kept, at their poses as they are known now."""
+        return self._loops.keyframes
 
     def corrected_scans(self) -> list[tuple[Scan, Array]]:
         """The scans that were kept, each with its pose (3,) after all corrections: what a map can be drawn from."""
         return [(f.scan, T) for f, T in zip(self._loops.keyframes, self._loops.relaxed(), strict=True)]
+
+    def _apply(self, correction: Correction) -> None:
+        """A loop was closed: pose, features and the map of points go where the keyframes have gone."""
+        last = len(correction.after) - 1
+        moved = correction.moved(last, self._ekf.pose)
+        self._feature_map.move(self._filter, correction)
+        self._ekf.move_pose(moved)
+        self._T_last_look = moved
+        places = correction.after[:, :2] - moved[:2]
+        self._redraw = np.argsort(-np.hypot(*places.T)).tolist()
+        self._matcher = ScanMatcher(self.config)
+        near = np.hypot(*places.T) < self.config.match_range_m
+        self._redraw_some(min(int(near.sum()), _REDRAWN_AT_ONCE))
+
+    def _redraw_some(self, count: int) -> None:
+        """Draw some of the keyframes that are due, the nearest first, into the map of points."""
+        seen_m = self._matcher.map.way_m
+        for k in [self._redraw.pop() for _ in range(min(count, len(self._redraw)))]:
+            frame = self._loops.keyframes[k]
+            self._matcher.map.way_m = frame.way_m
+            laser = se2.transform_points(frame.T_map_base, frame.scan.T_base_laser[None, :2])[0]
+            self._matcher.add(se2.transform_points(frame.T_map_base, frame.points_base), laser)
+        self._matcher.map.way_m = seen_m
 
     def _odometry(self, T_odom_base: Array) -> tuple[Array, Array]:
         """Input u of eq. (10): the increment (3,) since the last scan, and its covariance (3, 3)."""
@@ -224,7 +268,7 @@ class Localizer:
         in_doubt = max(self._ekf.pose_covariance[0, 0], self._ekf.pose_covariance[1, 1]) > _LOST_SIGMA_M**2
         return self._misfits >= self.config.lost_scans or bool(in_doubt)
 
-    def _estimate(self, match: Match, lines: Lines, matched: int) -> Estimate:
+    def _estimate(self, match: Match, lines: Lines, matched: int, correction: Correction | None) -> Estimate:
         T_map_base = self._ekf.pose
         T_odom_base = np.zeros(3) if self._T_odom_base is None else self._T_odom_base
         return Estimate(
@@ -237,6 +281,7 @@ class Localizer:
             len(self._filter.area),
             match.fit,
             self._is_lost(),
+            correction,
         )
 
 

@@ -1,15 +1,17 @@
 """Loops: coming back by another way, noticed, verified, and what it means for the whole path.
 
 Along the path a scan is kept now and then. Where the path has been near before, it is matched with the scans kept
-there; only what fits well counts. What the localizer says of neighbours on the path, and the matches of the others,
-make a graph of poses that is relaxed. A keyframe costs its scan, its pose and a few measurements in memory, and a few
-matches in time, one a step. Source: Lu and Milios, "Globally consistent range scan alignment for environment mapping",
-1997; for the graph see pose_graph.
+there. A match counts that fits well; of matches that tell the place sharply, several along the way that ask for one
+and the same correction make a loop. What the localizer says of neighbours on the path, and the matches of the others,
+make a graph of poses that is relaxed; should the matches that asked for it not be content then, nothing is corrected.
+A keyframe costs its scan, its pose and a few measurements in memory, and a few matches in time, one a step.
+Source: Lu and Milios, "Globally consistent range scan alignment for environment mapping", 1997; for the graph see
+pose_graph.
 """
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,6 +32,16 @@ _LEAP_SIGMAS = (0.1, 0.1, 0.05)  # the same where wheels and walls contradicted 
 _MATCH_SIGMAS = (0.04, 0.04, 0.02)  # matches err together, by more than each says of itself
 _PRIOR_SIGMAS = (0.3, 0.3, 0.15)
 _LEAST_OVERLAP, _LEAST_FIT = 0.5, 0.85
+_DRIFT = 0.01  # of the way since the earlier visit, by which the place may be off, beyond the first metres
+_FARTHEST_M = 2.5  # and no more than this
+_SEARCHED_M = 0.3  # from this on a good match near by is not taken without looking around
+_SEARCH_DEG = 12.0
+_SHARP_M = 0.1  # a match that leaves more than this open (1 sigma), as along a corridor, proves no loop
+_WITNESSES = 3  # matches of different keyframes that have to ask for the same correction
+_LATELY = 8  # keyframes back to which they count
+_ALIKE_M, _ALIKE_RAD = 0.2, 0.06  # by how much they may differ
+_WORTH_M, _WORTH_RAD = 0.12, 0.04  # smaller corrections are left to the end
+_HOLDS_M = 3.0  # so much way after a match that agrees, the old map is still trusted
 
 
 @dataclass(frozen=True)
@@ -43,12 +55,24 @@ class LoopConfig(Config):
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    """A scan that was kept, its points (N, 2) in the robot frame, the pose (3,) then, and the way up to there."""
+    """A scan that was kept, its points (N, 2) in the robot frame, its pose (3,), and the way up to there."""
 
     scan: Scan
     points_base: Array
     T_map_base: Array
     way_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """Poses (N, 3) of the keyframes before and after a loop was closed."""
+
+    before: Array
+    after: Array
+
+    def moved(self, k: int, T: Array) -> Array:
+        """Where a pose (3,) that was found from keyframe k is now."""
+        return se2.compose(self.after[k], se2.between(self.before[k], T))
 
 
 class Loops:
@@ -62,6 +86,8 @@ class Loops:
         self._config, self._matching = config, matching
         self._jobs: deque[tuple[int, int]] = deque()
         self._leapt = False
+        self._witnesses: deque[Measured] = deque(maxlen=_WITNESSES)
+        self._agreed_at_m = -math.inf
 
     def follow(self, scan: Scan, points_base: Array, T_map_base: Array, leapt: bool) -> None:
         """Take in a scan that fits the map at a pose (3,), with its points (N, 2).
@@ -90,12 +116,61 @@ class Loops:
             if match.overlap >= _LEAST_OVERLAP and match.fit >= _LEAST_FIT:
                 covariance = match.covariance + np.diag(np.square(_MATCH_SIGMAS))
                 self.matched.append(Measured(j, k, match.T_map_base, np.linalg.inv(covariance), True))
+                if k - j > 1 and math.sqrt(match.covariance[:2, :2].trace()) < _SHARP_M:
+                    self._hear(self.matched[-1])
+
+    @property
+    def agreed(self) -> bool:
+        """Whether, where the robot is now, what it maps agrees with what it mapped on earlier visits."""
+        return bool(self.keyframes) and self.keyframes[-1].way_m - self._agreed_at_m <= _HOLDS_M
+
+    def close(self) -> Correction | None:
+        """The correction that a verified loop asks for, which the keyframes have then undergone; mostly None."""
+        if not self._is_loop():
+            return None
+        witnesses, self._witnesses = list(self._witnesses), deque(maxlen=_WITNESSES)
+        before = np.array([k.T_map_base for k in self.keyframes])
+        after = self._relax(before)
+        if max(_size(_off(after, m)) for m in witnesses) > 0.5 * max(_size(_off(before, m)) for m in witnesses):
+            # The graph does not bend so far: either these are wrong, or much else is. They do not count.
+            self.matched = [m for m in self.matched if m not in witnesses]
+            return None
+        self.keyframes = [replace(f, T_map_base=T) for f, T in zip(self.keyframes, after, strict=True)]
+        self._agreed_at_m = self.keyframes[-1].way_m
+        return Correction(before, after)
+
+    def _hear(self, measured: Measured) -> None:
+        """Take a sharp match of the latest keyframes as a witness, for the map as it is or for a loop."""
+        off = _off(self._poses(measured), measured)
+        if math.hypot(off[0], off[1]) < _WORTH_M and abs(off[2]) < _WORTH_RAD:
+            self._agreed_at_m = max(self._agreed_at_m, self.keyframes[measured.b].way_m)
+            self._witnesses.clear()
+        elif not self._witnesses or self._witnesses[-1].b != measured.b:
+            self._witnesses.append(measured)
+
+    def _is_loop(self) -> bool:
+        """Whether enough matches of late ask for the same correction of the place where the robot is."""
+        if len(self._witnesses) < _WITNESSES or self._witnesses[0].b < len(self.keyframes) - _LATELY:
+            return False
+        poses = np.array([k.T_map_base for k in self.keyframes])
+        asked = np.array([se2.compose(poses[m.a], m.T_a_b) - poses[m.b] for m in self._witnesses])
+        asked[:, 2] = se2.wrap(asked[:, 2])
+        return bool(np.ptp(asked[:, :2], axis=0).max() < _ALIKE_M and np.ptp(asked[:, 2]) < _ALIKE_RAD)
+
+    def _poses(self, measured: Measured) -> Array:
+        """Poses of the keyframes up to the later one of a measurement; only its two are looked at."""
+        poses = np.zeros((measured.b + 1, 3))
+        for i in (measured.a, measured.b):
+            poses[i] = self.keyframes[i].T_map_base
+        return poses
 
     def relaxed(self) -> Array:
         """Poses (N, 3) of the keyframes that agree best with all measurements."""
         while self._jobs:
             self.work_off()
-        poses = np.array([k.T_map_base for k in self.keyframes]).reshape(-1, 3)
+        return self._relax(np.array([k.T_map_base for k in self.keyframes]).reshape(-1, 3))
+
+    def _relax(self, poses: Array) -> Array:
         usual, leap = (np.diag(1.0 / np.square(sigmas)) for sigmas in (self._step_sigmas(poses), _LEAP_SIGMAS))
         steps = [
             Measured(k, k + 1, step, leap if k in self._leaps else usual, False) for k, step in enumerate(self._steps)
@@ -132,25 +207,39 @@ class Loops:
         poses, ways = np.array([f.T_map_base for f in self.keyframes]), np.array([f.way_m for f in self.keyframes])
         distances = np.hypot(*(poses[:, :2] - here.T_map_base[:2]).T)
         unlike = distances + _TURN_M_RAD * np.abs(se2.wrap(poses[:, 2] - here.T_map_base[2]))
-        unlike[(distances > self._config.loop_reach_m) | (ways > here.way_m - _AGAIN_M)] = np.inf
+        unlike[(distances > self._reach(here.way_m - ways)) | (ways > here.way_m - _AGAIN_M)] = np.inf
         found: list[int] = []
         while len(found) < _VISITS and np.isfinite(unlike).any():
             found.append(int(unlike.argmin()))
             unlike[np.abs(ways - ways[found[-1]]) < _AGAIN_M] = np.inf
         return found
 
+    def _reach(self, way_m: Array) -> Array:
+        """How far from a place that was left so much way ago, (N,), the robot may seem to be when it is back, m."""
+        return np.asarray(self._config.loop_reach_m + np.minimum(_DRIFT * way_m, _FARTHEST_M))
+
     def _match(self, j: int, k: int) -> Match:
         """Keyframe k matched with j and those around it, in the frame of j."""
-        matcher = ScanMatcher(self._matching)
         base, here = self.keyframes[j].T_map_base, self.keyframes[k]
+        drift = min(_DRIFT * (here.way_m - self.keyframes[j].way_m), _FARTHEST_M)
+        matcher = ScanMatcher(replace(self._matching, search_m=self._matching.search_m + drift, search_deg=_SEARCH_DEG))
         for frame in self.keyframes[max(0, j - _AROUND) : min(j + _AROUND + 1, k)]:
             T = se2.between(base, frame.T_map_base)
             laser = se2.transform_points(T, frame.scan.T_base_laser[None, :2])[0]
             matcher.add(se2.transform_points(T, frame.points_base), laser)
         prior = se2.between(base, here.T_map_base)
         return matcher.match(
-            here.points_base, np.ascontiguousarray(here.scan.T_base_laser[:2]), prior, np.diag(np.square(_PRIOR_SIGMAS))
+            here.points_base,
+            np.ascontiguousarray(here.scan.T_base_laser[:2]),
+            prior,
+            np.diag(np.square(_PRIOR_SIGMAS) + [drift**2, drift**2, 0.0]),
+            search=drift > _SEARCHED_M and not self.agreed,
         )
+
+
+def _size(off: Array) -> float:
+    """Length of an error (3,), m; a radian counts as a metre."""
+    return math.hypot(*off)
 
 
 def _off(poses: Array, measured: Measured) -> Array:

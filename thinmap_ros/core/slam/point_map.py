@@ -14,8 +14,9 @@ from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.se2 import Array
 
 # What a cell holds: points counted, their mean (m, map frame), the unit normal of the surface there, towards where it
-# was seen from, and how loose the surface is: 0 a wall, up to 1 clutter, _UNFORMED where there are too few points.
-COUNT, MEAN_X, MEAN_Y, CENTRE_X, CENTRE_Y, NORMAL_X, NORMAL_Y, LOOSE, DENSE = range(9)
+# was seen from, how loose the surface is: 0 a wall, up to 1 clutter, UNFORMED where there are too few points; points
+# whose beams were dense; and how far the robot had come when it last saw the cell, m.
+COUNT, MEAN_X, MEAN_Y, CENTRE_X, CENTRE_Y, NORMAL_X, NORMAL_Y, LOOSE, DENSE, SEEN = range(10)
 UNFORMED = 2.0
 _SHIFT, _MASK = 6, TILE - 1
 _FEWEST_CELLS = 3
@@ -34,8 +35,10 @@ class PointMap:
     def __init__(self, cell_m: float, most: float) -> None:
         """cell_m: edge of a cell; most: points that a cell's mean remembers, so that it follows what moved."""
         self.cell_m = cell_m
-        self.tiles = TileStore(np.float32, (9,))
+        self.tiles = TileStore(np.float32, (10,))
         self._most = most
+        # How far the robot has come, and where on its way the cells that count were last seen, m.
+        self.way_m, self.since_m = 0.0, -math.inf
 
     @property
     def corner(self) -> NDArray[np.int64]:
@@ -43,7 +46,7 @@ class PointMap:
         return np.array([self.tiles.first_row, self.tiles.first_col], dtype=np.int64) * TILE
 
     def add(self, points_map: Array, seen_from: Array) -> None:
-        """Take in points (N, 2) seen from a place (2,), all in the map frame."""
+        """Take in points (N, 2) seen from a place (2,), all in the map frame. Cells that do not count begin anew."""
         if len(points_map) == 0:
             return
         cells = np.floor(points_map[:, ::-1] / self.cell_m).astype(np.int64)
@@ -53,7 +56,8 @@ class PointMap:
         self.tiles.ensure(tiles)
         cells -= self.corner
         dense = gaps(points_map) < DENSE_M
-        _add(self.tiles.pool, self.tiles.directory, cells, points_map, dense, seen_from, self._most)
+        limits = (self._most, self.way_m, self.since_m)
+        _add(self.tiles.pool, self.tiles.directory, cells, points_map, dense, seen_from, limits)
 
 
 def gaps(points: Array) -> Array:
@@ -79,12 +83,19 @@ def _add(
     points: Array,
     dense: NDArray[np.bool_],
     seen_from: Array,
-    most: float,
+    limits: tuple[float, float, float],
 ) -> None:
-    """Count the points into their cells, then form the surface of each cell that was touched."""
+    """Count the points into their cells, then form the surface of each cell that was touched.
+
+    limits: the most points that a cell remembers, where on its way the robot is, and where cells that count were seen.
+    """
+    most, way, since = limits
     for i in range(points.shape[0]):
         row, col = cells[i, 0], cells[i, 1]
         cell = pool[directory[row >> _SHIFT, col >> _SHIFT], row & _MASK, col & _MASK]
+        if cell[SEEN] < since:
+            cell[COUNT], cell[DENSE] = 0.0, 0.0
+        cell[SEEN] = way
         cell[COUNT] = min(cell[COUNT] + 1.0, most)
         cell[DENSE] += dense[i]
         cell[MEAN_X] += (points[i, 0] - cell[MEAN_X]) / cell[COUNT]
@@ -92,7 +103,7 @@ def _add(
     for i in range(points.shape[0]):
         row, col = cells[i, 0], cells[i, 1]
         for reach in _REACHES:
-            x, y, nx, ny, loose = _surface(pool, directory, row, col, reach, seen_from)
+            x, y, nx, ny, loose = _surface(pool, directory, row, col, reach, seen_from, since)
             if loose == 0.0:
                 break
         cell = pool[directory[row >> _SHIFT, col >> _SHIFT], row & _MASK, col & _MASK]
@@ -110,6 +121,7 @@ def _surface(
     col: int,
     reach: int,
     seen_from: Array,
+    since: float,
 ) -> tuple[float, float, float, float, float]:
     """Centre, normal and looseness of what the means around a cell make: their directions of least and most variance.
 
@@ -125,7 +137,7 @@ def _surface(
             cell = pool[slot, r & _MASK, c & _MASK]
             own = r == row and c == col
             away = cell[NORMAL_X] * (seen_from[0] - cell[MEAN_X]) + cell[NORMAL_Y] * (seen_from[1] - cell[MEAN_Y])
-            if cell[COUNT] > 0.0 and (own or cell[LOOSE] > 0.0 or away >= 0.0):
+            if cell[COUNT] > 0.0 and cell[SEEN] >= since and (own or cell[LOOSE] > 0.0 or away >= 0.0):
                 dx, dy = cell[MEAN_X] - base[MEAN_X], cell[MEAN_Y] - base[MEAN_Y]
                 weight = min(cell[COUNT], _MOST_WEIGHT)
                 cells += 1

@@ -26,6 +26,7 @@ from thinmap_ros.core.slam.point_map import (
     MEAN_Y,
     NORMAL_X,
     NORMAL_Y,
+    SEEN,
     UNFORMED,
     PointMap,
     gaps,
@@ -37,6 +38,9 @@ _ROUNDS = 20
 _WIDE_ROUNDS = 3  # rounds in which far neighbours and larger errors still count
 _LEAST_OVERLAP = 0.3  # share of the scan that has to lie where the map knows something, for a fit to be judged
 _FEWEST_POINTS = 10
+_SEARCHED_M, _SEARCHED_POINTS = 20.0, 60  # a search takes so many points of the scan, and none farther than this
+_SEARCH_STRIDE = 2  # cells from one place that is tried to the next
+_SEARCH_RIM = 1.25  # points by which a place at the rim of a search has to fit better than its middle
 
 
 @dataclass(frozen=True)
@@ -86,30 +90,36 @@ class ScanMatcher:
         """Take points (N, 2) seen from a place (2,) into the map, map frame."""
         self.map.add(points_map, seen_from)
 
-    def match(self, points_base: Array, laser_base: Array, prior: Array, covariance: Array) -> Match:
+    def match(
+        self, points_base: Array, laser_base: Array, prior: Array, covariance: Array, search: bool = False
+    ) -> Match:
         """Pose at which points (N, 2), in the order of the beams, fit the map near a prior pose (3,).
 
         laser_base (2,): where the laser sits on the robot; covariance (3, 3) of the prior, in the map frame. Where
-        the fit is poor, the surroundings are searched. Without points or map, the prior is given back, as not good.
+        the fit is poor, or with `search`, the surroundings are searched. Without points or map, the prior is given
+        back, as not good.
         """
         if len(points_base) < _FEWEST_POINTS or self.map.tiles.used == 0:
             return Match(prior, covariance, 0.0, 0.0, False)
         around = gaps(points_base)
         scan = np.column_stack([points_base, np.clip(around / self.config.match_cell_m, 0.05, 1.0), around < DENSE_M])
         match = self._refine(scan, laser_base, prior, prior, covariance)
-        if match.overlap >= _LEAST_OVERLAP and match.fit < self.config.match_good_fit:
+        if search or (match.overlap >= _LEAST_OVERLAP and match.fit < self.config.match_good_fit):
             match = self._search(scan, laser_base, prior, covariance, match)
         return match
 
     def _search(self, scan: Array, laser_base: Array, prior: Array, covariance: Array, poor: Match) -> Match:
         """The better of a poor match and of what the search around the prior leads to."""
         config, tiles = self.config, self.map.tiles
-        shifts = np.arange(-config.search_m, config.search_m + 1e-9, 2.0 * config.match_cell_m)
         turns = np.radians(np.arange(-config.search_deg, config.search_deg + 1e-9, 2.0))
-        sparse = np.ascontiguousarray(scan[:: max(1, len(scan) // 60)])
-        start = _search(
-            sparse, prior, shifts, turns, tiles.pool, tiles.directory, self.map.corner, config.match_cell_m
-        )
+        near = scan[np.hypot(scan[:, 0], scan[:, 1]) < _SEARCHED_M]
+        sparse = np.ascontiguousarray(near[:: max(1, len(near) // _SEARCHED_POINTS)])
+        steps = int(config.search_m / (_SEARCH_STRIDE * config.match_cell_m) + 1e-9)
+        reach = float(np.hypot(sparse[:, 0], sparse[:, 1]).max(initial=0.0)) + config.search_m
+        size = 2 * int(math.ceil(reach / config.match_cell_m)) + 8
+        low = np.floor(prior[1::-1] / config.match_cell_m).astype(np.int64) - size // 2
+        filled = _filled(tiles.pool, tiles.directory, low - self.map.corner, size, self.map.since_m)
+        start = _search(sparse, prior, steps, turns, filled, low, config.match_cell_m)
         # What is searched for is what the prior missed: it must not hold the pose back.
         wide = covariance + np.diag(np.square([config.search_m, config.search_m, math.radians(config.search_deg)]))
         found = self._refine(scan, laser_base, start, prior, wide)
@@ -119,7 +129,7 @@ class ScanMatcher:
         config, tiles = self.config, self.map.tiles
         limits = np.array(
             [config.match_cell_m, config.match_reach_m, config.match_sigma_m, config.match_outlier_m]
-            + [config.match_inlier_m]
+            + [config.match_inlier_m, self.map.since_m]
         )
         information: Array = np.linalg.inv(covariance).astype(np.float64)
         pose, posterior, shares = _align(
@@ -144,6 +154,7 @@ def _nearest(
     corner: NDArray[np.int64],
     cell_m: float,
     reach: int,
+    since: float,
 ) -> tuple[int, int, int]:
     """Cell whose mean is nearest to a point, ring by ring up to a reach in cells: slot (NO_TILE: none), row, col.
 
@@ -161,7 +172,7 @@ def _nearest(
                 if slot == NO_TILE:
                     continue
                 cell = pool[slot, r & _MASK, c & _MASK]
-                if cell[COUNT] == 0.0:
+                if cell[COUNT] == 0.0 or cell[SEEN] < since:
                     continue
                 dx, dy = cell[MEAN_X] - x, cell[MEAN_Y] - y
                 squared = dx * dx + dy * dy
@@ -236,9 +247,10 @@ def _align(
 ) -> tuple[Array, Array, Array]:
     """Pose (3,), its information (3, 3), and the weights (3,) of all points, of those near the map, of those on it.
 
-    scan (N, 3): x, y, weight in the robot frame; limits: cell, reach, sigma, outlier and inlier distance, m.
+    scan (N, 3): x, y, weight in the robot frame; limits: cell, reach, sigma, outlier and inlier distance, m, and
+    where on the robot's way the cells that count were last seen.
     """
-    cell_m, reach, sigma, outlier, inlier = limits
+    cell_m, reach, sigma, outlier, inlier, since = limits
     pose, information, gradient, shares = start.copy(), np.zeros((3, 3)), np.zeros(3), np.zeros(3)
     for iteration in range(_ROUNDS):
         wide = iteration < _WIDE_ROUNDS
@@ -253,7 +265,7 @@ def _align(
             px, py = cos * scan[i, 0] - sin * scan[i, 1], sin * scan[i, 0] + cos * scan[i, 1]
             x, y = px + pose[0], py + pose[1]
             shares[0] += scan[i, 2]
-            slot, row, col = _nearest(x, y, laser_x, laser_y, pool, directory, corner, cell_m, cells)
+            slot, row, col = _nearest(x, y, laser_x, laser_y, pool, directory, corner, cell_m, cells, since)
             if slot == NO_TILE:
                 continue
             cell = pool[slot, row, col]
@@ -278,43 +290,54 @@ def _align(
 
 
 @kernel
+def _filled(
+    pool: NDArray[np.float32], directory: NDArray[np.int32], low: NDArray[np.int64], size: int, since: float
+) -> NDArray[np.uint8]:
+    """1 where a cell or one of its eight neighbours holds points that count, else 0: (size, size) from a cell on."""
+    filled = np.zeros((size, size), dtype=np.uint8)
+    for r in range(1, size - 1):
+        for c in range(1, size - 1):
+            slot = slot_of(directory, low[0] + r, low[1] + c)
+            if slot == NO_TILE:
+                continue
+            cell = pool[slot, (low[0] + r) & _MASK, (low[1] + c) & _MASK]
+            if cell[COUNT] > 0.0 and cell[SEEN] >= since:
+                filled[r - 1 : r + 2, c - 1 : c + 2] = 1
+    return filled
+
+
+@kernel
 def _search(
     scan: Array,
     centre: Array,
-    shifts: Array,
+    steps: int,
     turns: Array,
-    pool: NDArray[np.float32],
-    directory: NDArray[np.int32],
-    corner: NDArray[np.int64],
+    filled: NDArray[np.uint8],
+    low: NDArray[np.int64],
     cell_m: float,
 ) -> Array:
-    """The pose (3,) around a centre at which most points fall on or beside cells that hold points."""
+    """The pose (3,) around a centre at which most points fall on or beside cells that hold points.
+
+    steps: how often to go _SEARCH_STRIDE cells to each side; filled (S, S): these cells, from the cell `low` on.
+    """
     best, best_score = centre.copy(), -np.inf
+    rim = max(steps, 1) * _SEARCH_STRIDE * cell_m
+    rows, cols = np.empty(scan.shape[0], dtype=np.int64), np.empty(scan.shape[0], dtype=np.int64)
     for turn in turns:
         cos, sin = math.cos(centre[2] + turn), math.sin(centre[2] + turn)
-        for dx in shifts:
-            for dy in shifts:
+        for k in range(scan.shape[0]):
+            x = centre[0] + cos * scan[k, 0] - sin * scan[k, 1]
+            y = centre[1] + sin * scan[k, 0] + cos * scan[k, 1]
+            rows[k], cols[k] = int(math.floor(y / cell_m)) - low[0], int(math.floor(x / cell_m)) - low[1]
+        for i in range(-steps, steps + 1):
+            for j in range(-steps, steps + 1):
+                down, right = _SEARCH_STRIDE * i, _SEARCH_STRIDE * j
+                dx, dy = right * cell_m, down * cell_m
                 # Of poses that fit alike the one nearer to the centre.
-                score = -5.0 * (dx * dx + dy * dy + turn * turn)
+                score = -_SEARCH_RIM * ((dx * dx + dy * dy) / (rim * rim) + 4.0 * turn * turn)
                 for k in range(scan.shape[0]):
-                    x = centre[0] + dx + cos * scan[k, 0] - sin * scan[k, 1]
-                    y = centre[1] + dy + sin * scan[k, 0] + cos * scan[k, 1]
-                    row = int(math.floor(y / cell_m)) - corner[0]
-                    col = int(math.floor(x / cell_m)) - corner[1]
-                    score += _beside(pool, directory, row, col)
+                    score += filled[rows[k] + down, cols[k] + right]
                 if score > best_score:
                     best_score = score
                     best[0], best[1], best[2] = centre[0] + dx, centre[1] + dy, centre[2] + turn
     return best
-
-
-@kernel
-def _beside(pool: NDArray[np.float32], directory: NDArray[np.int32], row: int, col: int) -> float:
-    """1 where a cell or one of its eight neighbours holds points, else 0."""
-    found = 0.0
-    for r in range(row - 1, row + 2):
-        for c in range(col - 1, col + 2):
-            slot = slot_of(directory, r, c)
-            if slot != NO_TILE and pool[slot, r & _MASK, c & _MASK, COUNT] > 0.0:
-                found = 1.0
-    return found

@@ -1,0 +1,77 @@
+"""What a grid was drawn from, so that it can be drawn anew when the robot's past turns out to have been elsewhere."""
+
+import math
+from array import array
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.grid.occupancy import OccupancyGrid
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+
+_KEPT_M, _KEPT_RAD = 0.25, 0.25
+
+
+class GridHistory:
+    """The pose of every scan, and a scan every 0.25 m or 0.25 rad: some 10 kB a metre.
+
+    A correction names some of the scans by their stamps and says where they were made. All others go with the last of
+    these before them, in the order in which they came: stamps of real robots step back now and then.
+    """
+
+    def __init__(self) -> None:
+        self._stamps = array('q')
+        self._poses = array('d')
+        self._kept: list[tuple[int, Scan]] = []
+
+    def add(self, scan: Scan, T_map_base: Array) -> None:
+        """Take in a scan that was drawn at a pose (3,)."""
+        number = len(self._stamps)
+        self._stamps.append(scan.stamp_ns)
+        self._poses.extend(T_map_base.tolist())
+        if self._kept:
+            first = 3 * self._kept[-1][0]
+            moved = se2.between(np.array(self._poses[first : first + 3]), T_map_base)
+            if math.hypot(moved[0], moved[1]) < _KEPT_M and abs(float(moved[2])) < _KEPT_RAD:
+                return
+        self._kept.append((number, scan))
+
+    def poses(self) -> Array:
+        """Poses (N, 3) of the kept scans as they are known now."""
+        return self._all_poses()[[number for number, _ in self._kept]]
+
+    def correct(self, stamps_ns: NDArray[np.int64], poses: Array, since_ns: int) -> None:
+        """Move everything as the scans of these stamps (M,) are moved, which were made at poses (M, 3).
+
+        since_ns: stamp of the scan from which on poses are right already, whether it has come yet or not.
+        """
+        before = self._all_poses()
+        right = self._stamps.index(since_ns) if since_ns in self._stamps else len(self._stamps)
+        numbers, named = self._numbers(stamps_ns, right)
+        if numbers.size == 0:
+            return
+        anchors = np.maximum(np.searchsorted(numbers, np.arange(right), side='right') - 1, 0)
+        after = [
+            se2.compose(poses[named[a]], se2.between(before[numbers[a]], T))
+            for a, T in zip(anchors, before[:right], strict=True)
+        ]
+        self._poses[: 3 * right] = array('d', np.array(after).ravel().tolist())
+
+    def draw(self, like: OccupancyGrid) -> OccupancyGrid:
+        """The grid of the kept scans at their poses, with the cells and the configuration of another."""
+        grid = OccupancyGrid(like.config, like.frame)
+        for (_, scan), T in zip(self._kept, self.poses(), strict=True):
+            grid.update(scan, T)
+        return grid
+
+    def _all_poses(self) -> Array:
+        return np.array(self._poses).reshape(-1, 3)
+
+    def _numbers(self, stamps_ns: NDArray[np.int64], end: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Numbers before `end` of the scans with these stamps, and which of the stamps each has; no others."""
+        number_of = {stamp: number for number, stamp in enumerate(self._stamps[:end])}
+        found = sorted((number_of[stamp], k) for k, stamp in enumerate(stamps_ns.tolist()) if stamp in number_of)
+        pairs = np.array(found, dtype=np.int64).reshape(-1, 2)
+        return pairs[:, 0], pairs[:, 1]
