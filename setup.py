@@ -9,7 +9,9 @@ NODES = [
     'sim', 'grid_mapper', 'topology_builder', 'localizer', 'explorer', 'navigator', 'recorder', 'bag_player',
     'demo_monitor', 'rerun_viewer',
 ]
-TOOLS = ['replay', 'explore_world', 'compare_exploration', 'carmen_to_bag', 'map_to_graph', 'demo', 'warm_up']
+TOOLS = [
+    'replay', 'explore_world', 'compare_exploration', 'carmen_to_bag', 'map_to_graph', 'bag_repair', 'demo', 'warm_up',
+]
 
 setup(
     name=NAME,
@@ -22,7 +24,9 @@ setup(
         (f'share/{NAME}/config', glob('config/*.yaml')),
         (f'share/{NAME}/worlds', glob('worlds/*.yaml')),
     ],
-    install_requires=['matplotlib', 'mcap', 'numba', 'numpy', 'pillow', 'pyyaml', 'rosbags', 'scipy', 'tqdm'],
+    install_requires=[
+        'lz4', 'matplotlib', 'mcap', 'numba', 'numpy', 'pillow', 'pyyaml', 'rosbags', 'scipy', 'tqdm', 'zstandard',
+    ],
     extras_require={
         'cluster': ['distributed'],
         'viewer': ['rerun-sdk>=0.41,<0.42'],  # its interface changes with each minor version

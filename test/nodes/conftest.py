@@ -34,8 +34,11 @@ class Graph:
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
 
-    def start(self, name: str, **parameters: Any) -> subprocess.Popen[bytes]:
+    def start(self, name: str, remap: tuple[str, ...] = (), **parameters: Any) -> subprocess.Popen[bytes]:
+        """Start a node with ROS's remapping rules and its parameters."""
         command = [sys.executable, '-m', f'thinmap_ros.nodes.{name}', '--ros-args']
+        for rule in remap:
+            command += ['-r', rule]
         for key, value in parameters.items():
             text = f"'{value}'" if isinstance(value, str) else str(value).lower()
             command += ['-p', f'{key}:={text}']

@@ -14,7 +14,7 @@ import pytest
 import rclpy
 import yaml
 
-from thinmap_ros.adapters.bags import BagWriter
+from thinmap_ros.adapters.bag_writer import BagWriter
 from thinmap_ros.core.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parents[2]
