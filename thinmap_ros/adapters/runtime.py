@@ -27,13 +27,15 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 def run(make_node: Callable[[], Node]) -> None:
     """Make a node and spin it until SIGINT or SIGTERM; the process ends with 0, or 2 on a refused start.
 
-    A node may have a method `close()`: it is called last, whatever ended the node.
+    A node may have a method `start()`, called once it is made, and a method `close()`: it is called last, whatever
+    ended the node.
     """
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     _on_signals(_leave)
     node = None
     try:
         node = make_node()
+        getattr(node, 'start', lambda: None)()
         release_compiler_pages()
         _spin(node)
     except ExternalShutdownException:

@@ -15,6 +15,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from thinmap_ros.adapters import messages, parameters, qos, runtime
 from thinmap_ros.adapters.bags import Bag, RawMessage
+from thinmap_ros.adapters.health import OK, WARN, Health
 from thinmap_ros.adapters.lockstep import NONE, TOPICS, Lockstep
 from thinmap_ros.adapters.playback import Playback, is_scan
 from thinmap_ros.adapters.services import answer
@@ -72,6 +73,8 @@ class BagPlayerNode(Node):
         self._ticked_at = self._clock_at = 0.0
         self._lockstep = Lockstep(self, self._config.lockstep)
         self._sent: Counter[str] = Counter()
+        self._health = Health(self)
+        self._health.before_telling(self._tell_health)
         self.finished = False
         self.create_service(SetBool, '~/pause', self._on_pause)
         self.create_service(Trigger, '~/step', self._on_step)
@@ -140,6 +143,15 @@ class BagPlayerNode(Node):
         if is_scan(message) and self._config.lockstep != NONE:
             with contextlib.suppress(InputError):  # a broken scan leads to nothing
                 self._lockstep.sent(messages.stamp_ns(self._bag.decode(message).header.stamp))
+
+    def _tell_health(self) -> None:
+        waits = self._begins_at is None
+        words = 'waiting for subscribers' if waits else 'paused' if self._paused else 'playing'
+        self._health.state(WARN if waits else OK, words)
+        self._health.tell('bag time', self._where())
+        self._health.tell('rounds', self._playback.laps)
+        for topic, count in self._sent.items():
+            self._health.tell(f'{topic}: sent', count)
 
     def _tell_time(self, ns: int) -> None:
         self._clock_topic.publish(ClockMsg(clock=messages.time_msg(ns)))

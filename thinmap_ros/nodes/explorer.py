@@ -8,7 +8,6 @@ from geometry_msgs.msg import Point, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid
 from rclpy.action import ActionClient
 from rclpy.action.client import ClientGoalHandle
-from rclpy.node import Node
 from rclpy.task import Future
 from sensor_msgs.msg import LaserScan
 
@@ -19,6 +18,7 @@ from thinmap_ros import warm_up
 from thinmap_ros.adapters import messages, parameters, qos, runtime
 from thinmap_ros.adapters.actions import Outcome, SingleGoalServer
 from thinmap_ros.adapters.listening import listen
+from thinmap_ros.adapters.live_node import LiveNode
 from thinmap_ros.adapters.stamps import StampMatcher
 from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.core.exploration.area import fenced
@@ -35,7 +35,7 @@ _SAME_GOAL_M, _SAME_GOAL_RAD = 0.1, 0.2
 _GIVE_UP_HOME = 3
 
 
-class ExplorerNode(Node):
+class ExplorerNode(LiveNode):
     """Maps, /topology, /pose and /scan in; goals for the navigator, /end_nodes and /exploration_status out."""
 
     def __init__(self) -> None:
@@ -45,16 +45,25 @@ class ExplorerNode(Node):
         self._mount = LaserMount(self)
         parameters.check_unknown(self)
         warm_up.explorer()
+        self._goal_sent: Array | None = None
+        self._handle: ClientGoalHandle | None = None
+        self.begin_anew()
+        self._make_topics()
+
+    def begin_anew(self) -> None:
+        """Forget the map, the graph and what was explored."""
         self._map = MapMirror()
         self._topology = messages.topology_from(TopologicalMap())
         self._matcher: StampMatcher[LaserScan, Array] = StampMatcher()
         self._T_map_base: Array | None = None
         self._heard_at = self._tracked_at = 0.0
-        self._goal_sent: Array | None = None
-        self._handle: ClientGoalHandle | None = None
         self._begin(Explore.Goal())
         self._state = ExplorationStatus.IDLE
-        self._make_topics()
+
+    def stand_still(self) -> None:
+        """End the exploration."""
+        if self._goals.active:
+            self._end(ExplorationStatus.CANCELLED, 'the explorer was stopped or begins anew')
 
     def _make_topics(self) -> None:
         self._end_nodes = self.create_publisher(EndNodeArray, 'end_nodes', qos.LATCHED)
@@ -67,7 +76,7 @@ class ExplorerNode(Node):
         listen(self, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
         self._navigator = ActionClient(self, NavigateToPose, 'navigate_to_pose')
         self._goals = SingleGoalServer(self, Explore, 'explore', self._begin, self._on_cancel, self._preempted)
-        self.create_timer(_FEEDBACK_PERIOD_S, self._every_second)
+        self.every(_FEEDBACK_PERIOD_S, self._every_second)
 
     def _begin(self, goal: Explore.Goal) -> None:
         self._goal = goal
@@ -125,7 +134,8 @@ class ExplorerNode(Node):
             return
         scan = messages.scan_from(message, T_base_laser)
         patch = self._map.patch if len(self._polygon) < 3 else fenced(self._map.patch, self._polygon)
-        self._decision = self._explorer.step(self._topology, patch, scan, self._T_map_base)
+        with self.health.timed('explorer'):
+            self._decision = self._explorer.step(self._topology, patch, scan, self._T_map_base)
         self._publish_end_nodes(self._decision, message)
         if self._decision.finished:
             self._conclude(int(self._decision.code), self._decision.reason)

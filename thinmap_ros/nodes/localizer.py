@@ -4,14 +4,15 @@ from time import perf_counter
 
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
 from thinmap_msgs.msg import LineFeature, LineFeatureArray, SlamStatus, TopologicalMap
 from thinmap_ros import warm_up
 from thinmap_ros.adapters import messages, parameters, qos, runtime
+from thinmap_ros.adapters.health import ERROR, OK
 from thinmap_ros.adapters.listening import listen
+from thinmap_ros.adapters.live_node import LiveNode
 from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.core.odometry import ScanPairing
 from thinmap_ros.core.scan import Scan
@@ -22,18 +23,20 @@ from thinmap_ros.core.slam.localizer import Estimate, Localizer, LocalizerConfig
 _WARN_PERIOD_S = 5.0
 
 
-class LocalizerNode(Node):
-    """/scan and /odom in; /pose, map -> odom on /tf, /line_features and /slam_status out."""
+class LocalizerNode(LiveNode):
+    """/scan and /odom in; /pose, map -> odom on /tf, /line_features and /slam_status out; services ~/pause, ~/reset."""
 
     def __init__(self) -> None:
         super().__init__('localizer')
-        self._localizer = Localizer(parameters.declare(self, LocalizerConfig))
+        self._config = parameters.declare(self, LocalizerConfig)
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
         self._odom_frame = parameters.declare_value(self, 'odom_frame', 'odom', 'frame of the odometry')
         self._mount = LaserMount(self)
         parameters.check_unknown(self)
         warm_up.localizer()
-        self._pairing = ScanPairing()
+        self.begin_anew()
+        self.offer_pause()
+        self.health.sole_publisher_of('pose')
         self._pose = self.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
         self._tf = self.create_publisher(TFMessage, '/tf', qos.STREAM)
         self._features = self.create_publisher(LineFeatureArray, 'line_features', qos.LATCHED)
@@ -43,6 +46,10 @@ class LocalizerNode(Node):
         listen(self, Odometry, 'odom', self._on_odometry, qos.STREAM)
         listen(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
         listen(self, PoseWithCovarianceStamped, 'initialpose', self._on_initial_pose, qos.STREAM)
+
+    def begin_anew(self) -> None:
+        """Forget all features: the robot is at its start."""
+        self._localizer, self._pairing = Localizer(self._config), ScanPairing()
 
     def _on_odometry(self, message: Odometry) -> None:
         stamp_ns = messages.stamp_ns(message.header.stamp)
@@ -73,7 +80,12 @@ class LocalizerNode(Node):
             estimate = self._localizer.step(scan, T_odom_base)
             self._publish(scan.stamp_ns, estimate, 1000.0 * (perf_counter() - started))
 
+        self.health.dropped_in_all('scans without odometry at their time', self._pairing.dropped)
+        self.health.dropped_in_all('scans or odometry that make no sense', self._localizer.refused)
+
     def _publish(self, ns: int, estimate: Estimate, step_ms: float) -> None:
+        self.health.took('localizer', step_ms)
+        self.health.state(*((ERROR, 'lost: scans do not fit the map') if estimate.lost else (OK, 'tracking')))
         pose = messages.pose_with_covariance_msg(
             estimate.T_map_base, estimate.covariance, self._map_frame, ns
         )

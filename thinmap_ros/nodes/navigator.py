@@ -3,7 +3,6 @@
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
-from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.action import NavigateToPose
@@ -11,6 +10,7 @@ from thinmap_ros import warm_up
 from thinmap_ros.adapters import messages, parameters, qos, runtime
 from thinmap_ros.adapters.actions import Outcome, SingleGoalServer
 from thinmap_ros.adapters.listening import listen
+from thinmap_ros.adapters.live_node import LiveNode
 from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
@@ -25,23 +25,17 @@ _CONTROL_PERIOD_S = 0.1
 _SILENCE_NS = 500_000_000
 
 
-class NavigatorNode(Node):
+class NavigatorNode(LiveNode):
     """/pose, /odom, /scan and the maps in; /cmd_vel and /plan out; action navigate_to_pose."""
 
     def __init__(self) -> None:
         super().__init__('navigator')
-        self._navigator = Navigator(parameters.declare(self, NavigatorConfig))
+        self._config = parameters.declare(self, NavigatorConfig)
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
         self._mount = LaserMount(self)
         parameters.check_unknown(self)
         warm_up.navigator()
-        self._map = MapMirror()
-        self._odometry = OdometryBuffer()
-        self._T_map_odom: Array | None = None
-        self._T_odom_base: Array | None = None
-        self._scan: Scan | None = None
-        self._shown_path: Array | None = None
-        self._cancel_asked = False
+        self.begin_anew()
         self._cmd_vel = self.create_publisher(Twist, 'cmd_vel', qos.STREAM)
         self._plan = self.create_publisher(Path, 'plan', qos.LATCHED)
         listen(self, Odometry, 'odom', self._on_odometry, qos.STREAM)
@@ -52,7 +46,22 @@ class NavigatorNode(Node):
         self._goals = SingleGoalServer(
             self, NavigateToPose, 'navigate_to_pose', self._on_goal, self._on_cancel, _preempted
         )
-        self.create_timer(_CONTROL_PERIOD_S, self._control)
+        self.every(_CONTROL_PERIOD_S, self._control)
+
+    def begin_anew(self) -> None:
+        """Forget the map and where the robot is."""
+        self._navigator = Navigator(self._config)
+        self._map = MapMirror()
+        self._odometry = OdometryBuffer()
+        self._T_map_odom: Array | None = None
+        self._T_odom_base: Array | None = None
+        self._scan: Scan | None = None
+        self._shown_path: Array | None = None
+        self._cancel_asked = False
+
+    def stand_still(self) -> None:
+        """End the goal; the robot stops."""
+        self._end(Outcome.ABORTED, 'the navigator was stopped or begins anew')
 
     def close(self) -> None:
         """Stop the robot: the last thing the node does."""
@@ -127,7 +136,8 @@ class NavigatorNode(Node):
             self.get_logger().warning('laser silent: standing still', throttle_duration_sec=_WARN_PERIOD_S)
             return Command(0.0, 0.0, 'blocked', 'laser silent')
         T_map_base = se2.compose(self._T_map_odom, self._T_odom_base)
-        return self._navigator.step(T_map_base, self._map.patch, self._scan, _CONTROL_PERIOD_S)
+        with self.health.timed('navigator'):
+            return self._navigator.step(T_map_base, self._map.patch, self._scan, _CONTROL_PERIOD_S)
 
     def _show_path(self) -> None:
         path = self._navigator.path

@@ -11,6 +11,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 
 from thinmap_ros.adapters import bag_qos, parameters, resources, runtime
 from thinmap_ros.adapters.bag_writer import BagWriter
+from thinmap_ros.adapters.health import Health
 from thinmap_ros.adapters.types import message_class
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
@@ -47,6 +48,7 @@ class RecorderNode(Node):
         self._seen: set[str] = {'/rosout', '/parameter_events'}
         self._early: list[tuple[str, str, bytes]] = []
         self._written = 0
+        self._health = Health(self)
         # Not in the robot's time, which may stand still until everybody listens.
         wall = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_LOOK_AROUND_S, self._look_around, clock=wall)
@@ -98,8 +100,10 @@ class RecorderNode(Node):
         self._write(topic, type_name, data, ns)
 
     def _write(self, topic: str, type_name: str, data: bytes, ns: int) -> None:
-        self._writer.write(topic, type_name, ns, data)
+        with self._health.timed('writing'):
+            self._writer.write(topic, type_name, ns, data)
         self._written += 1
+        self._health.tell('messages written', self._written)
 
     def _guarded(self, work: Callable[[], None]) -> None:
         try:
