@@ -126,13 +126,12 @@ class ExplorerNode(LiveNode):
         if pair is None:
             return
         message, self._T_map_base = pair
-        T_base_laser = self._mount.pose(message.header.frame_id)
-        if not self._goals.active or T_base_laser is None or self._map.patch is None:
+        if not self._goals.active or self._map.patch is None:
             return
         self._odometer.add(self._T_map_base)
         if self._state != ExplorationStatus.EXPLORING:
             return
-        scan = messages.scan_from(message, T_base_laser)
+        scan = self._mount.scan(message)
         patch = self._map.patch if len(self._polygon) < 3 else fenced(self._map.patch, self._polygon)
         with self.health.timed('explorer'):
             self._decision = self._explorer.step(self._topology, patch, scan, self._T_map_base)

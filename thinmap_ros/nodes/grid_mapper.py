@@ -72,10 +72,7 @@ class GridMapperNode(LiveNode):
         if pair is None:
             return
         message, T_map_base = pair
-        T_base_laser = self._mount.pose(message.header.frame_id)
-        if T_base_laser is None:
-            return  # the localizer, which gave the pose, knows where the laser is: the transform is on its way
-        scan = messages.scan_from(message, T_base_laser)
+        scan = self._mount.scan(message)
         with self.health.timed('map update'):
             self._grid.update(scan, T_map_base)
             window = self._grid.window(T_map_base[0], T_map_base[1], self._window_m)

@@ -20,8 +20,6 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.features import LineFeature as Feature
 from thinmap_ros.core.slam.localizer import Estimate, Localizer, LocalizerConfig
 
-_WARN_PERIOD_S = 5.0
-
 
 class LocalizerNode(LiveNode):
     """/scan and /odom in; /pose, map -> odom on /tf, /line_features and /slam_status out; services ~/pause, ~/reset."""
@@ -57,16 +55,7 @@ class LocalizerNode(LiveNode):
         self._take(ready)
 
     def _on_scan(self, message: LaserScan) -> None:
-        T_base_laser = self._mount.pose(message.header.frame_id)
-        if T_base_laser is None:
-            self.get_logger().warning(
-                f'scan in frame "{message.header.frame_id}": no static transform from the robot to it; publish one '
-                'on /tf_static or set the parameter laser_pose',
-                throttle_duration_sec=_WARN_PERIOD_S,
-            )
-            return
-        scan = messages.scan_from(message, T_base_laser)
-        self._take(self._pairing.add_scan(scan))
+        self._take(self._pairing.add_scan(self._mount.scan(message)))
 
     def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
         self._localizer.set_pose(messages.pose_from(message.pose.pose), messages.covariance_from(message))

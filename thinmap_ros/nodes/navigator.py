@@ -79,10 +79,7 @@ class NavigatorNode(LiveNode):
         self._T_map_odom = se2.compose(T_map_base, se2.invert(T_odom_base))
 
     def _on_scan(self, message: LaserScan) -> None:
-        T_base_laser = self._mount.pose(message.header.frame_id)
-        if T_base_laser is None:
-            return
-        self._scan = messages.scan_from(message, T_base_laser)
+        self._scan = self._mount.scan(message)
 
     def _on_map(self, message: OccupancyGrid) -> None:
         self._map.replace(messages.patch_from(message))
