@@ -1,5 +1,6 @@
 """How nodes listen: only while active, and what a message says wrongly is counted and said, and the node goes on."""
 
+from collections import deque
 from collections.abc import Callable
 from time import monotonic
 from typing import Any
@@ -13,6 +14,7 @@ from thinmap_ros.core.errors import InputError
 
 _QUIET_S = 5.0
 _SILENT_S = 3.0
+_LONGEST_GAP_NS = 5_000_000_000
 
 
 def listen(node: LiveNode, kind: type, topic: str, take: Callable[[Any], None], profile: QoSProfile) -> None:
@@ -31,6 +33,8 @@ class _Listener:
         self._is_latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
         self._held: Any = None
         self._said_at = -_QUIET_S
+        self._last_ns = 0
+        self._steps_ns: deque[int] = deque(maxlen=50)
         node.health.expects(topic)
         events = SubscriptionEventCallbacks(message_lost=self._on_lost) if self._is_scan else None
         node.create_subscription(kind, topic, self._on_message, profile, event_callbacks=events)
@@ -42,6 +46,8 @@ class _Listener:
     def _on_message(self, message: Any) -> None:
         node = self._node
         node.health.heard(self._topic)
+        if self._is_scan:
+            self._count_gaps(message)
         node.settle()
         if not node.is_active:
             self._held = message if self._is_latched else None
@@ -49,6 +55,16 @@ class _Listener:
             node.health.tell('last scan not taken', 'paused')
         else:
             self._guarded(message)
+
+    def _count_gaps(self, message: LaserScan) -> None:
+        """Count the scans that never came: a laser's stamps are evenly spaced."""
+        ns = 1_000_000_000 * message.header.stamp.sec + message.header.stamp.nanosec
+        step_ns, self._last_ns = ns - self._last_ns, ns
+        if not 0 < step_ns < _LONGEST_GAP_NS:
+            return
+        usual_ns = min(self._steps_ns, default=step_ns)
+        self._steps_ns.append(step_ns)
+        self._node.health.dropped(f'{self._topic}: gaps between the stamps', round(step_ns / usual_ns) - 1)
 
     def _guarded(self, message: Any) -> None:
         try:

@@ -1,10 +1,11 @@
 """What all nodes that are left running on a robot have in common: states, health, pause, reset, time set back."""
 
 from collections.abc import Callable
+from time import monotonic
 from typing import Any
 
 from lifecycle_msgs.srv import ChangeState
-from rclpy.clock import Clock, JumpThreshold
+from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -13,8 +14,11 @@ from std_srvs.srv import SetBool, Trigger
 
 from thinmap_ros.adapters import parameters
 from thinmap_ros.adapters.health import OK, Health
+from thinmap_ros.adapters.recovery import Recovery, State
 from thinmap_ros.adapters.services import answer
 
+_KEEP_S = 0.5
+_LEAST_PAUSES = 50.0
 RCLError = rclpy_implementation.RCLError
 _SET_BACK = JumpThreshold(min_forward=None, min_backward=Duration(seconds=-1.0), on_clock_change=False)
 
@@ -36,6 +40,7 @@ class LiveNode(LifecycleNode):
         self.is_active = False
         self.is_paused = False
         self._set_back = False
+        self._recovery: Recovery | None = None
         self._on_activation: list[Callable[[], None]] = []
         self._jumps = self.get_clock().create_jump_callback(_SET_BACK, post_callback=self._on_jump)
         self.health.before_telling(self.settle)
@@ -70,6 +75,39 @@ class LiveNode(LifecycleNode):
 
         return self.create_timer(period_s, guarded, clock=clock)
 
+    def keep(self, state: Callable[[], State | None]) -> State | None:
+        """Keep what a state returns, again and again, for the case that the node is killed; None: nothing to keep.
+
+        Returns what a predecessor left that was killed a short time ago.
+        """
+        limit_s = parameters.declare_value(
+            self, 'recover_s', 30.0, 'killed and started again within so many s, go on from there; 0: never'
+        )
+        self._recovery, self._state_of = Recovery(self, float(limit_s)), state
+        self._kept_at = monotonic()
+        self._keeping_s = 0.0
+        self.create_timer(_KEEP_S, self._keep, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        left = self._recovery.left()
+        if left is not None:
+            self.get_logger().warning('was killed, goes on from what it had; ~/reset begins anew')
+        return left
+
+    def close(self) -> None:
+        """Leave nothing behind: the node ends in order."""
+        if self._recovery is not None:
+            self._recovery.forget()
+
+    def _keep(self) -> None:
+        # However large the map: keeping it takes a small share of the time.
+        now = monotonic()
+        if self._recovery is None or now - self._kept_at < _LEAST_PAUSES * self._keeping_s:
+            return
+        state = self._state_of()
+        if state is not None:
+            self._recovery.keep(state)
+        self._kept_at = monotonic()
+        self._keeping_s = self._kept_at - now
+
     def when_activated(self, work: Callable[[], None]) -> None:
         """Have something done each time that the node becomes active."""
         self._on_activation.append(work)
@@ -88,6 +126,8 @@ class LiveNode(LifecycleNode):
 
     def _forget(self) -> None:
         self.stand_still()
+        if self._recovery is not None:
+            self._recovery.forget()
         self.begin_anew()
 
     # States.

@@ -29,7 +29,8 @@ from thinmap_ros.core.se2 import Array, wrap
 
 _WARN_PERIOD_S = 5.0
 _FEEDBACK_PERIOD_S = 1.0
-_SILENCE_S = 10.0
+_SILENCE_S = 60.0
+_DEAF_S = 3.0
 _LOST_S = 10.0
 _SAME_GOAL_M, _SAME_GOAL_RAD = 0.1, 0.2
 _GIVE_UP_HOME = 3
@@ -56,7 +57,8 @@ class ExplorerNode(LiveNode):
         self._topology = messages.topology_from(TopologicalMap())
         self._matcher: StampMatcher[LaserScan, Array] = StampMatcher()
         self._T_map_base: Array | None = None
-        self._heard_at = self._tracked_at = 0.0
+        self._heard_at = self._tracked_at = self._answered_at = 0.0
+        self._is_lost = False
         self._begin(Explore.Goal())
         self._state = ExplorationStatus.IDLE
 
@@ -114,8 +116,10 @@ class ExplorerNode(LiveNode):
         self._take(self._matcher.left(messages.stamp_ns(message.header.stamp), message))
 
     def _on_slam_status(self, message: SlamStatus) -> None:
-        if message.state == SlamStatus.TRACKING:
+        # Silence is none of it: a localizer that is started again goes on from where it was.
+        if message.state == SlamStatus.TRACKING or not self._is_lost:
             self._tracked_at = self._now()
+        self._is_lost = message.state != SlamStatus.TRACKING
 
     def _on_cancel(self) -> None:
         self._cancel_asked = True
@@ -151,9 +155,10 @@ class ExplorerNode(LiveNode):
         if now - self._heard_at > _SILENCE_S:
             self._end(ExplorationStatus.SENSOR_SILENT, f'no scan for {_SILENCE_S:.0f} s')
             return
-        if now - self._tracked_at > _LOST_S:
+        if self._is_lost and now - self._tracked_at > _LOST_S:
             self._end(ExplorationStatus.LOCALIZATION_LOST, f'the pose has been lost for {_LOST_S:.0f} s')
             return
+        self._ask_again(now)
         area = 0.0 if self._decision is None else self._decision.known_area_m2
         used_up = self._budget.used_up(now - self._begun_at, self._odometer.distance_m, area)
         if used_up and self._state == ExplorationStatus.EXPLORING:
@@ -198,10 +203,23 @@ class ExplorerNode(LiveNode):
         if not self._navigator.server_is_ready():
             self.get_logger().warning('no navigator yet', throttle_duration_sec=_WARN_PERIOD_S)
             return
-        self._goal_sent = goal
+        self._goal_sent, self._answered_at = goal, self._now()
         request = NavigateToPose.Goal(use_heading=True)
         request.pose = messages.pose_stamped_msg(goal, self._map_frame, self.get_clock().now().nanoseconds)
-        self._navigator.send_goal_async(request).add_done_callback(lambda f: self._on_accepted(f, goal))
+        sent = self._navigator.send_goal_async(request, self._on_feedback)
+        sent.add_done_callback(lambda f: self._on_accepted(f, goal))
+
+    def _ask_again(self, now: float) -> None:
+        """Send the goal again where the navigator says nothing of it: it may be another one than the one asked."""
+        if self._goal_sent is None or now - self._answered_at < _DEAF_S:
+            return
+        self.get_logger().warning('the navigator is silent: asking again', throttle_duration_sec=_WARN_PERIOD_S)
+        goal, self._goal_sent, self._handle = self._goal_sent, None, None
+        if self._state == ExplorationStatus.RETURNING:
+            self._drive_to(goal)
+
+    def _on_feedback(self, message: NavigateToPose.Impl.FeedbackMessage) -> None:
+        self._answered_at = self._now()
 
     def _on_accepted(self, future: Future, goal: Array) -> None:
         handle = future.result()

@@ -1,5 +1,6 @@
 """The occupancy grid: each scan drawn in at the pose that the localizer found for it."""
 
+import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid as OccupancyGridMsg
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -10,6 +11,7 @@ from thinmap_ros import warm_up
 from thinmap_ros.adapters import messages, parameters, qos, runtime, session_files
 from thinmap_ros.adapters.listening import listen
 from thinmap_ros.adapters.live_node import LiveNode
+from thinmap_ros.adapters.recovery import State
 from thinmap_ros.adapters.services import answer, ask
 from thinmap_ros.adapters.stamps import StampMatcher
 from thinmap_ros.adapters.transforms import LaserMount
@@ -35,7 +37,9 @@ class GridMapperNode(LiveNode):
         self._latest_ns: int | None = None
         self._map = self.create_publisher(OccupancyGridMsg, 'map', qos.LATCHED)
         self._local_map = self.create_publisher(OccupancyGridMsg, 'local_map', qos.LATCHED)
+        self._resumed_ns: int | None = None
         self.begin_anew()
+        self._go_on(self.keep(self._state))
         self.offer_pause()
         self.health.sole_publisher_of('map')
         listen(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
@@ -57,6 +61,17 @@ class GridMapperNode(LiveNode):
         if known:
             self._take_over(self._grid)
 
+    def _state(self) -> State | None:
+        if self._latest_ns is None:
+            return None
+        return {**self._grid.state(), 'latest_ns': np.array(self._latest_ns)}
+
+    def _go_on(self, left: State | None) -> None:
+        """Take over the map of a mapper that was killed."""
+        if left is not None and 'latest_ns' in left:
+            self._resumed_ns = self._latest_ns = int(left.pop('latest_ns'))
+            self._take_over(OccupancyGrid.from_state(left, self._config))
+
     def _of_session(self) -> OccupancyGrid:
         return session_files.load_grid(self._session, self._config)
 
@@ -73,6 +88,9 @@ class GridMapperNode(LiveNode):
             return
         message, T_map_base = pair
         scan = self._mount.scan(message)
+        if self._resumed_ns is not None and scan.stamp_ns < self._resumed_ns:
+            self.begin_anew()  # the robot has begun anew as well
+        self._resumed_ns = None
         with self.health.timed('map update'):
             self._grid.update(scan, T_map_base)
             window = self._grid.window(T_map_base[0], T_map_base[1], self._window_m)

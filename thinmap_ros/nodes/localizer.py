@@ -1,5 +1,6 @@
 """Where the robot is: each scan, with the odometry at its stamp, through one step of the localizer."""
 
+from dataclasses import replace
 from time import perf_counter
 
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped
@@ -14,7 +15,8 @@ from thinmap_ros.adapters.health import ERROR, OK
 from thinmap_ros.adapters.listening import listen
 from thinmap_ros.adapters.live_node import LiveNode
 from thinmap_ros.adapters.transforms import LaserMount
-from thinmap_ros.core.odometry import ScanPairing
+from thinmap_ros.core import se2
+from thinmap_ros.core.odometry import LastPose, ScanPairing
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.features import LineFeature as Feature
@@ -32,7 +34,11 @@ class LocalizerNode(LiveNode):
         self._mount = LaserMount(self)
         parameters.check_unknown(self)
         warm_up.localizer()
+        self._resumed: LastPose | None = None
+        self._last: LastPose | None = None
         self.begin_anew()
+        left = self.keep(lambda: None if self._last is None else self._last.state())
+        self._resumed = None if left is None else LastPose.from_state(left)
         self.offer_pause()
         self.health.sole_publisher_of('pose')
         self._pose = self.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
@@ -48,6 +54,7 @@ class LocalizerNode(LiveNode):
     def begin_anew(self) -> None:
         """Forget all features: the robot is at its start."""
         self._localizer, self._pairing = Localizer(self._config), ScanPairing()
+        self._resumed, self._last = None, None
 
     def _on_odometry(self, message: Odometry) -> None:
         stamp_ns = messages.stamp_ns(message.header.stamp)
@@ -65,12 +72,24 @@ class LocalizerNode(LiveNode):
 
     def _take(self, ready: list[tuple[Scan, Array]]) -> None:
         for scan, T_odom_base in ready:
+            if self._resumed is not None:
+                self._resume(self._resumed, scan.stamp_ns, T_odom_base)
             started = perf_counter()
             estimate = self._localizer.step(scan, T_odom_base)
             self._publish(scan.stamp_ns, estimate, 1000.0 * (perf_counter() - started))
+            self._last = LastPose(scan.stamp_ns, estimate.T_map_odom, T_odom_base)
 
         self.health.dropped_in_all('scans without odometry at their time', self._pairing.dropped)
         self.health.dropped_in_all('scans or odometry that make no sense', self._localizer.refused)
+
+    def _resume(self, last: LastPose, stamp_ns: int, T_odom_base: Array) -> None:
+        """Begin where the robot is now if its odometry has gone on; else at the start that is configured."""
+        self._resumed = None
+        if not last.leads_to(stamp_ns, T_odom_base):
+            self.get_logger().warning('the odometry has begun anew as well: beginning at the start')
+            return
+        x, y, yaw = se2.compose(last.T_map_odom, T_odom_base).tolist()
+        self._localizer = Localizer(replace(self._config, start_x_m=x, start_y_m=y, start_yaw_rad=yaw))
 
     def _publish(self, ns: int, estimate: Estimate, step_ms: float) -> None:
         self.health.took('localizer', step_ms)

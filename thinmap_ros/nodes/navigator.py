@@ -9,6 +9,7 @@ from thinmap_msgs.action import NavigateToPose
 from thinmap_ros import warm_up
 from thinmap_ros.adapters import messages, parameters, qos, runtime
 from thinmap_ros.adapters.actions import Outcome, SingleGoalServer
+from thinmap_ros.adapters.health import OK, WARN
 from thinmap_ros.adapters.listening import listen
 from thinmap_ros.adapters.live_node import LiveNode
 from thinmap_ros.adapters.transforms import LaserMount
@@ -22,7 +23,9 @@ from thinmap_ros.core.se2 import Array
 
 _WARN_PERIOD_S = 5.0
 _CONTROL_PERIOD_S = 0.1
-_SILENCE_NS = 500_000_000
+_SILENCE_NS = 400_000_000  # with the control period: a stop within half a second
+# Without a new pose the last correction of the odometry holds for a while.
+_SILENCES_NS = {'laser': _SILENCE_NS, 'odometry': _SILENCE_NS, 'localizer': 3_000_000_000}
 
 
 class NavigatorNode(LiveNode):
@@ -56,6 +59,7 @@ class NavigatorNode(LiveNode):
         self._T_map_odom: Array | None = None
         self._T_odom_base: Array | None = None
         self._scan: Scan | None = None
+        self._heard_ns: dict[str, int] = {}
         self._shown_path: Array | None = None
         self._cancel_asked = False
 
@@ -66,9 +70,11 @@ class NavigatorNode(LiveNode):
     def close(self) -> None:
         """Stop the robot: the last thing the node does."""
         self._cmd_vel.publish(messages.twist_msg(0.0, 0.0))
+        super().close()
 
     def _on_odometry(self, message: Odometry) -> None:
         self._T_odom_base = messages.pose_from(message.pose.pose)
+        self._note('odometry')
         self._odometry.add(messages.stamp_ns(message.header.stamp), self._T_odom_base)
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
@@ -76,10 +82,12 @@ class NavigatorNode(LiveNode):
         if T_odom_base is None:
             return
         T_map_base = messages.pose_from(message.pose.pose)
+        self._note('localizer')
         self._T_map_odom = se2.compose(T_map_base, se2.invert(T_odom_base))
 
     def _on_scan(self, message: LaserScan) -> None:
         self._scan = self._mount.scan(message)
+        self._note('laser')
 
     def _on_map(self, message: OccupancyGrid) -> None:
         self._map.replace(messages.patch_from(message))
@@ -111,6 +119,7 @@ class NavigatorNode(LiveNode):
             return
         command = self._command()
         if command is None:
+            self._tell('waiting')
             return
         self._cmd_vel.publish(messages.twist_msg(command.v, command.w))
         self._show_path()
@@ -119,7 +128,7 @@ class NavigatorNode(LiveNode):
         elif command.state == 'failed':
             self._end(Outcome.ABORTED, command.reason)
         else:
-            self._tell(command)
+            self._tell(command.state)
 
     def _command(self) -> Command | None:
         """What the navigator says now; a stop while the laser is silent; None before everything is known."""
@@ -128,13 +137,29 @@ class NavigatorNode(LiveNode):
                 'goal waits: no map, scan, pose or odometry yet', throttle_duration_sec=_WARN_PERIOD_S
             )
             return None
-        latest = self._odometry.latest_stamp_ns
-        if latest is not None and latest - self._scan.stamp_ns > _SILENCE_NS:
-            self.get_logger().warning('laser silent: standing still', throttle_duration_sec=_WARN_PERIOD_S)
-            return Command(0.0, 0.0, 'blocked', 'laser silent')
+        if who := self._silent():
+            reason = f'{who} silent: standing still'
+            self.get_logger().warning(reason, throttle_duration_sec=_WARN_PERIOD_S)
+            self.health.state(WARN, reason)
+            return Command(0.0, 0.0, 'blocked', reason)
+        self.health.state(OK, 'driving')
         T_map_base = se2.compose(self._T_map_odom, self._T_odom_base)
         with self.health.timed('navigator'):
             return self._navigator.step(T_map_base, self._map.patch, self._scan, _CONTROL_PERIOD_S)
+
+    def _silent(self) -> str:
+        """Who has not been heard for so long that driving on would be driving blind; '' where all is well."""
+        latest = self._odometry.latest_stamp_ns
+        if latest is not None and self._scan is not None and latest - self._scan.stamp_ns > _SILENCE_NS:
+            return 'laser'
+        now_ns = self.get_clock().now().nanoseconds
+        for who, limit_ns in _SILENCES_NS.items():
+            if now_ns - self._heard_ns.get(who, now_ns) > limit_ns:
+                return who
+        return ''
+
+    def _note(self, who: str) -> None:
+        self._heard_ns[who] = self.get_clock().now().nanoseconds
 
     def _show_path(self) -> None:
         path = self._navigator.path
@@ -143,14 +168,15 @@ class NavigatorNode(LiveNode):
             ns = self.get_clock().now().nanoseconds
             self._plan.publish(messages.path_msg(np.asarray(path), self._map_frame, ns))
 
-    def _tell(self, command: Command) -> None:
+    def _tell(self, state: str) -> None:
         feedback = NavigateToPose.Feedback()
-        feedback.state = command.state
+        feedback.state = state
         feedback.distance_remaining_m = self._navigator.distance_remaining_m
         self._goals.feedback(feedback)
 
     def _end(self, outcome: Outcome, reason: str) -> None:
         self._navigator.cancel()
+        self.health.state(OK, reason)
         self._cmd_vel.publish(messages.twist_msg(0.0, 0.0))
         self._goals.finish(
             outcome, NavigateToPose.Result(success=outcome is Outcome.SUCCEEDED, reason=reason)

@@ -1,5 +1,6 @@
 """The topological map: the window around the robot thinned at every scan and merged into the global graph."""
 
+import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid
 
@@ -9,6 +10,7 @@ from thinmap_ros import warm_up
 from thinmap_ros.adapters import messages, parameters, qos, runtime, session_files
 from thinmap_ros.adapters.listening import listen
 from thinmap_ros.adapters.live_node import LiveNode
+from thinmap_ros.adapters.recovery import State
 from thinmap_ros.adapters.services import answer
 from thinmap_ros.adapters.stamps import StampMatcher
 from thinmap_ros.core.grid.patch import GridPatch
@@ -34,7 +36,20 @@ class TopologyBuilderNode(LiveNode):
         self.create_service(SaveMap, 'save_topology', self._on_save)
         self.create_service(LoadMap, 'load_topology', self._on_load)
         self.health.sole_publisher_of('topology')
+        self._latest_ns: int | None = None
+        self._resumed_ns: int | None = None
         self.begin_anew()
+        self._go_on(self.keep(self._state))
+
+    def _state(self) -> State | None:
+        return None if self._latest_ns is None else {**self._builder.state(), 'latest_ns': np.array(self._latest_ns)}
+
+    def _go_on(self, left: State | None) -> None:
+        """Take over the graph of a builder that was killed."""
+        if left is not None and 'latest_ns' in left:
+            self._resumed_ns = self._latest_ns = int(left.pop('latest_ns'))
+            self._builder = TopologyBuilder.from_state(left, self._config)
+            self._publish(self._latest_ns)
 
     def begin_anew(self) -> None:
         """Forget the graph, or go back to the session that the node was started with."""
@@ -60,6 +75,9 @@ class TopologyBuilderNode(LiveNode):
         self.health.dropped_in_all('local maps and poses without a partner', self._matcher.dropped)
         if pair is None:
             return
+        if self._resumed_ns is not None and stamp_ns < self._resumed_ns:
+            self.begin_anew()  # the robot has begun anew as well
+        self._resumed_ns, self._latest_ns = None, stamp_ns
         with self.health.timed('graph update'):
             changed = self._builder.update(*pair)
         if changed:
