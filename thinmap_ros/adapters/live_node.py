@@ -31,11 +31,13 @@ class LiveNode(LifecycleNode):
     by the service ~/reset, and when the clock is set back (a bag or a simulation started again).
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, recovers: bool = False) -> None:
+        """Make a node; one that recovers calls `keep` once it is set up."""
         super().__init__(name)
         self._autostart = bool(
             parameters.declare_value(self, 'autostart', True, 'become active at once; false: wait for transitions')
         )
+        self._recover_s = parameters.declare_recovery(self) if recovers else 0.0
         self.health = Health(self)
         self.is_active = False
         self.is_paused = False
@@ -80,10 +82,7 @@ class LiveNode(LifecycleNode):
 
         Returns what a predecessor left that was killed a short time ago.
         """
-        limit_s = parameters.declare_value(
-            self, 'recover_s', 30.0, 'killed and started again within so many s, go on from there; 0: never'
-        )
-        self._recovery, self._state_of = Recovery(self, float(limit_s)), state
+        self._recovery, self._state_of = Recovery(self, self._recover_s), state
         self._kept_at = monotonic()
         self._keeping_s = 0.0
         self.create_timer(_KEEP_S, self._keep, clock=Clock(clock_type=ClockType.STEADY_TIME))

@@ -41,6 +41,13 @@ def declare_session(node: Node) -> str:
     return str(declare_value(node, 'session', '', 'path STEM of a saved session to go on from; empty: begin anew'))
 
 
+def declare_recovery(node: Node) -> float:
+    """Declare the parameter `recover_s` and return its value."""
+    return float(
+        declare_value(node, 'recover_s', 30.0, 'killed and started again within so many s, go on from there; 0: never')
+    )
+
+
 def check_unknown(node: Node) -> None:
     """Raise ConfigError where a parameter was given that the node does not have: a typo must not go unseen."""
     given = node._parameter_overrides  # rclpy has no public way to see what was given but never declared

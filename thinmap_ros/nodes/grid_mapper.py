@@ -26,7 +26,7 @@ class GridMapperNode(LiveNode):
     """/scan and /pose in; /map once a second and /local_map at every scan out; services save_map and load_map."""
 
     def __init__(self) -> None:
-        super().__init__('grid_mapper')
+        super().__init__('grid_mapper', recovers=True)
         self._config = parameters.declare(self, OccupancyConfig)
         self._window_m = parameters.declare(self, WindowConfig).window_m
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')

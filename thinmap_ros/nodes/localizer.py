@@ -27,7 +27,7 @@ class LocalizerNode(LiveNode):
     """/scan and /odom in; /pose, map -> odom on /tf, /line_features and /slam_status out; services ~/pause, ~/reset."""
 
     def __init__(self) -> None:
-        super().__init__('localizer')
+        super().__init__('localizer', recovers=True)
         self._config = parameters.declare(self, LocalizerConfig)
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
         self._odom_frame = parameters.declare_value(self, 'odom_frame', 'odom', 'frame of the odometry')

@@ -22,7 +22,7 @@ class TopologyBuilderNode(LiveNode):
     """/local_map and /pose in; /local_topology and /topology out; services save_topology and load_topology."""
 
     def __init__(self) -> None:
-        super().__init__('topology_builder')
+        super().__init__('topology_builder', recovers=True)
         self._config = parameters.declare(self, TopologyConfig)
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
         self._session = parameters.declare_session(self)
