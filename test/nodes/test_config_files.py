@@ -18,7 +18,8 @@ from thinmap_ros.adapters.bag_writer import BagWriter
 from thinmap_ros.core.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parents[2]
-NODES = sorted(path.stem for path in (ROOT / 'thinmap_ros' / 'nodes').glob('[a-z]*.py'))
+# All but the one that runs the others.
+NODES = sorted(path.stem for path in (ROOT / 'thinmap_ros' / 'nodes').glob('[a-z]*.py') if path.stem != 'thinmap')
 # What rclpy declares in every node of its own accord.
 OF_EVERY_NODE = {'start_type_description_service'}
 # What a node must be told here that is not its default: a bag that exists; a test opens no window.

@@ -1,6 +1,9 @@
 """Config dataclasses of core <-> declared ROS parameters: one home for each default, seen from ROS."""
 
 import dataclasses
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any, TypeVar
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -49,12 +52,47 @@ def declare_recovery(node: Node) -> float:
 
 
 def check_unknown(node: Node) -> None:
-    """Raise ConfigError where a parameter was given that the node does not have: a typo must not go unseen."""
-    given = node._parameter_overrides  # rclpy has no public way to see what was given but never declared
-    unknown = sorted(name for name in given if not node.has_parameter(name))
-    if unknown:
-        known = ', '.join(sorted(name for name in node._parameters if not name.startswith('qos_overrides')))
-        raise ConfigError(f'node {node.get_name()} has no parameter {", ".join(unknown)}; it has: {known}')
+    """Raise ConfigError where a parameter was given that the node does not have: a typo must not go unseen.
+
+    Where several nodes share a process, a parameter may be meant for another one: the last of them raises.
+    """
+    given = set(node._parameter_overrides)  # rclpy has no public way to see what was given but never declared
+    known = {name for name in node._parameters if not name.startswith('qos_overrides')}
+    shared = _SHARED.get()
+    if shared is not None:
+        shared.names.append(node.get_name())
+        shared.given |= given
+        shared.known |= known
+        if len(shared.names) < shared.count:
+            return
+        given, known, names = shared.given, shared.known, ', '.join(shared.names)
+    else:
+        names = str(node.get_name())
+    if unknown := sorted(given - known):
+        raise ConfigError(f'node {names} has no parameter {", ".join(unknown)}; it has: {", ".join(sorted(known))}')
+
+
+@dataclasses.dataclass
+class _Shared:
+    """What nodes that share a process were given and know, together."""
+
+    count: int
+    names: list[str] = dataclasses.field(default_factory=list)
+    given: set[str] = dataclasses.field(default_factory=set)
+    known: set[str] = dataclasses.field(default_factory=set)
+
+
+_SHARED: ContextVar[_Shared | None] = ContextVar('shared', default=None)
+
+
+@contextmanager
+def shared_by(count: int) -> Iterator[None]:
+    """Let so many nodes, made inside, share what parameters they are given."""
+    token = _SHARED.set(_Shared(count) if count > 1 else None)
+    try:
+        yield
+    finally:
+        _SHARED.reset(token)
 
 
 def _descriptor(field: 'dataclasses.Field[Any]') -> ParameterDescriptor:
