@@ -22,6 +22,7 @@ setup(
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
         (f'share/{NAME}/config', glob('config/*.yaml')),
+        (f'share/{NAME}/config/sensors', glob('config/sensors/*.yaml')),
         (f'share/{NAME}/worlds', glob('worlds/*.yaml')),
     ],
     install_requires=[

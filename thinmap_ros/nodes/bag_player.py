@@ -55,7 +55,7 @@ class BagPlayerNode(Node):
 
     def __init__(self) -> None:
         super().__init__('bag_player')
-        self._config = parameters.declare(self, BagPlayerConfig)
+        self._config = parameters.declare(self, BagPlayerConfig, self._on_config, live=('rate',))
         parameters.check_unknown(self)
         if not self._config.bag:
             raise ConfigError("bag = '': expected a rosbag2 folder or an MCAP file")
@@ -86,6 +86,9 @@ class BagPlayerNode(Node):
             publisher.wait_for_all_acked(_ACKNOWLEDGE)
         parts = ', '.join(f'{topic} {count}' for topic, count in sorted(self._sent.items())) or 'nothing'
         self.get_logger().info(f'{self._config.bag}: {self._sent.total()} messages sent: {parts}')
+
+    def _on_config(self, config: BagPlayerConfig) -> None:
+        self._config = config
 
     def _chosen(self) -> list[str]:
         asked = {topic.strip() for topic in self._config.topics.split(',') if topic.strip()}

@@ -41,7 +41,8 @@ class ExplorerNode(LiveNode):
 
     def __init__(self) -> None:
         super().__init__('explorer')
-        self._config = parameters.declare(self, ExplorerConfig)
+        # A change holds from the next goal on.
+        self._config = parameters.declare(self, ExplorerConfig, self._on_config)
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
         self._mount = LaserMount(self)
         parameters.check_unknown(self)
@@ -61,6 +62,9 @@ class ExplorerNode(LiveNode):
         self._is_lost = False
         self._begin(Explore.Goal())
         self._state = ExplorationStatus.IDLE
+
+    def _on_config(self, config: ExplorerConfig) -> None:
+        self._config = config
 
     def stand_still(self) -> None:
         """End the exploration."""

@@ -33,7 +33,7 @@ class NavigatorNode(LiveNode):
 
     def __init__(self) -> None:
         super().__init__('navigator')
-        self._config = parameters.declare(self, NavigatorConfig)
+        self._config = parameters.declare(self, NavigatorConfig, self._on_config)
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
         self._mount = LaserMount(self)
         parameters.check_unknown(self)
@@ -61,7 +61,14 @@ class NavigatorNode(LiveNode):
         self._scan: Scan | None = None
         self._heard_ns: dict[str, int] = {}
         self._shown_path: Array | None = None
+        self._goal: tuple[float, float, float | None] = (0.0, 0.0, None)
         self._cancel_asked = False
+
+    def _on_config(self, config: NavigatorConfig) -> None:
+        """Drive on with other parameters: to the same goal, on a new path."""
+        self._config, self._navigator = config, Navigator(config)
+        if self._goals.active:
+            self._navigator.set_goal(*self._goal)
 
     def stand_still(self) -> None:
         """End the goal; the robot stops."""
@@ -106,7 +113,8 @@ class NavigatorNode(LiveNode):
             self._end(Outcome.ABORTED, reason)
             return
         self._cancel_asked = False
-        self._navigator.set_goal(float(goal[0]), float(goal[1]), float(goal[2]) if request.use_heading else None)
+        self._goal = (float(goal[0]), float(goal[1]), float(goal[2]) if request.use_heading else None)
+        self._navigator.set_goal(*self._goal)
 
     def _on_cancel(self) -> None:
         self._cancel_asked = True
