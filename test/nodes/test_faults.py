@@ -29,6 +29,15 @@ def start_mapping(graph, rate=4.0, lockstep='local_topology'):
     graph.start('sim', start=START, hold_for_subscribers=2, rate=rate, lockstep=lockstep)
 
 
+def start_together(graph, *names, **simulation):
+    """The same in one process, as it is left running on a robot."""
+    graph.start('thinmap', arguments=names, use_sim_time=True, **AT_START)
+    graph.start(
+        'sim', start=START, hold_for_subscribers=len({*names} - {'topology_builder'}), rate=4.0,
+        lockstep='local_topology', **simulation,
+    )
+
+
 def start_one(graph, name):
     graph.start(name, use_sim_time=True, **(AT_START if name == 'localizer' else {}))
 
@@ -102,28 +111,49 @@ def test_mapping_goes_on_after_each_node_was_killed(graph):
     assert not list((graph.folder / 'state').iterdir()), 'who ends in order leaves nothing'
 
 
+def test_a_whole_robot_that_was_killed_and_begins_anew_is_not_mixed_with_the_one_before(graph):
+    robot = Robot(graph)
+    maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
+    start_together(graph, *MAPPING)
+    robot.drive(1.5)
+    graph.until(lambda: len(maps) > 3, 'time to be kept')
+    for name in ('thinmap', 'sim'):
+        kill(graph, name)
+    robot.poses.clear(), robot.truth.clear(), maps.clear()
+    start_together(graph, *MAPPING)
+    graph.until(lambda: len(robot.poses) > 10 and len(maps) > 2, 'mapping anew')
+    assert graph.log('thinmap').count('goes on from what it had') == 3
+    assert 'odometry has begun anew' in graph.log('thinmap')
+    assert robot.error_m() < 0.1
+    # The robot stands where it began: it sees what one sees from there, and nothing of the drive is left.
+    place = robot.truth[-1].pose.position
+    assert np.hypot(place.x - 2.0, place.y - 2.0) < 0.05
+    patch = messages.patch_from(maps[-1])
+    behind = patch.frame.cells_of(np.array([[1.0, 1.0]]))[0]
+    inside = np.all((behind >= 0) & (behind < patch.shape))
+    assert not inside or patch.cells[tuple(behind)] == -1
+
+
 def test_time_set_back_begins_everything_anew(graph):
     robot = Robot(graph)
     maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
     graphs = graph.heard('topology', TopologicalMap, qos.LATCHED)
-    for name in ('explorer', 'navigator'):
-        graph.start(name, use_sim_time=True)
-    start_mapping(graph)
+    names = (*MAPPING, 'explorer', 'navigator')
+    start_together(graph, *names)
     robot.drive(1.5)
     graph.until(lambda: maps and graphs and graphs[-1].nodes, 'map and graph')
     graph.stop('sim')
     robot.poses.clear(), robot.truth.clear(), maps.clear()
     graph.start('sim', start=START, hold_for_subscribers=4, rate=4.0, lockstep='local_topology', seed=3)
-    names = (*MAPPING, 'explorer', 'navigator')
-    graph.until(lambda: all('clock was set back' in graph.log(name) for name in names), 'all of them notice')
+    notices = [f'[{name}]: the clock was set back' for name in names]
+    graph.until(lambda: all(notice in graph.log('thinmap') for notice in notices), 'all of them notice')
     robot.poses.clear()
     graph.until(lambda: len(robot.poses) > 10 and robot.truth, 'new poses')
     assert robot.error_m() < 0.1
     graph.until(lambda: len(maps) > 3, 'new maps')
     # What only the first drive could see is forgotten: the robot, at its start again, stood still.
-    assert all(graph.log(name).count('clock was set back') == 1 for name in names)
-    for name in names:
-        assert graph.stop(name) == 0, graph.log(name)
+    assert all(graph.log('thinmap').count(notice) == 1 for notice in notices)
+    assert graph.stop('thinmap') == 0, graph.log('thinmap')
 
 
 def test_a_silent_laser_stops_the_robot_and_it_goes_on(graph):
@@ -222,7 +252,7 @@ def test_a_burst_of_scans_leaves_no_queue_and_what_is_lost_is_counted(graph):
 def test_a_full_disk_leaves_the_old_session_as_it_was(graph, tmp_path):
     robot = Robot(graph)
     start_mapping(graph)
-    robot.drive(0.5)
+    robot.drive(0.3)
     stem = tmp_path / 'maps' / 'room'
 
     def save():

@@ -6,6 +6,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import OccupancyGrid
+from rclpy.action import ActionClient
 from sensor_msgs.msg import LaserScan
 from std_srvs.srv import SetBool, Trigger
 
@@ -16,6 +17,7 @@ from thinmap_ros.adapters import qos
 pytestmark = pytest.mark.live
 AT_START = {'start_x_m': 2.0, 'start_y_m': 2.0, 'start_yaw_rad': 0.0}
 START = '2.0,2.0,0.0'
+MAPPING = ('localizer', 'grid_mapper', 'topology_builder')
 
 
 class Doctor:
@@ -41,9 +43,7 @@ class Doctor:
 
 def test_nodes_tell_rates_step_times_and_silence(graph):
     doctor = Doctor(graph)
-    graph.start('localizer', use_sim_time=True, **AT_START)
-    graph.start('grid_mapper', use_sim_time=True)
-    graph.start('topology_builder', use_sim_time=True)
+    graph.start('thinmap', arguments=MAPPING, use_sim_time=True, **AT_START)
     graph.start('sim', start=START, hold_for_subscribers=2)
     nodes = ('localizer', 'grid_mapper', 'topology_builder', 'sim')
     graph.until(lambda: all(doctor.level(node) == DiagnosticStatus.OK for node in nodes), 'all is well')
@@ -56,7 +56,7 @@ def test_nodes_tell_rates_step_times_and_silence(graph):
     graph.until(lambda: doctor.level('localizer') == DiagnosticStatus.WARN, 'silence is told')
     assert 'scan: silent for' in doctor.status('localizer').message
     assert 's ago' in doctor.value('localizer', 'scan: last')
-    assert 'silent for' in graph.log('localizer')
+    assert 'silent for' in graph.log('thinmap')
     assert doctor.number('localizer', 'scan: heard') > 5
 
 
@@ -127,8 +127,7 @@ def test_pause_and_reset(graph):
     doctor, poses = Doctor(graph), graph.heard('pose', PoseWithCovarianceStamped)
     maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
     graphs = graph.heard('topology', TopologicalMap, qos.LATCHED)
-    for name in ('localizer', 'grid_mapper', 'topology_builder'):
-        graph.start(name, use_sim_time=True, **(AT_START if name == 'localizer' else {}))
+    graph.start('thinmap', arguments=MAPPING, use_sim_time=True, **AT_START)
     graph.start('sim', start=START, hold_for_subscribers=2, rate=4.0)
     graph.until(lambda: maps and graphs and graphs[-1].nodes, 'map and graph')
     assert graph.call(SetBool, '/localizer/pause', SetBool.Request(data=True)).success
@@ -150,8 +149,6 @@ def test_a_deactivated_navigator_takes_no_goal(graph):
     graph.start('navigator', laser_pose='0,0,0')
     request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
     assert graph.call(ChangeState, '/navigator/change_state', request).success
-    from rclpy.action import ActionClient
-
     client = ActionClient(graph.node, NavigateToPose, 'navigate_to_pose')
     graph.until(client.server_is_ready, 'action')
     future = client.send_goal_async(NavigateToPose.Goal())

@@ -6,8 +6,10 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
+from action_msgs.msg import GoalStatus
+from geometry_msgs.msg import Point32, PoseWithCovarianceStamped, Twist
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
+from rclpy.action import ActionClient
 from sensor_msgs.msg import LaserScan
 from strange_messages import made, numbers
 from test_health import Doctor
@@ -68,9 +70,9 @@ def is_refused(message):
 
 @pytest.mark.parametrize('kind', CHECKS)
 def test_conversions_give_sound_values_or_refuse_in_one_line(kind):
-    refused = Counter(is_refused(message) for message in made(kind, 1500))
+    refused = Counter(is_refused(message) for message in made(kind, 800))
     # Both happen, and often.
-    assert refused[True] > 150 and refused[False] > 150
+    assert refused[True] > 80 and refused[False] > 80
 
 
 SPOKEN = {
@@ -104,8 +106,6 @@ ANSWERS = {  # what each node says when it hears good messages
 
 def set_to_work(graph, name):
     """Give the nodes that work on goals a goal that they do not reach."""
-    from rclpy.action import ActionClient
-
     if name not in ('explorer', 'navigator'):
         return
     kind, action = (Explore, 'explore') if name == 'explorer' else (NavigateToPose, 'navigate_to_pose')
@@ -130,7 +130,7 @@ def say(graph, publishers, count):
 
 
 @pytest.mark.parametrize('name', LISTENERS)
-@pytest.mark.parametrize('count', [150, pytest.param(10_000, marks=[pytest.mark.slow, pytest.mark.timeout(1800)])])
+@pytest.mark.parametrize('count', [100, pytest.param(10_000, marks=[pytest.mark.slow, pytest.mark.timeout(1800)])])
 def test_a_node_lives_through_them_publishes_no_nan_and_counts_what_it_refused(graph, name, count):
     heard = {topic: graph.heard(topic, kind) for topic, kind in SPOKEN.items() if topic not in LISTENERS[name]}
     doctor = Doctor(graph)
@@ -163,6 +163,24 @@ def test_a_node_lives_through_them_publishes_no_nan_and_counts_what_it_refused(g
     assert all(math.isfinite(number) for message in answers[before:] for number in numbers(message))
     assert graph.processes[name].poll() is None
     assert graph.stop(name) == 0, graph.log(name)
+
+
+def test_goals_that_are_no_goals_end_with_a_reason(graph):
+    for name in ('explorer', 'navigator'):
+        graph.start(name, laser_pose='0,0,0')
+    for wrong in (math.nan, math.inf, 1e30):
+        goal = Explore.Goal()
+        goal.area.points = [Point32(x=wrong), Point32(x=1.0), Point32(y=1.0)]
+        ended = graph.act(Explore, 'explore', goal)
+        assert ended.status == GoalStatus.STATUS_ABORTED and 'corner of the area' in ended.result.status.reason
+        ended = graph.act(Explore, 'explore', Explore.Goal(time_limit_s=wrong))
+        assert ended.status == GoalStatus.STATUS_ABORTED and 'limit' in ended.result.status.reason
+        goal = NavigateToPose.Goal()
+        goal.pose.pose.position.x = wrong
+        ended = graph.act(NavigateToPose, 'navigate_to_pose', goal)
+        assert ended.status == GoalStatus.STATUS_ABORTED and 'position' in ended.result.reason
+    for name in ('explorer', 'navigator'):
+        assert graph.stop(name) == 0, graph.log(name)
 
 
 def counted(doctor, name, expected):

@@ -15,12 +15,13 @@ from thinmap_msgs.action import Explore, NavigateToPose
 from thinmap_msgs.msg import EndNode as EndNodeMsg
 from thinmap_msgs.msg import EndNodeArray, ExplorationStatus, SlamStatus, TopologicalMap
 from thinmap_ros import warm_up
-from thinmap_ros.adapters import messages, parameters, qos, runtime
+from thinmap_ros.adapters import checks, messages, parameters, qos, runtime
 from thinmap_ros.adapters.actions import Outcome, SingleGoalServer
 from thinmap_ros.adapters.listening import listen
 from thinmap_ros.adapters.live_node import LiveNode
 from thinmap_ros.adapters.stamps import StampMatcher
 from thinmap_ros.adapters.transforms import LaserMount
+from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.area import fenced
 from thinmap_ros.core.exploration.explorer import Decision, EndNode, Explorer, ExplorerConfig
 from thinmap_ros.core.exploration.session import Budget, Odometer
@@ -81,8 +82,19 @@ class ExplorerNode(LiveNode):
         listen(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
         listen(self, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
         self._navigator = ActionClient(self, NavigateToPose, 'navigate_to_pose')
-        self._goals = SingleGoalServer(self, Explore, 'explore', self._begin, self._on_cancel, self._preempted)
+        self._goals = SingleGoalServer(self, Explore, 'explore', self._on_goal, self._on_cancel, self._preempted)
         self.every(_FEEDBACK_PERIOD_S, self._every_second)
+
+    def _on_goal(self, goal: Explore.Goal) -> None:
+        limits = (goal.time_limit_s, goal.distance_limit_m, goal.area_limit_m2)
+        try:
+            corners = [c for p in goal.area.points for c in (p.x, p.y)]
+            checks.within('goal: limit or corner of the area', [*limits, *corners])
+        except InputError as error:
+            self._begin(Explore.Goal())
+            self._end(ExplorationStatus.CANCELLED, str(error))
+            return
+        self._begin(goal)
 
     def _begin(self, goal: Explore.Goal) -> None:
         self._goal = goal

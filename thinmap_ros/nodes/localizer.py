@@ -21,6 +21,7 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.features import LineFeature as Feature
 from thinmap_ros.core.slam.localizer import Estimate, Localizer, LocalizerConfig
+from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 
 
 class LocalizerNode(LiveNode):
@@ -36,6 +37,7 @@ class LocalizerNode(LiveNode):
         warm_up.localizer()
         self._resumed: LastPose | None = None
         self._last: LastPose | None = None
+        self._topology: Graph | None = None
         self.begin_anew()
         left = self.keep(lambda: None if self._last is None else self._last.state())
         self._resumed = None if left is None else LastPose.from_state(left)
@@ -54,7 +56,7 @@ class LocalizerNode(LiveNode):
     def begin_anew(self) -> None:
         """Forget all features: the robot is at its start."""
         self._localizer, self._pairing = Localizer(self._config), ScanPairing()
-        self._resumed, self._last = None, None
+        self._resumed, self._last, self._topology = None, None, None
 
     def _on_odometry(self, message: Odometry) -> None:
         stamp_ns = messages.stamp_ns(message.header.stamp)
@@ -68,7 +70,8 @@ class LocalizerNode(LiveNode):
         self._localizer.set_pose(messages.pose_from(message.pose.pose), messages.covariance_from(message))
 
     def _on_topology(self, message: TopologicalMap) -> None:
-        self._localizer.set_topology(messages.topology_from(message))
+        self._topology = messages.topology_from(message)
+        self._localizer.set_topology(self._topology)
 
     def _take(self, ready: list[tuple[Scan, Array]]) -> None:
         for scan, T_odom_base in ready:
@@ -77,8 +80,8 @@ class LocalizerNode(LiveNode):
             started = perf_counter()
             estimate = self._localizer.step(scan, T_odom_base)
             self._publish(scan.stamp_ns, estimate, 1000.0 * (perf_counter() - started))
-            self._last = LastPose(scan.stamp_ns, estimate.T_map_odom, T_odom_base)
-
+            if not estimate.lost:
+                self._last = LastPose(scan.stamp_ns, estimate.T_map_odom, T_odom_base)
         self.health.dropped_in_all('scans without odometry at their time', self._pairing.dropped)
         self.health.dropped_in_all('scans or odometry that make no sense', self._localizer.refused)
 
@@ -90,6 +93,8 @@ class LocalizerNode(LiveNode):
             return
         x, y, yaw = se2.compose(last.T_map_odom, T_odom_base).tolist()
         self._localizer = Localizer(replace(self._config, start_x_m=x, start_y_m=y, start_yaw_rad=yaw))
+        if self._topology is not None:
+            self._localizer.set_topology(self._topology)
 
     def _publish(self, ns: int, estimate: Estimate, step_ms: float) -> None:
         self.health.took('localizer', step_ms)
