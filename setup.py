@@ -7,9 +7,11 @@ from setuptools import find_packages, setup
 NAME = 'thinmap_ros'
 NODES = [
     'sim', 'grid_mapper', 'topology_builder', 'localizer', 'explorer', 'navigator', 'recorder', 'bag_player',
-    'demo_monitor', 'rerun_viewer',
+    'demo_monitor', 'rerun_viewer', 'markers', 'thinmap',
 ]
-TOOLS = ['replay', 'explore_world', 'compare_exploration', 'carmen_to_bag', 'map_to_graph', 'demo', 'warm_up']
+TOOLS = [
+    'replay', 'explore_world', 'compare_exploration', 'carmen_to_bag', 'map_to_graph', 'bag_repair', 'demo', 'warm_up',
+]
 
 setup(
     name=NAME,
@@ -20,9 +22,12 @@ setup(
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
         (f'share/{NAME}/config', glob('config/*.yaml')),
+        (f'share/{NAME}/config/sensors', glob('config/sensors/*.yaml')),
         (f'share/{NAME}/worlds', glob('worlds/*.yaml')),
     ],
-    install_requires=['matplotlib', 'mcap', 'numba', 'numpy', 'pillow', 'pyyaml', 'rosbags', 'scipy', 'tqdm'],
+    install_requires=[
+        'lz4', 'matplotlib', 'mcap', 'numba', 'numpy', 'pillow', 'pyyaml', 'rosbags', 'scipy', 'tqdm', 'zstandard',
+    ],
     extras_require={
         'cluster': ['distributed'],
         'viewer': ['rerun-sdk>=0.41,<0.42'],  # its interface changes with each minor version

@@ -28,8 +28,9 @@ def shared_data() -> Path:
 
 
 @pytest.fixture
-def ros_domain(monkeypatch: pytest.MonkeyPatch) -> int:
+def ros_domain(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> int:
     """A ROS domain that no other process of this machine's tests uses, for the processes that a test starts."""
+    monkeypatch.setenv('THINMAP_STATE_DIR', str(tmp_path / 'state'))  # what killed nodes leave concerns no other test
     domain = 1 + os.getpid() % 100
     monkeypatch.setenv('ROS_DOMAIN_ID', str(domain))
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')

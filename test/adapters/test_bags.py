@@ -10,7 +10,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from thinmap_ros.adapters.bags import Bag, BagLog, BagWriter
+from thinmap_ros.adapters.bag_writer import BagWriter
+from thinmap_ros.adapters.bags import Bag, BagLog
 from thinmap_ros.adapters.events import Event, OdometryEvent, ScanEvent
 from thinmap_ros.core.errors import InputError
 

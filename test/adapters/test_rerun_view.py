@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.adapters import rerun_view
-from thinmap_ros.adapters.bags import BagWriter
+from thinmap_ros.adapters.bag_writer import BagWriter
 from thinmap_ros.adapters.rerun_view import NullView, View
 from thinmap_ros.adapters.view_feed import Feed, recording_from_bag
 from thinmap_ros.core import se2

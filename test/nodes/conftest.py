@@ -34,9 +34,15 @@ class Graph:
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
 
-    def start(self, name: str, **parameters: Any) -> subprocess.Popen[bytes]:
-        command = [sys.executable, '-m', f'thinmap_ros.nodes.{name}', '--ros-args']
-        for key, value in parameters.items():
+    def start(
+        self, name: str, remap: tuple[str, ...] = (), arguments: tuple[str, ...] = (), label: str = '', **values: Any
+    ) -> subprocess.Popen[bytes]:
+        """Start a node with arguments, ROS's remapping rules and its parameters; known by its label, or its name."""
+        command = [sys.executable, '-m', f'thinmap_ros.nodes.{name}', *arguments, '--ros-args']
+        name = label or name
+        for rule in remap:
+            command += ['-r', rule]
+        for key, value in values.items():
             text = f"'{value}'" if isinstance(value, str) else str(value).lower()
             command += ['-p', f'{key}:={text}']
         log = (self.folder / f'{name}.log').open('wb')

@@ -14,11 +14,12 @@ import pytest
 import rclpy
 import yaml
 
-from thinmap_ros.adapters.bags import BagWriter
+from thinmap_ros.adapters.bag_writer import BagWriter
 from thinmap_ros.core.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parents[2]
-NODES = sorted(path.stem for path in (ROOT / 'thinmap_ros' / 'nodes').glob('[a-z]*.py'))
+# All but the one that runs the others.
+NODES = sorted(path.stem for path in (ROOT / 'thinmap_ros' / 'nodes').glob('[a-z]*.py') if path.stem != 'thinmap')
 # What rclpy declares in every node of its own accord.
 OF_EVERY_NODE = {'start_type_description_service'}
 # What a node must be told here that is not its default: a bag that exists; a test opens no window.
@@ -70,6 +71,8 @@ def described(name, value, descriptor):
     if descriptor.additional_constraints:
         text += f'; {descriptor.additional_constraints}'
     assert text, f'{name} has no description'
+    if not descriptor.read_only and name not in OWN_WORDS:
+        text += '; can be changed at run time'
     lines = textwrap.wrap(text, 112, initial_indent='    # ', subsequent_indent='    # ')
     return [*lines, '    ' + yaml.safe_dump({name: value}).strip()]
 
@@ -115,4 +118,28 @@ def test_unknown_key_of_a_file_is_an_error(declared, tmp_path):
 
 
 def test_there_is_a_file_for_each_node_and_no_other():
-    assert sorted(path.stem for path in (ROOT / 'config').glob('*')) == NODES
+    assert sorted(path.stem for path in (ROOT / 'config').glob('*.yaml')) == NODES
+
+
+PRESETS = sorted((ROOT / 'config' / 'sensors').glob('*'))
+
+
+@pytest.mark.parametrize('name', ['localizer', 'grid_mapper', 'sim'])
+@pytest.mark.parametrize('preset', PRESETS, ids=lambda path: path.stem)
+def test_sensor_presets_are_known_to_the_nodes_and_hold_in_any_namespace(declared, preset, name):
+    wanted = yaml.safe_load(preset.read_text())[f'/**/{name}']['ros__parameters']
+    for namespace in ('', '/robot1'):
+        remap = ('-r', f'__ns:={namespace}') if namespace else ()
+        found = declared(name, '--params-file', str(preset), *remap)
+        assert {key: found[key][0] for key in wanted} == wanted
+
+
+def test_presets_fit_together():
+    assert len(PRESETS) == 5
+    for preset in PRESETS:
+        content = yaml.safe_load(preset.read_text())
+        sim, grid, localizer = (
+            content[f'/**/{name}']['ros__parameters'] for name in ('sim', 'grid_mapper', 'localizer')
+        )
+        assert localizer['match_range_m'] <= sim['range_max_m'] and grid['usable_range_m'] <= sim['range_max_m']
+        assert grid['window_m'] >= 2.0 * max(grid['no_return_range_m'], min(grid['usable_range_m'], 4.0))

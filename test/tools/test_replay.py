@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.adapters import map_files
-from thinmap_ros.adapters.bags import BagWriter
+from thinmap_ros.adapters.bag_writer import BagWriter
 from thinmap_ros.adapters.carmen import CarmenLog, LaserOptions
 from thinmap_ros.tools.carmen_to_bag import convert
 

@@ -6,7 +6,8 @@ from typing import Any
 
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
-from rclpy.node import Node
+
+from thinmap_ros.adapters.live_node import LiveNode
 
 
 class Outcome(Enum):
@@ -20,15 +21,15 @@ class Outcome(Enum):
 class SingleGoalServer:
     """Takes a goal, lets the node work on it in its own callbacks, and answers once `finish` is called.
 
-    A new goal takes the place of the old one, which is aborted with what `preempted` returns. rclpy runs a goal in a
-    coroutine, and one that waits keeps the executor busy all the time; here the goal's coroutine is started only when
-    its result is there. `on_cancel` only hears that the goal is to be ended: it calls `finish` later, from another
-    callback, when the goal's state has changed.
+    Goals are taken while the node is active. A new goal takes the place of the old one, which is aborted with what
+    `preempted` returns. rclpy runs a goal in a coroutine, and one that waits keeps the executor busy all the time; here
+    the goal's coroutine is started only when its result is there. `on_cancel` only hears that the goal is to be ended:
+    it calls `finish` later, from another callback, when the goal's state has changed.
     """
 
     def __init__(
         self,
-        node: Node,
+        node: LiveNode,
         action: Any,
         name: str,
         on_goal: Callable[[Any], None],
@@ -43,7 +44,7 @@ class SingleGoalServer:
             action,
             name,
             execute_callback=self._end,
-            goal_callback=lambda request: GoalResponse.ACCEPT,
+            goal_callback=lambda request: GoalResponse.ACCEPT if node.is_active else GoalResponse.REJECT,
             cancel_callback=self._cancel,
             handle_accepted_callback=self._accept,
         )

@@ -1,30 +1,19 @@
-"""rosbag2 folders and MCAP files: read as scans and odometry, read raw, and written."""
+"""rosbag2 folders and MCAP files: read as scans and odometry, and read raw."""
 
-import os
-import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from mcap.reader import NonSeekingReader
-from mcap.records import Schema
+from mcap.records import Channel, Schema
 from rosbags.highlevel import AnyReader
-from rosbags.interfaces import (
-    Connection,
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.interfaces import ConnectionExtRosbag2, Qos
+from rosbags.rosbag2.metadata import parse_qos
+from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-from thinmap_ros.adapters import bag_messages
+from thinmap_ros.adapters import bag_messages, bag_types
 from thinmap_ros.adapters.events import Event, OdometryEvent, ScanEvent, Skipped
 from thinmap_ros.adapters.mounts import Mount, StaticTransforms, rotation_matrix
 from thinmap_ros.core import se2
@@ -33,19 +22,6 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
 _SCAN, _ODOMETRY, _TF = 'sensor_msgs/msg/LaserScan', 'nav_msgs/msg/Odometry', 'tf2_msgs/msg/TFMessage'
-_FOREVER = QosTime(2147483647, 4294967295)
-# Players offer what was recorded; who listens to static transforms asks for the ones of before.
-_LATCHED = Qos(
-    history=QosHistory.KEEP_LAST,
-    depth=1,
-    reliability=QosReliability.RELIABLE,
-    durability=QosDurability.TRANSIENT_LOCAL,
-    deadline=_FOREVER,
-    lifespan=_FOREVER,
-    liveliness=QosLiveliness.AUTOMATIC,
-    liveliness_lease_duration=_FOREVER,
-    avoid_ros_namespace_conventions=False,
-)
 
 
 @dataclass(frozen=True)
@@ -59,7 +35,10 @@ class RawMessage:
 
 
 class Bag:
-    """A bag opened for reading. `cut_off` says that it was read only as far as it is whole, which may show late."""
+    """A bag opened for reading: `topics` and their types, `offers` and what their publishers offered.
+
+    `cut_off` says that it was read only as far as it is whole, which may show late.
+    """
 
     def __init__(self, path: Path) -> None:
         """Open a bag. Raises InputError naming the file where it is none."""
@@ -71,10 +50,14 @@ class Bag:
         self.cut_off = False
         self.typestore: Typestore = get_typestore(Stores.ROS2_JAZZY)
         self.topics: dict[str, str] = {}
+        self.offers: dict[str, list[Qos]] = {}
         self._without_index = False
         try:
             with AnyReader([path], default_typestore=self.typestore) as reader:
-                self.topics = {c.topic: c.msgtype for c in reader.connections}
+                for connection in reader.connections:
+                    self.topics[connection.topic] = connection.msgtype
+                    if isinstance(connection.ext, ConnectionExtRosbag2):
+                        self.offers.setdefault(connection.topic, []).extend(connection.ext.offered_qos_profiles)
                 self.typestore = reader.typestore
         except Exception as error:  # rosbags' readers raise whatever a broken file makes them stumble over
             self._look_through(error)
@@ -109,8 +92,7 @@ class Bag:
             with file.open('rb') as stream:
                 for schema, channel, message in NonSeekingReader(stream).iter_messages(log_time_order=False):
                     if schema is not None:
-                        self._learn(schema)
-                        self.topics.setdefault(channel.topic, schema.name)
+                        self._learn(schema, channel)
                         yield RawMessage(channel.topic, schema.name, message.log_time, message.data)
 
     def _mcap_files(self) -> list[Path]:
@@ -119,14 +101,15 @@ class Bag:
     def _look_through(self, reason: Exception) -> None:
         """Find the topics of a bag that ordinary readers refuse."""
         said = ' '.join(str(reason).split()) or type(reason).__name__
-        self.topics, self._without_index, self.cut_off = {}, True, True
+        self.topics, self.offers, self._without_index, self.cut_off = {}, {}, True, True
         if not sum(1 for _ in self.messages()):
             raise InputError(f'{self.path}: {said}: no whole message: expected a rosbag2 folder or an MCAP file')
 
-    def _learn(self, schema: Schema) -> None:
-        if schema.name not in self.typestore.types:
-            types = get_types_from_msg(schema.data.decode(), schema.name)
-            self.typestore.register({k: v for k, v in types.items() if k not in self.typestore.types})
+    def _learn(self, schema: Schema, channel: Channel) -> None:
+        if channel.topic not in self.topics:
+            self.topics[channel.topic] = schema.name
+            self.offers[channel.topic] = parse_qos(channel.metadata.get('offered_qos_profiles', ''))
+        bag_types.learn(self.typestore, schema)
 
 
 @dataclass
@@ -243,86 +226,3 @@ def _scan(message: Any) -> Scan:
         message.range_min,
         message.range_max,
     )
-
-
-class BagWriter:
-    """Writes a rosbag2 folder with an MCAP file, or, where the path ends in .mcap, that file alone.
-
-    As a context it writes aside and takes the name when the block ends well, so that no half-written bag passes for a
-    good one. `live` writes under the name from the start: what a recorder wants, whose work is never "done". An older
-    bag of that name gives way. Raises InputError where the path is something else.
-    """
-
-    def __init__(self, path: Path, live: bool = False, definitions: dict[str, str] | None = None) -> None:
-        self._path = path
-        self._folder = path if live else path.with_name(f'.{path.name}.{os.getpid()}.part')
-        self.typestore: Typestore = get_typestore(Stores.ROS2_JAZZY)
-        for name, text in (definitions or {}).items():
-            if name not in self.typestore.types:
-                self.typestore.register(get_types_from_msg(text, name))
-        self._connections: dict[str, Connection] = {}
-        _check_replaceable(path)
-        _remove(self._folder)
-        self._folder.parent.mkdir(parents=True, exist_ok=True)
-        self._writer = Writer(self._folder, version=9, storage_plugin=StoragePlugin.MCAP)
-        self._writer.open()
-
-    def __enter__(self) -> 'BagWriter':
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        try:
-            self.close()
-            if kind is None and self._folder != self._path:
-                self._take_name()
-        finally:
-            if self._folder != self._path or kind is not None:
-                _remove(self._folder)
-
-    def write(self, topic: str, type_name: str, log_ns: int, message: Any) -> None:
-        """Write a message: its CDR bytes, or a message object of the typestore."""
-        if topic not in self._connections:
-            offered = [_LATCHED] if topic.endswith('tf_static') else []
-            self._connections[topic] = self._writer.add_connection(
-                topic, type_name, typestore=self.typestore, offered_qos_profiles=offered
-            )
-        if not isinstance(message, bytes | memoryview):
-            message = self.typestore.serialize_cdr(message, type_name)
-        self._writer.write(self._connections[topic], log_ns, message)
-
-    def close(self) -> None:
-        """Finish the file."""
-        self._writer.close()
-
-    def _take_name(self) -> None:
-        (file,) = self._folder.glob('*.mcap')
-        if self._path.suffix == '.mcap':
-            file.replace(self._path)
-            return
-        # The file inside carries the folder's name, and the metadata carry the file's.
-        name = file.name.replace(self._folder.name, self._path.name)
-        metadata = self._folder / 'metadata.yaml'
-        metadata.write_text(metadata.read_text().replace(file.name, name))
-        file.rename(self._folder / name)
-        _remove(self._path)
-        self._folder.rename(self._path)
-
-
-def _check_replaceable(path: Path) -> None:
-    """Refuse to write where something else is than a bag: it would be lost."""
-    if path.is_dir() and path.suffix != '.mcap':
-        others = [file.name for file in path.iterdir() if file.suffix != '.mcap' and file.name != 'metadata.yaml']
-        if not others:
-            return
-        raise InputError(f'{path}: a folder with {min(others)} in it: expected a new name or an older bag')
-    if path.exists() and not (path.is_file() and path.suffix == '.mcap'):
-        raise InputError(f'{path}: exists and is no bag: expected a new name or an older bag')
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)

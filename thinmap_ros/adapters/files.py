@@ -13,12 +13,19 @@ from thinmap_ros.core.errors import InputError
 
 @contextmanager
 def written_aside(path: Path) -> Iterator[Path]:
-    """Give a path to write to: it takes the place of `path` when the block ends well and vanishes when not."""
+    """Give a path to write to: it takes the place of `path` when the block ends well and vanishes when not.
+
+    Raises OSError, with the name of the file, where the disk does not take it.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     aside = path.with_name(f'.{path.name}.{os.getpid()}.part')
     try:
         yield aside
         aside.replace(path)
+    except OSError as error:
+        if error.filename is not None:
+            raise
+        raise OSError(error.errno, error.strerror or str(error), str(path)) from error
     finally:
         aside.unlink(missing_ok=True)
 

@@ -27,9 +27,15 @@ def write_map(stem: Path, patch: GridPatch) -> Path:
     image, description = stem.with_name(stem.name + '.pgm'), stem.with_name(stem.name + '.yaml')
     with written_aside(image) as aside:
         Image.fromarray(grey[::-1]).save(aside, format='PPM')
+        # The image takes its name last: where there is no room for both, the old map stays as it was.
+        write_text(description, yaml.safe_dump(_description(image.name, patch), sort_keys=False))
+    return description
+
+
+def _description(image: str, patch: GridPatch) -> dict[str, Any]:
     frame = patch.frame
-    content = {
-        'image': image.name,
+    return {
+        'image': image,
         'mode': 'trinary',
         'resolution': frame.resolution,
         'origin': [round(frame.origin_x, 6), round(frame.origin_y, 6), 0.0],
@@ -38,8 +44,6 @@ def write_map(stem: Path, patch: GridPatch) -> Path:
         # Below the darkness of the grey for unknown (50/255): with 0.25, readers would take it for free.
         'free_thresh': 0.196,
     }
-    write_text(description, yaml.safe_dump(content, sort_keys=False))
-    return description
 
 
 def read_map(path: Path) -> GridPatch:

@@ -22,6 +22,7 @@ from std_msgs.msg import Header
 
 from thinmap_msgs.msg import TopologicalEdge, TopologicalNode
 from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
+from thinmap_ros.adapters import checks
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
@@ -34,7 +35,9 @@ SECOND_NS = 1_000_000_000
 
 
 def stamp_ns(stamp: Time) -> int:
-    """Time message as whole nanoseconds."""
+    """Time message as whole nanoseconds. Raises InputError where it is no time."""
+    if stamp.sec < 0 or stamp.nanosec >= SECOND_NS:
+        raise InputError(f'stamp {stamp.sec} s, {stamp.nanosec} ns: expected a time after 1970, ns below {SECOND_NS}')
     return int(stamp.sec) * SECOND_NS + int(stamp.nanosec)
 
 
@@ -60,7 +63,15 @@ def header(frame_id: str, ns: int) -> Header:
 
 
 def scan_from(message: LaserScan, T_base_laser: Array) -> Scan:
-    """Scan from its message and the laser's pose on the robot. Raises InputError as `Scan.create`."""
+    """Scan from its message and the laser's pose on the robot.
+
+    Raises InputError as `Scan.create`, and where it has no beams, too many, or beams at angles that there are not.
+    """
+    count = len(message.ranges)
+    if not 0 < count <= checks.MOST_BEAMS:
+        raise InputError(f'{count} beams: expected 1 to {checks.MOST_BEAMS}')
+    last = message.angle_min + message.angle_increment * (count - 1)
+    checks.within('angle of the first or last beam', (message.angle_min, last), checks.LARGEST_ANGLE_RAD)
     return Scan.create(
         stamp_ns(message.header.stamp),
         np.frombuffer(message.ranges, dtype=np.float32),
@@ -102,11 +113,9 @@ def quaternion_msg(yaw_rad: float) -> Quaternion:
 
 
 def pose_from(message: Pose) -> Array:
-    """Planar pose (3,). Raises InputError where it is not finite or no rotation."""
-    T = se2.pose(message.position.x, message.position.y, yaw_of(message.orientation))
-    if not se2.is_finite(T):
-        raise InputError(f'pose {T.tolist()}: expected finite numbers')
-    return T
+    """Planar pose (3,). Raises InputError where it is nowhere near (1000 km) or no rotation."""
+    checks.within('position', (message.position.x, message.position.y))
+    return se2.pose(message.position.x, message.position.y, yaw_of(message.orientation))
 
 
 def pose_msg(T: Array) -> Pose:
@@ -130,9 +139,14 @@ def pose_with_covariance_msg(T: Array, covariance: Array, frame_id: str, ns: int
 
 
 def covariance_from(message: PoseWithCovarianceStamped) -> Array:
-    """Covariance (3, 3) over x, y, theta."""
-    full = np.asarray(message.pose.covariance).reshape(6, 6)
-    return np.ascontiguousarray(full[np.ix_((0, 1, 5), (0, 1, 5))])
+    """Covariance (3, 3) over x, y, theta. Raises InputError where it is none: not finite, or below 0."""
+    full = np.asarray(message.pose.covariance, dtype=np.float64).reshape(6, 6)
+    part = full[np.ix_((0, 1, 5), (0, 1, 5))]
+    checks.within('covariance', part.ravel().tolist())
+    part = (part + part.T) / 2.0
+    if np.linalg.eigvalsh(part).min() < -1e-9:
+        raise InputError(f'covariance {part.tolist()}: expected no negative eigenvalue')
+    return part
 
 
 def odometry_msg(T: Array, velocity: tuple[float, float], frames: tuple[str, str], ns: int) -> Odometry:
@@ -178,19 +192,24 @@ def grid_msg(patch: GridPatch, frame_id: str, ns: int) -> OccupancyGrid:
 
 
 def patch_from(message: OccupancyGrid) -> GridPatch:
-    """Patch of a map message. Raises InputError where size and data do not fit, or the map is turned."""
+    """Patch of a map message.
+
+    Raises InputError where size and data do not fit, the map is turned, or its cells or their size make no sense.
+    """
     info = message.info
     # The message carries a float32; 0.1 has to be the same 0.1 on both sides.
     resolution = round(float(info.resolution), 6)
-    if len(message.data) != info.width * info.height or not resolution > 0.0:
+    size_fits = len(message.data) == info.width * info.height
+    if not size_fits or not checks.FINEST_M <= resolution <= checks.COARSEST_M:
         raise InputError(
             f'map of {info.width} x {info.height} cells of {resolution} m with {len(message.data)} values: '
-            'expected a value for each cell and a resolution above 0'
+            f'expected a value for each cell, and cells of {checks.FINEST_M} to {checks.COARSEST_M} m'
         )
     origin = pose_from(info.origin)
     if abs(origin[2]) > 1e-6:
         raise InputError(f'map turned by {origin[2]} rad: expected an origin without rotation')
     cells = np.frombuffer(message.data, dtype=np.int8).reshape(info.height, info.width)
+    checks.cells_in_range(cells)
     return GridPatch(GridFrame(float(origin[0]), float(origin[1]), resolution), cells)
 
 
@@ -221,14 +240,23 @@ def _edge_msg(edge: Edge) -> TopologicalEdge:
 
 
 def topology_from(message: TopologicalMapMsg) -> TopologicalMap:
-    """Topological map of a message. Raises InputError where a kind is unknown, or an edge leads to no node."""
+    """Topological map of a message.
+
+    Raises InputError where a kind is unknown, an edge leads to no node, a number is given twice, or one is no number.
+    """
+    checks.unique('nodes', [n.id for n in message.nodes])
+    checks.unique('edges', [e.id for e in message.edges])
     known = {n.id for n in message.nodes}
     for node in message.nodes:
         if node.kind not in list(NodeKind):
             raise InputError(f'node {node.id}: kind {node.kind}: expected one of {[int(kind) for kind in NodeKind]}')
+        checks.within(f'node {node.id}', (node.position.x, node.position.y, node.clearance_m))
     for edge in message.edges:
         if not {edge.node_a, edge.node_b} <= known:
             raise InputError(f'edge {edge.id} from node {edge.node_a} to {edge.node_b}: expected nodes of this map')
+        checks.within(f'edge {edge.id}', (edge.length_m, edge.clearance_m, *(c for p in edge.path for c in (p.x, p.y))))
+        if not edge.path:
+            raise InputError(f'edge {edge.id}: a path without points')
     nodes = [
         Node(n.id, NodeKind(n.kind), n.position.x, n.position.y, float(n.clearance_m)) for n in message.nodes
     ]

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from thinmap_ros.adapters import checks
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
@@ -58,8 +59,7 @@ class StaticTransforms:
         """Take a geometry_msgs/TransformStamped. Raises InputError where it is no transform."""
         moved = message.transform.translation
         translation = np.array([moved.x, moved.y, moved.z], dtype=np.float64)
-        if not np.isfinite(translation).all():
-            raise InputError(f'transform to {message.child_frame_id!r}: {translation.tolist()}: expected finite')
+        checks.within(f'transform to {checks.shown(message.child_frame_id)}', translation.tolist())
         rotation = rotation_matrix(message.transform.rotation)
         self._parents[_plain(message.child_frame_id)] = (_plain(message.header.frame_id), rotation, translation)
 

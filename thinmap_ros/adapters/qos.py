@@ -7,6 +7,9 @@ from rclpy.qos import (
     ReliabilityPolicy,
     qos_profile_sensor_data,
 )
+from rosbags.interfaces import Qos
+
+from thinmap_ros.adapters import bag_qos
 
 SENSOR = qos_profile_sensor_data
 STREAM = QoSProfile(depth=50, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
@@ -20,3 +23,16 @@ LATCHED = QoSProfile(
 STATIC_TRANSFORMS = QoSProfile(
     depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
+
+
+def as_recorded(topic: str, offers: list[Qos]) -> QoSProfile:
+    """What to offer when a topic of a bag is played: what was offered when it was recorded."""
+    latched = bag_qos.is_latched(topic, offers)
+    # Each part of the tree of static transforms came from somebody else; all of them are kept.
+    least = STATIC_TRANSFORMS.depth if topic.endswith('tf_static') else 1 if latched else STREAM.depth
+    return QoSProfile(
+        depth=max(bag_qos.depth(offers), least),
+        history=HistoryPolicy.KEEP_LAST,
+        reliability=ReliabilityPolicy.RELIABLE if bag_qos.is_reliable(offers) else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )

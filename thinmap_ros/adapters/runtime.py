@@ -1,4 +1,4 @@
-"""How a node process starts, spins and ends."""
+"""How a process of one node or several starts, spins and ends."""
 
 import ctypes
 import gc
@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -17,6 +17,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
+from thinmap_ros.adapters import parameters
 from thinmap_ros.core.errors import ThinmapError
 
 _RELEASE_S = 3.0
@@ -27,15 +28,27 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 def run(make_node: Callable[[], Node]) -> None:
     """Make a node and spin it until SIGINT or SIGTERM; the process ends with 0, or 2 on a refused start.
 
-    A node may have a method `close()`: it is called last, whatever ended the node.
+    A node may have a method `start()`, called once it is made, and a method `close()`: it is called last, whatever
+    ended the node.
+    """
+    run_all([make_node])
+
+
+def run_all(make_nodes: Sequence[Callable[[], Node]]) -> None:
+    """Make several nodes and spin them in one process, each in a thread of its own; the first to end ends all.
+
+    Parameters that are given to all of them need to be known to one of them.
     """
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     _on_signals(_leave)
-    node = None
+    nodes: list[Node] = []
     try:
-        node = make_node()
+        with parameters.shared_by(len(make_nodes)):
+            nodes.extend(make() for make in make_nodes)
+        for node in nodes:
+            getattr(node, 'start', lambda: None)()
         release_compiler_pages()
-        _spin(node)
+        _spin(nodes)
     except ExternalShutdownException:
         pass
     except ThinmapError as error:
@@ -43,28 +56,59 @@ def run(make_node: Callable[[], Node]) -> None:
         sys.exit(2)
     finally:
         _on_signals(signal.SIG_IGN)  # ending is short: a second signal must not cut it off
-        if node is not None:
+        for node in reversed(nodes):
             getattr(node, 'close', lambda: None)()
             node.destroy_node()
         rclpy.try_shutdown()
 
 
-def _spin(node: Node) -> None:
+def _spin(nodes: list[Node]) -> None:
     asked = threading.Event()
     # Only noted: an exception raised just anywhere comes out of compiled code as another error, or gets lost in it.
     _on_signals(lambda number, frame: asked.set())
+    failures: list[BaseException] = []
+    others = [threading.Thread(target=_spin_one, args=(node, asked, failures)) for node in nodes[1:]]
+    for thread in others:
+        thread.start()
+    try:
+        _spin_one(nodes[0], asked, failures, _give_back_pages())
+    finally:
+        asked.set()
+        for thread in others:
+            thread.join()
+    if failures:
+        raise failures[0]
+
+
+def _spin_one(
+    node: Node, asked: threading.Event, failures: list[BaseException], each_time: Callable[[], None] = lambda: None
+) -> None:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
+    try:
+        while rclpy.ok() and not asked.is_set() and not getattr(node, 'finished', False):
+            # A bounded wait: Python sees signals only between calls.
+            executor.spin_once(timeout_sec=0.25)
+            each_time()
+    except Exception as error:  # kept for the main thread, which says what it was
+        failures.append(error)
+    finally:
+        asked.set()
+
+
+def _give_back_pages() -> Callable[[], None]:
+    """Kernels that only a real message calls for bring the compiler back: what gives its pages back, now and then."""
     looked_at, least = monotonic(), _shared_bytes()
-    while rclpy.ok() and not asked.is_set() and not getattr(node, 'finished', False):
-        # A bounded wait: Python sees signals only between calls.
-        executor.spin_once(timeout_sec=0.25)
-        # Kernels that only a real message calls for bring the compiler back.
+
+    def look() -> None:
+        nonlocal looked_at, least
         if monotonic() - looked_at > _RELEASE_S:
             if _shared_bytes() > least + _RELEASE_BYTES:
                 release_compiler_pages()
                 least = _shared_bytes()
             looked_at = monotonic()
+
+    return look
 
 
 def _on_signals(handler: Any) -> None:

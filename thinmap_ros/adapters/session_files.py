@@ -37,8 +37,10 @@ def stem_of(path: str) -> Path:
 def save_grid(path: str, grid: OccupancyGrid) -> str:
     """Write STEM.pgm, STEM.yaml and STEM.grid.npz; returns what was written. Raises OSError where that fails."""
     stem = stem_of(path)
-    write_grid(_named(stem, _GRID_END), grid)
-    write_map(stem, grid.patch())
+    # All files are written before any takes its name: a full disk leaves the old session as it was.
+    with written_aside(_named(stem, _GRID_END)) as aside:
+        _write_to(aside, _GRID, grid.state())
+        write_map(stem, grid.patch())
     return f'{stem}.pgm, {_MAP_END} and {_GRID_END}'
 
 
@@ -131,8 +133,13 @@ def _is_there(path: Path) -> bool:
 
 
 def _write(path: Path, what: str, arrays: Mapping[str, NDArray[Any]]) -> None:
+    with written_aside(path) as aside:
+        _write_to(aside, what, arrays)
+
+
+def _write_to(path: Path, what: str, arrays: Mapping[str, NDArray[Any]]) -> None:
     named: dict[str, Any] = {_FORMAT: np.array(what), **arrays}
-    with written_aside(path) as aside, aside.open('wb') as stream:
+    with path.open('wb') as stream:
         np.savez_compressed(stream, **named)
 
 

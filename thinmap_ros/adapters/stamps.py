@@ -10,13 +10,14 @@ Right = TypeVar('Right')
 class StampMatcher(Generic[Left, Right]):
     """Pairs the messages of two topics that carry exactly the same stamp, whichever comes first.
 
-    What finds no partner within `capacity` later messages is dropped.
+    What finds no partner within `capacity` later messages is dropped, and counted.
     """
 
     def __init__(self, capacity: int = 50) -> None:
         self._lefts: OrderedDict[int, Left] = OrderedDict()
         self._rights: OrderedDict[int, Right] = OrderedDict()
         self._capacity = capacity
+        self.dropped = 0
 
     def left(self, stamp_ns: int, value: Left) -> tuple[Left, Right] | None:
         """Take a message of the first topic; returns the pair if it is complete now."""
@@ -26,6 +27,7 @@ class StampMatcher(Generic[Left, Right]):
         self._lefts[stamp_ns] = value
         if len(self._lefts) > self._capacity:
             self._lefts.popitem(last=False)
+            self.dropped += 1
         return None
 
     def right(self, stamp_ns: int, value: Right) -> tuple[Left, Right] | None:
@@ -36,4 +38,5 @@ class StampMatcher(Generic[Left, Right]):
         self._rights[stamp_ns] = value
         if len(self._rights) > self._capacity:
             self._rights.popitem(last=False)
+            self.dropped += 1
         return None

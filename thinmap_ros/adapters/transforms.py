@@ -2,19 +2,24 @@
 
 import numpy as np
 from rclpy.node import Node
+from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
-from thinmap_ros.adapters import messages, parameters, qos
+from thinmap_ros.adapters import checks, messages, parameters, qos
+from thinmap_ros.adapters.mounts import Mount, StaticTransforms
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import ConfigError, InputError
+from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+
+_MOST_FRAMES = 1000
 
 
 class LaserMount:
     """The pose of each laser frame on the robot.
 
-    Looked up in the static transforms. A node whose robot publishes none is given the parameter `laser_pose`
-    [x m, y m, yaw rad]; it then holds for every frame. Nothing is ever assumed: without either, `pose` is None.
+    Looked up in the static transforms, as bags are read. A node whose robot publishes none is given the parameter
+    `laser_pose` [x m, y m, yaw rad]; it then holds for every frame. Nothing is ever assumed.
     """
 
     def __init__(self, node: Node) -> None:
@@ -22,33 +27,48 @@ class LaserMount:
         given = parameters.declare_value(
             node, 'laser_pose', '', 'laser on the robot as "x,y,yaw" (m, m, rad); empty: from /tf_static'
         )
-        self._fixed = _parse_pose(str(given)) if given else None
-        self._parents: dict[str, tuple[str, Array]] = {}
+        self._fixed = Mount(_parse_pose(str(given)), upside_down=False) if given else None
+        self._transforms = StaticTransforms()
+        self._mounts: dict[str, Mount] = {}
         if self._fixed is None:
             node.create_subscription(TFMessage, '/tf_static', self._on_static, qos.STATIC_TRANSFORMS)
 
+    def scan(self, message: LaserScan) -> Scan:
+        """Scan of a message, with the pose of its laser.
+
+        Raises InputError where that is not known, or the message is no scan.
+        """
+        mount = self._mount(message.header.frame_id)
+        if mount is None:
+            raise InputError(
+                f'scan in frame {checks.shown(message.header.frame_id)}: no static transform from '
+                f'"{self._base_frame}" to it; publish one on /tf_static or set the parameter laser_pose'
+            )
+        return mount.placed(messages.scan_from(message, mount.T_base_laser))
+
     def pose(self, frame_id: str) -> Array | None:
         """T_base_laser (3,) of a laser frame, or None as long as it is not known."""
+        mount = self._mount(frame_id)
+        return None if mount is None else mount.T_base_laser
+
+    def _mount(self, frame_id: str) -> Mount | None:
         if self._fixed is not None:
             return self._fixed
-        T = np.zeros(3)
-        for _ in range(len(self._parents) + 1):
-            if frame_id == self._base_frame:
-                return T
-            if frame_id not in self._parents:
+        if frame_id not in self._mounts:
+            found = self._transforms.mount(frame_id, self._base_frame)
+            if found is None:
                 return None
-            frame_id, step = self._parents[frame_id]
-            T = se2.compose(step, T)
-        return None  # frames that are each other's parents
+            self._mounts[frame_id] = found
+        return self._mounts[frame_id]
 
     def _on_static(self, message: TFMessage) -> None:
+        self._mounts.clear()
         for transform in message.transforms:
-            moved, turned = transform.transform.translation, transform.transform.rotation
             try:
-                step = se2.pose(moved.x, moved.y, messages.yaw_of(turned))
+                if len(self._transforms.frames) < _MOST_FRAMES:
+                    self._transforms.add(transform)
             except InputError:
                 continue  # a transform that is none tells nothing: its frame stays unknown
-            self._parents[transform.child_frame_id] = (transform.header.frame_id, step)
 
 
 def _parse_pose(text: str) -> Array:

@@ -1,7 +1,14 @@
 """Odometry by time: the pose at a scan's stamp from samples around it."""
 
+import math
 from bisect import bisect_left
 from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
@@ -60,6 +67,38 @@ class OdometryBuffer:
             del self._stamps[:first], self._poses[:first]
 
 
+_FASTEST_M_S = 3.0
+_STEP_BACK_NS = 1_000_000_000
+_LONGEST_GAP_NS = 120_000_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class LastPose:
+    """Where odometry stood in the map, T_map_odom (3,), when it said T_odom_base (3,) at stamp_ns."""
+
+    stamp_ns: int
+    T_map_odom: Array
+    T_odom_base: Array
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """All of it as arrays; `from_state` makes an equal one."""
+        return {'stamp_ns': np.array(self.stamp_ns), 'T_map_odom': self.T_map_odom, 'T_odom_base': self.T_odom_base}
+
+    @staticmethod
+    def from_state(state: Mapping[str, NDArray[Any]]) -> 'LastPose | None':
+        """Return the pose of a state; None where it is none."""
+        poses = [np.asarray(state.get(name, np.empty(0)), dtype=np.float64) for name in ('T_map_odom', 'T_odom_base')]
+        if 'stamp_ns' not in state or any(pose.shape != (3,) or not se2.is_finite(pose) for pose in poses):
+            return None
+        return LastPose(int(state['stamp_ns']), poses[0], poses[1])
+
+    def leads_to(self, stamp_ns: int, T_odom_base: Array) -> bool:
+        """Whether a later odometry pose can be of the same drive: not before, not long after, not too far away."""
+        gap_ns = stamp_ns - self.stamp_ns
+        moved = math.dist(self.T_odom_base[:2], T_odom_base[:2])
+        return 0 <= gap_ns <= _LONGEST_GAP_NS and moved <= 0.5 + _FASTEST_M_S * gap_ns / 1e9
+
+
 class ScanPairing:
     """Brings each scan together with the odometry pose at its stamp, in the order in which the scans came.
 
@@ -84,6 +123,10 @@ class ScanPairing:
 
     def add_scan(self, scan: Scan) -> list[tuple[Scan, Array]]:
         """Take a scan; returns the scans that are ready now, each with its T_odom_base (3,)."""
+        # A scan whose stamp lies in the future of all that come after it would keep them waiting.
+        while self._waiting and self._waiting[-1].stamp_ns > scan.stamp_ns + _STEP_BACK_NS:
+            self._waiting.pop()
+            self.dropped += 1
         self._waiting.append(scan)
         if len(self._waiting) > self._capacity:
             self._waiting.popleft()

@@ -8,7 +8,6 @@ from geometry_msgs.msg import Point, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid
 from rclpy.action import ActionClient
 from rclpy.action.client import ClientGoalHandle
-from rclpy.node import Node
 from rclpy.task import Future
 from sensor_msgs.msg import LaserScan
 
@@ -16,11 +15,13 @@ from thinmap_msgs.action import Explore, NavigateToPose
 from thinmap_msgs.msg import EndNode as EndNodeMsg
 from thinmap_msgs.msg import EndNodeArray, ExplorationStatus, SlamStatus, TopologicalMap
 from thinmap_ros import warm_up
-from thinmap_ros.adapters import messages, parameters, qos, runtime
+from thinmap_ros.adapters import checks, messages, parameters, qos, runtime
 from thinmap_ros.adapters.actions import Outcome, SingleGoalServer
 from thinmap_ros.adapters.listening import listen
+from thinmap_ros.adapters.live_node import LiveNode
 from thinmap_ros.adapters.stamps import StampMatcher
 from thinmap_ros.adapters.transforms import LaserMount
+from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.area import fenced
 from thinmap_ros.core.exploration.explorer import Decision, EndNode, Explorer, ExplorerConfig
 from thinmap_ros.core.exploration.session import Budget, Odometer
@@ -29,32 +30,47 @@ from thinmap_ros.core.se2 import Array, wrap
 
 _WARN_PERIOD_S = 5.0
 _FEEDBACK_PERIOD_S = 1.0
-_SILENCE_S = 10.0
+_SILENCE_S = 60.0
+_DEAF_S = 3.0
 _LOST_S = 10.0
 _SAME_GOAL_M, _SAME_GOAL_RAD = 0.1, 0.2
 _GIVE_UP_HOME = 3
 
 
-class ExplorerNode(Node):
+class ExplorerNode(LiveNode):
     """Maps, /topology, /pose and /scan in; goals for the navigator, /end_nodes and /exploration_status out."""
 
     def __init__(self) -> None:
         super().__init__('explorer')
-        self._config = parameters.declare(self, ExplorerConfig)
+        # A change holds from the next goal on.
+        self._config = parameters.declare(self, ExplorerConfig, self._on_config)
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
         self._mount = LaserMount(self)
         parameters.check_unknown(self)
         warm_up.explorer()
+        self._goal_sent: Array | None = None
+        self._handle: ClientGoalHandle | None = None
+        self.begin_anew()
+        self._make_topics()
+
+    def begin_anew(self) -> None:
+        """Forget the map, the graph and what was explored."""
         self._map = MapMirror()
         self._topology = messages.topology_from(TopologicalMap())
         self._matcher: StampMatcher[LaserScan, Array] = StampMatcher()
         self._T_map_base: Array | None = None
-        self._heard_at = self._tracked_at = 0.0
-        self._goal_sent: Array | None = None
-        self._handle: ClientGoalHandle | None = None
+        self._heard_at = self._tracked_at = self._answered_at = 0.0
+        self._is_lost = False
         self._begin(Explore.Goal())
         self._state = ExplorationStatus.IDLE
-        self._make_topics()
+
+    def _on_config(self, config: ExplorerConfig) -> None:
+        self._config = config
+
+    def stand_still(self) -> None:
+        """End the exploration."""
+        if self._goals.active:
+            self._end(ExplorationStatus.CANCELLED, 'the explorer was stopped or begins anew')
 
     def _make_topics(self) -> None:
         self._end_nodes = self.create_publisher(EndNodeArray, 'end_nodes', qos.LATCHED)
@@ -66,8 +82,19 @@ class ExplorerNode(Node):
         listen(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
         listen(self, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
         self._navigator = ActionClient(self, NavigateToPose, 'navigate_to_pose')
-        self._goals = SingleGoalServer(self, Explore, 'explore', self._begin, self._on_cancel, self._preempted)
-        self.create_timer(_FEEDBACK_PERIOD_S, self._every_second)
+        self._goals = SingleGoalServer(self, Explore, 'explore', self._on_goal, self._on_cancel, self._preempted)
+        self.every(_FEEDBACK_PERIOD_S, self._every_second)
+
+    def _on_goal(self, goal: Explore.Goal) -> None:
+        limits = (goal.time_limit_s, goal.distance_limit_m, goal.area_limit_m2)
+        try:
+            corners = [c for p in goal.area.points for c in (p.x, p.y)]
+            checks.within('goal: limit or corner of the area', [*limits, *corners])
+        except InputError as error:
+            self._begin(Explore.Goal())
+            self._end(ExplorationStatus.CANCELLED, str(error))
+            return
+        self._begin(goal)
 
     def _begin(self, goal: Explore.Goal) -> None:
         self._goal = goal
@@ -105,8 +132,10 @@ class ExplorerNode(Node):
         self._take(self._matcher.left(messages.stamp_ns(message.header.stamp), message))
 
     def _on_slam_status(self, message: SlamStatus) -> None:
-        if message.state == SlamStatus.TRACKING:
+        # Silence is none of it: a localizer that is started again goes on from where it was.
+        if message.state == SlamStatus.TRACKING or not self._is_lost:
             self._tracked_at = self._now()
+        self._is_lost = message.state != SlamStatus.TRACKING
 
     def _on_cancel(self) -> None:
         self._cancel_asked = True
@@ -117,15 +146,15 @@ class ExplorerNode(Node):
         if pair is None:
             return
         message, self._T_map_base = pair
-        T_base_laser = self._mount.pose(message.header.frame_id)
-        if not self._goals.active or T_base_laser is None or self._map.patch is None:
+        if not self._goals.active or self._map.patch is None:
             return
         self._odometer.add(self._T_map_base)
         if self._state != ExplorationStatus.EXPLORING:
             return
-        scan = messages.scan_from(message, T_base_laser)
+        scan = self._mount.scan(message)
         patch = self._map.patch if len(self._polygon) < 3 else fenced(self._map.patch, self._polygon)
-        self._decision = self._explorer.step(self._topology, patch, scan, self._T_map_base)
+        with self.health.timed('explorer'):
+            self._decision = self._explorer.step(self._topology, patch, scan, self._T_map_base)
         self._publish_end_nodes(self._decision, message)
         if self._decision.finished:
             self._conclude(int(self._decision.code), self._decision.reason)
@@ -142,9 +171,10 @@ class ExplorerNode(Node):
         if now - self._heard_at > _SILENCE_S:
             self._end(ExplorationStatus.SENSOR_SILENT, f'no scan for {_SILENCE_S:.0f} s')
             return
-        if now - self._tracked_at > _LOST_S:
+        if self._is_lost and now - self._tracked_at > _LOST_S:
             self._end(ExplorationStatus.LOCALIZATION_LOST, f'the pose has been lost for {_LOST_S:.0f} s')
             return
+        self._ask_again(now)
         area = 0.0 if self._decision is None else self._decision.known_area_m2
         used_up = self._budget.used_up(now - self._begun_at, self._odometer.distance_m, area)
         if used_up and self._state == ExplorationStatus.EXPLORING:
@@ -189,10 +219,23 @@ class ExplorerNode(Node):
         if not self._navigator.server_is_ready():
             self.get_logger().warning('no navigator yet', throttle_duration_sec=_WARN_PERIOD_S)
             return
-        self._goal_sent = goal
+        self._goal_sent, self._answered_at = goal, self._now()
         request = NavigateToPose.Goal(use_heading=True)
         request.pose = messages.pose_stamped_msg(goal, self._map_frame, self.get_clock().now().nanoseconds)
-        self._navigator.send_goal_async(request).add_done_callback(lambda f: self._on_accepted(f, goal))
+        sent = self._navigator.send_goal_async(request, self._on_feedback)
+        sent.add_done_callback(lambda f: self._on_accepted(f, goal))
+
+    def _ask_again(self, now: float) -> None:
+        """Send the goal again where the navigator says nothing of it: it may be another one than the one asked."""
+        if self._goal_sent is None or now - self._answered_at < _DEAF_S:
+            return
+        self.get_logger().warning('the navigator is silent: asking again', throttle_duration_sec=_WARN_PERIOD_S)
+        goal, self._goal_sent, self._handle = self._goal_sent, None, None
+        if self._state == ExplorationStatus.RETURNING:
+            self._drive_to(goal)
+
+    def _on_feedback(self, message: NavigateToPose.Impl.FeedbackMessage) -> None:
+        self._answered_at = self._now()
 
     def _on_accepted(self, future: Future, goal: Array) -> None:
         handle = future.result()

@@ -1,15 +1,17 @@
 """The occupancy grid: each scan drawn in at the pose that the localizer found for it."""
 
+import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid as OccupancyGridMsg
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.srv import LoadMap, SaveMap
 from thinmap_ros import warm_up
 from thinmap_ros.adapters import messages, parameters, qos, runtime, session_files
 from thinmap_ros.adapters.listening import listen
+from thinmap_ros.adapters.live_node import LiveNode
+from thinmap_ros.adapters.recovery import State
 from thinmap_ros.adapters.services import answer, ask
 from thinmap_ros.adapters.stamps import StampMatcher
 from thinmap_ros.adapters.transforms import LaserMount
@@ -20,23 +22,26 @@ from thinmap_ros.core.se2 import Array
 _NO_BUILDER = 'no graph: there is no topology_builder'
 
 
-class GridMapperNode(Node):
+class GridMapperNode(LiveNode):
     """/scan and /pose in; /map once a second and /local_map at every scan out; services save_map and load_map."""
 
     def __init__(self) -> None:
-        super().__init__('grid_mapper')
+        super().__init__('grid_mapper', recovers=True)
         self._config = parameters.declare(self, OccupancyConfig)
         self._window_m = parameters.declare(self, WindowConfig).window_m
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
         self._mount = LaserMount(self)
-        session = parameters.declare_session(self)
+        self._session = parameters.declare_session(self)
         parameters.check_unknown(self)
-        self._grid = session_files.load_grid(session, self._config) if session else OccupancyGrid(self._config)
         warm_up.grid_mapper()
-        self._matcher: StampMatcher[LaserScan, Array] = StampMatcher()
         self._latest_ns: int | None = None
         self._map = self.create_publisher(OccupancyGridMsg, 'map', qos.LATCHED)
         self._local_map = self.create_publisher(OccupancyGridMsg, 'local_map', qos.LATCHED)
+        self._resumed_ns: int | None = None
+        self.begin_anew()
+        self._go_on(self.keep(self._state))
+        self.offer_pause()
+        self.health.sole_publisher_of('map')
         listen(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
         listen(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
         # Mapping goes on while a map is saved, and waits while one is loaded: nothing gets into the wrong graph.
@@ -45,9 +50,30 @@ class GridMapperNode(Node):
         self.create_service(LoadMap, 'load_map', self._on_load)
         self._save_topology = self.create_client(SaveMap, 'save_topology', callback_group=aside)
         self._load_topology = self.create_client(LoadMap, 'load_topology', callback_group=aside)
-        self.create_timer(1.0, self._publish_map)
-        if session:
+        self.every(1.0, self._publish_map)
+
+    def begin_anew(self) -> None:
+        """Forget the map, or go back to the session that the node was started with."""
+        self._matcher: StampMatcher[LaserScan, Array] = StampMatcher()
+        known = self._session or self._latest_ns is not None
+        self._latest_ns = None
+        self._grid = self._of_session() if self._session else OccupancyGrid(self._config)
+        if known:
             self._take_over(self._grid)
+
+    def _state(self) -> State | None:
+        if self._latest_ns is None:
+            return None
+        return {**self._grid.state(), 'latest_ns': np.array(self._latest_ns)}
+
+    def _go_on(self, left: State | None) -> None:
+        """Take over the map of a mapper that was killed."""
+        if left is not None and 'latest_ns' in left:
+            self._resumed_ns = self._latest_ns = int(left.pop('latest_ns'))
+            self._take_over(OccupancyGrid.from_state(left, self._config))
+
+    def _of_session(self) -> OccupancyGrid:
+        return session_files.load_grid(self._session, self._config)
 
     def _on_scan(self, message: LaserScan) -> None:
         self._take(self._matcher.left(messages.stamp_ns(message.header.stamp), message))
@@ -57,16 +83,18 @@ class GridMapperNode(Node):
         self._take(self._matcher.right(messages.stamp_ns(message.header.stamp), T_map_base))
 
     def _take(self, pair: tuple[LaserScan, Array] | None) -> None:
+        self.health.dropped_in_all('scans and poses without a partner', self._matcher.dropped)
         if pair is None:
             return
         message, T_map_base = pair
-        T_base_laser = self._mount.pose(message.header.frame_id)
-        if T_base_laser is None:
-            return  # the localizer, which gave the pose, knows where the laser is: the transform is on its way
-        scan = messages.scan_from(message, T_base_laser)
-        self._grid.update(scan, T_map_base)
+        scan = self._mount.scan(message)
+        if self._resumed_ns is not None and scan.stamp_ns < self._resumed_ns:
+            self.begin_anew()  # the robot has begun anew as well
+        self._resumed_ns = None
+        with self.health.timed('map update'):
+            self._grid.update(scan, T_map_base)
+            window = self._grid.window(T_map_base[0], T_map_base[1], self._window_m)
         self._latest_ns = scan.stamp_ns
-        window = self._grid.window(T_map_base[0], T_map_base[1], self._window_m)
         self._local_map.publish(messages.grid_msg(window, self._map_frame, scan.stamp_ns))
 
     def _publish_map(self) -> None:

@@ -1,39 +1,48 @@
 """Where the robot is: each scan, with the odometry at its stamp, through one step of the localizer."""
 
+from dataclasses import replace
 from time import perf_counter
 
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
 from thinmap_msgs.msg import LineFeature, LineFeatureArray, SlamStatus, TopologicalMap
 from thinmap_ros import warm_up
 from thinmap_ros.adapters import messages, parameters, qos, runtime
+from thinmap_ros.adapters.health import ERROR, OK
 from thinmap_ros.adapters.listening import listen
+from thinmap_ros.adapters.live_node import LiveNode
 from thinmap_ros.adapters.transforms import LaserMount
-from thinmap_ros.core.odometry import ScanPairing
+from thinmap_ros.core import se2
+from thinmap_ros.core.odometry import LastPose, ScanPairing
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.features import LineFeature as Feature
 from thinmap_ros.core.slam.localizer import Estimate, Localizer, LocalizerConfig
+from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 
-_WARN_PERIOD_S = 5.0
 
-
-class LocalizerNode(Node):
-    """/scan and /odom in; /pose, map -> odom on /tf, /line_features and /slam_status out."""
+class LocalizerNode(LiveNode):
+    """/scan and /odom in; /pose, map -> odom on /tf, /line_features and /slam_status out; services ~/pause, ~/reset."""
 
     def __init__(self) -> None:
-        super().__init__('localizer')
-        self._localizer = Localizer(parameters.declare(self, LocalizerConfig))
+        super().__init__('localizer', recovers=True)
+        self._config = parameters.declare(self, LocalizerConfig)
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
         self._odom_frame = parameters.declare_value(self, 'odom_frame', 'odom', 'frame of the odometry')
         self._mount = LaserMount(self)
         parameters.check_unknown(self)
         warm_up.localizer()
-        self._pairing = ScanPairing()
+        self._resumed: LastPose | None = None
+        self._last: LastPose | None = None
+        self._topology: Graph | None = None
+        self.begin_anew()
+        left = self.keep(lambda: None if self._last is None else self._last.state())
+        self._resumed = None if left is None else LastPose.from_state(left)
+        self.offer_pause()
+        self.health.sole_publisher_of('pose')
         self._pose = self.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
         self._tf = self.create_publisher(TFMessage, '/tf', qos.STREAM)
         self._features = self.create_publisher(LineFeatureArray, 'line_features', qos.LATCHED)
@@ -44,36 +53,52 @@ class LocalizerNode(Node):
         listen(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
         listen(self, PoseWithCovarianceStamped, 'initialpose', self._on_initial_pose, qos.STREAM)
 
+    def begin_anew(self) -> None:
+        """Forget all features: the robot is at its start."""
+        self._localizer, self._pairing = Localizer(self._config), ScanPairing()
+        self._resumed, self._last, self._topology = None, None, None
+
     def _on_odometry(self, message: Odometry) -> None:
         stamp_ns = messages.stamp_ns(message.header.stamp)
         ready = self._pairing.add_odometry(stamp_ns, messages.pose_from(message.pose.pose))
         self._take(ready)
 
     def _on_scan(self, message: LaserScan) -> None:
-        T_base_laser = self._mount.pose(message.header.frame_id)
-        if T_base_laser is None:
-            self.get_logger().warning(
-                f'scan in frame "{message.header.frame_id}": no static transform from the robot to it; publish one '
-                'on /tf_static or set the parameter laser_pose',
-                throttle_duration_sec=_WARN_PERIOD_S,
-            )
-            return
-        scan = messages.scan_from(message, T_base_laser)
-        self._take(self._pairing.add_scan(scan))
+        self._take(self._pairing.add_scan(self._mount.scan(message)))
 
     def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
         self._localizer.set_pose(messages.pose_from(message.pose.pose), messages.covariance_from(message))
 
     def _on_topology(self, message: TopologicalMap) -> None:
-        self._localizer.set_topology(messages.topology_from(message))
+        self._topology = messages.topology_from(message)
+        self._localizer.set_topology(self._topology)
 
     def _take(self, ready: list[tuple[Scan, Array]]) -> None:
         for scan, T_odom_base in ready:
+            if self._resumed is not None:
+                self._resume(self._resumed, scan.stamp_ns, T_odom_base)
             started = perf_counter()
             estimate = self._localizer.step(scan, T_odom_base)
             self._publish(scan.stamp_ns, estimate, 1000.0 * (perf_counter() - started))
+            if not estimate.lost:
+                self._last = LastPose(scan.stamp_ns, estimate.T_map_odom, T_odom_base)
+        self.health.dropped_in_all('scans without odometry at their time', self._pairing.dropped)
+        self.health.dropped_in_all('scans or odometry that make no sense', self._localizer.refused)
+
+    def _resume(self, last: LastPose, stamp_ns: int, T_odom_base: Array) -> None:
+        """Begin where the robot is now if its odometry has gone on; else at the start that is configured."""
+        self._resumed = None
+        if not last.leads_to(stamp_ns, T_odom_base):
+            self.get_logger().warning('the odometry has begun anew as well: beginning at the start')
+            return
+        x, y, yaw = se2.compose(last.T_map_odom, T_odom_base).tolist()
+        self._localizer = Localizer(replace(self._config, start_x_m=x, start_y_m=y, start_yaw_rad=yaw))
+        if self._topology is not None:
+            self._localizer.set_topology(self._topology)
 
     def _publish(self, ns: int, estimate: Estimate, step_ms: float) -> None:
+        self.health.took('localizer', step_ms)
+        self.health.state(*((ERROR, 'lost: scans do not fit the map') if estimate.lost else (OK, 'tracking')))
         pose = messages.pose_with_covariance_msg(
             estimate.T_map_base, estimate.covariance, self._map_frame, ns
         )

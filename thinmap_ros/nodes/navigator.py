@@ -3,14 +3,15 @@
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
-from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.action import NavigateToPose
 from thinmap_ros import warm_up
 from thinmap_ros.adapters import messages, parameters, qos, runtime
 from thinmap_ros.adapters.actions import Outcome, SingleGoalServer
+from thinmap_ros.adapters.health import OK, WARN
 from thinmap_ros.adapters.listening import listen
+from thinmap_ros.adapters.live_node import LiveNode
 from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
@@ -22,26 +23,22 @@ from thinmap_ros.core.se2 import Array
 
 _WARN_PERIOD_S = 5.0
 _CONTROL_PERIOD_S = 0.1
-_SILENCE_NS = 500_000_000
+_SILENCE_NS = 400_000_000  # with the control period: a stop within half a second
+# Without a new pose the last correction of the odometry holds for a while.
+_SILENCES_NS = {'laser': _SILENCE_NS, 'odometry': _SILENCE_NS, 'localizer': 3_000_000_000}
 
 
-class NavigatorNode(Node):
+class NavigatorNode(LiveNode):
     """/pose, /odom, /scan and the maps in; /cmd_vel and /plan out; action navigate_to_pose."""
 
     def __init__(self) -> None:
         super().__init__('navigator')
-        self._navigator = Navigator(parameters.declare(self, NavigatorConfig))
+        self._config = parameters.declare(self, NavigatorConfig, self._on_config)
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
         self._mount = LaserMount(self)
         parameters.check_unknown(self)
         warm_up.navigator()
-        self._map = MapMirror()
-        self._odometry = OdometryBuffer()
-        self._T_map_odom: Array | None = None
-        self._T_odom_base: Array | None = None
-        self._scan: Scan | None = None
-        self._shown_path: Array | None = None
-        self._cancel_asked = False
+        self.begin_anew()
         self._cmd_vel = self.create_publisher(Twist, 'cmd_vel', qos.STREAM)
         self._plan = self.create_publisher(Path, 'plan', qos.LATCHED)
         listen(self, Odometry, 'odom', self._on_odometry, qos.STREAM)
@@ -52,14 +49,39 @@ class NavigatorNode(Node):
         self._goals = SingleGoalServer(
             self, NavigateToPose, 'navigate_to_pose', self._on_goal, self._on_cancel, _preempted
         )
-        self.create_timer(_CONTROL_PERIOD_S, self._control)
+        self.every(_CONTROL_PERIOD_S, self._control)
+
+    def begin_anew(self) -> None:
+        """Forget the map and where the robot is."""
+        self._navigator = Navigator(self._config)
+        self._map = MapMirror()
+        self._odometry = OdometryBuffer()
+        self._T_map_odom: Array | None = None
+        self._T_odom_base: Array | None = None
+        self._scan: Scan | None = None
+        self._heard_ns: dict[str, int] = {}
+        self._shown_path: Array | None = None
+        self._goal: tuple[float, float, float | None] = (0.0, 0.0, None)
+        self._cancel_asked = False
+
+    def _on_config(self, config: NavigatorConfig) -> None:
+        """Drive on with other parameters: to the same goal, on a new path."""
+        self._config, self._navigator = config, Navigator(config)
+        if self._goals.active:
+            self._navigator.set_goal(*self._goal)
+
+    def stand_still(self) -> None:
+        """End the goal; the robot stops."""
+        self._end(Outcome.ABORTED, 'the navigator was stopped or begins anew')
 
     def close(self) -> None:
         """Stop the robot: the last thing the node does."""
         self._cmd_vel.publish(messages.twist_msg(0.0, 0.0))
+        super().close()
 
     def _on_odometry(self, message: Odometry) -> None:
         self._T_odom_base = messages.pose_from(message.pose.pose)
+        self._note('odometry')
         self._odometry.add(messages.stamp_ns(message.header.stamp), self._T_odom_base)
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
@@ -67,13 +89,12 @@ class NavigatorNode(Node):
         if T_odom_base is None:
             return
         T_map_base = messages.pose_from(message.pose.pose)
+        self._note('localizer')
         self._T_map_odom = se2.compose(T_map_base, se2.invert(T_odom_base))
 
     def _on_scan(self, message: LaserScan) -> None:
-        T_base_laser = self._mount.pose(message.header.frame_id)
-        if T_base_laser is None:
-            return
-        self._scan = messages.scan_from(message, T_base_laser)
+        self._scan = self._mount.scan(message)
+        self._note('laser')
 
     def _on_map(self, message: OccupancyGrid) -> None:
         self._map.replace(messages.patch_from(message))
@@ -92,7 +113,8 @@ class NavigatorNode(Node):
             self._end(Outcome.ABORTED, reason)
             return
         self._cancel_asked = False
-        self._navigator.set_goal(float(goal[0]), float(goal[1]), float(goal[2]) if request.use_heading else None)
+        self._goal = (float(goal[0]), float(goal[1]), float(goal[2]) if request.use_heading else None)
+        self._navigator.set_goal(*self._goal)
 
     def _on_cancel(self) -> None:
         self._cancel_asked = True
@@ -105,6 +127,7 @@ class NavigatorNode(Node):
             return
         command = self._command()
         if command is None:
+            self._tell('waiting')
             return
         self._cmd_vel.publish(messages.twist_msg(command.v, command.w))
         self._show_path()
@@ -113,7 +136,7 @@ class NavigatorNode(Node):
         elif command.state == 'failed':
             self._end(Outcome.ABORTED, command.reason)
         else:
-            self._tell(command)
+            self._tell(command.state)
 
     def _command(self) -> Command | None:
         """What the navigator says now; a stop while the laser is silent; None before everything is known."""
@@ -122,12 +145,29 @@ class NavigatorNode(Node):
                 'goal waits: no map, scan, pose or odometry yet', throttle_duration_sec=_WARN_PERIOD_S
             )
             return None
-        latest = self._odometry.latest_stamp_ns
-        if latest is not None and latest - self._scan.stamp_ns > _SILENCE_NS:
-            self.get_logger().warning('laser silent: standing still', throttle_duration_sec=_WARN_PERIOD_S)
-            return Command(0.0, 0.0, 'blocked', 'laser silent')
+        if who := self._silent():
+            reason = f'{who} silent: standing still'
+            self.get_logger().warning(reason, throttle_duration_sec=_WARN_PERIOD_S)
+            self.health.state(WARN, reason)
+            return Command(0.0, 0.0, 'blocked', reason)
+        self.health.state(OK, 'driving')
         T_map_base = se2.compose(self._T_map_odom, self._T_odom_base)
-        return self._navigator.step(T_map_base, self._map.patch, self._scan, _CONTROL_PERIOD_S)
+        with self.health.timed('navigator'):
+            return self._navigator.step(T_map_base, self._map.patch, self._scan, _CONTROL_PERIOD_S)
+
+    def _silent(self) -> str:
+        """Who has not been heard for so long that driving on would be driving blind; '' where all is well."""
+        latest = self._odometry.latest_stamp_ns
+        if latest is not None and self._scan is not None and latest - self._scan.stamp_ns > _SILENCE_NS:
+            return 'laser'
+        now_ns = self.get_clock().now().nanoseconds
+        for who, limit_ns in _SILENCES_NS.items():
+            if now_ns - self._heard_ns.get(who, now_ns) > limit_ns:
+                return who
+        return ''
+
+    def _note(self, who: str) -> None:
+        self._heard_ns[who] = self.get_clock().now().nanoseconds
 
     def _show_path(self) -> None:
         path = self._navigator.path
@@ -136,14 +176,15 @@ class NavigatorNode(Node):
             ns = self.get_clock().now().nanoseconds
             self._plan.publish(messages.path_msg(np.asarray(path), self._map_frame, ns))
 
-    def _tell(self, command: Command) -> None:
+    def _tell(self, state: str) -> None:
         feedback = NavigateToPose.Feedback()
-        feedback.state = command.state
+        feedback.state = state
         feedback.distance_remaining_m = self._navigator.distance_remaining_m
         self._goals.feedback(feedback)
 
     def _end(self, outcome: Outcome, reason: str) -> None:
         self._navigator.cancel()
+        self.health.state(OK, reason)
         self._cmd_vel.publish(messages.twist_msg(0.0, 0.0))
         self._goals.finish(
             outcome, NavigateToPose.Result(success=outcome is Outcome.SUCCEEDED, reason=reason)

@@ -1,5 +1,6 @@
 """Everything that is said on the graph, into an MCAP bag."""
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,15 +9,16 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-from thinmap_ros.adapters import parameters, resources, runtime
-from thinmap_ros.adapters.bags import BagWriter
+from thinmap_ros.adapters import bag_qos, parameters, resources, runtime
+from thinmap_ros.adapters.bag_writer import BagWriter
+from thinmap_ros.adapters.health import Health
 from thinmap_ros.adapters.types import message_class
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
 
 _LOOK_AROUND_S = 0.25
+_FLUSH_S = 0.5
 _DEPTH = 1000
-_OWN_MESSAGES = ('thinmap_msgs', 'tf2_msgs')
 
 
 @dataclass(frozen=True)
@@ -27,25 +29,38 @@ class RecorderConfig(Config):
 
 
 class RecorderNode(Node):
-    """Subscribes to every topic as soon as somebody publishes it, and writes the bytes as they come."""
+    """Subscribes to every topic as soon as somebody publishes it, and writes the bytes as they come.
+
+    What has come is on the disk within half a second, whatever ends the robot. Where the disk takes no more, the node
+    says so and ends.
+    """
 
     def __init__(self) -> None:
         super().__init__('recorder')
-        path = Path(parameters.declare(self, RecorderConfig).bag)
+        self._path = Path(parameters.declare(self, RecorderConfig).bag)
         parameters.check_unknown(self)
-        if path.exists():
-            raise InputError(f'{path}: exists already: expected the name of a new bag')
-        definitions: dict[str, str] = {}
-        for package in _OWN_MESSAGES:
-            definitions |= resources.message_definitions(package)
-        self._writer = BagWriter(path, live=True, definitions=definitions)
+        if self._path.exists():
+            raise InputError(f'{self._path}: exists already: expected the name of a new bag')
+        try:
+            self._writer = BagWriter(self._path, live=True)
+        except OSError as error:
+            raise InputError(f'{self._path}: {error.strerror or error}') from error
         self._seen: set[str] = {'/rosout', '/parameter_events'}
+        self._early: list[tuple[str, str, bytes]] = []
+        self._written = 0
+        self._health = Health(self)
         # Not in the robot's time, which may stand still until everybody listens.
-        self.create_timer(_LOOK_AROUND_S, self._look_around, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        wall = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(_LOOK_AROUND_S, self._look_around, clock=wall)
+        self.create_timer(_FLUSH_S, lambda: self._guarded(self._writer.flush), clock=wall)
 
     def close(self) -> None:
-        """Finish the bag."""
-        self._writer.close()
+        """Finish the bag; what a full disk leaves of it is readable, and `bag_repair` makes it whole."""
+        with contextlib.suppress(OSError):
+            for message in self._early:
+                self._write(*message, self.get_clock().now().nanoseconds)
+            self._writer.close()
+        self.get_logger().info(f'{self._path}: {self._written} messages')
 
     def _look_around(self) -> None:
         for topic, types in self.get_topic_names_and_types():
@@ -55,30 +70,56 @@ class RecorderNode(Node):
                 self._subscribe(topic, types[0])
 
     def _subscribe(self, topic: str, type_name: str) -> None:
-        try:
-            kind = message_class(type_name)
-        except InputError as error:
-            self.get_logger().warning(f'{topic} is not recorded: {error}')
-            return
-        self.create_subscription(kind, topic, self._writes(topic, type_name), self._offered(topic), raw=True)
-
-    def _writes(self, topic: str, type_name: str) -> Callable[[bytes], None]:
-        def write(data: bytes) -> None:
-            self._writer.write(topic, type_name, self.get_clock().now().nanoseconds, data)
-
-        return write
-
-    def _offered(self, topic: str) -> QoSProfile:
-        """What every publisher of a topic offers at least, so that all of them are heard."""
         offers = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
         reliable = all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers)
         latched = all(offer.durability == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers)
-        return QoSProfile(
-            depth=_DEPTH,
-            history=HistoryPolicy.KEEP_LAST,
-            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-        )
+        try:
+            kind = message_class(type_name)
+            self._writer.learn(resources.message_definitions(type_name.partition('/')[0]))
+            self._writer.add_topic(topic, type_name, [bag_qos.recorded(o.depth, reliable, latched) for o in offers])
+        except InputError as error:
+            self.get_logger().warning(f'{topic} is not recorded: {error}')
+            return
+        self.create_subscription(kind, topic, self._takes(topic, type_name), _wanted(reliable, latched), raw=True)
+
+    def _takes(self, topic: str, type_name: str) -> Callable[[bytes], None]:
+        def take(data: bytes) -> None:
+            self._guarded(lambda: self._take(topic, type_name, data))
+
+        return take
+
+    def _take(self, topic: str, type_name: str, data: bytes) -> None:
+        ns = self.get_clock().now().nanoseconds
+        if ns == 0 and len(self._early) < _DEPTH:
+            # Time has not begun: players must not think that so much of it passed before the first scan.
+            self._early.append((topic, type_name, data))
+            return
+        for message in self._early:
+            self._write(*message, ns)
+        self._early.clear()
+        self._write(topic, type_name, data, ns)
+
+    def _write(self, topic: str, type_name: str, data: bytes, ns: int) -> None:
+        with self._health.timed('writing'):
+            self._writer.write(topic, type_name, ns, data)
+        self._written += 1
+        self._health.tell('messages written', self._written)
+
+    def _guarded(self, work: Callable[[], None]) -> None:
+        try:
+            work()
+        except OSError as error:
+            raise InputError(f'{self._path}: {error.strerror or error}: recording ends here') from error
+
+
+def _wanted(reliable: bool, latched: bool) -> QoSProfile:
+    """What every publisher of a topic offers at least, so that all of them are heard."""
+    return QoSProfile(
+        depth=_DEPTH,
+        history=HistoryPolicy.KEEP_LAST,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
 
 
 def main() -> None:

@@ -13,6 +13,7 @@ from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.msg import EndNodeArray, ExplorationStatus, LineFeatureArray, SlamStatus, TopologicalMap
 from thinmap_ros.adapters import parameters, qos, runtime
+from thinmap_ros.adapters.health import Health
 from thinmap_ros.adapters.rerun_view import NullView, View
 from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.adapters.view_feed import Feed
@@ -53,6 +54,7 @@ class RerunViewerNode(Node):
         parameters.check_unknown(self)
         self._view = self._open(config)
         self._feed = Feed(self._view, mount.pose)
+        self._health = Health(self)
         for topic, (kind, profile) in _TOPICS.items():
             self.create_subscription(kind, topic, self._takes(topic), profile)
 
@@ -68,9 +70,11 @@ class RerunViewerNode(Node):
 
     def _takes(self, topic: str) -> Callable[[Any], None]:
         def take(message: Any) -> None:
+            self._health.heard(topic)
             try:
                 self._feed.take(topic, message)
             except InputError as error:
+                self._health.refused(topic, str(error))
                 self.get_logger().warning(f'{topic}: {error}', throttle_duration_sec=_WARN_PERIOD_S)
 
         return take

@@ -14,6 +14,7 @@ from std_msgs.msg import UInt32
 from tf2_msgs.msg import TFMessage
 
 from thinmap_ros.adapters import messages, parameters, qos, resources, runtime
+from thinmap_ros.adapters.health import OK, WARN, Health
 from thinmap_ros.adapters.lockstep import NONE, TOPICS, Lockstep
 from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core import se2
@@ -61,6 +62,7 @@ class SimNode(Node):
         self._repeated_at = 0.0
         self._running = False
         self._told_collisions = -1
+        self._health = Health(self)
         self._make_topics()
         self._publish_mount()
         wall = Clock(clock_type=ClockType.STEADY_TIME)
@@ -77,22 +79,29 @@ class SimNode(Node):
         self.create_subscription(Twist, 'cmd_vel', self._on_command, qos.STREAM)
 
     def _on_command(self, message: Twist) -> None:
-        if np.isfinite([message.linear.x, message.angular.z]).all():
-            self._command = (message.linear.x, message.angular.z)
-            self._command_ns = self._sim.stamp_ns
+        self._health.heard('cmd_vel')
+        command = (message.linear.x, message.angular.z)
+        if not np.isfinite(command).all():
+            self._health.refused('cmd_vel', f'command {command}: expected finite numbers')
+            return
+        self._command, self._command_ns = command, self._sim.stamp_ns
 
     def _tick(self) -> None:
         if not self._running:
             if self.count_subscribers('scan') < self._config.hold_for_subscribers:
+                self._health.state(WARN, 'time stands still: too few nodes listen to the scans')
                 return
             self._running = True
+            self._health.state(OK, 'running')
             self._publish(self._sim.sense())
             return
         if self._lockstep.waits and self._waits():
             return
         # As a robot's own controller does: without a fresh command it stops.
         fresh = self._sim.stamp_ns - self._command_ns <= _COMMAND_TIMEOUT_NS
-        self._publish(self._sim.step(*(self._command if fresh else (0.0, 0.0))))
+        with self._health.timed('simulation'):
+            moment = self._sim.step(*(self._command if fresh else (0.0, 0.0)))
+        self._publish(moment)
 
     def _waits(self) -> bool:
         """Whether time has to stand still for the last scan. The first one is repeated until somebody answers."""

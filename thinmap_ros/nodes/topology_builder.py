@@ -1,14 +1,16 @@
 """The topological map: the window around the robot thinned at every scan and merged into the global graph."""
 
+import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid
-from rclpy.node import Node
 
 from thinmap_msgs.msg import TopologicalMap
 from thinmap_msgs.srv import LoadMap, SaveMap
 from thinmap_ros import warm_up
 from thinmap_ros.adapters import messages, parameters, qos, runtime, session_files
 from thinmap_ros.adapters.listening import listen
+from thinmap_ros.adapters.live_node import LiveNode
+from thinmap_ros.adapters.recovery import State
 from thinmap_ros.adapters.services import answer
 from thinmap_ros.adapters.stamps import StampMatcher
 from thinmap_ros.core.grid.patch import GridPatch
@@ -16,26 +18,48 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig
 
 
-class TopologyBuilderNode(Node):
+class TopologyBuilderNode(LiveNode):
     """/local_map and /pose in; /local_topology and /topology out; services save_topology and load_topology."""
 
     def __init__(self) -> None:
-        super().__init__('topology_builder')
+        super().__init__('topology_builder', recovers=True)
         self._config = parameters.declare(self, TopologyConfig)
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
-        session = parameters.declare_session(self)
+        self._session = parameters.declare_session(self)
         parameters.check_unknown(self)
-        self._builder = session_files.load_topology(session, self._config) if session else TopologyBuilder(self._config)
         warm_up.topology_builder()
-        self._matcher: StampMatcher[GridPatch, Array] = StampMatcher()
+        self._said_something = False
         self._local = self.create_publisher(TopologicalMap, 'local_topology', qos.LATCHED)
         self._global = self.create_publisher(TopologicalMap, 'topology', qos.LATCHED)
         listen(self, OccupancyGrid, 'local_map', self._on_window, qos.STREAM)
         listen(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
         self.create_service(SaveMap, 'save_topology', self._on_save)
         self.create_service(LoadMap, 'load_topology', self._on_load)
-        if session:
+        self.health.sole_publisher_of('topology')
+        self._latest_ns: int | None = None
+        self._resumed_ns: int | None = None
+        self.begin_anew()
+        self._go_on(self.keep(self._state))
+
+    def _state(self) -> State | None:
+        return None if self._latest_ns is None else {**self._builder.state(), 'latest_ns': np.array(self._latest_ns)}
+
+    def _go_on(self, left: State | None) -> None:
+        """Take over the graph of a builder that was killed."""
+        if left is not None and 'latest_ns' in left:
+            self._resumed_ns = self._latest_ns = int(left.pop('latest_ns'))
+            self._builder = TopologyBuilder.from_state(left, self._config)
+            self._publish(self._latest_ns)
+
+    def begin_anew(self) -> None:
+        """Forget the graph, or go back to the session that the node was started with."""
+        self._matcher: StampMatcher[GridPatch, Array] = StampMatcher()
+        self._builder = self._of_session() if self._session else TopologyBuilder(self._config)
+        if self._session or self._said_something:
             self._publish(self.get_clock().now().nanoseconds)
+
+    def _of_session(self) -> TopologyBuilder:
+        return session_files.load_topology(self._session, self._config)
 
     def _on_window(self, message: OccupancyGrid) -> None:
         stamp_ns = messages.stamp_ns(message.header.stamp)
@@ -48,14 +72,21 @@ class TopologyBuilderNode(Node):
         self._take(stamp_ns, pair)
 
     def _take(self, stamp_ns: int, pair: tuple[GridPatch, Array] | None) -> None:
+        self.health.dropped_in_all('local maps and poses without a partner', self._matcher.dropped)
         if pair is None:
             return
-        if self._builder.update(*pair):
+        if self._resumed_ns is not None and stamp_ns < self._resumed_ns:
+            self.begin_anew()  # the robot has begun anew as well
+        self._resumed_ns, self._latest_ns = None, stamp_ns
+        with self.health.timed('graph update'):
+            changed = self._builder.update(*pair)
+        if changed:
             self._publish(stamp_ns)
         # The local map comes last: who hears it knows that all of this scan is said.
         self._local.publish(messages.topology_msg(self._builder.local_map(), self._map_frame, stamp_ns))
 
     def _publish(self, stamp_ns: int) -> None:
+        self._said_something = True
         self._global.publish(messages.topology_msg(self._builder.map, self._map_frame, stamp_ns))
 
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:

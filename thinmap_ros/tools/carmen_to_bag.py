@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from thinmap_ros.adapters.bags import BagWriter
+from thinmap_ros.adapters.bag_writer import BagWriter
 from thinmap_ros.adapters.carmen import CarmenLog, LaserOptions
 from thinmap_ros.adapters.events import Event, OdometryEvent
 from thinmap_ros.core.scan import Scan

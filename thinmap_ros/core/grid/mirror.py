@@ -19,13 +19,15 @@ class MapMirror:
     def paste(self, window: GridPatch) -> GridPatch:
         """Lay a window over what is held, growing it where the window stands out; returns the result.
 
-        Raises InputError where the window's cells do not lie on the lattice of the map.
+        Raises InputError where the window's cells do not lie on the lattice of the map, or far from it.
         """
         if self.patch is None:
             self.patch = window
             return window
         row, col = _offset(self.patch, window)
         rows, cols = window.shape
+        if max(-row - rows, row - self.patch.shape[0]) > rows or max(-col - cols, col - self.patch.shape[1]) > cols:
+            raise InputError(f'map window at {window.frame}: expected it on or beside the map at {self.patch.frame}')
         before = (max(-row, 0), max(-col, 0))
         after = (max(row + rows - self.patch.shape[0], 0), max(col + cols - self.patch.shape[1], 0))
         cells = np.pad(

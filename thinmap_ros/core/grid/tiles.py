@@ -5,8 +5,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from thinmap_ros.core.errors import InputError
+
 TILE = 64  # cells along the edge of a tile
 NO_TILE = -1
+_MOST_TILES = 1 << 15  # 134 million cells, some 1.1 km in each direction at 0.1 m
 _BORDER = 4  # tiles by which the directory grows at a time
 
 
@@ -27,7 +30,10 @@ class TileStore:
         self.used = 0
 
     def reach(self, row_a: int, col_a: int, row_b: int, col_b: int) -> None:
-        """Lay out the directory so that the tiles from (row_a, col_a) to (row_b, col_b), inclusive, lie in it."""
+        """Lay out the directory so that the tiles from (row_a, col_a) to (row_b, col_b), inclusive, lie in it.
+
+        Raises InputError where that would make it larger than any building: a pose is wrong then.
+        """
         rows, cols = self.directory.shape
         low_row, low_col = min(row_a, self.first_row), min(col_a, self.first_col)
         high_row = max(row_b + 1, self.first_row + rows)
@@ -37,6 +43,9 @@ class TileStore:
         low_row, low_col, high_row, high_col = (
             low_row - _BORDER, low_col - _BORDER, high_row + _BORDER, high_col + _BORDER
         )
+        if (high_row - low_row) * (high_col - low_col) > _MOST_TILES:
+            size = f'{high_row - low_row} x {high_col - low_col}'
+            raise InputError(f'map of {size} tiles: expected {_MOST_TILES} at most')
         wider = np.full((high_row - low_row, high_col - low_col), NO_TILE, dtype=np.int32)
         row, col = self.first_row - low_row, self.first_col - low_col
         wider[row : row + rows, col : col + cols] = self.directory

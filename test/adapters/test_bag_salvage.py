@@ -1,0 +1,166 @@
+"""bag_repair: of a file that was cut off or damaged everything whole is kept, and the result is an ordinary bag."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.reader import NonSeekingReader
+from mcap.records import Message
+from mcap.writer import CompressionType, Writer
+
+from thinmap_ros.adapters import bag_qos
+from thinmap_ros.adapters.bag_salvage import Salvage, whole_records
+from thinmap_ros.adapters.bag_writer import BagWriter
+from thinmap_ros.adapters.bags import Bag
+
+STRING = 'std_msgs/msg/String'
+COUNT, PER_CHUNK = 200, 10
+
+
+def write(path: Path, count: int = COUNT) -> Path:
+    """A bag of numbered messages, a chunk for every ten."""
+    writer = BagWriter(path, live=True)
+    writer.add_topic('/said', STRING, [bag_qos.recorded(7, False, False)])
+    writer.add_topic('/map', STRING, [bag_qos.recorded(1, True, True)])
+    for i in range(count):
+        writer.write('/map' if i % 20 == 0 else '/said', STRING, 10**9 + i, text(writer, i))
+        if i % PER_CHUNK == PER_CHUNK - 1:
+            writer.flush()
+    writer.close()
+    return path
+
+
+def text(writer: BagWriter, i: int) -> Any:
+    return writer.typestore.types[STRING](data=f'number {i} ' + 'x' * 50)
+
+
+def numbers(path: Path) -> list[int]:
+    bag = Bag(path)
+    assert not bag.cut_off
+    return [int(bag.decode(message).data.split()[1]) for message in bag.messages()]
+
+
+def repaired(source: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, '-m', 'thinmap_ros.tools.bag_repair', str(source), *arguments]
+    return subprocess.run(command, capture_output=True, text=True)
+
+
+def test_what_is_flushed_is_readable_at_once(tmp_path: Path) -> None:
+    writer = BagWriter(tmp_path / 'bag', live=True)
+    for i in range(5):
+        writer.write('/said', STRING, 10**9 + i, text(writer, i))
+    writer.flush()
+    writer.flush()
+    bag = Bag(tmp_path / 'bag')
+    assert len(list(bag.messages())) == 5 and bag.cut_off
+    writer.write('/said', STRING, 2 * 10**9, text(writer, 5))
+    writer.close()
+    assert numbers(tmp_path / 'bag') == list(range(6))
+
+
+def test_a_cut_off_bag_gets_index_metadata_and_its_qualities_back(tmp_path: Path) -> None:
+    whole = (write(tmp_path / 'bag') / 'bag.mcap').read_bytes()
+    (tmp_path / 'cut').mkdir()
+    (tmp_path / 'cut' / 'cut_0.mcap').write_bytes(whole[: len(whole) // 2])
+    done = repaired(tmp_path / 'cut')
+    assert done.returncode == 0, done.stderr
+    assert 'cut off' in done.stdout and 'on 2 topics' in done.stdout
+    good = tmp_path / 'cut_repaired'
+    found = numbers(good)
+    # The file's middle is behind the middle of its messages: summary and index come last.
+    assert found == list(range(len(found))) and COUNT / 2 - PER_CHUNK <= len(found) < COUNT
+    assert f'{len(found)} messages' in done.stdout
+    metadata = yaml.safe_load((good / 'metadata.yaml').read_text())['rosbag2_bagfile_information']
+    assert metadata['message_count'] == len(found)
+    assert metadata['relative_file_paths'] == ['cut_repaired.mcap']
+    assert metadata['starting_time']['nanoseconds_since_epoch'] == 10**9
+    assert metadata['duration']['nanoseconds'] == len(found) - 1
+    offers = Bag(good).offers
+    assert bag_qos.is_latched('/map', offers['/map']) and not bag_qos.is_latched('/said', offers['/said'])
+    assert not bag_qos.is_reliable(offers['/said']) and bag_qos.depth(offers['/said']) == 7
+
+
+def cut_file(tmp_path: Path, compression: CompressionType) -> Path:
+    """One chunk of many messages, cut in its middle."""
+    with (tmp_path / 'one.mcap').open('wb') as stream:
+        writer = Writer(stream, chunk_size=10**9, compression=compression)
+        writer.start(profile='ros2')
+        schema = writer.register_schema(STRING, 'ros2msg', b'string data')
+        channel = writer.register_channel('/said', 'cdr', schema)
+        noise = BagWriter(tmp_path / 'noise', live=True).typestore
+        for i in range(20_000):
+            data = noise.serialize_cdr(noise.types[STRING](data=f'number {i} {hash((i, 1)):x}'), STRING)
+            writer.add_message(channel, 10**9 + i, bytes(data), 10**9 + i, i)
+        writer.finish()
+    content = (tmp_path / 'one.mcap').read_bytes()
+    (tmp_path / 'cut.mcap').write_bytes(content[: len(content) // 2])
+    return tmp_path / 'cut.mcap'
+
+
+@pytest.mark.parametrize('compression', list(CompressionType))
+def test_of_a_chunk_that_was_cut_off_the_part_before_the_cut_is_kept(
+    tmp_path: Path, compression: CompressionType
+) -> None:
+    cut = cut_file(tmp_path, compression)
+    done = repaired(cut, '-o', str(tmp_path / 'good.mcap'))
+    assert done.returncode == 0, done.stderr
+    found = numbers(tmp_path / 'good.mcap')
+    assert found == list(range(len(found))) and 4_000 < len(found) < 16_000
+    with (tmp_path / 'good.mcap').open('rb') as stream:
+        last = list(NonSeekingReader(stream, validate_crcs=True).iter_messages())[-1][2]
+    assert last.sequence == last.log_time - 10**9 == len(found) - 1
+
+
+def test_a_damaged_chunk_costs_only_itself(tmp_path: Path) -> None:
+    with (tmp_path / 'bag.mcap').open('wb') as stream:
+        writer = Writer(stream, chunk_size=2000)
+        writer.start(profile='ros2')
+        channel = writer.register_channel('/said', 'cdr', writer.register_schema(STRING, 'ros2msg', b'string data'))
+        for i in range(500):
+            writer.add_message(channel, i, b'\x00\x01\x00\x00' + bytes([i % 251]) * 60, i)
+        writer.finish()
+    content = bytearray((tmp_path / 'bag.mcap').read_bytes())
+    middle = len(content) // 3
+    content[middle : middle + 4] = b'????'
+    (tmp_path / 'bag.mcap').write_bytes(content)
+    found = Salvage()
+    records = list(whole_records(tmp_path / 'bag.mcap', found))
+    assert found.damaged_chunks <= 1 and not found.cut_off
+    assert len(records) > 400
+
+
+def test_what_cannot_be_repaired_is_said_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / 'text.mcap').write_bytes(b'dear all')
+    (tmp_path / 'start.mcap').write_bytes(b'\x89MCAP0\r\n\x01')
+    (tmp_path / 'empty').mkdir()
+    for name, said in (('text.mcap', 'begin with'), ('start.mcap', 'no whole message'), ('empty', 'MCAP files in it')):
+        done = repaired(tmp_path / name)
+        assert done.returncode == 2 and said in done.stderr and name in done.stderr
+        assert len(done.stderr.splitlines()) == 1
+    (tmp_path / 'home').mkdir()
+    (tmp_path / 'home' / 'thesis').write_text('work')
+    done = repaired(write(tmp_path / 'bag') / 'bag.mcap', '-o', str(tmp_path / 'home'))
+    assert done.returncode == 2 and 'thesis' in done.stderr
+    assert not list(tmp_path.glob('.*.part'))
+
+
+_WHOLE: list[bytes] = []
+
+
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.floats(0.0, 1.0), st.binary(max_size=16), st.booleans())
+def test_no_damage_makes_it_stumble_or_invent(tmp_path: Path, share: float, noise: bytes, cut: bool) -> None:
+    if not _WHOLE:
+        _WHOLE.append((write(tmp_path / 'whole') / 'whole.mcap').read_bytes())
+    at = 8 + int(share * (len(_WHOLE[0]) - 8))
+    damaged = _WHOLE[0][:at] + noise + (b'' if cut else _WHOLE[0][at + len(noise) :])
+    (tmp_path / 'damaged.mcap').write_bytes(damaged)
+    records = list(whole_records(tmp_path / 'damaged.mcap', Salvage()))
+    if not cut and not noise:
+        assert sum(isinstance(record, Message) for record in records) == COUNT
+    assert len(records) <= COUNT + 10 + len(noise)

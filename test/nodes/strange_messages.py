@@ -1,0 +1,199 @@
+"""Messages that are nearly right, and wrong in up to three places: what broken drivers and strange nodes send."""
+
+import math
+from array import array
+
+import numpy as np
+from geometry_msgs.msg import Point32, PoseWithCovarianceStamped
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+from nav_msgs.msg import OccupancyGrid, Odometry
+from sensor_msgs.msg import LaserScan
+
+from thinmap_msgs.msg import TopologicalEdge, TopologicalMap, TopologicalNode
+
+STRANGE = st.sampled_from([
+    math.nan, math.inf, -math.inf, 0.0, -0.0, -1.0, 1e-300, 1e-30, 1e9, -1e9, 1e30, 1e300, -1e300, 3.0, 400.0,
+])
+STRANGE_32 = st.sampled_from([math.nan, math.inf, -math.inf, 0.0, -0.0, -1.0, 1e-30, 1e-3, 1e9, 1e30, -1e30, 3.0])
+NAMES = st.sampled_from(['', 'laser', 'map', '/laser', 'nowhere', 'x' * 300, 'a\nb\tc', '\u5730\u56f3', '..', ' '])
+PERIOD_NS = 100_000_000
+
+
+def stamped(draw, message, ns):
+    message.header.stamp.sec, message.header.stamp.nanosec = ns // 10**9, ns % 10**9
+    if draw(st.integers(0, 9)) == 0:
+        message.header.stamp.sec = draw(st.sampled_from([0, -1, -(2**31), 2**31 - 1, 4_000_000, 1]))
+        message.header.stamp.nanosec = draw(st.sampled_from([0, 10**9, 2**32 - 1]))
+    return message
+
+
+def changed(draw, setters):
+    """Apply up to three of the changes; often none."""
+    for setter in draw(st.lists(st.sampled_from(setters), max_size=3)) if draw(st.booleans()) else []:
+        setter()
+
+
+@st.composite
+def scans(draw, ns=10**9):
+    message = stamped(draw, LaserScan(angle_min=-1.5, angle_max=1.5, range_min=0.05, range_max=8.0), ns)
+    message.header.frame_id, message.angle_increment = 'laser', 3.0 / 60.0
+    ranges = np.full(61, 2.0, dtype=np.float32)
+
+    def some_ranges():
+        ranges[draw(st.integers(0, 60)) :] = draw(STRANGE_32)
+
+    def length():
+        nonlocal ranges
+        ranges = np.resize(ranges, draw(st.sampled_from([0, 1, 2, 7, 1000, 20_000])))
+
+    def number(name):
+        return lambda: setattr(message, name, draw(STRANGE_32))
+
+    def frame():
+        message.header.frame_id = draw(NAMES)
+
+    names = ('angle_min', 'angle_max', 'angle_increment', 'range_min', 'range_max', 'time_increment', 'scan_time')
+    changed(draw, [some_ranges, length, frame, *map(number, names)])
+    values = array('f')
+    values.frombytes(ranges.tobytes())
+    message.ranges = values
+    return message
+
+
+def pose_setters(draw, pose):
+    def position(name):
+        return lambda: setattr(pose.position, name, draw(STRANGE))
+
+    def turn(name):
+        return lambda: setattr(pose.orientation, name, draw(STRANGE))
+
+    return [*map(position, 'xyz'), *map(turn, 'xyzw')]
+
+
+@st.composite
+def odometries(draw, ns=10**9):
+    message = stamped(draw, Odometry(child_frame_id='base_link'), ns)
+    message.header.frame_id, message.pose.pose.orientation.w = 'odom', 1.0
+
+    def covariance():
+        message.pose.covariance[draw(st.integers(0, 35))] = draw(STRANGE)
+
+    def frames():
+        message.header.frame_id, message.child_frame_id = draw(NAMES), draw(NAMES)
+
+    changed(draw, [covariance, frames, *pose_setters(draw, message.pose.pose)])
+    return message
+
+
+@st.composite
+def poses(draw, ns=10**9):
+    message = stamped(draw, PoseWithCovarianceStamped(), ns)
+    message.header.frame_id, message.pose.pose.orientation.w = 'map', 1.0
+
+    def covariance():
+        message.pose.covariance[draw(st.sampled_from([0, 1, 5, 6, 7, 11, 30, 35]))] = draw(STRANGE)
+
+    changed(draw, [covariance, *pose_setters(draw, message.pose.pose)])
+    return message
+
+
+@st.composite
+def grids(draw, ns=10**9):
+    message = stamped(draw, OccupancyGrid(), ns)
+    message.header.frame_id = 'map'
+    info = message.info
+    info.resolution, info.width, info.height = 0.1, 40, 40
+    info.origin.position.x, info.origin.position.y, info.origin.orientation.w = -2.0, -2.0, 1.0
+    cells = np.zeros((40, 40), dtype=np.int8)
+    cells[[0, -1]], cells[:, [0, -1]] = 100, 100
+
+    def cell():
+        cells[draw(st.integers(0, 39))] = draw(st.integers(-128, 127))
+
+    def size():
+        info.width = draw(st.sampled_from([0, 1, 39, 41, 1600, 2**32 - 1]))
+
+    def resolution():
+        info.resolution = draw(STRANGE_32)
+
+    def flat():
+        info.width, info.height = 1600, 1
+
+    changed(draw, [cell, size, resolution, flat, *pose_setters(draw, info.origin)])
+    data = array('b')
+    data.frombytes(cells.tobytes())
+    message.data = data
+    return message
+
+
+@st.composite
+def topologies(draw, ns=10**9):
+    message = stamped(draw, TopologicalMap(), ns)
+    message.header.frame_id = 'map'
+    message.nodes = [TopologicalNode(id=i, kind=0, clearance_m=0.5) for i in range(1, 4)]
+    for i, node in enumerate(message.nodes):
+        node.position.x = float(i)
+    path = [Point32(x=float(i)) for i in range(2)]
+    message.edges = [TopologicalEdge(id=9, node_a=1, node_b=2, length_m=1.0, clearance_m=0.5, path=path)]
+    node, edge = message.nodes[draw(st.integers(0, 2))], message.edges[0]
+
+    def place():
+        node.position.x = draw(STRANGE)
+
+    def point():
+        path[1].y = draw(STRANGE_32)
+
+    def number(thing, name):
+        return lambda: setattr(thing, name, draw(st.sampled_from([0, 1, 2, 9, 255])))
+
+    def value(thing, name):
+        return lambda: setattr(thing, name, draw(STRANGE_32))
+
+    def empty():
+        edge.path = []
+
+    values = [value(edge, 'length_m'), value(edge, 'clearance_m'), value(node, 'clearance_m')]
+    numbers = [number(edge, 'node_a'), number(edge, 'node_b'), number(edge, 'id'), number(node, 'id')]
+    changed(draw, [place, point, empty, number(node, 'kind'), *values, *numbers])
+    return message
+
+
+STRATEGIES = {
+    LaserScan: scans, Odometry: odometries, PoseWithCovarianceStamped: poses, OccupancyGrid: grids,
+    TopologicalMap: topologies,
+}
+
+
+def made(kind, count):
+    """So many messages of a kind, the same ones every time; stamps go on by a tenth of a second."""
+    messages = []
+
+    @settings(
+        max_examples=count, database=None, derandomize=True, deadline=None, phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(st.data())
+    def make(data):
+        ns = 10**12 + len(messages) * PERIOD_NS
+        messages.append(data.draw(STRATEGIES[kind](ns)))
+
+    make()
+    # Hypothesis ends early where it has seen all that there is: then the same once more.
+    while len(messages) < count:
+        make()
+    return messages[:count]
+
+
+def numbers(message):
+    """All floating point numbers of a message."""
+    for name, kind in message.get_fields_and_field_types().items():
+        value = getattr(message, name)
+        if hasattr(value, 'get_fields_and_field_types'):
+            yield from numbers(value)
+        elif 'float' in kind or 'double' in kind:
+            yield from np.ravel(value).tolist()
+        elif isinstance(value, list):
+            for part in value:
+                if hasattr(part, 'get_fields_and_field_types'):
+                    yield from numbers(part)

@@ -1,0 +1,182 @@
+"""Recorder and player on a live graph: what a sudden end leaves, and how a bag is played."""
+
+import resource
+import signal
+import time
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import LaserScan
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+
+from thinmap_ros.adapters import bag_qos, messages, qos
+from thinmap_ros.adapters.bag_writer import BagWriter
+from thinmap_ros.adapters.bags import Bag
+
+pytestmark = pytest.mark.live
+STRING, SCAN = 'std_msgs/msg/String', 'sensor_msgs/msg/LaserScan'
+AT_MOST_LOST_S = 1.0
+BEST_EFFORT = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+def talk(graph, topic, seconds, said, rate_hz=20.0, size=100):
+    """Say numbers on a topic for a while; `said` is told when which."""
+    publisher = graph.node.create_publisher(String, topic, qos.STREAM)
+    graph.until(publisher.get_subscription_count, f'somebody who listens to {topic}')
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        said.append(time.monotonic())
+        publisher.publish(String(data=f'{len(said) - 1} '.ljust(size, 'x')))
+        graph.executor.spin_once(timeout_sec=0.0)
+        time.sleep(1.0 / rate_hz)
+    return publisher
+
+
+def numbers(path):
+    bag = Bag(path)
+    return [int(bag.decode(m).data.split()[0]) for m in bag.messages({'/said'})], bag
+
+
+def test_a_killed_recorder_loses_at_most_the_last_second(graph, tmp_path):
+    recorder, said = graph.start('recorder', bag=str(tmp_path / 'bag')), []
+    talk(graph, 'said', 2.5, said)
+    killed = time.monotonic()
+    recorder.send_signal(signal.SIGKILL)
+    recorder.wait()
+    del graph.processes['recorder']
+    found, bag = numbers(tmp_path / 'bag')
+    assert bag.cut_off
+    assert found == list(range(len(found)))
+    assert len(found) >= sum(at < killed - AT_MOST_LOST_S for at in said) > 10
+
+
+def test_a_full_disk_ends_the_recording_in_words_and_what_is_written_stays_readable(graph, tmp_path):
+    recorder, said = graph.start('recorder', bag=str(tmp_path / 'bag')), []
+    publisher = talk(graph, 'said', 1.2, said, size=1000)
+    size = (tmp_path / 'bag' / 'bag.mcap').stat().st_size
+    # Nothing fills a disk as surely as a limit on how long files may get.
+    resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (size + 3000, size + 3000))
+    before = len(said)
+    del graph.processes['recorder']
+
+    def ended():
+        said.append(time.monotonic())
+        publisher.publish(String(data=f'{len(said) - 1} '.ljust(1000, 'x')))
+        return recorder.poll() is not None
+
+    graph.until(ended, 'the recorder gives up')
+    assert recorder.returncode == 2
+    (line,) = [line for line in graph.log('recorder').splitlines() if line.startswith('error: ')]
+    assert str(tmp_path / 'bag') in line and 'recording ends here' in line
+    assert 'Traceback' not in graph.log('recorder')
+    found, bag = numbers(tmp_path / 'bag')
+    assert bag.cut_off
+    assert found == list(range(len(found))) and len(found) >= before - 20
+
+
+@pytest.fixture
+def bag(tmp_path):
+    """Ten scans, ten words and two signs that are latched, one a second; the words best effort."""
+    writer = BagWriter(tmp_path / 'bag', live=True)
+    make = writer.typestore.types
+    writer.add_topic('/robot/scan', SCAN, [bag_qos.recorded(5, True, False)])
+    writer.add_topic('/said', STRING, [bag_qos.recorded(0, False, False)])
+    writer.add_topic('/sign', STRING, [bag_qos.recorded(1, True, True)])
+    for i in range(10):
+        ns = 10**12 + i * 10**9
+        if i in (1, 6):
+            writer.write('/sign', STRING, ns, make[STRING](data=f'{i}'))
+        writer.write('/said', STRING, ns + 1, make[STRING](data=f'{i}'))
+        writer.write('/robot/scan', SCAN, ns + 2, scan(make, ns))
+    writer.close()
+    return tmp_path / 'bag'
+
+
+def scan(make, ns):
+    stamp = make['builtin_interfaces/msg/Time'](sec=ns // 10**9, nanosec=ns % 10**9)
+    return make[SCAN](
+        header=make['std_msgs/msg/Header'](stamp=stamp, frame_id='laser'), angle_min=-0.5, angle_max=0.5,
+        angle_increment=0.25, time_increment=0.0, scan_time=0.0, range_min=0.05, range_max=8.0,
+        ranges=np.full(5, 2.0, dtype=np.float32), intensities=np.zeros(0, dtype=np.float32),
+    )
+
+
+def seconds(heard):
+    return [messages.stamp_ns(message.header.stamp) // 10**9 - 1000 for message in heard]
+
+
+def offered(graph, topic):
+    (info,) = graph.node.get_publishers_info_by_topic(topic)
+    return info.qos_profile
+
+
+def test_a_bag_is_offered_as_it_was_recorded_and_under_other_names(graph, bag):
+    scans = graph.heard('/r1/scan', LaserScan)
+    words = graph.heard('/here/said', String, BEST_EFFORT)
+    player = graph.start(
+        'bag_player', bag=str(bag), rate=20.0, prefix='here', start_paused=True,
+        remap=('/here/robot/scan:=/r1/scan',),
+    )
+    signs = graph.heard('/here/sign', String, qos.LATCHED)
+    graph.until(lambda: graph.node.count_publishers('/here/sign') and graph.node.count_publishers('/here/said'), 'it')
+    assert offered(graph, '/here/said').reliability == ReliabilityPolicy.BEST_EFFORT
+    assert offered(graph, '/here/sign').durability == DurabilityPolicy.TRANSIENT_LOCAL
+    assert offered(graph, '/r1/scan').reliability == ReliabilityPolicy.RELIABLE
+    assert offered(graph, '/r1/scan').durability == DurabilityPolicy.VOLATILE
+    graph.call(SetBool, '/bag_player/pause', SetBool.Request(data=False))
+    graph.until(lambda: len(scans) == 10, 'all scans')
+    late = graph.heard('/here/sign', String, qos.LATCHED)
+    graph.until(lambda: late or player.poll() is not None, 'who comes late hears the sign, or comes too late')
+    graph.until(lambda: player.poll() == 0, 'the end')
+    assert [message.data for message in signs] == ['1', '6'] and words
+    assert '22 messages sent: /robot/scan 10, /said 10, /sign 2' in graph.log('bag_player')
+
+
+def test_a_bag_is_paused_stepped_and_begun_in_its_middle(graph, bag):
+    scans, clock = graph.heard('/robot/scan', LaserScan), graph.heard('/clock', Clock)
+    signs = graph.heard('/sign', String, qos.LATCHED)
+    graph.start('bag_player', bag=str(bag), start_offset_s=4.0, start_paused=True, rate=0.5)
+
+    def step():
+        return graph.call(Trigger, '/bag_player/step', Trigger.Request())
+
+    graph.until(lambda: signs, 'what was latched before the offset')
+    assert signs[0].data == '1' and not scans
+    graph.until(lambda: graph.node.count_publishers('/robot/scan'), 'the player')
+    for count in (1, 2, 3):
+        response = step()
+        assert response.success and response.message.endswith('s'), response.message
+        graph.until(lambda count=count: len(scans) == count, 'one scan a step')
+    assert seconds(scans) == [4, 5, 6]
+    graph.until(lambda: [sign.data for sign in signs] == ['1', '6'], 'the second sign')
+    clock.clear()
+    graph.until(lambda: len(clock) > 20, 'the clock, which stands still')
+    assert len({messages.stamp_ns(tick.clock) for tick in clock[-5:]}) == 1
+    assert graph.call(SetBool, '/bag_player/pause', SetBool.Request(data=False)).success
+    response = step()
+    assert not response.success and 'not paused' in response.message
+    graph.until(lambda: len(scans) > 3, 'it goes on')
+    ticks = [messages.stamp_ns(tick.clock) for tick in clock]
+    assert ticks == sorted(ticks) and len(set(ticks)) > 5
+    assert graph.stop('bag_player') == 0
+
+
+def test_a_loop_begins_again_with_the_clock(graph, bag):
+    scans, clock = graph.heard('/robot/scan', LaserScan), graph.heard('/clock', Clock)
+    graph.start('bag_player', bag=str(bag), loop=True, rate=50.0)
+    graph.until(lambda: len(scans) > 25, 'two rounds and a half')
+    assert seconds(scans)[:20] == 2 * list(range(10))
+    ticks = [messages.stamp_ns(tick.clock) for tick in clock]
+    back = [b for a, b in pairwise(ticks) if b < a]
+    assert len(back) == (len(scans) - 1) // 10 and all(tick < 10**12 + 10**9 for tick in back)
+    assert graph.stop('bag_player') == 0
+
+
+def test_a_bag_that_ends_before_the_offset_is_refused(graph, bag):
+    player = graph.start('bag_player', bag=str(bag), start_offset_s=60.0)
+    assert player.wait(timeout=60.0) == 2
+    assert 'start_offset_s = 60.0' in graph.log('bag_player').strip().splitlines()[-1]

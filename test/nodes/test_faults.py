@@ -1,0 +1,318 @@
+"""Faults on a live graph: killed nodes, silence, time set back, bursts, a full disk."""
+
+import resource
+import signal
+import time
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
+from nav_msgs.msg import OccupancyGrid, Odometry
+from rclpy.action import ActionClient
+from sensor_msgs.msg import LaserScan
+from test_health import Doctor
+
+from thinmap_msgs.action import Explore, NavigateToPose
+from thinmap_msgs.msg import ExplorationStatus, TopologicalMap
+from thinmap_msgs.srv import SaveMap
+from thinmap_ros.adapters import messages, qos
+
+pytestmark = pytest.mark.live
+START = '2.0,2.0,0.9'
+AT_START = {'start_x_m': 2.0, 'start_y_m': 2.0, 'start_yaw_rad': 0.9}
+MAPPING = ('localizer', 'grid_mapper', 'topology_builder')
+
+
+def start_mapping(graph, rate=4.0, lockstep='local_topology'):
+    for name in MAPPING:
+        start_one(graph, name)
+    graph.start('sim', start=START, hold_for_subscribers=2, rate=rate, lockstep=lockstep)
+
+
+def start_together(graph, *names, **simulation):
+    """The same in one process, as it is left running on a robot."""
+    graph.start('thinmap', arguments=names, use_sim_time=True, **AT_START)
+    graph.start(
+        'sim', start=START, hold_for_subscribers=len({*names} - {'topology_builder'}), rate=4.0,
+        lockstep='local_topology', **simulation,
+    )
+
+
+def start_one(graph, name):
+    graph.start(name, use_sim_time=True, **(AT_START if name == 'localizer' else {}))
+
+
+def kill(graph, name):
+    process = graph.processes.pop(name)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+
+
+class Robot:
+    """Where the robot is and where it is believed to be."""
+
+    def __init__(self, graph):
+        self.graph = graph
+        self.truth = graph.heard('ground_truth', PoseStamped)
+        self.poses = graph.heard('pose', PoseWithCovarianceStamped)
+        self.commands = graph.node.create_publisher(Twist, 'cmd_vel', 10)
+
+    def drive(self, metres, v=0.3, w=0.0):
+        """Drive so far as the crow flies."""
+        self.graph.until(lambda: self.truth, 'true pose')
+        start = self.truth[-1].pose.position
+        command = messages.twist_msg(v, w)
+
+        def far_enough():
+            self.commands.publish(command)
+            place = self.truth[-1].pose.position
+            return np.hypot(place.x - start.x, place.y - start.y) > metres
+
+        self.graph.until(far_enough, 'the robot makes its way')
+
+    def error_m(self):
+        """How far the last pose is from the truth of its time."""
+        truths = {messages.stamp_ns(m.header.stamp): m.pose.position for m in self.truth}
+        stamps = [messages.stamp_ns(m.header.stamp) for m in self.poses]
+        found = [i for i, ns in enumerate(stamps) if ns in truths]
+        place, believed = truths[stamps[found[-1]]], self.poses[found[-1]].pose.pose.position
+        return float(np.hypot(place.x - believed.x, place.y - believed.y))
+
+
+def places(graph_message):
+    return {n.id: (n.position.x, n.position.y) for n in graph_message.nodes}
+
+
+def test_mapping_goes_on_after_each_node_was_killed(graph):
+    robot = Robot(graph)
+    maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
+    graphs = graph.heard('topology', TopologicalMap, qos.LATCHED)
+    start_mapping(graph)
+    robot.drive(1.5)
+    graph.until(lambda: maps and graphs and len(graphs[-1].nodes) > 2, 'map and graph')
+    graph.until(lambda: len(maps) > 3, 'time to be kept')
+    for name in MAPPING:
+        known, before = (np.array(maps[-1].data) >= 0).sum(), places(graphs[-1])
+        kill(graph, name)
+        maps.clear(), robot.poses.clear(), graphs.clear()
+        start_one(graph, name)
+        graph.until(lambda n=name: 'goes on from what it had' in graph.log(n), 'it remembers')
+        robot.drive(0.15, v=0.15)
+        graph.until(lambda: maps and len(robot.poses) > 5, 'mapping goes on')
+        assert (np.array(maps[-1].data) >= 0).sum() > 0.9 * known, name
+        assert robot.error_m() < 0.15, name
+        if name == 'topology_builder':
+            graph.until(lambda: graphs, 'graph')
+            after = places(graphs[-1])
+            same = [k for k in before.keys() & after.keys() if np.hypot(*np.subtract(before[k], after[k])) < 0.5]
+            assert len(same) >= len(before) / 2
+    for name in MAPPING:
+        assert graph.stop(name) == 0
+    assert not list((graph.folder / 'state').iterdir()), 'who ends in order leaves nothing'
+
+
+def test_a_whole_robot_that_was_killed_and_begins_anew_is_not_mixed_with_the_one_before(graph):
+    robot = Robot(graph)
+    maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
+    start_together(graph, *MAPPING)
+    robot.drive(1.5)
+    graph.until(lambda: len(maps) > 3, 'time to be kept')
+    for name in ('thinmap', 'sim'):
+        kill(graph, name)
+    robot.poses.clear(), robot.truth.clear(), maps.clear()
+    start_together(graph, *MAPPING)
+    graph.until(lambda: len(robot.poses) > 10 and len(maps) > 2, 'mapping anew')
+    assert graph.log('thinmap').count('goes on from what it had') == 3
+    assert 'odometry has begun anew' in graph.log('thinmap')
+    assert robot.error_m() < 0.1
+    # The robot stands where it began: it sees what one sees from there, and nothing of the drive is left.
+    place = robot.truth[-1].pose.position
+    assert np.hypot(place.x - 2.0, place.y - 2.0) < 0.05
+    patch = messages.patch_from(maps[-1])
+    behind = patch.frame.cells_of(np.array([[1.0, 1.0]]))[0]
+    inside = np.all((behind >= 0) & (behind < patch.shape))
+    assert not inside or patch.cells[tuple(behind)] == -1
+
+
+def test_time_set_back_begins_everything_anew(graph):
+    robot = Robot(graph)
+    maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
+    graphs = graph.heard('topology', TopologicalMap, qos.LATCHED)
+    names = (*MAPPING, 'explorer', 'navigator')
+    start_together(graph, *names)
+    robot.drive(1.5)
+    graph.until(lambda: maps and graphs and graphs[-1].nodes, 'map and graph')
+    graph.stop('sim')
+    robot.poses.clear(), robot.truth.clear(), maps.clear()
+    graph.start('sim', start=START, hold_for_subscribers=4, rate=4.0, lockstep='local_topology', seed=3)
+    notices = [f'[{name}]: the clock was set back' for name in names]
+    graph.until(lambda: all(notice in graph.log('thinmap') for notice in notices), 'all of them notice')
+    robot.poses.clear()
+    graph.until(lambda: len(robot.poses) > 10 and robot.truth, 'new poses')
+    assert robot.error_m() < 0.1
+    graph.until(lambda: len(maps) > 3, 'new maps')
+    # What only the first drive could see is forgotten: the robot, at its start again, stood still.
+    assert all(graph.log('thinmap').count(notice) == 1 for notice in notices)
+    assert graph.stop('thinmap') == 0, graph.log('thinmap')
+
+
+def test_a_silent_laser_stops_the_robot_and_it_goes_on(graph):
+    commands = graph.heard('cmd_vel', Twist)
+    doctor = Doctor(graph)
+    graph.start('navigator', laser_pose='0,0,0')
+    scan = graph.node.create_publisher(LaserScan, 'scan', qos.STREAM)
+    odometry = graph.node.create_publisher(Odometry, 'odom', qos.STREAM)
+    pose = graph.node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
+    free = graph.node.create_publisher(OccupancyGrid, 'map', qos.LATCHED)
+    silent = set()
+    said_at = [0.0]
+
+    def speak():
+        """A robot at 10 Hz in an empty hall, with the time of the machine."""
+        if time.monotonic() - said_at[0] < 0.1:
+            return
+        said_at[0] = time.monotonic()
+        ns = time.time_ns()
+        if 'odometry' not in silent:
+            odometry.publish(messages.odometry_msg(np.zeros(3), (0.0, 0.0), ('odom', 'base_link'), ns))
+        if 'laser' not in silent:
+            message = LaserScan(angle_min=-1.5, angle_increment=0.05, range_min=0.05, range_max=8.0)
+            message.header = messages.header('laser', ns)
+            message.ranges = 61 * [5.0]
+            scan.publish(message)
+        if 'localizer' not in silent:
+            pose.publish(messages.pose_with_covariance_msg(np.zeros(3), np.eye(3), 'map', ns))
+
+    hall = OccupancyGrid()
+    hall.info.resolution, hall.info.width, hall.info.height = 0.1, 120, 120
+    hall.info.origin.position.x, hall.info.origin.position.y, hall.info.origin.orientation.w = -6.0, -6.0, 1.0
+    hall.data = [0] * 14400
+    free.publish(hall)
+    client = ActionClient(graph.node, NavigateToPose, 'navigate_to_pose')
+    graph.until(client.server_is_ready, 'navigator')
+    goal = NavigateToPose.Goal()
+    goal.pose.pose.position.x, goal.pose.pose.orientation.w = 4.0, 1.0
+    sent = client.send_goal_async(goal)
+    graph.until(sent.done, 'goal taken')
+
+    def drives():
+        speak()
+        return commands and commands[-1].linear.x > 0.02
+
+    def stands():
+        speak()
+        return commands and commands[-1].linear.x == commands[-1].angular.z == 0.0
+
+    for who, limit_s in (('laser', 0.5), ('odometry', 0.5), ('localizer', 3.5)):
+        silent.clear()
+        graph.until(drives, f'it drives before the {who} falls silent')
+        silent.add(who)
+        since = time.monotonic()
+        graph.until(stands, f'it stops without {who}')
+        # What a busy machine takes on top, between two programs.
+        assert time.monotonic() - since < limit_s + 0.3
+        graph.until(lambda w=who: speak() or f'{w} silent' in doctor.status('navigator').message, 'it says so')
+    silent.clear()
+    graph.until(drives, 'it goes on')
+
+
+def test_a_burst_of_scans_leaves_no_queue_and_what_is_lost_is_counted(graph):
+    poses, doctor = graph.heard('pose', PoseWithCovarianceStamped), Doctor(graph)
+    graph.start('localizer', laser_pose='0,0,0')
+    scan = graph.node.create_publisher(LaserScan, 'scan', qos.STREAM)
+    odometry = graph.node.create_publisher(Odometry, 'odom', qos.STREAM)
+    graph.until(lambda: scan.get_subscription_count() and odometry.get_subscription_count(), 'localizer')
+    period_ns, now = 25_000_000, [10**12]
+    message = LaserScan(angle_min=-1.5, angle_increment=0.05, range_min=0.05, range_max=8.0)
+    message.ranges = 61 * [3.0]
+
+    def say():
+        now[0] += period_ns
+        odometry.publish(messages.odometry_msg(np.zeros(3), (0.0, 0.0), ('odom', 'base_link'), now[0]))
+        message.header = messages.header('laser', now[0])
+        scan.publish(message)
+
+    def steadily():
+        say()
+        time.sleep(0.02)
+        return len(poses) > 40
+
+    graph.until(steadily, 'poses at 40 Hz')
+    for _ in range(400):
+        say()
+    last_ns = now[0]
+    graph.until(lambda: messages.stamp_ns(poses[-1].header.stamp) >= last_ns, 'the newest scan, at once', 5.0)
+    heard = {messages.stamp_ns(p.header.stamp) for p in poses}
+    burst = sum(ns > last_ns - 400 * period_ns for ns in heard)
+    assert burst < 400, 'the queue is short'
+    gaps = 'dropped: scan: gaps between the stamps'
+    graph.until(lambda: doctor.number('localizer', gaps) >= 0.9 * (400 - burst), 'they are counted')
+
+
+def test_a_full_disk_leaves_the_old_session_as_it_was(graph, tmp_path):
+    robot = Robot(graph)
+    start_mapping(graph)
+    robot.drive(0.3)
+    stem = tmp_path / 'maps' / 'room'
+
+    def save():
+        return graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(stem)))
+
+    graph.until(lambda: 'no topology_builder' not in save().message, 'a session with its graph')
+    before = {file.name: file.read_bytes() for file in stem.parent.iterdir()}
+    assert len(before) == 4
+    robot.drive(0.5)
+    for name in ('grid_mapper', 'topology_builder'):
+        pid = graph.processes[name].pid
+        for size in (0, 300):
+            resource.prlimit(pid, resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
+            response = save()
+            assert not response.success and 'room' in response.message, (name, size, response.message)
+            if name == 'grid_mapper':
+                assert {file.name: file.read_bytes() for file in stem.parent.iterdir()} == before
+        resource.prlimit(pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    assert (stem.parent / 'room.topology.npz').read_bytes() == before['room.topology.npz']
+    response = save()
+    assert response.success, response.message
+    assert sorted(file.name for file in stem.parent.iterdir()) == sorted(before)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_an_exploration_finishes_though_every_node_is_killed_once(graph):
+    robot, maps = Robot(graph), graph.heard('map', OccupancyGrid, qos.LATCHED)
+    status = graph.heard('exploration_status', ExplorationStatus, qos.LATCHED)
+    names = [*MAPPING, 'navigator', 'explorer']
+    for name in names[3:]:
+        start_one(graph, name)
+    start_mapping(graph, rate=5.0)
+    client = ActionClient(graph.node, Explore, 'explore')
+
+    def ask():
+        """Ask until somebody answers: one that was killed is still on the list for a while."""
+        graph.until(client.server_is_ready, 'explorer')
+        while True:
+            sent, until = client.send_goal_async(Explore.Goal()), time.monotonic() + 5.0
+            graph.until(lambda: sent.done() or time.monotonic() > until, 'goal taken')  # noqa: B023
+            if sent.done():
+                return sent.result().get_result_async()
+
+    ended = ask()
+    for name in names:
+        metres = status[-1].distance_m + 1.0 if status else 1.0
+        graph.until(lambda m=metres: status and status[-1].distance_m > m, f'a metre before {name} is killed')
+        assert not ended.done()
+        kill(graph, name)
+        time.sleep(1.0)
+        start_one(graph, name)
+        if name == 'explorer':
+            status.clear()
+            graph.until(lambda: 'finished' not in graph.log('explorer'), 'a new one')
+            ended = ask()
+    graph.until(ended.done, 'the exploration ends', 600.0)
+    result = ended.result().result.status
+    assert result.reason_code in (ExplorationStatus.ALL_RESOLVED, ExplorationStatus.NOTHING_REACHABLE), result.reason
+    assert robot.error_m() < 0.3
+    patch = messages.patch_from(maps[-1])
+    assert patch.free.sum() * 0.01 > 80.0, 'nearly all of a room of 10 x 10 m'
+    assert patch.shape[0] < 115 and patch.shape[1] < 115, 'and nothing double'

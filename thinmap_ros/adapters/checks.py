@@ -1,0 +1,38 @@
+"""What a message may say at most: beyond that it is a mistake, whoever made it."""
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core.errors import InputError
+
+FARTHEST_M = 1e6
+LARGEST_ANGLE_RAD = 4.0 * np.pi
+MOST_BEAMS = 200_000
+FINEST_M, COARSEST_M = 0.001, 10.0
+LONGEST_NAME = 40
+
+
+def within(what: str, values: Iterable[float], limit: float = FARTHEST_M) -> None:
+    """Raise InputError, naming what, unless all values are finite and at most `limit` in size."""
+    for value in values:
+        if not abs(value) <= limit:
+            raise InputError(f'{what}: {value}: expected a number from {-limit:g} to {limit:g}')
+
+
+def shown(name: str) -> str:
+    """A name as it can be printed: quoted, short, on one line."""
+    return repr(name if len(name) <= LONGEST_NAME else name[:LONGEST_NAME] + '...')
+
+
+def cells_in_range(cells: NDArray[np.int8]) -> None:
+    """Raise InputError unless all cells are -1 (unknown) or 0 to 100 %."""
+    if cells.size and (cells.min() < -1 or cells.max() > 100):
+        raise InputError(f'map with cells from {cells.min()} to {cells.max()}: expected -1, or 0 to 100')
+
+
+def unique(what: str, ids: list[int]) -> None:
+    """Raise InputError where a number is given twice."""
+    if len(set(ids)) < len(ids):
+        raise InputError(f'{what}: {len(ids)} of them with {len(set(ids))} ids: expected an id for each')

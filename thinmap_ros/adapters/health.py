@@ -1,0 +1,208 @@
+"""What a node tells of itself on /diagnostics once a second: rates, refusals, drops, step times, its state."""
+
+import re
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from time import monotonic, perf_counter
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+_PERIOD_S = 1.0
+_QUIET_S = 10.0
+_STEPS = 200
+_REASONS = 8  # so many kinds of refusal are told apart on a topic: a broken sensor must not fill the memory
+_NUMBER = re.compile(r'-?\b(\d+\.?\d*(e[+-]?\d+)?|inf|nan)\b')
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+
+
+@dataclass
+class _Topic:
+    """What came on a topic."""
+
+    heard: int = 0
+    told: int = 0
+    last_at: float | None = None
+    refused: Counter[str] = field(default_factory=Counter)
+    last_refusal: str = ''
+
+
+@dataclass
+class _Complaint:
+    """What is wrong while its condition finds words for it; logged now and then."""
+
+    level: bytes
+    condition: Callable[[], str]
+    words: str = ''
+    logged_at: float = -_QUIET_S
+
+    def holds(self, node: Node) -> bool:
+        self.words = self.condition()
+        if not self.words:
+            self.logged_at = -_QUIET_S  # what comes back is news
+        elif monotonic() - self.logged_at > _QUIET_S:
+            self.logged_at = monotonic()
+            node.get_logger().warning(self.words)
+        return bool(self.words)
+
+
+class Health:
+    """Counts what happens to a node and publishes it, whatever the node's own time does.
+
+    A level above OK lasts as long as what causes it: refusals and drops until a second has gone by without any, a
+    `complaint` until its condition is no longer true.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._topics: dict[str, _Topic] = {}
+        self._steps: dict[str, deque[float]] = {}
+        self._drops: Counter[str] = Counter()
+        self._bad = self._told_bad = 0
+        self._state = (OK, 'running')
+        self._values: dict[str, str] = {}
+        self._complaints: list[_Complaint] = []
+        self._before: list[Callable[[], None]] = []
+        self._told_at = monotonic()
+        self._topic = node.create_publisher(DiagnosticArray, '/diagnostics', QoSProfile(depth=10))
+        # Not in the robot's time: a clock that stands still is a thing to be told.
+        node.create_timer(_PERIOD_S, self._publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def expects(self, topic: str) -> None:
+        """Name a topic that the node listens to: it is told also while it is silent."""
+        self._topics.setdefault(topic, _Topic())
+
+    def heard(self, topic: str) -> None:
+        """Count a message."""
+        entry = self._topics.setdefault(topic, _Topic())
+        entry.heard += 1
+        entry.last_at = monotonic()
+
+    def refused(self, topic: str, reason: str) -> None:
+        """Count a message that could not be used, by kind of reason: the same words, whatever the numbers."""
+        entry = self._topics.setdefault(topic, _Topic())
+        kind = _NUMBER.sub('#', reason)
+        if kind not in entry.refused and len(entry.refused) >= _REASONS:
+            kind = 'other reasons'
+        entry.refused[kind] += 1
+        entry.last_refusal = reason
+        self._bad += 1
+
+    def dropped(self, cause: str, count: int) -> None:
+        """Count messages that were fine and were not used."""
+        if count > 0:
+            self._drops[cause] += count
+            self._bad += count
+
+    def dropped_in_all(self, cause: str, count: int) -> None:
+        """Tell a count of drops that somebody else keeps; one that begins anew is counted on."""
+        key = f'{cause}\n'  # no cause of ours has a line break in it
+        last = int(self._values.get(key, 0))
+        self._values[key] = str(count)
+        self.dropped(cause, count - last if count >= last else count)
+
+    def took(self, step: str, milliseconds: float) -> None:
+        """Note how long a step took, ms."""
+        self._steps.setdefault(step, deque(maxlen=_STEPS)).append(milliseconds)
+
+    @contextmanager
+    def timed(self, step: str) -> Iterator[None]:
+        """Note how long a block takes."""
+        started = perf_counter()
+        yield
+        self.took(step, 1000.0 * (perf_counter() - started))
+
+    def state(self, level: bytes, text: str) -> None:
+        """Say what state the node is in."""
+        self._state = (level, text)
+
+    def tell(self, key: str, value: object) -> None:
+        """Set a value that is told until another one takes its place."""
+        self._values[key] = str(value)
+
+    def complain(self, level: bytes, condition: Callable[[], str]) -> None:
+        """Look once a second what is wrong: a condition returns words, or '' where all is well."""
+        self._complaints.append(_Complaint(level, condition))
+
+    def complain_of_silence(self, topic: str, limit_s: float) -> None:
+        """Complain while nothing is heard on a topic."""
+        name = self._node.resolve_topic_name(topic)
+
+        def silence() -> str:
+            entry = self._topics[topic]
+            if entry.last_at is None:
+                return f'{topic}: nothing heard yet: {self._node.count_publishers(name)} publish {name}'
+            silent_s = monotonic() - entry.last_at
+            return f'{topic}: silent for {silent_s:.0f} s' if silent_s > limit_s else ''
+
+        self.complain(WARN, silence)
+
+    def before_telling(self, work: Callable[[], None]) -> None:
+        """Do something once a second, before it is told how things are."""
+        self._before.append(work)
+
+    def sole_publisher_of(self, topic: str) -> None:
+        """Complain while somebody else publishes a topic that only one node may publish."""
+        name = self._node.resolve_topic_name(topic)
+
+        def rivals() -> str:
+            if self._node.count_publishers(name) < 2:
+                return ''
+            nodes = [
+                f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+                for info in self._node.get_publishers_info_by_topic(name)
+            ]
+            return f'{len(nodes)} nodes publish {name}: {", ".join(sorted(nodes))}: stop all but one'
+
+        self.complain(ERROR, rivals)
+
+    def _publish(self) -> None:
+        for work in self._before:
+            work()
+        now = monotonic()
+        status = self._status(now)
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self._node.get_clock().now().to_msg()
+        self._topic.publish(array)
+        self._told_at, self._told_bad = now, self._bad
+        for entry in self._topics.values():
+            entry.told = entry.heard
+
+    def _status(self, now: float) -> DiagnosticStatus:
+        level, message = self._state
+        complaints = [complaint for complaint in self._complaints if complaint.holds(self._node)]
+        if complaints:
+            worst = max(complaints, key=lambda complaint: complaint.level)
+            level, message = (worst.level, worst.words) if worst.level > level else (level, message)
+        elif level == OK and self._bad > self._told_bad:
+            level, message = WARN, f'{self._bad - self._told_bad} messages refused or dropped: {self._why()}'
+        name = self._node.get_fully_qualified_name()
+        pairs = [KeyValue(key=key, value=value) for key, value in self._told(now).items()]
+        return DiagnosticStatus(level=level, name=f'{name.lstrip("/")}: thinmap', message=message, values=pairs)
+
+    def _why(self) -> str:
+        refusals = [f'{topic}: {e.last_refusal}' for topic, e in self._topics.items() if e.last_refusal]
+        return '; '.join([*refusals, *self._drops])
+
+    def _told(self, now: float) -> dict[str, str]:
+        """All values, in an order that stays."""
+        told = {key: value for key, value in self._values.items() if not key.endswith('\n')}
+        for topic, entry in self._topics.items():
+            told[f'{topic}: heard'] = str(entry.heard)
+            told[f'{topic}: rate'] = f'{(entry.heard - entry.told) / (now - self._told_at):.1f} Hz'
+            age = 'never' if entry.last_at is None else f'{now - entry.last_at:.1f} s ago'
+            told[f'{topic}: last'] = age
+            told[f'{topic}: refused'] = str(entry.refused.total())
+            for reason, count in entry.refused.items():
+                told[f'{topic}: refused: {reason}'] = str(count)
+        for cause, count in self._drops.items():
+            told[f'dropped: {cause}'] = str(count)
+        for step, times in self._steps.items():
+            middle, most = np.percentile(times, [50.0, 95.0])
+            told[f'{step}: step time'] = f'median {middle:.1f} ms, p95 {most:.1f} ms, max {max(times):.1f} ms'
+        return told

@@ -1,0 +1,46 @@
+"""All nodes in one process: less memory and less work than a process for each."""
+
+import sys
+from collections.abc import Callable
+from importlib import import_module
+
+from rclpy.node import Node
+from rclpy.utilities import remove_ros_args
+
+from thinmap_ros.adapters import runtime
+
+_NODES = ('localizer', 'grid_mapper', 'topology_builder', 'navigator', 'explorer')
+_OTHERS = ('sim', 'recorder', 'bag_player', 'rerun_viewer', 'markers')
+_USAGE = f"""usage: thinmap [NODE ...] [--ros-args ...]
+
+Runs nodes in one process. Without names: {', '.join(_NODES)}.
+There are also: {', '.join(_OTHERS)}.
+A parameter goes to every node that has it; -p localizer:slam:=off goes to one."""
+
+
+def maker(name: str) -> Callable[[], Node]:
+    """What makes the node of a module of this package."""
+
+    def make() -> Node:
+        # Imported here: a node that is not asked for costs nothing.
+        module = import_module(f'thinmap_ros.nodes.{name}')
+        return getattr(module, f'{name.title().replace("_", "")}Node')()
+
+    return make
+
+
+def main() -> None:
+    """Run the nodes that the command line names."""
+    names = remove_ros_args(sys.argv)[1:] or list(_NODES)
+    if {'-h', '--help'} & set(names):
+        print(_USAGE)
+        return
+    unknown = [name for name in names if name not in (*_NODES, *_OTHERS)]
+    if unknown or len(set(names)) < len(names):
+        print(f'error: {unknown[0] if unknown else "a name twice"}: no such choice\n{_USAGE}', file=sys.stderr)
+        sys.exit(2)
+    runtime.run_all([maker(name) for name in names])
+
+
+if __name__ == '__main__':
+    main()

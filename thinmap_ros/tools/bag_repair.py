@@ -1,0 +1,58 @@
+"""A bag that was cut off or damaged (MCAP) into a whole one, with everything that can be read of it."""
+
+import argparse
+from pathlib import Path
+
+from thinmap_ros.adapters.bag_salvage import Salvage, repair
+from thinmap_ros.adapters.bag_writer import written_as_bag
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.tools import cli
+
+
+def files_of(bag: Path) -> list[Path]:
+    """Return the MCAP files of a bag, in the order in which they were recorded. Raises InputError where it has none."""
+    files = sorted(bag.glob('*.mcap'), key=_number) if bag.is_dir() else [bag]
+    if not files or not files[0].is_file() or files[0].suffix != '.mcap':
+        raise InputError(f'{bag}: expected an MCAP file, or a folder with MCAP files in it')
+    return files
+
+
+def _number(file: Path) -> tuple[int, str]:
+    """rosbag2 numbers the files of a bag: name_0, name_1, ... name_10."""
+    number = file.stem.rpartition('_')[2]
+    return (int(number) if number.isdigit() else -1, file.name)
+
+
+def told(found: Salvage) -> str:
+    """Say in one line what was found."""
+    parts = [f'{sum(found.counts.values())} messages on {len(found.counts)} topics']
+    if found.first_ns is not None:
+        parts[0] += f', {(found.last_ns - found.first_ns) / 1e9:.1f} s'
+    if found.cut_off:
+        parts.append('it was cut off')
+    if found.damaged_chunks:
+        parts.append(f'{found.damaged_chunks} damaged chunks were left out')
+    return '; '.join(parts)
+
+
+def _work(arguments: argparse.Namespace) -> None:
+    bag: Path = arguments.bag
+    out: Path = arguments.out or bag.with_name(f'{bag.stem}_repaired')
+    files = files_of(bag)
+    if out.resolve() == bag.resolve():
+        raise InputError(f'{out}: expected another name than that of the bag itself')
+    with written_as_bag(out) as folder:
+        found = repair(files, folder)
+    print(f'{out}: {told(found)}')
+
+
+def main() -> None:
+    """Run the program."""
+    parser = argparse.ArgumentParser(prog='bag_repair', description=__doc__)
+    parser.add_argument('bag', type=Path, help='MCAP file, or rosbag2 folder of MCAP files')
+    parser.add_argument('-o', '--out', type=Path, help='folder or .mcap file to write (default: BAG_repaired)')
+    cli.run(_work, parser)
+
+
+if __name__ == '__main__':
+    main()
