@@ -83,12 +83,12 @@ class Pipeline:
         """A loop was closed: grid and topology are made anew from what was seen at the poses as they are known now."""
         keyframes = self.localizer.keyframes
         stamps = np.array([frame.scan.stamp_ns for frame in keyframes])
-        before = history.poses()
+        before = history.past.poses()
         with self._timed('rebuild'):
-            history.correct(stamps, np.array([frame.T_map_base for frame in keyframes]), since_ns)
+            history.past.correct(stamps, np.array([frame.T_map_base for frame in keyframes]), since_ns)
             self.grid = history.draw(self.grid)
             size = self.config.window.window_m
-            self.topology.rebuild(lambda x, y: self.grid.window(x, y, size), before, history.poses())
+            self.topology.rebuild(lambda x, y: self.grid.window(x, y, size), before, history.past.poses())
             self.localizer.set_topology(self.topology.map)
 
     @contextmanager

@@ -6,13 +6,16 @@ Equal means: poses to 1e-9 m and rad (a live pose travels as a quaternion), and 
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Path
+from slam_room import drive_round_the_block
 
 from thinmap_msgs.srv import SaveMap
-from thinmap_ros.adapters import map_files, messages, resources
+from thinmap_ros.adapters import map_files, messages, qos, resources
 from thinmap_ros.adapters.bags import BagLog
 from thinmap_ros.adapters.carmen import CarmenLog, LaserOptions
 from thinmap_ros.adapters.events import OdometryEvent, ScanEvent, Skipped
 from thinmap_ros.adapters.world_files import read_world
+from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.pipeline import PipelineConfig
 from thinmap_ros.sim.lms200 import Lms200Config
 from thinmap_ros.sim.pioneer import PRESETS
@@ -41,6 +44,18 @@ class SimulatedLog:
             moment = simulation.step(0.2, 0.25)
 
 
+class LoopLog:
+    """What a robot senses that comes back to where it began after its map has drifted."""
+
+    def __init__(self):
+        self.skipped = Skipped()
+
+    def events(self):
+        for scan, odom, _ in drive_round_the_block():
+            yield OdometryEvent(scan.stamp_ns, odom)
+            yield ScanEvent(scan)
+
+
 def assert_same(one, other):
     assert one.stamps_ns == other.stamps_ns
     assert np.abs(np.array(one.poses) - np.array(other.poses)).max() <= 1e-9
@@ -48,10 +63,10 @@ def assert_same(one, other):
     assert np.array_equal(patches[0].cells, patches[1].cells)
 
 
-def assert_live_is_same(graph, bag, expected, tmp_path):
+def assert_live_is_same(graph, bag, expected, tmp_path, **localizer):
     poses = graph.heard('pose', PoseWithCovarianceStamped)
     for name in ('localizer', 'grid_mapper', 'topology_builder'):
-        graph.start(name, use_sim_time=True)
+        graph.start(name, use_sim_time=True, **(localizer if name == 'localizer' else {}))
     graph.until(lambda: graph.node.count_subscribers('local_map') == 1, 'nodes')
     player = graph.start('bag_player', bag=str(bag), rate=1000.0, lockstep='local_topology', wait_for_subscribers=2)
     graph.until(lambda: player.poll() == 0 and len(poses) == len(expected.poses), 'a pose for each scan', 170.0)
@@ -71,6 +86,18 @@ def test_simulated_log_bag_and_live_graph_agree(graph, tmp_path):
     assert len(from_log.poses) == 100
     assert_same(from_log, from_bag)
     assert_live_is_same(graph, tmp_path / 'bag', from_log, tmp_path)
+
+
+def test_a_closed_loop_corrects_the_live_map_as_it_does_the_replayed_one(graph, tmp_path):
+    start = {'start_x_m': 3.0, 'start_y_m': 1.2}
+    expected = replay(LoopLog(), PipelineConfig(localizer=LocalizerConfig(**start)))
+    assert 'rebuild' in expected.pipeline.stage_seconds
+    convert(LoopLog(), tmp_path / 'bag')
+    trajectories = graph.heard('trajectory', Path, qos.LATCHED)
+    assert_live_is_same(graph, tmp_path / 'bag', expected, tmp_path, **start)
+    assert len(trajectories) == len(expected.pipeline.stage_seconds['rebuild'])
+    stamps, _ = messages.trajectory_from(trajectories[-1])
+    assert set(stamps.tolist()) <= set(expected.stamps_ns)
 
 
 def test_real_log_bag_and_live_graph_agree(graph, shared_data, tmp_path):

@@ -17,6 +17,7 @@ from geometry_msgs.msg import (
     Twist,
 )
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
+from numpy.typing import NDArray
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Header
 
@@ -178,10 +179,24 @@ def path_msg(points: Array, frame_id: str, ns: int) -> Path:
     return Path(header=header(frame_id, ns), poses=[pose_stamped_msg(T, frame_id, ns) for T in poses])
 
 
-def grid_msg(patch: GridPatch, frame_id: str, ns: int) -> OccupancyGrid:
-    """Map message of a patch."""
+def trajectory_msg(stamps_ns: list[int], poses: Array, frame_id: str, ns: int) -> Path:
+    """Path of poses (N, 3), each with a stamp of its own."""
+    message = path_msg(poses, frame_id, ns)
+    for pose, stamp in zip(message.poses, stamps_ns, strict=True):
+        pose.header.stamp = time_msg(stamp)
+    return message
+
+
+def trajectory_from(message: Path) -> tuple[NDArray[np.int64], Array]:
+    """Stamps (N,) and poses (N, 3) of a path. Raises InputError where a pose is none."""
+    stamps = np.array([stamp_ns(pose.header.stamp) for pose in message.poses], dtype=np.int64)
+    return stamps, np.array([pose_from(pose.pose) for pose in message.poses]).reshape(-1, 3)
+
+
+def grid_msg(patch: GridPatch, frame_id: str, ns: int, corrected_ns: int = 0) -> OccupancyGrid:
+    """Map message of a patch; corrected_ns: stamp of the trajectory by which its grid was last drawn anew."""
     message = OccupancyGrid(header=header(frame_id, ns))
-    message.info.map_load_time = time_msg(ns)
+    message.info.map_load_time = time_msg(corrected_ns)
     message.info.resolution = patch.frame.resolution
     message.info.height, message.info.width = patch.shape
     message.info.origin = pose_msg(np.array([patch.frame.origin_x, patch.frame.origin_y, 0.0]))

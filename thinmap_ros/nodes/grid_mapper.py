@@ -3,6 +3,7 @@
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid as OccupancyGridMsg
+from nav_msgs.msg import Path
 from rclpy.callback_groups import ReentrantCallbackGroup
 from sensor_msgs.msg import LaserScan
 
@@ -16,6 +17,7 @@ from thinmap_ros.adapters.services import answer, ask
 from thinmap_ros.adapters.stamps import StampMatcher
 from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.core.errors import ThinmapError
+from thinmap_ros.core.grid.history import GridHistory
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, WindowConfig
 from thinmap_ros.core.se2 import Array
 
@@ -23,7 +25,10 @@ _NO_BUILDER = 'no graph: there is no topology_builder'
 
 
 class GridMapperNode(LiveNode):
-    """/scan and /pose in; /map once a second and /local_map at every scan out; services save_map and load_map."""
+    """/scan and /pose in; /map once a second and /local_map at every scan out; services save_map and load_map.
+
+    After a /trajectory the map is drawn anew; map_load_time of both says by which one it was.
+    """
 
     def __init__(self) -> None:
         super().__init__('grid_mapper', recovers=True)
@@ -42,6 +47,8 @@ class GridMapperNode(LiveNode):
         self._go_on(self.keep(self._state))
         self.offer_pause()
         self.health.sole_publisher_of('map')
+        # First: of messages that wait together it is taken before the poses that follow from it.
+        listen(self, Path, 'trajectory', self._on_trajectory, qos.LATCHED)
         listen(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
         listen(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
         # Mapping goes on while a map is saved, and waits while one is loaded: nothing gets into the wrong graph.
@@ -56,10 +63,14 @@ class GridMapperNode(LiveNode):
         """Forget the map, or go back to the session that the node was started with."""
         self._matcher: StampMatcher[LaserScan, Array] = StampMatcher()
         known = self._session or self._latest_ns is not None
+        # None: the map began with a grid of which the scans are not known.
+        self._history: GridHistory | None = None if self._session else GridHistory()
+        self._corrected_ns = 0
         self._latest_ns = None
         self._grid = self._of_session() if self._session else OccupancyGrid(self._config)
         if known:
-            self._take_over(self._grid)
+            self._latest_ns = self.get_clock().now().nanoseconds
+            self._publish_map()
 
     def _state(self) -> State | None:
         if self._latest_ns is None:
@@ -93,16 +104,33 @@ class GridMapperNode(LiveNode):
         self._resumed_ns = None
         with self.health.timed('map update'):
             self._grid.update(scan, T_map_base)
+            if self._history is not None:
+                self._history.add(scan, T_map_base)
             window = self._grid.window(T_map_base[0], T_map_base[1], self._window_m)
         self._latest_ns = scan.stamp_ns
-        self._local_map.publish(messages.grid_msg(window, self._map_frame, scan.stamp_ns))
+        self._local_map.publish(messages.grid_msg(window, self._map_frame, scan.stamp_ns, self._corrected_ns))
 
     def _publish_map(self) -> None:
         if self._latest_ns is not None:
-            self._map.publish(messages.grid_msg(self._grid.patch(), self._map_frame, self._latest_ns))
+            patch = self._grid.patch()
+            self._map.publish(messages.grid_msg(patch, self._map_frame, self._latest_ns, self._corrected_ns))
+
+    def _on_trajectory(self, message: Path) -> None:
+        """A loop was closed: draw the map anew where the scans were really made."""
+        if self._latest_ns is None:
+            return  # of an earlier life
+        self._corrected_ns = messages.stamp_ns(message.header.stamp)
+        if self._history is None:
+            self.get_logger().warning('a loop is closed, but the map was loaded, not drawn here: it stays as it was')
+        else:
+            with self.health.timed('map drawn anew'):
+                self._history.past.correct(*messages.trajectory_from(message), since_ns=self._corrected_ns)
+                self._grid = self._history.draw(self._grid)
+        self._publish_map()
 
     def _take_over(self, grid: OccupancyGrid) -> None:
         self._grid, self._latest_ns = grid, self._latest_ns or self.get_clock().now().nanoseconds
+        self._history = None
         self._publish_map()
 
     async def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:

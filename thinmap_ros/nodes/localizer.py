@@ -3,8 +3,9 @@
 from dataclasses import replace
 from time import perf_counter
 
+import numpy as np
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import Odometry, Path
 from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
@@ -25,7 +26,10 @@ from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 
 
 class LocalizerNode(LiveNode):
-    """/scan and /odom in; /pose, map -> odom on /tf, /line_features and /slam_status out; services ~/pause, ~/reset."""
+    """/scan and /odom in; /pose, map -> odom on /tf, /line_features, /slam_status out; /trajectory after a loop.
+
+    Services ~/pause, ~/reset.
+    """
 
     def __init__(self) -> None:
         super().__init__('localizer', recovers=True)
@@ -47,6 +51,7 @@ class LocalizerNode(LiveNode):
         self._tf = self.create_publisher(TFMessage, '/tf', qos.STREAM)
         self._features = self.create_publisher(LineFeatureArray, 'line_features', qos.LATCHED)
         self._status = self.create_publisher(SlamStatus, 'slam_status', qos.STREAM)
+        self._trajectory = self.create_publisher(Path, 'trajectory', qos.LATCHED)
         # Before the scans: of messages that wait together, the executor takes the graph of the last scan first.
         listen(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
         listen(self, Odometry, 'odom', self._on_odometry, qos.STREAM)
@@ -99,6 +104,8 @@ class LocalizerNode(LiveNode):
     def _publish(self, ns: int, estimate: Estimate, step_ms: float) -> None:
         self.health.took('localizer', step_ms)
         self.health.state(*((ERROR, 'lost: scans do not fit the map') if estimate.lost else (OK, 'tracking')))
+        if estimate.correction is not None:
+            self._tell_trajectory(ns)
         pose = messages.pose_with_covariance_msg(
             estimate.T_map_base, estimate.covariance, self._map_frame, ns
         )
@@ -121,6 +128,14 @@ class LocalizerNode(LiveNode):
                 step_time_ms=step_ms,
             )
         )
+
+    def _tell_trajectory(self, ns: int) -> None:
+        """Say where the kept scans were made, now that a loop is closed: before the first pose that follows from it."""
+        kept = self._localizer.keyframes
+        poses = np.array([frame.T_map_base for frame in kept])
+        stamps = [frame.scan.stamp_ns for frame in kept]
+        self._trajectory.publish(messages.trajectory_msg(stamps, poses, self._map_frame, ns))
+        self.get_logger().info(f'a loop is closed: {len(kept)} poses of the past are corrected')
 
 
 def _feature_msg(feature: Feature) -> LineFeature:

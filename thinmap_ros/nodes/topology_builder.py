@@ -2,7 +2,7 @@
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import OccupancyGrid
+from nav_msgs.msg import OccupancyGrid, Path
 
 from thinmap_msgs.msg import TopologicalMap
 from thinmap_msgs.srv import LoadMap, SaveMap
@@ -15,11 +15,15 @@ from thinmap_ros.adapters.services import answer
 from thinmap_ros.adapters.stamps import StampMatcher
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.rebuilding import Rebuilding
 from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig
 
 
 class TopologyBuilderNode(LiveNode):
-    """/local_map and /pose in; /local_topology and /topology out; services save_topology and load_topology."""
+    """/local_map and /pose in; /local_topology and /topology out; services save_topology and load_topology.
+
+    After a /trajectory the graph is built anew from the /map that has been drawn by it; nodes keep their ids.
+    """
 
     def __init__(self) -> None:
         super().__init__('topology_builder', recovers=True)
@@ -31,6 +35,8 @@ class TopologyBuilderNode(LiveNode):
         self._said_something = False
         self._local = self.create_publisher(TopologicalMap, 'local_topology', qos.LATCHED)
         self._global = self.create_publisher(TopologicalMap, 'topology', qos.LATCHED)
+        listen(self, Path, 'trajectory', self._on_trajectory, qos.LATCHED)
+        listen(self, OccupancyGrid, 'map', self._on_map, qos.LATCHED)
         listen(self, OccupancyGrid, 'local_map', self._on_window, qos.STREAM)
         listen(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
         self.create_service(SaveMap, 'save_topology', self._on_save)
@@ -54,6 +60,7 @@ class TopologyBuilderNode(LiveNode):
     def begin_anew(self) -> None:
         """Forget the graph, or go back to the session that the node was started with."""
         self._matcher: StampMatcher[GridPatch, Array] = StampMatcher()
+        self._rebuilding = Rebuilding()
         self._builder = self._of_session() if self._session else TopologyBuilder(self._config)
         if self._session or self._said_something:
             self._publish(self.get_clock().now().nanoseconds)
@@ -63,8 +70,9 @@ class TopologyBuilderNode(LiveNode):
 
     def _on_window(self, message: OccupancyGrid) -> None:
         stamp_ns = messages.stamp_ns(message.header.stamp)
-        pair = self._matcher.left(stamp_ns, messages.patch_from(message))
-        self._take(stamp_ns, pair)
+        patch = messages.patch_from(message)
+        self._rebuilding.window(patch, messages.stamp_ns(message.info.map_load_time))
+        self._take(stamp_ns, self._matcher.left(stamp_ns, patch))
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         stamp_ns = messages.stamp_ns(message.header.stamp)
@@ -78,12 +86,25 @@ class TopologyBuilderNode(LiveNode):
         if self._resumed_ns is not None and stamp_ns < self._resumed_ns:
             self.begin_anew()  # the robot has begun anew as well
         self._resumed_ns, self._latest_ns = None, stamp_ns
+        window, T_map_base = pair
         with self.health.timed('graph update'):
-            changed = self._builder.update(*pair)
+            changed = self._rebuilding.may_take(window) and self._builder.update(window, T_map_base)
+        self._rebuilding.took(stamp_ns, T_map_base)
         if changed:
             self._publish(stamp_ns)
         # The local map comes last: who hears it knows that all of this scan is said.
         self._local.publish(messages.topology_msg(self._builder.local_map(), self._map_frame, stamp_ns))
+
+    def _on_trajectory(self, message: Path) -> None:
+        if self._latest_ns is not None:
+            self._rebuilding.expect(messages.stamp_ns(message.header.stamp), *messages.trajectory_from(message))
+
+    def _on_map(self, message: OccupancyGrid) -> None:
+        if not self._rebuilding.waits_for(messages.stamp_ns(message.info.map_load_time)):
+            return
+        with self.health.timed('graph built anew'):
+            self._rebuilding.rebuild(self._builder, messages.patch_from(message))
+        self._publish(messages.stamp_ns(message.header.stamp))
 
     def _publish(self, stamp_ns: int) -> None:
         self._said_something = True

@@ -27,15 +27,15 @@ def test_what_is_drawn_anew_is_what_was_drawn():
         grid.update(scan(k), T)
     drawn = history.draw(OccupancyGrid())
     np.testing.assert_array_equal(drawn.patch().cells, grid.patch().cells)
-    np.testing.assert_array_equal(history.poses(), POSES)
+    np.testing.assert_array_equal(history.past.poses(), POSES)
 
 
 def test_scans_go_with_the_last_named_one_before_them():
     """Scan 4 is moved to the side and scan 8 is turned: those after each go with it, those before the first as well."""
     history = filled(POSES, range(100, 112))
     moved = np.array([POSES[4] + [0.0, 1.0, 0.0], POSES[8] + [0.0, 0.0, 0.5]])
-    history.correct(np.array([104, 108]), moved, since_ns=112)
-    after = history.poses()
+    history.past.correct(np.array([104, 108]), moved, since_ns=112)
+    after = history.past.poses()
     np.testing.assert_allclose(after[:8], POSES[:8] + [0.0, 1.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(after[8], moved[1], atol=1e-12)
     np.testing.assert_allclose(se2.between(after[8], after[10]), se2.between(POSES[8], POSES[10]), atol=1e-12)
@@ -43,20 +43,20 @@ def test_scans_go_with_the_last_named_one_before_them():
 
 def test_scans_that_came_after_the_correction_stay():
     history = filled(POSES, range(12))
-    history.correct(np.array([0, 5]), POSES[[0, 5]] + [0.0, 0.0, 1.0], since_ns=9)
-    np.testing.assert_array_equal(history.poses()[9:], POSES[9:])
-    assert not np.allclose(history.poses()[8], POSES[8])
+    history.past.correct(np.array([0, 5]), POSES[[0, 5]] + [0.0, 0.0, 1.0], since_ns=9)
+    np.testing.assert_array_equal(history.past.poses()[9:], POSES[9:])
+    assert not np.allclose(history.past.poses()[8], POSES[8])
 
 
 def test_unknown_stamps_and_stamps_that_step_back_are_borne():
     stamps = [0, 1, 2, 3, 2, 4, 5, 6, 7, 8, 9, 10]
     history = filled(POSES, stamps)
-    history.correct(np.array([77]), POSES[:1] + 5.0, since_ns=100)
-    np.testing.assert_array_equal(history.poses(), POSES)
-    history.correct(np.array([2]), POSES[[4]] + [1.0, 0.0, 0.0], since_ns=100)
-    np.testing.assert_allclose(history.poses(), POSES + [1.0, 0.0, 0.0], atol=1e-12)
+    history.past.correct(np.array([77]), POSES[:1] + 5.0, since_ns=100)
+    np.testing.assert_array_equal(history.past.poses(), POSES)
+    history.past.correct(np.array([2]), POSES[[4]] + [1.0, 0.0, 0.0], since_ns=100)
+    np.testing.assert_allclose(history.past.poses(), POSES + [1.0, 0.0, 0.0], atol=1e-12)
 
 
 def test_a_robot_that_stands_still_is_kept_once():
     history = filled(np.zeros((50, 3)), range(50))
-    assert len(history.poses()) == 1
+    assert len(history.past.poses()) == 1

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from slam_room import ROOM, drive, scan_in
+from slam_room import ROOM, drive, drive_round_the_block, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
@@ -125,36 +125,15 @@ def test_before_any_scan_there_is_no_path():
     assert Localizer().corrected_scans() == []
 
 
-def corridor_ring():
-    """Walls of a corridor of 2.4 m round a block of 35 x 15 m, with niches to tell its sides apart, (N, 4)."""
-    outer, inner = np.array([40.0, 20.0]), 2.4
-    corners = [np.array([[0.0, 0.0], [outer[0], 0.0], outer, [0.0, outer[1]], [0.0, 0.0]])]
-    low, high = np.array([inner, inner]), outer - inner
-    corners.append(np.array([low, [high[0], low[1]], high, [low[0], high[1]], low]))
-    walls = [np.hstack([a, b]) for ring_ in corners for a, b in pairwise(ring_)]
-    for x in (6.0, 13.0, 17.5, 26.0, 33.0):
-        walls += [np.array([x, 0.0, x, 0.4]), np.array([x, 0.4, x + 0.5, 0.4]), np.array([x + 0.5, 0.4, x + 0.5, 0.0])]
-        walls += [np.array([x + 1.0, 20.0, x + 1.0, 19.6]), np.array([x + 1.0, 19.6, x + 2.0, 19.6])]
-    return np.array(walls)
-
-
 def test_a_loop_is_closed_while_the_robot_drives():
     """Wheels that wear to one side: round the block the map has drifted; coming back, all of it is put right."""
-    rng, walls = np.random.default_rng(5), corridor_ring()
-    start = np.array([3.0, 1.2, 0.0])
     localizer = Localizer(LocalizerConfig(start_x_m=3.0, start_y_m=1.2))
-    goals = [(38.8, 1.2), (38.8, 18.8), (1.2, 18.8), (1.2, 1.2), (20.0, 1.2)]
-    truth, odom, rows, closed = start, np.zeros(3), [], []
-    for goal in goals:
-        while np.hypot(*(goal - truth[:2])) > 0.15:
-            turn = float(np.clip(se2.wrap(np.arctan2(*(goal - truth[:2])[::-1]) - truth[2]), -0.3, 0.3))
-            step = np.array([0.15 if abs(turn) < 0.1 else 0.0, 0.0, turn])
-            truth = se2.compose(truth, step)
-            odom = se2.compose(odom, step * [1.03, 1.0, 1.02] + [0.0, 0.0, 0.01 * step[0]])
-            estimate = localizer.step(scan_in(walls, truth, rng, len(rows)), odom)
-            rows.append((truth, estimate.T_map_base))
-            if estimate.correction is not None:
-                closed.append(len(rows))
+    rows, closed = [], []
+    for scan, odom, truth in drive_round_the_block():
+        estimate = localizer.step(scan, odom)
+        rows.append((truth, estimate.T_map_base))
+        if estimate.correction is not None:
+            closed.append(len(rows))
     off = np.array([np.hypot(*(T - t)[:2]) for t, T in rows])
     assert closed
     assert off[: closed[0] - 1].max() > 0.3, 'without drift there is nothing to close'

@@ -11,11 +11,11 @@ from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
-_KEPT_M, _KEPT_RAD = 0.25, 0.25
+_APART_M, _APART_RAD = 0.25, 0.25
 
 
-class GridHistory:
-    """The pose of every scan, and a scan every 0.25 m or 0.25 rad: some 10 kB a metre.
+class PoseHistory:
+    """The pose of every scan; those that lie 0.25 m or 0.25 rad apart are the ones that are asked for.
 
     A correction names some of the scans by their stamps and says where they were made. All others go with the last of
     these before them, in the order in which they came: stamps of real robots step back now and then.
@@ -24,23 +24,24 @@ class GridHistory:
     def __init__(self) -> None:
         self._stamps = array('q')
         self._poses = array('d')
-        self._kept: list[tuple[int, Scan]] = []
+        self._apart = array('q')
 
-    def add(self, scan: Scan, T_map_base: Array) -> None:
-        """Take in a scan that was drawn at a pose (3,)."""
+    def add(self, stamp_ns: int, T_map_base: Array) -> bool:
+        """Take in the pose (3,) of a scan; whether it lies apart from the last one that did."""
         number = len(self._stamps)
-        self._stamps.append(scan.stamp_ns)
+        self._stamps.append(stamp_ns)
         self._poses.extend(T_map_base.tolist())
-        if self._kept:
-            first = 3 * self._kept[-1][0]
+        if self._apart:
+            first = 3 * self._apart[-1]
             moved = se2.between(np.array(self._poses[first : first + 3]), T_map_base)
-            if math.hypot(moved[0], moved[1]) < _KEPT_M and abs(float(moved[2])) < _KEPT_RAD:
-                return
-        self._kept.append((number, scan))
+            if math.hypot(moved[0], moved[1]) < _APART_M and abs(float(moved[2])) < _APART_RAD:
+                return False
+        self._apart.append(number)
+        return True
 
     def poses(self) -> Array:
-        """Poses (N, 3) of the kept scans as they are known now."""
-        return self._all_poses()[[number for number, _ in self._kept]]
+        """Poses (N, 3) that lie apart, as they are known now."""
+        return self._all_poses()[np.array(self._apart, dtype=np.int64)]
 
     def correct(self, stamps_ns: NDArray[np.int64], poses: Array, since_ns: int) -> None:
         """Move everything as the scans of these stamps (M,) are moved, which were made at poses (M, 3).
@@ -59,13 +60,6 @@ class GridHistory:
         ]
         self._poses[: 3 * right] = array('d', np.array(after).ravel().tolist())
 
-    def draw(self, like: OccupancyGrid) -> OccupancyGrid:
-        """The grid of the kept scans at their poses, with the cells and the configuration of another."""
-        grid = OccupancyGrid(like.config, like.frame)
-        for (_, scan), T in zip(self._kept, self.poses(), strict=True):
-            grid.update(scan, T)
-        return grid
-
     def _all_poses(self) -> Array:
         return np.array(self._poses).reshape(-1, 3)
 
@@ -75,3 +69,23 @@ class GridHistory:
         found = sorted((number_of[stamp], k) for k, stamp in enumerate(stamps_ns.tolist()) if stamp in number_of)
         pairs = np.array(found, dtype=np.int64).reshape(-1, 2)
         return pairs[:, 0], pairs[:, 1]
+
+
+class GridHistory:
+    """The scans that a grid can be drawn from anew, one every 0.25 m or 0.25 rad: some 10 kB a metre."""
+
+    def __init__(self) -> None:
+        self.past = PoseHistory()
+        self._scans: list[Scan] = []
+
+    def add(self, scan: Scan, T_map_base: Array) -> None:
+        """Take in a scan that was drawn at a pose (3,)."""
+        if self.past.add(scan.stamp_ns, T_map_base):
+            self._scans.append(scan)
+
+    def draw(self, like: OccupancyGrid) -> OccupancyGrid:
+        """The grid of the kept scans at their poses, with the cells and the configuration of another."""
+        grid = OccupancyGrid(like.config, like.frame)
+        for scan, T in zip(self._scans, self.past.poses(), strict=True):
+            grid.update(scan, T)
+        return grid

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from itertools import pairwise
 
 import numpy as np
 
@@ -80,3 +81,30 @@ def drive(
 
 
 BLIND = scan_in(np.array([[1e3, -1.0, 1e3, 1.0]]), np.zeros(3))  # a scan that meets nothing
+
+
+def corridor_ring() -> np.ndarray:
+    """Walls of a corridor of 2.4 m round a block of 35 x 15 m, with niches to tell its sides apart, (N, 4)."""
+    outer, inner = np.array([40.0, 20.0]), 2.4
+    corners = [np.array([[0.0, 0.0], [outer[0], 0.0], outer, [0.0, outer[1]], [0.0, 0.0]])]
+    low, high = np.array([inner, inner]), outer - inner
+    corners.append(np.array([low, [high[0], low[1]], high, [low[0], high[1]], low]))
+    walls = [np.hstack([a, b]) for ring_ in corners for a, b in pairwise(ring_)]
+    for x in (6.0, 13.0, 17.5, 26.0, 33.0):
+        walls += [np.array([x, 0.0, x, 0.4]), np.array([x, 0.4, x + 0.5, 0.4]), np.array([x + 0.5, 0.4, x + 0.5, 0.0])]
+        walls += [np.array([x + 1.0, 20.0, x + 1.0, 19.6]), np.array([x + 1.0, 19.6, x + 2.0, 19.6])]
+    return np.array(walls)
+
+
+def drive_round_the_block() -> Iterator[tuple[Scan, np.ndarray, np.ndarray]]:
+    """Scan, odometry and truth of a drive once round the corridor and on; the wheels wear to one side."""
+    rng, walls = np.random.default_rng(5), corridor_ring()
+    truth, odom, number = np.array([3.0, 1.2, 0.0]), np.zeros(3), 0
+    for goal in [(38.8, 1.2), (38.8, 18.8), (1.2, 18.8), (1.2, 1.2), (20.0, 1.2)]:
+        while np.hypot(*(goal - truth[:2])) > 0.15:
+            turn = float(np.clip(se2.wrap(np.arctan2(*(goal - truth[:2])[::-1]) - truth[2]), -0.3, 0.3))
+            step = np.array([0.15 if abs(turn) < 0.1 else 0.0, 0.0, turn])
+            truth = se2.compose(truth, step)
+            odom = se2.compose(odom, step * [1.03, 1.0, 1.02] + [0.0, 0.0, 0.01 * step[0]])
+            yield scan_in(walls, truth, rng, 200_000_000 * number), odom, truth
+            number += 1
