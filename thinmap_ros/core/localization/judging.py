@@ -1,0 +1,74 @@
+"""What poses are worth in view of one scan: the map's arrays and the noise, bound to the loops over them."""
+
+import math
+
+import numpy as np
+
+from thinmap_ros.core.localization import matching
+from thinmap_ros.core.localization.calibration import NodeModel
+from thinmap_ros.core.localization.config import GlobalLocalizationConfig
+from thinmap_ros.core.localization.observation import Observation
+from thinmap_ros.core.localization.places import NEAR_UNIT_M, Places
+from thinmap_ros.core.se2 import Array
+
+_SIGMAS = 3.0
+_COARSE_M = 0.3  # 1 sigma, for the first steps uphill from a place that is off by a spacing
+_OUTLIERS = 0.1
+# Beams are not independent of each other: neighbours meet the same wall, which the map has drawn once, and well or not.
+_BEAMS_A_FACT = 6.0
+_NODES_A_FACT = 2.0
+_BIRTH_STEPS = np.array([[0.16, 0.06], [0.08, 0.03]])
+_FINE_STEPS = np.array([[0.04, 0.015], [0.02, 0.0075]])
+_ROUNDS = 6
+
+
+class Judge:
+    """Compares poses with observations; tolerances follow from the cells of the grid and the noise of the sensor."""
+
+    def __init__(self, places: Places, config: GlobalLocalizationConfig, nodes: NodeModel) -> None:
+        self._places = places
+        self._nodes = nodes
+        self._origin = (places.frame.origin_x, places.frame.origin_y)
+        # A wall lies anywhere in its cell, and so does the end of a beam: uniform, twice.
+        cells = places.frame.resolution / math.sqrt(6.0)
+        sigma = math.sqrt(config.range_noise_m**2 + config.pose_noise_m**2 + cells**2)
+        self.tolerance = (_SIGMAS * sigma, _SIGMAS * config.heading_noise_rad)
+        off = np.arange(256) * NEAR_UNIT_M / sigma
+        bell = np.exp(-0.5 * off**2)
+        self._log_table = np.log((1.0 - _OUTLIERS) * bell + _OUTLIERS) / _BEAMS_A_FACT
+        self._fine_table = bell
+        self._coarse_table = np.exp(-0.5 * (off * sigma / _COARSE_M) ** 2)
+
+    def log_likelihoods(self, poses: Array, seen: Observation) -> Array:
+        """Log likelihood of beams and nodes at poses (N, 3), up to a constant, (N,)."""
+        ends = seen.ends[seen.met]
+        near, resolution = self._places.near, self._places.frame.resolution
+        scores = matching.range_scores(poses, ends, near, self._origin, resolution, self._log_table)
+        return np.asarray(scores + self.node_log_ratios(poses, seen))
+
+    def node_log_ratios(self, poses: Array, seen: Observation) -> Array:
+        """Log likelihood ratio of the observed nodes at poses (N, 3), against a pose anywhere, (N,)."""
+        places, model = self._places, self._nodes
+        ratios = matching.node_scores(
+            poses, seen.nodes, seen.node_kinds, places.nodes, (places.blocks, places.first, places.in_sight),
+            self._origin, places.block_cells * places.frame.resolution, model.found, model.spread_m, model.gain,
+        )
+        return np.asarray(ratios / _NODES_A_FACT)
+
+    def refined(self, poses: Array, seen: Observation, far: bool = False) -> Array:
+        """Poses (N, 3) moved to where the beams fit best near by; far: from up to a spacing away."""
+        near, resolution = self._places.near, self._places.frame.resolution
+        ends = seen.ends[seen.met]
+        if far:
+            poses = matching.refine(
+                poses, ends, near, self._origin, resolution, self._coarse_table, _BIRTH_STEPS, _ROUNDS
+            )
+        return matching.refine(poses, ends, near, self._origin, resolution, self._fine_table, _FINE_STEPS, _ROUNDS)
+
+    def explained(self, poses: Array, seen: Observation) -> Array:
+        """How many of the beams the map explains from poses (N, 3), (N,)."""
+        places = self._places
+        return matching.explained(
+            poses, seen.laser, seen.ranges_m, seen.bearings_rad, seen.met, (places.states, places.near), self._origin,
+            places.frame.resolution, self.tolerance,
+        )
