@@ -38,8 +38,13 @@ def random_start(world: World, rng: np.random.Generator, within: np.ndarray | No
     return pose(float(at[0]), float(at[1]), float(rng.uniform(-np.pi, np.pi)))
 
 
-def random_drive(world: World, start: Array, seed: int, laser: Lms200Config | None = None) -> Iterator[Look]:
-    """Look after look of a robot that drives from a start to random places, one after the other, without end."""
+def random_drive(
+    world: World, start: Array, seed: int, within: np.ndarray | None = None, laser: Lms200Config | None = None
+) -> Iterator[Look]:
+    """Look after look of a robot that drives from a start to random places, one after the other, without end.
+
+    within (H, W): cells of the world in which these places lie; all, where it is not given.
+    """
     rng = np.random.default_rng(seed)
     simulation = Simulation(world, start, PioneerConfig(), laser or Lms200Config(), seed)
     patch = GridPatch(world.frame, np.where(world.occupied != 0, np.int8(100), np.int8(0)))
@@ -47,7 +52,7 @@ def random_drive(world: World, start: Array, seed: int, laser: Lms200Config | No
     follower = Follower(FollowerConfig(max_speed_m_s=_SPEED_M_S))
     moment = simulation.sense()
     while True:
-        way = _random_way(world, patch, simulation.robot.T_world_base, rng, radius)
+        way = _random_way(world, patch, simulation.robot.T_world_base, rng, radius, within)
         for _ in range(_GIVE_UP_STEPS):
             T = simulation.robot.T_world_base
             if moment.scan is not None:
@@ -57,11 +62,13 @@ def random_drive(world: World, start: Array, seed: int, laser: Lms200Config | No
             moment = simulation.step(*follower.command(T, way, STEP_NS / 1e9))
 
 
-def _random_way(world: World, patch: GridPatch, T: Array, rng: np.random.Generator, radius_m: float) -> Array:
+def _random_way(
+    world: World, patch: GridPatch, T: Array, rng: np.random.Generator, radius_m: float, within: np.ndarray | None
+) -> Array:
     """Path (K, 2) to a random place that can be reached."""
     xy = (float(T[0]), float(T[1]))
     while True:
-        goal = random_start(world, rng)
+        goal = random_start(world, rng, within)
         if np.hypot(*(goal[:2] - T[:2])) < _NEAREST_GOAL_M:
             continue
         way = plan(patch, xy, (float(goal[0]), float(goal[1])), WavefrontConfig(robot_radius_m=radius_m))

@@ -23,12 +23,16 @@ __all__ = ['GlobalLocalization', 'GlobalLocalizationConfig', 'Hypothesis', 'Resu
 
 # Looks from about the same place meet the same errors of the map; they are independent after so much motion.
 _NEW_WAY_M, _NEW_TURN_RAD = 0.5, 0.5
+_SURE_NOVELTY = 0.5
 _VIEWS = 6
 _FRESH_SHARE = 0.2  # of the samples that are drawn anew all over the map while the search is on
 _FRESH_BEST = 100
 _JUMP_RAD = 2.0
 _STANDING_NOISE = (0.01, 0.005)  # m, rad: samples do not fall together
-_NODES_ALLOWED = 2.0  # log likelihood by which nodes may differ by chance
+# A search that looked at all of the map and did not find the right place: this often. So who turns up late is unlikely.
+_LOG_MISSED = math.log(0.2)
+_LEAST_LOG_PRIOR = -12.0
+_FIRST_SEARCHES, _LATER_EVERY = 6, 4.0  # looks: once all places are known, the map is searched less often
 
 
 class State(IntEnum):
@@ -103,6 +107,8 @@ class GlobalLocalization:
         self._T_look: Array | None = None
         self._way_m = 0.0
         self._since_search = math.inf
+        self._searches = 0  # that were complete
+        self._convinced = (0, 0.0)  # looks in a row, and independent ones of these, at which all spoke for one place
         self._drawn = self._draw(self.config.samples)
 
     @property
@@ -149,22 +155,28 @@ class GlobalLocalization:
         seen = observe(scan, self.places.frame.resolution, self.config)
         self._advance(T_odom_base)
         self._since_search += novelty
-        if self._since_search >= 1.0 and not self._is_sure():
+        every = 1.0 if self._searches < _FIRST_SEARCHES or self._explains_badly() else _LATER_EVERY
+        if self._since_search >= every and not self.is_sure:
             self._search(judge, seen, T_odom_base)
         known = self._known
         if len(known):
-            known.poses = judge.refined(known.poses, seen)
-            counts = judge.explained(known.poses, seen)
-            ratios = judge.node_log_ratios(known.poses, seen)
+            self._realign(judge, seen)
+            counts, self.fits = judge.explained(known.poses, seen)
             against = evidence_against(len(seen.ranges_m) - counts, len(seen.ranges_m), novelty)
-            against += novelty * np.maximum(ratios.max() - ratios - _NODES_ALLOWED, 0.0)
             known.take_evidence(counts, len(seen.ranges_m), novelty, against)
             known.prune()
             known.resample(None, self.config.samples, self._rng) if not len(known.samples) else None
             logs = judge.log_likelihoods(known.samples, seen)
             known.weigh(logs)
             known.resample(logs, self.config.samples, self._rng)
+        looks, independent = self._convinced
+        self._convinced = (looks + 1, independent + novelty) if self._speaks_for_one() else (0, 0.0)
         self._T_look = T_odom_base
+
+    def _realign(self, judge: Judge, seen: Observation) -> None:
+        """Move each hypothesis to where this scan fits best: near itself, or near the best of its samples."""
+        known = self._known
+        known.poses = judge.refined(known.poses, seen)
 
     def _ready(self, scan: Scan) -> Judge:
         """The judge; the first scan tells which laser it is for."""
@@ -191,7 +203,7 @@ class GlobalLocalization:
         self._drawn = self._draw(self.config.samples if not len(self._known) else self._fresh)
         logs = judge.log_likelihoods(self._drawn, seen)
         drawn = self._drawn[np.argsort(-logs, kind='stable')[:_FRESH_BEST]]
-        found = candidates(self.places, judge, seen, drawn, self._rng)
+        found, complete = candidates(self.places, judge, seen, drawn, self._rng)
         poses = np.concatenate([self._known.poses, found])
         if len(found):
             missing = unexplained_before(judge, self._views, poses, T_odom_base)
@@ -202,8 +214,14 @@ class GlobalLocalization:
                 against += evidence_against(row, count, 1.0)[old:]
                 explained += count - row[old:]
                 beams += count
-            self._known.add(found, -against, explained, beams)
+            prior = max(self._searches * _LOG_MISSED, _LEAST_LOG_PRIOR)
+            self._known.add(found, prior - against, explained, beams)
+        self._searches += complete
         self._views = [*self._views[-_VIEWS + 1 :], KeyView(seen, T_odom_base)]
+
+    def _explains_badly(self) -> bool:
+        """Whether no hypothesis explains enough to be sure of."""
+        return float(self._known.shares_explained.max(initial=0.0)) < self.config.sure_explained
 
     @property
     def _fresh(self) -> int:
@@ -217,7 +235,12 @@ class GlobalLocalization:
         at += self._rng.uniform(-0.5, 0.5, at.shape) * places.frame.resolution
         return np.column_stack([at, self._rng.uniform(-np.pi, np.pi, count)])
 
-    def _is_sure(self) -> bool:
+    @property
+    def is_sure(self) -> bool:
+        """Whether one place alone has explained all for some looks in a row, from more than one point of view."""
+        return self._convinced[0] >= self.config.sure_looks and self._convinced[1] >= _SURE_NOVELTY
+
+    def _speaks_for_one(self) -> bool:
         known, config = self._known, self.config
         if not len(known):
             return False
@@ -225,7 +248,6 @@ class GlobalLocalization:
         sigma_m = math.sqrt(max(float(np.linalg.eigvalsh(known.covariances[best][:2, :2])[-1]), 0.0))
         return (
             float(known.weights[best]) >= config.sure_share
-            and known.looks[best] >= config.sure_looks
             and float(known.shares_explained[best]) >= config.sure_explained
             and sigma_m <= config.sure_sigma_m
             and math.sqrt(max(float(known.covariances[best][2, 2]), 0.0)) <= config.sure_sigma_rad
@@ -245,7 +267,7 @@ class GlobalLocalization:
             Hypothesis(poses[k], known.covariances[k], float(weights[k]), float(shares[k])) for k in order.tolist()
         )
         best = hypotheses[0]
-        if self._is_sure():
+        if self.is_sure:
             return Result(State.LOCALIZED, f'one place explains {best.explained:.0%} of what was seen', hypotheses)
         most = float(shares.max())
         if self._way_m >= self.config.foreign_way_m and most < self.config.foreign_explained:

@@ -15,6 +15,8 @@ from thinmap_ros.core.se2 import Array
 LOG_ODDS_A_BEAM = 0.35
 # Beams at edges fall to either side by chance: so many of them may, one in ...
 EDGE_SHARE = 0.05
+# Now and then a whole look tells nonsense (someone stands in the way, a door has moved): no look settles the matter.
+_MOST_A_LOOK = 3.0
 _LEAST_LOG_WEIGHT = -14.0
 _MOST = 400
 _SAME_M, _SAME_RAD = 0.3, 0.15
@@ -29,7 +31,8 @@ def evidence_against(missing: Array, beams: int, novelty: float) -> Array:
     same stay equally likely.
     """
     allowed = 2.0 * math.sqrt(beams * EDGE_SHARE * (1.0 - EDGE_SHARE))
-    return novelty * LOG_ODDS_A_BEAM * np.maximum(missing - missing.min(initial=np.inf) - allowed, 0.0)
+    beyond = np.maximum(missing - missing.min(initial=np.inf) - allowed, 0.0)
+    return novelty * np.minimum(LOG_ODDS_A_BEAM * beyond, _MOST_A_LOOK)
 
 
 @dataclass(eq=False)

@@ -12,14 +12,18 @@ from thinmap_ros.core.localization.places import NEAR_UNIT_M, Places
 from thinmap_ros.core.se2 import Array
 
 _SIGMAS = 3.0
-_COARSE_M = 0.3  # 1 sigma, for the first steps uphill from a place that is off by a spacing
+# From afar to near: how wide a wall's pull is, 1 sigma, m, and the steps uphill, m and rad.
+_PULLS: tuple[tuple[float, Array], ...] = (
+    (0.30, np.array([[0.16, 0.06], [0.08, 0.03]])),
+    (0.15, np.array([[0.08, 0.03], [0.04, 0.015]])),
+)
 _OUTLIERS = 0.1
 # Beams are not independent of each other: neighbours meet the same wall, which the map has drawn once, and well or not.
 _BEAMS_A_FACT = 6.0
 _NODES_A_FACT = 2.0
-_BIRTH_STEPS = np.array([[0.16, 0.06], [0.08, 0.03]])
 _FINE_STEPS = np.array([[0.04, 0.015], [0.02, 0.0075]])
 _ROUNDS = 6
+_WORTH_A_JUMP = 1.0  # beams that a place farther off must fit better
 
 
 class Judge:
@@ -37,7 +41,7 @@ class Judge:
         bell = np.exp(-0.5 * off**2)
         self._log_table = np.log((1.0 - _OUTLIERS) * bell + _OUTLIERS) / _BEAMS_A_FACT
         self._fine_table = bell
-        self._coarse_table = np.exp(-0.5 * (off * sigma / _COARSE_M) ** 2)
+        self._pulls = [(np.exp(-0.5 * (off * sigma / pull) ** 2), steps) for pull, steps in _PULLS]
 
     def log_likelihoods(self, poses: Array, seen: Observation) -> Array:
         """Log likelihood of beams and nodes at poses (N, 3), up to a constant, (N,)."""
@@ -55,20 +59,30 @@ class Judge:
         )
         return np.asarray(ratios / _NODES_A_FACT)
 
-    def refined(self, poses: Array, seen: Observation, far: bool = False) -> Array:
-        """Poses (N, 3) moved to where the beams fit best near by; far: from up to a spacing away."""
-        near, resolution = self._places.near, self._places.frame.resolution
-        ends = seen.ends[seen.met]
-        if far:
-            poses = matching.refine(
-                poses, ends, near, self._origin, resolution, self._coarse_table, _BIRTH_STEPS, _ROUNDS
-            )
-        return matching.refine(poses, ends, near, self._origin, resolution, self._fine_table, _FINE_STEPS, _ROUNDS)
+    def refined(self, poses: Array, seen: Observation) -> Array:
+        """Poses (N, 3) moved to where the beams fit best near by.
 
-    def explained(self, poses: Array, seen: Observation) -> Array:
-        """How many of the beams the map explains from poses (N, 3), (N,)."""
+        Once straight from where they are, once from where they fit when walls pull from far: whichever fits better.
+        """
+        near, far = self._uphill(poses, seen, self._fine_table, _FINE_STEPS), poses
+        for table, steps in self._pulls:
+            far = self._uphill(far, seen, table, steps)
+        far = self._uphill(far, seen, self._fine_table, _FINE_STEPS)
+        better = self._fit(far, seen) > self._fit(near, seen) + _WORTH_A_JUMP
+        return np.where(better[:, None], far, near)
+
+    def _uphill(self, poses: Array, seen: Observation, table: Array, steps: Array) -> Array:
+        near, resolution = self._places.near, self._places.frame.resolution
+        return matching.refine(poses, seen.ends[seen.met], near, self._origin, resolution, table, steps, _ROUNDS)
+
+    def _fit(self, poses: Array, seen: Observation) -> Array:
+        near, resolution = self._places.near, self._places.frame.resolution
+        return matching.range_scores(poses, seen.ends[seen.met], near, self._origin, resolution, self._fine_table)
+
+    def explained(self, poses: Array, seen: Observation) -> tuple[Array, Array]:
+        """How many of the beams the map explains from poses (N, 3), and how well in all, (N,) each."""
         places = self._places
         return matching.explained(
             poses, seen.laser, seen.ranges_m, seen.bearings_rad, seen.met, (places.states, places.near), self._origin,
-            places.frame.resolution, self.tolerance,
+            places.frame.resolution, self.tolerance, self._fine_table,
         )

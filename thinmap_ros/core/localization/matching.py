@@ -141,14 +141,18 @@ def explained(
     origin: tuple[float, float],
     resolution: float,
     tolerance: tuple[float, float],
-) -> Array:
+    bell: Array,
+) -> tuple[Array, Array]:
     """How many of the beams the map explains from each pose, (N,): those that could have come about as measured.
+
+    And how well, (N,): each of these counts by how near to a wall it ends.
 
     poses (N, 3): of the robot; laser (3,): on it; ranges, bearings, met (B,): see Observation; maps: states and near
     of Places; tolerance: in m, and in m for each m of range. A beam that met something must end beside a wall, one
     that met nothing nowhere; on its way there must be no wall. What ends or passes through the unknown counts half.
+    bell (256,): what a beam counts by the distance of its end from the nearest wall.
     """
-    counts = np.zeros(len(poses))
+    counts, fits = np.zeros(len(poses)), np.zeros(len(poses))
     for i in range(len(poses)):
         c, s = math.cos(poses[i, 2]), math.sin(poses[i, 2])
         x = (poses[i, 0] + c * laser[0] - s * laser[1] - origin[0]) / resolution
@@ -157,25 +161,30 @@ def explained(
         for j in range(len(ranges)):
             slack = tolerance[0] + tolerance[1] * ranges[j]
             angle = heading + bearings[j]
-            counts[i] += _is_explained(maps, x, y, angle, ranges[j], met[j], slack, resolution)
-    return counts
+            counted, away = _is_explained(maps, x, y, angle, ranges[j], met[j], slack, resolution)
+            counts[i] += counted
+            fits[i] += counted * bell[away]
+    return counts, fits
 
 
 @inlined
 def _is_explained(
     maps: tuple[Bytes, Bytes], x: float, y: float, angle: float, range_m: float, met: bool, slack: float,
     resolution: float,
-) -> float:
+) -> tuple[float, int]:
+    """What a beam counts, and how far from a wall it ends, in NEAR_UNIT_M; 0 where it should not end at one."""
     states, near = maps
     c, s = math.cos(angle), math.sin(angle)
-    ends_well = 1.0
+    ends_well, away = 1.0, 0
     if met:
         row = int(math.floor(y + s * range_m / resolution))
         col = int(math.floor(x + c * range_m / resolution))
         if row < 0 or col < 0 or row >= near.shape[0] or col >= near.shape[1]:
             ends_well = _HALF
-        elif near[row, col] * NEAR_UNIT_M > slack:
-            ends_well = _HALF if states[row, col] == UNKNOWN else 0.0
+        else:
+            away = int(near[row, col])
+            if away * NEAR_UNIT_M > slack:
+                ends_well, away = (_HALF, 0) if states[row, col] == UNKNOWN else (0.0, 0)
     if ends_well > 0.0:
         most = max((range_m - slack) / resolution, 0.0)
         way, state = free_way(states, x, y, angle, most)
@@ -188,7 +197,7 @@ def _is_explained(
                 right, right_state = free_way(states, x + s * aside, y - c * aside, angle, most)
                 if left_state == FREE or right_state == FREE or left >= most or right >= most:
                     ends_well = 1.0
-    return ends_well
+    return ends_well, away
 
 
 @kernel

@@ -15,6 +15,7 @@ _FEWEST_WALLS = 6  # beams that met something, below which a scan could be anywh
 _MOST_SPOTS = 3000
 _MOST_LOOKED_AT_TWICE = 600
 _LEAST_SHARE = 0.6  # of the directions that must show what was measured
+_CLEARLY_WORSE = 0.1  # share of the directions
 _BELOW_BEST = 0.2  # share of the beams that a candidate may explain less than the best one
 
 
@@ -28,23 +29,25 @@ class KeyView:
 
 def candidates(
     places: Places, judge: Judge, seen: Observation, drawn: Array, rng: np.random.Generator
-) -> Array:
-    """Poses (N, 3) that explain a scan about as well as any in the map, refined.
+) -> tuple[Array, bool]:
+    """Poses (N, 3) that explain a scan about as well as any in the map, refined, and whether these are all.
 
     Every spot of the map is compared under every heading, range by range; to the best of them come the samples
     drawn (M, 3). None where the scan shows next to nothing.
     """
     if int(seen.met.sum()) < _FEWEST_WALLS:
-        return np.empty((0, 3))
-    poses = judge.refined(np.concatenate([_best_spots(places, seen, rng), drawn]), seen, far=True)
-    counts = judge.explained(poses, seen)
+        return np.empty((0, 3)), False
+    spots, complete = _best_spots(places, seen, rng)
+    poses = judge.refined(np.concatenate([spots, drawn]), seen)
+    counts, _ = judge.explained(poses, seen)
     good = counts >= counts.max() - _BELOW_BEST * len(seen.ranges_m)
     poses, counts = poses[good], counts[good]
-    return distinct(poses[np.argsort(-counts, kind='stable')], 0.3, 0.15, _MOST_LOOKED_AT_TWICE)
+    found = distinct(poses[np.argsort(-counts, kind='stable')], 0.3, 0.15, _MOST_LOOKED_AT_TWICE)
+    return found, complete and len(found) < _MOST_LOOKED_AT_TWICE
 
 
-def _best_spots(places: Places, seen: Observation, rng: np.random.Generator) -> Array:
-    """Spots with headings (N, 3) whose ranges all round agree best with a scan."""
+def _best_spots(places: Places, seen: Observation, rng: np.random.Generator) -> tuple[Array, bool]:
+    """Spots with headings (N, 3) whose ranges all round agree best with a scan; whether all that may be are there."""
     ranges, known, met = profile(seen)
     # Off by half a spacing, by half a direction, and more where walls are seen at a slant.
     slack = places.spacing_m + ranges * (np.pi / DIRECTIONS)
@@ -55,7 +58,9 @@ def _best_spots(places: Places, seen: Observation, rng: np.random.Generator) -> 
     # Equals in random order: where there are too many, each has its chance.
     order = np.argsort(-(counts + rng.random(len(counts))), kind='stable')[:_MOST_SPOTS]
     turns = headings[order] * (2.0 * np.pi / DIRECTIONS)
-    return np.column_stack([places.spots[spots[order]], turns])
+    # Those left out must be clearly worse than the best.
+    cut = len(counts) > _MOST_SPOTS and counts[order[-1]] > counts.max() - _CLEARLY_WORSE * int(known.sum())
+    return np.column_stack([places.spots[spots[order]], turns]), not cut
 
 
 def distinct(poses: Array, apart_m: float, apart_rad: float, most: int) -> Array:
@@ -89,7 +94,7 @@ def unexplained_before(judge: Judge, views: list[KeyView], poses: Array, T_odom_
         # From view to view: what odometry is off does not add up.
         now = judge.refined(moved(now, back), view.seen)
         at = view.T_odom_base
-        missing[k] = len(view.seen.ranges_m) - judge.explained(now, view.seen)
+        missing[k] = len(view.seen.ranges_m) - judge.explained(now, view.seen)[0]
     return missing
 
 
