@@ -31,14 +31,12 @@ class GlobalLocalizationConfig(Config):
     )
     sure_share: float = parameter(0.99, 'weight of the one hypothesis of a robot that is sure', low=0.6, high=1.0)
     sure_looks: int = parameter(3, 'looks in a row at which all must speak for one place before it is sure', low=1, high=1000)
-    sure_explained: float = parameter(
-        0.8, 'share of the beams that it must explain, over all its looks', low=0.3, high=1.0
+    least_explained: float = parameter(
+        0.8, 'a place that explains less than this share of what was seen is not taken for the right one',
+        low=0.3, high=1.0,
     )
     sure_sigma_m: float = parameter(0.15, 'its place must be known to this, 1 sigma, m', low=0.01, high=5.0)
     sure_sigma_rad: float = parameter(0.07, 'its heading must be known to this, 1 sigma, rad', low=0.005, high=1.0)
-    foreign_explained: float = parameter(
-        0.65, 'a map of which no pose explains this share of the beams is of another place', low=0.1, high=1.0
-    )
     foreign_way_m: float = parameter(
         2.0, 'so much way must have been looked at to say that a map is of another place, m', low=0.0, high=100.0
     )

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import GridPatch
@@ -14,7 +15,7 @@ from thinmap_ros.core.localization.hypotheses import Hypotheses, evidence_agains
 from thinmap_ros.core.localization.judging import Judge
 from thinmap_ros.core.localization.observation import Observation, observe
 from thinmap_ros.core.localization.places import Places
-from thinmap_ros.core.localization.search import KeyView, candidates, moved, unexplained_before
+from thinmap_ros.core.localization.search import KeyView, candidates, judged_before, moved
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
@@ -23,15 +24,18 @@ __all__ = ['GlobalLocalization', 'GlobalLocalizationConfig', 'Hypothesis', 'Resu
 
 # Looks from about the same place meet the same errors of the map; they are independent after so much motion.
 _NEW_WAY_M, _NEW_TURN_RAD = 0.5, 0.5
-_SURE_NOVELTY = 0.5
+_SURE_NOVELTY, _SURE_NOVELTY_MISSING, _SURE_NOVELTY_LATE = 0.6, 30.0, 0.5
+# After so many independent looks, one place that explains must have lasted for so many.
+_MANY_LOOKS, _LASTING_LOOKS = 16.0, 8.0
 _VIEWS = 6
 _FRESH_SHARE = 0.2  # of the samples that are drawn anew all over the map while the search is on
 _FRESH_BEST = 100
 _JUMP_RAD = 2.0
 _STANDING_NOISE = (0.01, 0.005)  # m, rad: samples do not fall together
 # A search that looked at all of the map and did not find the right place: this often. So who turns up late is unlikely.
-_LOG_MISSED = math.log(0.2)
-_LEAST_LOG_PRIOR = -12.0
+_LOG_MISSED = math.log(0.3)
+_LEAST_LOG_PRIOR = -9.0
+_TRUST_FROM = 0.6  # share of the beams that must be explained for that
 _FIRST_SEARCHES, _LATER_EVERY = 6, 4.0  # looks: once all places are known, the map is searched less often
 
 
@@ -106,6 +110,7 @@ class GlobalLocalization:
         self._T_step: Array | None = None
         self._T_look: Array | None = None
         self._way_m = 0.0
+        self._independent = 0.0  # looks
         self._since_search = math.inf
         self._searches = 0  # that were complete
         self._convinced = (0, 0.0)  # looks in a row, and independent ones of these, at which all spoke for one place
@@ -155,15 +160,16 @@ class GlobalLocalization:
         seen = observe(scan, self.places.frame.resolution, self.config)
         self._advance(T_odom_base)
         self._since_search += novelty
+        self._independent += novelty
         every = 1.0 if self._searches < _FIRST_SEARCHES or self._explains_badly() else _LATER_EVERY
         if self._since_search >= every and not self.is_sure:
             self._search(judge, seen, T_odom_base)
         known = self._known
         if len(known):
-            self._realign(judge, seen)
-            counts, self.fits = judge.explained(known.poses, seen)
-            against = evidence_against(len(seen.ranges_m) - counts, len(seen.ranges_m), novelty)
-            known.take_evidence(counts, len(seen.ranges_m), novelty, against)
+            known.poses = judge.refined(known.poses, seen, known.covariances)
+            judged = judge.explained(known.poses, seen)
+            against = evidence_against(judged, len(seen.ranges_m), novelty)
+            known.take_evidence(judged, len(seen.ranges_m), novelty, against)
             known.prune()
             known.resample(None, self.config.samples, self._rng) if not len(known.samples) else None
             logs = judge.log_likelihoods(known.samples, seen)
@@ -172,11 +178,6 @@ class GlobalLocalization:
         looks, independent = self._convinced
         self._convinced = (looks + 1, independent + novelty) if self._speaks_for_one() else (0, 0.0)
         self._T_look = T_odom_base
-
-    def _realign(self, judge: Judge, seen: Observation) -> None:
-        """Move each hypothesis to where this scan fits best: near itself, or near the best of its samples."""
-        known = self._known
-        known.poses = judge.refined(known.poses, seen)
 
     def _ready(self, scan: Scan) -> Judge:
         """The judge; the first scan tells which laser it is for."""
@@ -204,24 +205,30 @@ class GlobalLocalization:
         logs = judge.log_likelihoods(self._drawn, seen)
         drawn = self._drawn[np.argsort(-logs, kind='stable')[:_FRESH_BEST]]
         found, complete = candidates(self.places, judge, seen, drawn, self._rng)
-        poses = np.concatenate([self._known.poses, found])
         if len(found):
-            missing = unexplained_before(judge, self._views, poses, T_odom_base)
-            old = len(self._known)
-            against, explained, beams = np.zeros(len(found)), np.zeros(len(found)), 0.0
-            for view, row in zip(self._views, missing, strict=True):
-                count = len(view.seen.ranges_m)
-                against += evidence_against(row, count, 1.0)[old:]
-                explained += count - row[old:]
-                beams += count
-            prior = max(self._searches * _LOG_MISSED, _LEAST_LOG_PRIOR)
-            self._known.add(found, prior - against, explained, beams)
+            poses = np.concatenate([self._known.poses, found])
+            counts, silent = judged_before(
+                judge, self._views, poses, T_odom_base, self.config.odometry_noise
+            )
+            new = slice(len(self._known), None)
+            against, beams = np.zeros(len(found)), 0.0
+            for k, view in enumerate(self._views):
+                against += evidence_against((counts[k], silent[k]), len(view.seen.ranges_m), 1.0)[new]
+                beams += len(view.seen.ranges_m)
+            judged = counts.sum(axis=0)[new], silent.sum(axis=0)[new]
+            self._known.add(found, self._log_prior() - against, judged, beams)
         self._searches += complete
         self._views = [*self._views[-_VIEWS + 1 :], KeyView(seen, T_odom_base)]
 
+    def _log_prior(self) -> float:
+        """Log odds of a place that turns up late, against those that are known: less, the better these explain all."""
+        most = float(self._known.shares_explained.max(initial=0.0))
+        trust = min(max((most - _TRUST_FROM) / (1.0 - _TRUST_FROM), 0.0), 1.0)
+        return trust * max(self._searches * _LOG_MISSED, _LEAST_LOG_PRIOR)
+
     def _explains_badly(self) -> bool:
         """Whether no hypothesis explains enough to be sure of."""
-        return float(self._known.shares_explained.max(initial=0.0)) < self.config.sure_explained
+        return float(self._known.shares_explained.max(initial=0.0)) < self.config.least_explained
 
     @property
     def _fresh(self) -> int:
@@ -237,8 +244,18 @@ class GlobalLocalization:
 
     @property
     def is_sure(self) -> bool:
-        """Whether one place alone has explained all for some looks in a row, from more than one point of view."""
-        return self._convinced[0] >= self.config.sure_looks and self._convinced[1] >= _SURE_NOVELTY
+        """Whether one place alone has explained all for some looks in a row, from more than one point of view.
+
+        The less it explains, and the later it turned up, the longer: a place in a map of another building may look
+        alike for a while.
+        """
+        looks, independent = self._convinced
+        if looks < self.config.sure_looks:
+            return False
+        share = float(self._known.shares_explained[self._known.best()])
+        late = self._independent - float(self._known.ages[self._known.best()])
+        needed = _SURE_NOVELTY + _SURE_NOVELTY_MISSING * (1.0 - share) + _SURE_NOVELTY_LATE * late
+        return independent >= needed
 
     def _speaks_for_one(self) -> bool:
         known, config = self._known, self.config
@@ -248,10 +265,16 @@ class GlobalLocalization:
         sigma_m = math.sqrt(max(float(np.linalg.eigvalsh(known.covariances[best][:2, :2])[-1]), 0.0))
         return (
             float(known.weights[best]) >= config.sure_share
-            and float(known.shares_explained[best]) >= config.sure_explained
+            and float(known.shares_explained[best]) >= config.least_explained
             and sigma_m <= config.sure_sigma_m
             and math.sqrt(max(float(known.covariances[best][2, 2]), 0.0)) <= config.sure_sigma_rad
         )
+
+    def _lasting(self) -> NDArray[np.bool_]:
+        """Hypotheses (H,) that explain enough, and have done so for some time where much has been seen."""
+        known = self._known
+        enough = known.shares_explained >= self.config.least_explained
+        return enough & ((self._independent < _MANY_LOOKS) | (known.ages >= _LASTING_LOOKS))
 
     def _waiting(self, reason: str) -> Result:
         return Result(State.WAITING, reason, ())
@@ -269,9 +292,9 @@ class GlobalLocalization:
         best = hypotheses[0]
         if self.is_sure:
             return Result(State.LOCALIZED, f'one place explains {best.explained:.0%} of what was seen', hypotheses)
-        most = float(shares.max())
-        if self._way_m >= self.config.foreign_way_m and most < self.config.foreign_explained:
-            return Result(State.NOT_IN_MAP, f'no place explains more than {most:.0%} of what was seen', hypotheses)
+        if self._way_m >= self.config.foreign_way_m and not self._lasting().any():
+            share = self.config.least_explained
+            return Result(State.NOT_IN_MAP, f'no place explains {share:.0%} of what was seen for long', hypotheses)
         likely = int((weights > 0.05 * weights.max()).sum())
         if likely > 1:
             return Result(State.AMBIGUOUS, f'{likely} places explain what was seen', hypotheses)

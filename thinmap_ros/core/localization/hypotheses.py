@@ -20,17 +20,21 @@ _MOST_A_LOOK = 3.0
 _LEAST_LOG_WEIGHT = -14.0
 _MOST = 400
 _SAME_M, _SAME_RAD = 0.3, 0.15
+_LEAST_ASKED = 0.6  # share of the beams
 _NEW_SIGMA_M, _NEW_SIGMA_RAD = 0.08, 0.03
 _MEMORY = 0.9  # of what was explained, from one independent look to the next
 
 
-def evidence_against(missing: Array, beams: int, novelty: float) -> Array:
-    """What is taken off log weights for beams (N,) that are not explained, in comparison with the best one.
+def evidence_against(judged: tuple[Array, Array], beams: int, novelty: float) -> Array:
+    """What is taken off log weights for beams that are not explained, in comparison with the best one, (N,).
+
+    judged: of so many beams, how many the map explains, and of how many it says nothing, (N,) each; these count half.
 
     Differences that chance brings about at edges count for nothing, however often they come: two rooms that look the
     same stay equally likely.
     """
     allowed = 2.0 * math.sqrt(beams * EDGE_SHARE * (1.0 - EDGE_SHARE))
+    missing = beams - judged[0] - 0.5 * judged[1]
     beyond = np.maximum(missing - missing.min(initial=np.inf) - allowed, 0.0)
     return novelty * np.minimum(LOG_ODDS_A_BEAM * beyond, _MOST_A_LOOK)
 
@@ -39,15 +43,17 @@ def evidence_against(missing: Array, beams: int, novelty: float) -> Array:
 class Hypotheses:
     """Places of the robot as arrays over hypotheses (H), and samples (N, 3) that belong to them (N,), in order.
 
-    poses (H, 3); log_weights (H,), the best one 0; covariances (H, 3, 3); looks (H,): that each has explained;
-    explained, beams (H,): sums over looks, older ones counting less.
+    poses (H, 3); log_weights (H,), the best one 0; covariances (H, 3, 3); ages (H,): independent looks since each was found;
+    explained, asked, beams (H,): sums over looks of the beams that the map explains, of those it says something
+    about, and of all; older ones count less.
     """
 
     poses: Array
     log_weights: Array
     covariances: Array
-    looks: Array
+    ages: Array
     explained: Array
+    asked: Array
     beams: Array
     samples: Array
     owners: NDArray[np.int64]
@@ -57,7 +63,7 @@ class Hypotheses:
         """No hypothesis."""
         empty = np.empty(0)
         return Hypotheses(
-            np.empty((0, 3)), empty, np.empty((0, 3, 3)), empty, empty, empty, np.empty((0, 3)),
+            np.empty((0, 3)), empty, np.empty((0, 3, 3)), empty, empty, empty, empty, np.empty((0, 3)),
             np.empty(0, dtype=np.int64),
         )
 
@@ -72,8 +78,9 @@ class Hypotheses:
 
     @property
     def shares_explained(self) -> Array:
-        """Share of the beams that each explains, over its looks, (H,)."""
-        return np.asarray(self.explained / np.maximum(self.beams, 1e-9))
+        """Share of the beams that each explains, over its looks, of those that the map says something about, (H,)."""
+        # Where that are few, they prove little.
+        return np.asarray(self.explained / np.maximum(np.maximum(self.asked, _LEAST_ASKED * self.beams), 1e-9))
 
     def move(self, motion: Array, noise: tuple[float, float], rng: np.random.Generator) -> None:
         """Move all by odometry (3,), robot frame; samples with noise: 1 sigma, m and rad."""
@@ -83,16 +90,17 @@ class Hypotheses:
         self.samples += rng.normal(size=self.samples.shape) * spread
         self.covariances = self.covariances + np.diag(spread**2)
 
-    def take_evidence(self, counts: Array, beams: int, novelty: float, against: Array) -> None:
-        """Take in a look: beams (H,) that each explains of so many, and what is taken off its log weight (H,)."""
+    def take_evidence(self, judged: tuple[Array, Array], beams: int, novelty: float, against: Array) -> None:
+        """Take in a look: what each makes of so many beams (see evidence_against); what is taken off its log weight."""
         self.log_weights = self.log_weights - against
         self.log_weights -= self.log_weights.max(initial=-np.inf)
         fade = _MEMORY**novelty
-        self.explained = fade * self.explained + novelty * counts
+        self.explained = fade * self.explained + novelty * judged[0]
+        self.asked = fade * self.asked + novelty * (beams - judged[1])
         self.beams = fade * self.beams + novelty * beams
-        self.looks = self.looks + 1.0
+        self.ages = self.ages + novelty
 
-    def add(self, poses: Array, log_weights: Array, explained: Array, beams: float) -> None:
+    def add(self, poses: Array, log_weights: Array, judged: tuple[Array, Array], beams: float) -> None:
         """Take up new ones (N, 3) with their evidence so far."""
         count = len(poses)
         self.poses = np.concatenate([self.poses, poses])
@@ -100,8 +108,9 @@ class Hypotheses:
         self.log_weights -= self.log_weights.max(initial=-np.inf)
         fresh = np.broadcast_to(np.diag([_NEW_SIGMA_M**2, _NEW_SIGMA_M**2, _NEW_SIGMA_RAD**2]), (count, 3, 3))
         self.covariances = np.concatenate([self.covariances, fresh])
-        self.looks = np.concatenate([self.looks, np.zeros(count)])
-        self.explained = np.concatenate([self.explained, explained])
+        self.ages = np.concatenate([self.ages, np.zeros(count)])
+        self.explained = np.concatenate([self.explained, judged[0]])
+        self.asked = np.concatenate([self.asked, beams - judged[1]])
         self.beams = np.concatenate([self.beams, np.full(count, beams)])
 
     def prune(self) -> None:
@@ -111,7 +120,7 @@ class Hypotheses:
         kept = order[distinct_indices(self.poses[order], _SAME_M, _SAME_RAD, _MOST)]
         renumbered = np.full(len(self.poses), -1)
         renumbered[kept] = np.arange(len(kept))
-        for name in ('poses', 'log_weights', 'covariances', 'looks', 'explained', 'beams'):
+        for name in ('poses', 'log_weights', 'covariances', 'ages', 'explained', 'asked', 'beams'):
             setattr(self, name, getattr(self, name)[kept])
         owners = renumbered[self.owners]
         order = np.argsort(owners, kind='stable')[int((owners < 0).sum()) :]

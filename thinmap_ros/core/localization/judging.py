@@ -23,7 +23,7 @@ _BEAMS_A_FACT = 6.0
 _NODES_A_FACT = 2.0
 _FINE_STEPS = np.array([[0.04, 0.015], [0.02, 0.0075]])
 _ROUNDS = 6
-_WORTH_A_JUMP = 1.0  # beams that a place farther off must fit better
+_LEAST_COVARIANCE = np.diag([0.02**2, 0.02**2, 0.01**2])
 
 
 class Judge:
@@ -40,7 +40,6 @@ class Judge:
         off = np.arange(256) * NEAR_UNIT_M / sigma
         bell = np.exp(-0.5 * off**2)
         self._log_table = np.log((1.0 - _OUTLIERS) * bell + _OUTLIERS) / _BEAMS_A_FACT
-        self._fine_table = bell
         self._pulls = [(np.exp(-0.5 * (off * sigma / pull) ** 2), steps) for pull, steps in _PULLS]
 
     def log_likelihoods(self, poses: Array, seen: Observation) -> Array:
@@ -59,30 +58,32 @@ class Judge:
         )
         return np.asarray(ratios / _NODES_A_FACT)
 
-    def refined(self, poses: Array, seen: Observation) -> Array:
-        """Poses (N, 3) moved to where the beams fit best near by.
+    def refined(self, poses: Array, seen: Observation, covariances: Array | None = None) -> Array:
+        """Poses (N, 3) moved to where the beams fit best near by; covariances (N, 3, 3): how far that may be.
 
         Once straight from where they are, once from where they fit when walls pull from far: whichever fits better.
         """
-        near, far = self._uphill(poses, seen, self._fine_table, _FINE_STEPS), poses
+        free = np.zeros((len(poses), 3, 3))
+        held = free if covariances is None else np.linalg.inv(covariances + _LEAST_COVARIANCE)
+        near, near_score = self._uphill(poses, seen, self._log_table, _FINE_STEPS, poses, held)
+        far = poses
         for table, steps in self._pulls:
-            far = self._uphill(far, seen, table, steps)
-        far = self._uphill(far, seen, self._fine_table, _FINE_STEPS)
-        better = self._fit(far, seen) > self._fit(near, seen) + _WORTH_A_JUMP
-        return np.where(better[:, None], far, near)
+            far, _ = self._uphill(far, seen, table, steps, poses, free)
+        far, far_score = self._uphill(far, seen, self._log_table, _FINE_STEPS, poses, held)
+        return np.where((far_score > near_score)[:, None], far, near)
 
-    def _uphill(self, poses: Array, seen: Observation, table: Array, steps: Array) -> Array:
-        near, resolution = self._places.near, self._places.frame.resolution
-        return matching.refine(poses, seen.ends[seen.met], near, self._origin, resolution, table, steps, _ROUNDS)
-
-    def _fit(self, poses: Array, seen: Observation) -> Array:
-        near, resolution = self._places.near, self._places.frame.resolution
-        return matching.range_scores(poses, seen.ends[seen.met], near, self._origin, resolution, self._fine_table)
+    def _uphill(
+        self, poses: Array, seen: Observation, table: Array, steps: Array, expected: Array, held: Array
+    ) -> tuple[Array, Array]:
+        near, resolution, ends = self._places.near, self._places.frame.resolution, seen.ends[seen.met]
+        return matching.refine(
+            poses, ends, near, self._origin, resolution, table, steps, _ROUNDS, expected, held
+        )
 
     def explained(self, poses: Array, seen: Observation) -> tuple[Array, Array]:
-        """How many of the beams the map explains from poses (N, 3), and how well in all, (N,) each."""
+        """How many of the beams the map explains from poses (N, 3), and of how many it says nothing, (N,) each."""
         places = self._places
         return matching.explained(
             poses, seen.laser, seen.ranges_m, seen.bearings_rad, seen.met, (places.states, places.near), self._origin,
-            places.frame.resolution, self.tolerance, self._fine_table,
+            places.frame.resolution, self.tolerance,
         )

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.jit import inlined, kernel
-from thinmap_ros.core.localization.places import FREE, NEAR_UNIT_M, UNKNOWN, Bytes, free_way
+from thinmap_ros.core.localization.places import NEAR_UNIT_M, UNKNOWN, WALL, Bytes, free_way
 from thinmap_ros.core.se2 import Array
 
 _ASIDE_M = 0.12  # a beam is stopped only where those beside it, this far off, are stopped too
-_HALF = 0.5  # what a beam counts that ends in what the map does not know
+_NO, _YES, _SAYS_NOTHING = 0, 1, 2
 
 
 @kernel
@@ -99,16 +99,21 @@ def refine(
     table: Array,
     steps: Array,
     rounds: int,
-) -> Array:
-    """Poses (N, 3) moved uphill on their range score: along x, y and heading by ever smaller steps.
+    expected: Array,
+    information: Array,
+) -> tuple[Array, Array]:
+    """Poses (N, 3) moved uphill on their range score: along x, y and heading by ever smaller steps; their scores (N,).
 
-    steps (S, 2): m and rad; at each, up to `rounds` times the best of six neighbours is taken.
+    steps (S, 2): m and rad; at each, up to `rounds` times the best of six neighbours is taken. Taken off the score is
+    half the squared distance from the expected poses (N, 3), measured by information matrices (N, 3, 3).
     """
     rows, cols = near.shape
-    result = poses.copy()
+    result, scores = poses.copy(), np.zeros(len(poses))
     for i in range(len(poses)):
         x, y, theta = poses[i, 0] - origin[0], poses[i, 1] - origin[1], poses[i, 2]
+        mid = (expected[i, 0] - origin[0], expected[i, 1] - origin[1], expected[i, 2])
         best = _range_score(x, y, theta, ends, near, rows, cols, resolution, table)
+        best -= _unlikely(x - mid[0], y - mid[1], theta - mid[2], information[i])
         for step in range(len(steps)):
             for _ in range(rounds):
                 move = -1
@@ -118,6 +123,7 @@ def refine(
                     d_y = sign * steps[step, 0] if 2 <= k < 4 else 0.0
                     turn = sign * steps[step, 1] if k >= 4 else 0.0
                     score = _range_score(x + d_x, y + d_y, theta + turn, ends, near, rows, cols, resolution, table)
+                    score -= _unlikely(x + d_x - mid[0], y + d_y - mid[1], theta + turn - mid[2], information[i])
                     if score > best + 1e-9:
                         best, move = score, k
                 if move < 0:
@@ -126,8 +132,17 @@ def refine(
                 x += sign * steps[step, 0] if move < 2 else 0.0
                 y += sign * steps[step, 0] if 2 <= move < 4 else 0.0
                 theta += sign * steps[step, 1] if move >= 4 else 0.0
-        result[i, 0], result[i, 1], result[i, 2] = x + origin[0], y + origin[1], theta
-    return result
+        result[i, 0], result[i, 1], result[i, 2], scores[i] = x + origin[0], y + origin[1], theta, best
+    return result, scores
+
+
+@inlined
+def _unlikely(x: float, y: float, turn: float, information: Array) -> float:
+    """Half the squared length of a difference of poses, measured by an information matrix (3, 3)."""
+    turn = math.pi - (math.pi - turn) % (2.0 * math.pi)
+    squared = x * x * information[0, 0] + y * y * information[1, 1] + turn * turn * information[2, 2]
+    squared += 2.0 * (x * y * information[0, 1] + x * turn * information[0, 2] + y * turn * information[1, 2])
+    return 0.5 * squared
 
 
 @kernel
@@ -141,18 +156,16 @@ def explained(
     origin: tuple[float, float],
     resolution: float,
     tolerance: tuple[float, float],
-    bell: Array,
 ) -> tuple[Array, Array]:
-    """How many of the beams the map explains from each pose, (N,): those that could have come about as measured.
+    """How many of the beams the map explains from each pose, and of how many it says nothing, (N,) each.
 
-    And how well, (N,): each of these counts by how near to a wall it ends.
+    Explained is what could have come about as measured.
 
     poses (N, 3): of the robot; laser (3,): on it; ranges, bearings, met (B,): see Observation; maps: states and near
     of Places; tolerance: in m, and in m for each m of range. A beam that met something must end beside a wall, one
-    that met nothing nowhere; on its way there must be no wall. What ends or passes through the unknown counts half.
-    bell (256,): what a beam counts by the distance of its end from the nearest wall.
+    that met nothing nowhere; on its way there must be no wall. Of what ends in or passes through the unknown the map says nothing.
     """
-    counts, fits = np.zeros(len(poses)), np.zeros(len(poses))
+    counts, silent = np.zeros(len(poses)), np.zeros(len(poses))
     for i in range(len(poses)):
         c, s = math.cos(poses[i, 2]), math.sin(poses[i, 2])
         x = (poses[i, 0] + c * laser[0] - s * laser[1] - origin[0]) / resolution
@@ -161,43 +174,41 @@ def explained(
         for j in range(len(ranges)):
             slack = tolerance[0] + tolerance[1] * ranges[j]
             angle = heading + bearings[j]
-            counted, away = _is_explained(maps, x, y, angle, ranges[j], met[j], slack, resolution)
-            counts[i] += counted
-            fits[i] += counted * bell[away]
-    return counts, fits
+            answer = _explains(maps, x, y, angle, ranges[j], met[j], slack, resolution)
+            counts[i] += answer == _YES
+            silent[i] += answer == _SAYS_NOTHING
+    return counts, silent
 
 
 @inlined
-def _is_explained(
+def _explains(
     maps: tuple[Bytes, Bytes], x: float, y: float, angle: float, range_m: float, met: bool, slack: float,
     resolution: float,
-) -> tuple[float, int]:
-    """What a beam counts, and how far from a wall it ends, in NEAR_UNIT_M; 0 where it should not end at one."""
+) -> int:
+    """Whether the map explains a beam from a point (x, y, in cells): _YES, _NO or _SAYS_NOTHING."""
     states, near = maps
     c, s = math.cos(angle), math.sin(angle)
-    ends_well, away = 1.0, 0
+    answer = _YES
     if met:
         row = int(math.floor(y + s * range_m / resolution))
         col = int(math.floor(x + c * range_m / resolution))
         if row < 0 or col < 0 or row >= near.shape[0] or col >= near.shape[1]:
-            ends_well = _HALF
-        else:
-            away = int(near[row, col])
-            if away * NEAR_UNIT_M > slack:
-                ends_well, away = (_HALF, 0) if states[row, col] == UNKNOWN else (0.0, 0)
-    if ends_well > 0.0:
-        most = max((range_m - slack) / resolution, 0.0)
+            answer = _SAYS_NOTHING
+        elif near[row, col] * NEAR_UNIT_M > slack:
+            answer = _SAYS_NOTHING if states[row, col] == UNKNOWN else _NO
+    most = max((range_m - slack) / resolution, 0.0)
+    if answer != _NO:
         way, state = free_way(states, x, y, angle, most)
-        if state != FREE and way < most:
-            ends_well = min(ends_well, _HALF if state == UNKNOWN else 0.0)
-            if ends_well == 0.0:
-                # A beam that grazes a wall, or passes close by an edge, is off by less than a body's width.
-                aside = _ASIDE_M / resolution
-                left, left_state = free_way(states, x - s * aside, y + c * aside, angle, most)
-                right, right_state = free_way(states, x + s * aside, y - c * aside, angle, most)
-                if left_state == FREE or right_state == FREE or left >= most or right >= most:
-                    ends_well = 1.0
-    return ends_well, away
+        if state == UNKNOWN and way < most:
+            answer = _SAYS_NOTHING
+        elif state == WALL and way < most:
+            # A beam that grazes a wall, or passes close by an edge, is off by less than a body's width.
+            aside = _ASIDE_M / resolution
+            left, left_state = free_way(states, x - s * aside, y + c * aside, angle, most)
+            right, right_state = free_way(states, x + s * aside, y - c * aside, angle, most)
+            if left_state == WALL and left < most and right_state == WALL and right < most:
+                answer = _NO
+    return answer
 
 
 @kernel

@@ -11,6 +11,7 @@ from thinmap_ros.core.localization.observation import Observation, profile
 from thinmap_ros.core.localization.places import DIRECTIONS, RANGE_UNIT_M, Places
 from thinmap_ros.core.se2 import Array
 
+_SILENT_COUNTS = 0.5  # a beam of which the map says nothing
 _FEWEST_WALLS = 6  # beams that met something, below which a scan could be anywhere
 _MOST_SPOTS = 3000
 _MOST_LOOKED_AT_TWICE = 600
@@ -39,7 +40,8 @@ def candidates(
         return np.empty((0, 3)), False
     spots, complete = _best_spots(places, seen, rng)
     poses = judge.refined(np.concatenate([spots, drawn]), seen)
-    counts, _ = judge.explained(poses, seen)
+    counts, silent = judge.explained(poses, seen)
+    counts += _SILENT_COUNTS * silent
     good = counts >= counts.max() - _BELOW_BEST * len(seen.ranges_m)
     poses, counts = poses[good], counts[good]
     found = distinct(poses[np.argsort(-counts, kind='stable')], 0.3, 0.15, _MOST_LOOKED_AT_TWICE)
@@ -84,18 +86,30 @@ def distinct_indices(poses: Array, apart_m: float, apart_rad: float, most: int) 
     return kept
 
 
-def unexplained_before(judge: Judge, views: list[KeyView], poses: Array, T_odom_base: Array) -> Array:
-    """Beams of earlier views (V) that poses (N, 3) held now do not explain, (V, N), by odometry back to there."""
-    missing = np.zeros((len(views), len(poses)))
+def judged_before(
+    judge: Judge, views: list[KeyView], poses: Array, T_odom_base: Array, odometry_noise: float
+) -> tuple[Array, Array]:
+    """Beams of earlier views (V) that the map explains from poses (N, 3) held now, and of how many it says nothing.
+
+    (V, N) each, by odometry back to there.
+    """
+    counts, silent = np.zeros((len(views), len(poses))), np.zeros((len(views), len(poses)))
     now, at = poses, T_odom_base
     for k in range(len(views) - 1, -1, -1):
         view = views[k]
-        back = se2.between(at, view.T_odom_base)
         # From view to view: what odometry is off does not add up.
-        now = judge.refined(moved(now, back), view.seen)
+        back = se2.between(at, view.T_odom_base)
+        drift = _drift(back, odometry_noise)
+        now = judge.refined(moved(now, back), view.seen, np.broadcast_to(drift, (len(now), 3, 3)))
         at = view.T_odom_base
-        missing[k] = len(view.seen.ranges_m) - judge.explained(now, view.seen)[0]
-    return missing
+        counts[k], silent[k] = judge.explained(now, view.seen)
+    return counts, silent
+
+
+def _drift(motion: Array, noise: float) -> Array:
+    """Covariance (3, 3) of a motion (3,) by odometry."""
+    way, turn = float(np.hypot(motion[0], motion[1])), abs(float(motion[2]))
+    return np.diag(np.square([noise * way, noise * way, noise * (way + turn)]))
 
 
 def moved(poses: Array, motion: Array) -> Array:
