@@ -1,10 +1,10 @@
-"""All benchmarks: python -m benchmarks.run [thinning mapping graphs online] [--quick] [--worlds DIR]."""
+"""All benchmarks: python -m benchmarks.run [thinning mapping graphs online localization] [--quick] [--worlds DIR]."""
 
 import argparse
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from benchmarks import graphs, mapping, online, thinning
+from benchmarks import graphs, localization, mapping, online, thinning
 from benchmarks.table import Row, show
 from benchmarks.worlds import WORLDS
 
@@ -13,6 +13,7 @@ _ALL: dict[str, Callable[[Path, bool], Iterable[Row]]] = {
     'mapping': mapping.run,
     'graphs': graphs.run,
     'online': online.run,
+    'localization': localization.run,
 }
 
 

@@ -24,9 +24,11 @@ __all__ = ['GlobalLocalization', 'GlobalLocalizationConfig', 'Hypothesis', 'Resu
 
 # Looks from about the same place meet the same errors of the map; they are independent after so much motion.
 _NEW_WAY_M, _NEW_TURN_RAD = 0.5, 0.5
-_SURE_NOVELTY, _SURE_NOVELTY_MISSING, _SURE_NOVELTY_LATE = 0.6, 30.0, 0.5
-# After so many independent looks, one place that explains must have lasted for so many.
-_MANY_LOOKS, _LASTING_LOOKS = 16.0, 8.0
+# Way, m, for which one place must have explained all alone; more for each e-fold of places that looked alike, for
+# what it does not explain (1: all), and for each metre before it turned up.
+_SURE_WAY_M, _SURE_WAY_CROWD_M, _SURE_WAY_MISSING_M, _SURE_WAY_LATE = 0.2, 0.6, 15.0, 0.25
+# After so many independent looks, a place that explains must have lasted for this share of them, but not for ever.
+_MANY_LOOKS, _LASTING_SHARE, _LASTING_LOOKS = 16.0, 0.4, 20.0
 _VIEWS = 6
 _FRESH_SHARE = 0.2  # of the samples that are drawn anew all over the map while the search is on
 _FRESH_BEST = 100
@@ -113,7 +115,8 @@ class GlobalLocalization:
         self._independent = 0.0  # looks
         self._since_search = math.inf
         self._searches = 0  # that were complete
-        self._convinced = (0, 0.0)  # looks in a row, and independent ones of these, at which all spoke for one place
+        self._convinced = (0, 0.0)  # looks in a row at which all spoke for one place, and the way meanwhile, m
+        self._crowd = 1.0  # how many places looked alike at the most, counted by their weights
         self._drawn = self._draw(self.config.samples)
 
     @property
@@ -175,8 +178,11 @@ class GlobalLocalization:
             logs = judge.log_likelihoods(known.samples, seen)
             known.weigh(logs)
             known.resample(logs, self.config.samples, self._rng)
-        looks, independent = self._convinced
-        self._convinced = (looks + 1, independent + novelty) if self._speaks_for_one() else (0, 0.0)
+        if len(known):
+            self._crowd = max(self._crowd, float(np.exp(known.log_weights).sum()))
+        looks, begun_m = self._convinced
+        begun_m = begun_m if looks else self._way_m
+        self._convinced = (looks + 1, begun_m) if self._speaks_for_one() else (0, 0.0)
         self._T_look = T_odom_base
 
     def _ready(self, scan: Scan) -> Judge:
@@ -244,18 +250,19 @@ class GlobalLocalization:
 
     @property
     def is_sure(self) -> bool:
-        """Whether one place alone has explained all for some looks in a row, from more than one point of view.
+        """Whether one place alone has explained all for some looks in a row, and for some way.
 
-        The less it explains, and the later it turned up, the longer: a place in a map of another building may look
-        alike for a while.
+        The less it explains, the later it turned up, and the more places of this map have looked alike, the longer: a
+        place in a map of another building may look alike for a while.
         """
-        looks, independent = self._convinced
+        looks, begun_m = self._convinced
         if looks < self.config.sure_looks:
             return False
-        share = float(self._known.shares_explained[self._known.best()])
-        late = self._independent - float(self._known.ages[self._known.best()])
-        needed = _SURE_NOVELTY + _SURE_NOVELTY_MISSING * (1.0 - share) + _SURE_NOVELTY_LATE * late
-        return independent >= needed
+        best = self._known.best()
+        needed_m = _SURE_WAY_M + _SURE_WAY_CROWD_M * math.log(self._crowd)
+        needed_m += _SURE_WAY_MISSING_M * (1.0 - float(self._known.shares_explained[best]))
+        needed_m += _SURE_WAY_LATE * _NEW_WAY_M * (self._independent - float(self._known.ages[best]))
+        return self._way_m - begun_m >= needed_m
 
     def _speaks_for_one(self) -> bool:
         known, config = self._known, self.config
@@ -274,7 +281,9 @@ class GlobalLocalization:
         """Hypotheses (H,) that explain enough, and have done so for some time where much has been seen."""
         known = self._known
         enough = known.shares_explained >= self.config.least_explained
-        return enough & ((self._independent < _MANY_LOOKS) | (known.ages >= _LASTING_LOOKS))
+        if self._independent < _MANY_LOOKS:
+            return enough
+        return np.asarray(enough & (known.ages >= min(_LASTING_SHARE * self._independent, _LASTING_LOOKS)))
 
     def _waiting(self, reason: str) -> Result:
         return Result(State.WAITING, reason, ())

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core import se2
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.localization.search import distinct_indices, moved
 from thinmap_ros.core.se2 import Array
@@ -22,7 +21,7 @@ _MOST = 400
 _SAME_M, _SAME_RAD = 0.3, 0.15
 _LEAST_ASKED = 0.6  # share of the beams
 _NEW_SIGMA_M, _NEW_SIGMA_RAD = 0.08, 0.03
-_MEMORY = 0.9  # of what was explained, from one independent look to the next
+_MEMORY = 0.85  # of what was explained, from one independent look to the next
 
 
 def evidence_against(judged: tuple[Array, Array], beams: int, novelty: float) -> Array:
@@ -36,7 +35,7 @@ def evidence_against(judged: tuple[Array, Array], beams: int, novelty: float) ->
     allowed = 2.0 * math.sqrt(beams * EDGE_SHARE * (1.0 - EDGE_SHARE))
     missing = beams - judged[0] - 0.5 * judged[1]
     beyond = np.maximum(missing - missing.min(initial=np.inf) - allowed, 0.0)
-    return novelty * np.minimum(LOG_ODDS_A_BEAM * beyond, _MOST_A_LOOK)
+    return np.asarray(novelty * np.minimum(LOG_ODDS_A_BEAM * beyond, _MOST_A_LOOK))
 
 
 @dataclass(eq=False)
@@ -140,7 +139,7 @@ class Hypotheses:
         quotas[: total - int(quotas.sum())] += 1
         bounds = np.searchsorted(self.owners, np.arange(count + 1))
         log_likelihoods = np.zeros(len(self.samples)) if log_likelihoods is None else log_likelihoods
-        spreads = np.linalg.cholesky(self.covariances + np.diag([1e-8, 1e-8, 1e-8]))
+        spreads = np.asarray(np.linalg.cholesky(self.covariances + np.diag([1e-8, 1e-8, 1e-8])))
         self.samples = _resampled(
             self.samples, log_likelihoods, bounds, quotas, self.poses, spreads, rng.random(count),
             rng.normal(size=(total, 3)),
@@ -216,7 +215,3 @@ def _resampled(
             at += 1
     return result
 
-
-def wrapped_poses(poses: Array) -> Array:
-    """Poses (N, 3) with their headings wrapped."""
-    return np.column_stack([poses[:, :2], se2.wrap(poses[:, 2])])

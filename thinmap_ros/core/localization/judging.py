@@ -64,7 +64,7 @@ class Judge:
         Once straight from where they are, once from where they fit when walls pull from far: whichever fits better.
         """
         free = np.zeros((len(poses), 3, 3))
-        held = free if covariances is None else np.linalg.inv(covariances + _LEAST_COVARIANCE)
+        held: Array = free if covariances is None else np.asarray(np.linalg.inv(covariances + _LEAST_COVARIANCE))
         near, near_score = self._uphill(poses, seen, self._log_table, _FINE_STEPS, poses, held)
         far = poses
         for table, steps in self._pulls:

@@ -142,7 +142,8 @@ def _unlikely(x: float, y: float, turn: float, information: Array) -> float:
     turn = math.pi - (math.pi - turn) % (2.0 * math.pi)
     squared = x * x * information[0, 0] + y * y * information[1, 1] + turn * turn * information[2, 2]
     squared += 2.0 * (x * y * information[0, 1] + x * turn * information[0, 2] + y * turn * information[1, 2])
-    return 0.5 * squared
+    half: float = 0.5 * squared
+    return half
 
 
 @kernel
@@ -163,7 +164,8 @@ def explained(
 
     poses (N, 3): of the robot; laser (3,): on it; ranges, bearings, met (B,): see Observation; maps: states and near
     of Places; tolerance: in m, and in m for each m of range. A beam that met something must end beside a wall, one
-    that met nothing nowhere; on its way there must be no wall. Of what ends in or passes through the unknown the map says nothing.
+    that met nothing nowhere; on its way there must be no wall. Of what ends in
+    or passes through the unknown the map says nothing.
     """
     counts, silent = np.zeros(len(poses)), np.zeros(len(poses))
     for i in range(len(poses)):

@@ -1,4 +1,4 @@
-"""A look at all of the map: where could the last few scans have been made?"""
+"""A look at all of the map for places where the last few scans could have been made."""
 
 from dataclasses import dataclass
 
