@@ -32,7 +32,7 @@ def evidence_against(judged: tuple[Array, Array], beams: int, novelty: float) ->
     Differences that chance brings about at edges count for nothing, however often they come: two rooms that look the
     same stay equally likely.
     """
-    allowed = 2.0 * math.sqrt(beams * EDGE_SHARE * (1.0 - EDGE_SHARE))
+    allowed = 3.0 * math.sqrt(beams * EDGE_SHARE * (1.0 - EDGE_SHARE))
     missing = beams - judged[0] - 0.5 * judged[1]
     beyond = np.maximum(missing - missing.min(initial=np.inf) - allowed, 0.0)
     return np.asarray(novelty * np.minimum(LOG_ODDS_A_BEAM * beyond, _MOST_A_LOOK))
@@ -117,6 +117,8 @@ class Hypotheses:
         order = np.argsort(-self.log_weights, kind='stable')
         order = order[self.log_weights[order] > _LEAST_LOG_WEIGHT]
         kept = order[distinct_indices(self.poses[order], _SAME_M, _SAME_RAD, _MOST)]
+        if len(kept) == len(self) == int(self.owners.max(initial=-1)) + 1:
+            return
         renumbered = np.full(len(self.poses), -1)
         renumbered[kept] = np.arange(len(kept))
         for name in ('poses', 'log_weights', 'covariances', 'ages', 'explained', 'asked', 'beams'):
