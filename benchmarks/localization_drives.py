@@ -1,4 +1,4 @@
-"""Drives on which a lost robot is to find itself: scans and odometry of a simulated robot that goes to random places."""
+"""Drives of a lost robot: scans and odometry of a simulated one that goes to random places."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

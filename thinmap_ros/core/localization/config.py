@@ -30,7 +30,9 @@ class GlobalLocalizationConfig(Config):
         1.5, 'odometry that moves more than this between two scans has jumped, m', low=0.1, high=100.0
     )
     sure_share: float = parameter(0.99, 'weight of the one hypothesis of a robot that is sure', low=0.6, high=1.0)
-    sure_looks: int = parameter(3, 'looks in a row at which all must speak for one place before it is sure', low=1, high=1000)
+    sure_looks: int = parameter(
+        3, 'looks in a row at which all must speak for one place before it is sure', low=1, high=1000
+    )
     least_explained: float = parameter(
         0.8, 'a place that explains less than this share of what was seen is not taken for the right one',
         low=0.3, high=1.0,

@@ -42,8 +42,8 @@ def evidence_against(judged: tuple[Array, Array], beams: int, novelty: float) ->
 class Hypotheses:
     """Places of the robot as arrays over hypotheses (H), and samples (N, 3) that belong to them (N,), in order.
 
-    poses (H, 3); log_weights (H,), the best one 0; covariances (H, 3, 3); ages (H,): independent looks since each was found;
-    explained, asked, beams (H,): sums over looks of the beams that the map explains, of those it says something
+    poses (H, 3); log_weights (H,), the best one 0; covariances (H, 3, 3); ages (H,): independent looks since each was
+    found; explained, asked, beams (H,): sums over looks of the beams that the map explains, of those it says something
     about, and of all; older ones count less.
     """
 

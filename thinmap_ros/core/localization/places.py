@@ -38,8 +38,8 @@ class Places:
     nearest wall, in NEAR_UNIT_M, at most 255; standing (N, 2) int32: cells in which the robot can stand;
     spots (P, 2): places among these, a spacing apart, and around (P, DIRECTIONS) uint8: what a laser would measure
     from there towards the headings k / DIRECTIONS of a turn, in RANGE_UNIT_M; spacing_m: between the spots;
-    nodes (M, 2), node_kinds (M,): of the topological map; blocks, first, in_sight: nodes in sight of block (i, j) of
-    the map are in_sight[first[blocks[i, j]] : first[blocks[i, j] + 1]]; blocks are block_cells wide.
+    nodes (M, 2): of the topological map; blocks, first, in_sight: nodes in sight of block (i, j) of the map are
+    in_sight[first[blocks[i, j]] : first[blocks[i, j] + 1]], (S, 2); blocks are block_cells wide.
     """
 
     frame: GridFrame
@@ -50,10 +50,9 @@ class Places:
     around: Bytes
     spacing_m: float
     nodes: Array
-    node_kinds: NDArray[np.int64]
     blocks: NDArray[np.int32]
     first: NDArray[np.int32]
-    in_sight: NDArray[np.int32]
+    in_sight: Array
     block_cells: int
 
     @property
@@ -83,11 +82,10 @@ class Places:
         spots, spacing_m = _spots(standing, patch.frame)
         around = ranges_around(states, _in_cells(spots, patch.frame), patch.frame.resolution)
         nodes = np.array([node.position for node in topology.nodes.values()])
-        kinds = np.array([int(node.kind) for node in topology.nodes.values()], dtype=np.int64)
         block_cells = max(1, round(_BLOCK_M / patch.frame.resolution))
         blocks, first, in_sight = _sights(states, standing, nodes, patch.frame, block_cells, config)
         return Places(
-            patch.frame, states, near, standing, spots, around, spacing_m, nodes, kinds, blocks, first, in_sight,
+            patch.frame, states, near, standing, spots, around, spacing_m, nodes, blocks, first, nodes[in_sight],
             block_cells,
         )
 
