@@ -33,7 +33,7 @@ _PAPER_START = (2.0, 2.0, -np.pi / 2.0)
 # The paper's robot merged local maps of 10 to 15 stops: here of 12, looking both ways at each.
 _STOPS = (
     (1.5, 2.0), (2.3, 4.4), (3.0, 8.3), (5.3, 4.4), (5.2, 8.6), (7.9, 4.6), (9.6, 1.8), (10.2, 8.0), (12.8, 4.9),
-    (15.3, 1.6), (15.4, 7.6), (18.6, 6.0),
+    (15.3, 1.6), (15.4, 7.6), (18.9, 3.6),
 )
 _STEP_SCANS = 3  # a step of the laboratory's experiment: at 0.5 m/s and 5 Hz, up to 0.3 m
 _RIGHT_M, _RIGHT_RAD = 0.3, np.radians(10.0)

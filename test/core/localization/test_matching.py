@@ -55,7 +55,7 @@ def test_node_scores_are_those_of_the_nearest_node_in_sight(places, poses):
     model = np.array([0.3, 0.8, 0.5]), np.array([0.4, 0.3, 0.5]), np.array([20.0, 30.0, 10.0])
     sights = (places.blocks, places.first, places.in_sight)
     block_m = places.block_cells * CELL_M
-    found = matching.node_scores(poses, nodes, kinds, sights, origin(places), block_m, *model)
+    found = matching.node_scores(poses, nodes, kinds, places.nodes, sights, origin(places), block_m, *model)
     for T, score in zip(poses, found, strict=True):
         col, row = np.trunc((T[:2] - origin(places)) / block_m).astype(int)
         inside = 0 <= row < places.blocks.shape[0] and 0 <= col < places.blocks.shape[1]
@@ -64,7 +64,7 @@ def test_node_scores_are_those_of_the_nearest_node_in_sight(places, poses):
         expected = 0.0
         for at, kind in zip(se2.transform_points(T, nodes), kinds, strict=True):
             q, sigma, gain = (numbers[kind] for numbers in model)
-            nearest = min((np.hypot(*(there - at)) for there in known), default=np.inf)
+            nearest = min((np.hypot(*(places.nodes[k] - at)) for k in known), default=np.inf)
             agrees = math.exp(-0.5 * (nearest / sigma) ** 2) if nearest < 3.0 * sigma else 0.0
             expected += math.log(1.0 - q + q * gain * agrees)
         assert score == pytest.approx(expected)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.jit import inlined, kernel
-from thinmap_ros.core.localization.places import NEAR_UNIT_M, UNKNOWN, WALL, Bytes, free_way
+from thinmap_ros.core.localization.places import NEAR_UNIT_M, UNKNOWN, WALL, Bytes, Numbers, free_way
 from thinmap_ros.core.se2 import Array
 
 _ASIDE_M = 0.12  # a beam is stopped only where those beside it, this far off, are stopped too
@@ -51,7 +51,8 @@ def node_scores(
     poses: Array,
     seen: Array,
     kinds: NDArray[np.int64],
-    sights: tuple[NDArray[np.int32], NDArray[np.int32], Array],
+    nodes: Array,
+    sights: tuple[NDArray[np.int32], NDArray[np.int32], Numbers],
     origin: tuple[float, float],
     block_m: float,
     found: Array,
@@ -60,8 +61,8 @@ def node_scores(
 ) -> Array:
     """Log likelihood ratio of the observed nodes at each pose, against a pose anywhere, (N,).
 
-    poses (N, 3); seen (K, 2): observed nodes, robot frame, and their kinds (K,); sights: blocks, first and in_sight of
-    Places, blocks block_m wide. For each kind: found: chance that an observed node is
+    poses (N, 3); seen (K, 2): observed nodes, robot frame, and their kinds (K,); nodes (M, 2): of the map; sights:
+    blocks, first and in_sight of Places, blocks block_m wide. For each kind: found: chance that an observed node is
     one of the map; spread: 1 sigma of its place, m; gain: how much likelier its place is there than anywhere.
     An observed node agrees with one that the map has in sight of the pose when distance and angle agree; both do
     exactly when it lies at the same place. Source: topological map paper section 3.1, steps 3 to 6.
@@ -80,7 +81,7 @@ def node_scores(
             y = poses[i, 1] + s * seen[j, 0] + c * seen[j, 1]
             nearest = 1e9
             for k in range(low, high):
-                d_x, d_y = in_sight[k, 0] - x, in_sight[k, 1] - y
+                d_x, d_y = nodes[in_sight[k], 0] - x, nodes[in_sight[k], 1] - y
                 nearest = min(nearest, d_x * d_x + d_y * d_y)
             kind = kinds[j]
             agrees = math.exp(-0.5 * nearest / spread[kind] ** 2) if nearest < 9.0 * spread[kind] ** 2 else 0.0

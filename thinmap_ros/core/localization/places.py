@@ -17,6 +17,7 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 
 Mask = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]
+Numbers = NDArray[np.uint16] | NDArray[np.uint32]
 
 DIRECTIONS = 72
 NEAR_UNIT_M = 0.004  # of the distance to the nearest wall: up to 1.02 m in a byte
@@ -39,7 +40,7 @@ class Places:
     spots (P, 2): places among these, a spacing apart, and around (P, DIRECTIONS) uint8: what a laser would measure
     from there towards the headings k / DIRECTIONS of a turn, in RANGE_UNIT_M; spacing_m: between the spots;
     nodes (M, 2): of the topological map; blocks, first, in_sight: nodes in sight of block (i, j) of the map are
-    in_sight[first[blocks[i, j]] : first[blocks[i, j] + 1]], (S, 2); blocks are block_cells wide.
+    nodes[in_sight[first[blocks[i, j]] : first[blocks[i, j] + 1]]]; blocks are block_cells wide.
     """
 
     frame: GridFrame
@@ -52,7 +53,7 @@ class Places:
     nodes: Array
     blocks: NDArray[np.int32]
     first: NDArray[np.int32]
-    in_sight: Array
+    in_sight: Numbers
     block_cells: int
 
     @property
@@ -85,7 +86,7 @@ class Places:
         block_cells = max(1, round(_BLOCK_M / patch.frame.resolution))
         blocks, first, in_sight = _sights(states, standing, nodes, patch.frame, block_cells, config)
         return Places(
-            patch.frame, states, near, standing, spots, around, spacing_m, nodes, blocks, first, nodes[in_sight],
+            patch.frame, states, near, standing, spots, around, spacing_m, nodes, blocks, first, in_sight,
             block_cells,
         )
 
@@ -180,7 +181,7 @@ def _sights(
     frame: GridFrame,
     block_cells: int,
     config: GlobalLocalizationConfig,
-) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
+) -> tuple[NDArray[np.int32], NDArray[np.int32], Numbers]:
     """Nodes in sight of each block in which the robot can stand: see Places."""
     rows, cols = states.shape
     blocks = np.full((rows // block_cells + 1, cols // block_cells + 1), -1, dtype=np.int32)
@@ -191,7 +192,9 @@ def _sights(
     cells = frame.cells_of(nodes)
     reach = config.active_window_m / 2.0 / frame.resolution + block_cells
     first, in_sight = _list_sights(states == FREE, standing[leads].astype(np.int64), cells, reach)
-    return blocks, first, in_sight
+    # Small numbers: samples look at these lists in no order, and they should stay in the processor's cache.
+    narrow = in_sight.astype(np.uint16) if len(nodes) <= 1 << 16 else in_sight.astype(np.uint32)
+    return blocks, first, narrow
 
 
 @kernel
