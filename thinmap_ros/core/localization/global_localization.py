@@ -26,7 +26,7 @@ __all__ = ['GlobalLocalization', 'GlobalLocalizationConfig', 'Hypothesis', 'Resu
 _NEW_WAY_M, _NEW_TURN_RAD = 0.5, 0.5
 # Way, m, for which one place must have explained all alone; more for each e-fold of places that looked alike, for
 # what it does not explain (1: all), and for each metre before it turned up.
-_SURE_WAY_M, _SURE_WAY_CROWD_M, _SURE_WAY_MISSING_M, _SURE_WAY_LATE = 0.1, 0.4, 25.0, 0.4
+_SURE_WAY_M, _SURE_WAY_CROWD_M, _SURE_WAY_MISSING_M, _SURE_WAY_LATE = 0.1, 0.4, 20.0, 0.3
 # After so many independent looks, a place that explains must have lasted for this share of them, but not for ever.
 _MANY_LOOKS, _LASTING_SHARE, _LASTING_LOOKS = 16.0, 0.4, 20.0
 _VIEWS = 6
