@@ -7,7 +7,7 @@ from setuptools import find_packages, setup
 NAME = 'thinmap_ros'
 NODES = [
     'sim', 'grid_mapper', 'topology_builder', 'localizer', 'explorer', 'navigator', 'recorder', 'bag_player',
-    'demo_monitor', 'rerun_viewer', 'markers', 'thinmap',
+    'demo_monitor', 'rerun_viewer', 'markers', 'global_localizer', 'thinmap',
 ]
 TOOLS = [
     'replay', 'explore_world', 'compare_exploration', 'carmen_to_bag', 'map_to_graph', 'bag_repair', 'demo', 'warm_up',

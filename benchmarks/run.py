@@ -1,10 +1,10 @@
-"""All benchmarks: python -m benchmarks.run [thinning mapping graphs online nodes] [--quick] [--worlds DIR]."""
+"""All benchmarks: python -m benchmarks.run [NAME ...] [--quick] [--worlds DIR]."""
 
 import argparse
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from benchmarks import graphs, mapping, nodes, online, thinning
+from benchmarks import graphs, localization, mapping, nodes, online, thinning
 from benchmarks.table import Row, show
 from benchmarks.worlds import WORLDS
 
@@ -14,6 +14,7 @@ _ALL: dict[str, Callable[[Path, bool], Iterable[Row]]] = {
     'graphs': graphs.run,
     'online': online.run,
     'nodes': nodes.run,
+    'localization': localization.run,
 }
 
 

@@ -74,6 +74,17 @@ def navigator() -> None:
         rehearsed.step(T_map_base, patch, scan, _PERIOD_S)
 
 
+def global_localizer() -> None:
+    """Rehearse the search for a lost robot."""
+    from thinmap_ros.core.localization.global_localization import GlobalLocalization
+    from thinmap_ros.core.topology.update import TopologyConfig, build
+
+    patch = _room()
+    rehearsed = GlobalLocalization(patch, build(patch, (2.0, 2.0), TopologyConfig()))
+    for scan, T_map_base in _drive():
+        rehearsed.step(scan, T_map_base)
+
+
 def _room() -> GridPatch:
     """A room with a pillar, and a passage into the unknown."""
     cells = np.zeros((_ROOM_CELLS, _ROOM_CELLS), dtype=np.int8)

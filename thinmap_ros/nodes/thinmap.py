@@ -10,7 +10,7 @@ from rclpy.utilities import remove_ros_args
 from thinmap_ros.adapters import runtime
 
 _NODES = ('localizer', 'grid_mapper', 'topology_builder', 'navigator', 'explorer')
-_OTHERS = ('sim', 'recorder', 'bag_player', 'rerun_viewer', 'markers')
+_OTHERS = ('global_localizer', 'sim', 'recorder', 'bag_player', 'rerun_viewer', 'markers')
 _USAGE = f"""usage: thinmap [NODE ...] [--ros-args ...]
 
 Runs nodes in one process. Without names: {', '.join(_NODES)}.

@@ -14,6 +14,7 @@ def main() -> None:
     """Rehearse every algorithm, and the simulation."""
     for rehearse in (
         warm_up.localizer, warm_up.grid_mapper, warm_up.topology_builder, warm_up.explorer, warm_up.navigator,
+        warm_up.global_localizer,
     ):  # fmt: skip
         rehearse()
     world = World.from_patch(*read_world(resources.world_path('room_10x10')))

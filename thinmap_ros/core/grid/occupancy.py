@@ -412,4 +412,7 @@ def _apply(
 def _tiles_of(news: NDArray[np.int16], box: tuple[int, int, int, int]) -> NDArray[np.int64]:
     """Tiles (N, 2), from that in which the news begin, for which there are news."""
     rows, cols = np.nonzero(news[: box[1] + 1])
-    return np.unique(np.column_stack([rows // TILE, cols // TILE]), axis=0)
+    width = news.shape[1] // TILE + 1
+    drawn = np.zeros((news.shape[0] // TILE + 1) * width, dtype=np.bool_)
+    drawn[rows // TILE * width + cols // TILE] = True
+    return np.column_stack(np.divmod(np.flatnonzero(drawn), width))

@@ -1,0 +1,82 @@
+"""The node that finds a lost robot, as a process on a live graph."""
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped, Twist
+from nav_msgs.msg import Odometry
+
+from thinmap_msgs.msg import LocalizationStatus
+from thinmap_msgs.srv import LocalizeGlobally
+from thinmap_ros.adapters import map_files, messages, qos, resources
+from thinmap_ros.adapters.world_files import read_world
+from thinmap_ros.core import se2
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridPatch
+
+pytestmark = pytest.mark.live
+START = (2.0, 2.0, 0.0)
+
+
+@pytest.fixture
+def map_file(tmp_path):
+    """A map of the simulator's room, in cells of 10 cm."""
+    _, patch, _ = read_world(resources.world_path('room_10x10'))
+    rows, cols = (size // 5 * 5 for size in patch.shape)
+    cells = patch.cells[:rows, :cols].reshape(rows // 5, 5, cols // 5, 5).max(axis=(1, 3))
+    map_files.write_map(tmp_path / 'room', GridPatch(GridFrame(patch.frame.origin_x, patch.frame.origin_y, 0.1), cells))
+    return tmp_path / 'room.yaml'
+
+
+def test_a_robot_that_drives_about_finds_itself_when_asked(graph, map_file):
+    status = graph.heard('localization_status', LocalizationStatus, qos.LATCHED)
+    poses = graph.heard('initialpose', PoseWithCovarianceStamped)
+    samples = graph.heard('localization_samples', PoseArray, qos.LATCHED)
+    odometry = graph.heard('odom', Odometry)
+    graph.start('global_localizer', map=str(map_file), use_sim_time=True)
+    commands = graph.node.create_publisher(Twist, 'cmd_vel', 10)
+    graph.start('sim', start=','.join(map(str, START)), rate=3.0)
+    graph.until(lambda: status and odometry, 'status and odometry')
+    assert status[-1].state == LocalizationStatus.IDLE
+    answer = graph.call(LocalizeGlobally, 'localize_globally', LocalizeGlobally.Request(clear=True))
+    assert answer.accepted, answer.message
+    ahead = Twist()
+    ahead.linear.x, ahead.angular.z = 0.25, 0.35
+
+    def found():
+        commands.publish(ahead)
+        return poses
+
+    graph.until(found, 'a pose')
+    pose = poses[-1]
+    # The robot's odometry begins at zero at its start, and drifts little over this way.
+    ns = messages.stamp_ns(pose.header.stamp)
+    at = min(odometry, key=lambda message: abs(messages.stamp_ns(message.header.stamp) - ns))
+    truth = se2.compose(np.array(START), messages.pose_from(at.pose.pose))
+    off = se2.between(truth, messages.pose_from(pose.pose.pose))
+    assert np.hypot(off[0], off[1]) < 0.3
+    assert abs(off[2]) < np.radians(10.0)
+    covariance = messages.covariance_from(pose)
+    assert np.linalg.eigvalsh(covariance).min() > 0.0
+    assert len(samples[-1].poses) == 5000
+    assert all(np.isfinite([p.position.x, p.position.y, p.orientation.z]).all() for p in samples[-1].poses[:100])
+    graph.until(lambda: status[-1].state == LocalizationStatus.IDLE, 'rest, once the pose is said')
+    said = [message for message in status if message.state == LocalizationStatus.LOCALIZED]
+    assert len(said) == len(poses) == 1
+    assert said[0].weights[0] > 0.9
+    assert graph.stop('global_localizer') == 0, graph.log('global_localizer')
+
+
+def test_it_says_what_is_missing_and_waits(graph):
+    status = graph.heard('localization_status', LocalizationStatus, qos.LATCHED)
+    graph.start('global_localizer', automatic=True, laser_pose='0.0,0.0,0.0')
+    graph.until(lambda: status and status[-1].state == LocalizationStatus.WAITING, 'waiting')
+    assert status[-1].reason == 'waits for map, topology, odom, scan'
+    graph.until(lambda: 'waits for map' in graph.log('global_localizer'), 'a warning in words')
+    assert graph.stop('global_localizer') == 0
+
+
+def test_a_map_that_cannot_be_read_ends_the_start_in_words(graph, tmp_path):
+    process = graph.start('global_localizer', map=str(tmp_path / 'nowhere.yaml'))
+    assert process.wait(timeout=60.0) == 2
+    graph.processes.clear()
+    assert 'nowhere.yaml' in graph.log('global_localizer')

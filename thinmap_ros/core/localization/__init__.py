@@ -1,0 +1,1 @@
+"""Where a robot is that was switched on anywhere in a finished map."""

@@ -1,0 +1,219 @@
+"""The places where the robot may be, each with the samples round it and the evidence for it."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.localization.search import distinct_indices, moved
+from thinmap_ros.core.se2 import Array
+
+# A beam that one place explains and another does not: about 1 in log odds, but beams that miss come in groups.
+LOG_ODDS_A_BEAM = 0.35
+# Beams at edges fall to either side by chance: so many of them may, one in ...
+EDGE_SHARE = 0.05
+# Now and then a whole look tells nonsense (someone stands in the way, a door has moved): no look settles the matter.
+_MOST_A_LOOK = 3.0
+_LEAST_LOG_WEIGHT = -14.0
+_MOST = 400
+_SAME_M, _SAME_RAD = 0.3, 0.15
+_LEAST_ASKED = 0.6  # share of the beams
+_NEW_SIGMA_M, _NEW_SIGMA_RAD = 0.08, 0.03
+_MEMORY = 0.85  # of what was explained, from one independent look to the next
+
+
+def evidence_against(judged: tuple[Array, Array], beams: int, novelty: float) -> Array:
+    """What is taken off log weights for beams that are not explained, in comparison with the best one, (N,).
+
+    judged: of so many beams, how many the map explains, and of how many it says nothing, (N,) each; these count half.
+
+    Differences that chance brings about at edges count for nothing, however often they come: two rooms that look the
+    same stay equally likely.
+    """
+    allowed = 3.0 * math.sqrt(beams * EDGE_SHARE * (1.0 - EDGE_SHARE))
+    missing = beams - judged[0] - 0.5 * judged[1]
+    beyond = np.maximum(missing - missing.min(initial=np.inf) - allowed, 0.0)
+    return np.asarray(novelty * np.minimum(LOG_ODDS_A_BEAM * beyond, _MOST_A_LOOK))
+
+
+@dataclass(eq=False)
+class Hypotheses:
+    """Places of the robot as arrays over hypotheses (H), and samples (N, 3) that belong to them (N,), in order.
+
+    poses (H, 3); log_weights (H,), the best one 0; covariances (H, 3, 3); ages (H,): independent looks since each was
+    found; explained, asked, beams (H,): sums over looks of the beams that the map explains, of those it says something
+    about, and of all; older ones count less.
+    """
+
+    poses: Array
+    log_weights: Array
+    covariances: Array
+    ages: Array
+    explained: Array
+    asked: Array
+    beams: Array
+    samples: Array
+    owners: NDArray[np.int64]
+
+    @staticmethod
+    def none() -> 'Hypotheses':
+        """No hypothesis."""
+        empty = np.empty(0)
+        return Hypotheses(
+            np.empty((0, 3)), empty, np.empty((0, 3, 3)), empty, empty, empty, empty, np.empty((0, 3)),
+            np.empty(0, dtype=np.int64),
+        )
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    @property
+    def weights(self) -> Array:
+        """Probability of each, given that one of them is right, (H,)."""
+        odds = np.exp(self.log_weights)
+        return np.asarray(odds / max(float(odds.sum()), 1e-300))
+
+    @property
+    def shares_explained(self) -> Array:
+        """Share of the beams that each explains, over its looks, of those that the map says something about, (H,)."""
+        # Where that are few, they prove little.
+        return np.asarray(self.explained / np.maximum(np.maximum(self.asked, _LEAST_ASKED * self.beams), 1e-9))
+
+    def move(self, motion: Array, noise: tuple[float, float], rng: np.random.Generator) -> None:
+        """Move all by odometry (3,), robot frame; samples with noise: 1 sigma, m and rad."""
+        self.poses = moved(self.poses, motion)
+        self.samples = moved(self.samples, motion)
+        spread = np.array([noise[0], noise[0], noise[1]])
+        self.samples += rng.normal(size=self.samples.shape) * spread
+        self.covariances = self.covariances + np.diag(spread**2)
+
+    def take_evidence(self, judged: tuple[Array, Array], beams: int, novelty: float, against: Array) -> None:
+        """Take in a look: what each makes of so many beams (see evidence_against); what is taken off its log weight."""
+        self.log_weights = self.log_weights - against
+        self.log_weights -= self.log_weights.max(initial=-np.inf)
+        fade = _MEMORY**novelty
+        self.explained = fade * self.explained + novelty * judged[0]
+        self.asked = fade * self.asked + novelty * (beams - judged[1])
+        self.beams = fade * self.beams + novelty * beams
+        self.ages = self.ages + novelty
+
+    def add(self, poses: Array, log_weights: Array, judged: tuple[Array, Array], beams: float) -> None:
+        """Take up new ones (N, 3) with their evidence so far."""
+        count = len(poses)
+        self.poses = np.concatenate([self.poses, poses])
+        self.log_weights = np.concatenate([self.log_weights, log_weights])
+        self.log_weights -= self.log_weights.max(initial=-np.inf)
+        fresh = np.broadcast_to(np.diag([_NEW_SIGMA_M**2, _NEW_SIGMA_M**2, _NEW_SIGMA_RAD**2]), (count, 3, 3))
+        self.covariances = np.concatenate([self.covariances, fresh])
+        self.ages = np.concatenate([self.ages, np.zeros(count)])
+        self.explained = np.concatenate([self.explained, judged[0]])
+        self.asked = np.concatenate([self.asked, beams - judged[1]])
+        self.beams = np.concatenate([self.beams, np.full(count, beams)])
+
+    def prune(self) -> None:
+        """Drop what is out of the question, and of those that have come together all but the likeliest."""
+        order = np.argsort(-self.log_weights, kind='stable')
+        order = order[self.log_weights[order] > _LEAST_LOG_WEIGHT]
+        kept = order[distinct_indices(self.poses[order], _SAME_M, _SAME_RAD, _MOST)]
+        if len(kept) == len(self) == int(self.owners.max(initial=-1)) + 1:
+            return
+        renumbered = np.full(len(self.poses), -1)
+        renumbered[kept] = np.arange(len(kept))
+        for name in ('poses', 'log_weights', 'covariances', 'ages', 'explained', 'asked', 'beams'):
+            setattr(self, name, getattr(self, name)[kept])
+        owners = renumbered[self.owners]
+        order = np.argsort(owners, kind='stable')[int((owners < 0).sum()) :]
+        self.samples, self.owners = self.samples[order], owners[order]
+
+    def weigh(self, log_likelihoods: Array) -> None:
+        """Mean and covariance of the samples of each, weighted by their log likelihoods (N,)."""
+        bounds = np.searchsorted(self.owners, np.arange(len(self) + 1))
+        _moments(self.samples, log_likelihoods, bounds, self.poses, self.covariances)
+
+    def resample(self, log_likelihoods: Array | None, total: int, rng: np.random.Generator) -> None:
+        """As many samples for each, drawn from its own by weight; new ones get theirs from their covariance."""
+        count = len(self)
+        if not count:
+            return
+        quotas = np.full(count, total // count)
+        quotas[: total - int(quotas.sum())] += 1
+        bounds = np.searchsorted(self.owners, np.arange(count + 1))
+        log_likelihoods = np.zeros(len(self.samples)) if log_likelihoods is None else log_likelihoods
+        spreads = np.asarray(np.linalg.cholesky(self.covariances + np.diag([1e-8, 1e-8, 1e-8])))
+        self.samples = _resampled(
+            self.samples, log_likelihoods, bounds, quotas, self.poses, spreads, rng.random(count),
+            rng.normal(size=(total, 3)),
+        )
+        self.owners = np.repeat(np.arange(count), quotas)
+
+    def best(self) -> int:
+        """Number of the likeliest one; of equals that which explains most."""
+        return int(np.lexsort((-self.shares_explained, -self.log_weights))[0])
+
+
+@kernel
+def _moments(samples: Array, logs: Array, bounds: NDArray[np.int64], poses: Array, covariances: Array) -> None:
+    """Covariances (H, 3, 3) of weighted samples about their mean; those without samples keep theirs."""
+    for h in range(len(poses)):
+        low, high = bounds[h], bounds[h + 1]
+        if low == high:
+            continue
+        top = logs[low:high].max()
+        total, squares = 0.0, 0.0
+        mean, second = np.zeros(3), np.zeros((3, 3))
+        for k in range(low, high):
+            weight = math.exp(logs[k] - top)
+            turn = math.pi - (math.pi - (samples[k, 2] - poses[h, 2])) % (2.0 * math.pi)
+            off = np.array([samples[k, 0] - poses[h, 0], samples[k, 1] - poses[h, 1], turn])
+            total, squares = total + weight, squares + weight * weight
+            for i in range(3):
+                mean[i] += weight * off[i]
+                for j in range(3):
+                    second[i, j] += weight * off[i] * off[j]
+        for i in range(3):
+            for j in range(3):
+                covariances[h, i, j] = second[i, j] / total - mean[i] * mean[j] / total**2
+
+
+@kernel
+def _resampled(
+    samples: Array,
+    logs: Array,
+    bounds: NDArray[np.int64],
+    quotas: NDArray[np.int64],
+    poses: Array,
+    spreads: Array,
+    starts: Array,
+    normal: Array,
+) -> Array:
+    """Samples drawn by weight within each group, a comb for each; groups without any are drawn round their poses.
+
+    spreads (H, 3, 3): lower triangular; starts (H,): in [0, 1); normal (N, 3): standard normal numbers.
+    """
+    result = np.empty((quotas.sum(), 3))
+    at = 0
+    for h in range(len(poses)):
+        low, high = bounds[h], bounds[h + 1]
+        if low == high:
+            for _ in range(quotas[h]):
+                for i in range(3):
+                    result[at, i] = poses[h, i]
+                    for j in range(i + 1):
+                        result[at, i] += spreads[h, i, j] * normal[at, j]
+                at += 1
+            continue
+        top, total = logs[low:high].max(), 0.0
+        for k in range(low, high):
+            total += math.exp(logs[k] - top)
+        k, sum_so_far = low, math.exp(logs[low] - top)
+        for n in range(quotas[h]):
+            mark = (n + starts[h]) / quotas[h] * total
+            while sum_so_far < mark and k < high - 1:
+                k += 1
+                sum_so_far += math.exp(logs[k] - top)
+            result[at] = samples[k]
+            at += 1
+    return result
+

@@ -1,0 +1,89 @@
+"""What poses are worth in view of one scan: the map's arrays and the noise, bound to the loops over them."""
+
+import math
+
+import numpy as np
+
+from thinmap_ros.core.localization import matching
+from thinmap_ros.core.localization.calibration import NodeModel
+from thinmap_ros.core.localization.config import GlobalLocalizationConfig
+from thinmap_ros.core.localization.observation import Observation
+from thinmap_ros.core.localization.places import NEAR_UNIT_M, Places
+from thinmap_ros.core.se2 import Array
+
+_SIGMAS = 3.0
+# From afar to near: how wide a wall's pull is, 1 sigma, m, and the steps uphill, m and rad.
+_PULLS: tuple[tuple[float, Array], ...] = (
+    (0.30, np.array([[0.16, 0.06], [0.08, 0.03]])),
+    (0.15, np.array([[0.08, 0.03], [0.04, 0.015]])),
+)
+_OUTLIERS = 0.1
+# Beams are not independent of each other: neighbours meet the same wall, which the map has drawn once, and well or not.
+_BEAMS_A_FACT = 6.0
+_NODES_A_FACT = 2.0
+_FINE_STEPS = np.array([[0.04, 0.015], [0.02, 0.0075]])
+_ROUNDS = 6
+_LEAST_COVARIANCE = np.diag([0.02**2, 0.02**2, 0.01**2])
+
+
+class Judge:
+    """Compares poses with observations; tolerances follow from the cells of the grid and the noise of the sensor."""
+
+    def __init__(self, places: Places, config: GlobalLocalizationConfig, nodes: NodeModel) -> None:
+        self._places = places
+        self._nodes = nodes
+        self._origin = (places.frame.origin_x, places.frame.origin_y)
+        # A wall lies anywhere in its cell, and so does the end of a beam: uniform, twice.
+        cells = places.frame.resolution / math.sqrt(6.0)
+        sigma = math.sqrt(config.range_noise_m**2 + config.pose_noise_m**2 + cells**2)
+        self.tolerance = (_SIGMAS * sigma, _SIGMAS * config.heading_noise_rad)
+        off = np.arange(256) * NEAR_UNIT_M / sigma
+        bell = np.exp(-0.5 * off**2)
+        self._log_table = np.log((1.0 - _OUTLIERS) * bell + _OUTLIERS) / _BEAMS_A_FACT
+        self._pulls = [(np.exp(-0.5 * (off * sigma / pull) ** 2), steps) for pull, steps in _PULLS]
+
+    def log_likelihoods(self, poses: Array, seen: Observation) -> Array:
+        """Log likelihood of beams and nodes at poses (N, 3), up to a constant, (N,)."""
+        ends = seen.ends[seen.met]
+        near, resolution = self._places.near, self._places.frame.resolution
+        scores = matching.range_scores(poses, ends, near, self._origin, resolution, self._log_table)
+        return np.asarray(scores + self.node_log_ratios(poses, seen))
+
+    def node_log_ratios(self, poses: Array, seen: Observation) -> Array:
+        """Log likelihood ratio of the observed nodes at poses (N, 3), against a pose anywhere, (N,)."""
+        places, model = self._places, self._nodes
+        ratios = matching.node_scores(
+            poses, seen.nodes, seen.node_kinds, places.nodes, (places.blocks, places.first, places.in_sight),
+            self._origin, places.block_cells * places.frame.resolution, model.found, model.spread_m, model.gain,
+        )
+        return np.asarray(ratios / _NODES_A_FACT)
+
+    def refined(self, poses: Array, seen: Observation, covariances: Array | None = None) -> Array:
+        """Poses (N, 3) moved to where the beams fit best near by; covariances (N, 3, 3): how far that may be.
+
+        Once straight from where they are, once from where they fit when walls pull from far: whichever fits better.
+        """
+        free = np.zeros((len(poses), 3, 3))
+        held: Array = free if covariances is None else np.asarray(np.linalg.inv(covariances + _LEAST_COVARIANCE))
+        near, near_score = self._uphill(poses, seen, self._log_table, _FINE_STEPS, poses, held)
+        far = poses
+        for table, steps in self._pulls:
+            far, _ = self._uphill(far, seen, table, steps, poses, free)
+        far, far_score = self._uphill(far, seen, self._log_table, _FINE_STEPS, poses, held)
+        return np.where((far_score > near_score)[:, None], far, near)
+
+    def _uphill(
+        self, poses: Array, seen: Observation, table: Array, steps: Array, expected: Array, held: Array
+    ) -> tuple[Array, Array]:
+        near, resolution, ends = self._places.near, self._places.frame.resolution, seen.ends[seen.met]
+        return matching.refine(
+            poses, ends, near, self._origin, resolution, table, steps, _ROUNDS, expected, held
+        )
+
+    def explained(self, poses: Array, seen: Observation) -> tuple[Array, Array]:
+        """How many of the beams the map explains from poses (N, 3), and of how many it says nothing, (N,) each."""
+        places = self._places
+        return matching.explained(
+            poses, seen.laser, seen.ranges_m, seen.bearings_rad, seen.met, (places.states, places.near), self._origin,
+            places.frame.resolution, self.tolerance,
+        )
