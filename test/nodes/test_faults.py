@@ -111,6 +111,7 @@ def test_mapping_goes_on_after_each_node_was_killed(graph):
     assert not list((graph.folder / 'state').iterdir()), 'who ends in order leaves nothing'
 
 
+@pytest.mark.slow
 def test_a_whole_robot_that_was_killed_and_begins_anew_is_not_mixed_with_the_one_before(graph):
     robot = Robot(graph)
     maps = graph.heard('map', OccupancyGrid, qos.LATCHED)

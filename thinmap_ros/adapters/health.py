@@ -28,6 +28,7 @@ class _Topic:
     heard: int = 0
     told: int = 0
     last_at: float | None = None
+    since: float = field(default_factory=monotonic)
     refused: Counter[str] = field(default_factory=Counter)
     last_refusal: str = ''
 
@@ -63,6 +64,7 @@ class Health:
         self._topics: dict[str, _Topic] = {}
         self._steps: dict[str, deque[float]] = {}
         self._drops: Counter[str] = Counter()
+        self._totals: Counter[str] = Counter()
         self._bad = self._told_bad = 0
         self._state = (OK, 'running')
         self._values: dict[str, str] = {}
@@ -101,9 +103,7 @@ class Health:
 
     def dropped_in_all(self, cause: str, count: int) -> None:
         """Tell a count of drops that somebody else keeps; one that begins anew is counted on."""
-        key = f'{cause}\n'  # no cause of ours has a line break in it
-        last = int(self._values.get(key, 0))
-        self._values[key] = str(count)
+        last, self._totals[cause] = self._totals[cause], count
         self.dropped(cause, count - last if count >= last else count)
 
     def took(self, step: str, milliseconds: float) -> None:
@@ -136,6 +136,8 @@ class Health:
         def silence() -> str:
             entry = self._topics[topic]
             if entry.last_at is None:
+                if monotonic() - entry.since < limit_s:
+                    return ''  # nodes have just begun to find each other
                 return f'{topic}: nothing heard yet: {self._node.count_publishers(name)} publish {name}'
             silent_s = monotonic() - entry.last_at
             return f'{topic}: silent for {silent_s:.0f} s' if silent_s > limit_s else ''
@@ -191,7 +193,7 @@ class Health:
 
     def _told(self, now: float) -> dict[str, str]:
         """All values, in an order that stays."""
-        told = {key: value for key, value in self._values.items() if not key.endswith('\n')}
+        told = dict(self._values)
         for topic, entry in self._topics.items():
             told[f'{topic}: heard'] = str(entry.heard)
             told[f'{topic}: rate'] = f'{(entry.heard - entry.told) / (now - self._told_at):.1f} Hz'
