@@ -259,7 +259,7 @@ class Explorer:
         index = self.borders.owners(cells, self.borders.frame.cells_of(places), self.config.attach_m)
         return np.where(index < 0, -1, ids[index])
 
-    def _without_scraps(self, owners: Cells, numbers: NDArray[np.int32]) -> Cells:
+    def _without_scraps(self, owners: Cells, numbers: Cells) -> Cells:
         """Owners (N,) of border cells, such that no owner holds less of a stretch than would count as a border.
 
         Such a scrap goes to whoever holds most of the stretch: it would be a target that is none at the next scan.
@@ -281,7 +281,7 @@ class Explorer:
         return nearest_true(reached, (row, col), _NEAR_VISIT_M / self.borders.frame.resolution) is not None
 
     def _stand_in(
-        self, cells: Cells, numbers: NDArray[np.int32], reached: NDArray[np.bool_], T_map_base: Array
+        self, cells: Cells, numbers: Cells, reached: NDArray[np.bool_], T_map_base: Array
     ) -> list[_Candidate]:
         """One candidate for each stretch of border left over that can be looked at from somewhere."""
         found: list[tuple[Cells, Array]] = []

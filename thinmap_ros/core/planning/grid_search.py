@@ -30,14 +30,7 @@ def ways_from(allowed: Mask, start: tuple[int, int], goals: Cells) -> Array:
 
 def coarse(allowed: Mask, factor: int) -> Mask:
     """Squares of factor x factor cells of a mask (H, W) in which any is set, (ceil(H / factor), ceil(W / factor))."""
-    rows, cols = (-(-size // factor) for size in allowed.shape)
-    whole = np.zeros((rows * factor, cols * factor), dtype=np.bool_)
-    whole[: allowed.shape[0], : allowed.shape[1]] = allowed
-    result = np.zeros((rows, cols), dtype=np.bool_)
-    for row in range(factor):
-        for col in range(factor):
-            result |= whole[row::factor, col::factor]
-    return result
+    return np.asarray(_coarse(allowed, factor, 0, 0))
 
 
 class WayTable:
@@ -56,7 +49,7 @@ class WayTable:
         factor = max(1, round(self._cell_m / frame.resolution))
         # Squares on a lattice that stays when the frame grows.
         shift = [round(origin / frame.resolution) % factor for origin in (frame.origin_y, frame.origin_x)]
-        ways = coarse(np.pad(allowed, ((shift[0], 0), (shift[1], 0))), factor)
+        ways = _coarse(allowed, factor, shift[0], shift[1])
         cells = (frame.cells_of(places) + shift) // factor
         first = (round(frame.origin_y / frame.resolution) // factor, round(frame.origin_x / frame.resolution) // factor)
         keys = [(int(row), int(col)) for row, col in cells + first]
@@ -72,6 +65,22 @@ class WayTable:
                 for j, way in zip(missing, (found * frame.resolution * factor).tolist(), strict=True):
                     self._known[frozenset((key, keys[j]))] = (stamp_ns, way)
         return np.array([[0.0 if a == b else self._known[frozenset((a, b))][1] for b in keys] for a in keys])
+
+
+@kernel
+def _coarse(allowed: Mask, factor: int, shift_row: int, shift_col: int) -> Mask:
+    """Squares in which any cell is set; the first cell is (shift_row, shift_col) within its square."""
+    rows, cols = allowed.shape
+    squares = np.zeros((-(-(rows + shift_row) // factor), -(-(cols + shift_col) // factor)), dtype=np.bool_)
+    for row in range(rows):
+        line = squares[(row + shift_row) // factor]
+        square, within = 0, shift_col
+        for col in range(cols):
+            if within == factor:
+                square, within = square + 1, 0
+            line[square] |= allowed[row, col]
+            within += 1
+    return squares
 
 
 @kernel

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.grid.distance import distance_cells
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.jit import kernel
@@ -71,20 +70,17 @@ def cost_of_cells(patch: GridPatch, config: WavefrontConfig) -> Array:
     """Cost of moving one unit of distance in each cell (H, W): 1 + I; inf where the robot's centre may not be."""
     resolution = patch.frame.resolution
     free = known_free(patch, TopologyConfig(robot_radius_m=config.robot_radius_m))
-    solid = ~free if config.unknown == 'forbidden' else patch.occupied
-    distance_m = distance_from(solid) * resolution
-    allowed = distance_m >= config.robot_radius_m - _HAIR_M
+    passable = free if config.unknown == 'forbidden' else ~patch.occupied
+    reach = max(math.ceil(max(config.keep_m, config.robot_radius_m) / resolution), 1)
+    distance_m = np.sqrt(np.arange(2 * (reach + 1) ** 2 + 1)) * resolution
     spread = max(config.keep_m - config.robot_radius_m, 1e-6)
     nearness = np.clip((config.keep_m - distance_m) / spread, 0.0, 1.0)
-    cost = np.where(allowed, 1.0 + config.keep_weight * nearness * nearness, np.inf)
+    allowed = distance_m >= config.robot_radius_m - _HAIR_M
+    table = np.where(allowed, 1.0 + config.keep_weight * nearness * nearness, np.inf)
+    cost = _look_up(column_distance(passable), reach, table)
     if config.unknown == 'costly':
         cost += np.where(free, 0.0, config.unknown_weight)
-    return np.ascontiguousarray(cost)
-
-
-def distance_from(solid: Mask) -> Array:
-    """Distance, in cells between centres, from each cell (H, W) to the nearest solid one; outside all is solid."""
-    return distance_cells(np.pad(solid, 1, constant_values=True))[1:-1, 1:-1]
+    return cost
 
 
 def standing_places(free: Mask, radius_m: float, resolution: float) -> Mask:
@@ -168,24 +164,53 @@ def _disc(of: NDArray[Any], centre: tuple[int, int], reach: float) -> tuple[tupl
 
 
 @kernel
+def _look_up(distance: NDArray[np.int16], reach: int, table: Array) -> Array:
+    """table[squared distance in cells to the nearest solid cell] for each cell (H, W); outside all is solid.
+
+    distance: from `column_distance`. What is farther than `reach` cells in a row or column counts as reach + 1 there.
+    """
+    rows, cols = distance.shape
+    result = np.empty((rows, cols))
+    # Columns of solid on both sides, in a row of the processor's smallest numbers.
+    line = np.zeros(cols + 2 * reach, dtype=np.int16)
+    most = np.int16(reach + 1)
+    squared = np.empty(cols, dtype=np.int16)
+    for row in range(rows):
+        for col in range(cols):
+            here = min(distance[row, col], most)
+            line[reach + col] = here * here
+        squared[:] = line[reach : reach + cols]
+        for k in range(1, reach + 1):
+            step = np.int16(k * k)
+            for col in range(cols):
+                beside = min(line[reach + col - k], line[reach + col + k]) + step
+                squared[col] = min(squared[col], beside)
+        for col in range(cols):
+            result[row, col] = table[squared[col]]
+    return result
+
+
+@kernel
 def _reached_from(allowed: Mask, start_row: int, start_col: int) -> Mask:
-    rows, cols = allowed.shape
-    found = np.zeros((rows, cols), dtype=np.bool_)
-    stack = np.empty(rows * cols + 1, dtype=np.int64)
-    count = 0
-    if allowed[start_row, start_col]:
-        found[start_row, start_col] = True
-        stack[0], count = start_row * cols + start_col, 1
+    rows, cols = allowed.shape[0], allowed.shape[1] + 2
+    # An empty border saves the wave all questions about the rim.
+    left = np.zeros((rows + 2, cols), dtype=np.bool_)
+    left[1:-1, 1:-1] = allowed
+    found = np.zeros((rows + 2, cols), dtype=np.bool_)
+    flat, reached = left.ravel(), found.ravel()
+    stack = np.empty(flat.size, dtype=np.int64)
+    start = (start_row + 1) * cols + start_col + 1
+    stack[0], count = start, int(flat[start])
+    reached[start], flat[start] = flat[start], False
     while count > 0:
         count -= 1
-        row, col = stack[count] // cols, stack[count] % cols
-        for side in range(4):
-            r, c = row + (side == 0) - (side == 1), col + (side == 2) - (side == 3)
-            if 0 <= r < rows and 0 <= c < cols and allowed[r, c] and not found[r, c]:
-                found[r, c] = True
-                stack[count] = r * cols + c
+        at = stack[count]
+        for to in (at - cols, at - 1, at + 1, at + cols):
+            if flat[to]:
+                flat[to], reached[to] = False, True
+                stack[count] = to
                 count += 1
-    return found
+    return found[1:-1, 1:-1].copy()
 
 
 @kernel
