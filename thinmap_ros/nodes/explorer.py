@@ -22,7 +22,8 @@ from thinmap_ros.adapters.listening import listen
 from thinmap_ros.adapters.stamps import StampMatcher
 from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.core.exploration.area import fenced
-from thinmap_ros.core.exploration.explorer import Decision, EndNode, Explorer, ExplorerConfig
+from thinmap_ros.core.exploration.decision import Decision, EndNode
+from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
 from thinmap_ros.core.exploration.session import Budget, Odometer
 from thinmap_ros.core.grid.mirror import MapMirror
 from thinmap_ros.core.se2 import Array, wrap

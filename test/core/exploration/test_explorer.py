@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.exploration.explorer import FIRST_STAND_IN_ID, Decision, Explorer, ExplorerConfig, FinishCode
+from thinmap_ros.core.exploration.decision import FIRST_STAND_IN_ID, Decision, FinishCode
+from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
@@ -164,13 +165,3 @@ def test_the_literal_scheme_stops_by_itself_too():
     run = Run(two_rooms(), ExplorerConfig(mode='paper')).go(600.0)
     assert run.last.finished
     assert run.simulation.robot.collisions == 0
-
-
-def test_no_owner_holds_less_of_a_stretch_than_counts_as_a_border():
-    explorer = Explorer()
-    explorer.borders.frame = GridFrame(0.0, 0.0, 0.1)
-    owners = np.array([7] * 9 + [8] * 2 + [-1] * 6 + [8] * 3 + [9] * 2)
-    numbers = np.array([1] * 17 + [2] * 5, dtype=np.int32)
-    found = explorer._without_scraps(owners, numbers)
-    assert found.tolist() == [7] * 11 + [-1] * 6 + [8] * 5
-    assert owners[9] == 8

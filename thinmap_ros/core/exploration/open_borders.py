@@ -10,6 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core.exploration.viewpoints import place_at, place_for
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
@@ -22,31 +23,36 @@ from thinmap_ros.core.topology.free_space import known_free, true_cells
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.int64]
 _LOOKS = 3
-_SLACK = 5
 _SPARE = 64
+_WHOLE_EVERY = 100
 _PART_M = 1.0
 
 
 class OpenBorders:
     """The border cells of the whole map; only what a scan can have changed is looked at again.
 
-    free (H, W): known free cells, small gaps closed; mask (H, W): open border cells; both on the cells of `frame`,
-    which holds the map and some room for it to grow. revision: rises whenever one of them changes.
+    free (H, W): known free cells, small gaps closed; solid (H, W): occupied ones; mask (H, W): open border cells; all
+    on the cells of `frame`, which holds the map and some room for it to grow. revision: rises whenever they change.
     """
 
     def __init__(self, shortest_m: float) -> None:
         self._shortest_m = shortest_m
         self.frame = GridFrame(0.0, 0.0, 1.0)
-        self.revision = 0
+        self.revision = self._updates = 0
         self.free: Mask = np.zeros((0, 0), dtype=np.bool_)
         self.mask: Mask = np.zeros((0, 0), dtype=np.bool_)
+        self.solid: Mask = np.zeros((0, 0), dtype=np.bool_)
         self._looks: NDArray[np.uint8] = np.zeros((0, 0), dtype=np.uint8)
 
     def update(self, patch: GridPatch, xy: tuple[float, float], reach_m: float) -> None:
-        """Find the borders of a map anew within reach_m of a point, m; the first time everywhere."""
-        first = self.mask.size == 0
+        """Find the borders of a map anew within reach_m of a point, m; the first time and now and then everywhere.
+
+        What is known elsewhere changes only where the map was corrected.
+        """
+        whole = self._updates % _WHOLE_EVERY == 0
+        self._updates += 1
         row, col = self._fit(patch)
-        rows, cols = (slice(0, size) for size in patch.shape) if first else _around(patch, xy, reach_m)
+        rows, cols = (slice(0, size) for size in patch.shape) if whole else _around(patch, xy, reach_m)
         # Two cells more are read than written, so that the cut is no border.
         wide = (slice(max(rows.start - 3, 0), rows.stop + 3), slice(max(cols.start - 3, 0), cols.stop + 3))
         part = GridPatch(patch.frame, np.ascontiguousarray(patch.cells[wide]))
@@ -59,6 +65,7 @@ class OpenBorders:
         same = np.array_equal(self.free[rows, cols], free[inner]) and np.array_equal(self.mask[rows, cols], border)
         self.revision += not same
         self.free[rows, cols], self.mask[rows, cols] = free[inner], border
+        self.solid[rows, cols] = part.occupied[inner]
 
     def examine(self, xy: tuple[float, float], reach_m: float, faces: NDArray[np.float64]) -> None:
         """Count a close look from a point, m: border cells whose unknown neighbour lies in plain sight, yet unknown.
@@ -96,15 +103,22 @@ class OpenBorders:
         return np.asarray(_owners(self.free, cells, nodes, reach_m / self.frame.resolution))
 
     def place_to_look(self, cells: Cells, allowed: Mask, reach_m: float, xy: tuple[float, float]) -> Array | None:
-        """Centre (2,), m, of the allowed cell from which to look at a border (N, 2): near to it, and to a point xy.
+        """Centre (2,), m, of the allowed cell (H, W) right at a border (N, 2); see viewpoints.place_at."""
+        row, col = (int(v) for v in self.frame.cells_of(np.array([xy]))[0])
+        place = place_at(self.free, cells, allowed, int(reach_m / self.frame.resolution), (row, col))
+        return None if place is None else self.frame.centres_of(np.array([place]))[0]
 
-        Of all allowed cells whose way to the border over free cells is within reach_m, and nearly the shortest, the one
-        nearest to the point: round a pillar all sides are equally near.
+    def place_to_view(
+        self, cells: Cells, allowed: Mask, ways: Array, reach_m: float, depth_m: float
+    ) -> Array | None:
+        """Centre (2,), m, of the allowed cell (H, W) from which to see behind a border (N, 2): viewpoints.place_for.
+
+        ways (h, w): length of the way to each square of allowed cells; depth_m: how far behind the border is looked.
         """
-        row, col = self.frame.cells_of(np.array([xy]))[0]
-        steps = int(reach_m / self.frame.resolution)
-        place = _place_to_look(self.free, cells, allowed, steps, int(row), int(col))
-        return None if place[0] < 0 else self.frame.centres_of(np.array([place]))[0]
+        resolution = self.frame.resolution
+        depth, reach = round(depth_m / resolution), reach_m / resolution
+        place = place_for(self.free, self.solid, cells, allowed, ways, depth, reach)
+        return None if place is None else self.frame.centres_of(np.array([place]))[0]
 
     def _fit(self, patch: GridPatch) -> tuple[int, int]:
         """Make room for a patch where there is none; returns where its first cell lies, (row, col).
@@ -122,8 +136,9 @@ class OpenBorders:
         )
         if top or bottom or left or right:
             spare = _SPARE if self.mask.size else 0
-            more = tuple((low + spare * (low > 0), high + spare * (high > 0)) for low, high in ((top, bottom), (left, right)))
-            self.free, self.mask, self._looks = (np.pad(cells, more) for cells in (self.free, self.mask, self._looks))
+            more = tuple((low and low + spare, high and high + spare) for low, high in ((top, bottom), (left, right)))
+            self.free, self.solid = np.pad(self.free, more), np.pad(self.solid, more)
+            self.mask, self._looks = np.pad(self.mask, more), np.pad(self._looks, more)
             self.frame = self.frame.shifted(-more[0][0], -more[1][0])
             row, col = row + more[0][0], col + more[1][0]
         return row, col
@@ -233,34 +248,3 @@ def _owners(free: Mask, cells: Cells, nodes: Cells, reach: float) -> Cells:
             if away < best and line_is_clear(free, nodes[j, 0], nodes[j, 1], cells[i, 0], cells[i, 1]):
                 best, owners[i] = away, j
     return owners
-
-
-@kernel
-def _place_to_look(
-    free: Mask, cells: Cells, allowed: Mask, most_steps: int, to_row: int, to_col: int
-) -> tuple[int, int]:
-    """Breadth first over free cells, from all border cells at once, and _SLACK steps on after the first find."""
-    rows, cols = free.shape
-    seen = np.zeros((rows, cols), dtype=np.bool_)
-    queue = np.empty((rows * cols, 3), dtype=np.int64)
-    tail = 0
-    for i in range(cells.shape[0]):
-        queue[tail, 0], queue[tail, 1], queue[tail, 2] = cells[i, 0], cells[i, 1], 0
-        seen[cells[i, 0], cells[i, 1]] = True
-        tail += 1
-    head, best, best_row, best_col = 0, np.inf, -1, -1
-    while head < tail and queue[head, 2] <= most_steps:
-        row, col, steps = queue[head, 0], queue[head, 1], queue[head, 2]
-        head += 1
-        away = math.hypot(row - to_row, col - to_col)
-        if allowed[row, col] and away < best:
-            if best_row < 0:
-                most_steps = min(most_steps, steps + _SLACK)
-            best, best_row, best_col = away, row, col
-        for side in range(4):
-            r, c = row + (side == 0) - (side == 1), col + (side == 2) - (side == 3)
-            if 0 <= r < rows and 0 <= c < cols and free[r, c] and not seen[r, c]:
-                seen[r, c] = True
-                queue[tail, 0], queue[tail, 1], queue[tail, 2] = r, c, steps + 1
-                tail += 1
-    return best_row, best_col

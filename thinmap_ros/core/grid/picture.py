@@ -14,7 +14,7 @@ class Picture:
     """Cells (H, W) int8 of all tiles; which part is out of date; which rectangle holds all that is known."""
 
     def __init__(self, percent: NDArray[np.int8]) -> None:
-        """percent (2 L + 1,): what to show for log odds from -L to L."""
+        """Begin with nothing; percent (2 L + 1,): what to show for log odds from -L to L."""
         self._percent = percent
         self._cells: NDArray[np.int8] = np.empty((0, 0), dtype=np.int8)
         self._bounds: Bounds = (0, 0, 0, 0)
@@ -34,7 +34,8 @@ class Picture:
             return GridPatch(frame, np.full((1, 1), UNKNOWN, dtype=np.int8))
         row, col, end_row, end_col = self._known
         top, left = self._bounds[:2]
-        return GridPatch(frame.shifted(row, col), self._cells[row - top : end_row - top, col - left : end_col - left].copy())
+        shown = self._cells[row - top : end_row - top, col - left : end_col - left]
+        return GridPatch(frame.shifted(row, col), shown.copy())
 
     def _fit(self, tiles: TileStore) -> None:
         """Lay the cells anew when tiles have come outside of them."""

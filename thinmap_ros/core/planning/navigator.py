@@ -252,7 +252,7 @@ def _clear_steps(centres: Array, points: Array, radius: float) -> int:
 
     A point that is too near to the first centre already only forbids to come still nearer.
     """
-    clear = centres.shape[0]
+    clear: int = centres.shape[0]
     for i in range(points.shape[0]):
         limit = min(radius, math.hypot(points[i, 0] - centres[0, 0], points[i, 1] - centres[0, 1]) - 0.005)
         for k in range(clear):
