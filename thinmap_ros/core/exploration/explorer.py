@@ -12,12 +12,16 @@ Source: exploration paper sections 3.2 and 4.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import parameter
+from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.decision import Decision, EndNode, verdict
 from thinmap_ros.core.exploration.end_node_tracker import Track
 from thinmap_ros.core.exploration.failures import Failures
@@ -92,6 +96,27 @@ class Explorer:
         self._memory = _Memory()
         self._stamp_ns, self._began_ns = 0, 2**63
         self._last = _Survey([], 0, -1, {})
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """What the exploration has learned, as arrays by name: probabilities, and which borders show nothing more.
+
+        What could not be reached is left out: it is worth another try.
+        """
+        return self.surveyor.state() | {'first_choice_made': np.array(self._memory.first_choice_made)}
+
+    @staticmethod
+    def from_state(state: Mapping[str, NDArray[Any]], config: ExplorerConfig | None = None) -> 'Explorer':
+        """Explorer that goes on from the `state` of another one, with the map and the graph that belong to it.
+
+        Raises InputError where it is no such state.
+        """
+        explorer = Explorer(config)
+        try:
+            explorer.surveyor.restore(state)
+            explorer._memory.first_choice_made = bool(state['first_choice_made'])
+        except (KeyError, ValueError, TypeError, IndexError) as error:
+            raise InputError(f'saved exploration: {type(error).__name__} {error}: expected what was saved') from error
+        return explorer
 
     def step(self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array) -> Decision:
         """Take in the graph, the map and a scan made at a pose (3,); say where to go.

@@ -6,6 +6,8 @@ of it. Border cells belong to the nearest end node in sight of them; those that 
 """
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +45,21 @@ class OpenBorders:
         self.mask: Mask = np.zeros((0, 0), dtype=np.bool_)
         self.solid: Mask = np.zeros((0, 0), dtype=np.bool_)
         self._looks: NDArray[np.uint8] = np.zeros((0, 0), dtype=np.uint8)
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """What a map does not tell, as arrays by name: how often each border cell was looked at closely."""
+        return {'frame': self.frame.as_array(), 'looks': self._looks}
+
+    @staticmethod
+    def from_state(state: Mapping[str, NDArray[Any]], shortest_m: float) -> 'OpenBorders':
+        """Borders that go on from the `state` of others, on a map of the same lattice. Raises KeyError, ValueError."""
+        borders = OpenBorders(shortest_m)
+        origin_x, origin_y, resolution = state['frame'].tolist()
+        looks = state['looks'].astype(np.uint8)
+        rows, cols = looks.shape
+        borders.frame, borders._looks = GridFrame(origin_x, origin_y, resolution), looks
+        borders.free, borders.mask, borders.solid = (np.zeros((rows, cols), dtype=np.bool_) for _ in range(3))
+        return borders
 
     def update(self, patch: GridPatch, xy: tuple[float, float], reach_m: float) -> None:
         """Find the borders of a map anew within reach_m of a point, m; the first time and now and then everywhere.

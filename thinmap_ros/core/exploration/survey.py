@@ -8,7 +8,9 @@ Where such a look showed nothing, the robot goes to the end node itself, and the
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,6 +85,30 @@ class Surveyor:
         self.reached = self.maybe = self.borders.mask
         self.ways: Array = np.zeros((0, 0))
         self._memory = _Memory()
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """All that is remembered, as arrays by name; `restore` goes on from it."""
+        memory = self._memory
+        visited = [(node_id, *place) for node_id, place in memory.visited.items()]
+        parts = {'nodes': self.tracker.state(), 'stand_ins': self.stand_ins.state(), 'borders': self.borders.state()}
+        return {f'{part}_{key}': array for part, arrays in parts.items() for key, array in arrays.items()} | {
+            'visited': np.array(visited, dtype=np.float64).reshape(-1, 3),
+            'look_closer': np.array(memory.look_closer, dtype=np.float64).reshape(-1, 2),
+            'next_stand_in': np.array(memory.next_stand_in),
+        }
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Take over the `state` of another surveyor. Raises KeyError or ValueError where it is none."""
+
+        def part(name: str) -> dict[str, NDArray[Any]]:
+            return {key.removeprefix(f'{name}_'): state[key] for key in state if key.startswith(f'{name}_')}
+
+        self.tracker = EndNodeTracker.from_state(part('nodes'), self.config)
+        self.stand_ins = EndNodeTracker.from_state(part('stand_ins'), self.config)
+        self.borders = OpenBorders.from_state(part('borders'), self.config.shortest_border_m)
+        visited = {int(row[0]): (float(row[1]), float(row[2])) for row in state['visited']}
+        closer = [(float(x), float(y)) for x, y in state['look_closer']]
+        self._memory = _Memory(visited, closer, int(state['next_stand_in']))
 
     def follow(self, ends: dict[int, Place]) -> dict[int, int]:
         """Take in where the end nodes are now; returns the new id of each one that lives on under another one."""
