@@ -18,7 +18,7 @@ AT = se2.pose(1.0, 2.0, 0.0)
 
 def surveyor_of(cells, ends=None):
     surveyor = Surveyor(SurveyConfig())
-    surveyor.borders.update(GridPatch(FRAME, cells.astype(np.int8)), (1.0, 2.0), 1e3)
+    surveyor.borders.update(GridPatch(FRAME, cells.astype(np.int8)), np.array([[0.0, 0.0], [1.0, 1.0]]))
     surveyor.follow(ends or {})
     return surveyor
 

@@ -25,7 +25,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.decision import Decision, EndNode, verdict
 from thinmap_ros.core.exploration.end_node_tracker import Track
 from thinmap_ros.core.exploration.failures import Failures
-from thinmap_ros.core.exploration.open_borders import directions_of_view
+from thinmap_ros.core.exploration.open_borders import box_of_scan, directions_of_view
 from thinmap_ros.core.exploration.survey import Candidate, Place, SurveyConfig, Surveyor
 from thinmap_ros.core.exploration.tour import tours_by_first
 from thinmap_ros.core.grid.patch import GridPatch
@@ -127,7 +127,7 @@ class Explorer:
         self._began_ns = min(self._began_ns, self._stamp_ns)
         surveyor, borders = self.surveyor, self.surveyor.borders
         xy = (float(T_map_base[0]), float(T_map_base[1]))
-        borders.update(patch, xy, scan.range_max_m + 0.5)
+        borders.update(patch, box_of_scan(scan, T_map_base))
         borders.examine(xy, self.config.close_look_m, directions_of_view(scan, T_map_base))
         candidates = self._candidates(topology, T_map_base, scan.range_max_m)
         open_ids = {c.track.node_id for c in candidates}

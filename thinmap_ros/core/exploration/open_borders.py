@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.viewpoints import place_at, place_for
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
@@ -28,6 +29,7 @@ _LOOKS = 3
 _SPARE = 64
 _WHOLE_EVERY = 100
 _PART_M = 1.0
+_RIM_M = 0.5
 
 
 class OpenBorders:
@@ -61,15 +63,16 @@ class OpenBorders:
         borders.free, borders.mask, borders.solid = (np.zeros((rows, cols), dtype=np.bool_) for _ in range(3))
         return borders
 
-    def update(self, patch: GridPatch, xy: tuple[float, float], reach_m: float) -> None:
-        """Find the borders of a map anew within reach_m of a point, m; the first time and now and then everywhere.
+    def update(self, patch: GridPatch, box: Array) -> None:
+        """Find the borders of a map anew in a box, the first time and now and then everywhere.
 
-        What is known elsewhere changes only where the map was corrected.
+        box (2, 2): its lower left and upper right corner, m (see box_of_scan). What lies elsewhere changes only where the
+        map was corrected.
         """
         whole = self._updates % _WHOLE_EVERY == 0
         self._updates += 1
         row, col = self._fit(patch)
-        rows, cols = (slice(0, size) for size in patch.shape) if whole else _around(patch, xy, reach_m)
+        rows, cols = (slice(0, size) for size in patch.shape) if whole else _part(patch, box)
         # Two cells more are read than written, so that the cut is no border.
         wide = (slice(max(rows.start - 3, 0), rows.stop + 3), slice(max(cols.start - 3, 0), cols.stop + 3))
         part = GridPatch(patch.frame, np.ascontiguousarray(patch.cells[wide]))
@@ -168,12 +171,22 @@ def directions_of_view(scan: Scan, T_map_base: Array) -> Array:
     return np.array([heading + min(scan.angle_min_rad, last), heading + max(scan.angle_min_rad, last)])
 
 
-def _around(patch: GridPatch, xy: tuple[float, float], reach_m: float) -> tuple[slice, slice]:
-    row, col = (int(v) for v in patch.frame.cells_of(np.array([xy]))[0])
-    reach = math.ceil(reach_m / patch.frame.resolution)
+def box_of_scan(scan: Scan, T_map_base: Array) -> Array:
+    """Lower left and upper right corner, m, of all that a scan from a pose (3,) can have changed, (2, 2)."""
+    x, y, heading = se2.compose(T_map_base, scan.T_base_laser).tolist()
+    reach = np.where(scan.hit | scan.no_return, np.minimum(scan.ranges_m, scan.range_max_m), 0.0)
+    along_x, along_y = reach * np.cos(scan.angles_rad + heading), reach * np.sin(scan.angles_rad + heading)
+    low = (x + along_x.min(initial=0.0), y + along_y.min(initial=0.0))
+    high = (x + along_x.max(initial=0.0), y + along_y.max(initial=0.0))
+    return np.asarray(np.array([low, high]) + np.array([[-_RIM_M], [_RIM_M]]))
+
+
+def _part(patch: GridPatch, box: Array) -> tuple[slice, slice]:
+    """Rows and columns of a map that lie in a box."""
+    (top, left), (bottom, right) = patch.frame.cells_of(box).tolist()
     rows, cols = patch.shape
-    top, left = min(max(row - reach, 0), rows), min(max(col - reach, 0), cols)
-    return slice(top, max(min(row + reach + 1, rows), top)), slice(left, max(min(col + reach + 1, cols), left))
+    top, left = min(max(top, 0), rows), min(max(left, 0), cols)
+    return slice(top, max(min(bottom + 1, rows), top)), slice(left, max(min(right + 1, cols), left))
 
 
 def _borders(free: Mask, unknown: Mask) -> Mask:
