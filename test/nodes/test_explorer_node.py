@@ -37,7 +37,7 @@ def room(known_cols):
 
 
 class Robot:
-    """Says what the other nodes of a robot would say that stands in a room, and refuses to drive."""
+    """Says what the other nodes of a robot would say that stands in a room."""
 
     def __init__(self, graph):
         self.graph, self.node, self.numbers = graph, graph.node, count(1)
@@ -48,13 +48,17 @@ class Robot:
         self.pose = self.node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
         self.scan = self.node.create_publisher(LaserScan, 'scan', qos.STREAM)
         self.slam = self.node.create_publisher(SlamStatus, 'slam_status', qos.STREAM)
-        self.driver = ActionServer(self.node, NavigateToPose, 'navigate_to_pose', self.refuse)
         self.node.create_timer(0.1, self.speak)
         self.knows(40)
 
-    def refuse(self, handle):
-        handle.abort()
-        return NavigateToPose.Result(success=False, reason='the wheels are chained')
+    def refuses_to_drive(self):
+        """From now on, goals fail; before, there is no navigator at all, and the explorer waits for it."""
+
+        def refuse(handle):
+            handle.abort()
+            return NavigateToPose.Result(success=False, reason='the wheels are chained')
+
+        self.driver = ActionServer(self.node, NavigateToPose, 'navigate_to_pose', refuse)
 
     def knows(self, cols):
         patch = room(cols)
@@ -94,6 +98,7 @@ def test_it_says_why_it_ended(robot):
     robot.is_tracked, robot.hears_scans = True, False
     assert robot.explores() == (ExplorationStatus.SENSOR_SILENT, GoalStatus.STATUS_ABORTED)
     robot.hears_scans = True
+    robot.refuses_to_drive()
     assert robot.explores() == (ExplorationStatus.NOTHING_REACHABLE, GoalStatus.STATUS_SUCCEEDED)
     robot.knows(60)
     assert robot.explores() == (ExplorationStatus.ALL_RESOLVED, GoalStatus.STATUS_SUCCEEDED)
