@@ -10,7 +10,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.open_borders import OpenBorders, box_of_scan, directions_of_view
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.grid_search import coarse, ways_from
-from thinmap_ros.core.planning.wavefront import places_in_reach
+from thinmap_ros.core.planning.reach import places_in_reach
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 

@@ -11,7 +11,8 @@ from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.follower import _point_ahead, length_from, nearest_point
 from thinmap_ros.core.planning.navigator import _clear_steps, _touches
-from thinmap_ros.core.planning.wavefront import WavefrontConfig, cost_of_cells, reached_from
+from thinmap_ros.core.planning.reach import reached_from
+from thinmap_ros.core.planning.wavefront import WavefrontConfig, cost_of_cells
 
 SEEDS = range(20)
 

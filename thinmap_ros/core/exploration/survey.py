@@ -22,7 +22,7 @@ from thinmap_ros.core.exploration.end_node_tracker import EndNodeTracker, Track,
 from thinmap_ros.core.exploration.open_borders import OpenBorders
 from thinmap_ros.core.exploration.viewpoints import SQUARE
 from thinmap_ros.core.planning.grid_search import coarse, field_from
-from thinmap_ros.core.planning.wavefront import nearest_true, places_in_reach, standing_places
+from thinmap_ros.core.planning.reach import nearest_true, places_in_reach, standing_places
 from thinmap_ros.core.se2 import Array
 
 Cells = NDArray[np.int64]
