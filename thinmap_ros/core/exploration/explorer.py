@@ -22,11 +22,10 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import parameter
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.exploration.decision import Decision, EndNode, verdict
-from thinmap_ros.core.exploration.end_node_tracker import Track
+from thinmap_ros.core.exploration.decision import Decision, verdict
 from thinmap_ros.core.exploration.failures import Failures
 from thinmap_ros.core.exploration.open_borders import box_of_scan, directions_of_view
-from thinmap_ros.core.exploration.survey import Candidate, Place, SurveyConfig, Surveyor
+from thinmap_ros.core.exploration.survey import Candidate, Place, SurveyConfig, Surveyor, end_node_of
 from thinmap_ros.core.exploration.tour import tours_by_first
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.graph_search import costs_to
@@ -264,7 +263,7 @@ class Explorer:
         by_id = {c.track.node_id: c for c in candidates}
         goals = {} if target is None else {target: self._memory.goal}
         tracks = [*surveyor.tracker.tracks.values(), *surveyor.stand_ins.tracks.values()]
-        end_nodes = [_end_node(t, by_id.get(t.node_id), goals.get(t.node_id), resolution) for t in tracks]
+        end_nodes = [end_node_of(t, by_id.get(t.node_id), goals.get(t.node_id), resolution) for t in tracks]
         unreachable = sorted(i for i, candidate in worth.items() if self._failures.has(candidate.place))
         finished = self._memory.nothing_left >= _LOOKS
         code, reason = verdict(finished, unreachable, len(worth))
@@ -273,23 +272,6 @@ class Explorer:
         chosen = next((e for e in end_nodes if e.is_target), None)
         estimate = known / (known + expected) if known > 0.0 else 0.0
         return Decision(chosen, finished, reason, code, end_nodes, unreachable, estimate, known)
-
-
-def _end_node(track: Track, candidate: Candidate | None, target_goal: Array | None, resolution: float) -> EndNode:
-    goal = se2.pose(track.x, track.y, 0.0) if candidate is None else candidate.goal
-    return EndNode(
-        node_id=track.node_id,
-        x=track.x,
-        y=track.y,
-        probability=track.probability,
-        distance_index=track.distance_index,
-        angle_index=track.angle_index,
-        smallest_distance_m=track.smallest_distance_m,
-        angle_span_deg=track.angle_span_deg,
-        open_border_m=0.0 if candidate is None else len(candidate.cells) * resolution,
-        is_target=target_goal is not None,
-        goal=goal if target_goal is None else target_goal,
-    )
 
 
 def _turn_to(T_map_base: Array, goal: Array) -> float:

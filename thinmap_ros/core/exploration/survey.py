@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import parameter
-from thinmap_ros.core.exploration.decision import FIRST_STAND_IN_ID
+from thinmap_ros.core.exploration.decision import FIRST_STAND_IN_ID, EndNode
 from thinmap_ros.core.exploration.end_node_tracker import EndNodeTracker, Track, TrackerConfig
 from thinmap_ros.core.exploration.open_borders import OpenBorders
 from thinmap_ros.core.exploration.viewpoints import SQUARE
@@ -273,6 +273,24 @@ class Surveyor:
         cell = stretch[np.square(stretch - stretch.mean(axis=0)).sum(axis=1).argmin()]
         x, y = self.borders.frame.centres_of(cell[None])[0]
         return float(x), float(y)
+
+
+def end_node_of(track: Track, candidate: Candidate | None, target_goal: Array | None, resolution: float) -> EndNode:
+    """An end node as it is told of: with its candidate, if it is one, and its goal (3,), if it is the target."""
+    goal = se2.pose(track.x, track.y, 0.0) if candidate is None else candidate.goal
+    return EndNode(
+        node_id=track.node_id,
+        x=track.x,
+        y=track.y,
+        probability=track.probability,
+        distance_index=track.distance_index,
+        angle_index=track.angle_index,
+        smallest_distance_m=track.smallest_distance_m,
+        angle_span_deg=track.angle_span_deg,
+        open_border_m=0.0 if candidate is None else len(candidate.cells) * resolution,
+        is_target=target_goal is not None,
+        goal=goal if target_goal is None else target_goal,
+    )
 
 
 def _place(track: Track) -> Place:
