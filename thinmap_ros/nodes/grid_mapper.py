@@ -92,11 +92,13 @@ class GridMapperNode(Node):
         return await self._save_what_was_learned(path, response)
 
     async def _save_what_was_learned(self, path: str, response: SaveMap.Response) -> SaveMap.Response:
-        learned = await ask(self, self._save_exploration, SaveMap.Request(path=path))
-        saved = response.message
-        if learned is None:
-            return answer(response, lambda: f'{saved}{session_files.set_exploration_aside(path)}')
-        response.success, response.message = response.success and learned.success, f'{saved}; {learned.message}'
+        saved, learned = response.message, await ask(self, self._save_exploration, SaveMap.Request(path=path))
+        if learned is not None:
+            response.success, response.message = response.success and learned.success, f'{saved}; {learned.message}'
+            return response
+        # Without an explorer, what one has learned of an earlier map must not be taken for this one's.
+        if response.success:
+            answer(response, lambda: f'{saved}{session_files.set_exploration_aside(path)}')
         return response
 
     async def _on_load(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:
