@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from benchmarks import graphs, localization, mapping, nodes, online, thinning
+from benchmarks import graphs, localization, mapping, nodes, online, planning, thinning
 from benchmarks.table import Row, show
 from benchmarks.worlds import WORLDS
 
@@ -15,12 +15,13 @@ _ALL: dict[str, Callable[[Path, bool], Iterable[Row]]] = {
     'online': online.run,
     'nodes': nodes.run,
     'localization': localization.run,
+    'planning': planning.run,
 }
 
 
 def main() -> None:
     """Run the benchmarks that are named, or all."""
-    parser = argparse.ArgumentParser(prog='benchmarks.run', description='Benchmarks of grid, thinning and topology')
+    parser = argparse.ArgumentParser(prog='benchmarks.run', description='Benchmarks of the core')
     parser.add_argument('names', nargs='*', help=f'some of {", ".join(_ALL)} (default: all)')
     parser.add_argument('--quick', action='store_true', help='fewer worlds, pairs and scans: a minute or two')
     parser.add_argument('--worlds', type=Path, default=WORLDS, help=f'folder with worlds.json (default {WORLDS})')

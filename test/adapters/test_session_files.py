@@ -10,17 +10,21 @@ import pytest
 from thinmap_ros.adapters.map_files import write_map
 from thinmap_ros.adapters.session_files import (
     has_topology,
+    load_exploration,
     load_grid,
     load_topology,
     read_grid,
     read_topology,
+    save_exploration,
     save_grid,
     save_topology,
+    set_exploration_aside,
     stem_of,
     write_grid,
     write_topology,
 )
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.se2 import Array, pose
@@ -195,3 +199,21 @@ def test_a_correction_before_the_first_window() -> None:
     builder = TopologyBuilder()
     builder.rebuild(lambda x, y: OccupancyGrid().window(x, y, 10.0), np.empty((0, 3)), np.empty((0, 3)))
     assert not builder.map.nodes
+
+
+def test_what_an_exploration_learned_is_the_same_after_a_start(tmp_path):
+    explorer, stem = Explorer(), str(tmp_path / 'room')
+    assert load_exploration(stem) is None
+    explorer.surveyor.follow({7: (1.0, 2.0), 9: (3.0, 2.5)})
+    explorer.surveyor.tracker.tracks[9].probability = 0.8
+    save_exploration(stem, explorer)
+    again = load_exploration(stem)
+    assert again is not None
+    assert {i: (t.x, t.y, t.probability) for i, t in again.surveyor.tracker.tracks.items()} == {
+        7: (1.0, 2.0, 0.5), 9: (3.0, 2.5, 0.8)
+    }
+    (tmp_path / 'room.exploration.npz').write_bytes(b'no archive')
+    with pytest.raises(InputError, match=r'room\.exploration\.npz'):
+        load_exploration(stem)
+    assert 'room.exploration.npz.old' in set_exploration_aside(stem)
+    assert load_exploration(stem) is None

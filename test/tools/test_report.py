@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from thinmap_ros.core.exploration.explorer import FIRST_STAND_IN_ID
+from thinmap_ros.core.exploration.decision import FIRST_STAND_IN_ID
 from thinmap_ros.tools.report import FEWEST_SIGHTINGS, Ending, EndNodeCensus, TargetLog, exploration_report
 
 AFAR = np.array([100.0, 100.0, 0.0])

@@ -1,7 +1,7 @@
 """Saved sessions: grid and topological map with all that their builders know, so that work goes on where it was.
 
-A session has a path STEM: STEM.grid.npz holds the grid, STEM.pgm and STEM.yaml the same as a map_server map, and
-STEM.topology.npz the graph with its ids.
+A session has a path STEM: STEM.grid.npz holds the grid, STEM.pgm and STEM.yaml the same as a map_server map,
+STEM.topology.npz the graph with its ids, and STEM.exploration.npz what an exploration of it has learned.
 """
 
 from collections.abc import Mapping
@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 from thinmap_ros.adapters.files import written_aside
 from thinmap_ros.adapters.map_files import read_map, write_map
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig
 
 _FORMAT = 'thinmap_format'
-_GRID, _TOPOLOGY = 'grid 1', 'topology 1'
+_GRID, _TOPOLOGY, _EXPLORATION = 'grid 1', 'topology 1', 'exploration 1'
 _GRID_END, _TOPOLOGY_END, _MAP_END = '.grid.npz', '.topology.npz', '.yaml'
+_EXPLORATION_END = '.exploration.npz'
 
 
 def stem_of(path: str) -> Path:
@@ -27,7 +29,7 @@ def stem_of(path: str) -> Path:
 
     Raises InputError where it names nothing.
     """
-    for end in (_GRID_END, _TOPOLOGY_END, _MAP_END, '.pgm'):
+    for end in (_GRID_END, _TOPOLOGY_END, _EXPLORATION_END, _MAP_END, '.pgm'):
         path = path.removesuffix(end)
     if not Path(path).name or '\0' in path:
         raise InputError(f'{path!r}: expected the path of a session, without the endings of its files')
@@ -80,6 +82,24 @@ def load_topology(
     return builder
 
 
+def save_exploration(path: str, explorer: Explorer) -> str:
+    """Write STEM.exploration.npz; returns its name. Raises OSError where that fails."""
+    file = _named(stem_of(path), _EXPLORATION_END)
+    _write(file, _EXPLORATION, explorer.state())
+    return str(file)
+
+
+def load_exploration(path: str, config: ExplorerConfig | None = None) -> Explorer | None:
+    """Read STEM.exploration.npz; None where the session has none. Raises InputError where it is broken."""
+    file = _named(stem_of(path), _EXPLORATION_END)
+    if not _is_there(file):
+        return None
+    try:
+        return Explorer.from_state(_read(file, _EXPLORATION), config)
+    except InputError as error:
+        raise InputError(f'{file}: {error}') from error
+
+
 def has_topology(path: str) -> bool:
     """Whether a session has a graph."""
     return _is_there(_named(stem_of(path), _TOPOLOGY_END))
@@ -87,12 +107,19 @@ def has_topology(path: str) -> bool:
 
 def set_topology_aside(path: str) -> str:
     """Keep a graph that was saved with an earlier grid as STEM.topology.npz.old; returns what was done, or ''."""
-    file = _named(stem_of(path), _TOPOLOGY_END)
-    if not _is_there(file):
-        return ''
-    aside = file.with_name(f'{file.name}.old')
-    file.replace(aside)
-    return f'; the graph of an earlier grid is now {aside}'
+    aside = _set_aside(path, _TOPOLOGY_END)
+    return f'; the graph of an earlier grid is now {aside}' if aside else ''
+
+
+def set_exploration_aside(path: str) -> str:
+    """Keep what an exploration of an earlier grid has learned as STEM.exploration.npz.old; returns as above."""
+    aside = _set_aside(path, _EXPLORATION_END)
+    return f'; what was learned of an earlier grid is now {aside}' if aside else ''
+
+
+def _set_aside(path: str, end: str) -> Path | None:
+    file = _named(stem_of(path), end)
+    return file.replace(file.with_name(f'{file.name}.old')) if _is_there(file) else None
 
 
 def write_grid(path: Path, grid: OccupancyGrid) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.baselines.frontiers import Frontier, FrontierMap
 from thinmap_ros.core import se2
-from thinmap_ros.core.exploration.explorer import Decision, EndNode, FinishCode
+from thinmap_ros.core.exploration.decision import Decision, EndNode, FinishCode
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import axis_setup
 from thinmap_ros.core.jit import kernel

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.exploration.open_borders import OpenBorders, directions_of_view
+from thinmap_ros.core.exploration.open_borders import OpenBorders, box_of_scan, directions_of_view
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.grid_search import coarse, ways_from
-from thinmap_ros.core.planning.wavefront import places_in_reach
+from thinmap_ros.core.planning.reach import places_in_reach
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
@@ -54,7 +54,7 @@ class FrontierMap:
         """Take in the map after a scan made at a pose (3,)."""
         self.patch = patch
         xy = (float(T_map_base[0]), float(T_map_base[1]))
-        self.borders.update(patch, xy, scan.range_max_m + 0.5)
+        self.borders.update(patch, box_of_scan(scan, T_map_base))
         self.borders.examine(xy, _CLOSE_LOOK_M, directions_of_view(scan, T_map_base))
 
     def is_open(self, frontier: Frontier) -> bool:

@@ -14,16 +14,19 @@ from sensor_msgs.msg import LaserScan
 from thinmap_msgs.action import Explore, NavigateToPose
 from thinmap_msgs.msg import EndNode as EndNodeMsg
 from thinmap_msgs.msg import EndNodeArray, ExplorationStatus, SlamStatus, TopologicalMap
+from thinmap_msgs.srv import SaveMap
 from thinmap_ros import warm_up
-from thinmap_ros.adapters import checks, messages, parameters, qos, runtime
+from thinmap_ros.adapters import checks, messages, parameters, qos, runtime, session_files
 from thinmap_ros.adapters.actions import Outcome, SingleGoalServer
 from thinmap_ros.adapters.listening import listen
 from thinmap_ros.adapters.live_node import LiveNode
+from thinmap_ros.adapters.services import answer
 from thinmap_ros.adapters.stamps import StampMatcher
 from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.area import fenced
-from thinmap_ros.core.exploration.explorer import Decision, EndNode, Explorer, ExplorerConfig
+from thinmap_ros.core.exploration.decision import Decision, EndNode
+from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
 from thinmap_ros.core.exploration.session import Budget, Odometer
 from thinmap_ros.core.grid.mirror import MapMirror
 from thinmap_ros.core.se2 import Array, wrap
@@ -38,7 +41,10 @@ _GIVE_UP_HOME = 3
 
 
 class ExplorerNode(LiveNode):
-    """Maps, /topology, /pose and /scan in; goals for the navigator, /end_nodes and /exploration_status out."""
+    """Maps, /topology, /pose and /scan in; goals for the navigator, /end_nodes and /exploration_status out.
+
+    Service save_exploration keeps what was learned beside the map and the graph of a session.
+    """
 
     def __init__(self) -> None:
         super().__init__('explorer')
@@ -46,6 +52,7 @@ class ExplorerNode(LiveNode):
         self._config = parameters.declare(self, ExplorerConfig, self._on_config)
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
         self._mount = LaserMount(self)
+        self._session = parameters.declare_session(self)
         parameters.check_unknown(self)
         warm_up.explorer()
         self._goal_sent: Array | None = None
@@ -54,7 +61,10 @@ class ExplorerNode(LiveNode):
         self._make_topics()
 
     def begin_anew(self) -> None:
-        """Forget the map, the graph and what was explored."""
+        """Forget the map, the graph and what was explored, or go back to the session that the node was started with."""
+        # What was learned is kept for the next goal, until an exploration is finished.
+        self._learned = session_files.load_exploration(self._session, self._config) if self._session else None
+        self._polygon = np.empty((0, 2))
         self._map = MapMirror()
         self._topology = messages.topology_from(TopologicalMap())
         self._matcher: StampMatcher[LaserScan, Array] = StampMatcher()
@@ -65,7 +75,7 @@ class ExplorerNode(LiveNode):
         self._state = ExplorationStatus.IDLE
 
     def _on_config(self, config: ExplorerConfig) -> None:
-        self._config = config
+        self._config, self._learned = config, None
 
     def stand_still(self) -> None:
         """End the exploration."""
@@ -83,6 +93,7 @@ class ExplorerNode(LiveNode):
         listen(self, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
         self._navigator = ActionClient(self, NavigateToPose, 'navigate_to_pose')
         self._goals = SingleGoalServer(self, Explore, 'explore', self._on_goal, self._on_cancel, self._preempted)
+        self.create_service(SaveMap, 'save_exploration', self._on_save)
         self.every(_FEEDBACK_PERIOD_S, self._every_second)
 
     def _on_goal(self, goal: Explore.Goal) -> None:
@@ -98,8 +109,10 @@ class ExplorerNode(LiveNode):
 
     def _begin(self, goal: Explore.Goal) -> None:
         self._goal = goal
-        self._polygon = np.array([[p.x, p.y] for p in goal.area.points], dtype=np.float64).reshape(-1, 2)
-        self._explorer = Explorer(self._config)
+        before, self._polygon = self._polygon, np.array([[p.x, p.y] for p in goal.area.points]).reshape(-1, 2)
+        # Where other walls are in the way, other things are to be seen.
+        self._learned = self._learned if np.array_equal(before, self._polygon) else None
+        self._explorer = self._learned = self._learned or Explorer(self._config)
         self._odometer = Odometer()
         self._budget = Budget(goal.time_limit_s, goal.distance_limit_m, goal.area_limit_m2)
         self._decision: Decision | None = None
@@ -139,6 +152,9 @@ class ExplorerNode(LiveNode):
 
     def _on_cancel(self) -> None:
         self._cancel_asked = True
+
+    def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
+        return answer(response, lambda: f'saved {session_files.save_exploration(request.path, self._explorer)}')
 
     # What is done.
 
@@ -197,6 +213,8 @@ class ExplorerNode(LiveNode):
             self._handle.cancel_goal_async()
         self._handle = self._goal_sent = None
         self._ending, self._state = (code, reason), ExplorationStatus.FINISHED
+        if code in (ExplorationStatus.ALL_RESOLVED, ExplorationStatus.NOTHING_REACHABLE):
+            self._learned = None
         status = self._status_msg()
         self._status.publish(status)
         good = code in (ExplorationStatus.ALL_RESOLVED, ExplorationStatus.BUDGET, ExplorationStatus.NOTHING_REACHABLE)

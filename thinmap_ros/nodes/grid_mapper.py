@@ -56,6 +56,7 @@ class GridMapperNode(LiveNode):
         self.create_service(SaveMap, 'save_map', self._on_save, callback_group=aside)
         self.create_service(LoadMap, 'load_map', self._on_load)
         self._save_topology = self.create_client(SaveMap, 'save_topology', callback_group=aside)
+        self._save_exploration = self.create_client(SaveMap, 'save_exploration', callback_group=aside)
         self._load_topology = self.create_client(LoadMap, 'load_topology', callback_group=aside)
         self.every(1.0, self._publish_map)
 
@@ -141,8 +142,19 @@ class GridMapperNode(LiveNode):
         graph = await ask(self, self._save_topology, SaveMap.Request(path=path))
         if graph is None:
             saved = response.message
-            return answer(response, lambda: f'{saved}; {_NO_BUILDER}{session_files.set_topology_aside(path)}')
+            answer(response, lambda: f'{saved}; {_NO_BUILDER}{session_files.set_topology_aside(path)}')
+            return await self._save_what_was_learned(path, response)
         response.success, response.message = graph.success, f'{response.message}; {graph.message}'
+        return await self._save_what_was_learned(path, response)
+
+    async def _save_what_was_learned(self, path: str, response: SaveMap.Response) -> SaveMap.Response:
+        saved, learned = response.message, await ask(self, self._save_exploration, SaveMap.Request(path=path))
+        if learned is not None:
+            response.success, response.message = response.success and learned.success, f'{saved}; {learned.message}'
+            return response
+        # Without an explorer, what one has learned of an earlier map must not be taken for this one's.
+        if response.success:
+            answer(response, lambda: f'{saved}{session_files.set_exploration_aside(path)}')
         return response
 
     async def _on_load(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:

@@ -22,6 +22,7 @@ from thinmap_ros.sim.world import World
 
 CELL_M = 0.1
 _RAY_SPACING_M = 0.05
+_ALIGNED = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,12 +45,29 @@ class Coverable:
         centres = self._centres
         if len(centres) == 0:
             return 1.0
+        offset = self._offset_of(patch.frame)
+        if T_world_map is None and offset is not None:
+            return self._count_known(patch, *offset) / len(centres)
         if T_world_map is not None:
             centres = se2.transform_points(se2.invert(T_world_map), centres)
         at = patch.frame.cells_of(centres)
         rows, cols = patch.shape
         inside = (at[:, 0] >= 0) & (at[:, 0] < rows) & (at[:, 1] >= 0) & (at[:, 1] < cols)
         return float(patch.free[at[inside, 0], at[inside, 1]].sum()) / len(centres)
+
+    def _offset_of(self, frame: GridFrame) -> tuple[int, int] | None:
+        """Where a frame's first cell lies among these, (row, col), if it is on the same lattice."""
+        if frame.resolution != self.frame.resolution:
+            return None
+        offset = (frame.as_array() - self.frame.as_array())[1::-1] / frame.resolution
+        whole = np.round(offset)
+        return (int(whole[0]), int(whole[1])) if np.abs(offset - whole).max() < _ALIGNED else None
+
+    def _count_known(self, patch: GridPatch, row: int, col: int) -> int:
+        rows, cols = self.cells.shape
+        here = (slice(max(row, 0), row + patch.shape[0]), slice(max(col, 0), col + patch.shape[1]))
+        there = (slice(max(-row, 0), max(rows - row, 0)), slice(max(-col, 0), max(cols - col, 0)))
+        return int(np.count_nonzero(self.cells[here] & patch.free[there]))
 
     @cached_property
     def _centres(self) -> Array:

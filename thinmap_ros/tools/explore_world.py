@@ -24,7 +24,8 @@ from thinmap_ros.baselines.exploration import (
 )
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.exploration.explorer import Decision, Explorer, ExplorerConfig
+from thinmap_ros.core.exploration.decision import Decision
+from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig

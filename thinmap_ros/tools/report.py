@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from thinmap_ros.core.exploration.explorer import FIRST_STAND_IN_ID
+from thinmap_ros.core.exploration.decision import FIRST_STAND_IN_ID
 from thinmap_ros.core.exploration.position_probability import NEAR_M
 from thinmap_ros.core.se2 import Array
 

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.exploration.explorer import FIRST_STAND_IN_ID, Decision, Explorer, ExplorerConfig, FinishCode
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.exploration.decision import FIRST_STAND_IN_ID, Decision, FinishCode
+from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
@@ -160,17 +162,34 @@ def test_a_target_that_cannot_be_reached_is_put_aside_tried_again_and_named_at_t
     assert not np.hypot(*(np.array(run.poses)[:, :2] - START[:2]).T).any()
 
 
+def test_an_exploration_goes_on_from_its_state_as_if_it_had_not_been_interrupted():
+    run = Run(two_rooms()).go(8.0)
+    state = {key: array.copy() for key, array in run.explorer.state().items()}
+    again = Explorer.from_state(state)
+    before, after = run.explorer.surveyor, again.surveyor
+    assert {i: (t.probability, t.distances_m, t.angle_span_deg) for i, t in before.tracker.tracks.items()} == {
+        i: (t.probability, t.distances_m, t.angle_span_deg) for i, t in after.tracker.tracks.items()
+    }
+    run.explorer = again
+    run.go(300.0)
+    assert run.last.finished
+    assert run.last.code == FinishCode.ALL_RESOLVED
+    assert run.coverage() >= 0.99
+    finished = run.explorer.state()
+    late = Explorer.from_state(finished)
+    for _ in range(3):
+        decision = late.step(run.topology.map, run.grid.patch(), run.scan, run.poses[-1])
+    assert decision.finished, 'what was examined in vain stays examined'
+
+
+@pytest.mark.parametrize('broken', ['nodes_ids', 'borders_looks', 'visited'])
+def test_a_state_that_is_none_is_refused(broken):
+    state = Run(two_rooms()).go(1.0).explorer.state()
+    with pytest.raises(InputError, match='saved exploration'):
+        Explorer.from_state({key: array for key, array in state.items() if key != broken})
+
+
 def test_the_literal_scheme_stops_by_itself_too():
     run = Run(two_rooms(), ExplorerConfig(mode='paper')).go(600.0)
     assert run.last.finished
     assert run.simulation.robot.collisions == 0
-
-
-def test_no_owner_holds_less_of_a_stretch_than_counts_as_a_border():
-    explorer = Explorer()
-    explorer.borders.frame = GridFrame(0.0, 0.0, 0.1)
-    owners = np.array([7] * 9 + [8] * 2 + [-1] * 6 + [8] * 3 + [9] * 2)
-    numbers = np.array([1] * 17 + [2] * 5, dtype=np.int32)
-    found = explorer._without_scraps(owners, numbers)
-    assert found.tolist() == [7] * 11 + [-1] * 6 + [8] * 5
-    assert owners[9] == 8

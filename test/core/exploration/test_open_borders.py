@@ -5,11 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from thinmap_ros.core.exploration.open_borders import OpenBorders
+from thinmap_ros.core import se2
+from thinmap_ros.core.exploration.open_borders import OpenBorders, box_of_scan
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.scan import Scan
 
 FRAME = GridFrame(0.0, 0.0, 0.1)
+HERE = np.array([[0.5, 1.0], [1.5, 2.0]])
 ALL_ROUND = np.array([0.0, 2.0 * math.pi])
 
 
@@ -27,7 +30,7 @@ def half_known():
 
 def borders_of(cells, shortest_m=0.4):
     borders = OpenBorders(shortest_m)
-    borders.update(patch_of(cells), (1.0, 1.5), 1e3)
+    borders.update(patch_of(cells), HERE)
     return borders
 
 
@@ -37,7 +40,7 @@ def test_the_border_is_where_free_cells_touch_unknown_ones():
     expected[1:29, 19] = True
     assert (borders.mask == expected).all()
     cells, numbers, count = borders.stretches()
-    assert (len(cells), count, set(numbers)) == (28, 1, {1})
+    assert (len(cells), count, set(numbers)) == (28, 1, {0})
 
 
 def test_short_borders_are_missing_beams():
@@ -61,11 +64,30 @@ def test_updates_near_the_robot_give_what_a_new_look_at_the_whole_map_gives():
     for _ in range(60):
         row, col = rng.integers(8, 72), rng.integers(8, 82)
         known[row - 6 : row + 7, col - 6 : col + 7] = world[row - 6 : row + 7, col - 6 : col + 7]
-        at = ((col + 0.5) * 0.1, (row + 0.5) * 0.1)
-        local.update(patch_of(known), at, 1.0)
+        local.update(patch_of(known), np.array([[col - 10, row - 10], [col + 11, row + 11]]) * 0.1)
         whole = borders_of(known)
         assert (local.mask == whole.mask).all()
         assert (local.free == whole.free).all()
+
+
+def test_what_a_scan_can_have_changed_lies_in_its_box():
+    ranges = np.array([2.0, 3.0, np.inf, np.nan, 1.0])
+    scan = Scan.create(0, ranges, -0.5 * math.pi, 0.25 * math.pi, 0.05, 8.0)
+    low, high = box_of_scan(scan, se2.pose(10.0, 20.0, 0.0))
+    assert low.tolist() == pytest.approx([9.5, 20.0 - 3.0 / math.sqrt(2.0) - 0.5], abs=1.0)
+    assert low[1] <= 18.0
+    assert high.tolist() == pytest.approx([18.5, 21.5], abs=1e-6)
+
+
+def test_now_and_then_the_whole_map_is_looked_at_again():
+    borders = borders_of(half_known())
+    corrected = half_known()
+    corrected[5:25, 10] = 100
+    for _ in range(99):
+        borders.update(patch_of(corrected), np.array([[3.0, 0.0], [3.5, 0.5]]))
+    assert borders.free[10, 10]
+    borders.update(patch_of(corrected), np.array([[3.0, 0.0], [3.5, 0.5]]))
+    assert not borders.free[10, 10]
 
 
 def test_a_map_that_grows_on_all_sides_keeps_what_was_exhausted():
@@ -73,8 +95,8 @@ def test_a_map_that_grows_on_all_sides_keeps_what_was_exhausted():
     gone = np.argwhere(borders.mask)[:10]
     borders.exhaust(gone, (1.95, 0.15))
     grown = np.pad(half_known(), ((5, 3), (4, 6)), constant_values=-1)
-    borders.update(patch_of(grown, FRAME.shifted(-5, -4)), (1.0, 1.5), 0.5)
-    moved = gone + (5, 4)
+    borders.update(patch_of(grown, FRAME.shifted(-5, -4)), HERE)
+    moved = gone + np.round((FRAME.as_array() - borders.frame.as_array())[1::-1] / 0.1).astype(int)
     assert not borders.mask[moved[:, 0], moved[:, 1]].any()
     assert borders.mask.sum() == 18
 

@@ -259,3 +259,18 @@ def test_all_cells_are_those_of_the_plain_grid_bit_for_bit(seed, config):
             plain.update(scan, at)
     assert known_cells(grid) == plain.odds
     assert not grid._news.any()
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_the_whole_map_is_the_same_however_often_it_was_looked_at(seed):
+    rng = np.random.default_rng(seed)
+    watched = OccupancyGrid()
+    for _ in range(12):
+        scan = scan_of(rng.uniform(0.5, 9.0, 181))
+        watched.update(scan, pose(*rng.uniform(-15.0, 15.0, 2), rng.uniform(-3.0, 3.0)))
+        seen = watched.patch()
+        fresh = OccupancyGrid.from_state(watched.state()).patch()
+        assert seen.frame == fresh.frame
+        assert np.array_equal(seen.cells, fresh.cells)
+        known = seen.cells != -1
+        assert known[[0, -1]].any(axis=1).all() and known[:, [0, -1]].any(axis=0).all(), 'no rectangle is smaller'

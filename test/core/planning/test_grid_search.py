@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.planning.grid_search import WayTable, coarse, ways_from
+from thinmap_ros.core.planning.grid_search import WayTable, coarse, field_from, ways_from
 
 
 def dijkstra(allowed, start):
@@ -63,25 +63,45 @@ def test_a_coarse_square_is_set_where_any_of_its_cells_is():
 
 
 def test_a_table_of_ways_stays_true_while_the_map_grows_to_all_sides():
-    table = WayTable(0.2, 1e9)
+    table = WayTable(0.2, 1e9, 2)
     frame, allowed = GridFrame(0.3, -0.5, 0.1), np.ones((60, 80), dtype=np.bool_)
     allowed[28:33, :70] = False
     places = np.array([[1.05, 1.05], [1.05, 4.05], [7.05, 1.05], [7.95, 4.95]])
-    first = table.update(allowed, frame, places, 0)
+    first = table.update(allowed, np.zeros_like(allowed), frame, places, 0)
     assert np.allclose(first, first.T)
     assert first[0, 1] > 12.0
     grown = np.pad(allowed, ((3, 5), (7, 2)))
-    fresh = WayTable(0.2, 1e9).update(grown, frame.shifted(-3, -7), places, 0)
-    assert np.allclose(table.update(grown, frame.shifted(-3, -7), places, 5), first)
+    nothing, moved = np.zeros_like(grown), frame.shifted(-3, -7)
+    fresh = WayTable(0.2, 1e9, 2).update(grown, nothing, moved, places, 0)
+    assert np.allclose(table.update(grown, nothing, moved, places, 5), first)
     assert np.abs(fresh - first).max() < 0.7
 
 
 def test_a_way_is_found_anew_once_it_is_old():
-    table = WayTable(0.2, 10.0)
+    table = WayTable(0.2, 10.0, 2)
     allowed, frame = np.ones((60, 60), dtype=np.bool_), GridFrame(0.0, 0.0, 0.1)
     allowed[28:33, 4:] = False
     places = np.array([[5.0, 1.0], [5.0, 5.0]])
-    before = table.update(allowed, frame, places, 0)[0, 1]
+    before = table.update(allowed, np.zeros_like(allowed), frame, places, 0)[0, 1]
     allowed[:] = True
-    assert table.update(allowed, frame, places, 5_000_000_000)[0, 1] == before
-    assert table.update(allowed, frame, places, 15_000_000_000)[0, 1] == pytest.approx(4.0, abs=0.3)
+    assert table.update(allowed, np.zeros_like(allowed), frame, places, 5_000_000_000)[0, 1] == before
+    later = table.update(allowed, np.zeros_like(allowed), frame, places, 15_000_000_000)
+    assert later[0, 1] == pytest.approx(4.0, abs=0.3)
+
+
+def test_a_way_through_the_unknown_is_longer_than_it_is():
+    allowed = np.ones((60, 60), dtype=np.bool_)
+    allowed[:, 28:32] = False
+    places = np.array([[1.0, 3.0], [5.0, 3.0]])
+    frame = GridFrame(0.0, 0.0, 0.1)
+    assert WayTable(0.2, 10.0, 2).update(allowed, np.zeros_like(allowed), frame, places, 0)[0, 1] == math.inf
+    assert WayTable(0.2, 10.0, 2).update(allowed, ~allowed, frame, places, 0)[0, 1] == pytest.approx(4.4)
+
+
+def test_the_field_of_ways_holds_the_way_to_each_cell():
+    allowed = np.random.default_rng(9).random((30, 30)) < 0.8
+    everywhere = np.argwhere(np.ones_like(allowed))
+    field = field_from(allowed, (3, 3))
+    expected = ways_from(allowed, (3, 3), everywhere)
+    expected[3 * 30 + 3] = 0.0
+    assert (field.ravel() == expected).all()

@@ -8,14 +8,8 @@ from hypothesis import strategies as st
 
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.wavefront import (
-    WavefrontConfig,
-    cost_of_cells,
-    descend,
-    navigation_function,
-    nearest_true,
-    plan,
-)
+from thinmap_ros.core.planning.reach import nearest_true
+from thinmap_ros.core.planning.wavefront import WavefrontConfig, cost_of_cells, descend, navigation_function, plan
 
 PLAIN = WavefrontConfig(robot_radius_m=0.25, keep_weight=0.0)
 

@@ -16,7 +16,9 @@ What the paper leaves open, and how it is settled here:
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,6 +136,34 @@ class EndNodeTracker:
         if self.config.mode == 'open_border':
             for track in self.tracks.values():
                 self._judge_border(track, track.node_id in open_ids)
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """All that is known of the end nodes as arrays by name; `from_state` goes on from it."""
+        tracks = list(self.tracks.values())
+        unseen = (math.nan, math.nan)
+        rows = [(t.x, t.y, *t.began_at, t.probability, *(t.last_seen_from or unseen), t.closed) for t in tracks]
+        looks = [look for t in tracks for look in zip(t.distances_m, t.bearings_rad, strict=True)]
+        return {
+            'ids': np.array([t.node_id for t in tracks], dtype=np.int64),
+            'tracks': np.array(rows, dtype=np.float64).reshape(-1, 8),
+            'look_counts': np.array([len(t.distances_m) for t in tracks], dtype=np.int64),
+            'looks': np.array(looks, dtype=np.float64).reshape(-1, 2),
+        }
+
+    @staticmethod
+    def from_state(state: Mapping[str, NDArray[Any]], config: TrackerConfig) -> 'EndNodeTracker':
+        """Tracker that goes on from the `state` of another one. Raises KeyError or ValueError where it is none."""
+        tracker = EndNodeTracker(config)
+        ends = np.cumsum(state['look_counts'])
+        for node_id, row, end, count in zip(state['ids'], state['tracks'], ends, state['look_counts'], strict=True):
+            x, y, began_x, began_y, probability, seen_x, seen_y, closed = row.tolist()
+            looks = state['looks'][end - count : end]
+            tracker.tracks[int(node_id)] = Track(
+                int(node_id), x, y, (began_x, began_y), probability, looks[:, 0].tolist(), looks[:, 1].tolist(),
+                angle_difference(looks[:, 1]) if count else 0.0, None if math.isnan(seen_x) else (seen_x, seen_y),
+                bool(closed),
+            )
+        return tracker
 
     def _heir(self, lost: dict[int, Track], x: float, y: float) -> Track | None:
         """The nearest vanished track within moved_m; each is inherited once."""

@@ -6,10 +6,14 @@ of it. Border cells belong to the nearest end node in sight of them; those that 
 """
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core import se2
+from thinmap_ros.core.exploration.viewpoints import place_at, place_for
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
@@ -17,36 +21,58 @@ from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.config import TopologyConfig
-from thinmap_ros.core.topology.free_space import known_free, label
+from thinmap_ros.core.topology.free_space import known_free, true_cells
 
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.int64]
 _LOOKS = 3
-_SLACK = 5
+_SPARE = 64
+_WHOLE_EVERY = 100
 _PART_M = 1.0
+_RIM_M = 0.5
 
 
 class OpenBorders:
     """The border cells of the whole map; only what a scan can have changed is looked at again.
 
-    free (H, W): known free cells, small gaps closed; mask (H, W): open border cells; both on the cells of `frame`.
+    free (H, W): known free cells, small gaps closed; solid (H, W): occupied ones; mask (H, W): open border cells; all
+    on the cells of `frame`, which holds the map and some room for it to grow. revision: rises whenever they change.
     """
 
     def __init__(self, shortest_m: float) -> None:
         self._shortest_m = shortest_m
         self.frame = GridFrame(0.0, 0.0, 1.0)
+        self.revision = self._updates = 0
         self.free: Mask = np.zeros((0, 0), dtype=np.bool_)
         self.mask: Mask = np.zeros((0, 0), dtype=np.bool_)
+        self.solid: Mask = np.zeros((0, 0), dtype=np.bool_)
         self._looks: NDArray[np.uint8] = np.zeros((0, 0), dtype=np.uint8)
 
-    def update(self, patch: GridPatch, xy: tuple[float, float], reach_m: float) -> None:
-        """Find the borders of a map anew within reach_m of a point, m; the first time everywhere."""
-        if self.mask.size == 0:
-            self._fit(patch)
-            rows, cols = slice(0, patch.shape[0]), slice(0, patch.shape[1])
-        else:
-            self._fit(patch)
-            rows, cols = _around(patch, xy, reach_m)
+    def state(self) -> dict[str, NDArray[Any]]:
+        """What a map does not tell, as arrays by name: how often each border cell was looked at closely."""
+        return {'frame': self.frame.as_array(), 'looks': self._looks}
+
+    @staticmethod
+    def from_state(state: Mapping[str, NDArray[Any]], shortest_m: float) -> 'OpenBorders':
+        """Borders that go on from the `state` of others, on a map of the same lattice. Raises KeyError, ValueError."""
+        borders = OpenBorders(shortest_m)
+        origin_x, origin_y, resolution = state['frame'].tolist()
+        looks = state['looks'].astype(np.uint8)
+        rows, cols = looks.shape
+        borders.frame, borders._looks = GridFrame(origin_x, origin_y, resolution), looks
+        borders.free, borders.mask, borders.solid = (np.zeros((rows, cols), dtype=np.bool_) for _ in range(3))
+        return borders
+
+    def update(self, patch: GridPatch, box: Array) -> None:
+        """Find the borders of a map anew in a box, the first time and now and then everywhere.
+
+        box (2, 2): its lower left and upper right corner, m (see box_of_scan). What lies elsewhere changes only where
+        the map was corrected.
+        """
+        whole = self._updates % _WHOLE_EVERY == 0
+        self._updates += 1
+        row, col = self._fit(patch)
+        rows, cols = (slice(0, size) for size in patch.shape) if whole else _part(patch, box)
         # Two cells more are read than written, so that the cut is no border.
         wide = (slice(max(rows.start - 3, 0), rows.stop + 3), slice(max(cols.start - 3, 0), cols.stop + 3))
         part = GridPatch(patch.frame, np.ascontiguousarray(patch.cells[wide]))
@@ -54,8 +80,12 @@ class OpenBorders:
         border = _borders(free, part.unknown & ~free)
         top, left = rows.start - wide[0].start, cols.start - wide[1].start
         inner = (slice(top, top + rows.stop - rows.start), slice(left, left + cols.stop - cols.start))
-        self.free[rows, cols] = free[inner]
-        self.mask[rows, cols] = border[inner] & (self._looks[rows, cols] < _LOOKS)
+        rows, cols = slice(rows.start + row, rows.stop + row), slice(cols.start + col, cols.stop + col)
+        border = border[inner] & (self._looks[rows, cols] < _LOOKS)
+        same = np.array_equal(self.free[rows, cols], free[inner]) and np.array_equal(self.mask[rows, cols], border)
+        self.revision += not same
+        self.free[rows, cols], self.mask[rows, cols] = free[inner], border
+        self.solid[rows, cols] = part.occupied[inner]
 
     def examine(self, xy: tuple[float, float], reach_m: float, faces: NDArray[np.float64]) -> None:
         """Count a close look from a point, m: border cells whose unknown neighbour lies in plain sight, yet unknown.
@@ -64,8 +94,7 @@ class OpenBorders:
         """
         row, col = self.frame.cells_of(np.array([xy]))[0]
         reach = reach_m / self.frame.resolution
-        _examine(self.mask, self.free, self._looks, int(row), int(col), reach, faces)
-        self.mask &= self._looks < _LOOKS
+        self.revision += _examine(self.mask, self.free, self._looks, int(row), int(col), reach, faces)
 
     def exhaust(self, cells: Cells, xy: tuple[float, float]) -> None:
         """Give up border cells (N, 2) for good: those about as near to a point, m, as the nearest of them.
@@ -76,47 +105,63 @@ class OpenBorders:
         gone = cells[away_m <= away_m.min(initial=np.inf) + _PART_M]
         self._looks[gone[:, 0], gone[:, 1]] = _LOOKS
         self.mask[gone[:, 0], gone[:, 1]] = False
+        self.revision += 1
 
-    def stretches(self) -> tuple[Cells, NDArray[np.int32], int]:
-        """Border cells (N, 2) in stretches long enough, the number of their stretch (N,), and how many there are."""
-        labels, sizes = label(self.mask)
+    def stretches(self) -> tuple[Cells, Cells, int]:
+        """Border cells (N, 2) in stretches long enough, the number of their stretch (N,), and how many there are.
+
+        Stretches are joined over edges and corners, and numbered in the order of their first cells.
+        """
+        cells = true_cells(self.mask)
+        numbers, sizes = _parts(self.mask.shape, cells)
         long_enough = sizes * self.frame.resolution >= self._shortest_m - 1e-6
-        long_enough[0] = False
-        cells = np.argwhere(self.mask)
-        of_cells = labels[cells[:, 0], cells[:, 1]]
-        keep = long_enough[of_cells]
-        return cells[keep], of_cells[keep], int(long_enough.sum())
+        keep = long_enough[numbers]
+        return cells[keep], numbers[keep], int(long_enough.sum())
 
     def owners(self, cells: Cells, nodes: Cells, reach_m: float) -> Cells:
         """For each border cell (N, 2), the index of the nearest node cell (M, 2) in sight within reach_m, or -1."""
         return np.asarray(_owners(self.free, cells, nodes, reach_m / self.frame.resolution))
 
     def place_to_look(self, cells: Cells, allowed: Mask, reach_m: float, xy: tuple[float, float]) -> Array | None:
-        """Centre (2,), m, of the allowed cell from which to look at a border (N, 2): near to it, and to a point xy.
+        """Centre (2,), m, of the allowed cell (H, W) right at a border (N, 2); see viewpoints.place_at."""
+        row, col = (int(v) for v in self.frame.cells_of(np.array([xy]))[0])
+        place = place_at(self.free, cells, allowed, int(reach_m / self.frame.resolution), (row, col))
+        return None if place is None else self.frame.centres_of(np.array([place]))[0]
 
-        Of all allowed cells whose way to the border over free cells is within reach_m, and nearly the shortest, the one
-        nearest to the point: round a pillar all sides are equally near.
+    def place_to_view(
+        self, cells: Cells, allowed: Mask, ways: Array, reach_m: float, depth_m: float
+    ) -> Array | None:
+        """Centre (2,), m, of the allowed cell (H, W) from which to see behind a border (N, 2): viewpoints.place_for.
+
+        ways (h, w): length of the way to each square of allowed cells; depth_m: how far behind the border is looked.
         """
-        row, col = self.frame.cells_of(np.array([xy]))[0]
-        steps = int(reach_m / self.frame.resolution)
-        place = _place_to_look(self.free, cells, allowed, steps, int(row), int(col))
-        return None if place[0] < 0 else self.frame.centres_of(np.array([place]))[0]
+        resolution = self.frame.resolution
+        depth, reach = round(depth_m / resolution), reach_m / resolution
+        place = place_for(self.free, self.solid, cells, allowed, ways, depth, reach)
+        return None if place is None else self.frame.centres_of(np.array([place]))[0]
 
-    def _fit(self, patch: GridPatch) -> None:
-        """Bring the arrays to the patch's extent; what is outside of it is forgotten."""
-        if self.frame == patch.frame and self.mask.shape == patch.shape:
-            return
-        free, mask = np.zeros(patch.shape, dtype=np.bool_), np.zeros(patch.shape, dtype=np.bool_)
-        looks = np.zeros(patch.shape, dtype=np.uint8)
-        if self.mask.size:
-            row = round((self.frame.origin_y - patch.frame.origin_y) / patch.frame.resolution)
-            col = round((self.frame.origin_x - patch.frame.origin_x) / patch.frame.resolution)
-            rows, from_rows = _overlap(row, self.mask.shape[0], patch.shape[0])
-            cols, from_cols = _overlap(col, self.mask.shape[1], patch.shape[1])
-            free[rows, cols] = self.free[from_rows, from_cols]
-            mask[rows, cols] = self.mask[from_rows, from_cols]
-            looks[rows, cols] = self._looks[from_rows, from_cols]
-        self.frame, self.free, self.mask, self._looks = patch.frame, free, mask, looks
+    def _fit(self, patch: GridPatch) -> tuple[int, int]:
+        """Make room for a patch where there is none; returns where its first cell lies, (row, col).
+
+        Once there is a map, more room is made than is needed: what looks at these arrays does so anew when they grow.
+        """
+        if self.mask.size == 0:
+            self.frame = patch.frame
+        resolution = self.frame.resolution
+        row = round((patch.frame.origin_y - self.frame.origin_y) / resolution)
+        col = round((patch.frame.origin_x - self.frame.origin_x) / resolution)
+        (top, bottom), (left, right) = (
+            (max(-first, 0), max(first + size - have, 0))
+            for first, size, have in zip((row, col), patch.shape, self.mask.shape, strict=True)
+        )
+        if top or bottom or left or right:
+            spare = _SPARE if self.mask.size else 0
+            more = tuple((low and low + spare, high and high + spare) for low, high in ((top, bottom), (left, right)))
+            self.free, self.solid = np.pad(self.free, more), np.pad(self.solid, more)
+            self.mask, self._looks = np.pad(self.mask, more), np.pad(self._looks, more)
+            self.frame = self.frame.shifted(-more[0][0], -more[1][0])
+            row, col = row + more[0][0], col + more[1][0]
+        return row, col
 
 
 def directions_of_view(scan: Scan, T_map_base: Array) -> Array:
@@ -126,17 +171,22 @@ def directions_of_view(scan: Scan, T_map_base: Array) -> Array:
     return np.array([heading + min(scan.angle_min_rad, last), heading + max(scan.angle_min_rad, last)])
 
 
-def _overlap(offset: int, old: int, new: int) -> tuple[slice, slice]:
-    first, last = max(offset, 0), min(offset + old, new)
-    return slice(first, max(last, first)), slice(first - offset, max(last, first) - offset)
+def box_of_scan(scan: Scan, T_map_base: Array) -> Array:
+    """Lower left and upper right corner, m, of all that a scan from a pose (3,) can have changed, (2, 2)."""
+    x, y, heading = se2.compose(T_map_base, scan.T_base_laser).tolist()
+    reach = np.where(scan.hit | scan.no_return, np.minimum(scan.ranges_m, scan.range_max_m), 0.0)
+    along_x, along_y = reach * np.cos(scan.angles_rad + heading), reach * np.sin(scan.angles_rad + heading)
+    low = (x + along_x.min(initial=0.0), y + along_y.min(initial=0.0))
+    high = (x + along_x.max(initial=0.0), y + along_y.max(initial=0.0))
+    return np.asarray(np.array([low, high]) + np.array([[-_RIM_M], [_RIM_M]]))
 
 
-def _around(patch: GridPatch, xy: tuple[float, float], reach_m: float) -> tuple[slice, slice]:
-    row, col = (int(v) for v in patch.frame.cells_of(np.array([xy]))[0])
-    reach = math.ceil(reach_m / patch.frame.resolution)
+def _part(patch: GridPatch, box: Array) -> tuple[slice, slice]:
+    """Rows and columns of a map that lie in a box."""
+    (top, left), (bottom, right) = patch.frame.cells_of(box).tolist()
     rows, cols = patch.shape
-    top, left = min(max(row - reach, 0), rows), min(max(col - reach, 0), cols)
-    return slice(top, max(min(row + reach + 1, rows), top)), slice(left, max(min(col + reach + 1, cols), left))
+    top, left = min(max(top, 0), rows), min(max(left, 0), cols)
+    return slice(top, max(min(bottom + 1, rows), top)), slice(left, max(min(right + 1, cols), left))
 
 
 def _borders(free: Mask, unknown: Mask) -> Mask:
@@ -147,10 +197,42 @@ def _borders(free: Mask, unknown: Mask) -> Mask:
 
 
 @kernel
+def _parts(shape: tuple[int, int], cells: Cells) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Number of the part (joined over edges and corners) of each cell (N, 2) of an array, (N,); cells in each part."""
+    cols = shape[1] + 2
+    # Index + 1 of the cell that lies there; the empty border saves all questions about the rim.
+    at = np.zeros((shape[0] + 2) * cols, dtype=np.int32)
+    places = (cells[:, 0] + 1) * cols + cells[:, 1] + 1
+    for i in range(places.size):
+        at[places[i]] = i + 1
+    numbers = np.full(places.size, -1, dtype=np.int64)
+    sizes = np.zeros(places.size, dtype=np.int64)
+    stack = np.empty(places.size, dtype=np.int64)
+    parts = 0
+    for first in range(places.size):
+        if numbers[first] >= 0:
+            continue
+        numbers[first], stack[0], count = parts, first, 1
+        while count > 0:
+            count -= 1
+            here = places[stack[count]]
+            sizes[parts] += 1
+            for to in (-cols - 1, -cols, -cols + 1, -1, 1, cols - 1, cols, cols + 1):
+                i = at[here + to] - 1
+                if i >= 0 and numbers[i] < 0:
+                    numbers[i], stack[count] = parts, i
+                    count += 1
+        parts += 1
+    return numbers, sizes[:parts].copy()
+
+
+@kernel
 def _examine(
     mask: Mask, free: Mask, looks: NDArray[np.uint8], row: int, col: int, reach: float, faces: NDArray[np.float64]
-) -> None:
+) -> bool:
+    """Count a look at each border cell in plain sight; returns whether one of them is exhausted now."""
     rows, cols = mask.shape
+    exhausted = False
     whole = int(math.ceil(reach))
     for r in range(max(row - whole, 0), min(row + whole + 1, rows)):
         for c in range(max(col - whole, 0), min(col + whole + 1, cols)):
@@ -168,7 +250,10 @@ def _examine(
                 # In plain sight: all cells up to it are free, and it would be seen if it counted as free itself.
                 if _sees_up_to(free, row, col, ur, uc):
                     looks[r, c] = min(looks[r, c] + 1, _LOOKS)
+                    if looks[r, c] == _LOOKS:
+                        mask[r, c], exhausted = False, True
                     break
+    return exhausted
 
 
 @kernel
@@ -193,34 +278,3 @@ def _owners(free: Mask, cells: Cells, nodes: Cells, reach: float) -> Cells:
             if away < best and line_is_clear(free, nodes[j, 0], nodes[j, 1], cells[i, 0], cells[i, 1]):
                 best, owners[i] = away, j
     return owners
-
-
-@kernel
-def _place_to_look(
-    free: Mask, cells: Cells, allowed: Mask, most_steps: int, to_row: int, to_col: int
-) -> tuple[int, int]:
-    """Breadth first over free cells, from all border cells at once, and _SLACK steps on after the first find."""
-    rows, cols = free.shape
-    seen = np.zeros((rows, cols), dtype=np.bool_)
-    queue = np.empty((rows * cols, 3), dtype=np.int64)
-    tail = 0
-    for i in range(cells.shape[0]):
-        queue[tail, 0], queue[tail, 1], queue[tail, 2] = cells[i, 0], cells[i, 1], 0
-        seen[cells[i, 0], cells[i, 1]] = True
-        tail += 1
-    head, best, best_row, best_col = 0, np.inf, -1, -1
-    while head < tail and queue[head, 2] <= most_steps:
-        row, col, steps = queue[head, 0], queue[head, 1], queue[head, 2]
-        head += 1
-        away = math.hypot(row - to_row, col - to_col)
-        if allowed[row, col] and away < best:
-            if best_row < 0:
-                most_steps = min(most_steps, steps + _SLACK)
-            best, best_row, best_col = away, row, col
-        for side in range(4):
-            r, c = row + (side == 0) - (side == 1), col + (side == 2) - (side == 3)
-            if 0 <= r < rows and 0 <= c < cols and free[r, c] and not seen[r, c]:
-                seen[r, c] = True
-                queue[tail, 0], queue[tail, 1], queue[tail, 2] = r, c, steps + 1
-                tail += 1
-    return best_row, best_col

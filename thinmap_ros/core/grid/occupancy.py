@@ -13,6 +13,7 @@ from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
+from thinmap_ros.core.grid.picture import Picture
 from thinmap_ros.core.grid.raytrace import fill_segment
 from thinmap_ros.core.grid.tiles import TILE, TileStore
 from thinmap_ros.core.jit import inlined, kernel
@@ -86,6 +87,7 @@ class OccupancyGrid:
             )
         self._tiles = TileStore()
         self._percent = _percent_table()
+        self._picture = Picture(self._percent)
         self._news: NDArray[np.int16] = np.zeros((0, 0), dtype=np.int16)
         self._fan: tuple[int, float, float] = (0, 0.0, 0.0)
         self._cosines = self._sines = np.empty(0)
@@ -101,7 +103,7 @@ class OccupancyGrid:
         grid = OccupancyGrid(config, patch.frame)
         clamped = np.clip(patch.cells / 100.0, grid.config.p_lowest, grid.config.p_highest)
         odds = np.round(_SCALE * np.log(clamped / (1.0 - clamped))).astype(np.int16)
-        grid._tiles.write(0, 0, np.where(patch.cells == UNKNOWN, 0, odds).astype(np.int16))
+        grid._write(0, 0, np.where(patch.cells == UNKNOWN, 0, odds).astype(np.int16))
         return grid
 
     def state(self) -> dict[str, NDArray[Any]]:
@@ -128,8 +130,12 @@ class OccupancyGrid:
             raise InputError(f'saved grid: log odds up to {np.abs(odds).max()}: expected at most {_LIMIT}')
         grid = OccupancyGrid(config, GridFrame(origin_x, origin_y, resolution))
         for (row, col), cells in zip(tiles.tolist(), odds, strict=True):
-            grid._tiles.write(row * TILE, col * TILE, cells)
+            grid._write(row * TILE, col * TILE, cells)
         return grid
+
+    def _write(self, row: int, col: int, odds: NDArray[np.int16]) -> None:
+        self._tiles.write(row, col, odds)
+        self._picture.touch(row, col, row + odds.shape[0], col + odds.shape[1])
 
     def update(self, scan: Scan, T_map_base: Array) -> None:
         """Take in a scan made at a robot pose T_map_base (3,)."""
@@ -158,6 +164,8 @@ class OccupancyGrid:
         tiles = self._tiles
         last_row, last_col = tile_row + (box[1] >> _TILE_BITS), tile_col + (box[3] >> _TILE_BITS)
         tiles.reach(tile_row, tile_col, last_row, last_col)
+        row, col = tile_row * TILE, tile_col * TILE
+        self._picture.touch(row + box[0], col + box[2], row + box[1] + 1, col + box[3] + 1)
         place = (tile_row - tiles.first_row, tile_col - tiles.first_col)
         _spare(tiles.pool, tiles.directory, place, self._news, box, laser, self._steps, self._grazed)
         if _apply(tiles.pool, tiles.directory, place, self._news, box, self._steps):
@@ -172,16 +180,7 @@ class OccupancyGrid:
 
     def patch(self) -> GridPatch:
         """The smallest rectangle that holds all that is known; one unknown cell where nothing is."""
-        bounds = self._tiles.bounds()
-        if bounds is None:
-            return self._cut(0, 0, 1, 1)
-        row, col, end_row, end_col = bounds
-        known = self._tiles.read(row, col, end_row - row, end_col - col) != 0
-        rows, cols = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
-        if rows.size == 0:
-            return self._cut(0, 0, 1, 1)
-        height, width = rows[-1] - rows[0] + 1, cols[-1] - cols[0] + 1
-        return self._cut(row + int(rows[0]), col + int(cols[0]), int(height), int(width))
+        return self._picture.draw(self._tiles, self.frame)
 
     def _cut(self, row: int, col: int, rows: int, cols: int) -> GridPatch:
         odds = self._tiles.read(row, col, rows, cols)

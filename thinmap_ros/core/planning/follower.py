@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.se2 import Array, wrap
 
 
@@ -41,9 +42,10 @@ class Follower:
         """Speed (m/s) and turn rate (rad/s) for the next dt_s along a path (K, 2) that ends where to stop."""
         config = self.config
         reach = max(config.lookahead_m, config.lookahead_s * self.v)
-        ahead, rest_m = _point_ahead(path, T_map_base[:2], reach, config.stray_m)
-        dx, dy = ahead - T_map_base[:2]
-        error = wrap(math.atan2(dy, dx) - T_map_base[2]) if dx or dy else 0.0
+        x, y, theta = T_map_base.tolist()
+        ahead_x, ahead_y, rest_m = _point_ahead(path, x, y, reach, config.stray_m)
+        dx, dy = ahead_x - x, ahead_y - y
+        error = wrap(math.atan2(dy, dx) - theta) if dx or dy else 0.0
         # Once turning, on until the path is nearly straight ahead: no flickering at the limit.
         self._turning = abs(error) > (0.3 * config.turn_in_place_rad if self._turning else config.turn_in_place_rad)
         if self._turning:
@@ -85,26 +87,51 @@ def _towards(value: float, goal: float, change: float) -> float:
     return min(max(goal, value - change), value + change)
 
 
-def _point_ahead(path: Array, xy: Array, reach_m: float, stray_m: float) -> tuple[Array, float]:
-    """Point of a path (K, 2) to steer for from xy, and the length left from the point nearest to xy, m.
+@kernel
+def nearest_point(path: Array, x: float, y: float) -> int:
+    """Index of the point of a path (K, 2) nearest to (x, y); the first of equally near ones."""
+    best, nearest = np.inf, 0
+    for k in range(path.shape[0]):
+        squared = (path[k, 0] - x) ** 2 + (path[k, 1] - y) ** 2
+        if squared < best:
+            best, nearest = squared, k
+    return nearest
+
+
+@kernel
+def length_from(path: Array, first: int) -> float:
+    """Length of a path (K, 2) from one of its points to its end."""
+    length = 0.0
+    for k in range(first + 1, path.shape[0]):
+        length += math.hypot(path[k, 0] - path[k - 1, 0], path[k, 1] - path[k - 1, 1])
+    return length
+
+
+@kernel
+def _point_ahead(path: Array, x: float, y: float, reach_m: float, stray_m: float) -> tuple[float, float, float]:
+    """Point of a path (K, 2) to steer for from (x, y), and the length left from the point nearest to (x, y), m.
 
     It lies up to reach_m on along the path, and less far where the straight way to it would leave the path by more
     than stray_m: corners are not cut.
     """
-    nearest = int(np.square(path - xy).sum(axis=1).argmin())
-    rest = path[nearest:]
-    steps = np.hypot(*np.diff(rest, axis=0).T)
-    along = np.concatenate([[0.0], np.cumsum(steps)])
-    left_m = max(float(along[-1]), float(np.hypot(*(rest[-1] - xy))))
-    last = min(int(np.searchsorted(along, reach_m)), len(rest) - 1)
-    allowed = stray_m + float(np.hypot(*(rest[0] - xy)))
-    while last > 1 and _stray(rest[:last], xy, rest[last]) > allowed:
+    first, end = nearest_point(path, x, y), path.shape[0] - 1
+    left_m = max(length_from(path, first), math.hypot(path[end, 0] - x, path[end, 1] - y))
+    last, along = first, 0.0
+    while last < end and along < reach_m:
+        last += 1
+        along += math.hypot(path[last, 0] - path[last - 1, 0], path[last, 1] - path[last - 1, 1])
+    allowed = stray_m + math.hypot(path[first, 0] - x, path[first, 1] - y)
+    while last > first + 1 and _stray(path, first, last, x, y) > allowed:
         last -= 1
-    return np.asarray(rest[last]), left_m
+    return path[last, 0], path[last, 1], left_m
 
 
-def _stray(points: Array, a: Array, b: Array) -> float:
-    """Largest distance of points (K, 2) from the straight line through a and b, m."""
-    dx, dy = b - a
+@kernel
+def _stray(path: Array, first: int, last: int, x: float, y: float) -> float:
+    """Largest distance of the points first to last of a path from the straight line from (x, y) to the last, m."""
+    dx, dy = path[last, 0] - x, path[last, 1] - y
     length = max(math.hypot(dx, dy), 1e-9)
-    return float(np.abs((points[:, 0] - a[0]) * dy - (points[:, 1] - a[1]) * dx).max()) / length
+    most = 0.0
+    for k in range(first, last):
+        most = max(most, abs((path[k, 0] - x) * dy - (path[k, 1] - y) * dx))
+    return most / length

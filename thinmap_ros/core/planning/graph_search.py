@@ -103,6 +103,22 @@ def costs_from(topology: TopologicalMap, x: float, y: float) -> dict[int, float]
     return costs
 
 
+def costs_to(topology: TopologicalMap, from_pose: Array, goals: dict[int, Array]) -> dict[int, float]:
+    """Length of the shortest way along the graph from a pose to each goal (x, y, ...), m, where there is one.
+
+    A goal has the id of the node that it stands for, if that is in the map.
+    """
+    to_nodes = costs_from(topology, float(from_pose[0]), float(from_pose[1]))
+    costs = {}
+    for goal_id, goal in goals.items():
+        joins = None if goal_id in topology.nodes else access(topology, float(goal[0]), float(goal[1]))
+        ends = {goal_id: 0.0} if joins is None else joins.to_node_m
+        ways = [to_nodes[i] + rest for i, rest in ends.items() if i in to_nodes]
+        if ways:
+            costs[goal_id] = min(ways)
+    return costs
+
+
 def path_points(topology: TopologicalMap, route: Route) -> Array:
     """Points (K, 2) of a route from its first node to its last, m, map frame; where edges meet, each point once."""
     first = topology.nodes[route.node_ids[0]]

@@ -15,7 +15,8 @@ from thinmap_ros.core.se2 import Array
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.int64]
 Key = tuple[int, int]
-_STRAIGHT, _DIAGONAL, _BUCKETS = 5, 7, 8
+# Buckets for steps of up to four times the diagonal one.
+_STRAIGHT, _DIAGONAL, _BUCKETS = 5, 7, 32
 _FAR = 2**31 - 1
 
 
@@ -24,100 +25,153 @@ def ways_from(allowed: Mask, start: tuple[int, int], goals: Cells) -> Array:
 
     inf where there is none, and where a goal is not allowed. A start that is not allowed may be left all the same.
     """
-    steps = _ways_from(allowed, start[0], start[1], np.ascontiguousarray(goals, dtype=np.int64))
-    return np.where(steps == _FAR, np.inf, steps / _STRAIGHT)
+    weights = np.ascontiguousarray(allowed, dtype=np.uint8)
+    steps = _ways_from(weights, start[0], start[1], np.ascontiguousarray(goals, dtype=np.int64))
+    return _cells(steps)
+
+
+def field_from(allowed: Mask, start: tuple[int, int]) -> Array:
+    """Length, in cells, of the way over allowed cells from a start (row, col) to each cell (H, W); inf: none."""
+    nothing = np.zeros((allowed.shape[0] + 2, allowed.shape[1] + 2), dtype=np.bool_)
+    return _cells(_field(allowed.astype(np.uint8), start[0], start[1], nothing, -1)[1:-1, 1:-1])
 
 
 def coarse(allowed: Mask, factor: int) -> Mask:
     """Squares of factor x factor cells of a mask (H, W) in which any is set, (ceil(H / factor), ceil(W / factor))."""
-    rows, cols = (-(-size // factor) for size in allowed.shape)
-    whole = np.zeros((rows * factor, cols * factor), dtype=np.bool_)
-    whole[: allowed.shape[0], : allowed.shape[1]] = allowed
-    result = np.zeros((rows, cols), dtype=np.bool_)
-    for row in range(factor):
-        for col in range(factor):
-            result |= whole[row::factor, col::factor]
-    return result
+    return np.asarray(_coarse(allowed, factor, 0, 0))
 
 
 class WayTable:
-    """Ways between places of a map that grows, on a coarse grid, remembered for a while: most places stay."""
+    """Ways between places of a map that grows, on a coarse grid, remembered for a while: most places stay.
 
-    def __init__(self, cell_m: float, forget_s: float) -> None:
+    They may lead through the unknown, where a step counts unknown_weight times: two places may well be joined there.
+    """
+
+    def __init__(self, cell_m: float, forget_s: float, unknown_weight: int) -> None:
         self._cell_m = cell_m
         self._forget_ns = forget_s * 1e9
+        self._unknown_weight = unknown_weight
         self._known: dict[frozenset[Key], tuple[int, float]] = {}
 
-    def update(self, allowed: Mask, frame: GridFrame, places: Array, stamp_ns: int) -> Array:
+    def update(self, allowed: Mask, unknown: Mask, frame: GridFrame, places: Array, stamp_ns: int) -> Array:
         """Lengths of the ways, m, between all places (N, 2), m, over the allowed cells (H, W) of a frame, (N, N).
 
-        inf where there is none.
+        unknown (H, W): cells that may turn out to be allowed. inf where there is no way.
         """
         factor = max(1, round(self._cell_m / frame.resolution))
         # Squares on a lattice that stays when the frame grows.
         shift = [round(origin / frame.resolution) % factor for origin in (frame.origin_y, frame.origin_x)]
-        ways = coarse(np.pad(allowed, ((shift[0], 0), (shift[1], 0))), factor)
+        weights = self._unknown_weight * _coarse(unknown, factor, shift[0], shift[1]).astype(np.uint8)
+        weights[_coarse(allowed, factor, shift[0], shift[1])] = 1
         cells = (frame.cells_of(places) + shift) // factor
         first = (round(frame.origin_y / frame.resolution) // factor, round(frame.origin_x / frame.resolution) // factor)
         keys = [(int(row), int(col)) for row, col in cells + first]
+        self._forget(keys, stamp_ns)
+        for i, key in enumerate(keys):
+            missing = [j for j in range(i) if keys[j] != key and frozenset((key, keys[j])) not in self._known]
+            if missing:
+                steps = _ways_from(weights, int(cells[i, 0]), int(cells[i, 1]), np.ascontiguousarray(cells[missing]))
+                for j, way in zip(missing, (_cells(steps) * frame.resolution * factor).tolist(), strict=True):
+                    self._known[frozenset((key, keys[j]))] = (stamp_ns, way)
+        return np.array([[0.0 if a == b else self._known[frozenset((a, b))][1] for b in keys] for a in keys])
+
+    def _forget(self, keys: list[Key], stamp_ns: int) -> None:
+        """Forget ways that are old, or between places that are not asked for any more."""
         pairs = {frozenset((a, b)) for i, a in enumerate(keys) for b in keys[:i]}
         self._known = {
             pair: known for pair, known in self._known.items()
             if pair in pairs and stamp_ns - known[0] < self._forget_ns
         }
-        for i, key in enumerate(keys):
-            missing = [j for j in range(i) if keys[j] != key and frozenset((key, keys[j])) not in self._known]
-            if missing:
-                found = ways_from(ways, (int(cells[i, 0]), int(cells[i, 1])), cells[missing])
-                for j, way in zip(missing, (found * frame.resolution * factor).tolist(), strict=True):
-                    self._known[frozenset((key, keys[j]))] = (stamp_ns, way)
-        return np.array([[0.0 if a == b else self._known[frozenset((a, b))][1] for b in keys] for a in keys])
+
+
+def _cells(steps: NDArray[np.int32]) -> Array:
+    """Steps as lengths in cells."""
+    return np.where(steps == _FAR, np.inf, steps / _STRAIGHT)
 
 
 @kernel
-def _ways_from(allowed: Mask, start_row: int, start_col: int, goals: Cells) -> NDArray[np.int32]:
+def _coarse(allowed: Mask, factor: int, shift_row: int, shift_col: int) -> Mask:
+    """Squares in which any cell is set; the first cell is (shift_row, shift_col) within its square."""
     rows, cols = allowed.shape
-    steps = np.full((rows, cols), _FAR, dtype=np.int32)
-    wanted = np.zeros((rows, cols), dtype=np.bool_)
+    squares = np.zeros((-(-(rows + shift_row) // factor), -(-(cols + shift_col) // factor)), dtype=np.bool_)
+    for row in range(rows):
+        line = squares[(row + shift_row) // factor]
+        square, within = 0, shift_col
+        for col in range(cols):
+            if within == factor:
+                square, within = square + 1, 0
+            line[square] |= allowed[row, col]
+            within += 1
+    return squares
+
+
+@kernel
+def _ways_from(weights: NDArray[np.uint8], start_row: int, start_col: int, goals: Cells) -> NDArray[np.int32]:
+    rows, cols = weights.shape
+    wanted = np.zeros((rows + 2, cols + 2), dtype=np.bool_)
+    found = np.full(goals.shape[0], _FAR, dtype=np.int32)
     left = 0
     for i in range(goals.shape[0]):
         row, col = goals[i, 0], goals[i, 1]
-        if 0 <= row < rows and 0 <= col < cols and allowed[row, col] and not wanted[row, col]:
-            wanted[row, col] = True
+        if 0 <= row < rows and 0 <= col < cols and weights[row, col] and not wanted[row + 1, col + 1]:
+            wanted[row + 1, col + 1] = True
             left += 1
-    capacity = 2 * rows * cols + 1
+    steps = _field(weights, start_row, start_col, wanted, left)
+    for i in range(goals.shape[0]):
+        row, col = goals[i, 0], goals[i, 1]
+        if 0 <= row < rows and 0 <= col < cols and weights[row, col] and not wanted[row + 1, col + 1]:
+            found[i] = steps[row + 1, col + 1]
+    return found
+
+
+@kernel
+def _field(weights: NDArray[np.uint8], start_row: int, start_col: int, wanted: Mask, left: int) -> NDArray[np.int32]:
+    """Steps to each cell, in a frame of one cell more on each side, until all `left` wanted ones are reached.
+
+    wanted (H + 2, W + 2): cells to be reached; those that have been are cleared.
+    """
+    rows, cols = wanted.shape
+    # A border that cannot be entered saves all questions about the rim.
+    framed = np.zeros((rows, cols), dtype=np.uint8)
+    framed[1:-1, 1:-1] = weights
+    weight, asked = framed.ravel(), wanted.ravel()
+    field = np.full((rows, cols), _FAR, dtype=np.int32)
+    steps = field.ravel()
+    capacity = 2 * weight.size + 1
     queue = np.empty((_BUCKETS, capacity), dtype=np.int32)
     counts = np.zeros(_BUCKETS, dtype=np.int64)
-    steps[start_row, start_col] = 0
-    queue[0, 0], counts[0] = start_row * cols + start_col, 1
+    start = (start_row + 1) * cols + start_col + 1
+    steps[start], queue[0, 0], counts[0] = 0, start, 1
     now, waiting = 0, 1
-    while waiting > 0 and left > 0:
+    while waiting > 0 and left != 0:
         bucket = now % _BUCKETS
         while counts[bucket] > 0:
             counts[bucket] -= 1
             waiting -= 1
             cell = queue[bucket, counts[bucket]]
-            row, col = cell // cols, cell % cols
-            if steps[row, col] != now:
+            if steps[cell] != now:
                 continue
-            if wanted[row, col]:
-                wanted[row, col] = False
+            if asked[cell]:
+                asked[cell] = False
                 left -= 1
-            for r in range(max(row - 1, 0), min(row + 2, rows)):
-                for c in range(max(col - 1, 0), min(col + 2, cols)):
-                    # No corner is cut: a diagonal step needs both cells beside it.
-                    if not allowed[r, c] or not (allowed[r, col] or r == row) or not (allowed[row, c] or c == col):
+            for down in (-cols, 0, cols):
+                for right in (-1, 0, 1):
+                    to = cell + down + right
+                    if weight[to] == 0:
                         continue
-                    reached = now + (_STRAIGHT if r == row or c == col else _DIAGONAL)
-                    if reached < steps[r, c] and counts[reached % _BUCKETS] < capacity:
-                        steps[r, c] = reached
-                        queue[reached % _BUCKETS, counts[reached % _BUCKETS]] = r * cols + c
-                        counts[reached % _BUCKETS] += 1
-                        waiting += 1
+                    length = _STRAIGHT
+                    if down and right:
+                        # No corner is cut: a diagonal step needs both cells beside it.
+                        if weight[cell + down] == 0 or weight[cell + right] == 0:
+                            continue
+                        length = _DIAGONAL
+                    reached = now + weight[to] * length
+                    if reached < steps[to]:
+                        bucket_to = reached % _BUCKETS
+                        if counts[bucket_to] < capacity:
+                            steps[to] = reached
+                            queue[bucket_to, counts[bucket_to]] = to
+                            counts[bucket_to] += 1
+                            waiting += 1
         now += 1
-    found = np.full(goals.shape[0], _FAR, dtype=np.int32)
-    for i in range(goals.shape[0]):
-        row, col = goals[i, 0], goals[i, 1]
-        if 0 <= row < rows and 0 <= col < cols and allowed[row, col] and not wanted[row, col]:
-            found[i] = steps[row, col]
-    return found
+    return field

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import parameter
-from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.follower import Follower, FollowerConfig
+from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, GridPatch
+from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.planning.follower import Follower, FollowerConfig, length_from, nearest_point
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -127,23 +128,17 @@ class Navigator:
         self._path_age_s += dt_s
         if self.path is None or self._path_age_s >= self.config.replan_s:
             return True
-        squared = np.square(self.path - T_map_base[:2]).sum(axis=1)
-        nearest = int(squared.argmin())
-        strayed = squared[nearest] > (2.0 * self.config.lookahead_m) ** 2
-        return bool(strayed or (changed and self._is_blocked(self.path[nearest:], patch)))
+        x, y = float(T_map_base[0]), float(T_map_base[1])
+        nearest = nearest_point(self.path, x, y)
+        strayed = math.dist(self.path[nearest], (x, y)) > 2.0 * self.config.lookahead_m
+        return bool(strayed or (changed and self._is_blocked(nearest, patch)))
 
-    def _is_blocked(self, path: Array, patch: GridPatch) -> bool:
+    def _is_blocked(self, first: int, patch: GridPatch) -> bool:
         """Whether an obstacle has come nearer to the next metres of the path than the robot's radius."""
+        assert self.path is not None
         resolution = patch.frame.resolution
-        cells = patch.frame.cells_of(path[: max(1, int(2.0 * _CHECK_AHEAD_M / resolution))])
-        low, high = cells.min(axis=0), cells.max(axis=0)
-        reach = math.ceil(self.config.robot_radius_m / resolution)
-        low = np.maximum(low - reach, 0)
-        found = np.argwhere(patch.occupied[low[0] : high[0] + reach + 1, low[1] : high[1] + reach + 1])
-        if found.size == 0:
-            return False
-        squared = np.square((found + low)[:, None] - np.unique(cells, axis=0)[None]).sum(axis=2)
-        return bool(squared.min() < (self.config.robot_radius_m / resolution - 1e-6) ** 2)
+        ahead = self.path[first : first + max(1, int(2.0 * _CHECK_AHEAD_M / resolution))]
+        return _touches(patch.cells, patch.frame.cells_of(ahead), self.config.robot_radius_m / resolution - 1e-6)
 
     def _plan(self, T_map_base: Array, patch: GridPatch) -> str:
         """Plan anew; returns why there is no path, or nothing. In front of an obstacle its points count as walls."""
@@ -181,8 +176,8 @@ class Navigator:
 
     def _drive(self, T_map_base: Array, dt_s: float) -> Command:
         assert self.path is not None
-        nearest = int(np.square(self.path - T_map_base[:2]).sum(axis=1).argmin())
-        self._remaining_m = float(np.hypot(*np.diff(self.path[nearest:], axis=0).T).sum())
+        nearest = nearest_point(self.path, float(T_map_base[0]), float(T_map_base[1]))
+        self._remaining_m = length_from(self.path, nearest)
         if self._remaining_m < self._nearest_m - _PROGRESS_M:
             self._standstills, self._nearest_m = 0, self._remaining_m
         v, w = self._follower.command(T_map_base, self.path, dt_s)
@@ -214,7 +209,7 @@ class Navigator:
 
     def _heading_of_path(self, T_map_base: Array) -> float:
         assert self.path is not None
-        nearest = int(np.square(self.path - T_map_base[:2]).sum(axis=1).argmin())
+        nearest = nearest_point(self.path, float(T_map_base[0]), float(T_map_base[1]))
         ahead = self.path[min(nearest + 3, len(self.path) - 1)]
         return math.atan2(ahead[1] - T_map_base[1], ahead[0] - T_map_base[0])
 
@@ -228,20 +223,43 @@ class Navigator:
 
     def _free_length(self, T_map_base: Array, curvature: float, length_m: float) -> float:
         """How far the body can be moved along an arc before a point comes nearer than its radius, up to length_m."""
-        points = se2.transform_points(se2.invert(T_map_base), self._points_map)
-        radius = self.config.body_radius_m
-        points = points[np.square(points).sum(axis=1) < (length_m + radius) ** 2]
-        if len(points) == 0:
-            return length_m
         steps = np.linspace(0.0, length_m, math.ceil(length_m / _SWEEP_STEP_M) + 1)
         turns = curvature * steps
         along = steps * np.sinc(turns / (2.0 * np.pi))
         centres = np.column_stack([along * np.cos(turns / 2.0), along * np.sin(turns / 2.0)])
-        distances = np.hypot(*(centres[:, None] - points[None]).transpose(2, 0, 1))
-        # A point that is too near already only forbids to come still nearer.
-        limit = np.minimum(radius, distances[0] - 0.005)
-        blocked = (distances < limit).any(axis=1)
-        return float(steps[max(int(blocked.argmax()) - 1, 0)]) if blocked.any() else length_m
+        centres = se2.transform_points(T_map_base, centres)
+        return float(steps[_clear_steps(centres, self._points_map, self.config.body_radius_m)])
+
+
+@kernel
+def _touches(cells: NDArray[np.int8], path: NDArray[np.int64], radius: float) -> bool:
+    """Whether an occupied cell of a map (H, W) is nearer than a radius, in cells, to one of a path's cells (K, 2)."""
+    reach = int(math.ceil(radius))
+    for k in range(path.shape[0]):
+        row, col = path[k, 0], path[k, 1]
+        if k > 0 and row == path[k - 1, 0] and col == path[k - 1, 1]:
+            continue
+        for r in range(max(row - reach, 0), min(row + reach + 1, cells.shape[0])):
+            for c in range(max(col - reach, 0), min(col + reach + 1, cells.shape[1])):
+                if cells[r, c] >= OCCUPIED_AT_LEAST and (r - row) ** 2 + (c - col) ** 2 < radius * radius:
+                    return True
+    return False
+
+
+@kernel
+def _clear_steps(centres: Array, points: Array, radius: float) -> int:
+    """Index of the last centre (K, 2) that a disc can be moved to, one after the other, without touching points (N, 2).
+
+    A point that is too near to the first centre already only forbids to come still nearer.
+    """
+    clear: int = centres.shape[0]
+    for i in range(points.shape[0]):
+        limit = min(radius, math.hypot(points[i, 0] - centres[0, 0], points[i, 1] - centres[0, 1]) - 0.005)
+        for k in range(clear):
+            if math.hypot(points[i, 0] - centres[k, 0], points[i, 1] - centres[k, 1]) < limit:
+                clear = k
+                break
+    return max(clear - 1, 0)
 
 
 def _in_view(scan: Scan, T_map_laser: Array, points_map: Array) -> NDArray[np.bool_]:

@@ -9,19 +9,17 @@ Source: topological map paper section 3.2; Konolige, "A gradient method for real
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.grid.distance import distance_cells
-from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.planning.reach import disc, nearest_true, reached_from
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.config import TopologyConfig
-from thinmap_ros.core.topology.free_space import column_distance, known_free, standing_room
+from thinmap_ros.core.topology.free_space import column_distance, known_free
 
 Mask = NDArray[np.bool_]
 _ESCAPE_COST = 10.0
@@ -71,43 +69,17 @@ def cost_of_cells(patch: GridPatch, config: WavefrontConfig) -> Array:
     """Cost of moving one unit of distance in each cell (H, W): 1 + I; inf where the robot's centre may not be."""
     resolution = patch.frame.resolution
     free = known_free(patch, TopologyConfig(robot_radius_m=config.robot_radius_m))
-    solid = ~free if config.unknown == 'forbidden' else patch.occupied
-    distance_m = distance_from(solid) * resolution
-    allowed = distance_m >= config.robot_radius_m - _HAIR_M
+    passable = free if config.unknown == 'forbidden' else ~patch.occupied
+    reach = max(math.ceil(max(config.keep_m, config.robot_radius_m) / resolution), 1)
+    distance_m = np.sqrt(np.arange(2 * (reach + 1) ** 2 + 1)) * resolution
     spread = max(config.keep_m - config.robot_radius_m, 1e-6)
     nearness = np.clip((config.keep_m - distance_m) / spread, 0.0, 1.0)
-    cost = np.where(allowed, 1.0 + config.keep_weight * nearness * nearness, np.inf)
+    allowed = distance_m >= config.robot_radius_m - _HAIR_M
+    table = np.where(allowed, 1.0 + config.keep_weight * nearness * nearness, np.inf)
+    cost = _look_up(column_distance(passable), reach, table)
     if config.unknown == 'costly':
         cost += np.where(free, 0.0, config.unknown_weight)
-    return np.ascontiguousarray(cost)
-
-
-def distance_from(solid: Mask) -> Array:
-    """Distance, in cells between centres, from each cell (H, W) to the nearest solid one; outside all is solid."""
-    return distance_cells(np.pad(solid, 1, constant_values=True))[1:-1, 1:-1]
-
-
-def standing_places(free: Mask, radius_m: float, resolution: float) -> Mask:
-    """Cells (H, W) in which the centre of a robot of a radius may be; all that is not free counts as solid."""
-    return standing_room(column_distance(free), radius_m / resolution)
-
-
-def places_in_reach(free: Mask, frame: GridFrame, xy: tuple[float, float], radius_m: float, escape_m: float) -> Mask:
-    """Standing places (H, W) to which a robot of a radius can get from a point (m).
-
-    Where it stands too near to something it is let out over free cells up to escape_m away, as a path would.
-    """
-    standing = standing_places(free, radius_m, frame.resolution)
-    row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
-    if not (0 <= row < free.shape[0] and 0 <= col < free.shape[1]):
-        return np.zeros_like(standing)
-    ways = standing
-    if not standing[row, col]:
-        ways = standing.copy()
-        part, disc = _disc(ways, (row, col), escape_m / frame.resolution)
-        ways[part] |= disc & free[part]
-        ways[row, col] = True
-    return reached_from(ways, (row, col)) & standing
+    return cost
 
 
 def navigation_function(cost: Array, goal: tuple[int, int], start: tuple[int, int] | None = None) -> Array:
@@ -117,11 +89,6 @@ def navigation_function(cost: Array, goal: tuple[int, int], start: tuple[int, in
     """
     row, col = (-1, -1) if start is None else start
     return np.asarray(_march(cost, goal[0], goal[1], row, col))
-
-
-def reached_from(allowed: Mask, start: tuple[int, int]) -> Mask:
-    """Allowed cells (H, W) to which the wave can get from a start (row, col): over edges of cells, not corners."""
-    return np.asarray(_reached_from(allowed, start[0], start[1]))
 
 
 def descend(field: Array, x: float, y: float, goal_row: int, goal_col: int) -> Array:
@@ -134,58 +101,42 @@ def _in_cells(patch: GridPatch, xy: tuple[float, float]) -> tuple[float, float]:
     return (xy[0] - frame.origin_x) / frame.resolution, (xy[1] - frame.origin_y) / frame.resolution
 
 
-def nearest_true(allowed: Mask, cell: tuple[int, int], reach: float) -> tuple[int, int] | None:
-    """The true cell nearest to one that lies anywhere, if there is one within a distance of `reach` cells."""
-    whole = math.floor(reach)
-    top, left = max(cell[0] - whole, 0), max(cell[1] - whole, 0)
-    part = allowed[top : max(cell[0] + whole + 1, 0), left : max(cell[1] + whole + 1, 0)]
-    near = np.argwhere(part) + (top, left)
-    squared = np.square(near - cell).sum(axis=1)
-    if near.size == 0 or squared.min() > reach * reach:
-        return None
-    best = near[squared.argmin()]
-    return int(best[0]), int(best[1])
-
-
 def _let_out(cost: Array, occupied: Mask, start: tuple[int, int], reach: float) -> None:
     """Open the forbidden cells around a start, at a high cost: a robot that stands there has to get away somehow.
 
     Not those that are occupied, but for the robot's own cell: where the robot is, nothing else can be.
     """
-    where, disc = _disc(cost, start, reach)
+    where, within = disc(cost, start, reach)
     part = cost[where]
-    part[disc & ~np.isfinite(part) & ~occupied[where]] = _ESCAPE_COST
+    part[within & ~np.isfinite(part) & ~occupied[where]] = _ESCAPE_COST
     cost[start] = min(cost[start], _ESCAPE_COST)
 
 
-def _disc(of: NDArray[Any], centre: tuple[int, int], reach: float) -> tuple[tuple[slice, slice], Mask]:
-    """The part of an array (H, W) round a cell, and which of its cells lie within reach."""
-    whole = math.ceil(reach)
-    rows = slice(max(centre[0] - whole, 0), min(centre[0] + whole + 1, of.shape[0]))
-    cols = slice(max(centre[1] - whole, 0), min(centre[1] + whole + 1, of.shape[1]))
-    row, col = np.ogrid[rows, cols]
-    return (rows, cols), np.asarray(np.hypot(row - centre[0], col - centre[1]) <= reach)
-
-
 @kernel
-def _reached_from(allowed: Mask, start_row: int, start_col: int) -> Mask:
-    rows, cols = allowed.shape
-    found = np.zeros((rows, cols), dtype=np.bool_)
-    stack = np.empty(rows * cols + 1, dtype=np.int64)
-    count = 0
-    if allowed[start_row, start_col]:
-        found[start_row, start_col] = True
-        stack[0], count = start_row * cols + start_col, 1
-    while count > 0:
-        count -= 1
-        row, col = stack[count] // cols, stack[count] % cols
-        for side in range(4):
-            r, c = row + (side == 0) - (side == 1), col + (side == 2) - (side == 3)
-            if 0 <= r < rows and 0 <= c < cols and allowed[r, c] and not found[r, c]:
-                found[r, c] = True
-                stack[count] = r * cols + c
-                count += 1
-    return found
+def _look_up(distance: NDArray[np.int16], reach: int, table: Array) -> Array:
+    """table[squared distance in cells to the nearest solid cell] for each cell (H, W); outside all is solid.
+
+    distance: from `column_distance`. What is farther than `reach` cells in a row or column counts as reach + 1 there.
+    """
+    rows, cols = distance.shape
+    result = np.empty((rows, cols))
+    # Columns of solid on both sides, in a row of the processor's smallest numbers.
+    line = np.zeros(cols + 2 * reach, dtype=np.int16)
+    most = np.int16(reach + 1)
+    squared = np.empty(cols, dtype=np.int16)
+    for row in range(rows):
+        for col in range(cols):
+            here = min(distance[row, col], most)
+            line[reach + col] = here * here
+        squared[:] = line[reach : reach + cols]
+        for k in range(1, reach + 1):
+            step = np.int16(k * k)
+            for col in range(cols):
+                beside = min(line[reach + col - k], line[reach + col + k]) + step
+                squared[col] = min(squared[col], beside)
+        for col in range(cols):
+            result[row, col] = table[squared[col]]
+    return result
 
 
 @kernel

@@ -1,0 +1,94 @@
+"""The compiled loops of planning and exploration give what plain code gives."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from thinmap_ros.core.exploration.open_borders import _parts
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.planning.follower import _point_ahead, length_from, nearest_point
+from thinmap_ros.core.planning.navigator import _clear_steps, _touches
+from thinmap_ros.core.planning.reach import reached_from
+from thinmap_ros.core.planning.wavefront import WavefrontConfig, cost_of_cells
+
+SEEDS = range(20)
+
+
+def wandering(rng, count=40):
+    return np.cumsum(rng.normal(0.03, 0.05, (count, 2)), axis=0)
+
+
+def plain_point_ahead(path, xy, reach_m, stray_m):
+    nearest = int(np.square(path - xy).sum(axis=1).argmin())
+    rest = path[nearest:]
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(rest, axis=0).T))])
+    left_m = max(float(along[-1]), float(np.hypot(*(rest[-1] - xy))))
+    last = min(int(np.searchsorted(along, reach_m)), len(rest) - 1)
+    allowed = stray_m + float(np.hypot(*(rest[0] - xy)))
+    while last > 1:
+        dx, dy = rest[last] - xy
+        off = np.abs((rest[:last, 0] - xy[0]) * dy - (rest[:last, 1] - xy[1]) * dx).max()
+        if off / max(math.hypot(dx, dy), 1e-9) <= allowed:
+            break
+        last -= 1
+    return *rest[last], left_m
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_the_point_to_steer_for(seed):
+    rng = np.random.default_rng(seed)
+    path, xy = wandering(rng), rng.normal(0.0, 0.4, 2)
+    nearest = nearest_point(path, *xy)
+    assert nearest == int(np.square(path - xy).sum(axis=1).argmin())
+    assert length_from(path, nearest) == pytest.approx(np.hypot(*np.diff(path[nearest:], axis=0).T).sum())
+    found = _point_ahead(path, *xy, 0.4, 0.05)
+    assert found == pytest.approx(plain_point_ahead(path, xy, 0.4, 0.05))
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_how_far_a_disc_can_be_moved(seed):
+    rng = np.random.default_rng(seed)
+    centres, points = wandering(rng), rng.uniform(-1.0, 2.5, (12, 2))
+    distances = np.hypot(*(centres[:, None] - points[None]).transpose(2, 0, 1))
+    blocked = (distances < np.minimum(0.24, distances[0] - 0.005)).any(axis=1)
+    expected = max(int(blocked.argmax()) - 1, 0) if blocked.any() else len(centres) - 1
+    assert _clear_steps(centres, points, 0.24) == expected
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_whether_something_has_come_near_a_path(seed):
+    rng = np.random.default_rng(seed)
+    cells = np.where(rng.random((50, 50)) < 0.01, 100, 0).astype(np.int8)
+    path = np.clip(np.cumsum(rng.integers(-1, 2, (30, 2)), axis=0) + 25, 0, 49)
+    away = ndimage.distance_transform_edt(cells < 65)[path[:, 0], path[:, 1]].min()
+    assert _touches(cells, path, 2.5) == (away < 2.5)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_the_cost_of_cells_falls_with_the_distance_to_what_is_not_free(seed):
+    rng = np.random.default_rng(seed)
+    config, free = WavefrontConfig(), ndimage.binary_opening(rng.random((40, 50)) < 0.97)
+    cost = cost_of_cells(GridPatch(GridFrame(0.0, 0.0, 0.1), np.where(free, 0, 100).astype(np.int8)), config)
+    away_m = 0.1 * ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1]
+    nearness = np.clip((config.keep_m - away_m) / (config.keep_m - config.robot_radius_m), 0.0, 1.0)
+    expected = np.where(away_m >= config.robot_radius_m - 1e-6, 1.0 + config.keep_weight * nearness**2, np.inf)
+    assert cost == pytest.approx(expected)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_what_is_joined(seed):
+    mask = np.random.default_rng(seed).random((30, 40)) < 0.35
+    cells = np.argwhere(mask)
+    numbers, sizes = _parts(mask.shape, cells)
+    expected, count = ndimage.label(mask, np.ones((3, 3)))
+    assert len(sizes) == count
+    assert (numbers + 1 == expected[mask]).all()
+    assert (sizes == np.bincount(numbers)).all()
+    room = ~mask
+    parts, _ = ndimage.label(room)
+    start = tuple(int(v) for v in np.argwhere(room)[0])
+    assert (reached_from(room, start) == (parts == parts[start])).all()
+    assert not reached_from(room, tuple(int(v) for v in cells[0])).any()

@@ -1,0 +1,134 @@
+"""From where to look at a border of the known: from as far away as the laser allows, or from right beside it.
+
+The unknown behind a border is stood for by some points, straight on from the border's cells. A place is good if most of
+them could be seen from there as long as nothing is known to stand between. A robot that stands on the known side of a
+corner sees along the border, but none of what the corner hides; one at the end of its laser's range has to come only a
+little nearer.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core.grid.raytrace import line_is_clear
+from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.se2 import Array
+
+Mask = NDArray[np.bool_]
+Cells = NDArray[np.int64]
+Cell = tuple[int, int]
+SQUARE = 2
+_POINTS, _SHARE = 8, 0.7
+_SLACK = 5
+
+
+def place_for(
+    free: Mask, solid: Mask, cells: Cells, allowed: Mask, ways: Array, depth: int, reach: float
+) -> Cell | None:
+    """The allowed cell with the shortest way from which most of what a border (N, 2) hides could be seen.
+
+    free, solid, allowed (H, W); ways (ceil(H / SQUARE), ceil(W / SQUARE)): length of the way to each square of
+    SQUARE x SQUARE cells, in whose middle the robot would stand; depth: how far behind the border is looked, in cells;
+    reach: how far the laser sees, in cells.
+    """
+    points = _hidden_points(free, solid, cells, depth, _POINTS)
+    row, col = _view_place(ways, SQUARE, allowed, ~solid, points, reach, _SHARE)
+    return None if row < 0 else (int(row), int(col))
+
+
+def place_at(free: Mask, cells: Cells, allowed: Mask, most_steps: int, towards: Cell) -> Cell | None:
+    """The allowed cell right at a border (N, 2), near to it and to another cell.
+
+    Of all allowed cells whose way to the border over free cells is at most most_steps, and nearly the shortest, the one
+    nearest to `towards`: round a pillar all sides are equally near.
+    """
+    row, col = _place_at(free, cells, allowed, most_steps, *towards)
+    return None if row < 0 else (int(row), int(col))
+
+
+@kernel
+def _hidden_points(free: Mask, solid: Mask, cells: Cells, depth: int, most: int) -> Cells:
+    """Cells behind some of a border's cells (N, 2): straight on into the unknown, up to a depth or something known."""
+    rows, cols = free.shape
+    count = min(cells.shape[0], most)
+    points = np.empty((count, 2), dtype=np.int64)
+    for i in range(count):
+        k = (2 * i + 1) * cells.shape[0] // (2 * count)
+        row, col = cells[k, 0], cells[k, 1]
+        # Which way the unknown lies, from the cells around.
+        down, right = 0.0, 0.0
+        for r in range(max(row - 3, 0), min(row + 4, rows)):
+            for c in range(max(col - 3, 0), min(col + 4, cols)):
+                if not free[r, c] and not solid[r, c]:
+                    down += r - row
+                    right += c - col
+        length = max(math.hypot(down, right), 1e-9)
+        points[i, 0], points[i, 1] = row, col
+        for step in range(1, depth + 1):
+            r, c = int(round(row + step * down / length)), int(round(col + step * right / length))
+            if r < 0 or r >= rows or c < 0 or c >= cols or solid[r, c]:
+                break
+            points[i, 0], points[i, 1] = r, c
+    return points
+
+
+@kernel
+def _view_place(
+    ways: Array, factor: int, allowed: Mask, passable: Mask, points: Cells, reach: float, share: float
+) -> tuple[int, int]:
+    """The middle of a square, the one with the shortest way, that sees at least a share of the points; -1 if none does.
+
+    A line of sight runs over passable cells, and is shorter than reach.
+    """
+    rows, cols = allowed.shape
+    need = int(math.ceil(share * points.shape[0]))
+    low_r, high_r = points[:, 0].min() - reach, points[:, 0].max() + reach
+    low_c, high_c = points[:, 1].min() - reach, points[:, 1].max() + reach
+    best, best_row, best_col = np.inf, -1, -1
+    for r in range(max(int(low_r) // factor, 0), min(int(high_r) // factor + 1, ways.shape[0])):
+        for c in range(max(int(low_c) // factor, 0), min(int(high_c) // factor + 1, ways.shape[1])):
+            row, col = r * factor + factor // 2, c * factor + factor // 2
+            if ways[r, c] >= best or row >= rows or col >= cols or not allowed[row, col]:
+                continue
+            seen = 0
+            for i in range(points.shape[0]):
+                if seen + points.shape[0] - i < need:
+                    break
+                away = math.hypot(points[i, 0] - row, points[i, 1] - col)
+                if away < reach and line_is_clear(passable, row, col, points[i, 0], points[i, 1]):
+                    seen += 1
+            if seen >= need:
+                best, best_row, best_col = ways[r, c], row, col
+    return best_row, best_col
+
+
+@kernel
+def _place_at(
+    free: Mask, cells: Cells, allowed: Mask, most_steps: int, to_row: int, to_col: int
+) -> tuple[int, int]:
+    """Breadth first over free cells, from all border cells at once, and _SLACK steps on after the first find."""
+    rows, cols = free.shape
+    seen = np.zeros((rows, cols), dtype=np.bool_)
+    queue = np.empty((rows * cols, 3), dtype=np.int64)
+    tail = 0
+    for i in range(cells.shape[0]):
+        queue[tail, 0], queue[tail, 1], queue[tail, 2] = cells[i, 0], cells[i, 1], 0
+        seen[cells[i, 0], cells[i, 1]] = True
+        tail += 1
+    head, best, best_row, best_col = 0, np.inf, -1, -1
+    while head < tail and queue[head, 2] <= most_steps:
+        row, col, steps = queue[head, 0], queue[head, 1], queue[head, 2]
+        head += 1
+        away = math.hypot(row - to_row, col - to_col)
+        if allowed[row, col] and away < best:
+            if best_row < 0:
+                most_steps = min(most_steps, steps + _SLACK)
+            best, best_row, best_col = away, row, col
+        for side in range(4):
+            r, c = row + (side == 0) - (side == 1), col + (side == 2) - (side == 3)
+            if 0 <= r < rows and 0 <= c < cols and free[r, c] and not seen[r, c]:
+                seen[r, c] = True
+                queue[tail, 0], queue[tail, 1], queue[tail, 2] = r, c, steps + 1
+                tail += 1
+    return best_row, best_col

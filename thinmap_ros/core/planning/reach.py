@@ -1,0 +1,86 @@
+"""Where a robot can stand, and to which of these places it can get."""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.topology.free_space import column_distance, standing_room
+
+Mask = NDArray[np.bool_]
+
+
+def standing_places(free: Mask, radius_m: float, resolution: float) -> Mask:
+    """Cells (H, W) in which the centre of a robot of a radius may be; all that is not free counts as solid."""
+    return standing_room(column_distance(free), radius_m / resolution)
+
+
+def places_in_reach(free: Mask, frame: GridFrame, xy: tuple[float, float], radius_m: float, escape_m: float) -> Mask:
+    """Standing places (H, W) to which a robot of a radius can get from a point (m).
+
+    Where it stands too near to something it is let out over free cells up to escape_m away, as a path would.
+    """
+    standing = standing_places(free, radius_m, frame.resolution)
+    row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
+    if not (0 <= row < free.shape[0] and 0 <= col < free.shape[1]):
+        return np.zeros_like(standing)
+    ways = standing
+    if not standing[row, col]:
+        ways = standing.copy()
+        part, within = disc(ways, (row, col), escape_m / frame.resolution)
+        ways[part] |= within & free[part]
+        ways[row, col] = True
+    return reached_from(ways, (row, col)) & standing
+
+
+def reached_from(allowed: Mask, start: tuple[int, int]) -> Mask:
+    """Allowed cells (H, W) to which the wave can get from a start (row, col): over edges of cells, not corners."""
+    return np.asarray(_reached_from(allowed, start[0], start[1]))
+
+
+def nearest_true(allowed: Mask, cell: tuple[int, int], reach: float) -> tuple[int, int] | None:
+    """The true cell nearest to one that lies anywhere, if there is one within a distance of `reach` cells."""
+    whole = math.floor(reach)
+    top, left = max(cell[0] - whole, 0), max(cell[1] - whole, 0)
+    part = allowed[top : max(cell[0] + whole + 1, 0), left : max(cell[1] + whole + 1, 0)]
+    near = np.argwhere(part) + (top, left)
+    squared = np.square(near - cell).sum(axis=1)
+    if near.size == 0 or squared.min() > reach * reach:
+        return None
+    best = near[squared.argmin()]
+    return int(best[0]), int(best[1])
+
+
+def disc(of: NDArray[Any], centre: tuple[int, int], reach: float) -> tuple[tuple[slice, slice], Mask]:
+    """The part of an array (H, W) round a cell, and which of its cells lie within reach."""
+    whole = math.ceil(reach)
+    rows = slice(max(centre[0] - whole, 0), min(centre[0] + whole + 1, of.shape[0]))
+    cols = slice(max(centre[1] - whole, 0), min(centre[1] + whole + 1, of.shape[1]))
+    row, col = np.ogrid[rows, cols]
+    return (rows, cols), np.asarray(np.hypot(row - centre[0], col - centre[1]) <= reach)
+
+
+@kernel
+def _reached_from(allowed: Mask, start_row: int, start_col: int) -> Mask:
+    rows, cols = allowed.shape[0], allowed.shape[1] + 2
+    # An empty border saves the wave all questions about the rim.
+    left = np.zeros((rows + 2, cols), dtype=np.bool_)
+    left[1:-1, 1:-1] = allowed
+    found = np.zeros((rows + 2, cols), dtype=np.bool_)
+    flat, reached = left.ravel(), found.ravel()
+    stack = np.empty(flat.size, dtype=np.int64)
+    start = (start_row + 1) * cols + start_col + 1
+    stack[0], count = start, int(flat[start])
+    reached[start], flat[start] = flat[start], False
+    while count > 0:
+        count -= 1
+        at = stack[count]
+        for to in (at - cols, at - 1, at + 1, at + cols):
+            if flat[to]:
+                flat[to], reached[to] = False, True
+                stack[count] = to
+                count += 1
+    return found[1:-1, 1:-1].copy()
