@@ -57,7 +57,7 @@ def chosen(walls, seen, gap_m=0.3):
         ekf.add(line, 1e-6 * np.eye(2))
         along = ends @ [-math.sin(line[1]), math.cos(line[1])]
         features.append(Feature(1, along.min(), along.max(), np.zeros(2)))
-    return associate(ekf, features, seen_lines(*seen), np.zeros(2), AssociationConfig(gap_m=gap_m)).tolist()
+    return associate(ekf, features, seen_lines(*seen), np.zeros(2), AssociationConfig(gap_m=gap_m)).index.tolist()
 
 
 def test_collinear_walls_of_two_rooms_are_two():
@@ -71,6 +71,21 @@ def test_a_line_fits_only_where_the_gate_says_so():
     assert chosen([[[2, -1], [2, 1]]], [[[2.2, -1], [2.2, 1]]]) == [-1]
     assert chosen([[[2, -1], [2, 1]]], [[[2.2, -1], [1.8, 1]]]) == [-1]
     assert chosen([], [[[2, -1], [2, 1]]]) == [-1]
+
+
+def test_what_could_be_two_walls_is_decided_when_the_others_have_corrected_the_pose():
+    """A cupboard before a wall, 12 cm apart: taken by itself, the line fits the wrong one of them better."""
+    wall, cupboard, behind = [[2.12, -1.0], [2.12, 1.0]], [[2.0, -1.0], [2.0, 1.0]], [[-3.0, -1.0], [-3.0, 1.0]]
+    ekf, features = known([wall, cupboard, behind])
+    truth = np.array([0.08, 0.0, 0.0])
+    ekf.local.set_pose(np.zeros(3), np.diag([0.1**2, 0.01**2, 0.001**2]))
+    off = [truth[:2], truth[:2]]
+    seen = seen_lines(np.array(wall) - off, np.array(behind) - off)
+    alone = associate(ekf.local, features._local(ekf), seen, np.zeros(2), FeatureConfig())
+    assert ekf.area[alone.index[0]] == 2
+    assert alone.ambiguous.tolist() == [True, False]
+    features.observe(ekf, seen, BLIND)
+    assert ekf.local.pose[0] == pytest.approx(0.08, abs=0.02)
 
 
 def test_the_two_faces_of_a_thin_wall_are_two_features():

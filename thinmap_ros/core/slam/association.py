@@ -2,7 +2,9 @@
 
 Source: EKF-SLAM/TI paper eq. (13), with the sign of the gate as it must be: v' S^-1 v <= 5.99, two degrees of freedom,
 95 %. Infinite lines agree where walls of different rooms are collinear, so what was seen of them has to meet as well;
-and the two faces of a thin wall are two features, each seen from its own side.
+and the two faces of a thin wall are two features, each seen from its own side. Lines that could be several features
+are decided after the others have corrected the pose, so that the scan is taken as a whole (the idea of Neira and
+Tardos, "Data association in stochastic mapping using the joint compatibility test", 2001).
 """
 
 import math
@@ -30,27 +32,40 @@ class AssociationConfig(Config):
     gap_m: float = parameter(0.3, 'seen part and feature may lie this far apart along the line, m', low=0.0, high=5.0)
 
 
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """For each line of a scan the index of the feature it fits best, or -1, (K,), and whether others fit too, (K,)."""
+
+    index: NDArray[np.int64]
+    ambiguous: NDArray[np.bool_]
+
+
 def associate(
     ekf: EkfSlam, features: list[Feature], lines: Lines, laser_map: Array, config: AssociationConfig
-) -> NDArray[np.int64]:
-    """For each line of the scan the index of the feature it fits best, or -1, (K,).
+) -> Choice:
+    """Which features the lines of a scan are, each taken by itself.
 
-    laser_map (2,): where the scan was seen from.
+    laser_map (2,): where the scan was seen from. Lines that could be several features are better asked again when the
+    others have corrected the pose.
     """
     chosen = np.full(len(lines), -1, dtype=np.int64)
+    passing = np.zeros(len(lines), dtype=np.int64)
     if not features:
-        return chosen
+        return Choice(chosen, passing > 1)
     ends_map = transform_points(ekf.pose, lines.ends.reshape(-1, 2)).reshape(-1, 2, 2)
     pairs = np.argwhere(meeting(ekf.lines, features, ends_map, laser_map, config.gap_m))
-    best = np.full(len(lines), config.gate)
+    best = np.full(len(lines), np.inf)
     for k, index in pairs:
         expected, spread, _ = ekf.innovations(int(index))
         v = lines.z[k] - expected
         v[1] = wrap(float(v[1]))
         distance = mahalanobis(v, spread + lines.covariances[k])
+        if distance > config.gate:
+            continue
+        passing[k] += 1
         if distance <= best[k]:
             best[k], chosen[k] = distance, index
-    return chosen
+    return Choice(chosen, passing > 1)
 
 
 def meeting(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import parameter
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.se2 import transform_points
+from thinmap_ros.core.se2 import Array, transform_points
 from thinmap_ros.core.slam.association import AssociationConfig, associate, mahalanobis, meeting
 from thinmap_ros.core.slam.candidates import Candidate, Candidates
 from thinmap_ros.core.slam.ekf_ti import CompressedEkf
@@ -82,9 +82,8 @@ class FeatureMap:
             self._choose_area(ekf, scan)
         lines = Lines(lines.z, lines.covariances + self._wall, lines.ends)
         laser_map = transform_points(ekf.local.pose, scan.T_base_laser[None, :2])[0]
-        chosen = associate(ekf.local, self._local(ekf), lines, laser_map, self._config)
+        chosen, taken = self._correct(ekf, lines, laser_map)
         matched, unknown = np.flatnonzero(chosen >= 0), np.flatnonzero(chosen < 0)
-        taken = ekf.local.update(chosen[matched], lines.z[matched], lines.covariances[matched])
         seen = self._grow(ekf, chosen[matched], lines.chosen(matched))
         ripe = self._candidates.take(ekf.local.pose, lines.chosen(unknown), laser_map)
         self._miss(ekf, seen, scan)
@@ -92,6 +91,23 @@ class FeatureMap:
         new = [i for candidate in ripe for i in self._take_up(ekf, candidate)]
         self.area.store(ekf.local.pose, [i for i in (*seen, *new) if i in self._features])
         return len(matched), taken
+
+    def _correct(self, ekf: CompressedEkf, lines: Lines, laser_map: Array) -> tuple[NDArray[np.int64], bool]:
+        """Update by the lines that can only be one feature, then by the others; which feature each is (-1: none)."""
+        features = self._local(ekf)
+        choice = associate(ekf.local, features, lines, laser_map, self._config)
+        chosen = np.where(choice.ambiguous, -1, choice.index)
+        taken = self._update(ekf, chosen, lines)
+        left = np.flatnonzero(choice.ambiguous)
+        if left.size:
+            again = associate(ekf.local, features, lines.chosen(left), laser_map, self._config).index
+            taken &= self._update(ekf, again, lines.chosen(left))
+            chosen[left] = again
+        return chosen, taken
+
+    def _update(self, ekf: CompressedEkf, chosen: NDArray[np.int64], lines: Lines) -> bool:
+        matched = np.flatnonzero(chosen >= 0)
+        return ekf.local.update(chosen[matched], lines.z[matched], lines.covariances[matched])
 
     def move(self, ekf: CompressedEkf, correction: Correction) -> None:
         """Take the features where the keyframes nearest to where they were first seen from have gone.
