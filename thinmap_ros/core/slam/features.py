@@ -45,12 +45,19 @@ class LineFeature:
 
 def normals_of(lines: Array) -> Array:
     """Unit normals (N, 2) of lines (N, 2) as (r, alpha)."""
-    return np.column_stack([np.cos(lines[:, 1]), np.sin(lines[:, 1])])
+    return _paired(np.cos(lines[:, 1]), np.sin(lines[:, 1]))
 
 
 def tangents_of(lines: Array) -> Array:
     """Directions (N, 2) in which positions along lines (N, 2) grow: their normals turned to the left."""
-    return np.column_stack([-np.sin(lines[:, 1]), np.cos(lines[:, 1])])
+    return _paired(-np.sin(lines[:, 1]), np.cos(lines[:, 1]))
+
+
+def _paired(x: Array, y: Array) -> Array:
+    """(N, 2) of x (N,) and y (N,): a step asks for it so often that np.column_stack would be felt."""
+    pairs = np.empty((x.size, 2))
+    pairs[:, 0], pairs[:, 1] = x, y
+    return pairs
 
 
 def sides_of(lines: Array, points: Array) -> Array:

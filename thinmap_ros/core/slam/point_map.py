@@ -50,7 +50,7 @@ class PointMap:
         if len(points_map) == 0:
             return
         cells = np.floor(points_map[:, ::-1] / self.cell_m).astype(np.int64)
-        tiles = np.unique(cells // TILE, axis=0)
+        tiles = _once(cells // TILE)
         low, high = tiles.min(axis=0), tiles.max(axis=0)
         self.tiles.reach(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
         self.tiles.ensure(tiles)
@@ -64,6 +64,14 @@ def gaps(points: Array) -> Array:
     """Distance (N,) of each point, in the order of the beams, from the nearer of its neighbours; inf for one alone."""
     steps = np.hypot(*np.diff(points, axis=0).T)
     return np.asarray(np.minimum(np.append(steps, np.inf), np.append(np.inf, steps)))
+
+
+def _once(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The different ones of cells (N, 2)."""
+    row, col = cells.min(axis=0)
+    width = int(cells[:, 1].max() - col) + 1
+    numbers = np.unique((cells[:, 0] - row) * width + cells[:, 1] - col)
+    return np.stack([numbers // width + row, numbers % width + col], axis=1)
 
 
 @inlined
@@ -102,6 +110,8 @@ def _add(
         cell[MEAN_Y] += (points[i, 1] - cell[MEAN_Y]) / cell[COUNT]
     for i in range(points.shape[0]):
         row, col = cells[i, 0], cells[i, 1]
+        if i > 0 and row == cells[i - 1, 0] and col == cells[i - 1, 1]:
+            continue
         for reach in _REACHES:
             x, y, nx, ny, loose = _surface(pool, directory, row, col, reach, seen_from, since)
             if loose == 0.0:
@@ -130,14 +140,17 @@ def _surface(
     base = pool[slot_of(directory, row, col), row & _MASK, col & _MASK]
     cells, firm, count, sx, sy, sxx, sxy, syy = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for r in range(row - reach, row + reach + 1):
+        slot, last_tile = NO_TILE, -1
         for c in range(col - reach, col + reach + 1):
-            slot = slot_of(directory, r, c)
+            if c >> _SHIFT != last_tile:
+                slot, last_tile = slot_of(directory, r, c), c >> _SHIFT
             if slot == NO_TILE:
                 continue
             cell = pool[slot, r & _MASK, c & _MASK]
-            own = r == row and c == col
+            if cell[COUNT] == 0.0 or cell[SEEN] < since:
+                continue
             away = cell[NORMAL_X] * (seen_from[0] - cell[MEAN_X]) + cell[NORMAL_Y] * (seen_from[1] - cell[MEAN_Y])
-            if cell[COUNT] > 0.0 and cell[SEEN] >= since and (own or cell[LOOSE] > 0.0 or away >= 0.0):
+            if (r == row and c == col) or cell[LOOSE] > 0.0 or away >= 0.0:
                 dx, dy = cell[MEAN_X] - base[MEAN_X], cell[MEAN_Y] - base[MEAN_Y]
                 weight = min(cell[COUNT], _MOST_WEIGHT)
                 cells += 1
