@@ -1,6 +1,7 @@
 """The explorer as a process on a live graph: every way in which an exploration ends, and how it goes on afterwards."""
 
 import math
+import time
 from itertools import count
 
 import numpy as np
@@ -106,12 +107,19 @@ def test_it_says_why_it_ended(robot):
 
 def test_it_goes_on_after_a_cancelled_goal_and_after_a_new_start(graph, robot, tmp_path):
     client = ActionClient(graph.node, Explore, 'explore')
-    graph.until(client.server_is_ready, 'explorer')
-    accepted = client.send_goal_async(Explore.Goal())
-    graph.until(lambda: accepted.done() and robot.end_nodes and any(robot.evidence().values()), 'end nodes')
-    graph.until(lambda: any(distance > 0.0 for _, distance in robot.evidence().values()), 'looks at end nodes')
-    accepted.result().cancel_goal_async()
-    ended = accepted.result().get_result_async()
+    accepted = graph.send_goal(client, Explore.Goal())
+    graph.until(lambda: robot.end_nodes and any(robot.evidence().values()), 'end nodes')
+    # Nodes are looked at one after the other, and borders once a second: until nothing new comes.
+    seen = [(robot.evidence(), time.monotonic())]
+
+    def is_settled():
+        if robot.evidence() != seen[0][0]:
+            seen[0] = (robot.evidence(), time.monotonic())
+        return time.monotonic() - seen[0][1] > 3.0
+
+    graph.until(is_settled, 'all looks at end nodes')
+    accepted.cancel_goal_async()
+    ended = accepted.get_result_async()
     graph.until(ended.done, 'the end')
     assert ended.result().status == GoalStatus.STATUS_CANCELED
     assert ended.result().result.status.reason_code == ExplorationStatus.CANCELLED
