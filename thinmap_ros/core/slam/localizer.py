@@ -24,7 +24,7 @@ _LONGEST_STEP_M = 5.0  # between two scans the wheels cannot go farther: the odo
 _NEW_GROUND = 0.3  # where less of a scan than this lies on what is known, there is nothing to contradict
 _NEW_GROUND_M, _NEW_GROUND_RAD = 0.6, 0.6  # and that is so only this far from where the map last learned
 _LEAP_M, _LEAP_RAD = 0.4, 0.4  # a scan puts the robot this far from where the wheels did: one of them is wrong
-_OF_LATE_M = 15.0  # way in which the drift is as good as nothing
+_OF_LATE_M = 100.0  # way in which the drift stays below what a match with the map bridges
 _REDRAWN_AT_ONCE, _REDRAWN_A_STEP = 60, 3  # keyframes drawn anew when a loop was closed, and in each step after it
 _LOST_SIGMA_M = 1.0  # a robot in doubt by more than this does not know where it is
 
