@@ -158,6 +158,17 @@ def test_a_robot_carried_away_says_that_it_is_lost():
     assert not estimates[0].lost
 
 
+def test_far_from_the_start_a_robot_is_not_lost():
+    """In a large building the doubt of the pose in the map grows to metres; the scans fit all the same."""
+    rng = np.random.default_rng(10)
+    rows, localizer = driven(120)
+    truth, _, odom = rows[-1]
+    localizer._ekf.set_pose(localizer._ekf.pose, np.diag([4.0, 4.0, 0.001]))
+    estimate = localizer.step(scan_in(ROOM, truth, rng), odom)
+    assert estimate.covariance[0, 0] > 1.0
+    assert not estimate.lost
+
+
 def test_a_pose_that_is_set_is_settled_by_the_walls():
     rng = np.random.default_rng(9)
     rows, localizer = driven(300)

@@ -26,7 +26,7 @@ _NEW_GROUND_M, _NEW_GROUND_RAD = 0.6, 0.6  # and that is so only this far from w
 _LEAP_M, _LEAP_RAD = 0.4, 0.4  # a scan puts the robot this far from where the wheels did: one of them is wrong
 _OF_LATE_M = 100.0  # way in which the drift stays below what a match with the map bridges
 _REDRAWN_AT_ONCE, _REDRAWN_A_STEP = 60, 3  # keyframes drawn anew when a loop was closed, and in each step after it
-_LOST_SIGMA_M = 1.0  # a robot in doubt by more than this does not know where it is
+_LOST_SIGMA_M = 1.0  # doubt since a scan last fitted; far from the start, more than this is no reason to be lost
 
 
 @dataclass(frozen=True)
@@ -265,7 +265,7 @@ class Localizer:
         return math.hypot(moved[0], moved[1]) >= distance_m or abs(float(moved[2])) >= turn_rad
 
     def _is_lost(self) -> bool:
-        in_doubt = max(self._ekf.pose_covariance[0, 0], self._ekf.pose_covariance[1, 1]) > _LOST_SIGMA_M**2
+        in_doubt = max(self._doubt[0, 0], self._doubt[1, 1]) > _LOST_SIGMA_M**2
         return self._misfits >= self.config.lost_scans or bool(in_doubt)
 
     def _estimate(self, match: Match, lines: Lines, matched: int, correction: Correction | None) -> Estimate:
