@@ -16,6 +16,8 @@ from thinmap_msgs.action import Explore, NavigateToPose
 from thinmap_msgs.msg import ExplorationStatus, TopologicalMap
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.adapters import messages, qos
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridPatch
 
 pytestmark = pytest.mark.live
 START = '2.0,2.0,0.9'
@@ -157,6 +159,12 @@ def test_time_set_back_begins_everything_anew(graph):
     assert graph.stop('thinmap') == 0, graph.log('thinmap')
 
 
+def empty_hall():
+    """Map of 12 x 12 m around the origin in which all is free."""
+    cells = np.zeros((120, 120), dtype=np.int8)
+    return messages.grid_msg(GridPatch(GridFrame(-6.0, -6.0, 0.1), cells), 'map', 0)
+
+
 def test_a_silent_laser_stops_the_robot_and_it_goes_on(graph):
     commands = graph.heard('cmd_vel', Twist)
     doctor = Doctor(graph)
@@ -184,11 +192,7 @@ def test_a_silent_laser_stops_the_robot_and_it_goes_on(graph):
         if 'localizer' not in silent:
             pose.publish(messages.pose_with_covariance_msg(np.zeros(3), np.eye(3), 'map', ns))
 
-    hall = OccupancyGrid()
-    hall.info.resolution, hall.info.width, hall.info.height = 0.1, 120, 120
-    hall.info.origin.position.x, hall.info.origin.position.y, hall.info.origin.orientation.w = -6.0, -6.0, 1.0
-    hall.data = [0] * 14400
-    free.publish(hall)
+    free.publish(empty_hall())
     client = ActionClient(graph.node, NavigateToPose, 'navigate_to_pose')
     goal = NavigateToPose.Goal()
     goal.pose.pose.position.x, goal.pose.pose.orientation.w = 4.0, 1.0
@@ -240,7 +244,7 @@ def test_a_burst_of_scans_leaves_no_queue_and_what_is_lost_is_counted(graph):
     for _ in range(400):
         say()
     last_ns = now[0]
-    graph.until(lambda: messages.stamp_ns(poses[-1].header.stamp) >= last_ns, 'the newest scan')
+    graph.until(lambda: messages.stamp_ns(poses[-1].header.stamp) >= last_ns, 'the newest scan, at once', 5.0)
     heard = {messages.stamp_ns(p.header.stamp) for p in poses}
     burst = sum(ns > last_ns - 400 * period_ns for ns in heard)
     assert burst < 400, 'the queue is short'

@@ -43,6 +43,7 @@ class GridMapperNode(LiveNode):
         self._map = self.create_publisher(OccupancyGridMsg, 'map', qos.LATCHED)
         self._local_map = self.create_publisher(OccupancyGridMsg, 'local_map', qos.LATCHED)
         self._resumed_ns: int | None = None
+        self._taken_over_ns = 0
         self.begin_anew()
         self._go_on(self.keep(self._state))
         self.offer_pause()
@@ -81,7 +82,7 @@ class GridMapperNode(LiveNode):
     def _go_on(self, left: State | None) -> None:
         """Take over the map of a mapper that was killed."""
         if left is not None and 'latest_ns' in left:
-            self._resumed_ns = self._latest_ns = int(left.pop('latest_ns'))
+            self._resumed_ns = self._latest_ns = self._taken_over_ns = int(left.pop('latest_ns'))
             self._take_over(OccupancyGrid.from_state(left, self._config))
 
     def _of_session(self) -> OccupancyGrid:
@@ -118,9 +119,9 @@ class GridMapperNode(LiveNode):
 
     def _on_trajectory(self, message: Path) -> None:
         """A loop was closed: draw the map anew where the scans were really made."""
-        if self._latest_ns is None:
-            return  # of an earlier life
         self._corrected_ns = messages.stamp_ns(message.header.stamp)
+        if self._latest_ns is None or self._corrected_ns <= self._taken_over_ns:
+            return  # latched, and older than the map: that has undergone it, or is a new one
         if self._history is None:
             self.get_logger().warning('a loop is closed, but the map was loaded, not drawn here: it stays as it was')
         else:

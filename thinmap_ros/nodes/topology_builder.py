@@ -44,6 +44,7 @@ class TopologyBuilderNode(LiveNode):
         self.health.sole_publisher_of('topology')
         self._latest_ns: int | None = None
         self._resumed_ns: int | None = None
+        self._taken_over_ns = 0
         self.begin_anew()
         self._go_on(self.keep(self._state))
 
@@ -53,14 +54,15 @@ class TopologyBuilderNode(LiveNode):
     def _go_on(self, left: State | None) -> None:
         """Take over the graph of a builder that was killed."""
         if left is not None and 'latest_ns' in left:
-            self._resumed_ns = self._latest_ns = int(left.pop('latest_ns'))
+            self._resumed_ns = self._latest_ns = self._taken_over_ns = int(left.pop('latest_ns'))
             self._builder = TopologyBuilder.from_state(left, self._config)
+            self._rebuilding = Rebuilding(from_the_start=False)
             self._publish(self._latest_ns)
 
     def begin_anew(self) -> None:
         """Forget the graph, or go back to the session that the node was started with."""
         self._matcher: StampMatcher[GridPatch, Array] = StampMatcher()
-        self._rebuilding = Rebuilding()
+        self._rebuilding = Rebuilding(from_the_start=not self._session)
         self._builder = self._of_session() if self._session else TopologyBuilder(self._config)
         if self._session or self._said_something:
             self._publish(self.get_clock().now().nanoseconds)
@@ -88,7 +90,7 @@ class TopologyBuilderNode(LiveNode):
         self._resumed_ns, self._latest_ns = None, stamp_ns
         window, T_map_base = pair
         with self.health.timed('graph update'):
-            changed = self._rebuilding.may_take(window) and self._builder.update(window, T_map_base)
+            changed = self._rebuilding.may_take() and self._builder.update(window, T_map_base)
         self._rebuilding.took(stamp_ns, T_map_base)
         if changed:
             self._publish(stamp_ns)
@@ -96,8 +98,10 @@ class TopologyBuilderNode(LiveNode):
         self._local.publish(messages.topology_msg(self._builder.local_map(), self._map_frame, stamp_ns))
 
     def _on_trajectory(self, message: Path) -> None:
-        if self._latest_ns is not None:
-            self._rebuilding.expect(messages.stamp_ns(message.header.stamp), *messages.trajectory_from(message))
+        corrected_ns = messages.stamp_ns(message.header.stamp)
+        # A latched one may be of before the graph that was taken over, which then has undergone it.
+        if self._latest_ns is not None and corrected_ns > self._taken_over_ns:
+            self._rebuilding.expect(corrected_ns, *messages.trajectory_from(message))
 
     def _on_map(self, message: OccupancyGrid) -> None:
         if not self._rebuilding.waits_for(messages.stamp_ns(message.info.map_load_time)):
@@ -121,7 +125,7 @@ class TopologyBuilderNode(LiveNode):
         loaded = TopologyBuilder(self._config)
         if path:
             loaded = session_files.load_topology(path, self._config, self._builder.resolution_m)
-        self._builder, self._matcher = loaded, StampMatcher()
+        self._builder, self._matcher, self._rebuilding = loaded, StampMatcher(), Rebuilding(from_the_start=not path)
         self._publish(self.get_clock().now().nanoseconds)
         return f'graph of {len(loaded.map.nodes)} nodes' if path else 'the graph begins anew'
 

@@ -110,11 +110,11 @@ def test_the_corrected_path_has_every_step_and_is_no_worse(round_trip):
     assert off[1] < 0.02
 
 
-def test_the_kept_scans_come_with_corrected_poses(round_trip):
+def test_the_kept_scans_come_with_their_poses(round_trip):
     truth, _, localizer = round_trip
-    kept = localizer.corrected_scans()
+    kept = localizer.keyframes
     assert 10 < len(kept) < 200
-    for scan, T in kept:
+    for scan, T in [(frame.scan, frame.T_map_base) for frame in kept]:
         on_walls = se2.transform_points(T, scan.points_base())
         assert np.isfinite(on_walls).all()
         assert np.hypot(*(truth[:, :2] - T[:2]).T).min() < 0.05
@@ -122,7 +122,7 @@ def test_the_kept_scans_come_with_corrected_poses(round_trip):
 
 def test_before_any_scan_there_is_no_path():
     assert Localizer().corrected_path().shape == (0, 3)
-    assert Localizer().corrected_scans() == []
+    assert Localizer().keyframes == []
 
 
 def test_a_loop_is_closed_while_the_robot_drives():

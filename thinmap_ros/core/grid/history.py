@@ -54,11 +54,8 @@ class PoseHistory:
         if numbers.size == 0:
             return
         anchors = np.maximum(np.searchsorted(numbers, np.arange(right), side='right') - 1, 0)
-        after = [
-            se2.compose(poses[named[a]], se2.between(before[numbers[a]], T))
-            for a, T in zip(anchors, before[:right], strict=True)
-        ]
-        self._poses[: 3 * right] = array('d', np.array(after).ravel().tolist())
+        after = _carried(before[:right], before[numbers][anchors], poses[named][anchors])
+        self._poses[: 3 * right] = array('d', after.ravel().tolist())
 
     def _all_poses(self) -> Array:
         return np.array(self._poses).reshape(-1, 3)
@@ -69,6 +66,15 @@ class PoseHistory:
         found = sorted((number_of[stamp], k) for k, stamp in enumerate(stamps_ns.tolist()) if stamp in number_of)
         pairs = np.array(found, dtype=np.int64).reshape(-1, 2)
         return pairs[:, 0], pairs[:, 1]
+
+
+def _carried(poses: Array, before: Array, after: Array) -> Array:
+    """Poses (N, 3) after each went along with another one, from `before` (N, 3) to `after` (N, 3)."""
+    turn = after[:, 2] - before[:, 2]
+    c, s = np.cos(turn), np.sin(turn)
+    dx, dy = (poses - before)[:, 0], (poses - before)[:, 1]
+    x, y = after[:, 0] + c * dx - s * dy, after[:, 1] + s * dx + c * dy
+    return np.column_stack([x, y, se2.wrap(poses[:, 2] + turn)])
 
 
 class GridHistory:

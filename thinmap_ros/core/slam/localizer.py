@@ -94,7 +94,6 @@ class Localizer:
         self._loops = Loops(self.config, self.config)
         # Of every step, which keyframe came before it, and the pose from there.
         self._path: list[tuple[int, Array]] = []
-        self._way_m = 0.0
         # Keyframes from which the map of points has still to be drawn anew.
         self._redraw: list[int] = []
         self._T_odom_base: Array | None = None
@@ -133,10 +132,10 @@ class Localizer:
         increment, increment_covariance = self._odometry(T_odom_base)
         points_base, laser_base = self._seen(scan)
         expected = se2.compose(self._ekf.pose, increment)
-        self._way_m += math.hypot(increment[0], increment[1])
-        self._matcher.map.way_m = self._way_m
+        way_m = self._loops.way_m(self._ekf.pose)
+        self._matcher.map.way_m = way_m
         # Until it is known that old and new agree here, a scan is matched with what was seen of late.
-        self._matcher.map.since_m = -math.inf if self._loops.agreed else self._way_m - _OF_LATE_M
+        self._matcher.map.since_m = -math.inf if self._loops.agreed else way_m - _OF_LATE_M
         match = self._predict(points_base, laser_base, increment, increment_covariance)
         lines, matched = no_lines(), 0
         if self._has_news() and not self._is_lost():
@@ -169,10 +168,6 @@ class Localizer:
         """The scans that were kept, at their poses as they are known now."""
         return self._loops.keyframes
 
-    def corrected_scans(self) -> list[tuple[Scan, Array]]:
-        """The scans that were kept, each with its pose (3,) after all corrections: what a map can be drawn from."""
-        return [(f.scan, T) for f, T in zip(self._loops.keyframes, self._loops.relaxed(), strict=True)]
-
     def _apply(self, correction: Correction) -> None:
         """A loop was closed: pose, features and the map of points go where the keyframes have gone."""
         last = len(correction.after) - 1
@@ -188,13 +183,15 @@ class Localizer:
 
     def _redraw_some(self, count: int) -> None:
         """Draw some of the keyframes that are due, the nearest first, into the map of points."""
-        seen_m = self._matcher.map.way_m
+        points = self._matcher.map
+        now = points.way_m, points.since_m
+        points.since_m = -math.inf  # what is old counts here as well
         for k in [self._redraw.pop() for _ in range(min(count, len(self._redraw)))]:
             frame = self._loops.keyframes[k]
-            self._matcher.map.way_m = frame.way_m
+            points.way_m = frame.way_m
             laser = se2.transform_points(frame.T_map_base, frame.scan.T_base_laser[None, :2])[0]
             self._matcher.add(se2.transform_points(frame.T_map_base, frame.points_base), laser)
-        self._matcher.map.way_m = seen_m
+        points.way_m, points.since_m = now
 
     def _odometry(self, T_odom_base: Array) -> tuple[Array, Array]:
         """Input u of eq. (10): the increment (3,) since the last scan, and its covariance (3, 3)."""

@@ -95,9 +95,9 @@ class Loops:
         leapt: whether the pose is not where the wheels said, so that one of them is wrong.
         """
         self._leapt |= leapt
-        way = self._way_to(T_map_base)
-        if way is None:
+        if not self._is_apart(T_map_base):
             return
+        way = self.way_m(T_map_base)
         k = len(self.keyframes)
         self.keyframes.append(Keyframe(scan, points_base, T_map_base, way))
         if k > 0:
@@ -131,7 +131,8 @@ class Loops:
         witnesses, self._witnesses = list(self._witnesses), deque(maxlen=_WITNESSES)
         before = np.array([k.T_map_base for k in self.keyframes])
         after = self._relax(before)
-        if max(_size(_off(after, m)) for m in witnesses) > 0.5 * max(_size(_off(before, m)) for m in witnesses):
+        asked, left = (max(_size(_off(poses[m.a], poses[m.b], m)) for m in witnesses) for poses in (before, after))
+        if left > 0.5 * asked:
             # The graph does not bend so far: either these are wrong, or much else is. They do not count.
             self.matched = [m for m in self.matched if m not in witnesses]
             return None
@@ -141,7 +142,7 @@ class Loops:
 
     def _hear(self, measured: Measured) -> None:
         """Take a sharp match of the latest keyframes as a witness, for the map as it is or for a loop."""
-        off = _off(self._poses(measured), measured)
+        off = _off(self.keyframes[measured.a].T_map_base, self.keyframes[measured.b].T_map_base, measured)
         if math.hypot(off[0], off[1]) < _WORTH_M and abs(off[2]) < _WORTH_RAD:
             self._agreed_at_m = max(self._agreed_at_m, self.keyframes[measured.b].way_m)
             self._witnesses.clear()
@@ -156,13 +157,6 @@ class Loops:
         asked = np.array([se2.compose(poses[m.a], m.T_a_b) - poses[m.b] for m in self._witnesses])
         asked[:, 2] = se2.wrap(asked[:, 2])
         return bool(np.ptp(asked[:, :2], axis=0).max() < _ALIKE_M and np.ptp(asked[:, 2]) < _ALIKE_RAD)
-
-    def _poses(self, measured: Measured) -> Array:
-        """Poses of the keyframes up to the later one of a measurement; only its two are looked at."""
-        poses = np.zeros((measured.b + 1, 3))
-        for i in (measured.a, measured.b):
-            poses[i] = self.keyframes[i].T_map_base
-        return poses
 
     def relaxed(self) -> Array:
         """Poses (N, 3) of the keyframes that agree best with all measurements."""
@@ -183,23 +177,26 @@ class Loops:
         A localizer that holds on to its map adds next to nothing. To believe in more would let small errors of the
         matches bend a path that is straight.
         """
-        found = [(_off(poses, m), m.b - m.a) for m in self.matched if m.b - m.a > 1]
+        found = [(_off(poses[m.a], poses[m.b], m), m.b - m.a) for m in self.matched if m.b - m.a > 1]
         squared = np.array([np.square(off) / number for off, number in found]).reshape(-1, 3)
         if len(squared) == 0:
             return np.array([_STEP_M[0], _STEP_M[0], _STEP_RAD[0]])
         along = float(np.clip(math.sqrt(0.5 * np.median(squared[:, 0] + squared[:, 1])), *_STEP_M))
         return np.array([along, along, np.clip(math.sqrt(np.median(squared[:, 2])), *_STEP_RAD)])
 
-    def _way_to(self, T_map_base: Array) -> float | None:
-        """Length of the path up to a pose; None where it is too near to the last keyframe to be one."""
+    def way_m(self, T_map_base: Array) -> float:
+        """Length of the path up to a pose (3,), m, in straight lines from keyframe to keyframe."""
         if not self.keyframes:
             return 0.0
-        last = self.keyframes[-1]
-        moved = se2.between(last.T_map_base, T_map_base)
-        distance = math.hypot(moved[0], moved[1])
-        if distance < self._config.keyframe_m and abs(float(moved[2])) < self._config.keyframe_rad:
-            return None
-        return last.way_m + distance
+        return self.keyframes[-1].way_m + math.dist(self.keyframes[-1].T_map_base[:2], T_map_base[:2])
+
+    def _is_apart(self, T_map_base: Array) -> bool:
+        """Whether a pose is far enough from the last keyframe to be one."""
+        if not self.keyframes:
+            return True
+        moved = se2.between(self.keyframes[-1].T_map_base, T_map_base)
+        turned = abs(float(moved[2])) >= self._config.keyframe_rad
+        return turned or math.hypot(moved[0], moved[1]) >= self._config.keyframe_m
 
     def _earlier_visits(self, k: int) -> list[int]:
         """The keyframe most like this one of each of the earlier visits to the place, the likest first."""
@@ -242,7 +239,7 @@ def _size(off: Array) -> float:
     return math.hypot(*off)
 
 
-def _off(poses: Array, measured: Measured) -> Array:
-    """What a match says of two poses less what the poses (N, 3) say themselves, (3,)."""
-    off = measured.T_a_b - se2.between(poses[measured.a], poses[measured.b])
+def _off(T_a: Array, T_b: Array, measured: Measured) -> Array:
+    """What a match says of two poses (3,) less what they say themselves, (3,)."""
+    off = measured.T_a_b - se2.between(T_a, T_b)
     return np.array([off[0], off[1], se2.wrap(float(off[2]))])

@@ -103,7 +103,7 @@ def _add(
         cell = pool[directory[row >> _SHIFT, col >> _SHIFT], row & _MASK, col & _MASK]
         if cell[SEEN] < since:
             cell[COUNT], cell[DENSE] = 0.0, 0.0
-        cell[SEEN] = way
+        cell[SEEN] = max(np.float64(cell[SEEN]), way)
         cell[COUNT] = min(cell[COUNT] + 1.0, most)
         cell[DENSE] += dense[i]
         cell[MEAN_X] += (points[i, 0] - cell[MEAN_X]) / cell[COUNT]

@@ -40,6 +40,7 @@ _LEAST_OVERLAP = 0.3  # share of the scan that has to lie where the map knows so
 _FEWEST_POINTS = 10
 _SEARCHED_M, _SEARCHED_POINTS = 20.0, 60  # a search takes so many points of the scan, and none farther than this
 _SEARCH_STRIDE = 2  # cells from one place that is tried to the next
+_CLUTTER = 0.25  # weight of where along a surface a point lies: its nearest neighbour there is seldom the same thing
 _SEARCH_RIM = 1.25  # points by which a place at the rim of a search has to fit better than its middle
 
 
@@ -234,6 +235,51 @@ def _add_term(
 
 
 @kernel
+def _add_points(
+    scan: Array,
+    laser_base: Array,
+    pose: Array,
+    pool: NDArray[np.float32],
+    directory: NDArray[np.int32],
+    corner: NDArray[np.int64],
+    limits: tuple[float, int, float, float, float, float],
+    information: Array,
+    gradient: Array,
+) -> tuple[float, float, float]:
+    """Add what the points of a scan say at a pose (3,) to the normal equations; the weights that `_align` tells of.
+
+    limits: cell, reach in cells, sigma, outlier and inlier distance, and where the cells that count were last seen.
+    """
+    cell_m, cells, sigma, scale, inlier, since = limits
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    laser_x = pose[0] + cos * laser_base[0] - sin * laser_base[1]
+    laser_y = pose[1] + sin * laser_base[0] + cos * laser_base[1]
+    total, near, fitting = 0.0, 0.0, 0.0
+    for i in range(scan.shape[0]):
+        px, py = cos * scan[i, 0] - sin * scan[i, 1], sin * scan[i, 0] + cos * scan[i, 1]
+        x, y = px + pose[0], py + pose[1]
+        total += scan[i, 2]
+        slot, row, col = _nearest(x, y, laser_x, laser_y, pool, directory, corner, cell_m, cells, since)
+        if slot == NO_TILE:
+            continue
+        cell = pool[slot, row, col]
+        loose = np.float64(cell[LOOSE])
+        if loose == UNFORMED:
+            continue
+        nx, ny = np.float64(cell[NORMAL_X]), np.float64(cell[NORMAL_Y])
+        off_x, off_y = cell[CENTRE_X] - x, cell[CENTRE_Y] - y
+        error, slide = nx * off_x + ny * off_y, -ny * off_x + nx * off_y
+        squared = error * error + loose * slide * slide
+        near += scan[i, 2]
+        fitting += scan[i, 2] * (squared < inlier * inlier)
+        weight = scan[i, 2] / (sigma * sigma * (1.0 + squared / (scale * scale)))
+        _add_term(weight, nx * -py + ny * px, error, nx, ny, information, gradient)
+        if loose > 0.0 and scan[i, 3] > 0.0:
+            _add_term(_CLUTTER * weight * loose, ny * py + nx * px, slide, -ny, nx, information, gradient)
+    return total, near, fitting
+
+
+@kernel
 def _align(
     scan: Array,
     laser_base: Array,
@@ -247,41 +293,19 @@ def _align(
 ) -> tuple[Array, Array, Array]:
     """Pose (3,), its information (3, 3), and the weights (3,) of all points, of those near the map, of those on it.
 
-    scan (N, 3): x, y, weight in the robot frame; limits: cell, reach, sigma, outlier and inlier distance, m, and
-    where on the robot's way the cells that count were last seen.
+    scan (N, 4): x, y, weight in the robot frame, and whether the beams around are dense; limits: cell, reach, sigma,
+    outlier and inlier distance, m, and where on the robot's way the cells that count were last seen.
     """
     cell_m, reach, sigma, outlier, inlier, since = limits
     pose, information, gradient, shares = start.copy(), np.zeros((3, 3)), np.zeros(3), np.zeros(3)
     for iteration in range(_ROUNDS):
         wide = iteration < _WIDE_ROUNDS
         cells = int(math.ceil(reach / cell_m)) if wide else int(math.ceil(0.5 * reach / cell_m))
-        scale = 3.0 * outlier if wide else outlier
+        now = (cell_m, cells, sigma, 3.0 * outlier if wide else outlier, inlier, since)
         _prior_terms(pose, prior, prior_information, information, gradient)
-        cos, sin = math.cos(pose[2]), math.sin(pose[2])
-        laser_x = pose[0] + cos * laser_base[0] - sin * laser_base[1]
-        laser_y = pose[1] + sin * laser_base[0] + cos * laser_base[1]
-        shares[:] = 0.0
-        for i in range(scan.shape[0]):
-            px, py = cos * scan[i, 0] - sin * scan[i, 1], sin * scan[i, 0] + cos * scan[i, 1]
-            x, y = px + pose[0], py + pose[1]
-            shares[0] += scan[i, 2]
-            slot, row, col = _nearest(x, y, laser_x, laser_y, pool, directory, corner, cell_m, cells, since)
-            if slot == NO_TILE:
-                continue
-            cell = pool[slot, row, col]
-            loose = np.float64(cell[LOOSE])
-            if loose == UNFORMED:
-                continue
-            nx, ny = np.float64(cell[NORMAL_X]), np.float64(cell[NORMAL_Y])
-            off_x, off_y = cell[CENTRE_X] - x, cell[CENTRE_Y] - y
-            error, slide = nx * off_x + ny * off_y, -ny * off_x + nx * off_y
-            squared = error * error + loose * slide * slide
-            shares[1] += scan[i, 2]
-            shares[2] += scan[i, 2] * (squared < inlier * inlier)
-            weight = scan[i, 2] / (sigma * sigma * (1.0 + squared / (scale * scale)))
-            _add_term(weight, nx * -py + ny * px, error, nx, ny, information, gradient)
-            if loose > 0.0 and scan[i, 3] > 0.0:
-                _add_term(0.25 * weight * loose, ny * py + nx * px, slide, -ny, nx, information, gradient)
+        shares[0], shares[1], shares[2] = _add_points(
+            scan, laser_base, pose, pool, directory, corner, now, information, gradient
+        )
         dx, dy, turn = _solve(information, gradient)
         pose[0], pose[1], pose[2] = pose[0] + dx, pose[1] + dy, pose[2] + turn
         if not wide and abs(dx) + abs(dy) < 2e-4 and abs(turn) < 1e-4:
