@@ -136,8 +136,9 @@ def test_a_loop_is_closed_while_the_robot_drives():
             closed.append(len(rows))
     off = np.array([np.hypot(*(T - t)[:2]) for t, T in rows])
     assert closed
-    assert off[: closed[0] - 1].max() > 0.3, 'without drift there is nothing to close'
-    assert off[closed[-1] :].max() < 0.25
+    drift = off[: closed[0] - 1].max()
+    assert drift > 0.3, 'without drift there is nothing to close'
+    assert off[closed[-1] :].max() < 0.3 * min(drift, 1.0)
     assert len(localizer.corrected_path()) == len(rows)
     again = np.array([k.T_map_base for k in localizer.keyframes])
     assert np.isfinite(again).all()

@@ -7,7 +7,7 @@ import pytest
 from slam_room import ROOM, scan_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.slam.point_map import CENTRE_X, COUNT, LOOSE, NORMAL_X, NORMAL_Y, PointMap
+from thinmap_ros.core.slam.point_map import CENTRE_X, CENTRE_Y, COUNT, LOOSE, NORMAL_X, NORMAL_Y, PointMap
 from thinmap_ros.core.slam.scan_matching import MatchConfig, ScanMatcher
 
 TRUTH = np.array([2.0, 2.0, 0.3])
@@ -111,3 +111,16 @@ def test_the_point_map_forgets_what_has_moved():
         point_map.add(np.array([[x, 0.02]]), np.zeros(2))
     cells = point_map.tiles.pool.reshape(-1, point_map.tiles.pool.shape[-1])
     assert cells[cells[:, COUNT] > 0.0, 1] == pytest.approx([1.04], abs=0.003)
+
+
+def test_beside_a_door_a_wall_is_a_wall_to_its_end():
+    """The surface at the end of a wall is the wall's, not one that its jamb has turned."""
+    wall = np.column_stack([np.arange(0.0, 2.0, 0.02), np.full(100, 1.0)])
+    jamb = np.column_stack([np.full(6, 2.0), 1.0 + 0.02 * np.arange(6)])
+    points = PointMap(0.05, 30.0)
+    for _ in range(4):
+        points.add(np.vstack([wall, jamb]), np.array([1.5, 0.0]))
+    cells = [points.tiles.pool[0, 20, col] for col in range(24, 40)]
+    for cell in cells:
+        assert cell[LOOSE] == 0.0
+        np.testing.assert_allclose([cell[NORMAL_X], cell[NORMAL_Y], cell[CENTRE_Y]], [0.0, -1.0, 1.0], atol=0.03)

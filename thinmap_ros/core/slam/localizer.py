@@ -15,8 +15,9 @@ from thinmap_ros.core.slam.feature_map import FeatureConfig, FeatureMap
 from thinmap_ros.core.slam.features import LineFeature
 from thinmap_ros.core.slam.lines import LineConfig, Lines, extract_lines, no_lines
 from thinmap_ros.core.slam.loops import Correction, Keyframe, LoopConfig, Loops
-from thinmap_ros.core.slam.models import MotionConfig, odometry_covariance, rotation
-from thinmap_ros.core.slam.scan_matching import Match, MatchConfig, ScanMatcher
+from thinmap_ros.core.slam.models import MotionConfig, motion_jacobians, odometry_covariance, rotation
+from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
+from thinmap_ros.core.slam.scan_matching import FEWEST_POINTS, Match, MatchConfig, ScanMatcher
 from thinmap_ros.core.topology.graph import TopologicalMap
 
 _START_SIGMAS = (1e-4, 1e-4, 1e-4)  # the map begins where the robot stands: no doubt, but not singular
@@ -26,6 +27,7 @@ _NEW_GROUND_M, _NEW_GROUND_RAD = 0.6, 0.6  # and that is so only this far from w
 _LEAP_M, _LEAP_RAD = 0.4, 0.4  # a scan puts the robot this far from where the wheels did: one of them is wrong
 _OF_LATE_M = 100.0  # way in which the drift stays below what a match with the map bridges
 _REDRAWN_AT_ONCE, _REDRAWN_A_STEP = 60, 3  # keyframes drawn anew when a loop was closed, and in each step after it
+_SAME_POINTS_M, _SAME_POINTS_RAD = 1.0, 1.0  # after so much way a match errs by other points than before
 _LOST_SIGMA_M = 1.0  # doubt since a scan last fitted; far from the start, more than this is no reason to be lost
 
 
@@ -46,8 +48,8 @@ class LocalizerConfig(MotionConfig, MatchConfig, LineConfig, FeatureConfig, Loop
     start_x_m: float = parameter(0.0, 'where the robot starts in the map, m')
     start_y_m: float = parameter(0.0, 'where the robot starts in the map, m')
     start_yaw_rad: float = parameter(0.0, 'heading at the start, rad')
-    look_distance_m: float = parameter(0.1, 'the map learns after so much way, m', low=0.0, high=5.0)
-    look_turn_rad: float = parameter(0.1, 'or after such a turn, rad', low=0.0, high=3.0)
+    look_distance_m: float = parameter(0.3, 'the map learns after so much way, m', low=0.0, high=5.0)
+    look_turn_rad: float = parameter(0.2, 'or after such a turn, rad', low=0.0, high=3.0)
     lost_scans: int = parameter(5, 'lost after so many scans in a row that do not fit', low=1, high=1000)
 
 
@@ -97,6 +99,7 @@ class Localizer:
         # Keyframes from which the map of points has still to be drawn anew.
         self._redraw: list[int] = []
         self._T_odom_base: Array | None = None
+        self._calibration = OdometryCalibration()
         self._T_last_look: Array | None = None
         # What has been added to the doubt of the pose since a scan last fitted the map.
         self._doubt = np.zeros((3, 3))
@@ -149,8 +152,11 @@ class Localizer:
         self._filter.work_off()
         self._loops.work_off()
         correction = self._loops.close()
+        if match.good:
+            self._calibration.follow(self._ekf.pose)
         if correction is not None:
             self._apply(correction)
+            self._calibration.interrupt()
         self._redraw_some(_REDRAWN_A_STEP)
         k = len(self._loops.keyframes) - 1
         pose = self._ekf.pose
@@ -204,7 +210,8 @@ class Localizer:
         if not se2.is_finite(T_odom_base) or math.hypot(increment[0], increment[1]) > _LONGEST_STEP_M:
             self.refused += 1
             increment = np.zeros(3)
-        return increment, odometry_covariance(increment, self.config)
+        increment, systematic = self._calibration.corrected(increment)
+        return increment, odometry_covariance(increment, self.config) + systematic
 
     def _seen(self, scan: Scan) -> tuple[Array, Array]:
         """Points (N, 2) that can be matched and the laser's place (2,), robot frame."""
@@ -219,13 +226,15 @@ class Localizer:
         pose = self._ekf.pose
         turn = rotation(float(pose[2]))
         predicted = se2.compose(pose, increment)
-        self._doubt = self._doubt + turn @ covariance @ turn.T
+        F, _ = motion_jacobians(pose, increment)
+        self._doubt = F @ self._doubt @ F.T + turn @ covariance @ turn.T
         match = self._matcher.match(points_base, laser_base, predicted, self._doubt)
         if match.good:
+            added = _added(self._doubt, match.covariance, increment)
             self._doubt, self._misfits = np.zeros((3, 3)), 0
-            increment, covariance = se2.between(pose, match.T_map_base), turn.T @ match.covariance @ turn
+            increment, covariance = se2.between(pose, match.T_map_base), turn.T @ added @ turn
             predicted = match.T_map_base
-        elif not self._on_new_ground(match):
+        elif len(points_base) >= FEWEST_POINTS and not self._on_new_ground(match):
             self._misfits += 1
         if match.good and (self._placed_by_hand or self.config.slam == 'off'):
             self._ekf.set_pose(match.T_map_base, match.covariance)
@@ -280,6 +289,18 @@ class Localizer:
             self._is_lost(),
             correction,
         )
+
+
+def _added(prior: Array, posterior: Array, increment: Array) -> Array:
+    """What a step that ends in a match adds to the covariance of the pose, (3, 3), map frame.
+
+    Of the error of the prior (3, 3) a match with posterior (3, 3) leaves a part, that is new with every step; what the
+    map adds is much the same error as in the step before as long as the same points are seen.
+    """
+    by_prior = np.linalg.inv(prior)
+    by_map = np.linalg.inv(posterior) - by_prior
+    share = min(1.0, math.hypot(increment[0], increment[1]) / _SAME_POINTS_M + abs(increment[2]) / _SAME_POINTS_RAD)
+    return np.asarray(posterior @ (by_prior + share * by_map) @ posterior)
 
 
 def _is_leap(expected: Array, found: Array) -> bool:

@@ -22,9 +22,11 @@ _SHIFT, _MASK = 6, TILE - 1
 _FEWEST_CELLS = 3
 DENSE_M = 0.3  # gap between neighbouring beams up to which points show more than a plane
 _MOST_WEIGHT = 4.0  # of a cell's mean, in points: walls are not flat to the millimetre
-_REACHES = (8, 4)  # cells to each side that are asked for a wall: far ones tell its direction better
-_NOISE_M = 0.01  # of a point, 1 sigma
-_THIN_M = 0.02  # a wall is no wider than this (1 sigma)
+_REACH, _NEAR = 8, 4  # cells to each side that are asked for a wall, and for clutter
+_NOISE_M = 0.01  # of a point, 1 sigma; what lies together closer than this (1 sigma) is one wall
+_THIN_M = 0.02  # what is wider than this (1 sigma) and no wall is clutter
+_BAND_M = 0.025  # what is farther from a line through a cell is no part of that cell's wall
+_DIRECTIONS = 16  # in which walls through a cell are looked for at first
 _TILT_RAD = math.radians(2.0)  # doubt of a normal (1 sigma) above which it says nothing
 _FIRM = 4.0  # points that clutter has to consist of
 
@@ -108,14 +110,12 @@ def _add(
         cell[DENSE] += dense[i]
         cell[MEAN_X] += (points[i, 0] - cell[MEAN_X]) / cell[COUNT]
         cell[MEAN_Y] += (points[i, 1] - cell[MEAN_Y]) / cell[COUNT]
+    near = np.empty(((2 * _REACH + 1) ** 2, 3))
     for i in range(points.shape[0]):
         row, col = cells[i, 0], cells[i, 1]
         if i > 0 and row == cells[i - 1, 0] and col == cells[i - 1, 1]:
             continue
-        for reach in _REACHES:
-            x, y, nx, ny, loose = _surface(pool, directory, row, col, reach, seen_from, since)
-            if loose == 0.0:
-                break
+        x, y, nx, ny, loose = _surface(pool, directory, row, col, near, seen_from, since)
         cell = pool[directory[row >> _SHIFT, col >> _SHIFT], row & _MASK, col & _MASK]
         if nx * (seen_from[0] - cell[MEAN_X]) + ny * (seen_from[1] - cell[MEAN_Y]) < 0.0:
             nx, ny = -nx, -ny
@@ -124,24 +124,24 @@ def _add(
 
 
 @kernel
-def _surface(
+def _gather(
     pool: NDArray[np.float32],
     directory: NDArray[np.int32],
     row: int,
     col: int,
-    reach: int,
+    near: Array,
     seen_from: Array,
     since: float,
-) -> tuple[float, float, float, float, float]:
-    """Centre, normal and looseness of what the means around a cell make: their directions of least and most variance.
+) -> tuple[int, float]:
+    """Write the means around a cell, seen from its own, and their weights into near (N, 3); how many, how firm.
 
     Walls seen only from their other side are left out: the two faces of a thin wall are two surfaces.
     """
     base = pool[slot_of(directory, row, col), row & _MASK, col & _MASK]
-    cells, firm, count, sx, sy, sxx, sxy, syy = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for r in range(row - reach, row + reach + 1):
+    number, firm = 0, 0.0
+    for r in range(row - _REACH, row + _REACH + 1):
         slot, last_tile = NO_TILE, -1
-        for c in range(col - reach, col + reach + 1):
+        for c in range(col - _REACH, col + _REACH + 1):
             if c >> _SHIFT != last_tile:
                 slot, last_tile = slot_of(directory, r, c), c >> _SHIFT
             if slot == NO_TILE:
@@ -151,24 +151,82 @@ def _surface(
                 continue
             away = cell[NORMAL_X] * (seen_from[0] - cell[MEAN_X]) + cell[NORMAL_Y] * (seen_from[1] - cell[MEAN_Y])
             if (r == row and c == col) or cell[LOOSE] > 0.0 or away >= 0.0:
-                dx, dy = cell[MEAN_X] - base[MEAN_X], cell[MEAN_Y] - base[MEAN_Y]
-                weight = min(cell[COUNT], _MOST_WEIGHT)
-                cells += 1
-                firm += min(cell[DENSE], _MOST_WEIGHT)
-                count += weight
-                sx += weight * dx
-                sy += weight * dy
-                sxx += weight * dx * dx
-                sxy += weight * dx * dy
-                syy += weight * dy * dy
-    if cells < _FEWEST_CELLS:
-        return 0.0, 0.0, 1.0, 0.0, UNFORMED
+                near[number, 0], near[number, 1] = cell[MEAN_X] - base[MEAN_X], cell[MEAN_Y] - base[MEAN_Y]
+                near[number, 2] = min(cell[COUNT], _MOST_WEIGHT)
+                number += 1
+                if abs(r - row) <= _NEAR and abs(c - col) <= _NEAR:
+                    firm += min(cell[DENSE], _MOST_WEIGHT)
+    return number, firm
+
+
+@kernel
+def _line(near: Array, nx: float, ny: float) -> tuple[float, float, float, float, float, float, int]:
+    """Centre, normal, variance across and weighted variance along of the means in a band with normal (nx, ny).
+
+    near (N, 3): means and weights; the band goes through their origin, and (0, 0) stands for no band. Last: how many.
+    """
+    cells, count, sx, sy, sxx, sxy, syy = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(near.shape[0]):
+        dx, dy, weight = near[k, 0], near[k, 1], near[k, 2]
+        if abs(nx * dx + ny * dy) > _BAND_M:
+            continue
+        cells += 1
+        count += weight
+        sx += weight * dx
+        sy += weight * dy
+        sxx += weight * dx * dx
+        sxy += weight * dx * dy
+        syy += weight * dy * dy
     xx, xy, yy = sxx - sx * sx / count, sxy - sx * sy / count, syy - sy * sy / count
     spread = math.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
-    small, large = 0.5 * (xx + yy) - spread, 0.5 * (xx + yy) + spread
+    across, along = max(0.5 * (xx + yy) - spread, 0.0) / count, 0.5 * (xx + yy) + spread
     angle = 0.5 * math.atan2(-2.0 * xy, yy - xx)
-    if small <= count * _THIN_M**2:
-        loose = 0.0 if max(small / count, _NOISE_M**2) <= large * _TILT_RAD**2 else UNFORMED
-    else:
-        loose = small / large if firm >= _FIRM else UNFORMED
-    return sx / count, sy / count, math.cos(angle), math.sin(angle), loose
+    return sx / count, sy / count, math.cos(angle), math.sin(angle), across, along, cells
+
+
+@kernel
+def _direction(near: Array) -> tuple[float, float]:
+    """Normal of the band through the origin in which most of the means (N, 3) lie."""
+    best, best_x, best_y = -1.0, 1.0, 0.0
+    for k in range(_DIRECTIONS):
+        nx, ny = math.cos(math.pi * k / _DIRECTIONS), math.sin(math.pi * k / _DIRECTIONS)
+        total = 0.0
+        for i in range(near.shape[0]):
+            if abs(nx * near[i, 0] + ny * near[i, 1]) <= _BAND_M:
+                total += near[i, 2]
+        if total > best:
+            best, best_x, best_y = total, nx, ny
+    return best_x, best_y
+
+
+@kernel
+def _surface(
+    pool: NDArray[np.float32],
+    directory: NDArray[np.int32],
+    row: int,
+    col: int,
+    near: Array,
+    seen_from: Array,
+    since: float,
+) -> tuple[float, float, float, float, float]:
+    """Centre, normal and looseness of what the means around a cell make; near (M, 3): room for them.
+
+    Where they do not make one wall, as beside a door or in a corner, the wall through the cell is looked for: a
+    surface fitted to both sides of a corner would pull all points that come near it aside. What belongs to no wall
+    is a point, loose in all directions.
+    """
+    number, firm = _gather(pool, directory, row, col, near, seen_from, since)
+    if number < _FEWEST_CELLS:
+        return 0.0, 0.0, 1.0, 0.0, UNFORMED
+    near = near[:number]
+    x, y, nx, ny, across, along, cells = _line(near, 0.0, 0.0)
+    width = across
+    if across > _NOISE_M**2:
+        nx, ny = _direction(near)
+        for _ in range(2):
+            x, y, nx, ny, across, along, cells = _line(near, nx, ny)
+    if cells >= _FEWEST_CELLS and max(across, _NOISE_M**2) <= along * _TILT_RAD**2:
+        return x, y, nx, ny, 0.0
+    if width <= _THIN_M**2 or firm < _FIRM:
+        return x, y, nx, ny, UNFORMED
+    return 0.0, 0.0, nx, ny, 1.0

@@ -37,7 +37,7 @@ _MASK = TILE - 1
 _ROUNDS = 20
 _WIDE_ROUNDS = 3  # rounds in which far neighbours and larger errors still count
 _LEAST_OVERLAP = 0.3  # share of the scan that has to lie where the map knows something, for a fit to be judged
-_FEWEST_POINTS = 10
+FEWEST_POINTS = 10  # in a scan, for it to be matched
 _SEARCHED_M, _SEARCHED_POINTS = 20.0, 60  # a search takes so many points of the scan, and none farther than this
 _SEARCH_STRIDE = 2  # cells from one place that is tried to the next
 _CLUTTER = 0.25  # weight of where along a surface a point lies: its nearest neighbour there is seldom the same thing
@@ -100,7 +100,7 @@ class ScanMatcher:
         the fit is poor, or with `search`, the surroundings are searched. Without points or map, the prior is given
         back, as not good.
         """
-        if len(points_base) < _FEWEST_POINTS or self.map.tiles.used == 0:
+        if len(points_base) < FEWEST_POINTS or self.map.tiles.used == 0:
             return Match(prior, covariance, 0.0, 0.0, False)
         around = gaps(points_base)
         scan = np.column_stack([points_base, np.clip(around / self.config.match_cell_m, 0.05, 1.0), around < DENSE_M])

@@ -1,0 +1,63 @@
+"""What odometry errs by all the time is learned, what it errs by once is not."""
+
+import numpy as np
+import pytest
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
+
+# A metre is told as 1.04 m and 0.03 rad too much of turn, a radian is told as 1.05, the laser sits 1.5 deg askew.
+SCALE, DRIFT, TURN_SCALE, ASKEW = 1.04, 0.03, 1.05, 0.026
+
+
+def driven(steps, seed=0, backwards=False):
+    """Poses, and increments that wheels with these errors and a little noise tell."""
+    rng, T = np.random.default_rng(seed), np.zeros(3)
+    for k in range(steps):
+        way, turn = (-0.1 if backwards else 0.1), 0.2 * np.sin(k / 7.0) * (k % 40 > 20)
+        c, s = np.cos(ASKEW + 0.5 * turn), np.sin(ASKEW + 0.5 * turn)
+        T = se2.compose(T, np.array([way * c, way * s, turn]))
+        told_turn = TURN_SCALE * turn + DRIFT * way
+        told = np.array([np.cos(0.5 * told_turn), np.sin(0.5 * told_turn)]) * SCALE * way
+        yield T, np.append(told, told_turn) + rng.normal(0.0, [5e-4, 5e-4, 5e-4])
+
+
+@pytest.mark.parametrize('backwards', [False, True])
+def test_the_systematic_part_is_learned_and_taken_off(backwards):
+    calibration, last, off = OdometryCalibration(), np.zeros(3), []
+    for T, told in driven(600, backwards=backwards):
+        found, _ = calibration.corrected(told)
+        calibration.follow(T)
+        off.append(se2.between(se2.between(last, T), found))
+        last = T
+    late = np.mean(off[300:], axis=0)
+    np.testing.assert_allclose(late, 0.0, atol=5e-4)
+    assert abs(np.mean(off[:10], axis=0)[0]) > 3e-3, 'it erred before'
+
+
+def test_what_is_left_to_know_shrinks_with_the_way():
+    calibration, left = OdometryCalibration(), []
+    for T, told in driven(300):
+        left.append(calibration.corrected(told)[1])
+        calibration.follow(T)
+    assert np.trace(left[-1]) < 0.1 * np.trace(left[0])
+    assert np.linalg.eigvalsh(left[-1]).min() > -1e-12
+
+
+def test_a_slip_is_not_learned():
+    calibration, known = OdometryCalibration(), []
+    for k, (T, told) in enumerate(driven(300)):
+        calibration.corrected(told + [0.5, 0.0, 0.4] if k == 250 else told)
+        calibration.follow(T)
+        known.append(calibration.known)
+    np.testing.assert_allclose(known[-1], known[249], atol=5e-3)
+
+
+def test_across_an_interruption_nothing_is_compared():
+    calibration = OdometryCalibration()
+    known = calibration.known
+    for k, (T, told) in enumerate(driven(100)):
+        calibration.corrected(told)
+        calibration.follow(T + [3.0 * k, 0.0, 0.0])
+        calibration.interrupt()
+    np.testing.assert_array_equal(calibration.known, known)
