@@ -54,6 +54,19 @@ def nearest_true(allowed: Mask, cell: tuple[int, int], reach: float) -> tuple[in
     return int(best[0]), int(best[1])
 
 
+@kernel
+def are_near(allowed: Mask, cells: NDArray[np.int64], reach: float) -> Mask:
+    """Whether a true cell of a mask (H, W) lies within a distance of `reach` cells, for each cell (N, 2), (N,)."""
+    whole = int(math.floor(reach))
+    near = np.zeros(cells.shape[0], dtype=np.bool_)
+    for i in range(cells.shape[0]):
+        row, col = cells[i, 0], cells[i, 1]
+        for r in range(max(row - whole, 0), min(row + whole + 1, allowed.shape[0])):
+            for c in range(max(col - whole, 0), min(col + whole + 1, allowed.shape[1])):
+                near[i] |= allowed[r, c] and (r - row) ** 2 + (c - col) ** 2 <= reach * reach
+    return near
+
+
 def disc(of: NDArray[Any], centre: tuple[int, int], reach: float) -> tuple[tuple[slice, slice], Mask]:
     """The part of an array (H, W) round a cell, and which of its cells lie within reach."""
     whole = math.ceil(reach)
