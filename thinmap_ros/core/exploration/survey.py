@@ -22,8 +22,8 @@ from thinmap_ros.core.exploration.end_node_tracker import EndNodeTracker, Track,
 from thinmap_ros.core.exploration.open_borders import OpenBorders
 from thinmap_ros.core.exploration.viewpoints import SQUARE
 from thinmap_ros.core.jit import kernel
-from thinmap_ros.core.planning.grid_search import coarse, field_from
-from thinmap_ros.core.planning.reach import are_near, places_in_reach, standing_places
+from thinmap_ros.core.planning.grid_search import coarse, field_from, fine
+from thinmap_ros.core.planning.reach import are_near, places_and_ways, standing_places
 from thinmap_ros.core.se2 import Array
 
 Cells = NDArray[np.int64]
@@ -176,10 +176,11 @@ class Surveyor:
     def _look_around(self, T_map_base: Array) -> None:
         self.frame = self.borders.frame
         radius, xy = self.config.robot_radius_m, (float(T_map_base[0]), float(T_map_base[1]))
-        self.reached = places_in_reach(self.borders.free, self.frame, xy, radius, _ESCAPE_M)
+        standing, ways = places_and_ways(self.borders.free, self.frame, xy, radius, _ESCAPE_M)
         self.maybe = standing_places(~self.borders.solid, radius, self.frame.resolution)
         row, col = (int(v) for v in self.frame.cells_of(T_map_base[None, :2])[0])
-        self.ways = field_from(coarse(self.reached, SQUARE), (row // SQUARE, col // SQUARE))
+        self.ways = field_from(coarse(ways, SQUARE), (row // SQUARE, col // SQUARE))
+        self.reached = fine(np.isfinite(self.ways), SQUARE, standing)
 
     def _owners(self, cells: Cells) -> Cells:
         """Id of the end node to which each border cell belongs, or -1.
@@ -202,13 +203,7 @@ class Surveyor:
         Such a scrap goes to whoever holds most of the stretch: it would be a target that is none at the next scan.
         """
         fewest = round(self.config.shortest_border_m / self.borders.frame.resolution)
-        owners = owners.copy()
-        for number in np.unique(numbers):
-            where = np.flatnonzero(numbers == number)
-            ids, inverse, counts = np.unique(owners[where], return_inverse=True, return_counts=True)
-            scraps = counts[inverse] < fewest
-            owners[where[scraps]] = ids[counts.argmax()]
-        return owners
+        return _without_scraps(owners, numbers, fewest)
 
     def _stand_in(self, cells: Cells, numbers: Cells, T_map_base: Array, range_m: float) -> list[Candidate]:
         """One candidate for each stretch of border left over that can be looked at from somewhere."""
@@ -288,6 +283,24 @@ def end_node_of(track: Track, candidate: Candidate | None, target_goal: Array | 
         is_target=target_goal is not None,
         goal=goal if target_goal is None else target_goal,
     )
+
+
+@kernel
+def _without_scraps(owners: Cells, numbers: Cells, fewest: int) -> Cells:
+    """Owners (N,) of cells, such that in each part (numbers, (N,), from 0 on) none but the largest holds too few.
+
+    Of equally large ones that with the lowest id counts as the largest.
+    """
+    result = owners.copy()
+    ids = np.unique(owners)
+    counts = np.zeros((numbers.max() + 1 if numbers.size else 0, ids.size), dtype=np.int64)
+    places = np.searchsorted(ids, owners)
+    for i in range(owners.size):
+        counts[numbers[i], places[i]] += 1
+    for i in range(owners.size):
+        if counts[numbers[i], places[i]] < fewest:
+            result[i] = ids[counts[numbers[i]].argmax()]
+    return result
 
 
 @kernel

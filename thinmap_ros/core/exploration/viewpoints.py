@@ -18,7 +18,8 @@ from thinmap_ros.core.se2 import Array
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.int64]
 Cell = tuple[int, int]
-SQUARE = 2
+# Not more: across a wall one cell thick places where a robot can stand are six cells apart, and stay apart in squares.
+SQUARE = 3
 _POINTS, _SHARE = 8, 0.7
 _SLACK, _STRIDE = 5, 4
 

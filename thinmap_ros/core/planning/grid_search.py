@@ -41,6 +41,18 @@ def coarse(allowed: Mask, factor: int) -> Mask:
     return np.asarray(_coarse(allowed, factor, 0, 0))
 
 
+@kernel
+def fine(squares: Mask, factor: int, cells: Mask) -> Mask:
+    """Those cells of a mask (H, W) that lie in a true square of factor x factor cells."""
+    result = np.zeros(cells.shape, dtype=np.bool_)
+    for row in range(cells.shape[0]):
+        for square in range(squares.shape[1]):
+            if squares[row // factor, square]:
+                first, last = square * factor, min((square + 1) * factor, cells.shape[1])
+                result[row, first:last] = cells[row, first:last]
+    return result
+
+
 class WayTable:
     """Ways between places of a map that grows, on a coarse grid, remembered for a while: most places stay.
 

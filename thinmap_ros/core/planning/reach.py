@@ -19,21 +19,30 @@ def standing_places(free: Mask, radius_m: float, resolution: float) -> Mask:
 
 
 def places_in_reach(free: Mask, frame: GridFrame, xy: tuple[float, float], radius_m: float, escape_m: float) -> Mask:
-    """Standing places (H, W) to which a robot of a radius can get from a point (m).
+    """Standing places (H, W) to which a robot of a radius can get from a point (m); see `places_and_ways`."""
+    standing, ways = places_and_ways(free, frame, xy, radius_m, escape_m)
+    row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
+    inside = 0 <= row < free.shape[0] and 0 <= col < free.shape[1]
+    return reached_from(ways, (row, col)) & standing if inside else np.zeros_like(standing)
 
-    Where it stands too near to something it is let out over free cells up to escape_m away, as a path would.
+
+def places_and_ways(
+    free: Mask, frame: GridFrame, xy: tuple[float, float], radius_m: float, escape_m: float
+) -> tuple[Mask, Mask]:
+    """Standing places (H, W) of a robot of a radius, and the cells over which one that is at a point (m) may go.
+
+    These are the same, but where it stands too near to something it is let out over free cells up to escape_m away, as
+    a path would.
     """
     standing = standing_places(free, radius_m, frame.resolution)
     row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
-    if not (0 <= row < free.shape[0] and 0 <= col < free.shape[1]):
-        return np.zeros_like(standing)
-    ways = standing
-    if not standing[row, col]:
-        ways = standing.copy()
-        part, within = disc(ways, (row, col), escape_m / frame.resolution)
-        ways[part] |= within & free[part]
-        ways[row, col] = True
-    return reached_from(ways, (row, col)) & standing
+    if not (0 <= row < free.shape[0] and 0 <= col < free.shape[1]) or standing[row, col]:
+        return standing, standing
+    ways = standing.copy()
+    part, within = disc(ways, (row, col), escape_m / frame.resolution)
+    ways[part] |= within & free[part]
+    ways[row, col] = True
+    return standing, ways
 
 
 def reached_from(allowed: Mask, start: tuple[int, int]) -> Mask:
