@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from benchmarks import graphs, localization, mapping, nodes, online, planning, slam, thinning
+from benchmarks import exploration, graphs, localization, mapping, nodes, online, planning, slam, thinning
 from benchmarks.table import Row, show
 from benchmarks.worlds import WORLDS
 
@@ -16,6 +16,7 @@ _ALL: dict[str, Callable[[Path, bool], Iterable[Row]]] = {
     'nodes': nodes.run,
     'localization': localization.run,
     'planning': planning.run,
+    'exploration': exploration.run,
     'slam': slam.run,
 }
 

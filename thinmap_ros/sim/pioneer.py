@@ -73,7 +73,8 @@ class Pioneer:
         self.v = _towards(self.v, v, self.config.max_speed_m_s, self.config.max_acceleration_m_s2 * dt_s)
         self.w = _towards(self.w, w, self.config.max_turn_rad_s, self.config.max_turn_acceleration_rad_s2 * dt_s)
         moved = se2.compose(self.T_world_base, arc(self.v * dt_s, self.w * dt_s))
-        clear = self.world.is_clear(moved[0], moved[1], self.config.radius_m)
+        x, y, _ = moved.tolist()
+        clear = self.world.is_clear(x, y, self.config.radius_m)
         if not clear and self.v != 0.0:
             self.collisions += not self.touching
             self.v = 0.0
@@ -88,7 +89,7 @@ class Pioneer:
     def _measured(self, distance: float, turn: float) -> Array:
         """Return the motion, (3,), as the wheels count it."""
         metres, radians = abs(distance), abs(turn)
-        noise = self._rng.normal(size=2)
+        noise = self._rng.normal(size=2).tolist()
         seen_distance = distance * self._scale + noise[0] * self.config.distance_noise * math.sqrt(metres)
         sigma = self.config.turn_noise * math.sqrt(radians) + self.config.turn_noise_driving * math.sqrt(metres)
         seen_turn = turn * self._turn_scale + self._drift_rad_m * metres + noise[1] * sigma

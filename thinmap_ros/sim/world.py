@@ -39,15 +39,16 @@ class World:
         """Whether a disc whose centre lies within the world touches no solid cell; exact."""
         if not (math.isfinite(x) and math.isfinite(y)):
             return False
-        row, col = self.frame.cells_of(np.array([[x, y]]))[0]
-        rows, cols = self.occupied.shape
+        frame, (rows, cols) = self.frame, self.occupied.shape
+        row = math.floor((y - frame.origin_y) / frame.resolution)
+        col = math.floor((x - frame.origin_x) / frame.resolution)
         if not (0 <= row < rows and 0 <= col < cols):
             return False
         # The point lies up to 0.71 cells off the centre, and the distance there is up to 0.2 cells too long.
-        spare = (self.wall_distance_m[row, col] - radius_m) / self.frame.resolution
+        spare = (float(self.wall_distance_m[row, col]) - radius_m) / frame.resolution
         if abs(spare) > 1.0:
-            return bool(spare > 0.0)
-        return self._squared_gap(x, y, int(row), int(col), radius_m) > radius_m**2
+            return spare > 0.0
+        return self._squared_gap(x, y, row, col, radius_m) > radius_m**2
 
     def _squared_gap(self, x: float, y: float, row: int, col: int, reach_m: float) -> float:
         """Squared distance, m^2, from a point to the nearest solid cell within reach; inf where there is none."""

@@ -149,6 +149,6 @@ def test_a_closed_border_settles_a_node_and_an_opened_one_is_as_doubtful_as_at_f
 @pytest.mark.parametrize('increment_deg', [1.0, -1.0])
 def test_field_of_view_ends_at_the_outer_beams(increment_deg):
     laser = scan(increment_deg=increment_deg)
-    seen = [in_field_of_view(laser, np.array([0.0, 0.0, 0.3]), math.cos(a), math.sin(a))
-            for a in 0.3 + np.radians([0.0, 89.0, -89.0, 95.0, -95.0, 180.0])]
-    assert seen == [True, True, True, False, False, False]
+    angles = 0.3 + np.radians([0.0, 89.0, -89.0, 95.0, -95.0, 180.0])
+    seen = in_field_of_view(laser, np.array([0.0, 0.0, 0.3]), np.column_stack([np.cos(angles), np.sin(angles)]))
+    assert seen.tolist() == [True, True, True, False, False, False]

@@ -1,6 +1,7 @@
 """The explorer in small worlds: it sees all, stops by itself, says why, and does not waver."""
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -12,7 +13,10 @@ from thinmap_ros.core.exploration.decision import FIRST_STAND_IN_ID, Decision, F
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
+from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.core.topology.update import TopologyBuilder
 from thinmap_ros.sim.coverage import coverable
 from thinmap_ros.sim.lms200 import Lms200Config
@@ -134,6 +138,28 @@ def test_it_decides_the_same_every_time():
     again = Run(two_rooms()).go()
     assert len(again.decisions) == len(finished_run().decisions)
     assert np.array_equal(np.array(again.poses), np.array(finished_run().poses))
+
+
+def comb(doors=45):
+    """A corridor from which many openings lead into the unknown."""
+    cells = np.full((60, 30 + 20 * doors), -1, dtype=np.int8)
+    cells[[9, 50], :], cells[10:50, :] = 100, 0
+    cells[10:50, [0, -1]] = 100
+    for door in range(doors):
+        cells[50, 20 + 20 * door : 30 + 20 * door] = 0
+    return GridPatch(GridFrame(0.0, 0.0, 0.1), cells)
+
+
+def test_of_many_places_the_target_is_a_near_one_and_stays():
+    explorer, scan = Explorer(), Scan.create(0, np.full(181, np.inf), -math.pi / 2, math.pi / 180, 0.02, 8.0)
+    goals = []
+    for k in range(12):
+        pose = np.array([50.0 + 0.1 * k, 2.0, math.pi / 2])
+        decision = explorer.step(TopologicalMap(), comb(), replace(scan, stamp_ns=k * 400_000_000), pose)
+        goals.append(decision.target.goal[:2])
+    assert sum(node.open_border_m > 0.0 for node in decision.end_nodes) == 45
+    assert math.dist(goals[0], (50.0, 2.0)) < 4.0
+    assert max(math.dist(goal, goals[0]) for goal in goals) < 0.5
 
 
 @pytest.mark.parametrize('theta', [0.0, 1.5])

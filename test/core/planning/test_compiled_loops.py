@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.open_borders import _parts
+from thinmap_ros.core.exploration.survey import _without_scraps
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.follower import _point_ahead, length_from, nearest_point
-from thinmap_ros.core.planning.navigator import _clear_steps, _touches
-from thinmap_ros.core.planning.reach import reached_from
+from thinmap_ros.core.planning.grid_search import coarse, fine
+from thinmap_ros.core.planning.navigator import _arc, _clear_steps, _touches
+from thinmap_ros.core.planning.reach import are_near, reached_from
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, cost_of_cells
 
 SEEDS = range(20)
@@ -92,3 +95,49 @@ def test_what_is_joined(seed):
     start = tuple(int(v) for v in np.argwhere(room)[0])
     assert (reached_from(room, start) == (parts == parts[start])).all()
     assert not reached_from(room, tuple(int(v) for v in cells[0])).any()
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_squares_of_cells_and_back(seed):
+    rng = np.random.default_rng(seed)
+    cells, factor = rng.random((31, 44)) < 0.1, int(rng.integers(1, 5))
+    padded = np.pad(cells, [(0, -size % factor) for size in cells.shape])
+    shape = (padded.shape[0] // factor, factor, padded.shape[1] // factor, factor)
+    expected = padded.reshape(shape).any(axis=(1, 3))
+    assert (coarse(cells, factor) == expected).all()
+    chosen = rng.random(expected.shape) < 0.5
+    spread = np.repeat(np.repeat(chosen, factor, axis=0), factor, axis=1)[: cells.shape[0], : cells.shape[1]]
+    assert (fine(chosen, factor, cells) == (cells & spread)).all()
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_which_cells_are_near_a_true_one(seed):
+    rng = np.random.default_rng(seed)
+    mask, cells, reach = rng.random((30, 40)) < 0.01, rng.integers(-3, 44, (20, 2)), rng.uniform(0.0, 6.0)
+    places = np.argwhere(mask)
+    expected = [(np.square(places - cell).sum(axis=1) <= reach * reach).any() for cell in cells]
+    assert (are_near(mask, cells, reach) == expected).all()
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_owners_without_scraps(seed):
+    rng = np.random.default_rng(seed)
+    owners, numbers = rng.integers(-1, 4, 60), np.sort(rng.integers(0, 5, 60))
+    expected = owners.copy()
+    for number in np.unique(numbers):
+        ids, inverse, counts = np.unique(owners[numbers == number], return_inverse=True, return_counts=True)
+        expected[numbers == number] = np.where(counts[inverse] < 4, ids[counts.argmax()], owners[numbers == number])
+    assert (_without_scraps(owners, numbers, 4) == expected).all()
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_an_arc(seed):
+    start, curvature, length = np.random.default_rng(seed).normal(size=(3, 3))[0], 0.7 * seed - 5.0, 1.3
+    pose, count = start, 2600
+    for _ in range(count):
+        pose = se2.compose(pose, se2.pose(length / count, 0.0, curvature * length / count))
+    points = _arc(start, curvature, length, 13)
+    assert points[0] == pytest.approx(start[:2])
+    assert points[-1] == pytest.approx(pose[:2], abs=2e-3)
+    steps = np.hypot(*np.diff(points, axis=0).T)
+    assert steps == pytest.approx(np.full(13, steps[0]))

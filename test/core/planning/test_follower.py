@@ -82,3 +82,20 @@ def test_turning_to_a_heading_ends_there():
 def test_a_path_of_one_point():
     v, w = Follower(FollowerConfig()).command(np.zeros(3), np.array([[0.0, 0.0]]), DT)
     assert (v, w) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize('how', ['stop', 'turn'])
+def test_it_comes_to_rest_on_the_arc_that_it_drives_before_it_turns(how):
+    follower = Follower(FollowerConfig(max_speed_m_s=0.5))
+    follower.slowed(0.5, 0.6)
+    turned = False
+    for _ in range(40):
+        before = follower.v
+        v, w = follower.stop(DT) if how == 'stop' else follower.turn_to(np.zeros(3), -2.0, DT)
+        assert v <= max(before - 0.04, 0.0) + 1e-9
+        if v > 0.1:
+            assert w / v == pytest.approx(1.2)
+        turned |= w < 0.0
+        assert not (turned and v > 0.0)
+    assert follower.v == 0.0
+    assert turned == (how == 'turn')

@@ -15,6 +15,7 @@ What the paper leaves open, and how it is settled here:
   In mode `paper` the looks are all there is.
 """
 
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -35,9 +36,11 @@ from thinmap_ros.core.exploration.position_probability import (
 )
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.raytrace import line_is_clear
+from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
+Cells = NDArray[np.int64]
 PRIOR = 0.5
 _NEUTRAL = 0.5
 
@@ -130,8 +133,9 @@ class EndNodeTracker:
         (used in mode open_border only).
         """
         T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
-        for track in self.tracks.values():
-            if self._sees(scan, T_map_laser, track, free, frame) and self._is_news(track, T_map_laser):
+        tracks = list(self.tracks.values())
+        for track in itertools.compress(tracks, self._in_sight(scan, T_map_laser, tracks, free, frame)):
+            if self._is_news(track, T_map_laser):
                 self._count(track, T_map_laser, track.node_id in open_ids)
         if self.config.mode == 'open_border':
             for track in self.tracks.values():
@@ -172,14 +176,16 @@ class EndNodeTracker:
             return None
         return lost.pop(near.node_id)
 
-    def _sees(
-        self, scan: Scan, T_map_laser: Array, track: Track, free: NDArray[np.bool_], frame: GridFrame
-    ) -> bool:
-        dx, dy = track.x - T_map_laser[0], track.y - T_map_laser[1]
-        if math.hypot(dx, dy) >= scan.range_max_m or not in_field_of_view(scan, T_map_laser, dx, dy):
-            return False
-        cells = frame.cells_of(np.array([T_map_laser[:2], [track.x, track.y]]))
-        return bool(line_is_clear(free, *(int(v) for v in cells.ravel())))
+    @staticmethod
+    def _in_sight(
+        scan: Scan, T_map_laser: Array, tracks: list[Track], free: NDArray[np.bool_], frame: GridFrame
+    ) -> NDArray[np.bool_]:
+        """Which nodes (N) lie in the laser's range and field of view, with free cells all the way."""
+        places = np.array([(track.x, track.y) for track in tracks]).reshape(-1, 2)
+        cells = frame.cells_of(np.vstack([T_map_laser[None, :2], places]))
+        near = np.square(places - T_map_laser[:2]).sum(axis=1) < scan.range_max_m**2
+        asked = near & in_field_of_view(scan, T_map_laser, places)
+        return np.asarray(_lines_are_clear(free, cells[0], cells[1:], asked))
 
     def _is_news(self, track: Track, T_map_laser: Array) -> bool:
         if track.last_seen_from is None:
@@ -210,13 +216,22 @@ class EndNodeTracker:
         track.closed = not is_open
 
 
-def in_field_of_view(scan: Scan, T_map_laser: Array, dx: float, dy: float) -> bool:
-    """Whether the direction (dx, dy) in the map frame lies between the first and the last beam of a scan."""
+def in_field_of_view(scan: Scan, T_map_laser: Array, points: Array) -> NDArray[np.bool_]:
+    """Which points (N, 2), m, map frame, lie between the first and the last beam of a scan, (N,)."""
     last = scan.angle_min_rad + scan.angle_increment_rad * (scan.ranges_m.size - 1)
-    low, high = min(scan.angle_min_rad, last), max(scan.angle_min_rad, last)
-    middle, half = 0.5 * (low + high), 0.5 * (high - low)
-    off = se2.wrap(math.atan2(dy, dx) - float(T_map_laser[2]) - middle)
-    return abs(off) <= half + abs(scan.angle_increment_rad)
+    middle, half = 0.5 * (scan.angle_min_rad + last), 0.5 * abs(last - scan.angle_min_rad)
+    dx, dy = (points - T_map_laser[:2]).T
+    off = se2.wrap(np.arctan2(dy, dx) - (T_map_laser[2] + middle))
+    return np.asarray(np.abs(off) <= half + abs(scan.angle_increment_rad))
+
+
+@kernel
+def _lines_are_clear(free: NDArray[np.bool_], start: Cells, ends: Cells, asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """For which cells (N, 2), of those asked about (N,), all cells on the line from the start (2,) are free, (N,)."""
+    clear = np.zeros(ends.shape[0], dtype=np.bool_)
+    for i in range(ends.shape[0]):
+        clear[i] = asked[i] and line_is_clear(free, start[0], start[1], ends[i, 0], ends[i, 1])
+    return clear
 
 
 def _bearing(track: Track, T_map_laser: Array) -> float:

@@ -39,8 +39,10 @@ _SUCCESSOR_M = 1.5
 _NEAR_VISIT_M = 0.3
 _NEAR_HEADING_RAD = 0.35
 _STEADY_RAD = 0.6
-_COARSE_M, _FORGET_S, _UNKNOWN_WEIGHT = 0.2, 20.0, 2
+_COARSE_M, _FORGET_S, _UNKNOWN_WEIGHT = 0.3, 20.0, 2
 _FIRST_GRAPH_S = 5.0
+# Through more places no tour is planned at a time: its cost grows with their number's fourth power.
+_MOST_PLACES = 20
 _LOOKS = 3
 
 
@@ -238,19 +240,24 @@ class Explorer:
     def _tours(
         self, worth: dict[int, Candidate], turn_cost: dict[int, float], T_map_base: Array
     ) -> dict[int, float]:
-        """Cost of the tour through all that is left, m, by what comes first.
+        """Cost of the tour through what is left, m, by what comes first; of much, through the target and what is near.
 
         From one to the next the way may lead through the unknown, if nothing is known to stand there: whoever goes into
         it here may well come out there, and what would then be left behind is better done now.
         """
-        ids, surveyor = list(worth), self.surveyor
+        surveyor = self.surveyor
+        goals = np.array([candidate.goal[:2] for candidate in worth.values()])
+        away = np.hypot(*(goals - T_map_base[:2]).T)
+        ways = np.array([surveyor.way_m(candidate.goal) for candidate in worth.values()])
+        ways = np.maximum(np.where(np.isfinite(ways), ways, _DETOUR * away), away)
+        # A stable sort, so that of equally near ones the older stays.
+        near = dict(sorted(zip(worth, ways, strict=True), key=lambda pair: (pair[0] != self._memory.target, pair[1])))
+        ids = list(near)[:_MOST_PLACES]
         points = np.array([worth[i].goal[:2] for i in ids])
         straight = np.hypot(*(points[:, None] - points[None]).transpose(2, 0, 1))
         table = self._ways.update(surveyor.reached, surveyor.maybe, surveyor.frame, points, self._stamp_ns)
         between = np.maximum(np.where(np.isfinite(table), table, _DETOUR * straight), straight)
-        away = np.hypot(*(points - T_map_base[:2]).T)
-        ways = np.array([surveyor.way_m(worth[i].goal) for i in ids])
-        first = np.maximum(np.where(np.isfinite(ways), ways, _DETOUR * away), away) + [turn_cost[i] for i in ids]
+        first = np.array([near[i] + turn_cost[i] for i in ids])
         lengths = np.array([len(worth[i].cells) * surveyor.frame.resolution for i in ids])
         small = lengths < self.config.small_border_m
         weights = np.where(small, self.config.small_wait_weight, self.config.wait_weight)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.viewpoints import place_at, place_for
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.patch import FREE_AT_MOST, OCCUPIED_AT_LEAST, GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.scan import Scan
@@ -25,11 +25,13 @@ from thinmap_ros.core.topology.free_space import known_free, true_cells
 
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.int64]
+_TOPOLOGY = TopologyConfig()
 _LOOKS = 3
 _SPARE = 64
 _WHOLE_EVERY = 100
 _PART_M = 1.0
 _RIM_M = 0.5
+_MARGIN = 3
 
 
 class OpenBorders:
@@ -73,19 +75,15 @@ class OpenBorders:
         self._updates += 1
         row, col = self._fit(patch)
         rows, cols = (slice(0, size) for size in patch.shape) if whole else _part(patch, box)
-        # Two cells more are read than written, so that the cut is no border.
-        wide = (slice(max(rows.start - 3, 0), rows.stop + 3), slice(max(cols.start - 3, 0), cols.stop + 3))
+        # A few cells more are read than written, so that the cut is no border.
+        wide = (slice(max(rows.start - _MARGIN, 0), rows.stop + _MARGIN),
+                slice(max(cols.start - _MARGIN, 0), cols.stop + _MARGIN))
         part = GridPatch(patch.frame, np.ascontiguousarray(patch.cells[wide]))
-        free = known_free(part, TopologyConfig())
-        border = _borders(free, part.unknown & ~free)
-        top, left = rows.start - wide[0].start, cols.start - wide[1].start
-        inner = (slice(top, top + rows.stop - rows.start), slice(left, left + cols.stop - cols.start))
-        rows, cols = slice(rows.start + row, rows.stop + row), slice(cols.start + col, cols.stop + col)
-        border = border[inner] & (self._looks[rows, cols] < _LOOKS)
-        same = np.array_equal(self.free[rows, cols], free[inner]) and np.array_equal(self.mask[rows, cols], border)
-        self.revision += not same
-        self.free[rows, cols], self.mask[rows, cols] = free[inner], border
-        self.solid[rows, cols] = part.occupied[inner]
+        inner = (rows.start - wide[0].start, rows.stop - wide[0].start,
+                 cols.start - wide[1].start, cols.stop - wide[1].start)
+        offset = (wide[0].start + row, wide[1].start + col)
+        free = known_free(part, _TOPOLOGY)
+        self.revision += _renew(part.cells, free, inner, offset, self.free, self.solid, self.mask, self._looks)
 
     def examine(self, xy: tuple[float, float], reach_m: float, faces: NDArray[np.float64]) -> None:
         """Count a close look from a point, m: border cells whose unknown neighbour lies in plain sight, yet unknown.
@@ -189,11 +187,39 @@ def _part(patch: GridPatch, box: Array) -> tuple[slice, slice]:
     return slice(top, max(min(bottom + 1, rows), top)), slice(left, max(min(right + 1, cols), left))
 
 
-def _borders(free: Mask, unknown: Mask) -> Mask:
-    """Free cells with an unknown one above, below, left or right; what lies outside the array is unknown."""
-    beyond = np.pad(unknown, 1, constant_values=True)
-    beside = beyond[:-2, 1:-1] | beyond[2:, 1:-1] | beyond[1:-1, :-2] | beyond[1:-1, 2:]
-    return np.asarray(free & beside)
+@kernel
+def _renew(
+    cells: NDArray[np.int8],
+    known: Mask,
+    inner: tuple[int, int, int, int],
+    offset: tuple[int, int],
+    free: Mask,
+    solid: Mask,
+    mask: Mask,
+    looks: NDArray[np.uint8],
+) -> bool:
+    """Take over a part of a map (H, W) and find its borders; returns whether what is free or border has changed.
+
+    known (H, W): which cells are free; inner: first row, row after the last, and the same of columns, of what is
+    written to free, solid, mask and looks, in which the part begins at row and column `offset`. A border is a free cell
+    with an unknown one above, below, left or right; what lies outside of the part is unknown.
+    """
+    rows, cols = cells.shape
+    changed = False
+    for row in range(inner[0], inner[1]):
+        for col in range(inner[2], inner[3]):
+            r, c = row + offset[0], col + offset[1]
+            border = False
+            if known[row, col] and looks[r, c] < _LOOKS:
+                for side in range(4):
+                    y, x = row + (side == 0) - (side == 1), col + (side == 2) - (side == 3)
+                    if not (0 <= y < rows and 0 <= x < cols):
+                        border = True
+                    elif not known[y, x]:
+                        border |= cells[y, x] < 0 or FREE_AT_MOST < cells[y, x] < OCCUPIED_AT_LEAST
+            changed |= known[row, col] != free[r, c] or border != mask[r, c]
+            free[r, c], mask[r, c], solid[r, c] = known[row, col], border, cells[row, col] >= OCCUPIED_AT_LEAST
+    return changed
 
 
 @kernel

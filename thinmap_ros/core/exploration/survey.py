@@ -21,8 +21,9 @@ from thinmap_ros.core.exploration.decision import FIRST_STAND_IN_ID, EndNode
 from thinmap_ros.core.exploration.end_node_tracker import EndNodeTracker, Track, TrackerConfig
 from thinmap_ros.core.exploration.open_borders import OpenBorders
 from thinmap_ros.core.exploration.viewpoints import SQUARE
-from thinmap_ros.core.planning.grid_search import coarse, field_from
-from thinmap_ros.core.planning.reach import nearest_true, places_in_reach, standing_places
+from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.planning.grid_search import coarse, field_from, fine
+from thinmap_ros.core.planning.reach import are_near, places_and_ways, standing_places
 from thinmap_ros.core.se2 import Array
 
 Cells = NDArray[np.int64]
@@ -175,10 +176,11 @@ class Surveyor:
     def _look_around(self, T_map_base: Array) -> None:
         self.frame = self.borders.frame
         radius, xy = self.config.robot_radius_m, (float(T_map_base[0]), float(T_map_base[1]))
-        self.reached = places_in_reach(self.borders.free, self.frame, xy, radius, _ESCAPE_M)
+        standing, ways = places_and_ways(self.borders.free, self.frame, xy, radius, _ESCAPE_M)
         self.maybe = standing_places(~self.borders.solid, radius, self.frame.resolution)
         row, col = (int(v) for v in self.frame.cells_of(T_map_base[None, :2])[0])
-        self.ways = field_from(coarse(self.reached, SQUARE), (row // SQUARE, col // SQUARE))
+        self.ways = field_from(coarse(ways, SQUARE), (row // SQUARE, col // SQUARE))
+        self.reached = fine(np.isfinite(self.ways), SQUARE, standing)
 
     def _owners(self, cells: Cells) -> Cells:
         """Id of the end node to which each border cell belongs, or -1.
@@ -186,18 +188,14 @@ class Surveyor:
         Not one that was visited in vain, nor one to which the robot cannot get: the graph remembers a passage that the
         map, as it is now, no longer shows.
         """
-        ids = np.array([i for i in self.tracker.tracks if self._can_own(i)], dtype=np.int64)
+        ids = np.array([i for i in self.tracker.tracks if i not in self._memory.visited], dtype=np.int64)
         if ids.size == 0 or len(cells) == 0:
             return np.full(len(cells), -1, dtype=np.int64)
-        places = np.array([_place(self.tracker.tracks[int(i)]) for i in ids])
-        index = self.borders.owners(cells, self.frame.cells_of(places), self.config.attach_m)
-        return np.where(index < 0, -1, ids[index])
-
-    def _can_own(self, node_id: int) -> bool:
-        if node_id in self._memory.visited:
-            return False
-        row, col = (int(v) for v in self.frame.cells_of(np.array([_place(self.tracker.tracks[node_id])]))[0])
-        return nearest_true(self.reached, (row, col), _NEAR_VISIT_M / self.frame.resolution) is not None
+        nodes = self.frame.cells_of(np.array([_place(self.tracker.tracks[int(i)]) for i in ids]))
+        within = are_near(self.reached, nodes, _NEAR_VISIT_M / self.frame.resolution)
+        ids, nodes = ids[within], nodes[within]
+        index = self.borders.owners(cells, nodes, self.config.attach_m)
+        return np.where(index < 0, -1, ids[index]) if ids.size else index
 
     def _without_scraps(self, owners: Cells, numbers: Cells) -> Cells:
         """Owners (N,) of border cells, such that no owner holds less of a stretch than would count as a border.
@@ -205,13 +203,7 @@ class Surveyor:
         Such a scrap goes to whoever holds most of the stretch: it would be a target that is none at the next scan.
         """
         fewest = round(self.config.shortest_border_m / self.borders.frame.resolution)
-        owners = owners.copy()
-        for number in np.unique(numbers):
-            where = np.flatnonzero(numbers == number)
-            ids, inverse, counts = np.unique(owners[where], return_inverse=True, return_counts=True)
-            scraps = counts[inverse] < fewest
-            owners[where[scraps]] = ids[counts.argmax()]
-        return owners
+        return _without_scraps(owners, numbers, fewest)
 
     def _stand_in(self, cells: Cells, numbers: Cells, T_map_base: Array, range_m: float) -> list[Candidate]:
         """One candidate for each stretch of border left over that can be looked at from somewhere."""
@@ -270,9 +262,9 @@ class Surveyor:
 
     def _middle(self, stretch: Cells) -> Place:
         """The cell of a stretch nearest to its centre of gravity, in m."""
-        cell = stretch[np.square(stretch - stretch.mean(axis=0)).sum(axis=1).argmin()]
-        x, y = self.borders.frame.centres_of(cell[None])[0]
-        return float(x), float(y)
+        row, col = stretch[_middle_one(stretch)].tolist()
+        frame = self.borders.frame
+        return (col + 0.5) * frame.resolution + frame.origin_x, (row + 0.5) * frame.resolution + frame.origin_y
 
 
 def end_node_of(track: Track, candidate: Candidate | None, target_goal: Array | None, resolution: float) -> EndNode:
@@ -291,6 +283,39 @@ def end_node_of(track: Track, candidate: Candidate | None, target_goal: Array | 
         is_target=target_goal is not None,
         goal=goal if target_goal is None else target_goal,
     )
+
+
+@kernel
+def _without_scraps(owners: Cells, numbers: Cells, fewest: int) -> Cells:
+    """Owners (N,) of cells, such that in each part (numbers, (N,), from 0 on) none but the largest holds too few.
+
+    Of equally large ones that with the lowest id counts as the largest.
+    """
+    result = owners.copy()
+    ids = np.unique(owners)
+    counts = np.zeros((numbers.max() + 1 if numbers.size else 0, ids.size), dtype=np.int64)
+    places = np.searchsorted(ids, owners)
+    for i in range(owners.size):
+        counts[numbers[i], places[i]] += 1
+    for i in range(owners.size):
+        if counts[numbers[i], places[i]] < fewest:
+            result[i] = ids[counts[numbers[i]].argmax()]
+    return result
+
+
+@kernel
+def _middle_one(cells: Cells) -> int:
+    """Index of the cell (N, 2) nearest to the centre of gravity of all; the first of equally near ones."""
+    row, col = 0.0, 0.0
+    for i in range(cells.shape[0]):
+        row, col = row + cells[i, 0], col + cells[i, 1]
+    row, col = row / cells.shape[0], col / cells.shape[0]
+    best, middle = np.inf, 0
+    for i in range(cells.shape[0]):
+        away = (cells[i, 0] - row) ** 2 + (cells[i, 1] - col) ** 2
+        if away < best:
+            best, middle = away, i
+    return middle
 
 
 def _place(track: Track) -> Place:

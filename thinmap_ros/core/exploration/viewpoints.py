@@ -12,15 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.raytrace import line_is_clear
-from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.se2 import Array
 
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.int64]
 Cell = tuple[int, int]
-SQUARE = 2
+# Not more: across a wall one cell thick places where a robot can stand are six cells apart, and stay apart in squares.
+SQUARE = 3
 _POINTS, _SHARE = 8, 0.7
-_SLACK = 5
+_SLACK, _STRIDE = 5, 4
 
 
 def place_for(
@@ -86,21 +87,29 @@ def _view_place(
     low_r, high_r = points[:, 0].min() - reach, points[:, 0].max() + reach
     low_c, high_c = points[:, 1].min() - reach, points[:, 1].max() + reach
     best, best_row, best_col = np.inf, -1, -1
-    for r in range(max(int(low_r) // factor, 0), min(int(high_r) // factor + 1, ways.shape[0])):
-        for c in range(max(int(low_c) // factor, 0), min(int(high_c) // factor + 1, ways.shape[1])):
-            row, col = r * factor + factor // 2, c * factor + factor // 2
-            if ways[r, c] >= best or row >= rows or col >= cols or not allowed[row, col]:
-                continue
-            seen = 0
-            for i in range(points.shape[0]):
-                if seen + points.shape[0] - i < need:
-                    break
-                away = math.hypot(points[i, 0] - row, points[i, 1] - col)
-                if away < reach and line_is_clear(passable, row, col, points[i, 0], points[i, 1]):
-                    seen += 1
-            if seen >= need:
-                best, best_row, best_col = ways[r, c], row, col
+    # First a few squares here and there: with a good place in hand most others need no look.
+    for stride in (_STRIDE, 1):
+        for r in range(max(int(low_r) // factor, 0), min(int(high_r) // factor + 1, ways.shape[0]), stride):
+            for c in range(max(int(low_c) // factor, 0), min(int(high_c) // factor + 1, ways.shape[1]), stride):
+                row, col = r * factor + factor // 2, c * factor + factor // 2
+                if ways[r, c] >= best or row >= rows or col >= cols or not allowed[row, col]:
+                    continue
+                if _sees_enough(passable, row, col, points, reach, need):
+                    best, best_row, best_col = ways[r, c], row, col
     return best_row, best_col
+
+
+@inlined
+def _sees_enough(passable: Mask, row: int, col: int, points: Cells, reach: float, need: int) -> bool:
+    """Whether so many of the points (N, 2) are in sight of a cell."""
+    seen = 0
+    for i in range(points.shape[0]):
+        if seen + points.shape[0] - i < need:
+            break
+        away = math.hypot(points[i, 0] - row, points[i, 1] - col)
+        if away < reach and line_is_clear(passable, row, col, points[i, 0], points[i, 1]):
+            seen += 1
+    return seen >= need
 
 
 @kernel

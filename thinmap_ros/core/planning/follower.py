@@ -57,13 +57,19 @@ class Follower:
         return self._limited(v, v * curvature, dt_s)
 
     def turn_to(self, T_map_base: Array, heading_rad: float, dt_s: float) -> tuple[float, float]:
-        """Speed and turn rate for the next dt_s that stop the robot and turn it to a heading in the map frame."""
+        """Speed and turn rate for the next dt_s that stop the robot and then turn it to a heading in the map frame."""
+        if self.v > 0.0:
+            return self.stop(dt_s)
         error = wrap(heading_rad - float(T_map_base[2]))
         return self._limited(0.0, self._turn_for(error, dt_s), dt_s)
 
     def stop(self, dt_s: float) -> tuple[float, float]:
-        """Speed and turn rate for the next dt_s that come to rest within the limits."""
-        return self._limited(0.0, 0.0, dt_s)
+        """Speed and turn rate for the next dt_s that come to rest within the limits, on the arc that is being driven.
+
+        That arc was looked at when it was entered, up to where the robot would stand; any other may end in a wall.
+        """
+        v = max(self.v - self.config.max_acceleration_m_s2 * dt_s, 0.0)
+        return self._limited(v, self.w * v / self.v if self.v > 0.0 else 0.0, dt_s)
 
     def slowed(self, v: float, w: float) -> tuple[float, float]:
         """Take note that a command was made slower than the limits allow, for something right ahead."""

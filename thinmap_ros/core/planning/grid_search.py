@@ -41,6 +41,18 @@ def coarse(allowed: Mask, factor: int) -> Mask:
     return np.asarray(_coarse(allowed, factor, 0, 0))
 
 
+@kernel
+def fine(squares: Mask, factor: int, cells: Mask) -> Mask:
+    """Those cells of a mask (H, W) that lie in a true square of factor x factor cells."""
+    result = np.zeros(cells.shape, dtype=np.bool_)
+    for row in range(cells.shape[0]):
+        for square in range(squares.shape[1]):
+            if squares[row // factor, square]:
+                first, last = square * factor, min((square + 1) * factor, cells.shape[1])
+                result[row, first:last] = cells[row, first:last]
+    return result
+
+
 class WayTable:
     """Ways between places of a map that grows, on a coarse grid, remembered for a while: most places stay.
 
@@ -61,8 +73,7 @@ class WayTable:
         factor = max(1, round(self._cell_m / frame.resolution))
         # Squares on a lattice that stays when the frame grows.
         shift = [round(origin / frame.resolution) % factor for origin in (frame.origin_y, frame.origin_x)]
-        weights = self._unknown_weight * _coarse(unknown, factor, shift[0], shift[1]).astype(np.uint8)
-        weights[_coarse(allowed, factor, shift[0], shift[1])] = 1
+        weights: NDArray[np.uint8] | None = None
         cells = (frame.cells_of(places) + shift) // factor
         first = (round(frame.origin_y / frame.resolution) // factor, round(frame.origin_x / frame.resolution) // factor)
         keys = [(int(row), int(col)) for row, col in cells + first]
@@ -70,10 +81,18 @@ class WayTable:
         for i, key in enumerate(keys):
             missing = [j for j in range(i) if keys[j] != key and frozenset((key, keys[j])) not in self._known]
             if missing:
+                if weights is None:
+                    weights = self._weights(allowed, unknown, factor, shift)
                 steps = _ways_from(weights, int(cells[i, 0]), int(cells[i, 1]), np.ascontiguousarray(cells[missing]))
                 for j, way in zip(missing, (_cells(steps) * frame.resolution * factor).tolist(), strict=True):
                     self._known[frozenset((key, keys[j]))] = (stamp_ns, way)
         return np.array([[0.0 if a == b else self._known[frozenset((a, b))][1] for b in keys] for a in keys])
+
+    def _weights(self, allowed: Mask, unknown: Mask, factor: int, shift: list[int]) -> NDArray[np.uint8]:
+        """What a step costs in each square; 0: no way."""
+        weights = self._unknown_weight * _coarse(unknown, factor, shift[0], shift[1]).astype(np.uint8)
+        weights[_coarse(allowed, factor, shift[0], shift[1])] = 1
+        return weights
 
     def _forget(self, keys: list[Key], stamp_ns: int) -> None:
         """Forget ways that are old, or between places that are not asked for any more."""
@@ -93,15 +112,19 @@ def _cells(steps: NDArray[np.int32]) -> Array:
 def _coarse(allowed: Mask, factor: int, shift_row: int, shift_col: int) -> Mask:
     """Squares in which any cell is set; the first cell is (shift_row, shift_col) within its square."""
     rows, cols = allowed.shape
-    squares = np.zeros((-(-(rows + shift_row) // factor), -(-(cols + shift_col) // factor)), dtype=np.bool_)
-    for row in range(rows):
-        line = squares[(row + shift_row) // factor]
-        square, within = 0, shift_col
-        for col in range(cols):
-            if within == factor:
-                square, within = square + 1, 0
-            line[square] |= allowed[row, col]
-            within += 1
+    height, width = -(-(rows + shift_row) // factor), -(-(cols + shift_col) // factor)
+    squares = np.zeros((height, width), dtype=np.bool_)
+    line = np.zeros(width * factor, dtype=np.uint8)
+    for square in range(height):
+        line[:] = 0
+        for row in range(max(square * factor - shift_row, 0), min((square + 1) * factor - shift_row, rows)):
+            # All rows of a square into one, many cells at a time; then its columns.
+            cells, part = allowed[row].view(np.uint8), line[shift_col : shift_col + cols]
+            for col in range(cols):
+                part[col] |= cells[col]
+        for col in range(width):
+            for k in range(factor):
+                squares[square, col] |= line[col * factor + k] != 0
     return squares
 
 

@@ -180,6 +180,7 @@ class Navigator:
         self._remaining_m = length_from(self.path, nearest)
         if self._remaining_m < self._nearest_m - _PROGRESS_M:
             self._standstills, self._nearest_m = 0, self._remaining_m
+        before = (self._follower.v, self._follower.w)
         v, w = self._follower.command(T_map_base, self.path, dt_s)
         if v <= 0.0:
             return Command(v, w, 'driving')
@@ -187,11 +188,20 @@ class Navigator:
         if allowed >= v - _ROUNDING_M_S:
             self._blocked_s = 0.0
             return Command(v, w, 'driving')
-        # Slower on the same arc.
-        slow = self._follower.slowed(allowed, w * allowed / v)
-        if allowed > _CREEP_M_S:
-            return Command(*slow, 'driving')
-        return self._face_obstacle(T_map_base, dt_s)
+        slowest = before[0] - self.config.max_acceleration_m_s2 * dt_s
+        if allowed > max(_CREEP_M_S, slowest):
+            # Slower on the same arc.
+            return Command(*self._follower.slowed(allowed, w * allowed / v), 'driving')
+        self._follower.slowed(*before)
+        return self._brake(T_map_base, dt_s) if slowest > 0.0 else self._face_obstacle(T_map_base, dt_s)
+
+    def _brake(self, T_map_base: Array, dt_s: float) -> Command:
+        """Come to rest on the arc on which the robot is; at once where something has come into its way there too."""
+        before = self._follower.v
+        v, w = self._follower.stop(dt_s)
+        if self._safe_speed(T_map_base, before, w * before / v) < v:
+            v, w = self._follower.slowed(0.0, 0.0)
+        return Command(v, w, 'driving')
 
     def _face_obstacle(self, T_map_base: Array, dt_s: float) -> Command:
         """Right in front of something: turn along the path if that helps, else plan around it, else give up."""
@@ -223,12 +233,9 @@ class Navigator:
 
     def _free_length(self, T_map_base: Array, curvature: float, length_m: float) -> float:
         """How far the body can be moved along an arc before a point comes nearer than its radius, up to length_m."""
-        steps = np.linspace(0.0, length_m, math.ceil(length_m / _SWEEP_STEP_M) + 1)
-        turns = curvature * steps
-        along = steps * np.sinc(turns / (2.0 * np.pi))
-        centres = np.column_stack([along * np.cos(turns / 2.0), along * np.sin(turns / 2.0)])
-        centres = se2.transform_points(T_map_base, centres)
-        return float(steps[_clear_steps(centres, self._points_map, self.config.body_radius_m)])
+        count = math.ceil(length_m / _SWEEP_STEP_M)
+        centres = _arc(T_map_base, curvature, length_m, count)
+        return length_m * _clear_steps(centres, self._points_map, self.config.body_radius_m) / max(count, 1)
 
 
 @kernel
@@ -244,6 +251,19 @@ def _touches(cells: NDArray[np.int8], path: NDArray[np.int64], radius: float) ->
                 if cells[r, c] >= OCCUPIED_AT_LEAST and (r - row) ** 2 + (c - col) ** 2 < radius * radius:
                     return True
     return False
+
+
+@kernel
+def _arc(start: Array, curvature: float, length_m: float, count: int) -> Array:
+    """Points (count + 1, 2), evenly spaced, of an arc that begins at a pose (3,), m."""
+    points = np.empty((count + 1, 2))
+    for k in range(count + 1):
+        length = length_m * k / max(count, 1)
+        half = 0.5 * curvature * length
+        chord = length if half == 0.0 else length * math.sin(half) / half
+        points[k, 0] = start[0] + chord * math.cos(start[2] + half)
+        points[k, 1] = start[1] + chord * math.sin(start[2] + half)
+    return points
 
 
 @kernel

@@ -19,21 +19,30 @@ def standing_places(free: Mask, radius_m: float, resolution: float) -> Mask:
 
 
 def places_in_reach(free: Mask, frame: GridFrame, xy: tuple[float, float], radius_m: float, escape_m: float) -> Mask:
-    """Standing places (H, W) to which a robot of a radius can get from a point (m).
+    """Standing places (H, W) to which a robot of a radius can get from a point (m); see `places_and_ways`."""
+    standing, ways = places_and_ways(free, frame, xy, radius_m, escape_m)
+    row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
+    inside = 0 <= row < free.shape[0] and 0 <= col < free.shape[1]
+    return reached_from(ways, (row, col)) & standing if inside else np.zeros_like(standing)
 
-    Where it stands too near to something it is let out over free cells up to escape_m away, as a path would.
+
+def places_and_ways(
+    free: Mask, frame: GridFrame, xy: tuple[float, float], radius_m: float, escape_m: float
+) -> tuple[Mask, Mask]:
+    """Standing places (H, W) of a robot of a radius, and the cells over which one that is at a point (m) may go.
+
+    These are the same, but where it stands too near to something it is let out over free cells up to escape_m away, as
+    a path would.
     """
     standing = standing_places(free, radius_m, frame.resolution)
     row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
-    if not (0 <= row < free.shape[0] and 0 <= col < free.shape[1]):
-        return np.zeros_like(standing)
-    ways = standing
-    if not standing[row, col]:
-        ways = standing.copy()
-        part, within = disc(ways, (row, col), escape_m / frame.resolution)
-        ways[part] |= within & free[part]
-        ways[row, col] = True
-    return reached_from(ways, (row, col)) & standing
+    if not (0 <= row < free.shape[0] and 0 <= col < free.shape[1]) or standing[row, col]:
+        return standing, standing
+    ways = standing.copy()
+    part, within = disc(ways, (row, col), escape_m / frame.resolution)
+    ways[part] |= within & free[part]
+    ways[row, col] = True
+    return standing, ways
 
 
 def reached_from(allowed: Mask, start: tuple[int, int]) -> Mask:
@@ -52,6 +61,19 @@ def nearest_true(allowed: Mask, cell: tuple[int, int], reach: float) -> tuple[in
         return None
     best = near[squared.argmin()]
     return int(best[0]), int(best[1])
+
+
+@kernel
+def are_near(allowed: Mask, cells: NDArray[np.int64], reach: float) -> Mask:
+    """Whether a true cell of a mask (H, W) lies within a distance of `reach` cells, for each cell (N, 2), (N,)."""
+    whole = int(math.floor(reach))
+    near = np.zeros(cells.shape[0], dtype=np.bool_)
+    for i in range(cells.shape[0]):
+        row, col = cells[i, 0], cells[i, 1]
+        for r in range(max(row - whole, 0), min(row + whole + 1, allowed.shape[0])):
+            for c in range(max(col - whole, 0), min(col + whole + 1, allowed.shape[1])):
+                near[i] |= allowed[r, c] and (r - row) ** 2 + (c - col) ** 2 <= reach * reach
+    return near
 
 
 def disc(of: NDArray[Any], centre: tuple[int, int], reach: float) -> tuple[tuple[slice, slice], Mask]:
