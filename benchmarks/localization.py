@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.localization_drives import random_drive, random_start
 from benchmarks.table import Row, at_least, at_most
 from benchmarks.timing import best_seconds
 from benchmarks.worlds import floors
@@ -26,7 +25,7 @@ from thinmap_ros.core.se2 import Array, pose, wrap
 from thinmap_ros.core.topology.graph import Node, NodeKind, TopologicalMap
 from thinmap_ros.core.topology.update import TopologyConfig, build
 from thinmap_ros.sim.lms200 import Lms200, Lms200Config
-from thinmap_ros.sim.tours import Look
+from thinmap_ros.sim.tours import Look, patch_of, random_drive, random_start
 from thinmap_ros.sim.world import World
 
 _LAB = Path(__file__).resolve().parent.parent / 'worlds' / 'lab.yaml'
@@ -97,7 +96,7 @@ def find(finder: GlobalLocalization, looks: Iterable[Look], tally: Tally, every:
 
 def map_of(world: World) -> Map:
     """The map that a world is itself."""
-    patch = GridPatch(world.frame, np.where(world.occupied != 0, np.int8(100), np.int8(0)))
+    patch = patch_of(world)
     return Map(patch, build(patch, None, TopologyConfig()))
 
 

@@ -16,11 +16,16 @@ def surfaces(world: World, shortest_m: float) -> Array:
     of one end, x and y of the other. Slanting surfaces fall into steps, and are left out with these.
     """
     free = world.occupied == 0
-    inside = reachable(free, world.frame.cells_of(world.start[None, :2]))
+    inside = inside_of(world)
     found = [_rows_of_faces(inside, free, world.frame, shortest_m, side) for side in (-1, 1)]
     turned = GridFrame(world.frame.origin_y, world.frame.origin_x, world.frame.resolution)
     across = [_rows_of_faces(inside.T, free.T, turned, shortest_m, side)[:, [1, 0, 3, 2]] for side in (-1, 1)]
     return np.concatenate([*found, *across])
+
+
+def inside_of(world: World) -> NDArray[np.bool_]:
+    """Free cells (H, W) that are joined to the start."""
+    return reachable(world.occupied == 0, world.frame.cells_of(world.start[None, :2]))
 
 
 def _rows_of_faces(
