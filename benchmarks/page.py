@@ -22,7 +22,7 @@ _ABOUT = {
     'nodes': 'What the ROS nodes of map and graph need for a scan.',
     'localization': 'Global localization from 5,000 samples.',
     'planning': 'The wavefront planner.',
-    'slam': 'A step of the localizer by the number of features in the map: the filter over the local area (ti) and over '
+    'slam': 'A step of the localizer by the number of features in the map: the filter over the local area (ti), over '
     'all features (full).',
     'growth': 'Localizer, grid and graph together on a long drive through the warehouse of 200 x 200 m.',
 }

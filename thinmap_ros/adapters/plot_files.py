@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_DPI = 110
+_DPI, _PAD = 110, 0.1  # dots and margin, in inches
 _MANY = 2000  # points: more make an SVG needlessly large
 # Text stays text in an SVG, and its ids do not change from run to run.
 _SETTINGS: Any = {'svg.fonttype': 'none', 'svg.hashsalt': 'thinmap', 'font.size': 10.0, 'path.simplify': True}
@@ -42,7 +42,8 @@ def write_plot(folder: Path, plot: Plot) -> None:
     rows = -(-len(plot.panels) // plot.columns)
     width, height = plot.panel_inches
     with matplotlib.rc_context(_SETTINGS):
-        figure = Figure(figsize=(width * plot.columns, height * rows + 0.3), dpi=_DPI, layout='constrained')
+        figure = Figure(figsize=(width * plot.columns, height * rows + 0.3), dpi=_DPI)
+        figure.set_layout_engine('constrained', h_pad=_PAD, w_pad=_PAD)
         FigureCanvasAgg(figure)
         for axes, panel in zip(figure.subplots(rows, plot.columns, squeeze=False).flat, plot.panels, strict=False):
             _draw_panel(axes, panel)

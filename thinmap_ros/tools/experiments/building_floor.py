@@ -21,6 +21,7 @@ _LOCAL_AT = 0.45  # of the drive: Fig. 7 and 8
 _LINES, _PAPER_USED, _PAPER_ALL = 33, 7, 25
 _EVERY = 5
 _SIGMAS = 3.0
+_LIMITS = (-1.0, 41.0, -2.0, 12.0)  # the odometry alone goes far beyond
 
 
 class _Glance:
@@ -163,9 +164,10 @@ def _paths(ti: Run, full: Run) -> Plot:
             Curve(estimate[:, :2], 'estimated path', 0, '--', width=1.6),
             Robots(estimate[-1:], radius_m=0.32),
         ]
-        panels.append(Panel(layers, f'{name}: {int(sum(f.local for f in features))} of {len(features)} features used'))
+        title = f'{name}: {sum(f.local for f in features)} of {len(features)} features used'
+        panels.append(Panel(layers, title, limits=_LIMITS))
     caption = 'Paper 3, Fig. 12: paths and line features by both filters; thick: the features used at the last pose.'
-    return Plot('fig12', caption, panels, panel_inches=(9.0, 3.9))
+    return Plot('fig12', caption, panels, panel_inches=(9.0, 3.2))
 
 
 def _bounds(done: Run) -> Plot:
