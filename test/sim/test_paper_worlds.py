@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.warehouse import WAREHOUSE, warehouse
 from thinmap_ros.adapters.world_files import read_tour, read_world
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.raytrace import cast_rays
@@ -14,6 +13,7 @@ from thinmap_ros.sim.pioneer import PRESETS
 from thinmap_ros.sim.runner import Simulation
 from thinmap_ros.sim.surfaces import surfaces
 from thinmap_ros.sim.tours import drive, ways_along
+from thinmap_ros.sim.warehouse import warehouse
 from thinmap_ros.sim.world import World
 
 WORLDS = Path(__file__).parents[2] / 'worlds'
@@ -110,7 +110,7 @@ def test_the_long_tour_takes_twenty_minutes() -> None:
 
 
 def test_the_warehouse_is_what_its_program_writes() -> None:
-    assert WAREHOUSE.read_text(encoding='utf-8') == warehouse()
+    assert (WORLDS / 'warehouse.yaml').read_text(encoding='utf-8') == warehouse()
 
 
 def test_a_place_that_cannot_be_reached_is_said() -> None:

@@ -66,7 +66,7 @@ def test_an_experiment_writes_what_it_promises(name: str, tmp_path: Path) -> Non
     assert all(comparison.what in text for comparison in outcome.comparisons)
 
 
-@pytest.mark.parametrize('name', [name for name in EXPERIMENTS if name not in ('strategies', 'exploration')])
+@pytest.mark.parametrize('name', sorted(set(EXPERIMENTS) - {'strategies', 'exploration', 'long_floor'}))
 def test_the_same_seed_gives_the_same_numbers(name: str) -> None:
     again = EXPERIMENTS[name](QUICK)
     for before, after in zip(outcome_of(name).tables, again.tables, strict=True):

@@ -116,7 +116,7 @@ def _(layer: Band, axes: 'Axes') -> None:
 @_draw.register(Bars)
 def _(layer: Bars, axes: 'Axes') -> None:
     places = np.arange(len(layer.names))[::-1]
-    axes.barh(places, layer.values, xerr=layer.spread, color=[_colour(c) for c in layer.colours], height=0.7, capsize=3)
+    axes.barh(places, layer.values, color=[_colour(c) for c in layer.colours], height=0.7)
     axes.set_yticks(places, layer.names)
     for place, value in zip(places, layer.values, strict=True):
         axes.text(0.0, place, f' {value:.3g}', va='center', fontsize=8, color='white', fontweight='bold')

@@ -37,11 +37,10 @@ class Band:
 
 @dataclass(frozen=True, eq=False)
 class Bars:
-    """A bar for each name, with the half length of an interval (N,), and its value written beside it."""
+    """A bar for each name, with its value (N,) written on it."""
 
     names: Sequence[str]
     values: Array
-    spread: Array
     colours: Sequence[int]
 
 

@@ -16,7 +16,7 @@ from thinmap_ros.tools.experiments.drives import Source, world_of
 from thinmap_ros.tools.experiments.outcome import Comparison, Outcome, Rows, Table
 from thinmap_ros.tools.experiments.slam_run import Run, run_slam
 
-_QUICK_SCANS = 300
+_QUICK_SCANS = 200
 _LOCAL_AT = 0.45  # of the drive: Fig. 7 and 8
 _LINES, _PAPER_USED, _PAPER_ALL = 33, 7, 25
 _EVERY = 5

@@ -13,7 +13,7 @@ from thinmap_ros.tools.experiments.drives import Source, world_of
 from thinmap_ros.tools.experiments.outcome import Comparison, Outcome, Table
 from thinmap_ros.tools.experiments.slam_run import Run, run_slam
 
-_QUICK_SCANS = 400
+_QUICK_SCANS = 150
 _MARKS = 'ABCDE'
 _WINDOW_M = 10.0
 _LINES, _PAPER_M, _PAPER_DEG, _PAPER_MS = 88, 0.20, 5.0, 40.0

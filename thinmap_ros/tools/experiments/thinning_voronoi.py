@@ -57,8 +57,8 @@ def run(source: Source) -> Outcome:
                 'nodes of thinning beyond those of Voronoi, in the laboratory', f'{_MORE_NODES} in its example',
                 ', '.join(f'{more[prune_m]:+d} with dead ends up to {prune_m:g} m dropped' for prune_m in _TOLD_M),
                 max(more.values()) >= _MORE_NODES,
-                remark='A Voronoi diagram grows a branch into each corner. Only when all of these are dropped, as in '
-                'the paper, has thinning more nodes.',
+                remark='A Voronoi diagram grows a branch into each corner; when these are dropped, thinning has more nodes, '
+                'by its corner nodes.',
             ),
         ],
     )  # fmt: skip

@@ -1,10 +1,7 @@
-"""Write worlds/warehouse.yaml, 200 x 200 m of racks with goods in front of them: python -m benchmarks.warehouse."""
-
-from pathlib import Path
+"""Text of worlds/warehouse.yaml, 200 x 200 m of racks with goods in front: python -m thinmap_ros.sim.warehouse."""
 
 import numpy as np
 
-WAREHOUSE = Path(__file__).resolve().parent.parent / 'worlds' / 'warehouse.yaml'
 _SIDE_M = 200.0
 _RACK_M, _LENGTH_M = 2.4, 16.0  # two racks back to back
 _FIRST_M, _ACROSS_M, _ALONG_M = (6.0, 6.0), 7.4, 21.0  # aisles of 5 m both ways
@@ -13,7 +10,7 @@ _GOODS_M = (1.2, 0.8)  # a pallet on the floor, along the rack and out into the 
 _SEED = 0
 
 _HEADER = f"""\
-# A warehouse of 200 x 200 m for scale, by benchmarks/warehouse.py (seed {_SEED}): racks back to back, pallets on
+# A warehouse of 200 x 200 m for scale, by thinmap_ros.sim.warehouse (seed {_SEED}): racks back to back, pallets on
 # the floor in front of some. The tour goes up and down through every second aisle.
 name: warehouse
 resolution: 0.05
@@ -55,4 +52,4 @@ def _tour() -> list[tuple[float, float]]:
 
 
 if __name__ == '__main__':
-    WAREHOUSE.write_text(warehouse(), encoding='utf-8')
+    print(warehouse(), end='')
