@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from benchmarks.table import Row, at_least, at_most
 from benchmarks.timing import best_seconds
 from benchmarks.worlds import floors
-from thinmap_ros.adapters.world_files import read_tour, read_world
+from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.localization.calibration import NodeModel, random_pose
 from thinmap_ros.core.localization.config import GlobalLocalizationConfig
@@ -24,9 +23,10 @@ from thinmap_ros.core.localization.places import Places
 from thinmap_ros.core.se2 import Array, pose, wrap
 from thinmap_ros.core.topology.graph import Node, NodeKind, TopologicalMap
 from thinmap_ros.core.topology.update import TopologyConfig, build
-from thinmap_ros.sim.lms200 import Lms200, Lms200Config
 from thinmap_ros.sim.tours import Look, patch_of, random_drive, random_start
 from thinmap_ros.sim.world import World
+from thinmap_ros.tools.experiments.drives import Source
+from thinmap_ros.tools.experiments.maps import grid_of
 
 _LAB = Path(__file__).resolve().parent.parent / 'worlds' / 'lab.yaml'
 _PAPER_START = (2.0, 2.0, -np.pi / 2.0)
@@ -100,18 +100,6 @@ def map_of(world: World) -> Map:
     return Map(patch, build(patch, None, TopologyConfig()))
 
 
-def merged_map(world: World, stops: Array) -> Map:
-    """The map of scans at some stops (N, 2), looking two ways at each."""
-    grid, laser = OccupancyGrid(), Lms200(Lms200Config(), seed=0)
-    for x, y in stops:
-        for heading in (0.0, np.pi):
-            for _ in range(4):
-                T = pose(x, y, heading)
-                grid.update(laser.scan(world, T, 0), T)
-    patch = grid.patch()
-    return Map(patch, build(patch, (2.0, 2.0), TopologyConfig()))
-
-
 def _step_times(folder: Path, quick: bool) -> Iterator[Row]:
     """5,000 samples against 10 observed nodes and the beams of a scan, in maps with few and many nodes."""
     floor = floors(folder, 'kth/50052749')[0]
@@ -137,7 +125,8 @@ def _step_times(folder: Path, quick: bool) -> Iterator[Row]:
 
 def _laboratory(quick: bool) -> Iterator[Row]:
     world = World.from_patch(*read_world(_LAB))
-    known = merged_map(world, read_tour(_LAB))
+    patch = grid_of(Source().looks('lab_stops')).patch()
+    known = Map(patch, build(patch, _PAPER_START[:2], TopologyConfig()))
     tally = Tally()
     for seed in range(5 if quick else 20):
         finder = GlobalLocalization(known.patch, known.topology, seed=seed)

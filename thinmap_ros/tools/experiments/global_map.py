@@ -37,17 +37,6 @@ def run(source: Source) -> Outcome:
     batch = build(whole.patch(), _start(stops[0]), TopologyConfig())
     share, back = _agreement(states[-1], batch), _agreement(batch, states[-1])
     gone = _redundant(states[1], states[-1])
-    plots = [
-        Plot(
-            'fig7_8', 'Paper 1, Fig. 7 and 8: the local maps of two stops, and the map merged from them.',
-            [*locals_, *panels], columns=3, panel_inches=(5.0, 4.6),
-        ),
-        Plot(
-            'fig6_9', 'Paper 1, Fig. 6 and 9: the global grid map (above; only for better understanding) and the final '
-            'global topological map.',
-            [Panel([MapLayer(whole.patch())]), _panel(grid, states[-1], '')], panel_inches=(9.0, 4.6),
-        ),
-    ]  # fmt: skip
     return Outcome(
         'Local topological maps become a global one',
         'Topological map paper, sections 2.2 and 4.1, Fig. 6 to 9',
@@ -58,7 +47,7 @@ def run(source: Source) -> Outcome:
             Table('growth', ['stop', 'x_m', 'y_m', 'nodes', 'edges'], growth),
             Table('nodes', ['id', 'kind', 'x_m', 'y_m', 'clearance_m'], _rows(states[-1])),
         ],
-        plots,
+        _plots([*locals_, *panels], whole, _panel(grid, states[-1], '')),
         [
             Comparison('stops merged into one map', '10 to 15', str(len(stops)), 10 <= len(stops) <= 15),
             Comparison('one connected map', 'yes', f'{len(states[-1].components())} part', _is_one(states[-1])),
@@ -72,6 +61,20 @@ def run(source: Source) -> Outcome:
             ),
         ],
     )  # fmt: skip
+
+
+def _plots(early: list[Panel], whole: OccupancyGrid, final: Panel) -> list[Plot]:
+    return [
+        Plot(
+            'fig7_8', 'Paper 1, Fig. 7 and 8: the local maps of two stops, and the map merged from them.', early,
+            columns=3, panel_inches=(5.0, 4.6),
+        ),
+        Plot(
+            'fig6_9', 'Paper 1, Fig. 6 and 9: the global grid map (above; only for better understanding) and the final '
+            'global topological map.',
+            [Panel([MapLayer(whole.patch())]), final], panel_inches=(9.0, 4.6),
+        ),
+    ]  # fmt: skip
 
 
 def _visit(looks: list[Look], grid: OccupancyGrid, builder: TopologyBuilder) -> None:

@@ -57,7 +57,7 @@ def run(source: Source) -> Outcome:
                 'nodes of thinning beyond those of Voronoi, in the laboratory', f'{_MORE_NODES} in its example',
                 ', '.join(f'{more[prune_m]:+d} with dead ends up to {prune_m:g} m dropped' for prune_m in _TOLD_M),
                 max(more.values()) >= _MORE_NODES,
-                remark='A Voronoi diagram grows a branch into each corner; when these are dropped, thinning has more nodes, '
+                remark='A Voronoi diagram grows a branch into each corner; without these thinning has more nodes, '
                 'by its corner nodes.',
             ),
         ],
