@@ -15,6 +15,7 @@ def machine() -> Iterator[Row]:
     names = [line.partition(':')[2].strip() for line in lines if line.startswith('model name')]
     yield Row('processor', names[0] if names else platform.processor())
     yield Row('cores', str(os.cpu_count()))
+    yield Row('processes that wanted one of them (load)', f'{os.getloadavg()[2]:.0f}')
     yield Row('Python', platform.python_version())
     for package in ('numpy', 'scipy', 'numba'):
         yield Row(package, version(package))

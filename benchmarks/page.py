@@ -8,7 +8,8 @@ _HEAD = """\
 # Benchmarks
 
 Made by `python -m benchmarks.page out/benchmarks` of the files that `python -m benchmarks.run --csv out/benchmarks`
-leaves. Times are of one core, beside whatever else the machine had to do.
+leaves (`--quick` where a table is short). Times are of one core; a load far above the number of cores says that the
+machine was busy with other things, and that all times are much too long.
 
 Machine: {machine}.
 """
