@@ -26,14 +26,14 @@ _LASERS = {
 }
 # What others are said to reach on the Intel log: errors of translation in m, live and after all corrections; CPU ms a
 # scan; MB. Single runs of the programs with their defaults, Cartographer tuned; the last three as published in 2009.
-_OTHERS = [
+_OTHERS: list[tuple[str, float | None, float, float | None, float | None]] = [
     ('IRIS LaMa slam2d', 0.036, 0.033, 0.17, 13.0), ('Karto', 0.073, 0.038, 12.3, 73.0),
     ('GMapping, 30 particles', 0.104, 0.046, 8.7, 110.0), ('slam_toolbox', 0.113, 0.056, 1.17, 45.0),
     ('Cartographer 2D', 1.55, 0.081, 34.0, 257.0), ('a public line-feature EKF-SLAM', 1.87, 1.87, 30.0, 79.0),
     ('scan matching, 2009', None, 0.220, None, None), ('RBPF, 2009', None, 0.070, None, None),
     ('graph mapping, 2009', None, 0.031, None, None),
 ]  # fmt: skip
-_OTHERS_LOG, _PEER, _PEER_M = 'intel', 'graph mapping, 2009', 0.031
+_OTHERS_LOG = 'intel'
 _COLUMNS = [
     'log', 'scans', 'skipped', 'way_m', 'features', 'features_local', 'nodes', 'edges', 'loops', 'live_m', 'live_deg',
     'final_m', 'final_deg', 'odometry_m',
@@ -143,16 +143,20 @@ def _box(path: Array) -> tuple[float, float, float, float]:
 
 
 def _comparisons(row: list[Any]) -> list[Comparison]:
+    """The errors of a log whose relations are known, beside those of others where there are any."""
     values = dict(zip(_COLUMNS, row, strict=True))
     if values['final_m'] is None:
         return []
-    ours = f'{values["final_m"]:.3f} m after all corrections, {values["live_m"]:.3f} m live'
-    is_known = values['log'] == _OTHERS_LOG
-    return [
-        Comparison(
-            f'{values["log"]}: mean error of the relations', f'{_PEER}: {_PEER_M} m' if is_known else '', ours,
-            bool(values['final_m'] <= _PEER_M) if is_known else None,
-            remark=f'{values["final_deg"]:.2f} deg, live {values["live_deg"]:.2f} deg; odometry '
-            f'{values["odometry_m"]:.2f} m',
-        )
-    ]  # fmt: skip
+    name, ours = values['log'], f'{values["final_m"]:.3f} m after all corrections, {values["live_m"]:.3f} m live'
+    degrees = f'{values["final_deg"]:.2f} deg, live {values["live_deg"]:.2f} deg; odometry {values["odometry_m"]:.2f} m'
+    rows = [Comparison(f'{name}: mean error of the relations', '', ours, remark=degrees)]
+    if name == _OTHERS_LOG:
+        rows += [_against(system, live_m, final_m, values) for system, live_m, final_m, *_ in _OTHERS]
+    return rows
+
+
+def _against(system: str, live_m: float | None, final_m: float, values: dict[str, Any]) -> Comparison:
+    theirs = f'{final_m:.3f} m' + ('' if live_m is None else f', {live_m:.3f} m live')
+    ours = f'{values["final_m"]:.3f} m' + ('' if live_m is None else f', {values["live_m"]:.3f} m live')
+    better = values['final_m'] <= final_m and (live_m is None or values['live_m'] <= live_m)
+    return Comparison(f'{values["log"]}, against {system}', theirs, ours, bool(better))
