@@ -11,6 +11,7 @@ NODES = [
 ]
 TOOLS = [
     'replay', 'explore_world', 'compare_exploration', 'carmen_to_bag', 'map_to_graph', 'bag_repair', 'demo', 'warm_up',
+    'experiment', 'record_bags',
 ]
 
 setup(

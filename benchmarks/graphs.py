@@ -8,6 +8,7 @@ from benchmarks.table import Row, at_least, at_most
 from benchmarks.timing import best_seconds
 from benchmarks.worlds import floors
 from thinmap_ros.adapters.map_files import read_map
+from thinmap_ros.baselines.voronoi import build_voronoi
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.core.topology.update import TopologyConfig, build
 
@@ -28,6 +29,8 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
         if floor.name in _SECONDS:
             seconds = best_seconds({'work': work}, 5)['work']
             yield at_most('  map to graph', seconds, _SECONDS[floor.name], 's')
+            voronoi = best_seconds({'work': lambda patch=patch: build_voronoi(patch)}, 1)['work']
+            yield at_least('  times faster than a Voronoi graph (SciPy)', voronoi / seconds, 1.0)
         if floor.name == 'kth/50052751':
             yield at_most('  nodes', len(graph.nodes), _MOST_NODES)
         yield at_least('  drivable edges', drivable_share(patch, graph, config.robot_radius_m), 1.0)

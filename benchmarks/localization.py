@@ -8,13 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.localization_drives import Look, random_drive, random_start
 from benchmarks.table import Row, at_least, at_most
 from benchmarks.timing import best_seconds
 from benchmarks.worlds import floors
 from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.localization.calibration import NodeModel, random_pose
 from thinmap_ros.core.localization.config import GlobalLocalizationConfig
@@ -25,16 +23,13 @@ from thinmap_ros.core.localization.places import Places
 from thinmap_ros.core.se2 import Array, pose, wrap
 from thinmap_ros.core.topology.graph import Node, NodeKind, TopologicalMap
 from thinmap_ros.core.topology.update import TopologyConfig, build
-from thinmap_ros.sim.lms200 import Lms200, Lms200Config
+from thinmap_ros.sim.tours import Look, patch_of, random_drive, random_start
 from thinmap_ros.sim.world import World
+from thinmap_ros.tools.experiments.drives import Source
+from thinmap_ros.tools.experiments.maps import grid_of
 
 _LAB = Path(__file__).resolve().parent.parent / 'worlds' / 'lab.yaml'
 _PAPER_START = (2.0, 2.0, -np.pi / 2.0)
-# The paper's robot merged local maps of 10 to 15 stops: here of 12, looking both ways at each.
-_STOPS = (
-    (1.5, 2.0), (2.3, 4.4), (3.0, 8.3), (5.3, 4.4), (5.2, 8.6), (7.9, 4.6), (9.6, 1.8), (10.2, 8.0), (12.8, 4.9),
-    (15.3, 1.6), (15.4, 7.6), (18.9, 3.6),
-)
 _STEP_SCANS = 3  # a step of the laboratory's experiment: at 0.5 m/s and 5 Hz, up to 0.3 m
 _RIGHT_M, _RIGHT_RAD = 0.3, np.radians(10.0)
 
@@ -101,20 +96,8 @@ def find(finder: GlobalLocalization, looks: Iterable[Look], tally: Tally, every:
 
 def map_of(world: World) -> Map:
     """The map that a world is itself."""
-    patch = GridPatch(world.frame, np.where(world.occupied != 0, np.int8(100), np.int8(0)))
+    patch = patch_of(world)
     return Map(patch, build(patch, None, TopologyConfig()))
-
-
-def merged_map(world: World, stops: Iterable[tuple[float, float]]) -> Map:
-    """The map of scans at some stops, looking two ways at each."""
-    grid, laser = OccupancyGrid(), Lms200(Lms200Config(), seed=0)
-    for x, y in stops:
-        for heading in (0.0, np.pi):
-            for _ in range(4):
-                T = pose(x, y, heading)
-                grid.update(laser.scan(world, T, 0), T)
-    patch = grid.patch()
-    return Map(patch, build(patch, (2.0, 2.0), TopologyConfig()))
 
 
 def _step_times(folder: Path, quick: bool) -> Iterator[Row]:
@@ -142,7 +125,8 @@ def _step_times(folder: Path, quick: bool) -> Iterator[Row]:
 
 def _laboratory(quick: bool) -> Iterator[Row]:
     world = World.from_patch(*read_world(_LAB))
-    known = merged_map(world, _STOPS)
+    patch = grid_of(Source().looks('lab_stops')).patch()
+    known = Map(patch, build(patch, _PAPER_START[:2], TopologyConfig()))
     tally = Tally()
     for seed in range(5 if quick else 20):
         finder = GlobalLocalization(known.patch, known.topology, seed=seed)

@@ -1,10 +1,11 @@
-"""All benchmarks: python -m benchmarks.run [NAME ...] [--quick] [--worlds DIR]."""
+"""All benchmarks: python -m benchmarks.run [NAME ...] [--quick] [--worlds DIR] [--csv DIR]."""
 
 import argparse
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from benchmarks import exploration, graphs, localization, mapping, nodes, online, planning, slam, thinning
+from benchmarks import exploration, graphs, growth, localization, mapping, nodes, online, planning, slam, thinning
+from benchmarks.machine import machine
 from benchmarks.table import Row, show
 from benchmarks.worlds import WORLDS
 
@@ -18,6 +19,7 @@ _ALL: dict[str, Callable[[Path, bool], Iterable[Row]]] = {
     'planning': planning.run,
     'exploration': exploration.run,
     'slam': slam.run,
+    'growth': growth.run,
 }
 
 
@@ -27,12 +29,16 @@ def main() -> None:
     parser.add_argument('names', nargs='*', help=f'some of {", ".join(_ALL)} (default: all)')
     parser.add_argument('--quick', action='store_true', help='fewer worlds, pairs and scans: a minute or two')
     parser.add_argument('--worlds', type=Path, default=WORLDS, help=f'folder with worlds.json (default {WORLDS})')
+    parser.add_argument('--csv', type=Path, help='folder for the results: NAME.csv each, and machine.csv')
     arguments = parser.parse_args()
     if unknown := set(arguments.names) - set(_ALL):
         parser.error(f'unknown benchmark {sorted(unknown)[0]}: expected some of {", ".join(_ALL)}')
     for name in arguments.names or _ALL:
         print(f'-- {name}')
-        show(_ALL[name](arguments.worlds, arguments.quick))
+        rows = _ALL[name](arguments.worlds, arguments.quick)
+        show(rows, arguments.csv and arguments.csv / f'{name}.csv')
+    if arguments.csv:
+        show(machine(), arguments.csv / 'machine.csv')
 
 
 if __name__ == '__main__':

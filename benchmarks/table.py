@@ -1,7 +1,9 @@
 """Results as rows: what was measured, the value, and what it should be."""
 
+import csv
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 
 
 @dataclass(frozen=True)
@@ -24,8 +26,17 @@ def at_least(what: str, value: float, limit: float, unit: str = '') -> Row:
     return Row(what, f'{value:.4g} {unit}'.strip(), f'at least {limit:g} {unit}'.strip(), value >= limit)
 
 
-def show(rows: Iterable[Row]) -> None:
-    """Print rows under each other, each as soon as it is there."""
+COLUMNS = ('what', 'value', 'target', 'verdict')
+_VERDICTS = {True: 'ok', False: 'MISSED', None: ''}
+
+
+def show(rows: Iterable[Row], path: Path | None = None) -> None:
+    """Print rows under each other, each as soon as it is there, and write them to a CSV file where one is wished."""
+    shown = []
     for row in rows:
-        verdict = {True: 'ok', False: 'MISSED', None: ''}[row.good]
-        print(f'{row.what:<58} {row.value:>16}  {row.target:<18} {verdict}', flush=True)
+        shown.append((row.what, row.value, row.target, _VERDICTS[row.good]))
+        print(f'{row.what:<58} {row.value:>16}  {row.target:<18} {_VERDICTS[row.good]}', flush=True)
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open('w', encoding='utf-8', newline='') as file:
+            csv.writer(file, lineterminator='\n').writerows([COLUMNS, *shown])

@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import Any, cast
 
 from rosbags.interfaces import Connection, Qos
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.rosbag2.storage_mcap import McapWriter
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
@@ -23,11 +23,13 @@ class BagWriter:
 
     As a context it writes aside and takes the name when the block ends well, so that no half-written bag passes for a
     good one. `live` writes under the name from the start: what a recorder wants, whose work is never "done", and which
-    calls `flush` as often as it is willing to lose what came since. An older bag of that name gives way. Raises
-    InputError where the path is something else.
+    calls `flush` as often as it is willing to lose what came since. `compressed`: with zstd, chunk by chunk. An older
+    bag of that name gives way. Raises InputError where the path is something else.
     """
 
-    def __init__(self, path: Path, live: bool = False, definitions: dict[str, str] | None = None) -> None:
+    def __init__(
+        self, path: Path, live: bool = False, definitions: dict[str, str] | None = None, compressed: bool = False
+    ) -> None:
         self._path = path
         self._folder = path if live else _aside(path)
         self.typestore: Typestore = get_typestore(Stores.ROS2_JAZZY)
@@ -37,6 +39,8 @@ class BagWriter:
         _remove(self._folder)
         self._folder.parent.mkdir(parents=True, exist_ok=True)
         self._writer = Writer(self._folder, version=9, storage_plugin=StoragePlugin.MCAP)
+        if compressed:
+            self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         self._writer.open()
 
     def __enter__(self) -> 'BagWriter':

@@ -36,8 +36,8 @@ def summary_figure(
     figure = Figure(figsize=(width * scale + 1.2, height * scale + 1.6), dpi=110, layout='constrained')
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
-    _draw_map(axes, patch)
-    _draw_graph(axes, topology)
+    draw_map(axes, patch)
+    draw_graph(axes, topology)
     if true is not None and len(true):
         axes.plot(true[:, 0], true[:, 1], '-', color=colours.TRUTH, linewidth=2.5, label='path driven', zorder=2)
     if len(estimated):
@@ -51,7 +51,8 @@ def summary_figure(
         figure.savefig(aside, format='png', bbox_inches='tight')
 
 
-def _draw_map(axes: 'Axes', patch: GridPatch) -> None:
+def draw_map(axes: 'Axes', patch: GridPatch) -> None:
+    """Draw the cells of a grid: free white, occupied black, unknown grey."""
     shade = np.full(patch.shape, 0.8)
     shade[patch.free], shade[patch.occupied] = 1.0, 0.0
     frame = patch.frame
@@ -68,7 +69,8 @@ def _draw_map(axes: 'Axes', patch: GridPatch) -> None:
     )
 
 
-def _draw_graph(axes: 'Axes', topology: TopologicalMap) -> None:
+def draw_graph(axes: 'Axes', topology: TopologicalMap, size: float = 5.0) -> None:
+    """Draw the paths of the edges and the nodes by kind, markers so many points wide."""
     for i, edge in enumerate(topology.edges.values()):
         label = 'skeleton' if i == 0 else None
         axes.plot(edge.path[:, 0], edge.path[:, 1], '-', color=colours.EDGE, linewidth=1.2, label=label, zorder=4)
@@ -77,7 +79,7 @@ def _draw_graph(axes: 'Axes', topology: TopologicalMap) -> None:
         if len(places):
             label = f'{kind.name.lower()} nodes'
             axes.plot(
-                *places.T, marker, color=colours.NODES[kind], markersize=5, markeredgecolor='black',
+                *places.T, marker, color=colours.NODES[kind], markersize=size, markeredgecolor='black',
                 markeredgewidth=0.4, linestyle='', label=label, zorder=5,
             )
 

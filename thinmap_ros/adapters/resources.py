@@ -24,10 +24,9 @@ def world_path(name: str) -> Path:
 
 def message_definitions(package: str) -> dict[str, str]:
     """Texts of a package's message definitions by full name, for bags. Empty where the package is not there."""
-    try:
+    folder = Path(__file__).parents[2] / package / 'msg'  # from the source tree: not installed, or no ROS sourced
+    with contextlib.suppress(PackageNotFoundError, OSError):
         folder = Path(get_package_share_directory(package)) / 'msg'
-    except (PackageNotFoundError, OSError):
-        return {}
     return {f'{package}/msg/{file.stem}': file.read_text() for file in sorted(folder.glob('*.msg'))}
 
 

@@ -22,12 +22,21 @@ _FREE, _SOLID = 0, 100
 
 
 def read_world(path: Path) -> tuple[str, GridPatch, Array]:
-    """Name, map and start (3,) of a world YAML (walls, solids) or a map_server YAML (image); start NaN: none given.
+    """Name, map and start (3,), NaN: none given, of a world YAML (walls, solids, tour) or a map_server YAML (image).
 
     Raises InputError naming the file, the key, the value and what was expected.
     """
     content = read_yaml(path, 'a world (walls, start) or a map (image, resolution, origin)')
     return _of_map(path, content) if 'image' in content else _of_drawing(path, content)
+
+
+def read_tour(path: Path) -> Array:
+    """Places (N, 2), m, that a world names for a tour, to be visited in this order and from the start on; may be none.
+
+    Raises InputError naming the file, the value and what was expected.
+    """
+    content = read_yaml(path, 'a world (walls, start) or a map (image, resolution, origin)')
+    return _points(path, 'tour', content['tour'], 1) if 'tour' in content else np.empty((0, 2))
 
 
 def _of_map(path: Path, content: dict[str, Any]) -> tuple[str, GridPatch, Array]:
@@ -56,23 +65,24 @@ def _resolution(path: Path, content: dict[str, Any]) -> float:
 
 
 def _polylines(path: Path, content: dict[str, Any], key: str, fewest: int) -> list[Array]:
-    lines = []
     drawn = content.get(key, [])
     if not isinstance(drawn, list):
         raise InputError(f'{path}: {key}: {drawn!r}: expected a list of lists of points [x, y]')
-    for i, points in enumerate(drawn):
-        try:
-            line = np.asarray(points, dtype=np.float64)
-        except (TypeError, ValueError):
-            line = np.empty((0, 0))
-        if line.ndim != 2 or line.shape[1:] != (2,) or len(line) < fewest or not np.isfinite(line).all():
-            raise InputError(f'{path}: {key}[{i}]: {points!r}: expected at least {fewest} points [x, y]')
-        lines.append(line)
-    return lines
+    return [_points(path, f'{key}[{i}]', points, fewest) for i, points in enumerate(drawn)]
+
+
+def _points(path: Path, what: str, drawn: object, fewest: int) -> Array:
+    try:
+        points = np.asarray(drawn, dtype=np.float64)
+    except (TypeError, ValueError):
+        points = np.empty((0, 0))
+    if points.ndim != 2 or points.shape[1:] != (2,) or len(points) < fewest or not np.isfinite(points).all():
+        raise InputError(f'{path}: {what}: {drawn!r}: expected at least {fewest} points [x, y]')
+    return points
 
 
 def _of_drawing(path: Path, content: dict[str, Any]) -> tuple[str, GridPatch, Array]:
-    known = {'name', 'resolution', 'wall_thickness', 'start', 'walls', 'solids'}
+    known = {'name', 'resolution', 'wall_thickness', 'start', 'tour', 'walls', 'solids'}
     if unknown := set(content) - known:
         raise InputError(f'{path}: unknown key {sorted(unknown)[0]!r}: expected {", ".join(sorted(known))}')
     resolution = _resolution(path, content)

@@ -45,7 +45,7 @@ from thinmap_ros.tools.report import Ending, EndNodeCensus, TargetLog, explorati
 _CONTROL_STEPS = 2
 _MEASURE_SCANS = 5
 # At the survey's pace; thinning costs more than all else together.
-_SCANS_PER_GRAPH = 5
+SCANS_PER_GRAPH = 5
 
 
 class Strategy(Protocol):
@@ -186,7 +186,7 @@ def make_loop(world: World, start: Array, options: Options) -> ClosedLoop:
     source = true_pose_source(simulation) if options.localization == 'truth' else None
     # A beam that met nothing has seen as far as this laser can.
     grid = OccupancyConfig(no_return_range_m=options.laser.range_max_m)
-    pipeline = Pipeline(PipelineConfig(localizer=localizer, grid=grid, scans_per_graph=_SCANS_PER_GRAPH), source)
+    pipeline = Pipeline(PipelineConfig(localizer=localizer, grid=grid, scans_per_graph=SCANS_PER_GRAPH), source)
     navigator = Navigator(NavigatorConfig(max_speed_m_s=options.speed_m_s))
     return ClosedLoop(simulation, pipeline, STRATEGIES[options.strategy](), navigator)
 

@@ -1,0 +1,58 @@
+"""Make docs/benchmarks.md of the results of benchmarks: python -m benchmarks.page CSV_DIR [DOCS_DIR]."""
+
+import csv
+import sys
+from pathlib import Path
+
+_HEAD = """\
+# Benchmarks
+
+Made by `python -m benchmarks.page out/benchmarks` of the files that `python -m benchmarks.run --csv out/benchmarks`
+leaves (`--quick` where a table is short). Times are of one core; a load far above the number of cores says that the
+machine was busy with other things, and that all times are much too long.
+
+Machine: {machine}.
+"""
+# In this order, what each is about.
+_ABOUT = {
+    'thinning': 'Thinning a real floor, laid side by side to a size, against scikit-image, OpenCV (padded: the same '
+    'cells) and simpler work on the same cells.',
+    'mapping': 'Scans into the occupancy grid.',
+    'graphs': 'Maps of whole floors into graphs, against the Voronoi diagram by SciPy; are they drivable and complete?',
+    'online': 'Grid and global graph on a drive, scan by scan.',
+    'nodes': 'What the ROS nodes of map and graph need for a scan.',
+    'localization': 'Global localization from 5,000 samples.',
+    'planning': 'The wavefront planner.',
+    'slam': 'A step of the localizer by the number of features in the map: the filter over the local area (ti), over '
+    'all features (full).',
+    'growth': 'Localizer, grid and graph together on a long drive through the warehouse of 200 x 200 m.',
+}
+
+
+def page(folder: Path) -> str:
+    """Text of the page."""
+    machine = ', '.join(f'{what} {value}' for what, value, _, _ in _rows(folder / 'machine.csv'))
+    parts = [_HEAD.format(machine=machine)]
+    for name, about in _ABOUT.items():
+        path = folder / f'{name}.csv'
+        if path.exists():
+            parts.append(f'## {name}\n\n{about}\n')
+            parts.append('| what | value | target | |\n|---|---|---|---|')
+            parts += [f'| {" | ".join(_indented(row))} |' for row in _rows(path)]
+            parts.append('')
+    return '\n'.join(parts)
+
+
+def _rows(path: Path) -> list[list[str]]:
+    with path.open(encoding='utf-8', newline='') as file:
+        return list(csv.reader(file))[1:]
+
+
+def _indented(row: list[str]) -> list[str]:
+    what, *rest = row
+    return ['&nbsp;&nbsp;' * (len(what) - len(what.lstrip())) + what.strip(), *rest]
+
+
+if __name__ == '__main__':
+    docs = Path(sys.argv[2]) if len(sys.argv) > 2 else Path(__file__).resolve().parent.parent / 'docs'
+    (docs / 'benchmarks.md').write_text(page(Path(sys.argv[1])), encoding='utf-8')

@@ -1,0 +1,48 @@
+"""Paper 3, Fig. 10: the map of an office against its CAD data."""
+
+from itertools import islice
+
+import numpy as np
+
+from thinmap_ros.adapters.plots import Plot
+from thinmap_ros.tools.experiments import map_error
+from thinmap_ros.tools.experiments.drives import Source, world_of
+from thinmap_ros.tools.experiments.outcome import Comparison, Outcome, Table
+from thinmap_ros.tools.experiments.slam_run import run_slam
+
+_QUICK_SCANS = 150
+
+
+def run(source: Source) -> Outcome:
+    """Map the office with EKF-SLAM/TI."""
+    world = world_of('office')
+    done = run_slam(islice(source.looks('office'), _QUICK_SCANS if source.quick else None))
+    error = map_error.map_error(done.pipeline.grid.patch(), world)
+    off = np.hypot(*done.errors()[:, :2].T)
+    wheels = np.hypot(*done.errors(done.odometry)[:, :2].T)
+    row = map_error.row('office', error)
+    return Outcome(
+        'The map of an office',
+        'SLAM paper, section 5.1, Fig. 10',
+        'The office of 9.5 x 7.5 m with furniture; a Pioneer 3-AT with an LMS200 drives its tour at 0.2 m/s '
+        f'({done.way_m:.0f} m). Cells of 0.1 m.',
+        [Table('map', map_error.COLUMNS, [row])],
+        [
+            Plot(
+                'fig10', 'Paper 3, Fig. 10: (a) CAD data, (b) grid map by EKF-SLAM/TI, (c) its errors.',
+                map_error.panels(error, world), columns=3, panel_inches=(4.6, 3.9),
+            )
+        ],
+        [
+            Comparison(
+                'map against CAD data', 'similar to the accurate map',
+                f'occupied cells {100 * error.cells_off_m.mean():.1f} cm off (mean), {float(str(row[4])):.0%} within '
+                'a cell; '
+                f'{error.found:.0%} of all surfaces found', bool(error.cells_off_m.mean() < 0.1),
+            ),
+            Comparison(
+                'pose', '', f'{100 * off.mean():.1f} cm off (mean), {100 * off.max():.1f} cm (most); '
+                f'wheels alone {wheels[-1]:.2f} m at the end',
+            ),
+        ],
+    )  # fmt: skip

@@ -1,0 +1,136 @@
+"""Record the drives behind the experiments: sensors, ground truth and outputs, each as a bag with a text about it."""
+
+import argparse
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from thinmap_ros.adapters import resources
+from thinmap_ros.adapters.bag_objects import BagObjects
+from thinmap_ros.adapters.bag_writer import BagWriter
+from thinmap_ros.adapters.files import write_text
+from thinmap_ros.core import se2
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.localizer import Estimate, LocalizerConfig
+from thinmap_ros.pipeline import Pipeline, PipelineConfig
+from thinmap_ros.sim.tours import Look
+from thinmap_ros.tools import cli
+from thinmap_ros.tools.experiments.drives import RECIPES, TRUTH_TOPIC, Source
+
+_MAP_EVERY = 300  # scans: a minute
+_TYPES = {
+    '/scan': 'sensor_msgs/msg/LaserScan', '/odom': 'nav_msgs/msg/Odometry', '/tf': 'tf2_msgs/msg/TFMessage',
+    '/tf_static': 'tf2_msgs/msg/TFMessage', TRUTH_TOPIC: 'geometry_msgs/msg/PoseStamped',
+    '/pose': 'geometry_msgs/msg/PoseWithCovarianceStamped', '/map': 'nav_msgs/msg/OccupancyGrid',
+    '/topology': 'thinmap_msgs/msg/TopologicalMap',
+}  # fmt: skip
+
+
+class _Recording:
+    """A bag that is written to, its messages of one stamp a nanosecond apart in the log."""
+
+    def __init__(self, writer: BagWriter) -> None:
+        self._writer = writer
+        self._objects = BagObjects(writer.typestore.types)
+        self._log_ns = 0
+
+    def _write(self, topic: str, stamp_ns: int, message: object) -> None:
+        self._log_ns = max(stamp_ns, self._log_ns + 1)
+        self._writer.write(topic, _TYPES[topic], self._log_ns, message)
+
+    def mount(self, look: Look) -> None:
+        """Where the laser sits."""
+        ns, made = look.scan.stamp_ns, self._objects
+        self._write('/tf_static', ns, made.transform(ns, ('base_link', 'laser'), look.scan.T_base_laser))
+
+    def sensed(self, look: Look) -> None:
+        """What the robot had at a scan, and where it truly was."""
+        ns, made = look.scan.stamp_ns, self._objects
+        self._write(TRUTH_TOPIC, ns, made.pose(ns, 'map', look.T_world_base))
+        self._write('/odom', ns, made.odometry(ns, look.T_odom_base))
+        self._write('/tf', ns, made.transform(ns, ('odom', 'base_link'), look.T_odom_base))
+        self._write('/scan', ns, made.scan(look.scan))
+
+    def found(self, ns: int, estimate: Estimate) -> None:
+        """What the localizer made of it."""
+        made = self._objects
+        self._write('/pose', ns, made.estimate(ns, estimate.T_map_base, estimate.covariance))
+        self._write('/tf', ns, made.transform(ns, ('map', 'odom'), estimate.T_map_odom))
+
+    def mapped(self, ns: int, pipeline: Pipeline) -> None:
+        """Map and graph as they are."""
+        self._write('/map', ns, self._objects.grid(ns, pipeline.grid.patch()))
+        self._write('/topology', ns, self._objects.topology(ns, pipeline.topology.map))
+
+
+def record(path: Path, looks: Iterable[Look], localized: bool) -> int:
+    """Write the bag of a drive; returns the number of scans. localized: by the localizer, else by ground truth."""
+    definitions, scans, pipeline = resources.message_definitions('thinmap_msgs'), 0, None
+    with BagWriter(path, definitions=definitions, compressed=True) as writer:
+        recording = _Recording(writer)
+        for look in looks:
+            if pipeline is None:
+                pipeline, truth = _pipeline(look, localized)
+                recording.mount(look)
+            truth[:] = [look.T_world_base]
+            recording.sensed(look)
+            recording.found(look.scan.stamp_ns, pipeline.step(look.scan, look.T_odom_base).estimate)
+            scans += 1
+            if scans % _MAP_EVERY == 0:
+                recording.mapped(look.scan.stamp_ns, pipeline)
+        if pipeline is not None and scans % _MAP_EVERY:
+            recording.mapped(look.scan.stamp_ns, pipeline)
+    return scans
+
+
+def _pipeline(first: Look, localized: bool) -> tuple[Pipeline, list[Array]]:
+    """A pipeline for a drive that begins so, and the list into which the true pose of each scan is to be put."""
+    x, y, yaw = (float(number) for number in first.T_world_base)
+    config = PipelineConfig(localizer=LocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=yaw))
+    truth: list[Array] = []
+
+    def known(scan: object, T_odom_base: Array) -> Estimate:
+        return Estimate(truth[0], np.zeros((3, 3)), se2.compose(truth[0], se2.invert(T_odom_base)))
+
+    return Pipeline(config, None if localized else known), truth
+
+
+def _about(name: str, seed: int, scans: int, seconds: float, localized: bool) -> str:
+    recipe = RECIPES[name]
+    poses = 'by the localizer' if localized else 'the true ones'
+    return (
+        f'{name}.mcap\n\n'
+        f'A simulated Pioneer {recipe.robot.upper()} with an LMS200 (181 beams, 8 m, 5 Hz),\n'
+        f'in worlds/{recipe.world}.yaml, {recipe.how}.\n'
+        f'Seed {seed}; {scans} scans in {seconds:.1f} s.\n\n'
+        f'Topics: /scan /odom /tf /tf_static {TRUTH_TOPIC}, and as outputs /pose (poses {poses}), and once a minute\n'
+        '/map and /topology. MCAP with zstd. Made by: scripts/record_bags\n'
+    )  # fmt: skip
+
+
+def _work(arguments: argparse.Namespace) -> None:
+    if unknown := set(arguments.names) - set(RECIPES):
+        raise InputError(f'drive {min(unknown)!r}: expected some of {", ".join(RECIPES)}')
+    for name in arguments.names or RECIPES:
+        path = arguments.out / f'{name}.mcap'
+        looks = list(Source(arguments.seed).looks(name))
+        localized = RECIPES[name].localized
+        scans = record(path, looks, localized)
+        seconds = (looks[-1].scan.stamp_ns - looks[0].scan.stamp_ns) / 1e9
+        write_text(arguments.out / f'{name}.txt', _about(name, arguments.seed, scans, seconds, localized))
+        print(f'{path}: {scans} scans, {path.stat().st_size / 1e6:.2f} MB', flush=True)
+
+
+def main() -> None:
+    """Run the program."""
+    parser = argparse.ArgumentParser(prog='record_bags', description=__doc__)
+    parser.add_argument('names', nargs='*', help=f'which drives: some of {", ".join(RECIPES)} (default: all)')
+    parser.add_argument('-o', '--out', type=Path, required=True, help='folder of the bags')
+    parser.add_argument('--seed', type=int, default=0, help='decides all noise (default 0)')
+    cli.run(_work, parser)
+
+
+if __name__ == '__main__':
+    main()
