@@ -20,7 +20,8 @@ _LEAST_LOG_WEIGHT = -14.0
 _MOST = 400
 _SAME_M, _SAME_RAD = 0.3, 0.15
 _LEAST_ASKED = 0.6  # share of the beams
-_NEW_SIGMA_M, _NEW_SIGMA_RAD = 0.08, 0.03
+# Of those this near to each other one is kept: the place may be anywhere between.
+_NEW_SIGMA_M, _NEW_SIGMA_RAD = 0.5 * _SAME_M, 0.5 * _SAME_RAD
 _MEMORY = 0.85  # of what was explained, from one independent look to the next
 
 
@@ -126,6 +127,14 @@ class Hypotheses:
         owners = renumbered[self.owners]
         order = np.argsort(owners, kind='stable')[int((owners < 0).sum()) :]
         self.samples, self.owners = self.samples[order], owners[order]
+
+    def best_samples(self, log_likelihoods: Array) -> Array:
+        """Of the samples of each, the one with the highest log likelihood (N,); its pose where it has none: (H, 3)."""
+        best = self.poses.copy()
+        order = np.lexsort((log_likelihoods, self.owners))
+        last = np.flatnonzero(np.diff(self.owners, append=-1))
+        best[self.owners[last]] = self.samples[order[last]]
+        return best
 
     def weigh(self, log_likelihoods: Array) -> None:
         """Mean and covariance of the samples of each, weighted by their log likelihoods (N,)."""
