@@ -1,9 +1,12 @@
 """The localizer: one step for each scan, live and offline."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import parameter
@@ -23,6 +26,8 @@ _START_SIGMAS = (1e-4, 1e-4, 1e-4)  # the map begins where the robot stands: no 
 _LONGEST_STEP_M = 5.0  # between two scans the wheels cannot go farther: the odometry was set anew
 _NEW_GROUND = 0.3  # where less of a scan than this lies on what is known, there is nothing to contradict
 _NEW_GROUND_M, _NEW_GROUND_RAD = 0.6, 0.6  # and that is so only this far from where the map last learned
+_KNOWN_M, _KNOWN_RAD = 0.2, 0.2  # this near to there, a scan fits nearly as well as those before it:
+_AS_WELL, _USUAL_MEMORY = 0.7, 0.9  # with at least this share of their points, of which the latest count most
 _LEAP_M, _LEAP_RAD = 0.4, 0.4  # a scan puts the robot this far from where the wheels did: one of them is wrong
 _OF_LATE_M = 100.0  # way in which the drift stays below what a match with the map bridges
 _REDRAWN_AT_ONCE, _REDRAWN_A_STEP = 60, 3  # keyframes drawn anew when a loop was closed, and in each step after it
@@ -48,6 +53,7 @@ class LocalizerConfig(MotionConfig, MatchConfig, LineConfig, FeatureConfig, Loop
     start_yaw_rad: float = parameter(0.0, 'heading at the start, rad')
     look_distance_m: float = parameter(0.1, 'the map learns after so much way, m', low=0.0, high=5.0)
     look_turn_rad: float = parameter(0.1, 'or after such a turn, rad', low=0.0, high=3.0)
+    mapping: bool = parameter(True, 'learn what is seen; false: only find the place in the map that there is')
     lost_scans: int = parameter(5, 'lost after so many scans in a row that do not fit', low=1, high=1000)
 
 
@@ -90,7 +96,8 @@ class Localizer:
         start = se2.pose(self.config.start_x_m, self.config.start_y_m, self.config.start_yaw_rad)
         self._filter = CompressedEkf(start, np.diag(np.square(_START_SIGMAS)))
         self._feature_map = FeatureMap(self.config, local_areas=self.config.slam == 'ti')
-        self._matcher = ScanMatcher(self.config)
+        self._given: Mapping[str, NDArray[Any]] | None = None
+        self._matcher = self._given_map()
         self._loops = Loops(self.config, self.config)
         # Of every step, which keyframe came before it, and the pose from there.
         self._path: list[tuple[int, Array]] = []
@@ -102,6 +109,7 @@ class Localizer:
         self._doubt = np.zeros((3, 3))
         self._placed_by_hand = False
         self._misfits = 0
+        self._usual = 0.0  # share of a scan's points that lie on surfaces of the map, on an average
 
     def set_pose(self, T_map_base: Array, covariance: Array) -> None:
         """Put the robot at a pose (3,) with covariance (3, 3) in the map that it has; the next scans settle it."""
@@ -112,6 +120,32 @@ class Localizer:
         self._ekf.set_pose(T_map_base, covariance + floor)
         self._doubt = covariance + floor
         self._placed_by_hand, self._misfits = True, 0
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """The features and the map of points as arrays by name, for `from_state`; not where the robot is."""
+        return {**self._feature_map.state(self._filter), **self._matcher.map.state(), 'usual': np.array(self._usual)}
+
+    @staticmethod
+    def from_state(state: Mapping[str, NDArray[Any]], config: LocalizerConfig | None = None) -> 'Localizer':
+        """Localizer in the map of another one's `state`, at the configured start: lost, until a scan fits there.
+
+        The map of points that was given stays as it is where loops are closed later. Raises InputError where it is no
+        such state.
+        """
+        localizer = Localizer(config)
+        localizer._given = state
+        localizer._matcher = localizer._given_map()
+        localizer._feature_map.restore(localizer._filter, state)
+        localizer._misfits = localizer.config.lost_scans
+        localizer._usual = float(np.clip(np.nan_to_num(state.get('usual', np.ones(()))), 0.0, 1.0))
+        return localizer
+
+    def _given_map(self) -> ScanMatcher:
+        """A map of points in which there is what was taken over."""
+        matcher = ScanMatcher(self.config)
+        if self._given is not None:
+            matcher.map.restore(self._given)
+        return matcher
 
     @property
     def features(self) -> list[LineFeature]:
@@ -138,7 +172,7 @@ class Localizer:
         self._matcher.map.since_m = -math.inf if self._loops.agreed else way_m - _OF_LATE_M
         match = self._predict(points_base, laser_base, increment, increment_covariance)
         lines, matched = no_lines(), 0
-        if self._has_news() and not self._is_lost():
+        if self.config.mapping and self._has_news() and not self._is_lost():
             laser_map = se2.transform_points(self._ekf.pose, laser_base[None])[0]
             lines, matched = self._correct(scan)
             if match.good or self._on_new_ground(match):
@@ -146,6 +180,8 @@ class Localizer:
                 self._matcher.add(points_map, laser_map)
                 self._T_last_look = self._ekf.pose
                 self._loops.follow(scan, points_base, self._ekf.pose, _is_leap(expected, self._ekf.pose))
+        elif match.good and not self.config.mapping:
+            self._T_last_look = self._ekf.pose
         self._filter.work_off()
         self._loops.work_off()
         correction = self._loops.close()
@@ -177,7 +213,7 @@ class Localizer:
         self._T_last_look = moved
         places = correction.after[:, :2] - moved[:2]
         self._redraw = np.argsort(-np.hypot(*places.T)).tolist()
-        self._matcher = ScanMatcher(self.config)
+        self._matcher = self._given_map()
         near = np.hypot(*places.T) < self.config.match_range_m
         self._redraw_some(min(int(near.sum()), _REDRAWN_AT_ONCE))
 
@@ -221,13 +257,17 @@ class Localizer:
         predicted = se2.compose(pose, increment)
         self._doubt = self._doubt + turn @ covariance @ turn.T
         match = self._matcher.match(points_base, laser_base, predicted, self._doubt)
+        if match.good and not self._fits_as_usual(match):
+            match = replace(match, good=False)
         if match.good:
+            share = match.overlap * match.fit
+            self._usual = _USUAL_MEMORY * (self._usual or share) + (1.0 - _USUAL_MEMORY) * share
             self._doubt, self._misfits = np.zeros((3, 3)), 0
             increment, covariance = se2.between(pose, match.T_map_base), turn.T @ match.covariance @ turn
             predicted = match.T_map_base
         elif not self._on_new_ground(match):
             self._misfits += 1
-        if match.good and (self._placed_by_hand or self.config.slam == 'off'):
+        if match.good and (self._placed_by_hand or self.config.slam == 'off' or not self.config.mapping):
             self._ekf.set_pose(match.T_map_base, match.covariance)
             self._placed_by_hand = False
         else:
@@ -247,6 +287,15 @@ class Localizer:
         """Whether the robot has moved since it last learned: looks from one place err alike, and prove nothing anew."""
         return self._moved(self.config.look_distance_m, self.config.look_turn_rad)
 
+    def _fits_as_usual(self, match: Match) -> bool:
+        """Whether a match is as good as it must be where the robot has just been.
+
+        Of the scan of a robot that was carried off, some points fit as well; but suddenly fewer.
+        """
+        if self._misfits == 0 and self._moved(_KNOWN_M, _KNOWN_RAD, match.T_map_base):
+            return True
+        return match.overlap * match.fit >= _AS_WELL * self._usual
+
     def _on_new_ground(self, match: Match) -> bool:
         """Whether a scan that lies on little that is known can be explained by where the robot has come to.
 
@@ -254,11 +303,11 @@ class Localizer:
         """
         return match.overlap < _NEW_GROUND and self._moved(_NEW_GROUND_M, _NEW_GROUND_RAD)
 
-    def _moved(self, distance_m: float, turn_rad: float) -> bool:
-        """Whether the robot is that far from the last place at which the map learned."""
+    def _moved(self, distance_m: float, turn_rad: float, T_map_base: Array | None = None) -> bool:
+        """Whether the robot, or a pose (3,), is that far from the last place at which the map learned."""
         if self._T_last_look is None:
             return True
-        moved = se2.between(self._T_last_look, self._ekf.pose)
+        moved = se2.between(self._T_last_look, self._ekf.pose if T_map_base is None else T_map_base)
         return math.hypot(moved[0], moved[1]) >= distance_m or abs(float(moved[2])) >= turn_rad
 
     def _is_lost(self) -> bool:
