@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from benchmarks import graphs, localization, mapping, nodes, online, planning, slam, thinning
+from benchmarks import graphs, kidnapping, localization, mapping, nodes, online, planning, slam, thinning
 from benchmarks.table import Row, show
 from benchmarks.worlds import WORLDS
 
@@ -15,6 +15,7 @@ _ALL: dict[str, Callable[[Path, bool], Iterable[Row]]] = {
     'online': online.run,
     'nodes': nodes.run,
     'localization': localization.run,
+    'kidnapping': kidnapping.run,
     'planning': planning.run,
     'slam': slam.run,
 }

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,17 +20,18 @@ from thinmap_ros.core.slam.lines import LineConfig, Lines, extract_lines, no_lin
 from thinmap_ros.core.slam.loops import Correction, Keyframe, LoopConfig, Loops
 from thinmap_ros.core.slam.models import MotionConfig, odometry_covariance, rotation
 from thinmap_ros.core.slam.scan_matching import Match, MatchConfig, ScanMatcher
+from thinmap_ros.core.slam.tracking import Tracking
 from thinmap_ros.core.topology.graph import TopologicalMap
 
 _START_SIGMAS = (1e-4, 1e-4, 1e-4)  # the map begins where the robot stands: no doubt, but not singular
 _LONGEST_STEP_M = 5.0  # between two scans the wheels cannot go farther: the odometry was set anew
 _NEW_GROUND = 0.3  # where less of a scan than this lies on what is known, there is nothing to contradict
 _NEW_GROUND_M, _NEW_GROUND_RAD = 0.6, 0.6  # and that is so only this far from where the map last learned
-_KNOWN_M, _KNOWN_RAD = 0.2, 0.2  # this near to there, a scan fits nearly as well as those before it:
-_AS_WELL, _USUAL_MEMORY = 0.7, 0.9  # with at least this share of their points, of which the latest count most
+_KNOWN_M, _KNOWN_RAD = 0.2, 0.2  # nearer than that, most of a scan must be known
 _LEAP_M, _LEAP_RAD = 0.4, 0.4  # a scan puts the robot this far from where the wheels did: one of them is wrong
 _OF_LATE_M = 100.0  # way in which the drift stays below what a match with the map bridges
 _REDRAWN_AT_ONCE, _REDRAWN_A_STEP = 60, 3  # keyframes drawn anew when a loop was closed, and in each step after it
+_UNKNOWN_SIGMA_M = 300.0  # what a pose is known to while the robot is lost
 _LOST_SIGMA_M = 1.0  # doubt since a scan last fitted; far from the start, more than this is no reason to be lost
 
 
@@ -63,8 +64,9 @@ class Estimate:
 
     observed, matched: lines of this scan, and those found among the features (both 0 where the robot stands still and
     the scan has nothing new to say); n_features, n_local: features in the map, and in the local area; match_quality:
-    share of the scan's points on known ground that fit the map. correction: where a loop was closed in this step, what
-    it did to the keyframes; T_map_base is then the corrected pose.
+    share of the scan's points on known ground that fit the map. lost: it could be anywhere, as the covariance says.
+    correction: where a loop was closed in this step, what it did to the keyframes; T_map_base is then the corrected
+    pose.
     """
 
     T_map_base: Array
@@ -108,8 +110,7 @@ class Localizer:
         # What has been added to the doubt of the pose since a scan last fitted the map.
         self._doubt = np.zeros((3, 3))
         self._placed_by_hand = False
-        self._misfits = 0
-        self._usual = 0.0  # share of a scan's points that lie on surfaces of the map, on an average
+        self._tracking = Tracking(self.config.lost_scans)
 
     def set_pose(self, T_map_base: Array, covariance: Array) -> None:
         """Put the robot at a pose (3,) with covariance (3, 3) in the map that it has; the next scans settle it."""
@@ -119,11 +120,13 @@ class Localizer:
         floor = np.diag(np.square(_START_SIGMAS))
         self._ekf.set_pose(T_map_base, covariance + floor)
         self._doubt = covariance + floor
-        self._placed_by_hand, self._misfits = True, 0
+        self._placed_by_hand = True
+        self._tracking.found()
 
     def state(self) -> dict[str, NDArray[Any]]:
         """The features and the map of points as arrays by name, for `from_state`; not where the robot is."""
-        return {**self._feature_map.state(self._filter), **self._matcher.map.state(), 'usual': np.array(self._usual)}
+        usual = np.array(self._tracking.usual)
+        return {**self._feature_map.state(self._filter), **self._matcher.map.state(), 'usual': usual}
 
     @staticmethod
     def from_state(state: Mapping[str, NDArray[Any]], config: LocalizerConfig | None = None) -> 'Localizer':
@@ -136,8 +139,8 @@ class Localizer:
         localizer._given = state
         localizer._matcher = localizer._given_map()
         localizer._feature_map.restore(localizer._filter, state)
-        localizer._misfits = localizer.config.lost_scans
-        localizer._usual = float(np.clip(np.nan_to_num(state.get('usual', np.ones(()))), 0.0, 1.0))
+        usual = float(np.clip(np.nan_to_num(state.get('usual', np.ones(()))), 0.0, 1.0))
+        localizer._tracking = Tracking(localizer.config.lost_scans, usual, carried=True)
         return localizer
 
     def _given_map(self) -> ScanMatcher:
@@ -146,6 +149,11 @@ class Localizer:
         if self._given is not None:
             matcher.map.restore(self._given)
         return matcher
+
+    @property
+    def pose(self) -> Array:
+        """Where the robot is, T_map_base (3,)."""
+        return self._ekf.pose
 
     @property
     def features(self) -> list[LineFeature]:
@@ -170,7 +178,7 @@ class Localizer:
         self._matcher.map.way_m = way_m
         # Until it is known that old and new agree here, a scan is matched with what was seen of late.
         self._matcher.map.since_m = -math.inf if self._loops.agreed else way_m - _OF_LATE_M
-        match = self._predict(points_base, laser_base, increment, increment_covariance)
+        match = self._predict(scan, points_base, laser_base, increment, increment_covariance)
         lines, matched = no_lines(), 0
         if self.config.mapping and self._has_news() and not self._is_lost():
             laser_map = se2.transform_points(self._ekf.pose, laser_base[None])[0]
@@ -250,23 +258,22 @@ class Localizer:
         near = scan.ranges_m[scan.hit] < self.config.match_range_m
         return np.ascontiguousarray(scan.points_base()[near]), np.ascontiguousarray(scan.T_base_laser[:2])
 
-    def _predict(self, points_base: Array, laser_base: Array, increment: Array, covariance: Array) -> Match:
+    def _predict(
+        self, scan: Scan, points_base: Array, laser_base: Array, increment: Array, covariance: Array
+    ) -> Match:
         """Eqs. (10), (11): the increment is the odometry's, or where the scan fits the map, that of the match."""
         pose = self._ekf.pose
         turn = rotation(float(pose[2]))
         predicted = se2.compose(pose, increment)
         self._doubt = self._doubt + turn @ covariance @ turn.T
         match = self._matcher.match(points_base, laser_base, predicted, self._doubt)
-        if match.good and not self._fits_as_usual(match):
-            match = replace(match, good=False)
+        near = not self._moved(_KNOWN_M, _KNOWN_RAD, match.T_map_base)
+        match = self._tracking.judged(match, points_base, scan, increment, near)
+        self._tracking.count(match.good, self._on_new_ground(match))
         if match.good:
-            share = match.overlap * match.fit
-            self._usual = _USUAL_MEMORY * (self._usual or share) + (1.0 - _USUAL_MEMORY) * share
-            self._doubt, self._misfits = np.zeros((3, 3)), 0
+            self._doubt = np.zeros((3, 3))
             increment, covariance = se2.between(pose, match.T_map_base), turn.T @ match.covariance @ turn
             predicted = match.T_map_base
-        elif not self._on_new_ground(match):
-            self._misfits += 1
         if match.good and (self._placed_by_hand or self.config.slam == 'off' or not self.config.mapping):
             self._ekf.set_pose(match.T_map_base, match.covariance)
             self._placed_by_hand = False
@@ -287,15 +294,6 @@ class Localizer:
         """Whether the robot has moved since it last learned: looks from one place err alike, and prove nothing anew."""
         return self._moved(self.config.look_distance_m, self.config.look_turn_rad)
 
-    def _fits_as_usual(self, match: Match) -> bool:
-        """Whether a match is as good as it must be where the robot has just been.
-
-        Of the scan of a robot that was carried off, some points fit as well; but suddenly fewer.
-        """
-        if self._misfits == 0 and self._moved(_KNOWN_M, _KNOWN_RAD, match.T_map_base):
-            return True
-        return match.overlap * match.fit >= _AS_WELL * self._usual
-
     def _on_new_ground(self, match: Match) -> bool:
         """Whether a scan that lies on little that is known can be explained by where the robot has come to.
 
@@ -312,21 +310,22 @@ class Localizer:
 
     def _is_lost(self) -> bool:
         in_doubt = max(self._doubt[0, 0], self._doubt[1, 1]) > _LOST_SIGMA_M**2
-        return self._misfits >= self.config.lost_scans or bool(in_doubt)
+        return self._tracking.lost or bool(in_doubt)
 
     def _estimate(self, match: Match, lines: Lines, matched: int, correction: Correction | None) -> Estimate:
         T_map_base = self._ekf.pose
         T_odom_base = np.zeros(3) if self._T_odom_base is None else self._T_odom_base
+        lost, covariance = self._is_lost(), self._ekf.pose_covariance
         return Estimate(
             T_map_base,
-            self._ekf.pose_covariance,
+            covariance + np.diag([_UNKNOWN_SIGMA_M**2, _UNKNOWN_SIGMA_M**2, math.pi**2]) if lost else covariance,
             se2.compose(T_map_base, se2.invert(T_odom_base)),
             len(lines),
             matched,
             len(self._feature_map),
             len(self._filter.area),
             match.fit,
-            self._is_lost(),
+            lost,
             correction,
         )
 
