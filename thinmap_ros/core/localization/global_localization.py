@@ -34,9 +34,9 @@ _FRESH_SHARE = 0.2  # of the samples that are drawn anew all over the map while 
 _FRESH_BEST = 100
 _JUMP_RAD = 2.0
 _STANDING_NOISE = (0.01, 0.005)  # m, rad: samples do not fall together
-# A search that looked at all of the map and did not find the right place: this often. So who turns up late is unlikely.
-_LOG_MISSED = math.log(0.3)
-_LEAST_LOG_PRIOR = -9.0
+# A search that looked at all of the map and did not find the right place: this often. So who turns up late is unlikely,
+# but what one search misses the next ones may miss for the same reason: so often they all do.
+_LOG_MISSED, _LEAST_LOG_PRIOR = math.log(0.3), math.log(0.05)
 _TRUST_FROM = 0.6  # share of the beams that must be explained for that
 _FIRST_SEARCHES, _LATER_EVERY = 6, 4.0  # looks: once all places are known, the map is searched less often
 

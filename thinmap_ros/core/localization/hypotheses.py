@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.jit import kernel
-from thinmap_ros.core.localization.search import distinct_indices, moved
+from thinmap_ros.core.localization.search import SILENT_COUNTS, distinct_indices, moved
 from thinmap_ros.core.se2 import Array
 
 # A beam that one place explains and another does not: about 1 in log odds, but beams that miss come in groups.
@@ -28,13 +28,13 @@ _MEMORY = 0.85  # of what was explained, from one independent look to the next
 def evidence_against(judged: tuple[Array, Array], beams: int, novelty: float) -> Array:
     """What is taken off log weights for beams that are not explained, in comparison with the best one, (N,).
 
-    judged: of so many beams, how many the map explains, and of how many it says nothing, (N,) each; these count half.
+    judged: of so many beams, how many the map explains, and of how many it says nothing, (N,) each.
 
     Differences that chance brings about at edges count for nothing, however often they come: two rooms that look the
     same stay equally likely.
     """
     allowed = 3.0 * math.sqrt(beams * EDGE_SHARE * (1.0 - EDGE_SHARE))
-    missing = beams - judged[0] - 0.5 * judged[1]
+    missing = beams - judged[0] - SILENT_COUNTS * judged[1]
     beyond = np.maximum(missing - missing.min(initial=np.inf) - allowed, 0.0)
     return np.asarray(novelty * np.minimum(LOG_ODDS_A_BEAM * beyond, _MOST_A_LOOK))
 
