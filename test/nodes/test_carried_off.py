@@ -10,7 +10,7 @@ from thinmap_msgs.srv import SaveMap
 from thinmap_ros.adapters import messages, qos
 from thinmap_ros.core import se2
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.slow, pytest.mark.timeout(400)]
 START, ELSEWHERE, THERE = (2.0, 2.0, 0.0), (5.5, 2.0, 1.0), (3.8, 7.6, -1.2)
 NODES = ('grid_mapper', 'topology_builder', 'localizer')
 
