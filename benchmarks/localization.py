@@ -12,6 +12,7 @@ from benchmarks.table import Row, at_least, at_most
 from benchmarks.timing import best_seconds
 from benchmarks.worlds import floors
 from thinmap_ros.adapters.world_files import read_world
+from thinmap_ros.baselines.voronoi import build_voronoi
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.localization.calibration import NodeModel, random_pose
@@ -139,6 +140,19 @@ def _laboratory(quick: bool) -> Iterator[Row]:
     yield from tally.rows('lab, random starts, 15 steps', 99.0, 0.0)
 
 
+def _thinning_or_voronoi(quick: bool) -> Iterator[Row]:
+    """The laboratory with the nodes of thinning, and of a Voronoi diagram, in the map; a scan's own are of thinning."""
+    world = World.from_patch(*read_world(_LAB))
+    known = merged_map(world, _STOPS)
+    for name, topology in (('thinning', known.topology), ('Voronoi', build_voronoi(known.patch))):
+        rng, tally = np.random.default_rng(5), Tally()
+        finder = GlobalLocalization(known.patch, topology, seed=5)
+        for seed in range(20 if quick else 200):
+            drive = random_drive(world, random_start(world, rng), 2000 + seed)
+            find(finder, drive, tally, _STEP_SCANS, 15, np.inf)
+        yield from tally.rows(f'lab, {len(topology.nodes)} nodes by {name}, 15 steps', 99.0, 0.0)
+
+
 def _buildings(folder: Path, quick: bool) -> Iterator[Row]:
     for part, count in (('kth', 100), ('dungeon', 100)):
         tally = Tally()
@@ -237,6 +251,7 @@ def run(folder: Path, quick: bool) -> Iterator[Row]:
     """All of it; quick: fewer starts and worlds."""
     yield from _step_times(folder, quick)
     yield from _laboratory(quick)
+    yield from _thinning_or_voronoi(quick)
     yield from _ambiguous(quick)
     yield from _elsewhere(folder, quick)
     yield from _buildings(folder, quick)

@@ -4,7 +4,19 @@ import argparse
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from benchmarks import exploration, graphs, growth, localization, mapping, nodes, online, planning, slam, thinning
+from benchmarks import (
+    exploration,
+    graphs,
+    growth,
+    kidnapping,
+    localization,
+    mapping,
+    nodes,
+    online,
+    planning,
+    slam,
+    thinning,
+)
 from benchmarks.machine import machine
 from benchmarks.table import Row, show
 from benchmarks.worlds import WORLDS
@@ -16,6 +28,7 @@ _ALL: dict[str, Callable[[Path, bool], Iterable[Row]]] = {
     'online': online.run,
     'nodes': nodes.run,
     'localization': localization.run,
+    'kidnapping': kidnapping.run,
     'planning': planning.run,
     'exploration': exploration.run,
     'slam': slam.run,

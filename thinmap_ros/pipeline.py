@@ -63,10 +63,11 @@ class Pipeline:
             estimate = self._locate(scan, T_odom_base)
         if self._history is not None and estimate.correction is not None:
             self._rebuild(self._history, scan.stamp_ns)
-        with self._timed('grid'):
-            self.grid.update(scan, estimate.T_map_base)
-        if self._history is not None:
-            self._history.add(scan, estimate.T_map_base)
+        if not estimate.lost:
+            with self._timed('grid'):
+                self.grid.update(scan, estimate.T_map_base)
+            if self._history is not None:
+                self._history.add(scan, estimate.T_map_base)
         if self._window is None or self._scans % self.config.scans_per_graph == 0:
             self._window = self._thin(estimate.T_map_base)
         self._scans += 1

@@ -11,14 +11,17 @@ from thinmap_ros.adapters.map_files import write_map
 from thinmap_ros.adapters.session_files import (
     has_topology,
     load_exploration,
+    load_features,
     load_grid,
     load_topology,
     read_grid,
     read_topology,
     save_exploration,
+    save_features,
     save_grid,
     save_topology,
     set_exploration_aside,
+    set_features_aside,
     stem_of,
     write_grid,
     write_topology,
@@ -28,6 +31,7 @@ from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.se2 import Array, pose
+from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.core.topology.update import TopologyBuilder
@@ -217,3 +221,23 @@ def test_what_an_exploration_learned_is_the_same_after_a_start(tmp_path):
         load_exploration(stem)
     assert 'room.exploration.npz.old' in set_exploration_aside(stem)
     assert load_exploration(stem) is None
+
+
+def test_features_are_kept_set_aside_or_refused_in_words(tmp_path):
+    stem = str(tmp_path / 'office')
+    assert load_features(stem) is None
+    localizer, world, laser = Localizer(), building(), Lms200(Lms200Config(), 1)
+    for k in range(30):
+        T = pose(3.0 + 0.1 * k, 6.0, 0.0)
+        localizer.step(laser.scan(world, T, k), T)
+    save_features(stem, localizer)
+    loaded = load_features(stem)
+    assert loaded is not None
+    for name, value in localizer.state().items():
+        if name != 'points':
+            np.testing.assert_array_equal(loaded.state()[name], value)
+    (tmp_path / 'bad.features.npz').write_bytes(b'nothing')
+    with pytest.raises(InputError, match=r'bad\.features\.npz: .*expected'):
+        load_features(str(tmp_path / 'bad'))
+    assert 'office.features.npz.old' in set_features_aside(stem)
+    assert load_features(stem) is None

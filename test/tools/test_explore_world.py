@@ -66,6 +66,7 @@ def test_a_map_without_a_start_can_be_explored_from_a_given_one(world: Path, tmp
         (['WORLD', '--start=2.2,0.5,0'], 'expected a place where a robot'),
         (['WORLD', '--range-max-m', '-1'], 'range_max_m = -1.0: expected'),
         (['WORLD', '--speed', '0'], 'max_speed_m_s = 0.0: expected'),
+        (['WORLD', '--kidnap-at', '5'], 'expected --localization=slam'),
     ],
 )
 def test_bad_input_is_told_in_one_line(world: Path, tmp_path: Path, words: list[str], said: str) -> None:

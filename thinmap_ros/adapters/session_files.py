@@ -1,7 +1,8 @@
 """Saved sessions: grid and topological map with all that their builders know, so that work goes on where it was.
 
 A session has a path STEM: STEM.grid.npz holds the grid, STEM.pgm and STEM.yaml the same as a map_server map,
-STEM.topology.npz the graph with its ids, and STEM.exploration.npz what an exploration of it has learned.
+STEM.topology.npz the graph with its ids, STEM.features.npz the localizer's features and map of points, and
+STEM.exploration.npz what an exploration of it has learned.
 """
 
 from collections.abc import Mapping
@@ -16,12 +17,13 @@ from thinmap_ros.adapters.map_files import read_map, write_map
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
+from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
 from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig
 
 _FORMAT = 'thinmap_format'
-_GRID, _TOPOLOGY, _EXPLORATION = 'grid 1', 'topology 1', 'exploration 1'
+_GRID, _TOPOLOGY, _EXPLORATION, _FEATURES = 'grid 1', 'topology 1', 'exploration 1', 'features 1'
 _GRID_END, _TOPOLOGY_END, _MAP_END = '.grid.npz', '.topology.npz', '.yaml'
-_EXPLORATION_END = '.exploration.npz'
+_EXPLORATION_END, _FEATURES_END = '.exploration.npz', '.features.npz'
 
 
 def stem_of(path: str) -> Path:
@@ -29,7 +31,7 @@ def stem_of(path: str) -> Path:
 
     Raises InputError where it names nothing.
     """
-    for end in (_GRID_END, _TOPOLOGY_END, _EXPLORATION_END, _MAP_END, '.pgm'):
+    for end in (_GRID_END, _TOPOLOGY_END, _EXPLORATION_END, _FEATURES_END, _MAP_END, '.pgm'):
         path = path.removesuffix(end)
     if not Path(path).name or '\0' in path:
         raise InputError(f'{path!r}: expected the path of a session, without the endings of its files')
@@ -100,6 +102,24 @@ def load_exploration(path: str, config: ExplorerConfig | None = None) -> Explore
         raise InputError(f'{file}: {error}') from error
 
 
+def save_features(path: str, localizer: Localizer) -> str:
+    """Write STEM.features.npz; returns its name. Raises OSError where that fails."""
+    file = _named(stem_of(path), _FEATURES_END)
+    _write(file, _FEATURES, localizer.state())
+    return str(file)
+
+
+def load_features(path: str, config: LocalizerConfig | None = None) -> Localizer | None:
+    """Read STEM.features.npz; None where the session has none. Raises InputError where it is broken."""
+    file = _named(stem_of(path), _FEATURES_END)
+    if not _is_there(file):
+        return None
+    try:
+        return Localizer.from_state(_read(file, _FEATURES), config)
+    except InputError as error:
+        raise InputError(f'{file}: {error}') from error
+
+
 def has_topology(path: str) -> bool:
     """Whether a session has a graph."""
     return _is_there(_named(stem_of(path), _TOPOLOGY_END))
@@ -115,6 +135,12 @@ def set_exploration_aside(path: str) -> str:
     """Keep what an exploration of an earlier grid has learned as STEM.exploration.npz.old; returns as above."""
     aside = _set_aside(path, _EXPLORATION_END)
     return f'; what was learned of an earlier grid is now {aside}' if aside else ''
+
+
+def set_features_aside(path: str) -> str:
+    """Keep features that were saved with an earlier grid as STEM.features.npz.old; returns as above."""
+    aside = _set_aside(path, _FEATURES_END)
+    return f'; the features of an earlier grid are now {aside}' if aside else ''
 
 
 def _set_aside(path: str, end: str) -> Path | None:

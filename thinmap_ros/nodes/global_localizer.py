@@ -78,6 +78,7 @@ class GlobalLocalizerNode(LiveNode):
         self._finder: GlobalLocalization | None = None
         self._wanted = self._automatic
         self._lost_since_ns: int | None = None
+        self._found_ns = -1  # what the localizer said before it heard the pose says nothing
         self._pairing = ScanPairing()
         self._heard: set[str] = set()
 
@@ -90,7 +91,7 @@ class GlobalLocalizerNode(LiveNode):
     def _on_slam_status(self, message: SlamStatus) -> None:
         """A robot that was carried off: the localizer finds nothing where it thinks that it is."""
         stamp_ns = messages.stamp_ns(message.header.stamp)
-        if message.state != SlamStatus.LOST or self._wanted:
+        if message.state != SlamStatus.LOST or self._wanted or stamp_ns <= self._found_ns:
             self._lost_since_ns = None
         elif self._lost_since_ns is None:
             self._lost_since_ns = stamp_ns
@@ -181,7 +182,7 @@ class GlobalLocalizerNode(LiveNode):
                 messages.pose_with_covariance_msg(found.T_map_base, found.covariance, self._map_frame, ns)
             )
             self.get_logger().info(f'localized: {result.reason}')
-            self._wanted, self._finder = False, None
+            self._wanted, self._finder, self._found_ns = False, None, ns
 
 
 def main() -> None:

@@ -1,10 +1,13 @@
 """The occupancy grid: each scan drawn in at the pose that the localizer found for it."""
 
+from collections.abc import Callable
+
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid as OccupancyGridMsg
 from nav_msgs.msg import Path
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.client import Client
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.srv import LoadMap, SaveMap
@@ -19,8 +22,10 @@ from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.core.errors import ThinmapError
 from thinmap_ros.core.grid.history import GridHistory
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, WindowConfig
+from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
+_LOST_SIGMA_M = 200.0  # a pose that is not known better than this is that of a lost robot
 _NO_BUILDER = 'no graph: there is no topology_builder'
 
 
@@ -34,6 +39,7 @@ class GridMapperNode(LiveNode):
         super().__init__('grid_mapper', recovers=True)
         self._config = parameters.declare(self, OccupancyConfig)
         self._window_m = parameters.declare(self, WindowConfig).window_m
+        self._mapping = parameters.declare_value(self, 'mapping', True, 'draw what is seen; false: the map stays')
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
         self._mount = LaserMount(self)
         self._session = parameters.declare_session(self)
@@ -58,12 +64,14 @@ class GridMapperNode(LiveNode):
         self.create_service(LoadMap, 'load_map', self._on_load)
         self._save_topology = self.create_client(SaveMap, 'save_topology', callback_group=aside)
         self._save_exploration = self.create_client(SaveMap, 'save_exploration', callback_group=aside)
+        self._save_features = self.create_client(SaveMap, 'save_features', callback_group=aside)
+        self._load_features = self.create_client(LoadMap, 'load_features', callback_group=aside)
         self._load_topology = self.create_client(LoadMap, 'load_topology', callback_group=aside)
         self.every(1.0, self._publish_map)
 
     def begin_anew(self) -> None:
         """Forget the map, or go back to the session that the node was started with."""
-        self._matcher: StampMatcher[LaserScan, Array] = StampMatcher()
+        self._matcher: StampMatcher[LaserScan, PoseWithCovarianceStamped] = StampMatcher()
         known = self._session or self._latest_ns is not None
         # None: the map began with a grid of which the scans are not known.
         self._history: GridHistory | None = None if self._session else GridHistory()
@@ -92,25 +100,28 @@ class GridMapperNode(LiveNode):
         self._take(self._matcher.left(messages.stamp_ns(message.header.stamp), message))
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
-        T_map_base = messages.pose_from(message.pose.pose)
-        self._take(self._matcher.right(messages.stamp_ns(message.header.stamp), T_map_base))
+        self._take(self._matcher.right(messages.stamp_ns(message.header.stamp), message))
 
-    def _take(self, pair: tuple[LaserScan, Array] | None) -> None:
+    def _take(self, pair: tuple[LaserScan, PoseWithCovarianceStamped] | None) -> None:
         self.health.dropped_in_all('scans and poses without a partner', self._matcher.dropped)
         if pair is None:
             return
-        message, T_map_base = pair
-        scan = self._mount.scan(message)
+        message, pose = pair
+        scan, T_map_base = self._mount.scan(message), messages.pose_from(pose.pose.pose)
         if self._resumed_ns is not None and scan.stamp_ns < self._resumed_ns:
             self.begin_anew()  # the robot has begun anew as well
         self._resumed_ns = None
         with self.health.timed('map update'):
-            self._grid.update(scan, T_map_base)
-            if self._history is not None:
-                self._history.add(scan, T_map_base)
+            if self._mapping and messages.covariance_from(pose)[0, 0] < _LOST_SIGMA_M**2:
+                self._draw(scan, T_map_base)
             window = self._grid.window(T_map_base[0], T_map_base[1], self._window_m)
         self._latest_ns = scan.stamp_ns
         self._local_map.publish(messages.grid_msg(window, self._map_frame, scan.stamp_ns, self._corrected_ns))
+
+    def _draw(self, scan: Scan, T_map_base: Array) -> None:
+        self._grid.update(scan, T_map_base)
+        if self._history is not None:
+            self._history.add(scan, T_map_base)
 
     def _publish_map(self) -> None:
         if self._latest_ns is not None:
@@ -144,19 +155,21 @@ class GridMapperNode(LiveNode):
         if graph is None:
             saved = response.message
             answer(response, lambda: f'{saved}; {_NO_BUILDER}{session_files.set_topology_aside(path)}')
-            return await self._save_what_was_learned(path, response)
-        response.success, response.message = graph.success, f'{response.message}; {graph.message}'
-        return await self._save_what_was_learned(path, response)
-
-    async def _save_what_was_learned(self, path: str, response: SaveMap.Response) -> SaveMap.Response:
-        saved, learned = response.message, await ask(self, self._save_exploration, SaveMap.Request(path=path))
-        if learned is not None:
-            response.success, response.message = response.success and learned.success, f'{saved}; {learned.message}'
-            return response
-        # Without an explorer, what one has learned of an earlier map must not be taken for this one's.
-        if response.success:
-            answer(response, lambda: f'{saved}{session_files.set_exploration_aside(path)}')
+        else:
+            response.success, response.message = graph.success, f'{response.message}; {graph.message}'
+        await self._save_at(self._save_features, path, session_files.set_features_aside, response)
+        await self._save_at(self._save_exploration, path, session_files.set_exploration_aside, response)
         return response
+
+    async def _save_at(
+        self, client: Client, path: str, set_aside: Callable[[str], str], response: SaveMap.Response
+    ) -> None:
+        """Have another node save its part; without it, what is there of an earlier map must not pass for this one's."""
+        saved, part = response.message, await ask(self, client, SaveMap.Request(path=path))
+        if part is not None:
+            response.success, response.message = response.success and part.success, f'{saved}; {part.message}'
+        elif response.success:
+            answer(response, lambda: f'{saved}{set_aside(path)}')
 
     async def _on_load(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:
         """Take over grid and graph, or neither."""
@@ -172,6 +185,9 @@ class GridMapperNode(LiveNode):
         if response.success:
             self._take_over(grid)
             response.message = f'grid taken over; {response.message}'
+            features = await ask(self, self._load_features, LoadMap.Request(path=request.path))
+            if features is not None:
+                response.success, response.message = features.success, f'{response.message}; {features.message}'
         return response
 
 

@@ -10,11 +10,13 @@ from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
 from thinmap_msgs.msg import LineFeature, LineFeatureArray, SlamStatus, TopologicalMap
+from thinmap_msgs.srv import LoadMap, SaveMap
 from thinmap_ros import warm_up
-from thinmap_ros.adapters import messages, parameters, qos, runtime
+from thinmap_ros.adapters import messages, parameters, qos, runtime, session_files
 from thinmap_ros.adapters.health import ERROR, OK
 from thinmap_ros.adapters.listening import listen
 from thinmap_ros.adapters.live_node import LiveNode
+from thinmap_ros.adapters.services import answer
 from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.core import se2
 from thinmap_ros.core.odometry import LastPose, ScanPairing
@@ -28,7 +30,8 @@ from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 class LocalizerNode(LiveNode):
     """/scan and /odom in; /pose, map -> odom on /tf, /line_features, /slam_status out; /trajectory after a loop.
 
-    Services ~/pause, ~/reset.
+    Services ~/pause, ~/reset, and save_features and load_features for sessions: lost in the map of one, it waits for
+    /initialpose, or for a scan that fits where it is.
     """
 
     def __init__(self) -> None:
@@ -37,6 +40,7 @@ class LocalizerNode(LiveNode):
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
         self._odom_frame = parameters.declare_value(self, 'odom_frame', 'odom', 'frame of the odometry')
         self._mount = LaserMount(self)
+        self._session = parameters.declare_session(self)
         parameters.check_unknown(self)
         warm_up.localizer()
         self._resumed: LastPose | None = None
@@ -57,11 +61,22 @@ class LocalizerNode(LiveNode):
         listen(self, Odometry, 'odom', self._on_odometry, qos.STREAM)
         listen(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
         listen(self, PoseWithCovarianceStamped, 'initialpose', self._on_initial_pose, qos.STREAM)
+        self.create_service(SaveMap, 'save_features', self._on_save)
+        self.create_service(LoadMap, 'load_features', self._on_load)
 
     def begin_anew(self) -> None:
-        """Forget all features: the robot is at its start."""
-        self._localizer, self._pairing = Localizer(self._config), ScanPairing()
+        """Forget all features, or go back to the session that the node was started with: the robot is at its start."""
+        self._localizer, self._pairing = self._made(self._config), ScanPairing()
         self._resumed, self._last, self._topology = None, None, None
+
+    def _made(self, config: LocalizerConfig) -> Localizer:
+        """A localizer that begins at its start, in the map of the session if there is one."""
+        return (session_files.load_features(self._session, config) if self._session else None) or Localizer(config)
+
+    def _at(self, T_map_base: Array) -> LocalizerConfig:
+        """The configuration of a robot that starts at a pose (3,)."""
+        x, y, yaw = T_map_base.tolist()
+        return replace(self._config, start_x_m=x, start_y_m=y, start_yaw_rad=yaw)
 
     def _on_odometry(self, message: Odometry) -> None:
         stamp_ns = messages.stamp_ns(message.header.stamp)
@@ -96,10 +111,25 @@ class LocalizerNode(LiveNode):
         if not last.leads_to(stamp_ns, T_odom_base):
             self.get_logger().warning('the odometry has begun anew as well: beginning at the start')
             return
-        x, y, yaw = se2.compose(last.T_map_odom, T_odom_base).tolist()
-        self._localizer = Localizer(replace(self._config, start_x_m=x, start_y_m=y, start_yaw_rad=yaw))
+        self._localizer = self._made(self._at(se2.compose(last.T_map_odom, T_odom_base)))
         if self._topology is not None:
             self._localizer.set_topology(self._topology)
+
+    def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
+        return answer(response, lambda: f'saved {session_files.save_features(request.path, self._localizer)}')
+
+    def _on_load(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:
+        return answer(response, lambda: self._load(request.path))
+
+    def _load(self, path: str) -> str:
+        """Take over the features of a session; without any, those that there are stay."""
+        loaded = session_files.load_features(path, self._at(self._localizer.pose))
+        if loaded is None:
+            return 'no features are saved: the localizer keeps its own'
+        self._localizer = loaded
+        if self._topology is not None:
+            loaded.set_topology(self._topology)
+        return f'{len(loaded.features)} features'
 
     def _publish(self, ns: int, estimate: Estimate, step_ms: float) -> None:
         self.health.took('localizer', step_ms)

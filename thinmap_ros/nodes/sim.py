@@ -1,4 +1,4 @@
-"""A simulated robot: /cmd_vel in; /scan, /odom, /tf, /clock and the true pose out."""
+"""A simulated robot: /cmd_vel in; /scan, /odom, /tf, /clock and the true pose out; ~/carry puts it elsewhere."""
 
 from dataclasses import dataclass
 from time import monotonic
@@ -19,7 +19,7 @@ from thinmap_ros.adapters.lockstep import NONE, TOPICS, Lockstep
 from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.errors import ConfigError
+from thinmap_ros.core.errors import ConfigError, InputError
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.sim.lms200 import Lms200Config
 from thinmap_ros.sim.pioneer import PRESETS
@@ -77,6 +77,7 @@ class SimNode(Node):
         self._tf = self.create_publisher(TFMessage, '/tf', qos.STREAM)
         self._tf_static = self.create_publisher(TFMessage, '/tf_static', qos.STATIC_TRANSFORMS)
         self.create_subscription(Twist, 'cmd_vel', self._on_command, qos.STREAM)
+        self.create_subscription(PoseStamped, '~/carry', self._on_carry, qos.STREAM)
 
     def _on_command(self, message: Twist) -> None:
         self._health.heard('cmd_vel')
@@ -85,6 +86,14 @@ class SimNode(Node):
             self._health.refused('cmd_vel', f'command {command}: expected finite numbers')
             return
         self._command, self._command_ns = command, self._sim.stamp_ns
+
+    def _on_carry(self, message: PoseStamped) -> None:
+        """Somebody lifts the robot up and puts it down at a pose in the world: its wheels know nothing of it."""
+        self._health.heard('~/carry')
+        try:
+            self._sim.carry(messages.pose_from(message.pose))
+        except InputError as error:
+            self._health.refused('~/carry', str(error))
 
     def _tick(self) -> None:
         if not self._running:

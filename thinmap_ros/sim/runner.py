@@ -33,11 +33,7 @@ class Simulation:
     def __init__(
         self, world: World, start: Array, robot: PioneerConfig, laser: Lms200Config, seed: int
     ) -> None:
-        if not world.is_clear(start[0], start[1], robot.radius_m):
-            raise InputError(
-                f'{world.name}: start {start[:2].tolist()}: expected a place where a robot of '
-                f'{robot.radius_m} m radius touches nothing'
-            )
+        _check_fits(world, start, robot)
         self.world = world
         seeds = np.random.SeedSequence(seed).generate_state(2)
         self.robot = Pioneer(robot, world, start, int(seeds[0]))
@@ -45,6 +41,11 @@ class Simulation:
         self._scan_period_ns = round(1e9 / laser.rate_hz)
         self._next_scan_ns = 0
         self.stamp_ns = 0
+
+    def carry(self, T_world_base: Array) -> None:
+        """Carry the robot to a pose (3,): its wheels do not turn. Raises InputError where it does not fit."""
+        _check_fits(self.world, T_world_base, self.robot.config)
+        self.robot.T_world_base, self.robot.v, self.robot.w = np.array(T_world_base, dtype=np.float64), 0.0, 0.0
 
     def sense(self) -> Moment:
         """Return what the sensors tell now; a scan that is due is given once."""
@@ -59,3 +60,11 @@ class Simulation:
         self.robot.step(v, w, STEP_NS / 1e9)
         self.stamp_ns += STEP_NS
         return self.sense()
+
+
+def _check_fits(world: World, T_world_base: Array, robot: PioneerConfig) -> None:
+    if not world.is_clear(float(T_world_base[0]), float(T_world_base[1]), robot.radius_m):
+        raise InputError(
+            f'{world.name}: start {T_world_base[:2].tolist()}: expected a place where a robot of '
+            f'{robot.radius_m} m radius touches nothing'
+        )

@@ -40,6 +40,7 @@ from thinmap_ros.sim.pioneer import PRESETS
 from thinmap_ros.sim.runner import STEP_NS, Moment, Simulation
 from thinmap_ros.sim.world import World
 from thinmap_ros.tools import cli
+from thinmap_ros.tools.kidnapping import Kidnapping
 from thinmap_ros.tools.report import Ending, EndNodeCensus, TargetLog, exploration_report
 
 _CONTROL_STEPS = 2
@@ -85,11 +86,15 @@ class Log:
 class ClosedLoop:
     """Simulator, pipeline, strategy and navigator, each called in turn as the live graph would."""
 
-    def __init__(self, simulation: Simulation, pipeline: Pipeline, strategy: Strategy, navigator: Navigator) -> None:
+    def __init__(
+        self, simulation: Simulation, pipeline: Pipeline, strategy: Strategy, navigator: Navigator,
+        kidnapping: Kidnapping | None = None,
+    ) -> None:
         self.simulation = simulation
         self.pipeline = pipeline
         self.strategy = strategy
         self.navigator = navigator
+        self.kidnapping = kidnapping
         self.log = Log()
         self.decision: Decision | None = None
         self._patch: GridPatch | None = None
@@ -106,28 +111,47 @@ class ClosedLoop:
                 self._take(moment.scan, moment.T_odom_base)
                 if len(self.log.poses) % _MEASURE_SCANS == 1:
                     show(*self._measure(goal))
-                if self.decision is not None and self.decision.finished:
+                if self.is_finished:
                     break
             if steps % _CONTROL_STEPS == 0:
                 self._control(moment)
             moment, steps = self.simulation.step(*self._command), steps + 1
         show(*self._measure(goal))
-        finished = self.decision is not None and self.decision.finished
+        finished = self.decision is not None and self.is_finished
         reason = self.decision.reason if self.decision is not None and finished else f'time limit of {limit_s:.0f} s'
         return Ending(finished, reason, self.simulation.robot.collisions)
 
+    @property
+    def is_finished(self) -> bool:
+        """Whether the strategy has nothing left to do; a lost robot has."""
+        lost = self.kidnapping is not None and self.kidnapping.is_lost
+        return self.decision is not None and self.decision.finished and not lost
+
     def _take(self, scan: Scan, T_odom_base: Array) -> None:
         """One scan through localization, map and graph to a decision."""
+        if self.kidnapping is not None and self.kidnapping.takes(self, scan, T_odom_base):
+            return
         estimate = self.pipeline.step(scan, T_odom_base).estimate
+        self.note(scan, estimate)
+        if self.kidnapping is None or not self.kidnapping.is_lost:
+            self.decide(scan, estimate)
+
+    def note(self, scan: Scan, estimate: Estimate) -> None:
+        """Log where the robot is, and where it thinks that it is."""
+        self.log.stamps_ns.append(scan.stamp_ns)
+        self.log.poses.append(estimate.T_map_base)
+        self.log.true_poses.append(self.simulation.robot.T_world_base)
+        if self.kidnapping is not None:
+            self.kidnapping.hear(self, scan, estimate)
+
+    def decide(self, scan: Scan, estimate: Estimate) -> None:
+        """Say where to go, by the map as it is now."""
         self._scan, self._T_map_odom = scan, estimate.T_map_odom
         self._patch = self.pipeline.grid.patch()
         # The processor's time: what else the machine does is not the strategy's.
         began = time.thread_time()
         self.decision = self.strategy.step(self.pipeline.topology.map, self._patch, scan, estimate.T_map_base)
         self.log.decision_s.append(time.thread_time() - began)
-        self.log.stamps_ns.append(scan.stamp_ns)
-        self.log.poses.append(estimate.T_map_base)
-        self.log.true_poses.append(self.simulation.robot.T_world_base)
         self.log.census.take([(n.node_id, n.x, n.y) for n in self.decision.end_nodes], estimate.T_map_base)
         target = self.decision.target
         self.log.targets.take(None if target is None else target.goal)
@@ -137,6 +161,12 @@ class ClosedLoop:
         elif self._goal is None or not np.array_equal(target.goal, self._goal):
             self._goal = target.goal
             self.navigator.set_goal(*(float(number) for number in target.goal))
+
+    def drive_by(self, pipeline: Pipeline, strategy: Strategy, navigator: Navigator) -> None:
+        """Have other parts decide where to go from now on."""
+        self.navigator.cancel()
+        self.pipeline, self.strategy, self.navigator = pipeline, strategy, navigator
+        self.decision, self._patch, self._goal, self._command = None, None, None, (0.0, 0.0)
 
     def _control(self, moment: Moment) -> None:
         if self._patch is None:
@@ -176,6 +206,7 @@ class Options:
     robot: str = '2dx'
     laser: Lms200Config = field(default_factory=Lms200Config)
     time_limit_s: float = 20_000.0
+    kidnap_at_s: float | None = None
 
 
 def make_loop(world: World, start: Array, options: Options) -> ClosedLoop:
@@ -188,7 +219,8 @@ def make_loop(world: World, start: Array, options: Options) -> ClosedLoop:
     grid = OccupancyConfig(no_return_range_m=options.laser.range_max_m)
     pipeline = Pipeline(PipelineConfig(localizer=localizer, grid=grid, scans_per_graph=SCANS_PER_GRAPH), source)
     navigator = Navigator(NavigatorConfig(max_speed_m_s=options.speed_m_s))
-    return ClosedLoop(simulation, pipeline, STRATEGIES[options.strategy](), navigator)
+    kidnapping = None if options.kidnap_at_s is None else Kidnapping(options.kidnap_at_s, options.seed)
+    return ClosedLoop(simulation, pipeline, STRATEGIES[options.strategy](), navigator, kidnapping)
 
 
 def nothing_to_show(seconds: float, coverage: float) -> None:
@@ -212,6 +244,7 @@ def explore(
     report['target_changes'], report['reversals'] = log.targets.changes, log.targets.reversals
     milliseconds = 1e3 * np.array(log.decision_s)
     report['decision_ms'] = {'median': round(float(np.median(milliseconds)), 2), 'max': round(milliseconds.max(), 2)}
+    report |= {} if loop.kidnapping is None else loop.kidnapping.report()
     report['world'], report['strategy'], report['wall_s'] = world.name, options.strategy, round(wall_s, 3)
     return loop, report
 
@@ -254,6 +287,7 @@ def options_from(arguments: argparse.Namespace, strategy: str) -> Options:
         robot=arguments.robot,
         laser=cli.config_from(arguments, Lms200Config),
         time_limit_s=arguments.time_limit,
+        kidnap_at_s=arguments.kidnap_at,
     )
 
 
@@ -264,6 +298,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--localization', default='truth', choices=('truth', 'slam'))
     parser.add_argument('--robot', default='2dx', choices=sorted(PRESETS))
     parser.add_argument('--time-limit', type=float, default=20_000.0, help='simulated time to give up at, s')
+    parser.add_argument('--kidnap-at', type=float, help='carry the robot off after so many simulated s (with slam)')
     parser.add_argument('--quiet', action='store_true', help='no progress bar')
     cli.add_config(parser, Lms200Config, ['beams', 'field_of_view_deg', 'range_max_m'])
 
@@ -271,6 +306,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def _work(arguments: argparse.Namespace) -> None:
     world = World.from_patch(*read_world(arguments.world))
     options = options_from(arguments, arguments.strategy)
+    if options.kidnap_at_s is not None and options.localization == 'truth':
+        raise InputError('--kidnap-at: a robot that knows the truth is never lost: expected --localization=slam')
     with tqdm(total=100, unit='%', disable=arguments.quiet, bar_format='{l_bar}{bar}| {postfix}') as bar:
 
         def show(seconds: float, coverage: float) -> None:

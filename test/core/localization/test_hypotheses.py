@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.localization.hypotheses import Hypotheses, evidence_against
+from thinmap_ros.core.localization.search import SILENT_COUNTS
 
 
 def some(*poses, log_weights=None):
@@ -23,10 +24,11 @@ def test_what_chance_brings_about_at_edges_counts_for_nothing():
     assert evidence_against((counts, np.zeros(4)), 60, 0.1) == pytest.approx(0.1 * against)
 
 
-def test_a_beam_of_which_the_map_says_nothing_counts_half():
+def test_a_beam_of_which_the_map_says_nothing_counts_for_a_part():
     silent = evidence_against((np.array([60.0, 20.0]), np.array([0.0, 40.0])), 60, 1.0)[1]
-    denied = evidence_against((np.array([60.0, 40.0]), np.zeros(2)), 60, 1.0)[1]
+    denied = evidence_against((np.array([60.0, 20.0 + SILENT_COUNTS * 40.0]), np.zeros(2)), 60, 1.0)[1]
     assert silent == pytest.approx(denied)
+    assert evidence_against((np.array([60.0, 20.0]), np.zeros(2)), 60, 1.0)[1] > silent > 0.0
 
 
 def test_each_hypothesis_keeps_samples_of_its_own_however_unlikely():

@@ -5,6 +5,7 @@ import pytest
 from slam_room import ROOM, drive, scan_in
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
 
@@ -190,3 +191,74 @@ def test_after_a_reset_the_map_is_empty():
     assert not localizer.features
     estimate = localizer.step(scan_in(ROOM, START), rows[-1][2])
     np.testing.assert_allclose(estimate.T_map_base, START)
+
+
+def test_a_map_is_taken_over_by_another_localizer():
+    """Saved after a drive; put elsewhere in the room, the robot goes on in that map: features keep their ids."""
+    _, first = driven(900)
+    state = first.state()
+    before = {f.id: (f.r_m, f.alpha_rad, f.nodes) for f in first.features}
+    second = Localizer.from_state(state, LocalizerConfig())
+    assert {f.id: (f.r_m, f.alpha_rad, f.nodes) for f in second.features} == before
+    np.testing.assert_array_equal(
+        np.array([f.covariance for f in second.features]), np.array([f.covariance for f in first.features])
+    )
+    rng = np.random.default_rng(8)
+    elsewhere = np.array([8.0, 8.0, np.pi / 2.0])
+    second.set_pose(elsewhere + [0.15, -0.1, 0.05], np.diag([0.04, 0.04, 0.01]))
+    matched = 0
+    for i, (truth, odom) in enumerate(drive(300, rng, elsewhere)):
+        estimate = second.step(scan_in(ROOM, truth, rng, i * 200_000_000), odom)
+        matched += estimate.matched
+    assert not estimate.lost
+    off = se2.between(truth, estimate.T_map_base)
+    assert np.hypot(off[0], off[1]) < 0.05
+    assert sum(f.id in before for f in second.features) > 0.7 * len(before)
+    assert matched > 100
+
+
+def test_a_robot_with_a_given_map_is_lost_until_it_is_put_where_it_is():
+    _, first = driven(400)
+    second = Localizer.from_state(first.state(), LocalizerConfig(start_x_m=8.0, start_y_m=1.0))
+    points = second.state()['points']
+    rng, here = np.random.default_rng(8), np.array([2.5, 2.0, 0.3])
+    scans = [scan_in(ROOM, here, rng, i * 200_000_000) for i in range(12)]
+    assert all(second.step(scan, np.zeros(3)).lost for scan in scans[:6])
+    np.testing.assert_array_equal(second.state()['points'], points)
+    second.set_pose(here, 0.01 * np.eye(3))
+    estimates = [second.step(scan, np.zeros(3)) for scan in scans[6:]]
+    assert not any(estimate.lost for estimate in estimates)
+    assert np.hypot(*(estimates[-1].T_map_base - here)[:2]) < 0.03
+
+
+def test_without_mapping_the_map_stays_as_it_is():
+    _, first = driven(900)
+    state = first.state()
+    second = Localizer.from_state(state, LocalizerConfig(**AT_START, mapping=False))
+    rng = np.random.default_rng(8)
+    for i, (truth, odom) in enumerate(drive(300, rng, START)):
+        estimate = second.step(scan_in(ROOM, truth, rng, i * 200_000_000), odom)
+    assert not estimate.lost
+    assert np.hypot(*(estimate.T_map_base - truth)[:2]) < 0.05
+    after = second.state()
+    for name in ('cells', 'ids', 'lines', 'line_covariance', 'spans'):
+        np.testing.assert_array_equal(after[name], state[name])
+    assert not second.keyframes
+
+
+@pytest.mark.parametrize(
+    ('name', 'value'),
+    [
+        ('cell_m', np.array(0.1)), ('cells', np.zeros((3, 2), dtype=np.int64)), ('points', np.full((1, 10), np.nan)),
+        ('lines', np.zeros((1, 3))), ('line_covariance', np.eye(3)), ('next_id', np.array(1)),
+        ('stored_at', np.array([[1, 10_000]])), ('spans', None),
+    ],
+)  # fmt: skip
+def test_a_state_that_is_none_is_refused_in_words(name, value):
+    _, localizer = driven(300)
+    state = localizer.state()
+    del state[name]
+    if value is not None:
+        state[name] = value
+    with pytest.raises(InputError, match=r'^saved .*expected'):
+        Localizer.from_state(state)

@@ -24,9 +24,9 @@ __all__ = ['GlobalLocalization', 'GlobalLocalizationConfig', 'Hypothesis', 'Resu
 
 # Looks from about the same place meet the same errors of the map; they are independent after so much motion.
 _NEW_WAY_M, _NEW_TURN_RAD = 0.5, 0.5
-# Way, m, for which one place must have explained all alone; more for each e-fold of places that looked alike, for
-# what it does not explain (1: all), and for each metre before it turned up.
-_SURE_WAY_M, _SURE_WAY_CROWD_M, _SURE_WAY_MISSING_M, _SURE_WAY_LATE = 0.1, 0.4, 20.0, 0.3
+# Independent looks that a place must have explained: more for each e-fold of places that looked alike, and for each
+# look before it turned up. A look counts the less, the more it leaves unexplained, and nothing from this share on.
+_SURE_LOOKS, _SURE_LOOKS_CROWD, _SURE_LOOKS_LATE, _WORTHLESS = 1.0, 0.5, 2.0, 0.1
 # After so many independent looks, a place that explains must have lasted for this share of them, but not for ever.
 _MANY_LOOKS, _LASTING_SHARE, _LASTING_LOOKS = 16.0, 0.4, 20.0
 _VIEWS = 6
@@ -34,9 +34,9 @@ _FRESH_SHARE = 0.2  # of the samples that are drawn anew all over the map while 
 _FRESH_BEST = 100
 _JUMP_RAD = 2.0
 _STANDING_NOISE = (0.01, 0.005)  # m, rad: samples do not fall together
-# A search that looked at all of the map and did not find the right place: this often. So who turns up late is unlikely.
-_LOG_MISSED = math.log(0.3)
-_LEAST_LOG_PRIOR = -9.0
+# A search that looked at all of the map and did not find the right place: this often. So who turns up late is unlikely,
+# but what one search misses the next ones may miss for the same reason: so often they all do.
+_LOG_MISSED, _LEAST_LOG_PRIOR = math.log(0.3), math.log(0.05)
 _TRUST_FROM = 0.6  # share of the beams that must be explained for that
 _FIRST_SEARCHES, _LATER_EVERY = 6, 4.0  # looks: once all places are known, the map is searched less often
 
@@ -115,7 +115,7 @@ class GlobalLocalization:
         self._independent = 0.0  # looks
         self._since_search = math.inf
         self._searches = 0  # that were complete
-        self._convinced = (0, 0.0)  # looks in a row at which all spoke for one place, and the way meanwhile, m
+        self._convinced = 0  # looks in a row at which all spoke for one place
         self._crowd = 1.0  # how many places looked alike at the most, counted by their weights
         self._drawn = self._draw(self.config.samples)
 
@@ -169,7 +169,7 @@ class GlobalLocalization:
             self._search(judge, seen, T_odom_base)
         known = self._known
         if len(known):
-            known.poses = judge.refined(known.poses, seen, known.covariances)
+            known.poses = self._refined(judge, seen)
             judged = judge.explained(known.poses, seen)
             against = evidence_against(judged, len(seen.ranges_m), novelty)
             known.take_evidence(judged, len(seen.ranges_m), novelty, against)
@@ -180,10 +180,14 @@ class GlobalLocalization:
             known.resample(logs, self.config.samples, self._rng)
         if len(known):
             self._crowd = max(self._crowd, float(np.exp(known.log_weights).sum()))
-        looks, begun_m = self._convinced
-        begun_m = begun_m if looks else self._way_m
-        self._convinced = (looks + 1, begun_m) if self._speaks_for_one() else (0, 0.0)
+        self._convinced = self._convinced + 1 if self._speaks_for_one() else 0
         self._T_look = T_odom_base
+
+    def _refined(self, judge: Judge, seen: Observation) -> Array:
+        """Poses (H, 3) of the hypotheses where this scan fits best; samples that fit lead out of a dead end."""
+        known = self._known
+        others = known.best_samples(judge.log_likelihoods(known.samples, seen)) if len(known.samples) else None
+        return judge.refined(known.poses, seen, known.covariances, others)
 
     def _ready(self, scan: Scan) -> Judge:
         """The judge; the first scan tells which laser it is for."""
@@ -250,19 +254,18 @@ class GlobalLocalization:
 
     @property
     def is_sure(self) -> bool:
-        """Whether one place alone has explained all for some looks in a row, and for some way.
+        """Whether one place alone is left for some looks in a row, and has explained enough of them since it turned up.
 
-        The less it explains, the later it turned up, and the more places of this map have looked alike, the longer: a
+        The less it explains, the later it turned up, and the more places of this map have looked alike, the more: a
         place in a map of another building may look alike for a while.
         """
-        looks, begun_m = self._convinced
-        if looks < self.config.sure_looks:
+        if self._convinced < self.config.sure_looks:
             return False
         best = self._known.best()
-        needed_m = _SURE_WAY_M + _SURE_WAY_CROWD_M * math.log(self._crowd)
-        needed_m += _SURE_WAY_MISSING_M * (1.0 - float(self._known.shares_explained[best]))
-        needed_m += _SURE_WAY_LATE * _NEW_WAY_M * (self._independent - float(self._known.ages[best]))
-        return self._way_m - begun_m >= needed_m
+        age, missing = float(self._known.ages[best]), 1.0 - float(self._known.shares_explained[best])
+        needed = _SURE_LOOKS + _SURE_LOOKS_CROWD * math.log(self._crowd)
+        needed += _SURE_LOOKS_LATE * (self._independent - age)
+        return age * (1.0 - missing / _WORTHLESS) >= needed
 
     def _speaks_for_one(self) -> bool:
         known, config = self._known, self.config

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.jit import kernel
-from thinmap_ros.core.localization.search import distinct_indices, moved
+from thinmap_ros.core.localization.search import SILENT_COUNTS, distinct_indices, moved
 from thinmap_ros.core.se2 import Array
 
 # A beam that one place explains and another does not: about 1 in log odds, but beams that miss come in groups.
@@ -20,20 +20,21 @@ _LEAST_LOG_WEIGHT = -14.0
 _MOST = 400
 _SAME_M, _SAME_RAD = 0.3, 0.15
 _LEAST_ASKED = 0.6  # share of the beams
-_NEW_SIGMA_M, _NEW_SIGMA_RAD = 0.08, 0.03
+# Of those this near to each other one is kept: the place may be anywhere between.
+_NEW_SIGMA_M, _NEW_SIGMA_RAD = 0.5 * _SAME_M, 0.5 * _SAME_RAD
 _MEMORY = 0.85  # of what was explained, from one independent look to the next
 
 
 def evidence_against(judged: tuple[Array, Array], beams: int, novelty: float) -> Array:
     """What is taken off log weights for beams that are not explained, in comparison with the best one, (N,).
 
-    judged: of so many beams, how many the map explains, and of how many it says nothing, (N,) each; these count half.
+    judged: of so many beams, how many the map explains, and of how many it says nothing, (N,) each.
 
     Differences that chance brings about at edges count for nothing, however often they come: two rooms that look the
     same stay equally likely.
     """
     allowed = 3.0 * math.sqrt(beams * EDGE_SHARE * (1.0 - EDGE_SHARE))
-    missing = beams - judged[0] - 0.5 * judged[1]
+    missing = beams - judged[0] - SILENT_COUNTS * judged[1]
     beyond = np.maximum(missing - missing.min(initial=np.inf) - allowed, 0.0)
     return np.asarray(novelty * np.minimum(LOG_ODDS_A_BEAM * beyond, _MOST_A_LOOK))
 
@@ -126,6 +127,14 @@ class Hypotheses:
         owners = renumbered[self.owners]
         order = np.argsort(owners, kind='stable')[int((owners < 0).sum()) :]
         self.samples, self.owners = self.samples[order], owners[order]
+
+    def best_samples(self, log_likelihoods: Array) -> Array:
+        """Of the samples of each, the one with the highest log likelihood (N,); its pose where it has none: (H, 3)."""
+        best = self.poses.copy()
+        order = np.lexsort((log_likelihoods, self.owners))
+        last = np.flatnonzero(np.diff(self.owners, append=-1))
+        best[self.owners[last]] = self.samples[order[last]]
+        return best
 
     def weigh(self, log_likelihoods: Array) -> None:
         """Mean and covariance of the samples of each, weighted by their log likelihoods (N,)."""

@@ -58,10 +58,13 @@ class Judge:
         )
         return np.asarray(ratios / _NODES_A_FACT)
 
-    def refined(self, poses: Array, seen: Observation, covariances: Array | None = None) -> Array:
+    def refined(
+        self, poses: Array, seen: Observation, covariances: Array | None = None, others: Array | None = None
+    ) -> Array:
         """Poses (N, 3) moved to where the beams fit best near by; covariances (N, 3, 3): how far that may be.
 
-        Once straight from where they are, once from where they fit when walls pull from far: whichever fits better.
+        Once straight from where they are, once from where they fit when walls pull from far, and, where others (N, 3)
+        are given, once from there: whichever fits better.
         """
         free = np.zeros((len(poses), 3, 3))
         held: Array = free if covariances is None else np.asarray(np.linalg.inv(covariances + _LEAST_COVARIANCE))
@@ -70,7 +73,11 @@ class Judge:
         for table, steps in self._pulls:
             far, _ = self._uphill(far, seen, table, steps, poses, free)
         far, far_score = self._uphill(far, seen, self._log_table, _FINE_STEPS, poses, held)
-        return np.where((far_score > near_score)[:, None], far, near)
+        best, score = np.where((far_score > near_score)[:, None], far, near), np.maximum(far_score, near_score)
+        if others is not None:
+            other, other_score = self._uphill(others, seen, self._log_table, _FINE_STEPS, poses, held)
+            best = np.where((other_score > score)[:, None], other, best)
+        return best
 
     def _uphill(
         self, poses: Array, seen: Observation, table: Array, steps: Array, expected: Array, held: Array

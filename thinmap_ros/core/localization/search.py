@@ -11,7 +11,8 @@ from thinmap_ros.core.localization.observation import Observation, profile
 from thinmap_ros.core.localization.places import DIRECTIONS, RANGE_UNIT_M, Places
 from thinmap_ros.core.se2 import Array
 
-_SILENT_COUNTS = 0.5  # a beam of which the map says nothing
+# A beam of which the map says nothing, counted in beams that it explains: what is unknown there may well be like that.
+SILENT_COUNTS = 0.75
 _FEWEST_WALLS = 6  # beams that met something, below which a scan could be anywhere
 _MOST_SPOTS = 3000
 _MOST_LOOKED_AT_TWICE = 600
@@ -41,7 +42,7 @@ def candidates(
     spots, complete = _best_spots(places, seen, rng)
     poses = judge.refined(np.concatenate([spots, drawn]), seen)
     counts, silent = judge.explained(poses, seen)
-    counts += _SILENT_COUNTS * silent
+    counts += SILENT_COUNTS * silent
     good = counts >= counts.max() - _BELOW_BEST * len(seen.ranges_m)
     poses, counts = poses[good], counts[good]
     found = distinct(poses[np.argsort(-counts, kind='stable')], 0.3, 0.15, _MOST_LOOKED_AT_TWICE)

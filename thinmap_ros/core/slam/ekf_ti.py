@@ -103,6 +103,19 @@ class CompressedEkf:
         self.enter(area)
         return mean, covariance
 
+    def restore(self, ids: list[int], lines: Array, covariance: Array) -> None:
+        """Take up features with their lines (N, 2) and covariance (2 N, 2 N), into a filter that has none.
+
+        The pose has nothing to do with them. All are in the area until another one is entered.
+        """
+        for feature_id in ids:
+            self._places[feature_id] = self._store.take_place()
+        self._cross = np.zeros((0, self._store.width))
+        mean, own = np.concatenate([self.local.pose, lines.ravel()]), np.zeros((3 + lines.size,) * 2)
+        own[:3, :3], own[3:, 3:] = self.local.pose_covariance, covariance
+        self.local.set_state(mean, own)
+        self.area = list(ids)
+
     def lines(self) -> dict[int, Array]:
         """Line (r, alpha) of every feature; of those outside the area, as of when the area was entered."""
         found = {i: self._store.mean[2 * p : 2 * p + 2] for i, p in self._places.items()}

@@ -5,14 +5,16 @@ after several sightings from different places, because what was only clutter wou
 leaves when several looks went through where it should be.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import parameter
+from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, transform_points
 from thinmap_ros.core.slam.association import AssociationConfig, associate, mahalanobis, meeting
@@ -64,6 +66,43 @@ class FeatureMap:
 
     def __len__(self) -> int:
         return len(self._features)
+
+    def state(self, ekf: CompressedEkf) -> dict[str, NDArray[Any]]:
+        """All features as arrays by name, with the covariance of their lines; candidates are left out."""
+        mean, covariance = ekf.settle()
+        features = [self._features[i] for i in ekf.ids]
+        return {
+            'ids': np.array(ekf.ids, dtype=np.int64),
+            'lines': mean[3:].reshape(-1, 2),
+            'line_covariance': covariance[3:, 3:],
+            'spans': np.array([(f.low, f.high, *f.seen_from, f.missed) for f in features]).reshape(-1, 5),
+            'next_id': np.array(self._next_id),
+            **self.area.state(),
+        }
+
+    def restore(self, ekf: CompressedEkf, state: Mapping[str, NDArray[Any]]) -> None:
+        """Take up the `state` of another map, into an empty one and its filter.
+
+        Raises InputError where it is no such state.
+        """
+        try:
+            ids, lines, covariance, spans = (state[key] for key in ('ids', 'lines', 'line_covariance', 'spans'))
+            n, next_id = len(ids), int(state['next_id'])
+            if (lines.shape, covariance.shape, spans.shape) != ((n, 2), (2 * n, 2 * n), (n, 5)):
+                raise InputError(f'saved features: {n} ids, lines {lines.shape}, spans {spans.shape}: expected as many')
+            if not all(np.isfinite(a).all() for a in (lines, covariance, spans)):
+                raise InputError('saved features: expected finite numbers')
+            if len(set(ids.tolist())) < n or next_id <= ids.max(initial=0):
+                raise InputError(f'saved features: ids up to {ids.max()}, next {next_id}: expected each once')
+            ekf.restore(ids.tolist(), lines, covariance)
+            self._features = {
+                i: Feature(i, low, high, np.array([x, y]), int(missed))
+                for i, (low, high, x, y, missed) in zip(ids.tolist(), spans.tolist(), strict=True)
+            }
+            self._next_id = next_id
+            self.area.restore(state)
+        except (KeyError, ValueError, TypeError) as error:
+            raise InputError(f'saved features: {type(error).__name__} {error}: expected what was saved') from error
 
     def listed(self, ekf: CompressedEkf) -> list[LineFeature]:
         """The features as others see them."""

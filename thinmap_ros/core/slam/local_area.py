@@ -6,9 +6,13 @@ Source: EKF-SLAM/TI paper section 4, Fig. 6-8.
 """
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array, wrap
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 
@@ -47,6 +51,30 @@ class LocalArea:
         if trail is not None:
             self._hand_over({i: before.nodes[i].position for i in self._features_at})
             self._listed_at = np.full(2, np.inf)
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Which features are stored at which nodes (K, 2) as (feature, node), and these nodes with their places."""
+        nodes = self._topology.nodes
+        stored = [(f, n) for f, at in self._nodes_of.items() for n in sorted(at) if n in nodes]
+        ids = sorted({n for _, n in stored})
+        return {
+            'stored_at': np.array(stored, dtype=np.int64).reshape(-1, 2),
+            'node_ids': np.array(ids, dtype=np.int64),
+            'node_places': np.array([nodes[n].position for n in ids]).reshape(-1, 2),
+        }
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Take up the `state` of another area; once a topology is set, it counts instead of the nodes of then."""
+        ids, places = state['node_ids'].tolist(), state['node_places']
+        if not ids:
+            return
+        nodes = [Node(i, NodeKind.CORNER, x, y, 0.0) for i, (x, y) in zip(ids, places.tolist(), strict=True)]
+        self._topology, self._trail = TopologicalMap(nodes), None
+        self._ids, self._places = ids, places
+        for feature_id, node_id in state['stored_at'].tolist():
+            if node_id not in self._topology.nodes:
+                raise InputError(f'saved features: stored at node {node_id}: expected one of {len(ids)} saved nodes')
+            self._put(feature_id, node_id)
 
     def nodes_of(self, feature_id: int) -> list[int]:
         """Ids of the nodes at which a feature is stored."""

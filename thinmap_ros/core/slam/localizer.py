@@ -1,9 +1,12 @@
 """The localizer: one step for each scan, live and offline."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import parameter
@@ -18,16 +21,19 @@ from thinmap_ros.core.slam.loops import Correction, Keyframe, LoopConfig, Loops
 from thinmap_ros.core.slam.models import MotionConfig, motion_jacobians, odometry_covariance, rotation
 from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
 from thinmap_ros.core.slam.scan_matching import FEWEST_POINTS, Match, MatchConfig, ScanMatcher
+from thinmap_ros.core.slam.tracking import Tracking
 from thinmap_ros.core.topology.graph import TopologicalMap
 
 _START_SIGMAS = (1e-4, 1e-4, 1e-4)  # the map begins where the robot stands: no doubt, but not singular
 _LONGEST_STEP_M = 5.0  # between two scans the wheels cannot go farther: the odometry was set anew
 _NEW_GROUND = 0.3  # where less of a scan than this lies on what is known, there is nothing to contradict
 _NEW_GROUND_M, _NEW_GROUND_RAD = 0.6, 0.6  # and that is so only this far from where the map last learned
+_KNOWN_M, _KNOWN_RAD = 0.2, 0.2  # nearer than that, most of a scan must be known
 _LEAP_M, _LEAP_RAD = 0.4, 0.4  # a scan puts the robot this far from where the wheels did: one of them is wrong
 _OF_LATE_M = 100.0  # way in which the drift stays below what a match with the map bridges
 _REDRAWN_AT_ONCE, _REDRAWN_A_STEP = 60, 3  # keyframes drawn anew when a loop was closed, and in each step after it
 _SAME_POINTS_M, _SAME_POINTS_RAD = 1.0, 1.0  # after so much way a match errs by other points than before
+_UNKNOWN_SIGMA_M = 300.0  # what a pose is known to while the robot is lost
 _LOST_SIGMA_M = 1.0  # doubt since a scan last fitted; far from the start, more than this is no reason to be lost
 
 
@@ -50,6 +56,7 @@ class LocalizerConfig(MotionConfig, MatchConfig, LineConfig, FeatureConfig, Loop
     start_yaw_rad: float = parameter(0.0, 'heading at the start, rad')
     look_distance_m: float = parameter(0.3, 'the map learns after so much way, m', low=0.0, high=5.0)
     look_turn_rad: float = parameter(0.2, 'or after such a turn, rad', low=0.0, high=3.0)
+    mapping: bool = parameter(True, 'learn what is seen; false: only find the place in the map that there is')
     lost_scans: int = parameter(5, 'lost after so many scans in a row that do not fit', low=1, high=1000)
 
 
@@ -59,8 +66,9 @@ class Estimate:
 
     observed, matched: lines of this scan, and those found among the features (both 0 where the robot stands still and
     the scan has nothing new to say); n_features, n_local: features in the map, and in the local area; match_quality:
-    share of the scan's points on known ground that fit the map. correction: where a loop was closed in this step, what
-    it did to the keyframes; T_map_base is then the corrected pose.
+    share of the scan's points on known ground that fit the map. lost: it could be anywhere, as the covariance says.
+    correction: where a loop was closed in this step, what it did to the keyframes; T_map_base is then the corrected
+    pose.
     """
 
     T_map_base: Array
@@ -92,7 +100,8 @@ class Localizer:
         start = se2.pose(self.config.start_x_m, self.config.start_y_m, self.config.start_yaw_rad)
         self._filter = CompressedEkf(start, np.diag(np.square(_START_SIGMAS)))
         self._feature_map = FeatureMap(self.config, local_areas=self.config.slam == 'ti')
-        self._matcher = ScanMatcher(self.config)
+        self._given: Mapping[str, NDArray[Any]] | None = None
+        self._matcher = self._given_map()
         self._loops = Loops(self.config, self.config)
         # Of every step, which keyframe came before it, and the pose from there.
         self._path: list[tuple[int, Array]] = []
@@ -104,7 +113,7 @@ class Localizer:
         # What has been added to the doubt of the pose since a scan last fitted the map.
         self._doubt = np.zeros((3, 3))
         self._placed_by_hand = False
-        self._misfits = 0
+        self._tracking = Tracking(self.config.lost_scans)
 
     def set_pose(self, T_map_base: Array, covariance: Array) -> None:
         """Put the robot at a pose (3,) with covariance (3, 3) in the map that it has; the next scans settle it."""
@@ -114,7 +123,41 @@ class Localizer:
         floor = np.diag(np.square(_START_SIGMAS))
         self._ekf.set_pose(T_map_base, covariance + floor)
         self._doubt = covariance + floor
-        self._placed_by_hand, self._misfits = True, 0
+        self._placed_by_hand = True
+        self._tracking.found()
+        self._calibration.interrupt()
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """The features and the map of points as arrays by name, for `from_state`; not where the robot is."""
+        usual = np.array(self._tracking.usual)
+        return {**self._feature_map.state(self._filter), **self._matcher.map.state(), 'usual': usual}
+
+    @staticmethod
+    def from_state(state: Mapping[str, NDArray[Any]], config: LocalizerConfig | None = None) -> 'Localizer':
+        """Localizer in the map of another one's `state`, at the configured start: lost, until a scan fits there.
+
+        The map of points that was given stays as it is where loops are closed later. Raises InputError where it is no
+        such state.
+        """
+        localizer = Localizer(config)
+        localizer._given = state
+        localizer._matcher = localizer._given_map()
+        localizer._feature_map.restore(localizer._filter, state)
+        usual = float(np.clip(np.nan_to_num(state.get('usual', np.ones(()))), 0.0, 1.0))
+        localizer._tracking = Tracking(localizer.config.lost_scans, usual, carried=True)
+        return localizer
+
+    def _given_map(self) -> ScanMatcher:
+        """A map of points in which there is what was taken over."""
+        matcher = ScanMatcher(self.config)
+        if self._given is not None:
+            matcher.map.restore(self._given)
+        return matcher
+
+    @property
+    def pose(self) -> Array:
+        """Where the robot is, T_map_base (3,)."""
+        return self._ekf.pose
 
     @property
     def features(self) -> list[LineFeature]:
@@ -139,9 +182,9 @@ class Localizer:
         self._matcher.map.way_m = way_m
         # Until it is known that old and new agree here, a scan is matched with what was seen of late.
         self._matcher.map.since_m = -math.inf if self._loops.agreed else way_m - _OF_LATE_M
-        match = self._predict(points_base, laser_base, increment, increment_covariance)
+        match = self._predict(scan, points_base, laser_base, increment, increment_covariance)
         lines, matched = no_lines(), 0
-        if self._has_news() and not self._is_lost():
+        if self.config.mapping and self._has_news() and not self._is_lost():
             laser_map = se2.transform_points(self._ekf.pose, laser_base[None])[0]
             lines, matched = self._correct(scan)
             if match.good or self._on_new_ground(match):
@@ -149,6 +192,8 @@ class Localizer:
                 self._matcher.add(points_map, laser_map)
                 self._T_last_look = self._ekf.pose
                 self._loops.follow(scan, points_base, self._ekf.pose, _is_leap(expected, self._ekf.pose))
+        elif match.good and not self.config.mapping:
+            self._T_last_look = self._ekf.pose
         self._filter.work_off()
         self._loops.work_off()
         correction = self._loops.close()
@@ -183,7 +228,7 @@ class Localizer:
         self._T_last_look = moved
         places = correction.after[:, :2] - moved[:2]
         self._redraw = np.argsort(-np.hypot(*places.T)).tolist()
-        self._matcher = ScanMatcher(self.config)
+        self._matcher = self._given_map()
         near = np.hypot(*places.T) < self.config.match_range_m
         self._redraw_some(min(int(near.sum()), _REDRAWN_AT_ONCE))
 
@@ -221,7 +266,9 @@ class Localizer:
         near = scan.ranges_m[scan.hit] < self.config.match_range_m
         return np.ascontiguousarray(scan.points_base()[near]), np.ascontiguousarray(scan.T_base_laser[:2])
 
-    def _predict(self, points_base: Array, laser_base: Array, increment: Array, covariance: Array) -> Match:
+    def _predict(
+        self, scan: Scan, points_base: Array, laser_base: Array, increment: Array, covariance: Array
+    ) -> Match:
         """Eqs. (10), (11): the increment is the odometry's, or where the scan fits the map, that of the match."""
         pose = self._ekf.pose
         turn = rotation(float(pose[2]))
@@ -229,14 +276,16 @@ class Localizer:
         F, _ = motion_jacobians(pose, increment)
         self._doubt = F @ self._doubt @ F.T + turn @ covariance @ turn.T
         match = self._matcher.match(points_base, laser_base, predicted, self._doubt)
+        near = not self._moved(_KNOWN_M, _KNOWN_RAD, match.T_map_base)
+        match = self._tracking.judged(match, points_base, scan, increment, near)
+        if len(points_base) >= FEWEST_POINTS:  # fewer fit nothing, and contradict nothing
+            self._tracking.count(match.good, self._on_new_ground(match))
         if match.good:
             added = _added(self._doubt, match.covariance, increment)
-            self._doubt, self._misfits = np.zeros((3, 3)), 0
+            self._doubt = np.zeros((3, 3))
             increment, covariance = se2.between(pose, match.T_map_base), turn.T @ added @ turn
             predicted = match.T_map_base
-        elif len(points_base) >= FEWEST_POINTS and not self._on_new_ground(match):
-            self._misfits += 1
-        if match.good and (self._placed_by_hand or self.config.slam == 'off'):
+        if match.good and (self._placed_by_hand or self.config.slam == 'off' or not self.config.mapping):
             self._ekf.set_pose(match.T_map_base, match.covariance)
             self._placed_by_hand = False
         else:
@@ -263,30 +312,31 @@ class Localizer:
         """
         return match.overlap < _NEW_GROUND and self._moved(_NEW_GROUND_M, _NEW_GROUND_RAD)
 
-    def _moved(self, distance_m: float, turn_rad: float) -> bool:
-        """Whether the robot is that far from the last place at which the map learned."""
+    def _moved(self, distance_m: float, turn_rad: float, T_map_base: Array | None = None) -> bool:
+        """Whether the robot, or a pose (3,), is that far from the last place at which the map learned."""
         if self._T_last_look is None:
             return True
-        moved = se2.between(self._T_last_look, self._ekf.pose)
+        moved = se2.between(self._T_last_look, self._ekf.pose if T_map_base is None else T_map_base)
         return math.hypot(moved[0], moved[1]) >= distance_m or abs(float(moved[2])) >= turn_rad
 
     def _is_lost(self) -> bool:
         in_doubt = max(self._doubt[0, 0], self._doubt[1, 1]) > _LOST_SIGMA_M**2
-        return self._misfits >= self.config.lost_scans or bool(in_doubt)
+        return self._tracking.lost or bool(in_doubt)
 
     def _estimate(self, match: Match, lines: Lines, matched: int, correction: Correction | None) -> Estimate:
         T_map_base = self._ekf.pose
         T_odom_base = np.zeros(3) if self._T_odom_base is None else self._T_odom_base
+        lost, covariance = self._is_lost(), self._ekf.pose_covariance
         return Estimate(
             T_map_base,
-            self._ekf.pose_covariance,
+            covariance + np.diag([_UNKNOWN_SIGMA_M**2, _UNKNOWN_SIGMA_M**2, math.pi**2]) if lost else covariance,
             se2.compose(T_map_base, se2.invert(T_odom_base)),
             len(lines),
             matched,
             len(self._feature_map),
             len(self._filter.area),
             match.fit,
-            self._is_lost(),
+            lost,
             correction,
         )
 

@@ -5,10 +5,13 @@ to what was seen, because cells lie in tiles that exist only where points fell.
 """
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.tiles import NO_TILE, TILE, TileStore
 from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.se2 import Array
@@ -60,6 +63,41 @@ class PointMap:
         dense = gaps(points_map) < DENSE_M
         limits = (self._most, self.way_m, self.since_m)
         _add(self.tiles.pool, self.tiles.directory, cells, points_map, dense, seen_from, limits)
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """All that the map holds as arrays by name: its cells (N, 2) as (row, col), and what they hold (N, 10)."""
+        pool = self.tiles.pool[: self.tiles.used]
+        at = np.argwhere(pool[..., COUNT] > 0.0)
+        cells = self.tiles.places()[at[:, 0]] * TILE + at[:, 1:]
+        order = np.lexsort(cells.T[::-1])
+        points = pool[at[:, 0], at[:, 1], at[:, 2]]
+        return {'cell_m': np.array(self.cell_m), 'cells': cells[order], 'points': points[order]}
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Take up the `state` of another map, into an empty one; however far the robot comes, its cells count.
+
+        Raises InputError where it is no such state, or one of cells of another size.
+        """
+        try:
+            cell_m, cells, points = float(state['cell_m']), state['cells'], state['points'].astype(np.float32)
+        except (KeyError, ValueError, TypeError) as error:
+            raise InputError(f'saved map of points: {error}: expected cell_m, cells and points') from error
+        if cell_m != self.cell_m:
+            raise InputError(f'saved map of points: cells of {cell_m} m: expected {self.cell_m} m')
+        if cells.shape != (len(points), 2) or points.shape[1:] != (SEEN + 1,) or cells.dtype != np.int64:
+            raise InputError(f'saved map of points: {cells.shape} cells, {points.shape} points: expected one a cell')
+        if not np.isfinite(points[:, :SEEN]).all() or np.isnan(points[:, SEEN]).any():
+            raise InputError('saved map of points: expected finite numbers')
+        if not len(cells):
+            return
+        tiles = _once(cells // TILE)
+        low, high = tiles.min(axis=0), tiles.max(axis=0)
+        self.tiles.reach(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+        self.tiles.ensure(tiles)
+        rows, cols = (cells - self.corner).T
+        slots = self.tiles.directory[rows // TILE, cols // TILE]
+        points[:, SEEN] = np.inf
+        self.tiles.pool[slots, rows % TILE, cols % TILE] = points
 
 
 def gaps(points: Array) -> Array:
