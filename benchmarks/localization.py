@@ -124,10 +124,15 @@ def _step_times(folder: Path, quick: bool) -> Iterator[Row]:
         yield Row('  what the map takes', f'{places.memory_bytes() / 1e6:.3g} MB', 'at most 50 MB')
 
 
+def _lab_map() -> Map:
+    """The laboratory's map, merged from its stops."""
+    patch = grid_of(Source().looks('lab_stops')).patch()
+    return Map(patch, build(patch, _PAPER_START[:2], TopologyConfig()))
+
+
 def _laboratory(quick: bool) -> Iterator[Row]:
     world = World.from_patch(*read_world(_LAB))
-    patch = grid_of(Source().looks('lab_stops')).patch()
-    known = Map(patch, build(patch, _PAPER_START[:2], TopologyConfig()))
+    known = _lab_map()
     tally = Tally()
     for seed in range(5 if quick else 20):
         finder = GlobalLocalization(known.patch, known.topology, seed=seed)
@@ -143,7 +148,7 @@ def _laboratory(quick: bool) -> Iterator[Row]:
 def _thinning_or_voronoi(quick: bool) -> Iterator[Row]:
     """The laboratory with the nodes of thinning, and of a Voronoi diagram, in the map; a scan's own are of thinning."""
     world = World.from_patch(*read_world(_LAB))
-    known = merged_map(world, _STOPS)
+    known = _lab_map()
     for name, topology in (('thinning', known.topology), ('Voronoi', build_voronoi(known.patch))):
         rng, tally = np.random.default_rng(5), Tally()
         finder = GlobalLocalization(known.patch, topology, seed=5)
