@@ -63,15 +63,20 @@ class Pipeline:
             estimate = self._locate(scan, T_odom_base)
         if self._history is not None and estimate.correction is not None:
             self._rebuild(self._history, scan.stamp_ns)
-        if not estimate.lost:
-            with self._timed('grid'):
-                self.grid.update(scan, estimate.T_map_base)
-            if self._history is not None:
-                self._history.add(scan, estimate.T_map_base)
+        with self._timed('grid'):
+            self._draw(scan, estimate)
         if self._window is None or self._scans % self.config.scans_per_graph == 0:
             self._window = self._thin(estimate.T_map_base)
         self._scans += 1
         return Step(estimate, self._window)
+
+    def _draw(self, scan: Scan, estimate: Estimate) -> None:
+        """Into the map with it, unless nobody knows where it was made."""
+        if estimate.lost:
+            return
+        self.grid.update(scan, estimate.T_map_base)
+        if self._history is not None:
+            self._history.add(scan, estimate.T_map_base)
 
     def _thin(self, T_map_base: Array) -> GridPatch:
         with self._timed('topology'):

@@ -71,7 +71,7 @@ class GridMapperNode(LiveNode):
 
     def begin_anew(self) -> None:
         """Forget the map, or go back to the session that the node was started with."""
-        self._matcher: StampMatcher[LaserScan, PoseWithCovarianceStamped] = StampMatcher()
+        self._matcher: StampMatcher[LaserScan, tuple[Array, bool]] = StampMatcher()
         known = self._session or self._latest_ns is not None
         # None: the map began with a grid of which the scans are not known.
         self._history: GridHistory | None = None if self._session else GridHistory()
@@ -100,19 +100,21 @@ class GridMapperNode(LiveNode):
         self._take(self._matcher.left(messages.stamp_ns(message.header.stamp), message))
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
-        self._take(self._matcher.right(messages.stamp_ns(message.header.stamp), message))
+        is_known = bool(messages.covariance_from(message)[0, 0] < _LOST_SIGMA_M**2)
+        T_map_base = messages.pose_from(message.pose.pose)
+        self._take(self._matcher.right(messages.stamp_ns(message.header.stamp), (T_map_base, is_known)))
 
-    def _take(self, pair: tuple[LaserScan, PoseWithCovarianceStamped] | None) -> None:
+    def _take(self, pair: tuple[LaserScan, tuple[Array, bool]] | None) -> None:
         self.health.dropped_in_all('scans and poses without a partner', self._matcher.dropped)
         if pair is None:
             return
-        message, pose = pair
-        scan, T_map_base = self._mount.scan(message), messages.pose_from(pose.pose.pose)
+        message, (T_map_base, is_known) = pair
+        scan = self._mount.scan(message)
         if self._resumed_ns is not None and scan.stamp_ns < self._resumed_ns:
             self.begin_anew()  # the robot has begun anew as well
         self._resumed_ns = None
         with self.health.timed('map update'):
-            if self._mapping and messages.covariance_from(pose)[0, 0] < _LOST_SIGMA_M**2:
+            if self._mapping and is_known:
                 self._draw(scan, T_map_base)
             window = self._grid.window(T_map_base[0], T_map_base[1], self._window_m)
         self._latest_ns = scan.stamp_ns
