@@ -188,18 +188,18 @@ def test_no_file_and_a_folder(tmp_path: Path) -> None:
         read(tmp_path)
 
 
-def _never_a_traceback(path: Path) -> None:
+def _is_read_or_refused(path: Path) -> bool:
+    """Whether a log gives events, or ends in one line that says why not; anything else is raised."""
     try:
-        for event in CarmenLog(path).events():
-            assert isinstance(event, OdometryEvent | ScanEvent)
+        return all(isinstance(event, OdometryEvent | ScanEvent) for event in CarmenLog(path).events())
     except InputError as error:
-        assert '\n' not in str(error)
+        return '\n' not in str(error)
 
 
 @settings(deadline=None, max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.binary(max_size=300))
 def test_arbitrary_bytes(tmp_path: Path, content: bytes) -> None:
-    _never_a_traceback(write(tmp_path, content))
+    assert _is_read_or_refused(write(tmp_path, content))
 
 
 WORD = st.one_of(
@@ -214,7 +214,7 @@ WORD = st.one_of(
 @given(st.lists(st.tuples(st.sampled_from(['FLASER', 'ODOM', 'ROBOTLASER1']), st.lists(WORD, max_size=26)), max_size=6))
 def test_arbitrary_words(tmp_path: Path, lines: list[tuple[str, list[str]]]) -> None:
     text = ''.join(' '.join([key, *words]) + '\n' for key, words in lines)
-    _never_a_traceback(write(tmp_path, text.encode('utf-8', errors='surrogatepass')))
+    assert _is_read_or_refused(write(tmp_path, text.encode('utf-8', errors='surrogatepass')))
 
 
 @settings(deadline=None, max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -223,4 +223,4 @@ def test_damaged_files(tmp_path: Path, noise: bytes, at: int, zipped: bool) -> N
     content = (FLASER + ODOM + ROBOTLASER + FLASER).encode()
     content = gzip.compress(content) if zipped else content
     at = min(at, len(content))
-    _never_a_traceback(write(tmp_path, content[:at] + noise + content[at + len(noise) :]))
+    assert _is_read_or_refused(write(tmp_path, content[:at] + noise + content[at + len(noise) :]))

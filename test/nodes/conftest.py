@@ -82,11 +82,16 @@ class Graph:
         """Handle of a goal that was taken. A node that was killed passes for a server for a while: asked again then."""
         self.until(client.server_is_ready, 'action server')
         for _ in range(6):
-            sent, asked_at = client.send_goal_async(goal), time.monotonic()
-            self.until(lambda: sent.done() or time.monotonic() - asked_at > 0.2 * PATIENCE_S, 'goal taken')  # noqa: B023
+            sent = self._ask(client, goal, 0.2 * PATIENCE_S)
             if sent.done():
                 return sent.result()
         pytest.fail('goal taken by nobody')
+
+    def _ask(self, client: ActionClient, goal: Any, seconds: float) -> Any:
+        """Future of the handle of a goal, after it is done or the time is over."""
+        sent, end = client.send_goal_async(goal), time.monotonic() + seconds
+        self.until(lambda: sent.done() or time.monotonic() > end, 'goal taken')
+        return sent
 
     def act(self, kind: type, name: str, goal: Any) -> Any:
         """Result of an action's goal, with status."""

@@ -165,6 +165,13 @@ def empty_hall():
     return messages.grid_msg(GridPatch(GridFrame(-6.0, -6.0, 0.1), cells), 'map', 0)
 
 
+def scan_of_nothing_near(ns):
+    message = LaserScan(angle_min=-1.5, angle_increment=0.05, range_min=0.05, range_max=8.0)
+    message.header = messages.header('laser', ns)
+    message.ranges = 61 * [5.0]
+    return message
+
+
 def test_a_silent_laser_stops_the_robot_and_it_goes_on(graph):
     commands = graph.heard('cmd_vel', Twist)
     doctor = Doctor(graph)
@@ -185,10 +192,7 @@ def test_a_silent_laser_stops_the_robot_and_it_goes_on(graph):
         if 'odometry' not in silent:
             odometry.publish(messages.odometry_msg(np.zeros(3), (0.0, 0.0), ('odom', 'base_link'), ns))
         if 'laser' not in silent:
-            message = LaserScan(angle_min=-1.5, angle_increment=0.05, range_min=0.05, range_max=8.0)
-            message.header = messages.header('laser', ns)
-            message.ranges = 61 * [5.0]
-            scan.publish(message)
+            scan.publish(scan_of_nothing_near(ns))
         if 'localizer' not in silent:
             pose.publish(messages.pose_with_covariance_msg(np.zeros(3), np.eye(3), 'map', ns))
 

@@ -127,7 +127,8 @@ def test_before_any_scan_there_is_no_path():
 
 def test_a_loop_is_closed_while_the_robot_drives():
     """Wheels that wear to one side: round the block the map has drifted; coming back, all of it is put right."""
-    localizer = Localizer(LocalizerConfig(start_x_m=3.0, start_y_m=1.2))
+    # The first scan is made after the first step.
+    localizer = Localizer(LocalizerConfig(start_x_m=3.15, start_y_m=1.2))
     rows, closed = [], []
     for scan, odom, truth in drive_round_the_block():
         estimate = localizer.step(scan, odom)
@@ -136,9 +137,8 @@ def test_a_loop_is_closed_while_the_robot_drives():
             closed.append(len(rows))
     off = np.array([np.hypot(*(T - t)[:2]) for t, T in rows])
     assert closed
-    drift = off[: closed[0] - 1].max()
-    assert drift > 0.3, 'without drift there is nothing to close'
-    assert off[closed[-1] :].max() < 0.3 * min(drift, 1.0)
+    assert off[: closed[0] - 1].max() > 0.3, 'without drift there is nothing to close'
+    assert off[closed[-1] :].max() < 0.25
     assert len(localizer.corrected_path()) == len(rows)
     again = np.array([k.T_map_base for k in localizer.keyframes])
     assert np.isfinite(again).all()

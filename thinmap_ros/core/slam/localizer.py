@@ -18,7 +18,13 @@ from thinmap_ros.core.slam.feature_map import FeatureConfig, FeatureMap
 from thinmap_ros.core.slam.features import LineFeature
 from thinmap_ros.core.slam.lines import LineConfig, Lines, extract_lines, no_lines
 from thinmap_ros.core.slam.loops import Correction, Keyframe, LoopConfig, Loops
-from thinmap_ros.core.slam.models import MotionConfig, motion_jacobians, odometry_covariance, rotation
+from thinmap_ros.core.slam.models import (
+    MotionConfig,
+    added_by_match,
+    motion_jacobians,
+    odometry_covariance,
+    rotation,
+)
 from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
 from thinmap_ros.core.slam.scan_matching import FEWEST_POINTS, Match, MatchConfig, ScanMatcher
 from thinmap_ros.core.slam.tracking import Tracking
@@ -32,7 +38,6 @@ _KNOWN_M, _KNOWN_RAD = 0.2, 0.2  # nearer than that, most of a scan must be know
 _LEAP_M, _LEAP_RAD = 0.4, 0.4  # a scan puts the robot this far from where the wheels did: one of them is wrong
 _OF_LATE_M = 100.0  # way in which the drift stays below what a match with the map bridges
 _REDRAWN_AT_ONCE, _REDRAWN_A_STEP = 60, 3  # keyframes drawn anew when a loop was closed, and in each step after it
-_SAME_POINTS_M, _SAME_POINTS_RAD = 1.0, 1.0  # after so much way a match errs by other points than before
 _UNKNOWN_SIGMA_M = 300.0  # what a pose is known to while the robot is lost
 _LOST_SIGMA_M = 1.0  # doubt since a scan last fitted; far from the start, more than this is no reason to be lost
 
@@ -281,7 +286,7 @@ class Localizer:
         if len(points_base) >= FEWEST_POINTS:  # fewer fit nothing, and contradict nothing
             self._tracking.count(match.good, self._on_new_ground(match))
         if match.good:
-            added = _added(self._doubt, match.covariance, increment)
+            added = added_by_match(self._doubt, match.covariance, increment)
             self._doubt = np.zeros((3, 3))
             increment, covariance = se2.between(pose, match.T_map_base), turn.T @ added @ turn
             predicted = match.T_map_base
@@ -339,18 +344,6 @@ class Localizer:
             lost,
             correction,
         )
-
-
-def _added(prior: Array, posterior: Array, increment: Array) -> Array:
-    """What a step that ends in a match adds to the covariance of the pose, (3, 3), map frame.
-
-    Of the error of the prior (3, 3) a match with posterior (3, 3) leaves a part, that is new with every step; what the
-    map adds is much the same error as in the step before as long as the same points are seen.
-    """
-    by_prior = np.linalg.inv(prior)
-    by_map = np.linalg.inv(posterior) - by_prior
-    share = min(1.0, math.hypot(increment[0], increment[1]) / _SAME_POINTS_M + abs(increment[2]) / _SAME_POINTS_RAD)
-    return np.asarray(posterior @ (by_prior + share * by_map) @ posterior)
 
 
 def _is_leap(expected: Array, found: Array) -> bool:

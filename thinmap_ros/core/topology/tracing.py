@@ -161,7 +161,7 @@ def follow(
             elif not owner[start]:
                 continue
             for step in steps:
-                cell, before = start + step, start
+                cell = start + step
                 passage = flat[cell] == 1 and not walked[cell] and not owner[cell]
                 # Nodes side by side are joined once: from the lower number, and by the first pair of cells found.
                 beside = owner[cell] > owner[start] and not _joined(links[:linked], owner[start], owner[cell])
@@ -173,16 +173,7 @@ def follow(
                 if path.size - length < 3 * cells.size:
                     path = np.concatenate((path, np.empty(path.size, dtype=np.int64)))
                 length = _way_to_node(parent, start, path, length, scratch)
-                while not owner[cell]:
-                    walked[cell] = True
-                    path[length] = cell
-                    length += 1
-                    following = -1
-                    for turn in steps:
-                        to = cell + turn
-                        if flat[to] and to != before and (following < 0 or (owner[to] and not owner[following])):
-                            following = to
-                    before, cell = cell, following
+                cell, length = _through(flat, owner, walked, steps, (start, cell), path, length)
                 size = _climb(parent, cell, scratch, 0)
                 path[length : length + size] = scratch[:size]
                 length += size
@@ -190,6 +181,31 @@ def follow(
                 chains += 1
                 starts[chains] = length
     return all_nodes[:count], ends[:chains], starts[: chains + 1], path[:length]
+
+
+@inlined
+def _through(
+    flat: NDArray[np.uint8],
+    owner: NDArray[np.int32],
+    walked: NDArray[np.bool_],
+    steps: Cells,
+    first: tuple[int, int],
+    path: Cells,
+    length: int,
+) -> tuple[int, int]:
+    """Walk from one cell to the next and on along a passage to a node, written into the path: where, and its length."""
+    before, cell = first
+    while not owner[cell]:
+        walked[cell] = True
+        path[length] = cell
+        length += 1
+        following = -1
+        for turn in steps:
+            to = cell + turn
+            if flat[to] and to != before and (following < 0 or (owner[to] and not owner[following])):
+                following = to
+        before, cell = cell, following
+    return cell, length
 
 
 @inlined
