@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.sim.pioneer import PRESETS, Pioneer, PioneerConfig, arc
+from thinmap_ros.sim.pioneer import PRESETS, Pioneer, PioneerConfig, after_arc
 from thinmap_ros.sim.world import World
 
 EXACT = PioneerConfig(
@@ -37,14 +37,14 @@ def test_an_arc_is_many_small_steps(distance: float, turn: float) -> None:
     for _ in range(4000):
         middle = se2.compose(pose, se2.pose(0, 0, turn / 8000))
         pose = se2.compose(middle, se2.pose(distance / 4000, 0, turn / 8000))
-    ours = arc(distance, turn)
+    ours = after_arc(np.zeros(3), distance, turn)
     assert np.allclose(ours[:2], pose[:2], atol=1e-5)
     assert abs(se2.wrap(float(ours[2] - pose[2]))) < 1e-9
 
 
 @given(st.floats(-1e-6, 1e-6))
 def test_an_arc_has_no_jump_where_it_becomes_straight(turn: float) -> None:
-    assert np.allclose(arc(1.0, turn), [1.0, turn / 2.0, turn], atol=1e-9)
+    assert np.allclose(after_arc(np.zeros(3), 1.0, turn), [1.0, turn / 2.0, turn], atol=1e-9)
 
 
 def test_a_full_circle_comes_back() -> None:

@@ -1,7 +1,6 @@
 """Exploration: end nodes that may still move are visited until none is left."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped
@@ -314,14 +313,13 @@ class ExplorerNode(LiveNode):
 
 def _end_node_msg(node: EndNode) -> EndNodeMsg:
     far = node.smallest_distance_m if math.isfinite(node.smallest_distance_m) else 0.0
-    node = replace(node, smallest_distance_m=far)
     return EndNodeMsg(
         node_id=node.node_id,
         position=Point(x=node.x, y=node.y),
         position_probability=node.probability,
         distance_index=node.distance_index,
         angle_index=node.angle_index,
-        smallest_distance_m=node.smallest_distance_m,
+        smallest_distance_m=far,
         angle_span_deg=node.angle_span_deg,
         is_target=node.is_target,
     )

@@ -4,10 +4,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.grid.raytrace import cast_rays
+from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.sim.world import World
@@ -41,6 +43,7 @@ class Lms200:
         intervals = config.beams if full_circle else config.beams - 1
         self._increment = math.radians(config.field_of_view_deg) / intervals
         self._angle_min = -math.radians(config.field_of_view_deg) / 2.0
+        self._turns = self._increment * np.arange(config.beams)
         self._rng = np.random.default_rng(seed)
 
     def scan(self, world: World, T_world_base: Array, stamp_ns: int) -> Scan:
@@ -49,7 +52,7 @@ class Lms200:
         ranges = self._mix(exact) + self._rng.normal(0.0, self.config.noise_m, exact.size)
         if self.config.rounding_m > 0.0:
             ranges = np.round(ranges / self.config.rounding_m) * self.config.rounding_m
-        ranges = np.where(np.isfinite(ranges) & (ranges < self.config.range_max_m), ranges, np.inf)
+        ranges[~(ranges < self.config.range_max_m)] = np.inf
         return Scan.create(
             stamp_ns,
             ranges,
@@ -64,7 +67,7 @@ class Lms200:
         resolution = world.frame.resolution
         x = (T_world_laser[0] - world.frame.origin_x) / resolution
         y = (T_world_laser[1] - world.frame.origin_y) / resolution
-        angles = T_world_laser[2] + self._angle_min + self._increment * np.arange(self.config.beams)
+        angles = T_world_laser[2] + self._angle_min + self._turns
         return cast_rays(world.occupied, x, y, angles, self.config.range_max_m / resolution) * resolution
 
     def _mix(self, ranges: Array) -> Array:
@@ -73,12 +76,23 @@ class Lms200:
         Of the two beams beside an edge it is the one or the other: were it always the same one, the pixels of a left
         and a right wall would be off to the same side.
         """
-        nearer, farther = np.minimum(ranges[:-1], ranges[1:]), np.maximum(ranges[:-1], ranges[1:])
-        along_a_wall = nearer * self._increment / math.sin(_FLATTEST_RAD)
-        with np.errstate(invalid='ignore'):
-            edge = np.isfinite(farther) & (farther - nearer > np.maximum(self.config.edge_m, along_a_wall))
-        mixed = np.flatnonzero(edge & (self._rng.random(edge.size) < self.config.mixed_pixels))
+        edges = _edges(ranges, self.config.edge_m, self._increment / math.sin(_FLATTEST_RAD))
+        mixed = edges[self._rng.random(ranges.size - 1)[edges] < self.config.mixed_pixels]
         share, side = self._rng.random(mixed.size), self._rng.integers(0, 2, mixed.size)
+        nearer, farther = np.minimum(ranges[mixed], ranges[mixed + 1]), np.maximum(ranges[mixed], ranges[mixed + 1])
         result = ranges.copy()
-        result[mixed + side] = nearer[mixed] + share * (farther[mixed] - nearer[mixed])
+        result[mixed + side] = nearer + share * (farther - nearer)
         return result
+
+
+@kernel
+def _edges(ranges: Array, edge_m: float, along_a_wall: float) -> NDArray[np.int64]:
+    """Beams whose range differs from the next one's by more than edge_m, and than along a wall: there per metre."""
+    found = np.empty(ranges.size, dtype=np.int64)
+    count = 0
+    for i in range(ranges.size - 1):
+        nearer, farther = min(ranges[i], ranges[i + 1]), max(ranges[i], ranges[i + 1])
+        if math.isfinite(farther) and farther - nearer > max(edge_m, nearer * along_a_wall):
+            found[count] = i
+            count += 1
+    return found[:count].copy()

@@ -72,35 +72,38 @@ class Pioneer:
         """
         self.v = _towards(self.v, v, self.config.max_speed_m_s, self.config.max_acceleration_m_s2 * dt_s)
         self.w = _towards(self.w, w, self.config.max_turn_rad_s, self.config.max_turn_acceleration_rad_s2 * dt_s)
-        moved = se2.compose(self.T_world_base, arc(self.v * dt_s, self.w * dt_s))
+        moved = after_arc(self.T_world_base, self.v * dt_s, self.w * dt_s)
         x, y, _ = moved.tolist()
         clear = self.world.is_clear(x, y, self.config.radius_m)
         if not clear and self.v != 0.0:
             self.collisions += not self.touching
             self.v = 0.0
-            moved = se2.compose(self.T_world_base, arc(0.0, self.w * dt_s))
+            moved = after_arc(self.T_world_base, 0.0, self.w * dt_s)
         self.T_world_base = moved
         # One that goes on pushing creeps up to the wall and is stopped again: that is the same contact.
         self.touching = not clear or (
             self.touching and not self.world.is_clear(moved[0], moved[1], self.config.radius_m + _AWAY_M)
         )
-        self.T_odom_base = se2.compose(self.T_odom_base, self._measured(self.v * dt_s, self.w * dt_s))
+        self.T_odom_base = after_arc(self.T_odom_base, *self._measured(self.v * dt_s, self.w * dt_s))
 
-    def _measured(self, distance: float, turn: float) -> Array:
-        """Return the motion, (3,), as the wheels count it."""
+    def _measured(self, distance: float, turn: float) -> tuple[float, float]:
+        """Return the way and the turn as the wheels count them."""
         metres, radians = abs(distance), abs(turn)
         noise = self._rng.normal(size=2).tolist()
         seen_distance = distance * self._scale + noise[0] * self.config.distance_noise * math.sqrt(metres)
         sigma = self.config.turn_noise * math.sqrt(radians) + self.config.turn_noise_driving * math.sqrt(metres)
         seen_turn = turn * self._turn_scale + self._drift_rad_m * metres + noise[1] * sigma
-        return arc(seen_distance, seen_turn)
+        return seen_distance, seen_turn
 
 
-def arc(distance: float, turn: float) -> Array:
-    """Relative pose (3,) after driving a circular arc of a length (m) while turning by an angle (rad)."""
+def after_arc(T: Array, distance: float, turn: float) -> Array:
+    """Pose (3,) after driving a circular arc of a length (m) from a pose (3,) while turning by an angle (rad)."""
     half = turn / 2.0
     chord = distance if half == 0.0 else distance * math.sin(half) / half
-    return se2.pose(chord * math.cos(half), chord * math.sin(half), turn)
+    dx, dy = chord * math.cos(half), chord * math.sin(half)
+    x, y, theta = T.tolist()
+    c, s = math.cos(theta), math.sin(theta)
+    return se2.pose(x + c * dx - s * dy, y + s * dx + c * dy, theta + se2.wrap(turn))
 
 
 def _towards(value: float, goal: float, limit: float, change: float) -> float:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.exploration.end_node_tracker import PRIOR, EndNodeTracker, TrackerConfig, in_field_of_view
+from thinmap_ros.core.exploration.end_node_tracker import PRIOR, EndNodeTracker, TrackerConfig
 from thinmap_ros.core.exploration.position_probability import bayes_update, distance_index
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.scan import Scan
@@ -148,7 +148,9 @@ def test_a_closed_border_settles_a_node_and_an_opened_one_is_as_doubtful_as_at_f
 
 @pytest.mark.parametrize('increment_deg', [1.0, -1.0])
 def test_field_of_view_ends_at_the_outer_beams(increment_deg):
-    laser = scan(increment_deg=increment_deg)
     angles = 0.3 + np.radians([0.0, 89.0, -89.0, 95.0, -95.0, 180.0])
-    seen = in_field_of_view(laser, np.array([0.0, 0.0, 0.3]), np.column_stack([np.cos(angles), np.sin(angles)]))
-    assert seen.tolist() == [True, True, True, False, False, False]
+    nodes = tracker()
+    nodes.follow({i: (5.0 + math.cos(angle), 5.0 + math.sin(angle)) for i, angle in enumerate(angles.tolist())})
+    nodes.look(scan(increment_deg=increment_deg), se2.pose(5.0, 5.0, 0.3), FREE, FRAME, set())
+    seen = [bool(track.distances_m) for track in nodes.tracks.values()]
+    assert seen == [True, True, True, False, False, False]

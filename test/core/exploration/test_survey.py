@@ -77,7 +77,7 @@ def test_from_where_the_robot_is_to_look_most_of_what_is_hidden_is_in_sight():
     for candidate in candidates:
         row, col = (int(v) for v in borders.frame.cells_of(candidate.goal[None, :2])[0])
         assert surveyor.reached[row, col]
-        seen = [line_is_clear(~borders.solid, row, col, int(r), int(c)) for r, c in candidate.cells]
+        seen = [line_is_clear(borders.passable, row, col, int(r), int(c)) for r, c in candidate.cells]
         assert np.mean(seen) > 0.5
 
 

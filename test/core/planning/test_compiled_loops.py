@@ -7,15 +7,18 @@ import pytest
 from scipy import ndimage
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.exploration.end_node_tracker import _in_sight
 from thinmap_ros.core.exploration.open_borders import _parts
 from thinmap_ros.core.exploration.survey import _without_scraps
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.planning.follower import _point_ahead, length_from, nearest_point
 from thinmap_ros.core.planning.grid_search import coarse, fine
-from thinmap_ros.core.planning.navigator import _arc, _clear_steps, _touches
-from thinmap_ros.core.planning.reach import are_near, reached_from
+from thinmap_ros.core.planning.navigator import _arc, _clear_steps, _points_around, _touches
+from thinmap_ros.core.planning.reach import are_near, reached_from, renew_standing, standing_places
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, cost_of_cells
+from thinmap_ros.core.scan import Scan
 
 SEEDS = range(20)
 
@@ -67,7 +70,49 @@ def test_whether_something_has_come_near_a_path(seed):
     cells = np.where(rng.random((50, 50)) < 0.01, 100, 0).astype(np.int8)
     path = np.clip(np.cumsum(rng.integers(-1, 2, (30, 2)), axis=0) + 25, 0, 49)
     away = ndimage.distance_transform_edt(cells < 65)[path[:, 0], path[:, 1]].min()
-    assert _touches(cells, path, 2.5) == (away < 2.5)
+    at = (-1.0, 2.0, 0.1)
+    assert _touches(cells, at, GridFrame(*at).centres_of(path), 2.5) == (away < 2.5)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_points_around_are_those_of_the_scan_and_earlier_ones_near_and_out_of_view(seed):
+    rng = np.random.default_rng(seed)
+    scan = Scan.create(0, rng.uniform(0.0, 9.0, 100), -1.2, 0.02, 0.05, 8.0, se2.pose(0.2, -0.1, 0.3))
+    robot, earlier = se2.pose(*rng.normal(size=3)), rng.normal(0.0, 1.0, (50, 2))
+    laser = se2.compose(robot, scan.T_base_laser)
+    bearings = np.arctan2(*(earlier - laser[:2]).T[::-1]) - laser[2]
+    in_view = np.abs(se2.wrap(bearings - 0.5 * (scan.angles_rad[0] + scan.angles_rad[-1]))) <= 0.5 * 99 * 0.02
+    kept = earlier[(np.hypot(*(earlier - robot[:2]).T) < 1.0) & ~in_view]
+    expected = np.concatenate([se2.transform_points(robot, scan.points_base()), kept])
+    hits = np.where(scan.hit, scan.ranges_m, np.nan)
+    found = _points_around(hits, scan.angle_min_rad, scan.angle_increment_rad, laser, earlier, robot)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_standing_places_are_renewed_where_something_changed(seed):
+    rng = np.random.default_rng(seed)
+    free = rng.random((60, 70)) < 0.97
+    standing = standing_places(free, 0.25, 0.1)
+    for _ in range(10):
+        top, left = int(rng.integers(0, 55)), int(rng.integers(0, 65))
+        part = (top, left, min(top + int(rng.integers(1, 20)), 60), min(left + int(rng.integers(1, 20)), 70))
+        where = (slice(part[0], part[2]), slice(part[1], part[3]))
+        free[where] = rng.random(free[where].shape) < 0.97
+        renew_standing(standing, free, part, 0.25, 0.1)
+        assert (standing == standing_places(free, 0.25, 0.1)).all()
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_places_in_sight(seed):
+    rng = np.random.default_rng(seed)
+    frame, free = GridFrame(-1.0, 2.0, 0.1), rng.random((60, 70)) < 0.97
+    places = frame.centres_of(rng.integers(0, 60, (40, 2)))
+    laser = np.append(frame.centres_of(np.array([[30, 30]])), 2.5)
+    bearings = np.arctan2(*(places - laser[:2]).T[::-1]) - laser[2]
+    asked = (np.hypot(*(places - laser[:2]).T) < 2.5) & (np.abs(se2.wrap(bearings - 0.3)) <= 1.1)
+    clear = [line_is_clear(free, 30, 30, int(row), int(col)) for row, col in frame.cells_of(places)]
+    assert (_in_sight(free, frame.as_array(), laser, places, 2.5, 0.3, 1.1) == (asked & clear)).all()
 
 
 @pytest.mark.parametrize('seed', SEEDS)

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
 
 from thinmap_ros.core.se2 import Array
 
@@ -17,8 +18,7 @@ class FinishCode(IntEnum):
     NOTHING_REACHABLE = 4
 
 
-@dataclass(frozen=True)
-class EndNode:
+class EndNode(NamedTuple):
     """An end node as it stands: place x, y in m (map frame), probability and what it comes from.
 
     goal: pose (3,) from which to look at it; open_border_m: length of the border to the unknown that belongs to it.

@@ -132,9 +132,13 @@ class EndNodeTracker:
         free (H, W) bool: cells in `frame` through which one can see; open_ids: nodes with unknown space around
         (used in mode open_border only).
         """
+        if not self.tracks:
+            return
         T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
-        tracks = list(self.tracks.values())
-        for track in itertools.compress(tracks, self._in_sight(scan, T_map_laser, tracks, free, frame)):
+        places = np.array([(track.x, track.y) for track in self.tracks.values()])
+        at, (low, high) = frame.as_array(), field_of_view(scan)
+        seen = _in_sight(free, at, T_map_laser, places, scan.range_max_m, 0.5 * (low + high), 0.5 * (high - low))
+        for track in itertools.compress(self.tracks.values(), seen):
             if self._is_news(track, T_map_laser):
                 self._count(track, T_map_laser, track.node_id in open_ids)
         if self.config.mode == 'open_border':
@@ -176,17 +180,6 @@ class EndNodeTracker:
             return None
         return lost.pop(near.node_id)
 
-    @staticmethod
-    def _in_sight(
-        scan: Scan, T_map_laser: Array, tracks: list[Track], free: NDArray[np.bool_], frame: GridFrame
-    ) -> NDArray[np.bool_]:
-        """Which nodes (N) lie in the laser's range and field of view, with free cells all the way."""
-        places = np.array([(track.x, track.y) for track in tracks]).reshape(-1, 2)
-        cells = frame.cells_of(np.vstack([T_map_laser[None, :2], places]))
-        near = np.square(places - T_map_laser[:2]).sum(axis=1) < scan.range_max_m**2
-        asked = near & in_field_of_view(scan, T_map_laser, places)
-        return np.asarray(_lines_are_clear(free, cells[0], cells[1:], asked))
-
     def _is_news(self, track: Track, T_map_laser: Array) -> bool:
         if track.last_seen_from is None:
             return True
@@ -216,22 +209,34 @@ class EndNodeTracker:
         track.closed = not is_open
 
 
-def in_field_of_view(scan: Scan, T_map_laser: Array, points: Array) -> NDArray[np.bool_]:
-    """Which points (N, 2), m, map frame, lie between the first and the last beam of a scan, (N,)."""
+def field_of_view(scan: Scan) -> tuple[float, float]:
+    """Directions between which a scan looks, rad, laser frame: its outer beams and as much again as between two."""
     last = scan.angle_min_rad + scan.angle_increment_rad * (scan.ranges_m.size - 1)
-    middle, half = 0.5 * (scan.angle_min_rad + last), 0.5 * abs(last - scan.angle_min_rad)
-    dx, dy = (points - T_map_laser[:2]).T
-    off = se2.wrap(np.arctan2(dy, dx) - (T_map_laser[2] + middle))
-    return np.asarray(np.abs(off) <= half + abs(scan.angle_increment_rad))
+    more = abs(scan.angle_increment_rad)
+    return min(scan.angle_min_rad, last) - more, max(scan.angle_min_rad, last) + more
 
 
 @kernel
-def _lines_are_clear(free: NDArray[np.bool_], start: Cells, ends: Cells, asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """For which cells (N, 2), of those asked about (N,), all cells on the line from the start (2,) are free, (N,)."""
-    clear = np.zeros(ends.shape[0], dtype=np.bool_)
-    for i in range(ends.shape[0]):
-        clear[i] = asked[i] and line_is_clear(free, start[0], start[1], ends[i, 0], ends[i, 1])
-    return clear
+def _in_sight(
+    free: NDArray[np.bool_], frame: Array, laser: Array, places: Array, reach_m: float, middle: float, half: float
+) -> NDArray[np.bool_]:
+    """Which places (N, 2), m, a laser at a pose (3,) sees: in its range and field of view, with free cells all the way.
+
+    frame (3,): origin and resolution, m, of the free cells (H, W); middle, half: the field of view, rad.
+    """
+    seen = np.zeros(places.shape[0], dtype=np.bool_)
+    x, y, resolution = frame[0], frame[1], frame[2]
+    row, col = int(math.floor((laser[1] - y) / resolution)), int(math.floor((laser[0] - x) / resolution))
+    for i in range(places.shape[0]):
+        dx, dy = places[i, 0] - laser[0], places[i, 1] - laser[1]
+        if dx * dx + dy * dy >= reach_m * reach_m:
+            continue
+        off = math.pi - (math.pi - (math.atan2(dy, dx) - (laser[2] + middle))) % (2.0 * math.pi)
+        if abs(off) <= half:
+            to_row = int(math.floor((places[i, 1] - y) / resolution))
+            to_col = int(math.floor((places[i, 0] - x) / resolution))
+            seen[i] = line_is_clear(free, row, col, to_row, to_col)
+    return seen
 
 
 def _bearing(track: Track, T_map_laser: Array) -> float:

@@ -150,12 +150,13 @@ class Explorer:
     def _candidates(self, topology: TopologicalMap, T_map_base: Array, range_m: float) -> list[Candidate]:
         """A survey of all borders now and then, and when the target is gone; in between what is left of the last."""
         surveyor, borders, memory, last = self.surveyor, self.surveyor.borders, self._memory, self._last
-        ends = {n.id: (n.x, n.y) for n in topology.nodes.values() if n.kind == NodeKind.END}
+        end = NodeKind.END
+        ends = {n.id: (n.x, n.y) for n in topology.nodes.values() if n.kind == end}
         renamed = surveyor.follow(ends)
         memory.target = renamed.get(memory.target or 0, memory.target)
         same = last.revision == borders.revision and last.ends == ends
         if surveyor.frame == borders.frame and (same or self._stamp_ns - last.stamp_ns < self.config.survey_s * 1e9):
-            left = [c for c in map(surveyor.still_open, last.candidates) if c is not None]
+            left = last.candidates if same else [c for c in map(surveyor.still_open, last.candidates) if c is not None]
             if any(c.track.node_id == memory.target for c in left):
                 return left
         candidates = surveyor.survey(T_map_base, range_m)
@@ -274,7 +275,7 @@ class Explorer:
         unreachable = sorted(i for i, candidate in worth.items() if self._failures.has(candidate.place))
         finished = self._memory.nothing_left >= _LOOKS
         code, reason = verdict(finished, unreachable, len(worth))
-        known = float(np.count_nonzero(surveyor.borders.free)) * resolution**2
+        known = surveyor.borders.known_cells * resolution**2
         expected = sum(len(c.cells) for c in worth.values()) * resolution * self.config.behind_m
         chosen = next((e for e in end_nodes if e.is_target), None)
         estimate = known / (known + expected) if known > 0.0 else 0.0

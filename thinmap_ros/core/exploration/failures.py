@@ -63,5 +63,7 @@ class Failures:
         return left
 
     def _at(self, place: Place) -> _Failure | None:
+        if not self._failures:
+            return None
         near = min(self._failures, key=lambda f: math.dist(f.at, place), default=None)
         return near if near and math.dist(near.at, place) <= _SAME_PLACE_M else None

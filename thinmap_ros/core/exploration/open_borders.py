@@ -18,6 +18,7 @@ from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import FREE_AT_MOST, OCCUPIED_AT_LEAST, GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.planning.reach import Part
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.config import TopologyConfig
@@ -32,22 +33,26 @@ _WHOLE_EVERY = 100
 _PART_M = 1.0
 _RIM_M = 0.5
 _MARGIN = 3
+NOTHING = (0, 0, 0, 0)
 
 
 class OpenBorders:
     """The border cells of the whole map; only what a scan can have changed is looked at again.
 
-    free (H, W): known free cells, small gaps closed; solid (H, W): occupied ones; mask (H, W): open border cells; all
-    on the cells of `frame`, which holds the map and some room for it to grow. revision: rises whenever they change.
+    free (H, W): known free cells, small gaps closed; passable (H, W): all but occupied ones; mask (H, W): open border
+    cells; all on the cells of `frame`, which holds the map and some room for it to grow. revision: rises whenever they
+    change; known_cells: how many are free; changed: the part in which free and passable may have changed since somebody
+    set it to NOTHING, None where that is everywhere.
     """
 
     def __init__(self, shortest_m: float) -> None:
         self._shortest_m = shortest_m
         self.frame = GridFrame(0.0, 0.0, 1.0)
-        self.revision = self._updates = 0
+        self.revision = self.known_cells = self._updates = 0
         self.free: Mask = np.zeros((0, 0), dtype=np.bool_)
         self.mask: Mask = np.zeros((0, 0), dtype=np.bool_)
-        self.solid: Mask = np.zeros((0, 0), dtype=np.bool_)
+        self.passable: Mask = np.ones((0, 0), dtype=np.bool_)
+        self.changed: Part | None = None
         self._looks: NDArray[np.uint8] = np.zeros((0, 0), dtype=np.uint8)
 
     def state(self) -> dict[str, NDArray[Any]]:
@@ -62,7 +67,8 @@ class OpenBorders:
         looks = state['looks'].astype(np.uint8)
         rows, cols = looks.shape
         borders.frame, borders._looks = GridFrame(origin_x, origin_y, resolution), looks
-        borders.free, borders.mask, borders.solid = (np.zeros((rows, cols), dtype=np.bool_) for _ in range(3))
+        borders.free, borders.mask = (np.zeros((rows, cols), dtype=np.bool_) for _ in range(2))
+        borders.passable = np.ones((rows, cols), dtype=np.bool_)
         return borders
 
     def update(self, patch: GridPatch, box: Array) -> None:
@@ -82,17 +88,21 @@ class OpenBorders:
         inner = (rows.start - wide[0].start, rows.stop - wide[0].start,
                  cols.start - wide[1].start, cols.stop - wide[1].start)
         offset = (wide[0].start + row, wide[1].start + col)
+        if self.changed is not None:
+            written = (rows.start + row, cols.start + col, rows.stop + row, cols.stop + col)
+            self.changed = written if self.changed == NOTHING else _both(self.changed, written)
         free = known_free(part, _TOPOLOGY)
-        self.revision += _renew(part.cells, free, inner, offset, self.free, self.solid, self.mask, self._looks)
+        changed, more = _renew(part.cells, free, inner, offset, self.free, self.passable, self.mask, self._looks)
+        self.revision, self.known_cells = self.revision + changed, self.known_cells + more
 
     def examine(self, xy: tuple[float, float], reach_m: float, faces: NDArray[np.float64]) -> None:
         """Count a close look from a point, m: border cells whose unknown neighbour lies in plain sight, yet unknown.
 
         faces (2,): first and last direction of view in the map frame, rad. After some such looks a cell is exhausted.
         """
-        row, col = self.frame.cells_of(np.array([xy]))[0]
+        row, col = self._cell_of(xy)
         reach = reach_m / self.frame.resolution
-        self.revision += _examine(self.mask, self.free, self._looks, int(row), int(col), reach, faces)
+        self.revision += _examine(self.mask, self.free, self._looks, row, col, reach, faces)
 
     def exhaust(self, cells: Cells, xy: tuple[float, float]) -> None:
         """Give up border cells (N, 2) for good: those about as near to a point, m, as the nearest of them.
@@ -122,9 +132,9 @@ class OpenBorders:
 
     def place_to_look(self, cells: Cells, allowed: Mask, reach_m: float, xy: tuple[float, float]) -> Array | None:
         """Centre (2,), m, of the allowed cell (H, W) right at a border (N, 2); see viewpoints.place_at."""
-        row, col = (int(v) for v in self.frame.cells_of(np.array([xy]))[0])
-        place = place_at(self.free, cells, allowed, int(reach_m / self.frame.resolution), (row, col))
-        return None if place is None else self.frame.centres_of(np.array([place]))[0]
+        return self._centre_of(
+            place_at(self.free, cells, allowed, int(reach_m / self.frame.resolution), self._cell_of(xy))
+        )
 
     def place_to_view(
         self, cells: Cells, allowed: Mask, ways: Array, reach_m: float, depth_m: float
@@ -135,8 +145,20 @@ class OpenBorders:
         """
         resolution = self.frame.resolution
         depth, reach = round(depth_m / resolution), reach_m / resolution
-        place = place_for(self.free, self.solid, cells, allowed, ways, depth, reach)
-        return None if place is None else self.frame.centres_of(np.array([place]))[0]
+        return self._centre_of(place_for(self.free, self.passable, cells, allowed, ways, depth, reach))
+
+    def _cell_of(self, xy: tuple[float, float]) -> tuple[int, int]:
+        """Cell (row, col) that holds a point, m."""
+        frame = self.frame
+        row, col = (xy[1] - frame.origin_y) / frame.resolution, (xy[0] - frame.origin_x) / frame.resolution
+        return math.floor(row), math.floor(col)
+
+    def _centre_of(self, cell: tuple[int, int] | None) -> Array | None:
+        """Point (2,), m, in the middle of a cell (row, col)."""
+        if cell is None:
+            return None
+        x, y, resolution = self.frame.origin_x, self.frame.origin_y, self.frame.resolution
+        return np.array([(cell[1] + 0.5) * resolution + x, (cell[0] + 0.5) * resolution + y])
 
     def _fit(self, patch: GridPatch) -> tuple[int, int]:
         """Make room for a patch where there is none; returns where its first cell lies, (row, col).
@@ -155,9 +177,9 @@ class OpenBorders:
         if top or bottom or left or right:
             spare = _SPARE if self.mask.size else 0
             more = tuple((low and low + spare, high and high + spare) for low, high in ((top, bottom), (left, right)))
-            self.free, self.solid = np.pad(self.free, more), np.pad(self.solid, more)
+            self.free, self.passable = np.pad(self.free, more), np.pad(self.passable, more, constant_values=True)
             self.mask, self._looks = np.pad(self.mask, more), np.pad(self._looks, more)
-            self.frame = self.frame.shifted(-more[0][0], -more[1][0])
+            self.frame, self.changed = self.frame.shifted(-more[0][0], -more[1][0]), None
             row, col = row + more[0][0], col + more[1][0]
         return row, col
 
@@ -171,20 +193,39 @@ def directions_of_view(scan: Scan, T_map_base: Array) -> Array:
 
 def box_of_scan(scan: Scan, T_map_base: Array) -> Array:
     """Lower left and upper right corner, m, of all that a scan from a pose (3,) can have changed, (2, 2)."""
-    x, y, heading = se2.compose(T_map_base, scan.T_base_laser).tolist()
-    reach = np.where(scan.hit | scan.no_return, np.minimum(scan.ranges_m, scan.range_max_m), 0.0)
-    along_x, along_y = reach * np.cos(scan.angles_rad + heading), reach * np.sin(scan.angles_rad + heading)
-    low = (x + along_x.min(initial=0.0), y + along_y.min(initial=0.0))
-    high = (x + along_x.max(initial=0.0), y + along_y.max(initial=0.0))
-    return np.asarray(np.array([low, high]) + np.array([[-_RIM_M], [_RIM_M]]))
+    T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
+    limits = (scan.range_min_m, scan.range_max_m)
+    return np.asarray(_box(scan.ranges_m, limits, scan.angle_min_rad, scan.angle_increment_rad, T_map_laser))
+
+
+def _both(a: Part, b: Part) -> Part:
+    return min(a[0], b[0]), min(a[1], b[1]), max(a[2], b[2]), max(a[3], b[3])
 
 
 def _part(patch: GridPatch, box: Array) -> tuple[slice, slice]:
     """Rows and columns of a map that lie in a box."""
-    (top, left), (bottom, right) = patch.frame.cells_of(box).tolist()
-    rows, cols = patch.shape
+    frame, (rows, cols) = patch.frame, patch.shape
+    (left, top), (right, bottom) = (
+        (math.floor((x - frame.origin_x) / frame.resolution), math.floor((y - frame.origin_y) / frame.resolution))
+        for x, y in box.tolist()
+    )
     top, left = min(max(top, 0), rows), min(max(left, 0), cols)
     return slice(top, max(min(bottom + 1, rows), top)), slice(left, max(min(right + 1, cols), left))
+
+
+@kernel
+def _box(ranges: Array, limits: tuple[float, float], first: float, step: float, laser: Array) -> Array:
+    """Corners (2, 2) of what beams (N,) from a laser at a pose (3,) reach, and _RIM_M more; see box_of_scan."""
+    left = bottom = right = top = 0.0
+    for i in range(ranges.size):
+        if (ranges[i] >= limits[0] and ranges[i] > 0.0) or ranges[i] >= limits[1]:
+            reach, angle = min(ranges[i], limits[1]), first + step * i + laser[2]
+            x, y = reach * math.cos(angle), reach * math.sin(angle)
+            left, right, bottom, top = min(left, x), max(right, x), min(bottom, y), max(top, y)
+    box = np.empty((2, 2))
+    box[0, 0], box[0, 1] = laser[0] + left - _RIM_M, laser[1] + bottom - _RIM_M
+    box[1, 0], box[1, 1] = laser[0] + right + _RIM_M, laser[1] + top + _RIM_M
+    return box
 
 
 @kernel
@@ -194,18 +235,19 @@ def _renew(
     inner: tuple[int, int, int, int],
     offset: tuple[int, int],
     free: Mask,
-    solid: Mask,
+    passable: Mask,
     mask: Mask,
     looks: NDArray[np.uint8],
-) -> bool:
-    """Take over a part of a map (H, W) and find its borders; returns whether what is free or border has changed.
+) -> tuple[bool, int]:
+    """Take over a part of a map (H, W) and find its borders.
 
+    Returns whether what is free or border has changed, and how many more cells are free.
     known (H, W): which cells are free; inner: first row, row after the last, and the same of columns, of what is
-    written to free, solid, mask and looks, in which the part begins at row and column `offset`. A border is a free cell
-    with an unknown one above, below, left or right; what lies outside of the part is unknown.
+    written to free, passable, mask and looks, in which the part begins at row and column `offset`. A border is a free
+    cell with an unknown one above, below, left or right; what lies outside of the part is unknown.
     """
     rows, cols = cells.shape
-    changed = False
+    changed, more = False, 0
     for row in range(inner[0], inner[1]):
         for col in range(inner[2], inner[3]):
             r, c = row + offset[0], col + offset[1]
@@ -218,8 +260,9 @@ def _renew(
                     elif not known[y, x]:
                         border |= cells[y, x] < 0 or FREE_AT_MOST < cells[y, x] < OCCUPIED_AT_LEAST
             changed |= known[row, col] != free[r, c] or border != mask[r, c]
-            free[r, c], mask[r, c], solid[r, c] = known[row, col], border, cells[row, col] >= OCCUPIED_AT_LEAST
-    return changed
+            more += int(known[row, col]) - int(free[r, c])
+            free[r, c], mask[r, c], passable[r, c] = known[row, col], border, cells[row, col] < OCCUPIED_AT_LEAST
+    return changed, more
 
 
 @kernel

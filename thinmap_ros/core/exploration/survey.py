@@ -19,11 +19,11 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.config import parameter
 from thinmap_ros.core.exploration.decision import FIRST_STAND_IN_ID, EndNode
 from thinmap_ros.core.exploration.end_node_tracker import EndNodeTracker, Track, TrackerConfig
-from thinmap_ros.core.exploration.open_borders import OpenBorders
+from thinmap_ros.core.exploration.open_borders import NOTHING, OpenBorders
 from thinmap_ros.core.exploration.viewpoints import SQUARE
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.planning.grid_search import coarse, field_from, fine
-from thinmap_ros.core.planning.reach import are_near, places_and_ways, standing_places
+from thinmap_ros.core.planning.reach import are_near, let_out, renew_standing, standing_places
 from thinmap_ros.core.se2 import Array
 
 Cells = NDArray[np.int64]
@@ -83,9 +83,10 @@ class Surveyor:
         self.tracker = EndNodeTracker(config)
         self.stand_ins = EndNodeTracker(config)
         self.frame = self.borders.frame
-        self.reached = self.maybe = self.borders.mask
+        self.reached = self.maybe = self._standing = self.borders.mask
         self.ways: Array = np.zeros((0, 0))
         self._memory = _Memory()
+        self._ends: dict[int, Place] | None = None
 
     def state(self) -> dict[str, NDArray[Any]]:
         """All that is remembered, as arrays by name; `restore` goes on from it."""
@@ -109,10 +110,13 @@ class Surveyor:
         self.borders = OpenBorders.from_state(part('borders'), self.config.shortest_border_m)
         visited = {int(row[0]): (float(row[1]), float(row[2])) for row in state['visited']}
         closer = [(float(x), float(y)) for x, y in state['look_closer']]
-        self._memory = _Memory(visited, closer, int(state['next_stand_in']))
+        self._memory, self._ends = _Memory(visited, closer, int(state['next_stand_in'])), None
 
     def follow(self, ends: dict[int, Place]) -> dict[int, int]:
         """Take in where the end nodes are now; returns the new id of each one that lives on under another one."""
+        if ends == self._ends:
+            return {}  # scans come more often than graphs
+        self._ends = ends
         renamed = self.tracker.follow(ends)
         visited = {renamed.get(i, i): place for i, place in self._memory.visited.items()}
         # One that has moved is another one.
@@ -142,7 +146,10 @@ class Surveyor:
         """What is left of a candidate of the last survey; None if that is nothing."""
         if self.track(candidate.track.node_id) is not candidate.track:
             return None
-        cells = candidate.cells[self.borders.mask[candidate.cells[:, 0], candidate.cells[:, 1]]]
+        still = self.borders.mask[candidate.cells[:, 0], candidate.cells[:, 1]]
+        if still.all() and len(still):
+            return candidate
+        cells = candidate.cells[still]
         long_enough = len(cells) * self.borders.frame.resolution >= self.config.shortest_border_m - 1e-6
         if not (long_enough or self.config.mode == 'paper'):
             return None
@@ -174,13 +181,23 @@ class Surveyor:
         return float(self.ways[row, col]) * SQUARE * self.frame.resolution if inside else math.inf
 
     def _look_around(self, T_map_base: Array) -> None:
-        self.frame = self.borders.frame
-        radius, xy = self.config.robot_radius_m, (float(T_map_base[0]), float(T_map_base[1]))
-        standing, ways = places_and_ways(self.borders.free, self.frame, xy, radius, _ESCAPE_M)
-        self.maybe = standing_places(~self.borders.solid, radius, self.frame.resolution)
+        self._renew_standing()
+        free, standing, xy = self.borders.free, self._standing, (float(T_map_base[0]), float(T_map_base[1]))
+        ways = let_out(standing, free, self.frame, xy, _ESCAPE_M)
         row, col = (int(v) for v in self.frame.cells_of(T_map_base[None, :2])[0])
         self.ways = field_from(coarse(ways, SQUARE), (row // SQUARE, col // SQUARE))
         self.reached = fine(np.isfinite(self.ways), SQUARE, standing)
+
+    def _renew_standing(self) -> None:
+        """Where the robot can stand, and where it could: anew in the part of the map that has changed."""
+        borders, radius, resolution = self.borders, self.config.robot_radius_m, self.borders.frame.resolution
+        part, borders.changed, self.frame = borders.changed, NOTHING, borders.frame
+        if part is None:
+            self._standing = standing_places(borders.free, radius, resolution)
+            self.maybe = standing_places(borders.passable, radius, resolution)
+        elif part != NOTHING:
+            renew_standing(self._standing, borders.free, part, radius, resolution)
+            renew_standing(self.maybe, borders.passable, part, radius, resolution)
 
     def _owners(self, cells: Cells) -> Cells:
         """Id of the end node to which each border cell belongs, or -1.
@@ -269,7 +286,9 @@ class Surveyor:
 
 def end_node_of(track: Track, candidate: Candidate | None, target_goal: Array | None, resolution: float) -> EndNode:
     """An end node as it is told of: with its candidate, if it is one, and its goal (3,), if it is the target."""
-    goal = se2.pose(track.x, track.y, 0.0) if candidate is None else candidate.goal
+    goal = target_goal
+    if goal is None:
+        goal = np.array([track.x, track.y, 0.0]) if candidate is None else candidate.goal
     return EndNode(
         node_id=track.node_id,
         x=track.x,
@@ -281,7 +300,7 @@ def end_node_of(track: Track, candidate: Candidate | None, target_goal: Array | 
         angle_span_deg=track.angle_span_deg,
         open_border_m=0.0 if candidate is None else len(candidate.cells) * resolution,
         is_target=target_goal is not None,
-        goal=goal if target_goal is None else target_goal,
+        goal=goal,
     )
 
 

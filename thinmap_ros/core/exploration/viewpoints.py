@@ -25,16 +25,16 @@ _SLACK, _STRIDE = 5, 4
 
 
 def place_for(
-    free: Mask, solid: Mask, cells: Cells, allowed: Mask, ways: Array, depth: int, reach: float
+    free: Mask, passable: Mask, cells: Cells, allowed: Mask, ways: Array, depth: int, reach: float
 ) -> Cell | None:
     """The allowed cell with the shortest way from which most of what a border (N, 2) hides could be seen.
 
-    free, solid, allowed (H, W); ways (ceil(H / SQUARE), ceil(W / SQUARE)): length of the way to each square of
-    SQUARE x SQUARE cells, in whose middle the robot would stand; depth: how far behind the border is looked, in cells;
-    reach: how far the laser sees, in cells.
+    free, passable (all but what is known to be solid), allowed (H, W); ways (ceil(H / SQUARE), ceil(W / SQUARE)):
+    length of the way to each square of SQUARE x SQUARE cells, in whose middle the robot would stand; depth: how far
+    behind the border is looked, in cells; reach: how far the laser sees, in cells.
     """
-    points = _hidden_points(free, solid, cells, depth, _POINTS)
-    row, col = _view_place(ways, SQUARE, allowed, ~solid, points, reach, _SHARE)
+    points = _hidden_points(free, passable, cells, depth, _POINTS)
+    row, col = _view_place(ways, SQUARE, allowed, passable, points, reach, _SHARE)
     return None if row < 0 else (int(row), int(col))
 
 
@@ -49,7 +49,7 @@ def place_at(free: Mask, cells: Cells, allowed: Mask, most_steps: int, towards: 
 
 
 @kernel
-def _hidden_points(free: Mask, solid: Mask, cells: Cells, depth: int, most: int) -> Cells:
+def _hidden_points(free: Mask, passable: Mask, cells: Cells, depth: int, most: int) -> Cells:
     """Cells behind some of a border's cells (N, 2): straight on into the unknown, up to a depth or something known."""
     rows, cols = free.shape
     count = min(cells.shape[0], most)
@@ -61,14 +61,14 @@ def _hidden_points(free: Mask, solid: Mask, cells: Cells, depth: int, most: int)
         down, right = 0.0, 0.0
         for r in range(max(row - 3, 0), min(row + 4, rows)):
             for c in range(max(col - 3, 0), min(col + 4, cols)):
-                if not free[r, c] and not solid[r, c]:
+                if not free[r, c] and passable[r, c]:
                     down += r - row
                     right += c - col
         length = max(math.hypot(down, right), 1e-9)
         points[i, 0], points[i, 1] = row, col
         for step in range(1, depth + 1):
             r, c = int(round(row + step * down / length)), int(round(col + step * right / length))
-            if r < 0 or r >= rows or c < 0 or c >= cols or solid[r, c]:
+            if r < 0 or r >= rows or c < 0 or c >= cols or not passable[r, c]:
                 break
             points[i, 0], points[i, 1] = r, c
     return points

@@ -44,12 +44,17 @@ def coarse(allowed: Mask, factor: int) -> Mask:
 @kernel
 def fine(squares: Mask, factor: int, cells: Mask) -> Mask:
     """Those cells of a mask (H, W) that lie in a true square of factor x factor cells."""
-    result = np.zeros(cells.shape, dtype=np.bool_)
-    for row in range(cells.shape[0]):
+    rows, cols = cells.shape
+    result = np.zeros((rows, cols), dtype=np.bool_)
+    line = np.zeros(squares.shape[1] * factor, dtype=np.bool_)
+    for square_row in range(squares.shape[0]):
         for square in range(squares.shape[1]):
-            if squares[row // factor, square]:
-                first, last = square * factor, min((square + 1) * factor, cells.shape[1])
-                result[row, first:last] = cells[row, first:last]
+            for k in range(factor):
+                line[square * factor + k] = squares[square_row, square]
+        # All rows of a square with one line, many cells at a time.
+        for row in range(square_row * factor, min((square_row + 1) * factor, rows)):
+            for col in range(cols):
+                result[row, col] = cells[row, col] & line[col]
     return result
 
 
@@ -63,7 +68,7 @@ class WayTable:
         self._cell_m = cell_m
         self._forget_ns = forget_s * 1e9
         self._unknown_weight = unknown_weight
-        self._known: dict[frozenset[Key], tuple[int, float]] = {}
+        self._known: dict[tuple[Key, Key], tuple[int, float]] = {}
 
     def update(self, allowed: Mask, unknown: Mask, frame: GridFrame, places: Array, stamp_ns: int) -> Array:
         """Lengths of the ways, m, between all places (N, 2), m, over the allowed cells (H, W) of a frame, (N, N).
@@ -77,16 +82,17 @@ class WayTable:
         cells = (frame.cells_of(places) + shift) // factor
         first = (round(frame.origin_y / frame.resolution) // factor, round(frame.origin_x / frame.resolution) // factor)
         keys = [(int(row), int(col)) for row, col in cells + first]
-        self._forget(keys, stamp_ns)
+        known = self._still_known(keys, stamp_ns)
         for i, key in enumerate(keys):
-            missing = [j for j in range(i) if keys[j] != key and frozenset((key, keys[j])) not in self._known]
+            missing = [j for j in range(i) if keys[j] != key and _pair(key, keys[j]) not in known]
             if missing:
                 if weights is None:
                     weights = self._weights(allowed, unknown, factor, shift)
                 steps = _ways_from(weights, int(cells[i, 0]), int(cells[i, 1]), np.ascontiguousarray(cells[missing]))
                 for j, way in zip(missing, (_cells(steps) * frame.resolution * factor).tolist(), strict=True):
-                    self._known[frozenset((key, keys[j]))] = (stamp_ns, way)
-        return np.array([[0.0 if a == b else self._known[frozenset((a, b))][1] for b in keys] for a in keys])
+                    known[_pair(key, keys[j])] = (stamp_ns, way)
+        self._known = known
+        return _table([[0.0 if a == b else known[_pair(a, b)][1] for b in keys[:i]] for i, a in enumerate(keys)])
 
     def _weights(self, allowed: Mask, unknown: Mask, factor: int, shift: list[int]) -> NDArray[np.uint8]:
         """What a step costs in each square; 0: no way."""
@@ -94,13 +100,24 @@ class WayTable:
         weights[_coarse(allowed, factor, shift[0], shift[1])] = 1
         return weights
 
-    def _forget(self, keys: list[Key], stamp_ns: int) -> None:
-        """Forget ways that are old, or between places that are not asked for any more."""
-        pairs = {frozenset((a, b)) for i, a in enumerate(keys) for b in keys[:i]}
-        self._known = {
-            pair: known for pair, known in self._known.items()
-            if pair in pairs and stamp_ns - known[0] < self._forget_ns
-        }
+    def _still_known(self, keys: list[Key], stamp_ns: int) -> dict[tuple[Key, Key], tuple[int, float]]:
+        """The ways that are known between these places, and not too old; all others are forgotten."""
+        since = stamp_ns - self._forget_ns
+        pairs = (_pair(a, b) for i, a in enumerate(keys) for b in keys[:i])
+        found = ((pair, self._known.get(pair)) for pair in pairs)
+        return {pair: known for pair, known in found if known is not None and known[0] > since}
+
+
+def _pair(a: Key, b: Key) -> tuple[Key, Key]:
+    return (a, b) if a < b else (b, a)
+
+
+def _table(below: list[list[float]]) -> Array:
+    """Symmetric table (N, N) of the numbers below its diagonal, on which it is 0."""
+    table = np.zeros((len(below), len(below)))
+    for i, row in enumerate(below):
+        table[i, :i] = table[:i, i] = row
+    return table
 
 
 def _cells(steps: NDArray[np.int32]) -> Array:

@@ -109,10 +109,10 @@ class Navigator:
         """
         if scan is not None and scan is not self._scan:
             self._scan = scan
-            near = np.square(self._points_map - T_map_base[:2]).sum(axis=1) < _REMEMBERED_M**2
-            hidden = self._points_map[near]
-            hidden = hidden[~_in_view(scan, se2.compose(T_map_base, scan.T_base_laser), hidden)]
-            self._points_map = np.concatenate([se2.transform_points(T_map_base, scan.points_base()), hidden])
+            first, step = scan.angle_min_rad, scan.angle_increment_rad
+            T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
+            hits = np.where(scan.hit, scan.ranges_m, np.nan)
+            self._points_map = _points_around(hits, first, step, T_map_laser, self._points_map, T_map_base)
 
     def _arrive(self, T_map_base: Array, dt_s: float) -> Command:
         self._remaining_m = 0.0
@@ -136,9 +136,10 @@ class Navigator:
     def _is_blocked(self, first: int, patch: GridPatch) -> bool:
         """Whether an obstacle has come nearer to the next metres of the path than the robot's radius."""
         assert self.path is not None
-        resolution = patch.frame.resolution
-        ahead = self.path[first : first + max(1, int(2.0 * _CHECK_AHEAD_M / resolution))]
-        return _touches(patch.cells, patch.frame.cells_of(ahead), self.config.robot_radius_m / resolution - 1e-6)
+        frame = patch.frame
+        ahead = self.path[first : first + max(1, int(2.0 * _CHECK_AHEAD_M / frame.resolution))]
+        at = (frame.origin_x, frame.origin_y, frame.resolution)
+        return _touches(patch.cells, at, ahead, self.config.robot_radius_m / frame.resolution - 1e-6)
 
     def _plan(self, T_map_base: Array, patch: GridPatch) -> str:
         """Plan anew; returns why there is no path, or nothing. In front of an obstacle its points count as walls."""
@@ -234,18 +235,24 @@ class Navigator:
     def _free_length(self, T_map_base: Array, curvature: float, length_m: float) -> float:
         """How far the body can be moved along an arc before a point comes nearer than its radius, up to length_m."""
         count = math.ceil(length_m / _SWEEP_STEP_M)
-        centres = _arc(T_map_base, curvature, length_m, count)
-        return length_m * _clear_steps(centres, self._points_map, self.config.body_radius_m) / max(count, 1)
+        clear = _clear_steps_on_arc(T_map_base, curvature, length_m, count, self._points_map, self.config.body_radius_m)
+        return length_m * clear / max(count, 1)
 
 
 @kernel
-def _touches(cells: NDArray[np.int8], path: NDArray[np.int64], radius: float) -> bool:
-    """Whether an occupied cell of a map (H, W) is nearer than a radius, in cells, to one of a path's cells (K, 2)."""
+def _touches(cells: NDArray[np.int8], frame: tuple[float, float, float], path: Array, radius: float) -> bool:
+    """Whether an occupied cell of a map (H, W) is nearer than a radius, in cells, to one of a path's (K, 2), m.
+
+    frame: origin x, origin y and resolution of the map, m.
+    """
     reach = int(math.ceil(radius))
+    last_row, last_col = -1, -1
     for k in range(path.shape[0]):
-        row, col = path[k, 0], path[k, 1]
-        if k > 0 and row == path[k - 1, 0] and col == path[k - 1, 1]:
+        row = int(math.floor((path[k, 1] - frame[1]) / frame[2]))
+        col = int(math.floor((path[k, 0] - frame[0]) / frame[2]))
+        if row == last_row and col == last_col:
             continue
+        last_row, last_col = row, col
         for r in range(max(row - reach, 0), min(row + reach + 1, cells.shape[0])):
             for c in range(max(col - reach, 0), min(col + reach + 1, cells.shape[1])):
                 if cells[r, c] >= OCCUPIED_AT_LEAST and (r - row) ** 2 + (c - col) ** 2 < radius * radius:
@@ -282,9 +289,35 @@ def _clear_steps(centres: Array, points: Array, radius: float) -> int:
     return max(clear - 1, 0)
 
 
-def _in_view(scan: Scan, T_map_laser: Array, points_map: Array) -> NDArray[np.bool_]:
-    """Which points (N, 2) lie between the first and the last beam of a scan, (N,)."""
-    last = scan.angle_min_rad + scan.angle_increment_rad * (scan.ranges_m.size - 1)
-    dx, dy = (points_map - T_map_laser[:2]).T
-    off = se2.wrap(np.arctan2(dy, dx) - T_map_laser[2] - 0.5 * (scan.angle_min_rad + last))
-    return np.asarray(np.abs(off) <= 0.5 * abs(last - scan.angle_min_rad))
+@kernel
+def _clear_steps_on_arc(
+    start: Array, curvature: float, length_m: float, count: int, points: Array, radius: float
+) -> int:
+    """How many of `count` steps along an arc a disc can be moved without touching points: `_arc`, `_clear_steps`."""
+    return _clear_steps(_arc(start, curvature, length_m, count), points, radius)
+
+
+@kernel
+def _points_around(ranges: Array, first: float, step: float, laser: Array, earlier: Array, robot: Array) -> Array:
+    """Where the beams of a scan ended (NaN: nowhere), and those of the points seen earlier (N, 2) that still count.
+
+    These are near to the robot's pose (3,), and lie beside the scan's field of view. All in the map frame, m.
+    """
+    points = np.empty((ranges.size + earlier.shape[0], 2))
+    count = 0
+    for i in range(ranges.size):
+        if not math.isnan(ranges[i]):
+            angle = laser[2] + first + step * i
+            points[count, 0] = laser[0] + ranges[i] * math.cos(angle)
+            points[count, 1] = laser[1] + ranges[i] * math.sin(angle)
+            count += 1
+    last = first + step * (ranges.size - 1)
+    middle, half = laser[2] + 0.5 * (first + last), 0.5 * abs(last - first)
+    for i in range(earlier.shape[0]):
+        dx, dy = earlier[i, 0] - laser[0], earlier[i, 1] - laser[1]
+        off = math.pi - (math.pi - (math.atan2(dy, dx) - middle)) % (2.0 * math.pi)
+        near = (earlier[i, 0] - robot[0]) ** 2 + (earlier[i, 1] - robot[1]) ** 2 < _REMEMBERED_M**2
+        if near and abs(off) > half:
+            points[count, 0], points[count, 1] = earlier[i, 0], earlier[i, 1]
+            count += 1
+    return points[:count].copy()

@@ -11,6 +11,8 @@ from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.topology.free_space import column_distance, standing_room
 
 Mask = NDArray[np.bool_]
+# Rows and columns of cells: first row, first column, row after the last, column after the last.
+Part = tuple[int, int, int, int]
 
 
 def standing_places(free: Mask, radius_m: float, resolution: float) -> Mask:
@@ -18,31 +20,41 @@ def standing_places(free: Mask, radius_m: float, resolution: float) -> Mask:
     return standing_room(column_distance(free), radius_m / resolution)
 
 
+def renew_standing(standing: Mask, free: Mask, part: Part, radius_m: float, resolution: float) -> None:
+    """Bring standing places (H, W) up to date where free cells have changed within a part (see `standing_places`)."""
+    reach = math.ceil(radius_m / resolution) + 1
+    top, left, bottom, right = max(part[0] - reach, 0), max(part[1] - reach, 0), part[2] + reach, part[3] + reach
+    # As many cells again are read, so that the cut is no wall.
+    wide = free[max(top - reach, 0) : bottom + reach, max(left - reach, 0) : right + reach]
+    found = standing_places(np.ascontiguousarray(wide), radius_m, resolution)
+    row, col = top - max(top - reach, 0), left - max(left - reach, 0)
+    renewed = standing[top:bottom, left:right]
+    renewed[:] = found[row : row + renewed.shape[0], col : col + renewed.shape[1]]
+
+
 def places_in_reach(free: Mask, frame: GridFrame, xy: tuple[float, float], radius_m: float, escape_m: float) -> Mask:
-    """Standing places (H, W) to which a robot of a radius can get from a point (m); see `places_and_ways`."""
-    standing, ways = places_and_ways(free, frame, xy, radius_m, escape_m)
+    """Standing places (H, W) to which a robot of a radius can get from a point (m); see `let_out`."""
+    standing = standing_places(free, radius_m, frame.resolution)
+    ways = let_out(standing, free, frame, xy, escape_m)
     row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
     inside = 0 <= row < free.shape[0] and 0 <= col < free.shape[1]
     return reached_from(ways, (row, col)) & standing if inside else np.zeros_like(standing)
 
 
-def places_and_ways(
-    free: Mask, frame: GridFrame, xy: tuple[float, float], radius_m: float, escape_m: float
-) -> tuple[Mask, Mask]:
-    """Standing places (H, W) of a robot of a radius, and the cells over which one that is at a point (m) may go.
+def let_out(standing: Mask, free: Mask, frame: GridFrame, xy: tuple[float, float], escape_m: float) -> Mask:
+    """Cells (H, W) over which a robot that is at a point (m) may go.
 
-    These are the same, but where it stands too near to something it is let out over free cells up to escape_m away, as
-    a path would.
+    These are its standing places, but where it stands too near to something it is let out over free cells up to
+    escape_m away, as a path would.
     """
-    standing = standing_places(free, radius_m, frame.resolution)
     row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
     if not (0 <= row < free.shape[0] and 0 <= col < free.shape[1]) or standing[row, col]:
-        return standing, standing
+        return standing
     ways = standing.copy()
     part, within = disc(ways, (row, col), escape_m / frame.resolution)
     ways[part] |= within & free[part]
     ways[row, col] = True
-    return standing, ways
+    return ways
 
 
 def reached_from(allowed: Mask, start: tuple[int, int]) -> Mask:
