@@ -22,7 +22,8 @@ def report(strategy: str, world: str, start: int, distance: float) -> dict[str, 
     return {
         'strategy': strategy, 'world': world, 'start_number': start, 'distance': distance, 'time': 2.0 * distance,
         'turned_rad': 5.0, 'coverage': 0.995, 'finished': True, 'collisions': 0, 'end_nodes_seen': 4,
-        'end_nodes_visited': 1, 'wall_s': 1.0,
+        'end_nodes_visited': 1, 'cpu_s': 1.0,
+        'decision_ms': {'median': 0.5, 'max': 7.0},
     }
 
 
@@ -72,6 +73,10 @@ def test_it_runs_all_writes_all_and_goes_on_where_it_was(world: Path, tmp_path: 
     again = compare(*words)
     assert '1234.5' in again.stdout
     assert files[1].stat().st_mtime_ns > stamp
+    # Nor is what was run otherwise taken for it.
+    faster = compare(*words, '--speed', '0.3')
+    assert faster.returncode == 2
+    assert 'other options' in faster.stderr
 
 
 def test_a_world_without_start_is_told_in_one_line(world: Path, tmp_path: Path) -> None:

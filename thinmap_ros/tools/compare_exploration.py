@@ -8,7 +8,7 @@ import json
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -97,6 +97,14 @@ def _report_file(out: Path, job: Job) -> Path:
     return out / 'runs' / job.name / 'report.json'
 
 
+def _report_of(out: Path, job: Job) -> Report:
+    path = _report_file(out, job)
+    report: Report = json.loads(read_text(path))
+    if report.get('options') != asdict(job.options):
+        raise InputError(f'{path}: of a run with other options: expected another folder for these')
+    return report
+
+
 def run_missing(jobs: list[Job], out: Path, arguments: argparse.Namespace) -> None:
     """Run what has no result yet; each result is written as soon as it is there."""
     missing = [job for job in jobs if not _report_file(out, job).exists()]
@@ -113,7 +121,7 @@ def run_missing(jobs: list[Job], out: Path, arguments: argparse.Namespace) -> No
 def _work(arguments: argparse.Namespace) -> None:
     jobs = _jobs(arguments)
     run_missing(jobs, arguments.out, arguments)
-    reports = [json.loads(read_text(_report_file(arguments.out, job))) for job in jobs]
+    reports = [_report_of(arguments.out, job) for job in jobs]
     table = markdown(reports)
     write_text(arguments.out / 'table.md', table)
     write_text(arguments.out / 'reports.json', json.dumps(reports) + '\n')

@@ -19,8 +19,8 @@ def markdown(reports: list[Report]) -> str:
         by_strategy[report['strategy']][report['world'], report['start_number']] = report
     lines = [
         '| strategy | runs | stopped | coverage least | coverage mean | collisions | distance m | time s | turned rad '
-        '| end nodes visited / seen | x real time |',
-        '|---|---|---|---|---|---|---|---|---|---|---|',
+        '| end nodes visited / seen | decision ms, median (highest) | longest | x real time (one core) |',
+        '|---|---|---|---|---|---|---|---|---|---|---|---|---|',
     ]
     lines += [_row(name, list(runs.values())) for name, runs in sorted(by_strategy.items())]
     others = sorted(set(by_strategy) - {OURS})
@@ -41,12 +41,14 @@ def saved(ours: dict[tuple[str, int], Report], others: dict[tuple[str, int], Rep
 
 def _row(name: str, runs: list[Report]) -> str:
     coverage = [run['coverage'] for run in runs]
-    speed = sum(run['time'] for run in runs) / max(sum(run['wall_s'] for run in runs), 1e-9)
+    speed = sum(run['time'] for run in runs) / max(sum(run['cpu_s'] for run in runs), 1e-9)
+    decision, longest = (max(run['decision_ms'][key] for run in runs) for key in ('median', 'max'))
     visited, seen = (sum(run[key] for run in runs) for key in ('end_nodes_visited', 'end_nodes_seen'))
     return (
         f'| {name} | {len(runs)} | {sum(run["finished"] for run in runs)} | {min(coverage):.2%} '
         f'| {np.mean(coverage):.2%} | {sum(run["collisions"] for run in runs)} | {_spread(runs, "distance")} '
-        f'| {_spread(runs, "time")} | {_spread(runs, "turned_rad")} | {visited} / {seen} | {speed:.0f} |'
+        f'| {_spread(runs, "time")} | {_spread(runs, "turned_rad")} | {visited} / {seen} '
+        f'| {decision:.2f} | {longest:.0f} | {speed:.0f} |'
     )
 
 

@@ -5,7 +5,7 @@ import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -233,9 +233,9 @@ def explore(
     """Explore a world from a start (3,); returns what is left of it and the report."""
     loop = make_loop(world, start, options)
     goal = coverable(world, start, PRESETS[options.robot].radius_m, options.laser.range_max_m)
-    began = time.perf_counter()
+    began, cpu_began = time.perf_counter(), time.process_time()
     ending = loop.run(goal, options.time_limit_s, show)
-    wall_s = time.perf_counter() - began
+    wall_s, cpu_s = time.perf_counter() - began, time.process_time() - cpu_began
     log = loop.log
     report = exploration_report(
         ending, np.array(log.stamps_ns) / 1e9, np.array(log.true_poses), np.array(log.poses), np.array(log.coverage),
@@ -245,7 +245,8 @@ def explore(
     milliseconds = 1e3 * np.array(log.decision_s)
     report['decision_ms'] = {'median': round(float(np.median(milliseconds)), 2), 'max': round(milliseconds.max(), 2)}
     report |= {} if loop.kidnapping is None else loop.kidnapping.report()
-    report['world'], report['strategy'], report['wall_s'] = world.name, options.strategy, round(wall_s, 3)
+    report['world'], report['strategy'], report['options'] = world.name, options.strategy, asdict(options)
+    report['wall_s'], report['cpu_s'] = round(wall_s, 3), round(cpu_s, 3)
     return loop, report
 
 
