@@ -219,3 +219,31 @@ def test_the_literal_scheme_stops_by_itself_too():
     run = Run(two_rooms(), ExplorerConfig(mode='paper')).go(600.0)
     assert run.last.finished
     assert run.simulation.robot.collisions == 0
+
+
+def hall_with_pockets(size=(160, 300)):
+    """A free hall; 30 pockets of unknown near the robot, and two beside each other at its far end, as slices."""
+    cells = np.zeros(size, dtype=np.int8)
+    cells[[0, -1]], cells[:, [0, -1]] = 100, 100
+    near = [(slice(row, row + 6), slice(col, col + 6)) for row in range(20, 150, 25) for col in range(20, 110, 18)]
+    far = [(slice(row, row + 6), slice(270, 276)) for row in (74, 84)]
+    for pocket in near + far:
+        cells[pocket] = -1
+    return cells, far
+
+
+def test_the_successor_of_a_target_may_lie_farther_off_than_all_that_is_toured():
+    cells, far = hall_with_pockets()
+    explorer, pose = Explorer(), se2.pose(10.0, 8.2, 0.0)
+
+    def step(seconds):
+        nothing = Scan.create(seconds * 1_000_000_000, np.full(181, np.nan), -1.57, math.radians(1.0), 0.05, 2.0)
+        return explorer.step(TopologicalMap(), GridPatch(GridFrame(0.0, 0.0, 0.1), cells), nothing, pose).target
+
+    target = step(0)
+    assert target.x > 26.5
+    cells[min(far, key=lambda pocket: abs(pocket[0].start + 3 - 10.0 * target.y))] = 0
+    explorer.surveyor.borders.update(GridPatch(GridFrame(0.0, 0.0, 0.1), cells), np.array([[0.0, 0.0], [30.0, 16.0]]))
+    after = step(2)
+    assert after.node_id != target.node_id
+    assert after.x < 12.0, 'by now it is weighed against all that is nearer'

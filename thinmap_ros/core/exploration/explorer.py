@@ -197,9 +197,11 @@ class Explorer:
             faced = min(open_to_try, key=lambda i: _turn_to(T_map_base, open_to_try[i].goal))
             return self._go_for(open_to_try[faced], T_map_base)
         costs = self._costs(topology, open_to_try, T_map_base)
-        best = min(costs, key=lambda i: costs[i])
         if memory.target not in costs:
             memory.target = self._successor(open_to_try)
+            if memory.target is not None and memory.target not in costs:
+                costs = self._costs(topology, open_to_try, T_map_base)  # it is none of the nearest
+        best = min(costs, key=lambda i: costs[i])
         if memory.target is None or costs[best] < costs[memory.target] - self._margin(costs[memory.target]):
             memory.target = best
         return self._go_for(open_to_try[memory.target], T_map_base)
