@@ -10,7 +10,7 @@ from thinmap_ros.tools.comparison import OURS, markdown, saved
 
 Report = dict[str, Any]
 _PAGE = Path(__file__).resolve().parent.parent / 'docs' / 'exploration.md'
-_FULL_COVERAGE = 0.99
+_FULL_COVERAGE, _NEARLY_ALL = 0.99, 0.995
 _HEAD = """\
 # Exploration, measured
 
@@ -59,6 +59,9 @@ def _verdicts(reports: list[Report]) -> list[str]:
     lines = [_fault(report) for report in ours.values() if not _is_good(report)]
     if ours and not lines:
         lines = [f'All {len(ours)} runs of {OURS} stopped by themselves, with {_FULL_COVERAGE:.0%} or more, untouched.']
+    if ours:
+        rest = sum(_after(report, _NEARLY_ALL) for report in ours.values()) / len(ours)
+        lines.append(f'After {_NEARLY_ALL:.1%} were seen, {OURS} drove {rest:.1%} of its way (mean).')
     for name, theirs in sorted(by_strategy.items()):
         longer = saved(ours, theirs, 'distance')
         if (longer > 0.0).any():
@@ -67,6 +70,12 @@ def _verdicts(reports: list[Report]) -> list[str]:
                 f'{OURS} drove up to {longer.max():.0%} more.'
             )
     return [f'{line}\n' for line in lines]
+
+
+def _after(report: Report, share: float) -> float:
+    """Share of the whole way that was driven after a coverage was first measured; 0 where it never was."""
+    along = [distance for _, distance, coverage in report['curve'] if coverage >= share]
+    return 1.0 - along[0] / report['distance'] if along else 0.0
 
 
 def _is_good(report: Report) -> bool:

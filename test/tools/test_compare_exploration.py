@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from benchmarks.exploration_page import page
 from thinmap_ros.tools.comparison import markdown, saved
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -23,7 +24,7 @@ def report(strategy: str, world: str, start: int, distance: float) -> dict[str, 
         'strategy': strategy, 'world': world, 'start_number': start, 'distance': distance, 'time': 2.0 * distance,
         'turned_rad': 5.0, 'coverage': 0.995, 'finished': True, 'collisions': 0, 'end_nodes_seen': 4,
         'end_nodes_visited': 1, 'cpu_s': 1.0,
-        'decision_ms': {'median': 0.5, 'max': 7.0},
+        'decision_ms': {'median': 0.5, 'max': 7.0}, 'curve': [[1.0, 0.9 * distance, 0.995], [2.0, distance, 0.995]],
     }
 
 
@@ -40,6 +41,24 @@ def test_the_table_has_a_row_for_each_strategy_and_says_what_ours_saves() -> Non
     table = markdown(reports)
     assert '| nearest_frontier | 3 | 3 | 99.50% | 99.50% | 0 | 100.0 ± 0.0 |' in table
     assert '| nearest_frontier | 3 | -20.0% ± 0.0% | -20.0% ± 0.0% | +0.0% ± 0.0% | 3 |' in table
+
+
+def test_the_page_has_a_section_for_each_way_of_exploring_and_names_every_fault() -> None:
+    laser = {'beams': 181, 'field_of_view_deg': 180.0, 'range_max_m': 8.0}
+    options = {'localization': 'truth', 'speed_m_s': 0.5, 'laser': laser}
+    reports = [report('position_probability', f'dungeon-d{i}', 0, 80.0) | {'options': options} for i in range(3)]
+    for i in range(3):
+        reports.append(report('nearest_frontier', f'dungeon-d{i}', 0, 60.0 + 30.0 * i) | {'options': options})
+    far = options | {'laser': laser | {'range_max_m': 20.0}}
+    stuck = {'finished': False, 'reason': 'time limit of 20000 s', 'coverage': 0.5, 'options': far}
+    reports.append(report('position_probability', 'kth-a', 1, 50.0) | stuck)
+    text = page(reports)
+    assert '## dungeon, 3 worlds: 181 beams over 180 degrees, 8 m, 0.5 m/s, poses known' in text
+    assert 'All 3 runs of position_probability stopped by themselves' in text
+    assert 'After 99.5% were seen, position_probability drove 10.0% of its way (mean).' in text
+    assert 'nearest_frontier drove less in 1 of 3 pairs; position_probability drove up to 33% more.' in text
+    assert '## kth, 1 worlds: 181 beams over 180 degrees, 20 m' in text
+    assert '**kth-a, start 1**: time limit of 20000 s; coverage 50.00%, 0 contacts.' in text
 
 
 def compare(*words: str) -> 'subprocess.CompletedProcess[str]':
