@@ -83,8 +83,10 @@ class WayTable:
         first = (round(frame.origin_y / frame.resolution) // factor, round(frame.origin_x / frame.resolution) // factor)
         keys = [(int(row), int(col)) for row, col in cells + first]
         known = self._still_known(keys, stamp_ns)
-        for i, key in enumerate(keys):
-            missing = [j for j in range(i) if keys[j] != key and _pair(key, keys[j]) not in known]
+        # From new places to all others, not from all others to each of them.
+        for i in sorted(range(len(keys)), key=lambda i: sum(_pair(keys[i], key) in known for key in keys)):
+            key = keys[i]
+            missing = [j for j, other in enumerate(keys) if other != key and _pair(key, other) not in known]
             if missing:
                 if weights is None:
                     weights = self._weights(allowed, unknown, factor, shift)
