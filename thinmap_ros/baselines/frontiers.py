@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.exploration.open_borders import OpenBorders, box_of_scan, directions_of_view
+from thinmap_ros.core.exploration.open_borders import OpenBorders
+from thinmap_ros.core.exploration.views import box_of_scan, directions_of_view
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.grid_search import coarse, ways_from
 from thinmap_ros.core.planning.reach import places_in_reach

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.exploration.open_borders import OpenBorders, box_of_scan
+from thinmap_ros.core.exploration.open_borders import OpenBorders
+from thinmap_ros.core.exploration.views import box_of_scan
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan

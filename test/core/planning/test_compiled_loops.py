@@ -9,7 +9,7 @@ from scipy import ndimage
 from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.end_node_tracker import _in_sight
 from thinmap_ros.core.exploration.open_borders import _parts
-from thinmap_ros.core.exploration.survey import _without_scraps
+from thinmap_ros.core.exploration.stretches import without_scraps
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
@@ -172,7 +172,7 @@ def test_owners_without_scraps(seed):
     for number in np.unique(numbers):
         ids, inverse, counts = np.unique(owners[numbers == number], return_inverse=True, return_counts=True)
         expected[numbers == number] = np.where(counts[inverse] < 4, ids[counts.argmax()], owners[numbers == number])
-    assert (_without_scraps(owners, numbers, 4) == expected).all()
+    assert (without_scraps(owners, numbers, 4) == expected).all()
 
 
 @pytest.mark.parametrize('seed', SEEDS)

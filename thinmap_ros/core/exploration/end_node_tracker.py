@@ -34,6 +34,7 @@ from thinmap_ros.core.exploration.position_probability import (
     nearest_distance,
     reliability,
 )
+from thinmap_ros.core.exploration.views import field_of_view
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.jit import kernel
@@ -207,13 +208,6 @@ class EndNodeTracker:
             # What far looks said against the node is settled by the map: nothing is left that could move it.
             track.probability = bayes_update(max(track.probability, PRIOR), self.config.closed_reliability)
         track.closed = not is_open
-
-
-def field_of_view(scan: Scan) -> tuple[float, float]:
-    """Directions between which a scan looks, rad, laser frame: its outer beams and as much again as between two."""
-    last = scan.angle_min_rad + scan.angle_increment_rad * (scan.ranges_m.size - 1)
-    more = abs(scan.angle_increment_rad)
-    return min(scan.angle_min_rad, last) - more, max(scan.angle_min_rad, last) + more
 
 
 @kernel

@@ -24,9 +24,9 @@ from thinmap_ros.core.config import parameter
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.decision import Decision, verdict
 from thinmap_ros.core.exploration.failures import Failures
-from thinmap_ros.core.exploration.open_borders import box_of_scan, directions_of_view
 from thinmap_ros.core.exploration.survey import Candidate, Place, SurveyConfig, Surveyor, end_node_of
 from thinmap_ros.core.exploration.tour import tours_by_first
+from thinmap_ros.core.exploration.views import box_of_scan, directions_of_view
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.graph_search import costs_to
 from thinmap_ros.core.planning.grid_search import WayTable

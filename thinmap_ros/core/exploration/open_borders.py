@@ -12,14 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.viewpoints import place_at, place_for
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import FREE_AT_MOST, OCCUPIED_AT_LEAST, GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.planning.reach import Part
-from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.free_space import known_free, true_cells
@@ -31,7 +29,6 @@ _LOOKS = 3
 _SPARE = 64
 _WHOLE_EVERY = 100
 _PART_M = 1.0
-_RIM_M = 0.5
 _MARGIN = 3
 NOTHING = (0, 0, 0, 0)
 
@@ -74,8 +71,8 @@ class OpenBorders:
     def update(self, patch: GridPatch, box: Array) -> None:
         """Find the borders of a map anew in a box, the first time and now and then everywhere.
 
-        box (2, 2): its lower left and upper right corner, m (see box_of_scan). What lies elsewhere changes only where
-        the map was corrected.
+        box (2, 2): its lower left and upper right corner, m (see views.box_of_scan). What lies elsewhere changes only
+        where the map was corrected.
         """
         whole = self._updates % _WHOLE_EVERY == 0
         self._updates += 1
@@ -184,20 +181,6 @@ class OpenBorders:
         return row, col
 
 
-def directions_of_view(scan: Scan, T_map_base: Array) -> Array:
-    """First and last direction of view of a scan at a pose (3,), rad, map frame, the first the smaller, (2,)."""
-    last = scan.angle_min_rad + scan.angle_increment_rad * (scan.ranges_m.size - 1)
-    heading = float(T_map_base[2] + scan.T_base_laser[2])
-    return np.array([heading + min(scan.angle_min_rad, last), heading + max(scan.angle_min_rad, last)])
-
-
-def box_of_scan(scan: Scan, T_map_base: Array) -> Array:
-    """Lower left and upper right corner, m, of all that a scan from a pose (3,) can have changed, (2, 2)."""
-    T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
-    limits = (scan.range_min_m, scan.range_max_m)
-    return np.asarray(_box(scan.ranges_m, limits, scan.angle_min_rad, scan.angle_increment_rad, T_map_laser))
-
-
 def _both(a: Part, b: Part) -> Part:
     return min(a[0], b[0]), min(a[1], b[1]), max(a[2], b[2]), max(a[3], b[3])
 
@@ -211,21 +194,6 @@ def _part(patch: GridPatch, box: Array) -> tuple[slice, slice]:
     )
     top, left = min(max(top, 0), rows), min(max(left, 0), cols)
     return slice(top, max(min(bottom + 1, rows), top)), slice(left, max(min(right + 1, cols), left))
-
-
-@kernel
-def _box(ranges: Array, limits: tuple[float, float], first: float, step: float, laser: Array) -> Array:
-    """Corners (2, 2) of what beams (N,) from a laser at a pose (3,) reach, and _RIM_M more; see box_of_scan."""
-    left = bottom = right = top = 0.0
-    for i in range(ranges.size):
-        if (ranges[i] >= limits[0] and ranges[i] > 0.0) or ranges[i] >= limits[1]:
-            reach, angle = min(ranges[i], limits[1]), first + step * i + laser[2]
-            x, y = reach * math.cos(angle), reach * math.sin(angle)
-            left, right, bottom, top = min(left, x), max(right, x), min(bottom, y), max(top, y)
-    box = np.empty((2, 2))
-    box[0, 0], box[0, 1] = laser[0] + left - _RIM_M, laser[1] + bottom - _RIM_M
-    box[1, 0], box[1, 1] = laser[0] + right + _RIM_M, laser[1] + top + _RIM_M
-    return box
 
 
 @kernel

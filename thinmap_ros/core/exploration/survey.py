@@ -20,8 +20,8 @@ from thinmap_ros.core.config import parameter
 from thinmap_ros.core.exploration.decision import FIRST_STAND_IN_ID, EndNode
 from thinmap_ros.core.exploration.end_node_tracker import EndNodeTracker, Track, TrackerConfig
 from thinmap_ros.core.exploration.open_borders import NOTHING, OpenBorders
+from thinmap_ros.core.exploration.stretches import middle_one, without_scraps
 from thinmap_ros.core.exploration.viewpoints import SQUARE
-from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.planning.grid_search import coarse, field_from, fine
 from thinmap_ros.core.planning.reach import are_near, let_out, renew_standing, standing_places
 from thinmap_ros.core.se2 import Array
@@ -220,7 +220,7 @@ class Surveyor:
         Such a scrap goes to whoever holds most of the stretch: it would be a target that is none at the next scan.
         """
         fewest = round(self.config.shortest_border_m / self.borders.frame.resolution)
-        return _without_scraps(owners, numbers, fewest)
+        return without_scraps(owners, numbers, fewest)
 
     def _stand_in(self, cells: Cells, numbers: Cells, T_map_base: Array, range_m: float) -> list[Candidate]:
         """One candidate for each stretch of border left over that can be looked at from somewhere."""
@@ -279,7 +279,7 @@ class Surveyor:
 
     def _middle(self, stretch: Cells) -> Place:
         """The cell of a stretch nearest to its centre of gravity, in m."""
-        row, col = stretch[_middle_one(stretch)].tolist()
+        row, col = stretch[middle_one(stretch)].tolist()
         frame = self.borders.frame
         return (col + 0.5) * frame.resolution + frame.origin_x, (row + 0.5) * frame.resolution + frame.origin_y
 
@@ -302,39 +302,6 @@ def end_node_of(track: Track, candidate: Candidate | None, target_goal: Array | 
         is_target=target_goal is not None,
         goal=goal,
     )
-
-
-@kernel
-def _without_scraps(owners: Cells, numbers: Cells, fewest: int) -> Cells:
-    """Owners (N,) of cells, such that in each part (numbers, (N,), from 0 on) none but the largest holds too few.
-
-    Of equally large ones that with the lowest id counts as the largest.
-    """
-    result = owners.copy()
-    ids = np.unique(owners)
-    counts = np.zeros((numbers.max() + 1 if numbers.size else 0, ids.size), dtype=np.int64)
-    places = np.searchsorted(ids, owners)
-    for i in range(owners.size):
-        counts[numbers[i], places[i]] += 1
-    for i in range(owners.size):
-        if counts[numbers[i], places[i]] < fewest:
-            result[i] = ids[counts[numbers[i]].argmax()]
-    return result
-
-
-@kernel
-def _middle_one(cells: Cells) -> int:
-    """Index of the cell (N, 2) nearest to the centre of gravity of all; the first of equally near ones."""
-    row, col = 0.0, 0.0
-    for i in range(cells.shape[0]):
-        row, col = row + cells[i, 0], col + cells[i, 1]
-    row, col = row / cells.shape[0], col / cells.shape[0]
-    best, middle = np.inf, 0
-    for i in range(cells.shape[0]):
-        away = (cells[i, 0] - row) ** 2 + (cells[i, 1] - col) ** 2
-        if away < best:
-            best, middle = away, i
-    return middle
 
 
 def _place(track: Track) -> Place:

@@ -1,0 +1,48 @@
+"""What a scan looks at, and how far it may have changed the map."""
+
+import math
+
+import numpy as np
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+
+_RIM_M = 0.5
+
+
+def field_of_view(scan: Scan) -> tuple[float, float]:
+    """Directions between which a scan looks, rad, laser frame: its outer beams and as much again as between two."""
+    last = scan.angle_min_rad + scan.angle_increment_rad * (scan.ranges_m.size - 1)
+    more = abs(scan.angle_increment_rad)
+    return min(scan.angle_min_rad, last) - more, max(scan.angle_min_rad, last) + more
+
+
+def directions_of_view(scan: Scan, T_map_base: Array) -> Array:
+    """First and last direction of view of a scan at a pose (3,), rad, map frame, the first the smaller, (2,)."""
+    last = scan.angle_min_rad + scan.angle_increment_rad * (scan.ranges_m.size - 1)
+    heading = float(T_map_base[2] + scan.T_base_laser[2])
+    return np.array([heading + min(scan.angle_min_rad, last), heading + max(scan.angle_min_rad, last)])
+
+
+def box_of_scan(scan: Scan, T_map_base: Array) -> Array:
+    """Lower left and upper right corner, m, of all that a scan from a pose (3,) can have changed, (2, 2)."""
+    T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
+    limits = (scan.range_min_m, scan.range_max_m)
+    return np.asarray(_box(scan.ranges_m, limits, scan.angle_min_rad, scan.angle_increment_rad, T_map_laser))
+
+
+@kernel
+def _box(ranges: Array, limits: tuple[float, float], first: float, step: float, laser: Array) -> Array:
+    """Corners (2, 2) of what beams (N,) from a laser at a pose (3,) reach, and _RIM_M more; see box_of_scan."""
+    left = bottom = right = top = 0.0
+    for i in range(ranges.size):
+        if (ranges[i] >= limits[0] and ranges[i] > 0.0) or ranges[i] >= limits[1]:
+            reach, angle = min(ranges[i], limits[1]), first + step * i + laser[2]
+            x, y = reach * math.cos(angle), reach * math.sin(angle)
+            left, right, bottom, top = min(left, x), max(right, x), min(bottom, y), max(top, y)
+    box = np.empty((2, 2))
+    box[0, 0], box[0, 1] = laser[0] + left - _RIM_M, laser[1] + bottom - _RIM_M
+    box[1, 0], box[1, 1] = laser[0] + right + _RIM_M, laser[1] + top + _RIM_M
+    return box
