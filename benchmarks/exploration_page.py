@@ -38,7 +38,7 @@ def page(reports: list[Report]) -> str:
     parts = [_HEAD]
     for (kind, conditions), chosen in sections.items():
         worlds = {report['world'] for report in chosen}
-        parts += [f'## {kind}, {len(worlds)} worlds: {conditions}\n', markdown(chosen), *_verdicts(chosen)]
+        parts += [f'## {kind} ({len(worlds)}): {conditions}\n', markdown(chosen), *_verdicts(chosen)]
     return '\n'.join([*parts, _NOTES])
 
 
@@ -58,7 +58,8 @@ def _verdicts(reports: list[Report]) -> list[str]:
     ours = by_strategy.pop(OURS, {})
     lines = [_fault(report) for report in ours.values() if not _is_good(report)]
     if ours and not lines:
-        lines = [f'All {len(ours)} runs of {OURS} stopped by themselves, with {_FULL_COVERAGE:.0%} or more, untouched.']
+        count = f'{len(ours)} of {len(ours)}'
+        lines = [f'{OURS}: {count} stopped by itself, with {_FULL_COVERAGE:.0%} or more, without contact.']
     if ours:
         rest = sum(_after(report, _NEARLY_ALL) for report in ours.values()) / len(ours)
         lines.append(f'After {_NEARLY_ALL:.1%} were seen, {OURS} drove {rest:.1%} of its way (mean).')

@@ -53,11 +53,11 @@ def test_the_page_has_a_section_for_each_way_of_exploring_and_names_every_fault(
     stuck = {'finished': False, 'reason': 'time limit of 20000 s', 'coverage': 0.5, 'options': far}
     reports.append(report('position_probability', 'kth-a', 1, 50.0) | stuck)
     text = page(reports)
-    assert '## dungeon, 3 worlds: 181 beams over 180 degrees, 8 m, 0.5 m/s, poses known' in text
-    assert 'All 3 runs of position_probability stopped by themselves' in text
+    assert '## dungeon (3): 181 beams over 180 degrees, 8 m, 0.5 m/s, poses known' in text
+    assert 'position_probability: 3 of 3 stopped by itself' in text
     assert 'After 99.5% were seen, position_probability drove 10.0% of its way (mean).' in text
     assert 'nearest_frontier drove less in 1 of 3 pairs; position_probability drove up to 33% more.' in text
-    assert '## kth, 1 worlds: 181 beams over 180 degrees, 20 m' in text
+    assert '## kth (1): 181 beams over 180 degrees, 20 m' in text
     assert '**kth-a, start 1**: time limit of 20000 s; coverage 50.00%, 0 contacts.' in text
 
 
