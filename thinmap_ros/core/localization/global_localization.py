@@ -11,7 +11,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.localization.calibration import NodeModel, calibrate
 from thinmap_ros.core.localization.config import GlobalLocalizationConfig
-from thinmap_ros.core.localization.hypotheses import Hypotheses, evidence_against
+from thinmap_ros.core.localization.hypotheses import Hypotheses, missed_beams
 from thinmap_ros.core.localization.judging import Judge
 from thinmap_ros.core.localization.observation import Observation, observe
 from thinmap_ros.core.localization.places import Places
@@ -171,8 +171,7 @@ class GlobalLocalization:
         if len(known):
             known.poses = self._refined(judge, seen)
             judged = judge.explained(known.poses, seen)
-            against = evidence_against(judged, len(seen.ranges_m), novelty)
-            known.take_evidence(judged, len(seen.ranges_m), novelty, against)
+            known.take_evidence(judged, len(seen.ranges_m), novelty)
             known.prune()
             known.resample(None, self.config.samples, self._rng) if not len(known.samples) else None
             logs = judge.log_likelihoods(known.samples, seen)
@@ -220,13 +219,13 @@ class GlobalLocalization:
             counts, silent = judged_before(
                 judge, self._views, poses, T_odom_base, self.config.odometry_noise
             )
-            new = slice(len(self._known), None)
-            against, beams = np.zeros(len(found)), 0.0
+            new, missed, beams = slice(len(self._known), None), np.zeros(len(poses)), 0.0
             for k, view in enumerate(self._views):
-                against += evidence_against((counts[k], silent[k]), len(view.seen.ranges_m), 1.0)[new]
+                missed += missed_beams((counts[k], silent[k]), len(view.seen.ranges_m))
                 beams += len(view.seen.ranges_m)
             judged = counts.sum(axis=0)[new], silent.sum(axis=0)[new]
-            self._known.add(found, self._log_prior() - against, judged, beams)
+            more = missed[new] - (missed[self._known.best()] if len(self._known) else missed.min(initial=np.inf))
+            self._known.add(found, self._log_prior(), more, judged, beams)
         self._searches += complete
         self._views = [*self._views[-_VIEWS + 1 :], KeyView(seen, T_odom_base)]
 
