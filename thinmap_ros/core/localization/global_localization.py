@@ -27,8 +27,9 @@ __all__ = ['GlobalLocalization', 'GlobalLocalizationConfig', 'Hypothesis', 'Resu
 _NEW_WAY_M, _NEW_TURN_RAD = 0.5, 0.5
 # Independent looks that a place must have explained: more for each e-fold of places that looked alike, and for each
 # look before it turned up. A look counts the less, the more it leaves unexplained of what it should explain in this
-# map, and nothing from this share on.
-_SURE_LOOKS, _SURE_LOOKS_CROWD, _SURE_LOOKS_LATE, _WORTHLESS = 1.0, 0.75, 2.0, 0.06
+# map, and nothing from a share on: from this in smooth maps, from more in rough ones, where that varies with the place.
+_SURE_LOOKS, _SURE_LOOKS_CROWD, _SURE_LOOKS_LATE = 1.0, 0.75, 2.0
+_WORTHLESS, _WORTHLESS_ROUGH = 0.03, 0.5
 # After so many independent looks, a place that explains must have lasted for this share of them, but not for ever.
 _MANY_LOOKS, _LASTING_SHARE, _LASTING_LOOKS = 16.0, 0.4, 20.0
 _VIEWS = 6
@@ -273,7 +274,8 @@ class GlobalLocalization:
         age, missing = float(self._known.ages[best]), 1.0 - float(self._fits[best])
         needed = _SURE_LOOKS + _SURE_LOOKS_CROWD * math.log(self._crowd)
         needed += _SURE_LOOKS_LATE * (self._independent - age)
-        return age * (1.0 - missing / _WORTHLESS) >= needed
+        worthless = _WORTHLESS + _WORTHLESS_ROUGH * (1.0 - self._usual)
+        return age * (1.0 - missing / worthless) >= needed
 
     def _speaks_for_one(self) -> bool:
         known, config = self._known, self.config
