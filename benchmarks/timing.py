@@ -1,5 +1,6 @@
-"""Times that can be compared: the best of several runs, taken in turns."""
+"""Times that can be compared: the best of several runs, taken in turns, or what a run takes of the processor."""
 
+import statistics
 import time
 from collections.abc import Callable
 
@@ -15,3 +16,14 @@ def best_seconds(works: dict[str, Callable[[], object]], rounds: int) -> dict[st
             work()
             best[name] = min(best[name], time.perf_counter() - started)
     return best
+
+
+def median_seconds(work: Callable[[], object], rounds: int) -> float:
+    """Median time of the processor that a work takes over some rounds: a busy machine changes it little."""
+    work()  # compile, fill caches
+    taken = []
+    for _ in range(rounds):
+        started = time.process_time()
+        work()
+        taken.append(time.process_time() - started)
+    return statistics.median(taken)

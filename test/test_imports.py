@@ -18,7 +18,7 @@ ROOMS = {
     'core.planning': TOPOLOGY | {'core.planning'},
     'core.exploration': TOPOLOGY | {'core.planning', 'core.exploration'},
     'core.slam': TOPOLOGY | {'core.slam'},
-    'core.localization': TOPOLOGY | {'core.localization'},
+    'core.localization': TOPOLOGY | {'core.planning', 'core.localization'},
 }
 ALL_CORE = set(ROOMS)
 ROOMS |= {

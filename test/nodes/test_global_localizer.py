@@ -1,21 +1,29 @@
 """The node that finds a lost robot, as a process on a live graph."""
 
+import itertools
+
 import numpy as np
 import pytest
-from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped, Twist
-from nav_msgs.msg import Odometry
+from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped, Twist
+from nav_msgs.msg import OccupancyGrid, Odometry
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import LaserScan
 
-from thinmap_msgs.msg import LocalizationStatus
+from thinmap_msgs.msg import LocalizationStatus, TopologicalMap
 from thinmap_msgs.srv import LocalizeGlobally
 from thinmap_ros.adapters import map_files, messages, qos, resources
 from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.topology.graph import TopologicalMap as TopologicalGraph
+from thinmap_ros.core.topology.update import TopologyConfig, build
 
 pytestmark = pytest.mark.live
 START = (2.0, 2.0, 0.0)
+# Two messages may come before a busy test looks, and a latched topic's usual depth keeps one.
+DEEP = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 @pytest.fixture
@@ -29,9 +37,7 @@ def map_file(tmp_path):
 
 
 def test_a_robot_that_drives_about_finds_itself_when_asked(graph, map_file):
-    # Deep: two messages may come before a busy test looks, and a latched topic's usual depth keeps one.
-    deep = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    status = graph.heard('localization_status', LocalizationStatus, deep)
+    status = graph.heard('localization_status', LocalizationStatus, DEEP)
     poses = graph.heard('initialpose', PoseWithCovarianceStamped)
     samples = graph.heard('localization_samples', PoseArray, qos.LATCHED)
     odometry = graph.heard('odom', Odometry)
@@ -75,6 +81,76 @@ def test_it_says_what_is_missing_and_waits(graph):
     graph.until(lambda: status and status[-1].state == LocalizationStatus.WAITING, 'waiting')
     assert status[-1].reason == 'waits for map, topology, odom, scan'
     graph.until(lambda: 'waits for map' in graph.log('global_localizer'), 'a warning in words')
+    assert graph.stop('global_localizer') == 0
+
+
+def test_a_robot_that_may_drive_finds_itself_alone_and_stops(graph, map_file):
+    poses = graph.heard('initialpose', PoseWithCovarianceStamped)
+    truth = graph.heard('ground_truth', PoseStamped)
+    commands = graph.heard('cmd_vel', Twist)
+    graph.start('global_localizer', map=str(map_file), automatic=True, active=True, use_sim_time=True)
+    graph.start('sim', start=','.join(map(str, START)), rate=2.0, lockstep='localization_status')
+    graph.until(lambda: poses, 'a pose')
+    ns = messages.stamp_ns(poses[-1].header.stamp)
+    at = min(truth, key=lambda message: abs(messages.stamp_ns(message.header.stamp) - ns))
+    off = se2.between(messages.pose_from(at.pose), messages.pose_from(poses[-1].pose.pose))
+    assert np.hypot(off[0], off[1]) < 0.3
+    assert abs(off[2]) < np.radians(10.0)
+    assert any(command.linear.x > 0.1 for command in commands)
+    graph.until(lambda: not commands[-1].linear.x and not commands[-1].angular.z, 'a stop')
+    assert graph.stop('global_localizer') == 0, graph.log('global_localizer')
+
+
+def scan_msg(ns, ranges):
+    scan = Scan.create(ns, ranges, -np.pi / 2.0, np.pi / 180.0, 0.1, 20.0, np.zeros(3))
+    return messages.scan_msg(scan, 'laser', 0.1)
+
+
+def test_what_is_wrong_with_the_input_is_said_in_words_and_no_pose_comes_of_it(graph, map_file):
+    status = graph.heard('localization_status', LocalizationStatus, DEEP)
+    poses = graph.heard('initialpose', PoseWithCovarianceStamped)
+    samples = graph.heard('localization_samples', PoseArray, qos.LATCHED)
+    say = {
+        name: graph.node.create_publisher(kind, name, profile)
+        for name, kind, profile in (
+            ('map', OccupancyGrid, qos.LATCHED), ('topology', TopologicalMap, qos.LATCHED),
+            ('odom', Odometry, qos.STREAM), ('scan', LaserScan, qos.SENSOR),
+        )
+    }
+    graph.start('global_localizer', automatic=True, laser_pose='0.0,0.0,0.0')
+    good = map_files.read_map(map_file)
+    topology = build(good, None, TopologyConfig())
+    seconds = itertools.count(1)
+
+    def until_it_says(words, ranges, T=(0.0, 0.0, 0.0)):
+        before = len(status)
+
+        def said():
+            ns = 10**8 * next(seconds)
+            say['odom'].publish(messages.odometry_msg(np.array(T), (0.0, 0.0), ('odom', 'base_link'), ns))
+            say['scan'].publish(scan_msg(ns, ranges))
+            return any(words in message.reason for message in status[before:])
+
+        graph.until(said, words)
+
+    wall, nothing = np.full(181, 3.0), np.full(181, np.nan)
+    walls = GridPatch(good.frame, np.full(good.shape, 100, dtype=np.int8))
+    open_field = GridPatch(good.frame, np.zeros(good.shape, dtype=np.int8))
+    for patch, nodes, words in (
+        (good, TopologicalGraph(), 'topology without nodes'), (walls, topology, 'no free place'),
+        (open_field, topology, 'without an occupied one'),
+    ):
+        say['map'].publish(messages.grid_msg(patch, 'map', 0))
+        say['topology'].publish(messages.topology_msg(nodes, 'map', 0))
+        until_it_says(words, wall)
+    say['map'].publish(messages.grid_msg(good, 'map', 0))
+    until_it_says('without a valid beam', nothing)
+    until_it_says('places explain', wall)
+    until_it_says('has jumped', wall, (50.0, 0.0, 0.0))
+    assert not poses
+    heard = [[p.position.x, p.position.y, p.orientation.z, p.orientation.w] for s in samples for p in s.poses[:50]]
+    heard += [[p.position.x, p.position.y, p.orientation.z, p.orientation.w] for s in status for p in s.hypotheses]
+    assert np.isfinite(heard).all()
     assert graph.stop('global_localizer') == 0
 
 

@@ -7,7 +7,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid
 from rclpy.node import Node
 
-from thinmap_msgs.msg import TopologicalMap
+from thinmap_msgs.msg import LocalizationStatus, TopologicalMap
 from thinmap_ros.adapters import messages, qos
 
 NONE = 'none'
@@ -15,6 +15,7 @@ _TYPES: dict[str, Any] = {
     'pose': PoseWithCovarianceStamped,
     'local_map': OccupancyGrid,
     'local_topology': TopologicalMap,
+    'localization_status': LocalizationStatus,
 }
 TOPICS = (NONE, *_TYPES)
 _PATIENCE_S = 2.0

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped, Twist
 from nav_msgs.msg import OccupancyGrid, Odometry
 from sensor_msgs.msg import LaserScan
 
@@ -15,6 +15,7 @@ from thinmap_ros.adapters.live_node import LiveNode
 from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.localization.active import ActiveSearch
 from thinmap_ros.core.localization.global_localization import (
     GlobalLocalization,
     GlobalLocalizationConfig,
@@ -22,12 +23,16 @@ from thinmap_ros.core.localization.global_localization import (
     State,
 )
 from thinmap_ros.core.odometry import ScanPairing
+from thinmap_ros.core.planning.navigator import NavigatorConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap as Topology
 from thinmap_ros.core.topology.update import TopologyConfig, build
 
 _WARN_PERIOD_S = 5.0
+_CONTROL_PERIOD_S, _SILENCE_NS = 0.1, 400_000_000
+_SHOWN_NS = 1_000_000_000
+_PLANNED_M, _BODY_M = 0.05, 0.04  # wider than the robot: where it plans to go, and what stops it
 _STATES = {
     State.WAITING: LocalizationStatus.WAITING,
     State.SEARCHING: LocalizationStatus.SEARCHING,
@@ -41,7 +46,7 @@ class GlobalLocalizerNode(LiveNode):
     """/scan, /odom, /map and /topology in; /initialpose, /localization_samples, /localization_status out.
 
     Service localize_globally. The map is taken as it is when the search begins; once the robot is sure, its pose is
-    said once, and the node rests until it is asked again.
+    said once, and the node rests until it is asked again. Where it is `active`, it drives meanwhile: /cmd_vel out.
     """
 
     def __init__(self) -> None:
@@ -53,12 +58,22 @@ class GlobalLocalizerNode(LiveNode):
             self, 'automatic', False, 'begin at once, and again when the localizer has been lost for lost_s'
         )
         lost_s = parameters.declare_value(self, 'lost_s', 3.0, 'how long the localizer must have been lost, s')
+        self._active = bool(
+            parameters.declare_value(
+                self, 'active', False, 'drive, while it looks, to where the places in question differ most'
+            )
+        )
+        speed = parameters.declare_value(self, 'active_speed_m_s', 0.3, 'how fast it then drives, m/s')
         path = str(parameters.declare_value(self, 'map', '', 'map_server YAML file; empty: from the topics'))
         self._mount = LaserMount(self)
         parameters.check_unknown(self)
         self._automatic, self._lost_ns = bool(automatic), round(1e9 * float(lost_s))
         self._patch: GridPatch | None = map_files.read_map(Path(path)) if path else None
         self._topology: Topology | None = build(self._patch, None, TopologyConfig()) if self._patch else None
+        radius = self._config.robot_radius_m
+        self._driving = NavigatorConfig(
+            max_speed_m_s=float(speed), robot_radius_m=radius + _PLANNED_M, body_radius_m=radius + _BODY_M
+        )
         warm_up.global_localizer()
         self.begin_anew()
         self._pose = self.create_publisher(PoseWithCovarianceStamped, 'initialpose', qos.STREAM)
@@ -72,6 +87,9 @@ class GlobalLocalizerNode(LiveNode):
         listen(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
         self.create_service(LocalizeGlobally, 'localize_globally', self._on_request)
         self.every(1.0, self._say_what_is_missing)
+        if self._active:
+            self._cmd_vel = self.create_publisher(Twist, 'cmd_vel', qos.STREAM)
+            self.every(_CONTROL_PERIOD_S, self._drive)
 
     def begin_anew(self) -> None:
         """Forget where the robot may be."""
@@ -81,6 +99,23 @@ class GlobalLocalizerNode(LiveNode):
         self._found_ns = -1  # what the localizer said before it heard the pose says nothing
         self._pairing = ScanPairing()
         self._heard: set[str] = set()
+        self._search: ActiveSearch | None = None
+        self._T_odom_base: Array | None = None
+        self._scan: Scan | None = None
+        self._odometry_ns = 0
+        self._drives = False
+        self._shown_ns = -_SHOWN_NS
+
+    def stand_still(self) -> None:
+        """Stop the robot, if it is this node that drives it."""
+        if self._drives:
+            self._cmd_vel.publish(messages.twist_msg(0.0, 0.0))
+        self._drives = False
+
+    def close(self) -> None:
+        """Stop the robot: the last thing the node does."""
+        self.stand_still()
+        super().close()
 
     def _on_map(self, message: OccupancyGrid) -> None:
         self._patch = messages.patch_from(message)
@@ -111,16 +146,18 @@ class GlobalLocalizerNode(LiveNode):
     def _begin(self, clear: bool) -> None:
         self._wanted, self._lost_since_ns = True, None
         if clear:
-            self._finder = None
+            self._finder = self._search = None
 
     def _on_odometry(self, message: Odometry) -> None:
         self._heard.add('odom')
         stamp_ns = messages.stamp_ns(message.header.stamp)
-        self._take(self._pairing.add_odometry(stamp_ns, messages.pose_from(message.pose.pose)))
+        self._T_odom_base, self._odometry_ns = messages.pose_from(message.pose.pose), stamp_ns
+        self._take(self._pairing.add_odometry(stamp_ns, self._T_odom_base))
 
     def _on_scan(self, message: LaserScan) -> None:
         scan = self._mount.scan(message)
         self._heard.add('scan')
+        self._scan = scan
         self._take(self._pairing.add_scan(scan))
 
     def _take(self, ready: list[tuple[Scan, Array]]) -> None:
@@ -129,13 +166,32 @@ class GlobalLocalizerNode(LiveNode):
                 assert self._finder is not None
                 with self.health.timed('global localization'):
                     result = self._finder.step(scan, T_odom_base)
+                if self._search is not None:
+                    self._search.take(result, T_odom_base)
                 self._publish(scan.stamp_ns, result)
+
+    def _drive(self) -> None:
+        """Drive on, as long as the robot is looked for and what it sees and has driven is heard of."""
+        scan, T_odom_base = self._scan, self._T_odom_base
+        heard = scan is not None and abs(self._odometry_ns - scan.stamp_ns) <= _SILENCE_NS
+        heard = heard and self.get_clock().now().nanoseconds - self._odometry_ns <= _SILENCE_NS
+        if not self._wanted or self._search is None or scan is None or T_odom_base is None or not heard:
+            self.stand_still()
+            return
+        command = self._search.step(T_odom_base, scan, _CONTROL_PERIOD_S)
+        if command.state == 'idle':
+            self.stand_still()
+            return
+        self._drives = True
+        self._cmd_vel.publish(messages.twist_msg(command.v, command.w))
 
     def _make_finder(self) -> bool:
         """Whether there is all that a search needs; a map that cannot be used is said in words."""
         if self._finder is None and self._patch is not None and self._topology is not None:
             try:
                 self._finder = GlobalLocalization(self._patch, self._topology, self._config, self._seed)
+                if self._active:
+                    self._search = ActiveSearch(self._finder.places, self._config, self._driving)
             except InputError as error:
                 self._say(LocalizationStatus.WAITING, str(error))
         return self._finder is not None
@@ -160,10 +216,8 @@ class GlobalLocalizerNode(LiveNode):
             self.get_logger().warning(reason, throttle_duration_sec=_WARN_PERIOD_S)
 
     def _publish(self, ns: int, result: Result) -> None:
-        assert self._finder is not None
         header = messages.header(self._map_frame, ns)
-        poses = [messages.pose_msg(T) for T in self._finder.samples]
-        self._samples.publish(PoseArray(header=header, poses=poses))
+        self._show_samples(ns)
         self._status.publish(
             LocalizationStatus(
                 header=header,
@@ -182,7 +236,15 @@ class GlobalLocalizerNode(LiveNode):
                 messages.pose_with_covariance_msg(found.T_map_base, found.covariance, self._map_frame, ns)
             )
             self.get_logger().info(f'localized: {result.reason}')
-            self._wanted, self._finder, self._found_ns = False, None, ns
+            self._wanted, self._finder, self._search, self._found_ns = False, None, None, ns
+            self.stand_still()
+
+    def _show_samples(self, ns: int) -> None:
+        """Publish the samples, now and then: they are thousands of small objects, which take longer than a step."""
+        if self._finder is not None and not 0 <= ns - self._shown_ns < _SHOWN_NS:
+            self._shown_ns = ns
+            poses = [messages.pose_msg(T) for T in self._finder.samples]
+            self._samples.publish(PoseArray(header=messages.header(self._map_frame, ns), poses=poses))
 
 
 def main() -> None:

@@ -65,6 +65,18 @@ def test_twin_rooms_stay_equally_likely():
         assert is_right(first, T) or is_right(second, T)
 
 
+def test_a_floor_that_looks_the_same_when_turned_by_180_degrees_stays_ambiguous():
+    half = floor((0, 30, 35, 32), (40, 10, 45, 18), (8, 70, 12, 76))
+    turned = np.maximum(half, half[::-1, ::-1])
+    for result, T in run(GlobalLocalization(*map_of(turned)), drive(turned, START, WAY[:20])):
+        assert result.state == State.AMBIGUOUS
+        first, second = result.hypotheses[:2]
+        assert abs(first.weight - second.weight) < 0.1
+        assert is_right(first, T) or is_right(second, T)
+        middle = (7.0, 10.0, np.pi)  # twice the middle of the floor
+        assert is_right(second, np.array(middle) + first.T_map_base * (-1.0, -1.0, 1.0))
+
+
 def test_a_robot_in_another_building_is_told_so():
     other = floor((15, 0, 18, 50), (30, 30, 33, 90), (42, 0, 45, 60), rows=60, cols=90)
     way = [(0.15, 0.0)] * 20 + [(0.0, 0.4)] * 4 + [(0.15, 0.0)] * 15

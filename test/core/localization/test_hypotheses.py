@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from thinmap_ros.core.localization.hypotheses import Hypotheses, evidence_against
+from thinmap_ros.core.localization.hypotheses import LOG_ODDS_A_BEAM, Hypotheses, allowed_beams, missed_beams
 from thinmap_ros.core.localization.search import SILENT_COUNTS
 
 
@@ -11,24 +11,52 @@ def some(*poses, log_weights=None):
     poses = np.array(poses, dtype=np.float64)
     known = Hypotheses.none()
     logs = np.zeros(len(poses)) if log_weights is None else np.array(log_weights, dtype=np.float64)
-    known.add(poses, logs, (np.full(len(poses), 50.0), np.zeros(len(poses))), 60.0)
+    missed = np.where(logs < 0.0, allowed_beams(np.full(len(poses), 60.0)) - logs / LOG_ODDS_A_BEAM, 0.0)
+    known.add(poses, 0.0, missed, (np.full(len(poses), 50.0), np.zeros(len(poses))), 60.0)
     known.resample(None, 1000, np.random.default_rng(0))
     return known
 
 
-def test_what_chance_brings_about_at_edges_counts_for_nothing():
-    counts = np.array([58.0, 55.0, 54.0, 20.0])
-    against = evidence_against((counts, np.zeros(4)), 60, 1.0)
-    assert not against[:3].any()
-    assert against[3] > 1.0
-    assert evidence_against((counts, np.zeros(4)), 60, 0.1) == pytest.approx(0.1 * against)
+def looked(known, *looks, novelty=1.0):
+    for counts in looks:
+        known.take_evidence((np.array(counts), np.zeros(len(known))), 60, novelty)
+    return known
+
+
+def test_what_chance_brings_about_at_edges_counts_for_nothing_however_often_it_comes():
+    rng = np.random.default_rng(2)
+    three = some([0, 0, 0], [5, 0, 1], [0, 5, 2])
+    known = looked(three, *([58.0 - rng.binomial(3, 0.3), 57.0, 57.0] for _ in range(50)))
+    assert not known.log_weights.any()
+
+
+def test_what_a_place_misses_at_each_look_adds_up_until_it_is_out_of_the_question():
+    seldom, often = ([looked(some([0, 0, 0], [5, 0, 1]), *([[58.0, 52.0]] * n)).log_weights for n in (1, 12)])
+    assert not seldom[1] < -1.0
+    assert often.tolist() == [0.0, pytest.approx(often[1])]
+    assert often[1] < -5.0
+
+
+def test_one_look_settles_nothing_and_half_a_look_half_as_much():
+    nonsense = looked(some([0, 0, 0], [5, 0, 1]), [58.0, 0.0])
+    assert -4.0 < nonsense.log_weights[1] < -1.0
+    halves = looked(some([0, 0, 0], [5, 0, 1]), [58.0, 0.0], [58.0, 0.0], novelty=0.5)
+    assert halves.log_weights == pytest.approx(nonsense.log_weights)
+
+
+def test_a_place_that_turns_up_late_is_judged_by_what_it_was_asked():
+    known = looked(some([0, 0, 0], [5, 0, 1]), *([[50.0, 50.0]] * 40))
+    judged = np.array([60.0 * 6]), np.zeros(1)
+    known.add(np.array([[9.0, 9.0, 0.0]]), -3.0, np.array([-60.0]), judged, 360.0)
+    assert known.best() == 2
+    assert known.log_weights[0] == pytest.approx(3.0 - LOG_ODDS_A_BEAM * (60.0 - allowed_beams(np.array(360.0))))
 
 
 def test_a_beam_of_which_the_map_says_nothing_counts_for_a_part():
-    silent = evidence_against((np.array([60.0, 20.0]), np.array([0.0, 40.0])), 60, 1.0)[1]
-    denied = evidence_against((np.array([60.0, 20.0 + SILENT_COUNTS * 40.0]), np.zeros(2)), 60, 1.0)[1]
+    silent = missed_beams((np.array([60.0, 50.0]), np.array([0.0, 10.0])), 60)[1]
+    denied = missed_beams((np.array([60.0, 50.0 + SILENT_COUNTS * 10.0]), np.zeros(2)), 60)[1]
     assert silent == pytest.approx(denied)
-    assert evidence_against((np.array([60.0, 20.0]), np.zeros(2)), 60, 1.0)[1] > silent > 0.0
+    assert missed_beams((np.array([60.0, 50.0]), np.zeros(2)), 60)[1] > silent > 0.0
 
 
 def test_each_hypothesis_keeps_samples_of_its_own_however_unlikely():

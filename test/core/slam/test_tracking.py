@@ -40,6 +40,15 @@ def test_a_robot_that_is_carried_off_is_lost_at_once_and_learns_nothing(rng):
     assert not estimate.lost and estimate.covariance[0, 0] < 1.0
 
 
+def test_a_robot_that_turns_fast_is_not_lost_and_one_carried_off_in_the_turn_is(rng):
+    localizer = Localizer(LocalizerConfig(start_x_m=2.0, start_y_m=2.0))
+    for i in range(12):
+        turned = se2.compose(START, np.array([0.0, 0.0, 0.4 * i]))
+        assert not localizer.step(scan_in(ROOM, turned, rng, i), turned).lost
+    odometry = se2.compose(turned, np.array([0.0, 0.0, 0.3]))
+    assert localizer.step(scan_in(ROOM, np.array([8.5, 1.0, 2.5]), rng, 100), odometry).lost
+
+
 def test_the_pose_of_a_lost_robot_is_known_to_nothing(rng):
     localizer = Localizer(LocalizerConfig(start_x_m=2.0, start_y_m=2.0))
     for i, (truth, odom) in enumerate(drive(100, rng, START)):

@@ -34,7 +34,7 @@ class GlobalLocalizationConfig(Config):
         3, 'looks in a row at which all must speak for one place before it is sure', low=1, high=1000
     )
     least_explained: float = parameter(
-        0.8, 'a place that explains less than this share of what was seen is not taken for the right one',
+        0.8, 'a place that explains less than this share of what a right one would is not taken for the right one',
         low=0.3, high=1.0,
     )
     sure_sigma_m: float = parameter(0.15, 'its place must be known to this, 1 sigma, m', low=0.01, high=5.0)

@@ -11,7 +11,8 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.localization.calibration import NodeModel, calibrate
 from thinmap_ros.core.localization.config import GlobalLocalizationConfig
-from thinmap_ros.core.localization.hypotheses import Hypotheses, evidence_against
+from thinmap_ros.core.localization.fit import usual_share
+from thinmap_ros.core.localization.hypotheses import Hypotheses, missed_beams
 from thinmap_ros.core.localization.judging import Judge
 from thinmap_ros.core.localization.observation import Observation, observe
 from thinmap_ros.core.localization.places import Places
@@ -25,8 +26,10 @@ __all__ = ['GlobalLocalization', 'GlobalLocalizationConfig', 'Hypothesis', 'Resu
 # Looks from about the same place meet the same errors of the map; they are independent after so much motion.
 _NEW_WAY_M, _NEW_TURN_RAD = 0.5, 0.5
 # Independent looks that a place must have explained: more for each e-fold of places that looked alike, and for each
-# look before it turned up. A look counts the less, the more it leaves unexplained, and nothing from this share on.
-_SURE_LOOKS, _SURE_LOOKS_CROWD, _SURE_LOOKS_LATE, _WORTHLESS = 1.0, 0.5, 2.0, 0.1
+# look before it turned up. A look counts the less, the more it leaves unexplained of what it should explain in this
+# map, and nothing from a share on: from this in smooth maps, from more in rough ones, where that varies with the place.
+_SURE_LOOKS, _SURE_LOOKS_CROWD, _SURE_LOOKS_LATE = 1.0, 0.75, 2.0
+_WORTHLESS, _WORTHLESS_ROUGH = 0.03, 0.5
 # After so many independent looks, a place that explains must have lasted for this share of them, but not for ever.
 _MANY_LOOKS, _LASTING_SHARE, _LASTING_LOOKS = 16.0, 0.4, 20.0
 _VIEWS = 6
@@ -103,6 +106,7 @@ class GlobalLocalization:
         self._rng = np.random.default_rng(seed)
         self._model: NodeModel | None = None
         self._judge: Judge | None = None
+        self._usual = 1.0  # share that the right place explains in this map
         self.restart()
 
     def restart(self) -> None:
@@ -171,8 +175,7 @@ class GlobalLocalization:
         if len(known):
             known.poses = self._refined(judge, seen)
             judged = judge.explained(known.poses, seen)
-            against = evidence_against(judged, len(seen.ranges_m), novelty)
-            known.take_evidence(judged, len(seen.ranges_m), novelty, against)
+            known.take_evidence(judged, len(seen.ranges_m), novelty)
             known.prune()
             known.resample(None, self.config.samples, self._rng) if not len(known.samples) else None
             logs = judge.log_likelihoods(known.samples, seen)
@@ -194,6 +197,7 @@ class GlobalLocalization:
         if self._judge is None:
             self._model = calibrate(self.places, scan, self.config, self._rng)
             self._judge = Judge(self.places, self.config, self._model)
+            self._usual = usual_share(self.places, self._judge, scan, self.config, self._rng)
         return self._judge
 
     def _advance(self, T_odom_base: Array) -> None:
@@ -220,25 +224,30 @@ class GlobalLocalization:
             counts, silent = judged_before(
                 judge, self._views, poses, T_odom_base, self.config.odometry_noise
             )
-            new = slice(len(self._known), None)
-            against, beams = np.zeros(len(found)), 0.0
+            new, missed, beams = slice(len(self._known), None), np.zeros(len(poses)), 0.0
             for k, view in enumerate(self._views):
-                against += evidence_against((counts[k], silent[k]), len(view.seen.ranges_m), 1.0)[new]
+                missed += missed_beams((counts[k], silent[k]), len(view.seen.ranges_m))
                 beams += len(view.seen.ranges_m)
             judged = counts.sum(axis=0)[new], silent.sum(axis=0)[new]
-            self._known.add(found, self._log_prior() - against, judged, beams)
+            more = missed[new] - (missed[self._known.best()] if len(self._known) else missed.min(initial=np.inf))
+            self._known.add(found, self._log_prior(), more, judged, beams)
         self._searches += complete
         self._views = [*self._views[-_VIEWS + 1 :], KeyView(seen, T_odom_base)]
 
     def _log_prior(self) -> float:
         """Log odds of a place that turns up late, against those that are known: less, the better these explain all."""
-        most = float(self._known.shares_explained.max(initial=0.0))
+        most = float(self._fits.max(initial=0.0))
         trust = min(max((most - _TRUST_FROM) / (1.0 - _TRUST_FROM), 0.0), 1.0)
         return trust * max(self._searches * _LOG_MISSED, _LEAST_LOG_PRIOR)
 
     def _explains_badly(self) -> bool:
         """Whether no hypothesis explains enough to be sure of."""
-        return float(self._known.shares_explained.max(initial=0.0)) < self.config.least_explained
+        return float(self._fits.max(initial=0.0)) < self.config.least_explained
+
+    @property
+    def _fits(self) -> Array:
+        """Share that each hypothesis explains of what the right place should, (H,)."""
+        return np.minimum(self._known.shares_explained / self._usual, 1.0)
 
     @property
     def _fresh(self) -> int:
@@ -262,10 +271,11 @@ class GlobalLocalization:
         if self._convinced < self.config.sure_looks:
             return False
         best = self._known.best()
-        age, missing = float(self._known.ages[best]), 1.0 - float(self._known.shares_explained[best])
+        age, missing = float(self._known.ages[best]), 1.0 - float(self._fits[best])
         needed = _SURE_LOOKS + _SURE_LOOKS_CROWD * math.log(self._crowd)
         needed += _SURE_LOOKS_LATE * (self._independent - age)
-        return age * (1.0 - missing / _WORTHLESS) >= needed
+        worthless = _WORTHLESS + _WORTHLESS_ROUGH * (1.0 - self._usual)
+        return age * (1.0 - missing / worthless) >= needed
 
     def _speaks_for_one(self) -> bool:
         known, config = self._known, self.config
@@ -275,7 +285,7 @@ class GlobalLocalization:
         sigma_m = math.sqrt(max(float(np.linalg.eigvalsh(known.covariances[best][:2, :2])[-1]), 0.0))
         return (
             float(known.weights[best]) >= config.sure_share
-            and float(known.shares_explained[best]) >= config.least_explained
+            and float(self._fits[best]) >= config.least_explained
             and sigma_m <= config.sure_sigma_m
             and math.sqrt(max(float(known.covariances[best][2, 2]), 0.0)) <= config.sure_sigma_rad
         )
@@ -283,7 +293,7 @@ class GlobalLocalization:
     def _lasting(self) -> NDArray[np.bool_]:
         """Hypotheses (H,) that explain enough, and have done so for some time where much has been seen."""
         known = self._known
-        enough = known.shares_explained >= self.config.least_explained
+        enough = self._fits >= self.config.least_explained
         if self._independent < _MANY_LOOKS:
             return enough
         return np.asarray(enough & (known.ages >= min(_LASTING_SHARE * self._independent, _LASTING_LOOKS)))
@@ -305,7 +315,7 @@ class GlobalLocalization:
         if self.is_sure:
             return Result(State.LOCALIZED, f'one place explains {best.explained:.0%} of what was seen', hypotheses)
         if self._way_m >= self.config.foreign_way_m and not self._lasting().any():
-            share = self.config.least_explained
+            share = self.config.least_explained * self._usual
             return Result(State.NOT_IN_MAP, f'no place explains {share:.0%} of what was seen for long', hypotheses)
         likely = int((weights > 0.05 * weights.max()).sum())
         if likely > 1:

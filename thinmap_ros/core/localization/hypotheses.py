@@ -12,10 +12,11 @@ from thinmap_ros.core.se2 import Array
 
 # A beam that one place explains and another does not: about 1 in log odds, but beams that miss come in groups.
 LOG_ODDS_A_BEAM = 0.35
-# Beams at edges fall to either side by chance: so many of them may, one in ...
-EDGE_SHARE = 0.05
+# Shares of the beams that fall to either side at edges: by chance, and, as the cells of the map lie, always.
+_EDGE_SHARE, _LASTING_SHARE = 0.05, 0.01
+_SIGMAS = 3.0
 # Now and then a whole look tells nonsense (someone stands in the way, a door has moved): no look settles the matter.
-_MOST_A_LOOK = 3.0
+_MOST_A_LOOK = 14.0  # beams
 _LEAST_LOG_WEIGHT = -14.0
 _MOST = 400
 _SAME_M, _SAME_RAD = 0.3, 0.15
@@ -25,31 +26,35 @@ _NEW_SIGMA_M, _NEW_SIGMA_RAD = 0.5 * _SAME_M, 0.5 * _SAME_RAD
 _MEMORY = 0.85  # of what was explained, from one independent look to the next
 
 
-def evidence_against(judged: tuple[Array, Array], beams: int, novelty: float) -> Array:
-    """What is taken off log weights for beams that are not explained, in comparison with the best one, (N,).
+def missed_beams(judged: tuple[Array, Array], beams: int) -> Array:
+    """Beams of a look that are not explained, more than by the best one, (N,).
 
     judged: of so many beams, how many the map explains, and of how many it says nothing, (N,) each.
-
-    Differences that chance brings about at edges count for nothing, however often they come: two rooms that look the
-    same stay equally likely.
     """
-    allowed = 3.0 * math.sqrt(beams * EDGE_SHARE * (1.0 - EDGE_SHARE))
     missing = beams - judged[0] - SILENT_COUNTS * judged[1]
-    beyond = np.maximum(missing - missing.min(initial=np.inf) - allowed, 0.0)
-    return np.asarray(novelty * np.minimum(LOG_ODDS_A_BEAM * beyond, _MOST_A_LOOK))
+    return np.asarray(np.minimum(missing - missing.min(initial=np.inf), _MOST_A_LOOK))
+
+
+def allowed_beams(beams: Array) -> Array:
+    """How many of so many beams, over all looks, one place may explain more than another that is just like it."""
+    spread = np.sqrt(beams * _EDGE_SHARE * (1.0 - _EDGE_SHARE))
+    return np.asarray(_SIGMAS * spread + _LASTING_SHARE * beams)
 
 
 @dataclass(eq=False)
 class Hypotheses:
     """Places of the robot as arrays over hypotheses (H), and samples (N, 3) that belong to them (N,), in order.
 
-    poses (H, 3); log_weights (H,), the best one 0; covariances (H, 3, 3); ages (H,): independent looks since each was
-    found; explained, asked, beams (H,): sums over looks of the beams that the map explains, of those it says something
+    poses (H, 3); priors (H,): log odds of each from the beginning; missed, compared (H,): beams that it did not explain
+    while the best one did, and of how many; covariances (H, 3, 3); ages (H,): independent looks since each was found;
+    explained, asked, beams (H,): sums over looks of the beams that the map explains, of those it says something
     about, and of all; older ones count less.
     """
 
     poses: Array
-    log_weights: Array
+    priors: Array
+    missed: Array
+    compared: Array
     covariances: Array
     ages: Array
     explained: Array
@@ -63,12 +68,28 @@ class Hypotheses:
         """No hypothesis."""
         empty = np.empty(0)
         return Hypotheses(
-            np.empty((0, 3)), empty, np.empty((0, 3, 3)), empty, empty, empty, empty, np.empty((0, 3)),
-            np.empty(0, dtype=np.int64),
+            np.empty((0, 3)), empty, empty, empty, np.empty((0, 3, 3)), empty, empty, empty, empty,
+            np.empty((0, 3)), np.empty(0, dtype=np.int64),
         )
 
     def __len__(self) -> int:
         return len(self.poses)
+
+    @property
+    def log_weights(self) -> Array:
+        """Log odds (H,), the best one 0.
+
+        Differences that chance brings about at edges count for nothing, however often they come: two rooms that look
+        the same stay equally likely. What is allowed for chance grows with the root of the looks, what a place that is
+        not the right one misses grows with the looks.
+        """
+        if not len(self):
+            return np.empty(0)
+        best = int(self.missed.argmin())
+        allowed = allowed_beams(np.minimum(self.compared, self.compared[best]))
+        beyond = np.maximum(self.missed - self.missed[best] - allowed, 0.0)
+        logs = self.priors - LOG_ODDS_A_BEAM * beyond
+        return np.asarray(logs - logs.max())
 
     @property
     def weights(self) -> Array:
@@ -90,39 +111,43 @@ class Hypotheses:
         self.samples += rng.normal(size=self.samples.shape) * spread
         self.covariances = self.covariances + np.diag(spread**2)
 
-    def take_evidence(self, judged: tuple[Array, Array], beams: int, novelty: float, against: Array) -> None:
-        """Take in a look: what each makes of so many beams (see evidence_against); what is taken off its log weight."""
-        self.log_weights = self.log_weights - against
-        self.log_weights -= self.log_weights.max(initial=-np.inf)
+    def take_evidence(self, judged: tuple[Array, Array], beams: int, novelty: float) -> None:
+        """Take in a look: what each makes of so many beams (see missed_beams), and how much of a new look it is."""
+        self.missed = self.missed + novelty * missed_beams(judged, beams)
+        self.compared = self.compared + novelty * beams
         fade = _MEMORY**novelty
         self.explained = fade * self.explained + novelty * judged[0]
         self.asked = fade * self.asked + novelty * (beams - judged[1])
         self.beams = fade * self.beams + novelty * beams
         self.ages = self.ages + novelty
 
-    def add(self, poses: Array, log_weights: Array, judged: tuple[Array, Array], beams: float) -> None:
-        """Take up new ones (N, 3) with their evidence so far."""
+    def add(self, poses: Array, prior: float, missed: Array, judged: tuple[Array, Array], beams: float) -> None:
+        """Take up new ones (N, 3).
+
+        prior: log odds against those that are known; judged: what they make of so many beams of earlier looks, and
+        missed: how many of these they missed more than the best of the known ones, (N,) each.
+        """
         count = len(poses)
-        self.poses = np.concatenate([self.poses, poses])
-        self.log_weights = np.concatenate([self.log_weights, log_weights])
-        self.log_weights -= self.log_weights.max(initial=-np.inf)
         fresh = np.broadcast_to(np.diag([_NEW_SIGMA_M**2, _NEW_SIGMA_M**2, _NEW_SIGMA_RAD**2]), (count, 3, 3))
-        self.covariances = np.concatenate([self.covariances, fresh])
-        self.ages = np.concatenate([self.ages, np.zeros(count)])
-        self.explained = np.concatenate([self.explained, judged[0]])
-        self.asked = np.concatenate([self.asked, beams - judged[1]])
-        self.beams = np.concatenate([self.beams, np.full(count, beams)])
+        base = float(self.missed.min()) if len(self) else 0.0
+        for name, values in (
+            ('poses', poses), ('priors', np.full(count, prior)), ('missed', base + missed),
+            ('compared', np.full(count, beams)), ('covariances', fresh), ('ages', np.zeros(count)),
+            ('explained', judged[0]), ('asked', beams - judged[1]), ('beams', np.full(count, beams)),
+        ):
+            setattr(self, name, np.concatenate([getattr(self, name), values]))
 
     def prune(self) -> None:
         """Drop what is out of the question, and of those that have come together all but the likeliest."""
-        order = np.argsort(-self.log_weights, kind='stable')
-        order = order[self.log_weights[order] > _LEAST_LOG_WEIGHT]
+        logs = self.log_weights
+        order = np.lexsort((self.missed, -logs))
+        order = order[logs[order] > _LEAST_LOG_WEIGHT]
         kept = order[distinct_indices(self.poses[order], _SAME_M, _SAME_RAD, _MOST)]
         if len(kept) == len(self) == int(self.owners.max(initial=-1)) + 1:
             return
         renumbered = np.full(len(self.poses), -1)
         renumbered[kept] = np.arange(len(kept))
-        for name in ('poses', 'log_weights', 'covariances', 'ages', 'explained', 'asked', 'beams'):
+        for name in ('poses', 'priors', 'missed', 'compared', 'covariances', 'ages', 'explained', 'asked', 'beams'):
             setattr(self, name, getattr(self, name)[kept])
         owners = renumbered[self.owners]
         order = np.argsort(owners, kind='stable')[int((owners < 0).sum()) :]

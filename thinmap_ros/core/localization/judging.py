@@ -53,8 +53,8 @@ class Judge:
         """Log likelihood ratio of the observed nodes at poses (N, 3), against a pose anywhere, (N,)."""
         places, model = self._places, self._nodes
         ratios = matching.node_scores(
-            poses, seen.nodes, seen.node_kinds, places.nodes, (places.blocks, places.first, places.in_sight),
-            self._origin, places.block_cells * places.frame.resolution, model.found, model.spread_m, model.gain,
+            poses, seen.nodes, seen.node_kinds, (places.blocks, places.first, places.in_sight), self._origin,
+            places.block_cells * places.frame.resolution, model.found, model.spread_m, model.gain,
         )
         return np.asarray(ratios / _NODES_A_FACT)
 

@@ -17,7 +17,7 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 
 Mask = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]
-Numbers = NDArray[np.uint16] | NDArray[np.uint32]
+Short = NDArray[np.int16]
 
 DIRECTIONS = 72
 NEAR_UNIT_M = 0.004  # of the distance to the nearest wall: up to 1.02 m in a byte
@@ -26,7 +26,7 @@ _NEAR_CAP = 255
 _SPACING_M = 0.3
 _MOST_PLACES = 100_000
 _BLOCK_M = 0.5  # nodes in sight are listed for blocks of this size
-_MOST_IN_SIGHT = 48
+SIGHT_UNIT_M = 0.002  # of where these lie, from the corner of their block: up to 65 m in two bytes
 
 FREE, WALL, UNKNOWN = 0, 1, 2
 
@@ -39,8 +39,9 @@ class Places:
     nearest wall, in NEAR_UNIT_M, at most 255; standing (N, 2) int32: cells in which the robot can stand;
     spots (P, 2): places among these, a spacing apart, and around (P, DIRECTIONS) uint8: what a laser would measure
     from there towards the headings k / DIRECTIONS of a turn, in RANGE_UNIT_M; spacing_m: between the spots;
-    nodes (M, 2): of the topological map; blocks, first, in_sight: nodes in sight of block (i, j) of the map are
-    nodes[in_sight[first[blocks[i, j]] : first[blocks[i, j] + 1]]]; blocks are block_cells wide.
+    nodes (M, 2): of the topological map; blocks, first, in_sight (2, K): x and y, in SIGHT_UNIT_M from the corner of
+    block (i, j) of the map, of the nodes in sight of it are in_sight[:, first[blocks[i, j]] : first[blocks[i, j] + 1]];
+    blocks are block_cells wide.
     """
 
     frame: GridFrame
@@ -53,7 +54,7 @@ class Places:
     nodes: Array
     blocks: NDArray[np.int32]
     first: NDArray[np.int32]
-    in_sight: Numbers
+    in_sight: Short
     block_cells: int
 
     @property
@@ -181,7 +182,7 @@ def _sights(
     frame: GridFrame,
     block_cells: int,
     config: GlobalLocalizationConfig,
-) -> tuple[NDArray[np.int32], NDArray[np.int32], Numbers]:
+) -> tuple[NDArray[np.int32], NDArray[np.int32], Short]:
     """Nodes in sight of each block in which the robot can stand: see Places."""
     rows, cols = states.shape
     blocks = np.full((rows // block_cells + 1, cols // block_cells + 1), -1, dtype=np.int32)
@@ -192,9 +193,12 @@ def _sights(
     cells = frame.cells_of(nodes)
     reach = config.active_window_m / 2.0 / frame.resolution + block_cells
     first, in_sight = _list_sights(states == FREE, standing[leads].astype(np.int64), cells, reach)
-    # Small numbers: samples look at these lists in no order, and they should stay in the processor's cache.
-    narrow = in_sight.astype(np.uint16) if len(nodes) <= 1 << 16 else in_sight.astype(np.uint32)
-    return blocks, first, narrow
+    # Coordinates, not numbers of nodes: samples look at these lists in no order, and each look is one short run of
+    # whole numbers, which the compiler compares several at a time.
+    corners = np.stack([numbers % blocks.shape[1], numbers // blocks.shape[1]], axis=1) * block_cells
+    corner = np.repeat(corners, np.diff(first), axis=0) * frame.resolution
+    away = nodes[in_sight] - (frame.origin_x, frame.origin_y) - corner
+    return blocks, first, np.ascontiguousarray(np.round(away / SIGHT_UNIT_M).astype(np.int16).T)
 
 
 @kernel
@@ -203,18 +207,19 @@ def _list_sights(
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Of the nodes (M, 2) within a square round each place (N, 2), those in line of sight; the first of each place."""
     first = np.zeros(len(places) + 1, dtype=np.int32)
-    in_sight = np.empty(len(places) * _MOST_IN_SIGHT, dtype=np.int32)
+    in_sight = np.empty(max(len(places), 64), dtype=np.int32)
     order = np.argsort(nodes[:, 1])
     sorted_cols = nodes[order, 1]
     count = 0
     for i in range(len(places)):
         row, col = places[i]
-        own = count
         for k in range(np.searchsorted(sorted_cols, col - reach), len(order)):
             node = order[k]
-            if nodes[node, 1] > col + reach or count - own == _MOST_IN_SIGHT:
+            if nodes[node, 1] > col + reach:
                 break
             if abs(nodes[node, 0] - row) <= reach and line_is_clear(free, row, col, nodes[node, 0], nodes[node, 1]):
+                if count == len(in_sight):
+                    in_sight = np.concatenate((in_sight, np.empty_like(in_sight)))
                 in_sight[count] = node
                 count += 1
         first[i + 1] = count

@@ -1,0 +1,142 @@
+"""Where to drive to tell places apart: where what would be seen differs most between them."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import UNKNOWN as UNKNOWN_CELL
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.localization.places import FREE, UNKNOWN, WALL, Bytes, Places, free_way
+from thinmap_ros.core.planning.reach import places_and_ways
+from thinmap_ros.core.planning.wavefront import WavefrontConfig, navigation_function
+from thinmap_ros.core.se2 import Array
+
+_MOST_PLACES = 8  # the likeliest, which are compared
+_WINDOW_M = 30.0
+_SPACING_M = 0.6  # of the viewpoints that are compared
+_BEARINGS = 24
+# Ranges that differ by more than this, and by this share, tell two places apart; as many as this share do so surely.
+_DIFFERENT_M, _DIFFERENT_SHARE, _ENOUGH = 0.4, 0.1, 0.25
+_LEAST_GAIN = 0.05
+_CONFIRMED_M = 5.0  # of way, where one place only is left: it has then been seen from enough sides
+_NEAREST_M, _WAY_M = 0.5, 2.0  # nearer than this there is nothing new; so much way costs half of what is gained
+
+
+@dataclass(frozen=True, eq=False)
+class Viewpoint:
+    """A place to drive to: pose (3,) in the odometry's frame, map of what all places have in common there, and gain.
+
+    The heading is towards what differs. gain: share of the pairs of places that are told apart there, by their
+    weights; 0 where one place only is left.
+    """
+
+    T_odom_view: Array
+    patch: GridPatch
+    gain: float
+
+
+def best_viewpoint(
+    places: Places, T_odom_base: Array, starts: Array, weights: Array, range_m: float, driving: WavefrontConfig
+) -> Viewpoint | None:
+    """Viewpoint for a robot at an odometry pose (3,), where T_map_odom may be any of (H, 3), with weights (H,).
+
+    The way there is free in the map, whichever it is: it is the same motion for all of them. range_m: how far views
+    are compared. None where no viewpoint in reach tells them apart.
+    """
+    order = np.argsort(-weights, kind='stable')[:_MOST_PLACES]
+    starts, weights = starts[order], weights[order]
+    patch = common_patch(places, T_odom_base, starts)
+    at, ways = _in_reach(patch, T_odom_base, driving)
+    if not len(at):
+        return None
+    gains, bearings = _gains(places, starts, weights, at, range_m)
+    worth = gains if len(order) > 1 else np.minimum(ways / _CONFIRMED_M, 1.0)
+    best = int((worth / (ways + _WAY_M)).argmax())
+    if worth[best] < _LEAST_GAIN:
+        return None
+    return Viewpoint(se2.pose(at[best, 0], at[best, 1], bearings[best]), patch, float(gains[best]))
+
+
+def common_patch(places: Places, T_odom_base: Array, starts: Array) -> GridPatch:
+    """What the map says round the robot, in the odometry's frame, for all T_map_odom (H, 3) alike.
+
+    Free is what is free for all, occupied what is so for any of them.
+    """
+    resolution = places.frame.resolution
+    count = 2 * round(_WINDOW_M / 2.0 / resolution) + 1
+    corner = T_odom_base[:2] - 0.5 * count * resolution
+    frame = GridFrame(float(corner[0]), float(corner[1]), resolution)
+    origin = (places.frame.origin_x, places.frame.origin_y)
+    states = _common_states(places.states, starts, origin, corner, count, resolution)
+    cells = np.select([states == WALL, states == FREE], [np.int8(100), np.int8(0)], np.int8(UNKNOWN_CELL))
+    return GridPatch(frame, cells.astype(np.int8))
+
+
+@kernel
+def _common_states(
+    states: Bytes, starts: Array, origin: tuple[float, float], corner: Array, count: int, resolution: float
+) -> Bytes:
+    """WALL where any of the transforms (H, 3) leads into a wall of the map, else UNKNOWN where any does, else FREE."""
+    result = np.full((count, count), FREE, dtype=np.uint8)
+    for h in range(len(starts)):
+        c, s = math.cos(starts[h, 2]), math.sin(starts[h, 2])
+        for i in range(count):
+            for j in range(count):
+                x, y = corner[0] + (j + 0.5) * resolution, corner[1] + (i + 0.5) * resolution
+                col = int(math.floor((starts[h, 0] + c * x - s * y - origin[0]) / resolution))
+                row = int(math.floor((starts[h, 1] + s * x + c * y - origin[1]) / resolution))
+                inside = row >= 0 and col >= 0 and row < states.shape[0] and col < states.shape[1]
+                state = states[row, col] if inside else UNKNOWN
+                if state == WALL or (state == UNKNOWN and result[i, j] == FREE):
+                    result[i, j] = state
+    return result
+
+
+def _in_reach(patch: GridPatch, T_odom_base: Array, driving: WavefrontConfig) -> tuple[Array, Array]:
+    """Points (N, 2) a spacing apart to which the robot can get, and the way there, (N,), m."""
+    resolution, xy = patch.frame.resolution, (float(T_odom_base[0]), float(T_odom_base[1]))
+    standing, ways = places_and_ways(patch.free, patch.frame, xy, driving.robot_radius_m, driving.escape_m)
+    middle = patch.shape[0] // 2, patch.shape[1] // 2
+    metres = navigation_function(np.where(ways, 1.0, np.inf), middle) * resolution
+    near_by = np.argwhere(standing & (metres >= _NEAREST_M) & np.isfinite(metres))
+    step = max(1, round(_SPACING_M / resolution))
+    cells = near_by[((near_by - middle) % step == 0).all(axis=1)]
+    return patch.frame.centres_of(cells), metres[cells[:, 0], cells[:, 1]]
+
+
+def _gains(places: Places, starts: Array, weights: Array, at: Array, range_m: float) -> tuple[Array, Array]:
+    """For points (N, 2) of the odometry's frame: share of the pairs of places that are told apart, bearing to that."""
+    resolution = places.frame.resolution
+    views = np.stack([
+        (se2.transform_points(T, at) - (places.frame.origin_x, places.frame.origin_y)) / resolution for T in starts
+    ])
+    ranges = _ranges(places.states, views, starts[:, 2], range_m / resolution) * resolution
+    gains, total, towards = np.zeros(len(at)), 0.0, np.zeros(len(at), dtype=np.complex128)
+    unit = np.exp(2j * np.pi * np.arange(_BEARINGS) / _BEARINGS)
+    for i in range(len(starts)):
+        for j in range(i):
+            nearer, farther = np.minimum(ranges[i], ranges[j]), np.maximum(ranges[i], ranges[j])
+            differs = farther - nearer > _DIFFERENT_M + _DIFFERENT_SHARE * nearer  # not where either is unknown
+            pair = float(weights[i] * weights[j])
+            gains += pair * np.minimum(differs.mean(axis=1) / _ENOUGH, 1.0)
+            towards += pair * (differs * unit).sum(axis=1)
+            total += pair
+    return gains / max(total, 1e-300), np.angle(towards)
+
+
+@kernel
+def _ranges(states: Bytes, views: Array, headings: Array, most: float) -> NDArray[np.float64]:
+    """Ranges in cells all round from views (H, N, 2), x and y in cells, (H, N, _BEARINGS); NaN into the unknown."""
+    ranges = np.empty((views.shape[0], views.shape[1], _BEARINGS))
+    for h in range(views.shape[0]):
+        for i in range(views.shape[1]):
+            for k in range(_BEARINGS):
+                angle = headings[h] + 2.0 * math.pi * k / _BEARINGS
+                way, state = free_way(states, views[h, i, 0], views[h, i, 1], angle, most)
+                ranges[h, i, k] = np.nan if state == UNKNOWN else way
+    return ranges
