@@ -26,10 +26,11 @@ from thinmap_ros.core.topology.free_space import (
 )
 from thinmap_ros.core.topology.graph import Node, TopologicalMap
 from thinmap_ros.core.topology.identity import Registry
-from thinmap_ros.core.topology.skeleton import Measure, drawing_of, extract, looks_out, map_of, skeleton_of, web_of
+from thinmap_ros.core.topology.net import dissolve_all, draw, web_of_net
+from thinmap_ros.core.topology.simplify import Limits, Outlook, simplify
+from thinmap_ros.core.topology.skeleton import Measure, extract, map_of, net_along, simplified, skeleton_of
 from thinmap_ros.core.topology.stitching import Seam, stitch
 from thinmap_ros.core.topology.surroundings import Surroundings
-from thinmap_ros.core.topology.web import Limits, Spot, simplify
 
 __all__ = ['TopologyBuilder', 'TopologyConfig', 'build']
 
@@ -91,9 +92,9 @@ class TopologyBuilder:
         if view is None or around is None:
             return TopologicalMap()
         low = np.array([around.near.row - around.box.row, around.near.col - around.box.col])
-        shown = web_of(view.skeleton[around.near.within(around.box)], lambda cells: view.measure(cells + low))
-        shown.dissolve_all(set(shown.spots))
-        return map_of(shown, around.lattice.shifted(around.near.row, around.near.col), self.config)
+        shown = net_along(view.skeleton[around.near.within(around.box)], lambda cells: view.measure(cells + low))
+        dissolve_all(shown, np.ones(len(shown.spots), dtype=np.bool_))
+        return map_of(web_of_net(shown), around.lattice.shifted(around.near.row, around.near.col), self.config)
 
     def rebuild(self, window_at: Callable[[float, float], GridPatch], before: Array, after: Array) -> None:
         """Build the map anew after the robot's past poses (N, 3) were corrected, nodes carried along.
@@ -164,7 +165,7 @@ class TopologyBuilder:
         touched: set[int] = set()
         for part in self._places_to_redraw(squared != old, box):
             touched |= self._redraw(np.ascontiguousarray(squared[part.within(box)]), part)
-        simplify(self._atlas, touched, lambda spot: view.is_promising(spot, box), view.limits)
+        simplify(self._atlas, touched, view.outlook.at(box.row, box.col), view.limits)
 
     def _places_to_redraw(self, changed: NDArray[np.bool_], box: Box) -> list[Box]:
         """Rectangles of the lattice that hold what changed in a box (H, W), apart from each other."""
@@ -196,8 +197,8 @@ class TopologyBuilder:
         pinned = np.zeros(squared.shape, dtype=np.bool_)
         anchors = np.array(list(cut.anchors), dtype=np.int64).reshape(-1, 2) - (place.row, place.col)
         pinned[anchors[:, 0], anchors[:, 1]] = True
-        web = web_of(squared > 0, lambda cells: squared[cells[:, 0], cells[:, 1]], pinned)
-        return self._atlas.graft(web, place, cut.anchors) | cut.touched
+        net = net_along(squared > 0, lambda cells: squared[cells[:, 0], cells[:, 1]], pinned)
+        return self._atlas.graft(web_of_net(net), place, cut.anchors) | cut.touched
 
 
 @kernel
@@ -258,18 +259,12 @@ class _View:
         self.robot: Cells = np.empty((0, 2), dtype=np.int64) if seed is None else seed[None]
         self.free = reachable(room, np.concatenate((seeds, self.robot)))
         self.measure: Measure = lambda cells: squared_clearance(distance, cells)
-        self._looks_out = looks_out(known, patch.occupied, rim_is_unknown=True)
+        self.outlook = Outlook.of(known, patch.occupied, rim_is_unknown=True)
         self.limits = Limits.of(config, patch.frame.resolution)
-        web = web_of(skeleton_of(self.free, distance), self.measure)
-        simplify(web, set(web.spots), self._looks_out, self.limits)
-        self.skeleton = drawing_of(web, patch.shape)
+        net = simplified(skeleton_of(self.free, distance), self.measure, self.outlook, self.limits)
+        self.skeleton = draw(net, *patch.shape)
 
     def fresh(self) -> Cells:
         """Squared clearances (H, W) of the new skeleton where it is to take the old one's place, 0 elsewhere."""
         cells = true_cells(self.skeleton & self.redrawn)
         return _raster(cells, self.measure(cells), *self.skeleton.shape)
-
-    def is_promising(self, spot: Spot, box: Box) -> bool:
-        """Whether a spot on the lattice looks into the unknown; those outside the box may."""
-        row, col = spot.cell
-        return not box.has(spot.cell) or self._looks_out(Spot((row - box.row, col - box.col), spot.squared))
