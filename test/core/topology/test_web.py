@@ -11,7 +11,7 @@ from thinmap_ros.core.topology.net import web_of_net
 from thinmap_ros.core.topology.simplify import Limits, Outlook, simplify
 from thinmap_ros.core.topology.skeleton import net_along, simplified
 from thinmap_ros.core.topology.thinning import thin
-from thinmap_ros.core.topology.web import Chain, Spot, Web
+from thinmap_ros.core.topology.web import Chain, Spot, Web, extent
 
 LIMITS = Limits(radius=2.5, spur=6.0, spur_ratio=0.5, join=4.0)
 ROOMY = 36
@@ -137,3 +137,10 @@ def test_room_is_made_for_a_long_way_of_many_pieces():
     for col in range(0, 600, 2):
         chain(web, (0, col), (0, col + 2))
     assert left_of(web) == [(601, False)]
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(st.integers(-40, 40), st.integers(-40, 40)), min_size=1, max_size=12))
+def test_the_extent_of_a_chain_holds_its_cells_closely(corners):
+    cells = np.array(corners)
+    assert extent(cells) == (*cells.min(axis=0), *cells.max(axis=0))

@@ -216,11 +216,18 @@ def draw(net: Net, rows: int, cols: int) -> Mask:
 def web_of_net(net: Net) -> Web:
     """The web that is left."""
     web = Web()
-    left = np.flatnonzero(net.spots[:, DEGREE] != NONE).tolist()
-    numbers = {spot: web.add_spot(_spot(net, spot)) for spot in left}
-    for a, b, cells, squared in _chains_from(net, 0):
+    spots = [Spot((row, col), squared) if degree != NONE else None for row, col, squared, degree in net.spots.tolist()]
+    numbers = [web.add_spot(spot) if spot else NONE for spot in spots]
+    for a, b, cells, squared in chains_of(net):
         web.add_chain(Chain(numbers[a], numbers[b], cells, squared))
     return web
+
+
+def chains_of(net: Net, first: int = 0) -> list[tuple[int, int, Cells, Cells]]:
+    """Ends, cells (K, 2) and squared clearances (K,) of the chains that are left, from a number on."""
+    found = net.chains[first : chain_count(net)]
+    parts = [(a, b, net.cells[start : start + count]) for a, b, start, count in found.tolist() if a != NONE]
+    return [(a, b, part[:, :2].copy(), part[:, 2].copy()) for a, b, part in parts]
 
 
 def change(web: Web, spots: set[int], act: Callable[[Net, Mask], None]) -> None:
@@ -283,22 +290,10 @@ def _take_over(web: Web, net: Net, numbers: list[int], chains: list[int]) -> Non
     """Change a web as the net was that had been made of some of its spots and chains."""
     for k in np.flatnonzero(net.chains[: len(chains), A] == NONE).tolist():
         web.drop_chain(chains[k])
-    for k, number in enumerate(numbers):
-        if net.spots[k, DEGREE] == NONE:
+    for number, (row, col, squared, degree) in zip(numbers, net.spots.tolist(), strict=True):
+        if degree == NONE:
             web.drop_spot(number)
-        else:
-            web.move_spot(number, _spot(net, k))
-    for a, b, cells, squared in _chains_from(net, len(chains)):
+        elif web.spots[number].cell != (row, col):
+            web.move_spot(number, Spot((row, col), squared))
+    for a, b, cells, squared in chains_of(net, len(chains)):
         web.add_chain(Chain(numbers[a], numbers[b], cells, squared))
-
-
-def _spot(net: Net, spot: int) -> Spot:
-    row, col, squared = net.spots[spot, :3].tolist()
-    return Spot((row, col), squared)
-
-
-def _chains_from(net: Net, first: int) -> list[tuple[int, int, Cells, Cells]]:
-    """Ends, cells (K, 2) and squared clearances (K,) of the chains that are left, from a number on."""
-    found = net.chains[first : chain_count(net)]
-    parts = [(a, b, net.cells[start : start + count]) for a, b, start, count in found.tolist() if a != NONE]
-    return [(a, b, part[:, :2].copy(), part[:, 2].copy()) for a, b, part in parts]

@@ -159,17 +159,14 @@ class TopologyBuilder:
             return
         seam = Seam(fresh > 0, old > 0, view.redrawn, view.free, view.robot)
         stitched = stitch(seam, lambda parts: self._atlas.joined_outside(box, parts))
-        squared = np.where(stitched, np.where(view.redrawn, fresh, old), 0)
-        added = true_cells(stitched & (squared == 0))
-        squared[added[:, 0], added[:, 1]] = view.measure(added)
+        squared, changed = _put_together(stitched, view.redrawn, fresh, old, view.distance)
         touched: set[int] = set()
-        for part in self._places_to_redraw(squared != old, box):
+        for part in self._places_to_redraw(changed, box):
             touched |= self._redraw(np.ascontiguousarray(squared[part.within(box)]), part)
         simplify(self._atlas, touched, view.outlook.at(box.row, box.col), view.limits)
 
-    def _places_to_redraw(self, changed: NDArray[np.bool_], box: Box) -> list[Box]:
-        """Rectangles of the lattice that hold what changed in a box (H, W), apart from each other."""
-        cells = true_cells(changed)
+    def _places_to_redraw(self, cells: Cells, box: Box) -> list[Box]:
+        """Rectangles of the lattice that hold the cells (N, 2) of a box that changed, apart from each other."""
         blocks = cells // _APART
         coarse = np.zeros((box.rows // _APART + 1, box.cols // _APART + 1), dtype=np.bool_)
         coarse[blocks[:, 0], blocks[:, 1]] = True
@@ -198,7 +195,7 @@ class TopologyBuilder:
         anchors = np.array(list(cut.anchors), dtype=np.int64).reshape(-1, 2) - (place.row, place.col)
         pinned[anchors[:, 0], anchors[:, 1]] = True
         net = net_along(squared > 0, lambda cells: squared[cells[:, 0], cells[:, 1]], pinned)
-        return self._atlas.graft(web_of_net(net), place, cut.anchors) | cut.touched
+        return self._atlas.graft(net, place, cut.anchors) | cut.touched
 
 
 @kernel
@@ -218,6 +215,28 @@ def _agree(fresh: Cells, old: Cells, where: NDArray[np.bool_]) -> bool:
             if fresh[row, col] != (old[row, col] if where[row, col] else 0):
                 return False
     return True
+
+
+@kernel
+def _put_together(
+    drawn: NDArray[np.bool_], where: NDArray[np.bool_], fresh: Cells, old: Cells, distance: NDArray[np.int16]
+) -> tuple[Cells, Cells]:
+    """Squared clearances (H, W) of what is drawn, 0 elsewhere, and the cells (N, 2) where they are not the old ones.
+
+    They are the fresh ones where these take the old ones' place, and measured anew at cells that were neither.
+    """
+    squared, changed = np.zeros_like(old), np.empty((old.size, 2), dtype=np.int64)
+    cell, count = np.empty((1, 2), dtype=np.int64), 0
+    for row in range(old.shape[0]):
+        for col in range(old.shape[1]):
+            if drawn[row, col]:
+                known = fresh[row, col] if where[row, col] else old[row, col]
+                cell[0, 0], cell[0, 1] = row, col
+                squared[row, col] = known if known > 0 else squared_clearance(distance, cell)[0]
+            if squared[row, col] != old[row, col]:
+                changed[count, 0], changed[count, 1] = row, col
+                count += 1
+    return squared, changed[:count].copy()
 
 
 def _thinned_out(poses: Array) -> Array:
@@ -252,7 +271,7 @@ class _View:
         patch, painted = around.patch(*known_skeleton)
         self.redrawn = around.redrawn(painted)
         known = known_free(patch, config)
-        distance = column_distance(known)
+        self.distance = distance = column_distance(known)
         room = standing_room(distance, config.robot_radius_m / patch.frame.resolution)
         seeds = known_skeleton[0] - (around.box.row, around.box.col)
         seed = nearest_cell(room, patch, robot_xy, config.seed_reach_m)

@@ -42,6 +42,11 @@ class Chain:
         return Chain(self.a, self.b, self.cells[piece], self.squared[piece])
 
     @cached_property
+    def extent(self) -> tuple[int, int, int, int]:
+        """The first row and col of its cells, and the last ones."""
+        return extent(self.cells)
+
+    @cached_property
     def length(self) -> float:
         """Length along the cells, in cells."""
         return path_length(self.cells)
@@ -53,6 +58,17 @@ class Spot:
 
     cell: tuple[int, int]
     squared: int
+
+
+@kernel
+def extent(cells: Cells) -> tuple[int, int, int, int]:
+    """Smallest row and col of cells (K, 2), and the largest ones."""
+    low_row = high_row = cells[0, 0]
+    low_col = high_col = cells[0, 1]
+    for k in range(1, cells.shape[0]):
+        low_row, high_row = min(low_row, cells[k, 0]), max(high_row, cells[k, 0])
+        low_col, high_col = min(low_col, cells[k, 1]), max(high_col, cells[k, 1])
+    return low_row, low_col, high_row, high_col
 
 
 @kernel
