@@ -65,6 +65,10 @@ class Registry:
                 self.map.put_edge(edge_of(edge_id, a, b, piece, self._lattice))
                 self._pieces[edge_id] = piece
 
+    def skip(self, count: int) -> None:
+        """Never give the next so many ids."""
+        self._next_id += count
+
     def inherit(self, other: 'Registry', nodes: list[Node]) -> None:
         """Let the next `refresh` name places and edges after those of another registry, its nodes moved meanwhile."""
         self._next_id = other._next_id

@@ -114,6 +114,11 @@ class TopologyBuilder:
             self._registry.inherit(old, _carried_along(list(old.map.nodes.values()), before, after))
         self._registry.refresh(self._atlas)
 
+    def skip_ids(self, count: int) -> None:
+        """Never give the next so many ids: somebody may have given them meanwhile."""
+        if self._registry is not None:
+            self._registry.skip(count)
+
     def state(self) -> dict[str, NDArray[Any]]:
         """All that the builder knows as arrays by name, empty before the first window; `from_state` goes on from it."""
         if self._surroundings is None or self._registry is None:
