@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 
 from thinmap_ros.core.topology import net
 from thinmap_ros.core.topology.net import web_of_net
-from thinmap_ros.core.topology.simplify import Limits, Outlook, simplify
+from thinmap_ros.core.topology.simplify import simplify
 from thinmap_ros.core.topology.skeleton import net_along, simplified
+from thinmap_ros.core.topology.spurs import Limits, Outlook
 from thinmap_ros.core.topology.thinning import thin
 from thinmap_ros.core.topology.web import Chain, Spot, Web, extent
 

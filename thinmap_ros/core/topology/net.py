@@ -1,12 +1,13 @@
 """Spots and chains as arrays, for compiled code to change: what `Web` is, without an object for each of them."""
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.topology.web import Chain, Spot, Web
 
 Cells = NDArray[np.int64]
@@ -75,6 +76,22 @@ def state_of(net: Net) -> int:
 def chain_count(net: Net) -> int:
     """Numbers of chains given so far."""
     return int(net.used[_CHAINS])
+
+
+@inlined
+def is_among(net: Net, number: int, chosen: Mask) -> bool:
+    """Whether a chain is there and has an end among some spots (S,)."""
+    a = net.chains[number, A]
+    return bool(a != NONE and (chosen[a] or chosen[net.chains[number, B]]))
+
+
+@kernel
+def length_of(net: Net, number: int) -> float:
+    """Length of a chain along its cells, in cells."""
+    length, start = 0.0, net.chains[number, START]
+    for k in range(start + 1, start + net.chains[number, COUNT]):
+        length += math.hypot(net.cells[k, 0] - net.cells[k - 1, 0], net.cells[k, 1] - net.cells[k - 1, 1])
+    return length
 
 
 @kernel

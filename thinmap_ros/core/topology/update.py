@@ -27,8 +27,9 @@ from thinmap_ros.core.topology.free_space import (
 from thinmap_ros.core.topology.graph import Node, TopologicalMap
 from thinmap_ros.core.topology.identity import Registry
 from thinmap_ros.core.topology.net import dissolve_all, draw, web_of_net
-from thinmap_ros.core.topology.simplify import Limits, Outlook, simplify
+from thinmap_ros.core.topology.simplify import simplify
 from thinmap_ros.core.topology.skeleton import Measure, extract, map_of, net_along, simplified, skeleton_of
+from thinmap_ros.core.topology.spurs import Limits, Outlook
 from thinmap_ros.core.topology.stitching import Seam, stitch
 from thinmap_ros.core.topology.surroundings import Surroundings
 
