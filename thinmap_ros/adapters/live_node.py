@@ -18,7 +18,7 @@ from thinmap_ros.adapters.recovery import Recovery, State
 from thinmap_ros.adapters.services import answer
 
 _KEEP_S = 0.5
-_LEAST_PAUSES = 50.0
+_LEAST_PAUSES, _LEAST_PAUSES_NEWS = 50.0, 10.0  # between two times of keeping, in times that it took
 RCLError = rclpy_implementation.RCLError
 _SET_BACK = JumpThreshold(min_forward=None, min_backward=Duration(seconds=-1.0), on_clock_change=False)
 
@@ -96,16 +96,21 @@ class LiveNode(LifecycleNode):
         if self._recovery is not None:
             self._recovery.forget()
 
-    def _keep(self) -> None:
+    def keep_news(self) -> bool:
+        """Keep the state now, as others are about to hear of what is new in it; returns whether there was time to."""
+        return self._keep(_LEAST_PAUSES_NEWS)
+
+    def _keep(self, least_pauses: float = _LEAST_PAUSES) -> bool:
         # However large the map: keeping it takes a small share of the time.
         now = monotonic()
-        if self._recovery is None or now - self._kept_at < _LEAST_PAUSES * self._keeping_s:
-            return
+        if self._recovery is None or now - self._kept_at < least_pauses * self._keeping_s:
+            return False
         state = self._state_of()
         if state is not None:
             self._recovery.keep(state)
         self._kept_at = monotonic()
         self._keeping_s = self._kept_at - now
+        return True
 
     def when_activated(self, work: Callable[[], None]) -> None:
         """Have something done each time that the node becomes active."""

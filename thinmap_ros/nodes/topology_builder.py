@@ -18,6 +18,8 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.rebuilding import Rebuilding
 from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig
 
+_UNTOLD_IDS = 1000  # ids that a builder may have given after its state was kept last
+
 
 class TopologyBuilderNode(LiveNode):
     """/local_map and /pose in; /local_topology and /topology out; services save_topology and load_topology.
@@ -33,6 +35,7 @@ class TopologyBuilderNode(LiveNode):
         parameters.check_unknown(self)
         warm_up.topology_builder()
         self._said_something = False
+        self._newest_kept = 0
         self._local = self.create_publisher(TopologicalMap, 'local_topology', qos.LATCHED)
         self._global = self.create_publisher(TopologicalMap, 'topology', qos.LATCHED)
         listen(self, Path, 'trajectory', self._on_trajectory, qos.LATCHED)
@@ -56,12 +59,14 @@ class TopologyBuilderNode(LiveNode):
         if left is not None and 'latest_ns' in left:
             self._resumed_ns = self._latest_ns = self._taken_over_ns = int(left.pop('latest_ns'))
             self._builder = TopologyBuilder.from_state(left, self._config)
+            self._builder.skip_ids(_UNTOLD_IDS)
             self._rebuilding = Rebuilding(from_the_start=False)
             self._publish(self._latest_ns)
 
     def begin_anew(self) -> None:
         """Forget the graph, or go back to the session that the node was started with."""
         self._matcher: StampMatcher[GridPatch, Array] = StampMatcher()
+        self._newest_kept = 0
         self._rebuilding = Rebuilding(from_the_start=not self._session)
         self._builder = self._of_session() if self._session else TopologyBuilder(self._config)
         if self._session or self._said_something:
@@ -112,7 +117,14 @@ class TopologyBuilderNode(LiveNode):
 
     def _publish(self, stamp_ns: int) -> None:
         self._said_something = True
+        self._keep_new_ids()
         self._global.publish(messages.topology_msg(self._builder.map, self._map_frame, stamp_ns))
+
+    def _keep_new_ids(self) -> None:
+        """Whoever hears of a node may rely on its id: it is kept first, and not only when the next time has come."""
+        newest = max(self._builder.map.nodes, default=0)
+        if newest != self._newest_kept and self.keep_news():
+            self._newest_kept = newest
 
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         return answer(response, lambda: f'saved {session_files.save_topology(request.path, self._builder)}')

@@ -14,6 +14,7 @@ from tqdm import tqdm
 from thinmap_ros.adapters import figures, graph_files, map_files, trajectory_files
 from thinmap_ros.adapters.events import Log, OdometryEvent
 from thinmap_ros.adapters.files import write_text
+from thinmap_ros.adapters.pages import give_back_pages, release_compiler_pages
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.odometry import ScanPairing
@@ -38,7 +39,7 @@ class Replay:
 def replay(log: Log, config: PipelineConfig, show_progress: bool = False) -> Replay:
     """Play a log through the pipeline. Raises InputError where the log has nothing to play."""
     result = Replay(Pipeline(config))
-    pairing = ScanPairing()
+    pairing, tidy_up = ScanPairing(), give_back_pages()
     for event in tqdm(log.events(), unit=' events', disable=not show_progress):
         if isinstance(event, OdometryEvent):
             ready = pairing.add_odometry(event.stamp_ns, event.T_odom_base)
@@ -49,6 +50,7 @@ def replay(log: Log, config: PipelineConfig, show_progress: bool = False) -> Rep
             result.stamps_ns.append(scan.stamp_ns)
             result.poses.append(step.estimate.T_map_base)
             result.local_features.append(step.estimate.n_local)
+        tidy_up()
     result.skipped = log.skipped.count + pairing.dropped + pairing.waiting
     result.first_skipped = log.skipped.first
     if not result.poses:
@@ -66,6 +68,7 @@ def write_outputs(result: Replay, folder: Path, title: str, seconds: tuple[float
     trajectory_files.write_tum(folder / 'trajectory_final.tum', result.stamps_ns, final)
     map_files.write_map(folder / 'map', patch)
     graph_files.write_geojson(folder / 'topology.geojson', pipeline.topology.map)
+    release_compiler_pages()  # before matplotlib comes on top of them
     figures.summary_figure(folder / 'summary.png', patch, pipeline.topology.map, poses, title=title)
     report = _report(result, poses, seconds)
     write_text(folder / 'report.json', json.dumps(report, indent=2) + '\n')

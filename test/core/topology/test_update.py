@@ -103,6 +103,25 @@ def test_ids_stay_while_nothing_changes():
     assert asked > 100 and kept >= 0.99 * asked
 
 
+def test_ids_given_after_a_state_was_kept_are_not_given_again_to_other_places():
+    patch, builder = building(), TopologyBuilder()
+    seen = list(windows(patch, legs((5, 5), (5, 17), (16, 17), (16, 5), (5, 5))))
+    for window, T in seen[:20]:
+        builder.update(window, T)
+    state, told = builder.state(), {*builder.map.nodes, *builder.map.edges}
+    for window, T in seen[20:60]:
+        builder.update(window, T)
+        told |= {*builder.map.nodes, *builder.map.edges}
+    successor = TopologyBuilder.from_state(state)
+    known = {*successor.map.nodes, *successor.map.edges}
+    successor.skip_ids(1000)
+    for window, T in seen[60:]:
+        successor.update(window, T)
+    after = {*successor.map.nodes, *successor.map.edges}
+    assert told - known and after - known
+    assert not (after - known) & told
+
+
 def test_a_place_that_changed_is_replaced():
     patch, builder = building(), TopologyBuilder()
     way = legs((5, 5), (16, 5), (16, 17), (5, 17), (5, 5))

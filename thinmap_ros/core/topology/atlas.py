@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.topology.net import Net, chains_of
 from thinmap_ros.core.topology.web import Chain, Spot, Web
 
 Cells = NDArray[np.int64]
@@ -177,7 +178,7 @@ class Atlas(Web):
         inner_spots = {spot for spot in self.lone if box.has(self.spots[spot].cell)}
         for number in sorted(self._near(box)):
             chain = self.chains[number]
-            outside = _runs_outside(chain.cells, box)
+            outside = _runs_outside(chain, box)
             if outside == [(0, len(chain.cells))]:
                 continue
             self.drop_chain(number)
@@ -211,16 +212,15 @@ class Atlas(Web):
             cut.anchors[row, col] = self.add_spot(Spot((row, col), int(piece.squared[end])))
         return cut.anchors[row, col]
 
-    def graft(self, web: Web, box: Box, anchors: dict[tuple[int, int], int]) -> set[int]:
-        """Add a web drawn on the cells of a box, its spots at anchors being those; returns its spots."""
-        numbers = {}
-        for number, spot in web.spots.items():
-            cell = (spot.cell[0] + box.row, spot.cell[1] + box.col)
-            numbers[number] = anchors[cell] if cell in anchors else self.add_spot(Spot(cell, spot.squared))
-        for chain in web.chains.values():
-            cells = chain.cells + (box.row, box.col)
-            self.add_chain(Chain(numbers[chain.a], numbers[chain.b], cells, chain.squared))
-        return set(numbers.values())
+    def graft(self, net: Net, box: Box, anchors: dict[tuple[int, int], int]) -> set[int]:
+        """Add a whole net drawn on the cells of a box, its spots at anchors being those; returns its spots."""
+        numbers = []
+        for row, col, squared, _ in net.spots.tolist():
+            cell = (row + box.row, col + box.col)
+            numbers.append(anchors[cell] if cell in anchors else self.add_spot(Spot(cell, squared)))
+        for a, b, cells, squared in chains_of(net):
+            self.add_chain(Chain(numbers[a], numbers[b], cells + (box.row, box.col), squared))
+        return set(numbers)
 
     def calm(self, box: Box, limit: Box) -> Box:
         """A box, made larger until no spot lies at its border: there, chains that are cut would touch each other."""
@@ -264,7 +264,7 @@ class Atlas(Web):
         links: dict[int, set[int]] = {}
         for number in near:
             chain = self.chains[number]
-            for first, end in _runs_outside(chain.cells, box):
+            for first, end in _runs_outside(chain, box):
                 a = -chain.a if first == 0 else int(parts[tuple(chain.cells[first - 1] - (box.row, box.col))])
                 b = -chain.b if end == len(chain.cells) else int(parts[tuple(chain.cells[end] - (box.row, box.col))])
                 links.setdefault(a, set()).add(b)
@@ -272,10 +272,15 @@ class Atlas(Web):
         return links
 
 
-def _runs_outside(cells: Cells, box: Box) -> list[tuple[int, int]]:
-    """First index and end of each run of cells (K, 2) that lie outside a box."""
-    runs: list[tuple[int, int]] = _runs(cells, box.row, box.col, *box.end).tolist()
-    return [(first, end) for first, end in runs]
+def _runs_outside(chain: Chain, box: Box) -> list[tuple[int, int]]:
+    """First index and end of each run of a chain's cells that lie outside a box."""
+    low_row, low_col, high_row, high_col = chain.extent
+    end_row, end_col = box.end
+    if high_row < box.row or high_col < box.col or low_row >= end_row or low_col >= end_col:
+        return [(0, len(chain.cells))]
+    if low_row >= box.row and low_col >= box.col and high_row < end_row and high_col < end_col:
+        return []
+    return [(first, end) for first, end in _runs(chain.cells, box.row, box.col, end_row, end_col).tolist()]
 
 
 @kernel

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.topology.atlas import Atlas
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.corners import corner_indices
@@ -17,6 +18,7 @@ from thinmap_ros.core.topology.web import Chain, room_along
 
 _NEW = 0  # id of a node that has none yet
 _OTHER_KIND = 0.5  # share of same_place_m by which a node of another kind counts as farther away
+Cells = NDArray[np.int64]
 Place = tuple[int, int]  # spot, -1; or chain, index of a corner
 OldEdges = dict[tuple[int, int], list[Edge]]  # by the ids of their nodes, the lower one first
 
@@ -62,6 +64,10 @@ class Registry:
             for edge_id, (a, b, piece) in zip(ids[number], self._pieces_of(atlas, number), strict=True):
                 self.map.put_edge(edge_of(edge_id, a, b, piece, self._lattice))
                 self._pieces[edge_id] = piece
+
+    def skip(self, count: int) -> None:
+        """Never give the next so many ids."""
+        self._next_id += count
 
     def inherit(self, other: 'Registry', nodes: list[Node]) -> None:
         """Let the next `refresh` name places and edges after those of another registry, its nodes moved meanwhile."""
@@ -175,8 +181,7 @@ class Registry:
         same = old.get((min(a, b), max(a, b)), [])
         for k, edge in enumerate(same):
             known = self._pieces[edge.id]
-            same_cells = edge.a == a and np.array_equal(known.cells, piece.cells)
-            if same_cells and known.squared.min() == piece.squared.min():
+            if edge.a == a and _is_same(known.cells, known.squared, piece.cells, piece.squared):
                 return same.pop(k)
         edge_id = 0
         if same:
@@ -190,3 +195,14 @@ class Registry:
     def _new_id(self) -> int:
         self._next_id += 1
         return self._next_id - 1
+
+
+@kernel
+def _is_same(cells: Cells, squared: Cells, other_cells: Cells, other_squared: Cells) -> bool:
+    """Whether two pieces run along the same cells (K, 2), and their smallest squared clearances (K,) are the same."""
+    if cells.shape[0] != other_cells.shape[0]:
+        return False
+    for k in range(cells.shape[0]):
+        if cells[k, 0] != other_cells[k, 0] or cells[k, 1] != other_cells[k, 1]:
+            return False
+    return bool(squared.min() == other_squared.min())

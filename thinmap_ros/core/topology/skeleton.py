@@ -8,20 +8,20 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.corners import corner_indices
 from thinmap_ros.core.topology.free_space import column_distance, known_free, reachable, squared_clearance, true_cells
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
+from thinmap_ros.core.topology.net import DONE, Net, net_of, state_of, web_of_net
+from thinmap_ros.core.topology.simplify import simplify_net
+from thinmap_ros.core.topology.spurs import Limits, Outlook
 from thinmap_ros.core.topology.thinning import thin
 from thinmap_ros.core.topology.tracing import trace
-from thinmap_ros.core.topology.web import Chain, Limits, Promise, Spot, Web, room_along, simplify
+from thinmap_ros.core.topology.web import Chain, Web, room_along
 
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.int64]
 Measure = Callable[[Cells], Cells]
-_LOOKS_OUT = 3  # cells at the rim of the known that make a spot look out
-_FARTHER = 1.0  # cells beyond the clearance in which they lie
 
 
 def extract(free_cells: Mask, patch: GridPatch, config: TopologyConfig) -> TopologicalMap:
@@ -33,10 +33,13 @@ def extract(free_cells: Mask, patch: GridPatch, config: TopologyConfig) -> Topol
     """
     known = known_free(patch, config)
     distance = column_distance(known)
-    web = web_of(skeleton_of(free_cells, distance), lambda cells: squared_clearance(distance, cells))
-    promising = looks_out(known, patch.occupied, rim_is_unknown=False)
-    simplify(web, set(web.spots), promising, Limits.of(config, patch.frame.resolution))
-    return map_of(web, patch.frame, config)
+    net = simplified(
+        skeleton_of(free_cells, distance),
+        lambda cells: squared_clearance(distance, cells),
+        Outlook.of(known, patch.occupied, rim_is_unknown=False),
+        Limits.of(config, patch.frame.resolution),
+    )
+    return map_of(web_of_net(net), patch.frame, config)
 
 
 def skeleton_of(free_cells: Mask, distance: NDArray[np.int16]) -> Mask:
@@ -51,73 +54,26 @@ def skeleton_of(free_cells: Mask, distance: NDArray[np.int16]) -> Mask:
     return skeleton
 
 
-def web_of(skeleton: Mask, measure: Measure, pinned: Mask | None = None) -> Web:
+def net_along(skeleton: Mask, measure: Measure, pinned: Mask | None = None, room: int = 1) -> Net:
     """Spots and chains of a skeleton (H, W).
 
-    measure: squared clearances of cells (N, 2); pinned (H, W): cells that become spots.
+    measure: squared clearances of cells (N, 2); pinned (H, W): cells that become spots; room: from `net_of`.
     """
-    web = Web()
-    nodes, ends, paths = trace(skeleton, pinned)
-    cells = np.concatenate([nodes, *paths])
-    squared = measure(cells)
-    at_nodes = zip(nodes.tolist(), squared[: len(nodes)].tolist(), strict=True)
-    spots = [web.add_spot(Spot((row, col), room)) for (row, col), room in at_nodes]
-    start = len(nodes)
-    for (a, b), path in zip(ends.tolist(), paths, strict=True):
-        end = start + len(path)
-        web.add_chain(Chain(spots[a], spots[b], path, squared[start:end]))
-        start = end
-    return web
+    nodes, ends, starts, path = trace(skeleton, pinned)
+    cells = np.concatenate([nodes, path])
+    measured = np.column_stack([cells, measure(cells)])
+    return net_of(measured[: len(nodes)], ends, starts, measured[len(nodes) :], room)
 
 
-def drawing_of(web: Web, shape: tuple[int, int]) -> Mask:
-    """The cells of all spots and chains of a web, (H, W)."""
-    drawing = np.zeros(shape, dtype=np.bool_)
-    for spot in web.spots.values():
-        drawing[spot.cell] = True
-    for chain in web.chains.values():
-        drawing[chain.cells[:, 0], chain.cells[:, 1]] = True
-    return drawing
-
-
-def looks_out(known: Mask, occupied: Mask, rim_is_unknown: bool) -> Promise:
-    """Whether the free space round a spot borders on the unknown: its clearance ends there and not at an obstacle.
-
-    known, occupied (H, W): free and occupied cells; rim_is_unknown: what lies outside the array.
-    """
-    frontier = _frontier(known, occupied, rim_is_unknown)
-
-    def promising(spot: Spot) -> bool:
-        return _count_near(frontier, *spot.cell, math.sqrt(spot.squared) + _FARTHER) >= _LOOKS_OUT
-
-    return promising
-
-
-@kernel
-def _frontier(known: Mask, occupied: Mask, rim_is_unknown: bool) -> Mask:
-    """Free cells (H, W) with an unknown one beside them."""
-    rows, cols = known.shape
-    unknown = np.full((rows + 2, cols + 2), rim_is_unknown)
-    for row in range(rows):
-        for col in range(cols):
-            unknown[row + 1, col + 1] = not (known[row, col] | occupied[row, col])
-    frontier = np.empty((rows, cols), dtype=np.bool_)
-    for row in range(rows):
-        for col in range(cols):
-            beside = unknown[row, col + 1] | unknown[row + 2, col + 1]
-            beside |= unknown[row + 1, col] | unknown[row + 1, col + 2]
-            frontier[row, col] = known[row, col] & beside
-    return frontier
-
-
-@kernel
-def _count_near(cells: Mask, row: int, col: int, reach: float) -> int:
-    """True cells (H, W) within some cells of a place."""
-    count = 0
-    for r in range(max(math.ceil(row - reach), 0), min(int(row + reach) + 1, cells.shape[0])):
-        for c in range(max(math.ceil(col - reach), 0), min(int(col + reach) + 1, cells.shape[1])):
-            count += cells[r, c] and (r - row) ** 2 + (c - col) ** 2 <= reach**2
-    return count
+def simplified(skeleton: Mask, measure: Measure, outlook: Outlook, limits: Limits) -> Net:
+    """Spots and chains of a skeleton (H, W) without those that only noise made."""
+    room = 1
+    while True:
+        net = net_along(skeleton, measure, room=room)
+        simplify_net(net, np.ones(len(net.spots), dtype=np.bool_), outlook, limits)
+        if state_of(net) == DONE:
+            return net
+        room *= 2
 
 
 def map_of(web: Web, frame: GridFrame, config: TopologyConfig) -> TopologicalMap:

@@ -234,11 +234,12 @@ def _way_to_node(parent: Cells, cell: int, path: Cells, length: int, scratch: Ce
     return length + size
 
 
-def trace(raster: NDArray[np.bool_], pinned: NDArray[np.bool_] | None = None) -> tuple[Cells, Cells, list[Cells]]:
+def trace(raster: NDArray[np.bool_], pinned: NDArray[np.bool_] | None = None) -> tuple[Cells, Cells, Cells, Cells]:
     """Nodes and chains of a skeleton.
 
     raster, pinned (H, W) bool; pinned cells become nodes whatever is round them. Returns node cells (N, 2) as
-    (row, col), end nodes of each chain (M, 2), and each chain's cells (K, 2) from the one node's cell to the other's.
+    (row, col), end nodes of each chain (M, 2), where each chain's cells start (M + 1,) in the list that comes last, and
+    that list (K, 2): from the one node's cell to the other's, chain after chain.
     """
     framed = np.zeros((raster.shape[0] + 2, raster.shape[1] + 2), dtype=np.uint8)
     framed[1:-1, 1:-1] = raster
@@ -252,4 +253,4 @@ def trace(raster: NDArray[np.bool_], pinned: NDArray[np.bool_] | None = None) ->
     cols = framed.shape[1]
     path_cells = np.stack([path // cols - 1, path % cols - 1], axis=1)
     node_cells = np.stack([nodes // cols - 1, nodes % cols - 1], axis=1)
-    return node_cells, ends, [path_cells[a:b] for a, b in pairwise(starts)]
+    return node_cells, ends, starts, path_cells

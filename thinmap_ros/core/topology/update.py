@@ -26,10 +26,12 @@ from thinmap_ros.core.topology.free_space import (
 )
 from thinmap_ros.core.topology.graph import Node, TopologicalMap
 from thinmap_ros.core.topology.identity import Registry
-from thinmap_ros.core.topology.skeleton import Measure, drawing_of, extract, looks_out, map_of, skeleton_of, web_of
+from thinmap_ros.core.topology.net import dissolve_all, draw, web_of_net
+from thinmap_ros.core.topology.simplify import simplify
+from thinmap_ros.core.topology.skeleton import Measure, extract, map_of, net_along, simplified, skeleton_of
+from thinmap_ros.core.topology.spurs import Limits, Outlook
 from thinmap_ros.core.topology.stitching import Seam, stitch
 from thinmap_ros.core.topology.surroundings import Surroundings
-from thinmap_ros.core.topology.web import Limits, Spot, simplify
 
 __all__ = ['TopologyBuilder', 'TopologyConfig', 'build']
 
@@ -91,9 +93,9 @@ class TopologyBuilder:
         if view is None or around is None:
             return TopologicalMap()
         low = np.array([around.near.row - around.box.row, around.near.col - around.box.col])
-        shown = web_of(view.skeleton[around.near.within(around.box)], lambda cells: view.measure(cells + low))
-        shown.dissolve_all(set(shown.spots))
-        return map_of(shown, around.lattice.shifted(around.near.row, around.near.col), self.config)
+        shown = net_along(view.skeleton[around.near.within(around.box)], lambda cells: view.measure(cells + low))
+        dissolve_all(shown, np.ones(len(shown.spots), dtype=np.bool_))
+        return map_of(web_of_net(shown), around.lattice.shifted(around.near.row, around.near.col), self.config)
 
     def rebuild(self, window_at: Callable[[float, float], GridPatch], before: Array, after: Array) -> None:
         """Build the map anew after the robot's past poses (N, 3) were corrected, nodes carried along.
@@ -112,6 +114,11 @@ class TopologyBuilder:
         if old is not None:
             self._registry.inherit(old, _carried_along(list(old.map.nodes.values()), before, after))
         self._registry.refresh(self._atlas)
+
+    def skip_ids(self, count: int) -> None:
+        """Never give the next so many ids: somebody may have given them meanwhile."""
+        if self._registry is not None:
+            self._registry.skip(count)
 
     def state(self) -> dict[str, NDArray[Any]]:
         """All that the builder knows as arrays by name, empty before the first window; `from_state` goes on from it."""
@@ -158,17 +165,14 @@ class TopologyBuilder:
             return
         seam = Seam(fresh > 0, old > 0, view.redrawn, view.free, view.robot)
         stitched = stitch(seam, lambda parts: self._atlas.joined_outside(box, parts))
-        squared = np.where(stitched, np.where(view.redrawn, fresh, old), 0)
-        added = true_cells(stitched & (squared == 0))
-        squared[added[:, 0], added[:, 1]] = view.measure(added)
+        squared, changed = _put_together(stitched, view.redrawn, fresh, old, view.distance)
         touched: set[int] = set()
-        for part in self._places_to_redraw(squared != old, box):
+        for part in self._places_to_redraw(changed, box):
             touched |= self._redraw(np.ascontiguousarray(squared[part.within(box)]), part)
-        simplify(self._atlas, touched, lambda spot: view.is_promising(spot, box), view.limits)
+        simplify(self._atlas, touched, view.outlook.at(box.row, box.col), view.limits)
 
-    def _places_to_redraw(self, changed: NDArray[np.bool_], box: Box) -> list[Box]:
-        """Rectangles of the lattice that hold what changed in a box (H, W), apart from each other."""
-        cells = true_cells(changed)
+    def _places_to_redraw(self, cells: Cells, box: Box) -> list[Box]:
+        """Rectangles of the lattice that hold the cells (N, 2) of a box that changed, apart from each other."""
         blocks = cells // _APART
         coarse = np.zeros((box.rows // _APART + 1, box.cols // _APART + 1), dtype=np.bool_)
         coarse[blocks[:, 0], blocks[:, 1]] = True
@@ -196,8 +200,8 @@ class TopologyBuilder:
         pinned = np.zeros(squared.shape, dtype=np.bool_)
         anchors = np.array(list(cut.anchors), dtype=np.int64).reshape(-1, 2) - (place.row, place.col)
         pinned[anchors[:, 0], anchors[:, 1]] = True
-        web = web_of(squared > 0, lambda cells: squared[cells[:, 0], cells[:, 1]], pinned)
-        return self._atlas.graft(web, place, cut.anchors) | cut.touched
+        net = net_along(squared > 0, lambda cells: squared[cells[:, 0], cells[:, 1]], pinned)
+        return self._atlas.graft(net, place, cut.anchors) | cut.touched
 
 
 @kernel
@@ -217,6 +221,28 @@ def _agree(fresh: Cells, old: Cells, where: NDArray[np.bool_]) -> bool:
             if fresh[row, col] != (old[row, col] if where[row, col] else 0):
                 return False
     return True
+
+
+@kernel
+def _put_together(
+    drawn: NDArray[np.bool_], where: NDArray[np.bool_], fresh: Cells, old: Cells, distance: NDArray[np.int16]
+) -> tuple[Cells, Cells]:
+    """Squared clearances (H, W) of what is drawn, 0 elsewhere, and the cells (N, 2) where they are not the old ones.
+
+    They are the fresh ones where these take the old ones' place, and measured anew at cells that were neither.
+    """
+    squared, changed = np.zeros_like(old), np.empty((old.size, 2), dtype=np.int64)
+    cell, count = np.empty((1, 2), dtype=np.int64), 0
+    for row in range(old.shape[0]):
+        for col in range(old.shape[1]):
+            if drawn[row, col]:
+                known = fresh[row, col] if where[row, col] else old[row, col]
+                cell[0, 0], cell[0, 1] = row, col
+                squared[row, col] = known if known > 0 else squared_clearance(distance, cell)[0]
+            if squared[row, col] != old[row, col]:
+                changed[count, 0], changed[count, 1] = row, col
+                count += 1
+    return squared, changed[:count].copy()
 
 
 def _thinned_out(poses: Array) -> Array:
@@ -251,25 +277,19 @@ class _View:
         patch, painted = around.patch(*known_skeleton)
         self.redrawn = around.redrawn(painted)
         known = known_free(patch, config)
-        distance = column_distance(known)
+        self.distance = distance = column_distance(known)
         room = standing_room(distance, config.robot_radius_m / patch.frame.resolution)
         seeds = known_skeleton[0] - (around.box.row, around.box.col)
         seed = nearest_cell(room, patch, robot_xy, config.seed_reach_m)
         self.robot: Cells = np.empty((0, 2), dtype=np.int64) if seed is None else seed[None]
         self.free = reachable(room, np.concatenate((seeds, self.robot)))
         self.measure: Measure = lambda cells: squared_clearance(distance, cells)
-        self._looks_out = looks_out(known, patch.occupied, rim_is_unknown=True)
+        self.outlook = Outlook.of(known, patch.occupied, rim_is_unknown=True)
         self.limits = Limits.of(config, patch.frame.resolution)
-        web = web_of(skeleton_of(self.free, distance), self.measure)
-        simplify(web, set(web.spots), self._looks_out, self.limits)
-        self.skeleton = drawing_of(web, patch.shape)
+        net = simplified(skeleton_of(self.free, distance), self.measure, self.outlook, self.limits)
+        self.skeleton = draw(net, *patch.shape)
 
     def fresh(self) -> Cells:
         """Squared clearances (H, W) of the new skeleton where it is to take the old one's place, 0 elsewhere."""
         cells = true_cells(self.skeleton & self.redrawn)
         return _raster(cells, self.measure(cells), *self.skeleton.shape)
-
-    def is_promising(self, spot: Spot, box: Box) -> bool:
-        """Whether a spot on the lattice looks into the unknown; those outside the box may."""
-        row, col = spot.cell
-        return not box.has(spot.cell) or self._looks_out(Spot((row - box.row, col - box.col), spot.squared))
