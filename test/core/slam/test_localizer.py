@@ -176,6 +176,20 @@ def test_far_from_the_start_a_robot_is_not_lost():
     assert not estimate.lost
 
 
+def test_beyond_a_hall_in_which_nothing_is_seen_the_map_goes_on(rng):
+    """Walls that come into range far off and a few points at a time are new ground, and no reason to be lost."""
+    # Two rooms, each open towards the hall between them.
+    hall = np.vstack([ROOM[[0, 2, 3]], np.delete(ROOM, 3, axis=0) + [18.0, 0.0, 18.0, 0.0]])
+    localizer, odom = Localizer(LocalizerConfig(start_x_m=2.0, start_y_m=7.0)), np.zeros(3)
+    for x in np.arange(2.0, 22.0, 0.1):
+        odom = odom + [0.1 * 1.004, rng.normal(0.0, 1e-4), rng.normal(0.0, 1e-4)]
+        truth = np.array([x, 7.0, 0.0])
+        estimate = localizer.step(scan_in(hall, truth, rng, beams=46), odom)
+    assert not estimate.lost
+    assert estimate.match_quality > 0.9
+    assert abs(estimate.T_map_base - truth).max() < 0.3
+
+
 def test_a_pose_that_is_set_is_settled_by_the_walls():
     rng = np.random.default_rng(9)
     rows, localizer = driven(300)

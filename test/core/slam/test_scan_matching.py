@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from slam_room import ROOM, scan_in
+from slam_room import ROOM, corridor_ring, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam.point_map import CENTRE_X, CENTRE_Y, COUNT, LOOSE, NORMAL_X, NORMAL_Y, PointMap
@@ -124,3 +124,25 @@ def test_beside_a_door_a_wall_is_a_wall_to_its_end():
     for cell in cells:
         assert cell[LOOSE] == 0.0
         np.testing.assert_allclose([cell[NORMAL_X], cell[NORMAL_Y], cell[CENTRE_Y]], [0.0, -1.0, 1.0], atol=0.03)
+
+
+def test_a_good_prior_is_not_left_for_a_place_that_looks_alike(rng):
+    """A corridor with niches, seen as far as the robot has come: nothing but the prior says which niche is which."""
+    walls, prior_covariance = corridor_ring(), np.diag(np.square([0.02, 0.004, 0.04]))
+    matcher = ScanMatcher(MatchConfig())
+    for x in np.arange(36.0, 3.0, -0.15):
+        truth = np.array([x, 18.77, math.pi])
+        scan = scan_in(walls, truth, rng)
+        match = matcher.match(scan.points_base(), np.zeros(2), truth, prior_covariance)
+        assert np.hypot(*(match.T_map_base - truth)[:2]) < 0.1
+        if round(x / 0.15) % 2 == 0:
+            matcher.add(se2.transform_points(truth, scan.points_base()), truth[:2])
+
+
+def test_what_a_map_knows_of_a_scan(rng):
+    matcher = matcher_of(ROOM, around(TRUTH, 15, rng), rng)
+    points = scan_in(ROOM, TRUTH, rng).points_base()
+    assert matcher.known(points, np.zeros(2), TRUTH) > 0.9
+    assert matcher.known(points, np.zeros(2), TRUTH + [50.0, 0.0, 0.0]) == 0.0
+    assert matcher.known(np.empty((0, 2)), np.zeros(2), TRUTH) == 0.0
+    assert ScanMatcher(MatchConfig()).known(points, np.zeros(2), TRUTH) == 0.0

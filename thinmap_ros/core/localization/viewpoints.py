@@ -12,7 +12,7 @@ from thinmap_ros.core.grid.patch import UNKNOWN as UNKNOWN_CELL
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.localization.places import FREE, UNKNOWN, WALL, Bytes, Places, free_way
-from thinmap_ros.core.planning.reach import places_and_ways
+from thinmap_ros.core.planning.reach import let_out, standing_places
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, navigation_function
 from thinmap_ros.core.se2 import Array
 
@@ -100,7 +100,8 @@ def _common_states(
 def _in_reach(patch: GridPatch, T_odom_base: Array, driving: WavefrontConfig) -> tuple[Array, Array]:
     """Points (N, 2) a spacing apart to which the robot can get, and the way there, (N,), m."""
     resolution, xy = patch.frame.resolution, (float(T_odom_base[0]), float(T_odom_base[1]))
-    standing, ways = places_and_ways(patch.free, patch.frame, xy, driving.robot_radius_m, driving.escape_m)
+    standing = standing_places(patch.free, driving.robot_radius_m, resolution)
+    ways = let_out(standing, patch.free, patch.frame, xy, driving.escape_m)
     middle = patch.shape[0] // 2, patch.shape[1] // 2
     metres = navigation_function(np.where(ways, 1.0, np.inf), middle) * resolution
     near_by = np.argwhere(standing & (metres >= _NEAREST_M) & np.isfinite(metres))

@@ -19,6 +19,7 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, transform_points
 from thinmap_ros.core.slam.association import AssociationConfig, associate, mahalanobis, meeting
 from thinmap_ros.core.slam.candidates import Candidate, Candidates
+from thinmap_ros.core.slam.ekf import EkfSlam
 from thinmap_ros.core.slam.ekf_ti import CompressedEkf
 from thinmap_ros.core.slam.features import (
     Feature,
@@ -112,16 +113,19 @@ class FeatureMap:
             for i, feature in self._features.items()
         ]
 
-    def observe(self, ekf: CompressedEkf, lines: Lines, scan: Scan) -> tuple[int, bool]:
+    def observe(
+        self, ekf: CompressedEkf, lines: Lines, scan: Scan, leeway: Array | None = None
+    ) -> tuple[int, bool]:
         """Associate and correct the filter by the lines of a scan, then look after the features.
 
+        leeway (3, 3): the covariance with which the pose is known by other means, where it is.
         Returns how many were matched, and whether the filter took the update.
         """
         if self._local_areas:
             self._choose_area(ekf, scan)
         lines = Lines(lines.z, lines.covariances + self._wall, lines.ends)
         laser_map = transform_points(ekf.local.pose, scan.T_base_laser[None, :2])[0]
-        chosen, taken = self._correct(ekf, lines, laser_map)
+        chosen, taken = self._correct(ekf, lines, laser_map, leeway)
         matched, unknown = np.flatnonzero(chosen >= 0), np.flatnonzero(chosen < 0)
         seen = self._grow(ekf, chosen[matched], lines.chosen(matched))
         ripe = self._candidates.take(ekf.local.pose, lines.chosen(unknown), laser_map)
@@ -131,22 +135,20 @@ class FeatureMap:
         self.area.store(ekf.local.pose, [i for i in (*seen, *new) if i in self._features])
         return len(matched), taken
 
-    def _correct(self, ekf: CompressedEkf, lines: Lines, laser_map: Array) -> tuple[NDArray[np.int64], bool]:
+    def _correct(
+        self, ekf: CompressedEkf, lines: Lines, laser_map: Array, leeway: Array | None
+    ) -> tuple[NDArray[np.int64], bool]:
         """Update by the lines that can only be one feature, then by the others; which feature each is (-1: none)."""
         features = self._local(ekf)
         choice = associate(ekf.local, features, lines, laser_map, self._config)
         chosen = np.where(choice.ambiguous, -1, choice.index)
-        taken = self._update(ekf, chosen, lines)
+        taken = _update(ekf.local, chosen, lines, leeway)
         left = np.flatnonzero(choice.ambiguous)
         if left.size:
             again = associate(ekf.local, features, lines.chosen(left), laser_map, self._config).index
-            taken &= self._update(ekf, again, lines.chosen(left))
+            taken &= _update(ekf.local, again, lines.chosen(left), leeway)
             chosen[left] = again
         return chosen, taken
-
-    def _update(self, ekf: CompressedEkf, chosen: NDArray[np.int64], lines: Lines) -> bool:
-        matched = np.flatnonzero(chosen >= 0)
-        return ekf.local.update(chosen[matched], lines.z[matched], lines.covariances[matched])
 
     def move(self, ekf: CompressedEkf, correction: Correction) -> None:
         """Take the features where the keyframes nearest to where they were first seen from have gone.
@@ -257,3 +259,8 @@ class FeatureMap:
         near = meeting(lines, features, ends[None], candidate.span.seen_from, 0.0)[0]
         near &= np.abs(normals_of(lines) @ middle - lines[:, 0]) <= self._near
         return set(ids[near].tolist())
+
+
+def _update(ekf: EkfSlam, chosen: NDArray[np.int64], lines: Lines, leeway: Array | None) -> bool:
+    matched = np.flatnonzero(chosen >= 0)
+    return ekf.update(chosen[matched], lines.z[matched], lines.covariances[matched], leeway)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,19 +12,14 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.config import parameter
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.doubt import Doubt
 from thinmap_ros.core.slam.ekf import EkfSlam
 from thinmap_ros.core.slam.ekf_ti import CompressedEkf
 from thinmap_ros.core.slam.feature_map import FeatureConfig, FeatureMap
 from thinmap_ros.core.slam.features import LineFeature
 from thinmap_ros.core.slam.lines import LineConfig, Lines, extract_lines, no_lines
 from thinmap_ros.core.slam.loops import Correction, Keyframe, LoopConfig, Loops
-from thinmap_ros.core.slam.models import (
-    MotionConfig,
-    added_by_match,
-    motion_jacobians,
-    odometry_covariance,
-    rotation,
-)
+from thinmap_ros.core.slam.models import MotionConfig, motion_jacobians, odometry_covariance, rotation
 from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
 from thinmap_ros.core.slam.scan_matching import FEWEST_POINTS, Match, MatchConfig, ScanMatcher
 from thinmap_ros.core.slam.tracking import Tracking
@@ -38,6 +33,8 @@ _KNOWN_M, _KNOWN_RAD = 0.2, 0.2  # nearer than that, most of a scan must be know
 _LEAP_M, _LEAP_RAD = 0.4, 0.4  # a scan puts the robot this far from where the wheels did: one of them is wrong
 _OF_LATE_M = 100.0  # way in which the drift stays below what a match with the map bridges
 _REDRAWN_AT_ONCE, _REDRAWN_A_STEP = 60, 3  # keyframes drawn anew when a loop was closed, and in each step after it
+# By which lines may move the pose even where matches leave nothing open, m and rad, 1 sigma.
+_LEEWAY = np.diag(np.square([0.003, 0.003, 0.001]))
 _UNKNOWN_SIGMA_M = 300.0  # what a pose is known to while the robot is lost
 _LOST_SIGMA_M = 1.0  # doubt since a scan last fitted; far from the start, more than this is no reason to be lost
 
@@ -115,8 +112,9 @@ class Localizer:
         self._T_odom_base: Array | None = None
         self._calibration = OdometryCalibration()
         self._T_last_look: Array | None = None
-        # What has been added to the doubt of the pose since a scan last fitted the map.
-        self._doubt = np.zeros((3, 3))
+        # Share of that look's points which the map then knew; walls that are far off take several looks.
+        self._known_here = 0.0
+        self._doubt = Doubt()
         self._placed_by_hand = False
         self._tracking = Tracking(self.config.lost_scans)
 
@@ -127,7 +125,7 @@ class Localizer:
             return
         floor = np.diag(np.square(_START_SIGMAS))
         self._ekf.set_pose(T_map_base, covariance + floor)
-        self._doubt = covariance + floor
+        self._doubt = Doubt(covariance + floor)
         self._placed_by_hand = True
         self._tracking.found()
         self._calibration.interrupt()
@@ -195,6 +193,7 @@ class Localizer:
             if match.good or self._on_new_ground(match):
                 points_map = se2.transform_points(self._ekf.pose, points_base)
                 self._matcher.add(points_map, laser_map)
+                self._known_here = self._matcher.known(points_base, laser_base, self._ekf.pose)
                 self._T_last_look = self._ekf.pose
                 self._loops.follow(scan, points_base, self._ekf.pose, _is_leap(expected, self._ekf.pose))
         elif match.good and not self.config.mapping:
@@ -279,15 +278,15 @@ class Localizer:
         turn = rotation(float(pose[2]))
         predicted = se2.compose(pose, increment)
         F, _ = motion_jacobians(pose, increment)
-        self._doubt = F @ self._doubt @ F.T + turn @ covariance @ turn.T
-        match = self._matcher.match(points_base, laser_base, predicted, self._doubt)
+        self._doubt.move(F, turn @ covariance @ turn.T)
+        match = self._matcher.match(points_base, laser_base, predicted, self._doubt.since_match)
         near = not self._moved(_KNOWN_M, _KNOWN_RAD, match.T_map_base)
         match = self._tracking.judged(match, points_base, scan, increment, near)
         if len(points_base) >= FEWEST_POINTS:  # fewer fit nothing, and contradict nothing
             self._tracking.count(match.good, self._on_new_ground(match))
         if match.good:
-            added = added_by_match(self._doubt, match.covariance, increment)
-            self._doubt = np.zeros((3, 3))
+            match = self._taken_back(match, predicted)
+            added = self._doubt.match(match.covariance, increment)
             increment, covariance = se2.between(pose, match.T_map_base), turn.T @ added @ turn
             predicted = match.T_map_base
         if match.good and (self._placed_by_hand or self.config.slam == 'off' or not self.config.mapping):
@@ -297,12 +296,28 @@ class Localizer:
             self._ekf.predict(predicted, increment, covariance)
         return match
 
+    def _taken_back(self, match: Match, predicted: Array) -> Match:
+        """A match that takes back what lines did to the pose takes it back whole, in features and open directions, too.
+
+        The map of points is as it was, so the match leads back to it. If that passed for motion, each look would do it
+        again, and the pose would creep wherever points say nothing: along a corridor, by its own two walls.
+        """
+        step, by_prior = self._ekf.moved_by_updates(), np.linalg.inv(self._doubt.since_match)
+        seen = np.linalg.inv(match.covariance) - by_prior
+        off = match.T_map_base - predicted
+        off[2] = se2.wrap(float(off[2]))
+        share = float(np.clip(-(off @ seen @ step) / max(float(step @ seen @ step), 1e-12), 0.0, 1.0))
+        self._ekf.take_back(share)
+        T_map_base = match.T_map_base - share * (match.covariance @ by_prior @ step)
+        T_map_base[2] = se2.wrap(float(T_map_base[2]))
+        return replace(match, T_map_base=T_map_base)
+
     def _correct(self, scan: Scan) -> tuple[Lines, int]:
         """Eqs. (6)-(9) with the lines of the scan; how many of them were known."""
         if self.config.slam == 'off' or not se2.is_finite(scan.T_base_laser):
             return no_lines(), 0
         lines = extract_lines(scan, self.config)
-        matched, taken = self._feature_map.observe(self._filter, lines, scan)
+        matched, taken = self._feature_map.observe(self._filter, lines, scan, self._doubt.on_map + _LEEWAY)
         self.refused += not taken
         return lines, matched
 
@@ -313,9 +328,10 @@ class Localizer:
     def _on_new_ground(self, match: Match) -> bool:
         """Whether a scan that lies on little that is known can be explained by where the robot has come to.
 
-        Near the place where the map last learned, most of a scan has been seen before.
+        Near the place where the map last learned, most of a scan has been seen before, unless little came of it.
         """
-        return match.overlap < _NEW_GROUND and self._moved(_NEW_GROUND_M, _NEW_GROUND_RAD)
+        unformed = self._known_here < _NEW_GROUND
+        return match.overlap < _NEW_GROUND and (unformed or self._moved(_NEW_GROUND_M, _NEW_GROUND_RAD))
 
     def _moved(self, distance_m: float, turn_rad: float, T_map_base: Array | None = None) -> bool:
         """Whether the robot, or a pose (3,), is that far from the last place at which the map learned."""
@@ -325,7 +341,7 @@ class Localizer:
         return math.hypot(moved[0], moved[1]) >= distance_m or abs(float(moved[2])) >= turn_rad
 
     def _is_lost(self) -> bool:
-        in_doubt = max(self._doubt[0, 0], self._doubt[1, 1]) > _LOST_SIGMA_M**2
+        in_doubt = self._doubt.since_match[[0, 1], [0, 1]].max() > _LOST_SIGMA_M**2
         return self._tracking.lost or bool(in_doubt)
 
     def _estimate(self, match: Match, lines: Lines, matched: int, correction: Correction | None) -> Estimate:

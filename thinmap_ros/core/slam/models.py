@@ -8,8 +8,6 @@ import numpy as np
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.se2 import Array, wrap
 
-_SAME_POINTS_M, _SAME_POINTS_RAD = 1.0, 1.0  # after so much way a match errs by other points than before
-
 
 @dataclass(frozen=True)
 class MotionConfig(Config):
@@ -43,18 +41,6 @@ def odometry_covariance(increment: Array, config: MotionConfig) -> Array:
     slip = np.square([config.odom_slip_m, config.odom_slip_m, config.odom_slip_rad])
     scaled = G * np.array([of_chord, of_turn])
     return np.asarray(scaled @ scaled.T + np.diag(slip))
-
-
-def added_by_match(prior: Array, posterior: Array, increment: Array) -> Array:
-    """What a step that ends in a match adds to the covariance of the pose, (3, 3), map frame.
-
-    Of the error of the prior (3, 3) a match with posterior (3, 3) leaves a part, that is new with every step; what the
-    map adds is much the same error as in the step before as long as the same points are seen.
-    """
-    by_prior = np.linalg.inv(prior)
-    by_map = np.linalg.inv(posterior) - by_prior
-    share = min(1.0, math.hypot(increment[0], increment[1]) / _SAME_POINTS_M + abs(increment[2]) / _SAME_POINTS_RAD)
-    return np.asarray(posterior @ (by_prior + share * by_map) @ posterior)
 
 
 def rotation(theta: float) -> Array:

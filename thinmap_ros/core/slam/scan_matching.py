@@ -36,6 +36,9 @@ from thinmap_ros.core.slam.point_map import (
 _MASK = TILE - 1
 _ROUNDS = 20
 _WIDE_ROUNDS = 3  # rounds in which far neighbours and larger errors still count
+_PLAIN_FIT = 0.95  # share of points that fit below which it is asked whether near neighbours alone do better
+_OF_A_POINT = 0.25  # what a point says, as points err together, in terms of a log-likelihood
+_SLIPS = 3.0  # sigmas beyond which a prior says little more: wheels slip
 _LEAST_OVERLAP = 0.3  # share of the scan that has to lie where the map knows something, for a fit to be judged
 FEWEST_POINTS = 10  # in a scan, for it to be matched
 _SEARCHED_M, _SEARCHED_POINTS = 20.0, 60  # a search takes so many points of the scan, and none farther than this
@@ -50,7 +53,7 @@ class MatchConfig(Config):
 
     match_cell_m: float = parameter(0.05, 'edge of a cell of the point map, m', low=0.01, high=0.5)
     match_range_m: float = parameter(30.0, 'farther points are not matched, m', low=1.0, high=200.0)
-    match_memory: float = parameter(30.0, 'points that the mean of a cell remembers', low=1.0, high=1e6)
+    match_memory: float = parameter(15.0, 'points that the mean of a cell remembers', low=1.0, high=1e6)
     match_reach_m: float = parameter(0.6, 'points look for their surface within, m', low=0.05, high=2.0)
     match_sigma_m: float = parameter(
         0.03, 'doubt of a point on its surface (1 sigma), m; above range noise, as points err together', low=0.001
@@ -102,15 +105,48 @@ class ScanMatcher:
         """
         if len(points_base) < FEWEST_POINTS or self.map.tiles.used == 0:
             return Match(prior, covariance, 0.0, 0.0, False)
-        around = gaps(points_base)
-        scan = np.column_stack([points_base, np.clip(around / self.config.match_cell_m, 0.05, 1.0), around < DENSE_M])
+        scan = self._weighted(points_base)
         match = self._refine(scan, laser_base, prior, prior, covariance)
-        if search or (match.overlap >= _LEAST_OVERLAP and match.fit < self.config.match_good_fit):
-            match = self._search(scan, laser_base, prior, covariance, match)
+        if match.fit < _PLAIN_FIT or _squared_sigmas(match, prior, covariance) > _SLIPS**2:
+            # Far neighbours lead astray where little but one wall is seen, or much is new, and the prior was right.
+            near = self._refine(scan, laser_base, prior, prior, covariance, slipped=False)
+            match = _likelier(match, near, prior, covariance, len(scan))
+        if search:
+            return _better(match, self._search(scan, laser_base, prior, covariance))
+        if match.overlap >= _LEAST_OVERLAP and match.fit < self.config.match_good_fit:
+            found = self._search(scan, laser_base, prior, covariance)
+            # Where the prior's own match would do, another one has to be worth the leap.
+            match = _likelier(match, found, prior, covariance, len(scan)) if match.good else _better(match, found)
         return match
 
-    def _search(self, scan: Array, laser_base: Array, prior: Array, covariance: Array, poor: Match) -> Match:
-        """The better of a poor match and of what the search around the prior leads to."""
+    def known(self, points_base: Array, laser_base: Array, T_map_base: Array) -> float:
+        """Share of the points (N, 2) that lie where the map knows a surface, at a pose (3,)."""
+        if len(points_base) < FEWEST_POINTS or self.map.tiles.used == 0:
+            return 0.0
+        config, tiles = self.config, self.map.tiles
+        cells = int(math.ceil(0.5 * config.match_reach_m / config.match_cell_m))
+        limits = (config.match_cell_m, cells, config.match_sigma_m, config.match_outlier_m, config.match_inlier_m)
+        total, near, _ = _add_points(
+            self._weighted(points_base),
+            laser_base,
+            T_map_base,
+            tiles.pool,
+            tiles.directory,
+            self.map.corner,
+            (*limits, self.map.since_m),
+            np.zeros((3, 3)),
+            np.zeros(3),
+        )
+        return near / total
+
+    def _weighted(self, points_base: Array) -> Array:
+        """A scan as `_align` takes it, (N, 4)."""
+        around = gaps(points_base)
+        weights = np.clip(around / self.config.match_cell_m, 0.05, 1.0)
+        return np.column_stack([points_base, weights, around < DENSE_M])
+
+    def _search(self, scan: Array, laser_base: Array, prior: Array, covariance: Array) -> Match:
+        """The match to which the search around a prior leads."""
         config, tiles = self.config, self.map.tiles
         turns = np.radians(np.arange(-config.search_deg, config.search_deg + 1e-9, 2.0))
         near = scan[np.hypot(scan[:, 0], scan[:, 1]) < _SEARCHED_M]
@@ -123,10 +159,12 @@ class ScanMatcher:
         start = _search(sparse, prior, steps, turns, filled, low, config.match_cell_m)
         # What is searched for is what the prior missed: it must not hold the pose back.
         wide = covariance + np.diag(np.square([config.search_m, config.search_m, math.radians(config.search_deg)]))
-        found = self._refine(scan, laser_base, start, prior, wide)
-        return found if found.fit > poor.fit else poor
+        return self._refine(scan, laser_base, start, prior, wide)
 
-    def _refine(self, scan: Array, laser_base: Array, start: Array, prior: Array, covariance: Array) -> Match:
+    def _refine(
+        self, scan: Array, laser_base: Array, start: Array, prior: Array, covariance: Array, slipped: bool = True
+    ) -> Match:
+        """The match near a start; slipped: whether the prior may be wrong beyond what its covariance says."""
         config, tiles = self.config, self.map.tiles
         limits = np.array(
             [config.match_cell_m, config.match_reach_m, config.match_sigma_m, config.match_outlier_m]
@@ -134,7 +172,16 @@ class ScanMatcher:
         )
         information: Array = np.linalg.inv(covariance).astype(np.float64)
         pose, posterior, shares = _align(
-            scan, laser_base, start, prior, information, tiles.pool, tiles.directory, self.map.corner, limits
+            scan,
+            laser_base,
+            start,
+            prior,
+            information,
+            tiles.pool,
+            tiles.directory,
+            self.map.corner,
+            limits,
+            slipped,
         )
         overlap, fit = shares[1] / shares[0], shares[2] / max(shares[1], 1e-9)
         if not np.isfinite(pose).all():
@@ -142,6 +189,30 @@ class ScanMatcher:
         pose[2] = wrap(float(pose[2]))
         good = overlap >= _LEAST_OVERLAP and fit >= config.match_least_fit
         return Match(pose, np.linalg.inv(posterior).astype(np.float64), float(fit), float(overlap), bool(good))
+
+
+def _better(first: Match, second: Match) -> Match:
+    """The match of which more fits; the first where as much does of both."""
+    return max(first, second, key=lambda match: match.fit)
+
+
+def _likelier(first: Match, second: Match, prior: Array, covariance: Array, points: int) -> Match:
+    """The match for which more speaks; the first where as much speaks for both."""
+    return max(first, second, key=lambda match: _evidence(match, prior, covariance, points))
+
+
+def _evidence(match: Match, prior: Array, covariance: Array, points: int) -> float:
+    """How much speaks for a match: points that fit, less those that contradict, less how far off the prior it is."""
+    fitting = points * match.overlap * (2.0 * match.fit - 1.0)
+    squared = _squared_sigmas(match, prior, covariance)
+    return _OF_A_POINT * fitting - 0.5 * _SLIPS**2 * math.log1p(squared / _SLIPS**2)
+
+
+def _squared_sigmas(match: Match, prior: Array, covariance: Array) -> float:
+    """How far a match is off its prior, squared, in sigmas of that."""
+    off = match.T_map_base - prior
+    off[2] = wrap(float(off[2]))
+    return float(off @ np.linalg.solve(covariance, off))
 
 
 @kernel
@@ -188,9 +259,9 @@ def _nearest(
 
 @kernel
 def _prior_terms(
-    pose: Array, prior: Array, prior_information: Array, information: Array, gradient: Array
+    pose: Array, prior: Array, prior_information: Array, slipped: bool, information: Array, gradient: Array
 ) -> None:
-    """Start the normal equations with the prior; it counts less the farther the pose is from it, as wheels slip."""
+    """Start the normal equations with the prior; where wheels slip it counts less the farther the pose is from it."""
     turn = math.atan2(math.sin(prior[2] - pose[2]), math.cos(prior[2] - pose[2]))
     off = (prior[0] - pose[0], prior[1] - pose[1], turn)
     squared = 0.0
@@ -199,7 +270,7 @@ def _prior_terms(
         for b in range(3):
             gradient[a] += prior_information[a, b] * off[b]
         squared += off[a] * gradient[a]
-    weight = 1.0 / (1.0 + squared / 9.0)
+    weight = 1.0 / (1.0 + squared / (_SLIPS * _SLIPS)) if slipped else 1.0
     for a in range(3):
         gradient[a] *= weight
         for b in range(3):
@@ -290,19 +361,21 @@ def _align(
     directory: NDArray[np.int32],
     corner: NDArray[np.int64],
     limits: Array,
+    slipped: bool,
 ) -> tuple[Array, Array, Array]:
     """Pose (3,), its information (3, 3), and the weights (3,) of all points, of those near the map, of those on it.
 
     scan (N, 4): x, y, weight in the robot frame, and whether the beams around are dense; limits: cell, reach, sigma,
-    outlier and inlier distance, m, and where on the robot's way the cells that count were last seen.
+    outlier and inlier distance, m, and where on the robot's way the cells that count were last seen; slipped: whether
+    to look far, and to let go of the prior.
     """
     cell_m, reach, sigma, outlier, inlier, since = limits
     pose, information, gradient, shares = start.copy(), np.zeros((3, 3)), np.zeros(3), np.zeros(3)
     for iteration in range(_ROUNDS):
-        wide = iteration < _WIDE_ROUNDS
+        wide = slipped and iteration < _WIDE_ROUNDS
         cells = int(math.ceil(reach / cell_m)) if wide else int(math.ceil(0.5 * reach / cell_m))
         now = (cell_m, cells, sigma, 3.0 * outlier if wide else outlier, inlier, since)
-        _prior_terms(pose, prior, prior_information, information, gradient)
+        _prior_terms(pose, prior, prior_information, slipped, information, gradient)
         shares[0], shares[1], shares[2] = _add_points(
             scan, laser_base, pose, pool, directory, corner, now, information, gradient
         )

@@ -1,0 +1,45 @@
+"""How far the pose may be from where the map of points would have it."""
+
+import math
+
+import numpy as np
+
+from thinmap_ros.core.se2 import Array
+
+_SAME_POINTS_M, _SAME_POINTS_RAD = 1.0, 1.0  # after so much way a match errs by other points than before
+
+
+class Doubt:
+    """Covariances (3, 3) of the pose, map frame, as if the map of points were the truth.
+
+    since_match: what was added since a scan last fitted; on_map: what all matches so far leave open.
+    """
+
+    def __init__(self, covariance: Array | None = None) -> None:
+        """Begin with the covariance (3, 3) of where the robot is; without one, the map begins there."""
+        start = np.zeros((3, 3)) if covariance is None else covariance
+        self.since_match, self.on_map = start, start
+
+    def move(self, F_x: Array, added: Array) -> None:
+        """The robot has moved: the Jacobian (3, 3) by the pose, and the covariance (3, 3) of the increment."""
+        self.since_match = F_x @ self.since_match @ F_x.T + added
+        self.on_map = F_x @ self.on_map @ F_x.T + added
+
+    def match(self, posterior: Array, increment: Array) -> Array:
+        """A scan fits, with posterior (3, 3): what this step adds to the covariance of the pose in the world, (3, 3).
+
+        Of the error of the prior a match leaves a part, that is new with every step; what the map adds is much the
+        same error as in the step before as long as the same points are seen.
+        """
+        by_prior = np.linalg.inv(self.since_match)
+        by_map = _positive(np.linalg.inv(posterior) - by_prior)
+        self.since_match = np.zeros((3, 3))
+        self.on_map = np.asarray(np.linalg.inv(np.linalg.inv(self.on_map) + by_map), dtype=np.float64)
+        share = min(1.0, math.hypot(increment[0], increment[1]) / _SAME_POINTS_M + abs(increment[2]) / _SAME_POINTS_RAD)
+        return np.asarray(posterior @ (by_prior + share * by_map) @ posterior)
+
+
+def _positive(information: Array) -> Array:
+    """The part (3, 3) that is not negative: a match far from its prior gives that less weight than it claims."""
+    values, vectors = np.linalg.eigh(information)
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
