@@ -1,14 +1,15 @@
 """Scans against the map of points: back to the true pose, honest where the walls leave a direction open."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from slam_room import ROOM, corridor_ring, scan_in
+from slam_room import ROOM, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam.point_map import CENTRE_X, CENTRE_Y, COUNT, LOOSE, NORMAL_X, NORMAL_Y, PointMap
-from thinmap_ros.core.slam.scan_matching import MatchConfig, ScanMatcher
+from thinmap_ros.core.slam.scan_matching import Match, MatchConfig, ScanMatcher, likelier
 
 TRUTH = np.array([2.0, 2.0, 0.3])
 DOUBT = np.diag([0.1, 0.1, 0.1]) ** 2
@@ -126,17 +127,18 @@ def test_beside_a_door_a_wall_is_a_wall_to_its_end():
         np.testing.assert_allclose([cell[NORMAL_X], cell[NORMAL_Y], cell[CENTRE_Y]], [0.0, -1.0, 1.0], atol=0.03)
 
 
-def test_a_good_prior_is_not_left_for_a_place_that_looks_alike(rng):
-    """A corridor with niches, seen as far as the robot has come: nothing but the prior says which niche is which."""
-    walls, prior_covariance = corridor_ring(), np.diag(np.square([0.02, 0.004, 0.04]))
-    matcher = ScanMatcher(MatchConfig())
-    for x in np.arange(36.0, 3.0, -0.15):
-        truth = np.array([x, 18.77, math.pi])
-        scan = scan_in(walls, truth, rng)
-        match = matcher.match(scan.points_base(), np.zeros(2), truth, prior_covariance)
-        assert np.hypot(*(match.T_map_base - truth)[:2]) < 0.1
-        if round(x / 0.15) % 2 == 0:
-            matcher.add(se2.transform_points(truth, scan.points_base()), truth[:2])
+def test_a_match_far_from_its_prior_has_to_be_worth_it():
+    prior, covariance = np.zeros(3), np.diag(np.square([0.02, 0.02, 0.02]))
+    near, leap = (Match(np.array([x, 0.0, 0.0]), covariance, 0.9, 0.9, True) for x in (0.01, 0.6))
+    for fit, overlap, expected in ((0.95, 0.9, near), (0.9, 1.0, near), (1.0, 0.4, near)):
+        better = replace(leap, fit=fit, overlap=overlap)
+        assert likelier(near, better, prior, covariance, 181) is expected
+        assert likelier(better, near, prior, covariance, 181) is expected
+    clear = replace(leap, fit=1.0)
+    contradicted = replace(near, fit=0.6)
+    assert likelier(contradicted, clear, prior, covariance, 181) is clear
+    assert likelier(contradicted, clear, prior, covariance, 40) is contradicted
+    assert likelier(contradicted, clear, prior, 900.0 * covariance, 40) is clear
 
 
 def test_what_a_map_knows_of_a_scan(rng):

@@ -109,14 +109,14 @@ class ScanMatcher:
         match = self._refine(scan, laser_base, prior, prior, covariance)
         if match.fit < _PLAIN_FIT or _squared_sigmas(match, prior, covariance) > _SLIPS**2:
             # Far neighbours lead astray where little but one wall is seen, or much is new, and the prior was right.
-            near = self._refine(scan, laser_base, prior, prior, covariance, slipped=False)
-            match = _likelier(match, near, prior, covariance, len(scan))
+            near = self._refine(scan, laser_base, prior, prior, covariance, far=False)
+            match = likelier(match, near, prior, covariance, len(scan))
         if search:
             return _better(match, self._search(scan, laser_base, prior, covariance))
         if match.overlap >= _LEAST_OVERLAP and match.fit < self.config.match_good_fit:
             found = self._search(scan, laser_base, prior, covariance)
             # Where the prior's own match would do, another one has to be worth the leap.
-            match = _likelier(match, found, prior, covariance, len(scan)) if match.good else _better(match, found)
+            match = likelier(match, found, prior, covariance, len(scan)) if match.good else _better(match, found)
         return match
 
     def known(self, points_base: Array, laser_base: Array, T_map_base: Array) -> float:
@@ -162,9 +162,9 @@ class ScanMatcher:
         return self._refine(scan, laser_base, start, prior, wide)
 
     def _refine(
-        self, scan: Array, laser_base: Array, start: Array, prior: Array, covariance: Array, slipped: bool = True
+        self, scan: Array, laser_base: Array, start: Array, prior: Array, covariance: Array, far: bool = True
     ) -> Match:
-        """The match near a start; slipped: whether the prior may be wrong beyond what its covariance says."""
+        """The match to which a start leads; far: whether points look for their surfaces far off at first."""
         config, tiles = self.config, self.map.tiles
         limits = np.array(
             [config.match_cell_m, config.match_reach_m, config.match_sigma_m, config.match_outlier_m]
@@ -181,7 +181,7 @@ class ScanMatcher:
             tiles.directory,
             self.map.corner,
             limits,
-            slipped,
+            far,
         )
         overlap, fit = shares[1] / shares[0], shares[2] / max(shares[1], 1e-9)
         if not np.isfinite(pose).all():
@@ -196,7 +196,7 @@ def _better(first: Match, second: Match) -> Match:
     return max(first, second, key=lambda match: match.fit)
 
 
-def _likelier(first: Match, second: Match, prior: Array, covariance: Array, points: int) -> Match:
+def likelier(first: Match, second: Match, prior: Array, covariance: Array, points: int) -> Match:
     """The match for which more speaks; the first where as much speaks for both."""
     return max(first, second, key=lambda match: _evidence(match, prior, covariance, points))
 
@@ -259,9 +259,9 @@ def _nearest(
 
 @kernel
 def _prior_terms(
-    pose: Array, prior: Array, prior_information: Array, slipped: bool, information: Array, gradient: Array
+    pose: Array, prior: Array, prior_information: Array, information: Array, gradient: Array
 ) -> None:
-    """Start the normal equations with the prior; where wheels slip it counts less the farther the pose is from it."""
+    """Start the normal equations with the prior; it counts less the farther the pose is from it, as wheels slip."""
     turn = math.atan2(math.sin(prior[2] - pose[2]), math.cos(prior[2] - pose[2]))
     off = (prior[0] - pose[0], prior[1] - pose[1], turn)
     squared = 0.0
@@ -270,7 +270,7 @@ def _prior_terms(
         for b in range(3):
             gradient[a] += prior_information[a, b] * off[b]
         squared += off[a] * gradient[a]
-    weight = 1.0 / (1.0 + squared / (_SLIPS * _SLIPS)) if slipped else 1.0
+    weight = 1.0 / (1.0 + squared / (_SLIPS * _SLIPS))
     for a in range(3):
         gradient[a] *= weight
         for b in range(3):
@@ -361,21 +361,21 @@ def _align(
     directory: NDArray[np.int32],
     corner: NDArray[np.int64],
     limits: Array,
-    slipped: bool,
+    far: bool,
 ) -> tuple[Array, Array, Array]:
     """Pose (3,), its information (3, 3), and the weights (3,) of all points, of those near the map, of those on it.
 
     scan (N, 4): x, y, weight in the robot frame, and whether the beams around are dense; limits: cell, reach, sigma,
-    outlier and inlier distance, m, and where on the robot's way the cells that count were last seen; slipped: whether
-    to look far, and to let go of the prior.
+    outlier and inlier distance, m, and where on the robot's way the cells that count were last seen; far: whether
+    to begin with _WIDE_ROUNDS.
     """
     cell_m, reach, sigma, outlier, inlier, since = limits
     pose, information, gradient, shares = start.copy(), np.zeros((3, 3)), np.zeros(3), np.zeros(3)
     for iteration in range(_ROUNDS):
-        wide = slipped and iteration < _WIDE_ROUNDS
+        wide = far and iteration < _WIDE_ROUNDS
         cells = int(math.ceil(reach / cell_m)) if wide else int(math.ceil(0.5 * reach / cell_m))
         now = (cell_m, cells, sigma, 3.0 * outlier if wide else outlier, inlier, since)
-        _prior_terms(pose, prior, prior_information, slipped, information, gradient)
+        _prior_terms(pose, prior, prior_information, information, gradient)
         shares[0], shares[1], shares[2] = _add_points(
             scan, laser_base, pose, pool, directory, corner, now, information, gradient
         )
