@@ -96,7 +96,8 @@ def test_a_robot_that_may_drive_finds_itself_alone_and_stops(graph, map_file):
     off = se2.between(messages.pose_from(at.pose), messages.pose_from(poses[-1].pose.pose))
     assert np.hypot(off[0], off[1]) < 0.3
     assert abs(off[2]) < np.radians(10.0)
-    assert any(command.linear.x > 0.1 for command in commands)
+    # In a small room a turn may be all that it takes.
+    assert any(command.linear.x > 0.1 or abs(command.angular.z) > 0.1 for command in commands)
     graph.until(lambda: not commands[-1].linear.x and not commands[-1].angular.z, 'a stop')
     assert graph.stop('global_localizer') == 0, graph.log('global_localizer')
 
