@@ -16,7 +16,7 @@ def test_what_matches_leave_open_grows_only_where_they_say_nothing():
     doubt, along = Doubt(), np.diag([1e4, 0.0, 1e5])
     for _ in range(200):
         doubt.move(np.eye(3), ADDED)
-        doubt.match(np.linalg.inv(np.linalg.inv(doubt.since_match) + along), AHEAD)
+        doubt.match(doubt.evidence(np.linalg.inv(np.linalg.inv(doubt.since_match) + along)), AHEAD)
     assert np.allclose(doubt.since_match, 0.0)
     assert np.isclose(doubt.on_map[1, 1], 200 * ADDED[1, 1])
     assert doubt.on_map[0, 0] < 1e-4
@@ -29,7 +29,7 @@ def test_a_match_adds_less_the_less_the_robot_has_moved():
         doubt = Doubt()
         doubt.move(np.eye(3), ADDED)
         posterior = posterior_of(doubt)
-        added.append(doubt.match(posterior, np.array([way, 0.0, 0.0])))
+        added.append(doubt.match(doubt.evidence(posterior), np.array([way, 0.0, 0.0])))
         assert (np.linalg.eigvalsh(posterior - added[-1]) > -1e-15).all()
     assert added[0][0, 0] < added[1][0, 0] < added[2][0, 0]
     np.testing.assert_allclose(added[2], added[3])
@@ -39,5 +39,5 @@ def test_a_match_adds_less_the_less_the_robot_has_moved():
 def test_a_match_that_trusts_its_prior_less_than_that_claims_leaves_a_covariance():
     doubt = Doubt(np.diag([1e-6, 1e-6, 1e-6]))
     doubt.move(np.eye(3), 1e-8 * np.eye(3))
-    doubt.match(np.diag([1e-2, 1e-8, 1e-6]), AHEAD)
+    doubt.match(doubt.evidence(np.diag([1e-2, 1e-8, 1e-6])), AHEAD)
     assert (np.linalg.eigvalsh(doubt.on_map) > 0.0).all()

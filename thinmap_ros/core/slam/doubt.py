@@ -1,12 +1,21 @@
 """How far the pose may be from where the map of points would have it."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from thinmap_ros.core.se2 import Array
 
 _SAME_POINTS_M, _SAME_POINTS_RAD = 1.0, 1.0  # after so much way a match errs by other points than before
+
+
+class Evidence(NamedTuple):
+    """Covariance (3, 3) that a match leaves, and the information (3, 3) of its prior and of the map of points."""
+
+    posterior: Array
+    by_prior: Array
+    by_map: Array
 
 
 class Doubt:
@@ -25,18 +34,23 @@ class Doubt:
         self.since_match = F_x @ self.since_match @ F_x.T + added
         self.on_map = F_x @ self.on_map @ F_x.T + added
 
-    def match(self, posterior: Array, increment: Array) -> Array:
-        """A scan fits, with posterior (3, 3): what this step adds to the covariance of the pose in the world, (3, 3).
+    def evidence(self, posterior: Array) -> Evidence:
+        """What speaks for a match with posterior (3, 3) whose prior was since_match."""
+        by_prior = np.asarray(np.linalg.inv(self.since_match), dtype=np.float64)
+        return Evidence(posterior, by_prior, _positive(np.linalg.inv(posterior) - by_prior))
+
+    def match(self, evidence: Evidence, increment: Array) -> Array:
+        """A scan fits: what this step adds to the covariance of the pose in the world, (3, 3).
 
         Of the error of the prior a match leaves a part, that is new with every step; what the map adds is much the
         same error as in the step before as long as the same points are seen.
         """
-        by_prior = np.linalg.inv(self.since_match)
-        by_map = _positive(np.linalg.inv(posterior) - by_prior)
         self.since_match = np.zeros((3, 3))
-        self.on_map = np.asarray(np.linalg.inv(np.linalg.inv(self.on_map) + by_map), dtype=np.float64)
+        information = np.linalg.inv(self.on_map) + evidence.by_map
+        self.on_map = np.asarray(np.linalg.inv(information), dtype=np.float64)
         share = min(1.0, math.hypot(increment[0], increment[1]) / _SAME_POINTS_M + abs(increment[2]) / _SAME_POINTS_RAD)
-        return np.asarray(posterior @ (by_prior + share * by_map) @ posterior)
+        added = evidence.by_prior + share * evidence.by_map
+        return np.asarray(evidence.posterior @ added @ evidence.posterior)
 
 
 def _positive(information: Array) -> Array:

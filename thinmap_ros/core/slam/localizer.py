@@ -12,7 +12,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.config import parameter
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.doubt import Doubt
+from thinmap_ros.core.slam.doubt import Doubt, Evidence
 from thinmap_ros.core.slam.ekf import EkfSlam
 from thinmap_ros.core.slam.ekf_ti import CompressedEkf
 from thinmap_ros.core.slam.feature_map import FeatureConfig, FeatureMap
@@ -21,7 +21,8 @@ from thinmap_ros.core.slam.lines import LineConfig, Lines, extract_lines, no_lin
 from thinmap_ros.core.slam.loops import Correction, Keyframe, LoopConfig, Loops
 from thinmap_ros.core.slam.models import MotionConfig, motion_jacobians, odometry_covariance, rotation
 from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
-from thinmap_ros.core.slam.scan_matching import FEWEST_POINTS, Match, MatchConfig, ScanMatcher
+from thinmap_ros.core.slam.redrawn_map import RedrawnMap
+from thinmap_ros.core.slam.scan_matching import FEWEST_POINTS, Match, MatchConfig
 from thinmap_ros.core.slam.tracking import Tracking
 from thinmap_ros.core.topology.graph import TopologicalMap
 
@@ -32,7 +33,6 @@ _NEW_GROUND_M, _NEW_GROUND_RAD = 0.6, 0.6  # and that is so only this far from w
 _KNOWN_M, _KNOWN_RAD = 0.2, 0.2  # nearer than that, most of a scan must be known
 _LEAP_M, _LEAP_RAD = 0.4, 0.4  # a scan puts the robot this far from where the wheels did: one of them is wrong
 _OF_LATE_M = 100.0  # way in which the drift stays below what a match with the map bridges
-_REDRAWN_AT_ONCE, _REDRAWN_A_STEP = 60, 3  # keyframes drawn anew when a loop was closed, and in each step after it
 # By which lines may move the pose even where matches leave nothing open, m and rad, 1 sigma.
 _LEEWAY = np.diag(np.square([0.003, 0.003, 0.001]))
 _UNKNOWN_SIGMA_M = 300.0  # what a pose is known to while the robot is lost
@@ -102,13 +102,10 @@ class Localizer:
         start = se2.pose(self.config.start_x_m, self.config.start_y_m, self.config.start_yaw_rad)
         self._filter = CompressedEkf(start, np.diag(np.square(_START_SIGMAS)))
         self._feature_map = FeatureMap(self.config, local_areas=self.config.slam == 'ti')
-        self._given: Mapping[str, NDArray[Any]] | None = None
-        self._matcher = self._given_map()
+        self._map = RedrawnMap(self.config)
         self._loops = Loops(self.config, self.config)
         # Of every step, which keyframe came before it, and the pose from there.
         self._path: list[tuple[int, Array]] = []
-        # Keyframes from which the map of points has still to be drawn anew.
-        self._redraw: list[int] = []
         self._T_odom_base: Array | None = None
         self._calibration = OdometryCalibration()
         self._T_last_look: Array | None = None
@@ -133,7 +130,7 @@ class Localizer:
     def state(self) -> dict[str, NDArray[Any]]:
         """The features and the map of points as arrays by name, for `from_state`; not where the robot is."""
         usual = np.array(self._tracking.usual)
-        return {**self._feature_map.state(self._filter), **self._matcher.map.state(), 'usual': usual}
+        return {**self._feature_map.state(self._filter), **self._map.matcher.map.state(), 'usual': usual}
 
     @staticmethod
     def from_state(state: Mapping[str, NDArray[Any]], config: LocalizerConfig | None = None) -> 'Localizer':
@@ -143,19 +140,11 @@ class Localizer:
         such state.
         """
         localizer = Localizer(config)
-        localizer._given = state
-        localizer._matcher = localizer._given_map()
+        localizer._map = RedrawnMap(localizer.config, state)
         localizer._feature_map.restore(localizer._filter, state)
         usual = float(np.clip(np.nan_to_num(state.get('usual', np.ones(()))), 0.0, 1.0))
         localizer._tracking = Tracking(localizer.config.lost_scans, usual, carried=True)
         return localizer
-
-    def _given_map(self) -> ScanMatcher:
-        """A map of points in which there is what was taken over."""
-        matcher = ScanMatcher(self.config)
-        if self._given is not None:
-            matcher.map.restore(self._given)
-        return matcher
 
     @property
     def pose(self) -> Array:
@@ -182,9 +171,10 @@ class Localizer:
         points_base, laser_base = self._seen(scan)
         expected = se2.compose(self._ekf.pose, increment)
         way_m = self._loops.way_m(self._ekf.pose)
-        self._matcher.map.way_m = way_m
+        points = self._map.matcher.map
+        points.way_m = way_m
         # Until it is known that old and new agree here, a scan is matched with what was seen of late.
-        self._matcher.map.since_m = -math.inf if self._loops.agreed else way_m - _OF_LATE_M
+        points.since_m = -math.inf if self._loops.agreed else way_m - _OF_LATE_M
         match = self._predict(scan, points_base, laser_base, increment, increment_covariance)
         lines, matched = no_lines(), 0
         if self.config.mapping and self._has_news() and not self._is_lost():
@@ -192,8 +182,8 @@ class Localizer:
             lines, matched = self._correct(scan)
             if match.good or self._on_new_ground(match):
                 points_map = se2.transform_points(self._ekf.pose, points_base)
-                self._matcher.add(points_map, laser_map)
-                self._known_here = self._matcher.known(points_base, laser_base, self._ekf.pose)
+                self._map.matcher.add(points_map, laser_map)
+                self._known_here = self._map.matcher.known(points_base, laser_base, self._ekf.pose)
                 self._T_last_look = self._ekf.pose
                 self._loops.follow(scan, points_base, self._ekf.pose, _is_leap(expected, self._ekf.pose))
         elif match.good and not self.config.mapping:
@@ -206,7 +196,7 @@ class Localizer:
         if correction is not None:
             self._apply(correction)
             self._calibration.interrupt()
-        self._redraw_some(_REDRAWN_A_STEP)
+        self._map.go_on(self._loops.keyframes)
         k = len(self._loops.keyframes) - 1
         pose = self._ekf.pose
         self._path.append((k, pose if k < 0 else se2.between(self._loops.keyframes[k].T_map_base, pose)))
@@ -225,28 +215,11 @@ class Localizer:
 
     def _apply(self, correction: Correction) -> None:
         """A loop was closed: pose, features and the map of points go where the keyframes have gone."""
-        last = len(correction.after) - 1
-        moved = correction.moved(last, self._ekf.pose)
+        moved = correction.moved(len(correction.after) - 1, self._ekf.pose)
         self._feature_map.move(self._filter, correction)
         self._ekf.move_pose(moved)
         self._T_last_look = moved
-        places = correction.after[:, :2] - moved[:2]
-        self._redraw = np.argsort(-np.hypot(*places.T)).tolist()
-        self._matcher = self._given_map()
-        near = np.hypot(*places.T) < self.config.match_range_m
-        self._redraw_some(min(int(near.sum()), _REDRAWN_AT_ONCE))
-
-    def _redraw_some(self, count: int) -> None:
-        """Draw some of the keyframes that are due, the nearest first, into the map of points."""
-        points = self._matcher.map
-        now = points.way_m, points.since_m
-        points.since_m = -math.inf  # what is old counts here as well
-        for k in [self._redraw.pop() for _ in range(min(count, len(self._redraw)))]:
-            frame = self._loops.keyframes[k]
-            points.way_m = frame.way_m
-            laser = se2.transform_points(frame.T_map_base, frame.scan.T_base_laser[None, :2])[0]
-            self._matcher.add(se2.transform_points(frame.T_map_base, frame.points_base), laser)
-        points.way_m, points.since_m = now
+        self._map.begin_anew(self._loops.keyframes, moved)
 
     def _odometry(self, T_odom_base: Array) -> tuple[Array, Array]:
         """Input u of eq. (10): the increment (3,) since the last scan, and its covariance (3, 3)."""
@@ -279,14 +252,15 @@ class Localizer:
         predicted = se2.compose(pose, increment)
         F, _ = motion_jacobians(pose, increment)
         self._doubt.move(F, turn @ covariance @ turn.T)
-        match = self._matcher.match(points_base, laser_base, predicted, self._doubt.since_match)
+        match = self._map.matcher.match(points_base, laser_base, predicted, self._doubt.since_match)
         near = not self._moved(_KNOWN_M, _KNOWN_RAD, match.T_map_base)
         match = self._tracking.judged(match, points_base, scan, increment, near)
         if len(points_base) >= FEWEST_POINTS:  # fewer fit nothing, and contradict nothing
             self._tracking.count(match.good, self._on_new_ground(match))
         if match.good:
-            match = self._taken_back(match, predicted)
-            added = self._doubt.match(match.covariance, increment)
+            evidence = self._doubt.evidence(match.covariance)
+            match = self._taken_back(match, predicted, evidence)
+            added = self._doubt.match(evidence, increment)
             increment, covariance = se2.between(pose, match.T_map_base), turn.T @ added @ turn
             predicted = match.T_map_base
         if match.good and (self._placed_by_hand or self.config.slam == 'off' or not self.config.mapping):
@@ -296,19 +270,18 @@ class Localizer:
             self._ekf.predict(predicted, increment, covariance)
         return match
 
-    def _taken_back(self, match: Match, predicted: Array) -> Match:
+    def _taken_back(self, match: Match, predicted: Array, evidence: Evidence) -> Match:
         """A match that takes back what lines did to the pose takes it back whole, in features and open directions, too.
 
         The map of points is as it was, so the match leads back to it. If that passed for motion, each look would do it
         again, and the pose would creep wherever points say nothing: along a corridor, by its own two walls.
         """
-        step, by_prior = self._ekf.moved_by_updates(), np.linalg.inv(self._doubt.since_match)
-        seen = np.linalg.inv(match.covariance) - by_prior
+        step, seen = self._ekf.moved_by_updates(), evidence.by_map
         off = match.T_map_base - predicted
         off[2] = se2.wrap(float(off[2]))
         share = float(np.clip(-(off @ seen @ step) / max(float(step @ seen @ step), 1e-12), 0.0, 1.0))
         self._ekf.take_back(share)
-        T_map_base = match.T_map_base - share * (match.covariance @ by_prior @ step)
+        T_map_base = match.T_map_base - share * (evidence.posterior @ evidence.by_prior @ step)
         T_map_base[2] = se2.wrap(float(T_map_base[2]))
         return replace(match, T_map_base=T_map_base)
 

@@ -1,0 +1,53 @@
+"""The map of points, which is drawn anew from the keyframes where a loop was closed."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.loops import Keyframe
+from thinmap_ros.core.slam.scan_matching import MatchConfig, ScanMatcher
+
+_AT_ONCE, _A_STEP = 60, 3  # keyframes drawn anew when a loop was closed, and in each step after it
+
+
+class RedrawnMap:
+    """The matcher with the map of points that it matches with, in which there may be what was taken over."""
+
+    def __init__(self, config: MatchConfig, given: Mapping[str, NDArray[Any]] | None = None) -> None:
+        """Begin with the `state` of another map of points, where one is given; raises InputError where it is none."""
+        self._config, self._given = config, given
+        self._due: list[int] = []
+        self.matcher = self._fresh()
+
+    def begin_anew(self, keyframes: list[Keyframe], T_map_base: Array) -> None:
+        """The keyframes have moved: draw what is in sight of a pose (3,) at once, and the rest step by step."""
+        away = np.hypot(*np.array([frame.T_map_base[:2] - T_map_base[:2] for frame in keyframes]).T)
+        self._due = np.argsort(-away).tolist()
+        self.matcher = self._fresh()
+        self._draw(keyframes, min(int((away < self._config.match_range_m).sum()), _AT_ONCE))
+
+    def go_on(self, keyframes: list[Keyframe]) -> None:
+        """Draw a few more of the keyframes that are due, the nearest first."""
+        self._draw(keyframes, _A_STEP)
+
+    def _fresh(self) -> ScanMatcher:
+        matcher = ScanMatcher(self._config)
+        if self._given is not None:
+            matcher.map.restore(self._given)
+        return matcher
+
+    def _draw(self, keyframes: list[Keyframe], count: int) -> None:
+        points = self.matcher.map
+        now = points.way_m, points.since_m
+        points.since_m = -math.inf  # what is old counts here as well
+        for k in [self._due.pop() for _ in range(min(count, len(self._due)))]:
+            frame = keyframes[k]
+            points.way_m = frame.way_m
+            laser = se2.transform_points(frame.T_map_base, frame.scan.T_base_laser[None, :2])[0]
+            self.matcher.add(se2.transform_points(frame.T_map_base, frame.points_base), laser)
+        points.way_m, points.since_m = now
