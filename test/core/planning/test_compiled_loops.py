@@ -59,7 +59,8 @@ def test_how_far_a_disc_can_be_moved(seed):
     rng = np.random.default_rng(seed)
     centres, points = wandering(rng), rng.uniform(-1.0, 2.5, (12, 2))
     distances = np.hypot(*(centres[:, None] - points[None]).transpose(2, 0, 1))
-    blocked = (distances < np.minimum(0.24, distances[0] - 0.005)).any(axis=1)
+    hairs = np.maximum(distances[0] - 0.005, np.minimum(distances[0], 0.22))
+    blocked = (distances < np.minimum(0.24, hairs)).any(axis=1)
     expected = max(int(blocked.argmax()) - 1, 0) if blocked.any() else len(centres) - 1
     assert _clear_steps(centres, points, 0.24) == expected
 
@@ -74,19 +75,36 @@ def test_whether_something_has_come_near_a_path(seed):
     assert _touches(cells, at, GridFrame(*at).centres_of(path), 2.5) == (away < 2.5)
 
 
+def plain_smoothed(ranges):
+    """Each range that there is as the mean of those up to two beams beside it that differ by less than 3 cm."""
+    beside = [ranges[max(i - 2, 0) : i + 3] for i in range(len(ranges))]
+    return np.array([near[np.abs(near - r) < 0.03].mean() for r, near in zip(ranges, beside, strict=True) if r == r])
+
+
 @pytest.mark.parametrize('seed', SEEDS)
 def test_points_around_are_those_of_the_scan_and_earlier_ones_near_and_out_of_view(seed):
     rng = np.random.default_rng(seed)
-    scan = Scan.create(0, rng.uniform(0.0, 9.0, 100), -1.2, 0.02, 0.05, 8.0, se2.pose(0.2, -0.1, 0.3))
+    ranges = np.repeat(rng.uniform(0.0, 9.0, 25), 4) + rng.normal(0.0, 0.015, 100)
+    scan = Scan.create(0, ranges, -1.2, 0.02, 0.05, 8.0, se2.pose(0.2, -0.1, 0.3))
     robot, earlier = se2.pose(*rng.normal(size=3)), rng.normal(0.0, 1.0, (50, 2))
     laser = se2.compose(robot, scan.T_base_laser)
     bearings = np.arctan2(*(earlier - laser[:2]).T[::-1]) - laser[2]
     in_view = np.abs(se2.wrap(bearings - 0.5 * (scan.angles_rad[0] + scan.angles_rad[-1]))) <= 0.5 * 99 * 0.02
     kept = earlier[(np.hypot(*(earlier - robot[:2]).T) < 1.0) & ~in_view]
-    expected = np.concatenate([se2.transform_points(robot, scan.points_base()), kept])
     hits = np.where(scan.hit, scan.ranges_m, np.nan)
+    angles, smoothed = scan.angles_rad[scan.hit], plain_smoothed(hits)
+    seen = se2.transform_points(laser, np.column_stack([smoothed * np.cos(angles), smoothed * np.sin(angles)]))
+    expected = np.concatenate([seen, kept])
     found = _points_around(hits, scan.angle_min_rad, scan.angle_increment_rad, laser, earlier, robot)
     np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_hair_by_hair_a_disc_comes_no_nearer_than_a_few_hairs():
+    wall = np.column_stack([np.full(100, 0.23), np.linspace(-1.0, 1.0, 100)])
+    x = 0.0
+    for _ in range(100):
+        x += 0.004 * _clear_steps(np.array([[x, 0.0], [x + 0.004, 0.0]]), wall, 0.24)
+    assert 0.0 < x < 0.011
 
 
 @pytest.mark.parametrize('seed', SEEDS)

@@ -1,3 +1,4 @@
+import itertools
 import math
 
 import numpy as np
@@ -23,7 +24,8 @@ def room(rows=60, cols=80):
 class Ride:
     """A robot that does exactly what it is told, in a world of cells, with a map that may know less than the world."""
 
-    def __init__(self, world, start, known=None, config=None):
+    def __init__(self, world, start, known=None, config=None, noise=None):
+        self.noise = noise
         self.world, self.pose = world, np.array(start, dtype=np.float64)
         self.patch = GridPatch(GridFrame(0.0, 0.0, 0.1), world if known is None else known)
         self.navigator = Navigator(config or NavigatorConfig())
@@ -33,6 +35,8 @@ class Ride:
         angles = np.radians(np.arange(-90.0, 91.0))
         occupied = (self.world == 100).astype(np.uint8)
         ranges = cast_rays(occupied, self.pose[0] / 0.1, self.pose[1] / 0.1, angles + self.pose[2], 80.0) * 0.1
+        if self.noise is not None:
+            ranges = ranges + self.noise.normal(0.0, 0.01, ranges.shape)
         return Scan.create(int(self.seconds * 1e9), ranges, angles[0], np.radians(1.0), 0.02, 8.0)
 
     def step(self):
@@ -91,6 +95,43 @@ def test_it_stops_in_front_of_what_only_the_laser_knows_and_goes_around_it():
     ride = Ride(world, (1.0, 1.0, 0.0), known=room(), config=NavigatorConfig(max_speed_m_s=0.5))
     assert ride.go((7.0, 1.5), 120.0)[-1].state == 'reached'
     assert ride.nearest_m > 0.18
+
+
+def gap_of(cells):
+    """A room with a wall across, and a gap in it."""
+    world = room()
+    world[: 30 - cells // 2, 40:43], world[30 + cells - cells // 2 :, 40:43] = 100, 100
+    return world
+
+
+def rides_to_and_fro(ride, seconds):
+    """How often a robot gets from one side to the other in that time, and how near it comes to the walls, m."""
+    corners, nearest, crossings = np.argwhere(ride.world == 100)[:, ::-1] * 0.1, math.inf, 0
+    sides = itertools.cycle([(7.0, 3.05), (1.0, 3.05)])
+    goal = next(sides)
+    ride.navigator.set_goal(*goal)
+    while ride.seconds < seconds:
+        state = ride.step().state
+        crossings += state == 'reached'
+        goal = next(sides) if state == 'reached' else goal
+        if state in ('reached', 'failed'):
+            ride.navigator.set_goal(*goal)
+        away = np.maximum(np.abs(ride.pose[:2] - corners - 0.05) - 0.05, 0.0)
+        nearest = min(nearest, float(np.hypot(*away.T).min()))
+    return crossings, nearest
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_a_noisy_laser_makes_no_passage_too_narrow_and_none_wide_enough(seed):
+    config = NavigatorConfig(max_speed_m_s=0.5)
+    wide = Ride(gap_of(5), (1.0, 3.05, 0.0), config=config, noise=np.random.default_rng(seed))
+    crossings, nearest = rides_to_and_fro(wide, 120.0)
+    assert crossings >= 4
+    assert nearest > 0.22
+    narrow = Ride(gap_of(4), (1.0, 3.05, 0.0), room(), config, np.random.default_rng(seed))
+    crossings, nearest = rides_to_and_fro(narrow, 120.0)
+    assert crossings == 0
+    assert nearest > 0.2
 
 
 def test_where_there_is_no_way_around_it_gives_up_with_a_reason():

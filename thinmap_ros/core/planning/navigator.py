@@ -19,9 +19,12 @@ _CHECK_AHEAD_M = 4.0
 _SWEEP_STEP_M = 0.03
 _CREEP_M_S = 0.02
 _ROUNDING_M_S = 1e-9
+# How much nearer than it is a point may come that is too near already, and up to how much nearer than the radius.
+_HAIR_M, _MOST_HAIRS_M = 0.005, 0.02
 _AIM_RAD = 0.1
-_OVERLAY_M = 2.5
+_POINTS_M = 2.5  # so near, the laser's points count beside the map
 _REMEMBERED_M = 1.0
+_BESIDE, _SAME_M = 2, 0.03  # beams to either side, and by how much those that see the same thing differ
 # A goal that does not get this much nearer between so many standstills is given up.
 _PROGRESS_M = 0.5
 _STANDSTILLS = 5
@@ -142,11 +145,12 @@ class Navigator:
         return _touches(patch.cells, at, ahead, self.config.robot_radius_m / frame.resolution - 1e-6)
 
     def _plan(self, T_map_base: Array, patch: GridPatch) -> str:
-        """Plan anew; returns why there is no path, or nothing. In front of an obstacle its points count as walls."""
+        """Plan anew; returns why there is no path, or nothing. In front of an obstacle its points count, too."""
         assert self._goal is not None
-        if self._blocked_s > 0.0:
-            patch = self._with_points(T_map_base, patch)
-        path = plan(patch, (float(T_map_base[0]), float(T_map_base[1])), self._goal, self.config)
+        near = np.square(self._points_map - T_map_base[:2]).sum(axis=1) < _POINTS_M**2
+        points = self._points_map[near] if self._blocked_s > 0.0 else None
+        start = float(T_map_base[0]), float(T_map_base[1])
+        path = plan(patch, start, self._goal, self.config, points, self.config.body_radius_m)
         first = self.path is None
         self._path_age_s = 0.0
         if path is None:
@@ -155,15 +159,6 @@ class Navigator:
             return f'no way to {where}' if first and self._blocked_s == 0.0 else f'the way to {where} is blocked'
         self.path = path
         return ''
-
-    def _with_points(self, T_map_base: Array, patch: GridPatch) -> GridPatch:
-        near = np.square(self._points_map - T_map_base[:2]).sum(axis=1) < _OVERLAY_M**2
-        points = self._points_map[near]
-        marked = patch.cells.copy()
-        if len(points):
-            cells = patch.frame.cells_of(points[patch.contains(points)])
-            marked[cells[:, 0], cells[:, 1]] = 100
-        return GridPatch(patch.frame, marked)
 
     def _wait(self, reason: str, dt_s: float) -> Command:
         """Stand still; give the goal up where there never was a way, or after blocked_s."""
@@ -277,11 +272,13 @@ def _arc(start: Array, curvature: float, length_m: float, count: int) -> Array:
 def _clear_steps(centres: Array, points: Array, radius: float) -> int:
     """Index of the last centre (K, 2) that a disc can be moved to, one after the other, without touching points (N, 2).
 
-    A point that is too near to the first centre already only forbids to come still nearer.
+    A point that is too near to the first centre already only forbids to come still nearer: a hair does not count, but
+    many hairs would, one step after the other.
     """
     clear: int = centres.shape[0]
     for i in range(points.shape[0]):
-        limit = min(radius, math.hypot(points[i, 0] - centres[0, 0], points[i, 1] - centres[0, 1]) - 0.005)
+        now = math.hypot(points[i, 0] - centres[0, 0], points[i, 1] - centres[0, 1])
+        limit = min(radius, max(now - _HAIR_M, min(now, radius - _MOST_HAIRS_M)))
         for k in range(clear):
             if math.hypot(points[i, 0] - centres[k, 0], points[i, 1] - centres[k, 1]) < limit:
                 clear = k
@@ -298,6 +295,20 @@ def _clear_steps_on_arc(
 
 
 @kernel
+def _smoothed(ranges: Array, i: int) -> float:
+    """A range of a scan (NaN: none), m, as the mean of the beams beside it that say the same but for their noise.
+
+    The nearest of many noisy points is nearer than the wall: without this, passages would seem narrower than they are.
+    """
+    total, count = 0.0, 0
+    for k in range(max(i - _BESIDE, 0), min(i + _BESIDE + 1, ranges.size)):
+        if abs(ranges[k] - ranges[i]) < _SAME_M:
+            total += ranges[k]
+            count += 1
+    return total / count
+
+
+@kernel
 def _points_around(ranges: Array, first: float, step: float, laser: Array, earlier: Array, robot: Array) -> Array:
     """Where the beams of a scan ended (NaN: nowhere), and those of the points seen earlier (N, 2) that still count.
 
@@ -307,9 +318,9 @@ def _points_around(ranges: Array, first: float, step: float, laser: Array, earli
     count = 0
     for i in range(ranges.size):
         if not math.isnan(ranges[i]):
-            angle = laser[2] + first + step * i
-            points[count, 0] = laser[0] + ranges[i] * math.cos(angle)
-            points[count, 1] = laser[1] + ranges[i] * math.sin(angle)
+            angle, metres = laser[2] + first + step * i, _smoothed(ranges, i)
+            points[count, 0] = laser[0] + metres * math.cos(angle)
+            points[count, 1] = laser[1] + metres * math.sin(angle)
             count += 1
     last = first + step * (ranges.size - 1)
     middle, half = laser[2] + 0.5 * (first + last), 0.5 * abs(last - first)

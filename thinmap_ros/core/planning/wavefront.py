@@ -43,24 +43,39 @@ class WavefrontConfig(Config):
 
 
 def plan(
-    patch: GridPatch, start_xy: tuple[float, float], goal_xy: tuple[float, float], config: WavefrontConfig
+    patch: GridPatch,
+    start_xy: tuple[float, float],
+    goal_xy: tuple[float, float],
+    config: WavefrontConfig,
+    points: Array | None = None,
+    body_radius_m: float = 0.0,
 ) -> Array | None:
     """Path (K, 2) of points from start to goal, m, map frame, about half a cell apart; None where there is none.
 
-    The path ends at the goal, or at the allowed cell nearest to it within goal_slack_m.
+    The path ends at the goal, or at the allowed cell nearest to it within goal_slack_m. It keeps a body's radius away
+    from points (N, 2) that the map need not know. They are taken as exact: in cells, a wall whose points fall into the
+    cell before it, as noise has it, would be a cell thicker, and many a passage too narrow.
     """
     cells = patch.frame.cells_of(np.array([start_xy, goal_xy]))
     if not patch.contains(np.array([start_xy, goal_xy])).all():
         return None
-    cost = cost_of_cells(patch, config)
+    cost, occupied = cost_of_cells(patch, config), patch.occupied.copy()
+    if points is not None:
+        points = points[patch.contains(points)]
+        at = patch.frame.cells_of(points)
+        occupied[at[:, 0], at[:, 1]] = True
+        cell_m = patch.frame.resolution
+        keep = config.keep_m / cell_m
+        _keep_away(cost, _in_cells(patch, points), body_radius_m / cell_m, keep, config.keep_weight)
     start, wished = (int(cells[0, 0]), int(cells[0, 1])), (int(cells[1, 0]), int(cells[1, 1]))
     if not math.isfinite(cost[start]):
-        _let_out(cost, patch.occupied, start, config.escape_m / patch.frame.resolution)
+        _let_out(cost, occupied, start, config.escape_m / patch.frame.resolution)
     goal = nearest_true(reached_from(np.isfinite(cost), start), wished, config.goal_slack_m / patch.frame.resolution)
     if goal is None:
         return None
     field = navigation_function(cost, goal, start)
-    path = descend(field, *_in_cells(patch, start_xy), *goal) * patch.frame.resolution
+    x, y = _in_cells(patch, np.array([start_xy]))[0].tolist()
+    path = descend(field, x, y, *goal) * patch.frame.resolution
     path += (patch.frame.origin_x, patch.frame.origin_y)
     path[0] = start_xy
     return np.concatenate([path, [goal_xy]]) if goal == wished else path
@@ -97,9 +112,9 @@ def descend(field: Array, x: float, y: float, goal_row: int, goal_col: int) -> A
     return np.asarray(_descend(field, x, y, goal_row, goal_col))
 
 
-def _in_cells(patch: GridPatch, xy: tuple[float, float]) -> tuple[float, float]:
+def _in_cells(patch: GridPatch, points: Array) -> Array:
     frame = patch.frame
-    return (xy[0] - frame.origin_x) / frame.resolution, (xy[1] - frame.origin_y) / frame.resolution
+    return np.asarray((points - (frame.origin_x, frame.origin_y)) / frame.resolution)
 
 
 def _let_out(cost: Array, occupied: Mask, start: tuple[int, int], reach: float) -> None:
@@ -111,6 +126,23 @@ def _let_out(cost: Array, occupied: Mask, start: tuple[int, int], reach: float) 
     part = cost[where]
     part[within & ~np.isfinite(part) & ~occupied[where]] = _ESCAPE_COST
     cost[start] = min(cost[start], _ESCAPE_COST)
+
+
+@kernel
+def _keep_away(cost: Array, points: Array, radius: float, keep: float, weight: float) -> None:
+    """Raise the cost of cells (H, W) by how near their centres are to points (N, 2), in cells, as that by the map.
+
+    Those nearer than a radius are closed; from `keep` on a point costs nothing.
+    """
+    reach, spread = int(math.ceil(max(radius, keep))) + 1, max(keep - radius, 1e-6)
+    for i in range(points.shape[0]):
+        x, y = points[i, 0] - 0.5, points[i, 1] - 0.5
+        row, col = int(round(y)), int(round(x))
+        for r in range(max(row - reach, 0), min(row + reach + 1, cost.shape[0])):
+            for c in range(max(col - reach, 0), min(col + reach + 1, cost.shape[1])):
+                away = math.hypot(r - y, c - x)
+                nearness = max(keep - away, 0.0) / spread
+                cost[r, c] = np.inf if away < radius else max(cost[r, c], 1.0 + weight * nearness * nearness)
 
 
 @kernel
