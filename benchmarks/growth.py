@@ -34,7 +34,7 @@ _PARTS = ('localizer', 'grid', 'topology')
 
 @dataclass(frozen=True, eq=False)
 class _Mark:
-    """What there is after a way, m: CPU of scans on the last metres, ms, by part; free area, m2; memory, MB; error, m."""
+    """After a way, m: CPU of the last scans, ms, by part; free area, m2; memory, MB; error of the pose, m."""
 
     way_m: float
     taken_ms: dict[str, Array]
@@ -58,29 +58,32 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
     deque(_drive(islice(_looks()[0], _WARM_UP), [math.inf]), maxlen=0)  # compiles
     looks, lap_m = _looks()
     again = [lap * lap_m + _MARKS_M[0] for lap in range(1, 4)]  # where the first stretch has been driven once more
-    marks: dict[float, _Mark] = {}
+    first: _Mark | None = None
+    new: _Mark | None = None  # the last one of the first lap
     for mark in _drive(looks, sorted(_MARKS_QUICK_M if quick else {*_MARKS_M, *again})):
-        marks[mark.way_m] = mark
         yield from _rows(mark)
-    first, last = marks[_MARKS_M[0]], list(marks.values())[-1]
-    new = max((mark for mark in marks.values() if mark.way_m <= lap_m), key=lambda mark: mark.way_m)
-    grown_kb = 1e3 * (new.resident_mb - first.resident_mb)
-    yield Row('memory a square metre of new free area', f'{grown_kb / (new.area_m2 - first.area_m2):.3g} kB')
-    if last is not new:
-        more_mb = (last.resident_mb - new.resident_mb) / (1e-3 * (last.way_m - new.way_m))
-        yield Row('memory a kilometre on known ground', f'{more_mb:.3g} MB')
-    yield from _ratios(f'after {last.way_m:.0f} m', last, first)
-    for lap, at in enumerate(again, 2):
-        if at in marks:
-            yield from _ratios(f'on the first {_MARKS_M[0]:.0f} m, lap {lap}', marks[at], first)
+        first = first or mark
+        if mark is first:
+            continue
+        lap = again.index(mark.way_m) + 2 if mark.way_m in again else None
+        where = f'lap {lap}, on the first {_SPAN_M:.0f} m' if lap else f'after {mark.way_m:.0f} m'
+        yield from _ratios(where, mark, first)
+        if mark.way_m <= lap_m:
+            new = mark
+            grown_kb = 1e3 * (mark.resident_mb - first.resident_mb)
+            yield Row('  memory a square metre of new free area', f'{grown_kb / (mark.area_m2 - first.area_m2):.3g} kB')
+        elif new is not None:
+            more_mb = (mark.resident_mb - new.resident_mb) / (1e-3 * (mark.way_m - new.way_m))
+            yield Row('  memory a kilometre on known ground', f'{more_mb:.3g} MB')
 
 
 def _rows(mark: _Mark) -> Iterator[Row]:
     yield Row(f'after {mark.way_m:.0f} m: free area in the map', f'{mark.area_m2:.0f} m2')
     every = mark.taken_ms['all']
     yield Row('  CPU a scan, median and mean', f'{np.median(every):.3g} and {every.mean():.3g} ms')
-    parts = ', '.join(f'{np.median(mark.taken_ms[part]):.2f}' for part in _PARTS)
-    yield Row(f'  {", ".join(_PARTS)}: median', f'{parts} ms')
+    for of, name in ((np.median, 'median'), (np.mean, 'mean')):
+        parts = ', '.join(f'{of(mark.taken_ms[part]):.2f}' for part in _PARTS)
+        yield Row(f'  {", ".join(_PARTS)}: {name}', f'{parts} ms')
     yield Row('  CPU a scan, 99 of 100', f'{np.percentile(every, 99):.3g} ms')
     yield Row('  memory', f'{mark.resident_mb:.0f} MB')
     yield Row('  error of the pose', f'{mark.off_m:.2f} m')
@@ -88,7 +91,7 @@ def _rows(mark: _Mark) -> Iterator[Row]:
 
 def _ratios(where: str, mark: _Mark, first: _Mark) -> Iterator[Row]:
     now, then = mark.taken_ms['all'], first.taken_ms['all']
-    yield at_most(f'a scan {where} against the first time, median', float(np.median(now) / np.median(then)), 1.2)
+    yield at_most(f'  {where}, against the first time: median', float(np.median(now) / np.median(then)), 1.2)
     yield at_most('  the same, mean', float(now.mean() / then.mean()), 1.2)
 
 

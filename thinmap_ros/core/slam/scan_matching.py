@@ -32,7 +32,7 @@ from thinmap_ros.core.slam.point_map import (
     slot_of,
 )
 
-_MASK = TILE - 1
+_SHIFT, _MASK = TILE.bit_length() - 1, TILE - 1
 _ROUNDS = 20
 _WIDE_ROUNDS = 3  # rounds in which far neighbours and larger errors still count
 _PLAIN_FIT = 0.95  # share of points that fit below which it is asked whether near neighbours alone do better
@@ -85,9 +85,10 @@ class Match:
 class ScanMatcher:
     """Keeps the map of points, and finds the pose at which a scan fits it."""
 
-    def __init__(self, config: MatchConfig) -> None:
+    def __init__(self, config: MatchConfig, points: PointMap | None = None) -> None:
+        """Begin with an empty map of points, or with one that is there already."""
         self.config = config
-        self.map = PointMap(config.match_cell_m, config.match_memory)
+        self.map = points or PointMap(config.match_cell_m, config.match_memory)
 
     def add(self, points_map: Array, seen_from: Array) -> None:
         """Take points (N, 2) seen from a place (2,) into the map, map frame."""
@@ -404,14 +405,18 @@ def _filled(
 ) -> NDArray[np.uint8]:
     """1 where a cell or one of its eight neighbours holds points that count, else 0: (size, size) from a cell on."""
     filled = np.zeros((size, size), dtype=np.uint8)
-    for r in range(1, size - 1):
-        for c in range(1, size - 1):
-            slot = slot_of(directory, low[0] + r, low[1] + c)
+    for tile_row in range(max(low[0] >> _SHIFT, 0), min((low[0] + size >> _SHIFT) + 1, directory.shape[0])):
+        for tile_col in range(max(low[1] >> _SHIFT, 0), min((low[1] + size >> _SHIFT) + 1, directory.shape[1])):
+            slot = directory[tile_row, tile_col]
             if slot == NO_TILE:
                 continue
-            at = tiles[slot, (low[0] + r) & _MASK, (low[1] + c) & _MASK]
-            if at > 0 and cells[at, SEEN] >= since:
-                filled[r - 1 : r + 2, c - 1 : c + 2] = 1
+            top, left = (tile_row << _SHIFT) - low[0], (tile_col << _SHIFT) - low[1]
+            for r in range(max(top, 1), min(top + TILE, size - 1)):
+                numbers = tiles[slot, r - top]
+                for c in range(max(left, 1), min(left + TILE, size - 1)):
+                    at = numbers[c - left]
+                    if at > 0 and cells[at, SEEN] >= since:
+                        filled[r - 1 : r + 2, c - 1 : c + 2] = 1
     return filled
 
 
