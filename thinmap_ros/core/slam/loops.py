@@ -20,12 +20,10 @@ from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.grid.buckets import Buckets
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.point_map import PointMap
 from thinmap_ros.core.slam.pose_graph import Measured, relax
 from thinmap_ros.core.slam.scan_matching import Match, MatchConfig, ScanMatcher
 
 _AROUND = 4  # keyframes to either side that make a submap
-_SHARED, _KEPT = 5, 4  # neighbours that share a submap, and submaps that are kept for the next keyframes
 _AGAIN_M = 8.0  # so much way lies between leaving a place and coming back to it
 _VISITS = 3  # earlier visits to a place with which a scan is matched
 _TURN_M_RAD = 1.0  # a radian of turn makes two scans as different as so many metres
@@ -93,7 +91,6 @@ class Loops:
         self._witnesses: deque[Measured] = deque(maxlen=_WITNESSES)
         self._agreed_at_m = -math.inf
         self._places = Buckets(_BUCKET_M)  # of the keyframes
-        self._submaps: dict[int, PointMap] = {}  # of late, by the keyframe in whose frame each is
 
     def follow(self, scan: Scan, points_base: Array, T_map_base: Array, leapt: bool) -> None:
         """Take in a scan that fits the map at a pose (3,), with its points (N, 2).
@@ -119,10 +116,10 @@ class Loops:
         """Do one of the matches that are due; to be called once a step."""
         if self._jobs:
             j, k = self._jobs.popleft()
-            base, match = self._match(j, k)
+            match = self._match(j, k)
             if match.overlap >= _LEAST_OVERLAP and match.fit >= _LEAST_FIT:
                 covariance = match.covariance + np.diag(np.square(_MATCH_SIGMAS))
-                self.matched.append(Measured(base, k, match.T_map_base, np.linalg.inv(covariance), True))
+                self.matched.append(Measured(j, k, match.T_map_base, np.linalg.inv(covariance), True))
                 if k - j > 1 and math.sqrt(match.covariance[:2, :2].trace()) < _SHARP_M:
                     self._hear(self.matched[-1])
 
@@ -146,7 +143,6 @@ class Loops:
         self.keyframes = [replace(f, T_map_base=T) for f, T in zip(self.keyframes, after, strict=True)]
         for k, (x, y, _) in enumerate(after.tolist()):
             self._places.put(k, x, y)
-        self._submaps.clear()
         self._agreed_at_m = self.keyframes[-1].way_m
         return Correction(before, after)
 
@@ -231,43 +227,23 @@ class Loops:
         """How far from a place that was left so much way ago, (N,), the robot may seem to be when it is back, m."""
         return np.asarray(self._config.loop_reach_m + np.minimum(_DRIFT * way_m, _FARTHEST_M))
 
-    def _match(self, j: int, k: int) -> tuple[int, Match]:
-        """Keyframe k matched with j and those around it; the keyframe in whose frame the match is, and the match."""
-        base, points = self._submap(j, k)
-        origin, here = self.keyframes[base].T_map_base, self.keyframes[k]
+    def _match(self, j: int, k: int) -> Match:
+        """Keyframe k matched with j and those around it, in the frame of j."""
+        base, here = self.keyframes[j].T_map_base, self.keyframes[k]
         drift = min(_DRIFT * (here.way_m - self.keyframes[j].way_m), _FARTHEST_M)
-        config = replace(self._matching, search_m=self._matching.search_m + drift, search_deg=_SEARCH_DEG)
-        return base, ScanMatcher(config, points).match(
+        matcher = ScanMatcher(replace(self._matching, search_m=self._matching.search_m + drift, search_deg=_SEARCH_DEG))
+        for frame in self.keyframes[max(0, j - _AROUND) : min(j + _AROUND + 1, k)]:
+            T = se2.between(base, frame.T_map_base)
+            laser = se2.transform_points(T, frame.scan.T_base_laser[None, :2])[0]
+            matcher.add(se2.transform_points(T, frame.points_base), laser)
+        prior = se2.between(base, here.T_map_base)
+        return matcher.match(
             here.points_base,
             np.ascontiguousarray(here.scan.T_base_laser[:2]),
-            se2.between(origin, here.T_map_base),
+            prior,
             np.diag(np.square(_PRIOR_SIGMAS) + [drift**2, drift**2, 0.0]),
             search=drift > _SEARCHED_M and not self.agreed,
         )
-
-    def _submap(self, j: int, k: int) -> tuple[int, PointMap]:
-        """A map of points of keyframes around j and before k, and that one in whose frame it is.
-
-        Neighbours share one: on known ground keyframe after keyframe is matched with the same few places.
-        """
-        middle = j - j % _SHARED + _SHARED // 2
-        around = _AROUND + _SHARED // 2
-        if middle + around >= k:
-            return j, self._drawn(j, max(0, j - _AROUND), min(j + _AROUND + 1, k))
-        if middle not in self._submaps:
-            self._submaps[middle] = self._drawn(middle, max(0, middle - around), middle + around + 1)
-            if len(self._submaps) > _KEPT:
-                del self._submaps[next(iter(self._submaps))]
-        return middle, self._submaps[middle]
-
-    def _drawn(self, base: int, first: int, end: int) -> PointMap:
-        """A map of the points of some keyframes, in the frame of one."""
-        points, origin = ScanMatcher(self._matching), self.keyframes[base].T_map_base
-        for frame in self.keyframes[first:end]:
-            T = se2.between(origin, frame.T_map_base)
-            laser = se2.transform_points(T, frame.scan.T_base_laser[None, :2])[0]
-            points.add(se2.transform_points(T, frame.points_base), laser)
-        return points.map
 
 
 def _size(off: Array) -> float:

@@ -85,10 +85,9 @@ class Match:
 class ScanMatcher:
     """Keeps the map of points, and finds the pose at which a scan fits it."""
 
-    def __init__(self, config: MatchConfig, points: PointMap | None = None) -> None:
-        """Begin with an empty map of points, or with one that is there already."""
+    def __init__(self, config: MatchConfig) -> None:
         self.config = config
-        self.map = points or PointMap(config.match_cell_m, config.match_memory)
+        self.map = PointMap(config.match_cell_m, config.match_memory)
 
     def add(self, points_map: Array, seen_from: Array) -> None:
         """Take points (N, 2) seen from a place (2,) into the map, map frame."""
