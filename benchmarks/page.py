@@ -23,6 +23,8 @@ _ABOUT = {
     'nodes': 'What the ROS nodes of map and graph need for a scan.',
     'localization': 'Global localization from 5,000 samples.',
     'planning': 'The wavefront planner.',
+    'matching': 'A scan against ten others round its place: the scan matcher of the localizer, and that of OpenKarto '
+    '(package karto-scanmatcher, where it is installed), which makes its map anew for each match.',
     'slam': 'A step of the localizer by the number of features in the map: the filter over the local area (ti), over '
     'all features (full).',
     'growth': 'Localizer, grid and graph together on a long drive through the warehouse of 200 x 200 m.',

@@ -2,6 +2,7 @@
 
 import csv
 from collections.abc import Iterable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,11 +33,15 @@ _VERDICTS = {True: 'ok', False: 'MISSED', None: ''}
 
 def show(rows: Iterable[Row], path: Path | None = None) -> None:
     """Print rows under each other, each as soon as it is there, and write them to a CSV file where one is wished."""
-    shown = []
-    for row in rows:
-        shown.append((row.what, row.value, row.target, _VERDICTS[row.good]))
-        print(f'{row.what:<58} {row.value:>16}  {row.target:<18} {_VERDICTS[row.good]}', flush=True)
-    if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open('w', encoding='utf-8', newline='') as file:
-            csv.writer(file, lineterminator='\n').writerows([COLUMNS, *shown])
+    with ExitStack() as stack:
+        writer = None
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            file = stack.enter_context(path.open('w', encoding='utf-8', newline='', buffering=1))
+            writer = csv.writer(file, lineterminator='\n')
+            writer.writerow(COLUMNS)
+        for row in rows:
+            shown = (row.what, row.value, row.target, _VERDICTS[row.good])
+            print(f'{row.what:<58} {row.value:>16}  {row.target:<18} {_VERDICTS[row.good]}', flush=True)
+            if writer is not None:
+                writer.writerow(shown)

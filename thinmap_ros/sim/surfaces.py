@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.topology.free_space import reachable
+from thinmap_ros.core.topology.parts import reachable
 from thinmap_ros.sim.world import World
 
 

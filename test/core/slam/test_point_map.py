@@ -68,8 +68,8 @@ def plain_surface(near, weights, firm):
 def test_some_of_every_kind_are_there():
     kinds = set()
     for _, points in scenes():
-        pool = filled(points).tiles.pool
-        kinds |= set(pool[pool[..., COUNT] > 0][:, LOOSE].tolist())
+        cells = filled(points).cells
+        kinds |= set(cells[cells[:, COUNT] > 0][:, LOOSE].tolist())
     assert kinds == {0.0, 1.0, UNFORMED}
 
 
@@ -82,8 +82,9 @@ def filled(points):
 @pytest.mark.parametrize(('name', 'points'), scenes(), ids=lambda value: value if isinstance(value, str) else '')
 def test_surfaces_are_what_the_plain_words_say(name, points):
     points_map = filled(points)
-    rows, cols = np.nonzero(points_map.tiles.pool[0][..., COUNT])
-    cells = points_map.tiles.pool[0][rows, cols].astype(np.float64)
+    numbers = points_map.tiles.pool[0]
+    rows, cols = np.nonzero(numbers)
+    cells = points_map.cells[numbers[rows, cols]].astype(np.float64)
     means, weights = cells[:, [MEAN_X, MEAN_Y]], np.minimum(cells[:, COUNT], 4.0)
     dense = np.minimum(cells[:, 8], 4.0)
     for k, cell in enumerate(cells):

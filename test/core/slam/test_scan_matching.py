@@ -97,7 +97,7 @@ def test_surfaces_of_the_point_map_have_the_wall_s_normal(rng, angle):
     points = 3.0 * normal + np.linspace(-1.0, 1.0, 400)[:, None] * along + rng.normal(0.0, 0.01, (400, 1)) * normal
     point_map = PointMap(0.05, 30.0)
     point_map.add(points, np.zeros(2))
-    cells = point_map.tiles.pool.reshape(-1, point_map.tiles.pool.shape[-1])
+    cells = point_map.cells
     cells = cells[(cells[:, COUNT] > 0.0) & (np.abs(cells[:, CENTRE_X : CENTRE_X + 2] @ along) < 0.7)]
     assert len(cells) > 20
     assert (cells[:, LOOSE] == 0.0).all()
@@ -110,7 +110,7 @@ def test_the_point_map_forgets_what_has_moved():
     point_map = PointMap(0.05, 10.0)
     for x in [1.01] * 50 + [1.04] * 50:
         point_map.add(np.array([[x, 0.02]]), np.zeros(2))
-    cells = point_map.tiles.pool.reshape(-1, point_map.tiles.pool.shape[-1])
+    cells = point_map.cells
     assert cells[cells[:, COUNT] > 0.0, 1] == pytest.approx([1.04], abs=0.003)
 
 
@@ -121,7 +121,7 @@ def test_beside_a_door_a_wall_is_a_wall_to_its_end():
     points = PointMap(0.05, 30.0)
     for _ in range(4):
         points.add(np.vstack([wall, jamb]), np.array([1.5, 0.0]))
-    cells = [points.tiles.pool[0, 20, col] for col in range(24, 40)]
+    cells = points.cells[points.tiles.pool[0, 20, 24:40]]
     for cell in cells:
         assert cell[LOOSE] == 0.0
         np.testing.assert_allclose([cell[NORMAL_X], cell[NORMAL_Y], cell[CENTRE_Y]], [0.0, -1.0, 1.0], atol=0.03)

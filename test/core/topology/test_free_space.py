@@ -12,12 +12,11 @@ from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.free_space import (
     column_distance,
     known_free,
-    label,
-    reachable,
     select_free_space,
     squared_clearance,
     standing_room,
 )
+from thinmap_ros.core.topology.parts import label, reachable
 
 
 def random_mask(seed):

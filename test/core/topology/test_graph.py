@@ -58,3 +58,17 @@ def test_ids_are_positive_and_unique(triangle):
         triangle.put_node(Node(0, NodeKind.END, 0.0, 0.0, 0.0))
     with pytest.raises(InputError, match='nodes of the map'):
         triangle.put_edge(edge(7, 1, 77, (0, 0)))
+
+
+def test_the_nearest_node_is_the_nearest_of_all_however_far():
+    rng = np.random.default_rng(0)
+    places = np.vstack([rng.uniform(-30.0, 30.0, (200, 2)), [[500.0, 0.0]]])
+    topology = TopologicalMap(Node(k + 1, NodeKind.END, x, y, 0.5) for k, (x, y) in enumerate(places.tolist()))
+    for x, y in np.vstack([rng.uniform(-80.0, 80.0, (100, 2)), [[300.0, 10.0], [-2000.0, 0.0]]]).tolist():
+        assert topology.nearest_node(x, y).id == 1 + int(((places - (x, y)) ** 2).sum(axis=1).argmin())
+        assert {n.id for n in topology.nodes_near(x, y, 9.0)} >= {
+            k + 1 for k in np.flatnonzero(np.hypot(*(places - (x, y)).T) <= 9.0).tolist()
+        }
+    for k in range(200):
+        topology.drop_node(k + 1)
+    assert topology.nearest_node(0.0, 0.0).id == 201

@@ -184,7 +184,7 @@ class OccupancyGrid:
 
     def _cut(self, row: int, col: int, rows: int, cols: int) -> GridPatch:
         odds = self._tiles.read(row, col, rows, cols)
-        return GridPatch(self.frame.shifted(row, col), self._percent[odds.astype(np.int64) + _LIMIT])
+        return GridPatch(self.frame.shifted(row, col), _shades(odds, self._percent))
 
     def _sheet(self, radius: int) -> NDArray[np.int16]:
         """Zeros for what a scan adds, whole tiles that hold `radius` cells around any cell: kept, `_apply` clears it.
@@ -296,6 +296,16 @@ def _draw_ends(
     for i in range(ranges.size):
         if hit[i] and ranges[i] < usable:
             cells[int(ends[i, 1]) * width + int(ends[i, 0])] = step
+
+
+@kernel
+def _shades(odds: NDArray[np.int16], percent: NDArray[np.int8]) -> NDArray[np.int8]:
+    """Cells (H, W) of a patch: what the table says of their log odds."""
+    cells = np.empty(odds.shape, dtype=np.int8)
+    for row in range(odds.shape[0]):
+        for col in range(odds.shape[1]):
+            cells[row, col] = percent[np.int64(odds[row, col]) + _LIMIT]
+    return cells
 
 
 @inlined

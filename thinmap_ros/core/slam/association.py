@@ -82,7 +82,7 @@ def meeting(
     along = ends_map @ tangents_of(lines_map).T
     low, high = np.array([f.low for f in features]), np.array([f.high for f in features])
     gaps = np.maximum(low - along.max(axis=1), along.min(axis=1) - high)
-    first_seen_from = np.array([f.seen_from for f in features])
+    first_seen_from = np.array([f.seen_from for f in features]).reshape(-1, 2)
     facing = sides_of(lines_map, seen_from) == sides_of(lines_map, first_seen_from)
     return np.asarray((offsets <= _NEAR_M) & (rise <= math.sin(_NEAR_RAD)) & (gaps <= gap_m) & facing)
 

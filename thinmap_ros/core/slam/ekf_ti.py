@@ -75,7 +75,7 @@ class CompressedEkf:
         mean, rows = self._store.read(at)
         pose_covariance = self.local.pose_covariance
         own = np.block([[pose_covariance, pose_cross[:, at]], [pose_cross[:, at].T, rows[:, at]]])
-        others = np.setdiff1d(self._numbers(self.ids), at)
+        others = self._store.taken_but(at)
         self._cross = np.zeros((len(own) if others.size else 0, self._store.width))
         if others.size:
             self._cross[:, others] = np.vstack([pose_cross[:, others], rows[:, others]])
@@ -121,6 +121,13 @@ class CompressedEkf:
         found = {i: self._store.mean[2 * p : 2 * p + 2] for i, p in self._places.items()}
         found.update(zip(self.area, self.local.lines, strict=True))
         return found
+
+    def line_array(self) -> tuple[NDArray[np.int64], Array]:
+        """Ids (N,) and lines (N, 2) of all features, in the order of `ids`, as `lines` has them."""
+        lines = self._store.mean[: self._store.width].reshape(-1, 2).copy()  # by place
+        lines[[self._places[i] for i in self.area]] = self.local.lines
+        ids = np.fromiter(self._places, dtype=np.int64, count=len(self))
+        return ids, lines[np.fromiter(self._places.values(), dtype=np.int64, count=len(self))]
 
     def line_covariances(self) -> dict[int, Array]:
         """Covariance (2, 2) of every feature's line; of those outside the area, as of when the area was entered."""
@@ -195,6 +202,14 @@ class _Store:
     def free_place(self, place: int) -> None:
         """Give a place back."""
         self._free.append(place)
+
+    def taken_but(self, at: NDArray[np.int64]) -> NDArray[np.int64]:
+        """All numbers of places that are taken, in order, but some."""
+        taken = np.zeros(self.width, dtype=np.bool_)
+        taken[: 2 * self._used] = True
+        taken[at] = False
+        taken.reshape(-1, 2)[self._free] = False
+        return np.flatnonzero(taken)
 
     def move(self, change: Array) -> None:
         """Add to the mean, (width,)."""

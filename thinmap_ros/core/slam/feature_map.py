@@ -250,15 +250,14 @@ class FeatureMap:
         """Features that cover the candidate's place, though it failed the gate: two for one wall help nobody."""
         if not self._features:
             return set()
-        known = ekf.lines()
-        ids, lines = np.array(list(known)), np.array(list(known.values()))
+        ids, lines = ekf.line_array()
         start, end = ends_of(candidate.span, candidate.line)
         middle, reach = 0.5 * (start + end), 0.25 * (end - start)
-        features = [self._features[i] for i in known]
+        near = np.abs(normals_of(lines) @ middle - lines[:, 0]) <= self._near
+        ids, lines = ids[near], lines[near]  # the few on whose lines it lies, of all that the map has
+        features = [self._features[i] for i in ids.tolist()]
         ends = np.stack([middle - reach, middle + reach])
-        near = meeting(lines, features, ends[None], candidate.span.seen_from, 0.0)[0]
-        near &= np.abs(normals_of(lines) @ middle - lines[:, 0]) <= self._near
-        return set(ids[near].tolist())
+        return set(ids[meeting(lines, features, ends[None], candidate.span.seen_from, 0.0)[0]].tolist())
 
 
 def _update(ekf: EkfSlam, chosen: NDArray[np.int64], lines: Lines, leeway: Array | None) -> bool:

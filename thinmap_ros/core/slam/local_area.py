@@ -16,6 +16,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array, wrap
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 
+_LISTED_M = 12.0  # nodes are noted up to here, unless none is near
 _AS_NEAR_M = 1.0  # nodes farther than the nearest by no more than this are about as near
 _REACH_M = 8.0  # nodes along edges matter up to here, and the first one of every edge
 _BESIDE_M = 2.0  # what lies this near is not behind the robot
@@ -34,10 +35,13 @@ class LocalArea:
         self._trail: _Trail | None = _Trail(self._topology)
         self._features_at: dict[int, set[int]] = {}
         self._nodes_of: dict[int, set[int]] = {}
-        # Ids and places of all nodes, as they were when the robot was at a place (2,).
+        # Ids and places of the nodes that could be nearest, as they were when the robot was at a place (2,).
         self._ids: list[int] = []
         self._places: Array = np.empty((0, 2))
         self._listed_at: Array = np.full(2, np.inf)
+        # Where the nodes with features were when they were last listed, and the map of then.
+        self._place_of: dict[int, Array] = {}
+        self._listed: TopologicalMap | None = None
 
     def set_topology(self, topology: TopologicalMap) -> None:
         """Take the topological map in use from now on: a newer state of the same map, or the map itself, changed.
@@ -49,7 +53,8 @@ class LocalArea:
         before, trail = self._topology, self._trail
         self._topology, self._trail = topology, None
         if trail is not None:
-            self._hand_over({i: before.nodes[i].position for i in self._features_at})
+            self._place_of = {i: before.nodes[i].position for i in self._features_at}
+            self._hand_over(list(self._features_at))
             self._listed_at = np.full(2, np.inf)
 
     def state(self) -> dict[str, NDArray[Any]]:
@@ -71,6 +76,7 @@ class LocalArea:
         nodes = [Node(i, NodeKind.CORNER, x, y, 0.0) for i, (x, y) in zip(ids, places.tolist(), strict=True)]
         self._topology, self._trail = TopologicalMap(nodes), None
         self._ids, self._places = ids, places
+        self._place_of = dict(zip(ids, places, strict=True))
         for feature_id, node_id in state['stored_at'].tolist():
             if node_id not in self._topology.nodes:
                 raise InputError(f'saved features: stored at node {node_id}: expected one of {len(ids)} saved nodes')
@@ -137,27 +143,41 @@ class LocalArea:
         return best
 
     def _list_nodes(self, T_map_base: Array) -> None:
-        """Note all nodes anew. Once a metre is enough, and keeps a step's cost out of the size of the building."""
-        before = dict(zip(self._ids, self._places, strict=True))
-        nodes = self._topology.nodes
-        self._ids = list(nodes)
-        self._places = np.array([(n.x, n.y) for n in nodes.values()]).reshape(-1, 2)
+        """Note the nodes around anew. Once a metre, and only as far as it takes, whatever the size of the building."""
+        topology, (x, y) = self._topology, T_map_base[:2].tolist()
+        near = topology.nodes_near(x, y, _LISTED_M)
+        # After the next metre the nearest node may be one more away, and those about as near another one.
+        sure = min((math.hypot(n.x - x, n.y - y) for n in near), default=math.inf) + 2.0 * _AS_NEAR_M + _AS_NEAR_M
+        if sure > _LISTED_M:
+            near = list(topology.nodes.values())
+        self._ids = [node.id for node in near]
+        self._places = np.array([(n.x, n.y) for n in near]).reshape(-1, 2)
         self._listed_at = T_map_base[:2].copy()
-        self._hand_over({i: place for i, place in before.items() if i in self._features_at and i not in nodes})
+        gone = self._features_at.keys() - topology.nodes.keys()
+        self._note_places(near if topology is self._listed else list(topology.nodes.values()))
+        self._listed = topology
+        self._hand_over(sorted(gone))
 
-    def _hand_over(self, gone: dict[int, Array]) -> None:
-        """Features of nodes that are no more go to the nodes nearest to where those were, (2,)."""
+    def _note_places(self, nodes: list[Node]) -> None:
+        """Note where nodes with features are: of a map that is changed in place, those far off stay where they were."""
+        self._place_of.update((node.id, node.position) for node in nodes if node.id in self._features_at)
+
+    def _hand_over(self, gone: list[int]) -> None:
+        """Features of nodes that are no more go to the nodes nearest to where those were."""
         features = {node_id: self._features_at.pop(node_id) for node_id in gone}
         for node_id, left in features.items():
             for feature_id in left:
                 self._nodes_of[feature_id].discard(node_id)
-        for node_id, place in gone.items():
-            heir = self._topology.nearest_node(float(place[0]), float(place[1]))
+        for node_id in gone:
+            x, y = self._place_of.pop(node_id).tolist()
+            heir = self._topology.nearest_node(x, y)
             if heir is not None:
                 for feature_id in features[node_id]:
                     self._put(feature_id, heir.id)
 
     def _put(self, feature_id: int, node_id: int) -> None:
+        if node_id not in self._features_at:
+            self._place_of[node_id] = self._topology.nodes[node_id].position
         self._features_at.setdefault(node_id, set()).add(feature_id)
         self._nodes_of.setdefault(feature_id, set()).add(node_id)
 

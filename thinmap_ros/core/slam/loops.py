@@ -17,6 +17,7 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.grid.buckets import Buckets
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.pose_graph import Measured, relax
@@ -41,6 +42,7 @@ _WITNESSES = 3  # matches of different keyframes that have to ask for the same c
 _LATELY = 8  # keyframes back to which they count
 _ALIKE_M, _ALIKE_RAD = 0.2, 0.06  # by how much they may differ
 _WORTH_M, _WORTH_RAD = 0.12, 0.04  # smaller corrections are left to the end
+_BUCKET_M = 4.0  # keyframes are listed by squares of this size
 _HOLDS_M = 3.0  # so much way after a match that agrees, the old map is still trusted
 
 
@@ -88,6 +90,7 @@ class Loops:
         self._leapt = False
         self._witnesses: deque[Measured] = deque(maxlen=_WITNESSES)
         self._agreed_at_m = -math.inf
+        self._places = Buckets(_BUCKET_M)  # of the keyframes
 
     def follow(self, scan: Scan, points_base: Array, T_map_base: Array, leapt: bool) -> None:
         """Take in a scan that fits the map at a pose (3,), with its points (N, 2).
@@ -100,6 +103,7 @@ class Loops:
         way = self.way_m(T_map_base)
         k = len(self.keyframes)
         self.keyframes.append(Keyframe(scan, points_base, T_map_base, way))
+        self._places.put(k, float(T_map_base[0]), float(T_map_base[1]))
         if k > 0:
             self._steps.append(se2.between(self.keyframes[k - 1].T_map_base, T_map_base))
             if self._leapt:
@@ -137,6 +141,8 @@ class Loops:
             self.matched = [m for m in self.matched if m not in witnesses]
             return None
         self.keyframes = [replace(f, T_map_base=T) for f, T in zip(self.keyframes, after, strict=True)]
+        for k, (x, y, _) in enumerate(after.tolist()):
+            self._places.put(k, x, y)
         self._agreed_at_m = self.keyframes[-1].way_m
         return Correction(before, after)
 
@@ -153,8 +159,10 @@ class Loops:
         """Whether enough matches of late ask for the same correction of the place where the robot is."""
         if len(self._witnesses) < _WITNESSES or self._witnesses[0].b < len(self.keyframes) - _LATELY:
             return False
-        poses = np.array([k.T_map_base for k in self.keyframes])
-        asked = np.array([se2.compose(poses[m.a], m.T_a_b) - poses[m.b] for m in self._witnesses])
+        frames = self.keyframes
+        asked = np.array(
+            [se2.compose(frames[m.a].T_map_base, m.T_a_b) - frames[m.b].T_map_base for m in self._witnesses]
+        )
         asked[:, 2] = se2.wrap(asked[:, 2])
         return bool(np.ptp(asked[:, :2], axis=0).max() < _ALIKE_M and np.ptp(asked[:, 2]) < _ALIKE_RAD)
 
@@ -201,14 +209,18 @@ class Loops:
     def _earlier_visits(self, k: int) -> list[int]:
         """The keyframe most like this one of each of the earlier visits to the place, the likest first."""
         here = self.keyframes[k]
-        poses, ways = np.array([f.T_map_base for f in self.keyframes]), np.array([f.way_m for f in self.keyframes])
+        farthest = self._config.loop_reach_m + _FARTHEST_M
+        near = self._places.near(float(here.T_map_base[0]), float(here.T_map_base[1]), farthest)
+        frames = [self.keyframes[i] for i in near]
+        poses, ways = np.array([f.T_map_base for f in frames]), np.array([f.way_m for f in frames])
         distances = np.hypot(*(poses[:, :2] - here.T_map_base[:2]).T)
         unlike = distances + _TURN_M_RAD * np.abs(se2.wrap(poses[:, 2] - here.T_map_base[2]))
         unlike[(distances > self._reach(here.way_m - ways)) | (ways > here.way_m - _AGAIN_M)] = np.inf
         found: list[int] = []
         while len(found) < _VISITS and np.isfinite(unlike).any():
-            found.append(int(unlike.argmin()))
-            unlike[np.abs(ways - ways[found[-1]]) < _AGAIN_M] = np.inf
+            likest = int(unlike.argmin())
+            found.append(near[likest])
+            unlike[np.abs(ways - ways[likest]) < _AGAIN_M] = np.inf
         return found
 
     def _reach(self, way_m: Array) -> Array:

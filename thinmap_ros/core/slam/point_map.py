@@ -1,7 +1,7 @@
 """A map of laser points: for each small cell their mean, and the surface that it makes with its neighbours.
 
 Means keep what an occupancy grid rounds off: a wall's place is known to a fraction of a cell. Memory is proportional
-to what was seen, because cells lie in tiles that exist only where points fell.
+to what was seen: tiles exist only where points fell and hold the numbers of cells, and only cells with points have one.
 """
 
 import math
@@ -21,6 +21,7 @@ from thinmap_ros.core.se2 import Array
 # whose beams were dense; and how far the robot had come when it last saw the cell, m.
 COUNT, MEAN_X, MEAN_Y, CENTRE_X, CENTRE_Y, NORMAL_X, NORMAL_Y, LOOSE, DENSE, SEEN = range(10)
 UNFORMED = 2.0
+_ROOM = 4096  # cells by which a map begins
 _SHIFT, _MASK = 6, TILE - 1
 _FEWEST_CELLS = 3
 DENSE_M = 0.3  # gap between neighbouring beams up to which points show more than a plane
@@ -30,17 +31,20 @@ _NOISE_M = 0.01  # of a point, 1 sigma; what lies together closer than this (1 s
 _THIN_M = 0.02  # what is wider than this (1 sigma) and no wall is clutter
 _BAND_M = 0.025  # what is farther from a line through a cell is no part of that cell's wall
 _DIRECTIONS = 16  # in which walls through a cell are looked for at first
+_NORMALS = np.array([(math.cos(a), math.sin(a)) for a in (math.pi * k / _DIRECTIONS for k in range(_DIRECTIONS))])
 _TILT_RAD = math.radians(2.0)  # doubt of a normal (1 sigma) above which it says nothing
 _FIRM = 4.0  # points that clutter has to consist of
 
 
 class PointMap:
-    """Points by cell; `tiles.pool[slot, row, col]` is a cell."""
+    """Points by cell; `cells[tiles.pool[slot, row, col]]` is a cell, but for number 0, which stands for none."""
 
     def __init__(self, cell_m: float, most: float) -> None:
         """cell_m: edge of a cell; most: points that a cell's mean remembers, so that it follows what moved."""
         self.cell_m = cell_m
-        self.tiles = TileStore(np.float32, (10,))
+        self.tiles = TileStore(np.int32)
+        self.cells: NDArray[np.float32] = np.zeros((_ROOM, SEEN + 1), dtype=np.float32)
+        self._used = 1
         self._most = most
         # How far the robot has come, and where on its way the cells that count were last seen, m.
         self.way_m, self.since_m = 0.0, -math.inf
@@ -60,17 +64,26 @@ class PointMap:
         self.tiles.reach(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
         self.tiles.ensure(tiles)
         cells -= self.corner
+        self._reserve(len(cells))
         dense = gaps(points_map) < DENSE_M
         limits = (self._most, self.way_m, self.since_m)
-        _add(self.tiles.pool, self.tiles.directory, cells, points_map, dense, seen_from, limits)
+        chart = (self.cells, self.tiles.pool, self.tiles.directory)
+        self._used = _add(*chart, self._used, cells, points_map, dense, seen_from, limits)
+
+    def _reserve(self, count: int) -> None:
+        """Have room for so many more cells."""
+        if self._used + count > len(self.cells):
+            longer = np.zeros((len(self.cells) + max(len(self.cells) // 2, count), SEEN + 1), dtype=np.float32)
+            longer[: self._used] = self.cells[: self._used]
+            self.cells = longer
 
     def state(self) -> dict[str, NDArray[Any]]:
         """All that the map holds as arrays by name: its cells (N, 2) as (row, col), and what they hold (N, 10)."""
-        pool = self.tiles.pool[: self.tiles.used]
-        at = np.argwhere(pool[..., COUNT] > 0.0)
+        numbers = self.tiles.pool[: self.tiles.used]
+        at = np.argwhere(numbers > 0)
         cells = self.tiles.places()[at[:, 0]] * TILE + at[:, 1:]
         order = np.lexsort(cells.T[::-1])
-        points = pool[at[:, 0], at[:, 1], at[:, 2]]
+        points = self.cells[numbers[at[:, 0], at[:, 1], at[:, 2]]]
         return {'cell_m': np.array(self.cell_m), 'cells': cells[order], 'points': points[order]}
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
@@ -97,7 +110,11 @@ class PointMap:
         rows, cols = (cells - self.corner).T
         slots = self.tiles.directory[rows // TILE, cols // TILE]
         points[:, SEEN] = np.inf
-        self.tiles.pool[slots, rows % TILE, cols % TILE] = points
+        self._reserve(len(points))
+        numbers = self._used + np.arange(len(points), dtype=np.int32)
+        self.tiles.pool[slots, rows % TILE, cols % TILE] = numbers
+        self.cells[numbers] = points
+        self._used += len(points)
 
 
 def gaps(points: Array) -> Array:
@@ -125,22 +142,31 @@ def slot_of(directory: NDArray[np.int32], row: int, col: int) -> int:
 
 @kernel
 def _add(
-    pool: NDArray[np.float32],
+    cells: NDArray[np.float32],
+    tiles: NDArray[np.int32],
     directory: NDArray[np.int32],
-    cells: NDArray[np.int64],
+    used: int,
+    places: NDArray[np.int64],
     points: Array,
     dense: NDArray[np.bool_],
     seen_from: Array,
     limits: tuple[float, float, float],
-) -> None:
-    """Count the points into their cells, then form the surface of each cell that was touched.
+) -> int:
+    """Count the points into the cells at their places, then form the surface of each that was touched.
 
+    used: the first number that no cell has yet; returns it as it is then.
     limits: the most points that a cell remembers, where on its way the robot is, and where cells that count were seen.
     """
     most, way, since = limits
+    numbers = np.empty(points.shape[0], dtype=np.int32)
     for i in range(points.shape[0]):
-        row, col = cells[i, 0], cells[i, 1]
-        cell = pool[directory[row >> _SHIFT, col >> _SHIFT], row & _MASK, col & _MASK]
+        row, col = places[i, 0], places[i, 1]
+        slot = directory[row >> _SHIFT, col >> _SHIFT]
+        if tiles[slot, row & _MASK, col & _MASK] == 0:
+            tiles[slot, row & _MASK, col & _MASK] = used
+            used += 1
+        numbers[i] = tiles[slot, row & _MASK, col & _MASK]
+        cell = cells[numbers[i]]
         if cell[SEEN] < since:
             cell[COUNT], cell[DENSE] = 0.0, 0.0
         cell[SEEN] = max(np.float64(cell[SEEN]), way)
@@ -150,20 +176,22 @@ def _add(
         cell[MEAN_Y] += (points[i, 1] - cell[MEAN_Y]) / cell[COUNT]
     near = np.empty(((2 * _REACH + 1) ** 2, 3))
     for i in range(points.shape[0]):
-        row, col = cells[i, 0], cells[i, 1]
-        if i > 0 and row == cells[i - 1, 0] and col == cells[i - 1, 1]:
+        if i > 0 and numbers[i] == numbers[i - 1]:
             continue
-        x, y, nx, ny, loose = _surface(pool, directory, row, col, near, seen_from, since)
-        cell = pool[directory[row >> _SHIFT, col >> _SHIFT], row & _MASK, col & _MASK]
+        row, col = places[i, 0], places[i, 1]
+        x, y, nx, ny, loose = _surface(cells, tiles, directory, row, col, near, seen_from, since)
+        cell = cells[numbers[i]]
         if nx * (seen_from[0] - cell[MEAN_X]) + ny * (seen_from[1] - cell[MEAN_Y]) < 0.0:
             nx, ny = -nx, -ny
         cell[CENTRE_X], cell[CENTRE_Y] = cell[MEAN_X] + x, cell[MEAN_Y] + y
         cell[NORMAL_X], cell[NORMAL_Y], cell[LOOSE] = nx, ny, loose
+    return used
 
 
 @kernel
 def _gather(
-    pool: NDArray[np.float32],
+    cells: NDArray[np.float32],
+    tiles: NDArray[np.int32],
     directory: NDArray[np.int32],
     row: int,
     col: int,
@@ -175,7 +203,7 @@ def _gather(
 
     Walls seen only from their other side are left out: the two faces of a thin wall are two surfaces.
     """
-    base = pool[slot_of(directory, row, col), row & _MASK, col & _MASK]
+    base = cells[tiles[slot_of(directory, row, col), row & _MASK, col & _MASK]]
     number, firm = 0, 0.0
     for r in range(row - _REACH, row + _REACH + 1):
         slot, last_tile = NO_TILE, -1
@@ -184,8 +212,11 @@ def _gather(
                 slot, last_tile = slot_of(directory, r, c), c >> _SHIFT
             if slot == NO_TILE:
                 continue
-            cell = pool[slot, r & _MASK, c & _MASK]
-            if cell[COUNT] == 0.0 or cell[SEEN] < since:
+            at = tiles[slot, r & _MASK, c & _MASK]
+            if at == 0:
+                continue
+            cell = cells[at]
+            if cell[SEEN] < since:
                 continue
             away = cell[NORMAL_X] * (seen_from[0] - cell[MEAN_X]) + cell[NORMAL_Y] * (seen_from[1] - cell[MEAN_Y])
             if (r == row and c == col) or cell[LOOSE] > 0.0 or away >= 0.0:
@@ -227,7 +258,7 @@ def _direction(near: Array) -> tuple[float, float]:
     """Normal of the band through the origin in which most of the means (N, 3) lie."""
     best, best_x, best_y = -1.0, 1.0, 0.0
     for k in range(_DIRECTIONS):
-        nx, ny = math.cos(math.pi * k / _DIRECTIONS), math.sin(math.pi * k / _DIRECTIONS)
+        nx, ny = _NORMALS[k, 0], _NORMALS[k, 1]
         total = 0.0
         for i in range(near.shape[0]):
             if abs(nx * near[i, 0] + ny * near[i, 1]) <= _BAND_M:
@@ -239,7 +270,8 @@ def _direction(near: Array) -> tuple[float, float]:
 
 @kernel
 def _surface(
-    pool: NDArray[np.float32],
+    cells: NDArray[np.float32],
+    tiles: NDArray[np.int32],
     directory: NDArray[np.int32],
     row: int,
     col: int,
@@ -253,17 +285,17 @@ def _surface(
     surface fitted to both sides of a corner would pull all points that come near it aside. What belongs to no wall
     is a point, loose in all directions.
     """
-    number, firm = _gather(pool, directory, row, col, near, seen_from, since)
+    number, firm = _gather(cells, tiles, directory, row, col, near, seen_from, since)
     if number < _FEWEST_CELLS:
         return 0.0, 0.0, 1.0, 0.0, UNFORMED
     near = near[:number]
-    x, y, nx, ny, across, along, cells = _line(near, 0.0, 0.0)
+    x, y, nx, ny, across, along, count = _line(near, 0.0, 0.0)
     width = across
     if across > _NOISE_M**2:
         nx, ny = _direction(near)
         for _ in range(2):
-            x, y, nx, ny, across, along, cells = _line(near, nx, ny)
-    if cells >= _FEWEST_CELLS and max(across, _NOISE_M**2) <= along * _TILT_RAD**2:
+            x, y, nx, ny, across, along, count = _line(near, nx, ny)
+    if count >= _FEWEST_CELLS and max(across, _NOISE_M**2) <= along * _TILT_RAD**2:
         return x, y, nx, ny, 0.0
     if width <= _THIN_M**2 or firm < _FIRM:
         return x, y, nx, ny, UNFORMED

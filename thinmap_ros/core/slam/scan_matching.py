@@ -19,7 +19,6 @@ from thinmap_ros.core.se2 import Array, wrap
 from thinmap_ros.core.slam.point_map import (
     CENTRE_X,
     CENTRE_Y,
-    COUNT,
     DENSE_M,
     LOOSE,
     MEAN_X,
@@ -33,7 +32,7 @@ from thinmap_ros.core.slam.point_map import (
     slot_of,
 )
 
-_MASK = TILE - 1
+_SHIFT, _MASK = TILE.bit_length() - 1, TILE - 1
 _ROUNDS = 20
 _WIDE_ROUNDS = 3  # rounds in which far neighbours and larger errors still count
 _PLAIN_FIT = 0.95  # share of points that fit below which it is asked whether near neighbours alone do better
@@ -124,12 +123,13 @@ class ScanMatcher:
         if len(points_base) < FEWEST_POINTS or self.map.tiles.used == 0:
             return 0.0
         config, tiles = self.config, self.map.tiles
-        cells = int(math.ceil(0.5 * config.match_reach_m / config.match_cell_m))
-        limits = (config.match_cell_m, cells, config.match_sigma_m, config.match_outlier_m, config.match_inlier_m)
+        rings = int(math.ceil(0.5 * config.match_reach_m / config.match_cell_m))
+        limits = (config.match_cell_m, rings, config.match_sigma_m, config.match_outlier_m, config.match_inlier_m)
         total, near, _ = _add_points(
             self._weighted(points_base),
             laser_base,
             T_map_base,
+            self.map.cells,
             tiles.pool,
             tiles.directory,
             self.map.corner,
@@ -155,7 +155,7 @@ class ScanMatcher:
         reach = float(np.hypot(sparse[:, 0], sparse[:, 1]).max(initial=0.0)) + config.search_m
         size = 2 * int(math.ceil(reach / config.match_cell_m)) + 8
         low = np.floor(prior[1::-1] / config.match_cell_m).astype(np.int64) - size // 2
-        filled = _filled(tiles.pool, tiles.directory, low - self.map.corner, size, self.map.since_m)
+        filled = _filled(self.map.cells, tiles.pool, tiles.directory, low - self.map.corner, size, self.map.since_m)
         start = _search(sparse, prior, steps, turns, filled, low, config.match_cell_m)
         # What is searched for is what the prior missed: it must not hold the pose back.
         wide = covariance + np.diag(np.square([config.search_m, config.search_m, math.radians(config.search_deg)]))
@@ -177,6 +177,7 @@ class ScanMatcher:
             start,
             prior,
             information,
+            self.map.cells,
             tiles.pool,
             tiles.directory,
             self.map.corner,
@@ -221,19 +222,20 @@ def _nearest(
     y: float,
     laser_x: float,
     laser_y: float,
-    pool: NDArray[np.float32],
+    cells: NDArray[np.float32],
+    tiles: NDArray[np.int32],
     directory: NDArray[np.int32],
     corner: NDArray[np.int64],
     cell_m: float,
     reach: int,
     since: float,
-) -> tuple[int, int, int]:
-    """Cell whose mean is nearest to a point, ring by ring up to a reach in cells: slot (NO_TILE: none), row, col.
+) -> int:
+    """Number of the cell whose mean is nearest to a point, ring by ring up to a reach in cells; 0 where there is none.
 
     Walls that were seen only from their other side are passed over.
     """
     row, col = int(math.floor(y / cell_m)) - corner[0], int(math.floor(x / cell_m)) - corner[1]
-    best_slot, best_row, best_col, best = NO_TILE, 0, 0, np.inf
+    best_at, best = np.int32(0), np.inf
     for ring in range(reach + 1):
         if best < (max(ring - 1, 0) * cell_m) ** 2:
             break
@@ -243,8 +245,11 @@ def _nearest(
                 slot = slot_of(directory, r, c)
                 if slot == NO_TILE:
                     continue
-                cell = pool[slot, r & _MASK, c & _MASK]
-                if cell[COUNT] == 0.0 or cell[SEEN] < since:
+                at = tiles[slot, r & _MASK, c & _MASK]
+                if at == 0:
+                    continue
+                cell = cells[at]
+                if cell[SEEN] < since:
                     continue
                 dx, dy = cell[MEAN_X] - x, cell[MEAN_Y] - y
                 squared = dx * dx + dy * dy
@@ -253,8 +258,8 @@ def _nearest(
                 facing = cell[NORMAL_X] * (laser_x - x) + cell[NORMAL_Y] * (laser_y - y)
                 if cell[LOOSE] == 0.0 and facing < 0.0:
                     continue
-                best_slot, best_row, best_col, best = slot, r & _MASK, c & _MASK, squared
-    return best_slot, best_row, best_col
+                best_at, best = at, squared
+    return int(best_at)
 
 
 @kernel
@@ -310,7 +315,8 @@ def _add_points(
     scan: Array,
     laser_base: Array,
     pose: Array,
-    pool: NDArray[np.float32],
+    cells: NDArray[np.float32],
+    tiles: NDArray[np.int32],
     directory: NDArray[np.int32],
     corner: NDArray[np.int64],
     limits: tuple[float, int, float, float, float, float],
@@ -321,7 +327,7 @@ def _add_points(
 
     limits: cell, reach in cells, sigma, outlier and inlier distance, and where the cells that count were last seen.
     """
-    cell_m, cells, sigma, scale, inlier, since = limits
+    cell_m, reach, sigma, scale, inlier, since = limits
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     laser_x = pose[0] + cos * laser_base[0] - sin * laser_base[1]
     laser_y = pose[1] + sin * laser_base[0] + cos * laser_base[1]
@@ -330,10 +336,10 @@ def _add_points(
         px, py = cos * scan[i, 0] - sin * scan[i, 1], sin * scan[i, 0] + cos * scan[i, 1]
         x, y = px + pose[0], py + pose[1]
         total += scan[i, 2]
-        slot, row, col = _nearest(x, y, laser_x, laser_y, pool, directory, corner, cell_m, cells, since)
-        if slot == NO_TILE:
+        at = _nearest(x, y, laser_x, laser_y, cells, tiles, directory, corner, cell_m, reach, since)
+        if at == 0:
             continue
-        cell = pool[slot, row, col]
+        cell = cells[at]
         loose = np.float64(cell[LOOSE])
         if loose == UNFORMED:
             continue
@@ -357,7 +363,8 @@ def _align(
     start: Array,
     prior: Array,
     prior_information: Array,
-    pool: NDArray[np.float32],
+    cells: NDArray[np.float32],
+    tiles: NDArray[np.int32],
     directory: NDArray[np.int32],
     corner: NDArray[np.int64],
     limits: Array,
@@ -373,11 +380,11 @@ def _align(
     pose, information, gradient, shares = start.copy(), np.zeros((3, 3)), np.zeros(3), np.zeros(3)
     for iteration in range(_ROUNDS):
         wide = far and iteration < _WIDE_ROUNDS
-        cells = int(math.ceil(reach / cell_m)) if wide else int(math.ceil(0.5 * reach / cell_m))
-        now = (cell_m, cells, sigma, 3.0 * outlier if wide else outlier, inlier, since)
+        rings = int(math.ceil(reach / cell_m)) if wide else int(math.ceil(0.5 * reach / cell_m))
+        now = (cell_m, rings, sigma, 3.0 * outlier if wide else outlier, inlier, since)
         _prior_terms(pose, prior, prior_information, information, gradient)
         shares[0], shares[1], shares[2] = _add_points(
-            scan, laser_base, pose, pool, directory, corner, now, information, gradient
+            scan, laser_base, pose, cells, tiles, directory, corner, now, information, gradient
         )
         dx, dy, turn = _solve(information, gradient)
         pose[0], pose[1], pose[2] = pose[0] + dx, pose[1] + dy, pose[2] + turn
@@ -388,18 +395,27 @@ def _align(
 
 @kernel
 def _filled(
-    pool: NDArray[np.float32], directory: NDArray[np.int32], low: NDArray[np.int64], size: int, since: float
+    cells: NDArray[np.float32],
+    tiles: NDArray[np.int32],
+    directory: NDArray[np.int32],
+    low: NDArray[np.int64],
+    size: int,
+    since: float,
 ) -> NDArray[np.uint8]:
     """1 where a cell or one of its eight neighbours holds points that count, else 0: (size, size) from a cell on."""
     filled = np.zeros((size, size), dtype=np.uint8)
-    for r in range(1, size - 1):
-        for c in range(1, size - 1):
-            slot = slot_of(directory, low[0] + r, low[1] + c)
+    for tile_row in range(max(low[0] >> _SHIFT, 0), min((low[0] + size >> _SHIFT) + 1, directory.shape[0])):
+        for tile_col in range(max(low[1] >> _SHIFT, 0), min((low[1] + size >> _SHIFT) + 1, directory.shape[1])):
+            slot = directory[tile_row, tile_col]
             if slot == NO_TILE:
                 continue
-            cell = pool[slot, (low[0] + r) & _MASK, (low[1] + c) & _MASK]
-            if cell[COUNT] > 0.0 and cell[SEEN] >= since:
-                filled[r - 1 : r + 2, c - 1 : c + 2] = 1
+            top, left = (tile_row << _SHIFT) - low[0], (tile_col << _SHIFT) - low[1]
+            for r in range(max(top, 1), min(top + TILE, size - 1)):
+                numbers = tiles[slot, r - top]
+                for c in range(max(left, 1), min(left + TILE, size - 1)):
+                    at = numbers[c - left]
+                    if at > 0 and cells[at, SEEN] >= since:
+                        filled[r - 1 : r + 2, c - 1 : c + 2] = 1
     return filled
 
 

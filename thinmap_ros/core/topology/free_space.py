@@ -9,6 +9,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.topology.config import TopologyConfig
+from thinmap_ros.core.topology.parts import label, reachable
 
 Cells = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -159,81 +160,6 @@ def squared_clearance(distance: NDArray[np.int16], cells: Cells) -> Cells:
             step += 1
         squared[i] = best
     return squared
-
-
-def reachable(cells: Mask, seeds: Cells) -> Mask:
-    """The true cells that are joined to one of the seeds (N, 2), over edges and corners."""
-    left = np.zeros((cells.shape[0] + 2, cells.shape[1] + 2), dtype=np.bool_)
-    left[1:-1, 1:-1] = cells
-    found = _flood(left, (seeds[:, 0] + 1) * left.shape[1] + seeds[:, 1] + 1)
-    return np.ascontiguousarray(found[1:-1, 1:-1])
-
-
-@kernel
-def _flood(left: Mask, seeds: Cells) -> Mask:
-    """Cells reached from the seeds (flat indices); `left` has an empty border and loses the cells that are reached."""
-    cols = left.shape[1]
-    found = np.zeros(left.shape, dtype=np.bool_)
-    flat, reached = left.ravel(), found.ravel()
-    steps = np.array([-cols - 1, -cols, -cols + 1, -1, 1, cols - 1, cols, cols + 1], dtype=np.int64)
-    stack = np.empty(left.size + 8, dtype=np.int64)
-    count = 0
-    for at in seeds:
-        stack[count] = at
-        count += flat[at]
-        reached[at] |= flat[at]
-        flat[at] = False
-    while count > 0:
-        count -= 1
-        at = stack[count]
-        for step in steps:
-            to = at + step
-            if flat[to]:
-                flat[to] = False
-                reached[to] = True
-                stack[count] = to
-                count += 1
-    return found
-
-
-def label(cells: Mask) -> tuple[NDArray[np.int32], Cells]:
-    """Number of the part (joined over edges and corners) of each true cell, 0 elsewhere; cells in each part.
-
-    Parts are numbered in the order of their first cells, row after row.
-    """
-    numbers: NDArray[np.int32]
-    numbers, sizes = _label(np.ascontiguousarray(cells))
-    return numbers, sizes
-
-
-@kernel
-def _label(cells: Mask) -> tuple[NDArray[np.int32], Cells]:
-    rows, cols = cells.shape[0], cells.shape[1] + 2
-    # -1: to be numbered; the empty border saves the walk all questions about the rim.
-    framed = np.zeros((rows + 2, cols), dtype=np.int32)
-    for row in range(rows):
-        for col in range(cols - 2):
-            framed[row + 1, col + 1] = -np.int32(cells[row, col])
-    numbers = framed.ravel()
-    steps = np.array([-cols - 1, -cols, -cols + 1, -1, 1, cols - 1, cols, cols + 1], dtype=np.int64)
-    sizes = np.zeros(numbers.size // 4 + 2, dtype=np.int64)
-    stack = np.empty(numbers.size, dtype=np.int64)
-    last = 0
-    for start in range(numbers.size):
-        if numbers[start] >= 0:
-            continue
-        last += 1
-        numbers[start], stack[0], count = last, start, 1
-        while count > 0:
-            count -= 1
-            at = stack[count]
-            sizes[last] += 1
-            for step in steps:
-                to = at + step
-                if numbers[to] < 0:
-                    numbers[to], stack[count] = last, to
-                    count += 1
-    return np.ascontiguousarray(framed[1:-1, 1:-1]), sizes[: last + 1].copy()
 
 
 @kernel

@@ -7,7 +7,10 @@ from enum import IntEnum
 import numpy as np
 
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.buckets import Buckets
 from thinmap_ros.core.se2 import Array
+
+_BUCKET_M, _FAR_M = 4.0, 60.0  # nodes are listed by squares, in which one is looked for up to so far away
 
 
 class NodeKind(IntEnum):
@@ -68,6 +71,7 @@ class TopologicalMap:
         self.nodes: dict[int, Node] = {}
         self.edges: dict[int, Edge] = {}
         self._edges_at: dict[int, dict[int, None]] = {}
+        self._places = Buckets(_BUCKET_M)
         for node in nodes:
             self.put_node(node)
         for edge in edges:
@@ -86,6 +90,7 @@ class TopologicalMap:
             raise InputError(f'node id {node.id}: expected a positive number that no edge has')
         self.nodes[node.id] = node
         self._edges_at.setdefault(node.id, {})
+        self._places.put(node.id, node.x, node.y)
 
     def put_edge(self, edge: Edge) -> None:
         """Add an edge, or replace the one with its id.
@@ -113,6 +118,7 @@ class TopologicalMap:
         for edge_id in list(self._edges_at[node_id]):
             self.drop_edge(edge_id)
         del self.nodes[node_id], self._edges_at[node_id]
+        self._places.drop(node_id)
 
     def edges_at(self, node_id: int) -> list[Edge]:
         """Edges that begin or end at a node; a loop counts once."""
@@ -124,7 +130,17 @@ class TopologicalMap:
 
     def nearest_node(self, x: float, y: float) -> Node | None:
         """The node with the smallest straight distance to a point (m, map frame); None in an empty map."""
+        reach = _BUCKET_M
+        while reach <= _FAR_M:
+            best = min(self.nodes_near(x, y, reach), key=lambda n: (n.x - x) ** 2 + (n.y - y) ** 2, default=None)
+            if best is not None and (best.x - x) ** 2 + (best.y - y) ** 2 <= reach**2:
+                return best
+            reach *= 2.0
         return min(self.nodes.values(), key=lambda n: (n.x - x) ** 2 + (n.y - y) ** 2, default=None)
+
+    def nodes_near(self, x: float, y: float, reach_m: float) -> list[Node]:
+        """All nodes within a reach of a point (m, map frame), by id; some that are farther off may be among them."""
+        return [self.nodes[i] for i in self._places.near(x, y, reach_m)]
 
     def nearest_edge_point(self, x: float, y: float) -> tuple[int, int, float] | None:
         """Edge id, index into its path, and distance in m, of the path point nearest to a point; None without edges."""

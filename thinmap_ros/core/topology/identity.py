@@ -1,7 +1,6 @@
 """Ids that stay with a place: the global map's nodes and edges, brought up to date with what the atlas holds."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -55,7 +54,7 @@ class Registry:
         self._nodes = {(owner, index): node for owner, index, node in state['places'].tolist()}
         self._next_id = int(state['next_id'][0])
         for place, node in self._places(atlas, set(atlas.spots), set(atlas.chains)):
-            self.map.put_node(replace(node, id=self._nodes[place]))
+            self.map.put_node(_named(node, self._nodes[place]))
         ids: dict[int, list[int]] = {}
         for chain, edge in state['edges'].tolist():
             ids.setdefault(chain, []).append(edge)
@@ -91,7 +90,7 @@ class Registry:
         places = self._places(atlas, spots, chains)
         self._name([(place, node) for place, node in places if place not in self._nodes], old_nodes)
         for place, node in places:
-            self.map.put_node(replace(node, id=self._nodes[place]))
+            self.map.put_node(_named(node, self._nodes[place]))
         for number in sorted(chains & atlas.chains.keys()):
             self._put_edges(atlas, number, old)
         for left in old.values():
@@ -195,6 +194,10 @@ class Registry:
     def _new_id(self) -> int:
         self._next_id += 1
         return self._next_id - 1
+
+
+def _named(node: Node, number: int) -> Node:
+    return Node(number, node.kind, node.x, node.y, node.clearance_m)
 
 
 @kernel

@@ -10,9 +10,10 @@ from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.corners import corner_indices
-from thinmap_ros.core.topology.free_space import column_distance, known_free, reachable, squared_clearance, true_cells
+from thinmap_ros.core.topology.free_space import column_distance, known_free, squared_clearance, true_cells
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.core.topology.net import DONE, Net, net_of, state_of, web_of_net
+from thinmap_ros.core.topology.parts import reachable
 from thinmap_ros.core.topology.simplify import simplify_net
 from thinmap_ros.core.topology.spurs import Limits, Outlook
 from thinmap_ros.core.topology.thinning import thin

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.jit import kernel
-from thinmap_ros.core.topology.free_space import label, true_cells
+from thinmap_ros.core.topology.free_space import true_cells
+from thinmap_ros.core.topology.parts import label
 from thinmap_ros.core.topology.thinning import thin
 
 Mask = NDArray[np.bool_]
@@ -53,7 +54,8 @@ def stitch(seam: Seam, joined_outside: Grouping) -> Mask:
         if _share_free_space(parts, free_parts, len(free_sizes)):
             _bridge_parts(result, seam.free, parts, len(sizes) - 1, joined_outside(parts))
             parts, sizes = label(result)
-        result &= _held(result, parts, len(sizes), kept | _part_of(seam.robot, free_parts, len(free_sizes)))
+        robot = int(free_parts[seam.robot[0, 0], seam.robot[0, 1]]) if len(seam.robot) else 0
+        _keep_held(result, parts, len(sizes), kept, free_parts, robot)
         sizes = label(result)[1]
     if euler_number(result) < len(sizes) - 1 and _fill_empty_loops(result, seam.free):
         result = thin(result)
@@ -107,19 +109,22 @@ def _bridge_parts(
         owner[owner == number] = _draw_way(result, free, owner[parts], number)
 
 
-def _part_of(places: Cells, parts: NDArray[np.int32], count: int) -> Mask:
-    """Cells of those of the `count` - 1 parts in which some places (N, 2) lie."""
-    chosen = np.zeros(count, dtype=np.bool_)
-    chosen[parts[places[:, 0], places[:, 1]]] = True
-    chosen[0] = False
-    return chosen[parts]
+@kernel
+def _keep_held(
+    result: Mask, parts: NDArray[np.int32], count: int, kept: Mask, free_parts: NDArray[np.int32], robot: int
+) -> None:
+    """Clear, in place, those of the `count` - 1 parts of the result without a kept cell or one in the robot's part.
 
-
-def _held(result: Mask, parts: NDArray[np.int32], count: int, held: Mask) -> Mask:
-    """Cells of those of the `count` - 1 parts of the result that have a cell in `held`."""
-    keep = np.zeros(count, dtype=np.bool_)
-    keep[parts[result & held]] = True
-    return keep[parts]
+    robot: the number of the part of the free space in which it is; 0: in none.
+    """
+    held = np.zeros(count, dtype=np.bool_)
+    for row in range(result.shape[0]):
+        for col in range(result.shape[1]):
+            if result[row, col] and (kept[row, col] or (robot > 0 and free_parts[row, col] == robot)):
+                held[parts[row, col]] = True
+    for row in range(result.shape[0]):
+        for col in range(result.shape[1]):
+            result[row, col] &= held[parts[row, col]]
 
 
 def _draw_line(result: Mask, free: Mask, anchor: Cells, targets: Cells) -> None:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
+from thinmap_ros.core.grid.patch import FREE_AT_MOST, OCCUPIED_AT_LEAST, UNKNOWN, GridPatch
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.topology.atlas import Box
 from thinmap_ros.core.topology.config import TopologyConfig
@@ -57,7 +57,7 @@ class Surroundings:
         if max(window.shape) + 2 * self._margin > self._size:
             raise InputError(f'window of {window.shape} cells: expected the size of the first one')
         self._move_to(row, col, window.shape)
-        states = np.where(window.free, FREE, np.where(window.occupied, OCCUPIED, np.int8(UNKNOWN)))
+        states = _states(np.ascontiguousarray(window.cells))
         for cells, memory in self._parts(whole):
             self._memory[memory] = states[cells]
         self.near = whole.middle(self._near)
@@ -144,6 +144,18 @@ def _wrapped(first: int, count: int, size: int) -> list[tuple[slice, slice]]:
     head = min(count, size - at)
     runs = [(slice(0, head), slice(at, at + head))]
     return runs if head == count else [*runs, (slice(head, count), slice(0, count - head))]
+
+
+@kernel
+def _states(cells: States) -> States:
+    """FREE, OCCUPIED or UNKNOWN for each cell (H, W) of a patch."""
+    states = np.empty(cells.shape, dtype=np.int8)
+    for row in range(cells.shape[0]):
+        for col in range(cells.shape[1]):
+            cell = cells[row, col]
+            blocked = OCCUPIED if cell >= OCCUPIED_AT_LEAST else np.int8(UNKNOWN)
+            states[row, col] = FREE if 0 <= cell <= FREE_AT_MOST else blocked
+    return states
 
 
 @kernel

@@ -16,9 +16,7 @@ from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.free_space import (
     column_distance,
     known_free,
-    label,
     nearest_cell,
-    reachable,
     select_free_space,
     squared_clearance,
     standing_room,
@@ -27,6 +25,7 @@ from thinmap_ros.core.topology.free_space import (
 from thinmap_ros.core.topology.graph import Node, TopologicalMap
 from thinmap_ros.core.topology.identity import Registry
 from thinmap_ros.core.topology.net import dissolve_all, draw, web_of_net
+from thinmap_ros.core.topology.parts import label, reachable
 from thinmap_ros.core.topology.simplify import simplify
 from thinmap_ros.core.topology.skeleton import Measure, extract, map_of, net_along, simplified, skeleton_of
 from thinmap_ros.core.topology.spurs import Limits, Outlook

@@ -1,0 +1,28 @@
+"""Numbers found by place."""
+
+import numpy as np
+
+from thinmap_ros.core.grid.buckets import Buckets
+
+
+def test_all_that_is_near_is_found_and_little_else():
+    rng = np.random.default_rng(0)
+    places, buckets = rng.uniform(-50.0, 50.0, (500, 2)), Buckets(4.0)
+    for number, (x, y) in enumerate(places.tolist()):
+        buckets.put(number, x, y)
+    for x, y in rng.uniform(-60.0, 60.0, (50, 2)).tolist():
+        found = buckets.near(x, y, 7.0)
+        away = np.abs(places - (x, y)).max(axis=1)
+        assert set(np.flatnonzero(away <= 7.0).tolist()) <= set(found)
+        assert (away[found] <= 7.0 + 4.0).all()
+        assert found == sorted(set(found))
+
+
+def test_what_moves_is_found_where_it_is_now():
+    buckets = Buckets(1.0)
+    buckets.put(3, 0.5, 0.5)
+    buckets.put(3, 10.5, 0.5)
+    assert buckets.near(0.5, 0.5, 1.0) == [] and buckets.near(10.0, 0.0, 1.0) == [3]
+    buckets.drop(3)
+    buckets.drop(3)
+    assert buckets.near(10.0, 0.0, 1.0) == []

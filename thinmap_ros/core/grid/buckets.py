@@ -1,0 +1,38 @@
+"""Places by number, found again near a point without looking at all of them."""
+
+import math
+
+
+class Buckets:
+    """Which numbers lie in which square of the plane; what is near costs the same however many lie elsewhere."""
+
+    def __init__(self, edge_m: float) -> None:
+        self._edge_m = edge_m
+        self._numbers: dict[tuple[int, int], set[int]] = {}
+        self._bucket_of: dict[int, tuple[int, int]] = {}
+
+    def put(self, number: int, x: float, y: float) -> None:
+        """Add a number at a point, or move it there, m."""
+        bucket = (math.floor(x / self._edge_m), math.floor(y / self._edge_m))
+        if self._bucket_of.get(number) != bucket:
+            self.drop(number)
+            self._bucket_of[number] = bucket
+            self._numbers.setdefault(bucket, set()).add(number)
+
+    def drop(self, number: int) -> None:
+        """Forget a number, if it is known."""
+        bucket = self._bucket_of.pop(number, None)
+        if bucket is not None:
+            self._numbers[bucket].discard(number)
+            if not self._numbers[bucket]:
+                del self._numbers[bucket]
+
+    def near(self, x: float, y: float, reach_m: float) -> list[int]:
+        """All numbers within a reach of a point, m, in order; some that are farther off may be among them."""
+        low_col, high_col = (math.floor((x + reach) / self._edge_m) for reach in (-reach_m, reach_m))
+        low_row, high_row = (math.floor((y + reach) / self._edge_m) for reach in (-reach_m, reach_m))
+        found: list[int] = []
+        for col in range(low_col, high_col + 1):
+            for row in range(low_row, high_row + 1):
+                found.extend(self._numbers.get((col, row), ()))
+        return sorted(found)
