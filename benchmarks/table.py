@@ -27,15 +27,15 @@ def at_least(what: str, value: float, limit: float, unit: str = '') -> Row:
 
 
 COLUMNS = ('what', 'value', 'target', 'verdict')
-_VERDICTS = {True: 'ok', False: 'MISSED', None: ''}
+VERDICTS = {True: 'ok', False: 'MISSED', None: ''}
 
 
 def show(rows: Iterable[Row], path: Path | None = None) -> None:
     """Print rows under each other, each as soon as it is there, and write them to a CSV file where one is wished."""
     shown = []
     for row in rows:
-        shown.append((row.what, row.value, row.target, _VERDICTS[row.good]))
-        print(f'{row.what:<58} {row.value:>16}  {row.target:<18} {_VERDICTS[row.good]}', flush=True)
+        shown.append((row.what, row.value, row.target, VERDICTS[row.good]))
+        print(f'{row.what:<58} {row.value:>16}  {row.target:<18} {VERDICTS[row.good]}', flush=True)
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open('w', encoding='utf-8', newline='') as file:
