@@ -27,14 +27,16 @@ __all__ = ['GlobalLocalization', 'GlobalLocalizationConfig', 'Hypothesis', 'Resu
 _NEW_WAY_M, _NEW_TURN_RAD = 0.5, 0.5
 # Independent looks that a place must have explained: more for each e-fold of places that looked alike, and for each
 # look before it turned up. A look counts the less, the more it leaves unexplained of what it should explain in this
-# map, and nothing from a share on: from this in smooth maps, from more in rough ones, where that varies with the place.
+# map, and nothing from a share on: so many sigma of what that varies from place to place, but no less than the least
+# (few scans were made in the map), no more than the most, and more in rough maps, which draw things in part.
 _SURE_LOOKS, _SURE_LOOKS_CROWD, _SURE_LOOKS_LATE = 1.0, 0.75, 2.0
-_WORTHLESS, _WORTHLESS_ROUGH = 0.03, 0.5
+_WORTHLESS_SIGMAS, _LEAST_WORTHLESS, _MOST_WORTHLESS, _WORTHLESS_ROUGH = 3.0, 0.005, 0.03, 0.5
 # After so many independent looks, a place that explains must have lasted for this share of them, but not for ever.
 _MANY_LOOKS, _LASTING_SHARE, _LASTING_LOOKS = 16.0, 0.4, 20.0
 _VIEWS = 6
 _FRESH_SHARE = 0.2  # of the samples that are drawn anew all over the map while the search is on
 _FRESH_BEST = 100
+_LOOKED_ALONG = 300  # samples whose beams are followed, where the likeliest pose of a place leaves some unexplained
 _JUMP_RAD = 2.0
 _STANDING_NOISE = (0.01, 0.005)  # m, rad: samples do not fall together
 # A search that looked at all of the map and did not find the right place: this often. So who turns up late is unlikely,
@@ -106,7 +108,7 @@ class GlobalLocalization:
         self._rng = np.random.default_rng(seed)
         self._model: NodeModel | None = None
         self._judge: Judge | None = None
-        self._usual = 1.0  # share that the right place explains in this map
+        self._usual, self._spread = 1.0, 0.0  # share that the right place explains in this map
         self.restart()
 
     def restart(self) -> None:
@@ -189,15 +191,18 @@ class GlobalLocalization:
     def _refined(self, judge: Judge, seen: Observation) -> Array:
         """Poses (H, 3) of the hypotheses where this scan fits best; samples that fit lead out of a dead end."""
         known = self._known
-        others = known.best_samples(judge.log_likelihoods(known.samples, seen)) if len(known.samples) else None
-        return judge.refined(known.poses, seen, known.covariances, others)
+        if not len(known.samples):
+            return judge.refined(known.poses, seen, known.covariances)
+        others = known.best_samples(judge.log_likelihoods(known.samples, seen))
+        poses = judge.refined(known.poses, seen, known.covariances, others)
+        return judge.unblocked(poses, seen, known.some_samples(_LOOKED_ALONG))
 
     def _ready(self, scan: Scan) -> Judge:
         """The judge; the first scan tells which laser it is for."""
         if self._judge is None:
             self._model = calibrate(self.places, scan, self.config, self._rng)
             self._judge = Judge(self.places, self.config, self._model)
-            self._usual = usual_share(self.places, self._judge, scan, self.config, self._rng)
+            self._usual, self._spread = usual_share(self.places, self._judge, scan, self.config, self._rng)
         return self._judge
 
     def _advance(self, T_odom_base: Array) -> None:
@@ -274,7 +279,8 @@ class GlobalLocalization:
         age, missing = float(self._known.ages[best]), 1.0 - float(self._fits[best])
         needed = _SURE_LOOKS + _SURE_LOOKS_CROWD * math.log(self._crowd)
         needed += _SURE_LOOKS_LATE * (self._independent - age)
-        worthless = _WORTHLESS + _WORTHLESS_ROUGH * (1.0 - self._usual)
+        worthless = min(max(_WORTHLESS_SIGMAS * self._spread, _LEAST_WORTHLESS), _MOST_WORTHLESS)
+        worthless += _WORTHLESS_ROUGH * (1.0 - self._usual)
         return age * (1.0 - missing / worthless) >= needed
 
     def _speaks_for_one(self) -> bool:
@@ -294,8 +300,8 @@ class GlobalLocalization:
         """Hypotheses (H,) that explain enough, and have done so for some time where much has been seen."""
         known = self._known
         enough = self._fits >= self.config.least_explained
-        if self._independent < _MANY_LOOKS:
-            return enough
+        if self._independent < _MANY_LOOKS or not self._searches:
+            return enough  # what was not looked at may be the right place, and new
         return np.asarray(enough & (known.ages >= min(_LASTING_SHARE * self._independent, _LASTING_LOOKS)))
 
     def _waiting(self, reason: str) -> Result:
