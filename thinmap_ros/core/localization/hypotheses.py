@@ -75,6 +75,11 @@ class Hypotheses:
         return len(self.poses)
 
     @property
+    def are_too_many(self) -> bool:
+        """Whether there may be more places than can be kept."""
+        return len(self) == _MOST
+
+    @property
     def log_weights(self) -> Array:
         """Log odds (H,), the best one 0.
 
