@@ -27,10 +27,10 @@ __all__ = ['GlobalLocalization', 'GlobalLocalizationConfig', 'Hypothesis', 'Resu
 _NEW_WAY_M, _NEW_TURN_RAD = 0.5, 0.5
 # Independent looks that a place must have explained: more for each e-fold of places that looked alike, and for each
 # look before it turned up. A look counts the less, the more it leaves unexplained of what it should explain in this
-# map, and nothing from a share on: so many sigma of what that varies from place to place (no less than the least: few
-# scans were made in the map; no more than the most), and more in rough maps, which draw things in part.
+# map, and nothing from a share on: so many times what the right one leaves unexplained there (no less than the least,
+# as few scans were made in the map; no more than the most), and more in rough maps, which draw things in part.
 _SURE_LOOKS, _SURE_LOOKS_CROWD, _SURE_LOOKS_LATE = 1.0, 0.75, 2.0
-_WORTHLESS_SIGMAS, _LEAST_WORTHLESS, _MOST_WORTHLESS, _WORTHLESS_ROUGH = 3.0, 0.0075, 0.03, 0.5
+_WORTHLESS_TIMES, _LEAST_WORTHLESS, _MOST_WORTHLESS, _WORTHLESS_ROUGH = 10.0, 0.0075, 0.03, 0.5
 # After so many independent looks, a place that explains must have lasted for this share of them, but not for ever.
 _MANY_LOOKS, _LASTING_SHARE, _LASTING_LOOKS = 16.0, 0.4, 20.0
 _VIEWS = 6
@@ -108,7 +108,7 @@ class GlobalLocalization:
         self._rng = np.random.default_rng(seed)
         self._model: NodeModel | None = None
         self._judge: Judge | None = None
-        self._usual, self._spread = 1.0, 0.0  # share that the right place explains in this map
+        self._usual = 1.0  # share that the right place explains in this map
         self.restart()
 
     def restart(self) -> None:
@@ -205,7 +205,7 @@ class GlobalLocalization:
         if self._judge is None:
             self._model = calibrate(self.places, scan, self.config, self._rng)
             self._judge = Judge(self.places, self.config, self._model)
-            self._usual, self._spread = usual_share(self.places, self._judge, scan, self.config, self._rng)
+            self._usual = usual_share(self.places, self._judge, scan, self.config, self._rng)
         return self._judge
 
     def _advance(self, T_odom_base: Array) -> None:
@@ -280,12 +280,13 @@ class GlobalLocalization:
             return False
         best = self._known.best()
         age, missing = float(self._known.ages[best]), 1.0 - float(self._fits[best])
-        varies = min(max(_WORTHLESS_SIGMAS * self._spread, _LEAST_WORTHLESS), _MOST_WORTHLESS)
+        rough = 1.0 - self._usual
+        varies = min(max(_WORTHLESS_TIMES * rough, _LEAST_WORTHLESS), _MOST_WORTHLESS)
         needed = _SURE_LOOKS + _SURE_LOOKS_CROWD * math.log(self._crowd)
         # Bare walls explain the same share everywhere, at wrong places, too: there it takes more of them.
         needed *= _MOST_WORTHLESS / varies
         needed += _SURE_LOOKS_LATE * max(self._overview - age, 0.0)
-        return age * (1.0 - missing / (varies + _WORTHLESS_ROUGH * (1.0 - self._usual))) >= needed
+        return age * (1.0 - missing / (varies + _WORTHLESS_ROUGH * rough)) >= needed
 
     def _speaks_for_one(self) -> bool:
         known, config = self._known, self.config
