@@ -28,7 +28,7 @@ def at_least(what: str, value: float, limit: float, unit: str = '') -> Row:
 
 
 COLUMNS = ('what', 'value', 'target', 'verdict')
-_VERDICTS = {True: 'ok', False: 'MISSED', None: ''}
+VERDICTS = {True: 'ok', False: 'MISSED', None: ''}
 
 
 def show(rows: Iterable[Row], path: Path | None = None) -> None:
@@ -41,7 +41,7 @@ def show(rows: Iterable[Row], path: Path | None = None) -> None:
             writer = csv.writer(file, lineterminator='\n')
             writer.writerow(COLUMNS)
         for row in rows:
-            shown = (row.what, row.value, row.target, _VERDICTS[row.good])
-            print(f'{row.what:<58} {row.value:>16}  {row.target:<18} {_VERDICTS[row.good]}', flush=True)
+            shown = (row.what, row.value, row.target, VERDICTS[row.good])
+            print(f'{row.what:<58} {row.value:>16}  {row.target:<18} {VERDICTS[row.good]}', flush=True)
             if writer is not None:
                 writer.writerow(shown)

@@ -9,11 +9,11 @@ from small_floor import floor, map_of, world_of
 from thinmap_ros.core import se2
 from thinmap_ros.core.localization.active import ActiveSearch
 from thinmap_ros.core.localization.config import GlobalLocalizationConfig
-from thinmap_ros.core.localization.global_localization import GlobalLocalization, Hypothesis, Result, State
+from thinmap_ros.core.localization.global_localization import GlobalLocalization
 from thinmap_ros.core.localization.places import FREE, Places
 from thinmap_ros.core.localization.viewpoints import best_viewpoint, common_patch
 from thinmap_ros.core.planning.navigator import NavigatorConfig
-from thinmap_ros.sim.lms200 import Lms200, Lms200Config
+from thinmap_ros.sim.lms200 import Lms200Config
 from thinmap_ros.sim.pioneer import PioneerConfig
 from thinmap_ros.sim.runner import STEP_NS, Simulation
 from thinmap_ros.sim.tours import random_drive
@@ -93,18 +93,49 @@ def test_the_viewpoint_is_where_the_views_differ_and_in_reach_for_all_places(fin
         assert y > 2.0 + 6.0  # near the doors, far from the middle of the rooms
 
 
-def test_where_nothing_tells_places_apart_the_robot_stands():
+def everywhere(step_m=0.4):
+    """Odometry poses all over a room, with looks to all sides."""
+    x, y = np.meshgrid(np.arange(-7.0, 7.0, step_m), np.arange(-9.0, 9.0, step_m))
+    turns = np.arange(-3.0, 3.2, 0.7)
+    at = np.repeat(np.column_stack([x.ravel(), y.ravel()]), len(turns), axis=0)
+    return np.column_stack([at, np.tile(turns, x.size)])
+
+
+def test_where_nothing_tells_places_apart_the_robot_goes_on_and_stands_when_all_is_seen():
     shut = TWINS.copy()
     shut[70:72] = 100
     places = Places.of(*map_of(shut), CONFIG)
     starts = in_both_rooms(*STARTS[0])
-    assert best_viewpoint(places, np.zeros(3), starts, np.array([0.5, 0.5]), 15.0, NavigatorConfig()) is None
-    search = ActiveSearch(places, CONFIG, NavigatorConfig())
-    twins = tuple(Hypothesis(T, np.eye(3), 0.5, 1.0) for T in starts)
-    search.take(Result(State.AMBIGUOUS, '', twins), np.zeros(3))
-    scan = Lms200(Lms200Config(), 0).scan(world_of(shut), starts[0], 0)
-    command = search.step(np.zeros(3), scan, 0.1)
-    assert (command.v, command.w, command.state) == (0.0, 0.0, 'idle')
+    half, driving = np.array([0.5, 0.5]), NavigatorConfig()
+    view = best_viewpoint(places, np.zeros(3), starts, half, 15.0, driving)
+    assert view.gain == 0.0
+    assert np.hypot(*view.T_odom_view[:2]) > 2.0
+    seen = everywhere()
+    assert best_viewpoint(places, np.zeros(3), starts, half, 15.0, driving, seen) is None
+    ahead = seen[np.abs(se2.wrap(seen[:, 2])) < 1.5]
+    assert best_viewpoint(places, np.zeros(3), starts, half, 15.0, driving, ahead) is not None
+
+
+def test_what_is_beside_a_place_by_little_neither_closes_its_way_nor_is_told_apart(finder):
+    starts = in_both_rooms(*STARTS[0])
+    beside = np.array([se2.compose(T, se2.pose(0.4, 0.2, 0.1)) for T in starts])
+    weights = np.array([0.3, 0.3, 0.2, 0.2])
+    one = best_viewpoint(finder.places, np.zeros(3), starts, weights[:2], 15.0, NavigatorConfig())
+    four = best_viewpoint(
+        finder.places, np.zeros(3), np.concatenate([starts, beside]), weights, 15.0, NavigatorConfig()
+    )
+    assert np.array_equal(one.T_odom_view, four.T_odom_view)
+
+
+def test_where_all_but_the_own_place_has_been_looked_from_a_turn_there_is_new(finder):
+    # In front of its room's door, with its back to the corridor, which goes on to one side.
+    starts = np.array([[3.5, 9.9, -np.pi / 2.0], [9.5, 9.9, -np.pi / 2.0]])
+    seen = everywhere()
+    seen = np.concatenate([seen[np.hypot(seen[:, 0], seen[:, 1]) > 0.85], np.zeros((1, 3))])
+    view = best_viewpoint(finder.places, np.zeros(3), starts, np.array([0.5, 0.5]), 15.0, NavigatorConfig(), seen)
+    assert view.gain > 0.0
+    assert np.hypot(*view.T_odom_view[:2]) < 0.6
+    assert abs(view.T_odom_view[2]) > 0.8
 
 
 def test_of_what_places_have_in_common_nothing_is_lost(finder):

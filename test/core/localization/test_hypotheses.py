@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from thinmap_ros.core.localization.hypotheses import LOG_ODDS_A_BEAM, Hypotheses, allowed_beams, missed_beams
-from thinmap_ros.core.localization.search import SILENT_COUNTS
+from thinmap_ros.core.localization.hypotheses import Hypotheses, allowed_beams, missed_beams
+from thinmap_ros.core.localization.judging import LOG_ODDS_A_BEAM, SILENT_COUNTS
 
 
 def some(*poses, log_weights=None):

@@ -4,14 +4,16 @@ import math
 
 import numpy as np
 import pytest
-from small_floor import CELL_M, OFFICE, START, drive, map_of
+from small_floor import CELL_M, OFFICE, START, drive, floor, map_of
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.distance import distance_cells
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.localization import matching
+from thinmap_ros.core.localization.calibration import calibrate
 from thinmap_ros.core.localization.config import GlobalLocalizationConfig
-from thinmap_ros.core.localization.observation import observe, profile
+from thinmap_ros.core.localization.judging import Judge
+from thinmap_ros.core.localization.observation import observe, observed_beams, profile
 from thinmap_ros.core.localization.places import DIRECTIONS, NEAR_UNIT_M, RANGE_UNIT_M, SIGHT_UNIT_M, Places, free_way
 
 CONFIG = GlobalLocalizationConfig()
@@ -183,3 +185,16 @@ def test_distances_to_walls_are_exact_where_they_fit_a_byte(places):
     fits = exact < 1.0
     assert np.abs(near - exact)[fits].max() <= NEAR_UNIT_M
     assert (near[~fits] >= 1.0 - NEAR_UNIT_M).all()
+
+
+def test_of_poses_whose_beams_would_have_to_pass_walls_one_that_explains_them_is_taken():
+    hall = floor((20, 0, 22, 40), (20, 48, 22, 90), rows=60, cols=90)  # a door through which the robot looks
+    places = Places.of(*map_of(hall), CONFIG)
+    scan, _, T = next(drive(hall, (3.4, 2.8, 1.57), []))
+    judge = Judge(places, CONFIG, calibrate(places, scan, CONFIG, np.random.default_rng(0)))
+    seen = observed_beams(scan, CONFIG)
+    beside = T + np.array([0.45, 0.0, 0.0])
+    assert judge.explained(beside[None], seen)[0][0] < judge.explained(T[None], seen)[0][0]
+    others = np.stack([beside - (0.1, 0.0, 0.0), T])[None]
+    assert np.array_equal(judge.unblocked(beside[None], seen, others)[0], T)
+    assert np.array_equal(judge.unblocked(T[None], seen, others)[0], T)

@@ -16,6 +16,7 @@ from thinmap_ros.core.se2 import Array
 _LIKELY = 0.05  # of the weight of the best
 _THOUGHT_OVER_S = 4.0  # a goal stands so long, or until it is reached, or the number of places in question changes
 _CHANGED_S = 1.0  # but for so long at least
+_LOOK_M, _LOOK_RAD = 0.4, 0.4  # a look from elsewhere
 
 
 class ActiveSearch:
@@ -23,7 +24,8 @@ class ActiveSearch:
 
     The goal is where the views from the places in question differ most for the way; the path leads over what the map
     says is free for all of them, and the navigator stops in front of what the laser sees. Where one place only is in
-    question, any way confirms it; where nothing in reach tells the places apart, the robot stands.
+    question, any way confirms it; where nothing in reach tells the places apart, the robot goes on to what it has not
+    looked at yet, and stands only where there is no such thing.
     """
 
     def __init__(self, places: Places, config: GlobalLocalizationConfig, driving: NavigatorConfig) -> None:
@@ -31,16 +33,25 @@ class ActiveSearch:
         self._navigator = Navigator(driving)
         self._view: Viewpoint | None = None
         self._starts, self._weights = np.empty((0, 3)), np.empty(0)
+        self._looked = np.empty((0, 3))
         self._chosen_of = 0
         self._age_s = math.inf
 
     def take(self, result: Result, T_odom_base: Array) -> None:
         """Hear what a look at an odometry pose (3,) has brought."""
+        self._look(T_odom_base)
         most = max((h.weight for h in result.hypotheses), default=0.0)
         likely = [h for h in result.hypotheses if h.weight >= _LIKELY * most]
         T_base_odom = se2.invert(T_odom_base)
         self._starts = np.array([se2.compose(h.T_map_base, T_base_odom) for h in likely]).reshape(-1, 3)
         self._weights = np.array([h.weight for h in likely])
+
+    def _look(self, T_odom_base: Array) -> None:
+        """Remember where the robot has looked from."""
+        away = self._looked - T_odom_base
+        near = np.hypot(away[:, 0], away[:, 1]) < _LOOK_M
+        if not (near & (np.abs(se2.wrap(away[:, 2])) < _LOOK_RAD)).any():
+            self._looked = np.concatenate([self._looked, T_odom_base[None]])
 
     def step(self, T_odom_base: Array, scan: Scan, dt_s: float) -> Command:
         """Command for the next dt_s of a robot at an odometry pose (3,); idle where there is nothing to drive to."""
@@ -49,7 +60,7 @@ class ActiveSearch:
         if changed or self._age_s > _THOUGHT_OVER_S:
             self._choose(T_odom_base)
         if self._view is None:
-            return Command(0.0, 0.0, 'idle', 'nothing in reach tells the places apart')
+            return Command(0.0, 0.0, 'idle', 'nothing in reach tells the places apart, and all was looked at')
         command = self._navigator.step(T_odom_base, self._view.patch, scan, dt_s)
         if command.state in ('reached', 'failed', 'idle'):
             self._age_s = math.inf
@@ -59,7 +70,8 @@ class ActiveSearch:
         self._age_s, self._chosen_of, self._view = 0.0, len(self._starts), None
         if len(self._starts):
             self._view = best_viewpoint(
-                self._places, T_odom_base, self._starts, self._weights, self._range_m, self._driving
+                self._places, T_odom_base, self._starts, self._weights, self._range_m, self._driving,
+                self._looked,
             )
         if self._view is None:
             self._navigator.cancel()

@@ -27,14 +27,16 @@ __all__ = ['GlobalLocalization', 'GlobalLocalizationConfig', 'Hypothesis', 'Resu
 _NEW_WAY_M, _NEW_TURN_RAD = 0.5, 0.5
 # Independent looks that a place must have explained: more for each e-fold of places that looked alike, and for each
 # look before it turned up. A look counts the less, the more it leaves unexplained of what it should explain in this
-# map, and nothing from a share on: from this in smooth maps, from more in rough ones, where that varies with the place.
+# map, and nothing from a share on: so many times what the right one leaves unexplained there (no less than the least,
+# as few scans were made in the map; no more than the most), and more in rough maps, which draw things in part.
 _SURE_LOOKS, _SURE_LOOKS_CROWD, _SURE_LOOKS_LATE = 1.0, 0.75, 2.0
-_WORTHLESS, _WORTHLESS_ROUGH = 0.03, 0.5
+_WORTHLESS_TIMES, _LEAST_WORTHLESS, _MOST_WORTHLESS, _WORTHLESS_ROUGH = 10.0, 0.0075, 0.03, 0.5
 # After so many independent looks, a place that explains must have lasted for this share of them, but not for ever.
 _MANY_LOOKS, _LASTING_SHARE, _LASTING_LOOKS = 16.0, 0.4, 20.0
 _VIEWS = 6
 _FRESH_SHARE = 0.2  # of the samples that are drawn anew all over the map while the search is on
 _FRESH_BEST = 100
+_LOOKED_ALONG = 300  # samples whose beams are followed, where the likeliest pose of a place leaves some unexplained
 _JUMP_RAD = 2.0
 _STANDING_NOISE = (0.01, 0.005)  # m, rad: samples do not fall together
 # A search that looked at all of the map and did not find the right place: this often. So who turns up late is unlikely,
@@ -118,7 +120,8 @@ class GlobalLocalization:
         self._way_m = 0.0
         self._independent = 0.0  # looks
         self._since_search = math.inf
-        self._searches = 0  # that were complete
+        self._searches = 0  # that were complete, since there were not too many places to keep
+        self._overview = 0.0  # looks in which all places that explain them have been known
         self._convinced = 0  # looks in a row at which all spoke for one place
         self._crowd = 1.0  # how many places looked alike at the most, counted by their weights
         self._drawn = self._draw(self.config.samples)
@@ -177,20 +180,25 @@ class GlobalLocalization:
             judged = judge.explained(known.poses, seen)
             known.take_evidence(judged, len(seen.ranges_m), novelty)
             known.prune()
+            self._searches *= not known.are_too_many
             known.resample(None, self.config.samples, self._rng) if not len(known.samples) else None
             logs = judge.log_likelihoods(known.samples, seen)
             known.weigh(logs)
             known.resample(logs, self.config.samples, self._rng)
         if len(known):
             self._crowd = max(self._crowd, float(np.exp(known.log_weights).sum()))
+        self._overview = self._overview + novelty if self._searches else 0.0
         self._convinced = self._convinced + 1 if self._speaks_for_one() else 0
         self._T_look = T_odom_base
 
     def _refined(self, judge: Judge, seen: Observation) -> Array:
         """Poses (H, 3) of the hypotheses where this scan fits best; samples that fit lead out of a dead end."""
         known = self._known
-        others = known.best_samples(judge.log_likelihoods(known.samples, seen)) if len(known.samples) else None
-        return judge.refined(known.poses, seen, known.covariances, others)
+        if not len(known.samples):
+            return judge.refined(known.poses, seen, known.covariances)
+        others = known.best_samples(judge.log_likelihoods(known.samples, seen))
+        poses = judge.refined(known.poses, seen, known.covariances, others)
+        return judge.unblocked(poses, seen, known.some_samples(_LOOKED_ALONG))
 
     def _ready(self, scan: Scan) -> Judge:
         """The judge; the first scan tells which laser it is for."""
@@ -272,10 +280,13 @@ class GlobalLocalization:
             return False
         best = self._known.best()
         age, missing = float(self._known.ages[best]), 1.0 - float(self._fits[best])
+        rough = 1.0 - self._usual
+        varies = min(max(_WORTHLESS_TIMES * rough, _LEAST_WORTHLESS), _MOST_WORTHLESS)
         needed = _SURE_LOOKS + _SURE_LOOKS_CROWD * math.log(self._crowd)
-        needed += _SURE_LOOKS_LATE * (self._independent - age)
-        worthless = _WORTHLESS + _WORTHLESS_ROUGH * (1.0 - self._usual)
-        return age * (1.0 - missing / worthless) >= needed
+        # Bare walls explain the same share everywhere, at wrong places, too: there it takes more of them.
+        needed *= _MOST_WORTHLESS / varies
+        needed += _SURE_LOOKS_LATE * max(self._overview - age, 0.0)
+        return age * (1.0 - missing / (varies + _WORTHLESS_ROUGH * rough)) >= needed
 
     def _speaks_for_one(self) -> bool:
         known, config = self._known, self.config
@@ -294,9 +305,9 @@ class GlobalLocalization:
         """Hypotheses (H,) that explain enough, and have done so for some time where much has been seen."""
         known = self._known
         enough = self._fits >= self.config.least_explained
-        if self._independent < _MANY_LOOKS:
+        if self._overview < _MANY_LOOKS:
             return enough
-        return np.asarray(enough & (known.ages >= min(_LASTING_SHARE * self._independent, _LASTING_LOOKS)))
+        return np.asarray(enough & (known.ages >= min(_LASTING_SHARE * self._overview, _LASTING_LOOKS)))
 
     def _waiting(self, reason: str) -> Result:
         return Result(State.WAITING, reason, ())

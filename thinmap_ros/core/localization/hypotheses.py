@@ -7,11 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.jit import kernel
-from thinmap_ros.core.localization.search import SILENT_COUNTS, distinct_indices, moved
+from thinmap_ros.core.localization.judging import LOG_ODDS_A_BEAM, SILENT_COUNTS
+from thinmap_ros.core.localization.search import distinct_indices, moved
 from thinmap_ros.core.se2 import Array
 
-# A beam that one place explains and another does not: about 1 in log odds, but beams that miss come in groups.
-LOG_ODDS_A_BEAM = 0.35
 # Shares of the beams that fall to either side at edges: by chance, and, as the cells of the map lie, always.
 _EDGE_SHARE, _LASTING_SHARE = 0.05, 0.01
 _SIGMAS = 3.0
@@ -74,6 +73,11 @@ class Hypotheses:
 
     def __len__(self) -> int:
         return len(self.poses)
+
+    @property
+    def are_too_many(self) -> bool:
+        """Whether there may be more places than can be kept."""
+        return len(self) == _MOST
 
     @property
     def log_weights(self) -> Array:
@@ -152,6 +156,15 @@ class Hypotheses:
         owners = renumbered[self.owners]
         order = np.argsort(owners, kind='stable')[int((owners < 0).sum()) :]
         self.samples, self.owners = self.samples[order], owners[order]
+
+    def some_samples(self, total: int) -> Array:
+        """Some of the samples of each, as many for all: (H, K, 3); those of one without any are its pose."""
+        count = max(1, total // len(self))
+        bounds = np.searchsorted(self.owners, np.arange(len(self) + 1))
+        sizes = np.diff(bounds)
+        picks = bounds[:-1, None] + np.arange(count) * sizes[:, None] // count
+        some = self.samples[np.minimum(picks, len(self.samples) - 1)]
+        return np.where(sizes[:, None, None] > 0, some, self.poses[:, None])
 
     def best_samples(self, log_likelihoods: Array) -> Array:
         """Of the samples of each, the one with the highest log likelihood (N,); its pose where it has none: (H, 3)."""

@@ -11,6 +11,10 @@ from thinmap_ros.core.localization.observation import Observation
 from thinmap_ros.core.localization.places import NEAR_UNIT_M, Places
 from thinmap_ros.core.se2 import Array
 
+# A beam that one place explains and another does not: about 1 in log odds, but beams that miss come in groups.
+LOG_ODDS_A_BEAM = 0.35
+# A beam of which the map says nothing, counted in beams that it explains: what is unknown there may well be like that.
+SILENT_COUNTS = 0.75
 _SIGMAS = 3.0
 # From afar to near: how wide a wall's pull is, 1 sigma, m, and the steps uphill, m and rad.
 _PULLS: tuple[tuple[float, Array], ...] = (
@@ -78,6 +82,28 @@ class Judge:
             other, other_score = self._uphill(others, seen, self._log_table, _FINE_STEPS, poses, held)
             best = np.where((other_score > score)[:, None], other, best)
         return best
+
+    def unblocked(self, poses: Array, seen: Observation, others: Array) -> Array:
+        """Poses (N, 3), or, of others (N, K, 3), what explains more beams where those leave some unexplained.
+
+        Ends of beams alone do not tell how far along a corridor a robot is that looks through a door: from beside the
+        door, they end on walls just as well, but on their way they would have to pass one.
+        """
+        left = np.flatnonzero(self._left_out(poses, seen) > 0.0)
+        if not len(left):
+            return poses
+        tried = np.concatenate([poses[left, None], others[left]], axis=1)
+        flat = tried.reshape(-1, 3)
+        worth = self.log_likelihoods(flat, seen) - LOG_ODDS_A_BEAM * self._left_out(flat, seen)
+        best = worth.reshape(len(left), -1).argmax(axis=1)
+        result = poses.copy()
+        result[left] = tried[np.arange(len(left)), best]
+        return result
+
+    def _left_out(self, poses: Array, seen: Observation) -> Array:
+        """How many beams the map does not explain from poses (N, 3), (N,)."""
+        counts, silent = self.explained(poses, seen)
+        return np.asarray(len(seen.ranges_m) - counts - SILENT_COUNTS * silent)
 
     def _uphill(
         self, poses: Array, seen: Observation, table: Array, steps: Array, expected: Array, held: Array

@@ -1,7 +1,7 @@
 """What one scan shows: some of its beams, and the nodes of its own topological map."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,12 @@ class Observation:
 
 def observe(scan: Scan, resolution_m: float, config: GlobalLocalizationConfig) -> Observation:
     """Observation of a scan; the nodes are those of a grid with the map's resolution."""
+    nodes, kinds = observed_nodes(scan, resolution_m, config)
+    return replace(observed_beams(scan, config), nodes=nodes, node_kinds=kinds)
+
+
+def observed_beams(scan: Scan, config: GlobalLocalizationConfig) -> Observation:
+    """Observation of a scan without its nodes: beams alone."""
     usable = np.flatnonzero(scan.hit | scan.no_return)
     if usable.size > config.beams:
         usable = usable[np.linspace(0.0, usable.size - 1.0, config.beams).round().astype(np.int64)]
@@ -53,8 +59,8 @@ def observe(scan: Scan, resolution_m: float, config: GlobalLocalizationConfig) -
     ends = se2.transform_points(
         scan.T_base_laser, np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
     )
-    nodes, kinds = observed_nodes(scan, resolution_m, config)
-    return Observation(scan.T_base_laser, ranges, bearings, ends, met, nodes, kinds)
+    none = np.empty(0, dtype=np.int64)
+    return Observation(scan.T_base_laser, ranges, bearings, ends, met, np.empty((0, 2)), none)
 
 
 def observed_nodes(

@@ -6,13 +6,11 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.localization import matching
-from thinmap_ros.core.localization.judging import Judge
+from thinmap_ros.core.localization.judging import SILENT_COUNTS, Judge
 from thinmap_ros.core.localization.observation import Observation, profile
 from thinmap_ros.core.localization.places import DIRECTIONS, RANGE_UNIT_M, Places
 from thinmap_ros.core.se2 import Array
 
-# A beam of which the map says nothing, counted in beams that it explains: what is unknown there may well be like that.
-SILENT_COUNTS = 0.75
 _FEWEST_WALLS = 6  # beams that met something, below which a scan could be anywhere
 _MOST_SPOTS = 3000
 _MOST_LOOKED_AT_TWICE = 600

@@ -12,6 +12,7 @@ from thinmap_ros.core.grid.patch import UNKNOWN as UNKNOWN_CELL
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.localization.places import FREE, UNKNOWN, WALL, Bytes, Places, free_way
+from thinmap_ros.core.localization.search import distinct_indices
 from thinmap_ros.core.planning.reach import let_out, standing_places
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, navigation_function
 from thinmap_ros.core.se2 import Array
@@ -24,15 +25,19 @@ _BEARINGS = 24
 _DIFFERENT_M, _DIFFERENT_SHARE, _ENOUGH = 0.4, 0.1, 0.25
 _LEAST_GAIN = 0.05
 _CONFIRMED_M = 5.0  # of way, where one place only is left: it has then been seen from enough sides
-_NEAREST_M, _WAY_M = 0.5, 2.0  # nearer than this there is nothing new; so much way costs half of what is gained
+_NEAREST_M, _WAY_M = 0.5, 2.0  # nearer than this only a turn shows new things; so much way costs half of what is gained
+# Places this near to each other are one that is not known closely: nothing has to tell them apart.
+_SAME_M, _SAME_RAD = 1.0, 0.35
+# Who has looked from this near, and turned no more than this away, has seen it.
+_LOOKED_M, _LOOKED_RAD = 0.8, 0.8
 
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
     """A place to drive to: pose (3,) in the odometry's frame, map of what all places have in common there, and gain.
 
-    The heading is towards what differs. gain: share of the pairs of places that are told apart there, by their
-    weights; 0 where one place only is left.
+    The heading is towards what differs, or onwards. gain: share of the pairs of places that are told apart there, by
+    their weights; 0 where one place only is left, or where nothing is known to differ.
     """
 
     T_odom_view: Array
@@ -41,25 +46,53 @@ class Viewpoint:
 
 
 def best_viewpoint(
-    places: Places, T_odom_base: Array, starts: Array, weights: Array, range_m: float, driving: WavefrontConfig
+    places: Places,
+    T_odom_base: Array,
+    starts: Array,
+    weights: Array,
+    range_m: float,
+    driving: WavefrontConfig,
+    looked: Array | None = None,
 ) -> Viewpoint | None:
     """Viewpoint for a robot at an odometry pose (3,), where T_map_odom may be any of (H, 3), with weights (H,).
 
-    The way there is free in the map, whichever it is: it is the same motion for all of them. range_m: how far views
-    are compared. None where no viewpoint in reach tells them apart.
+    The way there is free in the map, whichever it is: it is the same motion for all of them; it may be a turn only.
+    range_m: how far views are compared; looked (M, 3): odometry poses at which it has looked already, which are of no
+    use again. Where no viewpoint in reach tells places apart, the farthest that is new; None where none is.
     """
-    order = np.argsort(-weights, kind='stable')[:_MOST_PLACES]
-    starts, weights = starts[order], weights[order]
+    looked = np.empty((0, 3)) if looked is None else looked
+    starts, weights = _distinct(T_odom_base, starts, weights)
     patch = common_patch(places, T_odom_base, starts)
     at, ways = _in_reach(patch, T_odom_base, driving)
-    if not len(at):
-        return None
     gains, bearings = _gains(places, starts, weights, at, range_m)
-    worth = gains if len(order) > 1 else np.minimum(ways / _CONFIRMED_M, 1.0)
-    best = int((worth / (ways + _WAY_M)).argmax())
-    if worth[best] < _LEAST_GAIN:
-        return None
-    return Viewpoint(se2.pose(at[best, 0], at[best, 1], bearings[best]), patch, float(gains[best]))
+    worth = gains if len(starts) > 1 else np.minimum(ways / _CONFIRMED_M, 1.0)
+    worth = np.where(_is_new(at, bearings, looked), worth, 0.0) / (ways + _WAY_M)
+    best = int(worth.argmax())
+    if worth[best] >= _LEAST_GAIN:
+        return Viewpoint(se2.pose(at[best, 0], at[best, 1], bearings[best]), patch, float(gains[best]))
+    onwards = np.arctan2(at[:, 1] - T_odom_base[1], at[:, 0] - T_odom_base[0])
+    onwards[ways == 0.0] = T_odom_base[2] + np.pi
+    far = np.where(_is_new(at, onwards, looked), ways, -1.0)
+    best = int(far.argmax())
+    return None if far[best] < 0.0 else Viewpoint(se2.pose(at[best, 0], at[best, 1], onwards[best]), patch, 0.0)
+
+
+def _distinct(T_odom_base: Array, starts: Array, weights: Array) -> tuple[Array, Array]:
+    """The likeliest of T_map_odom (H, 3), and their weights; of those with the robot at about the same place one.
+
+    What is as likely, but beside another by little, must neither close its way nor be told apart from it.
+    """
+    order = np.argsort(-weights, kind='stable')
+    robots = np.array([se2.compose(T, T_odom_base) for T in starts[order]])
+    kept = order[distinct_indices(robots, _SAME_M, _SAME_RAD, _MOST_PLACES)]
+    return starts[kept], weights[kept]
+
+
+def _is_new(at: Array, bearings: Array, looked: Array) -> NDArray[np.bool_]:
+    """Which views from points (N, 2) to bearings (N,) are not like any pose looked from (M, 3), (N,)."""
+    near = np.hypot(*(at[:, None] - looked[None, :, :2]).transpose(2, 0, 1)) < _LOOKED_M
+    same = np.abs(se2.wrap(bearings[:, None] - looked[None, :, 2])) < _LOOKED_RAD
+    return np.asarray(~(near & same).any(axis=1))
 
 
 def common_patch(places: Places, T_odom_base: Array, starts: Array) -> GridPatch:
@@ -98,7 +131,7 @@ def _common_states(
 
 
 def _in_reach(patch: GridPatch, T_odom_base: Array, driving: WavefrontConfig) -> tuple[Array, Array]:
-    """Points (N, 2) a spacing apart to which the robot can get, and the way there, (N,), m."""
+    """Points (N, 2) a spacing apart to which the robot can get, and the way there, (N,), m; where it is comes first."""
     resolution, xy = patch.frame.resolution, (float(T_odom_base[0]), float(T_odom_base[1]))
     standing = standing_places(patch.free, driving.robot_radius_m, resolution)
     ways = let_out(standing, patch.free, patch.frame, xy, driving.escape_m)
@@ -107,7 +140,8 @@ def _in_reach(patch: GridPatch, T_odom_base: Array, driving: WavefrontConfig) ->
     near_by = np.argwhere(standing & (metres >= _NEAREST_M) & np.isfinite(metres))
     step = max(1, round(_SPACING_M / resolution))
     cells = near_by[((near_by - middle) % step == 0).all(axis=1)]
-    return patch.frame.centres_of(cells), metres[cells[:, 0], cells[:, 1]]
+    at, far = patch.frame.centres_of(cells), metres[cells[:, 0], cells[:, 1]]
+    return np.concatenate([T_odom_base[None, :2], at]), np.concatenate([[0.0], far])
 
 
 def _gains(places: Places, starts: Array, weights: Array, at: Array, range_m: float) -> tuple[Array, Array]:
