@@ -19,8 +19,8 @@ _CHECK_AHEAD_M = 4.0
 _SWEEP_STEP_M = 0.03
 _CREEP_M_S = 0.02
 _ROUNDING_M_S = 1e-9
-# How much nearer than it is a point may come that is too near already, and up to how much nearer than the radius.
-_HAIR_M, _MOST_HAIRS_M = 0.005, 0.02
+# Where nothing else is left, points may come so much nearer than the body's radius, but only so slowly.
+_SQUEEZED_M, _SQUEEZED_M_S = 0.01, 0.1
 _AIM_RAD = 0.1
 _POINTS_M = 2.5  # so near, the laser's points count beside the map
 _REMEMBERED_M = 1.0
@@ -180,7 +180,7 @@ class Navigator:
         v, w = self._follower.command(T_map_base, self.path, dt_s)
         if v <= 0.0:
             return Command(v, w, 'driving')
-        allowed = self._safe_speed(T_map_base, v, w)
+        allowed = self._safe_speed(T_map_base, v, w, self.config.body_radius_m)
         if allowed >= v - _ROUNDING_M_S:
             self._blocked_s = 0.0
             return Command(v, w, 'driving')
@@ -188,6 +188,9 @@ class Navigator:
         if allowed > max(_CREEP_M_S, slowest):
             # Slower on the same arc.
             return Command(*self._follower.slowed(allowed, w * allowed / v), 'driving')
+        squeezed = self._squeezed_speed(T_map_base, min(v, _SQUEEZED_M_S), w / v)
+        if squeezed > _CREEP_M_S and slowest <= squeezed:
+            return Command(*self._follower.slowed(squeezed, w * squeezed / v), 'driving')
         self._follower.slowed(*before)
         return self._brake(T_map_base, dt_s) if slowest > 0.0 else self._face_obstacle(T_map_base, dt_s)
 
@@ -195,7 +198,7 @@ class Navigator:
         """Come to rest on the arc on which the robot is; at once where something has come into its way there too."""
         before = self._follower.v
         v, w = self._follower.stop(dt_s)
-        if self._safe_speed(T_map_base, before, w * before / v) < v:
+        if self._safe_speed(T_map_base, before, w * before / v, self.config.body_radius_m) < v:
             v, w = self._follower.slowed(0.0, 0.0)
         return Command(v, w, 'driving')
 
@@ -219,19 +222,19 @@ class Navigator:
         ahead = self.path[min(nearest + 3, len(self.path) - 1)]
         return math.atan2(ahead[1] - T_map_base[1], ahead[0] - T_map_base[0])
 
-    def _safe_speed(self, T_map_base: Array, v: float, w: float) -> float:
-        """Highest speed up to v from which the robot still stops before its body touches a point of the scan."""
+    def _squeezed_speed(self, T_map_base: Array, v: float, curvature: float) -> float:
+        """Highest speed up to v through a passage that is hardly wider than the robot: noise takes up the margin."""
+        return self._safe_speed(T_map_base, v, v * curvature, max(self.config.body_radius_m - _SQUEEZED_M, 0.0))
+
+    def _safe_speed(self, T_map_base: Array, v: float, w: float, radius_m: float) -> float:
+        """Highest speed up to v from which the robot still stops before a point of the scan is within a radius."""
         braking = self.config.max_acceleration_m_s2
         needed = v * self.config.reaction_s + v * v / (2.0 * braking)
-        free_m = self._free_length(T_map_base, w / v, needed)
+        count = math.ceil(needed / _SWEEP_STEP_M)
+        clear = _clear_steps_on_arc(T_map_base, w / v, needed, count, self._points_map, radius_m)
+        free_m = needed * clear / max(count, 1)
         late = self.config.reaction_s
         return min(v, braking * (math.sqrt(late * late + 2.0 * free_m / braking) - late))
-
-    def _free_length(self, T_map_base: Array, curvature: float, length_m: float) -> float:
-        """How far the body can be moved along an arc before a point comes nearer than its radius, up to length_m."""
-        count = math.ceil(length_m / _SWEEP_STEP_M)
-        clear = _clear_steps_on_arc(T_map_base, curvature, length_m, count, self._points_map, self.config.body_radius_m)
-        return length_m * clear / max(count, 1)
 
 
 @kernel
@@ -272,13 +275,11 @@ def _arc(start: Array, curvature: float, length_m: float, count: int) -> Array:
 def _clear_steps(centres: Array, points: Array, radius: float) -> int:
     """Index of the last centre (K, 2) that a disc can be moved to, one after the other, without touching points (N, 2).
 
-    A point that is too near to the first centre already only forbids to come still nearer: a hair does not count, but
-    many hairs would, one step after the other.
+    A point that is too near to the first centre already only forbids to come still nearer.
     """
     clear: int = centres.shape[0]
     for i in range(points.shape[0]):
-        now = math.hypot(points[i, 0] - centres[0, 0], points[i, 1] - centres[0, 1])
-        limit = min(radius, max(now - _HAIR_M, min(now, radius - _MOST_HAIRS_M)))
+        limit = min(radius, math.hypot(points[i, 0] - centres[0, 0], points[i, 1] - centres[0, 1]))
         for k in range(clear):
             if math.hypot(points[i, 0] - centres[k, 0], points[i, 1] - centres[k, 1]) < limit:
                 clear = k
