@@ -127,6 +127,7 @@ class Explorer:
         self._stamp_ns = scan.stamp_ns
         self._began_ns = min(self._began_ns, self._stamp_ns)
         surveyor, borders = self.surveyor, self.surveyor.borders
+        surveyor.trail.add(T_map_base)
         xy = (float(T_map_base[0]), float(T_map_base[1]))
         borders.update(patch, box_of_scan(scan, T_map_base))
         borders.examine(xy, self.config.close_look_m, directions_of_view(scan, T_map_base))

@@ -24,6 +24,7 @@ from thinmap_ros.core.exploration.stretches import middle_one, without_scraps
 from thinmap_ros.core.exploration.viewpoints import SQUARE
 from thinmap_ros.core.planning.grid_search import coarse, field_from, fine
 from thinmap_ros.core.planning.reach import are_near, let_out, renew_standing, standing_places
+from thinmap_ros.core.planning.trail import Trail
 from thinmap_ros.core.se2 import Array
 
 Cells = NDArray[np.int64]
@@ -82,6 +83,7 @@ class Surveyor:
         self.borders = OpenBorders(config.shortest_border_m)
         self.tracker = EndNodeTracker(config)
         self.stand_ins = EndNodeTracker(config)
+        self.trail = Trail()
         self.frame = self.borders.frame
         self.reached = self.maybe = self._standing = self.borders.mask
         self.ways: Array = np.zeros((0, 0))
@@ -183,7 +185,9 @@ class Surveyor:
     def _look_around(self, T_map_base: Array) -> None:
         self._renew_standing()
         free, standing, xy = self.borders.free, self._standing, (float(T_map_base[0]), float(T_map_base[1]))
-        ways = let_out(standing, free, self.frame, xy, _ESCAPE_M)
+        ways = let_out(standing, free, self.frame, xy, _ESCAPE_M).copy()
+        trail = self.trail.cells(self.frame, ways.shape)
+        ways[trail[:, 0], trail[:, 1]] |= free[trail[:, 0], trail[:, 1]]
         row, col = (int(v) for v in self.frame.cells_of(T_map_base[None, :2])[0])
         self.ways = field_from(coarse(ways, SQUARE), (row // SQUARE, col // SQUARE))
         self.reached = fine(np.isfinite(self.ways), SQUARE, standing)

@@ -12,6 +12,9 @@ from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.se2 import Array, wrap
 
+# Where it is narrow: the shortest look ahead, how it grows with the room to spare, and a speed that is always allowed.
+_SHORTEST_M, _SPARE_FACTOR, _SLOWEST_M_S = 0.1, 2.0, 0.1
+
 
 @dataclass(frozen=True)
 class FollowerConfig(Config):
@@ -38,10 +41,14 @@ class Follower:
         self.w = 0.0
         self._turning = False
 
-    def command(self, T_map_base: Array, path: Array, dt_s: float) -> tuple[float, float]:
-        """Speed (m/s) and turn rate (rad/s) for the next dt_s along a path (K, 2) that ends where to stop."""
+    def command(self, T_map_base: Array, path: Array, dt_s: float, spare_m: float = math.inf) -> tuple[float, float]:
+        """Speed (m/s) and turn rate (rad/s) for the next dt_s along a path (K, 2) that ends where to stop.
+
+        spare_m: room to either side of the path; where there is little, the robot keeps to it the more closely.
+        """
         config = self.config
-        reach = max(config.lookahead_m, config.lookahead_s * self.v)
+        narrow = _SHORTEST_M + _SPARE_FACTOR * max(spare_m, 0.0)
+        reach = min(max(config.lookahead_m, config.lookahead_s * self.v), narrow)
         x, y, theta = T_map_base.tolist()
         ahead_x, ahead_y, rest_m = _point_ahead(path, x, y, reach, config.stray_m)
         dx, dy = ahead_x - x, ahead_y - y
@@ -51,6 +58,7 @@ class Follower:
         if self._turning:
             return self._limited(0.0, self._turn_for(error, dt_s), dt_s)
         v = min(config.max_speed_m_s, math.sqrt(2.0 * config.max_acceleration_m_s2 * rest_m))
+        v = min(v, max(narrow / max(config.lookahead_s, 1e-9), _SLOWEST_M_S))
         curvature = 2.0 * math.sin(error) / max(math.hypot(dx, dy), 0.05)
         if abs(curvature) * v > config.max_turn_rad_s:
             v = config.max_turn_rad_s / abs(curvature)

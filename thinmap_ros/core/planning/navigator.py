@@ -11,11 +11,13 @@ from thinmap_ros.core.config import parameter
 from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, GridPatch
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.planning.follower import Follower, FollowerConfig, length_from, nearest_point
+from thinmap_ros.core.planning.trail import Trail
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
 _CHECK_AHEAD_M = 4.0
+_NARROW_AHEAD_M = 0.6
 _SWEEP_STEP_M = 0.03
 _CREEP_M_S = 0.02
 _ROUNDING_M_S = 1e-9
@@ -62,6 +64,7 @@ class Navigator:
         self.config = config or NavigatorConfig()
         self.path: Array | None = None
         self._follower = Follower(self.config)
+        self._trail = Trail()
         self._goal: tuple[float, float] | None = None
         self._heading_rad: float | None = None
         self._path_age_s = 0.0
@@ -95,6 +98,7 @@ class Navigator:
         moves on.
         """
         self._look(T_map_base, scan)
+        self._trail.add(T_map_base)
         if self._goal is None:
             return Command(*self._follower.stop(dt_s), 'idle')
         if math.dist(self._goal, T_map_base[:2]) <= self.config.goal_tolerance_m:
@@ -150,7 +154,8 @@ class Navigator:
         near = np.square(self._points_map - T_map_base[:2]).sum(axis=1) < _POINTS_M**2
         points = self._points_map[near] if self._blocked_s > 0.0 else None
         start = float(T_map_base[0]), float(T_map_base[1])
-        path = plan(patch, start, self._goal, self.config, points, self.config.body_radius_m)
+        trail = self._trail.cells(patch.frame, patch.shape)
+        path = plan(patch, start, self._goal, self.config, points, self.config.body_radius_m, trail)
         first = self.path is None
         self._path_age_s = 0.0
         if path is None:
@@ -177,7 +182,8 @@ class Navigator:
         if self._remaining_m < self._nearest_m - _PROGRESS_M:
             self._standstills, self._nearest_m = 0, self._remaining_m
         before = (self._follower.v, self._follower.w)
-        v, w = self._follower.command(T_map_base, self.path, dt_s)
+        room = _room_along(self.path, nearest, _NARROW_AHEAD_M, self._points_map)
+        v, w = self._follower.command(T_map_base, self.path, dt_s, room - self.config.body_radius_m)
         if v <= 0.0:
             return Command(v, w, 'driving')
         allowed = self._safe_speed(T_map_base, v, w, self.config.body_radius_m)
@@ -256,6 +262,20 @@ def _touches(cells: NDArray[np.int8], frame: tuple[float, float, float], path: A
                 if cells[r, c] >= OCCUPIED_AT_LEAST and (r - row) ** 2 + (c - col) ** 2 < radius * radius:
                     return True
     return False
+
+
+@kernel
+def _room_along(path: Array, first: int, length_m: float, points: Array) -> float:
+    """How near points (N, 2) are to a path (K, 2) from one of its points on for some length, m; inf without points."""
+    nearest, along = np.inf, 0.0
+    for k in range(first, path.shape[0]):
+        if k > first:
+            along += math.hypot(path[k, 0] - path[k - 1, 0], path[k, 1] - path[k - 1, 1])
+        if along > length_m:
+            break
+        for i in range(points.shape[0]):
+            nearest = min(nearest, (points[i, 0] - path[k, 0]) ** 2 + (points[i, 1] - path[k, 1]) ** 2)
+    return math.sqrt(nearest)
 
 
 @kernel

@@ -49,12 +49,14 @@ def plan(
     config: WavefrontConfig,
     points: Array | None = None,
     body_radius_m: float = 0.0,
+    trail: NDArray[np.int64] | None = None,
 ) -> Array | None:
     """Path (K, 2) of points from start to goal, m, map frame, about half a cell apart; None where there is none.
 
     The path ends at the goal, or at the allowed cell nearest to it within goal_slack_m. It keeps a body's radius away
     from points (N, 2) that the map need not know. They are taken as exact: in cells, a wall whose points fall into the
-    cell before it, as noise has it, would be a cell thicker, and many a passage too narrow.
+    cell before it, as noise has it, would be a cell thicker, and many a passage too narrow. trail: cells (N, 2) over
+    which the robot came; unless something stands there now, it may go back over them, however narrow it looks.
     """
     cells = patch.frame.cells_of(np.array([start_xy, goal_xy]))
     if not patch.contains(np.array([start_xy, goal_xy])).all():
@@ -70,6 +72,9 @@ def plan(
     start, wished = (int(cells[0, 0]), int(cells[0, 1])), (int(cells[1, 0]), int(cells[1, 1]))
     if not math.isfinite(cost[start]):
         _let_out(cost, occupied, start, config.escape_m / patch.frame.resolution)
+    if trail is not None:
+        back = trail[~occupied[trail[:, 0], trail[:, 1]]]
+        cost[back[:, 0], back[:, 1]] = np.minimum(cost[back[:, 0], back[:, 1]], _ESCAPE_COST)
     goal = nearest_true(reached_from(np.isfinite(cost), start), wished, config.goal_slack_m / patch.frame.resolution)
     if goal is None:
         return None

@@ -1,0 +1,58 @@
+"""Where the robot has been of late: it can go back there, even where a speck in the map makes a passage too narrow."""
+
+import math
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.se2 import Array
+
+_STEP_M, _JUMP_M = 0.03, 0.5
+_LONGEST = 1300  # points
+
+
+class Trail:
+    """The last of the robot's way. A pose that jumps, as where the map was corrected, begins it anew."""
+
+    def __init__(self) -> None:
+        self._points: deque[tuple[float, float]] = deque(maxlen=_LONGEST)
+
+    def add(self, T_map_base: Array) -> None:
+        """Hear where the robot is, (3,)."""
+        here = float(T_map_base[0]), float(T_map_base[1])
+        away = math.dist(here, self._points[-1]) if self._points else math.inf
+        if away > _JUMP_M:
+            self._points.clear()
+        if away >= _STEP_M:
+            self._points.append(here)
+
+    def cells(self, frame: GridFrame, shape: tuple[int, ...]) -> NDArray[np.int64]:
+        """Cells (N, 2) of a map (H, W) over which it led, each beside the one before over an edge."""
+        if not self._points:
+            return np.empty((0, 2), dtype=np.int64)
+        return np.asarray(_joined(frame.cells_of(np.array(self._points)), shape[0], shape[1]))
+
+
+@kernel
+def _joined(cells: NDArray[np.int64], rows: int, cols: int) -> NDArray[np.int64]:
+    """Cells (N, 2) and those between them, first along the column, then along the row; without those outside."""
+    count = cells.shape[0]
+    for k in range(1, cells.shape[0]):
+        count += abs(cells[k, 0] - cells[k - 1, 0]) + abs(cells[k, 1] - cells[k - 1, 1])
+    found = np.empty((count, 2), dtype=np.int64)
+    row, col, used = cells[0, 0], cells[0, 1], 0
+    for k in range(cells.shape[0]):
+        while True:
+            if 0 <= row < rows and 0 <= col < cols:
+                found[used, 0], found[used, 1] = row, col
+                used += 1
+            if row != cells[k, 0]:
+                row += 1 if cells[k, 0] > row else -1
+            elif col != cells[k, 1]:
+                col += 1 if cells[k, 1] > col else -1
+            else:
+                break
+    return found[:used].copy()
