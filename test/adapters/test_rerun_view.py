@@ -3,14 +3,16 @@
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from thinmap_ros.adapters import rerun_view
+from thinmap_ros.adapters import rerun_streams
 from thinmap_ros.adapters.bag_writer import BagWriter
-from thinmap_ros.adapters.rerun_view import NullView, View
+from thinmap_ros.adapters.rerun_view import View
 from thinmap_ros.adapters.view_feed import Feed, recording_from_bag
+from thinmap_ros.adapters.views import NullView
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
@@ -22,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[2]
 S = 1_000_000_000
 START = 1_700_000_000 * S
 needs_rerun = pytest.mark.skipif(
-    not rerun_view.is_installed(), reason='needs rerun, which is not installed (the extra "viewer")'
+    not rerun_streams.is_installed(), reason='needs rerun, which is not installed (the extra "viewer")'
 )
 
 
@@ -64,6 +66,8 @@ def test_map_lies_where_it_is_and_is_the_right_way_up(tmp_path):
     assert blueprints >= 1
     assert np.ravel(grid['GridMap:translation']).tolist() == [-1.0, 2.0, 0.0]
     assert np.ravel(grid['GridMap:cell_size']) == pytest.approx(0.1)
+    # Grey is drawn as grey, and not in the colours of a measurement.
+    assert np.ravel(grid['GridMap:colormap']).tolist() == [1]
     # Upper row first; free is white, occupied black, unknown between.
     assert np.ravel(grid['GridMap:data']).tolist() == [127, 255, 255, 255, 0, 205]
 
@@ -106,11 +110,13 @@ def test_graph_target_lines_and_numbers(tmp_path):
     view = View(tmp_path / 'a.rrd')
     view.topology(START, topology())
     view.end_nodes(START, np.array([[0.0, 0.0]]), np.array([0.444]))
-    view.lines(START, np.array([[[0.0, 0.0], [1.0, 2.0]]]))
+    view.lines(START, np.array([[[0.0, 0.0], [1.0, 2.0]], [[3.0, 0.0], [3.0, 1.0]]]), np.array([True, False]))
+    view.local_area(START, np.array([[1.0, 0.0]]))
+    view.samples(START, np.array([[4.0, 5.0], [6.0, 7.0]]))
     view.plan(START, np.array([[0.0, 0.0], [1.0, 0.0]]))
     for i, place in enumerate([np.array([1.0, 2.0]), np.array([1.0, 2.0]), None, None]):
         view.target(START + i * S, place)
-    view.number(START + S, 'step_ms/localizer', 4.5)
+    view.number(START + S, 'step', 'localizer', 4.5)
     view.close()
     rows, _ = read_back(tmp_path / 'a.rrd')
     colours = rows['/map/nodes'][0][1]['Points3D:colors']
@@ -119,7 +125,11 @@ def test_graph_target_lines_and_numbers(tmp_path):
     assert np.array(rows['/map/skeleton'][0][1]['LineStrips3D:strips']).shape == (1, 3, 3)
     np.testing.assert_allclose(np.array(rows['/map/lines'][0][1]['LineStrips3D:strips'])[0, :, :2], [[0, 0], [1, 2]])
     assert [(s, len(v['Points3D:positions'])) for s, v in rows['/map/target']] == [(0.0, 1), (2.0, 0)]
-    assert [(s, v['Scalars:scalars']) for s, v in rows['/plots/step_ms/localizer']] == [(1.0, [4.5])]
+    assert [(s, v['Scalars:scalars']) for s, v in rows['/plots/step/localizer'] if s is not None] == [(1.0, [4.5])]
+    near, far = rows['/map/lines'][0][1]['LineStrips3D:colors']
+    assert near != far, 'the features of the local area stand out'
+    np.testing.assert_allclose(np.array(rows['/map/local_area'][0][1]['Points3D:positions'])[:, :2], [[1, 0]])
+    np.testing.assert_allclose(np.array(rows['/map/samples'][0][1]['Points3D:positions'])[:, :2], [[4, 5], [6, 7]])
     assert len(rows['/map/plan']) == 1
 
 
@@ -146,19 +156,19 @@ def test_viewer_without_a_screen_is_refused(tmp_path, monkeypatch):
 def test_viewer_is_sent_what_the_file_holds_and_ends_with_the_view(tmp_path, monkeypatch):
     # The real program, told to write down what it receives where it would open a window.
     received, stand_in = tmp_path / 'received.rrd', tmp_path / 'viewer'
-    stand_in.write_text(f'#!/bin/sh\nexec "{rerun_view._viewer_program()}" --save "{received}" "$@"\n')
+    stand_in.write_text(f'#!/bin/sh\nexec "{rerun_streams.viewer_program()}" --save "{received}" "$@"\n')
     stand_in.chmod(0o755)
-    monkeypatch.setattr(rerun_view, '_viewer_program', lambda: str(stand_in))
+    monkeypatch.setattr(rerun_streams, 'viewer_program', lambda: str(stand_in))
     monkeypatch.setenv('DISPLAY', ':none')
     view = View(tmp_path / 'a.rrd', spawn=True)
-    viewer = view._viewer
+    viewer = view._streams.viewer
     for i in range(10):
-        view.number(START + i * S, 'coverage/estimate', 0.1 * i)
+        view.number(START + i * S, 'progress', 'coverage, %', 10.0 * i)
     assert viewer.poll() is None
     view.close()
     assert viewer.poll() is not None
     rows, _ = read_back(tmp_path / 'a.rrd')
-    assert len(rows['/plots/coverage/estimate']) == 10
+    assert sum(seconds is not None for seconds, _ in rows['/plots/progress/coverage_percent']) == 10
     # It is ended, not asked to finish its file: what matters is that it was reached.
     assert received.stat().st_size > 0
 
@@ -190,8 +200,8 @@ def test_bag_becomes_a_recording_with_the_error_of_the_pose(tmp_path):
     recording_from_bag(tmp_path / 'bag', tmp_path / 'run.rrd')
     rows, _ = read_back(tmp_path / 'run.rrd')
     # The pose that is no number is left out, and nothing else is.
-    errors = [(s, v['Scalars:scalars'][0]) for s, v in rows['/plots/error/position_m']]
-    assert errors == [(0.0, pytest.approx(0.03)), (1.0, pytest.approx(0.03)), (3.0, pytest.approx(0.03))]
+    errors = [(s, v['Scalars:scalars'][0]) for s, v in rows['/plots/error/position_cm'] if s is not None]
+    assert errors == [(0.0, pytest.approx(3.0)), (1.0, pytest.approx(3.0)), (3.0, pytest.approx(3.0))]
     assert len(rows['/map/truth']) == 3
     assert sorted(p.name for p in tmp_path.iterdir()) == ['bag', 'run.rrd']
 
@@ -233,3 +243,46 @@ def test_feed_refuses_what_makes_no_sense():
 
     with pytest.raises(InputError):
         Feed(NullView(), lambda frame: None).take('topology', Message)
+
+
+class Diary(NullView):
+    """What a view was told."""
+
+    def __init__(self):
+        self.numbers, self.near = [], None
+
+    def number(self, ns, plot, curve, value):
+        self.numbers.append((plot, curve, value))
+
+    def local_area(self, ns, places):
+        self.near = places.tolist()
+
+
+def plain(**values):
+    return SimpleNamespace(**values)
+
+
+def stamped(**values):
+    return plain(header=plain(stamp=plain(sec=3, nanosec=0)), **values)
+
+
+def test_step_times_are_those_of_the_robot_that_is_shown():
+    diary = Diary()
+    feed = Feed(diary, lambda frame: None, '/robot2')
+    pair = plain(key='graph update: step time', value='median 12.5 ms, p95 20.0 ms, max 31.0 ms')
+    rate = plain(key='scan: rate', value='5.0 Hz')
+    names = ('topology_builder: thinmap', 'robot2/topology_builder: thinmap', 'robot2/x/topology_builder: thinmap')
+    feed.take('diagnostics', stamped(status=[plain(name=name, values=[rate, pair]) for name in names]))
+    assert diary.numbers == [('step', 'graph update', 12.5)]
+
+
+def test_local_area_is_where_its_features_are_stored():
+    diary = Diary()
+    feed = Feed(diary, lambda frame: None)
+    nodes = [plain(id=i, kind=0, position=plain(x=1.0 * i, y=0.0), clearance_m=0.5) for i in (1, 2, 3)]
+    feed.take('topology', stamped(nodes=nodes, edges=[]))
+    point = plain(x=0.0, y=0.0)
+    kept = [([1, 7], True), ([2], True), ([3], False)]  # node 7 is gone
+    features = [plain(start=point, end=point, node_ids=ids, in_local_area=local) for ids, local in kept]
+    feed.take('line_features', stamped(features=features))
+    assert diary.near == [[1.0, 0.0], [2.0, 0.0]]

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from geometry_msgs.msg import PoseStamped
 
-from thinmap_ros.adapters import messages, qos, rerun_view
+from thinmap_ros.adapters import messages, qos, rerun_streams
 
 pytestmark = pytest.mark.live
 
@@ -16,7 +16,7 @@ def test_without_anything_to_show_it_says_so_and_ends_on_a_signal(graph):
     assert graph.stop('rerun_viewer') == 0
 
 
-@pytest.mark.skipif(not rerun_view.is_installed(), reason='needs rerun, which is not installed (the extra "viewer")')
+@pytest.mark.skipif(not rerun_streams.is_installed(), reason='needs rerun, which is not installed (the extra "viewer")')
 def test_recording_can_be_read_after_a_signal(graph, tmp_path):
     from rerun.chunk import RrdReader
 
@@ -35,7 +35,7 @@ def test_recording_can_be_read_after_a_signal(graph, tmp_path):
     assert rows == 4
 
 
-@pytest.mark.skipif(rerun_view.is_installed(), reason='says what happens where rerun is not installed; it is')
+@pytest.mark.skipif(rerun_streams.is_installed(), reason='says what happens where rerun is not installed; it is')
 @pytest.mark.parametrize('parameters', [{}, {'recording': 'live.rrd', 'spawn': False}])
 def test_without_rerun_the_start_ends_with_one_clear_line(graph, parameters):
     process = graph.start('rerun_viewer', **parameters)

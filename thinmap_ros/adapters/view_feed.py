@@ -1,5 +1,6 @@
 """Messages, live or from a bag, told to a view."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,24 +11,29 @@ from thinmap_ros.adapters import bag_messages
 from thinmap_ros.adapters.bags import Bag
 from thinmap_ros.adapters.files import written_aside
 from thinmap_ros.adapters.mounts import StaticTransforms
-from thinmap_ros.adapters.rerun_view import NullView, View
+from thinmap_ros.adapters.rerun_view import View
 from thinmap_ros.adapters.stamps import StampMatcher
+from thinmap_ros.adapters.views import NullView
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
 _TF_STATIC = '/tf_static'
+_MEDIAN = re.compile(r'median (\d+\.\d+) ms')
+_STEPS = {'map update', 'graph update', 'explorer', 'global localization'}
 
 
 class Feed:
     """Takes messages by topic and tells a view what they mean.
 
     laser_pose gives T_base_laser (3,) of a laser's frame, or None as long as it is not known: its scans are not shown.
+    namespace: of the nodes whose step times are shown, as /diagnostics are of all robots.
     """
 
-    def __init__(self, view: NullView, laser_pose: Callable[[str], Array | None]) -> None:
-        self._view, self._laser_pose = view, laser_pose
+    def __init__(self, view: NullView, laser_pose: Callable[[str], Array | None], namespace: str = '') -> None:
+        self._view, self._laser_pose, self._namespace = view, laser_pose, namespace.strip('/')
+        self._places: dict[int, Array] = {}
         self._T_odom_base: Array | None = None
         self._T_map_odom: Array | None = None
         self._pairs: StampMatcher[Array, Array] = StampMatcher()
@@ -35,7 +41,8 @@ class Feed:
             'map': self._on_map, 'scan': self._on_scan, 'pose': self._on_pose, 'odom': self._on_odometry,
             'ground_truth': self._on_truth, 'topology': self._on_topology, 'end_nodes': self._on_end_nodes,
             'line_features': self._on_lines, 'plan': self._on_plan, 'exploration_status': self._on_exploration,
-            'slam_status': self._on_slam,
+            'slam_status': self._on_slam, 'localization_samples': self._on_samples,
+            'diagnostics': self._on_diagnostics,
         }
 
     @property
@@ -67,6 +74,8 @@ class Feed:
         if not np.isfinite(covariance).all():
             raise InputError('covariance: expected finite numbers')
         self._view.pose(ns, T_map_base, covariance)
+        sigma_m = float(np.sqrt(max(np.linalg.eigvalsh(covariance[:2, :2])[-1], 0.0)))
+        self._view.number(ns, 'error', '2 sigma, cm', 200.0 * sigma_m)
         self._compare(ns, self._pairs.left(ns, T_map_base))
         if self._T_map_odom is None and self._T_odom_base is not None:
             self._T_map_odom = se2.compose(T_map_base, se2.invert(self._T_odom_base))
@@ -86,11 +95,15 @@ class Feed:
         if pair is None:
             return
         difference = pair[0] - pair[1]
-        self._view.number(ns, 'error/position_m', float(np.hypot(difference[0], difference[1])))
-        self._view.number(ns, 'error/heading_deg', abs(float(np.degrees(se2.wrap(float(difference[2]))))))
+        self._view.number(ns, 'error', 'position, cm', 100.0 * float(np.hypot(difference[0], difference[1])))
+        heading = abs(float(np.degrees(se2.wrap(float(difference[2])))))
+        self._view.number(ns, 'error', 'heading, deg', heading)
 
     def _on_topology(self, ns: int, message: Any) -> None:
-        self._view.topology(ns, bag_messages.topology(message))
+        topology = bag_messages.topology(message)
+        self._places = {node.id: node.position for node in topology.nodes.values()}
+        self._view.topology(ns, topology)
+        self._view.number(ns, 'count', 'nodes', len(topology.nodes))
 
     def _on_end_nodes(self, ns: int, message: Any) -> None:
         places = np.array([[n.position.x, n.position.y] for n in message.end_nodes]).reshape(-1, 2)
@@ -98,7 +111,15 @@ class Feed:
 
     def _on_lines(self, ns: int, message: Any) -> None:
         ends = [[[f.start.x, f.start.y], [f.end.x, f.end.y]] for f in message.features]
-        self._view.lines(ns, np.array(ends, dtype=np.float64).reshape(-1, 2, 2))
+        local = np.array([f.in_local_area for f in message.features], dtype=bool)
+        self._view.lines(ns, np.array(ends, dtype=np.float64).reshape(-1, 2, 2), local)
+        near = {int(node) for f in message.features if f.in_local_area for node in f.node_ids}
+        places = [self._places[node] for node in sorted(near & self._places.keys())]
+        self._view.local_area(ns, np.array(places).reshape(-1, 2))
+
+    def _on_samples(self, ns: int, message: Any) -> None:
+        places = [[pose.position.x, pose.position.y] for pose in message.poses]
+        self._view.samples(ns, np.array(places, dtype=np.float64).reshape(-1, 2))
 
     def _on_plan(self, ns: int, message: Any) -> None:
         points = [[p.pose.position.x, p.pose.position.y] for p in message.poses]
@@ -107,11 +128,28 @@ class Feed:
     def _on_exploration(self, ns: int, message: Any) -> None:
         place = message.target_position
         self._view.target(ns, np.array([place.x, place.y]) if message.has_target else None)
-        self._view.number(ns, 'coverage/estimate', float(message.coverage_estimate))
-        self._view.number(ns, 'distance_m/driven', float(message.distance_m))
+        self._view.number(ns, 'progress', 'coverage, %', 100.0 * float(message.coverage_estimate))
+        self._view.number(ns, 'progress', 'distance, m', float(message.distance_m))
+        self._view.number(ns, 'count', 'end nodes left', float(message.end_nodes_left))
 
     def _on_slam(self, ns: int, message: Any) -> None:
-        self._view.number(ns, 'step_ms/localizer', float(message.step_time_ms))
+        self._view.number(ns, 'step', 'localizer', float(message.step_time_ms))
+        self._view.number(ns, 'count', 'features', float(message.features))
+        self._view.number(ns, 'count', 'local features', float(message.local_features))
+        self._view.number(ns, 'count', 'matched lines', float(message.matched))
+
+    def _on_diagnostics(self, ns: int, message: Any) -> None:
+        """Step times of the nodes that publish none of their own."""
+        if ns <= 0:
+            return  # told before there was any time
+        for status in message.status:
+            if status.name.rpartition(': ')[0].rpartition('/')[0] != self._namespace:
+                continue
+            for pair in status.values:
+                step, _, key = pair.key.rpartition(': ')
+                median = _MEDIAN.match(pair.value)
+                if key == 'step time' and median and step in _STEPS:
+                    self._view.number(ns, 'step', step, float(median[1]))
 
 
 def recording_from_bag(bag_path: Path, out_rrd: Path) -> None:

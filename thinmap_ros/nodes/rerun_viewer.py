@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid, Odometry
 from nav_msgs.msg import Path as PathMsg
 from rclpy.node import Node
@@ -14,9 +15,10 @@ from sensor_msgs.msg import LaserScan
 from thinmap_msgs.msg import EndNodeArray, ExplorationStatus, LineFeatureArray, SlamStatus, TopologicalMap
 from thinmap_ros.adapters import parameters, qos, runtime
 from thinmap_ros.adapters.health import Health
-from thinmap_ros.adapters.rerun_view import NullView, View
+from thinmap_ros.adapters.rerun_view import View
 from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.adapters.view_feed import Feed
+from thinmap_ros.adapters.views import NullView
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
 
@@ -33,6 +35,8 @@ _TOPICS = {
     'plan': (PathMsg, qos.LATCHED),
     'exploration_status': (ExplorationStatus, qos.LATCHED),
     'slam_status': (SlamStatus, qos.STREAM),
+    'localization_samples': (PoseArray, qos.LATCHED),
+    'diagnostics': (DiagnosticArray, qos.STREAM),
 }
 
 
@@ -53,10 +57,12 @@ class RerunViewerNode(Node):
         mount = LaserMount(self)
         parameters.check_unknown(self)
         self._view = self._open(config)
-        self._feed = Feed(self._view, mount.pose)
+        self._feed = Feed(self._view, mount.pose, self.get_namespace())
         self._health = Health(self)
         for topic, (kind, profile) in _TOPICS.items():
-            self.create_subscription(kind, topic, self._takes(topic), profile)
+            # Those that are not of this robot alone have an absolute name.
+            name = f'/{topic}' if topic == 'diagnostics' else topic
+            self.create_subscription(kind, name, self._takes(topic), profile)
 
     def close(self) -> None:
         """Finish the recording."""

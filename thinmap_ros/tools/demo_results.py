@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from thinmap_ros.adapters import bag_messages, figures, graph_files, map_files, rerun_view, trajectory_files
+from thinmap_ros.adapters import bag_messages, figures, graph_files, map_files, rerun_streams, trajectory_files
 from thinmap_ros.adapters.bags import Bag
 from thinmap_ros.adapters.files import write_text
 from thinmap_ros.adapters.view_feed import recording_from_bag
@@ -87,7 +87,7 @@ def write(out: Path, world_file: Path, robot: str, result: dict[str, Any]) -> di
     true = np.array(list(recording.true.values()))
     title = f'{world.name}: {100.0 * report["coverage"]:.1f} % seen, {report["distance"]:.1f} m, {report["time"]:.0f} s'
     figures.summary_figure(out / 'summary.png', patch, recording.topology, estimated, true, title)
-    if rerun_view.is_installed():
+    if rerun_streams.is_installed():
         recording_from_bag(out / 'bag', out / 'recording.rrd')
     else:
         print('no recording.rrd: rerun is not installed (pip install "thinmap_ros[viewer]")', file=sys.stderr)
