@@ -1,5 +1,7 @@
 """Numbers found by place."""
 
+import math
+
 import numpy as np
 
 from thinmap_ros.core.grid.buckets import Buckets
@@ -26,3 +28,12 @@ def test_what_moves_is_found_where_it_is_now():
     buckets.drop(3)
     buckets.drop(3)
     assert buckets.near(10.0, 0.0, 1.0) == []
+
+
+def test_a_place_that_is_not_finite_is_near_to_nothing():
+    buckets = Buckets(1.0)
+    buckets.put(1, 0.5, 0.5)
+    buckets.put(1, math.nan, 0.5)
+    buckets.put(2, math.inf, 0.5)
+    assert buckets.near(0.5, 0.5, 3.0) == []
+    assert buckets.near(math.nan, 0.5, 3.0) == []

@@ -12,7 +12,10 @@ class Buckets:
         self._bucket_of: dict[int, tuple[int, int]] = {}
 
     def put(self, number: int, x: float, y: float) -> None:
-        """Add a number at a point, or move it there, m."""
+        """Add a number at a point, or move it there, m; near to a point that is not finite is nothing."""
+        if not (math.isfinite(x) and math.isfinite(y)):
+            self.drop(number)
+            return
         bucket = (math.floor(x / self._edge_m), math.floor(y / self._edge_m))
         if self._bucket_of.get(number) != bucket:
             self.drop(number)
@@ -29,6 +32,8 @@ class Buckets:
 
     def near(self, x: float, y: float, reach_m: float) -> list[int]:
         """All numbers within a reach of a point, m, in order; some that are farther off may be among them."""
+        if not (math.isfinite(x) and math.isfinite(y)):
+            return []
         low_col, high_col = (math.floor((x + reach) / self._edge_m) for reach in (-reach_m, reach_m))
         low_row, high_row = (math.floor((y + reach) / self._edge_m) for reach in (-reach_m, reach_m))
         found: list[int] = []
