@@ -9,11 +9,11 @@ from small_floor import floor, map_of, world_of
 from thinmap_ros.core import se2
 from thinmap_ros.core.localization.active import ActiveSearch
 from thinmap_ros.core.localization.config import GlobalLocalizationConfig
-from thinmap_ros.core.localization.global_localization import GlobalLocalization
+from thinmap_ros.core.localization.global_localization import GlobalLocalization, Hypothesis, Result, State
 from thinmap_ros.core.localization.places import FREE, Places
 from thinmap_ros.core.localization.viewpoints import best_viewpoint, common_patch
 from thinmap_ros.core.planning.navigator import NavigatorConfig
-from thinmap_ros.sim.lms200 import Lms200Config
+from thinmap_ros.sim.lms200 import Lms200, Lms200Config
 from thinmap_ros.sim.pioneer import PioneerConfig
 from thinmap_ros.sim.runner import STEP_NS, Simulation
 from thinmap_ros.sim.tours import random_drive
@@ -114,6 +114,13 @@ def test_where_nothing_tells_places_apart_the_robot_goes_on_and_stands_when_all_
     assert best_viewpoint(places, np.zeros(3), starts, half, 15.0, driving, seen) is None
     ahead = seen[np.abs(se2.wrap(seen[:, 2])) < 1.5]
     assert best_viewpoint(places, np.zeros(3), starts, half, 15.0, driving, ahead) is not None
+    search = ActiveSearch(places, CONFIG, driving)
+    for T in seen:
+        search.take(Result(State.AMBIGUOUS, '', ()), T)
+    search.take(Result(State.AMBIGUOUS, '', tuple(Hypothesis(T, np.eye(3), 0.5, 1.0) for T in starts)), np.zeros(3))
+    scan = Lms200(Lms200Config(), 0).scan(world_of(shut), starts[0], 0)
+    command = search.step(np.zeros(3), scan, 0.1)
+    assert (command.v, command.w, command.state) == (0.0, 0.0, 'idle')
 
 
 def test_what_is_beside_a_place_by_little_neither_closes_its_way_nor_is_told_apart(finder):

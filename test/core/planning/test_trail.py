@@ -39,6 +39,14 @@ def test_a_jump_begins_it_anew_and_it_forgets_what_is_long_past():
     assert len(Trail().cells(FRAME, (100, 1000))) == 0
 
 
+def test_a_pose_that_is_not_finite_leaves_no_trail():
+    trail = Trail()
+    for x in (np.nan, 0.0, np.inf, 0.1):
+        trail.add(np.array([x, 3.0, 0.0]))
+    cells = trail.cells(FRAME, (100, 1000))
+    assert np.unique(cells, axis=0).tolist() == FRAME.cells_of(np.array([[0.0, 3.0], [0.1, 3.0]])).tolist()
+
+
 def test_the_way_back_is_open_though_a_speck_makes_it_too_narrow_but_not_through_what_stands_there():
     cells = np.zeros((60, 80), dtype=np.int8)
     cells[[0, -1]], cells[:, [0, -1]] = 100, 100

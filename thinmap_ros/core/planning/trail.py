@@ -6,6 +6,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core import se2
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.se2 import Array
@@ -21,7 +22,9 @@ class Trail:
         self._points: deque[tuple[float, float]] = deque(maxlen=_LONGEST)
 
     def add(self, T_map_base: Array) -> None:
-        """Hear where the robot is, (3,)."""
+        """Hear where the robot is, (3,); what is not finite is passed over."""
+        if not se2.is_finite(T_map_base):
+            return
         here = float(T_map_base[0]), float(T_map_base[1])
         away = math.dist(here, self._points[-1]) if self._points else math.inf
         if away > _JUMP_M:
