@@ -52,6 +52,7 @@ def test_nodes_tell_rates_step_times_and_silence(graph):
     for node, step in (('localizer', 'localizer'), ('grid_mapper', 'map update'), ('topology_builder', 'graph update')):
         graph.until(lambda n=node, s=step: 'median' in doctor.value(n, f'{s}: step time'), f'step times of {node}')
     assert doctor.number('topology_builder', 'pose: heard') > 0
+    graph.until(lambda: doctor.number('localizer', 'scan: heard') > 5, 'more than five scans')
     graph.stop('sim')
     graph.until(lambda: doctor.level('localizer') == DiagnosticStatus.WARN, 'silence is told')
     assert 'scan: silent for' in doctor.status('localizer').message
