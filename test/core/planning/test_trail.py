@@ -39,6 +39,16 @@ def test_a_jump_begins_it_anew_and_it_forgets_what_is_long_past():
     assert len(Trail().cells(FRAME, (100, 1000))) == 0
 
 
+@pytest.mark.parametrize('count', [1300, 1301, 2600, 2601, 3899, 3901, 9000])
+def test_of_a_long_way_it_keeps_the_last_points(count):
+    trail, way = Trail(), np.arange(count) * 0.05
+    for x in way:
+        trail.add(np.array([x, 3.0, 0.0]))
+    columns = FRAME.cells_of(np.stack([way[-1300:], np.full(1300, 3.0)], axis=1))[:, 1]
+    kept = np.unique(trail.cells(FRAME, (100, 10_000))[:, 1])
+    assert kept.tolist() == np.unique(columns).tolist()
+
+
 def test_a_pose_that_is_not_finite_leaves_no_trail():
     trail = Trail()
     for x in (np.nan, 0.0, np.inf, 0.1):

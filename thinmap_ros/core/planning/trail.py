@@ -1,7 +1,6 @@
 """Where the robot has been of late: it can go back there, even where a speck in the map makes a passage too narrow."""
 
 import math
-from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,24 +18,33 @@ class Trail:
     """The last of the robot's way. A pose that jumps, as where the map was corrected, begins it anew."""
 
     def __init__(self) -> None:
-        self._points: deque[tuple[float, float]] = deque(maxlen=_LONGEST)
+        self._points = np.empty((2 * _LONGEST, 2))  # twice the room: moved to the front only when it is full
+        self._begin = self._end = 0
 
     def add(self, T_map_base: Array) -> None:
         """Hear where the robot is, (3,); what is not finite is passed over."""
         if not se2.is_finite(T_map_base):
             return
         here = float(T_map_base[0]), float(T_map_base[1])
-        away = math.dist(here, self._points[-1]) if self._points else math.inf
+        away = math.dist(here, self._points[self._end - 1]) if self._end > self._begin else math.inf
         if away > _JUMP_M:
-            self._points.clear()
+            self._begin = self._end = 0
         if away >= _STEP_M:
-            self._points.append(here)
+            self._append(here)
 
     def cells(self, frame: GridFrame, shape: tuple[int, ...]) -> NDArray[np.int64]:
         """Cells (N, 2) of a map (H, W) over which it led, each beside the one before over an edge."""
-        if not self._points:
+        if self._end == self._begin:
             return np.empty((0, 2), dtype=np.int64)
-        return np.asarray(_joined(frame.cells_of(np.array(self._points)), shape[0], shape[1]))
+        return np.asarray(_joined(frame.cells_of(self._points[self._begin : self._end]), shape[0], shape[1]))
+
+    def _append(self, here: tuple[float, float]) -> None:
+        if self._end == len(self._points):
+            self._points[: _LONGEST - 1] = self._points[self._end - _LONGEST + 1 :]
+            self._begin, self._end = 0, _LONGEST - 1
+        self._points[self._end] = here
+        self._end += 1
+        self._begin = max(self._begin, self._end - _LONGEST)
 
 
 @kernel
