@@ -15,8 +15,9 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.planning.follower import _point_ahead, length_from, nearest_point
 from thinmap_ros.core.planning.grid_search import coarse, fine
-from thinmap_ros.core.planning.navigator import _arc, _clear_steps, _points_around, _touches
+from thinmap_ros.core.planning.navigator import _touches
 from thinmap_ros.core.planning.reach import are_near, reached_from, renew_standing, standing_places
+from thinmap_ros.core.planning.seen_points import _arc, _clear_steps, _points_around
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, cost_of_cells
 from thinmap_ros.core.scan import Scan
 

@@ -205,7 +205,7 @@ def test_it_remembers_what_is_beside_it_where_the_laser_does_not_look():
     def look(pose, ranges, stamp):
         scan = Scan.create(stamp, ranges, -math.pi / 2, math.pi / 180, 0.02, 8.0)
         navigator.step(np.array(pose), patch, scan, DT)
-        return navigator._points_map
+        return navigator._seen.points
 
     ahead = np.full(181, np.inf)
     ahead[90] = 0.5

@@ -11,6 +11,7 @@ from thinmap_ros.core.config import parameter
 from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, GridPatch
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.planning.follower import Follower, FollowerConfig, length_from, nearest_point
+from thinmap_ros.core.planning.seen_points import SeenPoints
 from thinmap_ros.core.planning.trail import Trail
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.scan import Scan
@@ -18,15 +19,12 @@ from thinmap_ros.core.se2 import Array
 
 _CHECK_AHEAD_M = 4.0
 _NARROW_AHEAD_M = 0.6
-_SWEEP_STEP_M = 0.03
 _CREEP_M_S = 0.02
 _ROUNDING_M_S = 1e-9
 # Where nothing else is left, points may come so much nearer than the body's radius, but only so slowly.
 _SQUEEZED_M, _SQUEEZED_M_S = 0.01, 0.1
 _AIM_RAD = 0.1
 _POINTS_M = 2.5  # so near, the laser's points count beside the map
-_REMEMBERED_M = 1.0
-_BESIDE, _SAME_M = 2, 0.03  # beams to either side, and by how much those that see the same thing differ
 # A goal that does not get this much nearer between so many standstills is given up.
 _PROGRESS_M = 0.5
 _STANDSTILLS = 5
@@ -65,6 +63,7 @@ class Navigator:
         self.path: Array | None = None
         self._follower = Follower(self.config)
         self._trail = Trail()
+        self._seen = SeenPoints()
         self._goal: tuple[float, float] | None = None
         self._heading_rad: float | None = None
         self._path_age_s = 0.0
@@ -73,8 +72,6 @@ class Navigator:
         self._standstills = 0
         self._nearest_m = math.inf
         self._patch: GridPatch | None = None
-        self._scan: Scan | None = None
-        self._points_map: Array = np.empty((0, 2))
 
     @property
     def distance_remaining_m(self) -> float:
@@ -94,10 +91,9 @@ class Navigator:
     def step(self, T_map_base: Array, patch: GridPatch, scan: Scan | None, dt_s: float) -> Command:
         """Command for the next dt_s from the pose (3,), the map as known now, and the newest scan.
 
-        The scan's points keep the place where they were first seen, so the same scan may be given again while the robot
-        moves on.
+        The same scan may be given again while the robot moves on.
         """
-        self._look(T_map_base, scan)
+        self._seen.look(T_map_base, scan)
         self._trail.add(T_map_base)
         if self._goal is None:
             return Command(*self._follower.stop(dt_s), 'idle')
@@ -108,18 +104,6 @@ class Navigator:
             if reason:
                 return self._wait(reason, dt_s)
         return self._drive(T_map_base, dt_s)
-
-    def _look(self, T_map_base: Array, scan: Scan | None) -> None:
-        """Take a new scan's points; of earlier ones those stay that are near, where this scan does not look.
-
-        A laser that looks ahead only does not see the corner any more round which the robot is turning.
-        """
-        if scan is not None and scan is not self._scan:
-            self._scan = scan
-            first, step = scan.angle_min_rad, scan.angle_increment_rad
-            T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
-            hits = np.where(scan.hit, scan.ranges_m, np.nan)
-            self._points_map = _points_around(hits, first, step, T_map_laser, self._points_map, T_map_base)
 
     def _arrive(self, T_map_base: Array, dt_s: float) -> Command:
         self._remaining_m = 0.0
@@ -151,8 +135,7 @@ class Navigator:
     def _plan(self, T_map_base: Array, patch: GridPatch) -> str:
         """Plan anew; returns why there is no path, or nothing. In front of an obstacle its points count, too."""
         assert self._goal is not None
-        near = np.square(self._points_map - T_map_base[:2]).sum(axis=1) < _POINTS_M**2
-        points = self._points_map[near] if self._blocked_s > 0.0 else None
+        points = self._seen.within(T_map_base, _POINTS_M) if self._blocked_s > 0.0 else None
         start = float(T_map_base[0]), float(T_map_base[1])
         trail = self._trail.cells(patch.frame, patch.shape)
         path = plan(patch, start, self._goal, self.config, points, self.config.body_radius_m, trail)
@@ -182,7 +165,7 @@ class Navigator:
         if self._remaining_m < self._nearest_m - _PROGRESS_M:
             self._standstills, self._nearest_m = 0, self._remaining_m
         before = (self._follower.v, self._follower.w)
-        room = _room_along(self.path, nearest, _NARROW_AHEAD_M, self._points_map)
+        room = self._seen.room_along(self.path, nearest, _NARROW_AHEAD_M)
         v, w = self._follower.command(T_map_base, self.path, dt_s, room - self.config.body_radius_m)
         if v <= 0.0:
             return Command(v, w, 'driving')
@@ -236,9 +219,7 @@ class Navigator:
         """Highest speed up to v from which the robot still stops before a point of the scan is within a radius."""
         braking = self.config.max_acceleration_m_s2
         needed = v * self.config.reaction_s + v * v / (2.0 * braking)
-        count = math.ceil(needed / _SWEEP_STEP_M)
-        clear = _clear_steps_on_arc(T_map_base, w / v, needed, count, self._points_map, radius_m)
-        free_m = needed * clear / max(count, 1)
+        free_m = self._seen.clear_m(T_map_base, w / v, needed, radius_m)
         late = self.config.reaction_s
         return min(v, braking * (math.sqrt(late * late + 2.0 * free_m / braking) - late))
 
@@ -262,94 +243,3 @@ def _touches(cells: NDArray[np.int8], frame: tuple[float, float, float], path: A
                 if cells[r, c] >= OCCUPIED_AT_LEAST and (r - row) ** 2 + (c - col) ** 2 < radius * radius:
                     return True
     return False
-
-
-@kernel
-def _room_along(path: Array, first: int, length_m: float, points: Array) -> float:
-    """How near points (N, 2) are to a path (K, 2) from one of its points on for some length, m; inf without points."""
-    nearest, along = np.inf, 0.0
-    for k in range(first, path.shape[0]):
-        if k > first:
-            along += math.hypot(path[k, 0] - path[k - 1, 0], path[k, 1] - path[k - 1, 1])
-        if along > length_m:
-            break
-        for i in range(points.shape[0]):
-            nearest = min(nearest, (points[i, 0] - path[k, 0]) ** 2 + (points[i, 1] - path[k, 1]) ** 2)
-    return math.sqrt(nearest)
-
-
-@kernel
-def _arc(start: Array, curvature: float, length_m: float, count: int) -> Array:
-    """Points (count + 1, 2), evenly spaced, of an arc that begins at a pose (3,), m."""
-    points = np.empty((count + 1, 2))
-    for k in range(count + 1):
-        length = length_m * k / max(count, 1)
-        half = 0.5 * curvature * length
-        chord = length if half == 0.0 else length * math.sin(half) / half
-        points[k, 0] = start[0] + chord * math.cos(start[2] + half)
-        points[k, 1] = start[1] + chord * math.sin(start[2] + half)
-    return points
-
-
-@kernel
-def _clear_steps(centres: Array, points: Array, radius: float) -> int:
-    """Index of the last centre (K, 2) that a disc can be moved to, one after the other, without touching points (N, 2).
-
-    A point that is too near to the first centre already only forbids to come still nearer.
-    """
-    clear: int = centres.shape[0]
-    for i in range(points.shape[0]):
-        limit = min(radius, math.hypot(points[i, 0] - centres[0, 0], points[i, 1] - centres[0, 1]))
-        for k in range(clear):
-            if math.hypot(points[i, 0] - centres[k, 0], points[i, 1] - centres[k, 1]) < limit:
-                clear = k
-                break
-    return max(clear - 1, 0)
-
-
-@kernel
-def _clear_steps_on_arc(
-    start: Array, curvature: float, length_m: float, count: int, points: Array, radius: float
-) -> int:
-    """How many of `count` steps along an arc a disc can be moved without touching points: `_arc`, `_clear_steps`."""
-    return _clear_steps(_arc(start, curvature, length_m, count), points, radius)
-
-
-@kernel
-def _smoothed(ranges: Array, i: int) -> float:
-    """A range of a scan (NaN: none), m, as the mean of the beams beside it that say the same but for their noise.
-
-    The nearest of many noisy points is nearer than the wall: without this, passages would seem narrower than they are.
-    """
-    total, count = 0.0, 0
-    for k in range(max(i - _BESIDE, 0), min(i + _BESIDE + 1, ranges.size)):
-        if abs(ranges[k] - ranges[i]) < _SAME_M:
-            total += ranges[k]
-            count += 1
-    return total / count
-
-
-@kernel
-def _points_around(ranges: Array, first: float, step: float, laser: Array, earlier: Array, robot: Array) -> Array:
-    """Where the beams of a scan ended (NaN: nowhere), and those of the points seen earlier (N, 2) that still count.
-
-    These are near to the robot's pose (3,), and lie beside the scan's field of view. All in the map frame, m.
-    """
-    points = np.empty((ranges.size + earlier.shape[0], 2))
-    count = 0
-    for i in range(ranges.size):
-        if not math.isnan(ranges[i]):
-            angle, metres = laser[2] + first + step * i, _smoothed(ranges, i)
-            points[count, 0] = laser[0] + metres * math.cos(angle)
-            points[count, 1] = laser[1] + metres * math.sin(angle)
-            count += 1
-    last = first + step * (ranges.size - 1)
-    middle, half = laser[2] + 0.5 * (first + last), 0.5 * abs(last - first)
-    for i in range(earlier.shape[0]):
-        dx, dy = earlier[i, 0] - laser[0], earlier[i, 1] - laser[1]
-        off = math.pi - (math.pi - (math.atan2(dy, dx) - middle)) % (2.0 * math.pi)
-        near = (earlier[i, 0] - robot[0]) ** 2 + (earlier[i, 1] - robot[1]) ** 2 < _REMEMBERED_M**2
-        if near and abs(off) > half:
-            points[count, 0], points[count, 1] = earlier[i, 0], earlier[i, 1]
-            count += 1
-    return points[:count].copy()
