@@ -72,25 +72,40 @@ def test_without_measurements_nothing_moves():
     np.testing.assert_array_equal(relax(poses[:1], []), poses[:1])
 
 
-def test_loops_in_a_room_straighten_a_path_that_drifts():
-    """Poses that drift by 1 cm and 0.3 degrees a metre: the matches with earlier visits pull them together."""
+def loops_in_a_room(drift):
+    """Loops along a drive, and the true poses of the keyframes; drift (3,): what the given poses err a metre."""
     rng = np.random.default_rng(2)
-    config = MatchConfig()
-    loops, truths, drifting, last = Loops(LoopConfig(), config), [], START, START
+    loops, truths, drifting, last = Loops(LoopConfig(), MatchConfig()), [], START, START
     for truth, _ in drive(1300, rng, START):
         step = se2.between(last, truth)
         ahead = float(np.hypot(step[0], step[1]))
-        drifting, last = se2.compose(drifting, step + ahead * np.array([0.01, 0.003, 0.005])), truth
+        drifting, last = se2.compose(drifting, step + ahead * drift), truth
         scan = scan_in(ROOM, truth, rng)
         loops.follow(scan, np.ascontiguousarray(scan.points_base()), drifting, leapt=False)
         loops.work_off()
         if len(loops.keyframes) > len(truths):
             truths.append(truth)
+    return loops, np.array(truths)
+
+
+def test_loops_in_a_room_straighten_a_path_that_drifts():
+    """Poses that drift by 1 cm and 0.3 degrees a metre: the matches with earlier visits pull them together."""
+    loops, truths = loops_in_a_room(np.array([0.01, 0.003, 0.005]))
     before = np.array([k.T_map_base for k in loops.keyframes])
-    after, truths = loops.relaxed(), np.array(truths)
+    after = loops.relaxed()
     assert len(loops.matched) > 10
     assert worst(before, truths) > 0.3
     assert worst(after, truths) < 0.5 * worst(before, truths)
+
+
+def test_where_the_map_agrees_a_scan_is_matched_with_one_visit():
+    def matches(loops):
+        return np.bincount([m.b for m in loops.matched])
+
+    right, drifting = (loops_in_a_room(drift)[0] for drift in (np.zeros(3), np.array([0.01, 0.003, 0.005])))
+    assert matches(right).max() == 1
+    assert matches(right).sum() > 20
+    assert matches(drifting).max() > 1
 
 
 @pytest.fixture(scope='module')

@@ -1,9 +1,10 @@
 """Loops: coming back by another way, noticed, verified, and what it means for the whole path.
 
 Along the path a scan is kept now and then. Where the path has been near before, it is matched with the scans kept
-there. A match counts that fits well; of matches that tell the place sharply, several along the way that ask for one
-and the same correction make a loop. What the localizer says of neighbours on the path, and the matches of the others,
-make a graph of poses that is relaxed; should the matches that asked for it not be content then, nothing is corrected.
+there: with those of one visit where that agrees with the map, with more where it does not. A match counts that fits
+well; of matches that tell the place sharply, several along the way that ask for one and the same correction make a
+loop. What the localizer says of neighbours on the path, and the matches of the others, make a graph of poses that is
+relaxed; should the matches that asked for it not be content then, nothing is corrected.
 A keyframe costs its scan, its pose and a few measurements in memory, and a few matches in time, one a step.
 Source: Lu and Milios, "Globally consistent range scan alignment for environment mapping", 1997; for the graph see
 pose_graph.
@@ -25,7 +26,7 @@ from thinmap_ros.core.slam.scan_matching import Match, MatchConfig, ScanMatcher
 
 _AROUND = 4  # keyframes to either side that make a submap
 _AGAIN_M = 8.0  # so much way lies between leaving a place and coming back to it
-_VISITS = 3  # earlier visits to a place with which a scan is matched
+_VISITS = 3  # earlier visits to a place with which a scan is matched, at most
 _TURN_M_RAD = 1.0  # a radian of turn makes two scans as different as so many metres
 # Bounds of the error of a step from one keyframe to the next, in m and in rad.
 _STEP_M, _STEP_RAD = (0.002, 0.02), (0.0002, 0.02)
@@ -122,6 +123,8 @@ class Loops:
                 self.matched.append(Measured(j, k, match.T_map_base, np.linalg.inv(covariance), True))
                 if k - j > 1 and math.sqrt(match.covariance[:2, :2].trace()) < _SHARP_M:
                     self._hear(self.matched[-1])
+            while k - j > 1 and self.agreed and self._jobs and self._jobs[0][1] == k:
+                self._jobs.popleft()  # where nothing disagrees, one visit says what the others would
 
     @property
     def agreed(self) -> bool:
