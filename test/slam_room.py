@@ -97,14 +97,15 @@ def corridor_ring() -> np.ndarray:
 
 
 def drive_round_the_block() -> Iterator[tuple[Scan, np.ndarray, np.ndarray]]:
-    """Scan, odometry and truth of a drive once round the corridor and on; the wheels wear to one side."""
-    rng, walls = np.random.default_rng(5), corridor_ring()
+    """Scan, odometry and truth of a drive once round the corridor and on; the wheels wear to one side, and slip."""
+    rng, slips, walls = np.random.default_rng(5), np.random.default_rng(6), corridor_ring()
     truth, odom, number = np.array([3.0, 1.2, 0.0]), np.zeros(3), 0
     for goal in [(38.8, 1.2), (38.8, 18.8), (1.2, 18.8), (1.2, 1.2), (20.0, 1.2)]:
         while np.hypot(*(goal - truth[:2])) > 0.15:
             turn = float(np.clip(se2.wrap(np.arctan2(*(goal - truth[:2])[::-1]) - truth[2]), -0.3, 0.3))
             step = np.array([0.15 if abs(turn) < 0.1 else 0.0, 0.0, turn])
             truth = se2.compose(truth, step)
-            odom = se2.compose(odom, step * [1.03, 1.0, 1.02] + [0.0, 0.0, 0.01 * step[0]])
+            slip = slips.normal(0.0, 0.08)
+            odom = se2.compose(odom, step * [1.03, 1.0, 1.02] + [0.0, 0.0, 0.01 * step[0] + slip])
             yield scan_in(walls, truth, rng, 200_000_000 * number), odom, truth
             number += 1

@@ -45,6 +45,12 @@ def between(T_a_b: Array, T_a_c: Array) -> Array:
     return compose(invert(T_a_b), T_a_c)
 
 
+def off(T: Array, T_expected: Array) -> Array:
+    """How far a pose is from where it was expected, (3,): the differences of x, y and heading, the last one wrapped."""
+    x, y, theta = (T - T_expected).tolist()
+    return np.array([x, y, wrap(theta)])
+
+
 def transform_points(T_a_b: Array, points_b: Array) -> Array:
     """Points (N, 2) given in b, expressed in a, (N, 2)."""
     c, s = math.cos(T_a_b[2]), math.sin(T_a_b[2])

@@ -141,6 +141,18 @@ def test_a_match_far_from_its_prior_has_to_be_worth_it():
     assert likelier(contradicted, clear, prior, 900.0 * covariance, 40) is clear
 
 
+def test_a_few_points_of_a_new_wall_do_not_pull_the_robot_to_a_known_one(rng):
+    """As through a door: of a wall a foot before the known one twenty points are seen, which would fit that well."""
+    matcher = matcher_of(CORRIDOR, [np.array([x, 0.0, 0.0]) for x in np.linspace(-1, 1, 12)], rng)
+    points = np.column_stack([np.linspace(-0.4, 0.4, 20), np.full(20, 0.7)]) + rng.normal(0.0, 0.005, (20, 2))
+    prior, wheels = np.zeros(3), np.diag(np.square([0.01, 0.01, 0.05]))
+    match = matcher.match(points, np.zeros(2), prior, wheels)
+    assert not match.good or np.hypot(*match.T_map_base[:2]) < 0.05
+    # Of a robot that may be anywhere they tell something.
+    match = matcher.match(points, np.zeros(2), prior, wheels, lost=True)
+    assert match.good and match.T_map_base[1] == pytest.approx(0.3, abs=0.05)
+
+
 def test_what_a_map_knows_of_a_scan(rng):
     matcher = matcher_of(ROOM, around(TRUTH, 15, rng), rng)
     points = scan_in(ROOM, TRUTH, rng).points_base()

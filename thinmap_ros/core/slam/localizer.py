@@ -21,6 +21,7 @@ from thinmap_ros.core.slam.lines import LineConfig, Lines, extract_lines, no_lin
 from thinmap_ros.core.slam.loops import Correction, Keyframe, LoopConfig, Loops
 from thinmap_ros.core.slam.models import MotionConfig, motion_jacobians, odometry_covariance, rotation
 from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
+from thinmap_ros.core.slam.odometry_noise import OdometryNoise
 from thinmap_ros.core.slam.redrawn_map import RedrawnMap
 from thinmap_ros.core.slam.scan_matching import FEWEST_POINTS, Match, MatchConfig
 from thinmap_ros.core.slam.tracking import Tracking
@@ -108,6 +109,7 @@ class Localizer:
         self._path: list[tuple[int, Array]] = []
         self._T_odom_base: Array | None = None
         self._calibration = OdometryCalibration()
+        self._noise = OdometryNoise(self.config)
         self._T_last_look: Array | None = None
         # Share of that look's points which the map then knew; walls that are far off take several looks.
         self._known_here = 0.0
@@ -233,7 +235,8 @@ class Localizer:
             self.refused += 1
             increment = np.zeros(3)
         increment, systematic = self._calibration.corrected(increment)
-        return increment, odometry_covariance(increment, self.config) + systematic
+        self._noise.move(increment)
+        return increment, odometry_covariance(increment, self.config, self._noise.share) + systematic
 
     def _seen(self, scan: Scan) -> tuple[Array, Array]:
         """Points (N, 2) that can be matched and the laser's place (2,), robot frame."""
@@ -252,13 +255,16 @@ class Localizer:
         predicted = se2.compose(pose, increment)
         F, _ = motion_jacobians(pose, increment)
         self._doubt.move(F, turn @ covariance @ turn.T)
-        match = self._map.matcher.match(points_base, laser_base, predicted, self._doubt.since_match)
+        match = self._map.matcher.match(
+            points_base, laser_base, predicted, self._doubt.since_match, lost=self._tracking.lost
+        )
         near = not self._moved(_KNOWN_M, _KNOWN_RAD, match.T_map_base)
         match = self._tracking.judged(match, points_base, scan, increment, near)
         if len(points_base) >= FEWEST_POINTS:  # fewer fit nothing, and contradict nothing
             self._tracking.count(match.good, self._on_new_ground(match))
         if match.good:
             evidence = self._doubt.evidence(match.covariance)
+            self._noise.learn(se2.off(match.T_map_base, predicted), evidence, float(predicted[2]))
             match = self._taken_back(match, predicted, evidence)
             added = self._doubt.match(evidence, increment)
             increment, covariance = se2.between(pose, match.T_map_base), turn.T @ added @ turn
@@ -277,8 +283,7 @@ class Localizer:
         again, and the pose would creep wherever points say nothing: along a corridor, by its own two walls.
         """
         step, seen = self._ekf.moved_by_updates(), evidence.by_map
-        off = match.T_map_base - predicted
-        off[2] = se2.wrap(float(off[2]))
+        off = se2.off(match.T_map_base, predicted)
         share = float(np.clip(-(off @ seen @ step) / max(float(step @ seen @ step), 1e-12), 0.0, 1.0))
         self._ekf.take_back(share)
         T_map_base = match.T_map_base - share * (evidence.posterior @ evidence.by_prior @ step)

@@ -246,6 +246,7 @@ class Loops:
             prior,
             np.diag(np.square(_PRIOR_SIGMAS) + [drift**2, drift**2, 0.0]),
             search=drift > _SEARCHED_M and not self.agreed,
+            lost=True,  # drift is not what wheels do from scan to scan
         )
 
 

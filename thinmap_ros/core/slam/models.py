@@ -24,11 +24,19 @@ class MotionConfig(Config):
     odom_slip_rad: float = parameter(0.003, 'error of any increment, rad', low=1e-5, high=1.0)
 
 
-def odometry_covariance(increment: Array, config: MotionConfig) -> Array:
+def odometry_variances(increment: Array, config: MotionConfig) -> Array:
+    """Variances (2,) of the chord, m^2, and of the turn, rad^2, of an odometry increment (3,), without slip."""
+    chord, turn = math.hypot(increment[0], increment[1]), abs(float(increment[2]))
+    of_turn = config.odom_turn_sigma**2 * turn + config.odom_drift_sigma**2 * chord
+    return np.array([config.odom_distance_sigma**2 * chord, of_turn])
+
+
+def odometry_covariance(increment: Array, config: MotionConfig, shares: Array | None = None) -> Array:
     """Covariance (3, 3) of an odometry increment (3,), in the robot frame before the motion.
 
     The inputs are the chord d that the robot moved and the angle phi that it turned: on an arc the increment is
-    (d cos(phi/2), d sin(phi/2), phi). Their noise is independent; slip in any direction comes on top.
+    (d cos(phi/2), d sin(phi/2), phi). Their noise is independent; slip in any direction comes on top. shares (2,):
+    what there is of the variances of chord and turn, without it all.
     Source: EKF-SLAM/TI paper eq. (11), the part F_u Q F_u'; differential-drive model after Siegwart and Nourbakhsh.
     """
     chord, turn = math.hypot(increment[0], increment[1]), float(increment[2])
@@ -36,10 +44,9 @@ def odometry_covariance(increment: Array, config: MotionConfig) -> Array:
     d = -chord if backward else chord
     c, s = math.cos(turn / 2.0), math.sin(turn / 2.0)
     G = np.array([[c, -0.5 * d * s], [s, 0.5 * d * c], [0.0, 1.0]])
-    of_chord = config.odom_distance_sigma * math.sqrt(chord)
-    of_turn = math.sqrt(config.odom_turn_sigma**2 * abs(turn) + config.odom_drift_sigma**2 * chord)
+    variances = odometry_variances(increment, config) * (1.0 if shares is None else shares)
     slip = np.square([config.odom_slip_m, config.odom_slip_m, config.odom_slip_rad])
-    scaled = G * np.array([of_chord, of_turn])
+    scaled = G * np.sqrt(variances)
     return np.asarray(scaled @ scaled.T + np.diag(slip))
 
 

@@ -7,15 +7,16 @@ matching", 2009.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.grid.tiles import NO_TILE, TILE
 from thinmap_ros.core.jit import kernel
-from thinmap_ros.core.se2 import Array, wrap
+from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.point_map import (
     CENTRE_X,
     CENTRE_Y,
@@ -94,13 +95,14 @@ class ScanMatcher:
         self.map.add(points_map, seen_from)
 
     def match(
-        self, points_base: Array, laser_base: Array, prior: Array, covariance: Array, search: bool = False
+        self, points_base: Array, laser_base: Array, prior: Array, covariance: Array,
+        search: bool = False, lost: bool = False,
     ) -> Match:
         """Pose at which points (N, 2), in the order of the beams, fit the map near a prior pose (3,).
 
         laser_base (2,): where the laser sits on the robot; covariance (3, 3) of the prior, in the map frame. Where
-        the fit is poor, or with `search`, the surroundings are searched. Without points or map, the prior is given
-        back, as not good.
+        the fit is poor, or with `search`, the surroundings are searched. lost: the prior is only where to begin.
+        Without points or map, the prior is given back, as not good.
         """
         if len(points_base) < FEWEST_POINTS or self.map.tiles.used == 0:
             return Match(prior, covariance, 0.0, 0.0, False)
@@ -114,9 +116,12 @@ class ScanMatcher:
             return _better(match, self._search(scan, laser_base, prior, covariance))
         if match.overlap >= _LEAST_OVERLAP and match.fit < self.config.match_good_fit:
             found = self._search(scan, laser_base, prior, covariance)
-            # Where the prior's own match would do, another one has to be worth the leap.
-            match = likelier(match, found, prior, covariance, len(scan)) if match.good else _better(match, found)
-        return match
+            # Where the prior still says something, another place has to be worth the leap.
+            match = _better(match, found) if lost else likelier(match, found, prior, covariance, len(scan))
+        if lost:
+            return match
+        # Few points, or such as hardly fit, may say less than the prior does: then it is better that they say nothing.
+        return replace(match, good=match.good and _evidence(match, prior, covariance, len(scan)) >= 0.0)
 
     def known(self, points_base: Array, laser_base: Array, T_map_base: Array) -> float:
         """Share of the points (N, 2) that lie where the map knows a surface, at a pose (3,)."""
@@ -187,7 +192,7 @@ class ScanMatcher:
         overlap, fit = shares[1] / shares[0], shares[2] / max(shares[1], 1e-9)
         if not np.isfinite(pose).all():
             return Match(prior, covariance, 0.0, float(overlap), False)
-        pose[2] = wrap(float(pose[2]))
+        pose[2] = se2.wrap(float(pose[2]))
         good = overlap >= _LEAST_OVERLAP and fit >= config.match_least_fit
         return Match(pose, np.linalg.inv(posterior).astype(np.float64), float(fit), float(overlap), bool(good))
 
@@ -211,8 +216,7 @@ def _evidence(match: Match, prior: Array, covariance: Array, points: int) -> flo
 
 def _squared_sigmas(match: Match, prior: Array, covariance: Array) -> float:
     """How far a match is off its prior, squared, in sigmas of that."""
-    off = match.T_map_base - prior
-    off[2] = wrap(float(off[2]))
+    off = se2.off(match.T_map_base, prior)
     return float(off @ np.linalg.solve(covariance, off))
 
 
