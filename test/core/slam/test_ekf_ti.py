@@ -1,5 +1,7 @@
 """EKF-SLAM/TI against the conventional filter: the same associations, the same estimate to rounding."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from dense_filter import DenseFilter
@@ -9,6 +11,7 @@ from thinmap_ros.core.slam.ekf import EkfSlam
 from thinmap_ros.core.slam.ekf_ti import CompressedEkf
 from thinmap_ros.core.slam.models import observe_line
 
+STATUS = Path('/proc/self/status')
 P0, Q = np.diag([0.01, 0.02, 0.003]), np.diag([1e-4, 5e-5, 4e-5])
 R = np.array([[4e-4, 1e-5], [1e-5, 1e-4]])
 
@@ -137,3 +140,18 @@ def test_steps_touch_the_local_area_only(rng):
     pair.local.enter(pair.local.ids[:8])
     assert pair.local.local.size == 2 * (3 + 2 * 8)
     assert len(pair.local) == 300
+
+
+@pytest.mark.skipif(not STATUS.exists(), reason='says what a process holds only where there is a /proc')
+def test_some_hundred_features_take_little_memory(rng):
+    """Their covariance is 2 MB; the store has room for far more, which must not count."""
+    before, ekf = held_mb(), CompressedEkf(np.array([1.0, -2.0, 0.4]), P0)
+    for feature_id in range(250):
+        ekf.add(feature_id, new_line(rng), R)
+    ekf.enter([0, 1])
+    assert held_mb() - before < 14.0
+
+
+def held_mb():
+    """What this process has written to, MB."""
+    return next(int(line.split()[1]) / 1e3 for line in STATUS.read_text().splitlines() if 'RssAnon' in line)

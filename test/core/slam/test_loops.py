@@ -98,14 +98,14 @@ def test_loops_in_a_room_straighten_a_path_that_drifts():
     assert worst(after, truths) < 0.5 * worst(before, truths)
 
 
-def test_where_the_map_agrees_a_scan_is_matched_with_one_visit():
+def test_where_the_map_agrees_few_matches_are_asked_for():
     def matches(loops):
         return np.bincount([m.b for m in loops.matched])
 
-    right, drifting = (loops_in_a_room(drift)[0] for drift in (np.zeros(3), np.array([0.01, 0.003, 0.005])))
-    assert matches(right).max() == 1
-    assert matches(right).sum() > 20
-    assert matches(drifting).max() > 1
+    right, drifting = (matches(loops_in_a_room(drift)[0]) for drift in (np.zeros(3), np.array([0.01, 0.003, 0.005])))
+    assert right.sum() > 10
+    assert (right[:-1] + right[1:]).max() == 1, 'one visit, and not of two keyframes in a row'
+    assert drifting.max() > 1
 
 
 @pytest.fixture(scope='module')

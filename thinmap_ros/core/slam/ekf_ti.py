@@ -16,6 +16,8 @@ rows; reading only what a new area needs and working off W a few rows at each st
 """
 
 import math
+import mmap
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -177,7 +179,7 @@ class _Store:
     def __init__(self) -> None:
         self.mean: Array = np.zeros(_ROOM)
         self.width = _CHUNK  # numbers in use, in whole chunks
-        self._P: Array = np.zeros((_ROOM, _ROOM))
+        self._P = _zeros(_ROOM)
         self._used = 0
         self._free: list[int] = []
         self._sweeping: Array = np.zeros((0, self.width))
@@ -194,7 +196,7 @@ class _Store:
             self.width += _CHUNK
             self._sweeping, self._waiting = widened(self._sweeping, self.width), widened(self._waiting, self.width)
         if self.width > self.mean.size:
-            self.mean, larger = np.append(self.mean, np.zeros(_ROOM)), np.zeros((self.mean.size + _ROOM,) * 2)
+            self.mean, larger = np.append(self.mean, np.zeros(_ROOM)), _zeros(self.mean.size + _ROOM)
             larger[: len(self._P), : len(self._P)] = self._P
             self._P = larger
         return self._used - 1
@@ -261,6 +263,17 @@ class _Store:
         self._row = b
         if b == end:
             self._sweeping = self._sweeping[:0]
+
+
+def _zeros(size: int) -> Array:
+    """Zeros (size, size) that take up memory only where they are written.
+
+    Not by numpy: that asks for large pages, of which each line of the few numbers in use would take up its share.
+    """
+    pages = mmap.mmap(-1, 8 * size * size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    with suppress(AttributeError, OSError):  # where there are no large pages
+        pages.madvise(mmap.MADV_NOHUGEPAGE)
+    return np.frombuffer(pages, dtype=np.float64).reshape(size, size)
 
 
 def widened(rows: Array, width: int) -> Array:

@@ -1,10 +1,10 @@
 """Loops: coming back by another way, noticed, verified, and what it means for the whole path.
 
 Along the path a scan is kept now and then. Where the path has been near before, it is matched with the scans kept
-there: with those of one visit where that agrees with the map, with more where it does not. A match counts that fits
-well; of matches that tell the place sharply, several along the way that ask for one and the same correction make a
-loop. What the localizer says of neighbours on the path, and the matches of the others, make a graph of poses that is
-relaxed; should the matches that asked for it not be content then, nothing is corrected.
+there: now and then with those of one visit where that agrees with the map, always and with more where it does not. A
+match counts that fits well; of matches that tell the place sharply, several along the way that ask for one and the
+same correction make a loop. What the localizer says of neighbours on the path, and the matches of the others, make a
+graph of poses that is relaxed; should the matches that asked for it not be content then, nothing is corrected.
 A keyframe costs its scan, its pose and a few measurements in memory, and a few matches in time, one a step.
 Source: Lu and Milios, "Globally consistent range scan alignment for environment mapping", 1997; for the graph see
 pose_graph.
@@ -44,7 +44,8 @@ _LATELY = 8  # keyframes back to which they count
 _ALIKE_M, _ALIKE_RAD = 0.2, 0.06  # by how much they may differ
 _WORTH_M, _WORTH_RAD = 0.12, 0.04  # smaller corrections are left to the end
 _BUCKET_M = 4.0  # keyframes are listed by squares of this size
-_HOLDS_M = 3.0  # so much way after a match that agrees, the old map is still trusted
+_FRESH_M = 1.0  # so much way after a match that agrees, no other one is asked for
+_HOLDS_M = 3.0  # so much way after it, the old map is still trusted
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,8 @@ class Loops:
             if self._leapt:
                 self._leaps.add(k - 1)
                 self._jobs.append((k - 1, k))
-            self._jobs.extend((j, k) for j in self._earlier_visits(k))
+            if way - self._agreed_at_m > _FRESH_M:
+                self._jobs.extend((j, k) for j in self._earlier_visits(k))
         self._leapt = False
 
     def work_off(self) -> None:

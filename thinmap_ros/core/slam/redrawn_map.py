@@ -12,7 +12,8 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.loops import Keyframe
 from thinmap_ros.core.slam.scan_matching import MatchConfig, ScanMatcher
 
-_AT_ONCE, _A_STEP = 60, 3  # keyframes drawn anew when a loop was closed, and in each step after it
+_AT_ONCE, _A_STEP = 60, 1  # keyframes drawn anew when a loop was closed, and in each step after it
+_SORTED_M = 3.0  # after so much way it is asked again which of them are the nearest
 
 
 class RedrawnMap:
@@ -21,19 +22,31 @@ class RedrawnMap:
     def __init__(self, config: MatchConfig, given: Mapping[str, NDArray[Any]] | None = None) -> None:
         """Begin with the `state` of another map of points, where one is given; raises InputError where it is none."""
         self._config, self._given = config, given
-        self._due: list[int] = []
+        self._due: list[int] = []  # the nearest last
+        self._sorted_at: Array = np.zeros(2)
         self.matcher = self._fresh()
 
     def begin_anew(self, keyframes: list[Keyframe], T_map_base: Array) -> None:
         """The keyframes have moved: draw what is in sight of a pose (3,) at once, and the rest step by step."""
-        away = np.hypot(*np.array([frame.T_map_base[:2] - T_map_base[:2] for frame in keyframes]).T)
-        self._due = np.argsort(-away).tolist()
+        self._due = list(range(len(keyframes)))
+        away = self._sort(keyframes, T_map_base[:2])
         self.matcher = self._fresh()
         self._draw(keyframes, min(int((away < self._config.match_range_m).sum()), _AT_ONCE))
 
     def go_on(self, keyframes: list[Keyframe]) -> None:
-        """Draw a few more of the keyframes that are due, the nearest first."""
-        self._draw(keyframes, _A_STEP)
+        """Draw a few more of the keyframes that are due, those that are nearest to the newest one first."""
+        if self._due:
+            here = keyframes[-1].T_map_base[:2]
+            if math.dist(here, self._sorted_at) > _SORTED_M:
+                self._sort(keyframes, here)
+            self._draw(keyframes, _A_STEP)
+
+    def _sort(self, keyframes: list[Keyframe], here: Array) -> Array:
+        """Put what is due in order, the nearest to a place (2,) last; their distances (N,) from there."""
+        away = np.hypot(*(np.array([keyframes[k].T_map_base[:2] for k in self._due]).reshape(-1, 2) - here).T)
+        order = np.argsort(-away)
+        self._due, self._sorted_at = np.array(self._due)[order].tolist(), here.copy()
+        return np.asarray(away[order])
 
     def _fresh(self) -> ScanMatcher:
         matcher = ScanMatcher(self._config)
