@@ -28,6 +28,7 @@ class Graph:
 
     def __init__(self, domain: int, folder: Path) -> None:
         self.folder, self.processes = folder, {}
+        self._heard = 0
         self.context = Context()
         rclpy.init(context=self.context, domain_id=domain)
         self.node = Node('test_client', context=self.context)
@@ -57,8 +58,25 @@ class Graph:
     def heard(self, topic: str, kind: type, profile: QoSProfile = qos.STREAM) -> list[Any]:
         """List that fills with the messages of a topic as the test spins."""
         messages: list[Any] = []
-        self.node.create_subscription(kind, topic, messages.append, profile)
+
+        def hear(message: Any) -> None:
+            self._heard += 1
+            messages.append(message)
+
+        self.node.create_subscription(kind, topic, hear, profile)
         return messages
+
+    def hear_out(self) -> None:
+        """Hear what still waits, until it is quiet: of those that have stopped nothing comes later."""
+        last_heard, quiet = self._heard, 0
+
+        def is_quiet() -> bool:
+            nonlocal last_heard, quiet
+            quiet = quiet + 1 if self._heard == last_heard else 0
+            last_heard = self._heard
+            return quiet > 5
+
+        self.until(is_quiet, 'quiet')
 
     def until(self, condition: Callable[[], Any], what: str, seconds: float = PATIENCE_S) -> None:
         end = time.monotonic() + seconds
