@@ -21,6 +21,7 @@ from thinmap_ros.adapters import qos
 
 # Generous: a test waits for what it wants, and fails only where that never comes.
 PATIENCE_S = 60.0
+_DEPTH = 1000
 
 
 class Graph:
@@ -56,14 +57,15 @@ class Graph:
         return (self.folder / f'{name}.log').read_text()
 
     def heard(self, topic: str, kind: type, profile: QoSProfile = qos.STREAM) -> list[Any]:
-        """List that fills with the messages of a topic as the test spins."""
+        """List that fills with all messages of a topic as the test spins, however long it is kept from that."""
         messages: list[Any] = []
+        deep = QoSProfile(depth=_DEPTH, reliability=profile.reliability, durability=profile.durability)
 
         def hear(message: Any) -> None:
             self._heard += 1
             messages.append(message)
 
-        self.node.create_subscription(kind, topic, hear, profile)
+        self.node.create_subscription(kind, topic, hear, deep)
         return messages
 
     def hear_out(self) -> None:
