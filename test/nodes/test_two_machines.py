@@ -194,4 +194,4 @@ def test_an_exploration_in_real_time_over_a_weak_link_finishes_though_it_breaks_
     wait(machines, lambda: monitor.poll() is not None, 'the exploration ends', 800.0)
     assert json.loads(result.read_text())['finished'], machines.logs()
     frames = machines.frames()
-    assert frames['carried'] > 10_000 and 0.04 < frames['lost'] / (frames['carried'] + frames['lost']) < 0.08, frames
+    assert 0.04 < frames['lost'] / (frames['carried'] + frames['lost']) < 0.06, frames
