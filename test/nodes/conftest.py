@@ -76,7 +76,7 @@ class Graph:
             nonlocal last_heard, quiet
             quiet = quiet + 1 if self._heard == last_heard else 0
             last_heard = self._heard
-            return quiet > 5
+            return quiet > 3
 
         self.until(is_quiet, 'quiet')
 
