@@ -21,6 +21,7 @@ from thinmap_ros.adapters import qos
 
 # Generous: a test waits for what it wants, and fails only where that never comes.
 PATIENCE_S = 60.0
+_DEPTH = 1000
 
 
 class Graph:
@@ -28,6 +29,7 @@ class Graph:
 
     def __init__(self, domain: int, folder: Path) -> None:
         self.folder, self.processes = folder, {}
+        self._heard = 0
         self.context = Context()
         rclpy.init(context=self.context, domain_id=domain)
         self.node = Node('test_client', context=self.context)
@@ -55,10 +57,28 @@ class Graph:
         return (self.folder / f'{name}.log').read_text()
 
     def heard(self, topic: str, kind: type, profile: QoSProfile = qos.STREAM) -> list[Any]:
-        """List that fills with the messages of a topic as the test spins."""
+        """List that fills with all messages of a topic as the test spins, however long it is kept from that."""
         messages: list[Any] = []
-        self.node.create_subscription(kind, topic, messages.append, profile)
+        deep = QoSProfile(depth=_DEPTH, reliability=profile.reliability, durability=profile.durability)
+
+        def hear(message: Any) -> None:
+            self._heard += 1
+            messages.append(message)
+
+        self.node.create_subscription(kind, topic, hear, deep)
         return messages
+
+    def hear_out(self) -> None:
+        """Hear what still waits, until it is quiet: of those that have stopped nothing comes later."""
+        last_heard, quiet = self._heard, 0
+
+        def is_quiet() -> bool:
+            nonlocal last_heard, quiet
+            quiet = quiet + 1 if self._heard == last_heard else 0
+            last_heard = self._heard
+            return quiet > 3
+
+        self.until(is_quiet, 'quiet')
 
     def until(self, condition: Callable[[], Any], what: str, seconds: float = PATIENCE_S) -> None:
         end = time.monotonic() + seconds

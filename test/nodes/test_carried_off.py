@@ -76,6 +76,7 @@ def test_a_robot_finds_itself_in_a_saved_map_and_maps_on_also_when_it_is_carried
     known = robot.ids()
     assert len(known) > 4
     assert [graph.stop(name) for name in ('sim', *NODES)] == [0] * 4
+    graph.hear_out()
     heard = robot.truth, robot.poses, robot.status, robot.features, robot.maps
     for messages_of_then in heard:
         messages_of_then.clear()

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped, Twist
 from nav_msgs.msg import OccupancyGrid, Odometry
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.msg import LocalizationStatus, TopologicalMap
@@ -22,8 +21,6 @@ from thinmap_ros.core.topology.update import TopologyConfig, build
 
 pytestmark = pytest.mark.live
 START = (2.0, 2.0, 0.0)
-# Two messages may come before a busy test looks, and a latched topic's usual depth keeps one.
-DEEP = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 # Two rooms that are the same, so that a turn tells nothing, and the corridor at their doors, which goes on to one side.
@@ -60,7 +57,7 @@ def map_file(tmp_path):
 
 
 def test_a_robot_that_drives_about_finds_itself_when_asked(graph, map_file):
-    status = graph.heard('localization_status', LocalizationStatus, DEEP)
+    status = graph.heard('localization_status', LocalizationStatus, qos.LATCHED)
     poses = graph.heard('initialpose', PoseWithCovarianceStamped)
     samples = graph.heard('localization_samples', PoseArray, qos.LATCHED)
     odometry = graph.heard('odom', Odometry)
@@ -132,7 +129,7 @@ def scan_msg(ns, ranges):
 
 
 def test_what_is_wrong_with_the_input_is_said_in_words_and_no_pose_comes_of_it(graph, map_file):
-    status = graph.heard('localization_status', LocalizationStatus, DEEP)
+    status = graph.heard('localization_status', LocalizationStatus, qos.LATCHED)
     poses = graph.heard('initialpose', PoseWithCovarianceStamped)
     samples = graph.heard('localization_samples', PoseArray, qos.LATCHED)
     say = {

@@ -22,18 +22,23 @@ pytestmark = pytest.mark.live
 ADDRESSES = ('10.77.0.1', '10.77.0.2')
 CABLE = ('cable0', 'cable1')
 PATIENCE_S = 60.0
+WEAK = (0.05, 0.05, 7)  # share of the frames that is lost, seconds that each takes one way, seed
 
 
 class Machines:
     """Two network namespaces, 0 and 1, and the node processes in them."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, weak: bool) -> None:
         self.folder = folder
+        self.link: subprocess.Popen[str] | None = None
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
         self._holders = [self._hold(['unshare', '-r', '-n'])]
         self._holders.append(self._hold([*self._inside(0), 'unshare', '-n']))
-        self.run(0, 'ip', 'link', 'add', CABLE[0], 'type', 'veth', 'peer', 'name', CABLE[1])
-        self.run(0, 'ip', 'link', 'set', CABLE[1], 'netns', str(self._pid(1)))
+        if weak:
+            self._lay_weak_link()
+        else:
+            self.run(0, 'ip', 'link', 'add', CABLE[0], 'type', 'veth', 'peer', 'name', CABLE[1])
+            self.run(0, 'ip', 'link', 'set', CABLE[1], 'netns', str(self._pid(1)))
         for machine in (0, 1):
             self.run(machine, 'ip', 'addr', 'add', f'{ADDRESSES[machine]}/24', 'dev', CABLE[machine])
             self.run(machine, 'ip', 'link', 'set', 'lo', 'up')
@@ -45,6 +50,23 @@ class Machines:
         if not holder.stdout.readline():
             pytest.skip('this machine lets nobody make network namespaces (unshare -rn)')
         return holder
+
+    def _lay_weak_link(self) -> None:
+        if not os.access('/dev/net/tun', os.R_OK | os.W_OK):
+            pytest.skip('no frames can be lost or held up here: there is no /dev/net/tun that may be opened')
+        program = Path(__file__).with_name('weak_link.py')
+        command = [*self._inside(0), sys.executable, str(program), str(self._pid(1)), *CABLE, *map(str, WEAK)]
+        self.link = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        assert self.link.stdout is not None and self.link.stderr is not None
+        if not self.link.stdout.readline():
+            pytest.skip(f'no TAP devices here: {self.link.stderr.read().strip().splitlines()[-1]}')
+
+    def frames(self) -> dict[str, int]:
+        """How many frames the weak link carried, and how many it lost; with this it ends."""
+        assert self.link is not None
+        self.link.terminate()
+        counts: dict[str, int] = json.loads(self.link.communicate(timeout=PATIENCE_S)[0])
+        return counts
 
     def _pid(self, machine: int) -> int:
         return self._holders[machine].pid
@@ -92,17 +114,18 @@ class Machines:
         return '\n'.join(f'{name}: {(self.folder / f"{name}.log").read_text()[-1500:]}' for name in self.processes)
 
     def close(self) -> None:
-        for process in [*self.processes.values(), *reversed(self._holders)]:
+        links = [] if self.link is None else [self.link]
+        for process in [*self.processes.values(), *links, *reversed(self._holders)]:
             if process.poll() is None:
                 process.send_signal(signal.SIGKILL)
             process.wait()
 
 
-@pytest.fixture
-def machines(ros_domain, tmp_path):
+@pytest.fixture(params=['cable'])
+def machines(request, ros_domain, tmp_path):
     if missing := [tool for tool in ('unshare', 'nsenter', 'ip') if shutil.which(tool) is None]:
         pytest.skip(f'needs {missing[0]} (packages util-linux, iproute2)')
-    both = Machines(tmp_path)
+    both = Machines(tmp_path, weak=request.param == 'weak link')
     yield both
     both.close()
 
@@ -153,3 +176,22 @@ def test_an_exploration_over_the_cable_finishes_though_it_is_pulled_for_five_sec
     machines.unplugged(5.0)
     wait(machines, lambda: monitor.poll() is not None, 'the exploration ends', 800.0)
     assert json.loads(result.read_text())['finished'], machines.logs()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize('machines', ['weak link'], indirect=True)
+def test_an_exploration_in_real_time_over_a_weak_link_finishes_though_it_breaks_as_well(machines, tmp_path):
+    result = tmp_path / 'result.json'
+    start_mapping(machines, 1)
+    for name in ('navigator', 'explorer'):
+        machines.start(0, name, use_sim_time=True)
+    # Nobody waits for an answer: what comes late comes late.
+    machines.start(0, 'sim', start=START, hold_for_subscribers=4)
+    monitor = machines.start(0, 'demo_monitor', use_sim_time=True, result=str(result))
+    time.sleep(30.0)
+    machines.unplugged(5.0)
+    wait(machines, lambda: monitor.poll() is not None, 'the exploration ends', 800.0)
+    assert json.loads(result.read_text())['finished'], machines.logs()
+    frames = machines.frames()
+    assert 0.04 < frames['lost'] / (frames['carried'] + frames['lost']) < 0.06, frames

@@ -4,18 +4,26 @@ import gzip
 import json
 import subprocess
 import sys
+from collections import Counter
 
 import numpy as np
 import pytest
 
-from thinmap_ros.adapters import map_files
+from thinmap_ros.adapters import map_files, rerun_streams
 from thinmap_ros.adapters.bag_writer import BagWriter
 from thinmap_ros.adapters.carmen import CarmenLog, LaserOptions
+from thinmap_ros.adapters.views import NullView
+from thinmap_ros.pipeline import PipelineConfig
 from thinmap_ros.tools.carmen_to_bag import convert
+from thinmap_ros.tools.replay import main, replay
+from thinmap_ros.tools.replay_view import ReplayView
 
 TRAJECTORIES = {'trajectory.tum', 'trajectory_final.tum'}
 FILES = TRAJECTORIES | {'map.pgm', 'map.yaml', 'topology.geojson', 'summary.png', 'report.json'}
 BEAMS = 181
+needs_rerun = pytest.mark.skipif(
+    not rerun_streams.is_installed(), reason='needs rerun, which is not installed (the extra "viewer")'
+)
 
 
 def run(*arguments):
@@ -184,3 +192,88 @@ def test_real_office_log(shared_data, tmp_path):
     report = json.loads((tmp_path / 'out' / 'report.json').read_text())
     assert report['scans'] > 400
     assert report['nodes'] > 5
+
+
+class Diary(NullView):
+    """What a view was told: how often of what, and the last map."""
+
+    def __init__(self):
+        self.told, self.map_shown = Counter(), None
+
+    def pose(self, ns, T_map_base, covariance):
+        self.told['pose'] += 1
+
+    def scan(self, ns, scan):
+        self.told['scan'] += 1
+
+    def grid(self, ns, patch):
+        self.told['grid'] += 1
+        self.map_shown = patch
+
+    def number(self, ns, plot, curve, value):
+        self.told[plot, curve] += np.isfinite(value)
+
+
+def test_a_view_is_told_each_scan_and_the_map_as_it_is_in_the_end(log):
+    diary = Diary()
+    result = replay(CarmenLog(log, LaserOptions()), PipelineConfig(), shown=ReplayView(diary))
+    assert len(result.poses) == diary.told['pose'] == diary.told['scan'] == 30
+    assert diary.told['grid'] == 7, 'once a second of the log, and at its end'
+    assert np.array_equal(diary.map_shown.cells, result.pipeline.grid.patch().cells)
+    for curve in (('step', 'localizer'), ('step', 'map update'), ('step', 'graph update'), ('count', 'features')):
+        assert diary.told[curve] == 30
+
+
+@pytest.mark.skipif(rerun_streams.is_installed(), reason='says what happens where rerun is not installed; it is')
+@pytest.mark.parametrize('option', ['--view', '--recording=run.rrd'])
+def test_without_rerun_a_view_is_refused_in_one_line(log, tmp_path, option):
+    done = run(log, '-o', tmp_path / 'out', option)
+    assert done.returncode == 2 and done.stderr.splitlines()[-1].startswith('replay: error: rerun is not installed')
+    assert not (tmp_path / 'out').exists()
+
+
+@needs_rerun
+def test_without_a_screen_a_view_is_refused_in_one_line(log, tmp_path, monkeypatch):
+    monkeypatch.delenv('DISPLAY', raising=False)
+    monkeypatch.delenv('WAYLAND_DISPLAY', raising=False)
+    done = run(log, '-o', tmp_path / 'out', '--view', '--recording', tmp_path / 'run.rrd')
+    assert done.returncode == 2 and done.stderr.splitlines() == [
+        'replay: error: no screen for the viewer: neither DISPLAY nor WAYLAND_DISPLAY is set'
+    ]
+    assert list(tmp_path.iterdir()) == [log]
+
+
+def rows_of(path, entity):
+    from rerun.chunk import RrdReader
+
+    return sum(chunk.num_rows for chunk in RrdReader(path).stream() if chunk.entity_path == entity)
+
+
+@needs_rerun
+def test_a_recording_holds_the_whole_replay_or_is_not_written(log, tmp_path):
+    done = run(log, '-o', tmp_path / 'out', '--quiet', '--recording', tmp_path / 'run.rrd')
+    assert done.returncode == 0, done.stderr
+    assert rows_of(tmp_path / 'run.rrd', '/map/robot') == rows_of(tmp_path / 'run.rrd', '/map/robot/scan') == 30
+    assert rows_of(tmp_path / 'run.rrd', '/map/grid') >= 6
+    log.write_text('\n'.join(without_scans()))
+    done = run(log, '-o', tmp_path / 'out', '--quiet', '--recording', tmp_path / 'other.rrd')
+    assert done.returncode == 2 and not (tmp_path / 'other.rrd').exists()
+
+
+@needs_rerun
+def test_the_viewer_shows_the_replay_until_it_is_closed(log, tmp_path, monkeypatch, capsys):
+    # The real program, told to write down what it receives where it would open a window; closed when the results are
+    # there and it has had time to be looked at.
+    received, stand_in, report = tmp_path / 'received.rrd', tmp_path / 'viewer', tmp_path / 'out' / 'report.json'
+    stand_in.write_text(
+        f'#!/bin/sh\n"{rerun_streams.viewer_program()}" --save "{received}" "$@" &\n'
+        f'while [ ! -e "{report}" ]; do sleep 0.1; done; sleep 2; kill $!; wait $!\n'
+    )
+    stand_in.chmod(0o755)
+    monkeypatch.setattr(rerun_streams, 'viewer_program', lambda: str(stand_in))
+    monkeypatch.setenv('DISPLAY', ':none')
+    monkeypatch.setattr(sys, 'argv', ['replay', str(log), '-o', str(tmp_path / 'out'), '--quiet', '--view'])
+    main()
+    assert 'close the viewer to end' in capsys.readouterr().err
+    assert {path.name for path in (tmp_path / 'out').iterdir()} == FILES
+    assert rows_of(received, '/map/robot') == 30, 'it was sent all of it'

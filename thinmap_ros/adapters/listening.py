@@ -1,20 +1,18 @@
 """How nodes listen: only while active, and what a message says wrongly is counted and said, and the node goes on."""
 
-from collections import deque
 from collections.abc import Callable
 from time import monotonic
 from typing import Any
 
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import LaserScan
 
 from thinmap_ros.adapters.live_node import LiveNode
+from thinmap_ros.adapters.losses import Losses
 from thinmap_ros.core.errors import InputError
 
 _QUIET_S = 5.0
 _SILENT_S = 3.0
-_LONGEST_GAP_NS = 5_000_000_000
 
 
 def listen(node: LiveNode, kind: type, topic: str, take: Callable[[Any], None], profile: QoSProfile) -> None:
@@ -33,38 +31,49 @@ class _Listener:
         self._is_latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
         self._held: Any = None
         self._said_at = -_QUIET_S
-        self._last_ns = 0
-        self._steps_ns: deque[int] = deque(maxlen=50)
+        self._last_ns, self._set_backs = 0, 0
+        self._losses = Losses()
         node.health.expects(topic)
-        events = SubscriptionEventCallbacks(message_lost=self._on_lost) if self._is_scan else None
-        node.create_subscription(kind, topic, self._on_message, profile, event_callbacks=events)
+        node.create_subscription(kind, topic, self._on_message, profile)
         if self._is_scan:
             node.health.complain_of_silence(topic, _SILENT_S)
         if self._is_latched:
             node.when_activated(self._take_held)
 
-    def _on_message(self, message: Any) -> None:
+    def _on_message(self, message: Any, info: dict[str, Any]) -> None:
         node = self._node
         node.health.heard(self._topic)
-        if self._is_scan:
-            self._count_gaps(message)
+        last_ns, self._last_ns = self._last_ns, _stamp_ns(message)
+        if not self._is_latched:
+            self._count_losses(info.get('publication_sequence_number'))
         node.settle()
-        if not node.is_active:
+        if self._is_left_over(last_ns):
+            node.health.dropped(f'{self._topic}: left over from before the clock was set back', 1)
+        elif not node.is_active:
             self._held = message if self._is_latched else None
         elif self._is_scan and node.is_paused:
             node.health.tell('last scan not taken', 'paused')
         else:
             self._guarded(message)
 
-    def _count_gaps(self, message: LaserScan) -> None:
-        """Count the scans that never came: a laser's stamps are evenly spaced."""
-        ns = 1_000_000_000 * message.header.stamp.sec + message.header.stamp.nanosec
-        step_ns, self._last_ns = ns - self._last_ns, ns
-        if not 0 < step_ns < _LONGEST_GAP_NS:
-            return
-        usual_ns = min(self._steps_ns, default=step_ns)
-        self._steps_ns.append(step_ns)
-        self._node.health.dropped(f'{self._topic}: gaps between the stamps', round(step_ns / usual_ns) - 1)
+    def _is_left_over(self, last_ns: int) -> bool:
+        """Whether a message has waited here since before the clock was set back: it goes on where the stream was then.
+
+        With the first that does not, the stream has arrived in the new time.
+        """
+        node = self._node
+        if self._set_backs == node.set_backs:
+            return False
+        if node.is_of_before(last_ns) and node.is_of_before(self._last_ns):
+            return True
+        self._set_backs = node.set_backs
+        return False
+
+    def _count_losses(self, number: int | None) -> None:
+        lost, missing = self._losses.came(self._last_ns, number)
+        self._node.health.dropped(f'{self._topic}: lost on the way or in a full queue', lost)
+        if self._is_scan:
+            self._node.health.dropped(f'{self._topic}: gaps between the stamps', missing)
 
     def _guarded(self, message: Any) -> None:
         try:
@@ -80,5 +89,7 @@ class _Listener:
         if message is not None:
             self._guarded(message)
 
-    def _on_lost(self, event: Any) -> None:
-        self._node.health.dropped(f'{self._topic}: the queue was full, older ones gave way', event.total_count_change)
+
+def _stamp_ns(message: Any) -> int:
+    """Stamp of a message as it says it, however strange."""
+    return int(1_000_000_000 * message.header.stamp.sec + message.header.stamp.nanosec)

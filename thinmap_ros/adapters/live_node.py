@@ -2,10 +2,9 @@
 
 from collections.abc import Callable
 from time import monotonic
-from typing import Any
 
 from lifecycle_msgs.srv import ChangeState
-from rclpy.clock import Clock, ClockType, JumpThreshold
+from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -41,7 +40,8 @@ class LiveNode(LifecycleNode):
         self.health = Health(self)
         self.is_active = False
         self.is_paused = False
-        self._set_back = False
+        self._set_back, self.set_backs = False, 0
+        self._before_ns = self._back_ns = 0
         self._recovery: Recovery | None = None
         self._on_activation: list[Callable[[], None]] = []
         self._jumps = self.get_clock().create_jump_callback(_SET_BACK, post_callback=self._on_jump)
@@ -119,14 +119,19 @@ class LiveNode(LifecycleNode):
     def settle(self) -> None:
         """Begin anew if the clock was set back: before anything of the new time is taken."""
         if self._set_back:
-            self._set_back = False
+            self._set_back, self.set_backs = False, self.set_backs + 1
             self.get_logger().warning('the clock was set back: beginning anew')
             self.health.dropped('begun anew: the clock was set back', 1)
             self._forget()
 
-    def _on_jump(self, jump: Any) -> None:
+    def is_of_before(self, stamp_ns: int) -> bool:
+        """Whether a stamp is one of the last before the clock was set back."""
+        return abs(self._before_ns - stamp_ns) < self._back_ns // 4
+
+    def _on_jump(self, jump: TimeJump) -> None:
         # Only noted: whoever sets the clock must not be kept waiting.
-        self._set_back = True
+        self._set_back, self._back_ns = True, -jump.delta.nanoseconds
+        self._before_ns = self.get_clock().now().nanoseconds + self._back_ns
 
     def _forget(self) -> None:
         self.stand_still()

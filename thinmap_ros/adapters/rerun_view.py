@@ -193,16 +193,25 @@ class View(NullView):
         self._at(ns)
         self._log(rerun_layout.entity(plot, curve), self._rr.Scalars([value]))
 
+    def wait_until_closed(self) -> None:
+        """Show all that was told, and wait until the viewer that was opened is closed."""
+        self._finish_drawing()
+        if self._streams.viewer is not None:
+            self._streams.viewer.wait()
+
     def close(self) -> None:
         """Draw what still waits, finish the file, which then opens with the whole map in view, and end the viewer.
 
         Raises InputError where the file could not be written to its end.
         """
+        self._finish_drawing()
+        self._streams.close()
+
+    def _finish_drawing(self) -> None:
         for name in list(self._waiting):
             self._draw(name)
         if self._patch is not None:
             self._frame(self._patch)
-        self._streams.close()
 
     def _log_static(self) -> None:
         rr = self._rr

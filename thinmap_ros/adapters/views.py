@@ -51,5 +51,8 @@ class NullView:
     def number(self, ns: int, plot: str, curve: str, value: float) -> None:
         """Continue a curve of a plot (`error`, `progress`, `count`, `step`)."""
 
+    def wait_until_closed(self) -> None:
+        """Show all that was told until whoever looks at it has seen enough."""
+
     def close(self) -> None:
         """Finish what is shown or written."""

@@ -67,6 +67,8 @@ class ExplorerNode(LiveNode):
         self._map = MapMirror()
         self._topology = messages.topology_from(TopologicalMap())
         self._matcher: StampMatcher[LaserScan, Array] = StampMatcher()
+        self._looks: StampMatcher[tuple[LaserScan, Array], bool] = StampMatcher()
+        self._hears_windows = False
         self._T_map_base: Array | None = None
         self._heard_at = self._tracked_at = self._answered_at = 0.0
         self._is_lost = False
@@ -134,6 +136,8 @@ class ExplorerNode(LiveNode):
 
     def _on_window(self, message: OccupancyGrid) -> None:
         self._map.paste(messages.patch_from(message))
+        self._hears_windows = True
+        self._look(self._looks.right(messages.stamp_ns(message.header.stamp), True))
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         T_map_base = messages.pose_from(message.pose.pose)
@@ -160,7 +164,17 @@ class ExplorerNode(LiveNode):
     def _take(self, pair: tuple[LaserScan, Array] | None) -> None:
         if pair is None:
             return
-        message, self._T_map_base = pair
+        if not self._hears_windows:
+            self._look((pair, True))
+            return
+        # What a scan shows is in its window, which may come much later: a look at an older map shows nothing new.
+        self._look(self._looks.left(messages.stamp_ns(pair[0].header.stamp), pair))
+
+    def _look(self, complete: tuple[tuple[LaserScan, Array], bool] | None) -> None:
+        """Go on with a scan, made at a pose, that is in the map now."""
+        if complete is None:
+            return
+        message, self._T_map_base = complete[0]
         if not self._goals.active or self._map.patch is None:
             return
         self._odometer.add(self._T_map_base)

@@ -3,7 +3,10 @@
 import argparse
 import json
 import resource
+import sys
 import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,8 +16,9 @@ from tqdm import tqdm
 
 from thinmap_ros.adapters import figures, graph_files, map_files, trajectory_files
 from thinmap_ros.adapters.events import Log, OdometryEvent
-from thinmap_ros.adapters.files import write_text
+from thinmap_ros.adapters.files import write_text, written_aside
 from thinmap_ros.adapters.pages import give_back_pages, release_compiler_pages
+from thinmap_ros.adapters.rerun_view import View
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.odometry import ScanPairing
@@ -22,6 +26,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.tools import cli
+from thinmap_ros.tools.replay_view import ReplayView
 
 
 @dataclass(eq=False)
@@ -36,8 +41,10 @@ class Replay:
     first_skipped: str = ''
 
 
-def replay(log: Log, config: PipelineConfig, show_progress: bool = False) -> Replay:
-    """Play a log through the pipeline. Raises InputError where the log has nothing to play."""
+def replay(
+    log: Log, config: PipelineConfig, show_progress: bool = False, shown: ReplayView | None = None
+) -> Replay:
+    """Play a log through the pipeline, shown or not. Raises InputError where the log has nothing to play."""
     result = Replay(Pipeline(config))
     pairing, tidy_up = ScanPairing(), give_back_pages()
     for event in tqdm(log.events(), unit=' events', disable=not show_progress):
@@ -50,11 +57,15 @@ def replay(log: Log, config: PipelineConfig, show_progress: bool = False) -> Rep
             result.stamps_ns.append(scan.stamp_ns)
             result.poses.append(step.estimate.T_map_base)
             result.local_features.append(step.estimate.n_local)
+            if shown is not None:
+                shown.step(scan, T_odom_base, step.estimate, result.pipeline)
         tidy_up()
     result.skipped = log.skipped.count + pairing.dropped + pairing.waiting
     result.first_skipped = log.skipped.first
     if not result.poses:
         raise InputError(f'no scan with odometry around its stamp; {result.skipped} skipped')
+    if shown is not None:
+        shown.last(result.stamps_ns[-1], result.pipeline)
     return result
 
 
@@ -107,11 +118,32 @@ def _spread(milliseconds: Array) -> dict[str, float]:
 
 
 def _work(arguments: argparse.Namespace) -> None:
+    with _view(arguments) as view:
+        _play(arguments, None if view is None else ReplayView(view))
+        if view is not None and arguments.view:
+            print('close the viewer to end', file=sys.stderr)
+            view.wait_until_closed()
+
+
+@contextmanager
+def _view(arguments: argparse.Namespace) -> Iterator[View | None]:
+    """What is asked for of viewer and recording; of a log that cannot be replayed there is no recording."""
+    if not (arguments.view or arguments.recording):
+        yield None
+        return
+    with ExitStack() as stack:
+        aside = stack.enter_context(written_aside(arguments.recording)) if arguments.recording else None
+        view = View(aside, arguments.view)
+        stack.callback(view.close)
+        yield view
+
+
+def _play(arguments: argparse.Namespace, shown: ReplayView | None) -> None:
     config = PipelineConfig(
         localizer=cli.config_from(arguments, LocalizerConfig), grid=cli.config_from(arguments, OccupancyConfig)
     )
     wall, cpu = time.perf_counter(), time.process_time()
-    result = replay(cli.open_log(arguments), config, show_progress=not arguments.quiet)
+    result = replay(cli.open_log(arguments), config, show_progress=not arguments.quiet, shown=shown)
     seconds = (time.perf_counter() - wall, time.process_time() - cpu)
     title = f'{arguments.log.name}: {len(result.poses)} scans'
     report = write_outputs(result, arguments.out, title, seconds)
@@ -130,6 +162,8 @@ def main() -> None:
     cli.add_log_options(parser)
     parser.add_argument('-o', '--out', type=Path, required=True, help='folder for the results')
     parser.add_argument('--quiet', action='store_true', help='no progress bar')
+    parser.add_argument('--view', action='store_true', help='show it in rerun, until the viewer is closed')
+    parser.add_argument('--recording', type=Path, help="file for rerun's recording (.rrd)")
     cli.add_config(parser, LocalizerConfig, ['slam'])
     cli.add_config(parser, OccupancyConfig, ['resolution_m', 'no_return_range_m', 'usable_range_m'])
     cli.run(_work, parser)

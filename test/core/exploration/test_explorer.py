@@ -247,3 +247,17 @@ def test_the_successor_of_a_target_may_lie_farther_off_than_all_that_is_toured()
     after = step(2)
     assert after.node_id != target.node_id
     assert after.x < 12.0, 'by now it is weighed against all that is nearer'
+
+
+def test_a_graph_that_is_there_before_the_map_does_not_end_the_exploration():
+    run = Run(two_rooms())
+    run.look(run.simulation.sense().scan)
+    for _ in range(5):
+        run.look(run.simulation.step(0.0, 0.0).scan or run.scan)
+    assert run.topology.map.nodes
+    unknown = GridPatch(run.grid.patch().frame, np.full(run.grid.patch().shape, -1, dtype=np.int8))
+    late = Explorer()
+    for _ in range(20):
+        decision = late.step(run.topology.map, unknown, run.scan, START)
+        assert not decision.finished and decision.target is None
+    assert late.step(run.topology.map, run.grid.patch(), run.scan, START).known_area_m2 > 0.0

@@ -185,7 +185,8 @@ class Explorer:
         ids = self._failures.to_try({i: c.place for i, c in worth.items()}, self._stamp_ns)
         open_to_try = {i: c for i, c in worth.items() if i in ids}
         waits = any(self._failures.may_try_again(c.place) for c in worth.values())
-        # The first scans are not a graph yet.
+        # The first scans are not a map yet, and not a graph.
+        waits |= self.surveyor.borders.known_cells == 0
         waits |= not topology.nodes and self._stamp_ns - self._began_ns < _FIRST_GRAPH_S * 1e9
         memory.nothing_left = 0 if open_to_try or waits else memory.nothing_left + 1
         if not open_to_try:

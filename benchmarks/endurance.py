@@ -1,0 +1,222 @@
+"""Hours of a simulated robot that explores and then drives to random places: scripts/endurance [--minutes M] -o DIR.
+
+Time waits for the nodes, so that it goes as fast as the machine can. Writes DIR/endurance.csv, a line for every few
+seconds of simulated time: memory of each node, its step time, processor time of all nodes, scans without a pose. Ends
+with a verdict: what grew from the second quarter of the drive to the last one, and what was lost.
+"""
+
+import argparse
+import csv
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+
+from thinmap_ros.adapters import resources
+from thinmap_ros.adapters.world_files import read_world
+from thinmap_ros.sim.tours import random_start
+from thinmap_ros.sim.world import World
+
+_NODES = ('localizer', 'grid_mapper', 'topology_builder', 'navigator', 'explorer')
+_STEPS = {'localizer': 'localizer', 'grid_mapper': 'map update', 'topology_builder': 'graph update',
+          'navigator': 'navigator'}  # fmt: skip
+_MEDIAN = re.compile(r'median (\d+\.\d+) ms')
+_SCAN_S = 0.2
+_FLAT = 1.05
+_STOP_S, _START_S = 10.0, 120.0
+_LAG = 5  # scans whose pose may still be under way at the end
+_DEPTH = 1000
+
+
+@dataclass
+class Samples:
+    """What was seen of the nodes: rows of the CSV file."""
+
+    columns: list[str]
+    rows: list[list[float]] = field(default_factory=list)
+
+    def growth(self, column: str) -> float:
+        """Median of the last quarter over that of the second, as the first is for warming up; NaN: not measured."""
+        values = np.array([row[self.columns.index(column)] for row in self.rows])
+        quarter = len(values) // 4
+        known = [part[np.isfinite(part)] for part in (values[quarter : 2 * quarter], values[-quarter:])]
+        return float(np.median(known[1]) / np.median(known[0])) if all(part.size for part in known) else np.nan
+
+
+class Driver:
+    """A client of the nodes: has the world explored, then sends the robot from place to place."""
+
+    def __init__(self, world: World, seed: int) -> None:
+        import rclpy
+        from diagnostic_msgs.msg import DiagnosticArray
+        from geometry_msgs.msg import PoseWithCovarianceStamped
+        from rclpy.action import ActionClient
+        from rclpy.qos import QoSProfile
+
+        from thinmap_msgs.action import Explore, NavigateToPose
+        from thinmap_ros.adapters import messages
+
+        rclpy.init()
+        self._rclpy, self._messages, self._goal = rclpy, messages, NavigateToPose.Goal
+        self._world, self._chance = world, np.random.default_rng(seed)
+        self._node = rclpy.create_node('endurance')
+        self._explore = ActionClient(self._node, Explore, 'explore')
+        self._navigate = ActionClient(self._node, NavigateToPose, 'navigate_to_pose')
+        self._explored, self._busy = Explore.Goal(), False
+        self.explores, self.goals, self.reached = True, 0, 0
+        self.poses, self.simulated_s, self.step_ms = 0, 0.0, {}
+        deep = QoSProfile(depth=_DEPTH)
+        self._node.create_subscription(PoseWithCovarianceStamped, 'pose', self._on_pose, deep)
+        self._node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, deep)
+
+    def spin(self) -> None:
+        """Hear what there is, and send the robot on if it stands."""
+        self._rclpy.spin_once(self._node, timeout_sec=0.02)
+        client = self._explore if self.explores else self._navigate
+        if not self._busy and self.poses and client.server_is_ready():
+            self._busy = True
+            client.send_goal_async(self._next_goal()).add_done_callback(self._on_taken)
+
+    def lost(self) -> int:
+        """Scans of the simulated time that have no pose."""
+        return max(round(self.simulated_s / _SCAN_S) + 1 - self.poses, 0)
+
+    def close(self) -> None:
+        """Listen no more."""
+        self._node.destroy_node()
+        self._rclpy.shutdown()
+
+    def _next_goal(self) -> Any:
+        if self.explores:
+            return self._explored
+        self.goals += 1
+        goal, place = self._goal(use_heading=True), random_start(self._world, self._chance)
+        goal.pose = self._messages.pose_stamped_msg(place, 'map', 0)
+        return goal
+
+    def _on_taken(self, future: Any) -> None:
+        if not future.result().accepted:
+            self._busy = False
+            return
+        future.result().get_result_async().add_done_callback(self._on_ended)
+
+    def _on_ended(self, future: Any) -> None:
+        self._busy = False
+        self.reached += not self.explores and future.result().result.success
+        self.explores = False
+
+    def _on_pose(self, message: Any) -> None:
+        self.poses += 1
+        self.simulated_s = max(self.simulated_s, self._messages.stamp_ns(message.header.stamp) / 1e9)
+
+    def _on_diagnostics(self, message: Any) -> None:
+        for status in message.status:
+            name = status.name.partition(':')[0]
+            for pair in status.values:
+                median = _MEDIAN.match(pair.value)
+                if median and pair.key == f'{_STEPS.get(name)}: step time':
+                    self.step_ms[name] = float(median[1])
+
+
+def start(name: str, parameters: str) -> psutil.Popen:
+    """Start a node, its parameters given as name:=value and separated by spaces."""
+    words = [word for parameter in parameters.split() for word in ('-p', parameter)]
+    command = [sys.executable, '-m', f'thinmap_ros.nodes.{name}', '--ros-args', *words]
+    return psutil.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def start_all(world: str, at: np.ndarray, rate: float, seed: int) -> dict[str, psutil.Popen]:
+    """Start nodes and simulator; returns the nodes, and the simulator as `sim`."""
+    pose = f'start_x_m:={at[0]} start_y_m:={at[1]} start_yaw_rad:={at[2]}'
+    found = {name: start(name, f'use_sim_time:=true {pose if name == "localizer" else ""}') for name in _NODES}
+    place = f'start:={at[0]},{at[1]},{at[2]}'
+    found['sim'] = start(
+        'sim', f'world:={world} {place} rate:={rate} seed:={seed} lockstep:=local_topology hold_for_subscribers:=4'
+    )
+    return found
+
+
+def measure(driver: Driver, nodes: dict[str, psutil.Popen], arguments: argparse.Namespace, path: Path) -> Samples:
+    """Drive for so long, and write down how the nodes are. Raises RuntimeError where a node ends, or nothing comes."""
+    columns = ['simulated_s', 'wall_s', *(f'{n}_mb' for n in _NODES), *(f'{n}_ms' for n in _STEPS), 'cpu_s', 'lost']
+    samples, begun = Samples(columns), time.monotonic()
+    every_s = 60.0 * arguments.minutes / arguments.samples
+    with path.open('w', encoding='utf-8', newline='', buffering=1) as file:
+        writer = csv.writer(file, lineterminator='\n')
+        writer.writerow(columns)
+        while driver.simulated_s < 60.0 * arguments.minutes:
+            driver.spin()
+            ended = [name for name, process in nodes.items() if process.poll() is not None]
+            if ended or (not driver.poses and time.monotonic() - begun > _START_S):
+                raise RuntimeError(f'{ended[0]} has ended' if ended else 'no pose comes')
+            if driver.simulated_s >= every_s * (len(samples.rows) + 1):
+                samples.rows.append(sample(driver, nodes, time.monotonic() - begun))
+                writer.writerow([f'{value:.6g}' for value in samples.rows[-1]])
+    return samples
+
+
+def sample(driver: Driver, nodes: dict[str, psutil.Popen], wall_s: float) -> list[float]:
+    """A row: what each node has for itself in memory, MB; medians of step times, ms; processor time of all nodes, s."""
+    memory = [nodes[name].memory_full_info().uss / 1e6 for name in _NODES]
+    times = [nodes[name].cpu_times() for name in _NODES]
+    steps = [driver.step_ms.get(name, np.nan) for name in _STEPS]
+    lost = max(driver.lost() - _LAG, 0)
+    return [driver.simulated_s, wall_s, *memory, *steps, sum(t.user + t.system for t in times), lost]
+
+
+def verdict(samples: Samples, driver: Driver) -> bool:
+    """Say what grew and what was lost; returns whether all is flat and nothing lost."""
+    memory = {name: samples.growth(f'{name}_mb') for name in _NODES}
+    steps = {name: samples.growth(f'{name}_ms') for name in _STEPS}
+    for what, found in (('memory', memory), ('step time', steps)):
+        print(f'{what}, last quarter over second: ' + ', '.join(f'{n} {v:.3f}' for n, v in found.items()))
+    lost = samples.rows[-1][-1]
+    flat = max(memory.values()) <= _FLAT
+    good = flat and lost == 0
+    print(
+        f'{"GOOD" if good else "BAD"}: {samples.rows[-1][0] / 60.0:.1f} min simulated, {driver.reached} of '
+        f'{driver.goals} places reached; memory {"flat within" if flat else "NOT flat within"} 5 % '
+        f'(most: {max(memory.values()):.3f}), step time at most {np.nanmax(list(steps.values())):.3f} of what it was, '
+        f'{lost:.0f} of {driver.poses + lost:.0f} scans lost'
+    )
+    return good
+
+
+def main() -> None:
+    """Run the program."""
+    parser = argparse.ArgumentParser(prog='endurance', description=__doc__)
+    parser.add_argument('--minutes', type=float, default=120.0, help='simulated minutes (default 120)')
+    parser.add_argument('--rate', type=float, default=100.0, help='simulated seconds a second at most (default 100)')
+    parser.add_argument('--world', default='room_10x10', help='world or map YAML file, or a world of the package')
+    parser.add_argument('--seed', type=int, default=0, help='decides places and noise (default 0)')
+    parser.add_argument('--samples', type=int, default=240, help='lines of the CSV file (default 240)')
+    parser.add_argument('-o', '--out', type=Path, default=Path('out/endurance'), help='folder (out/endurance)')
+    arguments = parser.parse_args()
+    os.environ['ROS_DOMAIN_ID'] = str(random.SystemRandom().randrange(1, 102))
+    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+    path = resources.world_path(arguments.world)
+    world = World.from_patch(*read_world(path))
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    nodes = start_all(str(path), world.start, arguments.rate, arguments.seed)
+    driver = Driver(world, arguments.seed)
+    try:
+        samples = measure(driver, nodes, arguments, arguments.out / 'endurance.csv')
+    finally:
+        for process in nodes.values():
+            process.send_signal(signal.SIGTERM)
+        driver.close()
+        psutil.wait_procs(list(nodes.values()), timeout=_STOP_S)
+    sys.exit(0 if verdict(samples, driver) else 1)
+
+
+if __name__ == '__main__':
+    main()
