@@ -11,11 +11,13 @@ from thinmap_ros.baselines.exploration import (
     FrontierExplorer,
     InformationGain,
     NearestFrontier,
+    VisitAllEndNodes,
 )
 from thinmap_ros.baselines.frontiers import Frontier
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.sim.world import World
 from thinmap_ros.tools.explore_world import STRATEGIES, Options, explore
 
@@ -114,3 +116,25 @@ def test_a_target_that_fails_is_left_for_later_and_the_end_says_so() -> None:
     assert decision.reason == 'what is left cannot be reached'
     assert tried[0] != tried[1]
     assert len(tried) >= 3 * len(set(tried))
+
+
+def test_an_edge_is_followed_to_its_end_though_another_end_comes_nearer() -> None:
+    def ends_at(x: float) -> TopologicalMap:
+        places = [(x, 4.0), (14.0, 4.0)]
+        nodes = [Node(k + 1, NodeKind.END, *place, 1.0) for k, place in enumerate(places)]
+        path = np.array([[place[0], place[1]] for place in places])
+        return TopologicalMap(nodes, [Edge(3, 1, 2, path, 14.0 - x, 1.0)])
+
+    strategy, patch = VisitAllEndNodes(), GridPatch(GridFrame(0.0, 0.0, 0.1), corridor().astype(np.int8))
+
+    def goes_to(robot_x: float, end_x: float) -> float:
+        scan = Scan.create(0, np.full(181, np.nan), -math.pi / 2, math.pi / 180, 0.05, 8.0)
+        target = strategy.step(ends_at(end_x), patch, scan, np.array([robot_x, 4.0, 0.0])).target
+        assert target is not None
+        return target.x
+
+    assert goes_to(7.9, 2.0) == 2.0
+    # More is seen, and the end recedes: the other one is nearer now.
+    assert [goes_to(7.9, x) for x in (1.8, 1.5, 1.3)] == pytest.approx([1.8, 1.5, 1.3], abs=0.35)
+    # It was there.
+    assert goes_to(1.2, 1.2) == 14.0

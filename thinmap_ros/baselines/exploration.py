@@ -161,6 +161,7 @@ class DistanceAdvantage(FrontierExplorer):
 class VisitAllEndNodes(NearestFrontier):
     """The nearest end node that was not visited yet, by A* on the graph, until all were: exploration along a GVG.
 
+    An edge is followed to its end: another one is chosen when the robot is there, or when there is no end any more.
     Frontiers that no end node leads to are visited at the end, the nearest first.
     Source: Choset and Nagatani, "Topological simultaneous localization and mapping (SLAM)", 2001.
     """
@@ -200,11 +201,16 @@ class VisitAllEndNodes(NearestFrontier):
         if not left:
             return None
         costs = costs_from(topology, float(T_map_base[0]), float(T_map_base[1]))
-        best = min(left.values(), key=lambda node: costs.get(node.id, math.inf))
+        followed = {i: node for i, node in left.items() if self._is_followed(node.x, node.y)}
+        best = min((followed or left).values(), key=lambda node: costs.get(node.id, math.inf))
         if not math.isfinite(costs.get(best.id, math.inf)):
             return None
         heading = math.atan2(best.y - T_map_base[1], best.x - T_map_base[0])
         return best.id, se2.pose(best.x, best.y, heading)
+
+    def _is_followed(self, x: float, y: float) -> bool:
+        """Whether the end node at a place is the one to which the robot drives, which moves as more is seen."""
+        return self._end_node is not None and math.dist((x, y), self._end_node[1][:2]) < _SAME_PLACE_M
 
     def _was_visited(self, x: float, y: float) -> bool:
         return any(math.dist((x, y), place) < _VISIT_M for place in self._visited)
