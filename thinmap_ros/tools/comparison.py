@@ -65,7 +65,7 @@ def _paired(name: str, ours: dict[tuple[str, int], Report], others: dict[tuple[s
     shares = {key: saved(ours, others, key) for key in ('distance', 'time', 'turned_rad')}
     cells = []
     for values in shares.values():
-        half = _NORMAL_95 * values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
-        cells.append(f'{values.mean():+.1%} ± {half:.1%}' if len(values) else '')
+        half = f' ± {_NORMAL_95 * values.std(ddof=1) / np.sqrt(len(values)):.1%}' if len(values) > 1 else ''
+        cells.append(f'{values.mean():+.1%}{half}' if len(values) else '')
     distances = shares['distance']
     return f'| {name} | {len(distances)} | ' + ' | '.join(cells) + f' | {int((distances < 0.0).sum())} |'
