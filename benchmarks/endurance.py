@@ -14,6 +14,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,8 +24,10 @@ import psutil
 
 from thinmap_ros.adapters import resources
 from thinmap_ros.adapters.world_files import read_world
+from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.sim.tours import random_start
 from thinmap_ros.sim.world import World
+from thinmap_ros.tools import cli
 
 _NODES = ('localizer', 'grid_mapper', 'topology_builder', 'navigator', 'explorer')
 _STEPS = {'localizer': 'localizer', 'grid_mapper': 'map update', 'topology_builder': 'graph update',
@@ -35,6 +38,7 @@ _FLAT = 1.05
 _STOP_S, _START_S = 10.0, 120.0
 _LAG = 5  # scans whose pose may still be under way at the end
 _DEPTH = 1000
+_FEWEST_SAMPLES = 4  # a quarter of them is looked at
 
 
 @dataclass
@@ -146,7 +150,7 @@ def start_all(world: str, at: np.ndarray, rate: float, seed: int) -> dict[str, p
 
 
 def measure(driver: Driver, nodes: dict[str, psutil.Popen], arguments: argparse.Namespace, path: Path) -> Samples:
-    """Drive for so long, and write down how the nodes are. Raises RuntimeError where a node ends, or nothing comes."""
+    """Drive for so long, and write down how the nodes are. Raises ThinmapError where a node ends, or nothing comes."""
     columns = ['simulated_s', 'wall_s', *(f'{n}_mb' for n in _NODES), *(f'{n}_ms' for n in _STEPS), 'cpu_s', 'lost']
     samples, begun = Samples(columns), time.monotonic()
     every_s = 60.0 * arguments.minutes / arguments.samples
@@ -157,7 +161,7 @@ def measure(driver: Driver, nodes: dict[str, psutil.Popen], arguments: argparse.
             driver.spin()
             ended = [name for name, process in nodes.items() if process.poll() is not None]
             if ended or (not driver.poses and time.monotonic() - begun > _START_S):
-                raise RuntimeError(f'{ended[0]} has ended' if ended else 'no pose comes')
+                raise ThinmapError(f'{ended[0]} has ended' if ended else f'no pose came in {_START_S:.0f} s')
             if driver.simulated_s >= every_s * (len(samples.rows) + 1):
                 samples.rows.append(sample(driver, nodes, time.monotonic() - begun))
                 writer.writerow([f'{value:.6g}' for value in samples.rows[-1]])
@@ -191,6 +195,35 @@ def verdict(samples: Samples, driver: Driver) -> bool:
     return good
 
 
+def stop(nodes: dict[str, psutil.Popen]) -> None:
+    """End all nodes; those that do not end by themselves are killed."""
+    for process in nodes.values():
+        with suppress(psutil.NoSuchProcess):
+            process.send_signal(signal.SIGTERM)
+    for process in psutil.wait_procs(list(nodes.values()), timeout=_STOP_S)[1]:
+        process.kill()
+
+
+def _work(arguments: argparse.Namespace) -> None:
+    if not arguments.minutes > 0.0 or arguments.samples < _FEWEST_SAMPLES:
+        given = f'--minutes {arguments.minutes}, --samples {arguments.samples}'
+        raise InputError(f'{given}: expected more than 0 minutes and at least {_FEWEST_SAMPLES} samples')
+    os.environ['ROS_DOMAIN_ID'] = str(random.SystemRandom().randrange(1, 102))
+    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+    path = resources.world_path(arguments.world)
+    world = World.from_patch(*read_world(path))
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    driver = Driver(world, arguments.seed)
+    nodes = start_all(str(path), world.start, arguments.rate, arguments.seed)
+    try:
+        samples = measure(driver, nodes, arguments, arguments.out / 'endurance.csv')
+    finally:
+        stop(nodes)
+        driver.close()
+    if not verdict(samples, driver):
+        sys.exit(1)
+
+
 def main() -> None:
     """Run the program."""
     parser = argparse.ArgumentParser(prog='endurance', description=__doc__)
@@ -200,22 +233,7 @@ def main() -> None:
     parser.add_argument('--seed', type=int, default=0, help='decides places and noise (default 0)')
     parser.add_argument('--samples', type=int, default=240, help='lines of the CSV file (default 240)')
     parser.add_argument('-o', '--out', type=Path, default=Path('out/endurance'), help='folder (out/endurance)')
-    arguments = parser.parse_args()
-    os.environ['ROS_DOMAIN_ID'] = str(random.SystemRandom().randrange(1, 102))
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    path = resources.world_path(arguments.world)
-    world = World.from_patch(*read_world(path))
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    nodes = start_all(str(path), world.start, arguments.rate, arguments.seed)
-    driver = Driver(world, arguments.seed)
-    try:
-        samples = measure(driver, nodes, arguments, arguments.out / 'endurance.csv')
-    finally:
-        for process in nodes.values():
-            process.send_signal(signal.SIGTERM)
-        driver.close()
-        psutil.wait_procs(list(nodes.values()), timeout=_STOP_S)
-    sys.exit(0 if verdict(samples, driver) else 1)
+    cli.run(_work, parser)
 
 
 if __name__ == '__main__':

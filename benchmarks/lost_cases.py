@@ -76,19 +76,22 @@ def _in_lab(seed: int, steps: int, row: str) -> Record:
 
 def kth(setting: Setting) -> Iterator[Case]:
     """Real floors, 100 random starts each, 40 m of way."""
-    yield from _buildings(setting, 'kth/')
+    yield from _floor_by_floor(setting, _in_building, 100, _AT_A_TIME, 'kth/')
 
 
 def dungeon(setting: Setting) -> Iterator[Case]:
     """Dungeons, 100 random starts each, 40 m of way."""
-    yield from _buildings(setting, 'dungeon/')
+    yield from _floor_by_floor(setting, _in_building, 100, _AT_A_TIME, 'dungeon/')
 
 
-def _buildings(setting: Setting, part: str) -> Iterator[Case]:
-    for first in range(0, 100, _AT_A_TIME):
+def _floor_by_floor(
+    setting: Setting, run: Callable[[Path, str, int], Record], drives: int, at_a_time: int, part: str = ''
+) -> Iterator[Case]:
+    """So many drives in each world, some at a time, so that a row that is cut off has been everywhere."""
+    for first in range(0, drives, at_a_time):
         for floor in floors(setting.worlds, part):
-            for number in range(first, first + _AT_A_TIME):
-                yield Case(f'{floor.name} {number}', partial(_in_building, setting.worlds, floor.name, number))
+            for number in range(first, first + at_a_time):
+                yield Case(f'{floor.name} {number}', partial(run, setting.worlds, floor.name, number))
 
 
 def _in_building(folder: Path, name: str, number: int) -> Record:
@@ -126,10 +129,7 @@ def _with_laser(folder: Path, name: str, laser: str, number: int) -> Record:
 
 def fine(setting: Setting) -> Iterator[Case]:
     """The same worlds in maps with cells of half the size, and in another frame."""
-    for first in range(0, 20, 2):
-        for floor in floors(setting.worlds):
-            for number in range(first, first + 2):
-                yield Case(f'{floor.name} {number}', partial(_in_fine_map, setting.worlds, floor.name, number))
+    yield from _floor_by_floor(setting, _in_fine_map, 20, 2)
 
 
 def _in_fine_map(folder: Path, name: str, number: int) -> Record:
@@ -140,10 +140,7 @@ def _in_fine_map(folder: Path, name: str, number: int) -> Record:
 
 def driven(setting: Setting) -> Iterator[Case]:
     """Maps that a robot has made on a drive of 400 m, at exact poses; other robots start where it has been."""
-    for first in range(0, 20, 2):
-        for floor in floors(setting.worlds):
-            for number in range(first, first + 2):
-                yield Case(f'{floor.name} {number}', partial(_in_driven_map, setting.worlds, floor.name, number))
+    yield from _floor_by_floor(setting, _in_driven_map, 20, 2)
 
 
 def _in_driven_map(folder: Path, name: str, number: int) -> Record:

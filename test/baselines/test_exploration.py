@@ -138,3 +138,18 @@ def test_an_edge_is_followed_to_its_end_though_another_end_comes_nearer() -> Non
     assert [goes_to(7.9, x) for x in (1.8, 1.5, 1.3)] == pytest.approx([1.8, 1.5, 1.3], abs=0.35)
     # It was there.
     assert goes_to(1.2, 1.2) == 14.0
+
+
+def test_explore_lite_gives_up_what_comes_no_nearer_also_if_it_goes_to_and_fro() -> None:
+    strategy, patch = ExploreLite(), GridPatch(GridFrame(0.0, 0.0, 0.1), corridor().astype(np.int8))
+    places, failed = [], []
+    for second in range(120):
+        # Now one is cheaper, then the other one, as where the map grows at its rims.
+        pose = np.array([7.0 if second % 2 else 9.0, 4.0, 0.0])
+        scan = Scan.create(second * 10**9, np.full(181, np.nan), -math.pi / 2, math.pi / 180, 0.05, 8.0)
+        target = strategy.step(TopologicalMap(), patch, scan, pose).target
+        assert target is not None
+        places.append(target.x)
+        failed.append(len(strategy._failures))
+    assert failed[20] == 0 < failed[-1]
+    assert len(set(np.round(places, 1))) > 1

@@ -6,6 +6,7 @@ to is seen, and stop when nothing is left to choose from. What differs is the ch
 
 import math
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,16 @@ _LOOKS = 3
 _TRIES = 3
 _SAME_PLACE_M = 1.0
 _VISIT_M = 0.5
+_PROGRESS_M = 0.1
+
+
+@dataclass(eq=False)
+class _Progress:
+    """How near a place was while it was driven to, by the way there, m, and for how long it has been no nearer."""
+
+    place: tuple[float, float]
+    nearest_m: float
+    waited_ns: int = 0
 
 
 class FrontierExplorer(ABC):
@@ -108,11 +119,44 @@ class ExploreLite(FrontierExplorer):
     """explore_lite's cost: potential_scale * straight distance - gain_scale * size, both scaled by the cell size.
 
     Scales as in its launch file; size in cells, distance that of the nearest frontier cell, m; it drives to the
-    frontier's middle. Source: Hörner, "Map-merging for multi-robot system", 2016, package explore_lite.
+    frontier's middle. A goal that has come no nearer while it was driven to for progress_timeout_s is given up; here
+    also if others were driven to in between, as the package would go to and fro between two of them for ever.
+    Source: Hörner, "Map-merging for multi-robot system", 2016, package explore_lite.
     """
 
     potential_scale = 3.0
     gain_scale = 1.0
+    progress_timeout_s = 30.0
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._progress: list[_Progress] = []
+        self._driven: _Progress | None = None
+        self._stamp_ns = 0
+
+    def step(self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array) -> Decision:
+        """As the others; a target without progress has failed."""
+        decision = super().step(topology, patch, scan, T_map_base)
+        if self.target is not None and self._without_progress(self.target, scan.stamp_ns):
+            self.fail_target('no progress')
+        return decision
+
+    def _without_progress(self, target: Frontier, stamp_ns: int) -> bool:
+        """Count the time that has gone by on the way to a target since it was nearest."""
+        same = (p for p in self._progress if math.dist(p.place, target.place) <= _SAME_PLACE_M)
+        progress = next(same, None)
+        if progress is None:
+            progress = _Progress((float(target.place[0]), float(target.place[1])), target.way_m)
+            self._progress.append(progress)
+        if target.way_m < progress.nearest_m - _PROGRESS_M:
+            progress.nearest_m, progress.waited_ns = target.way_m, 0
+        if self._driven is progress:
+            progress.waited_ns += max(stamp_ns - self._stamp_ns, 0)
+        self._driven, self._stamp_ns = progress, stamp_ns
+        if progress.waited_ns <= 1e9 * self.progress_timeout_s:
+            return False
+        self._progress.remove(progress)
+        return True
 
     def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
         """Distance against size."""
