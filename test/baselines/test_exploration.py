@@ -153,3 +153,20 @@ def test_explore_lite_gives_up_what_comes_no_nearer_also_if_it_goes_to_and_fro()
         failed.append(len(strategy._failures))
     assert failed[20] == 0 < failed[-1]
     assert len(set(np.round(places, 1))) > 1
+
+
+def test_an_end_node_that_comes_no_nearer_counts_as_visited() -> None:
+    """A robot that does not get there, as if the end in a wide hall went wherever it goes."""
+    strategy, patch = VisitAllEndNodes(), GridPatch(GridFrame(0.0, 0.0, 0.1), corridor().astype(np.int8))
+    nodes = [Node(k + 1, NodeKind.END, x, 4.0, 1.0) for k, x in enumerate((2.0, 14.0))]
+    path = np.array([[2.0, 4.0], [14.0, 4.0]])
+    topology = TopologicalMap(nodes, [Edge(3, 1, 2, path, 12.0, 1.0)])
+    targets = []
+    for second in range(100):
+        scan = Scan.create(second * 10**9, np.full(181, np.nan), -math.pi / 2, math.pi / 180, 0.05, 8.0)
+        target = strategy.step(topology, patch, scan, np.array([7.0, 4.0, 0.0])).target
+        assert target is not None
+        targets.append(target.x)
+    assert targets[:30] == [2.0] * 30
+    assert targets[40:60] == [14.0] * 20
+    assert targets[-1] not in (2.0, 14.0), 'frontiers that are left'

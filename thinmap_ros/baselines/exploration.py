@@ -40,6 +40,33 @@ class _Progress:
     waited_ns: int = 0
 
 
+class _Patience:
+    """Gives up what comes no nearer while it is driven to, also if other places were driven to in between."""
+
+    def __init__(self, timeout_s: float) -> None:
+        self._timeout_ns = 1e9 * timeout_s
+        self._watched: list[_Progress] = []
+        self._driven: _Progress | None = None
+        self._stamp_ns = 0
+
+    def is_over(self, place: Array, way_m: float, stamp_ns: int) -> bool:
+        """Count the time that has gone by on the way (m) to a place (2,) since it was nearest."""
+        same = (p for p in self._watched if math.dist(p.place, place) <= _SAME_PLACE_M)
+        progress = next(same, None)
+        if progress is None:
+            progress = _Progress((float(place[0]), float(place[1])), way_m)
+            self._watched.append(progress)
+        if way_m < progress.nearest_m - _PROGRESS_M:
+            progress.nearest_m, progress.waited_ns = way_m, 0
+        if self._driven is progress:
+            progress.waited_ns += max(stamp_ns - self._stamp_ns, 0)
+        self._driven, self._stamp_ns = progress, stamp_ns
+        if progress.waited_ns <= self._timeout_ns:
+            return False
+        self._watched.remove(progress)
+        return True
+
+
 class FrontierExplorer(ABC):
     """Drives to one frontier after the other until none is left that can be reached."""
 
@@ -130,33 +157,15 @@ class ExploreLite(FrontierExplorer):
 
     def __init__(self) -> None:
         super().__init__()
-        self._progress: list[_Progress] = []
-        self._driven: _Progress | None = None
-        self._stamp_ns = 0
+        self._patience = _Patience(self.progress_timeout_s)
 
     def step(self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array) -> Decision:
         """As the others; a target without progress has failed."""
         decision = super().step(topology, patch, scan, T_map_base)
-        if self.target is not None and self._without_progress(self.target, scan.stamp_ns):
+        target = self.target
+        if target is not None and self._patience.is_over(target.place, target.way_m, scan.stamp_ns):
             self.fail_target('no progress')
         return decision
-
-    def _without_progress(self, target: Frontier, stamp_ns: int) -> bool:
-        """Count the time that has gone by on the way to a target since it was nearest."""
-        same = (p for p in self._progress if math.dist(p.place, target.place) <= _SAME_PLACE_M)
-        progress = next(same, None)
-        if progress is None:
-            progress = _Progress((float(target.place[0]), float(target.place[1])), target.way_m)
-            self._progress.append(progress)
-        if target.way_m < progress.nearest_m - _PROGRESS_M:
-            progress.nearest_m, progress.waited_ns = target.way_m, 0
-        if self._driven is progress:
-            progress.waited_ns += max(stamp_ns - self._stamp_ns, 0)
-        self._driven, self._stamp_ns = progress, stamp_ns
-        if progress.waited_ns <= 1e9 * self.progress_timeout_s:
-            return False
-        self._progress.remove(progress)
-        return True
 
     def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
         """Distance against size."""
@@ -205,19 +214,23 @@ class DistanceAdvantage(FrontierExplorer):
 class VisitAllEndNodes(NearestFrontier):
     """The nearest end node that was not visited yet, by A* on the graph, until all were: exploration along a GVG.
 
-    An edge is followed to its end: another one is chosen when the robot is there, or when there is no end any more.
-    Frontiers that no end node leads to are visited at the end, the nearest first.
+    An edge is followed to its end: another one is chosen when the robot is there, when there is no end any more, or
+    when it has come no nearer for progress_timeout_s: in wide halls ends come and go as more is seen. Frontiers that
+    no end node leads to are visited at the end, the nearest first.
     Source: Choset and Nagatani, "Topological simultaneous localization and mapping (SLAM)", 2001.
     """
 
+    progress_timeout_s = 30.0
+
     def __init__(self) -> None:
         super().__init__()
+        self._patience = _Patience(self.progress_timeout_s)
         self._visited: list[tuple[float, float]] = []
         self._end_node: tuple[int, Array] | None = None
 
     def step(self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array) -> Decision:
         """End nodes first; what frontiers there are is looked after meanwhile."""
-        node = self._next_end_node(topology, T_map_base)
+        node, way_m = self._next_end_node(topology, T_map_base)
         if node is None:
             self._end_node = None
             return super().step(topology, patch, scan, T_map_base)
@@ -225,7 +238,10 @@ class VisitAllEndNodes(NearestFrontier):
         if self._end_node is None or not _is_near(self._end_node[1], node[1]):
             self._number += 1
             self._end_node = node
-        return _decision(topology, self._end_node[1], self._number, False, False)
+        decision = _decision(topology, self._end_node[1], self._number, False, False)
+        if self._patience.is_over(node[1][:2], way_m, scan.stamp_ns):
+            self.fail_target('no progress')
+        return decision
 
     def fail_target(self, reason: str) -> None:
         """An end node that cannot be reached counts as visited."""
@@ -235,7 +251,8 @@ class VisitAllEndNodes(NearestFrontier):
             self._visited.append((float(self._end_node[1][0]), float(self._end_node[1][1])))
             self._end_node = None
 
-    def _next_end_node(self, topology: TopologicalMap, T_map_base: Array) -> tuple[int, Array] | None:
+    def _next_end_node(self, topology: TopologicalMap, T_map_base: Array) -> tuple[tuple[int, Array] | None, float]:
+        """Id and place of the end node that is next, if there is one, and the way there, m."""
         ends = [node for node in topology.nodes.values() if node.kind == NodeKind.END]
         self._visited += [
             (node.x, node.y) for node in ends
@@ -243,14 +260,15 @@ class VisitAllEndNodes(NearestFrontier):
         ]
         left = {node.id: node for node in ends if not self._was_visited(node.x, node.y)}
         if not left:
-            return None
+            return None, math.inf
         costs = costs_from(topology, float(T_map_base[0]), float(T_map_base[1]))
         followed = {i: node for i, node in left.items() if self._is_followed(node.x, node.y)}
         best = min((followed or left).values(), key=lambda node: costs.get(node.id, math.inf))
-        if not math.isfinite(costs.get(best.id, math.inf)):
-            return None
+        way_m = costs.get(best.id, math.inf)
+        if not math.isfinite(way_m):
+            return None, math.inf
         heading = math.atan2(best.y - T_map_base[1], best.x - T_map_base[0])
-        return best.id, se2.pose(best.x, best.y, heading)
+        return (best.id, se2.pose(best.x, best.y, heading)), way_m
 
     def _is_followed(self, x: float, y: float) -> bool:
         """Whether the end node at a place is the one to which the robot drives, which moves as more is seen."""
