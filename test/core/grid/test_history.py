@@ -60,3 +60,27 @@ def test_unknown_stamps_and_stamps_that_step_back_are_borne():
 def test_a_robot_that_stands_still_is_kept_once():
     history = filled(np.zeros((50, 3)), range(50))
     assert len(history.past.poses()) == 1
+
+
+def test_of_a_place_that_is_seen_again_and_again_the_newest_scans_are_kept():
+    laps = 30
+    history = filled(np.tile(POSES, (laps, 1)), range(12 * laps))
+    kept = history.past.scans()
+    assert len(kept) == len(history.past.poses()) <= 12 * 4
+    assert min(s.stamp_ns for s in kept) >= 12 * (laps - 5)
+    stamps = [s.stamp_ns for s in kept]
+    assert stamps == sorted(stamps)
+    drawn = history.draw(OccupancyGrid())
+    once = filled(POSES, range(12)).draw(OccupancyGrid())
+    np.testing.assert_array_equal(drawn.patch().cells >= 0, once.patch().cells >= 0)
+
+
+def test_places_are_those_after_a_correction():
+    """Two halves of a way turn out to be one: the newer scans of each place are left."""
+    there = np.array([se2.pose(0.01 + 0.5 * k, 0.1, 0.1) for k in range(8)])
+    away = there + [0.0, 50.0, 0.0]
+    history = filled(np.concatenate([there] * 4 + [away] * 4), range(64))
+    assert len(history.past.scans()) == 64
+    history.past.correct(np.array([0, 32]), there[[0, 0]], since_ns=64)
+    assert len(history.past.scans()) == 32
+    assert min(s.stamp_ns for s in history.past.scans()) == 32

@@ -1,7 +1,11 @@
-"""What a grid was drawn from, so that it can be drawn anew when the robot's past turns out to have been elsewhere."""
+"""What a grid was drawn from, so that it can be drawn anew when the robot's past turns out to have been elsewhere.
+
+It grows with the area that was seen, not with time: of each place and direction the newest few scans are kept.
+"""
 
 import math
 from array import array
+from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,36 +16,45 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
 _APART_M, _APART_RAD = 0.25, 0.25
+_PLACE_M, _DIRECTIONS = 0.5, 8  # edge of a place, and directions of the robot that are told apart there
+_OF_A_PLACE = 4  # scans of each place and direction: about two visits
+_Place = tuple[int, int, int]
 
 
 class PoseHistory:
     """The pose of every scan; those that lie 0.25 m or 0.25 rad apart are the ones that are asked for.
 
-    A correction names some of the scans by their stamps and says where they were made. All others go with the last of
-    these before them, in the order in which they came: stamps of real robots step back now and then.
+    Of many of these at one place the newest are asked for. A correction names some of the scans by their stamps and
+    says where they were made. All others go with the last of these before them, in the order in which they came:
+    stamps of real robots step back now and then.
     """
 
     def __init__(self) -> None:
         self._stamps = array('q')
         self._poses = array('d')
-        self._apart = array('q')
+        self._last_apart = -1
+        self._asked_for: dict[int, Scan | None] = {}  # by the number of scans that came before
+        self._at_place: dict[_Place, deque[int]] = {}
 
-    def add(self, stamp_ns: int, T_map_base: Array) -> bool:
-        """Take in the pose (3,) of a scan; whether it lies apart from the last one that did."""
+    def add(self, stamp_ns: int, T_map_base: Array, scan: Scan | None = None) -> None:
+        """Take in the pose (3,) of a scan, and the scan itself, if it is wanted again."""
         number = len(self._stamps)
         self._stamps.append(stamp_ns)
         self._poses.extend(T_map_base.tolist())
-        if self._apart:
-            first = 3 * self._apart[-1]
-            moved = se2.between(np.array(self._poses[first : first + 3]), T_map_base)
+        if self._last_apart >= 0:
+            moved = se2.between(self._pose(self._last_apart), T_map_base)
             if math.hypot(moved[0], moved[1]) < _APART_M and abs(float(moved[2])) < _APART_RAD:
-                return False
-        self._apart.append(number)
-        return True
+                return
+        self._last_apart = number
+        self._ask_for(number, scan)
+
+    def scans(self) -> list[Scan | None]:
+        """The scans that are asked for, as they came."""
+        return list(self._asked_for.values())
 
     def poses(self) -> Array:
-        """Poses (N, 3) that lie apart, as they are known now."""
-        return self._all_poses()[np.array(self._apart, dtype=np.int64)]
+        """Poses (N, 3) of the scans that are asked for, as they are known now."""
+        return self._all_poses()[np.array(list(self._asked_for), dtype=np.int64)]
 
     def correct(self, stamps_ns: NDArray[np.int64], poses: Array, since_ns: int) -> None:
         """Move everything as the scans of these stamps (M,) are moved, which were made at poses (M, 3).
@@ -56,6 +69,23 @@ class PoseHistory:
         anchors = np.maximum(np.searchsorted(numbers, np.arange(right), side='right') - 1, 0)
         after = _carried(before[:right], before[numbers][anchors], poses[named][anchors])
         self._poses[: 3 * right] = array('d', after.ravel().tolist())
+        kept, self._asked_for, self._at_place = self._asked_for, {}, {}
+        for number, scan in kept.items():
+            self._ask_for(number, scan)
+
+    def _ask_for(self, number: int, scan: Scan | None) -> None:
+        """Put a scan at its place; the oldest there is asked for no more, if there are too many."""
+        x, y, heading = self._pose(number).tolist()
+        turn = math.floor(heading % (2.0 * math.pi) / (2.0 * math.pi) * _DIRECTIONS)
+        place = (math.floor(x / _PLACE_M), math.floor(y / _PLACE_M), turn)
+        here = self._at_place.setdefault(place, deque())
+        here.append(number)
+        self._asked_for[number] = scan
+        if len(here) > _OF_A_PLACE:
+            del self._asked_for[here.popleft()]
+
+    def _pose(self, number: int) -> Array:
+        return np.array(self._poses[3 * number : 3 * number + 3])
 
     def _all_poses(self) -> Array:
         return np.array(self._poses).reshape(-1, 3)
@@ -78,20 +108,19 @@ def _carried(poses: Array, before: Array, after: Array) -> Array:
 
 
 class GridHistory:
-    """The scans that a grid can be drawn from anew, one every 0.25 m or 0.25 rad: some 10 kB a metre."""
+    """The scans that a grid can be drawn from anew: 10 kB a metre of what is new, at most 130 kB a square metre."""
 
     def __init__(self) -> None:
         self.past = PoseHistory()
-        self._scans: list[Scan] = []
 
     def add(self, scan: Scan, T_map_base: Array) -> None:
         """Take in a scan that was drawn at a pose (3,)."""
-        if self.past.add(scan.stamp_ns, T_map_base):
-            self._scans.append(scan)
+        self.past.add(scan.stamp_ns, T_map_base, scan)
 
     def draw(self, like: OccupancyGrid) -> OccupancyGrid:
         """The grid of the kept scans at their poses, with the cells and the configuration of another."""
         grid = OccupancyGrid(like.config, like.frame)
-        for scan, T in zip(self._scans, self.past.poses(), strict=True):
-            grid.update(scan, T)
+        for scan, T in zip(self.past.scans(), self.past.poses(), strict=True):
+            if scan is not None:
+                grid.update(scan, T)
         return grid
