@@ -81,6 +81,36 @@ def test_from_where_the_robot_is_to_look_most_of_what_is_hidden_is_in_sight():
         assert np.mean(seen) > 0.5
 
 
+def open_hall(seen_to_m):
+    """36 x 20 m, all of it seen up to x: the border is as long as the hall is wide."""
+    cells = np.full((200, 360), -1)
+    cells[:, : int(10 * seen_to_m)] = 0
+    cells[[0, -1]], cells[:, 0] = 100, 100
+    return cells
+
+
+def test_of_a_border_longer_than_the_laser_reaches_a_part_is_looked_at_from_the_nearest_place():
+    """From no place most of it can be seen; the goal is not right at it either, but as far off as the range allows."""
+    surveyor = surveyor_of(open_hall(12.0))
+    near, far = se2.pose(2.0, 4.0, 0.0), se2.pose(2.0, 16.0, 0.0)
+    for at in (near, far):
+        (candidate,) = surveyor.survey(at, 8.0)
+        assert len(candidate.cells) == 198
+        assert candidate.goal[0] < 9.0
+        assert abs(candidate.goal[1] - at[1]) < 2.5
+
+
+def test_a_goal_stays_good_as_long_as_enough_can_be_seen_from_it():
+    surveyor = surveyor_of(open_hall(12.0))
+    (candidate,) = surveyor.survey(se2.pose(2.0, 4.0, 0.0), 8.0)
+    assert surveyor.still_shows(candidate, candidate.goal, 8.0)
+    assert surveyor.still_shows(candidate, se2.pose(10.0, 14.0, 0.0), 8.0)
+    for x, y in ((2.0, 10.0), (-3.0, 5.0), (20.0, 10.0), (0.1, 0.1)):
+        assert not surveyor.still_shows(candidate, se2.pose(x, y, 0.0), 8.0)
+    surveyor.examined(candidate, candidate.goal)
+    assert not surveyor.still_shows(candidate, candidate.goal, 8.0)
+
+
 def test_the_way_to_a_goal_is_that_over_the_grid():
     surveyor = surveyor_of(corridor())
     (candidate,) = surveyor.survey(AT, 8.0)

@@ -95,7 +95,7 @@ class Explorer:
         self._failures = Failures(self.config.retry_s)
         self._ways = WayTable(_COARSE_M, _FORGET_S, _UNKNOWN_WEIGHT)
         self._memory = _Memory()
-        self._stamp_ns, self._began_ns = 0, 2**63
+        self._stamp_ns, self._began_ns, self._range_m = 0, 2**63, 0.0
         self._last = _Survey([], 0, -1, {})
 
     def state(self) -> dict[str, NDArray[Any]]:
@@ -124,7 +124,7 @@ class Explorer:
 
         patch: the whole map, on one lattice from step to step. Deterministic; call it once a scan.
         """
-        self._stamp_ns = scan.stamp_ns
+        self._stamp_ns, self._range_m = scan.stamp_ns, scan.range_max_m
         self._began_ns = min(self._began_ns, self._stamp_ns)
         surveyor, borders = self.surveyor, self.surveyor.borders
         surveyor.trail.add(T_map_base)
@@ -219,7 +219,10 @@ class Explorer:
         """
         memory = self._memory
         at = self.surveyor.border_of(chosen)
-        same = max(math.dist(at, memory.target_at), math.dist(chosen.goal[:2], memory.goal[:2])) <= _SUCCESSOR_M
+        jumped = math.dist(chosen.goal[:2], memory.goal[:2]) > _SUCCESSOR_M
+        same = math.dist(at, memory.target_at) <= _SUCCESSOR_M and not (
+            jumped and not self.surveyor.still_shows(chosen, memory.goal, self._range_m)
+        )
         on_the_way = same and math.dist(T_map_base[:2], memory.goal[:2]) > _NEAR_VISIT_M
         memory.target, memory.target_at = chosen.track.node_id, at
         if not (on_the_way or _about_same(chosen.goal, memory.goal)):

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.exploration.viewpoints import place_at, place_for
+from thinmap_ros.core.exploration.viewpoints import place_at, place_for, shows_enough
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import FREE_AT_MOST, OCCUPIED_AT_LEAST, GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
@@ -143,6 +143,13 @@ class OpenBorders:
         resolution = self.frame.resolution
         depth, reach = round(depth_m / resolution), reach_m / resolution
         return self._centre_of(place_for(self.free, self.passable, cells, allowed, ways, depth, reach))
+
+    def shows_enough(self, cells: Cells, place: Array, reach_m: float, depth_m: float) -> bool:
+        """Whether a place (2,), m, is one from which to see behind a border (N, 2): viewpoints.shows_enough."""
+        resolution = self.frame.resolution
+        depth, reach = round(depth_m / resolution), reach_m / resolution
+        cell = self._cell_of((float(place[0]), float(place[1])))
+        return shows_enough(self.free, self.passable, cells, cell, depth, reach)
 
     def _cell_of(self, xy: tuple[float, float]) -> tuple[int, int]:
         """Cell (row, col) that holds a point, m."""

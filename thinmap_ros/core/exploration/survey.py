@@ -257,6 +257,17 @@ class Surveyor:
         depth, reach = self.config.view_depth_m, range_m - _RIM_M
         return self.borders.place_to_view(cells, self.reached, self.ways, reach, depth)
 
+    def still_shows(self, candidate: Candidate, goal: Array, range_m: float) -> bool:
+        """Whether a goal (3,) is still one from which to look at a candidate's border from afar."""
+        cells = candidate.cells
+        if not len(cells) or self.config.mode == 'paper' or self._is_to_be_looked_at_closer(self._middle(cells)):
+            return False
+        row, col = self.frame.cells_of(goal[None, :2])[0]
+        inside = 0 <= row < self.reached.shape[0] and 0 <= col < self.reached.shape[1]
+        return bool(inside and self.reached[row, col]) and self.borders.shows_enough(
+            cells, goal[:2], range_m - _RIM_M, self.config.view_depth_m
+        )
+
     def _is_to_be_looked_at_closer(self, middle: Place) -> bool:
         return any(math.dist(middle, place) < _SAME_BORDER_M for place in self._memory.look_closer)
 

@@ -20,7 +20,10 @@ Cells = NDArray[np.int64]
 Cell = tuple[int, int]
 # Not more: across a wall one cell thick places where a robot can stand are six cells apart, and stay apart in squares.
 SQUARE = 3
+# Most of what a border hides: so much of so many points, and of a long border, with a point every so many cells, that of
+# a part of it.
 _POINTS, _SHARE = 8, 0.7
+_SPACING = 10
 _SLACK, _STRIDE = 5, 4
 
 
@@ -33,9 +36,23 @@ def place_for(
     length of the way to each square of SQUARE x SQUARE cells, in whose middle the robot would stand; depth: how far
     behind the border is looked, in cells; reach: how far the laser sees, in cells.
     """
-    points = _hidden_points(free, passable, cells, depth, _POINTS)
-    row, col = _view_place(ways, SQUARE, allowed, passable, points, reach, _SHARE)
+    points, need = _wanted(free, passable, cells, depth)
+    row, col = _view_place(ways, SQUARE, allowed, passable, points, reach, need)
     return None if row < 0 else (int(row), int(col))
+
+
+def shows_enough(
+    free: Mask, passable: Mask, cells: Cells, place: Cell, depth: int, reach: float
+) -> bool:
+    """Whether enough of what a border (N, 2) hides could be seen from a cell; see place_for."""
+    points, need = _wanted(free, passable, cells, depth)
+    return bool(_sees_enough(passable, place[0], place[1], points, reach, need))
+
+
+def _wanted(free: Mask, passable: Mask, cells: Cells, depth: int) -> tuple[Cells, int]:
+    """Points (M, 2) behind a border (N, 2), and how many of them have to be in sight."""
+    points = _hidden_points(free, passable, cells, depth, max(_POINTS, len(cells) // _SPACING))
+    return points, math.ceil(_SHARE * min(len(points), _POINTS))
 
 
 def place_at(free: Mask, cells: Cells, allowed: Mask, most_steps: int, towards: Cell) -> Cell | None:
@@ -76,14 +93,13 @@ def _hidden_points(free: Mask, passable: Mask, cells: Cells, depth: int, most: i
 
 @kernel
 def _view_place(
-    ways: Array, factor: int, allowed: Mask, passable: Mask, points: Cells, reach: float, share: float
+    ways: Array, factor: int, allowed: Mask, passable: Mask, points: Cells, reach: float, need: int
 ) -> tuple[int, int]:
-    """The middle of a square, the one with the shortest way, that sees at least a share of the points; -1 if none does.
+    """The middle of a square, the one with the shortest way, that sees at least `need` of the points; -1 if none does.
 
     A line of sight runs over passable cells, and is shorter than reach.
     """
     rows, cols = allowed.shape
-    need = int(math.ceil(share * points.shape[0]))
     low_r, high_r = points[:, 0].min() - reach, points[:, 0].max() + reach
     low_c, high_c = points[:, 1].min() - reach, points[:, 1].max() + reach
     best, best_row, best_col = np.inf, -1, -1
