@@ -5,8 +5,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from time import perf_counter
 
-import numpy as np
-
 from thinmap_ros.core.grid.history import GridHistory
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, WindowConfig
 from thinmap_ros.core.grid.patch import GridPatch
@@ -87,11 +85,9 @@ class Pipeline:
 
     def _rebuild(self, history: GridHistory, since_ns: int) -> None:
         """A loop was closed: grid and topology are made anew from what was seen at the poses as they are known now."""
-        keyframes = self.localizer.keyframes
-        stamps = np.array([frame.scan.stamp_ns for frame in keyframes])
         before = history.past.poses()
         with self._timed('rebuild'):
-            history.past.correct(stamps, np.array([frame.T_map_base for frame in keyframes]), since_ns)
+            history.past.correct(*self.localizer.past(), since_ns)
             self.grid = history.draw(self.grid)
             size = self.config.window.window_m
             self.topology.rebuild(lambda x, y: self.grid.window(x, y, size), before, history.past.poses())

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from time import perf_counter
 
-import numpy as np
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
 from sensor_msgs.msg import LaserScan
@@ -161,11 +160,9 @@ class LocalizerNode(LiveNode):
 
     def _tell_trajectory(self, ns: int) -> None:
         """Say where the kept scans were made, now that a loop is closed: before the first pose that follows from it."""
-        kept = self._localizer.keyframes
-        poses = np.array([frame.T_map_base for frame in kept])
-        stamps = [frame.scan.stamp_ns for frame in kept]
-        self._trajectory.publish(messages.trajectory_msg(stamps, poses, self._map_frame, ns))
-        self.get_logger().info(f'a loop is closed: {len(kept)} poses of the past are corrected')
+        stamps, poses = self._localizer.past()
+        self._trajectory.publish(messages.trajectory_msg(stamps.tolist(), poses, self._map_frame, ns))
+        self.get_logger().info(f'a loop is closed: {len(poses)} poses of the past are corrected')
 
 
 def _feature_msg(feature: Feature) -> LineFeature:

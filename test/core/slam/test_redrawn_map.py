@@ -23,7 +23,7 @@ def test_the_map_is_drawn_where_the_robot_drives():
     for step in range(150):
         if step % 4 == 0:
             keyframes.append(seen_at(0.25 * step, 0.5))
-        redrawn.go_on(keyframes)
+        redrawn.go_on(keyframes, keyframes[-1].T_map_base)
     assert redrawn.matcher.known(POST, np.zeros(2), np.array([36.0, 0.0, 0.0])) > 0.9
     assert redrawn.matcher.known(POST, np.zeros(2), np.array([-36.0, 0.0, 0.0])) < 0.1
 
@@ -33,6 +33,6 @@ def test_in_the_end_all_is_drawn():
     redrawn = RedrawnMap(MatchConfig())
     redrawn.begin_anew(keyframes, np.zeros(3))
     for _ in range(len(keyframes)):
-        redrawn.go_on(keyframes)
+        redrawn.go_on(keyframes, keyframes[-1].T_map_base)
     known = [redrawn.matcher.known(POST, np.zeros(2), frame.T_map_base) for frame in keyframes]
     assert min(known) > 0.9

@@ -12,19 +12,20 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.config import parameter
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.anchors import AnchoredPoses
 from thinmap_ros.core.slam.doubt import Doubt, Evidence
 from thinmap_ros.core.slam.ekf import EkfSlam
 from thinmap_ros.core.slam.ekf_ti import CompressedEkf
 from thinmap_ros.core.slam.feature_map import FeatureConfig, FeatureMap
 from thinmap_ros.core.slam.features import LineFeature
 from thinmap_ros.core.slam.lines import LineConfig, Lines, extract_lines, no_lines
-from thinmap_ros.core.slam.loops import Correction, Keyframe, LoopConfig, Loops
+from thinmap_ros.core.slam.loops import LEAP_SIGMAS, Correction, Keyframe, LoopConfig, Loops
 from thinmap_ros.core.slam.models import MotionConfig, motion_jacobians, odometry_covariance, rotation
 from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
 from thinmap_ros.core.slam.odometry_noise import OdometryNoise
 from thinmap_ros.core.slam.redrawn_map import RedrawnMap
 from thinmap_ros.core.slam.scan_matching import FEWEST_POINTS, Match, MatchConfig
-from thinmap_ros.core.slam.tracking import Tracking
+from thinmap_ros.core.slam.tracking import SEEN_AGAIN, Tracking, share_seen_again
 from thinmap_ros.core.topology.graph import TopologicalMap
 
 _START_SIGMAS = (1e-4, 1e-4, 1e-4)  # the map begins where the robot stands: no doubt, but not singular
@@ -32,6 +33,7 @@ _LONGEST_STEP_M = 5.0  # between two scans the wheels cannot go farther: the odo
 _NEW_GROUND = 0.3  # where less of a scan than this lies on what is known, there is nothing to contradict
 _NEW_GROUND_M, _NEW_GROUND_RAD = 0.6, 0.6  # and that is so only this far from where the map last learned
 _KNOWN_M, _KNOWN_RAD = 0.2, 0.2  # nearer than that, most of a scan must be known
+_NO_NEWS = 0.9  # where more of a scan than this lies on what is known, it shows nothing new
 _LEAP_M, _LEAP_RAD = 0.4, 0.4  # a scan puts the robot this far from where the wheels did: one of them is wrong
 _OF_LATE_M = 100.0  # way in which the drift stays below what a match with the map bridges
 # By which lines may move the pose even where matches leave nothing open, m and rad, 1 sigma.
@@ -105,15 +107,16 @@ class Localizer:
         self._feature_map = FeatureMap(self.config, local_areas=self.config.slam == 'ti')
         self._map = RedrawnMap(self.config)
         self._loops = Loops(self.config, self.config)
-        # Of every step, which keyframe came before it, and the pose from there.
-        self._path: list[tuple[int, Array]] = []
+        self._path = AnchoredPoses()  # of every step
         self._T_odom_base: Array | None = None
         self._calibration = OdometryCalibration()
         self._noise = OdometryNoise(self.config)
         self._T_last_look: Array | None = None
+        self._points_last_look: Array = np.empty((0, 2))
         # Share of that look's points which the map then knew; walls that are far off take several looks.
         self._known_here = 0.0
         self._doubt = Doubt()
+        self._blind: Array = np.zeros(3)  # doubt since the last look, where scans told nothing
         self._placed_by_hand = False
         self._tracking = Tracking(self.config.lost_scans)
 
@@ -179,17 +182,19 @@ class Localizer:
         points.since_m = -math.inf if self._loops.agreed else way_m - _OF_LATE_M
         match = self._predict(scan, points_base, laser_base, increment, increment_covariance)
         lines, matched = no_lines(), 0
-        if self.config.mapping and self._has_news() and not self._is_lost():
+        if self.config.mapping and self._has_news() and not self._tracking.lost:
             laser_map = se2.transform_points(self._ekf.pose, laser_base[None])[0]
             lines, matched = self._correct(scan)
-            if match.good or self._on_new_ground(match):
+            if match.good or (len(points_base) >= FEWEST_POINTS and self._on_new_ground(match, scan)):
                 points_map = se2.transform_points(self._ekf.pose, points_base)
                 self._map.matcher.add(points_map, laser_map)
                 self._known_here = self._map.matcher.known(points_base, laser_base, self._ekf.pose)
-                self._T_last_look = self._ekf.pose
-                self._loops.follow(scan, points_base, self._ekf.pose, _is_leap(expected, self._ekf.pose))
+                self._T_last_look, self._points_last_look = self._ekf.pose, points_base
+                leap = LEAP_SIGMAS if _is_leap(expected, self._ekf.pose) else np.zeros(3)
+                doubt, self._blind = np.maximum(leap, self._blind), np.zeros(3)
+                self._loops.follow(scan, points_base, self._ekf.pose, doubt, match.overlap < _NO_NEWS)
         elif match.good and not self.config.mapping:
-            self._T_last_look = self._ekf.pose
+            self._T_last_look, self._points_last_look = self._ekf.pose, points_base
         self._filter.work_off()
         self._loops.work_off()
         correction = self._loops.close()
@@ -198,17 +203,18 @@ class Localizer:
         if correction is not None:
             self._apply(correction)
             self._calibration.interrupt()
-        self._map.go_on(self._loops.keyframes)
-        k = len(self._loops.keyframes) - 1
-        pose = self._ekf.pose
-        self._path.append((k, pose if k < 0 else se2.between(self._loops.keyframes[k].T_map_base, pose)))
+        pose, k = self._ekf.pose, self._loops.anchor
+        self._map.go_on(self._loops.keyframes, pose)
+        self._path.add(scan.stamp_ns, k, pose if k < 0 else se2.between(self._loops.keyframes[k].T_map_base, pose))
         return self._estimate(match, lines, matched, correction)
 
     def corrected_path(self) -> Array:
         """Poses (N, 3) of all steps since the beginning, as they look now, after all corrections."""
-        relaxed = self._loops.relaxed()
-        path = [T if k < 0 else se2.compose(relaxed[k], T) for k, T in self._path]
-        return np.array(path).reshape(-1, 3)
+        return self._path.poses(self._loops.relaxed())
+
+    def past(self) -> tuple[NDArray[np.int64], Array]:
+        """Stamps (N,) and poses (N, 3), as known now, of scans along the whole way; all others go with those before."""
+        return self._loops.past()
 
     @property
     def keyframes(self) -> list[Keyframe]:
@@ -217,7 +223,7 @@ class Localizer:
 
     def _apply(self, correction: Correction) -> None:
         """A loop was closed: pose, features and the map of points go where the keyframes have gone."""
-        moved = correction.moved(len(correction.after) - 1, self._ekf.pose)
+        moved = correction.moved(self._loops.anchor, self._ekf.pose)
         self._feature_map.move(self._filter, correction)
         self._ekf.move_pose(moved)
         self._T_last_look = moved
@@ -254,6 +260,7 @@ class Localizer:
         turn = rotation(float(pose[2]))
         predicted = se2.compose(pose, increment)
         F, _ = motion_jacobians(pose, increment)
+        self._blind = np.maximum(self._blind, _blind(self._doubt.since_match, self._noise))
         self._doubt.move(F, turn @ covariance @ turn.T)
         match = self._map.matcher.match(
             points_base, laser_base, predicted, self._doubt.since_match, lost=self._tracking.lost
@@ -261,7 +268,7 @@ class Localizer:
         near = not self._moved(_KNOWN_M, _KNOWN_RAD, match.T_map_base)
         match = self._tracking.judged(match, points_base, scan, increment, near)
         if len(points_base) >= FEWEST_POINTS:  # fewer fit nothing, and contradict nothing
-            self._tracking.count(match.good, self._on_new_ground(match))
+            self._tracking.count(match.good, self._on_new_ground(match, scan))
         if match.good:
             evidence = self._doubt.evidence(match.covariance)
             self._noise.learn(se2.off(match.T_map_base, predicted), evidence, float(predicted[2]))
@@ -303,13 +310,19 @@ class Localizer:
         """Whether the robot has moved since it last learned: looks from one place err alike, and prove nothing anew."""
         return self._moved(self.config.look_distance_m, self.config.look_turn_rad)
 
-    def _on_new_ground(self, match: Match) -> bool:
+    def _on_new_ground(self, match: Match, scan: Scan) -> bool:
         """Whether a scan that lies on little that is known can be explained by where the robot has come to.
 
-        Near the place where the map last learned, most of a scan has been seen before, unless little came of it.
+        Near the place where the map last learned, what was seen there is still to be seen, if it is in view at all, and
+        unless little came of it.
         """
-        unformed = self._known_here < _NEW_GROUND
-        return match.overlap < _NEW_GROUND and (unformed or self._moved(_NEW_GROUND_M, _NEW_GROUND_RAD))
+        if match.overlap >= _NEW_GROUND:
+            return False
+        if self._known_here < _NEW_GROUND or self._moved(_NEW_GROUND_M, _NEW_GROUND_RAD):
+            return True
+        assert self._T_last_look is not None
+        moved = se2.between(self._T_last_look, self._ekf.pose)
+        return share_seen_again(self._points_last_look, moved, scan) >= SEEN_AGAIN
 
     def _moved(self, distance_m: float, turn_rad: float, T_map_base: Array | None = None) -> bool:
         """Whether the robot, or a pose (3,), is that far from the last place at which the map learned."""
@@ -343,3 +356,14 @@ class Localizer:
 def _is_leap(expected: Array, found: Array) -> bool:
     off = se2.between(expected, found)
     return math.hypot(off[0], off[1]) > _LEAP_M or abs(float(off[2])) > _LEAP_RAD
+
+
+def _blind(since_match: Array, noise: OdometryNoise) -> Array:
+    """Sigmas (3,) of a pose since a scan last fitted, by wheels that are as good as they were so far.
+
+    0 where that is no more than usual.
+    """
+    share = np.sqrt(noise.found_share / noise.share)
+    along = float(share.max()) * math.sqrt(max(float(np.linalg.eigvalsh(since_match[:2, :2])[-1]), 0.0))
+    sigmas = np.array([along, along, share[1] * math.sqrt(since_match[2, 2])])
+    return sigmas if (sigmas > LEAP_SIGMAS).any() else np.zeros(3)

@@ -15,12 +15,15 @@ from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.grid.buckets import Buckets
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.anchors import AnchoredPoses
+from thinmap_ros.core.slam.models import rotation
 from thinmap_ros.core.slam.pose_graph import Measured, relax
 from thinmap_ros.core.slam.scan_matching import Match, MatchConfig, ScanMatcher
 
@@ -30,20 +33,22 @@ _VISITS = 3  # earlier visits to a place with which a scan is matched, at most
 _TURN_M_RAD = 1.0  # a radian of turn makes two scans as different as so many metres
 # Bounds of the error of a step from one keyframe to the next, in m and in rad.
 _STEP_M, _STEP_RAD = (0.002, 0.02), (0.0002, 0.02)
-_LEAP_SIGMAS = (0.1, 0.1, 0.05)  # the same where wheels and walls contradicted each other
+LEAP_SIGMAS = (0.1, 0.1, 0.05)  # the same where wheels and walls contradicted each other
 _MATCH_SIGMAS = (0.04, 0.04, 0.02)  # matches err together, by more than each says of itself
 _PRIOR_SIGMAS = (0.3, 0.3, 0.15)
 _LEAST_OVERLAP, _LEAST_FIT = 0.5, 0.85
 _DRIFT = 0.01  # of the way since the earlier visit, by which the place may be off, beyond the first metres
-_FARTHEST_M = 2.5  # and no more than this
+_LEVER_M = 10.0  # at which a doubtful turn makes a place doubtful
+_FARTHEST_M = 3.0  # and no more than this in all: what is alike is seldom nearer
 _SEARCHED_M = 0.3  # from this on a good match near by is not taken without looking around
-_SEARCH_DEG = 12.0
+_SEARCH_DEG, _WIDEST_SEARCH_DEG = 12.0, 35.0
 _SHARP_M = 0.1  # a match that leaves more than this open (1 sigma), as along a corridor, proves no loop
 _WITNESSES = 3  # matches of different keyframes that have to ask for the same correction
 _LATELY = 8  # keyframes back to which they count
 _ALIKE_M, _ALIKE_RAD = 0.2, 0.06  # by how much they may differ
 _WORTH_M, _WORTH_RAD = 0.12, 0.04  # smaller corrections are left to the end
 _BUCKET_M = 4.0  # keyframes are listed by squares of this size
+_ENOUGH = 2  # keyframes that see about the same: from then on one of them stands for a new one
 _FRESH_M = 1.0  # so much way after a match that agrees, no other one is asked for
 _HOLDS_M = 3.0  # so much way after it, the old map is still trusted
 
@@ -80,65 +85,92 @@ class Correction:
 
 
 class Loops:
-    """The kept scans and the graph of their poses."""
+    """The kept scans and the graph of their poses.
+
+    Where old and new agree and a scan shows nothing new, an earlier one stands for it: the graph grows with what was
+    seen, not with time. Source: Johannsson, Kaess, Fallon and Leonard, "Temporally scalable visual SLAM using a reduced
+    pose graph", 2013.
+    """
 
     def __init__(self, config: LoopConfig, matching: MatchConfig) -> None:
         self.keyframes: list[Keyframe] = []
         self.matched: list[Measured] = []
-        self._steps: list[Array] = []  # from each keyframe to the next, as the localizer saw it
-        self._leaps: set[int] = set()  # of these, those where wheels and walls contradict each other
+        # To each keyframe but the first, from the one that was the anchor before it, as the localizer saw it.
+        self._steps: list[tuple[int, Array]] = []
+        self._tied: set[tuple[int, int]] = set()
+        self._leaps: dict[int, Array] = {}  # sigmas (3,) of those of which less is known than of others
+        self._unsettled: dict[int, Array] = {}  # of these, those over which no loop was closed since
         self._config, self._matching = config, matching
         self._jobs: deque[tuple[int, int]] = deque()
-        self._leapt = False
+        self._candidate: Keyframe | None = None  # the next keyframe, unless an earlier one can stand for it
+        self._path = AnchoredPoses()  # what was a keyframe, and what an earlier one stands for
+        # Where the last of them was, and how long the way up to there is; doubt and news since then.
+        self._here, self._way_m = np.zeros(3), 0.0
+        self._open, self._news = np.zeros(3), False
         self._witnesses: deque[Measured] = deque(maxlen=_WITNESSES)
         self._agreed_at_m = -math.inf
         self._places = Buckets(_BUCKET_M)  # of the keyframes
 
-    def follow(self, scan: Scan, points_base: Array, T_map_base: Array, leapt: bool) -> None:
+    def follow(self, scan: Scan, points_base: Array, T_map_base: Array, doubt: Array, news: bool) -> None:
         """Take in a scan that fits the map at a pose (3,), with its points (N, 2).
 
-        leapt: whether the pose is not where the wheels said, so that one of them is wrong.
+        doubt (3,): what else than usual may be wrong with the way here since the last scan, m, m and rad, 1 sigma:
+        where the pose is not where the wheels said, one of them is wrong; where nothing was in sight, the wheels may
+        be. news: whether the scan shows something that is not in the map.
         """
-        self._leapt |= leapt
+        self._open, self._news = np.maximum(self._open, doubt), self._news or news
         if not self._is_apart(T_map_base):
             return
-        way = self.way_m(T_map_base)
-        k = len(self.keyframes)
-        self.keyframes.append(Keyframe(scan, points_base, T_map_base, way))
-        self._places.put(k, float(T_map_base[0]), float(T_map_base[1]))
-        if k > 0:
-            self._steps.append(se2.between(self.keyframes[k - 1].T_map_base, T_map_base))
-            if self._leapt:
-                self._leaps.add(k - 1)
-                self._jobs.append((k - 1, k))
-            if way - self._agreed_at_m > _FRESH_M:
-                self._jobs.extend((j, k) for j in self._earlier_visits(k))
-        self._leapt = False
+        self._keep()
+        self._way_m, self._here = self.way_m(T_map_base), T_map_base
+        self._candidate = here = Keyframe(scan, points_base, T_map_base, self._way_m)
+        k, sure = len(self.keyframes), not (self._news or self._open.any())
+        if self._open.any() and k > 0:
+            self._leaps[k] = self._unsettled[k] = self._open
+            self._jobs.append((self._path.last, k))
+        if self._way_m - self._agreed_at_m > _FRESH_M:
+            self._jobs.extend((j, k) for j in self._earlier_visits(here))
+        self._open, self._news = np.zeros(3), False
+        if not (sure and self._awaits(k)):
+            self._settle(self._alike_of_late(here) if sure else None)
 
     def work_off(self) -> None:
         """Do one of the matches that are due; to be called once a step."""
-        if self._jobs:
-            j, k = self._jobs.popleft()
-            match = self._match(j, k)
-            if match.overlap >= _LEAST_OVERLAP and match.fit >= _LEAST_FIT:
-                covariance = match.covariance + np.diag(np.square(_MATCH_SIGMAS))
-                self.matched.append(Measured(j, k, match.T_map_base, np.linalg.inv(covariance), True))
-                if k - j > 1 and math.sqrt(match.covariance[:2, :2].trace()) < _SHARP_M:
-                    self._hear(self.matched[-1])
-            while k - j > 1 and self.agreed and self._jobs and self._jobs[0][1] == k:
+        if not self._jobs:
+            return
+        j, k = self._jobs.popleft()
+        match = self._match(j, k)
+        if match.overlap >= _LEAST_OVERLAP and match.fit >= _LEAST_FIT:
+            covariance = match.covariance + np.diag(np.square(_MATCH_SIGMAS))
+            measured = Measured(j, k, match.T_map_base, np.linalg.inv(covariance), True)
+            agrees = self._agrees(measured)
+            if not self._is_step(measured) and math.sqrt(match.covariance[:2, :2].trace()) < _SHARP_M:
+                self._hear(measured, agrees)
+            if k == len(self.keyframes):
+                if agrees and self.agreed and j in self._alike(self._frame(k)):
+                    self._tie(measured)
+                    self._settle(j)
+                else:
+                    self._keep()
+            if k < len(self.keyframes):
+                self.matched.append(measured)
+            while self.agreed and self._awaits(k) and not self._is_step(measured):
                 self._jobs.popleft()  # where nothing disagrees, one visit says what the others would
+        if not self._awaits(len(self.keyframes)):
+            self._keep()
 
     @property
     def agreed(self) -> bool:
         """Whether, where the robot is now, what it maps agrees with what it mapped on earlier visits."""
-        return bool(self.keyframes) and self.keyframes[-1].way_m - self._agreed_at_m <= _HOLDS_M
+        return self._way_m - self._agreed_at_m <= _HOLDS_M
 
     def close(self) -> Correction | None:
         """The correction that a verified loop asks for, which the keyframes have then undergone; mostly None."""
         if not self._is_loop():
             return None
+        self._keep()
         witnesses, self._witnesses = list(self._witnesses), deque(maxlen=_WITNESSES)
-        before = np.array([k.T_map_base for k in self.keyframes])
+        before = self._poses()
         after = self._relax(before)
         asked, left = (max(_size(_off(poses[m.a], poses[m.b], m)) for m in witnesses) for poses in (before, after))
         if left > 0.5 * asked:
@@ -148,17 +180,82 @@ class Loops:
         self.keyframes = [replace(f, T_map_base=T) for f, T in zip(self.keyframes, after, strict=True)]
         for k, (x, y, _) in enumerate(after.tolist()):
             self._places.put(k, x, y)
-        self._agreed_at_m = self.keyframes[-1].way_m
+        self._here = self._path.poses(after)[-1]
+        for measured in witnesses:
+            self._know(measured)
+        self._agreed_at_m = self._way_m
         return Correction(before, after)
 
-    def _hear(self, measured: Measured) -> None:
+    def _hear(self, measured: Measured, agrees: bool) -> None:
         """Take a sharp match of the latest keyframes as a witness, for the map as it is or for a loop."""
-        off = _off(self.keyframes[measured.a].T_map_base, self.keyframes[measured.b].T_map_base, measured)
-        if math.hypot(off[0], off[1]) < _WORTH_M and abs(off[2]) < _WORTH_RAD:
-            self._agreed_at_m = max(self._agreed_at_m, self.keyframes[measured.b].way_m)
+        if agrees:
+            self._agreed_at_m = max(self._agreed_at_m, self._frame(measured.b).way_m)
             self._witnesses.clear()
+            self._know(measured)
         elif not self._witnesses or self._witnesses[-1].b != measured.b:
             self._witnesses.append(measured)
+
+    def _know(self, measured: Measured) -> None:
+        """What lies between two keyframes is known by a loop now, also where the robot came blindly."""
+        self._unsettled = {k: leap for k, leap in self._unsettled.items() if not measured.a < k <= measured.b}
+
+    def _agrees(self, measured: Measured) -> bool:
+        """Whether a match finds two keyframes where they are taken to be."""
+        off = _off(self.keyframes[measured.a].T_map_base, self._frame(measured.b).T_map_base, measured)
+        return math.hypot(off[0], off[1]) < _WORTH_M and abs(float(off[2])) < _WORTH_RAD
+
+    def _is_step(self, measured: Measured) -> bool:
+        """Whether a match is of a keyframe and the one from which the robot came there."""
+        b = measured.b
+        return 0 < b <= len(self._steps) and self._steps[b - 1][0] == measured.a
+
+    def _awaits(self, k: int) -> bool:
+        """Whether the next match that is due is of a keyframe."""
+        return bool(self._jobs) and self._jobs[0][1] == k
+
+    def _frame(self, k: int) -> Keyframe:
+        """A keyframe, or the candidate that is to be the next."""
+        if k < len(self.keyframes) or self._candidate is None:
+            return self.keyframes[k]
+        return self._candidate
+
+    def _tie(self, measured: Measured) -> None:
+        """Keep what a match says of the keyframe that stands for the candidate, seen from the one before it.
+
+        Once for each two of them. If only matches that disagree were kept, they would pull the path to their side.
+        """
+        a, j = self._path.last, measured.a
+        if a == j or (a, j) in self._tied:
+            return
+        self._tied.add((a, j))
+        T_a_here = se2.between(self.keyframes[a].T_map_base, self._frame(measured.b).T_map_base)
+        T_a_j = se2.compose(T_a_here, se2.invert(measured.T_a_b))
+        turn = rotation(float(T_a_j[2]))
+        self.matched.append(Measured(a, j, T_a_j, turn @ measured.information @ turn.T, True))
+
+    def _settle(self, j: int | None) -> None:
+        """Have an earlier keyframe stand for the candidate, or keep it."""
+        here, k = self._candidate, len(self.keyframes)
+        if j is None or here is None:
+            self._keep()
+            return
+        self._candidate, self._jobs = None, deque(job for job in self._jobs if job[1] < k)
+        earlier = self.keyframes[j]
+        self.keyframes[j] = replace(earlier, way_m=here.way_m)
+        self._path.add(here.scan.stamp_ns, j, se2.between(earlier.T_map_base, here.T_map_base))
+
+    def _keep(self) -> None:
+        """Make the candidate a keyframe, if there is one."""
+        here, k = self._candidate, len(self.keyframes)
+        if here is None:
+            return
+        self._candidate = None
+        if k > 0:
+            anchor = self._path.last
+            self._steps.append((anchor, se2.between(self.keyframes[anchor].T_map_base, here.T_map_base)))
+        self.keyframes.append(here)
+        self._places.put(k, float(here.T_map_base[0]), float(here.T_map_base[1]))
+        self._path.add(here.scan.stamp_ns, k, np.zeros(3))
 
     def _is_loop(self) -> bool:
         """Whether enough matches of late ask for the same correction of the place where the robot is."""
@@ -175,12 +272,14 @@ class Loops:
         """Poses (N, 3) of the keyframes that agree best with all measurements."""
         while self._jobs:
             self.work_off()
-        return self._relax(np.array([k.T_map_base for k in self.keyframes]).reshape(-1, 3))
+        self._keep()
+        return self._relax(self._poses())
 
     def _relax(self, poses: Array) -> Array:
-        usual, leap = (np.diag(1.0 / np.square(sigmas)) for sigmas in (self._step_sigmas(poses), _LEAP_SIGMAS))
+        usual, none = np.square(self._step_sigmas(poses)), np.zeros(3)
         steps = [
-            Measured(k, k + 1, step, leap if k in self._leaps else usual, False) for k, step in enumerate(self._steps)
+            Measured(a, b, step, np.diag(1.0 / (usual + np.square(self._leaps.get(b, none)))), False)
+            for b, (a, step) in enumerate(self._steps, start=1)
         ]
         return relax(poses, steps + self.matched)
 
@@ -190,7 +289,7 @@ class Loops:
         A localizer that holds on to its map adds next to nothing. To believe in more would let small errors of the
         matches bend a path that is straight.
         """
-        found = [(_off(poses[m.a], poses[m.b], m), m.b - m.a) for m in self.matched if m.b - m.a > 1]
+        found = [(_off(poses[m.a], poses[m.b], m), abs(m.b - m.a)) for m in self.matched if not self._is_step(m)]
         squared = np.array([np.square(off) / number for off, number in found]).reshape(-1, 3)
         if len(squared) == 0:
             return np.array([_STEP_M[0], _STEP_M[0], _STEP_RAD[0]])
@@ -199,28 +298,62 @@ class Loops:
 
     def way_m(self, T_map_base: Array) -> float:
         """Length of the path up to a pose (3,), m, in straight lines from keyframe to keyframe."""
-        if not self.keyframes:
-            return 0.0
-        return self.keyframes[-1].way_m + math.dist(self.keyframes[-1].T_map_base[:2], T_map_base[:2])
+        return self._way_m + math.dist(self._here[:2], T_map_base[:2]) if self._is_begun else 0.0
+
+    @property
+    def anchor(self) -> int:
+        """Number of the keyframe from which the robot came to where it is; -1 before the first."""
+        return self._path.last
+
+    def past(self) -> tuple[NDArray[np.int64], Array]:
+        """Stamps (N,) and poses (N, 3) of the scans that are keyframes, or for which one stands, as they came."""
+        return self._path.stamps_ns, self._path.poses(self._poses())
+
+    def _poses(self) -> Array:
+        return np.array([frame.T_map_base for frame in self.keyframes]).reshape(-1, 3)
+
+    @property
+    def _is_begun(self) -> bool:
+        return bool(self.keyframes) or self._candidate is not None
 
     def _is_apart(self, T_map_base: Array) -> bool:
-        """Whether a pose is far enough from the last keyframe to be one."""
-        if not self.keyframes:
-            return True
-        moved = se2.between(self.keyframes[-1].T_map_base, T_map_base)
-        turned = abs(float(moved[2])) >= self._config.keyframe_rad
-        return turned or math.hypot(moved[0], moved[1]) >= self._config.keyframe_m
+        """Whether a pose is far enough from the last place on the path to be the next."""
+        return not (self._is_begun and self._are_near(self._here, T_map_base))
 
-    def _earlier_visits(self, k: int) -> list[int]:
+    def _are_near(self, T_a: Array, T_b: Array) -> bool:
+        """Whether two poses (3,) see about the same."""
+        moved = se2.between(T_a, T_b)
+        turned = abs(float(moved[2])) >= self._config.keyframe_rad
+        return not turned and math.hypot(moved[0], moved[1]) < self._config.keyframe_m
+
+    def _alike(self, here: Keyframe) -> list[int]:
+        """Keyframes that see about the same as another one; none where there are not enough to stand for it."""
+        x, y, _ = here.T_map_base.tolist()
+        near = self._places.near(x, y, self._config.keyframe_m)
+        alike = [k for k in near if self._are_near(self.keyframes[k].T_map_base, here.T_map_base)]
+        return alike if len(alike) >= _ENOUGH else []
+
+    def _alike_of_late(self, here: Keyframe) -> int | None:
+        """The keyframe that another one is most like, where old and new agree or it is of the same visit."""
+        frames = [(k, self.keyframes[k]) for k in self._alike(here)]
+        of_late = [(k, f) for k, f in frames if self.agreed or here.way_m - f.way_m <= _AGAIN_M]
+        if not of_late:
+            return None
+        offs = np.abs([se2.off(f.T_map_base, here.T_map_base) for _, f in of_late])
+        return of_late[int((np.hypot(offs[:, 0], offs[:, 1]) + _TURN_M_RAD * offs[:, 2]).argmin())][0]
+
+    def _earlier_visits(self, here: Keyframe) -> list[int]:
         """The keyframe most like this one of each of the earlier visits to the place, the likest first."""
-        here = self.keyframes[k]
         farthest = self._config.loop_reach_m + _FARTHEST_M
         near = self._places.near(float(here.T_map_base[0]), float(here.T_map_base[1]), farthest)
         frames = [self.keyframes[i] for i in near]
+        if not frames:
+            return []
         poses, ways = np.array([f.T_map_base for f in frames]), np.array([f.way_m for f in frames])
         distances = np.hypot(*(poses[:, :2] - here.T_map_base[:2]).T)
         unlike = distances + _TURN_M_RAD * np.abs(se2.wrap(poses[:, 2] - here.T_map_base[2]))
-        unlike[(distances > self._reach(here.way_m - ways)) | (ways > here.way_m - _AGAIN_M)] = np.inf
+        reach = self._config.loop_reach_m + np.array([self._drift(i, here)[0] for i in near])
+        unlike[(distances > reach) | (ways > here.way_m - _AGAIN_M)] = np.inf
         found: list[int] = []
         while len(found) < _VISITS and np.isfinite(unlike).any():
             likest = int(unlike.argmin())
@@ -228,15 +361,20 @@ class Loops:
             unlike[np.abs(ways - ways[likest]) < _AGAIN_M] = np.inf
         return found
 
-    def _reach(self, way_m: Array) -> Array:
-        """How far from a place that was left so much way ago, (N,), the robot may seem to be when it is back, m."""
-        return np.asarray(self._config.loop_reach_m + np.minimum(_DRIFT * way_m, _FARTHEST_M))
+    def _drift(self, j: int, here: Keyframe) -> tuple[float, float]:
+        """How far, m, and how much turned, rad, the robot may be from where it seems to be, seen from keyframe j."""
+        since_m = here.way_m - self.keyframes[j].way_m
+        sigmas = sum((leap for k, leap in self._unsettled.items() if k > j), np.zeros(3))
+        blind_m = float(sigmas[0] + sigmas[2] * min(since_m, _LEVER_M))
+        return min(_DRIFT * since_m + blind_m, _FARTHEST_M), float(sigmas[2])
 
     def _match(self, j: int, k: int) -> Match:
         """Keyframe k matched with j and those around it, in the frame of j."""
-        base, here = self.keyframes[j].T_map_base, self.keyframes[k]
-        drift = min(_DRIFT * (here.way_m - self.keyframes[j].way_m), _FARTHEST_M)
-        matcher = ScanMatcher(replace(self._matching, search_m=self._matching.search_m + drift, search_deg=_SEARCH_DEG))
+        base, here = self.keyframes[j].T_map_base, self._frame(k)
+        drift, turn = self._drift(j, here)
+        search_m = self._matching.search_m + drift
+        search_deg = min(_SEARCH_DEG + math.degrees(turn), _WIDEST_SEARCH_DEG)
+        matcher = ScanMatcher(replace(self._matching, search_m=search_m, search_deg=search_deg))
         for frame in self.keyframes[max(0, j - _AROUND) : min(j + _AROUND + 1, k)]:
             T = se2.between(base, frame.T_map_base)
             laser = se2.transform_points(T, frame.scan.T_base_laser[None, :2])[0]
@@ -246,7 +384,7 @@ class Loops:
             here.points_base,
             np.ascontiguousarray(here.scan.T_base_laser[:2]),
             prior,
-            np.diag(np.square(_PRIOR_SIGMAS) + [drift**2, drift**2, 0.0]),
+            np.diag(np.square(_PRIOR_SIGMAS) + [drift**2, drift**2, turn**2]),
             search=drift > _SEARCHED_M and not self.agreed,
             lost=True,  # drift is not what wheels do from scan to scan
         )

@@ -35,9 +35,14 @@ class OdometryNoise:
 
     @property
     def share(self) -> Array:
-        """Of each variance that is allowed, the share that there is, (2,)."""
+        """Of each variance that is allowed, the share that there is, (2,); never less than a tenth."""
+        return np.maximum(self.found_share, _LEAST)
+
+    @property
+    def found_share(self) -> Array:
+        """The same without that bound, (2,): what has been found so far."""
         known = self._allowed > 0.0
-        return np.clip(np.divide(self._found, self._allowed, out=np.ones(2), where=known), _LEAST, 1.0)
+        return np.minimum(np.divide(self._found, self._allowed, out=np.ones(2), where=known), 1.0)
 
     def move(self, increment: Array) -> None:
         """The robot has moved by an increment (3,) of odometry."""

@@ -33,10 +33,10 @@ class RedrawnMap:
         self.matcher = self._fresh()
         self._draw(keyframes, min(int((away < self._config.match_range_m).sum()), _AT_ONCE))
 
-    def go_on(self, keyframes: list[Keyframe]) -> None:
-        """Draw a few more of the keyframes that are due, those that are nearest to the newest one first."""
+    def go_on(self, keyframes: list[Keyframe], T_map_base: Array) -> None:
+        """Draw a few more of the keyframes that are due, those that are nearest to a pose (3,) first."""
         if self._due:
-            here = keyframes[-1].T_map_base[:2]
+            here = T_map_base[:2]
             if math.dist(here, self._sorted_at) > _SORTED_M:
                 self._sort(keyframes, here)
             self._draw(keyframes, _A_STEP)

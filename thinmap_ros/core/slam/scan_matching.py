@@ -64,7 +64,7 @@ class MatchConfig(Config):
         0.85, 'share of points that fit below which the surroundings are searched', low=0.0, high=1.0
     )
     match_least_fit: float = parameter(0.65, 'share of points that fit below which a match fails', low=0.0, high=1.0)
-    search_m: float = parameter(0.5, 'after a failed match: how far to search, m', low=0.0, high=3.0)
+    search_m: float = parameter(0.5, 'after a failed match: how far to search, m', low=0.0, high=10.0)
     search_deg: float = parameter(30.0, 'after a failed match: how far to turn, degrees', low=0.0, high=180.0)
 
 

@@ -13,7 +13,7 @@ _NEAR_M, _NEAR_RAD = 0.2, 0.2  # from one scan to the next; a robot that is fast
 _TURNED_RAD = 1.0  # up to here much of what was seen is still in view, if less surely in its place
 _SAME_M, _SAME_SHARE = 0.2, 0.05  # what is seen twice is as far away, give or take so much and so much of its range
 _FEWEST_POINTS = 20
-_SEEN_AGAIN = 0.45  # share of what was just seen that has to be there still; carried off, it is 0.1, seldom above 0.4
+SEEN_AGAIN = 0.45  # share of what was just seen that has to be there still; carried off, it is 0.1, seldom above 0.4
 _SEEN_AGAIN_TURNED = 0.2  # and so much of it in a turn
 _AS_WELL, _AS_WELL_AGAIN = 0.5, 0.8  # share of the points that usually fit; the second where something is wrong
 _USUAL_MEMORY = 0.9  # of what usually fits, from one scan to the next
@@ -52,7 +52,7 @@ class Tracking:
         way, turn = float(np.hypot(increment[0], increment[1])), abs(float(increment[2]))
         strange = False
         if before is not None and len(before) and len(points_base) and way <= _NEAR_M and turn <= _TURNED_RAD:
-            least = _SEEN_AGAIN if turn <= _NEAR_RAD else _SEEN_AGAIN_TURNED
+            least = SEEN_AGAIN if turn <= _NEAR_RAD else _SEEN_AGAIN_TURNED
             strange = share_seen_again(before, increment, scan) < least
         share = match.overlap * match.fit
         if strange or self._carried:
