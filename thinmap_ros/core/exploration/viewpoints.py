@@ -20,8 +20,7 @@ Cells = NDArray[np.int64]
 Cell = tuple[int, int]
 # Not more: across a wall one cell thick places where a robot can stand are six cells apart, and stay apart in squares.
 SQUARE = 3
-# Most of what a border hides: so much of so many points, and of a long border, with a point every so many cells, that of
-# a part of it.
+# Most of what a border hides: so much of so many points. Of a long one, with a point every so many cells, as many.
 _POINTS, _SHARE = 8, 0.7
 _SPACING = 10
 _SLACK, _STRIDE = 5, 4
