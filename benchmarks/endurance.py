@@ -77,7 +77,7 @@ class Driver:
         self._navigate = ActionClient(self._node, NavigateToPose, 'navigate_to_pose')
         self._explored, self._busy = Explore.Goal(), False
         self.explores, self.goals, self.reached = True, 0, 0
-        self.poses, self.simulated_s, self.step_ms = 0, 0.0, {}
+        self.poses, self.first_s, self.simulated_s, self.step_ms = 0, 0.0, 0.0, {}
         deep = QoSProfile(depth=_DEPTH)
         self._node.create_subscription(PoseWithCovarianceStamped, 'pose', self._on_pose, deep)
         self._node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, deep)
@@ -91,8 +91,8 @@ class Driver:
             client.send_goal_async(self._next_goal()).add_done_callback(self._on_taken)
 
     def lost(self) -> int:
-        """Scans of the simulated time that have no pose."""
-        return max(round(self.simulated_s / _SCAN_S) + 1 - self.poses, 0)
+        """Scans that have no pose, from the first one that was heard: before that nobody listened."""
+        return max(round((self.simulated_s - self.first_s) / _SCAN_S) + 1 - self.poses, 0)
 
     def close(self) -> None:
         """Listen no more."""
@@ -119,8 +119,10 @@ class Driver:
         self.explores = False
 
     def _on_pose(self, message: Any) -> None:
+        stamp_s = self._messages.stamp_ns(message.header.stamp) / 1e9
+        self.first_s = self.first_s if self.poses else stamp_s
         self.poses += 1
-        self.simulated_s = max(self.simulated_s, self._messages.stamp_ns(message.header.stamp) / 1e9)
+        self.simulated_s = max(self.simulated_s, stamp_s)
 
     def _on_diagnostics(self, message: Any) -> None:
         for status in message.status:

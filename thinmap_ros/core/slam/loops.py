@@ -5,7 +5,9 @@ there: now and then with those of one visit where that agrees with the map, alwa
 match counts that fits well; of matches that tell the place sharply, several along the way that ask for one and the
 same correction make a loop. What the localizer says of neighbours on the path, and the matches of the others, make a
 graph of poses that is relaxed; should the matches that asked for it not be content then, nothing is corrected.
-A keyframe costs its scan, its pose and a few measurements in memory, and a few matches in time, one a step.
+A keyframe costs its scan, its pose and a few measurements in memory, and a few matches in time, one a step. Where
+nothing was in sight for a while, the step between two of them is as doubtful as the wheels are, and that is looked
+for farther off.
 Source: Lu and Milios, "Globally consistent range scan alignment for environment mapping", 1997; for the graph see
 pose_graph.
 """
@@ -33,7 +35,7 @@ _VISITS = 3  # earlier visits to a place with which a scan is matched, at most
 _TURN_M_RAD = 1.0  # a radian of turn makes two scans as different as so many metres
 # Bounds of the error of a step from one keyframe to the next, in m and in rad.
 _STEP_M, _STEP_RAD = (0.002, 0.02), (0.0002, 0.02)
-LEAP_SIGMAS = (0.1, 0.1, 0.05)  # the same where wheels and walls contradicted each other
+LEAP_SIGMAS = (0.1, 0.1, 0.05)  # of one where wheels and walls contradicted each other
 _MATCH_SIGMAS = (0.04, 0.04, 0.02)  # matches err together, by more than each says of itself
 _PRIOR_SIGMAS = (0.3, 0.3, 0.15)
 _LEAST_OVERLAP, _LEAST_FIT = 0.5, 0.85
