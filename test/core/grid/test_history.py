@@ -77,7 +77,7 @@ def test_of_a_place_that_is_seen_again_and_again_the_newest_scans_are_kept():
 
 def test_places_are_those_after_a_correction():
     """Two halves of a way turn out to be one: the newer scans of each place are left."""
-    there = np.array([se2.pose(0.01 + 0.5 * k, 0.1, 0.1) for k in range(8)])
+    there = np.array([se2.pose(0.01 + k, 0.1, 0.1) for k in range(8)])
     away = there + [0.0, 50.0, 0.0]
     history = filled(np.concatenate([there] * 4 + [away] * 4), range(64))
     assert len(history.past.scans()) == 64

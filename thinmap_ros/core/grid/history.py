@@ -16,8 +16,8 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
 _APART_M, _APART_RAD = 0.25, 0.25
-_PLACE_M, _DIRECTIONS = 0.5, 8  # edge of a place, and directions of the robot that are told apart there
-_OF_A_PLACE = 4  # scans of each place and direction: about two visits
+_PLACE_M, _DIRECTIONS = 1.0, 8  # edge of a place, and directions of the robot that are told apart there
+_OF_A_PLACE = 4  # scans of each place and direction: about one visit
 _Place = tuple[int, int, int]
 
 
@@ -108,7 +108,7 @@ def _carried(poses: Array, before: Array, after: Array) -> Array:
 
 
 class GridHistory:
-    """The scans that a grid can be drawn from anew: 10 kB a metre of what is new, at most 130 kB a square metre."""
+    """The scans that a grid can be drawn from anew: 10 kB a metre of what is new, at most 30 kB a square metre."""
 
     def __init__(self) -> None:
         self.past = PoseHistory()
