@@ -76,11 +76,15 @@ def test_of_a_place_that_is_seen_again_and_again_the_newest_scans_are_kept():
 
 
 def test_places_are_those_after_a_correction():
-    """Two halves of a way turn out to be one: the newer scans of each place are left."""
+    """Two halves of a way turn out to be one: when more is seen there, the newer scans are left."""
     there = np.array([se2.pose(0.01 + k, 0.1, 0.1) for k in range(8)])
     away = there + [0.0, 50.0, 0.0]
     history = filled(np.concatenate([there] * 4 + [away] * 4), range(64))
-    assert len(history.past.scans()) == 64
+    before = history.past.poses()
     history.past.correct(np.array([0, 32]), there[[0, 0]], since_ns=64)
+    after = history.past.poses()
+    assert len(after) == len(before) == len(history.past.scans()) == 64, 'one pose for each that there was'
+    for k, T in enumerate(there):
+        history.add(scan(64 + k), T)
     assert len(history.past.scans()) == 32
-    assert min(s.stamp_ns for s in history.past.scans()) == 32
+    assert min(s.stamp_ns for s in history.past.scans()) == 40

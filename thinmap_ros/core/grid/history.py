@@ -69,20 +69,24 @@ class PoseHistory:
         anchors = np.maximum(np.searchsorted(numbers, np.arange(right), side='right') - 1, 0)
         after = _carried(before[:right], before[numbers][anchors], poses[named][anchors])
         self._poses[: 3 * right] = array('d', after.ravel().tolist())
-        kept, self._asked_for, self._at_place = self._asked_for, {}, {}
-        for number, scan in kept.items():
-            self._ask_for(number, scan)
+        # Before and after, the same ones are asked for: what is too many now is dropped when more come.
+        self._at_place = {}
+        for number in self._asked_for:
+            self._here(number).append(number)
 
     def _ask_for(self, number: int, scan: Scan | None) -> None:
-        """Put a scan at its place; the oldest there is asked for no more, if there are too many."""
-        x, y, heading = self._pose(number).tolist()
-        turn = math.floor(heading % (2.0 * math.pi) / (2.0 * math.pi) * _DIRECTIONS)
-        place = (math.floor(x / _PLACE_M), math.floor(y / _PLACE_M), turn)
-        here = self._at_place.setdefault(place, deque())
+        """Put a scan at its place; the oldest there are asked for no more, if there are too many."""
+        here = self._here(number)
         here.append(number)
         self._asked_for[number] = scan
-        if len(here) > _OF_A_PLACE:
+        while len(here) > _OF_A_PLACE:
             del self._asked_for[here.popleft()]
+
+    def _here(self, number: int) -> deque[int]:
+        """What is asked for at the place, and in the direction, of a scan."""
+        x, y, heading = self._pose(number).tolist()
+        turn = math.floor(heading % (2.0 * math.pi) / (2.0 * math.pi) * _DIRECTIONS)
+        return self._at_place.setdefault((math.floor(x / _PLACE_M), math.floor(y / _PLACE_M), turn), deque())
 
     def _pose(self, number: int) -> Array:
         return np.array(self._poses[3 * number : 3 * number + 3])
