@@ -91,7 +91,7 @@ def test_mapping_goes_on_after_each_node_was_killed(graph):
     maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
     graphs = graph.heard('topology', TopologicalMap, qos.LATCHED)
     start_mapping(graph)
-    robot.drive(2.5)
+    robot.drive(3.2)
     graph.until(lambda: maps and graphs and len(graphs[-1].nodes) > 2, 'map and graph')
     graph.until(lambda: len(maps) > 3, 'time to be kept')
     for name in MAPPING:

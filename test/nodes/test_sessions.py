@@ -56,7 +56,7 @@ def test_ids_and_cells_are_the_same_tomorrow_and_mapping_goes_on(graph, tmp_path
     maps, graphs, local = heard_maps(graph)
     for name in MAPPERS:
         graph.start(name, use_sim_time=True)
-    T = drive(graph, 2.0, 2.0, 0.9, 2.5)
+    T = drive(graph, 2.0, 2.0, 0.9, 3.2)
     stem = tmp_path / 'today' / 'room'
 
     def save_all():
@@ -82,7 +82,7 @@ def test_ids_and_cells_are_the_same_tomorrow_and_mapping_goes_on(graph, tmp_path
     assert not local
     assert places(graphs[-1]) == before and {edge.id for edge in graphs[-1].edges} == edges
     assert np.array_equal(messages.patch_from(maps[-1]).cells, known.cells)
-    drive(graph, *T.tolist(), 0.6)
+    drive(graph, *T.tolist(), 0.3)
     # Mapping has gone on from there: more is known, what stayed has its number, and no number is given twice.
     assert (messages.patch_from(maps[-1]).cells >= 0).sum() >= (known.cells >= 0).sum()
     after = places(graphs[-1])
