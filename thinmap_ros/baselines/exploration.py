@@ -226,20 +226,21 @@ class VisitAllEndNodes(NearestFrontier):
         super().__init__()
         self._patience = _Patience(self.progress_timeout_s)
         self._visited: list[tuple[float, float]] = []
-        self._end_node: tuple[int, Array] | None = None
+        self._end_node: Array | None = None  # the goal (3,) there
 
     def step(self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array) -> Decision:
         """End nodes first; what frontiers there are is looked after meanwhile."""
-        node, way_m = self._next_end_node(topology, T_map_base)
-        if node is None:
+        found = self._next_end_node(topology, T_map_base)
+        if found is None:
             self._end_node = None
             return super().step(topology, patch, scan, T_map_base)
+        goal, way_m = found
         self.map.update(patch, scan, T_map_base)
-        if self._end_node is None or not _is_near(self._end_node[1], node[1]):
+        if self._end_node is None or not _is_near(self._end_node, goal):
             self._number += 1
-            self._end_node = node
-        decision = _decision(topology, self._end_node[1], self._number, False, False)
-        if self._patience.is_over(node[1][:2], way_m, scan.stamp_ns):
+            self._end_node = goal
+        decision = _decision(topology, self._end_node, self._number, False, False)
+        if self._patience.is_over(goal[:2], way_m, scan.stamp_ns):
             self.fail_target('no progress')
         return decision
 
@@ -248,11 +249,11 @@ class VisitAllEndNodes(NearestFrontier):
         if self._end_node is None:
             super().fail_target(reason)
         else:
-            self._visited.append((float(self._end_node[1][0]), float(self._end_node[1][1])))
+            self._visited.append((float(self._end_node[0]), float(self._end_node[1])))
             self._end_node = None
 
-    def _next_end_node(self, topology: TopologicalMap, T_map_base: Array) -> tuple[tuple[int, Array] | None, float]:
-        """Id and place of the end node that is next, if there is one, and the way there, m."""
+    def _next_end_node(self, topology: TopologicalMap, T_map_base: Array) -> tuple[Array, float] | None:
+        """Goal (3,) at the end node that is next, and the way there, m; None without one."""
         ends = [node for node in topology.nodes.values() if node.kind == NodeKind.END]
         self._visited += [
             (node.x, node.y) for node in ends
@@ -260,19 +261,19 @@ class VisitAllEndNodes(NearestFrontier):
         ]
         left = {node.id: node for node in ends if not self._was_visited(node.x, node.y)}
         if not left:
-            return None, math.inf
+            return None
         costs = costs_from(topology, float(T_map_base[0]), float(T_map_base[1]))
         followed = {i: node for i, node in left.items() if self._is_followed(node.x, node.y)}
         best = min((followed or left).values(), key=lambda node: costs.get(node.id, math.inf))
         way_m = costs.get(best.id, math.inf)
         if not math.isfinite(way_m):
-            return None, math.inf
+            return None
         heading = math.atan2(best.y - T_map_base[1], best.x - T_map_base[0])
-        return (best.id, se2.pose(best.x, best.y, heading)), way_m
+        return se2.pose(best.x, best.y, heading), way_m
 
     def _is_followed(self, x: float, y: float) -> bool:
         """Whether the end node at a place is the one to which the robot drives, which moves as more is seen."""
-        return self._end_node is not None and math.dist((x, y), self._end_node[1][:2]) < _SAME_PLACE_M
+        return self._end_node is not None and math.dist((x, y), self._end_node[:2]) < _SAME_PLACE_M
 
     def _was_visited(self, x: float, y: float) -> bool:
         return any(math.dist((x, y), place) < _VISIT_M for place in self._visited)

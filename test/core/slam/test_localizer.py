@@ -201,6 +201,18 @@ def test_a_pose_that_is_set_is_settled_by_the_walls():
     assert localizer.refused == 1
 
 
+def test_a_robot_that_was_put_somewhere_roughly_draws_nothing_until_a_scan_fits():
+    """Where nothing is known nothing contradicts it either; somebody's guess is no reason to map there."""
+    rows, localizer = driven(300)
+    before = len(localizer.state()['cells'])
+    localizer.set_pose(rows[-1][0] + [40.0, 0.0, 0.0], np.diag([4.0, 4.0, 0.1]))
+    rng, odom = np.random.default_rng(1), rows[-1][2]
+    for i in range(20):
+        odom = se2.compose(odom, np.array([0.1, 0.0, 0.05]))
+        localizer.step(scan_in(ROOM, rows[-1][0], rng, (600 + i) * 200_000_000), odom)
+    assert len(localizer.state()['cells']) == before
+
+
 def test_after_a_reset_the_map_is_empty():
     rows, localizer = driven(200)
     localizer.reset()

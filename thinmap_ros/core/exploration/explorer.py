@@ -219,9 +219,9 @@ class Explorer:
         """
         memory = self._memory
         at = self.surveyor.border_of(chosen)
-        jumped = math.dist(chosen.goal[:2], memory.goal[:2]) > _SUCCESSOR_M
-        same = math.dist(at, memory.target_at) <= _SUCCESSOR_M and not (
-            jumped and not self.surveyor.still_shows(chosen, memory.goal, self._range_m)
+        same = math.dist(at, memory.target_at) <= _SUCCESSOR_M and (
+            math.dist(chosen.goal[:2], memory.goal[:2]) <= _SUCCESSOR_M
+            or self.surveyor.still_shows(chosen, memory.goal, self._range_m)
         )
         on_the_way = same and math.dist(T_map_base[:2], memory.goal[:2]) > _NEAR_VISIT_M
         memory.target, memory.target_at = chosen.track.node_id, at

@@ -182,10 +182,11 @@ class Localizer:
         points.since_m = -math.inf if self._loops.agreed else way_m - _OF_LATE_M
         match = self._predict(scan, points_base, laser_base, increment, increment_covariance)
         lines, matched = no_lines(), 0
-        if self.config.mapping and self._has_news() and not self._tracking.lost:
+        if self.config.mapping and self._has_news() and not self._is_unplaced():
             laser_map = se2.transform_points(self._ekf.pose, laser_base[None])[0]
             lines, matched = self._correct(scan)
-            if match.good or (len(points_base) >= FEWEST_POINTS and self._on_new_ground(match, scan)):
+            seen = len(points_base) >= FEWEST_POINTS
+            if match.good or (seen and self._on_new_ground(match, scan, self._ekf.pose)):
                 points_map = se2.transform_points(self._ekf.pose, points_base)
                 self._map.matcher.add(points_map, laser_map)
                 self._known_here = self._map.matcher.known(points_base, laser_base, self._ekf.pose)
@@ -201,7 +202,7 @@ class Localizer:
         if match.good:
             self._calibration.follow(self._ekf.pose)
         if correction is not None:
-            self._apply(correction)
+            self._apply(correction, points_base)
             self._calibration.interrupt()
         pose, k = self._ekf.pose, self._loops.anchor
         self._map.go_on(self._loops.keyframes, pose)
@@ -221,12 +222,15 @@ class Localizer:
         """The scans that were kept, at their poses as they are known now."""
         return self._loops.keyframes
 
-    def _apply(self, correction: Correction) -> None:
-        """A loop was closed: pose, features and the map of points go where the keyframes have gone."""
+    def _apply(self, correction: Correction, points_base: Array) -> None:
+        """A loop was closed: pose, features and the map of points go where the keyframes have gone.
+
+        points_base (N, 2): of the scan just made, which is what was seen last where the robot is now.
+        """
         moved = correction.moved(self._loops.anchor, self._ekf.pose)
         self._feature_map.move(self._filter, correction)
         self._ekf.move_pose(moved)
-        self._T_last_look = moved
+        self._T_last_look, self._points_last_look = moved, points_base
         self._map.begin_anew(self._loops.keyframes, moved)
 
     def _odometry(self, T_odom_base: Array) -> tuple[Array, Array]:
@@ -268,7 +272,7 @@ class Localizer:
         near = not self._moved(_KNOWN_M, _KNOWN_RAD, match.T_map_base)
         match = self._tracking.judged(match, points_base, scan, increment, near)
         if len(points_base) >= FEWEST_POINTS:  # fewer fit nothing, and contradict nothing
-            self._tracking.count(match.good, self._on_new_ground(match, scan))
+            self._tracking.count(match.good, self._on_new_ground(match, scan, predicted))
         if match.good:
             evidence = self._doubt.evidence(match.covariance)
             self._noise.learn(se2.off(match.T_map_base, predicted), evidence, float(predicted[2]))
@@ -310,18 +314,18 @@ class Localizer:
         """Whether the robot has moved since it last learned: looks from one place err alike, and prove nothing anew."""
         return self._moved(self.config.look_distance_m, self.config.look_turn_rad)
 
-    def _on_new_ground(self, match: Match, scan: Scan) -> bool:
-        """Whether a scan that lies on little that is known can be explained by where the robot has come to.
+    def _on_new_ground(self, match: Match, scan: Scan, T_map_base: Array) -> bool:
+        """Whether a scan that lies on little that is known can be explained by where the robot has come to, (3,).
 
         Near the place where the map last learned, what was seen there is still to be seen, if it is in view at all, and
         unless little came of it.
         """
         if match.overlap >= _NEW_GROUND:
             return False
-        if self._known_here < _NEW_GROUND or self._moved(_NEW_GROUND_M, _NEW_GROUND_RAD):
+        last = self._T_last_look
+        if last is None or self._known_here < _NEW_GROUND or self._moved(_NEW_GROUND_M, _NEW_GROUND_RAD, T_map_base):
             return True
-        assert self._T_last_look is not None
-        moved = se2.between(self._T_last_look, self._ekf.pose)
+        moved = se2.between(last, T_map_base)
         return share_seen_again(self._points_last_look, moved, scan) >= SEEN_AGAIN
 
     def _moved(self, distance_m: float, turn_rad: float, T_map_base: Array | None = None) -> bool:
@@ -330,6 +334,10 @@ class Localizer:
             return True
         moved = se2.between(self._T_last_look, self._ekf.pose if T_map_base is None else T_map_base)
         return math.hypot(moved[0], moved[1]) >= distance_m or abs(float(moved[2])) >= turn_rad
+
+    def _is_unplaced(self) -> bool:
+        """Whether nothing may be drawn where the robot seems to be: lost, or put there roughly and not yet settled."""
+        return self._tracking.lost or (self._placed_by_hand and self._is_lost())
 
     def _is_lost(self) -> bool:
         in_doubt = self._doubt.since_match[[0, 1], [0, 1]].max() > _LOST_SIGMA_M**2

@@ -133,7 +133,7 @@ class Loops:
         if self._way_m - self._agreed_at_m > _FRESH_M:
             self._jobs.extend((j, k) for j in self._earlier_visits(here))
         self._open, self._news = np.zeros(3), False
-        if not (sure and self._awaits(k)):
+        if not (sure and self._is_candidate_due()):
             self._settle(self._alike_of_late(here) if sure else None)
 
     def work_off(self) -> None:
@@ -156,9 +156,9 @@ class Loops:
                     self._keep()
             if k < len(self.keyframes):
                 self.matched.append(measured)
-            while self.agreed and self._awaits(k) and not self._is_step(measured):
+            while self.agreed and self._jobs and self._jobs[0][1] == k and not self._is_step(measured):
                 self._jobs.popleft()  # where nothing disagrees, one visit says what the others would
-        if not self._awaits(len(self.keyframes)):
+        if not self._is_candidate_due():
             self._keep()
 
     @property
@@ -211,9 +211,9 @@ class Loops:
         b = measured.b
         return 0 < b <= len(self._steps) and self._steps[b - 1][0] == measured.a
 
-    def _awaits(self, k: int) -> bool:
-        """Whether the next match that is due is of a keyframe."""
-        return bool(self._jobs) and self._jobs[0][1] == k
+    def _is_candidate_due(self) -> bool:
+        """Whether matches of the candidate are due; they are the last ones."""
+        return bool(self._jobs) and self._jobs[-1][1] == len(self.keyframes)
 
     def _frame(self, k: int) -> Keyframe:
         """A keyframe, or the candidate that is to be the next."""
@@ -354,7 +354,7 @@ class Loops:
         poses, ways = np.array([f.T_map_base for f in frames]), np.array([f.way_m for f in frames])
         distances = np.hypot(*(poses[:, :2] - here.T_map_base[:2]).T)
         unlike = distances + _TURN_M_RAD * np.abs(se2.wrap(poses[:, 2] - here.T_map_base[2]))
-        reach = self._config.loop_reach_m + np.array([self._drift(i, here)[0] for i in near])
+        reach = self._config.loop_reach_m + self._drift(near, here)[0]
         unlike[(distances > reach) | (ways > here.way_m - _AGAIN_M)] = np.inf
         found: list[int] = []
         while len(found) < _VISITS and np.isfinite(unlike).any():
@@ -363,17 +363,21 @@ class Loops:
             unlike[np.abs(ways - ways[likest]) < _AGAIN_M] = np.inf
         return found
 
-    def _drift(self, j: int, here: Keyframe) -> tuple[float, float]:
-        """How far, m, and how much turned, rad, the robot may be from where it seems to be, seen from keyframe j."""
-        since_m = here.way_m - self.keyframes[j].way_m
-        sigmas = sum((leap for k, leap in self._unsettled.items() if k > j), np.zeros(3))
-        blind_m = float(sigmas[0] + sigmas[2] * min(since_m, _LEVER_M))
-        return min(_DRIFT * since_m + blind_m, _FARTHEST_M), float(sigmas[2])
+    def _drift(self, numbers: list[int], here: Keyframe) -> tuple[Array, Array]:
+        """How far, m, and how much turned, rad, the robot may be from where it seems to be, seen from keyframes, (N,).
+
+        Leaps err each for itself, so that their variances add up.
+        """
+        since_m = here.way_m - np.array([self.keyframes[j].way_m for j in numbers])
+        leaps = np.square(list(self._unsettled.values())).reshape(-1, 3)
+        sigmas = np.sqrt((np.array(numbers)[:, None] < np.array(list(self._unsettled))) @ leaps)
+        blind_m = sigmas[:, 0] + sigmas[:, 2] * np.minimum(since_m, _LEVER_M)
+        return np.minimum(_DRIFT * since_m + blind_m, _FARTHEST_M), sigmas[:, 2]
 
     def _match(self, j: int, k: int) -> Match:
         """Keyframe k matched with j and those around it, in the frame of j."""
         base, here = self.keyframes[j].T_map_base, self._frame(k)
-        drift, turn = self._drift(j, here)
+        drift, turn = (float(each[0]) for each in self._drift([j], here))
         search_m = self._matching.search_m + drift
         search_deg = min(_SEARCH_DEG + math.degrees(turn), _WIDEST_SEARCH_DEG)
         matcher = ScanMatcher(replace(self._matching, search_m=search_m, search_deg=search_deg))
