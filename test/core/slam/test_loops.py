@@ -1,5 +1,6 @@
 """Pose graphs and loops: drift is spread over the path, and a wrong loop moves nothing."""
 
+from copy import deepcopy
 from itertools import pairwise
 
 import numpy as np
@@ -143,13 +144,23 @@ def test_the_kept_scans_come_with_their_poses(round_trip):
         assert np.hypot(*(truth[:, :2] - T[:2]).T).min() < 0.05
 
 
+def test_a_single_wrong_match_does_not_bend_a_way_that_was_come_blindly(round_trip):
+    *_, localizer = deepcopy(round_trip)
+    before, loops = localizer.corrected_path(), localizer._loops
+    middle = len(loops.keyframes) // 2
+    loops._leaps[middle] = np.array([2.0, 2.0, 0.05])
+    T = se2.between(loops.keyframes[2].T_map_base, loops.keyframes[-2].T_map_base)
+    loops.matched.append(Measured(2, len(loops.keyframes) - 2, T + [3.0, 0.0, 0.0], 100.0 * STEP, True))
+    assert np.hypot(*(localizer.corrected_path() - before)[:, :2].T).max() < 0.05
+
+
 def test_before_any_scan_there_is_no_path():
     assert Localizer().corrected_path().shape == (0, 3)
     assert Localizer().keyframes == []
 
 
 def test_a_loop_is_closed_while_the_robot_drives():
-    """Wheels that wear to one side: round the block the map has drifted; coming back, all of it is put right."""
+    """Wheels that wear as they go: round the block the map has drifted; coming back, all of it is put right."""
     # The first scan is made after the first step.
     localizer = Localizer(LocalizerConfig(start_x_m=3.15, start_y_m=1.2))
     rows, closed = [], []
@@ -189,12 +200,14 @@ def test_a_hall_that_is_wider_than_the_laser_sees_is_mapped_all_the_same(seed):
     round_it = along((36.5, 12), (36.5, 20), (3, 21), (3, 3))
     back = along((3, 3), (2, 2.5), (2, 12))
     localizer = Localizer(LocalizerConfig(start_x_m=2.0, start_y_m=2.0, start_yaw_rad=np.pi / 2.0))
-    blind, lost, off = 0, 0, []
+    blind, lost, off, turned = 0, 0, [], []
     for look in drive_along(simulation, [across, round_it, back], 0.5):
         estimate = localizer.step(look.scan, look.T_odom_base)
         sees = np.count_nonzero(look.scan.hit) > 30
         blind, lost = blind + (not sees), lost + (sees and estimate.lost)
         off.append(np.hypot(*se2.between(look.T_world_base, estimate.T_map_base)[:2]))
+        turned.append(abs(se2.between(look.T_world_base, estimate.T_map_base)[2]) if sees else 0.0)
     assert blind > 200
+    assert max(turned[len(turned) // 3 :]) < 0.03, 'beyond the hall its walls tell how the robot is turned'
     assert lost < 30, 'walls that are new are a map to hold on to'
     assert np.mean(off[-20:]) < 0.5 * max(off), 'what was known before puts it right'

@@ -49,6 +49,7 @@ _WITNESSES = 3  # matches of different keyframes that have to ask for the same c
 _LATELY = 8  # keyframes back to which they count
 _ALIKE_M, _ALIKE_RAD = 0.2, 0.06  # by how much they may differ
 _WORTH_M, _WORTH_RAD = 0.12, 0.04  # smaller corrections are left to the end
+_ASKED, _UNASKED_M = 2.0, 0.5  # what a single match may ask for: so many times what the witnesses do, and this
 _BUCKET_M = 4.0  # keyframes are listed by squares of this size
 _ENOUGH = 2  # keyframes that see about the same: from then on one of them stands for a new one
 _FRESH_M = 1.0  # so much way after a match that agrees, no other one is asked for
@@ -173,8 +174,9 @@ class Loops:
         self._keep()
         witnesses, self._witnesses = list(self._witnesses), deque(maxlen=_WITNESSES)
         before = self._poses()
-        after = self._relax(before)
-        asked, left = (max(_size(_off(poses[m.a], poses[m.b], m)) for m in witnesses) for poses in (before, after))
+        asked = _most_off(before, witnesses)
+        after = self._relax(before, asked)
+        left = _most_off(after, witnesses)
         if left > 0.5 * asked:
             # The graph does not bend so far: either these are wrong, or much else is. They do not count.
             self.matched = [m for m in self.matched if m not in witnesses]
@@ -275,15 +277,22 @@ class Loops:
         while self._jobs:
             self.work_off()
         self._keep()
-        return self._relax(self._poses())
+        return self._relax(self._poses(), 0.0)
 
-    def _relax(self, poses: Array) -> Array:
+    def _relax(self, poses: Array, asked: float) -> Array:
+        """Poses (N, 3) relaxed, where witnesses have asked for a correction of this size.
+
+        Of what bends easily, as where the robot came blindly, a single match that is wrong would make a loop. None
+        counts that asks for much more than the witnesses did.
+        """
+        most = _ASKED * asked + _UNASKED_M
+        matched = [m for m in self.matched if _size(_off(poses[m.a], poses[m.b], m)) <= most]
         usual, none = np.square(self._step_sigmas(poses)), np.zeros(3)
         steps = [
             Measured(a, b, step, np.diag(1.0 / (usual + np.square(self._leaps.get(b, none)))), False)
             for b, (a, step) in enumerate(self._steps, start=1)
         ]
-        return relax(poses, steps + self.matched)
+        return relax(poses, steps + matched)
 
     def _step_sigmas(self, poses: Array) -> Array:
         """How much a step adds to the drift, (3,), as told by what loops find after many steps.
@@ -394,6 +403,11 @@ class Loops:
             search=drift > _SEARCHED_M and not self.agreed,
             lost=True,  # drift is not what wheels do from scan to scan
         )
+
+
+def _most_off(poses: Array, matches: list[Measured]) -> float:
+    """By how much the match that poses (N, 3) suit least is off, m."""
+    return max(_size(_off(poses[m.a], poses[m.b], m)) for m in matches)
 
 
 def _size(off: Array) -> float:
