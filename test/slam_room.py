@@ -96,8 +96,20 @@ def corridor_ring() -> np.ndarray:
     return np.array(walls)
 
 
+def corridor(length_m: float) -> np.ndarray:
+    """Walls of a corridor of 2.4 m along x from the origin, with niches, open at its ends, (N, 4)."""
+    walls = []
+    for side in (-1.2, 1.2):
+        line = [(0.0, side)]
+        for x in np.arange(2.0 + 0.5 * side, length_m - 2.0, 4.0):
+            line += [(x, side), (x, 1.3 * side), (x + 0.9, 1.3 * side), (x + 0.9, side)]
+        line.append((length_m, side))
+        walls += [[*a, *b] for a, b in pairwise(line)]
+    return np.array(walls)
+
+
 def drive_round_the_block() -> Iterator[tuple[Scan, np.ndarray, np.ndarray]]:
-    """Scan, odometry and truth of a drive once round the corridor and on; the wheels wear to one side, and slip."""
+    """Scan, odometry and truth of a drive once round the corridor and on; the wheels wear as it goes, and slip."""
     rng, slips, walls = np.random.default_rng(5), np.random.default_rng(6), corridor_ring()
     truth, odom, number = np.array([3.0, 1.2, 0.0]), np.zeros(3), 0
     for goal in [(38.8, 1.2), (38.8, 18.8), (1.2, 18.8), (1.2, 1.2), (20.0, 1.2)]:
@@ -106,6 +118,7 @@ def drive_round_the_block() -> Iterator[tuple[Scan, np.ndarray, np.ndarray]]:
             step = np.array([0.15 if abs(turn) < 0.1 else 0.0, 0.0, turn])
             truth = se2.compose(truth, step)
             slip = slips.normal(0.0, 0.08)
-            odom = se2.compose(odom, step * [1.03, 1.0, 1.02] + [0.0, 0.0, 0.01 * step[0] + slip])
+            worn = 1.0 + 0.12 * min(number / 400.0, 1.0)
+            odom = se2.compose(odom, step * [worn, 1.0, 1.02] + [0.0, 0.0, 0.01 * step[0] + slip])
             yield scan_in(walls, truth, rng, 200_000_000 * number), odom, truth
             number += 1

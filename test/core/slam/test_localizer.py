@@ -98,7 +98,7 @@ def test_a_scan_of_nothing_leaves_the_odometry(value):
     _, before, odom = rows[-1]
     blind = Scan.create(0, np.full(181, value), -1.57, 0.0175, 0.05, 8.0)
     ahead = se2.pose(0.3, 0.0, 0.1)
-    expected, _ = deepcopy(localizer._calibration).corrected(ahead)
+    expected, _ = deepcopy(localizer._calibration).corrected(ahead, np.zeros(2))
     estimate = localizer.step(blind, se2.compose(odom, ahead))
     # What the odometry says, less what it was found to err by all the time.
     moved = se2.between(before.T_map_base, estimate.T_map_base)

@@ -8,6 +8,7 @@ from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
 
 # A metre is told as 1.04 m and 0.03 rad too much of turn, a radian is told as 1.05, the laser sits 1.5 deg askew.
 SCALE, DRIFT, TURN_SCALE, ASKEW = 1.04, 0.03, 1.05, 0.026
+NOISE, KNOWN = np.full(2, 2.5e-7), np.diag([1e6, 1e6, 1e6])  # of a step's wheels; what the map says of where it ends
 
 
 def driven(steps, seed=0, backwards=False):
@@ -26,8 +27,8 @@ def driven(steps, seed=0, backwards=False):
 def test_the_systematic_part_is_learned_and_taken_off(backwards):
     calibration, last, off = OdometryCalibration(), np.zeros(3), []
     for T, told in driven(600, backwards=backwards):
-        found, _ = calibration.corrected(told)
-        calibration.follow(T)
+        found, _ = calibration.corrected(told, NOISE)
+        calibration.follow(T, KNOWN)
         off.append(se2.between(se2.between(last, T), found))
         last = T
     late = np.mean(off[300:], axis=0)
@@ -38,8 +39,8 @@ def test_the_systematic_part_is_learned_and_taken_off(backwards):
 def test_what_is_left_to_know_shrinks_with_the_way():
     calibration, left = OdometryCalibration(), []
     for T, told in driven(300):
-        left.append(calibration.corrected(told)[1])
-        calibration.follow(T)
+        left.append(calibration.corrected(told, NOISE)[1])
+        calibration.follow(T, KNOWN)
     assert np.trace(left[-1]) < 0.1 * np.trace(left[0])
     assert np.linalg.eigvalsh(left[-1]).min() > -1e-12
 
@@ -47,8 +48,8 @@ def test_what_is_left_to_know_shrinks_with_the_way():
 def test_a_slip_is_not_learned():
     calibration, known = OdometryCalibration(), []
     for k, (T, told) in enumerate(driven(300)):
-        calibration.corrected(told + [0.5, 0.0, 0.4] if k == 250 else told)
-        calibration.follow(T)
+        calibration.corrected(told + [0.5, 0.0, 0.4] if k == 250 else told, NOISE)
+        calibration.follow(T, KNOWN)
         known.append(calibration.known)
     np.testing.assert_allclose(known[-1], known[249], atol=5e-3)
 
@@ -57,7 +58,20 @@ def test_across_an_interruption_nothing_is_compared():
     calibration = OdometryCalibration()
     known = calibration.known
     for k, (T, told) in enumerate(driven(100)):
-        calibration.corrected(told)
-        calibration.follow(T + [3.0 * k, 0.0, 0.0])
+        calibration.corrected(told, NOISE)
+        calibration.follow(T + [3.0 * k, 0.0, 0.0], KNOWN)
         calibration.interrupt()
     np.testing.assert_array_equal(calibration.known, known)
+
+
+def test_what_the_map_leaves_open_teaches_nothing():
+    """Along a corridor a scan is found where the wheels put it."""
+    calibration = OdometryCalibration()
+    for T, told in driven(300):
+        calibration.corrected(told, NOISE)
+        calibration.follow(T + [0.2 * T[0], 0.0, 0.0], np.diag([0.0, 1e6, 1e6]))
+    alone = OdometryCalibration()
+    for T, told in driven(300):
+        alone.corrected(told, NOISE)
+        alone.follow(T + [0.2 * T[0], 0.0, 0.0], KNOWN)
+    assert abs(calibration.known[0] - 1.0) < 0.2 * abs(alone.known[0] - 1.0)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.scan_matching import prior_weight
 
 _SAME_POINTS_M, _SAME_POINTS_RAD = 1.0, 1.0  # after so much way a match errs by other points than before
 
@@ -34,10 +35,11 @@ class Doubt:
         self.since_match = F_x @ self.since_match @ F_x.T + added
         self.on_map = F_x @ self.on_map @ F_x.T + added
 
-    def evidence(self, posterior: Array) -> Evidence:
-        """What speaks for a match with posterior (3, 3) whose prior was since_match."""
+    def evidence(self, posterior: Array, off: Array) -> Evidence:
+        """What speaks for a match with posterior (3, 3) whose prior was since_match, and which is off that by (3,)."""
         by_prior = np.asarray(np.linalg.inv(self.since_match), dtype=np.float64)
-        return Evidence(posterior, by_prior, _positive(np.linalg.inv(posterior) - by_prior))
+        held = prior_weight(float(off @ by_prior @ off))
+        return Evidence(posterior, held * by_prior, _positive(np.linalg.inv(posterior) - held * by_prior))
 
     def match(self, evidence: Evidence, increment: Array) -> Array:
         """A scan fits: what this step adds to the covariance of the pose in the world, (3, 3).

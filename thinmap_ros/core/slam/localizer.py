@@ -20,12 +20,19 @@ from thinmap_ros.core.slam.feature_map import FeatureConfig, FeatureMap
 from thinmap_ros.core.slam.features import LineFeature
 from thinmap_ros.core.slam.lines import LineConfig, Lines, extract_lines, no_lines
 from thinmap_ros.core.slam.loops import LEAP_SIGMAS, Correction, Keyframe, LoopConfig, Loops
-from thinmap_ros.core.slam.models import MotionConfig, motion_jacobians, odometry_covariance, rotation
+from thinmap_ros.core.slam.models import (
+    MotionConfig,
+    motion_jacobians,
+    odometry_covariance,
+    odometry_variances,
+    rotation,
+)
 from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
 from thinmap_ros.core.slam.odometry_noise import OdometryNoise
 from thinmap_ros.core.slam.redrawn_map import RedrawnMap
 from thinmap_ros.core.slam.scan_matching import FEWEST_POINTS, Match, MatchConfig
 from thinmap_ros.core.slam.tracking import SEEN_AGAIN, Tracking, share_seen_again
+from thinmap_ros.core.slam.wall_compass import WallCompass
 from thinmap_ros.core.topology.graph import TopologicalMap
 
 _START_SIGMAS = (1e-4, 1e-4, 1e-4)  # the map begins where the robot stands: no doubt, but not singular
@@ -39,6 +46,9 @@ _OF_LATE_M = 100.0  # way in which the drift stays below what a match with the m
 # By which lines may move the pose even where matches leave nothing open, m and rad, 1 sigma.
 _LEEWAY = np.diag(np.square([0.003, 0.003, 0.001]))
 _UNKNOWN_SIGMA_M = 300.0  # what a pose is known to while the robot is lost
+_TELLING_POINTS = 40  # where a scan has fewer, as in a wide hall, its contradiction is no proof of anything
+_UNTURNED_RAD = 0.03  # doubt of the heading (1 sigma) with which nothing is drawn while walls may tell it soon
+_USUAL_NOISE = 0.1  # share of the variances allowed for that wheels mostly have
 _LOST_SIGMA_M = 1.0  # doubt since a scan last fitted; far from the start, more than this is no reason to be lost
 
 
@@ -61,6 +71,9 @@ class LocalizerConfig(MotionConfig, MatchConfig, LineConfig, FeatureConfig, Loop
     start_yaw_rad: float = parameter(0.0, 'heading at the start, rad')
     look_distance_m: float = parameter(0.3, 'the map learns after so much way, m', low=0.0, high=5.0)
     look_turn_rad: float = parameter(0.2, 'or after such a turn, rad', low=0.0, high=3.0)
+    square_walls: bool = parameter(
+        True, 'hold the heading to the direction of the walls, where most stand parallel or square to each other'
+    )
     mapping: bool = parameter(True, 'learn what is seen; false: only find the place in the map that there is')
     lost_scans: int = parameter(5, 'lost after so many scans in a row that do not fit', low=1, high=1000)
 
@@ -111,10 +124,12 @@ class Localizer:
         self._T_odom_base: Array | None = None
         self._calibration = OdometryCalibration()
         self._noise = OdometryNoise(self.config)
+        self._by_map = np.zeros((3, 3))  # information of the last match that was good, as the map alone tells it
         self._T_last_look: Array | None = None
         self._points_last_look: Array = np.empty((0, 2))
         # Share of that look's points which the map then knew; walls that are far off take several looks.
         self._known_here = 0.0
+        self._compass = WallCompass()
         self._doubt = Doubt()
         self._blind: Array = np.zeros(3)  # doubt since the last look, where scans told nothing
         self._placed_by_hand = False
@@ -180,13 +195,14 @@ class Localizer:
         points.way_m = way_m
         # Until it is known that old and new agree here, a scan is matched with what was seen of late.
         points.since_m = -math.inf if self._loops.agreed else way_m - _OF_LATE_M
-        match = self._predict(scan, points_base, laser_base, increment, increment_covariance)
-        lines, matched = no_lines(), 0
-        if self.config.mapping and self._has_news() and not self._is_unplaced():
+        looks, matched = self.config.mapping and self._has_news(expected), 0
+        lines = self._lines(scan) if looks else no_lines()
+        match = self._predict(scan, lines, points_base, laser_base, increment, increment_covariance)
+        if looks and not self._is_unplaced():
             laser_map = se2.transform_points(self._ekf.pose, laser_base[None])[0]
-            lines, matched = self._correct(scan)
-            seen = len(points_base) >= FEWEST_POINTS
-            if match.good or (seen and self._on_new_ground(match, scan, self._ekf.pose)):
+            matched = self._correct(lines, scan)
+            if match.good or (self._on_new_ground(match, scan, self._ekf.pose) and self._may_draw(points_base, scan)):
+                self._compass.learn(lines, float(self._ekf.pose[2]), way_m)
                 points_map = se2.transform_points(self._ekf.pose, points_base)
                 self._map.matcher.add(points_map, laser_map)
                 self._known_here = self._map.matcher.known(points_base, laser_base, self._ekf.pose)
@@ -200,7 +216,7 @@ class Localizer:
         self._loops.work_off()
         correction = self._loops.close()
         if match.good:
-            self._calibration.follow(self._ekf.pose)
+            self._calibration.follow(self._ekf.pose, self._by_map)
         if correction is not None:
             self._apply(correction, points_base)
             self._calibration.interrupt()
@@ -244,7 +260,8 @@ class Localizer:
         if not se2.is_finite(T_odom_base) or math.hypot(increment[0], increment[1]) > _LONGEST_STEP_M:
             self.refused += 1
             increment = np.zeros(3)
-        increment, systematic = self._calibration.corrected(increment)
+        variances = _USUAL_NOISE * odometry_variances(increment, self.config)
+        increment, systematic = self._calibration.corrected(increment, variances)
         self._noise.move(increment)
         return increment, odometry_covariance(increment, self.config, self._noise.share) + systematic
 
@@ -257,7 +274,7 @@ class Localizer:
         return np.ascontiguousarray(scan.points_base()[near]), np.ascontiguousarray(scan.T_base_laser[:2])
 
     def _predict(
-        self, scan: Scan, points_base: Array, laser_base: Array, increment: Array, covariance: Array
+        self, scan: Scan, lines: Lines, points_base: Array, laser_base: Array, increment: Array, covariance: Array
     ) -> Match:
         """Eqs. (10), (11): the increment is the odometry's, or where the scan fits the map, that of the match."""
         pose = self._ekf.pose
@@ -266,16 +283,21 @@ class Localizer:
         F, _ = motion_jacobians(pose, increment)
         self._blind = np.maximum(self._blind, _blind(self._doubt.since_match, self._noise))
         self._doubt.move(F, turn @ covariance @ turn.T)
+        if self.config.square_walls and len(lines) and not self._is_unplaced():
+            predicted = self._turned_by_walls(lines, predicted)
+            increment = se2.between(pose, predicted)
         match = self._map.matcher.match(
             points_base, laser_base, predicted, self._doubt.since_match, lost=self._tracking.lost
         )
         near = not self._moved(_KNOWN_M, _KNOWN_RAD, match.T_map_base)
         match = self._tracking.judged(match, points_base, scan, increment, near)
-        if len(points_base) >= FEWEST_POINTS:  # fewer fit nothing, and contradict nothing
+        if match.good or len(points_base) >= _TELLING_POINTS:
             self._tracking.count(match.good, self._on_new_ground(match, scan, predicted))
         if match.good:
-            evidence = self._doubt.evidence(match.covariance)
-            self._noise.learn(se2.off(match.T_map_base, predicted), evidence, float(predicted[2]))
+            off = se2.off(match.T_map_base, predicted)
+            evidence = self._doubt.evidence(match.covariance, off)
+            self._noise.learn(off, evidence, float(predicted[2]))
+            self._by_map = evidence.by_map
             match = self._taken_back(match, predicted, evidence)
             added = self._doubt.match(evidence, increment)
             increment, covariance = se2.between(pose, match.T_map_base), turn.T @ added @ turn
@@ -286,6 +308,17 @@ class Localizer:
         else:
             self._ekf.predict(predicted, increment, covariance)
         return match
+
+    def _turned_by_walls(self, lines: Lines, predicted: Array) -> Array:
+        """A pose (3,), and the doubt of it, after the lines of the scan have told what they know of the heading."""
+        P = self._doubt.since_match
+        told = self._compass.read(lines, float(predicted[2]), float(P[2, 2]))
+        if told is None:
+            return predicted
+        gain = P[:, 2] / (P[2, 2] + told.variance)
+        self._doubt.since_match = P - np.outer(gain, P[2])
+        self._blind[2] = min(self._blind[2], math.sqrt(self._doubt.since_match[2, 2]))
+        return se2.pose(*(predicted + gain * (told.yaw - predicted[2])).tolist())
 
     def _taken_back(self, match: Match, predicted: Array, evidence: Evidence) -> Match:
         """A match that takes back what lines did to the pose takes it back whole, in features and open directions, too.
@@ -301,18 +334,31 @@ class Localizer:
         T_map_base[2] = se2.wrap(float(T_map_base[2]))
         return replace(match, T_map_base=T_map_base)
 
-    def _correct(self, scan: Scan) -> tuple[Lines, int]:
+    def _lines(self, scan: Scan) -> Lines:
+        """Lines of a scan, in the robot frame."""
+        wanted = (self.config.slam != 'off' or self.config.square_walls) and se2.is_finite(scan.T_base_laser)
+        return extract_lines(scan, self.config) if wanted else no_lines()
+
+    def _correct(self, lines: Lines, scan: Scan) -> int:
         """Eqs. (6)-(9) with the lines of the scan; how many of them were known."""
         if self.config.slam == 'off' or not se2.is_finite(scan.T_base_laser):
-            return no_lines(), 0
-        lines = extract_lines(scan, self.config)
+            return 0
         matched, taken = self._feature_map.observe(self._filter, lines, scan, self._doubt.on_map + _LEEWAY)
         self.refused += not taken
-        return lines, matched
+        return matched
 
-    def _has_news(self) -> bool:
+    def _has_news(self, T_map_base: Array) -> bool:
         """Whether the robot has moved since it last learned: looks from one place err alike, and prove nothing anew."""
-        return self._moved(self.config.look_distance_m, self.config.look_turn_rad)
+        return self._moved(self.config.look_distance_m, self.config.look_turn_rad, T_map_base)
+
+    def _may_draw(self, points_base: Array, scan: Scan) -> bool:
+        """Whether a scan on new ground is taken into the map: not a first glance after a turn that is hardly known.
+
+        What is drawn askew there keeps all that follows askew, and more of the walls soon tells the heading.
+        """
+        unturned = self._doubt.since_match[2, 2] > _UNTURNED_RAD**2 and self._compass.direction is not None
+        few = 3 * len(points_base) < scan.ranges_m.size
+        return len(points_base) >= FEWEST_POINTS and not (unturned and few and self.config.square_walls)
 
     def _on_new_ground(self, match: Match, scan: Scan, T_map_base: Array) -> bool:
         """Whether a scan that lies on little that is known can be explained by where the robot has come to, (3,).

@@ -13,11 +13,13 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.models import rotation
 
-_PRIOR_SIGMAS = (0.05, 0.1, 0.1, 0.05)  # of what is known before the first span
+_PRIOR_SIGMAS = (0.05, 0.05, 0.1, 0.05)  # of what is known before the first span
 _WANDER_SIGMAS = (0.001, 0.001, 0.001, 0.0002)  # in a metre or radian: floors and loads change
 _SPAN_M, _SPAN_RAD = 1.0, 1.0  # what is compared: long enough for the doubt of its two ends to be small beside it
-_SIGMA_M, _SIGMA_RAD = 0.02, 0.02  # of a span: of its ends, and of what the wheels err by on it at random
+_SIGMA_M, _SIGMA_RAD = 0.02, 0.02  # of a span, besides the doubt of its ends and of the wheels: matches err together
+_LEAST_INFORMATION = (1e-2, 1e-2, 1e-2)  # for what the map leaves open, as along a corridor
 _GATE_SIGMAS = 4.0  # what is farther off has slipped
 
 
@@ -29,15 +31,20 @@ class OdometryCalibration:
         self.known = np.array([1.0, 0.0, 1.0, 0.0])
         self._covariance = np.diag(np.square(_PRIOR_SIGMAS))
         self._begin: Array | None = None
+        self._doubt: Array = np.zeros((3, 3))  # of where a span begins, map frame
         self.interrupt()
 
     def interrupt(self) -> None:
         """Compare nothing across this moment: the pose was not found but put, moved or lost."""
         self._begin, self._expected = None, np.zeros(3)
         self._way_m = self._turned_rad = 0.0
+        self._random = np.zeros(2)
 
-    def corrected(self, increment: Array) -> tuple[Array, Array]:
-        """An increment (3,) of odometry, robot frame, without its systematic error, and what is left of that (3, 3)."""
+    def corrected(self, increment: Array, variances: Array) -> tuple[Array, Array]:
+        """An increment (3,) of odometry, robot frame, without its systematic error, and what is left of that (3, 3).
+
+        variances (2,): of its chord, m^2, and of its turn, rad^2, by what it errs by at random.
+        """
         way, turned = _way(increment), float(increment[2])
         scale, drift, turn_scale, askew = self.known
         turn = turn_scale * turned + drift * way
@@ -46,6 +53,7 @@ class OdometryCalibration:
         x, y = c * increment[0] - s * increment[1], s * increment[0] + c * increment[1]
         self._way_m += way
         self._turned_rad += turned
+        self._random = self._random + variances
         found = np.array([x, y, turn])
         self._expected = se2.compose(self._expected, found)
         G = np.array(
@@ -57,34 +65,49 @@ class OdometryCalibration:
         )
         return found, G @ self._covariance @ G.T
 
-    def follow(self, T_map_base: Array) -> None:
-        """Hear where the robot was found (3,) after the increments so far."""
-        if self._begin is not None:
-            if abs(self._way_m) < _SPAN_M and abs(self._turned_rad) < _SPAN_RAD:
-                return
-            self._learn(se2.between(self._begin, T_map_base))
-        self.interrupt()
-        self._begin = T_map_base
+    def follow(self, T_map_base: Array, by_map: Array) -> None:
+        """Hear where the robot was found (3,) after the increments so far, with what information (3, 3), map frame.
 
-    def _learn(self, found: Array) -> None:
-        """Kalman updates with a span's turn, and with its length along where it was expected to lead."""
+        Of this only what the map has said: what the wheels themselves said proves nothing about them.
+        """
+        if self._begin is not None and abs(self._way_m) < _SPAN_M and abs(self._turned_rad) < _SPAN_RAD:
+            return
+        doubt: Array = np.linalg.inv(by_map + np.diag(_LEAST_INFORMATION)).astype(np.float64)
+        if self._begin is not None:
+            turn = rotation(float(self._begin[2]))
+            self._learn(se2.between(self._begin, T_map_base), turn.T @ (doubt + self._doubt) @ turn)
+        self.interrupt()
+        self._begin, self._doubt = T_map_base, doubt
+
+    def _learn(self, found: Array, doubt: Array) -> None:
+        """Kalman updates with a span's turn, and with its length along where it was expected to lead.
+
+        found (3,), doubt (3, 3): of the span's end, seen from its beginning.
+        """
         moved = abs(self._way_m) + abs(self._turned_rad)
         self._covariance += np.diag(np.square(_WANDER_SIGMAS)) * moved
         off_turn = float(se2.wrap(float(found[2] - self._expected[2])))
-        self._update(off_turn, np.array([0.0, self._way_m, self._turned_rad, 0.0]), _SIGMA_RAD)
+        variance = _SIGMA_RAD**2 + self._random[1] + float(doubt[2, 2])
+        self._update(off_turn, np.array([0.0, self._way_m, self._turned_rad, 0.0]), variance)
         length = math.hypot(self._expected[0], self._expected[1])
         if length > 0.5 * _SPAN_M:
             x, y = self._expected[:2] / length
             dx, dy = found[:2] - self._expected[:2]
-            self._update(x * dx + y * dy, np.array([length / self.known[0], 0.0, 0.0, 0.0]), _SIGMA_M)
+            along, across = np.array([x, y]), np.array([-y, x])
+            variance = _SIGMA_M**2 + self._random[0] + float(along @ doubt[:2, :2] @ along)
+            self._update(x * dx + y * dy, np.array([length / self.known[0], 0.0, 0.0, 0.0]), variance)
             # Half of what it turned too far has led it aside as well.
             aside = x * dy - y * dx - 0.5 * length * off_turn
-            self._update(aside, np.array([0.0, 0.0, 0.0, length]), _SIGMA_M)
+            variance = _SIGMA_M**2 + 0.25 * length**2 * self._random[1] + float(across @ doubt[:2, :2] @ across)
+            self._update(aside, np.array([0.0, 0.0, 0.0, length]), variance)
 
-    def _update(self, off: float, H: Array, sigma: float) -> None:
-        """One scalar update of what is known; what is too far off to be systematic is left out."""
+    def _update(self, off: float, H: Array, noise: float) -> None:
+        """One scalar update of what is known; what is too far off to be systematic is left out.
+
+        noise: variance of off.
+        """
         along = self._covariance @ H
-        variance = float(H @ along) + sigma * sigma
+        variance = float(H @ along) + noise
         if off * off > _GATE_SIGMAS**2 * variance:
             return
         gain = along / variance

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.grid.tiles import NO_TILE, TILE
-from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.point_map import (
     CENTRE_X,
@@ -266,6 +266,12 @@ def _nearest(
     return int(best_at)
 
 
+@inlined
+def prior_weight(squared: float) -> float:
+    """What a prior counts at a pose so many sigmas off, squared: the less the farther, as wheels slip."""
+    return 1.0 / (1.0 + squared / (_SLIPS * _SLIPS))
+
+
 @kernel
 def _prior_terms(
     pose: Array, prior: Array, prior_information: Array, information: Array, gradient: Array
@@ -279,7 +285,7 @@ def _prior_terms(
         for b in range(3):
             gradient[a] += prior_information[a, b] * off[b]
         squared += off[a] * gradient[a]
-    weight = 1.0 / (1.0 + squared / (_SLIPS * _SLIPS))
+    weight = prior_weight(squared)
     for a in range(3):
         gradient[a] *= weight
         for b in range(3):
