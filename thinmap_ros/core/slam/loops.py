@@ -26,10 +26,12 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.anchors import AnchoredPoses
 from thinmap_ros.core.slam.models import rotation
+from thinmap_ros.core.slam.point_map import PointMap
 from thinmap_ros.core.slam.pose_graph import Measured, relax
 from thinmap_ros.core.slam.scan_matching import Match, MatchConfig, ScanMatcher
 
 _AROUND = 4  # keyframes to either side that make a submap
+_TOGETHER = 3  # keyframes in a row that share one
 _AGAIN_M = 8.0  # so much way lies between leaving a place and coming back to it
 _VISITS = 3  # earlier visits to a place with which a scan is matched, at most
 _TURN_M_RAD = 1.0  # a radian of turn makes two scans as different as so many metres
@@ -113,6 +115,7 @@ class Loops:
         self._witnesses: deque[Measured] = deque(maxlen=_WITNESSES)
         self._agreed_at_m = -math.inf
         self._places = Buckets(_BUCKET_M)  # of the keyframes
+        self._drawn: tuple[int, range, PointMap] | None = None  # the last submap: its middle, of which keyframes
 
     def follow(self, scan: Scan, points_base: Array, T_map_base: Array, doubt: Array, news: bool) -> None:
         """Take in a scan that fits the map at a pose (3,), with its points (N, 2).
@@ -184,7 +187,7 @@ class Loops:
         self.keyframes = [replace(f, T_map_base=T) for f, T in zip(self.keyframes, after, strict=True)]
         for k, (x, y, _) in enumerate(after.tolist()):
             self._places.put(k, x, y)
-        self._here = self._path.poses(after)[-1]
+        self._here, self._drawn = self._path.poses(after)[-1], None
         for measured in witnesses:
             self._know(measured)
         self._agreed_at_m = self._way_m
@@ -385,24 +388,40 @@ class Loops:
 
     def _match(self, j: int, k: int) -> Match:
         """Keyframe k matched with j and those around it, in the frame of j."""
-        base, here = self.keyframes[j].T_map_base, self._frame(k)
+        here, (middle, points) = self._frame(k), self._submap(j, k)
+        base = self.keyframes[middle].T_map_base
         drift, turn = (float(each[0]) for each in self._drift([j], here))
         search_m = self._matching.search_m + drift
         search_deg = min(_SEARCH_DEG + math.degrees(turn), _WIDEST_SEARCH_DEG)
-        matcher = ScanMatcher(replace(self._matching, search_m=search_m, search_deg=search_deg))
-        for frame in self.keyframes[max(0, j - _AROUND) : min(j + _AROUND + 1, k)]:
-            T = se2.between(base, frame.T_map_base)
-            laser = se2.transform_points(T, frame.scan.T_base_laser[None, :2])[0]
-            matcher.add(se2.transform_points(T, frame.points_base), laser)
-        prior = se2.between(base, here.T_map_base)
-        return matcher.match(
+        matcher = ScanMatcher(replace(self._matching, search_m=search_m, search_deg=search_deg), points)
+        match = matcher.match(
             here.points_base,
             np.ascontiguousarray(here.scan.T_base_laser[:2]),
-            prior,
+            se2.between(base, here.T_map_base),
             np.diag(np.square(_PRIOR_SIGMAS) + [drift**2, drift**2, turn**2]),
             search=drift > _SEARCHED_M and not self.agreed,
             lost=True,  # drift is not what wheels do from scan to scan
         )
+        T_j_middle = se2.between(self.keyframes[j].T_map_base, base)
+        R = rotation(float(T_j_middle[2]))
+        found = se2.compose(T_j_middle, match.T_map_base)
+        return replace(match, T_map_base=found, covariance=R @ match.covariance @ R.T)
+
+    def _submap(self, j: int, k: int) -> tuple[int, PointMap]:
+        """The middle one of the keyframes around j and before k, and what they saw, in its frame.
+
+        The last one is kept: to draw it takes most of a match, and the next one is mostly of the same.
+        """
+        middle = min(j - j % _TOGETHER + _TOGETHER // 2, len(self.keyframes) - 1)
+        numbers = range(max(0, middle - _AROUND), min(middle + _AROUND + 1, k, len(self.keyframes)))
+        if self._drawn is None or self._drawn[:2] != (middle, numbers):
+            matcher, base = ScanMatcher(self._matching), self.keyframes[middle].T_map_base
+            for frame in (self.keyframes[i] for i in numbers):
+                T = se2.between(base, frame.T_map_base)
+                laser = se2.transform_points(T, frame.scan.T_base_laser[None, :2])[0]
+                matcher.add(se2.transform_points(T, frame.points_base), laser)
+            self._drawn = (middle, numbers, matcher.map)
+        return middle, self._drawn[2]
 
 
 def _most_off(poses: Array, matches: list[Measured]) -> float:

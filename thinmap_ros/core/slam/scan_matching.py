@@ -86,9 +86,10 @@ class Match:
 class ScanMatcher:
     """Keeps the map of points, and finds the pose at which a scan fits it."""
 
-    def __init__(self, config: MatchConfig) -> None:
+    def __init__(self, config: MatchConfig, points: PointMap | None = None) -> None:
+        """points: the map to match with; an empty one where none is given."""
         self.config = config
-        self.map = PointMap(config.match_cell_m, config.match_memory)
+        self.map = points or PointMap(config.match_cell_m, config.match_memory)
 
     def add(self, points_map: Array, seen_from: Array) -> None:
         """Take points (N, 2) seen from a place (2,) into the map, map frame."""
