@@ -63,6 +63,7 @@ def _verdicts(reports: list[Report]) -> list[str]:
     if ours and not lines:
         count = f'{len(ours)} of {len(ours)}'
         lines = [f'{OURS}: {count} stopped by itself, with {_FULL_COVERAGE:.0%} or more, without contact.']
+    lines += [_pose_error(report) for report in ours.values() if report['options']['localization'] != 'truth']
     if ours:
         rest = sum(_after(report, _NEARLY_ALL) for report in ours.values()) / len(ours)
         lines.append(f'After {_NEARLY_ALL:.1%} were seen, {OURS} drove {rest:.1%} of its way (mean).')
@@ -91,6 +92,10 @@ def _fault(report: Report) -> str:
         f'**{report["world"]}, start {report["start_number"]}**: {report["reason"]}; '
         f'coverage {report["coverage"]:.2%}, {report["collisions"]} contacts.'
     )
+
+
+def _pose_error(report: Report) -> str:
+    return f'{report["world"]}, start {report["start_number"]}: pose error {report["pose_rmse"]:.3f} m (rms).'
 
 
 def main() -> None:
