@@ -46,7 +46,7 @@ _OF_LATE_M = 100.0  # way in which the drift stays below what a match with the m
 # By which lines may move the pose even where matches leave nothing open, m and rad, 1 sigma.
 _LEEWAY = np.diag(np.square([0.003, 0.003, 0.001]))
 _UNKNOWN_SIGMA_M = 300.0  # what a pose is known to while the robot is lost
-_TELLING_POINTS = 40  # where a scan has fewer, as in a wide hall, its contradiction is no proof of anything
+_TELLING_POINTS = 40  # where fewer beams hit, and not half of them, as in a wide hall, a contradiction proves nothing
 _UNTURNED_RAD = 0.03  # doubt of the heading (1 sigma) with which nothing is drawn while walls may tell it soon
 _USUAL_NOISE = 0.1  # share of the variances allowed for that wheels mostly have
 _LOST_SIGMA_M = 1.0  # doubt since a scan last fitted; far from the start, more than this is no reason to be lost
@@ -291,7 +291,8 @@ class Localizer:
         )
         near = not self._moved(_KNOWN_M, _KNOWN_RAD, match.T_map_base)
         match = self._tracking.judged(match, points_base, scan, increment, near)
-        if match.good or len(points_base) >= _TELLING_POINTS:
+        enough = max(FEWEST_POINTS, min(_TELLING_POINTS, scan.ranges_m.size // 2))
+        if match.good or len(points_base) >= enough:
             self._tracking.count(match.good, self._on_new_ground(match, scan, predicted))
         if match.good:
             off = se2.off(match.T_map_base, predicted)
