@@ -170,3 +170,18 @@ def test_an_end_node_that_comes_no_nearer_counts_as_visited() -> None:
     assert targets[:30] == [2.0] * 30
     assert targets[40:60] == [14.0] * 20
     assert targets[-1] not in (2.0, 14.0), 'frontiers that are left'
+
+
+def test_who_drives_along_the_graph_goes_back_where_it_came_through() -> None:
+    """A passage of two cells: too narrow on the map for the others, once it is behind."""
+    cells = corridor()
+    cells[:, 60:62] = 100
+    cells[39:41, 60:62] = 0
+    far, passage = np.array([8.0, 4.0, 0.0]), [np.array([x, 4.0, 0.0]) for x in np.arange(4.0, 8.0, 0.1)]
+    middles = {}
+    for strategy in (NearestFrontier(), VisitAllEndNodes()):
+        for pose in passage:
+            after_a_look(strategy, cells, pose)
+        middles[type(strategy)] = [frontier.middle[0] for frontier in after_a_look(strategy, cells, far)]
+    assert min(middles[NearestFrontier]) > 6.2
+    assert min(middles[VisitAllEndNodes]) < 1.0

@@ -224,6 +224,7 @@ class VisitAllEndNodes(NearestFrontier):
 
     def __init__(self) -> None:
         super().__init__()
+        self.map = FrontierMap(goes_back=True)  # the graph has led it where the others do not go
         self._patience = _Patience(self.progress_timeout_s)
         self._visited: list[tuple[float, float]] = []
         self._end_node: Array | None = None  # the goal (3,) there

@@ -11,11 +11,13 @@ from thinmap_ros.core.exploration.open_borders import OpenBorders
 from thinmap_ros.core.exploration.views import box_of_scan, directions_of_view
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.grid_search import coarse, ways_from
-from thinmap_ros.core.planning.reach import places_in_reach
+from thinmap_ros.core.planning.reach import let_out, reached_from, standing_places
+from thinmap_ros.core.planning.trail import Trail
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
 Cells = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 RADIUS_M = 0.25
 SHORTEST_M = 0.5
 _REACH_M = 3.0
@@ -46,15 +48,19 @@ class Frontier:
 class FrontierMap:
     """The frontiers of the map as it grows; those that were looked at closely and stayed do not count any more."""
 
-    def __init__(self) -> None:
+    def __init__(self, goes_back: bool = False) -> None:
+        """goes_back: where the robot came it can go back, also through passages that look too narrow on the map."""
         self.borders = OpenBorders(SHORTEST_M)
+        self._trail = Trail() if goes_back else None
         self.patch: GridPatch | None = None
-        self._ways = np.zeros((0, 0), dtype=np.bool_)
+        self._ways: Mask = np.zeros((0, 0), dtype=np.bool_)
 
     def update(self, patch: GridPatch, scan: Scan, T_map_base: Array) -> None:
         """Take in the map after a scan made at a pose (3,)."""
         self.patch = patch
         xy = (float(T_map_base[0]), float(T_map_base[1]))
+        if self._trail is not None:
+            self._trail.add(T_map_base)
         self.borders.update(patch, box_of_scan(scan, T_map_base))
         self.borders.examine(xy, _CLOSE_LOOK_M, directions_of_view(scan, T_map_base))
 
@@ -68,10 +74,12 @@ class FrontierMap:
         frame = self.borders.frame
         cells, numbers, _ = self.borders.stretches()
         xy = (float(T_map_base[0]), float(T_map_base[1]))
-        reached = places_in_reach(self.borders.free, frame, xy, RADIUS_M, _ESCAPE_M)
+        standing = standing_places(self.borders.free, RADIUS_M, frame.resolution)
+        reach = self._reach_from(standing, xy)
         if len(cells) == 0:
             return []
-        self._ways = coarse(reached, _COARSE)
+        reached = reach & standing
+        self._ways = coarse(reach, _COARSE)
         stretches = [cells[numbers == number] for number in np.unique(numbers)]
         places = [self.borders.place_to_look(stretch, reached, _REACH_M, xy) for stretch in stretches]
         found = [(s, p) for s, p in zip(stretches, places, strict=True) if p is not None]
@@ -80,6 +88,20 @@ class FrontierMap:
             Frontier(s, self._middle(s), p, float(way))
             for (s, p), way in zip(found, ways, strict=True) if math.isfinite(way)
         ]
+
+    def _reach_from(self, standing: Mask, xy: tuple[float, float]) -> Mask:
+        """Cells (H, W) to which the robot can get from a point (m)."""
+        free, frame = self.borders.free, self.borders.frame
+        row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
+        if not (0 <= row < free.shape[0] and 0 <= col < free.shape[1]):
+            return np.zeros_like(standing)
+        ways = let_out(standing, free, frame, xy, _ESCAPE_M)
+        if self._trail is None:
+            return reached_from(ways, (row, col)) & standing
+        trail = self._trail.cells(frame, ways.shape)
+        ways = ways.copy()
+        ways[trail[:, 0], trail[:, 1]] |= free[trail[:, 0], trail[:, 1]]
+        return reached_from(ways, (row, col))
 
     def ways(self, xy: Array, places: Array) -> Array:
         """Length, m, of the ways from a point (2,) to places (N, 2) that `find` has found, (N,)."""

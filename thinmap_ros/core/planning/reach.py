@@ -32,15 +32,6 @@ def renew_standing(standing: Mask, free: Mask, part: Part, radius_m: float, reso
     renewed[:] = found[row : row + renewed.shape[0], col : col + renewed.shape[1]]
 
 
-def places_in_reach(free: Mask, frame: GridFrame, xy: tuple[float, float], radius_m: float, escape_m: float) -> Mask:
-    """Standing places (H, W) to which a robot of a radius can get from a point (m); see `let_out`."""
-    standing = standing_places(free, radius_m, frame.resolution)
-    ways = let_out(standing, free, frame, xy, escape_m)
-    row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
-    inside = 0 <= row < free.shape[0] and 0 <= col < free.shape[1]
-    return reached_from(ways, (row, col)) & standing if inside else np.zeros_like(standing)
-
-
 def let_out(standing: Mask, free: Mask, frame: GridFrame, xy: tuple[float, float], escape_m: float) -> Mask:
     """Cells (H, W) over which a robot that is at a point (m) may go.
 
