@@ -95,13 +95,10 @@ class FrontierMap:
         row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
         if not (0 <= row < free.shape[0] and 0 <= col < free.shape[1]):
             return np.zeros_like(standing)
-        ways = let_out(standing, free, frame, xy, _ESCAPE_M)
         if self._trail is None:
-            return reached_from(ways, (row, col)) & standing
-        trail = self._trail.cells(frame, ways.shape)
-        ways = ways.copy()
-        ways[trail[:, 0], trail[:, 1]] |= free[trail[:, 0], trail[:, 1]]
-        return reached_from(ways, (row, col))
+            return reached_from(let_out(standing, free, frame, xy, _ESCAPE_M), (row, col)) & standing
+        trail = self._trail.cells(frame, free.shape)
+        return reached_from(let_out(standing, free, frame, xy, _ESCAPE_M, trail), (row, col))
 
     def ways(self, xy: Array, places: Array) -> Array:
         """Length, m, of the ways from a point (2,) to places (N, 2) that `find` has found, (N,)."""

@@ -185,9 +185,7 @@ class Surveyor:
     def _look_around(self, T_map_base: Array) -> None:
         self._renew_standing()
         free, standing, xy = self.borders.free, self._standing, (float(T_map_base[0]), float(T_map_base[1]))
-        ways = let_out(standing, free, self.frame, xy, _ESCAPE_M).copy()
-        trail = self.trail.cells(self.frame, ways.shape)
-        ways[trail[:, 0], trail[:, 1]] |= free[trail[:, 0], trail[:, 1]]
+        ways = let_out(standing, free, self.frame, xy, _ESCAPE_M, self.trail.cells(self.frame, free.shape))
         row, col = (int(v) for v in self.frame.cells_of(T_map_base[None, :2])[0])
         self.ways = field_from(coarse(ways, SQUARE), (row // SQUARE, col // SQUARE))
         self.reached = fine(np.isfinite(self.ways), SQUARE, standing)

@@ -11,6 +11,7 @@ from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.topology.free_space import column_distance, standing_room
 
 Mask = NDArray[np.bool_]
+Cells = NDArray[np.int64]
 # Rows and columns of cells: first row, first column, row after the last, column after the last.
 Part = tuple[int, int, int, int]
 
@@ -32,16 +33,20 @@ def renew_standing(standing: Mask, free: Mask, part: Part, radius_m: float, reso
     renewed[:] = found[row : row + renewed.shape[0], col : col + renewed.shape[1]]
 
 
-def let_out(standing: Mask, free: Mask, frame: GridFrame, xy: tuple[float, float], escape_m: float) -> Mask:
+def let_out(
+    standing: Mask, free: Mask, frame: GridFrame, xy: tuple[float, float], escape_m: float, trail: Cells | None = None
+) -> Mask:
     """Cells (H, W) over which a robot that is at a point (m) may go.
 
     These are its standing places, but where it stands too near to something it is let out over free cells up to
-    escape_m away, as a path would.
+    escape_m away, as a path would. trail: cells (N, 2) over which it came; over those that are free it can go back.
     """
+    ways = standing.copy()
+    if trail is not None:
+        ways[trail[:, 0], trail[:, 1]] |= free[trail[:, 0], trail[:, 1]]
     row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
     if not (0 <= row < free.shape[0] and 0 <= col < free.shape[1]) or standing[row, col]:
-        return standing
-    ways = standing.copy()
+        return ways
     part, within = disc(ways, (row, col), escape_m / frame.resolution)
     ways[part] |= within & free[part]
     ways[row, col] = True

@@ -413,7 +413,7 @@ class Loops:
         The last one is kept: to draw it takes most of a match, and the next one is mostly of the same.
         """
         middle = min(j - j % _TOGETHER + _TOGETHER // 2, len(self.keyframes) - 1)
-        numbers = range(max(0, middle - _AROUND), min(middle + _AROUND + 1, k, len(self.keyframes)))
+        numbers = range(max(0, middle - _AROUND), min(middle + _AROUND + 1, k))
         if self._drawn is None or self._drawn[:2] != (middle, numbers):
             matcher, base = ScanMatcher(self._matching), self.keyframes[middle].T_map_base
             for frame in (self.keyframes[i] for i in numbers):

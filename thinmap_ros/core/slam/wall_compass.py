@@ -38,7 +38,7 @@ class WallCompass:
     """Metres of wall by their direction in the map, and what the walls of a scan say of the heading."""
 
     def __init__(self) -> None:
-        # By direction: metres of wall, each with its weight, and the mean place of that within the bin times these.
+        # By direction: metres of wall, weighted, and these times where in the bin the walls stand on an average.
         self._metres, self._places = np.zeros(_BINS), np.zeros(_BINS)
 
     def learn(self, lines: Lines, yaw: float, way_m: float) -> None:
