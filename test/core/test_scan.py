@@ -54,3 +54,36 @@ def test_an_empty_scan_has_no_points():
 def test_geometry_that_is_none_is_refused(changes):
     with pytest.raises(InputError, match='expected'):
         scan_of([1.0, 1.0], **changes)
+
+
+def one_range(value, **options):
+    return Scan.create(0, np.full(20, value), -1.0, 0.1, 0.1, 8.0, **options)
+
+
+@pytest.mark.parametrize('value, name', [
+    (3.0, 'hit'), (0.1, 'hit'), (np.inf, 'no_return'), (8.0, 'no_return'), (81.83, 'no_return'),
+    (-np.inf, 'too_near'),
+    (np.nan, ''), (0.0, ''), (-1.0, ''), (0.05, ''),
+])  # fmt: skip
+def test_a_range_says_one_thing_or_nothing(value, name):
+    scan = one_range(value)
+    said = [key for key in ('hit', 'no_return', 'too_near') if getattr(scan, key).all()]
+    assert said == ([name] if name else [])
+    assert scan.valid.all() == bool(name)
+    assert scan.is_blind == (not name)
+
+
+def test_a_driver_that_publishes_zero_for_no_return_says_so():
+    """The LDS of the TurtleBot 3; zero frees nothing all the same."""
+    scan = one_range(0.0, zero_is_no_return=True)
+    assert scan.valid.all()
+    assert not scan.is_blind
+    assert not scan.no_return.any()
+    assert one_range(np.nan, zero_is_no_return=True).is_blind
+
+
+@pytest.mark.parametrize('valid, blind', [(0, True), (9, True), (10, False), (50, False)])
+def test_fewer_than_a_tenth_of_the_beams_is_blind(valid, blind):
+    ranges = np.full(100, np.nan)
+    ranges[:valid] = np.inf
+    assert Scan.create(0, ranges, -1.0, 0.01, 0.1, 8.0).is_blind == blind

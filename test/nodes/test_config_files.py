@@ -134,6 +134,15 @@ def test_sensor_presets_are_known_to_the_nodes_and_hold_in_any_namespace(declare
         assert {key: found[key][0] for key in wanted} == wanted
 
 
+def test_the_preset_of_a_laser_that_publishes_zero_says_so_to_every_node_with_a_laser():
+    content = yaml.safe_load((ROOT / 'config' / 'sensors' / 'turtlebot3_lds.yaml').read_text())
+    parts = {key.removeprefix('/**/'): part['ros__parameters'] for key, part in content.items()}
+    told = {name for name, part in parts.items() if part.get('zero_is_no_return')}
+    files = (ROOT / 'config').glob('*.yaml')
+    declaring = {path.stem for path in files if 'zero_is_no_return' in path.read_text()}
+    assert told == declaring
+
+
 def test_presets_fit_together():
     assert len(PRESETS) == 5
     for preset in PRESETS:

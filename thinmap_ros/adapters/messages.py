@@ -63,8 +63,10 @@ def header(frame_id: str, ns: int) -> Header:
     return Header(frame_id=frame_id, stamp=time_msg(ns))
 
 
-def scan_from(message: LaserScan, T_base_laser: Array) -> Scan:
-    """Scan from its message and the laser's pose on the robot.
+def scan_from(
+    message: LaserScan, T_base_laser: Array, zero_is_no_return: bool = False
+) -> Scan:
+    """Scan from its message, the laser's pose on the robot and what a range of 0 means for it.
 
     Raises InputError as `Scan.create`, and where it has no beams, too many, or beams at angles that there are not.
     """
@@ -81,6 +83,7 @@ def scan_from(message: LaserScan, T_base_laser: Array) -> Scan:
         message.range_min,
         message.range_max,
         T_base_laser,
+        zero_is_no_return,
     )
 
 

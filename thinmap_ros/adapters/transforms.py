@@ -27,6 +27,15 @@ class LaserMount:
         given = parameters.declare_value(
             node, 'laser_pose', '', 'laser on the robot as "x,y,yaw" (m, m, rad); empty: from /tf_static'
         )
+        self._zero_is_no_return = bool(
+            parameters.declare_value(
+                node,
+                'zero_is_no_return',
+                False,
+                'a range of 0 means that nothing was met (LDS of the TurtleBot 3); false: that the '
+                'beam is invalid',
+            )
+        )
         self._fixed = Mount(_parse_pose(str(given)), upside_down=False) if given else None
         self._transforms = StaticTransforms()
         self._mounts: dict[str, Mount] = {}
@@ -44,7 +53,8 @@ class LaserMount:
                 f'scan in frame {checks.shown(message.header.frame_id)}: no static transform from '
                 f'"{self._base_frame}" to it; publish one on /tf_static or set the parameter laser_pose'
             )
-        return mount.placed(messages.scan_from(message, mount.T_base_laser))
+        scan = messages.scan_from(message, mount.T_base_laser, self._zero_is_no_return)
+        return mount.placed(scan)
 
     def pose(self, frame_id: str) -> Array | None:
         """T_base_laser (3,) of a laser frame, or None as long as it is not known."""

@@ -10,6 +10,11 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
 
+# Of a laser with fewer beams than this that say anything, nobody can tell what is in front of it.
+SEEING_SHARE = 0.1
+# No laser is mounted farther from the middle of its robot.
+FARTHEST_MOUNT_M = 100.0
+
 
 @dataclass(frozen=True, eq=False)
 class Scan:
@@ -17,7 +22,11 @@ class Scan:
 
     stamp_ns: time of the scan; ranges_m (N,): raw, may hold inf, NaN and nonsense; beam i points to
     angle_min_rad + i * angle_increment_rad in the laser frame (a negative increment is a clockwise laser);
-    T_base_laser (3,): the laser's pose on the robot. Make one with `Scan.create`.
+    T_base_laser (3,): the laser's pose on the robot; zero_is_no_return: whether this laser's driver
+    publishes 0 for a beam that met nothing. Make one with `Scan.create`.
+
+    What a range says: `hit`, `no_return`, `too_near`, or nothing (`valid` is False).
+    Source: REP 117, with range_max as a finite value for "no return", which many drivers publish.
     """
 
     stamp_ns: int
@@ -27,6 +36,7 @@ class Scan:
     range_min_m: float
     range_max_m: float
     T_base_laser: Array
+    zero_is_no_return: bool = False
 
     @staticmethod
     def create(
@@ -37,11 +47,12 @@ class Scan:
         range_min_m: float,
         range_max_m: float,
         T_base_laser: Array | None = None,
+        zero_is_no_return: bool = False,
     ) -> 'Scan':
         """Make a scan, rounded to float32 as sensor_msgs/LaserScan is: text log, bag and live agree bit for bit.
 
         Raises InputError where the geometry is no geometry: NaN angles, beams without an angle between them, an empty
-        or negative range interval.
+        or negative range interval, a mount that is not finite or farther than FARTHEST_MOUNT_M.
         """
         ranges = np.asarray(ranges_m, dtype=np.float32).astype(np.float64)
         first, step, low, high = (
@@ -55,7 +66,15 @@ class Scan:
         if not 0.0 <= low < high:
             raise InputError(f'scan at {stamp_ns} ns: range {low} to {high} m: expected 0 <= min < max')
         T_base_laser = np.zeros(3) if T_base_laser is None else np.asarray(T_base_laser, dtype=np.float64)
-        return Scan(int(stamp_ns), ranges, first, step, low, high, T_base_laser)
+        if not (se2.is_finite(T_base_laser) and np.abs(T_base_laser[:2]).max() <= FARTHEST_MOUNT_M):
+            mount = ', '.join(f'{value:g}' for value in T_base_laser.tolist())
+            raise InputError(
+                f'scan at {stamp_ns} ns: laser mounted at {mount}: expected finite numbers, at most '
+                f'{FARTHEST_MOUNT_M:g} m'
+            )
+        return Scan(
+            int(stamp_ns), ranges, first, step, low, high, T_base_laser, zero_is_no_return
+        )
 
     @cached_property
     def angles_rad(self) -> Array:
@@ -71,6 +90,26 @@ class Scan:
     def no_return(self) -> NDArray[np.bool_]:
         """Beams that met nothing within the range: range >= range_max or +inf (REP 117), (N,)."""
         return self.ranges_m >= self.range_max_m
+
+    @cached_property
+    def too_near(self) -> NDArray[np.bool_]:
+        """Beams that met something nearer than can be measured: -inf (REP 117), (N,)."""
+        return np.isneginf(self.ranges_m)
+
+    @cached_property
+    def valid(self) -> NDArray[np.bool_]:
+        """Beams that say something, (N,). The others (NaN, 0, below range_min) may hide anything.
+
+        With zero_is_no_return a range of 0 is valid: the laser works, and nothing is near. It is
+        not `no_return` all the same: a dark thing gives 0 as well, so no cell of a map is freed.
+        """
+        valid = self.hit | self.no_return | self.too_near
+        return valid | (self.ranges_m == 0.0) if self.zero_is_no_return else valid
+
+    @cached_property
+    def is_blind(self) -> bool:
+        """Whether so few beams are valid that the laser may as well be covered or broken."""
+        return int(np.count_nonzero(self.valid)) < SEEING_SHARE * self.ranges_m.size
 
     def points_laser(self) -> Array:
         """End points of the beams that met something, laser frame, (M, 2)."""

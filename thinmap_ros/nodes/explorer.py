@@ -144,14 +144,16 @@ class ExplorerNode(LiveNode):
         self._take(self._matcher.right(messages.stamp_ns(message.header.stamp), T_map_base))
 
     def _on_scan(self, message: LaserScan) -> None:
+        if self._mount.scan(message).is_blind:
+            return  # as good as silent: what lies in its field of view was not looked at
         self._heard_at = self._now()
         self._take(self._matcher.left(messages.stamp_ns(message.header.stamp), message))
 
     def _on_slam_status(self, message: SlamStatus) -> None:
         # Silence is none of it: a localizer that is started again goes on from where it was.
-        if message.state == SlamStatus.TRACKING or not self._is_lost:
+        if message.state != SlamStatus.LOST or not self._is_lost:
             self._tracked_at = self._now()
-        self._is_lost = message.state != SlamStatus.TRACKING
+        self._is_lost = message.state == SlamStatus.LOST
 
     def _on_cancel(self) -> None:
         self._cancel_asked = True
@@ -198,7 +200,7 @@ class ExplorerNode(LiveNode):
             self._end(ExplorationStatus.CANCELLED, 'cancelled')
             return
         if now - self._heard_at > _SILENCE_S:
-            self._end(ExplorationStatus.SENSOR_SILENT, f'no scan for {_SILENCE_S:.0f} s')
+            self._end(ExplorationStatus.SENSOR_SILENT, f'no scan that shows anything for {_SILENCE_S:.0f} s')
             return
         if self._is_lost and now - self._tracked_at > _LOST_S:
             self._end(ExplorationStatus.LOCALIZATION_LOST, f'the pose has been lost for {_LOST_S:.0f} s')

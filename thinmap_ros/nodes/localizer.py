@@ -25,6 +25,12 @@ from thinmap_ros.core.slam.features import LineFeature as Feature
 from thinmap_ros.core.slam.localizer import Estimate, Localizer, LocalizerConfig
 from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 
+_HEALTH = {
+    SlamStatus.TRACKING: (OK, 'tracking'),
+    SlamStatus.LOST: (ERROR, 'lost: scans do not fit the map'),
+    SlamStatus.BLIND: (ERROR, 'laser blind (too few valid beams): odometry alone'),
+}
+
 
 class LocalizerNode(LiveNode):
     """/scan and /odom in; /pose, map -> odom on /tf, /line_features, /slam_status out; /trajectory after a loop.
@@ -98,7 +104,8 @@ class LocalizerNode(LiveNode):
                 self._resume(self._resumed, scan.stamp_ns, T_odom_base)
             started = perf_counter()
             estimate = self._localizer.step(scan, T_odom_base)
-            self._publish(scan.stamp_ns, estimate, 1000.0 * (perf_counter() - started))
+            step_ms = 1000.0 * (perf_counter() - started)
+            self._publish(scan, estimate, step_ms)
             if not estimate.lost:
                 self._last = LastPose(scan.stamp_ns, estimate.T_map_odom, T_odom_base)
         self.health.dropped_in_all('scans without odometry at their time', self._pairing.dropped)
@@ -130,9 +137,11 @@ class LocalizerNode(LiveNode):
             loaded.set_topology(self._topology)
         return f'{len(loaded.features)} features'
 
-    def _publish(self, ns: int, estimate: Estimate, step_ms: float) -> None:
+    def _publish(self, scan: Scan, estimate: Estimate, step_ms: float) -> None:
+        ns = scan.stamp_ns
         self.health.took('localizer', step_ms)
-        self.health.state(*((ERROR, 'lost: scans do not fit the map') if estimate.lost else (OK, 'tracking')))
+        state = _state_of(scan, estimate)
+        self.health.state(*_HEALTH[state])
         if estimate.correction is not None:
             self._tell_trajectory(ns)
         pose = messages.pose_with_covariance_msg(
@@ -147,7 +156,7 @@ class LocalizerNode(LiveNode):
         self._status.publish(
             SlamStatus(
                 header=header,
-                state=SlamStatus.LOST if estimate.lost else SlamStatus.TRACKING,
+                state=state,
                 features=len(features),
                 local_features=estimate.n_local,
                 observed=estimate.observed,
@@ -163,6 +172,13 @@ class LocalizerNode(LiveNode):
         stamps, poses = self._localizer.past()
         self._trajectory.publish(messages.trajectory_msg(stamps.tolist(), poses, self._map_frame, ns))
         self.get_logger().info(f'a loop is closed: {len(poses)} poses of the past are corrected')
+
+
+def _state_of(scan: Scan, estimate: Estimate) -> int:
+    """State of a SlamStatus. Of a robot that sees nothing it is not known whether it is lost."""
+    if scan.is_blind:
+        return int(SlamStatus.BLIND)
+    return int(SlamStatus.LOST if estimate.lost else SlamStatus.TRACKING)
 
 
 def _feature_msg(feature: Feature) -> LineFeature:

@@ -59,6 +59,7 @@ class NavigatorNode(LiveNode):
         self._T_map_odom: Array | None = None
         self._T_odom_base: Array | None = None
         self._scan: Scan | None = None
+        self._is_blind = False
         self._heard_ns: dict[str, int] = {}
         self._shown_path: Array | None = None
         self._goal: tuple[float, float, float | None] = (0.0, 0.0, None)
@@ -93,8 +94,11 @@ class NavigatorNode(LiveNode):
         self._T_map_odom = se2.compose(T_map_base, se2.invert(T_odom_base))
 
     def _on_scan(self, message: LaserScan) -> None:
-        self._scan = self._mount.scan(message)
-        self._note('laser')
+        scan = self._mount.scan(message)
+        self._is_blind = scan.is_blind
+        if not scan.is_blind:
+            self._scan = scan
+            self._note('laser')
 
     def _on_map(self, message: OccupancyGrid) -> None:
         self._map.replace(messages.patch_from(message))
@@ -145,25 +149,28 @@ class NavigatorNode(LiveNode):
                 'goal waits: no map, scan, pose or odometry yet', throttle_duration_sec=_WARN_PERIOD_S
             )
             return None
-        if who := self._silent():
-            reason = f'{who} silent: standing still'
+        if fault := self._fault():
+            reason = f'{fault}: standing still'
             self.get_logger().warning(reason, throttle_duration_sec=_WARN_PERIOD_S)
             self.health.state(WARN, reason)
+            self._navigator.halt()
             return Command(0.0, 0.0, 'blocked', reason)
         self.health.state(OK, 'driving')
         T_map_base = se2.compose(self._T_map_odom, self._T_odom_base)
         with self.health.timed('navigator'):
             return self._navigator.step(T_map_base, self._map.patch, self._scan, _CONTROL_PERIOD_S)
 
-    def _silent(self) -> str:
-        """Who has not been heard for so long that driving on would be driving blind; '' where all is well."""
+    def _fault(self) -> str:
+        """Why driving on would be driving blind; '' where all is well."""
+        if self._is_blind:
+            return 'laser blind (too few valid beams)'
         latest = self._odometry.latest_stamp_ns
         if latest is not None and self._scan is not None and latest - self._scan.stamp_ns > _SILENCE_NS:
-            return 'laser'
+            return 'laser silent'
         now_ns = self.get_clock().now().nanoseconds
         for who, limit_ns in _SILENCES_NS.items():
             if now_ns - self._heard_ns.get(who, now_ns) > limit_ns:
-                return who
+                return f'{who} silent'
         return ''
 
     def _note(self, who: str) -> None:

@@ -24,6 +24,8 @@ _ROUNDING_M_S = 1e-9
 # Where nothing else is left, points may come so much nearer than the body's radius, but only so slowly.
 _SQUEEZED_M, _SQUEEZED_M_S = 0.01, 0.1
 _AIM_RAD = 0.1
+_OBSTACLE = 'something stands in the way'
+_HIDDEN = 'the laser does not see the way: a sector of invalid beams'
 _POINTS_M = 2.5  # so near, the laser's points count beside the map
 # A goal that does not get this much nearer between so many standstills is given up.
 _PROGRESS_M = 0.5
@@ -83,6 +85,10 @@ class Navigator:
         self._goal, self._heading_rad = (x, y), theta
         self.path, self._path_age_s, self._blocked_s, self._remaining_m = None, 0.0, 0.0, 0.0
         self._standstills, self._nearest_m = 0, math.inf
+
+    def halt(self) -> None:
+        """Take note that the robot was stopped by somebody else; it goes on from rest."""
+        self._follower.slowed(0.0, 0.0)
 
     def cancel(self) -> None:
         """Forget the goal; the next steps bring the robot to rest."""
@@ -194,16 +200,17 @@ class Navigator:
     def _face_obstacle(self, T_map_base: Array, dt_s: float) -> Command:
         """Right in front of something: turn along the path if that helps, else plan around it, else give up."""
         assert self.path is not None
+        reason = _HIDDEN if self._seen.hidden else _OBSTACLE
         self._standstills += self._blocked_s == 0.0
         self._blocked_s += dt_s
         if self._blocked_s > self.config.blocked_s or self._standstills > _STANDSTILLS:
             self.cancel()
-            return Command(*self._follower.slowed(0.0, 0.0), 'failed', 'something stands in the way')
+            return Command(*self._follower.slowed(0.0, 0.0), 'failed', reason)
         heading = self._heading_of_path(T_map_base)
         if abs(se2.wrap(heading - float(T_map_base[2]))) > _AIM_RAD:
             return Command(*self._follower.turn_to(T_map_base, heading, dt_s), 'driving')
         self._path_age_s = max(self._path_age_s, self.config.replan_s - 0.5)
-        return Command(*self._follower.slowed(0.0, 0.0), 'blocked', 'something stands in the way')
+        return Command(*self._follower.slowed(0.0, 0.0), 'blocked', reason)
 
     def _heading_of_path(self, T_map_base: Array) -> float:
         assert self.path is not None

@@ -6,6 +6,7 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.planning.unseen import NARROWEST_M, UnseenSectors
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
@@ -19,10 +20,13 @@ class SeenPoints:
 
     A laser that looks ahead only does not see the corner any more round which the robot is turning.
     points (N, 2): in the map frame, m; they keep the place where they were first seen.
+    hidden: whether it was an unseen sector, not a point, that came first in the last `clear_m`.
     """
 
     def __init__(self) -> None:
         self.points: Array = np.empty((0, 2))
+        self.hidden = False
+        self._unseen = UnseenSectors()
         self._scan: Scan | None = None
 
     def look(self, T_map_base: Array, scan: Scan | None) -> None:
@@ -33,6 +37,8 @@ class SeenPoints:
         first, step = scan.angle_min_rad, scan.angle_increment_rad
         T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
         hits = np.where(scan.hit, scan.ranges_m, np.nan)
+        hits = np.where(scan.too_near, scan.range_min_m, hits)
+        self._unseen.observe(T_map_laser, scan)
         self.points = _points_around(hits, first, step, T_map_laser, self.points, T_map_base)
 
     def within(self, T_map_base: Array, reach_m: float) -> Array:
@@ -44,10 +50,27 @@ class SeenPoints:
         return float(_room_along(path, first, length_m, self.points))
 
     def clear_m(self, T_map_base: Array, curvature: float, length_m: float, radius_m: float) -> float:
-        """How far, m, a disc can be moved along an arc from a pose (3,) without touching anything, at most length_m."""
+        """How far, m, a disc can be moved along an arc from a pose (3,), at most length_m.
+
+        It touches nothing on that way, and nothing of what it sweeps is unseen.
+        """
         count = math.ceil(length_m / _SWEEP_STEP_M)
         clear = _clear_steps_on_arc(T_map_base, curvature, length_m, count, self.points, radius_m)
-        return float(length_m * clear / max(count, 1))
+        unseen = self._unseen_ahead(T_map_base, length_m, radius_m)
+        seen = _clear_steps_on_arc(T_map_base, curvature, length_m, count, unseen, radius_m)
+        self.hidden = seen < clear
+        return float(length_m * min(clear, seen) / max(count, 1))
+
+    def _unseen_ahead(self, T_map_base: Array, length_m: float, radius_m: float) -> Array:
+        """Points (K, 2), map frame, in what is unseen and may be swept by a disc at a pose (3,)."""
+        # What lies beside the robot now was in front of it one diameter ago.
+        points = self._unseen.points(2.0 * radius_m + length_m, 2.0 * radius_m)
+        if not len(points):
+            return points
+        # Right at its sides, a robot that begins to move has seen nothing, whatever its laser.
+        away = se2.transform_points(se2.invert(T_map_base), points)
+        near = np.hypot(away[:, 0], away[:, 1]) < radius_m + NARROWEST_M
+        return np.asarray(points[~(near & (np.abs(away[:, 1]) > away[:, 0]))])
 
 
 @kernel
