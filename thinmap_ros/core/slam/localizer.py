@@ -48,6 +48,7 @@ _LEEWAY = np.diag(np.square([0.003, 0.003, 0.001]))
 _UNKNOWN_SIGMA_M = 300.0  # what a pose is known to while the robot is lost
 _TELLING_POINTS = 40  # where fewer beams hit, and not half of them, as in a wide hall, a contradiction proves nothing
 _UNTURNED_RAD = 0.03  # doubt of the heading (1 sigma) with which nothing is drawn while walls may tell it soon
+_SLIP_SIGMAS = 3.0  # motion within so much of the slip is none
 _USUAL_NOISE = 0.1  # share of the variances allowed for that wheels mostly have
 _LOST_SIGMA_M = 1.0  # doubt since a scan last fitted; far from the start, more than this is no reason to be lost
 
@@ -66,8 +67,12 @@ class LocalizerConfig(MotionConfig, MatchConfig, LineConfig, FeatureConfig, Loop
         'ti: EKF over line features, local by topology; full: EKF over all; off: scan matching alone',
         choices=('ti', 'full', 'off'),
     )
-    start_x_m: float = parameter(0.0, 'where the robot starts in the map, m')
-    start_y_m: float = parameter(0.0, 'where the robot starts in the map, m')
+    start_x_m: float = parameter(
+        0.0, 'where the robot starts in the map, m', low=-se2.FARTHEST_M, high=se2.FARTHEST_M
+    )
+    start_y_m: float = parameter(
+        0.0, 'where the robot starts in the map, m', low=-se2.FARTHEST_M, high=se2.FARTHEST_M
+    )
     start_yaw_rad: float = parameter(0.0, 'heading at the start, rad')
     look_distance_m: float = parameter(0.3, 'the map learns after so much way, m', low=0.0, high=5.0)
     look_turn_rad: float = parameter(0.2, 'or after such a turn, rad', low=0.0, high=3.0)
@@ -122,6 +127,8 @@ class Localizer:
         self._loops = Loops(self.config, self.config)
         self._path = AnchoredPoses()  # of every step
         self._T_odom_base: Array | None = None
+        self._T_odom_moved: Array = np.zeros(3)  # when odometry last said that the robot moved
+        self._stands = False
         self._calibration = OdometryCalibration()
         self._noise = OdometryNoise(self.config)
         self._by_map = np.zeros((3, 3))  # information of the last match that was good, as the map alone tells it
@@ -137,7 +144,7 @@ class Localizer:
 
     def set_pose(self, T_map_base: Array, covariance: Array) -> None:
         """Put the robot at a pose (3,) with covariance (3, 3) in the map that it has; the next scans settle it."""
-        if not (se2.is_finite(T_map_base) and np.isfinite(covariance).all()):
+        if not (se2.is_on_earth(T_map_base) and np.isfinite(covariance).all()):
             self.refused += 1
             return
         floor = np.diag(np.square(_START_SIGMAS))
@@ -252,18 +259,35 @@ class Localizer:
     def _odometry(self, T_odom_base: Array) -> tuple[Array, Array]:
         """Input u of eq. (10): the increment (3,) since the last scan, and its covariance (3, 3)."""
         last, increment = self._T_odom_base, np.zeros(3)
+        moved = increment
         if se2.is_finite(T_odom_base):
             self._T_odom_base = np.array(T_odom_base, dtype=np.float64)
             if last is None:
+                self._T_odom_moved = self._T_odom_base
                 return increment, np.diag(np.square(_START_SIGMAS))
             increment = se2.between(last, self._T_odom_base)
+            moved = se2.between(self._T_odom_moved, self._T_odom_base)
+            self._stands = self._within_slip(moved)
+            if not self._stands:
+                self._T_odom_moved = self._T_odom_base
         if not se2.is_finite(T_odom_base) or math.hypot(increment[0], increment[1]) > _LONGEST_STEP_M:
             self.refused += 1
-            increment = np.zeros(3)
+            increment = moved = np.zeros(3)
         variances = _USUAL_NOISE * odometry_variances(increment, self.config)
         increment, systematic = self._calibration.corrected(increment, variances)
         self._noise.move(increment)
-        return increment, odometry_covariance(increment, self.config, self._noise.share) + systematic
+        return increment, odometry_covariance(moved, self.config, self._noise.share) + systematic
+
+    def _within_slip(self, moved: Array) -> bool:
+        """Whether a motion (3,) is no more than the error of any increment: 3 sigmas of the slip.
+
+        An odometry that trembles adds nothing then, and one that creeps counts as soon as it has
+        come that far.
+        """
+        slip = np.array(
+            [self.config.odom_slip_m, self.config.odom_slip_m, self.config.odom_slip_rad]
+        )
+        return bool((np.abs(moved) <= _SLIP_SIGMAS * slip).all())
 
     def _seen(self, scan: Scan) -> tuple[Array, Array]:
         """Points (N, 2) that can be matched and the laser's place (2,), robot frame."""
@@ -282,6 +306,8 @@ class Localizer:
         predicted = se2.compose(pose, increment)
         F, _ = motion_jacobians(pose, increment)
         self._blind = np.maximum(self._blind, _blind(self._doubt.since_match, self._noise))
+        since_match = self._doubt.since_match
+        on_map = self._doubt.on_map
         self._doubt.move(F, turn @ covariance @ turn.T)
         if self.config.square_walls and len(lines) and not self._is_unplaced():
             predicted = self._turned_by_walls(lines, predicted)
@@ -297,12 +323,23 @@ class Localizer:
         if match.good:
             off = se2.off(match.T_map_base, predicted)
             evidence = self._doubt.evidence(match.covariance, off)
-            self._noise.learn(off, evidence, float(predicted[2]))
+            # Wheels may be stuck, or the robot pushed: then the walls tell that it moves.
+            stands = self._stands and self._within_slip(off)
+            if not stands:
+                self._noise.learn(off, evidence, float(predicted[2]))
             self._by_map = evidence.by_map
             match = self._taken_back(match, predicted, evidence)
             added = self._doubt.match(evidence, increment)
+            if stands:
+                # The same look at the same walls: neither an error more nor a proof more.
+                self._doubt.on_map = on_map
+                added = np.zeros((3, 3))
             increment, covariance = se2.between(pose, match.T_map_base), turn.T @ added @ turn
             predicted = match.T_map_base
+        elif self._stands:
+            self._doubt = Doubt(on_map)
+            self._doubt.since_match = since_match
+            covariance = np.zeros((3, 3))
         if match.good and (self._placed_by_hand or self.config.slam == 'off' or not self.config.mapping):
             self._ekf.set_pose(match.T_map_base, match.covariance)
             self._placed_by_hand = False
