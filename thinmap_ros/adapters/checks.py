@@ -5,12 +5,14 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.frame import COARSEST_M as COARSEST_M
+from thinmap_ros.core.grid.frame import FINEST_M as FINEST_M
 
-FARTHEST_M = 1e6
+FARTHEST_M = se2.FARTHEST_M
 LARGEST_ANGLE_RAD = 4.0 * np.pi
 MOST_BEAMS = 200_000
-FINEST_M, COARSEST_M = 0.001, 10.0
 LONGEST_NAME = 40
 
 

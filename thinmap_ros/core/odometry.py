@@ -34,9 +34,13 @@ class OdometryBuffer:
         return self._stamps[-1] if self._stamps else None
 
     def add(self, stamp_ns: int, T_odom_base: Array) -> None:
-        """Take a sample, (3,). Raises InputError where the pose is not finite."""
-        if not se2.is_finite(T_odom_base):
-            raise InputError(f'odometry at {stamp_ns} ns: pose {list(T_odom_base)}: expected finite numbers')
+        """Take a sample, (3,). Raises InputError where the pose is not finite, or nowhere on earth."""
+        if not se2.is_on_earth(T_odom_base):
+            pose = ', '.join(f'{value:g}' for value in T_odom_base.tolist())
+            raise InputError(
+                f'odometry at {stamp_ns} ns: pose {pose}: expected finite numbers, at most '
+                f'{se2.FARTHEST_M:g} m'
+            )
         if self._stamps and stamp_ns < self._stamps[-1] - self._span_ns:
             self._stamps, self._poses = [], []
         index = bisect_left(self._stamps, stamp_ns)

@@ -8,6 +8,10 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+# No robot gets farther from where its map began. Beyond 1e15 m a coordinate cannot even tell cells
+# apart, and what is computed from it lies outside of every array.
+FARTHEST_M = 1e6
+
 
 @overload
 def wrap(angle: float) -> float: ...
@@ -61,6 +65,11 @@ def interpolate(T_a: Array, T_b: Array, share: float) -> Array:
     """Pose on the straight way from T_a (share 0) to T_b (share 1), heading turned the shorter way."""
     x, y = T_a[:2] + share * (T_b[:2] - T_a[:2])
     return pose(x, y, T_a[2] + share * wrap(float(T_b[2] - T_a[2])))
+
+
+def is_on_earth(T: Array) -> bool:
+    """Whether a pose (3,) is finite and no farther than FARTHEST_M from the origin of its frame."""
+    return is_finite(T) and abs(T[0]) <= FARTHEST_M and abs(T[1]) <= FARTHEST_M
 
 
 def is_finite(T: Array) -> bool:

@@ -5,7 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.se2 import FARTHEST_M, Array
+
+FINEST_M = 0.001
+COARSEST_M = 10.0
 
 
 @dataclass(frozen=True)
@@ -13,12 +17,24 @@ class GridFrame:
     """A lattice of square cells: world point <-> cell (row, col).
 
     origin_x, origin_y: lower left corner of cell (0, 0), m; resolution: edge of a cell, m. Row 0 has the lowest y,
-    as in nav_msgs/OccupancyGrid.
+    as in nav_msgs/OccupancyGrid. Raises InputError where it is no place on earth (FARTHEST_M), or
+    cells are finer than FINEST_M or coarser than COARSEST_M.
     """
 
     origin_x: float
     origin_y: float
     resolution: float
+
+    def __post_init__(self) -> None:
+        if not (abs(self.origin_x) <= FARTHEST_M and abs(self.origin_y) <= FARTHEST_M):
+            raise InputError(
+                f'map with its origin at {self.origin_x:g}, {self.origin_y:g} m: expected numbers '
+                f'from {-FARTHEST_M:g} to {FARTHEST_M:g}'
+            )
+        if not FINEST_M <= self.resolution <= COARSEST_M:
+            raise InputError(
+                f'map of cells of {self.resolution:g} m: expected {FINEST_M:g} to {COARSEST_M:g} m'
+            )
 
     def cells_of(self, points: Array) -> NDArray[np.int64]:
         """Cells (N, 2) as (row, col) that hold the points (N, 2)."""

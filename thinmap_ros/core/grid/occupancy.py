@@ -15,7 +15,7 @@ from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
 from thinmap_ros.core.grid.picture import Picture
 from thinmap_ros.core.grid.raytrace import fill_segment
-from thinmap_ros.core.grid.tiles import TILE, TileStore
+from thinmap_ros.core.grid.tiles import FARTHEST_TILE, TILE, TileStore
 from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -122,10 +122,15 @@ class OccupancyGrid:
             origin_x, origin_y, resolution = frame.astype(np.float64).tolist()
         except (KeyError, ValueError, TypeError) as error:
             raise InputError(f'saved grid: {error}: expected frame, tiles and log_odds') from error
-        if not np.isfinite([origin_x, origin_y, resolution]).all() or tiles.dtype != np.int64:
-            raise InputError(f'saved grid: frame {frame}, tiles of {tiles.dtype}: expected finite numbers, whole ones')
+        if tiles.dtype != np.int64:
+            raise InputError(f'saved grid: tiles of {tiles.dtype}: expected int64')
         if tiles.shape != (len(odds), 2) or odds.shape[1:] != (TILE, TILE) or odds.dtype != np.int16:
             raise InputError(f'saved grid: {tiles.shape} tiles, {odds.shape} log odds: expected one array a tile')
+        if len(tiles) and not -FARTHEST_TILE <= tiles.min() <= tiles.max() <= FARTHEST_TILE:
+            raise InputError(
+                f'saved grid: tiles from {tiles.min()} to {tiles.max()}: expected '
+                f'{-FARTHEST_TILE} to {FARTHEST_TILE}'
+            )
         if np.abs(odds.astype(np.int64)).max(initial=0) > _LIMIT:
             raise InputError(f'saved grid: log odds up to {np.abs(odds).max()}: expected at most {_LIMIT}')
         grid = OccupancyGrid(config, GridFrame(origin_x, origin_y, resolution))
@@ -138,10 +143,17 @@ class OccupancyGrid:
         self._picture.touch(row, col, row + odds.shape[0], col + odds.shape[1])
 
     def update(self, scan: Scan, T_map_base: Array) -> None:
-        """Take in a scan made at a robot pose T_map_base (3,)."""
+        """Take in a scan made at a robot pose T_map_base (3,).
+
+        Raises InputError where the laser is nowhere on earth or the map would get too large; the
+        map is then as it was.
+        """
         T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
         if scan.ranges_m.size == 0 or not se2.is_finite(T_map_laser):
             return
+        if not se2.is_on_earth(T_map_laser):
+            place = f'{T_map_laser[0]:g}, {T_map_laser[1]:g} m'
+            raise InputError(f'scan at {scan.stamp_ns} ns: laser at {place}: too far to be mapped')
         resolution, usable, depth = self.frame.resolution, self.config.usable_range_m, self.config.surface_depth_m
         x = (float(T_map_laser[0]) - self.frame.origin_x) / resolution
         y = (float(T_map_laser[1]) - self.frame.origin_y) / resolution
@@ -149,6 +161,10 @@ class OccupancyGrid:
         radius = math.ceil(min(usable, scan.range_max_m + depth) / resolution) + 2
         tile_row, tile_col = (math.floor(y) - radius) // TILE, (math.floor(x) - radius) // TILE
         laser = (x - tile_col * TILE, y - tile_row * TILE)
+        # Before anything is drawn: what cannot be merged must not stay on the sheet.
+        last_row = (math.floor(y) + radius) // TILE
+        last_col = (math.floor(x) + radius) // TILE
+        self._tiles.reach(tile_row, tile_col, last_row, last_col)
         news = self._sheet(radius)
         self._follow(scan)
         heading, bend = float(T_map_laser[2]), 2.0 * math.cos(scan.angle_increment_rad)
@@ -162,8 +178,6 @@ class OccupancyGrid:
     ) -> None:
         """Add the news to the tiles, and make those that do not exist; (tile_row, tile_col): where the news begin."""
         tiles = self._tiles
-        last_row, last_col = tile_row + (box[1] >> _TILE_BITS), tile_col + (box[3] >> _TILE_BITS)
-        tiles.reach(tile_row, tile_col, last_row, last_col)
         row, col = tile_row * TILE, tile_col * TILE
         self._picture.touch(row + box[0], col + box[2], row + box[1] + 1, col + box[3] + 1)
         place = (tile_row - tiles.first_row, tile_col - tiles.first_col)

@@ -6,10 +6,14 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.frame import FINEST_M
+from thinmap_ros.core.se2 import FARTHEST_M
 
 TILE = 64  # cells along the edge of a tile
 NO_TILE = -1
 _MOST_TILES = 1 << 15  # 134 million cells, some 1.1 km in each direction at 0.1 m
+MOST_CELLS = _MOST_TILES * TILE * TILE
+FARTHEST_TILE = int(FARTHEST_M / FINEST_M) // TILE  # of the finest cells
 _BORDER = 4  # tiles by which the directory grows at a time
 
 

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.tiles import NO_TILE, TILE, TileStore
+from thinmap_ros.core.grid.tiles import FARTHEST_TILE, NO_TILE, TILE, TileStore
 from thinmap_ros.core.jit import inlined, kernel
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import FARTHEST_M, Array
 
 # What a cell holds: points counted, their mean (m, map frame), the unit normal of the surface there, towards where it
 # was seen from, how loose the surface is: 0 a wall, up to 1 clutter, UNFORMED where there are too few points; points
@@ -55,9 +55,15 @@ class PointMap:
         return np.array([self.tiles.first_row, self.tiles.first_col], dtype=np.int64) * TILE
 
     def add(self, points_map: Array, seen_from: Array) -> None:
-        """Take in points (N, 2) seen from a place (2,), all in the map frame. Cells that do not count begin anew."""
+        """Take in points (N, 2) seen from a place (2,), all in the map frame.
+
+        Cells that do not count begin anew. Raises InputError where points are nowhere on earth or
+        the map would get too large; the map is then as it was.
+        """
         if len(points_map) == 0:
             return
+        if not np.abs(points_map).max() <= FARTHEST_M:
+            raise InputError(f'points up to {np.abs(points_map).max():g} m away: too far to be mapped')
         cells = np.floor(points_map[:, ::-1] / self.cell_m).astype(np.int64)
         tiles = _once(cells // TILE)
         low, high = tiles.min(axis=0), tiles.max(axis=0)
@@ -103,6 +109,8 @@ class PointMap:
             raise InputError('saved map of points: expected finite numbers')
         if not len(cells):
             return
+        if not -FARTHEST_TILE * TILE <= cells.min() <= cells.max() <= FARTHEST_TILE * TILE:
+            raise InputError(f'saved map of points: cells {cells.min()} to {cells.max()}: too far')
         tiles = _once(cells // TILE)
         low, high = tiles.min(axis=0), tiles.max(axis=0)
         self.tiles.reach(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
