@@ -1,10 +1,12 @@
 """Where the robot is: each scan, with the odometry at its stamp, through one step of the localizer."""
 
 from dataclasses import replace
-from time import perf_counter
+from time import monotonic, perf_counter
 
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped
-from nav_msgs.msg import Odometry, Path
+from nav_msgs.msg import OccupancyGrid, Odometry, Path
+from rclpy.clock import Clock, ClockType
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
@@ -18,6 +20,8 @@ from thinmap_ros.adapters.live_node import LiveNode
 from thinmap_ros.adapters.services import answer
 from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.core import se2
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import LastPose, ScanPairing
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -25,6 +29,7 @@ from thinmap_ros.core.slam.features import LineFeature as Feature
 from thinmap_ros.core.slam.localizer import Estimate, Localizer, LocalizerConfig
 from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 
+_MAP_WAIT_S = 3.0  # after a restart; the navigator drives on for so long without a new pose
 _HEALTH = {
     SlamStatus.TRACKING: (OK, 'tracking'),
     SlamStatus.LOST: (ERROR, 'lost: scans do not fit the map'),
@@ -48,12 +53,15 @@ class LocalizerNode(LiveNode):
         self._session = parameters.declare_session(self)
         parameters.check_unknown(self)
         warm_up.localizer()
+        self._map_topic: Subscription | None = None
+        # Of a localizer that was killed: its last pose, the map, and the newest scan, that waits for it.
         self._resumed: LastPose | None = None
-        self._last: LastPose | None = None
-        self._topology: Graph | None = None
+        self._latched: GridPatch | None = None
         self.begin_anew()
         left = self.keep(lambda: None if self._last is None else self._last.state())
         self._resumed = None if left is None else LastPose.from_state(left)
+        if self._resumed is not None:
+            self._listen_for_the_map()
         self.offer_pause()
         self.health.sole_publisher_of('pose')
         self._pose = self.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
@@ -72,7 +80,11 @@ class LocalizerNode(LiveNode):
     def begin_anew(self) -> None:
         """Forget all features, or go back to the session that the node was started with: the robot is at its start."""
         self._localizer, self._pairing = self._made(self._config), ScanPairing()
-        self._resumed, self._last, self._topology = None, None, None
+        self._last: LastPose | None = None
+        self._topology: Graph | None = None
+        self._resumed = self._latched = None
+        self._newest: list[tuple[Scan, Array]] = []
+        self._waits_since = monotonic()
 
     def _made(self, config: LocalizerConfig) -> Localizer:
         """A localizer that begins at its start, in the map of the session if there is one."""
@@ -99,9 +111,9 @@ class LocalizerNode(LiveNode):
         self._localizer.set_topology(self._topology)
 
     def _take(self, ready: list[tuple[Scan, Array]]) -> None:
+        if self._resumed is not None:
+            ready = self._resume(self._resumed, ready)
         for scan, T_odom_base in ready:
-            if self._resumed is not None:
-                self._resume(self._resumed, scan.stamp_ns, T_odom_base)
             started = perf_counter()
             estimate = self._localizer.step(scan, T_odom_base)
             step_ms = 1000.0 * (perf_counter() - started)
@@ -111,15 +123,51 @@ class LocalizerNode(LiveNode):
         self.health.dropped_in_all('scans without odometry at their time', self._pairing.dropped)
         self.health.dropped_in_all('scans or odometry that make no sense', self._localizer.refused)
 
-    def _resume(self, last: LastPose, stamp_ns: int, T_odom_base: Array) -> None:
-        """Begin where the robot is now if its odometry has gone on; else at the start that is configured."""
-        self._resumed = None
-        if not last.leads_to(stamp_ns, T_odom_base):
+    def _listen_for_the_map(self) -> None:
+        """Hear the map that was drawn before this localizer was killed, once."""
+
+        def take(message: OccupancyGrid) -> None:
+            try:
+                self._latched = messages.patch_from(message)
+            except InputError as error:
+                self.get_logger().warning(f'map: {error}')
+            if self.is_active:
+                self._take([])
+
+        self._map_topic = self.create_subscription(OccupancyGrid, 'map', take, qos.LATCHED)
+        self.every(_MAP_WAIT_S, lambda: self._take([]), Clock(clock_type=ClockType.STEADY_TIME))
+
+    def _resume(
+        self, last: LastPose, ready: list[tuple[Scan, Array]]
+    ) -> list[tuple[Scan, Array]]:
+        """Begin where the robot is now, in the map; returns the scan to go on with, or none yet.
+
+        Where the odometry has begun anew, too, the robot is at its start. Where there is no map, it
+        begins with what it sees where odometry says that it is.
+        """
+        self._newest = ready[-1:] or self._newest
+        if not self._newest:
+            self._waits_since = monotonic()
+            return []
+        scan, T_odom_base = self._newest[0]
+        leads = last.leads_to(scan.stamp_ns, T_odom_base)
+        waited_s = monotonic() - self._waits_since
+        if leads and self._latched is None and waited_s < _MAP_WAIT_S:
+            return []
+        if not leads:
             self.get_logger().warning('the odometry has begun anew as well: beginning at the start')
-            return
-        self._localizer = self._made(self._at(se2.compose(last.T_map_odom, T_odom_base)))
+        elif self._latched is None:
+            self.get_logger().warning(
+                f'no map came for {waited_s:.0f} s: what is drawn now may not fit what was before'
+            )
+            self._localizer = self._made(self._at(se2.compose(last.T_map_odom, T_odom_base)))
+        else:
+            self._localizer = Localizer.resumed(self._latched, last, T_odom_base, self._config)
         if self._topology is not None:
             self._localizer.set_topology(self._topology)
+        self._resumed = self._latched = None
+        self.destroy_subscription(self._map_topic)
+        return self._newest
 
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         return answer(response, lambda: f'saved {session_files.save_features(request.path, self._localizer)}')

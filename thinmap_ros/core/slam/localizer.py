@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import parameter
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.odometry import LastPose
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.anchors import AnchoredPoses
@@ -29,10 +31,12 @@ from thinmap_ros.core.slam.models import (
 )
 from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
 from thinmap_ros.core.slam.odometry_noise import OdometryNoise
+from thinmap_ros.core.slam.point_map import PointMap
 from thinmap_ros.core.slam.redrawn_map import RedrawnMap
 from thinmap_ros.core.slam.scan_matching import FEWEST_POINTS, Match, MatchConfig
 from thinmap_ros.core.slam.tracking import SEEN_AGAIN, Tracking, share_seen_again
 from thinmap_ros.core.slam.wall_compass import WallCompass
+from thinmap_ros.core.slam.wall_points import wall_points
 from thinmap_ros.core.topology.graph import TopologicalMap
 
 _START_SIGMAS = (1e-4, 1e-4, 1e-4)  # the map begins where the robot stands: no doubt, but not singular
@@ -171,6 +175,29 @@ class Localizer:
         localizer._feature_map.restore(localizer._filter, state)
         usual = float(np.clip(np.nan_to_num(state.get('usual', np.ones(()))), 0.0, 1.0))
         localizer._tracking = Tracking(localizer.config.lost_scans, usual, carried=True)
+        return localizer
+
+    @staticmethod
+    def resumed(
+        patch: GridPatch, last: LastPose, T_odom_base: Array, config: LocalizerConfig | None = None
+    ) -> 'Localizer':
+        """Localizer that goes on in an occupancy map, at T_odom_base (3,) after the last pose in it.
+
+        Scans are matched with the walls of the map before anything is drawn. The pose is known to
+        the noise of the odometry since then, and to a cell of the map (at a metre, for the heading).
+        """
+        localizer = Localizer(config)
+        points = PointMap(localizer.config.match_cell_m, localizer.config.match_memory)
+        for faces in wall_points(patch):
+            points.add(*faces)
+        localizer._map = RedrawnMap(localizer.config, points.state())
+        moved = se2.between(last.T_odom_base, T_odom_base)
+        turn = rotation(float(last.T_map_odom[2] + last.T_odom_base[2]))
+        covariance = turn @ odometry_covariance(moved, localizer.config) @ turn.T
+        cell = np.full(3, patch.frame.resolution)
+        localizer.set_pose(
+            se2.compose(last.T_map_odom, T_odom_base), covariance + np.diag(np.square(cell))
+        )
         return localizer
 
     @property

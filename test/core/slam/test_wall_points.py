@@ -1,0 +1,63 @@
+"""A localizer that goes on in an occupancy map: what was drawn stays where it is."""
+
+import numpy as np
+import pytest
+from slam_room import ROOM, drive, scan_in
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.odometry import LastPose
+from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
+from thinmap_ros.core.slam.wall_points import wall_points
+
+START = np.array([2.0, 2.0, 0.0])
+
+
+def test_points_lie_on_the_faces_that_are_turned_to_free_cells():
+    cells = np.full((9, 9), 100, dtype=np.int8)
+    cells[2:7, 3:8] = 0
+    cells[:, 8] = -1
+    points = [faces.points for faces in wall_points(GridPatch(GridFrame(-1.0, 2.0, 0.1), cells))]
+    right, left, up, down = points
+    # The room's walls are at x = -0.7 (left of it) and y = 2.2 and 2.7; on its right nothing is known.
+    assert len(left) == 0
+    np.testing.assert_allclose(right[:, 0], -0.7 - 0.02, atol=1e-9)
+    np.testing.assert_allclose(up[:, 1], 2.2 - 0.02, atol=1e-9)
+    np.testing.assert_allclose(down[:, 1], 2.7 + 0.02, atol=1e-9)
+    assert right[:, 1].min() == pytest.approx(2.225)
+    assert right[:, 1].max() == pytest.approx(2.675)
+    np.testing.assert_allclose(np.diff(right[:, 1]), 0.05, atol=1e-9)
+
+
+def test_a_map_without_walls_has_no_points():
+    patch = GridPatch(GridFrame(0.0, 0.0, 0.1), np.zeros((5, 5), dtype=np.int8))
+    assert all(len(faces.points) == 0 for faces in wall_points(patch))
+
+
+@pytest.mark.parametrize('resolution', [0.1, 0.05])
+@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('slip', [(0.0, 0.0), (0.3, 0.2)])
+def test_a_killed_localizer_does_not_bend_the_map(seed, resolution, slip):
+    """Killed for two metres; the wheels slip meanwhile. Then it goes on, and draws what it sees."""
+    rng = np.random.default_rng(seed)
+    config = LocalizerConfig(start_x_m=2.0, start_y_m=2.0)
+    localizer, last = Localizer(config), None
+    grid = OccupancyGrid(OccupancyConfig(resolution_m=resolution))
+    off = se2.pose(slip[0], 0.0, slip[1])
+    worst = 0.0
+    for k, (truth, odom) in enumerate(drive(700, rng, START)):
+        scan = scan_in(ROOM, truth, rng, k)
+        if k < 400:
+            estimate = localizer.step(scan, odom)
+            grid.update(scan, estimate.T_map_base)
+            last = LastPose(k, estimate.T_map_odom, odom)
+        elif k >= 450:
+            if k == 450:
+                slipped = se2.compose(odom, off)
+                localizer = Localizer.resumed(grid.patch(), last, slipped, config)
+            estimate = localizer.step(scan, se2.compose(odom, off))
+            worst = max(worst, float(np.hypot(*(estimate.T_map_base - truth)[:2])))
+    assert not estimate.lost
+    assert worst < 0.06
