@@ -1,6 +1,7 @@
 """/diagnostics of the nodes, their states, and the services that every node has."""
 
 import pytest
+import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from lifecycle_msgs.msg import State, Transition
@@ -12,7 +13,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from thinmap_msgs.action import NavigateToPose
 from thinmap_msgs.msg import TopologicalMap
-from thinmap_ros.adapters import qos
+from thinmap_ros.adapters import health, qos
 
 pytestmark = pytest.mark.live
 AT_START = {'start_x_m': 2.0, 'start_y_m': 2.0, 'start_yaw_rad': 0.0}
@@ -74,6 +75,34 @@ def test_two_localizers_on_one_graph_are_detected_and_reported(graph):
     graph.until(lambda: doctor.level('localizer') == DiagnosticStatus.WARN, 'the complaint ends')
 
 
+def test_what_is_over_is_not_told_first(ros_domain, monkeypatch):
+    """A refusal of long ago was the first thing told whenever anything else was dropped."""
+    now = [100.0]
+    monkeypatch.setattr(health, 'monotonic', lambda: now[0])
+    rclpy.init(domain_id=ros_domain)
+    node = rclpy.create_node('patient')
+    try:
+        told = health.Health(node)
+        told.refused('odom', 'pose nan: expected finite numbers')
+        told.dropped('scans without odometry at their time', 2)
+        now[0] += 1.0
+        told.refused('scan', '0 beams: expected 1 to 200000')
+        message = told._status(now[0]).message
+        assert message.startswith('4 messages refused or dropped: scan: 0 beams')
+        assert 'odom: pose nan' in message and 'without odometry' in message
+        told._publish()
+        now[0] += 10.5
+        told.dropped('scan: gaps between the stamps', 1)
+        message = told._status(now[0]).message
+        assert message == '1 messages refused or dropped: scan: gaps between the stamps'
+        # How often it happened is told for good.
+        values = {pair.key: pair.value for pair in told._status(now[0]).values}
+        assert values['odom: refused'] == '1'
+    finally:
+        node.destroy_node()
+        rclpy.shutdown()
+
+
 def test_a_localizer_walks_through_its_states(graph):
     poses, scans = graph.heard('pose', PoseWithCovarianceStamped), graph.heard('scan', LaserScan, qos.SENSOR)
     graph.start('localizer', use_sim_time=True, autostart=False, **AT_START)
@@ -133,6 +162,7 @@ def test_pause_and_reset(graph):
     graph.until(lambda: maps and graphs and graphs[-1].nodes, 'map and graph')
     assert graph.call(SetBool, '/localizer/pause', SetBool.Request(data=True)).success
     graph.until(lambda: doctor.value('localizer', 'paused') == 'True', 'it is told')
+    assert doctor.status('localizer').message == 'paused', 'and not that it tracks'
 
     def some_scans():
         heard = doctor.number('localizer', 'scan: heard')
@@ -147,6 +177,7 @@ def test_pause_and_reset(graph):
     graph.until(lambda: not graphs[-1].nodes and (len(maps[-1].data) == 0 or max(maps[-1].data) == -1), 'emptiness')
     assert graph.call(SetBool, '/localizer/pause', SetBool.Request(data=False)).success
     graph.until(lambda: poses, 'poses')
+    graph.until(lambda: doctor.status('localizer').message == 'tracking', 'it tracks')
     graph.until(lambda: graphs[-1].nodes, 'a graph')
     graph.until(lambda: max(maps[-1].data) > 90, 'a map')
 

@@ -1,5 +1,6 @@
 """What a node tells of itself on /diagnostics once a second: rates, refusals, drops, step times, its state."""
 
+import math
 import re
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
@@ -15,6 +16,7 @@ from rclpy.qos import QoSProfile
 
 _PERIOD_S = 1.0
 _QUIET_S = 10.0
+_RECENT_S = 10.0  # what was refused or dropped longer ago is over
 _STEPS = 200
 _REASONS = 8  # so many kinds of refusal are told apart on a topic: a broken sensor must not fill the memory
 _NUMBER = re.compile(r'-?\b(\d+\.?\d*(e[+-]?\d+)?|inf|nan)\b')
@@ -31,6 +33,7 @@ class _Topic:
     since: float = field(default_factory=monotonic)
     refused: Counter[str] = field(default_factory=Counter)
     last_refusal: str = ''
+    refused_at: float = -math.inf
 
 
 @dataclass
@@ -64,9 +67,11 @@ class Health:
         self._topics: dict[str, _Topic] = {}
         self._steps: dict[str, deque[float]] = {}
         self._drops: Counter[str] = Counter()
+        self._dropped_at: dict[str, float] = {}
         self._totals: Counter[str] = Counter()
         self._bad = self._told_bad = 0
         self._state = (OK, 'running')
+        self._is_paused = False
         self._values: dict[str, str] = {}
         self._complaints: list[_Complaint] = []
         self._before: list[Callable[[], None]] = []
@@ -93,12 +98,14 @@ class Health:
             kind = 'other reasons'
         entry.refused[kind] += 1
         entry.last_refusal = reason
+        entry.refused_at = monotonic()
         self._bad += 1
 
     def dropped(self, cause: str, count: int) -> None:
         """Count messages that were fine and were not used."""
         if count > 0:
             self._drops[cause] += count
+            self._dropped_at[cause] = monotonic()
             self._bad += count
 
     def dropped_in_all(self, cause: str, count: int) -> None:
@@ -120,6 +127,11 @@ class Health:
     def state(self, level: bytes, text: str) -> None:
         """Say what state the node is in."""
         self._state = (level, text)
+
+    def pause(self, is_paused: bool) -> None:
+        """Say `paused` for as long as that is so, whatever state the node would be in."""
+        self._is_paused = is_paused
+        self.tell('paused', is_paused)
 
     def tell(self, key: str, value: object) -> None:
         """Set a value that is told until another one takes its place."""
@@ -176,7 +188,7 @@ class Health:
             entry.told = entry.heard
 
     def _status(self, now: float) -> DiagnosticStatus:
-        level, message = self._state
+        level, message = (OK, 'paused') if self._is_paused else self._state
         complaints = [complaint for complaint in self._complaints if complaint.holds(self._node)]
         if complaints:
             worst = max(complaints, key=lambda complaint: complaint.level)
@@ -188,8 +200,11 @@ class Health:
         return DiagnosticStatus(level=level, name=f'{name.lstrip("/")}: thinmap', message=message, values=pairs)
 
     def _why(self) -> str:
-        refusals = [f'{topic}: {e.last_refusal}' for topic, e in self._topics.items() if e.last_refusal]
-        return '; '.join([*refusals, *self._drops])
+        """Reasons of the last refusals and drops, the newest first; what is over is not told."""
+        reasons = [(e.refused_at, f'{topic}: {e.last_refusal}') for topic, e in self._topics.items()]
+        reasons += [(at, cause) for cause, at in self._dropped_at.items()]
+        recent = [reason for reason in reasons if monotonic() - reason[0] <= _RECENT_S]
+        return '; '.join(text for _, text in sorted(recent, reverse=True))
 
     def _told(self, now: float) -> dict[str, str]:
         """All values, in an order that stays."""

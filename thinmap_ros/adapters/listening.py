@@ -51,9 +51,7 @@ class _Listener:
             node.health.dropped(f'{self._topic}: left over from before the clock was set back', 1)
         elif not node.is_active:
             self._held = message if self._is_latched else None
-        elif self._is_scan and node.is_paused:
-            node.health.tell('last scan not taken', 'paused')
-        else:
+        elif not (self._is_scan and node.is_paused):
             self._guarded(message)
 
     def _is_left_over(self, last_ns: int) -> bool:

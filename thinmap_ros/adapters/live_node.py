@@ -200,5 +200,5 @@ class LiveNode(LifecycleNode):
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self.is_paused = request.data
-        self.health.tell('paused', self.is_paused)
+        self.health.pause(self.is_paused)
         return answer(response, lambda: 'no new scans are taken' if self.is_paused else 'scans are taken')
