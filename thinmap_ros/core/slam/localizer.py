@@ -286,7 +286,7 @@ class Localizer:
     def _odometry(self, T_odom_base: Array) -> tuple[Array, Array]:
         """Input u of eq. (10): the increment (3,) since the last scan, and its covariance (3, 3)."""
         last, increment = self._T_odom_base, np.zeros(3)
-        moved = increment
+        since_it_moved: Array | None = None
         if se2.is_finite(T_odom_base):
             self._T_odom_base = np.array(T_odom_base, dtype=np.float64)
             if last is None:
@@ -294,16 +294,20 @@ class Localizer:
                 return increment, np.diag(np.square(_START_SIGMAS))
             increment = se2.between(last, self._T_odom_base)
             moved = se2.between(self._T_odom_moved, self._T_odom_base)
+            since_it_moved = moved if self._stands else None
             self._stands = self._within_slip(moved)
             if not self._stands:
                 self._T_odom_moved = self._T_odom_base
         if not se2.is_finite(T_odom_base) or math.hypot(increment[0], increment[1]) > _LONGEST_STEP_M:
             self.refused += 1
-            increment = moved = np.zeros(3)
+            increment = np.zeros(3)
+            since_it_moved = None
         variances = _USUAL_NOISE * odometry_variances(increment, self.config)
         increment, systematic = self._calibration.corrected(increment, variances)
         self._noise.move(increment)
-        return increment, odometry_covariance(moved, self.config, self._noise.share) + systematic
+        # Of a robot that stood, what it crept meanwhile was not counted yet.
+        counted = increment if since_it_moved is None else since_it_moved
+        return increment, odometry_covariance(counted, self.config, self._noise.share) + systematic
 
     def _within_slip(self, moved: Array) -> bool:
         """Whether a motion (3,) is no more than the error of any increment: 3 sigmas of the slip.
