@@ -14,9 +14,9 @@ from mcap.records import Message
 from mcap.writer import CompressionType, Writer
 
 from thinmap_ros.adapters import bag_qos
-from thinmap_ros.adapters.bag_salvage import Salvage, whole_records
 from thinmap_ros.adapters.bag_writer import BagWriter
 from thinmap_ros.adapters.bags import Bag
+from thinmap_ros.adapters.mcap_files import Damage, whole_records
 
 STRING = 'std_msgs/msg/String'
 COUNT, PER_CHUNK = 200, 10
@@ -128,9 +128,9 @@ def test_a_damaged_chunk_costs_only_itself(tmp_path: Path) -> None:
     middle = len(content) // 3
     content[middle : middle + 4] = b'????'
     (tmp_path / 'bag.mcap').write_bytes(content)
-    found = Salvage()
-    records = list(whole_records(tmp_path / 'bag.mcap', found))
-    assert found.damaged_chunks <= 1 and not found.cut_off
+    damage = Damage()
+    records = list(whole_records(tmp_path / 'bag.mcap', damage))
+    assert len(damage.parts) <= 1 and not damage.cut_off
     assert len(records) > 400
 
 
@@ -160,7 +160,7 @@ def test_no_damage_makes_it_stumble_or_invent(tmp_path: Path, share: float, nois
     at = 8 + int(share * (len(_WHOLE[0]) - 8))
     damaged = _WHOLE[0][:at] + noise + (b'' if cut else _WHOLE[0][at + len(noise) :])
     (tmp_path / 'damaged.mcap').write_bytes(damaged)
-    records = list(whole_records(tmp_path / 'damaged.mcap', Salvage()))
+    records = list(whole_records(tmp_path / 'damaged.mcap', Damage()))
     if not cut and not noise:
         assert sum(isinstance(record, Message) for record in records) == COUNT
     assert len(records) <= COUNT + 10 + len(noise)

@@ -82,6 +82,24 @@ def test_files_and_figures(log, tmp_path, form):
     assert patch.occupied[wall[0], wall[1] - 1 : wall[1] + 2].any()
 
 
+@pytest.mark.parametrize('share', [0.5, 0.97])
+def test_a_cut_off_bag_is_replayed_as_far_as_bag_repair_reads_it(log, tmp_path, share):
+    convert(CarmenLog(log, LaserOptions()), tmp_path / 'bag.mcap')
+    whole = (tmp_path / 'bag.mcap').read_bytes()
+    cut = tmp_path / 'cut.mcap'
+    cut.write_bytes(whole[: int(share * len(whole))])  # one chunk, and the summary
+    repair = [sys.executable, '-m', 'thinmap_ros.tools.bag_repair', cut, '-o', tmp_path / 'good.mcap']
+    assert subprocess.run(repair).returncode == 0
+    expected = run(tmp_path / 'good.mcap', '-o', tmp_path / 'expected', '--quiet')
+    done = run(cut, '-o', tmp_path / 'out', '--quiet')
+    assert (expected.returncode, done.returncode) == (0, 0), done.stderr
+    assert f'`bag_repair {cut}`' in done.stdout and 'cut off' in done.stdout
+    assert 'bag_repair' not in expected.stdout
+    for name in TRAJECTORIES | {'map.pgm'}:
+        assert (tmp_path / 'out' / name).read_bytes() == (tmp_path / 'expected' / name).read_bytes()
+    assert len(np.loadtxt(tmp_path / 'out' / 'trajectory.tum')) > 10
+
+
 def without_scans():
     return [line for line in carmen_lines() if not line.startswith('FLASER')]
 

@@ -1,8 +1,28 @@
 """Qualities of service as bags hold them: written with each topic, so that players offer what was offered."""
 
+from mcap.records import Channel
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.rosbag2.metadata import parse_qos
 
+from thinmap_ros.adapters.bag_folders import load_yaml
+from thinmap_ros.core.errors import InputError
+
+KEY = 'offered_qos_profiles'
+"""Key of a channel's metadata in an MCAP file; its value is YAML."""
 _FOREVER = QosTime(2147483647, 4294967295)
+_DEEPEST_QUEUE = 2**31
+
+
+def of_channel(channel: Channel) -> list[Qos]:
+    """QoS that the publishers of a channel offered; empty where it says none that can be read."""
+    text = channel.metadata.get(KEY, '')
+    try:
+        offers = parse_qos(load_yaml(text, channel.topic)) if text else []
+        depths = [offer.depth for offer in offers]
+    except (InputError, KeyError, TypeError, ValueError, AttributeError):
+        return []
+    good = all(isinstance(depth, int) and 0 <= depth < _DEEPEST_QUEUE for depth in depths)
+    return offers if good else []
 
 
 def recorded(depth: int, reliable: bool, latched: bool) -> Qos:

@@ -1,115 +1,122 @@
 """rosbag2 folders and MCAP files: read as scans and odometry, and read raw."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
-from mcap.reader import NonSeekingReader
-from mcap.records import Channel, Schema
-from rosbags.highlevel import AnyReader
-from rosbags.interfaces import ConnectionExtRosbag2, Qos
-from rosbags.rosbag2.metadata import parse_qos
-from rosbags.typesys import Stores, get_typestore
-from rosbags.typesys.store import Typestore
+import numpy as np
+from rosbags.interfaces import Qos
 
-from thinmap_ros.adapters import bag_messages, bag_types
+from thinmap_ros.adapters import bag_messages, checks
+from thinmap_ros.adapters.bag_folders import bag_files, without_compression
+from thinmap_ros.adapters.bag_storage import RawMessage, Storage, storage_of
 from thinmap_ros.adapters.events import Event, OdometryEvent, ScanEvent, Skipped
+from thinmap_ros.adapters.log_formats import is_mcap, refuse_foreign
+from thinmap_ros.adapters.mcap_records import LARGEST_CHUNK, DamagedError, unpacked
 from thinmap_ros.adapters.mounts import Mount, StaticTransforms, rotation_matrix
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
-_SCAN, _ODOMETRY, _TF = 'sensor_msgs/msg/LaserScan', 'nav_msgs/msg/Odometry', 'tf2_msgs/msg/TFMessage'
-
-
-@dataclass(frozen=True)
-class RawMessage:
-    """A message as it lies in a bag: topic, type, log time, CDR bytes."""
-
-    topic: str
-    type_name: str
-    log_ns: int
-    data: bytes
+_SCAN, _ODOMETRY, _TF = (
+    'sensor_msgs/msg/LaserScan',
+    'nav_msgs/msg/Odometry',
+    'tf2_msgs/msg/TFMessage',
+)
+_LISTED = 8
 
 
 class Bag:
-    """A bag opened for reading: `topics` and their types, `offers` and what their publishers offered.
-
-    `cut_off` says that it was read only as far as it is whole, which may show late.
-    """
+    """A bag opened for reading: `topics` and their types, `offers` and the QoS of their publishers."""
 
     def __init__(self, path: Path) -> None:
-        """Open a bag. Raises InputError naming the file where it is none."""
+        """Open a bag. Raises InputError naming the file where it is none or nothing is whole."""
         if not path.exists():
-            raise InputError(f'{path}: no such file or folder: expected a rosbag2 folder or an MCAP file')
-        if not path.is_dir() and path.suffix != '.mcap':
+            raise InputError(
+                f'{path}: no such file or folder: expected a rosbag2 folder or an MCAP file'
+            )
+        refuse_foreign(path)
+        if not (path.is_dir() or path.suffix == '.mcap' or is_mcap(path)):
             raise InputError(f'{path}: expected a rosbag2 folder or a file that ends in .mcap')
         self.path = path
-        self.cut_off = False
-        self.typestore: Typestore = get_typestore(Stores.ROS2_JAZZY)
         self.topics: dict[str, str] = {}
         self.offers: dict[str, list[Qos]] = {}
-        self._without_index = False
+        self._storages: list[Storage] = []
+        self._unpacked: list[TemporaryDirectory[str] | None] = []
+        self._files = bag_files(path)
+        self._unreadable = 0
         try:
-            with AnyReader([path], default_typestore=self.typestore) as reader:
-                for connection in reader.connections:
-                    self.topics[connection.topic] = connection.msgtype
-                    if isinstance(connection.ext, ConnectionExtRosbag2):
-                        self.offers.setdefault(connection.topic, []).extend(connection.ext.offered_qos_profiles)
-                self.typestore = reader.typestore
-        except Exception as error:  # rosbags' readers raise whatever a broken file makes them stumble over
-            self._look_through(error)
+            for file, unpacked_into in without_compression(self._files.files):
+                self._unpacked.append(unpacked_into)
+                self._add(storage_of(file))
+        except OSError as error:
+            raise InputError(f'{path}: {error.strerror or error}') from error
+        if self.damage and not any(storage.has_messages for storage in self._storages):
+            expected = 'expected a rosbag2 folder or an MCAP file'
+            raise InputError(f'{path}: {self.damage}: no whole message: {expected}')
+
+    @property
+    def cut_off(self) -> bool:
+        """Whether the bag is read only as far as it is whole, which may show late."""
+        return bool(self.damage)
+
+    @property
+    def damage(self) -> str:
+        """What of the bag is not whole, in one line; empty where all of it is."""
+        words = [str(storage.damage) for storage in self._storages if storage.damage]
+        if self._files.without_metadata:
+            words.append(self._files.without_metadata)
+        if self._unreadable:
+            words.append(f'{self._unreadable} messages that cannot be unpacked')
+        return '; '.join(words[:_LISTED])
+
+    @property
+    def advice(self) -> str:
+        """What is not whole and what to do about it, in one line; empty where all of it is whole."""
+        if not self.damage:
+            return ''
+        read = 'read as far as it is whole'
+        return (
+            f'{self.path}: {self.damage}: {read}; `bag_repair {self.path}` makes a whole bag of it'
+        )
 
     def messages(self, topics: set[str] | None = None) -> Iterator[RawMessage]:
-        """Messages in the order of the log, of the given topics or of all; they end where the file is broken."""
-        source = self._in_file_order() if self._without_index else self._in_log_order(topics)
-        try:
-            for message in source:
-                if topics is None or message.topic in topics:
+        """Whole messages of the given topics, or of all, in log order."""
+        for storage in self._storages:
+            for message in storage.messages(topics):
+                if not self._files.compressed_messages:
                     yield message
-        except Exception:  # as above: what came before it counts
-            self.cut_off = True
+                    continue
+                try:
+                    data = unpacked('zstd', message.data, LARGEST_CHUNK)
+                except DamagedError:
+                    self._unreadable += 1
+                    continue
+                yield RawMessage(message.topic, message.type_name, message.log_ns, data)
 
     def decode(self, message: RawMessage) -> Any:
         """Message object of a raw message. Raises InputError where its bytes do not fit its type."""
+        holders = (s for s in self._storages if s.topics.get(message.topic) == message.type_name)
+        storage = next(holders, self._storages[0])
         try:
-            return self.typestore.deserialize_cdr(message.data, message.type_name)
-        except Exception as error:  # any error of the deserializer means the same: these bytes are no such message
-            reason = ' '.join(str(error).split()) or type(error).__name__
-            raise InputError(f'{self.path}: {message.topic}: no {message.type_name}: {reason}') from error
+            return storage.typestore(message.type_name).deserialize_cdr(
+                message.data, message.type_name
+            )
+        except (
+            Exception
+        ) as error:  # any error of the deserializer means the same: these bytes are no such message
+            reason = ' '.join(str(error).split())[:120] or type(error).__name__
+            where = f'{self.path}: {checks.short(message.topic)}'
+            raise InputError(f'{where}: no {checks.short(message.type_name)}: {reason}') from error
 
-    def _in_log_order(self, topics: set[str] | None) -> Iterator[RawMessage]:
-        with AnyReader([self.path], default_typestore=self.typestore) as reader:
-            chosen = [c for c in reader.connections if topics is None or c.topic in topics]
-            for connection, log_ns, data in reader.messages(chosen) if chosen else ():
-                yield RawMessage(connection.topic, connection.msgtype, log_ns, bytes(data))
-
-    def _in_file_order(self) -> Iterator[RawMessage]:
-        """Messages of MCAP files without summary, which a killed recorder leaves, to the last whole chunk."""
-        for file in self._mcap_files():
-            with file.open('rb') as stream:
-                for schema, channel, message in NonSeekingReader(stream).iter_messages(log_time_order=False):
-                    if schema is not None:
-                        self._learn(schema, channel)
-                        yield RawMessage(channel.topic, schema.name, message.log_time, message.data)
-
-    def _mcap_files(self) -> list[Path]:
-        return sorted(self.path.glob('*.mcap')) if self.path.is_dir() else [self.path]
-
-    def _look_through(self, reason: Exception) -> None:
-        """Find the topics of a bag that ordinary readers refuse."""
-        said = ' '.join(str(reason).split()) or type(reason).__name__
-        self.topics, self.offers, self._without_index, self.cut_off = {}, {}, True, True
-        if not sum(1 for _ in self.messages()):
-            raise InputError(f'{self.path}: {said}: no whole message: expected a rosbag2 folder or an MCAP file')
-
-    def _learn(self, schema: Schema, channel: Channel) -> None:
-        if channel.topic not in self.topics:
-            self.topics[channel.topic] = schema.name
-            self.offers[channel.topic] = parse_qos(channel.metadata.get('offered_qos_profiles', ''))
-        bag_types.learn(self.typestore, schema)
+    def _add(self, storage: Storage) -> None:
+        self._storages.append(storage)
+        self.topics |= storage.topics
+        for topic, offers in storage.offers.items():
+            self.offers.setdefault(topic, offers)  # each file of a bag says the same of its topics
 
 
 @dataclass
@@ -151,12 +158,14 @@ class BagLog:
             else:
                 yield value
             used[message.topic] += 1
-        if bag.cut_off:
-            self.skipped.add(f'{self.path}: cut off: read up to its last whole chunk')
+        if bag.advice:
+            self.skipped.add_foremost(bag.advice)
         for topic, count in used.items():
             if count == 0:
                 first = f': {self.skipped.first}' if self.skipped.first else ''
-                raise InputError(f'{self.path}: {topic}: no message that can be used{first}')
+                raise InputError(
+                    f'{self.path}: {checks.short(topic)}: no message that can be used{first}'
+                )
 
     def _event(self, bag: Bag, message: RawMessage) -> tuple[str, OdometryEvent | Scan] | None:
         """Frame and value of a message; None, counted, where it is unusable."""
@@ -164,8 +173,8 @@ class BagLog:
             decoded = bag.decode(message)
             value = _odometry(decoded) if message.type_name == _ODOMETRY else _scan(decoded)
         except InputError as error:
-            reason = str(error).removeprefix(f'{self.path}: {message.topic}: ')
-            self.skipped.add(f'{self.path}: {message.topic}: {reason}')
+            where = f'{self.path}: {checks.short(message.topic)}: '
+            self.skipped.add(where + str(error).removeprefix(where))
             return None
         return decoded.header.frame_id, value
 
@@ -175,10 +184,13 @@ class BagLog:
             return wanted
         if not wanted and len(found) == 1:
             return found[0]
-        listed = ', '.join(f'{t} ({n})' for t, n in sorted(bag.topics.items())) or 'nothing'
         if not found or wanted:
+            listed = _listed(
+                f'{checks.short(t)} ({checks.short(n)})' for t, n in sorted(bag.topics.items())
+            )
             raise InputError(f'{self.path}: no {what} ({wanted or type_name}); it has {listed}')
-        raise InputError(f'{self.path}: {what} on several topics, name one of {", ".join(found)}')
+        listed = _listed(checks.short(topic) for topic in found)
+        raise InputError(f'{self.path}: {what} on several topics, name one of {listed}')
 
     def _static_transforms(self, bag: Bag) -> StaticTransforms:
         transforms = StaticTransforms()
@@ -188,7 +200,8 @@ class BagLog:
                 for transform in bag.decode(message).transforms:
                     transforms.add(transform)
             except InputError as error:
-                self.skipped.add(f'{self.path}: {message.topic}: {error}')
+                where = f'{self.path}: {checks.short(message.topic)}: '
+                self.skipped.add(where + str(error).removeprefix(where))
         return transforms
 
     def _mount(self, frame: str, transforms: StaticTransforms) -> Mount:
@@ -199,12 +212,20 @@ class BagLog:
         except InputError as error:
             raise InputError(f'{self.path}: /tf_static: {error}') from error
         if mount is None:
-            known = ', '.join(transforms.frames) or 'nothing'
+            known = _listed(checks.short(name) for name in transforms.frames)
+            where = f'where "{checks.short(frame)}" is on "{self.base_frame}"'
             raise InputError(
-                f'{self.path}: /tf_static does not say where "{frame}" is on "{self.base_frame}" (it has {known}): '
+                f'{self.path}: /tf_static does not say {where} (it has {known}): '
                 'give --base-frame, or --offset-m for a laser straight ahead'
             )
         return mount
+
+
+def _listed(names: Iterable[str]) -> str:
+    """Names as they can be printed: the first few."""
+    every = list(names)
+    more = f' and {len(every) - _LISTED} more' if len(every) > _LISTED else ''
+    return ', '.join(every[:_LISTED]) + more or 'nothing'
 
 
 def _odometry(message: Any) -> OdometryEvent:
@@ -218,11 +239,16 @@ def _odometry(message: Any) -> OdometryEvent:
 def _scan(message: Any) -> Scan:
     if len(message.ranges) == 0:
         raise InputError('a scan without ranges')
-    return Scan.create(
-        bag_messages.stamp_ns(message),
-        message.ranges,
-        message.angle_min,
-        message.angle_increment,
-        message.range_min,
-        message.range_max,
-    )
+    if len(message.ranges) > checks.MOST_BEAMS:
+        raise InputError(
+            f'a scan of {len(message.ranges)} ranges: expected at most {checks.MOST_BEAMS}'
+        )
+    with np.errstate(invalid='ignore'):  # a NaN stays one, however it is made
+        return Scan.create(
+            bag_messages.stamp_ns(message),
+            message.ranges,
+            message.angle_min,
+            message.angle_increment,
+            message.range_min,
+            message.range_max,
+        )

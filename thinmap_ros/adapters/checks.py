@@ -28,6 +28,11 @@ def shown(name: str) -> str:
     return repr(name if len(name) <= LONGEST_NAME else name[:LONGEST_NAME] + '...')
 
 
+def short(text: str, longest: int = 80) -> str:
+    """A topic, type or frame of a file as part of a message: one line of printable characters, unquoted, short."""
+    return repr(text if len(text) <= longest else text[:longest] + '...')[1:-1]
+
+
 def cells_in_range(cells: NDArray[np.int8]) -> None:
     """Raise InputError unless all cells are -1 (unknown) or 0 to 100 %."""
     if cells.size and (cells.min() < -1 or cells.max() > 100):

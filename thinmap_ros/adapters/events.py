@@ -38,6 +38,11 @@ class Skipped:
         self.count += 1
         self.first = self.first or where
 
+    def add_foremost(self, where: str) -> None:
+        """Count one more, which is named before what came first."""
+        self.count += 1
+        self.first = where
+
 
 class Log(Protocol):
     """A log file or bag."""

@@ -3,7 +3,8 @@
 from collections.abc import Iterator
 
 from thinmap_ros.adapters import bag_qos
-from thinmap_ros.adapters.bags import Bag, RawMessage
+from thinmap_ros.adapters.bag_storage import RawMessage
+from thinmap_ros.adapters.bags import Bag
 from thinmap_ros.core.errors import InputError
 
 _SCAN = 'sensor_msgs/msg/LaserScan'

@@ -14,7 +14,8 @@ from rosgraph_msgs.msg import Clock as ClockMsg
 from std_srvs.srv import SetBool, Trigger
 
 from thinmap_ros.adapters import messages, parameters, qos, runtime
-from thinmap_ros.adapters.bags import Bag, RawMessage
+from thinmap_ros.adapters.bag_storage import RawMessage
+from thinmap_ros.adapters.bags import Bag
 from thinmap_ros.adapters.health import OK, WARN, Health
 from thinmap_ros.adapters.lockstep import NONE, TOPICS, Lockstep
 from thinmap_ros.adapters.playback import Playback, is_scan
@@ -60,6 +61,8 @@ class BagPlayerNode(Node):
         if not self._config.bag:
             raise ConfigError("bag = '': expected a rosbag2 folder or an MCAP file")
         self._bag = Bag(Path(self._config.bag))
+        if self._bag.advice:
+            self.get_logger().warning(self._bag.advice)
         self._publishers_by_topic: dict[str, Publisher] = {}
         self._clock_topic = self.create_publisher(ClockMsg, '/clock', qos.STREAM)
         for topic in self._chosen():

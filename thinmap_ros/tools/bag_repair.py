@@ -3,24 +3,21 @@
 import argparse
 from pathlib import Path
 
+from thinmap_ros.adapters.bag_folders import mcap_files_in
 from thinmap_ros.adapters.bag_salvage import Salvage, repair
 from thinmap_ros.adapters.bag_writer import written_as_bag
+from thinmap_ros.adapters.log_formats import is_mcap, refuse_foreign
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.tools import cli
 
 
 def files_of(bag: Path) -> list[Path]:
     """Return the MCAP files of a bag, in the order in which they were recorded. Raises InputError where it has none."""
-    files = sorted(bag.glob('*.mcap'), key=_number) if bag.is_dir() else [bag]
-    if not files or not files[0].is_file() or files[0].suffix != '.mcap':
+    refuse_foreign(bag)
+    files = mcap_files_in(bag) if bag.is_dir() else [bag]
+    if not files or not files[0].is_file() or not (files[0].suffix == '.mcap' or is_mcap(files[0])):
         raise InputError(f'{bag}: expected an MCAP file, or a folder with MCAP files in it')
     return files
-
-
-def _number(file: Path) -> tuple[int, str]:
-    """rosbag2 numbers the files of a bag: name_0, name_1, ... name_10."""
-    number = file.stem.rpartition('_')[2]
-    return (int(number) if number.isdigit() else -1, file.name)
 
 
 def told(found: Salvage) -> str:
@@ -28,10 +25,7 @@ def told(found: Salvage) -> str:
     parts = [f'{sum(found.counts.values())} messages on {len(found.counts)} topics']
     if found.first_ns is not None:
         parts[0] += f', {(found.last_ns - found.first_ns) / 1e9:.1f} s'
-    if found.cut_off:
-        parts.append('it was cut off')
-    if found.damaged_chunks:
-        parts.append(f'{found.damaged_chunks} damaged chunks were left out')
+    parts.extend(f'{file.name}: {damage}' for file, damage in found.damage.items() if damage)
     return '; '.join(parts)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from thinmap_ros.adapters.bags import BagLog
 from thinmap_ros.adapters.carmen import CarmenLog, LaserOptions
 from thinmap_ros.adapters.events import Log
+from thinmap_ros.adapters.log_formats import is_mcap
 from thinmap_ros.core.config import Config
 from thinmap_ros.core.errors import ThinmapError
 
@@ -68,7 +69,7 @@ def open_log(arguments: argparse.Namespace) -> Log:
     """Return the log that the arguments name; a laser offset that is given comes before a bag's /tf_static."""
     path: Path = arguments.log
     options = config_from(arguments, LaserOptions)
-    if not (path.is_dir() or path.suffix == '.mcap'):
+    if not (path.is_dir() or path.suffix == '.mcap' or is_mcap(path)):
         return CarmenLog(path, options)
     T_base_laser = np.array([options.offset_m, 0.0, 0.0]) if hasattr(arguments, 'offset_m') else None
     return BagLog(path, arguments.scan_topic, arguments.odom_topic, T_base_laser, arguments.base_frame)

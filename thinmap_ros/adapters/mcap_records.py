@@ -1,0 +1,232 @@
+"""Records of MCAP files within limits: memory is taken for what is there, not for what is claimed.
+
+Source: https://mcap.dev/spec.
+"""
+
+import struct
+import zlib
+from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass
+from io import BytesIO
+from typing import Any
+
+import lz4.frame
+import numpy as np
+import zstandard
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Message, Schema
+from numpy.typing import NDArray
+
+MAGIC = b'\x89MCAP0\r\n'
+LARGEST_CHUNK = 256 * 2**20
+"""Bytes of a chunk, uncompressed, and of a message. Recorders close a chunk at 1 to 4 MB."""
+LATEST_NS = 2**31 * 1_000_000_000
+"""Log times end here, in 2038, as the seconds of ROS's messages do."""
+
+HEAD = struct.Struct('<BQ')
+_CHUNK = struct.Struct('<QQQI')
+_MESSAGE = struct.Struct('<HIQQ')
+_IN_CHUNK = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
+_PRIVATE = 0x80
+_MOST_DEFINITIONS = 2**16
+_PIECE = 2**20
+_SLICE = 2**16
+
+Definition = Schema | Channel
+
+
+class DamagedError(Exception):
+    """Bytes that are not what their place in the file says: what was found, what was expected."""
+
+
+@dataclass(frozen=True, eq=False)
+class Records:
+    """The records of a chunk, or of a stretch of the file without chunks.
+
+    definitions: schemas and channels; log_ns (N,), channel_ids (N,), offsets (N,): the messages in
+    file order, offsets into `data`; damaged: why records were left out, empty where none were.
+    """
+
+    data: bytes
+    definitions: list[Definition]
+    log_ns: NDArray[np.uint64]
+    channel_ids: NDArray[np.uint16]
+    offsets: NDArray[np.uint64]
+    damaged: str = ''
+
+    @property
+    def first_ns(self) -> int:
+        """Log time of the earliest message, 0 where there is none."""
+        return int(self.log_ns.min()) if self.log_ns.size else 0
+
+    def message(self, index: int) -> Message:
+        """Message by its place in `offsets`."""
+        at = int(self.offsets[index])
+        (_, length) = HEAD.unpack_from(self.data, at - HEAD.size)
+        channel_id, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(self.data, at)
+        content = self.data[at + _MESSAGE.size : at + length]
+        return Message(channel_id, log_ns, content, publish_ns, sequence)
+
+    def messages(self) -> Iterator[Message]:
+        """All messages in the order of the file."""
+        return (self.message(index) for index in range(self.offsets.size))
+
+
+def chunk_records(content: bytes, whole: bool) -> Records:
+    """Records of a chunk record's content; if it was cut off (not `whole`), those before the cut.
+
+    Raises DamagedError where it has been changed or is larger than LARGEST_CHUNK.
+    """
+    try:
+        _, _, size, checksum = _CHUNK.unpack_from(content)
+        (n,) = struct.unpack_from('<I', content, _CHUNK.size)
+        compression = content[_CHUNK.size + 4 : _CHUNK.size + 4 + n].decode('ascii')
+        (length,) = struct.unpack_from('<Q', content, _CHUNK.size + 4 + n)
+    except (struct.error, ValueError) as error:
+        raise DamagedError(f'no head of a chunk: {_short(error)}') from error
+    packed = content[_CHUNK.size + 12 + n : _CHUNK.size + 12 + n + length]
+    if whole and len(packed) < length:
+        raise DamagedError(f'{len(packed)} bytes compressed: expected {length}')
+    # The length of the whole record may be what is damaged.
+    complete = len(packed) == length
+    data = unpacked(compression, packed, size, complete)
+    if complete and len(data) != size:
+        raise DamagedError(f'{len(data)} bytes uncompressed: expected {size}')
+    if complete and checksum and zlib.crc32(data) != checksum:
+        raise DamagedError('checksum that does not fit its bytes')
+    return records_of(data, complete)
+
+
+def unpacked(compression: str, data: bytes, size: int, whole: bool = True) -> bytes:
+    """Uncompressed bytes; of data that was cut off (not `whole`) what comes out before the cut.
+
+    size: what the file claims, bytes; no more is ever unpacked. Raises DamagedError where it is
+    more than LARGEST_CHUNK, or the data expand to more than it.
+    """
+    if size > LARGEST_CHUNK:
+        raise DamagedError(f'{size} bytes uncompressed: expected at most {LARGEST_CHUNK}')
+    if compression == '':
+        return data
+    if compression not in ('lz4', 'zstd'):
+        raise DamagedError(f'compression {compression[:20]!r}: expected none, lz4 or zstd')
+    pieces = _lz4_pieces(data) if compression == 'lz4' else _zstd_pieces(data)
+    result = bytearray()
+    try:
+        for piece in pieces:
+            result += piece
+            if len(result) > size:
+                raise DamagedError(f'more than the {size} bytes uncompressed that it claims')
+    except (RuntimeError, zstandard.ZstdError) as error:
+        if whole:
+            raise DamagedError(f'{compression}: {_short(error)}') from error
+    return bytes(result)
+
+
+def _zstd_pieces(data: bytes) -> Iterator[bytes]:
+    reader = zstandard.ZstdDecompressor().stream_reader(BytesIO(data), read_across_frames=True)
+    while piece := reader.read(_PIECE):
+        yield piece
+
+
+def _lz4_pieces(data: bytes) -> Iterator[bytes]:
+    unpacker: Any = lz4.frame.LZ4FrameDecompressor()
+    for at in range(0, len(data), _SLICE):
+        piece = unpacker.decompress(data[at : at + _SLICE], max_length=_PIECE)
+        yield piece
+        while not unpacker.needs_input and not unpacker.eof:
+            yield unpacker.decompress(b'', max_length=_PIECE)
+        if unpacker.eof:
+            return
+
+
+def records_of(data: bytes, whole: bool = True) -> Records:
+    """Records that lie one after the other in `data`, up to its end or to bytes that are no record.
+
+    The message before such bytes is left out, too: most likely its own length is wrong. Of data
+    that was cut off (not `whole`) an incomplete last record is expected. Raises DamagedError at
+    too many definitions.
+    """
+    found = _Found([], array('Q'), array('H'), array('Q'))
+    at = 0
+    is_record = True
+    while at + HEAD.size <= len(data):
+        code, length = HEAD.unpack_from(data, at)
+        start = at + HEAD.size
+        is_record = code in _IN_CHUNK or code >= _PRIVATE
+        if not is_record or start + length > len(data):
+            break
+        found.add(code, data, start, length)
+        at = start + length
+    if at < len(data) and (whole or not is_record):
+        found.leave_out_last(f'no record at byte {at} of {len(data)}')
+    return Records(
+        data,
+        found.definitions,
+        np.frombuffer(found.log_ns, dtype=np.uint64),
+        np.frombuffer(found.channel_ids, dtype=np.uint16),
+        np.frombuffer(found.offsets, dtype=np.uint64),
+        found.damaged,
+    )
+
+
+@dataclass
+class _Found:
+    """Collects the records of some bytes; 18 bytes a message, however many a chunk has."""
+
+    definitions: list[Definition]
+    log_ns: 'array[int]'
+    channel_ids: 'array[int]'
+    offsets: 'array[int]'
+    damaged: str = ''
+
+    def add(self, code: int, data: bytes, start: int, length: int) -> None:
+        """Add a record by where its content lies, or note why it is none."""
+        try:
+            if code == Opcode.MESSAGE:
+                self._add_message(data, start, length)
+            elif code in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self.definitions.append(definition(code, data[start : start + length]))
+        except DamagedError as error:
+            self.damaged = self.damaged or str(error)
+        if len(self.definitions) > _MOST_DEFINITIONS:
+            raise DamagedError(f'more than {_MOST_DEFINITIONS} schemas and channels')
+
+    def leave_out_last(self, reason: str) -> None:
+        """Leave the last message out."""
+        self.damaged = self.damaged or reason
+        for values in (self.log_ns, self.channel_ids, self.offsets):
+            del values[-1:]
+
+    def _add_message(self, data: bytes, start: int, length: int) -> None:
+        if length < _MESSAGE.size:
+            raise DamagedError(f'message of {length} bytes: expected at least {_MESSAGE.size}')
+        channel_id, _, log_ns, _ = _MESSAGE.unpack_from(data, start)
+        if log_ns >= LATEST_NS:
+            raise DamagedError(f'message logged at {log_ns} ns: expected less than {LATEST_NS}')
+        self.log_ns.append(log_ns)
+        self.channel_ids.append(channel_id)
+        self.offsets.append(start)
+
+
+def definition(code: int, content: bytes) -> Definition:
+    """Schema or channel from its record's content. Raises DamagedError where it is none."""
+    stream = ReadDataStream(BytesIO(content))
+    builder = RecordBuilder()
+    try:
+        record: Definition = Schema.read(stream) if code == Opcode.SCHEMA else Channel.read(stream)
+        record.write(builder)
+    except (McapError, struct.error, ValueError) as error:
+        raise DamagedError(f'{Opcode(code).name.lower()}: {_short(error)}') from error
+    # mcap reads what is there of a string that claims to be longer.
+    if not content.startswith(builder.end()[HEAD.size :]):
+        raise DamagedError(
+            f'{Opcode(code).name.lower()}: lengths that do not fit its {len(content)} bytes'
+        )
+    return record
+
+
+def _short(error: Exception) -> str:
+    return ' '.join(str(error).split())[:80] or type(error).__name__
