@@ -186,3 +186,15 @@ def test_a_bag_that_ends_before_the_offset_is_refused(graph, bag):
     player = graph.start('bag_player', bag=str(bag), start_offset_s=60.0)
     assert player.wait(timeout=60.0) == 2
     assert 'start_offset_s = 60.0' in graph.log('bag_player').strip().splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ('begin', 'said'), [(b'#ROSBAG V2.0\n', 'rosbags-convert'), (b'SQLite format 3\0', 'ros2 bag reindex')]
+)
+def test_the_player_names_formats_that_it_does_not_read(graph, tmp_path, begin, said):
+    (tmp_path / 'old.bag').write_bytes(begin + bytes(100))
+    player = graph.start('bag_player', bag=str(tmp_path / 'old.bag'))
+    del graph.processes['bag_player']
+    assert player.wait(timeout=60) == 2
+    (line,) = [line for line in graph.log('bag_player').splitlines() if line.startswith('error: ')]
+    assert 'old.bag' in line and said in line

@@ -15,6 +15,7 @@ from typing import BinaryIO
 import numpy as np
 
 from thinmap_ros.adapters.events import Event, OdometryEvent, ScanEvent, Skipped
+from thinmap_ros.adapters.log_formats import is_mcap, refuse_foreign
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
@@ -23,6 +24,8 @@ from thinmap_ros.core.se2 import Array
 
 _SECOND_NS = 1_000_000_000
 _LATEST_S = 2**31
+LONGEST_LINE = 4 * 2**20
+"""Bytes of a line, unpacked. A scan of 1,000 beams takes 7,000."""
 
 
 @dataclass(frozen=True)
@@ -69,9 +72,18 @@ class CarmenLog:
             raise InputError(f'{self.path}: no scan: expected FLASER or ROBOTLASER1 lines{reason}')
 
     def _lines(self) -> Iterator[tuple[int, str]]:
+        refuse_foreign(self.path)
+        if is_mcap(self.path):
+            raise InputError(f'{self.path}: an MCAP file, which is a bag: expected a CARMEN log')
         try:
             with _open(self.path) as stream:
-                for number, line in enumerate(stream, start=1):
+                # One byte more than the limit: of a longer line no more is ever read.
+                lines = iter(lambda: stream.readline(LONGEST_LINE + 1), b'')
+                for number, line in enumerate(lines, start=1):
+                    if len(line) > LONGEST_LINE:
+                        raise InputError(
+                            f'{self.path}:{number}: a line of more than {LONGEST_LINE} bytes: expected a CARMEN log'
+                        )
                     if b'\0' in line:
                         raise InputError(f'{self.path}:{number}: a zero byte: expected a text file (CARMEN log)')
                     text = line.decode('utf-8', errors='replace')
