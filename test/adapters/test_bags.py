@@ -1,6 +1,7 @@
 """Bags: what is written is read back, and a bag that is broken or lacks something is said so in one line."""
 
 import math
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mcap.writer import Writer
 
 from thinmap_ros.adapters.bag_writer import BagWriter
 from thinmap_ros.adapters.bags import Bag, BagLog
@@ -335,3 +337,56 @@ def test_damaged_bags(tmp_path: Path, share: float, noise: bytes, cut: bool) -> 
             assert isinstance(event, OdometryEvent | ScanEvent)
     except InputError as error:
         assert '\n' not in str(error)
+
+
+def test_what_a_bag_names_is_quoted_in_short(tmp_path: Path) -> None:
+    def fill(writer: BagWriter, make: Maker) -> None:
+        for k in range(300):
+            writer.write(f'/robot_{k}/' + 'x' * 500, SCAN, 5, make.scan(5, RANGES))
+
+    path = write(tmp_path / 'bag.mcap', fill)
+    with pytest.raises(InputError, match=r'name one of /robot_0/x+\.\.\., .* and 29\d more$') as error:
+        read(path)
+    assert len(str(error.value)) < 400
+    with pytest.raises(InputError, match='no odometry') as error:
+        read(path, scan_topic='/robot_0/' + 'x' * 500)
+    assert len(str(error.value)) < 500
+
+
+def test_a_scan_of_too_many_beams_is_skipped(tmp_path: Path) -> None:
+    def fill(writer: BagWriter, make: Maker) -> None:
+        drive(writer, make)
+        writer.write('/scan', SCAN, 2 * 10**9, make.scan(2 * 10**9, [1.0] * 200_001))
+
+    log = BagLog(write(tmp_path / 'bag', fill))
+    assert len(scans(list(log.events()))) == 3
+    assert (log.skipped.count, '200001 ranges' in log.skipped.first) == (1, True)
+
+
+def test_definitions_are_those_of_the_bag(tmp_path: Path) -> None:
+    """A ROS 1 bag that was converted without new types keeps the `seq` of its headers."""
+    definition = 'Header header\nfloat32 x\n' + '=' * 80 + '\nMSG: std_msgs/Header\n'
+    definition += 'uint32 seq\ntime stamp\nstring frame_id\n'
+    with (tmp_path / 'bag.mcap').open('wb') as out:
+        writer = Writer(out)
+        writer.start(profile='ros2')
+        schema = writer.register_schema('a_msgs/msg/Old', 'ros2msg', definition.encode())
+        channel = writer.register_channel('/old', 'cdr', schema)
+        content = struct.pack('<IiIIccxxf', 7, 1, 2, 2, b'a', b'\0', 1.5)
+        writer.add_message(channel, 5, b'\0\1\0\0' + content, 5)
+        writer.finish()
+    bag = Bag(tmp_path / 'bag.mcap')
+    (message,) = bag.messages()
+    decoded = bag.decode(message)
+    assert (decoded.header.seq, decoded.header.frame_id, decoded.x) == (7, 'a', 1.5)
+
+
+def test_files_of_a_bag_are_read_as_they_were_numbered(tmp_path: Path) -> None:
+    folder = tmp_path / 'bag'
+    folder.mkdir()
+    for k in range(12):
+        with BagWriter(folder / f'bag_{k}.mcap') as writer:
+            writer.write('/scan', SCAN, k, Maker(writer).scan(k, RANGES))
+    bag = Bag(folder)
+    assert [message.log_ns for message in bag.messages()] == list(range(12))
+    assert 'metadata.yaml' in bag.advice and 'bag_repair' in bag.advice

@@ -198,3 +198,16 @@ def test_the_player_names_formats_that_it_does_not_read(graph, tmp_path, begin, 
     assert player.wait(timeout=60) == 2
     (line,) = [line for line in graph.log('bag_player').splitlines() if line.startswith('error: ')]
     assert 'old.bag' in line and said in line
+
+
+def test_the_player_leaves_out_topics_whose_names_are_damaged(graph, tmp_path):
+    writer = BagWriter(tmp_path / 'bag', live=True)
+    string = writer.typestore.types[STRING]
+    for topic in ('/said', '/sa id'):
+        writer.write(topic, STRING, 10**9, string(data='0'))
+    writer.close()
+    heard = graph.heard('said', String)
+    graph.start('bag_player', bag=str(tmp_path / 'bag'))
+    graph.until(lambda: heard, 'what was said')
+    assert '/sa id is not played: Invalid topic name' in graph.log('bag_player')
+    assert 'Traceback' not in graph.log('bag_player')

@@ -10,7 +10,7 @@ from thinmap_ros.core.errors import InputError
 KEY = 'offered_qos_profiles'
 """Key of a channel's metadata in an MCAP file; its value is YAML."""
 _FOREVER = QosTime(2147483647, 4294967295)
-_DEEPEST_QUEUE = 2**31
+_DEEPEST_QUEUE = 100_000
 
 
 def of_channel(channel: Channel) -> list[Qos]:

@@ -14,11 +14,13 @@ _IDL_SEPARATOR = '=' * 80 + '\n'
 def typestore_of(schema: Schema) -> Typestore:
     """Types to decode messages of a schema with: its own, or ROS 2 Jazzy's where these do not do.
 
-    That is where a definition cannot be read, or lacks fields of a type that Jazzy knows.
+    That is where a definition cannot be read, lacks a type that it is made of, or lacks fields of a
+    type that Jazzy knows.
     """
     known = get_typestore(Stores.ROS2_JAZZY)
     try:
         own = own_typestore(schema)
+        own.hash_rihs01(schema.name)  # raises where a type is missing
     except Exception:  # rosbags' parser raises whatever a broken definition makes it stumble over
         return known
     for name in own.fielddefs.keys() & known.fielddefs.keys():

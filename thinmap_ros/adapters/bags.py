@@ -1,6 +1,6 @@
 """rosbag2 folders and MCAP files: read as scans and odometry, and read raw."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,7 +26,7 @@ _SCAN, _ODOMETRY, _TF = (
     'nav_msgs/msg/Odometry',
     'tf2_msgs/msg/TFMessage',
 )
-_LISTED = 8
+_MOST_TOLD = 8
 
 
 class Bag:
@@ -71,7 +71,7 @@ class Bag:
             words.append(self._files.without_metadata)
         if self._unreadable:
             words.append(f'{self._unreadable} messages that cannot be unpacked')
-        return '; '.join(words[:_LISTED])
+        return '; '.join(words[:_MOST_TOLD])
 
     @property
     def advice(self) -> str:
@@ -141,6 +141,14 @@ class BagLog:
         """
         bag = Bag(self.path)
         self.skipped = Skipped()
+        try:
+            yield from self._events(bag)
+        except InputError as error:
+            if bag.damage and bag.damage not in str(error):
+                raise InputError(f'{error}; the bag is not whole: {bag.damage}') from error
+            raise
+
+    def _events(self, bag: Bag) -> Iterator[Event]:
         used = {
             self._topic(bag, _SCAN, self.scan_topic, 'laser scans'): 0,
             self._topic(bag, _ODOMETRY, self.odometry_topic, 'odometry'): 0,
@@ -185,12 +193,10 @@ class BagLog:
         if not wanted and len(found) == 1:
             return found[0]
         if not found or wanted:
-            listed = _listed(
-                f'{checks.short(t)} ({checks.short(n)})' for t, n in sorted(bag.topics.items())
-            )
-            raise InputError(f'{self.path}: no {what} ({wanted or type_name}); it has {listed}')
-        listed = _listed(checks.short(topic) for topic in found)
-        raise InputError(f'{self.path}: {what} on several topics, name one of {listed}')
+            has = checks.listed([f'{topic} ({name})' for topic, name in sorted(bag.topics.items())])
+            raise InputError(f'{self.path}: no {what} ({wanted or type_name}); it has {has}')
+        names = checks.listed(found)
+        raise InputError(f'{self.path}: {what} on several topics, name one of {names}')
 
     def _static_transforms(self, bag: Bag) -> StaticTransforms:
         transforms = StaticTransforms()
@@ -212,20 +218,13 @@ class BagLog:
         except InputError as error:
             raise InputError(f'{self.path}: /tf_static: {error}') from error
         if mount is None:
-            known = _listed(checks.short(name) for name in transforms.frames)
+            known = checks.listed(transforms.frames)
             where = f'where "{checks.short(frame)}" is on "{self.base_frame}"'
             raise InputError(
                 f'{self.path}: /tf_static does not say {where} (it has {known}): '
                 'give --base-frame, or --offset-m for a laser straight ahead'
             )
         return mount
-
-
-def _listed(names: Iterable[str]) -> str:
-    """Names as they can be printed: the first few."""
-    every = list(names)
-    more = f' and {len(every) - _LISTED} more' if len(every) > _LISTED else ''
-    return ', '.join(every[:_LISTED]) + more or 'nothing'
 
 
 def _odometry(message: Any) -> OdometryEvent:

@@ -1,6 +1,7 @@
 """What a message may say at most: beyond that it is a mistake, whoever made it."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ FARTHEST_M = se2.FARTHEST_M
 LARGEST_ANGLE_RAD = 4.0 * np.pi
 MOST_BEAMS = 200_000
 LONGEST_NAME = 40
+LONGEST_LIST = 200
 
 
 def within(what: str, values: Iterable[float], limit: float = FARTHEST_M) -> None:
@@ -31,6 +33,15 @@ def shown(name: str) -> str:
 def short(text: str, longest: int = 80) -> str:
     """A topic, type or frame of a file as part of a message: one line of printable characters, unquoted, short."""
     return repr(text if len(text) <= longest else text[:longest] + '...')[1:-1]
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names of a file as part of a message: the first of them, in short, and how many more there are."""
+    told = [short(name) for name in names]
+    lengths = accumulate(len(name) + 2 for name in told)
+    count = max(1, sum(length <= LONGEST_LIST for length in lengths))
+    more = f' and {len(told) - count} more' if len(told) > count else ''
+    return ', '.join(told[:count]) + more or 'nothing'
 
 
 def cells_in_range(cells: NDArray[np.int8]) -> None:

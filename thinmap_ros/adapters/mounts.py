@@ -84,7 +84,8 @@ def _laid_down(frame: str, rotation: Array, translation: Array) -> Mount:
     up = float(rotation[2, 2])
     if abs(up) < math.cos(math.radians(_LARGEST_TILT_DEG)):
         tilt = math.degrees(math.acos(min(abs(up), 1.0)))
-        raise InputError(f'laser {frame!r} is tilted by {tilt:.0f} deg: expected at most {_LARGEST_TILT_DEG:.0f}')
+        expected = f'expected at most {_LARGEST_TILT_DEG:.0f}'
+        raise InputError(f'laser {checks.shown(frame)} is tilted by {tilt:.0f} deg: {expected}')
     yaw = math.atan2(rotation[1, 0], rotation[0, 0])
     return Mount(se2.pose(float(translation[0]), float(translation[1]), yaw), up < 0.0)
 

@@ -8,12 +8,13 @@ from time import monotonic
 
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
+from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock as ClockMsg
 from std_srvs.srv import SetBool, Trigger
 
-from thinmap_ros.adapters import messages, parameters, qos, runtime
+from thinmap_ros.adapters import checks, messages, parameters, qos, runtime
 from thinmap_ros.adapters.bag_storage import RawMessage
 from thinmap_ros.adapters.bags import Bag
 from thinmap_ros.adapters.health import OK, WARN, Health
@@ -96,24 +97,23 @@ class BagPlayerNode(Node):
     def _chosen(self) -> list[str]:
         asked = {topic.strip() for topic in self._config.topics.split(',') if topic.strip()}
         if unknown := asked - set(self._bag.topics):
-            raise InputError(
-                f'{self._config.bag}: no topic {sorted(unknown)[0]}; it has {", ".join(sorted(self._bag.topics))}'
-            )
+            has = checks.listed(sorted(self._bag.topics))
+            raise InputError(f'{self._config.bag}: no topic {sorted(unknown)[0]}; it has {has}')
         # A recorded clock would run against the player's own.
         return sorted((asked or set(self._bag.topics)) - {'/clock'})
 
     def _offer(self, topic: str) -> None:
         """Make the publisher of a topic. What is not installed here is left out, unless it was asked for by name."""
-        try:
-            kind = message_class(self._bag.topics[topic])
-        except InputError as error:
-            if self._config.topics:
-                raise
-            self.get_logger().warning(f'{topic} is not played: {error}')
-            return
         name = f'/{self._config.prefix.strip("/")}{topic}' if self._config.prefix else topic
         profile = qos.as_recorded(topic, self._bag.offers.get(topic, []))
-        self._publishers_by_topic[topic] = self.create_publisher(kind, name, profile)
+        try:
+            kind = message_class(self._bag.topics[topic])
+            self._publishers_by_topic[topic] = self.create_publisher(kind, name, profile)
+        except (InputError, NameValidationException) as error:
+            reason = ' '.join(str(error).split())[:200]
+            if self._config.topics:
+                raise InputError(f'{checks.short(topic)}: {reason}') from error
+            self.get_logger().warning(f'{checks.short(topic)} is not played: {reason}')
 
     def _has_listeners(self) -> bool:
         scans = [t for t in self._publishers_by_topic if self._bag.topics[t] == _SCAN]
