@@ -12,6 +12,9 @@ from hypothesis import strategies as st
 from mcap.reader import NonSeekingReader
 from mcap.records import Message
 from mcap.writer import CompressionType, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as RosbagWriter
+from rosbags.typesys import Stores, get_typestore
 
 from thinmap_ros.adapters import bag_qos
 from thinmap_ros.adapters.bag_writer import BagWriter
@@ -147,6 +150,36 @@ def test_what_cannot_be_repaired_is_said_in_one_line(tmp_path: Path) -> None:
     done = repaired(write(tmp_path / 'bag') / 'bag.mcap', '-o', str(tmp_path / 'home'))
     assert done.returncode == 2 and 'thesis' in done.stderr
     assert not list(tmp_path.glob('.*.part'))
+
+
+def test_behind_a_range_of_zeros_it_goes_on_at_the_next_chunk_of_the_summary(tmp_path: Path) -> None:
+    folder = write(tmp_path / 'bag')
+    content = bytearray((folder / 'bag.mcap').read_bytes())
+    middle = len(content) // 3
+    content[middle : middle + 3000] = bytes(3000)
+    (folder / 'bag.mcap').write_bytes(content)
+    done = repaired(folder)
+    assert done.returncode == 0 and 'damaged part' in done.stdout
+    found = numbers(tmp_path / 'bag_repaired')
+    assert COUNT - 10 * PER_CHUNK < len(found) < COUNT and {0, COUNT - 1} <= set(found)
+    bag = Bag(folder)
+    assert [int(bag.decode(m).data.split()[1]) for m in bag.messages()] == found
+    assert bag.cut_off
+
+
+def test_messages_that_are_compressed_each_on_its_own_are_unpacked(tmp_path: Path) -> None:
+    writer = RosbagWriter(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP)
+    writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+    types = get_typestore(Stores.ROS2_JAZZY)
+    with writer:
+        connection = writer.add_connection('/said', STRING, typestore=types)
+        for i in range(20):
+            data = types.serialize_cdr(types.types[STRING](data=f'number {i}'), STRING)
+            writer.write(connection, 10**9 + i, data)
+    assert numbers(tmp_path / 'bag') == list(range(20))
+    done = repaired(tmp_path / 'bag', '-o', str(tmp_path / 'good.mcap'))
+    assert done.returncode == 0, done.stderr
+    assert numbers(tmp_path / 'good.mcap') == list(range(20))
 
 
 _WHOLE: list[bytes] = []

@@ -22,7 +22,7 @@ from thinmap_ros.core.errors import InputError
 
 MAGIC = b'\x89MCAP0\r\n'
 EXPANDED = 900 * 2**20
-MOST_MB = 550
+MOST_MB = 300
 RUNNER = """
 import resource, runpy, sys
 del sys.argv[0]

@@ -12,17 +12,19 @@ from rosbags.rosbag2.metadata import dump_qos_v9
 from thinmap_ros.adapters import bag_qos, bag_types
 from thinmap_ros.adapters.files import write_text
 from thinmap_ros.adapters.mcap_files import Damage, Definitions, whole_records
+from thinmap_ros.adapters.mcap_records import LARGEST_CHUNK, DamagedError, unpacked
 from thinmap_ros.core.errors import InputError
 
 
 @dataclass
 class Salvage:
-    """What was found: messages by topic, and by file what is not whole."""
+    """What was found: messages by topic, what is not whole by file, and messages that cannot be unpacked."""
 
     counts: dict[str, int] = field(default_factory=dict)
     first_ns: int | None = None
     last_ns: int = 0
     damage: dict[Path, Damage] = field(default_factory=dict)
+    unreadable: int = 0
 
     def count(self, topic: str, log_ns: int) -> None:
         """Count one message."""
@@ -36,9 +38,10 @@ class Salvage:
         return next((str(damage) for damage in self.damage.values() if damage), '')
 
 
-def repair(files: list[Path], folder: Path) -> Salvage:
+def repair(files: list[Path], folder: Path, compressed_messages: bool = False) -> Salvage:
     """Write what is whole in MCAP files into folder/NAME.mcap and folder/metadata.yaml, NAME being the folder's.
 
+    compressed_messages: each message is compressed on its own; it is written unpacked.
     Raises InputError where a file is no MCAP file, or no whole message is left.
     """
     found = Salvage()
@@ -47,7 +50,7 @@ def repair(files: list[Path], folder: Path) -> Salvage:
     with (folder / f'{folder.name}.mcap').open('wb') as stream:
         writer = Writer(stream, compression=CompressionType.ZSTD)
         writer.start(profile='ros2')
-        copy = _Copy(writer, found, channels, schemas)
+        copy = _Copy(writer, found, channels, schemas, compressed_messages)
         for file in files:
             copy.add_file(file)
         writer.finish()
@@ -66,6 +69,7 @@ class _Copy:
     found: Salvage
     channels: dict[str, Channel]
     schemas: dict[str, Schema]
+    compressed_messages: bool = False
     _schema_ids: dict[str, int] = field(default_factory=dict)
     _channel_ids: dict[str, int] = field(default_factory=dict)
 
@@ -76,7 +80,15 @@ class _Copy:
             if not isinstance(record, Message):
                 definitions.add(record)
             elif (known := definitions.of(record.channel_id)) is not None:
-                self._write(*known, record)
+                try:
+                    self._write(*known, self._uncompressed(record))
+                except DamagedError:
+                    self.found.unreadable += 1
+
+    def _uncompressed(self, message: Message) -> Message:
+        if not self.compressed_messages:
+            return message
+        return replace(message, data=unpacked('zstd', message.data, LARGEST_CHUNK))
 
     def _write(self, schema: Schema, channel: Channel, message: Message) -> None:
         if schema.name not in self._schema_ids:

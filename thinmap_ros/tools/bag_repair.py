@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from thinmap_ros.adapters.bag_folders import mcap_files_in
+from thinmap_ros.adapters.bag_folders import bag_files, mcap_files_in
 from thinmap_ros.adapters.bag_salvage import Salvage, repair
 from thinmap_ros.adapters.bag_writer import written_as_bag
 from thinmap_ros.adapters.log_formats import is_mcap, refuse_foreign
@@ -20,12 +20,22 @@ def files_of(bag: Path) -> list[Path]:
     return files
 
 
+def _has_compressed_messages(bag: Path) -> bool:
+    """Whether metadata.yaml says that each message is compressed on its own; without it, none is."""
+    try:
+        return bag_files(bag).compressed_messages
+    except InputError:
+        return False
+
+
 def told(found: Salvage) -> str:
     """Say in one line what was found."""
     parts = [f'{sum(found.counts.values())} messages on {len(found.counts)} topics']
     if found.first_ns is not None:
         parts[0] += f', {(found.last_ns - found.first_ns) / 1e9:.1f} s'
     parts.extend(f'{file.name}: {damage}' for file, damage in found.damage.items() if damage)
+    if found.unreadable:
+        parts.append(f'{found.unreadable} messages that cannot be unpacked')
     return '; '.join(parts)
 
 
@@ -36,7 +46,7 @@ def _work(arguments: argparse.Namespace) -> None:
     if out.resolve() == bag.resolve():
         raise InputError(f'{out}: expected another name than that of the bag itself')
     with written_as_bag(out) as folder:
-        found = repair(files, folder)
+        found = repair(files, folder, _has_compressed_messages(bag))
     print(f'{out}: {told(found)}')
 
 
