@@ -18,7 +18,7 @@ from thinmap_ros.adapters.events import Event, OdometryEvent, ScanEvent, Skipped
 from thinmap_ros.adapters.log_formats import is_mcap, refuse_foreign
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.errors import InputError, shown
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
@@ -98,7 +98,7 @@ class CarmenLog:
         """Return a line that was cut off without its last word, which may be half a number."""
         whole = text.rstrip().rpartition(' ')[0]
         if text.strip() and not whole:
-            self.skipped.add(f'{self.path}:{number}: {text.strip()[:20]!r}: a line cut off')
+            self.skipped.add(f'{self.path}:{number}: {shown(text.strip()[:20])}: a line cut off')
         return whole
 
     def _parse(self, line: str) -> list[Event]:
@@ -172,7 +172,7 @@ def _stamp(word: str) -> int:
     """Seconds as written, exact to the nanosecond."""
     seconds, _, fraction = word.partition('.')
     if not (seconds.isdigit() and (fraction == '' or fraction.isdigit()) and int(seconds) < _LATEST_S):
-        raise ValueError(f'stamp {word!r}: expected seconds from 0 to {_LATEST_S}')
+        raise ValueError(f'stamp {shown(word)}: expected seconds from 0 to {_LATEST_S}')
     return int(seconds) * _SECOND_NS + int(f'{fraction:0<9.9}')
 
 

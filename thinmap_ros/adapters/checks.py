@@ -14,7 +14,6 @@ from thinmap_ros.core.grid.frame import FINEST_M as FINEST_M
 FARTHEST_M = se2.FARTHEST_M
 LARGEST_ANGLE_RAD = 4.0 * np.pi
 MOST_BEAMS = 200_000
-LONGEST_NAME = 40
 LONGEST_LIST = 200
 
 
@@ -23,11 +22,6 @@ def within(what: str, values: Iterable[float], limit: float = FARTHEST_M) -> Non
     for value in values:
         if not abs(value) <= limit:
             raise InputError(f'{what}: {value}: expected a number from {-limit:g} to {limit:g}')
-
-
-def shown(name: str) -> str:
-    """A name as it can be printed: quoted, short, on one line."""
-    return repr(name if len(name) <= LONGEST_NAME else name[:LONGEST_NAME] + '...')
 
 
 def short(text: str, longest: int = 80) -> str:

@@ -1,33 +1,42 @@
-"""Files that are whole or not there (written aside, then renamed), and YAML checked at the door."""
+"""Files that are whole or not there (written aside, then renamed), and texts read up to a limit."""
 
 import os
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
+from glob import escape
 from pathlib import Path
-from typing import Any
 
-import yaml
+from thinmap_ros.core.errors import InputError, reason_of
 
-from thinmap_ros.core.errors import InputError
+_MOST_TEXT_BYTES = 1 << 30
+_NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 @contextmanager
 def written_aside(path: Path) -> Iterator[Path]:
     """Give a path to write to: it takes the place of `path` when the block ends well and vanishes when not.
 
+    Its name cannot be guessed and the file is new: nobody can have put a link there beforehand.
     Raises OSError, with the name of the file, where the disk does not take it.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(f'.{path.name}.{os.getpid()}.part')
+    aside = path.with_name(f'.{path.name}.{secrets.token_hex(8)}.part')
     try:
+        os.close(os.open(aside, _NEW_FILE, 0o666))
         yield aside
         aside.replace(path)
     except OSError as error:
-        if error.filename is not None:
+        if error.filename is not None and error.filename != str(aside):
             raise
-        raise OSError(error.errno, error.strerror or str(error), str(path)) from error
+        raise OSError(error.errno, error.strerror or reason_of(error), str(path)) from error
     finally:
         aside.unlink(missing_ok=True)
+
+
+def parts_of(path: Path) -> list[Path]:
+    """Unfinished files beside a file: those of a `written_aside` that was killed meanwhile."""
+    return sorted(path.parent.glob(f'.{escape(path.name)}.*.part'))
 
 
 def write_text(path: Path, text: str) -> None:
@@ -36,24 +45,16 @@ def write_text(path: Path, text: str) -> None:
         aside.write_text(text, encoding='utf-8')
 
 
-def read_text(path: Path) -> str:
-    """Read a text file. Raises InputError where there is none, or it is no text."""
+def read_text(path: Path, most_bytes: int = _MOST_TEXT_BYTES) -> str:
+    """Read a text file. Raises InputError where it is missing, no text, or above most_bytes."""
     try:
-        return path.read_text(encoding='utf-8')
-    except OSError as error:
-        raise InputError(f'{path}: {error.strerror or error}') from error
+        with path.open('rb') as stream:
+            content = stream.read(most_bytes + 1)
+    except (OSError, ValueError) as error:  # ValueError: a name with a zero byte
+        raise InputError(f'{path}: {getattr(error, "strerror", None) or error}') from error
+    if len(content) > most_bytes:
+        raise InputError(f'{path}: expected at most {most_bytes} bytes')
+    try:
+        return content.decode('utf-8').replace('\r\n', '\n')
     except UnicodeDecodeError as error:
         raise InputError(f'{path}: byte {error.start}: {error.reason}: expected a text file') from error
-
-
-def read_yaml(path: Path, expected: str) -> dict[str, Any]:
-    """Read a YAML file that holds keys and values. Raises InputError naming the file and what was expected."""
-    text = read_text(path)
-    try:
-        content = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError, OverflowError) as error:
-        # ValueError: a date such as 2001-99-99.
-        raise InputError(f'{path}: {" ".join(str(error).split())}: expected {expected}') from error
-    if not isinstance(content, dict):
-        raise InputError(f'{path}: expected {expected}')
-    return content

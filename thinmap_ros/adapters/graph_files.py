@@ -18,12 +18,16 @@ from xml.etree import ElementTree
 import numpy as np
 import yaml
 
+from thinmap_ros.adapters import checks
 from thinmap_ros.adapters.files import read_text, write_text
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.errors import InputError, reason_of, shown
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 
 _LARGEST_ID = 2**32 - 1
+_MOST_BYTES = 256 << 20
+_MOST_DIGITS = 100
+_BAD_FEATURE = (KeyError, TypeError, ValueError, InputError)
 _ARRIVED_M = 0.3  # distance at which topological_navigation counts a node as reached
 _UPRIGHT = {'w': 1.0, 'x': 0.0, 'y': 0.0, 'z': 0.0}
 _SIDES = 8  # of the polygon round a node, within which the robot counts as being there
@@ -172,28 +176,46 @@ def _tmap2_node(node: Node, edges: list[dict[str, Any]], name: str, frame_id: st
 
 
 def read_geojson(path: Path) -> TopologicalMap:
-    """Read a topological map that `write_geojson` wrote. Raises InputError naming the file and the feature."""
+    """Read a topological map that `write_geojson` wrote, of at most 256 MiB.
+
+    Raises InputError naming the file and the feature.
+    """
+    expected = 'expected a GeoJSON collection of features'
+    text = read_text(path, _MOST_BYTES)
     try:
-        features = json.loads(read_text(path))['features']
+        features = json.loads(text, parse_int=_whole)['features']
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(f'{path}: {error}: expected a GeoJSON collection of features') from error
+        raise InputError(f'{path}: {reason_of(error)}: {expected}') from error
+    if not isinstance(features, list):
+        raise InputError(f'{path}: features: {shown(features)}: {expected}')
     topology = TopologicalMap()
     lines: list[tuple[int, dict[str, Any]]] = []
-    for i, feature in enumerate(features if isinstance(features, list) else []):
+    for i, feature in enumerate(features):
         try:
             if feature['geometry']['type'] == 'Point':
                 topology.put_node(_node(feature))
             else:
                 lines.append((i, feature))
-        except (KeyError, TypeError, ValueError, InputError) as error:
-            raise InputError(f'{path}: features[{i}]: {error}: expected a node (point with id, kind)') from error
+        except _BAD_FEATURE as error:
+            reason = reason_of(error)
+            expected = 'expected a node (point with id, kind)'
+            raise InputError(f'{path}: features[{i}]: {reason}: {expected}') from error
     for i, feature in lines:
         try:
             if feature['properties']['id'] == feature['properties']['metadata']['edge']:
                 topology.put_edge(_edge(feature))
-        except (KeyError, TypeError, ValueError, InputError) as error:
-            raise InputError(f'{path}: features[{i}]: {error}: expected an edge (line with ids, length)') from error
+        except _BAD_FEATURE as error:
+            reason = reason_of(error)
+            expected = 'expected an edge (line with ids, length)'
+            raise InputError(f'{path}: features[{i}]: {reason}: {expected}') from error
     return topology
+
+
+def _whole(digits: str) -> int:
+    """A whole number of a JSON text; no id and no coordinate has hundreds of digits."""
+    if len(digits) > _MOST_DIGITS:
+        raise ValueError(f'a number of {len(digits)} digits: expected at most {_MOST_DIGITS}')
+    return int(digits)
 
 
 def _node_feature(node: Node, frame_id: str) -> dict[str, Any]:
@@ -230,15 +252,16 @@ def _rounded(points: Array) -> list[list[float]]:
     return [[round(float(x), 4), round(float(y), 4)] for x, y in points]
 
 
-def _finite(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ValueError(f'{value!r} is no finite number')
+def _number(value: Any) -> float:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not is_number or not abs(value) <= checks.FARTHEST_M:
+        raise ValueError(f'{shown(value)} is no finite number of m')
     return float(value)
 
 
 def _id(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise ValueError(f'id {value!r} is no whole number')
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 < value <= _LARGEST_ID:
+        raise ValueError(f'id {shown(value)} is no whole number from 1 to {_LARGEST_ID}')
     return value
 
 
@@ -246,17 +269,18 @@ def _node(feature: dict[str, Any]) -> Node:
     properties, (x, y) = feature['properties'], feature['geometry']['coordinates']
     metadata = properties['metadata']
     kind = NodeKind[str(metadata['kind']).upper()]
-    return Node(_id(properties['id']), kind, _finite(x), _finite(y), _finite(metadata['clearance']))
+    return Node(_id(properties['id']), kind, _number(x), _number(y), _number(metadata['clearance']))
 
 
 def _edge(feature: dict[str, Any]) -> Edge:
     properties, (line,) = feature['properties'], feature['geometry']['coordinates']
-    path = np.array([[_finite(x), _finite(y)] for x, y in line])
+    path = np.array([[_number(x), _number(y)] for x, y in line])
     if len(path) < 2:
         raise ValueError(f'a line of {len(path)} points')
     metadata = properties['metadata']
     ends = (_id(properties['startid']), _id(properties['endid']))
-    return Edge(_id(properties['id']), *ends, path, _finite(metadata['length']), _finite(metadata['clearance']))
+    measures = (_number(metadata['length']), _number(metadata['clearance']))
+    return Edge(_id(properties['id']), *ends, path, *measures)
 
 
 _WRITERS: dict[str, Callable[[Path, TopologicalMap], None]] = {

@@ -1,20 +1,35 @@
-"""map_server maps: an image and a YAML file <-> a patch of cells."""
+"""map_server maps: an image and a YAML file <-> a patch of cells.
 
+Images are PGM (or another netpbm format), PNG, BMP or JPEG, of at most 8192 x 8192 pixels: a square
+of 400 m at 0.05 m a cell. The size in an image's header is checked before any pixel is decoded.
+"""
+
+import warnings
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from thinmap_ros.adapters.files import read_yaml, write_text, written_aside
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.adapters.files import write_text, written_aside
+from thinmap_ros.adapters.yaml_files import read_mapping
+from thinmap_ros.core.errors import InputError, reason_of, shown
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, UNKNOWN, GridPatch
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 # Grey values of a trinary map, as map_saver writes them.
 _GREY_FREE, _GREY_UNKNOWN, _GREY_OCCUPIED = 254, 205, 0
 _FAR_M = 1e7
+_MOST_PIXELS = 8192 * 8192
+_LONGEST_NAME = 200
+# Only these: the readers of others run programs, or decode before they know the size.
+_FORMATS = ('PPM', 'PNG', 'BMP', 'JPEG')
+_GREYS_8, _GREYS_16 = 1 << 8, 1 << 16
 
 
 def write_map(stem: Path, patch: GridPatch) -> Path:
@@ -46,20 +61,29 @@ def _description(image: str, patch: GridPatch) -> dict[str, Any]:
     }
 
 
-def read_map(path: Path) -> GridPatch:
+def read_map(path: Path, folder: Path | None = None) -> GridPatch:
     """Read a map from its YAML file; trinary and scale modes.
 
-    Raises InputError naming the file, the key, its value and what was expected.
+    folder: where given, the image has to lie below it. Raises InputError naming the file, the key,
+    its value and what was expected.
     """
-    content = read_yaml(path, 'a map_server YAML file')
-    if not isinstance(content.get('image'), str):
-        raise InputError(f'{path}: image: {content.get("image")!r}: expected the name of an image')
+    content = read_mapping(path, 'a map_server YAML file')
+    image = _image_of(path, content, folder)
     resolution = _number(path, content, 'resolution', 1e-3, 10.0)
     origin = _origin(path, content)
-    image = path.parent / content['image']
-    darkness = _darkness(path, image, _is_negated(path, content))
-    cells = _cells(path, content, darkness)
+    shades = _Shades.of(path, content)
+    cells = _cells(path, image, shades)
     return GridPatch(GridFrame(origin[0], origin[1], resolution), np.ascontiguousarray(cells[::-1]))
+
+
+def _image_of(path: Path, content: dict[str, Any], folder: Path | None) -> Path:
+    name = content.get('image')
+    if not isinstance(name, str) or not name.isprintable() or len(name) > _LONGEST_NAME:
+        raise InputError(f'{path}: image: {shown(name)}: expected the name of an image')
+    image = path.parent / name
+    if folder is not None and not image.resolve().is_relative_to(folder):
+        raise InputError(f'{path}: image: {shown(name)}: expected a file below {folder}')
+    return image
 
 
 def _number(
@@ -67,14 +91,14 @@ def _number(
 ) -> float:
     value = content.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-        raise InputError(f'{path}: {key}: {value!r}: expected a number from {low} to {high}')
+        raise InputError(f'{path}: {key}: {shown(value)}: expected a number from {low} to {high}')
     return float(value)
 
 
 def _is_negated(path: Path, content: dict[str, Any]) -> bool:
     value = content.get('negate', 0)
     if value not in (0, 1):  # false and true count as such
-        raise InputError(f'{path}: negate: {value!r}: expected 0 or 1')
+        raise InputError(f'{path}: negate: {shown(value)}: expected 0 or 1')
     return bool(value)
 
 
@@ -82,41 +106,72 @@ def _origin(path: Path, content: dict[str, Any]) -> list[float]:
     value = content.get('origin')
     numbers = value if isinstance(value, list) else []
     if len(numbers) != 3 or not all(isinstance(v, int | float) and abs(v) < _FAR_M for v in numbers):
-        raise InputError(f'{path}: origin: {value!r}: expected [x, y, yaw] in m, m, rad')
+        raise InputError(f'{path}: origin: {shown(value)}: expected [x, y, yaw] in m, m, rad')
     if numbers[2] != 0:
         raise InputError(f'{path}: origin: yaw {numbers[2]}: expected 0; turned maps are not read')
     return [float(v) for v in numbers]
 
 
-def _darkness(path: Path, image: Path, negate: bool) -> NDArray[np.float64]:
-    """How dark each pixel is, 0 to 1, first row on top; NaN where it is transparent."""
+@dataclass(frozen=True)
+class _Shades:
+    """Which shade stands for which cell."""
+
+    occupied: float
+    free: float
+    scale: bool
+    negate: bool
+
+    @staticmethod
+    def of(path: Path, content: dict[str, Any]) -> '_Shades':
+        occupied = _number(path, content, 'occupied_thresh', 0.0, 1.0, default=0.65)
+        free = _number(path, content, 'free_thresh', 0.0, 1.0, default=0.25)
+        mode = content.get('mode', 'trinary')
+        if mode not in ('trinary', 'scale'):
+            raise InputError(f'{path}: mode: {shown(mode)}: expected trinary or scale')
+        if not free < occupied:
+            expected = f'expected less than occupied_thresh ({occupied})'
+            raise InputError(f'{path}: free_thresh: {free}: {expected}')
+        return _Shades(occupied, free, mode == 'scale', _is_negated(path, content))
+
+    def table(self, greys: int) -> NDArray[np.int8]:
+        """The cell for each grey from 0 to greys - 1."""
+        shade = np.arange(greys) / (greys - 1)
+        darkness = shade if self.negate else 1.0 - shade
+        cells = np.full(greys, UNKNOWN, dtype=np.int8)
+        if self.scale:
+            share = np.clip((darkness - self.free) / (self.occupied - self.free), 0.0, 1.0)
+            cells = (1 + 98 * share).astype(np.int8)
+        cells[darkness < self.free] = 0
+        cells[darkness > self.occupied] = 100
+        return cells
+
+
+def _cells(path: Path, image: Path, shades: _Shades) -> NDArray[np.int8]:
+    """Cells (H, W) of an image, first row on top; unknown where it is transparent."""
     from PIL import Image
 
     try:
-        with Image.open(image) as opened:
-            opened.load()
-            alpha = np.asarray(opened.convert('RGBA'))[..., 3] if 'A' in opened.getbands() else None
-            deep = opened.mode.startswith(('I', 'F'))
-            grey = np.asarray(opened if deep else opened.convert('L'), dtype=np.float64)
+        # Above its own, larger limit Pillow warns on stderr; here, that is an error like others.
+        with warnings.catch_warnings():
+            warnings.simplefilter('error', Image.DecompressionBombWarning)
+            with Image.open(image, formats=_FORMATS) as opened:
+                width, height = opened.size
+                if width * height > _MOST_PIXELS:
+                    raise ValueError(f'{width} x {height} pixels: expected at most {_MOST_PIXELS}')
+                opened.load()
+                return _cells_of(opened, shades)
     except Exception as error:  # Pillow's readers raise whatever a broken image makes them stumble over
-        reason = ' '.join(str(error).split()) or type(error).__name__
+        reason = reason_of(error)
         raise InputError(f'{image}: {reason}: expected an image that {path} names') from error
-    shade = grey / (65535.0 if deep else 255.0)
-    darkness = shade if negate else 1.0 - shade
-    return darkness if alpha is None else np.where(alpha == 0, np.nan, darkness)
 
 
-def _cells(path: Path, content: dict[str, Any], darkness: NDArray[np.float64]) -> NDArray[np.int8]:
-    occupied = _number(path, content, 'occupied_thresh', 0.0, 1.0, default=0.65)
-    free = _number(path, content, 'free_thresh', 0.0, 1.0, default=0.25)
-    mode = content.get('mode', 'trinary')
-    if mode not in ('trinary', 'scale'):
-        raise InputError(f'{path}: mode: {mode!r}: expected trinary or scale')
-    if not free < occupied:
-        raise InputError(f'{path}: free_thresh: {free}: expected less than occupied_thresh ({occupied})')
-    between = np.full(darkness.shape, UNKNOWN, dtype=np.int8)
-    if mode == 'scale':
-        share = np.clip((darkness - free) / (occupied - free), 0.0, 1.0)
-        between = np.where(np.isnan(share), UNKNOWN, 1 + 98 * np.nan_to_num(share)).astype(np.int8)
-    cells = np.where(darkness > occupied, np.int8(100), np.where(darkness < free, np.int8(0), between))
-    return cells.astype(np.int8)
+def _cells_of(image: 'Image.Image', shades: _Shades) -> NDArray[np.int8]:
+    if image.mode.startswith(('I', 'F')):
+        greys = np.clip(np.asarray(image), 0, _GREYS_16 - 1).astype(np.uint16)
+        deep: NDArray[np.int8] = shades.table(_GREYS_16)[greys]
+        return deep
+    cells: NDArray[np.int8] = shades.table(_GREYS_8)[np.asarray(image.convert('L'))]
+    if 'A' in image.getbands():
+        transparent = np.asarray(image.getchannel('A')) == 0
+        cells[transparent] = UNKNOWN
+    return cells

@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from thinmap_ros.adapters import checks
 from thinmap_ros.core import se2
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.errors import InputError, shown
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
@@ -59,7 +58,7 @@ class StaticTransforms:
         """Take a geometry_msgs/TransformStamped. Raises InputError where it is no transform."""
         moved = message.transform.translation
         translation = np.array([moved.x, moved.y, moved.z], dtype=np.float64)
-        checks.within(f'transform to {checks.shown(message.child_frame_id)}', translation.tolist())
+        checks.within(f'transform to {shown(message.child_frame_id)}', translation.tolist())
         rotation = rotation_matrix(message.transform.rotation)
         self._parents[_plain(message.child_frame_id)] = (_plain(message.header.frame_id), rotation, translation)
 
@@ -85,7 +84,7 @@ def _laid_down(frame: str, rotation: Array, translation: Array) -> Mount:
     if abs(up) < math.cos(math.radians(_LARGEST_TILT_DEG)):
         tilt = math.degrees(math.acos(min(abs(up), 1.0)))
         expected = f'expected at most {_LARGEST_TILT_DEG:.0f}'
-        raise InputError(f'laser {checks.shown(frame)} is tilted by {tilt:.0f} deg: {expected}')
+        raise InputError(f'laser {shown(frame)} is tilted by {tilt:.0f} deg: {expected}')
     yaw = math.atan2(rotation[1, 0], rotation[0, 0])
     return Mount(se2.pose(float(translation[0]), float(translation[1]), yaw), up < 0.0)
 

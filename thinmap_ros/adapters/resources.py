@@ -5,7 +5,7 @@ from pathlib import Path
 
 from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.errors import InputError, shown
 
 
 def world_path(name: str) -> Path:
@@ -19,7 +19,8 @@ def world_path(name: str) -> Path:
     worlds = _worlds()
     if name in worlds:
         return worlds[name]
-    raise InputError(f'world {name!r}: expected a file, or one of {", ".join(sorted(worlds)) or "none installed"}')
+    installed = ', '.join(sorted(worlds)) or 'none installed'
+    raise InputError(f'world {shown(name)}: expected a file, or one of {installed}')
 
 
 def message_definitions(package: str) -> dict[str, str]:

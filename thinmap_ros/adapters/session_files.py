@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.adapters.files import written_aside
 from thinmap_ros.adapters.map_files import read_map, write_map
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.errors import InputError, shown
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
@@ -34,7 +34,8 @@ def stem_of(path: str) -> Path:
     for end in (_GRID_END, _TOPOLOGY_END, _EXPLORATION_END, _FEATURES_END, _MAP_END, '.pgm'):
         path = path.removesuffix(end)
     if not Path(path).name or '\0' in path:
-        raise InputError(f'{path!r}: expected the path of a session, without the endings of its files')
+        expected = 'expected the path of a session, without the endings of its files'
+        raise InputError(f'{shown(path)}: {expected}')
     return Path(path).absolute()
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from thinmap_ros.adapters.files import read_text, write_text
 from thinmap_ros.core import se2
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.errors import InputError, shown
 from thinmap_ros.core.se2 import Array
 
 
@@ -36,9 +36,10 @@ def read_tum(path: Path) -> tuple[list[int], Array]:
             stamp_ns = int(seconds) * 1_000_000_000 + int(f'{nano:0<9.9}')
             x, y, _, _, _, qz, qw = (float(v) for v in fields[1:])
         except ValueError as error:
-            raise InputError(f'{path}:{number}: {line[:60]!r}: expected t x y z qx qy qz qw') from error
+            quoted = shown(line[:60])
+            raise InputError(f'{path}:{number}: {quoted}: expected t x y z qx qy qz qw') from error
         if not all(map(math.isfinite, (x, y, qz, qw))):
-            raise InputError(f'{path}:{number}: {line[:60]!r}: expected finite numbers')
+            raise InputError(f'{path}:{number}: {shown(line[:60])}: expected finite numbers')
         stamps.append(stamp_ns)
         poses.append(se2.pose(x, y, 2.0 * math.atan2(qz, qw)))
     return stamps, np.array(poses).reshape(-1, 3)

@@ -5,10 +5,10 @@ from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
-from thinmap_ros.adapters import checks, messages, parameters, qos
+from thinmap_ros.adapters import messages, parameters, qos
 from thinmap_ros.adapters.mounts import Mount, StaticTransforms
 from thinmap_ros.core import se2
-from thinmap_ros.core.errors import ConfigError, InputError
+from thinmap_ros.core.errors import ConfigError, InputError, shown
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
@@ -50,7 +50,7 @@ class LaserMount:
         mount = self._mount(message.header.frame_id)
         if mount is None:
             raise InputError(
-                f'scan in frame {checks.shown(message.header.frame_id)}: no static transform from '
+                f'scan in frame {shown(message.header.frame_id)}: no static transform from '
                 f'"{self._base_frame}" to it; publish one on /tf_static or set the parameter laser_pose'
             )
         scan = messages.scan_from(message, mount.T_base_laser, self._zero_is_no_return)
@@ -88,5 +88,5 @@ def _parse_pose(text: str) -> Array:
     except ValueError:
         T = np.full(3, np.nan)
     if not se2.is_finite(T):
-        raise ConfigError(f'laser_pose = {text!r}: expected "x,y,yaw" in m, m, rad')
+        raise ConfigError(f'laser_pose = {shown(text)}: expected "x,y,yaw" in m, m, rad')
     return T

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.adapters.files import read_yaml
 from thinmap_ros.adapters.map_files import read_map
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.adapters.yaml_files import read_mapping
+from thinmap_ros.core.errors import InputError, shown
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array, pose
@@ -18,6 +18,7 @@ from thinmap_ros.core.se2 import Array, pose
 _MARGIN_M = 0.2
 _NUDGE_M = 1e-9
 _MOST_CELLS = 100_000_000
+_LONGEST_NAME = 200
 _FREE, _SOLID = 0, 100
 
 
@@ -26,7 +27,7 @@ def read_world(path: Path) -> tuple[str, GridPatch, Array]:
 
     Raises InputError naming the file, the key, the value and what was expected.
     """
-    content = read_yaml(path, 'a world (walls, start) or a map (image, resolution, origin)')
+    content = read_mapping(path, 'a world (walls, start) or a map (image, resolution, origin)')
     return _of_map(path, content) if 'image' in content else _of_drawing(path, content)
 
 
@@ -35,7 +36,7 @@ def read_tour(path: Path) -> Array:
 
     Raises InputError naming the file, the value and what was expected.
     """
-    content = read_yaml(path, 'a world (walls, start) or a map (image, resolution, origin)')
+    content = read_mapping(path, 'a world (walls, start) or a map (image, resolution, origin)')
     return _points(path, 'tour', content['tour'], 1) if 'tour' in content else np.empty((0, 2))
 
 
@@ -50,10 +51,11 @@ def _numbers(path: Path, content: dict[str, Any], key: str, count: int) -> list[
     value = content.get(key)
     try:
         numbers = [float(v) for v in (value if isinstance(value, list) else [value])]  # type: ignore[arg-type]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         numbers = []
     if len(numbers) != count or not all(math.isfinite(v) for v in numbers):
-        raise InputError(f'{path}: {key}: {value!r}: expected {count} finite number{"s" if count > 1 else ""}')
+        expected = f'expected {count} finite number{"s" if count > 1 else ""}'
+        raise InputError(f'{path}: {key}: {shown(value)}: {expected}')
     return numbers
 
 
@@ -67,24 +69,27 @@ def _resolution(path: Path, content: dict[str, Any]) -> float:
 def _polylines(path: Path, content: dict[str, Any], key: str, fewest: int) -> list[Array]:
     drawn = content.get(key, [])
     if not isinstance(drawn, list):
-        raise InputError(f'{path}: {key}: {drawn!r}: expected a list of lists of points [x, y]')
+        expected = 'expected a list of lists of points [x, y]'
+        raise InputError(f'{path}: {key}: {shown(drawn)}: {expected}')
     return [_points(path, f'{key}[{i}]', points, fewest) for i, points in enumerate(drawn)]
 
 
 def _points(path: Path, what: str, drawn: object, fewest: int) -> Array:
     try:
         points = np.asarray(drawn, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         points = np.empty((0, 0))
     if points.ndim != 2 or points.shape[1:] != (2,) or len(points) < fewest or not np.isfinite(points).all():
-        raise InputError(f'{path}: {what}: {drawn!r}: expected at least {fewest} points [x, y]')
+        expected = f'expected at least {fewest} points [x, y]'
+        raise InputError(f'{path}: {what}: {shown(drawn)}: {expected}')
     return points
 
 
 def _of_drawing(path: Path, content: dict[str, Any]) -> tuple[str, GridPatch, Array]:
     known = {'name', 'resolution', 'wall_thickness', 'start', 'tour', 'walls', 'solids'}
     if unknown := set(content) - known:
-        raise InputError(f'{path}: unknown key {sorted(unknown)[0]!r}: expected {", ".join(sorted(known))}')
+        expected = ', '.join(sorted(known))
+        raise InputError(f'{path}: unknown key {shown(min(unknown))}: expected {expected}')
     resolution = _resolution(path, content)
     (thickness,) = _numbers(path, content, 'wall_thickness', 1)
     # Thinner walls let rays slip through between cells that touch at a corner only.
@@ -98,8 +103,15 @@ def _of_drawing(path: Path, content: dict[str, Any]) -> tuple[str, GridPatch, Ar
     cells = np.full(shape, _FREE, dtype=np.int8)
     for polygon in polygons:
         _fill(cells, frame, polygon)
-    name = str(content.get('name', path.stem))
-    return name, GridPatch(frame, cells), pose(*_numbers(path, content, 'start', 3))
+    return _name(path, content), GridPatch(frame, cells), pose(*_numbers(path, content, 'start', 3))
+
+
+def _name(path: Path, content: dict[str, Any]) -> str:
+    name = content.get('name', path.stem)
+    if not isinstance(name, str | int | float) or len(str(name)) > _LONGEST_NAME:
+        expected = f'expected a name of at most {_LONGEST_NAME} characters'
+        raise InputError(f'{path}: name: {shown(name)}: {expected}')
+    return str(name)
 
 
 def _lattice(path: Path, points: Array, resolution: float) -> tuple[GridFrame, tuple[int, int]]:

@@ -5,7 +5,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from thinmap_ros.core.errors import ConfigError
+from thinmap_ros.core.errors import ConfigError, shown
 
 
 def parameter(
@@ -40,15 +40,16 @@ class Config:
 def _check(field: 'dataclasses.Field[Any]', value: Any) -> None:
     low, high, choices = (field.metadata[key] for key in ('low', 'high', 'choices'))
     if not _same_type(value, field.default):
-        raise ConfigError(f'{field.name} = {value!r}: expected a {type(field.default).__name__}')
+        expected = type(field.default).__name__
+        raise ConfigError(f'{field.name} = {shown(value)}: expected a {expected}')
     if choices is not None and value not in choices:
-        raise ConfigError(f'{field.name} = {value!r}: expected one of {", ".join(choices)}')
+        raise ConfigError(f'{field.name} = {shown(value)}: expected one of {", ".join(choices)}')
     if isinstance(value, bool) or not isinstance(value, int | float):
         return
     if not math.isfinite(value):
-        raise ConfigError(f'{field.name} = {value!r}: expected a finite number')
+        raise ConfigError(f'{field.name} = {shown(value)}: expected a finite number')
     if (low is not None and value < low) or (high is not None and value > high):
-        raise ConfigError(f'{field.name} = {value!r}: expected {_interval(low, high)}')
+        raise ConfigError(f'{field.name} = {shown(value)}: expected {_interval(low, high)}')
 
 
 def _same_type(value: Any, default: Any) -> bool:

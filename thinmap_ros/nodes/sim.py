@@ -19,7 +19,7 @@ from thinmap_ros.adapters.lockstep import NONE, TOPICS, Lockstep
 from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.errors import ConfigError, InputError
+from thinmap_ros.core.errors import ConfigError, InputError, shown
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.sim.lms200 import Lms200Config
 from thinmap_ros.sim.pioneer import PRESETS
@@ -162,7 +162,7 @@ def _start(text: str, world: World) -> Array:
     try:
         x, y, theta = (float(part) for part in text.split(','))
     except ValueError as error:
-        raise ConfigError(f'start = {text!r}: expected "x,y,theta" in m, m, rad') from error
+        raise ConfigError(f'start = {shown(text)}: expected "x,y,theta" in m, m, rad') from error
     return se2.pose(x, y, theta)
 
 

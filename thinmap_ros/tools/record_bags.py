@@ -11,7 +11,7 @@ from thinmap_ros.adapters.bag_objects import BagObjects
 from thinmap_ros.adapters.bag_writer import BagWriter
 from thinmap_ros.adapters.files import write_text
 from thinmap_ros.core import se2
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.errors import InputError, shown
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import Estimate, LocalizerConfig
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
@@ -112,7 +112,7 @@ def _about(name: str, seed: int, scans: int, seconds: float, localized: bool) ->
 
 def _work(arguments: argparse.Namespace) -> None:
     if unknown := set(arguments.names) - set(RECIPES):
-        raise InputError(f'drive {min(unknown)!r}: expected some of {", ".join(RECIPES)}')
+        raise InputError(f'drive {shown(min(unknown))}: expected some of {", ".join(RECIPES)}')
     for name in arguments.names or RECIPES:
         path = arguments.out / f'{name}.mcap'
         looks = list(Source(arguments.seed).looks(name))

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from thinmap_ros.adapters.carmen import CarmenLog, LaserOptions
-from thinmap_ros.adapters.files import read_yaml
 from thinmap_ros.adapters.plots import Curve, GraphLayer, MapLayer, Panel, Plot, Segments
-from thinmap_ros.core.errors import ConfigError, InputError
+from thinmap_ros.adapters.yaml_files import read_mapping
+from thinmap_ros.core.errors import ConfigError, InputError, reason_of
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.pipeline import PipelineConfig
 from thinmap_ros.tools.experiments.outcome import Comparison, Outcome, Table
@@ -95,11 +95,13 @@ def _one(folder: Path, out: Path) -> _Result:
 def _laser(folder: Path) -> LaserOptions:
     """Options of the laser: those of laser.yaml in the folder, or of a known log. Raises InputError where it is bad."""
     path = folder / 'laser.yaml'
-    options = read_yaml(path, 'options of the laser') if path.exists() else _LASERS.get(folder.name, {})
+    options = _LASERS.get(folder.name, {})
+    if path.exists():
+        options = read_mapping(path, 'options of the laser')
     try:
         return LaserOptions(**options)
     except (TypeError, ConfigError) as error:
-        raise InputError(f'{path}: {error}') from error
+        raise InputError(f'{path}: {reason_of(error)}') from error
 
 
 def _errors(folder: Path, result: Replay) -> list[float | None]:
