@@ -18,13 +18,13 @@ from thinmap_ros.adapters.yaml_files import read_mapping
 from thinmap_ros.core.errors import InputError, reason_of, shown
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, UNKNOWN, GridPatch
+from thinmap_ros.core.se2 import FARTHEST_M
 
 if TYPE_CHECKING:
     from PIL import Image
 
 # Grey values of a trinary map, as map_saver writes them.
 _GREY_FREE, _GREY_UNKNOWN, _GREY_OCCUPIED = 254, 205, 0
-_FAR_M = 1e7
 _MOST_PIXELS = 8192 * 8192
 _LONGEST_NAME = 200
 # Only these: the readers of others run programs, or decode before they know the size.
@@ -105,7 +105,8 @@ def _is_negated(path: Path, content: dict[str, Any]) -> bool:
 def _origin(path: Path, content: dict[str, Any]) -> list[float]:
     value = content.get('origin')
     numbers = value if isinstance(value, list) else []
-    if len(numbers) != 3 or not all(isinstance(v, int | float) and abs(v) < _FAR_M for v in numbers):
+    fit = all(isinstance(v, int | float) and abs(v) <= FARTHEST_M for v in numbers)
+    if len(numbers) != 3 or not fit:
         raise InputError(f'{path}: origin: {shown(value)}: expected [x, y, yaw] in m, m, rad')
     if numbers[2] != 0:
         raise InputError(f'{path}: origin: yaw {numbers[2]}: expected 0; turned maps are not read')

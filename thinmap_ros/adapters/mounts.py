@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from thinmap_ros.adapters import checks
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, shown
 from thinmap_ros.core.scan import Scan

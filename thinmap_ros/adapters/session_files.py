@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.adapters.archive_files import opened, read_arrays
 from thinmap_ros.adapters.files import written_aside
 from thinmap_ros.adapters.map_files import read_map, write_map
-from thinmap_ros.core.errors import InputError, shown
+from thinmap_ros.core.errors import InputError, reason_of, shown
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
@@ -198,14 +199,15 @@ def _write_to(path: Path, what: str, arrays: Mapping[str, NDArray[Any]]) -> None
 
 
 def _read(path: Path, what: str) -> dict[str, NDArray[Any]]:
+    expected = f'expected a saved {what.split()[0]}'
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {key: archive[key] for key in archive.files}
+        with opened(path) as stream:
+            arrays = read_arrays(stream)
     except OSError as error:
-        raise InputError(error.strerror or str(error)) from error
-    except Exception as error:  # zlib and NumPy's readers raise whatever a broken file makes them stumble over
-        raise InputError(f'{" ".join(str(error).split())}: expected a saved {what.split()[0]}') from error
-    found = arrays.pop(_FORMAT, None)
-    if found is None or str(found) != what:
-        raise InputError(f'holds {found}: expected a saved {what.split()[0]} ({what})')
+        raise InputError(error.strerror or reason_of(error)) from error
+    except InputError as error:
+        raise InputError(f'{error}: {expected}') from error
+    found = arrays.pop(_FORMAT, np.empty(0))
+    if found.shape or found.dtype.kind != 'U' or str(found) != what:
+        raise InputError(f'holds {shown(str(found))}: {expected} ({what})')
     return arrays

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from thinmap_ros.adapters.map_files import read_map
 from thinmap_ros.adapters.yaml_files import read_mapping
 from thinmap_ros.core.errors import InputError, shown
-from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.frame import FINEST_M, GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.se2 import Array, pose
+from thinmap_ros.core.se2 import FARTHEST_M, Array, pose
 
 _MARGIN_M = 0.2
 _NUDGE_M = 1e-9
@@ -61,8 +61,8 @@ def _numbers(path: Path, content: dict[str, Any], key: str, count: int) -> list[
 
 def _resolution(path: Path, content: dict[str, Any]) -> float:
     (resolution,) = _numbers(path, content, 'resolution', 1)
-    if not 0.0 < resolution <= 1.0:
-        raise InputError(f'{path}: resolution: {resolution}: expected more than 0 and at most 1 m')
+    if not FINEST_M <= resolution <= 1.0:
+        raise InputError(f'{path}: resolution: {resolution}: expected {FINEST_M} to 1 m')
     return resolution
 
 
@@ -116,6 +116,10 @@ def _name(path: Path, content: dict[str, Any]) -> str:
 
 def _lattice(path: Path, points: Array, resolution: float) -> tuple[GridFrame, tuple[int, int]]:
     """Frame and shape of a grid with room for all points; its lines go through the origin, as a map's do."""
+    farthest = float(np.abs(points).max())
+    if farthest > FARTHEST_M:
+        expected = f'expected at most {FARTHEST_M:g} m; is a point far off?'
+        raise InputError(f'{path}: point at {farthest:g} m: {expected}')
     low = np.floor((points.min(axis=0) - _MARGIN_M) / resolution)
     cols, rows = np.ceil((points.max(axis=0) + _MARGIN_M) / resolution) - low
     if not rows * cols <= _MOST_CELLS:

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core import se2
+from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.snapshot import FAR_M, LARGEST_COUNT, Field
 
 
 class OdometryBuffer:
@@ -74,6 +75,11 @@ class OdometryBuffer:
 _FASTEST_M_S = 3.0
 _STEP_BACK_NS = 1_000_000_000
 _LONGEST_GAP_NS = 120_000_000_000
+FIELDS = {
+    'stamp_ns': Field(np.int64, (), 0, LARGEST_COUNT),
+    'T_map_odom': Field(np.float64, (3,), -FAR_M, FAR_M),
+    'T_odom_base': Field(np.float64, (3,), -FAR_M, FAR_M),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,12 +95,10 @@ class LastPose:
         return {'stamp_ns': np.array(self.stamp_ns), 'T_map_odom': self.T_map_odom, 'T_odom_base': self.T_odom_base}
 
     @staticmethod
-    def from_state(state: Mapping[str, NDArray[Any]]) -> 'LastPose | None':
-        """Return the pose of a state; None where it is none."""
-        poses = [np.asarray(state.get(name, np.empty(0)), dtype=np.float64) for name in ('T_map_odom', 'T_odom_base')]
-        if 'stamp_ns' not in state or any(pose.shape != (3,) or not se2.is_finite(pose) for pose in poses):
-            return None
-        return LastPose(int(state['stamp_ns']), poses[0], poses[1])
+    def from_state(state: Mapping[str, NDArray[Any]]) -> 'LastPose':
+        """Return the pose of a `state`. Raises InputError where it is none."""
+        own = snapshot.check(state, FIELDS, 'pose')
+        return LastPose(int(own['stamp_ns']), own['T_map_odom'], own['T_odom_base'])
 
     def leads_to(self, stamp_ns: int, T_odom_base: Array) -> bool:
         """Whether a later odometry pose can be of the same drive: not before, not long after, not too far away."""

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core import se2
+from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.exploration.position_probability import (
     angle_difference,
@@ -40,10 +40,23 @@ from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.snapshot import FAR_M, LARGEST_COUNT, LARGEST_ID, Field
 
 Cells = NDArray[np.int64]
 PRIOR = 0.5
 _NEUTRAL = 0.5
+_SEEN = slice(5, 7)  # of a row of 'tracks': from where the node was last seen, NaN if it was not
+FIELDS = {
+    'ids': Field(np.int64, ('n',), 1, LARGEST_ID),
+    # x, y, x and y where the evidence began, probability, x and y of where it was seen from, closed
+    'tracks': Field(
+        np.float64, ('n', 8), (-FAR_M, -FAR_M, -FAR_M, -FAR_M, 0.0, -FAR_M, -FAR_M, 0.0),
+        (FAR_M, FAR_M, FAR_M, FAR_M, 1.0, FAR_M, FAR_M, 1.0), nan=True,
+    ),
+    'look_counts': Field(np.int64, ('n',), 0, LARGEST_COUNT),
+    # distance and bearing of each look, node after node
+    'looks': Field(np.float64, ('k', 2), (0.0, -2.0 * math.pi), (2.0 * FAR_M, 2.0 * math.pi)),
+}
 
 
 @dataclass(frozen=True)
@@ -161,7 +174,11 @@ class EndNodeTracker:
 
     @staticmethod
     def from_state(state: Mapping[str, NDArray[Any]], config: TrackerConfig) -> 'EndNodeTracker':
-        """Tracker that goes on from the `state` of another one. Raises KeyError or ValueError where it is none."""
+        """Tracker that goes on from the `state` of another one.
+
+        state: checked by FIELDS. Raises InputError where its arrays contradict each other.
+        """
+        _check_references(state)
         tracker = EndNodeTracker(config)
         ends = np.cumsum(state['look_counts'])
         for node_id, row, end, count in zip(state['ids'], state['tracks'], ends, state['look_counts'], strict=True):
@@ -208,6 +225,23 @@ class EndNodeTracker:
             # What far looks said against the node is settled by the map: nothing is left that could move it.
             track.probability = bayes_update(max(track.probability, PRIOR), self.config.closed_reliability)
         track.closed = not is_open
+
+
+def _check_references(state: Mapping[str, NDArray[Any]]) -> None:
+    """Raise InputError unless each node has its looks, and a place of the last one if any."""
+    counts, tracks = state['look_counts'], state['tracks']
+    total = len(state['looks'])
+    fits = bool((counts <= total).all()) and int(counts.sum()) == total
+    snapshot.require(fits, f'exploration: {total} looks', 'as many as the nodes have')
+    snapshot.require_unique(state['ids'], 'exploration: id of an end node')
+    unseen = np.isnan(tracks[:, _SEEN])
+    told = np.delete(tracks, np.r_[_SEEN], axis=1)
+    snapshot.require(not np.isnan(told).any(), 'exploration: place or probability NaN', 'a number')
+    consistent = (unseen[:, 0] == unseen[:, 1]) & (unseen[:, 0] == (counts == 0))
+    expected = 'a place from which it was seen of each node with looks, and of no other'
+    snapshot.require(bool(consistent.all()), 'exploration: tracks', expected)
+    closed = tracks[:, -1]
+    snapshot.require(bool(np.isin(closed, (0.0, 1.0)).all()), 'exploration: closed', '0 or 1')
 
 
 @kernel

@@ -19,9 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core import se2
+from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import parameter
-from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.decision import Decision, verdict
 from thinmap_ros.core.exploration.failures import Failures
 from thinmap_ros.core.exploration.survey import Candidate, Place, SurveyConfig, Surveyor, end_node_of
@@ -32,6 +31,7 @@ from thinmap_ros.core.planning.graph_search import costs_to
 from thinmap_ros.core.planning.grid_search import WayTable
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.snapshot import Field
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
 
 _DETOUR = 3.0
@@ -44,6 +44,7 @@ _FIRST_GRAPH_S = 5.0
 # Through more places no tour is planned at a time: its cost grows with their number's fourth power.
 _MOST_PLACES = 20
 _LOOKS = 3
+FIELDS = {'first_choice_made': Field(np.bool_)}
 
 
 @dataclass(frozen=True)
@@ -112,11 +113,10 @@ class Explorer:
         Raises InputError where it is no such state.
         """
         explorer = Explorer(config)
-        try:
-            explorer.surveyor.restore(state)
-            explorer._memory.first_choice_made = bool(state['first_choice_made'])
-        except (KeyError, ValueError, TypeError, IndexError) as error:
-            raise InputError(f'saved exploration: {type(error).__name__} {error}: expected what was saved') from error
+        own = {key: array for key, array in state.items() if key in FIELDS}
+        checked = snapshot.check(own, FIELDS, 'exploration')
+        explorer.surveyor.restore({key: state[key] for key in state if key not in FIELDS})
+        explorer._memory.first_choice_made = bool(checked['first_choice_made'])
         return explorer
 
     def step(self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array) -> Decision:

@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.exploration.viewpoints import place_at, place_for, shows_enough
-from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.frame import COARSEST_M, FINEST_M, GridFrame
 from thinmap_ros.core.grid.patch import FREE_AT_MOST, OCCUPIED_AT_LEAST, GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.planning.reach import Part
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.snapshot import FAR_M, Field
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.free_space import known_free, true_cells
 
@@ -31,6 +32,11 @@ _WHOLE_EVERY = 100
 _PART_M = 1.0
 _MARGIN = 3
 NOTHING = (0, 0, 0, 0)
+_MOST_CELLS = 1 << 28  # of a map with the room to grow
+FIELDS = {
+    'frame': Field(np.float64, (3,), (-FAR_M, -FAR_M, FINEST_M), (FAR_M, FAR_M, COARSEST_M)),
+    'looks': Field(np.uint8, ('rows', 'cols'), 0, _LOOKS),
+}
 
 
 class OpenBorders:
@@ -58,10 +64,13 @@ class OpenBorders:
 
     @staticmethod
     def from_state(state: Mapping[str, NDArray[Any]], shortest_m: float) -> 'OpenBorders':
-        """Borders that go on from the `state` of others, on a map of the same lattice. Raises KeyError, ValueError."""
+        """Borders that go on from the `state` of others, on a map of their lattice.
+
+        state: checked by FIELDS.
+        """
         borders = OpenBorders(shortest_m)
         origin_x, origin_y, resolution = state['frame'].tolist()
-        looks = state['looks'].astype(np.uint8)
+        looks = state['looks']
         rows, cols = looks.shape
         borders.frame, borders._looks = GridFrame(origin_x, origin_y, resolution), looks
         borders.free, borders.mask = (np.zeros((rows, cols), dtype=np.bool_) for _ in range(2))
@@ -151,6 +160,29 @@ class OpenBorders:
         cell = self._cell_of((float(place[0]), float(place[1])))
         return shows_enough(self.free, self.passable, cells, cell, depth, reach)
 
+    def _has_room_for(self, patch: GridPatch) -> bool:
+        """Whether a map has cells of this size, and near these: saved ones may be of elsewhere."""
+        frame = self.frame
+        x = (patch.frame.origin_x - frame.origin_x) / frame.resolution
+        y = (patch.frame.origin_y - frame.origin_y) / frame.resolution
+        if patch.frame.resolution != frame.resolution:
+            return False
+        rows, cols = (
+            max(first + size, have) - min(first, 0.0) + 2 * _SPARE
+            for first, size, have in zip((y, x), patch.shape, self.mask.shape, strict=True)
+        )
+        return bool(rows * cols <= _MOST_CELLS)
+
+    def _clear(self, frame: GridFrame) -> None:
+        """Begin with nothing, on the cells of a frame."""
+        self.frame = frame
+        self.changed = None
+        self.known_cells = 0
+        self.free = np.zeros((0, 0), dtype=np.bool_)
+        self.mask = np.zeros((0, 0), dtype=np.bool_)
+        self.passable = np.ones((0, 0), dtype=np.bool_)
+        self._looks = np.zeros((0, 0), dtype=np.uint8)
+
     def _cell_of(self, xy: tuple[float, float]) -> tuple[int, int]:
         """Cell (row, col) that holds a point, m."""
         frame = self.frame
@@ -169,8 +201,8 @@ class OpenBorders:
 
         Once there is a map, more room is made than is needed: what looks at these arrays does so anew when they grow.
         """
-        if self.mask.size == 0:
-            self.frame = patch.frame
+        if self.mask.size == 0 or not self._has_room_for(patch):
+            self._clear(patch.frame)
         resolution = self.frame.resolution
         row = round((patch.frame.origin_y - self.frame.origin_y) / resolution)
         col = round((patch.frame.origin_x - self.frame.origin_x) / resolution)

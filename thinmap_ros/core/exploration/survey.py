@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core import se2
+from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import parameter
+from thinmap_ros.core.exploration import end_node_tracker, open_borders
 from thinmap_ros.core.exploration.decision import FIRST_STAND_IN_ID, EndNode
 from thinmap_ros.core.exploration.end_node_tracker import EndNodeTracker, Track, TrackerConfig
 from thinmap_ros.core.exploration.open_borders import NOTHING, OpenBorders
@@ -26,6 +27,7 @@ from thinmap_ros.core.planning.grid_search import coarse, field_from, fine
 from thinmap_ros.core.planning.reach import are_near, let_out, renew_standing, standing_places
 from thinmap_ros.core.planning.trail import Trail
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.snapshot import FAR_M, LARGEST_ID, Field, Fields
 
 Cells = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -35,6 +37,17 @@ _NEAR_VISIT_M = 0.3
 _ESCAPE_M = 0.6
 _SAME_BORDER_M = 1.5
 _RIM_M = 0.5
+_PARTS: dict[str, Fields] = {
+    'nodes': end_node_tracker.FIELDS,
+    'stand_ins': end_node_tracker.FIELDS,
+    'borders': open_borders.FIELDS,
+}
+FIELDS = {
+    # id, x, y of end nodes that were visited without success
+    'visited': Field(np.float64, ('v', 3), (1, -FAR_M, -FAR_M), (LARGEST_ID, FAR_M, FAR_M)),
+    'look_closer': Field(np.float64, ('c', 2), -FAR_M, FAR_M),
+    'next_stand_in': Field(np.int64, (), FIRST_STAND_IN_ID, LARGEST_ID),
+}
 
 
 @dataclass(frozen=True)
@@ -102,17 +115,29 @@ class Surveyor:
         }
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Take over the `state` of another surveyor. Raises KeyError or ValueError where it is none."""
+        """Take over the `state` of another surveyor, all of it or nothing.
 
-        def part(name: str) -> dict[str, NDArray[Any]]:
-            return {key.removeprefix(f'{name}_'): state[key] for key in state if key.startswith(f'{name}_')}
-
-        self.tracker = EndNodeTracker.from_state(part('nodes'), self.config)
-        self.stand_ins = EndNodeTracker.from_state(part('stand_ins'), self.config)
-        self.borders = OpenBorders.from_state(part('borders'), self.config.shortest_border_m)
-        visited = {int(row[0]): (float(row[1]), float(row[2])) for row in state['visited']}
-        closer = [(float(x), float(y)) for x, y in state['look_closer']]
-        self._memory, self._ends = _Memory(visited, closer, int(state['next_stand_in'])), None
+        Raises InputError where it is none.
+        """
+        parts = {name: _part(state, name, fields) for name, fields in _PARTS.items()}
+        prefixes = tuple(f'{name}_' for name in _PARTS)
+        rest = {key: array for key, array in state.items() if not key.startswith(prefixes)}
+        own = snapshot.check(rest, FIELDS, 'exploration')
+        ids = own['visited'][:, 0]
+        snapshot.require(bool((ids == np.floor(ids)).all()), 'exploration: visited', 'whole ids')
+        next_id = int(own['next_stand_in'])
+        stand_ins = parts['stand_ins']['ids']
+        given = bool(((stand_ins >= FIRST_STAND_IN_ID) & (stand_ins < next_id)).all())
+        expected = f'from {FIRST_STAND_IN_ID} to below {next_id}'
+        snapshot.require(given, 'exploration: ids of stand-ins', expected)
+        tracker = EndNodeTracker.from_state(parts['nodes'], self.config)
+        self.stand_ins = EndNodeTracker.from_state(parts['stand_ins'], self.config)
+        self.tracker = tracker
+        self.borders = OpenBorders.from_state(parts['borders'], self.config.shortest_border_m)
+        visited = {int(row[0]): (float(row[1]), float(row[2])) for row in own['visited']}
+        closer = [(float(x), float(y)) for x, y in own['look_closer']]
+        self._memory = _Memory(visited, closer, next_id)
+        self._ends = None
 
     def follow(self, ends: dict[int, Place]) -> dict[int, int]:
         """Take in where the end nodes are now; returns the new id of each one that lives on under another one."""
@@ -315,6 +340,18 @@ def end_node_of(track: Track, candidate: Candidate | None, target_goal: Array | 
         is_target=target_goal is not None,
         goal=goal,
     )
+
+
+def _part(
+    state: Mapping[str, NDArray[Any]], name: str, fields: Fields
+) -> dict[str, NDArray[Any]]:
+    """The arrays of one part of a state, checked."""
+    own = {
+        key.removeprefix(f'{name}_'): array
+        for key, array in state.items()
+        if key.startswith(f'{name}_')
+    }
+    return snapshot.check(own, fields, f'exploration: {name}')
 
 
 def _place(track: Track) -> Place:

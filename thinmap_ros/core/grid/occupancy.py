@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core import se2
+from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.frame import COARSEST_M, FINEST_M, GridFrame
 from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
 from thinmap_ros.core.grid.picture import Picture
 from thinmap_ros.core.grid.raytrace import fill_segment
@@ -19,6 +19,7 @@ from thinmap_ros.core.grid.tiles import FARTHEST_TILE, TILE, TileStore
 from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.snapshot import FAR_M, Field
 
 # Log odds are kept as whole thousandths in int16: small, exact to add, and the same on every machine.
 _SCALE = 1000.0
@@ -30,6 +31,11 @@ _LONGEST_SURFACE_M = 3.0
 # What a beam passes through is no wall; but where it passes through this much of one, it grazes a face of the wall.
 _GRAZED_M = 0.4
 _SURELY_OCCUPIED = 0.9
+FIELDS = {
+    'frame': Field(np.float64, (3,), (-FAR_M, -FAR_M, FINEST_M), (FAR_M, FAR_M, COARSEST_M)),
+    'tiles': Field(np.int64, ('n', 2), -FARTHEST_TILE, FARTHEST_TILE),
+    'log_odds': Field(np.int16, ('n', TILE, TILE), -_LIMIT, _LIMIT),
+}
 
 
 @dataclass(frozen=True)
@@ -117,22 +123,12 @@ class OccupancyGrid:
     @staticmethod
     def from_state(state: Mapping[str, NDArray[Any]], config: OccupancyConfig | None = None) -> 'OccupancyGrid':
         """Grid that goes on from the `state` of another. Raises InputError where it is no such state."""
-        try:
-            frame, tiles, odds = (state[key] for key in ('frame', 'tiles', 'log_odds'))
-            origin_x, origin_y, resolution = frame.astype(np.float64).tolist()
-        except (KeyError, ValueError, TypeError) as error:
-            raise InputError(f'saved grid: {error}: expected frame, tiles and log_odds') from error
-        if tiles.dtype != np.int64:
-            raise InputError(f'saved grid: tiles of {tiles.dtype}: expected int64')
-        if tiles.shape != (len(odds), 2) or odds.shape[1:] != (TILE, TILE) or odds.dtype != np.int16:
-            raise InputError(f'saved grid: {tiles.shape} tiles, {odds.shape} log odds: expected one array a tile')
-        if len(tiles) and not -FARTHEST_TILE <= tiles.min() <= tiles.max() <= FARTHEST_TILE:
-            raise InputError(
-                f'saved grid: tiles from {tiles.min()} to {tiles.max()}: expected '
-                f'{-FARTHEST_TILE} to {FARTHEST_TILE}'
-            )
-        if np.abs(odds.astype(np.int64)).max(initial=0) > _LIMIT:
-            raise InputError(f'saved grid: log odds up to {np.abs(odds).max()}: expected at most {_LIMIT}')
+        checked = snapshot.check(state, FIELDS, 'grid')
+        tiles = checked['tiles']
+        odds = checked['log_odds']
+        flat = tiles[:, 0] * (2 * FARTHEST_TILE + 1) + tiles[:, 1]
+        snapshot.require(len(np.unique(flat)) == len(tiles), 'grid: tiles', 'each once')
+        origin_x, origin_y, resolution = checked['frame'].tolist()
         grid = OccupancyGrid(config, GridFrame(origin_x, origin_y, resolution))
         for (row, col), cells in zip(tiles.tolist(), odds, strict=True):
             grid._write(row * TILE, col * TILE, cells)

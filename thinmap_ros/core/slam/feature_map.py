@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core import se2
+from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import parameter
-from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, transform_points
+from thinmap_ros.core.slam import local_area
 from thinmap_ros.core.slam.association import AssociationConfig, associate, mahalanobis, meeting
 from thinmap_ros.core.slam.candidates import Candidate, Candidates
 from thinmap_ros.core.slam.ekf import EkfSlam
@@ -34,8 +34,24 @@ from thinmap_ros.core.slam.lines import Lines
 from thinmap_ros.core.slam.local_area import LocalArea
 from thinmap_ros.core.slam.loops import Correction
 from thinmap_ros.core.slam.visibility import seen_through
+from thinmap_ros.core.snapshot import FAR_M, LARGEST_COUNT, LARGEST_ID, Field
 
 _SPARE = 8  # features that the local area may hold beyond those it should
+_ROUNDING = 1e-6  # of the largest variance, by which a covariance may fail to be one
+FIELDS = {
+    'ids': Field(np.int64, ('n',), 1, LARGEST_ID),
+    'lines': Field(np.float64, ('n', 2), (-FAR_M, -4.0 * np.pi), (FAR_M, 4.0 * np.pi)),
+    'line_covariance': Field(np.float64, ('2n', '2n'), -FAR_M, FAR_M),
+    # low and high end along the line, x and y of where it was first seen from, missed
+    'spans': Field(
+        np.float64,
+        ('n', 5),
+        (-2.0 * FAR_M, -2.0 * FAR_M, -FAR_M, -FAR_M, 0.0),
+        (2.0 * FAR_M, 2.0 * FAR_M, FAR_M, FAR_M, float(LARGEST_COUNT)),
+    ),
+    'next_id': Field(np.int64, (), 1, LARGEST_ID),
+    **local_area.FIELDS,
+}
 
 
 @dataclass(frozen=True)
@@ -84,26 +100,17 @@ class FeatureMap:
     def restore(self, ekf: CompressedEkf, state: Mapping[str, NDArray[Any]]) -> None:
         """Take up the `state` of another map, into an empty one and its filter.
 
-        Raises InputError where it is no such state.
+        state: checked by FIELDS. Raises InputError where its arrays contradict each other.
         """
-        try:
-            ids, lines, covariance, spans = (state[key] for key in ('ids', 'lines', 'line_covariance', 'spans'))
-            n, next_id = len(ids), int(state['next_id'])
-            if (lines.shape, covariance.shape, spans.shape) != ((n, 2), (2 * n, 2 * n), (n, 5)):
-                raise InputError(f'saved features: {n} ids, lines {lines.shape}, spans {spans.shape}: expected as many')
-            if not all(np.isfinite(a).all() for a in (lines, covariance, spans)):
-                raise InputError('saved features: expected finite numbers')
-            if len(set(ids.tolist())) < n or next_id <= ids.max(initial=0):
-                raise InputError(f'saved features: ids up to {ids.max()}, next {next_id}: expected each once')
-            ekf.restore(ids.tolist(), lines, covariance)
-            self._features = {
-                i: Feature(i, low, high, np.array([x, y]), int(missed))
-                for i, (low, high, x, y, missed) in zip(ids.tolist(), spans.tolist(), strict=True)
-            }
-            self._next_id = next_id
-            self.area.restore(state)
-        except (KeyError, ValueError, TypeError) as error:
-            raise InputError(f'saved features: {type(error).__name__} {error}: expected what was saved') from error
+        _check_references(state)
+        ids = state['ids'].tolist()
+        self.area.restore(state)
+        ekf.restore(ids, state['lines'], state['line_covariance'])
+        self._features = {
+            i: Feature(i, low, high, np.array([x, y]), int(missed))
+            for i, (low, high, x, y, missed) in zip(ids, state['spans'].tolist(), strict=True)
+        }
+        self._next_id = int(state['next_id'])
 
     def listed(self, ekf: CompressedEkf) -> list[LineFeature]:
         """The features as others see them."""
@@ -258,6 +265,33 @@ class FeatureMap:
         features = [self._features[i] for i in ids.tolist()]
         ends = np.stack([middle - reach, middle + reach])
         return set(ids[meeting(lines, features, ends[None], candidate.span.seen_from, 0.0)[0]].tolist())
+
+
+def _check_references(state: Mapping[str, NDArray[Any]]) -> None:
+    """Raise InputError unless ids are unique and known, spans in order, and P a covariance."""
+    ids, spans = state['ids'], state['spans']
+    snapshot.require_unique(ids, 'features: id')
+    last, next_id = int(ids.max(initial=0)), int(state['next_id'])
+    snapshot.require(last < next_id, f'features: next id {next_id}', f'above {last}')
+    snapshot.require_known(state['stored_at'][:, 0], ids, 'features: stored feature')
+    in_order = bool((spans[:, 0] <= spans[:, 1]).all())
+    snapshot.require(in_order, 'features: spans', 'low ends below high ends')
+    is_covariance = _is_covariance(state['line_covariance'])
+    expected = 'a symmetric matrix without negative variances'
+    snapshot.require(is_covariance, 'features: line_covariance', expected)
+
+
+def _is_covariance(P: Array) -> bool:
+    """Whether a matrix (N, N) is symmetric and, but for rounding, positive semidefinite."""
+    rounding = _ROUNDING * float(np.abs(P).max(initial=0.0))
+    if np.abs(P - P.T).max(initial=0.0) > rounding:
+        return False
+    try:
+        # A smallest variance that is no more than rounding error keeps it definite.
+        np.linalg.cholesky(P + (rounding + 1e-12) * np.eye(len(P)))
+    except np.linalg.LinAlgError:
+        return False
+    return True
 
 
 def _update(ekf: EkfSlam, chosen: NDArray[np.int64], lines: Lines, leeway: Array | None) -> bool:

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core import snapshot
 from thinmap_ros.core.se2 import Array, wrap
+from thinmap_ros.core.snapshot import FAR_M, LARGEST_ID, Field
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 
 _LISTED_M = 12.0  # nodes are noted up to here, unless none is near
@@ -21,6 +22,11 @@ _AS_NEAR_M = 1.0  # nodes farther than the nearest by no more than this are abou
 _REACH_M = 8.0  # nodes along edges matter up to here, and the first one of every edge
 _BESIDE_M = 2.0  # what lies this near is not behind the robot
 _TURN_M_RAD = 0.5  # way that the robot could have gone while it turns by a radian
+FIELDS = {
+    'stored_at': Field(np.int64, ('s', 2), 1, LARGEST_ID),
+    'node_ids': Field(np.int64, ('a',), 1, LARGEST_ID),
+    'node_places': Field(np.float64, ('a', 2), -FAR_M, FAR_M),
+}
 _TRAIL_M = 3.0  # where no topology is known, the robot's own way is one, with nodes this far apart
 
 
@@ -69,7 +75,13 @@ class LocalArea:
         }
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Take up the `state` of another area; once a topology is set, it counts instead of the nodes of then."""
+        """Take up the `state` of another area; once a topology is set, it replaces these nodes.
+
+        state: checked by FIELDS. Raises InputError where features are stored at unknown nodes.
+        """
+        snapshot.require_unique(state['node_ids'], 'features: node')
+        used = state['stored_at'][:, 1]
+        snapshot.require_known(used, state['node_ids'], 'features: stored at node')
         ids, places = state['node_ids'].tolist(), state['node_places']
         if not ids:
             return
@@ -78,8 +90,6 @@ class LocalArea:
         self._ids, self._places = ids, places
         self._place_of = dict(zip(ids, places, strict=True))
         for feature_id, node_id in state['stored_at'].tolist():
-            if node_id not in self._topology.nodes:
-                raise InputError(f'saved features: stored at node {node_id}: expected one of {len(ids)} saved nodes')
             self._put(feature_id, node_id)
 
     def nodes_of(self, feature_id: int) -> list[int]:

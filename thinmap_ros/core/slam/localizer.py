@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core import se2
+from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import parameter
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import LastPose
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam import feature_map, point_map
 from thinmap_ros.core.slam.anchors import AnchoredPoses
 from thinmap_ros.core.slam.doubt import Doubt, Evidence
 from thinmap_ros.core.slam.ekf import EkfSlam
@@ -37,6 +38,7 @@ from thinmap_ros.core.slam.scan_matching import FEWEST_POINTS, Match, MatchConfi
 from thinmap_ros.core.slam.tracking import SEEN_AGAIN, Tracking, share_seen_again
 from thinmap_ros.core.slam.wall_compass import WallCompass
 from thinmap_ros.core.slam.wall_points import wall_points
+from thinmap_ros.core.snapshot import Field
 from thinmap_ros.core.topology.graph import TopologicalMap
 
 _START_SIGMAS = (1e-4, 1e-4, 1e-4)  # the map begins where the robot stands: no doubt, but not singular
@@ -54,6 +56,12 @@ _TELLING_POINTS = 40  # where fewer beams hit, and not half of them, as in a wid
 _UNTURNED_RAD = 0.03  # doubt of the heading (1 sigma) with which nothing is drawn while walls may tell it soon
 _SLIP_SIGMAS = 3.0  # motion within so much of the slip is none
 _USUAL_NOISE = 0.1  # share of the variances allowed for that wheels mostly have
+FIELDS = {
+    **feature_map.FIELDS,
+    **point_map.FIELDS,
+    # the share of a scan that usually fits; not in the first sessions
+    'usual': Field(np.float64, (), 0.0, 1.0, optional=True),
+}
 _LOST_SIGMA_M = 1.0  # doubt since a scan last fitted; far from the start, more than this is no reason to be lost
 
 
@@ -170,10 +178,11 @@ class Localizer:
         The map of points that was given stays as it is where loops are closed later. Raises InputError where it is no
         such state.
         """
+        checked = snapshot.check(state, FIELDS, 'features')
         localizer = Localizer(config)
-        localizer._map = RedrawnMap(localizer.config, state)
-        localizer._feature_map.restore(localizer._filter, state)
-        usual = float(np.clip(np.nan_to_num(state.get('usual', np.ones(()))), 0.0, 1.0))
+        localizer._map = RedrawnMap(localizer.config, checked)
+        localizer._feature_map.restore(localizer._filter, checked)
+        usual = float(checked.get('usual', np.ones(())))
         localizer._tracking = Tracking(localizer.config.lost_scans, usual, carried=True)
         return localizer
 

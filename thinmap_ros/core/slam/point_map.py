@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core import snapshot
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.tiles import FARTHEST_TILE, NO_TILE, TILE, TileStore
 from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.se2 import FARTHEST_M, Array
+from thinmap_ros.core.snapshot import Field
 
 # What a cell holds: points counted, their mean (m, map frame), the unit normal of the surface there, towards where it
 # was seen from, how loose the surface is: 0 a wall, up to 1 clutter, UNFORMED where there are too few points; points
@@ -34,6 +36,19 @@ _DIRECTIONS = 16  # in which walls through a cell are looked for at first
 _NORMALS = np.array([(math.cos(a), math.sin(a)) for a in (math.pi * k / _DIRECTIONS for k in range(_DIRECTIONS))])
 _TILT_RAD = math.radians(2.0)  # doubt of a normal (1 sigma) above which it says nothing
 _FIRM = 4.0  # points that clutter has to consist of
+_MOST_POINTS = 1e9
+_ABOUT_1 = 1.0 + 1e-5  # what rounding may make of 1
+FIELDS = {
+    'cell_m': Field(np.float64, (), 1e-3, 10.0),
+    'cells': Field(np.int64, ('p', 2), -FARTHEST_TILE * TILE, FARTHEST_TILE * TILE),
+    # as the columns from COUNT to SEEN; infinite where a cell was taken over from a session
+    'points': Field(
+        np.float32,
+        ('p', 10),
+        (0, *(4 * (-FARTHEST_M,)), -_ABOUT_1, -_ABOUT_1, 0, 0, -math.inf),
+        (_MOST_POINTS, *(4 * (FARTHEST_M,)), _ABOUT_1, _ABOUT_1, 2, _MOST_POINTS, math.inf),
+    ),
+}
 
 
 class PointMap:
@@ -95,27 +110,23 @@ class PointMap:
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Take up the `state` of another map, into an empty one; however far the robot comes, its cells count.
 
-        Raises InputError where it is no such state, or one of cells of another size.
+        state: checked by FIELDS. Raises InputError where its cells are of another size, or lie too
+        far apart for one map.
         """
-        try:
-            cell_m, cells, points = float(state['cell_m']), state['cells'], state['points'].astype(np.float32)
-        except (KeyError, ValueError, TypeError) as error:
-            raise InputError(f'saved map of points: {error}: expected cell_m, cells and points') from error
-        if cell_m != self.cell_m:
-            raise InputError(f'saved map of points: cells of {cell_m} m: expected {self.cell_m} m')
-        if cells.shape != (len(points), 2) or points.shape[1:] != (SEEN + 1,) or cells.dtype != np.int64:
-            raise InputError(f'saved map of points: {cells.shape} cells, {points.shape} points: expected one a cell')
-        if not np.isfinite(points[:, :SEEN]).all() or np.isnan(points[:, SEEN]).any():
-            raise InputError('saved map of points: expected finite numbers')
+        cell_m = float(state['cell_m'])
+        cells = state['cells']
+        points = state['points'].copy()
+        expected = f'{self.cell_m} m'
+        snapshot.require(cell_m == self.cell_m, f'map of points: cells of {cell_m} m', expected)
         if not len(cells):
             return
-        if not -FARTHEST_TILE * TILE <= cells.min() <= cells.max() <= FARTHEST_TILE * TILE:
-            raise InputError(f'saved map of points: cells {cells.min()} to {cells.max()}: too far')
         tiles = _once(cells // TILE)
         low, high = tiles.min(axis=0), tiles.max(axis=0)
         self.tiles.reach(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
         self.tiles.ensure(tiles)
         rows, cols = (cells - self.corner).T
+        once = np.unique(rows * self.tiles.directory.shape[1] * TILE + cols)
+        snapshot.require(len(once) == len(cells), 'map of points: cells', 'each once')
         slots = self.tiles.directory[rows // TILE, cols // TILE]
         points[:, SEEN] = np.inf
         self._reserve(len(points))

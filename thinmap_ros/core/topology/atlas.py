@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core import snapshot
 from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.snapshot import FAR_CELLS, LARGEST_COUNT, Field
 from thinmap_ros.core.topology.net import Net, chains_of
 from thinmap_ros.core.topology.web import Chain, Spot, Web
 
@@ -15,6 +17,23 @@ Cells = NDArray[np.int64]
 _BLOCK = 6  # chains are listed by blocks of 2**6 cells
 _STRIDE = 16  # of which every so many cells are asked; a search looks as far around
 _RIM = 4  # cells at the border of a cut in which no spot may lie
+_LARGEST_SQUARED = 2**32  # of a clearance, in cells
+FIELDS = {
+    # number, row, col, squared clearance
+    'spots': Field(
+        np.int64,
+        ('n', 4),
+        (1, -FAR_CELLS, -FAR_CELLS, 0),
+        (LARGEST_COUNT, FAR_CELLS, FAR_CELLS, _LARGEST_SQUARED),
+    ),
+    # number, spot a, spot b, how many cells
+    'chains': Field(np.int64, ('m', 4), 1, LARGEST_COUNT),
+    # row, col, squared clearance, chain after chain
+    'cells': Field(
+        np.int64, ('k', 3), (-FAR_CELLS, -FAR_CELLS, 0), (FAR_CELLS, FAR_CELLS, _LARGEST_SQUARED)
+    ),
+    'next': Field(np.int64, (1,), 0, LARGEST_COUNT),
+}
 
 
 @dataclass
@@ -103,7 +122,11 @@ class Atlas(Web):
 
     @staticmethod
     def from_state(state: Mapping[str, Cells]) -> 'Atlas':
-        """The web that another one's `state` describes, with the same numbers."""
+        """The web that another one's `state` describes, with the same numbers.
+
+        state: checked by FIELDS. Raises InputError where its arrays contradict each other.
+        """
+        _check_references(state)
         atlas = Atlas()
         for number, row, col, squared in state['spots'].tolist():
             atlas._next = number - 1
@@ -270,6 +293,32 @@ class Atlas(Web):
                 links.setdefault(a, set()).add(b)
                 links.setdefault(b, set()).add(a)
         return links
+
+
+def _check_references(state: Mapping[str, Cells]) -> None:
+    """Raise InputError unless each chain runs, cell by cell, from one of the spots to another."""
+    spots, chains, cells = state['spots'], state['chains'], state['cells']
+    numbers = np.concatenate([spots[:, 0], chains[:, 0]])
+    snapshot.require_unique(numbers, 'topology: number of a spot or chain')
+    last, newest = int(numbers.max(initial=0)), int(state['next'][0])
+    snapshot.require(last <= newest, f'topology: next {newest}', f'at least {last}')
+    snapshot.require_known(chains[:, 1:3].ravel(), spots[:, 0], 'topology: spot of a chain')
+    counts = chains[:, 3]
+    fits = bool((counts <= len(cells)).all()) and int(counts.sum()) == len(cells)
+    snapshot.require(fits, f'topology: {len(cells)} cells', 'as many as the chains have')
+    if not len(chains):
+        return
+    ends = np.cumsum(counts)
+    starts = ends - counts
+    steps = np.abs(np.diff(cells[:, :2], axis=0)).max(axis=1, initial=0)
+    steps[ends[:-1] - 1] = 0  # from one chain to the next
+    beside = bool((steps <= 1).all())
+    snapshot.require(beside, 'topology: cells', 'each beside the next of its chain')
+    order = np.argsort(spots[:, 0])
+    for column, at in ((1, starts), (2, ends - 1)):
+        row = order[np.searchsorted(spots[:, 0], chains[:, column], sorter=order)]
+        together = np.array_equal(spots[row, 1:3], cells[at, :2])
+        snapshot.require(together, 'topology: ends of chains', 'the cells of their spots')
 
 
 def _runs_outside(chain: Chain, box: Box) -> list[tuple[int, int]]:

@@ -6,8 +6,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core import snapshot
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.snapshot import FAR_CELLS, LARGEST_COUNT, LARGEST_ID, Field
 from thinmap_ros.core.topology.atlas import Atlas
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.corners import corner_indices
@@ -19,6 +21,13 @@ _NEW = 0  # id of a node that has none yet
 _OTHER_KIND = 0.5  # share of same_place_m by which a node of another kind counts as farther away
 Cells = NDArray[np.int64]
 Place = tuple[int, int]  # spot, -1; or chain, index of a corner
+FIELDS = {
+    # number of a spot and -1, or number of a chain and index of a corner; id of its node
+    'places': Field(np.int64, ('p', 3), (1, -1, 1), (LARGEST_COUNT, FAR_CELLS, LARGEST_ID)),
+    # number of a chain, id of an edge along it
+    'edges': Field(np.int64, ('e', 2), 1, (LARGEST_COUNT, LARGEST_ID)),
+    'next_id': Field(np.int64, (1,), 1, LARGEST_ID),
+}
 OldEdges = dict[tuple[int, int], list[Edge]]  # by the ids of their nodes, the lower one first
 
 
@@ -50,17 +59,40 @@ class Registry:
         }
 
     def restore(self, atlas: Atlas, state: Mapping[str, NDArray[np.int64]]) -> None:
-        """Give an atlas the ids that the `state` of the registry beside it names."""
+        """Give an atlas the ids that the `state` of the registry beside it names.
+
+        state: checked by FIELDS. Raises InputError where it does not name each place and edge once.
+        """
         self._nodes = {(owner, index): node for owner, index, node in state['places'].tolist()}
         self._next_id = int(state['next_id'][0])
-        for place, node in self._places(atlas, set(atlas.spots), set(atlas.chains)):
+        used = np.concatenate([state['places'][:, 2], state['edges'][:, 1]])
+        snapshot.require_unique(used, 'topology: id of a node or edge')
+        last = int(used.max(initial=0))
+        next_id = self._next_id
+        snapshot.require(last < next_id, f'topology: next id {next_id}', f'above {last}')
+        places = self._places(atlas, set(atlas.spots), set(atlas.chains))
+        # Where the corners are depends on the robot's size: saved with another one, they differ.
+        same = self._nodes.keys() == {place for place, _ in places}
+        same = same and len(self._nodes) == len(state['places'])
+        expected = f'the {len(places)} of this robot_radius_m, each once'
+        snapshot.require(same, f'topology: {len(state["places"])} places with ids', expected)
+        for place, node in places:
             self.map.put_node(_named(node, self._nodes[place]))
+        self._restore_edges(atlas, state['edges'])
+
+    def _restore_edges(self, atlas: Atlas, edges: NDArray[np.int64]) -> None:
+        """Put the edges (chain, edge id) of an atlas whose nodes are there already into the map."""
         ids: dict[int, list[int]] = {}
-        for chain, edge in state['edges'].tolist():
+        for chain, edge in edges.tolist():
             ids.setdefault(chain, []).append(edge)
+        same = ids.keys() == atlas.chains.keys()
+        snapshot.require(same, f'topology: edges of {len(ids)} chains', f'of {len(atlas.chains)}')
         for number in atlas.chains:
+            pieces = self._pieces_of(atlas, number)
+            same = len(pieces) == len(ids[number])
+            snapshot.require(same, f'topology: edges of chain {number}', f'{len(pieces)} of them')
             self._edges[number] = ids[number]
-            for edge_id, (a, b, piece) in zip(ids[number], self._pieces_of(atlas, number), strict=True):
+            for edge_id, (a, b, piece) in zip(ids[number], pieces, strict=True):
                 self.map.put_edge(edge_of(edge_id, a, b, piece, self._lattice))
                 self._pieces[edge_id] = piece
 

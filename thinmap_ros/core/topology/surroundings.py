@@ -6,10 +6,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core import snapshot
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.frame import COARSEST_M, FINEST_M, GridFrame
 from thinmap_ros.core.grid.patch import FREE_AT_MOST, OCCUPIED_AT_LEAST, UNKNOWN, GridPatch
 from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.snapshot import FAR_CELLS, FAR_M, Field
 from thinmap_ros.core.topology.atlas import Box
 from thinmap_ros.core.topology.config import TopologyConfig
 
@@ -19,6 +21,12 @@ States = NDArray[np.int8]
 FREE, OCCUPIED = np.int8(0), np.int8(100)
 _NEVER = np.int8(-2)  # never in a window, or forgotten
 _BLOCK = 3  # painting looks first at blocks of 2**3 cells
+FIELDS = {
+    'memory': Field(np.int8, ('s', 's'), int(_NEVER), int(OCCUPIED)),
+    'low': Field(np.int64, (2,), -FAR_CELLS, FAR_CELLS),
+    'lattice': Field(np.float64, (3,), (-FAR_M, -FAR_M, FINEST_M), (FAR_M, FAR_M, COARSEST_M)),
+    'reach': Field(np.int64, (), 0, FAR_CELLS),
+}
 _OFF_LATTICE = 1e-3  # of a cell: windows that lie worse than this do not belong to the same grid
 
 
@@ -40,7 +48,7 @@ class Surroundings:
         self._margin = round(config.context_m / resolution)
         self._near = round(config.near_m / resolution)
         self._depth = round(config.margin_m / resolution)
-        self._reach = max(round(config.memory_m / resolution), self._margin)
+        self._reach = _reach(config, resolution)
         self._size = max(window) + 2 * self._reach
         self._memory: States = np.full((self._size, self._size), _NEVER, dtype=np.int8)
         self._low = (0, 0)
@@ -78,13 +86,22 @@ class Surroundings:
 
     @staticmethod
     def from_state(state: Mapping[str, NDArray[Any]], config: TopologyConfig) -> 'Surroundings':
-        """What another one's `state` describes. Raises InputError where it does not fit the configuration."""
-        memory, reach = state['memory'], int(state['reach'])
+        """What another one's `state` describes.
+
+        state: checked by FIELDS. Raises InputError where it does not fit the configuration.
+        """
+        memory = state['memory']
+        reach = int(state['reach'])
+        lattice = GridFrame(*state['lattice'].tolist())
+        wanted = _reach(config, lattice.resolution)
+        expected = f'{wanted} (memory_m, context_m)'
+        snapshot.require(reach == wanted, f'surroundings {reach} cells wide', expected)
         window = memory.shape[0] - 2 * reach
-        around = Surroundings(GridFrame(*state['lattice'].tolist()), (window, window), config)
-        if memory.shape != around._memory.shape:
-            raise InputError(f'saved surroundings {reach} cells wide: expected {around._reach} (memory_m, context_m)')
-        around._memory = memory.astype(np.int8)
+        snapshot.require(window > 0, f'surroundings {memory.shape}', f'more than {2 * reach} cells')
+        known = np.isin(memory, np.array([_NEVER, UNKNOWN, FREE, OCCUPIED]))
+        snapshot.require(bool(known.all()), 'surroundings: memory', '-2, -1, 0 or 100')
+        around = Surroundings(lattice, (window, window), config)
+        around._memory = memory
         around._low = (int(state['low'][0]), int(state['low'][1]))
         return around
 
@@ -136,6 +153,11 @@ class Surroundings:
             origin = (frame.origin_x, frame.origin_y)
             raise InputError(f'window at {origin}: expected whole cells from the first window of the map')
         return round(row), round(col)
+
+
+def _reach(config: TopologyConfig, resolution: float) -> int:
+    """How far round a window is remembered, in cells."""
+    return max(round(config.memory_m / resolution), round(config.context_m / resolution))
 
 
 def _wrapped(first: int, count: int, size: int) -> list[tuple[slice, slice]]:

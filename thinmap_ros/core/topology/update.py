@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core import snapshot
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.se2 import Array, invert, transform_points
+from thinmap_ros.core.snapshot import LARGEST_COUNT, Field
+from thinmap_ros.core.topology import atlas, identity, surroundings
 from thinmap_ros.core.topology.atlas import Atlas, Box
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.free_space import (
@@ -39,6 +41,12 @@ _WIDE_EVERY = 5  # scans: what lies farther from the robot changes more slowly
 _STRIDE_M = 1.0  # between poses at which the map is built anew
 _PAD = 6  # cells round what changed that are drawn anew with it
 _APART = 16  # cells between changes that are drawn anew each for itself
+FIELDS = {
+    'taken': Field(np.int64, (), 0, LARGEST_COUNT),
+    **surroundings.FIELDS,
+    **atlas.FIELDS,
+    **identity.FIELDS,
+}
 
 
 def build(patch: GridPatch, seed_xy: tuple[float, float] | None, config: TopologyConfig) -> TopologicalMap:
@@ -135,14 +143,12 @@ class TopologyBuilder:
         builder = TopologyBuilder(config)
         if not state:
             return builder
-        try:
-            builder._surroundings = Surroundings.from_state(state, builder.config)
-            builder._atlas = Atlas.from_state(state)
-            builder._taken = int(state['taken'])
-            builder._registry = Registry(builder.config, builder._surroundings.lattice)
-            builder._registry.restore(builder._atlas, state)
-        except (KeyError, ValueError, TypeError, IndexError, ZeroDivisionError) as error:
-            raise InputError(f'saved topology: {type(error).__name__} {error}: expected what was saved') from error
+        checked = snapshot.check(state, FIELDS, 'topology')
+        builder._surroundings = Surroundings.from_state(checked, builder.config)
+        builder._atlas = Atlas.from_state(checked)
+        builder._taken = int(checked['taken'])
+        builder._registry = Registry(builder.config, builder._surroundings.lattice)
+        builder._registry.restore(builder._atlas, checked)
         return builder
 
     def _take(self, window: GridPatch, T_map_base: Array, wide: bool) -> '_View':

@@ -1,0 +1,97 @@
+"""NumPy archives (.npz) from outside: no array is read before it is known how large it will be.
+
+An archive's members are compressed a thousandfold at best, and the header of an array may say any
+size. So sizes are added up first, and what a header says is compared with what its member holds.
+The limits are above the largest map that thinmap builds: 512 MiB in all, 64 arrays.
+"""
+
+import math
+import os
+import stat
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+from thinmap_ros.core.errors import InputError, ThinmapError, reason_of, shown
+
+MOST_BYTES = 512 << 20
+_MOST_ARRAYS = 64
+_ENDING = '.npy'
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_READERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+_READ_ONLY = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK
+
+
+@contextmanager
+def opened(path: Path, flags: int = 0) -> Iterator[IO[bytes]]:
+    """Open a regular file to be read; flags: more of them for os.open, such as O_NOFOLLOW.
+
+    Raises InputError where it is another kind of file (a pipe would block), OSError as open.
+    """
+    number = os.open(path, _READ_ONLY | flags)
+    with os.fdopen(number, 'rb') as stream:
+        if not stat.S_ISREG(os.fstat(number).st_mode):
+            raise InputError('expected a regular file')
+        yield stream
+
+
+def read_arrays(stream: IO[bytes]) -> dict[str, NDArray[Any]]:
+    """Read all arrays of an archive, by name.
+
+    Raises InputError where it is no archive of plain arrays (no pickled objects), or beyond the
+    limits; OSError as the stream.
+    """
+    try:
+        with zipfile.ZipFile(stream) as archive:
+            members = archive.infolist()
+            _check_sizes(members)
+            return {_name_of(member): _read(archive, member) for member in members}
+    except (OSError, ThinmapError):
+        raise
+    except (
+        Exception
+    ) as error:  # zlib and NumPy raise whatever a broken file makes them stumble over
+        raise InputError(reason_of(error)) from error
+
+
+def _check_sizes(members: list[zipfile.ZipInfo]) -> None:
+    names = {member.filename for member in members}
+    if len(members) > _MOST_ARRAYS or len(names) < len(members):
+        expected = f'expected at most {_MOST_ARRAYS}, each once'
+        raise InputError(f'{len(members)} arrays of {len(names)} names: {expected}')
+    size = sum(member.file_size for member in members)
+    if size > MOST_BYTES:
+        raise InputError(f'{size} bytes unpacked: expected at most {MOST_BYTES}')
+    for member in members:
+        if not member.filename.endswith(_ENDING) or member.compress_type not in _METHODS:
+            raise InputError(f'{shown(member.filename)}: expected an array, stored or deflated')
+
+
+def _name_of(member: zipfile.ZipInfo) -> str:
+    return member.filename.removesuffix(_ENDING)
+
+
+def _read(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
+    with archive.open(member) as stream:
+        _check_header(stream, member)
+    with archive.open(member) as stream:
+        array: NDArray[Any] = npy.read_array(stream, allow_pickle=False)
+        return array
+
+
+def _check_header(stream: IO[bytes], member: zipfile.ZipInfo) -> None:
+    """Raise InputError unless a member is as large as its header says."""
+    version = npy.read_magic(stream)
+    if version not in _READERS:
+        raise InputError(f'{shown(member.filename)}: version {version}: expected 1.0 or 2.0')
+    shape, _, dtype = _READERS[version](stream)
+    declared = math.prod(shape) * dtype.itemsize
+    there = member.file_size - stream.tell()
+    if min(shape, default=0) < 0 or dtype.itemsize == 0 or declared != there:
+        found = f'{shown(shape)} of {shown(str(dtype))}'
+        raise InputError(f'{shown(member.filename)}: {found}: expected an array of {there} bytes')
