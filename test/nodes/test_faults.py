@@ -150,6 +150,34 @@ def test_a_killed_localizer_goes_on_in_the_map_and_does_not_bend_it(graph):
     assert robot.error_m() < 0.06
 
 
+def test_a_killed_node_that_is_started_otherwise_begins_anew_and_says_why(graph):
+    maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
+    local = graph.heard('local_topology', TopologicalMap, qos.LATCHED)
+    start_mapping(graph)
+    graph.until(lambda: maps and local, 'map and graph')
+    state = graph.folder / 'state'
+    graph.until(lambda: len(list(state.glob('[!.]*.npz'))) == 3, 'all is kept')
+    changed = {
+        'grid_mapper': ({'resolution_m': 0.05}, 'expected 0.05 m (resolution_m)'),
+        'topology_builder': ({'memory_m': 20.0}, '(memory_m, context_m)'),
+    }
+    for name, (values, said) in changed.items():
+        kill(graph, name)
+        maps.clear()
+        graph.start(name, use_sim_time=True, **values)
+        graph.until(lambda n=name: 'begins anew' in graph.log(n), 'it says so')
+        assert said in graph.log(name), graph.log(name)
+    kill(graph, 'localizer')
+    (kept,) = state.glob('*.localizer.npz')
+    np.savez(kept, stamp_ns=np.array(1), T_map_odom=np.zeros(4), T_odom_base=np.zeros(3))
+    start_one(graph, 'localizer')
+    graph.until(lambda: 'T_map_odom: (4,)' in graph.log('localizer'), 'it says so')
+    assert 'was killed, but what it had is refused' in graph.log('localizer')
+    graph.until(lambda: maps and maps[-1].info.resolution < 0.06, 'a map with the new cells')
+    for name in MAPPING:
+        assert graph.stop(name) == 0
+
+
 @pytest.mark.slow
 def test_a_whole_robot_that_was_killed_and_begins_anew_is_not_mixed_with_the_one_before(graph):
     robot = Robot(graph)

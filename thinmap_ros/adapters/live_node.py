@@ -15,6 +15,7 @@ from thinmap_ros.adapters import parameters
 from thinmap_ros.adapters.health import OK, Health
 from thinmap_ros.adapters.recovery import Recovery, State
 from thinmap_ros.adapters.services import answer
+from thinmap_ros.core.errors import ThinmapError, reason_of
 
 _KEEP_S = 0.5
 _LEAST_PAUSES, _LEAST_PAUSES_NEWS = 50.0, 10.0  # between two times of keeping, in times that it took
@@ -77,19 +78,28 @@ class LiveNode(LifecycleNode):
 
         return self.create_timer(period_s, guarded, clock=clock)
 
-    def keep(self, state: Callable[[], State | None]) -> State | None:
-        """Keep what a state returns, again and again, for the case that the node is killed; None: nothing to keep.
+    def keep(self, state: Callable[[], State | None], resume: Callable[[State], None]) -> None:
+        """Keep what a state returns, again and again, for the case that the node is killed.
 
-        Returns what a predecessor left that was killed a short time ago.
+        state: returns None where there is nothing to keep. resume: is called with what a
+        predecessor left that was killed a short time ago. Where it raises a ThinmapError, as the
+        node was started with other parameters, the node begins anew.
         """
         self._recovery, self._state_of = Recovery(self, self._recover_s), state
         self._kept_at = monotonic()
         self._keeping_s = 0.0
         self.create_timer(_KEEP_S, self._keep, clock=Clock(clock_type=ClockType.STEADY_TIME))
         left = self._recovery.left()
-        if left is not None:
+        if left is None:
+            return
+        try:
+            resume(left)
+        except ThinmapError as error:
+            reason = reason_of(error)
+            self.get_logger().warning(f'was killed, but what it had is refused: {reason}: begins anew')
+            self._forget()
+        else:
             self.get_logger().warning('was killed, goes on from what it had; ~/reset begins anew')
-        return left
 
     def close(self) -> None:
         """Leave nothing behind: the node ends in order."""

@@ -1,6 +1,7 @@
 """What a node leaves for itself in case it is killed: one that is started again soon goes on from there."""
 
 import os
+import stat
 import tempfile
 import time
 from pathlib import Path
@@ -10,37 +11,54 @@ import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
 
-from thinmap_ros.adapters.files import written_aside
+from thinmap_ros.adapters.archive_files import opened, read_arrays
+from thinmap_ros.adapters.files import parts_of, written_aside
+from thinmap_ros.core.errors import InputError, reason_of
 
 State = dict[str, NDArray[Any]]
 _FOLDER = 'THINMAP_STATE_DIR'
+_MODE = 0o700
+_OF_OTHERS = 0o077
 
 
 class Recovery:
     """The file of one node: of its name, on its ROS domain.
 
-    It lies where nothing survives a restart of the machine, and is removed when the node ends in order: what is found
-    there was left by a node that was killed.
+    It lies where nothing survives a restart of the machine, and is removed when the node ends in
+    order: what is found there was left by a node that was killed. The folder belongs to this user
+    alone and is no link; else nothing is kept, and a warning says so.
     """
 
     def __init__(self, node: Node, limit_s: float) -> None:
         self._limit_s = limit_s
         self._node = node
         name = node.get_fully_qualified_name().strip('/').replace('/', '.')
-        folder = _folder()
-        self._path = None if folder is None else folder / f'{os.environ.get("ROS_DOMAIN_ID", "0")}.{name}.npz'
+        self._path: Path | None = None
+        if limit_s <= 0.0:
+            return
+        try:
+            self._path = state_folder() / f'{os.environ.get("ROS_DOMAIN_ID", "0")}.{name}.npz'
+        except InputError as error:
+            node.get_logger().warning(f'{error}: killed, the node would begin anew')
 
     def left(self) -> State | None:
-        """What a node that was killed left, if that is not long ago; None where nothing is there or it is broken."""
+        """What a node that was killed left, if not long ago; None where nothing is, or it is broken."""
+        if self._path is None:
+            return None
+        for part in parts_of(self._path):
+            part.unlink(missing_ok=True)
         try:
-            if self._path is None or time.time() - self._path.stat().st_mtime > self._limit_s:
-                return None
-            with np.load(self._path, allow_pickle=False) as archive:
-                return {key: archive[key] for key in archive.files}
+            with opened(self._path, os.O_NOFOLLOW) as stream:
+                status = os.fstat(stream.fileno())
+                if status.st_uid != os.getuid():
+                    raise InputError('expected a file of this user')
+                if time.time() - status.st_mtime > self._limit_s:
+                    return None
+                return read_arrays(stream)
         except FileNotFoundError:
             return None
-        except Exception as error:  # zipfile and NumPy raise whatever a broken file makes them stumble over
-            self._node.get_logger().warning(f'{self._path}: {error}: beginning anew')
+        except (OSError, InputError) as error:
+            self._warn(f'{reason_of(error)}: beginning anew')
             return None
 
     def keep(self, state: State) -> None:
@@ -51,24 +69,36 @@ class Recovery:
             with written_aside(self._path) as aside, aside.open('wb') as stream:
                 np.savez(stream, **state)  # type: ignore[arg-type]
         except OSError as error:
-            self._node.get_logger().warning(
-                f'{self._path}: {error.strerror}: killed now, the node would begin anew', throttle_duration_sec=60.0
-            )
+            self._warn(f'{error.strerror}: killed now, the node would begin anew')
 
     def forget(self) -> None:
         """Leave nothing."""
         if self._path is not None:
             self._path.unlink(missing_ok=True)
 
+    def _warn(self, what: str) -> None:
+        self._node.get_logger().warning(f'{self._path}: {what}', throttle_duration_sec=60.0)
 
-def _folder() -> Path | None:
-    """A folder of this user alone, or None where somebody else has made it."""
+
+def state_folder() -> Path:
+    """The folder of this user alone in which nodes keep their states; made where it is missing.
+
+    Raises InputError where it is none: a link, of another user, or open to others.
+    """
     chosen = os.environ.get(_FOLDER)
     runtime = os.environ.get('XDG_RUNTIME_DIR')
     base = Path(runtime) if runtime and Path(runtime).is_dir() else Path(tempfile.gettempdir())
     folder = Path(chosen) if chosen else base / f'thinmap-{os.getuid()}'
     try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        return folder if folder.stat().st_uid == os.getuid() else None
-    except OSError:
-        return None
+        folder.mkdir(mode=_MODE, parents=True, exist_ok=True)
+        status = folder.lstat()
+    except OSError as error:
+        raise InputError(f'{folder}: {error.strerror}: expected a folder for states') from error
+    if not stat.S_ISDIR(status.st_mode):
+        raise InputError(f'{folder}: expected a folder, not a link or a file')
+    if status.st_uid != os.getuid():
+        raise InputError(f'{folder}: of user {status.st_uid}: expected a folder of this user')
+    if status.st_mode & _OF_OTHERS:
+        mode = stat.S_IMODE(status.st_mode)
+        raise InputError(f'{folder}: mode {mode:o}: expected {_MODE:o}, closed to other users')
+    return folder

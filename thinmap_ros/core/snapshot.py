@@ -44,6 +44,9 @@ class Field:
 Fields = Mapping[str, Field]
 
 
+STAMPED: Fields = {'latest_ns': Field(np.int64, (), 0, LARGEST_COUNT)}
+
+
 def check(state: State, fields: Fields, what: str) -> dict[str, NDArray[Any]]:
     """Return the arrays of a state in their declared types; what: of what it is, for the error.
 
@@ -60,6 +63,16 @@ def check(state: State, fields: Fields, what: str) -> dict[str, NDArray[Any]]:
         elif not field.optional:
             raise InputError(f'saved {what}: no {name}: expected {", ".join(fields)}')
     return checked
+
+
+def check_stamp(state: State) -> tuple[int, dict[str, NDArray[Any]]]:
+    """Return the stamp, ns, of a state that a node kept ('latest_ns'), and the rest of its arrays.
+
+    Raises InputError where there is no stamp.
+    """
+    own = {name: array for name, array in state.items() if name in STAMPED}
+    stamp_ns = int(check(own, STAMPED, 'state')['latest_ns'])
+    return stamp_ns, {name: array for name, array in state.items() if name not in STAMPED}
 
 
 def require(is_so: bool, what: str, expected: str) -> None:

@@ -19,6 +19,7 @@ from thinmap_ros.adapters.recovery import State
 from thinmap_ros.adapters.services import answer, ask
 from thinmap_ros.adapters.stamps import StampMatcher
 from thinmap_ros.adapters.transforms import LaserMount
+from thinmap_ros.core import snapshot
 from thinmap_ros.core.errors import ThinmapError
 from thinmap_ros.core.grid.history import GridHistory
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, WindowConfig
@@ -51,7 +52,7 @@ class GridMapperNode(LiveNode):
         self._resumed_ns: int | None = None
         self._taken_over_ns = 0
         self.begin_anew()
-        self._go_on(self.keep(self._state))
+        self.keep(self._state, self._resume)
         self.offer_pause()
         self.health.sole_publisher_of('map')
         # First: of messages that wait together it is taken before the poses that follow from it.
@@ -87,11 +88,12 @@ class GridMapperNode(LiveNode):
             return None
         return {**self._grid.state(), 'latest_ns': np.array(self._latest_ns)}
 
-    def _go_on(self, left: State | None) -> None:
-        """Take over the map of a mapper that was killed."""
-        if left is not None and 'latest_ns' in left:
-            self._resumed_ns = self._latest_ns = self._taken_over_ns = int(left.pop('latest_ns'))
-            self._take_over(OccupancyGrid.from_state(left, self._config))
+    def _resume(self, left: State) -> None:
+        """Take over the map of a killed mapper. Raises InputError where it is no such map."""
+        latest_ns, cells = snapshot.check_stamp(left)
+        grid = OccupancyGrid.from_state(cells, self._config)
+        self._resumed_ns = self._latest_ns = self._taken_over_ns = latest_ns
+        self._take_over(grid)
 
     def _of_session(self) -> OccupancyGrid:
         return session_files.load_grid(self._session, self._config)

@@ -17,6 +17,7 @@ from thinmap_ros.adapters import messages, parameters, qos, runtime, session_fil
 from thinmap_ros.adapters.health import ERROR, OK
 from thinmap_ros.adapters.listening import listen
 from thinmap_ros.adapters.live_node import LiveNode
+from thinmap_ros.adapters.recovery import State
 from thinmap_ros.adapters.services import answer
 from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.core import se2
@@ -58,10 +59,7 @@ class LocalizerNode(LiveNode):
         self._resumed: LastPose | None = None
         self._latched: GridPatch | None = None
         self.begin_anew()
-        left = self.keep(lambda: None if self._last is None else self._last.state())
-        self._resumed = None if left is None else LastPose.from_state(left)
-        if self._resumed is not None:
-            self._listen_for_the_map()
+        self.keep(lambda: None if self._last is None else self._last.state(), self._take_up)
         self.offer_pause()
         self.health.sole_publisher_of('pose')
         self._pose = self.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
@@ -85,6 +83,11 @@ class LocalizerNode(LiveNode):
         self._resumed = self._latched = None
         self._newest: list[tuple[Scan, Array]] = []
         self._waits_since = monotonic()
+
+    def _take_up(self, left: State) -> None:
+        """Go on from the last pose of a killed localizer. Raises InputError where it is none."""
+        self._resumed = LastPose.from_state(left)
+        self._listen_for_the_map()
 
     def _made(self, config: LocalizerConfig) -> Localizer:
         """A localizer that begins at its start, in the map of the session if there is one."""

@@ -13,6 +13,7 @@ from thinmap_ros.adapters.live_node import LiveNode
 from thinmap_ros.adapters.recovery import State
 from thinmap_ros.adapters.services import answer
 from thinmap_ros.adapters.stamps import StampMatcher
+from thinmap_ros.core import snapshot
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.rebuilding import Rebuilding
@@ -49,19 +50,20 @@ class TopologyBuilderNode(LiveNode):
         self._resumed_ns: int | None = None
         self._taken_over_ns = 0
         self.begin_anew()
-        self._go_on(self.keep(self._state))
+        self.keep(self._state, self._resume)
 
     def _state(self) -> State | None:
         return None if self._latest_ns is None else {**self._builder.state(), 'latest_ns': np.array(self._latest_ns)}
 
-    def _go_on(self, left: State | None) -> None:
-        """Take over the graph of a builder that was killed."""
-        if left is not None and 'latest_ns' in left:
-            self._resumed_ns = self._latest_ns = self._taken_over_ns = int(left.pop('latest_ns'))
-            self._builder = TopologyBuilder.from_state(left, self._config)
-            self._builder.skip_ids(_UNTOLD_IDS)
-            self._rebuilding = Rebuilding(from_the_start=False)
-            self._publish(self._latest_ns)
+    def _resume(self, left: State) -> None:
+        """Take over the graph of a builder that was killed. Raises InputError where it is none."""
+        latest_ns, graph = snapshot.check_stamp(left)
+        builder = TopologyBuilder.from_state(graph, self._config)
+        builder.skip_ids(_UNTOLD_IDS)
+        self._resumed_ns = self._latest_ns = self._taken_over_ns = latest_ns
+        self._builder = builder
+        self._rebuilding = Rebuilding(from_the_start=False)
+        self._publish(latest_ns)
 
     def begin_anew(self) -> None:
         """Forget the graph, or go back to the session that the node was started with."""
