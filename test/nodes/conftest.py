@@ -48,7 +48,10 @@ class Graph:
             text = f"'{value}'" if isinstance(value, str) else str(value).lower()
             command += ['-p', f'{key}:={text}']
         log = (self.folder / f'{name}.log').open('wb')
-        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, start_new_session=True)
+        # Services save and load below the working directory.
+        process = subprocess.Popen(
+            command, stdout=log, stderr=subprocess.STDOUT, start_new_session=True, cwd=self.folder
+        )
         log.close()
         self.processes[name] = process
         return process

@@ -177,6 +177,87 @@ def test_sessions_are_loaded_into_running_nodes_or_refused_in_words(graph, tmp_p
         assert graph.stop(name) == 0
 
 
+def files_below(folder):
+    """Each file below a folder with its content, but for the logs of nodes and what they keep."""
+    files = [p for p in folder.rglob('*') if p.is_file() and p.suffix != '.log']
+    return {p: p.read_bytes() for p in files if 'state' not in p.parts}
+
+
+def test_services_touch_nothing_outside_of_their_folder(graph, tmp_path):
+    folder, outside = tmp_path / 'maps', tmp_path / 'outside'
+    folder.mkdir(), outside.mkdir()
+    save(outside / 'room', *room_of())
+    map_files.write_map(outside / 'drawn', room_of()[0].patch())
+    (folder / 'link').symlink_to(outside)
+    (folder / 'circle').symlink_to(folder / 'circle')
+    for end in ('.grid.npz', '.topology.npz'):
+        (folder / f'linked{end}').symlink_to(outside / f'room{end}')
+    described = (outside / 'drawn.yaml').read_text()
+    (folder / 'seen.yaml').write_text(described.replace('drawn.pgm', '../outside/drawn.pgm'))
+    for name in ('grid_mapper', 'topology_builder', 'localizer', 'explorer'):
+        graph.start(name, save_folder='maps', **({} if name == 'explorer' else {'recover_s': 0.0}))
+    before = files_below(tmp_path)
+    wrong = [
+        str(outside / 'room'), '../outside/room', 'link/room', 'linked', 'linked.grid.npz',
+        'circle/room', '/etc/passwd', '/proc/self/fd/1', 10_000 * 'x', 'a/../../outside/room', 'a\nb',
+    ]  # fmt: skip
+    calls = [
+        (kind, name) for kind, names in (
+            (SaveMap, ('save_map', 'save_topology', 'save_features', 'save_exploration')),
+            (LoadMap, ('load_map', 'load_topology', 'load_features')),
+        ) for name in names
+    ]  # fmt: skip
+    for kind, name in calls:
+        for path in wrong:
+            response = graph.call(kind, name, kind.Request(path=path))
+            said = response.message
+            assert not response.success and said.startswith('path '), (name, path, said)
+            assert 'expected a file below' in said, (name, path, said)
+            assert len(said) < 600 and said.isprintable()
+    response = graph.call(LoadMap, 'load_map', LoadMap.Request(path='seen.yaml'))
+    assert not response.success and 'image' in response.message and 'below' in response.message
+    assert files_below(tmp_path) == before
+    response = graph.call(SaveMap, 'save_map', SaveMap.Request(path='new/room'))
+    assert response.success, response.message
+    assert (folder / 'new' / 'room.grid.npz').exists()
+    new = files_below(tmp_path).keys() - before.keys()
+    assert new and all(file.is_relative_to(folder / 'new') for file in new)
+    absolute = str(folder / 'new' / 'room.yaml')
+    response = graph.call(LoadMap, 'load_map', LoadMap.Request(path=absolute))
+    assert response.success, response.message
+    # What the operator names at the start is not confined.
+    assert graph.stop('grid_mapper') == 0
+    maps = graph.heard('map', OccupancyGridMsg, qos.LATCHED)
+    graph.start('grid_mapper', save_folder='maps', session=str(outside / 'room'))
+    graph.until(lambda: maps and max(maps[-1].data) > 50, 'the session from elsewhere')
+
+
+def test_a_session_of_nonsense_leaves_the_running_map_as_it_was(graph, tmp_path):
+    grid, builder = room_of()
+    save(tmp_path / 'room', grid, builder)
+    save(tmp_path / 'bad', grid, builder)
+    with np.load(tmp_path / 'bad.topology.npz') as archive:
+        arrays = dict(archive)
+    arrays['cells'][5, 0] = 10**9
+    np.savez(tmp_path / 'bad.topology.npz', **arrays)
+    maps, graphs, _ = heard_maps(graph)
+    for name in MAPPERS:
+        graph.start(name, session=str(tmp_path / 'room'))
+    graph.until(lambda: maps and graphs, 'map and graph')
+    before = places(graphs[-1])
+
+    def refused():
+        response = graph.call(LoadMap, 'load_map', LoadMap.Request(path='bad'))
+        return not response.success and 'bad.topology.npz: saved topology: cells' in response.message
+
+    graph.until(refused, 'the reason')
+    again = graph.heard('topology', TopologicalMap, qos.LATCHED)
+    graph.until(lambda: again, 'the graph as it is')
+    assert places(again[-1]) == before
+    for name in MAPPERS:
+        assert graph.stop(name) == 0
+
+
 def test_a_builder_that_does_not_answer_is_said_and_the_mapper_goes_on(graph, tmp_path):
     async def never(request, response):
         await Future()

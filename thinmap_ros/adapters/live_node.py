@@ -95,8 +95,8 @@ class LiveNode(LifecycleNode):
         try:
             resume(left)
         except ThinmapError as error:
-            reason = reason_of(error)
-            self.get_logger().warning(f'was killed, but what it had is refused: {reason}: begins anew')
+            refused = f'what it had is refused: {reason_of(error)}'
+            self.get_logger().warning(f'was killed, but {refused}: begins anew')
             self._forget()
         else:
             self.get_logger().warning('was killed, goes on from what it had; ~/reset begins anew')

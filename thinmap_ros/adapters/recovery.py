@@ -42,7 +42,7 @@ class Recovery:
             node.get_logger().warning(f'{error}: killed, the node would begin anew')
 
     def left(self) -> State | None:
-        """What a node that was killed left, if not long ago; None where nothing is, or it is broken."""
+        """What a killed node left, if not long ago; None where nothing is, or it is broken."""
         if self._path is None:
             return None
         for part in parts_of(self._path):

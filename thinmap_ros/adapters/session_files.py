@@ -25,6 +25,10 @@ _FORMAT = 'thinmap_format'
 _GRID, _TOPOLOGY, _EXPLORATION, _FEATURES = 'grid 1', 'topology 1', 'exploration 1', 'features 1'
 _GRID_END, _TOPOLOGY_END, _MAP_END = '.grid.npz', '.topology.npz', '.yaml'
 _EXPLORATION_END, _FEATURES_END = '.exploration.npz', '.features.npz'
+# Of all files that a session may consist of, or that are set aside with a new one.
+_OLD = '.old'
+_KEPT = (_TOPOLOGY_END, _EXPLORATION_END, _FEATURES_END)
+ENDINGS = (_GRID_END, _MAP_END, '.pgm', *_KEPT, *(end + _OLD for end in _KEPT))
 
 
 def stem_of(path: str) -> Path:
@@ -50,10 +54,13 @@ def save_grid(path: str, grid: OccupancyGrid) -> str:
     return f'{stem}.pgm, {_MAP_END} and {_GRID_END}'
 
 
-def load_grid(path: str, config: OccupancyConfig | None = None) -> OccupancyGrid:
-    """Read STEM.grid.npz or, where that is not there, STEM.yaml and its image, which may be any map_server map.
+def load_grid(
+    path: str, config: OccupancyConfig | None = None, folder: Path | None = None
+) -> OccupancyGrid:
+    """Read STEM.grid.npz or, where that is not there, STEM.yaml and its image: any map_server map.
 
-    Raises InputError where there is neither, or one is broken or of another resolution.
+    folder: where given, the image has to lie below it. Raises InputError where there is neither, or
+    one is broken or of another resolution.
     """
     stem = stem_of(path)
     exact, description = _named(stem, _GRID_END), _named(stem, _MAP_END)
@@ -61,7 +68,7 @@ def load_grid(path: str, config: OccupancyConfig | None = None) -> OccupancyGrid
         return read_grid(exact, config)
     if not _is_there(description):
         raise InputError(f'{stem}: neither {exact.name} nor {description.name} is there')
-    patch = read_map(description)
+    patch = read_map(description, folder)
     try:
         return OccupancyGrid.from_patch(patch, config)
     except InputError as error:
@@ -147,7 +154,7 @@ def set_features_aside(path: str) -> str:
 
 def _set_aside(path: str, end: str) -> Path | None:
     file = _named(stem_of(path), end)
-    return file.replace(file.with_name(f'{file.name}.old')) if _is_there(file) else None
+    return file.replace(file.with_name(f'{file.name}{_OLD}')) if _is_there(file) else None
 
 
 def write_grid(path: Path, grid: OccupancyGrid) -> None:

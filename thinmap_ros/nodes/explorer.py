@@ -19,6 +19,7 @@ from thinmap_ros.adapters import checks, messages, parameters, qos, runtime, ses
 from thinmap_ros.adapters.actions import Outcome, SingleGoalServer
 from thinmap_ros.adapters.listening import listen
 from thinmap_ros.adapters.live_node import LiveNode
+from thinmap_ros.adapters.save_folder import SaveFolder
 from thinmap_ros.adapters.services import answer
 from thinmap_ros.adapters.stamps import StampMatcher
 from thinmap_ros.adapters.transforms import LaserMount
@@ -52,6 +53,7 @@ class ExplorerNode(LiveNode):
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
         self._mount = LaserMount(self)
         self._session = parameters.declare_session(self)
+        self._saves = SaveFolder(self)
         parameters.check_unknown(self)
         warm_up.explorer()
         self._goal_sent: Array | None = None
@@ -159,7 +161,11 @@ class ExplorerNode(LiveNode):
         self._cancel_asked = True
 
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
-        return answer(response, lambda: f'saved {session_files.save_exploration(request.path, self._explorer)}')
+        def save() -> str:
+            path = self._saves.inside(request.path)
+            return f'saved {session_files.save_exploration(path, self._explorer)}'
+
+        return answer(response, save)
 
     # What is done.
 

@@ -16,6 +16,7 @@ from thinmap_ros.adapters import messages, parameters, qos, runtime, session_fil
 from thinmap_ros.adapters.listening import listen
 from thinmap_ros.adapters.live_node import LiveNode
 from thinmap_ros.adapters.recovery import State
+from thinmap_ros.adapters.save_folder import SaveFolder
 from thinmap_ros.adapters.services import answer, ask
 from thinmap_ros.adapters.stamps import StampMatcher
 from thinmap_ros.adapters.transforms import LaserMount
@@ -44,6 +45,7 @@ class GridMapperNode(LiveNode):
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
         self._mount = LaserMount(self)
         self._session = parameters.declare_session(self)
+        self._saves = SaveFolder(self)
         parameters.check_unknown(self)
         warm_up.grid_mapper()
         self._latest_ns: int | None = None
@@ -151,10 +153,14 @@ class GridMapperNode(LiveNode):
         self._publish_map()
 
     async def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
-        answer(response, lambda: f'saved {session_files.save_grid(request.path, self._grid)}')
+        def save() -> str:
+            path = self._saves.inside(request.path)
+            return f'saved {session_files.save_grid(path, self._grid)}'
+
+        answer(response, save)
         if not response.success:
             return response
-        path = str(session_files.stem_of(request.path))
+        path = str(session_files.stem_of(self._saves.inside(request.path)))
         graph = await ask(self, self._save_topology, SaveMap.Request(path=path))
         if graph is None:
             saved = response.message
@@ -178,8 +184,10 @@ class GridMapperNode(LiveNode):
     async def _on_load(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:
         """Take over grid and graph, or neither."""
         try:
-            grid = session_files.load_grid(request.path, self._config)
-            path = str(session_files.stem_of(request.path)) if session_files.has_topology(request.path) else ''
+            inside = self._saves.inside(request.path)
+            grid = session_files.load_grid(inside, self._config, self._saves.path)
+            stem = str(session_files.stem_of(inside))
+            path = stem if session_files.has_topology(stem) else ''
         except ThinmapError as error:
             response.success, response.message = False, str(error)
             return response
@@ -189,7 +197,7 @@ class GridMapperNode(LiveNode):
         if response.success:
             self._take_over(grid)
             response.message = f'grid taken over; {response.message}'
-            features = await ask(self, self._load_features, LoadMap.Request(path=request.path))
+            features = await ask(self, self._load_features, LoadMap.Request(path=stem))
             if features is not None:
                 response.success, response.message = features.success, f'{response.message}; {features.message}'
         return response

@@ -18,6 +18,7 @@ from thinmap_ros.adapters.health import ERROR, OK
 from thinmap_ros.adapters.listening import listen
 from thinmap_ros.adapters.live_node import LiveNode
 from thinmap_ros.adapters.recovery import State
+from thinmap_ros.adapters.save_folder import SaveFolder
 from thinmap_ros.adapters.services import answer
 from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.core import se2
@@ -52,6 +53,7 @@ class LocalizerNode(LiveNode):
         self._odom_frame = parameters.declare_value(self, 'odom_frame', 'odom', 'frame of the odometry')
         self._mount = LaserMount(self)
         self._session = parameters.declare_session(self)
+        self._saves = SaveFolder(self)
         parameters.check_unknown(self)
         warm_up.localizer()
         self._map_topic: Subscription | None = None
@@ -173,14 +175,19 @@ class LocalizerNode(LiveNode):
         return self._newest
 
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
-        return answer(response, lambda: f'saved {session_files.save_features(request.path, self._localizer)}')
+        def save() -> str:
+            path = self._saves.inside(request.path)
+            return f'saved {session_files.save_features(path, self._localizer)}'
+
+        return answer(response, save)
 
     def _on_load(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:
         return answer(response, lambda: self._load(request.path))
 
     def _load(self, path: str) -> str:
         """Take over the features of a session; without any, those that there are stay."""
-        loaded = session_files.load_features(path, self._at(self._localizer.pose))
+        config = self._at(self._localizer.pose)
+        loaded = session_files.load_features(self._saves.inside(path), config)
         if loaded is None:
             return 'no features are saved: the localizer keeps its own'
         self._localizer = loaded

@@ -11,6 +11,7 @@ from thinmap_ros.adapters import messages, parameters, qos, runtime, session_fil
 from thinmap_ros.adapters.listening import listen
 from thinmap_ros.adapters.live_node import LiveNode
 from thinmap_ros.adapters.recovery import State
+from thinmap_ros.adapters.save_folder import SaveFolder
 from thinmap_ros.adapters.services import answer
 from thinmap_ros.adapters.stamps import StampMatcher
 from thinmap_ros.core import snapshot
@@ -33,6 +34,7 @@ class TopologyBuilderNode(LiveNode):
         self._config = parameters.declare(self, TopologyConfig)
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
         self._session = parameters.declare_session(self)
+        self._saves = SaveFolder(self)
         parameters.check_unknown(self)
         warm_up.topology_builder()
         self._said_something = False
@@ -129,7 +131,11 @@ class TopologyBuilderNode(LiveNode):
             self._newest_kept = newest
 
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
-        return answer(response, lambda: f'saved {session_files.save_topology(request.path, self._builder)}')
+        def save() -> str:
+            path = self._saves.inside(request.path)
+            return f'saved {session_files.save_topology(path, self._builder)}'
+
+        return answer(response, save)
 
     def _on_load(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:
         return answer(response, lambda: self._load(request.path))
@@ -138,7 +144,9 @@ class TopologyBuilderNode(LiveNode):
         """Take over what was saved; what is on its way from before is forgotten."""
         loaded = TopologyBuilder(self._config)
         if path:
-            loaded = session_files.load_topology(path, self._config, self._builder.resolution_m)
+            inside = self._saves.inside(path)
+            resolution_m = self._builder.resolution_m
+            loaded = session_files.load_topology(inside, self._config, resolution_m)
         self._builder, self._matcher, self._rebuilding = loaded, StampMatcher(), Rebuilding(from_the_start=not path)
         self._publish(self.get_clock().now().nanoseconds)
         return f'graph of {len(loaded.map.nodes)} nodes' if path else 'the graph begins anew'
