@@ -19,15 +19,15 @@ class SaveFolder:
     """The folder below which the paths of a node's services lie."""
 
     def __init__(self, node: Node) -> None:
-        """Declare the parameter `save_folder` of a node; empty: its working directory at the start."""
+        """Declare the parameter `save_folder`; empty: the working directory of the node."""
         description = 'folder below which services save and load; empty: the working directory'
         given = parameters.declare_value(node, 'save_folder', '', description)
         self.path = Path(str(given)).resolve()
 
     def inside(self, given: str) -> str:
-        """Return the absolute path of what a service names, relative to this folder, links resolved.
+        """Return the absolute path of what a service names below this folder, links resolved.
 
-        Raises InputError where it, or a file of the session that it names, is not below this folder.
+        Raises InputError where it, or a file of the session that it names, is elsewhere.
         """
         expected = f'expected a file below {self.path}'
         if not given.isprintable() or len(given) > _LONGEST_PATH:
