@@ -1,6 +1,7 @@
 """What is read is bounded: a small file that expands or nests without end is refused in one line and little memory."""
 
 import gzip
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -12,7 +13,6 @@ import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.records import Channel, Chunk, DataEnd, Footer, Header, Message, Schema
 
-from thinmap_ros.adapters.bag_folders import load_yaml
 from thinmap_ros.adapters.bag_writer import BagWriter
 from thinmap_ros.adapters.bags import Bag
 from thinmap_ros.adapters.carmen import LONGEST_LINE, CarmenLog
@@ -24,12 +24,14 @@ MAGIC = b'\x89MCAP0\r\n'
 EXPANDED = 900 * 2**20
 MOST_MB = 300
 RUNNER = """
-import resource, runpy, sys
+import pathlib, runpy, sys
 del sys.argv[0]
 try:
     runpy.run_module(sys.argv[0], run_name='__main__', alter_sys=True)
 finally:
-    print('peak', resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
+    # Not ru_maxrss: after a fork that is at least what the parent had.
+    status = pathlib.Path('/proc/self/status').read_text()
+    print('peak', int(status.split('VmHWM:')[1].split()[0]) // 1024)
 """
 
 
@@ -142,23 +144,27 @@ def laughs() -> str:
 
 
 YAML_BOMBS: dict[str, Callable[[], str]] = {
-    'alias': laughs,
-    'deep': lambda: '[' * 100_000,
+    'anchors': laughs,
+    '20 levels': lambda: '[' * 100_000,
     'at most 4194304': lambda: '#' * 5_000_000,
-    'at most 1000 characters': lambda: 'a: ' + '1:' * 100_000 + '1',
+    'at most 100': lambda: 'a: ' + '1:' * 100_000 + '1',
 }
 
 
 @pytest.mark.timeout(20)
 @pytest.mark.parametrize('said', YAML_BOMBS)
-def test_yaml_that_grows_in_memory_is_refused(tmp_path: Path, said: str) -> None:
-    with pytest.raises(InputError, match=said):
-        load_yaml(YAML_BOMBS[said](), 'x.yaml')
+def test_metadata_that_grow_in_memory_are_not_read(tmp_path: Path, said: str) -> None:
     writer = BagWriter(tmp_path / 'bag')
     writer.write('/said', 'std_msgs/msg/String', 5, b'\0\1\0\0\1\0\0\0\0')
     writer.__exit__(None, None, None)
     (tmp_path / 'bag' / 'metadata.yaml').write_text(YAML_BOMBS[said]())
-    with pytest.raises(InputError, match=f'metadata.yaml.*{said}') as error:
+    bag = Bag(tmp_path / 'bag')
+    # The bag itself is whole, and is read without it.
+    assert set(bag.topics) == {'/said'}
+    assert re.search(f'metadata.yaml.*{said}', bag.damage)
+    assert len(bag.damage) < 400
+    (tmp_path / 'bag' / 'bag.mcap').unlink()
+    with pytest.raises(InputError) as error:
         Bag(tmp_path / 'bag')
     assert len(str(error.value)) < 400
 

@@ -6,52 +6,15 @@ from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import yaml
 import zstandard
 
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.adapters.files import read_text
+from thinmap_ros.adapters.yaml_files import MOST_BYTES, parse_yaml
+from thinmap_ros.core.errors import InputError, reason_of
 
-LARGEST_YAML = 4 * 2**20
-"""Characters of metadata.yaml, and of the offered QoS that a channel of an MCAP file carries."""
-DEEPEST_YAML = 20
-LONGEST_PLAIN = 1000
-"""Characters of a value without quotes, which may be a number."""
 LARGEST_FILE = 32 * 2**30
 """Bytes that a file of a bag compressed file by file may expand to."""
 _PIECE = 2**20
-_LOADER: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
-
-
-def load_yaml(text: str, where: str) -> Any:
-    """Content of a YAML document.
-
-    Raises InputError, naming `where`, at what makes a short document large or slow (aliases, depth,
-    endless numbers), and ValueError where it is no YAML.
-    """
-    if len(text) > LARGEST_YAML:
-        raise InputError(
-            f'{where}: {len(text)} characters of YAML: expected at most {LARGEST_YAML}'
-        )
-    depth = 0
-    try:
-        for event in yaml.parse(text, Loader=_LOADER):
-            depth += isinstance(event, yaml.CollectionStartEvent)
-            depth -= isinstance(event, yaml.CollectionEndEvent)
-            if isinstance(event, yaml.AliasEvent):
-                raise InputError(f'{where}: a YAML alias: expected plain values')
-            if depth > DEEPEST_YAML:
-                raise InputError(f'{where}: YAML nested more than {DEEPEST_YAML} deep')
-            # A number of many digits takes time that grows with their square.
-            if isinstance(event, yaml.ScalarEvent) and event.implicit[0]:
-                _check_length(event.value, where)
-        return yaml.load(text, Loader=_LOADER)
-    except (yaml.YAMLError, OverflowError) as error:
-        raise ValueError(str(error)) from error
-
-
-def _check_length(value: str, where: str) -> None:
-    if len(value) > LONGEST_PLAIN:
-        raise InputError(f'{where}: {value[:20]}...: expected at most {LONGEST_PLAIN} characters')
 
 
 @dataclass(frozen=True)
@@ -70,8 +33,8 @@ class BagFiles:
 def bag_files(path: Path) -> BagFiles:
     """Files of a bag: the one that is given, or those of a folder.
 
-    MCAP files are found without metadata.yaml, too. Raises InputError where there are no files, or
-    metadata.yaml exceeds the limits of `load_yaml`.
+    MCAP files are found without metadata.yaml, too, or where it cannot be read. Raises InputError
+    where there are no files.
     """
     if not path.is_dir():
         return BagFiles([path])
@@ -79,8 +42,8 @@ def bag_files(path: Path) -> BagFiles:
     found = mcap_files_in(path)
     try:
         return _listed(path, _information(metadata))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        reason = f'{metadata}: {" ".join(str(error).split())[:120] or type(error).__name__}'
+    except (InputError, KeyError, TypeError, ValueError, AttributeError) as error:
+        reason = f'{metadata}: {reason_of(error).removeprefix(f"{metadata}: ")}'
     if found:
         return BagFiles(found, without_metadata=reason)
     if any(path.glob('*.db3')):
@@ -102,13 +65,9 @@ def _number(file: Path) -> tuple[int, str]:
 
 
 def _information(metadata: Path) -> Any:
-    """Raises ValueError where it cannot be read, InputError where it exceeds the limits."""
-    try:
-        with metadata.open(encoding='utf-8') as stream:
-            text = stream.read(LARGEST_YAML + 1)
-    except OSError as error:
-        raise ValueError(error.strerror or str(error)) from error
-    return load_yaml(text, str(metadata))['rosbag2_bagfile_information']
+    """Raises InputError, KeyError or TypeError where there is none, or beyond the limits of YAML."""
+    content: Any = parse_yaml(read_text(metadata, MOST_BYTES))
+    return content['rosbag2_bagfile_information']
 
 
 def _listed(folder: Path, information: Any) -> BagFiles:

@@ -1,10 +1,12 @@
 """Qualities of service as bags hold them: written with each topic, so that players offer what was offered."""
 
+from typing import Any
+
 from mcap.records import Channel
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2.metadata import parse_qos
 
-from thinmap_ros.adapters.bag_folders import load_yaml
+from thinmap_ros.adapters.yaml_files import parse_yaml
 from thinmap_ros.core.errors import InputError
 
 KEY = 'offered_qos_profiles'
@@ -17,7 +19,8 @@ def of_channel(channel: Channel) -> list[Qos]:
     """QoS that the publishers of a channel offered; empty where it says none that can be read."""
     text = channel.metadata.get(KEY, '')
     try:
-        offers = parse_qos(load_yaml(text, channel.topic)) if text else []
+        content: Any = parse_yaml(text) if text else []
+        offers = parse_qos(content) if content else []
         depths = [offer.depth for offer in offers]
     except (InputError, KeyError, TypeError, ValueError, AttributeError):
         return []
