@@ -150,6 +150,17 @@ def test_a_hall_in_which_nothing_is_near_is_not_blind(graph):
     )
 
 
+def test_a_laser_that_is_blind_from_the_start_is_told(graph):
+    doctor = Doctor(graph)
+    graph.start('navigator', laser_pose='0,0,0')
+    robot = Robot(graph)
+    blind = np.full(61, math.nan)
+    graph.until(
+        lambda: robot.say(blind) or 'blind' in doctor.status('navigator').message, 'it says so'
+    )
+    assert not any(drives(command) for command in robot.commands)
+
+
 def test_zero_means_no_return_where_the_preset_says_so(graph):
     doctor = Doctor(graph)
     graph.start('navigator', laser_pose='0,0,0', zero_is_no_return=True)

@@ -85,12 +85,15 @@ class Robot:
         self.graph.until(lambda: len(self.poses) > said, 'poses of a robot that stands')
 
     def error_m(self):
-        """How far the last pose is from the truth of its time."""
+        """How far the last pose is from the truth of its time, as soon as that is heard."""
+        self.graph.until(self._errors_m, 'a pose, and the true one of its time')
+        return self._errors_m()[-1]
+
+    def _errors_m(self):
         truths = {messages.stamp_ns(m.header.stamp): m.pose.position for m in self.truth}
-        stamps = [messages.stamp_ns(m.header.stamp) for m in self.poses]
-        found = [i for i, ns in enumerate(stamps) if ns in truths]
-        place, believed = truths[stamps[found[-1]]], self.poses[found[-1]].pose.pose.position
-        return float(np.hypot(place.x - believed.x, place.y - believed.y))
+        stamped = [(messages.stamp_ns(m.header.stamp), m.pose.pose.position) for m in self.poses]
+        pairs = [(truths[ns], believed) for ns, believed in stamped if ns in truths]
+        return [float(np.hypot(place.x - p.x, place.y - p.y)) for place, p in pairs]
 
 
 def places(graph_message):

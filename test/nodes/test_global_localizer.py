@@ -166,7 +166,7 @@ def test_what_is_wrong_with_the_input_is_said_in_words_and_no_pose_comes_of_it(g
         say['topology'].publish(messages.topology_msg(nodes, 'map', 0))
         until_it_says(words, wall)
     say['map'].publish(messages.grid_msg(good, 'map', 0))
-    until_it_says('without a valid beam', nothing)
+    until_it_says('laser blind', nothing)
     until_it_says('places explain', wall)
     until_it_says('has jumped', wall, (50.0, 0.0, 0.0))
     assert not poses

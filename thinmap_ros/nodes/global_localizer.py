@@ -157,13 +157,8 @@ class GlobalLocalizerNode(LiveNode):
     def _on_scan(self, message: LaserScan) -> None:
         scan = self._mount.scan(message)
         self._heard.add('scan')
-        if scan.is_blind:
-            self._scan = None  # nobody sees where the robot drives
-            self.get_logger().warning(
-                'laser blind (too few valid beams): waiting', throttle_duration_sec=_WARN_PERIOD_S
-            )
-            return
-        self._scan = scan
+        # Where the laser is blind, nobody sees where the robot drives.
+        self._scan = None if scan.is_blind else scan
         self._take(self._pairing.add_scan(scan))
 
     def _take(self, ready: list[tuple[Scan, Array]]) -> None:

@@ -132,6 +132,8 @@ class LocalizerNode(LiveNode):
         """Hear the map that was drawn before this localizer was killed, once."""
 
         def take(message: OccupancyGrid) -> None:
+            if self._resumed is None:
+                return  # it was told to begin anew
             try:
                 self._latched = messages.patch_from(message)
             except InputError as error:

@@ -144,17 +144,17 @@ class NavigatorNode(LiveNode):
 
     def _command(self) -> Command | None:
         """What the navigator says now; a stop while the laser is silent; None before everything is known."""
-        if self._map.patch is None or self._scan is None or self._T_map_odom is None or self._T_odom_base is None:
-            self.get_logger().warning(
-                'goal waits: no map, scan, pose or odometry yet', throttle_duration_sec=_WARN_PERIOD_S
-            )
-            return None
         if fault := self._fault():
             reason = f'{fault}: standing still'
             self.get_logger().warning(reason, throttle_duration_sec=_WARN_PERIOD_S)
             self.health.state(WARN, reason)
             self._navigator.halt()
             return Command(0.0, 0.0, 'blocked', reason)
+        if self._map.patch is None or self._scan is None or self._T_map_odom is None or self._T_odom_base is None:
+            self.get_logger().warning(
+                'goal waits: no map, scan, pose or odometry yet', throttle_duration_sec=_WARN_PERIOD_S
+            )
+            return None
         self.health.state(OK, 'driving')
         T_map_base = se2.compose(self._T_map_odom, self._T_odom_base)
         with self.health.timed('navigator'):

@@ -140,8 +140,8 @@ class GlobalLocalization:
             self._T_step = T_odom_base
             return self._waiting('odometry has jumped: all begins anew')
         self._T_step = T_odom_base
-        if not (scan.hit | scan.no_return).any():
-            return self._waiting(f'scan at {scan.stamp_ns} ns without a valid beam')
+        if scan.is_blind or not (scan.hit | scan.no_return).any():
+            return self._waiting(f'scan at {scan.stamp_ns} ns: laser blind (too few valid beams)')
         novelty = self._novelty(T_odom_base)
         if novelty > 0.0:
             self._look(scan, T_odom_base, novelty)
