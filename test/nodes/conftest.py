@@ -97,9 +97,13 @@ class Graph:
     def call(self, kind: type, name: str, request: Any) -> Any:
         client = self.node.create_client(kind, name)
         self.until(client.service_is_ready, f'service {name}')
-        future = client.call_async(request)
-        self.until(future.done, f'answer of {name}')
-        return future.result()
+        # A server that has just found its client may not be able to answer it yet: asked again then.
+        for _ in range(3):
+            future, end = client.call_async(request), time.monotonic() + PATIENCE_S / 3.0
+            self.until(lambda f=future, e=end: f.done() or time.monotonic() > e, f'answer of {name}')
+            if future.done():
+                return future.result()
+        pytest.fail(f'{name} answers nobody')
 
     def send_goal(self, client: ActionClient, goal: Any) -> Any:
         """Handle of a goal that was taken. A node that was killed passes for a server for a while: asked again then."""
