@@ -364,8 +364,7 @@ def test_a_robot_that_stands_for_minutes_is_as_sure_of_its_pose_as_before(graph)
     there = here + (1.0, 0.0, 0.0)
     before = answered(there, 10)
     after = answered(there, 500)
-    # What is left is that of the matches' own jitter, by which an uncertain heading is carried on.
-    assert np.abs(after - before).max() < 1e-4
+    assert np.abs(after - before).max() < 1e-6
     place = poses[-1].pose.pose.position
     assert np.hypot(place.x - there[0], place.y - there[1]) < 0.02
     assert (answered(there + (0.5, 0.0, 0.0), 1) > after).any(), 'driving adds'

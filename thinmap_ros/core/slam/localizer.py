@@ -374,7 +374,9 @@ class Localizer:
                 # The same look at the same walls: neither an error more nor a proof more.
                 self._doubt.on_map = on_map
                 added = np.zeros((3, 3))
-            increment, covariance = se2.between(pose, match.T_map_base), turn.T @ added @ turn
+            # Of a robot that stands, the jitter of the matches is no motion, and carries nothing on.
+            increment = np.zeros(3) if stands else se2.between(pose, match.T_map_base)
+            covariance = turn.T @ added @ turn
             predicted = match.T_map_base
         elif self._stands:
             self._doubt = Doubt(on_map)
