@@ -6,12 +6,31 @@ from setuptools import find_packages, setup
 
 NAME = 'thinmap_ros'
 NODES = [
-    'sim', 'grid_mapper', 'topology_builder', 'localizer', 'explorer', 'navigator', 'recorder', 'bag_player',
-    'demo_monitor', 'rerun_viewer', 'markers', 'global_localizer', 'thinmap',
+    'sim',
+    'grid_mapper',
+    'topology_builder',
+    'localizer',
+    'explorer',
+    'navigator',
+    'recorder',
+    'bag_player',
+    'demo_monitor',
+    'rerun_viewer',
+    'markers',
+    'global_localizer',
+    'thinmap',
 ]
 TOOLS = [
-    'replay', 'explore_world', 'compare_exploration', 'carmen_to_bag', 'map_to_graph', 'bag_repair', 'demo', 'warm_up',
-    'experiment', 'record_bags',
+    'replay',
+    'explore_world',
+    'compare_exploration',
+    'carmen_to_bag',
+    'map_to_graph',
+    'bag_repair',
+    'demo',
+    'warm_up',
+    'experiment',
+    'record_bags',
 ]
 
 setup(
@@ -27,18 +46,36 @@ setup(
         (f'share/{NAME}/worlds', glob('worlds/*.yaml')),
     ],
     install_requires=[
-        'lz4', 'matplotlib', 'mcap', 'numba', 'numpy', 'pillow', 'pyyaml', 'rosbags', 'scipy', 'tqdm', 'zstandard',
+        'lz4',
+        'matplotlib',
+        'mcap',
+        'numba',
+        'numpy',
+        'pillow',
+        'pyyaml',
+        'rosbags',
+        'scipy',
+        'tqdm',
+        'zstandard',
     ],
     extras_require={
         'cluster': ['distributed'],
         'viewer': ['rerun-sdk>=0.41,<0.42'],  # its interface changes with each minor version
-        'test': ['hypothesis', 'opencv-contrib-python-headless', 'psutil', 'pytest', 'pytest-timeout', 'scikit-image'],
+        'test': [
+            'hypothesis',
+            'opencv-contrib-python-headless',
+            'psutil',
+            'pytest',
+            'pytest-timeout',
+            'scikit-image',
+        ],
     },
     python_requires='>=3.11',
     zip_safe=False,
     maintainer='thinmap maintainers',
     maintainer_email='maintainers@thinmap.invalid',
-    description='Thinning-based topological mapping, exploration and SLAM for robots with one 2D laser scanner.',
+    description='Thinning-based topological mapping, exploration and SLAM for robots '
+    'with one 2D laser scanner.',
     license='Apache-2.0',
     entry_points={
         'console_scripts': [f'{node} = {NAME}.nodes.{node}:main' for node in NODES]

@@ -1,4 +1,4 @@
-"""A drive through a world with exact poses: what the grid and the topological map become on the way."""
+"""A drive through a world with exact poses: what grid and topological map become on the way."""
 
 import math
 import time
@@ -25,7 +25,7 @@ _IN_VIEW_M = 3.0
 
 @dataclass
 class Ledger:
-    """What was seen on the way: seconds of each cycle, and how many nodes in view kept their ids."""
+    """What was seen on the way: seconds of each cycle, how many nodes in view kept their ids."""
 
     seconds: list[float] = field(default_factory=list)
     kept: int = 0
@@ -59,7 +59,7 @@ class Drive:
             self.step(T)
 
     def _compare(self, before: dict[int, Node], T: Array) -> None:
-        """Count the nodes in view whose place still has a node, and those of them that kept their id."""
+        """Count nodes in view whose place still has a node, and how many of them kept their id."""
         after = self.builder.map.nodes
         places = np.array([node.position for node in after.values()]).reshape(-1, 2)
         for number, node in before.items():
@@ -71,7 +71,7 @@ class Drive:
 
 
 def tour(world: World, start: Array, radius_m: float, goals: int, seed: int) -> list[Array]:
-    """Poses (3,) of a drive that goes to the place of the world farthest from where it has been, again and again.
+    """Poses (3,) of a drive, again and again to the world's place farthest from where it has been.
 
     The ways are the wavefront planner's on the world itself: 0.6 m from walls where there is room.
     """
@@ -110,7 +110,9 @@ def _along(T: Array, way: Array) -> list[Array]:
     for point in points:
         heading = math.atan2(point[1] - last[1], point[0] - last[0])
         while abs(wrap(heading - last[2])) > _TURN_RAD:
-            last = pose(last[0], last[1], last[2] + math.copysign(_TURN_RAD, wrap(heading - last[2])))
+            last = pose(
+                last[0], last[1], last[2] + math.copysign(_TURN_RAD, wrap(heading - last[2]))
+            )
             poses.append(last)
         last = pose(point[0], point[1], heading)
         poses.append(last)

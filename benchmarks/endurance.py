@@ -1,8 +1,9 @@
-"""Hours of a simulated robot that explores and then drives to random places: scripts/endurance [--minutes M] -o DIR.
+"""Hours of a simulated robot that explores and then drives to random places.
 
-Time waits for the nodes, so that it goes as fast as the machine can. Writes DIR/endurance.csv, a line for every few
-seconds of simulated time: memory of each node, its step time, processor time of all nodes, scans without a pose. Ends
-with a verdict: what grew from the second quarter of the drive to the last one, and what was lost.
+Usage: scripts/endurance [--minutes M] -o DIR. Time waits for the nodes, so that it goes as fast as
+the machine can. Writes DIR/endurance.csv, a line for every few seconds of simulated time: memory of
+each node, its step time, processor time of all nodes, scans without a pose. Ends with a verdict:
+what grew from the second quarter of the drive to the last one, and what was lost.
 """
 
 import argparse
@@ -30,8 +31,12 @@ from thinmap_ros.sim.world import World
 from thinmap_ros.tools import cli
 
 _NODES = ('localizer', 'grid_mapper', 'topology_builder', 'navigator', 'explorer')
-_STEPS = {'localizer': 'localizer', 'grid_mapper': 'map update', 'topology_builder': 'graph update',
-          'navigator': 'navigator'}  # fmt: skip
+_STEPS = {
+    'localizer': 'localizer',
+    'grid_mapper': 'map update',
+    'topology_builder': 'graph update',
+    'navigator': 'navigator',
+}
 _MEDIAN = re.compile(r'median (\d+\.\d+) ms')
 _SCAN_S = 0.2
 _FLAT = 1.05
@@ -49,11 +54,18 @@ class Samples:
     rows: list[list[float]] = field(default_factory=list)
 
     def growth(self, column: str) -> float:
-        """Median of the last quarter over that of the second, as the first is for warming up; NaN: not measured."""
+        """Median of the last quarter over that of the second; NaN: not measured.
+
+        The first quarter is for warming up.
+        """
         values = np.array([row[self.columns.index(column)] for row in self.rows])
         quarter = len(values) // 4
-        known = [part[np.isfinite(part)] for part in (values[quarter : 2 * quarter], values[-quarter:])]
-        return float(np.median(known[1]) / np.median(known[0])) if all(part.size for part in known) else np.nan
+        known = [
+            part[np.isfinite(part)] for part in (values[quarter : 2 * quarter], values[-quarter:])
+        ]
+        if not all(part.size for part in known):
+            return np.nan
+        return float(np.median(known[1]) / np.median(known[0]))
 
 
 class Driver:
@@ -91,7 +103,7 @@ class Driver:
             client.send_goal_async(self._next_goal()).add_done_callback(self._on_taken)
 
     def lost(self) -> int:
-        """Scans that have no pose, from the first one that was heard: before that nobody listened."""
+        """Scans without a pose since the first one that was heard: before that nobody listened."""
         return max(round((self.simulated_s - self.first_s) / _SCAN_S) + 1 - self.poses, 0)
 
     def close(self) -> None:
@@ -143,17 +155,34 @@ def start(name: str, parameters: str) -> psutil.Popen:
 def start_all(world: str, at: np.ndarray, rate: float, seed: int) -> dict[str, psutil.Popen]:
     """Start nodes and simulator; returns the nodes, and the simulator as `sim`."""
     pose = f'start_x_m:={at[0]} start_y_m:={at[1]} start_yaw_rad:={at[2]}'
-    found = {name: start(name, f'use_sim_time:=true {pose if name == "localizer" else ""}') for name in _NODES}
+    found = {
+        name: start(name, f'use_sim_time:=true {pose if name == "localizer" else ""}')
+        for name in _NODES
+    }
     place = f'start:={at[0]},{at[1]},{at[2]}'
     found['sim'] = start(
-        'sim', f'world:={world} {place} rate:={rate} seed:={seed} lockstep:=local_topology hold_for_subscribers:=4'
+        'sim',
+        f'world:={world} {place} rate:={rate} seed:={seed} '
+        'lockstep:=local_topology hold_for_subscribers:=4',
     )
     return found
 
 
-def measure(driver: Driver, nodes: dict[str, psutil.Popen], arguments: argparse.Namespace, path: Path) -> Samples:
-    """Drive for so long, and write down how the nodes are. Raises ThinmapError where a node ends, or nothing comes."""
-    columns = ['simulated_s', 'wall_s', *(f'{n}_mb' for n in _NODES), *(f'{n}_ms' for n in _STEPS), 'cpu_s', 'lost']
+def measure(
+    driver: Driver, nodes: dict[str, psutil.Popen], arguments: argparse.Namespace, path: Path
+) -> Samples:
+    """Drive for so long, and write down how the nodes are.
+
+    Raises ThinmapError where a node ends, or nothing comes.
+    """
+    columns = [
+        'simulated_s',
+        'wall_s',
+        *(f'{n}_mb' for n in _NODES),
+        *(f'{n}_ms' for n in _STEPS),
+        'cpu_s',
+        'lost',
+    ]
     samples, begun = Samples(columns), time.monotonic()
     every_s = 60.0 * arguments.minutes / arguments.samples
     with path.open('w', encoding='utf-8', newline='', buffering=1) as file:
@@ -163,7 +192,9 @@ def measure(driver: Driver, nodes: dict[str, psutil.Popen], arguments: argparse.
             driver.spin()
             ended = [name for name, process in nodes.items() if process.poll() is not None]
             if ended or (not driver.poses and time.monotonic() - begun > _START_S):
-                raise ThinmapError(f'{ended[0]} has ended' if ended else f'no pose came in {_START_S:.0f} s')
+                raise ThinmapError(
+                    f'{ended[0]} has ended' if ended else f'no pose came in {_START_S:.0f} s'
+                )
             if driver.simulated_s >= every_s * (len(samples.rows) + 1):
                 samples.rows.append(sample(driver, nodes, time.monotonic() - begun))
                 writer.writerow([f'{value:.6g}' for value in samples.rows[-1]])
@@ -171,12 +202,13 @@ def measure(driver: Driver, nodes: dict[str, psutil.Popen], arguments: argparse.
 
 
 def sample(driver: Driver, nodes: dict[str, psutil.Popen], wall_s: float) -> list[float]:
-    """A row: what each node has for itself in memory, MB; medians of step times, ms; processor time of all nodes, s."""
+    """A row: each node's own memory, MB; median step times, ms; processor time of all nodes, s."""
     memory = [nodes[name].memory_full_info().uss / 1e6 for name in _NODES]
     times = [nodes[name].cpu_times() for name in _NODES]
     steps = [driver.step_ms.get(name, np.nan) for name in _STEPS]
     lost = max(driver.lost() - _LAG, 0)
-    return [driver.simulated_s, wall_s, *memory, *steps, sum(t.user + t.system for t in times), lost]
+    cpu_s = sum(t.user + t.system for t in times)
+    return [driver.simulated_s, wall_s, *memory, *steps, cpu_s, lost]
 
 
 def verdict(samples: Samples, driver: Driver) -> bool:
@@ -184,14 +216,19 @@ def verdict(samples: Samples, driver: Driver) -> bool:
     memory = {name: samples.growth(f'{name}_mb') for name in _NODES}
     steps = {name: samples.growth(f'{name}_ms') for name in _STEPS}
     for what, found in (('memory', memory), ('step time', steps)):
-        print(f'{what}, last quarter over second: ' + ', '.join(f'{n} {v:.3f}' for n, v in found.items()))
+        print(
+            f'{what}, last quarter over second: '
+            + ', '.join(f'{n} {v:.3f}' for n, v in found.items())
+        )
     lost = samples.rows[-1][-1]
     flat = max(memory.values()) <= _FLAT
     good = flat and lost == 0
     print(
-        f'{"GOOD" if good else "BAD"}: {samples.rows[-1][0] / 60.0:.1f} min simulated, {driver.reached} of '
-        f'{driver.goals} places reached; memory {"flat within" if flat else "NOT flat within"} 5 % '
-        f'(most: {max(memory.values()):.3f}), step time at most {np.nanmax(list(steps.values())):.3f} of what it was, '
+        f'{"GOOD" if good else "BAD"}: {samples.rows[-1][0] / 60.0:.1f} min simulated, '
+        f'{driver.reached} of {driver.goals} places reached; '
+        f'memory {"flat within" if flat else "NOT flat within"} 5 % '
+        f'(most: {max(memory.values()):.3f}), '
+        f'step time at most {np.nanmax(list(steps.values())):.3f} of what it was, '
         f'{lost:.0f} of {driver.poses + lost:.0f} scans lost'
     )
     return good
@@ -209,7 +246,9 @@ def stop(nodes: dict[str, psutil.Popen]) -> None:
 def _work(arguments: argparse.Namespace) -> None:
     if not arguments.minutes > 0.0 or arguments.samples < _FEWEST_SAMPLES:
         given = f'--minutes {arguments.minutes}, --samples {arguments.samples}'
-        raise InputError(f'{given}: expected more than 0 minutes and at least {_FEWEST_SAMPLES} samples')
+        raise InputError(
+            f'{given}: expected more than 0 minutes and at least {_FEWEST_SAMPLES} samples'
+        )
     os.environ['ROS_DOMAIN_ID'] = str(random.SystemRandom().randrange(1, 102))
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     path = resources.world_path(arguments.world)
@@ -229,12 +268,22 @@ def _work(arguments: argparse.Namespace) -> None:
 def main() -> None:
     """Run the program."""
     parser = argparse.ArgumentParser(prog='endurance', description=__doc__)
-    parser.add_argument('--minutes', type=float, default=120.0, help='simulated minutes (default 120)')
-    parser.add_argument('--rate', type=float, default=100.0, help='simulated seconds a second at most (default 100)')
-    parser.add_argument('--world', default='room_10x10', help='world or map YAML file, or a world of the package')
+    parser.add_argument(
+        '--minutes', type=float, default=120.0, help='simulated minutes (default 120)'
+    )
+    parser.add_argument(
+        '--rate', type=float, default=100.0, help='simulated seconds a second at most (default 100)'
+    )
+    parser.add_argument(
+        '--world', default='room_10x10', help='world or map YAML file, or a world of the package'
+    )
     parser.add_argument('--seed', type=int, default=0, help='decides places and noise (default 0)')
-    parser.add_argument('--samples', type=int, default=240, help='lines of the CSV file (default 240)')
-    parser.add_argument('-o', '--out', type=Path, default=Path('out/endurance'), help='folder (out/endurance)')
+    parser.add_argument(
+        '--samples', type=int, default=240, help='lines of the CSV file (default 240)'
+    )
+    parser.add_argument(
+        '-o', '--out', type=Path, default=Path('out/endurance'), help='folder (out/endurance)'
+    )
     cli.run(_work, parser)
 
 

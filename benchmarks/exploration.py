@@ -1,4 +1,4 @@
-"""Explorations in the simulator: how long a decision takes, how much faster than real time, and how much is seen."""
+"""Explorations in the simulator: time of a decision, speed against real time, and coverage."""
 
 import time
 from collections.abc import Iterator
@@ -17,13 +17,14 @@ _PART_S, _PART_QUICK_S = 3000.0, 200.0
 
 
 def run(worlds: Path, quick: bool) -> Iterator[Row]:
-    """Rows of whole explorations of dungeons, and of the time for decisions on the largest floor."""
+    """Rows of whole explorations of dungeons, and of times for decisions on the largest floor."""
     yield from _dungeons(floors(worlds, _DUNGEON_QUICK if quick else _DUNGEON))
     yield from _decisions(floors(worlds, _LARGEST)[0], _PART_QUICK_S if quick else _PART_S)
 
 
 def _dungeons(chosen: list[Floor]) -> Iterator[Row]:
-    explore(chosen[0].world, chosen[0].starts[0], replace(_FAST, time_limit_s=30.0))  # compile, fill caches
+    # Compile, fill caches.
+    explore(chosen[0].world, chosen[0].starts[0], replace(_FAST, time_limit_s=30.0))
     reports, speeds = [], []
     for floor in chosen:
         began = time.process_time()
@@ -31,7 +32,9 @@ def _dungeons(chosen: list[Floor]) -> Iterator[Row]:
         speeds.append(report['time'] / (time.process_time() - began))
         reports.append(report)
     yield Row('dungeons explored', f'{len(reports)}')
-    yield at_least('  stopped by itself', float(np.mean([report['finished'] for report in reports])), 1.0)
+    yield at_least(
+        '  stopped by itself', float(np.mean([report['finished'] for report in reports])), 1.0
+    )
     yield at_least('  least coverage', min(report['coverage'] for report in reports), 0.99)
     yield at_most('  collisions', sum(report['collisions'] for report in reports), 0)
     yield Row('  distance, mean', f'{np.mean([report["distance"] for report in reports]):.1f} m')

@@ -1,4 +1,7 @@
-"""Make docs/exploration.md of what compare_exploration left: python -m benchmarks.exploration_page DIR [DIR ...]."""
+"""Make docs/exploration.md of what compare_exploration left.
+
+Usage: python -m benchmarks.exploration_page DIR [DIR ...].
+"""
 
 import json
 import sys
@@ -14,22 +17,23 @@ _FULL_COVERAGE, _NEARLY_ALL = 0.99, 0.995
 _HEAD = """\
 # Exploration, measured
 
-Made by `python -m benchmarks.exploration_page DIR ...` of the folders that `compare_exploration WORLD... -o DIR` left,
-with the options that each section names. Distance, time and turns are means ± the mean spread over the starts of a
-world; coverage is the share of what could be seen from where the robot can get to; a contact is a collision. Times are
-of the processor, on a machine that did other things as well.
+Made by `python -m benchmarks.exploration_page DIR ...` of the folders that
+`compare_exploration WORLD... -o DIR` left, with the options that each section names. Distance, time
+and turns are means ± the mean spread over the starts of a world; coverage is the share of what
+could be seen from where the robot can get to; a contact is a collision. Times are of the processor,
+on a machine that did other things as well.
 """
 _NOTES = """\
 ## What was tried for the order of targets
 
-In a model of such worlds with cells of half a metre: the nearest place from which the unknown can be seen; tours
-through all places with other costs of waiting, or that come back; ways through the unknown or not; the
-distance-advantage rule; a laser that sees all around; an oracle that told how much is hidden behind each border. None
-was clearly better than the default, a tour through all. One turn at the first fork decides a lot, so that single
-worlds scatter widely.
+In a model of such worlds with cells of half a metre: the nearest place from which the unknown can
+be seen; tours through all places with other costs of waiting, or that come back; ways through the
+unknown or not; the distance-advantage rule; a laser that sees all around; an oracle that told how
+much is hidden behind each border. None was clearly better than the default, a tour through all. One
+turn at the first fork decides a lot, so that single worlds scatter widely.
 
-Borders seen in pieces, with gaps of a cell, counted as one: doorways that specks almost shut are then looked into, for
-more way in most worlds, where there are no such doorways. Not taken.
+Borders seen in pieces, with gaps of a cell, counted as one: doorways that specks almost shut are
+then looked into, for more way in most worlds, where there are no such doorways. Not taken.
 """
 
 
@@ -41,14 +45,19 @@ def page(reports: list[Report]) -> str:
     parts = [_HEAD]
     for (kind, conditions), chosen in sections.items():
         worlds = {report['world'] for report in chosen}
-        parts += [f'## {kind} ({len(worlds)}): {conditions}\n', markdown(chosen), *_verdicts(chosen)]
+        parts += [
+            f'## {kind} ({len(worlds)}): {conditions}\n',
+            markdown(chosen),
+            *_verdicts(chosen),
+        ]
     return '\n'.join([*parts, _NOTES])
 
 
 def _conditions(options: dict[str, Any]) -> str:
     laser, known = options['laser'], options['localization'] == 'truth'
     return (
-        f'{laser["beams"]} beams over {laser["field_of_view_deg"]:g} degrees, {laser["range_max_m"]:g} m, '
+        f'{laser["beams"]} beams over {laser["field_of_view_deg"]:g} degrees, '
+        f'{laser["range_max_m"]:g} m, '
         f'{options["speed_m_s"]:g} m/s, poses {"known" if known else "by SLAM"}'
     )
 
@@ -62,11 +71,18 @@ def _verdicts(reports: list[Report]) -> list[str]:
     lines = [_fault(report) for report in ours.values() if not _is_good(report)]
     if ours and not lines:
         count = f'{len(ours)} of {len(ours)}'
-        lines = [f'{OURS}: {count} stopped by itself, with {_FULL_COVERAGE:.0%} or more, without contact.']
-    lines += [_pose_error(report) for report in ours.values() if report['options']['localization'] != 'truth']
+        share = f'{_FULL_COVERAGE:.0%} or more'
+        lines = [f'{OURS}: {count} stopped by itself, with {share}, without contact.']
+    lines += [
+        _pose_error(report)
+        for report in ours.values()
+        if report['options']['localization'] != 'truth'
+    ]
     if ours:
         rest = sum(_after(report, _NEARLY_ALL) for report in ours.values()) / len(ours)
-        lines.append(f'After {_NEARLY_ALL:.1%} were seen, {OURS} drove {rest:.1%} of its way (mean).')
+        lines.append(
+            f'After {_NEARLY_ALL:.1%} were seen, {OURS} drove {rest:.1%} of its way (mean).'
+        )
     for name, theirs in sorted(by_strategy.items()):
         longer = saved(ours, theirs, 'distance')
         if (longer > 0.0).any():
@@ -78,13 +94,15 @@ def _verdicts(reports: list[Report]) -> list[str]:
 
 
 def _after(report: Report, share: float) -> float:
-    """Share of the whole way that was driven after a coverage was first measured; 0 where it never was."""
+    """Share of the whole way driven after a coverage was first measured; 0 where it never was."""
     along = [distance for _, distance, coverage in report['curve'] if coverage >= share]
     return 1.0 - along[0] / report['distance'] if along else 0.0
 
 
 def _is_good(report: Report) -> bool:
-    return bool(report['finished'] and report['coverage'] >= _FULL_COVERAGE and report['collisions'] == 0)
+    return bool(
+        report['finished'] and report['coverage'] >= _FULL_COVERAGE and report['collisions'] == 0
+    )
 
 
 def _fault(report: Report) -> str:
@@ -95,13 +113,20 @@ def _fault(report: Report) -> str:
 
 
 def _pose_error(report: Report) -> str:
-    return f'{report["world"]}, start {report["start_number"]}: pose error {report["pose_rmse"]:.3f} m (rms).'
+    return (
+        f'{report["world"]}, start {report["start_number"]}: '
+        f'pose error {report["pose_rmse"]:.3f} m (rms).'
+    )
 
 
 def main() -> None:
     """Write the page."""
     folders = [Path(word) for word in sys.argv[1:]]
-    reports = [report for folder in folders for report in json.loads((folder / 'reports.json').read_text('utf-8'))]
+    reports = [
+        report
+        for folder in folders
+        for report in json.loads((folder / 'reports.json').read_text('utf-8'))
+    ]
     _PAGE.write_text(page(reports), encoding='utf-8')
 
 

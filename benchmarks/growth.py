@@ -1,4 +1,4 @@
-"""What a scan costs, and what the map takes, as the map grows: a long drive through the warehouse of 200 x 200 m."""
+"""What a scan and the map cost as it grows: a long drive through the warehouse of 200 x 200 m."""
 
 import math
 import resource
@@ -25,7 +25,8 @@ from thinmap_ros.sim.tours import Look, drive, ways_along
 from thinmap_ros.sim.world import World
 
 _SPEED_M_S, _ROBOT = 1.0, '2dx'
-_MARKS_M, _MARKS_QUICK_M = (100.0, 500.0, 1000.0, 2000.0, 3000.0, 5000.0, 7500.0, 10_000.0), (100.0, 500.0, 1000.0)
+_MARKS_M = (100.0, 500.0, 1000.0, 2000.0, 3000.0, 5000.0, 7500.0, 10_000.0)
+_MARKS_QUICK_M = (100.0, 500.0, 1000.0)
 _SPAN_M = 100.0  # before a mark, over which its time is measured
 _WARM_UP = 300  # scans of a drive that is thrown away
 _RANGE_M = 32.0  # another mode of the LMS200: with 8 m, aisles show too little
@@ -34,7 +35,7 @@ _PARTS = ('localizer', 'grid', 'topology')
 
 @dataclass(frozen=True, eq=False)
 class _Mark:
-    """After a way, m: CPU of the last scans, ms, by part; free area, m2; memory, MB; error of the pose, m."""
+    """After a way, m: CPU of last scans by part, ms; free area, m2; memory, MB; pose error, m."""
 
     way_m: float
     taken_ms: dict[str, Array]
@@ -57,7 +58,8 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
     """Rows at some lengths of the drive, as they come."""
     deque(_drive(islice(_looks()[0], _WARM_UP), [math.inf]), maxlen=0)  # compiles
     looks, lap_m = _looks()
-    again = [lap * lap_m + _MARKS_M[0] for lap in range(1, 4)]  # where the first stretch has been driven once more
+    # Where the first stretch has been driven once more.
+    again = [lap * lap_m + _MARKS_M[0] for lap in range(1, 4)]
     first: _Mark | None = None
     new: _Mark | None = None  # the last one of the first lap
     for mark in _drive(looks, sorted(_MARKS_QUICK_M if quick else {*_MARKS_M, *again})):
@@ -71,7 +73,10 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
         if mark.way_m <= lap_m:
             new = mark
             grown_kb = 1e3 * (mark.resident_mb - first.resident_mb)
-            yield Row('  memory a square metre of new free area', f'{grown_kb / (mark.area_m2 - first.area_m2):.3g} kB')
+            yield Row(
+                '  memory a square metre of new free area',
+                f'{grown_kb / (mark.area_m2 - first.area_m2):.3g} kB',
+            )
         elif new is not None:
             more_mb = (mark.resident_mb - new.resident_mb) / (1e-3 * (mark.way_m - new.way_m))
             yield Row('  memory a kilometre on known ground', f'{more_mb:.3g} MB')
@@ -91,7 +96,9 @@ def _rows(mark: _Mark) -> Iterator[Row]:
 
 def _ratios(where: str, mark: _Mark, first: _Mark) -> Iterator[Row]:
     now, then = mark.taken_ms['all'], first.taken_ms['all']
-    yield at_most(f'  {where}, against the first time: median', float(np.median(now) / np.median(then)), 1.2)
+    yield at_most(
+        f'  {where}, against the first time: median', float(np.median(now) / np.median(then)), 1.2
+    )
     yield at_most('  the same, mean', float(now.mean() / then.mean()), 1.2)
 
 
@@ -103,7 +110,11 @@ def _drive(looks: Iterator[Look], marks_m: list[float]) -> Iterator[_Mark]:
     for look in looks:
         if pipeline is None:
             x, y, yaw = look.T_world_base.tolist()
-            pipeline = _Timed(PipelineConfig(localizer=LocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=yaw)))
+            pipeline = _Timed(
+                PipelineConfig(
+                    localizer=LocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=yaw)
+                )
+            )
         way_m += 0.0 if last is None else float(np.hypot(*(look.T_world_base - last)[:2]))
         last = look.T_world_base
         began = time.process_time()
@@ -116,10 +127,12 @@ def _drive(looks: Iterator[Look], marks_m: list[float]) -> Iterator[_Mark]:
             on_span = np.array(ways) > way_m - _SPAN_M
             patch = pipeline.grid.patch()
             yield _Mark(
-                marks_m[0], {part: 1e3 * np.array(each)[on_span] for part, each in taken.items()},
-                float(patch.free.sum()) * patch.frame.resolution**2, _resident_mb(),
+                marks_m[0],
+                {part: 1e3 * np.array(each)[on_span] for part, each in taken.items()},
+                float(patch.free.sum()) * patch.frame.resolution**2,
+                _resident_mb(),
                 float(np.hypot(*(T_map_base - look.T_world_base)[:2])),
-            )  # fmt: skip
+            )
             marks_m = marks_m[1:]
             if not marks_m:
                 return

@@ -1,4 +1,4 @@
-"""Global localization: time of a step, memory, and how some lost robots fare; `benchmarks.lost` has them all."""
+"""Global localization: step time, memory, some lost robots; `benchmarks.lost` has them all."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -26,7 +26,7 @@ _QUICK = {'paper': 5, 'lab': 20, 'voronoi': 20, 'twins': 2, 'foreign': 4, 'dunge
 
 
 def _step_times(folder: Path, quick: bool) -> Iterator[Row]:
-    """5,000 samples against 10 observed nodes and the beams of a scan, in maps with few and many nodes."""
+    """5,000 samples against 10 observed nodes and a scan's beams, in maps of few and many nodes."""
     floor = floors(folder, 'kth/50052749')[0]
     patch = shifted_map(floor.world, 1, (0.0, 0.0)).patch
     look = next(random_drive(floor.world, floor.starts[0], 0))
@@ -39,10 +39,13 @@ def _step_times(folder: Path, quick: bool) -> Iterator[Row]:
         judge = Judge(places, config, NodeModel(np.full(3, 0.5), np.full(3, 0.4), np.full(3, 20.0)))
         seen = replace(
             observe(look.scan, patch.frame.resolution, config),
-            nodes=rng.normal(0.0, 2.0, (10, 2)), node_kinds=np.ones(10, dtype=np.int64),
+            nodes=rng.normal(0.0, 2.0, (10, 2)),
+            node_kinds=np.ones(10, dtype=np.int64),
         )
         samples = np.array([random_pose(places, rng) for _ in range(config.samples)])
-        taken = 1e3 * median_seconds(partial(judge.log_likelihoods, samples, seen), 20 if quick else 200)
+        taken = 1e3 * median_seconds(
+            partial(judge.log_likelihoods, samples, seen), 20 if quick else 200
+        )
         yield at_most(f'5,000 samples, 10 observed nodes, {count} in the map', taken, limit, 'ms')
         yield Row('  what the map takes', f'{places.memory_bytes() / 1e6:.3g} MB', 'at most 50 MB')
 

@@ -1,7 +1,9 @@
-"""Lost robots by the hundred: python -m benchmarks.lost [ROW ...] -o DIR [--count N] [--worlds DIR] [--log LOG].
+"""Lost robots by the hundred.
 
-Each row of docs/localization.md leaves a CSV file with a line for each robot, as soon as it is there; what is in the
-file is not run again.
+Python -m benchmarks.lost [ROW ...] -o DIR [--count N] [--worlds DIR] [--log LOG].
+
+Each row of docs/localization.md leaves a CSV file with a line for each robot, as soon as it is
+there; what is in the file is not run again.
 """
 
 import argparse
@@ -42,12 +44,23 @@ def run_missing(cases: list[Case], path: Path) -> None:
 
 def main() -> None:
     """Run the rows that are named, or all."""
-    parser = argparse.ArgumentParser(prog='benchmarks.lost', description='Robots that were switched on anywhere')
+    parser = argparse.ArgumentParser(
+        prog='benchmarks.lost', description='Robots that were switched on anywhere'
+    )
     parser.add_argument('rows', nargs='*', help=f'some of {", ".join(ROWS)} (default: all)')
     parser.add_argument('-o', '--output', type=Path, required=True, help='folder for ROW.csv')
-    parser.add_argument('--count', type=int, help='of the cases of each row, the first so many (default: all)')
-    parser.add_argument('--worlds', type=Path, default=WORLDS, help=f'folder with worlds.json (default {WORLDS})')
-    parser.add_argument('--log', type=Path, default=_LOG, help=f'CARMEN log with laser and odometry (default {_LOG})')
+    parser.add_argument(
+        '--count', type=int, help='of the cases of each row, the first so many (default: all)'
+    )
+    parser.add_argument(
+        '--worlds', type=Path, default=WORLDS, help=f'folder with worlds.json (default {WORLDS})'
+    )
+    parser.add_argument(
+        '--log',
+        type=Path,
+        default=_LOG,
+        help=f'CARMEN log with laser and odometry (default {_LOG})',
+    )
     arguments = parser.parse_args()
     if unknown := set(arguments.rows) - set(ROWS):
         parser.error(f'unknown row {sorted(unknown)[0]}: expected some of {", ".join(ROWS)}')

@@ -68,8 +68,12 @@ def voronoi(_: Setting) -> Iterator[Case]:
 
 
 def _in_lab(seed: int, steps: int, row: str) -> Record:
-    world, known = lost_robots.lab(), lost_robots.voronoi_lab_map() if row == 'voronoi' else lost_robots.lab_map()
-    start = pose(*lost_robots.LAB_START) if row == 'paper' else random_start(world, np.random.default_rng([1, seed]))
+    world = lost_robots.lab()
+    known = lost_robots.voronoi_lab_map() if row == 'voronoi' else lost_robots.lab_map()
+    if row == 'paper':
+        start = pose(*lost_robots.LAB_START)
+    else:
+        start = random_start(world, np.random.default_rng([1, seed]))
     finder = GlobalLocalization(known.patch, known.topology, seed=seed)
     return search(finder, random_drive(world, start, seed), every=_STEP_SCANS, steps=steps)
 
@@ -85,27 +89,40 @@ def dungeon(setting: Setting) -> Iterator[Case]:
 
 
 def _floor_by_floor(
-    setting: Setting, run: Callable[[Path, str, int], Record], drives: int, at_a_time: int, part: str = ''
+    setting: Setting,
+    run: Callable[[Path, str, int], Record],
+    drives: int,
+    at_a_time: int,
+    part: str = '',
 ) -> Iterator[Case]:
-    """So many drives in each world, some at a time, so that a row that is cut off has been everywhere."""
+    """So many drives in each world, some at a time: a row that is cut off has been everywhere."""
     for first in range(0, drives, at_a_time):
         for floor in floors(setting.worlds, part):
             for number in range(first, first + at_a_time):
-                yield Case(f'{floor.name} {number}', partial(run, setting.worlds, floor.name, number))
+                yield Case(
+                    f'{floor.name} {number}', partial(run, setting.worlds, floor.name, number)
+                )
 
 
 def _in_building(folder: Path, name: str, number: int) -> Record:
     world, laser = lost_robots.floor_of(folder, name), _FULL
     start = random_start(world, np.random.default_rng([2, number]))
-    return search(fresh(_finder(folder, name, '', 1)), random_drive(world, start, number, laser=laser), _WAY_M)
+    return search(
+        fresh(_finder(folder, name, '', 1)), random_drive(world, start, number, laser=laser), _WAY_M
+    )
 
 
 @lru_cache(maxsize=1)
-def _finder(folder: Path, name: str, laser: str, finer: int, driven: bool = False) -> GlobalLocalization:
+def _finder(
+    folder: Path, name: str, laser: str, finer: int, driven: bool = False
+) -> GlobalLocalization:
     """A search that is ready to begin in a world's map."""
     world, kind = lost_robots.floor_of(folder, name), LASERS.get(laser, _FULL)
     shift = _SHIFT_M if finer > 1 else (0.0, 0.0)
-    known = lost_robots.driven_map(world, kind) if driven else lost_robots.shifted_map(world, finer, shift)
+    if driven:
+        known = lost_robots.driven_map(world, kind)
+    else:
+        known = lost_robots.shifted_map(world, finer, shift)
     start = random_start(world, np.random.default_rng(0))
     return prepared(known, next(random_drive(world, start, 0, laser=kind)), seed=1)
 
@@ -139,7 +156,7 @@ def _in_fine_map(folder: Path, name: str, number: int) -> Record:
 
 
 def driven(setting: Setting) -> Iterator[Case]:
-    """Maps that a robot has made on a drive of 400 m, at exact poses; other robots start where it has been."""
+    """Maps made on a drive of 400 m, at exact poses; other robots start where that one was."""
     yield from _floor_by_floor(setting, _in_driven_map, 20, 2)
 
 
@@ -147,15 +164,20 @@ def _in_driven_map(folder: Path, name: str, number: int) -> Record:
     world = lost_robots.floor_of(folder, name)
     finder = fresh(_finder(folder, name, '', 1, driven=True))
     within = np.zeros(world.occupied.shape, dtype=np.bool_)
-    cells = world.frame.cells_of(finder.places.frame.centres_of(finder.places.standing.astype(np.int64)))
+    cells = world.frame.cells_of(
+        finder.places.frame.centres_of(finder.places.standing.astype(np.int64))
+    )
     within[cells[:, 0], cells[:, 1]] = True
     start = random_start(world, np.random.default_rng([4, number]), within)
     return search(finder, random_drive(world, start, number, within), _WAY_M)
 
 
 def twins(_: Setting) -> Iterator[Case]:
-    """Places that look the same for ever: twin rooms, and a floor that looks the same when turned."""
-    for name, (world, within) in (('twin rooms', lost_robots.twin_rooms()), ('floor', lost_robots.turned_floor())):
+    """Places that look the same for ever: twin rooms, and a floor that is the same when turned."""
+    for name, (world, within) in (
+        ('twin rooms', lost_robots.twin_rooms()),
+        ('floor', lost_robots.turned_floor()),
+    ):
         for seed in range(20):
             yield Case(f'{name} {seed}', partial(_among_twins, world, within, seed))
 
@@ -168,12 +190,17 @@ def _among_twins(world: World, within: np.ndarray, seed: int) -> Record:
 
 
 def foreign(setting: Setting) -> Iterator[Case]:
-    """Robots in other buildings than that of the map, 20 m of way: each map against buildings after it, and others."""
+    """Robots in other buildings than that of the map, 20 m of way.
+
+    Each map against buildings after it, and others.
+    """
     names = ['lab', *sorted(floor.name for floor in floors(setting.worlds))]
     for distance in range(1, len(names)):
         for number, mapped in enumerate(names):
             driven_in = names[(number + distance * _COPRIME) % len(names)]
-            yield Case(f'{mapped} <- {driven_in}', partial(_elsewhere, setting.worlds, mapped, driven_in))
+            yield Case(
+                f'{mapped} <- {driven_in}', partial(_elsewhere, setting.worlds, mapped, driven_in)
+            )
 
 
 _COPRIME = 7  # to 25 worlds: all pairs come, and worlds of both kinds meet at once
@@ -193,7 +220,7 @@ def _map_of(folder: Path, name: str) -> Map:
 
 
 def kidnapped(setting: Setting) -> Iterator[Case]:
-    """Robots that are carried off while they explore with SLAM at 0.5 m/s: after 150 s, somewhere else on the map."""
+    """Robots carried off after 150 s of exploring with SLAM at 0.5 m/s, elsewhere on the map."""
     for number, floor in enumerate(floors(setting.worlds)):
         yield Case(floor.name, partial(_carried_off, setting.worlds, floor.name, number))
 
@@ -215,7 +242,7 @@ def halves(setting: Setting) -> Iterator[Case]:
 
 
 def foreign_log(setting: Setting) -> Iterator[Case]:
-    """The robot of the log in the maps of other buildings, and robots of other buildings in the log's map."""
+    """The log's robot in the maps of other buildings, and robots of other buildings in its map."""
     names = sorted(floor.name for floor in floors(setting.worlds))
     for name in names:
         yield Case(f'{name} <- log', partial(_log_elsewhere, setting, name))
@@ -226,16 +253,34 @@ def foreign_log(setting: Setting) -> Iterator[Case]:
 def _log_elsewhere(setting: Setting, name: str) -> Record:
     known = _map_of(setting.worlds, name)
     looks = lost_log.looks_from(setting.log, sum(map(ord, name)))
-    return lost_robots.watch_foreign(GlobalLocalization(known.patch, known.topology, seed=1), looks, _FOREIGN_WAY_M)
+    return lost_robots.watch_foreign(
+        GlobalLocalization(known.patch, known.topology, seed=1), looks, _FOREIGN_WAY_M
+    )
 
 
 def _in_log_map(setting: Setting, name: str) -> Record:
     world, known = lost_robots.floor_of(setting.worlds, name), lost_log.first_half(setting.log)
     drive = random_drive(world, random_start(world, np.random.default_rng(6)), 6)
-    return lost_robots.watch_foreign(GlobalLocalization(known.patch, known.topology, seed=1), drive, _FOREIGN_WAY_M)
+    return lost_robots.watch_foreign(
+        GlobalLocalization(known.patch, known.topology, seed=1), drive, _FOREIGN_WAY_M
+    )
 
 
 ROWS: dict[str, Callable[[Setting], Iterator[Case]]] = {
     row.__name__: row
-    for row in (paper, lab, voronoi, kth, dungeon, twins, foreign, foreign_log, kidnapped, halves, lasers, fine, driven)
+    for row in (
+        paper,
+        lab,
+        voronoi,
+        kth,
+        dungeon,
+        twins,
+        foreign,
+        foreign_log,
+        kidnapped,
+        halves,
+        lasers,
+        fine,
+        driven,
+    )
 }

@@ -30,7 +30,7 @@ _SHOWN, _AGREES = 0.7, 0.8  # shares of the beams
 
 @dataclass(frozen=True, eq=False)
 class _Halves:
-    """Looks of the whole log with their poses in the frame of the map of the first half, and that map."""
+    """Looks of the whole log with poses in the frame of the map of the first half, and that map."""
 
     looks: list[Look]
     half: int
@@ -49,7 +49,7 @@ def looks_from(log: Path, seed: int) -> Iterator[Look]:
 
 
 def in_second_half(log: Path, number: int) -> Record:
-    """A robot that is switched on at one of 100 stamps of the second half, with the map of the first."""
+    """A robot switched on at one of 100 stamps of the second half, with the map of the first."""
     halves = _halves(log)
     begin = int(np.linspace(halves.half, len(halves.looks) - SCANS - 1, _STARTS)[number])
     looks = halves.looks[begin : begin + SCANS]
@@ -64,7 +64,7 @@ def _finder(log: Path) -> GlobalLocalization:
 
 
 def _in_map(finder: GlobalLocalization, looks: list[Look]) -> tuple[float, float]:
-    """From the true poses: of how many of the beams the map says something, and with how many of these it agrees."""
+    """Of how many beams the map tells, from true poses, and with how many of these it agrees."""
     asked, agreed, beams = 0.0, 0.0, 0
     model = calibrate(finder.places, looks[0].scan, finder.config, np.random.default_rng(0))
     judge = Judge(finder.places, finder.config, model)
@@ -110,7 +110,7 @@ def _pairs(log: Path) -> list[tuple[Scan, Array]]:
 
 
 def _between_paths(path: Array, onto: Array) -> Array:
-    """Rigid motion (3,) that lays a path (N, 3) onto another one: least squares of the positions."""
+    """Rigid motion (3,) that lays a path (N, 3) onto another: least squares of the positions."""
     middle, onto_middle = path[:, :2].mean(axis=0), onto[:, :2].mean(axis=0)
     a, b = path[:, :2] - middle, onto[:, :2] - onto_middle
     turn = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())

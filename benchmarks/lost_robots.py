@@ -1,4 +1,4 @@
-"""Robots that were switched on anywhere: the maps that they have, their drives, and how the search for them ends."""
+"""Robots switched on anywhere: the maps they have, their drives, how the search for them ends."""
 
 import copy
 import time
@@ -16,7 +16,12 @@ from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.baselines.voronoi import build_voronoi
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.localization.global_localization import GlobalLocalization, Hypothesis, Result, State
+from thinmap_ros.core.localization.global_localization import (
+    GlobalLocalization,
+    Hypothesis,
+    Result,
+    State,
+)
 from thinmap_ros.core.se2 import Array, wrap
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.core.topology.update import TopologyConfig, build
@@ -72,17 +77,17 @@ def voronoi_lab_map() -> Map:
 
 
 def shifted_map(world: World, finer: int, shift_m: tuple[float, float]) -> Map:
-    """The map that a world is itself, in cells so many times finer, in a frame moved by this much."""
+    """A world itself as a map, in cells so many times finer, in a frame moved by this much."""
     patch = patch_of(world)
     cells = np.repeat(np.repeat(patch.cells, finer, axis=0), finer, axis=1)
     frame = patch.frame
-    return map_of_patch(
-        GridPatch(GridFrame(frame.origin_x + shift_m[0], frame.origin_y + shift_m[1], frame.resolution / finer), cells)
-    )
+    origin = (frame.origin_x + shift_m[0], frame.origin_y + shift_m[1])
+    shifted = GridFrame(*origin, frame.resolution / finer)
+    return map_of_patch(GridPatch(shifted, cells))
 
 
 def driven_map(world: World, laser: Lms200Config) -> Map:
-    """The map that a robot with a laser makes on a long drive, at exact poses: full of what it did not see."""
+    """The map of a long drive with a laser at exact poses, full of what the robot did not see."""
     looks = random_drive(world, random_start(world, np.random.default_rng(99)), 99, laser=laser)
     return map_of_patch(grid_of(look for look, _ in along(looks, _MAPPED_WAY_M)).patch())
 
@@ -141,7 +146,13 @@ def search(
         count += 1
         if result.pose is not None or count == steps:
             break
-    record: Record = {'outcome': 'open', 'way_m': round(driven_m, 2), 'steps': count, 'off_m': '', 'off_deg': ''}
+    record: Record = {
+        'outcome': 'open',
+        'way_m': round(driven_m, 2),
+        'steps': count,
+        'off_m': '',
+        'off_deg': '',
+    }
     if result is not None and result.pose is not None:
         off_m, off_rad = offset(result.pose, look.T_world_base + (*shift_m, 0.0))
         good = off_m <= right_m and off_rad <= _RIGHT_RAD
@@ -151,7 +162,10 @@ def search(
 
 
 def watch_twins(finder: GlobalLocalization, looks: Iterable[Look], way_m: float) -> Record:
-    """How often a robot that cannot tell places apart is sure, and how often the two likeliest are equally likely."""
+    """Counts of steps of a robot that cannot tell places apart.
+
+    How often it is sure, and how often the two likeliest places are equally likely.
+    """
     results = [finder.step(look.scan, look.T_odom_base) for look, _ in along(looks, way_m)]
     return {
         'steps': len(results),
@@ -162,12 +176,13 @@ def watch_twins(finder: GlobalLocalization, looks: Iterable[Look], way_m: float)
 
 def _gap(result: Result) -> float:
     """By how much the likeliest is likelier than the next."""
-    weights = [*sorted((hypothesis.weight for hypothesis in result.hypotheses), reverse=True), 0.0, 0.0]
+    found = sorted((hypothesis.weight for hypothesis in result.hypotheses), reverse=True)
+    weights = [*found, 0.0, 0.0]
     return weights[0] - weights[1]
 
 
 def watch_foreign(finder: GlobalLocalization, looks: Iterable[Look], way_m: float) -> Record:
-    """After how much way a robot in another building is told so, how it stands at last, and whether it was ever sure.
+    """After how much way a robot in another building is told so, or sure, and how it ends.
 
     It is looked for on and on, whether it was sure or not.
     """
@@ -182,7 +197,7 @@ def watch_foreign(finder: GlobalLocalization, looks: Iterable[Look], way_m: floa
 
 
 def twin_rooms() -> tuple[World, NDArray[np.bool_]]:
-    """Two rooms that are the same, doors shut, a number of cells apart that is not whole; the robot is in the first."""
+    """Two equal rooms, doors shut, not a whole number of cells apart; the robot is in the first."""
     cells = np.ones((300, 700), dtype=np.uint8)
     for left in (20, 367):
         cells[20:270, left : left + 300] = 0
@@ -198,11 +213,18 @@ def turned_floor() -> tuple[World, NDArray[np.bool_]]:
     cells = np.zeros((440, 893), dtype=np.uint8)
     cells[:5] = cells[-5:] = 1
     cells[:, :5] = cells[:, -5:] = 1
-    walls = ((100, 0, 105, 300), (250, 200, 255, 420), (0, 400, 180, 405), (300, 80, 340, 140), (30, 520, 60, 600))
+    walls = (
+        (100, 0, 105, 300),
+        (250, 200, 255, 420),
+        (0, 400, 180, 405),
+        (300, 80, 340, 140),
+        (30, 520, 60, 600),
+    )
     for top, left, bottom, right in walls:
         cells[top:bottom, left:right] = 1
     cells |= cells[::-1, ::-1]
-    return World('turned floor', cells, GridFrame(-0.013, -0.027, 0.02), np.zeros(3)), np.ones(cells.shape, np.bool_)
+    world = World('turned floor', cells, GridFrame(-0.013, -0.027, 0.02), np.zeros(3))
+    return world, np.ones(cells.shape, np.bool_)
 
 
 def coarse_map(world: World) -> Map:

@@ -19,7 +19,10 @@ def summary(row: str, records: list[Written]) -> Iterator[Row]:
 
 
 def by_group(records: list[Written]) -> dict[str, list[Written]]:
-    """Records by world or laser: what comes before the colon or, without one, before the number in a case's name."""
+    """Records by world or laser.
+
+    What comes before the colon or, without one, before the number in a case's name.
+    """
     groups: dict[str, list[Written]] = defaultdict(list)
     for record in records:
         name, colon, _ = record['case'].partition(':')
@@ -32,10 +35,18 @@ def percent(some: int, of: int) -> float:
     return 100.0 * some / max(of, 1)
 
 
-def outcomes(records: list[Written], right: float, wrong: float, steps: float | None = None) -> Iterator[Row]:
-    """Rows of drives that end where the robot is sure; right, wrong: percent wanted; steps: their median wanted."""
+def outcomes(
+    records: list[Written], right: float, wrong: float, steps: float | None = None
+) -> Iterator[Row]:
+    """Rows of drives that end where the robot is sure; right, wrong: percent wanted.
+
+    Steps: their median wanted.
+    """
     count = len(records)
-    counts = {word: sum(record['outcome'] == word for record in records) for word in ('right', 'wrong', 'open')}
+    counts = {
+        word: sum(record['outcome'] == word for record in records)
+        for word in ('right', 'wrong', 'open')
+    }
     yield Row('drives', f'{count}')
     yield at_least('right, of 100', percent(counts['right'], count), right)
     yield at_most('wrong and sure, of 100', percent(counts['wrong'], count), wrong)
@@ -43,15 +54,23 @@ def outcomes(records: list[Written], right: float, wrong: float, steps: float | 
     taken = [float(record['steps']) for record in records]
     if steps is not None:
         yield at_most('steps, median', float(np.median(taken)), steps)
-    for what, values in (('steps', taken), ('way, m', [float(record['way_m']) for record in records])):
+    for what, values in (
+        ('steps', taken),
+        ('way, m', [float(record['way_m']) for record in records]),
+    ):
         shares = ' '.join(f'{value:.3g}' for value in np.percentile(values, [50, 90, 97, 100]))
         yield Row(f'{what}: 50, 90, 97, 100 of 100', shares)
-    yield Row('processor time of a step, median', f'{np.median([float(r["step_ms"]) for r in records]):.3g} ms')
+    yield Row(
+        'processor time of a step, median',
+        f'{np.median([float(r["step_ms"]) for r in records]):.3g} ms',
+    )
 
 
 def _twins(records: list[Written]) -> Iterator[Row]:
     for name, group in by_group(records).items():
-        steps, sure, equal = (sum(int(record[key]) for record in group) for key in ('steps', 'sure', 'equal'))
+        steps, sure, equal = (
+            sum(int(record[key]) for record in group) for key in ('steps', 'sure', 'equal')
+        )
         yield Row(f'{name}: drives, steps', f'{len(group)}, {steps}')
         yield at_most('sure, of 100 steps', percent(sure, steps), 0.0)
         yield at_least('weights within 0.1, of 100 steps', percent(equal, steps), 95.0)
@@ -74,15 +93,20 @@ def _foreign(records: list[Written]) -> Iterator[Row]:
 
 def _kidnapped(records: list[Written]) -> Iterator[Row]:
     count = len(records)
-    noticed = [float(record['detected_after_s']) for record in records if record['detected_after_s']]
+    noticed = [
+        float(record['detected_after_s']) for record in records if record['detected_after_s']
+    ]
     found = [record for record in records if record['found_after_s']]
     right = sum(record['found_right'] == 'True' for record in found)
     yield Row('robots carried off', f'{count}')
-    yield at_least('noticed within 5 s, of 100', percent(sum(s <= _NOTICED_S for s in noticed), count), 95.0)
+    yield at_least(
+        'noticed within 5 s, of 100', percent(sum(s <= _NOTICED_S for s in noticed), count), 95.0
+    )
     yield at_least('right again, of 100', percent(right, count), 97.0)
     yield at_most('wrong and sure, of 100', percent(len(found) - right, count), 0.5)
     for what, values in (
-        ('noticed after, s', noticed), ('found after that, s', [float(record['found_after_s']) for record in found]),
+        ('noticed after, s', noticed),
+        ('found after that, s', [float(record['found_after_s']) for record in found]),
         ('and m', [float(record['found_after_m']) for record in found]),
     ):
         shares = ' '.join(f'{value:.3g}' for value in np.percentile(values or [0.0], [50, 90, 100]))
@@ -97,7 +121,9 @@ def _halves(records: list[Written]) -> Iterator[Row]:
         soon = percent(sum(int(record['steps']) <= _SCANS for record in right), len(chosen))
         name = f'{what}: right within {_SCANS} scans, of 100'
         yield Row(name, f'{soon:.3g}') if wanted is None else at_least(name, soon, wanted)
-        yield Row(f'{what}: right within 60 scans, of 100', f'{percent(len(right), len(chosen)):.3g}')
+        yield Row(
+            f'{what}: right within 60 scans, of 100', f'{percent(len(right), len(chosen)):.3g}'
+        )
     wrong = sum(record['outcome'] == 'wrong' for record in records)
     yield at_most('wrong and sure, of 100', percent(wrong, len(records)), 1.0)
 

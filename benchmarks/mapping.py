@@ -17,10 +17,14 @@ _SCANS = 200
 
 
 def run(worlds: Path, quick: bool) -> list[Row]:
-    """One row: 181 beams, 8 m, 10 cm, in a real floor, the robot turning on the spot at ten places."""
+    """One row: 181 beams, 8 m, 10 cm, a real floor, the robot turning on the spot at ten places."""
     floor = floors(worlds, 'kth/50052748')[0]
     laser = Lms200(Lms200Config(), 0)
-    turns = [np.array([*start[:2], start[2] + 0.3 * k]) for start in floor.starts for k in range(_SCANS // 10)]
+    turns = [
+        np.array([*start[:2], start[2] + 0.3 * k])
+        for start in floor.starts
+        for k in range(_SCANS // 10)
+    ]
     scans = [(laser.scan(floor.world, T, 0), T) for T in turns]
     grid = OccupancyGrid()
     seconds = best_seconds({'update': lambda: _update(grid, scans)}, 10 if quick else 40)['update']

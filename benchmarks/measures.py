@@ -23,18 +23,20 @@ def loop_count(graph: TopologicalMap) -> int:
 
 
 def clearance_m(patch: GridPatch) -> Array:
-    """Distance of each cell's centre (H, W) to the nearest centre of an occupied cell, m; outside all is occupied."""
+    """Distance (H, W) of cells to the nearest occupied one, by centres, m; outside is occupied."""
     distance = ndimage.distance_transform_edt(np.pad(~patch.occupied, 1))[1:-1, 1:-1]
     return np.asarray(distance * patch.frame.resolution)
 
 
 def drivable_share(patch: GridPatch, graph: TopologicalMap, radius_m: float) -> float:
-    """Share of the edges whose straight line, looked at every tenth of a cell, keeps a radius from obstacles."""
+    """Share of edges whose straight line, every tenth of a cell, keeps a radius from obstacles."""
     clearance = clearance_m(patch)
     good = 0
     for edge in graph.edges.values():
         a, b = graph.nodes[edge.a].position, graph.nodes[edge.b].position
-        count = max(2, math.ceil(float(np.hypot(*(b - a))) / (_SAMPLE_CELLS * patch.frame.resolution)) + 1)
+        count = max(
+            2, math.ceil(float(np.hypot(*(b - a))) / (_SAMPLE_CELLS * patch.frame.resolution)) + 1
+        )
         cells = patch.frame.cells_of(a + np.linspace(0.0, 1.0, count)[:, None] * (b - a))
         good += bool((clearance[cells[:, 0], cells[:, 1]] >= radius_m - 1e-9).all())
     return good / max(len(graph.edges), 1)
@@ -44,7 +46,9 @@ def agreement(one: TopologicalMap, other: TopologicalMap, reach_m: float) -> tup
     """Share of the nodes of each map that have a node of the other within reach."""
     if not one.nodes or not other.nodes:
         return (float(not other.nodes), float(not one.nodes))
-    first, second = (np.array([node.position for node in graph.nodes.values()]) for graph in (one, other))
+    first, second = (
+        np.array([node.position for node in graph.nodes.values()]) for graph in (one, other)
+    )
     near = cKDTree(second).query(first)[0] <= reach_m, cKDTree(first).query(second)[0] <= reach_m
     return float(near[0].mean()), float(near[1].mean())
 
@@ -60,7 +64,7 @@ class GridPaths:
         self.parts = ndimage.label(standing, np.ones((3, 3)))[0][standing]
 
     def lengths_from(self, number: int) -> Array:
-        """Length, in cells, of the shortest way from one cell to every other, inf where there is none."""
+        """Shortest way, in cells, from one cell to every other, inf where there is none."""
         return np.asarray(csgraph.dijkstra(self._links, directed=False, indices=number))
 
     def _neighbours(self, standing: Mask) -> sparse.csr_matrix:
@@ -82,11 +86,11 @@ class GridPaths:
 def completeness(
     patch: GridPatch, graph: TopologicalMap, radius_m: float, pairs: int, seed: int
 ) -> tuple[float, float]:
-    """Share of random reachable pairs of cells joined through the graph, and the mean length against the best.
+    """Share of reachable random pairs of cells joined by a graph, mean length against the best.
 
-    From a cell the robot goes over the grid to one of the nearest nodes (the way counts), then along straight lines
-    between nodes. The best way is the shortest one over cells with the same clearance. Means are over all pairs that
-    are joined.
+    From a cell the robot goes over the grid to one of the nearest nodes (the way counts), then
+    along straight lines between nodes. The best way is the shortest one over cells with the same
+    clearance. Means are over all pairs that are joined.
     """
     paths = GridPaths(clearance_m(patch) >= radius_m - 1e-9)
     rng = np.random.default_rng(seed)
@@ -95,12 +99,18 @@ def completeness(
     order = list(graph.nodes)
     places = patch.frame.cells_of(np.array([graph.nodes[k].position for k in order]))
     at_nodes = paths.numbers[places[:, 0], places[:, 1]]
-    between = csgraph.dijkstra(_straight_lines(graph, order, patch.frame.resolution), directed=False)
+    between = csgraph.dijkstra(
+        _straight_lines(graph, order, patch.frame.resolution), directed=False
+    )
     found, best = [], []
     for source, target in zip(sources.tolist(), targets, strict=True):
         from_source, from_target = paths.lengths_from(source), paths.lengths_from(target)
         first, last = (_nearest(lengths, at_nodes) for lengths in (from_source, from_target))
-        ways = from_source[at_nodes[first], None] + between[np.ix_(first, last)] + from_target[at_nodes[last]]
+        ways = (
+            from_source[at_nodes[first], None]
+            + between[np.ix_(first, last)]
+            + from_target[at_nodes[last]]
+        )
         length = float(ways.min(initial=np.inf))
         if math.isfinite(length):
             found.append(length)
@@ -115,13 +125,20 @@ def _nearest(lengths: Array, at_nodes: NDArray[np.int64]) -> NDArray[np.int64]:
     return nearest[np.isfinite(distance[nearest])]
 
 
-def _straight_lines(graph: TopologicalMap, order: list[int], resolution: float) -> sparse.csr_matrix:
-    """Lengths, in cells, of the straight lines between joined nodes; the shorter one of parallel edges."""
+def _straight_lines(
+    graph: TopologicalMap, order: list[int], resolution: float
+) -> sparse.csr_matrix:
+    """Lengths, in cells, of straight lines between joined nodes; the shorter of parallel edges."""
     index = {node: k for k, node in enumerate(order)}
     lines: dict[tuple[int, int], float] = {}
     for edge in graph.edges.values():
         a, b = sorted((index[edge.a], index[edge.b]))
-        length = float(np.hypot(*(graph.nodes[edge.a].position - graph.nodes[edge.b].position))) / resolution
+        length = (
+            float(np.hypot(*(graph.nodes[edge.a].position - graph.nodes[edge.b].position)))
+            / resolution
+        )
         lines[a, b] = min(lines.get((a, b), math.inf), length)
     ends = np.array(list(lines), dtype=np.int64).reshape(-1, 2)
-    return sparse.csr_matrix((list(lines.values()), (ends[:, 0], ends[:, 1])), shape=(len(order), len(order)))
+    return sparse.csr_matrix(
+        (list(lines.values()), (ends[:, 0], ends[:, 1])), shape=(len(order), len(order))
+    )

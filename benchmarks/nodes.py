@@ -1,6 +1,9 @@
-"""Nodes at work, a simulated robot at 5 Hz in real time: processor, memory, delay, traffic. In a shell of scripts/env.
+"""Nodes at work, a simulated robot at 5 Hz in real time: processor, memory, delay, traffic.
 
-One process with all nodes against a process for each. Delays are those that a listener sees, from scan to answer.
+In a shell of scripts/env.
+
+One process with all nodes against a process for each. Delays are those that a listener sees, from
+scan to answer.
 """
 
 import os
@@ -39,16 +42,30 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
 
 def _start(words: list[str], parameters: str) -> psutil.Popen:
     arguments = [word for parameter in parameters.split() for word in ('-p', parameter)]
-    command = [sys.executable, '-m', f'thinmap_ros.nodes.{words[0]}', *words[1:], '--ros-args', *arguments]
+    command = [
+        sys.executable,
+        '-m',
+        f'thinmap_ros.nodes.{words[0]}',
+        *words[1:],
+        '--ros-args',
+        *arguments,
+    ]
     return psutil.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
 def _measured(
-    what: str, programs: list[list[str]], seconds: float, bag: Path | None, limits: tuple[float | None, float | None]
+    what: str,
+    programs: list[list[str]],
+    seconds: float,
+    bag: Path | None,
+    limits: tuple[float | None, float | None],
 ) -> Iterator[Row]:
     start = 'start_x_m:=5.0 start_y_m:=2.0 start_yaw_rad:=0.0'
     placed = ('localizer', 'thinmap')
-    nodes = [_start(words, f'use_sim_time:=true {start if words[0] in placed else ""}') for words in programs]
+    nodes = [
+        _start(words, f'use_sim_time:=true {start if words[0] in placed else ""}')
+        for words in programs
+    ]
     others = [_start(['sim'], 'start:=5.0,2.0,0.0 hold_for_subscribers:=5')]
     if bag is not None:
         others.append(_start(['recorder'], f'use_sim_time:=true bag:={bag}'))
@@ -68,13 +85,18 @@ def _measured(
         delays.close()
         psutil.wait_procs([*nodes, *others], timeout=_STOP_S)
     yield Row(what, f'{len(delays.of("pose"))} scans')
-    for name, value, limit, unit in (('processor', share, limits[0], '%'), ('memory', memory, limits[1], 'MB')):
+    for name, value, limit, unit in (
+        ('processor', share, limits[0], '%'),
+        ('memory', memory, limits[1], 'MB'),
+    ):
         if limit is None:
             yield Row(f'  {name}', f'{value:.3g} {unit}')
         else:
             yield at_most(f'  {name}', value, limit, unit)
     for topic, limit in (('pose', 20.0), ('local_topology', 50.0)):
-        yield at_most(f'  scan to {topic}, 99 %', float(np.percentile(delays.of(topic), 99.0)), limit, 'ms')
+        yield at_most(
+            f'  scan to {topic}, 99 %', float(np.percentile(delays.of(topic), 99.0)), limit, 'ms'
+        )
 
 
 def _processor_s(process: psutil.Process) -> float:
@@ -99,9 +121,15 @@ class _Listener:
         self._node = rclpy.create_node('listener')
         self._cmd_vel = self._node.create_publisher(Twist, 'cmd_vel', qos.STREAM)
         self._heard: dict[str, dict[int, float]] = {}
-        kinds = {'scan': LaserScan, 'pose': PoseWithCovarianceStamped, 'local_topology': TopologicalMap}
+        kinds = {
+            'scan': LaserScan,
+            'pose': PoseWithCovarianceStamped,
+            'local_topology': TopologicalMap,
+        }
         for topic, kind in kinds.items():
-            self._node.create_subscription(kind, topic, self._hears(topic, messages.stamp_ns), qos.STREAM)
+            self._node.create_subscription(
+                kind, topic, self._hears(topic, messages.stamp_ns), qos.STREAM
+            )
 
     def _hears(self, topic, stamp_ns):  # type: ignore[no-untyped-def]
         def hear(message) -> None:  # type: ignore[no-untyped-def]
@@ -133,7 +161,9 @@ class _Listener:
     def of(self, topic: str) -> list[float]:
         """Milliseconds from each scan to the message of its stamp."""
         scans, answers = self._heard.get('scan', {}), self._heard.get(topic, {})
-        return [1e3 * (answers[ns] - at) for ns, at in scans.items() if ns in answers] or [float('inf')]
+        return [1e3 * (answers[ns] - at) for ns, at in scans.items() if ns in answers] or [
+            float('inf')
+        ]
 
 
 def _traffic(bag: Path) -> Iterator[Row]:

@@ -1,4 +1,4 @@
-"""A drive through worlds: time of a cycle, the global graph against the batch graph of the same grid, ids that stay."""
+"""A drive through worlds: time of a cycle, global against batch graph of a grid, ids that stay."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +10,8 @@ from benchmarks.measures import agreement, drivable_share, loop_count
 from benchmarks.table import Row, at_least, at_most
 from benchmarks.worlds import floors
 
-_QUICK, _WORLDS = ('dungeon/d114',), ('dungeon/d114', 'dungeon/d2555', 'kth/50052751', 'kth/50052748')
+_QUICK = ('dungeon/d114',)
+_WORLDS = ('dungeon/d114', 'dungeon/d2555', 'kth/50052751', 'kth/50052748')
 _WARM_UP = 20
 _RUN = 6000  # scans in 20 min
 
@@ -22,7 +23,7 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
         poses = tour(floor.world, floor.starts[0], 0.25, 8 if quick else 40, 0)
         drive = Drive(floor.world)
         drive.run(poses)
-        milliseconds = 1e3 * np.array(drive.ledger.seconds[_WARM_UP:])[: _RUN]
+        milliseconds = 1e3 * np.array(drive.ledger.seconds[_WARM_UP:])[:_RUN]
         tenth = len(milliseconds) // 10
         graph, batch = drive.builder.map, final_map(drive, floor.starts[0])
         there, back = agreement(graph, batch, 0.5)
@@ -37,9 +38,18 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
             ),
             at_least('  nodes with one of the batch map within 0.5 m', there, 0.95),
             at_least('  nodes of the batch map with one within 0.5 m', back, 0.95),
-            Row('  loops', f'{loop_count(graph)}', f'{loop_count(batch)}', loop_count(graph) == loop_count(batch)),
+            Row(
+                '  loops',
+                f'{loop_count(graph)}',
+                f'{loop_count(batch)}',
+                loop_count(graph) == loop_count(batch),
+            ),
             _components(len(graph.components()), len(batch.components())),
-            at_least('  nodes in view that keep their ids', drive.ledger.kept / max(drive.ledger.asked, 1), 0.99),
+            at_least(
+                '  nodes in view that keep their ids',
+                drive.ledger.kept / max(drive.ledger.asked, 1),
+                0.99,
+            ),
             at_least('  drivable edges', drivable_share(drive.grid.patch(), graph, 0.25), 1.0),
         ]
 

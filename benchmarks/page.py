@@ -1,4 +1,7 @@
-"""Make docs/benchmarks.md of the results of benchmarks: python -m benchmarks.page CSV_DIR [DOCS_DIR]."""
+"""Make docs/benchmarks.md of the results of benchmarks.
+
+Usage: python -m benchmarks.page CSV_DIR [DOCS_DIR].
+"""
 
 import csv
 import sys
@@ -7,27 +10,31 @@ from pathlib import Path
 _HEAD = """\
 # Benchmarks
 
-Made by `python -m benchmarks.page out/benchmarks` of the files that `python -m benchmarks.run --csv out/benchmarks`
-leaves (`--quick` where a table is short). Times are of one core; a load far above the number of cores says that the
-machine was busy with other things, and that all times are much too long.
+Made by `python -m benchmarks.page out/benchmarks` of the files that
+`python -m benchmarks.run --csv out/benchmarks` leaves (`--quick` where a table is short). Times are
+of one core; a load far above the number of cores says that the machine was busy with other things,
+and that all times are much too long.
 
 Machine: {machine}.
 """
 # In this order, what each is about.
 _ABOUT = {
-    'thinning': 'Thinning a real floor, laid side by side to a size, against scikit-image, OpenCV (padded: the same '
-    'cells) and simpler work on the same cells.',
+    'thinning': 'Thinning a real floor, laid side by side to a size, against scikit-image, OpenCV '
+    '(padded: the same cells) and simpler work on the same cells.',
     'mapping': 'Scans into the occupancy grid.',
-    'graphs': 'Maps of whole floors into graphs, against the Voronoi diagram by SciPy; are they drivable and complete?',
+    'graphs': 'Maps of whole floors into graphs, against the Voronoi diagram by SciPy; are they '
+    'drivable and complete?',
     'online': 'Grid and global graph on a drive, scan by scan.',
     'nodes': 'What the ROS nodes of map and graph need for a scan.',
     'localization': 'Global localization from 5,000 samples.',
     'planning': 'The wavefront planner.',
-    'matching': 'A scan against ten others round its place: the scan matcher of the localizer, and that of OpenKarto '
-    '(package karto-scanmatcher, where it is installed), which makes its map anew for each match.',
-    'slam': 'A step of the localizer by the number of features in the map: the filter over the local area (ti), over '
-    'all features (full).',
-    'growth': 'Localizer, grid and graph together on a long drive through the warehouse of 200 x 200 m.',
+    'matching': 'A scan against ten others round its place: the scan matcher of the localizer, and '
+    'that of OpenKarto (package karto-scanmatcher, where it is installed), which makes its map '
+    'anew for each match.',
+    'slam': 'A step of the localizer by the number of features in the map: the filter over the '
+    'local area (ti), over all features (full).',
+    'growth': 'Localizer, grid and graph together on a long drive through the warehouse of '
+    '200 x 200 m.',
 }
 
 
@@ -56,5 +63,7 @@ def _indented(row: list[str]) -> list[str]:
 
 
 if __name__ == '__main__':
-    docs = Path(sys.argv[2]) if len(sys.argv) > 2 else Path(__file__).resolve().parent.parent / 'docs'
+    docs = (
+        Path(sys.argv[2]) if len(sys.argv) > 2 else Path(__file__).resolve().parent.parent / 'docs'
+    )
     (docs / 'benchmarks.md').write_text(page(Path(sys.argv[1])), encoding='utf-8')

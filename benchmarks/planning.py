@@ -1,4 +1,7 @@
-"""The wavefront planner on random goals: all that can be reached is, on short ways; the rest is refused, and soon."""
+"""The wavefront planner on random goals: all that can be reached is, on short ways.
+
+The rest is refused, and soon.
+"""
 
 import math
 import time
@@ -23,7 +26,10 @@ _HAIR = 1e-6
 
 @dataclass
 class _Tally:
-    """What came of the goals: length of each path over the best one's, and how long each answer took, s."""
+    """What came of the goals.
+
+    Length of each path over the best one's, and how long each answer took, s.
+    """
 
     reachable: int = 0
     reached: int = 0
@@ -47,7 +53,11 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
     yield Row('goals', f'{tally.reachable + tally.unreachable}')
     yield at_least('  reachable ones reached', tally.reached / max(tally.reachable, 1), 1.0)
     yield at_most('  paths nearer to something than allowed', tally.too_near, 0)
-    yield at_most('  length against the best with the same clearance, mean', float(np.mean(tally.ratios)), 1.05)
+    yield at_most(
+        '  length against the best with the same clearance, mean',
+        float(np.mean(tally.ratios)),
+        1.05,
+    )
     yield at_most('  the same, longest', float(np.max(tally.ratios)), 1.05)
     yield at_least('  unreachable ones refused', tally.refused / max(tally.unreachable, 1), 1.0)
     yield at_most('  longest time to refuse one', max(tally.refuse_s), 1.0, 's')
@@ -65,7 +75,8 @@ def _try(floor: Floor, patch: GridPatch, rng: np.random.Generator, tally: _Tally
     at = tuple(patch.frame.cells_of(start[None, :2])[0])
     expected = parts[at] > 0 and parts[tuple(cell)] == parts[at]
     # Beside what can be reached, a goal moves a little: neither answer is wrong there.
-    low, slack = np.maximum(cell - math.ceil(config.goal_slack_m / resolution), 0), config.goal_slack_m / resolution
+    low = np.maximum(cell - math.ceil(config.goal_slack_m / resolution), 0)
+    slack = config.goal_slack_m / resolution
     near = parts[low[0] : cell[0] + math.ceil(slack) + 1, low[1] : cell[1] + math.ceil(slack) + 1]
     if parts[at] == 0 or (not expected and (near == parts[at]).any()):
         return
@@ -82,7 +93,9 @@ def _try(floor: Floor, patch: GridPatch, rng: np.random.Generator, tally: _Tally
         tally.refuse_s.append(seconds)
 
 
-def _judge(path: Array, patch: GridPatch, clearance_m: NDArray[np.float64], tally: _Tally, radius_m: float) -> None:
+def _judge(
+    path: Array, patch: GridPatch, clearance_m: NDArray[np.float64], tally: _Tally, radius_m: float
+) -> None:
     cells = patch.frame.cells_of(path)
     least_m = float(clearance_m[cells[:, 0], cells[:, 1]].min())
     tally.too_near += least_m < radius_m - _HAIR

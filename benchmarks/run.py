@@ -40,9 +40,15 @@ def main() -> None:
     """Run the benchmarks that are named, or all."""
     parser = argparse.ArgumentParser(prog='benchmarks.run', description='Benchmarks of the core')
     parser.add_argument('names', nargs='*', help=f'some of {", ".join(_ALL)} (default: all)')
-    parser.add_argument('--quick', action='store_true', help='fewer worlds, pairs and scans: a minute or two')
-    parser.add_argument('--worlds', type=Path, default=WORLDS, help=f'folder with worlds.json (default {WORLDS})')
-    parser.add_argument('--csv', type=Path, help='folder for the results: NAME.csv each, and machine.csv')
+    parser.add_argument(
+        '--quick', action='store_true', help='fewer worlds, pairs and scans: a minute or two'
+    )
+    parser.add_argument(
+        '--worlds', type=Path, default=WORLDS, help=f'folder with worlds.json (default {WORLDS})'
+    )
+    parser.add_argument(
+        '--csv', type=Path, help='folder for the results: NAME.csv each, and machine.csv'
+    )
     arguments = parser.parse_args()
     if unknown := set(arguments.names) - set(_ALL):
         parser.error(f'unknown benchmark {sorted(unknown)[0]}: expected some of {", ".join(_ALL)}')

@@ -1,4 +1,7 @@
-"""What a step of the localizer costs as the map grows: the filter over the local area against the filter over all."""
+"""What a step of the localizer costs as the map grows.
+
+The filter over the local area against the filter over all.
+"""
 
 import math
 import time
@@ -30,7 +33,11 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
         yield at_most(f'ti, {number} features: step, median', median, 3.0, 'ms')
         yield at_most(f'ti, {number} features: longest step', longest, limit, 'ms')
     numbers = [number for number in numbers if number in local]
-    yield at_most(f'ti: {numbers[-1]} features against {numbers[0]}', local[numbers[-1]][0] / local[numbers[0]][0], 1.5)
+    yield at_most(
+        f'ti: {numbers[-1]} features against {numbers[0]}',
+        local[numbers[-1]][0] / local[numbers[0]][0],
+        1.5,
+    )
     whole = dict(_cost('full', [number for number in numbers if number <= 1000]))
     for number, (median, _) in whole.items():
         yield Row(f'full, {number} features: step, median', f'{median:.3g} ms')
@@ -40,7 +47,10 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
 
 
 def _cost(slam: str, numbers: list[int]) -> Iterator[tuple[int, tuple[float, float]]]:
-    """For each number of features: median and longest step of the last ones before the map holds so many, ms."""
+    """For each number of features.
+
+    Median and longest step of the last ones before the map holds so many, ms.
+    """
     length = 1.5 * numbers[-1] + 60.0
     world, laser = _floor(length), Lms200(Lms200Config(), 0)
     truth = np.array([1.0, 0.5 * _WIDTH_M, 0.0])
@@ -69,9 +79,17 @@ def _floor(length_m: float) -> World:
     for a, b in pairwise(np.arange(0.0, length_m + 1e-6, _ROOM_M)):
         for y, low, high in ((sides[0], 0.0, sides[0]), (sides[1], sides[1], _WIDTH_M)):
             door = rng.uniform(a + 0.9, b - 0.9 - _DOOR_M)
-            _fill(cells, (a, y, door, y + _WALL_M), (door + _DOOR_M, y, b, y + _WALL_M), (b, low, b + _WALL_M, high))
+            _fill(
+                cells,
+                (a, y, door, y + _WALL_M),
+                (door + _DOOR_M, y, b, y + _WALL_M),
+                (b, low, b + _WALL_M, high),
+            )
             x, depth = rng.uniform(a + 0.2, b - 1.4), rng.uniform(0.4, 0.8)
-            _fill(cells, (x, low, x + 1.2, low + depth) if low == 0.0 else (x, high - depth, x + 1.2, high))
+            _fill(
+                cells,
+                (x, low, x + 1.2, low + depth) if low == 0.0 else (x, high - depth, x + 1.2, high),
+            )
     return World('floor', cells, GridFrame(0.0, 0.0, _CELL_M), np.array([1.0, 0.5 * _WIDTH_M, 0.0]))
 
 

@@ -1,4 +1,4 @@
-"""Thinning against scikit-image, OpenCV, a copy of the mask and a distance transform, in one run."""
+"""Thinning against scikit-image, OpenCV, a mask's copy and a distance transform, in one run."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,7 +27,9 @@ def floor_of(worlds: Path, side: int) -> Mask:
 def padded_opencv(free: Mask) -> Mask:
     """Zhang-Suen by OpenCV, padded because it leaves the outermost cells alone."""
     padded = np.pad(free, 1).astype(np.uint8) * 255
-    return np.asarray(cv2.ximgproc.thinning(padded, thinningType=cv2.ximgproc.THINNING_ZHANGSUEN)[1:-1, 1:-1] > 0)
+    return np.asarray(
+        cv2.ximgproc.thinning(padded, thinningType=cv2.ximgproc.THINNING_ZHANGSUEN)[1:-1, 1:-1] > 0
+    )
 
 
 def run(worlds: Path, quick: bool) -> Iterator[Row]:
@@ -46,7 +48,10 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
             rounds=30 if side <= 1000 else 5,
         )
         slow = best_seconds(
-            {'skimage': lambda free=free: skeletonize(free), 'opencv': lambda free=free: padded_opencv(free)},
+            {
+                'skimage': lambda free=free: skeletonize(free),
+                'opencv': lambda free=free: padded_opencv(free),
+            },
             rounds=3 if side <= 1000 else 1,
         )
         yield Row(f'thin {side} x {side}', f'{1e3 * fast["thin"]:.2f} ms')

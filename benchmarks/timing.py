@@ -1,4 +1,7 @@
-"""Times that can be compared: the best of several runs, taken in turns, or what a run takes of the processor."""
+"""Times that can be compared.
+
+The best of several runs, taken in turns, or what a run takes of the processor.
+"""
 
 import statistics
 import time
@@ -6,7 +9,10 @@ from collections.abc import Callable
 
 
 def best_seconds(works: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
-    """Shortest time of each work over some rounds; all take turns, so that a busy machine is busy for all."""
+    """Shortest time of each work over some rounds.
+
+    All take turns, so that a busy machine is busy for all.
+    """
     for work in works.values():
         work()  # compile, fill caches
     best = dict.fromkeys(works, float('inf'))
@@ -19,7 +25,10 @@ def best_seconds(works: dict[str, Callable[[], object]], rounds: int) -> dict[st
 
 
 def median_seconds(work: Callable[[], object], rounds: int) -> float:
-    """Median time of the processor that a work takes over some rounds: a busy machine changes it little."""
+    """Median time of the processor that a work takes over some rounds.
+
+    A busy machine changes it little.
+    """
     work()  # compile, fill caches
     taken = []
     for _ in range(rounds):

@@ -1,4 +1,7 @@
-"""Real floors and random worlds to measure on: map_server maps in a folder, with places to start from."""
+"""Real floors and random worlds to measure on.
+
+map_server maps in a folder, with places to start from.
+"""
 
 import json
 from dataclasses import dataclass
@@ -26,9 +29,14 @@ class Floor:
 def floors(folder: Path, wanted: str = '') -> list[Floor]:
     """All worlds of a folder whose name holds `wanted`, the largest last."""
     known = json.loads((folder / 'worlds.json').read_text(encoding='utf-8'))
-    names = sorted((name for name in known if wanted in name), key=lambda name: float(known[name]['free_area_m2']))
+    names = sorted(
+        (name for name in known if wanted in name),
+        key=lambda name: float(known[name]['free_area_m2']),
+    )
     found = []
     for name in names:
         path = folder / f'{name}.yaml'
-        found.append(Floor(name, path, World.from_patch(*read_world(path)), np.array(known[name]['starts'])))
+        found.append(
+            Floor(name, path, World.from_patch(*read_world(path)), np.array(known[name]['starts']))
+        )
     return found

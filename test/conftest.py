@@ -8,13 +8,18 @@ import pytest
 from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parent.parent
-SHARED = next((up / 'shared' for up in ROOT.parents if (up / 'shared' / 'data').exists()), ROOT.parent / 'shared')
+SHARED = next(
+    (up / 'shared' for up in ROOT.parents if (up / 'shared' / 'data').exists()),
+    ROOT.parent / 'shared',
+)
 
-# How long an example takes says more about the machine than about the code; the same examples every time.
+# How long an example takes says more about the machine than about the code; the same examples every
+# time.
 settings.register_profile('thinmap', deadline=None, derandomize=True)
 settings.load_profile('thinmap')
 
-# A shell's job in the background is born deaf to Ctrl-C, and so would be the programs that tests start and interrupt.
+# A shell's job in the background is born deaf to Ctrl-C, and so would be the programs that tests
+# start and interrupt.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -29,8 +34,9 @@ def shared_data() -> Path:
 
 @pytest.fixture
 def ros_domain(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> int:
-    """A ROS domain that no other process of this machine's tests uses, for the processes that a test starts."""
-    monkeypatch.setenv('THINMAP_STATE_DIR', str(tmp_path / 'state'))  # what killed nodes leave concerns no other test
+    """A ROS domain that no other process of this machine's tests uses, for what a test starts."""
+    # What killed nodes leave concerns no other test.
+    monkeypatch.setenv('THINMAP_STATE_DIR', str(tmp_path / 'state'))
     domain = 1 + os.getpid() % 100
     monkeypatch.setenv('ROS_DOMAIN_ID', str(domain))
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')

@@ -12,21 +12,35 @@ from thinmap_ros.core.scan import Scan
 RANGE_MAX_M = 8.0
 
 # 10 x 10 m with an inner wall, a box and a doorway: [x0, y0, x1, y1].
-ROOM = np.array([
-    [0.0, 0.0, 10.0, 0.0], [10.0, 0.0, 10.0, 10.0], [10.0, 10.0, 0.0, 10.0], [0.0, 10.0, 0.0, 0.0],
-    [0.0, 5.0, 3.5, 5.0], [4.7, 5.0, 6.0, 5.0],
-    [7.0, 2.0, 8.0, 2.0], [8.0, 2.0, 8.0, 3.0], [8.0, 3.0, 7.0, 3.0], [7.0, 3.0, 7.0, 2.0],
-])  # fmt: skip
+ROOM = np.array(
+    [
+        [0.0, 0.0, 10.0, 0.0],
+        [10.0, 0.0, 10.0, 10.0],
+        [10.0, 10.0, 0.0, 10.0],
+        [0.0, 10.0, 0.0, 0.0],
+        [0.0, 5.0, 3.5, 5.0],
+        [4.7, 5.0, 6.0, 5.0],
+        [7.0, 2.0, 8.0, 2.0],
+        [8.0, 2.0, 8.0, 3.0],
+        [8.0, 3.0, 7.0, 3.0],
+        [7.0, 3.0, 7.0, 2.0],
+    ]
+)
 
 
 def ranges_in(segments: np.ndarray, T_world_laser: np.ndarray, angles: np.ndarray) -> np.ndarray:
     """Exact range of each ray to the nearest segment, inf where it meets none."""
-    directions = np.column_stack([np.cos(angles + T_world_laser[2]), np.sin(angles + T_world_laser[2])])
+    directions = np.column_stack(
+        [np.cos(angles + T_world_laser[2]), np.sin(angles + T_world_laser[2])]
+    )
     starts, along = segments[:, :2] - T_world_laser[:2], segments[:, 2:] - segments[:, :2]
     cross = directions[:, None, 0] * along[None, :, 1] - directions[:, None, 1] * along[None, :, 0]
     with np.errstate(divide='ignore', invalid='ignore'):
         t = (starts[:, 0] * along[:, 1] - starts[:, 1] * along[:, 0])[None] / cross
-        u = (starts[None, :, 0] * directions[:, None, 1] - starts[None, :, 1] * directions[:, None, 0]) / cross
+        u = (
+            starts[None, :, 0] * directions[:, None, 1]
+            - starts[None, :, 1] * directions[:, None, 0]
+        ) / cross
     met = (np.abs(cross) > 1e-12) & (t > 0.0) & (u >= 0.0) & (u <= 1.0)
     return np.where(met, t, np.inf).min(axis=1)
 
@@ -40,7 +54,7 @@ def scan_in(
     beams: int = 181,
     clockwise: bool = False,
 ) -> Scan:
-    """A 180 degree scan; with rng: 1 cm of noise, and a third of the depth edges give a range in between."""
+    """A 180 degree scan; with rng: 1 cm of noise, a third of depth edges give ranges in between."""
     mount = np.zeros(3) if T_base_laser is None else T_base_laser
     sign = -1.0 if clockwise else 1.0
     start, step = -sign * math.pi / 2.0, sign * math.pi / (beams - 1)
@@ -62,10 +76,25 @@ def mixed(ranges: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def drive(
-    steps: int, rng: np.random.Generator, start: np.ndarray, scale: float = 1.03, drift_rad_m: float = 0.05
+    steps: int,
+    rng: np.random.Generator,
+    start: np.ndarray,
+    scale: float = 1.03,
+    drift_rad_m: float = 0.05,
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Truth (3,) and drifting odometry (3,) of a drive around the room at 0.2 m/s and 5 Hz."""
-    way = np.array([[2.0, 2.0], [5.5, 1.5], [5.5, 4.0], [4.1, 5.0], [4.1, 7.0], [2.0, 8.0], [7.0, 8.0], [8.5, 5.0]])
+    way = np.array(
+        [
+            [2.0, 2.0],
+            [5.5, 1.5],
+            [5.5, 4.0],
+            [4.1, 5.0],
+            [4.1, 7.0],
+            [2.0, 8.0],
+            [7.0, 8.0],
+            [8.5, 5.0],
+        ]
+    )
     truth, odom, goal = start, np.zeros(3), 1
     for _ in range(steps):
         yield truth, odom
@@ -84,20 +113,27 @@ BLIND = scan_in(np.array([[1e3, -1.0, 1e3, 1.0]]), np.zeros(3))  # a scan that m
 
 
 def corridor_ring() -> np.ndarray:
-    """Walls of a corridor of 2.4 m round a block of 35 x 15 m, with niches to tell its sides apart, (N, 4)."""
+    """Walls (N, 4) of a corridor of 2.4 m round a block of 35 x 15 m; niches tell sides apart."""
     outer, inner = np.array([40.0, 20.0]), 2.4
     corners = [np.array([[0.0, 0.0], [outer[0], 0.0], outer, [0.0, outer[1]], [0.0, 0.0]])]
     low, high = np.array([inner, inner]), outer - inner
     corners.append(np.array([low, [high[0], low[1]], high, [low[0], high[1]], low]))
     walls = [np.hstack([a, b]) for ring_ in corners for a, b in pairwise(ring_)]
     for x in (6.0, 13.0, 17.5, 26.0, 33.0):
-        walls += [np.array([x, 0.0, x, 0.4]), np.array([x, 0.4, x + 0.5, 0.4]), np.array([x + 0.5, 0.4, x + 0.5, 0.0])]
-        walls += [np.array([x + 1.0, 20.0, x + 1.0, 19.6]), np.array([x + 1.0, 19.6, x + 2.0, 19.6])]
+        walls += [
+            np.array([x, 0.0, x, 0.4]),
+            np.array([x, 0.4, x + 0.5, 0.4]),
+            np.array([x + 0.5, 0.4, x + 0.5, 0.0]),
+        ]
+        walls += [
+            np.array([x + 1.0, 20.0, x + 1.0, 19.6]),
+            np.array([x + 1.0, 19.6, x + 2.0, 19.6]),
+        ]
     return np.array(walls)
 
 
 def corridor(length_m: float) -> np.ndarray:
-    """Walls of a corridor of 2.4 m along x from the origin, with niches, open at its ends, (N, 4)."""
+    """Walls (N, 4) of a corridor of 2.4 m along x from the origin, with niches and open ends."""
     walls = []
     for side in (-1.2, 1.2):
         line = [(0.0, side)]
@@ -109,12 +145,14 @@ def corridor(length_m: float) -> np.ndarray:
 
 
 def drive_round_the_block() -> Iterator[tuple[Scan, np.ndarray, np.ndarray]]:
-    """Scan, odometry and truth of a drive once round the corridor and on; the wheels wear as it goes, and slip."""
+    """Scan, odometry, truth of a drive once round the corridor and on; the wheels wear and slip."""
     rng, slips, walls = np.random.default_rng(5), np.random.default_rng(6), corridor_ring()
     truth, odom, number = np.array([3.0, 1.2, 0.0]), np.zeros(3), 0
     for goal in [(38.8, 1.2), (38.8, 18.8), (1.2, 18.8), (1.2, 1.2), (20.0, 1.2)]:
         while np.hypot(*(goal - truth[:2])) > 0.15:
-            turn = float(np.clip(se2.wrap(np.arctan2(*(goal - truth[:2])[::-1]) - truth[2]), -0.3, 0.3))
+            turn = float(
+                np.clip(se2.wrap(np.arctan2(*(goal - truth[:2])[::-1]) - truth[2]), -0.3, 0.3)
+            )
             step = np.array([0.15 if abs(turn) < 0.1 else 0.0, 0.0, turn])
             truth = se2.compose(truth, step)
             slip = slips.normal(0.0, 0.08)

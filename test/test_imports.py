@@ -31,7 +31,17 @@ ROOMS |= {
 BELOW = ALL_CORE | {'sim', 'baselines', 'pipeline', 'warm_up', 'adapters'}
 ROOMS |= {'nodes': BELOW | {'nodes'}, 'tools': BELOW | {'tools'}}
 
-OUTSIDE = {'rclpy', 'rosbags', 'mcap', 'rerun', 'matplotlib', 'ament_index_python', 'PIL', 'yaml', 'networkx'}
+OUTSIDE = {
+    'rclpy',
+    'rosbags',
+    'mcap',
+    'rerun',
+    'matplotlib',
+    'ament_index_python',
+    'PIL',
+    'yaml',
+    'networkx',
+}
 CORE_LIBRARIES = {'numpy', 'numba', 'scipy'}
 SOURCES = sorted(PACKAGE.rglob('*.py'))
 
@@ -71,7 +81,9 @@ def test_imports_go_through_the_doors(path):
         elif room not in ('adapters', 'nodes'):
             assert top not in OUTSIDE and not top.endswith('_msgs'), f'{module} imports {imported}'
         if room.startswith('core') and top != 'thinmap_ros':
-            assert top in CORE_LIBRARIES or top in sys.stdlib_module_names, f'{module} imports {imported}'
+            assert top in CORE_LIBRARIES or top in sys.stdlib_module_names, (
+                f'{module} imports {imported}'
+            )
 
 
 def test_every_room_is_known():
@@ -96,5 +108,7 @@ sys.meta_path.insert(0, Wall())
 for module in {modules!r}:
     importlib.import_module(module)
 """
-    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, cwd=PACKAGE.parent)
+    done = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, cwd=PACKAGE.parent
+    )
     assert done.returncode == 0, done.stderr

@@ -13,7 +13,9 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / 'thinmap_ros'
 MODULES = [path for room in ('nodes', 'tools') for path in (PACKAGE / room).glob('*.py')]
 PROGRAMS = sorted(path.stem for path in MODULES if 'def main(' in path.read_text())
-TOOLS = sorted(path.stem for path in (PACKAGE / 'tools').glob('*.py') if 'ArgumentParser(' in path.read_text())
+TOOLS = sorted(
+    path.stem for path in (PACKAGE / 'tools').glob('*.py') if 'ArgumentParser(' in path.read_text()
+)
 # rosdep keys of what is imported under another name.
 KEYS = {
     'PIL': 'python3-pil',
@@ -27,7 +29,11 @@ EXTRAS = {'rerun', 'dask', 'distributed'}
 
 
 @pytest.mark.parametrize(
-    ('folder', 'tags'), [('thinmap_ros', ('depend', 'exec_depend')), ('test', ('depend', 'exec_depend', 'test_depend'))]
+    ('folder', 'tags'),
+    [
+        ('thinmap_ros', ('depend', 'exec_depend')),
+        ('test', ('depend', 'exec_depend', 'test_depend')),
+    ],
 )
 def test_every_import_has_its_key_in_package_xml(folder, tags):
     wanted, own = set(), {'thinmap_ros'} | {path.stem for path in (ROOT / 'test').rglob('*.py')}
@@ -40,7 +46,11 @@ def test_every_import_has_its_key_in_package_xml(folder, tags):
     wanted -= set(sys.stdlib_module_names) | own | EXTRAS
     tree = ElementTree.parse(ROOT / 'package.xml')
     keys = {element.text for tag in tags for element in tree.iter(tag)}
-    missing = {name for name in wanted if KEYS.get(name, name) not in keys and f'python3-{name}' not in keys}
+    missing = {
+        name
+        for name in wanted
+        if KEYS.get(name, name) not in keys and f'python3-{name}' not in keys
+    }
     assert not missing
 
 
@@ -52,7 +62,9 @@ def test_every_program_is_installed_where_ros2_run_looks(name):
 @pytest.mark.parametrize('folder', ['config', 'worlds'])
 def test_files_for_users_are_installed(folder):
     installed = Path(get_package_share_directory('thinmap_ros')) / folder
-    assert sorted(p.name for p in installed.iterdir()) == sorted(p.name for p in (ROOT / folder).iterdir())
+    assert sorted(p.name for p in installed.iterdir()) == sorted(
+        p.name for p in (ROOT / folder).iterdir()
+    )
 
 
 @pytest.mark.parametrize('name', TOOLS)

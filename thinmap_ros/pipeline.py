@@ -16,7 +16,10 @@ from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig
 
 @dataclass(frozen=True)
 class PipelineConfig:
-    """Parameters of all stages; scans_per_graph: the graph is brought up to date with every so many scans."""
+    """Parameters of all stages.
+
+    scans_per_graph: the graph is brought up to date with every so many scans.
+    """
 
     localizer: LocalizerConfig = field(default_factory=LocalizerConfig)
     grid: OccupancyConfig = field(default_factory=OccupancyConfig)
@@ -34,9 +37,12 @@ class Step:
 
 
 class Pipeline:
-    """Localizer, grid and topology, one after the other, for every scan: what the live graph does in three nodes.
+    """Localizer, grid and topology, one after the other, for every scan.
 
-    `pose_source` takes the place of the localizer where poses are known from elsewhere (a simulator's truth).
+    What the live graph does in three nodes.
+
+    `pose_source` takes the place of the localizer where poses are known from elsewhere (a
+    simulator's truth).
     """
 
     def __init__(
@@ -84,13 +90,18 @@ class Pipeline:
         return window
 
     def _rebuild(self, history: GridHistory, since_ns: int) -> None:
-        """A loop was closed: grid and topology are made anew from what was seen at the poses as they are known now."""
+        """A loop was closed.
+
+        Grid and topology are made anew from what was seen at the poses as they are known now.
+        """
         before = history.past.poses()
         with self._timed('rebuild'):
             history.past.correct(*self.localizer.past(), since_ns)
             self.grid = history.draw(self.grid)
             size = self.config.window.window_m
-            self.topology.rebuild(lambda x, y: self.grid.window(x, y, size), before, history.past.poses())
+            self.topology.rebuild(
+                lambda x, y: self.grid.window(x, y, size), before, history.past.poses()
+            )
             self.localizer.set_topology(self.topology.map)
 
     @contextmanager

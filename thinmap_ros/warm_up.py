@@ -1,8 +1,8 @@
-"""A rehearsal of each algorithm in a small room, so that no kernel has to be compiled or loaded during a real step.
+"""A rehearsal of each algorithm in a small room, so that no real step compiles or loads a kernel.
 
-A node rehearses before it listens: on a robot the first seconds would otherwise be spent standing still, and in a
-simulation that runs faster than real time many more. Each rehearsal imports what it needs, so that a node does not
-carry the compiled code of the others.
+A node rehearses before it listens: on a robot the first seconds would otherwise be spent standing
+still, and in a simulation that runs faster than real time many more. Each rehearsal imports what it
+needs, so that a node does not carry the compiled code of the others.
 """
 
 from collections.abc import Iterator
@@ -49,7 +49,9 @@ def topology_builder() -> None:
     grid, rehearsed = OccupancyGrid(), TopologyBuilder()
     for scan, T_map_base in _drive():
         grid.update(scan, T_map_base)
-        rehearsed.update(grid.window(T_map_base[0], T_map_base[1], WindowConfig().window_m), T_map_base)
+        rehearsed.update(
+            grid.window(T_map_base[0], T_map_base[1], WindowConfig().window_m), T_map_base
+        )
         rehearsed.local_map()
 
 
@@ -103,6 +105,8 @@ def _drive() -> Iterator[tuple[Scan, Array]]:
     for k in range(_SCANS):
         x, y = T_map_base[:2] / _CELL_M
         ranges = _CELL_M * cast_rays(occupied, x, y, angles + T_map_base[2], _RANGE_M / _CELL_M)
-        scan = Scan.create(round(1e9 * _PERIOD_S * k), ranges, float(angles[0]), float(step), 0.05, _RANGE_M)
+        scan = Scan.create(
+            round(1e9 * _PERIOD_S * k), ranges, float(angles[0]), float(step), 0.05, _RANGE_M
+        )
         yield scan, T_map_base
         T_map_base = se2.compose(T_map_base, se2.pose(_STEP_M, 0.0, _TURN_RAD))

@@ -1,4 +1,4 @@
-"""bag_repair: of a file that was cut off or damaged everything whole is kept, and the result is an ordinary bag."""
+"""bag_repair keeps all that is whole of a cut or damaged file; the result is an ordinary bag."""
 
 import subprocess
 import sys
@@ -84,7 +84,8 @@ def test_a_cut_off_bag_gets_index_metadata_and_its_qualities_back(tmp_path: Path
     assert metadata['starting_time']['nanoseconds_since_epoch'] == 10**9
     assert metadata['duration']['nanoseconds'] == len(found) - 1
     offers = Bag(good).offers
-    assert bag_qos.is_latched('/map', offers['/map']) and not bag_qos.is_latched('/said', offers['/said'])
+    assert bag_qos.is_latched('/map', offers['/map'])
+    assert not bag_qos.is_latched('/said', offers['/said'])
     assert not bag_qos.is_reliable(offers['/said']) and bag_qos.depth(offers['/said']) == 7
 
 
@@ -97,7 +98,9 @@ def cut_file(tmp_path: Path, compression: CompressionType) -> Path:
         channel = writer.register_channel('/said', 'cdr', schema)
         noise = BagWriter(tmp_path / 'noise', live=True).typestore
         for i in range(20_000):
-            data = noise.serialize_cdr(noise.types[STRING](data=f'number {i} {hash((i, 1)):x}'), STRING)
+            data = noise.serialize_cdr(
+                noise.types[STRING](data=f'number {i} {hash((i, 1)):x}'), STRING
+            )
             writer.add_message(channel, 10**9 + i, bytes(data), 10**9 + i, i)
         writer.finish()
     content = (tmp_path / 'one.mcap').read_bytes()
@@ -123,7 +126,9 @@ def test_a_damaged_chunk_costs_only_itself(tmp_path: Path) -> None:
     with (tmp_path / 'bag.mcap').open('wb') as stream:
         writer = Writer(stream, chunk_size=2000)
         writer.start(profile='ros2')
-        channel = writer.register_channel('/said', 'cdr', writer.register_schema(STRING, 'ros2msg', b'string data'))
+        channel = writer.register_channel(
+            '/said', 'cdr', writer.register_schema(STRING, 'ros2msg', b'string data')
+        )
         for i in range(500):
             writer.add_message(channel, i, b'\x00\x01\x00\x00' + bytes([i % 251]) * 60, i)
         writer.finish()
@@ -141,7 +146,11 @@ def test_what_cannot_be_repaired_is_said_in_one_line(tmp_path: Path) -> None:
     (tmp_path / 'text.mcap').write_bytes(b'dear all')
     (tmp_path / 'start.mcap').write_bytes(b'\x89MCAP0\r\n\x01')
     (tmp_path / 'empty').mkdir()
-    for name, said in (('text.mcap', 'begin with'), ('start.mcap', 'no whole message'), ('empty', 'MCAP files in it')):
+    for name, said in (
+        ('text.mcap', 'begin with'),
+        ('start.mcap', 'no whole message'),
+        ('empty', 'MCAP files in it'),
+    ):
         done = repaired(tmp_path / name)
         assert done.returncode == 2 and said in done.stderr and name in done.stderr
         assert len(done.stderr.splitlines()) == 1
@@ -152,7 +161,9 @@ def test_what_cannot_be_repaired_is_said_in_one_line(tmp_path: Path) -> None:
     assert not list(tmp_path.glob('.*.part'))
 
 
-def test_behind_a_range_of_zeros_it_goes_on_at_the_next_chunk_of_the_summary(tmp_path: Path) -> None:
+def test_behind_a_range_of_zeros_it_goes_on_at_the_next_chunk_of_the_summary(
+    tmp_path: Path,
+) -> None:
     folder = write(tmp_path / 'bag')
     content = bytearray((folder / 'bag.mcap').read_bytes())
     middle = len(content) // 3
@@ -187,7 +198,9 @@ _WHOLE: list[bytes] = []
 
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.floats(0.0, 1.0), st.binary(max_size=16), st.booleans())
-def test_no_damage_makes_it_stumble_or_invent(tmp_path: Path, share: float, noise: bytes, cut: bool) -> None:
+def test_no_damage_makes_it_stumble_or_invent(
+    tmp_path: Path, share: float, noise: bytes, cut: bool
+) -> None:
     if not _WHOLE:
         _WHOLE.append((write(tmp_path / 'whole') / 'whole.mcap').read_bytes())
     at = 8 + int(share * (len(_WHOLE[0]) - 8))

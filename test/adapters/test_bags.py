@@ -1,4 +1,4 @@
-"""Bags: what is written is read back, and a bag that is broken or lacks something is said so in one line."""
+"""Bags: what is written is read back; that one is broken or lacks something is said in one line."""
 
 import math
 import struct
@@ -35,7 +35,9 @@ class Maker:
         stamp = self('builtin_interfaces/msg/Time', sec=ns // 10**9, nanosec=ns % 10**9)
         return self('std_msgs/msg/Header', stamp=stamp, frame_id=frame)
 
-    def transform(self, parent: str, child: str, moved: tuple[float, ...], turned: Quaternion) -> Any:
+    def transform(
+        self, parent: str, child: str, moved: tuple[float, ...], turned: Quaternion
+    ) -> Any:
         x, y, z, w = turned
         transform = self(
             'geometry_msgs/msg/Transform',
@@ -52,9 +54,17 @@ class Maker:
 
     def scan(self, ns: int, ranges: list[float], frame: str = 'laser') -> Any:
         return self(
-            SCAN, header=self.header(frame, ns), angle_min=-0.5, angle_max=0.5, angle_increment=0.25,
-            time_increment=0.0, scan_time=0.0, range_min=0.05, range_max=8.0,
-            ranges=np.array(ranges, dtype=np.float32), intensities=np.zeros(0, dtype=np.float32),
+            SCAN,
+            header=self.header(frame, ns),
+            angle_min=-0.5,
+            angle_max=0.5,
+            angle_increment=0.25,
+            time_increment=0.0,
+            scan_time=0.0,
+            range_min=0.05,
+            range_max=8.0,
+            ranges=np.array(ranges, dtype=np.float32),
+            intensities=np.zeros(0, dtype=np.float32),
         )
 
     def odometry(self, ns: int, x: float, turned: Quaternion = UPRIGHT) -> Any:
@@ -62,7 +72,9 @@ class Maker:
         pose = self(
             'geometry_msgs/msg/Pose',
             position=self('geometry_msgs/msg/Point', x=x, y=1.0, z=0.0),
-            orientation=self('geometry_msgs/msg/Quaternion', **dict(zip('xyzw', turned, strict=True))),
+            orientation=self(
+                'geometry_msgs/msg/Quaternion', **dict(zip('xyzw', turned, strict=True))
+            ),
         )
         twist = self('geometry_msgs/msg/Twist', linear=zero, angular=zero)
         return self(
@@ -70,7 +82,9 @@ class Maker:
             header=self.header('odom', ns),
             child_frame_id='base_link',
             pose=self('geometry_msgs/msg/PoseWithCovariance', pose=pose, covariance=np.zeros(36)),
-            twist=self('geometry_msgs/msg/TwistWithCovariance', twist=twist, covariance=np.zeros(36)),
+            twist=self(
+                'geometry_msgs/msg/TwistWithCovariance', twist=twist, covariance=np.zeros(36)
+            ),
         )
 
 
@@ -85,7 +99,9 @@ RANGES = [1.0, 2.0, math.inf, math.nan, 3.0]
 
 def drive(writer: BagWriter, make: Maker, count: int = 3, mount: bool = True) -> None:
     if mount:
-        writer.write('/tf_static', TF, 1, make.transform('base_link', 'laser', (0.2, -0.1, 0.3), UPRIGHT))
+        writer.write(
+            '/tf_static', TF, 1, make.transform('base_link', 'laser', (0.2, -0.1, 0.3), UPRIGHT)
+        )
     for i in range(count):
         ns = 10**9 + i * 2 * 10**8
         writer.write('/odom', ODOMETRY, ns, make.odometry(ns, 0.1 * i))
@@ -122,8 +138,12 @@ def test_a_folder_is_what_rosbag2_writes(tmp_path: Path) -> None:
     path = write(tmp_path / 'drive', drive)
     metadata = yaml.safe_load((path / 'metadata.yaml').read_text())['rosbag2_bagfile_information']
     assert metadata['storage_identifier'] == 'mcap'
-    assert metadata['relative_file_paths'] == [f.name for f in path.glob('*.mcap')] == ['drive.mcap']
-    offered = {t['topic_metadata']['name']: t['topic_metadata'] for t in metadata['topics_with_message_count']}
+    files = [f.name for f in path.glob('*.mcap')]
+    assert metadata['relative_file_paths'] == files == ['drive.mcap']
+    offered = {
+        t['topic_metadata']['name']: t['topic_metadata']
+        for t in metadata['topics_with_message_count']
+    }
     assert offered['/tf_static']['offered_qos_profiles'][0]['durability'] in (1, 'transient_local')
 
 
@@ -184,7 +204,9 @@ def test_a_chain_of_mounts(tmp_path: Path) -> None:
 
 
 def test_a_laser_upside_down_sees_the_same_room(tmp_path: Path) -> None:
-    scan = scans(read(mounted(tmp_path, ('base_link', 'laser', (0.2, 0.0, 0.3), about('x', math.pi)))))[0]
+    scan = scans(
+        read(mounted(tmp_path, ('base_link', 'laser', (0.2, 0.0, 0.3), about('x', math.pi))))
+    )[0]
     assert np.array_equal(scan.ranges_m, RANGES[::-1], equal_nan=True)
     assert scan.angle_increment_rad == 0.25
     # Its beam at -0.5 rad with range 1 points to the left of the robot.
@@ -251,7 +273,9 @@ def with_empty_scans(writer: BagWriter, make: Maker) -> None:
         (lambda w, m: None, 'no laser scans'),
     ],
 )
-def test_what_is_missing_is_said(tmp_path: Path, fill: Callable[[BagWriter, Maker], None], said: str) -> None:
+def test_what_is_missing_is_said(
+    tmp_path: Path, fill: Callable[[BagWriter, Maker], None], said: str
+) -> None:
     path = write(tmp_path / 'bag', fill)
     with pytest.raises(InputError, match=said) as error:
         read(path)
@@ -273,7 +297,10 @@ def test_unusable_messages_are_skipped_and_counted(tmp_path: Path) -> None:
 
 
 def test_messages_of_our_own_types(tmp_path: Path) -> None:
-    definitions = {'thinmap_test/msg/Inner': 'float64 x\n', 'thinmap_test/msg/Outer': 'Inner[] parts\nuint32 id\n'}
+    definitions = {
+        'thinmap_test/msg/Inner': 'float64 x\n',
+        'thinmap_test/msg/Outer': 'Inner[] parts\nuint32 id\n',
+    }
     with BagWriter(tmp_path / 'bag', definitions=definitions) as writer:
         inner, outer = (writer.typestore.types[f'thinmap_test/msg/{n}'] for n in ('Inner', 'Outer'))
         writer.write('/own', 'thinmap_test/msg/Outer', 7, outer(parts=[inner(x=1.5)], id=3))
@@ -304,7 +331,13 @@ def test_a_cut_mcap_is_read_as_far_as_it_is_whole(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ('name', 'content'),
-    [('a.mcap', b''), ('b.mcap', b'hello'), ('c.mcap', b'\x89MCAP0\r\n'), ('d.bag', b'#ROSBAG V2.0'), ('e.db3', b'x')],
+    [
+        ('a.mcap', b''),
+        ('b.mcap', b'hello'),
+        ('c.mcap', b'\x89MCAP0\r\n'),
+        ('d.bag', b'#ROSBAG V2.0'),
+        ('e.db3', b'x'),
+    ],
 )
 def test_files_that_are_no_bags(tmp_path: Path, name: str, content: bytes) -> None:
     (tmp_path / name).write_bytes(content)
@@ -323,7 +356,9 @@ def test_no_file_and_an_empty_folder(tmp_path: Path) -> None:
 _WHOLE: list[bytes] = []
 
 
-@settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(st.floats(0.0, 1.0), st.binary(max_size=12), st.booleans())
 def test_damaged_bags(tmp_path: Path, share: float, noise: bytes, cut: bool) -> None:
     if not _WHOLE:
@@ -345,7 +380,9 @@ def test_what_a_bag_names_is_quoted_in_short(tmp_path: Path) -> None:
             writer.write(f'/robot_{k}/' + 'x' * 500, SCAN, 5, make.scan(5, RANGES))
 
     path = write(tmp_path / 'bag.mcap', fill)
-    with pytest.raises(InputError, match=r'name one of /robot_0/x+\.\.\., .* and 29\d more$') as error:
+    with pytest.raises(
+        InputError, match=r'name one of /robot_0/x+\.\.\., .* and 29\d more$'
+    ) as error:
         read(path)
     assert len(str(error.value)) < 400
     with pytest.raises(InputError, match='no odometry') as error:

@@ -47,11 +47,19 @@ def test_the_fan_follows_the_number_of_beams(tmp_path: Path, count: int, last_de
     line = f'FLASER {count} {"1.0 " * count} 0 0 0 0 0 0 1.5 host 1\n'
     scan_event = read(write(tmp_path, line))[1]
     assert isinstance(scan_event, ScanEvent)
-    assert np.degrees(scan_event.scan.angles_rad[[0, -1]]) == pytest.approx([-90.0, last_deg], abs=1e-4)
+    assert np.degrees(scan_event.scan.angles_rad[[0, -1]]) == pytest.approx(
+        [-90.0, last_deg], abs=1e-4
+    )
 
 
 def test_options_say_what_flaser_does_not(tmp_path: Path) -> None:
-    event = read(write(tmp_path, FLASER), start_angle_deg=-110.0, step_deg=2.0, offset_m=0.16, max_range_m=2.0)[1]
+    event = read(
+        write(tmp_path, FLASER),
+        start_angle_deg=-110.0,
+        step_deg=2.0,
+        offset_m=0.16,
+        max_range_m=2.0,
+    )[1]
     assert isinstance(event, ScanEvent)
     assert np.degrees(event.scan.angles_rad) == pytest.approx([-110, -108, -106], abs=1e-4)
     assert np.array_equal(event.scan.T_base_laser, [0.16, 0.0, 0.0])
@@ -74,7 +82,9 @@ def test_robotlaser_says_it_all(tmp_path: Path) -> None:
 
 def test_order_is_that_of_the_file_also_where_stamps_step_back(tmp_path: Path) -> None:
     earlier = FLASER.replace('857.337530', '856.000000')
-    events = read(write(tmp_path, '# a comment\nPARAM robot_width 0.5\n\n' + ODOM + FLASER + earlier + ODOM))
+    events = read(
+        write(tmp_path, '# a comment\nPARAM robot_width 0.5\n\n' + ODOM + FLASER + earlier + ODOM)
+    )
     kinds = ['odometry' if isinstance(e, OdometryEvent) else 'scan' for e in events]
     assert kinds == ['odometry', 'odometry', 'scan', 'odometry', 'scan', 'odometry']
     assert isinstance(events[0], OdometryEvent)
@@ -189,35 +199,67 @@ def test_no_file_and_a_folder(tmp_path: Path) -> None:
 
 
 def _is_read_or_refused(path: Path) -> bool:
-    """Whether a log gives events, or ends in one line that says why not; anything else is raised."""
+    """Whether a log gives events, or ends in one line that says why not.
+
+    Anything else is raised.
+    """
     try:
-        return all(isinstance(event, OdometryEvent | ScanEvent) for event in CarmenLog(path).events())
+        return all(
+            isinstance(event, OdometryEvent | ScanEvent) for event in CarmenLog(path).events()
+        )
     except InputError as error:
         return '\n' not in str(error)
 
 
-@settings(deadline=None, max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    deadline=None, max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(st.binary(max_size=300))
 def test_arbitrary_bytes(tmp_path: Path, content: bytes) -> None:
     assert _is_read_or_refused(write(tmp_path, content))
 
 
 WORD = st.one_of(
-    st.sampled_from(['FLASER', 'ODOM', 'ROBOTLASER1', '#', '1', '2', '180', '-1', '0', 'nan', 'inf', '1e400', '976.5']),
+    st.sampled_from(
+        [
+            'FLASER',
+            'ODOM',
+            'ROBOTLASER1',
+            '#',
+            '1',
+            '2',
+            '180',
+            '-1',
+            '0',
+            'nan',
+            'inf',
+            '1e400',
+            '976.5',
+        ]
+    ),
     st.integers(-5, 2**70).map(str),
     st.floats().map(str),
     st.text(max_size=6),
 )
 
 
-@settings(deadline=None, max_examples=400, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.lists(st.tuples(st.sampled_from(['FLASER', 'ODOM', 'ROBOTLASER1']), st.lists(WORD, max_size=26)), max_size=6))
+@settings(
+    deadline=None, max_examples=400, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(['FLASER', 'ODOM', 'ROBOTLASER1']), st.lists(WORD, max_size=26)),
+        max_size=6,
+    )
+)
 def test_arbitrary_words(tmp_path: Path, lines: list[tuple[str, list[str]]]) -> None:
     text = ''.join(' '.join([key, *words]) + '\n' for key, words in lines)
     assert _is_read_or_refused(write(tmp_path, text.encode('utf-8', errors='surrogatepass')))
 
 
-@settings(deadline=None, max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    deadline=None, max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(st.binary(max_size=20), st.integers(0, 400), st.booleans())
 def test_damaged_files(tmp_path: Path, noise: bytes, at: int, zipped: bool) -> None:
     content = (FLASER + ODOM + ROBOTLASER + FLASER).encode()

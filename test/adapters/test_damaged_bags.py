@@ -1,4 +1,7 @@
-"""Damaged MCAP files: whatever happened to a bag, what is whole is read, and no program ends in a traceback."""
+"""Damaged MCAP files.
+
+Whatever happened to a bag, what is whole is read, and no program ends in a traceback.
+"""
 
 import argparse
 import io

@@ -83,7 +83,9 @@ def test_an_empty_map(tmp_path: Path) -> None:
 
 def test_not_a_number_is_never_written(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match='JSON'):
-        write_geojson(tmp_path / 'g.geojson', TopologicalMap([Node(1, NodeKind.END, np.nan, 0.0, 1.0)]))
+        write_geojson(
+            tmp_path / 'g.geojson', TopologicalMap([Node(1, NodeKind.END, np.nan, 0.0, 1.0)])
+        )
     assert list(tmp_path.iterdir()) == []
 
 
@@ -97,7 +99,9 @@ def test_not_a_number_is_never_written(tmp_path: Path) -> None:
         (('geometry',), None, 'features.0'),
     ],
 )
-def test_what_is_wrong_is_said(tmp_path: Path, place: tuple[str, ...], value: object, said: str) -> None:
+def test_what_is_wrong_is_said(
+    tmp_path: Path, place: tuple[str, ...], value: object, said: str
+) -> None:
     features = written(tmp_path)
     target = features[0]
     for key in place[:-1]:
@@ -110,13 +114,22 @@ def test_what_is_wrong_is_said(tmp_path: Path, place: tuple[str, ...], value: ob
 
 
 JSON = st.recursive(
-    st.none() | st.booleans() | st.integers(-5, 5) | st.floats(allow_nan=False) | st.text(max_size=5),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(['id', 'type', 'geometry']), inner),
+    st.none()
+    | st.booleans()
+    | st.integers(-5, 5)
+    | st.floats(allow_nan=False)
+    | st.text(max_size=5),
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(st.sampled_from(['id', 'type', 'geometry']), inner)
+    ),
     max_leaves=6,
 )
 
 
-@settings(deadline=None, max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    deadline=None, max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(JSON, st.integers(0, 10), st.sampled_from(['properties', 'geometry', None]))
 def test_damaged_features(tmp_path: Path, value: object, index: int, key: str | None) -> None:
     features: list[Any] = written(tmp_path)
@@ -131,7 +144,9 @@ def test_damaged_features(tmp_path: Path, value: object, index: int, key: str | 
         assert '\n' not in str(error)
 
 
-@settings(deadline=None, max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    deadline=None, max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(st.binary(max_size=60))
 def test_arbitrary_bytes(tmp_path: Path, content: bytes) -> None:
     (tmp_path / 'g.geojson').write_bytes(content)

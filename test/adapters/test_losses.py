@@ -1,4 +1,7 @@
-"""What of a stream did not come: told from what was silent, and from what two publishers say in turn."""
+"""What of a stream did not come.
+
+Told from what was silent, and from what two publishers say in turn.
+"""
 
 from thinmap_ros.adapters.losses import Losses
 

@@ -1,4 +1,7 @@
-"""map_server files: what we write others read as we meant it, and what others write we read as they do."""
+"""map_server files.
+
+What we write others read as we meant it, and what others write we read as they do.
+"""
 
 from pathlib import Path
 
@@ -34,7 +37,11 @@ def described(tmp_path: Path, grey: np.ndarray, suffix: str = 'pgm', **changes: 
 
 @settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
-    arrays(np.int8, st.tuples(st.integers(1, 12), st.integers(1, 12)), elements=st.sampled_from([-1, 0, 100])),
+    arrays(
+        np.int8,
+        st.tuples(st.integers(1, 12), st.integers(1, 12)),
+        elements=st.sampled_from([-1, 0, 100]),
+    ),
     st.integers(-400, 400),
     st.integers(-400, 400),
 )
@@ -43,7 +50,9 @@ def test_round_trip(tmp_path: Path, cells: np.ndarray, col: int, row: int) -> No
     again = read_map(write_map(tmp_path / 'map', patch))
     assert np.array_equal(again.cells, cells)
     assert again.frame.resolution == 0.1
-    assert (again.frame.origin_x, again.frame.origin_y) == pytest.approx((col * 0.1, row * 0.1), abs=1e-6)
+    assert (again.frame.origin_x, again.frame.origin_y) == pytest.approx(
+        (col * 0.1, row * 0.1), abs=1e-6
+    )
 
 
 def test_each_state_is_read_back_as_what_it_is(tmp_path: Path) -> None:
@@ -83,7 +92,9 @@ def test_negate(tmp_path: Path, negate: object) -> None:
 
 def test_scale_mode_and_transparency(tmp_path: Path) -> None:
     ramp = np.arange(255, -1, -15, dtype=np.uint8)[None]
-    cells = read_map(described(tmp_path, ramp, mode='scale', free_thresh=0.1, occupied_thresh=0.9)).cells[0]
+    cells = read_map(
+        described(tmp_path, ramp, mode='scale', free_thresh=0.1, occupied_thresh=0.9)
+    ).cells[0]
     assert cells[0] == 0 and cells[-1] == 100
     assert np.all(np.diff(cells) >= 0) and len(set(cells.tolist())) > 10
     rgba = np.zeros((1, 2, 4), dtype=np.uint8)
@@ -125,7 +136,9 @@ def test_what_is_wrong_is_said(tmp_path: Path, changes: dict[str, object], said:
     assert str(tmp_path) in str(error.value) and '\n' not in str(error.value)
 
 
-@settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    deadline=None, max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(st.binary(max_size=120), st.sampled_from(['pgm', 'png']), st.integers(0, 200))
 def test_damaged_images(tmp_path: Path, noise: bytes, suffix: str, at: int) -> None:
     path = described(tmp_path, np.arange(100, dtype=np.uint8).reshape(10, 10), suffix)
@@ -138,17 +151,23 @@ def test_damaged_images(tmp_path: Path, noise: bytes, suffix: str, at: int) -> N
         assert '\n' not in str(error)
 
 
-@settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    deadline=None, max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(st.text(max_size=80) | st.binary(max_size=80))
 def test_damaged_yaml(tmp_path: Path, content: str | bytes) -> None:
     path = tmp_path / 'm.yaml'
-    path.write_bytes(content.encode('utf-8', errors='replace') if isinstance(content, str) else content)
+    path.write_bytes(
+        content.encode('utf-8', errors='replace') if isinstance(content, str) else content
+    )
     with pytest.raises(InputError) as error:
         read_map(path)
     assert '\n' not in str(error.value)
 
 
-def test_a_write_that_fails_leaves_the_old_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_write_that_fails_leaves_the_old_map(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     patch = GridPatch(GridFrame(0.0, 0.0, 0.1), np.zeros((2, 2), dtype=np.int8))
     write_map(tmp_path / 'map', patch)
     before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}

@@ -1,4 +1,7 @@
-"""What is read is bounded: a small file that expands or nests without end is refused in one line and little memory."""
+"""What is read is bounded.
+
+A small file that expands or nests without end is refused in one line and little memory.
+"""
 
 import gzip
 import re

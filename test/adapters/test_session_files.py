@@ -48,11 +48,23 @@ def building() -> World:
 
 
 def way() -> list[Array]:
-    corners = [(3.0, 6.0), (12.5, 6.0), (12.5, 10.0), (27.5, 10.0), (27.5, 2.0), (12.5, 2.0), (12.5, 6.0), (3.0, 6.0)]
+    corners = [
+        (3.0, 6.0),
+        (12.5, 6.0),
+        (12.5, 10.0),
+        (27.5, 10.0),
+        (27.5, 2.0),
+        (12.5, 2.0),
+        (12.5, 6.0),
+        (3.0, 6.0),
+    ]
     poses = []
     for (x, y), (to_x, to_y) in pairwise(corners):
         heading, steps = math.atan2(to_y - y, to_x - x), int(math.hypot(to_x - x, to_y - y) / 0.25)
-        poses += [pose(x + k / steps * (to_x - x), y + k / steps * (to_y - y), heading) for k in range(steps)]
+        poses += [
+            pose(x + k / steps * (to_x - x), y + k / steps * (to_y - y), heading)
+            for k in range(steps)
+        ]
     return poses
 
 
@@ -68,7 +80,12 @@ def assert_same(one: TopologicalMap, other: TopologicalMap) -> None:
     assert one.edges.keys() == other.edges.keys()
     for number, edge in one.edges.items():
         twin = other.edges[number]
-        assert (edge.a, edge.b, edge.length_m, edge.clearance_m) == (twin.a, twin.b, twin.length_m, twin.clearance_m)
+        assert (edge.a, edge.b, edge.length_m, edge.clearance_m) == (
+            twin.a,
+            twin.b,
+            twin.length_m,
+            twin.clearance_m,
+        )
         assert np.array_equal(edge.path, twin.path)
 
 
@@ -83,7 +100,10 @@ def test_work_goes_on_as_if_it_had_never_stopped(tmp_path: Path) -> None:
     assert_same(builder.map, restored.map)
     drive(grid, builder, poses[120:], 1)
     drive(again, restored, poses[120:], 1)
-    assert np.array_equal(grid.patch().cells, again.patch().cells) and grid.patch().frame == again.patch().frame
+    assert (
+        np.array_equal(grid.patch().cells, again.patch().cells)
+        and grid.patch().frame == again.patch().frame
+    )
     assert_same(builder.map, restored.map)
     for key, array in grid.state().items():
         assert np.array_equal(array, again.state()[key]) or key in ('tiles', 'log_odds')
@@ -127,7 +147,9 @@ def test_a_session_is_named_by_its_stem_or_one_of_its_files(tmp_path: Path, end:
     assert has_topology(path)
     assert np.array_equal(load_grid(path).state()['log_odds'], grid.state()['log_odds'])
     assert_same(load_topology(path, None, 0.1).map, builder.map)
-    with pytest.raises(InputError, match=r'room.one.topology.npz: made from 0.1 m a cell: expected 0.05 m'):
+    with pytest.raises(
+        InputError, match=r'room.one.topology.npz: made from 0.1 m a cell: expected 0.05 m'
+    ):
         load_topology(path, None, 0.05)
 
 
@@ -153,7 +175,9 @@ def test_a_map_is_read_where_there_is_no_saved_grid_and_only_there(tmp_path: Pat
         load_grid(str(tmp_path / 'b'))
 
 
-@pytest.mark.parametrize('wrong', [{'frame': np.array([0.0, np.nan, 0.1])}, {'tiles': np.zeros((0, 2))}])
+@pytest.mark.parametrize(
+    'wrong', [{'frame': np.array([0.0, np.nan, 0.1])}, {'tiles': np.zeros((0, 2))}]
+)
 def test_a_grid_of_nonsense_is_refused(wrong: dict[str, Array]) -> None:
     with pytest.raises(InputError, match=r'saved grid: (frame|tiles).*: expected'):
         OccupancyGrid.from_state(OccupancyGrid().state() | wrong)
@@ -201,7 +225,9 @@ def test_a_corrected_past_moves_the_nodes_and_they_keep_their_ids() -> None:
 
 def test_a_correction_before_the_first_window() -> None:
     builder = TopologyBuilder()
-    builder.rebuild(lambda x, y: OccupancyGrid().window(x, y, 10.0), np.empty((0, 3)), np.empty((0, 3)))
+    builder.rebuild(
+        lambda x, y: OccupancyGrid().window(x, y, 10.0), np.empty((0, 3)), np.empty((0, 3))
+    )
     assert not builder.map.nodes
 
 
@@ -214,7 +240,8 @@ def test_what_an_exploration_learned_is_the_same_after_a_start(tmp_path):
     again = load_exploration(stem)
     assert again is not None
     assert {i: (t.x, t.y, t.probability) for i, t in again.surveyor.tracker.tracks.items()} == {
-        7: (1.0, 2.0, 0.5), 9: (3.0, 2.5, 0.8)
+        7: (1.0, 2.0, 0.5),
+        9: (3.0, 2.5, 0.8),
     }
     (tmp_path / 'room.exploration.npz').write_bytes(b'no archive')
     with pytest.raises(InputError, match=r'room\.exploration\.npz'):

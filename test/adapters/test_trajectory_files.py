@@ -35,14 +35,17 @@ def test_the_text(tmp_path: Path) -> None:
 
 
 def test_comments_and_short_fractions(tmp_path: Path) -> None:
-    (tmp_path / 't.tum').write_text('# t x y z qx qy qz qw\n\n1.5 0 0 0 0 0 0 1 # here\n2 1 0 0 0 0 1 0\n')
+    (tmp_path / 't.tum').write_text(
+        '# t x y z qx qy qz qw\n\n1.5 0 0 0 0 0 0 1 # here\n2 1 0 0 0 0 1 0\n'
+    )
     stamps, poses = read_tum(tmp_path / 't.tum')
     assert stamps == [1_500_000_000, 2_000_000_000]
     assert poses == pytest.approx(np.array([[0, 0, 0], [1, 0, math.pi]]))
 
 
 @pytest.mark.parametrize(
-    'line', ['1 2 3', 'a 0 0 0 0 0 0 1', '1 0 0 0 0 0 0 x', '1 nan 0 0 0 0 0 1', '1e9 0 0 0 0 0 0 1']
+    'line',
+    ['1 2 3', 'a 0 0 0 0 0 0 1', '1 0 0 0 0 0 0 x', '1 nan 0 0 0 0 0 1', '1e9 0 0 0 0 0 0 1'],
 )
 def test_what_is_wrong_is_said(tmp_path: Path, line: str) -> None:
     (tmp_path / 't.tum').write_text('0 0 0 0 0 0 0 1\n' + line + '\n')
@@ -50,7 +53,9 @@ def test_what_is_wrong_is_said(tmp_path: Path, line: str) -> None:
         read_tum(tmp_path / 't.tum')
 
 
-@settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    deadline=None, max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(st.binary(max_size=100))
 def test_arbitrary_bytes(tmp_path: Path, content: bytes) -> None:
     (tmp_path / 't.tum').write_bytes(content)

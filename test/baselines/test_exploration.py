@@ -1,4 +1,4 @@
-"""Every strategy that ours is compared with: each finishes a small world by itself, and chooses as it says."""
+"""All strategies ours is compared with: each finishes a small world, and chooses as it says."""
 
 import math
 
@@ -33,7 +33,9 @@ def two_rooms() -> World:
 
 @pytest.mark.parametrize('strategy', sorted(set(STRATEGIES) - {'paper'}))
 def test_each_strategy_sees_all_stops_by_itself_and_touches_nothing(strategy: str) -> None:
-    _, report = explore(two_rooms(), START, Options(strategy=strategy, speed_m_s=0.5, time_limit_s=600.0))
+    _, report = explore(
+        two_rooms(), START, Options(strategy=strategy, speed_m_s=0.5, time_limit_s=600.0)
+    )
     assert report['finished']
     assert report['coverage'] >= 0.99
     assert report['collisions'] == 0
@@ -41,7 +43,9 @@ def test_each_strategy_sees_all_stops_by_itself_and_touches_nothing(strategy: st
 
 
 def test_the_literal_scheme_sets_out_and_stops_by_itself() -> None:
-    _, report = explore(two_rooms(), START, Options(strategy='paper', speed_m_s=0.5, time_limit_s=600.0))
+    _, report = explore(
+        two_rooms(), START, Options(strategy='paper', speed_m_s=0.5, time_limit_s=600.0)
+    )
     assert report['finished']
     assert report['distance'] > 1.0
     assert report['collisions'] == 0
@@ -55,7 +59,7 @@ def after_a_look(strategy: FrontierExplorer, cells: np.ndarray, pose: np.ndarray
 
 
 def corridor() -> np.ndarray:
-    """A corridor of 16 m, open at both ends, with a wide opening to the right half of its upper side."""
+    """A corridor of 16 m, open at both ends, with a wide opening in the upper side's right half."""
     cells = np.full((80, 160), -1)
     cells[30:50] = 0
     cells[29], cells[50, :120], cells[50:60, 120:150] = 100, 100, 0
@@ -106,7 +110,9 @@ def test_a_target_that_fails_is_left_for_later_and_the_end_says_so() -> None:
     topology = explore(two_rooms(), START, Options(time_limit_s=1.0))[0].pipeline.topology.map
     tried = []
     for i in range(40):
-        decision = strategy.step(topology, patch, Scan.create(i * 10**9, scan.ranges_m, -1.57, 0.0174, 0.05, 8.0), pose)
+        decision = strategy.step(
+            topology, patch, Scan.create(i * 10**9, scan.ranges_m, -1.57, 0.0174, 0.05, 8.0), pose
+        )
         if decision.finished:
             break
         if decision.target is not None:
@@ -125,7 +131,8 @@ def test_an_edge_is_followed_to_its_end_though_another_end_comes_nearer() -> Non
         path = np.array([[place[0], place[1]] for place in places])
         return TopologicalMap(nodes, [Edge(3, 1, 2, path, 14.0 - x, 1.0)])
 
-    strategy, patch = VisitAllEndNodes(), GridPatch(GridFrame(0.0, 0.0, 0.1), corridor().astype(np.int8))
+    strategy = VisitAllEndNodes()
+    patch = GridPatch(GridFrame(0.0, 0.0, 0.1), corridor().astype(np.int8))
 
     def goes_to(robot_x: float, end_x: float) -> float:
         scan = Scan.create(0, np.full(181, np.nan), -math.pi / 2, math.pi / 180, 0.05, 8.0)
@@ -146,7 +153,9 @@ def test_explore_lite_gives_up_what_comes_no_nearer_also_if_it_goes_to_and_fro()
     for second in range(120):
         # Now one is cheaper, then the other one, as where the map grows at its rims.
         pose = np.array([7.0 if second % 2 else 9.0, 4.0, 0.0])
-        scan = Scan.create(second * 10**9, np.full(181, np.nan), -math.pi / 2, math.pi / 180, 0.05, 8.0)
+        scan = Scan.create(
+            second * 10**9, np.full(181, np.nan), -math.pi / 2, math.pi / 180, 0.05, 8.0
+        )
         target = strategy.step(TopologicalMap(), patch, scan, pose).target
         assert target is not None
         places.append(target.x)
@@ -157,13 +166,16 @@ def test_explore_lite_gives_up_what_comes_no_nearer_also_if_it_goes_to_and_fro()
 
 def test_an_end_node_that_comes_no_nearer_counts_as_visited() -> None:
     """A robot that does not get there, as if the end in a wide hall went wherever it goes."""
-    strategy, patch = VisitAllEndNodes(), GridPatch(GridFrame(0.0, 0.0, 0.1), corridor().astype(np.int8))
+    strategy = VisitAllEndNodes()
+    patch = GridPatch(GridFrame(0.0, 0.0, 0.1), corridor().astype(np.int8))
     nodes = [Node(k + 1, NodeKind.END, x, 4.0, 1.0) for k, x in enumerate((2.0, 14.0))]
     path = np.array([[2.0, 4.0], [14.0, 4.0]])
     topology = TopologicalMap(nodes, [Edge(3, 1, 2, path, 12.0, 1.0)])
     targets = []
     for second in range(100):
-        scan = Scan.create(second * 10**9, np.full(181, np.nan), -math.pi / 2, math.pi / 180, 0.05, 8.0)
+        scan = Scan.create(
+            second * 10**9, np.full(181, np.nan), -math.pi / 2, math.pi / 180, 0.05, 8.0
+        )
         target = strategy.step(topology, patch, scan, np.array([7.0, 4.0, 0.0])).target
         assert target is not None
         targets.append(target.x)
@@ -177,11 +189,14 @@ def test_who_drives_along_the_graph_goes_back_where_it_came_through() -> None:
     cells = corridor()
     cells[:, 60:62] = 100
     cells[39:41, 60:62] = 0
-    far, passage = np.array([8.0, 4.0, 0.0]), [np.array([x, 4.0, 0.0]) for x in np.arange(4.0, 8.0, 0.1)]
+    far = np.array([8.0, 4.0, 0.0])
+    passage = [np.array([x, 4.0, 0.0]) for x in np.arange(4.0, 8.0, 0.1)]
     middles = {}
     for strategy in (NearestFrontier(), VisitAllEndNodes()):
         for pose in passage:
             after_a_look(strategy, cells, pose)
-        middles[type(strategy)] = [frontier.middle[0] for frontier in after_a_look(strategy, cells, far)]
+        middles[type(strategy)] = [
+            frontier.middle[0] for frontier in after_a_look(strategy, cells, far)
+        ]
     assert min(middles[NearestFrontier]) > 6.2
     assert min(middles[VisitAllEndNodes]) < 1.0

@@ -46,7 +46,9 @@ def test_longer_pruning_leaves_less() -> None:
     rng = np.random.default_rng(3)
     cells = tee()
     cells[10, rng.integers(10, 50, 12)] = 100
-    counts = [len(build_voronoi(patch_of(cells), VoronoiConfig(prune_m=m)).nodes) for m in (0.0, 0.3, 1.0)]
+    counts = [
+        len(build_voronoi(patch_of(cells), VoronoiConfig(prune_m=m)).nodes) for m in (0.0, 0.3, 1.0)
+    ]
     assert counts[0] > counts[1] >= counts[2]
     assert counts[2] == 4
 

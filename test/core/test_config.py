@@ -25,8 +25,15 @@ def test_defaults_and_values_within_the_range_are_taken():
 @pytest.mark.parametrize(
     'wrong',
     [
-        {'speed': -0.1}, {'speed': 2.1}, {'speed': math.nan}, {'speed': 'fast'}, {'count': 0}, {'count': 1.5},
-        {'mode': 'maybe'}, {'active': 1}, {'count': True},
+        {'speed': -0.1},
+        {'speed': 2.1},
+        {'speed': math.nan},
+        {'speed': 'fast'},
+        {'count': 0},
+        {'count': 1.5},
+        {'mode': 'maybe'},
+        {'active': 1},
+        {'count': True},
     ],
 )
 def test_a_wrong_value_is_named(wrong):

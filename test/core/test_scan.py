@@ -10,7 +10,12 @@ from thinmap_ros.core.scan import Scan
 
 
 def scan_of(ranges, **changes):
-    fields = {'angle_min_rad': -math.pi / 2, 'angle_increment_rad': 0.1, 'range_min_m': 0.1, 'range_max_m': 8.0}
+    fields = {
+        'angle_min_rad': -math.pi / 2,
+        'angle_increment_rad': 0.1,
+        'range_min_m': 0.1,
+        'range_max_m': 8.0,
+    }
     return Scan.create(5, ranges, **(fields | changes))
 
 
@@ -26,7 +31,10 @@ def test_a_zero_range_is_no_hit_even_where_the_sensor_claims_to_measure_it():
 
 def test_points_follow_the_mount_of_a_clockwise_laser():
     scan = scan_of(
-        [2.0, 3.0], angle_min_rad=math.pi / 2, angle_increment_rad=-math.pi / 2, T_base_laser=np.array([1, 0, 0])
+        [2.0, 3.0],
+        angle_min_rad=math.pi / 2,
+        angle_increment_rad=-math.pi / 2,
+        T_base_laser=np.array([1, 0, 0]),
     )
     np.testing.assert_allclose(scan.points_base(), [[1, 2], [4, 0]], atol=1e-6)
 
@@ -60,11 +68,21 @@ def one_range(value, **options):
     return Scan.create(0, np.full(20, value), -1.0, 0.1, 0.1, 8.0, **options)
 
 
-@pytest.mark.parametrize('value, name', [
-    (3.0, 'hit'), (0.1, 'hit'), (np.inf, 'no_return'), (8.0, 'no_return'), (81.83, 'no_return'),
-    (-np.inf, 'too_near'),
-    (np.nan, ''), (0.0, ''), (-1.0, ''), (0.05, ''),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    'value, name',
+    [
+        (3.0, 'hit'),
+        (0.1, 'hit'),
+        (np.inf, 'no_return'),
+        (8.0, 'no_return'),
+        (81.83, 'no_return'),
+        (-np.inf, 'too_near'),
+        (np.nan, ''),
+        (0.0, ''),
+        (-1.0, ''),
+        (0.05, ''),
+    ],
+)
 def test_a_range_says_one_thing_or_nothing(value, name):
     scan = one_range(value)
     said = [key for key in ('hit', 'no_return', 'too_near') if getattr(scan, key).all()]

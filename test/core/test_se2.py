@@ -36,11 +36,15 @@ def test_between_undoes_compose(a, b):
 
 @given(poses, poses)
 def test_points_move_like_poses(a, b):
-    np.testing.assert_allclose(se2.transform_points(a, b[None, :2])[0], se2.compose(a, b)[:2], atol=1e-9)
+    np.testing.assert_allclose(
+        se2.transform_points(a, b[None, :2])[0], se2.compose(a, b)[:2], atol=1e-9
+    )
 
 
 def test_a_step_ahead_of_a_robot_facing_north_goes_north():
-    np.testing.assert_allclose(se2.compose(se2.pose(1, 2, math.pi / 2), se2.pose(1, 0, 0))[:2], [1, 3])
+    np.testing.assert_allclose(
+        se2.compose(se2.pose(1, 2, math.pi / 2), se2.pose(1, 0, 0))[:2], [1, 3]
+    )
 
 
 def test_interpolation_turns_the_shorter_way():

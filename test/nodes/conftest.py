@@ -1,4 +1,4 @@
-"""A live ROS graph for a test: real node processes on a private domain, and a client beside them."""
+"""A live ROS graph for a test: node processes on a private domain, and a client beside them."""
 
 import os
 import signal
@@ -37,9 +37,17 @@ class Graph:
         self.executor.add_node(self.node)
 
     def start(
-        self, name: str, remap: tuple[str, ...] = (), arguments: tuple[str, ...] = (), label: str = '', **values: Any
+        self,
+        name: str,
+        remap: tuple[str, ...] = (),
+        arguments: tuple[str, ...] = (),
+        label: str = '',
+        **values: Any,
     ) -> subprocess.Popen[bytes]:
-        """Start a node with arguments, ROS's remapping rules and its parameters; known by its label, or its name."""
+        """Start a node with arguments, ROS's remapping rules and its parameters.
+
+        It is known by its label, or its name.
+        """
         command = [sys.executable, '-m', f'thinmap_ros.nodes.{name}', *arguments, '--ros-args']
         name = label or name
         for rule in remap:
@@ -60,9 +68,11 @@ class Graph:
         return (self.folder / f'{name}.log').read_text()
 
     def heard(self, topic: str, kind: type, profile: QoSProfile = qos.STREAM) -> list[Any]:
-        """List that fills with all messages of a topic as the test spins, however long it is kept from that."""
+        """List that fills with all messages of a topic as the test spins, however rare that is."""
         messages: list[Any] = []
-        deep = QoSProfile(depth=_DEPTH, reliability=profile.reliability, durability=profile.durability)
+        deep = QoSProfile(
+            depth=_DEPTH, reliability=profile.reliability, durability=profile.durability
+        )
 
         def hear(message: Any) -> None:
             self._heard += 1
@@ -72,7 +82,7 @@ class Graph:
         return messages
 
     def hear_out(self) -> None:
-        """Hear what still waits, until it is quiet: of those that have stopped nothing comes later."""
+        """Hear what still waits, until it is quiet: those that have stopped send nothing later."""
         last_heard, quiet = self._heard, 0
 
         def is_quiet() -> bool:
@@ -97,16 +107,21 @@ class Graph:
     def call(self, kind: type, name: str, request: Any) -> Any:
         client = self.node.create_client(kind, name)
         self.until(client.service_is_ready, f'service {name}')
-        # A server that has just found its client may not be able to answer it yet: asked again then.
+        # A server that has just found its client may not be able to answer yet: asked again then.
         for _ in range(3):
             future, end = client.call_async(request), time.monotonic() + PATIENCE_S / 3.0
-            self.until(lambda f=future, e=end: f.done() or time.monotonic() > e, f'answer of {name}')
+            self.until(
+                lambda f=future, e=end: f.done() or time.monotonic() > e, f'answer of {name}'
+            )
             if future.done():
                 return future.result()
         pytest.fail(f'{name} answers nobody')
 
     def send_goal(self, client: ActionClient, goal: Any) -> Any:
-        """Handle of a goal that was taken. A node that was killed passes for a server for a while: asked again then."""
+        """Handle of a goal that was taken.
+
+        A node that was killed passes for a server for a while: asked again then.
+        """
         self.until(client.server_is_ready, 'action server')
         for _ in range(6):
             sent = self._ask(client, goal, 0.2 * PATIENCE_S)

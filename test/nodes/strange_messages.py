@@ -1,4 +1,7 @@
-"""Messages that are nearly right, and wrong in up to three places: what broken drivers and strange nodes send."""
+"""Messages that are nearly right, and wrong in up to three places.
+
+What broken drivers and strange nodes send.
+"""
 
 import math
 from array import array
@@ -12,11 +15,31 @@ from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.msg import TopologicalEdge, TopologicalMap, TopologicalNode
 
-STRANGE = st.sampled_from([
-    math.nan, math.inf, -math.inf, 0.0, -0.0, -1.0, 1e-300, 1e-30, 1e9, -1e9, 1e30, 1e300, -1e300, 3.0, 400.0,
-])
-STRANGE_32 = st.sampled_from([math.nan, math.inf, -math.inf, 0.0, -0.0, -1.0, 1e-30, 1e-3, 1e9, 1e30, -1e30, 3.0])
-NAMES = st.sampled_from(['', 'laser', 'map', '/laser', 'nowhere', 'x' * 300, 'a\nb\tc', '\u5730\u56f3', '..', ' '])
+STRANGE = st.sampled_from(
+    [
+        math.nan,
+        math.inf,
+        -math.inf,
+        0.0,
+        -0.0,
+        -1.0,
+        1e-300,
+        1e-30,
+        1e9,
+        -1e9,
+        1e30,
+        1e300,
+        -1e300,
+        3.0,
+        400.0,
+    ]
+)
+STRANGE_32 = st.sampled_from(
+    [math.nan, math.inf, -math.inf, 0.0, -0.0, -1.0, 1e-30, 1e-3, 1e9, 1e30, -1e30, 3.0]
+)
+NAMES = st.sampled_from(
+    ['', 'laser', 'map', '/laser', 'nowhere', 'x' * 300, 'a\nb\tc', '\u5730\u56f3', '..', ' ']
+)
 PERIOD_NS = 100_000_000
 
 
@@ -30,13 +53,17 @@ def stamped(draw, message, ns):
 
 def changed(draw, setters):
     """Apply up to three of the changes; often none."""
-    for setter in draw(st.lists(st.sampled_from(setters), max_size=3)) if draw(st.booleans()) else []:
+    for setter in (
+        draw(st.lists(st.sampled_from(setters), max_size=3)) if draw(st.booleans()) else []
+    ):
         setter()
 
 
 @st.composite
 def scans(draw, ns=10**9):
-    message = stamped(draw, LaserScan(angle_min=-1.5, angle_max=1.5, range_min=0.05, range_max=8.0), ns)
+    message = stamped(
+        draw, LaserScan(angle_min=-1.5, angle_max=1.5, range_min=0.05, range_max=8.0), ns
+    )
     message.header.frame_id, message.angle_increment = 'laser', 3.0 / 60.0
     ranges = np.full(61, 2.0, dtype=np.float32)
 
@@ -53,7 +80,15 @@ def scans(draw, ns=10**9):
     def frame():
         message.header.frame_id = draw(NAMES)
 
-    names = ('angle_min', 'angle_max', 'angle_increment', 'range_min', 'range_max', 'time_increment', 'scan_time')
+    names = (
+        'angle_min',
+        'angle_max',
+        'angle_increment',
+        'range_min',
+        'range_max',
+        'time_increment',
+        'scan_time',
+    )
     changed(draw, [some_ranges, length, frame, *map(number, names)])
     values = array('f')
     values.frombytes(ranges.tobytes())
@@ -135,7 +170,9 @@ def topologies(draw, ns=10**9):
     for i, node in enumerate(message.nodes):
         node.position.x = float(i)
     path = [Point32(x=float(i)) for i in range(2)]
-    message.edges = [TopologicalEdge(id=9, node_a=1, node_b=2, length_m=1.0, clearance_m=0.5, path=path)]
+    message.edges = [
+        TopologicalEdge(id=9, node_a=1, node_b=2, length_m=1.0, clearance_m=0.5, path=path)
+    ]
     node, edge = message.nodes[draw(st.integers(0, 2))], message.edges[0]
 
     def place():
@@ -154,13 +191,21 @@ def topologies(draw, ns=10**9):
         edge.path = []
 
     values = [value(edge, 'length_m'), value(edge, 'clearance_m'), value(node, 'clearance_m')]
-    numbers = [number(edge, 'node_a'), number(edge, 'node_b'), number(edge, 'id'), number(node, 'id')]
+    numbers = [
+        number(edge, 'node_a'),
+        number(edge, 'node_b'),
+        number(edge, 'id'),
+        number(node, 'id'),
+    ]
     changed(draw, [place, point, empty, number(node, 'kind'), *values, *numbers])
     return message
 
 
 STRATEGIES = {
-    LaserScan: scans, Odometry: odometries, PoseWithCovarianceStamped: poses, OccupancyGrid: grids,
+    LaserScan: scans,
+    Odometry: odometries,
+    PoseWithCovarianceStamped: poses,
+    OccupancyGrid: grids,
     TopologicalMap: topologies,
 }
 
@@ -170,7 +215,11 @@ def made(kind, count):
     messages = []
 
     @settings(
-        max_examples=count, database=None, derandomize=True, deadline=None, phases=[Phase.generate],
+        max_examples=count,
+        database=None,
+        derandomize=True,
+        deadline=None,
+        phases=[Phase.generate],
         suppress_health_check=list(HealthCheck),
     )
     @given(st.data())

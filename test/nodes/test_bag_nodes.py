@@ -55,7 +55,9 @@ def test_a_killed_recorder_loses_at_most_the_last_second(graph, tmp_path):
     assert len(found) >= sum(at < killed - AT_MOST_LOST_S for at in said) > 10
 
 
-def test_a_full_disk_ends_the_recording_in_words_and_what_is_written_stays_readable(graph, tmp_path):
+def test_a_full_disk_ends_the_recording_in_words_and_what_is_written_stays_readable(
+    graph, tmp_path
+):
     recorder, said = graph.start('recorder', bag=str(tmp_path / 'bag')), []
     publisher = talk(graph, 'said', 1.2, said, size=1000)
     size = (tmp_path / 'bag' / 'bag.mcap').stat().st_size
@@ -100,9 +102,16 @@ def bag(tmp_path):
 def scan(make, ns):
     stamp = make['builtin_interfaces/msg/Time'](sec=ns // 10**9, nanosec=ns % 10**9)
     return make[SCAN](
-        header=make['std_msgs/msg/Header'](stamp=stamp, frame_id='laser'), angle_min=-0.5, angle_max=0.5,
-        angle_increment=0.25, time_increment=0.0, scan_time=0.0, range_min=0.05, range_max=8.0,
-        ranges=np.full(5, 2.0, dtype=np.float32), intensities=np.zeros(0, dtype=np.float32),
+        header=make['std_msgs/msg/Header'](stamp=stamp, frame_id='laser'),
+        angle_min=-0.5,
+        angle_max=0.5,
+        angle_increment=0.25,
+        time_increment=0.0,
+        scan_time=0.0,
+        range_min=0.05,
+        range_max=8.0,
+        ranges=np.full(5, 2.0, dtype=np.float32),
+        intensities=np.zeros(0, dtype=np.float32),
     )
 
 
@@ -119,11 +128,20 @@ def test_a_bag_is_offered_as_it_was_recorded_and_under_other_names(graph, bag):
     scans = graph.heard('/r1/scan', LaserScan)
     words = graph.heard('/here/said', String, BEST_EFFORT)
     player = graph.start(
-        'bag_player', bag=str(bag), rate=20.0, prefix='here', start_paused=True,
+        'bag_player',
+        bag=str(bag),
+        rate=20.0,
+        prefix='here',
+        start_paused=True,
         remap=('/here/robot/scan:=/r1/scan',),
     )
     signs = graph.heard('/here/sign', String, qos.LATCHED)
-    graph.until(lambda: graph.node.count_publishers('/here/sign') and graph.node.count_publishers('/here/said'), 'it')
+    graph.until(
+        lambda: (
+            graph.node.count_publishers('/here/sign') and graph.node.count_publishers('/here/said')
+        ),
+        'it',
+    )
     assert offered(graph, '/here/said').reliability == ReliabilityPolicy.BEST_EFFORT
     assert offered(graph, '/here/sign').durability == DurabilityPolicy.TRANSIENT_LOCAL
     assert offered(graph, '/r1/scan').reliability == ReliabilityPolicy.RELIABLE
@@ -131,7 +149,10 @@ def test_a_bag_is_offered_as_it_was_recorded_and_under_other_names(graph, bag):
     graph.call(SetBool, '/bag_player/pause', SetBool.Request(data=False))
     graph.until(lambda: len(scans) == 10, 'all scans')
     late = graph.heard('/here/sign', String, qos.LATCHED)
-    graph.until(lambda: late or player.poll() is not None, 'who comes late hears the sign, or comes too late')
+    graph.until(
+        lambda: late or player.poll() is not None,
+        'who comes late hears the sign, or comes too late',
+    )
     graph.until(lambda: player.poll() == 0, 'the end')
     assert [message.data for message in signs] == ['1', '6'] and words
     assert '22 messages sent: /robot/scan 10, /said 10, /sign 2' in graph.log('bag_player')
@@ -176,7 +197,10 @@ def test_a_loop_begins_again_with_the_clock(graph, bag):
         return [b for a, b in pairwise(ticks) if b < a]
 
     # Scans and clock do not come at the same moment.
-    graph.until(lambda: len(scans) > 25 and len(set_back()) == (len(scans) - 1) // 10, 'two rounds and a half')
+    graph.until(
+        lambda: len(scans) > 25 and len(set_back()) == (len(scans) - 1) // 10,
+        'two rounds and a half',
+    )
     assert seconds(scans)[:20] == 2 * list(range(10))
     assert all(tick < 10**12 + 10**9 for tick in set_back())
     assert graph.stop('bag_player') == 0
@@ -189,7 +213,8 @@ def test_a_bag_that_ends_before_the_offset_is_refused(graph, bag):
 
 
 @pytest.mark.parametrize(
-    ('begin', 'said'), [(b'#ROSBAG V2.0\n', 'rosbags-convert'), (b'SQLite format 3\0', 'ros2 bag reindex')]
+    ('begin', 'said'),
+    [(b'#ROSBAG V2.0\n', 'rosbags-convert'), (b'SQLite format 3\0', 'ros2 bag reindex')],
 )
 def test_the_player_names_formats_that_it_does_not_read(graph, tmp_path, begin, said):
     (tmp_path / 'old.bag').write_bytes(begin + bytes(100))

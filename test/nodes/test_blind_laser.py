@@ -1,4 +1,7 @@
-"""A laser that says nothing, on a live graph: the robot stops, says why, and goes on when ranges come back."""
+"""A laser that says nothing, on a live graph.
+
+The robot stops, says why, and goes on when ranges come back.
+"""
 
 import math
 from array import array
@@ -105,7 +108,9 @@ class Robot:
         self._pose.publish(messages.pose_with_covariance_msg(np.zeros(3), np.eye(3), 'map', ns))
 
     def until(self, ranges, condition, what):
-        self.graph.until(lambda: self.say(ranges) or (self.commands and condition(self.commands[-1])), what)
+        self.graph.until(
+            lambda: self.say(ranges) or (self.commands and condition(self.commands[-1])), what
+        )
 
 
 def drives(command):

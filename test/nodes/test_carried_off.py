@@ -1,4 +1,7 @@
-"""A robot in a saved map on a live graph: switched on anywhere it finds itself and maps on, and so when carried off."""
+"""A robot in a saved map on a live graph.
+
+Switched on anywhere it finds itself and maps on, and so when carried off.
+"""
 
 import numpy as np
 import pytest
@@ -60,14 +63,20 @@ class Robot:
 
 def start_sim(graph, at, subscribers):
     text = ','.join(map(str, at))
-    graph.start('sim', start=text, rate=6.0, lockstep='local_topology', hold_for_subscribers=subscribers)
+    graph.start(
+        'sim', start=text, rate=6.0, lockstep='local_topology', hold_for_subscribers=subscribers
+    )
 
 
-def test_a_robot_finds_itself_in_a_saved_map_and_maps_on_also_when_it_is_carried_off(graph, tmp_path):
+def test_a_robot_finds_itself_in_a_saved_map_and_maps_on_also_when_it_is_carried_off(
+    graph, tmp_path
+):
     robot, stem = Robot(graph), tmp_path / 'room'
     x, y, yaw = START
     for name in NODES:
-        start = {'start_x_m': x, 'start_y_m': y, 'start_yaw_rad': yaw} if name == 'localizer' else {}
+        start = (
+            {'start_x_m': x, 'start_y_m': y, 'start_yaw_rad': yaw} if name == 'localizer' else {}
+        )
         graph.start(name, use_sim_time=True, **start)
     start_sim(graph, START, 2)
     robot.drive_until(lambda: robot.seconds() > 30.0, 'a map of the room')

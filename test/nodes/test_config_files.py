@@ -19,7 +19,11 @@ from thinmap_ros.core.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parents[2]
 # All but the one that runs the others.
-NODES = sorted(path.stem for path in (ROOT / 'thinmap_ros' / 'nodes').glob('[a-z]*.py') if path.stem != 'thinmap')
+NODES = sorted(
+    path.stem
+    for path in (ROOT / 'thinmap_ros' / 'nodes').glob('[a-z]*.py')
+    if path.stem != 'thinmap'
+)
 # What rclpy declares in every node of its own accord.
 OF_EVERY_NODE = {'start_type_description_service'}
 # What a node must be told here that is not its default: a bag that exists; a test opens no window.
@@ -29,7 +33,9 @@ OWN_WORDS = {'use_sim_time': 'follow /clock instead of the time of the machine'}
 
 def node_class(name):
     module = importlib.import_module(f'thinmap_ros.nodes.{name}')
-    classes = [c for c in vars(module).values() if isinstance(c, type) and c.__module__ == module.__name__]
+    classes = [
+        c for c in vars(module).values() if isinstance(c, type) and c.__module__ == module.__name__
+    ]
     (found,) = [c for c in classes if issubclass(c, rclpy.node.Node)]
     return found
 
@@ -37,14 +43,20 @@ def node_class(name):
 def default_of(name, key):
     """Default of a field of the config that a node's own module has."""
     module = importlib.import_module(f'thinmap_ros.nodes.{name}')
-    configs = [c for c in vars(module).values() if dataclasses.is_dataclass(c) and c.__module__ == module.__name__]
-    (default,) = [field.default for c in configs for field in dataclasses.fields(c) if field.name == key]
+    configs = [
+        c
+        for c in vars(module).values()
+        if dataclasses.is_dataclass(c) and c.__module__ == module.__name__
+    ]
+    (default,) = [
+        field.default for c in configs for field in dataclasses.fields(c) if field.name == key
+    ]
     return default
 
 
 @pytest.fixture
 def declared(ros_domain, tmp_path, monkeypatch):
-    """Value and descriptor of each parameter of a node, by name, as it starts with some arguments."""
+    """Value and descriptor of a node's parameters, by name, as it starts with some arguments."""
     monkeypatch.chdir(tmp_path)
     BagWriter(tmp_path / 'some_bag', live=True).close()
 
@@ -52,7 +64,11 @@ def declared(ros_domain, tmp_path, monkeypatch):
         rclpy.init(args=['--ros-args', *arguments])
         try:
             node = node_class(name)()
-            names = [n for n in node._parameters if n not in OF_EVERY_NODE and not n.startswith('qos_overrides')]
+            names = [
+                n
+                for n in node._parameters
+                if n not in OF_EVERY_NODE and not n.startswith('qos_overrides')
+            ]
             found = {n: (node.get_parameter(n).value, node.describe_parameter(n)) for n in names}
             getattr(node, 'close', lambda: None)()
             node.destroy_node()
@@ -90,19 +106,24 @@ def file_text(name, parameters):
 def test_config_file_says_what_the_node_declares(declared, name):
     path = ROOT / 'config' / f'{name}.yaml'
     needed = NEEDED.get(name, {})
-    arguments = [word for key, value in needed.items() for word in ('-p', f'{key}:={json.dumps(value)}')]
+    arguments = [
+        word for key, value in needed.items() for word in ('-p', f'{key}:={json.dumps(value)}')
+    ]
     parameters = declared(name, *arguments)
     for key in needed:
         parameters[key] = (default_of(name, key), parameters[key][1])
     text = file_text(name, parameters)
     if 'THINMAP_WRITE_CONFIG' in os.environ:
         path.write_text(text)
-    assert path.read_text() == text, f'{path.name}: see the top of {__file__} for how to write it anew'
+    assert path.read_text() == text, (
+        f'{path.name}: see the top of {__file__} for how to write it anew'
+    )
 
 
 @pytest.mark.parametrize('name', NODES)
 def test_node_takes_its_config_file(declared, tmp_path, name):
-    values = yaml.safe_load((ROOT / 'config' / f'{name}.yaml').read_text())['/**']['ros__parameters']
+    content = yaml.safe_load((ROOT / 'config' / f'{name}.yaml').read_text())
+    values = content['/**']['ros__parameters']
     # A value that is no default proves that the file is read at all.
     values['use_sim_time'] = True
     values |= NEEDED.get(name, {})
@@ -112,7 +133,9 @@ def test_node_takes_its_config_file(declared, tmp_path, name):
 
 
 def test_unknown_key_of_a_file_is_an_error(declared, tmp_path):
-    (tmp_path / 'given.yaml').write_text(yaml.safe_dump({'/**': {'ros__parameters': {'windwo_m': 3.0}}}))
+    (tmp_path / 'given.yaml').write_text(
+        yaml.safe_dump({'/**': {'ros__parameters': {'windwo_m': 3.0}}})
+    )
     with pytest.raises(ConfigError, match=r'no parameter windwo_m; it has: .*window_m'):
         declared('grid_mapper', '--params-file', str(tmp_path / 'given.yaml'))
 
@@ -148,7 +171,10 @@ def test_presets_fit_together():
     for preset in PRESETS:
         content = yaml.safe_load(preset.read_text())
         sim, grid, localizer = (
-            content[f'/**/{name}']['ros__parameters'] for name in ('sim', 'grid_mapper', 'localizer')
+            content[f'/**/{name}']['ros__parameters']
+            for name in ('sim', 'grid_mapper', 'localizer')
         )
-        assert localizer['match_range_m'] <= sim['range_max_m'] and grid['usable_range_m'] <= sim['range_max_m']
-        assert grid['window_m'] >= 2.0 * max(grid['no_return_range_m'], min(grid['usable_range_m'], 4.0))
+        assert localizer['match_range_m'] <= sim['range_max_m']
+        assert grid['usable_range_m'] <= sim['range_max_m']
+        reach_m = max(grid['no_return_range_m'], min(grid['usable_range_m'], 4.0))
+        assert grid['window_m'] >= 2.0 * reach_m

@@ -1,4 +1,7 @@
-"""The explorer as a process on a live graph: every way in which an exploration ends, and how it goes on afterwards."""
+"""The explorer as a process on a live graph.
+
+Every way in which an exploration ends, and how it goes on afterwards.
+"""
 
 import math
 from itertools import count
@@ -52,7 +55,10 @@ class Robot:
         self.knows(40)
 
     def refuses_to_drive(self):
-        """From now on, goals fail; before, there is no navigator at all, and the explorer waits for it."""
+        """From now on, goals fail.
+
+        Before, there is no navigator at all, and the explorer waits for it.
+        """
 
         def refuse(handle):
             handle.abort()
@@ -63,16 +69,22 @@ class Robot:
     def knows(self, cols):
         patch = room(cols)
         self.map.publish(messages.grid_msg(patch, 'map', 0))
-        self.graph_map.publish(messages.topology_msg(build(patch, (2.0, 2.0), TopologyConfig()), 'map', 0))
+        self.graph_map.publish(
+            messages.topology_msg(build(patch, (2.0, 2.0), TopologyConfig()), 'map', 0)
+        )
 
     def speak(self):
         ns = next(self.numbers) * PERIOD_NS
-        ranges = 0.1 * cast_rays(room(60).occupied.astype(np.uint8), 20.0, 20.0, ANGLES + AT[2], 80.0)
+        ranges = 0.1 * cast_rays(
+            room(60).occupied.astype(np.uint8), 20.0, 20.0, ANGLES + AT[2], 80.0
+        )
         scan = Scan.create(ns, ranges, -0.5 * math.pi, math.pi / 180.0, 0.05, 8.0)
         if self.hears_scans:
             self.scan.publish(messages.scan_msg(scan, 'laser', 0.2))
             self.pose.publish(messages.pose_with_covariance_msg(AT, np.zeros((3, 3)), 'map', ns))
-        self.slam.publish(SlamStatus(state=SlamStatus.TRACKING if self.is_tracked else SlamStatus.LOST))
+        self.slam.publish(
+            SlamStatus(state=SlamStatus.TRACKING if self.is_tracked else SlamStatus.LOST)
+        )
 
     def explores(self, **goal):
         """Status with which an exploration ends, and whether it succeeded."""
@@ -81,7 +93,10 @@ class Robot:
 
     def evidence(self):
         """Probability and number of counted looks' closest distance by end node."""
-        return {n.node_id: (n.position_probability, n.smallest_distance_m) for n in self.end_nodes[-1].end_nodes}
+        return {
+            n.node_id: (n.position_probability, n.smallest_distance_m)
+            for n in self.end_nodes[-1].end_nodes
+        }
 
 
 @pytest.fixture
@@ -92,7 +107,10 @@ def robot(graph):
 
 
 def test_it_says_why_it_ended(robot):
-    assert robot.explores(area_limit_m2=1.0) == (ExplorationStatus.BUDGET, GoalStatus.STATUS_SUCCEEDED)
+    assert robot.explores(area_limit_m2=1.0) == (
+        ExplorationStatus.BUDGET,
+        GoalStatus.STATUS_SUCCEEDED,
+    )
     robot.is_tracked = False
     assert robot.explores() == (ExplorationStatus.LOCALIZATION_LOST, GoalStatus.STATUS_ABORTED)
     robot.is_tracked, robot.hears_scans = True, False
@@ -108,7 +126,8 @@ def test_it_goes_on_after_a_cancelled_goal_and_after_a_new_start(graph, robot, t
     client = ActionClient(graph.node, Explore, 'explore')
     accepted = graph.send_goal(client, Explore.Goal())
     graph.until(lambda: robot.end_nodes and any(robot.evidence().values()), 'end nodes')
-    # Nodes are looked at one after the other, and borders once a second: until nothing new comes for 30 looks.
+    # Nodes are looked at one after the other, and borders once a second: until nothing new comes
+    # for 30 looks.
     seen = [(robot.evidence(), len(robot.end_nodes))]
 
     def is_settled():

@@ -37,8 +37,12 @@ def start_together(graph, *names, **simulation):
     """The same in one process, as it is left running on a robot."""
     graph.start('thinmap', arguments=names, use_sim_time=True, **AT_START)
     graph.start(
-        'sim', start=START, hold_for_subscribers=len({*names} - {'topology_builder'}), rate=4.0,
-        lockstep='local_topology', **simulation,
+        'sim',
+        start=START,
+        hold_for_subscribers=len({*names} - {'topology_builder'}),
+        rate=4.0,
+        lockstep='local_topology',
+        **simulation,
     )
 
 
@@ -121,7 +125,11 @@ def test_mapping_goes_on_after_each_node_was_killed(graph):
         if name == 'topology_builder':
             graph.until(lambda: graphs, 'graph')
             after = places(graphs[-1])
-            same = [k for k in before.keys() & after.keys() if np.hypot(*np.subtract(before[k], after[k])) < 0.5]
+            same = [
+                k
+                for k in before.keys() & after.keys()
+                if np.hypot(*np.subtract(before[k], after[k])) < 0.5
+            ]
             assert len(same) >= len(before) / 2
     for name in MAPPING:
         assert graph.stop(name) == 0
@@ -197,7 +205,8 @@ def test_a_whole_robot_that_was_killed_and_begins_anew_is_not_mixed_with_the_one
     assert graph.log('thinmap').count('goes on from what it had') == 3
     assert 'odometry has begun anew' in graph.log('thinmap')
     assert robot.error_m() < 0.1
-    # The robot stands where it began: it sees what one sees from there, and nothing of the drive is left.
+    # The robot stands where it began: it sees what one sees from there, and nothing of the drive is
+    # left.
     place = robot.truth[-1].pose.position
     assert np.hypot(place.x - 2.0, place.y - 2.0) < 0.05
     patch = messages.patch_from(maps[-1])
@@ -217,9 +226,13 @@ def test_time_set_back_begins_everything_anew(graph):
     assert graph.stop('sim') == 0
     graph.hear_out()
     robot.poses.clear(), robot.truth.clear(), maps.clear()
-    graph.start('sim', start=START, hold_for_subscribers=4, rate=4.0, lockstep='local_topology', seed=3)
+    graph.start(
+        'sim', start=START, hold_for_subscribers=4, rate=4.0, lockstep='local_topology', seed=3
+    )
     notices = [f'[{name}]: the clock was set back' for name in names]
-    graph.until(lambda: all(notice in graph.log('thinmap') for notice in notices), 'all of them notice')
+    graph.until(
+        lambda: all(notice in graph.log('thinmap') for notice in notices), 'all of them notice'
+    )
     robot.poses.clear(), maps.clear()
     graph.until(lambda: len(robot.poses) > 10 and robot.truth, 'new poses')
     assert robot.error_m() < 0.1
@@ -239,7 +252,9 @@ def test_what_waited_while_the_clock_was_set_back_does_not_begin_the_new_map(gra
 
     def say(seconds, x):
         ns = int(1e9 * seconds)
-        odometry.publish(messages.odometry_msg(np.array([x, 0.0, 0.0]), (0.0, 0.0), ('odom', 'base_link'), ns))
+        odometry.publish(
+            messages.odometry_msg(np.array([x, 0.0, 0.0]), (0.0, 0.0), ('odom', 'base_link'), ns)
+        )
         scan.publish(scan_of_nothing_near(ns))
 
     def go_on(x):
@@ -250,21 +265,28 @@ def test_what_waited_while_the_clock_was_set_back_does_not_begin_the_new_map(gra
     graph.until(lambda: go_on(4.0) or len(poses) > 5, 'poses')
     last, now[0] = now[0], 1.0
     set_back = Clock(clock=messages.time_msg(10**9))
-    graph.until(lambda: clock.publish(set_back) or 'the clock was set back' in graph.log('localizer'), 'it notices')
+    graph.until(
+        lambda: clock.publish(set_back) or 'the clock was set back' in graph.log('localizer'),
+        'it notices',
+    )
     said = 0
 
     def left_over():
         nonlocal said
         said += 1
         say(last + 0.1 * said, 4.0)
-        return doctor.number('localizer', 'dropped: scan: left over from before the clock was set back') > 0
+        cause = 'dropped: scan: left over from before the clock was set back'
+        return doctor.number('localizer', cause) > 0
 
     graph.until(left_over, 'it is counted')
     graph.hear_out()
     poses.clear()
     graph.until(lambda: go_on(0.0) or len(poses) > 5, 'poses of the new time')
-    assert max(messages.stamp_ns(pose.header.stamp) for pose in poses) <= int(1e9 * now[0]) < 50 * 10**9
-    assert all(np.hypot(pose.pose.pose.position.x, pose.pose.pose.position.y) < 0.05 for pose in poses)
+    newest_ns = max(messages.stamp_ns(pose.header.stamp) for pose in poses)
+    assert newest_ns <= int(1e9 * now[0]) < 50 * 10**9
+    assert all(
+        np.hypot(pose.pose.pose.position.x, pose.pose.pose.position.y) < 0.05 for pose in poses
+    )
 
 
 def empty_hall():
@@ -298,7 +320,9 @@ def test_a_silent_laser_stops_the_robot_and_it_goes_on(graph):
         said_at[0] = time.monotonic()
         ns = time.time_ns()
         if 'odometry' not in silent:
-            odometry.publish(messages.odometry_msg(np.zeros(3), (0.0, 0.0), ('odom', 'base_link'), ns))
+            odometry.publish(
+                messages.odometry_msg(np.zeros(3), (0.0, 0.0), ('odom', 'base_link'), ns)
+            )
         if 'laser' not in silent:
             scan.publish(scan_of_nothing_near(ns))
         if 'localizer' not in silent:
@@ -326,7 +350,10 @@ def test_a_silent_laser_stops_the_robot_and_it_goes_on(graph):
         graph.until(stands, f'it stops without {who}')
         # What a busy machine takes on top, between two programs.
         assert time.monotonic() - since < limit_s + 0.3
-        graph.until(lambda w=who: speak() or f'{w} silent' in doctor.status('navigator').message, 'it says so')
+        graph.until(
+            lambda w=who: speak() or f'{w} silent' in doctor.status('navigator').message,
+            'it says so',
+        )
     silent.clear()
     graph.until(drives, 'it goes on')
 
@@ -343,12 +370,14 @@ def test_a_robot_that_stands_for_minutes_is_as_sure_of_its_pose_as_before(graph)
     def say(T_map_base):
         stamp[0] += 200_000_000
         T_odom_base = T_map_base - here
-        odometry.publish(messages.odometry_msg(T_odom_base, (0.0, 0.0), ('odom', 'base_link'), stamp[0]))
+        odometry.publish(
+            messages.odometry_msg(T_odom_base, (0.0, 0.0), ('odom', 'base_link'), stamp[0])
+        )
         seen = scan_in(ROOM, T_map_base, rng, stamp[0])
         scan.publish(messages.scan_msg(seen, 'laser', 0.2))
 
     def answered(T_map_base, count):
-        """Say where it is, again and again, until so many of these scans are behind the last pose."""
+        """Say where it is, over and over, until so many of these scans are behind the last pose."""
         wanted = stamp[0] + count * 200_000_000
 
         def is_answered():
@@ -375,14 +404,18 @@ def test_a_burst_of_scans_leaves_no_queue_and_what_is_lost_is_counted(graph):
     graph.start('localizer', laser_pose='0,0,0')
     scan = graph.node.create_publisher(LaserScan, 'scan', qos.STREAM)
     odometry = graph.node.create_publisher(Odometry, 'odom', qos.STREAM)
-    graph.until(lambda: scan.get_subscription_count() and odometry.get_subscription_count(), 'localizer')
+    graph.until(
+        lambda: scan.get_subscription_count() and odometry.get_subscription_count(), 'localizer'
+    )
     period_ns, now = 25_000_000, [10**12]
     message = LaserScan(angle_min=-1.5, angle_increment=0.05, range_min=0.05, range_max=8.0)
     message.ranges = 61 * [3.0]
 
     def say():
         now[0] += period_ns
-        odometry.publish(messages.odometry_msg(np.zeros(3), (0.0, 0.0), ('odom', 'base_link'), now[0]))
+        odometry.publish(
+            messages.odometry_msg(np.zeros(3), (0.0, 0.0), ('odom', 'base_link'), now[0])
+        )
         message.header = messages.header('laser', now[0])
         scan.publish(message)
 
@@ -396,7 +429,6 @@ def test_a_burst_of_scans_leaves_no_queue_and_what_is_lost_is_counted(graph):
         say()
     last_ns = now[0]
 
-
     def newest():
         steadily()
         return messages.stamp_ns(poses[-1].header.stamp) >= last_ns
@@ -407,7 +439,9 @@ def test_a_burst_of_scans_leaves_no_queue_and_what_is_lost_is_counted(graph):
     assert burst < 400, 'the queue is short'
     lost = 'dropped: scan: lost on the way or in a full queue'
     graph.until(lambda: doctor.number('localizer', lost) >= 400 - burst, 'they are counted')
-    assert doctor.number('localizer', 'dropped: scan: gaps between the stamps') == 0.0, 'each was sent'
+    assert doctor.number('localizer', 'dropped: scan: gaps between the stamps') == 0.0, (
+        'each was sent'
+    )
 
 
 def test_a_full_disk_leaves_the_old_session_as_it_was(graph, tmp_path):
@@ -420,19 +454,30 @@ def test_a_full_disk_leaves_the_old_session_as_it_was(graph, tmp_path):
         return graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(stem)))
 
     parts = ('.topology.npz', '.features.npz')
-    graph.until(lambda: all(part in save().message for part in parts), 'a session with all its parts')
+    graph.until(
+        lambda: all(part in save().message for part in parts), 'a session with all its parts'
+    )
     before = {file.name: file.read_bytes() for file in stem.parent.iterdir()}
-    assert sorted(before) == ['room.features.npz', 'room.grid.npz', 'room.pgm', 'room.topology.npz', 'room.yaml']
+    assert sorted(before) == [
+        'room.features.npz',
+        'room.grid.npz',
+        'room.pgm',
+        'room.topology.npz',
+        'room.yaml',
+    ]
     robot.drive(0.5)
     for name in ('grid_mapper', 'topology_builder'):
         pid = graph.processes[name].pid
         for size in (0, 300):
             resource.prlimit(pid, resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
             response = save()
-            assert not response.success and 'room' in response.message, (name, size, response.message)
+            told = (name, size, response.message)
+            assert not response.success and 'room' in response.message, told
             if name == 'grid_mapper':
                 assert {file.name: file.read_bytes() for file in stem.parent.iterdir()} == before
-        resource.prlimit(pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+        resource.prlimit(
+            pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
+        )
     assert (stem.parent / 'room.topology.npz').read_bytes() == before['room.topology.npz']
     response = save()
     assert response.success, response.message
@@ -462,7 +507,10 @@ def test_an_exploration_finishes_though_every_node_is_killed_once(graph):
     ended = ask()
     for name in names:
         metres = status[-1].distance_m + 1.0 if status else 1.0
-        graph.until(lambda m=metres: status and status[-1].distance_m > m, f'a metre before {name} is killed')
+        graph.until(
+            lambda m=metres: status and status[-1].distance_m > m,
+            f'a metre before {name} is killed',
+        )
         assert not ended.done()
         kill(graph, name)
         time.sleep(1.0)
@@ -473,7 +521,8 @@ def test_an_exploration_finishes_though_every_node_is_killed_once(graph):
             ended = ask()
     graph.until(ended.done, 'the exploration ends', 600.0)
     result = ended.result().result.status
-    assert result.reason_code in (ExplorationStatus.ALL_RESOLVED, ExplorationStatus.NOTHING_REACHABLE), result.reason
+    good = (ExplorationStatus.ALL_RESOLVED, ExplorationStatus.NOTHING_REACHABLE)
+    assert result.reason_code in good, result.reason
     assert robot.error_m() < 0.3
     patch = messages.patch_from(maps[-1])
     assert patch.free.sum() * 0.01 > 80.0, 'nearly all of a room of 10 x 10 m'

@@ -23,7 +23,8 @@ pytestmark = pytest.mark.live
 START = (2.0, 2.0, 0.0)
 
 
-# Two rooms that are the same, so that a turn tells nothing, and the corridor at their doors, which goes on to one side.
+# Two rooms that are the same, so that a turn tells nothing, and the corridor at their doors, which
+# goes on to one side.
 TWINS = """
 name: twins
 resolution: 0.02
@@ -47,7 +48,9 @@ def map_of(world, folder):
     _, patch, _ = read_world(resources.world_path(str(world)))
     rows, cols = (size // 5 * 5 for size in patch.shape)
     cells = patch.cells[:rows, :cols].reshape(rows // 5, 5, cols // 5, 5).max(axis=(1, 3))
-    map_files.write_map(folder / 'map', GridPatch(GridFrame(patch.frame.origin_x, patch.frame.origin_y, 0.1), cells))
+    map_files.write_map(
+        folder / 'map', GridPatch(GridFrame(patch.frame.origin_x, patch.frame.origin_y, 0.1), cells)
+    )
     return folder / 'map.yaml'
 
 
@@ -87,7 +90,10 @@ def test_a_robot_that_drives_about_finds_itself_when_asked(graph, map_file):
     covariance = messages.covariance_from(pose)
     assert np.linalg.eigvalsh(covariance).min() > 0.0
     assert len(samples[-1].poses) == 5000
-    assert all(np.isfinite([p.position.x, p.position.y, p.orientation.z]).all() for p in samples[-1].poses[:100])
+    assert all(
+        np.isfinite([p.position.x, p.position.y, p.orientation.z]).all()
+        for p in samples[-1].poses[:100]
+    )
     graph.until(lambda: status[-1].state == LocalizationStatus.IDLE, 'rest, once the pose is said')
     said = [message for message in status if message.state == LocalizationStatus.LOCALIZED]
     assert len(said) == len(poses) == 1
@@ -110,7 +116,9 @@ def test_a_robot_that_may_drive_finds_itself_alone_and_stops(graph, tmp_path):
     poses = graph.heard('initialpose', PoseWithCovarianceStamped)
     truth = graph.heard('ground_truth', PoseStamped)
     commands = graph.heard('cmd_vel', Twist)
-    graph.start('global_localizer', map=str(map_file), automatic=True, active=True, use_sim_time=True)
+    graph.start(
+        'global_localizer', map=str(map_file), automatic=True, active=True, use_sim_time=True
+    )
     graph.start('sim', world=str(tmp_path / 'twins.yaml'), rate=4.0, lockstep='localization_status')
     graph.until(lambda: poses, 'a pose')
     ns = messages.stamp_ns(poses[-1].header.stamp)
@@ -135,8 +143,10 @@ def test_what_is_wrong_with_the_input_is_said_in_words_and_no_pose_comes_of_it(g
     say = {
         name: graph.node.create_publisher(kind, name, profile)
         for name, kind, profile in (
-            ('map', OccupancyGrid, qos.LATCHED), ('topology', TopologicalMap, qos.LATCHED),
-            ('odom', Odometry, qos.STREAM), ('scan', LaserScan, qos.SENSOR),
+            ('map', OccupancyGrid, qos.LATCHED),
+            ('topology', TopologicalMap, qos.LATCHED),
+            ('odom', Odometry, qos.STREAM),
+            ('scan', LaserScan, qos.SENSOR),
         )
     }
     graph.start('global_localizer', automatic=True, laser_pose='0.0,0.0,0.0')
@@ -149,7 +159,9 @@ def test_what_is_wrong_with_the_input_is_said_in_words_and_no_pose_comes_of_it(g
 
         def said():
             ns = 10**8 * next(seconds)
-            say['odom'].publish(messages.odometry_msg(np.array(T), (0.0, 0.0), ('odom', 'base_link'), ns))
+            say['odom'].publish(
+                messages.odometry_msg(np.array(T), (0.0, 0.0), ('odom', 'base_link'), ns)
+            )
             say['scan'].publish(scan_msg(ns, ranges))
             return any(words in message.reason for message in status[before:])
 
@@ -159,7 +171,8 @@ def test_what_is_wrong_with_the_input_is_said_in_words_and_no_pose_comes_of_it(g
     walls = GridPatch(good.frame, np.full(good.shape, 100, dtype=np.int8))
     open_field = GridPatch(good.frame, np.zeros(good.shape, dtype=np.int8))
     for patch, nodes, words in (
-        (good, TopologicalGraph(), 'topology without nodes'), (walls, topology, 'no free place'),
+        (good, TopologicalGraph(), 'topology without nodes'),
+        (walls, topology, 'no free place'),
         (open_field, topology, 'without an occupied one'),
     ):
         say['map'].publish(messages.grid_msg(patch, 'map', 0))
@@ -170,8 +183,16 @@ def test_what_is_wrong_with_the_input_is_said_in_words_and_no_pose_comes_of_it(g
     until_it_says('places explain', wall)
     until_it_says('has jumped', wall, (50.0, 0.0, 0.0))
     assert not poses
-    heard = [[p.position.x, p.position.y, p.orientation.z, p.orientation.w] for s in samples for p in s.poses[:50]]
-    heard += [[p.position.x, p.position.y, p.orientation.z, p.orientation.w] for s in status for p in s.hypotheses]
+    heard = [
+        [p.position.x, p.position.y, p.orientation.z, p.orientation.w]
+        for s in samples
+        for p in s.poses[:50]
+    ]
+    heard += [
+        [p.position.x, p.position.y, p.orientation.z, p.orientation.w]
+        for s in status
+        for p in s.hypotheses
+    ]
     assert np.isfinite(heard).all()
     assert graph.stop('global_localizer') == 0
 

@@ -47,11 +47,20 @@ def test_nodes_tell_rates_step_times_and_silence(graph):
     graph.start('thinmap', arguments=MAPPING, use_sim_time=True, **AT_START)
     graph.start('sim', start=START, hold_for_subscribers=2)
     nodes = ('localizer', 'grid_mapper', 'topology_builder', 'sim')
-    graph.until(lambda: all(doctor.level(node) == DiagnosticStatus.OK for node in nodes), 'all is well')
+    graph.until(
+        lambda: all(doctor.level(node) == DiagnosticStatus.OK for node in nodes), 'all is well'
+    )
     graph.until(lambda: 3.0 < doctor.number('localizer', 'scan: rate') < 8.0, 'scans at 5 Hz')
     graph.until(lambda: doctor.status('localizer').message == 'tracking', 'it tracks')
-    for node, step in (('localizer', 'localizer'), ('grid_mapper', 'map update'), ('topology_builder', 'graph update')):
-        graph.until(lambda n=node, s=step: 'median' in doctor.value(n, f'{s}: step time'), f'step times of {node}')
+    for node, step in (
+        ('localizer', 'localizer'),
+        ('grid_mapper', 'map update'),
+        ('topology_builder', 'graph update'),
+    ):
+        graph.until(
+            lambda n=node, s=step: 'median' in doctor.value(n, f'{s}: step time'),
+            f'step times of {node}',
+        )
     graph.until(lambda: doctor.number('topology_builder', 'pose: heard') > 0, 'poses are counted')
     graph.until(lambda: doctor.number('localizer', 'scan: heard') > 5, 'more than five scans')
     graph.stop('sim')
@@ -65,11 +74,18 @@ def test_nodes_tell_rates_step_times_and_silence(graph):
 def test_two_localizers_on_one_graph_are_detected_and_reported(graph):
     doctor = Doctor(graph)
     graph.start('localizer', laser_pose='0,0,0')
-    graph.until(lambda: doctor.level('localizer') == DiagnosticStatus.WARN, 'one localizer, which waits for scans')
+    graph.until(
+        lambda: doctor.level('localizer') == DiagnosticStatus.WARN,
+        'one localizer, which waits for scans',
+    )
     rival = graph.node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
-    graph.until(lambda: doctor.level('localizer') == DiagnosticStatus.ERROR, 'the second publisher of /pose')
+    graph.until(
+        lambda: doctor.level('localizer') == DiagnosticStatus.ERROR, 'the second publisher of /pose'
+    )
     message = doctor.status('localizer').message
-    assert '2 nodes publish /pose' in message and '/localizer' in message and '/test_client' in message
+    assert (
+        '2 nodes publish /pose' in message and '/localizer' in message and '/test_client' in message
+    )
     assert '2 nodes publish /pose' in graph.log('localizer')
     graph.node.destroy_publisher(rival)
     graph.until(lambda: doctor.level('localizer') == DiagnosticStatus.WARN, 'the complaint ends')
@@ -104,7 +120,8 @@ def test_what_is_over_is_not_told_first(ros_domain, monkeypatch):
 
 
 def test_a_localizer_walks_through_its_states(graph):
-    poses, scans = graph.heard('pose', PoseWithCovarianceStamped), graph.heard('scan', LaserScan, qos.SENSOR)
+    poses = graph.heard('pose', PoseWithCovarianceStamped)
+    scans = graph.heard('scan', LaserScan, qos.SENSOR)
     graph.start('localizer', use_sim_time=True, autostart=False, **AT_START)
     graph.start('sim', start=START, hold_for_subscribers=2, rate=2.0)
 
@@ -149,7 +166,9 @@ def test_a_node_that_becomes_active_has_what_was_latched(graph):
     for transition in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
         request = ChangeState.Request(transition=Transition(id=transition))
         assert graph.call(ChangeState, '/explorer/change_state', request).success
-    graph.until(lambda: doctor.number('explorer', 'local_map: refused') == 1.0, 'it is taken, and refused')
+    graph.until(
+        lambda: doctor.number('explorer', 'local_map: refused') == 1.0, 'it is taken, and refused'
+    )
     assert not graphs and poses
 
 
@@ -166,7 +185,10 @@ def test_pause_and_reset(graph):
 
     def some_scans():
         heard = doctor.number('localizer', 'scan: heard')
-        graph.until(lambda: doctor.number('localizer', 'scan: heard') > heard + 10, 'scans that are not taken')
+        graph.until(
+            lambda: doctor.number('localizer', 'scan: heard') > heard + 10,
+            'scans that are not taken',
+        )
 
     some_scans()  # poses of before may still be on their way
     poses.clear()
@@ -174,7 +196,10 @@ def test_pause_and_reset(graph):
     assert not poses
     for name in ('grid_mapper', 'topology_builder'):
         assert graph.call(Trigger, f'/{name}/reset', Trigger.Request()).success
-    graph.until(lambda: not graphs[-1].nodes and (len(maps[-1].data) == 0 or max(maps[-1].data) == -1), 'emptiness')
+    graph.until(
+        lambda: not graphs[-1].nodes and (len(maps[-1].data) == 0 or max(maps[-1].data) == -1),
+        'emptiness',
+    )
     assert graph.call(SetBool, '/localizer/pause', SetBool.Request(data=False)).success
     graph.until(lambda: poses, 'poses')
     graph.until(lambda: doctor.status('localizer').message == 'tracking', 'it tracks')

@@ -1,4 +1,4 @@
-"""docs/nodes.md says what every node listens to, says, offers and can be told, as the running node declares it.
+"""docs/nodes.md says what a node listens to, says, offers and can be told, as the node declares it.
 
 THINMAP_WRITE_CONFIG=1 writes the page anew.
 """
@@ -23,14 +23,16 @@ HEAD = """# Nodes
 Made from the nodes themselves; do not edit (see `test/nodes/test_node_reference.py`). Names without a leading slash are
 relative: a namespace goes before them. Every node but the monitor publishes `/diagnostics`; all follow `/clock` with
 `use_sim_time`. Nodes with the parameter `autostart` are lifecycle nodes (`~/change_state`, `~/get_state`, ...).
-"""
+"""  # noqa: E501
 
 
 @pytest.fixture
 def declared(ros_domain, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     BagWriter(tmp_path / 'some_bag', live=True).close()
-    arguments = [word for name in NODES for k, v in NEEDED.get(name, {}).items() for word in rule(name, k, v)]
+    arguments = [
+        word for name in NODES for k, v in NEEDED.get(name, {}).items() for word in rule(name, k, v)
+    ]
     rclpy.init(args=['--ros-args', *arguments])
     yield lambda name: node_class(name)()
     rclpy.shutdown()
@@ -53,21 +55,26 @@ def quality(profile):
 
 def relative(name, node):
     own = f'/{node}/'
-    name = f'~/{name[len(own):]}' if name.startswith(own) else name
+    name = f'~/{name[len(own) :]}' if name.startswith(own) else name
     return name if name in ('/tf', '/tf_static', '/clock') else name.removeprefix('/')
 
 
 def topics(entities, node):
     rows = {
         (relative(e.topic_name, node), kind_of(e.msg_type), quality(e.qos_profile))
-        for e in entities if not e.topic_name.endswith(COMMON)
+        for e in entities
+        if not e.topic_name.endswith(COMMON)
     }
     return [f'| `{topic}` | `{kind}` | {profile} |' for topic, kind, profile in sorted(rows)]
 
 
 def services(node, name):
     found = {(relative(s.srv_name, name), kind_of(s.srv_type)) for s in node.services}
-    return [f'`{topic}` (`{kind}`)' for topic, kind in sorted(found) if kind.startswith(('std_srvs', 'thinmap'))]
+    return [
+        f'`{topic}` (`{kind}`)'
+        for topic, kind in sorted(found)
+        if kind.startswith(('std_srvs', 'thinmap'))
+    ]
 
 
 def actions(node):
@@ -79,10 +86,16 @@ def parameters(node, name):
     for key in node._parameters:
         if key in OF_EVERY_NODE or key in OWN_WORDS or key.startswith('qos_overrides'):
             continue
-        value = default_of(name, key) if key in NEEDED.get(name, {}) else node.get_parameter(key).value
+        value = (
+            default_of(name, key) if key in NEEDED.get(name, {}) else node.get_parameter(key).value
+        )
         descriptor = node.describe_parameter(key)
         limits = [*descriptor.floating_point_range, *descriptor.integer_range]
-        span = f'{limits[0].from_value:g} to {limits[0].to_value:g}' if limits else descriptor.additional_constraints
+        span = (
+            f'{limits[0].from_value:g} to {limits[0].to_value:g}'
+            if limits
+            else descriptor.additional_constraints
+        )
         live = '' if descriptor.read_only else 'yes'
         shown = f'`{value}`' if value != '' else ''
         yield f'| `{key}` | {shown} | {span} | {live} | {descriptor.description} |'
@@ -98,7 +111,12 @@ def section(name, node):
         if found:
             lines += [f'{what}: {", ".join(found)}', '']
     if rows := list(parameters(node, name)):
-        lines += ['| parameter | default | allowed | at run time | what |', '|---|---|---|---|---|', *rows, '']
+        lines += [
+            '| parameter | default | allowed | at run time | what |',
+            '|---|---|---|---|---|',
+            *rows,
+            '',
+        ]
     return lines
 
 
@@ -106,7 +124,14 @@ def message_texts():
     lines = ['# Messages, services and actions', '']
     for part in ('msg', 'srv', 'action'):
         for path in sorted((ROOT / 'thinmap_msgs' / part).iterdir()):
-            lines += [f'## thinmap_msgs/{part}/{path.stem}', '', '```', path.read_text().strip(), '```', '']
+            lines += [
+                f'## thinmap_msgs/{part}/{path.stem}',
+                '',
+                '```',
+                path.read_text().strip(),
+                '```',
+                '',
+            ]
     return lines
 
 
@@ -120,5 +145,7 @@ def test_the_page_says_what_the_nodes_declare(declared):
     text = '\n'.join([*lines, *message_texts()])
     if 'THINMAP_WRITE_CONFIG' in os.environ:
         PAGE.write_text(text)
-    assert PAGE.read_text() == text, f'{PAGE.name}: see the top of {__file__} for how to write it anew'
+    assert PAGE.read_text() == text, (
+        f'{PAGE.name}: see the top of {__file__} for how to write it anew'
+    )
     assert files('thinmap_ros').joinpath('nodes', 'thinmap.py').is_file()

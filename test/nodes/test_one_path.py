@@ -1,6 +1,7 @@
-"""One path: a log through `replay`, the same as a bag, and that bag played into the live nodes, give the same.
+"""One path: a log through `replay`, as a bag, and that bag played into live nodes give the same.
 
-Equal means: poses to 1e-9 m and rad (a live pose travels as a quaternion), and maps equal cell by cell.
+Equal means: poses to 1e-9 m and rad (a live pose travels as a quaternion), and maps equal cell by
+cell.
 """
 
 import numpy as np
@@ -68,8 +69,14 @@ def assert_live_is_same(graph, bag, expected, tmp_path, **localizer):
     for name in ('localizer', 'grid_mapper', 'topology_builder'):
         graph.start(name, use_sim_time=True, **(localizer if name == 'localizer' else {}))
     graph.until(lambda: graph.node.count_subscribers('local_map') == 1, 'nodes')
-    player = graph.start('bag_player', bag=str(bag), rate=1000.0, lockstep='local_topology', wait_for_subscribers=2)
-    graph.until(lambda: player.poll() == 0 and len(poses) == len(expected.poses), 'a pose for each scan', 170.0)
+    player = graph.start(
+        'bag_player', bag=str(bag), rate=1000.0, lockstep='local_topology', wait_for_subscribers=2
+    )
+    graph.until(
+        lambda: player.poll() == 0 and len(poses) == len(expected.poses),
+        'a pose for each scan',
+        170.0,
+    )
     assert [messages.stamp_ns(pose.header.stamp) for pose in poses] == expected.stamps_ns
     live = np.array([messages.pose_from(pose.pose.pose) for pose in poses])
     assert np.abs(live - expected.poses).max() <= 1e-9

@@ -1,4 +1,7 @@
-"""All nodes in one process, and two robots on one graph: each does what it does in a process of its own."""
+"""All nodes in one process, and two robots on one graph.
+
+Each does what it does in a process of its own.
+"""
 
 import signal
 import subprocess
@@ -30,21 +33,34 @@ def free_at(map_message, x, y):
 def test_one_process_locates_maps_and_drives(graph):
     maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
     graphs = graph.heard('topology', TopologicalMap, qos.LATCHED)
-    truth, health = graph.heard('ground_truth', PoseStamped), graph.heard('/diagnostics', DiagnosticArray)
+    truth = graph.heard('ground_truth', PoseStamped)
+    health = graph.heard('/diagnostics', DiagnosticArray)
     start = {'start_x_m': 2.0, 'start_y_m': 2.0, 'use_sim_time': True}
     process = graph.start('thinmap', **start)
-    graph.start('sim', start='2.0,2.0,0.0', rate=8.0, lockstep='local_topology', hold_for_subscribers=3)
-    graph.until(lambda: maps and free_at(maps[-1], 3.0, 2.0) and graphs and graphs[-1].nodes, 'a map and a graph')
+    graph.start(
+        'sim', start='2.0,2.0,0.0', rate=8.0, lockstep='local_topology', hold_for_subscribers=3
+    )
+    graph.until(
+        lambda: maps and free_at(maps[-1], 3.0, 2.0) and graphs and graphs[-1].nodes,
+        'a map and a graph',
+    )
     goal = NavigateToPose.Goal()
     goal.pose.header.frame_id = 'map'
-    goal.pose.pose.position.x, goal.pose.pose.position.y, goal.pose.pose.orientation.w = 3.0, 2.0, 1.0
+    goal.pose.pose.position.x = 3.0
+    goal.pose.pose.position.y = 2.0
+    goal.pose.pose.orientation.w = 1.0
     ended = graph.act(NavigateToPose, 'navigate_to_pose', goal)
     assert ended.status == GoalStatus.STATUS_SUCCEEDED, ended.result
     graph.until(lambda: truth, 'where it is')
     assert np.hypot(truth[-1].pose.position.x - 3.0, truth[-1].pose.position.y - 2.0) < 0.3
 
     def well():
-        return {s.name.split(':')[0] for array in health for s in array.status if s.level == DiagnosticStatus.OK}
+        return {
+            s.name.split(':')[0]
+            for array in health
+            for s in array.status
+            if s.level == DiagnosticStatus.OK
+        }
 
     graph.until(lambda: well() >= set(FIVE), 'each says that it is well')
     # The kernels' compiler and the libraries are there once, not five times.
@@ -59,8 +75,17 @@ def start_robot(graph, name, start, seed):
     """A robot all by itself in a namespace, simulation included."""
     x, y, _ = start.split(',')
     graph.start(
-        'thinmap', label=name, remap=(f'__ns:=/{name}', *ROBOT), start=start, seed=seed, use_sim_time=True,
-        start_x_m=float(x), start_y_m=float(y), start_yaw_rad=0.0, hold_for_subscribers=2, rate=2.0,
+        'thinmap',
+        label=name,
+        remap=(f'__ns:=/{name}', *ROBOT),
+        start=start,
+        seed=seed,
+        use_sim_time=True,
+        start_x_m=float(x),
+        start_y_m=float(y),
+        start_yaw_rad=0.0,
+        hold_for_subscribers=2,
+        rate=2.0,
         arguments=('sim', 'localizer', 'grid_mapper', 'topology_builder'),
     )
 
@@ -87,7 +112,10 @@ def test_two_robots_in_namespaces_keep_to_themselves(graph):
     assert np.hypot(last['robot1'][0] - 2.0, last['robot1'][1] - 2.0) < 1.0
     assert all(frames.values()) and not nobody
     names = {'robot1/localizer: thinmap', 'robot2/localizer: thinmap'}
-    graph.until(lambda: names <= {s.name for array in health for s in array.status}, 'both tell how they are')
+    graph.until(
+        lambda: names <= {s.name for array in health for s in array.status},
+        'both tell how they are',
+    )
     assert not [s.message for array in health for s in array.status if 'nodes publish' in s.message]
     for name in starts:
         assert graph.stop(name) == 0, graph.log(name)

@@ -19,7 +19,9 @@ def change(graph, node, **values):
 
 
 def current(graph, node, *names):
-    answer = graph.call(GetParameters, f'/{node}/get_parameters', GetParameters.Request(names=names))
+    answer = graph.call(
+        GetParameters, f'/{node}/get_parameters', GetParameters.Request(names=names)
+    )
     return [found.double_value for found in answer.values]
 
 
@@ -27,21 +29,30 @@ def test_the_navigator_changes_its_speed_and_refuses_what_makes_no_sense(graph):
     graph.start('navigator')
     assert change(graph, 'navigator', max_speed_m_s=0.5, max_turn_rad_s=0.7).successful
     assert current(graph, 'navigator', 'max_speed_m_s', 'max_turn_rad_s') == [0.5, 0.7]
-    graph.until(lambda: 'changed: max_speed_m_s = 0.5, max_turn_rad_s = 0.7' in graph.log('navigator'), 'it is said')
+    graph.until(
+        lambda: 'changed: max_speed_m_s = 0.5, max_turn_rad_s = 0.7' in graph.log('navigator'),
+        'it is said',
+    )
     # All or none, with a reason; NaN is within no range.
     for wrong in (-1.0, 1e9, float('nan'), float('inf')):
         result = change(graph, 'navigator', max_turn_rad_s=0.9, max_speed_m_s=wrong)
         assert not result.successful and 'max_speed_m_s' in result.reason, result
     assert current(graph, 'navigator', 'max_speed_m_s', 'max_turn_rad_s') == [0.5, 0.7]
-    request = SetParametersAtomically.Request(parameters=[Parameter(name='map_frame', value=value(1.0))])
-    assert not graph.call(SetParametersAtomically, '/navigator/set_parameters_atomically', request).result.successful
+    request = SetParametersAtomically.Request(
+        parameters=[Parameter(name='map_frame', value=value(1.0))]
+    )
+    assert not graph.call(
+        SetParametersAtomically, '/navigator/set_parameters_atomically', request
+    ).result.successful
     assert graph.stop('navigator') == 0
 
 
 def test_what_cannot_change_is_marked_and_refused(graph):
     graph.start('grid_mapper')
     request = DescribeParameters.Request(names=['resolution_m'])
-    (descriptor,) = graph.call(DescribeParameters, '/grid_mapper/describe_parameters', request).descriptors
+    (descriptor,) = graph.call(
+        DescribeParameters, '/grid_mapper/describe_parameters', request
+    ).descriptors
     assert descriptor.read_only and 'edge of a cell' in descriptor.description
     assert descriptor.floating_point_range[0].to_value == 1.0
     result = change(graph, 'grid_mapper', resolution_m=0.2)

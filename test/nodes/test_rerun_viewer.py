@@ -16,7 +16,10 @@ def test_without_anything_to_show_it_says_so_and_ends_on_a_signal(graph):
     assert graph.stop('rerun_viewer') == 0
 
 
-@pytest.mark.skipif(not rerun_streams.is_installed(), reason='needs rerun, which is not installed (the extra "viewer")')
+@pytest.mark.skipif(
+    not rerun_streams.is_installed(),
+    reason='needs rerun, which is not installed (the extra "viewer")',
+)
 def test_recording_can_be_read_after_a_signal(graph, tmp_path):
     from rerun.chunk import RrdReader
 
@@ -28,17 +31,29 @@ def test_recording_can_be_read_after_a_signal(graph, tmp_path):
         truth.publish(messages.pose_stamped_msg([0.2 * i, 0.0, 0.0], 'map', i * messages.SECOND_NS))
     broken = messages.pose_stamped_msg([float('nan'), 0.0, 0.0], 'map', 5 * messages.SECOND_NS)
     truth.publish(broken)
-    graph.until(lambda: 'ground_truth: pose' in graph.log('rerun_viewer'), 'the refusal of a pose that is none')
+    graph.until(
+        lambda: 'ground_truth: pose' in graph.log('rerun_viewer'),
+        'the refusal of a pose that is none',
+    )
     assert graph.stop('rerun_viewer') == 0
     assert 'Traceback' not in graph.log('rerun_viewer')
-    rows = sum(chunk.num_rows for chunk in RrdReader(path).stream() if chunk.entity_path == '/map/truth')
+    rows = sum(
+        chunk.num_rows for chunk in RrdReader(path).stream() if chunk.entity_path == '/map/truth'
+    )
     assert rows == 4
 
 
-@pytest.mark.skipif(rerun_streams.is_installed(), reason='says what happens where rerun is not installed; it is')
+@pytest.mark.skipif(
+    rerun_streams.is_installed(), reason='says what happens where rerun is not installed; it is'
+)
 @pytest.mark.parametrize('parameters', [{}, {'recording': 'live.rrd', 'spawn': False}])
 def test_without_rerun_the_start_ends_with_one_clear_line(graph, parameters):
     process = graph.start('rerun_viewer', **parameters)
     assert process.wait(timeout=60.0) == 2
-    assert graph.log('rerun_viewer').strip().splitlines()[-1].startswith('error: rerun is not installed')
+    assert (
+        graph.log('rerun_viewer')
+        .strip()
+        .splitlines()[-1]
+        .startswith('error: rerun is not installed')
+    )
     assert not Path('live.rrd').exists()

@@ -1,4 +1,7 @@
-"""Sessions on a live graph: what was saved is there again after a new start, and mapping goes on from it."""
+"""Sessions on a live graph.
+
+What was saved is there again after a new start, and mapping goes on from it.
+"""
 
 import numpy as np
 import pytest
@@ -34,17 +37,25 @@ def heard_maps(graph):
 
 
 def drive(graph, x, y, yaw, metres):
-    """Nodes of a robot that stands at a place, driven until it has made its way; then the robot alone is stopped."""
+    """Nodes of a robot that stands at a place, driven until it has made its way.
+
+    Then the robot alone is stopped.
+    """
     truth = graph.heard('ground_truth', PoseStamped)
     graph.start('localizer', use_sim_time=True, start_x_m=x, start_y_m=y, start_yaw_rad=yaw)
-    graph.start('sim', start=f'{x},{y},{yaw}', rate=4.0, lockstep='local_topology', hold_for_subscribers=2)
+    graph.start(
+        'sim', start=f'{x},{y},{yaw}', rate=4.0, lockstep='local_topology', hold_for_subscribers=2
+    )
     commands = graph.node.create_publisher(Twist, 'cmd_vel', 10)
     forward = Twist()
     forward.linear.x = 0.3
 
     def far_enough():
         commands.publish(forward)
-        return truth and np.hypot(truth[-1].pose.position.x - x, truth[-1].pose.position.y - y) > metres
+        return (
+            truth
+            and np.hypot(truth[-1].pose.position.x - x, truth[-1].pose.position.y - y) > metres
+        )
 
     graph.until(far_enough, 'the robot makes its way')
     T = messages.pose_from(truth[-1].pose)
@@ -83,10 +94,15 @@ def test_ids_and_cells_are_the_same_tomorrow_and_mapping_goes_on(graph, tmp_path
     assert places(graphs[-1]) == before and {edge.id for edge in graphs[-1].edges} == edges
     assert np.array_equal(messages.patch_from(maps[-1]).cells, known.cells)
     drive(graph, *T.tolist(), 0.3)
-    # Mapping has gone on from there: more is known, what stayed has its number, and no number is given twice.
+    # Mapping has gone on from there: more is known, what stayed has its number, and no number is
+    # given twice.
     assert (messages.patch_from(maps[-1]).cells >= 0).sum() >= (known.cells >= 0).sum()
     after = places(graphs[-1])
-    stayed = [k for k in before.keys() & after.keys() if np.hypot(*np.subtract(before[k], after[k])[1:]) < 0.5]
+    stayed = [
+        k
+        for k in before.keys() & after.keys()
+        if np.hypot(*np.subtract(before[k], after[k])[1:]) < 0.5
+    ]
     assert len(stayed) >= len(before) / 2
     assert all(k > max(before.keys() | edges) for k in after.keys() - before.keys())
 
@@ -137,7 +153,9 @@ def test_sessions_are_loaded_into_running_nodes_or_refused_in_words(graph, tmp_p
     save(tmp_path / 'room', grid, builder)
     maps, graphs, _ = heard_maps(graph)
     graph.start('grid_mapper')
-    response = graph.call(LoadMap, 'load_map', LoadMap.Request(path=str(tmp_path / 'room.grid.npz')))
+    response = graph.call(
+        LoadMap, 'load_map', LoadMap.Request(path=str(tmp_path / 'room.grid.npz'))
+    )
     assert response.success and 'no topology_builder' in response.message
     response = graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(tmp_path / 'alone')))
     assert response.success and 'no topology_builder' in response.message
@@ -145,7 +163,9 @@ def test_sessions_are_loaded_into_running_nodes_or_refused_in_words(graph, tmp_p
     # The graph of an earlier grid must not be loaded with the new one.
     response = graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(tmp_path / 'room')))
     assert response.success and 'room.topology.npz.old' in response.message
-    assert (tmp_path / 'room.topology.npz.old').exists() and not (tmp_path / 'room.topology.npz').exists()
+    assert (tmp_path / 'room.topology.npz.old').exists() and not (
+        tmp_path / 'room.topology.npz'
+    ).exists()
     save(tmp_path / 'room', grid, builder)
     graph.start('topology_builder')
 
@@ -153,7 +173,9 @@ def test_sessions_are_loaded_into_running_nodes_or_refused_in_words(graph, tmp_p
         path = str(tmp_path / name) if name else ''
         return graph.call(LoadMap, 'load_map', LoadMap.Request(path=path))
 
-    graph.until(lambda: 'no topology_builder' not in load('room').message, 'the mapper sees the builder')
+    graph.until(
+        lambda: 'no topology_builder' not in load('room').message, 'the mapper sees the builder'
+    )
     graph.until(lambda: maps and graphs and graphs[-1].nodes, 'map and graph, published at once')
     expected = places(messages.topology_msg(builder.map, 'map', 0))
     assert places(graphs[-1]) == expected
@@ -198,15 +220,26 @@ def test_services_touch_nothing_outside_of_their_folder(graph, tmp_path):
         graph.start(name, save_folder='maps', **({} if name == 'explorer' else {'recover_s': 0.0}))
     before = files_below(tmp_path)
     wrong = [
-        str(outside / 'room'), '../outside/room', 'link/room', 'linked', 'linked.grid.npz',
-        'circle/room', '/etc/passwd', '/proc/self/fd/1', 10_000 * 'x', 'a/../../outside/room', 'a\nb',
-    ]  # fmt: skip
+        str(outside / 'room'),
+        '../outside/room',
+        'link/room',
+        'linked',
+        'linked.grid.npz',
+        'circle/room',
+        '/etc/passwd',
+        '/proc/self/fd/1',
+        10_000 * 'x',
+        'a/../../outside/room',
+        'a\nb',
+    ]
     calls = [
-        (kind, name) for kind, names in (
+        (kind, name)
+        for kind, names in (
             (SaveMap, ('save_map', 'save_topology', 'save_features', 'save_exploration')),
             (LoadMap, ('load_map', 'load_topology', 'load_features')),
-        ) for name in names
-    ]  # fmt: skip
+        )
+        for name in names
+    ]
     for kind, name in calls:
         for path in wrong:
             response = graph.call(kind, name, kind.Request(path=path))
@@ -248,7 +281,9 @@ def test_a_session_of_nonsense_leaves_the_running_map_as_it_was(graph, tmp_path)
 
     def refused():
         response = graph.call(LoadMap, 'load_map', LoadMap.Request(path='bad'))
-        return not response.success and 'bad.topology.npz: saved topology: cells' in response.message
+        return (
+            not response.success and 'bad.topology.npz: saved topology: cells' in response.message
+        )
 
     graph.until(refused, 'the reason')
     again = graph.heard('topology', TopologicalMap, qos.LATCHED)
@@ -262,13 +297,17 @@ def test_a_builder_that_does_not_answer_is_said_and_the_mapper_goes_on(graph, tm
     async def never(request, response):
         await Future()
 
-    asked = graph.node.create_service(SaveMap, 'save_topology', never, callback_group=ReentrantCallbackGroup())
+    asked = graph.node.create_service(
+        SaveMap, 'save_topology', never, callback_group=ReentrantCallbackGroup()
+    )
     graph.start('grid_mapper')
     # Asked before the two have found each other, the mapper sees no builder.
     answers = []
 
     def save_again():
-        answers.append(graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(tmp_path / 'room'))))
+        answers.append(
+            graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(tmp_path / 'room')))
+        )
         return not answers[-1].success
 
     graph.until(save_again, 'the mapper asks')

@@ -1,6 +1,9 @@
-"""Nodes that get too little of the processor: what they cannot take is dropped and counted, and nothing queues up.
+"""Nodes that get too little of the processor.
 
-A slow machine is made of any other by halting a process again and again; how fast this one is makes no difference.
+What they cannot take is dropped and counted, and nothing queues up.
+
+A slow machine is made of any other by halting a process again and again; how fast this one is makes
+no difference.
 """
 
 import signal
@@ -18,8 +21,9 @@ pytestmark = pytest.mark.live
 MAPPING = ('localizer', 'grid_mapper', 'topology_builder')
 RATE, SCANS_A_S = 8.0, 40.0
 HALTED_S, AT_WORK_S = 0.45, 0.05
-# What may lie between the newest scan and the one that a pose is of: the queue of the subscription, the scans that wait
-# for their odometry, and what came while the process was halted with a pose in hand.
+# What may lie between the newest scan and the one that a pose is of: the queue of the subscription,
+# the scans that wait for their odometry, and what came while the process was halted with a pose in
+# hand.
 QUEUE, WAITING = qos.SENSOR.depth, 20
 DROPS = ('scan: lost on the way or in a full queue', 'scans without odometry at their time')
 

@@ -1,4 +1,7 @@
-"""Whatever messages say: conversions give sound values or refuse in one line, and no node dies or publishes NaN."""
+"""Whatever messages say.
+
+Conversions give sound values or refuse in one line, and no node dies or publishes NaN.
+"""
 
 import math
 import time
@@ -16,7 +19,13 @@ from test_health import Doctor
 from tf2_msgs.msg import TFMessage
 
 from thinmap_msgs.action import Explore, NavigateToPose
-from thinmap_msgs.msg import EndNodeArray, ExplorationStatus, LineFeatureArray, SlamStatus, TopologicalMap
+from thinmap_msgs.msg import (
+    EndNodeArray,
+    ExplorationStatus,
+    LineFeatureArray,
+    SlamStatus,
+    TopologicalMap,
+)
 from thinmap_ros.adapters import messages, qos
 from thinmap_ros.core.errors import InputError
 
@@ -42,7 +51,11 @@ def check_pose(message):
 
 def check_grid(message):
     patch = messages.patch_from(message)
-    assert patch.cells.size == len(message.data) and patch.cells.min() >= -1 and patch.cells.max() <= 100
+    assert (
+        patch.cells.size == len(message.data)
+        and patch.cells.min() >= -1
+        and patch.cells.max() <= 100
+    )
     assert np.isfinite(patch.frame.as_array()).all() and patch.frame.resolution > 0.0
 
 
@@ -50,12 +63,17 @@ def check_topology(message):
     found = messages.topology_from(message)
     assert len(found.nodes) == len(message.nodes) and len(found.edges) == len(message.edges)
     assert all(math.isfinite(node.x + node.y + node.clearance_m) for node in found.nodes.values())
-    assert all(np.isfinite(edge.path).all() and edge.a in found.nodes for edge in found.edges.values())
+    assert all(
+        np.isfinite(edge.path).all() and edge.a in found.nodes for edge in found.edges.values()
+    )
 
 
 CHECKS = {
-    LaserScan: check_scan, Odometry: check_odometry, PoseWithCovarianceStamped: check_pose,
-    OccupancyGrid: check_grid, TopologicalMap: check_topology,
+    LaserScan: check_scan,
+    Odometry: check_odometry,
+    PoseWithCovarianceStamped: check_pose,
+    OccupancyGrid: check_grid,
+    TopologicalMap: check_topology,
 }
 
 
@@ -76,30 +94,55 @@ def test_conversions_give_sound_values_or_refuse_in_one_line(kind):
 
 
 SPOKEN = {
-    'pose': PoseWithCovarianceStamped, '/tf': TFMessage, 'line_features': LineFeatureArray, 'slam_status': SlamStatus,
-    'map': OccupancyGrid, 'local_map': OccupancyGrid, 'topology': TopologicalMap, 'local_topology': TopologicalMap,
-    'end_nodes': EndNodeArray, 'exploration_status': ExplorationStatus, 'cmd_vel': Twist, 'plan': Path,
+    'pose': PoseWithCovarianceStamped,
+    '/tf': TFMessage,
+    'line_features': LineFeatureArray,
+    'slam_status': SlamStatus,
+    'map': OccupancyGrid,
+    'local_map': OccupancyGrid,
+    'topology': TopologicalMap,
+    'local_topology': TopologicalMap,
+    'end_nodes': EndNodeArray,
+    'exploration_status': ExplorationStatus,
+    'cmd_vel': Twist,
+    'plan': Path,
 }
 LISTENERS = {
     'localizer': {
-        'odom': Odometry, 'scan': LaserScan, 'topology': TopologicalMap, 'initialpose': PoseWithCovarianceStamped,
+        'odom': Odometry,
+        'scan': LaserScan,
+        'topology': TopologicalMap,
+        'initialpose': PoseWithCovarianceStamped,
     },
     'grid_mapper': {'scan': LaserScan, 'pose': PoseWithCovarianceStamped},
     'topology_builder': {'local_map': OccupancyGrid, 'pose': PoseWithCovarianceStamped},
     'explorer': {
-        'local_map': OccupancyGrid, 'map': OccupancyGrid, 'topology': TopologicalMap, 'scan': LaserScan,
+        'local_map': OccupancyGrid,
+        'map': OccupancyGrid,
+        'topology': TopologicalMap,
+        'scan': LaserScan,
         'pose': PoseWithCovarianceStamped,
     },
     'navigator': {
-        'local_map': OccupancyGrid, 'map': OccupancyGrid, 'odom': Odometry, 'scan': LaserScan,
+        'local_map': OccupancyGrid,
+        'map': OccupancyGrid,
+        'odom': Odometry,
+        'scan': LaserScan,
         'pose': PoseWithCovarianceStamped,
     },
 }
 LATER = {  # looked into only when the message of another topic has come that belongs to it
-    'localizer': (), 'grid_mapper': ('scan',), 'topology_builder': (), 'explorer': ('scan',), 'navigator': ('pose',),
+    'localizer': (),
+    'grid_mapper': ('scan',),
+    'topology_builder': (),
+    'explorer': ('scan',),
+    'navigator': ('pose',),
 }
 ANSWERS = {  # what each node says when it hears good messages
-    'localizer': 'pose', 'grid_mapper': 'local_map', 'topology_builder': 'local_topology', 'explorer': 'end_nodes',
+    'localizer': 'pose',
+    'grid_mapper': 'local_map',
+    'topology_builder': 'local_topology',
+    'explorer': 'end_nodes',
     'navigator': 'cmd_vel',
 }
 
@@ -108,7 +151,9 @@ def set_to_work(graph, name):
     """Give the nodes that work on goals a goal that they do not reach."""
     if name not in ('explorer', 'navigator'):
         return
-    kind, action = (Explore, 'explore') if name == 'explorer' else (NavigateToPose, 'navigate_to_pose')
+    kind, action = (
+        (Explore, 'explore') if name == 'explorer' else (NavigateToPose, 'navigate_to_pose')
+    )
     client = ActionClient(graph.node, kind, action)
     graph.until(client.server_is_ready, action)
     goal = kind.Goal()
@@ -119,7 +164,10 @@ def set_to_work(graph, name):
 
 
 def say(graph, publishers, count):
-    """Publish so many strange messages on each topic, stamp by stamp; returns how many of each must be refused."""
+    """Publish so many strange messages on each topic, stamp by stamp.
+
+    Returns how many of each must be refused.
+    """
     columns = {topic: made(kind, count) for topic, (kind, _) in publishers.items()}
     for row in range(count):
         for topic, (_, publisher) in publishers.items():
@@ -130,21 +178,31 @@ def say(graph, publishers, count):
 
 
 @pytest.mark.parametrize('name', LISTENERS)
-@pytest.mark.parametrize('count', [100, pytest.param(10_000, marks=[pytest.mark.slow, pytest.mark.timeout(1800)])])
+@pytest.mark.parametrize(
+    'count', [100, pytest.param(10_000, marks=[pytest.mark.slow, pytest.mark.timeout(1800)])]
+)
 def test_a_node_lives_through_them_publishes_no_nan_and_counts_what_it_refused(graph, name, count):
-    heard = {topic: graph.heard(topic, kind) for topic, kind in SPOKEN.items() if topic not in LISTENERS[name]}
+    heard = {
+        topic: graph.heard(topic, kind)
+        for topic, kind in SPOKEN.items()
+        if topic not in LISTENERS[name]
+    }
     doctor = Doctor(graph)
     graph.start(name, laser_pose='0,0,0') if name != 'topology_builder' else graph.start(name)
     publishers = {}
     for topic, kind in LISTENERS[name].items():
         profile = qos.LATCHED if kind in (OccupancyGrid, TopologicalMap) else qos.STREAM
         publishers[topic] = (kind, graph.node.create_publisher(kind, topic, profile))
-    graph.until(lambda: all(p.get_subscription_count() for _, p in publishers.values()), 'subscriptions')
+    graph.until(
+        lambda: all(p.get_subscription_count() for _, p in publishers.values()), 'subscriptions'
+    )
     set_to_work(graph, name)
     expected = say(graph, publishers, count)
     graph.until(lambda: counted(doctor, name, expected) == [], f'counts {expected}', 20.0)
     assert all(doctor.number(name, f'{topic}: heard') >= 0.7 * count for topic in expected)
-    assert doctor.value(name, 'scan: refused') == '' or any('refused: ' in p.key for p in doctor.status(name).values)
+    assert doctor.value(name, 'scan: refused') == '' or any(
+        'refused: ' in p.key for p in doctor.status(name).values
+    )
     for topic, said in heard.items():
         assert all(math.isfinite(number) for message in said for number in numbers(message)), topic
     # It still works; fresh stamps, as all that was said before may lie ahead of these.
@@ -172,7 +230,10 @@ def test_goals_that_are_no_goals_end_with_a_reason(graph):
         goal = Explore.Goal()
         goal.area.points = [Point32(x=wrong), Point32(x=1.0), Point32(y=1.0)]
         ended = graph.act(Explore, 'explore', goal)
-        assert ended.status == GoalStatus.STATUS_ABORTED and 'corner of the area' in ended.result.status.reason
+        assert (
+            ended.status == GoalStatus.STATUS_ABORTED
+            and 'corner of the area' in ended.result.status.reason
+        )
         ended = graph.act(Explore, 'explore', Explore.Goal(time_limit_s=wrong))
         assert ended.status == GoalStatus.STATUS_ABORTED and 'limit' in ended.result.status.reason
         goal = NavigateToPose.Goal()
@@ -184,8 +245,15 @@ def test_goals_that_are_no_goals_end_with_a_reason(graph):
 
 
 def counted(doctor, name, expected):
-    """Topics of which not enough refusals are counted; some messages are lost where they come this fast."""
-    return [t for t, n in expected.items() if doctor.number(name, f'{t}: refused') < 0.7 * n and t not in LATER[name]]
+    """Topics of which not enough refusals are counted.
+
+    Some messages are lost where they come this fast.
+    """
+    return [
+        t
+        for t, n in expected.items()
+        if doctor.number(name, f'{t}: refused') < 0.7 * n and t not in LATER[name]
+    ]
 
 
 def good(kind, ns):
@@ -197,9 +265,17 @@ def good(kind, ns):
 
 def is_plain(message):
     if isinstance(message, LaserScan):
-        return message.header.frame_id == 'laser' and list(message.ranges) == 61 * [2.0] and message.range_max == 8.0
+        return (
+            message.header.frame_id == 'laser'
+            and list(message.ranges) == 61 * [2.0]
+            and message.range_max == 8.0
+        )
     if isinstance(message, OccupancyGrid):
-        return message.info.width == 40 and abs(message.info.origin.position.x + 2.0) < 1e-9 and message.data[41] == 0
+        return (
+            message.info.width == 40
+            and abs(message.info.origin.position.x + 2.0) < 1e-9
+            and message.data[41] == 0
+        )
     if isinstance(message, TopologicalMap):
         return True
     return message.pose.pose.position.x == 0.0 and message.pose.pose.position.y == 0.0

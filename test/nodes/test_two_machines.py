@@ -1,6 +1,9 @@
-"""Two machines: two network namespaces with a virtual Ethernet between them; nothing else connects their nodes.
+"""Two machines: two network namespaces with a virtual Ethernet between them.
 
-Needs a kernel on which an ordinary user may make namespaces (`unshare -rn`) and virtual Ethernets; skipped where not.
+Nothing else connects their nodes.
+
+Needs a kernel on which an ordinary user may make namespaces (`unshare -rn`) and virtual Ethernets;
+skipped where not.
 """
 
 import json
@@ -40,12 +43,16 @@ class Machines:
             self.run(0, 'ip', 'link', 'add', CABLE[0], 'type', 'veth', 'peer', 'name', CABLE[1])
             self.run(0, 'ip', 'link', 'set', CABLE[1], 'netns', str(self._pid(1)))
         for machine in (0, 1):
-            self.run(machine, 'ip', 'addr', 'add', f'{ADDRESSES[machine]}/24', 'dev', CABLE[machine])
+            self.run(
+                machine, 'ip', 'addr', 'add', f'{ADDRESSES[machine]}/24', 'dev', CABLE[machine]
+            )
             self.run(machine, 'ip', 'link', 'set', 'lo', 'up')
             self.plug(machine)
 
     def _hold(self, prefix: list[str]) -> subprocess.Popen[bytes]:
-        holder = subprocess.Popen([*prefix, 'sh', '-c', 'echo $$; exec sleep 3600'], stdout=subprocess.PIPE)
+        holder = subprocess.Popen(
+            [*prefix, 'sh', '-c', 'echo $$; exec sleep 3600'], stdout=subprocess.PIPE
+        )
         assert holder.stdout is not None
         if not holder.stdout.readline():
             pytest.skip('this machine lets nobody make network namespaces (unshare -rn)')
@@ -53,10 +60,21 @@ class Machines:
 
     def _lay_weak_link(self) -> None:
         if not os.access('/dev/net/tun', os.R_OK | os.W_OK):
-            pytest.skip('no frames can be lost or held up here: there is no /dev/net/tun that may be opened')
+            pytest.skip(
+                'no frames can be lost or held up here: there is no /dev/net/tun that may be opened'
+            )
         program = Path(__file__).with_name('weak_link.py')
-        command = [*self._inside(0), sys.executable, str(program), str(self._pid(1)), *CABLE, *map(str, WEAK)]
-        self.link = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        command = [
+            *self._inside(0),
+            sys.executable,
+            str(program),
+            str(self._pid(1)),
+            *CABLE,
+            *map(str, WEAK),
+        ]
+        self.link = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
         assert self.link.stdout is not None and self.link.stderr is not None
         if not self.link.stdout.readline():
             pytest.skip(f'no TAP devices here: {self.link.stderr.read().strip().splitlines()[-1]}')
@@ -95,23 +113,38 @@ class Machines:
         return int(link['stats64']['rx']['bytes'])
 
     def start(self, machine: int, name: str, **parameters: object) -> subprocess.Popen[bytes]:
-        command = [*self._inside(machine), sys.executable, '-m', f'thinmap_ros.nodes.{name}', '--ros-args']
+        command = [
+            *self._inside(machine),
+            sys.executable,
+            '-m',
+            f'thinmap_ros.nodes.{name}',
+            '--ros-args',
+        ]
         for key, value in parameters.items():
             text = f"'{value}'" if isinstance(value, str) else str(value).lower()
             command += ['-p', f'{key}:={text}']
         # Shared memory would lead past the cable: both namespaces are of one machine, after all.
         environment = {
-            **os.environ, 'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4', 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET',
+            **os.environ,
+            'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4',
+            'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET',
         }
         with (self.folder / f'{name}.log').open('wb') as log:
             process = subprocess.Popen(
-                command, stdout=log, stderr=subprocess.STDOUT, env=environment, start_new_session=True
+                command,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=environment,
+                start_new_session=True,
             )
         self.processes[name] = process
         return process
 
     def logs(self) -> str:
-        return '\n'.join(f'{name}: {(self.folder / f"{name}.log").read_text()[-1500:]}' for name in self.processes)
+        return '\n'.join(
+            f'{name}: {(self.folder / f"{name}.log").read_text()[-1500:]}'
+            for name in self.processes
+        )
 
     def close(self) -> None:
         links = [] if self.link is None else [self.link]
@@ -146,14 +179,18 @@ def wait(machines, condition, what, seconds=PATIENCE_S):
 
 def start_mapping(machines, machine):
     for name in ('localizer', 'grid_mapper', 'topology_builder'):
-        machines.start(machine, name, use_sim_time=True, **(AT_START if name == 'localizer' else {}))
+        machines.start(
+            machine, name, use_sim_time=True, **(AT_START if name == 'localizer' else {})
+        )
 
 
 def test_a_robot_here_and_its_map_there_outlive_a_cable_that_is_pulled(machines, tmp_path):
     bag = tmp_path / 'bag'
     machines.start(0, 'recorder', bag=str(bag), use_sim_time=True)
     start_mapping(machines, 1)
-    machines.start(0, 'sim', start=START, rate=4.0, lockstep='local_topology', hold_for_subscribers=3)
+    machines.start(
+        0, 'sim', start=START, rate=4.0, lockstep='local_topology', hold_for_subscribers=3
+    )
     wait(machines, lambda: recorded(bag, '/local_topology') > 10, 'the graph comes over')
     machines.unplugged(3.0)
     before = recorded(bag, '/local_topology')
@@ -165,12 +202,16 @@ def test_a_robot_here_and_its_map_there_outlive_a_cable_that_is_pulled(machines,
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_an_exploration_over_the_cable_finishes_though_it_is_pulled_for_five_seconds(machines, tmp_path):
+def test_an_exploration_over_the_cable_finishes_though_it_is_pulled_for_five_seconds(
+    machines, tmp_path
+):
     result = tmp_path / 'result.json'
     start_mapping(machines, 1)
     for name in ('navigator', 'explorer'):
         machines.start(0, name, use_sim_time=True)
-    machines.start(0, 'sim', start=START, rate=5.0, lockstep='local_topology', hold_for_subscribers=4)
+    machines.start(
+        0, 'sim', start=START, rate=5.0, lockstep='local_topology', hold_for_subscribers=4
+    )
     monitor = machines.start(0, 'demo_monitor', use_sim_time=True, result=str(result))
     time.sleep(30.0)
     machines.unplugged(5.0)
@@ -181,7 +222,9 @@ def test_an_exploration_over_the_cable_finishes_though_it_is_pulled_for_five_sec
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize('machines', ['weak link'], indirect=True)
-def test_an_exploration_in_real_time_over_a_weak_link_finishes_though_it_breaks_as_well(machines, tmp_path):
+def test_an_exploration_in_real_time_over_a_weak_link_finishes_though_it_breaks_as_well(
+    machines, tmp_path
+):
     result = tmp_path / 'result.json'
     start_mapping(machines, 1)
     for name in ('navigator', 'explorer'):

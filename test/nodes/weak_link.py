@@ -2,8 +2,8 @@
 
     weak_link.py PID DEVICE DEVICE LOSS DELAY_S SEED
 
-Makes a TAP device here and one in the namespace of a process, carries frames between them until SIGTERM, and then
-prints how many it carried and how many it lost, as JSON.
+Makes a TAP device here and one in the namespace of a process, carries frames between them until
+SIGTERM, and then prints how many it carried and how many it lost, as JSON.
 """
 
 import contextlib
@@ -27,12 +27,17 @@ _LARGEST_FRAME = 65_536
 def tap(name: str) -> int:
     """Return the descriptor of a new TAP device in the namespace that this process is in now."""
     descriptor = os.open('/dev/net/tun', os.O_RDWR | os.O_NONBLOCK)
-    fcntl.ioctl(descriptor, _TUNSETIFF, struct.pack('16sH22x', name.encode(), _IFF_TAP | _IFF_NO_PI))
+    fcntl.ioctl(
+        descriptor, _TUNSETIFF, struct.pack('16sH22x', name.encode(), _IFF_TAP | _IFF_NO_PI)
+    )
     return descriptor
 
 
 def enter_network_of(pid: int) -> None:
-    """Go over to the network namespace of a process; devices that are open stay where they were made."""
+    """Go over to the network namespace of a process.
+
+    Devices that are open stay where they were made.
+    """
     namespace = os.open(f'/proc/{pid}/ns/net', os.O_RDONLY)
     if ctypes.CDLL(None, use_errno=True).setns(namespace, _CLONE_NEWNET):
         raise OSError(ctypes.get_errno(), f'setns to the network of process {pid}')
@@ -52,7 +57,11 @@ class Link:
     def run(self) -> None:
         """Carry frames until it is ended."""
         while not self.ended:
-            wait_s = min(max(self._under_way[0][0] - time.monotonic(), 0.0), 0.2) if self._under_way else 0.2
+            wait_s = (
+                min(max(self._under_way[0][0] - time.monotonic(), 0.0), 0.2)
+                if self._under_way
+                else 0.2
+            )
             for end in select.select(list(self._other), [], [], wait_s)[0]:
                 self._take(end)
             while self._under_way and self._under_way[0][0] <= time.monotonic():
@@ -67,7 +76,10 @@ class Link:
             self.lost += 1
             return
         self.carried += 1
-        heapq.heappush(self._under_way, (time.monotonic() + self._delay_s, self.carried, self._other[end], frame))
+        heapq.heappush(
+            self._under_way,
+            (time.monotonic() + self._delay_s, self.carried, self._other[end], frame),
+        )
 
     def _hand_over(self, end: int, frame: bytes) -> None:
         with contextlib.suppress(OSError):  # unplugged

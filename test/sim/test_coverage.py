@@ -13,12 +13,17 @@ from thinmap_ros.sim.coverage import coverable
 from thinmap_ros.sim.world import World
 
 
-def walled(rows: int, cols: int, origin: tuple[float, float] = (0.0, 0.0), seed: int | None = None) -> World:
+def walled(
+    rows: int, cols: int, origin: tuple[float, float] = (0.0, 0.0), seed: int | None = None
+) -> World:
     cells = np.zeros((rows, cols), dtype=np.uint8)
     if seed is not None:
         rng = np.random.default_rng(seed)
         for _ in range(9):
-            r, c, h, w = rng.integers(0, rows), rng.integers(0, cols), rng.integers(1, 12), rng.integers(1, 12)
+            r = rng.integers(0, rows)
+            c = rng.integers(0, cols)
+            h = rng.integers(1, 12)
+            w = rng.integers(1, 12)
             cells[r : r + h, c : c + w] = 1
         cells[rows // 2 - 4 : rows // 2 + 5, cols // 2 - 4 : cols // 2 + 5] = 0
     cells[0], cells[-1], cells[:, 0], cells[:, -1] = 1, 1, 1, 1
@@ -28,7 +33,7 @@ def walled(rows: int, cols: int, origin: tuple[float, float] = (0.0, 0.0), seed:
 def reference(
     world: World, start_cell: tuple[int, int], radius_m: float, range_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Free cells surely seen, and cells perhaps seen: rays from every reachable cell, fine, then with one to spare."""
+    """Free cells surely and perhaps seen: fine rays from reachable cells, then one to spare."""
     solid = world.occupied != 0
     standing = world.wall_distance_m > radius_m
     reached = np.zeros_like(standing)
@@ -59,7 +64,8 @@ def test_it_is_the_definition(seed: int) -> None:
     ours = coverable(world, start, 0.25, 3.0).cells
     seen, perhaps = reference(world, (25, 30), 0.25, 3.0)
     assert not (ours & ~perhaps).any()
-    # Centre to centre, a line may slip through where two solid cells touch at a corner; no ray of ours does.
+    # Centre to centre, a line may slip through where two solid cells touch at a corner; no ray of
+    # ours does.
     assert (seen & ~ours).sum() <= 0.001 * seen.sum()
     # A cell is seen here when any part of a place's cell is met, there when its centre is.
     assert (ours & ~seen).sum() <= 0.02 * seen.sum()
@@ -81,7 +87,10 @@ def test_range_counts() -> None:
     world = walled(10, 100)
     world.occupied[1:6, 30:99] = 1  # the rest is a slit of 0.3 m
     world.occupied[8, 30:99] = 1
-    short, long = (coverable(world, np.array([1.0, 0.5, 0.0]), 0.2, r).cells[6:8].any(axis=0) for r in (2.0, 5.0))
+    short, long = (
+        coverable(world, np.array([1.0, 0.5, 0.0]), 0.2, r).cells[6:8].any(axis=0)
+        for r in (2.0, 5.0)
+    )
     reached = 28
     assert short[reached] and long[reached]
     assert 1.5 < 0.1 * (np.flatnonzero(short).max() - reached) <= 2.1
@@ -90,7 +99,10 @@ def test_range_counts() -> None:
 
 def test_the_lattice_is_that_of_maps() -> None:
     fine = np.zeros((300, 300), dtype=np.uint8)
-    fine[10:15, 10:290], fine[285:290, 10:290], fine[10:290, 10:15], fine[10:290, 285:290] = 1, 1, 1, 1
+    fine[10:15, 10:290] = 1
+    fine[285:290, 10:290] = 1
+    fine[10:290, 10:15] = 1
+    fine[10:290, 285:290] = 1
     world = World('fine', fine, GridFrame(-0.26, -0.26, 0.02), np.zeros(3))
     found = coverable(world, np.array([1.0, 1.0, 0.0]), 0.2, 8.0)
     np.testing.assert_allclose(found.frame.as_array(), [-0.3, -0.3, 0.1])
@@ -123,7 +135,9 @@ def test_share_known_of_a_map_in_a_frame_of_its_own() -> None:
     # x from -2 to 0 in the map is y from 0 to 2 in the world.
     lower = GridPatch(GridFrame(-2.0, -3.0, 0.1), np.zeros((60, 20), dtype=np.int8))
     assert found.share_known(lower, T_world_map) == pytest.approx(19 / 38, abs=0.03)
-    assert found.share_known(lower, T_world_map) == found.share_known(lower, T_world_map + se2.pose(0, 0, 0))
+    assert found.share_known(lower, T_world_map) == found.share_known(
+        lower, T_world_map + se2.pose(0, 0, 0)
+    )
 
 
 def test_a_start_where_the_robot_does_not_fit() -> None:

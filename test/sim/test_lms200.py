@@ -18,9 +18,14 @@ EXACT = Lms200Config(noise_m=0.0, mixed_pixels=0.0, rounding_m=0.0)
 
 
 def box(width_m: float = 6.0, height_m: float = 4.0, pillar: bool = False) -> World:
-    """A box whose inner walls are at 0 and width, 0 and height; with a pillar of 0.4 m around (4, 2)."""
+    """A box whose inner walls are at 0 and width, 0 and height.
+
+    With a pillar of 0.4 m around (4, 2).
+    """
     resolution = 0.02
-    cells = np.zeros((round((height_m + 0.2) / resolution), round((width_m + 0.2) / resolution)), dtype=np.uint8)
+    cells = np.zeros(
+        (round((height_m + 0.2) / resolution), round((width_m + 0.2) / resolution)), dtype=np.uint8
+    )
     cells[:5], cells[-5:], cells[:, :5], cells[:, -5:] = 1, 1, 1, 1
     if pillar:
         cells[95:115, 195:215] = 1
@@ -30,7 +35,9 @@ def box(width_m: float = 6.0, height_m: float = 4.0, pillar: bool = False) -> Wo
 BOX = box()
 
 
-def analytic(x: float, y: float, theta: float, angles: np.ndarray, width: float = 6.0) -> np.ndarray:
+def analytic(
+    x: float, y: float, theta: float, angles: np.ndarray, width: float = 6.0
+) -> np.ndarray:
     """Range to the walls of the empty box, 4 m high."""
     height = 4.0
     dx, dy = np.cos(angles + theta), np.sin(angles + theta)
@@ -65,10 +72,17 @@ def test_beyond_the_range_there_is_no_return() -> None:
     assert np.isinf(scan.ranges_m[scan.no_return]).all()
 
 
-@pytest.mark.parametrize(('beams', 'fov', 'range_m'), [(541, 270.0, 4.0), (360, 360.0, 80.0), (181, 180.0, 8.0)])
+@pytest.mark.parametrize(
+    ('beams', 'fov', 'range_m'), [(541, 270.0, 4.0), (360, 360.0, 80.0), (181, 180.0, 8.0)]
+)
 def test_other_lasers(beams: int, fov: float, range_m: float) -> None:
     config = Lms200Config(
-        beams=beams, field_of_view_deg=fov, range_max_m=range_m, noise_m=0.0, mixed_pixels=0.0, rounding_m=0.0
+        beams=beams,
+        field_of_view_deg=fov,
+        range_max_m=range_m,
+        noise_m=0.0,
+        mixed_pixels=0.0,
+        rounding_m=0.0,
     )
     scan = Lms200(config, 0).scan(BOX, np.array([3.0, 1.0, 1.0]), 0)
     assert scan.ranges_m.size == beams
@@ -86,7 +100,9 @@ def test_the_mount_moves_the_laser() -> None:
     T_world_base = np.array([1.0, 2.0, 0.7])
     scan = Lms200(config, 0).scan(BOX, T_world_base, 0)
     points = se2.transform_points(T_world_base, scan.points_base())
-    on_wall = np.minimum.reduce([abs(points[:, 0]), abs(points[:, 0] - 6), abs(points[:, 1]), abs(points[:, 1] - 4)])
+    on_wall = np.minimum.reduce(
+        [abs(points[:, 0]), abs(points[:, 0] - 6), abs(points[:, 1]), abs(points[:, 1] - 4)]
+    )
     assert on_wall.max() < 1e-5
     assert np.array_equal(scan.T_base_laser, [0.4, 0.0, 0.0])
 

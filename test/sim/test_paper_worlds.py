@@ -1,4 +1,7 @@
-"""The papers' worlds: as large and as full of lines as the papers say, with tours that a robot can drive."""
+"""The papers' worlds.
+
+As large and as full of lines as the papers say, with tours that a robot can drive.
+"""
 
 from pathlib import Path
 
@@ -30,10 +33,13 @@ def load(name: str) -> tuple[World, np.ndarray]:
 @pytest.mark.parametrize(
     ('name', 'size', 'lines'),
     [
-        ('office', (9.5, 7.5), 23), ('floor_40x10', (40.0, 10.0), 33), ('floor_70x10', (70.0, 10.0), 88),
-        ('room_10x10', (10.0, 10.0), 20), ('lab', (20.0, 10.0), 49),
+        ('office', (9.5, 7.5), 23),
+        ('floor_40x10', (40.0, 10.0), 33),
+        ('floor_70x10', (70.0, 10.0), 88),
+        ('room_10x10', (10.0, 10.0), 20),
+        ('lab', (20.0, 10.0), 49),
     ],
-)  # fmt: skip
+)
 def test_size_and_lines_are_the_papers(name: str, size: tuple[float, float], lines: int) -> None:
     world, _ = load(name)
     found = surfaces(world, SHORTEST_M)
@@ -86,7 +92,12 @@ def test_the_tour_can_be_driven(name: str) -> None:
     world, tour = load(name)
     robot = PRESETS['2dx']
     simulation = Simulation(world, world.start, robot, Lms200Config(rate_hz=0.1), 0)
-    poses = np.array([look.T_world_base for look in drive(simulation, ways_along(world, tour, robot.radius_m), 0.5)])
+    poses = np.array(
+        [
+            look.T_world_base
+            for look in drive(simulation, ways_along(world, tour, robot.radius_m), 0.5)
+        ]
+    )
     assert simulation.robot.collisions == 0
     assert np.hypot(*(simulation.robot.T_world_base[:2] - tour[-1])) < 0.31
     assert len(poses) > 1
@@ -124,7 +135,9 @@ def test_the_same_seed_drives_the_same() -> None:
 
     def ranges() -> np.ndarray:
         simulation = Simulation(world, world.start, PRESETS['2dx'], Lms200Config(), 3)
-        return np.array([x.scan.ranges_m for x in drive(simulation, ways_along(world, tour[:1], 0.22), 1.0)])
+        return np.array(
+            [x.scan.ranges_m for x in drive(simulation, ways_along(world, tour[:1], 0.22), 1.0)]
+        )
 
     assert np.array_equal(ranges(), ranges())
 

@@ -47,9 +47,20 @@ def test_walls_have_their_thickness(tmp_path: Path) -> None:
 
 def test_every_axis_parallel_wall_of_the_room_is_equally_thick() -> None:
     world = load(ROOM)
-    for x, y, along in [(3.5, 1.0, 0), (6.5, 8.0, 0), (1.0, 6.0, 1), (9.0, 3.4, 1), (0.0, 5.0, 0), (5.0, 10.0, 1)]:
+    for x, y, along in [
+        (3.5, 1.0, 0),
+        (6.5, 8.0, 0),
+        (1.0, 6.0, 1),
+        (9.0, 3.4, 1),
+        (0.0, 5.0, 0),
+        (5.0, 10.0, 1),
+    ]:
         row, col = world.frame.cells_of(np.array([[x, y]]))[0]
-        across = world.occupied[row, col - 10 : col + 10] if along == 0 else world.occupied[row - 10 : row + 10, col]
+        across = (
+            world.occupied[row, col - 10 : col + 10]
+            if along == 0
+            else world.occupied[row - 10 : row + 10, col]
+        )
         assert across.sum() == 5, (x, y)
 
 
@@ -68,7 +79,9 @@ def test_solids_are_filled(tmp_path: Path) -> None:
     world = box(tmp_path, solids=[[[1, 1], [2, 1], [2, 2], [1, 2]], [[3, 1], [3.5, 1], [3.25, 2]]])
     inside = [(1.02, 1.02), (1.98, 1.98), (1.5, 1.5), (3.25, 1.5)]
     assert all(is_solid(world, x, y) for x, y in inside)
-    assert not any(is_solid(world, x, y) for x, y in [(0.98, 1.5), (2.02, 1.5), (3.05, 1.8), (3.45, 1.8)])
+    assert not any(
+        is_solid(world, x, y) for x, y in [(0.98, 1.5), (2.02, 1.5), (3.05, 1.8), (3.45, 1.8)]
+    )
     area_m2 = (int(world.occupied.sum()) - int(box(tmp_path).occupied.sum())) * 0.05**2
     assert area_m2 == pytest.approx(1.25, abs=0.02)
 
@@ -86,7 +99,9 @@ def test_contact_is_exact(x: float, y: float, radius: float) -> None:
     nearest = np.clip([x, y], low, low + 0.05)
     gap = float(np.hypot(*(nearest - [x, y]).T).min())
     if abs(gap - radius) > 1e-9 and world.is_clear(2.0, 1.5, 0.1):
-        assert world.is_clear(x, y, radius) == (gap > radius and -0.25 <= x < 4.25 and -0.25 <= y < 3.25)
+        assert world.is_clear(x, y, radius) == (
+            gap > radius and -0.25 <= x < 4.25 and -0.25 <= y < 3.25
+        )
 
 
 _BOXES: list[World] = []
@@ -146,7 +161,9 @@ def test_what_is_wrong_is_said(tmp_path: Path, change: dict[str, object], said: 
     assert '\n' not in str(error.value)
 
 
-@pytest.mark.parametrize('text', ['', '- 1', 'a: [', 'd: 2001-99-99', '{' * 5000, '\x00', 'a: !!python/object:x {}'])
+@pytest.mark.parametrize(
+    'text', ['', '- 1', 'a: [', 'd: 2001-99-99', '{' * 5000, '\x00', 'a: !!python/object:x {}']
+)
 def test_text_that_is_no_world(tmp_path: Path, text: str) -> None:
     path = tmp_path / 'w.yaml'
     path.write_text(text)
@@ -170,7 +187,8 @@ def test_a_map_is_a_world(tmp_path: Path) -> None:
     grey[2, 5] = 205
     Image.fromarray(grey).save(tmp_path / 'm.pgm')
     (tmp_path / 'm.yaml').write_text(
-        'image: m.pgm\nresolution: 0.1\norigin: [-1.0, 2.0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n'
+        'image: m.pgm\nresolution: 0.1\norigin: [-1.0, 2.0, 0]\nnegate: 0\n'
+        'occupied_thresh: 0.65\nfree_thresh: 0.196\n'
     )
     world = load(tmp_path / 'm.yaml')
     assert world.occupied.shape == (20, 30)

@@ -77,7 +77,10 @@ def test_log_time_keeps_the_order_of_the_file(tmp_path: Path) -> None:
     ('name', 'options'),
     [
         ('sena', {'offset_m': 0.78}),
-        ('mrpt_office', {'start_angle_deg': -110.0, 'step_deg': 0.352, 'offset_m': 0.16, 'max_range_m': 25.0}),
+        (
+            'mrpt_office',
+            {'start_angle_deg': -110.0, 'step_deg': 0.352, 'offset_m': 0.16, 'max_range_m': 25.0},
+        ),
         ('intel_sparse', {}),
     ],
 )
@@ -93,7 +96,9 @@ def test_real_logs(tmp_path: Path, name: str, options: dict[str, float]) -> None
 def run(*arguments: object) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, '-m', 'thinmap_ros.tools.carmen_to_bag', *map(str, arguments)]
     root = Path(__file__).parents[2]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=root, check=False)
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=60, cwd=root, check=False
+    )
 
 
 def test_the_program(tmp_path: Path) -> None:
@@ -102,7 +107,10 @@ def test_the_program(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert '2 scans, 1 lines skipped' in done.stdout and f'{log.path}:2' in done.stdout
     events = list(BagLog(tmp_path / 'bag').events())
-    assert [e.scan.T_base_laser[0] for e in events if not isinstance(e, OdometryEvent)] == [0.3, 0.3]
+    assert [e.scan.T_base_laser[0] for e in events if not isinstance(e, OdometryEvent)] == [
+        0.3,
+        0.3,
+    ]
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,11 @@ def ends_with(monkeypatch: pytest.MonkeyPatch, error: BaseException | None) -> o
         (None, 0, ''),
         (InputError('a.log:3: x: expected y'), 2, 'prog: error: a.log:3: x: expected y\n'),
         (ConfigError('several\nlines'), 2, 'prog: error: several lines\n'),
-        (OSError(28, 'No space left on device'), 2, 'prog: error: [Errno 28] No space left on device\n'),
+        (
+            OSError(28, 'No space left on device'),
+            2,
+            'prog: error: [Errno 28] No space left on device\n',
+        ),
         (KeyboardInterrupt(), 130, 'prog: interrupted\n'),
     ],
 )
@@ -54,7 +58,9 @@ def parse(*words: str) -> argparse.Namespace:
 
 def test_an_option_that_is_not_given_is_the_configs() -> None:
     assert cli.config_from(parse('a.clf'), LaserOptions) == LaserOptions()
-    given = cli.config_from(parse('a.clf', '--max-range-m', '25', '--start-angle-deg=-110'), LaserOptions)
+    given = cli.config_from(
+        parse('a.clf', '--max-range-m', '25', '--start-angle-deg=-110'), LaserOptions
+    )
     assert given == LaserOptions(max_range_m=25.0, start_angle_deg=-110.0)
 
 
@@ -72,7 +78,9 @@ def test_logs_and_bags_are_told_apart(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(('word', 'offset'), [('--offset-m=0.78', 0.78), ('--offset-m=0', 0.0)])
-def test_an_offset_that_is_given_comes_before_tf_static(tmp_path: Path, word: str, offset: float) -> None:
+def test_an_offset_that_is_given_comes_before_tf_static(
+    tmp_path: Path, word: str, offset: float
+) -> None:
     bag = cli.open_log(parse(str(tmp_path), word))
     assert isinstance(bag, BagLog) and bag.T_base_laser is not None
     assert np.array_equal(bag.T_base_laser, [offset, 0.0, 0.0])

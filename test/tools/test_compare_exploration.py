@@ -14,17 +14,29 @@ from thinmap_ros.tools.comparison import markdown, saved
 
 ROOT = Path(__file__).resolve().parents[2]
 WORLD = {
-    'resolution': 0.05, 'wall_thickness': 0.1, 'start': [1.0, 1.0, 0.0],
+    'resolution': 0.05,
+    'wall_thickness': 0.1,
+    'start': [1.0, 1.0, 0.0],
     'walls': [[[0, 0], [4, 0], [4, 3], [0, 3], [0, 0]], [[2.2, 0], [2.2, 1.6]]],
 }
 
 
 def report(strategy: str, world: str, start: int, distance: float) -> dict[str, object]:
     return {
-        'strategy': strategy, 'world': world, 'start_number': start, 'distance': distance, 'time': 2.0 * distance,
-        'turned_rad': 5.0, 'coverage': 0.995, 'finished': True, 'collisions': 0, 'end_nodes_seen': 4,
-        'end_nodes_visited': 1, 'cpu_s': 1.0,
-        'decision_ms': {'median': 0.5, 'max': 7.0}, 'curve': [[1.0, 0.9 * distance, 0.995], [2.0, distance, 0.995]],
+        'strategy': strategy,
+        'world': world,
+        'start_number': start,
+        'distance': distance,
+        'time': 2.0 * distance,
+        'turned_rad': 5.0,
+        'coverage': 0.995,
+        'finished': True,
+        'collisions': 0,
+        'end_nodes_seen': 4,
+        'end_nodes_visited': 1,
+        'cpu_s': 1.0,
+        'decision_ms': {'median': 0.5, 'max': 7.0},
+        'curve': [[1.0, 0.9 * distance, 0.995], [2.0, distance, 0.995]],
     }
 
 
@@ -46,9 +58,14 @@ def test_the_table_has_a_row_for_each_strategy_and_says_what_ours_saves() -> Non
 def test_the_page_has_a_section_for_each_way_of_exploring_and_names_every_fault() -> None:
     laser = {'beams': 181, 'field_of_view_deg': 180.0, 'range_max_m': 8.0}
     options = {'localization': 'truth', 'speed_m_s': 0.5, 'laser': laser}
-    reports = [report('position_probability', f'dungeon-d{i}', 0, 80.0) | {'options': options} for i in range(3)]
+    reports = [
+        report('position_probability', f'dungeon-d{i}', 0, 80.0) | {'options': options}
+        for i in range(3)
+    ]
     for i in range(3):
-        reports.append(report('nearest_frontier', f'dungeon-d{i}', 0, 60.0 + 30.0 * i) | {'options': options})
+        reports.append(
+            report('nearest_frontier', f'dungeon-d{i}', 0, 60.0 + 30.0 * i) | {'options': options}
+        )
     far = options | {'laser': laser | {'range_max_m': 20.0}}
     stuck = {'finished': False, 'reason': 'time limit of 20000 s', 'coverage': 0.5, 'options': far}
     reports.append(report('position_probability', 'kth-a', 1, 50.0) | stuck)
@@ -56,7 +73,10 @@ def test_the_page_has_a_section_for_each_way_of_exploring_and_names_every_fault(
     assert '## dungeon (3): 181 beams over 180 degrees, 8 m, 0.5 m/s, poses known' in text
     assert 'position_probability: 3 of 3 stopped by itself' in text
     assert 'After 99.5% were seen, position_probability drove 10.0% of its way (mean).' in text
-    assert 'nearest_frontier drove less in 1 of 3 pairs; position_probability drove up to 33% more.' in text
+    assert (
+        'nearest_frontier drove less in 1 of 3 pairs; position_probability drove up to 33% more.'
+        in text
+    )
     assert '## kth (1): 181 beams over 180 degrees, 20 m' in text
     assert '**kth-a, start 1**: time limit of 20000 s; coverage 50.00%, 0 contacts.' in text
 
@@ -64,7 +84,9 @@ def test_the_page_has_a_section_for_each_way_of_exploring_and_names_every_fault(
 def compare(*words: str) -> 'subprocess.CompletedProcess[str]':
     command = [sys.executable, '-m', 'thinmap_ros.tools.compare_exploration', *words, '--quiet']
     environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
-    return subprocess.run(command, capture_output=True, text=True, timeout=170, env=environment, cwd=ROOT, check=False)
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=170, env=environment, cwd=ROOT, check=False
+    )
 
 
 @pytest.fixture
@@ -77,7 +99,16 @@ def world(tmp_path: Path) -> Path:
 
 def test_it_runs_all_writes_all_and_goes_on_where_it_was(world: Path, tmp_path: Path) -> None:
     out = tmp_path / 'out'
-    words = [str(world), '-o', str(out), '--processes', '1', '--strategies', 'position_probability', 'nearest_frontier']
+    words = [
+        str(world),
+        '-o',
+        str(out),
+        '--processes',
+        '1',
+        '--strategies',
+        'position_probability',
+        'nearest_frontier',
+    ]
     result = compare(*words)
     assert result.returncode == 0, result.stderr
     assert (out / 'coverage.png').stat().st_size > 0
@@ -107,11 +138,18 @@ def test_a_world_without_start_is_told_in_one_line(world: Path, tmp_path: Path) 
 def test_a_cluster_gives_what_one_machine_gives(world: Path, tmp_path: Path) -> None:
     distributed = pytest.importorskip('distributed')
     words = [str(world), '--strategies', 'nearest_frontier']
-    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
-        there = compare(*words, '-o', str(tmp_path / 'there'), '--scheduler', cluster.scheduler_address)
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, dashboard_address=None
+    ) as cluster:
+        there = compare(
+            *words, '-o', str(tmp_path / 'there'), '--scheduler', cluster.scheduler_address
+        )
     assert there.returncode == 0, there.stderr
     assert compare(*words, '-o', str(tmp_path / 'here'), '--processes', '1').returncode == 0
-    reports = [json.loads(next((tmp_path / name).rglob('report.json')).read_text()) for name in ('there', 'here')]
+    reports = [
+        json.loads(next((tmp_path / name).rglob('report.json')).read_text())
+        for name in ('there', 'here')
+    ]
     for one in reports:
         del one['wall_s'], one['decision_ms']
     assert reports[0] == reports[1]

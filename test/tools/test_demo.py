@@ -15,10 +15,29 @@ from thinmap_ros.adapters.bags import Bag
 
 pytestmark = pytest.mark.live
 REPORT = {
-    'finished', 'reason', 'coverage', 'distance', 'time', 'distance_at', 'time_at', 'collisions', 'end_nodes_seen',
-    'end_nodes_visited', 'pose_rmse',
-}  # fmt: skip
-TOPICS = {'/scan', '/odom', '/pose', '/map', '/local_map', '/topology', '/local_topology', '/end_nodes', '/cmd_vel'}
+    'finished',
+    'reason',
+    'coverage',
+    'distance',
+    'time',
+    'distance_at',
+    'time_at',
+    'collisions',
+    'end_nodes_seen',
+    'end_nodes_visited',
+    'pose_rmse',
+}
+TOPICS = {
+    '/scan',
+    '/odom',
+    '/pose',
+    '/map',
+    '/local_map',
+    '/topology',
+    '/local_topology',
+    '/end_nodes',
+    '/cmd_vel',
+}
 
 
 def demo(out, *arguments):
@@ -27,7 +46,10 @@ def demo(out, *arguments):
 
 
 def nodes_of(out):
-    """Processes of a demo: each has the results' folder in its arguments, or is a child of one that has."""
+    """Processes of a demo.
+
+    Each has the results' folder in its arguments, or is a child of one that has.
+    """
     found = []
     for process in psutil.process_iter(['cmdline']):
         if any(str(out) in part for part in process.info['cmdline'] or ()):
@@ -80,7 +102,11 @@ def process_tree(process):
 
 @pytest.mark.parametrize(
     ('arguments', 'said'),
-    [(['--world', 'atlantis'], 'atlantis'), (['--robot', '4wd'], '4wd'), (['--rate', 'fast'], 'fast')],
+    [
+        (['--world', 'atlantis'], 'atlantis'),
+        (['--robot', '4wd'], '4wd'),
+        (['--rate', 'fast'], 'fast'),
+    ],
 )
 def test_wrong_arguments_end_at_once(tmp_path, arguments, said):
     process = demo(tmp_path / 'demo', *arguments)

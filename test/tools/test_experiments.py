@@ -1,4 +1,7 @@
-"""The experiments in their quick form: they write what they promise, always the same, and from a bag as from live."""
+"""The experiments in their quick form.
+
+They write what they promise, always the same, and from a bag as from live.
+"""
 
 import csv
 import json
@@ -62,17 +65,24 @@ def test_an_experiment_writes_what_it_promises(name: str, tmp_path: Path) -> Non
     page = write_page(tmp_path, [name]).read_text(encoding='utf-8')
     assert all(f'{name}/{plot.name}.png' in page for plot in outcome.plots)
     text = write_markdown(tmp_path, [name], tmp_path / 'docs').read_text(encoding='utf-8')
-    assert all((tmp_path / 'docs' / 'experiments' / f'{name}_{plot.name}.png').exists() for plot in outcome.plots)
+    assert all(
+        (tmp_path / 'docs' / 'experiments' / f'{name}_{plot.name}.png').exists()
+        for plot in outcome.plots
+    )
     assert all(comparison.what in text for comparison in outcome.comparisons)
 
 
-@pytest.mark.parametrize('name', sorted(set(EXPERIMENTS) - {'strategies', 'exploration', 'long_floor'}))
+@pytest.mark.parametrize(
+    'name', sorted(set(EXPERIMENTS) - {'strategies', 'exploration', 'long_floor'})
+)
 def test_the_same_seed_gives_the_same_numbers(name: str) -> None:
     again = EXPERIMENTS[name](QUICK)
     for before, after in zip(outcome_of(name).tables, again.tables, strict=True):
         assert before.timed or before.csv() == after.csv(), before.name
     told = [comparison for comparison in again.comparisons if not comparison.timed]
-    assert told == [comparison for comparison in outcome_of(name).comparisons if not comparison.timed]
+    assert told == [
+        comparison for comparison in outcome_of(name).comparisons if not comparison.timed
+    ]
 
 
 def test_every_experiment_has_its_script() -> None:
@@ -86,22 +96,33 @@ def test_the_plain_stages_end_where_nothing_changes() -> None:
     free = np.zeros((20, 30), dtype=np.bool_)
     free[3:17, 3:27] = True
     found = stages(free)
-    assert [int(cells.sum()) for cells in found] == sorted((int(cells.sum()) for cells in found), reverse=True)
+    assert [int(cells.sum()) for cells in found] == sorted(
+        (int(cells.sum()) for cells in found), reverse=True
+    )
     assert (found[-1] <= free).all()
 
 
 @pytest.fixture(scope='module')
 def office_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp('bags')
-    assert record(folder / 'office.mcap', islice(Source().looks('office'), 150), localized=True) == 150
+    assert (
+        record(folder / 'office.mcap', islice(Source().looks('office'), 150), localized=True) == 150
+    )
     return folder
 
 
 def test_a_bag_holds_sensors_truth_and_outputs(office_bag: Path) -> None:
     bag = Bag(office_bag / 'office.mcap')
     assert set(bag.topics) == {
-        '/scan', '/odom', '/tf', '/tf_static', '/ground_truth', '/pose', '/map', '/topology'
-    }  # fmt: skip
+        '/scan',
+        '/odom',
+        '/tf',
+        '/tf_static',
+        '/ground_truth',
+        '/pose',
+        '/map',
+        '/topology',
+    }
     live = list(islice(Source().looks('office'), 150))
     for one, other in zip(live, looks_of_bag(office_bag / 'office.mcap'), strict=True):
         assert one.scan.stamp_ns == other.scan.stamp_ns
@@ -115,7 +136,9 @@ def test_from_the_bag_as_from_live(office_bag: Path) -> None:
     replayed = run_slam(Source(bags=office_bag).looks('office'))
     assert np.abs(np.array(live.estimate) - np.array(replayed.estimate)).max() < POSE_TOLERANCE_M
     assert live.features == replayed.features
-    one, other = (office.run(Source(bags=bags, quick=True)).tables[0] for bags in (None, office_bag))
+    one, other = (
+        office.run(Source(bags=bags, quick=True)).tables[0] for bags in (None, office_bag)
+    )
     for mine, theirs in zip(one.rows[0][1:], other.rows[0][1:], strict=True):
         assert mine == pytest.approx(theirs, rel=0.02, abs=1e-3)
 
@@ -133,7 +156,11 @@ def test_every_drive_begins_where_its_world_says() -> None:
 
 
 def test_numbers_in_a_table_are_short_and_plain() -> None:
-    table = Table('t', ['a', 'b', 'c', 'd'], [[0.1 + 0.2, None, True, np.float64(-0.0)], [1e-9, 'x', 3, np.int64(4)]])
+    table = Table(
+        't',
+        ['a', 'b', 'c', 'd'],
+        [[0.1 + 0.2, None, True, np.float64(-0.0)], [1e-9, 'x', 3, np.int64(4)]],
+    )
     assert table.csv() == 'a,b,c,d\n0.3,,True,0\n0,x,3,4\n'
 
 
@@ -141,7 +168,9 @@ def test_relation_errors_of_a_known_path(tmp_path: Path) -> None:
     times = np.arange(0.0, 10.0, 1.0)
     poses = np.column_stack([times, np.zeros(10), np.zeros(10)])
     (tmp_path / 'odom').write_text(''.join(f'{t} {t} 0 0\n' for t in times))
-    (tmp_path / 'relations').write_text('1 3 2.0 0 0 0 0 0\n2 5 3.3 0.4 0 0 0 0.1\n4.5 6 1.5 0 0 0 0 0\n')
+    (tmp_path / 'relations').write_text(
+        '1 3 2.0 0 0 0 0 0\n2 5 3.3 0.4 0 0 0 0.1\n4.5 6 1.5 0 0 0 0 0\n'
+    )
     errors = relation_errors(times, poses, tmp_path / 'relations', tmp_path / 'odom')
     assert errors.metres == pytest.approx([0.0, 0.5, 0.5], abs=1e-9)
     assert errors.degrees == pytest.approx([0.0, np.degrees(0.1), 0.0])

@@ -11,19 +11,33 @@ import yaml
 
 ROOT = Path(__file__).resolve().parents[2]
 ROOM = {
-    'name': 'closet', 'resolution': 0.05, 'wall_thickness': 0.1, 'start': [1.0, 1.0, 0.0],
+    'name': 'closet',
+    'resolution': 0.05,
+    'wall_thickness': 0.1,
+    'start': [1.0, 1.0, 0.0],
     'walls': [[[0, 0], [4, 0], [4, 3], [0, 3], [0, 0]], [[2.2, 0], [2.2, 1.6]]],
 }
 FIELDS = {
-    'finished', 'reason', 'coverage', 'distance', 'time', 'distance_at', 'time_at', 'collisions', 'end_nodes_seen',
-    'end_nodes_visited', 'pose_rmse',
+    'finished',
+    'reason',
+    'coverage',
+    'distance',
+    'time',
+    'distance_at',
+    'time_at',
+    'collisions',
+    'end_nodes_seen',
+    'end_nodes_visited',
+    'pose_rmse',
 }
 
 
 def explore(*words: str) -> 'subprocess.CompletedProcess[str]':
     command = [sys.executable, '-m', 'thinmap_ros.tools.explore_world', *words, '--quiet']
     environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
-    return subprocess.run(command, capture_output=True, text=True, timeout=150, env=environment, cwd=ROOT, check=False)
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=150, env=environment, cwd=ROOT, check=False
+    )
 
 
 @pytest.fixture
@@ -35,7 +49,9 @@ def world(tmp_path: Path) -> Path:
 
 def test_a_room_is_explored_and_everything_written(world: Path, tmp_path: Path) -> None:
     out = tmp_path / 'out'
-    result = explore(str(world), '-o', str(out), '--localization', 'slam', '--seed', '3', '--speed', '0.3')
+    result = explore(
+        str(world), '-o', str(out), '--localization', 'slam', '--seed', '3', '--speed', '0.3'
+    )
     assert result.returncode == 0, result.stderr
     assert 'finished (all end nodes resolved)' in result.stdout
     report = json.loads((out / 'report.json').read_text())
@@ -43,16 +59,22 @@ def test_a_room_is_explored_and_everything_written(world: Path, tmp_path: Path) 
     assert report['finished'] is True
     assert report['coverage'] >= 0.99
     assert report['collisions'] == 0
-    assert report['time_at'].keys() == report['distance_at'].keys() == {'0.90', '0.95', '0.98', '0.99'}
+    assert (
+        report['time_at'].keys() == report['distance_at'].keys() == {'0.90', '0.95', '0.98', '0.99'}
+    )
     assert report['pose_rmse'] < 0.1
     for name in ('map.pgm', 'map.yaml', 'topology.geojson', 'summary.png', 'trajectory.tum'):
         assert (out / name).stat().st_size > 0
 
 
-def test_a_map_without_a_start_can_be_explored_from_a_given_one(world: Path, tmp_path: Path) -> None:
+def test_a_map_without_a_start_can_be_explored_from_a_given_one(
+    world: Path, tmp_path: Path
+) -> None:
     # What comes out is a map_server map: explored once more, it is the world.
     assert explore(str(world), '-o', str(tmp_path / 'one')).returncode == 0
-    result = explore(str(tmp_path / 'one' / 'map.yaml'), '-o', str(tmp_path / 'two'), '--start=1.0,1.0,1.5')
+    result = explore(
+        str(tmp_path / 'one' / 'map.yaml'), '-o', str(tmp_path / 'two'), '--start=1.0,1.0,1.5'
+    )
     assert result.returncode == 0, result.stderr
     assert json.loads((tmp_path / 'two' / 'report.json').read_text())['coverage'] >= 0.99
 
@@ -69,8 +91,12 @@ def test_a_map_without_a_start_can_be_explored_from_a_given_one(world: Path, tmp
         (['WORLD', '--kidnap-at', '5'], 'expected --localization=slam'),
     ],
 )
-def test_bad_input_is_told_in_one_line(world: Path, tmp_path: Path, words: list[str], said: str) -> None:
-    result = explore(*[str(world) if word == 'WORLD' else word for word in words], '-o', str(tmp_path / 'out'))
+def test_bad_input_is_told_in_one_line(
+    world: Path, tmp_path: Path, words: list[str], said: str
+) -> None:
+    result = explore(
+        *[str(world) if word == 'WORLD' else word for word in words], '-o', str(tmp_path / 'out')
+    )
     assert result.returncode == 2
     assert said in result.stderr
     assert result.stderr.count('\n') == 1

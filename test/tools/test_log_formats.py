@@ -1,4 +1,7 @@
-"""Logs in formats that are not read: every program that opens a log says what they are and how to convert them."""
+"""Logs in formats that are not read.
+
+Every program that opens a log says what they are and how to convert them.
+"""
 
 import shlex
 import sqlite3

@@ -1,4 +1,7 @@
-"""Lost robots by the hundred: what is in the files is not run again, and the page is made of them."""
+"""Lost robots by the hundred.
+
+What is in the files is not run again, and the page is made of them.
+"""
 
 from pathlib import Path
 
@@ -14,7 +17,14 @@ from benchmarks.lost_summary import summary
 def cases(ran: list[str], outcomes: dict[str, str]) -> list[Case]:
     def run(name: str) -> Record:
         ran.append(name)
-        return {'outcome': outcomes[name], 'way_m': 2.5, 'steps': 12, 'off_m': '', 'off_deg': '', 'step_ms': 9.0}
+        return {
+            'outcome': outcomes[name],
+            'way_m': 2.5,
+            'steps': 12,
+            'off_m': '',
+            'off_deg': '',
+            'step_ms': 9.0,
+        }
 
     return [Case(name, lambda name=name: run(name)) for name in outcomes]
 
@@ -36,8 +46,12 @@ def test_a_row_is_gone_on_with_and_told_on_the_page(tmp_path: Path) -> None:
     assert '## Dungeons' not in text
 
 
-@pytest.mark.parametrize(('said', 'sure', 'good'), [('4.2', '', (True, True)), ('', '3.1', (False, False))])
-def test_robots_elsewhere_are_to_be_told_so_and_never_sure(said: str, sure: str, good: tuple[bool, bool]) -> None:
+@pytest.mark.parametrize(
+    ('said', 'sure', 'good'), [('4.2', '', (True, True)), ('', '3.1', (False, False))]
+)
+def test_robots_elsewhere_are_to_be_told_so_and_never_sure(
+    said: str, sure: str, good: tuple[bool, bool]
+) -> None:
     records = [{'case': 'a <- b', 'said_m': said, 'sure_m': sure, 'last': 'NOT_IN_MAP'}]
     rows = {row.what: row.good for row in summary('foreign', records)}
     assert (rows['told "not in this map", of 100'], rows['sure at some time, of 100']) == good

@@ -1,4 +1,7 @@
-"""The program map_to_graph: any map_server map in, a route graph out, or one line on what is wrong."""
+"""The program map_to_graph.
+
+Any map_server map in, a route graph out, or one line on what is wrong.
+"""
 
 import json
 from pathlib import Path
@@ -44,19 +47,27 @@ def written(tmp_path: Path, grey: np.ndarray, **changes: object) -> Path:
     return path
 
 
-def test_three_formats_and_a_picture_of_one_graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_three_formats_and_a_picture_of_one_graph(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = written(tmp_path, corridors())
     for name in ('g.geojson', 'g.graphml', 'g.tmap2.yaml'):
         assert run(monkeypatch, path, '-o', tmp_path / name, '--picture', tmp_path / 'g.png') == 0
     features = json.loads((tmp_path / 'g.geojson').read_text())['features']
-    points = {f['properties']['id']: f['geometry']['coordinates'] for f in features if 'startid' not in f['properties']}
+    points = {
+        f['properties']['id']: f['geometry']['coordinates']
+        for f in features
+        if 'startid' not in f['properties']
+    }
     graph = networkx.read_graphml(tmp_path / 'g.graphml', node_type=int)
     assert {k: [d['x'], d['y']] for k, d in graph.nodes.items()} == points
     assert sorted(d['kind'] for d in graph.nodes.values()) == ['branch', 'end', 'end', 'end']
     assert all(d['clearance'] >= 0.25 and d['length'] > 1.0 for d in graph.edges.values())
     tmap2 = yaml.safe_load((tmp_path / 'g.tmap2.yaml').read_text())
     places = {n['node']['name']: n['node']['pose']['position'] for n in tmap2['nodes']}
-    assert {k: [at['x'], at['y']] for k, at in places.items()} == {f'NODE{k}': v for k, v in points.items()}
+    assert {k: [at['x'], at['y']] for k, at in places.items()} == {
+        f'NODE{k}': v for k, v in points.items()
+    }
     ways = {(n['node']['name'], e['node']) for n in tmap2['nodes'] for e in n['node']['edges']}
     assert ways == {(f'NODE{a}', f'NODE{b}') for k, n in graph.edges for a, b in ((k, n), (n, k))}
     ids = [e['edge_id'] for n in tmap2['nodes'] for e in n['node']['edges']]
@@ -91,7 +102,11 @@ def test_options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_wrong_options(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], words: list[str], said: str
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    words: list[str],
+    said: str,
 ) -> None:
     path = written(tmp_path, corridors())
     monkeypatch.chdir(tmp_path)
@@ -129,7 +144,10 @@ def test_maps_of_one_value(
     ],
 )
 def test_bad_maps(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], changes: dict[str, object]
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    changes: dict[str, object],
 ) -> None:
     path = written(tmp_path, corridors(), **changes)
     assert run(monkeypatch, path, '-o', tmp_path / 'g.geojson') == 2
@@ -138,9 +156,14 @@ def test_bad_maps(
     assert not (tmp_path / 'g.geojson').exists()
 
 
-@pytest.mark.parametrize('content', [b'P5\n0 0\n255\n', b'P5\n5 0\n255\n', b'', b'P5\n10 10\n255\n123'])
+@pytest.mark.parametrize(
+    'content', [b'P5\n0 0\n255\n', b'P5\n5 0\n255\n', b'', b'P5\n10 10\n255\n123']
+)
 def test_images_of_no_size_or_cut_short(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], content: bytes
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    content: bytes,
 ) -> None:
     path = written(tmp_path, corridors(), image='m.pgm')
     (tmp_path / 'm.pgm').write_bytes(content)

@@ -22,7 +22,8 @@ TRAJECTORIES = {'trajectory.tum', 'trajectory_final.tum'}
 FILES = TRAJECTORIES | {'map.pgm', 'map.yaml', 'topology.geojson', 'summary.png', 'report.json'}
 BEAMS = 181
 needs_rerun = pytest.mark.skipif(
-    not rerun_streams.is_installed(), reason='needs rerun, which is not installed (the extra "viewer")'
+    not rerun_streams.is_installed(),
+    reason='needs rerun, which is not installed (the extra "viewer")',
 )
 
 
@@ -45,7 +46,10 @@ def carmen_lines(scans=30, beams=BEAMS, start_s=0.0):
         x, stamp = 0.03 * k, start_s + 0.2 * k
         readings = ' '.join(f'{r:.3f}' for r in box_ranges(x, 0.0)[:beams])
         tail = f'{x:.4f} 0 0 {x:.4f} 0 0 {stamp:.3f} robot {stamp:.3f}'
-        lines += [f'ODOM {x:.4f} 0 0 0.15 0 0 {stamp:.3f} robot {stamp:.3f}', f'FLASER {beams} {readings} {tail}']
+        lines += [
+            f'ODOM {x:.4f} 0 0 0.15 0 0 {stamp:.3f} robot {stamp:.3f}',
+            f'FLASER {beams} {readings} {tail}',
+        ]
     return lines
 
 
@@ -88,9 +92,10 @@ def test_a_cut_off_bag_is_replayed_as_far_as_bag_repair_reads_it(log, tmp_path, 
     whole = (tmp_path / 'bag.mcap').read_bytes()
     cut = tmp_path / 'cut.mcap'
     cut.write_bytes(whole[: int(share * len(whole))])  # one chunk, and the summary
-    repair = [sys.executable, '-m', 'thinmap_ros.tools.bag_repair', cut, '-o', tmp_path / 'good.mcap']
+    good = tmp_path / 'good.mcap'
+    repair = [sys.executable, '-m', 'thinmap_ros.tools.bag_repair', cut, '-o', good]
     assert subprocess.run(repair).returncode == 0
-    expected = run(tmp_path / 'good.mcap', '-o', tmp_path / 'expected', '--quiet')
+    expected = run(good, '-o', tmp_path / 'expected', '--quiet')
     done = run(cut, '-o', tmp_path / 'out', '--quiet')
     assert (expected.returncode, done.returncode) == (0, 0), done.stderr
     assert f'`bag_repair {cut}`' in done.stdout and 'cut off' in done.stdout
@@ -111,9 +116,17 @@ def bag_without_odometry(path):
         header = types['std_msgs/msg/Header'](stamp=time, frame_id='laser')
         ranges = np.full(BEAMS, 2.0, dtype=np.float32)
         scan = types['sensor_msgs/msg/LaserScan'](
-            header=header, angle_min=-1.57, angle_max=1.57, angle_increment=0.01745, time_increment=0.0, scan_time=0.0,
-            range_min=0.0, range_max=8.0, ranges=ranges, intensities=ranges[:0],
-        )  # fmt: skip
+            header=header,
+            angle_min=-1.57,
+            angle_max=1.57,
+            angle_increment=0.01745,
+            time_increment=0.0,
+            scan_time=0.0,
+            range_min=0.0,
+            range_max=8.0,
+            ranges=ranges,
+            intensities=ranges[:0],
+        )
         writer.write('/scan', 'sensor_msgs/msg/LaserScan', 1_000_000_000, scan)
 
 
@@ -187,7 +200,9 @@ def test_stamps_that_jump_back_do_no_harm(tmp_path):
     assert np.abs(poses[:, 1]).max() < 1.0
 
 
-@pytest.mark.parametrize('arguments', [['--slam', 'magic'], ['--resolution-m', '0'], ['--offset-m', 'nan'], []])
+@pytest.mark.parametrize(
+    'arguments', [['--slam', 'magic'], ['--resolution-m', '0'], ['--offset-m', 'nan'], []]
+)
 def test_wrong_options_end_with_two(log, tmp_path, arguments):
     out = [] if not arguments else ['-o', tmp_path / 'out']
     done = run(log, *out, *arguments)
@@ -204,7 +219,8 @@ def test_unwritable_place_is_said(log):
 @pytest.mark.slow
 def test_real_office_log(shared_data, tmp_path):
     log = shared_data / 'logs' / 'mrpt_office' / 'log.clf'
-    options = ['--start-angle-deg', '-110.0', '--step-deg', '0.352', '--offset-m', '0.16', '--max-range-m', '24.9']
+    angles = ['--start-angle-deg', '-110.0', '--step-deg', '0.352']
+    options = [*angles, '--offset-m', '0.16', '--max-range-m', '24.9']
     done = run(log, '-o', tmp_path / 'out', '--quiet', *options)
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / 'out' / 'report.json').read_text())
@@ -238,15 +254,23 @@ def test_a_view_is_told_each_scan_and_the_map_as_it_is_in_the_end(log):
     assert len(result.poses) == diary.told['pose'] == diary.told['scan'] == 30
     assert diary.told['grid'] == 7, 'once a second of the log, and at its end'
     assert np.array_equal(diary.map_shown.cells, result.pipeline.grid.patch().cells)
-    for curve in (('step', 'localizer'), ('step', 'map update'), ('step', 'graph update'), ('count', 'features')):
+    for curve in (
+        ('step', 'localizer'),
+        ('step', 'map update'),
+        ('step', 'graph update'),
+        ('count', 'features'),
+    ):
         assert diary.told[curve] == 30
 
 
-@pytest.mark.skipif(rerun_streams.is_installed(), reason='says what happens where rerun is not installed; it is')
+@pytest.mark.skipif(
+    rerun_streams.is_installed(), reason='says what happens where rerun is not installed; it is'
+)
 @pytest.mark.parametrize('option', ['--view', '--recording=run.rrd'])
 def test_without_rerun_a_view_is_refused_in_one_line(log, tmp_path, option):
     done = run(log, '-o', tmp_path / 'out', option)
-    assert done.returncode == 2 and done.stderr.splitlines()[-1].startswith('replay: error: rerun is not installed')
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1].startswith('replay: error: rerun is not installed')
     assert not (tmp_path / 'out').exists()
 
 
@@ -271,7 +295,11 @@ def rows_of(path, entity):
 def test_a_recording_holds_the_whole_replay_or_is_not_written(log, tmp_path):
     done = run(log, '-o', tmp_path / 'out', '--quiet', '--recording', tmp_path / 'run.rrd')
     assert done.returncode == 0, done.stderr
-    assert rows_of(tmp_path / 'run.rrd', '/map/robot') == rows_of(tmp_path / 'run.rrd', '/map/robot/scan') == 30
+    assert (
+        rows_of(tmp_path / 'run.rrd', '/map/robot')
+        == rows_of(tmp_path / 'run.rrd', '/map/robot/scan')
+        == 30
+    )
     assert rows_of(tmp_path / 'run.rrd', '/map/grid') >= 6
     log.write_text('\n'.join(without_scans()))
     done = run(log, '-o', tmp_path / 'out', '--quiet', '--recording', tmp_path / 'other.rrd')
@@ -280,9 +308,10 @@ def test_a_recording_holds_the_whole_replay_or_is_not_written(log, tmp_path):
 
 @needs_rerun
 def test_the_viewer_shows_the_replay_until_it_is_closed(log, tmp_path, monkeypatch, capsys):
-    # The real program, told to write down what it receives where it would open a window; closed when the results are
-    # there and it has had time to be looked at.
-    received, stand_in, report = tmp_path / 'received.rrd', tmp_path / 'viewer', tmp_path / 'out' / 'report.json'
+    # The real program, told to write down what it receives where it would open a window; closed
+    # when the results are there and it has had time to be looked at.
+    received, stand_in = tmp_path / 'received.rrd', tmp_path / 'viewer'
+    report = tmp_path / 'out' / 'report.json'
     stand_in.write_text(
         f'#!/bin/sh\n"{rerun_streams.viewer_program()}" --save "{received}" "$@" &\n'
         f'while [ ! -e "{report}" ]; do sleep 0.1; done; sleep 2; kill $!; wait $!\n'
@@ -290,7 +319,9 @@ def test_the_viewer_shows_the_replay_until_it_is_closed(log, tmp_path, monkeypat
     stand_in.chmod(0o755)
     monkeypatch.setattr(rerun_streams, 'viewer_program', lambda: str(stand_in))
     monkeypatch.setenv('DISPLAY', ':none')
-    monkeypatch.setattr(sys, 'argv', ['replay', str(log), '-o', str(tmp_path / 'out'), '--quiet', '--view'])
+    monkeypatch.setattr(
+        sys, 'argv', ['replay', str(log), '-o', str(tmp_path / 'out'), '--quiet', '--view']
+    )
     main()
     assert 'close the viewer to end' in capsys.readouterr().err
     assert {path.name for path in (tmp_path / 'out').iterdir()} == FILES

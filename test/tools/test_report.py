@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.exploration.decision import FIRST_STAND_IN_ID
-from thinmap_ros.tools.report import FEWEST_SIGHTINGS, Ending, EndNodeCensus, TargetLog, exploration_report
+from thinmap_ros.tools.report import (
+    FEWEST_SIGHTINGS,
+    Ending,
+    EndNodeCensus,
+    TargetLog,
+    exploration_report,
+)
 
 AFAR = np.array([100.0, 100.0, 0.0])
 
@@ -50,7 +56,12 @@ def report_of(coverage, census=None):
     times = np.arange(0.0, 10.1, 0.5)
     poses = np.column_stack([0.5 * times, 0.0 * times, 0.1 * times])
     return exploration_report(
-        Ending(True, 'done', 0), times, poses, poses + (0.0, 0.03, 0.0), np.array(coverage), census or EndNodeCensus()
+        Ending(True, 'done', 0),
+        times,
+        poses,
+        poses + (0.0, 0.03, 0.0),
+        np.array(coverage),
+        census or EndNodeCensus(),
     )
 
 

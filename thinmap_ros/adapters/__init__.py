@@ -1,1 +1,4 @@
-"""Everything that touches the outside: ROS, bags, logs, image files, pictures. One file an outside thing."""
+"""Everything that touches the outside: ROS, bags, logs, image files, pictures.
+
+One file an outside thing.
+"""

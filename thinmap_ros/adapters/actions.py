@@ -19,12 +19,13 @@ class Outcome(Enum):
 
 
 class SingleGoalServer:
-    """Takes a goal, lets the node work on it in its own callbacks, and answers once `finish` is called.
+    """Takes a goal, lets the node work on it in its own callbacks, answers once `finish` is called.
 
-    Goals are taken while the node is active. A new goal takes the place of the old one, which is aborted with what
-    `preempted` returns. rclpy runs a goal in a coroutine, and one that waits keeps the executor busy all the time; here
-    the goal's coroutine is started only when its result is there. `on_cancel` only hears that the goal is to be ended:
-    it calls `finish` later, from another callback, when the goal's state has changed.
+    Goals are taken while the node is active. A new goal takes the place of the old one, which is
+    aborted with what `preempted` returns. rclpy runs a goal in a coroutine, and one that waits
+    keeps the executor busy all the time; here the goal's coroutine is started only when its result
+    is there. `on_cancel` only hears that the goal is to be ended: it calls `finish` later, from
+    another callback, when the goal's state has changed.
     """
 
     def __init__(
@@ -44,7 +45,9 @@ class SingleGoalServer:
             action,
             name,
             execute_callback=self._end,
-            goal_callback=lambda request: GoalResponse.ACCEPT if node.is_active else GoalResponse.REJECT,
+            goal_callback=lambda request: (
+                GoalResponse.ACCEPT if node.is_active else GoalResponse.REJECT
+            ),
             cancel_callback=self._cancel,
             handle_accepted_callback=self._accept,
         )

@@ -65,7 +65,7 @@ def _number(file: Path) -> tuple[int, str]:
 
 
 def _information(metadata: Path) -> Any:
-    """Raises InputError, KeyError or TypeError where there is none, or beyond the limits of YAML."""
+    """Raises InputError, KeyError or TypeError where there is none, or beyond YAML's limits."""
     content: Any = parse_yaml(read_text(metadata, MOST_BYTES))
     return content['rosbag2_bagfile_information']
 

@@ -1,4 +1,4 @@
-"""Messages as a bag gives them (rosbags' own classes, which have the fields of ROS's) -> core values."""
+"""Messages as a bag gives them (rosbags' own classes, with the fields of ROS's) -> core values."""
 
 import math
 from typing import Any
@@ -32,17 +32,29 @@ def pose(message: Any) -> Array:
 def patch(message: Any) -> GridPatch:
     """Cells of a nav_msgs/OccupancyGrid."""
     info = message.info
-    frame = GridFrame(info.origin.position.x, info.origin.position.y, round(float(info.resolution), 6))
-    return GridPatch(frame, np.asarray(message.data, dtype=np.int8).reshape(info.height, info.width))
+    frame = GridFrame(
+        info.origin.position.x, info.origin.position.y, round(float(info.resolution), 6)
+    )
+    return GridPatch(
+        frame, np.asarray(message.data, dtype=np.int8).reshape(info.height, info.width)
+    )
 
 
 def topology(message: Any) -> TopologicalMap:
     """Graph of a thinmap_msgs/TopologicalMap."""
     nodes = [
-        Node(int(n.id), NodeKind(n.kind), n.position.x, n.position.y, float(n.clearance_m)) for n in message.nodes
+        Node(int(n.id), NodeKind(n.kind), n.position.x, n.position.y, float(n.clearance_m))
+        for n in message.nodes
     ]
     edges = [
-        Edge(int(e.id), int(e.node_a), int(e.node_b), _points(e.path), float(e.length_m), float(e.clearance_m))
+        Edge(
+            int(e.id),
+            int(e.node_a),
+            int(e.node_b),
+            _points(e.path),
+            float(e.length_m),
+            float(e.clearance_m),
+        )
         for e in message.edges
     ]
     return TopologicalMap(nodes, edges)

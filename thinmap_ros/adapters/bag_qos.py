@@ -1,9 +1,19 @@
-"""Qualities of service as bags hold them: written with each topic, so that players offer what was offered."""
+"""Qualities of service as bags hold them.
+
+Written with each topic, so that players offer what was offered.
+"""
 
 from typing import Any
 
 from mcap.records import Channel
-from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
 from rosbags.rosbag2.metadata import parse_qos
 
 from thinmap_ros.adapters.yaml_files import parse_yaml
@@ -44,7 +54,9 @@ def recorded(depth: int, reliable: bool, latched: bool) -> Qos:
 
 
 def is_latched(topic: str, offers: list[Qos]) -> bool:
-    """Whether who comes late is to hear the last message of a topic: all its publishers offered that.
+    """Whether who comes late is to hear the last message of a topic.
+
+    All its publishers offered that.
 
     Converted bags say nothing about static transforms, which are always latched.
     """
@@ -59,5 +71,8 @@ def is_reliable(offers: list[Qos]) -> bool:
 
 
 def depth(offers: list[Qos]) -> int:
-    """How many messages of a topic its publishers kept, all together; the graph does not always tell."""
+    """How many messages of a topic its publishers kept, all together.
+
+    The graph does not always tell.
+    """
     return sum(max(offer.depth, 1) for offer in offers)

@@ -1,4 +1,4 @@
-"""MCAP files that were cut off or damaged: every record that is whole, and a new file made of them."""
+"""MCAP files cut off or damaged: every record that is whole, and a new file made of them."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,7 +18,7 @@ from thinmap_ros.core.errors import InputError
 
 @dataclass
 class Salvage:
-    """What was found: messages by topic, what is not whole by file, and messages that cannot be unpacked."""
+    """What was found: messages by topic, damage by file, messages that cannot be unpacked."""
 
     counts: dict[str, int] = field(default_factory=dict)
     first_ns: int | None = None
@@ -34,13 +34,14 @@ class Salvage:
 
     @property
     def reason(self) -> str:
-        """What is not whole, in one line, by the first file that is not; empty where all of them are."""
+        """What is not whole, in one line, by the first such file; empty where all of them are."""
         return next((str(damage) for damage in self.damage.values() if damage), '')
 
 
 def repair(files: list[Path], folder: Path, compressed_messages: bool = False) -> Salvage:
-    """Write what is whole in MCAP files into folder/NAME.mcap and folder/metadata.yaml, NAME being the folder's.
+    """Write what is whole in MCAP files into folder/NAME.mcap and folder/metadata.yaml.
 
+    NAME is the folder's.
     compressed_messages: each message is compressed on its own; it is written unpacked.
     Raises InputError where a file is no MCAP file, or no whole message is left.
     """
@@ -57,7 +58,9 @@ def repair(files: list[Path], folder: Path, compressed_messages: bool = False) -
     if not found.counts:
         reason = f': {found.reason}' if found.reason else ''
         raise InputError(f'{files[0]}: no whole message is left in it{reason}')
-    write_text(folder / 'metadata.yaml', yaml.safe_dump(_metadata(folder.name, found, channels, schemas)))
+    write_text(
+        folder / 'metadata.yaml', yaml.safe_dump(_metadata(folder.name, found, channels, schemas))
+    )
     return found
 
 
@@ -92,19 +95,28 @@ class _Copy:
 
     def _write(self, schema: Schema, channel: Channel, message: Message) -> None:
         if schema.name not in self._schema_ids:
-            self._schema_ids[schema.name] = self.writer.register_schema(schema.name, schema.encoding, schema.data)
+            self._schema_ids[schema.name] = self.writer.register_schema(
+                schema.name, schema.encoding, schema.data
+            )
         if channel.topic not in self._channel_ids:
             if not bag_qos.of_channel(channel):
                 # What cannot be read would keep players from the whole bag.
                 kept = {key: value for key, value in channel.metadata.items() if key != bag_qos.KEY}
                 channel = replace(channel, metadata=kept)
             self._channel_ids[channel.topic] = self.writer.register_channel(
-                channel.topic, channel.message_encoding, self._schema_ids[schema.name], channel.metadata
+                channel.topic,
+                channel.message_encoding,
+                self._schema_ids[schema.name],
+                channel.metadata,
             )
             self.channels[channel.topic] = channel
             self.schemas[channel.topic] = schema
         self.writer.add_message(
-            self._channel_ids[channel.topic], message.log_time, message.data, message.publish_time, message.sequence
+            self._channel_ids[channel.topic],
+            message.log_time,
+            message.data,
+            message.publish_time,
+            message.sequence,
         )
         self.found.count(channel.topic, message.log_time)
 
@@ -113,7 +125,8 @@ def _hash(schema: Schema) -> str:
     """Hash of a message type as ROS computes it; empty where its definition cannot be read."""
     try:
         return bag_types.own_typestore(schema).hash_rihs01(schema.name)
-    except Exception:  # rosbags' parser and hasher raise whatever a broken definition makes them stumble over
+    except Exception:
+        # rosbags' parser and hasher raise whatever a broken definition makes them stumble over.
         return ''
 
 
@@ -126,7 +139,9 @@ def _span(found: Salvage) -> dict[str, Any]:
     }
 
 
-def _metadata(name: str, found: Salvage, channels: dict[str, Channel], schemas: dict[str, Schema]) -> dict[str, Any]:
+def _metadata(
+    name: str, found: Salvage, channels: dict[str, Channel], schemas: dict[str, Schema]
+) -> dict[str, Any]:
     """Content of rosbag2's metadata.yaml."""
     topics = [
         {
@@ -135,7 +150,8 @@ def _metadata(name: str, found: Salvage, channels: dict[str, Channel], schemas: 
                 'type': schemas[topic].name,
                 'serialization_format': channel.message_encoding,
                 'offered_qos_profiles': dump_qos_v9(bag_qos.of_channel(channel)),
-                'type_description_hash': channel.metadata.get('topic_type_hash') or _hash(schemas[topic]),
+                'type_description_hash': channel.metadata.get('topic_type_hash')
+                or _hash(schemas[topic]),
             },
             'message_count': found.counts[topic],
         }

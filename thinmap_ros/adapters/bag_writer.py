@@ -1,4 +1,4 @@
-"""Bags written: rosbag2 folders and MCAP files, whole at the end, or readable to the last second if killed."""
+"""Writes rosbag2 folders and MCAP files: whole at the end, or to the last second if killed."""
 
 import os
 import shutil
@@ -21,14 +21,19 @@ from thinmap_ros.core.errors import InputError
 class BagWriter:
     """Writes a rosbag2 folder with an MCAP file, or, where the path ends in .mcap, that file alone.
 
-    As a context it writes aside and takes the name when the block ends well, so that no half-written bag passes for a
-    good one. `live` writes under the name from the start: what a recorder wants, whose work is never "done", and which
-    calls `flush` as often as it is willing to lose what came since. `compressed`: with zstd, chunk by chunk. An older
-    bag of that name gives way. Raises InputError where the path is something else.
+    As a context it writes aside and takes the name when the block ends well, so that no
+    half-written bag passes for a good one. `live` writes under the name from the start: what a
+    recorder wants, whose work is never "done", and which calls `flush` as often as it is willing to
+    lose what came since. `compressed`: with zstd, chunk by chunk. An older bag of that name gives
+    way. Raises InputError where the path is something else.
     """
 
     def __init__(
-        self, path: Path, live: bool = False, definitions: dict[str, str] | None = None, compressed: bool = False
+        self,
+        path: Path,
+        live: bool = False,
+        definitions: dict[str, str] | None = None,
+        compressed: bool = False,
     ) -> None:
         self._path = path
         self._folder = path if live else _aside(path)
@@ -47,7 +52,10 @@ class BagWriter:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         try:
             self.close()
@@ -58,7 +66,7 @@ class BagWriter:
                 _remove(self._folder)
 
     def learn(self, definitions: dict[str, str]) -> None:
-        """Take in the texts of message definitions by full name, for types that do not come with ROS."""
+        """Take in message definitions, texts by full name, for types that do not come with ROS."""
         for name, text in definitions.items():
             if name not in self.typestore.types:
                 self.typestore.register(get_types_from_msg(text, name))
@@ -66,7 +74,9 @@ class BagWriter:
     def write(self, topic: str, type_name: str, log_ns: int, message: Any) -> None:
         """Write a message: its CDR bytes, or a message object of the typestore."""
         if topic not in self._connections:
-            self.add_topic(topic, type_name, [recorded(1, True, True)] if topic.endswith('tf_static') else [])
+            self.add_topic(
+                topic, type_name, [recorded(1, True, True)] if topic.endswith('tf_static') else []
+            )
         if not isinstance(message, bytes | memoryview):
             message = self.typestore.serialize_cdr(message, type_name)
         self._writer.write(self._connections[topic], log_ns, message)
@@ -84,7 +94,7 @@ class BagWriter:
             raise InputError(f'{topic}: {" ".join(str(error).split())}') from error
 
     def flush(self) -> None:
-        """Close the chunk that is being filled and hand all of it to the disk: no sudden end can take it back."""
+        """Close the chunk being filled and hand all to the disk: no sudden end can take it back."""
         storage = cast(McapWriter, self._writer.storage)
         if storage.chunk.msgs:
             storage.close_chunk()
@@ -98,8 +108,9 @@ class BagWriter:
 
 @contextmanager
 def written_as_bag(path: Path) -> Iterator[Path]:
-    """Give an empty folder: NAME.mcap and metadata.yaml in it become the bag `path` when the block ends well.
+    """Give an empty folder, whose content becomes the bag `path` when the block ends well.
 
+    Its content: NAME.mcap and metadata.yaml.
     An older bag of that name gives way. Raises InputError where the path is something else.
     """
     _check_replaceable(path)
@@ -134,10 +145,16 @@ def _take_name(folder: Path, path: Path) -> None:
 def _check_replaceable(path: Path) -> None:
     """Refuse to write where something else is than a bag: it would be lost."""
     if path.is_dir() and path.suffix != '.mcap':
-        others = [file.name for file in path.iterdir() if file.suffix != '.mcap' and file.name != 'metadata.yaml']
+        others = [
+            file.name
+            for file in path.iterdir()
+            if file.suffix != '.mcap' and file.name != 'metadata.yaml'
+        ]
         if not others:
             return
-        raise InputError(f'{path}: a folder with {min(others)} in it: expected a new name or an older bag')
+        raise InputError(
+            f'{path}: a folder with {min(others)} in it: expected a new name or an older bag'
+        )
     if path.exists() and not (path.is_file() and path.suffix == '.mcap'):
         raise InputError(f'{path}: exists and is no bag: expected a new name or an older bag')
 

@@ -21,16 +21,17 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
-_SCAN, _ODOMETRY, _TF = (
-    'sensor_msgs/msg/LaserScan',
-    'nav_msgs/msg/Odometry',
-    'tf2_msgs/msg/TFMessage',
-)
+_SCAN = 'sensor_msgs/msg/LaserScan'
+_ODOMETRY = 'nav_msgs/msg/Odometry'
+_TF = 'tf2_msgs/msg/TFMessage'
 _MOST_TOLD = 8
 
 
 class Bag:
-    """A bag opened for reading: `topics` and their types, `offers` and the QoS of their publishers."""
+    """A bag opened for reading.
+
+    `topics` and their types, `offers` and the QoS of their publishers.
+    """
 
     def __init__(self, path: Path) -> None:
         """Open a bag. Raises InputError naming the file where it is none or nothing is whole."""
@@ -75,7 +76,7 @@ class Bag:
 
     @property
     def advice(self) -> str:
-        """What is not whole and what to do about it, in one line; empty where all of it is whole."""
+        """What is not whole and what to do about it, in one line; empty where all is whole."""
         if not self.damage:
             return ''
         read = 'read as far as it is whole'
@@ -98,7 +99,10 @@ class Bag:
                 yield RawMessage(message.topic, message.type_name, message.log_ns, data)
 
     def decode(self, message: RawMessage) -> Any:
-        """Message object of a raw message. Raises InputError where its bytes do not fit its type."""
+        """Message object of a raw message.
+
+        Raises InputError where its bytes do not fit its type.
+        """
         holders = (s for s in self._storages if s.topics.get(message.topic) == message.type_name)
         storage = next(holders, self._storages[0])
         try:
@@ -136,8 +140,8 @@ class BagLog:
     def events(self) -> Iterator[Event]:
         """Odometry and scans in the order of the log.
 
-        Raises InputError where the bag has no scans or no odometry (naming the topics that it has), or nothing says
-        where the laser sits. A message that cannot be used is skipped and counted.
+        Raises InputError where the bag has no scans or no odometry (naming the topics that it has),
+        or nothing says where the laser sits. A message that cannot be used is skipped and counted.
         """
         bag = Bag(self.path)
         self.skipped = Skipped()

@@ -25,12 +25,18 @@ def within(what: str, values: Iterable[float], limit: float = FARTHEST_M) -> Non
 
 
 def short(text: str, longest: int = 80) -> str:
-    """A topic, type or frame of a file as part of a message: one line of printable characters, unquoted, short."""
+    """A topic, type or frame of a file as part of a message.
+
+    One line of printable characters, unquoted, short.
+    """
     return repr(text if len(text) <= longest else text[:longest] + '...')[1:-1]
 
 
 def listed(names: Sequence[str]) -> str:
-    """Names of a file as part of a message: the first of them, in short, and how many more there are."""
+    """Names of a file as part of a message.
+
+    The first of them, in short, and how many more there are.
+    """
     told = [short(name) for name in names]
     lengths = accumulate(len(name) + 2 for name in told)
     count = max(1, sum(length <= LONGEST_LIST for length in lengths))
@@ -41,10 +47,14 @@ def listed(names: Sequence[str]) -> str:
 def cells_in_range(cells: NDArray[np.int8]) -> None:
     """Raise InputError unless all cells are -1 (unknown) or 0 to 100 %."""
     if cells.size and (cells.min() < -1 or cells.max() > 100):
-        raise InputError(f'map with cells from {cells.min()} to {cells.max()}: expected -1, or 0 to 100')
+        raise InputError(
+            f'map with cells from {cells.min()} to {cells.max()}: expected -1, or 0 to 100'
+        )
 
 
 def unique(what: str, ids: list[int]) -> None:
     """Raise InputError where a number is given twice."""
     if len(set(ids)) < len(ids):
-        raise InputError(f'{what}: {len(ids)} of them with {len(set(ids))} ids: expected an id for each')
+        raise InputError(
+            f'{what}: {len(ids)} of them with {len(set(ids))} ids: expected an id for each'
+        )

@@ -28,24 +28,47 @@ def summary_figure(
     true: Array | None = None,
     title: str = '',
 ) -> None:
-    """Write a PNG: map, skeleton, nodes by kind, and the paths (N, 2 or more columns) as estimated and as driven."""
+    """Write a PNG: map, skeleton, nodes by kind, paths (N, 2 or more), as estimated and driven."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     height, width = (count * patch.frame.resolution for count in patch.shape)
     scale = 9.0 / max(height, width)
-    figure = Figure(figsize=(width * scale + 1.2, height * scale + 1.6), dpi=110, layout='constrained')
+    figure = Figure(
+        figsize=(width * scale + 1.2, height * scale + 1.6), dpi=110, layout='constrained'
+    )
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     draw_map(axes, patch)
     draw_graph(axes, topology)
     if true is not None and len(true):
-        axes.plot(true[:, 0], true[:, 1], '-', color=colours.TRUTH, linewidth=2.5, label='path driven', zorder=2)
+        axes.plot(
+            true[:, 0],
+            true[:, 1],
+            '-',
+            color=colours.TRUTH,
+            linewidth=2.5,
+            label='path driven',
+            zorder=2,
+        )
     if len(estimated):
         axes.plot(
-            *estimated[:, :2].T, '-', color=colours.ESTIMATE, linewidth=1.0, label='path estimated', zorder=3
+            *estimated[:, :2].T,
+            '-',
+            color=colours.ESTIMATE,
+            linewidth=1.0,
+            label='path estimated',
+            zorder=3,
         )
-        axes.plot(*estimated[0, :2], marker='*', color='black', markersize=11, linestyle='', label='start', zorder=6)
+        axes.plot(
+            *estimated[0, :2],
+            marker='*',
+            color='black',
+            markersize=11,
+            linestyle='',
+            label='start',
+            zorder=6,
+        )
     axes.set(xlabel='x (m)', ylabel='y (m)', title=title, aspect='equal')
     axes.legend(loc='upper center', bbox_to_anchor=(0.5, -0.07), ncols=4, fontsize=8, frameon=False)
     with written_aside(path) as aside:
@@ -67,21 +90,38 @@ def draw_graph(axes: 'Axes', topology: TopologicalMap, size: float = 5.0) -> Non
     """Draw the paths of the edges and the nodes by kind, markers so many points wide."""
     for i, edge in enumerate(topology.edges.values()):
         label = 'skeleton' if i == 0 else None
-        axes.plot(edge.path[:, 0], edge.path[:, 1], '-', color=colours.EDGE, linewidth=1.2, label=label, zorder=4)
+        axes.plot(
+            edge.path[:, 0],
+            edge.path[:, 1],
+            '-',
+            color=colours.EDGE,
+            linewidth=1.2,
+            label=label,
+            zorder=4,
+        )
     for kind, marker in _MARKERS.items():
-        places = np.array([n.position for n in topology.nodes.values() if n.kind == kind]).reshape(-1, 2)
+        positions = [n.position for n in topology.nodes.values() if n.kind == kind]
+        places = np.array(positions).reshape(-1, 2)
         if len(places):
             label = f'{kind.name.lower()} nodes'
             axes.plot(
-                *places.T, marker, color=colours.NODES[kind], markersize=size, markeredgecolor='black',
-                markeredgewidth=0.4, linestyle='', label=label, zorder=5,
+                *places.T,
+                marker,
+                color=colours.NODES[kind],
+                markersize=size,
+                markeredgecolor='black',
+                markeredgewidth=0.4,
+                linestyle='',
+                label=label,
+                zorder=5,
             )
 
 
 def coverage_figure(path: Path, reports: list[dict[str, Any]]) -> None:
-    """Write a PNG: coverage over distance by strategy, the mean over all runs that reports (with `curve`) tell of.
+    """Write a PNG: coverage over distance by strategy, the mean of all runs in `reports`.
 
-    A run's distance is given as a share of the mean distance of all strategies from the same world and start.
+    Each report has its `curve`. A run's distance is given as a share of the mean distance of all
+    strategies from the same world and start.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -100,7 +140,9 @@ def coverage_figure(path: Path, reports: list[dict[str, Any]]) -> None:
     axes = figure.add_subplot()
     for strategy, runs in sorted(curves.items()):
         axes.plot(shares, 100.0 * np.mean(runs, axis=0), label=f'{strategy} ({len(runs)})')
-    axes.set(xlabel='distance, of the mean of all strategies', ylabel='coverage (%)', ylim=(0.0, 101.0))
+    axes.set(
+        xlabel='distance, of the mean of all strategies', ylabel='coverage (%)', ylim=(0.0, 101.0)
+    )
     axes.legend(fontsize=8, frameon=False)
     with written_aside(path) as aside:
         figure.savefig(aside, format='png', bbox_inches='tight')

@@ -15,7 +15,9 @@ _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 
 @contextmanager
 def written_aside(path: Path) -> Iterator[Path]:
-    """Give a path to write to: it takes the place of `path` when the block ends well and vanishes when not.
+    """Give a path to write to.
+
+    It takes the place of `path` when the block ends well and vanishes when not.
 
     Its name cannot be guessed and the file is new: nobody can have put a link there beforehand.
     Raises OSError, with the name of the file, where the disk does not take it.
@@ -57,4 +59,6 @@ def read_text(path: Path, most_bytes: int = _MOST_TEXT_BYTES) -> str:
     try:
         return content.decode('utf-8').replace('\r\n', '\n')
     except UnicodeDecodeError as error:
-        raise InputError(f'{path}: byte {error.start}: {error.reason}: expected a text file') from error
+        raise InputError(
+            f'{path}: byte {error.start}: {error.reason}: expected a text file'
+        ) from error

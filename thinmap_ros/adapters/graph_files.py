@@ -1,9 +1,11 @@
-"""Topological maps as route graphs: GeoJSON for Nav2's route server, GraphML, tmap2 for topological_navigation.
+"""Topological maps as route graphs.
 
-GeoJSON: nodes are points, edges are lines along the cells that they were found in (the route server itself drives
-straight from node to node). Edges are directed there, so each of ours is written in both directions; ids are unsigned
-and unique over nodes and edges; metadata are flat and without nulls, on which its reader would throw. Lengths and
-clearances are in m everywhere.
+GeoJSON for Nav2's route server, GraphML, tmap2 for topological_navigation.
+
+GeoJSON: nodes are points, edges are lines along the cells that they were found in (the route server
+itself drives straight from node to node). Edges are directed there, so each of ours is written in
+both directions; ids are unsigned and unique over nodes and edges; metadata are flat and without
+nulls, on which its reader would throw. Lengths and clearances are in m everywhere.
 """
 
 import json
@@ -42,7 +44,10 @@ def write_graph(path: Path, topology: TopologicalMap) -> None:
 
 
 def writer_of(path: Path) -> Callable[[Path, TopologicalMap], None]:
-    """What writes the format that a file's name asks for. Raises InputError where the name has no known ending."""
+    """What writes the format that a file's name asks for.
+
+    Raises InputError where the name has no known ending.
+    """
     for ending, writer in _WRITERS.items():
         if path.name.endswith(ending) and path.name != ending:
             return writer
@@ -50,7 +55,9 @@ def writer_of(path: Path) -> Callable[[Path, TopologicalMap], None]:
 
 
 def write_geojson(path: Path, topology: TopologicalMap, frame_id: str = 'map') -> None:
-    """Write a topological map, whole or not at all; the way back along an edge has an id above all others.
+    """Write a topological map, whole or not at all.
+
+    The way back along an edge has an id above all others.
 
     Raises InputError where an id is too large for an unsigned int.
     """
@@ -66,7 +73,9 @@ def write_geojson(path: Path, topology: TopologicalMap, frame_id: str = 'map') -
 
 
 def write_graphml(path: Path, topology: TopologicalMap) -> None:
-    """Write an undirected GraphML graph: x, y, kind and clearance of nodes; length, clearance and path of edges.
+    """Write an undirected GraphML graph: x, y, kind and clearance of nodes.
+
+    Length, clearance and path of edges.
 
     A path is a list of points in one string: "x y x y ...".
     """
@@ -75,18 +84,36 @@ def write_graphml(path: Path, topology: TopologicalMap) -> None:
     for owner, names in keys.items():
         for name in names:
             kind = 'string' if name in ('kind', 'path') else 'double'
-            attributes = {'id': f'{owner}_{name}', 'for': owner, 'attr.name': name, 'attr.type': kind}
+            attributes = {
+                'id': f'{owner}_{name}',
+                'for': owner,
+                'attr.name': name,
+                'attr.type': kind,
+            }
             ElementTree.SubElement(root, 'key', attributes)
     graph = ElementTree.SubElement(root, 'graph', id='topology', edgedefault='undirected')
     for node in topology.nodes.values():
         at = ElementTree.SubElement(graph, 'node', id=str(node.id))
         x, y = _rounded(node.position[None])[0]
-        _put_data(at, 'node', {'x': x, 'y': y, 'kind': node.kind.name.lower(), 'clearance': round(node.clearance_m, 3)})
+        _put_data(
+            at,
+            'node',
+            {
+                'x': x,
+                'y': y,
+                'kind': node.kind.name.lower(),
+                'clearance': round(node.clearance_m, 3),
+            },
+        )
     for edge in topology.edges.values():
         ends = {'id': str(edge.id), 'source': str(edge.a), 'target': str(edge.b)}
         at = ElementTree.SubElement(graph, 'edge', ends)
         way = ' '.join(f'{x} {y}' for x, y in _rounded(edge.path))
-        values = {'length': round(edge.length_m, 3), 'clearance': round(edge.clearance_m, 3), 'path': way}
+        values = {
+            'length': round(edge.length_m, 3),
+            'clearance': round(edge.clearance_m, 3),
+            'path': way,
+        }
         _put_data(at, 'edge', values)
     ElementTree.indent(root)
     write_text(path, ElementTree.tostring(root, encoding='unicode', xml_declaration=True) + '\n')
@@ -98,7 +125,9 @@ def _put_data(element: ElementTree.Element, owner: str, values: dict[str, Any]) 
 
 
 def write_tmap2(path: Path, topology: TopologicalMap, frame_id: str = 'map') -> None:
-    """Write a map for topological_navigation (LCAS): waypoints named NODE<id>, edges both ways to be driven by Nav2.
+    """Write a map for topological_navigation (LCAS).
+
+    Waypoints named NODE<id>, edges both ways to be driven by Nav2.
 
     A robot counts as being at a node within its clearance.
     """
@@ -121,7 +150,9 @@ def write_tmap2(path: Path, topology: TopologicalMap, frame_id: str = 'map') -> 
             'rotation': _UPRIGHT,
             'translation': {'x': 0.0, 'y': 0.0, 'z': 0.0},
         },
-        'nodes': [_tmap2_node(node, edges[node.id], name, frame_id) for node in topology.nodes.values()],
+        'nodes': [
+            _tmap2_node(node, edges[node.id], name, frame_id) for node in topology.nodes.values()
+        ],
     }
     write_text(path, yaml.dump(content, Dumper=_WithoutAliases, sort_keys=False))
 
@@ -139,7 +170,9 @@ def _tmap2_edge(edge: Edge, start: int, end: int, copy: int) -> dict[str, Any]:
         'node': f'NODE{end}',
         'action': 'navigate_to_pose',
         'action_type': 'geometry_msgs/PoseStamped',
-        'goal': {'target_pose': {'header': {'frame_id': '$node.parent_frame'}, 'pose': '$node.pose'}},
+        'goal': {
+            'target_pose': {'header': {'frame_id': '$node.parent_frame'}, 'pose': '$node.pose'}
+        },
         'config': [],
         'fail_policy': 'fail',
         'fluid_navigation': True,
@@ -150,7 +183,9 @@ def _tmap2_edge(edge: Edge, start: int, end: int, copy: int) -> dict[str, Any]:
     }
 
 
-def _tmap2_node(node: Node, edges: list[dict[str, Any]], name: str, frame_id: str) -> dict[str, Any]:
+def _tmap2_node(
+    node: Node, edges: list[dict[str, Any]], name: str, frame_id: str
+) -> dict[str, Any]:
     x, y = _rounded(node.position[None])[0]
     angles = 2.0 * math.pi * (np.arange(_SIDES) + 0.5) / _SIDES
     corners = node.clearance_m * np.column_stack([np.cos(angles), np.sin(angles)])

@@ -1,4 +1,4 @@
-"""What a node tells of itself on /diagnostics once a second: rates, refusals, drops, step times, its state."""
+"""What a node tells on /diagnostics once a second: rates, refusals, drops, step times, state."""
 
 import math
 import re
@@ -18,7 +18,8 @@ _PERIOD_S = 1.0
 _QUIET_S = 10.0
 _RECENT_S = 10.0  # what was refused or dropped longer ago is over
 _STEPS = 200
-_REASONS = 8  # so many kinds of refusal are told apart on a topic: a broken sensor must not fill the memory
+# So many kinds of refusal are told apart on a topic: a broken sensor must not fill the memory.
+_REASONS = 8
 _NUMBER = re.compile(r'-?\b(\d+\.?\d*(e[+-]?\d+)?|inf|nan)\b')
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
@@ -58,8 +59,8 @@ class _Complaint:
 class Health:
     """Counts what happens to a node and publishes it, whatever the node's own time does.
 
-    A level above OK lasts as long as what causes it: refusals and drops until a second has gone by without any, a
-    `complaint` until its condition is no longer true.
+    A level above OK lasts as long as what causes it: refusals and drops until a second has gone by
+    without any, a `complaint` until its condition is no longer true.
     """
 
     def __init__(self, node: Node) -> None:
@@ -91,7 +92,7 @@ class Health:
         entry.last_at = monotonic()
 
     def refused(self, topic: str, reason: str) -> None:
-        """Count a message that could not be used, by kind of reason: the same words, whatever the numbers."""
+        """Count a message that could not be used, by reason: its words, whatever the numbers."""
         entry = self._topics.setdefault(topic, _Topic())
         kind = _NUMBER.sub('#', reason)
         if kind not in entry.refused and len(entry.refused) >= _REASONS:
@@ -150,7 +151,8 @@ class Health:
             if entry.last_at is None:
                 if monotonic() - entry.since < limit_s:
                     return ''  # nodes have just begun to find each other
-                return f'{topic}: nothing heard yet: {self._node.count_publishers(name)} publish {name}'
+                count = self._node.count_publishers(name)
+                return f'{topic}: nothing heard yet: {count} publish {name}'
             silent_s = monotonic() - entry.last_at
             return f'{topic}: silent for {silent_s:.0f} s' if silent_s > limit_s else ''
 
@@ -171,7 +173,9 @@ class Health:
                 f'{info.node_namespace.rstrip("/")}/{info.node_name}'
                 for info in self._node.get_publishers_info_by_topic(name)
             ]
-            return f'{len(nodes)} nodes publish {name}: {", ".join(sorted(nodes))}: stop all but one'
+            return (
+                f'{len(nodes)} nodes publish {name}: {", ".join(sorted(nodes))}: stop all but one'
+            )
 
         self.complain(ERROR, rivals)
 
@@ -194,14 +198,19 @@ class Health:
             worst = max(complaints, key=lambda complaint: complaint.level)
             level, message = (worst.level, worst.words) if worst.level > level else (level, message)
         elif level == OK and self._bad > self._told_bad:
-            level, message = WARN, f'{self._bad - self._told_bad} messages refused or dropped: {self._why()}'
+            level = WARN
+            message = f'{self._bad - self._told_bad} messages refused or dropped: {self._why()}'
         name = self._node.get_fully_qualified_name()
         pairs = [KeyValue(key=key, value=value) for key, value in self._told(now).items()]
-        return DiagnosticStatus(level=level, name=f'{name.lstrip("/")}: thinmap', message=message, values=pairs)
+        return DiagnosticStatus(
+            level=level, name=f'{name.lstrip("/")}: thinmap', message=message, values=pairs
+        )
 
     def _why(self) -> str:
         """Reasons of the last refusals and drops, the newest first; what is over is not told."""
-        reasons = [(e.refused_at, f'{topic}: {e.last_refusal}') for topic, e in self._topics.items()]
+        reasons = [
+            (e.refused_at, f'{topic}: {e.last_refusal}') for topic, e in self._topics.items()
+        ]
         reasons += [(at, cause) for cause, at in self._dropped_at.items()]
         recent = [reason for reason in reasons if monotonic() - reason[0] <= _RECENT_S]
         return '; '.join(text for _, text in sorted(recent, reverse=True))
@@ -221,5 +230,7 @@ class Health:
             told[f'dropped: {cause}'] = str(count)
         for step, times in self._steps.items():
             middle, most = np.percentile(times, [50.0, 95.0])
-            told[f'{step}: step time'] = f'median {middle:.1f} ms, p95 {most:.1f} ms, max {max(times):.1f} ms'
+            told[f'{step}: step time'] = (
+                f'median {middle:.1f} ms, p95 {most:.1f} ms, max {max(times):.1f} ms'
+            )
         return told

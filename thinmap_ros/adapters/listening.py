@@ -1,4 +1,7 @@
-"""How nodes listen: only while active, and what a message says wrongly is counted and said, and the node goes on."""
+"""How nodes listen.
+
+Only while active, and what a message says wrongly is counted and said, and the node goes on.
+"""
 
 from collections.abc import Callable
 from time import monotonic
@@ -15,8 +18,13 @@ _QUIET_S = 5.0
 _SILENT_S = 3.0
 
 
-def listen(node: LiveNode, kind: type, topic: str, take: Callable[[Any], None], profile: QoSProfile) -> None:
-    """Subscribe to a topic. A message that `take` refuses with InputError is dropped with a warning, throttled."""
+def listen(
+    node: LiveNode, kind: type, topic: str, take: Callable[[Any], None], profile: QoSProfile
+) -> None:
+    """Subscribe to a topic.
+
+    A message that `take` refuses with InputError is dropped with a warning, throttled.
+    """
     _Listener(node, kind, topic, take, profile)
 
 
@@ -24,7 +32,12 @@ class _Listener:
     """A subscription, and what is to be known of it."""
 
     def __init__(
-        self, node: LiveNode, kind: type, topic: str, take: Callable[[Any], None], profile: QoSProfile
+        self,
+        node: LiveNode,
+        kind: type,
+        topic: str,
+        take: Callable[[Any], None],
+        profile: QoSProfile,
     ) -> None:
         self._node, self._topic, self._take = node, topic, take
         self._is_scan = kind is LaserScan
@@ -55,7 +68,9 @@ class _Listener:
             self._guarded(message)
 
     def _is_left_over(self, last_ns: int) -> bool:
-        """Whether a message has waited here since before the clock was set back: it goes on where the stream was then.
+        """Whether a message has waited here since before the clock was set back.
+
+        It goes on where the stream was then.
 
         With the first that does not, the stream has arrived in the new time.
         """

@@ -1,4 +1,4 @@
-"""What all nodes that are left running on a robot have in common: states, health, pause, reset, time set back."""
+"""What all nodes left running on a robot share: states, health, pause, reset, time set back."""
 
 from collections.abc import Callable
 from time import monotonic
@@ -18,24 +18,30 @@ from thinmap_ros.adapters.services import answer
 from thinmap_ros.core.errors import ThinmapError, reason_of
 
 _KEEP_S = 0.5
-_LEAST_PAUSES, _LEAST_PAUSES_NEWS = 50.0, 10.0  # between two times of keeping, in times that it took
+# Between two times of keeping, in times that it took.
+_LEAST_PAUSES, _LEAST_PAUSES_NEWS = 50.0, 10.0
 RCLError = rclpy_implementation.RCLError
-_SET_BACK = JumpThreshold(min_forward=None, min_backward=Duration(seconds=-1.0), on_clock_change=False)
+_SET_BACK = JumpThreshold(
+    min_forward=None, min_backward=Duration(seconds=-1.0), on_clock_change=False
+)
 
 
 class LiveNode(LifecycleNode):
-    """A node with ROS's states (unconfigured, inactive, active, finalized), which it walks through by itself.
+    """A node that walks through ROS's states by itself: unconfigured, inactive, active, finalized.
 
-    Everything is set up on construction. Only an active node takes messages, works by its timers and takes goals; of a
-    latched topic it takes the last message when it becomes active. `begin_anew` forgets what was learned: on clean-up,
-    by the service ~/reset, and when the clock is set back (a bag or a simulation started again).
+    Everything is set up on construction. Only an active node takes messages, works by its timers
+    and takes goals; of a latched topic it takes the last message when it becomes active.
+    `begin_anew` forgets what was learned: on clean-up, by the service ~/reset, and when the clock
+    is set back (a bag or a simulation started again).
     """
 
     def __init__(self, name: str, recovers: bool = False) -> None:
         """Make a node; one that recovers calls `keep` once it is set up."""
         super().__init__(name)
         self._autostart = bool(
-            parameters.declare_value(self, 'autostart', True, 'become active at once; false: wait for transitions')
+            parameters.declare_value(
+                self, 'autostart', True, 'become active at once; false: wait for transitions'
+            )
         )
         self._recover_s = parameters.declare_recovery(self) if recovers else 0.0
         self.health = Health(self)
@@ -107,7 +113,7 @@ class LiveNode(LifecycleNode):
             self._recovery.forget()
 
     def keep_news(self) -> bool:
-        """Keep the state now, as others are about to hear of what is new in it; returns whether there was time to."""
+        """Keep the state before others hear what is new in it; returns whether there was time."""
         return self._keep(_LEAST_PAUSES_NEWS)
 
     def _keep(self, least_pauses: float = _LEAST_PAUSES) -> bool:
@@ -189,7 +195,9 @@ class LiveNode(LifecycleNode):
         service = self._service_change_state
         change = service.callback
 
-        def guarded(request: ChangeState.Request, response: ChangeState.Response) -> ChangeState.Response:
+        def guarded(
+            request: ChangeState.Request, response: ChangeState.Response
+        ) -> ChangeState.Response:
             try:
                 return change(request, response)
             except RCLError as error:
@@ -211,4 +219,6 @@ class LiveNode(LifecycleNode):
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self.is_paused = request.data
         self.health.pause(self.is_paused)
-        return answer(response, lambda: 'no new scans are taken' if self.is_paused else 'scans are taken')
+        return answer(
+            response, lambda: 'no new scans are taken' if self.is_paused else 'scans are taken'
+        )

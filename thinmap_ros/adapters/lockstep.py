@@ -1,4 +1,7 @@
-"""Time that waits for the nodes: with it a log or a simulation can run at any rate, and no scan is lost."""
+"""Time that waits for the nodes.
+
+With it a log or a simulation can run at any rate, and no scan is lost.
+"""
 
 from time import monotonic
 from typing import Any
@@ -22,7 +25,10 @@ _PATIENCE_S = 2.0
 
 
 class Lockstep:
-    """Waits, after each scan, for the message of a topic that carries the scan's stamp: what the scan led to."""
+    """Waits, after each scan, for the message of a topic that carries the scan's stamp.
+
+    What the scan led to.
+    """
 
     def __init__(self, node: Node, topic: str) -> None:
         self._node, self._topic = node, topic
@@ -55,5 +61,8 @@ class Lockstep:
         return True
 
     def _on_message(self, message: Any) -> None:
-        if self._awaited_ns is not None and messages.stamp_ns(message.header.stamp) >= self._awaited_ns:
+        if (
+            self._awaited_ns is not None
+            and messages.stamp_ns(message.header.stamp) >= self._awaited_ns
+        ):
             self._awaited_ns = None

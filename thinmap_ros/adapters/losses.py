@@ -6,9 +6,10 @@ _LONGEST_GAP_NS = 5_000_000_000  # whoever says nothing for longer was silent
 
 
 class Losses:
-    """Counts by the numbers that the publisher gives its messages, and by their stamps, which are evenly spaced.
+    """Counts by the numbers that a publisher gives its messages, and by their evenly spaced stamps.
 
-    Either alone is not enough: numbers of two publishers are mixed up, and a sensor that was silent has lost nothing.
+    Either alone is not enough: numbers of two publishers are mixed up, and a sensor that was silent
+    has lost nothing.
     """
 
     def __init__(self) -> None:
@@ -18,8 +19,8 @@ class Losses:
     def came(self, stamp_ns: int, number: int | None) -> tuple[int, int]:
         """Take note of a message and of its number, None where the middleware gives none.
 
-        Returns how many between it and the last one were lost on the way, and how many more are missing: never sent, or
-        without numbers nobody knows.
+        Returns how many between it and the last one were lost on the way, and how many more are
+        missing: never sent, or without numbers nobody knows.
         """
         step_ns, self._last_ns = stamp_ns - self._last_ns, stamp_ns
         skipped, self._last_number = (number or 0) - self._last_number - 1, number or 0

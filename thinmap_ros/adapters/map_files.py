@@ -42,7 +42,8 @@ def write_map(stem: Path, patch: GridPatch) -> Path:
     image, description = stem.with_name(stem.name + '.pgm'), stem.with_name(stem.name + '.yaml')
     with written_aside(image) as aside:
         Image.fromarray(grey[::-1]).save(aside, format='PPM')
-        # The image takes its name last: where there is no room for both, the old map stays as it was.
+        # The image takes its name last: where there is no room for both, the old map stays as it
+        # was.
         write_text(description, yaml.safe_dump(_description(image.name, patch), sort_keys=False))
     return description
 
@@ -56,7 +57,8 @@ def _description(image: str, patch: GridPatch) -> dict[str, Any]:
         'origin': [round(frame.origin_x, 6), round(frame.origin_y, 6), 0.0],
         'negate': 0,
         'occupied_thresh': OCCUPIED_AT_LEAST / 100,
-        # Below the darkness of the grey for unknown (50/255): with 0.25, readers would take it for free.
+        # Below the darkness of the grey for unknown (50/255): with 0.25, readers would take it for
+        # free.
         'free_thresh': 0.196,
     }
 
@@ -87,7 +89,12 @@ def _image_of(path: Path, content: dict[str, Any], folder: Path | None) -> Path:
 
 
 def _number(
-    path: Path, content: dict[str, Any], key: str, low: float, high: float, default: float | None = None
+    path: Path,
+    content: dict[str, Any],
+    key: str,
+    low: float,
+    high: float,
+    default: float | None = None,
 ) -> float:
     value = content.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
@@ -161,7 +168,9 @@ def _cells(path: Path, image: Path, shades: _Shades) -> NDArray[np.int8]:
                     raise ValueError(f'{width} x {height} pixels: expected at most {_MOST_PIXELS}')
                 opened.load()
                 return _cells_of(opened, shades)
-    except Exception as error:  # Pillow's readers raise whatever a broken image makes them stumble over
+    except (
+        Exception
+    ) as error:  # Pillow's readers raise whatever a broken image makes them stumble over
         reason = reason_of(error)
         raise InputError(f'{image}: {reason}: expected an image that {path} names') from error
 

@@ -17,7 +17,10 @@ _REMOTE, _TEXT = '#999999', '#000000'
 
 
 def topology(message: TopologicalMap) -> MarkerArray:
-    """Edges as lines along their paths, nodes as spheres coloured by kind. Raises InputError as `topology_from`."""
+    """Edges as lines along their paths, nodes as spheres coloured by kind.
+
+    Raises InputError as `topology_from`.
+    """
     graph = messages.topology_from(message)
     edges = _marker(message.header, 'edges', Marker.LINE_LIST, _EDGE_M, colours.EDGE)
     for edge in graph.edges.values():
@@ -32,7 +35,7 @@ def topology(message: TopologicalMap) -> MarkerArray:
 
 
 def end_nodes(message: EndNodeArray) -> MarkerArray:
-    """End nodes as spheres, the paler the less sure their place is, the target's larger, with their probability.
+    """End nodes as spheres, the paler the less sure, the target's larger, with their probability.
 
     Raises InputError where a place or probability is no number.
     """
@@ -40,7 +43,13 @@ def end_nodes(message: EndNodeArray) -> MarkerArray:
     for node in message.end_nodes:
         checks.within(f'end node {node.node_id}', (node.position.x, node.position.y))
         checks.within(f'probability of end node {node.node_id}', (node.position_probability,), 1.0)
-        ball = _marker(message.header, 'end_nodes', Marker.SPHERE, _NODE_M * (2.0 if node.is_target else 1.2), _END)
+        ball = _marker(
+            message.header,
+            'end_nodes',
+            Marker.SPHERE,
+            _NODE_M * (2.0 if node.is_target else 1.2),
+            _END,
+        )
         ball.id, ball.color.a = len(markers), 0.3 + 0.7 * node.position_probability
         ball.pose.position = _point(node.position.x, node.position.y, _NODE_Z)
         text = _marker(message.header, 'probabilities', Marker.TEXT_VIEW_FACING, _TEXT_M, _TEXT)
@@ -51,7 +60,10 @@ def end_nodes(message: EndNodeArray) -> MarkerArray:
 
 
 def line_features(message: LineFeatureArray) -> MarkerArray:
-    """Line features, those of the local area in another colour. Raises InputError where an end is no number."""
+    """Line features, those of the local area in another colour.
+
+    Raises InputError where an end is no number.
+    """
     lines = _marker(message.header, 'lines', Marker.LINE_LIST, _LINE_M, colours.ESTIMATE)
     for feature in message.features:
         ends = (feature.start, feature.end)
@@ -62,15 +74,20 @@ def line_features(message: LineFeatureArray) -> MarkerArray:
 
 
 def _shown(markers: list[Marker]) -> MarkerArray:
-    """Markers in place of all that were shown before; lists without points are left out, as RViz complains of them."""
+    """Markers in place of all shown before; lists without points are left out: RViz complains."""
     lists = (Marker.LINE_LIST, Marker.SPHERE_LIST)
     return MarkerArray(
-        markers=[Marker(action=Marker.DELETEALL), *(m for m in markers if m.type not in lists or m.points)]
+        markers=[
+            Marker(action=Marker.DELETEALL),
+            *(m for m in markers if m.type not in lists or m.points),
+        ]
     )
 
 
 def _marker(header: Header, namespace: str, kind: int, size_m: float, colour: str) -> Marker:
-    marker = Marker(header=header, ns=namespace, type=kind, action=Marker.ADD, color=_colour(colour))
+    marker = Marker(
+        header=header, ns=namespace, type=kind, action=Marker.ADD, color=_colour(colour)
+    )
     marker.scale.x = marker.scale.y = marker.scale.z = size_m
     marker.pose.orientation.w = 1.0
     return marker

@@ -38,7 +38,10 @@ SECOND_NS = 1_000_000_000
 def stamp_ns(stamp: Time) -> int:
     """Time message as whole nanoseconds. Raises InputError where it is no time."""
     if stamp.sec < 0 or stamp.nanosec >= SECOND_NS:
-        raise InputError(f'stamp {stamp.sec} s, {stamp.nanosec} ns: expected a time after 1970, ns below {SECOND_NS}')
+        raise InputError(
+            f'stamp {stamp.sec} s, {stamp.nanosec} ns: '
+            f'expected a time after 1970, ns below {SECOND_NS}'
+        )
     return int(stamp.sec) * SECOND_NS + int(stamp.nanosec)
 
 
@@ -63,18 +66,19 @@ def header(frame_id: str, ns: int) -> Header:
     return Header(frame_id=frame_id, stamp=time_msg(ns))
 
 
-def scan_from(
-    message: LaserScan, T_base_laser: Array, zero_is_no_return: bool = False
-) -> Scan:
+def scan_from(message: LaserScan, T_base_laser: Array, zero_is_no_return: bool = False) -> Scan:
     """Scan from its message, the laser's pose on the robot and what a range of 0 means for it.
 
-    Raises InputError as `Scan.create`, and where it has no beams, too many, or beams at angles that there are not.
+    Raises InputError as `Scan.create`, and where it has no beams, too many, or beams at angles that
+    there are not.
     """
     count = len(message.ranges)
     if not 0 < count <= checks.MOST_BEAMS:
         raise InputError(f'{count} beams: expected 1 to {checks.MOST_BEAMS}')
     last = message.angle_min + message.angle_increment * (count - 1)
-    checks.within('angle of the first or last beam', (message.angle_min, last), checks.LARGEST_ANGLE_RAD)
+    checks.within(
+        'angle of the first or last beam', (message.angle_min, last), checks.LARGEST_ANGLE_RAD
+    )
     return Scan.create(
         stamp_ns(message.header.stamp),
         np.frombuffer(message.ranges, dtype=np.float32),
@@ -124,7 +128,9 @@ def pose_from(message: Pose) -> Array:
 
 def pose_msg(T: Array) -> Pose:
     """Planar pose (3,) as a message."""
-    return Pose(position=Point(x=float(T[0]), y=float(T[1])), orientation=quaternion_msg(float(T[2])))
+    return Pose(
+        position=Point(x=float(T[0]), y=float(T[1])), orientation=quaternion_msg(float(T[2]))
+    )
 
 
 def pose_stamped_msg(T: Array, frame_id: str, ns: int) -> PoseStamped:
@@ -132,7 +138,9 @@ def pose_stamped_msg(T: Array, frame_id: str, ns: int) -> PoseStamped:
     return PoseStamped(header=header(frame_id, ns), pose=pose_msg(T))
 
 
-def pose_with_covariance_msg(T: Array, covariance: Array, frame_id: str, ns: int) -> PoseWithCovarianceStamped:
+def pose_with_covariance_msg(
+    T: Array, covariance: Array, frame_id: str, ns: int
+) -> PoseWithCovarianceStamped:
     """Planar pose (3,) with its covariance (3, 3) over x, y, theta."""
     message = PoseWithCovarianceStamped(header=header(frame_id, ns))
     message.pose.pose = pose_msg(T)
@@ -143,7 +151,10 @@ def pose_with_covariance_msg(T: Array, covariance: Array, frame_id: str, ns: int
 
 
 def covariance_from(message: PoseWithCovarianceStamped) -> Array:
-    """Covariance (3, 3) over x, y, theta. Raises InputError where it is none: not finite, or below 0."""
+    """Covariance (3, 3) over x, y, theta.
+
+    Raises InputError where it is none: not finite, or below 0.
+    """
     full = np.asarray(message.pose.covariance, dtype=np.float64).reshape(6, 6)
     part = full[np.ix_((0, 1, 5), (0, 1, 5))]
     checks.within('covariance', part.ravel().tolist())
@@ -153,7 +164,9 @@ def covariance_from(message: PoseWithCovarianceStamped) -> Array:
     return part
 
 
-def odometry_msg(T: Array, velocity: tuple[float, float], frames: tuple[str, str], ns: int) -> Odometry:
+def odometry_msg(
+    T: Array, velocity: tuple[float, float], frames: tuple[str, str], ns: int
+) -> Odometry:
     """Odometry: pose (3,), (v m/s, w rad/s), (frame, child frame)."""
     message = Odometry(header=header(frames[0], ns), child_frame_id=frames[1])
     message.pose.pose = pose_msg(T)
@@ -179,7 +192,9 @@ def transform_msg(T: Array, frame_id: str, child_frame_id: str, ns: int) -> Tran
 def path_msg(points: Array, frame_id: str, ns: int) -> Path:
     """Path through points (N, 2) or poses (N, 3)."""
     poses = points if points.shape[1] == 3 else np.column_stack([points, np.zeros(len(points))])
-    return Path(header=header(frame_id, ns), poses=[pose_stamped_msg(T, frame_id, ns) for T in poses])
+    return Path(
+        header=header(frame_id, ns), poses=[pose_stamped_msg(T, frame_id, ns) for T in poses]
+    )
 
 
 def trajectory_msg(stamps_ns: list[int], poses: Array, frame_id: str, ns: int) -> Path:
@@ -197,7 +212,7 @@ def trajectory_from(message: Path) -> tuple[NDArray[np.int64], Array]:
 
 
 def grid_msg(patch: GridPatch, frame_id: str, ns: int, corrected_ns: int = 0) -> OccupancyGrid:
-    """Map message of a patch; corrected_ns: stamp of the trajectory by which its grid was last drawn anew."""
+    """Map message; corrected_ns: stamp of the trajectory by which its grid was last drawn anew."""
     message = OccupancyGrid(header=header(frame_id, ns))
     message.info.map_load_time = time_msg(corrected_ns)
     message.info.resolution = patch.frame.resolution
@@ -212,7 +227,8 @@ def grid_msg(patch: GridPatch, frame_id: str, ns: int, corrected_ns: int = 0) ->
 def patch_from(message: OccupancyGrid) -> GridPatch:
     """Patch of a map message.
 
-    Raises InputError where size and data do not fit, the map is turned, or its cells or their size make no sense.
+    Raises InputError where size and data do not fit, the map is turned, or its cells or their size
+    make no sense.
     """
     info = message.info
     # The message carries a float32; 0.1 has to be the same 0.1 on both sides.
@@ -220,8 +236,9 @@ def patch_from(message: OccupancyGrid) -> GridPatch:
     size_fits = len(message.data) == info.width * info.height
     if not size_fits or not checks.FINEST_M <= resolution <= checks.COARSEST_M:
         raise InputError(
-            f'map of {info.width} x {info.height} cells of {resolution} m with {len(message.data)} values: '
-            f'expected a value for each cell, and cells of {checks.FINEST_M} to {checks.COARSEST_M} m'
+            f'map of {info.width} x {info.height} cells of {resolution} m '
+            f'with {len(message.data)} values: expected a value for each cell, '
+            f'and cells of {checks.FINEST_M} to {checks.COARSEST_M} m'
         )
     origin = pose_from(info.origin)
     if abs(origin[2]) > 1e-6:
@@ -242,7 +259,10 @@ def topology_msg(topology: TopologicalMap, frame_id: str, ns: int) -> Topologica
 
 def _node_msg(node: Node) -> TopologicalNode:
     return TopologicalNode(
-        id=node.id, kind=int(node.kind), position=Point(x=node.x, y=node.y), clearance_m=node.clearance_m
+        id=node.id,
+        kind=int(node.kind),
+        position=Point(x=node.x, y=node.y),
+        clearance_m=node.clearance_m,
     )
 
 
@@ -260,23 +280,34 @@ def _edge_msg(edge: Edge) -> TopologicalEdge:
 def topology_from(message: TopologicalMapMsg) -> TopologicalMap:
     """Topological map of a message.
 
-    Raises InputError where a kind is unknown, an edge leads to no node, a number is given twice, or one is no number.
+    Raises InputError where a kind is unknown, an edge leads to no node, a number is given twice, or
+    one is no number.
     """
     checks.unique('nodes', [n.id for n in message.nodes])
     checks.unique('edges', [e.id for e in message.edges])
     known = {n.id for n in message.nodes}
     for node in message.nodes:
         if node.kind not in list(NodeKind):
-            raise InputError(f'node {node.id}: kind {node.kind}: expected one of {[int(kind) for kind in NodeKind]}')
+            raise InputError(
+                f'node {node.id}: kind {node.kind}: '
+                f'expected one of {[int(kind) for kind in NodeKind]}'
+            )
         checks.within(f'node {node.id}', (node.position.x, node.position.y, node.clearance_m))
     for edge in message.edges:
         if not {edge.node_a, edge.node_b} <= known:
-            raise InputError(f'edge {edge.id} from node {edge.node_a} to {edge.node_b}: expected nodes of this map')
-        checks.within(f'edge {edge.id}', (edge.length_m, edge.clearance_m, *(c for p in edge.path for c in (p.x, p.y))))
+            raise InputError(
+                f'edge {edge.id} from node {edge.node_a} to {edge.node_b}: '
+                'expected nodes of this map'
+            )
+        checks.within(
+            f'edge {edge.id}',
+            (edge.length_m, edge.clearance_m, *(c for p in edge.path for c in (p.x, p.y))),
+        )
         if not edge.path:
             raise InputError(f'edge {edge.id}: a path without points')
     nodes = [
-        Node(n.id, NodeKind(n.kind), n.position.x, n.position.y, float(n.clearance_m)) for n in message.nodes
+        Node(n.id, NodeKind(n.kind), n.position.x, n.position.y, float(n.clearance_m))
+        for n in message.nodes
     ]
     edges = [
         Edge(e.id, e.node_a, e.node_b, _points(e.path), float(e.length_m), float(e.clearance_m))

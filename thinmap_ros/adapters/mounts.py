@@ -1,4 +1,7 @@
-"""Where lasers sit on a robot: static transforms, chained in space and laid down on the floor plan."""
+"""Where lasers sit on a robot.
+
+Static transforms, chained in space and laid down on the floor plan.
+"""
 
 import dataclasses
 import math
@@ -16,21 +19,29 @@ _LARGEST_TILT_DEG = 15.0
 
 
 def rotation_matrix(q: Any) -> Array:
-    """Rotation (3, 3) of a quaternion with fields x, y, z, w. Raises InputError where its norm is not 1."""
+    """Rotation (3, 3) of a quaternion with fields x, y, z, w.
+
+    Raises InputError where its norm is not 1.
+    """
     norm = math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
     if not abs(norm - 1.0) < 0.01:
         raise InputError(f'quaternion ({q.x}, {q.y}, {q.z}, {q.w}): expected norm 1, not {norm}')
     x, y, z, w = q.x, q.y, q.z, q.w
-    return np.array([
-        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
-        [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
-        [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
-    ])
+    return np.array(
+        [
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
+            [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
+            [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
+        ]
+    )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Mount:
-    """A laser on its robot: T_base_laser (3,) and whether it hangs upside down, its beams running clockwise."""
+    """A laser on its robot.
+
+    T_base_laser (3,) and whether it hangs upside down, its beams running clockwise.
+    """
 
     T_base_laser: Array
     upside_down: bool
@@ -41,7 +52,9 @@ class Mount:
             return dataclasses.replace(scan, T_base_laser=self.T_base_laser)
         last = scan.angle_min_rad + scan.angle_increment_rad * (scan.ranges_m.size - 1)
         ranges = np.ascontiguousarray(scan.ranges_m[::-1])
-        return dataclasses.replace(scan, ranges_m=ranges, angle_min_rad=-last, T_base_laser=self.T_base_laser)
+        return dataclasses.replace(
+            scan, ranges_m=ranges, angle_min_rad=-last, T_base_laser=self.T_base_laser
+        )
 
 
 class StaticTransforms:
@@ -61,10 +74,14 @@ class StaticTransforms:
         translation = np.array([moved.x, moved.y, moved.z], dtype=np.float64)
         checks.within(f'transform to {shown(message.child_frame_id)}', translation.tolist())
         rotation = rotation_matrix(message.transform.rotation)
-        self._parents[_plain(message.child_frame_id)] = (_plain(message.header.frame_id), rotation, translation)
+        self._parents[_plain(message.child_frame_id)] = (
+            _plain(message.header.frame_id),
+            rotation,
+            translation,
+        )
 
     def mount(self, laser_frame: str, base_frame: str) -> Mount | None:
-        """Mount of a laser, or None where no chain of transforms leads from its frame to the robot's.
+        """Mount of a laser, or None where no transforms lead from its frame to the robot's.
 
         Raises InputError where it is tilted: its scans are no floor plan then.
         """

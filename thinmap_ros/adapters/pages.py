@@ -12,7 +12,10 @@ _RELEASE_BYTES = 4e6
 
 
 def give_back_pages() -> Callable[[], None]:
-    """Kernels that only a real message calls for bring the compiler back: what gives its pages back, now and then."""
+    """Kernels that only a real message calls for bring the compiler back.
+
+    What gives its pages back, now and then.
+    """
     looked_at, least = monotonic(), _shared_bytes()
 
     def look() -> None:
@@ -33,10 +36,12 @@ def _shared_bytes() -> int:
 
 
 def release_compiler_pages() -> None:
-    """Give back the memory pages of the kernels' compiler: its library, some 100 MB, is idle once they are loaded.
+    """Give back the memory pages of the kernels' compiler.
 
-    Only mappings without a page of the process's own are dropped: the system reads them again from the library's
-    file whenever they are needed. Where there is no /proc, nothing happens.
+    Its library, some 100 MB, is idle once they are loaded.
+
+    Only mappings without a page of the process's own are dropped: the system reads them again from
+    the library's file whenever they are needed. Where there is no /proc, nothing happens.
     """
     gc.collect()
     smaps = Path('/proc/self/smaps')

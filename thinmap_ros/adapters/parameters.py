@@ -1,4 +1,7 @@
-"""Config dataclasses of core <-> declared ROS parameters: one home for each default, seen from ROS."""
+"""Config dataclasses of core <-> declared ROS parameters.
+
+One home for each default, seen from ROS.
+"""
 
 import dataclasses
 from collections.abc import Callable, Collection, Iterator
@@ -6,7 +9,12 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any, Generic, TypeVar
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -22,10 +30,11 @@ def declare(
     changed: Callable[[AnyConfig], None] | None = None,
     live: Collection[str] | None = None,
 ) -> AnyConfig:
-    """Declare each field of a config as a parameter of the node, and return the config as it was set.
+    """Declare each field of a config as a parameter of the node; return the config as it was set.
 
-    All are read-only, but where `changed` is given: then those named in `live` (None: all) can be set at run time, and
-    `changed` gets the new config. A setting that the config refuses is refused with its reason.
+    All are read-only, but where `changed` is given: then those named in `live` (None: all) can be
+    set at run time, and `changed` gets the new config. A setting that the config refuses is refused
+    with its reason.
     Raises ConfigError where a value is outside its range or of the wrong type.
     """
     names = {field.name for field in dataclasses.fields(config)}
@@ -35,8 +44,11 @@ def declare(
         descriptor = _descriptor(field, read_only=field.name not in free)
         try:
             values[field.name] = node.declare_parameter(field.name, field.default, descriptor).value
-        except Exception as error:  # rclpy has a class of its own for each way in which a value can be wrong
-            raise ConfigError(f'parameter {field.name} of node {node.get_name()}: {error}') from error
+        except Exception as error:
+            # rclpy has a class of its own for each way in which a value can be wrong.
+            raise ConfigError(
+                f'parameter {field.name} of node {node.get_name()}: {error}'
+            ) from error
     current = config(**values)
     if changed is not None:
         _Changes(node, current, free, changed)
@@ -54,7 +66,9 @@ class _Changes(Generic[AnyConfig]):
         node.add_post_set_parameters_callback(self._take)
 
     def _with(self, given: list[Parameter]) -> AnyConfig:
-        values = {parameter.name: parameter.value for parameter in given if parameter.name in self._free}
+        values = {
+            parameter.name: parameter.value for parameter in given if parameter.name in self._free
+        }
         return dataclasses.replace(self._current, **values)
 
     def _check(self, given: list[Parameter]) -> SetParametersResult:
@@ -84,22 +98,33 @@ def declare_value(node: Node, name: str, default: Any, description: str) -> Any:
 
 def declare_session(node: Node) -> str:
     """Declare the parameter `session` and return its value."""
-    return str(declare_value(node, 'session', '', 'path STEM of a saved session to go on from; empty: begin anew'))
+    return str(
+        declare_value(
+            node, 'session', '', 'path STEM of a saved session to go on from; empty: begin anew'
+        )
+    )
 
 
 def declare_recovery(node: Node) -> float:
     """Declare the parameter `recover_s` and return its value."""
     return float(
-        declare_value(node, 'recover_s', 30.0, 'killed and started again within so many s, go on from there; 0: never')
+        declare_value(
+            node,
+            'recover_s',
+            30.0,
+            'killed and started again within so many s, go on from there; 0: never',
+        )
     )
 
 
 def check_unknown(node: Node) -> None:
-    """Raise ConfigError where a parameter was given that the node does not have: a typo must not go unseen.
+    """Raise ConfigError where a parameter was given that the node does not have.
 
-    Where several nodes share a process, a parameter may be meant for another one: the last of them raises.
+    A typo must not go unseen. Where several nodes share a process, a parameter may be meant for
+    another one: the last of them raises.
     """
-    given = set(node._parameter_overrides)  # rclpy has no public way to see what was given but never declared
+    # rclpy has no public way to see what was given but never declared.
+    given = set(node._parameter_overrides)
     known = {name for name in node._parameters if not name.startswith('qos_overrides')}
     shared = _SHARED.get()
     if shared is not None:
@@ -112,7 +137,10 @@ def check_unknown(node: Node) -> None:
     else:
         names = str(node.get_name())
     if unknown := sorted(given - known):
-        raise ConfigError(f'node {names} has no parameter {", ".join(unknown)}; it has: {", ".join(sorted(known))}')
+        raise ConfigError(
+            f'node {names} has no parameter {", ".join(unknown)}; '
+            f'it has: {", ".join(sorted(known))}'
+        )
 
 
 @dataclasses.dataclass
@@ -139,7 +167,8 @@ def shared_by(count: int) -> Iterator[None]:
 
 
 def _descriptor(field: 'dataclasses.Field[Any]', read_only: bool) -> ParameterDescriptor:
-    description, low, high, choices = (field.metadata[k] for k in ('description', 'low', 'high', 'choices'))
+    keys = ('description', 'low', 'high', 'choices')
+    description, low, high, choices = (field.metadata[k] for k in keys)
     descriptor = ParameterDescriptor(description=description, read_only=read_only)
     if choices is not None:
         descriptor.additional_constraints = 'one of: ' + ', '.join(choices)
@@ -148,5 +177,6 @@ def _descriptor(field: 'dataclasses.Field[Any]', read_only: bool) -> ParameterDe
     if isinstance(field.default, int):
         descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=1)]
     elif isinstance(field.default, float):
-        descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
+        allowed = FloatingPointRange(from_value=float(low), to_value=float(high))
+        descriptor.floating_point_range = [allowed]
     return descriptor

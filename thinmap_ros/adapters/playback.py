@@ -1,4 +1,7 @@
-"""Which messages of a bag are due, in a time that is told: it runs, stands still, goes by steps, or begins again."""
+"""Which messages of a bag are due, in a time that is told.
+
+It runs, stands still, goes by steps, or begins again.
+"""
 
 from collections.abc import Iterator
 
@@ -18,8 +21,9 @@ def is_scan(message: RawMessage) -> bool:
 class Playback:
     """Goes through chosen topics of a bag from an offset on.
 
-    What is latched is known from the start: `known_before` holds the last message before the offset of each such
-    topic, and all static transforms of the bag, as where the sensors sit is known before anything is sensed.
+    What is latched is known from the start: `known_before` holds the last message before the offset
+    of each such topic, and all static transforms of the bag, as where the sensors sit is known
+    before anything is sensed.
     """
 
     def __init__(self, bag: Bag, topics: set[str], start_offset_s: float, loop: bool) -> None:
@@ -48,7 +52,10 @@ class Playback:
         self.played_ns += int(ns)
 
     def due(self) -> RawMessage | None:
-        """Next message whose time has come; None where there is none yet. After the last one a loop begins again."""
+        """Next message whose time has come; None where there is none yet.
+
+        After the last one a loop begins again.
+        """
         if self._next is None or self._next.log_ns > self.played_ns:
             return None
         return self._take()

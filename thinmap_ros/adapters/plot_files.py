@@ -1,4 +1,7 @@
-"""Figures of `plots` drawn with matplotlib, as PNG and SVG; the same figure gives the same bytes."""
+"""Figures of `plots` drawn with matplotlib, as PNG and SVG.
+
+The same figure gives the same bytes.
+"""
 
 from functools import singledispatch
 from pathlib import Path
@@ -30,7 +33,12 @@ if TYPE_CHECKING:
 _DPI, _PAD = 110, 0.1  # dots and margin, in inches
 _MANY = 2000  # points: more make an SVG needlessly large
 # Text stays text in an SVG, and its ids do not change from run to run.
-_SETTINGS: Any = {'svg.fonttype': 'none', 'svg.hashsalt': 'thinmap', 'font.size': 10.0, 'path.simplify': True}
+_SETTINGS: Any = {
+    'svg.fonttype': 'none',
+    'svg.hashsalt': 'thinmap',
+    'font.size': 10.0,
+    'path.simplify': True,
+}
 
 
 def write_plot(folder: Path, plot: Plot) -> None:
@@ -45,7 +53,9 @@ def write_plot(folder: Path, plot: Plot) -> None:
         figure = Figure(figsize=(width * plot.columns, height * rows + 0.3), dpi=_DPI)
         figure.set_layout_engine('constrained', h_pad=_PAD, w_pad=_PAD)
         FigureCanvasAgg(figure)
-        for axes, panel in zip(figure.subplots(rows, plot.columns, squeeze=False).flat, plot.panels, strict=False):
+        for axes, panel in zip(
+            figure.subplots(rows, plot.columns, squeeze=False).flat, plot.panels, strict=False
+        ):
             _draw_panel(axes, panel)
         for axes in figure.axes[len(plot.panels) : rows * plot.columns]:
             axes.set_visible(False)
@@ -64,11 +74,19 @@ def _add_legend(figure: 'Figure', where: str) -> None:
         return
     handles = {}
     for axes in figure.axes:
-        handles.update({label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)})
+        handles.update(
+            {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+        )
     if handles:
         columns = max(1, min(len(handles), int(figure.get_figwidth() / 1.7)))
-        figure.legend(handles.values(), handles.keys(), loc='outside lower center', ncols=columns, fontsize=8,
-                      frameon=False)  # fmt: skip
+        figure.legend(
+            handles.values(),
+            handles.keys(),
+            loc='outside lower center',
+            ncols=columns,
+            fontsize=8,
+            frameon=False,
+        )
 
 
 def _draw_panel(axes: 'Axes', panel: Panel) -> None:
@@ -101,16 +119,24 @@ def _draw(layer: object, axes: 'Axes') -> None:
 @_draw.register(Curve)
 def _(layer: Curve, axes: 'Axes') -> None:
     axes.plot(
-        *layer.points.T, color=_colour(layer.colour), linestyle=layer.style or 'none', marker=layer.marker,
-        linewidth=layer.width, markersize=layer.size, label=layer.label or None, rasterized=len(layer.points) > _MANY,
-    )  # fmt: skip
+        *layer.points.T,
+        color=_colour(layer.colour),
+        linestyle=layer.style or 'none',
+        marker=layer.marker,
+        linewidth=layer.width,
+        markersize=layer.size,
+        label=layer.label or None,
+        rasterized=len(layer.points) > _MANY,
+    )
 
 
 @_draw.register(Band)
 def _(layer: Band, axes: 'Axes') -> None:
     label = layer.label or None
     colour = _colour(layer.colour)
-    axes.fill_between(layer.x, layer.low, layer.high, color=colour, alpha=0.25, linewidth=0.0, label=label)
+    axes.fill_between(
+        layer.x, layer.low, layer.high, color=colour, alpha=0.25, linewidth=0.0, label=label
+    )
 
 
 @_draw.register(Bars)
@@ -119,7 +145,9 @@ def _(layer: Bars, axes: 'Axes') -> None:
     axes.barh(places, layer.values, color=[_colour(c) for c in layer.colours], height=0.7)
     axes.set_yticks(places, layer.names)
     for place, value in zip(places, layer.values, strict=True):
-        axes.text(0.0, place, f' {value:.3g}', va='center', fontsize=8, color='white', fontweight='bold')
+        axes.text(
+            0.0, place, f' {value:.3g}', va='center', fontsize=8, color='white', fontweight='bold'
+        )
 
 
 @_draw.register(Segments)
@@ -127,9 +155,12 @@ def _(layer: Segments, axes: 'Axes') -> None:
     from matplotlib.collections import LineCollection
 
     lines = LineCollection(
-        list(layer.ends.reshape(-1, 2, 2)), colors=_colour(layer.colour), linewidths=layer.width,
-        label=layer.label or None, zorder=3,
-    )  # fmt: skip
+        list(layer.ends.reshape(-1, 2, 2)),
+        colors=_colour(layer.colour),
+        linewidths=layer.width,
+        label=layer.label or None,
+        zorder=3,
+    )
     axes.add_collection(lines)
     axes.autoscale_view()
 
@@ -138,9 +169,20 @@ def _(layer: Segments, axes: 'Axes') -> None:
 def _(layer: Words, axes: 'Axes') -> None:
     for at, word in zip(layer.at, layer.words, strict=True):
         axes.annotate(
-            word, at, annotation_clip=True, xytext=(4, 4), textcoords='offset points', fontsize=layer.size, zorder=8,
-            bbox={'boxstyle': 'round,pad=0.1', 'facecolor': 'white', 'edgecolor': 'none', 'alpha': 0.75},
-        )  # fmt: skip
+            word,
+            at,
+            annotation_clip=True,
+            xytext=(4, 4),
+            textcoords='offset points',
+            fontsize=layer.size,
+            zorder=8,
+            bbox={
+                'boxstyle': 'round,pad=0.1',
+                'facecolor': 'white',
+                'edgecolor': 'none',
+                'alpha': 0.75,
+            },
+        )
 
 
 @_draw.register(Robots)
@@ -148,7 +190,14 @@ def _(layer: Robots, axes: 'Axes') -> None:
     from matplotlib.patches import Circle
 
     for k, (x, y, theta) in enumerate(layer.poses):
-        disc = Circle((x, y), layer.radius_m, facecolor='none', edgecolor=colours.ESTIMATE, linewidth=2.0, zorder=7)
+        disc = Circle(
+            (x, y),
+            layer.radius_m,
+            facecolor='none',
+            edgecolor=colours.ESTIMATE,
+            linewidth=2.0,
+            zorder=7,
+        )
         disc.set_label(layer.label if k == 0 else '')
         axes.add_patch(disc)
         tip = (x + 1.8 * layer.radius_m * np.cos(theta), y + 1.8 * layer.radius_m * np.sin(theta))
@@ -171,9 +220,14 @@ def _(layer: Raster, axes: 'Axes') -> None:
     right, top = frame.origin_x + cols * frame.resolution, frame.origin_y + rows * frame.resolution
     low, high = layer.limits or (float(np.nanmin(layer.values)), float(np.nanmax(layer.values)))
     image = axes.imshow(
-        layer.values, cmap='viridis', vmin=low, vmax=high, origin='lower', interpolation='nearest',
+        layer.values,
+        cmap='viridis',
+        vmin=low,
+        vmax=high,
+        origin='lower',
+        interpolation='nearest',
         extent=(frame.origin_x, right, frame.origin_y, top),
-    )  # fmt: skip
+    )
     figure = axes.get_figure()
     if figure is not None:
         figure.colorbar(image, ax=axes, label=layer.label, shrink=0.8)

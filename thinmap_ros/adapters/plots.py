@@ -13,7 +13,10 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """A line through points (N, 2), or markers alone where the style is empty; colour: a number in the palette."""
+    """A line through points (N, 2), or markers alone where the style is empty.
+
+    Colour: a number in the palette.
+    """
 
     points: Array
     label: str = ''
@@ -81,7 +84,10 @@ class MapLayer:
 
 @dataclass(frozen=True, eq=False)
 class GraphLayer:
-    """A topological map: the paths of its edges, and its nodes with a shape and a colour for each kind."""
+    """A topological map.
+
+    The paths of its edges, and its nodes with a shape and a colour for each kind.
+    """
 
     topology: TopologicalMap
     size: float = 5.0
@@ -102,7 +108,10 @@ Layer = Curve | Band | Bars | Segments | Words | Robots | MapLayer | GraphLayer 
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """Layers over one pair of axes; plan: x and y are metres of the same length. limits: (x, x, y, y)."""
+    """Layers over one pair of axes; plan: x and y are metres of the same length.
+
+    limits: (x, x, y, y).
+    """
 
     layers: Sequence[Layer]
     title: str = ''
@@ -116,7 +125,10 @@ class Panel:
 
 @dataclass(frozen=True, eq=False)
 class Plot:
-    """A figure: the name of its files, what it shows, and its panels, row by row; panel_inches: width and height."""
+    """A figure: the name of its files, what it shows, and its panels, row by row.
+
+    panel_inches: width and height.
+    """
 
     name: str
     caption: str

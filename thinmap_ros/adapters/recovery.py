@@ -1,4 +1,7 @@
-"""What a node leaves for itself in case it is killed: one that is started again soon goes on from there."""
+"""What a node leaves for itself in case it is killed.
+
+One that is started again soon goes on from there.
+"""
 
 import os
 import stat

@@ -14,7 +14,8 @@ _TILT = 0.25  # so much of its height the eye stands south of what it looks at
 _MARGIN = 1.15
 _WIDTHS, _HEIGHTS = (5, 2), (3, 3, 3, 3, 3)
 LEGEND = """**orange** end node, with its position probability; **grey** it will stay ·
-**dark blue** branch · **amber** corner · **green** skeleton · **blue** features of the local area, its nodes ringed;
+**dark blue** branch · **amber** corner · **green** skeleton ·
+**blue** features of the local area, its nodes ringed;
 **pale blue** other features · **red dots** scan · **pink** pose and its 95 % · **sky** truth ·
 **yellow** path and target · **purple** samples"""
 # Each curve: name in the legend and colour, by plot.
@@ -22,7 +23,10 @@ _PLOTS = {
     'error': ('pose: error, 2 sigma', ('position, cm', 'heading, deg', '2 sigma, cm')),
     'progress': ('progress', ('coverage, %', 'distance, m')),
     'count': ('counts', ('features', 'local features', 'matched lines', 'nodes', 'end nodes left')),
-    'step': ('step times, ms', ('localizer', 'map update', 'graph update', 'explorer', 'global localization')),
+    'step': (
+        'step times, ms',
+        ('localizer', 'map update', 'graph update', 'explorer', 'global localization'),
+    ),
 }
 
 
@@ -34,16 +38,24 @@ def entity(plot: str, curve: str) -> str:
 def style(rr: Any) -> dict[str, Any]:
     """Names and colours of all curves, by entity."""
     return {
-        entity(plot, curve): rr.SeriesLines(colors=[colours.rgb(colour)], names=[curve], widths=[1.5])
+        entity(plot, curve): rr.SeriesLines(
+            colors=[colours.rgb(colour)], names=[curve], widths=[1.5]
+        )
         for plot, (_, curves) in _PLOTS.items()
         for curve, colour in zip(curves, colours.PALETTE, strict=False)
     }
 
 
 def blueprint(rr: Any, patch: GridPatch, trails: list[str]) -> Any:
-    """Layout in which the whole of a map is in view; trails (entities) are shown from their beginning."""
+    """Layout in which the whole of a map is in view.
+
+    Trails (entities) are shown from their beginning.
+    """
     rrb = rr.blueprint
-    past = {'start': rrb.TimeRangeBoundary.infinite(), 'end': rrb.TimeRangeBoundary.cursor_relative()}
+    past = {
+        'start': rrb.TimeRangeBoundary.infinite(),
+        'end': rrb.TimeRangeBoundary.cursor_relative(),
+    }
     scene = rrb.Spatial3DView(
         origin='map',
         name='map',
@@ -53,7 +65,9 @@ def blueprint(rr: Any, patch: GridPatch, trails: list[str]) -> Any:
         overrides={name: rrb.VisibleTimeRanges(timeline=TIMELINE, **past) for name in trails},
     )
     corner = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop)
-    everything = rrb.TimeRange(start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite())
+    everything = rrb.TimeRange(
+        start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite()
+    )
     axis = rrb.TimeAxis(view_range=everything)
     curves = [
         rrb.TimeSeriesView(origin=f'plots/{plot}', name=name, plot_legend=corner, axis_x=axis)
@@ -78,6 +92,9 @@ def _eye(rrb: Any, patch: GridPatch) -> Any:
     """A little south of straight above."""
     rows, cols = patch.shape
     frame = patch.frame
-    x, y = frame.origin_x + frame.resolution * cols / 2.0, frame.origin_y + frame.resolution * rows / 2.0
+    x = frame.origin_x + frame.resolution * cols / 2.0
+    y = frame.origin_y + frame.resolution * rows / 2.0
     height = _MARGIN * size_m(patch) / (2.0 * math.tan(_HALF_VIEW))
-    return rrb.EyeControls3D(position=(x, y - _TILT * height, height), look_target=(x, y, 0.0), eye_up=(0.0, 0.0, 1.0))
+    return rrb.EyeControls3D(
+        position=(x, y - _TILT * height, height), look_target=(x, y, 0.0), eye_up=(0.0, 0.0, 1.0)
+    )

@@ -1,4 +1,7 @@
-"""Where a view's recording goes: a file, a viewer that is started for it, or both. rerun is the extra `viewer`."""
+"""Where a view's recording goes: a file, a viewer that is started for it, or both.
+
+rerun is the extra `viewer`.
+"""
 
 import contextlib
 import importlib.util
@@ -42,7 +45,8 @@ class Streams:
     def __init__(self) -> None:
         self._rr = library()
         self.viewer: subprocess.Popen[bytes] | None = None
-        # A stream of its own for each: a viewer that hangs must not keep the file from being finished.
+        # A stream of its own for each: a viewer that hangs must not keep the file from being
+        # finished.
         self._files: list[tuple[Path, Any]] = []
         self._shown: list[Any] = []
         self._first_ns: int | None = None
@@ -60,16 +64,35 @@ class Streams:
 
         Raises InputError where there is no screen, or no viewer.
         """
-        if sys.platform == 'linux' and not (os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY')):
+        if sys.platform == 'linux' and not (
+            os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY')
+        ):
             raise InputError('no screen for the viewer: neither DISPLAY nor WAYLAND_DISPLAY is set')
         port = _free_port()
-        command = [viewer_program(), '--bind', _LOCALHOST, '--port', str(port), '--memory-limit', _MEMORY_LIMIT]
-        command += ['--server-memory-limit', _SERVER_MEMORY_LIMIT, '--hide-welcome-screen', '--expect-data-soon']
+        command = [
+            viewer_program(),
+            '--bind',
+            _LOCALHOST,
+            '--port',
+            str(port),
+            '--memory-limit',
+            _MEMORY_LIMIT,
+        ]
+        command += [
+            '--server-memory-limit',
+            _SERVER_MEMORY_LIMIT,
+            '--hide-welcome-screen',
+            '--expect-data-soon',
+        ]
         try:
             self.viewer = subprocess.Popen(command, stdin=subprocess.DEVNULL)
         except OSError as error:
-            raise InputError(f'{command[0]}: {error.strerror or error}: expected the viewer of rerun') from error
-        self._shown.append(self._new_stream(self._rr.GrpcSink(f'rerun+http://{_LOCALHOST}:{port}/proxy')))
+            raise InputError(
+                f'{command[0]}: {error.strerror or error}: expected the viewer of rerun'
+            ) from error
+        self._shown.append(
+            self._new_stream(self._rr.GrpcSink(f'rerun+http://{_LOCALHOST}:{port}/proxy'))
+        )
 
     def at(self, ns: int) -> None:
         """Set the time of what is logged next; the first one is 0."""
@@ -89,7 +112,10 @@ class Streams:
             stream.send_blueprint(blueprint)
 
     def close(self) -> None:
-        """Finish the file and end the viewer. Raises InputError where the file could not be written to its end."""
+        """Finish the file and end the viewer.
+
+        Raises InputError where the file could not be written to its end.
+        """
         try:
             for path, stream in self._files:
                 _finish(path, stream)

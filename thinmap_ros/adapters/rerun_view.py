@@ -16,7 +16,8 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
 
-# What is large is drawn at most so often, and a trail grows by steps of so much: a recording grows slowly.
+# What is large is drawn at most so often, and a trail grows by steps of so much: a recording grows
+# slowly.
 _PERIOD_NS = 1_000_000_000
 _TRAIL_STEP_M = 0.05
 _OUTGROWN = 1.4  # a map so much larger than what was in view is brought into view
@@ -29,22 +30,34 @@ _STAYS = (125, 125, 125)  # an end node of which is sure that it will stay
 _TRAILS = {'estimate': colours.ESTIMATE, 'truth': colours.TRUTH, 'odometry': _ODOMETRY}
 # Heights above the map, so that what matters more covers what matters less, m.
 _Z = {
-    'skeleton': 0.02, 'lines': 0.03, 'samples': 0.035, 'odometry': 0.04, 'truth': 0.05, 'estimate': 0.06, 'plan': 0.07,
-    'local_area': 0.075, 'nodes': 0.08, 'target': 0.085, 'end_nodes': 0.09, 'covariance': 0.11, 'robot': 0.12,
+    'skeleton': 0.02,
+    'lines': 0.03,
+    'samples': 0.035,
+    'odometry': 0.04,
+    'truth': 0.05,
+    'estimate': 0.06,
+    'plan': 0.07,
+    'local_area': 0.075,
+    'nodes': 0.08,
+    'target': 0.085,
+    'end_nodes': 0.09,
+    'covariance': 0.11,
+    'robot': 0.12,
 }
 
 
 class View(NullView):
     """A recording in rerun: to a file, to a viewer that it opens, or to both. Close it.
 
-    Memory is bounded: what is large is logged at most once a second, a scan replaces the one before, a trail is made of
-    steps, and the viewer has a limit beyond which it forgets the oldest.
+    Memory is bounded: what is large is logged at most once a second, a scan replaces the one
+    before, a trail is made of steps, and the viewer has a limit beyond which it forgets the oldest.
     """
 
     def __init__(self, recording: Path | None = None, spawn: bool = False) -> None:
         """Begin a recording.
 
-        Raises InputError where rerun is missing, the file cannot be written, or there is no screen for the viewer.
+        Raises InputError where rerun is missing, the file cannot be written, or there is no screen
+        for the viewer.
         """
         self._rr = library()
         self._streams = Streams()
@@ -61,18 +74,26 @@ class View(NullView):
         self._log_static()
 
     def grid(self, ns: int, patch: GridPatch) -> None:
-        """Show the map, at most once a second; where it has outgrown what is in view, the eye moves away."""
+        """Show the map, at most once a second.
+
+        Where it has outgrown what is in view, the eye moves away.
+        """
 
         def draw() -> None:
             rr, frame = self._rr, patch.frame
             rows, cols = patch.shape
-            form = rr.components.ImageFormat(width=cols, height=rows, color_model='L', channel_datatype='U8')
+            form = rr.components.ImageFormat(
+                width=cols, height=rows, color_model='L', channel_datatype='U8'
+            )
             origin = [frame.origin_x, frame.origin_y, 0.0]
             # An image's first row is its upper one.
             data = np.ascontiguousarray(_shade(patch)[::-1]).tobytes()
-            grey = rr.components.Colormap.Grayscale  # else a shade passes for a measurement, in all colours
+            # Else a shade passes for a measurement, in all colours.
+            grey = rr.components.Colormap.Grayscale
             size = frame.resolution
-            image = rr.GridMap(data=data, format=form, cell_size=size, translation=origin, colormap=grey)
+            image = rr.GridMap(
+                data=data, format=form, cell_size=size, translation=origin, colormap=grey
+            )
             self._log('map/grid', image)
 
         self._patch = patch
@@ -83,19 +104,30 @@ class View(NullView):
     def scan(self, ns: int, scan: Scan) -> None:
         """Show a scan where the robot is; it replaces the one before."""
         self._at(ns)
-        points = self._rr.Points3D(_lifted(scan.points_base(), 0.0), colors=[rgb(_SCAN)], radii=[self._px(1.8)])
+        points = self._rr.Points3D(
+            _lifted(scan.points_base(), 0.0), colors=[rgb(_SCAN)], radii=[self._px(1.8)]
+        )
         self._log('map/robot/scan', points)
 
     def pose(self, ns: int, T_map_base: Array, covariance: Array) -> None:
-        """Show the robot with its covariance (3, 3) over x, y, theta; its way becomes the trail `estimate`."""
+        """Show the robot with its covariance (3, 3) over x, y, theta.
+
+        Its way becomes the trail `estimate`.
+        """
         rr = self._rr
         self._at(ns)
         x, y, theta = (float(v) for v in T_map_base)
         turn = rr.RotationAxisAngle(axis=[0.0, 0.0, 1.0], radians=theta)
         self._log('map/robot', rr.Transform3D(translation=[x, y, _Z['robot']], rotation=turn))
-        outline = [_ellipse(T_map_base[:2], covariance[:2, :2]), _wedge(T_map_base, float(covariance[2, 2]))]
+        outline = [
+            _ellipse(T_map_base[:2], covariance[:2, :2]),
+            _wedge(T_map_base, float(covariance[2, 2])),
+        ]
         strips = [_lifted(points, _Z['covariance']) for points in outline]
-        self._log('map/covariance', rr.LineStrips3D(strips, colors=[rgb(colours.ESTIMATE)], radii=[self._px(1.0)]))
+        self._log(
+            'map/covariance',
+            rr.LineStrips3D(strips, colors=[rgb(colours.ESTIMATE)], radii=[self._px(1.0)]),
+        )
         self.trail(ns, 'estimate', T_map_base)
 
     def trail(self, ns: int, name: str, T_map_base: Array) -> None:
@@ -107,7 +139,10 @@ class View(NullView):
         self._trail_ends[name] = here
         self._at(ns)
         step = _lifted(np.array([before, here]), _Z[name])
-        self._log(f'map/{name}', self._rr.LineStrips3D([step], colors=[rgb(_TRAILS[name])], radii=[self._px(1.2)]))
+        self._log(
+            f'map/{name}',
+            self._rr.LineStrips3D([step], colors=[rgb(_TRAILS[name])], radii=[self._px(1.2)]),
+        )
 
     def topology(self, ns: int, topology: TopologicalMap) -> None:
         """Show the skeleton, and the nodes coloured by kind, at most once a second."""
@@ -124,7 +159,7 @@ class View(NullView):
         self._now_and_then('topology', ns, draw)
 
     def end_nodes(self, ns: int, places: Array, probabilities: Array) -> None:
-        """Show end nodes at places (N, 2) with their position probabilities (N,), at most once a second."""
+        """Show end nodes (N, 2) with their position probabilities (N,), at most once a second."""
         labels = [f'{p:.2f}' for p in probabilities]
 
         def draw() -> None:
@@ -140,7 +175,10 @@ class View(NullView):
         self._now_and_then('end_nodes', ns, draw)
 
     def lines(self, ns: int, segments: Array, local: NDArray[np.bool_]) -> None:
-        """Show line features by their ends (N, 2, 2), and which (N,) are in the local area, at most once a second."""
+        """Show line features by their ends (N, 2, 2), at most once a second.
+
+        local (N,): which are in the local area.
+        """
 
         def draw() -> None:
             strips = [_lifted(ends, _Z['lines']) for ends in segments]
@@ -156,7 +194,9 @@ class View(NullView):
         def draw() -> None:
             colour = [*rgb(_LOCAL_NODE), 90]
             points = _lifted(places, _Z['local_area'])
-            self._log('map/local_area', self._rr.Points3D(points, colors=[colour], radii=[self._px(9.0)]))
+            self._log(
+                'map/local_area', self._rr.Points3D(points, colors=[colour], radii=[self._px(9.0)])
+            )
 
         self._now_and_then('local_area', ns, draw)
 
@@ -165,7 +205,10 @@ class View(NullView):
 
         def draw() -> None:
             points = _lifted(places, _Z['samples'])
-            self._log('map/samples', self._rr.Points3D(points, colors=[rgb(_SAMPLE)], radii=[self._px(1.2)]))
+            self._log(
+                'map/samples',
+                self._rr.Points3D(points, colors=[rgb(_SAMPLE)], radii=[self._px(1.2)]),
+            )
 
         self._now_and_then('samples', ns, draw)
 
@@ -174,7 +217,10 @@ class View(NullView):
 
         def draw() -> None:
             strips = [_lifted(points, _Z['plan'])] if len(points) > 1 else []
-            self._log('map/plan', self._rr.LineStrips3D(strips, colors=[rgb(_PLAN)], radii=[self._px(2.0)]))
+            self._log(
+                'map/plan',
+                self._rr.LineStrips3D(strips, colors=[rgb(_PLAN)], radii=[self._px(2.0)]),
+            )
 
         self._now_and_then('plan', ns, draw)
 
@@ -185,7 +231,9 @@ class View(NullView):
             return
         self._target = places
         self._at(ns)
-        points = self._rr.Points3D(_lifted(places, _Z['target']), colors=[rgb(_TARGET)], radii=[self._px(10.0)])
+        points = self._rr.Points3D(
+            _lifted(places, _Z['target']), colors=[rgb(_TARGET)], radii=[self._px(10.0)]
+        )
         self._log('map/target', points)
 
     def number(self, ns: int, plot: str, curve: str, value: float) -> None:
@@ -200,8 +248,9 @@ class View(NullView):
             self._streams.viewer.wait()
 
     def close(self) -> None:
-        """Draw what still waits, finish the file, which then opens with the whole map in view, and end the viewer.
+        """Draw what still waits, finish the file, and end the viewer.
 
+        The file then opens with the whole map in view.
         Raises InputError where the file could not be written to its end.
         """
         self._finish_drawing()
@@ -220,14 +269,18 @@ class View(NullView):
         self._log('map/robot/heading', arrow, static=True)
         body = rr.Points3D([[0.0, 0.0, 0.0]], colors=[[0, 0, 0]], radii=[self._px(6.0)])
         self._log('map/robot/body', body, static=True)
-        self._log('legend', rr.TextDocument(rerun_layout.LEGEND, media_type='text/markdown'), static=True)
+        self._log(
+            'legend', rr.TextDocument(rerun_layout.LEGEND, media_type='text/markdown'), static=True
+        )
         for entity, style in rerun_layout.style(rr).items():
             self._log(entity, style, static=True)
 
     def _frame(self, patch: GridPatch) -> None:
         """Bring the whole of a map into view."""
         self._framed_m = rerun_layout.size_m(patch)
-        self._streams.send_blueprint(rerun_layout.blueprint(self._rr, patch, [f'map/{name}' for name in _TRAILS]))
+        self._streams.send_blueprint(
+            rerun_layout.blueprint(self._rr, patch, [f'map/{name}' for name in _TRAILS])
+        )
 
     def _px(self, pixels: float) -> Any:
         """A radius in pixels: to be seen in a room and in a hall."""
@@ -261,7 +314,9 @@ def _shade(patch: GridPatch) -> NDArray[np.uint8]:
 
 def _faded(colour: str, share: float) -> list[int]:
     """A colour, the closer to grey the larger the share, 0 to 1."""
-    return [round((1.0 - share) * c + share * grey) for c, grey in zip(rgb(colour), _STAYS, strict=True)]
+    return [
+        round((1.0 - share) * c + share * grey) for c, grey in zip(rgb(colour), _STAYS, strict=True)
+    ]
 
 
 def _lifted(points: Array, z: float) -> NDArray[np.float32]:
@@ -281,5 +336,8 @@ def _wedge(T_map_base: Array, variance: float) -> Array:
     """Outline (3, 2) of where the robot looks, given the variance of its heading."""
     x, y, theta = T_map_base.tolist()
     spread = min(_HEADING_SIGMAS * np.sqrt(max(variance, 0.0)), np.pi)
-    ends = [(x + _HEADING_M * np.cos(theta + s), y + _HEADING_M * np.sin(theta + s)) for s in (-spread, spread)]
+    ends = [
+        (x + _HEADING_M * np.cos(theta + s), y + _HEADING_M * np.sin(theta + s))
+        for s in (-spread, spread)
+    ]
     return np.array([ends[0], (x, y), ends[1]])

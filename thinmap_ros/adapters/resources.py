@@ -24,8 +24,13 @@ def world_path(name: str) -> Path:
 
 
 def message_definitions(package: str) -> dict[str, str]:
-    """Texts of a package's message definitions by full name, for bags. Empty where the package is not there."""
-    folder = Path(__file__).parents[2] / package / 'msg'  # from the source tree: not installed, or no ROS sourced
+    """Texts of a package's message definitions by full name, for bags.
+
+    Empty where the package is not there.
+    """
+    folder = (
+        Path(__file__).parents[2] / package / 'msg'
+    )  # from the source tree: not installed, or no ROS sourced
     with contextlib.suppress(PackageNotFoundError, OSError):
         folder = Path(get_package_share_directory(package)) / 'msg'
     return {f'{package}/msg/{file.stem}': file.read_text() for file in sorted(folder.glob('*.msg'))}
@@ -33,6 +38,8 @@ def message_definitions(package: str) -> dict[str, str]:
 
 def _worlds() -> dict[str, Path]:
     folders = [Path(__file__).parents[2] / 'worlds']
-    with contextlib.suppress(PackageNotFoundError, OSError):  # from the source tree: not installed, or no ROS sourced
+    with contextlib.suppress(
+        PackageNotFoundError, OSError
+    ):  # from the source tree: not installed, or no ROS sourced
         folders.append(Path(get_package_share_directory('thinmap_ros')) / 'worlds')
     return {file.stem: file for folder in folders for file in folder.glob('*.yaml')}

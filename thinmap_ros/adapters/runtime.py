@@ -20,16 +20,20 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def run(make_node: Callable[[], Node]) -> None:
-    """Make a node and spin it until SIGINT or SIGTERM; the process ends with 0, or 2 on a refused start.
+    """Make a node and spin it until SIGINT or SIGTERM.
 
-    A node may have a method `start()`, called once it is made, and a method `close()`: it is called last, whatever
-    ended the node.
+    The process ends with 0, or 2 on a refused start.
+
+    A node may have a method `start()`, called once it is made, and a method `close()`: it is called
+    last, whatever ended the node.
     """
     run_all([make_node])
 
 
 def run_all(make_nodes: Sequence[Callable[[], Node]]) -> None:
-    """Make several nodes and spin them in one process, each in a thread of its own; the first to end ends all.
+    """Make several nodes and spin them in one process, each in a thread of its own.
+
+    The first to end ends all.
 
     Parameters that are given to all of them need to be known to one of them.
     """
@@ -58,10 +62,13 @@ def run_all(make_nodes: Sequence[Callable[[], Node]]) -> None:
 
 def _spin(nodes: list[Node]) -> None:
     asked = threading.Event()
-    # Only noted: an exception raised just anywhere comes out of compiled code as another error, or gets lost in it.
+    # Only noted: an exception raised just anywhere comes out of compiled code as another error, or
+    # gets lost in it.
     _on_signals(lambda number, frame: asked.set())
     failures: list[BaseException] = []
-    others = [threading.Thread(target=_spin_one, args=(node, asked, failures)) for node in nodes[1:]]
+    others = [
+        threading.Thread(target=_spin_one, args=(node, asked, failures)) for node in nodes[1:]
+    ]
     for thread in others:
         thread.start()
     try:
@@ -75,7 +82,10 @@ def _spin(nodes: list[Node]) -> None:
 
 
 def _spin_one(
-    node: Node, asked: threading.Event, failures: list[BaseException], each_time: Callable[[], None] = lambda: None
+    node: Node,
+    asked: threading.Event,
+    failures: list[BaseException],
+    each_time: Callable[[], None] = lambda: None,
 ) -> None:
     executor = SingleThreadedExecutor()
     executor.add_node(node)

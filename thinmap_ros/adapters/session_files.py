@@ -1,8 +1,8 @@
-"""Saved sessions: grid and topological map with all that their builders know, so that work goes on where it was.
+"""Saved sessions, to go on from: grid and topological map with all that their builders know.
 
-A session has a path STEM: STEM.grid.npz holds the grid, STEM.pgm and STEM.yaml the same as a map_server map,
-STEM.topology.npz the graph with its ids, STEM.features.npz the localizer's features and map of points, and
-STEM.exploration.npz what an exploration of it has learned.
+A session has a path STEM: STEM.grid.npz holds the grid, STEM.pgm and STEM.yaml the same as a
+map_server map, STEM.topology.npz the graph with its ids, STEM.features.npz the localizer's features
+and map of points, and STEM.exploration.npz what an exploration of it has learned.
 """
 
 from collections.abc import Mapping
@@ -32,8 +32,9 @@ ENDINGS = (_GRID_END, _MAP_END, '.pgm', *_KEPT, *(end + _OLD for end in _KEPT))
 
 
 def stem_of(path: str) -> Path:
-    """STEM of a session, given as such or as one of its files; absolute, as nodes may have been started elsewhere.
+    """STEM of a session, given as such or as one of its files.
 
+    It is absolute, as nodes may have been started elsewhere.
     Raises InputError where it names nothing.
     """
     for end in (_GRID_END, _TOPOLOGY_END, _EXPLORATION_END, _FEATURES_END, _MAP_END, '.pgm'):
@@ -45,7 +46,10 @@ def stem_of(path: str) -> Path:
 
 
 def save_grid(path: str, grid: OccupancyGrid) -> str:
-    """Write STEM.pgm, STEM.yaml and STEM.grid.npz; returns what was written. Raises OSError where that fails."""
+    """Write STEM.pgm, STEM.yaml and STEM.grid.npz; returns what was written.
+
+    Raises OSError where that fails.
+    """
     stem = stem_of(path)
     # All files are written before any takes its name: a full disk leaves the old session as it was.
     with written_aside(_named(stem, _GRID_END)) as aside:
@@ -85,11 +89,16 @@ def save_topology(path: str, builder: TopologyBuilder) -> str:
 def load_topology(
     path: str, config: TopologyConfig | None = None, resolution_m: float | None = None
 ) -> TopologyBuilder:
-    """Read STEM.topology.npz. Raises InputError as `read_topology`, and where its cells are not of the resolution."""
+    """Read STEM.topology.npz.
+
+    Raises InputError as `read_topology`, and where its cells are not of the resolution.
+    """
     file = _named(stem_of(path), _TOPOLOGY_END)
     builder = read_topology(file, config)
     if None not in (resolution_m, builder.resolution_m) and builder.resolution_m != resolution_m:
-        raise InputError(f'{file}: made from {builder.resolution_m} m a cell: expected {resolution_m} m')
+        raise InputError(
+            f'{file}: made from {builder.resolution_m} m a cell: expected {resolution_m} m'
+        )
     return builder
 
 
@@ -101,7 +110,10 @@ def save_exploration(path: str, explorer: Explorer) -> str:
 
 
 def load_exploration(path: str, config: ExplorerConfig | None = None) -> Explorer | None:
-    """Read STEM.exploration.npz; None where the session has none. Raises InputError where it is broken."""
+    """Read STEM.exploration.npz; None where the session has none.
+
+    Raises InputError where it is broken.
+    """
     file = _named(stem_of(path), _EXPLORATION_END)
     if not _is_there(file):
         return None
@@ -119,7 +131,10 @@ def save_features(path: str, localizer: Localizer) -> str:
 
 
 def load_features(path: str, config: LocalizerConfig | None = None) -> Localizer | None:
-    """Read STEM.features.npz; None where the session has none. Raises InputError where it is broken."""
+    """Read STEM.features.npz; None where the session has none.
+
+    Raises InputError where it is broken.
+    """
     file = _named(stem_of(path), _FEATURES_END)
     if not _is_there(file):
         return None
@@ -135,19 +150,28 @@ def has_topology(path: str) -> bool:
 
 
 def set_topology_aside(path: str) -> str:
-    """Keep a graph that was saved with an earlier grid as STEM.topology.npz.old; returns what was done, or ''."""
+    """Keep a graph that was saved with an earlier grid as STEM.topology.npz.old.
+
+    Returns what was done, or ''.
+    """
     aside = _set_aside(path, _TOPOLOGY_END)
     return f'; the graph of an earlier grid is now {aside}' if aside else ''
 
 
 def set_exploration_aside(path: str) -> str:
-    """Keep what an exploration of an earlier grid has learned as STEM.exploration.npz.old; returns as above."""
+    """Keep what an exploration of an earlier grid has learned as STEM.exploration.npz.old.
+
+    Returns as above.
+    """
     aside = _set_aside(path, _EXPLORATION_END)
     return f'; what was learned of an earlier grid is now {aside}' if aside else ''
 
 
 def set_features_aside(path: str) -> str:
-    """Keep features that were saved with an earlier grid as STEM.features.npz.old; returns as above."""
+    """Keep features that were saved with an earlier grid as STEM.features.npz.old.
+
+    Returns as above.
+    """
     aside = _set_aside(path, _FEATURES_END)
     return f'; the features of an earlier grid are now {aside}' if aside else ''
 
@@ -163,7 +187,10 @@ def write_grid(path: Path, grid: OccupancyGrid) -> None:
 
 
 def read_grid(path: Path, config: OccupancyConfig | None = None) -> OccupancyGrid:
-    """Read a grid that `write_grid` wrote. Raises InputError where the file is none, or of another resolution."""
+    """Read a grid that `write_grid` wrote.
+
+    Raises InputError where the file is none, or of another resolution.
+    """
     try:
         return OccupancyGrid.from_state(_read(path, _GRID), config)
     except InputError as error:
@@ -171,12 +198,15 @@ def read_grid(path: Path, config: OccupancyConfig | None = None) -> OccupancyGri
 
 
 def write_topology(path: Path, builder: TopologyBuilder) -> None:
-    """Write the global map with its ids and what the builder remembers (NumPy archive), whole or not at all."""
+    """Write the global map, its ids and the builder's memory (NumPy archive), all or nothing."""
     _write(path, _TOPOLOGY, builder.state())
 
 
 def read_topology(path: Path, config: TopologyConfig | None = None) -> TopologyBuilder:
-    """Read a builder that `write_topology` wrote. Raises InputError where the file is none, or does not fit."""
+    """Read a builder that `write_topology` wrote.
+
+    Raises InputError where the file is none, or does not fit.
+    """
     try:
         return TopologyBuilder.from_state(_read(path, _TOPOLOGY), config)
     except InputError as error:

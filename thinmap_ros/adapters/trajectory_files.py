@@ -18,8 +18,8 @@ def write_tum(path: Path, stamps_ns: Sequence[int], poses: Sequence[Array]) -> N
     for ns, (x, y, theta) in zip(stamps_ns, poses, strict=True):
         half = theta / 2.0
         lines.append(
-            f'{ns // 1_000_000_000}.{ns % 1_000_000_000:09d} {x:.6f} {y:.6f} 0 0 0 {math.sin(half):.9f} '
-            f'{math.cos(half):.9f}\n'
+            f'{ns // 1_000_000_000}.{ns % 1_000_000_000:09d} {x:.6f} {y:.6f} 0 0 0 '
+            f'{math.sin(half):.9f} {math.cos(half):.9f}\n'
         )
     write_text(path, ''.join(lines))
 

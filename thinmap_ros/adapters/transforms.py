@@ -1,4 +1,7 @@
-"""Where the laser sits on the robot: from /tf_static, or from a parameter where the user chose so."""
+"""Where the laser sits on the robot.
+
+From /tf_static, or from a parameter where the user chose so.
+"""
 
 import numpy as np
 from rclpy.node import Node
@@ -18,14 +21,20 @@ _MOST_FRAMES = 1000
 class LaserMount:
     """The pose of each laser frame on the robot.
 
-    Looked up in the static transforms, as bags are read. A node whose robot publishes none is given the parameter
-    `laser_pose` [x m, y m, yaw rad]; it then holds for every frame. Nothing is ever assumed.
+    Looked up in the static transforms, as bags are read. A node whose robot publishes none is given
+    the parameter `laser_pose` [x m, y m, yaw rad]; it then holds for every frame. Nothing is ever
+    assumed.
     """
 
     def __init__(self, node: Node) -> None:
-        self._base_frame = str(parameters.declare_value(node, 'base_frame', 'base_link', 'frame of the robot'))
+        self._base_frame = str(
+            parameters.declare_value(node, 'base_frame', 'base_link', 'frame of the robot')
+        )
         given = parameters.declare_value(
-            node, 'laser_pose', '', 'laser on the robot as "x,y,yaw" (m, m, rad); empty: from /tf_static'
+            node,
+            'laser_pose',
+            '',
+            'laser on the robot as "x,y,yaw" (m, m, rad); empty: from /tf_static',
         )
         self._zero_is_no_return = bool(
             parameters.declare_value(
@@ -40,7 +49,9 @@ class LaserMount:
         self._transforms = StaticTransforms()
         self._mounts: dict[str, Mount] = {}
         if self._fixed is None:
-            node.create_subscription(TFMessage, '/tf_static', self._on_static, qos.STATIC_TRANSFORMS)
+            node.create_subscription(
+                TFMessage, '/tf_static', self._on_static, qos.STATIC_TRANSFORMS
+            )
 
     def scan(self, message: LaserScan) -> Scan:
         """Scan of a message, with the pose of its laser.
@@ -51,7 +62,8 @@ class LaserMount:
         if mount is None:
             raise InputError(
                 f'scan in frame {shown(message.header.frame_id)}: no static transform from '
-                f'"{self._base_frame}" to it; publish one on /tf_static or set the parameter laser_pose'
+                f'"{self._base_frame}" to it; publish one on /tf_static or set the parameter '
+                'laser_pose'
             )
         scan = messages.scan_from(message, mount.T_base_laser, self._zero_is_no_return)
         return mount.placed(scan)

@@ -12,7 +12,10 @@ _NAME = re.compile(r'([a-z]\w*)/msg/([A-Z]\w*)', re.ASCII)
 
 
 def message_class(type_name: str) -> Any:
-    """Class of a message type such as sensor_msgs/msg/LaserScan. Raises InputError where it is not installed."""
+    """Class of a message type such as sensor_msgs/msg/LaserScan.
+
+    Raises InputError where it is not installed.
+    """
     parts = _NAME.fullmatch(type_name)
     if parts is None:
         raise InputError(f'message type {checks.short(type_name)}: expected PACKAGE/msg/NAME')

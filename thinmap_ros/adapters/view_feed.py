@@ -27,21 +27,32 @@ _STEPS = {'map update', 'graph update', 'explorer', 'global localization'}
 class Feed:
     """Takes messages by topic and tells a view what they mean.
 
-    laser_pose gives T_base_laser (3,) of a laser's frame, or None as long as it is not known: its scans are not shown.
+    laser_pose gives T_base_laser (3,) of a laser's frame, or None as long as it is not known: its
+    scans are not shown.
     namespace: of the nodes whose step times are shown, as /diagnostics are of all robots.
     """
 
-    def __init__(self, view: NullView, laser_pose: Callable[[str], Array | None], namespace: str = '') -> None:
+    def __init__(
+        self, view: NullView, laser_pose: Callable[[str], Array | None], namespace: str = ''
+    ) -> None:
         self._view, self._laser_pose, self._namespace = view, laser_pose, namespace.strip('/')
         self._places: dict[int, Array] = {}
         self._T_odom_base: Array | None = None
         self._T_map_odom: Array | None = None
         self._pairs: StampMatcher[Array, Array] = StampMatcher()
         self._takers: dict[str, Callable[[int, Any], None]] = {
-            'map': self._on_map, 'scan': self._on_scan, 'pose': self._on_pose, 'odom': self._on_odometry,
-            'ground_truth': self._on_truth, 'topology': self._on_topology, 'end_nodes': self._on_end_nodes,
-            'line_features': self._on_lines, 'plan': self._on_plan, 'exploration_status': self._on_exploration,
-            'slam_status': self._on_slam, 'localization_samples': self._on_samples,
+            'map': self._on_map,
+            'scan': self._on_scan,
+            'pose': self._on_pose,
+            'odom': self._on_odometry,
+            'ground_truth': self._on_truth,
+            'topology': self._on_topology,
+            'end_nodes': self._on_end_nodes,
+            'line_features': self._on_lines,
+            'plan': self._on_plan,
+            'exploration_status': self._on_exploration,
+            'slam_status': self._on_slam,
+            'localization_samples': self._on_samples,
             'diagnostics': self._on_diagnostics,
         }
 
@@ -51,7 +62,10 @@ class Feed:
         return set(self._takers)
 
     def take(self, topic: str, message: Any) -> None:
-        """Tell the view of a message (ROS's class or rosbags'). Raises InputError where it makes no sense."""
+        """Tell the view of a message (ROS's class or rosbags').
+
+        Raises InputError where it makes no sense.
+        """
         try:
             self._takers[topic](bag_messages.stamp_ns(message), message)
         except ValueError as error:  # a kind of node that there is not, cells that are no rectangle
@@ -64,7 +78,8 @@ class Feed:
         T_base_laser = self._laser_pose(message.header.frame_id)
         if T_base_laser is None:
             return
-        angles, limits = (message.angle_min, message.angle_increment), (message.range_min, message.range_max)
+        angles = (message.angle_min, message.angle_increment)
+        limits = (message.range_min, message.range_max)
         self._view.scan(ns, Scan.create(ns, message.ranges, *angles, *limits, T_base_laser))
 
     def _on_pose(self, ns: int, message: Any) -> None:
@@ -95,7 +110,9 @@ class Feed:
         if pair is None:
             return
         difference = pair[0] - pair[1]
-        self._view.number(ns, 'error', 'position, cm', 100.0 * float(np.hypot(difference[0], difference[1])))
+        self._view.number(
+            ns, 'error', 'position, cm', 100.0 * float(np.hypot(difference[0], difference[1]))
+        )
         heading = abs(float(np.degrees(se2.wrap(float(difference[2])))))
         self._view.number(ns, 'error', 'heading, deg', heading)
 
@@ -107,7 +124,9 @@ class Feed:
 
     def _on_end_nodes(self, ns: int, message: Any) -> None:
         places = np.array([[n.position.x, n.position.y] for n in message.end_nodes]).reshape(-1, 2)
-        self._view.end_nodes(ns, places, np.array([float(n.position_probability) for n in message.end_nodes]))
+        self._view.end_nodes(
+            ns, places, np.array([float(n.position_probability) for n in message.end_nodes])
+        )
 
     def _on_lines(self, ns: int, message: Any) -> None:
         ends = [[[f.start.x, f.start.y], [f.end.x, f.end.y]] for f in message.features]
@@ -155,7 +174,8 @@ class Feed:
 def recording_from_bag(bag_path: Path, out_rrd: Path) -> None:
     """Write the .rrd of a bag of a run, whole or not at all.
 
-    Messages that make no sense are left out. Raises InputError where rerun is missing or the bag is none.
+    Messages that make no sense are left out. Raises InputError where rerun is missing or the bag is
+    none.
     """
     bag = Bag(bag_path)
     mounts = _static_transforms(bag)

@@ -22,7 +22,10 @@ class NullView:
         """Show a scan where the robot is; it replaces the one before."""
 
     def pose(self, ns: int, T_map_base: Array, covariance: Array) -> None:
-        """Show the robot with its covariance (3, 3) over x, y, theta; its way becomes the trail `estimate`."""
+        """Show the robot with its covariance (3, 3) over x, y, theta.
+
+        Its way becomes the trail `estimate`.
+        """
 
     def trail(self, ns: int, name: str, T_map_base: Array) -> None:
         """Lengthen the trail of this name: `estimate`, `truth` or `odometry`."""

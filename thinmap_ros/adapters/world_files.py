@@ -23,8 +23,9 @@ _FREE, _SOLID = 0, 100
 
 
 def read_world(path: Path) -> tuple[str, GridPatch, Array]:
-    """Name, map and start (3,), NaN: none given, of a world YAML (walls, solids, tour) or a map_server YAML (image).
+    """Name, map and start (3,), NaN: none given, of a YAML file.
 
+    The file is a world (walls, solids, tour) or a map_server map (image).
     Raises InputError naming the file, the key, the value and what was expected.
     """
     content = read_mapping(path, 'a world (walls, start) or a map (image, resolution, origin)')
@@ -32,8 +33,9 @@ def read_world(path: Path) -> tuple[str, GridPatch, Array]:
 
 
 def read_tour(path: Path) -> Array:
-    """Places (N, 2), m, that a world names for a tour, to be visited in this order and from the start on; may be none.
+    """Places (N, 2), m, that a world names for a tour; may be none.
 
+    They are to be visited in this order and from the start on.
     Raises InputError naming the file, the value and what was expected.
     """
     content = read_mapping(path, 'a world (walls, start) or a map (image, resolution, origin)')
@@ -79,7 +81,12 @@ def _points(path: Path, what: str, drawn: object, fewest: int) -> Array:
         points = np.asarray(drawn, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         points = np.empty((0, 0))
-    if points.ndim != 2 or points.shape[1:] != (2,) or len(points) < fewest or not np.isfinite(points).all():
+    if (
+        points.ndim != 2
+        or points.shape[1:] != (2,)
+        or len(points) < fewest
+        or not np.isfinite(points).all()
+    ):
         expected = f'expected at least {fewest} points [x, y]'
         raise InputError(f'{path}: {what}: {shown(drawn)}: {expected}')
     return points
@@ -94,7 +101,10 @@ def _of_drawing(path: Path, content: dict[str, Any]) -> tuple[str, GridPatch, Ar
     (thickness,) = _numbers(path, content, 'wall_thickness', 1)
     # Thinner walls let rays slip through between cells that touch at a corner only.
     if not 2.0 * resolution <= thickness <= 10.0:
-        raise InputError(f'{path}: wall_thickness: {thickness}: expected at least two cells ({2.0 * resolution} m)')
+        raise InputError(
+            f'{path}: wall_thickness: {thickness}: '
+            f'expected at least two cells ({2.0 * resolution} m)'
+        )
     walls, polygons = _polylines(path, content, 'walls', 2), _polylines(path, content, 'solids', 3)
     polygons += [_slab(a, b, thickness) for wall in walls for a, b in pairwise(wall)]
     if not polygons:
@@ -115,7 +125,10 @@ def _name(path: Path, content: dict[str, Any]) -> str:
 
 
 def _lattice(path: Path, points: Array, resolution: float) -> tuple[GridFrame, tuple[int, int]]:
-    """Frame and shape of a grid with room for all points; its lines go through the origin, as a map's do."""
+    """Frame and shape of a grid with room for all points.
+
+    Its lines go through the origin, as a map's do.
+    """
     farthest = float(np.abs(points).max())
     if farthest > FARTHEST_M:
         expected = f'expected at most {FARTHEST_M:g} m; is a point far off?'
@@ -123,14 +136,21 @@ def _lattice(path: Path, points: Array, resolution: float) -> tuple[GridFrame, t
     low = np.floor((points.min(axis=0) - _MARGIN_M) / resolution)
     cols, rows = np.ceil((points.max(axis=0) + _MARGIN_M) / resolution) - low
     if not rows * cols <= _MOST_CELLS:
-        raise InputError(f'{path}: {rows:.0f} x {cols:.0f} cells: expected at most {_MOST_CELLS}; is a point far off?')
+        raise InputError(
+            f'{path}: {rows:.0f} x {cols:.0f} cells: expected at most {_MOST_CELLS}; '
+            'is a point far off?'
+        )
     frame = GridFrame(float(low[0]) * resolution, float(low[1]) * resolution, resolution)
     return frame, (int(rows), int(cols))
 
 
 def _fill(cells: NDArray[np.int8], frame: GridFrame, polygon: Array) -> None:
-    """Make the cells solid whose centres lie in a polygon (N, 2): a ray from one crosses it an odd number of times."""
-    # A border that runs through centres would otherwise fall to either side by rounding: walls 4 to 6 cells wide.
+    """Make the cells solid whose centres lie in a polygon (N, 2).
+
+    A ray from such a centre crosses it an odd number of times.
+    """
+    # A border that runs through centres would otherwise fall to either side by rounding: walls 4 to
+    # 6 cells wide.
     polygon = polygon - _NUDGE_M
     low = np.maximum(frame.cells_of(polygon.min(axis=0))[0], 0)
     high = frame.cells_of(polygon.max(axis=0))[0] + 1
@@ -146,7 +166,10 @@ def _fill(cells: NDArray[np.int8], frame: GridFrame, polygon: Array) -> None:
 
 
 def _slab(a: Array, b: Array, thickness: float) -> Array:
-    """Corners (4, 2) of a wall from a to b, longer by half its thickness at both ends so that corners close."""
+    """Corners (4, 2) of a wall from a to b.
+
+    It is longer by half its thickness at both ends so that corners close.
+    """
     length = float(np.hypot(*(b - a)))
     along = (b - a) / length if length > 0.0 else np.array([1.0, 0.0])
     across = np.array([-along[1], along[0]]) * thickness / 2.0

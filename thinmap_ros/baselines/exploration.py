@@ -1,7 +1,8 @@
 """Exploration as others do it: which frontier, or which end node, next.
 
-All of them run on the same map, drive by the same navigator, choose anew once a second and as soon as what they drive
-to is seen, and stop when nothing is left to choose from. What differs is the choice.
+All of them run on the same map, drive by the same navigator, choose anew once a second and as soon
+as what they drive to is seen, and stop when nothing is left to choose from. What differs is the
+choice.
 """
 
 import math
@@ -33,7 +34,10 @@ _PROGRESS_M = 0.1
 
 @dataclass(eq=False)
 class _Progress:
-    """How near a place was while it was driven to, by the way there, m, and for how long it has been no nearer."""
+    """How near a place was while it was driven to, and for how long it has been no nearer.
+
+    nearest_m: by the way there.
+    """
 
     place: tuple[float, float]
     nearest_m: float
@@ -41,7 +45,7 @@ class _Progress:
 
 
 class _Patience:
-    """Gives up what comes no nearer while it is driven to, also if other places were driven to in between."""
+    """Gives up what comes no nearer while it is driven to, also if others came between."""
 
     def __init__(self, timeout_s: float) -> None:
         self._timeout_ns = 1e9 * timeout_s
@@ -82,7 +86,9 @@ class FrontierExplorer(ABC):
     def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
         """Cost of each frontier, (N,), from a pose (3,): the cheapest is next."""
 
-    def step(self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array) -> Decision:
+    def step(
+        self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
+    ) -> Decision:
         """Say where to go; see tools/explore_world.Strategy."""
         self.map.update(patch, scan, T_map_base)
         self._give_up_what_was_looked_at(T_map_base)
@@ -90,7 +96,9 @@ class FrontierExplorer(ABC):
             self._survey_ns, self._frame = scan.stamp_ns, self.map.borders.frame
             self._choose(T_map_base)
         self._nothing_left = self._nothing_left + 1 if self.target is None else 0
-        return _decision(topology, self.target, self._number, self._nothing_left >= _LOOKS, bool(self._failures))
+        return _decision(
+            topology, self.target, self._number, self._nothing_left >= _LOOKS, bool(self._failures)
+        )
 
     def fail_target(self, reason: str) -> None:
         """Remember where a target could not be reached."""
@@ -99,7 +107,11 @@ class FrontierExplorer(ABC):
         self.target = None
 
     def _is_due(self, stamp_ns: int) -> bool:
-        gone = self.target is None or self._frame != self.map.borders.frame or not self.map.is_open(self.target)
+        gone = (
+            self.target is None
+            or self._frame != self.map.borders.frame
+            or not self.map.is_open(self.target)
+        )
         return gone or stamp_ns - self._survey_ns >= _SURVEY_NS
 
     def _choose(self, T_map_base: Array) -> None:
@@ -112,29 +124,36 @@ class FrontierExplorer(ABC):
             if before is None or math.dist(before.middle, best.middle) > _SAME_PLACE_M:
                 self._number += 1
             near = before is not None and math.dist(before.place, best.place) < _AT_GOAL_M
-            # A goal that hardly moved stays where it is: the robot would otherwise set out anew once a second.
-            self.target = Frontier(best.cells, best.middle, before.place, best.way_m) if near and before else best
+            # A goal that hardly moved stays where it is: the robot would otherwise set out anew
+            # once a second.
+            if near and before:
+                best = Frontier(best.cells, best.middle, before.place, best.way_m)
+            self.target = best
 
     def _tries(self, frontier: Frontier) -> int:
         return sum(math.dist(frontier.place, place) <= _SAME_PLACE_M for place in self._failures)
 
     def _give_up_what_was_looked_at(self, T_map_base: Array) -> None:
-        """What is still unknown although the robot stands there and looks has nothing more to show."""
+        """What stays unknown although the robot stands there and looks has nothing more to show."""
         if self.target is None or self._frame != self.map.borders.frame:
             return
         goal = self.target.goal
         near = math.dist(T_map_base[:2], goal[:2]) <= _AT_GOAL_M
-        self._at_goal = self._at_goal + 1 if near and _turn(T_map_base, goal[2]) <= _AT_GOAL_RAD else 0
+        looks = near and _turn(T_map_base, goal[2]) <= _AT_GOAL_RAD
+        self._at_goal = self._at_goal + 1 if looks else 0
         if self._at_goal >= _LOOKS:
-            self.map.borders.exhaust(self.target.cells, (float(T_map_base[0]), float(T_map_base[1])))
+            self.map.borders.exhaust(
+                self.target.cells, (float(T_map_base[0]), float(T_map_base[1]))
+            )
             self.target, self._at_goal = None, 0
 
 
 class NearestFrontier(FrontierExplorer):
     """The frontier with the shortest way over the grid.
 
-    Source: Yamauchi, "A frontier-based approach for autonomous exploration", 1997; Holz et al., "Evaluating the
-    efficiency of frontier-based exploration strategies", 2010 (choosing anew when the frontier is gone).
+    Source: Yamauchi, "A frontier-based approach for autonomous exploration", 1997; Holz et al.,
+    "Evaluating the efficiency of frontier-based exploration strategies", 2010 (choosing anew when
+    the frontier is gone).
     """
 
     def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
@@ -143,11 +162,12 @@ class NearestFrontier(FrontierExplorer):
 
 
 class ExploreLite(FrontierExplorer):
-    """explore_lite's cost: potential_scale * straight distance - gain_scale * size, both scaled by the cell size.
+    """explore_lite's cost: potential_scale * straight distance - gain_scale * size.
 
-    Scales as in its launch file; size in cells, distance that of the nearest frontier cell, m; it drives to the
-    frontier's middle. A goal that has come no nearer while it was driven to for progress_timeout_s is given up; here
-    also if others were driven to in between, as the package would go to and fro between two of them for ever.
+    Both are scaled by the cell size. Scales as in its launch file; size in cells, distance that of
+    the nearest frontier cell, m; it drives to the frontier's middle. A goal that has come no nearer
+    while it was driven to for progress_timeout_s is given up; here also if others were driven to in
+    between, as the package would go to and fro between two of them for ever.
     Source: Hörner, "Map-merging for multi-robot system", 2016, package explore_lite.
     """
 
@@ -159,7 +179,9 @@ class ExploreLite(FrontierExplorer):
         super().__init__()
         self._patience = _Patience(self.progress_timeout_s)
 
-    def step(self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array) -> Decision:
+    def step(
+        self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
+    ) -> Decision:
         """As the others; a target without progress has failed."""
         decision = super().step(topology, patch, scan, T_map_base)
         target = self.target
@@ -170,15 +192,20 @@ class ExploreLite(FrontierExplorer):
     def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
         """Distance against size."""
         frame = self.map.borders.frame
-        nearest = [np.hypot(*(frame.centres_of(f.cells) - T_map_base[:2]).T).min() for f in frontiers]
+        nearest = [
+            np.hypot(*(frame.centres_of(f.cells) - T_map_base[:2]).T).min() for f in frontiers
+        ]
         sizes = [len(f.cells) for f in frontiers]
-        return (self.potential_scale * np.array(nearest) - self.gain_scale * np.array(sizes)) * frame.resolution
+        return (
+            self.potential_scale * np.array(nearest) - self.gain_scale * np.array(sizes)
+        ) * frame.resolution
 
 
 class InformationGain(FrontierExplorer):
-    """The greatest area that could be seen from a place, discounted by the way there: A exp(-lambda L).
+    """The greatest area to be seen from a place, discounted by the way there: A exp(-lambda L).
 
-    Source: Gonzalez-Banos and Latombe, "Navigation strategies for exploring indoor environments", 2002.
+    Source: Gonzalez-Banos and Latombe, "Navigation strategies for exploring indoor environments",
+    2002.
     """
 
     discount_per_m = 0.2
@@ -190,14 +217,18 @@ class InformationGain(FrontierExplorer):
         frame = self.map.borders.frame
         cells = frame.cells_of(np.array([f.place for f in frontiers]))
         areas = _unknown_in_sight(self.map.patch.cells, cells, self.range_m / frame.resolution)
-        return -(areas + 1.0) * np.exp(-self.discount_per_m * np.array([f.way_m for f in frontiers]))
+        return -(areas + 1.0) * np.exp(
+            -self.discount_per_m * np.array([f.way_m for f in frontiers])
+        )
 
 
 class DistanceAdvantage(FrontierExplorer):
-    """The frontier for which now is the best time: near to the robot, and far from where it would be otherwise.
+    """The frontier for which now is the best time.
 
-    Cost: the way from the robot less the mean way from the other frontiers, from which it would have to be come back
-    to later.
+    It is near to the robot, and far from where the robot would be otherwise.
+
+    Cost: the way from the robot less the mean way from the other frontiers, from which it would
+    have to be come back to later.
     """
 
     def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
@@ -212,11 +243,14 @@ class DistanceAdvantage(FrontierExplorer):
 
 
 class VisitAllEndNodes(NearestFrontier):
-    """The nearest end node that was not visited yet, by A* on the graph, until all were: exploration along a GVG.
+    """The nearest end node that was not visited yet, by A* on the graph, until all were.
 
-    An edge is followed to its end: another one is chosen when the robot is there, when there is no end any more, or
-    when it has come no nearer for progress_timeout_s: in wide halls ends come and go as more is seen. Frontiers that
-    no end node leads to are visited at the end, the nearest first.
+    This is exploration along a GVG.
+
+    An edge is followed to its end: another one is chosen when the robot is there, when there is no
+    end any more, or when it has come no nearer for progress_timeout_s: in wide halls ends come and
+    go as more is seen. Frontiers that no end node leads to are visited at the end, the nearest
+    first.
     Source: Choset and Nagatani, "Topological simultaneous localization and mapping (SLAM)", 2001.
     """
 
@@ -229,7 +263,9 @@ class VisitAllEndNodes(NearestFrontier):
         self._visited: list[tuple[float, float]] = []
         self._end_node: Array | None = None  # the goal (3,) there
 
-    def step(self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array) -> Decision:
+    def step(
+        self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
+    ) -> Decision:
         """End nodes first; what frontiers there are is looked after meanwhile."""
         found = self._next_end_node(topology, T_map_base)
         if found is None:
@@ -253,12 +289,16 @@ class VisitAllEndNodes(NearestFrontier):
             self._visited.append((float(self._end_node[0]), float(self._end_node[1])))
             self._end_node = None
 
-    def _next_end_node(self, topology: TopologicalMap, T_map_base: Array) -> tuple[Array, float] | None:
+    def _next_end_node(
+        self, topology: TopologicalMap, T_map_base: Array
+    ) -> tuple[Array, float] | None:
         """Goal (3,) at the end node that is next, and the way there, m; None without one."""
         ends = [node for node in topology.nodes.values() if node.kind == NodeKind.END]
         self._visited += [
-            (node.x, node.y) for node in ends
-            if math.dist((node.x, node.y), T_map_base[:2]) < _VISIT_M and not self._was_visited(node.x, node.y)
+            (node.x, node.y)
+            for node in ends
+            if math.dist((node.x, node.y), T_map_base[:2]) < _VISIT_M
+            and not self._was_visited(node.x, node.y)
         ]
         left = {node.id: node for node in ends if not self._was_visited(node.x, node.y)}
         if not left:
@@ -273,7 +313,7 @@ class VisitAllEndNodes(NearestFrontier):
         return se2.pose(best.x, best.y, heading), way_m
 
     def _is_followed(self, x: float, y: float) -> bool:
-        """Whether the end node at a place is the one to which the robot drives, which moves as more is seen."""
+        """Whether the end node at a place is the one driven to, which moves as more is seen."""
         return self._end_node is not None and math.dist((x, y), self._end_node[:2]) < _SAME_PLACE_M
 
     def _was_visited(self, x: float, y: float) -> bool:
@@ -289,12 +329,20 @@ def _turn(T_map_base: Array, heading_rad: float) -> float:
 
 
 def _decision(
-    topology: TopologicalMap, target: Frontier | Array | None, number: int, finished: bool, failures: bool
+    topology: TopologicalMap,
+    target: Frontier | Array | None,
+    number: int,
+    finished: bool,
+    failures: bool,
 ) -> Decision:
-    """What is common to all: the graph's end nodes are told of, though nobody asked for their probability."""
+    """What is common to all.
+
+    The graph's end nodes are told of, though nobody asked for their probability.
+    """
     nodes = [
         _end_node(node.id, se2.pose(node.x, node.y, 0.0), False)
-        for node in topology.nodes.values() if node.kind == NodeKind.END
+        for node in topology.nodes.values()
+        if node.kind == NodeKind.END
     ]
     goal = target.goal if isinstance(target, Frontier) else target
     chosen = None if goal is None else _end_node(-number, goal, True)
@@ -311,8 +359,10 @@ def _end_node(node_id: int, goal: Array, is_target: bool) -> EndNode:
 
 
 @kernel
-def _unknown_in_sight(cells: NDArray[np.int8], places: NDArray[np.int64], reach: float) -> NDArray[np.float64]:
-    """Unknown cells on rays (one a degree) from each place (N, 2) until something known to be occupied, (N,)."""
+def _unknown_in_sight(
+    cells: NDArray[np.int8], places: NDArray[np.int64], reach: float
+) -> NDArray[np.float64]:
+    """Unknown cells on rays (one a degree) from each place (N, 2) up to a known obstacle, (N,)."""
     rows, cols = cells.shape
     areas = np.zeros(places.shape[0])
     seen = np.full((rows, cols), -1, dtype=np.int32)
@@ -322,7 +372,9 @@ def _unknown_in_sight(cells: NDArray[np.int8], places: NDArray[np.int64], reach:
             col, step_x, next_x, delta_x = axis_setup(places[i, 1] + 0.5, math.cos(angle))
             row, step_y, next_y, delta_y = axis_setup(places[i, 0] + 0.5, math.sin(angle))
             travelled = 0.0
-            while travelled <= reach and 0 <= row < rows and 0 <= col < cols and cells[row, col] < 65:
+            while (
+                travelled <= reach and 0 <= row < rows and 0 <= col < cols and cells[row, col] < 65
+            ):
                 if cells[row, col] < 0 and seen[row, col] != i:
                     seen[row, col] = i
                     areas[i] += 1.0

@@ -1,4 +1,7 @@
-"""What all frontier based exploration shares: stretches of frontier, where to look at them from, how far that is."""
+"""What all frontier based exploration shares.
+
+Stretches of frontier, where to look at them from, how far that is.
+"""
 
 import math
 from dataclasses import dataclass
@@ -46,10 +49,13 @@ class Frontier:
 
 
 class FrontierMap:
-    """The frontiers of the map as it grows; those that were looked at closely and stayed do not count any more."""
+    """The frontiers of the map as it grows.
+
+    Those that were looked at closely and stayed do not count any more.
+    """
 
     def __init__(self, goes_back: bool = False) -> None:
-        """goes_back: where the robot came it can go back, also through passages that look too narrow on the map."""
+        """goes_back: it can go back where it came, also where the map looks too narrow."""
         self.borders = OpenBorders(SHORTEST_M)
         self._trail = Trail() if goes_back else None
         self.patch: GridPatch | None = None
@@ -70,7 +76,7 @@ class FrontierMap:
         return bool(left * self.borders.frame.resolution >= SHORTEST_M - 1e-6)
 
     def find(self, T_map_base: Array) -> list[Frontier]:
-        """All frontiers that can be looked at from somewhere that the robot can get to from a pose (3,)."""
+        """All frontiers that can be looked at from where the robot can get to from a pose (3,)."""
         frame = self.borders.frame
         cells, numbers, _ = self.borders.stretches()
         xy = (float(T_map_base[0]), float(T_map_base[1]))
@@ -81,12 +87,15 @@ class FrontierMap:
         reached = reach & standing
         self._ways = coarse(reach, _COARSE)
         stretches = [cells[numbers == number] for number in np.unique(numbers)]
-        places = [self.borders.place_to_look(stretch, reached, _REACH_M, xy) for stretch in stretches]
+        places = [
+            self.borders.place_to_look(stretch, reached, _REACH_M, xy) for stretch in stretches
+        ]
         found = [(s, p) for s, p in zip(stretches, places, strict=True) if p is not None]
         ways = self.ways(np.array(T_map_base[:2]), np.array([p for _, p in found]).reshape(-1, 2))
         return [
             Frontier(s, self._middle(s), p, float(way))
-            for (s, p), way in zip(found, ways, strict=True) if math.isfinite(way)
+            for (s, p), way in zip(found, ways, strict=True)
+            if math.isfinite(way)
         ]
 
     def _reach_from(self, standing: Mask, xy: tuple[float, float]) -> Mask:
@@ -96,7 +105,8 @@ class FrontierMap:
         if not (0 <= row < free.shape[0] and 0 <= col < free.shape[1]):
             return np.zeros_like(standing)
         if self._trail is None:
-            return reached_from(let_out(standing, free, frame, xy, _ESCAPE_M), (row, col)) & standing
+            ways = let_out(standing, free, frame, xy, _ESCAPE_M)
+            return reached_from(ways, (row, col)) & standing
         trail = self._trail.cells(frame, free.shape)
         return reached_from(let_out(standing, free, frame, xy, _ESCAPE_M, trail), (row, col))
 

@@ -1,7 +1,9 @@
-"""The Voronoi topology that the papers compare thinning with: points as far from two obstacle cells as from each other.
+"""The Voronoi topology that the papers compare thinning with.
 
-Source: topological map paper sections 1 and 4 (hierarchical map building); Zwynsvoorde et al., "Incremental
-topological modeling using local Voronoi-like graphs", 2000.
+It is made of points as far from two obstacle cells as from each other.
+
+Source: topological map paper sections 1 and 4 (hierarchical map building); Zwynsvoorde et al.,
+"Incremental topological modeling using local Voronoi-like graphs", 2000.
 """
 
 from dataclasses import dataclass
@@ -24,31 +26,40 @@ Numbers = NDArray[np.int64]
 class VoronoiConfig(Config):
     """Which parts of the diagram make the graph."""
 
-    robot_radius_m: float = parameter(0.25, 'vertices and lines keep this from obstacles, m', low=0.0, high=5.0)
+    robot_radius_m: float = parameter(
+        0.25, 'vertices and lines keep this from obstacles, m', low=0.0, high=5.0
+    )
     prune_m: float = parameter(
         1.0, 'dead ends up to this long are dropped, again and again, m', low=0.0, high=50.0
     )
 
 
 def build_voronoi(patch: GridPatch, config: VoronoiConfig | None = None) -> TopologicalMap:
-    """Topological map (m, map frame) from the Voronoi diagram of the cells that bound the free space.
+    """Topological map (m, map frame) from the Voronoi diagram of the cells that bound free space.
 
-    A ridge of the diagram counts where both its ends lie on free cells, at least robot_radius_m from the centres that
-    they belong to. Of what is left, dead ends up to prune_m long are dropped, shortest first, until there are none;
-    then nodes stand where one or three and more ridges meet, and one in each ring that has none. Clearances are
-    distances to the nearest obstacle centre.
+    A ridge of the diagram counts where both its ends lie on free cells, at least robot_radius_m
+    from the centres that they belong to. Of what is left, dead ends up to prune_m long are dropped,
+    shortest first, until there are none; then nodes stand where one or three and more ridges meet,
+    and one in each ring that has none. Clearances are distances to the nearest obstacle centre.
     """
     config = config or VoronoiConfig()
     solid = ~patch.free
-    border = np.argwhere(np.pad(solid, 1, constant_values=True) & _beside(np.pad(patch.free, 1))) - 1
+    border = (
+        np.argwhere(np.pad(solid, 1, constant_values=True) & _beside(np.pad(patch.free, 1))) - 1
+    )
     if len(border) < 4 or not patch.free.any():
         return TopologicalMap()
     diagram = Voronoi(patch.frame.centres_of(border))
     vertices, clearance = diagram.vertices, np.full(len(diagram.vertices), np.inf)
     ridges = np.array(diagram.ridge_vertices)
-    gap = np.hypot(*(vertices[np.maximum(ridges, 0)] - diagram.points[diagram.ridge_points[:, :1]]).transpose(2, 0, 1))
+    centres = diagram.points[diagram.ridge_points[:, :1]]
+    gap = np.hypot(*(vertices[np.maximum(ridges, 0)] - centres).transpose(2, 0, 1))
     for side in (0, 1):
-        np.minimum.at(clearance, np.maximum(ridges[:, side], 0), np.where(ridges[:, side] < 0, np.inf, gap[:, side]))
+        np.minimum.at(
+            clearance,
+            np.maximum(ridges[:, side], 0),
+            np.where(ridges[:, side] < 0, np.inf, gap[:, side]),
+        )
     allowed = (clearance >= config.robot_radius_m) & _on_free_cells(patch, vertices)
     kept = ridges[(ridges >= 0).all(axis=1) & allowed[ridges].all(axis=1)]
     kept = _pruned(vertices, kept[kept[:, 0] != kept[:, 1]], config.prune_m)
@@ -73,7 +84,7 @@ def _degrees(ridges: Numbers, count: int) -> Numbers:
 
 
 def _chains(ridges: Numbers, count: int) -> list[list[int]]:
-    """Vertices along each chain of ridges between vertices with one or three and more ridges, rings last."""
+    """Vertices along each chain of ridges between vertices with one or over two, rings last."""
     ends = np.concatenate([ridges, ridges[:, ::-1]])
     ends = ends[np.argsort(ends[:, 0], kind='stable')]
     starts = np.searchsorted(ends[:, 0], np.arange(count + 1))
@@ -81,9 +92,13 @@ def _chains(ridges: Numbers, count: int) -> list[list[int]]:
     degree = np.diff(starts)
     used: set[tuple[int, int]] = set()
     chains = []
-    firsts = np.flatnonzero((degree > 0) & (degree != 2)).tolist() + np.flatnonzero(degree == 2).tolist()
+    firsts = (
+        np.flatnonzero((degree > 0) & (degree != 2)).tolist() + np.flatnonzero(degree == 2).tolist()
+    )
     for first in firsts:
-        if degree[first] == 2 and any((first, int(to)) in used for to in neighbours[starts[first] : starts[first + 1]]):
+        if degree[first] == 2 and any(
+            (first, int(to)) in used for to in neighbours[starts[first] : starts[first + 1]]
+        ):
             continue
         for second in neighbours[starts[first] : starts[first + 1]].tolist():
             if (first, second) in used:
@@ -103,18 +118,26 @@ def _length(vertices: Array, chain: list[int]) -> float:
 
 
 def _pruned(vertices: Array, ridges: Numbers, prune_m: float) -> Numbers:
-    """Ridges (M, 2) without dead ends up to prune_m long; a part that is nothing else keeps its longest one."""
+    """Ridges (M, 2) without dead ends up to prune_m long.
+
+    A part that is nothing else keeps its longest one.
+    """
     while True:
         degree = _degrees(ridges, len(vertices))
-        dead = [c for c in _chains(ridges, len(vertices)) if (degree[c[0]] == 1) != (degree[c[-1]] == 1)]
-        short = [(length, chain) for chain in dead if (length := _length(vertices, chain)) <= prune_m]
+        dead = [
+            c for c in _chains(ridges, len(vertices)) if (degree[c[0]] == 1) != (degree[c[-1]] == 1)
+        ]
+        short = [
+            (length, chain) for chain in dead if (length := _length(vertices, chain)) <= prune_m
+        ]
         if not short:
             return ridges
         gone: set[tuple[int, int]] = set()
         touched: set[int] = set()
         for _, chain in sorted(short):
             base = chain[0] if degree[chain[0]] != 1 else chain[-1]
-            # One dead end a junction and round: dropping one may make the others part of something longer.
+            # One dead end a junction and round: dropping one may make the others part of something
+            # longer.
             if base not in touched:
                 touched.add(base)
                 gone |= {(min(a, b), max(a, b)) for a, b in pairwise(chain)}
@@ -129,7 +152,8 @@ def _graph_of(vertices: Array, clearance: Array, ridges: Numbers) -> Topological
     result = TopologicalMap()
     for vertex in dict.fromkeys(end for chain in chains for end in (chain[0], chain[-1])):
         ids[vertex] = len(ids) + 1
-        kind = NodeKind.END if degree[vertex] < 2 else NodeKind.BRANCH if degree[vertex] > 2 else NodeKind.CORNER
+        inner = NodeKind.BRANCH if degree[vertex] > 2 else NodeKind.CORNER
+        kind = NodeKind.END if degree[vertex] < 2 else inner
         x, y = vertices[vertex].tolist()
         result.put_node(Node(ids[vertex], kind, x, y, float(clearance[vertex])))
     for number, chain in enumerate(chains, len(ids) + 1):

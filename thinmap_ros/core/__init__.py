@@ -1,1 +1,4 @@
-"""The papers' algorithms as NumPy and numba code: no ROS, no files, no clock, no global random state."""
+"""The papers' algorithms as NumPy and numba code.
+
+No ROS, no files, no clock, no global random state.
+"""

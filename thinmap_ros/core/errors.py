@@ -11,7 +11,10 @@ class ThinmapError(Exception):
 
 
 class InputError(ThinmapError):
-    """A file, topic or message that cannot be used: the message names it, the value, and what was expected."""
+    """A file, topic or message that cannot be used.
+
+    The message names it, the value, and what was expected.
+    """
 
 
 class ConfigError(ThinmapError):

@@ -14,5 +14,5 @@ def kernel(function: Function) -> Function:
 
 
 def inlined(function: Function) -> Function:
-    """Compile a small step that is shared by several kernels and inlined into each by the compiler."""
+    """Compile a small step shared by several kernels and inlined into each by the compiler."""
     return cast(Function, numba.njit(cache=True, nogil=True, inline='always')(function))

@@ -20,8 +20,9 @@ from thinmap_ros.core.snapshot import FAR_M, LARGEST_COUNT, Field
 class OdometryBuffer:
     """The last few seconds of odometry, looked up by stamp.
 
-    Stamps of real robots step back a little now and then: a sample that comes late is put in its place. One that
-    is older than all that is kept means that time was set back (a bag started again): the buffer starts anew.
+    Stamps of real robots step back a little now and then: a sample that comes late is put in its
+    place. One that is older than all that is kept means that time was set back (a bag started
+    again): the buffer starts anew.
     """
 
     def __init__(self, span_ns: int = 10_000_000_000) -> None:
@@ -35,7 +36,10 @@ class OdometryBuffer:
         return self._stamps[-1] if self._stamps else None
 
     def add(self, stamp_ns: int, T_odom_base: Array) -> None:
-        """Take a sample, (3,). Raises InputError where the pose is not finite, or nowhere on earth."""
+        """Take a sample, (3,).
+
+        Raises InputError where the pose is not finite, or nowhere on earth.
+        """
         if not se2.is_on_earth(T_odom_base):
             pose = ', '.join(f'{value:g}' for value in T_odom_base.tolist())
             raise InputError(
@@ -53,7 +57,10 @@ class OdometryBuffer:
         self._forget()
 
     def at(self, stamp_ns: int) -> Array | None:
-        """Pose at a stamp: exact on a sample, interpolated between two, None outside what is known."""
+        """Pose at a stamp.
+
+        Exact on a sample, interpolated between two, None outside what is known.
+        """
         index = bisect_left(self._stamps, stamp_ns)
         if index == len(self._stamps):
             return None
@@ -84,7 +91,7 @@ FIELDS = {
 
 @dataclass(frozen=True, eq=False)
 class LastPose:
-    """Where odometry stood in the map, T_map_odom (3,), when it said T_odom_base (3,) at stamp_ns."""
+    """Where odometry lay in the map, T_map_odom (3,), when it said T_odom_base (3,) at stamp_ns."""
 
     stamp_ns: int
     T_map_odom: Array
@@ -92,7 +99,11 @@ class LastPose:
 
     def state(self) -> dict[str, NDArray[Any]]:
         """All of it as arrays; `from_state` makes an equal one."""
-        return {'stamp_ns': np.array(self.stamp_ns), 'T_map_odom': self.T_map_odom, 'T_odom_base': self.T_odom_base}
+        return {
+            'stamp_ns': np.array(self.stamp_ns),
+            'T_map_odom': self.T_map_odom,
+            'T_odom_base': self.T_odom_base,
+        }
 
     @staticmethod
     def from_state(state: Mapping[str, NDArray[Any]]) -> 'LastPose':
@@ -101,16 +112,20 @@ class LastPose:
         return LastPose(int(own['stamp_ns']), own['T_map_odom'], own['T_odom_base'])
 
     def leads_to(self, stamp_ns: int, T_odom_base: Array) -> bool:
-        """Whether a later odometry pose can be of the same drive: not before, not long after, not too far away."""
+        """Whether a later odometry pose can be of the same drive.
+
+        It is not before, not long after, not too far away.
+        """
         gap_ns = stamp_ns - self.stamp_ns
         moved = math.dist(self.T_odom_base[:2], T_odom_base[:2])
         return 0 <= gap_ns <= _LONGEST_GAP_NS and moved <= 0.5 + _FASTEST_M_S * gap_ns / 1e9
 
 
 class ScanPairing:
-    """Brings each scan together with the odometry pose at its stamp, in the order in which the scans came.
+    """Brings each scan together with the odometry pose at its stamp, in the order of the scans.
 
-    A scan waits until odometry as new as itself has come. Used live and in replay alike, so that both see the same.
+    A scan waits until odometry as new as itself has come. Used live and in replay alike, so that
+    both see the same.
     """
 
     def __init__(self, capacity: int = 20) -> None:
@@ -125,7 +140,10 @@ class ScanPairing:
         return len(self._waiting)
 
     def add_odometry(self, stamp_ns: int, T_odom_base: Array) -> list[tuple[Scan, Array]]:
-        """Take an odometry sample; returns the scans that are ready now, each with its T_odom_base (3,)."""
+        """Take an odometry sample.
+
+        Returns the scans that are ready now, each with its T_odom_base (3,).
+        """
         self._buffer.add(stamp_ns, T_odom_base)
         return self._ready()
 

@@ -21,9 +21,9 @@ class Scan:
     """Ranges of one scan and where the laser sat on the robot when it was taken.
 
     stamp_ns: time of the scan; ranges_m (N,): raw, may hold inf, NaN and nonsense; beam i points to
-    angle_min_rad + i * angle_increment_rad in the laser frame (a negative increment is a clockwise laser);
-    T_base_laser (3,): the laser's pose on the robot; zero_is_no_return: whether this laser's driver
-    publishes 0 for a beam that met nothing. Make one with `Scan.create`.
+    angle_min_rad + i * angle_increment_rad in the laser frame (a negative increment is a clockwise
+    laser); T_base_laser (3,): the laser's pose on the robot; zero_is_no_return: whether this
+    laser's driver publishes 0 for a beam that met nothing. Make one with `Scan.create`.
 
     What a range says: `hit`, `no_return`, `too_near`, or nothing (`valid` is False).
     Source: REP 117, with range_max as a finite value for "no return", which many drivers publish.
@@ -49,42 +49,56 @@ class Scan:
         T_base_laser: Array | None = None,
         zero_is_no_return: bool = False,
     ) -> 'Scan':
-        """Make a scan, rounded to float32 as sensor_msgs/LaserScan is: text log, bag and live agree bit for bit.
+        """Make a scan, rounded to float32 as sensor_msgs/LaserScan is.
 
-        Raises InputError where the geometry is no geometry: NaN angles, beams without an angle between them, an empty
-        or negative range interval, a mount that is not finite or farther than FARTHEST_MOUNT_M.
+        Text log, bag and live agree bit for bit.
+
+        Raises InputError where the geometry is no geometry: NaN angles, beams without an angle
+        between them, an empty or negative range interval, a mount that is not finite or farther
+        than FARTHEST_MOUNT_M.
         """
         ranges = np.asarray(ranges_m, dtype=np.float32).astype(np.float64)
         first, step, low, high = (
-            float(np.float32(v)) for v in (angle_min_rad, angle_increment_rad, range_min_m, range_max_m)
+            float(np.float32(v))
+            for v in (angle_min_rad, angle_increment_rad, range_min_m, range_max_m)
         )
         if ranges.ndim != 1 or not np.isfinite([first, step, low]).all() or np.isnan(high):
             limits = f'angles {first}, {step}, range {low} to {high}'
             raise InputError(f'scan at {stamp_ns} ns: {limits}: expected finite numbers')
         if step == 0.0 and ranges.size > 1:
-            raise InputError(f'scan at {stamp_ns} ns: {ranges.size} beams, increment 0: expected an angle between them')
+            raise InputError(
+                f'scan at {stamp_ns} ns: {ranges.size} beams, increment 0: '
+                'expected an angle between them'
+            )
         if not 0.0 <= low < high:
-            raise InputError(f'scan at {stamp_ns} ns: range {low} to {high} m: expected 0 <= min < max')
-        T_base_laser = np.zeros(3) if T_base_laser is None else np.asarray(T_base_laser, dtype=np.float64)
+            raise InputError(
+                f'scan at {stamp_ns} ns: range {low} to {high} m: expected 0 <= min < max'
+            )
+        T_base_laser = (
+            np.zeros(3) if T_base_laser is None else np.asarray(T_base_laser, dtype=np.float64)
+        )
         if not (se2.is_finite(T_base_laser) and np.abs(T_base_laser[:2]).max() <= FARTHEST_MOUNT_M):
             mount = ', '.join(f'{value:g}' for value in T_base_laser.tolist())
             raise InputError(
-                f'scan at {stamp_ns} ns: laser mounted at {mount}: expected finite numbers, at most '
-                f'{FARTHEST_MOUNT_M:g} m'
+                f'scan at {stamp_ns} ns: laser mounted at {mount}: '
+                f'expected finite numbers, at most {FARTHEST_MOUNT_M:g} m'
             )
-        return Scan(
-            int(stamp_ns), ranges, first, step, low, high, T_base_laser, zero_is_no_return
-        )
+        return Scan(int(stamp_ns), ranges, first, step, low, high, T_base_laser, zero_is_no_return)
 
     @cached_property
     def angles_rad(self) -> Array:
         """Bearing of each beam in the laser frame, (N,)."""
-        return self.angle_min_rad + self.angle_increment_rad * np.arange(self.ranges_m.size, dtype=np.float64)
+        beams = np.arange(self.ranges_m.size, dtype=np.float64)
+        return self.angle_min_rad + self.angle_increment_rad * beams
 
     @cached_property
     def hit(self) -> NDArray[np.bool_]:
         """Beams that met something: range_min <= range < range_max, (N,)."""
-        return (self.ranges_m >= self.range_min_m) & (self.ranges_m < self.range_max_m) & (self.ranges_m > 0.0)
+        return (
+            (self.ranges_m >= self.range_min_m)
+            & (self.ranges_m < self.range_max_m)
+            & (self.ranges_m > 0.0)
+        )
 
     @cached_property
     def no_return(self) -> NDArray[np.bool_]:

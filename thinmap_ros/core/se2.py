@@ -1,4 +1,7 @@
-"""Planar poses [x m, y m, theta rad] as float64 arrays; T_a_b is the pose of frame b seen from frame a."""
+"""Planar poses [x m, y m, theta rad] as float64 arrays.
+
+T_a_b is the pose of frame b seen from frame a.
+"""
 
 import math
 from typing import overload
@@ -50,7 +53,7 @@ def between(T_a_b: Array, T_a_c: Array) -> Array:
 
 
 def off(T: Array, T_expected: Array) -> Array:
-    """How far a pose is from where it was expected, (3,): the differences of x, y and heading, the last one wrapped."""
+    """How far a pose is from where it was expected, (3,): x, y and heading, the latter wrapped."""
     x, y, theta = (T - T_expected).tolist()
     return np.array([x, y, wrap(theta)])
 
@@ -62,7 +65,7 @@ def transform_points(T_a_b: Array, points_b: Array) -> Array:
 
 
 def interpolate(T_a: Array, T_b: Array, share: float) -> Array:
-    """Pose on the straight way from T_a (share 0) to T_b (share 1), heading turned the shorter way."""
+    """Pose on the straight way from T_a (share 0) to T_b (share 1), turned the shorter way."""
     x, y = T_a[:2] + share * (T_b[:2] - T_a[:2])
     return pose(x, y, T_a[2] + share * wrap(float(T_b[2] - T_a[2])))
 

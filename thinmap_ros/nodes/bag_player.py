@@ -44,15 +44,21 @@ class BagPlayerConfig(Config):
     loop: bool = parameter(False, 'begin again at the end')
     start_paused: bool = parameter(False, 'wait for ~/pause or ~/step')
     wait_for_subscribers: int = parameter(
-        1, 'begin when every scan topic (or, without one, any topic) has so many subscribers', low=0, high=100
+        1,
+        'begin when every scan topic (or, without one, any topic) has so many subscribers',
+        low=0,
+        high=100,
     )
-    lockstep: str = parameter(NONE, 'wait for what each scan leads to: nothing is lost at high rates', choices=TOPICS)
+    lockstep: str = parameter(
+        NONE, 'wait for what each scan leads to: nothing is lost at high rates', choices=TOPICS
+    )
 
 
 class BagPlayerNode(Node):
-    """Publishes the bytes of a bag in its own rhythm and as they were offered, counts them, and ends with the bag.
+    """Publishes the bytes of a bag in its rhythm and as offered, counts them, ends with the bag.
 
-    Services: ~/pause (true: stand still, false: go on), ~/step (while it stands still: up to and with the next scan).
+    Services: ~/pause (true: stand still, false: go on), ~/step (while it stands still: up to and
+    with the next scan).
     """
 
     def __init__(self) -> None:
@@ -88,7 +94,8 @@ class BagPlayerNode(Node):
         """See the last messages through to those who listen, and say what was done."""
         for publisher in self._publishers_by_topic.values():
             publisher.wait_for_all_acked(_ACKNOWLEDGE)
-        parts = ', '.join(f'{topic} {count}' for topic, count in sorted(self._sent.items())) or 'nothing'
+        counts = sorted(self._sent.items())
+        parts = ', '.join(f'{topic} {count}' for topic, count in counts) or 'nothing'
         self.get_logger().info(f'{self._config.bag}: {self._sent.total()} messages sent: {parts}')
 
     def _on_config(self, config: BagPlayerConfig) -> None:
@@ -103,7 +110,10 @@ class BagPlayerNode(Node):
         return sorted((asked or set(self._bag.topics)) - {'/clock'})
 
     def _offer(self, topic: str) -> None:
-        """Make the publisher of a topic. What is not installed here is left out, unless it was asked for by name."""
+        """Make the publisher of a topic.
+
+        What is not installed here is left out, unless it was asked for by name.
+        """
         name = f'/{self._config.prefix.strip("/")}{topic}' if self._config.prefix else topic
         profile = qos.as_recorded(topic, self._bag.offers.get(topic, []))
         try:
@@ -117,7 +127,10 @@ class BagPlayerNode(Node):
 
     def _has_listeners(self) -> bool:
         scans = [t for t in self._publishers_by_topic if self._bag.topics[t] == _SCAN]
-        counts = [self._publishers_by_topic[t].get_subscription_count() for t in scans or self._publishers_by_topic]
+        counts = [
+            self._publishers_by_topic[t].get_subscription_count()
+            for t in scans or self._publishers_by_topic
+        ]
         enough = self._config.wait_for_subscribers
         return all(n >= enough for n in counts) if scans else any(n >= enough for n in counts)
 
@@ -164,7 +177,9 @@ class BagPlayerNode(Node):
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._paused = request.data
-        return answer(response, lambda: f'{"paused" if self._paused else "playing"} at {self._where()}')
+        return answer(
+            response, lambda: f'{"paused" if self._paused else "playing"} at {self._where()}'
+        )
 
     def _on_step(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         return answer(response, self._step)

@@ -31,7 +31,9 @@ class DemoMonitorConfig(Config):
     world: str = parameter('room_10x10', 'world whose coverage is shown')
     robot: str = parameter('2dx', 'which Pioneer', choices=tuple(PRESETS))
     range_max_m: float = parameter(8.0, "the laser's range, m", low=0.1, high=200.0)
-    time_limit_s: float = parameter(0.0, 'simulated time after which the exploration ends; 0: none, s', low=0.0)
+    time_limit_s: float = parameter(
+        0.0, 'simulated time after which the exploration ends; 0: none, s', low=0.0
+    )
     result: str = parameter('', 'JSON file for the result')
 
 
@@ -48,7 +50,9 @@ class DemoMonitorNode(Node):
         self._coverage = 0.0
         self._asked = False
         self.finished = False
-        self._bar = tqdm(total=100.0, bar_format='{desc:<48}|{bar}| {n:5.1f} % seen  {postfix}', leave=True)
+        self._bar = tqdm(
+            total=100.0, bar_format='{desc:<48}|{bar}| {n:5.1f} % seen  {postfix}', leave=True
+        )
         self._bar.set_description_str('waiting for the nodes')
         self._explore = ActionClient(self, Explore, 'explore')
         self.create_subscription(OccupancyGrid, 'map', self._on_map, qos.LATCHED)
@@ -76,9 +80,17 @@ class DemoMonitorNode(Node):
 
     def _show(self, status: ExplorationStatus) -> None:
         place = status.target_position
-        target = f'to the end node at {place.x:.1f}, {place.y:.1f}' if status.has_target else 'looking around'
-        self._bar.set_description_str(target if status.state == ExplorationStatus.EXPLORING else status.reason)
-        self._bar.set_postfix_str(f'{status.distance_m:.1f} m, {messages.seconds(status.time):.0f} s')
+        target = (
+            f'to the end node at {place.x:.1f}, {place.y:.1f}'
+            if status.has_target
+            else 'looking around'
+        )
+        self._bar.set_description_str(
+            target if status.state == ExplorationStatus.EXPLORING else status.reason
+        )
+        self._bar.set_postfix_str(
+            f'{status.distance_m:.1f} m, {messages.seconds(status.time):.0f} s'
+        )
         self._bar.n = 100.0 * self._coverage
         self._bar.refresh()
 
@@ -88,7 +100,8 @@ class DemoMonitorNode(Node):
         if self._config.result:
             end_ns = messages.stamp_ns(status.header.stamp)
             content = {
-                'finished': status.reason_code in (ExplorationStatus.ALL_RESOLVED, ExplorationStatus.NOTHING_REACHABLE),
+                'finished': status.reason_code
+                in (ExplorationStatus.ALL_RESOLVED, ExplorationStatus.NOTHING_REACHABLE),
                 'reason': status.reason,
                 'start_ns': end_ns - round(1e9 * messages.seconds(status.time)),
                 'end_ns': end_ns,

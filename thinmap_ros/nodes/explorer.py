@@ -41,7 +41,7 @@ _GIVE_UP_HOME = 3
 
 
 class ExplorerNode(LiveNode):
-    """Maps, /topology, /pose and /scan in; goals for the navigator, /end_nodes and /exploration_status out.
+    """Maps, /topology, /pose, /scan in; navigator's goals, /end_nodes, /exploration_status out.
 
     Service save_exploration keeps what was learned beside the map and the graph of a session.
     """
@@ -62,9 +62,11 @@ class ExplorerNode(LiveNode):
         self._make_topics()
 
     def begin_anew(self) -> None:
-        """Forget the map, the graph and what was explored, or go back to the session that the node was started with."""
+        """Forget map, graph and what was explored, or go back to the session of the start."""
         # What was learned is kept for the next goal, until an exploration is finished.
-        self._learned = session_files.load_exploration(self._session, self._config) if self._session else None
+        self._learned = (
+            session_files.load_exploration(self._session, self._config) if self._session else None
+        )
         self._polygon = np.empty((0, 2))
         self._map = MapMirror()
         self._topology = messages.topology_from(TopologicalMap())
@@ -95,7 +97,9 @@ class ExplorerNode(LiveNode):
         listen(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
         listen(self, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
         self._navigator = ActionClient(self, NavigateToPose, 'navigate_to_pose')
-        self._goals = SingleGoalServer(self, Explore, 'explore', self._on_goal, self._on_cancel, self._preempted)
+        self._goals = SingleGoalServer(
+            self, Explore, 'explore', self._on_goal, self._on_cancel, self._preempted
+        )
         self.create_service(SaveMap, 'save_exploration', self._on_save)
         self.every(_FEEDBACK_PERIOD_S, self._every_second)
 
@@ -112,7 +116,8 @@ class ExplorerNode(LiveNode):
 
     def _begin(self, goal: Explore.Goal) -> None:
         self._goal = goal
-        before, self._polygon = self._polygon, np.array([[p.x, p.y] for p in goal.area.points]).reshape(-1, 2)
+        before = self._polygon
+        self._polygon = np.array([[p.x, p.y] for p in goal.area.points]).reshape(-1, 2)
         # Where other walls are in the way, other things are to be seen.
         self._learned = self._learned if np.array_equal(before, self._polygon) else None
         self._explorer = self._learned = self._learned or Explorer(self._config)
@@ -175,7 +180,8 @@ class ExplorerNode(LiveNode):
         if not self._hears_windows:
             self._look((pair, True))
             return
-        # What a scan shows is in its window, which may come much later: a look at an older map shows nothing new.
+        # What a scan shows is in its window, which may come much later: a look at an older map
+        # shows nothing new.
         self._look(self._looks.left(messages.stamp_ns(pair[0].header.stamp), pair))
 
     def _look(self, complete: tuple[tuple[LaserScan, Array], bool] | None) -> None:
@@ -189,7 +195,9 @@ class ExplorerNode(LiveNode):
         if self._state != ExplorationStatus.EXPLORING:
             return
         scan = self._mount.scan(message)
-        patch = self._map.patch if len(self._polygon) < 3 else fenced(self._map.patch, self._polygon)
+        patch = (
+            self._map.patch if len(self._polygon) < 3 else fenced(self._map.patch, self._polygon)
+        )
         with self.health.timed('explorer'):
             self._decision = self._explorer.step(self._topology, patch, scan, self._T_map_base)
         self._publish_end_nodes(self._decision, message)
@@ -206,10 +214,15 @@ class ExplorerNode(LiveNode):
             self._end(ExplorationStatus.CANCELLED, 'cancelled')
             return
         if now - self._heard_at > _SILENCE_S:
-            self._end(ExplorationStatus.SENSOR_SILENT, f'no scan that shows anything for {_SILENCE_S:.0f} s')
+            self._end(
+                ExplorationStatus.SENSOR_SILENT,
+                f'no scan that shows anything for {_SILENCE_S:.0f} s',
+            )
             return
         if self._is_lost and now - self._tracked_at > _LOST_S:
-            self._end(ExplorationStatus.LOCALIZATION_LOST, f'the pose has been lost for {_LOST_S:.0f} s')
+            self._end(
+                ExplorationStatus.LOCALIZATION_LOST, f'the pose has been lost for {_LOST_S:.0f} s'
+            )
             return
         self._ask_again(now)
         area = 0.0 if self._decision is None else self._decision.known_area_m2
@@ -238,7 +251,11 @@ class ExplorerNode(LiveNode):
             self._learned = None
         status = self._status_msg()
         self._status.publish(status)
-        good = code in (ExplorationStatus.ALL_RESOLVED, ExplorationStatus.BUDGET, ExplorationStatus.NOTHING_REACHABLE)
+        good = code in (
+            ExplorationStatus.ALL_RESOLVED,
+            ExplorationStatus.BUDGET,
+            ExplorationStatus.NOTHING_REACHABLE,
+        )
         outcome = Outcome.SUCCEEDED if good else Outcome.ABORTED
         outcome = Outcome.CANCELED if code == ExplorationStatus.CANCELLED else outcome
         self.get_logger().info(f'finished: {reason}')
@@ -260,15 +277,22 @@ class ExplorerNode(LiveNode):
             return
         self._goal_sent, self._answered_at = goal, self._now()
         request = NavigateToPose.Goal(use_heading=True)
-        request.pose = messages.pose_stamped_msg(goal, self._map_frame, self.get_clock().now().nanoseconds)
+        request.pose = messages.pose_stamped_msg(
+            goal, self._map_frame, self.get_clock().now().nanoseconds
+        )
         sent = self._navigator.send_goal_async(request, self._on_feedback)
         sent.add_done_callback(lambda f: self._on_accepted(f, goal))
 
     def _ask_again(self, now: float) -> None:
-        """Send the goal again where the navigator says nothing of it: it may be another one than the one asked."""
+        """Send the goal again where the navigator says nothing of it.
+
+        The navigator may be another one than the one asked.
+        """
         if self._goal_sent is None or now - self._answered_at < _DEAF_S:
             return
-        self.get_logger().warning('the navigator is silent: asking again', throttle_duration_sec=_WARN_PERIOD_S)
+        self.get_logger().warning(
+            'the navigator is silent: asking again', throttle_duration_sec=_WARN_PERIOD_S
+        )
         goal, self._goal_sent, self._handle = self._goal_sent, None, None
         if self._state == ExplorationStatus.RETURNING:
             self._drive_to(goal)
@@ -280,7 +304,8 @@ class ExplorerNode(LiveNode):
         handle = future.result()
         if goal is not self._goal_sent:
             if handle.accepted:
-                handle.cancel_goal_async()  # meanwhile another goal was chosen, or the exploration ended
+                # Meanwhile another goal was chosen, or the exploration ended.
+                handle.cancel_goal_async()
             return
         if not handle.accepted:
             self._goal_sent = None
@@ -311,13 +336,16 @@ class ExplorerNode(LiveNode):
         self._end_nodes.publish(EndNodeArray(header=header, end_nodes=end_nodes))
 
     def _end_nodes_msg(self) -> EndNodeArray:
-        nodes = [] if self._decision is None else [_end_node_msg(node) for node in self._decision.end_nodes]
+        end_nodes = [] if self._decision is None else self._decision.end_nodes
+        nodes = [_end_node_msg(node) for node in end_nodes]
         header = messages.header(self._map_frame, self.get_clock().now().nanoseconds)
         return EndNodeArray(header=header, end_nodes=nodes)
 
     def _status_msg(self) -> ExplorationStatus:
         now_ns = self.get_clock().now().nanoseconds
-        status = ExplorationStatus(header=messages.header(self._map_frame, now_ns), state=self._state)
+        status = ExplorationStatus(
+            header=messages.header(self._map_frame, now_ns), state=self._state
+        )
         status.reason_code, status.reason = self._ending
         status.distance_m = self._odometer.distance_m
         status.time = messages.duration_msg(self._now() - self._begun_at)
@@ -326,7 +354,9 @@ class ExplorerNode(LiveNode):
             status.coverage_estimate = self._decision.coverage_estimate
             status.known_area_m2 = self._decision.known_area_m2
             status.reason = status.reason or self._decision.reason
-            status.end_nodes_left = sum(1 for n in self._decision.end_nodes if n.open_border_m > 0.0)
+            status.end_nodes_left = sum(
+                1 for n in self._decision.end_nodes if n.open_border_m > 0.0
+            )
             if target is not None:
                 status.has_target, status.target = True, target.node_id
                 status.target_position = Point(x=target.x, y=target.y)

@@ -1,4 +1,4 @@
-"""Where is a robot that was switched on anywhere? Asked by service, or by itself, until one place is left."""
+"""Where is a robot switched on anywhere? Asked by service or by itself, until one place is left."""
 
 from pathlib import Path
 
@@ -43,36 +43,58 @@ _STATES = {
 
 
 class GlobalLocalizerNode(LiveNode):
-    """/scan, /odom, /map and /topology in; /initialpose, /localization_samples, /localization_status out.
+    """/scan, /odom, /map and /topology in.
 
-    Service localize_globally. The map is taken as it is when the search begins; once the robot is sure, its pose is
-    said once, and the node rests until it is asked again. Where it is `active`, it drives meanwhile: /cmd_vel out.
+    /initialpose, /localization_samples and /localization_status out. Service localize_globally.
+    The map is taken as it is when the search begins; once the robot is sure, its pose is said once,
+    and the node rests until it is asked again. Where it is `active`, it drives meanwhile: /cmd_vel
+    out.
     """
 
     def __init__(self) -> None:
         super().__init__('global_localizer')
         self._config = parameters.declare(self, GlobalLocalizationConfig)
-        self._seed = int(parameters.declare_value(self, 'seed', 0, 'decides where samples are drawn'))
+        self._seed = int(
+            parameters.declare_value(self, 'seed', 0, 'decides where samples are drawn')
+        )
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
         automatic = parameters.declare_value(
-            self, 'automatic', False, 'begin at once, and again when the localizer has been lost for lost_s'
+            self,
+            'automatic',
+            False,
+            'begin at once, and again when the localizer has been lost for lost_s',
         )
-        lost_s = parameters.declare_value(self, 'lost_s', 3.0, 'how long the localizer must have been lost, s')
+        lost_s = parameters.declare_value(
+            self, 'lost_s', 3.0, 'how long the localizer must have been lost, s'
+        )
         self._active = bool(
             parameters.declare_value(
-                self, 'active', False, 'drive, while it looks, to where the places in question differ most'
+                self,
+                'active',
+                False,
+                'drive, while it looks, to where the places in question differ most',
             )
         )
-        speed = parameters.declare_value(self, 'active_speed_m_s', 0.3, 'how fast it then drives, m/s')
-        path = str(parameters.declare_value(self, 'map', '', 'map_server YAML file; empty: from the topics'))
+        speed = parameters.declare_value(
+            self, 'active_speed_m_s', 0.3, 'how fast it then drives, m/s'
+        )
+        path = str(
+            parameters.declare_value(
+                self, 'map', '', 'map_server YAML file; empty: from the topics'
+            )
+        )
         self._mount = LaserMount(self)
         parameters.check_unknown(self)
         self._automatic, self._lost_ns = bool(automatic), round(1e9 * float(lost_s))
         self._patch: GridPatch | None = map_files.read_map(Path(path)) if path else None
-        self._topology: Topology | None = build(self._patch, None, TopologyConfig()) if self._patch else None
+        self._topology: Topology | None = (
+            build(self._patch, None, TopologyConfig()) if self._patch else None
+        )
         radius = self._config.robot_radius_m
         self._driving = NavigatorConfig(
-            max_speed_m_s=float(speed), robot_radius_m=radius + _PLANNED_M, body_radius_m=radius + _BODY_M
+            max_speed_m_s=float(speed),
+            robot_radius_m=radius + _PLANNED_M,
+            body_radius_m=radius + _BODY_M,
         )
         warm_up.global_localizer()
         self.begin_anew()
@@ -172,11 +194,17 @@ class GlobalLocalizerNode(LiveNode):
                 self._publish(scan.stamp_ns, result)
 
     def _drive(self) -> None:
-        """Drive on, as long as the robot is looked for and what it sees and has driven is heard of."""
+        """Drive on while the robot is looked for and what it sees and has driven is heard of."""
         scan, T_odom_base = self._scan, self._T_odom_base
         heard = scan is not None and abs(self._odometry_ns - scan.stamp_ns) <= _SILENCE_NS
         heard = heard and self.get_clock().now().nanoseconds - self._odometry_ns <= _SILENCE_NS
-        if not self._wanted or self._search is None or scan is None or T_odom_base is None or not heard:
+        if (
+            not self._wanted
+            or self._search is None
+            or scan is None
+            or T_odom_base is None
+            or not heard
+        ):
             self.stand_still()
             return
         command = self._search.step(T_odom_base, scan, _CONTROL_PERIOD_S)
@@ -190,7 +218,9 @@ class GlobalLocalizerNode(LiveNode):
         """Whether there is all that a search needs; a map that cannot be used is said in words."""
         if self._finder is None and self._patch is not None and self._topology is not None:
             try:
-                self._finder = GlobalLocalization(self._patch, self._topology, self._config, self._seed)
+                self._finder = GlobalLocalization(
+                    self._patch, self._topology, self._config, self._seed
+                )
                 if self._active:
                     self._search = ActiveSearch(self._finder.places, self._config, self._driving)
             except InputError as error:
@@ -199,7 +229,11 @@ class GlobalLocalizerNode(LiveNode):
 
     def _missing(self) -> str:
         """What is not there yet, in words; empty where nothing is missing."""
-        missing = [name for name, value in (('map', self._patch), ('topology', self._topology)) if value is None]
+        missing = [
+            name
+            for name, value in (('map', self._patch), ('topology', self._topology))
+            if value is None
+        ]
         missing += [name for name in ('odom', 'scan') if name not in self._heard]
         return ', '.join(missing)
 
@@ -234,18 +268,25 @@ class GlobalLocalizerNode(LiveNode):
         if result.pose is not None:
             found = result.pose
             self._pose.publish(
-                messages.pose_with_covariance_msg(found.T_map_base, found.covariance, self._map_frame, ns)
+                messages.pose_with_covariance_msg(
+                    found.T_map_base, found.covariance, self._map_frame, ns
+                )
             )
             self.get_logger().info(f'localized: {result.reason}')
             self._wanted, self._finder, self._search, self._found_ns = False, None, None, ns
             self.stand_still()
 
     def _show_samples(self, ns: int) -> None:
-        """Publish the samples, now and then: they are thousands of small objects, which take longer than a step."""
+        """Publish the samples, now and then.
+
+        They are thousands of small objects, which take longer than a step.
+        """
         if self._finder is not None and not 0 <= ns - self._shown_ns < _SHOWN_NS:
             self._shown_ns = ns
             poses = [messages.pose_msg(T) for T in self._finder.samples]
-            self._samples.publish(PoseArray(header=messages.header(self._map_frame, ns), poses=poses))
+            self._samples.publish(
+                PoseArray(header=messages.header(self._map_frame, ns), poses=poses)
+            )
 
 
 def main() -> None:

@@ -32,7 +32,9 @@ _NO_BUILDER = 'no graph: there is no topology_builder'
 
 
 class GridMapperNode(LiveNode):
-    """/scan and /pose in; /map once a second and /local_map at every scan out; services save_map and load_map.
+    """/scan and /pose in; /map once a second and /local_map at every scan out.
+
+    Services save_map and load_map.
 
     After a /trajectory the map is drawn anew; map_load_time of both says by which one it was.
     """
@@ -41,7 +43,9 @@ class GridMapperNode(LiveNode):
         super().__init__('grid_mapper', recovers=True)
         self._config = parameters.declare(self, OccupancyConfig)
         self._window_m = parameters.declare(self, WindowConfig).window_m
-        self._mapping = parameters.declare_value(self, 'mapping', True, 'draw what is seen; false: the map stays')
+        self._mapping = parameters.declare_value(
+            self, 'mapping', True, 'draw what is seen; false: the map stays'
+        )
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
         self._mount = LaserMount(self)
         self._session = parameters.declare_session(self)
@@ -61,12 +65,15 @@ class GridMapperNode(LiveNode):
         listen(self, Path, 'trajectory', self._on_trajectory, qos.LATCHED)
         listen(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
         listen(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
-        # Mapping goes on while a map is saved, and waits while one is loaded: nothing gets into the wrong graph.
+        # Mapping goes on while a map is saved, and waits while one is loaded: nothing gets into the
+        # wrong graph.
         aside = ReentrantCallbackGroup()
         self.create_service(SaveMap, 'save_map', self._on_save, callback_group=aside)
         self.create_service(LoadMap, 'load_map', self._on_load)
         self._save_topology = self.create_client(SaveMap, 'save_topology', callback_group=aside)
-        self._save_exploration = self.create_client(SaveMap, 'save_exploration', callback_group=aside)
+        self._save_exploration = self.create_client(
+            SaveMap, 'save_exploration', callback_group=aside
+        )
         self._save_features = self.create_client(SaveMap, 'save_features', callback_group=aside)
         self._load_features = self.create_client(LoadMap, 'load_features', callback_group=aside)
         self._load_topology = self.create_client(LoadMap, 'load_topology', callback_group=aside)
@@ -106,7 +113,9 @@ class GridMapperNode(LiveNode):
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         is_known = bool(messages.covariance_from(message)[0, 0] < _LOST_SIGMA_M**2)
         T_map_base = messages.pose_from(message.pose.pose)
-        self._take(self._matcher.right(messages.stamp_ns(message.header.stamp), (T_map_base, is_known)))
+        self._take(
+            self._matcher.right(messages.stamp_ns(message.header.stamp), (T_map_base, is_known))
+        )
 
     def _take(self, pair: tuple[LaserScan, tuple[Array, bool]] | None) -> None:
         self.health.dropped_in_all('scans and poses without a partner', self._matcher.dropped)
@@ -122,7 +131,9 @@ class GridMapperNode(LiveNode):
                 self._draw(scan, T_map_base)
             window = self._grid.window(T_map_base[0], T_map_base[1], self._window_m)
         self._latest_ns = scan.stamp_ns
-        self._local_map.publish(messages.grid_msg(window, self._map_frame, scan.stamp_ns, self._corrected_ns))
+        self._local_map.publish(
+            messages.grid_msg(window, self._map_frame, scan.stamp_ns, self._corrected_ns)
+        )
 
     def _draw(self, scan: Scan, T_map_base: Array) -> None:
         self._grid.update(scan, T_map_base)
@@ -132,7 +143,9 @@ class GridMapperNode(LiveNode):
     def _publish_map(self) -> None:
         if self._latest_ns is not None:
             patch = self._grid.patch()
-            self._map.publish(messages.grid_msg(patch, self._map_frame, self._latest_ns, self._corrected_ns))
+            self._map.publish(
+                messages.grid_msg(patch, self._map_frame, self._latest_ns, self._corrected_ns)
+            )
 
     def _on_trajectory(self, message: Path) -> None:
         """A loop was closed: draw the map anew where the scans were really made."""
@@ -140,10 +153,14 @@ class GridMapperNode(LiveNode):
         if self._latest_ns is None or self._corrected_ns <= self._taken_over_ns:
             return  # latched, and older than the map: that has undergone it, or is a new one
         if self._history is None:
-            self.get_logger().warning('a loop is closed, but the map was loaded, not drawn here: it stays as it was')
+            self.get_logger().warning(
+                'a loop is closed, but the map was loaded, not drawn here: it stays as it was'
+            )
         else:
             with self.health.timed('map drawn anew'):
-                self._history.past.correct(*messages.trajectory_from(message), since_ns=self._corrected_ns)
+                self._history.past.correct(
+                    *messages.trajectory_from(message), since_ns=self._corrected_ns
+                )
                 self._grid = self._history.draw(self._grid)
         self._publish_map()
 
@@ -152,7 +169,9 @@ class GridMapperNode(LiveNode):
         self._history = None
         self._publish_map()
 
-    async def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
+    async def _on_save(
+        self, request: SaveMap.Request, response: SaveMap.Response
+    ) -> SaveMap.Response:
         def save() -> str:
             path = self._saves.inside(request.path)
             return f'saved {session_files.save_grid(path, self._grid)}'
@@ -164,24 +183,35 @@ class GridMapperNode(LiveNode):
         graph = await ask(self, self._save_topology, SaveMap.Request(path=path))
         if graph is None:
             saved = response.message
-            answer(response, lambda: f'{saved}; {_NO_BUILDER}{session_files.set_topology_aside(path)}')
+            answer(
+                response, lambda: f'{saved}; {_NO_BUILDER}{session_files.set_topology_aside(path)}'
+            )
         else:
-            response.success, response.message = graph.success, f'{response.message}; {graph.message}'
+            response.success = graph.success
+            response.message = f'{response.message}; {graph.message}'
         await self._save_at(self._save_features, path, session_files.set_features_aside, response)
-        await self._save_at(self._save_exploration, path, session_files.set_exploration_aside, response)
+        await self._save_at(
+            self._save_exploration, path, session_files.set_exploration_aside, response
+        )
         return response
 
     async def _save_at(
         self, client: Client, path: str, set_aside: Callable[[str], str], response: SaveMap.Response
     ) -> None:
-        """Have another node save its part; without it, what is there of an earlier map must not pass for this one's."""
+        """Have another node save its part.
+
+        Without that node, what is there of an earlier map must not pass for this one's.
+        """
         saved, part = response.message, await ask(self, client, SaveMap.Request(path=path))
         if part is not None:
-            response.success, response.message = response.success and part.success, f'{saved}; {part.message}'
+            response.success = response.success and part.success
+            response.message = f'{saved}; {part.message}'
         elif response.success:
             answer(response, lambda: f'{saved}{set_aside(path)}')
 
-    async def _on_load(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:
+    async def _on_load(
+        self, request: LoadMap.Request, response: LoadMap.Response
+    ) -> LoadMap.Response:
         """Take over grid and graph, or neither."""
         try:
             inside = self._saves.inside(request.path)
@@ -199,7 +229,8 @@ class GridMapperNode(LiveNode):
             response.message = f'grid taken over; {response.message}'
             features = await ask(self, self._load_features, LoadMap.Request(path=stem))
             if features is not None:
-                response.success, response.message = features.success, f'{response.message}; {features.message}'
+                response.success = features.success
+                response.message = f'{response.message}; {features.message}'
         return response
 
 

@@ -1,4 +1,7 @@
-"""Where the robot is: each scan, with the odometry at its stamp, through one step of the localizer."""
+"""Where the robot is.
+
+Each scan, with the odometry at its stamp, through one step of the localizer.
+"""
 
 from dataclasses import replace
 from time import monotonic, perf_counter
@@ -40,24 +43,29 @@ _HEALTH = {
 
 
 class LocalizerNode(LiveNode):
-    """/scan and /odom in; /pose, map -> odom on /tf, /line_features, /slam_status out; /trajectory after a loop.
+    """/scan and /odom in; /pose, map -> odom on /tf, /line_features, /slam_status out.
 
-    Services ~/pause, ~/reset, and save_features and load_features for sessions: lost in the map of one, it waits for
-    /initialpose, or for a scan that fits where it is.
+    /trajectory after a loop.
+
+    Services ~/pause, ~/reset, and save_features and load_features for sessions: lost in the map of
+    one, it waits for /initialpose, or for a scan that fits where it is.
     """
 
     def __init__(self) -> None:
         super().__init__('localizer', recovers=True)
         self._config = parameters.declare(self, LocalizerConfig)
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
-        self._odom_frame = parameters.declare_value(self, 'odom_frame', 'odom', 'frame of the odometry')
+        self._odom_frame = parameters.declare_value(
+            self, 'odom_frame', 'odom', 'frame of the odometry'
+        )
         self._mount = LaserMount(self)
         self._session = parameters.declare_session(self)
         self._saves = SaveFolder(self)
         parameters.check_unknown(self)
         warm_up.localizer()
         self._map_topic: Subscription | None = None
-        # Of a localizer that was killed: its last pose, the map, and the newest scan, that waits for it.
+        # Of a localizer that was killed: its last pose, the map, and the newest scan, that waits
+        # for it.
         self._resumed: LastPose | None = None
         self._latched: GridPatch | None = None
         self.begin_anew()
@@ -69,7 +77,8 @@ class LocalizerNode(LiveNode):
         self._features = self.create_publisher(LineFeatureArray, 'line_features', qos.LATCHED)
         self._status = self.create_publisher(SlamStatus, 'slam_status', qos.STREAM)
         self._trajectory = self.create_publisher(Path, 'trajectory', qos.LATCHED)
-        # Before the scans: of messages that wait together, the executor takes the graph of the last scan first.
+        # Before the scans: of messages that wait together, the executor takes the graph of the last
+        # scan first.
         listen(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
         listen(self, Odometry, 'odom', self._on_odometry, qos.STREAM)
         listen(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
@@ -78,7 +87,10 @@ class LocalizerNode(LiveNode):
         self.create_service(LoadMap, 'load_features', self._on_load)
 
     def begin_anew(self) -> None:
-        """Forget all features, or go back to the session that the node was started with: the robot is at its start."""
+        """Forget all features, or go back to the session that the node was started with.
+
+        The robot is at its start.
+        """
         self._localizer, self._pairing = self._made(self._config), ScanPairing()
         self._last: LastPose | None = None
         self._topology: Graph | None = None
@@ -93,7 +105,9 @@ class LocalizerNode(LiveNode):
 
     def _made(self, config: LocalizerConfig) -> Localizer:
         """A localizer that begins at its start, in the map of the session if there is one."""
-        return (session_files.load_features(self._session, config) if self._session else None) or Localizer(config)
+        return (
+            session_files.load_features(self._session, config) if self._session else None
+        ) or Localizer(config)
 
     def _at(self, T_map_base: Array) -> LocalizerConfig:
         """The configuration of a robot that starts at a pose (3,)."""
@@ -109,7 +123,9 @@ class LocalizerNode(LiveNode):
         self._take(self._pairing.add_scan(self._mount.scan(message)))
 
     def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
-        self._localizer.set_pose(messages.pose_from(message.pose.pose), messages.covariance_from(message))
+        self._localizer.set_pose(
+            messages.pose_from(message.pose.pose), messages.covariance_from(message)
+        )
 
     def _on_topology(self, message: TopologicalMap) -> None:
         self._topology = messages.topology_from(message)
@@ -144,9 +160,7 @@ class LocalizerNode(LiveNode):
         self._map_topic = self.create_subscription(OccupancyGrid, 'map', take, qos.LATCHED)
         self.every(_MAP_WAIT_S, lambda: self._take([]), Clock(clock_type=ClockType.STEADY_TIME))
 
-    def _resume(
-        self, last: LastPose, ready: list[tuple[Scan, Array]]
-    ) -> list[tuple[Scan, Array]]:
+    def _resume(self, last: LastPose, ready: list[tuple[Scan, Array]]) -> list[tuple[Scan, Array]]:
         """Begin where the robot is now, in the map; returns the scan to go on with, or none yet.
 
         Where the odometry has begun anew, too, the robot is at its start. Where there is no map, it
@@ -208,7 +222,9 @@ class LocalizerNode(LiveNode):
             estimate.T_map_base, estimate.covariance, self._map_frame, ns
         )
         self._pose.publish(pose)
-        transform = messages.transform_msg(estimate.T_map_odom, self._map_frame, self._odom_frame, ns)
+        transform = messages.transform_msg(
+            estimate.T_map_odom, self._map_frame, self._odom_frame, ns
+        )
         self._tf.publish(TFMessage(transforms=[transform]))
         header = messages.header(self._map_frame, ns)
         features = [_feature_msg(feature) for feature in self._localizer.features]
@@ -228,9 +244,14 @@ class LocalizerNode(LiveNode):
         )
 
     def _tell_trajectory(self, ns: int) -> None:
-        """Say where the kept scans were made, now that a loop is closed: before the first pose that follows from it."""
+        """Say where the kept scans were made, now that a loop is closed.
+
+        Before the first pose that follows from it.
+        """
         stamps, poses = self._localizer.past()
-        self._trajectory.publish(messages.trajectory_msg(stamps.tolist(), poses, self._map_frame, ns))
+        self._trajectory.publish(
+            messages.trajectory_msg(stamps.tolist(), poses, self._map_frame, ns)
+        )
         self.get_logger().info(f'a loop is closed: {len(poses)} poses of the past are corrected')
 
 

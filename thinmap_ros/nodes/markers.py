@@ -1,4 +1,7 @@
-"""Graph, end nodes and line features as markers, for RViz and Foxglove, which do not know thinmap's messages."""
+"""Graph, end nodes and line features as markers, for RViz and Foxglove.
+
+These do not know thinmap's messages.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,7 +15,7 @@ from thinmap_ros.adapters.live_node import LiveNode
 
 
 class MarkersNode(LiveNode):
-    """/topology, /end_nodes and /line_features in; the same as markers on /topology_markers, ... out."""
+    """/topology, /end_nodes, /line_features in; as markers on /topology_markers, ... out."""
 
     def __init__(self) -> None:
         super().__init__('markers')

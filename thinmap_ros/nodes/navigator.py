@@ -117,7 +117,11 @@ class NavigatorNode(LiveNode):
             self._end(Outcome.ABORTED, reason)
             return
         self._cancel_asked = False
-        self._goal = (float(goal[0]), float(goal[1]), float(goal[2]) if request.use_heading else None)
+        self._goal = (
+            float(goal[0]),
+            float(goal[1]),
+            float(goal[2]) if request.use_heading else None,
+        )
         self._navigator.set_goal(*self._goal)
 
     def _on_cancel(self) -> None:
@@ -143,16 +147,25 @@ class NavigatorNode(LiveNode):
             self._tell(command.state)
 
     def _command(self) -> Command | None:
-        """What the navigator says now; a stop while the laser is silent; None before everything is known."""
+        """What the navigator says now; a stop while the laser is silent.
+
+        None before everything is known.
+        """
         if fault := self._fault():
             reason = f'{fault}: standing still'
             self.get_logger().warning(reason, throttle_duration_sec=_WARN_PERIOD_S)
             self.health.state(WARN, reason)
             self._navigator.halt()
             return Command(0.0, 0.0, 'blocked', reason)
-        if self._map.patch is None or self._scan is None or self._T_map_odom is None or self._T_odom_base is None:
+        if (
+            self._map.patch is None
+            or self._scan is None
+            or self._T_map_odom is None
+            or self._T_odom_base is None
+        ):
             self.get_logger().warning(
-                'goal waits: no map, scan, pose or odometry yet', throttle_duration_sec=_WARN_PERIOD_S
+                'goal waits: no map, scan, pose or odometry yet',
+                throttle_duration_sec=_WARN_PERIOD_S,
             )
             return None
         self.health.state(OK, 'driving')
@@ -165,7 +178,11 @@ class NavigatorNode(LiveNode):
         if self._is_blind:
             return 'laser blind (too few valid beams)'
         latest = self._odometry.latest_stamp_ns
-        if latest is not None and self._scan is not None and latest - self._scan.stamp_ns > _SILENCE_NS:
+        if (
+            latest is not None
+            and self._scan is not None
+            and latest - self._scan.stamp_ns > _SILENCE_NS
+        ):
             return 'laser silent'
         now_ns = self.get_clock().now().nanoseconds
         for who, limit_ns in _SILENCES_NS.items():

@@ -29,10 +29,10 @@ class RecorderConfig(Config):
 
 
 class RecorderNode(Node):
-    """Subscribes to every topic as soon as somebody publishes it, and writes the bytes as they come.
+    """Subscribes to each topic as soon as somebody publishes it, and writes the bytes as they come.
 
-    What has come is on the disk within half a second, whatever ends the robot. Where the disk takes no more, the node
-    says so and ends.
+    What has come is on the disk within half a second, whatever ends the robot. Where the disk takes
+    no more, the node says so and ends.
     """
 
     def __init__(self) -> None:
@@ -55,7 +55,7 @@ class RecorderNode(Node):
         self.create_timer(_FLUSH_S, lambda: self._guarded(self._writer.flush), clock=wall)
 
     def close(self) -> None:
-        """Finish the bag; what a full disk leaves of it is readable, and `bag_repair` makes it whole."""
+        """Finish the bag; what a full disk leaves is readable, and `bag_repair` makes it whole."""
         with contextlib.suppress(OSError):
             for message in self._early:
                 self._write(*message, self.get_clock().now().nanoseconds)
@@ -65,7 +65,11 @@ class RecorderNode(Node):
     def _look_around(self) -> None:
         for topic, types in self.get_topic_names_and_types():
             # What an action says under way is repeated on topics of its own.
-            if '/_action/' not in topic and topic not in self._seen and self.count_publishers(topic) > 0:
+            if (
+                '/_action/' not in topic
+                and topic not in self._seen
+                and self.count_publishers(topic) > 0
+            ):
                 self._seen.add(topic)
                 self._subscribe(topic, types[0])
 
@@ -76,11 +80,15 @@ class RecorderNode(Node):
         try:
             kind = message_class(type_name)
             self._writer.learn(resources.message_definitions(type_name.partition('/')[0]))
-            self._writer.add_topic(topic, type_name, [bag_qos.recorded(o.depth, reliable, latched) for o in offers])
+            self._writer.add_topic(
+                topic, type_name, [bag_qos.recorded(o.depth, reliable, latched) for o in offers]
+            )
         except InputError as error:
             self.get_logger().warning(f'{topic} is not recorded: {error}')
             return
-        self.create_subscription(kind, topic, self._takes(topic, type_name), _wanted(reliable, latched), raw=True)
+        self.create_subscription(
+            kind, topic, self._takes(topic, type_name), _wanted(reliable, latched), raw=True
+        )
 
     def _takes(self, topic: str, type_name: str) -> Callable[[bytes], None]:
         def take(data: bytes) -> None:
@@ -91,7 +99,8 @@ class RecorderNode(Node):
     def _take(self, topic: str, type_name: str, data: bytes) -> None:
         ns = self.get_clock().now().nanoseconds
         if ns == 0 and len(self._early) < _DEPTH:
-            # Time has not begun: players must not think that so much of it passed before the first scan.
+            # Time has not begun: players must not think that so much of it passed before the first
+            # scan.
             self._early.append((topic, type_name, data))
             return
         for message in self._early:
@@ -109,7 +118,9 @@ class RecorderNode(Node):
         try:
             work()
         except OSError as error:
-            raise InputError(f'{self._path}: {error.strerror or error}: recording ends here') from error
+            raise InputError(
+                f'{self._path}: {error.strerror or error}: recording ends here'
+            ) from error
 
 
 def _wanted(reliable: bool, latched: bool) -> QoSProfile:

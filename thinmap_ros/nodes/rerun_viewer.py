@@ -1,4 +1,4 @@
-"""Everything that the graph says about the map and the robot, shown in rerun and written to an .rrd file."""
+"""All that the graph says about map and robot, shown in rerun and written to an .rrd file."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +12,13 @@ from nav_msgs.msg import Path as PathMsg
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
-from thinmap_msgs.msg import EndNodeArray, ExplorationStatus, LineFeatureArray, SlamStatus, TopologicalMap
+from thinmap_msgs.msg import (
+    EndNodeArray,
+    ExplorationStatus,
+    LineFeatureArray,
+    SlamStatus,
+    TopologicalMap,
+)
 from thinmap_ros.adapters import parameters, qos, runtime
 from thinmap_ros.adapters.health import Health
 from thinmap_ros.adapters.rerun_view import View

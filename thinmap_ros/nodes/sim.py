@@ -1,4 +1,7 @@
-"""A simulated robot: /cmd_vel in; /scan, /odom, /tf, /clock and the true pose out; ~/carry puts it elsewhere."""
+"""A simulated robot: /cmd_vel in; /scan, /odom, /tf, /clock and the true pose out.
+
+~/carry puts it elsewhere.
+"""
 
 from dataclasses import dataclass
 from time import monotonic
@@ -34,13 +37,19 @@ _REPEAT_S = 0.25
 class SimConfig(Config):
     """Parameters of the simulation."""
 
-    world: str = parameter('room_10x10', 'world or map YAML file, or the name of a world of the package')
+    world: str = parameter(
+        'room_10x10', 'world or map YAML file, or the name of a world of the package'
+    )
     robot: str = parameter('2dx', 'which Pioneer', choices=tuple(PRESETS))
     start: str = parameter('', 'start as "x,y,theta" (m, m, rad); empty: the one of the world')
     seed: int = parameter(0, 'decides all noise', low=0, high=2**31 - 1)
     rate: float = parameter(1.0, 'simulated seconds a second', low=0.01, high=1000.0)
-    lockstep: str = parameter(NONE, 'wait for what each scan leads to: nothing is lost at high rates', choices=TOPICS)
-    hold_for_subscribers: int = parameter(0, 'time stands still until /scan has so many subscribers', low=0, high=100)
+    lockstep: str = parameter(
+        NONE, 'wait for what each scan leads to: nothing is lost at high rates', choices=TOPICS
+    )
+    hold_for_subscribers: int = parameter(
+        0, 'time stands still until /scan has so many subscribers', low=0, high=100
+    )
     publish_tf: bool = parameter(True, 'publish odom -> base_link and base_link -> laser')
 
 
@@ -88,7 +97,10 @@ class SimNode(Node):
         self._command, self._command_ns = command, self._sim.stamp_ns
 
     def _on_carry(self, message: PoseStamped) -> None:
-        """Somebody lifts the robot up and puts it down at a pose in the world: its wheels know nothing of it."""
+        """Somebody lifts the robot up and puts it down at a pose in the world.
+
+        Its wheels know nothing of it.
+        """
         self._health.heard('~/carry')
         try:
             self._sim.carry(messages.pose_from(message.pose))
@@ -113,7 +125,10 @@ class SimNode(Node):
         self._publish(moment)
 
     def _waits(self) -> bool:
-        """Whether time has to stand still for the last scan. The first one is repeated until somebody answers."""
+        """Whether time has to stand still for the last scan.
+
+        The first one is repeated until somebody answers.
+        """
         if self._sim.stamp_ns > 0:
             return not self._lockstep.give_up()
         if monotonic() - self._repeated_at > _REPEAT_S and self._last_scan is not None:
@@ -127,7 +142,9 @@ class SimNode(Node):
         self._publish_clock(moment.stamp_ns)
         self._odom.publish(self._odometry(moment))
         if self._config.publish_tf:
-            transform = messages.transform_msg(moment.T_odom_base, 'odom', 'base_link', moment.stamp_ns)
+            transform = messages.transform_msg(
+                moment.T_odom_base, 'odom', 'base_link', moment.stamp_ns
+            )
             self._tf.publish(TFMessage(transforms=[transform]))
         truth = messages.pose_stamped_msg(self._sim.robot.T_world_base, 'world', moment.stamp_ns)
         self._truth.publish(truth)
@@ -145,7 +162,9 @@ class SimNode(Node):
 
     def _odometry(self, moment: Moment) -> Odometry:
         velocity = (self._sim.robot.v, self._sim.robot.w)
-        return messages.odometry_msg(moment.T_odom_base, velocity, ('odom', 'base_link'), moment.stamp_ns)
+        return messages.odometry_msg(
+            moment.T_odom_base, velocity, ('odom', 'base_link'), moment.stamp_ns
+        )
 
     def _publish_mount(self) -> None:
         if self._config.publish_tf:

@@ -37,7 +37,10 @@ def main() -> None:
         return
     unknown = [name for name in names if name not in (*_NODES, *_OTHERS)]
     if unknown or len(set(names)) < len(names):
-        print(f'error: {unknown[0] if unknown else "a name twice"}: no such choice\n{_USAGE}', file=sys.stderr)
+        print(
+            f'error: {unknown[0] if unknown else "a name twice"}: no such choice\n{_USAGE}',
+            file=sys.stderr,
+        )
         sys.exit(2)
     runtime.run_all([maker(name) for name in names])
 

@@ -1,4 +1,4 @@
-"""The topological map: the window around the robot thinned at every scan and merged into the global graph."""
+"""The topological map: the window of every scan is thinned and merged into the global graph."""
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -24,9 +24,11 @@ _UNTOLD_IDS = 1000  # ids that a builder may have given after its state was kept
 
 
 class TopologyBuilderNode(LiveNode):
-    """/local_map and /pose in; /local_topology and /topology out; services save_topology and load_topology.
+    """/local_map and /pose in; /local_topology and /topology out.
 
-    After a /trajectory the graph is built anew from the /map that has been drawn by it; nodes keep their ids.
+    Services save_topology and load_topology.
+    After a /trajectory the graph is built anew from the /map that has been drawn by it; nodes keep
+    their ids.
     """
 
     def __init__(self) -> None:
@@ -55,7 +57,9 @@ class TopologyBuilderNode(LiveNode):
         self.keep(self._state, self._resume)
 
     def _state(self) -> State | None:
-        return None if self._latest_ns is None else {**self._builder.state(), 'latest_ns': np.array(self._latest_ns)}
+        if self._latest_ns is None:
+            return None
+        return {**self._builder.state(), 'latest_ns': np.array(self._latest_ns)}
 
     def _resume(self, left: State) -> None:
         """Take over the graph of a builder that was killed. Raises InputError where it is none."""
@@ -104,7 +108,9 @@ class TopologyBuilderNode(LiveNode):
         if changed:
             self._publish(stamp_ns)
         # The local map comes last: who hears it knows that all of this scan is said.
-        self._local.publish(messages.topology_msg(self._builder.local_map(), self._map_frame, stamp_ns))
+        self._local.publish(
+            messages.topology_msg(self._builder.local_map(), self._map_frame, stamp_ns)
+        )
 
     def _on_trajectory(self, message: Path) -> None:
         corrected_ns = messages.stamp_ns(message.header.stamp)
@@ -125,7 +131,10 @@ class TopologyBuilderNode(LiveNode):
         self._global.publish(messages.topology_msg(self._builder.map, self._map_frame, stamp_ns))
 
     def _keep_new_ids(self) -> None:
-        """Whoever hears of a node may rely on its id: it is kept first, and not only when the next time has come."""
+        """Whoever hears of a node may rely on its id.
+
+        It is kept first, and not only when the next time has come.
+        """
         newest = max(self._builder.map.nodes, default=0)
         if newest != self._newest_kept and self.keep_news():
             self._newest_kept = newest
@@ -147,7 +156,8 @@ class TopologyBuilderNode(LiveNode):
             inside = self._saves.inside(path)
             resolution_m = self._builder.resolution_m
             loaded = session_files.load_topology(inside, self._config, resolution_m)
-        self._builder, self._matcher, self._rebuilding = loaded, StampMatcher(), Rebuilding(from_the_start=not path)
+        self._builder, self._matcher = loaded, StampMatcher()
+        self._rebuilding = Rebuilding(from_the_start=not path)
         self._publish(self.get_clock().now().nanoseconds)
         return f'graph of {len(loaded.map.nodes)} nodes' if path else 'the graph begins anew'
 

@@ -1,7 +1,7 @@
 """How much of what could be seen is known.
 
-Coverage is the share of the free cells that a sensor of a range could see, by line of sight, from some place that a
-robot of a radius can reach from its start, that the map holds as free.
+Coverage is the share of the free cells that a sensor of a range could see, by line of sight, from
+some place that a robot of a radius can reach from its start, that the map holds as free.
 """
 
 import math
@@ -75,11 +75,12 @@ class Coverable:
 
 
 def coverable(world: World, start: Array, radius_m: float, range_m: float) -> Coverable:
-    """All that a robot of a radius, from its start (3,), could come to see all around with a sensor of a range.
+    """All that a robot of a radius could come to see, all around up to a range, from a start (3,).
 
-    Every place in the world's own cells where the robot can stand is taken; none is left out for speed. Sight goes
-    both ways, so each free cell looks around for such a place and stops at the first: most stand on one. Rays are
-    5 cm apart at the full range: a gap narrower than that, that far away, may be missed.
+    Every place in the world's own cells where the robot can stand is taken; none is left out for
+    speed. Sight goes both ways, so each free cell looks around for such a place and stops at the
+    first: most stand on one. Rays are 5 cm apart at the full range: a gap narrower than that, that
+    far away, may be missed.
     Raises InputError where the robot does not fit at its start.
     """
     reached = _reachable_from(world, start, radius_m)
@@ -89,7 +90,8 @@ def coverable(world: World, start: Array, radius_m: float, range_m: float) -> Co
     rows, cols = world.occupied.shape
     last = frame.cells_of(world.frame.centres_of(np.array([[rows - 1, cols - 1]])))[0]
     cells = np.argwhere(_without_solids(world, frame, (int(last[0]) + 1, int(last[1]) + 1)))
-    places = (frame.centres_of(cells) - (world.frame.origin_x, world.frame.origin_y)) / world.frame.resolution
+    origin = (world.frame.origin_x, world.frame.origin_y)
+    places = (frame.centres_of(cells) - origin) / world.frame.resolution
     angles = np.arange(0.0, 2.0 * math.pi, _RAY_SPACING_M / max(range_m, 1.0))
     seen = _look_around(world.occupied, reached, places, angles, range_m / world.frame.resolution)
     coverable_cells = np.zeros(tuple(last + 1), dtype=np.bool_)
@@ -98,14 +100,16 @@ def coverable(world: World, start: Array, radius_m: float, range_m: float) -> Co
 
 
 def _reachable_from(world: World, start: Array, radius_m: float) -> NDArray[np.bool_]:
-    """Cells of the world (H, W) at whose centres the robot can stand, connected with the one that it starts in."""
+    """Cells (H, W) at whose centres the robot can stand, connected with the one it starts in."""
     from scipy import ndimage
 
     standing = world.wall_distance_m > radius_m
     row, col = world.frame.cells_of(start[None, :2])[0]
     rows, cols = standing.shape
     if not (0 <= row < rows and 0 <= col < cols and standing[row, col]):
-        raise InputError(f'{world.name}: start {start[:2].tolist()}: a robot of {radius_m} m does not fit there')
+        raise InputError(
+            f'{world.name}: start {start[:2].tolist()}: a robot of {radius_m} m does not fit there'
+        )
     labels, _ = ndimage.label(standing)
     return np.asarray(labels == labels[row, col])
 
@@ -120,9 +124,13 @@ def _without_solids(world: World, frame: GridFrame, shape: tuple[int, int]) -> N
 
 @kernel
 def _look_around(
-    solid: NDArray[np.uint8], wanted: NDArray[np.bool_], places: Array, angles: Array, max_cells: float
+    solid: NDArray[np.uint8],
+    wanted: NDArray[np.bool_],
+    places: Array,
+    angles: Array,
+    max_cells: float,
 ) -> NDArray[np.bool_]:
-    """Whether a ray from each place (N, 2), as x and y in cells, meets a wanted cell before a solid one."""
+    """Whether rays from each place (N, 2; x, y in cells) meet a wanted cell before a solid one."""
     rows, cols = solid.shape
     found = np.zeros(len(places), dtype=np.bool_)
     for i in range(len(places)):
@@ -130,7 +138,12 @@ def _look_around(
             col, step_x, next_x, delta_x = axis_setup(places[i, 0], math.cos(angles[k]))
             row, step_y, next_y, delta_y = axis_setup(places[i, 1], math.sin(angles[k]))
             travelled = 0.0
-            while travelled <= max_cells and 0 <= row < rows and 0 <= col < cols and not solid[row, col]:
+            while (
+                travelled <= max_cells
+                and 0 <= row < rows
+                and 0 <= col < cols
+                and not solid[row, col]
+            ):
                 if wanted[row, col]:
                     found[i] = True
                     break

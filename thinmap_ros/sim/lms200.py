@@ -14,7 +14,8 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.sim.world import World
 
-_FLATTEST_RAD = math.radians(10.0)  # neighbouring beams on a wall seen at this angle are no depth edge
+# Neighbouring beams on a wall seen at this angle are no depth edge.
+_FLATTEST_RAD = math.radians(10.0)
 
 
 @dataclass(frozen=True)
@@ -22,14 +23,20 @@ class Lms200Config(Config):
     """A planar laser scanner; the defaults are those of an LMS200 in its 8 m mode."""
 
     beams: int = parameter(181, 'beams of a scan', low=2, high=10_000)
-    field_of_view_deg: float = parameter(180.0, 'angle between first and last beam, degrees', low=0.0, high=360.0)
+    field_of_view_deg: float = parameter(
+        180.0, 'angle between first and last beam, degrees', low=0.0, high=360.0
+    )
     range_min_m: float = parameter(0.05, 'nearest range, m', low=0.0, high=10.0)
     range_max_m: float = parameter(8.0, 'farthest range, m', low=0.1, high=200.0)
     rate_hz: float = parameter(5.0, 'scans a second', low=0.1, high=20.0)
     noise_m: float = parameter(0.01, 'range noise, 1 sigma, m', low=0.0, high=1.0)
     rounding_m: float = parameter(0.001, 'ranges are whole multiples of this, m', low=0.0, high=0.1)
-    mixed_pixels: float = parameter(0.3, 'share of depth edges that give a range in between', low=0.0, high=1.0)
-    edge_m: float = parameter(0.3, 'neighbouring beams that differ by more make a depth edge, m', low=0.01, high=10.0)
+    mixed_pixels: float = parameter(
+        0.3, 'share of depth edges that give a range in between', low=0.0, high=1.0
+    )
+    edge_m: float = parameter(
+        0.3, 'neighbouring beams that differ by more make a depth edge, m', low=0.01, high=10.0
+    )
     mount_x_m: float = parameter(0.0, 'laser ahead of the robot centre, m', low=-2.0, high=2.0)
 
 
@@ -68,18 +75,22 @@ class Lms200:
         x = (T_world_laser[0] - world.frame.origin_x) / resolution
         y = (T_world_laser[1] - world.frame.origin_y) / resolution
         angles = T_world_laser[2] + self._angle_min + self._turns
-        return cast_rays(world.occupied, x, y, angles, self.config.range_max_m / resolution) * resolution
+        return (
+            cast_rays(world.occupied, x, y, angles, self.config.range_max_m / resolution)
+            * resolution
+        )
 
     def _mix(self, ranges: Array) -> Array:
-        """Mixed pixels: at a depth edge a beam's spot falls on both surfaces, and the range lies in between.
+        """Mixed pixels: at a depth edge a beam's spot is on both surfaces, the range in between.
 
-        Of the two beams beside an edge it is the one or the other: were it always the same one, the pixels of a left
-        and a right wall would be off to the same side.
+        Of the two beams beside an edge it is the one or the other: were it always the same one, the
+        pixels of a left and a right wall would be off to the same side.
         """
         edges = _edges(ranges, self.config.edge_m, self._increment / math.sin(_FLATTEST_RAD))
         mixed = edges[self._rng.random(ranges.size - 1)[edges] < self.config.mixed_pixels]
         share, side = self._rng.random(mixed.size), self._rng.integers(0, 2, mixed.size)
-        nearer, farther = np.minimum(ranges[mixed], ranges[mixed + 1]), np.maximum(ranges[mixed], ranges[mixed + 1])
+        nearer = np.minimum(ranges[mixed], ranges[mixed + 1])
+        farther = np.maximum(ranges[mixed], ranges[mixed + 1])
         result = ranges.copy()
         result[mixed + side] = nearer + share * (farther - nearer)
         return result
@@ -87,7 +98,7 @@ class Lms200:
 
 @kernel
 def _edges(ranges: Array, edge_m: float, along_a_wall: float) -> NDArray[np.int64]:
-    """Beams whose range differs from the next one's by more than edge_m, and than along a wall: there per metre."""
+    """Beams whose range differs from the next by more than edge_m and than along_a_wall a metre."""
     found = np.empty(ranges.size, dtype=np.int64)
     count = 0
     for i in range(ranges.size - 1):

@@ -1,4 +1,4 @@
-"""A Pioneer with two driven wheels: exact motion, limits, contact with walls, and wheel odometry that drifts."""
+"""A Pioneer with two driven wheels: exact motion, limits, contact with walls, drifting odometry."""
 
 import math
 from dataclasses import dataclass, field
@@ -17,17 +17,33 @@ _AWAY_M = 0.05
 class PioneerConfig(Config):
     """A robot's body, limits, and the errors of its wheel odometry."""
 
-    radius_m: float = parameter(0.22, 'radius of the disc that holds the body, m', low=0.01, high=2.0)
+    radius_m: float = parameter(
+        0.22, 'radius of the disc that holds the body, m', low=0.01, high=2.0
+    )
     max_speed_m_s: float = parameter(1.6, 'speed limit, m/s', low=0.01, high=5.0)
     max_turn_rad_s: float = parameter(3.0, 'turn rate limit, rad/s', low=0.01, high=10.0)
     max_acceleration_m_s2: float = parameter(0.5, 'acceleration limit, m/s^2', low=0.01, high=10.0)
-    max_turn_acceleration_rad_s2: float = parameter(3.0, 'turn acceleration limit, rad/s^2', low=0.01, high=20.0)
-    scale_sigma: float = parameter(0.01, 'systematic error of distances: wheel diameter (1 sigma)', low=0.0)
-    turn_scale_sigma: float = parameter(0.02, 'systematic error of turns: wheel base (1 sigma)', low=0.0)
-    drift_sigma_rad_m: float = parameter(0.01, 'systematic turn per metre: unequal wheels (1 sigma), rad/m', low=0.0)
-    distance_noise: float = parameter(0.01, 'noise of distances per square root of metres (1 sigma), m', low=0.0)
-    turn_noise: float = parameter(0.02, 'noise of turns per square root of radians (1 sigma), rad', low=0.0)
-    turn_noise_driving: float = parameter(0.01, 'noise of turns per square root of metres (1 sigma), rad', low=0.0)
+    max_turn_acceleration_rad_s2: float = parameter(
+        3.0, 'turn acceleration limit, rad/s^2', low=0.01, high=20.0
+    )
+    scale_sigma: float = parameter(
+        0.01, 'systematic error of distances: wheel diameter (1 sigma)', low=0.0
+    )
+    turn_scale_sigma: float = parameter(
+        0.02, 'systematic error of turns: wheel base (1 sigma)', low=0.0
+    )
+    drift_sigma_rad_m: float = parameter(
+        0.01, 'systematic turn per metre: unequal wheels (1 sigma), rad/m', low=0.0
+    )
+    distance_noise: float = parameter(
+        0.01, 'noise of distances per square root of metres (1 sigma), m', low=0.0
+    )
+    turn_noise: float = parameter(
+        0.02, 'noise of turns per square root of radians (1 sigma), rad', low=0.0
+    )
+    turn_noise_driving: float = parameter(
+        0.01, 'noise of turns per square root of metres (1 sigma), rad', low=0.0
+    )
 
 
 # The 3-AT is larger and skid-steered: its wheels slip whenever it turns.
@@ -46,7 +62,7 @@ PRESETS = {
 
 @dataclass(eq=False)
 class Pioneer:
-    """A robot at T_world_base (3,), with odometry T_odom_base (3,) that begins at zero and drifts by its seed."""
+    """A robot at T_world_base (3,), odometry T_odom_base (3,) from zero that drifts by its seed."""
 
     config: PioneerConfig
     world: World
@@ -65,13 +81,17 @@ class Pioneer:
         self._drift_rad_m = self._rng.normal(0.0, self.config.drift_sigma_rad_m)
 
     def step(self, v: float, w: float, dt_s: float) -> None:
-        """Drive for dt_s towards a commanded speed v (m/s) and turn rate w (rad/s), within the limits.
+        """Drive for dt_s towards a commanded speed v (m/s) and turn rate w (rad/s), within limits.
 
-        A robot that would touch a wall stays where it is and can still turn. A contact counts once, until the robot has
-        come away from the wall.
+        A robot that would touch a wall stays where it is and can still turn. A contact counts once,
+        until the robot has come away from the wall.
         """
-        self.v = _towards(self.v, v, self.config.max_speed_m_s, self.config.max_acceleration_m_s2 * dt_s)
-        self.w = _towards(self.w, w, self.config.max_turn_rad_s, self.config.max_turn_acceleration_rad_s2 * dt_s)
+        self.v = _towards(
+            self.v, v, self.config.max_speed_m_s, self.config.max_acceleration_m_s2 * dt_s
+        )
+        self.w = _towards(
+            self.w, w, self.config.max_turn_rad_s, self.config.max_turn_acceleration_rad_s2 * dt_s
+        )
         moved = after_arc(self.T_world_base, self.v * dt_s, self.w * dt_s)
         x, y, _ = moved.tolist()
         clear = self.world.is_clear(x, y, self.config.radius_m)
@@ -80,24 +100,28 @@ class Pioneer:
             self.v = 0.0
             moved = after_arc(self.T_world_base, 0.0, self.w * dt_s)
         self.T_world_base = moved
-        # One that goes on pushing creeps up to the wall and is stopped again: that is the same contact.
+        # One that goes on pushing creeps up to the wall and is stopped again: the same contact.
         self.touching = not clear or (
-            self.touching and not self.world.is_clear(moved[0], moved[1], self.config.radius_m + _AWAY_M)
+            self.touching
+            and not self.world.is_clear(moved[0], moved[1], self.config.radius_m + _AWAY_M)
         )
-        self.T_odom_base = after_arc(self.T_odom_base, *self._measured(self.v * dt_s, self.w * dt_s))
+        self.T_odom_base = after_arc(
+            self.T_odom_base, *self._measured(self.v * dt_s, self.w * dt_s)
+        )
 
     def _measured(self, distance: float, turn: float) -> tuple[float, float]:
         """Return the way and the turn as the wheels count them."""
         metres, radians = abs(distance), abs(turn)
         noise = self._rng.normal(size=2).tolist()
-        seen_distance = distance * self._scale + noise[0] * self.config.distance_noise * math.sqrt(metres)
-        sigma = self.config.turn_noise * math.sqrt(radians) + self.config.turn_noise_driving * math.sqrt(metres)
+        root = math.sqrt(metres)
+        seen_distance = distance * self._scale + noise[0] * self.config.distance_noise * root
+        sigma = self.config.turn_noise * math.sqrt(radians) + self.config.turn_noise_driving * root
         seen_turn = turn * self._turn_scale + self._drift_rad_m * metres + noise[1] * sigma
         return seen_distance, seen_turn
 
 
 def after_arc(T: Array, distance: float, turn: float) -> Array:
-    """Pose (3,) after driving a circular arc of a length (m) from a pose (3,) while turning by an angle (rad)."""
+    """Pose (3,) after a circular arc of a length (m) from a pose (3,), with a turn (rad)."""
     half = turn / 2.0
     chord = distance if half == 0.0 else distance * math.sin(half) / half
     dx, dy = chord * math.cos(half), chord * math.sin(half)

@@ -16,7 +16,10 @@ STEP_NS = 50_000_000
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """What the robot's sensors tell after a step: odometry at stamp_ns, and a scan where one is due."""
+    """What the robot's sensors tell after a step.
+
+    Odometry at stamp_ns, and a scan where one is due.
+    """
 
     stamp_ns: int
     T_odom_base: Array
@@ -24,10 +27,12 @@ class Moment:
 
 
 class Simulation:
-    """Steps of 50 ms: odometry at 20 Hz, and a scan whenever the laser's period is over. The seed decides all noise.
+    """Steps of 50 ms: odometry at 20 Hz, and a scan whenever the laser's period is over.
 
-    start (3,): where the robot stands in the world; its odometry begins at zero there. Raises InputError where it
-    does not fit.
+    The seed decides all noise.
+
+    start (3,): where the robot stands in the world; its odometry begins at zero there. Raises
+    InputError where it does not fit.
     """
 
     def __init__(
@@ -43,9 +48,14 @@ class Simulation:
         self.stamp_ns = 0
 
     def carry(self, T_world_base: Array) -> None:
-        """Carry the robot to a pose (3,): its wheels do not turn. Raises InputError where it does not fit."""
+        """Carry the robot to a pose (3,): its wheels do not turn.
+
+        Raises InputError where it does not fit.
+        """
         _check_fits(self.world, T_world_base, self.robot.config)
-        self.robot.T_world_base, self.robot.v, self.robot.w = np.array(T_world_base, dtype=np.float64), 0.0, 0.0
+        self.robot.T_world_base = np.array(T_world_base, dtype=np.float64)
+        self.robot.v = 0.0
+        self.robot.w = 0.0
 
     def sense(self) -> Moment:
         """Return what the sensors tell now; a scan that is due is given once."""

@@ -10,16 +10,22 @@ from thinmap_ros.sim.world import World
 
 
 def surfaces(world: World, shortest_m: float) -> Array:
-    """Faces of what is solid, parallel to an axis, that bound the free space round the start: ends (N, 4), m.
+    """Faces of what is solid, parallel to an axis, that bound the free space round the start.
 
-    Each is as long as it goes on straight, at least shortest_m; the two sides of a thin wall are two. Columns: x and y
-    of one end, x and y of the other. Slanting surfaces fall into steps, and are left out with these.
+    Ends (N, 4), m.
+
+    Each is as long as it goes on straight, at least shortest_m; the two sides of a thin wall are
+    two. Columns: x and y of one end, x and y of the other. Slanting surfaces fall into steps, and
+    are left out with these.
     """
     free = world.occupied == 0
     inside = inside_of(world)
     found = [_rows_of_faces(inside, free, world.frame, shortest_m, side) for side in (-1, 1)]
     turned = GridFrame(world.frame.origin_y, world.frame.origin_x, world.frame.resolution)
-    across = [_rows_of_faces(inside.T, free.T, turned, shortest_m, side)[:, [1, 0, 3, 2]] for side in (-1, 1)]
+    across = [
+        _rows_of_faces(inside.T, free.T, turned, shortest_m, side)[:, [1, 0, 3, 2]]
+        for side in (-1, 1)
+    ]
     return np.concatenate([*found, *across])
 
 
@@ -29,12 +35,21 @@ def inside_of(world: World) -> NDArray[np.bool_]:
 
 
 def _rows_of_faces(
-    inside: NDArray[np.bool_], free: NDArray[np.bool_], frame: GridFrame, shortest_m: float, side: int
+    inside: NDArray[np.bool_],
+    free: NDArray[np.bool_],
+    frame: GridFrame,
+    shortest_m: float,
+    side: int,
 ) -> Array:
-    """Faces along rows, (N, 4): free cells inside that have a solid one beside them, a row below (-1) or above (1)."""
+    """Faces along rows, (N, 4).
+
+    Free cells inside that have a solid one beside them, a row below (-1) or above (1).
+    """
     faces = np.zeros((inside.shape[0], inside.shape[1] + 2), dtype=np.int8)
     beyond = np.ones_like(free)
-    beyond[max(-side, 0) : len(free) - max(side, 0)] = free[max(side, 0) : len(free) - max(-side, 0)]
+    beyond[max(-side, 0) : len(free) - max(side, 0)] = free[
+        max(side, 0) : len(free) - max(-side, 0)
+    ]
     faces[:, 1:-1] = inside & ~beyond
     rows, first = np.nonzero(np.diff(faces, axis=1) > 0)
     _, end = np.nonzero(np.diff(faces, axis=1) < 0)

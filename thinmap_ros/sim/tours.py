@@ -1,4 +1,4 @@
-"""Drives of a simulated robot, along given ways or to random places: scan, odometry and truth, from one seed."""
+"""Drives of a simulated robot, on given or random ways: scan, odometry and truth, from one seed."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -62,7 +62,7 @@ def patch_of(world: World) -> GridPatch:
 
 
 def ways_along(world: World, places: Array, radius_m: float) -> Iterator[Array]:
-    """Ways (K, 2) from the start of a world to places (N, 2), one after the other: straight where there is room.
+    """Ways (K, 2) from a world's start to places (N, 2), one by one, straight where there is room.
 
     Raises InputError where a place cannot be reached.
     """
@@ -72,7 +72,9 @@ def ways_along(world: World, places: Array, radius_m: float) -> Iterator[Array]:
     for place in places:
         way = _straight(at, place)
         if not _is_clear(world, way, reach.robot_radius_m):
-            planned = plan(patch, (float(at[0]), float(at[1])), (float(place[0]), float(place[1])), reach)
+            planned = plan(
+                patch, (float(at[0]), float(at[1])), (float(place[0]), float(place[1])), reach
+            )
             if planned is None:
                 raise InputError(f'{world.name}: tour: {place.tolist()}: no way from {at.tolist()}')
             way = planned
@@ -94,7 +96,9 @@ def _is_clear(world: World, way: Array, radius_m: float) -> bool:
     return bool((world.wall_distance_m[cells[:, 0], cells[:, 1]] > radius_m).all())
 
 
-def random_start(world: World, rng: np.random.Generator, within: NDArray[np.bool_] | None = None) -> Array:
+def random_start(
+    world: World, rng: np.random.Generator, within: NDArray[np.bool_] | None = None
+) -> Array:
     """A pose (3,) at which the robot fits, anywhere in the world or in some of its cells (H, W)."""
     room = world.wall_distance_m > PioneerConfig().radius_m + MARGIN_M
     cells = np.argwhere(room if within is None else room & within)
@@ -103,17 +107,25 @@ def random_start(world: World, rng: np.random.Generator, within: NDArray[np.bool
 
 
 def random_drive(
-    world: World, start: Array, seed: int, within: NDArray[np.bool_] | None = None, laser: Lms200Config | None = None
+    world: World,
+    start: Array,
+    seed: int,
+    within: NDArray[np.bool_] | None = None,
+    laser: Lms200Config | None = None,
 ) -> Iterator[Look]:
-    """Look after look of a robot that drives from a start to random places, one after the other, without end.
+    """Look after look of a robot that drives from a start to random places, one by one, endlessly.
 
     within (H, W): cells of the world in which these places lie; all, where it is not given.
     """
     simulation = Simulation(world, start, PioneerConfig(), laser or Lms200Config(), seed)
-    return drive(simulation, _random_ways(simulation, np.random.default_rng(seed), within), _RANDOM_SPEED_M_S)
+    return drive(
+        simulation, _random_ways(simulation, np.random.default_rng(seed), within), _RANDOM_SPEED_M_S
+    )
 
 
-def _random_ways(simulation: Simulation, rng: np.random.Generator, within: NDArray[np.bool_] | None) -> Iterator[Array]:
+def _random_ways(
+    simulation: Simulation, rng: np.random.Generator, within: NDArray[np.bool_] | None
+) -> Iterator[Array]:
     """Paths (K, 2) from where the robot is to random places that can be reached."""
     world = simulation.world
     patch = patch_of(world)

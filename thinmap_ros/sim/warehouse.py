@@ -1,4 +1,7 @@
-"""Text of worlds/warehouse.yaml, 200 x 200 m of racks with goods in front: python -m thinmap_ros.sim.warehouse."""
+"""Text of worlds/warehouse.yaml, 200 x 200 m of racks with goods in front.
+
+Python -m thinmap_ros.sim.warehouse.
+"""
 
 import numpy as np
 
@@ -10,8 +13,8 @@ _GOODS_M = (1.2, 0.8)  # a pallet on the floor, along the rack and out into the 
 _SEED = 0
 
 _HEADER = f"""\
-# A warehouse of 200 x 200 m for scale, by thinmap_ros.sim.warehouse (seed {_SEED}): racks back to back, pallets on
-# the floor in front of some. The tour goes up and down through every second aisle.
+# A warehouse of 200 x 200 m for scale, by thinmap_ros.sim.warehouse (seed {_SEED}): racks back to
+# back, pallets on the floor in front of some. The tour goes up and down through every second aisle.
 name: warehouse
 resolution: 0.05
 wall_thickness: 0.20
@@ -28,9 +31,15 @@ def warehouse() -> str:
             solids.append(_box(x, y, _RACK_M, _LENGTH_M))
             for at_x in (x - _GOODS_M[1], x + _RACK_M):
                 if rng.random() < 0.5:
-                    solids.append(_box(at_x, y + rng.uniform(0.0, _LENGTH_M - _GOODS_M[0]), *_GOODS_M[::-1]))
+                    solids.append(
+                        _box(at_x, y + rng.uniform(0.0, _LENGTH_M - _GOODS_M[0]), *_GOODS_M[::-1])
+                    )
     side = f'{_SIDE_M:g}'
-    lines = ['walls:', f'  - [[0, 0], [{side}, 0], [{side}, {side}], [0, {side}], [0, 0]]', 'solids:']
+    lines = [
+        'walls:',
+        f'  - [[0, 0], [{side}, 0], [{side}, {side}], [0, {side}], [0, 0]]',
+        'solids:',
+    ]
     tour = ', '.join(f'[{x:.5g}, {y:.5g}]' for x, y in _tour())
     return _HEADER + f'start: [3.0, 3.0, 0.0]\ntour: [{tour}]\n' + '\n'.join(lines + solids) + '\n'
 

@@ -15,7 +15,10 @@ from thinmap_ros.core.se2 import Array
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """What is solid: `occupied` (H, W) uint8 on a lattice in the world frame; where a robot may start (3,)."""
+    """What is solid: `occupied` (H, W) uint8 on a lattice in the world frame.
+
+    Where a robot may start (3,).
+    """
 
     name: str
     occupied: NDArray[np.uint8]
@@ -44,14 +47,18 @@ class World:
         col = math.floor((x - frame.origin_x) / frame.resolution)
         if not (0 <= row < rows and 0 <= col < cols):
             return False
-        # The point lies up to 0.71 cells off the centre, and the distance there is up to 0.2 cells too long.
+        # The point lies up to 0.71 cells off the centre, and the distance there is up to 0.2 cells
+        # too long.
         spare = (float(self.wall_distance_m[row, col]) - radius_m) / frame.resolution
         if abs(spare) > 1.0:
             return spare > 0.0
         return self._squared_gap(x, y, row, col, radius_m) > radius_m**2
 
     def _squared_gap(self, x: float, y: float, row: int, col: int, reach_m: float) -> float:
-        """Squared distance, m^2, from a point to the nearest solid cell within reach; inf where there is none."""
+        """Squared distance, m^2, from a point to the nearest solid cell within reach.
+
+        Inf where there is none.
+        """
         reach = math.ceil(reach_m / self.frame.resolution) + 1
         first = np.maximum([row - reach, col - reach], 0)
         near = self.occupied[first[0] : row + reach + 1, first[1] : col + reach + 1]

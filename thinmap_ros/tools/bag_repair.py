@@ -1,4 +1,4 @@
-"""A bag that was cut off or damaged (MCAP) into a whole one, with everything that can be read of it."""
+"""A bag that was cut off or damaged (MCAP) into a whole one, with all that can be read of it."""
 
 import argparse
 from pathlib import Path
@@ -12,7 +12,10 @@ from thinmap_ros.tools import cli
 
 
 def files_of(bag: Path) -> list[Path]:
-    """Return the MCAP files of a bag, in the order in which they were recorded. Raises InputError where it has none."""
+    """Return the MCAP files of a bag, in the order in which they were recorded.
+
+    Raises InputError where it has none.
+    """
     refuse_foreign(bag)
     files = mcap_files_in(bag) if bag.is_dir() else [bag]
     if not files or not files[0].is_file() or not (files[0].suffix == '.mcap' or is_mcap(files[0])):
@@ -21,7 +24,7 @@ def files_of(bag: Path) -> list[Path]:
 
 
 def _has_compressed_messages(bag: Path) -> bool:
-    """Whether metadata.yaml says that each message is compressed on its own; without it, none is."""
+    """Whether metadata.yaml says that each message is compressed on its own; none without it."""
     try:
         return bag_files(bag).compressed_messages
     except InputError:
@@ -54,7 +57,9 @@ def main() -> None:
     """Run the program."""
     parser = argparse.ArgumentParser(prog='bag_repair', description=__doc__)
     parser.add_argument('bag', type=Path, help='MCAP file, or rosbag2 folder of MCAP files')
-    parser.add_argument('-o', '--out', type=Path, help='folder or .mcap file to write (default: BAG_repaired)')
+    parser.add_argument(
+        '-o', '--out', type=Path, help='folder or .mcap file to write (default: BAG_repaired)'
+    )
     cli.run(_work, parser)
 
 

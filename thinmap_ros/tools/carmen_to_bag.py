@@ -13,8 +13,9 @@ from thinmap_ros.tools import cli
 def convert(log: CarmenLog, bag: Path) -> int:
     """Write a bag of a log; returns the number of scans.
 
-    Header stamps are the log's own, also where they step back. The bag's log time never does: it follows the largest
-    stamp so far, a nanosecond a message, so that playing it keeps the order of the file.
+    Header stamps are the log's own, also where they step back. The bag's log time never does: it
+    follows the largest stamp so far, a nanosecond a message, so that playing it keeps the order of
+    the file.
     """
     scans = 0
     with BagWriter(bag) as writer:
@@ -24,7 +25,9 @@ def convert(log: CarmenLog, bag: Path) -> int:
             stamp_ns = event.stamp_ns if isinstance(event, OdometryEvent) else event.scan.stamp_ns
             log_ns = max(stamp_ns, log_ns + 1)
             if scans == 0 and not isinstance(event, OdometryEvent):
-                mount = messages.transform(stamp_ns, ('base_link', 'laser'), event.scan.T_base_laser)
+                mount = messages.transform(
+                    stamp_ns, ('base_link', 'laser'), event.scan.T_base_laser
+                )
                 writer.write('/tf_static', 'tf2_msgs/msg/TFMessage', log_ns, mount)
                 log_ns += 1
             log_ns = _write(writer, messages, event, log_ns)
@@ -47,7 +50,11 @@ def _write(writer: BagWriter, messages: BagObjects, event: Event, log_ns: int) -
 def _work(arguments: argparse.Namespace) -> None:
     log = CarmenLog(arguments.log, cli.config_from(arguments, LaserOptions))
     scans = convert(log, arguments.bag)
-    skipped = f', {log.skipped.count} lines skipped (first: {log.skipped.first})' if log.skipped.count else ''
+    skipped = (
+        f', {log.skipped.count} lines skipped (first: {log.skipped.first})'
+        if log.skipped.count
+        else ''
+    )
     print(f'{arguments.bag}: {scans} scans{skipped}')
 
 
@@ -55,7 +62,9 @@ def main() -> None:
     """Run the program."""
     parser = argparse.ArgumentParser(prog='carmen_to_bag', description=__doc__)
     parser.add_argument('log', type=Path, help='CARMEN log, plain or gzip')
-    parser.add_argument('bag', type=Path, help='rosbag2 folder to write, or a file that ends in .mcap')
+    parser.add_argument(
+        'bag', type=Path, help='rosbag2 folder to write, or a file that ends in .mcap'
+    )
     cli.add_config(parser, LaserOptions)
     cli.run(_work, parser)
 

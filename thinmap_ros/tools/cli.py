@@ -23,7 +23,10 @@ Options = argparse._ActionsContainer
 
 
 def run(work: Callable[[argparse.Namespace], None], parser: argparse.ArgumentParser) -> None:
-    """Parse the arguments, do the work, and end: 0, 2 after one line on what is wrong, or 130 on Ctrl-C."""
+    """Parse the arguments, do the work, and end.
+
+    0, 2 after one line on what is wrong, or 130 on Ctrl-C.
+    """
     arguments = parser.parse_args()
     try:
         work(arguments)
@@ -36,9 +39,12 @@ def run(work: Callable[[argparse.Namespace], None], parser: argparse.ArgumentPar
 
 
 def add_config(parser: Options, config: type[Config], names: list[str] | None = None) -> None:
-    """Add an option for each field of a config (or those named); its default and description are the config's.
+    """Add an option for each field of a config (or those named).
 
-    What is not given on the command line is not among the arguments: `config_from` leaves it to the config.
+    Its default and description are the config's.
+
+    What is not given on the command line is not among the arguments: `config_from` leaves it to the
+    config.
     """
     for field in fields(config):
         if (names is None or field.name in names) and isinstance(field.default, int | float | str):
@@ -46,30 +52,52 @@ def add_config(parser: Options, config: type[Config], names: list[str] | None = 
             help_text = f'{field.metadata["description"]} (default {field.default})'
             kind = type(field.default)
             choices = field.metadata.get('choices')
-            parser.add_argument(option, type=kind, default=argparse.SUPPRESS, choices=choices, help=help_text)
+            parser.add_argument(
+                option, type=kind, default=argparse.SUPPRESS, choices=choices, help=help_text
+            )
 
 
 def config_from(arguments: argparse.Namespace, config: type[AnyConfig]) -> AnyConfig:
-    """Config of what was given on the command line. Raises ConfigError where a value is out of range."""
+    """Config of what was given on the command line.
+
+    Raises ConfigError where a value is out of range.
+    """
     names = [field.name for field in fields(config)]
     return config(**{name: getattr(arguments, name) for name in names if hasattr(arguments, name)})
 
 
 def add_log_options(parser: argparse.ArgumentParser) -> None:
     """Add the log itself and what says where its laser sits and which topics to read."""
-    parser.add_argument('log', type=Path, help='CARMEN log (plain or gzip), rosbag2 folder, or MCAP file')
-    carmen = parser.add_argument_group('laser of a CARMEN log', 'Bags say this themselves, but for --offset-m.')
+    parser.add_argument(
+        'log', type=Path, help='CARMEN log (plain or gzip), rosbag2 folder, or MCAP file'
+    )
+    carmen = parser.add_argument_group(
+        'laser of a CARMEN log', 'Bags say this themselves, but for --offset-m.'
+    )
     add_config(carmen, LaserOptions)
-    parser.add_argument('--scan-topic', default='', help='bag: topic of the scans, where there are several')
-    parser.add_argument('--odom-topic', default='', help='bag: topic of the odometry, where there are several')
-    parser.add_argument('--base-frame', default='base_link', help="bag: the robot's frame (default base_link)")
+    parser.add_argument(
+        '--scan-topic', default='', help='bag: topic of the scans, where there are several'
+    )
+    parser.add_argument(
+        '--odom-topic', default='', help='bag: topic of the odometry, where there are several'
+    )
+    parser.add_argument(
+        '--base-frame', default='base_link', help="bag: the robot's frame (default base_link)"
+    )
 
 
 def open_log(arguments: argparse.Namespace) -> Log:
-    """Return the log that the arguments name; a laser offset that is given comes before a bag's /tf_static."""
+    """Return the log that the arguments name.
+
+    A laser offset that is given comes before a bag's /tf_static.
+    """
     path: Path = arguments.log
     options = config_from(arguments, LaserOptions)
     if not (path.is_dir() or path.suffix == '.mcap' or is_mcap(path)):
         return CarmenLog(path, options)
-    T_base_laser = np.array([options.offset_m, 0.0, 0.0]) if hasattr(arguments, 'offset_m') else None
-    return BagLog(path, arguments.scan_topic, arguments.odom_topic, T_base_laser, arguments.base_frame)
+    T_base_laser = (
+        np.array([options.offset_m, 0.0, 0.0]) if hasattr(arguments, 'offset_m') else None
+    )
+    return BagLog(
+        path, arguments.scan_topic, arguments.odom_topic, T_base_laser, arguments.base_frame
+    )

@@ -1,4 +1,4 @@
-"""Run strategies x worlds x starts, on all cores or on a Dask cluster, into one table and plots of coverage.
+"""Run strategies x worlds x starts, on all cores or a Dask cluster: one table, plots of coverage.
 
 What is finished is kept: started again with the same folder, only what is missing is run.
 """
@@ -46,7 +46,7 @@ class Job:
 
 
 def run_job(job: Job) -> Report:
-    """Explore; runs in a process of its own, here or on another machine, which needs no file of this one."""
+    """Explore, in its own process, here or on another machine, which needs no file of this one."""
     _, report = explore(job.world, job.start, job.options)
     return report | {'start_number': job.number, 'seed': job.options.seed}
 
@@ -55,14 +55,19 @@ def _jobs(arguments: argparse.Namespace) -> list[Job]:
     jobs = []
     for path in arguments.worlds:
         # Worlds of different folders may have the same file name.
-        world = replace(World.from_patch(*read_world(path)), name=f'{path.resolve().parent.name}-{path.stem}')
+        world = replace(
+            World.from_patch(*read_world(path)), name=f'{path.resolve().parent.name}-{path.stem}'
+        )
         for number, start in enumerate(_starts(path, world, arguments.starts)):
-            jobs += [Job(world, start, number, options_from(arguments, name)) for name in arguments.strategies]
+            jobs += [
+                Job(world, start, number, options_from(arguments, name))
+                for name in arguments.strategies
+            ]
     return jobs
 
 
 def _starts(path: Path, world: World, count: int) -> list[Array]:
-    """The first starts of a world: those of a worlds.json in the folder above its own, else the one that it names."""
+    """The first starts of a world: of worlds.json in the folder above its own, else its own one."""
     listing = path.resolve().parent.parent / 'worlds.json'
     key = f'{path.resolve().parent.name}/{path.stem}'
     if listing.exists():
@@ -70,7 +75,9 @@ def _starts(path: Path, world: World, count: int) -> list[Array]:
             starts = json.loads(read_text(listing))[key]['starts'][:count]
             return [se2.pose(*(float(number) for number in start)) for start in starts]
         except (KeyError, TypeError, ValueError) as error:
-            raise InputError(f'{listing}: {key}: expected starts as lists of x, y, theta') from error
+            raise InputError(
+                f'{listing}: {key}: expected starts as lists of x, y, theta'
+            ) from error
     if not np.isfinite(world.start).all():
         raise InputError(f'{path}: the world names no start, and there is no {listing}')
     return [world.start]
@@ -109,10 +116,13 @@ def run_missing(jobs: list[Job], out: Path, arguments: argparse.Namespace) -> No
     """Run what has no result yet; each result is written as soon as it is there."""
     missing = [job for job in jobs if not _report_file(out, job).exists()]
     how: Callable[[list[Job]], Iterator[tuple[Job, Report]]] = (
-        (lambda todo: _on_cluster(todo, arguments.scheduler)) if arguments.scheduler
+        (lambda todo: _on_cluster(todo, arguments.scheduler))
+        if arguments.scheduler
         else (lambda todo: _on_cores(todo, arguments.processes))
     )
-    with tqdm(total=len(jobs), initial=len(jobs) - len(missing), unit='run', disable=arguments.quiet) as bar:
+    with tqdm(
+        total=len(jobs), initial=len(jobs) - len(missing), unit='run', disable=arguments.quiet
+    ) as bar:
         for job, report in how(missing) if missing else ():
             write_text(_report_file(out, job), json.dumps(report) + '\n')
             bar.update()
@@ -134,10 +144,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog='compare_exploration', description=__doc__)
     parser.add_argument('worlds', type=Path, nargs='+', help='world YAMLs or map_server YAMLs')
     parser.add_argument('-o', '--out', type=Path, required=True, help='folder for the results')
-    parser.add_argument('--strategies', nargs='+', default=sorted(STRATEGIES), choices=sorted(STRATEGIES))
-    parser.add_argument('--starts', type=int, default=3, help='how many of the starts in worlds.json (default 3)')
-    parser.add_argument('--processes', type=int, default=os.cpu_count() or 1, help='runs at a time (default: cores)')
-    parser.add_argument('--scheduler', default='', help='address of a Dask scheduler, such as tcp://host:8786')
+    parser.add_argument(
+        '--strategies', nargs='+', default=sorted(STRATEGIES), choices=sorted(STRATEGIES)
+    )
+    parser.add_argument(
+        '--starts', type=int, default=3, help='how many of the starts in worlds.json (default 3)'
+    )
+    parser.add_argument(
+        '--processes', type=int, default=os.cpu_count() or 1, help='runs at a time (default: cores)'
+    )
+    parser.add_argument(
+        '--scheduler', default='', help='address of a Dask scheduler, such as tcp://host:8786'
+    )
     add_options(parser)
     cli.run(_work, parser)
 

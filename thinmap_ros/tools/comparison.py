@@ -18,22 +18,29 @@ def markdown(reports: list[Report]) -> str:
     for report in reports:
         by_strategy[report['strategy']][report['world'], report['start_number']] = report
     lines = [
-        '| strategy | runs | stopped | coverage least | coverage mean | collisions | distance m | time s | turned rad '
-        '| end nodes visited / seen | decision ms, median (highest) | longest | x real time (one core) |',
+        '| strategy | runs | stopped | coverage least | coverage mean | collisions '
+        '| distance m | time s | turned rad | end nodes visited / seen '
+        '| decision ms, median (highest) | longest | x real time (one core) |',
         '|---|---|---|---|---|---|---|---|---|---|---|---|---|',
     ]
     lines += [_row(name, list(runs.values())) for name, runs in sorted(by_strategy.items())]
     others = sorted(set(by_strategy) - {OURS})
     if OURS in by_strategy and others:
         lines += [
-            '', f'{OURS} against each, paired by world and start (mean, 95 % interval; in how many it is shorter):',
-            '', '| against | pairs | distance | time | turns | shorter in |', '|---|---|---|---|---|---|',
+            '',
+            f'{OURS} against each, paired by world and start '
+            '(mean, 95 % interval; in how many it is shorter):',
+            '',
+            '| against | pairs | distance | time | turns | shorter in |',
+            '|---|---|---|---|---|---|',
         ]
         lines += [_paired(name, by_strategy[OURS], by_strategy[name]) for name in others]
     return '\n'.join(lines) + '\n'
 
 
-def saved(ours: dict[tuple[str, int], Report], others: dict[tuple[str, int], Report], key: str) -> Array:
+def saved(
+    ours: dict[tuple[str, int], Report], others: dict[tuple[str, int], Report], key: str
+) -> Array:
     """Ours / other - 1 of a quantity for each world and start that both have, (N,)."""
     common = sorted(ours.keys() & others.keys())
     return np.array([ours[pair][key] / others[pair][key] - 1.0 for pair in common])
@@ -43,11 +50,14 @@ def _row(name: str, runs: list[Report]) -> str:
     coverage = [run['coverage'] for run in runs]
     speed = sum(run['time'] for run in runs) / max(sum(run['cpu_s'] for run in runs), 1e-9)
     decision, longest = (max(run['decision_ms'][key] for run in runs) for key in ('median', 'max'))
-    visited, seen = (sum(run[key] for run in runs) for key in ('end_nodes_visited', 'end_nodes_seen'))
+    visited, seen = (
+        sum(run[key] for run in runs) for key in ('end_nodes_visited', 'end_nodes_seen')
+    )
     return (
         f'| {name} | {len(runs)} | {sum(run["finished"] for run in runs)} | {min(coverage):.2%} '
-        f'| {np.mean(coverage):.2%} | {sum(run["collisions"] for run in runs)} | {_spread(runs, "distance")} '
-        f'| {_spread(runs, "time")} | {_spread(runs, "turned_rad")} | {visited} / {seen} '
+        f'| {np.mean(coverage):.2%} | {sum(run["collisions"] for run in runs)} '
+        f'| {_spread(runs, "distance")} | {_spread(runs, "time")} | {_spread(runs, "turned_rad")} '
+        f'| {visited} / {seen} '
         f'| {decision:.2f} | {longest:.0f} | {speed:.0f} |'
     )
 
@@ -61,11 +71,21 @@ def _spread(runs: list[Report], key: str) -> str:
     return f'{np.mean([run[key] for run in runs]):.1f} ± {spread:.1f}'
 
 
-def _paired(name: str, ours: dict[tuple[str, int], Report], others: dict[tuple[str, int], Report]) -> str:
+def _paired(
+    name: str, ours: dict[tuple[str, int], Report], others: dict[tuple[str, int], Report]
+) -> str:
     shares = {key: saved(ours, others, key) for key in ('distance', 'time', 'turned_rad')}
     cells = []
     for values in shares.values():
-        half = f' ± {_NORMAL_95 * values.std(ddof=1) / np.sqrt(len(values)):.1%}' if len(values) > 1 else ''
+        half = (
+            f' ± {_NORMAL_95 * values.std(ddof=1) / np.sqrt(len(values)):.1%}'
+            if len(values) > 1
+            else ''
+        )
         cells.append(f'{values.mean():+.1%}{half}' if len(values) else '')
     distances = shares['distance']
-    return f'| {name} | {len(distances)} | ' + ' | '.join(cells) + f' | {int((distances < 0.0).sum())} |'
+    return (
+        f'| {name} | {len(distances)} | '
+        + ' | '.join(cells)
+        + f' | {int((distances < 0.0).sum())} |'
+    )

@@ -31,7 +31,10 @@ _DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG
 
 @dataclass(eq=False)
 class Processes:
-    """Processes that live and end together: each in a group of its own, with its output in a file."""
+    """Processes that live and end together.
+
+    Each in a group of its own, with its output in a file.
+    """
 
     folder: Path
     running: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
@@ -52,7 +55,9 @@ class Processes:
 
     def ended(self) -> str | None:
         """Name of a process that has ended."""
-        return next((name for name, process in self.running.items() if process.poll() is not None), None)
+        return next(
+            (name for name, process in self.running.items() if process.poll() is not None), None
+        )
 
     def stop(self) -> None:
         """SIGTERM to every group, and SIGKILL to those that are still there a little later."""
@@ -82,7 +87,10 @@ def _raise_interrupt(number: int, frame: object) -> None:
 
 
 def explore(arguments: argparse.Namespace, world: Path, start: Array) -> None:
-    """Run the graph until the exploration has ended. Raises ThinmapError where a node ends before."""
+    """Run the graph until the exploration has ended.
+
+    Raises ThinmapError where a node ends before.
+    """
     out: Path = arguments.out
     processes = Processes(out / 'log')
     sim_time = ['-p', 'use_sim_time:=true']
@@ -96,11 +104,21 @@ def explore(arguments: argparse.Namespace, world: Path, start: Array) -> None:
     try:
         for name in _NODES:
             processes.start(name, sim_time + extra.get(name, []))
-        lockstep = ['-p', 'lockstep:=local_topology', '-p', f'hold_for_subscribers:={_SCAN_LISTENERS}']
+        lockstep = [
+            '-p',
+            'lockstep:=local_topology',
+            '-p',
+            f'hold_for_subscribers:={_SCAN_LISTENERS}',
+        ]
         clock = ['-p', f'rate:={arguments.rate}', '-p', f'seed:={arguments.seed}']
         where = ['-p', f'start:={start[0]},{start[1]},{start[2]}']
         processes.start('sim', common + lockstep + clock + where)
-        limit = ['-p', f'time_limit_s:={arguments.time_limit}', '-p', f'result:={out / "result.json"}']
+        limit = [
+            '-p',
+            f'time_limit_s:={arguments.time_limit}',
+            '-p',
+            f'result:={out / "result.json"}',
+        ]
         if arguments.view:
             processes.start('rerun_viewer', sim_time)
         processes.start('demo_monitor', sim_time + common + limit, quiet=False)
@@ -120,7 +138,10 @@ def _wait(processes: Processes) -> None:
 
 
 def _prepare(out: Path) -> None:
-    """An empty place for the results of this run; what an earlier run left there goes, and nothing else."""
+    """An empty place for the results of this run.
+
+    What an earlier run left there goes, and nothing else.
+    """
     out.mkdir(parents=True, exist_ok=True)
     if (out / 'bag').exists():
         for file in (out / 'bag').iterdir():
@@ -131,7 +152,10 @@ def _prepare(out: Path) -> None:
 
 
 def _choose_domain() -> None:
-    """A domain of its own, unless the user has set one: two demos at once do not hear each other."""
+    """A domain of its own, unless the user has set one.
+
+    Two demos at once do not hear each other.
+    """
     if 'ROS_DOMAIN_ID' not in os.environ:
         os.environ['ROS_DOMAIN_ID'] = str(random.SystemRandom().randrange(1, 102))
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
@@ -158,13 +182,23 @@ def _work(arguments: argparse.Namespace) -> None:
 def main() -> None:
     """Run the program."""
     parser = argparse.ArgumentParser(prog='demo', description=__doc__)
-    parser.add_argument('--world', default='room_10x10', help='world or map YAML file, or a world of the package')
-    parser.add_argument('--robot', default='2dx', choices=tuple(PRESETS), help='which Pioneer (default 2dx)')
+    parser.add_argument(
+        '--world', default='room_10x10', help='world or map YAML file, or a world of the package'
+    )
+    parser.add_argument(
+        '--robot', default='2dx', choices=tuple(PRESETS), help='which Pioneer (default 2dx)'
+    )
     parser.add_argument('--speed', type=float, default=0.2, help='top speed, m/s (default 0.2)')
     parser.add_argument('--seed', type=int, default=0, help='decides all noise (default 0)')
-    parser.add_argument('--rate', type=float, default=5.0, help='simulated seconds a second, at most (default 5)')
-    parser.add_argument('--time-limit', type=float, default=0.0, help='simulated seconds, 0: none (default)')
-    parser.add_argument('-o', '--out', type=Path, default=Path('out/demo'), help='folder for the results (out/demo)')
+    parser.add_argument(
+        '--rate', type=float, default=5.0, help='simulated seconds a second, at most (default 5)'
+    )
+    parser.add_argument(
+        '--time-limit', type=float, default=0.0, help='simulated seconds, 0: none (default)'
+    )
+    parser.add_argument(
+        '-o', '--out', type=Path, default=Path('out/demo'), help='folder for the results (out/demo)'
+    )
     parser.add_argument('--view', action='store_true', help='show it in rerun')
     cli.run(_work, parser)
 

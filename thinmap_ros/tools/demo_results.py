@@ -8,7 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from thinmap_ros.adapters import bag_messages, figures, graph_files, map_files, rerun_streams, trajectory_files
+from thinmap_ros.adapters import (
+    bag_messages,
+    figures,
+    graph_files,
+    map_files,
+    rerun_streams,
+    trajectory_files,
+)
 from thinmap_ros.adapters.bags import Bag
 from thinmap_ros.adapters.files import write_text
 from thinmap_ros.adapters.view_feed import recording_from_bag
@@ -24,7 +31,13 @@ from thinmap_ros.sim.world import World
 from thinmap_ros.tools.report import Ending, EndNodeCensus, exploration_report
 
 FILES = (
-    'map.pgm', 'map.yaml', 'topology.geojson', 'trajectory.tum', 'report.json', 'summary.png', 'recording.rrd',
+    'map.pgm',
+    'map.yaml',
+    'topology.geojson',
+    'trajectory.tum',
+    'report.json',
+    'summary.png',
+    'recording.rrd',
 )
 _TOPICS = {'/ground_truth', '/pose', '/map', '/topology', '/end_nodes', '/collisions', '/scan'}
 
@@ -65,12 +78,15 @@ def read(path: Path) -> Recording:
         else:
             recording.range_max_m = float(message.range_max)
     if not (recording.true and recording.estimated and recording.maps):
-        raise InputError(f'{path}: expected /ground_truth, /pose and /map; it has {", ".join(sorted(bag.topics))}')
+        raise InputError(
+            f'{path}: expected /ground_truth, /pose and /map; '
+            f'it has {", ".join(sorted(bag.topics))}'
+        )
     return recording
 
 
 def write(out: Path, world_file: Path, robot: str, result: dict[str, Any]) -> dict[str, Any]:
-    """Write map, graph, trajectory, picture, report and, with rerun, recording of the run in out/bag.
+    """Write map, graph, trajectory, picture, report and, with rerun, recording of a run in out/bag.
 
     Returns the report.
     """
@@ -85,12 +101,18 @@ def write(out: Path, world_file: Path, robot: str, result: dict[str, Any]) -> di
     estimated = np.array(list(recording.estimated.values()))
     trajectory_files.write_tum(out / 'trajectory.tum', list(recording.estimated), list(estimated))
     true = np.array(list(recording.true.values()))
-    title = f'{world.name}: {100.0 * report["coverage"]:.1f} % seen, {report["distance"]:.1f} m, {report["time"]:.0f} s'
+    title = (
+        f'{world.name}: {100.0 * report["coverage"]:.1f} % seen, '
+        f'{report["distance"]:.1f} m, {report["time"]:.0f} s'
+    )
     figures.summary_figure(out / 'summary.png', patch, recording.topology, estimated, true, title)
     if rerun_streams.is_installed():
         recording_from_bag(out / 'bag', out / 'recording.rrd')
     else:
-        print('no recording.rrd: rerun is not installed (pip install "thinmap_ros[viewer]")', file=sys.stderr)
+        print(
+            'no recording.rrd: rerun is not installed (pip install "thinmap_ros[viewer]")',
+            file=sys.stderr,
+        )
     write_text(out / 'report.json', json.dumps(report, indent=2) + '\n')
     return report
 
@@ -101,7 +123,9 @@ def _report(recording: Recording, seen: Coverable, result: dict[str, Any]) -> di
     true = np.array([recording.true[ns] for ns in stamps])
     estimated = np.array([recording.estimated[ns] for ns in stamps])
     times = (np.array(stamps) - start_ns) / 1e9
-    coverage = np.array([((ns - start_ns) / 1e9, seen.share_known(patch)) for ns, patch in recording.maps])
+    coverage = np.array(
+        [((ns - start_ns) / 1e9, seen.share_known(patch)) for ns, patch in recording.maps]
+    )
     ending = Ending(bool(result['finished']), str(result['reason']), recording.collisions)
     report = exploration_report(ending, times, true, estimated, coverage, _census(recording))
     # Heading as well: a live run is judged by its poses, not by places alone.

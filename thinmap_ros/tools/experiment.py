@@ -1,4 +1,4 @@
-"""The papers' experiments: each figure and table, with the paper's number beside ours, and one page for all of them."""
+"""The papers' experiments: figures and tables, the paper's numbers beside ours, a page for all."""
 
 import argparse
 import json
@@ -55,7 +55,10 @@ _LONGEST = ('strategies', 'feature_count', 'long_floor', 'convergence')
 
 
 def run_one(name: str, source: Source, out: Path) -> float:
-    """Run an experiment and write all of it into the folder out/NAME; returns the seconds it took."""
+    """Run an experiment and write all of it into the folder out/NAME.
+
+    Returns the seconds it took.
+    """
     began = time.perf_counter()
     write_outcome(EXPERIMENTS[name](source), out / name)
     return time.perf_counter() - began
@@ -71,14 +74,19 @@ def write_outcome(outcome: Outcome, folder: Path) -> None:
         'title': outcome.title,
         'source': outcome.source,
         'how': outcome.how,
-        'tables': [{'name': table.name, 'timed': table.timed, 'rows': len(table.rows)} for table in outcome.tables],
+        'tables': [
+            {'name': table.name, 'timed': table.timed, 'rows': len(table.rows)}
+            for table in outcome.tables
+        ],
         'plots': [{'name': plot.name, 'caption': plot.caption} for plot in outcome.plots],
         'comparisons': [asdict(comparison) for comparison in outcome.comparisons],
     }
     write_text(folder / 'about.json', json.dumps(about, indent=2) + '\n')
 
 
-def _run_all(names: list[str], source: Source, out: Path, processes: int) -> Iterator[tuple[str, float]]:
+def _run_all(
+    names: list[str], source: Source, out: Path, processes: int
+) -> Iterator[tuple[str, float]]:
     if len(names) == 1 or processes == 1:
         yield from ((name, run_one(name, source, out)) for name in names)
         return
@@ -105,7 +113,10 @@ def _work(arguments: argparse.Namespace) -> None:
 def _work_experiments(arguments: argparse.Namespace) -> None:
     names = list(EXPERIMENTS) if arguments.name == 'all' else [arguments.name]
     if arguments.from_bag is not None and not arguments.from_bag.is_dir():
-        raise InputError(f'{arguments.from_bag}: no such folder: expected the bags that scripts/record_bags makes')
+        raise InputError(
+            f'{arguments.from_bag}: no such folder: '
+            'expected the bags that scripts/record_bags makes'
+        )
     source = Source(arguments.seed, arguments.from_bag, arguments.quick)
     for name, seconds in _run_all(names, source, arguments.out, arguments.processes):
         print(f'{name}: {seconds:.0f} s', flush=True)
@@ -120,14 +131,28 @@ def _work_logs(arguments: argparse.Namespace) -> None:
 def main() -> None:
     """Run the program."""
     parser = argparse.ArgumentParser(prog='experiment', description=__doc__)
-    parser.add_argument('name', choices=[*EXPERIMENTS, 'all', LOGS, PAGE], help='which one; page: none')
+    parser.add_argument(
+        'name', choices=[*EXPERIMENTS, 'all', LOGS, PAGE], help='which one; page: none'
+    )
     parser.add_argument('-o', '--out', type=Path, required=True, help='folder for the results')
     parser.add_argument('--seed', type=int, default=0, help='decides all noise (default 0)')
-    parser.add_argument('--from-bag', type=Path, help='folder of bags: drives come from there, not from the simulator')
-    parser.add_argument('--logs', type=Path, help='logs: a folder that has a folder NAME/log.clf for each of them')
-    parser.add_argument('--docs', type=Path, help='folder in which experiments.md is made of all results in --out')
-    parser.add_argument('--quick', action='store_true', help='fewer runs and shorter drives, to see that all works')
-    parser.add_argument('--processes', type=int, default=os.cpu_count() or 1, help='at a time (default: cores)')
+    parser.add_argument(
+        '--from-bag',
+        type=Path,
+        help='folder of bags: drives come from there, not from the simulator',
+    )
+    parser.add_argument(
+        '--logs', type=Path, help='logs: a folder that has a folder NAME/log.clf for each of them'
+    )
+    parser.add_argument(
+        '--docs', type=Path, help='folder in which experiments.md is made of all results in --out'
+    )
+    parser.add_argument(
+        '--quick', action='store_true', help='fewer runs and shorter drives, to see that all works'
+    )
+    parser.add_argument(
+        '--processes', type=int, default=os.cpu_count() or 1, help='at a time (default: cores)'
+    )
     cli.run(_work, parser)
 
 

@@ -1,4 +1,4 @@
-"""Explore a world in the simulator without a ROS graph, faster than real time: map, graph, path, picture and report."""
+"""Explore a simulated world, no ROS, faster than real time: map, graph, path, picture, report."""
 
 import argparse
 import json
@@ -52,7 +52,9 @@ SCANS_PER_GRAPH = 5
 class Strategy(Protocol):
     """What decides where to go: ours, and everything that it is compared with."""
 
-    def step(self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array) -> Decision:
+    def step(
+        self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
+    ) -> Decision:
         """Say where to go, from the graph, the whole map and a scan made at a pose (3,)."""
 
     def fail_target(self, reason: str) -> None:
@@ -72,7 +74,7 @@ STRATEGIES: dict[str, Callable[[], Strategy]] = {
 
 @dataclass(eq=False)
 class Log:
-    """What happened, scan by scan: stamps, poses (3,) true and estimated; coverage over time; end nodes met."""
+    """Scan by scan: stamps, poses (3,) true and estimated; coverage over time, end nodes met."""
 
     stamps_ns: list[int] = field(default_factory=list)
     true_poses: list[Array] = field(default_factory=list)
@@ -87,7 +89,11 @@ class ClosedLoop:
     """Simulator, pipeline, strategy and navigator, each called in turn as the live graph would."""
 
     def __init__(
-        self, simulation: Simulation, pipeline: Pipeline, strategy: Strategy, navigator: Navigator,
+        self,
+        simulation: Simulation,
+        pipeline: Pipeline,
+        strategy: Strategy,
+        navigator: Navigator,
         kidnapping: Kidnapping | None = None,
     ) -> None:
         self.simulation = simulation
@@ -104,7 +110,10 @@ class ClosedLoop:
         self._command = (0.0, 0.0)
 
     def run(self, goal: Coverable, limit_s: float, show: Callable[[float, float], None]) -> Ending:
-        """Explore until the strategy is finished or the time is up; show is told time (s) and coverage now and then."""
+        """Explore until the strategy is finished or the time is up.
+
+        `show` is told time (s) and coverage now and then.
+        """
         moment, steps = self.simulation.sense(), 0
         while moment.stamp_ns < limit_s * 1e9:
             if moment.scan is not None:
@@ -118,7 +127,11 @@ class ClosedLoop:
             moment, steps = self.simulation.step(*self._command), steps + 1
         show(*self._measure(goal))
         finished = self.decision is not None and self.is_finished
-        reason = self.decision.reason if self.decision is not None and finished else f'time limit of {limit_s:.0f} s'
+        reason = (
+            self.decision.reason
+            if self.decision is not None and finished
+            else f'time limit of {limit_s:.0f} s'
+        )
         return Ending(finished, reason, self.simulation.robot.collisions)
 
     @property
@@ -150,9 +163,13 @@ class ClosedLoop:
         self._patch = self.pipeline.grid.patch()
         # The processor's time: what else the machine does is not the strategy's.
         began = time.thread_time()
-        self.decision = self.strategy.step(self.pipeline.topology.map, self._patch, scan, estimate.T_map_base)
+        self.decision = self.strategy.step(
+            self.pipeline.topology.map, self._patch, scan, estimate.T_map_base
+        )
         self.log.decision_s.append(time.thread_time() - began)
-        self.log.census.take([(n.node_id, n.x, n.y) for n in self.decision.end_nodes], estimate.T_map_base)
+        self.log.census.take(
+            [(n.node_id, n.x, n.y) for n in self.decision.end_nodes], estimate.T_map_base
+        )
         target = self.decision.target
         self.log.targets.take(None if target is None else target.goal)
         if target is None:
@@ -172,7 +189,9 @@ class ClosedLoop:
         if self._patch is None:
             return
         T_map_base = se2.compose(self._T_map_odom, moment.T_odom_base)
-        command = self.navigator.step(T_map_base, self._patch, self._scan, _CONTROL_STEPS * STEP_NS / 1e9)
+        command = self.navigator.step(
+            T_map_base, self._patch, self._scan, _CONTROL_STEPS * STEP_NS / 1e9
+        )
         self._command = (command.v, command.w)
         if command.state == 'failed':
             self.strategy.fail_target(command.reason)
@@ -190,7 +209,9 @@ def true_pose_source(simulation: Simulation) -> Callable[[Scan, Array], Estimate
 
     def locate(scan: Scan, T_odom_base: Array) -> Estimate:
         T_map_base = simulation.robot.T_world_base
-        return Estimate(T_map_base, np.zeros((3, 3)), se2.compose(T_map_base, se2.invert(T_odom_base)))
+        return Estimate(
+            T_map_base, np.zeros((3, 3)), se2.compose(T_map_base, se2.invert(T_odom_base))
+        )
 
     return locate
 
@@ -217,9 +238,13 @@ def make_loop(world: World, start: Array, options: Options) -> ClosedLoop:
     source = true_pose_source(simulation) if options.localization == 'truth' else None
     # A beam that met nothing has seen as far as this laser can.
     grid = OccupancyConfig(no_return_range_m=options.laser.range_max_m)
-    pipeline = Pipeline(PipelineConfig(localizer=localizer, grid=grid, scans_per_graph=SCANS_PER_GRAPH), source)
+    pipeline = Pipeline(
+        PipelineConfig(localizer=localizer, grid=grid, scans_per_graph=SCANS_PER_GRAPH), source
+    )
     navigator = Navigator(NavigatorConfig(max_speed_m_s=options.speed_m_s))
-    kidnapping = None if options.kidnap_at_s is None else Kidnapping(options.kidnap_at_s, options.seed)
+    kidnapping = (
+        None if options.kidnap_at_s is None else Kidnapping(options.kidnap_at_s, options.seed)
+    )
     return ClosedLoop(simulation, pipeline, STRATEGIES[options.strategy](), navigator, kidnapping)
 
 
@@ -228,7 +253,10 @@ def nothing_to_show(seconds: float, coverage: float) -> None:
 
 
 def explore(
-    world: World, start: Array, options: Options, show: Callable[[float, float], None] = nothing_to_show
+    world: World,
+    start: Array,
+    options: Options,
+    show: Callable[[float, float], None] = nothing_to_show,
 ) -> tuple[ClosedLoop, dict[str, Any]]:
     """Explore a world from a start (3,); returns what is left of it and the report."""
     loop = make_loop(world, start, options)
@@ -238,14 +266,23 @@ def explore(
     wall_s, cpu_s = time.perf_counter() - began, time.process_time() - cpu_began
     log = loop.log
     report = exploration_report(
-        ending, np.array(log.stamps_ns) / 1e9, np.array(log.true_poses), np.array(log.poses), np.array(log.coverage),
+        ending,
+        np.array(log.stamps_ns) / 1e9,
+        np.array(log.true_poses),
+        np.array(log.poses),
+        np.array(log.coverage),
         log.census,
     )
     report['target_changes'], report['reversals'] = log.targets.changes, log.targets.reversals
     milliseconds = 1e3 * np.array(log.decision_s)
-    report['decision_ms'] = {'median': round(float(np.median(milliseconds)), 2), 'max': round(milliseconds.max(), 2)}
+    report['decision_ms'] = {
+        'median': round(float(np.median(milliseconds)), 2),
+        'max': round(milliseconds.max(), 2),
+    }
     report |= {} if loop.kidnapping is None else loop.kidnapping.report()
-    report['world'], report['strategy'], report['options'] = world.name, options.strategy, asdict(options)
+    report['world'] = world.name
+    report['strategy'] = options.strategy
+    report['options'] = asdict(options)
     report['wall_s'], report['cpu_s'] = round(wall_s, 3), round(cpu_s, 3)
     return loop, report
 
@@ -258,7 +295,10 @@ def write_outputs(loop: ClosedLoop, report: dict[str, Any], folder: Path) -> Non
     trajectory_files.write_tum(folder / 'trajectory.tum', log.stamps_ns, log.poses)
     map_files.write_map(folder / 'map', patch)
     graph_files.write_geojson(folder / 'topology.geojson', topology)
-    title = f'{report["world"]}: {report["coverage"]:.1%} in {report["time"]:.0f} s, {report["distance"]:.0f} m'
+    title = (
+        f'{report["world"]}: {report["coverage"]:.1%} in {report["time"]:.0f} s, '
+        f'{report["distance"]:.0f} m'
+    )
     poses, true_poses = np.array(log.poses), np.array(log.true_poses)
     figures.summary_figure(folder / 'summary.png', patch, topology, poses, true_poses, title=title)
     write_text(folder / 'report.json', json.dumps(report, indent=2) + '\n')
@@ -267,7 +307,9 @@ def write_outputs(loop: ClosedLoop, report: dict[str, Any], folder: Path) -> Non
 def _start(world: World, given: str | None) -> Array:
     if given is None:
         if not np.isfinite(world.start).all():
-            raise InputError(f'{world.name}: the world names no start: give one with --start=X,Y,THETA')
+            raise InputError(
+                f'{world.name}: the world names no start: give one with --start=X,Y,THETA'
+            )
         return world.start
     try:
         x, y, theta = (float(word) for word in given.split(','))
@@ -298,8 +340,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--speed', type=float, default=0.2, help='speed limit, m/s (default 0.2)')
     parser.add_argument('--localization', default='truth', choices=('truth', 'slam'))
     parser.add_argument('--robot', default='2dx', choices=sorted(PRESETS))
-    parser.add_argument('--time-limit', type=float, default=20_000.0, help='simulated time to give up at, s')
-    parser.add_argument('--kidnap-at', type=float, help='carry the robot off after so many simulated s (with slam)')
+    parser.add_argument(
+        '--time-limit', type=float, default=20_000.0, help='simulated time to give up at, s'
+    )
+    parser.add_argument(
+        '--kidnap-at', type=float, help='carry the robot off after so many simulated s (with slam)'
+    )
     parser.add_argument('--quiet', action='store_true', help='no progress bar')
     cli.add_config(parser, Lms200Config, ['beams', 'field_of_view_deg', 'range_max_m'])
 
@@ -308,8 +354,12 @@ def _work(arguments: argparse.Namespace) -> None:
     world = World.from_patch(*read_world(arguments.world))
     options = options_from(arguments, arguments.strategy)
     if options.kidnap_at_s is not None and options.localization == 'truth':
-        raise InputError('--kidnap-at: a robot that knows the truth is never lost: expected --localization=slam')
-    with tqdm(total=100, unit='%', disable=arguments.quiet, bar_format='{l_bar}{bar}| {postfix}') as bar:
+        raise InputError(
+            '--kidnap-at: a robot that knows the truth is never lost: expected --localization=slam'
+        )
+    with tqdm(
+        total=100, unit='%', disable=arguments.quiet, bar_format='{l_bar}{bar}| {postfix}'
+    ) as bar:
 
         def show(seconds: float, coverage: float) -> None:
             bar.set_postfix_str(f'{seconds:.0f} s simulated', refresh=False)
@@ -319,8 +369,10 @@ def _work(arguments: argparse.Namespace) -> None:
     write_outputs(loop, report, arguments.out)
     how = 'finished' if report['finished'] else 'not finished'
     print(
-        f'{arguments.out}: {how} ({report["reason"]}), coverage {report["coverage"]:.1%}, {report["distance"]:.1f} m, '
-        f'{report["time"]:.0f} s simulated in {report["wall_s"]:.1f} s, {report["collisions"]} collisions'
+        f'{arguments.out}: {how} ({report["reason"]}), '
+        f'coverage {report["coverage"]:.1%}, {report["distance"]:.1f} m, '
+        f'{report["time"]:.0f} s simulated in {report["wall_s"]:.1f} s, '
+        f'{report["collisions"]} collisions'
     )
 
 

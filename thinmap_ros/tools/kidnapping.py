@@ -1,4 +1,4 @@
-"""A robot that is carried off while it explores: whether it notices, and how soon it knows again where it is."""
+"""A robot carried off while it explores: if it notices, and how soon it knows where it is again."""
 
 import math
 from typing import TYPE_CHECKING, Any
@@ -24,10 +24,11 @@ _RIGHT_M, _RIGHT_RAD = 0.5, math.radians(10.0)
 
 
 class Kidnapping:
-    """What befalls a closed loop in which the robot is carried, once, to a random place of what it has mapped.
+    """What befalls a closed loop whose robot is carried, once, to a random place of its map.
 
-    When its localizer is lost, samples all over the map find it again. Until then it explores what is around it, as a
-    robot that has just been switched on, for itself: nothing of that gets into the map.
+    When its localizer is lost, samples all over the map find it again. Until then it explores what
+    is around it, as a robot that has just been switched on, for itself: nothing of that gets into
+    the map.
     """
 
     def __init__(self, at_s: float, seed: int) -> None:
@@ -47,15 +48,16 @@ class Kidnapping:
             return None if since is None or until is None else round(until - since, 3)
 
         off = self._off
+        right: bool | None = None
+        if off is not None:
+            right = bool(math.hypot(off[0], off[1]) <= _RIGHT_M and abs(off[2]) <= _RIGHT_RAD)
         return {
             'kidnapped_at_s': self._carried_s,
             'detected_after_s': after(self._carried_s, self._detected_s),
             'found_after_s': after(self._detected_s, self._found_s),
             'found_after_m': None if self._found_s is None else round(self._way_m, 3),
             'found_error_m': None if off is None else round(math.hypot(off[0], off[1]), 3),
-            'found_right': None if off is None else bool(
-                math.hypot(off[0], off[1]) <= _RIGHT_M and abs(off[2]) <= _RIGHT_RAD
-            ),
+            'found_right': right,
         }
 
     @property
@@ -64,7 +66,7 @@ class Kidnapping:
         return self._finder is not None
 
     def takes(self, loop: 'ClosedLoop', scan: Scan, T_odom_base: Array) -> bool:
-        """Whether a scan is not for the loop: it is of before the robot was carried off, or of a lost robot."""
+        """Whether a scan, of before the robot was carried or of a lost one, is not for the loop."""
         if self._carried_s is None and scan.stamp_ns >= 1e9 * self._at_s:
             self._carry(loop, scan.stamp_ns / 1e9)
             return True
@@ -75,26 +77,40 @@ class Kidnapping:
 
     def hear(self, loop: 'ClosedLoop', scan: Scan, estimate: Estimate) -> None:
         """Begin to search once the robot is lost."""
-        if estimate.lost and self._finder is None and self._carried_s is not None and self._found_s is None:
+        if (
+            estimate.lost
+            and self._finder is None
+            and self._carried_s is not None
+            and self._found_s is None
+        ):
             self._detected_s = scan.stamp_ns / 1e9
-            self._finder = GlobalLocalization(loop.pipeline.grid.patch(), loop.pipeline.topology.map, seed=self._seed)
+            self._finder = GlobalLocalization(
+                loop.pipeline.grid.patch(), loop.pipeline.topology.map, seed=self._seed
+            )
             self._own = loop.pipeline, loop.strategy, loop.navigator
             loop.drive_by(Pipeline(), NearestFrontier(), Navigator(loop.navigator.config))
 
     def _carry(self, loop: 'ClosedLoop', seconds: float) -> None:
         """Put the robot on some place that it has mapped, far from where it is."""
-        world, robot, patch = loop.simulation.world, loop.simulation.robot, loop.pipeline.grid.patch()
+        world = loop.simulation.world
+        robot = loop.simulation.robot
+        patch = loop.pipeline.grid.patch()
         at = patch.frame.centres_of(np.argwhere(patch.free))
         at = at[np.hypot(*(at - robot.T_world_base[:2]).T) >= _FAR_M]
         fits = [world.is_clear(x, y, robot.config.radius_m + _MARGIN_M) for x, y in at.tolist()]
         if not any(fits):
-            raise InputError(f'--kidnap-at={self._at_s:g}: nothing {_FAR_M:g} m off is known: expected a later time')
+            raise InputError(
+                f'--kidnap-at={self._at_s:g}: nothing {_FAR_M:g} m off is known: '
+                'expected a later time'
+            )
         rng = np.random.default_rng(self._seed)
         x, y = rng.choice(at[fits])
         loop.simulation.carry(se2.pose(float(x), float(y), float(rng.uniform(-math.pi, math.pi))))
         self._carried_s = seconds
 
-    def _search(self, loop: 'ClosedLoop', finder: GlobalLocalization, scan: Scan, T_odom_base: Array) -> None:
+    def _search(
+        self, loop: 'ClosedLoop', finder: GlobalLocalization, scan: Scan, T_odom_base: Array
+    ) -> None:
         """One scan of a lost robot, for all of its localizers."""
         assert self._own is not None
         localizer, T_world_base = self._own[0].localizer, loop.simulation.robot.T_world_base
@@ -105,7 +121,8 @@ class Kidnapping:
         if found is not None:
             localizer.set_pose(found.T_map_base, found.covariance)
         if found is not None or not estimate.lost:
-            self._found_s, self._off = scan.stamp_ns / 1e9, se2.between(T_world_base, localizer.pose)
+            self._found_s = scan.stamp_ns / 1e9
+            self._off = se2.between(T_world_base, localizer.pose)
             self._finder = None
             loop.drive_by(*self._own)
         else:

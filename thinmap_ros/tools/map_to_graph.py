@@ -1,4 +1,4 @@
-"""A map_server map becomes a route graph: places and passages that a robot can drive straight between."""
+"""A map_server map becomes a route graph: places, and passages that a robot can drive straight."""
 
 import argparse
 import math
@@ -28,11 +28,12 @@ def _start(given: str | None) -> tuple[float, float] | None:
 
 
 def _config(arguments: argparse.Namespace) -> TopologyConfig:
-    """Robot and pruning as the arguments want them: what keeps a greater clearance is a wider robot."""
+    """Robot and pruning as the arguments want them: a greater clearance is a wider robot."""
     radius = arguments.robot_radius if arguments.min_clearance is None else arguments.min_clearance
     if radius < arguments.robot_radius:
         raise InputError(
-            f'--min-clearance {radius}: expected at least the robot radius ({arguments.robot_radius} m)'
+            f'--min-clearance {radius}: '
+            f'expected at least the robot radius ({arguments.robot_radius} m)'
         )
     return TopologyConfig(robot_radius_m=radius, spur_m=arguments.prune)
 
@@ -46,16 +47,21 @@ def _work(arguments: argparse.Namespace) -> None:
     topology = build(patch, start, config)
     graph_files.write_graph(arguments.out, topology)
     if arguments.picture is not None:
-        figures.summary_figure(arguments.picture, patch, topology, np.empty((0, 2)), title=arguments.map.stem)
+        figures.summary_figure(
+            arguments.picture, patch, topology, np.empty((0, 2)), title=arguments.map.stem
+        )
     if not topology.nodes:
         place = 'no free place' if start is None else f'no free place round {start}'
         print(
-            f'map_to_graph: warning: {arguments.map}: {place} for a robot of {config.robot_radius_m} m radius: '
-            'the graph is empty',
+            f'map_to_graph: warning: {arguments.map}: {place} '
+            f'for a robot of {config.robot_radius_m} m radius: the graph is empty',
             file=sys.stderr,
         )
     parts = len(topology.components())
-    print(f'{arguments.out}: {len(topology.nodes)} nodes, {len(topology.edges)} edges, connected parts: {parts}')
+    print(
+        f'{arguments.out}: {len(topology.nodes)} nodes, {len(topology.edges)} edges, '
+        f'connected parts: {parts}'
+    )
 
 
 def main() -> None:
@@ -68,9 +74,13 @@ def main() -> None:
     parser.add_argument('--robot-radius', type=float, default=radius, help=f'm (default {radius})')
     clearance_help = 'how far nodes and edges stay from obstacles, m (default: the robot radius)'
     parser.add_argument('--min-clearance', type=float, help=clearance_help)
-    prune_help = f'a branch must bring the robot farther than this to count, m (default {_DEFAULTS.spur_m})'
+    prune_help = (
+        f'a branch must bring the robot farther than this to count, m (default {_DEFAULTS.spur_m})'
+    )
     parser.add_argument('--prune', type=float, default=_DEFAULTS.spur_m, help=prune_help)
-    parser.add_argument('--start', help='X,Y in m: only what a robot can reach from there (default: all parts)')
+    parser.add_argument(
+        '--start', help='X,Y in m: only what a robot can reach from there (default: all parts)'
+    )
     parser.add_argument('--picture', type=Path, help='FILE.png: the graph drawn on the map')
     cli.run(_work, parser)
 

@@ -1,4 +1,4 @@
-"""Record the drives behind the experiments: sensors, ground truth and outputs, each as a bag with a text about it."""
+"""Record the experiments' drives: sensors, ground truth, outputs, each a bag with a text on it."""
 
 import argparse
 from collections.abc import Iterable
@@ -21,11 +21,15 @@ from thinmap_ros.tools.experiments.drives import RECIPES, TRUTH_TOPIC, Source
 
 _MAP_EVERY = 300  # scans: a minute
 _TYPES = {
-    '/scan': 'sensor_msgs/msg/LaserScan', '/odom': 'nav_msgs/msg/Odometry', '/tf': 'tf2_msgs/msg/TFMessage',
-    '/tf_static': 'tf2_msgs/msg/TFMessage', TRUTH_TOPIC: 'geometry_msgs/msg/PoseStamped',
-    '/pose': 'geometry_msgs/msg/PoseWithCovarianceStamped', '/map': 'nav_msgs/msg/OccupancyGrid',
+    '/scan': 'sensor_msgs/msg/LaserScan',
+    '/odom': 'nav_msgs/msg/Odometry',
+    '/tf': 'tf2_msgs/msg/TFMessage',
+    '/tf_static': 'tf2_msgs/msg/TFMessage',
+    TRUTH_TOPIC: 'geometry_msgs/msg/PoseStamped',
+    '/pose': 'geometry_msgs/msg/PoseWithCovarianceStamped',
+    '/map': 'nav_msgs/msg/OccupancyGrid',
     '/topology': 'thinmap_msgs/msg/TopologicalMap',
-}  # fmt: skip
+}
 
 
 class _Recording:
@@ -43,7 +47,9 @@ class _Recording:
     def mount(self, look: Look) -> None:
         """Where the laser sits."""
         ns, made = look.scan.stamp_ns, self._objects
-        self._write('/tf_static', ns, made.transform(ns, ('base_link', 'laser'), look.scan.T_base_laser))
+        self._write(
+            '/tf_static', ns, made.transform(ns, ('base_link', 'laser'), look.scan.T_base_laser)
+        )
 
     def sensed(self, look: Look) -> None:
         """What the robot had at a scan, and where it truly was."""
@@ -66,7 +72,10 @@ class _Recording:
 
 
 def record(path: Path, looks: Iterable[Look], localized: bool) -> int:
-    """Write the bag of a drive; returns the number of scans. localized: by the localizer, else by ground truth."""
+    """Write the bag of a drive; returns the number of scans.
+
+    localized: by the localizer, else by ground truth.
+    """
     definitions, scans, pipeline = resources.message_definitions('thinmap_msgs'), 0, None
     with BagWriter(path, definitions=definitions, compressed=True) as writer:
         recording = _Recording(writer)
@@ -86,7 +95,7 @@ def record(path: Path, looks: Iterable[Look], localized: bool) -> int:
 
 
 def _pipeline(first: Look, localized: bool) -> tuple[Pipeline, list[Array]]:
-    """A pipeline for a drive that begins so, and the list into which the true pose of each scan is to be put."""
+    """A pipeline for a drive that begins so, and the list that is to take each scan's true pose."""
     x, y, yaw = (float(number) for number in first.T_world_base)
     config = PipelineConfig(localizer=LocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=yaw))
     truth: list[Array] = []
@@ -105,9 +114,10 @@ def _about(name: str, seed: int, scans: int, seconds: float, localized: bool) ->
         f'A simulated Pioneer {recipe.robot.upper()} with an LMS200 (181 beams, 8 m, 5 Hz),\n'
         f'in worlds/{recipe.world}.yaml, {recipe.how}.\n'
         f'Seed {seed}; {scans} scans in {seconds:.1f} s.\n\n'
-        f'Topics: /scan /odom /tf /tf_static {TRUTH_TOPIC}, and as outputs /pose (poses {poses}), and once a minute\n'
+        f'Topics: /scan /odom /tf /tf_static {TRUTH_TOPIC}, '
+        f'and as outputs /pose (poses {poses}), and once a minute\n'
         '/map and /topology. MCAP with zstd. Made by: scripts/record_bags\n'
-    )  # fmt: skip
+    )
 
 
 def _work(arguments: argparse.Namespace) -> None:
@@ -119,14 +129,18 @@ def _work(arguments: argparse.Namespace) -> None:
         localized = RECIPES[name].localized
         scans = record(path, looks, localized)
         seconds = (looks[-1].scan.stamp_ns - looks[0].scan.stamp_ns) / 1e9
-        write_text(arguments.out / f'{name}.txt', _about(name, arguments.seed, scans, seconds, localized))
+        write_text(
+            arguments.out / f'{name}.txt', _about(name, arguments.seed, scans, seconds, localized)
+        )
         print(f'{path}: {scans} scans, {path.stat().st_size / 1e6:.2f} MB', flush=True)
 
 
 def main() -> None:
     """Run the program."""
     parser = argparse.ArgumentParser(prog='record_bags', description=__doc__)
-    parser.add_argument('names', nargs='*', help=f'which drives: some of {", ".join(RECIPES)} (default: all)')
+    parser.add_argument(
+        'names', nargs='*', help=f'which drives: some of {", ".join(RECIPES)} (default: all)'
+    )
     parser.add_argument('-o', '--out', type=Path, required=True, help='folder of the bags')
     parser.add_argument('--seed', type=int, default=0, help='decides all noise (default 0)')
     cli.run(_work, parser)

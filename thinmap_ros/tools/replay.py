@@ -1,4 +1,7 @@
-"""A log or bag through localizer, grid and topology, as fast as it goes: trajectory, map, graph, report and picture."""
+"""A log or bag through localizer, grid and topology, as fast as it goes.
+
+Trajectory, map, graph, report and picture.
+"""
 
 import argparse
 import json
@@ -44,7 +47,10 @@ class Replay:
 def replay(
     log: Log, config: PipelineConfig, show_progress: bool = False, shown: ReplayView | None = None
 ) -> Replay:
-    """Play a log through the pipeline, shown or not. Raises InputError where the log has nothing to play."""
+    """Play a log through the pipeline, shown or not.
+
+    Raises InputError where the log has nothing to play.
+    """
     result = Replay(Pipeline(config))
     pairing, tidy_up = ScanPairing(), give_back_pages()
     for event in tqdm(log.events(), unit=' events', disable=not show_progress):
@@ -69,7 +75,9 @@ def replay(
     return result
 
 
-def write_outputs(result: Replay, folder: Path, title: str, seconds: tuple[float, float]) -> dict[str, Any]:
+def write_outputs(
+    result: Replay, folder: Path, title: str, seconds: tuple[float, float]
+) -> dict[str, Any]:
     """Write all files into a folder; seconds: wall and CPU time taken. Returns the report."""
     pipeline = result.pipeline
     patch, poses = pipeline.grid.patch(), np.array(result.poses)
@@ -127,12 +135,17 @@ def _work(arguments: argparse.Namespace) -> None:
 
 @contextmanager
 def _view(arguments: argparse.Namespace) -> Iterator[View | None]:
-    """What is asked for of viewer and recording; of a log that cannot be replayed there is no recording."""
+    """What is asked for of viewer and recording.
+
+    Of a log that cannot be replayed there is no recording.
+    """
     if not (arguments.view or arguments.recording):
         yield None
         return
     with ExitStack() as stack:
-        aside = stack.enter_context(written_aside(arguments.recording)) if arguments.recording else None
+        aside = (
+            stack.enter_context(written_aside(arguments.recording)) if arguments.recording else None
+        )
         view = View(aside, arguments.view)
         stack.callback(view.close)
         yield view
@@ -140,7 +153,8 @@ def _view(arguments: argparse.Namespace) -> Iterator[View | None]:
 
 def _play(arguments: argparse.Namespace, shown: ReplayView | None) -> None:
     config = PipelineConfig(
-        localizer=cli.config_from(arguments, LocalizerConfig), grid=cli.config_from(arguments, OccupancyConfig)
+        localizer=cli.config_from(arguments, LocalizerConfig),
+        grid=cli.config_from(arguments, OccupancyConfig),
     )
     wall, cpu = time.perf_counter(), time.process_time()
     result = replay(cli.open_log(arguments), config, show_progress=not arguments.quiet, shown=shown)
@@ -162,7 +176,9 @@ def main() -> None:
     cli.add_log_options(parser)
     parser.add_argument('-o', '--out', type=Path, required=True, help='folder for the results')
     parser.add_argument('--quiet', action='store_true', help='no progress bar')
-    parser.add_argument('--view', action='store_true', help='show it in rerun, until the viewer is closed')
+    parser.add_argument(
+        '--view', action='store_true', help='show it in rerun, until the viewer is closed'
+    )
     parser.add_argument('--recording', type=Path, help="file for rerun's recording (.rrd)")
     cli.add_config(parser, LocalizerConfig, ['slam'])
     cli.add_config(parser, OccupancyConfig, ['resolution_m', 'no_return_range_m', 'usable_range_m'])

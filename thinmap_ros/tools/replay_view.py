@@ -9,12 +9,16 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import Estimate
 from thinmap_ros.pipeline import Pipeline
 
-_PERIOD_NS = 1_000_000_000  # what is large is put together once a second, as a view does not draw it more often
+# What is large is put together once a second, as a view does not draw it more often.
+_PERIOD_NS = 1_000_000_000
 _STAGES = {'localizer': 'localizer', 'grid': 'map update', 'topology': 'graph update'}
 
 
 class ReplayView:
-    """Tells a view what a pipeline makes of each scan; at the end `last` tells of the map and graph once more."""
+    """Tells a view what a pipeline makes of each scan.
+
+    At the end `last` tells of the map and graph once more.
+    """
 
     def __init__(self, view: NullView) -> None:
         """Begin with nothing shown."""

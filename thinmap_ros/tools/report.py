@@ -1,4 +1,7 @@
-"""The numbers that sum up an exploration, from plain arrays: the same for the simulator and for the live graph."""
+"""The numbers that sum up an exploration, from plain arrays.
+
+The same for the simulator and for the live graph.
+"""
 
 import math
 from collections.abc import Iterable
@@ -18,7 +21,10 @@ FEWEST_SIGHTINGS = 5
 
 @dataclass(eq=False)
 class _Place:
-    """A place where an end node was: where it is or was last (m), under which id, how often seen, whether come near."""
+    """A place where an end node was.
+
+    Where it is or was last (m), under which id, how often seen, whether come near.
+    """
 
     node_id: int
     x: float
@@ -30,9 +36,10 @@ class _Place:
 class EndNodeCensus:
     """At how many places there were end nodes, and to how many of them the robot came near.
 
-    An end node wanders as the map grows, and may come and go under new ids: one that appears within SAME_PLACE_M of
-    where another one was last, and is no more, continues that one. One that did not last for FEWEST_SIGHTINGS
-    decisions is not counted, and neither are what stands in for borders that no end node sees.
+    An end node wanders as the map grows, and may come and go under new ids: one that appears within
+    SAME_PLACE_M of where another one was last, and is no more, continues that one. One that did not
+    last for FEWEST_SIGHTINGS decisions is not counted, and neither are what stands in for borders
+    that no end node sees.
     """
 
     def __init__(self) -> None:
@@ -49,7 +56,10 @@ class EndNodeCensus:
         return sum(place.visited and place.sightings >= FEWEST_SIGHTINGS for place in self._places)
 
     def take(self, end_nodes: Iterable[tuple[int, float, float]], T_map_base: Array) -> None:
-        """Count the end nodes (id, x, y in m) known at a pose (3,); nearer than 0.5 m is a visit (equation (2))."""
+        """Count the end nodes (id, x, y in m) known at a pose (3,).
+
+        Nearer than 0.5 m is a visit (equation (2)).
+        """
         nodes = {node_id: (x, y) for node_id, x, y in end_nodes if node_id < FIRST_STAND_IN_ID}
         alive = {place.node_id: place for place in self._places if place.node_id in nodes}
         idle = [place for place in self._places if place.node_id not in nodes]
@@ -76,7 +86,10 @@ class TargetLog:
         self._last: list[tuple[float, float]] = []
 
     def take(self, goal: Array | None) -> None:
-        """Take the goal (x, y, ...), m, of a decision; one less than SAME_PLACE_M from the last is the same."""
+        """Take the goal (x, y, ...), m, of a decision.
+
+        One less than SAME_PLACE_M from the last is the same.
+        """
         if goal is None:
             return
         at = (float(goal[0]), float(goal[1]))
@@ -89,7 +102,10 @@ class TargetLog:
 
 @dataclass(frozen=True)
 class Ending:
-    """How an exploration ended: whether by itself, why, and how often the robot touched something."""
+    """How an exploration ended.
+
+    Whether by itself, why, and how often the robot touched something.
+    """
 
     finished: bool
     reason: str
@@ -97,14 +113,19 @@ class Ending:
 
 
 def exploration_report(
-    ending: Ending, times_s: Array, true_poses: Array, estimated_poses: Array, coverage: Array, census: EndNodeCensus
+    ending: Ending,
+    times_s: Array,
+    true_poses: Array,
+    estimated_poses: Array,
+    coverage: Array,
+    census: EndNodeCensus,
 ) -> dict[str, Any]:
     """Report of an exploration, ready for JSON.
 
-    times_s (N,): from the start on; true_poses, estimated_poses (N, 3): at these times, in the same frame; coverage
-    (M, 2): time in s and coverage, 0 to 1, whenever it was measured. distance and the times and distances at which a
-    coverage was first measured are of the true path, in m and s; None where it was not reached. curve: time, distance
-    and coverage whenever it was measured.
+    times_s (N,): from the start on; true_poses, estimated_poses (N, 3): at these times, in the same
+    frame; coverage (M, 2): time in s and coverage, 0 to 1, whenever it was measured. distance and
+    the times and distances at which a coverage was first measured are of the true path, in m and s;
+    None where it was not reached. curve: time, distance and coverage whenever it was measured.
     """
     steps = np.hypot(*np.diff(true_poses[:, :2], axis=0).T)
     along = np.concatenate([[0.0], np.cumsum(steps)])
@@ -128,7 +149,11 @@ def exploration_report(
         'pose_rmse': round(float(np.sqrt(np.mean(errors**2))), 5),
         'turned_rad': round(float(np.abs(_turns(true_poses)).sum()), 2),
         'curve': [
-            [round(float(time), 2), round(float(np.interp(time, times_s, along)), 2), round(float(share), 4)]
+            [
+                round(float(time), 2),
+                round(float(np.interp(time, times_s, along)), 2),
+                round(float(share), 4),
+            ]
             for time, share in coverage
         ],
     }

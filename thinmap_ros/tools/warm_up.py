@@ -10,9 +10,13 @@ from thinmap_ros.tools import explore_world
 def main() -> None:
     """Rehearse every algorithm, and an exploration in the simulator."""
     for rehearse in (
-        warm_up.localizer, warm_up.grid_mapper, warm_up.topology_builder, warm_up.explorer, warm_up.navigator,
+        warm_up.localizer,
+        warm_up.grid_mapper,
+        warm_up.topology_builder,
+        warm_up.explorer,
+        warm_up.navigator,
         warm_up.global_localizer,
-    ):  # fmt: skip
+    ):
         rehearse()
     world = World.from_patch(*read_world(resources.world_path('office')))
     # What is needed only where there are several places to go to is reached by a whole exploration.

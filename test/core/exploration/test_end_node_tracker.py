@@ -1,4 +1,4 @@
-"""The tracker: which looks count, and what becomes of a node that moves, appears, merges or vanishes."""
+"""The tracker: which looks count, what becomes of nodes that move, appear, merge or vanish."""
 
 import math
 
@@ -150,7 +150,12 @@ def test_a_closed_border_settles_a_node_and_an_opened_one_is_as_doubtful_as_at_f
 def test_field_of_view_ends_at_the_outer_beams(increment_deg):
     angles = 0.3 + np.radians([0.0, 89.0, -89.0, 95.0, -95.0, 180.0])
     nodes = tracker()
-    nodes.follow({i: (5.0 + math.cos(angle), 5.0 + math.sin(angle)) for i, angle in enumerate(angles.tolist())})
+    nodes.follow(
+        {
+            i: (5.0 + math.cos(angle), 5.0 + math.sin(angle))
+            for i, angle in enumerate(angles.tolist())
+        }
+    )
     nodes.look(scan(increment_deg=increment_deg), se2.pose(5.0, 5.0, 0.3), FREE, FRAME, set())
     seen = [bool(track.distances_m) for track in nodes.tracks.values()]
     assert seen == [True, True, True, False, False, False]

@@ -42,7 +42,7 @@ def two_rooms():
 
 
 class Run:
-    """An exploration with known poses; fails(decision) says which targets the navigator shall refuse."""
+    """An exploration with known poses; fails(decision): which targets the navigator refuses."""
 
     def __init__(self, world, config=None, seed=1, fails=None, start=START):
         self.world, self.fails = world, fails or (lambda decision: False)
@@ -77,7 +77,9 @@ class Run:
         while moment.stamp_ns < seconds * 1e9:
             if moment.scan is not None and self.look(moment.scan).finished:
                 break
-            command = self.navigator.step(self.simulation.robot.T_world_base, self.grid.patch(), self.scan, 0.05)
+            command = self.navigator.step(
+                self.simulation.robot.T_world_base, self.grid.patch(), self.scan, 0.05
+            )
             if command.state == 'failed':
                 self.explorer.fail_target(command.reason)
             if command.state in ('reached', 'failed'):
@@ -111,7 +113,10 @@ def test_it_sees_all_and_stops_by_itself_without_a_touch():
 def test_at_the_end_every_end_node_is_reliable_and_none_has_a_border():
     nodes = finished_run().last.end_nodes
     assert nodes
-    assert min(node.probability for node in nodes if node.node_id < FIRST_STAND_IN_ID) >= ExplorerConfig().threshold
+    assert (
+        min(node.probability for node in nodes if node.node_id < FIRST_STAND_IN_ID)
+        >= ExplorerConfig().threshold
+    )
     assert all(node.open_border_m == 0.0 for node in nodes)
 
 
@@ -151,11 +156,14 @@ def comb(doors=45):
 
 
 def test_of_many_places_the_target_is_a_near_one_and_stays():
-    explorer, scan = Explorer(), Scan.create(0, np.full(181, np.inf), -math.pi / 2, math.pi / 180, 0.02, 8.0)
+    explorer = Explorer()
+    scan = Scan.create(0, np.full(181, np.inf), -math.pi / 2, math.pi / 180, 0.02, 8.0)
     goals = []
     for k in range(12):
         pose = np.array([50.0 + 0.1 * k, 2.0, math.pi / 2])
-        decision = explorer.step(TopologicalMap(), comb(), replace(scan, stamp_ns=k * 400_000_000), pose)
+        decision = explorer.step(
+            TopologicalMap(), comb(), replace(scan, stamp_ns=k * 400_000_000), pose
+        )
         goals.append(decision.target.goal[:2])
     assert sum(node.open_border_m > 0.0 for node in decision.end_nodes) == 45
     assert math.dist(goals[0], (50.0, 2.0)) < 4.0
@@ -168,7 +176,8 @@ def test_the_first_target_is_the_one_that_the_robot_faces(theta):
     first = next(decision for decision in run.decisions if decision.target is not None)
     turns = {
         node.node_id: abs(se2.wrap(math.atan2(node.goal[1] - 1.0, node.goal[0] - 1.0) - theta))
-        for node in first.end_nodes if node.open_border_m > 0.0
+        for node in first.end_nodes
+        if node.open_border_m > 0.0
     }
     assert turns[first.target.node_id] == min(turns.values())
 
@@ -193,7 +202,10 @@ def test_an_exploration_goes_on_from_its_state_as_if_it_had_not_been_interrupted
     state = {key: array.copy() for key, array in run.explorer.state().items()}
     again = Explorer.from_state(state)
     before, after = run.explorer.surveyor, again.surveyor
-    assert {i: (t.probability, t.distances_m, t.angle_span_deg) for i, t in before.tracker.tracks.items()} == {
+    assert {
+        i: (t.probability, t.distances_m, t.angle_span_deg)
+        for i, t in before.tracker.tracks.items()
+    } == {
         i: (t.probability, t.distances_m, t.angle_span_deg) for i, t in after.tracker.tracks.items()
     }
     run.explorer = again
@@ -222,10 +234,14 @@ def test_the_literal_scheme_stops_by_itself_too():
 
 
 def hall_with_pockets(size=(160, 300)):
-    """A free hall; 30 pockets of unknown near the robot, and two beside each other at its far end, as slices."""
+    """A free hall; 30 unknown pockets near the robot, two side by side at its far end (slices)."""
     cells = np.zeros(size, dtype=np.int8)
     cells[[0, -1]], cells[:, [0, -1]] = 100, 100
-    near = [(slice(row, row + 6), slice(col, col + 6)) for row in range(20, 150, 25) for col in range(20, 110, 18)]
+    near = [
+        (slice(row, row + 6), slice(col, col + 6))
+        for row in range(20, 150, 25)
+        for col in range(20, 110, 18)
+    ]
     far = [(slice(row, row + 6), slice(270, 276)) for row in (74, 84)]
     for pocket in near + far:
         cells[pocket] = -1
@@ -237,13 +253,19 @@ def test_the_successor_of_a_target_may_lie_farther_off_than_all_that_is_toured()
     explorer, pose = Explorer(), se2.pose(10.0, 8.2, 0.0)
 
     def step(seconds):
-        nothing = Scan.create(seconds * 1_000_000_000, np.full(181, np.nan), -1.57, math.radians(1.0), 0.05, 2.0)
-        return explorer.step(TopologicalMap(), GridPatch(GridFrame(0.0, 0.0, 0.1), cells), nothing, pose).target
+        nothing = Scan.create(
+            seconds * 1_000_000_000, np.full(181, np.nan), -1.57, math.radians(1.0), 0.05, 2.0
+        )
+        return explorer.step(
+            TopologicalMap(), GridPatch(GridFrame(0.0, 0.0, 0.1), cells), nothing, pose
+        ).target
 
     target = step(0)
     assert target.x > 26.5
     cells[min(far, key=lambda pocket: abs(pocket[0].start + 3 - 10.0 * target.y))] = 0
-    explorer.surveyor.borders.update(GridPatch(GridFrame(0.0, 0.0, 0.1), cells), np.array([[0.0, 0.0], [30.0, 16.0]]))
+    explorer.surveyor.borders.update(
+        GridPatch(GridFrame(0.0, 0.0, 0.1), cells), np.array([[0.0, 0.0], [30.0, 16.0]])
+    )
     after = step(2)
     assert after.node_id != target.node_id
     assert after.x < 12.0, 'by now it is weighed against all that is nearer'

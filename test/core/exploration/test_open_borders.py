@@ -1,4 +1,7 @@
-"""Borders of the known: found anew scan by scan as from scratch, given to end nodes, looked at, exhausted."""
+"""Borders of the known.
+
+Found anew scan by scan as from scratch, given to end nodes, looked at, exhausted.
+"""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Equations (1) to (10) of the exploration paper, against numbers worked out by hand and against their meaning."""
+"""Equations (1) to (10) of the exploration paper, against hand-worked numbers and their meaning."""
 
 import math
 
@@ -19,7 +19,9 @@ from thinmap_ros.core.exploration.position_probability import (
 shares = st.floats(0.05, 0.95)
 
 
-@pytest.mark.parametrize(('r', 'index'), [(0.5, 1.0), (4.5, 0.5), (0.0, 1.0), (8.0, 4.0 / 11.5), (2.5, 4.0 / 6.0)])
+@pytest.mark.parametrize(
+    ('r', 'index'), [(0.5, 1.0), (4.5, 0.5), (0.0, 1.0), (8.0, 4.0 / 11.5), (2.5, 4.0 / 6.0)]
+)
 def test_distance_index_is_equation_1(r, index):
     assert distance_index(r) == pytest.approx(index)
 
@@ -63,7 +65,9 @@ def test_reliability_is_the_better_of_both(r, span):
 
 @given(shares, shares)
 def test_update_is_bayes_rule(p, value):
-    assert bayes_update(p, value) == pytest.approx(value * p / (value * p + (1.0 - value) * (1.0 - p)), abs=1e-6)
+    assert bayes_update(p, value) == pytest.approx(
+        value * p / (value * p + (1.0 - value) * (1.0 - p)), abs=1e-6
+    )
 
 
 @given(shares, st.lists(shares, max_size=3))

@@ -27,7 +27,12 @@ def test_the_start_is_the_first_pose():
 
 @pytest.mark.parametrize(
     ('used', 'word'),
-    [((9.0, 4.0, 19.0), ''), ((10.0, 0.0, 0.0), 'time'), ((0.0, 5.0, 0.0), 'distance'), ((0.0, 0.0, 21.0), 'area')],
+    [
+        ((9.0, 4.0, 19.0), ''),
+        ((10.0, 0.0, 0.0), 'time'),
+        ((0.0, 5.0, 0.0), 'distance'),
+        ((0.0, 0.0, 21.0), 'area'),
+    ],
 )
 def test_each_limit_ends_it_and_says_which(used, word):
     reason = Budget(10.0, 5.0, 20.0).used_up(*used)

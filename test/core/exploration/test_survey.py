@@ -1,4 +1,4 @@
-"""Borders of the known are shared among end nodes, and looked at from as far away as that shows something."""
+"""Borders of the known: shared among end nodes, looked at from as far as that shows something."""
 
 import math
 
@@ -18,7 +18,9 @@ AT = se2.pose(1.0, 2.0, 0.0)
 
 def surveyor_of(cells, ends=None):
     surveyor = Surveyor(SurveyConfig())
-    surveyor.borders.update(GridPatch(FRAME, cells.astype(np.int8)), np.array([[0.0, 0.0], [1.0, 1.0]]))
+    surveyor.borders.update(
+        GridPatch(FRAME, cells.astype(np.int8)), np.array([[0.0, 0.0], [1.0, 1.0]])
+    )
     surveyor.follow(ends or {})
     return surveyor
 
@@ -32,7 +34,7 @@ def corridor():
 
 
 def corner():
-    """A room of 4 x 4 m with a side room to the north, of which what lies behind the corner is hidden."""
+    """A room of 4 x 4 m with a side room to the north, hidden where it lies behind the corner."""
     cells = np.full((90, 90), -1)
     cells[:40, :40] = 0
     cells[[0, 39], :40], cells[:40, [0, 39]] = 100, 100
@@ -77,7 +79,9 @@ def test_from_where_the_robot_is_to_look_most_of_what_is_hidden_is_in_sight():
     for candidate in candidates:
         row, col = (int(v) for v in borders.frame.cells_of(candidate.goal[None, :2])[0])
         assert surveyor.reached[row, col]
-        seen = [line_is_clear(borders.passable, row, col, int(r), int(c)) for r, c in candidate.cells]
+        seen = [
+            line_is_clear(borders.passable, row, col, int(r), int(c)) for r, c in candidate.cells
+        ]
         assert np.mean(seen) > 0.5
 
 
@@ -90,7 +94,7 @@ def open_hall(seen_to_m):
 
 
 def test_of_a_border_longer_than_the_laser_reaches_a_part_is_looked_at_from_the_nearest_place():
-    """From no place most of it can be seen; the goal is not right at it either, but as far off as the range allows."""
+    """No place shows most of it; the goal is not right at it, but as far as the range allows."""
     surveyor = surveyor_of(open_hall(12.0))
     near, far = se2.pose(2.0, 4.0, 0.0), se2.pose(2.0, 16.0, 0.0)
     for at in (near, far):
@@ -114,7 +118,9 @@ def test_a_goal_stays_good_as_long_as_enough_can_be_seen_from_it():
 def test_the_way_to_a_goal_is_that_over_the_grid():
     surveyor = surveyor_of(corridor())
     (candidate,) = surveyor.survey(AT, 8.0)
-    assert surveyor.way_m(candidate.goal) == pytest.approx(math.dist(candidate.goal[:2], AT[:2]), rel=0.1, abs=0.2)
+    assert surveyor.way_m(candidate.goal) == pytest.approx(
+        math.dist(candidate.goal[:2], AT[:2]), rel=0.1, abs=0.2
+    )
     assert surveyor.way_m(np.array([11.0, 2.0, 0.0])) == math.inf
     assert surveyor.way_m(np.array([-50.0, 2.0, 0.0])) == math.inf
 

@@ -34,7 +34,8 @@ def test_tours_are_as_good_as_the_best_of_all_orders_or_nearly(count, weight):
 
 
 def test_a_place_that_would_have_to_be_come_back_to_comes_first():
-    # A niche 3 m to one side, and three rooms in a row from 2 m on to the other: the nearest first would cost 6 m more.
+    # A niche 3 m to one side, and three rooms in a row from 2 m on to the other: the nearest first
+    # would cost 6 m more.
     points = np.array([[-3.0, 0.0], [2.0, 0.0], [12.0, 0.0], [22.0, 0.0]])
     costs = tours_by_first(np.abs(points[:, 0]), between_of(points), np.zeros(4), 0.0)
     assert int(costs.argmin()) == 0

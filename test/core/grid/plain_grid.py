@@ -1,4 +1,7 @@
-"""The occupancy grid once more, slow and obvious: a dictionary of cells, and one beam after the other."""
+"""The occupancy grid once more, slow and obvious.
+
+A dictionary of cells, and one beam after the other.
+"""
 
 import math
 
@@ -11,7 +14,10 @@ FLAT_M, LONGEST_SURFACE_M, GRAZED_M, SURELY_OCCUPIED = 0.06, 3.0, 0.4, 0.9
 
 
 def crossed(start, end):
-    """Cells (row, col) of a segment (x, y) to (x, y): those of the middles between its crossings of cell borders."""
+    """Cells (row, col) of a segment (x, y) to (x, y).
+
+    Those of the middles between its crossings of cell borders.
+    """
     shares = [0.0, 1.0]
     for a, b in zip(start, end, strict=True):
         borders = np.arange(math.ceil(min(a, b)), math.floor(max(a, b)) + 1)
@@ -44,7 +50,11 @@ class PlainGrid:
                 passed |= crossed(self.laser, end)
             if i > 0 and (self.is_flat(scan, i) or self.is_flat(scan, i - 1)):
                 surface |= crossed(ends[i - 1], end)
-        hit = {(math.floor(ends[i][1]), math.floor(ends[i][0])) for i in range(len(ends)) if self.is_hit(scan, i)}
+        hit = {
+            (math.floor(ends[i][1]), math.floor(ends[i][0]))
+            for i in range(len(ends))
+            if self.is_hit(scan, i)
+        }
         spared = {cell for cell in passed - hit if self.is_grazed(cell)}
         for cell in hit:
             self.add(cell, self.thousandths(self.config.p_occupied))
@@ -53,7 +63,11 @@ class PlainGrid:
 
     def is_hit(self, scan, i):
         """Whether a beam ended in something near enough."""
-        return 0 <= i < scan.ranges_m.size and scan.hit[i] and scan.ranges_m[i] < self.config.usable_range_m
+        return (
+            0 <= i < scan.ranges_m.size
+            and scan.hit[i]
+            and scan.ranges_m[i] < self.config.usable_range_m
+        )
 
     def end_of(self, scan, i, heading):
         """Where a beam ends (x, y), in cells; None where it says nothing."""
@@ -65,7 +79,11 @@ class PlainGrid:
         elif scan.no_return[i]:
             length = min(config.no_return_range_m, scan.range_max_m, config.usable_range_m)
         angle, reach = heading + scan.angles_rad[i], length / config.resolution_m
-        return (self.laser[0] + reach * math.cos(angle), self.laser[1] + reach * math.sin(angle)) if length else None
+        return (
+            (self.laser[0] + reach * math.cos(angle), self.laser[1] + reach * math.sin(angle))
+            if length
+            else None
+        )
 
     def is_flat(self, scan, i):
         """Whether a beam and those beside it end on one straight surface."""
@@ -85,11 +103,19 @@ class PlainGrid:
         step, run = away / np.abs(away).max(), 1
         for sign in (-1, 1):
             k = 1
-            while self.odds.get((cell[0] + round(sign * k * step[0]), cell[1] + round(sign * k * step[1])), 0) >= sure:
+            while (
+                self.odds.get(
+                    (cell[0] + round(sign * k * step[0]), cell[1] + round(sign * k * step[1])), 0
+                )
+                >= sure
+            ):
                 run, k = run + 1, k + 1
         return run >= max(3, round(GRAZED_M / config.resolution_m))
 
     def add(self, cell, step):
-        """Bayes' rule for one cell; even odds stay a thousandth off, because 0 is a cell never seen."""
+        """Bayes' rule for one cell.
+
+        Even odds stay a thousandth off, because 0 is a cell never seen.
+        """
         low, high = self.thousandths(self.config.p_lowest), self.thousandths(self.config.p_highest)
         self.odds[cell] = min(max((self.odds.get(cell, 0) + step) or 1, low), high)

@@ -60,13 +60,16 @@ def test_a_map_that_would_get_too_large_keeps_nothing_of_the_scan():
     np.testing.assert_array_equal(grid.state()['log_odds'], before['log_odds'])
 
 
-@pytest.mark.parametrize('name, value', [
-    ('frame', np.array([0.0, -1e300, 0.1])),
-    ('frame', np.array([np.nan, 0.0, 0.1])),
-    ('frame', np.array([0.0, 0.0, 1e-300])),
-    ('tiles', np.array([[2**62, 0]])),
-    ('tiles', np.array([[0, -(2**63)]])),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    'name, value',
+    [
+        ('frame', np.array([0.0, -1e300, 0.1])),
+        ('frame', np.array([np.nan, 0.0, 0.1])),
+        ('frame', np.array([0.0, 0.0, 1e-300])),
+        ('tiles', np.array([[2**62, 0]])),
+        ('tiles', np.array([[0, -(2**63)]])),
+    ],
+)
 def test_a_saved_grid_from_nowhere_is_refused(name, value):
     state = OccupancyGrid.from_patch(GridPatch(GridFrame(0.0, 0.0, 0.1), np.zeros((4, 4), np.int8)))
     with pytest.raises(InputError):

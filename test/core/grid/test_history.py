@@ -31,14 +31,19 @@ def test_what_is_drawn_anew_is_what_was_drawn():
 
 
 def test_scans_go_with_the_last_named_one_before_them():
-    """Scan 4 is moved to the side and scan 8 is turned: those after each go with it, those before the first as well."""
+    """Scan 4 is moved to the side and scan 8 is turned.
+
+    Those after each go with it, those before the first as well.
+    """
     history = filled(POSES, range(100, 112))
     moved = np.array([POSES[4] + [0.0, 1.0, 0.0], POSES[8] + [0.0, 0.0, 0.5]])
     history.past.correct(np.array([104, 108]), moved, since_ns=112)
     after = history.past.poses()
     np.testing.assert_allclose(after[:8], POSES[:8] + [0.0, 1.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(after[8], moved[1], atol=1e-12)
-    np.testing.assert_allclose(se2.between(after[8], after[10]), se2.between(POSES[8], POSES[10]), atol=1e-12)
+    np.testing.assert_allclose(
+        se2.between(after[8], after[10]), se2.between(POSES[8], POSES[10]), atol=1e-12
+    )
 
 
 def test_scans_that_came_after_the_correction_stay():
@@ -83,7 +88,9 @@ def test_places_are_those_after_a_correction():
     before = history.past.poses()
     history.past.correct(np.array([0, 32]), there[[0, 0]], since_ns=64)
     after = history.past.poses()
-    assert len(after) == len(before) == len(history.past.scans()) == 64, 'one pose for each that there was'
+    assert len(after) == len(before) == len(history.past.scans()) == 64, (
+        'one pose for each that there was'
+    )
     for k, T in enumerate(there):
         history.add(scan(64 + k), T)
     assert len(history.past.scans()) == 32

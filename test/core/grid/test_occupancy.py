@@ -19,7 +19,12 @@ STEP = math.radians(1.0)
 
 def scan_of(ranges, **changes):
     ranges = np.asarray(ranges, dtype=float)
-    fields = {'angle_min_rad': -math.pi / 2, 'angle_increment_rad': STEP, 'range_min_m': 0.1, 'range_max_m': 8.0}
+    fields = {
+        'angle_min_rad': -math.pi / 2,
+        'angle_increment_rad': STEP,
+        'range_min_m': 0.1,
+        'range_max_m': 8.0,
+    }
     return Scan.create(0, ranges, **(fields | changes))
 
 
@@ -28,16 +33,20 @@ def percent(grid, x, y):
 
 
 def reference(scan, T, config):
-    """Cells passed and hit by sampling each beam finely: slow, obvious, and blind only at corners of cells."""
+    """Cells passed and hit by fine sampling of beams: slow, obvious, blind only at cell corners."""
     passed, hit = set(), set()
     ranges = np.where(scan.hit, scan.ranges_m + config.surface_depth_m, scan.ranges_m)
     for r, angle in zip(ranges, scan.angles_rad + T[2], strict=True):
         reach = min(r, config.usable_range_m) if r < scan.range_max_m else config.no_return_range_m
         along = np.arange(0.0, reach, 0.002)
-        cells = np.floor(np.column_stack([T[1] + along * math.sin(angle), T[0] + along * math.cos(angle)]) / 0.1)
+        cells = np.floor(
+            np.column_stack([T[1] + along * math.sin(angle), T[0] + along * math.cos(angle)]) / 0.1
+        )
         passed |= {tuple(c) for c in cells.astype(int).tolist()}
         if r < min(scan.range_max_m, config.usable_range_m):
-            hit.add((math.floor((T[1] + r * math.sin(angle)) / 0.1), math.floor((T[0] + r * math.cos(angle)) / 0.1)))
+            row = math.floor((T[1] + r * math.sin(angle)) / 0.1)
+            col = math.floor((T[0] + r * math.cos(angle)) / 0.1)
+            hit.add((row, col))
     return passed - hit, hit
 
 
@@ -53,10 +62,12 @@ def test_one_scan_marks_what_a_finely_sampled_reference_marks(seed):
     patch = grid.patch()
     offset = np.round([patch.frame.origin_y / 0.1, patch.frame.origin_x / 0.1]).astype(int)
     found_hit = {tuple((c + offset).tolist()) for c in np.argwhere(patch.cells >= 65)}
-    found_passed = {tuple((c + offset).tolist()) for c in np.argwhere((patch.cells >= 0) & (patch.cells < 65))}
+    found_passed = {
+        tuple((c + offset).tolist()) for c in np.argwhere((patch.cells >= 0) & (patch.cells < 65))
+    }
     assert found_hit == hit
-    # A beam cuts the corner of a cell by less than the reference's step now and then, and some neighbours of these
-    # random ranges look like a surface.
+    # A beam cuts the corner of a cell by less than the reference's step now and then, and some
+    # neighbours of these random ranges look like a surface.
     assert len(found_passed ^ passed) <= 0.02 * len(passed)
 
 
@@ -182,7 +193,7 @@ def test_a_wall_on_the_border_of_two_cells_leaves_the_one_in_front_free():
 
 
 def seen_from(x, y, heading, wall_y, solid=True):
-    """Scan of a laser that sees a wall from (0, wall_y) to (2.4, wall_y), 0.1 m thick, before one at x = -1."""
+    """Scan of a wall from (0, wall_y) to (2.4, wall_y), 0.1 m thick, before one at x = -1."""
     world = np.zeros((500, 500), dtype=np.uint8)
     world[:, 75:80] = 1
     if solid:
@@ -218,7 +229,7 @@ def test_a_long_wall_that_went_away_is_unlearned_by_beams_that_cross_it():
 
 
 def drive_through_clutter(seed, scans=25):
-    """Scans on a curve through a room with posts and walls, some of their beams lost, spoilt or without return."""
+    """Scans on a curve among posts and walls, some beams lost, spoilt or without return."""
     rng = np.random.default_rng(seed)
     world = np.zeros((600, 600), dtype=np.uint8)
     world[[0, -1]], world[:, [0, -1]], world[300:305, 100:420] = 1, 1, 1
@@ -227,9 +238,12 @@ def drive_through_clutter(seed, scans=25):
     T = pose(4.0, 4.0, 0.3)
     angles = math.radians(-90.0) + STEP * np.arange(181)
     for _ in range(scans):
-        ranges = 0.02 * cast_rays(world, T[0] / 0.02, T[1] / 0.02, angles + T[2], 500.0) + rng.normal(0.0, 0.01, 181)
+        reach = cast_rays(world, T[0] / 0.02, T[1] / 0.02, angles + T[2], 500.0)
+        ranges = 0.02 * reach + rng.normal(0.0, 0.01, 181)
         spoilt = rng.random(181) < 0.05
-        ranges[spoilt] = rng.choice([np.nan, np.inf, -np.inf, 0.0, -1.0, 0.01, 7.99, 8.0, 1e9], spoilt.sum())
+        ranges[spoilt] = rng.choice(
+            [np.nan, np.inf, -np.inf, 0.0, -1.0, 0.01, 7.99, 8.0, 1e9], spoilt.sum()
+        )
         yield scan_of(ranges, T_base_laser=pose(0.1, -0.02, 0.01)), T
         T = compose(T, pose(0.1, 0.0, 0.06))
 
@@ -237,9 +251,15 @@ def drive_through_clutter(seed, scans=25):
 def known_cells(grid):
     """Log odds by (row, col) of all the cells that a grid has seen."""
     state = grid.state()
-    cells = [(tile, *at) for tile, odds in enumerate(state['log_odds']) for at in np.argwhere(odds).tolist()]
+    cells = [
+        (tile, *at)
+        for tile, odds in enumerate(state['log_odds'])
+        for at in np.argwhere(odds).tolist()
+    ]
     first = (TILE * state['tiles']).tolist()
-    return {(first[t][0] + r, first[t][1] + c): int(state['log_odds'][t, r, c]) for t, r, c in cells}
+    return {
+        (first[t][0] + r, first[t][1] + c): int(state['log_odds'][t, r, c]) for t, r, c in cells
+    }
 
 
 @pytest.mark.parametrize(
@@ -273,4 +293,6 @@ def test_the_whole_map_is_the_same_however_often_it_was_looked_at(seed):
         assert seen.frame == fresh.frame
         assert np.array_equal(seen.cells, fresh.cells)
         known = seen.cells != -1
-        assert known[[0, -1]].any(axis=1).all() and known[:, [0, -1]].any(axis=0).all(), 'no rectangle is smaller'
+        assert known[[0, -1]].any(axis=1).all() and known[:, [0, -1]].any(axis=0).all(), (
+            'no rectangle is smaller'
+        )

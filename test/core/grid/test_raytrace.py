@@ -27,7 +27,9 @@ def distance_to_box(x, y, angle, left, bottom, right, top):
 @given(st.floats(1.5, 58.5), st.floats(1.5, 38.5), st.floats(-math.pi, math.pi))
 def test_rays_in_a_room_meet_its_walls_where_geometry_says(x, y, angle):
     (found,) = cast_rays(room(), x, y, np.array([angle]), 100.0)
-    assert math.isclose(found, distance_to_box(x, y, angle, 1, 1, 59, 39), rel_tol=1e-9, abs_tol=1e-7)
+    assert math.isclose(
+        found, distance_to_box(x, y, angle, 1, 1, 59, 39), rel_tol=1e-9, abs_tol=1e-7
+    )
 
 
 def test_a_ray_ends_at_its_range_and_at_the_rim_of_the_map():
@@ -49,7 +51,8 @@ def test_a_line_is_clear_just_where_finely_sampled_points_on_it_are(seed, a, b):
     free = np.random.default_rng(seed).random((20, 20)) > 0.1
     points = np.linspace(np.add(a, 0.5), np.add(b, 0.5), 2003)
     off_lattice = np.abs(points - np.round(points))
-    # On a border a point belongs to no cell for sure; through a corner the line visits one of two cells.
+    # On a border a point belongs to no cell for sure; through a corner the line visits one of two
+    # cells.
     inside = off_lattice.min(axis=1) > 1e-6
     through_corner = bool((off_lattice.max(axis=1) < 0.01).any())
     sampled = all(free[int(r), int(c)] for r, c in points[inside])
@@ -77,14 +80,17 @@ def test_a_filled_segment_joins_its_ends_through_the_cells_that_it_crosses(start
     ends = [(math.floor(y), math.floor(x)) for x, y in (start, end)]
     assert filled.issuperset(ends)
     assert len(filled) == np.count_nonzero(sheet)
-    # Cells that differ are cut by so little that rounding decides: the segment passes their corners.
+    # Cells that differ are cut by so little that rounding decides: the segment passes their
+    # corners.
     for row, col in filled ^ crossed(start, end).union(ends):
         assert distance_to_segment(col, row, start, end) < 1e-6
 
 
 def distance_to_segment(col, row, start, end):
     """The least distance of a cell's corners from a segment, in cells."""
-    corners = np.array([[col, row], [col + 1, row], [col, row + 1], [col + 1, row + 1]], dtype=float)
+    corners = np.array(
+        [[col, row], [col + 1, row], [col, row + 1], [col + 1, row + 1]], dtype=float
+    )
     along = np.subtract(end, start)
     share = np.clip((corners - start) @ along / max(along @ along, 1e-300), 0.0, 1.0)
     return np.linalg.norm(corners - start - share[:, None] * along, axis=1).min()

@@ -22,7 +22,14 @@ def floor(*walls, rows=60, cols=90):
 
 
 # Nothing in it looks like anything else.
-OFFICE = floor((0, 30, 35, 32), (20, 60, 60, 62), (40, 10, 45, 18), (8, 70, 12, 76), (30, 44, 34, 48), (50, 70, 53, 80))
+OFFICE = floor(
+    (0, 30, 35, 32),
+    (20, 60, 60, 62),
+    (40, 10, 45, 18),
+    (8, 70, 12, 76),
+    (30, 44, 34, 48),
+    (50, 70, 53, 80),
+)
 
 
 def map_of(cells):
@@ -36,7 +43,10 @@ def world_of(cells):
 
 
 def drive(cells, start, moves, seed=0, odometry_at=(5.0, -3.0, 0.7)):
-    """Scan, odometry pose and true pose from a start on; moves: (m ahead, rad turned), one a step."""
+    """Scan, odometry pose and true pose from a start on.
+
+    Moves: (m ahead, rad turned), one a step.
+    """
     world, laser = world_of(cells), Lms200(Lms200Config(), seed)
     rng = np.random.default_rng(seed)
     T, odometry = se2.pose(*start), se2.pose(*odometry_at)

@@ -1,4 +1,4 @@
-"""A lost robot that drives by itself: to where the places in question differ, sooner sure than one that roams."""
+"""A lost robot drives to where the places in question differ, sure sooner than one that roams."""
 
 import itertools
 
@@ -9,7 +9,12 @@ from small_floor import floor, map_of, world_of
 from thinmap_ros.core import se2
 from thinmap_ros.core.localization.active import ActiveSearch
 from thinmap_ros.core.localization.config import GlobalLocalizationConfig
-from thinmap_ros.core.localization.global_localization import GlobalLocalization, Hypothesis, Result, State
+from thinmap_ros.core.localization.global_localization import (
+    GlobalLocalization,
+    Hypothesis,
+    Result,
+    State,
+)
 from thinmap_ros.core.localization.places import FREE, Places
 from thinmap_ros.core.localization.viewpoints import best_viewpoint, common_patch
 from thinmap_ros.core.planning.navigator import NavigatorConfig
@@ -20,7 +25,9 @@ from thinmap_ros.sim.tours import random_drive
 
 # Two rooms that are the same, and the corridor at their doors, which goes on to one side.
 _ROOM = ((0, 0, 70, 2), (70, 0, 72, 46), (70, 56, 72, 60), (20, 18, 34, 30), (50, 35, 53, 45))
-TWINS = floor(*((r, c + left, e, d + left) for left in (0, 60) for r, c, e, d in _ROOM), rows=86, cols=135)
+TWINS = floor(
+    *((r, c + left, e, d + left) for left in (0, 60) for r, c, e, d in _ROOM), rows=86, cols=135
+)
 TWINS[:72, 120:] = 100
 STARTS = [(0.2, 3.0, 1.2), (3.5, 4.5, -2.0), (6.2, 3.2, 2.5), (10.0, 7.5, -1.0)]
 LIMIT_S = 90.0
@@ -40,8 +47,11 @@ def is_right(found, T):
 def seconds_driven_by_itself(finder, start, seed):
     """Time until it is sure, and the way to there; it never touches a wall."""
     finder.restart()
-    simulation = Simulation(world_of(TWINS), se2.pose(*start), PioneerConfig(), Lms200Config(), seed)
-    search = ActiveSearch(finder.places, finder.config, NavigatorConfig(max_speed_m_s=0.5))  # as those that roam
+    simulation = Simulation(
+        world_of(TWINS), se2.pose(*start), PioneerConfig(), Lms200Config(), seed
+    )
+    # As those that roam.
+    search = ActiveSearch(finder.places, finder.config, NavigatorConfig(max_speed_m_s=0.5))
     moment, scan = simulation.sense(), None
     for k in itertools.count():
         if moment.scan is not None:
@@ -75,7 +85,7 @@ def test_a_robot_that_drives_where_places_differ_is_sure_sooner_than_one_that_ro
 
 
 def in_both_rooms(*start):
-    """The same place in each of the twin rooms, as T_map_odom of a robot whose odometry is zero there."""
+    """The same place in both twin rooms, as T_map_odom of a robot whose odometry is zero there."""
     return np.array([se2.pose(*start), se2.pose(start[0] + 6.0, *start[1:])])
 
 
@@ -117,7 +127,10 @@ def test_where_nothing_tells_places_apart_the_robot_goes_on_and_stands_when_all_
     search = ActiveSearch(places, CONFIG, driving)
     for T in seen:
         search.take(Result(State.AMBIGUOUS, '', ()), T)
-    search.take(Result(State.AMBIGUOUS, '', tuple(Hypothesis(T, np.eye(3), 0.5, 1.0) for T in starts)), np.zeros(3))
+    search.take(
+        Result(State.AMBIGUOUS, '', tuple(Hypothesis(T, np.eye(3), 0.5, 1.0) for T in starts)),
+        np.zeros(3),
+    )
     scan = Lms200(Lms200Config(), 0).scan(world_of(shut), starts[0], 0)
     command = search.step(np.zeros(3), scan, 0.1)
     assert (command.v, command.w, command.state) == (0.0, 0.0, 'idle')
@@ -129,7 +142,12 @@ def test_what_is_beside_a_place_by_little_neither_closes_its_way_nor_is_told_apa
     weights = np.array([0.3, 0.3, 0.2, 0.2])
     one = best_viewpoint(finder.places, np.zeros(3), starts, weights[:2], 15.0, NavigatorConfig())
     four = best_viewpoint(
-        finder.places, np.zeros(3), np.concatenate([starts, beside]), weights, 15.0, NavigatorConfig()
+        finder.places,
+        np.zeros(3),
+        np.concatenate([starts, beside]),
+        weights,
+        15.0,
+        NavigatorConfig(),
     )
     assert np.array_equal(one.T_odom_view, four.T_odom_view)
 
@@ -139,7 +157,9 @@ def test_where_all_but_the_own_place_has_been_looked_from_a_turn_there_is_new(fi
     starts = np.array([[3.5, 9.9, -np.pi / 2.0], [9.5, 9.9, -np.pi / 2.0]])
     seen = everywhere()
     seen = np.concatenate([seen[np.hypot(seen[:, 0], seen[:, 1]) > 0.85], np.zeros((1, 3))])
-    view = best_viewpoint(finder.places, np.zeros(3), starts, np.array([0.5, 0.5]), 15.0, NavigatorConfig(), seen)
+    view = best_viewpoint(
+        finder.places, np.zeros(3), starts, np.array([0.5, 0.5]), 15.0, NavigatorConfig(), seen
+    )
     assert view.gain > 0.0
     assert np.hypot(*view.T_odom_view[:2]) < 0.6
     assert abs(view.T_odom_view[2]) > 0.8

@@ -1,4 +1,7 @@
-"""What a map explains from the right place: nearly all where walls are smooth, less where small things stand about."""
+"""What a map explains from the right place.
+
+Nearly all where walls are smooth, less where small things stand about.
+"""
 
 import numpy as np
 from small_floor import OFFICE, START, drive, map_of

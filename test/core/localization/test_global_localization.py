@@ -1,4 +1,7 @@
-"""A lost robot: found, in doubt, or in another building; and what it says when something is missing."""
+"""A lost robot: found, in doubt, or in another building.
+
+And what it says when something is missing.
+"""
 
 from dataclasses import replace
 
@@ -41,7 +44,8 @@ def test_a_robot_switched_on_anywhere_is_found_and_never_wrongly_sure(finder, st
 
 def test_the_same_seed_gives_the_same_answers():
     first, second = (
-        run(GlobalLocalization(*map_of(OFFICE), seed=5), drive(OFFICE, START, WAY[:6])) for _ in range(2)
+        run(GlobalLocalization(*map_of(OFFICE), seed=5), drive(OFFICE, START, WAY[:6]))
+        for _ in range(2)
     )
     for (one, _), (other, _) in zip(first, second, strict=True):
         assert [h.weight for h in one.hypotheses] == [h.weight for h in other.hypotheses]
@@ -94,7 +98,9 @@ def test_a_pose_found_is_followed_and_a_robot_carried_off_is_found_again(finder)
     ]
     results = run(finder, before + after)
     assert results[len(before) - 1][0].state == State.LOCALIZED
-    wrong = [T for result, T in results[len(before) :] if result.pose and not is_right(result.pose, T)]
+    wrong = [
+        T for result, T in results[len(before) :] if result.pose and not is_right(result.pose, T)
+    ]
     assert len(wrong) <= 3  # until the first looks there have been taken
     assert results[-1][0].state != State.LOCALIZED or is_right(results[-1][0].pose, results[-1][1])
 
@@ -114,13 +120,17 @@ def test_what_is_wrong_with_a_scan_or_the_odometry_is_said_and_waited_for(finder
     assert result.state == State.WAITING
     assert 'jumped' in result.reason
     jumped = [finder.step(s, o + (40.0, 0.0, 0.0)) for s, o, _ in rest[1:]]
-    numbers = [[*h.T_map_base, *h.covariance.ravel(), h.weight] for r in jumped for h in r.hypotheses]
+    numbers = [
+        [*h.T_map_base, *h.covariance.ravel(), h.weight] for r in jumped for h in r.hypotheses
+    ]
     assert np.isfinite(numbers).all()
 
 
 def test_a_scan_that_meets_nothing_leaves_all_open(finder):
     scans = list(drive(OFFICE, START, WAY[:5]))
-    open_field = [(replace(s, ranges_m=np.full(s.ranges_m.size, np.inf)), o, T) for s, o, T in scans]
+    open_field = [
+        (replace(s, ranges_m=np.full(s.ranges_m.size, np.inf)), o, T) for s, o, T in scans
+    ]
     results = run(finder, open_field)
     assert {result.state for result, _ in results} == {State.SEARCHING}
     assert len(finder.samples) == finder.config.samples

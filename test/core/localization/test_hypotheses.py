@@ -11,7 +11,9 @@ def some(*poses, log_weights=None):
     poses = np.array(poses, dtype=np.float64)
     known = Hypotheses.none()
     logs = np.zeros(len(poses)) if log_weights is None else np.array(log_weights, dtype=np.float64)
-    missed = np.where(logs < 0.0, allowed_beams(np.full(len(poses), 60.0)) - logs / LOG_ODDS_A_BEAM, 0.0)
+    missed = np.where(
+        logs < 0.0, allowed_beams(np.full(len(poses), 60.0)) - logs / LOG_ODDS_A_BEAM, 0.0
+    )
     known.add(poses, 0.0, missed, (np.full(len(poses), 50.0), np.zeros(len(poses))), 60.0)
     known.resample(None, 1000, np.random.default_rng(0))
     return known
@@ -31,7 +33,9 @@ def test_what_chance_brings_about_at_edges_counts_for_nothing_however_often_it_c
 
 
 def test_what_a_place_misses_at_each_look_adds_up_until_it_is_out_of_the_question():
-    seldom, often = ([looked(some([0, 0, 0], [5, 0, 1]), *([[58.0, 52.0]] * n)).log_weights for n in (1, 12)])
+    seldom, often = [
+        looked(some([0, 0, 0], [5, 0, 1]), *([[58.0, 52.0]] * n)).log_weights for n in (1, 12)
+    ]
     assert not seldom[1] < -1.0
     assert often.tolist() == [0.0, pytest.approx(often[1])]
     assert often[1] < -5.0
@@ -49,7 +53,9 @@ def test_a_place_that_turns_up_late_is_judged_by_what_it_was_asked():
     judged = np.array([60.0 * 6]), np.zeros(1)
     known.add(np.array([[9.0, 9.0, 0.0]]), -3.0, np.array([-60.0]), judged, 360.0)
     assert known.best() == 2
-    assert known.log_weights[0] == pytest.approx(3.0 - LOG_ODDS_A_BEAM * (60.0 - allowed_beams(np.array(360.0))))
+    assert known.log_weights[0] == pytest.approx(
+        3.0 - LOG_ODDS_A_BEAM * (60.0 - allowed_beams(np.array(360.0)))
+    )
 
 
 def test_a_beam_of_which_the_map_says_nothing_counts_for_a_part():
@@ -74,11 +80,15 @@ def test_covariance_is_that_of_the_weighted_samples():
     logs = np.random.default_rng(3).normal(size=len(known.samples))
     known.weigh(logs)
     turned = known.samples - known.poses[0]
-    assert known.covariances[0] == pytest.approx(np.cov(turned.T, aweights=np.exp(logs), bias=True), abs=1e-9)
+    assert known.covariances[0] == pytest.approx(
+        np.cov(turned.T, aweights=np.exp(logs), bias=True), abs=1e-9
+    )
 
 
 def test_doubles_become_one_and_the_hopeless_are_dropped():
-    known = some([0, 0, 0], [0.05, 0, 0.02], [9, 0, 0], [3, 3, 0], log_weights=[-1.0, 0.0, -20.0, -2.0])
+    known = some(
+        [0, 0, 0], [0.05, 0, 0.02], [9, 0, 0], [3, 3, 0], log_weights=[-1.0, 0.0, -20.0, -2.0]
+    )
     known.prune()
     assert known.poses[:, 0].tolist() == [0.05, 3.0]
     assert known.weights.sum() == pytest.approx(1.0)

@@ -14,7 +14,14 @@ from thinmap_ros.core.localization.calibration import calibrate
 from thinmap_ros.core.localization.config import GlobalLocalizationConfig
 from thinmap_ros.core.localization.judging import Judge
 from thinmap_ros.core.localization.observation import observe, observed_beams, profile
-from thinmap_ros.core.localization.places import DIRECTIONS, NEAR_UNIT_M, RANGE_UNIT_M, SIGHT_UNIT_M, Places, free_way
+from thinmap_ros.core.localization.places import (
+    DIRECTIONS,
+    NEAR_UNIT_M,
+    RANGE_UNIT_M,
+    SIGHT_UNIT_M,
+    Places,
+    free_way,
+)
 
 CONFIG = GlobalLocalizationConfig()
 
@@ -33,7 +40,9 @@ def seen():
 @pytest.fixture(scope='module')
 def poses():
     rng = np.random.default_rng(4)
-    return np.column_stack([rng.uniform(-1.5, 8.5, 200), rng.uniform(1.5, 8.5, 200), rng.uniform(-7.0, 7.0, 200)])
+    return np.column_stack(
+        [rng.uniform(-1.5, 8.5, 200), rng.uniform(1.5, 8.5, 200), rng.uniform(-7.0, 7.0, 200)]
+    )
 
 
 def origin(places):
@@ -63,13 +72,17 @@ def test_nodes_in_sight_of_a_block_are_those_of_the_map_that_nothing_hides(place
     cells = places.frame.cells_of(places.nodes)
     for row, col in places.standing[::211]:
         block = places.blocks[row // places.block_cells, col // places.block_cells]
-        own = (places.standing // places.block_cells == (row // places.block_cells, col // places.block_cells)).all(1)
+        own = (
+            places.standing // places.block_cells
+            == (row // places.block_cells, col // places.block_cells)
+        ).all(1)
         lead = places.standing[own][0]
         reach = CONFIG.active_window_m / 2.0 / CELL_M + places.block_cells
         expected = [
             node
             for node, cell in zip(places.nodes, cells, strict=True)
-            if np.abs(cell - lead).max() <= reach and line_is_clear(places.states == 0, *lead, *cell)
+            if np.abs(cell - lead).max() <= reach
+            and line_is_clear(places.states == 0, *lead, *cell)
         ]
         found = nodes_in_sight(places, block)
         assert len(found) == len(expected)
@@ -96,7 +109,8 @@ def test_node_scores_are_those_of_the_nearest_node_in_sight(places, poses):
             nearest = min((np.hypot(*(node - at)) for node in known), default=np.inf)
             agrees = math.exp(-0.5 * (nearest / sigma) ** 2) if nearest < 5.0 * sigma else 0.0
             expected += math.log(1.0 - q + q * gain * agrees)
-        # Places of nodes and of squared distances are steps of a scale: ten nodes are off by a little each.
+        # Places of nodes and of squared distances are steps of a scale: ten nodes are off by a
+        # little each.
         assert score == pytest.approx(expected, abs=0.05)
 
 
@@ -125,8 +139,15 @@ def test_the_true_pose_explains_nearly_all_and_one_behind_a_wall_little(places, 
     T = se2.pose(*START)
     tried = np.array([T, T + (4.5, 1.0, 0.0), T + (0.0, 0.0, 1.5)])
     counts, silent = matching.explained(
-        tried, seen.laser, seen.ranges_m, seen.bearings_rad, seen.met, (places.states, places.near), origin(places),
-        CELL_M, (0.2, 0.03),
+        tried,
+        seen.laser,
+        seen.ranges_m,
+        seen.bearings_rad,
+        seen.met,
+        (places.states, places.near),
+        origin(places),
+        CELL_M,
+        (0.2, 0.03),
     )
     assert counts[0] >= 0.95 * len(seen.ranges_m)
     assert (counts[1:] < 0.7 * len(seen.ranges_m)).all()
@@ -136,13 +157,21 @@ def test_the_true_pose_explains_nearly_all_and_one_behind_a_wall_little(places, 
 def test_of_the_unknown_the_map_says_nothing(places, seen):
     states = np.where(places.states == 1, np.uint8(2), places.states)
     near = np.full_like(places.near, 255)
-    # Each beam that met something ends a hair within the unknown: where noise lets it end before, the map says much.
+    # Each beam that met something ends a hair within the unknown: where noise lets it end before,
+    # the map says much.
     x, y = (se2.pose(*START)[:2] - origin(places)) / CELL_M
     ways = [free_way(states, x, y, START[2] + bearing, 500.0)[0] for bearing in seen.bearings_rad]
     ranges = np.where(seen.met, (np.array(ways) + 1e-3) * CELL_M, seen.ranges_m)
     counts, silent = matching.explained(
-        se2.pose(*START)[None], seen.laser, ranges, seen.bearings_rad, seen.met, (states, near), origin(places),
-        CELL_M, (0.2, 0.03),
+        se2.pose(*START)[None],
+        seen.laser,
+        ranges,
+        seen.bearings_rad,
+        seen.met,
+        (states, near),
+        origin(places),
+        CELL_M,
+        (0.2, 0.03),
     )
     assert silent[0] >= seen.met.sum() > 0.5 * len(ranges)
     assert counts[0] + silent[0] <= len(ranges)
@@ -160,7 +189,16 @@ def test_refinement_comes_back_to_the_true_pose_and_never_fits_worse(places, see
     assert (scores >= before).all()
     assert np.hypot(*(found - START)[:, :2].T).max() < 0.12
     held, _ = matching.refine(
-        starts, ends, places.near, origin(places), CELL_M, table, steps, 8, starts, free + np.eye(3) * 1e9
+        starts,
+        ends,
+        places.near,
+        origin(places),
+        CELL_M,
+        table,
+        steps,
+        8,
+        starts,
+        free + np.eye(3) * 1e9,
     )
     assert held == pytest.approx(starts)
 
@@ -168,8 +206,12 @@ def test_refinement_comes_back_to_the_true_pose_and_never_fits_worse(places, see
 def test_spots_are_those_whose_ranges_agree_best(places, seen):
     ranges, known, met = profile(seen)
     slack = 0.3 + 0.05 * ranges
-    low = np.where(known, np.clip((ranges - slack) / RANGE_UNIT_M, 0.0, 254.0), 0.0).astype(np.uint8)
-    high = np.where(known & met, np.clip((ranges + slack) / RANGE_UNIT_M, 0.0, 255.0), 255.0).astype(np.uint8)
+    low = np.where(known, np.clip((ranges - slack) / RANGE_UNIT_M, 0.0, 254.0), 0.0).astype(
+        np.uint8
+    )
+    high = np.where(
+        known & met, np.clip((ranges + slack) / RANGE_UNIT_M, 0.0, 255.0), 255.0
+    ).astype(np.uint8)
     spots, headings, counts = matching.spot_scores(places.around, low, high, 0)
     for k in range(0, len(spots), 97):
         turned = np.roll(places.around[spots[k]], -headings[k])
@@ -188,7 +230,9 @@ def test_distances_to_walls_are_exact_where_they_fit_a_byte(places):
 
 
 def test_of_poses_whose_beams_would_have_to_pass_walls_one_that_explains_them_is_taken():
-    hall = floor((20, 0, 22, 40), (20, 48, 22, 90), rows=60, cols=90)  # a door through which the robot looks
+    hall = floor(
+        (20, 0, 22, 40), (20, 48, 22, 90), rows=60, cols=90
+    )  # a door through which the robot looks
     places = Places.of(*map_of(hall), CONFIG)
     scan, _, T = next(drive(hall, (3.4, 2.8, 1.57), []))
     judge = Judge(places, CONFIG, calibrate(places, scan, CONFIG, np.random.default_rng(0)))

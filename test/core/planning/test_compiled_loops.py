@@ -50,7 +50,9 @@ def test_the_point_to_steer_for(seed):
     path, xy = wandering(rng), rng.normal(0.0, 0.4, 2)
     nearest = nearest_point(path, *xy)
     assert nearest == int(np.square(path - xy).sum(axis=1).argmin())
-    assert length_from(path, nearest) == pytest.approx(np.hypot(*np.diff(path[nearest:], axis=0).T).sum())
+    assert length_from(path, nearest) == pytest.approx(
+        np.hypot(*np.diff(path[nearest:], axis=0).T).sum()
+    )
     found = _point_ahead(path, *xy, 0.4, 0.05)
     assert found == pytest.approx(plain_point_ahead(path, xy, 0.4, 0.05))
 
@@ -76,9 +78,15 @@ def test_whether_something_has_come_near_a_path(seed):
 
 
 def plain_smoothed(ranges):
-    """Each range that there is as the mean of those up to two beams beside it that differ by less than 3 cm."""
+    """Each known range as the mean of those up to two beams off that differ by less than 3 cm."""
     beside = [ranges[max(i - 2, 0) : i + 3] for i in range(len(ranges))]
-    return np.array([near[np.abs(near - r) < 0.03].mean() for r, near in zip(ranges, beside, strict=True) if r == r])
+    return np.array(
+        [
+            near[np.abs(near - r) < 0.03].mean()
+            for r, near in zip(ranges, beside, strict=True)
+            if r == r
+        ]
+    )
 
 
 @pytest.mark.parametrize('seed', SEEDS)
@@ -89,13 +97,18 @@ def test_points_around_are_those_of_the_scan_and_earlier_ones_near_and_out_of_vi
     robot, earlier = se2.pose(*rng.normal(size=3)), rng.normal(0.0, 1.0, (50, 2))
     laser = se2.compose(robot, scan.T_base_laser)
     bearings = np.arctan2(*(earlier - laser[:2]).T[::-1]) - laser[2]
-    in_view = np.abs(se2.wrap(bearings - 0.5 * (scan.angles_rad[0] + scan.angles_rad[-1]))) <= 0.5 * 99 * 0.02
+    middle = 0.5 * (scan.angles_rad[0] + scan.angles_rad[-1])
+    in_view = np.abs(se2.wrap(bearings - middle)) <= 0.5 * 99 * 0.02
     kept = earlier[(np.hypot(*(earlier - robot[:2]).T) < 1.0) & ~in_view]
     hits = np.where(scan.hit, scan.ranges_m, np.nan)
     angles, smoothed = scan.angles_rad[scan.hit], plain_smoothed(hits)
-    seen = se2.transform_points(laser, np.column_stack([smoothed * np.cos(angles), smoothed * np.sin(angles)]))
+    seen = se2.transform_points(
+        laser, np.column_stack([smoothed * np.cos(angles), smoothed * np.sin(angles)])
+    )
     expected = np.concatenate([seen, kept])
-    found = _points_around(hits, scan.angle_min_rad, scan.angle_increment_rad, laser, earlier, robot)
+    found = _points_around(
+        hits, scan.angle_min_rad, scan.angle_increment_rad, laser, earlier, robot
+    )
     np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
@@ -114,7 +127,9 @@ def test_standing_places_are_renewed_where_something_changed(seed):
     standing = standing_places(free, 0.25, 0.1)
     for _ in range(10):
         top, left = int(rng.integers(0, 55)), int(rng.integers(0, 65))
-        part = (top, left, min(top + int(rng.integers(1, 20)), 60), min(left + int(rng.integers(1, 20)), 70))
+        bottom = min(top + int(rng.integers(1, 20)), 60)
+        right = min(left + int(rng.integers(1, 20)), 70)
+        part = (top, left, bottom, right)
         where = (slice(part[0], part[2]), slice(part[1], part[3]))
         free[where] = rng.random(free[where].shape) < 0.97
         renew_standing(standing, free, part, 0.25, 0.1)
@@ -130,17 +145,22 @@ def test_places_in_sight(seed):
     bearings = np.arctan2(*(places - laser[:2]).T[::-1]) - laser[2]
     asked = (np.hypot(*(places - laser[:2]).T) < 2.5) & (np.abs(se2.wrap(bearings - 0.3)) <= 1.1)
     clear = [line_is_clear(free, 30, 30, int(row), int(col)) for row, col in frame.cells_of(places)]
-    assert (_in_sight(free, frame.as_array(), laser, places, 2.5, 0.3, 1.1) == (asked & clear)).all()
+    found = _in_sight(free, frame.as_array(), laser, places, 2.5, 0.3, 1.1)
+    assert (found == (asked & clear)).all()
 
 
 @pytest.mark.parametrize('seed', SEEDS)
 def test_the_cost_of_cells_falls_with_the_distance_to_what_is_not_free(seed):
     rng = np.random.default_rng(seed)
     config, free = WavefrontConfig(), ndimage.binary_opening(rng.random((40, 50)) < 0.97)
-    cost = cost_of_cells(GridPatch(GridFrame(0.0, 0.0, 0.1), np.where(free, 0, 100).astype(np.int8)), config)
+    cost = cost_of_cells(
+        GridPatch(GridFrame(0.0, 0.0, 0.1), np.where(free, 0, 100).astype(np.int8)), config
+    )
     away_m = 0.1 * ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1]
     nearness = np.clip((config.keep_m - away_m) / (config.keep_m - config.robot_radius_m), 0.0, 1.0)
-    expected = np.where(away_m >= config.robot_radius_m - 1e-6, 1.0 + config.keep_weight * nearness**2, np.inf)
+    expected = np.where(
+        away_m >= config.robot_radius_m - 1e-6, 1.0 + config.keep_weight * nearness**2, np.inf
+    )
     assert cost == pytest.approx(expected)
 
 
@@ -169,14 +189,17 @@ def test_squares_of_cells_and_back(seed):
     expected = padded.reshape(shape).any(axis=(1, 3))
     assert (coarse(cells, factor) == expected).all()
     chosen = rng.random(expected.shape) < 0.5
-    spread = np.repeat(np.repeat(chosen, factor, axis=0), factor, axis=1)[: cells.shape[0], : cells.shape[1]]
+    rows, cols = cells.shape
+    spread = np.repeat(np.repeat(chosen, factor, axis=0), factor, axis=1)[:rows, :cols]
     assert (fine(chosen, factor, cells) == (cells & spread)).all()
 
 
 @pytest.mark.parametrize('seed', SEEDS)
 def test_which_cells_are_near_a_true_one(seed):
     rng = np.random.default_rng(seed)
-    mask, cells, reach = rng.random((30, 40)) < 0.01, rng.integers(-3, 44, (20, 2)), rng.uniform(0.0, 6.0)
+    mask = rng.random((30, 40)) < 0.01
+    cells = rng.integers(-3, 44, (20, 2))
+    reach = rng.uniform(0.0, 6.0)
     places = np.argwhere(mask)
     expected = [(np.square(places - cell).sum(axis=1) <= reach * reach).any() for cell in cells]
     assert (are_near(mask, cells, reach) == expected).all()
@@ -188,14 +211,16 @@ def test_owners_without_scraps(seed):
     owners, numbers = rng.integers(-1, 4, 60), np.sort(rng.integers(0, 5, 60))
     expected = owners.copy()
     for number in np.unique(numbers):
-        ids, inverse, counts = np.unique(owners[numbers == number], return_inverse=True, return_counts=True)
-        expected[numbers == number] = np.where(counts[inverse] < 4, ids[counts.argmax()], owners[numbers == number])
+        part = owners[numbers == number]
+        ids, inverse, counts = np.unique(part, return_inverse=True, return_counts=True)
+        expected[numbers == number] = np.where(counts[inverse] < 4, ids[counts.argmax()], part)
     assert (without_scraps(owners, numbers, 4) == expected).all()
 
 
 @pytest.mark.parametrize('seed', SEEDS)
 def test_an_arc(seed):
-    start, curvature, length = np.random.default_rng(seed).normal(size=(3, 3))[0], 0.7 * seed - 5.0, 1.3
+    start = np.random.default_rng(seed).normal(size=(3, 3))[0]
+    curvature, length = 0.7 * seed - 5.0, 1.3
     pose, count = start, 2600
     for _ in range(count):
         pose = se2.compose(pose, se2.pose(length / count, 0.0, curvature * length / count))

@@ -16,7 +16,9 @@ def drive(path, start, config=None, seconds=60.0):
     pose, poses, commands = np.array(start, dtype=np.float64), [], []
     for _ in range(int(seconds / DT)):
         v, w = follower.command(pose, path, DT)
-        pose = se2.compose(pose, se2.pose(v * DT * np.cos(w * DT / 2), v * DT * np.sin(w * DT / 2), w * DT))
+        pose = se2.compose(
+            pose, se2.pose(v * DT * np.cos(w * DT / 2), v * DT * np.sin(w * DT / 2), w * DT)
+        )
         poses.append(pose)
         commands.append((v, w))
         if math.dist(pose[:2], path[-1]) < 0.03:
@@ -63,7 +65,9 @@ def test_it_turns_on_the_spot_towards_a_path_that_begins_behind():
 
 
 def test_it_slows_down_to_stop_at_the_end():
-    poses, commands = drive(dense([(0.0, 0.0), (3.0, 0.0)]), (0.0, 0.0, 0.0), FollowerConfig(max_speed_m_s=0.5))
+    poses, commands = drive(
+        dense([(0.0, 0.0), (3.0, 0.0)]), (0.0, 0.0, 0.0), FollowerConfig(max_speed_m_s=0.5)
+    )
     assert commands[:, 0].max() == pytest.approx(0.5)
     # The speed that can be braked to rest on the last 0.1 m.
     assert commands[-1, 0] < math.sqrt(2.0 * FollowerConfig().max_acceleration_m_s2 * 0.1)

@@ -5,7 +5,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from thinmap_ros.core.planning.graph_search import access, costs_from, path_between, path_points, shortest_path
+from thinmap_ros.core.planning.graph_search import (
+    access,
+    costs_from,
+    path_between,
+    path_points,
+    shortest_path,
+)
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 
 
@@ -23,7 +29,8 @@ def square():
     nodes = [node(1, 0, 0), node(2, 4, 0), node(3, 4, 3), node(4, 0, 3), node(5, 9, 9)]
     corners = {n.id: (n.x, n.y) for n in nodes}
     edges = [
-        edge(10 + i, a, b, np.linspace(corners[a], corners[b], 9)) for i, (a, b) in enumerate([(1, 2), (3, 2), (3, 4)])
+        edge(10 + i, a, b, np.linspace(corners[a], corners[b], 9))
+        for i, (a, b) in enumerate([(1, 2), (3, 2), (3, 4)])
     ]
     return TopologicalMap(nodes, edges)
 
@@ -51,7 +58,12 @@ def test_costs_equal_floyd_and_warshall_s(count, seed):
     nodes = [node(i + 1, *places[i]) for i in range(count)]
     pairs = [pair for pair in itertools.product(range(count), repeat=2) if rng.random() < 0.3]
     edges = [
-        edge(100 + k, a + 1, b + 1, [places[a], (places[a] + places[b]) / 2 + rng.uniform(-1, 1, 2), places[b]])
+        edge(
+            100 + k,
+            a + 1,
+            b + 1,
+            [places[a], (places[a] + places[b]) / 2 + rng.uniform(-1, 1, 2), places[b]],
+        )
         for k, (a, b) in enumerate(pairs)
     ]
     best = np.where(np.eye(count, dtype=bool), 0.0, np.inf)
@@ -85,12 +97,16 @@ def test_a_loop_is_left_the_shorter_way():
     ring = [(0, 0), (1, 0), (2, 0), (2, 1), (1, 1), (0, 1), (0, 0)]
     topology = TopologicalMap([node(1, 0, 0)], [edge(2, 1, 1, ring)])
     assert access(topology, 1.0, 1.0).to_node_m == pytest.approx({1: 2.0})
-    assert np.hypot(*np.diff(path_between(topology, (1.0, 1.0), (1.0, 0.0)), axis=0).T).sum() == pytest.approx(3.0)
+    assert np.hypot(
+        *np.diff(path_between(topology, (1.0, 1.0), (1.0, 0.0)), axis=0).T
+    ).sum() == pytest.approx(3.0)
 
 
 def test_a_map_without_edges_and_an_empty_one():
     lone = TopologicalMap([node(7, 1.0, 1.0)])
     assert costs_from(lone, 1.0, 3.0) == {7: 2.0}
-    np.testing.assert_allclose(path_between(lone, (1.0, 3.0), (0.0, 1.0))[[0, -1]], [[1.0, 3.0], [0.0, 1.0]])
+    np.testing.assert_allclose(
+        path_between(lone, (1.0, 3.0), (0.0, 1.0))[[0, -1]], [[1.0, 3.0], [0.0, 1.0]]
+    )
     assert costs_from(TopologicalMap(), 0.0, 0.0) == {}
     assert path_between(TopologicalMap(), (0.0, 0.0), (1.0, 1.0)) is None

@@ -84,7 +84,9 @@ def test_a_way_is_found_anew_once_it_is_old():
     places = np.array([[5.0, 1.0], [5.0, 5.0]])
     before = table.update(allowed, np.zeros_like(allowed), frame, places, 0)[0, 1]
     allowed[:] = True
-    assert table.update(allowed, np.zeros_like(allowed), frame, places, 5_000_000_000)[0, 1] == before
+    assert (
+        table.update(allowed, np.zeros_like(allowed), frame, places, 5_000_000_000)[0, 1] == before
+    )
     later = table.update(allowed, np.zeros_like(allowed), frame, places, 15_000_000_000)
     assert later[0, 1] == pytest.approx(4.0, abs=0.3)
 
@@ -94,8 +96,13 @@ def test_a_way_through_the_unknown_is_longer_than_it_is():
     allowed[:, 28:32] = False
     places = np.array([[1.0, 3.0], [5.0, 3.0]])
     frame = GridFrame(0.0, 0.0, 0.1)
-    assert WayTable(0.2, 10.0, 2).update(allowed, np.zeros_like(allowed), frame, places, 0)[0, 1] == math.inf
-    assert WayTable(0.2, 10.0, 2).update(allowed, ~allowed, frame, places, 0)[0, 1] == pytest.approx(4.4)
+    assert (
+        WayTable(0.2, 10.0, 2).update(allowed, np.zeros_like(allowed), frame, places, 0)[0, 1]
+        == math.inf
+    )
+    assert WayTable(0.2, 10.0, 2).update(allowed, ~allowed, frame, places, 0)[
+        0, 1
+    ] == pytest.approx(4.4)
 
 
 def test_the_field_of_ways_holds_the_way_to_each_cell():

@@ -22,7 +22,7 @@ def room(rows=60, cols=80):
 
 
 class Ride:
-    """A robot that does exactly what it is told, in a world of cells, with a map that may know less than the world."""
+    """A robot that does exactly as told, in a world of cells of which its map may know less."""
 
     def __init__(self, world, start, known=None, config=None, noise=None):
         self.noise = noise
@@ -34,7 +34,10 @@ class Ride:
     def scan(self):
         angles = np.radians(np.arange(-90.0, 91.0))
         occupied = (self.world == 100).astype(np.uint8)
-        ranges = cast_rays(occupied, self.pose[0] / 0.1, self.pose[1] / 0.1, angles + self.pose[2], 80.0) * 0.1
+        ranges = (
+            cast_rays(occupied, self.pose[0] / 0.1, self.pose[1] / 0.1, angles + self.pose[2], 80.0)
+            * 0.1
+        )
         if self.noise is not None:
             ranges = ranges + self.noise.normal(0.0, 0.01, ranges.shape)
         return Scan.create(int(self.seconds * 1e9), ranges, angles[0], np.radians(1.0), 0.02, 8.0)
@@ -43,12 +46,15 @@ class Ride:
         command = self.navigator.step(self.pose, self.patch, self.scan(), DT)
         v, w = command.v, command.w
         self.pose = se2.compose(
-            self.pose, se2.pose(v * DT * math.cos(w * DT / 2), v * DT * math.sin(w * DT / 2), w * DT)
+            self.pose,
+            se2.pose(v * DT * math.cos(w * DT / 2), v * DT * math.sin(w * DT / 2), w * DT),
         )
         self.commands.append((v, w))
         self.seconds += DT
         clearance = (distance_cells(self.world == 100) - 0.5) * 0.1
-        self.nearest_m = min(self.nearest_m, clearance[int(self.pose[1] / 0.1), int(self.pose[0] / 0.1)])
+        self.nearest_m = min(
+            self.nearest_m, clearance[int(self.pose[1] / 0.1), int(self.pose[0] / 0.1)]
+        )
         return command
 
     def go(self, goal, seconds=90.0):
@@ -105,7 +111,7 @@ def gap_of(cells):
 
 
 def rides_to_and_fro(ride, seconds):
-    """How often a robot gets from one side to the other in that time, and how near it comes to the walls, m."""
+    """How often a robot crosses to the other side in that time, how near it comes to walls, m."""
     corners, nearest, crossings = np.argwhere(ride.world == 100)[:, ::-1] * 0.1, math.inf, 0
     sides = itertools.cycle([(7.0, 3.05), (1.0, 3.05)])
     goal = next(sides)
@@ -176,7 +182,7 @@ def test_a_new_goal_takes_the_place_of_the_old_one_and_cancel_brings_it_to_rest(
 
 
 def test_speed_is_kept_low_enough_to_stop_before_what_stands_ahead():
-    """A wall at every distance: the robot told to drive on never has more speed than it can brake."""
+    """A wall at every distance: told to drive on, it never has more speed than it can brake."""
     config = NavigatorConfig(max_speed_m_s=0.5)
     known = room()
     for gap in (0.3, 0.4, 0.6, 1.0):

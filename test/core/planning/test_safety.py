@@ -1,4 +1,7 @@
-"""Whatever it is told, the robot touches nothing: real limits and a real laser in rooms full of pillars."""
+"""Whatever it is told, the robot touches nothing.
+
+Real limits and a real laser in rooms full of pillars.
+"""
 
 import numpy as np
 import pytest
@@ -32,11 +35,18 @@ def start_in(world, rng):
 
 
 def rove(seed, speed, knows_pillars, seconds=40.0):
-    """Drive to one random goal after the other, often sent elsewhere on the way; returns contacts and the way made."""
+    """Drive to one random goal after the other, often sent elsewhere on the way.
+
+    Returns contacts and the way made.
+    """
     rng = np.random.default_rng(seed)
     world = pillars(rng)
     robot = Simulation(world, start_in(world, rng), PRESETS['2dx'], Lms200Config(), seed)
-    known = world.occupied if knows_pillars else np.pad(np.zeros((68, 68), dtype=np.uint8), 1, constant_values=1)
+    known = (
+        world.occupied
+        if knows_pillars
+        else np.pad(np.zeros((68, 68), dtype=np.uint8), 1, constant_values=1)
+    )
     patch = GridPatch(FRAME, np.where(known, 100, 0).astype(np.int8))
     navigator = Navigator(NavigatorConfig(max_speed_m_s=speed))
     moment, scan, until, way_m = robot.sense(), None, 0.0, 0.0

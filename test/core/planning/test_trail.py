@@ -1,4 +1,4 @@
-"""Where the robot has been, it can go back: as cells, and for a planner whose map has a speck too many."""
+"""Where a robot was it can go back: as cells, and for a planner whose map has a speck too many."""
 
 import numpy as np
 import pytest
@@ -54,10 +54,11 @@ def test_a_pose_that_is_not_finite_leaves_no_trail():
     for x in (np.nan, 0.0, np.inf, 0.1):
         trail.add(np.array([x, 3.0, 0.0]))
     cells = trail.cells(FRAME, (100, 1000))
-    assert np.unique(cells, axis=0).tolist() == FRAME.cells_of(np.array([[0.0, 3.0], [0.1, 3.0]])).tolist()
+    been = FRAME.cells_of(np.array([[0.0, 3.0], [0.1, 3.0]]))
+    assert np.unique(cells, axis=0).tolist() == been.tolist()
 
 
-def test_the_way_back_is_open_though_a_speck_makes_it_too_narrow_but_not_through_what_stands_there():
+def test_the_way_back_is_open_though_a_speck_makes_it_too_narrow_but_not_through_what_is_there():
     cells = np.zeros((60, 80), dtype=np.int8)
     cells[[0, -1]], cells[:, [0, -1]] = 100, 100
     cells[:28, 40], cells[33:, 40] = 100, 100

@@ -89,7 +89,9 @@ def spoiled(ride, spoil):
     def scan():
         made = whole()
         ranges = np.where(made.no_return, np.inf, made.ranges_m)
-        return Scan.create(made.stamp_ns, spoil(ranges), made.angle_min_rad, made.angle_increment_rad, 0.02, 8.0)
+        return Scan.create(
+            made.stamp_ns, spoil(ranges), made.angle_min_rad, made.angle_increment_rad, 0.02, 8.0
+        )
 
     ride.scan = scan
     return ride

@@ -9,13 +9,22 @@ from hypothesis import strategies as st
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.reach import nearest_true
-from thinmap_ros.core.planning.wavefront import WavefrontConfig, cost_of_cells, descend, navigation_function, plan
+from thinmap_ros.core.planning.wavefront import (
+    WavefrontConfig,
+    cost_of_cells,
+    descend,
+    navigation_function,
+    plan,
+)
 
 PLAIN = WavefrontConfig(robot_radius_m=0.25, keep_weight=0.0)
 
 
 def patch_of(drawing):
-    """Rows from the top down: '.' free, '#' occupied, '?' unknown; 10 cm a cell, corner at (1, 2)."""
+    """Rows from the top down: '.' free, '#' occupied, '?' unknown.
+
+    10 cm a cell, corner at (1, 2).
+    """
     states = {'.': 0, '#': 100, '?': -1}
     cells = np.array([[states[c] for c in row] for row in reversed(drawing)], dtype=np.int8)
     return GridPatch(GridFrame(1.0, 2.0, 0.1), cells)
@@ -49,7 +58,11 @@ def reference(cost, goal):
             a = min(padded[r, c + 1], padded[r + 2, c + 1])
             b = min(padded[r + 1, c], padded[r + 1, c + 2])
             f = cost[r, c]
-            value = (a + b + math.sqrt(2 * f * f - (a - b) ** 2)) / 2 if abs(a - b) < f else min(a, b) + f
+            value = (
+                (a + b + math.sqrt(2 * f * f - (a - b) ** 2)) / 2
+                if abs(a - b) < f
+                else min(a, b) + f
+            )
             if value < field[r, c]:
                 field[r, c] = value
                 heapq.heappush(heap, (value, (r, c)))
@@ -69,7 +82,8 @@ def test_the_wave_equals_the_plain_reference(rows, cols, seed):
 def test_a_path_goes_down_over_open_cells_to_the_goal_and_never_jumps(rows, cols, seed):
     rng = np.random.default_rng(seed)
     cost = np.where(rng.random((rows, cols)) < 0.3, np.inf, rng.uniform(1.0, 4.0, (rows, cols)))
-    goal, start = (int(rng.integers(rows)), int(rng.integers(cols))), (int(rng.integers(rows)), int(rng.integers(cols)))
+    goal = (int(rng.integers(rows)), int(rng.integers(cols)))
+    start = (int(rng.integers(rows)), int(rng.integers(cols)))
     cost[goal] = 1.0
     field = navigation_function(cost, goal)
     if np.isinf(field[start]):
@@ -95,7 +109,9 @@ def test_stopping_at_the_start_leaves_the_way_there_as_it_was():
 @pytest.mark.parametrize('angle_deg', [0, 10, 30, 45, 70, 90, 135, 200])
 def test_in_the_open_a_path_is_straight_in_every_direction(angle_deg):
     free = np.zeros((200, 200), dtype=np.int8)
-    goal = 10.0 + 7.0 * np.array([math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))])
+    goal = 10.0 + 7.0 * np.array(
+        [math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))]
+    )
     path = plan(patch(free), (10.0, 10.0), tuple(goal), PLAIN)
     length = np.hypot(*np.diff(path, axis=0).T).sum()
     assert length <= 1.02 * 7.0
@@ -106,7 +122,8 @@ def test_round_a_wall_a_path_is_hardly_longer_than_the_string_pulled_tight():
     cells = room(120, 120)
     cells[40, :80] = 100
     path = plan(patch(cells), (2.0, 2.0), (2.0, 6.0), PLAIN)
-    # Tight round the end of the wall (x = 8.0, y = 4.0 to 4.1), at 0.25 m, half a cell more for the cells' width.
+    # Tight round the end of the wall (x = 8.0, y = 4.0 to 4.1), at 0.25 m,
+    # half a cell more for the cells' width.
     around = 2.0 * math.hypot(8.2 - 2.0, 2.05)
     assert np.hypot(*np.diff(path, axis=0).T).sum() <= 1.05 * around
 
@@ -150,7 +167,9 @@ def test_unknown_space_is_forbidden_or_costly_as_configured():
 def test_costly_unknown_space_is_avoided_where_there_is_another_way():
     cells = room(60, 100)
     cells[25:35, :70] = -1
-    path = plan(patch(cells), (2.0, 1.0), (2.0, 5.0), WavefrontConfig(unknown='costly', unknown_weight=20.0))
+    path = plan(
+        patch(cells), (2.0, 1.0), (2.0, 5.0), WavefrontConfig(unknown='costly', unknown_weight=20.0)
+    )
     assert path[:, 0].max() > 7.0
 
 

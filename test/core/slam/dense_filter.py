@@ -1,4 +1,4 @@
-"""EKF-SLAM written out with whole matrices, slowly and plainly, to hold the fast filters against."""
+"""EKF-SLAM written out with whole matrices, slow and plain, to hold the fast filters against."""
 
 import math
 
@@ -9,7 +9,7 @@ from thinmap_ros.core.slam.models import motion_jacobians, observe_line, place_l
 
 
 class DenseFilter:
-    """x (3 + 2 N,), P: pose and lines; every step is the textbook's formula over the whole state."""
+    """x (3 + 2 N,), P: pose and lines; each step is the textbook's formula over the whole state."""
 
     def __init__(self, pose, covariance):
         self.x, self.P = np.array(pose, dtype=float), np.array(covariance, dtype=float)
@@ -33,7 +33,8 @@ class DenseFilter:
     def tie(self, a, b, R):
         H = np.zeros((2, self.x.size))
         opposed = abs(wrap(float(self.x[4 + 2 * a] - self.x[4 + 2 * b]))) > math.pi / 2.0
-        H[:, 3 + 2 * a : 5 + 2 * a], H[:, 3 + 2 * b : 5 + 2 * b] = np.eye(2), np.diag([1.0 if opposed else -1.0, -1.0])
+        H[:, 3 + 2 * a : 5 + 2 * a] = np.eye(2)
+        H[:, 3 + 2 * b : 5 + 2 * b] = np.diag([1.0 if opposed else -1.0, -1.0])
         v = -H @ self.x
         v[1] = wrap(float(v[1] + (math.pi if opposed else 0.0)))
         self._correct(H, v, R)

@@ -57,11 +57,15 @@ def chosen(walls, seen, gap_m=0.3):
         ekf.add(line, 1e-6 * np.eye(2))
         along = ends @ [-math.sin(line[1]), math.cos(line[1])]
         features.append(Feature(1, along.min(), along.max(), np.zeros(2)))
-    return associate(ekf, features, seen_lines(*seen), np.zeros(2), AssociationConfig(gap_m=gap_m)).index.tolist()
+    return associate(
+        ekf, features, seen_lines(*seen), np.zeros(2), AssociationConfig(gap_m=gap_m)
+    ).index.tolist()
 
 
 def test_collinear_walls_of_two_rooms_are_two():
-    assert chosen([[[2, 1], [2, 3]], [[2, -3], [2, -1]]], [[[2, -2.5], [2, -1.2]], [[2, 1.5], [2, 2]]]) == [1, 0]
+    assert chosen(
+        [[[2, 1], [2, 3]], [[2, -3], [2, -1]]], [[[2, -2.5], [2, -1.2]], [[2, 1.5], [2, 2]]]
+    ) == [1, 0]
     assert chosen([[[2, 1], [2, 3]]], [[[2, -3], [2, -1]]]) == [-1]
     assert chosen([[[2, 1], [2, 3]]], [[[2, -3], [2, -1]]], gap_m=2.5) == [0]
 
@@ -74,8 +78,10 @@ def test_a_line_fits_only_where_the_gate_says_so():
 
 
 def test_what_could_be_two_walls_is_decided_when_the_others_have_corrected_the_pose():
-    """A cupboard before a wall, 12 cm apart: taken by itself, the line fits the wrong one of them better."""
-    wall, cupboard, behind = [[2.12, -1.0], [2.12, 1.0]], [[2.0, -1.0], [2.0, 1.0]], [[-3.0, -1.0], [-3.0, 1.0]]
+    """A cupboard 12 cm before a wall: taken by itself, the line fits the wrong one better."""
+    wall = [[2.12, -1.0], [2.12, 1.0]]
+    cupboard = [[2.0, -1.0], [2.0, 1.0]]
+    behind = [[-3.0, -1.0], [-3.0, 1.0]]
     ekf, features = known([wall, cupboard, behind])
     truth = np.array([0.08, 0.0, 0.0])
     ekf.local.set_pose(np.zeros(3), np.diag([0.1**2, 0.01**2, 0.001**2]))
@@ -98,7 +104,8 @@ def test_the_two_faces_of_a_thin_wall_are_two_features():
 
 
 def test_a_feature_enters_after_several_sightings_and_keeps_its_id():
-    ekf, features = CompressedEkf(np.zeros(3), SURE), FeatureMap(FeatureConfig(sightings=3), local_areas=False)
+    ekf = CompressedEkf(np.zeros(3), SURE)
+    features = FeatureMap(FeatureConfig(sightings=3), local_areas=False)
     wall = seen_lines([[2.0, -1.0], [2.0, 1.0]])
     counts = []
     for _ in range(5):
@@ -124,7 +131,9 @@ def test_what_was_seen_once_and_then_no_more_is_forgotten():
 
 
 def test_two_features_that_turn_out_to_be_one_wall_merge():
-    ekf, features = known([[[2.0, -3.0], [2.0, -1.0]], [[2.0, 1.0], [2.0, 3.0]], [[-1.0, 2.0], [1.0, 2.0]]])
+    ekf, features = known(
+        [[[2.0, -3.0], [2.0, -1.0]], [[2.0, 1.0], [2.0, 3.0]], [[-1.0, 2.0], [1.0, 2.0]]]
+    )
     first = min(f.id for f in features.listed(ekf))
     assert len(features) == 3
     features.observe(ekf, seen_lines([[2.0, -1.5], [2.0, 1.5]]), BLIND)
@@ -152,9 +161,13 @@ def test_a_drive_through_a_room_finds_its_walls_once(rng, local_areas):
 def wall_of(feature):
     for index, wall in enumerate(ROOM):
         along = (wall[2:] - wall[:2]) / np.hypot(*(wall[2:] - wall[:2]))
-        off = [abs((end - wall[:2]) @ [-along[1], along[0]]) for end in (feature.start, feature.end)]
-        inside = [-0.2 < (end - wall[:2]) @ along < np.hypot(*(wall[2:] - wall[:2])) + 0.2
-                  for end in (feature.start, feature.end)]  # fmt: skip
+        off = [
+            abs((end - wall[:2]) @ [-along[1], along[0]]) for end in (feature.start, feature.end)
+        ]
+        inside = [
+            -0.2 < (end - wall[:2]) @ along < np.hypot(*(wall[2:] - wall[:2])) + 0.2
+            for end in (feature.start, feature.end)
+        ]
         if max(off) < 0.06 and all(inside):
             return index
     return -1
@@ -178,7 +191,8 @@ def test_a_door_that_opens_leaves_the_map_and_a_wall_behind_a_person_does_not():
     for _ in range(FeatureConfig().misses):
         assert len(features) == 2
         features.observe(ekf, seen_lines(far), scan_in(person[1:], np.zeros(3)))
-    assert [round(f.r_m) for f in features.listed(ekf)] == [5] == [f.id + 3 for f in features.listed(ekf)]
+    left = features.listed(ekf)
+    assert [round(f.r_m) for f in left] == [5] == [f.id + 3 for f in left]
     assert len(ekf) == 1
 
 

@@ -1,4 +1,4 @@
-"""Consistency: the errors of the pose are as large as the filter says, step by step, over many runs."""
+"""Consistency: pose errors are as large as the filter says, step by step, over many runs."""
 
 import math
 
@@ -16,7 +16,11 @@ from thinmap_ros.core.slam.models import MotionConfig, observe_line, odometry_co
 FEATURES = FeatureConfig()
 # What wheels leave open after scan matching.
 MOTION = MotionConfig(
-    odom_distance_sigma=0.02, odom_turn_sigma=0.03, odom_drift_sigma=0.01, odom_slip_m=0.002, odom_slip_rad=0.002
+    odom_distance_sigma=0.02,
+    odom_turn_sigma=0.03,
+    odom_drift_sigma=0.01,
+    odom_slip_m=0.002,
+    odom_slip_rad=0.002,
 )
 SEEN = np.diag([0.01**2, 0.005**2])
 WALL = np.diag(np.square([FEATURES.wall_sigma_m, FEATURES.wall_sigma_rad]))
@@ -36,7 +40,9 @@ def floor():
 WALLS = floor()
 NORMALS = np.column_stack([-(WALLS[:, 1] - WALLS[:, 0])[:, 1], (WALLS[:, 1] - WALLS[:, 0])[:, 0]])
 NORMALS = NORMALS / np.hypot(*NORMALS.T)[:, None]
-TRUE_LINES = np.column_stack([(NORMALS * WALLS[:, 0]).sum(axis=1), np.arctan2(NORMALS[:, 1], NORMALS[:, 0])])
+TRUE_LINES = np.column_stack(
+    [(NORMALS * WALLS[:, 0]).sum(axis=1), np.arctan2(NORMALS[:, 1], NORMALS[:, 0])]
+)
 
 
 def look(rng, truth):
@@ -49,7 +55,8 @@ def look(rng, truth):
     z = np.array([observe_line(truth, TRUE_LINES[i])[0] for i in seen]).reshape(-1, 2)
     seen, z = seen[z[:, 0] > 0.3], z[z[:, 0] > 0.3]
     z = z + rng.multivariate_normal([0.0, 0.0], SEEN + WALL, len(z))
-    ends = np.array([se2.transform_points(se2.invert(truth), WALLS[i]) for i in seen]).reshape(-1, 2, 2)
+    ends = np.array([se2.transform_points(se2.invert(truth), WALLS[i]) for i in seen])
+    ends = ends.reshape(-1, 2, 2)
     return Lines(z, np.tile(SEEN, (len(z), 1, 1)), ends)
 
 
@@ -57,7 +64,8 @@ def nees_of_a_run(seed, local_areas, looks):
     """Squared error of the pose, in sigmas, at each look of a drive up and down the corridor."""
     rng = np.random.default_rng(seed)
     truth = np.array([2.0, 5.0, 0.0])
-    ekf, features, found = CompressedEkf(truth, 1e-8 * np.eye(3)), FeatureMap(FEATURES, local_areas), []
+    ekf = CompressedEkf(truth, 1e-8 * np.eye(3))
+    features, found = FeatureMap(FEATURES, local_areas), []
     for step in range(looks):
         turning = step % 120 >= 110
         increment = np.array([0.0 if turning else 0.3, 0.0, math.pi / 10.0 if turning else 0.0])

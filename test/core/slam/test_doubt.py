@@ -16,7 +16,10 @@ def test_what_matches_leave_open_grows_only_where_they_say_nothing():
     doubt, along = Doubt(), np.diag([1e4, 0.0, 1e5])
     for _ in range(200):
         doubt.move(np.eye(3), ADDED)
-        doubt.match(doubt.evidence(np.linalg.inv(np.linalg.inv(doubt.since_match) + along), np.zeros(3)), AHEAD)
+        doubt.match(
+            doubt.evidence(np.linalg.inv(np.linalg.inv(doubt.since_match) + along), np.zeros(3)),
+            AHEAD,
+        )
     assert np.allclose(doubt.since_match, 0.0)
     assert np.isclose(doubt.on_map[1, 1], 200 * ADDED[1, 1])
     assert doubt.on_map[0, 0] < 1e-4
@@ -45,7 +48,9 @@ def test_a_match_that_trusts_its_prior_less_than_that_claims_leaves_a_covariance
 
 def test_what_the_map_says_counts_in_full_where_it_contradicts_the_wheels():
     doubt, by_map = Doubt(np.diag([1e-4, 1e-4, 1e-4])), np.diag([1e5, 1e5, 1e5])
-    off = np.array([0.0, 0.0, 0.2])  # 20 sigmas: the match has held on to its prior by a fraction only
+    off = np.array(
+        [0.0, 0.0, 0.2]
+    )  # 20 sigmas: the match has held on to its prior by a fraction only
     held = 9.0 / (9.0 + 0.2**2 / 1e-4)
     posterior = np.linalg.inv(by_map + held * np.linalg.inv(doubt.since_match))
     np.testing.assert_allclose(doubt.evidence(posterior, off).by_map, by_map, atol=1e-3)

@@ -24,7 +24,9 @@ def both(rng, features):
 
 def look(rng, filter_, indices):
     """Noisy observations of some features, as the filter expects them."""
-    expected = np.array([observe_line(filter_.pose, filter_.lines[i])[0] for i in indices]).reshape(-1, 2)
+    expected = np.array([observe_line(filter_.pose, filter_.lines[i])[0] for i in indices]).reshape(
+        -1, 2
+    )
     return expected + rng.multivariate_normal([0.0, 0.0], R, len(indices))
 
 
@@ -129,7 +131,9 @@ def test_an_update_that_moves_the_pose_too_far_is_left_out(rng):
     np.testing.assert_array_equal(fast.mean, before[0])
     np.testing.assert_array_equal(fast.covariance, before[1])
     free, plain = both(rng, 3)
-    assert free.update(np.array([0, 2]), look(rng, free, [0, 2]), np.tile(R, (2, 1, 1)), 1e3 * np.eye(3))
+    assert free.update(
+        np.array([0, 2]), look(rng, free, [0, 2]), np.tile(R, (2, 1, 1)), 1e3 * np.eye(3)
+    )
     assert not np.array_equal(free.covariance, plain.P)
 
 

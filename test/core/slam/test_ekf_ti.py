@@ -1,4 +1,4 @@
-"""EKF-SLAM/TI against the conventional filter: the same associations, the same estimate to rounding."""
+"""EKF-SLAM/TI against the conventional filter: same associations, same estimate to rounding."""
 
 from pathlib import Path
 
@@ -52,9 +52,12 @@ class Pair:
 
     def assert_same(self):
         mean, covariance = self.local.settle()
-        at = np.concatenate([np.arange(3)] + [3 + 2 * self.ids.index(i) + np.arange(2) for i in self.local.ids])
+        at = np.concatenate(
+            [np.arange(3)] + [3 + 2 * self.ids.index(i) + np.arange(2) for i in self.local.ids]
+        )
         conventional = isinstance(self.whole, EkfSlam)
-        x, P = (self.whole.mean, self.whole.covariance) if conventional else (self.whole.x, self.whole.P)
+        whole = self.whole
+        x, P = (whole.mean, whole.covariance) if conventional else (whole.x, whole.P)
         np.testing.assert_allclose(mean, x[at], atol=1e-9)
         np.testing.assert_allclose(covariance, P[np.ix_(at, at)], atol=1e-9)
 
@@ -64,7 +67,7 @@ def new_line(rng):
 
 
 def run(pair, rng, steps, area_every, change):
-    """A robot that goes from area to area, sees what is there, and now and then something new or gone."""
+    """A robot goes from area to area and sees what is there, at times something new or gone."""
     for _ in range(20):
         pair.add(new_line(rng))
     for step in range(steps):
@@ -129,11 +132,13 @@ def test_what_is_told_of_features_outside_the_area(rng):
     lines, covariances = pair.local.lines(), pair.local.line_covariances()
     at = [pair.ids.index(i) for i in ids]
     np.testing.assert_allclose([lines[i] for i in ids], pair.whole.lines[at], atol=1e-9)
-    np.testing.assert_allclose([covariances[i] for i in ids], pair.whole.line_covariances()[at], atol=1e-9)
+    np.testing.assert_allclose(
+        [covariances[i] for i in ids], pair.whole.line_covariances()[at], atol=1e-9
+    )
 
 
 def test_steps_touch_the_local_area_only(rng):
-    """The filter that is stepped holds pose, area and as many numbers again, whatever the map holds."""
+    """The stepped filter holds pose, area and as many numbers again, whatever the map holds."""
     pair = Pair(EkfSlam(np.array([1.0, -2.0, 0.4]), P0))
     for _ in range(300):
         pair.add(new_line(rng))
@@ -142,7 +147,9 @@ def test_steps_touch_the_local_area_only(rng):
     assert len(pair.local) == 300
 
 
-@pytest.mark.skipif(not STATUS.exists(), reason='says what a process holds only where there is a /proc')
+@pytest.mark.skipif(
+    not STATUS.exists(), reason='says what a process holds only where there is a /proc'
+)
 def test_some_hundred_features_take_little_memory(rng):
     """Their covariance is 2 MB; the store has room for far more, which must not count."""
     before, ekf = held_mb(), CompressedEkf(np.array([1.0, -2.0, 0.4]), P0)
@@ -154,4 +161,6 @@ def test_some_hundred_features_take_little_memory(rng):
 
 def held_mb():
     """What this process has written to, MB."""
-    return next(int(line.split()[1]) / 1e3 for line in STATUS.read_text().splitlines() if 'RssAnon' in line)
+    return next(
+        int(line.split()[1]) / 1e3 for line in STATUS.read_text().splitlines() if 'RssAnon' in line
+    )

@@ -47,7 +47,9 @@ def test_the_fit_is_the_minimum_that_a_general_solver_finds(rng):
 
     best = least_squares(residuals, [3.9, 0.05], xtol=1e-14, ftol=1e-14, gtol=1e-14)
     np.testing.assert_allclose(lines.z[0], best.x, atol=1e-5)
-    np.testing.assert_allclose(lines.covariances[0], np.linalg.inv(best.jac.T @ best.jac), rtol=1e-3)
+    np.testing.assert_allclose(
+        lines.covariances[0], np.linalg.inv(best.jac.T @ best.jac), rtol=1e-3
+    )
 
 
 @pytest.mark.parametrize('mount', [np.zeros(3), np.array([0.5, 0.2, 0.3])])
@@ -60,10 +62,14 @@ def test_the_covariance_is_what_many_scans_show(rng, mount):
     for _ in range(400):
         # Bearing noise moves the range on the wall at hand: rho = d / cos(phi - alpha).
         off = exact.angles_rad[hit] + normal
-        measured = exact.ranges_m[hit] * np.cos(off) / np.cos(off + rng.normal(0.0, 0.002, off.size))
+        measured = (
+            exact.ranges_m[hit] * np.cos(off) / np.cos(off + rng.normal(0.0, 0.002, off.size))
+        )
         ranges = exact.ranges_m.copy()
         ranges[hit] = measured + rng.normal(0.0, 0.02, off.size)
-        scan = Scan.create(0, ranges, exact.angle_min_rad, exact.angle_increment_rad, 0.05, 30.0, mount)
+        scan = Scan.create(
+            0, ranges, exact.angle_min_rad, exact.angle_increment_rad, 0.05, 30.0, mount
+        )
         lines = extract_lines(scan, config)
         assert len(lines) == 1
         found.append(lines.z[0])
@@ -102,7 +108,9 @@ def test_all_lines_of_a_furnished_room_are_walls(rng):
 def wall_error(wall, a, b):
     along = (wall[2:] - wall[:2]) / np.hypot(*(wall[2:] - wall[:2]))
     normal = np.array([-along[1], along[0]])
-    inside = all(-0.1 <= (p - wall[:2]) @ along <= np.hypot(*(wall[2:] - wall[:2])) + 0.1 for p in (a, b))
+    inside = all(
+        -0.1 <= (p - wall[:2]) @ along <= np.hypot(*(wall[2:] - wall[:2])) + 0.1 for p in (a, b)
+    )
     return max(abs((p - wall[:2]) @ normal) for p in (a, b)) if inside else math.inf
 
 
@@ -119,9 +127,13 @@ def test_a_bend_parts_a_wall_and_a_split_by_noise_is_healed(rng):
     assert len(extract_lines(scan_in(bent, np.zeros(3), rng), LineConfig())) == 2
     straight = np.array([[3.0, -2.5, 3.0, 2.5]])
     config = LineConfig(line_split_m=0.025)
-    assert all(len(extract_lines(scan_in(straight, np.zeros(3), rng), config)) == 1 for _ in range(50))
+    assert all(
+        len(extract_lines(scan_in(straight, np.zeros(3), rng), config)) == 1 for _ in range(50)
+    )
 
 
-@pytest.mark.parametrize('ranges', [[], [1.0], [np.inf] * 181, [np.nan] * 181, [0.0] * 181, [1.0] * 181])
+@pytest.mark.parametrize(
+    'ranges', [[], [1.0], [np.inf] * 181, [np.nan] * 181, [0.0] * 181, [1.0] * 181]
+)
 def test_scans_without_walls(ranges):
     assert len(extract_lines(scan_of(np.array(ranges)), LineConfig())) == 0

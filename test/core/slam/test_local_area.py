@@ -86,7 +86,9 @@ def test_without_a_topology_the_robot_s_own_way_is_one():
     assert 12.0 <= places[-1] <= 10.0 + 11.0
     # Known topology takes over what the trail's nodes held.
     area.set_topology(corridor(0.0, 10.0, 20.0))
-    assert area.features_near(np.array([10.0, 0.0, 0.0]), math.pi) == {10 * (i + 1) for i in range(len(xs))}
+    assert area.features_near(np.array([10.0, 0.0, 0.0]), math.pi) == {
+        10 * (i + 1) for i in range(len(xs))
+    }
 
 
 def test_without_any_node_there_is_no_area():

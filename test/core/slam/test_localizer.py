@@ -22,7 +22,9 @@ def driven(steps, seed=3, every=2, **config):
     rows = []
     for i, (truth, odom) in enumerate(drive(steps, rng, START)):
         if i % every == 0:
-            rows.append((truth, localizer.step(scan_in(ROOM, truth, rng, i * 200_000_000), odom), odom))
+            rows.append(
+                (truth, localizer.step(scan_in(ROOM, truth, rng, i * 200_000_000), odom), odom)
+            )
     return rows, localizer
 
 
@@ -46,7 +48,9 @@ def test_a_drive_round_the_room_stays_on_its_path(slam):
 def test_local_areas_cost_no_accuracy():
     """The path with the features of the local area, and with all."""
     local, whole = driven(900, slam='ti')[0], driven(900, slam='full')[0]
-    apart = np.array([a.T_map_base - b.T_map_base for (_, a, _), (_, b, _) in zip(local, whole, strict=True)])
+    apart = np.array(
+        [a.T_map_base - b.T_map_base for (_, a, _), (_, b, _) in zip(local, whole, strict=True)]
+    )
     assert np.sqrt(np.mean(apart[:, 0] ** 2 + apart[:, 1] ** 2)) < 0.005
     assert all(estimate.n_local <= estimate.n_features for _, estimate, _ in local)
     assert all(estimate.n_local == estimate.n_features for _, estimate, _ in whole)
@@ -55,7 +59,9 @@ def test_local_areas_cost_no_accuracy():
 def test_the_estimate_is_told_in_a_consistent_way():
     rows, _ = driven(200)
     for _, estimate, odom in rows:
-        np.testing.assert_allclose(se2.compose(estimate.T_map_odom, odom), estimate.T_map_base, atol=1e-9)
+        np.testing.assert_allclose(
+            se2.compose(estimate.T_map_odom, odom), estimate.T_map_base, atol=1e-9
+        )
         np.testing.assert_allclose(estimate.covariance, estimate.covariance.T)
         assert np.linalg.eigvalsh(estimate.covariance).min() > 0.0
         assert estimate.matched <= estimate.observed
@@ -153,7 +159,9 @@ def test_wheels_that_slip_are_caught_by_the_walls():
     for i, (truth, odom) in enumerate(drive(700, rng, START)):
         measured, last = se2.compose(measured, se2.between(last, odom)), odom
         if i % 100 == 60:
-            slip = se2.pose(0.3, 0.0, 0.0) if i % 200 == 60 else se2.pose(0.0, 0.0, np.radians(10.0))
+            slip = (
+                se2.pose(0.3, 0.0, 0.0) if i % 200 == 60 else se2.pose(0.0, 0.0, np.radians(10.0))
+            )
             measured = se2.compose(measured, slip)
         estimate = localizer.step(scan_in(ROOM, truth, rng), measured)
         worst = max(worst, float(np.hypot(*(estimate.T_map_base - truth)[:2])))
@@ -178,25 +186,30 @@ def test_people_walking_through_do_not_carry_the_robot_along():
         legs = []
         for k in range(3):
             at = truth[:2] + [1.5 * np.cos(0.05 * i + 2.0 * k), 1.5 * np.sin(0.05 * i + 2.0 * k)]
-            legs += [[at[0] - 0.15, at[1], at[0] + 0.15, at[1]], [at[0], at[1] - 0.15, at[0], at[1] + 0.15]]
+            legs += [
+                [at[0] - 0.15, at[1], at[0] + 0.15, at[1]],
+                [at[0], at[1] - 0.15, at[0], at[1] + 0.15],
+            ]
         estimate = localizer.step(scan_in(np.vstack([ROOM, legs]), truth, rng), odom)
         worst = max(worst, float(np.hypot(*(estimate.T_map_base - truth)[:2])))
     assert worst < 0.1
 
 
 def test_a_robot_carried_away_says_that_it_is_lost():
-    """Set down where nothing fits: the scans no longer lie on the map, and the estimate admits it."""
+    """Set down where nothing fits: scans no longer lie on the map, and the estimate admits it."""
     rng = np.random.default_rng(8)
     rows, localizer = driven(300)
     _, _, odom = rows[-1]
-    scans = [Scan.create(0, rng.uniform(0.5, 4.0, 181), -1.57, 0.0175, 0.05, 8.0) for _ in range(12)]
+    scans = [
+        Scan.create(0, rng.uniform(0.5, 4.0, 181), -1.57, 0.0175, 0.05, 8.0) for _ in range(12)
+    ]
     estimates = [localizer.step(scan, odom) for scan in scans]
     assert estimates[-1].lost
     assert not estimates[0].lost
 
 
 def test_far_from_the_start_a_robot_is_not_lost():
-    """In a large building the doubt of the pose in the map grows to metres; the scans fit all the same."""
+    """In a large building the pose in the map is in doubt by metres; the scans fit all the same."""
     rng = np.random.default_rng(10)
     rows, localizer = driven(120)
     truth, _, odom = rows[-1]
@@ -207,7 +220,7 @@ def test_far_from_the_start_a_robot_is_not_lost():
 
 
 def test_beyond_a_hall_in_which_nothing_is_seen_the_map_goes_on(rng):
-    """Walls that come into range far off and a few points at a time are new ground, and no reason to be lost."""
+    """Walls that come into range far off, some points at a time, are new: no reason to be lost."""
     # Two rooms, each open towards the hall between them.
     hall = np.vstack([ROOM[[0, 2, 3]], np.delete(ROOM, 3, axis=0) + [18.0, 0.0, 18.0, 0.0]])
     localizer, odom = Localizer(LocalizerConfig(start_x_m=2.0, start_y_m=7.0)), np.zeros(3)
@@ -232,7 +245,7 @@ def test_a_pose_that_is_set_is_settled_by_the_walls():
 
 
 def test_a_robot_that_was_put_somewhere_roughly_draws_nothing_until_a_scan_fits():
-    """Where nothing is known nothing contradicts it either; somebody's guess is no reason to map there."""
+    """Where nothing is known nothing contradicts it; somebody's guess is no reason to map there."""
     rows, localizer = driven(300)
     before = len(localizer.state()['cells'])
     localizer.set_pose(rows[-1][0] + [40.0, 0.0, 0.0], np.diag([4.0, 4.0, 0.1]))
@@ -252,14 +265,15 @@ def test_after_a_reset_the_map_is_empty():
 
 
 def test_a_map_is_taken_over_by_another_localizer():
-    """Saved after a drive; put elsewhere in the room, the robot goes on in that map: features keep their ids."""
+    """A saved map: put elsewhere in the room, the robot goes on in it; features keep their ids."""
     _, first = driven(900)
     state = first.state()
     before = {f.id: (f.r_m, f.alpha_rad, f.nodes) for f in first.features}
     second = Localizer.from_state(state, LocalizerConfig())
     assert {f.id: (f.r_m, f.alpha_rad, f.nodes) for f in second.features} == before
     np.testing.assert_array_equal(
-        np.array([f.covariance for f in second.features]), np.array([f.covariance for f in first.features])
+        np.array([f.covariance for f in second.features]),
+        np.array([f.covariance for f in first.features]),
     )
     rng = np.random.default_rng(8)
     elsewhere = np.array([8.0, 8.0, np.pi / 2.0])
@@ -307,11 +321,16 @@ def test_without_mapping_the_map_stays_as_it_is():
 @pytest.mark.parametrize(
     ('name', 'value'),
     [
-        ('cell_m', np.array(0.1)), ('cells', np.zeros((3, 2), dtype=np.int64)), ('points', np.full((1, 10), np.nan)),
-        ('lines', np.zeros((1, 3))), ('line_covariance', np.eye(3)), ('next_id', np.array(1)),
-        ('stored_at', np.array([[1, 10_000]])), ('spans', None),
+        ('cell_m', np.array(0.1)),
+        ('cells', np.zeros((3, 2), dtype=np.int64)),
+        ('points', np.full((1, 10), np.nan)),
+        ('lines', np.zeros((1, 3))),
+        ('line_covariance', np.eye(3)),
+        ('next_id', np.array(1)),
+        ('stored_at', np.array([[1, 10_000]])),
+        ('spans', None),
     ],
-)  # fmt: skip
+)
 def test_a_state_that_is_none_is_refused_in_words(name, value):
     _, localizer = driven(300)
     state = localizer.state()

@@ -26,14 +26,17 @@ START = np.array([2.0, 2.0, 0.0])
 
 
 def ring(rng, number=40):
-    """True poses round a circle, drifting estimates, and what was measured from each to the next."""
+    """True poses round a circle, drifting estimates, and what was measured from one to the next."""
     angles = np.linspace(0.0, 2.0 * np.pi, number, endpoint=False)
-    truth = np.column_stack([5.0 * np.cos(angles), 5.0 * np.sin(angles), se2.wrap(angles + np.pi / 2.0)])
+    truth = np.column_stack(
+        [5.0 * np.cos(angles), 5.0 * np.sin(angles), se2.wrap(angles + np.pi / 2.0)]
+    )
     steps = [se2.between(a, b) + rng.normal(0.003, 0.004, 3) for a, b in pairwise(truth)]
     poses = [truth[0]]
     for step in steps:
         poses.append(se2.compose(poses[-1], step))
-    return truth, np.array(poses), [Measured(i, i + 1, step, STEP, False) for i, step in enumerate(steps)]
+    measured = [Measured(i, i + 1, step, STEP, False) for i, step in enumerate(steps)]
+    return truth, np.array(poses), measured
 
 
 def worst(poses, truth):
@@ -67,7 +70,10 @@ def test_the_minimum_is_that_of_a_general_solver(rng):
 
 def test_a_wrong_loop_among_right_ones_moves_little(rng):
     truth, poses, measured = ring(rng)
-    right = [Measured(39 - i, i, se2.between(truth[39 - i], truth[i]), 100.0 * STEP, True) for i in range(3)]
+    right = [
+        Measured(39 - i, i, se2.between(truth[39 - i], truth[i]), 100.0 * STEP, True)
+        for i in range(3)
+    ]
     wrong = Measured(5, 25, np.zeros(3), 100.0 * STEP, True)
     with_wrong = relax(poses, [*measured, *right, wrong])
     without = relax(poses, [*measured, *right])
@@ -81,7 +87,7 @@ def test_without_measurements_nothing_moves():
 
 
 def loops_in_a_room(drift, steps=1300):
-    """Loops along a drive, and the true poses of the keyframes; drift (3,): what the given poses err a metre."""
+    """Loops along a drive, true poses of keyframes; drift (3,): what given poses err a metre."""
     rng = np.random.default_rng(2)
     loops, truths, drifting, last = Loops(LoopConfig(), MatchConfig()), [], START, START
     for k, (truth, _) in enumerate(drive(steps, rng, START)):
@@ -89,14 +95,16 @@ def loops_in_a_room(drift, steps=1300):
         ahead = float(np.hypot(step[0], step[1]))
         drifting, last = se2.compose(drifting, step + ahead * drift), truth
         scan = scan_in(ROOM, truth, rng, k)
-        loops.follow(scan, np.ascontiguousarray(scan.points_base()), drifting, np.zeros(3), news=False)
+        loops.follow(
+            scan, np.ascontiguousarray(scan.points_base()), drifting, np.zeros(3), news=False
+        )
         loops.work_off()
         truths.append(truth)
     return loops, np.array([truths[frame.scan.stamp_ns] for frame in loops.keyframes])
 
 
 def test_loops_in_a_room_straighten_a_path_that_drifts():
-    """Poses that drift by 1 cm and 0.3 degrees a metre: the matches with earlier visits pull them together."""
+    """Poses drift by 1 cm and 0.3 degrees a metre: matches with earlier visits correct them."""
     loops, truths = loops_in_a_room(np.array([0.01, 0.003, 0.005]))
     before = np.array([k.T_map_base for k in loops.keyframes])
     after = loops.relaxed()
@@ -106,7 +114,7 @@ def test_loops_in_a_room_straighten_a_path_that_drifts():
 
 
 def test_where_the_map_agrees_it_stays_as_it_is():
-    """Where old and new agree earlier scans stand for new ones; where they do not, all are kept and matched."""
+    """Where old and new agree earlier scans stand for new ones; else all are kept and matched."""
     (once, _), (again, _) = (loops_in_a_room(np.zeros(3), steps) for steps in (1300, 5200))
     assert len(again.keyframes) < 1.3 * len(once.keyframes)
     assert len(again.matched) < 4 * len(again.keyframes)
@@ -150,7 +158,9 @@ def test_a_single_wrong_match_does_not_bend_a_way_that_was_come_blindly(round_tr
     middle = len(loops.keyframes) // 2
     loops._leaps[middle] = np.array([2.0, 2.0, 0.05])
     T = se2.between(loops.keyframes[2].T_map_base, loops.keyframes[-2].T_map_base)
-    loops.matched.append(Measured(2, len(loops.keyframes) - 2, T + [3.0, 0.0, 0.0], 100.0 * STEP, True))
+    loops.matched.append(
+        Measured(2, len(loops.keyframes) - 2, T + [3.0, 0.0, 0.0], 100.0 * STEP, True)
+    )
     assert np.hypot(*(localizer.corrected_path() - before)[:, :2].T).max() < 0.05
 
 
@@ -160,7 +170,7 @@ def test_before_any_scan_there_is_no_path():
 
 
 def test_a_loop_is_closed_while_the_robot_drives():
-    """Wheels that wear as they go: round the block the map has drifted; coming back, all of it is put right."""
+    """Wheels wear as they go: round the block the map has drifted; back there, all is put right."""
     # The first scan is made after the first step.
     localizer = Localizer(LocalizerConfig(start_x_m=3.15, start_y_m=1.2))
     rows, closed = [], []
@@ -180,13 +190,17 @@ def test_a_loop_is_closed_while_the_robot_drives():
 
 HALL = np.zeros((242, 402), dtype=np.int8)  # 40 x 24 m, with a few pilasters
 HALL[[0, -1]] = HALL[:, [0, -1]] = 100
-HALL[:6, 60:66] = HALL[:6, 200:204] = HALL[-8:, 100:104] = HALL[100:104, -9:] = HALL[150:153, :8] = 100
+HALL[:6, 60:66] = HALL[:6, 200:204] = HALL[-8:, 100:104] = 100
+HALL[100:104, -9:] = HALL[150:153, :8] = 100
 HALL[60:64, -12:] = 100
 
 
 def along(*corners):
     """Points (K, 2) every 5 cm along straight lines from corner to corner, m."""
-    legs = [np.linspace(a, b, int(np.hypot(*np.subtract(b, a)) / 0.05) + 1) for a, b in pairwise(corners)]
+    legs = [
+        np.linspace(a, b, int(np.hypot(*np.subtract(b, a)) / 0.05) + 1)
+        for a, b in pairwise(corners)
+    ]
     return np.concatenate(legs)
 
 
@@ -208,6 +222,8 @@ def test_a_hall_that_is_wider_than_the_laser_sees_is_mapped_all_the_same(seed):
         off.append(np.hypot(*se2.between(look.T_world_base, estimate.T_map_base)[:2]))
         turned.append(abs(se2.between(look.T_world_base, estimate.T_map_base)[2]) if sees else 0.0)
     assert blind > 200
-    assert max(turned[len(turned) // 3 :]) < 0.03, 'beyond the hall its walls tell how the robot is turned'
+    assert max(turned[len(turned) // 3 :]) < 0.03, (
+        'beyond the hall its walls tell how the robot is turned'
+    )
     assert lost < 30, 'walls that are new are a map to hold on to'
     assert np.mean(off[-20:]) < 0.5 * max(off), 'what was known before puts it right'

@@ -1,4 +1,7 @@
-"""Motion and observation: known answers, and every Jacobian against numeric differences of functions written anew."""
+"""Motion and observation: known answers and Jacobians.
+
+Every Jacobian is held against numeric differences of functions written anew.
+"""
 
 import cmath
 import math
@@ -42,7 +45,7 @@ def moved(pose, increment):
 
 
 def seen(pose, line):
-    """The foot of the perpendicular from the robot on the line, in the robot's frame, in polar form."""
+    """Foot of the perpendicular from the robot on the line, in the robot's frame, in polar form."""
     on_line = line[0] * cmath.exp(1j * line[1])
     normal = cmath.exp(1j * line[1])
     robot = complex(pose[0], pose[1])
@@ -75,7 +78,9 @@ def test_placing_a_line_undoes_the_observation(pose, line):
     expected, _, _ = observe_line(pose, line)
     placed, _, _ = place_line(pose, expected)
     normal = placed[0] * np.array([math.cos(placed[1]), math.sin(placed[1])])
-    np.testing.assert_allclose(normal, line[0] * np.array([math.cos(line[1]), math.sin(line[1])]), atol=1e-7)
+    np.testing.assert_allclose(
+        normal, line[0] * np.array([math.cos(line[1]), math.sin(line[1])]), atol=1e-7
+    )
     assert placed[0] >= 0.0
 
 
@@ -84,8 +89,12 @@ def test_placement_jacobians(pose, z):
     placed, by_pose, by_seen = place_line(pose, z)
     if placed[0] < 0.01:
         return
-    np.testing.assert_allclose(by_pose, numeric(lambda x: place_line(x, z)[0], pose, [1]), atol=1e-4)
-    np.testing.assert_allclose(by_seen, numeric(lambda x: place_line(pose, x)[0], z, [1]), atol=1e-4)
+    np.testing.assert_allclose(
+        by_pose, numeric(lambda x: place_line(x, z)[0], pose, [1]), atol=1e-4
+    )
+    np.testing.assert_allclose(
+        by_seen, numeric(lambda x: place_line(pose, x)[0], z, [1]), atol=1e-4
+    )
 
 
 def test_a_line_passed_by_is_seen_from_its_other_side():
@@ -120,8 +129,11 @@ def test_turning_noise_matches_an_arc_driven_many_times(rng):
     config = MotionConfig(odom_slip_m=1e-5, odom_slip_rad=1e-5)
     d, phi = 0.5, 0.6
     noise = [config.odom_distance_sigma * math.sqrt(d)]
-    noise.append(math.hypot(config.odom_turn_sigma * math.sqrt(phi), config.odom_drift_sigma * math.sqrt(d)))
-    chords, turns = np.array([d, phi])[:, None] + np.array(noise)[:, None] * rng.normal(size=(2, 20000)) * 0.2
+    noise.append(
+        math.hypot(config.odom_turn_sigma * math.sqrt(phi), config.odom_drift_sigma * math.sqrt(d))
+    )
+    off = np.array(noise)[:, None] * rng.normal(size=(2, 20000)) * 0.2
+    chords, turns = np.array([d, phi])[:, None] + off
     samples = np.stack([chords * np.cos(turns / 2.0), chords * np.sin(turns / 2.0), turns])
     mean = np.array([d * math.cos(phi / 2.0), d * math.sin(phi / 2.0), phi])
     expected = odometry_covariance(mean, config)

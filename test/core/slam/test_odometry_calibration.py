@@ -6,9 +6,11 @@ import pytest
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
 
-# A metre is told as 1.04 m and 0.03 rad too much of turn, a radian is told as 1.05, the laser sits 1.5 deg askew.
+# A metre is told as 1.04 m and 0.03 rad too much of turn, a radian is told as 1.05, the laser sits
+# 1.5 deg askew.
 SCALE, DRIFT, TURN_SCALE, ASKEW = 1.04, 0.03, 1.05, 0.026
-NOISE, KNOWN = np.full(2, 2.5e-7), np.diag([1e6, 1e6, 1e6])  # of a step's wheels; what the map says of where it ends
+NOISE = np.full(2, 2.5e-7)  # of a step's wheels
+KNOWN = np.diag([1e6, 1e6, 1e6])  # what the map says of where it ends
 
 
 def driven(steps, seed=0, backwards=False):

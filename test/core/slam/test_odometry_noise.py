@@ -1,4 +1,4 @@
-"""The share of the allowed noise that odometry has is learned from matches, and never from what they cannot tell."""
+"""The share of the allowed noise is learned from matches, and never from what they cannot tell."""
 
 import numpy as np
 import pytest
@@ -52,7 +52,9 @@ def test_what_the_map_leaves_open_tells_nothing():
 
 def test_it_begins_with_all_that_is_allowed_and_stands_still_where_nothing_is():
     assert OdometryNoise(CONFIG).share.tolist() == [1.0, 1.0]
-    exact = OdometryNoise(MotionConfig(odom_distance_sigma=0.0, odom_turn_sigma=0.0, odom_drift_sigma=0.0))
+    exact = OdometryNoise(
+        MotionConfig(odom_distance_sigma=0.0, odom_turn_sigma=0.0, odom_drift_sigma=0.0)
+    )
     exact.move(np.array([0.1, 0.0, 0.1]))
     exact.learn(np.zeros(3), SURE, 0.0)
     assert exact.share.tolist() == [1.0, 1.0]
@@ -60,7 +62,8 @@ def test_it_begins_with_all_that_is_allowed_and_stands_still_where_nothing_is():
 
 def test_the_covariance_of_an_increment_takes_the_share():
     increment = np.array([0.2, 0.0, 0.0])
-    whole, part = odometry_covariance(increment, CONFIG), odometry_covariance(increment, CONFIG, np.array([0.5, 0.1]))
+    whole = odometry_covariance(increment, CONFIG)
+    part = odometry_covariance(increment, CONFIG, np.array([0.5, 0.1]))
     slip = np.diag(np.square([CONFIG.odom_slip_m, CONFIG.odom_slip_m, CONFIG.odom_slip_rad]))
     assert (part - slip)[0, 0] == pytest.approx(0.5 * (whole - slip)[0, 0])
     assert (part - slip)[1:, 1:] == pytest.approx(0.1 * (whole - slip)[1:, 1:])

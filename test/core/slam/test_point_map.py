@@ -23,12 +23,13 @@ CELL_M, SEEN_FROM = 0.05, np.array([1.6, 0.1])
 
 
 def scenes():
-    """Points: a corner, a wall with a jamb, a round column, scattered clutter, beams far apart; with noise."""
+    """Noisy points: a corner, a wall with a jamb, a round column, clutter, beams far apart."""
     rng = np.random.default_rng(3)
     along = np.arange(0.2, 1.5, 0.02)
     wall = np.column_stack([along, np.full_like(along, 1.5)])
     corner = np.vstack([wall, np.column_stack([np.full_like(along, 0.2), along])])
-    jamb = np.vstack([np.column_stack([along, np.full_like(along, 1.2)]), [[1.5, 1.2 + 0.02 * k] for k in range(6)]])
+    nearer = np.column_stack([along, np.full_like(along, 1.2)])
+    jamb = np.vstack([nearer, [[1.5, 1.2 + 0.02 * k] for k in range(6)]])
     angles = np.linspace(math.pi, 1.5 * math.pi, 40)
     column = np.column_stack([1.5 + 0.3 * np.cos(angles), 1.5 + 0.3 * np.sin(angles)])
     clutter = rng.uniform(0.5, 1.1, (60, 2))
@@ -38,7 +39,7 @@ def scenes():
 
 
 def line(near, weights, normal=None):
-    """Centre, normal, variance across and weighted variance along of points in a band through the origin."""
+    """Centre, normal, variance across and weighted along of points in a band through the origin."""
     if normal is not None:
         inside = np.abs(near @ normal) <= 0.025
         near, weights = near[inside], weights[inside]
@@ -54,7 +55,9 @@ def plain_surface(near, weights, firm):
     centre, normal, across, along, cells = line(near, weights)
     width = across
     if across > 0.01**2:
-        turns = [np.array([math.cos(math.pi * k / 16), math.sin(math.pi * k / 16)]) for k in range(16)]
+        turns = [
+            np.array([math.cos(math.pi * k / 16), math.sin(math.pi * k / 16)]) for k in range(16)
+        ]
         normal = max(turns, key=lambda n: weights[np.abs(near @ n) <= 0.025].sum())
         for _ in range(2):
             centre, normal, across, along, cells = line(near, weights, normal)
@@ -79,7 +82,9 @@ def filled(points):
     return points_map
 
 
-@pytest.mark.parametrize(('name', 'points'), scenes(), ids=lambda value: value if isinstance(value, str) else '')
+@pytest.mark.parametrize(
+    ('name', 'points'), scenes(), ids=lambda value: value if isinstance(value, str) else ''
+)
 def test_surfaces_are_what_the_plain_words_say(name, points):
     points_map = filled(points)
     numbers = points_map.tiles.pool[0]
@@ -93,7 +98,8 @@ def test_surfaces_are_what_the_plain_words_say(name, points):
         expected = plain_surface((means - means[k])[near], weights[near], dense[away <= 4].sum())
         assert cell[LOOSE] == pytest.approx(expected[2]), (name, means[k])
         np.testing.assert_allclose(cell[[CENTRE_X, CENTRE_Y]] - means[k], expected[0], atol=1e-4)
-        turn = math.atan2(cell[NORMAL_Y], cell[NORMAL_X]) - math.atan2(expected[1][1], expected[1][0])
+        normal = expected[1]
+        turn = math.atan2(cell[NORMAL_Y], cell[NORMAL_X]) - math.atan2(normal[1], normal[0])
         if cell[LOOSE] == 0.0:
             assert abs(float(wrap(2.0 * turn))) < 1e-3
             assert (SEEN_FROM - means[k]) @ cell[[NORMAL_X, NORMAL_Y]] >= 0.0

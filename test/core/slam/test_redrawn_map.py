@@ -1,4 +1,7 @@
-"""The map of points drawn anew: where the robot is there is a map, however much else is still to be drawn."""
+"""The map of points drawn anew.
+
+Where the robot is there is a map, however much else is still to be drawn.
+"""
 
 import numpy as np
 
@@ -8,7 +11,9 @@ from thinmap_ros.core.slam.redrawn_map import RedrawnMap
 from thinmap_ros.core.slam.scan_matching import MatchConfig
 
 SCAN = Scan(0, np.ones(3), 0.0, 0.1, 0.1, 8.0, np.zeros(3))
-POST = np.stack([0.3 * np.cos(np.linspace(0.0, 6.0, 60)), 0.3 * np.sin(np.linspace(0.0, 6.0, 60))], axis=1)
+POST = np.stack(
+    [0.3 * np.cos(np.linspace(0.0, 6.0, 60)), 0.3 * np.sin(np.linspace(0.0, 6.0, 60))], axis=1
+)
 
 
 def seen_at(x, y):
@@ -16,8 +21,13 @@ def seen_at(x, y):
 
 
 def test_the_map_is_drawn_where_the_robot_drives():
-    """1,600 keyframes on 80 x 80 m; it drives from the middle to the border while every step draws one of them."""
-    keyframes = [seen_at(x, y) for x in np.arange(-40.0, 40.0, 2.0) for y in np.arange(-40.0, 40.0, 2.0)]
+    """1,600 keyframes on 80 x 80 m.
+
+    It drives from the middle to the border while every step draws one of them.
+    """
+    keyframes = [
+        seen_at(x, y) for x in np.arange(-40.0, 40.0, 2.0) for y in np.arange(-40.0, 40.0, 2.0)
+    ]
     redrawn = RedrawnMap(MatchConfig())
     redrawn.begin_anew(keyframes, keyframes[820].T_map_base)
     for step in range(150):
@@ -29,7 +39,9 @@ def test_the_map_is_drawn_where_the_robot_drives():
 
 
 def test_in_the_end_all_is_drawn():
-    keyframes = [seen_at(x, y) for x in np.arange(0.0, 20.0, 2.0) for y in np.arange(0.0, 20.0, 2.0)]
+    keyframes = [
+        seen_at(x, y) for x in np.arange(0.0, 20.0, 2.0) for y in np.arange(0.0, 20.0, 2.0)
+    ]
     redrawn = RedrawnMap(MatchConfig())
     redrawn.begin_anew(keyframes, np.zeros(3))
     for _ in range(len(keyframes)):

@@ -1,4 +1,4 @@
-"""Scans against the map of points: back to the true pose, honest where the walls leave a direction open."""
+"""Scans against the point map: back to the true pose, honest where walls leave a direction open."""
 
 import math
 from dataclasses import replace
@@ -8,7 +8,15 @@ import pytest
 from slam_room import ROOM, scan_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.slam.point_map import CENTRE_X, CENTRE_Y, COUNT, LOOSE, NORMAL_X, NORMAL_Y, PointMap
+from thinmap_ros.core.slam.point_map import (
+    CENTRE_X,
+    CENTRE_Y,
+    COUNT,
+    LOOSE,
+    NORMAL_X,
+    NORMAL_Y,
+    PointMap,
+)
 from thinmap_ros.core.slam.scan_matching import Match, MatchConfig, ScanMatcher, likelier
 
 TRUTH = np.array([2.0, 2.0, 0.3])
@@ -55,7 +63,9 @@ def test_a_prior_far_off_is_searched_for(rng):
 def test_along_a_corridor_the_odometry_decides(rng):
     matcher = matcher_of(CORRIDOR, [np.array([x, 0.0, 0.0]) for x in np.linspace(-1, 1, 12)], rng)
     prior = np.array([0.1, 0.06, 0.02])
-    match = matcher.match(scan_in(CORRIDOR, np.zeros(3), rng).points_base(), np.zeros(2), prior, DOUBT)
+    match = matcher.match(
+        scan_in(CORRIDOR, np.zeros(3), rng).points_base(), np.zeros(2), prior, DOUBT
+    )
     assert match.good
     assert abs(match.T_map_base[0] - 0.1) < 0.03
     assert abs(match.T_map_base[1]) < 0.01
@@ -79,14 +89,18 @@ def test_without_points_or_map_the_prior_is_given_back(rng):
 
 
 def test_a_thin_wall_is_matched_by_the_face_that_is_seen(rng):
-    """From the far side of a wall 10 cm thick the near face must not draw the scan through the wall."""
-    faces = np.array([[2.0, -3.0, 2.0, 3.0], [2.1, -3.0, 2.1, 3.0], [0.0, -3.0, 5.0, -3.0], [0.0, 3.0, 5.0, 3.0]])
+    """From the far side of a wall 10 cm thick the near face must not draw the scan through it."""
+    faces = np.array(
+        [[2.0, -3.0, 2.0, 3.0], [2.1, -3.0, 2.1, 3.0], [0.0, -3.0, 5.0, -3.0], [0.0, 3.0, 5.0, 3.0]]
+    )
     west, east = np.zeros(3), np.array([4.0, 0.0, math.pi])
     matcher = matcher_of(faces[[0, 2, 3]], around(west, 15, rng), rng)
     scan = scan_in(faces[[1, 2, 3]], east, rng)
     for _ in range(15):
         matcher.add(se2.transform_points(east, scan.points_base()), east[:2])
-    match = matcher.match(scan_in(faces[[1, 2, 3]], east, rng).points_base(), np.zeros(2), east, DOUBT)
+    match = matcher.match(
+        scan_in(faces[[1, 2, 3]], east, rng).points_base(), np.zeros(2), east, DOUBT
+    )
     assert abs(match.T_map_base[0] - 4.0) < 0.01
 
 
@@ -94,11 +108,17 @@ def test_a_thin_wall_is_matched_by_the_face_that_is_seen(rng):
 def test_surfaces_of_the_point_map_have_the_wall_s_normal(rng, angle):
     normal = np.array([math.cos(angle), math.sin(angle)])
     along = np.array([-normal[1], normal[0]])
-    points = 3.0 * normal + np.linspace(-1.0, 1.0, 400)[:, None] * along + rng.normal(0.0, 0.01, (400, 1)) * normal
+    points = (
+        3.0 * normal
+        + np.linspace(-1.0, 1.0, 400)[:, None] * along
+        + rng.normal(0.0, 0.01, (400, 1)) * normal
+    )
     point_map = PointMap(0.05, 30.0)
     point_map.add(points, np.zeros(2))
     cells = point_map.cells
-    cells = cells[(cells[:, COUNT] > 0.0) & (np.abs(cells[:, CENTRE_X : CENTRE_X + 2] @ along) < 0.7)]
+    cells = cells[
+        (cells[:, COUNT] > 0.0) & (np.abs(cells[:, CENTRE_X : CENTRE_X + 2] @ along) < 0.7)
+    ]
     assert len(cells) > 20
     assert (cells[:, LOOSE] == 0.0).all()
     # Turned towards where it was seen from.
@@ -124,7 +144,9 @@ def test_beside_a_door_a_wall_is_a_wall_to_its_end():
     cells = points.cells[points.tiles.pool[0, 20, 24:40]]
     for cell in cells:
         assert cell[LOOSE] == 0.0
-        np.testing.assert_allclose([cell[NORMAL_X], cell[NORMAL_Y], cell[CENTRE_Y]], [0.0, -1.0, 1.0], atol=0.03)
+        np.testing.assert_allclose(
+            [cell[NORMAL_X], cell[NORMAL_Y], cell[CENTRE_Y]], [0.0, -1.0, 1.0], atol=0.03
+        )
 
 
 def test_a_match_far_from_its_prior_has_to_be_worth_it():
@@ -142,9 +164,10 @@ def test_a_match_far_from_its_prior_has_to_be_worth_it():
 
 
 def test_a_few_points_of_a_new_wall_do_not_pull_the_robot_to_a_known_one(rng):
-    """As through a door: of a wall a foot before the known one twenty points are seen, which would fit that well."""
+    """As through a door: 20 points of a wall a foot before the known one, which they would fit."""
     matcher = matcher_of(CORRIDOR, [np.array([x, 0.0, 0.0]) for x in np.linspace(-1, 1, 12)], rng)
-    points = np.column_stack([np.linspace(-0.4, 0.4, 20), np.full(20, 0.7)]) + rng.normal(0.0, 0.005, (20, 2))
+    points = np.column_stack([np.linspace(-0.4, 0.4, 20), np.full(20, 0.7)])
+    points = points + rng.normal(0.0, 0.005, (20, 2))
     prior, wheels = np.zeros(3), np.diag(np.square([0.01, 0.01, 0.05]))
     match = matcher.match(points, np.zeros(2), prior, wheels)
     assert not match.good or np.hypot(*match.T_map_base[:2]) < 0.05

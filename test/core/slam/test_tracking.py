@@ -1,4 +1,4 @@
-"""Whether a robot notices that it was carried off, and does not where it only turns or drives on."""
+"""Whether a robot notices that it was carried off, and not where it only turns or drives on."""
 
 import numpy as np
 import pytest
@@ -17,8 +17,10 @@ def test_what_was_just_seen_is_seen_again_unless_the_robot_was_carried_off(clock
     how = {'T_base_laser': np.array(mount), 'clockwise': clockwise}
     increment = np.array([0.08, 0.01, 0.12])
     before = scan_in(ROOM, START, rng, **how).points_base()
-    assert share_seen_again(before, increment, scan_in(ROOM, se2.compose(START, increment), rng, **how)) > 0.9
-    assert share_seen_again(before, increment, scan_in(ROOM, np.array([5.5, 8.0, 2.0]), rng, **how)) < 0.4
+    moved = scan_in(ROOM, se2.compose(START, increment), rng, **how)
+    assert share_seen_again(before, increment, moved) > 0.9
+    elsewhere = scan_in(ROOM, np.array([5.5, 8.0, 2.0]), rng, **how)
+    assert share_seen_again(before, increment, elsewhere) < 0.4
     assert share_seen_again(before[:5], increment, scan_in(ROOM, START, rng, **how)) == 1.0
 
 
@@ -27,7 +29,8 @@ def test_a_robot_that_is_carried_off_is_lost_at_once_and_learns_nothing(rng):
     for i, (truth, odom) in enumerate(drive(400, rng, START)):
         assert not localizer.step(scan_in(ROOM, truth, rng, i), odom).lost
     lost = 0
-    for k, place in enumerate(([8.5, 8.5, -2.0], [8.5, 1.0, 2.5], [1.0, 8.0, 0.5], [5.5, 8.0, -1.0])):
+    places = ([8.5, 8.5, -2.0], [8.5, 1.0, 2.5], [1.0, 8.0, 0.5], [5.5, 8.0, -1.0])
+    for k, place in enumerate(places):
         localizer.set_pose(truth, 1e-4 * np.eye(3))
         assert not localizer.step(scan_in(ROOM, truth, rng, 10_000 + 10 * k), odom).lost
         points = localizer.state()['points']

@@ -9,7 +9,9 @@ from thinmap_ros.core.slam.lines import LineConfig, extract_lines, no_lines
 from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
 from thinmap_ros.core.slam.wall_compass import WallCompass
 
-PLACES = np.array([[2.0, 2.0, 0.0], [5.5, 4.0, 1.0], [4.1, 7.0, 2.0], [8.5, 8.0, -2.0], [1.0, 8.0, -0.5]])
+PLACES = np.array(
+    [[2.0, 2.0, 0.0], [5.5, 4.0, 1.0], [4.1, 7.0, 2.0], [8.5, 8.0, -2.0], [1.0, 8.0, -0.5]]
+)
 TURNED = 0.3
 
 
@@ -52,7 +54,9 @@ def test_nothing_is_believed_before_enough_was_seen(rng):
 
 
 def test_where_most_walls_are_not_square_there_is_no_direction(rng):
-    corners = np.array([[5.0 + 4.5 * np.cos(a), 5.0 + 4.5 * np.sin(a)] for a in np.linspace(0, 2 * np.pi, 8)])
+    corners = np.array(
+        [[5.0 + 4.5 * np.cos(a), 5.0 + 4.5 * np.sin(a)] for a in np.linspace(0, 2 * np.pi, 8)]
+    )
     assert learned(rng, np.hstack([corners[:-1], corners[1:]])).direction is None
 
 
@@ -69,14 +73,22 @@ def test_what_was_seen_where_the_map_began_counts_most(rng):
 def test_a_wing_that_stands_askew_is_mapped_as_it_stands(askew_deg, rng):
     """A corridor, and round its corner another one, at a right angle or not."""
     wing = se2.pose(21.2, 1.2, np.pi / 2.0 + np.radians(askew_deg))
-    walls = np.vstack([corridor(20.0), se2.transform_points(wing, corridor(14.0).reshape(-1, 2)).reshape(-1, 4)])
-    corner = [[20.0, -1.2, 22.9, -1.2], [22.9, -1.2, *se2.transform_points(wing, np.array([[0.0, -1.2]]))[0]]]
+    walls = np.vstack(
+        [corridor(20.0), se2.transform_points(wing, corridor(14.0).reshape(-1, 2)).reshape(-1, 4)]
+    )
+    corner = [
+        [20.0, -1.2, 22.9, -1.2],
+        [22.9, -1.2, *se2.transform_points(wing, np.array([[0.0, -1.2]]))[0]],
+    ]
     walls = np.vstack([walls, corner])
     odom, localizer = np.zeros(3), Localizer(LocalizerConfig())
-    truth, goals = np.zeros(3), [[20.8, 0.0], *se2.transform_points(wing, np.array([[0.5, 0.0], [12.0, 0.0]]))]
+    truth = np.zeros(3)
+    goals = [[20.8, 0.0], *se2.transform_points(wing, np.array([[0.5, 0.0], [12.0, 0.0]]))]
     for goal in goals:
         while np.hypot(*(goal - truth[:2])) > 0.15:
-            turn = float(np.clip(se2.wrap(np.arctan2(*(goal - truth[:2])[::-1]) - truth[2]), -0.12, 0.12))
+            turn = float(
+                np.clip(se2.wrap(np.arctan2(*(goal - truth[:2])[::-1]) - truth[2]), -0.12, 0.12)
+            )
             step = np.array([0.1 if abs(turn) < 0.1 else 0.0, 0.0, turn])
             truth = se2.compose(truth, step)
             odom = se2.compose(odom, step + [0.0, 0.0, rng.normal(0.0, 0.003)])

@@ -21,7 +21,8 @@ def test_points_lie_on_the_faces_that_are_turned_to_free_cells():
     cells[:, 8] = -1
     points = [faces.points for faces in wall_points(GridPatch(GridFrame(-1.0, 2.0, 0.1), cells))]
     right, left, up, down = points
-    # The room's walls are at x = -0.7 (left of it) and y = 2.2 and 2.7; on its right nothing is known.
+    # The room's walls are at x = -0.7 (left of it) and y = 2.2 and 2.7; on its right nothing is
+    # known.
     assert len(left) == 0
     np.testing.assert_allclose(right[:, 0], -0.7 - 0.02, atol=1e-9)
     np.testing.assert_allclose(up[:, 1], 2.2 - 0.02, atol=1e-9)

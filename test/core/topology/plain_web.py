@@ -62,7 +62,12 @@ def simplify(web, spots, promising, limits):
 def merge_close(web, spots, limit):
     for length, number in sorted((path_length(web.chains[n].cells), n) for n in among(web, spots)):
         chain = web.chains.get(number)
-        if chain is None or length > limit or chain.a == chain.b or min(map(web.degree, chain.ends)) < 3:
+        if (
+            chain is None
+            or length > limit
+            or chain.a == chain.b
+            or min(map(web.degree, chain.ends)) < 3
+        ):
             continue
         web_spots = web.spots[chain.a], web.spots[chain.b]
         merge(web, number, chain.a if web_spots[0].squared >= web_spots[1].squared else chain.b)
@@ -79,7 +84,11 @@ def drop_hollow(web, spots, radius):
     for number in sorted(among(web, spots), key=lambda n: (path_length(web.chains[n].cells), n)):
         chain = web.chains[number]
         beside = kept.setdefault(frozenset(chain.ends), [])
-        ways = [from_spot(other, chain.b).cells for other in beside] if chain.a != chain.b else [chain.cells[:1]]
+        ways = (
+            [from_spot(other, chain.b).cells for other in beside]
+            if chain.a != chain.b
+            else [chain.cells[:1]]
+        )
         if any(area(np.concatenate((chain.cells, way[1:]))) < least for way in ways):
             web.drop_chain(number)
         else:
@@ -95,7 +104,9 @@ def drop_spurs(web, spots, promising, limits):
             continue
         tip = min(tips, key=lambda spot: web.spots[spot].squared)
         base = chain.other(tip)
-        tip_room, base_room = (math.sqrt(web.spots[spot].squared) - limits.radius for spot in (tip, base))
+        tip_room, base_room = (
+            math.sqrt(web.spots[spot].squared) - limits.radius for spot in (tip, base)
+        )
         adds = path_length(chain.cells) + tip_room - base_room
         seen = adds <= limits.spur_ratio * base_room and not promising(web.spots[tip])
         if adds <= limits.spur or seen:
@@ -128,7 +139,9 @@ def move_rings(web, spots):
             continue
         middle = (chain.cells.min(axis=0) + chain.cells.max(axis=0)) / 2.0
         distance = np.hypot(*(chain.cells[:-1] - middle).T)
-        start = min(np.flatnonzero(distance >= distance.max() - 2.0), key=lambda k: tuple(chain.cells[k]))
+        start = min(
+            np.flatnonzero(distance >= distance.max() - 2.0), key=lambda k: tuple(chain.cells[k])
+        )
         last = len(chain.cells) - 1
         web.drop_chain(number)
         web.move_spot(chain.a, Spot(tuple(chain.cells[start].tolist()), int(chain.squared[start])))

@@ -33,7 +33,10 @@ def test_nearest(triangle):
     assert triangle.nearest_node(2.2, 0.3).id == 2
     number, index, distance = triangle.nearest_edge_point(1.5, 1.2)
     assert (number, index) == (5, 1) and distance == pytest.approx(0.2)
-    assert TopologicalMap().nearest_node(0, 0) is None and TopologicalMap().nearest_edge_point(0, 0) is None
+    assert (
+        TopologicalMap().nearest_node(0, 0) is None
+        and TopologicalMap().nearest_edge_point(0, 0) is None
+    )
 
 
 def test_paths_from_either_end(triangle):
@@ -63,9 +66,15 @@ def test_ids_are_positive_and_unique(triangle):
 def test_the_nearest_node_is_the_nearest_of_all_however_far():
     rng = np.random.default_rng(0)
     places = np.vstack([rng.uniform(-30.0, 30.0, (200, 2)), [[500.0, 0.0]]])
-    topology = TopologicalMap(Node(k + 1, NodeKind.END, x, y, 0.5) for k, (x, y) in enumerate(places.tolist()))
-    for x, y in np.vstack([rng.uniform(-80.0, 80.0, (100, 2)), [[300.0, 10.0], [-2000.0, 0.0]]]).tolist():
-        assert topology.nearest_node(x, y).id == 1 + int(((places - (x, y)) ** 2).sum(axis=1).argmin())
+    topology = TopologicalMap(
+        Node(k + 1, NodeKind.END, x, y, 0.5) for k, (x, y) in enumerate(places.tolist())
+    )
+    for x, y in np.vstack(
+        [rng.uniform(-80.0, 80.0, (100, 2)), [[300.0, 10.0], [-2000.0, 0.0]]]
+    ).tolist():
+        assert topology.nearest_node(x, y).id == 1 + int(
+            ((places - (x, y)) ** 2).sum(axis=1).argmin()
+        )
         assert {n.id for n in topology.nodes_near(x, y, 9.0)} >= {
             k + 1 for k in np.flatnonzero(np.hypot(*(places - (x, y)).T) <= 9.0).tolist()
         }

@@ -42,7 +42,9 @@ def test_the_graph_goes_where_the_grid_has_gone_and_its_nodes_keep_their_ids(fro
     assert len(builder.map.nodes) == len(before)
     if from_the_start:
         for i, place in before.items():
-            np.testing.assert_allclose(builder.map.nodes[i].position, np.add(place, [1.0, 0.0]), atol=0.15)
+            np.testing.assert_allclose(
+                builder.map.nodes[i].position, np.add(place, [1.0, 0.0]), atol=0.15
+            )
 
 
 def test_between_the_news_and_the_grid_nothing_is_taken_nor_what_is_out_of_date():

@@ -22,7 +22,7 @@ def loops(graph):
 
 
 def assert_sound(patch, graph, free):
-    """Edges run over free cells from node to node, and the straight lines between their nodes do so too."""
+    """Edges run over free cells from node to node, and so do straight lines between their nodes."""
     assert not set(graph.nodes) & set(graph.edges) and min([*graph.nodes, 1]) >= 1
     for node in graph.nodes.values():
         assert free[tuple(patch.frame.cells_of(node.position)[0])]
@@ -36,8 +36,11 @@ def assert_sound(patch, graph, free):
         assert edge.length_m >= np.linalg.norm(edge.path[-1] - edge.path[0]) - 1e-9
         assert edge.clearance_m >= CONFIG.robot_radius_m - 1e-9
         if len(cells) > 2:
-            assert line_is_clear(free, *cells[0], *cells[-1]) and line_is_clear(free, *cells[-1], *cells[0])
-        assert edge.a != edge.b, 'a loop is broken by corners, or its straight line would lead nowhere'
+            assert line_is_clear(free, *cells[0], *cells[-1])
+            assert line_is_clear(free, *cells[-1], *cells[0])
+        assert edge.a != edge.b, (
+            'a loop is broken by corners, or its straight line would lead nowhere'
+        )
 
 
 def shape(*lines, scale=10, seed=None):
@@ -70,13 +73,25 @@ KNOWN = {
         1,
     ),
     'ring with spur': (
-        ['###########', '#......####', '#.####.####', '#.####....#', '#.####.####', '#......####', '###########'],
+        [
+            '###########',
+            '#......####',
+            '#.####.####',
+            '#.####....#',
+            '#.####.####',
+            '#......####',
+            '###########',
+        ],
         {C: [(1, 1), (6, 1), (1, 5), (6, 5)], B: [(6, 3)], E: [(9, 3)]},
         1,
     ),
     'comb': (
         ['###########', '#.#.#.#.#.#', '#.#.#.#.#.#', '#.#.#.#.#.#', '#.........#', '###########'],
-        {E: [(1, 1), (3, 1), (5, 1), (7, 1), (9, 1)], B: [(3, 4), (5, 4), (7, 4)], C: [(1, 4), (9, 4)]},
+        {
+            E: [(1, 1), (3, 1), (5, 1), (7, 1), (9, 1)],
+            B: [(3, 4), (5, 4), (7, 4)],
+            C: [(1, 4), (9, 4)],
+        },
         0,
     ),
     'spiral': (
@@ -101,11 +116,16 @@ KNOWN = {
 def test_known_answers(name):
     lines, wanted, ring_count = KNOWN[name]
     graph = shape(*lines)
-    assert sorted(node.kind for node in graph.nodes.values()) == sorted(k for k, at in wanted.items() for _ in at)
+    kinds = sorted(k for k, at in wanted.items() for _ in at)
+    assert sorted(node.kind for node in graph.nodes.values()) == kinds
     for kind, places in wanted.items():
         for col, row in places:
             x, y = place(col, row, len(lines))
-            near = [n for n in graph.nodes.values() if n.kind == kind and np.hypot(n.x - x, n.y - y) <= 0.6]
+            near = [
+                n
+                for n in graph.nodes.values()
+                if n.kind == kind and np.hypot(n.x - x, n.y - y) <= 0.6
+            ]
             assert len(near) == 1, f'{kind.name} at {(x, y)}'
     assert loops(graph) == ring_count and len(graph.components()) == 1
 
@@ -114,11 +134,18 @@ def test_open_hall_is_one_place():
     graph = shape(*['#' * 14, *['#............#'] * 12, '#' * 14])
     (node,) = graph.nodes.values()
     assert node.kind == E and not graph.edges
-    assert np.hypot(node.x - 7.0, node.y - 7.0) <= 0.6 and node.clearance_m == pytest.approx(6.0, abs=0.3)
+    assert np.hypot(node.x - 7.0, node.y - 7.0) <= 0.6
+    assert node.clearance_m == pytest.approx(6.0, abs=0.3)
 
 
 def test_two_rooms_and_a_door():
-    lines = ['#' * 17, *['#.......#.......#'] * 3, '#...............#', *['#.......#.......#'] * 3, '#' * 17]
+    lines = [
+        '#' * 17,
+        *['#.......#.......#'] * 3,
+        '#...............#',
+        *['#.......#.......#'] * 3,
+        '#' * 17,
+    ]
     graph = shape(*lines)
     assert sorted(node.kind for node in graph.nodes.values()) == [E, E]
     xs = sorted(node.x for node in graph.nodes.values())
@@ -186,7 +213,8 @@ def random_building(seed):
         cells[row : row + rng.integers(8, 30), col : col + rng.integers(8, 40)] = 0
     for _ in range(rng.integers(0, 12)):
         row, col = rng.integers(0, 86), rng.integers(0, 116)
-        cells[row : row + rng.integers(1, 4), col : col + rng.integers(1, 4)] = rng.choice([100, -1])
+        value = rng.choice([100, -1])
+        cells[row : row + rng.integers(1, 4), col : col + rng.integers(1, 4)] = value
     cells[:2], cells[-2:], cells[:, :2], cells[:, -2:] = 100, 100, 100, 100
     return patch_of(cells)
 
@@ -214,7 +242,9 @@ def test_as_many_loops_as_holes(seed):
     assert loops(build(patch, None, CONFIG)) == holes
 
 
-@pytest.mark.parametrize('name', ['kth/50052751', 'kth/50052748', 'dungeon/d114', 'dungeon/d1848', 'dungeon/d3641'])
+@pytest.mark.parametrize(
+    'name', ['kth/50052751', 'kth/50052748', 'dungeon/d114', 'dungeon/d1848', 'dungeon/d3641']
+)
 def test_floors_are_drivable_and_complete(shared_data, name):
     patch, start = world(shared_data, name)
     free = select_free_space(patch, start, CONFIG)

@@ -24,7 +24,9 @@ def literal(free: np.ndarray) -> np.ndarray:
                 p8, p9 = cells[row, col - 1], cells[row - 1, col - 1]
                 ring = [p2, p3, p4, p5, p6, p7, p8, p9]
                 rises = sum(a == 0 and b == 1 for a, b in zip(ring, [*ring[1:], p2], strict=True))
-                first, second = (p2 * p4 * p6, p4 * p6 * p8) if step == 1 else (p2 * p4 * p8, p2 * p6 * p8)
+                first, second = (
+                    (p2 * p4 * p6, p4 * p6 * p8) if step == 1 else (p2 * p4 * p8, p2 * p6 * p8)
+                )
                 if 2 <= sum(ring) <= 6 and rises == 1 and first == 0 and second == 0:
                     doomed.append((row, col))
             for row, col in doomed:
@@ -36,7 +38,9 @@ def literal(free: np.ndarray) -> np.ndarray:
 
 def opencv(free: np.ndarray) -> np.ndarray:
     padded = np.pad(free, 1).astype(np.uint8) * 255
-    return cv2.ximgproc.thinning(padded, thinningType=cv2.ximgproc.THINNING_ZHANGSUEN)[1:-1, 1:-1] > 0
+    return (
+        cv2.ximgproc.thinning(padded, thinningType=cv2.ximgproc.THINNING_ZHANGSUEN)[1:-1, 1:-1] > 0
+    )
 
 
 masks = arrays(np.bool_, array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=24))

@@ -22,7 +22,10 @@ def windows(patch, way, size=100):
     frame = patch.frame.shifted(-PAD, -PAD)
     for x, y in way:
         row, col = (frame.cells_of(np.array([[x, y]]))[0] - size // 2).tolist()
-        yield GridPatch(frame.shifted(row, col), cells[row : row + size, col : col + size].copy()), np.array([x, y, 0])
+        yield (
+            GridPatch(frame.shifted(row, col), cells[row : row + size, col : col + size].copy()),
+            np.array([x, y, 0]),
+        )
 
 
 def legs(*corners, step=0.3):
@@ -61,7 +64,9 @@ def assert_like(graph, batch):
 
 def test_a_drive_leads_to_the_map_of_the_whole():
     patch, builder = building(), TopologyBuilder()
-    round_trip = legs((5, 5), (5, 17), (16, 17), (27, 17), (27, 5), (16, 5), (16, 17), (27, 17), (27, 5), (5, 5))
+    round_trip = legs(
+        (5, 5), (5, 17), (16, 17), (27, 17), (27, 5), (16, 5), (16, 17), (27, 17), (27, 5), (5, 5)
+    )
     for window, T in windows(patch, round_trip):
         builder.update(window, T)
     assert_like(builder.map, build(patch, (5.0, 5.0), TopologyConfig()))
@@ -83,7 +88,10 @@ def test_what_only_the_far_ends_of_beams_change_is_drawn_in_too():
     for _ in range(5):
         builder.update(window, T)
     assert not any(4.0 < node.x < 9.0 and 4.0 < node.y < 6.0 for node in builder.map.nodes.values())
-    assert all(abs(node.x - 5.0) <= 5.0 and abs(node.y - 12.0) <= 5.0 for node in builder.local_map().nodes.values())
+    assert all(
+        abs(node.x - 5.0) <= 5.0 and abs(node.y - 12.0) <= 5.0
+        for node in builder.local_map().nodes.values()
+    )
 
 
 def test_ids_stay_while_nothing_changes():
@@ -144,7 +152,9 @@ def test_jumps_and_far_away_windows_do_not_break_the_map():
             builder.update(window, T)
         sizes.append(sum(len(chain.cells) for chain in builder._atlas.chains.values()))
     assert sizes[-1] <= 2 * sizes[1], 'the web does not grow where nothing is new'
-    far = GridPatch(patch.frame.shifted(100_000, -50_000), np.full((100, 100), UNKNOWN, dtype=np.int8))
+    far = GridPatch(
+        patch.frame.shifted(100_000, -50_000), np.full((100, 100), UNKNOWN, dtype=np.int8)
+    )
     builder.update(far, np.array([0.0, 0.0, 0.0]))
 
 
@@ -176,7 +186,14 @@ def test_drives_through_floors_lead_to_the_map_of_the_whole(shared_data, name):
     builder, shown = TopologyBuilder(config), np.full_like(np.pad(patch.cells, PAD), UNKNOWN)
     for window, T in windows(patch, way):
         builder.update(window, T)
-        row, col = patch.frame.cells_of(np.array([[window.frame.origin_x, window.frame.origin_y]]) + 0.05)[0] + PAD
+        row, col = (
+            patch.frame.cells_of(np.array([[window.frame.origin_x, window.frame.origin_y]]) + 0.05)[
+                0
+            ]
+            + PAD
+        )
         shown[row : row + 100, col : col + 100] = window.cells
     # What no window showed, the batch map must not know either.
-    assert_like(builder.map, build(GridPatch(patch.frame.shifted(-PAD, -PAD), shown), start, config))
+    assert_like(
+        builder.map, build(GridPatch(patch.frame.shifted(-PAD, -PAD), shown), start, config)
+    )

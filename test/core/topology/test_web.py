@@ -24,7 +24,9 @@ def chain(web, *cells):
     way = [cells[0]]
     for row, col in cells[1:]:
         while way[-1] != (row, col):
-            way.append((way[-1][0] + np.sign(row - way[-1][0]), way[-1][1] + np.sign(col - way[-1][1])))
+            way.append(
+                (way[-1][0] + np.sign(row - way[-1][0]), way[-1][1] + np.sign(col - way[-1][1]))
+            )
     known = {spot.cell: number for number, spot in web.spots.items()}
     for cell in {cells[0], cells[-1]} - set(known):
         known[cell] = web.add_spot(Spot(cell, ROOMY))
@@ -88,7 +90,8 @@ def scribble(seed, size=60):
 def said(web):
     spots = [(spot.cell, spot.squared) for spot in web.spots.values()]
     return spots, [
-        (web.spots[c.a].cell, web.spots[c.b].cell, c.cells.tolist(), c.squared.tolist()) for c in web.chains.values()
+        (web.spots[c.a].cell, web.spots[c.b].cell, c.cells.tolist(), c.squared.tolist())
+        for c in web.chains.values()
     ]
 
 
@@ -97,9 +100,13 @@ def looking(rim, row, col):
     marked = np.argwhere(rim) + (row, col)
 
     def promising(spot):
-        if not (row <= spot.cell[0] < row + rim.shape[0] and col <= spot.cell[1] < col + rim.shape[1]):
+        if not (
+            row <= spot.cell[0] < row + rim.shape[0] and col <= spot.cell[1] < col + rim.shape[1]
+        ):
             return True
-        return (((marked - spot.cell) ** 2).sum(axis=1) <= (np.sqrt(spot.squared) + 1.0) ** 2).sum() >= 3
+        return (
+            ((marked - spot.cell) ** 2).sum(axis=1) <= (np.sqrt(spot.squared) + 1.0) ** 2
+        ).sum() >= 3
 
     return promising
 
@@ -109,7 +116,9 @@ def looking(rim, row, col):
 def test_compiled_rules_are_the_plain_ones_wherever_they_are_applied(seed, everywhere):
     skeleton, measure = scribble(seed)
     rng = np.random.default_rng(seed + 1)
-    limits = Limits(rng.uniform(0.0, 3.0), rng.uniform(0.0, 8.0), rng.uniform(0.0, 2.0), rng.uniform(0.0, 6.0))
+    limits = Limits(
+        rng.uniform(0.0, 3.0), rng.uniform(0.0, 8.0), rng.uniform(0.0, 2.0), rng.uniform(0.0, 6.0)
+    )
     outlook = Outlook(rng.random((30, 40)) < 0.1, *rng.integers(0, 20, 2).tolist())
     one, two = (web_of_net(net_along(skeleton, measure)) for _ in range(2))
     chosen = {spot for spot in one.spots if everywhere or rng.random() < 0.3}

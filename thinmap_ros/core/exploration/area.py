@@ -21,7 +21,10 @@ def inside(points: Array, polygon: Array) -> NDArray[np.bool_]:
 
 
 def fenced(patch: GridPatch, polygon: Array) -> GridPatch:
-    """The map as it is to somebody who must not leave a polygon (M, 2), m: all cells outside are walls."""
+    """The map as it is to somebody who must not leave a polygon (M, 2), m.
+
+    All cells outside are walls.
+    """
     centres = patch.frame.centres_of(np.argwhere(np.ones(patch.shape, dtype=np.bool_)))
     within = inside(centres, polygon).reshape(patch.shape)
     return GridPatch(patch.frame, np.where(within, patch.cells, _WALL).astype(np.int8))

@@ -21,7 +21,8 @@ class FinishCode(IntEnum):
 class EndNode(NamedTuple):
     """An end node as it stands: place x, y in m (map frame), probability and what it comes from.
 
-    goal: pose (3,) from which to look at it; open_border_m: length of the border to the unknown that belongs to it.
+    goal: pose (3,) from which to look at it; open_border_m: length of the border to the unknown
+    that belongs to it.
     """
 
     node_id: int
@@ -41,8 +42,9 @@ class EndNode(NamedTuple):
 class Decision:
     """What to do now: drive to target.goal, or nothing more.
 
-    reason: words for the end, or for what is going on; unreachable: ids put aside because they could not be reached;
-    coverage_estimate: known free area over that and the area expected behind open borders, 0 to 1.
+    reason: words for the end, or for what is going on; unreachable: ids put aside because they
+    could not be reached; coverage_estimate: known free area over that and the area expected behind
+    open borders, 0 to 1.
     """
 
     target: EndNode | None
@@ -61,4 +63,7 @@ def verdict(finished: bool, unreachable: list[int], left: int) -> tuple[FinishCo
         return FinishCode.NONE, f'{left} end nodes left'
     if not unreachable:
         return FinishCode.ALL_RESOLVED, 'all end nodes resolved'
-    return FinishCode.NOTHING_REACHABLE, f'{len(unreachable)} end nodes left, none of them reachable'
+    return (
+        FinishCode.NOTHING_REACHABLE,
+        f'{len(unreachable)} end nodes left, none of them reachable',
+    )

@@ -2,17 +2,21 @@
 
 What the paper leaves open, and how it is settled here:
 
-- *Independent evidence.* A look at a node counts only if, since the last look that counted, the robot has moved
-  `look_move_m` or the bearing to the node has turned by `look_turn_deg`. A robot that stands still learns nothing new.
-- *Which looks.* The node lies in the laser's field of view and range, and all cells between are free.
-- *Moved nodes.* A node that is farther than `moved_m` from where its evidence began loses all of it: the looks were
-  about another place.
-- *Which node continues which.* The topological map's ids decide. An end node with a new id takes over the evidence of
-  one that vanished at the same scan within `moved_m`; so a merged node keeps that of the nearest one.
-- *Rim of the range, and of the known.* A skeleton also ends where only knowledge ends. In mode `open_border`, a node
-  with unknown space at its neighbourhood's border (see `open_borders`) is not made more reliable by any look (R is at
-  most 0.5), and one without any cannot move any more: that counts as one look of reliability `closed_reliability`.
-  In mode `paper` the looks are all there is.
+- *Independent evidence.* A look at a node counts only if, since the last look that counted, the
+  robot has moved `look_move_m` or the bearing to the node has turned by `look_turn_deg`. A robot
+  that stands still learns nothing new.
+- *Which looks.* The node lies in the laser's field of view and range, and all cells between are
+  free.
+- *Moved nodes.* A node that is farther than `moved_m` from where its evidence began loses all of
+  it: the looks were about another place.
+- *Which node continues which.* The topological map's ids decide. An end node with a new id takes
+  over the evidence of one that vanished at the same scan within `moved_m`; so a merged node keeps
+  that of the nearest one.
+- *Rim of the range, and of the known.* A skeleton also ends where only knowledge ends. In mode
+  `open_border`, a node with unknown space at its neighbourhood's border (see `open_borders`) is not
+  made more reliable by any look (R is at most 0.5), and one without any cannot move any more: that
+  counts as one look of reliability `closed_reliability`. In mode `paper` the looks are all there
+  is.
 """
 
 import itertools
@@ -50,8 +54,11 @@ FIELDS = {
     'ids': Field(np.int64, ('n',), 1, LARGEST_ID),
     # x, y, x and y where the evidence began, probability, x and y of where it was seen from, closed
     'tracks': Field(
-        np.float64, ('n', 8), (-FAR_M, -FAR_M, -FAR_M, -FAR_M, 0.0, -FAR_M, -FAR_M, 0.0),
-        (FAR_M, FAR_M, FAR_M, FAR_M, 1.0, FAR_M, FAR_M, 1.0), nan=True,
+        np.float64,
+        ('n', 8),
+        (-FAR_M, -FAR_M, -FAR_M, -FAR_M, 0.0, -FAR_M, -FAR_M, 0.0),
+        (FAR_M, FAR_M, FAR_M, FAR_M, 1.0, FAR_M, FAR_M, 1.0),
+        nan=True,
     ),
     'look_counts': Field(np.int64, ('n',), 0, LARGEST_COUNT),
     # distance and bearing of each look, node after node
@@ -63,10 +70,18 @@ FIELDS = {
 class TrackerConfig(Config):
     """Which looks count, and what becomes of a node's evidence."""
 
-    mode: str = parameter('open_border', 'what a node is judged by', choices=('open_border', 'paper'))
-    look_move_m: float = parameter(0.5, 'a look counts after the robot has moved this far, m', low=0.0, high=10.0)
-    look_turn_deg: float = parameter(15.0, 'or the bearing to the node has turned this far, deg', low=0.0, high=180.0)
-    moved_m: float = parameter(0.4, 'a node that moved farther loses its evidence, m', low=0.0, high=10.0)
+    mode: str = parameter(
+        'open_border', 'what a node is judged by', choices=('open_border', 'paper')
+    )
+    look_move_m: float = parameter(
+        0.5, 'a look counts after the robot has moved this far, m', low=0.0, high=10.0
+    )
+    look_turn_deg: float = parameter(
+        15.0, 'or the bearing to the node has turned this far, deg', low=0.0, high=180.0
+    )
+    moved_m: float = parameter(
+        0.4, 'a node that moved farther loses its evidence, m', low=0.0, high=10.0
+    )
     closed_reliability: float = parameter(
         0.95, 'reliability of a node without unknown space around', low=0.5, high=0.999
     )
@@ -74,8 +89,9 @@ class TrackerConfig(Config):
 
 @dataclass
 class Track:
-    """An end node and its evidence: place (x, y) m, where the evidence began, and the looks that counted.
+    """An end node and its evidence.
 
+    Place (x, y) m, where the evidence began, and the looks that counted.
     angle_span_deg: largest difference between the bearings of these looks.
     """
 
@@ -107,7 +123,8 @@ class Track:
 
     def forget(self) -> None:
         """Begin anew at the present place."""
-        self.began_at, self.probability, self.last_seen_from, self.closed = (self.x, self.y), PRIOR, None, False
+        self.began_at, self.probability = (self.x, self.y), PRIOR
+        self.last_seen_from, self.closed = None, False
         self.distances_m, self.bearings_rad, self.angle_span_deg = [], [], 0.0
 
 
@@ -119,8 +136,9 @@ class EndNodeTracker:
         self.tracks: dict[int, Track] = {}
 
     def follow(self, places: dict[int, tuple[float, float]]) -> dict[int, int]:
-        """Take in where the end nodes (id -> x, y in m) are now: tracks move, appear and vanish with them.
+        """Take in where the end nodes (id -> x, y in m) are now.
 
+        Tracks move, appear and vanish with them.
         Returns the new id of each node that lives on under another one.
         """
         lost = {i: track for i, track in self.tracks.items() if i not in places}
@@ -139,19 +157,26 @@ class EndNodeTracker:
         return renamed
 
     def look(
-        self, scan: Scan, T_map_base: Array, free: NDArray[np.bool_], frame: GridFrame, open_ids: set[int]
+        self,
+        scan: Scan,
+        T_map_base: Array,
+        free: NDArray[np.bool_],
+        frame: GridFrame,
+        open_ids: set[int],
     ) -> None:
         """Update the probability of each node that this scan sees.
 
-        free (H, W) bool: cells in `frame` through which one can see; open_ids: nodes with unknown space around
-        (used in mode open_border only).
+        free (H, W) bool: cells in `frame` through which one can see; open_ids: nodes with unknown
+        space around (used in mode open_border only).
         """
         if not self.tracks:
             return
         T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
         places = np.array([(track.x, track.y) for track in self.tracks.values()])
         at, (low, high) = frame.as_array(), field_of_view(scan)
-        seen = _in_sight(free, at, T_map_laser, places, scan.range_max_m, 0.5 * (low + high), 0.5 * (high - low))
+        seen = _in_sight(
+            free, at, T_map_laser, places, scan.range_max_m, 0.5 * (low + high), 0.5 * (high - low)
+        )
         for track in itertools.compress(self.tracks.values(), seen):
             if self._is_news(track, T_map_laser):
                 self._count(track, T_map_laser, track.node_id in open_ids)
@@ -163,7 +188,10 @@ class EndNodeTracker:
         """All that is known of the end nodes as arrays by name; `from_state` goes on from it."""
         tracks = list(self.tracks.values())
         unseen = (math.nan, math.nan)
-        rows = [(t.x, t.y, *t.began_at, t.probability, *(t.last_seen_from or unseen), t.closed) for t in tracks]
+        rows = [
+            (t.x, t.y, *t.began_at, t.probability, *(t.last_seen_from or unseen), t.closed)
+            for t in tracks
+        ]
         looks = [look for t in tracks for look in zip(t.distances_m, t.bearings_rad, strict=True)]
         return {
             'ids': np.array([t.node_id for t in tracks], dtype=np.int64),
@@ -181,19 +209,30 @@ class EndNodeTracker:
         _check_references(state)
         tracker = EndNodeTracker(config)
         ends = np.cumsum(state['look_counts'])
-        for node_id, row, end, count in zip(state['ids'], state['tracks'], ends, state['look_counts'], strict=True):
+        for node_id, row, end, count in zip(
+            state['ids'], state['tracks'], ends, state['look_counts'], strict=True
+        ):
             x, y, began_x, began_y, probability, seen_x, seen_y, closed = row.tolist()
             looks = state['looks'][end - count : end]
             tracker.tracks[int(node_id)] = Track(
-                int(node_id), x, y, (began_x, began_y), probability, looks[:, 0].tolist(), looks[:, 1].tolist(),
-                angle_difference(looks[:, 1]) if count else 0.0, None if math.isnan(seen_x) else (seen_x, seen_y),
+                int(node_id),
+                x,
+                y,
+                (began_x, began_y),
+                probability,
+                looks[:, 0].tolist(),
+                looks[:, 1].tolist(),
+                angle_difference(looks[:, 1]) if count else 0.0,
+                None if math.isnan(seen_x) else (seen_x, seen_y),
                 bool(closed),
             )
         return tracker
 
     def _heir(self, lost: dict[int, Track], x: float, y: float) -> Track | None:
         """The nearest vanished track within moved_m; each is inherited once."""
-        near = min(lost.values(), key=lambda track: math.dist((x, y), (track.x, track.y)), default=None)
+        near = min(
+            lost.values(), key=lambda track: math.dist((x, y), (track.x, track.y)), default=None
+        )
         if near is None or math.dist((x, y), (near.x, near.y)) > self.config.moved_m:
             return None
         return lost.pop(near.node_id)
@@ -222,8 +261,10 @@ class EndNodeTracker:
         if is_open and track.closed:
             track.forget()
         elif not is_open and not track.closed:
-            # What far looks said against the node is settled by the map: nothing is left that could move it.
-            track.probability = bayes_update(max(track.probability, PRIOR), self.config.closed_reliability)
+            # What far looks said against the node is settled by the map: nothing is left that could
+            # move it.
+            before = max(track.probability, PRIOR)
+            track.probability = bayes_update(before, self.config.closed_reliability)
         track.closed = not is_open
 
 
@@ -246,15 +287,24 @@ def _check_references(state: Mapping[str, NDArray[Any]]) -> None:
 
 @kernel
 def _in_sight(
-    free: NDArray[np.bool_], frame: Array, laser: Array, places: Array, reach_m: float, middle: float, half: float
+    free: NDArray[np.bool_],
+    frame: Array,
+    laser: Array,
+    places: Array,
+    reach_m: float,
+    middle: float,
+    half: float,
 ) -> NDArray[np.bool_]:
-    """Which places (N, 2), m, a laser at a pose (3,) sees: in its range and field of view, with free cells all the way.
+    """Which places (N, 2), m, a laser at a pose (3,) sees.
 
-    frame (3,): origin and resolution, m, of the free cells (H, W); middle, half: the field of view, rad.
+    They lie in its range and field of view, with free cells all the way.
+    frame (3,): origin and resolution, m, of the free cells (H, W); middle, half: the field of view,
+    rad.
     """
     seen = np.zeros(places.shape[0], dtype=np.bool_)
     x, y, resolution = frame[0], frame[1], frame[2]
-    row, col = int(math.floor((laser[1] - y) / resolution)), int(math.floor((laser[0] - x) / resolution))
+    row = int(math.floor((laser[1] - y) / resolution))
+    col = int(math.floor((laser[0] - x) / resolution))
     for i in range(places.shape[0]):
         dx, dy = places[i, 0] - laser[0], places[i, 1] - laser[1]
         if dx * dx + dy * dy >= reach_m * reach_m:

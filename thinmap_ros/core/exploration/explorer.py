@@ -2,9 +2,11 @@
 
 Only end nodes whose position probability is below a threshold are worth a visit. Which of them:
 
-- first the one that the robot faces (section 3.2); afterwards the one with which a good tour through all of them
-  begins; in mode `paper`, as there, the one with the least path cost on the graph;
-- the target is kept until it is resolved, unless another one is better by a clear margin, so that nothing oscillates;
+- first the one that the robot faces (section 3.2); afterwards the one with which a good tour
+  through all of them begins; in mode `paper`, as there, the one with the least path cost on the
+  graph;
+- the target is kept until it is resolved, unless another one is better by a clear margin, so that
+  nothing oscillates;
 - it is dropped as soon as its probability passes the threshold on the way;
 - one that cannot be reached is put aside, and tried again after a while and before the end.
 
@@ -23,7 +25,13 @@ from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import parameter
 from thinmap_ros.core.exploration.decision import Decision, verdict
 from thinmap_ros.core.exploration.failures import Failures
-from thinmap_ros.core.exploration.survey import Candidate, Place, SurveyConfig, Surveyor, end_node_of
+from thinmap_ros.core.exploration.survey import (
+    Candidate,
+    Place,
+    SurveyConfig,
+    Surveyor,
+    end_node_of,
+)
 from thinmap_ros.core.exploration.tour import tours_by_first
 from thinmap_ros.core.exploration.views import box_of_scan, directions_of_view
 from thinmap_ros.core.grid.patch import GridPatch
@@ -51,23 +59,48 @@ FIELDS = {'first_choice_made': Field(np.bool_)}
 class ExplorerConfig(SurveyConfig):
     """What is worth a visit, and how steady a choice is."""
 
-    threshold: float = parameter(0.9, 'an end node as probable as this needs no visit', low=0.5, high=0.999)
-    small_border_m: float = parameter(1.5, 'behind a shorter border not much is expected, m', low=0.0, high=50.0)
-    wait_weight: float = parameter(0.5, 'cost of a metre until a target is reached, m', low=0.0, high=10.0)
-    small_wait_weight: float = parameter(2.0, 'the same, for one with a small border', low=0.0, high=10.0)
-    wait_m: float = parameter(15.0, 'a target farther off than this along the tour waits no more, m', low=0.0, high=1e3)
-    close_look_m: float = parameter(2.0, 'unknown in plain sight this near stays unknown, m', low=0.0, high=50.0)
-    turn_cost_m_rad: float = parameter(0.2, 'path length that a turn by one radian costs, m', low=0.0, high=10.0)
+    threshold: float = parameter(
+        0.9, 'an end node as probable as this needs no visit', low=0.5, high=0.999
+    )
+    small_border_m: float = parameter(
+        1.5, 'behind a shorter border not much is expected, m', low=0.0, high=50.0
+    )
+    wait_weight: float = parameter(
+        0.5, 'cost of a metre until a target is reached, m', low=0.0, high=10.0
+    )
+    small_wait_weight: float = parameter(
+        2.0, 'the same, for one with a small border', low=0.0, high=10.0
+    )
+    wait_m: float = parameter(
+        15.0, 'a target farther off than this along the tour waits no more, m', low=0.0, high=1e3
+    )
+    close_look_m: float = parameter(
+        2.0, 'unknown in plain sight this near stays unknown, m', low=0.0, high=50.0
+    )
+    turn_cost_m_rad: float = parameter(
+        0.2, 'path length that a turn by one radian costs, m', low=0.0, high=10.0
+    )
     switch_share: float = parameter(0.1, 'and this share of it', low=0.0, high=1.0)
-    switch_m: float = parameter(2.0, 'another target must save this much of the way, m', low=0.0, high=100.0)
-    retry_s: float = parameter(60.0, 'a target that failed is tried again after this time, s', low=0.0, high=1e5)
-    survey_s: float = parameter(1.0, 'borders are assigned anew after this time, s', low=0.0, high=60.0)
-    behind_m: float = parameter(2.0, 'depth of unknown space expected behind a border, m', low=0.0, high=50.0)
+    switch_m: float = parameter(
+        2.0, 'another target must save this much of the way, m', low=0.0, high=100.0
+    )
+    retry_s: float = parameter(
+        60.0, 'a target that failed is tried again after this time, s', low=0.0, high=1e5
+    )
+    survey_s: float = parameter(
+        1.0, 'borders are assigned anew after this time, s', low=0.0, high=60.0
+    )
+    behind_m: float = parameter(
+        2.0, 'depth of unknown space expected behind a border, m', low=0.0, high=50.0
+    )
 
 
 @dataclass(frozen=True)
 class _Survey:
-    """Candidates, when they were found, and on what: the state of the borders and the places of the end nodes."""
+    """Candidates, when they were found, and on what.
+
+    On what: the state of the borders and the places of the end nodes.
+    """
 
     candidates: list[Candidate]
     stamp_ns: int
@@ -77,7 +110,7 @@ class _Survey:
 
 @dataclass
 class _Memory:
-    """The target, where its border is and from where it is looked at, and how long things have been as they are."""
+    """The target, its border's place, where it is looked at from, and how long all has been so."""
 
     target: int | None = None
     target_at: Place = (math.inf, math.inf)
@@ -100,15 +133,20 @@ class Explorer:
         self._last = _Survey([], 0, -1, {})
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """What the exploration has learned, as arrays by name: probabilities, and which borders show nothing more.
+        """What the exploration has learned, as arrays by name.
 
+        These are probabilities, and which borders show nothing more.
         What could not be reached is left out: it is worth another try.
         """
-        return self.surveyor.state() | {'first_choice_made': np.array(self._memory.first_choice_made)}
+        return self.surveyor.state() | {
+            'first_choice_made': np.array(self._memory.first_choice_made)
+        }
 
     @staticmethod
-    def from_state(state: Mapping[str, NDArray[Any]], config: ExplorerConfig | None = None) -> 'Explorer':
-        """Explorer that goes on from the `state` of another one, with the map and the graph that belong to it.
+    def from_state(
+        state: Mapping[str, NDArray[Any]], config: ExplorerConfig | None = None
+    ) -> 'Explorer':
+        """Explorer that goes on from another's `state`, with the map and graph that belong to it.
 
         Raises InputError where it is no such state.
         """
@@ -119,7 +157,9 @@ class Explorer:
         explorer._memory.first_choice_made = bool(checked['first_choice_made'])
         return explorer
 
-    def step(self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array) -> Decision:
+    def step(
+        self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
+    ) -> Decision:
         """Take in the graph, the map and a scan made at a pose (3,); say where to go.
 
         patch: the whole map, on one lattice from step to step. Deterministic; call it once a scan.
@@ -135,7 +175,9 @@ class Explorer:
         open_ids = {c.track.node_id for c in candidates}
         for tracker in (surveyor.tracker, surveyor.stand_ins):
             tracker.look(scan, T_map_base, borders.free, borders.frame, open_ids)
-        worth = {c.track.node_id: c for c in candidates if c.track.probability < self.config.threshold}
+        worth = {
+            c.track.node_id: c for c in candidates if c.track.probability < self.config.threshold
+        }
         self._give_up_what_was_examined(worth, T_map_base)
         target = self._choose(topology, worth, T_map_base)
         return self._decision(target, worth, candidates)
@@ -148,16 +190,25 @@ class Explorer:
             self._failures.add((track.x, track.y), self._stamp_ns)
             self._memory.target = None
 
-    def _candidates(self, topology: TopologicalMap, T_map_base: Array, range_m: float) -> list[Candidate]:
-        """A survey of all borders now and then, and when the target is gone; in between what is left of the last."""
-        surveyor, borders, memory, last = self.surveyor, self.surveyor.borders, self._memory, self._last
+    def _candidates(
+        self, topology: TopologicalMap, T_map_base: Array, range_m: float
+    ) -> list[Candidate]:
+        """A survey of all borders now and then, and when the target is gone.
+
+        In between, what is left of the last.
+        """
+        surveyor, borders = self.surveyor, self.surveyor.borders
+        memory, last = self._memory, self._last
         end = NodeKind.END
         ends = {n.id: (n.x, n.y) for n in topology.nodes.values() if n.kind == end}
         renamed = surveyor.follow(ends)
         memory.target = renamed.get(memory.target or 0, memory.target)
         same = last.revision == borders.revision and last.ends == ends
-        if surveyor.frame == borders.frame and (same or self._stamp_ns - last.stamp_ns < self.config.survey_s * 1e9):
-            left = last.candidates if same else [c for c in map(surveyor.still_open, last.candidates) if c is not None]
+        recent = same or self._stamp_ns - last.stamp_ns < self.config.survey_s * 1e9
+        if surveyor.frame == borders.frame and recent:
+            left = last.candidates
+            if not same:
+                left = [c for c in map(surveyor.still_open, left) if c is not None]
             if any(c.track.node_id == memory.target for c in left):
                 return left
         candidates = surveyor.survey(T_map_base, range_m)
@@ -165,7 +216,7 @@ class Explorer:
         return candidates
 
     def _give_up_what_was_examined(self, worth: dict[int, Candidate], T_map_base: Array) -> None:
-        """A target that stays open although the robot stands there and looks has nothing more to show from there."""
+        """A target that stays open although the robot is there and looks shows nothing more."""
         memory = self._memory
         candidate = worth.get(memory.target) if memory.target is not None else None
         if candidate is None or not _is_at(T_map_base, memory.goal):
@@ -180,7 +231,9 @@ class Explorer:
 
     # Which of them is the target.
 
-    def _choose(self, topology: TopologicalMap, worth: dict[int, Candidate], T_map_base: Array) -> int | None:
+    def _choose(
+        self, topology: TopologicalMap, worth: dict[int, Candidate], T_map_base: Array
+    ) -> int | None:
         memory = self._memory
         ids = self._failures.to_try({i: c.place for i, c in worth.items()}, self._stamp_ns)
         open_to_try = {i: c for i, c in worth.items() if i in ids}
@@ -193,7 +246,8 @@ class Explorer:
             memory.target = None
             return None
         if memory.target in open_to_try and self._last.stamp_ns != self._stamp_ns:
-            return self._go_for(open_to_try[memory.target], T_map_base)  # costs are weighed anew once a survey
+            # Costs are weighed anew once a survey.
+            return self._go_for(open_to_try[memory.target], T_map_base)
         if not memory.first_choice_made:
             memory.first_choice_made = True
             faced = min(open_to_try, key=lambda i: _turn_to(T_map_base, open_to_try[i].goal))
@@ -204,18 +258,24 @@ class Explorer:
             if memory.target is not None and memory.target not in costs:
                 costs = self._costs(topology, open_to_try, T_map_base)  # it is none of the nearest
         best = min(costs, key=lambda i: costs[i])
-        if memory.target is None or costs[best] < costs[memory.target] - self._margin(costs[memory.target]):
-            memory.target = best
-        return self._go_for(open_to_try[memory.target], T_map_base)
+        kept = memory.target
+        if kept is None or costs[best] < costs[kept] - self._margin(costs[kept]):
+            memory.target = kept = best
+        return self._go_for(open_to_try[kept], T_map_base)
 
     def _margin(self, cost: float) -> float:
-        """What another target must save, m: plans change with every scan, and whoever turns back gains nothing."""
+        """What another target must save, m.
+
+        Plans change with every scan, and whoever turns back gains nothing.
+        """
         return max(self.config.switch_m, self.config.switch_share * cost)
 
     def _go_for(self, chosen: Candidate, T_map_base: Array) -> int:
-        """Make a candidate the target; until the robot is there its goal stays, if it is still about the same border.
+        """Make a candidate the target.
 
-        Borders change hands between nodes from one survey to the next, and the place to look at them from with that.
+        Until the robot is there its goal stays, if it is still about the same border.
+        Borders change hands between nodes from one survey to the next, and the place to look at
+        them from with that.
         """
         memory = self._memory
         at = self.surveyor.border_of(chosen)
@@ -230,15 +290,25 @@ class Explorer:
         return chosen.track.node_id
 
     def _successor(self, worth: dict[int, Candidate]) -> int | None:
-        """Where the target vanished: whose border is now nearest to the one that the target stood for."""
+        """Where the target vanished, whose border is now nearest to the one that it stood for."""
         at = self._memory.target_at
-        away = {i: math.dist(at, self.surveyor.border_of(candidate)) for i, candidate in worth.items()}
+        away = {
+            i: math.dist(at, self.surveyor.border_of(candidate)) for i, candidate in worth.items()
+        }
         near = min(away, key=lambda i: away[i])
         return near if away[near] <= _SUCCESSOR_M else None
 
-    def _costs(self, topology: TopologicalMap, worth: dict[int, Candidate], T_map_base: Array) -> dict[int, float]:
-        """What is compared of the candidates, m: see the modes above; a turn on the spot counts as well."""
-        turn_cost = {i: self.config.turn_cost_m_rad * _first_turn(T_map_base, c.goal) for i, c in worth.items()}
+    def _costs(
+        self, topology: TopologicalMap, worth: dict[int, Candidate], T_map_base: Array
+    ) -> dict[int, float]:
+        """What is compared of the candidates, m: see the modes above.
+
+        A turn on the spot counts as well.
+        """
+        turn_cost = {
+            i: self.config.turn_cost_m_rad * _first_turn(T_map_base, c.goal)
+            for i, c in worth.items()
+        }
         if self.config.mode == 'open_border':
             return self._tours(worth, turn_cost, T_map_base)
         ways = costs_to(topology, T_map_base, {i: c.goal for i, c in worth.items()})
@@ -248,10 +318,13 @@ class Explorer:
     def _tours(
         self, worth: dict[int, Candidate], turn_cost: dict[int, float], T_map_base: Array
     ) -> dict[int, float]:
-        """Cost of the tour through what is left, m, by what comes first; of much, through the target and what is near.
+        """Cost of the tour through what is left, m, by what comes first.
 
-        From one to the next the way may lead through the unknown, if nothing is known to stand there: whoever goes into
-        it here may well come out there, and what would then be left behind is better done now.
+        Of much, through the target and what is near only.
+
+        From one to the next the way may lead through the unknown, if nothing is known to stand
+        there: whoever goes into it here may well come out there, and what would then be left behind
+        is better done now.
         """
         surveyor = self.surveyor
         goals = np.array([candidate.goal[:2] for candidate in worth.values()])
@@ -259,27 +332,37 @@ class Explorer:
         ways = np.array([surveyor.way_m(candidate.goal) for candidate in worth.values()])
         ways = np.maximum(np.where(np.isfinite(ways), ways, _DETOUR * away), away)
         # A stable sort, so that of equally near ones the older stays.
-        near = dict(sorted(zip(worth, ways, strict=True), key=lambda pair: (pair[0] != self._memory.target, pair[1])))
+        pairs = zip(worth, ways, strict=True)
+        near = dict(sorted(pairs, key=lambda pair: (pair[0] != self._memory.target, pair[1])))
         ids = list(near)[:_MOST_PLACES]
         points = np.array([worth[i].goal[:2] for i in ids])
         straight = np.hypot(*(points[:, None] - points[None]).transpose(2, 0, 1))
-        table = self._ways.update(surveyor.reached, surveyor.maybe, surveyor.frame, points, self._stamp_ns)
+        table = self._ways.update(
+            surveyor.reached, surveyor.maybe, surveyor.frame, points, self._stamp_ns
+        )
         between = np.maximum(np.where(np.isfinite(table), table, _DETOUR * straight), straight)
         first = np.array([near[i] + turn_cost[i] for i in ids])
         lengths = np.array([len(worth[i].cells) * surveyor.frame.resolution for i in ids])
         small = lengths < self.config.small_border_m
         weights = np.where(small, self.config.small_wait_weight, self.config.wait_weight)
-        return dict(zip(ids, tours_by_first(first, between, weights, self.config.wait_m).tolist(), strict=True))
+        costs = tours_by_first(first, between, weights, self.config.wait_m)
+        return dict(zip(ids, costs.tolist(), strict=True))
 
     # What is told.
 
-    def _decision(self, target: int | None, worth: dict[int, Candidate], candidates: list[Candidate]) -> Decision:
+    def _decision(
+        self, target: int | None, worth: dict[int, Candidate], candidates: list[Candidate]
+    ) -> Decision:
         surveyor, resolution = self.surveyor, self.surveyor.borders.frame.resolution
         by_id = {c.track.node_id: c for c in candidates}
         goals = {} if target is None else {target: self._memory.goal}
         tracks = [*surveyor.tracker.tracks.values(), *surveyor.stand_ins.tracks.values()]
-        end_nodes = [end_node_of(t, by_id.get(t.node_id), goals.get(t.node_id), resolution) for t in tracks]
-        unreachable = sorted(i for i, candidate in worth.items() if self._failures.has(candidate.place))
+        end_nodes = [
+            end_node_of(t, by_id.get(t.node_id), goals.get(t.node_id), resolution) for t in tracks
+        ]
+        unreachable = sorted(
+            i for i, candidate in worth.items() if self._failures.has(candidate.place)
+        )
         finished = self._memory.nothing_left >= _LOOKS
         code, reason = verdict(finished, unreachable, len(worth))
         known = surveyor.borders.known_cells * resolution**2
@@ -291,12 +374,14 @@ class Explorer:
 
 def _turn_to(T_map_base: Array, goal: Array) -> float:
     """Size of the turn towards a goal's place, rad."""
-    return abs(se2.wrap(math.atan2(goal[1] - T_map_base[1], goal[0] - T_map_base[0]) - float(T_map_base[2])))
+    bearing = math.atan2(goal[1] - T_map_base[1], goal[0] - T_map_base[0])
+    return abs(se2.wrap(bearing - float(T_map_base[2])))
 
 
 def _first_turn(T_map_base: Array, goal: Array) -> float:
-    """Size of the turn with which the way to a goal begins, rad: none where the robot is there already."""
-    return _turn_to(T_map_base, goal) if math.dist(goal[:2], T_map_base[:2]) > _NEAR_VISIT_M else 0.0
+    """Size of the turn with which the way to a goal begins, rad; 0 where the robot is there."""
+    away_m = math.dist(goal[:2], T_map_base[:2])
+    return _turn_to(T_map_base, goal) if away_m > _NEAR_VISIT_M else 0.0
 
 
 def _is_at(T_map_base: Array, goal: Array) -> bool:
@@ -306,4 +391,5 @@ def _is_at(T_map_base: Array, goal: Array) -> bool:
 
 def _about_same(a: Array, b: Array) -> bool:
     """Whether two goals are near enough to each other not to send the robot anew."""
-    return math.dist(a[:2], b[:2]) <= _NEAR_VISIT_M and abs(se2.wrap(float(a[2] - b[2]))) <= _STEADY_RAD
+    near = math.dist(a[:2], b[:2]) <= _NEAR_VISIT_M
+    return near and abs(se2.wrap(float(a[2] - b[2]))) <= _STEADY_RAD

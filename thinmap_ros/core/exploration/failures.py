@@ -1,4 +1,7 @@
-"""Places that could not be reached: put aside, tried again after a while and before the end, forgotten in time."""
+"""Places that could not be reached.
+
+They are put aside, tried again after a while and before the end, forgotten in time.
+"""
 
 import math
 from collections.abc import Mapping
@@ -38,27 +41,32 @@ class Failures:
         return self._at(place) is not None
 
     def may_try_again(self, place: Place) -> bool:
-        """Whether something failed there, but not too often to be tried once more before the end."""
+        """Whether something failed there, but not too often to be tried again before the end."""
         failure = self._at(place)
         return failure is not None and failure.times < _TRIES
 
     def to_try(self, places: Mapping[int, Place], stamp_ns: int) -> set[int]:
-        """Ids of the places where nothing failed, or a while ago; else, before the end, of those that failed least.
+        """Ids of the places where nothing failed, or a while ago.
 
-        The latter after a pause: a door may be free by then. What failed too often is tried no more, unless so much
-        else is left to do that the failure fades from memory.
+        Else, before the end, of those that failed least. The latter after a pause: a door may be
+        free by then. What failed too often is tried no more, unless so much else is left to do that
+        the failure fades from memory.
         """
         first = self._left(places, stamp_ns, self._retry_ns)
         if not first:
             return self._left(places, stamp_ns, _PAUSE_S * 1e9)
-        self._failures = [f for f in self._failures if stamp_ns - f.stamp_ns < _FADE * self._retry_ns]
+        self._failures = [
+            f for f in self._failures if stamp_ns - f.stamp_ns < _FADE * self._retry_ns
+        ]
         return first
 
     def _left(self, places: Mapping[int, Place], stamp_ns: int, pause_ns: float) -> set[int]:
         left = set()
         for node_id, place in places.items():
             failure = self._at(place)
-            if failure is None or (failure.times < _TRIES and stamp_ns - failure.stamp_ns > pause_ns):
+            if failure is None or (
+                failure.times < _TRIES and stamp_ns - failure.stamp_ns > pause_ns
+            ):
                 left.add(node_id)
         return left
 

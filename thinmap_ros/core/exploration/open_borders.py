@@ -1,8 +1,11 @@
-"""Where known free space ends although nothing stands there: what is left to see, kept up to date scan by scan.
+"""Where known free space ends although nothing stands there.
 
-A border cell is a free cell beside (over an edge) one that is unknown. A single missing beam makes one too, so only
-borders of some length count. A border is *exhausted* when it has been looked at closely and stayed: no laser sees more
-of it. Border cells belong to the nearest end node in sight of them; those that no end node sees are left over.
+It is what is left to see, kept up to date scan by scan.
+
+A border cell is a free cell beside (over an edge) one that is unknown. A single missing beam makes
+one too, so only borders of some length count. A border is *exhausted* when it has been looked at
+closely and stayed: no laser sees more of it. Border cells belong to the nearest end node in sight
+of them; those that no end node sees are left over.
 """
 
 import math
@@ -42,10 +45,11 @@ FIELDS = {
 class OpenBorders:
     """The border cells of the whole map; only what a scan can have changed is looked at again.
 
-    free (H, W): known free cells, small gaps closed; passable (H, W): all but occupied ones; mask (H, W): open border
-    cells; all on the cells of `frame`, which holds the map and some room for it to grow. revision: rises whenever they
-    change; known_cells: how many are free; changed: the part in which free and passable may have changed since somebody
-    set it to NOTHING, None where that is everywhere.
+    free (H, W): known free cells, small gaps closed; passable (H, W): all but occupied ones;
+    mask (H, W): open border cells; all on the cells of `frame`, which holds the map and some room
+    for it to grow. revision: rises whenever they change; known_cells: how many are free; changed:
+    the part in which free and passable may have changed since somebody set it to NOTHING, None
+    where that is everywhere.
     """
 
     def __init__(self, shortest_m: float) -> None:
@@ -59,7 +63,10 @@ class OpenBorders:
         self._looks: NDArray[np.uint8] = np.zeros((0, 0), dtype=np.uint8)
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """What a map does not tell, as arrays by name: how often each border cell was looked at closely."""
+        """What a map does not tell, as arrays by name.
+
+        It is how often each border cell was looked at closely.
+        """
         return {'frame': self.frame.as_array(), 'looks': self._looks}
 
     @staticmethod
@@ -80,39 +87,50 @@ class OpenBorders:
     def update(self, patch: GridPatch, box: Array) -> None:
         """Find the borders of a map anew in a box, the first time and now and then everywhere.
 
-        box (2, 2): its lower left and upper right corner, m (see views.box_of_scan). What lies elsewhere changes only
-        where the map was corrected.
+        box (2, 2): its lower left and upper right corner, m (see views.box_of_scan). What lies
+        elsewhere changes only where the map was corrected.
         """
         whole = self._updates % _WHOLE_EVERY == 0
         self._updates += 1
         row, col = self._fit(patch)
         rows, cols = (slice(0, size) for size in patch.shape) if whole else _part(patch, box)
         # A few cells more are read than written, so that the cut is no border.
-        wide = (slice(max(rows.start - _MARGIN, 0), rows.stop + _MARGIN),
-                slice(max(cols.start - _MARGIN, 0), cols.stop + _MARGIN))
+        wide = (
+            slice(max(rows.start - _MARGIN, 0), rows.stop + _MARGIN),
+            slice(max(cols.start - _MARGIN, 0), cols.stop + _MARGIN),
+        )
         part = GridPatch(patch.frame, np.ascontiguousarray(patch.cells[wide]))
-        inner = (rows.start - wide[0].start, rows.stop - wide[0].start,
-                 cols.start - wide[1].start, cols.stop - wide[1].start)
+        inner = (
+            rows.start - wide[0].start,
+            rows.stop - wide[0].start,
+            cols.start - wide[1].start,
+            cols.stop - wide[1].start,
+        )
         offset = (wide[0].start + row, wide[1].start + col)
         if self.changed is not None:
             written = (rows.start + row, cols.start + col, rows.stop + row, cols.stop + col)
             self.changed = written if self.changed == NOTHING else _both(self.changed, written)
         free = known_free(part, _TOPOLOGY)
-        changed, more = _renew(part.cells, free, inner, offset, self.free, self.passable, self.mask, self._looks)
+        changed, more = _renew(
+            part.cells, free, inner, offset, self.free, self.passable, self.mask, self._looks
+        )
         self.revision, self.known_cells = self.revision + changed, self.known_cells + more
 
     def examine(self, xy: tuple[float, float], reach_m: float, faces: NDArray[np.float64]) -> None:
-        """Count a close look from a point, m: border cells whose unknown neighbour lies in plain sight, yet unknown.
+        """Count a close look from a point, m.
 
-        faces (2,): first and last direction of view in the map frame, rad. After some such looks a cell is exhausted.
+        It counts for border cells whose unknown neighbour lies in plain sight, yet unknown.
+        faces (2,): first and last direction of view in the map frame, rad. After some such looks a
+        cell is exhausted.
         """
         row, col = self._cell_of(xy)
         reach = reach_m / self.frame.resolution
         self.revision += _examine(self.mask, self.free, self._looks, row, col, reach, faces)
 
     def exhaust(self, cells: Cells, xy: tuple[float, float]) -> None:
-        """Give up border cells (N, 2) for good: those about as near to a point, m, as the nearest of them.
+        """Give up border cells (N, 2) for good.
 
+        Only those about as near to a point, m, as the nearest of them are given up.
         A long border is seen from one place in part only.
         """
         away_m = np.hypot(*(self.frame.centres_of(cells) - xy).T)
@@ -122,7 +140,7 @@ class OpenBorders:
         self.revision += 1
 
     def stretches(self) -> tuple[Cells, Cells, int]:
-        """Border cells (N, 2) in stretches long enough, the number of their stretch (N,), and how many there are.
+        """Border cells (N, 2) in stretches long enough, their numbers (N,), and how many there are.
 
         Stretches are joined over edges and corners, and numbered in the order of their first cells.
         """
@@ -133,28 +151,42 @@ class OpenBorders:
         return cells[keep], numbers[keep], int(long_enough.sum())
 
     def owners(self, cells: Cells, nodes: Cells, reach_m: float) -> Cells:
-        """For each border cell (N, 2), the index of the nearest node cell (M, 2) in sight within reach_m, or -1."""
+        """Index of the node (M, 2) in sight within reach_m nearest to each cell (N, 2), or -1."""
         return np.asarray(_owners(self.free, cells, nodes, reach_m / self.frame.resolution))
 
-    def place_to_look(self, cells: Cells, allowed: Mask, reach_m: float, xy: tuple[float, float]) -> Array | None:
-        """Centre (2,), m, of the allowed cell (H, W) right at a border (N, 2); see viewpoints.place_at."""
+    def place_to_look(
+        self, cells: Cells, allowed: Mask, reach_m: float, xy: tuple[float, float]
+    ) -> Array | None:
+        """Centre (2,), m, of the allowed cell (H, W) right at a border (N, 2).
+
+        See viewpoints.place_at.
+        """
         return self._centre_of(
-            place_at(self.free, cells, allowed, int(reach_m / self.frame.resolution), self._cell_of(xy))
+            place_at(
+                self.free, cells, allowed, int(reach_m / self.frame.resolution), self._cell_of(xy)
+            )
         )
 
     def place_to_view(
         self, cells: Cells, allowed: Mask, ways: Array, reach_m: float, depth_m: float
     ) -> Array | None:
-        """Centre (2,), m, of the allowed cell (H, W) from which to see behind a border (N, 2): viewpoints.place_for.
+        """Centre (2,), m, of the allowed cell (H, W) from which to see behind a border (N, 2).
 
-        ways (h, w): length of the way to each square of allowed cells; depth_m: how far behind the border is looked.
+        See viewpoints.place_for.
+        ways (h, w): length of the way to each square of allowed cells; depth_m: how far behind the
+        border is looked.
         """
         resolution = self.frame.resolution
         depth, reach = round(depth_m / resolution), reach_m / resolution
-        return self._centre_of(place_for(self.free, self.passable, cells, allowed, ways, depth, reach))
+        return self._centre_of(
+            place_for(self.free, self.passable, cells, allowed, ways, depth, reach)
+        )
 
     def shows_enough(self, cells: Cells, place: Array, reach_m: float, depth_m: float) -> bool:
-        """Whether a place (2,), m, is one from which to see behind a border (N, 2): viewpoints.shows_enough."""
+        """Whether a place (2,), m, is one from which to see behind a border (N, 2).
+
+        See viewpoints.shows_enough.
+        """
         resolution = self.frame.resolution
         depth, reach = round(depth_m / resolution), reach_m / resolution
         cell = self._cell_of((float(place[0]), float(place[1])))
@@ -186,7 +218,8 @@ class OpenBorders:
     def _cell_of(self, xy: tuple[float, float]) -> tuple[int, int]:
         """Cell (row, col) that holds a point, m."""
         frame = self.frame
-        row, col = (xy[1] - frame.origin_y) / frame.resolution, (xy[0] - frame.origin_x) / frame.resolution
+        row = (xy[1] - frame.origin_y) / frame.resolution
+        col = (xy[0] - frame.origin_x) / frame.resolution
         return math.floor(row), math.floor(col)
 
     def _centre_of(self, cell: tuple[int, int] | None) -> Array | None:
@@ -199,7 +232,8 @@ class OpenBorders:
     def _fit(self, patch: GridPatch) -> tuple[int, int]:
         """Make room for a patch where there is none; returns where its first cell lies, (row, col).
 
-        Once there is a map, more room is made than is needed: what looks at these arrays does so anew when they grow.
+        Once there is a map, more room is made than is needed: what looks at these arrays does so
+        anew when they grow.
         """
         if self.mask.size == 0 or not self._has_room_for(patch):
             self._clear(patch.frame)
@@ -212,8 +246,12 @@ class OpenBorders:
         )
         if top or bottom or left or right:
             spare = _SPARE if self.mask.size else 0
-            more = tuple((low and low + spare, high and high + spare) for low, high in ((top, bottom), (left, right)))
-            self.free, self.passable = np.pad(self.free, more), np.pad(self.passable, more, constant_values=True)
+            more = tuple(
+                (low and low + spare, high and high + spare)
+                for low, high in ((top, bottom), (left, right))
+            )
+            self.free = np.pad(self.free, more)
+            self.passable = np.pad(self.passable, more, constant_values=True)
             self.mask, self._looks = np.pad(self.mask, more), np.pad(self._looks, more)
             self.frame, self.changed = self.frame.shifted(-more[0][0], -more[1][0]), None
             row, col = row + more[0][0], col + more[1][0]
@@ -228,7 +266,10 @@ def _part(patch: GridPatch, box: Array) -> tuple[slice, slice]:
     """Rows and columns of a map that lie in a box."""
     frame, (rows, cols) = patch.frame, patch.shape
     (left, top), (right, bottom) = (
-        (math.floor((x - frame.origin_x) / frame.resolution), math.floor((y - frame.origin_y) / frame.resolution))
+        (
+            math.floor((x - frame.origin_x) / frame.resolution),
+            math.floor((y - frame.origin_y) / frame.resolution),
+        )
         for x, y in box.tolist()
     )
     top, left = min(max(top, 0), rows), min(max(left, 0), cols)
@@ -249,9 +290,10 @@ def _renew(
     """Take over a part of a map (H, W) and find its borders.
 
     Returns whether what is free or border has changed, and how many more cells are free.
-    known (H, W): which cells are free; inner: first row, row after the last, and the same of columns, of what is
-    written to free, passable, mask and looks, in which the part begins at row and column `offset`. A border is a free
-    cell with an unknown one above, below, left or right; what lies outside of the part is unknown.
+    known (H, W): which cells are free; inner: first row, row after the last, and the same of
+    columns, of what is written to free, passable, mask and looks, in which the part begins at row
+    and column `offset`. A border is a free cell with an unknown one above, below, left or right;
+    what lies outside of the part is unknown.
     """
     rows, cols = cells.shape
     changed, more = False, 0
@@ -268,13 +310,17 @@ def _renew(
                         border |= cells[y, x] < 0 or FREE_AT_MOST < cells[y, x] < OCCUPIED_AT_LEAST
             changed |= known[row, col] != free[r, c] or border != mask[r, c]
             more += int(known[row, col]) - int(free[r, c])
-            free[r, c], mask[r, c], passable[r, c] = known[row, col], border, cells[row, col] < OCCUPIED_AT_LEAST
+            free[r, c], mask[r, c] = known[row, col], border
+            passable[r, c] = cells[row, col] < OCCUPIED_AT_LEAST
     return changed, more
 
 
 @kernel
 def _parts(shape: tuple[int, int], cells: Cells) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Number of the part (joined over edges and corners) of each cell (N, 2) of an array, (N,); cells in each part."""
+    """Number of the part (joined over edges and corners) of each cell (N, 2) of an array, (N,).
+
+    Also how many cells are in each part.
+    """
     cols = shape[1] + 2
     # Index + 1 of the cell that lies there; the empty border saves all questions about the rim.
     at = np.zeros((shape[0] + 2) * cols, dtype=np.int32)
@@ -304,9 +350,18 @@ def _parts(shape: tuple[int, int], cells: Cells) -> tuple[NDArray[np.int64], NDA
 
 @kernel
 def _examine(
-    mask: Mask, free: Mask, looks: NDArray[np.uint8], row: int, col: int, reach: float, faces: NDArray[np.float64]
+    mask: Mask,
+    free: Mask,
+    looks: NDArray[np.uint8],
+    row: int,
+    col: int,
+    reach: float,
+    faces: NDArray[np.float64],
 ) -> bool:
-    """Count a look at each border cell in plain sight; returns whether one of them is exhausted now."""
+    """Count a look at each border cell in plain sight.
+
+    Returns whether one of them is exhausted now.
+    """
     rows, cols = mask.shape
     exhausted = False
     whole = int(math.ceil(reach))
@@ -323,7 +378,8 @@ def _examine(
                 inside = 0 <= ur < rows and 0 <= uc < cols
                 if not inside or free[ur, uc] or math.hypot(ur - row, uc - col) < away:
                     continue
-                # In plain sight: all cells up to it are free, and it would be seen if it counted as free itself.
+                # In plain sight: all cells up to it are free, and it would be seen if it counted as
+                # free itself.
                 if _sees_up_to(free, row, col, ur, uc):
                     looks[r, c] = min(looks[r, c] + 1, _LOOKS)
                     if looks[r, c] == _LOOKS:
@@ -334,7 +390,7 @@ def _examine(
 
 @kernel
 def _sees_up_to(free: Mask, row: int, col: int, to_row: int, to_col: int) -> bool:
-    """Whether the straight line between two cells runs over free cells, the last one not counted."""
+    """Whether the straight line between two cells runs over free cells, the last not counted."""
     steps = 2 * max(abs(to_row - row), abs(to_col - col))
     for i in range(steps):
         r = int(math.floor(row + 0.5 + (to_row - row) * i / steps))
@@ -351,6 +407,8 @@ def _owners(free: Mask, cells: Cells, nodes: Cells, reach: float) -> Cells:
         best = reach
         for j in range(nodes.shape[0]):
             away = math.hypot(cells[i, 0] - nodes[j, 0], cells[i, 1] - nodes[j, 1])
-            if away < best and line_is_clear(free, nodes[j, 0], nodes[j, 1], cells[i, 0], cells[i, 1]):
+            if away < best and line_is_clear(
+                free, nodes[j, 0], nodes[j, 1], cells[i, 0], cells[i, 1]
+            ):
                 best, owners[i] = away, j
     return owners

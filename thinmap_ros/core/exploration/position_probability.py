@@ -12,7 +12,7 @@ _SUREST = 1.0 - 1e-6
 
 
 def nearest_distance(distances_m: Array) -> float:
-    """r: smallest of the distances (t,) between end node and robot so far, and never less than 0.5 m.
+    """r: smallest of the distances (t,) between end node and robot so far, never less than 0.5 m.
 
     Source: exploration paper equation (2).
     """
@@ -20,7 +20,7 @@ def nearest_distance(distances_m: Array) -> float:
 
 
 def distance_index(r: float) -> float:
-    """D: 1.0 at r = 0.5 m, 0.5 at 4.5 m, and below that farther off, where a look speaks against the node.
+    """D: 1.0 at r = 0.5 m, 0.5 at 4.5 m, less farther off, where a look speaks against the node.
 
     Source: exploration paper equations (1) and (2).
     """
@@ -28,10 +28,11 @@ def distance_index(r: float) -> float:
 
 
 def angle_difference(bearings_rad: Array) -> float:
-    """a_max, degrees: largest difference between any two of the bearings (t,) under which a node was seen.
+    """a_max, degrees: largest difference between any two bearings (t,) under which a node was seen.
 
-    Bearings are those of the vector from robot to node in the global frame; differences are taken the shorter way
-    round, so none is above 180 degrees. Source: exploration paper equation (3).
+    Bearings are those of the vector from robot to node in the global frame; differences are taken
+    the shorter way round, so none is above 180 degrees.
+    Source: exploration paper equation (3).
     """
     return float(np.degrees(np.abs(wrap(bearings_rad[:, None] - bearings_rad[None, :])).max()))
 
@@ -55,8 +56,9 @@ def reliability(r: float, span_deg: float) -> float:
 def bayes_update(p: float, reliability: float) -> float:
     """Position probability after a look of a reliability R: R p / (R p + (1 - R)(1 - p)).
 
-    R = p(X | reliable) and 1 - R = p(X | unreliable). The result stays a millionth away from 0 and 1, because nothing
-    could ever change a certainty again. Source: exploration paper equations (6) to (10).
+    R = p(X | reliable) and 1 - R = p(X | unreliable). The result stays a millionth away from 0 and
+    1, because nothing could ever change a certainty again.
+    Source: exploration paper equations (6) to (10).
     """
     for_it = reliability * p
     against = (1.0 - reliability) * (1.0 - p)

@@ -10,8 +10,9 @@ Cells = NDArray[np.int64]
 
 @kernel
 def without_scraps(owners: Cells, numbers: Cells, fewest: int) -> Cells:
-    """Owners (N,) of cells, such that in each part (numbers, (N,), from 0 on) none but the largest holds too few.
+    """Owners (N,) of cells, such that in each part none but the largest holds too few.
 
+    numbers (N,): the part of each cell, from 0 on.
     Of equally large ones that with the lowest id counts as the largest.
     """
     result = owners.copy()
@@ -28,7 +29,10 @@ def without_scraps(owners: Cells, numbers: Cells, fewest: int) -> Cells:
 
 @kernel
 def middle_one(cells: Cells) -> int:
-    """Index of the cell (N, 2) nearest to the centre of gravity of all; the first of equally near ones."""
+    """Index of the cell (N, 2) nearest to the centre of gravity of all.
+
+    The first of equally near ones.
+    """
     row, col = 0.0, 0.0
     for i in range(cells.shape[0]):
         row, col = row + cells[i, 0], col + cells[i, 1]

@@ -1,10 +1,13 @@
-"""What there is to choose from: end nodes with the borders to the unknown that belong to them, and from where to look.
+"""What there is to choose from.
 
-Unknown space that no end node has in sight (a niche, or a gap that the skeleton does not reach into) is not lost: the
-middle of such a border stands in for an end node.
+These are end nodes with the borders to the unknown that belong to them, and from where to look.
 
-The place to look from is the nearest one from which most of what the border hides can be seen, up to the laser's range.
-Where such a look showed nothing, the robot goes to the end node itself, and then right up to the border.
+Unknown space that no end node has in sight (a niche, or a gap that the skeleton does not reach
+into) is not lost: the middle of such a border stands in for an end node.
+
+The place to look from is the nearest one from which most of what the border hides can be seen, up
+to the laser's range. Where such a look showed nothing, the robot goes to the end node itself, and
+then right up to the border.
 """
 
 import math
@@ -55,14 +58,23 @@ class SurveyConfig(TrackerConfig):
     """Which borders count, to whom they belong, and from where they are looked at."""
 
     robot_radius_m: float = parameter(0.25, 'radius of the robot, m', low=0.0, high=5.0)
-    shortest_border_m: float = parameter(0.5, 'a shorter border is a missing beam, m', low=0.0, high=5.0)
-    attach_m: float = parameter(3.0, 'a border belongs to an end node in sight within this, m', low=0.1, high=50.0)
-    view_depth_m: float = parameter(2.0, 'a look at a border is to show this much behind it, m', low=0.1, high=20.0)
+    shortest_border_m: float = parameter(
+        0.5, 'a shorter border is a missing beam, m', low=0.0, high=5.0
+    )
+    attach_m: float = parameter(
+        3.0, 'a border belongs to an end node in sight within this, m', low=0.1, high=50.0
+    )
+    view_depth_m: float = parameter(
+        2.0, 'a look at a border is to show this much behind it, m', low=0.1, high=20.0
+    )
 
 
 @dataclass
 class Candidate:
-    """A place worth a visit: the border cells that belong to it, and the pose (3,) from which to look at it."""
+    """A place worth a visit.
+
+    The border cells that belong to it, and the pose (3,) from which to look at it.
+    """
 
     track: Track
     cells: Cells
@@ -76,7 +88,10 @@ class Candidate:
 
 @dataclass
 class _Memory:
-    """End nodes that were visited without success, with their places; borders that are to be looked at from near."""
+    """End nodes that were visited without success, with their places.
+
+    Also borders that are to be looked at from near.
+    """
 
     visited: dict[int, Place] = field(default_factory=dict)
     look_closer: list[Place] = field(default_factory=list)
@@ -86,9 +101,10 @@ class _Memory:
 class Surveyor:
     """Shares the borders of the known among the end nodes.
 
-    tracks: end nodes; stand_ins: what stands in for them; reached (H, W): cells on which the robot can stand and to
-    which it can get; maybe (H, W): those on which it could stand if nothing stood in the unknown; ways: length of the
-    way, in squares, from the robot to each square of reached cells; all as they were at the last survey, on `frame`.
+    tracks: end nodes; stand_ins: what stands in for them; reached (H, W): cells on which the robot
+    can stand and to which it can get; maybe (H, W): those on which it could stand if nothing stood
+    in the unknown; ways: length of the way, in squares, from the robot to each square of reached
+    cells; all as they were at the last survey, on `frame`.
     """
 
     def __init__(self, config: SurveyConfig) -> None:
@@ -107,8 +123,13 @@ class Surveyor:
         """All that is remembered, as arrays by name; `restore` goes on from it."""
         memory = self._memory
         visited = [(node_id, *place) for node_id, place in memory.visited.items()]
-        parts = {'nodes': self.tracker.state(), 'stand_ins': self.stand_ins.state(), 'borders': self.borders.state()}
-        return {f'{part}_{key}': array for part, arrays in parts.items() for key, array in arrays.items()} | {
+        parts = {
+            'nodes': self.tracker.state(),
+            'stand_ins': self.stand_ins.state(),
+            'borders': self.borders.state(),
+        }
+        named = {f'{part}_{k}': array for part, own in parts.items() for k, array in own.items()}
+        return named | {
             'visited': np.array(visited, dtype=np.float64).reshape(-1, 3),
             'look_closer': np.array(memory.look_closer, dtype=np.float64).reshape(-1, 2),
             'next_stand_in': np.array(memory.next_stand_in),
@@ -140,7 +161,10 @@ class Surveyor:
         self._ends = None
 
     def follow(self, ends: dict[int, Place]) -> dict[int, int]:
-        """Take in where the end nodes are now; returns the new id of each one that lives on under another one."""
+        """Take in where the end nodes are now.
+
+        Returns the new id of each one that lives on under another one.
+        """
         if ends == self._ends:
             return {}  # scans come more often than graphs
         self._ends = ends
@@ -148,8 +172,10 @@ class Surveyor:
         visited = {renamed.get(i, i): place for i, place in self._memory.visited.items()}
         # One that has moved is another one.
         self._memory.visited = {
-            i: place for i, place in visited.items()
-            if i in self.tracker.tracks and math.dist(place, _place(self.tracker.tracks[i])) <= self.config.moved_m
+            i: place
+            for i, place in visited.items()
+            if i in self.tracker.tracks
+            and math.dist(place, _place(self.tracker.tracks[i])) <= self.config.moved_m
         }
         return renamed
 
@@ -158,7 +184,10 @@ class Surveyor:
         return self.tracker.tracks.get(node_id) or self.stand_ins.tracks.get(node_id)
 
     def survey(self, T_map_base: Array, range_m: float) -> list[Candidate]:
-        """End nodes with their borders, and stand-ins for the borders that no end node sees; range_m: the laser's."""
+        """End nodes with their borders, and stand-ins for the borders that no end node sees.
+
+        range_m: the laser's.
+        """
         cells, numbers, _ = self.borders.stretches()
         self._look_around(T_map_base)
         owners = self._without_scraps(self._owners(cells), numbers)
@@ -166,8 +195,10 @@ class Surveyor:
         for node_id, track in self.tracker.tracks.items():
             own = cells[owners == node_id]
             if len(own) or (self.config.mode == 'paper' and node_id not in self._memory.visited):
-                candidates.append(Candidate(track, own, self._goal_at(track, own, T_map_base, range_m)))
-        return candidates + self._stand_in(cells[owners < 0], numbers[owners < 0], T_map_base, range_m)
+                goal = self._goal_at(track, own, T_map_base, range_m)
+                candidates.append(Candidate(track, own, goal))
+        left = owners < 0
+        return candidates + self._stand_in(cells[left], numbers[left], T_map_base, range_m)
 
     def still_open(self, candidate: Candidate) -> Candidate | None:
         """What is left of a candidate of the last survey; None if that is nothing."""
@@ -177,7 +208,8 @@ class Surveyor:
         if still.all() and len(still):
             return candidate
         cells = candidate.cells[still]
-        long_enough = len(cells) * self.borders.frame.resolution >= self.config.shortest_border_m - 1e-6
+        length_m = len(cells) * self.borders.frame.resolution
+        long_enough = length_m >= self.config.shortest_border_m - 1e-6
         if not (long_enough or self.config.mode == 'paper'):
             return None
         return Candidate(candidate.track, cells, candidate.goal)
@@ -185,12 +217,17 @@ class Surveyor:
     def examined(self, candidate: Candidate, T_map_base: Array) -> None:
         """Hear that a candidate stays open although the robot stands at its goal and looks.
 
-        Then it is to be looked at from nearer; after that, an end node owns no border any more, and what is left of it
-        gets a stand-in with a place right at it; the border of a stand-in is exhausted.
+        Then it is to be looked at from nearer; after that, an end node owns no border any more, and
+        what is left of it gets a stand-in with a place right at it; the border of a stand-in is
+        exhausted.
         """
         memory, node_id = self._memory, candidate.track.node_id
         middle = self.border_of(candidate)
-        if len(candidate.cells) and self.config.mode == 'open_border' and not self._is_to_be_looked_at_closer(middle):
+        if (
+            len(candidate.cells)
+            and self.config.mode == 'open_border'
+            and not self._is_to_be_looked_at_closer(middle)
+        ):
             memory.look_closer.append(middle)
         elif node_id >= FIRST_STAND_IN_ID:
             self.borders.exhaust(candidate.cells, (float(T_map_base[0]), float(T_map_base[1])))
@@ -209,15 +246,21 @@ class Surveyor:
 
     def _look_around(self, T_map_base: Array) -> None:
         self._renew_standing()
-        free, standing, xy = self.borders.free, self._standing, (float(T_map_base[0]), float(T_map_base[1]))
-        ways = let_out(standing, free, self.frame, xy, _ESCAPE_M, self.trail.cells(self.frame, free.shape))
+        free, standing = self.borders.free, self._standing
+        xy = (float(T_map_base[0]), float(T_map_base[1]))
+        trail = self.trail.cells(self.frame, free.shape)
+        ways = let_out(standing, free, self.frame, xy, _ESCAPE_M, trail)
         row, col = (int(v) for v in self.frame.cells_of(T_map_base[None, :2])[0])
         self.ways = field_from(coarse(ways, SQUARE), (row // SQUARE, col // SQUARE))
         self.reached = fine(np.isfinite(self.ways), SQUARE, standing)
 
     def _renew_standing(self) -> None:
-        """Where the robot can stand, and where it could: anew in the part of the map that has changed."""
-        borders, radius, resolution = self.borders, self.config.robot_radius_m, self.borders.frame.resolution
+        """Where the robot can stand, and where it could.
+
+        Both are found anew in the part of the map that has changed.
+        """
+        borders, radius = self.borders, self.config.robot_radius_m
+        resolution = borders.frame.resolution
         part, borders.changed, self.frame = borders.changed, NOTHING, borders.frame
         if part is None:
             self._standing = standing_places(borders.free, radius, resolution)
@@ -229,10 +272,12 @@ class Surveyor:
     def _owners(self, cells: Cells) -> Cells:
         """Id of the end node to which each border cell belongs, or -1.
 
-        Not one that was visited in vain, nor one to which the robot cannot get: the graph remembers a passage that the
-        map, as it is now, no longer shows.
+        Not one that was visited in vain, nor one to which the robot cannot get: the graph remembers
+        a passage that the map, as it is now, no longer shows.
         """
-        ids = np.array([i for i in self.tracker.tracks if i not in self._memory.visited], dtype=np.int64)
+        ids = np.array(
+            [i for i in self.tracker.tracks if i not in self._memory.visited], dtype=np.int64
+        )
         if ids.size == 0 or len(cells) == 0:
             return np.full(len(cells), -1, dtype=np.int64)
         nodes = self.frame.cells_of(np.array([_place(self.tracker.tracks[int(i)]) for i in ids]))
@@ -242,15 +287,18 @@ class Surveyor:
         return np.where(index < 0, -1, ids[index]) if ids.size else index
 
     def _without_scraps(self, owners: Cells, numbers: Cells) -> Cells:
-        """Owners (N,) of border cells, such that no owner holds less of a stretch than would count as a border.
+        """Owners (N,) of border cells; none holds less of a stretch than counts as a border.
 
-        Such a scrap goes to whoever holds most of the stretch: it would be a target that is none at the next scan.
+        Such a scrap goes to whoever holds most of the stretch: it would be a target that is none at
+        the next scan.
         """
         fewest = round(self.config.shortest_border_m / self.borders.frame.resolution)
         return without_scraps(owners, numbers, fewest)
 
-    def _stand_in(self, cells: Cells, numbers: Cells, T_map_base: Array, range_m: float) -> list[Candidate]:
-        """One candidate for each stretch of border left over that can be looked at from somewhere."""
+    def _stand_in(
+        self, cells: Cells, numbers: Cells, T_map_base: Array, range_m: float
+    ) -> list[Candidate]:
+        """One candidate for each stretch of border left over that can be seen from somewhere."""
         found: list[tuple[Cells, Array]] = []
         if len(cells) and self.config.mode == 'open_border':
             for number in np.unique(numbers):
@@ -267,7 +315,7 @@ class Surveyor:
         ]
 
     def _place_for(self, stretch: Cells, T_map_base: Array, range_m: float) -> Array | None:
-        """From where to look at a border: from afar if that may show something, else right from it."""
+        """Where to look at a border: from afar if that may show something, else right from it."""
         place = self._far_place_for(stretch, range_m)
         if place is not None:
             return place
@@ -283,7 +331,11 @@ class Surveyor:
     def still_shows(self, candidate: Candidate, goal: Array, range_m: float) -> bool:
         """Whether a goal (3,) is still one from which to look at a candidate's border from afar."""
         cells = candidate.cells
-        if not len(cells) or self.config.mode == 'paper' or self._is_to_be_looked_at_closer(self._middle(cells)):
+        if (
+            not len(cells)
+            or self.config.mode == 'paper'
+            or self._is_to_be_looked_at_closer(self._middle(cells))
+        ):
             return False
         row, col = self.frame.cells_of(goal[None, :2])[0]
         inside = 0 <= row < self.reached.shape[0] and 0 <= col < self.reached.shape[1]
@@ -295,9 +347,13 @@ class Surveyor:
         return any(math.dist(middle, place) < _SAME_BORDER_M for place in self._memory.look_closer)
 
     def _goal_at(self, track: Track, own: Cells, T_map_base: Array, range_m: float) -> Array:
-        """Where to look at an end node's border from; without one, at the node, on in the direction of approach."""
+        """Where to look at an end node's border from.
+
+        Without one, at the node, on in the direction of approach.
+        """
         if len(own) == 0:
-            return se2.pose(track.x, track.y, math.atan2(track.y - T_map_base[1], track.x - T_map_base[0]))
+            heading = math.atan2(track.y - T_map_base[1], track.x - T_map_base[0])
+            return se2.pose(track.x, track.y, heading)
         place = self._far_place_for(own, range_m)
         return _facing(np.array(_place(track)) if place is None else place, self._middle(own))
 
@@ -319,11 +375,18 @@ class Surveyor:
         """The cell of a stretch nearest to its centre of gravity, in m."""
         row, col = stretch[middle_one(stretch)].tolist()
         frame = self.borders.frame
-        return (col + 0.5) * frame.resolution + frame.origin_x, (row + 0.5) * frame.resolution + frame.origin_y
+        x = (col + 0.5) * frame.resolution + frame.origin_x
+        y = (row + 0.5) * frame.resolution + frame.origin_y
+        return x, y
 
 
-def end_node_of(track: Track, candidate: Candidate | None, target_goal: Array | None, resolution: float) -> EndNode:
-    """An end node as it is told of: with its candidate, if it is one, and its goal (3,), if it is the target."""
+def end_node_of(
+    track: Track, candidate: Candidate | None, target_goal: Array | None, resolution: float
+) -> EndNode:
+    """An end node as it is told of.
+
+    With its candidate, if it is one, and its goal (3,), if it is the target.
+    """
     goal = target_goal
     if goal is None:
         goal = np.array([track.x, track.y, 0.0]) if candidate is None else candidate.goal
@@ -342,9 +405,7 @@ def end_node_of(track: Track, candidate: Candidate | None, target_goal: Array | 
     )
 
 
-def _part(
-    state: Mapping[str, NDArray[Any]], name: str, fields: Fields
-) -> dict[str, NDArray[Any]]:
+def _part(state: Mapping[str, NDArray[Any]], name: str, fields: Fields) -> dict[str, NDArray[Any]]:
     """The arrays of one part of a state, checked."""
     own = {
         key.removeprefix(f'{name}_'): array

@@ -1,8 +1,11 @@
-"""Which of several places to visit first, when all of them have to be visited: an open tour from where the robot is.
+"""Which of several places to visit first, when all of them have to be visited.
 
-A place that is passed over now has to be come back to: a tour weighs both, which "the nearest first" does not.
-Source: Kulich, Faigl and Preucil, "On distance utility in the exploration task", 2011; Croes, "A method for solving
-traveling-salesman problems", 1958 (2-opt); Or, 1976 (moving a piece elsewhere).
+An open tour from where the robot is.
+
+A place that is passed over now has to be come back to: a tour weighs both, which "the nearest
+first" does not. Source: Kulich, Faigl and Preucil, "On distance utility in the exploration task",
+2011; Croes, "A method for solving traveling-salesman problems", 1958 (2-opt); Or, 1976 (moving a
+piece elsewhere).
 """
 
 import numpy as np
@@ -18,14 +21,16 @@ _ROUNDS = 10
 def tours_by_first(from_start: Array, between: Array, wait_weights: Array, wait_m: float) -> Array:
     """Cost of a good open tour through all N places for each of them that could come first, (N,).
 
-    The cost is the tour's length, and for each place its weight times the way until it is reached, at most wait_m: what
-    lies near is better done now, since what comes to light on the way may change the tour.
-    from_start (N,): way from the robot to each place; between (N, N): ways between them, symmetric; all finite;
-    wait_weights (N,).
+    The cost is the tour's length, and for each place its weight times the way until it is reached,
+    at most wait_m: what lies near is better done now, since what comes to light on the way may
+    change the tour. from_start (N,): way from the robot to each place; between (N, N): ways between
+    them, symmetric; all finite; wait_weights (N,).
     """
     from_start, between = np.ascontiguousarray(from_start), np.ascontiguousarray(between)
     count = from_start.size
-    return np.array([_best_tour(from_start, between, first, wait_weights, wait_m) for first in range(count)])
+    return np.array(
+        [_best_tour(from_start, between, first, wait_weights, wait_m) for first in range(count)]
+    )
 
 
 @kernel
@@ -40,7 +45,10 @@ def _cost(order: Places, from_start: Array, between: Array, weights: Array, most
 
 @kernel
 def _best_tour(from_start: Array, between: Array, first: int, weights: Array, most: float) -> float:
-    """Begin with the nearest next, always; then turn pieces and move places as long as that helps."""
+    """Begin with the nearest next, always.
+
+    Then turn pieces and move places as long as that helps.
+    """
     count = from_start.size
     order = np.empty(count, dtype=np.int64)
     _nearest_next(order, first, between)

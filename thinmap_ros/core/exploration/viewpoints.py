@@ -1,9 +1,11 @@
-"""From where to look at a border of the known: from as far away as the laser allows, or from right beside it.
+"""From where to look at a border of the known.
 
-The unknown behind a border is stood for by some points, straight on from the border's cells. A place is good if most of
-them could be seen from there as long as nothing is known to stand between. A robot that stands on the known side of a
-corner sees along the border, but none of what the corner hides; one at the end of its laser's range has to come only a
-little nearer.
+From as far away as the laser allows, or from right beside it.
+
+The unknown behind a border is stood for by some points, straight on from the border's cells. A
+place is good if most of them could be seen from there as long as nothing is known to stand between.
+A robot that stands on the known side of a corner sees along the border, but none of what the corner
+hides; one at the end of its laser's range has to come only a little nearer.
 """
 
 import math
@@ -18,9 +20,11 @@ from thinmap_ros.core.se2 import Array
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.int64]
 Cell = tuple[int, int]
-# Not more: across a wall one cell thick places where a robot can stand are six cells apart, and stay apart in squares.
+# Not more: across a wall one cell thick places where a robot can stand are six cells apart, and
+# stay apart in squares.
 SQUARE = 3
-# Most of what a border hides: so much of so many points. Of a long one, with a point every so many cells, as many.
+# Most of what a border hides: so much of so many points. Of a long one, with a point every so many
+# cells, as many.
 _POINTS, _SHARE = 8, 0.7
 _SPACING = 10
 _SLACK, _STRIDE = 5, 4
@@ -29,11 +33,12 @@ _SLACK, _STRIDE = 5, 4
 def place_for(
     free: Mask, passable: Mask, cells: Cells, allowed: Mask, ways: Array, depth: int, reach: float
 ) -> Cell | None:
-    """The allowed cell with the shortest way from which most of what a border (N, 2) hides could be seen.
+    """The allowed cell with the shortest way that could see most of what a border (N, 2) hides.
 
-    free, passable (all but what is known to be solid), allowed (H, W); ways (ceil(H / SQUARE), ceil(W / SQUARE)):
-    length of the way to each square of SQUARE x SQUARE cells, in whose middle the robot would stand; depth: how far
-    behind the border is looked, in cells; reach: how far the laser sees, in cells.
+    free, passable (all but what is known to be solid), allowed (H, W);
+    ways (ceil(H / SQUARE), ceil(W / SQUARE)): length of the way to each square of SQUARE x SQUARE
+    cells, in whose middle the robot would stand; depth: how far behind the border is looked, in
+    cells; reach: how far the laser sees, in cells.
     """
     points, need = _wanted(free, passable, cells, depth)
     row, col = _view_place(ways, SQUARE, allowed, passable, points, reach, need)
@@ -54,11 +59,13 @@ def _wanted(free: Mask, passable: Mask, cells: Cells, depth: int) -> tuple[Cells
     return points, math.ceil(_SHARE * min(len(points), _POINTS))
 
 
-def place_at(free: Mask, cells: Cells, allowed: Mask, most_steps: int, towards: Cell) -> Cell | None:
+def place_at(
+    free: Mask, cells: Cells, allowed: Mask, most_steps: int, towards: Cell
+) -> Cell | None:
     """The allowed cell right at a border (N, 2), near to it and to another cell.
 
-    Of all allowed cells whose way to the border over free cells is at most most_steps, and nearly the shortest, the one
-    nearest to `towards`: round a pillar all sides are equally near.
+    Of all allowed cells whose way to the border over free cells is at most most_steps, and nearly
+    the shortest, the one nearest to `towards`: round a pillar all sides are equally near.
     """
     row, col = _place_at(free, cells, allowed, most_steps, *towards)
     return None if row < 0 else (int(row), int(col))
@@ -66,7 +73,10 @@ def place_at(free: Mask, cells: Cells, allowed: Mask, most_steps: int, towards: 
 
 @kernel
 def _hidden_points(free: Mask, passable: Mask, cells: Cells, depth: int, most: int) -> Cells:
-    """Cells behind some of a border's cells (N, 2): straight on into the unknown, up to a depth or something known."""
+    """Cells behind some of a border's cells (N, 2).
+
+    They lie straight on into the unknown, up to a depth or something known.
+    """
     rows, cols = free.shape
     count = min(cells.shape[0], most)
     points = np.empty((count, 2), dtype=np.int64)
@@ -94,18 +104,20 @@ def _hidden_points(free: Mask, passable: Mask, cells: Cells, depth: int, most: i
 def _view_place(
     ways: Array, factor: int, allowed: Mask, passable: Mask, points: Cells, reach: float, need: int
 ) -> tuple[int, int]:
-    """The middle of a square, the one with the shortest way, that sees at least `need` of the points; -1 if none does.
+    """Middle of the square with the shortest way that sees at least `need` of the points, or -1.
 
     A line of sight runs over passable cells, and is shorter than reach.
     """
     rows, cols = allowed.shape
     low_r, high_r = points[:, 0].min() - reach, points[:, 0].max() + reach
     low_c, high_c = points[:, 1].min() - reach, points[:, 1].max() + reach
+    top, bottom = max(int(low_r) // factor, 0), min(int(high_r) // factor + 1, ways.shape[0])
+    left, right = max(int(low_c) // factor, 0), min(int(high_c) // factor + 1, ways.shape[1])
     best, best_row, best_col = np.inf, -1, -1
     # First a few squares here and there: with a good place in hand most others need no look.
     for stride in (_STRIDE, 1):
-        for r in range(max(int(low_r) // factor, 0), min(int(high_r) // factor + 1, ways.shape[0]), stride):
-            for c in range(max(int(low_c) // factor, 0), min(int(high_c) // factor + 1, ways.shape[1]), stride):
+        for r in range(top, bottom, stride):
+            for c in range(left, right, stride):
                 row, col = r * factor + factor // 2, c * factor + factor // 2
                 if ways[r, c] >= best or row >= rows or col >= cols or not allowed[row, col]:
                     continue
@@ -115,7 +127,9 @@ def _view_place(
 
 
 @inlined
-def _sees_enough(passable: Mask, row: int, col: int, points: Cells, reach: float, need: int) -> bool:
+def _sees_enough(
+    passable: Mask, row: int, col: int, points: Cells, reach: float, need: int
+) -> bool:
     """Whether so many of the points (N, 2) are in sight of a cell."""
     seen = 0
     for i in range(points.shape[0]):
@@ -131,7 +145,10 @@ def _sees_enough(passable: Mask, row: int, col: int, points: Cells, reach: float
 def _place_at(
     free: Mask, cells: Cells, allowed: Mask, most_steps: int, to_row: int, to_col: int
 ) -> tuple[int, int]:
-    """Breadth first over free cells, from all border cells at once, and _SLACK steps on after the first find."""
+    """Breadth first over free cells, from all border cells at once.
+
+    It goes _SLACK steps on after the first find.
+    """
     rows, cols = free.shape
     seen = np.zeros((rows, cols), dtype=np.bool_)
     queue = np.empty((rows * cols, 3), dtype=np.int64)

@@ -13,29 +13,41 @@ _RIM_M = 0.5
 
 
 def field_of_view(scan: Scan) -> tuple[float, float]:
-    """Directions between which a scan looks, rad, laser frame: its outer beams and as much again as between two."""
+    """Directions between which a scan looks, rad, laser frame.
+
+    Its outer beams and as much again as between two.
+    """
     last = scan.angle_min_rad + scan.angle_increment_rad * (scan.ranges_m.size - 1)
     more = abs(scan.angle_increment_rad)
     return min(scan.angle_min_rad, last) - more, max(scan.angle_min_rad, last) + more
 
 
 def directions_of_view(scan: Scan, T_map_base: Array) -> Array:
-    """First and last direction of view of a scan at a pose (3,), rad, map frame, the first the smaller, (2,)."""
+    """First (smaller) and last direction of view (2,) of a scan at a pose (3,), rad, map frame."""
     last = scan.angle_min_rad + scan.angle_increment_rad * (scan.ranges_m.size - 1)
     heading = float(T_map_base[2] + scan.T_base_laser[2])
-    return np.array([heading + min(scan.angle_min_rad, last), heading + max(scan.angle_min_rad, last)])
+    return np.array(
+        [heading + min(scan.angle_min_rad, last), heading + max(scan.angle_min_rad, last)]
+    )
 
 
 def box_of_scan(scan: Scan, T_map_base: Array) -> Array:
-    """Lower left and upper right corner, m, of all that a scan from a pose (3,) can have changed, (2, 2)."""
+    """Lower left and upper right corner (2, 2), m, of what a scan at (3,) can have changed."""
     T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
     limits = (scan.range_min_m, scan.range_max_m)
-    return np.asarray(_box(scan.ranges_m, limits, scan.angle_min_rad, scan.angle_increment_rad, T_map_laser))
+    return np.asarray(
+        _box(scan.ranges_m, limits, scan.angle_min_rad, scan.angle_increment_rad, T_map_laser)
+    )
 
 
 @kernel
-def _box(ranges: Array, limits: tuple[float, float], first: float, step: float, laser: Array) -> Array:
-    """Corners (2, 2) of what beams (N,) from a laser at a pose (3,) reach, and _RIM_M more; see box_of_scan."""
+def _box(
+    ranges: Array, limits: tuple[float, float], first: float, step: float, laser: Array
+) -> Array:
+    """Corners (2, 2) of what beams (N,) from a laser at a pose (3,) reach, and _RIM_M more.
+
+    See box_of_scan.
+    """
     left = bottom = right = top = 0.0
     for i in range(ranges.size):
         if (ranges[i] >= limits[0] and ranges[i] > 0.0) or ranges[i] >= limits[1]:

@@ -4,7 +4,10 @@ import math
 
 
 class Buckets:
-    """Which numbers lie in which square of the plane; what is near costs the same however many lie elsewhere."""
+    """Which numbers lie in which square of the plane.
+
+    What is near costs the same however many lie elsewhere.
+    """
 
     def __init__(self, edge_m: float) -> None:
         self._edge_m = edge_m
@@ -12,7 +15,10 @@ class Buckets:
         self._bucket_of: dict[int, tuple[int, int]] = {}
 
     def put(self, number: int, x: float, y: float) -> None:
-        """Add a number at a point, or move it there, m; near to a point that is not finite is nothing."""
+        """Add a number at a point, or move it there, m.
+
+        Near to a point that is not finite is nothing.
+        """
         if not (math.isfinite(x) and math.isfinite(y)):
             self.drop(number)
             return
@@ -31,11 +37,18 @@ class Buckets:
                 del self._numbers[bucket]
 
     def near(self, x: float, y: float, reach_m: float) -> list[int]:
-        """All numbers within a reach of a point, m, in order; some that are farther off may be among them."""
+        """All numbers within a reach of a point, m, in order.
+
+        Some that are farther off may be among them.
+        """
         if not (math.isfinite(x) and math.isfinite(y)):
             return []
-        low_col, high_col = (math.floor((x + reach) / self._edge_m) for reach in (-reach_m, reach_m))
-        low_row, high_row = (math.floor((y + reach) / self._edge_m) for reach in (-reach_m, reach_m))
+        low_col, high_col = (
+            math.floor((x + reach) / self._edge_m) for reach in (-reach_m, reach_m)
+        )
+        low_row, high_row = (
+            math.floor((y + reach) / self._edge_m) for reach in (-reach_m, reach_m)
+        )
         found: list[int] = []
         for col in range(low_col, high_col + 1):
             for row in range(low_row, high_row + 1):

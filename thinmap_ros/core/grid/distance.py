@@ -9,10 +9,12 @@ FAR = 1.0e6  # squared distance, in cells, where the set is empty
 
 
 def distance_cells(marked: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Distance, in cells between centres, from each cell (H, W) to the nearest marked one; 1000 where none is.
+    """Distance, in cells between centres, from each cell (H, W) to the nearest marked one.
 
-    Source: Felzenszwalb and Huttenlocher, "Distance transforms of sampled functions", 2012: the lower envelope of
-    parabolas, along columns and then along rows.
+    1000 where none is.
+
+    Source: Felzenszwalb and Huttenlocher, "Distance transforms of sampled functions", 2012: the
+    lower envelope of parabolas, along columns and then along rows.
     """
     return np.asarray(_distance(np.ascontiguousarray(marked)))
 
@@ -43,7 +45,9 @@ def _distance(marked: NDArray[np.bool_]) -> NDArray[np.float64]:
         for col in range(1, cols):
             while True:
                 other = vertex[last]
-                meet = (heights[col] + col * col - heights[other] - other * other) / (2.0 * (col - other))
+                meet = (heights[col] + col * col - heights[other] - other * other) / (
+                    2.0 * (col - other)
+                )
                 if meet > border[last]:
                     break
                 last -= 1

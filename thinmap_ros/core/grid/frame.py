@@ -16,9 +16,9 @@ COARSEST_M = 10.0
 class GridFrame:
     """A lattice of square cells: world point <-> cell (row, col).
 
-    origin_x, origin_y: lower left corner of cell (0, 0), m; resolution: edge of a cell, m. Row 0 has the lowest y,
-    as in nav_msgs/OccupancyGrid. Raises InputError where it is no place on earth (FARTHEST_M), or
-    cells are finer than FINEST_M or coarser than COARSEST_M.
+    origin_x, origin_y: lower left corner of cell (0, 0), m; resolution: edge of a cell, m. Row 0
+    has the lowest y, as in nav_msgs/OccupancyGrid. Raises InputError where it is no place on earth
+    (FARTHEST_M), or cells are finer than FINEST_M or coarser than COARSEST_M.
     """
 
     origin_x: float

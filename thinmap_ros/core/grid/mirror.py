@@ -1,4 +1,7 @@
-"""A map put together from published patches: what a node knows of a grid that another node keeps."""
+"""A map put together from published patches.
+
+It is what a node knows of a grid that another node keeps.
+"""
 
 import numpy as np
 
@@ -8,7 +11,10 @@ from thinmap_ros.core.grid.tiles import MOST_CELLS
 
 
 class MapMirror:
-    """The newest whole map, with newer windows pasted over it; the lattice of all patches must be the same."""
+    """The newest whole map, with newer windows pasted over it.
+
+    The lattice of all patches must be the same.
+    """
 
     def __init__(self) -> None:
         self.patch: GridPatch | None = None
@@ -18,17 +24,25 @@ class MapMirror:
         self.patch = whole
 
     def paste(self, window: GridPatch) -> GridPatch:
-        """Lay a window over what is held, growing it where the window stands out; returns the result.
+        """Lay a window over what is held, growing it where the window stands out.
 
-        Raises InputError where the window's cells do not lie on the lattice of the map, or far from it.
+        Returns the result.
+        Raises InputError where the window's cells do not lie on the lattice of the map, or far from
+        it.
         """
         if self.patch is None:
             self.patch = window
             return window
         row, col = _offset(self.patch, window)
         rows, cols = window.shape
-        if max(-row - rows, row - self.patch.shape[0]) > rows or max(-col - cols, col - self.patch.shape[1]) > cols:
-            raise InputError(f'map window at {window.frame}: expected it on or beside the map at {self.patch.frame}')
+        if (
+            max(-row - rows, row - self.patch.shape[0]) > rows
+            or max(-col - cols, col - self.patch.shape[1]) > cols
+        ):
+            raise InputError(
+                f'map window at {window.frame}: expected it on or beside the map '
+                f'at {self.patch.frame}'
+            )
         rows_in_all = max(row + rows, self.patch.shape[0]) - min(row, 0)
         cols_in_all = max(col + cols, self.patch.shape[1]) - min(col, 0)
         if rows_in_all * cols_in_all > MOST_CELLS:
@@ -39,7 +53,9 @@ class MapMirror:
         before = (max(-row, 0), max(-col, 0))
         after = (max(row + rows - self.patch.shape[0], 0), max(col + cols - self.patch.shape[1], 0))
         cells = np.pad(
-            self.patch.cells, ((before[0], after[0]), (before[1], after[1])), constant_values=UNKNOWN
+            self.patch.cells,
+            ((before[0], after[0]), (before[1], after[1])),
+            constant_values=UNKNOWN,
         )
         row, col = row + before[0], col + before[1]
         cells[row : row + rows, col : col + cols] = window.cells
@@ -54,5 +70,7 @@ def _offset(whole: GridPatch, window: GridPatch) -> tuple[int, int]:
     row = (window.frame.origin_y - whole.frame.origin_y) / resolution
     on_lattice = abs(col - round(col)) < 0.01 and abs(row - round(row)) < 0.01
     if abs(window.frame.resolution - resolution) > 1e-6 or not on_lattice:
-        raise InputError(f'map window at {window.frame}: expected cells on the lattice of {whole.frame}')
+        raise InputError(
+            f'map window at {window.frame}: expected cells on the lattice of {whole.frame}'
+        )
     return round(row), round(col)

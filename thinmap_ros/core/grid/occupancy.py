@@ -21,14 +21,17 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.snapshot import FAR_M, Field
 
-# Log odds are kept as whole thousandths in int16: small, exact to add, and the same on every machine.
+# Log odds are kept as whole thousandths in int16: small, exact to add, and the same on every
+# machine.
 _SCALE = 1000.0
 _LIMIT = 6000
 _TILE_BITS = TILE.bit_length() - 1
-# Three neighbouring beams show one surface if the middle range is this near to what the others foretell, m.
+# Three neighbouring beams show one surface if the middle range is this near to what the others
+# foretell, m.
 _FLAT_M = 0.06
 _LONGEST_SURFACE_M = 3.0
-# What a beam passes through is no wall; but where it passes through this much of one, it grazes a face of the wall.
+# What a beam passes through is no wall; but where it passes through this much of one, it grazes a
+# face of the wall.
 _GRAZED_M = 0.4
 _SURELY_OCCUPIED = 0.9
 FIELDS = {
@@ -43,16 +46,29 @@ class OccupancyConfig(Config):
     """Parameters of the grid and of the laser's inverse sensor model."""
 
     resolution_m: float = parameter(0.10, 'edge of a cell, m', low=0.01, high=1.0)
-    p_free: float = parameter(0.35, 'probability of occupied after a beam passed through', low=0.01, high=0.49)
-    p_occupied: float = parameter(0.80, 'probability of occupied after a beam ended there', low=0.51, high=0.99)
-    p_lowest: float = parameter(0.05, 'clamp: no cell gets surer of being free', low=0.003, high=0.4)
-    p_highest: float = parameter(0.97, 'clamp: no cell gets surer of being occupied', low=0.6, high=0.997)
-    usable_range_m: float = parameter(30.0, 'farther hits only free the way up to here, m', low=0.5, high=200.0)
+    p_free: float = parameter(
+        0.35, 'probability of occupied after a beam passed through', low=0.01, high=0.49
+    )
+    p_occupied: float = parameter(
+        0.80, 'probability of occupied after a beam ended there', low=0.51, high=0.99
+    )
+    p_lowest: float = parameter(
+        0.05, 'clamp: no cell gets surer of being free', low=0.003, high=0.4
+    )
+    p_highest: float = parameter(
+        0.97, 'clamp: no cell gets surer of being occupied', low=0.6, high=0.997
+    )
+    usable_range_m: float = parameter(
+        30.0, 'farther hits only free the way up to here, m', low=0.5, high=200.0
+    )
     no_return_range_m: float = parameter(
         8.0, 'a beam without return frees up to here (0: nothing), m', low=0.0, high=200.0
     )
     surface_depth_m: float = parameter(
-        0.03, 'what a beam met fills the cell this far behind the measured surface, m', low=0.0, high=0.5
+        0.03,
+        'what a beam met fills the cell this far behind the measured surface, m',
+        low=0.0,
+        high=0.5,
     )
 
 
@@ -66,30 +82,38 @@ class WindowConfig(Config):
     """The part of the map around the robot that a scan changes."""
 
     window_m: float = parameter(
-        16.0, 'edge of the local map around the robot, m: best twice what the laser reaches', low=2.0, high=100.0
+        16.0,
+        'edge of the local map around the robot, m: best twice what the laser reaches',
+        low=2.0,
+        high=100.0,
     )
 
 
 class OccupancyGrid:
     """A map of any extent, in tiles that exist only where something was seen.
 
-    The inverse sensor model: cells along a beam are free, its end is occupied, nothing is said of what lies
-    beyond. The end is taken surface_depth_m behind the measured surface, where the solid is: with a wall on the border
-    of two cells, noise would otherwise fill the free one in front of it half the time. Each cell is counted once a
-    scan, and a cell in which any beam of the scan ends counts as occupied. Beams that graze a wall pass through the
-    cells in which it stands, long before they end, or without ending there at all. A cell on the line between the ends
-    of neighbouring beams that lie on one surface is therefore never counted as free; nor is a cell that is surely
-    occupied, as are others in line with it along the beam, for 0.4 m: nothing that thick is looked through. What was
-    taken away is still unlearned, by the beams that cross it.
-    Source: topological map paper section 2.1 (binary local map), exploration paper section 2.1 (Bayes update).
+    The inverse sensor model: cells along a beam are free, its end is occupied, nothing is said of
+    what lies beyond. The end is taken surface_depth_m behind the measured surface, where the solid
+    is: with a wall on the border of two cells, noise would otherwise fill the free one in front of
+    it half the time. Each cell is counted once a scan, and a cell in which any beam of the scan
+    ends counts as occupied. Beams that graze a wall pass through the cells in which it stands, long
+    before they end, or without ending there at all. A cell on the line between the ends of
+    neighbouring beams that lie on one surface is therefore never counted as free; nor is a cell
+    that is surely occupied, as are others in line with it along the beam, for 0.4 m: nothing that
+    thick is looked through. What was taken away is still unlearned, by the beams that cross it.
+    Source: topological map paper section 2.1 (binary local map), exploration paper section 2.1
+    (Bayes update).
     """
 
-    def __init__(self, config: OccupancyConfig | None = None, frame: GridFrame | None = None) -> None:
+    def __init__(
+        self, config: OccupancyConfig | None = None, frame: GridFrame | None = None
+    ) -> None:
         self.config = config or OccupancyConfig()
         self.frame = frame or GridFrame(0.0, 0.0, self.config.resolution_m)
         if self.frame.resolution != self.config.resolution_m:
             raise InputError(
-                f'map with {self.frame.resolution} m a cell: expected {self.config.resolution_m} m (resolution_m)'
+                f'map with {self.frame.resolution} m a cell: '
+                f'expected {self.config.resolution_m} m (resolution_m)'
             )
         self._tiles = TileStore()
         self._percent = _percent_table()
@@ -113,7 +137,10 @@ class OccupancyGrid:
         return grid
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """All that the grid knows, exactly, as arrays by name; `from_state` makes the same grid of it."""
+        """All that the grid knows, exactly, as arrays by name.
+
+        `from_state` makes the same grid of it.
+        """
         return {
             'frame': self.frame.as_array(),
             'tiles': self._tiles.places(),
@@ -121,8 +148,13 @@ class OccupancyGrid:
         }
 
     @staticmethod
-    def from_state(state: Mapping[str, NDArray[Any]], config: OccupancyConfig | None = None) -> 'OccupancyGrid':
-        """Grid that goes on from the `state` of another. Raises InputError where it is no such state."""
+    def from_state(
+        state: Mapping[str, NDArray[Any]], config: OccupancyConfig | None = None
+    ) -> 'OccupancyGrid':
+        """Grid that goes on from the `state` of another.
+
+        Raises InputError where it is no such state.
+        """
         checked = snapshot.check(state, FIELDS, 'grid')
         tiles = checked['tiles']
         odds = checked['log_odds']
@@ -150,7 +182,8 @@ class OccupancyGrid:
         if not se2.is_on_earth(T_map_laser):
             place = f'{T_map_laser[0]:g}, {T_map_laser[1]:g} m'
             raise InputError(f'scan at {scan.stamp_ns} ns: laser at {place}: too far to be mapped')
-        resolution, usable, depth = self.frame.resolution, self.config.usable_range_m, self.config.surface_depth_m
+        resolution, usable = self.frame.resolution, self.config.usable_range_m
+        depth = self.config.surface_depth_m
         x = (float(T_map_laser[0]) - self.frame.origin_x) / resolution
         y = (float(T_map_laser[1]) - self.frame.origin_y) / resolution
         without_return = min(self.config.no_return_range_m, scan.range_max_m, usable)
@@ -166,30 +199,43 @@ class OccupancyGrid:
         heading, bend = float(T_map_laser[2]), 2.0 * math.cos(scan.angle_increment_rad)
         turn = (math.cos(heading), math.sin(heading))
         beams = (scan.ranges_m, scan.hit, scan.no_return, self._cosines, self._sines)
-        box = _draw(news, laser, turn, *beams, (usable, without_return, depth, resolution, bend), self._steps)
+        limits = (usable, without_return, depth, resolution, bend)
+        box = _draw(news, laser, turn, *beams, limits, self._steps)
         self._merge(tile_row, tile_col, box, laser)
 
     def _merge(
-        self, tile_row: int, tile_col: int, box: tuple[int, int, int, int], laser: tuple[float, float]
+        self,
+        tile_row: int,
+        tile_col: int,
+        box: tuple[int, int, int, int],
+        laser: tuple[float, float],
     ) -> None:
-        """Add the news to the tiles, and make those that do not exist; (tile_row, tile_col): where the news begin."""
+        """Add the news to the tiles, and make those that do not exist.
+
+        (tile_row, tile_col): where the news begin.
+        """
         tiles = self._tiles
         row, col = tile_row * TILE, tile_col * TILE
         self._picture.touch(row + box[0], col + box[2], row + box[1] + 1, col + box[3] + 1)
         place = (tile_row - tiles.first_row, tile_col - tiles.first_col)
-        _spare(tiles.pool, tiles.directory, place, self._news, box, laser, self._steps, self._grazed)
+        _spare(
+            tiles.pool, tiles.directory, place, self._news, box, laser, self._steps, self._grazed
+        )
         if _apply(tiles.pool, tiles.directory, place, self._news, box, self._steps):
             tiles.ensure(_tiles_of(self._news, box) + (tile_row, tile_col))
             _apply(tiles.pool, tiles.directory, place, self._news, box, self._steps)
 
     def window(self, x: float, y: float, size_m: float) -> GridPatch:
-        """Square of size_m around a point, aligned with the cells, copied out of the tiles it touches."""
+        """Square of size_m around a point, aligned with the cells, copied out of the tiles."""
         count = max(1, round(size_m / self.frame.resolution))
         row, col = self.frame.cells_of(np.array([[x, y]]))[0] - count // 2
         return self._cut(int(row), int(col), count, count)
 
     def patch(self) -> GridPatch:
-        """The smallest rectangle that holds all that is known; one unknown cell where nothing is."""
+        """The smallest rectangle that holds all that is known.
+
+        One unknown cell where nothing is.
+        """
         return self._picture.draw(self._tiles, self.frame)
 
     def _cut(self, row: int, col: int, rows: int, cols: int) -> GridPatch:
@@ -197,10 +243,11 @@ class OccupancyGrid:
         return GridPatch(self.frame.shifted(row, col), _shades(odds, self._percent))
 
     def _sheet(self, radius: int) -> NDArray[np.int16]:
-        """Zeros for what a scan adds, whole tiles that hold `radius` cells around any cell: kept, `_apply` clears it.
+        """Zeros for what a scan adds, whole tiles that hold `radius` cells around any cell.
 
-        Its rows are longer than the tiles by one line of the processor's cache: with a power of two, cells above each
-        other would compete for the same few lines.
+        The sheet is kept; `_apply` clears it.
+        Its rows are longer than the tiles by one line of the processor's cache: with a power of
+        two, cells above each other would compete for the same few lines.
         """
         tiles = (2 * radius) // TILE + 2
         if self._news.shape[0] != tiles * TILE:
@@ -211,20 +258,28 @@ class OccupancyGrid:
         """Keep the cosines and sines of the beams' bearings for the next scan of the same laser."""
         fan = (scan.ranges_m.size, scan.angle_min_rad, scan.angle_increment_rad)
         if fan != self._fan:
-            self._fan, self._cosines, self._sines = fan, np.cos(scan.angles_rad), np.sin(scan.angles_rad)
+            self._fan = fan
+            self._cosines, self._sines = np.cos(scan.angles_rad), np.sin(scan.angles_rad)
 
 
 def _steps(config: OccupancyConfig) -> NDArray[np.int16]:
-    """What a cell gains that a beam passed, or in which one ended; lowest, highest and sure log odds, (5,)."""
+    """What a cell gains that a beam passed, or in which one ended.
+
+    Then lowest, highest and sure log odds, (5,) in all.
+    """
     free, hit, low, high = (
-        round(_SCALE * log_odds(p)) for p in (config.p_free, config.p_occupied, config.p_lowest, config.p_highest)
+        round(_SCALE * log_odds(p))
+        for p in (config.p_free, config.p_occupied, config.p_lowest, config.p_highest)
     )
     sure = min(round(_SCALE * log_odds(_SURELY_OCCUPIED)), high)
     return np.array([free, hit, low, high, sure], dtype=np.int16)
 
 
 def _percent_table() -> NDArray[np.int8]:
-    """Occupancy in percent for each log odds from -_LIMIT to _LIMIT; exactly 0 is a cell never seen."""
+    """Occupancy in percent for each log odds from -_LIMIT to _LIMIT.
+
+    Exactly 0 is a cell never seen.
+    """
     odds = np.arange(-_LIMIT, _LIMIT + 1) / _SCALE
     table = np.round(100.0 / (1.0 + np.exp(-odds))).astype(np.int8)
     table[_LIMIT] = UNKNOWN
@@ -235,8 +290,9 @@ def _percent_table() -> NDArray[np.int8]:
 def _is_flat(ranges: Array, hit: NDArray[np.bool_], usable: float, bend: float, i: int) -> bool:
     """Whether a beam and those beside it end on one surface.
 
-    On a straight line 1 / range is a sine of the bearing: the two outer ranges foretell the one between, also where
-    the wall is grazed and its points lie almost behind each other. bend: twice the cosine of the angle between beams.
+    On a straight line 1 / range is a sine of the bearing: the two outer ranges foretell the one
+    between, also where the wall is grazed and its points lie almost behind each other. bend: twice
+    the cosine of the angle between beams.
     """
     if i < 1 or i > ranges.size - 2 or not (hit[i - 1] and hit[i] and hit[i + 1]):
         return False
@@ -260,12 +316,15 @@ def _draw(
     limits: tuple[float, float, float, float, float],
     steps: NDArray[np.int16],
 ) -> tuple[int, int, int, int]:
-    """Draw what a scan adds to each cell: what beams passed, over it the surfaces (nothing), over these their ends.
+    """Draw what a scan adds to each cell.
 
-    news (H, W): zeros, large enough for every beam; laser: (x, y) in cells from there; turn: cosine and sine of its
-    heading; ranges (m), hit, no_return, cosines, sines (N,): the beams, bearings in the laser's frame; limits: how far
-    beams tell something, and those without return, how far behind its range a beam ends, edge of a cell, all m, and
-    the `bend` of `_is_flat`. Returns first and last row, first and last column of the box that holds all that is drawn.
+    What beams passed, over it the surfaces (nothing), over these their ends.
+
+    news (H, W): zeros, large enough for every beam; laser: (x, y) in cells from there; turn: cosine
+    and sine of its heading; ranges (m), hit, no_return, cosines, sines (N,): the beams, bearings in
+    the laser's frame; limits: how far beams tell something, and those without return, how far
+    behind its range a beam ends, edge of a cell, all m, and the `bend` of `_is_flat`. Returns first
+    and last row, first and last column of the box that holds all that is drawn.
     """
     usable, without_return, depth, resolution, bend = limits
     cells, width = news.ravel(), news.shape[1]
@@ -279,7 +338,8 @@ def _draw(
         ends[i, 0], ends[i, 1] = x, y
         if reach > 0.0:
             fill_segment(cells, width, laser, (x, y), steps[0])
-            low_x, low_y, high_x, high_y = min(low_x, x), min(low_y, y), max(high_x, x), max(high_y, y)
+            low_x, low_y = min(low_x, x), min(low_y, y)
+            high_x, high_y = max(high_x, x), max(high_y, y)
     _draw_ends(cells, width, ends, ranges, hit, usable, bend, steps[1])
     # One more on each side: a coordinate in fixed point may come to lie just beyond a border.
     return int(low_y) - 1, int(high_y) + 1, int(low_x) - 1, int(high_x) + 1
@@ -296,12 +356,17 @@ def _draw_ends(
     bend: float,
     step: int,
 ) -> None:
-    """Draw what the beams of a scan met over what they passed: the surfaces between their ends, then the ends."""
+    """Draw what the beams of a scan met over what they passed.
+
+    The surfaces between their ends, then the ends.
+    """
     flat_before = False
     for i in range(1, ranges.size):
         flat = _is_flat(ranges, hit, usable, bend, i)
         if flat or flat_before:
-            fill_segment(cells, width, (ends[i - 1, 0], ends[i - 1, 1]), (ends[i, 0], ends[i, 1]), 0)
+            fill_segment(
+                cells, width, (ends[i - 1, 0], ends[i - 1, 1]), (ends[i, 0], ends[i, 1]), 0
+            )
         flat_before = flat
     for i in range(ranges.size):
         if hit[i] and ranges[i] < usable:
@@ -322,7 +387,12 @@ def _shades(odds: NDArray[np.int16], percent: NDArray[np.int8]) -> NDArray[np.in
 def _odds_at(pool: NDArray[np.int16], directory: NDArray[np.int32], row: int, col: int) -> int:
     """Log odds of a cell, counted from the directory's first one on; 0 where no tile is."""
     tile_row, tile_col = row >> _TILE_BITS, col >> _TILE_BITS
-    if tile_row < 0 or tile_col < 0 or tile_row >= directory.shape[0] or tile_col >= directory.shape[1]:
+    if (
+        tile_row < 0
+        or tile_col < 0
+        or tile_row >= directory.shape[0]
+        or tile_col >= directory.shape[1]
+    ):
         return 0
     slot = directory[tile_row, tile_col]
     return 0 if slot < 0 else int(pool[slot, row & (TILE - 1), col & (TILE - 1)])
@@ -338,8 +408,9 @@ def _run_of(
     sure: int,
     enough: int,
 ) -> int:
-    """How many surely occupied cells lie in line with one along a beam, itself among them; counted up to `enough`.
+    """How many surely occupied cells lie in line with one along a beam, itself among them.
 
+    They are counted up to `enough`.
     away: (x, y) from the laser to the cell, in cells.
     """
     longest = max(abs(away[0]), abs(away[1]), 1e-9)
@@ -375,9 +446,10 @@ def _spare(
     steps: NDArray[np.int16],
     grazed: int,
 ) -> None:
-    """Take back what beams only passed, but what is surely occupied for as many cells as `grazed` along them.
+    """Take back what beams only passed but what is surely occupied for `grazed` cells along them.
 
-    place: (row, col) in the directory of the tile in which the news begin; laser: (x, y) in cells of them.
+    place: (row, col) in the directory of the tile in which the news begin; laser: (x, y) in cells
+    of them.
     """
     sure, top, left = steps[4], place[0] * TILE, place[1] * TILE
     for row in range(box[0], box[1] + 1):
@@ -390,7 +462,9 @@ def _spare(
                 for k in range(TILE):
                     if added[k] < 0 and odds[k] >= sure:
                         away = (first + k + 0.5 - laser[0], row + 0.5 - laser[1])
-                        run = _run_of(pool, directory, top + row, left + first + k, away, sure, grazed)
+                        run = _run_of(
+                            pool, directory, top + row, left + first + k, away, sure, grazed
+                        )
                         added[k] = 0 if run >= grazed else added[k]
 
 
@@ -403,9 +477,11 @@ def _apply(
     box: tuple[int, int, int, int],
     steps: NDArray[np.int16],
 ) -> bool:
-    """Add the news to the log odds, clamped, and clear them; returns whether some are left, where no tile is.
+    """Add the news to the log odds, clamped, and clear them.
 
-    Strip after strip of a tile, cell after cell without a branch: the compiler makes 16 or more additions one.
+    Returns whether some are left, where no tile is.
+    Strip after strip of a tile, cell after cell without a branch: the compiler makes 16 or more
+    additions one.
     """
     missing = False
     low, high, one, none = steps[2], steps[3], np.int16(1), np.int16(0)
@@ -418,7 +494,8 @@ def _apply(
                 continue
             odds = pool[slot, row & (TILE - 1)]
             for k in range(TILE):
-                # 0 is kept for cells never seen: a cell that comes back to even odds stays a thousandth off.
+                # 0 is kept for cells never seen: a cell that comes back to even odds stays a
+                # thousandth off.
                 total = np.int16(odds[k] + added[k])
                 total = one if total == none else total
                 total = low if total < low else total

@@ -17,7 +17,9 @@ OCCUPIED_AT_LEAST = 65
 
 @dataclass(frozen=True, eq=False)
 class GridPatch:
-    """Cells (H, W) int8 as in nav_msgs/OccupancyGrid: -1 unknown, else 0..100 % occupied; row 0 has the lowest y.
+    """Cells (H, W) int8 as in nav_msgs/OccupancyGrid: -1 unknown, else 0..100 % occupied.
+
+    Row 0 has the lowest y.
 
     A cell up to 25 % is free, from 65 % occupied; what lies between counts as unknown.
     """

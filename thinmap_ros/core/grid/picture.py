@@ -1,4 +1,7 @@
-"""The whole of a grid as people and planners see it, in percent, worked out anew only where the grid has changed."""
+"""The whole of a grid as people and planners see it, in percent.
+
+It is worked out anew only where the grid has changed.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +14,10 @@ Bounds = tuple[int, int, int, int]
 
 
 class Picture:
-    """Cells (H, W) int8 of all tiles; which part is out of date; which rectangle holds all that is known."""
+    """Cells (H, W) int8 of all tiles.
+
+    Also which part is out of date, and which rectangle holds all that is known.
+    """
 
     def __init__(self, percent: NDArray[np.int8]) -> None:
         """Begin with nothing; percent (2 L + 1,): what to show for log odds from -L to L."""
@@ -26,7 +32,10 @@ class Picture:
         self._stale = _union(self._stale, (row, col, end_row, end_col))
 
     def draw(self, tiles: TileStore, frame: GridFrame) -> GridPatch:
-        """The smallest rectangle that holds all that is known, as a copy; one unknown cell where nothing is."""
+        """The smallest rectangle that holds all that is known, as a copy.
+
+        One unknown cell where nothing is.
+        """
         self._fit(tiles)
         if self._stale is not None:
             self._refresh(tiles, _common(self._stale, self._bounds))
@@ -58,7 +67,12 @@ class Picture:
         rows, cols = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
         if rows.size:
             # What is known once stays so: the rectangle only grows.
-            found = (row + int(rows[0]), col + int(cols[0]), row + int(rows[-1]) + 1, col + int(cols[-1]) + 1)
+            found = (
+                row + int(rows[0]),
+                col + int(cols[0]),
+                row + int(rows[-1]) + 1,
+                col + int(cols[-1]) + 1,
+            )
             self._known = _union(self._known, found)
         self._stale = None
 

@@ -1,9 +1,9 @@
 """Rays and segments through cells: map update, simulated laser and line of sight.
 
-What may be stopped on its way goes from border to border; what is drawn as a whole goes by columns (or rows), which
-does not wait for one border to know the next.
-Source: Amanatides and Woo, "A fast voxel traversal algorithm for ray tracing", 1987. All numbers are in units of
-cells: x runs along columns, y along rows, and cell (row, col) covers [col, col + 1) x [row, row + 1).
+What may be stopped on its way goes from border to border; what is drawn as a whole goes by columns
+(or rows), which does not wait for one border to know the next. Source: Amanatides and Woo, "A fast
+voxel traversal algorithm for ray tracing", 1987. All numbers are in units of cells: x runs along
+columns, y along rows, and cell (row, col) covers [col, col + 1) x [row, row + 1).
 """
 
 import math
@@ -20,7 +20,10 @@ _ONE = float(1 << _FRACTION_BITS)
 
 @inlined
 def axis_setup(start: float, direction: float) -> tuple[int, int, float, float]:
-    """One axis of the traversal: first cell, step, distance to the first border, distance between borders."""
+    """One axis of the traversal.
+
+    First cell, step, distance to the first border, distance between borders.
+    """
     cell = int(math.floor(start))
     if direction > 0.0:
         return cell, 1, (cell + 1 - start) / direction, 1.0 / direction
@@ -35,8 +38,9 @@ def cast_rays(
 ) -> Array:
     """Distance, in cells, at which each ray enters the first occupied cell.
 
-    occupied (H, W) uint8; x_cell, y_cell: where the rays start; angles (N,): their directions, rad. Returns (N,):
-    inf where nothing is met within max_cells or before the ray leaves the array, 0 where the start is occupied.
+    occupied (H, W) uint8; x_cell, y_cell: where the rays start; angles (N,): their directions, rad.
+    Returns (N,): inf where nothing is met within max_cells or before the ray leaves the array, 0
+    where the start is occupied.
     """
     rows, cols = occupied.shape
     distances = np.full(angles.size, np.inf)
@@ -59,8 +63,8 @@ def cast_rays(
 def line_is_clear(free: NDArray[np.bool_], row_a: int, col_a: int, row_b: int, col_b: int) -> bool:
     """Whether every cell on the straight line between the centres of two cells is free.
 
-    free (H, W) bool. A line through the corner of four cells visits one of the two beside it; cells outside the
-    array are not free.
+    free (H, W) bool. A line through the corner of four cells visits one of the two beside it; cells
+    outside the array are not free.
     """
     rows, cols = free.shape
     length = math.hypot(row_b - row_a, col_b - col_a)
@@ -80,14 +84,18 @@ def line_is_clear(free: NDArray[np.bool_], row_a: int, col_a: int, row_b: int, c
 
 @inlined
 def fill_segment(
-    cells: NDArray[np.int16], width: int, start: tuple[float, float], end: tuple[float, float], value: int
+    cells: NDArray[np.int16],
+    width: int,
+    start: tuple[float, float],
+    end: tuple[float, float],
+    value: int,
 ) -> None:
     """Give a value to each cell that a segment passes, the first and the last included.
 
-    cells (H * W,) with W = width; start, end: (x, y) inside. In each column that the segment passes (row, where it is
-    steep), it lies in the cell where it enters and in that where it leaves, which may be the same one; the rows of
-    these are counted in fixed point, 2**-32 of a cell. No cell is left out but where the segment cuts less than a
-    millionth of a cell off its corner.
+    cells (H * W,) with W = width; start, end: (x, y) inside. In each column that the segment passes
+    (row, where it is steep), it lies in the cell where it enters and in that where it leaves, which
+    may be the same one; the rows of these are counted in fixed point, 2**-32 of a cell. No cell is
+    left out but where the segment cuts less than a millionth of a cell off its corner.
     """
     d_x, d_y = end[0] - start[0], end[1] - start[1]
     steep = abs(d_y) > abs(d_x)

@@ -1,4 +1,4 @@
-"""Tiles: storage for maps that grow in any direction, in memory proportional to what was touched."""
+"""Tiles: storage for maps growing in any direction, in memory proportional to what was touched."""
 
 from typing import Any
 
@@ -18,12 +18,13 @@ _BORDER = 4  # tiles by which the directory grows at a time
 
 
 class TileStore:
-    """An unbounded lattice of cells, kept as square tiles of TILE x TILE that exist only where needed.
+    """An unbounded lattice of cells, in square tiles of TILE x TILE that exist only where needed.
 
     A cell is a number of the given type, or an array of them of shape per_cell; it begins as 0.
-    `directory` (R, C) int32 says for each tile of a bounding rectangle which slot of `pool` (N, TILE, TILE, *per_cell)
-    holds it, or NO_TILE; `first_row`, `first_col`: tile coordinates of directory[0, 0]. Only the directory, one
-    number a tile, is ever laid anew when the map grows; the pool is lengthened by half.
+    `directory` (R, C) int32 says for each tile of a bounding rectangle which slot of `pool`
+    (N, TILE, TILE, *per_cell) holds it, or NO_TILE; `first_row`, `first_col`: tile coordinates of
+    directory[0, 0]. Only the directory, one number a tile, is ever laid anew when the map grows;
+    the pool is lengthened by half.
     """
 
     def __init__(self, dtype: DTypeLike = np.int16, per_cell: tuple[int, ...] = ()) -> None:
@@ -34,7 +35,7 @@ class TileStore:
         self.used = 0
 
     def reach(self, row_a: int, col_a: int, row_b: int, col_b: int) -> None:
-        """Lay out the directory so that the tiles from (row_a, col_a) to (row_b, col_b), inclusive, lie in it.
+        """Lay out the directory for the tiles from (row_a, col_a) to (row_b, col_b), inclusive.
 
         Raises InputError where that would make it larger than any building: a pose is wrong then.
         """
@@ -44,9 +45,8 @@ class TileStore:
         high_col = max(col_b + 1, self.first_col + cols)
         if (high_row - low_row, high_col - low_col) == (rows, cols):
             return
-        low_row, low_col, high_row, high_col = (
-            low_row - _BORDER, low_col - _BORDER, high_row + _BORDER, high_col + _BORDER
-        )
+        low_row, low_col = low_row - _BORDER, low_col - _BORDER
+        high_row, high_col = high_row + _BORDER, high_col + _BORDER
         if (high_row - low_row) * (high_col - low_col) > _MOST_TILES:
             size = f'{high_row - low_row} x {high_col - low_col}'
             raise InputError(f'map of {size} tiles: expected {_MOST_TILES} at most')
@@ -56,12 +56,13 @@ class TileStore:
         self.directory, self.first_row, self.first_col = wider, low_row, low_col
 
     def ensure(self, tiles: NDArray[np.int64]) -> None:
-        """Make the tiles (N, 2), given as (row, col) in tile coordinates inside the directory, exist."""
+        """Make the tiles (N, 2), (row, col) in tile coordinates inside the directory, exist."""
         for row, col in tiles:
             place = (row - self.first_row, col - self.first_col)
             if self.directory[place] == NO_TILE:
                 if self.used == self.pool.shape[0]:
-                    longer = np.zeros((self.used + self.used // 2, *self.pool.shape[1:]), dtype=self.pool.dtype)
+                    size = self.used + self.used // 2
+                    longer = np.zeros((size, *self.pool.shape[1:]), dtype=self.pool.dtype)
                     longer[: self.used] = self.pool
                     self.pool = longer
                 self.directory[place] = self.used
@@ -74,7 +75,10 @@ class TileStore:
         return np.asarray(found[order] + (self.first_row, self.first_col), dtype=np.int64)
 
     def bounds(self) -> tuple[int, int, int, int] | None:
-        """First row, first col, end row, end col, in cells, of the rectangle of existing tiles; None if empty."""
+        """First row, first col, end row, end col, in cells, of the rectangle of existing tiles.
+
+        None if empty.
+        """
         rows, cols = np.nonzero(self.directory != NO_TILE)
         if rows.size == 0:
             return None
@@ -97,7 +101,9 @@ class TileStore:
     def write(self, row: int, col: int, cells: NDArray[Any]) -> None:
         """Set the cells from (row, col) on to those given, (H, W, ...)."""
         rows, cols = cells.shape[:2]
-        tiles = np.mgrid[row // TILE : (row + rows - 1) // TILE + 1, col // TILE : (col + cols - 1) // TILE + 1]
+        tiles = np.mgrid[
+            row // TILE : (row + rows - 1) // TILE + 1, col // TILE : (col + cols - 1) // TILE + 1
+        ]
         tiles = tiles.reshape(2, -1).T
         self.reach(int(tiles[0, 0]), int(tiles[0, 1]), int(tiles[-1, 0]), int(tiles[-1, 1]))
         self.ensure(tiles)
@@ -112,11 +118,18 @@ class TileStore:
     def _tiles_within(self, row: int, col: int, rows: int, cols: int) -> list[tuple[int, int, int]]:
         """Existing tiles that touch a rectangle of cells: tile row, tile col, slot."""
         low = (row // TILE - self.first_row, col // TILE - self.first_col)
-        high = ((row + rows - 1) // TILE - self.first_row, (col + cols - 1) // TILE - self.first_col)
+        high = (
+            (row + rows - 1) // TILE - self.first_row,
+            (col + cols - 1) // TILE - self.first_col,
+        )
         part = self.directory[max(low[0], 0) : high[0] + 1, max(low[1], 0) : high[1] + 1]
         found = np.argwhere(part != NO_TILE)
         first = (max(low[0], 0), max(low[1], 0))
         return [
-            (int(r) + first[0] + self.first_row, int(c) + first[1] + self.first_col, int(part[r, c]))
+            (
+                int(r) + first[0] + self.first_row,
+                int(c) + first[1] + self.first_col,
+                int(part[r, c]),
+            )
             for r, c in found
         ]

@@ -1,4 +1,4 @@
-"""A lost robot that drives where the places in question differ most, so that it finds itself sooner."""
+"""A lost robot that drives where the places in question differ most, to find itself sooner."""
 
 import math
 
@@ -14,21 +14,26 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
 _LIKELY = 0.05  # of the weight of the best
-_THOUGHT_OVER_S = 4.0  # a goal stands so long, or until it is reached, or the number of places in question changes
+# A goal stands so long, or until it is reached, or the number of places in question changes.
+_THOUGHT_OVER_S = 4.0
 _CHANGED_S = 1.0  # but for so long at least
 _LOOK_M, _LOOK_RAD = 0.4, 0.4  # a look from elsewhere
 
 
 class ActiveSearch:
-    """From what is known of a lost robot to velocities, in the odometry's frame: no place in the map is needed.
+    """From what is known of a lost robot to velocities, in the odometry's frame.
 
-    The goal is where the views from the places in question differ most for the way; the path leads over what the map
-    says is free for all of them, and the navigator stops in front of what the laser sees. Where one place only is in
-    question, any way confirms it; where nothing in reach tells the places apart, the robot goes on to what it has not
-    looked at yet, and stands only where there is no such thing.
+    No place in the map is needed.
+    The goal is where the views from the places in question differ most for the way; the path leads
+    over what the map says is free for all of them, and the navigator stops in front of what the
+    laser sees. Where one place only is in question, any way confirms it; where nothing in reach
+    tells the places apart, the robot goes on to what it has not looked at yet, and stands only
+    where there is no such thing.
     """
 
-    def __init__(self, places: Places, config: GlobalLocalizationConfig, driving: NavigatorConfig) -> None:
+    def __init__(
+        self, places: Places, config: GlobalLocalizationConfig, driving: NavigatorConfig
+    ) -> None:
         self._places, self._range_m, self._driving = places, config.usable_range_m, driving
         self._navigator = Navigator(driving)
         self._view: Viewpoint | None = None
@@ -43,7 +48,8 @@ class ActiveSearch:
         most = max((h.weight for h in result.hypotheses), default=0.0)
         likely = [h for h in result.hypotheses if h.weight >= _LIKELY * most]
         T_base_odom = se2.invert(T_odom_base)
-        self._starts = np.array([se2.compose(h.T_map_base, T_base_odom) for h in likely]).reshape(-1, 3)
+        starts = np.array([se2.compose(h.T_map_base, T_base_odom) for h in likely])
+        self._starts = starts.reshape(-1, 3)
         self._weights = np.array([h.weight for h in likely])
 
     def _look(self, T_odom_base: Array) -> None:
@@ -54,13 +60,17 @@ class ActiveSearch:
             self._looked = np.concatenate([self._looked, T_odom_base[None]])
 
     def step(self, T_odom_base: Array, scan: Scan, dt_s: float) -> Command:
-        """Command for the next dt_s of a robot at an odometry pose (3,); idle where there is nothing to drive to."""
+        """Command for the next dt_s of a robot at an odometry pose (3,).
+
+        Idle where there is nothing to drive to.
+        """
         self._age_s += dt_s
         changed = len(self._starts) != self._chosen_of and self._age_s > _CHANGED_S
         if changed or self._age_s > _THOUGHT_OVER_S:
             self._choose(T_odom_base)
         if self._view is None:
-            return Command(0.0, 0.0, 'idle', 'nothing in reach tells the places apart, and all was looked at')
+            reason = 'nothing in reach tells the places apart, and all was looked at'
+            return Command(0.0, 0.0, 'idle', reason)
         command = self._navigator.step(T_odom_base, self._view.patch, scan, dt_s)
         if command.state in ('reached', 'failed', 'idle'):
             self._age_s = math.inf
@@ -70,7 +80,12 @@ class ActiveSearch:
         self._age_s, self._chosen_of, self._view = 0.0, len(self._starts), None
         if len(self._starts):
             self._view = best_viewpoint(
-                self._places, T_odom_base, self._starts, self._weights, self._range_m, self._driving,
+                self._places,
+                T_odom_base,
+                self._starts,
+                self._weights,
+                self._range_m,
+                self._driving,
                 self._looked,
             )
         if self._view is None:

@@ -23,8 +23,8 @@ _VIEW_SHARE = 0.25  # of the active window: where an observed node may lie
 class NodeModel:
     """What an observed node is worth, by its kind (3,).
 
-    found: chance that the map has it; spread_m: 1 sigma of its place along each axis; gain: how much likelier its
-    place is, right there, than anywhere.
+    found: chance that the map has it; spread_m: 1 sigma of its place along each axis; gain: how
+    much likelier its place is, right there, than anywhere.
     """
 
     found: Array
@@ -32,16 +32,23 @@ class NodeModel:
     gain: Array
 
 
-def calibrate(places: Places, like: Scan, config: GlobalLocalizationConfig, rng: np.random.Generator) -> NodeModel:
-    """Node model for a map and a laser: scans are made in the map at random poses, and their nodes looked up in it.
+def calibrate(
+    places: Places, like: Scan, config: GlobalLocalizationConfig, rng: np.random.Generator
+) -> NodeModel:
+    """Node model for a map and a laser.
 
-    like: a scan of that laser. So the tolerance follows from the grid and the sensor: from the cells' size, the
-    field of view, what a view from one side leaves unknown, and how the map's own nodes were made.
+    Scans are made in the map at random poses, and their nodes looked up in it.
+
+    like: a scan of that laser. So the tolerance follows from the grid and the sensor: from the
+    cells' size, the field of view, what a view from one side leaves unknown, and how the map's own
+    nodes were made.
     """
     distances: list[list[float]] = [[] for _ in NodeKind]
     for _ in range(_TRIALS):
         T = random_pose(places, rng)
-        nodes, kinds = observed_nodes(made_up_scan(places, T, like), places.frame.resolution, config)
+        nodes, kinds = observed_nodes(
+            made_up_scan(places, T, like), places.frame.resolution, config
+        )
         away = se2.transform_points(T, nodes)[:, None, :] - places.nodes[None]
         nearest = np.hypot(away[..., 0], away[..., 1]).min(axis=1)
         for kind, distance in zip(kinds.tolist(), nearest.tolist(), strict=True):
@@ -61,19 +68,31 @@ def calibrate(places: Places, like: Scan, config: GlobalLocalizationConfig, rng:
 
 def random_pose(places: Places, rng: np.random.Generator) -> Array:
     """Pose (3,) at which the robot can stand, each as likely as any other."""
-    at = places.frame.centres_of(places.standing[rng.integers(len(places.standing))][None].astype(np.int64))[0]
+    at = places.frame.centres_of(
+        places.standing[rng.integers(len(places.standing))][None].astype(np.int64)
+    )[0]
     return se2.pose(float(at[0]), float(at[1]), float(rng.uniform(-np.pi, np.pi)))
 
 
 def made_up_scan(places: Places, T_map_base: Array, like: Scan) -> Scan:
-    """The scan that a laser would make in the map, without noise; what is unknown lets nothing through."""
+    """The scan that a laser would make in the map, without noise.
+
+    What is unknown lets nothing through.
+    """
     T_map_laser = se2.compose(T_map_base, like.T_base_laser)
     resolution = places.frame.resolution
     x = (T_map_laser[0] - places.frame.origin_x) / resolution
     y = (T_map_laser[1] - places.frame.origin_y) / resolution
-    ranges = resolution * _ways(places.states, x, y, T_map_laser[2] + like.angles_rad, like.range_max_m / resolution)
+    ranges = resolution * _ways(
+        places.states, x, y, T_map_laser[2] + like.angles_rad, like.range_max_m / resolution
+    )
     return Scan.create(
-        like.stamp_ns, ranges, like.angle_min_rad, like.angle_increment_rad, like.range_min_m, like.range_max_m,
+        like.stamp_ns,
+        ranges,
+        like.angle_min_rad,
+        like.angle_increment_rad,
+        like.range_min_m,
+        like.range_max_m,
         like.T_base_laser,
     )
 
@@ -82,7 +101,9 @@ def _chance(places: Places) -> float:
     """Share of the places in the map that have a node near by, whatever was observed."""
     some = places.spots[:: max(1, len(places.spots) // 1000)]
     away = some[:, None, :] - places.nodes[None]
-    return float((np.hypot(away[..., 0], away[..., 1]).min(axis=1) < _SAME_NODE_M).mean()) * (1.0 - 1e-6)
+    return float((np.hypot(away[..., 0], away[..., 1]).min(axis=1) < _SAME_NODE_M).mean()) * (
+        1.0 - 1e-6
+    )
 
 
 @kernel

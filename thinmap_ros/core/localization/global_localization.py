@@ -1,4 +1,7 @@
-"""Where is the robot? Samples all over a finished map, matched with what each scan shows, until one place is left."""
+"""Where is the robot? Samples all over a finished map, until one place is left.
+
+They are matched with what each scan shows.
+"""
 
 import math
 from dataclasses import dataclass
@@ -23,27 +26,33 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 
 __all__ = ['GlobalLocalization', 'GlobalLocalizationConfig', 'Hypothesis', 'Result', 'State']
 
-# Looks from about the same place meet the same errors of the map; they are independent after so much motion.
+# Looks from about the same place meet the same errors of the map; they are independent after so
+# much motion.
 _NEW_WAY_M, _NEW_TURN_RAD = 0.5, 0.5
-# Independent looks that a place must have explained: more for each e-fold of places that looked alike, and for each
-# look before it turned up. A look counts the less, the more it leaves unexplained of what it should explain in this
-# map, and nothing from a share on: so many times what the right one leaves unexplained there (no less than the least,
-# as few scans were made in the map; no more than the most), and more in rough maps, which draw things in part.
+# Independent looks that a place must have explained: more for each e-fold of places that looked
+# alike, and for each look before it turned up. A look counts the less, the more it leaves
+# unexplained of what it should explain in this map, and nothing from a share on: so many times what
+# the right one leaves unexplained there (no less than the least, as few scans were made in the map;
+# no more than the most), and more in rough maps, which draw things in part.
 _SURE_LOOKS, _SURE_LOOKS_CROWD, _SURE_LOOKS_LATE = 1.0, 0.75, 2.0
 _WORTHLESS_TIMES, _LEAST_WORTHLESS, _MOST_WORTHLESS, _WORTHLESS_ROUGH = 10.0, 0.0075, 0.03, 0.5
-# After so many independent looks, a place that explains must have lasted for this share of them, but not for ever.
+# After so many independent looks, a place that explains must have lasted for this share of them,
+# but not for ever.
 _MANY_LOOKS, _LASTING_SHARE, _LASTING_LOOKS = 16.0, 0.4, 20.0
 _VIEWS = 6
 _FRESH_SHARE = 0.2  # of the samples that are drawn anew all over the map while the search is on
 _FRESH_BEST = 100
-_LOOKED_ALONG = 300  # samples whose beams are followed, where the likeliest pose of a place leaves some unexplained
+# Samples whose beams are followed, where the likeliest pose of a place leaves some unexplained.
+_LOOKED_ALONG = 300
 _JUMP_RAD = 2.0
 _STANDING_NOISE = (0.01, 0.005)  # m, rad: samples do not fall together
-# A search that looked at all of the map and did not find the right place: this often. So who turns up late is unlikely,
-# but what one search misses the next ones may miss for the same reason: so often they all do.
+# A search that looked at all of the map and did not find the right place: this often. So who turns
+# up late is unlikely, but what one search misses the next ones may miss for the same reason: so
+# often they all do.
 _LOG_MISSED, _LEAST_LOG_PRIOR = math.log(0.3), math.log(0.05)
 _TRUST_FROM = 0.6  # share of the beams that must be explained for that
-_FIRST_SEARCHES, _LATER_EVERY = 6, 4.0  # looks: once all places are known, the map is searched less often
+# Looks: once all places are known, the map is searched less often.
+_FIRST_SEARCHES, _LATER_EVERY = 6, 4.0
 
 
 class State(IntEnum):
@@ -58,7 +67,10 @@ class State(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A place where the robot may be: T_map_base (3,), covariance (3, 3), weight, and share of beams it explains."""
+    """A place where the robot may be.
+
+    T_map_base (3,), covariance (3, 3), weight, and share of beams it explains.
+    """
 
     T_map_base: Array
     covariance: Array
@@ -68,7 +80,10 @@ class Hypothesis:
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What is known after a step: the state, why in words, and the hypotheses, the likeliest first."""
+    """What is known after a step.
+
+    The state, why in words, and the hypotheses, the likeliest first.
+    """
 
     state: State
     reason: str
@@ -81,17 +96,23 @@ class Result:
 
 
 class GlobalLocalization:
-    """Finds a robot in a map that it may be in, at any place and heading; the same seed gives the same answers.
+    """Finds a robot in a map that it may be in, at any place and heading.
 
-    1. Samples of x, y and heading are drawn over all places where the robot can stand. 2. All count the same.
-    3.-5. For each, the nodes are taken that the map has in sight within the active window, and compared with those
-    of the current scan's topological map by distance and angle. 6. Bayes' rule weighs them, and odometry moves them.
+    The same seed gives the same answers.
+
+    1. Samples of x, y and heading are drawn over all places where the robot can stand.
+    2. All count the same.
+    3.-5. For each, the nodes are taken that the map has in sight within the active window, and
+       compared with those of the current scan's topological map by distance and angle.
+    6. Bayes' rule weighs them, and odometry moves them.
+
     Where one or a few candidates are left, sampling goes on round these only.
 
-    Beyond the paper: every spot of the map is compared with the ranges of the scan, so that long corridors, halls and
-    scans without nodes tell something too; candidates must explain each beam, on its whole way; each keeps samples of
-    its own, so that none dies out by chance; what they explain alike leaves them equally likely; and the robot is sure
-    only of a place that explains what it has seen, has no rival left, and is known closely.
+    Beyond the paper: every spot of the map is compared with the ranges of the scan, so that long
+    corridors, halls and scans without nodes tell something too; candidates must explain each beam,
+    on its whole way; each keeps samples of its own, so that none dies out by chance; what they
+    explain alike leaves them equally likely; and the robot is sure only of a place that explains
+    what it has seen, has no rival left, and is known closely.
     Source: topological map paper section 3.1.
     """
 
@@ -102,7 +123,10 @@ class GlobalLocalization:
         config: GlobalLocalizationConfig | None = None,
         seed: int = 0,
     ) -> None:
-        """Look at a map. Raises InputError where it has no wall, no free place, or the topology no node."""
+        """Look at a map.
+
+        Raises InputError where it has no wall, no free place, or the topology no node.
+        """
         self.config = config or GlobalLocalizationConfig()
         self.places = Places.of(patch, topology, self.config)
         self._rng = np.random.default_rng(seed)
@@ -155,7 +179,10 @@ class GlobalLocalization:
         return far or abs(float(motion[2])) > _JUMP_RAD
 
     def _novelty(self, T_odom_base: Array) -> float:
-        """How much of an independent look this is, 0 to 1; 0: none, the robot is where it looked last."""
+        """How much of an independent look this is, 0 to 1.
+
+        0: none, the robot is where it looked last.
+        """
         if self._T_look is None:
             return 1.0
         motion = se2.between(self._T_look, T_odom_base)
@@ -165,7 +192,7 @@ class GlobalLocalization:
         return min(1.0, way / _NEW_WAY_M + turn / _NEW_TURN_RAD)
 
     def _look(self, scan: Scan, T_odom_base: Array, novelty: float) -> None:
-        """One look: move, search where that is due, weigh, and drop what does not explain the scan."""
+        """One look: move, search if that is due, weigh, drop what does not explain the scan."""
         judge = self._ready(scan)
         seen = observe(scan, self.places.frame.resolution, self.config)
         self._advance(T_odom_base)
@@ -192,7 +219,10 @@ class GlobalLocalization:
         self._T_look = T_odom_base
 
     def _refined(self, judge: Judge, seen: Observation) -> Array:
-        """Poses (H, 3) of the hypotheses where this scan fits best; samples that fit lead out of a dead end."""
+        """Poses (H, 3) of the hypotheses where this scan fits best.
+
+        Samples that fit lead out of a dead end.
+        """
         known = self._known
         if not len(known.samples):
             return judge.refined(known.poses, seen, known.covariances)
@@ -237,13 +267,17 @@ class GlobalLocalization:
                 missed += missed_beams((counts[k], silent[k]), len(view.seen.ranges_m))
                 beams += len(view.seen.ranges_m)
             judged = counts.sum(axis=0)[new], silent.sum(axis=0)[new]
-            more = missed[new] - (missed[self._known.best()] if len(self._known) else missed.min(initial=np.inf))
+            least = missed[self._known.best()] if len(self._known) else missed.min(initial=np.inf)
+            more = missed[new] - least
             self._known.add(found, self._log_prior(), more, judged, beams)
         self._searches += complete
         self._views = [*self._views[-_VIEWS + 1 :], KeyView(seen, T_odom_base)]
 
     def _log_prior(self) -> float:
-        """Log odds of a place that turns up late, against those that are known: less, the better these explain all."""
+        """Log odds of a place that turns up late, against those that are known.
+
+        Less, the better these explain all.
+        """
         most = float(self._fits.max(initial=0.0))
         trust = min(max((most - _TRUST_FROM) / (1.0 - _TRUST_FROM), 0.0), 1.0)
         return trust * max(self._searches * _LOG_MISSED, _LEAST_LOG_PRIOR)
@@ -271,10 +305,11 @@ class GlobalLocalization:
 
     @property
     def is_sure(self) -> bool:
-        """Whether one place alone is left for some looks in a row, and has explained enough of them since it turned up.
+        """Whether one place alone is left for some looks in a row, and has explained enough.
 
-        The less it explains, the later it turned up, and the more places of this map have looked alike, the more: a
-        place in a map of another building may look alike for a while.
+        Enough of the looks since it turned up: the less it explains, the later it turned up, and
+        the more places of this map have looked alike, the more; a place in a map of another
+        building may look alike for a while.
         """
         if self._convinced < self.config.sure_looks:
             return False
@@ -283,7 +318,8 @@ class GlobalLocalization:
         rough = 1.0 - self._usual
         varies = min(max(_WORTHLESS_TIMES * rough, _LEAST_WORTHLESS), _MOST_WORTHLESS)
         needed = _SURE_LOOKS + _SURE_LOOKS_CROWD * math.log(self._crowd)
-        # Bare walls explain the same share everywhere, at wrong places, too: there it takes more of them.
+        # Bare walls explain the same share everywhere, at wrong places, too: there it takes more of
+        # them.
         needed *= _MOST_WORTHLESS / varies
         needed += _SURE_LOOKS_LATE * max(self._overview - age, 0.0)
         return age * (1.0 - missing / (varies + _WORTHLESS_ROUGH * rough)) >= needed
@@ -293,7 +329,8 @@ class GlobalLocalization:
         if not len(known):
             return False
         best = known.best()
-        sigma_m = math.sqrt(max(float(np.linalg.eigvalsh(known.covariances[best][:2, :2])[-1]), 0.0))
+        variance = float(np.linalg.eigvalsh(known.covariances[best][:2, :2])[-1])
+        sigma_m = math.sqrt(max(variance, 0.0))
         return (
             float(known.weights[best]) >= config.sure_share
             and float(self._fits[best]) >= config.least_explained
@@ -302,12 +339,13 @@ class GlobalLocalization:
         )
 
     def _lasting(self) -> NDArray[np.bool_]:
-        """Hypotheses (H,) that explain enough, and have done so for some time where much has been seen."""
+        """Hypotheses (H,) that explain enough, and for some time where much has been seen."""
         known = self._known
         enough = self._fits >= self.config.least_explained
         if self._overview < _MANY_LOOKS:
             return enough
-        return np.asarray(enough & (known.ages >= min(_LASTING_SHARE * self._overview, _LASTING_LOOKS)))
+        least_age = min(_LASTING_SHARE * self._overview, _LASTING_LOOKS)
+        return np.asarray(enough & (known.ages >= least_age))
 
     def _waiting(self, reason: str) -> Result:
         return Result(State.WAITING, reason, ())
@@ -320,15 +358,19 @@ class GlobalLocalization:
         poses, weights, shares = moved(known.poses, motion), known.weights, known.shares_explained
         order = np.lexsort((-shares, -known.log_weights))
         hypotheses = tuple(
-            Hypothesis(poses[k], known.covariances[k], float(weights[k]), float(shares[k])) for k in order.tolist()
+            Hypothesis(poses[k], known.covariances[k], float(weights[k]), float(shares[k]))
+            for k in order.tolist()
         )
         best = hypotheses[0]
         if self.is_sure:
-            return Result(State.LOCALIZED, f'one place explains {best.explained:.0%} of what was seen', hypotheses)
+            reason = f'one place explains {best.explained:.0%} of what was seen'
+            return Result(State.LOCALIZED, reason, hypotheses)
         if self._way_m >= self.config.foreign_way_m and not self._lasting().any():
             share = self.config.least_explained * self._usual
-            return Result(State.NOT_IN_MAP, f'no place explains {share:.0%} of what was seen for long', hypotheses)
+            reason = f'no place explains {share:.0%} of what was seen for long'
+            return Result(State.NOT_IN_MAP, reason, hypotheses)
         likely = int((weights > 0.05 * weights.max()).sum())
         if likely > 1:
             return Result(State.AMBIGUOUS, f'{likely} places explain what was seen', hypotheses)
-        return Result(State.SEARCHING, f'one place, not yet sure: {best.explained:.0%} explained', hypotheses)
+        reason = f'one place, not yet sure: {best.explained:.0%} explained'
+        return Result(State.SEARCHING, reason, hypotheses)

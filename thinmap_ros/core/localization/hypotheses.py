@@ -11,10 +11,12 @@ from thinmap_ros.core.localization.judging import LOG_ODDS_A_BEAM, SILENT_COUNTS
 from thinmap_ros.core.localization.search import distinct_indices, moved
 from thinmap_ros.core.se2 import Array
 
-# Shares of the beams that fall to either side at edges: by chance, and, as the cells of the map lie, always.
+# Shares of the beams that fall to either side at edges: by chance, and, as the cells of the map
+# lie, always.
 _EDGE_SHARE, _LASTING_SHARE = 0.05, 0.01
 _SIGMAS = 3.0
-# Now and then a whole look tells nonsense (someone stands in the way, a door has moved): no look settles the matter.
+# Now and then a whole look tells nonsense (someone stands in the way, a door has moved): no look
+# settles the matter.
 _MOST_A_LOOK = 14.0  # beams
 _LEAST_LOG_WEIGHT = -14.0
 _MOST = 400
@@ -35,19 +37,20 @@ def missed_beams(judged: tuple[Array, Array], beams: int) -> Array:
 
 
 def allowed_beams(beams: Array) -> Array:
-    """How many of so many beams, over all looks, one place may explain more than another that is just like it."""
+    """How many of so many beams, over all looks, one place may explain more than its double."""
     spread = np.sqrt(beams * _EDGE_SHARE * (1.0 - _EDGE_SHARE))
     return np.asarray(_SIGMAS * spread + _LASTING_SHARE * beams)
 
 
 @dataclass(eq=False)
 class Hypotheses:
-    """Places of the robot as arrays over hypotheses (H), and samples (N, 3) that belong to them (N,), in order.
+    """Places of the robot as arrays over hypotheses (H); samples (N, 3) and owners (N,), in order.
 
-    poses (H, 3); priors (H,): log odds of each from the beginning; missed, compared (H,): beams that it did not explain
-    while the best one did, and of how many; covariances (H, 3, 3); ages (H,): independent looks since each was found;
-    explained, asked, beams (H,): sums over looks of the beams that the map explains, of those it says something
-    about, and of all; older ones count less.
+    poses (H, 3); priors (H,): log odds of each from the beginning; missed, compared (H,): beams
+    that it did not explain while the best one did, and of how many; covariances (H, 3, 3);
+    ages (H,): independent looks since each was found; explained, asked, beams (H,): sums over looks
+    of the beams that the map explains, of those it says something about, and of all; older ones
+    count less.
     """
 
     poses: Array
@@ -65,10 +68,11 @@ class Hypotheses:
     @staticmethod
     def none() -> 'Hypotheses':
         """No hypothesis."""
-        empty = np.empty(0)
+        empty, covariances = np.empty(0), np.empty((0, 3, 3))
+        poses, samples = np.empty((0, 3)), np.empty((0, 3))
+        owners = np.empty(0, dtype=np.int64)
         return Hypotheses(
-            np.empty((0, 3)), empty, empty, empty, np.empty((0, 3, 3)), empty, empty, empty, empty,
-            np.empty((0, 3)), np.empty(0, dtype=np.int64),
+            poses, empty, empty, empty, covariances, empty, empty, empty, empty, samples, owners
         )
 
     def __len__(self) -> int:
@@ -83,9 +87,9 @@ class Hypotheses:
     def log_weights(self) -> Array:
         """Log odds (H,), the best one 0.
 
-        Differences that chance brings about at edges count for nothing, however often they come: two rooms that look
-        the same stay equally likely. What is allowed for chance grows with the root of the looks, what a place that is
-        not the right one misses grows with the looks.
+        Differences that chance brings about at edges count for nothing, however often they come:
+        two rooms that look the same stay equally likely. What is allowed for chance grows with the
+        root of the looks, what a place that is not the right one misses grows with the looks.
         """
         if not len(self):
             return np.empty(0)
@@ -103,9 +107,13 @@ class Hypotheses:
 
     @property
     def shares_explained(self) -> Array:
-        """Share of the beams that each explains, over its looks, of those that the map says something about, (H,)."""
+        """Share (H,) of the beams of its looks that each explains.
+
+        Only beams that the map says something about count.
+        """
         # Where that are few, they prove little.
-        return np.asarray(self.explained / np.maximum(np.maximum(self.asked, _LEAST_ASKED * self.beams), 1e-9))
+        asked = np.maximum(self.asked, _LEAST_ASKED * self.beams)
+        return np.asarray(self.explained / np.maximum(asked, 1e-9))
 
     def move(self, motion: Array, noise: tuple[float, float], rng: np.random.Generator) -> None:
         """Move all by odometry (3,), robot frame; samples with noise: 1 sigma, m and rad."""
@@ -116,7 +124,10 @@ class Hypotheses:
         self.covariances = self.covariances + np.diag(spread**2)
 
     def take_evidence(self, judged: tuple[Array, Array], beams: int, novelty: float) -> None:
-        """Take in a look: what each makes of so many beams (see missed_beams), and how much of a new look it is."""
+        """Take in a look: what each makes of so many beams (see missed_beams).
+
+        novelty: how much of a new look it is.
+        """
         self.missed = self.missed + novelty * missed_beams(judged, beams)
         self.compared = self.compared + novelty * beams
         fade = _MEMORY**novelty
@@ -125,24 +136,34 @@ class Hypotheses:
         self.beams = fade * self.beams + novelty * beams
         self.ages = self.ages + novelty
 
-    def add(self, poses: Array, prior: float, missed: Array, judged: tuple[Array, Array], beams: float) -> None:
+    def add(
+        self, poses: Array, prior: float, missed: Array, judged: tuple[Array, Array], beams: float
+    ) -> None:
         """Take up new ones (N, 3).
 
-        prior: log odds against those that are known; judged: what they make of so many beams of earlier looks, and
-        missed: how many of these they missed more than the best of the known ones, (N,) each.
+        prior: log odds against those that are known; judged: what they make of so many beams of
+        earlier looks, and missed: how many of these they missed more than the best of the known
+        ones, (N,) each.
         """
         count = len(poses)
-        fresh = np.broadcast_to(np.diag([_NEW_SIGMA_M**2, _NEW_SIGMA_M**2, _NEW_SIGMA_RAD**2]), (count, 3, 3))
+        covariance = np.diag([_NEW_SIGMA_M**2, _NEW_SIGMA_M**2, _NEW_SIGMA_RAD**2])
+        fresh = np.broadcast_to(covariance, (count, 3, 3))
         base = float(self.missed.min()) if len(self) else 0.0
         for name, values in (
-            ('poses', poses), ('priors', np.full(count, prior)), ('missed', base + missed),
-            ('compared', np.full(count, beams)), ('covariances', fresh), ('ages', np.zeros(count)),
-            ('explained', judged[0]), ('asked', beams - judged[1]), ('beams', np.full(count, beams)),
+            ('poses', poses),
+            ('priors', np.full(count, prior)),
+            ('missed', base + missed),
+            ('compared', np.full(count, beams)),
+            ('covariances', fresh),
+            ('ages', np.zeros(count)),
+            ('explained', judged[0]),
+            ('asked', beams - judged[1]),
+            ('beams', np.full(count, beams)),
         ):
             setattr(self, name, np.concatenate([getattr(self, name), values]))
 
     def prune(self) -> None:
-        """Drop what is out of the question, and of those that have come together all but the likeliest."""
+        """Drop what is out of the question, and of what has come together all but the likeliest."""
         logs = self.log_weights
         order = np.lexsort((self.missed, -logs))
         order = order[logs[order] > _LEAST_LOG_WEIGHT]
@@ -151,14 +172,18 @@ class Hypotheses:
             return
         renumbered = np.full(len(self.poses), -1)
         renumbered[kept] = np.arange(len(kept))
-        for name in ('poses', 'priors', 'missed', 'compared', 'covariances', 'ages', 'explained', 'asked', 'beams'):
+        names = ('poses', 'priors', 'missed', 'compared', 'covariances', 'ages')
+        for name in (*names, 'explained', 'asked', 'beams'):
             setattr(self, name, getattr(self, name)[kept])
         owners = renumbered[self.owners]
         order = np.argsort(owners, kind='stable')[int((owners < 0).sum()) :]
         self.samples, self.owners = self.samples[order], owners[order]
 
     def some_samples(self, total: int) -> Array:
-        """Some of the samples of each, as many for all: (H, K, 3); those of one without any are its pose."""
+        """Some of the samples of each, as many for all: (H, K, 3).
+
+        Those of one without any are its pose.
+        """
         count = max(1, total // len(self))
         bounds = np.searchsorted(self.owners, np.arange(len(self) + 1))
         sizes = np.diff(bounds)
@@ -167,7 +192,10 @@ class Hypotheses:
         return np.where(sizes[:, None, None] > 0, some, self.poses[:, None])
 
     def best_samples(self, log_likelihoods: Array) -> Array:
-        """Of the samples of each, the one with the highest log likelihood (N,); its pose where it has none: (H, 3)."""
+        """Of the samples of each, the one with the highest log likelihood (N,).
+
+        Its pose where it has none: (H, 3).
+        """
         best = self.poses.copy()
         order = np.lexsort((log_likelihoods, self.owners))
         last = np.flatnonzero(np.diff(self.owners, append=-1))
@@ -180,17 +208,27 @@ class Hypotheses:
         _moments(self.samples, log_likelihoods, bounds, self.poses, self.covariances)
 
     def resample(self, log_likelihoods: Array | None, total: int, rng: np.random.Generator) -> None:
-        """As many samples for each, drawn from its own by weight; new ones get theirs from their covariance."""
+        """As many samples for each, drawn from its own by weight.
+
+        New ones get theirs from their covariance.
+        """
         count = len(self)
         if not count:
             return
         quotas = np.full(count, total // count)
         quotas[: total - int(quotas.sum())] += 1
         bounds = np.searchsorted(self.owners, np.arange(count + 1))
-        log_likelihoods = np.zeros(len(self.samples)) if log_likelihoods is None else log_likelihoods
+        if log_likelihoods is None:
+            log_likelihoods = np.zeros(len(self.samples))
         spreads = np.asarray(np.linalg.cholesky(self.covariances + np.diag([1e-8, 1e-8, 1e-8])))
         self.samples = _resampled(
-            self.samples, log_likelihoods, bounds, quotas, self.poses, spreads, rng.random(count),
+            self.samples,
+            log_likelihoods,
+            bounds,
+            quotas,
+            self.poses,
+            spreads,
+            rng.random(count),
             rng.normal(size=(total, 3)),
         )
         self.owners = np.repeat(np.arange(count), quotas)
@@ -201,8 +239,13 @@ class Hypotheses:
 
 
 @kernel
-def _moments(samples: Array, logs: Array, bounds: NDArray[np.int64], poses: Array, covariances: Array) -> None:
-    """Covariances (H, 3, 3) of weighted samples about their mean; those without samples keep theirs."""
+def _moments(
+    samples: Array, logs: Array, bounds: NDArray[np.int64], poses: Array, covariances: Array
+) -> None:
+    """Covariances (H, 3, 3) of weighted samples about their mean.
+
+    Those without samples keep theirs.
+    """
     for h in range(len(poses)):
         low, high = bounds[h], bounds[h + 1]
         if low == high:
@@ -235,9 +278,11 @@ def _resampled(
     starts: Array,
     normal: Array,
 ) -> Array:
-    """Samples drawn by weight within each group, a comb for each; groups without any are drawn round their poses.
+    """Samples drawn by weight within each group, a comb for each.
 
-    spreads (H, 3, 3): lower triangular; starts (H,): in [0, 1); normal (N, 3): standard normal numbers.
+    Groups without any are drawn round their poses.
+    spreads (H, 3, 3): lower triangular; starts (H,): in [0, 1); normal (N, 3): standard normal
+    numbers.
     """
     result = np.empty((quotas.sum(), 3))
     at = 0
@@ -263,4 +308,3 @@ def _resampled(
             result[at] = samples[k]
             at += 1
     return result
-

@@ -6,37 +6,68 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.jit import inlined, kernel
-from thinmap_ros.core.localization.places import NEAR_UNIT_M, SIGHT_UNIT_M, UNKNOWN, WALL, Bytes, Short, free_way
+from thinmap_ros.core.localization.places import (
+    NEAR_UNIT_M,
+    SIGHT_UNIT_M,
+    UNKNOWN,
+    WALL,
+    Bytes,
+    Short,
+    free_way,
+)
 from thinmap_ros.core.se2 import Array
 
 _ASIDE_M = 0.12  # a beam is stopped only where those beside it, this far off, are stopped too
 _NO, _YES, _SAYS_NOTHING = 0, 1, 2
-# Nodes lie within 13,000 units of their block; squares of differences from what is farther off than this do not fit.
+# Nodes lie within 13,000 units of their block; squares of differences from what is farther off than
+# this do not fit.
 _AFAR, _NOWHERE = 16_000.0, 2**31 - 1
-_SIGMAS, _STEPS = 5.0, 2048  # beyond so many sigma nodes do not agree at all; steps of squared distance up to there
+_SIGMAS = 5.0  # beyond so many sigma nodes do not agree at all
+_STEPS = 2048  # of squared distance up to there
 
 
 @kernel
 def range_scores(
-    poses: Array, ends: Array, near: Bytes, origin: tuple[float, float], resolution: float, table: Array
+    poses: Array,
+    ends: Array,
+    near: Bytes,
+    origin: tuple[float, float],
+    resolution: float,
+    table: Array,
 ) -> Array:
-    """Sum over the beams' ends of a table's value at their distance from the nearest wall, for each pose, (N,).
+    """Sum (N,) over the beams' ends of a table's value at their distance from the nearest wall.
 
-    poses (N, 3); ends (B, 2): of beams that met something, robot frame; near (H, W): see Places; table (256,): by
-    that distance; its last value counts outside the map.
+    poses (N, 3); ends (B, 2): of beams that met something, robot frame; near (H, W): see Places;
+    table (256,): by that distance; its last value counts outside the map.
     """
     rows, cols = near.shape
     scores = np.zeros(len(poses))
     for i in range(len(poses)):
         scores[i] = _range_score(
-            poses[i, 0] - origin[0], poses[i, 1] - origin[1], poses[i, 2], ends, near, rows, cols, resolution, table
+            poses[i, 0] - origin[0],
+            poses[i, 1] - origin[1],
+            poses[i, 2],
+            ends,
+            near,
+            rows,
+            cols,
+            resolution,
+            table,
         )
     return scores
 
 
 @inlined
 def _range_score(
-    x: float, y: float, theta: float, ends: Array, near: Bytes, rows: int, cols: int, resolution: float, table: Array
+    x: float,
+    y: float,
+    theta: float,
+    ends: Array,
+    near: Bytes,
+    rows: int,
+    cols: int,
+    resolution: float,
+    table: Array,
 ) -> float:
     c, s = math.cos(theta) / resolution, math.sin(theta) / resolution
     at_x, at_y = x / resolution, y / resolution
@@ -63,11 +94,12 @@ def node_scores(
 ) -> Array:
     """Log likelihood ratio of the observed nodes at each pose, against a pose anywhere, (N,).
 
-    poses (N, 3); seen (K, 2): observed nodes, robot frame, and their kinds (K,); sights: blocks, first and in_sight of
-    Places, blocks block_m wide. For each kind: found: chance that an observed node is one of the map; spread: 1 sigma
-    of its place, m; gain: how much likelier its place is there than anywhere.
-    An observed node agrees with one that the map has in sight of the pose when distance and angle agree; both do
-    exactly when it lies at the same place. Source: topological map paper section 3.1, steps 3 to 6.
+    poses (N, 3); seen (K, 2): observed nodes, robot frame, and their kinds (K,); sights: blocks,
+    first and in_sight of Places, blocks block_m wide. For each kind: found: chance that an observed
+    node is one of the map; spread: 1 sigma of its place, m; gain: how much likelier its place is
+    there than anywhere. An observed node agrees with one that the map has in sight of the pose when
+    distance and angle agree; both do exactly when it lies at the same place.
+    Source: topological map paper section 3.1, steps 3 to 6.
     """
     blocks, first, in_sight = sights
     table = _ratios_by_distance(found, gain)
@@ -94,7 +126,7 @@ def node_scores(
 
 @kernel
 def _ratios_by_distance(found: Array, gain: Array) -> Array:
-    """Log likelihood ratio of an observed node of each kind (kinds, _STEPS + 1), in steps of squared distance."""
+    """Log likelihood ratio of a node, by kind and step of squared distance (kinds, _STEPS + 1)."""
     table = np.empty((len(found), _STEPS + 1))
     for kind in range(len(found)):
         for k in range(_STEPS + 1):
@@ -105,8 +137,9 @@ def _ratios_by_distance(found: Array, gain: Array) -> Array:
 
 @inlined
 def _nearest_squared(all_x: Short, all_y: Short, x: float, y: float) -> float:
-    """Squared distance from (x, y) to the nearest of points (K,), all in whole units; a huge one where there is none.
+    """Squared distance from (x, y) to the nearest of points (K,), all in whole units.
 
+    A huge one where there is none.
     In numbers of four bytes throughout, so that the compiler takes eight points at a time.
     """
     at_x, at_y = np.int32(min(max(x, -_AFAR), _AFAR)), np.int32(min(max(y, -_AFAR), _AFAR))
@@ -130,10 +163,13 @@ def refine(
     expected: Array,
     information: Array,
 ) -> tuple[Array, Array]:
-    """Poses (N, 3) moved uphill on their range score: along x, y and heading by ever smaller steps; their scores (N,).
+    """Poses (N, 3) moved uphill on their range score: along x, y and heading by ever smaller steps.
 
-    steps (S, 2): m and rad; at each, up to `rounds` times the best of six neighbours is taken. Taken off the score is
-    half the squared distance from the expected poses (N, 3), measured by information matrices (N, 3, 3).
+    Also their scores (N,).
+
+    steps (S, 2): m and rad; at each, up to `rounds` times the best of six neighbours is taken.
+    Taken off the score is half the squared distance from the expected poses (N, 3), measured by
+    information matrices (N, 3, 3).
     """
     rows, cols = near.shape
     result, scores = poses.copy(), np.zeros(len(poses))
@@ -150,8 +186,12 @@ def refine(
                     d_x = sign * steps[step, 0] if k < 2 else 0.0
                     d_y = sign * steps[step, 0] if 2 <= k < 4 else 0.0
                     turn = sign * steps[step, 1] if k >= 4 else 0.0
-                    score = _range_score(x + d_x, y + d_y, theta + turn, ends, near, rows, cols, resolution, table)
-                    score -= _unlikely(x + d_x - mid[0], y + d_y - mid[1], theta + turn - mid[2], information[i])
+                    score = _range_score(
+                        x + d_x, y + d_y, theta + turn, ends, near, rows, cols, resolution, table
+                    )
+                    score -= _unlikely(
+                        x + d_x - mid[0], y + d_y - mid[1], theta + turn - mid[2], information[i]
+                    )
                     if score > best + 1e-9:
                         best, move = score, k
                 if move < 0:
@@ -160,16 +200,21 @@ def refine(
                 x += sign * steps[step, 0] if move < 2 else 0.0
                 y += sign * steps[step, 0] if 2 <= move < 4 else 0.0
                 theta += sign * steps[step, 1] if move >= 4 else 0.0
-        result[i, 0], result[i, 1], result[i, 2], scores[i] = x + origin[0], y + origin[1], theta, best
+        result[i, 0], result[i, 1] = x + origin[0], y + origin[1]
+        result[i, 2], scores[i] = theta, best
     return result, scores
 
 
 @inlined
 def _unlikely(x: float, y: float, turn: float, information: Array) -> float:
-    """Half the squared length of a difference of poses, measured by an information matrix (3, 3)."""
+    """Half the squared length of a difference of poses, by an information matrix (3, 3)."""
     turn = math.pi - (math.pi - turn) % (2.0 * math.pi)
-    squared = x * x * information[0, 0] + y * y * information[1, 1] + turn * turn * information[2, 2]
-    squared += 2.0 * (x * y * information[0, 1] + x * turn * information[0, 2] + y * turn * information[1, 2])
+    squared = (
+        x * x * information[0, 0] + y * y * information[1, 1] + turn * turn * information[2, 2]
+    )
+    squared += 2.0 * (
+        x * y * information[0, 1] + x * turn * information[0, 2] + y * turn * information[1, 2]
+    )
     half: float = 0.5 * squared
     return half
 
@@ -186,14 +231,14 @@ def explained(
     resolution: float,
     tolerance: tuple[float, float],
 ) -> tuple[Array, Array]:
-    """How many of the beams the map explains from each pose, and of how many it says nothing, (N,) each.
+    """How many beams the map explains from each pose, and of how many it says nothing, (N,) each.
 
     Explained is what could have come about as measured.
 
-    poses (N, 3): of the robot; laser (3,): on it; ranges, bearings, met (B,): see Observation; maps: states and near
-    of Places; tolerance: in m, and in m for each m of range. A beam that met something must end beside a wall, one
-    that met nothing nowhere; on its way there must be no wall. Of what ends in
-    or passes through the unknown the map says nothing.
+    poses (N, 3): of the robot; laser (3,): on it; ranges, bearings, met (B,): see Observation;
+    maps: states and near of Places; tolerance: in m, and in m for each m of range. A beam that met
+    something must end beside a wall, one that met nothing nowhere; on its way there must be no
+    wall. Of what ends in or passes through the unknown the map says nothing.
     """
     counts, silent = np.zeros(len(poses)), np.zeros(len(poses))
     for i in range(len(poses)):
@@ -212,7 +257,13 @@ def explained(
 
 @inlined
 def _explains(
-    maps: tuple[Bytes, Bytes], x: float, y: float, angle: float, range_m: float, met: bool, slack: float,
+    maps: tuple[Bytes, Bytes],
+    x: float,
+    y: float,
+    angle: float,
+    range_m: float,
+    met: bool,
+    slack: float,
     resolution: float,
 ) -> int:
     """Whether the map explains a beam from a point (x, y, in cells): _YES, _NO or _SAYS_NOTHING."""
@@ -232,7 +283,8 @@ def _explains(
         if state == UNKNOWN and way < most:
             answer = _SAYS_NOTHING
         elif state == WALL and way < most:
-            # A beam that grazes a wall, or passes close by an edge, is off by less than a body's width.
+            # A beam that grazes a wall, or passes close by an edge, is off by less than a body's
+            # width.
             aside = _ASIDE_M / resolution
             left, left_state = free_way(states, x - s * aside, y + c * aside, angle, most)
             right, right_state = free_way(states, x + s * aside, y - c * aside, angle, most)
@@ -245,10 +297,13 @@ def _explains(
 def spot_scores(
     around: Bytes, low: Bytes, high: Bytes, least: int
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
-    """Spots and headings from which at least so many directions show what was measured: (spot, heading, how many).
+    """Spots and headings from which at least so many directions show what was measured.
 
-    around (P, D): see Places; low, high (D,): what is measured towards each direction of the robot lies between; 0
-    and 255 where nothing is known. Of neighbouring headings of a spot, the best ones are kept.
+    Returns spot, heading and how many.
+
+    around (P, D): see Places; low, high (D,): what is measured towards each direction of the robot
+    lies between; 0 and 255 where nothing is known. Of neighbouring headings of a spot, the best
+    ones are kept.
     """
     spots, directions = around.shape
     counts = np.empty(directions, dtype=np.int32)

@@ -22,9 +22,9 @@ _P_FREE, _P_OCCUPIED = 0.2, 0.8
 class Observation:
     """Beams and nodes of one scan in the robot frame.
 
-    laser (3,): its pose on the robot; ranges_m, bearings_rad (B,): beams from there, ranges cut at what is usable;
-    ends (B, 2): where they end; met (B,): whether they met something there;
-    nodes (K, 2): places of the nodes of the scan's topological map, and their kinds (K,).
+    laser (3,): its pose on the robot; ranges_m, bearings_rad (B,): beams from there, ranges cut at
+    what is usable; ends (B, 2): where they end; met (B,): whether they met something there; nodes
+    (K, 2): places of the nodes of the scan's topological map, and their kinds (K,).
     """
 
     laser: Array
@@ -73,8 +73,11 @@ def observed_nodes(
     half = config.active_window_m / 2.0
     grid = OccupancyGrid(
         OccupancyConfig(
-            resolution_m=resolution_m, p_free=_P_FREE, p_occupied=_P_OCCUPIED,
-            usable_range_m=max(half, 0.5), no_return_range_m=half,
+            resolution_m=resolution_m,
+            p_free=_P_FREE,
+            p_occupied=_P_OCCUPIED,
+            usable_range_m=max(half, 0.5),
+            no_return_range_m=half,
         )
     )
     grid.update(scan, np.zeros(3))
@@ -85,10 +88,12 @@ def observed_nodes(
 
 
 def profile(observation: Observation) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Range in each of DIRECTIONS round the robot: ranges (DIRECTIONS,), m, which are known, and which met something.
+    """Range in each of DIRECTIONS round the robot.
 
-    Direction k covers the bearings k / DIRECTIONS of a turn, robot frame; of several beams the one nearest to its
-    middle counts. Ranges are cut at what `Places.around` can hold.
+    Ranges (DIRECTIONS,), m, which are known, and which met something.
+
+    Direction k covers the bearings k / DIRECTIONS of a turn, robot frame; of several beams the one
+    nearest to its middle counts. Ranges are cut at what `Places.around` can hold.
     """
     most = 254 * RANGE_UNIT_M
     away = observation.ends

@@ -35,13 +35,14 @@ FREE, WALL, UNKNOWN = 0, 1, 2
 class Places:
     """A map as a lost robot looks at it; all in the map frame.
 
-    frame: of the cells; states (H, W) uint8: FREE, WALL or UNKNOWN; near (H, W) uint8: distance from a cell to the
-    nearest wall, in NEAR_UNIT_M, at most 255; standing (N, 2) int32: cells in which the robot can stand;
-    spots (P, 2): places among these, a spacing apart, and around (P, DIRECTIONS) uint8: what a laser would measure
-    from there towards the headings k / DIRECTIONS of a turn, in RANGE_UNIT_M; spacing_m: between the spots;
-    nodes (M, 2): of the topological map; blocks, first, in_sight (2, K): x and y, in SIGHT_UNIT_M from the corner of
-    block (i, j) of the map, of the nodes in sight of it are in_sight[:, first[blocks[i, j]] : first[blocks[i, j] + 1]];
-    blocks are block_cells wide.
+    frame: of the cells; states (H, W) uint8: FREE, WALL or UNKNOWN; near (H, W) uint8: distance
+    from a cell to the nearest wall, in NEAR_UNIT_M, at most 255; standing (N, 2) int32: cells in
+    which the robot can stand; spots (P, 2): places among these, a spacing apart, and
+    around (P, DIRECTIONS) uint8: what a laser would measure from there towards the headings
+    k / DIRECTIONS of a turn, in RANGE_UNIT_M; spacing_m: between the spots; nodes (M, 2): of the
+    topological map; blocks, first, in_sight (2, K): x and y, in SIGHT_UNIT_M from the corner of
+    block (i, j) of the map, of the nodes in sight of it are
+    in_sight[:, first[blocks[i, j]] : first[blocks[i, j] + 1]]; blocks are block_cells wide.
     """
 
     frame: GridFrame
@@ -67,27 +68,45 @@ class Places:
         return sum(value.nbytes for value in vars(self).values() if isinstance(value, np.ndarray))
 
     @staticmethod
-    def of(patch: GridPatch, topology: TopologicalMap, config: GlobalLocalizationConfig) -> 'Places':
+    def of(
+        patch: GridPatch, topology: TopologicalMap, config: GlobalLocalizationConfig
+    ) -> 'Places':
         """Places of a map and its topological map.
 
-        Raises InputError where there is no free cell on which the robot can stand, no wall, or no node.
+        Raises InputError where there is no free cell on which the robot can stand, no wall, or no
+        node.
         """
         if not topology.nodes:
             raise InputError('topology without nodes: expected that of the map')
-        states = np.where(patch.free, FREE, np.where(patch.occupied, WALL, UNKNOWN)).astype(np.uint8)
+        others = np.where(patch.occupied, WALL, UNKNOWN)
+        states = np.where(patch.free, FREE, others).astype(np.uint8)
         if not patch.occupied.any():
             raise InputError(f'map of {patch.shape} cells without an occupied one: expected walls')
         near = near_walls(states, patch.frame.resolution)
-        standing = np.argwhere((states == FREE) & (near * NEAR_UNIT_M >= config.robot_radius_m)).astype(np.int32)
+        has_room = near * NEAR_UNIT_M >= config.robot_radius_m
+        standing = np.argwhere((states == FREE) & has_room).astype(np.int32)
         if not len(standing):
-            raise InputError(f'map of {patch.shape} cells: no free place for a robot of {config.robot_radius_m} m')
+            raise InputError(
+                f'map of {patch.shape} cells: no free place for a robot '
+                f'of {config.robot_radius_m} m'
+            )
         spots, spacing_m = _spots(standing, patch.frame)
         around = ranges_around(states, _in_cells(spots, patch.frame), patch.frame.resolution)
         nodes = np.array([node.position for node in topology.nodes.values()])
         block_cells = max(1, round(_BLOCK_M / patch.frame.resolution))
         blocks, first, in_sight = _sights(states, standing, nodes, patch.frame, block_cells, config)
         return Places(
-            patch.frame, states, near, standing, spots, around, spacing_m, nodes, blocks, first, in_sight,
+            patch.frame,
+            states,
+            near,
+            standing,
+            spots,
+            around,
+            spacing_m,
+            nodes,
+            blocks,
+            first,
+            in_sight,
             block_cells,
         )
 
@@ -98,7 +117,10 @@ def _in_cells(points: Array, frame: GridFrame) -> Array:
 
 
 def _spots(standing: NDArray[np.int32], frame: GridFrame) -> tuple[Array, float]:
-    """Of the cells (N, 2), the one nearest to the middle of each square of a spacing: points (P, 2), spacing in m."""
+    """Of the cells (N, 2), the one nearest to the middle of each square of a spacing.
+
+    Returns points (P, 2), and the spacing in m.
+    """
     spacing = max(_SPACING_M, math.sqrt(len(standing) * frame.resolution**2 / _MOST_PLACES))
     edge = max(1, round(spacing / frame.resolution))
     squares = standing // edge
@@ -112,7 +134,10 @@ def _spots(standing: NDArray[np.int32], frame: GridFrame) -> tuple[Array, float]
 
 @kernel
 def near_walls(states: Bytes, resolution: float) -> Bytes:
-    """Distance between the centres of each cell (H, W) and of the nearest wall, in NEAR_UNIT_M, at most 255; exact."""
+    """Distance between the centres of each cell (H, W) and of the nearest wall; exact.
+
+    In NEAR_UNIT_M, at most 255.
+    """
     rows, cols = states.shape
     reach = int(_NEAR_CAP * NEAR_UNIT_M / resolution) + 1
     column = np.full((rows, cols), reach + 1, dtype=np.int16)
@@ -142,8 +167,9 @@ def near_walls(states: Bytes, resolution: float) -> Bytes:
 
 @kernel
 def free_way(states: Bytes, x: float, y: float, angle: float, most: float) -> tuple[float, int]:
-    """Way in cells from a point (x, y, in cells) to the border of the first cell that is not free, and its state.
+    """Way from a point (x, y) to the border of the first cell that is not free, and its state.
 
+    Way, x and y in cells.
     FREE where there is none within `most`; UNKNOWN where the ray leaves the map.
     """
     rows, cols = states.shape
@@ -164,7 +190,10 @@ def free_way(states: Bytes, x: float, y: float, angle: float, most: float) -> tu
 
 @kernel
 def ranges_around(states: Bytes, points: Array, resolution: float) -> Bytes:
-    """Ranges in all DIRECTIONS from points (P, 2), x and y in cells, in RANGE_UNIT_M, (P, DIRECTIONS); 255: farther."""
+    """Ranges (P, DIRECTIONS) in all directions from points (P, 2), x and y in cells.
+
+    In RANGE_UNIT_M; 255: farther.
+    """
     around = np.empty((len(points), DIRECTIONS), dtype=np.uint8)
     most = 255 * RANGE_UNIT_M / resolution
     for i in range(len(points)):
@@ -187,15 +216,17 @@ def _sights(
     rows, cols = states.shape
     blocks = np.full((rows // block_cells + 1, cols // block_cells + 1), -1, dtype=np.int32)
     numbers, leads = np.unique(
-        (standing // block_cells) @ np.array([blocks.shape[1], 1], dtype=np.int64), return_index=True
+        (standing // block_cells) @ np.array([blocks.shape[1], 1], dtype=np.int64),
+        return_index=True,
     )
     blocks.ravel()[numbers] = np.arange(len(numbers), dtype=np.int32)
     cells = frame.cells_of(nodes)
     reach = config.active_window_m / 2.0 / frame.resolution + block_cells
     first, in_sight = _list_sights(states == FREE, standing[leads].astype(np.int64), cells, reach)
-    # Coordinates, not numbers of nodes: samples look at these lists in no order, and each look is one short run of
-    # whole numbers, which the compiler compares several at a time.
-    corners = np.stack([numbers % blocks.shape[1], numbers // blocks.shape[1]], axis=1) * block_cells
+    # Coordinates, not numbers of nodes: samples look at these lists in no order, and each look is
+    # one short run of whole numbers, which the compiler compares several at a time.
+    across = blocks.shape[1]
+    corners = np.stack([numbers % across, numbers // across], axis=1) * block_cells
     corner = np.repeat(corners, np.diff(first), axis=0) * frame.resolution
     away = nodes[in_sight] - (frame.origin_x, frame.origin_y) - corner
     return blocks, first, np.ascontiguousarray(np.round(away / SIGHT_UNIT_M).astype(np.int16).T)
@@ -205,7 +236,10 @@ def _sights(
 def _list_sights(
     free: Mask, places: NDArray[np.int64], nodes: NDArray[np.int64], reach: float
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Of the nodes (M, 2) within a square round each place (N, 2), those in line of sight; the first of each place."""
+    """Of the nodes (M, 2) within a square round each place (N, 2), those in line of sight.
+
+    Before them, the index of the first of each place.
+    """
     first = np.zeros(len(places) + 1, dtype=np.int32)
     in_sight = np.empty(max(len(places), 64), dtype=np.int32)
     order = np.argsort(nodes[:, 1])
@@ -217,7 +251,9 @@ def _list_sights(
             node = order[k]
             if nodes[node, 1] > col + reach:
                 break
-            if abs(nodes[node, 0] - row) <= reach and line_is_clear(free, row, col, nodes[node, 0], nodes[node, 1]):
+            if abs(nodes[node, 0] - row) <= reach and line_is_clear(
+                free, row, col, nodes[node, 0], nodes[node, 1]
+            ):
                 if count == len(in_sight):
                     in_sight = np.concatenate((in_sight, np.empty_like(in_sight)))
                 in_sight[count] = node

@@ -30,10 +30,10 @@ class KeyView:
 def candidates(
     places: Places, judge: Judge, seen: Observation, drawn: Array, rng: np.random.Generator
 ) -> tuple[Array, bool]:
-    """Poses (N, 3) that explain a scan about as well as any in the map, refined, and whether these are all.
+    """Refined poses (N, 3) that explain a scan about as well as any, and whether these are all.
 
-    Every spot of the map is compared under every heading, range by range; to the best of them come the samples
-    drawn (M, 3). None where the scan shows next to nothing.
+    Every spot of the map is compared under every heading, range by range; to the best of them come
+    the samples drawn (M, 3). None where the scan shows next to nothing.
     """
     if int(seen.met.sum()) < _FEWEST_WALLS:
         return np.empty((0, 3)), False
@@ -48,19 +48,25 @@ def candidates(
 
 
 def _best_spots(places: Places, seen: Observation, rng: np.random.Generator) -> tuple[Array, bool]:
-    """Spots with headings (N, 3) whose ranges all round agree best with a scan; whether all that may be are there."""
+    """Spots with headings (N, 3) whose ranges all round agree best with a scan.
+
+    Also whether all that may be are there.
+    """
     ranges, known, met = profile(seen)
     # Off by half a spacing, by half a direction, and more where walls are seen at a slant.
     slack = places.spacing_m + ranges * (np.pi / DIRECTIONS)
-    low = np.where(known, np.clip((ranges - slack) / RANGE_UNIT_M, 0.0, 254.0), 0.0).astype(np.uint8)
-    high = np.where(known & met, np.clip((ranges + slack) / RANGE_UNIT_M, 0.0, 255.0), 255.0).astype(np.uint8)
+    nearest = np.clip((ranges - slack) / RANGE_UNIT_M, 0.0, 254.0)
+    farthest = np.clip((ranges + slack) / RANGE_UNIT_M, 0.0, 255.0)
+    low = np.where(known, nearest, 0.0).astype(np.uint8)
+    high = np.where(known & met, farthest, 255.0).astype(np.uint8)
     least = DIRECTIONS - round((1.0 - _LEAST_SHARE) * int(known.sum()))
     spots, headings, counts = matching.spot_scores(places.around, low, high, least)
     # Equals in random order: where there are too many, each has its chance.
     order = np.argsort(-(counts + rng.random(len(counts))), kind='stable')[:_MOST_SPOTS]
     turns = headings[order] * (2.0 * np.pi / DIRECTIONS)
     # Those left out must be clearly worse than the best.
-    cut = len(counts) > _MOST_SPOTS and counts[order[-1]] > counts.max() - _CLEARLY_WORSE * int(known.sum())
+    margin = _CLEARLY_WORSE * int(known.sum())
+    cut = len(counts) > _MOST_SPOTS and counts[order[-1]] > counts.max() - margin
     return np.column_stack([places.spots[spots[order]], turns]), not cut
 
 
@@ -70,7 +76,7 @@ def distinct(poses: Array, apart_m: float, apart_rad: float, most: int) -> Array
 
 
 def distinct_indices(poses: Array, apart_m: float, apart_rad: float, most: int) -> list[int]:
-    """Indices of the first of each group of poses (N, 3) that lie near each other, at most so many."""
+    """Indices of the first of each group of poses (N, 3) near each other, at most so many."""
     kept: list[int] = []
     at = np.empty((most, 3))
     for k, T in enumerate(poses):
@@ -88,9 +94,9 @@ def distinct_indices(poses: Array, apart_m: float, apart_rad: float, most: int) 
 def judged_before(
     judge: Judge, views: list[KeyView], poses: Array, T_odom_base: Array, odometry_noise: float
 ) -> tuple[Array, Array]:
-    """Beams of earlier views (V) that the map explains from poses (N, 3) held now, and of how many it says nothing.
+    """How many beams of earlier views (V) the map explains from poses (N, 3) held now.
 
-    (V, N) each, by odometry back to there.
+    Also of how many it says nothing; (V, N) each, by odometry back to there.
     """
     counts, silent = np.zeros((len(views), len(poses))), np.zeros((len(views), len(poses)))
     now, at = poses, T_odom_base

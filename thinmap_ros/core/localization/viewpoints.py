@@ -21,11 +21,13 @@ _MOST_PLACES = 8  # the likeliest, which are compared
 _WINDOW_M = 30.0
 _SPACING_M = 0.6  # of the viewpoints that are compared
 _BEARINGS = 24
-# Ranges that differ by more than this, and by this share, tell two places apart; as many as this share do so surely.
+# Ranges that differ by more than this, and by this share, tell two places apart; as many as this
+# share do so surely.
 _DIFFERENT_M, _DIFFERENT_SHARE, _ENOUGH = 0.4, 0.1, 0.25
 _LEAST_GAIN = 0.05
 _CONFIRMED_M = 5.0  # of way, where one place only is left: it has then been seen from enough sides
-_NEAREST_M, _WAY_M = 0.5, 2.0  # nearer than this only a turn shows new things; so much way costs half of what is gained
+_NEAREST_M = 0.5  # nearer than this only a turn shows new things
+_WAY_M = 2.0  # so much way costs half of what is gained
 # Places this near to each other are one that is not known closely: nothing has to tell them apart.
 _SAME_M, _SAME_RAD = 1.0, 0.35
 # Who has looked from this near, and turned no more than this away, has seen it.
@@ -34,10 +36,12 @@ _LOOKED_M, _LOOKED_RAD = 0.8, 0.8
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """A place to drive to: pose (3,) in the odometry's frame, map of what all places have in common there, and gain.
+    """A place to drive to.
 
-    The heading is towards what differs, or onwards. gain: share of the pairs of places that are told apart there, by
-    their weights; 0 where one place only is left, or where nothing is known to differ.
+    Pose (3,) in the odometry's frame, map of what all places have in common there, and gain.
+    The heading is towards what differs, or onwards. gain: share of the pairs of places that are
+    told apart there, by their weights; 0 where one place only is left, or where nothing is known to
+    differ.
     """
 
     T_odom_view: Array
@@ -54,11 +58,13 @@ def best_viewpoint(
     driving: WavefrontConfig,
     looked: Array | None = None,
 ) -> Viewpoint | None:
-    """Viewpoint for a robot at an odometry pose (3,), where T_map_odom may be any of (H, 3), with weights (H,).
+    """Viewpoint for a robot at an odometry pose (3,).
 
-    The way there is free in the map, whichever it is: it is the same motion for all of them; it may be a turn only.
-    range_m: how far views are compared; looked (M, 3): odometry poses at which it has looked already, which are of no
-    use again. Where no viewpoint in reach tells places apart, the farthest that is new; None where none is.
+    starts (H, 3): any of them may be T_map_odom, with weights (H,).
+    The way there is free in the map, whichever it is: it is the same motion for all of them; it may
+    be a turn only. range_m: how far views are compared; looked (M, 3): odometry poses at which it
+    has looked already, which are of no use again. Where no viewpoint in reach tells places apart,
+    the farthest that is new; None where none is.
     """
     looked = np.empty((0, 3)) if looked is None else looked
     starts, weights = _distinct(T_odom_base, starts, weights)
@@ -69,18 +75,23 @@ def best_viewpoint(
     worth = np.where(_is_new(at, bearings, looked), worth, 0.0) / (ways + _WAY_M)
     best = int(worth.argmax())
     if worth[best] >= _LEAST_GAIN:
-        return Viewpoint(se2.pose(at[best, 0], at[best, 1], bearings[best]), patch, float(gains[best]))
+        view = se2.pose(at[best, 0], at[best, 1], bearings[best])
+        return Viewpoint(view, patch, float(gains[best]))
     onwards = np.arctan2(at[:, 1] - T_odom_base[1], at[:, 0] - T_odom_base[0])
     onwards[ways == 0.0] = T_odom_base[2] + np.pi
     far = np.where(_is_new(at, onwards, looked), ways, -1.0)
     best = int(far.argmax())
-    return None if far[best] < 0.0 else Viewpoint(se2.pose(at[best, 0], at[best, 1], onwards[best]), patch, 0.0)
+    if far[best] < 0.0:
+        return None
+    return Viewpoint(se2.pose(at[best, 0], at[best, 1], onwards[best]), patch, 0.0)
 
 
 def _distinct(T_odom_base: Array, starts: Array, weights: Array) -> tuple[Array, Array]:
-    """The likeliest of T_map_odom (H, 3), and their weights; of those with the robot at about the same place one.
+    """The likeliest of T_map_odom (H, 3), and their weights.
 
-    What is as likely, but beside another by little, must neither close its way nor be told apart from it.
+    Of those with the robot at about the same place, one is kept.
+    What is as likely, but beside another by little, must neither close its way nor be told apart
+    from it.
     """
     order = np.argsort(-weights, kind='stable')
     robots = np.array([se2.compose(T, T_odom_base) for T in starts[order]])
@@ -89,7 +100,7 @@ def _distinct(T_odom_base: Array, starts: Array, weights: Array) -> tuple[Array,
 
 
 def _is_new(at: Array, bearings: Array, looked: Array) -> NDArray[np.bool_]:
-    """Which views from points (N, 2) to bearings (N,) are not like any pose looked from (M, 3), (N,)."""
+    """Which views from points (N, 2) to bearings (N,) are unlike all looked from (M, 3), (N,)."""
     near = np.hypot(*(at[:, None] - looked[None, :, :2]).transpose(2, 0, 1)) < _LOOKED_M
     same = np.abs(se2.wrap(bearings[:, None] - looked[None, :, 2])) < _LOOKED_RAD
     return np.asarray(~(near & same).any(axis=1))
@@ -106,15 +117,25 @@ def common_patch(places: Places, T_odom_base: Array, starts: Array) -> GridPatch
     frame = GridFrame(float(corner[0]), float(corner[1]), resolution)
     origin = (places.frame.origin_x, places.frame.origin_y)
     states = _common_states(places.states, starts, origin, corner, count, resolution)
-    cells = np.select([states == WALL, states == FREE], [np.int8(100), np.int8(0)], np.int8(UNKNOWN_CELL))
+    cells = np.select(
+        [states == WALL, states == FREE], [np.int8(100), np.int8(0)], np.int8(UNKNOWN_CELL)
+    )
     return GridPatch(frame, cells.astype(np.int8))
 
 
 @kernel
 def _common_states(
-    states: Bytes, starts: Array, origin: tuple[float, float], corner: Array, count: int, resolution: float
+    states: Bytes,
+    starts: Array,
+    origin: tuple[float, float],
+    corner: Array,
+    count: int,
+    resolution: float,
 ) -> Bytes:
-    """WALL where any of the transforms (H, 3) leads into a wall of the map, else UNKNOWN where any does, else FREE."""
+    """WALL where any of the transforms (H, 3) leads into a wall of the map.
+
+    Else UNKNOWN where any leads into the unknown, else FREE.
+    """
     result = np.full((count, count), FREE, dtype=np.uint8)
     for h in range(len(starts)):
         c, s = math.cos(starts[h, 2]), math.sin(starts[h, 2])
@@ -130,8 +151,13 @@ def _common_states(
     return result
 
 
-def _in_reach(patch: GridPatch, T_odom_base: Array, driving: WavefrontConfig) -> tuple[Array, Array]:
-    """Points (N, 2) a spacing apart to which the robot can get, and the way there, (N,), m; where it is comes first."""
+def _in_reach(
+    patch: GridPatch, T_odom_base: Array, driving: WavefrontConfig
+) -> tuple[Array, Array]:
+    """Points (N, 2) a spacing apart to which the robot can get, and the way there, (N,), m.
+
+    Where it is comes first.
+    """
     resolution, xy = patch.frame.resolution, (float(T_odom_base[0]), float(T_odom_base[1]))
     standing = standing_places(patch.free, driving.robot_radius_m, resolution)
     ways = let_out(standing, patch.free, patch.frame, xy, driving.escape_m)
@@ -144,19 +170,23 @@ def _in_reach(patch: GridPatch, T_odom_base: Array, driving: WavefrontConfig) ->
     return np.concatenate([T_odom_base[None, :2], at]), np.concatenate([[0.0], far])
 
 
-def _gains(places: Places, starts: Array, weights: Array, at: Array, range_m: float) -> tuple[Array, Array]:
-    """For points (N, 2) of the odometry's frame: share of the pairs of places that are told apart, bearing to that."""
-    resolution = places.frame.resolution
-    views = np.stack([
-        (se2.transform_points(T, at) - (places.frame.origin_x, places.frame.origin_y)) / resolution for T in starts
-    ])
+def _gains(
+    places: Places, starts: Array, weights: Array, at: Array, range_m: float
+) -> tuple[Array, Array]:
+    """Share of the pairs of places that are told apart from points (N, 2), and bearing to that.
+
+    Points and bearings are of the odometry's frame.
+    """
+    resolution, origin = places.frame.resolution, (places.frame.origin_x, places.frame.origin_y)
+    views = np.stack([(se2.transform_points(T, at) - origin) / resolution for T in starts])
     ranges = _ranges(places.states, views, starts[:, 2], range_m / resolution) * resolution
     gains, total, towards = np.zeros(len(at)), 0.0, np.zeros(len(at), dtype=np.complex128)
     unit = np.exp(2j * np.pi * np.arange(_BEARINGS) / _BEARINGS)
     for i in range(len(starts)):
         for j in range(i):
             nearer, farther = np.minimum(ranges[i], ranges[j]), np.maximum(ranges[i], ranges[j])
-            differs = farther - nearer > _DIFFERENT_M + _DIFFERENT_SHARE * nearer  # not where either is unknown
+            # Not where either is unknown.
+            differs = farther - nearer > _DIFFERENT_M + _DIFFERENT_SHARE * nearer
             pair = float(weights[i] * weights[j])
             gains += pair * np.minimum(differs.mean(axis=1) / _ENOUGH, 1.0)
             towards += pair * (differs * unit).sum(axis=1)
@@ -166,7 +196,10 @@ def _gains(places: Places, starts: Array, weights: Array, at: Array, range_m: fl
 
 @kernel
 def _ranges(states: Bytes, views: Array, headings: Array, most: float) -> NDArray[np.float64]:
-    """Ranges in cells all round from views (H, N, 2), x and y in cells, (H, N, _BEARINGS); NaN into the unknown."""
+    """Ranges in cells all round from views (H, N, 2), x and y in cells, (H, N, _BEARINGS).
+
+    NaN into the unknown.
+    """
     ranges = np.empty((views.shape[0], views.shape[1], _BEARINGS))
     for h in range(views.shape[0]):
         for i in range(views.shape[1]):

@@ -1,1 +1,4 @@
-"""Ways through the known: along edges of the topological map, over the cells of the grid, and how to drive them."""
+"""Ways through the known.
+
+Along edges of the topological map, over the cells of the grid, and how to drive them.
+"""

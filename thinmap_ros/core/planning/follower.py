@@ -1,4 +1,6 @@
-"""Path -> speed and turn rate for a differential drive: pure pursuit, with turns on the spot where the path bends hard.
+"""Path -> speed and turn rate for a differential drive.
+
+It is pure pursuit, with turns on the spot where the path bends hard.
 
 Source: Coulter, "Implementation of the pure pursuit path tracking algorithm", 1992.
 """
@@ -12,7 +14,8 @@ from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.se2 import Array, wrap
 
-# Where it is narrow: the shortest look ahead, how it grows with the room to spare, and a speed that is always allowed.
+# Where it is narrow: the shortest look ahead, how it grows with the room to spare, and a speed that
+# is always allowed.
 _SHORTEST_M, _SPARE_FACTOR, _SLOWEST_M_S = 0.1, 2.0, 0.1
 
 
@@ -23,17 +26,28 @@ class FollowerConfig(Config):
     max_speed_m_s: float = parameter(0.2, 'speed limit, m/s', low=0.01, high=5.0)
     max_turn_rad_s: float = parameter(1.0, 'turn rate limit, rad/s', low=0.05, high=10.0)
     max_acceleration_m_s2: float = parameter(0.4, 'acceleration limit, m/s^2', low=0.01, high=10.0)
-    max_turn_acceleration_rad_s2: float = parameter(2.5, 'turn acceleration limit, rad/s^2', low=0.05, high=20.0)
-    lookahead_m: float = parameter(0.35, 'distance of the point on the path that is steered for, m', low=0.05, high=5.0)
-    lookahead_s: float = parameter(0.8, 'time ahead of the point that is steered for, s', low=0.0, high=10.0)
-    stray_m: float = parameter(0.05, 'corners of the path are cut by no more than this, m', low=0.0, high=1.0)
+    max_turn_acceleration_rad_s2: float = parameter(
+        2.5, 'turn acceleration limit, rad/s^2', low=0.05, high=20.0
+    )
+    lookahead_m: float = parameter(
+        0.35, 'distance of the point on the path that is steered for, m', low=0.05, high=5.0
+    )
+    lookahead_s: float = parameter(
+        0.8, 'time ahead of the point that is steered for, s', low=0.0, high=10.0
+    )
+    stray_m: float = parameter(
+        0.05, 'corners of the path are cut by no more than this, m', low=0.0, high=1.0
+    )
     turn_in_place_rad: float = parameter(
         0.9, 'heading error from which on the robot turns on the spot, rad', low=0.1, high=3.0
     )
 
 
 class Follower:
-    """Follows one path after the other; remembers the last command, so that the acceleration limits hold."""
+    """Follows one path after the other.
+
+    Remembers the last command, so that the acceleration limits hold.
+    """
 
     def __init__(self, config: FollowerConfig) -> None:
         self.config = config
@@ -41,10 +55,13 @@ class Follower:
         self.w = 0.0
         self._turning = False
 
-    def command(self, T_map_base: Array, path: Array, dt_s: float, spare_m: float = math.inf) -> tuple[float, float]:
-        """Speed (m/s) and turn rate (rad/s) for the next dt_s along a path (K, 2) that ends where to stop.
+    def command(
+        self, T_map_base: Array, path: Array, dt_s: float, spare_m: float = math.inf
+    ) -> tuple[float, float]:
+        """Speed (m/s) and turn rate (rad/s) for the next dt_s along a path (K, 2) to a stop.
 
-        spare_m: room to either side of the path; where there is little, the robot keeps to it the more closely.
+        spare_m: room to either side of the path; where there is little, the robot keeps to it the
+        more closely.
         """
         config = self.config
         narrow = _SHORTEST_M + _SPARE_FACTOR * max(spare_m, 0.0)
@@ -54,7 +71,8 @@ class Follower:
         dx, dy = ahead_x - x, ahead_y - y
         error = wrap(math.atan2(dy, dx) - theta) if dx or dy else 0.0
         # Once turning, on until the path is nearly straight ahead: no flickering at the limit.
-        self._turning = abs(error) > (0.3 * config.turn_in_place_rad if self._turning else config.turn_in_place_rad)
+        least = 0.3 * config.turn_in_place_rad if self._turning else config.turn_in_place_rad
+        self._turning = abs(error) > least
         if self._turning:
             return self._limited(0.0, self._turn_for(error, dt_s), dt_s)
         v = min(config.max_speed_m_s, math.sqrt(2.0 * config.max_acceleration_m_s2 * rest_m))
@@ -65,22 +83,23 @@ class Follower:
         return self._limited(v, v * curvature, dt_s)
 
     def turn_to(self, T_map_base: Array, heading_rad: float, dt_s: float) -> tuple[float, float]:
-        """Speed and turn rate for the next dt_s that stop the robot and then turn it to a heading in the map frame."""
+        """Speed and turn rate for the next dt_s to stop, then turn to a heading, map frame."""
         if self.v > 0.0:
             return self.stop(dt_s)
         error = wrap(heading_rad - float(T_map_base[2]))
         return self._limited(0.0, self._turn_for(error, dt_s), dt_s)
 
     def stop(self, dt_s: float) -> tuple[float, float]:
-        """Speed and turn rate for the next dt_s that come to rest within the limits, on the arc that is being driven.
+        """Speed and turn rate for the next dt_s to come to rest on the arc that is being driven.
 
-        That arc was looked at when it was entered, up to where the robot would stand; any other may end in a wall.
+        It does so within the limits. That arc was looked at when it was entered, up to where the
+        robot would stand; any other may end in a wall.
         """
         v = max(self.v - self.config.max_acceleration_m_s2 * dt_s, 0.0)
         return self._limited(v, self.w * v / self.v if self.v > 0.0 else 0.0, dt_s)
 
     def slowed(self, v: float, w: float) -> tuple[float, float]:
-        """Take note that a command was made slower than the limits allow, for something right ahead."""
+        """Note that a command was made slower than the limits allow, for something right ahead."""
         self.v, self.w = v, w
         return v, w
 
@@ -122,11 +141,13 @@ def length_from(path: Array, first: int) -> float:
 
 
 @kernel
-def _point_ahead(path: Array, x: float, y: float, reach_m: float, stray_m: float) -> tuple[float, float, float]:
-    """Point of a path (K, 2) to steer for from (x, y), and the length left from the point nearest to (x, y), m.
+def _point_ahead(
+    path: Array, x: float, y: float, reach_m: float, stray_m: float
+) -> tuple[float, float, float]:
+    """Point of a path (K, 2) to steer for from (x, y), and the length left from the nearest one, m.
 
-    It lies up to reach_m on along the path, and less far where the straight way to it would leave the path by more
-    than stray_m: corners are not cut.
+    It lies up to reach_m on along the path, and less far where the straight way to it would leave
+    the path by more than stray_m: corners are not cut.
     """
     first, end = nearest_point(path, x, y), path.shape[0] - 1
     left_m = max(length_from(path, first), math.hypot(path[end, 0] - x, path[end, 1] - y))
@@ -142,7 +163,7 @@ def _point_ahead(path: Array, x: float, y: float, reach_m: float, stray_m: float
 
 @kernel
 def _stray(path: Array, first: int, last: int, x: float, y: float) -> float:
-    """Largest distance of the points first to last of a path from the straight line from (x, y) to the last, m."""
+    """Largest distance, m, of path points first to last from the line from (x, y) to the last."""
     dx, dy = path[last, 0] - x, path[last, 1] - y
     length = max(math.hypot(dx, dy), 1e-9)
     most = 0.0

@@ -24,9 +24,11 @@ class Route:
 
 @dataclass(frozen=True)
 class Access:
-    """Where a point joins the graph: the edge and the index into its path nearest to it, or a lone node.
+    """Where a point joins the graph.
 
-    approach_m: straight distance from the point to there; to_node_m: from the point, over there, to the nodes.
+    The edge and the index into its path nearest to it, or a lone node.
+    approach_m: straight distance from the point to there; to_node_m: from the point, over there, to
+    the nodes.
     """
 
     edge_id: int | None
@@ -38,7 +40,8 @@ class Access:
 def shortest_path(topology: TopologicalMap, start_id: int, goal_id: int) -> Route | None:
     """Shortest way from node to node by A*; None where the map joins them by no edges.
 
-    The straight distance to the goal never exceeds the way along edges, as long as edges are as long as their paths.
+    The straight distance to the goal never exceeds the way along edges, as long as edges are as
+    long as their paths.
     """
     goal = topology.nodes[goal_id]
     reached_by: dict[int, tuple[int, int]] = {}
@@ -82,7 +85,7 @@ def access(topology: TopologicalMap, x: float, y: float) -> Access | None:
 
 
 def costs_from(topology: TopologicalMap, x: float, y: float) -> dict[int, float]:
-    """Length of the shortest way from a point (m, map frame) to every node that it is joined with, m."""
+    """Length of the shortest way from a point (m, map frame) to every node joined with it, m."""
     start = access(topology, x, y)
     if start is None:
         return {}
@@ -103,15 +106,18 @@ def costs_from(topology: TopologicalMap, x: float, y: float) -> dict[int, float]
     return costs
 
 
-def costs_to(topology: TopologicalMap, from_pose: Array, goals: dict[int, Array]) -> dict[int, float]:
-    """Length of the shortest way along the graph from a pose to each goal (x, y, ...), m, where there is one.
+def costs_to(
+    topology: TopologicalMap, from_pose: Array, goals: dict[int, Array]
+) -> dict[int, float]:
+    """Length of the shortest way along the graph from a pose to each goal (x, y, ...), if any, m.
 
     A goal has the id of the node that it stands for, if that is in the map.
     """
     to_nodes = costs_from(topology, float(from_pose[0]), float(from_pose[1]))
     costs = {}
     for goal_id, goal in goals.items():
-        joins = None if goal_id in topology.nodes else access(topology, float(goal[0]), float(goal[1]))
+        x, y = float(goal[0]), float(goal[1])
+        joins = None if goal_id in topology.nodes else access(topology, x, y)
         ends = {goal_id: 0.0} if joins is None else joins.to_node_m
         ways = [to_nodes[i] + rest for i, rest in ends.items() if i in to_nodes]
         if ways:
@@ -120,7 +126,10 @@ def costs_to(topology: TopologicalMap, from_pose: Array, goals: dict[int, Array]
 
 
 def path_points(topology: TopologicalMap, route: Route) -> Array:
-    """Points (K, 2) of a route from its first node to its last, m, map frame; where edges meet, each point once."""
+    """Points (K, 2) of a route from its first node to its last, m, map frame.
+
+    Where edges meet, each point once.
+    """
     first = topology.nodes[route.node_ids[0]]
     parts = [np.array([[first.x, first.y]])]
     for node_id, edge_id in zip(route.node_ids, route.edge_ids, strict=False):
@@ -131,8 +140,9 @@ def path_points(topology: TopologicalMap, route: Route) -> Array:
 def path_between(
     topology: TopologicalMap, start_xy: tuple[float, float], goal_xy: tuple[float, float]
 ) -> Array | None:
-    """Way (K, 2) along edges between any two points, m, map frame: from each straight to the nearest edge.
+    """Way (K, 2) along edges between any two points, m, map frame.
 
+    From each straight to the nearest edge.
     None where the map is empty or does not join them.
     """
     start, goal = access(topology, *start_xy), access(topology, *goal_xy)
@@ -148,7 +158,10 @@ def path_between(
 
 
 def _ways(topology: TopologicalMap, start: Access, goal: Access) -> Iterator[tuple[float, Array]]:
-    """Over each node that the start joins to each that the goal joins; and straight along an edge that both lie on."""
+    """Over each node that the start joins to each that the goal joins.
+
+    Also straight along an edge that both lie on.
+    """
     if start.edge_id is not None and start.edge_id == goal.edge_id:
         edge = topology.edges[start.edge_id]
         piece = _piece(edge, start.index, goal.index)
@@ -157,7 +170,11 @@ def _ways(topology: TopologicalMap, start: Access, goal: Access) -> Iterator[tup
         for b, to_b in goal.to_node_m.items():
             route = shortest_path(topology, a, b)
             if route is not None:
-                parts = [_to_node(topology, start, a), path_points(topology, route), _to_node(topology, goal, b)[::-1]]
+                parts = [
+                    _to_node(topology, start, a),
+                    path_points(topology, route),
+                    _to_node(topology, goal, b)[::-1],
+                ]
                 yield to_a + route.cost_m + to_b, np.concatenate(parts)
 
 
@@ -190,7 +207,9 @@ def _length(points: Array) -> float:
     return float(np.hypot(*np.diff(points, axis=0).T).sum())
 
 
-def _route(start_id: int, goal_id: int, reached_by: dict[int, tuple[int, int]], cost: float) -> Route:
+def _route(
+    start_id: int, goal_id: int, reached_by: dict[int, tuple[int, int]], cost: float
+) -> Route:
     nodes, edges = [goal_id], []
     while nodes[-1] != start_id:
         node_id, edge_id = reached_by[nodes[-1]]

@@ -1,8 +1,10 @@
-"""How far it is over the grid from one place to many: lengths of ways only, fast enough to ask all the time.
+"""How far it is over the grid from one place to many.
 
-Chamfer steps of 5 and 7 (a fifth of a cell) in a circular bucket queue; ways are at most 8 % longer than the straight
-line. Source: Dial, "Algorithm 360: shortest-path forest with topological ordering", 1969; Borgefors, "Distance
-transformations in digital images", 1986.
+Lengths of ways only, fast enough to ask all the time.
+
+Chamfer steps of 5 and 7 (a fifth of a cell) in a circular bucket queue; ways are at most 8 % longer
+than the straight line. Source: Dial, "Algorithm 360: shortest-path forest with topological
+ordering", 1969; Borgefors, "Distance transformations in digital images", 1986.
 """
 
 import numpy as np
@@ -21,9 +23,10 @@ _FAR = 2**31 - 1
 
 
 def ways_from(allowed: Mask, start: tuple[int, int], goals: Cells) -> Array:
-    """Length, in cells, of the way over allowed cells (H, W) from a start (row, col) to each goal (N, 2), (N,).
+    """Length (N,), cells, of the way over allowed cells (H, W) from (row, col) to each goal (N, 2).
 
-    inf where there is none, and where a goal is not allowed. A start that is not allowed may be left all the same.
+    inf where there is none, and where a goal is not allowed. A start that is not allowed may be
+    left all the same.
     """
     weights = np.ascontiguousarray(allowed, dtype=np.uint8)
     steps = _ways_from(weights, start[0], start[1], np.ascontiguousarray(goals, dtype=np.int64))
@@ -31,13 +34,19 @@ def ways_from(allowed: Mask, start: tuple[int, int], goals: Cells) -> Array:
 
 
 def field_from(allowed: Mask, start: tuple[int, int]) -> Array:
-    """Length, in cells, of the way over allowed cells from a start (row, col) to each cell (H, W); inf: none."""
+    """Length, in cells, of the way over allowed cells from a start (row, col) to each cell (H, W).
+
+    inf where there is none.
+    """
     nothing = np.zeros((allowed.shape[0] + 2, allowed.shape[1] + 2), dtype=np.bool_)
     return _cells(_field(allowed.astype(np.uint8), start[0], start[1], nothing, -1)[1:-1, 1:-1])
 
 
 def coarse(allowed: Mask, factor: int) -> Mask:
-    """Squares of factor x factor cells of a mask (H, W) in which any is set, (ceil(H / factor), ceil(W / factor))."""
+    """Squares of factor x factor cells of a mask (H, W) in which any is set.
+
+    Their shape is (ceil(H / factor), ceil(W / factor)).
+    """
     return np.asarray(_coarse(allowed, factor, 0, 0))
 
 
@@ -59,9 +68,10 @@ def fine(squares: Mask, factor: int, cells: Mask) -> Mask:
 
 
 class WayTable:
-    """Ways between places of a map that grows, on a coarse grid, remembered for a while: most places stay.
+    """Ways between places of a map that grows, on a coarse grid, remembered for a while.
 
-    They may lead through the unknown, where a step counts unknown_weight times: two places may well be joined there.
+    Most places stay. Ways may lead through the unknown, where a step counts unknown_weight times:
+    two places may well be joined there.
     """
 
     def __init__(self, cell_m: float, forget_s: float, unknown_weight: int) -> None:
@@ -70,40 +80,65 @@ class WayTable:
         self._unknown_weight = unknown_weight
         self._known: dict[tuple[Key, Key], tuple[int, float]] = {}
 
-    def update(self, allowed: Mask, unknown: Mask, frame: GridFrame, places: Array, stamp_ns: int) -> Array:
-        """Lengths of the ways, m, between all places (N, 2), m, over the allowed cells (H, W) of a frame, (N, N).
+    def update(
+        self, allowed: Mask, unknown: Mask, frame: GridFrame, places: Array, stamp_ns: int
+    ) -> Array:
+        """Lengths (N, N), m, of ways between places (N, 2), m, over allowed cells (H, W).
 
-        unknown (H, W): cells that may turn out to be allowed. inf where there is no way.
+        frame: of the cells; unknown (H, W): cells that may turn out to be allowed. inf where there
+        is no way.
         """
         factor = max(1, round(self._cell_m / frame.resolution))
         # Squares on a lattice that stays when the frame grows.
-        shift = [round(origin / frame.resolution) % factor for origin in (frame.origin_y, frame.origin_x)]
+        shift = [
+            round(origin / frame.resolution) % factor for origin in (frame.origin_y, frame.origin_x)
+        ]
         weights: NDArray[np.uint8] | None = None
         cells = (frame.cells_of(places) + shift) // factor
-        first = (round(frame.origin_y / frame.resolution) // factor, round(frame.origin_x / frame.resolution) // factor)
+        first = (
+            round(frame.origin_y / frame.resolution) // factor,
+            round(frame.origin_x / frame.resolution) // factor,
+        )
         keys = [(int(row), int(col)) for row, col in cells + first]
         known = self._still_known(keys, stamp_ns)
         # From new places to all others, not from all others to each of them.
-        for i in sorted(range(len(keys)), key=lambda i: sum(_pair(keys[i], key) in known for key in keys)):
+        for i in sorted(
+            range(len(keys)), key=lambda i: sum(_pair(keys[i], key) in known for key in keys)
+        ):
             key = keys[i]
-            missing = [j for j, other in enumerate(keys) if other != key and _pair(key, other) not in known]
+            missing = [
+                j for j, other in enumerate(keys) if other != key and _pair(key, other) not in known
+            ]
             if missing:
                 if weights is None:
                     weights = self._weights(allowed, unknown, factor, shift)
-                steps = _ways_from(weights, int(cells[i, 0]), int(cells[i, 1]), np.ascontiguousarray(cells[missing]))
-                for j, way in zip(missing, (_cells(steps) * frame.resolution * factor).tolist(), strict=True):
+                goals = np.ascontiguousarray(cells[missing])
+                steps = _ways_from(weights, int(cells[i, 0]), int(cells[i, 1]), goals)
+                ways = (_cells(steps) * frame.resolution * factor).tolist()
+                for j, way in zip(missing, ways, strict=True):
                     known[_pair(key, keys[j])] = (stamp_ns, way)
         self._known = known
-        return _table([[0.0 if a == b else known[_pair(a, b)][1] for b in keys[:i]] for i, a in enumerate(keys)])
+        below = [
+            [0.0 if a == b else known[_pair(a, b)][1] for b in keys[:i]] for i, a in enumerate(keys)
+        ]
+        return _table(below)
 
-    def _weights(self, allowed: Mask, unknown: Mask, factor: int, shift: list[int]) -> NDArray[np.uint8]:
+    def _weights(
+        self, allowed: Mask, unknown: Mask, factor: int, shift: list[int]
+    ) -> NDArray[np.uint8]:
         """What a step costs in each square; 0: no way."""
-        weights = self._unknown_weight * _coarse(unknown, factor, shift[0], shift[1]).astype(np.uint8)
+        maybe = _coarse(unknown, factor, shift[0], shift[1])
+        weights = self._unknown_weight * maybe.astype(np.uint8)
         weights[_coarse(allowed, factor, shift[0], shift[1])] = 1
         return weights
 
-    def _still_known(self, keys: list[Key], stamp_ns: int) -> dict[tuple[Key, Key], tuple[int, float]]:
-        """The ways that are known between these places, and not too old; all others are forgotten."""
+    def _still_known(
+        self, keys: list[Key], stamp_ns: int
+    ) -> dict[tuple[Key, Key], tuple[int, float]]:
+        """The ways that are known between these places, and not too old.
+
+        All others are forgotten.
+        """
         since = stamp_ns - self._forget_ns
         pairs = (_pair(a, b) for i, a in enumerate(keys) for b in keys[:i])
         found = ((pair, self._known.get(pair)) for pair in pairs)
@@ -129,14 +164,19 @@ def _cells(steps: NDArray[np.int32]) -> Array:
 
 @kernel
 def _coarse(allowed: Mask, factor: int, shift_row: int, shift_col: int) -> Mask:
-    """Squares in which any cell is set; the first cell is (shift_row, shift_col) within its square."""
+    """Squares in which any cell is set.
+
+    The first cell is (shift_row, shift_col) within its square.
+    """
     rows, cols = allowed.shape
     height, width = -(-(rows + shift_row) // factor), -(-(cols + shift_col) // factor)
     squares = np.zeros((height, width), dtype=np.bool_)
     line = np.zeros(width * factor, dtype=np.uint8)
     for square in range(height):
         line[:] = 0
-        for row in range(max(square * factor - shift_row, 0), min((square + 1) * factor - shift_row, rows)):
+        top = max(square * factor - shift_row, 0)
+        bottom = min((square + 1) * factor - shift_row, rows)
+        for row in range(top, bottom):
             # All rows of a square into one, many cells at a time; then its columns.
             cells, part = allowed[row].view(np.uint8), line[shift_col : shift_col + cols]
             for col in range(cols):
@@ -148,27 +188,41 @@ def _coarse(allowed: Mask, factor: int, shift_row: int, shift_col: int) -> Mask:
 
 
 @kernel
-def _ways_from(weights: NDArray[np.uint8], start_row: int, start_col: int, goals: Cells) -> NDArray[np.int32]:
+def _ways_from(
+    weights: NDArray[np.uint8], start_row: int, start_col: int, goals: Cells
+) -> NDArray[np.int32]:
     rows, cols = weights.shape
     wanted = np.zeros((rows + 2, cols + 2), dtype=np.bool_)
     found = np.full(goals.shape[0], _FAR, dtype=np.int32)
     left = 0
     for i in range(goals.shape[0]):
         row, col = goals[i, 0], goals[i, 1]
-        if 0 <= row < rows and 0 <= col < cols and weights[row, col] and not wanted[row + 1, col + 1]:
+        if (
+            0 <= row < rows
+            and 0 <= col < cols
+            and weights[row, col]
+            and not wanted[row + 1, col + 1]
+        ):
             wanted[row + 1, col + 1] = True
             left += 1
     steps = _field(weights, start_row, start_col, wanted, left)
     for i in range(goals.shape[0]):
         row, col = goals[i, 0], goals[i, 1]
-        if 0 <= row < rows and 0 <= col < cols and weights[row, col] and not wanted[row + 1, col + 1]:
+        if (
+            0 <= row < rows
+            and 0 <= col < cols
+            and weights[row, col]
+            and not wanted[row + 1, col + 1]
+        ):
             found[i] = steps[row + 1, col + 1]
     return found
 
 
 @kernel
-def _field(weights: NDArray[np.uint8], start_row: int, start_col: int, wanted: Mask, left: int) -> NDArray[np.int32]:
-    """Steps to each cell, in a frame of one cell more on each side, until all `left` wanted ones are reached.
+def _field(
+    weights: NDArray[np.uint8], start_row: int, start_col: int, wanted: Mask, left: int
+) -> NDArray[np.int32]:
+    """Steps to each cell, in a frame one cell wider all round, until all `left` wanted are reached.
 
     wanted (H + 2, W + 2): cells to be reached; those that have been are cleared.
     """

@@ -1,4 +1,7 @@
-"""Goal in, velocity commands out: plans by wavefront, follows, replans, and stops in front of what the laser sees."""
+"""Goal in, velocity commands out.
+
+It plans by wavefront, follows, replans, and stops in front of what the laser sees.
+"""
 
 import math
 from dataclasses import dataclass
@@ -21,7 +24,8 @@ _CHECK_AHEAD_M = 4.0
 _NARROW_AHEAD_M = 0.6
 _CREEP_M_S = 0.02
 _ROUNDING_M_S = 1e-9
-# Where nothing else is left, points may come so much nearer than the body's radius, but only so slowly.
+# Where nothing else is left, points may come so much nearer than the body's radius, but only so
+# slowly.
 _SQUEEZED_M, _SQUEEZED_M_S = 0.01, 0.1
 _AIM_RAD = 0.1
 _OBSTACLE = 'something stands in the way'
@@ -36,19 +40,30 @@ _STANDSTILLS = 5
 class NavigatorConfig(WavefrontConfig, FollowerConfig):
     """Parameters of planning and following, and when a goal counts as reached or is given up."""
 
-    body_radius_m: float = parameter(0.24, 'nothing that the laser sees may come this near, m', low=0.0, high=5.0)
-    reaction_s: float = parameter(0.3, 'time from a measurement until the robot brakes, s', low=0.0, high=5.0)
+    body_radius_m: float = parameter(
+        0.24, 'nothing that the laser sees may come this near, m', low=0.0, high=5.0
+    )
+    reaction_s: float = parameter(
+        0.3, 'time from a measurement until the robot brakes, s', low=0.0, high=5.0
+    )
     goal_tolerance_m: float = parameter(0.15, 'a goal this near is reached, m', low=0.01, high=5.0)
-    heading_tolerance_rad: float = parameter(0.15, 'a heading this near is reached, rad', low=0.01, high=3.2)
-    replan_s: float = parameter(5.0, 'a path is planned anew after this time, s', low=0.1, high=1000.0)
-    blocked_s: float = parameter(8.0, 'a goal is given up after this time at a standstill, s', low=0.1, high=1000.0)
+    heading_tolerance_rad: float = parameter(
+        0.15, 'a heading this near is reached, rad', low=0.01, high=3.2
+    )
+    replan_s: float = parameter(
+        5.0, 'a path is planned anew after this time, s', low=0.1, high=1000.0
+    )
+    blocked_s: float = parameter(
+        8.0, 'a goal is given up after this time at a standstill, s', low=0.1, high=1000.0
+    )
 
 
 @dataclass(frozen=True)
 class Command:
     """What to do until the next step: speed v (m/s), turn rate w (rad/s), and how the goal stands.
 
-    state: 'idle', 'driving', 'blocked', 'reached' or 'failed'; reason: why blocked or failed, in words.
+    state: 'idle', 'driving', 'blocked', 'reached' or 'failed'; reason: why blocked or failed, in
+    words.
     """
 
     v: float
@@ -116,7 +131,8 @@ class Navigator:
         if self._heading_rad is not None:
             error = se2.wrap(self._heading_rad - float(T_map_base[2]))
             if abs(error) > self.config.heading_tolerance_rad:
-                return Command(*self._follower.turn_to(T_map_base, self._heading_rad, dt_s), 'driving')
+                v, w = self._follower.turn_to(T_map_base, self._heading_rad, dt_s)
+                return Command(v, w, 'driving')
         self.cancel()
         return Command(*self._follower.stop(dt_s), 'reached')
 
@@ -131,15 +147,19 @@ class Navigator:
         return bool(strayed or (changed and self._is_blocked(nearest, patch)))
 
     def _is_blocked(self, first: int, patch: GridPatch) -> bool:
-        """Whether an obstacle has come nearer to the next metres of the path than the robot's radius."""
+        """Whether an obstacle has come nearer to the path's next metres than the robot's radius."""
         assert self.path is not None
         frame = patch.frame
         ahead = self.path[first : first + max(1, int(2.0 * _CHECK_AHEAD_M / frame.resolution))]
         at = (frame.origin_x, frame.origin_y, frame.resolution)
-        return _touches(patch.cells, at, ahead, self.config.robot_radius_m / frame.resolution - 1e-6)
+        radius = self.config.robot_radius_m / frame.resolution - 1e-6
+        return _touches(patch.cells, at, ahead, radius)
 
     def _plan(self, T_map_base: Array, patch: GridPatch) -> str:
-        """Plan anew; returns why there is no path, or nothing. In front of an obstacle its points count, too."""
+        """Plan anew; returns why there is no path, or nothing.
+
+        In front of an obstacle its points count, too.
+        """
         assert self._goal is not None
         points = self._seen.within(T_map_base, _POINTS_M) if self._blocked_s > 0.0 else None
         start = float(T_map_base[0]), float(T_map_base[1])
@@ -150,7 +170,8 @@ class Navigator:
         if path is None:
             self.path = None
             where = f'({self._goal[0]:.2f}, {self._goal[1]:.2f})'
-            return f'no way to {where}' if first and self._blocked_s == 0.0 else f'the way to {where} is blocked'
+            never = first and self._blocked_s == 0.0
+            return f'no way to {where}' if never else f'the way to {where} is blocked'
         self.path = path
         return ''
 
@@ -187,10 +208,14 @@ class Navigator:
         if squeezed > _CREEP_M_S and slowest <= squeezed:
             return Command(*self._follower.slowed(squeezed, w * squeezed / v), 'driving')
         self._follower.slowed(*before)
-        return self._brake(T_map_base, dt_s) if slowest > 0.0 else self._face_obstacle(T_map_base, dt_s)
+        brakes = slowest > 0.0
+        return self._brake(T_map_base, dt_s) if brakes else self._face_obstacle(T_map_base, dt_s)
 
     def _brake(self, T_map_base: Array, dt_s: float) -> Command:
-        """Come to rest on the arc on which the robot is; at once where something has come into its way there too."""
+        """Come to rest on the arc on which the robot is.
+
+        At once where something has come into its way there too.
+        """
         before = self._follower.v
         v, w = self._follower.stop(dt_s)
         if self._safe_speed(T_map_base, before, w * before / v, self.config.body_radius_m) < v:
@@ -198,7 +223,10 @@ class Navigator:
         return Command(v, w, 'driving')
 
     def _face_obstacle(self, T_map_base: Array, dt_s: float) -> Command:
-        """Right in front of something: turn along the path if that helps, else plan around it, else give up."""
+        """Right in front of something.
+
+        Turn along the path if that helps, else plan around it, else give up.
+        """
         assert self.path is not None
         reason = _HIDDEN if self._seen.hidden else _OBSTACLE
         self._standstills += self._blocked_s == 0.0
@@ -219,11 +247,15 @@ class Navigator:
         return math.atan2(ahead[1] - T_map_base[1], ahead[0] - T_map_base[0])
 
     def _squeezed_speed(self, T_map_base: Array, v: float, curvature: float) -> float:
-        """Highest speed up to v through a passage that is hardly wider than the robot: noise takes up the margin."""
-        return self._safe_speed(T_map_base, v, v * curvature, max(self.config.body_radius_m - _SQUEEZED_M, 0.0))
+        """Highest speed up to v through a passage that is hardly wider than the robot.
+
+        Noise takes up the margin.
+        """
+        radius_m = max(self.config.body_radius_m - _SQUEEZED_M, 0.0)
+        return self._safe_speed(T_map_base, v, v * curvature, radius_m)
 
     def _safe_speed(self, T_map_base: Array, v: float, w: float, radius_m: float) -> float:
-        """Highest speed up to v from which the robot still stops before a point of the scan is within a radius."""
+        """Highest speed up to v at which it still stops before a scan point is within a radius."""
         braking = self.config.max_acceleration_m_s2
         needed = v * self.config.reaction_s + v * v / (2.0 * braking)
         free_m = self._seen.clear_m(T_map_base, w / v, needed, radius_m)
@@ -232,8 +264,10 @@ class Navigator:
 
 
 @kernel
-def _touches(cells: NDArray[np.int8], frame: tuple[float, float, float], path: Array, radius: float) -> bool:
-    """Whether an occupied cell of a map (H, W) is nearer than a radius, in cells, to one of a path's (K, 2), m.
+def _touches(
+    cells: NDArray[np.int8], frame: tuple[float, float, float], path: Array, radius: float
+) -> bool:
+    """Whether an occupied cell of a map (H, W) is nearer than a radius, cells, to a path (K, 2), m.
 
     frame: origin x, origin y and resolution of the map, m.
     """
@@ -247,6 +281,9 @@ def _touches(cells: NDArray[np.int8], frame: tuple[float, float, float], path: A
         last_row, last_col = row, col
         for r in range(max(row - reach, 0), min(row + reach + 1, cells.shape[0])):
             for c in range(max(col - reach, 0), min(col + reach + 1, cells.shape[1])):
-                if cells[r, c] >= OCCUPIED_AT_LEAST and (r - row) ** 2 + (c - col) ** 2 < radius * radius:
+                if (
+                    cells[r, c] >= OCCUPIED_AT_LEAST
+                    and (r - row) ** 2 + (c - col) ** 2 < radius * radius
+                ):
                     return True
     return False

@@ -17,14 +17,23 @@ Part = tuple[int, int, int, int]
 
 
 def standing_places(free: Mask, radius_m: float, resolution: float) -> Mask:
-    """Cells (H, W) in which the centre of a robot of a radius may be; all that is not free counts as solid."""
+    """Cells (H, W) in which the centre of a robot of a radius may be.
+
+    All that is not free counts as solid.
+    """
     return standing_room(column_distance(free), radius_m / resolution)
 
 
-def renew_standing(standing: Mask, free: Mask, part: Part, radius_m: float, resolution: float) -> None:
-    """Bring standing places (H, W) up to date where free cells have changed within a part (see `standing_places`)."""
+def renew_standing(
+    standing: Mask, free: Mask, part: Part, radius_m: float, resolution: float
+) -> None:
+    """Bring standing places (H, W) up to date where free cells have changed within a part.
+
+    See `standing_places`.
+    """
     reach = math.ceil(radius_m / resolution) + 1
-    top, left, bottom, right = max(part[0] - reach, 0), max(part[1] - reach, 0), part[2] + reach, part[3] + reach
+    top, left = max(part[0] - reach, 0), max(part[1] - reach, 0)
+    bottom, right = part[2] + reach, part[3] + reach
     # As many cells again are read, so that the cut is no wall.
     wide = free[max(top - reach, 0) : bottom + reach, max(left - reach, 0) : right + reach]
     found = standing_places(np.ascontiguousarray(wide), radius_m, resolution)
@@ -34,12 +43,18 @@ def renew_standing(standing: Mask, free: Mask, part: Part, radius_m: float, reso
 
 
 def let_out(
-    standing: Mask, free: Mask, frame: GridFrame, xy: tuple[float, float], escape_m: float, trail: Cells | None = None
+    standing: Mask,
+    free: Mask,
+    frame: GridFrame,
+    xy: tuple[float, float],
+    escape_m: float,
+    trail: Cells | None = None,
 ) -> Mask:
     """Cells (H, W) over which a robot that is at a point (m) may go.
 
-    These are its standing places, but where it stands too near to something it is let out over free cells up to
-    escape_m away, as a path would. trail: cells (N, 2) over which it came; over those that are free it can go back.
+    These are its standing places, but where it stands too near to something it is let out over free
+    cells up to escape_m away, as a path would. trail: cells (N, 2) over which it came; over those
+    that are free it can go back.
     """
     ways = standing.copy()
     if trail is not None:
@@ -54,12 +69,15 @@ def let_out(
 
 
 def reached_from(allowed: Mask, start: tuple[int, int]) -> Mask:
-    """Allowed cells (H, W) to which the wave can get from a start (row, col): over edges of cells, not corners."""
+    """Allowed cells (H, W) to which the wave can get from a start (row, col).
+
+    It goes over edges of cells, not corners.
+    """
     return np.asarray(_reached_from(allowed, start[0], start[1]))
 
 
 def nearest_true(allowed: Mask, cell: tuple[int, int], reach: float) -> tuple[int, int] | None:
-    """The true cell nearest to one that lies anywhere, if there is one within a distance of `reach` cells."""
+    """The true cell nearest to one that lies anywhere, if there is one within `reach` cells."""
     whole = math.floor(reach)
     top, left = max(cell[0] - whole, 0), max(cell[1] - whole, 0)
     part = allowed[top : max(cell[0] + whole + 1, 0), left : max(cell[1] + whole + 1, 0)]
@@ -73,7 +91,7 @@ def nearest_true(allowed: Mask, cell: tuple[int, int], reach: float) -> tuple[in
 
 @kernel
 def are_near(allowed: Mask, cells: NDArray[np.int64], reach: float) -> Mask:
-    """Whether a true cell of a mask (H, W) lies within a distance of `reach` cells, for each cell (N, 2), (N,)."""
+    """Whether a true cell of a mask (H, W) lies within `reach` cells of each cell (N, 2), (N,)."""
     whole = int(math.floor(reach))
     near = np.zeros(cells.shape[0], dtype=np.bool_)
     for i in range(cells.shape[0]):
@@ -84,7 +102,9 @@ def are_near(allowed: Mask, cells: NDArray[np.int64], reach: float) -> Mask:
     return near
 
 
-def disc(of: NDArray[Any], centre: tuple[int, int], reach: float) -> tuple[tuple[slice, slice], Mask]:
+def disc(
+    of: NDArray[Any], centre: tuple[int, int], reach: float
+) -> tuple[tuple[slice, slice], Mask]:
     """The part of an array (H, W) round a cell, and which of its cells lie within reach."""
     whole = math.ceil(reach)
     rows = slice(max(centre[0] - whole, 0), min(centre[0] + whole + 1, of.shape[0]))

@@ -12,11 +12,14 @@ from thinmap_ros.core.se2 import Array
 
 _REMEMBERED_M = 1.0
 _SWEEP_STEP_M = 0.03
-_BESIDE, _SAME_M = 2, 0.03  # beams to either side, and by how much those that see the same thing differ
+_BESIDE = 2  # beams to either side
+_SAME_M = 0.03  # by how much those that see the same thing differ
 
 
 class SeenPoints:
-    """Where the beams of the newest scan ended, and points seen earlier that are near, where this scan does not look.
+    """Where the beams of the newest scan ended, and points seen earlier where it does not look.
+
+    The latter only as long as they are near.
 
     A laser that looks ahead only does not see the corner any more round which the robot is turning.
     points (N, 2): in the map frame, m; they keep the place where they were first seen.
@@ -30,7 +33,10 @@ class SeenPoints:
         self._scan: Scan | None = None
 
     def look(self, T_map_base: Array, scan: Scan | None) -> None:
-        """Take a scan made at a pose (3,); the one taken last may be given again while the robot moves on."""
+        """Take a scan made at a pose (3,).
+
+        The one taken last may be given again while the robot moves on.
+        """
         if scan is None or scan is self._scan:
             return
         self._scan = scan
@@ -43,13 +49,20 @@ class SeenPoints:
 
     def within(self, T_map_base: Array, reach_m: float) -> Array:
         """Points (M, 2), m, nearer than reach_m to a pose (3,)."""
-        return np.asarray(self.points[np.square(self.points - T_map_base[:2]).sum(axis=1) < reach_m**2])
+        return np.asarray(
+            self.points[np.square(self.points - T_map_base[:2]).sum(axis=1) < reach_m**2]
+        )
 
     def room_along(self, path: Array, first: int, length_m: float) -> float:
-        """How near points are to a path (K, 2) from one of its points on for some length, m; inf without points."""
+        """How near points are to a path (K, 2) from its point `first` on for some length, m.
+
+        Without points: inf.
+        """
         return float(_room_along(path, first, length_m, self.points))
 
-    def clear_m(self, T_map_base: Array, curvature: float, length_m: float, radius_m: float) -> float:
+    def clear_m(
+        self, T_map_base: Array, curvature: float, length_m: float, radius_m: float
+    ) -> float:
         """How far, m, a disc can be moved along an arc from a pose (3,), at most length_m.
 
         It touches nothing on that way, and nothing of what it sweeps is unseen.
@@ -75,7 +88,10 @@ class SeenPoints:
 
 @kernel
 def _room_along(path: Array, first: int, length_m: float, points: Array) -> float:
-    """How near points (N, 2) are to a path (K, 2) from one of its points on for some length, m; inf without points."""
+    """How near points (N, 2) are to a path (K, 2) from its point `first` on for some length, m.
+
+    Without points: inf.
+    """
     nearest, along = np.inf, 0.0
     for k in range(first, path.shape[0]):
         if k > first:
@@ -83,7 +99,9 @@ def _room_along(path: Array, first: int, length_m: float, points: Array) -> floa
         if along > length_m:
             break
         for i in range(points.shape[0]):
-            nearest = min(nearest, (points[i, 0] - path[k, 0]) ** 2 + (points[i, 1] - path[k, 1]) ** 2)
+            nearest = min(
+                nearest, (points[i, 0] - path[k, 0]) ** 2 + (points[i, 1] - path[k, 1]) ** 2
+            )
     return math.sqrt(nearest)
 
 
@@ -102,7 +120,9 @@ def _arc(start: Array, curvature: float, length_m: float, count: int) -> Array:
 
 @kernel
 def _clear_steps(centres: Array, points: Array, radius: float) -> int:
-    """Index of the last centre (K, 2) that a disc can be moved to, one after the other, without touching points (N, 2).
+    """Index of the last centre (K, 2) to which a disc can be moved, one after the other.
+
+    It touches none of the points (N, 2) on its way.
 
     A point that is too near to the first centre already only forbids to come still nearer.
     """
@@ -120,15 +140,19 @@ def _clear_steps(centres: Array, points: Array, radius: float) -> int:
 def _clear_steps_on_arc(
     start: Array, curvature: float, length_m: float, count: int, points: Array, radius: float
 ) -> int:
-    """How many of `count` steps along an arc a disc can be moved without touching points: `_arc`, `_clear_steps`."""
+    """How many of `count` steps along an arc a disc can be moved without touching points.
+
+    See `_arc` and `_clear_steps`.
+    """
     return _clear_steps(_arc(start, curvature, length_m, count), points, radius)
 
 
 @kernel
 def _smoothed(ranges: Array, i: int) -> float:
-    """A range of a scan (NaN: none), m, as the mean of the beams beside it that say the same but for their noise.
+    """A range of a scan (NaN: none), m: the mean of the beams beside it that differ by noise only.
 
-    The nearest of many noisy points is nearer than the wall: without this, passages would seem narrower than they are.
+    The nearest of many noisy points is nearer than the wall: without this, passages would seem
+    narrower than they are.
     """
     total, count = 0.0, 0
     for k in range(max(i - _BESIDE, 0), min(i + _BESIDE + 1, ranges.size)):
@@ -139,10 +163,13 @@ def _smoothed(ranges: Array, i: int) -> float:
 
 
 @kernel
-def _points_around(ranges: Array, first: float, step: float, laser: Array, earlier: Array, robot: Array) -> Array:
-    """Where the beams of a scan ended (NaN: nowhere), and those of the points seen earlier (N, 2) that still count.
+def _points_around(
+    ranges: Array, first: float, step: float, laser: Array, earlier: Array, robot: Array
+) -> Array:
+    """Where the beams of a scan ended (NaN: nowhere), and what counts of the points seen before.
 
-    These are near to the robot's pose (3,), and lie beside the scan's field of view. All in the map frame, m.
+    Of those (N, 2), the ones near to the robot's pose (3,) that lie beside the scan's field of
+    view. All in the map frame, m.
     """
     points = np.empty((ranges.size + earlier.shape[0], 2))
     count = 0

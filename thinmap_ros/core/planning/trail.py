@@ -1,4 +1,7 @@
-"""Where the robot has been of late: it can go back there, even where a speck in the map makes a passage too narrow."""
+"""Where the robot has been of late.
+
+It can go back there, even where a speck in the map makes a passage too narrow.
+"""
 
 import math
 
@@ -15,10 +18,14 @@ _LONGEST = 1300  # points
 
 
 class Trail:
-    """The last of the robot's way. A pose that jumps, as where the map was corrected, begins it anew."""
+    """The last of the robot's way.
+
+    A pose that jumps, as where the map was corrected, begins it anew.
+    """
 
     def __init__(self) -> None:
-        self._points = np.empty((2 * _LONGEST, 2))  # twice the room: moved to the front only when it is full
+        # Twice the room: moved to the front only when it is full.
+        self._points = np.empty((2 * _LONGEST, 2))
         self._begin = self._end = 0
 
     def add(self, T_map_base: Array) -> None:
@@ -33,10 +40,12 @@ class Trail:
             self._append(here)
 
     def cells(self, frame: GridFrame, shape: tuple[int, ...]) -> NDArray[np.int64]:
-        """Cells (N, 2) of a map (H, W) over which it led, each beside the one before over an edge."""
+        """Cells (N, 2) of a map (H, W) over which it led, each joined to the next by an edge."""
         if self._end == self._begin:
             return np.empty((0, 2), dtype=np.int64)
-        return np.asarray(_joined(frame.cells_of(self._points[self._begin : self._end]), shape[0], shape[1]))
+        return np.asarray(
+            _joined(frame.cells_of(self._points[self._begin : self._end]), shape[0], shape[1])
+        )
 
     def _append(self, here: tuple[float, float]) -> None:
         if self._end == len(self._points):
@@ -49,7 +58,10 @@ class Trail:
 
 @kernel
 def _joined(cells: NDArray[np.int64], rows: int, cols: int) -> NDArray[np.int64]:
-    """Cells (N, 2) and those between them, first along the column, then along the row; without those outside."""
+    """Cells (N, 2) and those between them, first along the column, then along the row.
+
+    Those outside the map are left out.
+    """
     count = cells.shape[0]
     for k in range(1, cells.shape[0]):
         count += abs(cells[k, 0] - cells[k - 1, 0]) + abs(cells[k, 1] - cells[k - 1, 1])

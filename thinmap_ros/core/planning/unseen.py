@@ -1,8 +1,8 @@
 """Where the laser does not see though it looks there: behind invalid beams something may stand.
 
-Between two valid beams an angle D apart, a thing of width w cannot hide nearer than w / D. What lies
-farther out in a sector of invalid beams is unseen, until an earlier scan has seen it from a place
-that the robot has just left.
+Between two valid beams an angle D apart, a thing of width w cannot hide nearer than w / D. What
+lies farther out in a sector of invalid beams is unseen, until an earlier scan has seen it from a
+place that the robot has just left.
 """
 
 import math
@@ -24,7 +24,7 @@ _APART_M, _APART_RAD = 0.05, 0.1  # between two scans that are remembered
 
 
 class _Observation(NamedTuple):
-    """How far each beam of a scan saw, (N,), m (NaN: not at all), and from where, (3,), map frame."""
+    """Ranges (N,) that a scan saw, m (NaN: not at all), and from where, (3,), map frame."""
 
     seen_m: Array
     first_rad: float
@@ -33,7 +33,7 @@ class _Observation(NamedTuple):
 
 
 class UnseenSectors:
-    """The sectors of invalid beams in the newest scan, less what the scans just before have seen."""
+    """The sectors of invalid beams in the newest scan, less what the scans just before saw."""
 
     def __init__(self) -> None:
         self._newest: _Observation | None = None
@@ -78,7 +78,7 @@ class UnseenSectors:
 def _sector_points(
     invalid: NDArray[np.bool_], first: float, step: float, laser: Array, reach: float
 ) -> Array:
-    """Points (K, 2) in the sectors of invalid beams (N,), from where something can hide, to a reach.
+    """Points (K, 2) to a reach in the sectors of invalid beams (N,), from where something can hide.
 
     first, step: bearing of the first beam and from one to the next, rad; laser (3,): its pose.
     """

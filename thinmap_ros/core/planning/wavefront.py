@@ -1,10 +1,11 @@
 """The gradient method: the cheapest way from every cell to the goal, and the path down its slope.
 
-F(P) = sum I(p_i) + sum A(p_i, p_i+1): the intrinsic cost I falls from `keep_weight` at the closest allowed distance to
-an obstacle to zero at `keep_m`, the adjacency cost A is the distance moved. The wave is carried on from cell to cell by
-solving |grad F| = 1 + I, so that ways in all directions are measured alike, not only along rows, columns and diagonals.
-Source: topological map paper section 3.2; Konolige, "A gradient method for realtime robot control", 2000; Sethian,
-"A fast marching level set method for monotonically advancing fronts", 1996.
+F(P) = sum I(p_i) + sum A(p_i, p_i+1): the intrinsic cost I falls from `keep_weight` at the closest
+allowed distance to an obstacle to zero at `keep_m`, the adjacency cost A is the distance moved. The
+wave is carried on from cell to cell by solving |grad F| = 1 + I, so that ways in all directions are
+measured alike, not only along rows, columns and diagonals.
+Source: topological map paper section 3.2; Konolige, "A gradient method for realtime robot control",
+2000; Sethian, "A fast marching level set method for monotonically advancing fronts", 1996.
 """
 
 import math
@@ -25,7 +26,8 @@ Mask = NDArray[np.bool_]
 _ESCAPE_COST = 10.0
 _STEP_CELLS = 0.5
 _TOPOLOGY = TopologyConfig()
-# Distances are whole cells times the resolution: rounding must not close a passage as wide as the robot.
+# Distances are whole cells times the resolution:
+# rounding must not close a passage as wide as the robot.
 _HAIR_M = 1e-6
 
 
@@ -33,13 +35,27 @@ _HAIR_M = 1e-6
 class WavefrontConfig(Config):
     """What a path may cross and what it should rather avoid."""
 
-    robot_radius_m: float = parameter(0.25, 'radius of the robot: its centre comes no closer, m', low=0.0, high=5.0)
-    keep_m: float = parameter(0.6, 'distance to obstacles from which on they cost nothing, m', low=0.0, high=10.0)
-    keep_weight: float = parameter(2.0, 'cost of a metre right beside an obstacle, in metres', low=0.0, high=100.0)
-    unknown: str = parameter('forbidden', 'unknown space in a path', choices=('forbidden', 'costly'))
-    unknown_weight: float = parameter(3.0, 'cost of a metre of unknown space, in metres', low=0.0, high=1000.0)
-    goal_slack_m: float = parameter(0.3, 'a goal too near to an obstacle may move this far, m', low=0.0, high=5.0)
-    escape_m: float = parameter(0.6, 'a start too near to an obstacle is let out this far, m', low=0.0, high=5.0)
+    robot_radius_m: float = parameter(
+        0.25, 'radius of the robot: its centre comes no closer, m', low=0.0, high=5.0
+    )
+    keep_m: float = parameter(
+        0.6, 'distance to obstacles from which on they cost nothing, m', low=0.0, high=10.0
+    )
+    keep_weight: float = parameter(
+        2.0, 'cost of a metre right beside an obstacle, in metres', low=0.0, high=100.0
+    )
+    unknown: str = parameter(
+        'forbidden', 'unknown space in a path', choices=('forbidden', 'costly')
+    )
+    unknown_weight: float = parameter(
+        3.0, 'cost of a metre of unknown space, in metres', low=0.0, high=1000.0
+    )
+    goal_slack_m: float = parameter(
+        0.3, 'a goal too near to an obstacle may move this far, m', low=0.0, high=5.0
+    )
+    escape_m: float = parameter(
+        0.6, 'a start too near to an obstacle is let out this far, m', low=0.0, high=5.0
+    )
 
 
 def plan(
@@ -51,12 +67,13 @@ def plan(
     body_radius_m: float = 0.0,
     trail: NDArray[np.int64] | None = None,
 ) -> Array | None:
-    """Path (K, 2) of points from start to goal, m, map frame, about half a cell apart; None where there is none.
+    """Path (K, 2) from start to goal, m, map frame, points about half a cell apart; None: no way.
 
-    The path ends at the goal, or at the allowed cell nearest to it within goal_slack_m. It keeps a body's radius away
-    from points (N, 2) that the map need not know. They are taken as exact: in cells, a wall whose points fall into the
-    cell before it, as noise has it, would be a cell thicker, and many a passage too narrow. trail: cells (N, 2) over
-    which the robot came; unless something stands there now, it may go back over them, however narrow it looks.
+    The path ends at the goal, or at the allowed cell nearest to it within goal_slack_m. It keeps a
+    body's radius away from points (N, 2) that the map need not know. They are taken as exact: in
+    cells, a wall whose points fall into the cell before it, as noise has it, would be a cell
+    thicker, and many a passage too narrow. trail: cells (N, 2) over which the robot came; unless
+    something stands there now, it may go back over them, however narrow it looks.
     """
     cells = patch.frame.cells_of(np.array([start_xy, goal_xy]))
     if not patch.contains(np.array([start_xy, goal_xy])).all():
@@ -75,7 +92,9 @@ def plan(
     if trail is not None:
         back = trail[~occupied[trail[:, 0], trail[:, 1]]]
         cost[back[:, 0], back[:, 1]] = np.minimum(cost[back[:, 0], back[:, 1]], _ESCAPE_COST)
-    goal = nearest_true(reached_from(np.isfinite(cost), start), wished, config.goal_slack_m / patch.frame.resolution)
+    goal = nearest_true(
+        reached_from(np.isfinite(cost), start), wished, config.goal_slack_m / patch.frame.resolution
+    )
     if goal is None:
         return None
     field = navigation_function(cost, goal, start)
@@ -87,7 +106,10 @@ def plan(
 
 
 def cost_of_cells(patch: GridPatch, config: WavefrontConfig) -> Array:
-    """Cost of moving one unit of distance in each cell (H, W): 1 + I; inf where the robot's centre may not be."""
+    """Cost of moving one unit of distance in each cell (H, W): 1 + I.
+
+    Inf where the robot's centre may not be.
+    """
     resolution = patch.frame.resolution
     free = known_free(patch, _TOPOLOGY)
     passable = free if config.unknown == 'forbidden' else ~patch.occupied
@@ -103,17 +125,23 @@ def cost_of_cells(patch: GridPatch, config: WavefrontConfig) -> Array:
     return cost
 
 
-def navigation_function(cost: Array, goal: tuple[int, int], start: tuple[int, int] | None = None) -> Array:
-    """Cheapest cost F, in cells, from each cell (H, W) to the goal (row, col); inf where there is no way.
+def navigation_function(
+    cost: Array, goal: tuple[int, int], start: tuple[int, int] | None = None
+) -> Array:
+    """Cheapest cost F, in cells, from each cell (H, W) to the goal (row, col); inf: no way.
 
-    With a start (row, col), the wave stops a little after it has got there, and cells farther off stay inf.
+    With a start (row, col), the wave stops a little after it has got there, and cells farther off
+    stay inf.
     """
     row, col = (-1, -1) if start is None else start
     return np.asarray(_march(cost, goal[0], goal[1], row, col))
 
 
 def descend(field: Array, x: float, y: float, goal_row: int, goal_col: int) -> Array:
-    """Path (K, 2) down the slope of a navigation function (H, W), in cells (x, y), from a point to a cell's centre."""
+    """Path (K, 2) down the slope of a navigation function (H, W), in cells (x, y).
+
+    It leads from a point to a cell's centre.
+    """
     return np.asarray(_descend(field, x, y, goal_row, goal_col))
 
 
@@ -123,9 +151,10 @@ def _in_cells(patch: GridPatch, points: Array) -> Array:
 
 
 def _let_out(cost: Array, occupied: Mask, start: tuple[int, int], reach: float) -> None:
-    """Open the forbidden cells around a start, at a high cost: a robot that stands there has to get away somehow.
+    """Open the forbidden cells around a start, at a high cost.
 
-    Not those that are occupied, but for the robot's own cell: where the robot is, nothing else can be.
+    A robot that stands there has to get away somehow. Cells that are occupied stay closed, but for
+    the robot's own cell: where the robot is, nothing else can be.
     """
     where, within = disc(cost, start, reach)
     part = cost[where]
@@ -135,9 +164,9 @@ def _let_out(cost: Array, occupied: Mask, start: tuple[int, int], reach: float) 
 
 @kernel
 def _keep_away(cost: Array, points: Array, radius: float, keep: float, weight: float) -> None:
-    """Raise the cost of cells (H, W) by how near their centres are to points (N, 2), in cells, as that by the map.
+    """Raise the cost of cells (H, W) by how near their centres are to points (N, 2), in cells.
 
-    Those nearer than a radius are closed; from `keep` on a point costs nothing.
+    As by the map, cells nearer than a radius are closed; from `keep` on a point costs nothing.
     """
     reach, spread = int(math.ceil(max(radius, keep))) + 1, max(keep - radius, 1e-6)
     for i in range(points.shape[0]):
@@ -147,14 +176,16 @@ def _keep_away(cost: Array, points: Array, radius: float, keep: float, weight: f
             for c in range(max(col - reach, 0), min(col + reach + 1, cost.shape[1])):
                 away = math.hypot(r - y, c - x)
                 nearness = max(keep - away, 0.0) / spread
-                cost[r, c] = np.inf if away < radius else max(cost[r, c], 1.0 + weight * nearness * nearness)
+                near_cost = 1.0 + weight * nearness * nearness
+                cost[r, c] = np.inf if away < radius else max(cost[r, c], near_cost)
 
 
 @kernel
 def _look_up(distance: NDArray[np.int16], reach: int, table: Array) -> Array:
-    """table[squared distance in cells to the nearest solid cell] for each cell (H, W); outside all is solid.
+    """table[squared distance in cells to the nearest solid cell] for each cell (H, W).
 
-    distance: from `column_distance`. What is farther than `reach` cells in a row or column counts as reach + 1 there.
+    Outside all is solid. distance: from `column_distance`. What is farther than `reach` cells in a
+    row or column counts as reach + 1 there.
     """
     rows, cols = distance.shape
     result = np.empty((rows, cols))
@@ -168,8 +199,10 @@ def _look_up(distance: NDArray[np.int16], reach: int, table: Array) -> Array:
             line[reach + col] = here * here
         squared[:] = line[reach : reach + cols]
         for k in range(1, reach + 1):
-            # Slices whose indices are all counted from 0: the compiler makes sixteen comparisons one.
-            step, left, right = np.int16(k * k), line[reach - k : reach - k + cols], line[reach + k : reach + k + cols]
+            step = np.int16(k * k)
+            # Slices whose indices all count from 0: the compiler makes sixteen comparisons one.
+            left = line[reach - k : reach - k + cols]
+            right = line[reach + k : reach + k + cols]
             for col in range(cols):
                 beside = np.int16((left[col] if left[col] < right[col] else right[col]) + step)
                 squared[col] = beside if beside < squared[col] else squared[col]
@@ -179,9 +212,7 @@ def _look_up(distance: NDArray[np.int16], reach: int, table: Array) -> Array:
 
 
 @kernel
-def _push(
-    keys: Array, cells: NDArray[np.int64], count: int, key: float, cell: int
-) -> None:
+def _push(keys: Array, cells: NDArray[np.int64], count: int, key: float, cell: int) -> None:
     place = count
     while place > 0:
         parent = (place - 1) // 2
@@ -280,12 +311,16 @@ def _slope(field: Array, row: int, col: int, out: Array) -> bool:
 
 @kernel
 def _lowest_around(field: Array, row: int, col: int) -> tuple[int, int]:
-    """The lowest of the eight neighbours; over a corner only where both cells beside it are open."""
+    """The lowest of the eight neighbours; over a corner only where both cells beside are open."""
     rows, cols = field.shape
     best_row, best_col = row, col
     for r in range(max(row - 1, 0), min(row + 2, rows)):
         for c in range(max(col - 1, 0), min(col + 2, cols)):
-            if field[row, c] < np.inf and field[r, col] < np.inf and field[r, c] < field[best_row, best_col]:
+            if (
+                field[row, c] < np.inf
+                and field[r, col] < np.inf
+                and field[r, c] < field[best_row, best_col]
+            ):
                 best_row, best_col = r, c
     return best_row, best_col
 
@@ -294,8 +329,9 @@ def _lowest_around(field: Array, row: int, col: int) -> tuple[int, int]:
 def _descend(field: Array, x: float, y: float, goal_row: int, goal_col: int) -> Array:
     """Half a cell at a time along the slope, blended over the four nearest cells.
 
-    Every cell entered lies lower than the one left; where the slope would not lead to one (beside walls, and
-    wherever it has led nowhere for some steps), the path goes to the centre of the lowest neighbour.
+    Every cell entered lies lower than the one left; where the slope would not lead to one (beside
+    walls, and wherever it has led nowhere for some steps), the path goes to the centre of the
+    lowest neighbour.
     """
     rows, cols = field.shape
     path = np.empty((8 * field.size + 8, 2))

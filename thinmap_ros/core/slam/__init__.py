@@ -1,1 +1,1 @@
-"""EKF-SLAM on line features, with a prediction that is sharpened by matching each scan against the map of points."""
+"""EKF-SLAM on line features; matching scans with the map of points sharpens predictions."""

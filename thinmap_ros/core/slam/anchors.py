@@ -10,7 +10,10 @@ from thinmap_ros.core.se2 import Array
 
 
 class AnchoredPoses:
-    """Poses with their stamps, each seen from a keyframe, or from the map where there was none yet; 36 bytes each."""
+    """Poses with their stamps, each seen from a keyframe, or from the map where there was none yet.
+
+    36 bytes each.
+    """
 
     def __init__(self) -> None:
         self._stamps = array('q')
@@ -36,7 +39,9 @@ class AnchoredPoses:
     def poses(self, keyframes: Array) -> Array:
         """Poses (N, 3) in the map, where the keyframes are at (M, 3)."""
         # The row after the last keyframe is the map's own origin, which number -1 finds.
-        anchors = np.vstack([keyframes.reshape(-1, 3), np.zeros(3)])[np.array(self._anchors, dtype=np.int64)]
+        anchors = np.vstack([keyframes.reshape(-1, 3), np.zeros(3)])[
+            np.array(self._anchors, dtype=np.int64)
+        ]
         moved = np.array(self._from_anchor).reshape(-1, 3)
         c, s = np.cos(anchors[:, 2]), np.sin(anchors[:, 2])
         x = anchors[:, 0] + c * moved[:, 0] - s * moved[:, 1]

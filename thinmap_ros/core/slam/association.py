@@ -1,10 +1,11 @@
 """Which line of the scan is which feature of the map.
 
-Source: EKF-SLAM/TI paper eq. (13), with the sign of the gate as it must be: v' S^-1 v <= 5.99, two degrees of freedom,
-95 %. Infinite lines agree where walls of different rooms are collinear, so what was seen of them has to meet as well;
-and the two faces of a thin wall are two features, each seen from its own side. Lines that could be several features
-are decided after the others have corrected the pose, so that the scan is taken as a whole (the idea of Neira and
-Tardos, "Data association in stochastic mapping using the joint compatibility test", 2001).
+Source: EKF-SLAM/TI paper eq. (13), with the sign of the gate as it must be: v' S^-1 v <= 5.99, two
+degrees of freedom, 95 %. Infinite lines agree where walls of different rooms are collinear, so what
+was seen of them has to meet as well; and the two faces of a thin wall are two features, each seen
+from its own side. Lines that could be several features are decided after the others have corrected
+the pose, so that the scan is taken as a whole (the idea of Neira and Tardos, "Data association in
+stochastic mapping using the joint compatibility test", 2001).
 """
 
 import math
@@ -28,13 +29,20 @@ _NEAR_RAD = math.radians(15.0)
 class AssociationConfig(Config):
     """Parameters of data association."""
 
-    gate: float = parameter(5.99, 'largest squared Mahalanobis distance of a match (95 %, 2 dof)', low=0.1, high=50.0)
-    gap_m: float = parameter(0.3, 'seen part and feature may lie this far apart along the line, m', low=0.0, high=5.0)
+    gate: float = parameter(
+        5.99, 'largest squared Mahalanobis distance of a match (95 %, 2 dof)', low=0.1, high=50.0
+    )
+    gap_m: float = parameter(
+        0.3, 'seen part and feature may lie this far apart along the line, m', low=0.0, high=5.0
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """For each line of a scan the index of the feature it fits best, or -1, (K,), and whether others fit too, (K,)."""
+    """For each line of a scan the index of the feature it fits best, and whether others fit, too.
+
+    Both (K,); index: -1 where there is none.
+    """
 
     index: NDArray[np.int64]
     ambiguous: NDArray[np.bool_]
@@ -45,8 +53,8 @@ def associate(
 ) -> Choice:
     """Which features the lines of a scan are, each taken by itself.
 
-    laser_map (2,): where the scan was seen from. Lines that could be several features are better asked again when the
-    others have corrected the pose.
+    laser_map (2,): where the scan was seen from. Lines that could be several features are better
+    asked again when the others have corrected the pose.
     """
     chosen = np.full(len(lines), -1, dtype=np.int64)
     passing = np.zeros(len(lines), dtype=np.int64)
@@ -73,8 +81,8 @@ def meeting(
 ) -> NDArray[np.bool_]:
     """Which segments, by their ends (K, 2, 2), could be part of which features, (K, N).
 
-    Direction and offset roughly agree, the intervals along the line lie at most gap_m apart, and the place (2,) from
-    which the segments were seen is on the feature's side.
+    Direction and offset roughly agree, the intervals along the line lie at most gap_m apart, and
+    the place (2,) from which the segments were seen is on the feature's side.
     """
     offsets = np.abs(ends_map.mean(axis=1) @ normals_of(lines_map).T - lines_map[:, 0])
     chords = ends_map[:, 1] - ends_map[:, 0]
@@ -84,11 +92,16 @@ def meeting(
     gaps = np.maximum(low - along.max(axis=1), along.min(axis=1) - high)
     first_seen_from = np.array([f.seen_from for f in features]).reshape(-1, 2)
     facing = sides_of(lines_map, seen_from) == sides_of(lines_map, first_seen_from)
-    return np.asarray((offsets <= _NEAR_M) & (rise <= math.sin(_NEAR_RAD)) & (gaps <= gap_m) & facing)
+    return np.asarray(
+        (offsets <= _NEAR_M) & (rise <= math.sin(_NEAR_RAD)) & (gaps <= gap_m) & facing
+    )
 
 
 def mahalanobis(v: Array, S: Array) -> float:
-    """Squared Mahalanobis distance v' S^-1 v of a (2,) and a (2, 2); inf where S is not positive."""
+    """Squared Mahalanobis distance v' S^-1 v of a (2,) and a (2, 2).
+
+    Inf where S is not positive.
+    """
     determinant = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
     if not (determinant > 0.0 and S[0, 0] > 0.0):
         return math.inf

@@ -1,4 +1,7 @@
-"""Lines that are not yet features: only what is seen several times, at the same place, becomes one."""
+"""Lines that are not yet features.
+
+Only what is seen several times, at the same place, becomes one.
+"""
 
 from dataclasses import dataclass
 
@@ -14,7 +17,10 @@ from thinmap_ros.core.slam.models import place_line
 
 @dataclass(eq=False)
 class Candidate:
-    """A line (r, alpha) and what was seen of it, in the map; the last look as it was seen, z (2,) with covariance."""
+    """A line (r, alpha) and what was seen of it, in the map.
+
+    The last look as it was seen, z (2,) with covariance.
+    """
 
     line: Array
     span: Feature
@@ -28,13 +34,19 @@ class Candidates:
     """The lines that have been seen too seldom so far."""
 
     def __init__(self, sightings: int, patience: int, gate: float, gap_m: float) -> None:
-        """sightings: after how many a line is ripe; patience: looks without it after which it is dropped."""
+        """sightings: after how many a line is ripe.
+
+        Patience: looks without it after which it is dropped.
+        """
         self._sightings, self._patience, self._gate, self._gap_m = sightings, patience, gate, gap_m
         self._all: list[Candidate] = []
         self._looks = 0
 
     def take(self, pose: Array, lines: Lines, laser_map: Array) -> list[Candidate]:
-        """Take in lines of a scan from a pose (3,), with the laser at a place (2,); returns those that are ripe now."""
+        """Take in lines of a scan from a pose (3,), with the laser at a place (2,).
+
+        Returns those that are ripe now.
+        """
         self._looks += 1
         seen = [
             self._take(pose, z, covariance, transform_points(pose, ends), laser_map)
@@ -49,7 +61,9 @@ class Candidates:
         """Drop them all: what they were compared with has moved."""
         self._all.clear()
 
-    def _take(self, pose: Array, z: Array, covariance: Array, ends_map: Array, laser_map: Array) -> Candidate:
+    def _take(
+        self, pose: Array, z: Array, covariance: Array, ends_map: Array, laser_map: Array
+    ) -> Candidate:
         """The candidate that a seen line continues, brought up to date, or a new one."""
         line, _, by_seen = place_line(pose, z)
         # Two looks at one line differ by the noise of both; the robot hardly moved in between.

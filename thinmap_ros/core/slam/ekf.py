@@ -1,6 +1,7 @@
 """EKF-SLAM over a pose and line features: the conventional filter.
 
-Source: EKF-SLAM/TI paper section 2, eqs. (1)-(11). State [x, y, theta, r_1, alpha_1, r_2, alpha_2, ...].
+Source: EKF-SLAM/TI paper section 2, eqs. (1)-(11).
+State [x, y, theta, r_1, alpha_1, r_2, alpha_2, ...].
 """
 
 import math
@@ -18,8 +19,9 @@ _POSE_GATE = 11.34  # largest squared Mahalanobis distance of a step of the pose
 class EkfSlam:
     """The filter. Features are addressed by their place in the state, 0 to count - 1.
 
-    Between pose and features the state may hold `carried` numbers that no observation sees and no motion moves; whoever
-    wants to know what the updates did to other quantities lets them stand for these (see ekf_ti).
+    Between pose and features the state may hold `carried` numbers that no observation sees and no
+    motion moves; whoever wants to know what the updates did to other quantities lets them stand for
+    these (see ekf_ti).
     """
 
     def __init__(self, T_map_base: Array, covariance: Array, carried: int = 0) -> None:
@@ -71,7 +73,10 @@ class EkfSlam:
         return np.asarray(self._P[at[:, :, None], at[:, None, :]])
 
     def set_state(self, mean: Array, covariance: Array) -> None:
-        """Take a whole state (size,) with its covariance; what follows pose and carried numbers are features."""
+        """Take a whole state (size,) with its covariance.
+
+        What follows pose and carried numbers are features.
+        """
         n = mean.size
         self._reserve(n)
         self.count = (n - self.first) // 2
@@ -79,7 +84,7 @@ class EkfSlam:
         self._step[:] = 0.0
 
     def set_pose(self, T_map_base: Array, covariance: Array) -> None:
-        """Put the robot at a pose (3,) with covariance (3, 3) that has nothing to do with the features."""
+        """Put the robot at a pose (3,) with covariance (3, 3), independent of the features."""
         n = self.size
         self._x[:3] = T_map_base
         self._x[2] = wrap(float(T_map_base[2]))
@@ -93,7 +98,7 @@ class EkfSlam:
         self._x[2] = wrap(float(T_map_base[2]))
 
     def predict(self, T_map_base: Array, increment: Array, increment_covariance: Array) -> None:
-        """Move to T_map_base = pose o increment, with the covariance (3, 3) of the increment. Eqs. (10), (11).
+        """Move to T_map_base = pose o increment of covariance (3, 3), by eqs. (10) and (11).
 
         Only the pose moves, so only the pose's rows and columns of P change.
         """
@@ -118,18 +123,24 @@ class EkfSlam:
         return self._step[:3].copy()
 
     def take_back(self, share: float) -> None:
-        """Move the features back by a share of what these updates moved them; whose the pose is, is the caller's."""
+        """Move the features back by a share of what these updates moved them.
+
+        The pose is left to the caller.
+        """
         n = self.size
         self._x[3:n] -= share * self._step[3:n]
         self._step[:] = 0.0
         self._normalise()
 
-    def update(self, indices: NDArray[np.int64], z: Array, R: Array, leeway: Array | None = None) -> bool:
-        """Correct by features (M,) seen as lines z (M, 2) with covariances R (M, 2, 2). Eqs. (6)-(9).
+    def update(
+        self, indices: NDArray[np.int64], z: Array, R: Array, leeway: Array | None = None
+    ) -> bool:
+        """Correct by features (M,) seen as lines z (M, 2) of covariances R (M, 2, 2), eqs. (6)-(9).
 
-        Returns False, and changes nothing, where the numbers do not make an update. An update that would move the pose
-        farther than a leeway (3, 3), a covariance, allows contradicts what is known from elsewhere, and is left out.
-        H has five nonzero columns a line, so H P takes these rows only.
+        Returns False, and changes nothing, where the numbers do not make an update. An update that
+        would move the pose farther than a leeway (3, 3), a covariance, allows contradicts what is
+        known from elsewhere, and is left out. H has five nonzero columns a line, so H P takes these
+        rows only.
         """
         if len(indices) == 0:
             return True
@@ -157,13 +168,16 @@ class EkfSlam:
         return taken
 
     def tie(self, kept: int, dropped: int, covariance: Array) -> bool:
-        """Let two features be one wall: their difference is 0 up to a covariance (2, 2); whether that could be done."""
+        """Let two features be one wall: their difference is 0 up to a covariance (2, 2).
+
+        Returns whether that could be done.
+        """
         n, a, b = self.size, self.place(kept), self.place(dropped)
         v, S, signs = self.difference(kept, dropped)
         return self._correct(-v, S + covariance, self._P[a, :n] - signs[:, None] * self._P[b, :n])
 
     def difference(self, a: int, b: int) -> tuple[Array, Array, Array]:
-        """Line a less line b, (2,), its covariance (2, 2), and the signs (2,) with which b's r and alpha count.
+        """Line a less line b, (2,), its covariance (2, 2), and signs (2,) of b's r and alpha in it.
 
         (r, alpha) and (-r, alpha + pi) are one line; b is taken in the form that is nearer to a.
         """
@@ -195,7 +209,10 @@ class EkfSlam:
         self.count -= 1
 
     def _correct(self, v: Array, S: Array, HP: Array) -> bool:
-        """Eqs. (6)-(9): x += K v and P -= K (H P), from innovation v (M,), its covariance S (M, M) and HP (M, size)."""
+        """Eqs. (6)-(9): x += K v and P -= K (H P).
+
+        v (M,): the innovation, S (M, M): its covariance, HP (M, size).
+        """
         taken = bool(_correct(0.5 * (S + S.T), HP, v, self._x, self._P))
         if taken:
             self._normalise()
@@ -211,7 +228,10 @@ class EkfSlam:
         self._x, self._step, self._P = x, step, P
 
     def _normalise(self) -> None:
-        """Angles into (-pi, pi]. An r below zero stays: turning the line round would turn its ends with it."""
+        """Angles into (-pi, pi].
+
+        An r below zero stays: turning the line round would turn its ends with it.
+        """
         self._x[2] = wrap(float(self._x[2]))
         self.lines[:, 1] = wrap(self.lines[:, 1])
 
@@ -225,7 +245,7 @@ def _beyond(step: Array, leeway: Array) -> bool:
 
 
 def line_difference(a: Array, b: Array) -> tuple[Array, Array]:
-    """Line a (r, alpha) less line b, in the form of b that is nearer, and the signs (2,) of b's r and alpha in it."""
+    """Line a (r, alpha) less line b, in the nearer form of b, and signs (2,) of b's r and alpha."""
     v = _difference(a, b)
     if abs(v[1]) <= 0.5 * math.pi:
         return v, np.ones(2)
@@ -236,8 +256,8 @@ def line_difference(a: Array, b: Array) -> tuple[Array, Array]:
 def _correct(S: Array, HP: Array, v: Array, x: Array, P: Array) -> bool:
     """Correct x and P in place; returns False, with x and P untouched, where S is not positive.
 
-    With S = L L', W = L^-1 H P and w = L^-1 v the gain need not be formed: K v = W' w, and K (H P) = W' W, which is
-    symmetric to the last bit. S, HP and v are used up.
+    With S = L L', W = L^-1 H P and w = L^-1 v the gain need not be formed: K v = W' w, and
+    K (H P) = W' W, which is symmetric to the last bit. S, HP and v are used up.
     """
     m, n = HP.shape
     for j in range(m):

@@ -1,18 +1,21 @@
-"""EKF-SLAM/TI: the conventional filter's estimate at a cost that does not depend on the number of features.
+"""EKF-SLAM/TI: the conventional filter's estimate at a cost independent of the feature count.
 
-Steps touch the pose and the features of a local area, A. What they would do to all other features, B, is gathered in
-a few numbers and worked in when the area changes. Source: EKF-SLAM/TI paper section 4 for the area; the compressed
-filter after Guivant and Nebot, "Optimization of the simultaneous localization and map-building algorithm for
-real-time implementation", 2001 (the paper's reference [4]).
+Steps touch the pose and the features of a local area, A. What they would do to all other features,
+B, is gathered in a few numbers and worked in when the area changes. Source: EKF-SLAM/TI paper
+section 4 for the area; the compressed filter after Guivant and Nebot, "Optimization of the
+simultaneous localization and map-building algorithm for real-time implementation", 2001 (the
+paper's reference [4]).
 
-With the covariances at the time when the area was entered, P_AB and P_BB, there is a matrix C and a vector c so that
-now x_B = x_B + P_BA c and P_BB = P_BB + P_BA C P_AB, and each number a of A has the cross terms
-P_aB = Phi_a P_AB. That is just what happens to a vector e with mean 0, covariance 0 and cov(A, e) = I on entering
-(B moves as P_BA e), whose mean c, covariance C and cross terms Phi the filter itself keeps up when e is carried in its
-state. So there is no second set of equations: the local filter is the conventional one with e carried along.
+With the covariances at the time when the area was entered, P_AB and P_BB, there is a matrix C and a
+vector c so that now x_B = x_B + P_BA c and P_BB = P_BB + P_BA C P_AB, and each number a of A has
+the cross terms P_aB = Phi_a P_AB. That is just what happens to a vector e with mean 0, covariance 0
+and cov(A, e) = I on entering (B moves as P_BA e), whose mean c, covariance C and cross terms Phi
+the filter itself keeps up when e is carried in its state. So there is no second set of equations:
+the local filter is the conventional one with e carried along.
 
-Folding P_BA C P_AB into P_BB costs the square of the number of features. C is negative, so the term is -W' W with few
-rows; reading only what a new area needs and working off W a few rows at each step keeps every step short.
+Folding P_BA C P_AB into P_BB costs the square of the number of features. C is negative, so the term
+is -W' W with few rows; reading only what a new area needs and working off W a few rows at each step
+keeps every step short.
 """
 
 import math
@@ -35,18 +38,20 @@ _ROUNDING = 1e-15  # eigenvalues this much smaller than the largest are nothing 
 class CompressedEkf:
     """Pose and all features; `local` is the filter of pose and the features of the area.
 
-    Features are known by ids of the caller's choice. `area` lists those of the local filter, in its order; change the
-    number of its features only by `add` and `remove` of this class. As long as `enter` is never called, all features
-    are in the area, and this is the conventional filter.
+    Features are known by ids of the caller's choice. `area` lists those of the local filter, in its
+    order; change the number of its features only by `add` and `remove` of this class. As long as
+    `enter` is never called, all features are in the area, and this is the conventional filter.
     """
 
     def __init__(self, T_map_base: Array, covariance: Array) -> None:
         self.local = EkfSlam(T_map_base, covariance)
         self.area: list[int] = []
         self._store = _Store()
-        # P_AB on entering the area, (carried numbers, store's width); the columns of the area itself are 0.
+        # P_AB on entering the area, (carried numbers, store's width);
+        # the columns of the area itself are 0.
         self._cross: Array = np.zeros((0, self._store.width))
-        self._places: dict[int, int] = {}  # by id, which pair of the store's numbers is the feature's
+        # By id, which pair of the store's numbers is the feature's.
+        self._places: dict[int, int] = {}
 
     def __len__(self) -> int:
         return len(self._places)
@@ -57,7 +62,10 @@ class CompressedEkf:
         return list(self._places)
 
     def add(self, feature_id: int, seen: Array, covariance: Array) -> int:
-        """Take up a line seen as (r, alpha) as a new feature of the area; returns its index in the local filter."""
+        """Take up a line seen as (r, alpha) as a new feature of the area.
+
+        Returns its index in the local filter.
+        """
         self._places[feature_id] = self._store.take_place()
         if self._cross.shape[1] < self._store.width:
             self._cross = widened(self._cross, self._store.width)
@@ -71,7 +79,10 @@ class CompressedEkf:
         self.local.remove(index)
 
     def enter(self, ids: list[int]) -> None:
-        """Make these features the local area; what the steps so far mean for all others is folded in."""
+        """Make these features the local area.
+
+        What the steps so far mean for all others is folded in.
+        """
         pose_cross = self._fold()
         at = self._numbers(ids)
         mean, rows = self._store.read(at)
@@ -98,7 +109,10 @@ class CompressedEkf:
         self._store.sweep()
 
     def settle(self) -> tuple[Array, Array]:
-        """Work everything in; mean (3 + 2 N,) and covariance of pose and all features, in the order of `ids`."""
+        """Work everything in.
+
+        Mean (3 + 2 N,) and covariance of pose and all features, in the order of `ids`.
+        """
         area = self.area
         self.enter(self.ids)
         mean, covariance = self.local.mean, self.local.covariance
@@ -106,20 +120,24 @@ class CompressedEkf:
         return mean, covariance
 
     def restore(self, ids: list[int], lines: Array, covariance: Array) -> None:
-        """Take up features with their lines (N, 2) and covariance (2 N, 2 N), into a filter that has none.
+        """Take up features with lines (N, 2) and covariance (2 N, 2 N), into a filter without any.
 
         The pose has nothing to do with them. All are in the area until another one is entered.
         """
         for feature_id in ids:
             self._places[feature_id] = self._store.take_place()
         self._cross = np.zeros((0, self._store.width))
-        mean, own = np.concatenate([self.local.pose, lines.ravel()]), np.zeros((3 + lines.size,) * 2)
+        mean = np.concatenate([self.local.pose, lines.ravel()])
+        own = np.zeros((3 + lines.size,) * 2)
         own[:3, :3], own[3:, 3:] = self.local.pose_covariance, covariance
         self.local.set_state(mean, own)
         self.area = list(ids)
 
     def lines(self) -> dict[int, Array]:
-        """Line (r, alpha) of every feature; of those outside the area, as of when the area was entered."""
+        """Line (r, alpha) of every feature.
+
+        Of those outside the area, as of when the area was entered.
+        """
         found = {i: self._store.mean[2 * p : 2 * p + 2] for i, p in self._places.items()}
         found.update(zip(self.area, self.local.lines, strict=True))
         return found
@@ -132,7 +150,10 @@ class CompressedEkf:
         return ids, lines[np.fromiter(self._places.values(), dtype=np.int64, count=len(self))]
 
     def line_covariances(self) -> dict[int, Array]:
-        """Covariance (2, 2) of every feature's line; of those outside the area, as of when the area was entered."""
+        """Covariance (2, 2) of every feature's line.
+
+        Of those outside the area, as of when the area was entered.
+        """
         found = dict(zip(self.ids, self._store.blocks(list(self._places.values())), strict=True))
         found.update(zip(self.area, self.local.line_covariances(), strict=True))
         return found
@@ -157,7 +178,10 @@ class CompressedEkf:
 
 
 def _carrying(pose: Array, lines: Array, covariance: Array, carried: int) -> EkfSlam:
-    """A filter of pose (3,) and lines (2 L,) with their covariance, and e between them, with cov(A, e) = I."""
+    """A filter of pose (3,) and lines (2 L,) with their covariance, and e between them.
+
+    It has cov(A, e) = I.
+    """
     local = EkfSlam(pose, covariance[:3, :3], carried)
     at = np.r_[0:3, 3 + carried : 3 + carried + lines.size]
     mean, P = np.zeros(at.size + carried), np.zeros((at.size + carried, at.size + carried))
@@ -169,11 +193,12 @@ def _carrying(pose: Array, lines: Array, covariance: Array, carried: int) -> Ekf
 
 
 class _Store:
-    """Mean and covariance of all features as of the last fold, the latter with a few terms -W' W still to be added.
+    """Mean and covariance of all features as of the last fold.
 
-    Terms are worked off in sweeps over rows and columns, from the first to the last. A sweep takes what is there when
-    it begins; what comes meanwhile waits for the next. Rows and columns that are written are up to date, so the terms
-    are zero there from then on.
+    To the covariance a few terms -W' W are still to be added. These are worked off in sweeps over
+    rows and columns, from the first to the last. A sweep takes what is there when it begins; what
+    comes meanwhile waits for the next. Rows and columns that are written are up to date, so the
+    terms are zero there from then on.
     """
 
     def __init__(self) -> None:
@@ -194,9 +219,11 @@ class _Store:
         self._used += 1
         if 2 * self._used > self.width:
             self.width += _CHUNK
-            self._sweeping, self._waiting = widened(self._sweeping, self.width), widened(self._waiting, self.width)
+            self._sweeping = widened(self._sweeping, self.width)
+            self._waiting = widened(self._waiting, self.width)
         if self.width > self.mean.size:
-            self.mean, larger = np.append(self.mean, np.zeros(_ROOM)), _zeros(self.mean.size + _ROOM)
+            larger = _zeros(self.mean.size + _ROOM)
+            self.mean = np.append(self.mean, np.zeros(_ROOM))
             larger[: len(self._P), : len(self._P)] = self._P
             self._P = larger
         return self._used - 1
@@ -238,7 +265,9 @@ class _Store:
         found = self._P[at[:, :, None], at[:, None, :]]
         swept = np.where(at[:, 0] >= self._row, 1.0, 0.0)[:, None, None]
         found -= swept * np.einsum('kia,kib->iab', self._sweeping[:, at], self._sweeping[:, at])
-        return np.asarray(found - np.einsum('kia,kib->iab', self._waiting[:, at], self._waiting[:, at]))
+        return np.asarray(
+            found - np.einsum('kia,kib->iab', self._waiting[:, at], self._waiting[:, at])
+        )
 
     def subtract(self, W: Array) -> None:
         """Take W' W off the covariance, in time; W (R, width)."""
@@ -250,7 +279,8 @@ class _Store:
             self._sweeping, self._waiting, self._row = self._waiting, self._sweeping, 0
         if len(self._sweeping) == 0:
             return
-        # Rows grow shorter to the diagonal, so a step's share is one of the triangle; shares are saved up for a block.
+        # Rows grow shorter to the diagonal, so a step's share is one of the triangle; shares are
+        # saved up for a block.
         end, a = 2 * self._used, self._row
         self._due += 0.5 * end * end / _SWEEP_STEPS
         if self._due < _BLOCK * (end - a) and self._due < 0.5 * (end - a) ** 2:
@@ -268,7 +298,8 @@ class _Store:
 def _zeros(size: int) -> Array:
     """Zeros (size, size) that take up memory only where they are written.
 
-    Not by numpy: that asks for large pages, of which each line of the few numbers in use would take up its share.
+    Not by numpy: that asks for large pages, of which each line of the few numbers in use would take
+    up its share.
     """
     pages = mmap.mmap(-1, 8 * size * size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
     with suppress(AttributeError, OSError):  # where there are no large pages

@@ -1,8 +1,10 @@
-"""The line features of the map and their care: how one enters, grows, is found to be another one, and leaves.
+"""The line features of the map and their care.
 
-Source: EKF-SLAM/TI paper sections 2 and 4. The paper does not say when a feature enters or leaves; here it enters
-after several sightings from different places, because what was only clutter would stay in the state for ever, and
-leaves when several looks went through where it should be.
+How one enters, grows, is found to be another one, and leaves.
+
+Source: EKF-SLAM/TI paper sections 2 and 4. The paper does not say when a feature enters or leaves;
+here it enters after several sightings from different places, because what was only clutter would
+stay in the state for ever, and leaves when several looks went through where it should be.
 """
 
 from collections.abc import Iterable, Mapping
@@ -58,17 +60,26 @@ FIELDS = {
 class FeatureConfig(AssociationConfig):
     """Parameters of the upkeep of features."""
 
-    wall_sigma_m: float = parameter(0.02, 'how far real walls are from straight lines, 1 sigma, m', low=0.0, high=1.0)
-    wall_sigma_rad: float = parameter(0.006, 'how far real walls are from straight lines, rad', low=0.0, high=0.5)
+    wall_sigma_m: float = parameter(
+        0.02, 'how far real walls are from straight lines, 1 sigma, m', low=0.0, high=1.0
+    )
+    wall_sigma_rad: float = parameter(
+        0.006, 'how far real walls are from straight lines, rad', low=0.0, high=0.5
+    )
     sightings: int = parameter(4, 'a line enters the map after so many sightings', low=1, high=100)
-    patience: int = parameter(15, 'a candidate not seen for so many looks is dropped', low=1, high=10_000)
-    misses: int = parameter(5, 'a feature seen through by so many looks in a row leaves the map', low=1, high=1000)
+    patience: int = parameter(
+        15, 'a candidate not seen for so many looks is dropped', low=1, high=10_000
+    )
+    misses: int = parameter(
+        5, 'a feature seen through by so many looks in a row leaves the map', low=1, high=1000
+    )
 
 
 class FeatureMap:
-    """All features by id, in which of them the filter's local area consists, and the lines that may become features.
+    """All features by id, those in the filter's local area, and lines that may become features.
 
-    With local areas (EKF-SLAM/TI) association and update take the features of the local area; without, all.
+    With local areas (EKF-SLAM/TI) association and update take the features of the local area;
+    without, all.
     """
 
     def __init__(self, config: FeatureConfig, local_areas: bool) -> None:
@@ -85,14 +96,18 @@ class FeatureMap:
         return len(self._features)
 
     def state(self, ekf: CompressedEkf) -> dict[str, NDArray[Any]]:
-        """All features as arrays by name, with the covariance of their lines; candidates are left out."""
+        """All features as arrays by name, with the covariance of their lines.
+
+        Candidates are left out.
+        """
         mean, covariance = ekf.settle()
         features = [self._features[i] for i in ekf.ids]
+        spans = [(f.low, f.high, *f.seen_from, f.missed) for f in features]
         return {
             'ids': np.array(ekf.ids, dtype=np.int64),
             'lines': mean[3:].reshape(-1, 2),
             'line_covariance': covariance[3:, 3:],
-            'spans': np.array([(f.low, f.high, *f.seen_from, f.missed) for f in features]).reshape(-1, 5),
+            'spans': np.array(spans).reshape(-1, 5),
             'next_id': np.array(self._next_id),
             **self.area.state(),
         }
@@ -145,22 +160,28 @@ class FeatureMap:
     def _correct(
         self, ekf: CompressedEkf, lines: Lines, laser_map: Array, leeway: Array | None
     ) -> tuple[NDArray[np.int64], bool]:
-        """Update by the lines that can only be one feature, then by the others; which feature each is (-1: none)."""
+        """Update by the lines that can only be one feature, then by the others.
+
+        Returns which feature each is (-1: none).
+        """
         features = self._local(ekf)
         choice = associate(ekf.local, features, lines, laser_map, self._config)
         chosen = np.where(choice.ambiguous, -1, choice.index)
         taken = _update(ekf.local, chosen, lines, leeway)
         left = np.flatnonzero(choice.ambiguous)
         if left.size:
-            again = associate(ekf.local, features, lines.chosen(left), laser_map, self._config).index
+            again = associate(
+                ekf.local, features, lines.chosen(left), laser_map, self._config
+            ).index
             taken &= _update(ekf.local, again, lines.chosen(left), leeway)
             chosen[left] = again
         return chosen, taken
 
     def move(self, ekf: CompressedEkf, correction: Correction) -> None:
-        """Take the features where the keyframes nearest to where they were first seen from have gone.
+        """Take features where the keyframes nearest to where they were first seen from have gone.
 
-        How doubtful they are stays as it was. Two that turn out to be one wall are merged when they are seen next.
+        How doubtful they are stays as it was. Two that turn out to be one wall are merged when they
+        are seen next.
         """
         places, moved = correction.before[:, :2], {}
         for feature_id, line in ekf.lines().items():
@@ -178,7 +199,7 @@ class FeatureMap:
         return [self._features[i] for i in ekf.area]
 
     def _choose_area(self, ekf: CompressedEkf, scan: Scan) -> None:
-        """Have the filter enter the area of the robot, when it lacks something of it or holds much that is not."""
+        """Have the filter enter the robot's area when it lacks some of it or holds much else."""
         half_view = 0.5 * abs(scan.angle_increment_rad) * scan.ranges_m.size
         wanted = self.area.features_near(ekf.local.pose, half_view) | self._called
         if not wanted <= set(ekf.area) or len(ekf.area) > len(wanted) + _SPARE:
@@ -196,13 +217,15 @@ class FeatureMap:
     def _miss(self, ekf: CompressedEkf, seen: Iterable[int], scan: Scan) -> None:
         """Features that the scan went through, time and again, leave."""
         through = seen_through(scan, ekf.local.pose, ekf.local.lines, self._local(ekf))
-        for feature_id in [i for i, gone in zip(ekf.area, through, strict=True) if gone and i not in seen]:
+        for feature_id in [
+            i for i, gone in zip(ekf.area, through, strict=True) if gone and i not in seen
+        ]:
             self._features[feature_id].missed += 1
             if self._features[feature_id].missed >= self._config.misses:
                 self._drop(ekf, feature_id, None)
 
     def _merge(self, ekf: CompressedEkf, seen: Iterable[int]) -> None:
-        """Of the features just seen, those that turn out to be another one are tied to it in the filter and go."""
+        """Of the features just seen, those found to be another one are tied to it, and go."""
         for feature_id in seen:
             twin = self._twin(ekf, feature_id) if feature_id in self._features else None
             if twin is None:
@@ -215,10 +238,15 @@ class FeatureMap:
                 self._drop(ekf, dropped, kept)
 
     def _twin(self, ekf: CompressedEkf, feature_id: int) -> int | None:
-        """Another feature that passes for the same wall: it meets this one, and their difference passes the gate."""
+        """Another feature that passes for the same wall.
+
+        It meets this one, and their difference passes the gate.
+        """
         index, lines = ekf.area.index(feature_id), ekf.local.lines
         ends = ends_of(self._features[feature_id], lines[index])
-        near = meeting(lines, self._local(ekf), ends[None], self._features[feature_id].seen_from, 0.0)[0]
+        near = meeting(
+            lines, self._local(ekf), ends[None], self._features[feature_id].seen_from, 0.0
+        )[0]
         for other in np.flatnonzero(near):
             if other != index and self._is_one_wall(ekf, index, int(other)):
                 return ekf.area[other]
@@ -242,7 +270,10 @@ class FeatureMap:
         del self._features[feature_id]
 
     def _take_up(self, ekf: CompressedEkf, candidate: Candidate) -> list[int]:
-        """Make a line a feature, unless it is one that the map has elsewhere; returns the id of the new feature."""
+        """Make a line a feature, unless it is one that the map has elsewhere.
+
+        Returns the id of the new feature.
+        """
         known = self._covering(ekf, candidate)
         if known:
             self._called |= known - set(ekf.area)
@@ -254,17 +285,24 @@ class FeatureMap:
         return [feature_id]
 
     def _covering(self, ekf: CompressedEkf, candidate: Candidate) -> set[int]:
-        """Features that cover the candidate's place, though it failed the gate: two for one wall help nobody."""
+        """Features that cover the candidate's place, though it failed the gate.
+
+        Two for one wall help nobody.
+        """
         if not self._features:
             return set()
         ids, lines = ekf.line_array()
         start, end = ends_of(candidate.span, candidate.line)
         middle, reach = 0.5 * (start + end), 0.25 * (end - start)
         near = np.abs(normals_of(lines) @ middle - lines[:, 0]) <= self._near
-        ids, lines = ids[near], lines[near]  # the few on whose lines it lies, of all that the map has
+        # The few on whose lines it lies, of all that the map has.
+        ids = ids[near]
+        lines = lines[near]
         features = [self._features[i] for i in ids.tolist()]
         ends = np.stack([middle - reach, middle + reach])
-        return set(ids[meeting(lines, features, ends[None], candidate.span.seen_from, 0.0)[0]].tolist())
+        return set(
+            ids[meeting(lines, features, ends[None], candidate.span.seen_from, 0.0)[0]].tolist()
+        )
 
 
 def _check_references(state: Mapping[str, NDArray[Any]]) -> None:

@@ -1,4 +1,4 @@
-"""What is kept of a line feature beside its place in the filter's state, and where it lies along its line."""
+"""What is kept of a line feature beside the filter's state, and where it lies along its line."""
 
 from dataclasses import dataclass
 
@@ -9,10 +9,11 @@ from thinmap_ros.core.se2 import Array, wrap
 
 @dataclass(eq=False)
 class Feature:
-    """A feature's id, the interval [low, high] (m) seen of its line, and from where (2,) it was first seen, map frame.
+    """A feature's id, the interval [low, high] (m) seen of its line, and from where at first.
 
-    Positions along a line are counted from the foot of the perpendicular from the map's origin, to its left. missed
-    counts the looks in a row that should have met the feature and did not.
+    Positions along a line are counted from the foot of the perpendicular from the map's origin, to
+    its left. seen_from (2,): in the map frame, m. missed counts the looks in a row that should have
+    met the feature and did not.
     """
 
     id: int
@@ -28,9 +29,10 @@ class Feature:
 
 @dataclass(frozen=True, eq=False)
 class LineFeature:
-    """A feature as others see it: id, (r >= 0, alpha) with covariance (2, 2), and its ends (2,) each, m, map frame.
+    """A feature as others see it.
 
-    nodes: ids of the topological nodes at which it is stored; local: whether it is in the local area now.
+    id; r >= 0 and alpha with their covariance (2, 2); its ends (2,) each, m, map frame; nodes: ids
+    of the topological nodes at which it is stored; local: whether it is in the local area now.
     """
 
     id: int
@@ -49,19 +51,25 @@ def normals_of(lines: Array) -> Array:
 
 
 def tangents_of(lines: Array) -> Array:
-    """Directions (N, 2) in which positions along lines (N, 2) grow: their normals turned to the left."""
+    """Directions (N, 2) in which positions along lines (N, 2) grow.
+
+    Their normals turned to the left.
+    """
     return _paired(-np.sin(lines[:, 1]), np.cos(lines[:, 1]))
 
 
 def _paired(x: Array, y: Array) -> Array:
-    """(N, 2) of x (N,) and y (N,): a step asks for it so often that np.column_stack would be felt."""
+    """(N, 2) of x (N,) and y (N,): asked for so often that np.column_stack would be felt."""
     pairs = np.empty((x.size, 2))
     pairs[:, 0], pairs[:, 1] = x, y
     return pairs
 
 
 def sides_of(lines: Array, points: Array) -> Array:
-    """Side of each line (N, 2) on which its point (N, 2), or one point (2,), lies: 1 the origin's, -1 beyond."""
+    """Side of each line (N, 2) on which its point (N, 2), or one point (2,), lies.
+
+    1 the origin's, -1 beyond.
+    """
     return np.where(lines[:, 0] - (normals_of(lines) * points).sum(axis=1) >= 0.0, 1.0, -1.0)
 
 
@@ -77,7 +85,10 @@ def point_on(line: Array, position: float) -> Array:
 
 
 def moved_line(T: Array, line: Array) -> Array:
-    """Line (r, alpha) after a motion T (3,) of the plane; r may become negative, as its normal turns with it."""
+    """Line (r, alpha) after a motion T (3,) of the plane.
+
+    Its r may become negative, as its normal turns with it.
+    """
     alpha = wrap(float(line[1] + T[2]))
     return np.array([line[0] + T[0] * np.cos(alpha) + T[1] * np.sin(alpha), alpha])
 
@@ -87,10 +98,15 @@ def ends_of(feature: Feature, line: Array) -> Array:
     return np.stack([point_on(line, feature.low), point_on(line, feature.high)])
 
 
-def as_seen(feature: Feature, line: Array, covariance: Array, nodes: list[int], local: bool) -> LineFeature:
-    """The feature with its line (r, alpha) of the present state, for others: in the form with r >= 0."""
+def as_seen(
+    feature: Feature, line: Array, covariance: Array, nodes: list[int], local: bool
+) -> LineFeature:
+    """The feature with its line (r, alpha) of the present state, for others: with r >= 0."""
     start, end = ends_of(feature, line)
     if line[0] < 0.0:
         signs = np.array([-1.0, 1.0])
-        line, covariance = np.array([-line[0], line[1] + np.pi]), signs[:, None] * covariance * signs
-    return LineFeature(feature.id, float(line[0]), wrap(float(line[1])), covariance, start, end, nodes, local)
+        line = np.array([-line[0], line[1] + np.pi])
+        covariance = signs[:, None] * covariance * signs
+    return LineFeature(
+        feature.id, float(line[0]), wrap(float(line[1])), covariance, start, end, nodes, local
+    )

@@ -1,11 +1,15 @@
-"""Line segments of a scan: split where the beams jump or bend, merged where they go on, fitted by least squares.
+"""Line segments of a scan.
 
-A run of beams ends where two neighbours lie farther apart than on a wall seen at the flattest usable angle. It is split
-at the point farthest from the chord of its ends while that is farther than noise can be (iterative end point fit);
-neighbouring parts that fit one line are merged again. What is then left has to pass for a wall: enough points, long
-enough, residuals that the noise of the beams explains, and no bow (round columns make short chords).
-Source: EKF-SLAM/TI paper section 4 (least-squares lines, reference [9] there); the breakpoints after Borges and Aldon,
-"Line extraction in 2D range images", 2004; the fit minimises sum w (rho cos(phi - alpha) - r)^2.
+Split where the beams jump or bend, merged where they go on, fitted by least squares.
+
+A run of beams ends where two neighbours lie farther apart than on a wall seen at the flattest
+usable angle. It is split at the point farthest from the chord of its ends while that is farther
+than noise can be (iterative end point fit); neighbouring parts that fit one line are merged again.
+What is then left has to pass for a wall: enough points, long enough, residuals that the noise of
+the beams explains, and no bow (round columns make short chords).
+Source: EKF-SLAM/TI paper section 4 (least-squares lines, reference [9] there); the breakpoints
+after Borges and Aldon, "Line extraction in 2D range images", 2004; the fit minimises
+sum w (rho cos(phi - alpha) - r)^2.
 """
 
 import math
@@ -33,18 +37,31 @@ _R, _ALPHA, _RR, _RA, _AA, _CHI2, _BOW, _BOW_SIGMA, _LOW, _HIGH = range(10)
 class LineConfig(Config):
     """Parameters of line extraction and the noise of the beams."""
 
-    range_sigma_m: float = parameter(0.015, 'range noise of a beam, 1 sigma, m', low=0.0005, high=0.5)
-    bearing_sigma_rad: float = parameter(0.002, 'bearing noise of a beam, 1 sigma, rad', low=0.0, high=0.1)
-    line_range_m: float = parameter(20.0, 'points farther away make no lines, m', low=1.0, high=200.0)
-    line_split_m: float = parameter(0.05, 'a point this far from the chord splits a line, m', low=0.005, high=1.0)
+    range_sigma_m: float = parameter(
+        0.015, 'range noise of a beam, 1 sigma, m', low=0.0005, high=0.5
+    )
+    bearing_sigma_rad: float = parameter(
+        0.002, 'bearing noise of a beam, 1 sigma, rad', low=0.0, high=0.1
+    )
+    line_range_m: float = parameter(
+        20.0, 'points farther away make no lines, m', low=1.0, high=200.0
+    )
+    line_split_m: float = parameter(
+        0.05, 'a point this far from the chord splits a line, m', low=0.005, high=1.0
+    )
     line_points: int = parameter(8, 'fewest points of a line', low=4, high=1000)
     line_length_m: float = parameter(0.8, 'shortest line, m', low=0.05, high=10.0)
-    line_bow_m: float = parameter(0.02, 'a bow that rises by more than this is no wall, m', low=0.001, high=1.0)
+    line_bow_m: float = parameter(
+        0.02, 'a bow that rises by more than this is no wall, m', low=0.001, high=1.0
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """Segments of a scan, robot frame: z (K, 2) as (r, alpha), r >= 0, covariances (K, 2, 2), end points (K, 2, 2)."""
+    """Segments of a scan, robot frame.
+
+    z (K, 2) as (r, alpha), r >= 0, covariances (K, 2, 2), end points (K, 2, 2).
+    """
 
     z: Array
     covariances: Array
@@ -82,7 +99,10 @@ def extract_lines(scan: Scan, config: LineConfig) -> Lines:
 
 
 def _in_robot_frame(fits: Array, T_base_laser: Array) -> Lines:
-    """Lines of the laser frame seen from the robot: turned by the mount, r longer by the mount's part along n."""
+    """Lines of the laser frame seen from the robot.
+
+    Turned by the mount, r longer by the mount's part along n.
+    """
     r, alpha = fits[:, _R], fits[:, _ALPHA]
     normals = np.column_stack([np.cos(alpha), np.sin(alpha)])
     along = np.column_stack([-normals[:, 1], normals[:, 0]])
@@ -98,7 +118,9 @@ def _in_robot_frame(fits: Array, T_base_laser: Array) -> Lines:
     sign = np.where(r_base < 0.0, -1.0, 1.0)
     z = np.column_stack([sign * r_base, wrap(alpha_base + np.where(sign < 0.0, np.pi, 0.0))])
     covariances = np.stack([rr, sign * ra, sign * ra, fits[:, _AA]], axis=1).reshape(-1, 2, 2)
-    return Lines(z, covariances, transform_points(T_base_laser, ends.reshape(-1, 2)).reshape(-1, 2, 2))
+    return Lines(
+        z, covariances, transform_points(T_base_laser, ends.reshape(-1, 2)).reshape(-1, 2, 2)
+    )
 
 
 @kernel
@@ -152,7 +174,10 @@ def _apart(
     turn = (beams[i] - beams[i - 1]) * step
     if beams[i] - beams[i - 1] > 1 + _MOST_MISSING or turn >= 0.9 * _FLATTEST_RAD:
         return True
-    reach = min(ranges[i], ranges[i - 1]) * math.sin(turn) / math.sin(_FLATTEST_RAD - turn) + 3.0 * sigma
+    reach = (
+        min(ranges[i], ranges[i - 1]) * math.sin(turn) / math.sin(_FLATTEST_RAD - turn)
+        + 3.0 * sigma
+    )
     return bool(math.hypot(x[i] - x[i - 1], y[i] - y[i - 1]) > min(reach, _WIDEST_GAP_M))
 
 
@@ -166,7 +191,10 @@ def _split(
     parts: NDArray[np.int64],
     stack: NDArray[np.int64],
 ) -> int:
-    """Break a run [first, end) of points into parts that stay near their chords; returns how many."""
+    """Break a run [first, end) of points into parts that stay near their chords.
+
+    Returns how many.
+    """
     count, depth = 0, 1
     stack[0, 0], stack[0, 1] = first, end
     while depth > 0:
@@ -191,7 +219,15 @@ def _split(
 
 @kernel
 def _fit_trimmed(
-    x: Array, y: Array, ranges: Array, angles: Array, a: int, b: int, sigmas: Array, fewest: int, fit: Array
+    x: Array,
+    y: Array,
+    ranges: Array,
+    angles: Array,
+    a: int,
+    b: int,
+    sigmas: Array,
+    fewest: int,
+    fit: Array,
 ) -> tuple[int, int]:
     """Fit points [a, b) without end points that the line does not explain; returns what is left."""
     for _ in range(4):
@@ -214,7 +250,9 @@ def _variance(rho: float, off: float, sigmas: Array) -> float:
 
 
 @kernel
-def _off(x: Array, y: Array, ranges: Array, angles: Array, i: int, sigmas: Array, fit: Array) -> float:
+def _off(
+    x: Array, y: Array, ranges: Array, angles: Array, i: int, sigmas: Array, fit: Array
+) -> float:
     """Distance of a point from a fitted line, in sigmas."""
     distance = x[i] * math.cos(fit[_ALPHA]) + y[i] * math.sin(fit[_ALPHA]) - fit[_R]
     return float(abs(distance)) / math.sqrt(_variance(ranges[i], angles[i] - fit[_ALPHA], sigmas))
@@ -224,10 +262,11 @@ def _off(x: Array, y: Array, ranges: Array, angles: Array, i: int, sigmas: Array
 def _fit(
     x: Array, y: Array, ranges: Array, angles: Array, a: int, b: int, sigmas: Array, fit: Array
 ) -> None:
-    """Weighted total least squares through points [a, b), its covariance, and how well it explains them.
+    """Weighted total least squares through points [a, b), its covariance, and how well it fits.
 
-    The covariance is (J' W J)^-1, J the derivative of each point's distance by (r, alpha): the normal equations of the
-    fit itself. The bow is the parabola across the line that the distances still contain.
+    The covariance is (J' W J)^-1, J the derivative of each point's distance by (r, alpha): the
+    normal equations of the fit itself. The bow is the parabola across the line that the distances
+    still contain.
     """
     chord = math.atan2(y[b - 1] - y[a], x[b - 1] - x[a])
     alpha = chord - 0.5 * math.pi
@@ -256,7 +295,8 @@ def _fit(
         spread, chi2 = spread + w * (t - foot) ** 2, chi2 + w * d * d
         low, high = min(low, t), max(high, t)
     spread = max(spread, 1e-12)
-    # The mean's offset and the direction are independent; turning about the mean shifts r by foot times the turn.
+    # The mean's offset and the direction are independent; turning about the mean shifts r by foot
+    # times the turn.
     fit[_R], fit[_ALPHA], fit[_AA] = r, alpha, 1.0 / spread
     fit[_RA], fit[_RR] = foot / spread, 1.0 / total + foot * foot / spread
     fit[_CHI2], fit[_LOW], fit[_HIGH] = chi2 / max(b - a - 2, 1), low, high

@@ -1,7 +1,7 @@
 """Topological information: which features matter where the robot is.
 
-Features are stored at the nodes near which they were seen. The local area of a robot are the features of its node and
-of the nodes that edges join to it, but for those that it cannot see.
+Features are stored at the nodes near which they were seen. The local area of a robot are the
+features of its node and of the nodes that edges join to it, but for those that it cannot see.
 Source: EKF-SLAM/TI paper section 4, Fig. 6-8.
 """
 
@@ -41,7 +41,8 @@ class LocalArea:
         self._trail: _Trail | None = _Trail(self._topology)
         self._features_at: dict[int, set[int]] = {}
         self._nodes_of: dict[int, set[int]] = {}
-        # Ids and places of the nodes that could be nearest, as they were when the robot was at a place (2,).
+        # Ids and places of the nodes that could be nearest,
+        # as they were when the robot was at a place (2,).
         self._ids: list[int] = []
         self._places: Array = np.empty((0, 2))
         self._listed_at: Array = np.full(2, np.inf)
@@ -50,7 +51,9 @@ class LocalArea:
         self._listed: TopologicalMap | None = None
 
     def set_topology(self, topology: TopologicalMap) -> None:
-        """Take the topological map in use from now on: a newer state of the same map, or the map itself, changed.
+        """Take the topological map in use from now on.
+
+        It is a newer state of the same map, or the map itself, changed.
 
         Either way features at nodes that are no more are handed on when nodes are listed next.
         """
@@ -64,7 +67,7 @@ class LocalArea:
             self._listed_at = np.full(2, np.inf)
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """Which features are stored at which nodes (K, 2) as (feature, node), and these nodes with their places."""
+        """Features by node (K, 2) as (feature, node), and these nodes with their places."""
         nodes = self._topology.nodes
         stored = [(f, n) for f, at in self._nodes_of.items() for n in sorted(at) if n in nodes]
         ids = sorted({n for _, n in stored})
@@ -85,7 +88,10 @@ class LocalArea:
         ids, places = state['node_ids'].tolist(), state['node_places']
         if not ids:
             return
-        nodes = [Node(i, NodeKind.CORNER, x, y, 0.0) for i, (x, y) in zip(ids, places.tolist(), strict=True)]
+        nodes = [
+            Node(i, NodeKind.CORNER, x, y, 0.0)
+            for i, (x, y) in zip(ids, places.tolist(), strict=True)
+        ]
         self._topology, self._trail = TopologicalMap(nodes), None
         self._ids, self._places = ids, places
         self._place_of = dict(zip(ids, places, strict=True))
@@ -106,14 +112,20 @@ class LocalArea:
                 self._put(feature_id, node)
 
     def forget(self, feature_id: int, heir: int | None = None) -> None:
-        """Drop a feature everywhere; where it has become another one, heir, that is stored in its place."""
+        """Drop a feature everywhere.
+
+        Where it has become another one, heir, that is stored in its place.
+        """
         for node_id in self._nodes_of.pop(feature_id, set()):
             self._features_at[node_id].discard(feature_id)
             if heir is not None:
                 self._put(heir, node_id)
 
     def features_near(self, T_map_base: Array, half_view_rad: float) -> set[int]:
-        """Features of the local area at a pose (3,); half_view_rad: how far to either side the laser sees."""
+        """Features of the local area at a pose (3,).
+
+        half_view_rad: how far to either side the laser sees.
+        """
         here = self._node_at(T_map_base)
         if here is None:
             return set()
@@ -125,7 +137,7 @@ class LocalArea:
         return found
 
     def _along_edges(self, here: int) -> list[int]:
-        """Nodes that edges join to one, and those farther on that are still within reach along edges."""
+        """Nodes that edges join to one, and those farther on within reach along edges."""
         ways = {here: 0.0}
         open_ids = [here]
         while open_ids:
@@ -141,23 +153,34 @@ class LocalArea:
         return [i for i in ways if i != here]
 
     def _node_at(self, T_map_base: Array) -> int | None:
-        """The nearest node; of those about as near, the one that the robot reaches sooner as it is headed."""
+        """The nearest node.
+
+        Of those about as near, the one that the robot reaches sooner as it is headed.
+        """
         if math.dist(T_map_base[:2], self._listed_at) > _AS_NEAR_M:
             self._list_nodes(T_map_base)
         distances = np.hypot(*(self._places - T_map_base[:2]).T)
         cost, best = math.inf, None
         for i in np.flatnonzero(distances <= distances.min(initial=np.inf) + _AS_NEAR_M):
             bearing, distance = _from_robot(T_map_base, self._places[i])
-            if distance + _TURN_M_RAD * abs(bearing) < cost and self._ids[i] in self._topology.nodes:
+            if (
+                distance + _TURN_M_RAD * abs(bearing) < cost
+                and self._ids[i] in self._topology.nodes
+            ):
                 cost, best = distance + _TURN_M_RAD * abs(bearing), self._ids[i]
         return best
 
     def _list_nodes(self, T_map_base: Array) -> None:
-        """Note the nodes around anew. Once a metre, and only as far as it takes, whatever the size of the building."""
+        """Note the nodes around anew.
+
+        Once a metre, and only as far as it takes, whatever the size of the building.
+        """
         topology, (x, y) = self._topology, T_map_base[:2].tolist()
         near = topology.nodes_near(x, y, _LISTED_M)
-        # After the next metre the nearest node may be one more away, and those about as near another one.
-        sure = min((math.hypot(n.x - x, n.y - y) for n in near), default=math.inf) + 2.0 * _AS_NEAR_M + _AS_NEAR_M
+        # After the next metre the nearest node may be one more away, and those about as near
+        # another one.
+        nearest = min((math.hypot(n.x - x, n.y - y) for n in near), default=math.inf)
+        sure = nearest + 2.0 * _AS_NEAR_M + _AS_NEAR_M
         if sure > _LISTED_M:
             near = list(topology.nodes.values())
         self._ids = [node.id for node in near]
@@ -169,8 +192,13 @@ class LocalArea:
         self._hand_over(sorted(gone))
 
     def _note_places(self, nodes: list[Node]) -> None:
-        """Note where nodes with features are: of a map that is changed in place, those far off stay where they were."""
-        self._place_of.update((node.id, node.position) for node in nodes if node.id in self._features_at)
+        """Note where nodes with features are.
+
+        Of a map that is changed in place, those far off stay where they were.
+        """
+        self._place_of.update(
+            (node.id, node.position) for node in nodes if node.id in self._features_at
+        )
 
     def _hand_over(self, gone: list[int]) -> None:
         """Features of nodes that are no more go to the nodes nearest to where those were."""
@@ -193,7 +221,10 @@ class LocalArea:
 
 
 class _Trail:
-    """Nodes along the robot's way, in a map that is given; coming back to one, the robot is there again."""
+    """Nodes along the robot's way, in a map that is given.
+
+    Coming back to one, the robot is there again.
+    """
 
     def __init__(self, topology: TopologicalMap) -> None:
         self._map = topology

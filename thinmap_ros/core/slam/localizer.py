@@ -41,19 +41,27 @@ from thinmap_ros.core.slam.wall_points import wall_points
 from thinmap_ros.core.snapshot import Field
 from thinmap_ros.core.topology.graph import TopologicalMap
 
-_START_SIGMAS = (1e-4, 1e-4, 1e-4)  # the map begins where the robot stands: no doubt, but not singular
+# The map begins where the robot stands: no doubt, but not singular.
+_START_SIGMAS = (1e-4, 1e-4, 1e-4)
 _LONGEST_STEP_M = 5.0  # between two scans the wheels cannot go farther: the odometry was set anew
-_NEW_GROUND = 0.3  # where less of a scan than this lies on what is known, there is nothing to contradict
-_NEW_GROUND_M, _NEW_GROUND_RAD = 0.6, 0.6  # and that is so only this far from where the map last learned
+# Where less of a scan than this lies on what is known, there is nothing to contradict,
+_NEW_GROUND = 0.3
+# and that is so only this far from where the map last learned.
+_NEW_GROUND_M = 0.6
+_NEW_GROUND_RAD = 0.6
 _KNOWN_M, _KNOWN_RAD = 0.2, 0.2  # nearer than that, most of a scan must be known
 _NO_NEWS = 0.9  # where more of a scan than this lies on what is known, it shows nothing new
-_LEAP_M, _LEAP_RAD = 0.4, 0.4  # a scan puts the robot this far from where the wheels did: one of them is wrong
+# A scan puts the robot this far from where the wheels did: one of them is wrong.
+_LEAP_M = 0.4
+_LEAP_RAD = 0.4
 _OF_LATE_M = 100.0  # way in which the drift stays below what a match with the map bridges
 # By which lines may move the pose even where matches leave nothing open, m and rad, 1 sigma.
 _LEEWAY = np.diag(np.square([0.003, 0.003, 0.001]))
 _UNKNOWN_SIGMA_M = 300.0  # what a pose is known to while the robot is lost
-_TELLING_POINTS = 40  # where fewer beams hit, and not half of them, as in a wide hall, a contradiction proves nothing
-_UNTURNED_RAD = 0.03  # doubt of the heading (1 sigma) with which nothing is drawn while walls may tell it soon
+# Where fewer beams hit, and not half of them, as in a wide hall, a contradiction proves nothing.
+_TELLING_POINTS = 40
+# Doubt of the heading (1 sigma) with which nothing is drawn while walls may tell it soon.
+_UNTURNED_RAD = 0.03
 _SLIP_SIGMAS = 3.0  # motion within so much of the slip is none
 _USUAL_NOISE = 0.1  # share of the variances allowed for that wheels mostly have
 FIELDS = {
@@ -62,21 +70,23 @@ FIELDS = {
     # the share of a scan that usually fits; not in the first sessions
     'usual': Field(np.float64, (), 0.0, 1.0, optional=True),
 }
-_LOST_SIGMA_M = 1.0  # doubt since a scan last fitted; far from the start, more than this is no reason to be lost
+# Doubt since a scan last fitted; far from the start, more than this is no reason to be lost.
+_LOST_SIGMA_M = 1.0
 
 
 @dataclass(frozen=True)
 class LocalizerConfig(MotionConfig, MatchConfig, LineConfig, FeatureConfig, LoopConfig):
     """Parameters of the localizer and of its parts.
 
-    slam: ti runs the filter over the line features of the local area, and full, for the same estimate, over all; off
-    leaves them out, and the covariance of the pose is then what the match with the map of points leaves open, without
-    the drift of that map.
+    slam: ti runs the filter over the line features of the local area, and full, for the same
+    estimate, over all; off leaves them out, and the covariance of the pose is then what the match
+    with the map of points leaves open, without the drift of that map.
     """
 
     slam: str = parameter(
         'ti',
-        'ti: EKF over line features, local by topology; full: EKF over all; off: scan matching alone',
+        'ti: EKF over line features, local by topology; full: EKF over all; '
+        'off: scan matching alone',
         choices=('ti', 'full', 'off'),
     )
     start_x_m: float = parameter(
@@ -86,24 +96,35 @@ class LocalizerConfig(MotionConfig, MatchConfig, LineConfig, FeatureConfig, Loop
         0.0, 'where the robot starts in the map, m', low=-se2.FARTHEST_M, high=se2.FARTHEST_M
     )
     start_yaw_rad: float = parameter(0.0, 'heading at the start, rad')
-    look_distance_m: float = parameter(0.3, 'the map learns after so much way, m', low=0.0, high=5.0)
+    look_distance_m: float = parameter(
+        0.3, 'the map learns after so much way, m', low=0.0, high=5.0
+    )
     look_turn_rad: float = parameter(0.2, 'or after such a turn, rad', low=0.0, high=3.0)
     square_walls: bool = parameter(
-        True, 'hold the heading to the direction of the walls, where most stand parallel or square to each other'
+        True,
+        'hold the heading to the direction of the walls, '
+        'where most stand parallel or square to each other',
     )
-    mapping: bool = parameter(True, 'learn what is seen; false: only find the place in the map that there is')
-    lost_scans: int = parameter(5, 'lost after so many scans in a row that do not fit', low=1, high=1000)
+    mapping: bool = parameter(
+        True, 'learn what is seen; false: only find the place in the map that there is'
+    )
+    lost_scans: int = parameter(
+        5, 'lost after so many scans in a row that do not fit', low=1, high=1000
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What a step found: T_map_base (3,) with covariance (3, 3), T_map_odom (3,), and how it was found.
+    """What a step found.
 
-    observed, matched: lines of this scan, and those found among the features (both 0 where the robot stands still and
-    the scan has nothing new to say); n_features, n_local: features in the map, and in the local area; match_quality:
-    share of the scan's points on known ground that fit the map. lost: it could be anywhere, as the covariance says.
-    correction: where a loop was closed in this step, what it did to the keyframes; T_map_base is then the corrected
-    pose.
+    T_map_base (3,) with covariance (3, 3), T_map_odom (3,), and how it was found.
+
+    observed, matched: lines of this scan, and those found among the features (both 0 where the
+    robot stands still and the scan has nothing new to say); n_features, n_local: features in the
+    map, and in the local area; match_quality: share of the scan's points on known ground that fit
+    the map. lost: it could be anywhere, as the covariance says.
+    correction: where a loop was closed in this step, what it did to the keyframes; T_map_base is
+    then the corrected pose.
     """
 
     T_map_base: Array
@@ -119,10 +140,10 @@ class Estimate:
 
 
 class Localizer:
-    """Line-feature EKF-SLAM whose prediction is odometry sharpened by matching the scan with the map of points.
+    """Line-feature EKF-SLAM; predicts by odometry, sharpened by matching scan and map of points.
 
-    Source: EKF-SLAM/TI paper section 2. Input that is not finite is refused and counted in `refused`: the robot is
-    then taken to be where it was.
+    Source: EKF-SLAM/TI paper section 2. Input that is not finite is refused and counted in
+    `refused`: the robot is then taken to be where it was.
     """
 
     def __init__(self, config: LocalizerConfig | None = None) -> None:
@@ -143,10 +164,12 @@ class Localizer:
         self._stands = False
         self._calibration = OdometryCalibration()
         self._noise = OdometryNoise(self.config)
-        self._by_map = np.zeros((3, 3))  # information of the last match that was good, as the map alone tells it
+        # Information of the last match that was good, as the map alone tells it.
+        self._by_map = np.zeros((3, 3))
         self._T_last_look: Array | None = None
         self._points_last_look: Array = np.empty((0, 2))
-        # Share of that look's points which the map then knew; walls that are far off take several looks.
+        # Share of that look's points which the map then knew;
+        # walls that are far off take several looks.
         self._known_here = 0.0
         self._compass = WallCompass()
         self._doubt = Doubt()
@@ -155,7 +178,10 @@ class Localizer:
         self._tracking = Tracking(self.config.lost_scans)
 
     def set_pose(self, T_map_base: Array, covariance: Array) -> None:
-        """Put the robot at a pose (3,) with covariance (3, 3) in the map that it has; the next scans settle it."""
+        """Put the robot at a pose (3,) with covariance (3, 3) in the map that it has.
+
+        The next scans settle it.
+        """
         if not (se2.is_on_earth(T_map_base) and np.isfinite(covariance).all()):
             self.refused += 1
             return
@@ -167,16 +193,25 @@ class Localizer:
         self._calibration.interrupt()
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """The features and the map of points as arrays by name, for `from_state`; not where the robot is."""
+        """The features and the map of points as arrays by name, for `from_state`.
+
+        Not where the robot is.
+        """
         usual = np.array(self._tracking.usual)
-        return {**self._feature_map.state(self._filter), **self._map.matcher.map.state(), 'usual': usual}
+        return {
+            **self._feature_map.state(self._filter),
+            **self._map.matcher.map.state(),
+            'usual': usual,
+        }
 
     @staticmethod
-    def from_state(state: Mapping[str, NDArray[Any]], config: LocalizerConfig | None = None) -> 'Localizer':
-        """Localizer in the map of another one's `state`, at the configured start: lost, until a scan fits there.
+    def from_state(
+        state: Mapping[str, NDArray[Any]], config: LocalizerConfig | None = None
+    ) -> 'Localizer':
+        """Localizer in the map of another one's `state`, at the configured start.
 
-        The map of points that was given stays as it is where loops are closed later. Raises InputError where it is no
-        such state.
+        It is lost until a scan fits there. The map of points that was given stays as it is where
+        loops are closed later. Raises InputError where it is no such state.
         """
         checked = snapshot.check(state, FIELDS, 'features')
         localizer = Localizer(config)
@@ -190,10 +225,11 @@ class Localizer:
     def resumed(
         patch: GridPatch, last: LastPose, T_odom_base: Array, config: LocalizerConfig | None = None
     ) -> 'Localizer':
-        """Localizer that goes on in an occupancy map, at T_odom_base (3,) after the last pose in it.
+        """Localizer that goes on in an occupancy map, at T_odom_base (3,) after its last pose.
 
         Scans are matched with the walls of the map before anything is drawn. The pose is known to
-        the noise of the odometry since then, and to a cell of the map (at a metre, for the heading).
+        the noise of the odometry since then, and to a cell of the map (at a metre, for the
+        heading).
         """
         localizer = Localizer(config)
         points = PointMap(localizer.config.match_cell_m, localizer.config.match_memory)
@@ -225,7 +261,10 @@ class Localizer:
         return self._filter.local
 
     def set_topology(self, topology: TopologicalMap) -> None:
-        """Take the topological map by which features are stored; until one is known, the robot's own way serves."""
+        """Take the topological map by which features are stored.
+
+        Until one is known, the robot's own way serves.
+        """
         self._feature_map.area.set_topology(topology)
 
     def step(self, scan: Scan, T_odom_base: Array) -> Estimate:
@@ -236,7 +275,8 @@ class Localizer:
         way_m = self._loops.way_m(self._ekf.pose)
         points = self._map.matcher.map
         points.way_m = way_m
-        # Until it is known that old and new agree here, a scan is matched with what was seen of late.
+        # Until it is known that old and new agree here, a scan is matched with what was seen of
+        # late.
         points.since_m = -math.inf if self._loops.agreed else way_m - _OF_LATE_M
         looks, matched = self.config.mapping and self._has_news(expected), 0
         lines = self._lines(scan) if looks else no_lines()
@@ -244,7 +284,10 @@ class Localizer:
         if looks and not self._is_unplaced():
             laser_map = se2.transform_points(self._ekf.pose, laser_base[None])[0]
             matched = self._correct(lines, scan)
-            if match.good or (self._on_new_ground(match, scan, self._ekf.pose) and self._may_draw(points_base, scan)):
+            if match.good or (
+                self._on_new_ground(match, scan, self._ekf.pose)
+                and self._may_draw(points_base, scan)
+            ):
                 self._compass.learn(lines, float(self._ekf.pose[2]), way_m)
                 points_map = se2.transform_points(self._ekf.pose, points_base)
                 self._map.matcher.add(points_map, laser_map)
@@ -252,7 +295,9 @@ class Localizer:
                 self._T_last_look, self._points_last_look = self._ekf.pose, points_base
                 leap = LEAP_SIGMAS if _is_leap(expected, self._ekf.pose) else np.zeros(3)
                 doubt, self._blind = np.maximum(leap, self._blind), np.zeros(3)
-                self._loops.follow(scan, points_base, self._ekf.pose, doubt, match.overlap < _NO_NEWS)
+                self._loops.follow(
+                    scan, points_base, self._ekf.pose, doubt, match.overlap < _NO_NEWS
+                )
         elif match.good and not self.config.mapping:
             self._T_last_look, self._points_last_look = self._ekf.pose, points_base
         self._filter.work_off()
@@ -265,15 +310,22 @@ class Localizer:
             self._calibration.interrupt()
         pose, k = self._ekf.pose, self._loops.anchor
         self._map.go_on(self._loops.keyframes, pose)
-        self._path.add(scan.stamp_ns, k, pose if k < 0 else se2.between(self._loops.keyframes[k].T_map_base, pose))
+        self._path.add(
+            scan.stamp_ns,
+            k,
+            pose if k < 0 else se2.between(self._loops.keyframes[k].T_map_base, pose),
+        )
         return self._estimate(match, lines, matched, correction)
 
     def corrected_path(self) -> Array:
-        """Poses (N, 3) of all steps since the beginning, as they look now, after all corrections."""
+        """Poses (N, 3) of all steps since the beginning, as they look after all corrections."""
         return self._path.poses(self._loops.relaxed())
 
     def past(self) -> tuple[NDArray[np.int64], Array]:
-        """Stamps (N,) and poses (N, 3), as known now, of scans along the whole way; all others go with those before."""
+        """Stamps (N,) and poses (N, 3), as known now, of scans along the whole way.
+
+        All others go with those before.
+        """
         return self._loops.past()
 
     @property
@@ -284,7 +336,8 @@ class Localizer:
     def _apply(self, correction: Correction, points_base: Array) -> None:
         """A loop was closed: pose, features and the map of points go where the keyframes have gone.
 
-        points_base (N, 2): of the scan just made, which is what was seen last where the robot is now.
+        points_base (N, 2): of the scan just made, which is what was seen last where the robot is
+        now.
         """
         moved = correction.moved(self._loops.anchor, self._ekf.pose)
         self._feature_map.move(self._filter, correction)
@@ -293,7 +346,7 @@ class Localizer:
         self._map.begin_anew(self._loops.keyframes, moved)
 
     def _odometry(self, T_odom_base: Array) -> tuple[Array, Array]:
-        """Input u of eq. (10): the increment (3,) since the last scan, and its covariance (3, 3)."""
+        """Input u of eq. (10): increment (3,) since the last scan, and its covariance (3, 3)."""
         last, increment = self._T_odom_base, np.zeros(3)
         since_it_moved: Array | None = None
         if se2.is_finite(T_odom_base):
@@ -307,7 +360,10 @@ class Localizer:
             self._stands = self._within_slip(moved)
             if not self._stands:
                 self._T_odom_moved = self._T_odom_base
-        if not se2.is_finite(T_odom_base) or math.hypot(increment[0], increment[1]) > _LONGEST_STEP_M:
+        if (
+            not se2.is_finite(T_odom_base)
+            or math.hypot(increment[0], increment[1]) > _LONGEST_STEP_M
+        ):
             self.refused += 1
             increment = np.zeros(3)
             since_it_moved = None
@@ -335,12 +391,22 @@ class Localizer:
             self.refused += 1
             return np.empty((0, 2)), np.zeros(2)
         near = scan.ranges_m[scan.hit] < self.config.match_range_m
-        return np.ascontiguousarray(scan.points_base()[near]), np.ascontiguousarray(scan.T_base_laser[:2])
+        laser_base = np.ascontiguousarray(scan.T_base_laser[:2])
+        return np.ascontiguousarray(scan.points_base()[near]), laser_base
 
     def _predict(
-        self, scan: Scan, lines: Lines, points_base: Array, laser_base: Array, increment: Array, covariance: Array
+        self,
+        scan: Scan,
+        lines: Lines,
+        points_base: Array,
+        laser_base: Array,
+        increment: Array,
+        covariance: Array,
     ) -> Match:
-        """Eqs. (10), (11): the increment is the odometry's, or where the scan fits the map, that of the match."""
+        """Eqs. (10), (11) with the increment of the odometry.
+
+        Where the scan fits the map, with that of the match.
+        """
         pose = self._ekf.pose
         turn = rotation(float(pose[2]))
         predicted = se2.compose(pose, increment)
@@ -374,7 +440,8 @@ class Localizer:
                 # The same look at the same walls: neither an error more nor a proof more.
                 self._doubt.on_map = on_map
                 added = np.zeros((3, 3))
-            # Of a robot that stands, the jitter of the matches is no motion, and carries nothing on.
+            # Of a robot that stands, the jitter of the matches is no motion,
+            # and carries nothing on.
             increment = np.zeros(3) if stands else se2.between(pose, match.T_map_base)
             covariance = turn.T @ added @ turn
             predicted = match.T_map_base
@@ -382,7 +449,9 @@ class Localizer:
             self._doubt = Doubt(on_map)
             self._doubt.since_match = since_match
             covariance = np.zeros((3, 3))
-        if match.good and (self._placed_by_hand or self.config.slam == 'off' or not self.config.mapping):
+        if match.good and (
+            self._placed_by_hand or self.config.slam == 'off' or not self.config.mapping
+        ):
             self._ekf.set_pose(match.T_map_base, match.covariance)
             self._placed_by_hand = False
         else:
@@ -390,7 +459,10 @@ class Localizer:
         return match
 
     def _turned_by_walls(self, lines: Lines, predicted: Array) -> Array:
-        """A pose (3,), and the doubt of it, after the lines of the scan have told what they know of the heading."""
+        """A pose (3,) after the lines of the scan have told what they know of the heading.
+
+        The doubt of it changes, too.
+        """
         P = self._doubt.since_match
         told = self._compass.read(lines, float(predicted[2]), float(P[2, 2]))
         if told is None:
@@ -401,14 +473,17 @@ class Localizer:
         return se2.pose(*(predicted + gain * (told.yaw - predicted[2])).tolist())
 
     def _taken_back(self, match: Match, predicted: Array, evidence: Evidence) -> Match:
-        """A match that takes back what lines did to the pose takes it back whole, in features and open directions, too.
+        """A match that takes back what lines did to the pose takes it back whole.
 
-        The map of points is as it was, so the match leads back to it. If that passed for motion, each look would do it
-        again, and the pose would creep wherever points say nothing: along a corridor, by its own two walls.
+        That is, in features and open directions, too. The map of points is as it was, so the match
+        leads back to it. If that passed for motion, each look would do it again, and the pose would
+        creep wherever points say nothing: along a corridor, by its own two walls.
         """
         step, seen = self._ekf.moved_by_updates(), evidence.by_map
         off = se2.off(match.T_map_base, predicted)
-        share = float(np.clip(-(off @ seen @ step) / max(float(step @ seen @ step), 1e-12), 0.0, 1.0))
+        share = float(
+            np.clip(-(off @ seen @ step) / max(float(step @ seen @ step), 1e-12), 0.0, 1.0)
+        )
         self._ekf.take_back(share)
         T_map_base = match.T_map_base - share * (evidence.posterior @ evidence.by_prior @ step)
         T_map_base[2] = se2.wrap(float(T_map_base[2]))
@@ -416,66 +491,88 @@ class Localizer:
 
     def _lines(self, scan: Scan) -> Lines:
         """Lines of a scan, in the robot frame."""
-        wanted = (self.config.slam != 'off' or self.config.square_walls) and se2.is_finite(scan.T_base_laser)
+        used = self.config.slam != 'off' or self.config.square_walls
+        wanted = used and se2.is_finite(scan.T_base_laser)
         return extract_lines(scan, self.config) if wanted else no_lines()
 
     def _correct(self, lines: Lines, scan: Scan) -> int:
         """Eqs. (6)-(9) with the lines of the scan; how many of them were known."""
         if self.config.slam == 'off' or not se2.is_finite(scan.T_base_laser):
             return 0
-        matched, taken = self._feature_map.observe(self._filter, lines, scan, self._doubt.on_map + _LEEWAY)
+        matched, taken = self._feature_map.observe(
+            self._filter, lines, scan, self._doubt.on_map + _LEEWAY
+        )
         self.refused += not taken
         return matched
 
     def _has_news(self, T_map_base: Array) -> bool:
-        """Whether the robot has moved since it last learned: looks from one place err alike, and prove nothing anew."""
+        """Whether the robot has moved since it last learned.
+
+        Looks from one place err alike, and prove nothing anew.
+        """
         return self._moved(self.config.look_distance_m, self.config.look_turn_rad, T_map_base)
 
     def _may_draw(self, points_base: Array, scan: Scan) -> bool:
-        """Whether a scan on new ground is taken into the map: not a first glance after a turn that is hardly known.
+        """Whether a scan on new ground is taken into the map.
 
-        What is drawn askew there keeps all that follows askew, and more of the walls soon tells the heading.
+        Not a first glance after a turn that is hardly known: what is drawn askew there keeps all
+        that follows askew, and more of the walls soon tells the heading.
         """
-        unturned = self._doubt.since_match[2, 2] > _UNTURNED_RAD**2 and self._compass.direction is not None
+        unturned = (
+            self._doubt.since_match[2, 2] > _UNTURNED_RAD**2 and self._compass.direction is not None
+        )
         few = 3 * len(points_base) < scan.ranges_m.size
-        return len(points_base) >= FEWEST_POINTS and not (unturned and few and self.config.square_walls)
+        early = unturned and few and self.config.square_walls
+        return len(points_base) >= FEWEST_POINTS and not early
 
     def _on_new_ground(self, match: Match, scan: Scan, T_map_base: Array) -> bool:
-        """Whether a scan that lies on little that is known can be explained by where the robot has come to, (3,).
+        """Whether the robot's place, (3,), explains that a scan lies on little that is known.
 
-        Near the place where the map last learned, what was seen there is still to be seen, if it is in view at all, and
-        unless little came of it.
+        Near the place where the map last learned, what was seen there is still to be seen, if it is
+        in view at all, and unless little came of it.
         """
         if match.overlap >= _NEW_GROUND:
             return False
         last = self._T_last_look
-        if last is None or self._known_here < _NEW_GROUND or self._moved(_NEW_GROUND_M, _NEW_GROUND_RAD, T_map_base):
+        if (
+            last is None
+            or self._known_here < _NEW_GROUND
+            or self._moved(_NEW_GROUND_M, _NEW_GROUND_RAD, T_map_base)
+        ):
             return True
         moved = se2.between(last, T_map_base)
         return share_seen_again(self._points_last_look, moved, scan) >= SEEN_AGAIN
 
     def _moved(self, distance_m: float, turn_rad: float, T_map_base: Array | None = None) -> bool:
-        """Whether the robot, or a pose (3,), is that far from the last place at which the map learned."""
+        """Whether the robot, or a pose (3,), is that far from where the map last learned."""
         if self._T_last_look is None:
             return True
         moved = se2.between(self._T_last_look, self._ekf.pose if T_map_base is None else T_map_base)
         return math.hypot(moved[0], moved[1]) >= distance_m or abs(float(moved[2])) >= turn_rad
 
     def _is_unplaced(self) -> bool:
-        """Whether nothing may be drawn where the robot seems to be: lost, or put there roughly and not yet settled."""
+        """Whether nothing may be drawn where the robot seems to be.
+
+        Lost, or put there roughly and not yet settled.
+        """
         return self._tracking.lost or (self._placed_by_hand and self._is_lost())
 
     def _is_lost(self) -> bool:
         in_doubt = self._doubt.since_match[[0, 1], [0, 1]].max() > _LOST_SIGMA_M**2
         return self._tracking.lost or bool(in_doubt)
 
-    def _estimate(self, match: Match, lines: Lines, matched: int, correction: Correction | None) -> Estimate:
+    def _estimate(
+        self, match: Match, lines: Lines, matched: int, correction: Correction | None
+    ) -> Estimate:
         T_map_base = self._ekf.pose
         T_odom_base = np.zeros(3) if self._T_odom_base is None else self._T_odom_base
         lost, covariance = self._is_lost(), self._ekf.pose_covariance
+        if lost:
+            unknown = np.diag([_UNKNOWN_SIGMA_M**2, _UNKNOWN_SIGMA_M**2, math.pi**2])
+            covariance = covariance + unknown
         return Estimate(
             T_map_base,
-            covariance + np.diag([_UNKNOWN_SIGMA_M**2, _UNKNOWN_SIGMA_M**2, math.pi**2]) if lost else covariance,
+            covariance,
             se2.compose(T_map_base, se2.invert(T_odom_base)),
             len(lines),
             matched,
@@ -493,11 +590,12 @@ def _is_leap(expected: Array, found: Array) -> bool:
 
 
 def _blind(since_match: Array, noise: OdometryNoise) -> Array:
-    """Sigmas (3,) of a pose since a scan last fitted, by wheels that are as good as they were so far.
+    """Sigmas (3,) of a pose since a scan last fitted, by wheels as good as they were so far.
 
     0 where that is no more than usual.
     """
     share = np.sqrt(noise.found_share / noise.share)
-    along = float(share.max()) * math.sqrt(max(float(np.linalg.eigvalsh(since_match[:2, :2])[-1]), 0.0))
+    largest = float(np.linalg.eigvalsh(since_match[:2, :2])[-1])
+    along = float(share.max()) * math.sqrt(max(largest, 0.0))
     sigmas = np.array([along, along, share[1] * math.sqrt(since_match[2, 2])])
     return sigmas if (sigmas > LEAP_SIGMAS).any() else np.zeros(3)

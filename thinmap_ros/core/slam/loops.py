@@ -1,15 +1,16 @@
 """Loops: coming back by another way, noticed, verified, and what it means for the whole path.
 
-Along the path a scan is kept now and then. Where the path has been near before, it is matched with the scans kept
-there: now and then with those of one visit where that agrees with the map, always and with more where it does not. A
-match counts that fits well; of matches that tell the place sharply, several along the way that ask for one and the
-same correction make a loop. What the localizer says of neighbours on the path, and the matches of the others, make a
-graph of poses that is relaxed; should the matches that asked for it not be content then, nothing is corrected.
-A keyframe costs its scan, its pose and a few measurements in memory, and a few matches in time, one a step. Where
-nothing was in sight for a while, the step between two of them is as doubtful as the wheels are, and that is looked
-for farther off.
-Source: Lu and Milios, "Globally consistent range scan alignment for environment mapping", 1997; for the graph see
-pose_graph.
+Along the path a scan is kept now and then. Where the path has been near before, it is matched with
+the scans kept there: now and then with those of one visit where that agrees with the map, always
+and with more where it does not. A match counts that fits well; of matches that tell the place
+sharply, several along the way that ask for one and the same correction make a loop. What the
+localizer says of neighbours on the path, and the matches of the others, make a graph of poses that
+is relaxed; should the matches that asked for it not be content then, nothing is corrected.
+A keyframe costs its scan, its pose and a few measurements in memory, and a few matches in time, one
+a step. Where nothing was in sight for a while, the step between two of them is as doubtful as the
+wheels are, and that is looked for farther off.
+Source: Lu and Milios, "Globally consistent range scan alignment for environment mapping", 1997; for
+the graph see pose_graph.
 """
 
 import math
@@ -41,17 +42,21 @@ LEAP_SIGMAS = (0.1, 0.1, 0.05)  # of one where wheels and walls contradicted eac
 _MATCH_SIGMAS = (0.04, 0.04, 0.02)  # matches err together, by more than each says of itself
 _PRIOR_SIGMAS = (0.3, 0.3, 0.15)
 _LEAST_OVERLAP, _LEAST_FIT = 0.5, 0.85
-_DRIFT = 0.01  # of the way since the earlier visit, by which the place may be off, beyond the first metres
+# Of the way since the earlier visit, by which the place may be off, beyond the first metres.
+_DRIFT = 0.01
 _LEVER_M = 10.0  # at which a doubtful turn makes a place doubtful
 _FARTHEST_M = 3.0  # and no more than this in all: what is alike is seldom nearer
 _SEARCHED_M = 0.3  # from this on a good match near by is not taken without looking around
 _SEARCH_DEG, _WIDEST_SEARCH_DEG = 12.0, 35.0
-_SHARP_M = 0.1  # a match that leaves more than this open (1 sigma), as along a corridor, proves no loop
+# A match that leaves more than this open (1 sigma), as along a corridor, proves no loop.
+_SHARP_M = 0.1
 _WITNESSES = 3  # matches of different keyframes that have to ask for the same correction
 _LATELY = 8  # keyframes back to which they count
 _ALIKE_M, _ALIKE_RAD = 0.2, 0.06  # by how much they may differ
 _WORTH_M, _WORTH_RAD = 0.12, 0.04  # smaller corrections are left to the end
-_ASKED, _UNASKED_M = 2.0, 0.5  # what a single match may ask for: so many times what the witnesses do, and this
+# What a single match may ask for: so many times what the witnesses do, and this.
+_ASKED = 2.0
+_UNASKED_M = 0.5
 _BUCKET_M = 4.0  # keyframes are listed by squares of this size
 _ENOUGH = 2  # keyframes that see about the same: from then on one of them stands for a new one
 _FRESH_M = 1.0  # so much way after a match that agrees, no other one is asked for
@@ -64,12 +69,14 @@ class LoopConfig(Config):
 
     keyframe_m: float = parameter(0.7, 'a scan is kept after so much way, m', low=0.1, high=10.0)
     keyframe_rad: float = parameter(0.7, 'or after such a turn, rad', low=0.1, high=3.2)
-    loop_reach_m: float = parameter(2.0, 'places nearer than this are matched, m', low=0.1, high=20.0)
+    loop_reach_m: float = parameter(
+        2.0, 'places nearer than this are matched, m', low=0.1, high=20.0
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    """A scan that was kept, its points (N, 2) in the robot frame, its pose (3,), and the way up to there."""
+    """A scan that was kept, its points (N, 2), robot frame, its pose (3,), and the way so far."""
 
     scan: Scan
     points_base: Array
@@ -92,37 +99,46 @@ class Correction:
 class Loops:
     """The kept scans and the graph of their poses.
 
-    Where old and new agree and a scan shows nothing new, an earlier one stands for it: the graph grows with what was
-    seen, not with time. Source: Johannsson, Kaess, Fallon and Leonard, "Temporally scalable visual SLAM using a reduced
-    pose graph", 2013.
+    Where old and new agree and a scan shows nothing new, an earlier one stands for it: the graph
+    grows with what was seen, not with time. Source: Johannsson, Kaess, Fallon and Leonard,
+    "Temporally scalable visual SLAM using a reduced pose graph", 2013.
     """
 
     def __init__(self, config: LoopConfig, matching: MatchConfig) -> None:
         self.keyframes: list[Keyframe] = []
         self.matched: list[Measured] = []
-        # To each keyframe but the first, from the one that was the anchor before it, as the localizer saw it.
+        # To each keyframe but the first, from the one that was the anchor before it,
+        # as the localizer saw it.
         self._steps: list[tuple[int, Array]] = []
         self._tied: set[tuple[int, int]] = set()
-        self._leaps: dict[int, Array] = {}  # sigmas (3,) of those of which less is known than of others
-        self._unsettled: dict[int, Array] = {}  # of these, those over which no loop was closed since
+        # Sigmas (3,) of those of which less is known than of others,
+        self._leaps: dict[int, Array] = {}
+        # and of these, those over which no loop was closed since.
+        self._unsettled: dict[int, Array] = {}
         self._config, self._matching = config, matching
         self._jobs: deque[tuple[int, int]] = deque()
-        self._candidate: Keyframe | None = None  # the next keyframe, unless an earlier one can stand for it
+        # The next keyframe, unless an earlier one can stand for it.
+        self._candidate: Keyframe | None = None
         self._path = AnchoredPoses()  # what was a keyframe, and what an earlier one stands for
-        # Where the last of them was, and how long the way up to there is; doubt and news since then.
+        # Where the last of them was, and how long the way up to there is;
+        # doubt and news since then.
         self._here, self._way_m = np.zeros(3), 0.0
         self._open, self._news = np.zeros(3), False
         self._witnesses: deque[Measured] = deque(maxlen=_WITNESSES)
         self._agreed_at_m = -math.inf
         self._places = Buckets(_BUCKET_M)  # of the keyframes
-        self._drawn: tuple[int, range, PointMap] | None = None  # the last submap: its middle, of which keyframes
+        # The last submap: its middle, of which keyframes.
+        self._drawn: tuple[int, range, PointMap] | None = None
 
-    def follow(self, scan: Scan, points_base: Array, T_map_base: Array, doubt: Array, news: bool) -> None:
+    def follow(
+        self, scan: Scan, points_base: Array, T_map_base: Array, doubt: Array, news: bool
+    ) -> None:
         """Take in a scan that fits the map at a pose (3,), with its points (N, 2).
 
-        doubt (3,): what else than usual may be wrong with the way here since the last scan, m, m and rad, 1 sigma:
-        where the pose is not where the wheels said, one of them is wrong; where nothing was in sight, the wheels may
-        be. news: whether the scan shows something that is not in the map.
+        doubt (3,): what else than usual may be wrong with the way here since the last scan, m, m
+        and rad, 1 sigma: where the pose is not where the wheels said, one of them is wrong; where
+        nothing was in sight, the wheels may be. news: whether the scan shows something that is not
+        in the map.
         """
         self._open, self._news = np.maximum(self._open, doubt), self._news or news
         if not self._is_apart(T_map_base):
@@ -150,7 +166,10 @@ class Loops:
             covariance = match.covariance + np.diag(np.square(_MATCH_SIGMAS))
             measured = Measured(j, k, match.T_map_base, np.linalg.inv(covariance), True)
             agrees = self._agrees(measured)
-            if not self._is_step(measured) and math.sqrt(match.covariance[:2, :2].trace()) < _SHARP_M:
+            if (
+                not self._is_step(measured)
+                and math.sqrt(match.covariance[:2, :2].trace()) < _SHARP_M
+            ):
                 self._hear(measured, agrees)
             if k == len(self.keyframes):
                 if agrees and self.agreed and j in self._alike(self._frame(k)):
@@ -160,18 +179,21 @@ class Loops:
                     self._keep()
             if k < len(self.keyframes):
                 self.matched.append(measured)
-            while self.agreed and self._jobs and self._jobs[0][1] == k and not self._is_step(measured):
-                self._jobs.popleft()  # where nothing disagrees, one visit says what the others would
+            while (
+                self.agreed and self._jobs and self._jobs[0][1] == k and not self._is_step(measured)
+            ):
+                # Where nothing disagrees, one visit says what the others would.
+                self._jobs.popleft()
         if not self._is_candidate_due():
             self._keep()
 
     @property
     def agreed(self) -> bool:
-        """Whether, where the robot is now, what it maps agrees with what it mapped on earlier visits."""
+        """Whether what the robot maps here agrees with what it mapped on earlier visits."""
         return self._way_m - self._agreed_at_m <= _HOLDS_M
 
     def close(self) -> Correction | None:
-        """The correction that a verified loop asks for, which the keyframes have then undergone; mostly None."""
+        """The correction by a verified loop, which the keyframes have then undergone, or None."""
         if not self._is_loop():
             return None
         self._keep()
@@ -181,10 +203,13 @@ class Loops:
         after = self._relax(before, asked)
         left = _most_off(after, witnesses)
         if left > 0.5 * asked:
-            # The graph does not bend so far: either these are wrong, or much else is. They do not count.
+            # The graph does not bend so far: either these are wrong, or much else is.
+            # They do not count.
             self.matched = [m for m in self.matched if m not in witnesses]
             return None
-        self.keyframes = [replace(f, T_map_base=T) for f, T in zip(self.keyframes, after, strict=True)]
+        self.keyframes = [
+            replace(f, T_map_base=T) for f, T in zip(self.keyframes, after, strict=True)
+        ]
         for k, (x, y, _) in enumerate(after.tolist()):
             self._places.put(k, x, y)
         self._here, self._drawn = self._path.poses(after)[-1], None
@@ -194,7 +219,7 @@ class Loops:
         return Correction(before, after)
 
     def _hear(self, measured: Measured, agrees: bool) -> None:
-        """Take a sharp match of the latest keyframes as a witness, for the map as it is or for a loop."""
+        """Take a sharp match of the latest keyframes as a witness, for the map as is or a loop."""
         if agrees:
             self._agreed_at_m = max(self._agreed_at_m, self._frame(measured.b).way_m)
             self._witnesses.clear()
@@ -203,12 +228,16 @@ class Loops:
             self._witnesses.append(measured)
 
     def _know(self, measured: Measured) -> None:
-        """What lies between two keyframes is known by a loop now, also where the robot came blindly."""
-        self._unsettled = {k: leap for k, leap in self._unsettled.items() if not measured.a < k <= measured.b}
+        """By a loop, what lies between two keyframes is known, even if the robot came blindly."""
+        self._unsettled = {
+            k: leap for k, leap in self._unsettled.items() if not measured.a < k <= measured.b
+        }
 
     def _agrees(self, measured: Measured) -> bool:
         """Whether a match finds two keyframes where they are taken to be."""
-        off = _off(self.keyframes[measured.a].T_map_base, self._frame(measured.b).T_map_base, measured)
+        off = _off(
+            self.keyframes[measured.a].T_map_base, self._frame(measured.b).T_map_base, measured
+        )
         return math.hypot(off[0], off[1]) < _WORTH_M and abs(float(off[2])) < _WORTH_RAD
 
     def _is_step(self, measured: Measured) -> bool:
@@ -227,9 +256,10 @@ class Loops:
         return self._candidate
 
     def _tie(self, measured: Measured) -> None:
-        """Keep what a match says of the keyframe that stands for the candidate, seen from the one before it.
+        """Keep what a match says of the keyframe that stands for the candidate.
 
-        Once for each two of them. If only matches that disagree were kept, they would pull the path to their side.
+        It is seen from the one before it. Once for each two of them. If only matches that disagree
+        were kept, they would pull the path to their side.
         """
         a, j = self._path.last, measured.a
         if a == j or (a, j) in self._tied:
@@ -259,21 +289,31 @@ class Loops:
         self._candidate = None
         if k > 0:
             anchor = self._path.last
-            self._steps.append((anchor, se2.between(self.keyframes[anchor].T_map_base, here.T_map_base)))
+            self._steps.append(
+                (anchor, se2.between(self.keyframes[anchor].T_map_base, here.T_map_base))
+            )
         self.keyframes.append(here)
         self._places.put(k, float(here.T_map_base[0]), float(here.T_map_base[1]))
         self._path.add(here.scan.stamp_ns, k, np.zeros(3))
 
     def _is_loop(self) -> bool:
-        """Whether enough matches of late ask for the same correction of the place where the robot is."""
-        if len(self._witnesses) < _WITNESSES or self._witnesses[0].b < len(self.keyframes) - _LATELY:
+        """Whether enough matches of late ask for the same correction of the robot's place."""
+        if (
+            len(self._witnesses) < _WITNESSES
+            or self._witnesses[0].b < len(self.keyframes) - _LATELY
+        ):
             return False
         frames = self.keyframes
         asked = np.array(
-            [se2.compose(frames[m.a].T_map_base, m.T_a_b) - frames[m.b].T_map_base for m in self._witnesses]
+            [
+                se2.compose(frames[m.a].T_map_base, m.T_a_b) - frames[m.b].T_map_base
+                for m in self._witnesses
+            ]
         )
         asked[:, 2] = se2.wrap(asked[:, 2])
-        return bool(np.ptp(asked[:, :2], axis=0).max() < _ALIKE_M and np.ptp(asked[:, 2]) < _ALIKE_RAD)
+        return bool(
+            np.ptp(asked[:, :2], axis=0).max() < _ALIKE_M and np.ptp(asked[:, 2]) < _ALIKE_RAD
+        )
 
     def relaxed(self) -> Array:
         """Poses (N, 3) of the keyframes that agree best with all measurements."""
@@ -285,14 +325,16 @@ class Loops:
     def _relax(self, poses: Array, asked: float) -> Array:
         """Poses (N, 3) relaxed, where witnesses have asked for a correction of this size.
 
-        Of what bends easily, as where the robot came blindly, a single match that is wrong would make a loop. None
-        counts that asks for much more than the witnesses did.
+        Of what bends easily, as where the robot came blindly, a single match that is wrong would
+        make a loop. None counts that asks for much more than the witnesses did.
         """
         most = _ASKED * asked + _UNASKED_M
         matched = [m for m in self.matched if _size(_off(poses[m.a], poses[m.b], m)) <= most]
         usual, none = np.square(self._step_sigmas(poses)), np.zeros(3)
         steps = [
-            Measured(a, b, step, np.diag(1.0 / (usual + np.square(self._leaps.get(b, none)))), False)
+            Measured(
+                a, b, step, np.diag(1.0 / (usual + np.square(self._leaps.get(b, none)))), False
+            )
             for b, (a, step) in enumerate(self._steps, start=1)
         ]
         return relax(poses, steps + matched)
@@ -300,10 +342,14 @@ class Loops:
     def _step_sigmas(self, poses: Array) -> Array:
         """How much a step adds to the drift, (3,), as told by what loops find after many steps.
 
-        A localizer that holds on to its map adds next to nothing. To believe in more would let small errors of the
-        matches bend a path that is straight.
+        A localizer that holds on to its map adds next to nothing. To believe in more would let
+        small errors of the matches bend a path that is straight.
         """
-        found = [(_off(poses[m.a], poses[m.b], m), abs(m.b - m.a)) for m in self.matched if not self._is_step(m)]
+        found = [
+            (_off(poses[m.a], poses[m.b], m), abs(m.b - m.a))
+            for m in self.matched
+            if not self._is_step(m)
+        ]
         squared = np.array([np.square(off) / number for off, number in found]).reshape(-1, 3)
         if len(squared) == 0:
             return np.array([_STEP_M[0], _STEP_M[0], _STEP_RAD[0]])
@@ -320,7 +366,10 @@ class Loops:
         return self._path.last
 
     def past(self) -> tuple[NDArray[np.int64], Array]:
-        """Stamps (N,) and poses (N, 3) of the scans that are keyframes, or for which one stands, as they came."""
+        """Stamps (N,) and poses (N, 3) of the scans that are keyframes, as they came.
+
+        Also of those for which a keyframe stands.
+        """
         return self._path.stamps_ns, self._path.poses(self._poses())
 
     def _poses(self) -> Array:
@@ -341,23 +390,27 @@ class Loops:
         return not turned and math.hypot(moved[0], moved[1]) < self._config.keyframe_m
 
     def _alike(self, here: Keyframe) -> list[int]:
-        """Keyframes that see about the same as another one; none where there are not enough to stand for it."""
+        """Keyframes that see about the same as another one.
+
+        None where there are not enough to stand for it.
+        """
         x, y, _ = here.T_map_base.tolist()
         near = self._places.near(x, y, self._config.keyframe_m)
         alike = [k for k in near if self._are_near(self.keyframes[k].T_map_base, here.T_map_base)]
         return alike if len(alike) >= _ENOUGH else []
 
     def _alike_of_late(self, here: Keyframe) -> int | None:
-        """The keyframe that another one is most like, where old and new agree or it is of the same visit."""
+        """The keyframe most like another one, if old and new agree or it is of the same visit."""
         frames = [(k, self.keyframes[k]) for k in self._alike(here)]
         of_late = [(k, f) for k, f in frames if self.agreed or here.way_m - f.way_m <= _AGAIN_M]
         if not of_late:
             return None
         offs = np.abs([se2.off(f.T_map_base, here.T_map_base) for _, f in of_late])
-        return of_late[int((np.hypot(offs[:, 0], offs[:, 1]) + _TURN_M_RAD * offs[:, 2]).argmin())][0]
+        unlike = np.hypot(offs[:, 0], offs[:, 1]) + _TURN_M_RAD * offs[:, 2]
+        return of_late[int(unlike.argmin())][0]
 
     def _earlier_visits(self, here: Keyframe) -> list[int]:
-        """The keyframe most like this one of each of the earlier visits to the place, the likest first."""
+        """The keyframe most like this one of each earlier visit to the place, likest first."""
         farthest = self._config.loop_reach_m + _FARTHEST_M
         near = self._places.near(float(here.T_map_base[0]), float(here.T_map_base[1]), farthest)
         frames = [self.keyframes[i] for i in near]
@@ -376,7 +429,7 @@ class Loops:
         return found
 
     def _drift(self, numbers: list[int], here: Keyframe) -> tuple[Array, Array]:
-        """How far, m, and how much turned, rad, the robot may be from where it seems to be, seen from keyframes, (N,).
+        """How far (N,), m, and turned (N,), rad, the robot may be off, seen from keyframes (N,).
 
         Leaps err each for itself, so that their variances add up.
         """
@@ -393,7 +446,9 @@ class Loops:
         drift, turn = (float(each[0]) for each in self._drift([j], here))
         search_m = self._matching.search_m + drift
         search_deg = min(_SEARCH_DEG + math.degrees(turn), _WIDEST_SEARCH_DEG)
-        matcher = ScanMatcher(replace(self._matching, search_m=search_m, search_deg=search_deg), points)
+        matcher = ScanMatcher(
+            replace(self._matching, search_m=search_m, search_deg=search_deg), points
+        )
         match = matcher.match(
             here.points_base,
             np.ascontiguousarray(here.scan.T_base_laser[:2]),
@@ -410,7 +465,8 @@ class Loops:
     def _submap(self, j: int, k: int) -> tuple[int, PointMap]:
         """The middle one of the keyframes around j and before k, and what they saw, in its frame.
 
-        The last one is kept: to draw it takes most of a match, and the next one is mostly of the same.
+        The last one is kept: to draw it takes most of a match, and the next one is mostly of the
+        same.
         """
         middle = min(j - j % _TOGETHER + _TOGETHER // 2, len(self.keyframes) - 1)
         numbers = range(max(0, middle - _AROUND), min(middle + _AROUND + 1, k))

@@ -1,10 +1,13 @@
-"""What odometry errs by all the time: wheels of another size than thought, unequal ones, a laser mounted askew.
+"""What odometry errs by all the time.
 
-A match with the map takes an error of the prediction back only in part: the rest is drawn into the map where it grows,
-and bends it. What can be known beforehand is therefore taken off beforehand. The model is that of UMBmark, learned
-while driving: of the way as odometry tells it, each metre is `scale` metres in a direction that is `askew` radians off
-the heading of the scans, and each radian `turn_scale` radians with `drift` radians to each metre. Source: Borenstein
-and Feng, "Measurement and correction of systematic odometry errors in mobile robots", 1996.
+Wheels of another size than thought, unequal ones, a laser mounted askew.
+
+A match with the map takes an error of the prediction back only in part: the rest is drawn into the
+map where it grows, and bends it. What can be known beforehand is therefore taken off beforehand.
+The model is that of UMBmark, learned while driving: of the way as odometry tells it, each metre is
+`scale` metres in a direction that is `askew` radians off the heading of the scans, and each radian
+`turn_scale` radians with `drift` radians to each metre. Source: Borenstein and Feng, "Measurement
+and correction of systematic odometry errors in mobile robots", 1996.
 """
 
 import math
@@ -17,14 +20,21 @@ from thinmap_ros.core.slam.models import rotation
 
 _PRIOR_SIGMAS = (0.05, 0.05, 0.1, 0.05)  # of what is known before the first span
 _WANDER_SIGMAS = (0.001, 0.001, 0.001, 0.0002)  # in a metre or radian: floors and loads change
-_SPAN_M, _SPAN_RAD = 1.0, 1.0  # what is compared: long enough for the doubt of its two ends to be small beside it
-_SIGMA_M, _SIGMA_RAD = 0.02, 0.02  # of a span, besides the doubt of its ends and of the wheels: matches err together
+# What is compared: long enough for the doubt of its two ends to be small beside it.
+_SPAN_M = 1.0
+_SPAN_RAD = 1.0
+# Of a span, besides the doubt of its ends and of the wheels: matches err together.
+_SIGMA_M = 0.02
+_SIGMA_RAD = 0.02
 _LEAST_INFORMATION = (1e-2, 1e-2, 1e-2)  # for what the map leaves open, as along a corridor
 _GATE_SIGMAS = 4.0  # what is farther off has slipped
 
 
 class OdometryCalibration:
-    """Compares spans of odometry with where the scans say that the robot went; takes the systematic part off."""
+    """Compares spans of odometry with where the scans say that the robot went.
+
+    Takes the systematic part off.
+    """
 
     def __init__(self) -> None:
         # scale, drift in rad/m, turn_scale, askew in rad
@@ -41,7 +51,9 @@ class OdometryCalibration:
         self._random = np.zeros(2)
 
     def corrected(self, increment: Array, variances: Array) -> tuple[Array, Array]:
-        """An increment (3,) of odometry, robot frame, without its systematic error, and what is left of that (3, 3).
+        """Odometry increment (3,), robot frame, without its systematic error.
+
+        Also returns the covariance (3, 3) of what is left of that error.
 
         variances (2,): of its chord, m^2, and of its turn, rad^2, by what it errs by at random.
         """
@@ -66,11 +78,16 @@ class OdometryCalibration:
         return found, G @ self._covariance @ G.T
 
     def follow(self, T_map_base: Array, by_map: Array) -> None:
-        """Hear where the robot was found (3,) after the increments so far, with what information (3, 3), map frame.
+        """Hear where the robot was found (3,) after the increments so far, map frame.
 
-        Of this only what the map has said: what the wheels themselves said proves nothing about them.
+        by_map (3, 3): with what information. Of this only what the map has said: what the wheels
+        themselves said proves nothing about them.
         """
-        if self._begin is not None and abs(self._way_m) < _SPAN_M and abs(self._turned_rad) < _SPAN_RAD:
+        if (
+            self._begin is not None
+            and abs(self._way_m) < _SPAN_M
+            and abs(self._turned_rad) < _SPAN_RAD
+        ):
             return
         doubt: Array = np.linalg.inv(by_map + np.diag(_LEAST_INFORMATION)).astype(np.float64)
         if self._begin is not None:
@@ -80,7 +97,7 @@ class OdometryCalibration:
         self._begin, self._doubt = T_map_base, doubt
 
     def _learn(self, found: Array, doubt: Array) -> None:
-        """Kalman updates with a span's turn, and with its length along where it was expected to lead.
+        """Kalman updates with a span's turn, and its length along where it should have led.
 
         found (3,), doubt (3, 3): of the span's end, seen from its beginning.
         """
@@ -95,10 +112,16 @@ class OdometryCalibration:
             dx, dy = found[:2] - self._expected[:2]
             along, across = np.array([x, y]), np.array([-y, x])
             variance = _SIGMA_M**2 + self._random[0] + float(along @ doubt[:2, :2] @ along)
-            self._update(x * dx + y * dy, np.array([length / self.known[0], 0.0, 0.0, 0.0]), variance)
+            self._update(
+                x * dx + y * dy, np.array([length / self.known[0], 0.0, 0.0, 0.0]), variance
+            )
             # Half of what it turned too far has led it aside as well.
             aside = x * dy - y * dx - 0.5 * length * off_turn
-            variance = _SIGMA_M**2 + 0.25 * length**2 * self._random[1] + float(across @ doubt[:2, :2] @ across)
+            variance = (
+                _SIGMA_M**2
+                + 0.25 * length**2 * self._random[1]
+                + float(across @ doubt[:2, :2] @ across)
+            )
             self._update(aside, np.array([0.0, 0.0, 0.0, length]), variance)
 
     def _update(self, off: float, H: Array, noise: float) -> None:

@@ -1,7 +1,10 @@
-"""A map of laser points: for each small cell their mean, and the surface that it makes with its neighbours.
+"""A map of laser points.
 
-Means keep what an occupancy grid rounds off: a wall's place is known to a fraction of a cell. Memory is proportional
-to what was seen: tiles exist only where points fell and hold the numbers of cells, and only cells with points have one.
+For each small cell their mean, and the surface that it makes with its neighbours.
+
+Means keep what an occupancy grid rounds off: a wall's place is known to a fraction of a cell.
+Memory is proportional to what was seen: tiles exist only where points fell and hold the numbers of
+cells, and only cells with points have one.
 """
 
 import math
@@ -18,9 +21,10 @@ from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.se2 import FARTHEST_M, Array
 from thinmap_ros.core.snapshot import Field
 
-# What a cell holds: points counted, their mean (m, map frame), the unit normal of the surface there, towards where it
-# was seen from, how loose the surface is: 0 a wall, up to 1 clutter, UNFORMED where there are too few points; points
-# whose beams were dense; and how far the robot had come when it last saw the cell, m.
+# What a cell holds: points counted, their mean (m, map frame), the unit normal of the surface
+# there, towards where it was seen from, how loose the surface is: 0 a wall, up to 1 clutter,
+# UNFORMED where there are too few points; points whose beams were dense; and how far the robot had
+# come when it last saw the cell, m.
 COUNT, MEAN_X, MEAN_Y, CENTRE_X, CENTRE_Y, NORMAL_X, NORMAL_Y, LOOSE, DENSE, SEEN = range(10)
 UNFORMED = 2.0
 _ROOM = 4096  # cells by which a map begins
@@ -33,7 +37,9 @@ _NOISE_M = 0.01  # of a point, 1 sigma; what lies together closer than this (1 s
 _THIN_M = 0.02  # what is wider than this (1 sigma) and no wall is clutter
 _BAND_M = 0.025  # what is farther from a line through a cell is no part of that cell's wall
 _DIRECTIONS = 16  # in which walls through a cell are looked for at first
-_NORMALS = np.array([(math.cos(a), math.sin(a)) for a in (math.pi * k / _DIRECTIONS for k in range(_DIRECTIONS))])
+_NORMALS = np.array(
+    [(math.cos(a), math.sin(a)) for a in (math.pi * k / _DIRECTIONS for k in range(_DIRECTIONS))]
+)
 _TILT_RAD = math.radians(2.0)  # doubt of a normal (1 sigma) above which it says nothing
 _FIRM = 4.0  # points that clutter has to consist of
 _MOST_POINTS = 1e9
@@ -52,10 +58,13 @@ FIELDS = {
 
 
 class PointMap:
-    """Points by cell; `cells[tiles.pool[slot, row, col]]` is a cell, but for number 0, which stands for none."""
+    """Points by cell; `cells[tiles.pool[slot, row, col]]` is a cell; number 0 stands for none."""
 
     def __init__(self, cell_m: float, most: float) -> None:
-        """cell_m: edge of a cell; most: points that a cell's mean remembers, so that it follows what moved."""
+        """cell_m: edge of a cell; most: points that a cell's mean remembers.
+
+        So the mean follows what moved.
+        """
         self.cell_m = cell_m
         self.tiles = TileStore(np.int32)
         self.cells: NDArray[np.float32] = np.zeros((_ROOM, SEEN + 1), dtype=np.float32)
@@ -78,7 +87,9 @@ class PointMap:
         if len(points_map) == 0:
             return
         if not np.abs(points_map).max() <= FARTHEST_M:
-            raise InputError(f'points up to {np.abs(points_map).max():g} m away: too far to be mapped')
+            raise InputError(
+                f'points up to {np.abs(points_map).max():g} m away: too far to be mapped'
+            )
         cells = np.floor(points_map[:, ::-1] / self.cell_m).astype(np.int64)
         tiles = _once(cells // TILE)
         low, high = tiles.min(axis=0), tiles.max(axis=0)
@@ -94,12 +105,17 @@ class PointMap:
     def _reserve(self, count: int) -> None:
         """Have room for so many more cells."""
         if self._used + count > len(self.cells):
-            longer = np.zeros((len(self.cells) + max(len(self.cells) // 2, count), SEEN + 1), dtype=np.float32)
+            longer = np.zeros(
+                (len(self.cells) + max(len(self.cells) // 2, count), SEEN + 1), dtype=np.float32
+            )
             longer[: self._used] = self.cells[: self._used]
             self.cells = longer
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """All that the map holds as arrays by name: its cells (N, 2) as (row, col), and what they hold (N, 10)."""
+        """All that the map holds as arrays by name.
+
+        Its cells (N, 2) as (row, col), and what they hold (N, 10).
+        """
         numbers = self.tiles.pool[: self.tiles.used]
         at = np.argwhere(numbers > 0)
         cells = self.tiles.places()[at[:, 0]] * TILE + at[:, 1:]
@@ -108,7 +124,9 @@ class PointMap:
         return {'cell_m': np.array(self.cell_m), 'cells': cells[order], 'points': points[order]}
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Take up the `state` of another map, into an empty one; however far the robot comes, its cells count.
+        """Take up the `state` of another map, into an empty one.
+
+        However far the robot comes, its cells count.
 
         state: checked by FIELDS. Raises InputError where its cells are of another size, or lie too
         far apart for one map.
@@ -137,7 +155,10 @@ class PointMap:
 
 
 def gaps(points: Array) -> Array:
-    """Distance (N,) of each point, in the order of the beams, from the nearer of its neighbours; inf for one alone."""
+    """Distance (N,) of each point, in the order of the beams, from the nearer of its neighbours.
+
+    Inf for one alone.
+    """
     steps = np.hypot(*np.diff(points, axis=0).T)
     return np.asarray(np.minimum(np.append(steps, np.inf), np.append(np.inf, steps)))
 
@@ -152,9 +173,14 @@ def _once(cells: NDArray[np.int64]) -> NDArray[np.int64]:
 
 @inlined
 def slot_of(directory: NDArray[np.int32], row: int, col: int) -> int:
-    """Slot of the tile in which a cell lies, counted from the directory's first cell, or NO_TILE."""
+    """Slot of the tile of a cell, counted from the directory's first cell, or NO_TILE."""
     tile_row, tile_col = row >> _SHIFT, col >> _SHIFT
-    if tile_row < 0 or tile_col < 0 or tile_row >= directory.shape[0] or tile_col >= directory.shape[1]:
+    if (
+        tile_row < 0
+        or tile_col < 0
+        or tile_row >= directory.shape[0]
+        or tile_col >= directory.shape[1]
+    ):
         return NO_TILE
     return int(directory[tile_row, tile_col])
 
@@ -171,10 +197,11 @@ def _add(
     seen_from: Array,
     limits: tuple[float, float, float],
 ) -> int:
-    """Count the points into the cells at their places, then form the surface of each that was touched.
+    """Count the points into the cells at their places, then form the surface of each touched.
 
     used: the first number that no cell has yet; returns it as it is then.
-    limits: the most points that a cell remembers, where on its way the robot is, and where cells that count were seen.
+    limits: the most points that a cell remembers, where on its way the robot is, and where cells
+    that count were seen.
     """
     most, way, since = limits
     numbers = np.empty(points.shape[0], dtype=np.int32)
@@ -218,9 +245,12 @@ def _gather(
     seen_from: Array,
     since: float,
 ) -> tuple[int, float]:
-    """Write the means around a cell, seen from its own, and their weights into near (N, 3); how many, how firm.
+    """Write the means around a cell, seen from its own, and their weights into near (N, 3).
 
-    Walls seen only from their other side are left out: the two faces of a thin wall are two surfaces.
+    Returns how many, and how firm.
+
+    Walls seen only from their other side are left out: the two faces of a thin wall are two
+    surfaces.
     """
     base = cells[tiles[slot_of(directory, row, col), row & _MASK, col & _MASK]]
     number, firm = 0, 0.0
@@ -237,9 +267,11 @@ def _gather(
             cell = cells[at]
             if cell[SEEN] < since:
                 continue
-            away = cell[NORMAL_X] * (seen_from[0] - cell[MEAN_X]) + cell[NORMAL_Y] * (seen_from[1] - cell[MEAN_Y])
+            to_x, to_y = seen_from[0] - cell[MEAN_X], seen_from[1] - cell[MEAN_Y]
+            away = cell[NORMAL_X] * to_x + cell[NORMAL_Y] * to_y
             if (r == row and c == col) or cell[LOOSE] > 0.0 or away >= 0.0:
-                near[number, 0], near[number, 1] = cell[MEAN_X] - base[MEAN_X], cell[MEAN_Y] - base[MEAN_Y]
+                near[number, 0] = cell[MEAN_X] - base[MEAN_X]
+                near[number, 1] = cell[MEAN_Y] - base[MEAN_Y]
                 near[number, 2] = min(cell[COUNT], _MOST_WEIGHT)
                 number += 1
                 if abs(r - row) <= _NEAR and abs(c - col) <= _NEAR:
@@ -248,10 +280,13 @@ def _gather(
 
 
 @kernel
-def _line(near: Array, nx: float, ny: float) -> tuple[float, float, float, float, float, float, int]:
-    """Centre, normal, variance across and weighted variance along of the means in a band with normal (nx, ny).
+def _line(
+    near: Array, nx: float, ny: float
+) -> tuple[float, float, float, float, float, float, int]:
+    """Centre, normal, variance across and weighted variance along of the means in a band.
 
-    near (N, 3): means and weights; the band goes through their origin, and (0, 0) stands for no band. Last: how many.
+    near (N, 3): means and weights; the band has the normal (nx, ny) and goes through their origin,
+    and (0, 0) stands for no band. Last: how many.
     """
     cells, count, sx, sy, sxx, sxy, syy = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(near.shape[0]):
@@ -298,11 +333,11 @@ def _surface(
     seen_from: Array,
     since: float,
 ) -> tuple[float, float, float, float, float]:
-    """Centre, normal and looseness of what the means around a cell make; near (M, 3): room for them.
+    """Centre, normal, looseness of what the means around a cell make; near (M, 3): room for them.
 
-    Where they do not make one wall, as beside a door or in a corner, the wall through the cell is looked for: a
-    surface fitted to both sides of a corner would pull all points that come near it aside. What belongs to no wall
-    is a point, loose in all directions.
+    Where they do not make one wall, as beside a door or in a corner, the wall through the cell is
+    looked for: a surface fitted to both sides of a corner would pull all points that come near it
+    aside. What belongs to no wall is a point, loose in all directions.
     """
     number, firm = _gather(cells, tiles, directory, row, col, near, seen_from, since)
     if number < _FEWEST_CELLS:

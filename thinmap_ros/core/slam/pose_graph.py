@@ -1,8 +1,9 @@
 """Poses that agree best with measured relative poses between them.
 
-Source: Grisetti, Kuemmerle, Stachniss and Burgard, "A tutorial on graph-based SLAM", 2010. Measurements that may be
-wrong are held down by the loss of Geman and McClure, which is narrowed round by round, so that true loops have time to
-close: Yang et al., "Graduated non-convexity for robust spatial perception", 2020.
+Source: Grisetti, Kuemmerle, Stachniss and Burgard, "A tutorial on graph-based SLAM", 2010.
+Measurements that may be wrong are held down by the loss of Geman and McClure, which is narrowed
+round by round, so that true loops have time to close: Yang et al., "Graduated non-convexity for
+robust spatial perception", 2020.
 """
 
 from dataclasses import dataclass
@@ -20,7 +21,10 @@ _NARROWING = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Pose b seen from pose a, T_a_b (3,), with its information (3, 3); doubtful: whether it may be all wrong."""
+    """Pose b seen from pose a, T_a_b (3,), with its information (3, 3).
+
+    doubtful: whether it may be all wrong.
+    """
 
     a: int
     b: int
@@ -30,7 +34,7 @@ class Measured:
 
 
 def relax(poses: Array, measured: list[Measured]) -> Array:
-    """Poses (N, 3) moved to agree with what was measured between them; the first stays. Gauss-Newton."""
+    """Poses (N, 3) moved by Gauss-Newton to agree with what was measured; the first stays."""
     poses = poses.copy()
     if len(poses) < 2 or not measured:
         return poses
@@ -75,7 +79,10 @@ def _linearise(poses: Array, edges: _Edges) -> tuple[Array, Array, Array]:
 
 
 def _step(edges: _Edges, e: Array, by_a: Array, by_b: Array, W: Array) -> Array:
-    """Gauss-Newton step (N - 1, 3) of all poses but the first, from errors, Jacobians and weights (M, 3, 3)."""
+    """Gauss-Newton step (N - 1, 3) of all poses but the first.
+
+    From errors, Jacobians and weights (M, 3, 3).
+    """
     # Here, not above: a live localizer never comes here, and these libraries take 18 MB.
     from scipy.sparse import coo_matrix
     from scipy.sparse.linalg import spsolve
@@ -93,11 +100,15 @@ def _step(edges: _Edges, e: Array, by_a: Array, by_b: Array, W: Array) -> Array:
             blocks.append((weighted @ J_j).ravel())
             rows.append(row)
             cols.append(col)
-    H = coo_matrix((np.concatenate(blocks), (np.concatenate(rows), np.concatenate(cols))), shape=(size, size)).tocsc()
+    H = coo_matrix(
+        (np.concatenate(blocks), (np.concatenate(rows), np.concatenate(cols))), shape=(size, size)
+    ).tocsc()
     return np.asarray(spsolve(H[3:, 3:], gradient.ravel()[3:]).reshape(-1, 3))
 
 
-def _places(i: NDArray[np.int64], j: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _places(
+    i: NDArray[np.int64], j: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Rows and columns, each (9 M,), of blocks (3, 3) at block rows i and columns j, (M,)."""
     along = np.arange(3)
     row = np.broadcast_to(3 * i[:, None, None] + along[:, None], (len(i), 3, 3))

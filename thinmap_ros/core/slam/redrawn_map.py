@@ -17,24 +17,32 @@ _SORTED_M = 3.0  # after so much way it is asked again which of them are the nea
 
 
 class RedrawnMap:
-    """The matcher with the map of points that it matches with, in which there may be what was taken over."""
+    """The matcher with its map of points, in which there may be what was taken over."""
 
-    def __init__(self, config: MatchConfig, given: Mapping[str, NDArray[Any]] | None = None) -> None:
-        """Begin with the `state` of another map of points, where one is given; raises InputError where it is none."""
+    def __init__(
+        self, config: MatchConfig, given: Mapping[str, NDArray[Any]] | None = None
+    ) -> None:
+        """Begin with the `state` of another map of points, where one is given.
+
+        Raises InputError where it is none.
+        """
         self._config, self._given = config, given
         self._due: list[int] = []  # the nearest last
         self._sorted_at: Array = np.zeros(2)
         self.matcher = self._fresh()
 
     def begin_anew(self, keyframes: list[Keyframe], T_map_base: Array) -> None:
-        """The keyframes have moved: draw what is in sight of a pose (3,) at once, and the rest step by step."""
+        """The keyframes have moved.
+
+        Draw what is in sight of a pose (3,) at once, and the rest step by step.
+        """
         self._due = list(range(len(keyframes)))
         away = self._sort(keyframes, T_map_base[:2])
         self.matcher = self._fresh()
         self._draw(keyframes, min(int((away < self._config.match_range_m).sum()), _AT_ONCE))
 
     def go_on(self, keyframes: list[Keyframe], T_map_base: Array) -> None:
-        """Draw a few more of the keyframes that are due, those that are nearest to a pose (3,) first."""
+        """Draw a few more of the keyframes that are due, the nearest to a pose (3,) first."""
         if self._due:
             here = T_map_base[:2]
             if math.dist(here, self._sorted_at) > _SORTED_M:
@@ -42,8 +50,13 @@ class RedrawnMap:
             self._draw(keyframes, _A_STEP)
 
     def _sort(self, keyframes: list[Keyframe], here: Array) -> Array:
-        """Put what is due in order, the nearest to a place (2,) last; their distances (N,) from there."""
-        away = np.hypot(*(np.array([keyframes[k].T_map_base[:2] for k in self._due]).reshape(-1, 2) - here).T)
+        """Put what is due in order, the nearest to a place (2,) last.
+
+        Returns their distances (N,) from there.
+        """
+        away = np.hypot(
+            *(np.array([keyframes[k].T_map_base[:2] for k in self._due]).reshape(-1, 2) - here).T
+        )
         order = np.argsort(-away)
         self._due, self._sorted_at = np.array(self._due)[order].tolist(), here.copy()
         return np.asarray(away[order])

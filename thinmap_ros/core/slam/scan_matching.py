@@ -1,9 +1,10 @@
 """A scan against the map of points: laser odometry that sharpens the prediction.
 
-Gauss-Newton on the distances of the scan's points from the surfaces that the map's points make near them, with Cauchy
-weights, and the odometry as a prior: where the walls leave a direction open, as along a corridor, the odometry decides.
-Source: Censi, "An ICP variant using a point-to-line metric", 2008; the search after Olson, "Real-time correlative scan
-matching", 2009.
+Gauss-Newton on the distances of the scan's points from the surfaces that the map's points make near
+them, with Cauchy weights, and the odometry as a prior: where the walls leave a direction open, as
+along a corridor, the odometry decides.
+Source: Censi, "An ICP variant using a point-to-line metric", 2008; the search after Olson,
+"Real-time correlative scan matching", 2009.
 """
 
 import math
@@ -36,15 +37,22 @@ from thinmap_ros.core.slam.point_map import (
 _SHIFT, _MASK = TILE.bit_length() - 1, TILE - 1
 _ROUNDS = 20
 _WIDE_ROUNDS = 3  # rounds in which far neighbours and larger errors still count
-_PLAIN_FIT = 0.95  # share of points that fit below which it is asked whether near neighbours alone do better
+# Share of points that fit below which it is asked whether near neighbours alone do better.
+_PLAIN_FIT = 0.95
 _OF_A_POINT = 0.25  # what a point says, as points err together, in terms of a log-likelihood
 _SLIPS = 3.0  # sigmas beyond which a prior says little more: wheels slip
-_LEAST_OVERLAP = 0.3  # share of the scan that has to lie where the map knows something, for a fit to be judged
+# Share of the scan that has to lie where the map knows something, for a fit to be judged.
+_LEAST_OVERLAP = 0.3
 FEWEST_POINTS = 10  # in a scan, for it to be matched
-_SEARCHED_M, _SEARCHED_POINTS = 20.0, 60  # a search takes so many points of the scan, and none farther than this
+# A search takes so many points of the scan, and none farther than this.
+_SEARCHED_M = 20.0
+_SEARCHED_POINTS = 60
 _SEARCH_STRIDE = 2  # cells from one place that is tried to the next
-_CLUTTER = 0.25  # weight of where along a surface a point lies: its nearest neighbour there is seldom the same thing
-_SEARCH_RIM = 1.25  # points by which a place at the rim of a search has to fit better than its middle
+# Weight of where along a surface a point lies:
+# its nearest neighbour there is seldom the same thing.
+_CLUTTER = 0.25
+# Points by which a place at the rim of a search has to fit better than its middle.
+_SEARCH_RIM = 1.25
 
 
 @dataclass(frozen=True)
@@ -53,27 +61,46 @@ class MatchConfig(Config):
 
     match_cell_m: float = parameter(0.05, 'edge of a cell of the point map, m', low=0.01, high=0.5)
     match_range_m: float = parameter(30.0, 'farther points are not matched, m', low=1.0, high=200.0)
-    match_memory: float = parameter(15.0, 'points that the mean of a cell remembers', low=1.0, high=1e6)
-    match_reach_m: float = parameter(0.6, 'points look for their surface within, m', low=0.05, high=2.0)
+    match_memory: float = parameter(
+        15.0, 'points that the mean of a cell remembers', low=1.0, high=1e6
+    )
+    match_reach_m: float = parameter(
+        0.6, 'points look for their surface within, m', low=0.05, high=2.0
+    )
     match_sigma_m: float = parameter(
-        0.03, 'doubt of a point on its surface (1 sigma), m; above range noise, as points err together', low=0.001
+        0.03,
+        'doubt of a point on its surface (1 sigma), m; above range noise, as points err together',
+        low=0.001,
     )
-    match_outlier_m: float = parameter(0.1, 'points this far from their surface count half, m', low=0.001, high=1.0)
-    match_inlier_m: float = parameter(0.1, 'points this near to their surface fit, m', low=0.001, high=1.0)
+    match_outlier_m: float = parameter(
+        0.1, 'points this far from their surface count half, m', low=0.001, high=1.0
+    )
+    match_inlier_m: float = parameter(
+        0.1, 'points this near to their surface fit, m', low=0.001, high=1.0
+    )
     match_good_fit: float = parameter(
-        0.85, 'share of points that fit below which the surroundings are searched', low=0.0, high=1.0
+        0.85,
+        'share of points that fit below which the surroundings are searched',
+        low=0.0,
+        high=1.0,
     )
-    match_least_fit: float = parameter(0.65, 'share of points that fit below which a match fails', low=0.0, high=1.0)
-    search_m: float = parameter(0.5, 'after a failed match: how far to search, m', low=0.0, high=10.0)
-    search_deg: float = parameter(30.0, 'after a failed match: how far to turn, degrees', low=0.0, high=180.0)
+    match_least_fit: float = parameter(
+        0.65, 'share of points that fit below which a match fails', low=0.0, high=1.0
+    )
+    search_m: float = parameter(
+        0.5, 'after a failed match: how far to search, m', low=0.0, high=10.0
+    )
+    search_deg: float = parameter(
+        30.0, 'after a failed match: how far to turn, degrees', low=0.0, high=180.0
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class Match:
     """A matched pose T_map_base (3,) and its covariance (3, 3), map frame.
 
-    fit: of the points that lie where the map knows something, the share that lies on its surfaces; overlap: the share
-    of the points that lie there at all; good: whether the pose can be trusted.
+    fit: of the points that lie where the map knows something, the share that lies on its surfaces;
+    overlap: the share of the points that lie there at all; good: whether the pose can be trusted.
     """
 
     T_map_base: Array
@@ -96,21 +123,27 @@ class ScanMatcher:
         self.map.add(points_map, seen_from)
 
     def match(
-        self, points_base: Array, laser_base: Array, prior: Array, covariance: Array,
-        search: bool = False, lost: bool = False,
+        self,
+        points_base: Array,
+        laser_base: Array,
+        prior: Array,
+        covariance: Array,
+        search: bool = False,
+        lost: bool = False,
     ) -> Match:
-        """Pose at which points (N, 2), in the order of the beams, fit the map near a prior pose (3,).
+        """Pose near a prior pose (3,) at which points (N, 2), in beam order, fit the map.
 
-        laser_base (2,): where the laser sits on the robot; covariance (3, 3) of the prior, in the map frame. Where
-        the fit is poor, or with `search`, the surroundings are searched. lost: the prior is only where to begin.
-        Without points or map, the prior is given back, as not good.
+        laser_base (2,): where the laser sits on the robot; covariance (3, 3) of the prior, in the
+        map frame. Where the fit is poor, or with `search`, the surroundings are searched. lost: the
+        prior is only where to begin. Without points or map, the prior is given back, as not good.
         """
         if len(points_base) < FEWEST_POINTS or self.map.tiles.used == 0:
             return Match(prior, covariance, 0.0, 0.0, False)
         scan = self._weighted(points_base)
         match = self._refine(scan, laser_base, prior, prior, covariance)
         if match.fit < _PLAIN_FIT or _squared_sigmas(match, prior, covariance) > _SLIPS**2:
-            # Far neighbours lead astray where little but one wall is seen, or much is new, and the prior was right.
+            # Far neighbours lead astray where little but one wall is seen, or much is new,
+            # and the prior was right.
             near = self._refine(scan, laser_base, prior, prior, covariance, far=False)
             match = likelier(match, near, prior, covariance, len(scan))
         if search:
@@ -118,11 +151,18 @@ class ScanMatcher:
         if match.overlap >= _LEAST_OVERLAP and match.fit < self.config.match_good_fit:
             found = self._search(scan, laser_base, prior, covariance)
             # Where the prior still says something, another place has to be worth the leap.
-            match = _better(match, found) if lost else likelier(match, found, prior, covariance, len(scan))
+            match = (
+                _better(match, found)
+                if lost
+                else likelier(match, found, prior, covariance, len(scan))
+            )
         if lost:
             return match
-        # Few points, or such as hardly fit, may say less than the prior does: then it is better that they say nothing.
-        return replace(match, good=match.good and _evidence(match, prior, covariance, len(scan)) >= 0.0)
+        # Few points, or such as hardly fit, may say less than the prior does: then it is better
+        # that they say nothing.
+        return replace(
+            match, good=match.good and _evidence(match, prior, covariance, len(scan)) >= 0.0
+        )
 
     def known(self, points_base: Array, laser_base: Array, T_map_base: Array) -> float:
         """Share of the points (N, 2) that lie where the map knows a surface, at a pose (3,)."""
@@ -130,7 +170,13 @@ class ScanMatcher:
             return 0.0
         config, tiles = self.config, self.map.tiles
         rings = int(math.ceil(0.5 * config.match_reach_m / config.match_cell_m))
-        limits = (config.match_cell_m, rings, config.match_sigma_m, config.match_outlier_m, config.match_inlier_m)
+        limits = (
+            config.match_cell_m,
+            rings,
+            config.match_sigma_m,
+            config.match_outlier_m,
+            config.match_inlier_m,
+        )
         total, near, _ = _add_points(
             self._weighted(points_base),
             laser_base,
@@ -161,20 +207,38 @@ class ScanMatcher:
         reach = float(np.hypot(sparse[:, 0], sparse[:, 1]).max(initial=0.0)) + config.search_m
         size = 2 * int(math.ceil(reach / config.match_cell_m)) + 8
         low = np.floor(prior[1::-1] / config.match_cell_m).astype(np.int64) - size // 2
-        filled = _filled(self.map.cells, tiles.pool, tiles.directory, low - self.map.corner, size, self.map.since_m)
+        filled = _filled(
+            self.map.cells,
+            tiles.pool,
+            tiles.directory,
+            low - self.map.corner,
+            size,
+            self.map.since_m,
+        )
         start = _search(sparse, prior, steps, turns, filled, low, config.match_cell_m)
         # What is searched for is what the prior missed: it must not hold the pose back.
-        wide = covariance + np.diag(np.square([config.search_m, config.search_m, math.radians(config.search_deg)]))
+        wide = covariance + np.diag(
+            np.square([config.search_m, config.search_m, math.radians(config.search_deg)])
+        )
         return self._refine(scan, laser_base, start, prior, wide)
 
     def _refine(
-        self, scan: Array, laser_base: Array, start: Array, prior: Array, covariance: Array, far: bool = True
+        self,
+        scan: Array,
+        laser_base: Array,
+        start: Array,
+        prior: Array,
+        covariance: Array,
+        far: bool = True,
     ) -> Match:
-        """The match to which a start leads; far: whether points look for their surfaces far off at first."""
+        """The match to which a start leads.
+
+        far: whether points look for their surfaces far off at first.
+        """
         config, tiles = self.config, self.map.tiles
         limits = np.array(
-            [config.match_cell_m, config.match_reach_m, config.match_sigma_m, config.match_outlier_m]
-            + [config.match_inlier_m, self.map.since_m]
+            [config.match_cell_m, config.match_reach_m, config.match_sigma_m]
+            + [config.match_outlier_m, config.match_inlier_m, self.map.since_m]
         )
         information: Array = np.linalg.inv(covariance).astype(np.float64)
         pose, posterior, shares = _align(
@@ -195,7 +259,13 @@ class ScanMatcher:
             return Match(prior, covariance, 0.0, float(overlap), False)
         pose[2] = se2.wrap(float(pose[2]))
         good = overlap >= _LEAST_OVERLAP and fit >= config.match_least_fit
-        return Match(pose, np.linalg.inv(posterior).astype(np.float64), float(fit), float(overlap), bool(good))
+        return Match(
+            pose,
+            np.linalg.inv(posterior).astype(np.float64),
+            float(fit),
+            float(overlap),
+            bool(good),
+        )
 
 
 def _better(first: Match, second: Match) -> Match:
@@ -209,7 +279,10 @@ def likelier(first: Match, second: Match, prior: Array, covariance: Array, point
 
 
 def _evidence(match: Match, prior: Array, covariance: Array, points: int) -> float:
-    """How much speaks for a match: points that fit, less those that contradict, less how far off the prior it is."""
+    """How much speaks for a match.
+
+    Points that fit, less those that contradict, less how far off the prior it is.
+    """
     fitting = points * match.overlap * (2.0 * match.fit - 1.0)
     squared = _squared_sigmas(match, prior, covariance)
     return _OF_A_POINT * fitting - 0.5 * _SLIPS**2 * math.log1p(squared / _SLIPS**2)
@@ -235,7 +308,9 @@ def _nearest(
     reach: int,
     since: float,
 ) -> int:
-    """Number of the cell whose mean is nearest to a point, ring by ring up to a reach in cells; 0 where there is none.
+    """Number of the cell whose mean is nearest to a point, ring by ring up to a reach in cells.
+
+    0 where there is none.
 
     Walls that were seen only from their other side are passed over.
     """
@@ -269,7 +344,10 @@ def _nearest(
 
 @inlined
 def prior_weight(squared: float) -> float:
-    """What a prior counts at a pose so many sigmas off, squared: the less the farther, as wheels slip."""
+    """What a prior counts at a pose so many sigmas off, squared.
+
+    The less the farther, as wheels slip.
+    """
     return 1.0 / (1.0 + squared / (_SLIPS * _SLIPS))
 
 
@@ -277,7 +355,10 @@ def prior_weight(squared: float) -> float:
 def _prior_terms(
     pose: Array, prior: Array, prior_information: Array, information: Array, gradient: Array
 ) -> None:
-    """Start the normal equations with the prior; it counts less the farther the pose is from it, as wheels slip."""
+    """Start the normal equations with the prior.
+
+    It counts less the farther the pose is from it, as wheels slip.
+    """
     turn = math.atan2(math.sin(prior[2] - pose[2]), math.cos(prior[2] - pose[2]))
     off = (prior[0] - pose[0], prior[1] - pose[1], turn)
     squared = 0.0
@@ -311,9 +392,18 @@ def _solve(A: Array, b: Array) -> tuple[float, float, float]:
 
 @kernel
 def _add_term(
-    weight: float, across: float, error: float, nx: float, ny: float, information: Array, gradient: Array
+    weight: float,
+    across: float,
+    error: float,
+    nx: float,
+    ny: float,
+    information: Array,
+    gradient: Array,
 ) -> None:
-    """Add one measured direction (nx, ny) with its error; across: how the direction moves with the heading."""
+    """Add one measured direction (nx, ny) with its error.
+
+    across: how the direction moves with the heading.
+    """
     jacobian = (nx, ny, across)
     for a in range(3):
         gradient[a] += weight * jacobian[a] * error
@@ -334,9 +424,10 @@ def _add_points(
     information: Array,
     gradient: Array,
 ) -> tuple[float, float, float]:
-    """Add what the points of a scan say at a pose (3,) to the normal equations; the weights that `_align` tells of.
+    """Add what the points of a scan say at a pose (3,) to the normal equations.
 
-    limits: cell, reach in cells, sigma, outlier and inlier distance, and where the cells that count were last seen.
+    Returns the weights that `_align` tells of. limits: cell, reach in cells, sigma, outlier and
+    inlier distance, and where the cells that count were last seen.
     """
     cell_m, reach, sigma, scale, inlier, since = limits
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
@@ -363,7 +454,9 @@ def _add_points(
         weight = scan[i, 2] / (sigma * sigma * (1.0 + squared / (scale * scale)))
         _add_term(weight, nx * -py + ny * px, error, nx, ny, information, gradient)
         if loose > 0.0 and scan[i, 3] > 0.0:
-            _add_term(_CLUTTER * weight * loose, ny * py + nx * px, slide, -ny, nx, information, gradient)
+            _add_term(
+                _CLUTTER * weight * loose, ny * py + nx * px, slide, -ny, nx, information, gradient
+            )
     return total, near, fitting
 
 
@@ -381,11 +474,11 @@ def _align(
     limits: Array,
     far: bool,
 ) -> tuple[Array, Array, Array]:
-    """Pose (3,), its information (3, 3), and the weights (3,) of all points, of those near the map, of those on it.
+    """Pose (3,), information (3, 3), weights (3,) of all points, those near the map, those on it.
 
-    scan (N, 4): x, y, weight in the robot frame, and whether the beams around are dense; limits: cell, reach, sigma,
-    outlier and inlier distance, m, and where on the robot's way the cells that count were last seen; far: whether
-    to begin with _WIDE_ROUNDS.
+    scan (N, 4): x, y, weight in the robot frame, and whether the beams around are dense; limits:
+    cell, reach, sigma, outlier and inlier distance, m, and where on the robot's way the cells that
+    count were last seen; far: whether to begin with _WIDE_ROUNDS.
     """
     cell_m, reach, sigma, outlier, inlier, since = limits
     pose, information, gradient, shares = start.copy(), np.zeros((3, 3)), np.zeros(3), np.zeros(3)
@@ -413,10 +506,17 @@ def _filled(
     size: int,
     since: float,
 ) -> NDArray[np.uint8]:
-    """1 where a cell or one of its eight neighbours holds points that count, else 0: (size, size) from a cell on."""
+    """1 where a cell or one of its eight neighbours holds points that count, else 0.
+
+    Shape (size, size), from the cell `low` on.
+    """
     filled = np.zeros((size, size), dtype=np.uint8)
-    for tile_row in range(max(low[0] >> _SHIFT, 0), min((low[0] + size >> _SHIFT) + 1, directory.shape[0])):
-        for tile_col in range(max(low[1] >> _SHIFT, 0), min((low[1] + size >> _SHIFT) + 1, directory.shape[1])):
+    for tile_row in range(
+        max(low[0] >> _SHIFT, 0), min((low[0] + size >> _SHIFT) + 1, directory.shape[0])
+    ):
+        for tile_col in range(
+            max(low[1] >> _SHIFT, 0), min((low[1] + size >> _SHIFT) + 1, directory.shape[1])
+        ):
             slot = directory[tile_row, tile_col]
             if slot == NO_TILE:
                 continue
@@ -442,7 +542,8 @@ def _search(
 ) -> Array:
     """The pose (3,) around a centre at which most points fall on or beside cells that hold points.
 
-    steps: how often to go _SEARCH_STRIDE cells to each side; filled (S, S): these cells, from the cell `low` on.
+    steps: how often to go _SEARCH_STRIDE cells to each side; filled (S, S): these cells, from the
+    cell `low` on.
     """
     best, best_score = centre.copy(), -np.inf
     rim = max(steps, 1) * _SEARCH_STRIDE * cell_m
@@ -452,7 +553,8 @@ def _search(
         for k in range(scan.shape[0]):
             x = centre[0] + cos * scan[k, 0] - sin * scan[k, 1]
             y = centre[1] + sin * scan[k, 0] + cos * scan[k, 1]
-            rows[k], cols[k] = int(math.floor(y / cell_m)) - low[0], int(math.floor(x / cell_m)) - low[1]
+            rows[k] = int(math.floor(y / cell_m)) - low[0]
+            cols[k] = int(math.floor(x / cell_m)) - low[1]
         for i in range(-steps, steps + 1):
             for j in range(-steps, steps + 1):
                 down, right = _SEARCH_STRIDE * i, _SEARCH_STRIDE * j

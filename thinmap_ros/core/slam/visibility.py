@@ -14,11 +14,13 @@ _SHARE = 0.7  # of the beams that come as far as the feature
 _FLATTEST = 0.17  # least sine of the angle between beam and wall
 
 
-def seen_through(scan: Scan, T_map_base: Array, lines: Array, features: list[Feature]) -> NDArray[np.bool_]:
-    """For each feature with its line (N, 2) whether the scan shows that it is no longer there, (N,).
+def seen_through(
+    scan: Scan, T_map_base: Array, lines: Array, features: list[Feature]
+) -> NDArray[np.bool_]:
+    """For each feature with its line (N, 2), whether the scan shows that it is gone, (N,).
 
-    Most of the beams that should have met it, and enough of them, end well behind it. Beams that return nothing tell
-    nothing: glass and black walls do that as well.
+    Most of the beams that should have met it, and enough of them, end well behind it. Beams that
+    return nothing tell nothing: glass and black walls do that as well.
     """
     if not features:
         return np.zeros(0, dtype=np.bool_)
@@ -30,7 +32,12 @@ def seen_through(scan: Scan, T_map_base: Array, lines: Array, features: list[Fea
         expected = (lines[:, 0] - normals_of(lines) @ T_map_laser[:2]) / towards
         along = tangents_of(lines) @ T_map_laser[:2] + expected * (beams @ tangents_of(lines).T)
     low, high = np.array([(f.low, f.high) for f in features]).T
-    aimed = (expected > 0.0) & (np.abs(towards) > _FLATTEST) & (along > low + _END_M) & (along < high - _END_M)
+    aimed = (
+        (expected > 0.0)
+        & (np.abs(towards) > _FLATTEST)
+        & (along > low + _END_M)
+        & (along < high - _END_M)
+    )
     ranges = scan.ranges_m[scan.hit][:, None]
     through = (aimed & (ranges > expected + _BEYOND_M)).sum(axis=0)
     reaching = (aimed & (ranges > expected - _BEYOND_M)).sum(axis=0)

@@ -1,10 +1,12 @@
 """Heading by the walls: those of most buildings stand parallel or square to each other.
 
-Where a robot comes round a corner into a hall, a scan may show nothing that the map knows: the wheels alone then say
-how it is turned, and all that is drawn from there on is turned with it. What was learned of the walls so far tells
-better: how many metres of them were seen in which direction, modulo a right angle. Only where most stand in one it is
-believed, and walls that stand otherwise say nothing.
-Source: Coughlan and Yuille, "Manhattan world: compass direction from a single image by Bayesian inference", 1999.
+Where a robot comes round a corner into a hall, a scan may show nothing that the map knows: the
+wheels alone then say how it is turned, and all that is drawn from there on is turned with it. What
+was learned of the walls so far tells better: how many metres of them were seen in which direction,
+modulo a right angle. Only where most stand in one it is believed, and walls that stand otherwise
+say nothing.
+Source: Coughlan and Yuille, "Manhattan world: compass direction from a single image by Bayesian
+inference", 1999.
 """
 
 import math
@@ -20,7 +22,8 @@ _BINS = 180  # of half a degree
 _NEAR_BINS = 3  # to either side of the fullest: walls of its direction
 _LEAST_M = 60.0  # of wall, scan by scan, before a direction is believed
 _MOST = 0.7  # share of them that stands in it
-# The heading is surest where the map begins: after so much way a wall weighs half as much, and in the end this much.
+# The heading is surest where the map begins: after so much way a wall weighs half as much, and in
+# the end this much.
 _FADES_M, _LEAST_WEIGHT = 20.0, 0.02
 _ASKEW_RAD = 0.003  # by which walls are built askew, 1 sigma
 _GATE_SIGMAS, _WIDEST_RAD = 3.0, 0.35
@@ -35,14 +38,15 @@ class Heading(NamedTuple):
 
 
 class WallCompass:
-    """Metres of wall by their direction in the map, and what the walls of a scan say of the heading."""
+    """Metres of wall by direction in the map, and what the walls of a scan say of the heading."""
 
     def __init__(self) -> None:
-        # By direction: metres of wall, weighted, and these times where in the bin the walls stand on an average.
+        # By direction: metres of wall, weighted, and these times where in the bin the walls stand
+        # on an average.
         self._metres, self._places = np.zeros(_BINS), np.zeros(_BINS)
 
     def learn(self, lines: Lines, yaw: float, way_m: float) -> None:
-        """Take in the walls of a scan that was made with a heading, rad, so far along the way, m."""
+        """Take in the walls of a scan made with a heading, rad, so far along the way, m."""
         at = (lines.z[:, 1] + yaw) % _QUARTER / _QUARTER * _BINS
         bins = at.astype(np.int64)
         weights = _lengths(lines) * max(1.0 / (1.0 + (way_m / _FADES_M) ** 2), _LEAST_WEIGHT)
@@ -63,7 +67,7 @@ class WallCompass:
         return float((fullest + mean) * _QUARTER / _BINS) % _QUARTER
 
     def read(self, lines: Lines, yaw: float, variance: float) -> Heading | None:
-        """The heading, near one (rad) that is known to a variance, at which the lines stand as walls do.
+        """The heading, near one (rad) known to a variance, at which the lines stand as walls do.
 
         None where the building has no such direction, or these lines do not tell it.
         """

@@ -10,18 +10,19 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
 
 _FAR_M = 1e4  # all faces to one side look towards one place there
-_SIDES = ((0, 1), (0, -1), (1, 0), (-1, 0))  # (row, col) from an occupied cell to the free one beside it
+# (row, col) from an occupied cell to the free one beside it.
+_SIDES = ((0, 1), (0, -1), (1, 0), (-1, 0))
 
 
 class Faces(NamedTuple):
-    """Points (N, 2) on walls, m, in order along each wall, and a place (2,) that all of them face."""
+    """Points (N, 2) on walls, m, in order along each, and a place (2,) that all of them face."""
 
     points: Array
     seen_from: Array
 
 
 def wall_points(patch: GridPatch) -> list[Faces]:
-    """Points on the faces of the occupied cells of a map that are turned to free ones, for each of four sides.
+    """Points on the faces of a map's occupied cells towards free ones, for each of four sides.
 
     A beam fills the cell that lies surface_depth_m behind what it met. So the surface is on average
     half a cell, less that depth, behind the face of the cell.
@@ -47,6 +48,11 @@ def _faces(patch: GridPatch, row: int, col: int, depth_m: float) -> Faces:
 
 
 def _along(cells: NDArray[np.int64], row: int) -> NDArray[np.int64]:
-    """Cells (N, 2) in the order of the walls that their faces make: along rows, or along columns."""
-    order = np.lexsort((cells[:, 1], cells[:, 0])) if row else np.lexsort((cells[:, 0], cells[:, 1]))
+    """Cells (N, 2) in the order of the walls that their faces make.
+
+    Along rows, or along columns.
+    """
+    order = (
+        np.lexsort((cells[:, 1], cells[:, 0])) if row else np.lexsort((cells[:, 0], cells[:, 1]))
+    )
     return cells[order]

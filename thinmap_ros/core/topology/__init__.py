@@ -1,1 +1,4 @@
-"""The thinning-based topological map: free space, skeleton, nodes and edges, local maps into the global one."""
+"""The thinning-based topological map.
+
+Free space, skeleton, nodes and edges, local maps into the global one.
+"""

@@ -1,4 +1,4 @@
-"""The global web: spots and chains on one unbounded lattice, found by place without looking at all of them."""
+"""The global web: spots and chains on one unbounded lattice, found by place, not by a search."""
 
 from collections import deque
 from collections.abc import Mapping
@@ -40,8 +40,8 @@ FIELDS = {
 class Cut:
     """How the atlas was cut open.
 
-    anchors: the spot at the first cell within of each chain that goes on outside, by cell; and all spots at which
-    chains were cut.
+    anchors: the spot at the first cell within of each chain that goes on outside, by cell; and all
+    spots at which chains were cut.
     """
 
     anchors: dict[tuple[int, int], int]
@@ -59,7 +59,9 @@ class Box:
 
     def holds(self, cells: Cells) -> NDArray[np.bool_]:
         """Which of the cells (..., 2) lie in it."""
-        inside: NDArray[np.bool_] = np.all((cells >= (self.row, self.col)) & (cells < self.end), axis=-1)
+        inside: NDArray[np.bool_] = np.all(
+            (cells >= (self.row, self.col)) & (cells < self.end), axis=-1
+        )
         return inside
 
     def has(self, cell: tuple[int, int]) -> bool:
@@ -91,14 +93,16 @@ class Box:
         return rows and self.col <= other.end[1] and other.col <= self.end[1]
 
     def around(self, cells: Cells, rim: int, limit: 'Box') -> 'Box':
-        """The smallest box that holds this one and some cells (N, 2) with a rim, but ends at the limit."""
-        low = np.maximum(np.minimum((self.row, self.col), cells.min(axis=0) - rim), (limit.row, limit.col))
+        """The smallest box round this one and cells (N, 2) with their rim; ends at the limit."""
+        low = np.maximum(
+            np.minimum((self.row, self.col), cells.min(axis=0) - rim), (limit.row, limit.col)
+        )
         high = np.minimum(np.maximum(self.end, cells.max(axis=0) + rim + 1), limit.end)
         return Box(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
 
 
 class Atlas(Web):
-    """A web that knows which chains pass through which block of the lattice, and which spots stand alone."""
+    """A web that knows which chains pass through which block, and which spots stand alone."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -109,9 +113,14 @@ class Atlas(Web):
         self._changed_chains: set[int] = set()
 
     def state(self) -> dict[str, Cells]:
-        """Spots (number, row, col, squared clearance), chains (number, a, b, cells) and their cells, as arrays."""
+        """The web as arrays.
+
+        Spots (number, row, col, squared clearance), chains (number, a, b, cells) and their cells.
+        """
         spots = [(number, *spot.cell, spot.squared) for number, spot in self.spots.items()]
-        chains = [(number, chain.a, chain.b, len(chain.cells)) for number, chain in self.chains.items()]
+        chains = [
+            (number, chain.a, chain.b, len(chain.cells)) for number, chain in self.chains.items()
+        ]
         cells = [np.column_stack([chain.cells, chain.squared]) for chain in self.chains.values()]
         return {
             'spots': np.array(spots, dtype=np.int64).reshape(-1, 4),
@@ -135,13 +144,18 @@ class Atlas(Web):
         for number, a, b, count in state['chains'].tolist():
             part = state['cells'][start : start + count]
             atlas._next, start = number - 1, start + count
-            atlas.add_chain(Chain(a, b, np.ascontiguousarray(part[:, :2]), np.ascontiguousarray(part[:, 2])))
+            atlas.add_chain(
+                Chain(a, b, np.ascontiguousarray(part[:, :2]), np.ascontiguousarray(part[:, 2]))
+            )
         atlas._next = int(state['next'][0])
         atlas.take_changes()
         return atlas
 
     def take_changes(self) -> tuple[set[int], set[int]]:
-        """Numbers of the spots and chains that came, went or (spots) got other chains since the last call."""
+        """Numbers of the spots and chains that came or went since the last call.
+
+        Also of the spots that got other chains.
+        """
         changes = self._changed_spots, self._changed_chains
         self._changed_spots, self._changed_chains = set(), set()
         return changes
@@ -196,7 +210,10 @@ class Atlas(Web):
         return all_cells[inside], all_squared[inside]
 
     def cut_out(self, box: Box) -> Cut:
-        """Take out all that lies in a box; chains that cross its border end at an anchor just inside."""
+        """Take out all that lies in a box.
+
+        Chains that cross its border end at an anchor just inside.
+        """
         cut = Cut({}, set())
         inner_spots = {spot for spot in self.lone if box.has(self.spots[spot].cell)}
         for number in sorted(self._near(box)):
@@ -220,7 +237,7 @@ class Atlas(Web):
         return found
 
     def _keep(self, chain: Chain, outside: list[tuple[int, int]], cut: Cut) -> None:
-        """Put back the runs of a chain that lie outside, each with the cells inside that it hangs on."""
+        """Put back the runs of a chain outside, each with the cells inside that it hangs on."""
         count = len(chain.cells)
         for first, end in outside:
             piece = chain.part(max(first - 1, 0), min(end, count - 1))
@@ -236,7 +253,10 @@ class Atlas(Web):
         return cut.anchors[row, col]
 
     def graft(self, net: Net, box: Box, anchors: dict[tuple[int, int], int]) -> set[int]:
-        """Add a whole net drawn on the cells of a box, its spots at anchors being those; returns its spots."""
+        """Add a whole net drawn on the cells of a box, its spots at anchors being those.
+
+        Returns its spots.
+        """
         numbers = []
         for row, col, squared, _ in net.spots.tolist():
             cell = (row + box.row, col + box.col)
@@ -246,10 +266,17 @@ class Atlas(Web):
         return set(numbers)
 
     def calm(self, box: Box, limit: Box) -> Box:
-        """A box, made larger until no spot lies at its border: there, chains that are cut would touch each other."""
+        """A box, made larger until no spot lies at its border.
+
+        There, chains that are cut would touch each other.
+        """
         while True:
             reach, inner = box.grown(_RIM), box.grown(-_RIM)
-            ends = {spot for number in self._near(reach) for spot in (self.chains[number].a, self.chains[number].b)}
+            ends = {
+                spot
+                for number in self._near(reach)
+                for spot in (self.chains[number].a, self.chains[number].b)
+            }
             cells = [self.spots[spot].cell for spot in ends]
             cells = [cell for cell in cells if reach.has(cell) and not inner.has(cell)]
             wider = box.around(np.array(cells), _RIM + 1, limit) if cells else box
@@ -260,7 +287,8 @@ class Atlas(Web):
     def joined_outside(self, box: Box, parts: NDArray[np.int32]) -> list[set[int]]:
         """Numbers in `parts` (H, W), drawn on the cells of a box, that chains outside the box join.
 
-        Looks no farther from the box than it takes to find all parts that go on outside, wherever that is possible.
+        Looks no farther from the box than it takes to find all parts that go on outside, wherever
+        that is possible.
         """
         near = self._near(box)
         links = self._links(near, box, parts)
@@ -274,7 +302,8 @@ class Atlas(Web):
                 at = open_ends.popleft()
                 found = links.get(at, set()) - seen
                 if at < 0:
-                    found |= {-self.chains[n].other(-at) for n in self._at[-at] if n not in near} - seen
+                    others = {-self.chains[n].other(-at) for n in self._at[-at] if n not in near}
+                    found |= others - seen
                 seen |= found
                 open_ends.extend(found)
                 group |= found & left
@@ -283,13 +312,24 @@ class Atlas(Web):
         return groups
 
     def _links(self, near: set[int], box: Box, parts: NDArray[np.int32]) -> dict[int, set[int]]:
-        """What the runs of some chains outside a box join: parts (positive numbers, 0: none) and spots (negative)."""
+        """What the runs of some chains outside a box join.
+
+        Parts (positive numbers, 0: none) and spots (negative).
+        """
         links: dict[int, set[int]] = {}
         for number in near:
             chain = self.chains[number]
             for first, end in _runs_outside(chain, box):
-                a = -chain.a if first == 0 else int(parts[tuple(chain.cells[first - 1] - (box.row, box.col))])
-                b = -chain.b if end == len(chain.cells) else int(parts[tuple(chain.cells[end] - (box.row, box.col))])
+                a = (
+                    -chain.a
+                    if first == 0
+                    else int(parts[tuple(chain.cells[first - 1] - (box.row, box.col))])
+                )
+                b = (
+                    -chain.b
+                    if end == len(chain.cells)
+                    else int(parts[tuple(chain.cells[end] - (box.row, box.col))])
+                )
                 links.setdefault(a, set()).add(b)
                 links.setdefault(b, set()).add(a)
         return links
@@ -329,7 +369,10 @@ def _runs_outside(chain: Chain, box: Box) -> list[tuple[int, int]]:
         return [(0, len(chain.cells))]
     if low_row >= box.row and low_col >= box.col and high_row < end_row and high_col < end_col:
         return []
-    return [(first, end) for first, end in _runs(chain.cells, box.row, box.col, end_row, end_col).tolist()]
+    return [
+        (first, end)
+        for first, end in _runs(chain.cells, box.row, box.col, end_row, end_col).tolist()
+    ]
 
 
 @kernel

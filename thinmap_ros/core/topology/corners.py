@@ -1,4 +1,4 @@
-"""Corner nodes: where a chain of cells has to be broken so that straight lines stay where the robot fits."""
+"""Corner nodes: where chains of cells break so that straight lines stay where the robot fits."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,13 +10,14 @@ Cells = NDArray[np.int64]
 
 
 def corner_indices(cells: Cells, room: Array) -> Cells:
-    """Indices into a chain's cells (K, 2) at which corner nodes stand, in order, the chain's ends left out.
+    """Indices into a chain's cells (K, 2) at which corner nodes stand, in order, without its ends.
 
-    room (K,): how far, in cells, the robot's centre may leave each cell in any direction (clearance less radius).
-    Where the straight line between two neighbouring nodes is blocked, the cell farthest from it becomes a node,
-    again and again until every line is clear. A line counts as clear when each cell it touches lies within `room`
-    of a cell of the very piece it stands for: by the triangle inequality the robot then fits everywhere on it, and
-    no grid has to be kept to know this. A closed chain is always broken.
+    room (K,): how far, in cells, the robot's centre may leave each cell in any direction (clearance
+    less radius). Where the straight line between two neighbouring nodes is blocked, the cell
+    farthest from it becomes a node, again and again until every line is clear. A line counts as
+    clear when each cell it touches lies within `room` of a cell of the very piece it stands for: by
+    the triangle inequality the robot then fits everywhere on it, and no grid has to be kept to know
+    this. A closed chain is always broken.
     Source: exploration paper section 2.2, Fig. 3(c) and (d).
     """
     broken = _split(np.ascontiguousarray(cells), np.maximum(room, 0.0))
@@ -26,7 +27,10 @@ def corner_indices(cells: Cells, room: Array) -> Cells:
 
 @inlined
 def _held(cells: Cells, room: Array, first: int, last: int, hint: int, row: int, col: int) -> int:
-    """A member of the piece within whose room a cell lies, or -1; `hint` and those after it are tried first."""
+    """A member of the piece within whose room a cell lies, or -1.
+
+    `hint` and those after it are tried first.
+    """
     for k in range(hint, last + 1):
         if (cells[k, 0] - row) ** 2 + (cells[k, 1] - col) ** 2 <= room[k] ** 2:
             return k
@@ -38,7 +42,10 @@ def _held(cells: Cells, room: Array, first: int, last: int, hint: int, row: int,
 
 @inlined
 def _is_clear(cells: Cells, room: Array, first: int, last: int) -> bool:
-    """Whether every cell that the line between two members touches is held; at a cell's corner, both beside it."""
+    """Whether every cell that the line between two members touches is held.
+
+    At a cell's corner, both beside it.
+    """
     row, col = cells[first, 0], cells[first, 1]
     rows, cols = abs(cells[last, 0] - row), abs(cells[last, 1] - col)
     up = 1 if cells[last, 0] > row else -1
@@ -62,7 +69,7 @@ def _is_clear(cells: Cells, room: Array, first: int, last: int) -> bool:
 
 @inlined
 def _farthest(cells: Cells, first: int, last: int) -> int:
-    """The member strictly between two others that is farthest from the straight piece that joins them."""
+    """The member strictly between two others that is farthest from the line between them."""
     d_row, d_col = cells[last, 0] - cells[first, 0], cells[last, 1] - cells[first, 1]
     squared = d_row * d_row + d_col * d_col
     best, best_distance = (first + last) // 2, 1e-9

@@ -16,17 +16,21 @@ Mask = NDArray[np.bool_]
 FAR = 1 << 14  # rows; "nothing in this column"
 
 
-def select_free_space(patch: GridPatch, seed_xy: tuple[float, float] | None, config: TopologyConfig) -> Mask:
+def select_free_space(
+    patch: GridPatch, seed_xy: tuple[float, float] | None, config: TopologyConfig
+) -> Mask:
     """Cells on which the robot can stand and that it can reach from the seed, (H, W) bool.
 
-    The rules: a cell counts when its centre is at least the robot's radius from the centre of every cell that is not
-    known to be free, so the robot never stands with its body in a wall or in the unknown, and the free space ends
-    one radius before the rim of what is known. First, runs of unknown cells up to gap_m long between two free cells
-    of a row or column are taken for free: specks between beams. Occupied cells count however few they are: a lone one
-    is a pillar until the grid takes it back. Cells are joined over edges and corners. seed_xy: x, y in m in the map
-    frame; where it is not on such a cell, the nearest one within seed_reach_m; none: an empty selection. Without
-    seed: every part that is larger than the robot itself.
-    Source: exploration paper section 2.1, "selection of free space"; rules beyond the papers are stated above.
+    The rules: a cell counts when its centre is at least the robot's radius from the centre of every
+    cell that is not known to be free, so the robot never stands with its body in a wall or in the
+    unknown, and the free space ends one radius before the rim of what is known. First, runs of
+    unknown cells up to gap_m long between two free cells of a row or column are taken for free:
+    specks between beams. Occupied cells count however few they are: a lone one is a pillar until
+    the grid takes it back. Cells are joined over edges and corners. seed_xy: x, y in m in the map
+    frame; where it is not on such a cell, the nearest one within seed_reach_m; none: an empty
+    selection. Without seed: every part that is larger than the robot itself.
+    Source: exploration paper section 2.1, "selection of free space"; rules beyond the papers are
+    stated above.
     """
     radius = config.robot_radius_m / patch.frame.resolution
     standing = standing_room(column_distance(known_free(patch, config)), radius)
@@ -44,7 +48,9 @@ def known_free(patch: GridPatch, config: TopologyConfig) -> Mask:
 
 
 def standing_room(distance: NDArray[np.int16], radius_cells: float) -> Mask:
-    """Cells whose centre is at least radius_cells from the centre of each cell that is not free; outside is not.
+    """Cells whose centre is at least radius_cells from the centre of each cell that is not free.
+
+    Cells outside are not free.
 
     distance (H, W): from `column_distance`.
     """
@@ -71,7 +77,8 @@ def nearest_cell(
         return own
     reach = math.ceil(reach_m / patch.frame.resolution)
     low = np.maximum(centre - reach, 0)
-    found = np.argwhere(cells[low[0] : max(centre[0] + reach + 1, 0), low[1] : max(centre[1] + reach + 1, 0)]) + low
+    high = np.maximum(centre + reach + 1, 0)
+    found = np.argwhere(cells[low[0] : high[0], low[1] : high[1]]) + low
     if found.size == 0:
         return None
     squared = ((found - centre) ** 2).sum(axis=1)
@@ -81,7 +88,7 @@ def nearest_cell(
 
 
 def without_specks(cells: Mask, smallest: float) -> Mask:
-    """Cells without the parts (joined over edges and corners) that have fewer than `smallest` cells."""
+    """Cells without the parts (joined over edges and corners) of fewer than `smallest` cells."""
     labels, sizes = label(cells)
     keep = sizes >= smallest
     keep[0] = False
@@ -90,7 +97,7 @@ def without_specks(cells: Mask, smallest: float) -> Mask:
 
 @kernel
 def _close_gaps(states: NDArray[np.uint8], gap: int) -> Mask:
-    """Free cells (state 1), and runs of unknown cells (2) up to `gap` long that lie between two free ones."""
+    """Free cells (1), and runs of unknown cells (2) up to `gap` long that lie between free ones."""
     rows, cols = states.shape
     free: Mask = states == 1
     last_free = np.full(cols, -1, dtype=np.int64)
@@ -111,7 +118,10 @@ def _close_gaps(states: NDArray[np.uint8], gap: int) -> Mask:
 
 @kernel
 def column_distance(free: Mask) -> NDArray[np.int16]:
-    """Rows from each cell to the nearest one in its column that is not free (0 there); outside is not free."""
+    """Rows from each cell to the nearest one in its column that is not free (0 there).
+
+    Cells outside are not free.
+    """
     rows, cols = free.shape
     distance = np.zeros((rows, cols), dtype=np.int16)
     for row in range(rows):
@@ -142,9 +152,12 @@ def _standing_room(distance: NDArray[np.int16], need: NDArray[np.int16]) -> Mask
 
 @kernel
 def squared_clearance(distance: NDArray[np.int16], cells: Cells) -> Cells:
-    """Squared distance, in cells, from each cell (N, 2) to the nearest one that is not free; outside is not.
+    """Squared distance, in cells, from each cell (N, 2) to the nearest one that is not free.
 
-    distance (H, W): from `column_distance`. Searches columns outwards until they are too far to matter.
+    Cells outside are not free.
+
+    distance (H, W): from `column_distance`. Searches columns outwards until they are too far to
+    matter.
     """
     cols = distance.shape[1]
     squared = np.empty(cells.shape[0], dtype=np.int64)

@@ -10,11 +10,16 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.buckets import Buckets
 from thinmap_ros.core.se2 import Array
 
-_BUCKET_M, _FAR_M = 4.0, 60.0  # nodes are listed by squares, in which one is looked for up to so far away
+# Nodes are listed by squares, in which one is looked for up to so far away.
+_BUCKET_M = 4.0
+_FAR_M = 60.0
 
 
 class NodeKind(IntEnum):
-    """What a node marks: the end of an edge, the meeting of three or more, or a bend that an obstacle forces."""
+    """What a node marks.
+
+    The end of an edge, the meeting of three or more, or a bend that an obstacle forces.
+    """
 
     END = 0
     BRANCH = 1
@@ -23,7 +28,10 @@ class NodeKind(IntEnum):
 
 @dataclass(frozen=True)
 class Node:
-    """A place: x, y in m in the map frame; clearance_m: distance to the nearest cell that is not free."""
+    """A place: x, y in m in the map frame.
+
+    clearance_m: distance to the nearest cell that is not free.
+    """
 
     id: int
     kind: NodeKind
@@ -39,9 +47,12 @@ class Node:
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """A passage between the nodes a and b: path (K, 2) in m in the map frame, from a to b through free cells.
+    """A passage between the nodes a and b.
 
-    length_m: along the path; clearance_m: smallest distance from the path to a cell that is not free.
+    Path (K, 2) in m in the map frame, from a to b through free cells.
+
+    length_m: along the path; clearance_m: smallest distance from the path to a cell that is not
+    free.
     """
 
     id: int
@@ -63,7 +74,8 @@ class Edge:
 class TopologicalMap:
     """Nodes and edges by id; ids are positive and unique over nodes and edges together.
 
-    Parallel edges and loops are allowed. `nodes` and `edges` are for reading: change the map by its methods.
+    Parallel edges and loops are allowed. `nodes` and `edges` are for reading: change the map by its
+    methods.
     Source: topological map paper section 2, exploration paper section 2.2.
     """
 
@@ -95,12 +107,15 @@ class TopologicalMap:
     def put_edge(self, edge: Edge) -> None:
         """Add an edge, or replace the one with its id.
 
-        Raises InputError where the id is not positive or belongs to a node, or an end does not exist.
+        Raises InputError where the id is not positive or belongs to a node, or an end does not
+        exist.
         """
         if edge.id <= 0 or edge.id in self.nodes:
             raise InputError(f'edge id {edge.id}: expected a positive number that no node has')
         if edge.a not in self.nodes or edge.b not in self.nodes:
-            raise InputError(f'edge {edge.id} from node {edge.a} to {edge.b}: expected nodes of the map')
+            raise InputError(
+                f'edge {edge.id} from node {edge.a} to {edge.b}: expected nodes of the map'
+            )
         if edge.id in self.edges:
             self.drop_edge(edge.id)
         self.edges[edge.id] = edge
@@ -129,21 +144,34 @@ class TopologicalMap:
         return list(dict.fromkeys(edge.other(node_id) for edge in self.edges_at(node_id)))
 
     def nearest_node(self, x: float, y: float) -> Node | None:
-        """The node with the smallest straight distance to a point (m, map frame); None in an empty map."""
+        """The node with the smallest straight distance to a point (m, map frame).
+
+        None in an empty map.
+        """
         reach = _BUCKET_M
         while reach <= _FAR_M:
-            best = min(self.nodes_near(x, y, reach), key=lambda n: (n.x - x) ** 2 + (n.y - y) ** 2, default=None)
+            best = min(
+                self.nodes_near(x, y, reach),
+                key=lambda n: (n.x - x) ** 2 + (n.y - y) ** 2,
+                default=None,
+            )
             if best is not None and (best.x - x) ** 2 + (best.y - y) ** 2 <= reach**2:
                 return best
             reach *= 2.0
         return min(self.nodes.values(), key=lambda n: (n.x - x) ** 2 + (n.y - y) ** 2, default=None)
 
     def nodes_near(self, x: float, y: float, reach_m: float) -> list[Node]:
-        """All nodes within a reach of a point (m, map frame), by id; some that are farther off may be among them."""
+        """All nodes within a reach of a point (m, map frame), by id.
+
+        Some that are farther off may be among them.
+        """
         return [self.nodes[i] for i in self._places.near(x, y, reach_m)]
 
     def nearest_edge_point(self, x: float, y: float) -> tuple[int, int, float] | None:
-        """Edge id, index into its path, and distance in m, of the path point nearest to a point; None without edges."""
+        """Edge id, index into its path, and distance in m, of the path point nearest to a point.
+
+        None without edges.
+        """
         best: tuple[int, int, float] | None = None
         for edge in self.edges.values():
             squared = (edge.path[:, 0] - x) ** 2 + (edge.path[:, 1] - y) ** 2

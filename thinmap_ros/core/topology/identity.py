@@ -1,4 +1,7 @@
-"""Ids that stay with a place: the global map's nodes and edges, brought up to date with what the atlas holds."""
+"""Ids that stay with a place.
+
+The global map's nodes and edges, brought up to date with what the atlas holds.
+"""
 
 from collections.abc import Mapping
 from itertools import pairwise
@@ -49,7 +52,10 @@ class Registry:
         self._heritage: tuple[list[Node], list[Edge]] = ([], [])
 
     def state(self) -> dict[str, NDArray[np.int64]]:
-        """Which ids stand for what: places (spot or chain, index, node id), edges (chain, edge id), the next id."""
+        """Which ids stand for what.
+
+        Places (spot or chain, index, node id), edges (chain, edge id), the next id.
+        """
         places = [(*place, node) for place, node in self._nodes.items()]
         edges = [(chain, edge) for chain, ids in self._edges.items() for edge in ids]
         return {
@@ -101,7 +107,10 @@ class Registry:
         self._next_id += count
 
     def inherit(self, other: 'Registry', nodes: list[Node]) -> None:
-        """Let the next `refresh` name places and edges after those of another registry, its nodes moved meanwhile."""
+        """Let the next `refresh` name places and edges after those of another registry.
+
+        Its nodes have moved meanwhile.
+        """
         self._next_id = other._next_id
         self._heritage = nodes, list(other.map.edges.values())
         self._pieces = {edge: other._pieces[edge] for edge in other.map.edges}
@@ -109,8 +118,9 @@ class Registry:
     def refresh(self, atlas: Atlas) -> bool:
         """Follow the changes of the atlas since the last call; returns whether there were any.
 
-        A new node takes over the id of one that is gone and lay within same_place_m: nearest pairs first, and one of
-        another kind counts as farther away unless it was in the same cell. An edge between two nodes keeps its id.
+        A new node takes over the id of one that is gone and lay within same_place_m: nearest pairs
+        first, and one of another kind counts as farther away unless it was in the same cell. An
+        edge between two nodes keeps its id.
         """
         spots, chains = atlas.take_changes()
         changed = bool(spots or chains)
@@ -138,10 +148,14 @@ class Registry:
         return old
 
     def _withdraw_nodes(self, atlas: Atlas, spots: set[int], chains: set[int]) -> list[Node]:
-        """Take the nodes of spots that are gone, and the corners of chains that changed, out of the map."""
+        """Take nodes of spots that are gone, and corners of changed chains, out of the map."""
         places = [(spot, -1) for spot in spots - atlas.spots.keys()]
         places += [(number, k) for number in chains for k in self._breaks.pop(number, [])]
-        old = [self.map.nodes[self._nodes.pop(place)] for place in sorted(places) if place in self._nodes]
+        old = [
+            self.map.nodes[self._nodes.pop(place)]
+            for place in sorted(places)
+            if place in self._nodes
+        ]
         for node in old:
             self.map.drop_node(node.id)
         return old
@@ -151,19 +165,26 @@ class Registry:
         places = []
         for spot in sorted(spots & atlas.spots.keys()):
             cell, squared = atlas.spots[spot].cell, atlas.spots[spot].squared
-            places.append(((spot, -1), node_of(_NEW, kind_of(atlas, spot), cell, squared, self._lattice)))
+            places.append(
+                ((spot, -1), node_of(_NEW, kind_of(atlas, spot), cell, squared, self._lattice))
+            )
         radius = self._config.robot_radius_m / self._lattice.resolution
         for number in sorted(chains & atlas.chains.keys()):
             chain = atlas.chains[number]
             self._breaks[number] = corner_indices(chain.cells, room_along(chain, radius)).tolist()
             for k in self._breaks[number]:
                 row, col = chain.cells[k].tolist()
-                node = node_of(_NEW, NodeKind.CORNER, (row, col), int(chain.squared[k]), self._lattice)
+                node = node_of(
+                    _NEW, NodeKind.CORNER, (row, col), int(chain.squared[k]), self._lattice
+                )
                 places.append(((number, k), node))
         return places
 
     def _name(self, fresh: list[tuple[Place, Node]], old: list[Node]) -> None:
-        """Give ids to new places: those of old nodes where they continue them, new ones to the rest."""
+        """Give ids to new places.
+
+        Those of old nodes where they continue them, new ones to the rest.
+        """
         for i, j in self._continued([node for _, node in fresh], old):
             self._nodes[fresh[i][0]] = old[j].id
         for place, _ in fresh:
@@ -175,7 +196,8 @@ class Registry:
         if not fresh or not old:
             return []
         new_xy, old_xy = (np.array([(node.x, node.y) for node in nodes]) for nodes in (fresh, old))
-        kinds = np.array([node.kind for node in fresh])[:, None] != np.array([node.kind for node in old])
+        fresh_kinds, old_kinds = (np.array([n.kind for n in nodes]) for nodes in (fresh, old))
+        kinds = fresh_kinds[:, None] != old_kinds
         distance = np.hypot(*np.moveaxis(new_xy[:, None] - old_xy, 2, 0))
         limit = self._config.same_place_m
         moved = distance > 0.1 * self._lattice.resolution
@@ -192,7 +214,10 @@ class Registry:
         return found
 
     def _put_edges(self, atlas: Atlas, number: int, old: OldEdges) -> None:
-        """Put the edges of a chain into the map; each takes over the id of an old one between the same nodes."""
+        """Put the edges of a chain into the map.
+
+        Each takes over the id of an old one between the same nodes.
+        """
         self._edges[number] = []
         for a, b, piece in self._pieces_of(atlas, number):
             edge = self._edge(a, b, piece, old)
@@ -202,13 +227,20 @@ class Registry:
     def _pieces_of(self, atlas: Atlas, number: int) -> list[tuple[int, int, Chain]]:
         """The pieces of a chain between its nodes, and the ids of these."""
         chain, breaks = atlas.chains[number], self._breaks[number]
-        ids = [self._nodes[chain.a, -1], *(self._nodes[number, k] for k in breaks), self._nodes[chain.b, -1]]
+        ids = [
+            self._nodes[chain.a, -1],
+            *(self._nodes[number, k] for k in breaks),
+            self._nodes[chain.b, -1],
+        ]
         stops = [0, *breaks, len(chain.cells) - 1]
         ends = zip(pairwise(ids), pairwise(stops), strict=True)
         return [(a, b, chain.part(first, last)) for (a, b), (first, last) in ends]
 
     def _edge(self, a: int, b: int, piece: Chain, old: OldEdges) -> Edge:
-        """The edge along a piece of chain: an old one if it ran just there, else a new one, with an old id if any."""
+        """The edge along a piece of chain.
+
+        An old one if it ran just there, else a new one, with an old id if any.
+        """
         same = old.get((min(a, b), max(a, b)), [])
         for k, edge in enumerate(same):
             known = self._pieces[edge.id]
@@ -234,7 +266,7 @@ def _named(node: Node, number: int) -> Node:
 
 @kernel
 def _is_same(cells: Cells, squared: Cells, other_cells: Cells, other_squared: Cells) -> bool:
-    """Whether two pieces run along the same cells (K, 2), and their smallest squared clearances (K,) are the same."""
+    """Whether two pieces have the same cells (K, 2) and smallest squared clearances (K,)."""
     if cells.shape[0] != other_cells.shape[0]:
         return False
     for k in range(cells.shape[0]):

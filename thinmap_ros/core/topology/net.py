@@ -1,4 +1,7 @@
-"""Spots and chains as arrays, for compiled code to change: what `Web` is, without an object for each of them."""
+"""Spots and chains as arrays, for compiled code to change.
+
+What `Web` is, without an object for each of them.
+"""
 
 import math
 from collections.abc import Callable
@@ -13,7 +16,8 @@ from thinmap_ros.core.topology.web import Chain, Spot, Web
 Cells = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 NONE = -1
-ROW, COL, SQUARED, DEGREE = 0, 1, 2, 3  # of a spot; squared clearance in cells, chain ends; degree NONE: gone
+# Of a spot; squared clearance in cells, chain ends; degree NONE: gone.
+ROW, COL, SQUARED, DEGREE = 0, 1, 2, 3
 A, B, START, COUNT = 0, 1, 2, 3  # of a chain; a NONE: gone
 DONE, FULL, SHORT = 0, 1, 2  # how far one got: to the end, out of room, or past what was put in
 _CHAINS, _CELLS, _STATE = 0, 1, 2  # of what is used
@@ -23,9 +27,11 @@ _REACH = 4  # chains from a spot that are put in at first
 class Net(NamedTuple):
     """A web as arrays with room for more. Numbers are given in order, and never again.
 
-    A chain k has two ends, 2 k at its spot a and 2 k + 1 at b. spots (S, 4): row, col, squared clearance, degree;
-    hooks (S, 2): first and last chain end there; chains (C, 4): a, b, first cell and their count; ends (2 C, 2): the
-    chain end before and after each at the same spot, oldest first; cells (P, 3): row, col, squared clearance;
+    A chain k has two ends, 2 k at its spot a and 2 k + 1 at b. spots (S, 4): row, col, squared
+    clearance, degree;
+    hooks (S, 2): first and last chain end there; chains (C, 4): a, b, first cell and their count;
+    ends (2 C, 2): the chain end before and after each at the same spot, oldest first; cells (P, 3):
+    row, col, squared clearance;
     used (3,): chains, cells, state; partial (S,): spots of which not all chains have been put in.
     """
 
@@ -41,7 +47,8 @@ class Net(NamedTuple):
 def net_of(nodes: Cells, ends: Cells, starts: Cells, cells: Cells, room: int = 1) -> Net:
     """Net of nodes (N, 3) as row, col and squared clearance, and chains between them.
 
-    ends (M, 2): nodes; starts (M + 1,): where in the cells (K, 3) each chain begins; room: for how many times as much.
+    ends (M, 2): nodes; starts (M + 1,): where in the cells (K, 3) each chain begins; room: for how
+    many times as much.
     """
     chains, count = len(ends) * (1 + room) + 64, len(cells) * (1 + 3 * room) + 4096
     net = Net(
@@ -90,7 +97,9 @@ def length_of(net: Net, number: int) -> float:
     """Length of a chain along its cells, in cells."""
     length, start = 0.0, net.chains[number, START]
     for k in range(start + 1, start + net.chains[number, COUNT]):
-        length += math.hypot(net.cells[k, 0] - net.cells[k - 1, 0], net.cells[k, 1] - net.cells[k - 1, 1])
+        length += math.hypot(
+            net.cells[k, 0] - net.cells[k - 1, 0], net.cells[k, 1] - net.cells[k - 1, 1]
+        )
     return length
 
 
@@ -105,7 +114,9 @@ def whole(net: Net, spot: int) -> bool:
 @kernel
 def fits(net: Net, cells: int) -> bool:
     """Whether there is room for a chain of so many cells; says so where there is none."""
-    room = net.used[_CHAINS] < net.chains.shape[0] and net.used[_CELLS] + cells <= net.cells.shape[0]
+    room = (
+        net.used[_CHAINS] < net.chains.shape[0] and net.used[_CELLS] + cells <= net.cells.shape[0]
+    )
     if not room:
         net.used[_STATE] = FULL
     return bool(room)
@@ -150,7 +161,10 @@ def drop_chain(net: Net, number: int) -> None:
 
 @kernel
 def append_cells(net: Net, start: int, count: int, backwards: bool, skip: int) -> None:
-    """Put a copy of `count` cells from `start` on, or of these backwards, less the first few, after all others."""
+    """Put a copy of `count` cells from `start` on after all others, less the first few.
+
+    With `backwards`, of these in reverse order.
+    """
     used = net.used[_CELLS]
     for k in range(skip, count):
         net.cells[used + k - skip] = net.cells[start + (count - 1 - k if backwards else k)]
@@ -193,7 +207,10 @@ def dissolve_all(net: Net, spots: Mask) -> None:
 
 @kernel
 def merge(net: Net, number: int, kept: int) -> None:
-    """Draw the two ends of a chain together at one of them; the other's chains get the way between."""
+    """Draw the two ends of a chain together at one of them.
+
+    The other's chains get the way between.
+    """
     backwards = net.chains[number, A] != kept
     gone = net.chains[number, A if backwards else B]
     start, count = net.chains[number, START], net.chains[number, COUNT]
@@ -225,7 +242,9 @@ def draw(net: Net, rows: int, cols: int) -> Mask:
             drawing[net.spots[spot, ROW], net.spots[spot, COL]] = True
     for number in range(chain_count(net)):
         if net.chains[number, A] != NONE:
-            for k in range(net.chains[number, START], net.chains[number, START] + net.chains[number, COUNT]):
+            for k in range(
+                net.chains[number, START], net.chains[number, START] + net.chains[number, COUNT]
+            ):
                 drawing[net.cells[k, 0], net.cells[k, 1]] = True
     return drawing
 
@@ -233,7 +252,10 @@ def draw(net: Net, rows: int, cols: int) -> Mask:
 def web_of_net(net: Net) -> Web:
     """The web that is left."""
     web = Web()
-    spots = [Spot((row, col), squared) if degree != NONE else None for row, col, squared, degree in net.spots.tolist()]
+    spots = [
+        Spot((row, col), squared) if degree != NONE else None
+        for row, col, squared, degree in net.spots.tolist()
+    ]
     numbers = [web.add_spot(spot) if spot else NONE for spot in spots]
     for a, b, cells, squared in chains_of(net):
         web.add_chain(Chain(numbers[a], numbers[b], cells, squared))
@@ -241,17 +263,23 @@ def web_of_net(net: Net) -> Web:
 
 
 def chains_of(net: Net, first: int = 0) -> list[tuple[int, int, Cells, Cells]]:
-    """Ends, cells (K, 2) and squared clearances (K,) of the chains that are left, from a number on."""
+    """Ends, cells (K, 2), squared clearances (K,) of the chains that are left, from a number on."""
     found = net.chains[first : chain_count(net)]
-    parts = [(a, b, net.cells[start : start + count]) for a, b, start, count in found.tolist() if a != NONE]
+    parts = [
+        (a, b, net.cells[start : start + count])
+        for a, b, start, count in found.tolist()
+        if a != NONE
+    ]
     return [(a, b, part[:, :2].copy(), part[:, 2].copy()) for a, b, part in parts]
 
 
 def change(web: Web, spots: set[int], act: Callable[[Net, Mask], None]) -> None:
-    """Let compiled code change a web round some of its spots: it gets a net, and which of its spots (S,) they are.
+    """Let compiled code change a web round some of its spots.
 
-    As much of the web is put into the net as the code turns out to need. Nothing but that is looked at, so the cost
-    does not depend on the size of the web.
+    It gets a net, and which of its spots (S,) they are.
+
+    As much of the web is put into the net as the code turns out to need. Nothing but that is looked
+    at, so the cost does not depend on the size of the web.
     """
     reach, room = _REACH, 1
     while True:
@@ -266,7 +294,10 @@ def change(web: Web, spots: set[int], act: Callable[[Net, Mask], None]) -> None:
 
 
 def _neighbourhood(web: Web, spots: set[int], reach: int) -> tuple[list[int], list[int], set[int]]:
-    """Numbers of the spots and chains within some chains of those given, and those spots that have others as well."""
+    """Numbers of the spots and chains within some chains of those given.
+
+    Also those spots that have others as well.
+    """
     known = {spot for spot in spots if spot in web.spots}
     chains: set[int] = set()
     newest = known

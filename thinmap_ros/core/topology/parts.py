@@ -1,4 +1,7 @@
-"""Which cells hang together, over edges and corners: found row by row, from one run of true cells to the next."""
+"""Which cells hang together, over edges and corners.
+
+Found row by row, from one run of true cells to the next.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +13,9 @@ Mask = NDArray[np.bool_]
 
 
 def label(cells: Mask) -> tuple[NDArray[np.int32], Cells]:
-    """Number of the part (joined over edges and corners) of each true cell, 0 elsewhere; cells in each part.
+    """Number of the part (joined over edges and corners) of each true cell, 0 elsewhere.
+
+    Cells in each part.
 
     Parts are numbered in the order of their first cells, row after row.
     """
@@ -29,7 +34,8 @@ def reachable(cells: Mask, seeds: Cells) -> Mask:
 def _runs(cells: Mask) -> tuple[Cells, Cells, Cells, int]:
     """Runs (R, 3) of true cells as (row, first column, end), row after row, and what they make.
 
-    Also: which run is the first of each row, (H + 1,); the number of each run's part from 1 on, (R,); how many parts.
+    Also: which run is the first of each row, (H + 1,); the number of each run's part from 1 on,
+    (R,); how many parts.
     """
     rows, cols = cells.shape
     runs = np.empty((rows * (cols // 2 + 1), 3), dtype=np.int64)
@@ -72,7 +78,10 @@ def _runs(cells: Mask) -> tuple[Cells, Cells, Cells, int]:
 
 @kernel
 def _root(owner: Cells, k: int) -> int:
-    """The earliest run known to be of the same part; the way there is made shorter for the next one who asks."""
+    """The earliest run known to be of the same part.
+
+    The way there is made shorter for the next one who asks.
+    """
     while owner[k] != k:
         owner[k] = owner[owner[k]]
         k = owner[k]

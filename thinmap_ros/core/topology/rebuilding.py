@@ -1,4 +1,4 @@
-"""A topological map built anew after a loop was closed, where grid and poses are heard of one after the other."""
+"""A topological map built anew after a loop closure, with grid and poses heard of in turn."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,16 +15,21 @@ _PATIENCE = 100  # windows after which a grid that does not come is waited for n
 class Rebuilding:
     """What is needed for it: where the robot has been, and which correction the grid has undergone.
 
-    Between the news of a correction and the grid that has undergone it nothing is taken into the graph, nor are
-    windows that were cut out of the grid before: they would be drawn over what is right.
+    Between the news of a correction and the grid that has undergone it nothing is taken into the
+    graph, nor are windows that were cut out of the grid before: they would be drawn over what is
+    right.
     """
 
     def __init__(self, from_the_start: bool = True) -> None:
-        """from_the_start: whether the graph begins here, so that all poses from which it was seen become known."""
+        """from_the_start: whether the graph begins here.
+
+        All poses from which it was seen then become known.
+        """
         self._past = PoseHistory() if from_the_start else None
         self._awaited: tuple[int, NDArray[np.int64], Array] | None = None
         self._waited = 0
-        # The newest window, and stamps of the corrections that its grid, and one that is out of date, had undergone.
+        # The newest window, and stamps of the corrections that its grid,
+        # and one that is out of date, had undergone.
         self._window: GridPatch | None = None
         self._window_ns = 0
         self._stale_ns: int | None = None
@@ -62,7 +67,8 @@ class Rebuilding:
             return
         corrected_ns, stamps_ns, poses = self._awaited
         self._awaited = None
-        # Of a graph that began elsewhere nobody knows from where it was seen: nodes are looked for where they were.
+        # Of a graph that began elsewhere nobody knows from where it was seen: nodes are looked for
+        # where they were.
         before = after = poses
         if self._past is not None:
             before = self._past.poses()

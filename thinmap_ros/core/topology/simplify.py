@@ -1,4 +1,7 @@
-"""What may be simplified in a skeleton: close branches drawn together, the branches of noise dropped."""
+"""What may be simplified in a skeleton.
+
+Close branches drawn together, the branches of noise dropped.
+"""
 
 import math
 
@@ -27,7 +30,7 @@ from thinmap_ros.core.topology.net import (
     length_of,
     merge,
     state_of,
-)  # fmt: skip
+)
 from thinmap_ros.core.topology.spurs import Limits, Outlook, drop_spurs
 from thinmap_ros.core.topology.web import Web
 
@@ -36,7 +39,10 @@ Mask = NDArray[np.bool_]
 
 
 def simplify(web: Web, spots: set[int], outlook: Outlook, limits: Limits) -> None:
-    """Round some spots of a web: draw close branches together, drop those of noise, join what then needs no node."""
+    """Round some spots of a web.
+
+    Draw close branches together, drop those of noise, join what then needs no node.
+    """
     change(web, spots, lambda net, chosen: simplify_net(net, chosen, outlook, limits))
 
 
@@ -56,7 +62,10 @@ def simplify_net(net: Net, chosen: Mask, outlook: Outlook, limits: Limits) -> No
 
 @kernel
 def _merge_close(net: Net, chosen: Mask, limit: float) -> None:
-    """Make one branch of two that are joined by a short chain, shortest first; the roomier place stays."""
+    """Make one branch of two that are joined by a short chain, shortest first.
+
+    The roomier place stays.
+    """
     numbers = np.empty(chain_count(net), dtype=np.int64)
     lengths = np.empty(numbers.size)
     count = 0
@@ -78,8 +87,9 @@ def _merge_close(net: Net, chosen: Mask, limit: float) -> None:
 def _drop_hollow(net: Net, chosen: Mask, radius: float) -> None:
     """Drop what closes a ring round nothing; of chains side by side the shortest stays.
 
-    A ring keeps the robot's radius from what it goes round, so it encloses a disc of that radius at least. What
-    encloses less is left over from sewing and from drawing branches together: a way there and back, or one way twice.
+    A ring keeps the robot's radius from what it goes round, so it encloses a disc of that radius at
+    least. What encloses less is left over from sewing and from drawing branches together: a way
+    there and back, or one way twice.
     """
     # Cells lie up to half a cell beside the true ring; round a single cell goes a ring of area 2.
     least = max(math.pi * (radius - 0.5) ** 2, 1.0)
@@ -96,7 +106,10 @@ def _drop_hollow(net: Net, chosen: Mask, radius: float) -> None:
 
 @kernel
 def _side_by_side(net: Net, spot: int, other: int, found: Cells) -> int:
-    """Write down the numbers of the chains between two spots, in order, each once; returns how many."""
+    """Write down the numbers of the chains between two spots, in order, each once.
+
+    Returns how many.
+    """
     count, end = 0, net.hooks[spot, 0]
     while end != NONE:
         number = end // 2
@@ -109,7 +122,10 @@ def _side_by_side(net: Net, spot: int, other: int, found: Cells) -> int:
 
 @kernel
 def _drop_narrow(net: Net, numbers: Cells, least: float) -> None:
-    """Of chains (N,) between the same two spots, shortest first, drop each that encloses too little with one kept."""
+    """Drop chains (N,), shortest first, that enclose too little with one that is kept.
+
+    All of them lie between the same two spots.
+    """
     lengths = np.array([length_of(net, number) for number in numbers])
     twice = np.array([_twice_area(net, number) for number in numbers])
     kept = np.empty(numbers.size, dtype=np.int64)
@@ -129,7 +145,10 @@ def _drop_narrow(net: Net, numbers: Cells, least: float) -> None:
 
 @kernel
 def _twice_area(net: Net, number: int) -> int:
-    """Twice the area, in cells, that a chain sweeps as seen from the lattice's first cell: Gauss's shoelace formula."""
+    """Twice the area, in cells, that a chain sweeps as seen from the lattice's first cell.
+
+    Gauss's shoelace formula.
+    """
     twice, start = 0, net.chains[number, START]
     for k in range(start, start + net.chains[number, COUNT] - 1):
         twice += net.cells[k, 0] * net.cells[k + 1, 1] - net.cells[k, 1] * net.cells[k + 1, 0]
@@ -138,11 +157,13 @@ def _twice_area(net: Net, number: int) -> int:
 
 @kernel
 def _move_rings(net: Net, chosen: Mask) -> None:
-    """Put the one node of each ring at the ring's cell that is farthest from its middle, wherever tracing began."""
+    """Put the one node of each ring at its cell farthest from its middle, however it was traced."""
     for number in range(chain_count(net)):
         if state_of(net) != DONE or not is_among(net, number, chosen):
             continue
-        spot, start, count = net.chains[number, A], net.chains[number, START], net.chains[number, COUNT]
+        spot = net.chains[number, A]
+        start = net.chains[number, START]
+        count = net.chains[number, COUNT]
         if spot != net.chains[number, B] or net.spots[spot, DEGREE] != 2 or not fits(net, count):
             continue
         first = _farthest_out(net.cells[start : start + count])
@@ -155,9 +176,10 @@ def _move_rings(net: Net, chosen: Mask) -> None:
 
 @kernel
 def _farthest_out(ring: Cells) -> int:
-    """Index of the cell of a ring (K, 3), its last the same as its first, farthest from its middle, or nearly so.
+    """Index of the cell of a ring (K, 3) that is farthest from its middle, or nearly so.
 
-    Of all that are as far within two cells the first in reading order, so that it does not jump.
+    The ring's last cell is the same as its first. Of all that are as far within two cells the first
+    in reading order, so that it does not jump.
     """
     middle_row = (ring[:, 0].min() + ring[:, 0].max()) / 2.0
     middle_col = (ring[:, 1].min() + ring[:, 1].max()) / 2.0
@@ -166,7 +188,9 @@ def _farthest_out(ring: Cells) -> int:
     for k in range(distance.size):
         if distance[k] < limit:
             continue
-        earlier = ring[k, 0] < ring[best, 0] or (ring[k, 0] == ring[best, 0] and ring[k, 1] < ring[best, 1])
+        earlier = ring[k, 0] < ring[best, 0] or (
+            ring[k, 0] == ring[best, 0] and ring[k, 1] < ring[best, 1]
+        )
         if best == NONE or earlier:
             best = k
     return best

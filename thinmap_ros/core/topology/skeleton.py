@@ -10,7 +10,12 @@ from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.corners import corner_indices
-from thinmap_ros.core.topology.free_space import column_distance, known_free, squared_clearance, true_cells
+from thinmap_ros.core.topology.free_space import (
+    column_distance,
+    known_free,
+    squared_clearance,
+    true_cells,
+)
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.core.topology.net import DONE, Net, net_of, state_of, web_of_net
 from thinmap_ros.core.topology.parts import reachable
@@ -28,9 +33,9 @@ Measure = Callable[[Cells], Cells]
 def extract(free_cells: Mask, patch: GridPatch, config: TopologyConfig) -> TopologicalMap:
     """Topological map of the free space of a patch.
 
-    free_cells (H, W) bool: where the robot can stand (`select_free_space`). Ids count from 1: nodes, then edges.
-    A part of the free space that thinning erases whole keeps one node, at its roomiest cell.
-    Source: exploration paper section 2.2.
+    free_cells (H, W) bool: where the robot can stand (`select_free_space`). Ids count from 1:
+    nodes, then edges. A part of the free space that thinning erases whole keeps one node, at its
+    roomiest cell. Source: exploration paper section 2.2.
     """
     known = known_free(patch, config)
     distance = column_distance(known)
@@ -44,7 +49,10 @@ def extract(free_cells: Mask, patch: GridPatch, config: TopologyConfig) -> Topol
 
 
 def skeleton_of(free_cells: Mask, distance: NDArray[np.int16]) -> Mask:
-    """Thinned free cells; each part that thinning erases whole (2 x 2 blobs and what shrinks to one) keeps a cell."""
+    """Thinned free cells.
+
+    Each part that thinning erases whole (2 x 2 blobs and what shrinks to one) keeps a cell.
+    """
     skeleton = thin(free_cells)
     lost = free_cells & ~reachable(free_cells, true_cells(skeleton))
     while lost.any():
@@ -58,7 +66,8 @@ def skeleton_of(free_cells: Mask, distance: NDArray[np.int16]) -> Mask:
 def net_along(skeleton: Mask, measure: Measure, pinned: Mask | None = None, room: int = 1) -> Net:
     """Spots and chains of a skeleton (H, W).
 
-    measure: squared clearances of cells (N, 2); pinned (H, W): cells that become spots; room: from `net_of`.
+    measure: squared clearances of cells (N, 2); pinned (H, W): cells that become spots; room: from
+    `net_of`.
     """
     nodes, ends, starts, path = trace(skeleton, pinned)
     cells = np.concatenate([nodes, path])
@@ -83,7 +92,11 @@ def map_of(web: Web, frame: GridFrame, config: TopologyConfig) -> TopologicalMap
     radius = config.robot_radius_m / frame.resolution
     numbers = {spot: number for number, spot in enumerate(web.spots, 1)}
     for spot, number in numbers.items():
-        result.put_node(node_of(number, kind_of(web, spot), web.spots[spot].cell, web.spots[spot].squared, frame))
+        result.put_node(
+            node_of(
+                number, kind_of(web, spot), web.spots[spot].cell, web.spots[spot].squared, frame
+            )
+        )
     pieces: list[tuple[Chain, int, int, int, int]] = []
     for chain in web.chains.values():
         breaks = corner_indices(chain.cells, room_along(chain, radius)).tolist()
@@ -91,24 +104,33 @@ def map_of(web: Web, frame: GridFrame, config: TopologyConfig) -> TopologicalMap
         for index in breaks:
             ids.append(len(result.nodes) + 1)
             row, col = chain.cells[index].tolist()
-            result.put_node(node_of(ids[-1], NodeKind.CORNER, (row, col), int(chain.squared[index]), frame))
+            result.put_node(
+                node_of(ids[-1], NodeKind.CORNER, (row, col), int(chain.squared[index]), frame)
+            )
         ids.append(numbers[chain.b])
         stops = [0, *breaks, len(chain.cells) - 1]
-        pieces += [(chain, *part) for part in zip(stops[:-1], stops[1:], ids[:-1], ids[1:], strict=True)]
+        pieces += [
+            (chain, *part) for part in zip(stops[:-1], stops[1:], ids[:-1], ids[1:], strict=True)
+        ]
     for number, (chain, first, last, a, b) in enumerate(pieces, len(result.nodes) + 1):
         result.put_edge(edge_of(number, a, b, chain.part(first, last), frame))
     return result
 
 
 def kind_of(web: Web, spot: int) -> NodeKind:
-    """End with one chain or none, branch with three or more; the one spot of a ring is a corner of it."""
+    """End with one chain or none, branch with three or more.
+
+    The one spot of a ring is a corner of it.
+    """
     degree = web.degree(spot)
     if degree < 2:
         return NodeKind.END
     return NodeKind.CORNER if degree == 2 else NodeKind.BRANCH
 
 
-def node_of(number: int, kind: NodeKind, cell: tuple[int, int], squared: int, frame: GridFrame) -> Node:
+def node_of(
+    number: int, kind: NodeKind, cell: tuple[int, int], squared: int, frame: GridFrame
+) -> Node:
     """Node at the centre of a cell."""
     x = frame.origin_x + (cell[1] + 0.5) * frame.resolution
     y = frame.origin_y + (cell[0] + 0.5) * frame.resolution
@@ -118,4 +140,6 @@ def node_of(number: int, kind: NodeKind, cell: tuple[int, int], squared: int, fr
 def edge_of(number: int, a: int, b: int, piece: Chain, frame: GridFrame) -> Edge:
     """Edge from node a to node b along a piece of chain."""
     clearance = math.sqrt(int(piece.squared.min())) * frame.resolution
-    return Edge(number, a, b, frame.centres_of(piece.cells), piece.length * frame.resolution, clearance)
+    return Edge(
+        number, a, b, frame.centres_of(piece.cells), piece.length * frame.resolution, clearance
+    )

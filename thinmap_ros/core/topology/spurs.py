@@ -25,7 +25,7 @@ from thinmap_ros.core.topology.net import (
     is_among,
     length_of,
     whole,
-)  # fmt: skip
+)
 
 Cells = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -49,7 +49,10 @@ class Limits(NamedTuple):
 
 
 class Outlook(NamedTuple):
-    """Where the known borders on the unknown: cells (H, W), the first of which lies at (row, col)."""
+    """Where the known borders on the unknown.
+
+    Cells (H, W), the first of which lies at (row, col).
+    """
 
     rim: Mask
     row: int
@@ -57,7 +60,10 @@ class Outlook(NamedTuple):
 
     @staticmethod
     def of(known: Mask, occupied: Mask, rim_is_unknown: bool) -> 'Outlook':
-        """Outlook over free and occupied cells (H, W); rim_is_unknown: what lies outside the array."""
+        """Outlook over free and occupied cells (H, W).
+
+        rim_is_unknown: what lies outside the array.
+        """
         return Outlook(_frontier(known, occupied, rim_is_unknown), 0, 0)
 
     def at(self, row: int, col: int) -> 'Outlook':
@@ -86,11 +92,12 @@ def _frontier(known: Mask, occupied: Mask, rim_is_unknown: bool) -> Mask:
 def drop_spurs(net: Net, chosen: Mask, outlook: Outlook, limits: Limits) -> bool:
     """One round of pruning; whether anything was dropped.
 
-    A spur is a chain with one free end. What it adds to the place where it begins is the length by which the space
-    round its tip reaches beyond the space round its base: length + room(tip) - room(base), room being clearance less
-    robot radius. Up to spur_m that is noise; and where the tip looks at known walls only, up to spur_ratio of the
-    base's room too (a right-angled corner of a room adds 0.41 of it). So is one that lies in the room round other
-    chains from its base altogether: what is left where an old piece of skeleton runs beside a new one. All spurs of a
+    A spur is a chain with one free end. What it adds to the place where it begins is the length by
+    which the space round its tip reaches beyond the space round its base: length + room(tip) -
+    room(base), room being clearance less robot radius. Up to spur_m that is noise; and where the
+    tip looks at known walls only, up to spur_ratio of the base's room too (a right-angled corner of
+    a room adds 0.41 of it). So is one that lies in the room round other chains from its base
+    altogether: what is left where an old piece of skeleton runs beside a new one. All spurs of a
     round go together, so that the two corners at the end of a corridor leave its middle as the end.
     """
     gone = np.empty(chain_count(net), dtype=np.int64)
@@ -126,7 +133,9 @@ def _tip(net: Net, number: int) -> int:
 
 
 @kernel
-def _adds_little(net: Net, number: int, tip: int, base: int, outlook: Outlook, limits: Limits) -> bool:
+def _adds_little(
+    net: Net, number: int, tip: int, base: int, outlook: Outlook, limits: Limits
+) -> bool:
     """Whether a spur brings the robot hardly any farther than its base does."""
     tip_room = math.sqrt(net.spots[tip, SQUARED]) - limits.radius
     base_room = math.sqrt(net.spots[base, SQUARED]) - limits.radius
@@ -138,7 +147,9 @@ def _adds_little(net: Net, number: int, tip: int, base: int, outlook: Outlook, l
 
 @kernel
 def _looks_out(outlook: Outlook, spot: Cells) -> bool:
-    """Whether the free space round a spot borders on the unknown: its clearance ends there and not at an obstacle.
+    """Whether the free space round a spot borders on the unknown.
+
+    Its clearance ends there and not at an obstacle.
 
     Nobody knows that of a spot outside the cells: it may.
     """
@@ -156,7 +167,7 @@ def _looks_out(outlook: Outlook, spot: Cells) -> bool:
 
 @kernel
 def _adds_nothing(net: Net, number: int, base: int, radius: float) -> bool:
-    """Whether a spur lies in the room round other chains, those at its base and at the next spots, altogether."""
+    """Whether a spur lies wholly in the room round other chains at its base and the next spots."""
     others = _others_near(net, number, base)
     start, count = net.chains[number, START], net.chains[number, COUNT]
     # From the tip on: that is where most spurs stand out.
@@ -169,7 +180,10 @@ def _adds_nothing(net: Net, number: int, base: int, radius: float) -> bool:
 
 @kernel
 def _others_near(net: Net, number: int, base: int) -> Cells:
-    """Numbers (N,) of the chains at a spot and at the next ones, but for one; none where not all are known."""
+    """Numbers (N,) of the chains at a spot and at the next ones, but for one.
+
+    None where not all are known.
+    """
     found = np.empty(chain_count(net), dtype=np.int64)
     taken = np.zeros(found.size, dtype=np.bool_)
     taken[number] = True

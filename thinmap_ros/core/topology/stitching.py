@@ -22,8 +22,9 @@ _TRIES = 40  # nearest skeleton cells that an anchor looks at
 class Seam:
     """The surroundings of the window, all on one array of cells.
 
-    new (H, W): skeleton of all that is free; old (H, W): the known skeleton; window (H, W): where the new one takes
-    the old one's place; free (H, W): the robot can stand there; robot: its cell, (1, 2), or none, (0, 2).
+    new (H, W): skeleton of all that is free; old (H, W): the known skeleton; window (H, W): where
+    the new one takes the old one's place; free (H, W): the robot can stand there; robot: its cell,
+    (1, 2), or none, (0, 2).
     """
 
     new: Mask
@@ -34,14 +35,18 @@ class Seam:
 
 
 def stitch(seam: Seam, joined_outside: Grouping) -> Mask:
-    """The skeleton (H, W) that results: new in the window, old round it, joined over the window's rim.
+    """The skeleton (H, W) that results.
 
-    An old cell cut off at the rim needs nothing where a new one is beside it: that is how it is where nothing has
-    changed. From another one a straight line goes to the nearest new cell that it sees over free cells. Then parts
-    that are joined neither by the skeleton nor outside, but by free cells, are joined by the shortest way over these.
-    Loops round nothing but free cells, which all this may leave, are drawn together to one line. A new part that the
-    robot cannot reach within the surroundings, and that hangs on nothing old, is left out: it is only the corner of
-    another place. joined_outside: says which numbered parts hang together outside, asked only where it matters.
+    New in the window, old round it, joined over the window's rim.
+
+    An old cell cut off at the rim needs nothing where a new one is beside it: that is how it is
+    where nothing has changed. From another one a straight line goes to the nearest new cell that it
+    sees over free cells. Then parts that are joined neither by the skeleton nor outside, but by
+    free cells, are joined by the shortest way over these. Loops round nothing but free cells, which
+    all this may leave, are drawn together to one line. A new part that the robot cannot reach
+    within the surroundings, and that hangs on nothing old, is left out: it is only the corner of
+    another place. joined_outside: says which numbered parts hang together outside, asked only where
+    it matters.
     """
     drawn, kept = seam.new & seam.window, seam.old & ~seam.window
     result = drawn | kept
@@ -111,16 +116,24 @@ def _bridge_parts(
 
 @kernel
 def _keep_held(
-    result: Mask, parts: NDArray[np.int32], count: int, kept: Mask, free_parts: NDArray[np.int32], robot: int
+    result: Mask,
+    parts: NDArray[np.int32],
+    count: int,
+    kept: Mask,
+    free_parts: NDArray[np.int32],
+    robot: int,
 ) -> None:
-    """Clear, in place, those of the `count` - 1 parts of the result without a kept cell or one in the robot's part.
+    """Clear, in place, parts of the result without a kept cell or one in the robot's part.
 
-    robot: the number of the part of the free space in which it is; 0: in none.
+    count: parts plus one. robot: the number of the part of the free space in which it is; 0: in
+    none.
     """
     held = np.zeros(count, dtype=np.bool_)
     for row in range(result.shape[0]):
         for col in range(result.shape[1]):
-            if result[row, col] and (kept[row, col] or (robot > 0 and free_parts[row, col] == robot)):
+            if result[row, col] and (
+                kept[row, col] or (robot > 0 and free_parts[row, col] == robot)
+            ):
                 held[parts[row, col]] = True
     for row in range(result.shape[0]):
         for col in range(result.shape[1]):
@@ -128,7 +141,7 @@ def _keep_held(
 
 
 def _draw_line(result: Mask, free: Mask, anchor: Cells, targets: Cells) -> None:
-    """Draw a straight line of cells from an old cell to the nearest target, if it sees a near one."""
+    """Draw a straight line of cells from an old cell to the nearest target, if it sees one near."""
     squared = ((targets - anchor) ** 2).sum(axis=1)
     for target in targets[np.argsort(squared, kind='stable')[:_TRIES]]:
         if line_is_clear(free, *anchor.tolist(), *target.tolist()):
@@ -141,7 +154,10 @@ def _draw_line(result: Mask, free: Mask, anchor: Cells, targets: Cells) -> None:
 
 @kernel
 def _draw_way(result: Mask, free: Mask, owner: Cells, source: int) -> int:
-    """Draw the shortest way over free cells from one owner's cells to any other's; returns whom it reached."""
+    """Draw the shortest way over free cells from one owner's cells to any other's.
+
+    Returns whom it reached.
+    """
     rows, cols = free.shape
     before = np.full(free.size, -1, dtype=np.int64)
     queue = np.empty(free.size, dtype=np.int64)
@@ -169,7 +185,9 @@ def _draw_way(result: Mask, free: Mask, owner: Cells, source: int) -> int:
 
 @kernel
 def euler_number(cells: Mask) -> int:
-    """Parts (joined over edges and corners) less holes, counted from 2 x 2 blocks: no search needed.
+    """Parts (joined over edges and corners) less holes, counted from 2 x 2 blocks.
+
+    No search needed.
 
     Source: Gray, "Local properties of binary images in two dimensions", 1971.
     """
@@ -192,7 +210,10 @@ def euler_number(cells: Mask) -> int:
 
 
 def _fill_empty_loops(skeleton: Mask, free: Mask) -> bool:
-    """Fill, in place, what lies within loops of a skeleton where all of it is free; returns whether there are any."""
+    """Fill, in place, what lies within loops of a skeleton where all of it is free.
+
+    Returns whether there are any.
+    """
     framed = np.zeros((skeleton.shape[0] + 2, skeleton.shape[1] + 2), dtype=np.bool_)
     framed[1:-1, 1:-1] = free & ~skeleton
     solid = np.ones_like(framed)
@@ -205,7 +226,10 @@ def _fill_empty_loops(skeleton: Mask, free: Mask) -> bool:
 
 @kernel
 def _drain(left: Mask, solid: Mask) -> None:
-    """Clear, in place, the true cells that are joined to a solid one over edges; the border is solid and not left."""
+    """Clear, in place, the true cells that are joined to a solid one over edges.
+
+    The border is solid and not left.
+    """
     cols = left.shape[1]
     flat, walls = left.ravel(), solid.ravel()
     steps = np.array([-cols, -1, 1, cols], dtype=np.int64)

@@ -1,4 +1,7 @@
-"""The robot's working memory: the last windows of the grid, on one lattice, in a square that moves along."""
+"""The robot's working memory.
+
+The last windows of the grid, on one lattice, in a square that moves along.
+"""
 
 from collections.abc import Mapping
 from typing import Any
@@ -31,14 +34,17 @@ _OFF_LATTICE = 1e-3  # of a cell: windows that lie worse than this do not belong
 
 
 class Surroundings:
-    """What the windows of the last places showed, within memory_m round the newest one: bounded, whatever the map.
+    """What the windows of the last places showed, within memory_m round the newest one.
 
-    Thinning near the rim of a window differs from thinning the whole map. With what lies round the window at hand,
-    context_m wide, the skeleton goes on over its rim as it would in a map of the whole. The cells are kept in a square
-    array whose indices wrap round, so that nothing is moved when the robot moves.
+    Bounded, whatever the map.
 
-    `near` is the near part of the window, `inner` that part or all of it, whichever is to be thinned now, and `box`
-    the same with its context.
+    Thinning near the rim of a window differs from thinning the whole map. With what lies round the
+    window at hand, context_m wide, the skeleton goes on over its rim as it would in a map of the
+    whole. The cells are kept in a square array whose indices wrap round, so that nothing is moved
+    when the robot moves.
+
+    `near` is the near part of the window, `inner` that part or all of it, whichever is to be
+    thinned now, and `box` the same with its context.
     """
 
     def __init__(self, lattice: GridFrame, window: tuple[int, int], config: TopologyConfig) -> None:
@@ -56,9 +62,10 @@ class Surroundings:
         self._cells: States = np.full((1, 1), _NEVER, dtype=np.int8)
 
     def take(self, window: GridPatch, wide: bool) -> None:
-        """Move to a new window and take its cells over; wide: all of it is to be thinned, not the near part only.
+        """Move to a new window and take its cells over.
 
-        Raises InputError where its cells do not lie on those of the first window, or it is larger than that one was.
+        wide: all of it is to be thinned, not the near part only. Raises InputError where its cells
+        do not lie on those of the first window, or it is larger than that one was.
         """
         row, col = self._place_of(window.frame)
         whole = Box(row, col, *window.shape)
@@ -118,13 +125,15 @@ class Surroundings:
 
     def _parts(self, box: Box) -> list[tuple[tuple[slice, slice], tuple[slice, slice]]]:
         """The up to four blocks of a rectangle: where they lie in it, and where in the memory."""
-        rows, cols = _wrapped(box.row, box.rows, self._size), _wrapped(box.col, box.cols, self._size)
+        rows = _wrapped(box.row, box.rows, self._size)
+        cols = _wrapped(box.col, box.cols, self._size)
         return [((r, c), (at_r, at_c)) for r, at_r in rows for c, at_c in cols]
 
     def redrawn(self, painted: Mask) -> Mask:
-        """Where the new skeleton takes the old one's place: the inner part, away from places known but not remembered.
+        """Where the new skeleton takes the old one's place.
 
-        painted (H, W): from `patch`. There the new skeleton rests on the outline of the old one only.
+        This is the inner part, away from places known but not remembered. painted (H, W): from
+        `patch`. There the new skeleton rests on the outline of the old one only.
         """
         result = np.zeros_like(painted)
         result[self.inner.within(self.box)] = True
@@ -133,11 +142,13 @@ class Surroundings:
         return result
 
     def patch(self, skeleton: Cells, squared: Cells) -> tuple[GridPatch, Mask]:
-        """The remembered cells; where nothing is, what the known skeleton says; and a mask (H, W) of the latter.
+        """The remembered cells; where nothing is, what the known skeleton says.
 
-        skeleton (N, 2): lattice cells in the box; squared (N,): their squared clearances. All within a cell's
-        clearance is free, so the map itself keeps the outline of the places whose cells have been forgotten. Every
-        other cell is enough for that.
+        Also a mask (H, W) of the latter.
+
+        skeleton (N, 2): lattice cells in the box; squared (N,): their squared clearances. All
+        within a cell's clearance is free, so the map itself keeps the outline of the places whose
+        cells have been forgotten. Every other cell is enough for that.
         """
         cells = self._cells.copy()
         painted = _paint(cells, (skeleton - (self.box.row, self.box.col))[::2], squared[::2])
@@ -146,12 +157,16 @@ class Surroundings:
 
     def _place_of(self, frame: GridFrame) -> tuple[int, int]:
         if frame.resolution != self.lattice.resolution:
-            raise InputError(f'window with {frame.resolution} m a cell: expected {self.lattice.resolution} m')
+            raise InputError(
+                f'window with {frame.resolution} m a cell: expected {self.lattice.resolution} m'
+            )
         row = (frame.origin_y - self.lattice.origin_y) / frame.resolution
         col = (frame.origin_x - self.lattice.origin_x) / frame.resolution
         if abs(row - round(row)) > _OFF_LATTICE or abs(col - round(col)) > _OFF_LATTICE:
             origin = (frame.origin_x, frame.origin_y)
-            raise InputError(f'window at {origin}: expected whole cells from the first window of the map')
+            raise InputError(
+                f'window at {origin}: expected whole cells from the first window of the map'
+            )
         return round(row), round(col)
 
 
@@ -161,7 +176,10 @@ def _reach(config: TopologyConfig, resolution: float) -> int:
 
 
 def _wrapped(first: int, count: int, size: int) -> list[tuple[slice, slice]]:
-    """The one or two runs of `count` indices from `first` on in a ring of `size`: in the run, and in the ring."""
+    """The one or two runs of `count` indices from `first` on in a ring of `size`.
+
+    Each as slices in the run, and in the ring.
+    """
     at = first % size
     head = min(count, size - at)
     runs = [(slice(0, head), slice(at, at + head))]
@@ -182,7 +200,10 @@ def _states(cells: States) -> States:
 
 @kernel
 def _paint(cells: States, centres: Cells, squared: Cells) -> Mask:
-    """Mark as free all cells never seen that lie nearer to one of the centres (N, 2) than its clearance; say which."""
+    """Mark as free all cells never seen that lie nearer to a centre (N, 2) than its clearance.
+
+    Returns which.
+    """
     rows, cols = cells.shape
     painted = np.zeros((rows, cols), dtype=np.bool_)
     gaps = np.zeros(((rows >> _BLOCK) + 1, (cols >> _BLOCK) + 1), dtype=np.bool_)
@@ -193,7 +214,9 @@ def _paint(cells: States, centres: Cells, squared: Cells) -> Mask:
         row, col = centres[i, 0], centres[i, 1]
         reach = int(np.sqrt(squared[i]))
         low_row, low_col = max(row - reach, 0) >> _BLOCK, max(col - reach, 0) >> _BLOCK
-        if not np.any(gaps[low_row : (row + reach >> _BLOCK) + 1, low_col : (col + reach >> _BLOCK) + 1]):
+        if not np.any(
+            gaps[low_row : (row + reach >> _BLOCK) + 1, low_col : (col + reach >> _BLOCK) + 1]
+        ):
             continue
         for r in range(max(row - reach, 0), min(row + reach + 1, rows)):
             for c in range(max(col - reach, 0), min(col + reach + 1, cols)):

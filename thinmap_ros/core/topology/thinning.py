@@ -17,9 +17,11 @@ _TOP, _ANY, _BOTTOM = 0, 1, 2  # where in a band: in its first row, in any, in i
 def thin(free: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Skeleton of the free cells: the cells that Zhang and Suen's two sub-iterations leave.
 
-    free (H, W) bool; returns (H, W) bool, the input is not touched. Cells outside the array count as not free. All
-    deletions of a sub-iteration happen at once; the two alternate until neither deletes a cell.
-    Source: topological map paper section 2.1, steps 1 and 2 (S(p1) counted cyclically, p2 p3 ... p9 p2).
+    free (H, W) bool; returns (H, W) bool, the input is not touched. Cells outside the array count
+    as not free. All deletions of a sub-iteration happen at once; the two alternate until neither
+    deletes a cell.
+    Source: topological map paper section 2.1, steps 1 and 2 (S(p1) counted cyclically, p2 p3 ... p9
+    p2).
     """
     words, stride = _pack(np.ascontiguousarray(free, dtype=np.bool_))
     _thin_words(words, stride)
@@ -29,7 +31,8 @@ def thin(free: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _pack(free: NDArray[np.bool_]) -> tuple[Words, int]:
     """Rows as words inside a border of empty ones, one after the other; and the words of a row.
 
-    Bit i of word w is column 64 w + i. Some more empty words follow, so that whole lanes may be read at the end.
+    Bit i of word w is column 64 w + i. Some more empty words follow, so that whole lanes may be
+    read at the end.
     """
     rows, cols = free.shape
     count = -(-cols // _WORD)
@@ -48,10 +51,15 @@ def _unpack(words: Words, stride: int, shape: tuple[int, ...]) -> NDArray[np.boo
 
 
 @inlined
-def _find(words: Words, first: Index, count: Index, stride: Index, north: bool, deleted: Words) -> None:
-    """Bits that a sub-iteration deletes in some words of a row: conditions (a) to (d) for 64 cells at once.
+def _find(
+    words: Words, first: Index, count: Index, stride: Index, north: bool, deleted: Words
+) -> None:
+    """Bits that a sub-iteration deletes in some words of a row.
 
-    north: the first sub-iteration, which keeps what (c) and (d) say of p2 p4 p6 and p4 p6 p8; else the second.
+    Conditions (a) to (d) for 64 cells at once.
+
+    north: the first sub-iteration, which keeps what (c) and (d) say of p2 p4 p6 and p4 p6 p8; else
+    the second.
     """
     one, top, step = np.uint64(1), np.uint64(63), Index(1)
     for k in range(count):
@@ -68,8 +76,9 @@ def _find(words: Words, first: Index, count: Index, stride: Index, north: bool, 
         for rise in (~p3 & p4, ~p4 & p5, ~p5 & p6, ~p6 & p7, ~p7 & p8, ~p8 & p9, ~p9 & p2):
             many |= some & rise
             some |= rise
-        # Where S = 1 the neighbours are one run of ones and one of zeros. 2 <= N <= 6 says that both are longer than
-        # 1, which is to say that in each there is a neighbour over an edge and one over a corner.
+        # Where S = 1 the neighbours are one run of ones and one of zeros. 2 <= N <= 6 says that
+        # both are longer than 1, which is to say that in each there is a neighbour over an edge and
+        # one over a corner.
         pair = (p2 | p4 | p6 | p8) & (p3 | p5 | p7 | p9)
         gap = ~((p2 & p4 & p6 & p8) | (p3 & p5 & p7 & p9))
         kept = p4 & p6 & (p2 | p8) if north else p2 & p8 & (p4 | p6)
@@ -80,16 +89,19 @@ def _find(words: Words, first: Index, count: Index, stride: Index, north: bool, 
 def _thin_words(words: Words, stride: int) -> None:
     """Delete in place, `stride` words a row, until nothing changes.
 
-    A cell is looked at only when one beside it, or itself, changed in one of the last two sub-iterations: before that,
-    the same sub-iteration has already seen these very cells and left them. Rows are looked at in bands, from the first
-    to the last column of words with such a cell, so that the compiler can treat several words at a time.
+    A cell is looked at only when one beside it, or itself, changed in one of the last two
+    sub-iterations: before that, the same sub-iteration has already seen these very cells and left
+    them. Rows are looked at in bands, from the first to the last column of words with such a cell,
+    so that the compiler can treat several words at a time.
     """
     rows = (words.size - _LANES) // stride - 2
     bands = -(-rows // _BAND)
     deleted = np.zeros(words.size, dtype=np.uint64)
-    # Of the last two sub-iterations: bands (from 1 on) that changed; first column of the changes there, and their end.
+    # Of the last two sub-iterations: bands (from 1 on) that changed;
+    # first column of the changes there, and their end.
     active, counts = np.empty((2, bands), dtype=np.int64), np.zeros(2, dtype=np.int64)
-    first, end = np.full((2, bands + 2, 3), stride, dtype=np.int64), np.zeros((2, bands + 2, 3), dtype=np.int64)
+    first = np.full((2, bands + 2, 3), stride, dtype=np.int64)
+    end = np.zeros((2, bands + 2, 3), dtype=np.int64)
     first[:, 1:-1], end[:, 1:-1] = 1, stride - 1
     active[:], counts[:] = np.arange(1, bands + 1), bands
     stamps, due = np.full(bands + 2, -1, dtype=np.int64), np.empty((bands, 3), dtype=np.int64)
@@ -118,7 +130,9 @@ def _thin_words(words: Words, stride: int) -> None:
         for i in range(total):
             band, low, high = due[i, 0], due[i, 1], due[i, 2]
             rim = (band - 1) * _BAND + 1, min(band * _BAND, rows)
-            _delete_band(words, deleted, stride, rim, (low, high), first[which, band], end[which, band])
+            _delete_band(
+                words, deleted, stride, rim, (low, high), first[which, band], end[which, band]
+            )
             active[which, counts[which]] = band
             counts[which] += end[which, band, _ANY] > 0
         turn += 1
@@ -126,11 +140,18 @@ def _thin_words(words: Words, stride: int) -> None:
 
 @inlined
 def _columns(first: Cells, end: Cells, band: int, stride: int) -> tuple[int, int]:
-    """First column of words, and the end of those, that changes touch in a band or in the rows next to it."""
+    """First column of words, and their end, that changes touch in a band or the rows next to it."""
     low, high = stride, 0
     for which in range(2):
-        low = min(low, first[which, band - 1, _BOTTOM], first[which, band, _ANY], first[which, band + 1, _TOP])
-        high = max(high, end[which, band - 1, _BOTTOM], end[which, band, _ANY], end[which, band + 1, _TOP])
+        low = min(
+            low,
+            first[which, band - 1, _BOTTOM],
+            first[which, band, _ANY],
+            first[which, band + 1, _TOP],
+        )
+        high = max(
+            high, end[which, band - 1, _BOTTOM], end[which, band, _ANY], end[which, band + 1, _TOP]
+        )
     return max(low - 1, 1), min(high + 1, stride - 1)
 
 
@@ -144,7 +165,10 @@ def _delete_band(
     first: Cells,
     end: Cells,
 ) -> None:
-    """Delete bits in some columns of a band, rows rim[0] to rim[1]; notes which columns change in `first` and `end`."""
+    """Delete bits in some columns of a band, rows rim[0] to rim[1].
+
+    Notes which columns change in `first` and `end`.
+    """
     for row in range(rim[0], rim[1] + 1):
         changed = _delete(words, deleted, row * stride, columns[0], columns[1])
         _widen(first, end, _ANY, changed)
@@ -156,7 +180,10 @@ def _delete_band(
 
 @inlined
 def _delete(words: Words, deleted: Words, row_start: int, low: int, high: int) -> tuple[int, int]:
-    """Delete bits in some columns of a row; returns the first column that changes, and the end of those."""
+    """Delete bits in some columns of a row.
+
+    Returns the first column that changes, and the end of those.
+    """
     while low < high and deleted[row_start + low] == 0:
         low += 1
     while low < high and deleted[row_start + high - 1] == 0:

@@ -16,15 +16,19 @@ def _ring(code: int) -> list[int]:
 
 
 def _crossings() -> NDArray[np.int64]:
-    """Rises 0 -> 1 round the eight neighbours (bit k: neighbour k, clockwise from north), for all 256 of them."""
+    """Rises 0 -> 1 round the eight neighbours, for all 256 of them.
+
+    Bit k: neighbour k, clockwise from north.
+    """
     rings = (_ring(code) for code in range(256))
     return np.array([sum(a < b for a, b in pairwise([*r, r[0]])) for r in rings], dtype=np.int64)
 
 
 def _redundant() -> NDArray[np.bool_]:
-    """Neighbourhoods whose centre can go: two or more neighbours that hang together, over edges or corners, without it.
+    """Neighbourhoods whose centre can go.
 
-    Yokoi's connectivity number for eight-joined cells counts the gaps that are closed by an edge neighbour.
+    That is two or more neighbours that hang together, over edges or corners, without it. Yokoi's
+    connectivity number for eight-joined cells counts the gaps that are closed by an edge neighbour.
     """
     table = np.zeros(256, dtype=np.bool_)
     for code in range(256):
@@ -41,26 +45,35 @@ _REDUNDANT = _redundant()
 @inlined
 def _code(raster: Raster, row: int, col: int) -> int:
     """The eight neighbours as bits, clockwise from north."""
-    code: np.int64 = np.int64(raster[row - 1, col] != 0) | (np.int64(raster[row - 1, col + 1] != 0) << 1)
-    code |= (np.int64(raster[row, col + 1] != 0) << 2) | (np.int64(raster[row + 1, col + 1] != 0) << 3)
-    code |= (np.int64(raster[row + 1, col] != 0) << 4) | (np.int64(raster[row + 1, col - 1] != 0) << 5)
-    code |= (np.int64(raster[row, col - 1] != 0) << 6) | (np.int64(raster[row - 1, col - 1] != 0) << 7)
+    code: np.int64 = np.int64(raster[row - 1, col] != 0)
+    code |= np.int64(raster[row - 1, col + 1] != 0) << 1
+    code |= np.int64(raster[row, col + 1] != 0) << 2
+    code |= np.int64(raster[row + 1, col + 1] != 0) << 3
+    code |= np.int64(raster[row + 1, col] != 0) << 4
+    code |= np.int64(raster[row + 1, col - 1] != 0) << 5
+    code |= np.int64(raster[row, col - 1] != 0) << 6
+    code |= np.int64(raster[row - 1, col - 1] != 0) << 7
     return int(code)
 
 
 @inlined
 def _steps(cols: int) -> Cells:
-    """Index steps to the eight neighbours; those over an edge come first, so that walks prefer them."""
+    """Index steps to the eight neighbours.
+
+    Those over an edge come first, so that walks prefer them.
+    """
     return np.array([-cols, 1, cols, -1, -cols + 1, cols + 1, cols - 1, -cols - 1], dtype=np.int64)
 
 
 @kernel
-def clean(raster: Raster, pinned: Raster, crossings: Cells, redundant: NDArray[np.bool_]) -> tuple[Raster, Cells]:
-    """Make a skeleton one cell wide, cell after cell, so that staircases are not taken for branches.
+def clean(
+    raster: Raster, pinned: Raster, crossings: Cells, redundant: NDArray[np.bool_]
+) -> tuple[Raster, Cells]:
+    """Make a skeleton one cell wide, cell by cell, so that staircases are not taken for branches.
 
-    raster, pinned (H, W) uint8 with an empty border; pinned cells stay. Returns, as rasters of the same shape:
-    0 empty, 1 passage (two neighbours), 2 junction (three or more), 3 end or lone cell, 4 pinned; and the list of
-    flat indices of all cells left.
+    raster, pinned (H, W) uint8 with an empty border; pinned cells stay. Returns, as rasters of the
+    same shape: 0 empty, 1 passage (two neighbours), 2 junction (three or more), 3 end or lone cell,
+    4 pinned; and the list of flat indices of all cells left.
     """
     cols = raster.shape[1]
     kinds = raster.copy()
@@ -90,12 +103,14 @@ def clean(raster: Raster, pinned: Raster, crossings: Cells, redundant: NDArray[n
 
 
 @kernel
-def place_nodes(kinds: Raster, cells: Cells, crossings: Cells) -> tuple[Cells, NDArray[np.int32], Cells]:
+def place_nodes(
+    kinds: Raster, cells: Cells, crossings: Cells
+) -> tuple[Cells, NDArray[np.int32], Cells]:
     """One node for each end, pinned cell and cluster of junction cells.
 
-    Returns the nodes' flat cell indices (N,); the node number + 1 of each of their cells, (H * W,); and for each
-    junction cell the next cell on its way to the node's own, (H * W,). A cluster's own cell has three or more
-    crossings, if any has, and is the nearest such to the cluster's middle.
+    Returns the nodes' flat cell indices (N,); the node number + 1 of each of their cells, (H * W,);
+    and for each junction cell the next cell on its way to the node's own, (H * W,). A cluster's own
+    cell has three or more crossings, if any has, and is the nearest such to the cluster's middle.
     """
     cols = kinds.shape[1]
     flat, steps = kinds.ravel(), _steps(cols)
@@ -139,16 +154,18 @@ def follow(
 ) -> tuple[Cells, Cells, Cells, Cells]:
     """Walk along all passages between nodes; a ring without node gets one.
 
-    Returns the nodes, longer by those of rings; the chains' end nodes (M, 2); where each chain starts in the flat
-    list of cells, (M + 1,); and that list, node cells included.
+    Returns the nodes, longer by those of rings; the chains' end nodes (M, 2); where each chain
+    starts in the flat list of cells, (M + 1,); and that list, node cells included.
     """
     cols = kinds.shape[1]
     flat, steps = kinds.ravel(), _steps(cols)
     walked = np.zeros(flat.size, dtype=np.bool_)
     all_nodes = np.empty(cells.size, dtype=np.int64)
     all_nodes[: nodes.size], count = nodes, nodes.size
-    ends, starts = np.empty((4 * cells.size + 1, 2), dtype=np.int64), np.zeros(4 * cells.size + 2, dtype=np.int64)
-    path, scratch = np.empty(8 * cells.size + 64, dtype=np.int64), np.empty(cells.size + 1, dtype=np.int64)
+    ends = np.empty((4 * cells.size + 1, 2), dtype=np.int64)
+    starts = np.zeros(4 * cells.size + 2, dtype=np.int64)
+    path = np.empty(8 * cells.size + 64, dtype=np.int64)
+    scratch = np.empty(cells.size + 1, dtype=np.int64)
     links, linked = np.empty((4 * cells.size + 1, 2), dtype=np.int64), 0
     chains = length = 0
     for ring in range(2):
@@ -163,8 +180,11 @@ def follow(
             for step in steps:
                 cell = start + step
                 passage = flat[cell] == 1 and not walked[cell] and not owner[cell]
-                # Nodes side by side are joined once: from the lower number, and by the first pair of cells found.
-                beside = owner[cell] > owner[start] and not _joined(links[:linked], owner[start], owner[cell])
+                # Nodes side by side are joined once: from the lower number, and by the first pair
+                # of cells found.
+                beside = owner[cell] > owner[start] and not _joined(
+                    links[:linked], owner[start], owner[cell]
+                )
                 if not passage and not beside:
                     continue
                 if beside:
@@ -193,7 +213,10 @@ def _through(
     path: Cells,
     length: int,
 ) -> tuple[int, int]:
-    """Walk from one cell to the next and on along a passage to a node, written into the path: where, and its length."""
+    """Walk from one cell to the next and on along a passage to a node, written into the path.
+
+    Returns where, and its length.
+    """
     before, cell = first
     while not owner[cell]:
         walked[cell] = True
@@ -202,7 +225,11 @@ def _through(
         following = -1
         for turn in steps:
             to = cell + turn
-            if flat[to] and to != before and (following < 0 or (owner[to] and not owner[following])):
+            if (
+                flat[to]
+                and to != before
+                and (following < 0 or (owner[to] and not owner[following]))
+            ):
                 following = to
         before, cell = cell, following
     return cell, length
@@ -234,12 +261,15 @@ def _way_to_node(parent: Cells, cell: int, path: Cells, length: int, scratch: Ce
     return length + size
 
 
-def trace(raster: NDArray[np.bool_], pinned: NDArray[np.bool_] | None = None) -> tuple[Cells, Cells, Cells, Cells]:
+def trace(
+    raster: NDArray[np.bool_], pinned: NDArray[np.bool_] | None = None
+) -> tuple[Cells, Cells, Cells, Cells]:
     """Nodes and chains of a skeleton.
 
-    raster, pinned (H, W) bool; pinned cells become nodes whatever is round them. Returns node cells (N, 2) as
-    (row, col), end nodes of each chain (M, 2), where each chain's cells start (M + 1,) in the list that comes last, and
-    that list (K, 2): from the one node's cell to the other's, chain after chain.
+    raster, pinned (H, W) bool; pinned cells become nodes whatever is round them. Returns node cells
+    (N, 2) as (row, col), end nodes of each chain (M, 2), where each chain's cells start (M + 1,) in
+    the list that comes last, and that list (K, 2): from the one node's cell to the other's, chain
+    after chain.
     """
     framed = np.zeros((raster.shape[0] + 2, raster.shape[1] + 2), dtype=np.uint8)
     framed[1:-1, 1:-1] = raster

@@ -29,7 +29,14 @@ from thinmap_ros.core.topology.identity import Registry
 from thinmap_ros.core.topology.net import dissolve_all, draw, web_of_net
 from thinmap_ros.core.topology.parts import label, reachable
 from thinmap_ros.core.topology.simplify import simplify
-from thinmap_ros.core.topology.skeleton import Measure, extract, map_of, net_along, simplified, skeleton_of
+from thinmap_ros.core.topology.skeleton import (
+    Measure,
+    extract,
+    map_of,
+    net_along,
+    simplified,
+    skeleton_of,
+)
 from thinmap_ros.core.topology.spurs import Limits, Outlook
 from thinmap_ros.core.topology.stitching import Seam, stitch
 from thinmap_ros.core.topology.surroundings import Surroundings
@@ -49,19 +56,22 @@ FIELDS = {
 }
 
 
-def build(patch: GridPatch, seed_xy: tuple[float, float] | None, config: TopologyConfig) -> TopologicalMap:
-    """Topological map of a whole grid: the part that a robot can reach from seed_xy (m, map frame), or all parts."""
+def build(
+    patch: GridPatch, seed_xy: tuple[float, float] | None, config: TopologyConfig
+) -> TopologicalMap:
+    """Topological map of a whole grid: what can be reached from seed_xy (m, map frame), or all."""
     return extract(select_free_space(patch, seed_xy, config), patch, config)
 
 
 class TopologyBuilder:
     """The global topological map, kept up to date by looking only at the surroundings of the robot.
 
-    At each scan the near part of the window is thinned, together with what is remembered round it, and every few
-    scans all of the window, so that what only the far ends of the beams change is drawn in too. Its part of the
-    global map is drawn anew from that: all that lay there is cut out, the new skeleton put in its place and joined to
-    the chains that go on outside, and nodes and edges are found again there as in a map of its own. So a node at a
-    window's rim is gone as soon as the window has moved on, and no grid of the whole is needed.
+    At each scan the near part of the window is thinned, together with what is remembered round it,
+    and every few scans all of the window, so that what only the far ends of the beams change is
+    drawn in too. Its part of the global map is drawn anew from that: all that lay there is cut out,
+    the new skeleton put in its place and joined to the chains that go on outside, and nodes and
+    edges are found again there as in a map of its own. So a node at a window's rim is gone as soon
+    as the window has moved on, and no grid of the whole is needed.
     Source: topological map paper section 2.2, Fig. 5 and 8.
     """
 
@@ -85,9 +95,10 @@ class TopologyBuilder:
         return None if self._surroundings is None else self._surroundings.lattice.resolution
 
     def update(self, window: GridPatch, T_map_base: Array) -> bool:
-        """Take in the window round the robot at pose T_map_base (3,); returns whether the map changed.
+        """Take in the window round the robot at T_map_base (3,); returns whether the map changed.
 
-        Windows must lie on the cells of one lattice. Raises InputError where they do not, or the pose is not finite.
+        Windows must lie on the cells of one lattice. Raises InputError where they do not, or the
+        pose is not finite.
         """
         self._view = self._take(window, T_map_base, wide=self._taken % _WIDE_EVERY == 0)
         self._taken += 1
@@ -95,21 +106,28 @@ class TopologyBuilder:
         return self._registry.refresh(self._atlas)
 
     def local_map(self) -> TopologicalMap:
-        """The map of what is near in the newest window, near_m wide, not merged with anything; ids from 1."""
+        """The map of what is near in the newest window, near_m wide, not merged; ids from 1."""
         view, around = self._view, self._surroundings
         if view is None or around is None:
             return TopologicalMap()
         low = np.array([around.near.row - around.box.row, around.near.col - around.box.col])
-        shown = net_along(view.skeleton[around.near.within(around.box)], lambda cells: view.measure(cells + low))
+        shown = net_along(
+            view.skeleton[around.near.within(around.box)], lambda cells: view.measure(cells + low)
+        )
         dissolve_all(shown, np.ones(len(shown.spots), dtype=np.bool_))
-        return map_of(web_of_net(shown), around.lattice.shifted(around.near.row, around.near.col), self.config)
+        return map_of(
+            web_of_net(shown), around.lattice.shifted(around.near.row, around.near.col), self.config
+        )
 
-    def rebuild(self, window_at: Callable[[float, float], GridPatch], before: Array, after: Array) -> None:
-        """Build the map anew after the robot's past poses (N, 3) were corrected, nodes carried along.
+    def rebuild(
+        self, window_at: Callable[[float, float], GridPatch], before: Array, after: Array
+    ) -> None:
+        """Build the map anew after past poses (N, 3) were corrected, nodes carried along.
 
-        before, after: the same poses as they were known and as they are known now; window_at: the window round a
-        point (x, y, m) of the grid as it has been drawn anew. A node keeps its id where the new map has a node at the
-        place to which the pose nearest to it took it. Edges between the same two nodes keep theirs.
+        before, after: the same poses as they were known and as they are known now; window_at: the
+        window round a point (x, y, m) of the grid as it has been drawn anew. A node keeps its id
+        where the new map has a node at the place to which the pose nearest to it took it. Edges
+        between the same two nodes keep theirs.
         """
         old = self._registry
         self._atlas, self._surroundings, self._registry = Atlas(), None, None
@@ -128,14 +146,19 @@ class TopologyBuilder:
             self._registry.skip(count)
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """All that the builder knows as arrays by name, empty before the first window; `from_state` goes on from it."""
+        """All that the builder knows as arrays by name, empty before the first window.
+
+        `from_state` goes on from it.
+        """
         if self._surroundings is None or self._registry is None:
             return {}
         own = {'taken': np.array(self._taken)}
         return own | self._surroundings.state() | self._atlas.state() | self._registry.state()
 
     @staticmethod
-    def from_state(state: Mapping[str, NDArray[Any]], config: TopologyConfig | None = None) -> 'TopologyBuilder':
+    def from_state(
+        state: Mapping[str, NDArray[Any]], config: TopologyConfig | None = None
+    ) -> 'TopologyBuilder':
         """Builder that goes on from the `state` of another one with the same configuration.
 
         Raises InputError where it is no such state.
@@ -177,7 +200,7 @@ class TopologyBuilder:
         simplify(self._atlas, touched, view.outlook.at(box.row, box.col), view.limits)
 
     def _places_to_redraw(self, cells: Cells, box: Box) -> list[Box]:
-        """Rectangles of the lattice that hold the cells (N, 2) of a box that changed, apart from each other."""
+        """Separate rectangles of the lattice that hold the cells (N, 2) of a box that changed."""
         blocks = cells // _APART
         coarse = np.zeros((box.rows // _APART + 1, box.cols // _APART + 1), dtype=np.bool_)
         coarse[blocks[:, 0], blocks[:, 1]] = True
@@ -191,7 +214,9 @@ class TopologyBuilder:
             while beside := [other for other in places if place.meets(other)]:
                 places = [other for other in places if other not in beside]
                 corners = [(other.row, other.col) for other in beside]
-                ends = [(other.row + other.rows - 1, other.col + other.cols - 1) for other in beside]
+                ends = [
+                    (other.row + other.rows - 1, other.col + other.cols - 1) for other in beside
+                ]
                 place = self._atlas.calm(place.around(np.array(corners + ends), 0, box), box)
             places.append(place)
         return places
@@ -203,7 +228,8 @@ class TopologyBuilder:
         """
         cut = self._atlas.cut_out(place)
         pinned = np.zeros(squared.shape, dtype=np.bool_)
-        anchors = np.array(list(cut.anchors), dtype=np.int64).reshape(-1, 2) - (place.row, place.col)
+        low = (place.row, place.col)
+        anchors = np.array(list(cut.anchors), dtype=np.int64).reshape(-1, 2) - low
         pinned[anchors[:, 0], anchors[:, 1]] = True
         net = net_along(squared > 0, lambda cells: squared[cells[:, 0], cells[:, 1]], pinned)
         return self._atlas.graft(net, place, cut.anchors) | cut.touched
@@ -220,7 +246,7 @@ def _raster(cells: Cells, values: Cells, rows: int, cols: int) -> Cells:
 
 @kernel
 def _agree(fresh: Cells, old: Cells, where: NDArray[np.bool_]) -> bool:
-    """Whether two arrays (H, W) are the same at some cells, and the first one is 0 at all others."""
+    """Whether two arrays (H, W) are the same at some cells, and the first is 0 at all others."""
     for row in range(fresh.shape[0]):
         for col in range(fresh.shape[1]):
             if fresh[row, col] != (old[row, col] if where[row, col] else 0):
@@ -230,11 +256,16 @@ def _agree(fresh: Cells, old: Cells, where: NDArray[np.bool_]) -> bool:
 
 @kernel
 def _put_together(
-    drawn: NDArray[np.bool_], where: NDArray[np.bool_], fresh: Cells, old: Cells, distance: NDArray[np.int16]
+    drawn: NDArray[np.bool_],
+    where: NDArray[np.bool_],
+    fresh: Cells,
+    old: Cells,
+    distance: NDArray[np.int16],
 ) -> tuple[Cells, Cells]:
-    """Squared clearances (H, W) of what is drawn, 0 elsewhere, and the cells (N, 2) where they are not the old ones.
+    """Squared clearances (H, W) of what is drawn, 0 elsewhere, and the cells (N, 2) that changed.
 
-    They are the fresh ones where these take the old ones' place, and measured anew at cells that were neither.
+    The clearances are the fresh ones where these take the old ones' place, and measured anew at
+    cells that were neither.
     """
     squared, changed = np.zeros_like(old), np.empty((old.size, 2), dtype=np.int64)
     cell, count = np.empty((1, 2), dtype=np.int64), 0
@@ -251,7 +282,7 @@ def _put_together(
 
 
 def _thinned_out(poses: Array) -> Array:
-    """Some of the poses (N, 3), in order: the first, each that lies _STRIDE_M from the last one taken, and the last."""
+    """Some of the poses (N, 3): the first, each _STRIDE_M from the last one taken, and the last."""
     taken = [0] if len(poses) else []
     for k in range(1, len(poses)):
         if k == len(poses) - 1 or np.hypot(*(poses[k, :2] - poses[taken[-1], :2])) >= _STRIDE_M:
@@ -264,13 +295,14 @@ def _carried_along(nodes: list[Node], before: Array, after: Array) -> list[Node]
     moved = []
     for node in nodes:
         k = int(((before[:, :2] - node.position) ** 2).sum(axis=1).argmin())
-        place = transform_points(after[k], transform_points(invert(before[k]), node.position[None]))[0]
+        seen = transform_points(invert(before[k]), node.position[None])
+        place = transform_points(after[k], seen)[0]
         moved.append(replace(node, x=float(place[0]), y=float(place[1])))
     return moved
 
 
 class _View:
-    """The surroundings thinned: free space, pruned skeleton and clearances, on the cells of their box."""
+    """The surroundings thinned: free space, pruned skeleton, clearances, on cells of their box."""
 
     def __init__(
         self,
@@ -295,6 +327,6 @@ class _View:
         self.skeleton = draw(net, *patch.shape)
 
     def fresh(self) -> Cells:
-        """Squared clearances (H, W) of the new skeleton where it is to take the old one's place, 0 elsewhere."""
+        """Squared clearances (H, W) of the new skeleton where it replaces the old, 0 elsewhere."""
         cells = true_cells(self.skeleton & self.redrawn)
         return _raster(cells, self.measure(cells), *self.skeleton.shape)

@@ -18,8 +18,8 @@ Mask = NDArray[np.bool_]
 class Chain:
     """A piece of skeleton between the spots a and b.
 
-    cells (K, 2): lattice cells (row, col) from a's to b's, each beside the next; squared (K,): squared clearance in
-    cells.
+    cells (K, 2): lattice cells (row, col) from a's to b's, each beside the next; squared (K,):
+    squared clearance in cells.
     """
 
     a: int

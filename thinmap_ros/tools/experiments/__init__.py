@@ -1,1 +1,4 @@
-"""The papers' experiments: one module each, with a function `run` that returns tables, figures and comparisons."""
+"""The papers' experiments.
+
+One module each, with a function `run` that returns tables, figures and comparisons.
+"""

@@ -1,10 +1,21 @@
-"""Paper 3, Fig. 7, 8, 11 and 12: a building floor by both filters; which features are used; errors with bounds."""
+"""Paper 3, Fig. 7, 8, 11, 12: a building floor by both filters; features used; error bounds."""
 
 from itertools import islice
 
 import numpy as np
 
-from thinmap_ros.adapters.plots import Band, Curve, GraphLayer, Layer, MapLayer, Panel, Plot, Robots, Segments, xy
+from thinmap_ros.adapters.plots import (
+    Band,
+    Curve,
+    GraphLayer,
+    Layer,
+    MapLayer,
+    Panel,
+    Plot,
+    Robots,
+    Segments,
+    xy,
+)
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array, wrap
 from thinmap_ros.core.slam.features import LineFeature
@@ -49,52 +60,74 @@ def run(source: Source) -> Outcome:
     return Outcome(
         'A building floor with 33 lines',
         'SLAM paper, sections 4 and 5.1, Fig. 7, 8, 11 and 12',
-        f'The floor of 40 x 10 m: a Pioneer 3-AT with an LMS200 drives its tour at 0.2 m/s ({ti.way_m:.0f} m). The '
-        'same scans go through the conventional filter (all features) and through EKF-SLAM/TI (local areas).',
+        'The floor of 40 x 10 m: a Pioneer 3-AT with an LMS200 drives its tour at 0.2 m/s '
+        f'({ti.way_m:.0f} m). The same scans go through the conventional filter (all features) '
+        'and through EKF-SLAM/TI (local areas).',
         [
             Table('map', map_error.COLUMNS, [map_error.row('floor_40x10', error)]),
             Table('path', _PATH, _path_rows(ti, full)),
-            Table('features', ['id', 'r_m', 'alpha_rad', 'length_m', 'local'], _feature_rows(ti.pipeline)),
+            Table(
+                'features',
+                ['id', 'r_m', 'alpha_rad', 'length_m', 'local'],
+                _feature_rows(ti.pipeline),
+            ),
         ],
         [
             _local_area(glance),
             Plot(
-                'fig11', 'Paper 3, Fig. 11: (a) CAD data, (b) global grid map by EKF-SLAM/TI, (c) its errors.',
-                map_error.panels(error, world), panel_inches=(9.0, 2.9),
+                'fig11',
+                'Paper 3, Fig. 11: (a) CAD data, (b) global grid map by EKF-SLAM/TI, '
+                '(c) its errors.',
+                map_error.panels(error, world),
+                panel_inches=(9.0, 2.9),
             ),
             _paths(ti, full),
             _bounds(ti),
         ],
         [*_comparisons(ti, full, apart, used, known), _similar(error)],
-    )  # fmt: skip
+    )
 
 
 def _comparisons(ti: Run, full: Run, apart: Array, used: float, known: int) -> list[Comparison]:
     inside = _inside(ti)
     return [
-        Comparison('line features extracted', str(_LINES), str(known), abs(known - _LINES) <= 0.1 * _LINES,
-                   remark='the world has 33 surfaces of at least 0.8 m'),
         Comparison(
-            'features used for an update', f'{_PAPER_USED} instead of more than {_PAPER_ALL}',
-            f'{used:.0f} (median; most {max(ti.local)}) instead of {full.local[-1]}', used <= 0.5 * full.local[-1],
+            'line features extracted',
+            str(_LINES),
+            str(known),
+            abs(known - _LINES) <= 0.1 * _LINES,
+            remark='the world has 33 surfaces of at least 0.8 m',
         ),
         Comparison(
-            'paths of both filters', 'almost identical', f'{100 * apart.mean():.2f} cm apart (mean), '
-            f'{100 * apart.max():.1f} cm '
-            '(most)', bool(apart.max() < 0.05),
+            'features used for an update',
+            f'{_PAPER_USED} instead of more than {_PAPER_ALL}',
+            f'{used:.0f} (median; most {max(ti.local)}) instead of {full.local[-1]}',
+            used <= 0.5 * full.local[-1],
         ),
-        Comparison('errors within 3 sigma (x, y, heading)', '', ', '.join(f'{share:.1%}' for share in inside),
-                   remark='99.7 % would be a filter without any modelling error'),
-    ]  # fmt: skip
+        Comparison(
+            'paths of both filters',
+            'almost identical',
+            f'{100 * apart.mean():.2f} cm apart (mean), {100 * apart.max():.1f} cm (most)',
+            bool(apart.max() < 0.05),
+        ),
+        Comparison(
+            'errors within 3 sigma (x, y, heading)',
+            '',
+            ', '.join(f'{share:.1%}' for share in inside),
+            remark='99.7 % would be a filter without any modelling error',
+        ),
+    ]
 
 
 def _similar(error: map_error.MapError) -> Comparison:
     off = error.cells_off_m
     return Comparison(
-        'map against CAD data', 'similar to the accurate map',
-        f'occupied cells {100 * off.mean():.1f} cm off (mean); {error.found:.0%} of all surfaces found',
+        'map against CAD data',
+        'similar to the accurate map',
+        f'occupied cells {100 * off.mean():.1f} cm off (mean); '
+        f'{error.found:.0%} of all surfaces found',
         bool(off.mean() < 0.1),
-    )  # fmt: skip
+    )
 
 
 def _errors(done: Run) -> Array:
@@ -106,24 +139,49 @@ def _errors(done: Run) -> Array:
 
 def _inside(done: Run) -> list[float]:
     """Shares of the scans with errors within three sigma, for x, y and heading."""
-    return [float(share) for share in (np.abs(_errors(done)) <= _SIGMAS * np.array(done.sigmas)).mean(axis=0)]
+    return [
+        float(share)
+        for share in (np.abs(_errors(done)) <= _SIGMAS * np.array(done.sigmas)).mean(axis=0)
+    ]
 
 
 _PATH = [
-    'time_s', 'true_x_m', 'true_y_m', 'odometry_x_m', 'odometry_y_m', 'full_x_m', 'full_y_m', 'ti_x_m', 'ti_y_m',
-    'error_x_m', 'error_y_m', 'error_rad', 'sigma_x_m', 'sigma_y_m', 'sigma_rad', 'features', 'local_features',
-]  # fmt: skip
+    'time_s',
+    'true_x_m',
+    'true_y_m',
+    'odometry_x_m',
+    'odometry_y_m',
+    'full_x_m',
+    'full_y_m',
+    'ti_x_m',
+    'ti_y_m',
+    'error_x_m',
+    'error_y_m',
+    'error_rad',
+    'sigma_x_m',
+    'sigma_y_m',
+    'sigma_rad',
+    'features',
+    'local_features',
+]
 
 
 def _path_rows(ti: Run, full: Run) -> list[list[float]]:
     errors = _errors(ti)
     return [
         [
-            ti.seconds[k], *ti.truth[k][:2], *ti.odometry[k][:2], *full.estimate[k][:2], *ti.estimate[k][:2],
-            *errors[k], *ti.sigmas[k], ti.features[k], ti.local[k],
+            ti.seconds[k],
+            *ti.truth[k][:2],
+            *ti.odometry[k][:2],
+            *full.estimate[k][:2],
+            *ti.estimate[k][:2],
+            *errors[k],
+            *ti.sigmas[k],
+            ti.features[k],
+            ti.local[k],
         ]
         for k in range(0, len(ti.seconds), _EVERY)
-    ]  # fmt: skip
+    ]
 
 
 def _feature_rows(pipeline: Pipeline) -> Rows:
@@ -140,14 +198,16 @@ def _local_area(glance: _Glance) -> Plot:
     stored = {node for feature in glance.features if feature.local for node in feature.nodes}
     nodes = TopologicalMap([node for i, node in glance.graph.nodes.items() if i in stored])
     layers: list[Layer] = [
-        MapLayer(glance.patch), GraphLayer(glance.graph, 3.0), GraphLayer(nodes, 9.0),
+        MapLayer(glance.patch),
+        GraphLayer(glance.graph, 3.0),
+        GraphLayer(nodes, 9.0),
         Segments(_ends(glance.features, False), 'other features', 5, 2.0),
         Segments(_ends(glance.features, True), 'features of the local area', 1, 4.0),
         Robots(glance.pose[None], radius_m=0.32),
-    ]  # fmt: skip
+    ]
     caption = (
-        'Paper 3, Fig. 7 and 8: the local area: nodes near the robot (large: those at which its features are '
-        'stored) and the features that an update takes.'
+        'Paper 3, Fig. 7 and 8: the local area: nodes near the robot (large: those at which its '
+        'features are stored) and the features that an update takes.'
     )
     return Plot('fig7_8', caption, [Panel(layers)], panel_inches=(9.5, 3.4))
 
@@ -166,7 +226,10 @@ def _paths(ti: Run, full: Run) -> Plot:
         ]
         title = f'{name}: {sum(f.local for f in features)} of {len(features)} features used'
         panels.append(Panel(layers, title, limits=_LIMITS))
-    caption = 'Paper 3, Fig. 12: paths and line features by both filters; thick: the features used at the last pose.'
+    caption = (
+        'Paper 3, Fig. 12: paths and line features by both filters; '
+        'thick: the features used at the last pose.'
+    )
     return Plot('fig12', caption, panels, panel_inches=(9.0, 3.2))
 
 
@@ -178,7 +241,12 @@ def _bounds(done: Run) -> Plot:
             Band(seconds, -scale * bounds[:, k], scale * bounds[:, k], '3 sigma', 5),
             Curve(xy(seconds, scale * errors[:, k]), 'error', 0, width=1.0),
         ]
-        panels.append(Panel(layers, '', 'time (s)' if k == 2 else '', f'{name} ({unit})', plan=False))
-    caption = 'Paper 3: errors of the estimated pose over time with 3-sigma bounds, EKF-SLAM/TI on the floor of 40 x '
+        panels.append(
+            Panel(layers, '', 'time (s)' if k == 2 else '', f'{name} ({unit})', plan=False)
+        )
+    caption = (
+        'Paper 3: errors of the estimated pose over time with 3-sigma bounds, '
+        'EKF-SLAM/TI on the floor of 40 x '
+    )
     '10 m.'
     return Plot('bounds', caption, panels, panel_inches=(8.5, 1.9))

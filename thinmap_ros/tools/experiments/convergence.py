@@ -37,7 +37,8 @@ def run(source: Source) -> Outcome:
         first = None
         for step, look in enumerate(looks, 1):
             result = finder.step(look.scan, look.T_odom_base)
-            rows.append([seed, step, _candidates(result), State(result.state).name.lower(), *_error(result, look)])
+            state = State(result.state).name.lower()
+            rows.append([seed, step, _candidates(result), state, *_error(result, look)])
             if first is None and result.pose is not None:
                 first = step
                 steps.append([seed, step, *_error(result, look), _is_right(result, look)])
@@ -49,9 +50,10 @@ def run(source: Source) -> Outcome:
     return Outcome(
         'Global localization: 5,000 samples converge',
         'Topological map paper, sections 3.1 and 4.2, Fig. 10 and 11',
-        'The robot is switched on at (2 m, 2 m, 270 deg) of the laboratory, moves on continuously, and knows only '
-        f'the map of the twelve stops. A step is {0.2 * LOST_STEP_SCANS:g} s, up to 0.3 m. The same drive is '
-        f'localized with {len(seeds)} seeds of the samples.',
+        'The robot is switched on at (2 m, 2 m, 270 deg) of the laboratory, moves on continuously, '
+        'and knows only the map of the twelve stops. '
+        f'A step is {0.2 * LOST_STEP_SCANS:g} s, up to 0.3 m. '
+        f'The same drive is localized with {len(seeds)} seeds of the samples.',
         [
             Table('steps', ['seed', 'step', 'candidates', 'state', 'error_m', 'error_deg'], rows),
             Table('convergence', ['seed', 'steps', 'error_m', 'error_deg', 'right'], steps),
@@ -59,17 +61,20 @@ def run(source: Source) -> Outcome:
         [_samples(panels), _curve(rows, len(looks))],
         [
             Comparison(
-                'one position left', f'after {_STEPS} steps',
-                f'after {np.median(taken):.0f} (median), {taken.max()} (most) steps in {len(taken)} of {len(seeds)} '
-                'runs',
+                'one position left',
+                f'after {_STEPS} steps',
+                f'after {np.median(taken):.0f} (median), {taken.max()} (most) steps '
+                f'in {len(taken)} of {len(seeds)} runs',
                 len(taken) == len(seeds) and int(taken.max()) <= _STEPS,
             ),
             Comparison(
-                'it is the right one', 'yes', f'{right} of {len(seeds)} runs, at most {worst:.2f} m off',
+                'it is the right one',
+                'yes',
+                f'{right} of {len(seeds)} runs, at most {worst:.2f} m off',
                 right == len(seeds),
             ),
         ],
-    )  # fmt: skip
+    )
 
 
 def _candidates(result: Result) -> int:
@@ -86,13 +91,20 @@ def _error(result: Result, look: Look) -> tuple[float | None, float | None]:
 
 def _is_right(result: Result, look: Look) -> bool:
     metres, degrees = _error(result, look)
-    return metres is not None and degrees is not None and metres <= _RIGHT_M and degrees <= np.degrees(_RIGHT_RAD)
+    return (
+        metres is not None
+        and degrees is not None
+        and metres <= _RIGHT_M
+        and degrees <= np.degrees(_RIGHT_RAD)
+    )
 
 
 def _panel(patch: GridPatch, samples: Array, look: Look | None, step: int) -> Panel:
     title = f'after {step} steps' if step else f'at the start: {len(samples)} samples'
     robot = [] if look is None else [Robots(look.T_world_base[None])]
-    return Panel([MapLayer(patch), Curve(samples[:, :2], 'samples', 1, '', '.', size=1.5), *robot], title)
+    return Panel(
+        [MapLayer(patch), Curve(samples[:, :2], 'samples', 1, '', '.', size=1.5), *robot], title
+    )
 
 
 def _samples(panels: list[Panel]) -> Plot:
@@ -108,7 +120,9 @@ def _curve(rows: Rows, steps: int) -> Plot:
         label = 'one seed each' if k == 0 else ''
         layers.append(Curve(xy(mine[:, 1], np.maximum(mine[:, 2], 0.5)), label, 5, width=0.8))
     median = [float(np.median(table[table[:, 1] == step, 2])) for step in range(1, steps + 1)]
-    layers.append(Curve(xy(np.arange(1.0, steps + 1.0), np.array(median)), 'median', 0, marker='o', width=2.0))
+    layers.append(
+        Curve(xy(np.arange(1.0, steps + 1.0), np.array(median)), 'median', 0, marker='o', width=2.0)
+    )
     panel = Panel(layers, '', 'step', 'candidate positions', plan=False, log_y=True)
     caption = 'Paper 1, to Fig. 11: candidate positions (of at least 1 % of the weight) over steps.'
     return Plot('candidates', caption, [panel], panel_inches=(6.5, 3.6), legend='inside')

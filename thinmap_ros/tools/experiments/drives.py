@@ -1,4 +1,4 @@
-"""The drives behind the experiments: simulated from a seed, or read from the bag that was recorded of them."""
+"""The drives behind the experiments: simulated from a seed, or read from a recorded bag."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -26,7 +26,8 @@ from thinmap_ros.sim.world import World
 from thinmap_ros.tools.explore_world import Options, Strategy, make_loop, nothing_to_show
 
 SPEED_M_S = 0.2  # of all three papers
-LOST_STEPS, LOST_STEP_SCANS = 15, 3  # a step of global localization: at 0.5 m/s and 5 Hz, up to 0.3 m
+# A step of global localization: at 0.5 m/s and 5 Hz, up to 0.3 m.
+LOST_STEPS, LOST_STEP_SCANS = 15, 3
 TRUTH_TOPIC = '/ground_truth'
 _LOOKS_AT_A_STOP = 4
 _EXPLORE_LIMIT_S = 1000.0
@@ -87,8 +88,12 @@ class _Watched:
         self._strategy, self._simulation = strategy, simulation
         self.looks: list[Look] = []
 
-    def step(self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array) -> Decision:
-        self.looks.append(Look(scan, self._simulation.robot.T_odom_base, self._simulation.robot.T_world_base))
+    def step(
+        self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
+    ) -> Decision:
+        self.looks.append(
+            Look(scan, self._simulation.robot.T_odom_base, self._simulation.robot.T_world_base)
+        )
         return self._strategy.step(topology, patch, scan, T_map_base)
 
     def fail_target(self, reason: str) -> None:
@@ -97,7 +102,9 @@ class _Watched:
 
 def _exploration(recipe: Recipe, seed: int) -> Iterator[Look]:
     world = world_of(recipe.world)
-    loop = make_loop(world, world.start, Options(seed=seed, robot=recipe.robot, speed_m_s=SPEED_M_S))
+    loop = make_loop(
+        world, world.start, Options(seed=seed, robot=recipe.robot, speed_m_s=SPEED_M_S)
+    )
     watched = _Watched(loop.strategy, loop.simulation)
     loop.strategy = watched
     goal = coverable(world, world.start, PRESETS[recipe.robot].radius_m, Lms200Config().range_max_m)
@@ -106,20 +113,35 @@ def _exploration(recipe: Recipe, seed: int) -> Iterator[Look]:
 
 
 RECIPES = {
-    'lab_stops': Recipe('lab', '2dx', 'put down by hand at twelve stops, four scans to either side at each', _stops),
+    'lab_stops': Recipe(
+        'lab', '2dx', 'put down by hand at twelve stops, four scans to either side at each', _stops
+    ),
     'lab_lost': Recipe('lab', '2dx', 'from (2 m, 2 m, 270 deg) to random places at 0.5 m/s', _lost),
     'dead_end': Recipe('dead_end', '2dx', 'along the tour of the world at 0.2 m/s', _tour),
-    'joined_hallways': Recipe('joined_hallways', '2dx', 'along the tour of the world at 0.2 m/s', _tour),
-    'room_10x10': Recipe('room_10x10', '2dx', 'explored by position probability at up to 0.2 m/s', _exploration),
-    'office': Recipe('office', '3at', 'along the tour of the world at 0.2 m/s', _tour, localized=True),
-    'floor_40x10': Recipe('floor_40x10', '3at', 'along the tour of the world at 0.2 m/s', _tour, localized=True),
-    'floor_70x10': Recipe('floor_70x10', '3at', 'along the tour of the world at 0.2 m/s', _tour, localized=True),
+    'joined_hallways': Recipe(
+        'joined_hallways', '2dx', 'along the tour of the world at 0.2 m/s', _tour
+    ),
+    'room_10x10': Recipe(
+        'room_10x10', '2dx', 'explored by position probability at up to 0.2 m/s', _exploration
+    ),
+    'office': Recipe(
+        'office', '3at', 'along the tour of the world at 0.2 m/s', _tour, localized=True
+    ),
+    'floor_40x10': Recipe(
+        'floor_40x10', '3at', 'along the tour of the world at 0.2 m/s', _tour, localized=True
+    ),
+    'floor_70x10': Recipe(
+        'floor_70x10', '3at', 'along the tour of the world at 0.2 m/s', _tour, localized=True
+    ),
 }
 
 
 @dataclass(frozen=True)
 class Source:
-    """Where drives come from: a seed, or a folder of bags. quick: experiments are made small, as for a test."""
+    """Where drives come from: a seed, or a folder of bags.
+
+    quick: experiments are made small, as for a test.
+    """
 
     seed: int = 0
     bags: Path | None = None
@@ -134,7 +156,10 @@ class Source:
 
 
 def looks_of_bag(path: Path) -> Iterator[Look]:
-    """The drive that a bag holds. Raises InputError where a scan has no odometry or ground truth of its stamp."""
+    """The drive that a bag holds.
+
+    Raises InputError where a scan has no odometry or ground truth of its stamp.
+    """
     bag = Bag(path)
     truth = {}
     for message in bag.messages({TRUTH_TOPIC}):
@@ -147,5 +172,7 @@ def looks_of_bag(path: Path) -> Iterator[Look]:
             continue
         stamp_ns = event.scan.stamp_ns
         if stamp_ns not in T_odom_base or stamp_ns not in truth:
-            raise InputError(f'{path}: scan at {stamp_ns} ns: expected /odom and {TRUTH_TOPIC} of the same stamp')
+            raise InputError(
+                f'{path}: scan at {stamp_ns} ns: expected /odom and {TRUTH_TOPIC} of the same stamp'
+            )
         yield Look(event.scan, T_odom_base[stamp_ns], truth[stamp_ns])

@@ -4,7 +4,17 @@ import math
 
 import numpy as np
 
-from thinmap_ros.adapters.plots import Curve, GraphLayer, Layer, MapLayer, Panel, Plot, Robots, Words, xy
+from thinmap_ros.adapters.plots import (
+    Curve,
+    GraphLayer,
+    Layer,
+    MapLayer,
+    Panel,
+    Plot,
+    Robots,
+    Words,
+    xy,
+)
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
@@ -35,44 +45,49 @@ def run(source: Source) -> Outcome:
         last = len(moments) - 1
         shown = [moments[round(share * last)] for share in _MOMENTS]
         caption = (
-            f'Paper 2, {figure}: the topological map while the robot drives up the hallway; A is the end node that is '
-            'followed.'
+            f'Paper 2, {figure}: the topological map while the robot drives up the hallway; '
+            'A is the end node that is followed.'
         )
         panels = [_panel(moment, _limits(name)) for moment in shown]
         plots.append(Plot(name, caption, panels, columns=3, panel_inches=(4.6, 3.6)))
         moved = np.hypot(*(line[:, 1:3] - line[0, 1:3]).T)
         curves.append(Curve(xy(line[:, 3], moved), name.replace('_', ' '), k, ('-', '--')[k]))
-    panel = Panel(curves, '', 'way of the robot (m)', 'node A from where it was first (m)', plan=False)
+    panel = Panel(
+        curves, '', 'way of the robot (m)', 'node A from where it was first (m)', plan=False
+    )
     caption = 'Paper 2, to Fig. 5 and 6: how far node A has moved.'
     plots.append(Plot('movement', caption, [panel], panel_inches=(6.5, 3.6), legend='inside'))
     (dead, dead_rest), (joined, joined_rest) = ends['dead_end'], ends['joined_hallways']
     return Outcome(
         'End nodes move while there is something to see',
         'Exploration paper, section 3.1, Fig. 5 and 6',
-        'The robot drives up a hallway and to the left, where it cannot see from its start: a dead end, or the way '
-        'to another hallway. Node A is the end node ahead of it.',
+        'The robot drives up a hallway and to the left, where it cannot see from its start: '
+        'a dead end, or the way to another hallway. Node A is the end node ahead of it.',
         [Table('node_a', ['world', 'time_s', 'x_m', 'y_m', 'way_m'], rows)],
         plots,
         [
             Comparison(
-                'dead end: node A moves, then rests', 'yes',
-                f'moves {_moved(dead):.1f} m, rests after {dead_rest:.1f} m of {dead[-1, 3]:.1f} m of way',
+                'dead end: node A moves, then rests',
+                'yes',
+                f'moves {_moved(dead):.1f} m, '
+                f'rests after {dead_rest:.1f} m of {dead[-1, 3]:.1f} m of way',
                 bool(_moved(dead) > 1.0 and dead_rest < dead[-1, 3] - 0.5),
             ),
             Comparison(
-                'joined hallways: node A sprawls out into the other one', 'yes',
+                'joined hallways: node A sprawls out into the other one',
+                'yes',
                 f'moves {_moved(joined):.1f} m, to ({joined[-1, 1]:.1f} m, {joined[-1, 2]:.1f} m)',
                 _moved(joined) > _moved(dead) and joined_rest > dead_rest,
             ),
         ],
-    )  # fmt: skip
+    )
 
 
 Moment = tuple[float, Array, GridPatch, TopologicalMap, Array]
 
 
 def _follow(source: Source, name: str) -> tuple[list[Moment], list[list[float]]]:
-    """The state once a second (time, pose, map, graph, node A), and node A at each scan: time, x, y, way."""
+    """State once a second (time, pose, map, graph, node A), and A at each scan: time, x, y, way."""
     builder, grid = TopologyBuilder(TopologyConfig()), OccupancyGrid()
     moments: list[Moment] = []
     track: list[list[float]] = []
@@ -83,7 +98,9 @@ def _follow(source: Source, name: str) -> tuple[list[Moment], list[list[float]]]
         last = T
         grid.update(look.scan, T)
         builder.update(grid.window(float(T[0]), float(T[1]), _WINDOW_M), T)
-        places = np.array([n.position for n in builder.map.nodes.values() if n.kind == NodeKind.END]).reshape(-1, 2)
+        places = np.array(
+            [n.position for n in builder.map.nodes.values() if n.kind == NodeKind.END]
+        ).reshape(-1, 2)
         away = np.hypot(*(places - at).T)
         if away.min(initial=np.inf) <= _JUMP_M:
             at = places[int(away.argmin())]
@@ -103,7 +120,12 @@ def _limits(name: str) -> tuple[float, float, float, float]:
 
 def _panel(moment: Moment, limits: tuple[float, float, float, float]) -> Panel:
     seconds, T, patch, graph, at = moment
-    layers: list[Layer] = [MapLayer(patch), GraphLayer(graph), Robots(T[None]), Words(at[None], ['A'], 11.0)]
+    layers: list[Layer] = [
+        MapLayer(patch),
+        GraphLayer(graph),
+        Robots(T[None]),
+        Words(at[None], ['A'], 11.0),
+    ]
     return Panel(layers, f'after {seconds:.0f} s', limits=limits)
 
 

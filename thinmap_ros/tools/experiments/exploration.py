@@ -4,7 +4,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thinmap_ros.adapters.plots import Curve, GraphLayer, Layer, MapLayer, Panel, Plot, Robots, Words
+from thinmap_ros.adapters.plots import (
+    Curve,
+    GraphLayer,
+    Layer,
+    MapLayer,
+    Panel,
+    Plot,
+    Robots,
+    Words,
+)
 from thinmap_ros.core.exploration.decision import FIRST_STAND_IN_ID, Decision
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.patch import GridPatch
@@ -39,7 +48,7 @@ class _Moment:
 
 
 def run(source: Source) -> Outcome:
-    """Decide anew what was decided on the drive, from the same scans, and look at what was known."""
+    """Decide anew what was decided on the drive, from the same scans; look at what was known."""
     world = world_of('room_10x10')
     moments, census = _relive(list(source.looks('room_10x10')))
     goal = coverable(world, world.start, PRESETS['2dx'].radius_m, Lms200Config().range_max_m)
@@ -52,39 +61,61 @@ def run(source: Source) -> Outcome:
     return Outcome(
         'Exploration by position probability',
         'Exploration paper, section 4, Fig. 10',
-        'The room of 10 x 10 m, cells of 10 cm, 181 beams over 180 degrees, at most 0.2 m/s, with exact poses. '
-        'Beside each end node stand its number and its position probability.',
+        'The room of 10 x 10 m, cells of 10 cm, 181 beams over 180 degrees, at most 0.2 m/s, '
+        'with exact poses. Beside each end node stand its number and its position probability.',
         [
             Table('end_nodes', _COLUMNS, _rows(moments)),
             Table('coverage', ['time_s', 'coverage'], coverage),
         ],
         [
             Plot(
-                'fig10', 'Paper 2, Fig. 10: the exploration at six moments; number and position probability beside '
-                'each end node, the path so far.',
-                [_panel(m, poses[: moments.index(m) + 1]) for m in shown], columns=3, panel_inches=(4.6, 4.6),
+                'fig10',
+                'Paper 2, Fig. 10: the exploration at six moments; '
+                'number and position probability beside each end node, the path so far.',
+                [_panel(m, poses[: moments.index(m) + 1]) for m in shown],
+                columns=3,
+                panel_inches=(4.6, 4.6),
             )
         ],
         [
             Comparison(
-                'time for the room', f'under {_PAPER_S:.0f} s', f'{last.seconds:.0f} s, {way_m:.1f} m',
+                'time for the room',
+                f'under {_PAPER_S:.0f} s',
+                f'{last.seconds:.0f} s, {way_m:.1f} m',
                 last.seconds < _PAPER_S,
             ),
-            Comparison('explored', 'the entire environment', f'{coverage[-1][1]:.1%}', coverage[-1][1] >= _FULL),
             Comparison(
-                'end nodes that were never visited', 'some', f'{unvisited} of {census.seen}', unvisited > 0,
+                'explored',
+                'the entire environment',
+                f'{coverage[-1][1]:.1%}',
+                coverage[-1][1] >= _FULL,
+            ),
+            Comparison(
+                'end nodes that were never visited',
+                'some',
+                f'{unvisited} of {census.seen}',
+                unvisited > 0,
             ),
         ],
-    )  # fmt: skip
+    )
 
 
 _COLUMNS = [
-    'time_s', 'end_node', 'x_m', 'y_m', 'probability', 'distance_index', 'angle_index', 'open_border_m', 'is_target',
-]  # fmt: skip
+    'time_s',
+    'end_node',
+    'x_m',
+    'y_m',
+    'probability',
+    'distance_index',
+    'angle_index',
+    'open_border_m',
+    'is_target',
+]
 
 
 def _relive(looks: list[Look]) -> tuple[list[_Moment], EndNodeCensus]:
     """Once a second, and at the end, what is known."""
+
     def here(scan: object, T_odom_base: Array) -> Estimate:
         return Estimate(truth, np.zeros((3, 3)), np.zeros(3))
 
@@ -103,7 +134,17 @@ def _relive(looks: list[Look]) -> tuple[list[_Moment], EndNodeCensus]:
 
 def _rows(moments: list[_Moment]) -> Rows:
     return [
-        [m.seconds, n.node_id, n.x, n.y, n.probability, n.distance_index, n.angle_index, n.open_border_m, n.is_target]
+        [
+            m.seconds,
+            n.node_id,
+            n.x,
+            n.y,
+            n.probability,
+            n.distance_index,
+            n.angle_index,
+            n.open_border_m,
+            n.is_target,
+        ]
         for m in moments
         for n in m.decision.end_nodes
         if n.node_id < FIRST_STAND_IN_ID
@@ -115,7 +156,16 @@ def _panel(moment: _Moment, path: Array) -> Panel:
     words = [f'{n.node_id}({n.probability:.2f})' for n in nodes]
     at = np.array([[n.x, n.y] for n in nodes]).reshape(-1, 2)
     target = moment.decision.target
-    goal = [] if target is None else [Curve(target.goal[None, :2], 'looked at from', 3, '', 'X', size=9.0)]
-    layers: list[Layer] = [MapLayer(moment.patch), GraphLayer(moment.graph), Curve(path[:, :2], 'path', 5), *goal]
+    goal = (
+        []
+        if target is None
+        else [Curve(target.goal[None, :2], 'looked at from', 3, '', 'X', size=9.0)]
+    )
+    layers: list[Layer] = [
+        MapLayer(moment.patch),
+        GraphLayer(moment.graph),
+        Curve(path[:, :2], 'path', 5),
+        *goal,
+    ]
     layers += [Robots(moment.T_map_base[None]), Words(at, words)]
     return Panel(layers, f'after {moment.seconds:.0f} s', limits=_LIMITS)

@@ -26,7 +26,8 @@ def run(source: Source) -> Outcome:
     counts = _COUNTS_QUICK if source.quick else _COUNTS
     times, same = [], []
     for count in counts:
-        (local_ms, local_pose), (full_ms, full_pose) = (_drive(source.seed, count, local) for local in (True, False))
+        local_ms, local_pose = _drive(source.seed, count, True)
+        full_ms, full_pose = _drive(source.seed, count, False)
         times.append([count, *_spread(local_ms), *_spread(full_ms)])
         same.append([count, float(np.abs(local_pose - full_pose).max())])
     first, last = times[0], times[-1]
@@ -35,11 +36,11 @@ def run(source: Source) -> Outcome:
     return Outcome(
         'Time of a step against the number of features',
         'SLAM paper, section 5.2, Fig. 13',
-        f'Maps of {counts[0]} to {counts[-1]} lines. A step predicts and corrects by {_SEEN} lines that are seen; a '
-        f'local area has {_LOCAL} features, and after every {_AREA_STEPS} steps, or a metre, the robot is in another '
-        f'one. The '
-        'conventional filter takes the same steps with all features. CPU time of the filter alone: what a whole '
-        'scan costs is on the benchmark page.',
+        f'Maps of {counts[0]} to {counts[-1]} lines. A step predicts and corrects by {_SEEN} lines '
+        f'that are seen; a local area has {_LOCAL} features, and after every {_AREA_STEPS} steps, '
+        'or a metre, the robot is in another one. '
+        'The conventional filter takes the same steps with all features. '
+        'CPU time of the filter alone: what a whole scan costs is on the benchmark page.',
         [
             Table('times', _COLUMNS, times, timed=True),
             Table('difference', ['features', 'largest_difference_of_pose'], same),
@@ -47,39 +48,59 @@ def run(source: Source) -> Outcome:
         [_plot(np.array(times))],
         [
             Comparison(
-                'EKF-SLAM/TI', 'nearly constant, 30-40 ms in all', f'{first[1]:.2f} ms with {first[0]}, '
-                f'{last[1]:.2f} ms with '
-                f'{last[0]} features (medians)', bool(half[1] <= _FLAT * first[1]), timed=True,
-                remark=f'{half[1] / first[1]:.2f} times as much with {half[0]} as with {first[0]} features, '
-                f'{last[1] / first[1]:.2f} times with {last[0]}; mean {first[2]:.2f} and {last[2]:.2f} ms, a step '
-                f'into another area up to '
-                f'{last[3]:.0f} ms',
+                'EKF-SLAM/TI',
+                'nearly constant, 30-40 ms in all',
+                f'{first[1]:.2f} ms with {first[0]}, '
+                f'{last[1]:.2f} ms with {last[0]} features (medians)',
+                bool(half[1] <= _FLAT * first[1]),
+                timed=True,
+                remark=f'{half[1] / first[1]:.2f} times as much with {half[0]} '
+                f'as with {first[0]} features, '
+                f'{last[1] / first[1]:.2f} times with {last[0]}; '
+                f'mean {first[2]:.2f} and {last[2]:.2f} ms, '
+                f'a step into another area up to {last[3]:.0f} ms',
             ),
             Comparison(
-                'conventional EKF-SLAM', 'grows, rapidly from about 100 on', f'{first[4]:.2f} ms with {first[0]}, '
-                f'{last[4]:.1f} '
-                f'ms with {last[0]} features (medians)', bool(last[4] > 2.0 * first[4]), timed=True,
+                'conventional EKF-SLAM',
+                'grows, rapidly from about 100 on',
+                f'{first[4]:.2f} ms with {first[0]}, '
+                f'{last[4]:.1f} ms with {last[0]} features (medians)',
+                bool(last[4] > 2.0 * first[4]),
+                timed=True,
             ),
             Comparison(
-                'both estimate the same', 'almost identical', f'pose at most {apart:.1e} (m, rad) apart', apart < _SAME,
+                'both estimate the same',
+                'almost identical',
+                f'pose at most {apart:.1e} (m, rad) apart',
+                apart < _SAME,
                 remark='the compressed form loses nothing; the paper drops the rest',
             ),
         ],
-    )  # fmt: skip
+    )
 
 
 _COLUMNS = [
-    'features', 'ti_median_ms', 'ti_mean_ms', 'ti_longest_ms', 'full_median_ms', 'full_mean_ms', 'full_longest_ms',
-]  # fmt: skip
+    'features',
+    'ti_median_ms',
+    'ti_mean_ms',
+    'ti_longest_ms',
+    'full_median_ms',
+    'full_mean_ms',
+    'full_longest_ms',
+]
 
 
 def _drive(seed: int, count: int, local: bool) -> tuple[Array, Array]:
     """Time of each step, ms, (N,), and the pose at the end (3,)."""
     rng = np.random.default_rng([seed, count])
     ekf = CompressedEkf(np.zeros(3), np.diag([1e-4, 1e-4, 1e-4]))
-    for number, line in enumerate(np.column_stack([rng.uniform(1.0, 40.0, count), rng.uniform(-np.pi, np.pi, count)])):
+    lines = np.column_stack([rng.uniform(1.0, 40.0, count), rng.uniform(-np.pi, np.pi, count)])
+    for number, line in enumerate(lines):
         ekf.add(number, line, _LINE)
-    areas = [rng.choice(count, min(_LOCAL, count), replace=False).tolist() for _ in range(_STEPS // _AREA_STEPS)]
+    areas = [
+        rng.choice(count, min(_LOCAL, count), replace=False).tolist()
+        for _ in range(_STEPS // _AREA_STEPS)
+    ]
     noise = rng.normal(0.0, 1.0, (_STEPS, min(_SEEN, count), 2)) * np.sqrt(np.diag(_LINE))
     taken = []
     for step in range(_STEPS):
@@ -113,6 +134,14 @@ def _plot(times: Array) -> Plot:
         Curve(times[:, [0, 1]], 'EKF-SLAM/TI, median', 2, '--', marker='o'),
         Curve(times[:, [0, 3]], 'EKF-SLAM/TI, longest step', 4, ':', marker='^'),
     ]
-    panel = Panel(layers, '', 'features in the map', 'CPU time of a step (ms)', plan=False, log_x=True, log_y=True)
+    panel = Panel(
+        layers,
+        '',
+        'features in the map',
+        'CPU time of a step (ms)',
+        plan=False,
+        log_x=True,
+        log_y=True,
+    )
     caption = 'Paper 3, Fig. 13: processing time of EKF-SLAM (solid) and EKF-SLAM/TI (dashed).'
     return Plot('fig13', caption, [panel], panel_inches=(7.0, 4.4), legend='inside')

@@ -1,4 +1,4 @@
-"""Logs of real robots: map, graph, features and trajectory of each, and its errors where relations are known."""
+"""Logs of real robots: map, graph, features, trajectory, and errors where relations are known."""
 
 import time
 from concurrent.futures import ProcessPoolExecutor
@@ -22,22 +22,44 @@ from thinmap_ros.tools.replay import Replay, replay, write_outputs
 # Lasers of known logs, by the folder's name; a file laser.yaml in a log's folder comes before.
 _LASERS = {
     'sena': {'offset_m': 0.78},
-    'mrpt_office': {'offset_m': 0.16, 'start_angle_deg': -110.0079, 'step_deg': 0.352025, 'max_range_m': 25.0},
+    'mrpt_office': {
+        'offset_m': 0.16,
+        'start_angle_deg': -110.0079,
+        'step_deg': 0.352025,
+        'max_range_m': 25.0,
+    },
 }
-# What others are said to reach on the Intel log: errors of translation in m, live and after all corrections; CPU ms a
-# scan; MB. Single runs of the programs with their defaults, Cartographer tuned; the last three as published in 2009.
+# What others are said to reach on the Intel log: errors of translation in m, live and after all
+# corrections; CPU ms a scan; MB. Single runs of the programs with their defaults, Cartographer
+# tuned; the last three as published in 2009.
 _OTHERS: list[tuple[str, float | None, float, float | None, float | None]] = [
-    ('IRIS LaMa slam2d', 0.036, 0.033, 0.17, 13.0), ('Karto', 0.073, 0.038, 12.3, 73.0),
-    ('GMapping, 30 particles', 0.104, 0.046, 8.7, 110.0), ('slam_toolbox', 0.113, 0.056, 1.17, 45.0),
-    ('Cartographer 2D', 1.55, 0.081, 34.0, 257.0), ('a public line-feature EKF-SLAM', 1.87, 1.87, 30.0, 79.0),
-    ('scan matching, 2009', None, 0.220, None, None), ('RBPF, 2009', None, 0.070, None, None),
+    ('IRIS LaMa slam2d', 0.036, 0.033, 0.17, 13.0),
+    ('Karto', 0.073, 0.038, 12.3, 73.0),
+    ('GMapping, 30 particles', 0.104, 0.046, 8.7, 110.0),
+    ('slam_toolbox', 0.113, 0.056, 1.17, 45.0),
+    ('Cartographer 2D', 1.55, 0.081, 34.0, 257.0),
+    ('a public line-feature EKF-SLAM', 1.87, 1.87, 30.0, 79.0),
+    ('scan matching, 2009', None, 0.220, None, None),
+    ('RBPF, 2009', None, 0.070, None, None),
     ('graph mapping, 2009', None, 0.031, None, None),
-]  # fmt: skip
+]
 _OTHERS_LOG = 'intel'
 _COLUMNS = [
-    'log', 'scans', 'skipped', 'way_m', 'features', 'features_local', 'nodes', 'edges', 'loops', 'live_m', 'live_deg',
-    'final_m', 'final_deg', 'odometry_m',
-]  # fmt: skip
+    'log',
+    'scans',
+    'skipped',
+    'way_m',
+    'features',
+    'features_local',
+    'nodes',
+    'edges',
+    'loops',
+    'live_m',
+    'live_deg',
+    'final_m',
+    'final_deg',
+    'odometry_m',
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,9 +85,10 @@ def run(folder: Path, out: Path) -> Outcome:
     return Outcome(
         'Logs of real robots',
         'Recorded with SICK lasers; none of it was simulated',
-        'Each log in file order through localizer, grid and topology. live: the pose as known at its scan; final: '
-        'after all '
-        'corrections. Errors are those of the known relations between poses (mean of translation, and of rotation).',
+        'Each log in file order through localizer, grid and topology. '
+        'live: the pose as known at its scan; final: after all corrections. '
+        'Errors are those of the known relations between poses '
+        '(mean of translation, and of rotation).',
         [
             Table('logs', _COLUMNS, rows),
             Table('others', ['system', 'live_m', 'final_m', 'cpu_ms_per_scan', 'peak_mb'], _OTHERS),
@@ -73,7 +96,7 @@ def run(folder: Path, out: Path) -> Outcome:
         ],
         [result.plot for result in results],
         [comparison for row in rows for comparison in _comparisons(row)],
-    )  # fmt: skip
+    )
 
 
 _TIMED = ['log', 'cpu_ms_per_scan', 'wall_ms_median', 'wall_ms_p95', 'wall_ms_max', 'peak_mb']
@@ -87,13 +110,25 @@ def _one(folder: Path, out: Path) -> _Result:
     ms = report['ms_per_scan']['all']
     cpu_ms = 1000.0 * seconds[1] / report['scans']
     timed = [folder.name, cpu_ms, ms['median'], ms['p95'], ms['max'], report['peak_mb']]
-    keys = ('scans', 'skipped', 'distance', 'features', 'features_local_median', 'nodes', 'edges', 'loops_closed')
+    keys = (
+        'scans',
+        'skipped',
+        'distance',
+        'features',
+        'features_local_median',
+        'nodes',
+        'edges',
+        'loops_closed',
+    )
     row = [folder.name, *(report[key] for key in keys), *_errors(folder, result)]
     return _Result(row, timed, _plot(folder, result))
 
 
 def _laser(folder: Path) -> LaserOptions:
-    """Options of the laser: those of laser.yaml in the folder, or of a known log. Raises InputError where it is bad."""
+    """Options of the laser: those of laser.yaml in the folder, or of a known log.
+
+    Raises InputError where it is bad.
+    """
     path = folder / 'laser.yaml'
     options = _LASERS.get(folder.name, {})
     if path.exists():
@@ -105,7 +140,7 @@ def _laser(folder: Path) -> LaserOptions:
 
 
 def _errors(folder: Path, result: Replay) -> list[float | None]:
-    """Errors by relations: live m and deg, final m and deg, raw odometry m; None where no relations are known."""
+    """Errors by relations: live m, deg, final m, deg, raw odometry m; None without relations."""
     relations, odometry = folder / 'relations', folder / 'odom.txt'
     if not relations.exists():
         return [None] * 5
@@ -129,14 +164,20 @@ def _plot(folder: Path, result: Replay) -> Plot:
     rows, cols = patch.shape
     width = min(7.0, 6.0 * cols / rows)
     return Plot(
-        folder.name, f'{folder.name}: map and trajectory; topological map; line features.',
+        folder.name,
+        f'{folder.name}: map and trajectory; topological map; line features.',
         [
             Panel([MapLayer(patch), way], 'map and trajectory'),
             Panel([MapLayer(patch), GraphLayer(graph, 3.0)], f'{len(graph.nodes)} nodes'),
-            Panel([Segments(lines, 'line features', 'black', 1.2), way], f'{len(lines)} features', limits=_box(final)),
+            Panel(
+                [Segments(lines, 'line features', 'black', 1.2), way],
+                f'{len(lines)} features',
+                limits=_box(final),
+            ),
         ],
-        columns=3, panel_inches=(width, min(6.0, width * rows / cols + 0.8)),
-    )  # fmt: skip
+        columns=3,
+        panel_inches=(width, min(6.0, width * rows / cols + 0.8)),
+    )
 
 
 def _box(path: Array) -> tuple[float, float, float, float]:
@@ -149,16 +190,25 @@ def _comparisons(row: list[Any]) -> list[Comparison]:
     values = dict(zip(_COLUMNS, row, strict=True))
     if values['final_m'] is None:
         return []
-    name, ours = values['log'], f'{values["final_m"]:.3f} m after all corrections, {values["live_m"]:.3f} m live'
-    degrees = f'{values["final_deg"]:.2f} deg, live {values["live_deg"]:.2f} deg; odometry {values["odometry_m"]:.2f} m'
+    name = values['log']
+    ours = f'{values["final_m"]:.3f} m after all corrections, {values["live_m"]:.3f} m live'
+    degrees = (
+        f'{values["final_deg"]:.2f} deg, live {values["live_deg"]:.2f} deg; '
+        f'odometry {values["odometry_m"]:.2f} m'
+    )
     rows = [Comparison(f'{name}: mean error of the relations', '', ours, remark=degrees)]
     if name == _OTHERS_LOG:
-        rows += [_against(system, live_m, final_m, values) for system, live_m, final_m, *_ in _OTHERS]
+        rows += [
+            _against(system, live_m, final_m, values) for system, live_m, final_m, *_ in _OTHERS
+        ]
     return rows
 
 
-def _against(system: str, live_m: float | None, final_m: float, values: dict[str, Any]) -> Comparison:
+def _against(
+    system: str, live_m: float | None, final_m: float, values: dict[str, Any]
+) -> Comparison:
     theirs = f'{final_m:.3f} m' + ('' if live_m is None else f', {live_m:.3f} m live')
-    ours = f'{values["final_m"]:.3f} m' + ('' if live_m is None else f', {values["live_m"]:.3f} m live')
+    live = '' if live_m is None else f', {values["live_m"]:.3f} m live'
+    ours = f'{values["final_m"]:.3f} m' + live
     better = values['final_m'] <= final_m and (live_m is None or values['live_m'] <= live_m)
     return Comparison(f'{values["log"]}, against {system}', theirs, ours, bool(better))

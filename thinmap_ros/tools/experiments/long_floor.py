@@ -24,7 +24,9 @@ class _Marks:
     """What the map and its window look like at some scans."""
 
     def __init__(self, scans: int) -> None:
-        self._at = {round((k + 1) / len(_MARKS) * (scans - 1)): name for k, name in enumerate(_MARKS)}
+        self._at = {
+            round((k + 1) / len(_MARKS) * (scans - 1)): name for k, name in enumerate(_MARKS)
+        }
         self.wide: list[Panel] = []
         self.near: list[Panel] = []
         self._passed: list[tuple[str, Array]] = []
@@ -37,10 +39,21 @@ class _Marks:
         names, places = zip(*self._passed, strict=True)
         graph, robot = pipeline.topology.map.copy(), Robots(T[None], radius_m=0.32)
         words = Words(np.array(places), names, 11.0)
-        title = f'{self._at[k]}: after {look.scan.stamp_ns / 6e10:.1f} min, {step.estimate.n_features} features'
-        self.wide.append(Panel([MapLayer(pipeline.grid.patch()), robot, words], title, limits=(-1.0, 71.0, -0.5, 10.5)))
+        title = (
+            f'{self._at[k]}: after {look.scan.stamp_ns / 6e10:.1f} min, '
+            f'{step.estimate.n_features} features'
+        )
+        self.wide.append(
+            Panel(
+                [MapLayer(pipeline.grid.patch()), robot, words],
+                title,
+                limits=(-1.0, 71.0, -0.5, 10.5),
+            )
+        )
         window = pipeline.grid.window(float(T[0]), float(T[1]), _WINDOW_M)
-        self.near.append(Panel([MapLayer(window), GraphLayer(graph), robot], self._at[k], limits=_box(T)))
+        self.near.append(
+            Panel([MapLayer(window), GraphLayer(graph), robot], self._at[k], limits=_box(T))
+        )
 
 
 def _box(T: Array) -> tuple[float, float, float, float]:
@@ -60,46 +73,71 @@ def run(source: Source) -> Outcome:
     return Outcome(
         'A floor of 70 x 10 m over twenty minutes',
         'SLAM paper, section 5.2, Fig. 14',
-        f'A Pioneer 3-AT with an LMS200 drives the tour of the floor with its 88 lines at 0.2 m/s: {ti.way_m:.0f} m '
-        f'in {ti.seconds[-1] / 60.0:.0f} minutes.',
+        'A Pioneer 3-AT with an LMS200 drives the tour of the floor with its 88 lines at 0.2 m/s: '
+        f'{ti.way_m:.0f} m in {ti.seconds[-1] / 60.0:.0f} minutes.',
         [
             Table('path', _PATH, _rows(ti)),
             Table('map', map_error.COLUMNS, [map_error.row('floor_70x10', error)]),
-            Table('times', ['time_s', 'features', 'ti_ms', 'full_ms'], _times(ti, full), timed=True),
+            Table(
+                'times', ['time_s', 'features', 'ti_ms', 'full_ms'], _times(ti, full), timed=True
+            ),
         ],
         [
             Plot(
-                'fig14_global', 'Paper 3, Fig. 14 (left): the global grid map when the robot is at A to E.',
-                marks.wide, panel_inches=(9.0, 2.0),
+                'fig14_global',
+                'Paper 3, Fig. 14 (left): the global grid map when the robot is at A to E.',
+                marks.wide,
+                panel_inches=(9.0, 2.0),
             ),
             Plot(
-                'fig14_local', 'Paper 3, Fig. 14 (right): the local maps of 10 x 10 m there, with the topological map.',
-                marks.near, columns=len(marks.near), panel_inches=(3.4, 3.4),
+                'fig14_local',
+                'Paper 3, Fig. 14 (right): the local maps of 10 x 10 m there, '
+                'with the topological map.',
+                marks.near,
+                columns=len(marks.near),
+                panel_inches=(3.4, 3.4),
             ),
             Plot(
-                'map_error', 'Paper 3, to Fig. 14: the floor, its map, and the errors of the map.',
-                map_error.panels(error, world), panel_inches=(9.5, 2.4),
+                'map_error',
+                'Paper 3, to Fig. 14: the floor, its map, and the errors of the map.',
+                map_error.panels(error, world),
+                panel_inches=(9.5, 2.4),
             ),
             _over_time(ti, full, off, turned),
         ],
         _comparisons(ti, full, off, turned),
-    )  # fmt: skip
+    )
 
 
 _PATH = [
-    'time_s', 'true_x_m', 'true_y_m', 'x_m', 'y_m', 'error_m', 'error_deg', 'odometry_error_m', 'features', 'local',
-]  # fmt: skip
+    'time_s',
+    'true_x_m',
+    'true_y_m',
+    'x_m',
+    'y_m',
+    'error_m',
+    'error_deg',
+    'odometry_error_m',
+    'features',
+    'local',
+]
 
 
 def _rows(done: Run) -> list[list[float]]:
     off, wheels = done.errors(), done.errors(done.odometry)
     return [
         [
-            done.seconds[k], *done.truth[k][:2], *done.estimate[k][:2], float(np.hypot(*off[k, :2])),
-            float(np.degrees(abs(off[k, 2]))), float(np.hypot(*wheels[k, :2])), done.features[k], done.local[k],
+            done.seconds[k],
+            *done.truth[k][:2],
+            *done.estimate[k][:2],
+            float(np.hypot(*off[k, :2])),
+            float(np.degrees(abs(off[k, 2]))),
+            float(np.hypot(*wheels[k, :2])),
+            done.features[k],
+            done.local[k],
         ]
         for k in range(0, len(done.seconds), _EVERY)
-    ]  # fmt: skip
+    ]
 
 
 def _times(ti: Run, full: Run) -> list[list[float]]:
@@ -116,17 +154,35 @@ def _times(ti: Run, full: Run) -> list[list[float]]:
 def _over_time(ti: Run, full: Run, off: Array, turned: Array) -> Plot:
     seconds, times = np.array(ti.seconds), np.array(_times(ti, full))
     panels = [
-        Panel([Curve(xy(seconds, 100.0 * off), 'position', 0, width=1.0)], '', '', 'position (cm)', plan=False),
-        Panel([Curve(xy(seconds, turned), 'heading', 1, width=1.0)], '', '', 'heading (deg)', plan=False),
+        Panel(
+            [Curve(xy(seconds, 100.0 * off), 'position', 0, width=1.0)],
+            '',
+            '',
+            'position (cm)',
+            plan=False,
+        ),
+        Panel(
+            [Curve(xy(seconds, turned), 'heading', 1, width=1.0)],
+            '',
+            '',
+            'heading (deg)',
+            plan=False,
+        ),
         Panel(
             [
                 Curve(times[:, [0, 3]], 'conventional EKF-SLAM', 6, '-', marker='s'),
                 Curve(times[:, [0, 2]], 'EKF-SLAM/TI', 2, '--', marker='o'),
             ],
-            '', 'time (s)', 'CPU a scan (ms)', plan=False,
+            '',
+            'time (s)',
+            'CPU a scan (ms)',
+            plan=False,
         ),
-    ]  # fmt: skip
-    caption = 'Paper 3, to Fig. 14: errors of the pose over time, and what a scan costs (with grid and topological '
+    ]
+    caption = (
+        'Paper 3, to Fig. 14: errors of the pose over time, '
+        'and what a scan costs (with grid and topological '
+    )
     'map).'
     return Plot('over_time', caption, panels, panel_inches=(8.5, 2.1), legend='inside')
 
@@ -135,18 +191,38 @@ def _comparisons(ti: Run, full: Run, off: Array, turned: Array) -> list[Comparis
     known, slowest = ti.features[-1], float(np.percentile(ti.step_ms, 99))
     medians = [float(np.median(done.step_ms)) for done in (ti, full)]
     return [
-        Comparison('features extracted', str(_LINES), str(known), abs(known - _LINES) <= 0.1 * _LINES,
-                   remark='the world has 88 surfaces of at least 0.8 m'),
-        Comparison('error of the position', 'about 20 cm', f'{100 * off.mean():.1f} cm (mean), {100 * off.max():.1f} '
-        f'cm (most)',
-                   bool(off.max() <= _PAPER_M)),
-        Comparison('error of the heading', 'about 5 deg', f'{turned.mean():.2f} deg (mean), {turned.max():.2f} deg '
-        f'(most)',
-                   bool(turned.max() <= _PAPER_DEG)),
-        Comparison('a step', '30-40 ms, on a machine of 2006', f'{medians[0]:.1f} ms (median), {slowest:.1f} ms (99 '
-        f'of 100)',
-                   slowest <= _PAPER_MS, timed=True),
-        Comparison('the conventional filter', 'grows', f'{medians[1]:.1f} ms (median)', timed=True,
-                   remark='with as few features as here both cost about the same: see the time by the number of '
-                   'features'),
-    ]  # fmt: skip
+        Comparison(
+            'features extracted',
+            str(_LINES),
+            str(known),
+            abs(known - _LINES) <= 0.1 * _LINES,
+            remark='the world has 88 surfaces of at least 0.8 m',
+        ),
+        Comparison(
+            'error of the position',
+            'about 20 cm',
+            f'{100 * off.mean():.1f} cm (mean), {100 * off.max():.1f} cm (most)',
+            bool(off.max() <= _PAPER_M),
+        ),
+        Comparison(
+            'error of the heading',
+            'about 5 deg',
+            f'{turned.mean():.2f} deg (mean), {turned.max():.2f} deg (most)',
+            bool(turned.max() <= _PAPER_DEG),
+        ),
+        Comparison(
+            'a step',
+            '30-40 ms, on a machine of 2006',
+            f'{medians[0]:.1f} ms (median), {slowest:.1f} ms (99 of 100)',
+            slowest <= _PAPER_MS,
+            timed=True,
+        ),
+        Comparison(
+            'the conventional filter',
+            'grows',
+            f'{medians[1]:.1f} ms (median)',
+            timed=True,
+            remark='with as few features as here both cost about the same: '
+            'see the time by the number of features',
+        ),
+    ]

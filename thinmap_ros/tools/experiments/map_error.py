@@ -17,7 +17,10 @@ _SHOWN_M = 0.3
 
 @dataclass(frozen=True, eq=False)
 class MapError:
-    """Distance of each occupied cell's centre to what is solid, m, (H, W), NaN elsewhere; share of surfaces found."""
+    """Distance of each occupied cell's centre to what is solid, m, (H, W), NaN elsewhere.
+
+    Share of surfaces found.
+    """
 
     off_m: Array
     patch: GridPatch
@@ -30,7 +33,10 @@ class MapError:
 
 
 def map_error(patch: GridPatch, world: World) -> MapError:
-    """Compare a map with its world, in the same frame. A surface is found where a cell within 0.2 m is occupied."""
+    """Compare a map with its world, in the same frame.
+
+    A surface is found where a cell within 0.2 m is occupied.
+    """
     off_m = np.full(patch.shape, np.nan)
     cells = np.argwhere(patch.occupied)
     to_solid_m = ndimage.distance_transform_edt(world.occupied == 0) * world.frame.resolution
@@ -38,7 +44,9 @@ def map_error(patch: GridPatch, world: World) -> MapError:
     at = np.clip(at, 0, np.array(world.occupied.shape) - 1)
     off_m[cells[:, 0], cells[:, 1]] = to_solid_m[at[:, 0], at[:, 1]]
     points = _points_on(surfaces(world, _SHORTEST_M))
-    to_cell_m = ndimage.distance_transform_edt(np.pad(~patch.occupied, 1, constant_values=True))[1:-1, 1:-1]
+    to_cell_m = ndimage.distance_transform_edt(np.pad(~patch.occupied, 1, constant_values=True))[
+        1:-1, 1:-1
+    ]
     inside = patch.contains(points)
     there = patch.frame.cells_of(points[inside])
     near = to_cell_m[there[:, 0], there[:, 1]] * patch.frame.resolution <= _FOUND_M
@@ -60,13 +68,23 @@ def panels(error: MapError, world: World) -> list[Panel]:
 
 
 def row(name: str, error: MapError) -> list[object]:
-    """Name, occupied cells, and how far they are off: mean, 95 of 100, share within a cell; share of surfaces found."""
+    """Name, occupied cells, and how far they are off: mean, 95 of 100, share within a cell.
+
+    Share of surfaces found.
+    """
     off = error.cells_off_m
     within = float((off <= error.patch.frame.resolution).mean())
     return [name, len(off), float(off.mean()), float(np.percentile(off, 95)), within, error.found]
 
 
-COLUMNS = ['map', 'occupied_cells', 'mean_off_m', 'p95_off_m', 'share_within_a_cell', 'surfaces_found']
+COLUMNS = [
+    'map',
+    'occupied_cells',
+    'mean_off_m',
+    'p95_off_m',
+    'share_within_a_cell',
+    'surfaces_found',
+]
 
 
 def _points_on(lines: Array) -> Array:

@@ -29,7 +29,7 @@ def patch_at_rest(name: str) -> GridPatch:
 
 
 def patch_of_world(world: World) -> GridPatch:
-    """Cells of 0.1 m: free where all of it is and the start is joined to it, unknown outside, else occupied."""
+    """0.1 m cells: free where wholly so and joined to the start, unknown outside, else occupied."""
     low = np.floor(np.array([world.frame.origin_x, world.frame.origin_y]) / CELL_M - 1e-6)
     rows, cols = world.occupied.shape
     cells = np.floor(world.frame.centres_of(np.array([[rows - 1, cols - 1]]))[0] / CELL_M) - low + 1

@@ -35,7 +35,10 @@ def run(source: Source) -> Outcome:
         patch = _patch(boxes)
         graph = build(patch, None, TopologyConfig())
         rows.append([name, *_counts(graph)])
-        ends = [[*graph.nodes[edge.a].position, *graph.nodes[edge.b].position] for edge in graph.edges.values()]
+        ends = [
+            [*graph.nodes[edge.a].position, *graph.nodes[edge.b].position]
+            for edge in graph.edges.values()
+        ]
         lines = Segments(np.array(ends), 'straight between nodes', 'black', 0.8)
         panels.append(Panel([MapLayer(patch), GraphLayer(graph, 7.0), lines], name))
     room = patch_at_rest('room_10x10')
@@ -45,18 +48,34 @@ def run(source: Source) -> Outcome:
     return Outcome(
         'Three kinds of nodes',
         'Exploration paper, section 2.2, Fig. 3 and 4',
-        'A cell of the skeleton with one neighbour is an end node, one where three and more edges meet a branch '
-        'node. A corner node stands where an obstacle blocks the straight line between two nodes.',
+        'A cell of the skeleton with one neighbour is an end node, one where three and more edges '
+        'meet a branch node. '
+        'A corner node stands where an obstacle blocks the straight line between two nodes.',
         [Table('nodes', ['shape', 'end', 'branch', 'corner'], rows)],
         [
-            Plot('fig3', 'Paper 2, Fig. 3: which nodes a shape has.', panels, columns=2, panel_inches=(4.4, 3.6)),
             Plot(
-                'fig4', 'Paper 2, Fig. 4: the three types of nodes in the room of 10 x 10 m.',
-                [Panel([MapLayer(room), GraphLayer(graph, 7.0)])], panel_inches=(6.5, 6.5),
+                'fig3',
+                'Paper 2, Fig. 3: which nodes a shape has.',
+                panels,
+                columns=2,
+                panel_inches=(4.4, 3.6),
+            ),
+            Plot(
+                'fig4',
+                'Paper 2, Fig. 4: the three types of nodes in the room of 10 x 10 m.',
+                [Panel([MapLayer(room), GraphLayer(graph, 7.0)])],
+                panel_inches=(6.5, 6.5),
             ),
         ],
-        [Comparison('nodes of the four shapes', 'as drawn in Fig. 3', 'the same' if right else 'others', right)],
-    )  # fmt: skip
+        [
+            Comparison(
+                'nodes of the four shapes',
+                'as drawn in Fig. 3',
+                'the same' if right else 'others',
+                right,
+            )
+        ],
+    )
 
 
 def _patch(boxes: list[tuple[float, float, float, float]]) -> GridPatch:

@@ -24,25 +24,32 @@ def run(source: Source) -> Outcome:
     return Outcome(
         'The map of an office',
         'SLAM paper, section 5.1, Fig. 10',
-        'The office of 9.5 x 7.5 m with furniture; a Pioneer 3-AT with an LMS200 drives its tour at 0.2 m/s '
-        f'({done.way_m:.0f} m). Cells of 0.1 m.',
+        'The office of 9.5 x 7.5 m with furniture; a Pioneer 3-AT with an LMS200 drives its tour '
+        f'at 0.2 m/s ({done.way_m:.0f} m). Cells of 0.1 m.',
         [Table('map', map_error.COLUMNS, [row])],
         [
             Plot(
-                'fig10', 'Paper 3, Fig. 10: (a) CAD data, (b) grid map by EKF-SLAM/TI, (c) its errors.',
-                map_error.panels(error, world), columns=3, panel_inches=(4.6, 3.9),
+                'fig10',
+                'Paper 3, Fig. 10: (a) CAD data, (b) grid map by EKF-SLAM/TI, (c) its errors.',
+                map_error.panels(error, world),
+                columns=3,
+                panel_inches=(4.6, 3.9),
             )
         ],
         [
             Comparison(
-                'map against CAD data', 'similar to the accurate map',
-                f'occupied cells {100 * error.cells_off_m.mean():.1f} cm off (mean), {float(str(row[4])):.0%} within '
-                'a cell; '
-                f'{error.found:.0%} of all surfaces found', bool(error.cells_off_m.mean() < 0.1),
+                'map against CAD data',
+                'similar to the accurate map',
+                f'occupied cells {100 * error.cells_off_m.mean():.1f} cm off (mean), '
+                f'{float(str(row[4])):.0%} within a cell; '
+                f'{error.found:.0%} of all surfaces found',
+                bool(error.cells_off_m.mean() < 0.1),
             ),
             Comparison(
-                'pose', '', f'{100 * off.mean():.1f} cm off (mean), {100 * off.max():.1f} cm (most); '
+                'pose',
+                '',
+                f'{100 * off.mean():.1f} cm off (mean), {100 * off.max():.1f} cm (most); '
                 f'wheels alone {wheels[-1]:.2f} m at the end',
             ),
         ],
-    )  # fmt: skip
+    )

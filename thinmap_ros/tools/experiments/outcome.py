@@ -13,7 +13,10 @@ Rows = list[list[Any]]
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Rows under columns (with units in their names). timed: holds times, so it is not the same from run to run."""
+    """Rows under columns (with units in their names).
+
+    timed: holds times, so it is not the same from run to run.
+    """
 
     name: str
     columns: Sequence[str]
@@ -31,7 +34,10 @@ class Table:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What the paper reports beside what came out here; met: whether that is as good, None: there is no number."""
+    """What the paper reports beside what came out here.
+
+    Met: whether that is as good, None: there is no number.
+    """
 
     what: str
     paper: str

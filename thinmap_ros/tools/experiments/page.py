@@ -1,4 +1,4 @@
-"""Pages of the results of experiments, in HTML and in Markdown, made of the files in their folders alone."""
+"""Pages of experiments' results, in HTML and Markdown, made of the files in their folders alone."""
 
 import json
 from html import escape
@@ -28,10 +28,13 @@ def read_about(out: Path, name: str) -> About:
 def write_page(out: Path, names: list[str]) -> Path:
     """Write index.html over the experiments in a folder; returns its path."""
     sections = [_section(name, read_about(out, name)) for name in names]
-    links = ''.join(f'<li><a href="#{name}">{escape(read_about(out, name)["title"])}</a></li>' for name in names)
+    links = ''.join(
+        f'<li><a href="#{name}">{escape(read_about(out, name)["title"])}</a></li>' for name in names
+    )
     text = (
-        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>thinmap: experiments</title>'
-        f"<style>{_STYLE}</style></head><body>\n<h1>The papers' experiments</h1>\n<ul>{links}</ul>\n"
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        f'<title>thinmap: experiments</title><style>{_STYLE}</style></head><body>\n'
+        f"<h1>The papers' experiments</h1>\n<ul>{links}</ul>\n"
         + '\n'.join(sections)
         + '\n</body></html>\n'
     )
@@ -40,14 +43,18 @@ def write_page(out: Path, names: list[str]) -> Path:
 
 
 def _section(name: str, about: About) -> str:
-    parts = [f'<h2 id="{name}">{escape(about["title"])}</h2>', f'<p><b>{escape(about["source"])}</b></p>']
+    parts = [
+        f'<h2 id="{name}">{escape(about["title"])}</h2>',
+        f'<p><b>{escape(about["source"])}</b></p>',
+    ]
     parts.append(f'<p>{escape(about["how"])}</p>')
     if about['comparisons']:
         parts.append(_comparisons(about['comparisons']))
     for plot in about['plots']:
         file = f'{name}/{plot["name"]}'
         parts.append(
-            f'<figure><a href="{file}.svg"><img src="{file}.png" alt="{escape(plot["caption"])}"></a>'
+            f'<figure><a href="{file}.svg">'
+            f'<img src="{file}.png" alt="{escape(plot["caption"])}"></a>'
             f'<figcaption>{escape(plot["caption"])}</figcaption></figure>'
         )
     tables = [
@@ -63,7 +70,9 @@ def _comparisons(comparisons: list[dict[str, Any]]) -> str:
     for c in comparisons:
         cells = ''.join(f'<td>{escape(c[key])}</td>' for key in ('what', 'paper', 'ours'))
         verdict = _VERDICTS[c['met']]
-        rows.append(f'<tr>{cells}<td class="{verdict}">{verdict}</td><td>{escape(c["remark"])}</td></tr>')
+        rows.append(
+            f'<tr>{cells}<td class="{verdict}">{verdict}</td><td>{escape(c["remark"])}</td></tr>'
+        )
     head = '<tr><th>what</th><th>paper</th><th>here</th><th>met</th><th>remark</th></tr>'
     return f'<table>{head}{"".join(rows)}</table>'
 
@@ -71,18 +80,22 @@ def _comparisons(comparisons: list[dict[str, Any]]) -> str:
 _HEAD = """\
 # The papers' experiments
 
-Made by `scripts/experiments/all.sh --docs docs` from the files that the experiments leave in `out/experiments`; the
-same seed gives the same numbers, but for times. The robots are simulated, with noise as of real ones, but for the logs
-at the end. One experiment alone: `scripts/experiments/NAME.sh`; from the recorded drives, with the same figures (poses
-within 1 mm): `scripts/experiments/NAME.sh --from-bag bags`.
+Made by `scripts/experiments/all.sh --docs docs` from the files that the experiments leave in
+`out/experiments`; the same seed gives the same numbers, but for times. The robots are simulated,
+with noise as of real ones, but for the logs at the end. One experiment alone:
+`scripts/experiments/NAME.sh`; from the recorded drives, with the same figures (poses within 1 mm):
+`scripts/experiments/NAME.sh --from-bag bags`.
 
-Papers: 1 thinning-based topological maps, 2 exploration by position probability, 3 EKF-SLAM with topological
-information.
+Papers: 1 thinning-based topological maps, 2 exploration by position probability, 3 EKF-SLAM with
+topological information.
 """
 
 
 def write_markdown(out: Path, names: list[str], docs: Path) -> Path:
-    """Write experiments.md over the experiments in a folder, their figures to docs/experiments; returns its path."""
+    """Write experiments.md over the experiments in a folder, their figures to docs/experiments.
+
+    Returns its path.
+    """
     parts = [_HEAD]
     for name in names:
         about = read_about(out, name)

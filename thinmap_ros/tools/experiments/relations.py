@@ -1,7 +1,7 @@
 """The error of a trajectory by known relations between its poses.
 
-Source: Kuemmerle et al., "On measuring the accuracy of SLAM algorithms", 2009: for each relation the difference of the
-true motion between two stamps and the estimated one.
+Source: Kuemmerle et al., "On measuring the accuracy of SLAM algorithms", 2009: for each relation
+the difference of the true motion between two stamps and the estimated one.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,9 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array, wrap
 
-_NEAR_S = 0.1  # a pose this near to a stamp is the one of that stamp; else it is moved along the odometry
+_NEAR_S = (
+    0.1  # a pose this near to a stamp is the one of that stamp; else it is moved along the odometry
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +28,10 @@ class RelationErrors:
 
 
 def read_columns(path: Path, columns: list[int]) -> Array:
-    """Some columns (N, len(columns)) of a text of numbers. Raises InputError where a line has no such numbers."""
+    """Some columns (N, len(columns)) of a text of numbers.
+
+    Raises InputError where a line has no such numbers.
+    """
     rows = []
     for number, line in enumerate(read_text(path).splitlines(), 1):
         words = line.split('#')[0].split()
@@ -34,11 +39,15 @@ def read_columns(path: Path, columns: list[int]) -> Array:
             try:
                 rows.append([float(words[k]) for k in columns])
             except (ValueError, IndexError):
-                raise InputError(f'{path}: line {number}: expected numbers in {max(columns) + 1} columns') from None
+                raise InputError(
+                    f'{path}: line {number}: expected numbers in {max(columns) + 1} columns'
+                ) from None
     return np.array(rows, dtype=np.float64).reshape(-1, len(columns))
 
 
-def relation_errors(times_s: Array, poses: Array, relations: Path, odometry: Path) -> RelationErrors:
+def relation_errors(
+    times_s: Array, poses: Array, relations: Path, odometry: Path
+) -> RelationErrors:
     """Errors of poses (N, 3) at times (N,), s, by a file of relations `t1 t2 x y z roll pitch yaw`.
 
     odometry: a file of `t x y theta`.
@@ -59,10 +68,14 @@ def _pose_at(t: float, times: Array, path: Array, wheels: Array) -> Array:
     k = _nearest(times, t)
     if abs(times[k] - t) <= _NEAR_S:
         return np.asarray(path[k])
-    moved = se2.between(wheels[_nearest(wheels[:, 0], times[k]), 1:], wheels[_nearest(wheels[:, 0], t), 1:])
+    moved = se2.between(
+        wheels[_nearest(wheels[:, 0], times[k]), 1:], wheels[_nearest(wheels[:, 0], t), 1:]
+    )
     return se2.compose(path[k], moved)
 
 
 def _nearest(times: Array, t: float) -> int:
     k = int(np.searchsorted(times, t))
-    return min((j for j in (k - 1, k) if 0 <= j < len(times)), key=lambda j: abs(float(times[j]) - t))
+    return min(
+        (j for j in (k - 1, k) if 0 <= j < len(times)), key=lambda j: abs(float(times[j]) - t)
+    )

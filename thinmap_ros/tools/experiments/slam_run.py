@@ -17,7 +17,10 @@ Watch = Callable[[int, Look, Pipeline, Step], None]
 
 @dataclass(eq=False)
 class Run:
-    """What came of each scan: seconds (N,); poses (N, 3) true, by odometry and estimated; 1 sigma (N, 3); features."""
+    """What came of each scan: seconds (N,); poses (N, 3) true, by odometry and estimated.
+
+    1 sigma (N, 3); features.
+    """
 
     pipeline: Pipeline
     seconds: list[float] = field(default_factory=list)
@@ -31,7 +34,10 @@ class Run:
     step_ms: list[float] = field(default_factory=list)
 
     def errors(self, poses: list[Array] | None = None) -> Array:
-        """How far poses (N, 3), or the estimates, are off: along and across the true heading, m, and in it, rad."""
+        """How far poses (N, 3), or the estimates, are off.
+
+        Along and across the true heading, m, and in it, rad.
+        """
         found = self.estimate if poses is None else poses
         return np.array([se2.between(T, other) for T, other in zip(self.truth, found, strict=True)])
 
@@ -42,7 +48,10 @@ class Run:
 
 
 def run_slam(looks: Iterable[Look], slam: str = 'ti', watch: Watch | None = None) -> Run:
-    """Run a drive; the map's frame is the world's. watch is called after each scan with its number."""
+    """Run a drive; the map's frame is the world's.
+
+    watch is called after each scan with its number.
+    """
     run: Run | None = None
     for k, look in enumerate(looks):
         if run is None:
@@ -54,7 +63,9 @@ def run_slam(looks: Iterable[Look], slam: str = 'ti', watch: Watch | None = None
         run.step_ms.append(1e3 * (process_time() - began))
         run.seconds.append(look.scan.stamp_ns / 1e9)
         run.truth.append(look.T_world_base)
-        run.odometry.append(se2.compose(start.T_world_base, se2.between(start.T_odom_base, look.T_odom_base)))
+        run.odometry.append(
+            se2.compose(start.T_world_base, se2.between(start.T_odom_base, look.T_odom_base))
+        )
         run.estimate.append(step.estimate.T_map_base)
         run.sigmas.append(np.sqrt(np.diag(step.estimate.covariance)))
         run.features.append(step.estimate.n_features)

@@ -14,7 +14,8 @@ from thinmap_ros.tools.experiments.outcome import Comparison, Outcome, Table
 
 Mask = NDArray[np.bool_]
 _SHOWN = (1, 2, 5, 8, 10, 13)
-# Neighbours p2 ... p9 in rows and columns, clockwise from north; as in pictures, the row before lies to the north.
+# Neighbours p2 ... p9 in rows and columns, clockwise from north; as in pictures, the row before
+# lies to the north.
 _AROUND = ((-1, 0), (-1, 1), (0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1))
 
 
@@ -30,26 +31,39 @@ def run(source: Source) -> Outcome:
     last = len(all_stages) - 1
     panels += [_panel(patch, all_stages[k], f'stage {k}') for k in _SHOWN if k <= last]
     graph = build(patch, start, TopologyConfig())
-    panels.append(Panel([MapLayer(patch), GraphLayer(graph, 4.0)], f'final result: stage {last}, with nodes'))
+    panels.append(
+        Panel([MapLayer(patch), GraphLayer(graph, 4.0)], f'final result: stage {last}, with nodes')
+    )
     return Outcome(
         'Stages of thinning',
         'Exploration paper, section 2.1, Fig. 2 (and SLAM paper, Fig. 4)',
-        'The room of 10 x 10 m, 0.1 m a cell. Free is where the centre of a robot of 0.25 m radius can be. A stage '
-        'is both '
-        "sub-iterations, by a plain copy of the paper's rules.",
-        [Table('stages', ['stage', 'cells_left'], [[k, int(cells.sum())] for k, cells in enumerate(all_stages)])],
+        'The room of 10 x 10 m, 0.1 m a cell. '
+        'Free is where the centre of a robot of 0.25 m radius can be. '
+        "A stage is both sub-iterations, by a plain copy of the paper's rules.",
+        [
+            Table(
+                'stages',
+                ['stage', 'cells_left'],
+                [[k, int(cells.sum())] for k, cells in enumerate(all_stages)],
+            )
+        ],
         [
             Plot(
-                'fig2', 'Paper 2, Fig. 2: environment, selection of free space, and thinning stage by stage (dark: '
-                'what is '
-                'left).', panels, columns=3, panel_inches=(3.6, 3.6),
+                'fig2',
+                'Paper 2, Fig. 2: environment, selection of free space, '
+                'and thinning stage by stage (dark: what is left).',
+                panels,
+                columns=3,
+                panel_inches=(3.6, 3.6),
             )
         ],
         [
             Comparison('stages until nothing changes', 'more than 13', str(last)),
-            Comparison('the fast thinning gives the very same cells', '', 'yes' if same else 'no', same),
+            Comparison(
+                'the fast thinning gives the very same cells', '', 'yes' if same else 'no', same
+            ),
         ],
-    )  # fmt: skip
+    )
 
 
 def stages(free: Mask) -> list[Mask]:
@@ -68,7 +82,9 @@ def stages(free: Mask) -> list[Mask]:
 def _sub_iteration(cells: Mask, first: bool) -> Mask:
     padded = np.pad(cells, 1).astype(np.int8)
     rows, cols = cells.shape
-    p = [padded[1 + down : 1 + down + rows, 1 + right : 1 + right + cols] for down, right in _AROUND]
+    p = [
+        padded[1 + down : 1 + down + rows, 1 + right : 1 + right + cols] for down, right in _AROUND
+    ]
     count = np.sum(p, axis=0)
     rises = np.sum([(p[k] == 0) & (p[(k + 1) % 8] == 1) for k in range(8)], axis=0)
     north, east, south, west = p[0], p[2], p[4], p[6]

@@ -1,4 +1,4 @@
-"""Paper 1, Fig. 3 and 4: a local topological map of one scan, and thinning against the Voronoi diagram."""
+"""Paper 1, Fig. 3, 4: local topological map of a scan; thinning against the Voronoi diagram."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -33,35 +33,52 @@ def run(source: Source) -> Outcome:
     times: Rows = []
     for name, patch in maps.items():
         for prune_m in _PRUNE_M:
-            (thin_s, thinned), (voronoi_s, voronoi) = (_timed(work) for work in _methods(patch, prune_m))
+            (thin_s, thinned), (voronoi_s, voronoi) = map(_timed, _methods(patch, prune_m))
             sizes = [len(thinned.nodes), len(voronoi.nodes), len(thinned.edges), len(voronoi.edges)]
             counts.append([name, prune_m, *sizes])
             times.append([name, prune_m, 1e3 * thin_s, 1e3 * voronoi_s])
     more = {prune_m: n - v for name, prune_m, n, v, *_ in counts if name == 'lab'}
     faster = float(np.median([voronoi_ms / thin_ms for _, _, thin_ms, voronoi_ms in times]))
-    columns = ['map', 'prune_m', 'nodes_thinning', 'nodes_voronoi', 'edges_thinning', 'edges_voronoi']
+    columns = [
+        'map',
+        'prune_m',
+        'nodes_thinning',
+        'nodes_voronoi',
+        'edges_thinning',
+        'edges_voronoi',
+    ]
     return Outcome(
         'Thinning against the Voronoi diagram',
         'Topological map paper, section 2.1, Fig. 3 and 4',
-        'The map of the laboratory, merged from its twelve stops, and worlds as they are, 0.1 m a cell. Dead ends '
-        'up to the pruning distance are dropped: by the Voronoi diagram of all obstacle cells, or as spurs of the '
-        'skeleton.',
+        'The map of the laboratory, merged from its twelve stops, and worlds as they are, '
+        '0.1 m a cell. Dead ends up to the pruning distance are dropped: '
+        'by the Voronoi diagram of all obstacle cells, or as spurs of the skeleton.',
         [
             Table('nodes', columns, counts),
             Table('times', ['map', 'prune_m', 'thinning_ms', 'voronoi_ms'], times, timed=True),
         ],
         [_local_map(looks[_STOP : _STOP + _LOOKS]), _both(maps['lab']), _curves(counts, times)],
         [
-            Comparison('computing', 'thinning needs less', f'{faster:.0f} times less (median)', faster > 1.0, True),
             Comparison(
-                'nodes of thinning beyond those of Voronoi, in the laboratory', f'{_MORE_NODES} in its example',
-                ', '.join(f'{more[prune_m]:+d} with dead ends up to {prune_m:g} m dropped' for prune_m in _TOLD_M),
+                'computing',
+                'thinning needs less',
+                f'{faster:.0f} times less (median)',
+                faster > 1.0,
+                True,
+            ),
+            Comparison(
+                'nodes of thinning beyond those of Voronoi, in the laboratory',
+                f'{_MORE_NODES} in its example',
+                ', '.join(
+                    f'{more[prune_m]:+d} with dead ends up to {prune_m:g} m dropped'
+                    for prune_m in _TOLD_M
+                ),
                 max(more.values()) >= _MORE_NODES,
-                remark='A Voronoi diagram grows a branch into each corner; without these thinning has more nodes, '
-                'by its corner nodes.',
+                remark='A Voronoi diagram grows a branch into each corner; '
+                'without these thinning has more nodes, by its corner nodes.',
             ),
         ],
-    )  # fmt: skip
+    )
 
 
 def _methods(patch: GridPatch, prune_m: float) -> Iterator[Callable[[], TopologicalMap]]:
@@ -88,10 +105,12 @@ def _local_map(looks: list[Look]) -> Plot:
     robot = np.array([look.T_world_base])
     return Plot(
         'fig3',
-        'Paper 1, Fig. 3: (a) range data of one scan, laser at the origin; (b) the binary map of four such scans, '
-        'with arcs and nodes by thinning.',
+        'Paper 1, Fig. 3: (a) range data of one scan, laser at the origin; '
+        '(b) the binary map of four such scans, with arcs and nodes by thinning.',
         [
-            Panel([Curve(points, 'range data', 0, '', '.'), Robots(np.zeros((1, 3)), 'laser')], '(a)'),
+            Panel(
+                [Curve(points, 'range data', 0, '', '.'), Robots(np.zeros((1, 3)), 'laser')], '(a)'
+            ),
             Panel([MapLayer(patch), GraphLayer(graph), Robots(robot)], '(b)'),
         ],
         columns=2,
@@ -103,8 +122,8 @@ def _both(patch: GridPatch) -> Plot:
     thinned, voronoi = (work() for work in _methods(patch, _SHOWN_M))
     return Plot(
         'fig4',
-        'Paper 1, Fig. 4: the laboratory by Voronoi diagram (left) and by thinning (right), dead ends up to '
-        f'{_SHOWN_M} m dropped in both.',
+        'Paper 1, Fig. 4: the laboratory by Voronoi diagram (left) and by thinning (right), '
+        f'dead ends up to {_SHOWN_M} m dropped in both.',
         [
             Panel([MapLayer(patch), GraphLayer(voronoi)], f'Voronoi: {len(voronoi.nodes)} nodes'),
             Panel([MapLayer(patch), GraphLayer(thinned)], f'thinning: {len(thinned.nodes)} nodes'),
@@ -128,7 +147,9 @@ def _curves(counts: Rows, times: Rows) -> Plot:
         panels.append(Panel(layers, '', 'pruning distance (m)', label, plan=False, log_y=log))
     return Plot(
         'fig4_by_pruning',
-        'Paper 1, to Fig. 4: nodes and computing time by the length of dead ends that are dropped; map of the '
-        'laboratory.',
-        panels, columns=2, panel_inches=(4.5, 3.4),
-    )  # fmt: skip
+        'Paper 1, to Fig. 4: nodes and computing time by the length of dead ends that are dropped; '
+        'map of the laboratory.',
+        panels,
+        columns=2,
+        panel_inches=(4.5, 3.4),
+    )
