@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -22,6 +24,16 @@ settings.load_profile('thinmap')
 # start and interrupt.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile the kernels before any test: `colcon test` in a workspace that was just built.
+
+    Within the tests it would take the time of those that come first. scripts/env has done it.
+    """
+    is_worker = hasattr(session.config, 'workerinput')
+    if not is_worker and not session.config.option.collectonly and 'THINMAP_ENV' not in os.environ:
+        subprocess.run([sys.executable, '-m', 'thinmap_ros.tools.warm_up'], cwd=ROOT, check=True)
 
 
 @pytest.fixture(scope='session')

@@ -4,8 +4,6 @@ One that is started again soon goes on from there.
 """
 
 import os
-import stat
-import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -17,11 +15,10 @@ from rclpy.node import Node
 from thinmap_ros.adapters.archive_files import opened, read_arrays
 from thinmap_ros.adapters.files import parts_of, written_aside
 from thinmap_ros.core.errors import InputError, reason_of
+from thinmap_ros.core.private_folder import private_folder, temporary_folder
 
 State = dict[str, NDArray[Any]]
 _FOLDER = 'THINMAP_STATE_DIR'
-_MODE = 0o700
-_OF_OTHERS = 0o077
 
 
 class Recovery:
@@ -90,18 +87,8 @@ def state_folder() -> Path:
     """
     chosen = os.environ.get(_FOLDER)
     runtime = os.environ.get('XDG_RUNTIME_DIR')
-    base = Path(runtime) if runtime and Path(runtime).is_dir() else Path(tempfile.gettempdir())
-    folder = Path(chosen) if chosen else base / f'thinmap-{os.getuid()}'
-    try:
-        folder.mkdir(mode=_MODE, parents=True, exist_ok=True)
-        status = folder.lstat()
-    except OSError as error:
-        raise InputError(f'{folder}: {error.strerror}: expected a folder for states') from error
-    if not stat.S_ISDIR(status.st_mode):
-        raise InputError(f'{folder}: expected a folder, not a link or a file')
-    if status.st_uid != os.getuid():
-        raise InputError(f'{folder}: of user {status.st_uid}: expected a folder of this user')
-    if status.st_mode & _OF_OTHERS:
-        mode = stat.S_IMODE(status.st_mode)
-        raise InputError(f'{folder}: mode {mode:o}: expected {_MODE:o}, closed to other users')
-    return folder
+    if chosen:
+        return private_folder(Path(chosen))
+    if runtime and Path(runtime).is_dir():
+        return private_folder(Path(runtime) / temporary_folder().name)
+    return private_folder(temporary_folder())

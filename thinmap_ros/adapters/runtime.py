@@ -13,6 +13,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from thinmap_ros.adapters import parameters
+from thinmap_ros.adapters.compiling import report_compilation
 from thinmap_ros.adapters.pages import give_back_pages, release_compiler_pages
 from thinmap_ros.core.errors import ThinmapError
 
@@ -39,12 +40,14 @@ def run_all(make_nodes: Sequence[Callable[[], Node]]) -> None:
     """
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     _on_signals(_leave)
+    compilation = report_compilation()
     nodes: list[Node] = []
     try:
         with parameters.shared_by(len(make_nodes)):
             nodes.extend(make() for make in make_nodes)
         for node in nodes:
             getattr(node, 'start', lambda: None)()
+        compilation.end()
         release_compiler_pages()
         _spin(nodes)
     except ExternalShutdownException:

@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable
+from functools import partial
 from importlib import import_module
 
 from rclpy.node import Node
@@ -18,15 +19,16 @@ There are also: {', '.join(_OTHERS)}.
 A parameter goes to every node that has it; -p localizer:slam:=off goes to one."""
 
 
-def maker(name: str) -> Callable[[], Node]:
-    """What makes the node of a module of this package."""
+def makers(names: list[str]) -> list[Callable[[], Node]]:
+    """What makes the nodes of these modules of this package, one each."""
 
-    def make() -> Node:
-        # Imported here: a node that is not asked for costs nothing.
-        module = import_module(f'thinmap_ros.nodes.{name}')
-        return getattr(module, f'{name.title().replace("_", "")}Node')()
+    def make(name: str) -> Node:
+        # Imported here: a node that is not asked for costs nothing. All of them before the first
+        # is made: the kernels of all are counted then.
+        modules = {each: import_module(f'thinmap_ros.nodes.{each}') for each in names}
+        return getattr(modules[name], f'{name.title().replace("_", "")}Node')()
 
-    return make
+    return [partial(make, name) for name in names]
 
 
 def main() -> None:
@@ -42,7 +44,7 @@ def main() -> None:
             file=sys.stderr,
         )
         sys.exit(2)
-    runtime.run_all([maker(name) for name in names])
+    runtime.run_all(makers(names))
 
 
 if __name__ == '__main__':

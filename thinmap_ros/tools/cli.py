@@ -11,6 +11,7 @@ import numpy as np
 
 from thinmap_ros.adapters.bags import BagLog
 from thinmap_ros.adapters.carmen import CarmenLog, LaserOptions
+from thinmap_ros.adapters.compiling import report_compilation
 from thinmap_ros.adapters.events import Log
 from thinmap_ros.adapters.log_formats import is_mcap
 from thinmap_ros.core.config import Config
@@ -28,6 +29,7 @@ def run(work: Callable[[argparse.Namespace], None], parser: argparse.ArgumentPar
     0, 2 after one line on what is wrong, or 130 on Ctrl-C.
     """
     arguments = parser.parse_args()
+    compilation = report_compilation()
     try:
         work(arguments)
     except (ThinmapError, OSError) as error:
@@ -36,6 +38,8 @@ def run(work: Callable[[argparse.Namespace], None], parser: argparse.ArgumentPar
     except KeyboardInterrupt:
         print(f'{parser.prog}: interrupted', file=sys.stderr)
         sys.exit(INTERRUPTED)
+    finally:
+        compilation.end()
 
 
 def add_config(parser: Options, config: type[Config], names: list[str] | None = None) -> None:

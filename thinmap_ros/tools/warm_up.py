@@ -1,26 +1,40 @@
-"""Compiles all kernels into their caches, so that no node has to wait for that at its start."""
+"""Compiles all kernels and keeps them, so that no program has to wait for that at its start."""
+
+import argparse
 
 from thinmap_ros import warm_up
 from thinmap_ros.adapters import resources
 from thinmap_ros.adapters.world_files import read_world
+from thinmap_ros.core import kernel_cache
 from thinmap_ros.sim.world import World
-from thinmap_ros.tools import explore_world
+from thinmap_ros.tools import cli, explore_world
+
+_REHEARSALS = (
+    warm_up.localizer,
+    warm_up.grid_mapper,
+    warm_up.topology_builder,
+    warm_up.explorer,
+    warm_up.navigator,
+    warm_up.global_localizer,
+)
 
 
 def main() -> None:
+    """Run the command line."""
+    cli.run(work, argparse.ArgumentParser(prog='warm_up', description=__doc__))
+
+
+def work(arguments: argparse.Namespace) -> None:
     """Rehearse every algorithm, and an exploration in the simulator."""
-    for rehearse in (
-        warm_up.localizer,
-        warm_up.grid_mapper,
-        warm_up.topology_builder,
-        warm_up.explorer,
-        warm_up.navigator,
-        warm_up.global_localizer,
-    ):
+    for rehearse in _REHEARSALS:
         rehearse()
     world = World.from_patch(*read_world(resources.world_path('office')))
     # What is needed only where there are several places to go to is reached by a whole exploration.
     explore_world.explore(world, world.start, explore_world.Options(localization='slam'))
+    kept = kernel_cache.folder()
+    print(
+        f'all kernels are compiled, and kept in {kept}' if kept else 'there is no folder for them'
+    )
 
 
 if __name__ == '__main__':

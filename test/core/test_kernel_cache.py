@@ -1,0 +1,152 @@
+"""Kernels are kept where there is room for them, and compiled anew when what they hold changed."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from thinmap_ros.core import kernel_cache
+
+CONSTANT = 'GAIN = {gain}\n'
+MODULE = """
+from thinmap_ros.core.constant import GAIN
+from thinmap_ros.core.jit import kernel
+
+@kernel
+def amplified(value):
+    return GAIN * value
+"""
+PROGRAM = """
+from thinmap_ros.adapters.compiling import report_compilation
+report = report_compilation()
+from thinmap_ros.core import jit, kernel_cache
+from thinmap_ros.core.amplifier import amplified
+print(amplified(3.0), kernel_cache.folder())
+report.end()
+"""
+
+
+class Install:
+    """A copy of the package with a kernel of its own, in a folder, and programs run with it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.package = folder / 'thinmap_ros'
+        leave_out = shutil.ignore_patterns('__pycache__')
+        for name in ('core', 'adapters'):
+            shutil.copytree(kernel_cache.PACKAGE / name, self.package / name, ignore=leave_out)
+        (self.package / '__init__.py').touch()
+        (self.package / 'core' / 'amplifier.py').write_text(MODULE)
+        self.set_gain(2.0)
+
+    def set_gain(self, gain: float) -> None:
+        """Change a constant of another module than the kernel's."""
+        (self.package / 'core' / 'constant.py').write_text(CONSTANT.format(gain=gain))
+
+    def close_to_writing(self) -> None:
+        """Leave no room beside the package, for root neither."""
+        (self.package / '__pycache__').touch()
+
+    def run(self, **variables: str) -> tuple[list[str], str]:
+        """What the program prints: value and folder; and what it says on stderr."""
+        environment = {**os.environ, 'PYTHONPATH': str(self.folder), 'PYTHONDONTWRITEBYTECODE': '1'}
+        for name in ('NUMBA_CACHE_DIR', 'XDG_CACHE_HOME', 'HOME'):
+            environment.pop(name, None)
+        environment |= {'XDG_CACHE_HOME': str(self.folder / 'home'), **variables}
+        command = [sys.executable, '-c', PROGRAM]
+        done = subprocess.run(
+            command, cwd=self.folder, env=environment, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout.split(), done.stderr
+
+
+@pytest.fixture
+def install(tmp_path: Path) -> Install:
+    return Install(tmp_path)
+
+
+def test_the_first_run_says_that_it_compiles_and_later_ones_need_not(install: Install) -> None:
+    (value, folder), said = install.run()
+    assert value == '6.0'
+    assert folder == str(install.package / '__pycache__' / 'kernels')
+    first, last = said.splitlines()
+    assert first == 'thinmap: compiling kernels, once (1 of 1)'
+    assert last.startswith('thinmap: kernels compiled in ')
+    assert last.endswith(f'kept in {folder}')
+    assert install.run() == (['6.0', folder], '')
+
+
+def test_a_kernel_follows_what_it_imports(install: Install) -> None:
+    """Numba itself looks at the kernel's own module alone, and would say 6.0 for ever."""
+    install.run()
+    install.set_gain(5.0)
+    (value, _), said = install.run()
+    assert value == '15.0'
+    assert 'compiling' in said
+
+
+def test_a_comment_elsewhere_costs_nothing(install: Install) -> None:
+    install.run()
+    with (install.package / 'core' / 'scan.py').open('a') as other:
+        other.write('# No module of the kernel.\n')
+    assert install.run()[1] == ''
+
+
+def test_a_read_only_install_keeps_them_in_the_cache_of_the_user(install: Install) -> None:
+    install.close_to_writing()
+    (value, folder), _ = install.run()
+    assert value == '6.0'
+    assert Path(folder).parent == install.folder / 'home' / 'thinmap'
+    assert install.run() == (['6.0', folder], '')
+
+
+def test_without_a_home_they_are_kept_among_the_temporary_files(install: Install) -> None:
+    install.close_to_writing()
+    variables = {'XDG_CACHE_HOME': '/dev/null/home', 'TMPDIR': str(install.folder)}
+    (value, folder), _ = install.run(**variables)
+    private = install.folder / f'thinmap-{os.getuid()}'
+    assert value == '6.0'
+    assert private in Path(folder).parents
+    assert private.stat().st_mode & 0o777 == 0o700
+    assert install.run(**variables) == (['6.0', folder], '')
+
+
+def test_kernels_are_not_kept_where_others_may_write(install: Install) -> None:
+    """They are code."""
+    install.close_to_writing()
+    private = install.folder / f'thinmap-{os.getuid()}'
+    private.mkdir()
+    private.chmod(0o777)
+    variables = {'XDG_CACHE_HOME': '/dev/null/home', 'TMPDIR': str(install.folder)}
+    (value, folder), said = install.run(**variables)
+    assert (value, folder) == ('6.0', 'None')
+    assert said.count('RuntimeWarning: kernels are compiled at each start') == 1
+    assert 'NUMBA_CACHE_DIR' in said
+    assert 'closed to other users' in said
+    assert not list(private.iterdir())
+
+
+def test_the_folder_of_numba_itself_comes_first(install: Install) -> None:
+    (value, folder), _ = install.run(NUMBA_CACHE_DIR=str(install.folder / 'chosen'))
+    assert (value, folder) == ('6.0', str(install.folder / 'chosen'))
+    assert list((install.folder / 'chosen').rglob('*.nbc'))
+    assert not (install.package / '__pycache__').exists()
+
+
+def test_what_was_compiled_at_install_time_is_taken_over(
+    install: Install, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An administrator ran warm_up; the users of the read-only install need not compile."""
+    install.run()
+    beside = install.package / '__pycache__' / 'kernels'
+    monkeypatch.setattr(kernel_cache, 'BESIDE_PACKAGE', beside)
+    folder = kernel_cache._seeded(install.folder / 'home')
+    names = {file.relative_to(beside) for file in beside.rglob('*.nb[ic]')}
+    assert names
+    assert {file.relative_to(folder) for file in folder.rglob('*.nb[ic]')} == names
+    assert list(folder.parent.iterdir()) == [folder]
+    assert install.run(NUMBA_CACHE_DIR=str(folder)) == (['6.0', str(folder)], '')

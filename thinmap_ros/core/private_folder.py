@@ -1,0 +1,36 @@
+"""A folder that belongs to this user alone: for what no other user may read, or put there."""
+
+import os
+import stat
+import tempfile
+from pathlib import Path
+
+from thinmap_ros.core.errors import InputError
+
+_MODE = 0o700
+_OF_OTHERS = 0o077
+
+
+def private_folder(folder: Path) -> Path:
+    """Return the folder, made where it is missing.
+
+    Raises InputError where it is a link, of another user, or open to others.
+    """
+    try:
+        folder.mkdir(mode=_MODE, parents=True, exist_ok=True)
+        status = folder.lstat()
+    except OSError as error:
+        raise InputError(f'{folder}: {error.strerror}: expected a folder') from error
+    if not stat.S_ISDIR(status.st_mode):
+        raise InputError(f'{folder}: expected a folder, not a link or a file')
+    if status.st_uid != os.getuid():
+        raise InputError(f'{folder}: of user {status.st_uid}: expected a folder of this user')
+    if status.st_mode & _OF_OTHERS:
+        mode = stat.S_IMODE(status.st_mode)
+        raise InputError(f'{folder}: mode {mode:o}: expected {_MODE:o}, closed to other users')
+    return folder
+
+
+def temporary_folder() -> Path:
+    """Path of thinmap's folder of this user among the temporary files; it may not be there yet."""
+    return Path(tempfile.gettempdir()) / f'thinmap-{os.getuid()}'
