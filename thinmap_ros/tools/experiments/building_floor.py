@@ -246,7 +246,6 @@ def _bounds(done: Run) -> Plot:
         )
     caption = (
         'Paper 3: errors of the estimated pose over time with 3-sigma bounds, '
-        'EKF-SLAM/TI on the floor of 40 x '
+        'EKF-SLAM/TI on the floor of 40 x 10 m.'
     )
-    '10 m.'
     return Plot('bounds', caption, panels, panel_inches=(8.5, 1.9))

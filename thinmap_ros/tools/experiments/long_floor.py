@@ -181,9 +181,8 @@ def _over_time(ti: Run, full: Run, off: Array, turned: Array) -> Plot:
     ]
     caption = (
         'Paper 3, to Fig. 14: errors of the pose over time, '
-        'and what a scan costs (with grid and topological '
+        'and what a scan costs (with grid and topological map).'
     )
-    'map).'
     return Plot('over_time', caption, panels, panel_inches=(8.5, 2.1), legend='inside')
 
 
