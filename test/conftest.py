@@ -4,9 +4,11 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from domains import free_domain
 from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -45,11 +47,11 @@ def shared_data() -> Path:
 
 
 @pytest.fixture
-def ros_domain(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> int:
+def ros_domain(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[int]:
     """A ROS domain that no other process of this machine's tests uses, for what a test starts."""
     # What killed nodes leave concerns no other test.
     monkeypatch.setenv('THINMAP_STATE_DIR', str(tmp_path / 'state'))
-    domain = 1 + os.getpid() % 100
-    monkeypatch.setenv('ROS_DOMAIN_ID', str(domain))
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    return domain
+    with free_domain() as domain:
+        monkeypatch.setenv('ROS_DOMAIN_ID', str(domain))
+        yield domain
