@@ -1,5 +1,6 @@
 """A live ROS graph for a test: node processes on a private domain, and a client beside them."""
 
+import math
 import os
 import signal
 import subprocess
@@ -11,7 +12,9 @@ from typing import Any
 
 import pytest
 import rclpy
+from patience import PATIENCE_S
 from rclpy.action import ActionClient
+from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -19,9 +22,9 @@ from rclpy.qos import QoSProfile
 
 from thinmap_ros.adapters import qos
 
-# Generous: a test waits for what it wants, and fails only where that never comes.
-PATIENCE_S = 60.0
 _DEPTH = 1000
+# After so long an answer passes for lost.
+_ASK_AGAIN_S = 20.0
 
 
 class Graph:
@@ -29,6 +32,7 @@ class Graph:
 
     def __init__(self, domain: int, folder: Path) -> None:
         self.folder, self.processes = folder, {}
+        self._clients: dict[str, Client] = {}
         self._heard = 0
         self.context = Context()
         rclpy.init(context=self.context, domain_id=domain)
@@ -104,18 +108,20 @@ class Graph:
                 logs = '\n'.join(f'{name}: {self.log(name)[-2000:]}' for name in self.processes)
                 pytest.fail(f'never came: {what}\n{logs}')
 
+    def client(self, kind: type, name: str) -> Client:
+        """Client of a service, the same each time: that both sides know each other takes a while.
+
+        Made before the server, it is known by the time that the server is ready.
+        """
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(kind, name)
+        return self._clients[name]
+
     def call(self, kind: type, name: str, request: Any) -> Any:
-        client = self.node.create_client(kind, name)
+        client = self.client(kind, name)
         self.until(client.service_is_ready, f'service {name}')
         # A server that has just found its client may not be able to answer yet: asked again then.
-        for _ in range(3):
-            future, end = client.call_async(request), time.monotonic() + PATIENCE_S / 3.0
-            self.until(
-                lambda f=future, e=end: f.done() or time.monotonic() > e, f'answer of {name}'
-            )
-            if future.done():
-                return future.result()
-        pytest.fail(f'{name} answers nobody')
+        return self._first(lambda: client.call_async(request), f'an answer of {name}')
 
     def send_goal(self, client: ActionClient, goal: Any) -> Any:
         """Handle of a goal that was taken.
@@ -123,24 +129,33 @@ class Graph:
         A node that was killed passes for a server for a while: asked again then.
         """
         self.until(client.server_is_ready, 'action server')
-        for _ in range(6):
-            sent = self._ask(client, goal, 0.2 * PATIENCE_S)
-            if sent.done():
-                return sent.result()
-        pytest.fail('goal taken by nobody')
+        return self._first(lambda: client.send_goal_async(goal), 'goal taken')
 
-    def _ask(self, client: ActionClient, goal: Any, seconds: float) -> Any:
-        """Future of the handle of a goal, after it is done or the time is over."""
-        sent, end = client.send_goal_async(goal), time.monotonic() + seconds
-        self.until(lambda: sent.done() or time.monotonic() > end, 'goal taken')
-        return sent
+    def _first(self, ask: Callable[[], Any], what: str) -> Any:
+        """The first answer that comes, asking again where none does for a while."""
+        asked: list[Any] = []
+        asked_at = -math.inf
+
+        def is_answered() -> bool:
+            nonlocal asked_at
+            if time.monotonic() - asked_at > _ASK_AGAIN_S:
+                asked_at = time.monotonic()
+                asked.append(ask())
+            return any(future.done() for future in asked)
+
+        self.until(is_answered, what)
+        return next(future for future in asked if future.done()).result()
 
     def act(self, kind: type, name: str, goal: Any) -> Any:
         """Result of an action's goal, with status."""
         client = ActionClient(self.node, kind, name)
         ended = self.send_goal(client, goal).get_result_async()
-        self.until(ended.done, f'{name} ends', 120.0)
+        self.until(ended.done, f'{name} ends')
         return ended.result()
+
+    def ended(self, process: subprocess.Popen[bytes]) -> int:
+        """Exit code of a node that ends by itself."""
+        return process.wait(timeout=PATIENCE_S)
 
     def stop(self, name: str, number: int = signal.SIGINT) -> int:
         """Exit code of a node after a signal."""

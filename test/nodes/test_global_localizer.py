@@ -199,6 +199,6 @@ def test_what_is_wrong_with_the_input_is_said_in_words_and_no_pose_comes_of_it(g
 
 def test_a_map_that_cannot_be_read_ends_the_start_in_words(graph, tmp_path):
     process = graph.start('global_localizer', map=str(tmp_path / 'nowhere.yaml'))
-    assert process.wait(timeout=60.0) == 2
+    assert graph.ended(process) == 2
     graph.processes.clear()
     assert 'nowhere.yaml' in graph.log('global_localizer')

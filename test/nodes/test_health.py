@@ -31,6 +31,10 @@ class Doctor:
         found = [s for array in self.heard for s in array.status if s.name == f'{node}: thinmap']
         return found[-1] if found else DiagnosticStatus(level=DiagnosticStatus.STALE)
 
+    def times(self, node):
+        """How often a node has said how it is."""
+        return sum(s.name == f'{node}: thinmap' for array in self.heard for s in array.status)
+
     def value(self, node, key):
         return {pair.key: pair.value for pair in self.status(node).values}.get(key, '')
 

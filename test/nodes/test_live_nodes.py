@@ -154,7 +154,7 @@ def test_bad_messages_are_refused_in_words_and_nothing_dies(graph):
 )
 def test_a_wrong_parameter_ends_the_start_with_one_clear_line(graph, name, parameters, said):
     process = graph.start(name, **parameters)
-    assert process.wait(timeout=60.0) == 2
+    assert graph.ended(process) == 2
     lines = graph.log(name).strip().splitlines()
     assert said in lines[-1]
     assert 'Traceback' not in graph.log(name)
@@ -214,5 +214,5 @@ def test_what_is_recorded_is_played_again(graph, tmp_path):
     assert stamps(scans) == [messages.stamp_ns(bag.decode(raw).header.stamp) for raw in kept]
     # A bag is never written over.
     again = graph.start('recorder', bag=str(tmp_path / 'bag'))
-    assert again.wait(timeout=60.0) == 2
+    assert graph.ended(again) == 2
     assert 'exists already' in graph.log('recorder')

@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Path
+from patience import PATIENCE_S
 from slam_room import drive_round_the_block
+from std_srvs.srv import SetBool
+from test_health import Doctor
 
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.adapters import map_files, messages, qos, resources
@@ -26,6 +29,31 @@ from thinmap_ros.tools.carmen_to_bag import convert
 from thinmap_ros.tools.replay import replay
 
 pytestmark = pytest.mark.live
+# The test listens to the poses as well, the player to the local graph.
+CONNECTIONS = {
+    'bag_player': {'scan: listeners': 2, 'odom: listeners': 1, 'local_topology: speakers': 1},
+    'localizer': {
+        'scan: speakers': 1,
+        'odom: speakers': 1,
+        'topology: speakers': 1,
+        'pose: listeners': 3,
+    },
+    'grid_mapper': {
+        'scan: speakers': 1,
+        'pose: speakers': 1,
+        'trajectory: speakers': 1,
+        'local_map: listeners': 1,
+        'map: listeners': 1,
+    },
+    'topology_builder': {
+        'local_map: speakers': 1,
+        'map: speakers': 1,
+        'pose: speakers': 1,
+        'trajectory: speakers': 1,
+        'topology: listeners': 1,
+        'local_topology: listeners': 1,
+    },
+}
 
 
 class SimulatedLog:
@@ -64,19 +92,40 @@ def assert_same(one, other):
     assert np.array_equal(patches[0].cells, patches[1].cells)
 
 
+def connections(doctor):
+    """How many have found each other, of those that lead from a scan to what the player awaits.
+
+    Nodes find each other one by one, and what is said to one that is not yet found is lost. A
+    localizer that finds the graph late steps without it meanwhile.
+    """
+    return {
+        f'{node}: {topic}': doctor.number(node, topic)
+        for node, topics in CONNECTIONS.items()
+        for topic in topics
+    }
+
+
 def assert_live_is_same(graph, bag, expected, tmp_path, **localizer):
-    poses = graph.heard('pose', PoseWithCovarianceStamped)
+    doctor, poses = Doctor(graph), graph.heard('pose', PoseWithCovarianceStamped)
+    resume = graph.client(SetBool, '/bag_player/pause')
     for name in ('localizer', 'grid_mapper', 'topology_builder'):
         graph.start(name, use_sim_time=True, **(localizer if name == 'localizer' else {}))
-    graph.until(lambda: graph.node.count_subscribers('local_map') == 1, 'nodes')
     player = graph.start(
-        'bag_player', bag=str(bag), rate=1000.0, lockstep='local_topology', wait_for_subscribers=2
+        'bag_player',
+        bag=str(bag),
+        rate=1000.0,
+        start_paused=True,
+        lockstep='local_topology',
+        lockstep_patience_s=PATIENCE_S,
+        wait_for_subscribers=2,
     )
+    wanted = {f'{n}: {t}': c for n, topics in CONNECTIONS.items() for t, c in topics.items()}
+    graph.until(lambda: connections(doctor) == wanted, f'connections {wanted}')
+    assert graph.call(SetBool, resume.srv_name, SetBool.Request(data=False)).success
     graph.until(
-        lambda: player.poll() == 0 and len(poses) == len(expected.poses),
-        'a pose for each scan',
-        170.0,
+        lambda: player.poll() == 0 and len(poses) == len(expected.poses), 'a pose for each scan'
     )
+    assert 'going on without it' not in graph.log('bag_player')
     assert [messages.stamp_ns(pose.header.stamp) for pose in poses] == expected.stamps_ns
     live = np.array([messages.pose_from(pose.pose.pose) for pose in poses])
     assert np.abs(live - expected.poses).max() <= 1e-9

@@ -14,6 +14,7 @@ from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
 from nav_msgs.msg import OccupancyGrid
+from patience import PATIENCE_S
 from tf2_msgs.msg import TFMessage
 
 from thinmap_msgs.action import NavigateToPose
@@ -123,7 +124,7 @@ def test_two_robots_in_namespaces_keep_to_themselves(graph):
 
 def run(*arguments):
     command = [sys.executable, '-m', 'thinmap_ros.nodes.thinmap', *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60.0)
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S)
 
 
 def test_what_cannot_be_run_is_said_in_one_line(ros_domain):

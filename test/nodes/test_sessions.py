@@ -320,6 +320,6 @@ def test_a_builder_that_does_not_answer_is_said_and_the_mapper_goes_on(graph, tm
 @pytest.mark.parametrize('name', MAPPERS)
 def test_a_session_that_is_not_there_ends_the_start_with_one_clear_line(graph, name):
     process = graph.start(name, session='/nowhere/room')
-    assert process.wait(timeout=60.0) == 2
+    assert graph.ended(process) == 2
     lines = graph.log(name).strip().splitlines()
     assert '/nowhere/room' in lines[-1] and 'Traceback' not in graph.log(name)

@@ -16,6 +16,7 @@ import time
 from pathlib import Path
 
 import pytest
+from patience import PATIENCE_S
 from test_faults import AT_START, START
 
 from thinmap_ros.adapters.bags import Bag
@@ -24,7 +25,6 @@ from thinmap_ros.core.errors import InputError
 pytestmark = pytest.mark.live
 ADDRESSES = ('10.77.0.1', '10.77.0.2')
 CABLE = ('cable0', 'cable1')
-PATIENCE_S = 60.0
 WEAK = (0.05, 0.05, 7)  # share of the frames that is lost, seconds that each takes one way, seed
 
 

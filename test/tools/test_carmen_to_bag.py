@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from patience import PROGRAM_S
 
 from thinmap_ros.adapters.bags import Bag, BagLog
 from thinmap_ros.adapters.carmen import CarmenLog, LaserOptions
@@ -97,7 +98,7 @@ def run(*arguments: object) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, '-m', 'thinmap_ros.tools.carmen_to_bag', *map(str, arguments)]
     root = Path(__file__).parents[2]
     return subprocess.run(
-        command, capture_output=True, text=True, timeout=60, cwd=root, check=False
+        command, capture_output=True, text=True, timeout=PROGRAM_S, cwd=root, check=False
     )
 
 

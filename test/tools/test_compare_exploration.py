@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from patience import PROGRAM_S
 
 from benchmarks.exploration_page import page
 from thinmap_ros.tools.comparison import markdown, saved
@@ -85,7 +86,13 @@ def compare(*words: str) -> 'subprocess.CompletedProcess[str]':
     command = [sys.executable, '-m', 'thinmap_ros.tools.compare_exploration', *words, '--quiet']
     environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
     return subprocess.run(
-        command, capture_output=True, text=True, timeout=170, env=environment, cwd=ROOT, check=False
+        command,
+        capture_output=True,
+        text=True,
+        timeout=PROGRAM_S,
+        env=environment,
+        cwd=ROOT,
+        check=False,
     )
 
 

@@ -9,6 +9,7 @@ import time
 import numpy as np
 import psutil
 import pytest
+from patience import PATIENCE_S, PROGRAM_S
 
 from thinmap_ros.adapters import map_files
 from thinmap_ros.adapters.bags import Bag
@@ -59,7 +60,7 @@ def nodes_of(out):
 
 def test_the_robot_explores_the_room_and_stops_by_itself(ros_domain, tmp_path):
     process = demo(tmp_path / 'demo', '--rate', '20', '--seed', '4')
-    stdout, stderr = process.communicate(timeout=170)
+    stdout, stderr = process.communicate(timeout=PROGRAM_S)
     assert process.returncode == 0, stderr
     out = tmp_path / 'demo'
     report = json.loads((out / 'report.json').read_text())
@@ -83,16 +84,16 @@ def test_the_robot_explores_the_room_and_stops_by_itself(ros_domain, tmp_path):
 def test_ctrl_c_ends_everything(ros_domain, tmp_path):
     out = tmp_path / 'demo'
     process = demo(out, '--rate', '5')
-    until = time.monotonic() + 90.0
+    until = time.monotonic() + PATIENCE_S
     while not (out / 'bag').exists() or len(process_tree(process)) < 8:
         assert time.monotonic() < until and process.poll() is None, process.communicate()
         time.sleep(0.1)
     tree = process_tree(process)
     process.send_signal(signal.SIGINT)
-    _, stderr = process.communicate(timeout=30)
+    _, stderr = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 130
     assert 'interrupted' in stderr and 'Traceback' not in stderr
-    assert not psutil.wait_procs(tree, timeout=1.0)[1]
+    assert not psutil.wait_procs(tree, timeout=PATIENCE_S)[1]
     assert not (out / 'report.json').exists()
 
 
@@ -110,6 +111,6 @@ def process_tree(process):
 )
 def test_wrong_arguments_end_at_once(tmp_path, arguments, said):
     process = demo(tmp_path / 'demo', *arguments)
-    _, stderr = process.communicate(timeout=60)
+    _, stderr = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 2
     assert said in stderr and 'Traceback' not in stderr

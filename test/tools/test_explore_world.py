@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from patience import PROGRAM_S
 
 ROOT = Path(__file__).resolve().parents[2]
 ROOM = {
@@ -36,7 +37,13 @@ def explore(*words: str) -> 'subprocess.CompletedProcess[str]':
     command = [sys.executable, '-m', 'thinmap_ros.tools.explore_world', *words, '--quiet']
     environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
     return subprocess.run(
-        command, capture_output=True, text=True, timeout=150, env=environment, cwd=ROOT, check=False
+        command,
+        capture_output=True,
+        text=True,
+        timeout=PROGRAM_S,
+        env=environment,
+        cwd=ROOT,
+        check=False,
     )
 
 

@@ -18,6 +18,7 @@ _PERIOD_S = 1.0
 _QUIET_S = 10.0
 _RECENT_S = 10.0  # what was refused or dropped longer ago is over
 _STEPS = 200
+_OF_EVERY_NODE = ('/parameter_events', '/rosout', '/diagnostics', '/clock')
 # So many kinds of refusal are told apart on a topic: a broken sensor must not fill the memory.
 _REASONS = 8
 _NUMBER = re.compile(r'-?\b(\d+\.?\d*(e[+-]?\d+)?|inf|nan)\b')
@@ -215,9 +216,26 @@ class Health:
         recent = [reason for reason in reasons if monotonic() - reason[0] <= _RECENT_S]
         return '; '.join(text for _, text in sorted(recent, reverse=True))
 
+    def _connections(self) -> dict[str, str]:
+        """How many have been found that hear what the node says, or say what it hears.
+
+        Others may see both of two endpoints a while before these see each other.
+        """
+        found = {}
+        for publisher in list(self._node.publishers):
+            if publisher.topic_name not in _OF_EVERY_NODE:
+                name = publisher.topic_name.lstrip('/')
+                found[f'{name}: listeners'] = str(publisher.get_subscription_count())
+        for subscription in list(self._node.subscriptions):
+            if subscription.topic_name not in _OF_EVERY_NODE:
+                name = subscription.topic_name.lstrip('/')
+                found[f'{name}: speakers'] = str(subscription.get_publisher_count())
+        return found
+
     def _told(self, now: float) -> dict[str, str]:
         """All values, in an order that stays."""
         told = dict(self._values)
+        told.update(self._connections())
         for topic, entry in self._topics.items():
             told[f'{topic}: heard'] = str(entry.heard)
             told[f'{topic}: rate'] = f'{(entry.heard - entry.told) / (now - self._told_at):.1f} Hz'

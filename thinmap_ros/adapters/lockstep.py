@@ -21,7 +21,9 @@ _TYPES: dict[str, Any] = {
     'localization_status': LocalizationStatus,
 }
 TOPICS = (NONE, *_TYPES)
-_PATIENCE_S = 2.0
+# Long: a machine that is busy, or compiles, is not one on which a scan leads to nothing.
+PATIENCE_S = 10.0
+PATIENCE_WORDS = 'in lockstep, go on without an answer after so long, s of the machine'
 
 
 class Lockstep:
@@ -30,8 +32,10 @@ class Lockstep:
     What the scan led to.
     """
 
-    def __init__(self, node: Node, topic: str) -> None:
-        self._node, self._topic = node, topic
+    def __init__(self, node: Node, topic: str, patience_s: float = PATIENCE_S) -> None:
+        self._node = node
+        self._topic = topic
+        self._patience_s = patience_s
         self._awaited_ns: int | None = None
         self._since = 0.0
         if topic != NONE:
@@ -54,7 +58,7 @@ class Lockstep:
 
     def give_up(self) -> bool:
         """Whether patience is at an end; then waiting ends as well."""
-        if self.waited_s < _PATIENCE_S:
+        if self.waited_s < self._patience_s:
             return False
         self._node.get_logger().warning(f'no /{self._topic} for the last scan: going on without it')
         self._awaited_ns = None

@@ -18,7 +18,7 @@ from thinmap_ros.adapters import checks, messages, parameters, qos, runtime
 from thinmap_ros.adapters.bag_storage import RawMessage
 from thinmap_ros.adapters.bags import Bag
 from thinmap_ros.adapters.health import OK, WARN, Health
-from thinmap_ros.adapters.lockstep import NONE, TOPICS, Lockstep
+from thinmap_ros.adapters.lockstep import NONE, PATIENCE_S, PATIENCE_WORDS, TOPICS, Lockstep
 from thinmap_ros.adapters.playback import Playback, is_scan
 from thinmap_ros.adapters.services import answer
 from thinmap_ros.adapters.types import message_class
@@ -52,6 +52,7 @@ class BagPlayerConfig(Config):
     lockstep: str = parameter(
         NONE, 'wait for what each scan leads to: nothing is lost at high rates', choices=TOPICS
     )
+    lockstep_patience_s: float = parameter(PATIENCE_S, PATIENCE_WORDS, low=0.1, high=3600.0)
 
 
 class BagPlayerNode(Node):
@@ -81,7 +82,7 @@ class BagPlayerNode(Node):
         self._begins_at: float | None = None
         self._paused = self._config.start_paused
         self._ticked_at = self._clock_at = 0.0
-        self._lockstep = Lockstep(self, self._config.lockstep)
+        self._lockstep = Lockstep(self, self._config.lockstep, self._config.lockstep_patience_s)
         self._sent: Counter[str] = Counter()
         self._health = Health(self)
         self._health.before_telling(self._tell_health)

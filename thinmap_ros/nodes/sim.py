@@ -18,7 +18,7 @@ from tf2_msgs.msg import TFMessage
 
 from thinmap_ros.adapters import messages, parameters, qos, resources, runtime
 from thinmap_ros.adapters.health import OK, WARN, Health
-from thinmap_ros.adapters.lockstep import NONE, TOPICS, Lockstep
+from thinmap_ros.adapters.lockstep import NONE, PATIENCE_S, PATIENCE_WORDS, TOPICS, Lockstep
 from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
@@ -47,6 +47,7 @@ class SimConfig(Config):
     lockstep: str = parameter(
         NONE, 'wait for what each scan leads to: nothing is lost at high rates', choices=TOPICS
     )
+    lockstep_patience_s: float = parameter(PATIENCE_S, PATIENCE_WORDS, low=0.1, high=3600.0)
     hold_for_subscribers: int = parameter(
         0, 'time stands still until /scan has so many subscribers', low=0, high=100
     )
@@ -66,7 +67,7 @@ class SimNode(Node):
         self._sim = Simulation(world, start, PRESETS[self._config.robot], laser, self._config.seed)
         self._scan_time_s = 1.0 / laser.rate_hz
         self._command, self._command_ns = (0.0, 0.0), 0
-        self._lockstep = Lockstep(self, self._config.lockstep)
+        self._lockstep = Lockstep(self, self._config.lockstep, self._config.lockstep_patience_s)
         self._last_scan: LaserScan | None = None
         self._repeated_at = 0.0
         self._running = False
