@@ -1,0 +1,155 @@
+"""`ros2 action`."""
+
+import sys
+from argparse import ArgumentParser, Namespace
+from typing import Any
+
+from action_msgs.msg import GoalStatus
+from rclpy.action import (
+    ActionClient,
+    get_action_client_names_and_types_by_node,
+    get_action_names_and_types,
+    get_action_server_names_and_types_by_node,
+)
+from rclpy.task import Future
+
+from ros2_shim import values
+from ros2_shim.session import Session, split
+from ros2_shim.verbs import ShimError, Verb, add_graph_arguments, say
+
+_STATUS = {
+    GoalStatus.STATUS_ACCEPTED: 'ACCEPTED',
+    GoalStatus.STATUS_EXECUTING: 'EXECUTING',
+    GoalStatus.STATUS_CANCELING: 'CANCELING',
+    GoalStatus.STATUS_SUCCEEDED: 'SUCCEEDED',
+    GoalStatus.STATUS_CANCELED: 'CANCELED',
+    GoalStatus.STATUS_ABORTED: 'ABORTED',
+}
+_CANCEL_S = 10.0
+
+
+def _list_arguments(parser: ArgumentParser) -> None:
+    add_graph_arguments(parser)
+    parser.add_argument('-t', '--show-types', action='store_true', help='types, too')
+    parser.add_argument('-c', '--count-actions', action='store_true', help='only how many')
+
+
+def _list(args: Namespace) -> None:
+    with Session(args) as session:
+        session.settle()
+        pairs = get_action_names_and_types(session.node)
+    if args.count_actions:
+        say(str(len(pairs)))
+        return
+    for name, types in pairs:
+        say(f'{name} [{", ".join(types)}]' if args.show_types else name)
+
+
+def _info_arguments(parser: ArgumentParser) -> None:
+    add_graph_arguments(parser)
+    parser.add_argument('action_name')
+    parser.add_argument('-t', '--show-types', action='store_true', help='types, too')
+    parser.add_argument('-c', '--count', action='store_true', help='only how many')
+
+
+def _info(args: Namespace) -> None:
+    with Session(args) as session:
+        name = session.full_name(args.action_name, 'action')
+        session.settle()
+        say(f'Action: {name}')
+        for title, ask in (
+            ('clients', get_action_client_names_and_types_by_node),
+            ('servers', get_action_server_names_and_types_by_node),
+        ):
+            found = _nodes_with(session, ask, name)
+            say(f'Action {title}: {len(found)}')
+            for node, types in [] if args.count else found:
+                say(f'    {node} [{", ".join(types)}]' if args.show_types else f'    {node}')
+
+
+def _nodes_with(session: Session, ask: Any, action: str) -> list[tuple[str, list[str]]]:
+    found = []
+    for node in session.node_names(hidden=True):
+        types = dict(ask(session.node, *split(node))).get(action)
+        if types:
+            found.append((node, types))
+    return found
+
+
+def _send_goal_arguments(parser: ArgumentParser) -> None:
+    parser.add_argument('action_name')
+    parser.add_argument('action_type', help='as in thinmap_msgs/action/Explore')
+    group = parser.add_mutually_exclusive_group()
+    group.add_argument('goal', nargs='?', default='{}', help="as in '{time_limit_s: 60.0}'")
+    group.add_argument('--stdin', action='store_true', help='read the goal there')
+    parser.add_argument('-f', '--feedback', action='store_true', help='show what is told meanwhile')
+
+
+def _send_goal(args: Namespace) -> None:
+    kind = values.type_named(args.action_type, 'action')
+    text = sys.stdin.read() if args.stdin else args.goal
+    goal = values.fill(kind.Goal(), values.mapping(text))
+    with Session(args) as session:
+        client = ActionClient(session.node, kind, session.full_name(args.action_name, 'action'))
+        say('Waiting for an action server to become available...')
+        session.meet(client.server_is_ready)
+        say(f'Sending goal:\n     {values.to_yaml(goal)}')
+        sent = client.send_goal_async(goal, _tell if args.feedback else None)
+        try:
+            _follow(session, sent)
+        except (KeyboardInterrupt, BrokenPipeError):
+            _cancel(session, sent)
+            raise
+        finally:
+            client.destroy()
+
+
+def _tell(message: Any) -> None:
+    say(f'Feedback:\n    {values.to_yaml(message.feedback)}')
+
+
+def _follow(session: Session, sent: Future) -> None:
+    """Say what becomes of a goal until it has ended."""
+    handle = session.result(sent)
+    if not handle.accepted:
+        say('Goal was rejected.')
+        return
+    say(f'Goal accepted with ID: {bytes(handle.goal_id.uuid).hex()}\n')
+    ended = session.result(handle.get_result_async())
+    say(f'Result:\n    {values.to_yaml(ended.result)}')
+    say(f'Goal finished with status: {_STATUS.get(ended.status, "UNKNOWN")}')
+
+
+def _cancel(session: Session, sent: Future) -> None:
+    """Cancel a goal, also one of which it is not known yet whether it was taken.
+
+    Said on standard error where nobody reads the output any more: the robot stops all the same.
+    """
+    if not session.until(sent.done, _CANCEL_S):
+        raise ShimError('Failed to cancel goal: no answer whether it was accepted')
+    handle = sent.result()
+    if handle is None or not handle.accepted:
+        return
+    if handle.status not in (GoalStatus.STATUS_ACCEPTED, GoalStatus.STATUS_EXECUTING):
+        return
+    _say_somewhere('Canceling goal...')
+    answer = handle.cancel_goal_async()
+    if not session.until(answer.done, _CANCEL_S) or not answer.result().goals_canceling:
+        raise ShimError('Failed to cancel goal')
+    _say_somewhere('Goal canceled.')
+
+
+def _say_somewhere(text: str) -> None:
+    try:
+        say(text)
+    except BrokenPipeError:
+        print(text, file=sys.stderr)
+
+
+VERBS = {
+    'info': Verb('Which nodes serve and use an action.', _info_arguments, _info),
+    'list': Verb('Names of all actions.', _list_arguments, _list),
+    'send_goal': Verb(
+        'Send a goal and wait for its end; Ctrl-C cancels it.', _send_goal_arguments, _send_goal
+    ),
+}

@@ -1,0 +1,86 @@
+"""The command line: which command, which verb, and how all of them end."""
+
+import importlib
+import os
+import signal
+import sys
+
+from ros2_shim.verbs import Parser, ShimError, Verb
+
+# Each is a module beside this one; it is read only where it is asked for.
+COMMANDS = {
+    'action': 'list actions, send goals',
+    'interface': 'show the fields of a type',
+    'lifecycle': 'states of lifecycle nodes',
+    'node': 'list nodes, and what they talk about',
+    'param': 'parameters of running nodes',
+    'pkg': 'packages and their programs',
+    'run': 'run a program of a package',
+    'service': 'list and call services',
+    'topic': 'list, hear and publish topics',
+}
+SMALL = "thinmap's small ros2 for machines without ROS"
+
+
+def main(words: list[str]) -> int:
+    """Exit code of a command line."""
+    try:
+        return _command(words)
+    except KeyboardInterrupt:
+        return int(signal.SIGINT)
+    except BrokenPipeError:
+        # Nobody reads any more. Python would complain when it closes its output at the end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except ShimError as failure:
+        print(_one_line(failure), file=sys.stderr)
+    except RuntimeError as error:
+        # What rclpy and the middleware refuse.
+        print(f'ros2: {_one_line(error)}', file=sys.stderr)
+    return 1
+
+
+def _one_line(error: Exception) -> str:
+    return ' '.join(str(error).split())
+
+
+def _command(words: list[str]) -> int:
+    if not words or words[0] in ('-h', '--help'):
+        print(f'usage: ros2 COMMAND ...\n\n{SMALL}. Commands:')
+        _table(COMMANDS)
+        print('\nros2 COMMAND -h: its verbs')
+        return 0
+    if words[0] not in COMMANDS:
+        return _unknown('ros2', 'command', words[0], COMMANDS)
+    if words[0] == 'run':
+        module = importlib.import_module('ros2_shim.pkg')
+        module.run(words[1:])
+        return 0
+    return _verb(words[0], words[1:])
+
+
+def _verb(command: str, words: list[str]) -> int:
+    verbs: dict[str, Verb] = importlib.import_module(f'ros2_shim.{command}').VERBS
+    if not words or words[0] in ('-h', '--help'):
+        print(f'usage: ros2 {command} VERB ...\n\n{SMALL}: {COMMANDS[command]}. Verbs:')
+        _table({name: verb.help for name, verb in verbs.items()})
+        return 0
+    if words[0] not in verbs:
+        return _unknown(f'ros2 {command}', 'verb', words[0], verbs)
+    verb = verbs[words[0]]
+    parser = Parser(prog=f'ros2 {command} {words[0]}', description=verb.help, allow_abbrev=False)
+    verb.arguments(parser)
+    verb.main(parser.parse_args(words[1:]))
+    return 0
+
+
+def _table(lines: dict[str, str]) -> None:
+    width = max(len(name) for name in lines)
+    for name, text in lines.items():
+        print(f'  {name:{width}}  {text}')
+
+
+def _unknown(program: str, kind: str, word: str, known: dict[str, str] | dict[str, Verb]) -> int:
+    has = ', '.join(known)
+    print(f'{program}: no {kind} {word}: this is {SMALL}; it has {has}', file=sys.stderr)
+    return 2

@@ -1,0 +1,156 @@
+"""A node that looks at the graph and asks.
+
+There is no daemon that knows the graph already: what is named is waited for, and a list is given
+when nothing new has been found for a while.
+"""
+
+import itertools
+import os
+import time
+from argparse import Namespace
+from collections.abc import Callable, Iterator
+from typing import Any, Self
+
+import rclpy
+from rclpy.exceptions import NameValidationException
+from rclpy.expand_topic_name import expand_topic_name
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
+from rclpy.validate_full_topic_name import validate_full_topic_name
+
+from ros2_shim.verbs import SPIN_TIME_S, ShimError
+
+# A spin is short, as Python hears Ctrl-C only after it.
+_SPIN_S = 0.05
+_LOOK_S = 1.0
+_QUIET_S = 0.6
+# A server knows its client a moment later than the client knows the server.
+_MEET_S = 0.2
+
+
+class Session:
+    """A hidden node, from `with` to its end."""
+
+    def __init__(self, args: Namespace, name: str = '') -> None:
+        self.patience_s: float = getattr(args, 'spin_time', SPIN_TIME_S)
+        self._name = name or f'_ros2cli_{os.getpid()}'
+        self._begun = time.monotonic()
+        self.node: Node
+
+    def __enter__(self) -> Self:
+        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+        self.node = Node(self._name, use_global_arguments=False, start_parameter_services=False)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.node.destroy_node()
+        rclpy.shutdown()
+
+    def spin(self, seconds: float = _SPIN_S) -> None:
+        """Do what there is to be done, or wait."""
+        rclpy.spin_once(self.node, timeout_sec=seconds)
+
+    def until(self, condition: Callable[[], Any], seconds: float | None = None) -> bool:
+        """Spin until a condition holds; without seconds for ever."""
+        end = None if seconds is None else time.monotonic() + seconds
+        while not condition():
+            if end is not None and time.monotonic() > end:
+                return False
+            self.spin()
+        return True
+
+    def beats(self, period_s: float) -> Iterator[None]:
+        """Spin between beats; the first is at once."""
+        begun = time.monotonic()
+        for count in itertools.count():
+            due = begun + count * period_s
+            while time.monotonic() < due:
+                self.spin(min(_SPIN_S, max(0.0, due - time.monotonic())))
+            yield
+
+    def found(self, condition: Callable[[], Any]) -> bool:
+        """Wait for something that is named, as long as the options say."""
+        return self.until(condition, self.patience_s)
+
+    def settle(self) -> None:
+        """Wait until nothing new has been found for a while."""
+        known = self._snapshot()
+        quiet_since = time.monotonic()
+        while time.monotonic() < self._begun + self.patience_s:
+            self.spin()
+            now = time.monotonic()
+            seen = self._snapshot()
+            if seen != known:
+                known = seen
+                quiet_since = now
+            if now > self._begun + _LOOK_S and now > quiet_since + _QUIET_S:
+                return
+
+    def _snapshot(self) -> Any:
+        node = self.node
+        names = sorted(node.get_node_names_and_namespaces())
+        topics = node.get_topic_names_and_types()
+        ends = [(node.count_publishers(n), node.count_subscribers(n)) for n, _ in topics]
+        return names, topics, ends, node.get_service_names_and_types()
+
+    def full_name(self, name: str, kind: str = 'topic') -> str:
+        """Name with its namespace; what cannot be a name is a failure."""
+        try:
+            full = expand_topic_name(name, self.node.get_name(), self.node.get_namespace())
+            validate_full_topic_name(full, is_service=kind == 'service')
+        except (NameValidationException, ValueError) as error:
+            reason = str(error).splitlines()[0]
+            raise ShimError(f"'{name}' is no name of a {kind}: {reason}") from None
+        return str(full)
+
+    def node_names(self, hidden: bool = False) -> list[str]:
+        """Full names of all nodes but this one, in order."""
+        pairs = self.node.get_node_names_and_namespaces()
+        names = [f'{namespace.rstrip("/")}/{name}' for name, namespace in pairs]
+        own = f'/{self._name}'
+        shown = [name for name in names if name != own]
+        return sorted(name for name in shown if hidden or '/_' not in name)
+
+    def find_node(self, name: str) -> str:
+        """Full name of a node that is there."""
+        full = absolute(name)
+        if not self.found(lambda: full in self.node_names(hidden=True)):
+            raise ShimError(f"Node not found: '{full}'")
+        return full
+
+    def meet(self, is_ready: Callable[[], Any], seconds: float | None = None) -> bool:
+        """Wait for a server, and until it knows its client, too."""
+        ready = self.until(is_ready, seconds)
+        if ready:
+            self.until(lambda: False, _MEET_S)
+        return ready
+
+    def ask(self, kind: Any, name: str, request: Any) -> Any:
+        """Response of a service of a node that is there."""
+        client = self.node.create_client(kind, name)
+        if not self.meet(client.service_is_ready, self.patience_s):
+            raise ShimError(f"Wait for service timed out: '{name}'")
+        future = client.call_async(request)
+        if not self.until(future.done, 2.0 * self.patience_s):
+            raise ShimError(f"No answer from service '{name}'")
+        return self.result(future)
+
+    def result(self, future: Future) -> Any:
+        """Wait for what was asked; an error on the way is a failure."""
+        self.until(future.done)
+        error = future.exception()
+        if error is not None:
+            raise ShimError(f'{type(error).__name__}: {error}')
+        return future.result()
+
+
+def absolute(name: str) -> str:
+    """Name of a node from the root."""
+    return name if name.startswith('/') else f'/{name}'
+
+
+def split(name: str) -> tuple[str, str]:
+    """Name and namespace of a node."""
+    namespace, _, last = name.rpartition('/')
+    return last, namespace or '/'
