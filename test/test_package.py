@@ -3,10 +3,12 @@
 import ast
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+import yaml
 from ament_index_python import get_package_prefix, get_package_share_directory
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -22,7 +24,55 @@ KEYS = {
     'yaml': 'python3-yaml',
     'rosbags': 'python3-rosbags-pip',
     'mcap': 'python3-mcap-pip',
+    'lz4': 'python3-mcap-pip',  # comes with mcap, as zstandard
+    'zstandard': 'python3-mcap-pip',
     'cv2': 'python3-opencv',
+}
+# Keys of rosdistro's rosdep/python.yaml, read in its commit 662921b on 2026-11-22; of two that were
+# added or widened to Ubuntu 24.04 later: its pull requests 37795 (rosbags) and 36477 (numba).
+KNOWN_KEYS = {
+    'python3-hypothesis',
+    'python3-matplotlib',
+    'python3-networkx',
+    'python3-numba',
+    'python3-numpy',
+    'python3-opencv',
+    'python3-pil',
+    'python3-psutil',
+    'python3-pytest',
+    'python3-pytest-timeout',
+    'python3-rosbags-pip',
+    'python3-scipy',
+    'python3-skimage',
+    'python3-tqdm',
+    'python3-yaml',
+}
+# Packages of ROS 2 Jazzy itself, from its distribution's list.
+KNOWN_PACKAGES = {
+    'action_msgs',
+    'ament_cmake',
+    'ament_index_python',
+    'builtin_interfaces',
+    'diagnostic_msgs',
+    'geometry_msgs',
+    'lifecycle_msgs',
+    'nav_msgs',
+    'rcl_interfaces',
+    'rclpy',
+    'rosgraph_msgs',
+    'rosidl_default_generators',
+    'rosidl_default_runtime',
+    'sensor_msgs',
+    'std_msgs',
+    'std_srvs',
+    'tf2_msgs',
+    'visualization_msgs',
+}
+MANIFESTS = [ROOT / 'package.xml', ROOT / 'thinmap_msgs' / 'package.xml']
+LOCKS = {
+    'lock-3.11.txt': ('python', 'ros', 'test', 'viewer'),
+    'lock-3.12.txt': ('python', 'ros', 'test', 'viewer'),
+    'lock-system-3.12.txt': ('python', 'test'),
 }
 # Optional, and named in setup.py as extras.
 EXTRAS = {'rerun', 'dask', 'distributed'}
@@ -54,6 +104,42 @@ def test_every_import_has_its_key_in_package_xml(folder, tags):
     assert not missing
 
 
+def test_rosdep_knows_every_key():
+    elements = [e for path in MANIFESTS for e in ElementTree.parse(path).iter()]
+    keys = {element.text for element in elements if element.tag.endswith('depend')}
+    own = yaml.safe_load((ROOT / 'rosdep.yaml').read_text())
+    assert keys - KNOWN_KEYS - KNOWN_PACKAGES - own.keys() == {'thinmap_msgs'}, 'ours, built beside'
+    assert own.keys() <= keys, 'none that nothing needs'
+    for systems in own.values():
+        assert systems['ubuntu']['pip']['packages'], "in rosdep's own format"
+
+
+def names_in(path):
+    """Names of requirements, as the index of packages spells them, and their pinned versions."""
+    lines = [line.partition('#')[0].strip() for line in path.read_text().splitlines()]
+    pairs = [line.partition('==') for line in lines if line]
+    return {name.lower().replace('_', '-'): pinned for name, _, pinned in pairs}
+
+
+@pytest.mark.parametrize('lock', LOCKS)
+def test_a_lock_pins_all_that_is_asked_for(lock):
+    pinned = names_in(ROOT / 'requirements' / lock)
+    assert all(pinned.values())
+    for part in LOCKS[lock]:
+        asked = names_in(ROOT / 'requirements' / f'{part}.in')
+        assert {name.partition('>')[0].partition('<')[0] for name in asked} <= pinned.keys()
+
+
+@pytest.mark.skipif(
+    not Path(sys.prefix).is_relative_to(ROOT / '.setup') or sys.prefix == sys.base_prefix,
+    reason='what is installed is pinned in the environment of scripts/env only',
+)
+def test_no_test_waits_for_a_package_that_is_never_installed():
+    lock = ROOT / 'requirements' / 'lock-{}.{}.txt'.format(*sys.version_info[:2])
+    pinned = names_in(lock)
+    assert {name: version(name) for name in pinned if version(name) != pinned[name]} == {}
+
+
 @pytest.mark.parametrize('name', PROGRAMS)
 def test_every_program_is_installed_where_ros2_run_looks(name):
     assert (Path(get_package_prefix('thinmap_ros')) / 'lib' / 'thinmap_ros' / name).exists()
@@ -76,6 +162,5 @@ def test_every_tool_has_help(name):
 
 
 def test_versions_agree():
-    manifests = [ROOT / 'package.xml', ROOT / 'thinmap_msgs' / 'package.xml']
-    (version,) = {ElementTree.parse(path).find('version').text for path in manifests}
-    assert f"version='{version}'" in (ROOT / 'setup.py').read_text()
+    (ours,) = {ElementTree.parse(path).find('version').text for path in MANIFESTS}
+    assert f"version='{ours}'" in (ROOT / 'setup.py').read_text()

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 from geometry_msgs.msg import PoseStamped
+from hidden import hide
 
 from thinmap_ros.adapters import messages, qos, rerun_streams
 
@@ -43,11 +44,11 @@ def test_recording_can_be_read_after_a_signal(graph, tmp_path):
     assert rows == 4
 
 
-@pytest.mark.skipif(
-    rerun_streams.is_installed(), reason='says what happens where rerun is not installed; it is'
-)
 @pytest.mark.parametrize('parameters', [{}, {'recording': 'live.rrd', 'spawn': False}])
-def test_without_rerun_the_start_ends_with_one_clear_line(graph, parameters):
+def test_without_rerun_the_start_ends_with_one_clear_line(
+    graph, tmp_path_factory, monkeypatch, parameters
+):
+    hide('rerun', tmp_path_factory.mktemp('hidden'), monkeypatch)
     process = graph.start('rerun_viewer', **parameters)
     assert graph.ended(process) == 2
     assert (

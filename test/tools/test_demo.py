@@ -9,6 +9,7 @@ import time
 import numpy as np
 import psutil
 import pytest
+from hidden import hide
 from patience import PATIENCE_S, PROGRAM_S
 
 from thinmap_ros.adapters import map_files
@@ -114,3 +115,16 @@ def test_wrong_arguments_end_at_once(tmp_path, arguments, said):
     _, stderr = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 2
     assert said in stderr and 'Traceback' not in stderr
+
+
+def test_without_rerun_a_view_is_refused_before_anything_is_started(
+    tmp_path, tmp_path_factory, monkeypatch
+):
+    hide('rerun', tmp_path_factory.mktemp('hidden'), monkeypatch)
+    process = demo(tmp_path / 'out', '--view')
+    said = process.communicate(timeout=PATIENCE_S)[1].splitlines()
+    assert process.returncode == 2
+    assert said == [
+        'demo: error: --view: rerun is not installed: pip install "thinmap_ros[viewer]"'
+    ]
+    assert not (tmp_path / 'out').exists()

@@ -8,6 +8,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
+from hidden import hide
 
 from thinmap_ros.adapters import map_files, rerun_streams
 from thinmap_ros.adapters.bag_writer import BagWriter
@@ -263,11 +264,11 @@ def test_a_view_is_told_each_scan_and_the_map_as_it_is_in_the_end(log):
         assert diary.told[curve] == 30
 
 
-@pytest.mark.skipif(
-    rerun_streams.is_installed(), reason='says what happens where rerun is not installed; it is'
-)
 @pytest.mark.parametrize('option', ['--view', '--recording=run.rrd'])
-def test_without_rerun_a_view_is_refused_in_one_line(log, tmp_path, option):
+def test_without_rerun_a_view_is_refused_in_one_line(
+    log, tmp_path, tmp_path_factory, monkeypatch, option
+):
+    hide('rerun', tmp_path_factory.mktemp('hidden'), monkeypatch)
     done = run(log, '-o', tmp_path / 'out', option)
     assert done.returncode == 2
     assert done.stderr.splitlines()[-1].startswith('replay: error: rerun is not installed')
