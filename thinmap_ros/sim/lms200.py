@@ -16,6 +16,7 @@ from thinmap_ros.sim.world import World
 
 # Neighbouring beams on a wall seen at this angle are no depth edge.
 _FLATTEST_RAD = math.radians(10.0)
+_INTO_CELL = 1e-6
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ class Lms200:
 
     def scan(self, world: World, T_world_base: Array, stamp_ns: int) -> Scan:
         """Scan from a robot pose (3,) in the world."""
-        exact = self._exact(world, se2.compose(T_world_base, self.T_base_laser))
+        exact = self._exact(world, se2.compose(T_world_base, self.T_base_laser), stamp_ns)
         ranges = self._mix(exact) + self._rng.normal(0.0, self.config.noise_m, exact.size)
         if self.config.rounding_m > 0.0:
             ranges = np.round(ranges / self.config.rounding_m) * self.config.rounding_m
@@ -70,15 +71,20 @@ class Lms200:
             self.T_base_laser,
         )
 
-    def _exact(self, world: World, T_world_laser: Array) -> Array:
-        resolution = world.frame.resolution
-        x = (T_world_laser[0] - world.frame.origin_x) / resolution
-        y = (T_world_laser[1] - world.frame.origin_y) / resolution
+    def _exact(self, world: World, T_world_laser: Array, stamp_ns: int) -> Array:
+        frame = world.frame
+        x = (T_world_laser[0] - frame.origin_x) / frame.resolution
+        y = (T_world_laser[1] - frame.origin_y) / frame.resolution
         angles = T_world_laser[2] + self._angle_min + self._turns
-        return (
-            cast_rays(world.occupied, x, y, angles, self.config.range_max_m / resolution)
-            * resolution
-        )
+        reach_m = self.config.range_max_m
+        cells = cast_rays(world.occupied, x, y, angles, reach_m / frame.resolution)
+        if world.glass is not None:
+            cells[_meets(world.glass, x, y, angles, cells)] = np.inf
+        ranges = cells * frame.resolution
+        if world.moving is None:
+            return ranges
+        nearer = world.moving.ranges(stamp_ns / 1e9, T_world_laser, angles, reach_m)
+        return np.minimum(ranges, nearer)
 
     def _mix(self, ranges: Array) -> Array:
         """Mixed pixels: at a depth edge a beam's spot is on both surfaces, the range in between.
@@ -94,6 +100,21 @@ class Lms200:
         result = ranges.copy()
         result[mixed + side] = nearer + share * (farther - nearer)
         return result
+
+
+def _meets(
+    special: NDArray[np.bool_], x: float, y: float, angles: Array, cells: Array
+) -> NDArray[np.bool_]:
+    """Whether beams from (x, y) that end after so many cells (N,) end in a special cell."""
+    inside = np.where(np.isfinite(cells), cells, 0.0) + _INTO_CELL
+    cols = np.floor(x + inside * np.cos(angles)).astype(np.int64)
+    rows = np.floor(y + inside * np.sin(angles)).astype(np.int64)
+    there: NDArray[np.bool_] = (
+        (rows >= 0) & (rows < special.shape[0]) & (cols >= 0) & (cols < special.shape[1])
+    )
+    there &= np.isfinite(cells)
+    there[there] = special[rows[there], cols[there]]
+    return there
 
 
 @kernel

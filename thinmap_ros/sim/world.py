@@ -11,19 +11,23 @@ from thinmap_ros.core.grid.distance import distance_cells
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.sim.moving import Moving
 
 
 @dataclass(frozen=True, eq=False)
 class World:
     """What is solid: `occupied` (H, W) uint8 on a lattice in the world frame.
 
-    Where a robot may start (3,).
+    Where a robot may start (3,); where a laser gets no return from what is solid, `glass` (H, W);
+    and what moves.
     """
 
     name: str
     occupied: NDArray[np.uint8]
     frame: GridFrame
     start: Array
+    glass: NDArray[np.bool_] | None = None
+    moving: Moving | None = None
 
     @staticmethod
     def from_patch(name: str, patch: GridPatch, start: Array) -> 'World':

@@ -1,0 +1,148 @@
+"""Buildings from seeds: every part can be reached; what is glass, walks or swings does so."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.sim.buildings import BuildingConfig, building
+from thinmap_ros.sim.floor_plan import Kind, floor_plan
+from thinmap_ros.sim.lms200 import Lms200, Lms200Config
+from thinmap_ros.sim.moving import Leaves, Moving, People
+from thinmap_ros.sim.pioneer import PioneerConfig
+from thinmap_ros.sim.surfaces import inside_of
+from thinmap_ros.sim.world import World
+
+SEEDS = range(24)
+EXACT = Lms200Config(noise_m=0.0, rounding_m=0.0, mixed_pixels=0.0)
+NOBODY = People(np.zeros((0, 4, 2)), np.zeros(0), np.zeros((0, 4)))
+NO_DOOR = Leaves(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0), 0)
+
+
+def plain(seed, **given):
+    """A building without furniture."""
+    return building(seed, BuildingConfig(clutter=0.0, **given))
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_a_robot_gets_into_every_part(seed):
+    made = plain(seed, area_m2=600.0 + 100.0 * seed)
+    world = made.world
+    inside = inside_of(replace(world, occupied=(world.wall_distance_m < 0.3).astype(np.uint8)))
+    assert world.is_clear(*world.start[:2], PioneerConfig().radius_m)
+    for wing in made.wings:
+        for part in wing.plan.parts:
+            middle = np.array([[0.5 * (part.x0 + part.x1), 0.5 * (part.y0 + part.y1)]])
+            x, y, turn = wing.T_world_wing
+            c, s = math.cos(turn), math.sin(turn)
+            at = world.frame.cells_of(middle @ np.array([[c, s], [-s, c]]) + (x, y))[0]
+            near = inside[at[0] - 12 : at[0] + 13, at[1] - 12 : at[1] + 13]
+            assert near.any(), part
+
+
+def test_parts_tile_the_plan():
+    for seed in SEEDS:
+        rng = np.random.default_rng(seed)
+        plan = floor_plan(*rng.uniform(10.0, 120.0, 2), 0.3, rng)
+        area = sum(part.width * part.depth for part in plan.parts)
+        assert area == pytest.approx(plan.width * plan.depth)
+        assert min(min(part.width, part.depth) for part in plan.parts) > 1.5
+        assert all(door.length > 0.8 for door in plan.doors)
+
+
+def test_a_seed_says_all_and_another_says_something_else():
+    one, same, other = building(5), building(5), building(6)
+    assert np.array_equal(one.world.occupied, same.world.occupied)
+    assert one.world.frame == same.world.frame
+    assert np.array_equal(one.world.start, same.world.start)
+    places = [made.world.moving.people.places(77.0) for made in (one, same)]
+    assert np.array_equal(*places)
+    assert one.world.occupied.shape != other.world.occupied.shape
+
+
+def test_what_is_asked_for():
+    made = plain(3, area_m2=4000.0, hall_share=0.0, wings=1, people_per_1000_m2=0.0)
+    assert made.area_m2 == pytest.approx(4000.0, rel=0.1)
+    assert len(made.wings) == 1
+    assert not any(part.kind is Kind.HALL for part in made.wings[0].plan.parts)
+    assert made.world.moving is None or len(made.world.moving.people.points) == 0
+    halls = plain(3, area_m2=4000.0, hall_share=1.0)
+    wide = [p for w in halls.wings for p in w.plan.parts if p.kind is Kind.HALL]
+    assert any(min(hall.width, hall.depth) > 16.0 for hall in wide)  # wider than 8 m of laser
+
+
+def test_oblique_wings_are_among_them():
+    made = [plain(seed, area_m2=2000.0, wings=3) for seed in SEEDS]
+    turns = [wing.T_world_wing[2] % (0.5 * math.pi) for each in made for wing in each.wings]
+    oblique = [turn for turn in turns if 0.05 < turn < 0.5 * math.pi - 0.05]
+    assert len(turns) > 2 * len(SEEDS)
+    assert len(oblique) > len(SEEDS) // 2
+
+
+def test_the_largest():
+    made = building(1, BuildingConfig(area_m2=100_000.0))
+    assert made.area_m2 > 50_000.0
+    assert made.world.is_clear(*made.world.start[:2], PioneerConfig().radius_m)
+
+
+@pytest.mark.parametrize('area_m2', [math.nan, 0.0, 100.0, 1e6])
+def test_a_size_that_there_is_not_is_refused(area_m2):
+    with pytest.raises(InputError, match=r'area_m2: .*: expected 150 to 100000 m2'):
+        building(0, BuildingConfig(area_m2=area_m2))
+
+
+def walled(glass, moving=None):
+    """A room with its right wall at x = 3 m, seen from (1, 2)."""
+    occupied = np.zeros((80, 80), dtype=np.uint8)
+    occupied[:, 60:62] = 1
+    pane = np.zeros_like(occupied, dtype=bool)
+    pane[35:45, 60:62] = glass
+    return World('room', occupied, GridFrame(0.0, 0.0, 0.05), np.zeros(3), pane, moving)
+
+
+def ahead(world, seconds=0.0):
+    """What the beam straight ahead reads, looking along x from (1, 2)."""
+    scan = Lms200(EXACT, 0).scan(world, np.array([1.0, 2.0, 0.0]), round(1e9 * seconds))
+    return scan.ranges_m[90]
+
+
+def test_glass_returns_nothing_and_is_solid():
+    assert ahead(walled(glass=False)) == pytest.approx(2.0)
+    assert ahead(walled(glass=True)) == math.inf
+    assert not walled(glass=True).is_clear(3.0, 2.0, 0.2)
+
+
+def test_people_are_seen_where_they_are_then_and_step_aside():
+    points = np.array([[[2.0, 2.0], [2.0, 3.9], [2.0, 3.9], [2.0, 2.0]]])
+    people = People(points, np.array([1.0]), np.full((1, 4), 10.0))
+    world = walled(False, Moving(people, NO_DOOR))
+    assert ahead(world, 5.0) == pytest.approx(0.8)
+    assert people.places(11.0)[0] == pytest.approx((2.0, 3.0))
+    assert ahead(world, 20.0) == pytest.approx(2.0)
+    assert ahead(world, 43.8 + 5.0) == pytest.approx(0.8)  # round again
+    beside = People(points - (0.6, 0.0), np.array([1.0]), np.full((1, 4), 10.0))
+    assert ahead(walled(False, Moving(beside, NO_DOOR)), 5.0) == pytest.approx(2.0)
+
+
+def test_doors_swing_and_are_held_open_for_a_robot():
+    hinges, ends = np.array([[2.0, 1.5]]), np.array([[2.0, 2.5]])
+    leaves = Leaves(hinges, ends, np.ones(1), np.array([10.0]), np.array([0.5]), 3)
+    far, near = np.array([-6.0, 2.0]), np.array([1.0, 2.0])
+    shut = [np.allclose(leaves.segments(10.0 * k, far, 20.0)[0, 2:], ends[0]) for k in range(60)]
+    assert 15 < sum(shut) < 45
+    assert not any(
+        np.allclose(leaves.segments(10.0 * k, near, 20.0)[0, 2:], ends[0]) for k in range(60)
+    )
+    same = [leaves.segments(seconds, far, 20.0) for seconds in (10.0, 19.9)]
+    assert np.array_equal(*same)
+    always = Leaves(hinges, ends, np.ones(1), np.array([np.inf]), np.zeros(1), 3)
+    leaf = always.segments(1e4, far, 20.0)[0]
+    assert np.hypot(*(leaf[2:] - leaf[:2])) == pytest.approx(1.0)
+    assert not np.allclose(leaf[2:], ends[0])
+    blocked = Leaves(hinges, ends, np.ones(1), np.array([np.inf]), np.ones(1), 3)
+    world = walled(False, Moving(NOBODY, blocked))
+    scan = Lms200(EXACT, 0).scan(world, np.array([-2.5 + 1.0, 2.0, 0.0]), 0)
+    assert scan.ranges_m[90] == pytest.approx(3.5)

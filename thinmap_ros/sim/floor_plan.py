@@ -1,0 +1,226 @@
+"""Floor plans made by chance: rectangles that are rooms, corridors and halls, and openings."""
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+from itertools import pairwise
+
+import numpy as np
+
+WALL_M = 0.15
+_CORRIDOR_M = (1.6, 3.0)
+_ROOM_WIDTH_M = (2.6, 8.0)
+_ROW_M = 5.5  # a block that is no deeper has one row of rooms, and
+_LONGEST_ROW_M = 30.0  # where it is longer is cut across
+_SPINE_M = 18.0  # one that is no deeper has a corridor along its middle
+_HALL_M = (12.0, 45.0)  # shortest and longest side of what may become a hall
+_DOOR_M = (0.85, 1.05)
+_WIDE_DOOR_M = (1.6, 2.4)
+_JAMB_M = 0.25  # between an opening and the corner of a room
+_TOUCHING_M = 1e-6
+
+
+class Kind(Enum):
+    """What a part of a floor is."""
+
+    ROOM = 'room'
+    CORRIDOR = 'corridor'
+    HALL = 'hall'
+
+
+@dataclass(frozen=True)
+class Part:
+    """A rectangle of the floor from middle of wall to middle of wall, m."""
+
+    kind: Kind
+    x0: float
+    y0: float
+    x1: float
+    y1: float
+
+    @property
+    def width(self) -> float:
+        """Along x, m."""
+        return self.x1 - self.x0
+
+    @property
+    def depth(self) -> float:
+        """Along y, m."""
+        return self.y1 - self.y0
+
+
+@dataclass(frozen=True)
+class Opening:
+    """A stretch of the wall between two parts (their numbers), from (x0, y0) to (x1, y1), m."""
+
+    a: int
+    b: int
+    x0: float
+    y0: float
+    x1: float
+    y1: float
+
+    @property
+    def length(self) -> float:
+        """Its width, m."""
+        return math.hypot(self.x1 - self.x0, self.y1 - self.y0)
+
+
+@dataclass(frozen=True)
+class FloorPlan:
+    """Parts that tile a rectangle of width x depth, m, from (0, 0) on.
+
+    doors: openings of the width of a door; passages: where corridors and halls go over into each
+    other; walls: what is left between two parts, where a pane of glass may be.
+    """
+
+    width: float
+    depth: float
+    parts: list[Part]
+    doors: list[Opening]
+    passages: list[Opening]
+    walls: list[Opening]
+
+
+def floor_plan(
+    width: float, depth: float, hall_share: float, rng: np.random.Generator
+) -> FloorPlan:
+    """Plan of one wing.
+
+    hall_share: how often a block that is large enough is a hall. Every part can be reached.
+    """
+    parts = _cut(Part(Kind.ROOM, 0.0, 0.0, width, depth), hall_share, rng)
+    shared = _shared_walls(parts)
+    passages = [wall for wall in shared if _is_open(parts[wall.a], parts[wall.b])]
+    closed = [wall for wall in shared if not _is_open(parts[wall.a], parts[wall.b])]
+    doors = [
+        _door(wall, parts, rng) for wall in _with_doors(parts, passages, _wide_enough(closed), rng)
+    ]
+    inner = [_shortened(wall, 0.5 * WALL_M) for wall in passages if wall.length > 2.0 * WALL_M]
+    return FloorPlan(width, depth, parts, doors, inner, closed)
+
+
+def _cut(block: Part, hall_share: float, rng: np.random.Generator) -> list[Part]:
+    """Corridors through a block, as long as it is too deep for rooms, and what is between."""
+    short, long = sorted((block.width, block.depth))
+    if short >= _HALL_M[0] and long <= _HALL_M[1] and rng.random() < hall_share:
+        return [_as(Kind.HALL, block)]
+    along_x = block.width >= block.depth
+    if short <= _ROW_M and long <= _LONGEST_ROW_M:
+        return _rooms(block, along_x, rng)
+    # A corridor along a block that is as deep as two rows of rooms, else across it.
+    spine = short <= _SPINE_M
+    across_x = along_x != spine
+    length = block.width if across_x else block.depth
+    corridor = rng.uniform(*_CORRIDOR_M)
+    at = rng.uniform(0.35, 0.65) * (length - corridor)
+    first, middle, last = _sliced(block, across_x, [at, at + corridor])
+    if spine:
+        sides = [_rooms(side, along_x, rng) for side in (first, last)]
+    else:
+        sides = [_cut(side, hall_share, rng) for side in (first, last)]
+    return [*sides[0], _as(Kind.CORRIDOR, middle), *sides[1]]
+
+
+def _rooms(row: Part, along_x: bool, rng: np.random.Generator) -> list[Part]:
+    """A row of rooms."""
+    length = row.width if along_x else row.depth
+    marks = [rng.uniform(*_ROOM_WIDTH_M)]
+    while marks[-1] < length - _ROOM_WIDTH_M[0]:
+        marks.append(marks[-1] + rng.uniform(*_ROOM_WIDTH_M))
+    return _sliced(row, along_x, [mark for mark in marks if mark < length - _ROOM_WIDTH_M[0]])
+
+
+def _sliced(part: Part, along_x: bool, marks: list[float]) -> list[Part]:
+    """Pieces of a part, cut across one of its axes at distances from its lower side."""
+    low = part.x0 if along_x else part.y0
+    high = part.x1 if along_x else part.y1
+    pieces = []
+    for a, b in pairwise([low, *(low + mark for mark in marks), high]):
+        if along_x:
+            pieces.append(Part(part.kind, a, part.y0, b, part.y1))
+        else:
+            pieces.append(Part(part.kind, part.x0, a, part.x1, b))
+    return pieces
+
+
+def _as(kind: Kind, part: Part) -> Part:
+    return Part(kind, part.x0, part.y0, part.x1, part.y1)
+
+
+def _is_open(a: Part, b: Part) -> bool:
+    return a.kind is Kind.CORRIDOR and b.kind is Kind.CORRIDOR
+
+
+def _shared_walls(parts: list[Part]) -> list[Opening]:
+    """Where two parts lie beside each other, all along their common side."""
+    boxes = np.array([(p.x0, p.y0, p.x1, p.y1) for p in parts])
+    found = []
+    for i, part in enumerate(parts):
+        rest = boxes[i + 1 :]
+        low = np.maximum(rest[:, :2], (part.x0, part.y0))
+        high = np.minimum(rest[:, 2:], (part.x1, part.y1))
+        size = high - low
+        beside_x = (np.abs(size[:, 0]) < _TOUCHING_M) & (size[:, 1] > _TOUCHING_M)
+        beside_y = (np.abs(size[:, 1]) < _TOUCHING_M) & (size[:, 0] > _TOUCHING_M)
+        for k in np.flatnonzero(beside_x | beside_y):
+            ends = (*low[k].tolist(), *high[k].tolist())
+            found.append(Opening(i, i + 1 + int(k), *ends))
+    return found
+
+
+def _wide_enough(walls: list[Opening]) -> list[Opening]:
+    return [wall for wall in walls if wall.length >= _DOOR_M[1] + 2.0 * _JAMB_M]
+
+
+def _with_doors(
+    parts: list[Part], passages: list[Opening], walls: list[Opening], rng: np.random.Generator
+) -> list[Opening]:
+    """Walls that get a door: so many that all is connected, corridors first, and some more."""
+    group = list(range(len(parts)))
+
+    def root(i: int) -> int:
+        while group[i] != i:
+            group[i] = group[group[i]]
+            i = group[i]
+        return i
+
+    for passage in passages:
+        group[root(passage.a)] = root(passage.b)
+    order = rng.permutation(len(walls)).tolist()
+    # A room has its door on a corridor where it has one.
+    order = sorted(order, key=lambda k: not _leads_to_corridor(parts, walls[k]))
+    chosen = []
+    for k in order:
+        a = root(walls[k].a)
+        b = root(walls[k].b)
+        spare = 0.15 if _leads_to_corridor(parts, walls[k]) else 0.08
+        if a != b or rng.random() < spare:
+            group[a] = b
+            chosen.append(walls[k])
+    return chosen
+
+
+def _leads_to_corridor(parts: list[Part], wall: Opening) -> bool:
+    return Kind.CORRIDOR in (parts[wall.a].kind, parts[wall.b].kind)
+
+
+def _door(wall: Opening, parts: list[Part], rng: np.random.Generator) -> Opening:
+    """A door somewhere in a wall; one to a hall may be wide."""
+    is_hall = Kind.HALL in (parts[wall.a].kind, parts[wall.b].kind)
+    wide = is_hall and wall.length > _WIDE_DOOR_M[1] + 2.0 * _JAMB_M and rng.random() < 0.6
+    width = rng.uniform(*(_WIDE_DOOR_M if wide else _DOOR_M))
+    begin = rng.uniform(_JAMB_M, wall.length - _JAMB_M - width)
+    return _stretch(wall, begin, begin + width)
+
+
+def _shortened(wall: Opening, by: float) -> Opening:
+    return _stretch(wall, by, wall.length - by)
+
+
+def _stretch(wall: Opening, begin: float, end: float) -> Opening:
+    """The part of a wall between two distances from its first end."""
+    along = np.array([wall.x1 - wall.x0, wall.y1 - wall.y0]) / wall.length
+    first = np.array([wall.x0, wall.y0]) + begin * along
+    last = np.array([wall.x0, wall.y0]) + end * along
+    return Opening(wall.a, wall.b, *first.tolist(), *last.tolist())
