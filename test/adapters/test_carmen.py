@@ -169,7 +169,8 @@ def test_nan_ranges_are_neither_hit_nor_no_return(tmp_path: Path) -> None:
         (b'FLASER 3 1.0', 'no scan.*log.clf:1'),
         (b'\x89PNG\r\n\x00\x00', 'zero byte'),
         (b'hello\nworld\n', 'no scan'),
-        (gzip.compress(FLASER.encode())[:-12], 'no scan'),
+        # Without the time of day, which would be in the name of the test.
+        (gzip.compress(FLASER.encode(), mtime=0)[:-12], 'no scan'),
         (b'\x1f\x8bnonsense', 'no scan'),
     ],
 )
