@@ -3,6 +3,8 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from time import monotonic
+from typing import Any
 
 from nav_msgs.msg import OccupancyGrid
 from rclpy.action import ActionClient
@@ -22,6 +24,9 @@ from thinmap_ros.sim.pioneer import PRESETS
 from thinmap_ros.sim.world import World
 
 _LOOK_PERIOD_S = 0.5
+# After so long an answer passes for lost: an explorer that has just found us may be unable to give
+# one.
+_ASK_AGAIN_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -48,7 +53,9 @@ class DemoMonitorNode(Node):
         radius = PRESETS[self._config.robot].radius_m
         self._coverable = coverable(world, world.start, radius, self._config.range_max_m)
         self._coverage = 0.0
-        self._asked = False
+        self._sent: Any = None
+        self._sent_at = 0.0
+        self._accepted = False
         self.finished = False
         self._bar = tqdm(
             total=100.0, bar_format='{desc:<48}|{bar}| {n:5.1f} % seen  {postfix}', leave=True
@@ -63,13 +70,19 @@ class DemoMonitorNode(Node):
         self._bar.close()
 
     def _ask(self) -> None:
-        if self._asked or not self._explore.server_is_ready():
+        if self._accepted or not self._explore.server_is_ready():
             return
-        self._asked = True
+        if self._sent is not None and monotonic() - self._sent_at < _ASK_AGAIN_S:
+            return
         goal = Explore.Goal(time_limit_s=self._config.time_limit_s)
-        self._explore.send_goal_async(goal, self._on_feedback).add_done_callback(self._on_accepted)
+        self._sent_at = monotonic()
+        self._sent = self._explore.send_goal_async(goal, self._on_feedback)
+        self._sent.add_done_callback(self._on_accepted)
 
     def _on_accepted(self, future: Future) -> None:
+        if future is not self._sent:
+            return  # a newer goal has taken its place
+        self._accepted = True
         future.result().get_result_async().add_done_callback(self._on_result)
 
     def _on_map(self, message: OccupancyGrid) -> None:

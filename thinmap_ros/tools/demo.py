@@ -21,7 +21,8 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.sim.pioneer import PRESETS
 from thinmap_ros.tools import cli, demo_results
 
-_PATIENCE_S = 1.2
+# Nodes end at once, but not on a machine that is busy; a recorder that is killed leaves half a bag.
+_PATIENCE_S = 20.0
 _NODES = ('localizer', 'grid_mapper', 'topology_builder', 'explorer', 'navigator', 'recorder')
 # These listen to /scan: time stands still until all of them do.
 _SCAN_LISTENERS = 5
