@@ -87,7 +87,7 @@ EXTRAS = {'rerun', 'dask', 'distributed'}
 )
 def test_every_import_has_its_key_in_package_xml(folder, tags):
     wanted, own = set(), {'thinmap_ros'} | {path.stem for path in (ROOT / 'test').rglob('*.py')}
-    own |= {'benchmarks'} if folder == 'test' else set()
+    own |= {'benchmarks', 'fuzz'} if folder == 'test' else set()
     for path in (ROOT / folder).rglob('*.py'):
         for node in ast.walk(ast.parse(path.read_text())):
             names = [n.name for n in node.names] if isinstance(node, ast.Import) else []

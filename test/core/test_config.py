@@ -42,3 +42,9 @@ def test_a_wrong_value_is_named(wrong):
         Sample(**wrong)
     assert name in str(caught.value)
     assert repr(value) in str(caught.value)
+
+
+@pytest.mark.parametrize('name', ['speed', 'count'])
+def test_a_number_beyond_all_floats_is_none(name):
+    with pytest.raises(ConfigError, match=f'{name} = a whole number of 1329 bits: expected a fin'):
+        Sample(**{name: 10**400})

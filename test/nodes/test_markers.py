@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from strange_messages import made, numbers
+from fuzz.strange_messages import made, numbers
 from visualization_msgs.msg import Marker, MarkerArray
 
 from thinmap_msgs.msg import EndNode, EndNodeArray, LineFeature, LineFeatureArray, TopologicalMap

@@ -6,15 +6,14 @@ Conversions give sound values or refuse in one line, and no node dies or publish
 import math
 from collections import Counter
 
-import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
+from fuzz.strange_messages import CHECKS, made, numbers
 from geometry_msgs.msg import Point32, PoseWithCovarianceStamped, Twist
 from lifecycle_msgs.srv import GetState
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from rclpy.action import ActionClient
 from sensor_msgs.msg import LaserScan
-from strange_messages import made, numbers
 from test_health import Doctor
 from tf2_msgs.msg import TFMessage
 
@@ -30,51 +29,6 @@ from thinmap_ros.adapters import messages, qos
 from thinmap_ros.core.errors import InputError
 
 pytestmark = pytest.mark.live
-
-
-def check_scan(message):
-    scan = messages.scan_from(message, np.zeros(3))
-    assert np.isfinite(scan.points_base()).all() and np.isfinite(scan.angles_rad).all()
-    assert scan.ranges_m.size == len(message.ranges) > 0 and scan.stamp_ns >= 0
-
-
-def check_odometry(message):
-    assert messages.stamp_ns(message.header.stamp) >= 0
-    assert np.isfinite(messages.pose_from(message.pose.pose)).all()
-
-
-def check_pose(message):
-    check_odometry(message)
-    covariance = messages.covariance_from(message)
-    assert np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance).min() > -1e-8
-
-
-def check_grid(message):
-    patch = messages.patch_from(message)
-    assert (
-        patch.cells.size == len(message.data)
-        and patch.cells.min() >= -1
-        and patch.cells.max() <= 100
-    )
-    assert np.isfinite(patch.frame.as_array()).all() and patch.frame.resolution > 0.0
-
-
-def check_topology(message):
-    found = messages.topology_from(message)
-    assert len(found.nodes) == len(message.nodes) and len(found.edges) == len(message.edges)
-    assert all(math.isfinite(node.x + node.y + node.clearance_m) for node in found.nodes.values())
-    assert all(
-        np.isfinite(edge.path).all() and edge.a in found.nodes for edge in found.edges.values()
-    )
-
-
-CHECKS = {
-    LaserScan: check_scan,
-    Odometry: check_odometry,
-    PoseWithCovarianceStamped: check_pose,
-    OccupancyGrid: check_grid,
-    TopologicalMap: check_topology,
-}
 
 
 def is_refused(message):

@@ -46,10 +46,17 @@ def _check(field: 'dataclasses.Field[Any]', value: Any) -> None:
         raise ConfigError(f'{field.name} = {shown(value)}: expected one of {", ".join(choices)}')
     if isinstance(value, bool) or not isinstance(value, int | float):
         return
-    if not math.isfinite(value):
+    if not _is_finite(value):
         raise ConfigError(f'{field.name} = {shown(value)}: expected a finite number')
     if (low is not None and value < low) or (high is not None and value > high):
         raise ConfigError(f'{field.name} = {shown(value)}: expected {_interval(low, high)}')
+
+
+def _is_finite(value: float) -> bool:
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # a whole number beyond all that can be calculated with
+        return False
 
 
 def _same_type(value: Any, default: Any) -> bool:

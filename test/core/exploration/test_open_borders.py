@@ -83,6 +83,17 @@ def test_what_a_scan_can_have_changed_lies_in_its_box():
     assert high.tolist() == pytest.approx([18.5, 21.5], abs=1e-6)
 
 
+@pytest.mark.parametrize('heading', [0.0, 0.5 * math.pi, 1.0])
+def test_a_laser_whose_range_has_no_end_may_have_changed_all_that_there_is(heading):
+    scan = Scan.create(0, np.full(181, np.inf), -0.5 * math.pi, math.pi / 180.0, 0.05, np.inf)
+    box = box_of_scan(scan, se2.pose(1.0, 1.0, heading))
+    assert np.isfinite(box).all()
+    borders = OpenBorders(0.4)
+    borders.update(patch_of(half_known()), np.array([[0.0, 0.0], [0.1, 0.1]]))
+    borders.update(patch_of(half_known()), box)
+    assert (borders.mask == borders_of(half_known()).mask).all()
+
+
 def test_now_and_then_the_whole_map_is_looked_at_again():
     borders = borders_of(half_known())
     corrected = half_known()

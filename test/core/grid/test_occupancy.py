@@ -133,9 +133,13 @@ def test_the_map_grows_in_any_direction_in_memory_proportional_to_what_was_seen(
     assert percent(grid, 1.05, 0.05) == 80
 
 
-def test_a_pose_that_is_not_finite_changes_nothing():
+@pytest.mark.parametrize('axis', range(3))
+@pytest.mark.parametrize('value', [np.nan, np.inf, -np.inf])
+def test_a_pose_that_is_not_finite_changes_nothing(axis, value):
     grid = OccupancyGrid()
-    grid.update(scan_of(np.full(181, 1.0)), np.array([np.nan, 0.0, 0.0]))
+    T = np.zeros(3)
+    T[axis] = value
+    grid.update(scan_of(np.full(181, 1.0)), T)
     assert grid.patch().unknown.all()
 
 

@@ -176,9 +176,9 @@ class OccupancyGrid:
         Raises InputError where the laser is nowhere on earth or the map would get too large; the
         map is then as it was.
         """
-        T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
-        if scan.ranges_m.size == 0 or not se2.is_finite(T_map_laser):
+        if scan.ranges_m.size == 0 or not se2.is_finite(T_map_base):
             return
+        T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
         if not se2.is_on_earth(T_map_laser):
             place = f'{T_map_laser[0]:g}, {T_map_laser[1]:g} m'
             raise InputError(f'scan at {scan.stamp_ns} ns: laser at {place}: too far to be mapped')

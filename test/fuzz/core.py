@@ -1,0 +1,209 @@
+"""The core with scans, poses, maps and graphs at random: what comes out has to make sense."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from slam_room import ROOM, scan_in
+
+from fuzz.cases import Source, chosen, finite, nothing, tried
+from fuzz.files import small_graph, sound_graph, sound_patch
+from thinmap_ros.core import se2
+from thinmap_ros.core.exploration.explorer import Explorer
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.occupancy import OccupancyGrid
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.localization.config import GlobalLocalizationConfig
+from thinmap_ros.core.localization.global_localization import GlobalLocalization
+from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
+from thinmap_ros.core.topology.update import TopologyBuilder
+
+_PERIOD_NS = 200_000_000
+_STRANGE_RANGES = (np.nan, np.inf, -np.inf, 0.0, -1.0, 1e-30, 1e30, 7.999, 8.0, 400.0)
+_STRANGE = (0.0, -0.0, 1e-300, 1e-9, 1.0, -1.0, 50.0, 1e6, -1e9, 1e300, np.nan, np.inf, -np.inf)
+
+
+class Drive:
+    """A robot in a room, which is thrown about, and whose laser and wheels fail now and then."""
+
+    def __init__(self, rng: np.random.Generator, folder: Path) -> None:
+        self._rng = rng
+        self._diary = (folder / 'drive.txt').open('w')
+        self.T = se2.pose(float(rng.uniform(0.5, 9.0)), float(rng.uniform(0.5, 9.0)), 0.0)
+        self.T_odom = np.zeros(3)
+        self._k = 0
+
+    def move(self) -> None:
+        """Go on by a step; seldom leap, or say what is no pose."""
+        rng = self._rng
+        step = se2.pose(float(rng.uniform(0.0, 0.2)), 0.0, float(rng.normal(0.0, 0.2)))
+        self.T = se2.compose(self.T, step)
+        if rng.random() < 0.05:
+            self.T = np.append(rng.uniform(0.0, 10.0, 2), rng.uniform(-4.0, 4.0))
+        self.T_odom = se2.compose(self.T_odom, step)
+        if rng.random() < 0.05:
+            self.T_odom = rng.uniform(-1.0, 1.0, 3) * float(chosen(rng, (0.1, 1.0, 50.0, 1e5)))
+        self._k += 1
+
+    def scan(self) -> Scan | None:
+        """A scan from where the robot is, often with faults; None where it was refused."""
+        rng = self._rng
+        good = scan_in(ROOM, self.T, stamp_ns=self._k * _PERIOD_NS)
+        ranges = good.ranges_m.copy()
+        if rng.random() < 0.3:
+            at = int(rng.integers(ranges.size))
+            ranges[at : at + int(rng.integers(1, 200))] = chosen(rng, _STRANGE_RANGES)
+        if rng.random() < 0.1:
+            ranges = rng.uniform(-1.0, 9.0, int(chosen(rng, (0, 1, 2, 7, 181, 2_000))))
+        numbers = [good.angle_min_rad, good.angle_increment_rad, good.range_min_m, good.range_max_m]
+        if rng.random() < 0.1:
+            numbers[int(rng.integers(4))] = float(chosen(rng, _STRANGE))
+        mount = np.append(rng.uniform(-0.5, 0.5, 2), rng.uniform(-4.0, 4.0))
+        mount = mount if rng.random() < 0.1 else np.zeros(3)
+        stamp = good.stamp_ns + int(chosen(rng, (0, 0, 0, 0, 0, 0, -(10**9), 10**12)))
+        self.tell('scan', stamp, ranges.tolist(), numbers, mount.tolist())
+        zero = bool(rng.random() < 0.2)
+        made: Scan | None = tried(lambda: Scan.create(stamp, ranges, *numbers, mount, zero))
+        return made
+
+    def tell(self, *words: Any) -> None:
+        """Write down what comes next, to be found where that fails."""
+        print(*words, file=self._diary, flush=True)
+
+    def pose(self) -> Array:
+        """Where the robot is; now and then somewhere else on or beyond the earth."""
+        if self._rng.random() > 0.05:
+            return self.T
+        size = float(chosen(self._rng, (1.0, 1e3, 1e5, 1e7, 1e300, np.inf, np.nan)))
+        T = self._rng.uniform(-1.0, 1.0, 3) * size
+        self.tell('pose', T.tolist())
+        return T
+
+
+def map_and_graph(shared: None, rng: np.random.Generator, folder: Path) -> None:
+    drive = Drive(rng, folder)
+    grid = OccupancyGrid()
+    builder = TopologyBuilder()
+    explorer = Explorer()
+    for _ in range(int(rng.integers(1, 15))):
+        drive.move()
+        scan = drive.scan()
+        if scan is None:
+            continue
+        T = drive.pose()
+        if tried(lambda s=scan, p=T: [grid.update(s, p)]) is None or not se2.is_on_earth(T):
+            continue
+        window = grid.window(T[0], T[1], 16.0)
+        sound_patch(window)
+        if tried(lambda w=window, p=T: [builder.update(w, p)]) is None:
+            continue
+        sound_graph(builder.map)
+        sound_graph(builder.local_map())
+        patch = grid.patch()
+        if patch.cells.size < 4_000_000:
+            decision = tried(lambda s=scan, p=T, m=patch: explorer.step(builder.map, m, s, p))
+            if decision is not None and decision.target is not None:
+                finite(decision.target.goal)
+    sound_patch(grid.patch())
+
+
+def localize(shared: None, rng: np.random.Generator, folder: Path) -> None:
+    drive = Drive(rng, folder)
+    config = LocalizerConfig(slam=str(chosen(rng, ('ti', 'full', 'off'))))
+    localizer = Localizer(config)
+    graph = small_graph()
+    for _ in range(int(rng.integers(1, 20))):
+        drive.move()
+        scan = drive.scan()
+        if scan is None:
+            continue
+        drive.tell('odometry', drive.T_odom.tolist())
+        estimate = tried(lambda s=scan: localizer.step(s, drive.T_odom))
+        if estimate is not None:
+            finite(estimate.T_map_base, estimate.covariance)
+            assert np.linalg.eigvalsh(estimate.covariance).min() > -1e-6
+        if rng.random() < 0.1:
+            localizer.set_topology(graph)
+    finite(localizer.corrected_path())
+    tried(lambda: Localizer.from_state(localizer.state(), config))
+
+
+def known_room(folder: Path) -> tuple[GridPatch, Any]:
+    grid = OccupancyGrid()
+    builder = TopologyBuilder()
+    for k in range(40):
+        T = se2.pose(1.5 + 0.18 * k, 1.5, 0.4 * k)
+        grid.update(scan_in(ROOM, T, stamp_ns=k * _PERIOD_NS), T)
+        builder.update(grid.window(T[0], T[1], 16.0), T)
+    return grid.patch(), builder.map
+
+
+def localize_globally(
+    shared: tuple[GridPatch, Any], rng: np.random.Generator, folder: Path
+) -> None:
+    drive = Drive(rng, folder)
+    config = GlobalLocalizationConfig(samples=300)
+    search = tried(lambda: GlobalLocalization(*shared, config, int(rng.integers(1000))))
+    if search is None:
+        return
+    for _ in range(int(rng.integers(1, 12))):
+        drive.move()
+        scan = drive.scan()
+        if scan is None:
+            continue
+        drive.tell('odometry', drive.T_odom.tolist())
+        result = tried(lambda s=scan: search.step(s, drive.T_odom))
+        if result is None:
+            continue
+        assert result.reason.isprintable() and len(result.reason) < 1000
+        finite(search.samples)
+        for hypothesis in result.hypotheses:
+            finite(hypothesis.T_map_base, hypothesis.covariance, hypothesis.weight)
+
+
+def _random_map(rng: np.random.Generator) -> GridPatch:
+    rows, cols = rng.integers(1, 120, 2)
+    cells = np.full((rows, cols), chosen(rng, (0, 0, 0, -1, 100)), dtype=np.int8)
+    for _ in range(int(rng.integers(0, 30))):
+        row = int(rng.integers(rows))
+        col = int(rng.integers(cols))
+        tall, wide = (int(rng.integers(1, 40)) for _ in range(2))
+        cells[row : row + tall, col : col + wide] = chosen(rng, (0, 0, 100, -1, 50))
+    origin = rng.uniform(-6.0, 1.0, 2)
+    return GridPatch(GridFrame(float(origin[0]), float(origin[1]), 0.1), cells)
+
+
+def navigate(shared: None, rng: np.random.Generator, folder: Path) -> None:
+    drive = Drive(rng, folder)
+    config = NavigatorConfig()
+    navigator = Navigator(config)
+    for k in range(int(rng.integers(1, 30))):
+        if k % 7 == 0:
+            patch = _random_map(rng)
+            goal = rng.uniform(-2.0, 12.0, 2) * float(chosen(rng, (1.0, 1.0, 1.0, 1e4, 1e9)))
+            drive.tell('goal', goal.tolist(), patch.cells.tolist())
+            navigator.set_goal(float(goal[0]), float(goal[1]), chosen(rng, (None, 1.0, -3.0)))
+        drive.move()
+        scan = drive.scan() if rng.random() < 0.8 else None
+        T = drive.T
+        dt_s = float(chosen(rng, (0.01, 0.1, 0.1, 1.0)))
+        command = tried(lambda p=T, m=patch, s=scan, d=dt_s: navigator.step(p, m, s, d))
+        if command is None:
+            continue
+        finite(command.v, command.w)
+        assert abs(command.v) <= config.max_speed_m_s + 1e-9
+        assert command.state in ('idle', 'driving', 'blocked', 'reached', 'failed')
+        finite(navigator.distance_remaining_m)
+        if navigator.path is not None:
+            finite(navigator.path)
+
+
+SOURCES = (
+    Source('mapping', nothing, map_and_graph),
+    Source('localizer', nothing, localize),
+    Source('global', known_room, localize_globally),
+    Source('navigator', nothing, navigate),
+)

@@ -1,0 +1,175 @@
+"""What a robot that explores a room saves, and what may stand in its archives instead."""
+
+import io
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thinmap_ros.adapters.world_files import read_world
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.exploration.explorer import Explorer
+from thinmap_ros.core.grid.occupancy import OccupancyGrid
+from thinmap_ros.core.slam.localizer import Localizer
+from thinmap_ros.core.topology.update import TopologyBuilder
+from thinmap_ros.sim.world import World
+from thinmap_ros.tools.explore_world import ClosedLoop, Options, coverable, make_loop
+
+ROOM = Path(__file__).resolve().parents[2] / 'worlds' / 'room_10x10.yaml'
+State = dict[str, np.ndarray]
+Work = Callable[[Any, Any], object]
+LONGEST = 500
+STEPS = 4
+KINDS = ('topology', 'exploration', 'features', 'grid')
+
+
+class Explored:
+    """A room that a robot is exploring, and what each part of it knows."""
+
+    def __init__(self) -> None:
+        name, patch, start = read_world(ROOM)
+        world = World(name, patch.occupied.astype(np.uint8), patch.frame, start)
+        self.loop: ClosedLoop = make_loop(world, start, Options(localization='slam', speed_m_s=0.4))
+        self.scans: list[tuple[Any, Any]] = []
+        note = self.loop.note
+
+        def noted(scan: Any, estimate: Any) -> None:
+            self.scans.append((scan, estimate.T_map_base))
+            note(scan, estimate)
+
+        self.loop.note = noted  # type: ignore[method-assign]
+        self.loop.run(coverable(world, start, 0.3, 8.0), 40.0, lambda seconds, share: None)
+        pipeline = self.loop.pipeline
+        self.states: dict[str, State] = {
+            'topology': pipeline.topology.state(),
+            'exploration': self.loop.strategy.state(),  # type: ignore[attr-defined]
+            'features': pipeline.localizer.state(),
+            'grid': pipeline.grid.state(),
+        }
+
+    def use(self, kind: str, state: State) -> None:
+        """Make what a state is of, and let it do its work for some scans."""
+        work = getattr(self, f'_use_{kind}')(state)
+        for scan, T_map_base in self.scans[-STEPS:]:
+            work(scan, T_map_base)
+
+    def _use_topology(self, state: State) -> Work:
+        builder = TopologyBuilder.from_state(state)
+
+        def work(scan: Any, T: Any) -> None:
+            builder.update(self.loop.pipeline.grid.window(T[0], T[1], 16.0), T)
+            builder.local_map()
+
+        return work
+
+    def _use_exploration(self, state: State) -> Work:
+        explorer, pipeline = Explorer.from_state(state), self.loop.pipeline
+        patch = pipeline.grid.patch()
+        return lambda scan, T: explorer.step(pipeline.topology.map, patch, scan, T)
+
+    def _use_features(self, state: State) -> Work:
+        localizer = Localizer.from_state(state, self.loop.pipeline.localizer.config)
+        localizer.set_pose(self.scans[-STEPS][1], 1e-4 * np.eye(3))
+
+        def work(scan: Any, T: Any) -> None:
+            localizer.step(scan, T)
+            assert len(localizer.features) == len({f.id for f in localizer.features})
+
+        return work
+
+    def _use_grid(self, state: State) -> Work:
+        grid = OccupancyGrid.from_state(state)
+
+        def work(scan: Any, T: Any) -> None:
+            grid.update(scan, T)
+            grid.window(T[0], T[1], 8.0)
+            grid.patch()
+
+        return work
+
+
+def replaced(array: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+    """What may stand in an archive in the place of an array."""
+    yield 'complex', array.astype(np.complex128)
+    yield 'text', array.astype(str)
+    yield 'objects', array.astype(object)
+    yield 'times', np.zeros(array.shape, dtype='M8[s]')
+    yield 'records', np.zeros(array.shape, dtype=[('a', 'f8')])
+    yield 'truth values', array.astype(np.bool_)
+    yield 'bytes', array.astype(np.uint8)
+    yield 'half floats', array.astype(np.float16)
+    yield 'long floats', array.astype(np.longdouble)
+    yield 'large whole numbers', array.astype(np.uint64)
+    yield 'other byte order', array.astype(array.dtype.newbyteorder())
+    yield 'one axis more', array[None]
+    yield 'one axis more at the end', array[..., None]
+    yield 'a single number', np.array(array.ravel()[0] if array.size else 0, dtype=array.dtype)
+    yield 'nothing', np.empty((0,) * array.ndim, dtype=array.dtype)
+    if array.ndim:
+        yield 'one less', array[:-1]
+        yield 'one more', np.concatenate([array, array[-1:]])
+        yield 'first row only', array[:1]
+        yield 'backwards', array[::-1]
+        yield 'flat', array.ravel()
+    if array.ndim > 1:
+        yield 'turned', np.swapaxes(array, 0, 1)
+        yield 'a column less', array[:, :-1]
+    for value in (np.nan, np.inf, -np.inf, 1e300, -1e300, 1e9, -1.0, 0.0, 2**62, -(2**62), 2**31):
+        with np.errstate(all='ignore'):
+            yield f'all {value}', np.full(array.shape, value).astype(array.dtype)
+            if array.size:
+                one = array.copy()
+                one.ravel()[array.size // 2 :][:1] = np.full(1, value).astype(array.dtype)
+                yield f'one {value}', one
+
+
+def check(explored: Explored, kind: str, state: State, what: str) -> bool:
+    """Whether a state is refused, with a good reason; any other exception is a failure."""
+    try:
+        explored.use(kind, state)
+    except InputError as error:
+        assert len(str(error)) <= LONGEST and str(error).isprintable(), (what, str(error))
+        # What no array tells is whether the windows that come will lie on the saved lattice.
+        beside = kind == 'topology' and str(error).startswith('window')
+        beside |= kind in ('grid', 'features') and str(error).startswith('map ')
+        assert str(error).startswith('saved') or beside, (what, str(error))
+        return True
+    return False
+
+
+def one_number_replaced(whole: State, rng: np.random.Generator) -> tuple[str, State]:
+    """A state with one number of one array replaced, and which."""
+    state = {name: array.copy() for name, array in whole.items()}
+    name = str(rng.choice([name for name, array in whole.items() if array.size]))
+    flat = state[name].reshape(-1)
+    at = int(rng.integers(0, flat.size))
+    if flat.dtype.kind == 'f':
+        flat[at] = rng.choice([0.0, -1.0, 0.5, 7.0, 1e3, 1e5, -1e6, np.nan, flat[at - 1]])
+    else:
+        flat[at] = rng.choice([0, 1, 2, 3, 50, 127, int(flat[at - 1]) % 128])
+    state[name] = flat.reshape(whole[name].shape)
+    return f'{name}[{at}] = {flat[at]}', state
+
+
+def archive(path: Path, **members: bytes) -> Path:
+    with zipfile.ZipFile(path, 'w', zipfile.ZIP_DEFLATED) as file:
+        for name, content in members.items():
+            file.writestr(f'{name}.npy', content)
+    return path
+
+
+def npy(array: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, array)
+    return stream.getvalue()
+
+
+def with_header(header: dict[str, Any], data: bytes) -> bytes:
+    text = repr(header).encode().ljust(117) + b'\n'
+    return b'\x93NUMPY\x01\x00' + len(text).to_bytes(2, 'little') + text + data
+
+
+def plain(shape: tuple[int, ...], descr: str = '<i8') -> dict[str, Any]:
+    return {'descr': descr, 'fortran_order': False, 'shape': shape}
