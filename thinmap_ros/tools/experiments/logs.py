@@ -104,7 +104,7 @@ _TIMED = ['log', 'cpu_ms_per_scan', 'wall_ms_median', 'wall_ms_p95', 'wall_ms_ma
 
 def _one(folder: Path, out: Path) -> _Result:
     wall, cpu = time.perf_counter(), time.process_time()
-    result = replay(CarmenLog(folder / 'log.clf', _laser(folder)), PipelineConfig())
+    result = replay(CarmenLog(folder / 'log.clf', laser_of(folder, folder.name)), PipelineConfig())
     seconds = (time.perf_counter() - wall, time.process_time() - cpu)
     report = write_outputs(result, out, folder.name, seconds)
     ms = report['ms_per_scan']['all']
@@ -124,13 +124,13 @@ def _one(folder: Path, out: Path) -> _Result:
     return _Result(row, timed, _plot(folder, result))
 
 
-def _laser(folder: Path) -> LaserOptions:
-    """Options of the laser: those of laser.yaml in the folder, or of a known log.
+def laser_of(folder: Path, log: str) -> LaserOptions:
+    """Options of the laser: those of laser.yaml in the folder, or of a known log of that name.
 
     Raises InputError where it is bad.
     """
     path = folder / 'laser.yaml'
-    options = _LASERS.get(folder.name, {})
+    options = _LASERS.get(log, {})
     if path.exists():
         options = read_mapping(path, 'options of the laser')
     try:

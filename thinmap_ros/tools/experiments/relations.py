@@ -14,9 +14,8 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array, wrap
 
-_NEAR_S = (
-    0.1  # a pose this near to a stamp is the one of that stamp; else it is moved along the odometry
-)
+# A pose this near to a stamp is the one of that stamp; else it is moved along the odometry.
+_NEAR_S = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,27 +45,28 @@ def read_columns(path: Path, columns: list[int]) -> Array:
 
 
 def relation_errors(
-    times_s: Array, poses: Array, relations: Path, odometry: Path
+    times_s: Array, poses: Array, relations: Path, odometry: Path, near_s: float = _NEAR_S
 ) -> RelationErrors:
     """Errors of poses (N, 3) at times (N,), s, by a file of relations `t1 t2 x y z roll pitch yaw`.
 
-    odometry: a file of `t x y theta`.
+    odometry: a file of `t x y theta`, along which a pose is moved to a stamp from which it is
+    farther than near_s.
     """
     known, wheels = read_columns(relations, [0, 1, 2, 3, 7]), read_columns(odometry, [0, 1, 2, 3])
     order, wheel_order = np.argsort(times_s, kind='stable'), np.argsort(wheels[:, 0], kind='stable')
     times, path, wheels = times_s[order], poses[order], wheels[wheel_order]
     metres, degrees = [], []
     for t1, t2, *motion in known:
-        a, b = (_pose_at(t, times, path, wheels) for t in (t1, t2))
+        a, b = (_pose_at(t, times, path, wheels, near_s) for t in (t1, t2))
         off = se2.between(np.array(motion), se2.between(a, b))
         metres.append(float(np.hypot(off[0], off[1])))
         degrees.append(float(np.degrees(abs(wrap(float(off[2]))))))
     return RelationErrors(np.array(metres), np.array(degrees))
 
 
-def _pose_at(t: float, times: Array, path: Array, wheels: Array) -> Array:
+def _pose_at(t: float, times: Array, path: Array, wheels: Array, near_s: float) -> Array:
     k = _nearest(times, t)
-    if abs(times[k] - t) <= _NEAR_S:
+    if abs(times[k] - t) <= near_s:
         return np.asarray(path[k])
     moved = se2.between(
         wheels[_nearest(wheels[:, 0], times[k]), 1:], wheels[_nearest(wheels[:, 0], t), 1:]

@@ -1,0 +1,1 @@
+"""The scoreboard: real logs, the same made worse, and drives in generated buildings."""

@@ -1,0 +1,87 @@
+"""What is on the scoreboard: logs, degraded logs, and drives in buildings."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from thinmap_ros.core.errors import InputError
+
+# Options of degrade_log.py, by the name of what they do to a log.
+DEGRADED = {
+    'scale': ('--scale', '1.05'),
+    'turn_noise_0.05': ('--turn-noise', '0.05'),
+    'turn_noise_0.15': ('--turn-noise', '0.15'),
+    'no_turn': ('--no-turn',),
+    'no_odometry': ('--no-odometry',),
+    'range_8m': ('--max-range', '8'),
+    'half_blind': ('--blind', '0.5'),
+    'slip': ('--slip', '0.4,1,0,0.5'),
+    'gap': ('--gap', '0.4,20,20'),
+    'gap_anew': ('--gap', '0.4,20,20', '--anew'),
+}
+THINNED = {'every_2': ('--every', '2'), 'every_5': ('--every', '5'), 'rate_1hz': ('--rate', '1')}
+_THINNED_LOGS = ('intel', 'sena', 'mrpt_office')
+_EXACT_S = 0.002  # of the logs in which a scan lies at each stamp of a relation
+BUILDINGS = range(30)
+ROBOTS = ('2dx', '3at')
+NOISES = (1.0, 3.0)
+
+
+@dataclass(frozen=True)
+class LogCase:
+    """A log of a folder, perhaps degraded; exact_s: how near a pose must be to a relation's stamp.
+
+    options: of degrade_log.py.
+    """
+
+    log: str
+    version: str = ''
+    options: tuple[str, ...] = ()
+    exact_s: float = 0.1
+
+    @property
+    def name(self) -> str:
+        """What it is called on the page, and its file."""
+        return f'{self.log}.{self.version}' if self.version else self.log
+
+
+@dataclass(frozen=True)
+class BuildingCase:
+    """A drive through a generated building; noise: times that of the robot's odometry."""
+
+    seed: int
+    robot: str
+    noise: float
+
+    @property
+    def name(self) -> str:
+        """What it is called on the page, and its file."""
+        return f'building_{self.seed:03d}.{self.robot}_x{self.noise:g}'
+
+
+Case = LogCase | BuildingCase
+
+
+def all_cases(logs: Path) -> list[Case]:
+    """All cases, the undegraded logs first; logs: a folder with NAME/log.clf or log.clf.gz.
+
+    Raises InputError where there is no log.
+    """
+    names = sorted({path.parent.name for path in logs.glob('*/log.clf*')})
+    if not names:
+        raise InputError(f'{logs}: no NAME/log.clf in it: expected folders with logs')
+    cases: list[Case] = [_log(name) for name in names]
+    cases += [_log(name, *item) for name in names for item in DEGRADED.items()]
+    thinned = [name for name in _THINNED_LOGS if name in names]
+    cases += [_log(name, *item) for name in thinned for item in THINNED.items()]
+    cases += [
+        BuildingCase(seed, robot, noise)
+        for seed in BUILDINGS
+        for robot in ROBOTS
+        for noise in NOISES
+    ]
+    return cases
+
+
+def _log(name: str, version: str = '', options: tuple[str, ...] = ()) -> LogCase:
+    exact = name.endswith('_raw') or (name == 'intel' and version == 'rate_1hz')
+    return LogCase(name, version, options, _EXACT_S if exact else 0.1)

@@ -1,0 +1,111 @@
+"""Drives through generated buildings: to parts that are near, one by one, and back to the start."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
+from thinmap_ros.core.se2 import Array, transform_points
+from thinmap_ros.sim.buildings import Building, building
+from thinmap_ros.sim.lms200 import Lms200Config
+from thinmap_ros.sim.pioneer import PRESETS, PioneerConfig
+from thinmap_ros.sim.runner import Simulation
+from thinmap_ros.sim.tours import MARGIN_M, Look, drive, patch_of
+from thinmap_ros.sim.world import World
+
+_SPEED_M_S = 0.7
+_LENGTH_M = 250.0
+_NEAR_M = 40.0  # a part that is so near may be the next
+_DETOUR_M = 25.0  # ways may lead so far round
+_CHOICES = 5  # the next is one of so many nearest that were not visited
+_MOST_GOALS = 60
+_ODOMETRY = (
+    'scale_sigma',
+    'turn_scale_sigma',
+    'drift_sigma_rad_m',
+    'distance_noise',
+    'turn_noise',
+    'turn_noise_driving',
+)
+
+
+def looks(seed: int, robot: str, noise: float) -> Iterator[Look]:
+    """Look after look of a drive of some 250 m that ends where it began."""
+    made = building(seed)
+    body = noisy(PRESETS[robot], noise)
+    simulation = Simulation(made.world, _start(made, body), body, Lms200Config(), seed)
+    return drive(simulation, ways(made, simulation.robot.T_world_base, body, seed), _SPEED_M_S)
+
+
+def noisy(robot: PioneerConfig, noise: float) -> PioneerConfig:
+    """A robot whose odometry errs so many times as much."""
+    return replace(robot, **{name: noise * getattr(robot, name) for name in _ODOMETRY})
+
+
+def ways(made: Building, start: Array, robot: PioneerConfig, seed: int) -> Iterator[Array]:
+    """Ways (K, 2), m, of a drive, each from where the one before ends."""
+    rng = np.random.default_rng(seed)
+    patch = patch_of(made.world)
+    goals = _middles(made)
+    left = np.ones(len(goals), dtype=np.bool_)
+    at = start[:2]
+    driven = []
+    length_m = 0.0
+    for _ in range(_MOST_GOALS):
+        away = np.where(left, np.hypot(*(goals - at).T), np.inf)
+        nearest = np.argsort(away)[:_CHOICES]
+        nearest = nearest[away[nearest] < _NEAR_M]
+        if length_m > 0.5 * _LENGTH_M or not len(nearest):
+            break
+        chosen = int(rng.choice(nearest))
+        left[chosen] = False
+        way = _way(patch, at, goals[chosen], robot.radius_m)
+        if way is not None:
+            driven.append(way)
+            at = way[-1]
+            length_m += float(np.hypot(*np.diff(way, axis=0).T).sum())
+            yield way
+    # Home the way it came, but for the detours: known ground, and a loop where there is one.
+    for way in reversed(driven):
+        back = _way(patch, at, way[0], robot.radius_m)
+        if back is not None:
+            at = back[-1]
+            yield back
+
+
+def _middles(made: Building) -> Array:
+    """Middles of all parts (N, 2), in the world."""
+    found = []
+    for wing in made.wings:
+        boxes = np.array([(p.x0, p.y0, p.x1, p.y1) for p in wing.plan.parts])
+        middles = 0.5 * (boxes[:, :2] + boxes[:, 2:])
+        found.append(transform_points(wing.T_world_wing, middles))
+    return np.concatenate(found)
+
+
+def _way(patch: GridPatch, a: Array, b: Array, radius_m: float) -> Array | None:
+    """A way from a to b in the part of the map round both, or None."""
+    frame = patch.frame
+    ends = np.stack([a, b])
+    low = frame.cells_of(ends.min(axis=0)[None] - _DETOUR_M)[0].clip(0)
+    high = frame.cells_of(ends.max(axis=0)[None] + _DETOUR_M)[0] + 1
+    resolution = frame.resolution
+    corner = GridFrame(
+        frame.origin_x + resolution * low[1], frame.origin_y + resolution * low[0], resolution
+    )
+    near = GridPatch(corner, patch.cells[low[0] : high[0], low[1] : high[1]])
+    config = WavefrontConfig(robot_radius_m=radius_m + MARGIN_M)
+    return plan(near, (float(a[0]), float(a[1])), (float(b[0]), float(b[1])), config)
+
+
+def _start(made: Building, robot: PioneerConfig) -> Array:
+    """The building's start, or the nearest place where a robot of this size fits."""
+    world: World = made.world
+    if world.is_clear(float(world.start[0]), float(world.start[1]), robot.radius_m + MARGIN_M):
+        return world.start
+    room = world.frame.centres_of(np.argwhere(world.wall_distance_m > robot.radius_m + MARGIN_M))
+    place = room[np.argmin(np.hypot(*(room - world.start[:2]).T))]
+    return np.array([place[0], place[1], world.start[2]])

@@ -1,0 +1,227 @@
+"""One case of the scoreboard: the numbers that stand for it."""
+
+import math
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.scoreboard.cases import BuildingCase, Case, LogCase
+from benchmarks.scoreboard.drives import looks
+from thinmap_ros.adapters.carmen import CarmenLog
+from thinmap_ros.adapters.events import OdometryEvent
+from thinmap_ros.core import se2
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.odometry import ScanPairing
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
+from thinmap_ros.pipeline import Pipeline, PipelineConfig, Step
+from thinmap_ros.tools.experiments.logs import laser_of
+from thinmap_ros.tools.experiments.relations import read_columns, relation_errors
+
+Numbers = dict[str, Any]
+_STANDS_M = 0.01
+_STANDS_RAD = math.radians(0.5)
+_KNOWN_AGAIN_M = 30.0  # of way after a slip or a gap, from which on relations over it are judged
+_CHI2_95 = 5.991  # of two degrees of freedom
+_WRONG_M = 0.5
+
+
+@dataclass(eq=False)
+class Played:
+    """What a pipeline made of a drive: (N,) and (N, 3) by scan."""
+
+    stamps_ns: list[int] = field(default_factory=list)
+    poses: list[Array] = field(default_factory=list)
+    covariances: list[Array] = field(default_factory=list)
+    lost: list[bool] = field(default_factory=list)
+    localizer_ms: list[float] = field(default_factory=list)
+    stall_ms: list[float] = field(default_factory=list)
+    final: Array = field(default_factory=lambda: np.zeros((0, 3)))
+
+    def numbers(self) -> Numbers:
+        """What every case is judged by; times of the processor."""
+        taken = np.array(self.localizer_ms)
+        return {
+            'scans': len(self.poses),
+            'homeless': self._homeless(),
+            'ms_median': float(np.median(taken)),
+            'ms_mean': float(taken.mean()),
+            'ms_99': float(np.percentile(taken, 99.0)),
+            'stall_ms': max(self.stall_ms),
+            'mb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
+        }
+
+    def _homeless(self) -> float:
+        """Share of the scans, standing ones aside, whose pose belongs to no map that grows."""
+        moves = [True]
+        for before, after in pairwise(self.poses):
+            x, y, turn = se2.between(before, after)
+            moves.append(math.hypot(x, y) > _STANDS_M or abs(turn) > _STANDS_RAD)
+        moving = np.array(moves)
+        return float(np.array(self.lost)[moving].mean())
+
+
+class _Timed(Pipeline):
+    """Stages timed by what they take of the processor: a busy machine changes it little."""
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        began = time.process_time()
+        yield
+        self.stage_seconds.setdefault(stage, []).append(time.process_time() - began)
+
+
+def measure(case: Case, logs: Path, degrade: Path, folder: Path, options: Numbers) -> Numbers:
+    """Numbers of a case.
+
+    logs: folder of the logs; degrade: the program that degrades one; folder: for what is degraded;
+    options: of the localizer.
+    """
+    if isinstance(case, LogCase):
+        return _measure_log(case, logs, degrade, folder, options)
+    return _measure_building(case, options)
+
+
+def _measure_log(
+    case: LogCase, logs: Path, degrade: Path, folder: Path, options: Numbers
+) -> Numbers:
+    own = logs / case.log
+    if case.version:
+        own = _degraded(case, own, degrade, folder)
+    played = _play(_scans(own, case.log), LocalizerConfig(**options))
+    numbers = played.numbers()
+    relations = own / 'relations'
+    times = np.array(played.stamps_ns) / 1e9
+    if not relations.exists():
+        return numbers | {'path': np.column_stack([times, np.array(played.poses)]).tolist()}
+    for name, path in (('live', np.array(played.poses)), ('final', played.final)):
+        errors = relation_errors(times, path, relations, own / 'odom.txt', case.exact_s)
+        numbers[f'{name}_m'] = float(errors.metres.mean())
+        numbers[f'{name}_deg'] = float(errors.degrees.mean())
+        again = own / 'relations_again'
+        if again.exists() and read_columns(again, [0]).size:
+            errors = relation_errors(times, path, again, own / 'odom.txt', case.exact_s)
+            numbers[f'again_{name}_m'] = float(errors.metres.mean())
+    return numbers | _over_the_event(own, times, np.array(played.poses), case.exact_s)
+
+
+def _over_the_event(own: Path, times: Array, poses: Array, exact_s: float) -> Numbers:
+    """Errors of relations that begin before a slip or a gap and end on known ground after it."""
+    for name in ('slip.txt', 'gap.txt'):
+        if not (own / name).exists():
+            continue
+        began, ended = read_columns(own / name, [0, 1])[0]
+        wheels = read_columns(own / 'odom.txt', [0, 1, 2])
+        after = wheels[wheels[:, 0] > ended]
+        way = np.cumsum(np.hypot(*np.diff(after[:, 1:], axis=0).T))
+        far = np.flatnonzero(way > _KNOWN_AGAIN_M)
+        if not len(far):
+            return {}
+        again_s = after[far[0] + 1, 0]
+        over: list[float] = []
+        for file in ('relations', 'relations_again'):
+            if not (own / file).exists():
+                continue
+            ends = read_columns(own / file, [0, 1])
+            errors = relation_errors(times, poses, own / file, own / 'odom.txt', exact_s)
+            spans = (ends.min(axis=1) < began) & (ends.max(axis=1) > again_s)
+            over += errors.metres[spans].tolist()
+        return {'over_m': float(np.mean(over)), 'over': len(over)} if over else {}
+    return {}
+
+
+def _degraded(case: LogCase, own: Path, degrade: Path, folder: Path) -> Path:
+    """Folder of the degraded log, made where it is not there yet."""
+    made = folder / case.name
+    if not (made / 'done').exists():
+        log = next(own.glob('log.clf*'))
+        command = [sys.executable, str(degrade), str(log), str(made), *case.options]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode != 0:
+            raise InputError(f'{case.name}: {degrade.name}: {done.stderr.strip()[-200:]}')
+        (made / 'done').touch()
+    return made
+
+
+def _scans(own: Path, laser: str) -> Iterator[tuple[Scan, Array]]:
+    """Scans with the odometry at their stamps, in the order of the file."""
+    pairing = ScanPairing()
+    for event in CarmenLog(next(own.glob('log.clf*')), laser_of(own, laser)).events():
+        if isinstance(event, OdometryEvent):
+            yield from pairing.add_odometry(event.stamp_ns, event.T_odom_base)
+        else:
+            yield from pairing.add_scan(event.scan)
+
+
+def _measure_building(case: BuildingCase, options: Numbers) -> Numbers:
+    drive = list(looks(case.seed, case.robot, case.noise))
+    truth = np.array([look.T_world_base for look in drive])
+    x, y, yaw = truth[0].tolist()
+    config = LocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=yaw, **options)
+    played = _play(((look.scan, look.T_odom_base) for look in drive), config)
+    numbers = played.numbers()
+    for name, path in (('live', np.array(played.poses)), ('final', played.final)):
+        off = np.hypot(*(path - truth)[:, :2].T)
+        numbers[f'{name}_m'] = float(np.sqrt((off**2).mean()))
+        numbers[f'{name}_most_m'] = float(off.max())
+    return numbers | _consistency(played, truth)
+
+
+def _consistency(played: Played, truth: Array) -> Numbers:
+    """How well the covariance tells the errors of the live poses."""
+    off = (np.array(played.poses) - truth)[:, :2]
+    covariances = np.array(played.covariances)[:, :2, :2] + 1e-12 * np.eye(2)
+    squared = np.einsum('ni,ni->n', off, np.linalg.solve(covariances, off[:, :, None])[:, :, 0])
+    sigmas = np.sqrt(np.linalg.eigvalsh(covariances)[:, -1])
+    metres = np.hypot(*off.T)
+    rms = math.sqrt(float((metres**2).mean()))
+    return {
+        'inside_95': float((squared < _CHI2_95).mean()),
+        'sigma_of_rms': float(np.median(sigmas)) / max(rms, 1e-3),
+        'wrong_and_sure': int(((metres > _WRONG_M) & (3.0 * sigmas < metres)).sum()),
+    }
+
+
+def _play(scans: Iterator[tuple[Scan, Array]], config: LocalizerConfig) -> Played:
+    """All scans through localizer, grid and topology."""
+    _rehearse(config)
+    pipeline = _Timed(PipelineConfig(localizer=config))
+    played = Played()
+    for scan, T_odom_base in scans:
+        rebuilds = len(pipeline.stage_seconds.get('rebuild', []))
+        _keep(played, scan, pipeline.step(scan, T_odom_base))
+        stages = pipeline.stage_seconds
+        rebuild_s = sum(stages.get('rebuild', [])[rebuilds:])
+        played.localizer_ms.append(1e3 * stages['localizer'][-1])
+        played.stall_ms.append(1e3 * (stages['localizer'][-1] + stages['grid'][-1] + rebuild_s))
+    if not played.poses:
+        raise InputError('no scan with odometry around its stamp')
+    played.final = pipeline.localizer.corrected_path()
+    return played
+
+
+def _keep(played: Played, scan: Scan, step: Step) -> None:
+    played.stamps_ns.append(scan.stamp_ns)
+    played.poses.append(step.estimate.T_map_base)
+    played.covariances.append(step.estimate.covariance)
+    played.lost.append(step.estimate.lost)
+
+
+def _rehearse(config: LocalizerConfig) -> None:
+    """Load the compiled kernels before anything is timed."""
+    from thinmap_ros import warm_up
+
+    warm_up.localizer()
+    warm_up.grid_mapper()
+    warm_up.topology_builder()
+    Localizer(config)

@@ -1,0 +1,116 @@
+"""The scoreboard's page, and the one number for its worst tenth."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from benchmarks.scoreboard.cases import BuildingCase, Case, LogCase
+from thinmap_ros.core import se2
+
+Numbers = dict[str, Any]
+_MOST_M = 10.0  # an error beyond says no more
+_PEERS = """\
+Peers on the same logs, final or live = final, m: IRIS LaMa intel 0.047, aces 0.046, csail 1.09,
+fhw 0.75; published, Cartographer: intel_raw 0.023, aces_raw 0.038, csail_raw 0.032.
+"""
+_HEAD = """\
+# Scoreboard
+
+Made by `python -m benchmarks.scoreboard -o DIR`. Logs: mean error of the known relations, m;
+`ours`: against the undegraded run of a log without relations (rms of positions). Buildings: rms
+error of the position, m. *over*: error of relations that span the slip or the gap, live, from 30 m
+of known ground on. *homeless*: share of the scans, standing ones aside, whose pose belongs to no
+map that grows. CPU ms a scan of the localizer; *stall*: the longest step of localizer and grid,
+with loop closing.
+"""
+_COLUMNS = (
+    ('live', 'live_m', '.3f'),
+    ('final', 'final_m', '.3f'),
+    ('again live', 'again_live_m', '.3f'),
+    ('again final', 'again_final_m', '.3f'),
+    ('over', 'over_m', '.3f'),
+    ('homeless', 'homeless', '.1%'),
+    ('in 95 %', 'inside_95', '.0%'),
+    ('sigma / rms', 'sigma_of_rms', '.1f'),
+    ('wrong and sure', 'wrong_and_sure', 'd'),
+    ('ms median', 'ms_median', '.2f'),
+    ('mean', 'ms_mean', '.2f'),
+    ('99 %', 'ms_99', '.1f'),
+    ('stall ms', 'stall_ms', '.0f'),
+    ('MB', 'mb', '.0f'),
+)
+
+
+def page(cases: Sequence[Case], reports: Sequence[Numbers]) -> str:
+    """Markdown of all cases, the worst ones first named."""
+    live = errors(cases, reports)
+    order = np.argsort(-live, kind='stable')
+    worst = [f'{cases[k].name} {live[k]:.2f}' for k in order[: math.ceil(0.1 * len(live))]]
+    parts = [
+        _HEAD,
+        f'**Worst tenth, live: {worst_tenth(cases, reports):.3f} m** (mean; an error '
+        f'counts as at most {_MOST_M:g} m). It is: {", ".join(worst)}.\n',
+        _PEERS,
+    ]
+    for title, kind in (('Logs', LogCase), ('Buildings', BuildingCase)):
+        rows = [k for k, case in enumerate(cases) if isinstance(case, kind)]
+        if rows:
+            parts.append(f'## {title}\n\n' + _table(rows, cases, reports, live))
+    return '\n'.join(parts)
+
+
+def worst_tenth(cases: Sequence[Case], reports: Sequence[Numbers]) -> float:
+    """Mean of the largest tenth of the live errors, m."""
+    live = np.sort(errors(cases, reports))
+    return float(live[-math.ceil(0.1 * len(live)) :].mean())
+
+
+def errors(cases: Sequence[Case], reports: Sequence[Numbers]) -> np.ndarray:
+    """Live error of each case (N,), m, at most 10; 0 for what the others are compared with."""
+    paths = {report['name']: report['path'] for report in reports if 'path' in report}
+    found = []
+    for case, report in zip(cases, reports, strict=True):
+        error = report.get('live_m')
+        if error is None and isinstance(case, LogCase):
+            error = _against(paths.get(case.log), report['path'])
+        found.append(_MOST_M if error is None or not error < _MOST_M else error)
+    return np.array(found)
+
+
+def _against(own: list[list[float]] | None, path: list[list[float]]) -> float:
+    """Rms of positions against those of another run at the same stamps, both from their first."""
+    if own is None:
+        return math.nan
+    known = {stamp: pose for stamp, *pose in own}
+    pairs = [(known[stamp], pose) for stamp, *pose in path if stamp in known]
+    if not pairs:
+        return math.nan
+    first, second = (np.array(side) for side in zip(*pairs, strict=True))
+    off = [
+        se2.between(first[0], a)[:2] - se2.between(second[0], b)[:2]
+        for a, b in zip(first, second, strict=True)
+    ]
+    return float(np.sqrt((np.array(off) ** 2).sum(axis=1).mean()))
+
+
+def _table(
+    rows: list[int], cases: Sequence[Case], reports: Sequence[Numbers], live: np.ndarray
+) -> str:
+    columns = [
+        each for each in _COLUMNS if each[1] == 'live_m' or any(each[1] in reports[k] for k in rows)
+    ]
+    lines = ['| case | scans | ' + ' | '.join(title for title, _, _ in columns) + ' |']
+    lines.append('|---' * (len(columns) + 2) + '|')
+    for k in rows:
+        report = reports[k]
+        cells = [_cell(report, key, form) for _, key, form in columns]
+        if 'live_m' not in report:
+            cells[0] = f'{live[k]:.3f} (ours)'
+        lines.append(f'| {report["name"]} | {report["scans"]} | ' + ' | '.join(cells) + ' |')
+    return '\n'.join(lines) + '\n'
+
+
+def _cell(report: Numbers, key: str, form: str) -> str:
+    return format(report[key], form) if key in report else ''
