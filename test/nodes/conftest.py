@@ -18,8 +18,10 @@ from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 
+from thinmap_msgs.msg import TopologicalMap
 from thinmap_ros.adapters import qos
 
 _DEPTH = 1000
@@ -33,6 +35,7 @@ class Graph:
     def __init__(self, domain: int, folder: Path) -> None:
         self.folder, self.processes = folder, {}
         self._clients: dict[str, Client] = {}
+        self._pacemaker: Publisher | None = None
         self._heard = 0
         self.context = Context()
         rclpy.init(context=self.context, domain_id=domain)
@@ -84,6 +87,19 @@ class Graph:
 
         self.node.create_subscription(kind, topic, hear, deep)
         return messages
+
+    def paced(self) -> tuple[str, ...]:
+        """Remapping of a simulation in lockstep with the local graph: it waits for the test, too.
+
+        Else a test that hears late where the robot is would drive it on, into a wall.
+        """
+        if self._pacemaker is None:
+            heard_too = self.node.create_publisher(TopologicalMap, 'heard_too', qos.STREAM)
+            self.node.create_subscription(
+                TopologicalMap, 'local_topology', heard_too.publish, qos.STREAM
+            )
+            self._pacemaker = heard_too
+        return ('local_topology:=heard_too',)
 
     def hear_out(self) -> None:
         """Hear what still waits, until it is quiet: those that have stopped send nothing later."""

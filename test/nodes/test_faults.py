@@ -37,6 +37,7 @@ def start_mapping(graph, rate=4.0, lockstep='local_topology'):
         start_one(graph, name)
     graph.start(
         'sim',
+        remap=graph.paced() if lockstep == 'local_topology' else (),
         start=START,
         hold_for_subscribers=2,
         rate=rate,
@@ -50,6 +51,7 @@ def start_together(graph, *names, **simulation):
     graph.start('thinmap', arguments=names, use_sim_time=True, recover_s=RECOVER_S, **AT_START)
     graph.start(
         'sim',
+        remap=graph.paced(),
         start=START,
         hold_for_subscribers=len({*names} - {'topology_builder'}),
         rate=4.0,

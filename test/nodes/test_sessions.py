@@ -44,7 +44,12 @@ def drive(graph, x, y, yaw, metres):
     truth = graph.heard('ground_truth', PoseStamped)
     graph.start('localizer', use_sim_time=True, start_x_m=x, start_y_m=y, start_yaw_rad=yaw)
     graph.start(
-        'sim', start=f'{x},{y},{yaw}', rate=4.0, lockstep='local_topology', hold_for_subscribers=2
+        'sim',
+        remap=graph.paced(),
+        start=f'{x},{y},{yaw}',
+        rate=4.0,
+        lockstep='local_topology',
+        hold_for_subscribers=2,
     )
     commands = graph.node.create_publisher(Twist, 'cmd_vel', 10)
     forward = Twist()
