@@ -1,5 +1,6 @@
 """Cases one after the other, each in a process that may hang or die, until the time is over."""
 
+import faulthandler
 import os
 import resource
 import select
@@ -54,7 +55,9 @@ class Runner:
         self.outcome = Outcome(seed)
         self._sources = sources
         self._out = out / str(seed)
-        self._work = self._out / 'work'
+        # Another run of the same seed may go on beside.
+        self._work = self._out / f'work-{os.getpid()}'
+        self._failed = self._out / f'failed-{os.getpid()}'
         self._limit_s = limit_s
         self._shared: dict[str, Any] = {}
         self._spent = Counter[str]()
@@ -78,7 +81,8 @@ class Runner:
                 self._spent[source.name] += time.monotonic() - began
         except KeyboardInterrupt:
             self.outcome.interrupted = True
-        shutil.rmtree(self._work, ignore_errors=True)
+        for folder in (self._work, self._failed):
+            shutil.rmtree(folder, ignore_errors=True)
         return self.outcome
 
     def _batch(self, source: Source, numbers: range, end_s: float) -> int:
@@ -142,7 +146,7 @@ class Runner:
     def _keep(self, source: Source, number: int) -> str:
         """Keep the files of a failed case; returns why it failed, in a line."""
         kept = self._out / f'{source.name}-{number}'
-        waiting = self._out / f'.failed-{number}'
+        waiting = self._failed / str(number)
         made = waiting if waiting.exists() else self._work
         lines = (made / 'why.txt').read_text().strip().splitlines()
         if sum(name == source.name for name, _, _ in self.outcome.failures) < _KEPT_OF_A_KIND:
@@ -169,14 +173,21 @@ class Runner:
     def _tried(self, source: Source, number: int) -> bool:
         shutil.rmtree(self._work, ignore_errors=True)
         self._work.mkdir(parents=True)
+        # What was going on when the process died.
+        died = (self._work / 'died.txt').open('w')
+        faulthandler.enable(died)
         rng = rng_of(self.outcome.seed, source.name, number)
         try:
             source.run(self._shared[source.name], rng, self._work)
         except Exception:
             # The folder is taken over at once: the next case has one of its own.
             (self._work / 'why.txt').write_text(traceback.format_exc())
-            self._work.rename(self._out / f'.failed-{number}')
+            self._failed.mkdir(exist_ok=True)
+            self._work.rename(self._failed / str(number))
             return False
+        finally:
+            faulthandler.disable()
+            died.close()
         return True
 
 

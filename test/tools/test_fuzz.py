@@ -88,6 +88,7 @@ def test_whatever_a_case_does_the_run_goes_on(tmp_path: Path, run: object, why: 
     assert [number for _, number, _ in runner.outcome.failures] == [0, 1]
     assert all(why in said for _, _, said in runner.outcome.failures)
     assert why in (kept / 's-1' / 'why.txt').read_text()
+    assert ('in dies' in (kept / 's-1' / 'died.txt').read_text()) == (run is dies)
 
 
 def test_damages_are_the_same_for_a_seed_and_others_for_another() -> None:
