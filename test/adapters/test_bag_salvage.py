@@ -9,8 +9,8 @@ import pytest
 import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from mcap.reader import NonSeekingReader
-from mcap.records import Message
+from mcap.reader import NonSeekingReader, make_reader
+from mcap.records import ChunkIndex, Message
 from mcap.writer import CompressionType, Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 from thinmap_ros.adapters import bag_qos
 from thinmap_ros.adapters.bag_writer import BagWriter
 from thinmap_ros.adapters.bags import Bag
-from thinmap_ros.adapters.mcap_files import Damage, whole_records
+from thinmap_ros.adapters.mcap_files import Damage, McapFile, whole_records
 
 STRING = 'std_msgs/msg/String'
 COUNT, PER_CHUNK = 200, 10
@@ -122,9 +122,10 @@ def test_of_a_chunk_that_was_cut_off_the_part_before_the_cut_is_kept(
     assert last.sequence == last.log_time - 10**9 == len(found) - 1
 
 
-def test_a_damaged_chunk_costs_only_itself(tmp_path: Path) -> None:
-    with (tmp_path / 'bag.mcap').open('wb') as stream:
-        writer = Writer(stream, chunk_size=2000)
+def chunked_file(path: Path, compression: CompressionType) -> list[ChunkIndex]:
+    """A file of 500 numbered messages; where its chunks lie."""
+    with path.open('wb') as stream:
+        writer = Writer(stream, chunk_size=2000, compression=compression)
         writer.start(profile='ros2')
         channel = writer.register_channel(
             '/said', 'cdr', writer.register_schema(STRING, 'ros2msg', b'string data')
@@ -132,14 +133,43 @@ def test_a_damaged_chunk_costs_only_itself(tmp_path: Path) -> None:
         for i in range(500):
             writer.add_message(channel, i, b'\x00\x01\x00\x00' + bytes([i % 251]) * 60, i)
         writer.finish()
-    content = bytearray((tmp_path / 'bag.mcap').read_bytes())
-    middle = len(content) // 3
-    content[middle : middle + 4] = b'????'
-    (tmp_path / 'bag.mcap').write_bytes(content)
+    with path.open('rb') as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    return summary.chunk_indexes
+
+
+@pytest.mark.parametrize('compression', list(CompressionType))
+def test_a_damaged_chunk_costs_only_itself(tmp_path: Path, compression: CompressionType) -> None:
+    path = tmp_path / 'bag.mcap'
+    chunks = chunked_file(path, compression)
+    hit = chunks[len(chunks) // 3]
+    content = bytearray(path.read_bytes())
+    # In the middle of what the chunk holds: uncompressed, its checksum alone tells.
+    content[hit.chunk_start_offset + hit.chunk_length - hit.compressed_size // 2] ^= 0x40
+    path.write_bytes(content)
     damage = Damage()
-    records = list(whole_records(tmp_path / 'bag.mcap', damage))
-    assert len(damage.parts) <= 1 and not damage.cut_off
-    assert len(records) > 400
+    records = list(whole_records(path, damage))
+    lost = range(hit.message_start_time, hit.message_end_time + 1)
+    assert 0 < len(lost) < 100
+    assert [r.log_time for r in records if isinstance(r, Message)] == [
+        i for i in range(500) if i not in lost
+    ]
+    assert list(damage.parts) == [hit.chunk_start_offset] and not damage.cut_off
+    if compression == CompressionType.NONE:
+        assert damage.parts[hit.chunk_start_offset] == 'checksum that does not fit its bytes'
+
+
+def test_a_damaged_summary_is_not_believed(tmp_path: Path) -> None:
+    path = tmp_path / 'bag.mcap'
+    chunked_file(path, CompressionType.NONE)
+    content = bytearray(path.read_bytes())
+    # The last mention of the topic is the summary's.
+    at = content.rindex(b'/said')
+    content[at : at + 5] = b'/sald'
+    path.write_bytes(content)
+    file = McapFile(path)
+    assert {channel.topic for _, channel, _ in file.messages()} == {'/said'}
 
 
 def test_what_cannot_be_repaired_is_said_in_one_line(tmp_path: Path) -> None:

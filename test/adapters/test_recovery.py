@@ -1,6 +1,7 @@
 """What a killed node left: found again, but only where nobody else can have put it."""
 
 import os
+import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -88,6 +89,69 @@ def test_folders_that_are_not_of_this_user_alone(folder: Path, tmp_path: Path, w
     assert recovery.left() is None
     recovery.forget()
     assert 'expected' in node.said[0] and not list((tmp_path / 'other').glob('*'))
+
+
+@pytest.mark.parametrize('bit', [0o040, 0o020, 0o010, 0o004, 0o002, 0o001])
+def test_a_folder_that_is_open_in_any_way(folder: Path, bit: int) -> None:
+    folder.mkdir()
+    folder.chmod(0o700 | bit)
+    with pytest.raises(InputError, match=f'mode {0o700 | bit:o}: expected 700, closed to other'):
+        state_folder()
+    folder.chmod(0o700)
+    assert state_folder() == folder
+
+
+def test_a_new_folder_is_closed_whatever_new_files_are_else(folder: Path) -> None:
+    before = os.umask(0)
+    try:
+        assert state_folder() == folder
+    finally:
+        os.umask(before)
+    assert folder.stat().st_mode & 0o777 == 0o700
+
+
+def test_a_link_to_nowhere_is_no_folder(folder: Path, tmp_path: Path) -> None:
+    folder.symlink_to(tmp_path / 'nowhere')
+    with pytest.raises(InputError, match='state: '):
+        state_folder()
+    assert not (tmp_path / 'nowhere').exists()
+
+
+@pytest.mark.parametrize('chosen', [None, ''])
+@pytest.mark.parametrize('runtime', ['there', 'missing', '', None])
+def test_where_nothing_is_chosen_states_lie_where_a_restart_removes_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chosen: str | None, runtime: str | None
+) -> None:
+    (tmp_path / 'there').mkdir()
+    (tmp_path / 'temporary').mkdir()
+    places = {
+        'THINMAP_STATE_DIR': chosen,
+        'XDG_RUNTIME_DIR': runtime and str(tmp_path / runtime),
+    }
+    for name, value in places.items():
+        monkeypatch.delenv(name, raising=False)
+        if value is not None:
+            monkeypatch.setenv(name, value)
+    monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path / 'temporary'))
+    base = tmp_path / ('there' if runtime == 'there' else 'temporary')
+    assert state_folder() == base / f'thinmap-{os.getuid()}'
+    assert state_folder().stat().st_mode & 0o777 == 0o700
+    # What somebody else put there first is not used, and it is the node that says so.
+    state_folder().chmod(0o755)
+    node = FakeNode()
+    Recovery(node, 30.0).keep(STATE)
+    assert 'mode 755' in node.said[0] and not list(base.glob('*/*'))
+
+
+def test_a_file_of_another_user_is_left_alone(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = FakeNode()
+    recovery = Recovery(node, 30.0)
+    recovery.keep(STATE)
+    monkeypatch.setattr(os, 'getuid', lambda: folder.stat().st_uid + 1)
+    assert recovery.left() is None
+    assert 'expected a file of this user' in node.said[-1]
 
 
 def test_a_folder_of_another_user(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

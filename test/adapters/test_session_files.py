@@ -183,18 +183,6 @@ def test_a_grid_of_nonsense_is_refused(wrong: dict[str, Array]) -> None:
         OccupancyGrid.from_state(OccupancyGrid().state() | wrong)
 
 
-@pytest.mark.parametrize('seed', range(30))
-def test_damaged_files(tmp_path: Path, seed: int) -> None:
-    write_topology(tmp_path / 'b.npz', TopologyBuilder())
-    whole, rng = bytearray((tmp_path / 'b.npz').read_bytes()), np.random.default_rng(seed)
-    for at in rng.integers(0, len(whole), 5):
-        whole[at] = rng.integers(0, 256)
-    (tmp_path / 'b.npz').write_bytes(whole[: rng.integers(0, len(whole))])
-    with pytest.raises(InputError) as error:
-        read_topology(tmp_path / 'b.npz')
-    assert '\n' not in str(error.value)
-
-
 def test_a_corrected_past_moves_the_nodes_and_they_keep_their_ids() -> None:
     """The robot's heading was wrong by a little more with each metre; then a loop was closed."""
     world, poses = building(), way()

@@ -3,6 +3,7 @@
 import json
 import os
 import pickle
+import re
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ from fuzz.saved_states import (
     KINDS,
     LONGEST,
     Explored,
+    State,
     archive,
     check,
     npy,
@@ -92,6 +94,56 @@ def test_what_a_killed_localizer_left() -> None:
 
 
 # Archives.
+
+LOADERS: dict[str, Callable[[str], Any]] = {
+    'topology': load_topology,
+    'exploration': load_exploration,
+    'features': load_features,
+    'grid': load_grid,
+}
+# The largest number of whole numbers, or one of 300 digits; -1 in whole numbers, NaN in others.
+LARGE, MINUS_ONE = b'\x7f', b'\xff'
+# Where -1 is a number like others, and where NaN stands for "not known".
+MAY_BE_NEGATIVE = {
+    'topology': {'low', 'memory'},
+    'grid': {'tiles', 'log_odds'},
+    'features': {'cells'},
+    'exploration': set[str](),
+}
+MAY_BE_NAN = {'features': {'spans', 'points'}, 'exploration': {'tracks'}}
+
+
+def saved(folder: Path, kind: str, state: State) -> Path:
+    """An archive as session_files writes it."""
+    members = {name: npy(array) for name, array in state.items()}
+    return archive(folder / f'a.{kind}.npz', thinmap_format=npy(np.array(f'{kind} 1')), **members)
+
+
+def overwritten(array: np.ndarray, byte: bytes) -> np.ndarray:
+    """An array of the same type and shape with every byte the same."""
+    return np.frombuffer(byte * array.nbytes, dtype=array.dtype).reshape(array.shape)
+
+
+@pytest.mark.parametrize('byte', [LARGE, MINUS_ONE])
+@pytest.mark.parametrize('kind', KINDS)
+def test_what_no_field_may_hold_is_refused_by_its_name(
+    explored: Explored, tmp_path: Path, kind: str, byte: bytes
+) -> None:
+    state = explored.states[kind]
+    assert LOADERS[kind](str(saved(tmp_path, kind, state))) is not None
+    bounded = 0
+    for name, array in state.items():
+        told = re.sub('^(nodes|stand_ins|borders)_', r'\1: ', name)
+        may = MAY_BE_NAN if array.dtype.kind == 'f' else MAY_BE_NEGATIVE
+        may_be = byte == MINUS_ONE and told.rpartition(' ')[2] in may.get(kind, ())
+        if array.size == 0 or array.dtype.kind == 'b' or may_be:
+            continue
+        path = saved(tmp_path, kind, state | {name: overwritten(array, byte)})
+        with pytest.raises(InputError) as error:
+            LOADERS[kind](str(path))
+        assert str(error.value).startswith(f'{path}: saved {kind}: {told}'), name
+        bounded += 1
+    assert bounded >= (1 if kind == 'grid' else 7)
 
 
 class Evil:

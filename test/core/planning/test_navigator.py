@@ -88,11 +88,18 @@ def test_a_goal_that_cannot_be_reached_is_refused_at_once_with_a_reason(goal):
     world = room()
     world[:, 60] = 100
     commands = Ride(world, (1.0, 1.0, 0.0)).go(goal)
-    if goal == (5.0, 0.02):
-        assert commands[-1].state in ('failed', 'reached')
-        return
     assert [c.state for c in commands] == ['failed']
     assert f'({goal[0]:.2f}, {goal[1]:.2f})' in commands[-1].reason
+
+
+@pytest.mark.parametrize('y', [0.1, 0.15, 0.2, 0.25, 0.3])
+@pytest.mark.parametrize('heading', [None, 2.0])
+def test_a_goal_too_near_to_a_wall_is_reached_as_near_to_it_as_the_robot_may_stand(y, heading):
+    ride = Ride(room(), (1.0, 1.0, 0.0))
+    assert ride.go((5.0, y) if heading is None else (5.0, y, heading))[-1].state == 'reached'
+    assert math.dist(ride.pose[:2], (5.0, 0.35)) < 0.2
+    assert ride.nearest_m > 0.2
+    assert heading is None or abs(se2.wrap(ride.pose[2] - heading)) < 0.2
 
 
 def test_it_stops_in_front_of_what_only_the_laser_knows_and_goes_around_it():

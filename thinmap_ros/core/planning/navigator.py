@@ -118,13 +118,20 @@ class Navigator:
         self._trail.add(T_map_base)
         if self._goal is None:
             return Command(*self._follower.stop(dt_s), 'idle')
-        if math.dist(self._goal, T_map_base[:2]) <= self.config.goal_tolerance_m:
+        if self._is_there(T_map_base):
             return self._arrive(T_map_base, dt_s)
         if self._must_plan(T_map_base, patch, dt_s):
             reason = self._plan(T_map_base, patch)
             if reason:
                 return self._wait(reason, dt_s)
         return self._drive(T_map_base, dt_s)
+
+    def _is_there(self, T_map_base: Array) -> bool:
+        """Whether the robot is at its goal, or where the path ends that leads as near as may be."""
+        assert self._goal is not None
+        ends = [self._goal] if self.path is None else [self._goal, self.path[-1]]
+        away_m = min(math.dist(end, T_map_base[:2]) for end in ends)
+        return away_m <= self.config.goal_tolerance_m
 
     def _arrive(self, T_map_base: Array, dt_s: float) -> Command:
         self._remaining_m = 0.0
