@@ -223,6 +223,28 @@ def test_what_else_an_archive_may_hold(tmp_path: Path) -> None:
         read_arrays(stream)
 
 
+@pytest.mark.filterwarnings('ignore:Duplicate name')
+def test_an_array_that_is_there_twice_is_not_read_as_either(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / 'twice.npz', 'w') as file:
+        file.writestr('a.npy', npy(np.zeros(3)))
+        file.writestr('a.npy', npy(np.ones(3)))
+    with (tmp_path / 'twice.npz').open('rb') as stream, pytest.raises(InputError) as error:
+        read_arrays(stream)
+    assert str(error.value) == '2 arrays of 1 names: expected at most 64, each once'
+
+
+@pytest.mark.parametrize('more', [-8, -1, 1, 8, 800])
+def test_a_member_is_as_large_as_its_header_says(
+    explored: Explored, tmp_path: Path, more: int
+) -> None:
+    members = {name: npy(array) for name, array in explored.states['grid'].items()}
+    whole = members['frame']
+    members['frame'] = whole[:more] if more < 0 else whole + bytes(more)
+    path = archive(tmp_path / 'a.grid.npz', thinmap_format=npy(np.array('grid 1')), **members)
+    with pytest.raises(InputError, match=rf'expected an array of {24 + more} bytes: expected a'):
+        load_grid(str(path))
+
+
 def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / 'a.grid.npz')
     with pytest.raises(InputError, match='expected a regular file'):
