@@ -1,0 +1,95 @@
+"""Command lines in the documentation.
+
+A command is each line of a block of code, and each span of code in the text that begins like one.
+`<!-- not run -->` on the line before a block or paragraph, or in front of a span, marks it.
+"""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+MARK = '<!-- not run -->'
+_SPAN = re.compile(rf'({re.escape(MARK)}\s+)?`([^`]+)`')
+_WHOLE = re.compile(
+    r'ros2 (run \S+ \S+|-h|(topic|service|action|param|lifecycle|node|pkg|interface) \S+)'
+    r'|scripts/\S+|(source|export|rosbags-convert|\S+/pip) \S+'
+)
+_CODE_INDENT = 4
+
+
+@dataclass(frozen=True)
+class Command:
+    """One command as it stands, where it stands, and whether it is marked as not run."""
+
+    document: str
+    section: str
+    text: str
+    marked: bool
+
+
+@dataclass
+class _Part:
+    """A block of code or a paragraph of text."""
+
+    section: str
+    is_code: bool
+    marked: bool
+    lines: list[str]
+
+
+def commands(path: Path) -> list[Command]:
+    """All commands of a document, in order."""
+    found = []
+    for part in _parts(path.read_text().splitlines()):
+        lines = _of_code(part.lines) if part.is_code else _of_text(part.lines)
+        for text, marked in lines:
+            found.append(Command(path.name, part.section, text, marked or part.marked))
+    return found
+
+
+def marks(path: Path) -> int:
+    """How many marks a document has."""
+    return path.read_text().count(MARK)
+
+
+def _parts(lines: list[str]) -> list[_Part]:
+    parts: list[_Part] = []
+    section = ''
+    marked = False
+    fenced = False
+    open_part: _Part | None = None
+    for line in lines:
+        text = line.strip()
+        if text.startswith('```'):
+            fenced = not fenced
+            open_part = None
+            continue
+        if not fenced and (not text or text == MARK):
+            marked = text == MARK
+            open_part = None
+            continue
+        if not fenced and line.startswith('#'):
+            section = line.lstrip('# ')
+            open_part = None
+            continue
+        if open_part is None:
+            is_code = fenced or line.startswith(' ' * _CODE_INDENT)
+            open_part = _Part(section, is_code, marked, [])
+            parts.append(open_part)
+            marked = False
+        open_part.lines.append(line)
+    return parts
+
+
+def _of_code(lines: list[str]) -> list[tuple[str, bool]]:
+    joined = '\n'.join(line.strip() for line in lines).replace('\\\n', '\\\n  ')
+    texts = re.split(r'(?<!\\)\n', joined)
+    return [(text, False) for text in texts if text and not text.startswith('#')]
+
+
+def _of_text(lines: list[str]) -> list[tuple[str, bool]]:
+    found = []
+    for mark, span in _SPAN.findall(' '.join(line.strip() for line in lines)):
+        if _WHOLE.match(span):
+            found.append((span, bool(mark)))
+    return found
