@@ -39,9 +39,13 @@ NOT_RUN = {
     ".setup/venv/bin/pip install 'rerun-sdk>=0.41,<0.42'": 'fetches 740 MB',
     'scripts/screenshot RUN.rrd OUT.png': 'needs rerun and an X server',
     'cd ws/src && git clone <this repository> thinmap && cd ..': 'the workspace of a user',
+    'echo "yaml file://$PWD/src/thinmap/rosdep.yaml" | '
+    'sudo tee /etc/ros/rosdep/sources.list.d/50-thinmap.list': 'as above',
+    'rosdep update': 'as above',
     'rosdep install --from-paths src/thinmap src/thinmap/thinmap_msgs --ignore-src -y': 'as above',
     'colcon build --base-paths src/thinmap src/thinmap/thinmap_msgs': 'as above; CI does it',
     'source install/setup.bash': 'as above',
+    'ros2 run thinmap_ros warm_up      # compiles the kernels: once, a minute or two': 'as above',
     'ros2 run thinmap_ros localizer': 'as above; the tutorials have it, too',
     'ros2 run thinmap_ros rerun_viewer': 'needs rerun, opens a window',
 }
