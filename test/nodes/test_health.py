@@ -67,6 +67,8 @@ def test_nodes_tell_rates_step_times_and_silence(graph):
         )
     graph.until(lambda: doctor.number('topology_builder', 'pose: heard') > 0, 'poses are counted')
     graph.until(lambda: doctor.number('localizer', 'scan: heard') > 5, 'more than five scans')
+    graph.until(lambda: doctor.number('localizer', 'scan: speakers') == 1, 'the simulation')
+    graph.until(lambda: doctor.number('localizer', 'pose: listeners') == 2, 'mapper and builder')
     graph.stop('sim')
     graph.until(lambda: 'scan: silent for' in doctor.status('localizer').message, 'silence is told')
     assert doctor.level('localizer') == DiagnosticStatus.WARN
