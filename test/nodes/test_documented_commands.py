@@ -63,6 +63,9 @@ SHORTER = {
     'scripts/experiments/exploration.sh': 'scripts/experiments/exploration.sh --from-bag bags',
 }
 
+# Said by commands that end with 0 all the same.
+FAILED = ('Traceback', 'success=False', 'Setting parameter failed', 'Transitioning failed')
+
 
 @dataclass(frozen=True)
 class Section:
@@ -164,8 +167,8 @@ class Line:
         """Check the exit code, now or soon."""
         self.process.wait(timeout=PATIENCE_S)
         assert self.process.returncode == code, f'{self.text}\n{self.said()}'
-        assert 'Traceback' not in self.said(), f'{self.text}\n{self.said()}'
-        assert 'success=False' not in self.said(), f'{self.text}\n{self.said()}'
+        for bad in FAILED:
+            assert bad not in self.said(), f'{self.text}\n{self.said()}'
 
     def kill(self) -> None:
         for child in self._children():

@@ -90,9 +90,11 @@ def _send_goal(args: Namespace) -> None:
     text = sys.stdin.read() if args.stdin else args.goal
     goal = values.fill(kind.Goal(), values.mapping(text))
     with Session(args) as session:
-        client = ActionClient(session.node, kind, session.full_name(args.action_name, 'action'))
+        name = session.full_name(args.action_name, 'action')
+        client = ActionClient(session.node, kind, name)
         say('Waiting for an action server to become available...')
-        session.meet(client.server_is_ready)
+        session.until(client.server_is_ready)
+        session.introduce(session.server_of(f'{name}/_action/send_goal'))
         say(f'Sending goal:\n     {values.to_yaml(goal)}')
         sent = client.send_goal_async(goal, _tell if args.feedback else None)
         try:

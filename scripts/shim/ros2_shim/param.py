@@ -50,9 +50,19 @@ def _list(args: Namespace) -> None:
         services = dict(session.node.get_service_names_and_types())
         for node in session.node_names():
             if f'{node}/list_parameters' in services:
-                say(f'{node}:')
-                for name in _names(session, node):
-                    say(f'  {name}')
+                _list_one(session, node)
+
+
+def _list_one(session: Session, node: str) -> None:
+    """Say the names of one of several nodes; one that does not answer keeps none from the rest."""
+    try:
+        names = _names(session, node)
+    except ShimError as error:
+        print(f"Exception while calling service of node '{node}': {error}", file=sys.stderr)
+        return
+    say(f'{node}:')
+    for name in names:
+        say(f'  {name}')
 
 
 def _get_arguments(parser: ArgumentParser) -> None:

@@ -59,7 +59,8 @@ def _call(args: Namespace) -> None:
         client = session.node.create_client(kind, name)
         if not client.service_is_ready():
             say('waiting for service to become available...')
-        session.meet(client.service_is_ready)
+        session.until(client.service_is_ready)
+        session.introduce(session.server_of(name))
         say(f'requester: making request: {request!r}\n')
         say(f'response:\n{session.result(client.call_async(request))!r}\n')
 

@@ -12,9 +12,10 @@ from collections.abc import Callable, Iterator
 from typing import Any, Self
 
 import rclpy
+from rcl_interfaces.srv import GetParameters
 from rclpy.exceptions import NameValidationException
 from rclpy.expand_topic_name import expand_topic_name
-from rclpy.node import Node
+from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from rclpy.validate_full_topic_name import validate_full_topic_name
@@ -24,8 +25,10 @@ from ros2_shim.verbs import SPIN_TIME_S, ShimError
 # A spin is short, as Python hears Ctrl-C only after it.
 _SPIN_S = 0.05
 _LOOK_S = 1.0
+# Where nobody has been found yet.
+_LOOK_LONGER_S = 2.5
 _QUIET_S = 0.6
-# A server knows its client a moment later than the client knows the server.
+# Time for a server of unknown name to know its client.
 _MEET_S = 0.2
 
 
@@ -84,7 +87,8 @@ class Session:
             if seen != known:
                 known = seen
                 quiet_since = now
-            if now > self._begun + _LOOK_S and now > quiet_since + _QUIET_S:
+            look_s = _LOOK_S if self.node_names(hidden=True) else _LOOK_LONGER_S
+            if now > self._begun + look_s and now > quiet_since + _QUIET_S:
                 return
 
     def _snapshot(self) -> Any:
@@ -119,18 +123,40 @@ class Session:
             raise ShimError(f"Node not found: '{full}'")
         return full
 
-    def meet(self, is_ready: Callable[[], Any], seconds: float | None = None) -> bool:
-        """Wait for a server, and until it knows its client, too."""
-        ready = self.until(is_ready, seconds)
-        if ready:
+    def server_of(self, service: str) -> str | None:
+        """Name of the node that offers a service."""
+        for node in self.node_names(hidden=True):
+            try:
+                pairs = self.node.get_service_names_and_types_by_node(*split(node))
+            except NodeNameNonExistentError:
+                continue
+            if service in dict(pairs):
+                return node
+        return None
+
+    def introduce(self, node: str | None) -> None:
+        """Make sure that a node knows the clients made so far.
+
+        A server that does not know its client yet takes the request, and its answer is lost. Ends
+        of a topic or service become known in the order in which they were made: a node that answers
+        to a later client knows the earlier ones. What is asked here may be asked again.
+        """
+        client = self.node.create_client(GetParameters, f'{node or ""}/get_parameters')
+        if node is None or not self.until(client.service_is_ready, _LOOK_S):
             self.until(lambda: False, _MEET_S)
-        return ready
+            return
+        end = time.monotonic() + self.patience_s
+        while time.monotonic() < end:
+            answer = client.call_async(GetParameters.Request())
+            if self.until(answer.done, _LOOK_S):
+                return
 
     def ask(self, kind: Any, name: str, request: Any) -> Any:
         """Response of a service of a node that is there."""
         client = self.node.create_client(kind, name)
-        if not self.meet(client.service_is_ready, self.patience_s):
+        if not self.until(client.service_is_ready, self.patience_s):
             raise ShimError(f"Wait for service timed out: '{name}'")
+        self.introduce(name.rpartition('/')[0])
         future = client.call_async(request)
         if not self.until(future.done, 2.0 * self.patience_s):
             raise ShimError(f"No answer from service '{name}'")
