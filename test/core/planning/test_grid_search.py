@@ -8,6 +8,7 @@ import pytest
 
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.planning.grid_search import WayTable, coarse, field_from, ways_from
+from thinmap_ros.core.planning.reach import reached_from
 
 
 def dijkstra(allowed, start):
@@ -47,6 +48,17 @@ def test_few_goals_give_what_all_give_and_places_outside_cannot_be_reached():
     for i in (0, 77, 450, 899):
         assert ways_from(allowed, (3, 3), everywhere[[i]])[0] == whole[i]
     assert ways_from(allowed, (3, 3), np.array([[-1, 3], [3, 30]])).tolist() == [math.inf, math.inf]
+
+
+@pytest.mark.parametrize(
+    'start', [(-1, 3), (3, -1), (30, 3), (3, 30), (29, 31), (-2, 29), (10**9, 0), (0, -(10**9))]
+)
+def test_from_beyond_the_grid_nothing_can_be_reached(start):
+    allowed = np.ones((30, 30), dtype=np.bool_)
+    everywhere = np.argwhere(allowed)
+    assert np.isinf(field_from(allowed, start)).all()
+    assert np.isinf(ways_from(allowed, start, everywhere)).all()
+    assert not reached_from(allowed, start).any()
 
 
 def test_ways_are_at_most_a_twelfth_longer_than_straight_ones():

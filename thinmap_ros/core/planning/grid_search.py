@@ -25,8 +25,8 @@ _FAR = 2**31 - 1
 def ways_from(allowed: Mask, start: tuple[int, int], goals: Cells) -> Array:
     """Length (N,), cells, of the way over allowed cells (H, W) from (row, col) to each goal (N, 2).
 
-    inf where there is none, and where a goal is not allowed. A start that is not allowed may be
-    left all the same.
+    inf where there is none, where a goal is not allowed, and from a start beyond the grid. A start
+    that is not allowed may be left all the same.
     """
     weights = np.ascontiguousarray(allowed, dtype=np.uint8)
     steps = _ways_from(weights, start[0], start[1], np.ascontiguousarray(goals, dtype=np.int64))
@@ -36,7 +36,7 @@ def ways_from(allowed: Mask, start: tuple[int, int], goals: Cells) -> Array:
 def field_from(allowed: Mask, start: tuple[int, int]) -> Array:
     """Length, in cells, of the way over allowed cells from a start (row, col) to each cell (H, W).
 
-    inf where there is none.
+    inf where there is none, and everywhere from a start beyond the grid.
     """
     nothing = np.zeros((allowed.shape[0] + 2, allowed.shape[1] + 2), dtype=np.bool_)
     return _cells(_field(allowed.astype(np.uint8), start[0], start[1], nothing, -1)[1:-1, 1:-1])
@@ -227,11 +227,14 @@ def _field(
     wanted (H + 2, W + 2): cells to be reached; those that have been are cleared.
     """
     rows, cols = wanted.shape
+    field = np.full((rows, cols), _FAR, dtype=np.int32)
+    # A robot may be believed where there is no map; what is beyond these arrays is not theirs.
+    if not (0 <= start_row < rows - 2 and 0 <= start_col < cols - 2):
+        return field
     # A border that cannot be entered saves all questions about the rim.
     framed = np.zeros((rows, cols), dtype=np.uint8)
     framed[1:-1, 1:-1] = weights
     weight, asked = framed.ravel(), wanted.ravel()
-    field = np.full((rows, cols), _FAR, dtype=np.int32)
     steps = field.ravel()
     capacity = 2 * weight.size + 1
     queue = np.empty((_BUCKETS, capacity), dtype=np.int32)

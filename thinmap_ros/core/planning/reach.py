@@ -71,7 +71,7 @@ def let_out(
 def reached_from(allowed: Mask, start: tuple[int, int]) -> Mask:
     """Allowed cells (H, W) to which the wave can get from a start (row, col).
 
-    It goes over edges of cells, not corners.
+    It goes over edges of cells, not corners. None from a start beyond the mask.
     """
     return np.asarray(_reached_from(allowed, start[0], start[1]))
 
@@ -120,6 +120,8 @@ def _reached_from(allowed: Mask, start_row: int, start_col: int) -> Mask:
     left = np.zeros((rows + 2, cols), dtype=np.bool_)
     left[1:-1, 1:-1] = allowed
     found = np.zeros((rows + 2, cols), dtype=np.bool_)
+    if not (0 <= start_row < rows and 0 <= start_col < cols - 2):
+        return found[1:-1, 1:-1].copy()
     flat, reached = left.ravel(), found.ravel()
     stack = np.empty(flat.size, dtype=np.int64)
     start = (start_row + 1) * cols + start_col + 1
