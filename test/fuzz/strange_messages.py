@@ -244,7 +244,8 @@ def check_topology(message):
     assert len(found.nodes) == len(message.nodes) and len(found.edges) == len(message.edges)
     assert all(math.isfinite(node.x + node.y + node.clearance_m) for node in found.nodes.values())
     assert all(
-        np.isfinite(edge.path).all() and edge.a in found.nodes for edge in found.edges.values()
+        np.isfinite(edge.path).all() and {edge.a, edge.b} <= found.nodes.keys()
+        for edge in found.edges.values()
     )
 
 

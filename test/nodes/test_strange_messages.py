@@ -47,6 +47,25 @@ def test_conversions_give_sound_values_or_refuse_in_one_line(kind):
     assert refused[True] > 80 and refused[False] > 80
 
 
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+def test_a_map_that_is_turned_is_refused_and_no_other(sign):
+    good = next(message for message in made(OccupancyGrid, 40) if not is_refused(message))
+    for turned, refused in ((0.0, False), (0.01, True), (1.5, True)):
+        good.info.origin.orientation = messages.quaternion_msg(sign * turned)
+        assert is_refused(good) == refused
+
+
+@pytest.mark.parametrize(
+    ('sec', 'nanosec', 'refused'),
+    [(0, 0, False), (-1, 0, True), (1, 10**9 - 1, False), (1, 10**9, True), (1, 2**32 - 1, True)],
+)
+def test_stamps(sec, nanosec, refused):
+    good = next(message for message in made(Odometry, 40) if not is_refused(message))
+    good.header.stamp.sec = sec
+    good.header.stamp.nanosec = nanosec
+    assert is_refused(good) == refused
+
+
 SPOKEN = {
     'pose': PoseWithCovarianceStamped,
     '/tf': TFMessage,

@@ -229,3 +229,29 @@ def test_it_remembers_what_is_beside_it_where_the_laser_does_not_look():
     # What is left behind is forgotten too.
     look((2.0, 3.0, 0.0), ahead, 3)
     assert len(look((3.6, 3.0, 0.0), np.full(181, np.inf), 4)) == 0
+
+
+def test_the_way_it_came_it_can_go_back_however_narrow_it_looks_now():
+    navigator = Navigator()
+    looks_open = GridPatch(GridFrame(0.0, 0.0, 0.1), room())
+    for x in np.arange(1.0, 7.0, 0.05):
+        navigator.step(np.array([x, 3.05, 0.0]), looks_open, None, DT)
+    narrow = GridPatch(looks_open.frame, gap_of(2))
+    navigator.set_goal(1.0, 3.05)
+    assert navigator.step(np.array([7.0, 3.05, math.pi]), narrow, None, DT).state == 'driving'
+    # Nobody has been there who did not come that way.
+    other = Navigator()
+    other.set_goal(1.0, 3.05)
+    assert other.step(np.array([7.0, 3.05, math.pi]), narrow, None, DT).state == 'failed'
+
+
+def test_carried_off_its_path_it_plans_anew_at_once():
+    navigator = Navigator()
+    patch = GridPatch(GridFrame(0.0, 0.0, 0.1), room())
+    navigator.set_goal(7.0, 1.0)
+    navigator.step(np.array([1.0, 1.0, 0.0]), patch, None, DT)
+    kept = navigator.path
+    navigator.step(np.array([1.1, 1.1, 0.0]), patch, None, DT)
+    assert navigator.path is kept
+    navigator.step(np.array([1.0, 5.0, 0.0]), patch, None, DT)
+    np.testing.assert_allclose(navigator.path[0], (1.0, 5.0))
