@@ -82,6 +82,7 @@ def test_a_robot_that_drives_about_finds_itself_when_asked(graph, map_file):
     pose = poses[-1]
     # The robot's odometry begins at zero at its start, and drifts little over this way.
     ns = messages.stamp_ns(pose.header.stamp)
+    graph.until(lambda: messages.stamp_ns(odometry[-1].header.stamp) >= ns, 'where it was then')
     at = min(odometry, key=lambda message: abs(messages.stamp_ns(message.header.stamp) - ns))
     truth = se2.compose(np.array(START), messages.pose_from(at.pose.pose))
     off = se2.between(truth, messages.pose_from(pose.pose.pose))
@@ -122,6 +123,7 @@ def test_a_robot_that_may_drive_finds_itself_alone_and_stops(graph, tmp_path):
     graph.start('sim', world=str(tmp_path / 'twins.yaml'), rate=4.0, lockstep='localization_status')
     graph.until(lambda: poses, 'a pose')
     ns = messages.stamp_ns(poses[-1].header.stamp)
+    graph.until(lambda: messages.stamp_ns(truth[-1].header.stamp) >= ns, 'where it was then')
     at = min(truth, key=lambda message: abs(messages.stamp_ns(message.header.stamp) - ns))
     off = se2.between(messages.pose_from(at.pose), messages.pose_from(poses[-1].pose.pose))
     assert np.hypot(off[0], off[1]) < 0.3
