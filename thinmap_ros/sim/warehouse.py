@@ -1,6 +1,6 @@
 """Text of worlds/warehouse.yaml, 200 x 200 m of racks with goods in front.
 
-Python -m thinmap_ros.sim.warehouse.
+It is printed by python -m thinmap_ros.sim.warehouse.
 """
 
 import numpy as np
