@@ -73,6 +73,8 @@ class Runner:
                     break
                 # The one that has had the least time so far.
                 source = min(left, key=lambda s: self._spent[s.name])
+                # What all cases share may take longer than many of them: it does not count.
+                self._prepare(source)
                 began = time.monotonic()
                 stop = min(following[source.name] + _BATCH, first + most)
                 following[source.name] = self._batch(
@@ -85,12 +87,14 @@ class Runner:
             shutil.rmtree(folder, ignore_errors=True)
         return self.outcome
 
-    def _batch(self, source: Source, numbers: range, end_s: float) -> int:
-        """Try cases until one ends its process; the number to go on with."""
+    def _prepare(self, source: Source) -> None:
         if source.name not in self._shared:
             folder = self._out / 'shared' / source.name
             folder.mkdir(parents=True, exist_ok=True)
             self._shared[source.name] = source.prepare(folder)
+
+    def _batch(self, source: Source, numbers: range, end_s: float) -> int:
+        """Try cases until one ends its process; the number to go on with."""
         read, write = os.pipe()
         # What is waiting to be written would be written twice.
         sys.stdout.flush()
