@@ -1,6 +1,6 @@
 """Lost robots by the hundred.
 
-Python -m benchmarks.lost [ROW ...] -o DIR [--count N] [--worlds DIR] [--log LOG].
+Usage: python -m benchmarks.lost [ROW ...] -o DIR [--count N] [--worlds DIR] [--log LOG].
 
 Each row of docs/localization.md leaves a CSV file with a line for each robot, as soon as it is
 there; what is in the file is not run again.
