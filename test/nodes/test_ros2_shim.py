@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import yaml
 from action_msgs.msg import GoalStatus, GoalStatusArray
+from domains import free_domain
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import OccupancyGrid
 from nodes.conftest import PATIENCE_S, Graph
@@ -31,10 +32,9 @@ NODES = [name.lstrip('/') for name in FIVE]
 @pytest.fixture(scope='module')
 def robot(tmp_path_factory):
     """A simulated robot whose nodes run; each test leaves them as it found them."""
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, free_domain() as domain:
         folder = tmp_path_factory.mktemp('robot')
         patch.setenv('THINMAP_STATE_DIR', str(folder / 'state'))
-        domain = 101 + os.getpid() % 100
         patch.setenv('ROS_DOMAIN_ID', str(domain))
         patch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
         graph = Graph(domain, folder)
