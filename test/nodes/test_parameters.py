@@ -1,5 +1,8 @@
 """Parameters of running nodes: set where that makes sense, and refused with a reason where not."""
 
+import subprocess
+import sys
+
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParametersAtomically
@@ -58,3 +61,21 @@ def test_what_cannot_change_is_marked_and_refused(graph):
     result = change(graph, 'grid_mapper', resolution_m=0.2)
     assert not result.successful and 'read-only' in result.reason
     assert graph.stop('grid_mapper') == 0
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'said'),
+    [
+        (['--params-file', '/nowhere.yaml'], '/nowhere.yaml'),
+        (['-p', 'robot_radius_m:=[1'], 'robot_radius_m:=[1'),
+        (['-r', 'scan'], '-r scan'),
+    ],
+)
+def test_arguments_that_ros_cannot_read_end_the_start_with_a_line(arguments, said):
+    command = [sys.executable, '-m', 'thinmap_ros.nodes.navigator', '--ros-args', *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    line = done.stderr.splitlines()[-1]  # before it one of rcl's log
+    assert 'Traceback' not in done.stderr
+    assert line.startswith('error: arguments after --ros-args: ')
+    assert said in line

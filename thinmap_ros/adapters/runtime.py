@@ -9,13 +9,14 @@ from typing import Any
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from thinmap_ros.adapters import parameters
 from thinmap_ros.adapters.compiling import report_compilation
 from thinmap_ros.adapters.pages import give_back_pages, release_compiler_pages
-from thinmap_ros.core.errors import ThinmapError
+from thinmap_ros.core.errors import ThinmapError, reason_of
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -38,7 +39,7 @@ def run_all(make_nodes: Sequence[Callable[[], Node]]) -> None:
 
     Parameters that are given to all of them need to be known to one of them.
     """
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    _init()
     _on_signals(_leave)
     compilation = report_compilation()
     nodes: list[Node] = []
@@ -61,6 +62,15 @@ def run_all(make_nodes: Sequence[Callable[[], Node]]) -> None:
             getattr(node, 'close', lambda: None)()
             node.destroy_node()
         rclpy.try_shutdown()
+
+
+def _init() -> None:
+    """Take the arguments after --ros-args; ends with 2 and a line where they are wrong."""
+    try:
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    except rclpy_implementation.RCLError as error:
+        print(f'error: arguments after --ros-args: {reason_of(error)}', file=sys.stderr)
+        sys.exit(2)
 
 
 def _spin(nodes: list[Node]) -> None:
