@@ -64,7 +64,10 @@ def start(*words):
 
 def run(*words):
     process = start(*words)
-    stdout, stderr = process.communicate(timeout=150.0)
+    try:
+        stdout, stderr = process.communicate(timeout=2.0 * PATIENCE_S)
+    finally:
+        process.kill()
     assert 'Traceback' not in stderr
     return subprocess.CompletedProcess(words, process.returncode, stdout, stderr)
 

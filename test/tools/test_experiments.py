@@ -201,7 +201,7 @@ def test_logs_of_the_users_own(tmp_path: Path) -> None:
 def test_a_laser_file_that_is_wrong_is_said(tmp_path: Path) -> None:
     (tmp_path / 'laser.yaml').write_text('ofset_m: 0.1\n')
     with pytest.raises(InputError, match=r'laser\.yaml.*ofset_m'):
-        logs._laser(tmp_path)
+        logs.laser_of(tmp_path, tmp_path.name)
     with pytest.raises(InputError, match=r'no NAME/log\.clf'):
         logs.run(tmp_path, tmp_path / 'out')
 
