@@ -137,6 +137,11 @@ def test_the_folder_of_numba_itself_comes_first(install: Install) -> None:
     assert not (install.package / '__pycache__').exists()
 
 
+def test_a_folder_of_numba_that_cannot_be_written_to_is_passed_over(install: Install) -> None:
+    (value, folder), _ = install.run(NUMBA_CACHE_DIR='/dev/null/chosen')
+    assert (value, folder) == ('6.0', str(install.package / '__pycache__' / 'kernels'))
+
+
 def test_what_was_compiled_at_install_time_is_taken_over(
     install: Install, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -36,14 +36,13 @@ _IMPORT = re.compile(
 def folder() -> Path | None:
     """The folder for kernels, or None, with a warning, where there is none to write to.
 
-    NUMBA_CACHE_DIR where it is set, else beside the package, else the user's cache folder, else a
-    private one among the temporary files. What an administrator compiled beside a package that this
-    user may not write to is taken over.
+    The first that can be written to of: NUMBA_CACHE_DIR, where it is set; beside the package; the
+    user's cache folder; a private one among the temporary files. What an administrator compiled
+    beside a package that this user may not write to is taken over.
     """
-    if numba.config.CACHE_DIR:
-        return Path(numba.config.CACHE_DIR)
     refusals = []
-    for make in (_beside_package, _of_user, _temporary):
+    named = [_named] if numba.config.CACHE_DIR else []
+    for make in (*named, _beside_package, _of_user, _temporary):
         try:
             return make()
         except (OSError, InputError, RuntimeError) as error:
@@ -108,6 +107,10 @@ class KernelLocator:
 
 
 caching.CacheImpl._locator_classes.insert(0, KernelLocator)
+
+
+def _named() -> Path:
+    return _writable(Path(numba.config.CACHE_DIR))
 
 
 def _beside_package() -> Path:
