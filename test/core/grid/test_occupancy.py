@@ -107,6 +107,17 @@ def test_invalid_beams_change_nothing(value):
     assert grid.patch().unknown.all()
 
 
+@pytest.mark.parametrize('place', [(0.0, 0.0), (9.0, 0.0), (-9.0, 0.0), (0.0, 9.0), (300.0, -9.0)])
+def test_a_scan_that_shows_nothing_leaves_the_picture_as_it_was(place):
+    grid = OccupancyGrid()
+    grid.update(scan_of(np.full(181, 3.0)), pose(0.0, 0.0, 0.3))
+    before = grid.patch()
+    grid.update(scan_of(np.full(181, np.nan)), pose(*place, 0.3))
+    after = grid.patch()
+    assert after.frame == before.frame
+    assert np.array_equal(after.cells, before.cells)
+
+
 def test_a_beam_without_return_frees_up_to_the_configured_range():
     grid = OccupancyGrid(OccupancyConfig(no_return_range_m=3.0))
     for _ in range(2):

@@ -38,7 +38,8 @@ class Picture:
         """
         self._fit(tiles)
         if self._stale is not None:
-            self._refresh(tiles, _common(self._stale, self._bounds))
+            self._refresh(tiles, *_common(self._stale, self._bounds))
+            self._stale = None
         if self._known is None:
             return GridPatch(frame, np.full((1, 1), UNKNOWN, dtype=np.int8))
         row, col, end_row, end_col = self._known
@@ -57,9 +58,10 @@ class Picture:
             cells[row : row + self._cells.shape[0], col : col + self._cells.shape[1]] = self._cells
         self._cells, self._bounds = cells, bounds
 
-    def _refresh(self, tiles: TileStore, part: Bounds) -> None:
-        row, col, end_row, end_col = part
-        odds = tiles.read(row, col, max(end_row - row, 0), max(end_col - col, 0))
+    def _refresh(self, tiles: TileStore, row: int, col: int, end_row: int, end_col: int) -> None:
+        if end_row <= row or end_col <= col:
+            return  # beyond all tiles
+        odds = tiles.read(row, col, end_row - row, end_col - col)
         top, left = self._bounds[:2]
         shown = self._percent[odds.astype(np.intp) + self._percent.size // 2]
         self._cells[row - top : end_row - top, col - left : end_col - left] = shown
@@ -74,7 +76,6 @@ class Picture:
                 col + int(cols[-1]) + 1,
             )
             self._known = _union(self._known, found)
-        self._stale = None
 
 
 def _union(a: Bounds | None, b: Bounds) -> Bounds:
