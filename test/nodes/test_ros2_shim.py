@@ -94,10 +94,12 @@ def test_lists_show_what_there_is(robot):
     assert listed(names, 'node', 'list') == names
     topics = listed(['/scan [sensor_msgs/msg/LaserScan]'], 'topic', 'list', '-t')
     assert not [line for line in topics if '/_action/' in line]
+    listed(['/explore/_action/status'], 'topic', 'list', '--include-hidden-topics')
     listed(['/save_map [thinmap_msgs/srv/SaveMap]'], 'service', 'list', '-t')
     listed(['/save_map', '/localizer/get_state'], 'service', 'list')
     actions = ['/explore [thinmap_msgs/action/Explore]']
     listed(actions, 'action', 'list', '-t')
+    assert int(output('action', 'list', '-c')) > 0
     states = listed(['/localizer', '/explorer'], 'lifecycle', 'nodes')
     assert '/sim' not in states
     listed(['Action: /explore', 'Action servers: 1', '    /explorer'], 'action', 'info', '/explore')
@@ -325,6 +327,8 @@ AT_ONCE = ('--spin-time', '0.5')
         (['topic', 'echo', '/x', 'std_msgs/msg/Nix'], 1, 'message type is invalid'),
         (['action', 'send_goal', '/x', 'x/action/X', '{}'], 1, 'action type is invalid'),
         (['topic', 'type', '/nowhere', *AT_ONCE], 1, "Unknown topic '/nowhere'"),
+        (['service', 'type', '/nowhere', *AT_ONCE], 1, "Unknown service '/nowhere'"),
+        (['service', 'type'], 2, 'required: service_name'),
         (['param', 'get', '/nobody', 'x', *AT_ONCE], 1, "Node not found: '/nobody'"),
         (['lifecycle', 'set', 'nobody', 'activate', *AT_ONCE], 1, "Node not found: '/nobody'"),
         (['node', 'info', '/nobody', *AT_ONCE], 1, "Node not found: '/nobody'"),

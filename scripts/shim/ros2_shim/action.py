@@ -14,6 +14,7 @@ from rclpy.action import (
 from rclpy.task import Future
 
 from ros2_shim import values
+from ros2_shim.named import Named
 from ros2_shim.session import Session, split
 from ros2_shim.verbs import ShimError, Verb, add_graph_arguments, say
 
@@ -26,23 +27,7 @@ _STATUS = {
     GoalStatus.STATUS_ABORTED: 'ABORTED',
 }
 _CANCEL_S = 10.0
-
-
-def _list_arguments(parser: ArgumentParser) -> None:
-    add_graph_arguments(parser)
-    parser.add_argument('-t', '--show-types', action='store_true', help='types, too')
-    parser.add_argument('-c', '--count-actions', action='store_true', help='only how many')
-
-
-def _list(args: Namespace) -> None:
-    with Session(args) as session:
-        session.settle()
-        pairs = get_action_names_and_types(session.node)
-    if args.count_actions:
-        say(str(len(pairs)))
-        return
-    for name, types in pairs:
-        say(f'{name} [{", ".join(types)}]' if args.show_types else name)
+_ACTIONS = Named('action', get_action_names_and_types, hides=False)
 
 
 def _info_arguments(parser: ArgumentParser) -> None:
@@ -150,7 +135,7 @@ def _say_somewhere(text: str) -> None:
 
 VERBS = {
     'info': Verb('Which nodes serve and use an action.', _info_arguments, _info),
-    'list': Verb('Names of all actions.', _list_arguments, _list),
+    'list': _ACTIONS.list_verb,
     'send_goal': Verb(
         'Send a goal and wait for its end; Ctrl-C cancels it.', _send_goal_arguments, _send_goal
     ),

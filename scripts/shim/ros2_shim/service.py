@@ -3,43 +3,14 @@
 import sys
 from argparse import ArgumentParser, Namespace
 
+from rclpy.node import Node
+
 from ros2_shim import values
-from ros2_shim.node import is_hidden
+from ros2_shim.named import Named
 from ros2_shim.session import Session
-from ros2_shim.verbs import ShimError, Verb, add_graph_arguments, say
+from ros2_shim.verbs import Verb, say
 
-
-def _list_arguments(parser: ArgumentParser) -> None:
-    add_graph_arguments(parser)
-    parser.add_argument('-t', '--show-types', action='store_true', help='types, too')
-    parser.add_argument('-c', '--count-services', action='store_true', help='only how many')
-    parser.add_argument('--include-hidden-services', action='store_true', help='hidden ones, too')
-
-
-def _list(args: Namespace) -> None:
-    with Session(args) as session:
-        session.settle()
-        pairs = session.node.get_service_names_and_types()
-    shown = [p for p in pairs if args.include_hidden_services or not is_hidden(p[0])]
-    if args.count_services:
-        say(str(len(shown)))
-        return
-    for name, types in shown:
-        say(f'{name} [{", ".join(types)}]' if args.show_types else name)
-
-
-def _type_arguments(parser: ArgumentParser) -> None:
-    add_graph_arguments(parser)
-    parser.add_argument('service_name')
-
-
-def _type(args: Namespace) -> None:
-    with Session(args) as session:
-        name = session.full_name(args.service_name, 'service')
-        if not session.found(lambda: name in dict(session.node.get_service_names_and_types())):
-            raise ShimError(f"Unknown service '{name}'")
-        for kind in dict(session.node.get_service_names_and_types())[name]:
-            say(kind)
+_SERVICES = Named('service', Node.get_service_names_and_types)
 
 
 def _call_arguments(parser: ArgumentParser) -> None:
@@ -67,6 +38,6 @@ def _call(args: Namespace) -> None:
 
 VERBS = {
     'call': Verb('Call a service.', _call_arguments, _call),
-    'list': Verb('Names of all services.', _list_arguments, _list),
-    'type': Verb('Type of a service.', _type_arguments, _type),
+    'list': _SERVICES.list_verb,
+    'type': _SERVICES.type_verb,
 }

@@ -5,8 +5,10 @@ import time
 from argparse import ArgumentParser, Namespace
 from typing import Any
 
+from rclpy.node import Node
+
 from ros2_shim import qos, values
-from ros2_shim.node import is_hidden
+from ros2_shim.named import Named
 from ros2_shim.rates import Rates
 from ros2_shim.session import Session
 from ros2_shim.verbs import (
@@ -19,14 +21,11 @@ from ros2_shim.verbs import (
 )
 
 _TRUNCATE = 128
-
-
-def _types(session: Session, topic: str) -> list[str]:
-    return list(dict(session.node.get_topic_names_and_types()).get(topic, []))
+_TOPICS = Named('topic', Node.get_topic_names_and_types)
 
 
 def _single_type(session: Session, topic: str) -> Any:
-    types = _types(session, topic)
+    types = _TOPICS.types(session, topic)
     if len(types) > 1:
         raise ShimError(
             f"Cannot echo topic '{topic}', as it contains more than one type: [{', '.join(types)}]"
@@ -38,61 +37,20 @@ def _not_published(topic: str) -> None:
     say(f'WARNING: topic [{topic}] does not appear to be published yet')
 
 
-# list ------------------------------------------------------------------------------------------
-
-
-def _list_arguments(parser: ArgumentParser) -> None:
-    add_graph_arguments(parser)
-    parser.add_argument('-t', '--show-types', action='store_true', help='types, too')
-    parser.add_argument('-c', '--count-topics', action='store_true', help='only how many')
-    parser.add_argument('--include-hidden-topics', action='store_true', help='hidden ones, too')
-
-
-def _list(args: Namespace) -> None:
-    with Session(args) as session:
-        session.settle()
-        pairs = session.node.get_topic_names_and_types()
-    shown = [p for p in pairs if args.include_hidden_topics or not is_hidden(p[0])]
-    if args.count_topics:
-        say(str(len(shown)))
-        return
-    for name, types in shown:
-        say(f'{name} [{", ".join(types)}]' if args.show_types else name)
-
-
-# type, info ------------------------------------------------------------------------------------
-
-
-def _type_arguments(parser: ArgumentParser) -> None:
-    add_graph_arguments(parser)
-    parser.add_argument('topic_name')
-
-
-def _type(args: Namespace) -> None:
-    with Session(args) as session:
-        for kind in _types(session, _known(session, args.topic_name)):
-            say(kind)
-
-
-def _known(session: Session, name: str) -> str:
-    """Full name of a topic that is there."""
-    topic = session.full_name(name)
-    if not session.found(lambda: _types(session, topic)):
-        raise ShimError(f"Unknown topic '{topic}'")
-    return topic
+# info ------------------------------------------------------------------------------------------
 
 
 def _info_arguments(parser: ArgumentParser) -> None:
-    _type_arguments(parser)
+    _TOPICS.name_arguments(parser)
     parser.add_argument('-v', '--verbose', action='store_true', help='each end, with its QoS')
 
 
 def _info(args: Namespace) -> None:
     end = '\n\n' if args.verbose else '\n'
     with Session(args) as session:
-        topic = _known(session, args.topic_name)
+        topic = _TOPICS.known(session, args.name)
         session.settle()
-        types = _types(session, topic)
+        types = _TOPICS.types(session, topic)
         node = session.node
         say(f'Type: {types[0] if len(types) == 1 else types}', end)
         say(f'Publisher count: {node.count_publishers(topic)}', end)
@@ -125,7 +83,7 @@ def _echo(args: Namespace) -> None:
     given = values.type_named(args.message_type, 'msg') if args.message_type else None
     with Session(args) as session:
         topic = session.full_name(args.topic_name)
-        if given is None and not session.found(lambda: _types(session, topic)):
+        if given is None and not session.found(lambda: _TOPICS.types(session, topic)):
             _not_published(topic)
             raise ShimError('Could not determine the type for the passed topic')
         kind = given or _single_type(session, topic)
@@ -175,9 +133,9 @@ def _hz(args: Namespace) -> None:
     rates = Rates(args.window)
     with Session(args) as session:
         topic = session.full_name(args.topic_name)
-        if not session.found(lambda: _types(session, topic)):
+        if not session.found(lambda: _TOPICS.types(session, topic)):
             _not_published(topic)
-            session.until(lambda: _types(session, topic))
+            session.until(lambda: _TOPICS.types(session, topic))
         kind = _single_type(session, topic)
         profile = qos.to_hear(session, topic, args)
 
@@ -247,7 +205,7 @@ VERBS = {
     'echo': Verb('Print the messages of a topic.', _echo_arguments, _echo),
     'hz': Verb('How often a topic is heard.', _hz_arguments, _hz),
     'info': Verb('Who publishes and who hears a topic.', _info_arguments, _info),
-    'list': Verb('Names of all topics.', _list_arguments, _list),
+    'list': _TOPICS.list_verb,
     'pub': Verb('Publish messages on a topic.', _pub_arguments, _pub),
-    'type': Verb('Type of a topic.', _type_arguments, _type),
+    'type': _TOPICS.type_verb,
 }
