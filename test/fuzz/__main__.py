@@ -10,7 +10,7 @@ import time
 import warnings
 from pathlib import Path
 
-from fuzz.runner import LIMIT_S, Outcome, Runner
+from fuzz.runner import LIMIT_S, NET, Outcome, Runner
 from fuzz.sources import SOURCES
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -27,7 +27,7 @@ def parsed(words: list[str] | None) -> argparse.Namespace:
     parser.add_argument('--cases', type=int, default=10**9, help='so many of each source at most')
     parser.add_argument('--first', type=int, default=0, help='number of the first case (default 0)')
     parser.add_argument(
-        '--limit-s', type=float, default=LIMIT_S, help=f'for one case (default {LIMIT_S:g} s)'
+        '--limit-s', type=float, default=LIMIT_S, help=f'CPU time of a case (default {LIMIT_S:g} s)'
     )
     parser.add_argument('--out', type=Path, default=ROOT / 'out' / 'fuzz', help='for what fails')
     return parser.parse_args(words)
@@ -62,7 +62,8 @@ def main(words: list[str] | None = None) -> int:
     warnings.simplefilter('ignore')
     print(f'seed {seed}', flush=True)
     sources = [SOURCES[name] for name in arguments.only]
-    runner = Runner(sources, seed, arguments.out, arguments.limit_s)
+    limit_s = arguments.limit_s
+    runner = Runner(sources, seed, arguments.out, limit_s, NET * limit_s)
     end_s = time.monotonic() + 60.0 * arguments.minutes
     outcome = runner.run(end_s, arguments.cases, arguments.first)
     print(summary(outcome, arguments.out), flush=True)

@@ -21,7 +21,9 @@ import numpy as np
 from fuzz.cases import Source
 
 LIMIT_S = 60.0
-"""A case takes milliseconds to a second; a busy machine ten times that."""
+"""CPU time: a case takes milliseconds to a second of it, however busy the machine is."""
+NET = 20
+"""A case that sleeps or waits for itself takes none: it is ended after so many limits."""
 MEMORY_BYTES = 3 << 30
 _BATCH = 200
 _KEPT_OF_A_KIND = 20
@@ -45,12 +47,17 @@ def rng_of(seed: int, source: str, number: int) -> np.random.Generator:
 class Runner:
     """Tries cases of all sources in turn, a batch at a time, and keeps those that fail.
 
-    Each batch runs in a child process with a limit of memory. A case that takes longer than
-    limit_s is ended with its process.
+    Each batch runs in a child process with a limit of memory. A case that takes more CPU time than
+    limit_s is ended with its process, and so is one that has not ended after net_s by the clock.
     """
 
     def __init__(
-        self, sources: Sequence[Source], seed: int, out: Path, limit_s: float = LIMIT_S
+        self,
+        sources: Sequence[Source],
+        seed: int,
+        out: Path,
+        limit_s: float = LIMIT_S,
+        net_s: float = NET * LIMIT_S,
     ) -> None:
         self.outcome = Outcome(seed)
         self._sources = sources
@@ -59,6 +66,7 @@ class Runner:
         self._work = self._out / f'work-{os.getpid()}'
         self._failed = self._out / f'failed-{os.getpid()}'
         self._limit_s = limit_s
+        self._net_s = net_s
         self._shared: dict[str, Any] = {}
         self._spent = Counter[str]()
 
@@ -118,13 +126,13 @@ class Runner:
         try:
             signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
             while not ended:
-                ready, _, _ = select.select([pipe], [], [], self._limit_s)
+                ready, _, _ = select.select([pipe], [], [], self._net_s)
                 said = os.read(pipe, 1) if ready else b''
                 if said in (b'+', b'-'):
                     self._count(source, number, said == b'-')
                     number += 1
                 elif not ready:
-                    ended = f'takes longer than {self._limit_s:g} s'
+                    ended = f'has not ended after {self._net_s:g} s'
                 else:
                     break
         finally:
@@ -132,12 +140,17 @@ class Runner:
                 os.kill(child, signal.SIGKILL)
             _, status = os.waitpid(child, 0)
         if not ended and status != 0:
-            ended = f'the process ends with {os.waitstatus_to_exitcode(status)}'
+            ended = self._why(os.waitstatus_to_exitcode(status))
         if ended:
             (self._work / 'why.txt').write_text(ended + '\n')
             self._count(source, number, True)
             number += 1
         return number
+
+    def _why(self, code: int) -> str:
+        if code == -signal.SIGPROF:
+            return f'takes more than {self._limit_s:g} s of CPU time'
+        return f'the process ends with {code}'
 
     def _count(self, source: Source, number: int, failed: bool) -> None:
         self.outcome.tried[source.name] += 1
@@ -180,6 +193,10 @@ class Runner:
         # What was going on when the process died.
         died = (self._work / 'died.txt').open('w')
         faulthandler.enable(died)
+        # It ends the process when the time is over, also amidst a kernel that never comes back to
+        # the interpreter, and says before where that was.
+        faulthandler.register(signal.SIGPROF, died, chain=True)
+        signal.setitimer(signal.ITIMER_PROF, self._limit_s)
         rng = rng_of(self.outcome.seed, source.name, number)
         try:
             source.run(self._shared[source.name], rng, self._work)
@@ -190,6 +207,8 @@ class Runner:
             self._work.rename(self._failed / str(number))
             return False
         finally:
+            signal.setitimer(signal.ITIMER_PROF, 0.0)
+            faulthandler.unregister(signal.SIGPROF)
             faulthandler.disable()
             died.close()
         return True

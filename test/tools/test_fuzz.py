@@ -5,6 +5,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from itertools import repeat
 from pathlib import Path
 
 import numpy as np
@@ -30,9 +32,9 @@ def fails(shared: None, rng: np.random.Generator, folder: Path) -> None:
 
 
 def tried_once(
-    tmp_path: Path, run: object, cases: int = 12, limit_s: float = 60.0
+    tmp_path: Path, run: object, cases: int = 12, **limits: float
 ) -> tuple[Runner, Path]:
-    runner = Runner([Source('s', nothing, run)], 5, tmp_path, limit_s)  # type: ignore[arg-type]
+    runner = Runner([Source('s', nothing, run)], 5, tmp_path, **limits)  # type: ignore[arg-type]
     runner.run(time.monotonic() + HOURS_S, cases)
     return runner, tmp_path / '5'
 
@@ -63,6 +65,15 @@ def hangs(shared: None, rng: np.random.Generator, folder: Path) -> None:
         time.sleep(1.0)
 
 
+def waits(shared: None, rng: np.random.Generator, folder: Path) -> None:
+    time.sleep(0.5)
+
+
+def burns(shared: None, rng: np.random.Generator, folder: Path) -> None:
+    # As in a kernel: no signal reaches Python before its end.
+    sum(repeat(0))
+
+
 def takes_memory(shared: None, rng: np.random.Generator, folder: Path) -> None:
     np.ones(1 << 40, dtype=np.uint8)
 
@@ -75,20 +86,30 @@ def says_too_much(shared: None, rng: np.random.Generator, folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ('run', 'why'),
+    ('run', 'limits', 'why'),
     [
-        (dies, 'the process ends with -11'),
-        (hangs, 'takes longer than 0.5 s'),
-        (takes_memory, 'Unable to allocate'),
-        (says_too_much, 'not one line'),
+        (dies, {}, 'the process ends with -11'),
+        (burns, {'limit_s': 0.2}, 'takes more than 0.2 s of CPU time'),
+        (hangs, {'net_s': 2.0}, 'has not ended after 2 s'),
+        (takes_memory, {}, 'Unable to allocate'),
+        (says_too_much, {}, 'not one line'),
     ],
 )
-def test_whatever_a_case_does_the_run_goes_on(tmp_path: Path, run: object, why: str) -> None:
-    runner, kept = tried_once(tmp_path, run, 2, 0.5 if run is hangs else 60.0)
+def test_whatever_a_case_does_the_run_goes_on(
+    tmp_path: Path, run: Callable[..., None], limits: dict[str, float], why: str
+) -> None:
+    runner, kept = tried_once(tmp_path, run, 2, **limits)
     assert [number for _, number, _ in runner.outcome.failures] == [0, 1]
     assert all(why in said for _, _, said in runner.outcome.failures)
     assert why in (kept / 's-1' / 'why.txt').read_text()
-    assert ('in dies' in (kept / 's-1' / 'died.txt').read_text()) == (run is dies)
+    where = (kept / 's-1' / 'died.txt').read_text()
+    assert (f'in {run.__name__}' in where) == (run in (dies, burns))
+
+
+def test_a_case_that_only_waits_is_within_its_limit(tmp_path: Path) -> None:
+    runner, _ = tried_once(tmp_path, waits, 2, limit_s=0.2)
+    assert runner.outcome.tried['s'] == 2
+    assert not runner.outcome.failures
 
 
 def test_damages_are_the_same_for_a_seed_and_others_for_another() -> None:
