@@ -63,10 +63,12 @@ setup(
         'viewer': ['rerun-sdk>=0.41,<0.42'],  # its interface changes with each minor version
         'test': [
             'hypothesis',
+            'networkx',
             'opencv-contrib-python-headless',
             'psutil',
             'pytest',
             'pytest-timeout',
+            'pytest-xdist',
             'scikit-image',
         ],
     },

@@ -18,15 +18,20 @@ PROGRAMS = sorted(path.stem for path in MODULES if 'def main(' in path.read_text
 TOOLS = sorted(
     path.stem for path in (PACKAGE / 'tools').glob('*.py') if 'ArgumentParser(' in path.read_text()
 )
-# rosdep keys of what is imported under another name.
+# rosdep keys of what is imported or installed under another name.
 KEYS = {
     'PIL': 'python3-pil',
+    'pillow': 'python3-pil',
     'yaml': 'python3-yaml',
+    'pyyaml': 'python3-yaml',
     'rosbags': 'python3-rosbags-pip',
     'mcap': 'python3-mcap-pip',
     'lz4': 'python3-mcap-pip',  # comes with mcap, as zstandard
     'zstandard': 'python3-mcap-pip',
     'cv2': 'python3-opencv',
+    'opencv-contrib-python-headless': 'python3-opencv',
+    'scikit-image': 'python3-skimage',
+    'pytest-xdist': None,  # there is none; it only runs tests side by side
 }
 # Keys of rosdistro's rosdep/python.yaml, read in its commit 662921b on 2026-11-22; of two that were
 # added or widened to Ubuntu 24.04 later: its pull requests 37795 (rosbags) and 36477 (numba).
@@ -76,6 +81,9 @@ LOCKS = {
 }
 # Optional, and named in setup.py as extras.
 EXTRAS = {'rerun', 'dask', 'distributed'}
+# What builds and what checks the code: it runs without.
+BUILDERS = {'colcon-common-extensions', 'catkin-pkg', 'setuptools'}
+CHECKERS = {'ruff', 'mypy', 'types-pyyaml', 'types-tqdm', 'scipy-stubs'}
 
 
 @pytest.mark.parametrize(
@@ -123,13 +131,43 @@ def names_in(path):
     return {name.lower().replace('_', '-'): pinned for name, _, pinned in pairs}
 
 
+def bare(requirements):
+    """Names without their bounds."""
+    return {name.partition('>')[0].partition('<')[0] for name in requirements}
+
+
+def asked_in_setup_py():
+    """What thinmap needs, and its extras."""
+    tree = ast.parse((ROOT / 'setup.py').read_text())
+    given = {node.arg: node.value for node in ast.walk(tree) if isinstance(node, ast.keyword)}
+    return [ast.literal_eval(given[name]) for name in ('install_requires', 'extras_require')]
+
+
+def test_setup_py_and_the_requirements_ask_for_the_same():
+    needed, extras = asked_in_setup_py()
+    python, test, viewer = (
+        names_in(ROOT / 'requirements' / f'{part}.in') for part in ('python', 'test', 'viewer')
+    )
+    assert bare(needed) == bare(python) - BUILDERS
+    assert bare(extras['test'] + extras['cluster']) == bare(test) - CHECKERS
+    assert set(extras['viewer']) == viewer.keys(), 'with the same bounds'
+
+
+def test_setup_py_and_package_xml_ask_for_the_same():
+    tree = ElementTree.parse(ROOT / 'package.xml')
+    needed, extras = asked_in_setup_py()
+    for names, tag in ((needed, 'exec_depend'), (extras['test'], 'test_depend')):
+        keys = {KEYS.get(name, f'python3-{name}') for name in names} - {None}
+        assert keys == {e.text for e in tree.iter(tag) if e.text.startswith('python3-')}
+
+
 @pytest.mark.parametrize('lock', LOCKS)
 def test_a_lock_pins_all_that_is_asked_for(lock):
     pinned = names_in(ROOT / 'requirements' / lock)
     assert all(pinned.values())
     for part in LOCKS[lock]:
         asked = names_in(ROOT / 'requirements' / f'{part}.in')
-        assert {name.partition('>')[0].partition('<')[0] for name in asked} <= pinned.keys()
+        assert bare(asked) <= pinned.keys()
 
 
 @pytest.mark.skipif(
