@@ -19,7 +19,9 @@ from thinmap_ros.sim.world import World
 SEEDS = range(24)
 EXACT = Lms200Config(noise_m=0.0, rounding_m=0.0, mixed_pixels=0.0)
 NOBODY = People(np.zeros((0, 4, 2)), np.zeros(0), np.zeros((0, 4)))
-NO_DOOR = Leaves(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0), 0)
+NO_DOOR = Leaves(
+    np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros((0, 1)), np.zeros((0, 1), bool)
+)
 
 
 def plain(seed, **given):
@@ -60,6 +62,8 @@ def test_a_seed_says_all_and_another_says_something_else():
     assert np.array_equal(one.world.start, same.world.start)
     places = [made.world.moving.people.places(77.0) for made in (one, same)]
     assert np.array_equal(*places)
+    leaves = [vars(made.world.moving.leaves) for made in (one, same)]
+    assert all(np.array_equal(leaves[0][name], leaves[1][name]) for name in leaves[0])
     assert one.world.occupied.shape != other.world.occupied.shape
 
 
@@ -127,22 +131,54 @@ def test_people_are_seen_where_they_are_then_and_step_aside():
     assert ahead(walled(False, Moving(beside, NO_DOOR)), 5.0) == pytest.approx(2.0)
 
 
+def test_people_walk_evenly_from_point_to_point():
+    rng = np.random.default_rng(2)
+    points, speeds = rng.uniform(0.0, 20.0, (6, 4, 2)), rng.uniform(0.5, 1.4, 6)
+    points[3, 2] = points[3, 1]
+    pauses = rng.exponential(8.0, (6, 4))
+    pauses[4] = 0.0
+    people = People(points, speeds, pauses)
+    for seconds in (0.0, *rng.uniform(0.0, 500.0, 200)):
+        for i, place in enumerate(people.places(seconds)):
+            times, stations = [0.0], [points[i, 0]]
+            for k, pause in enumerate(pauses[i]):
+                goal = points[i, (k + 1) % 4]
+                leg = np.hypot(*(goal - points[i, k])) / speeds[i]
+                times += [times[-1] + pause, times[-1] + pause + leg]
+                stations += [points[i, k], goal]
+            now = seconds % times[-1]
+            wanted = [np.interp(now, times, axis) for axis in np.transpose(stations)]
+            assert place == pytest.approx(wanted, abs=1e-9)
+
+
 def test_doors_swing_and_are_held_open_for_a_robot():
     hinges, ends = np.array([[2.0, 1.5]]), np.array([[2.0, 2.5]])
-    leaves = Leaves(hinges, ends, np.ones(1), np.array([10.0]), np.array([0.5]), 3)
+    open_rad, is_shut = np.array([[1.0, -0.5, 1.0]]), np.array([[False, False, True]])
+    leaves = Leaves(hinges, ends, np.array([10.0]), open_rad, is_shut)
     far, near = np.array([-6.0, 2.0]), np.array([1.0, 2.0])
-    shut = [np.allclose(leaves.segments(10.0 * k, far, 20.0)[0, 2:], ends[0]) for k in range(60)]
-    assert 15 < sum(shut) < 45
-    assert not any(
-        np.allclose(leaves.segments(10.0 * k, near, 20.0)[0, 2:], ends[0]) for k in range(60)
-    )
-    same = [leaves.segments(seconds, far, 20.0) for seconds in (10.0, 19.9)]
-    assert np.array_equal(*same)
-    always = Leaves(hinges, ends, np.ones(1), np.array([np.inf]), np.zeros(1), 3)
-    leaf = always.segments(1e4, far, 20.0)[0]
-    assert np.hypot(*(leaf[2:] - leaf[:2])) == pytest.approx(1.0)
-    assert not np.allclose(leaf[2:], ends[0])
-    blocked = Leaves(hinges, ends, np.ones(1), np.array([np.inf]), np.ones(1), 3)
+
+    def angle(seconds, robot):
+        leaf = leaves.segments(seconds, robot, 20.0)[0]
+        assert np.hypot(*(leaf[2:] - leaf[:2])) == pytest.approx(1.0)
+        return math.atan2(leaf[3] - leaf[1], leaf[2] - leaf[0]) - 0.5 * math.pi
+
+    for first in (0.0, 30.0, 3000.0):  # round again
+        seen = [angle(first + seconds, far) for seconds in (0.0, 9.9, 10.0, 20.0, 29.9)]
+        assert seen == pytest.approx([1.0, 1.0, -0.5, 0.0, 0.0])
+    assert [angle(seconds, near) for seconds in (10.0, 20.0)] == pytest.approx([-0.5, 1.0])
+    blocked = Leaves(hinges, ends, np.array([np.inf]), np.ones((1, 2)), np.array([[True, False]]))
     world = walled(False, Moving(NOBODY, blocked))
-    scan = Lms200(EXACT, 0).scan(world, np.array([-2.5 + 1.0, 2.0, 0.0]), 0)
-    assert scan.ranges_m[90] == pytest.approx(3.5)
+    for seconds in (0.0, 1e4):
+        scan = Lms200(EXACT, 0).scan(world, np.array([-1.5, 2.0, 0.0]), round(1e9 * seconds))
+        assert scan.ranges_m[90] == pytest.approx(3.5)
+
+
+def test_doors_that_move_are_shut_half_of_the_time():
+    for share in (0.0, 0.5, 1.0):
+        leaves = plain(3, area_m2=4000.0, moving_doors=share).world.moving.leaves
+        moves = np.isfinite(leaves.period_s)
+        assert moves.mean() == pytest.approx(share, abs=0.2)
+        assert not leaves.is_shut[~moves].any()
+        assert share == 0.0 or leaves.is_shut[moves].mean() == pytest.approx(0.5, abs=0.1)
+        assert (leaves.open_rad > 0.0).any() and (leaves.open_rad < 0.0).any()
+        assert np.abs(leaves.open_rad).min() >= 0.6

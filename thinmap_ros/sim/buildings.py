@@ -29,6 +29,9 @@ _GAP_M = (2.0, 6.0)
 _TRIES = 40
 _START_CLEAR_M = 0.45
 _KEEP_FREE_M = 1.0  # no furniture nearer to a door
+_AJAR_RAD = (0.6, 1.9)
+_SHUT_SHARE = 0.5  # of the time, where a door moves
+_PERIODS = 64  # of a door, before they come round again
 
 
 @dataclass(frozen=True)
@@ -389,11 +392,10 @@ def _leaves(wings: list[Wing], moving: float, rng: np.random.Generator) -> Leave
     together = np.concatenate(hinges)
     count = len(together)
     moves = rng.random(count) < moving
-    return Leaves(
-        together,
-        np.concatenate(ends),
-        rng.choice([-1.0, 1.0], count),
-        np.where(moves, rng.uniform(20.0, 300.0, count), np.inf),
-        np.where(moves, 0.5, 0.0),
-        int(rng.integers(2**31)),
-    )
+    side = rng.choice([-1.0, 1.0], count)
+    period_s = np.where(moves, rng.uniform(20.0, 300.0, count), np.inf)
+    # One of its own: however much it is asked for, what is drawn elsewhere stays the same.
+    chance = np.random.default_rng(int(rng.integers(2**31)))
+    open_rad = side[:, None] * chance.uniform(*_AJAR_RAD, (count, _PERIODS))
+    is_shut = moves[:, None] & (chance.random((count, _PERIODS)) < _SHUT_SHARE)
+    return Leaves(together, np.concatenate(ends), period_s, open_rad, is_shut)

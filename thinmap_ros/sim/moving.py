@@ -1,6 +1,5 @@
 """What moves in a world beside the robot: people who walk about, and the leaves of doors."""
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,7 +10,6 @@ from thinmap_ros.core.se2 import Array
 
 _PERSON_M = 0.2  # radius
 _PERSONAL_SPACE_M = 0.7  # people step aside for a robot
-_AJAR_RAD = (0.6, 1.9)
 _ROBOT_NEAR_M = 3.0  # doors are held open for it
 
 
@@ -42,28 +40,29 @@ class People:
 
     def places(self, seconds: float) -> Array:
         """Where all are (N, 2) at a time."""
-        found = np.empty((len(self.points), 2))
-        for i, times in enumerate(self._times):
-            now = seconds % times[-1]
-            for axis in (0, 1):
-                found[i, axis] = np.interp(now, times, self._stations[i, :, axis])
-        return found
+        now = seconds % self._times[:, -1]
+        who = np.arange(len(now))
+        span = (self._times[:, 1:-1] <= now[:, None]).sum(axis=1)
+        begun, ended = self._times[who, span], self._times[who, span + 1]
+        share = (now - begun) / (ended - begun)
+        start, goal = self._stations[who, span], self._stations[who, span + 1]
+        places: Array = start + share[:, None] * (goal - start)
+        return places
 
 
 @dataclass(frozen=True, eq=False)
 class Leaves:
     """Leaves of doors, each in its frame: hinges (N, 2), m; ends (N, 2) of the shut leaf, m.
 
-    side (N,): +1 or -1, to which it opens; period_s (N,): how often it stands otherwise, inf for
-    one that stays open; shut_share (N,): how often it is shut; seed: what decides the angles.
+    Each stands otherwise after every period_s (N,), inf for one that stays as it is: in the k-th
+    of K periods, which come round again, open by open_rad (N, K), or shut where is_shut (N, K).
     """
 
     hinges: Array
     ends: Array
-    side: Array
     period_s: Array
-    shut_share: Array
-    seed: int
+    open_rad: Array
+    is_shut: NDArray[np.bool_]
 
     def segments(self, seconds: float, robot: Array, reach_m: float) -> Array:
         """Leaves (M, 4) near a robot (x, y): from the hinge to where the leaf ends now, m."""
@@ -77,16 +76,10 @@ class Leaves:
         return np.column_stack([self.hinges[near], self.hinges[near] + ends])
 
     def _angles(self, doors: NDArray[np.int64], seconds: float, held: NDArray[np.bool_]) -> Array:
-        """Opening angles, rad: for each period of each door another one."""
-        found = np.empty(len(doors))
-        for i, door in enumerate(doors.tolist()):
-            period_s = self.period_s[door]
-            number = 0 if math.isinf(period_s) else int(seconds // period_s)
-            chance, share = np.random.default_rng((self.seed, door, number)).random(2)
-            is_shut = chance < self.shut_share[door] and not held[i]
-            open_rad = _AJAR_RAD[0] + share * (_AJAR_RAD[1] - _AJAR_RAD[0])
-            found[i] = 0.0 if is_shut else self.side[door] * open_rad
-        return found
+        """Opening angles of some, rad; what is held is not shut."""
+        period = (seconds // self.period_s[doors]).astype(np.int64) % self.open_rad.shape[1]
+        shut = self.is_shut[doors, period] & ~held
+        return np.where(shut, 0.0, self.open_rad[doors, period])
 
 
 @dataclass(frozen=True, eq=False)
