@@ -53,7 +53,7 @@ class Played:
         taken = np.array(self.localizer_ms)
         return {
             'scans': len(self.poses),
-            'homeless': self._homeless(),
+            'unmapped': self._unmapped(),
             'ms_median': float(np.median(taken)),
             'ms_mean': float(taken.mean()),
             'ms_99': float(np.percentile(taken, 99.0)),
@@ -61,8 +61,8 @@ class Played:
             'mb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
         }
 
-    def _homeless(self) -> float:
-        """Share of the scans, standing ones aside, whose pose belongs to no map that grows."""
+    def _unmapped(self) -> float:
+        """Share of scans, standing ones aside, whose pose is in no map that is being extended."""
         moves = [True]
         for before, after in pairwise(self.poses):
             x, y, turn = se2.between(before, after)

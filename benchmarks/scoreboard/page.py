@@ -21,9 +21,9 @@ _HEAD = """\
 Made by `python -m benchmarks.scoreboard -o DIR`. Logs: mean error of the known relations, m;
 `ours`: against the undegraded run of a log without relations (rms of positions). Buildings: rms
 error of the position, m. *over*: error of relations that span the slip or the gap, live, from 30 m
-of known ground on. *homeless*: share of the scans, standing ones aside, whose pose belongs to no
-map that grows. CPU ms a scan of the localizer; *stall*: the longest step of localizer and grid,
-with loop closing.
+of known ground on. *unmapped*: share of scans whose pose belongs to no map that is being extended,
+standing scans aside. CPU ms a scan of the localizer; *stall*: the longest step of localizer and
+grid, with loop closing.
 """
 _COLUMNS = (
     ('live', 'live_m', '.3f'),
@@ -31,7 +31,7 @@ _COLUMNS = (
     ('again live', 'again_live_m', '.3f'),
     ('again final', 'again_final_m', '.3f'),
     ('over', 'over_m', '.3f'),
-    ('homeless', 'homeless', '.1%'),
+    ('unmapped', 'unmapped', '.1%'),
     ('in 95 %', 'inside_95', '.0%'),
     ('sigma / rms', 'sigma_of_rms', '.1f'),
     ('wrong and sure', 'wrong_and_sure', 'd'),
