@@ -5,7 +5,6 @@ import resource
 import time
 from collections import deque
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import cycle, islice
 from pathlib import Path
@@ -13,11 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.table import Row, at_most
+from benchmarks.timing import CpuTimedPipeline
 from thinmap_ros.adapters.resources import world_path
 from thinmap_ros.adapters.world_files import read_tour, read_world
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import LocalizerConfig
-from thinmap_ros.pipeline import Pipeline, PipelineConfig
+from thinmap_ros.pipeline import PipelineConfig
 from thinmap_ros.sim.lms200 import Lms200Config
 from thinmap_ros.sim.pioneer import PRESETS
 from thinmap_ros.sim.runner import Simulation
@@ -42,16 +42,6 @@ class _Mark:
     area_m2: float
     resident_mb: float
     off_m: float
-
-
-class _Timed(Pipeline):
-    """Stages timed by what they take of the processor: a busy machine changes it little."""
-
-    @contextmanager
-    def _timed(self, stage: str) -> Iterator[None]:
-        started = time.process_time()
-        yield
-        self.stage_seconds.setdefault(stage, []).append(time.process_time() - started)
 
 
 def run(worlds: Path, quick: bool) -> Iterator[Row]:
@@ -104,13 +94,13 @@ def _ratios(where: str, mark: _Mark, first: _Mark) -> Iterator[Row]:
 
 def _drive(looks: Iterator[Look], marks_m: list[float]) -> Iterator[_Mark]:
     """Marks after these lengths of the drive."""
-    pipeline: _Timed | None = None
+    pipeline: CpuTimedPipeline | None = None
     way_m, last, ways = 0.0, None, []
     taken: dict[str, list[float]] = {part: [] for part in ('all', *_PARTS)}
     for look in looks:
         if pipeline is None:
             x, y, yaw = look.T_world_base.tolist()
-            pipeline = _Timed(
+            pipeline = CpuTimedPipeline(
                 PipelineConfig(
                     localizer=LocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=yaw)
                 )

@@ -4,9 +4,7 @@ import math
 import resource
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -16,6 +14,7 @@ import numpy as np
 
 from benchmarks.scoreboard.cases import BuildingCase, Case, LogCase
 from benchmarks.scoreboard.drives import looks
+from benchmarks.timing import CpuTimedPipeline
 from thinmap_ros.adapters.carmen import CarmenLog
 from thinmap_ros.adapters.events import OdometryEvent
 from thinmap_ros.core import se2
@@ -24,7 +23,7 @@ from thinmap_ros.core.odometry import ScanPairing
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
-from thinmap_ros.pipeline import Pipeline, PipelineConfig, Step
+from thinmap_ros.pipeline import PipelineConfig, Step
 from thinmap_ros.tools.experiments.logs import laser_of
 from thinmap_ros.tools.experiments.relations import read_columns, relation_errors
 
@@ -69,16 +68,6 @@ class Played:
             moves.append(math.hypot(x, y) > _STANDS_M or abs(turn) > _STANDS_RAD)
         moving = np.array(moves)
         return float(np.array(self.lost)[moving].mean())
-
-
-class _Timed(Pipeline):
-    """Stages timed by what they take of the processor: a busy machine changes it little."""
-
-    @contextmanager
-    def _timed(self, stage: str) -> Iterator[None]:
-        began = time.process_time()
-        yield
-        self.stage_seconds.setdefault(stage, []).append(time.process_time() - began)
 
 
 def measure(case: Case, logs: Path, degrade: Path, folder: Path, options: Numbers) -> Numbers:
@@ -195,7 +184,7 @@ def _consistency(played: Played, truth: Array) -> Numbers:
 def _play(scans: Iterator[tuple[Scan, Array]], config: LocalizerConfig) -> Played:
     """All scans through localizer, grid and topology."""
     _rehearse(config)
-    pipeline = _Timed(PipelineConfig(localizer=config))
+    pipeline = CpuTimedPipeline(PipelineConfig(localizer=config))
     played = Played()
     for scan, T_odom_base in scans:
         rebuilds = len(pipeline.stage_seconds.get('rebuild', []))
