@@ -5,16 +5,10 @@ What is finished is kept: started again with the same folder, only what is missi
 
 import argparse
 import json
-import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
-from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from thinmap_ros.adapters import figures
 from thinmap_ros.adapters.files import read_text, write_text
@@ -26,8 +20,7 @@ from thinmap_ros.sim.world import World
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.comparison import markdown
 from thinmap_ros.tools.explore_world import STRATEGIES, Options, add_options, explore, options_from
-
-Report = dict[str, Any]
+from thinmap_ros.tools.runs import Report, add_run_options, complaint, read_report, run_missing
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,55 +76,18 @@ def _starts(path: Path, world: World, count: int) -> list[Array]:
     return [world.start]
 
 
-def _on_cores(jobs: list[Job], processes: int) -> Iterator[tuple[Job, Report]]:
-    with ProcessPoolExecutor(processes, mp_context=get_context('spawn')) as pool:
-        running = {pool.submit(run_job, job): job for job in jobs}
-        for future in as_completed(running):
-            yield running[future], future.result()
-
-
-def _on_cluster(jobs: list[Job], address: str) -> Iterator[tuple[Job, Report]]:
-    from dask.distributed import Client
-    from dask.distributed import as_completed as as_completed_there
-
-    with Client(address) as client:
-        running = {client.submit(run_job, job, pure=False): job for job in jobs}
-        for future in as_completed_there(list(running)):
-            yield running[future], future.result()
-
-
 def _report_file(out: Path, job: Job) -> Path:
     return out / 'runs' / job.name / 'report.json'
 
 
-def _report_of(out: Path, job: Job) -> Report:
-    path = _report_file(out, job)
-    report: Report = json.loads(read_text(path))
-    if report.get('options') != asdict(job.options):
-        raise InputError(f'{path}: of a run with other options: expected another folder for these')
-    return report
-
-
-def run_missing(jobs: list[Job], out: Path, arguments: argparse.Namespace) -> None:
-    """Run what has no result yet; each result is written as soon as it is there."""
-    missing = [job for job in jobs if not _report_file(out, job).exists()]
-    how: Callable[[list[Job]], Iterator[tuple[Job, Report]]] = (
-        (lambda todo: _on_cluster(todo, arguments.scheduler))
-        if arguments.scheduler
-        else (lambda todo: _on_cores(todo, arguments.processes))
-    )
-    with tqdm(
-        total=len(jobs), initial=len(jobs) - len(missing), unit='run', disable=arguments.quiet
-    ) as bar:
-        for job, report in how(missing) if missing else ():
-            write_text(_report_file(out, job), json.dumps(report) + '\n')
-            bar.update()
-
-
 def _work(arguments: argparse.Namespace) -> None:
     jobs = _jobs(arguments)
-    run_missing(jobs, arguments.out, arguments)
-    reports = [_report_of(arguments.out, job) for job in jobs]
+    failures = run_missing(
+        run_job, jobs, lambda job: _report_file(arguments.out, job), arguments, arguments.quiet
+    )
+    if failures:
+        raise complaint(failures)
+    reports = [read_report(_report_file(arguments.out, job), asdict(job.options)) for job in jobs]
     table = markdown(reports)
     write_text(arguments.out / 'table.md', table)
     write_text(arguments.out / 'reports.json', json.dumps(reports) + '\n')
@@ -150,12 +106,7 @@ def main() -> None:
     parser.add_argument(
         '--starts', type=int, default=3, help='how many of the starts in worlds.json (default 3)'
     )
-    parser.add_argument(
-        '--processes', type=int, default=os.cpu_count() or 1, help='runs at a time (default: cores)'
-    )
-    parser.add_argument(
-        '--scheduler', default='', help='address of a Dask scheduler, such as tcp://host:8786'
-    )
+    add_run_options(parser)
     add_options(parser)
     cli.run(_work, parser)
 
