@@ -1,5 +1,6 @@
 """Drives through generated buildings: to parts that are near, one by one, and back to the start."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -22,6 +23,7 @@ _NEAR_M = 40.0  # a part that is so near may be the next
 _DETOUR_M = 25.0  # ways may lead so far round
 _CHOICES = 5  # the next is one of so many nearest that were not visited
 _MOST_GOALS = 60
+_PIECE_M = 16.0  # of a hall: what a laser of 8 m sees from its middle
 _ODOMETRY = (
     'scale_sigma',
     'turn_scale_sigma',
@@ -49,7 +51,7 @@ def ways(made: Building, start: Array, robot: PioneerConfig, seed: int) -> Itera
     """Ways (K, 2), m, of a drive, each from where the one before ends."""
     rng = np.random.default_rng(seed)
     patch = patch_of(made.world)
-    goals = _middles(made)
+    goals = _goals(made)
     left = np.ones(len(goals), dtype=np.bool_)
     at = start[:2]
     driven = []
@@ -76,14 +78,24 @@ def ways(made: Building, start: Array, robot: PioneerConfig, seed: int) -> Itera
             yield back
 
 
-def _middles(made: Building) -> Array:
-    """Middles of all parts (N, 2), in the world."""
+def _goals(made: Building) -> Array:
+    """Middle of each part, or of each piece of one that is wider than the laser (N, 2), m."""
     found = []
     for wing in made.wings:
-        boxes = np.array([(p.x0, p.y0, p.x1, p.y1) for p in wing.plan.parts])
-        middles = 0.5 * (boxes[:, :2] + boxes[:, 2:])
-        found.append(transform_points(wing.T_world_wing, middles))
+        middles = [
+            (x, y)
+            for part in wing.plan.parts
+            for x in _middles(part.x0, part.x1)
+            for y in _middles(part.y0, part.y1)
+        ]
+        found.append(transform_points(wing.T_world_wing, np.array(middles)))
     return np.concatenate(found)
+
+
+def _middles(low: float, high: float) -> Array:
+    """Middles of equal pieces, of _PIECE_M at the most, of an interval."""
+    ends = np.linspace(low, high, 1 + math.ceil((high - low) / _PIECE_M))
+    return np.asarray(0.5 * (ends[1:] + ends[:-1]))
 
 
 def _way(patch: GridPatch, a: Array, b: Array, radius_m: float) -> Array | None:
