@@ -1,7 +1,6 @@
 """What a scan and the map cost as it grows: a long drive through the warehouse of 200 x 200 m."""
 
 import math
-import resource
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -11,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.memory import resident_mb
 from benchmarks.table import Row, at_most
 from benchmarks.timing import CpuTimedPipeline
 from thinmap_ros.adapters.resources import world_path
@@ -120,7 +120,7 @@ def _drive(looks: Iterator[Look], marks_m: list[float]) -> Iterator[_Mark]:
                 marks_m[0],
                 {part: 1e3 * np.array(each)[on_span] for part, each in taken.items()},
                 float(patch.free.sum()) * patch.frame.resolution**2,
-                _resident_mb(),
+                resident_mb(),
                 float(np.hypot(*(T_map_base - look.T_world_base)[:2])),
             )
             marks_m = marks_m[1:]
@@ -137,8 +137,3 @@ def _looks() -> tuple[Iterator[Look], float]:
     ways = list(ways_along(world, tour, robot.radius_m))  # closed: it begins where it ends
     lap_m = float(sum(np.hypot(*np.diff(way, axis=0).T).sum() for way in ways))
     return drive(simulation, islice(cycle(ways), 20 * len(ways)), _SPEED_M_S), lap_m
-
-
-def _resident_mb() -> float:
-    pages = int(Path('/proc/self/statm').read_text().split()[1])
-    return pages * resource.getpagesize() / 1e6
