@@ -1,32 +1,26 @@
 """Run the scoreboard: python -m benchmarks.scoreboard -o DIR [--short].
 
 What is finished is kept: started again with the same folder and options, only what is missing is
-run.
+run. A case that fails is named on the page, and is tried again by the next run.
 """
 
 import argparse
 import json
-import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from fnmatch import fnmatch
-from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
-from tqdm import tqdm
-
-from benchmarks.scoreboard.cases import Case, all_cases
-from benchmarks.scoreboard.measure import Numbers, measure
-from benchmarks.scoreboard.page import page, worst_tenth
+from benchmarks.scoreboard.against import against
+from benchmarks.scoreboard.cases import BY_HAND, Case, all_cases, compared_with
+from benchmarks.scoreboard.measure import Numbers, Task, measure
+from benchmarks.scoreboard.page import page, shortened, worst_tenth
 from thinmap_ros.adapters.files import read_text, write_text
 from thinmap_ros.core.errors import ConfigError, InputError
 from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.tools import cli
+from thinmap_ros.tools.runs import Failure, add_run_options, complaint, read_report, run_missing
 
 _SHARED = Path(__file__).resolve().parents[3] / 'shared'
 _SHORT = Path(__file__).parent / 'short.txt'
-Work = tuple[Case, Path, Path, Path, Numbers]
 
 
 def main() -> None:
@@ -38,93 +32,113 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog='benchmarks.scoreboard', description=__doc__)
     parser.add_argument('-o', '--out', type=Path, required=True, help='folder for all results')
     parser.add_argument('--shared', type=Path, default=_SHARED, help='folder of logs and tools')
-    parser.add_argument('--short', action='store_true', help='only the hard cases of short.txt')
+    parser.add_argument(
+        '--short',
+        action='store_true',
+        help='only the cases of short.txt, the worst tenth of a complete run: some 2 minutes on 2 '
+        'cores. Where it is missing or names none: some that were chosen by hand',
+    )
     parser.add_argument('--only', default='*', help='cases whose names match, such as "intel*"')
     parser.add_argument(
         '--set', action='append', default=[], metavar='NAME=VALUE', help='option of the localizer'
     )
-    parser.add_argument('--processes', type=int, default=os.cpu_count(), help='at the same time')
     parser.add_argument(
-        '--scheduler', default='', help='address of a Dask scheduler, such as tcp://host:8786'
+        '--against', type=Path, metavar='DIR', help='compare with the results of another folder'
     )
+    parser.add_argument(
+        '--write-short',
+        action='store_true',
+        help='write short.txt anew from the complete run in DIR (what is missing is run first)',
+    )
+    parser.add_argument('--quiet', action='store_true', help='no bar of progress')
+    add_run_options(parser)
     return parser
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    if arguments.write_short and (arguments.short or arguments.only != '*'):
+        raise ConfigError('--write-short: expected a complete run: neither --short nor --only')
     options = _options(arguments.set)
     cases = _chosen(arguments)
-    results = arguments.out / 'results'
-    missing = [case for case in cases if not (results / f'{case.name}.json').exists()]
-    for case in set(cases) - set(missing):
-        _checked(results / f'{case.name}.json', options)
+    for case in cases:
+        if _file(arguments.out, case.name).exists():
+            read_report(_file(arguments.out, case.name), options)  # before hours of work
+    failures = _run_cases(cases, options, arguments)
+    reports = [_report(arguments.out, case.name, options, failures) for case in cases]
+    text = page(cases, reports)
+    if arguments.against:
+        text += '\n' + against(cases, reports, _reports_there(arguments.against, cases))
+    write_text(arguments.out / 'scoreboard.md', text)
+    print(f'worst tenth, live: {worst_tenth(cases, reports):.3f} m; {arguments.out}/scoreboard.md')
+    if failures:
+        raise complaint(failures)
+    if arguments.write_short:
+        write_text(_SHORT, shortened(cases, reports))
+
+
+def _run_cases(
+    cases: list[Case], options: Numbers, arguments: argparse.Namespace
+) -> dict[str, Failure]:
     logs = arguments.shared / 'data' / 'logs'
     degrade = arguments.shared / 'tools' / 'degrade_log.py'
-    work = [(case, logs, degrade, arguments.out / 'logs', options) for case in missing]
-    how = _on_cluster if arguments.scheduler else _on_cores
-    with tqdm(total=len(cases), initial=len(cases) - len(missing), unit='case') as bar:
-        for case, numbers in how(work, arguments) if work else ():
-            report = {'name': case.name, 'options': options, **numbers}
-            write_text(results / f'{case.name}.json', json.dumps(report) + '\n')
-            bar.update()
-    reports = [_checked(results / f'{case.name}.json', options) for case in cases]
-    write_text(arguments.out / 'scoreboard.md', page(cases, reports))
-    print(f'worst tenth, live: {worst_tenth(cases, reports):.3f} m; {arguments.out}/scoreboard.md')
+    tasks = [Task(case, logs, degrade, arguments.out / 'logs', options) for case in cases]
+    return run_missing(
+        measure, tasks, lambda task: _file(arguments.out, task.name), arguments, arguments.quiet
+    )
 
 
 def _chosen(arguments: argparse.Namespace) -> list[Case]:
-    cases = all_cases(arguments.shared / 'data' / 'logs')
+    logs = arguments.shared / 'data' / 'logs'
+    cases = all_cases(logs)
+    chosen = {case.name for case in cases if fnmatch(case.name, arguments.only)}
     if arguments.short:
-        names = set(read_text(_SHORT).split())
-        cases = [case for case in cases if case.name in names]
-    cases = [case for case in cases if fnmatch(case.name, arguments.only)]
-    if not cases:
+        chosen &= set(_short_names())
+    if not chosen:
         raise InputError(f'--only {arguments.only}: no case has such a name')
-    return cases
+    chosen |= {compared_with(case, logs) for case in cases if case.name in chosen}
+    return [case for case in cases if case.name in chosen]
+
+
+def _short_names() -> list[str]:
+    lines = read_text(_SHORT).splitlines() if _SHORT.exists() else []
+    names = [line.strip() for line in lines if line.strip() and not line.startswith('#')]
+    return names or list(BY_HAND)
 
 
 def _options(words: list[str]) -> Numbers:
     """Options of the localizer, each of the type of its default."""
     defaults = vars(LocalizerConfig())
-    options: dict[str, Any] = {}
+    options: Numbers = {}
     for word in words:
         name, _, value = word.partition('=')
         if name not in defaults:
             raise ConfigError(f'--set {word}: expected one of {", ".join(sorted(defaults))}')
         kind = type(defaults[name])
         try:
-            options[name] = value == 'true' if kind is bool else kind(value)
-        except ValueError:
-            raise ConfigError(f'--set {word}: expected a value like {defaults[name]}') from None
+            options[name] = {'true': True, 'false': False}[value] if kind is bool else kind(value)
+        except (KeyError, ValueError):
+            like = str(defaults[name]).lower() if kind is bool else defaults[name]
+            raise ConfigError(f'--set {word}: expected a value like {like}') from None
     LocalizerConfig(**options)
     return options
 
 
-def _checked(path: Path, options: Numbers) -> Numbers:
-    report: Numbers = json.loads(read_text(path))
-    if report.get('options') != options:
-        raise InputError(f'{path}: of a run with other options: expected another folder for these')
-    return report
+def _file(out: Path, name: str) -> Path:
+    return out / 'results' / f'{name}.json'
 
 
-def _on_cores(work: list[Work], arguments: argparse.Namespace) -> Iterator[tuple[Case, Numbers]]:
-    # A process for each case: the memory that it took at the most is then its own.
-    context = get_context('spawn')
-    with ProcessPoolExecutor(arguments.processes, context, max_tasks_per_child=1) as pool:
-        running = {pool.submit(measure, *each): each[0] for each in work}
-        for future in as_completed(running):
-            yield running[future], future.result()
+def _report(out: Path, name: str, options: Numbers, failures: dict[str, Failure]) -> Numbers:
+    if name in failures:
+        return {'name': name, 'error': failures[name].reason}
+    return read_report(_file(out, name), options)
 
 
-def _on_cluster(work: list[Work], arguments: argparse.Namespace) -> Iterator[tuple[Case, Numbers]]:
-    from dask.distributed import Client
-    from dask.distributed import as_completed as as_completed_there
-
-    submit: Callable[..., Any]
-    with Client(arguments.scheduler) as client:
-        submit = client.submit
-        running = {submit(measure, *each, pure=False): each[0] for each in work}
-        for future in as_completed_there(list(running)):
-            yield running[future], future.result()
+def _reports_there(out: Path, cases: list[Case]) -> list[Numbers | None]:
+    """Reports of another folder, whatever its options; None for a case that is not there."""
+    files = [_file(out, case.name) for case in cases]
+    if not any(file.exists() for file in files):
+        raise InputError(f'--against {out}: none of these cases has a result there')
+    return [json.loads(read_text(file)) if file.exists() else None for file in files]
 
 
 if __name__ == '__main__':
