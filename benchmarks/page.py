@@ -15,6 +15,10 @@ Made by `python -m benchmarks.page out/benchmarks` of the files that
 of one core; a load far above the number of cores says that the machine was busy with other things,
 and that all times are much too long.
 
+How well the localizer does on real logs, on degraded ones and in generated buildings is told by
+another program: `python -m benchmarks.scoreboard -o DIR` (`--short`: two minutes of its worst
+cases) leaves its page in `DIR/scoreboard.md`.
+
 Machine: {machine}.
 """
 # In this order, what each is about.
