@@ -205,7 +205,8 @@ def _consistency(played: Played, truth: Array) -> Numbers:
     """How well the covariance of the position tells the errors of the live poses.
 
     Normalized estimation error squared of two dimensions, chi-square distributed where it does;
-    sigma: root of the mean trace, what the rms error would be.
+    sigma: root of the mean trace, what the rms error would be; of scans that are not lost, as one
+    that is has a sigma of hundreds of metres, which a few scans more or less would decide.
     """
     errors = (np.array(played.poses) - truth)[:, :2]
     covariances = np.array(played.covariances)[:, :2, :2] + 1e-12 * np.eye(2)
@@ -213,8 +214,11 @@ def _consistency(played: Played, truth: Array) -> Numbers:
     squared = np.einsum('ni,ni->n', errors, whitened)
     widest = np.sqrt(np.linalg.eigvalsh(covariances)[:, -1])
     metres = np.hypot(*errors.T)
-    rms = math.sqrt(float((metres**2).mean()))
-    sigma = math.sqrt(float(np.trace(covariances, axis1=1, axis2=2).mean()))
+    known = ~np.array(played.lost)
+    if not known.any():
+        known[:] = True
+    rms = math.sqrt(float((metres[known] ** 2).mean()))
+    sigma = math.sqrt(float(np.trace(covariances[known], axis1=1, axis2=2).mean()))
     return {
         'inside_95': float((squared < _CHI2_95).mean()),
         'sigma_of_rms': sigma / max(rms, 1e-3),

@@ -27,12 +27,12 @@ error of the position, m.
 relations of revisits alone. *over*: error of relations that span the slip or the gap, live, from
 30 m of known ground on. *unmapped*: share of scans whose pose belongs to no map that is being
 extended, standing scans aside. *in 95 %*: share of scans whose true position is in the 95 %
-ellipse. *sigma / rms*: root of the mean trace of the covariance over the rms error, 1 where it is
-right. *wrong and sure*: scans with an error above 0.5 m and 3 sigma below it. *ms*: CPU time a scan
-of the localizer. *stall*: longest step of localizer and grid, with loop closing and all that is
-made anew after it, CPU time. *peak MB*: highest resident memory of the process, libraries and, for
-buildings, the simulated drive included. *MB more*: that without what the process held before the
-first scan.
+ellipse. *sigma / rms*: root of the mean trace of the covariance over the rms error, both of scans
+that are not lost, 1 where it is right. *wrong and sure*: scans with an error above 0.5 m and
+3 sigma below it. *ms*: CPU time a scan of the localizer. *stall*: longest step of localizer and
+grid, with loop closing and all that is made anew after it, CPU time. *peak MB*: highest resident
+memory of the process, libraries and, for buildings, the simulated drive included. *MB more*: that
+without what the process held before the first scan.
 """
 _COLUMNS = (
     ('live', 'live_m', '.3f'),

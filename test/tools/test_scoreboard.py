@@ -191,12 +191,15 @@ def test_a_covariance_that_is_right_is_found_to_be():
     truth = np.zeros((4000, 3))
     covariance = np.diag([0.04, 0.01, 1.0])
     poses = rng.normal(size=(4000, 3)) * (0.2, 0.1, 0.0)
-    right = Played(poses=list(poses), covariances=[covariance] * 4000)
+    right = Played(poses=list(poses), covariances=[covariance] * 4000, lost=[False] * 4000)
     found = _consistency(right, truth)
     assert found['inside_95'] == pytest.approx(0.95, abs=0.015)
     assert found['sigma_of_rms'] == pytest.approx(1.0, abs=0.03)
     assert found['wrong_and_sure'] <= 60
-    sure = Played(poses=list(10.0 * poses), covariances=[covariance] * 4000)
+    right.covariances[:5] = [9e4 * np.eye(3)] * 5
+    right.lost[:5] = [True] * 5
+    assert _consistency(right, truth)['sigma_of_rms'] == pytest.approx(1.0, abs=0.03)
+    sure = Played(poses=list(10.0 * poses), covariances=[covariance] * 4000, lost=[False] * 4000)
     found = _consistency(sure, truth)
     assert found['sigma_of_rms'] == pytest.approx(0.1, abs=0.003)
     metres = 10.0 * np.hypot(*poses[:, :2].T)
