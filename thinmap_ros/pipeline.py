@@ -11,6 +11,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import Estimate, Localizer, LocalizerConfig
+from thinmap_ros.core.slam.scan_localizer import ScanLocalizer, ScanLocalizerConfig
 from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig
 
 
@@ -18,10 +19,11 @@ from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig
 class PipelineConfig:
     """Parameters of all stages.
 
-    scans_per_graph: the graph is brought up to date with every so many scans.
+    localizer: its type says which of the two there are it is. scans_per_graph: the graph is brought
+    up to date with every so many scans.
     """
 
-    localizer: LocalizerConfig = field(default_factory=LocalizerConfig)
+    localizer: LocalizerConfig | ScanLocalizerConfig = field(default_factory=LocalizerConfig)
     grid: OccupancyConfig = field(default_factory=OccupancyConfig)
     window: WindowConfig = field(default_factory=WindowConfig)
     topology: TopologyConfig = field(default_factory=TopologyConfig)
@@ -51,7 +53,7 @@ class Pipeline:
         pose_source: Callable[[Scan, Array], Estimate] | None = None,
     ) -> None:
         self.config = config or PipelineConfig()
-        self.localizer = Localizer(self.config.localizer)
+        self.localizer = _localizer(self.config.localizer)
         self.grid = OccupancyGrid(self.config.grid)
         self.topology = TopologyBuilder(self.config.topology)
         self.stage_seconds: dict[str, list[float]] = {}
@@ -109,3 +111,15 @@ class Pipeline:
         started = perf_counter()
         yield
         self.stage_seconds.setdefault(stage, []).append(perf_counter() - started)
+
+
+# The localizers that there are: today's, and the one that is to take its place.
+CORES: dict[str, type[LocalizerConfig | ScanLocalizerConfig]] = {
+    'ekf': LocalizerConfig,
+    'scan': ScanLocalizerConfig,
+}
+
+
+def _localizer(config: LocalizerConfig | ScanLocalizerConfig) -> Localizer | ScanLocalizer:
+    """The localizer that a configuration is of."""
+    return ScanLocalizer(config) if isinstance(config, ScanLocalizerConfig) else Localizer(config)

@@ -30,6 +30,18 @@ def localizer() -> None:
         rehearsed.step(scan, T_map_base)
 
 
+def scan_localizer() -> None:
+    """Rehearse the localizer that is to take the place of the other."""
+    from thinmap_ros.core.slam.scan_localizer import ScanLocalizer
+
+    rehearsed = ScanLocalizer()
+    for scan, T_map_base in _drive():
+        rehearsed.step(scan, T_map_base)
+    # A scan that fits nowhere is searched for; a map that was saved is taken up.
+    rehearsed.step(_odd_scan(), T_map_base)
+    ScanLocalizer.from_state(rehearsed.state())
+
+
 def grid_mapper() -> None:
     """Rehearse the map update and its windows."""
     from thinmap_ros.core.grid.occupancy import OccupancyGrid, WindowConfig
@@ -94,6 +106,14 @@ def _room() -> GridPatch:
     cells[40:46, 40:46] = 100
     cells[_PASSAGE, -1], cells[:, -20:-1] = 0, UNKNOWN
     return GridPatch(GridFrame(0.0, 0.0, _CELL_M), cells)
+
+
+def _odd_scan() -> Scan:
+    """A scan of beams of many lengths, which is of no room."""
+    step = np.radians(180.0 / (_BEAMS - 1))
+    ranges = 1.0 + np.arange(_BEAMS) * 0.37 % 3.0
+    stamp_ns = round(1e9 * _PERIOD_S * _SCANS)
+    return Scan.create(stamp_ns, ranges, -np.pi / 2.0, float(step), 0.05, _RANGE_M)
 
 
 def _drive() -> Iterator[tuple[Scan, Array]]:

@@ -11,14 +11,15 @@ from pathlib import Path
 
 from benchmarks.scoreboard.against import against
 from benchmarks.scoreboard.cases import BY_HAND, Case, all_cases, compared_with
-from benchmarks.scoreboard.measure import Numbers, Task, measure
+from benchmarks.scoreboard.measure import Numbers, Task, config_of, measure
 from benchmarks.scoreboard.page import page, shortened, worst_tenth
 from thinmap_ros.adapters.files import read_text, write_text
 from thinmap_ros.core.errors import ConfigError, InputError
-from thinmap_ros.core.slam.localizer import LocalizerConfig
+from thinmap_ros.pipeline import CORES
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.runs import Failure, add_run_options, complaint, read_report, run_missing
 
+_CORE = 'ekf'
 _SHARED = Path(__file__).resolve().parents[3] / 'shared'
 _SHORT = Path(__file__).parent / 'short.txt'
 
@@ -50,6 +51,12 @@ def _parser() -> argparse.ArgumentParser:
         action='store_true',
         help='write short.txt anew from the complete run in DIR (what is missing is run first)',
     )
+    parser.add_argument(
+        '--core',
+        choices=tuple(CORES),
+        default=_CORE,
+        help='the localizer: ekf, or scan, which is to take its place',
+    )
     parser.add_argument('--quiet', action='store_true', help='no bar of progress')
     add_run_options(parser)
     return parser
@@ -58,7 +65,7 @@ def _parser() -> argparse.ArgumentParser:
 def _run(arguments: argparse.Namespace) -> None:
     if arguments.write_short and (arguments.short or arguments.only != '*'):
         raise ConfigError('--write-short: expected a complete run: neither --short nor --only')
-    options = _options(arguments.set)
+    options = _options(arguments.set, arguments.core)
     cases = _chosen(arguments)
     for case in cases:
         if _file(arguments.out, case.name).exists():
@@ -105,10 +112,10 @@ def _short_names() -> list[str]:
     return names or list(BY_HAND)
 
 
-def _options(words: list[str]) -> Numbers:
+def _options(words: list[str], core: str = _CORE) -> Numbers:
     """Options of the localizer, each of the type of its default."""
-    defaults = vars(LocalizerConfig())
-    options: Numbers = {}
+    defaults = vars(CORES[core]())
+    options: Numbers = {} if core == _CORE else {'core': core}
     for word in words:
         name, _, value = word.partition('=')
         if name not in defaults:
@@ -119,7 +126,7 @@ def _options(words: list[str]) -> Numbers:
         except (KeyError, ValueError):
             like = str(defaults[name]).lower() if kind is bool else defaults[name]
             raise ConfigError(f'--set {word}: expected a value like {like}') from None
-    LocalizerConfig(**options)
+    config_of(options)
     return options
 
 

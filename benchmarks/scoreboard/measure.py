@@ -24,7 +24,8 @@ from thinmap_ros.core.odometry import ScanPairing
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
-from thinmap_ros.pipeline import PipelineConfig, Step
+from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
+from thinmap_ros.pipeline import CORES, PipelineConfig, Step
 from thinmap_ros.tools.experiments.logs import laser_of
 from thinmap_ros.tools.experiments.relations import read_columns, relation_errors
 
@@ -110,7 +111,7 @@ def _measure_log(case: LogCase, task: Task) -> Numbers:
     own = task.logs / case.log
     if case.version:
         own = _degraded(case, own, task.degrade, task.folder)
-    played = _play(_scans(own, case.log), LocalizerConfig(**task.options))
+    played = _play(_scans(own, case.log), config_of(task.options))
     numbers = played.numbers()
     times = np.array(played.stamps_ns) / 1e9
     live = np.array(played.poses)
@@ -191,7 +192,8 @@ def _measure_building(case: BuildingCase, options: Numbers) -> Numbers:
     drive = list(looks(case.seed, case.robot, case.noise))
     truth = np.array([look.T_world_base for look in drive])
     x, y, yaw = truth[0].tolist()
-    config = LocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=yaw, **options)
+    start = {'start_x_m': x, 'start_y_m': y, 'start_yaw_rad': yaw}
+    config = config_of(options | start)
     played = _play(((look.scan, look.T_odom_base) for look in drive), config)
     numbers = played.numbers()
     for name, path in (('live', np.array(played.poses)), ('final', played.final)):
@@ -226,7 +228,15 @@ def _consistency(played: Played, truth: Array) -> Numbers:
     }
 
 
-def _play(scans: Iterator[tuple[Scan, Array]], config: LocalizerConfig) -> Played:
+def config_of(options: Numbers) -> LocalizerConfig | ScanLocalizerConfig:
+    """Configuration of the localizer that the option `core` names."""
+    own = dict(options)
+    return CORES[own.pop('core', 'ekf')](**own)
+
+
+def _play(
+    scans: Iterator[tuple[Scan, Array]], config: LocalizerConfig | ScanLocalizerConfig
+) -> Played:
     """All scans through localizer, grid and topology."""
     _rehearse(config)
     pipeline = CpuTimedPipeline(PipelineConfig(localizer=config))
@@ -253,11 +263,12 @@ def _keep(played: Played, scan: Scan, step: Step) -> None:
     played.lost.append(step.estimate.lost)
 
 
-def _rehearse(config: LocalizerConfig) -> None:
+def _rehearse(config: LocalizerConfig | ScanLocalizerConfig) -> None:
     """Load the compiled kernels before anything is timed."""
     from thinmap_ros import warm_up
 
     warm_up.localizer()
+    warm_up.scan_localizer()
     warm_up.grid_mapper()
     warm_up.topology_builder()
     Localizer(config)

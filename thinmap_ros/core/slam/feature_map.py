@@ -21,6 +21,7 @@ from thinmap_ros.core.se2 import Array, transform_points
 from thinmap_ros.core.slam import local_area
 from thinmap_ros.core.slam.association import AssociationConfig, associate, mahalanobis, meeting
 from thinmap_ros.core.slam.candidates import Candidate, Candidates
+from thinmap_ros.core.slam.correction import Correction
 from thinmap_ros.core.slam.ekf import EkfSlam
 from thinmap_ros.core.slam.ekf_ti import CompressedEkf
 from thinmap_ros.core.slam.features import (
@@ -34,7 +35,6 @@ from thinmap_ros.core.slam.features import (
 )
 from thinmap_ros.core.slam.lines import Lines
 from thinmap_ros.core.slam.local_area import LocalArea
-from thinmap_ros.core.slam.loops import Correction
 from thinmap_ros.core.slam.visibility import seen_through
 from thinmap_ros.core.snapshot import FAR_M, LARGEST_COUNT, LARGEST_ID, Field
 

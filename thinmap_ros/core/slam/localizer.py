@@ -16,13 +16,14 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam import feature_map, point_map
 from thinmap_ros.core.slam.anchors import AnchoredPoses
+from thinmap_ros.core.slam.correction import Correction
 from thinmap_ros.core.slam.doubt import Doubt, Evidence
 from thinmap_ros.core.slam.ekf import EkfSlam
 from thinmap_ros.core.slam.ekf_ti import CompressedEkf
 from thinmap_ros.core.slam.feature_map import FeatureConfig, FeatureMap
 from thinmap_ros.core.slam.features import LineFeature
 from thinmap_ros.core.slam.lines import LineConfig, Lines, extract_lines, no_lines
-from thinmap_ros.core.slam.loops import LEAP_SIGMAS, Correction, Keyframe, LoopConfig, Loops
+from thinmap_ros.core.slam.loops import LEAP_SIGMAS, Keyframe, LoopConfig, Loops
 from thinmap_ros.core.slam.models import (
     MotionConfig,
     motion_jacobians,

@@ -26,6 +26,7 @@ from thinmap_ros.core.grid.buckets import Buckets
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.anchors import AnchoredPoses
+from thinmap_ros.core.slam.correction import Correction
 from thinmap_ros.core.slam.models import rotation
 from thinmap_ros.core.slam.point_map import PointMap
 from thinmap_ros.core.slam.pose_graph import Measured, relax
@@ -82,18 +83,6 @@ class Keyframe:
     points_base: Array
     T_map_base: Array
     way_m: float
-
-
-@dataclass(frozen=True, eq=False)
-class Correction:
-    """Poses (N, 3) of the keyframes before and after a loop was closed."""
-
-    before: Array
-    after: Array
-
-    def moved(self, k: int, T: Array) -> Array:
-        """Where a pose (3,) that was found from keyframe k is now."""
-        return se2.compose(self.after[k], se2.between(self.before[k], T))
 
 
 class Loops:

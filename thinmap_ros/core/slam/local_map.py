@@ -1,0 +1,427 @@
+"""The local map that scans are matched with: cells with hits, and the way to the nearest wall.
+
+A cell counts how often a beam ended in it and how often one was seen through it or in it, and keeps
+the mean of its hits, which lies much nearer to the surface than the middle of the cell. A cell is a
+wall where enough of its observations are hits. Each cell near a wall knows the nearest one, so that
+the distance from any point to the walls is looked up, not searched.
+Source: Konolige et al., "Efficient sparse pose adjustment for 2D mapping", 2010, for the counts;
+Lau, Sprunk and Burgard, "Efficient grid-based spatial representations for robot navigation in
+dynamic environments", 2013, for distances that follow a changing map.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core import se2, snapshot
+from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.grid.tiles import FARTHEST_TILE, NO_TILE, TILE, TileStore
+from thinmap_ros.core.jit import inlined, kernel
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.snapshot import Field
+
+CELL = np.dtype(
+    [
+        ('hits', np.uint8),
+        ('seen', np.uint8),
+        ('to_row', np.uint8),  # the nearest wall, in cells from here, + HERE; 0: none within reach
+        ('to_col', np.uint8),
+        ('x', np.float32),  # mean of the hits, in cells from the middle of this one
+        ('y', np.float32),
+    ]
+)
+HERE = 100
+_SHIFT = TILE.bit_length() - 1
+_MASK = TILE - 1
+_MOST_SEEN = 255
+
+
+@dataclass(frozen=True)
+class LocalMapConfig(Config):
+    """Parameters of the local map."""
+
+    match_cell_m: float = parameter(0.05, 'edge of a cell of the local map, m', low=0.01, high=0.5)
+    match_range_m: float = parameter(30.0, 'farther points are not matched, m', low=1.0, high=200.0)
+    match_reach_m: float = parameter(
+        0.5, 'a point looks for the nearest wall within, m', low=0.05, high=2.0
+    )
+    match_wall_share: float = parameter(
+        0.25,
+        'share of hits among the observations of a cell that make it a wall',
+        low=0.01,
+        high=1.0,
+    )
+
+
+class LocalMap:
+    """Cells that grow in any direction, in tiles, in the frame of the map."""
+
+    def __init__(self, config: LocalMapConfig | None = None) -> None:
+        self.config = config or LocalMapConfig()
+        self.tiles = TileStore(CELL)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing was added yet."""
+        return self.tiles.used == 0
+
+    @property
+    def lattice(self) -> 'Lattice':
+        """The cells as kernels take them: pool, directory, first cell (2,), cell edge, reach."""
+        tiles, config = self.tiles, self.config
+        first = np.array([tiles.first_row, tiles.first_col]) * TILE
+        reach = int(math.ceil(config.match_reach_m / config.match_cell_m))
+        return tiles.pool, tiles.directory, first, config.match_cell_m, min(reach, HERE - 1)
+
+    def add(self, points_map: Array, laser_map: Array) -> None:
+        """Take in the points (N, 2) that beams from a laser at (2,) met, map frame."""
+        if len(points_map) == 0:
+            return
+        self._reach(points_map, laser_map)
+        _add(points_map, laser_map, *self.lattice, self.config.match_wall_share)
+
+    def add_scan(self, points_base: Array, T_base_laser: Array, T_map_base: Array) -> None:
+        """Take in the points (N, 2), robot frame, of a scan at a pose (3,)."""
+        laser = se2.transform_points(T_map_base, T_base_laser[None, :2])[0]
+        self.add(se2.transform_points(T_map_base, points_base), laser)
+
+    def distances(self, points_map: Array) -> Array:
+        """Distances (N,) of points (N, 2) from the walls, m; `match_reach_m` where none is near."""
+        return _distances(points_map, *self.lattice)
+
+    def add_walls(self, points_map: Array) -> None:
+        """Take in points (N, 2) of walls that were not seen by a scan, as of an occupancy map."""
+        if len(points_map):
+            cells = np.floor(points_map / self.config.match_cell_m).astype(np.int64)
+            _, once = np.unique(cells, axis=0, return_index=True)
+            points = points_map[np.sort(once)]
+            self._reach(points, points[0])
+            _hit(points, *self.lattice, self.config.match_wall_share)
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """All cells as arrays by name, for `restore`."""
+        tiles = self.tiles
+        cells = tiles.pool[: tiles.used]
+        return {
+            'cell_m': np.array(self.config.match_cell_m),
+            'tiles': tiles.places(),
+            'hits': cells['hits'],
+            'seen': cells['seen'],
+            'means': np.stack([cells['x'], cells['y']], axis=-1),
+        }
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Take over the cells of a `state`, checked by FIELDS, into a map that is empty.
+
+        Raises InputError where they are of another size, or lie too far apart for one map.
+        """
+        cell_m = float(state['cell_m'])
+        own = self.config.match_cell_m
+        snapshot.require(cell_m == own, f'local map: cells of {cell_m} m', f'{own} m')
+        places = state['tiles']
+        if not len(places):
+            return
+        once = len(np.unique(places, axis=0)) == len(places)
+        snapshot.require(once, 'features: tiles: one twice', 'each tile once')
+        low, high = places.min(axis=0), places.max(axis=0)
+        self.tiles.reach(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+        self.tiles.ensure(places)
+        cells = self.tiles.pool[: len(places)]
+        cells['hits'] = np.minimum(state['hits'], state['seen'])
+        cells['seen'] = state['seen']
+        cells['x'] = state['means'][..., 0]
+        cells['y'] = state['means'][..., 1]
+        _lead(places * TILE, *self.lattice, self.config.match_wall_share)
+
+    def _reach(self, points_map: Array, laser_map: Array) -> None:
+        """Have all tiles that the beams touch, and those within reach of their ends."""
+        reach = self.config.match_reach_m
+        edge_m = TILE * self.config.match_cell_m
+        both = np.vstack([points_map, laser_map])
+        low = np.floor((both.min(axis=0) - reach) / edge_m).astype(np.int64)[::-1]
+        high = np.floor((both.max(axis=0) + reach) / edge_m).astype(np.int64)[::-1]
+        self.tiles.reach(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+        touched = _touched(points_map, laser_map, low, high, edge_m, reach)
+        first = (low[0] - self.tiles.first_row, low[1] - self.tiles.first_col)
+        rows, cols = touched.shape
+        missing = touched & (
+            self.tiles.directory[first[0] : first[0] + rows, first[1] : first[1] + cols] == NO_TILE
+        )
+        if missing.any():
+            self.tiles.ensure(np.argwhere(missing) + low)
+
+
+FIELDS = {
+    'cell_m': Field(np.float64, (), 1e-3, 10.0),
+    'tiles': Field(np.int64, ('t', 2), -FARTHEST_TILE, FARTHEST_TILE),
+    'hits': Field(np.uint8, ('t', TILE, TILE), 0, 255),
+    'seen': Field(np.uint8, ('t', TILE, TILE), 0, 255),
+    'means': Field(np.float32, ('t', TILE, TILE, 2), -0.5, 0.5),
+}
+Lattice = tuple[NDArray[Any], NDArray[np.int32], NDArray[np.int64], float, int]
+
+
+@inlined
+def slot_of(directory: NDArray[np.int32], row: int, col: int) -> int:
+    """Slot of the tile with a cell, counted from the first one, or NO_TILE."""
+    tile_row, tile_col = row >> _SHIFT, col >> _SHIFT
+    if tile_row < 0 or tile_col < 0:
+        return NO_TILE
+    if tile_row >= directory.shape[0] or tile_col >= directory.shape[1]:
+        return NO_TILE
+    return int(directory[tile_row, tile_col])
+
+
+@inlined
+def cell_distance(
+    pool: NDArray[Any], directory: NDArray[np.int32], row: int, col: int, far: float
+) -> float:
+    """Distance, in cells, from the middle of a cell to the hits of its nearest wall, or far."""
+    slot = slot_of(directory, row, col)
+    if slot == NO_TILE:
+        return far
+    cell = pool[slot, row & _MASK, col & _MASK]
+    if cell['to_row'] == 0:
+        return far
+    down, right = int(cell['to_row']) - HERE, int(cell['to_col']) - HERE
+    wall_slot = slot_of(directory, row + down, col + right)
+    if wall_slot == NO_TILE:
+        return far
+    wall = pool[wall_slot, (row + down) & _MASK, (col + right) & _MASK]
+    dx, dy = right + wall['x'], down + wall['y']
+    return min(math.sqrt(dx * dx + dy * dy), far)
+
+
+@inlined
+def interpolated(
+    pool: NDArray[Any], directory: NDArray[np.int32], x: float, y: float, far: float
+) -> tuple[float, float, float]:
+    """Distance at (x, y), and its slopes, by the four cells around; all in cells.
+
+    far: distance where no wall is within reach.
+    """
+    col, row = int(math.floor(x - 0.5)), int(math.floor(y - 0.5))
+    u, v = x - 0.5 - col, y - 0.5 - row
+    d00 = cell_distance(pool, directory, row, col, far)
+    d01 = cell_distance(pool, directory, row, col + 1, far)
+    d10 = cell_distance(pool, directory, row + 1, col, far)
+    d11 = cell_distance(pool, directory, row + 1, col + 1, far)
+    lower, upper = d00 + u * (d01 - d00), d10 + u * (d11 - d10)
+    by_x = (1.0 - v) * (d01 - d00) + v * (d11 - d10)
+    return lower + v * (upper - lower), by_x, upper - lower
+
+
+@kernel
+def _distances(
+    points: Array,
+    pool: NDArray[Any],
+    directory: NDArray[np.int32],
+    first: NDArray[np.int64],
+    cell_m: float,
+    reach: int,
+) -> Array:
+    found = np.empty(len(points))
+    for i in range(len(points)):
+        x = points[i, 0] / cell_m - first[1]
+        y = points[i, 1] / cell_m - first[0]
+        found[i] = cell_m * interpolated(pool, directory, x, y, float(reach))[0]
+    return found
+
+
+@kernel
+def _touched(
+    points: Array,
+    laser: Array,
+    low: NDArray[np.int64],
+    high: NDArray[np.int64],
+    edge_m: float,
+    reach_m: float,
+) -> NDArray[np.bool_]:
+    """Tiles from low to high that beams touch, or whose cells are within reach of their ends."""
+    touched = np.zeros((high[0] - low[0] + 1, high[1] - low[1] + 1), dtype=np.bool_)
+    for i in range(len(points)):
+        dx, dy = points[i, 0] - laser[0], points[i, 1] - laser[1]
+        steps = int(2.0 * math.hypot(dx, dy) / edge_m) + 1
+        for k in range(steps):
+            x, y = laser[0] + k / steps * dx, laser[1] + k / steps * dy
+            row, col = int(math.floor(y / edge_m)), int(math.floor(x / edge_m))
+            touched[row - low[0], col - low[1]] = True
+        for a in range(-1, 2):
+            for b in range(-1, 2):
+                row = int(math.floor((points[i, 1] + a * reach_m) / edge_m))
+                col = int(math.floor((points[i, 0] + b * reach_m) / edge_m))
+                touched[row - low[0], col - low[1]] = True
+    return touched
+
+
+@inlined
+def _is_wall(cell: Any, share: float) -> bool:
+    return bool(cell['hits'] > share * cell['seen'])
+
+
+@inlined
+def _observe(cell: Any, hit: int) -> None:
+    """Count an observation; what is old counts less and less."""
+    if cell['seen'] == _MOST_SEEN:
+        cell['seen'] //= 2
+        cell['hits'] //= 2
+    cell['seen'] += 1
+    cell['hits'] += hit
+
+
+@kernel
+def _add(
+    points: Array,
+    laser: Array,
+    pool: NDArray[Any],
+    directory: NDArray[np.int32],
+    first: NDArray[np.int64],
+    cell_m: float,
+    reach: int,
+    share: float,
+) -> None:
+    """Count what beams saw, then bring the ways to the walls up to date."""
+    gone = [(0, 0) for _ in range(0)]
+    x0, y0 = laser[0] / cell_m - first[1], laser[1] / cell_m - first[0]
+    for i in range(len(points)):
+        x1, y1 = points[i, 0] / cell_m - first[1], points[i, 1] / cell_m - first[0]
+        end_row, end_col = int(math.floor(y1)), int(math.floor(x1))
+        steps = int(max(abs(x1 - x0), abs(y1 - y0))) + 1
+        step_x, step_y = (x1 - x0) / steps, (y1 - y0) / steps
+        x, y = x0 + 0.5 * step_x, y0 + 0.5 * step_y
+        for _ in range(steps):
+            row, col = int(math.floor(y)), int(math.floor(x))
+            x, y = x + step_x, y + step_y
+            slot = slot_of(directory, row, col)
+            if slot == NO_TILE or (row == end_row and col == end_col):
+                continue
+            cell = pool[slot, row & _MASK, col & _MASK]
+            was_wall = _is_wall(cell, share)
+            _observe(cell, 0)
+            if was_wall and not _is_wall(cell, share):
+                gone.append((row, col))
+    _hit(points, pool, directory, first, cell_m, reach, share)
+    if len(gone):
+        _vanish(pool, directory, gone, reach, share)
+
+
+@kernel
+def _hit(
+    points: Array,
+    pool: NDArray[Any],
+    directory: NDArray[np.int32],
+    first: NDArray[np.int64],
+    cell_m: float,
+    reach: int,
+    share: float,
+) -> None:
+    """Count the points that beams met."""
+    for i in range(len(points)):
+        x, y = points[i, 0] / cell_m - first[1], points[i, 1] / cell_m - first[0]
+        row, col = int(math.floor(y)), int(math.floor(x))
+        slot = slot_of(directory, row, col)
+        if slot == NO_TILE:
+            continue
+        cell = pool[slot, row & _MASK, col & _MASK]
+        was_wall = _is_wall(cell, share)
+        _observe(cell, 1)
+        cell['x'] += np.float32((x - col - 0.5 - cell['x']) / cell['hits'])
+        cell['y'] += np.float32((y - row - 0.5 - cell['y']) / cell['hits'])
+        if not was_wall and _is_wall(cell, share):
+            _appear(pool, directory, row, col, reach)
+
+
+@kernel
+def _lead(
+    corners: NDArray[np.int64],
+    pool: NDArray[Any],
+    directory: NDArray[np.int32],
+    first: NDArray[np.int64],
+    cell_m: float,
+    reach: int,
+    share: float,
+) -> None:
+    """Have all cells of tiles with first cells (N, 2) know their nearest walls."""
+    for i in range(len(corners)):
+        top, left = corners[i, 0] - first[0], corners[i, 1] - first[1]
+        for row in range(top, top + TILE):
+            for col in range(left, left + TILE):
+                slot = slot_of(directory, row, col)
+                if _is_wall(pool[slot, row & _MASK, col & _MASK], share):
+                    _appear(pool, directory, row, col, reach)
+
+
+@kernel
+def _appear(
+    pool: NDArray[Any], directory: NDArray[np.int32], row: int, col: int, reach: int
+) -> None:
+    """A cell has become a wall: those around to which it is the nearest lead there."""
+    for down in range(-reach, reach + 1):
+        for right in range(-reach, reach + 1):
+            squared = down * down + right * right
+            slot = slot_of(directory, row + down, col + right)
+            if slot == NO_TILE or squared > reach * reach:
+                continue
+            cell = pool[slot, (row + down) & _MASK, (col + right) & _MASK]
+            to_row, to_col = int(cell['to_row']) - HERE, int(cell['to_col']) - HERE
+            if cell['to_row'] == 0 or squared < to_row * to_row + to_col * to_col:
+                cell['to_row'], cell['to_col'] = HERE - down, HERE - right
+
+
+@kernel
+def _vanish(
+    pool: NDArray[Any],
+    directory: NDArray[np.int32],
+    gone: list[tuple[int, int]],
+    reach: int,
+    share: float,
+) -> None:
+    """Cells are walls no more: those that led there take the nearest wall of their neighbours."""
+    led = [(0, 0) for _ in range(0)]
+    for row, col in gone:
+        slot = slot_of(directory, row, col)
+        if _is_wall(pool[slot, row & _MASK, col & _MASK], share):
+            continue
+        for down in range(-reach, reach + 1):
+            for right in range(-reach, reach + 1):
+                slot = slot_of(directory, row + down, col + right)
+                if slot == NO_TILE:
+                    continue
+                cell = pool[slot, (row + down) & _MASK, (col + right) & _MASK]
+                if cell['to_row'] == HERE - down and cell['to_col'] == HERE - right:
+                    cell['to_row'] = 0
+                    led.append((row + down, col + right))
+    changed = len(led) > 0
+    while changed:
+        changed = False
+        for row, col in led:
+            slot = slot_of(directory, row, col)
+            changed |= _ask(pool, directory, row, col, reach)
+
+
+@inlined
+def _ask(pool: NDArray[Any], directory: NDArray[np.int32], row: int, col: int, reach: int) -> bool:
+    """Whether one of its neighbours knows a nearer wall for a cell, which leads there then."""
+    changed = False
+    cell = pool[slot_of(directory, row, col), row & _MASK, col & _MASK]
+    for i in range(-1, 2):
+        for j in range(-1, 2):
+            slot = slot_of(directory, row + i, col + j)
+            if slot == NO_TILE:
+                continue
+            other = pool[slot, (row + i) & _MASK, (col + j) & _MASK]
+            if other['to_row'] == 0:
+                continue
+            down = i + int(other['to_row']) - HERE
+            right = j + int(other['to_col']) - HERE
+            to_row, to_col = int(cell['to_row']) - HERE, int(cell['to_col']) - HERE
+            squared = down * down + right * right
+            nearer = cell['to_row'] == 0 or squared < to_row * to_row + to_col * to_col
+            if squared <= reach * reach and nearer:
+                cell['to_row'], cell['to_col'] = HERE + down, HERE + right
+                changed = True
+    return changed

@@ -1,0 +1,426 @@
+"""The localizer that is to take the place of `localizer`, beside it until it is better everywhere.
+
+A scan is matched with the local map from where odometry and velocity expect it. The local map grows
+where the robot moves; keyframes and loop closure keep the whole consistent. A robot whose scans
+contradict the map goes on in a new local map, which hangs on the old one by a step as uncertain as
+it is.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core import se2, snapshot
+from thinmap_ros.core.config import parameter
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.odometry import LastPose
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam import feature_map, local_map
+from thinmap_ros.core.slam.anchors import AnchoredPoses
+from thinmap_ros.core.slam.correction import Correction
+from thinmap_ros.core.slam.feature_map import FeatureConfig
+from thinmap_ros.core.slam.features import LineFeature
+from thinmap_ros.core.slam.keyframes import Keyframe, carried, turned
+from thinmap_ros.core.slam.line_map import LineMap
+from thinmap_ros.core.slam.lines import LineConfig
+from thinmap_ros.core.slam.local_map import LocalMap
+from thinmap_ros.core.slam.localizer import Estimate
+from thinmap_ros.core.slam.loop_closure import LoopClosure, LoopConfig
+from thinmap_ros.core.slam.matcher import FEWEST_POINTS, Match, Matcher, MatcherConfig
+from thinmap_ros.core.slam.motion import Motion, MotionConfig, MotionModel
+from thinmap_ros.core.slam.wall_points import wall_points
+from thinmap_ros.core.topology.graph import TopologicalMap
+
+_FASTEST_M_S = 3.0
+_JUMP_M = 0.5  # where odometry says more than this and that speed, it was set anew
+_CHI2 = 11.34  # 99 % of three degrees of freedom
+_VIEW_M = 1.0  # after a path of this length a match errs by other points than before
+_STANDS_M = 1e-3  # odometry of a robot that stands, and a scan's worth of turning
+_SIGMAS = 3.0
+_AT_ONCE = 20  # keyframes drawn at once after a correction
+_A_STEP = 2  # and in each step after it
+_UNKNOWN_M = 300.0  # uncertainty of a pose that could be anywhere
+_ADRIFT_M = 10.0  # path in a new local map after which it is part of the map for good
+_STEP_SIGMAS = (2e-3, 2e-3, 5e-4)  # of a step between keyframes, at least
+FIELDS = {**feature_map.FIELDS, **local_map.FIELDS}
+
+
+@dataclass(frozen=True)
+class ScanLocalizerConfig(MotionConfig, MatcherConfig, LoopConfig, LineConfig, FeatureConfig):
+    """Parameters of the localizer and of its parts."""
+
+    slam: str = parameter(
+        'ti',
+        'ti: map line features, those of the local area by topology; full: compare with all; '
+        'off: no line features',
+        choices=('ti', 'full', 'off'),
+    )
+    start_x_m: float = parameter(
+        0.0, 'where the robot starts in the map, m', low=-se2.FARTHEST_M, high=se2.FARTHEST_M
+    )
+    start_y_m: float = parameter(
+        0.0, 'where the robot starts in the map, m', low=-se2.FARTHEST_M, high=se2.FARTHEST_M
+    )
+    start_yaw_rad: float = parameter(0.0, 'heading at the start, rad')
+    map_distance_m: float = parameter(
+        0.2, 'the local map learns after a path of this length, m', low=0.0, high=5.0
+    )
+    map_turn_rad: float = parameter(0.2, 'or after such a turn, rad', low=0.0, high=3.0)
+    mapping: bool = parameter(
+        True, 'learn what is seen; false: only find the place in the map that there is'
+    )
+    lost_evidence: float = parameter(
+        1.5,
+        'lost when this many scans more contradict the map than fit it, each by its share',
+        low=0.1,
+        high=1000.0,
+    )
+
+
+class ScanLocalizer:
+    """Scan matching with a local map, keyframes and loop closure.
+
+    Input that is not finite is refused and counted in `refused`: the robot is then taken to be
+    where it was.
+    """
+
+    def __init__(self, config: ScanLocalizerConfig | None = None) -> None:
+        self.config = config or ScanLocalizerConfig()
+        self.refused = 0
+        self._matcher = Matcher(self.config)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: the next scan is the first, at the configured start."""
+        config = self.config
+        self._pose = se2.pose(config.start_x_m, config.start_y_m, config.start_yaw_rad)
+        self._given: Mapping[str, NDArray[Any]] | None = None
+        self._map = LocalMap(config)
+        self._motion = MotionModel(config)
+        self._loops = LoopClosure(config, self._matcher)
+        self._lines = LineMap(config, config, config.slam == 'ti')
+        self._path = AnchoredPoses()
+        self._T_odom_base: Array | None = None
+        self._stamp_ns: int | None = None
+        self._T_learned: Array | None = None
+        # Covariances (3, 3), map frame: of the motion since a scan fitted, of the pose since the
+        # map learned, of the place where it did since the anchor, and of contradictions on the way.
+        self._since_fit = np.zeros((3, 3))
+        self._since_learned = np.zeros((3, 3))
+        self._since_anchor = np.zeros((3, 3))
+        self._jump = np.zeros((3, 3))
+        self._evidence = 0.0
+        self._is_unplaced = False  # in a map that was given, or put somewhere by hand
+        self._adrift_m = 0.0  # path for which a new local map is not yet part of the map
+        self._submap = 0
+        self._due: list[int] = []
+
+    @property
+    def pose(self) -> Array:
+        """Where the robot is, T_map_base (3,)."""
+        return self._pose.copy()
+
+    @property
+    def features(self) -> list[LineFeature]:
+        """The line features of the map."""
+        return self._lines.features
+
+    @property
+    def keyframes(self) -> list[Keyframe]:
+        """The scans that were kept, at their poses as they are known now."""
+        return self._loops.keyframes.frames
+
+    def set_topology(self, topology: TopologicalMap) -> None:
+        """Take the topological map by which features are stored."""
+        self._lines.set_topology(topology)
+
+    def set_pose(self, T_map_base: Array, covariance: Array) -> None:
+        """Put the robot at a pose (3,) with covariance (3, 3) in the map that it has.
+
+        The next scans settle it; nothing is learned before.
+        """
+        if not (se2.is_on_earth(T_map_base) and np.isfinite(covariance).all()):
+            self.refused += 1
+            return
+        least = np.diag(np.square(_STEP_SIGMAS))
+        self._pose = se2.pose(*T_map_base.tolist())
+        self._since_fit = 0.5 * (covariance + covariance.T) + least
+        self._since_anchor = np.zeros((3, 3))
+        self._since_learned = self._since_fit
+        self._jump = self._jump + self._since_fit + np.diag([_UNKNOWN_M**2, _UNKNOWN_M**2, 10.0])
+        self._motion.interrupt()
+        self._is_unplaced = True
+        self._adrift_m = 0.0
+        self._evidence = 0.0
+        self._draw_anew()
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """The features and the local map as arrays by name, for `from_state`.
+
+        Not where the robot is.
+        """
+        return {**self._lines.state(), **self._map.state()}
+
+    @staticmethod
+    def from_state(
+        state: Mapping[str, NDArray[Any]], config: ScanLocalizerConfig | None = None
+    ) -> 'ScanLocalizer':
+        """ScanLocalizer in the map of another one's `state`, at the configured start.
+
+        It is lost until scans fit there. Raises InputError where it is no such state.
+        """
+        checked = snapshot.check(state, FIELDS, 'features')
+        localizer = ScanLocalizer(config)
+        localizer._map.restore(checked)
+        localizer._lines.restore(
+            {name: array for name, array in checked.items() if name in feature_map.FIELDS}
+        )
+        localizer._begin_in({name: checked[name] for name in local_map.FIELDS})
+        return localizer
+
+    @staticmethod
+    def resumed(
+        patch: GridPatch,
+        last: LastPose,
+        T_odom_base: Array,
+        config: ScanLocalizerConfig | None = None,
+    ) -> 'ScanLocalizer':
+        """ScanLocalizer that goes on in an occupancy map, at T_odom_base (3,) after its last pose.
+
+        The pose is known to the noise of the odometry since then, and to a cell of the map (at a
+        metre, for the heading).
+        """
+        localizer = ScanLocalizer(config)
+        for faces in wall_points(patch):
+            localizer._map.add_walls(faces.points)
+        localizer._begin_in(localizer._map.state())
+        moved = se2.between(last.T_odom_base, T_odom_base)
+        turn = float(last.T_map_odom[2] + last.T_odom_base[2])
+        variances = MotionModel(localizer.config).expect(moved, 0.0).variances
+        cell = np.full(3, patch.frame.resolution)
+        localizer.set_pose(
+            se2.compose(last.T_map_odom, T_odom_base),
+            turned(np.diag(variances), turn) + np.diag(np.square(cell)),
+        )
+        return localizer
+
+    def step(self, scan: Scan, T_odom_base: Array) -> Estimate:
+        """Take in a scan with the odometry pose (3,) at its stamp."""
+        motion = self._expect(scan, T_odom_base)
+        points = self._points(scan)
+        before = self._pose
+        Q = turned(np.diag(motion.variances), float(before[2]))
+        prior = se2.compose(before, motion.increment)
+        lever = prior[:2] - before[:2]
+        self._since_fit = carried(self._since_fit, lever) + Q
+        self._since_anchor = carried(self._since_anchor, lever)
+        self._since_learned = carried(self._since_learned, lever)
+        match = self._match(scan, points, prior)
+        if match is None:
+            self._pose = prior
+            self._since_learned = self._since_learned + (0.0 if motion.stands else 1.0) * Q
+            self._motion.interrupt()
+        else:
+            self._take(match, before, prior, Q, motion.stands)
+        self._lines.rest()
+        if self.config.mapping and not self._is_unplaced:
+            self._learn(scan, points)
+        self._lines.work_off()
+        correction = self._loops.work()
+        if correction is not None:
+            self._apply(correction)
+        self._draw(_A_STEP)
+        self._note(scan)
+        return self._estimate(match, correction)
+
+    def corrected_path(self) -> Array:
+        """Poses (N, 3) of all steps since the beginning, as they look after all corrections."""
+        return self._path.poses(self._loops.finish())
+
+    def past(self) -> tuple[NDArray[np.int64], Array]:
+        """Stamps (N,) and poses (N, 3), as known now, of scans along the whole path.
+
+        All others go with those before.
+        """
+        return self._loops.keyframes.path()
+
+    def _begin_in(self, given: Mapping[str, NDArray[Any]]) -> None:
+        """The local map was given: the robot is lost in it until scans fit."""
+        self._given = given
+        self._is_unplaced = True
+        self._evidence = self.config.lost_evidence
+        sigma = _SIGMAS * np.array([self.config.slip_m] * 2 + [self.config.slip_rad])
+        self._since_fit = np.diag(np.square(sigma))
+
+    def _expect(self, scan: Scan, T_odom_base: Array) -> Motion:
+        """The motion since the last scan."""
+        last = self._T_odom_base
+        seconds = 0.0 if self._stamp_ns is None else (scan.stamp_ns - self._stamp_ns) / 1e9
+        self._stamp_ns = scan.stamp_ns
+        increment: Array = np.zeros(3)
+        if not se2.is_finite(T_odom_base):
+            self.refused += 1
+        else:
+            self._T_odom_base = np.array(T_odom_base, dtype=np.float64)
+            if last is not None:
+                # Text logs, bags and messages differ by less, and are to lead to the same.
+                increment = np.round(se2.between(last, self._T_odom_base), 9)
+        farthest = _JUMP_M + _FASTEST_M_S * max(seconds, 1.0)
+        if math.hypot(increment[0], increment[1]) > farthest:
+            self.refused += 1
+            increment = np.zeros(3)
+            motion = self._motion.expect(increment, seconds)
+            unknown = np.square([farthest, farthest, 1.0])
+            return Motion(motion.increment, motion.variances + unknown, False)
+        return self._motion.expect(increment, seconds)
+
+    def _points(self, scan: Scan) -> Array:
+        """Points (N, 2) that can be matched, robot frame."""
+        near = scan.ranges_m[scan.hit] < self.config.match_range_m
+        return np.ascontiguousarray(scan.points_base()[near])
+
+    def _match(self, scan: Scan, points: Array, prior: Array) -> Match | None:
+        if len(points) < FEWEST_POINTS or self._map.is_empty:
+            return None
+        return self._matcher.match(points, scan.T_base_laser, self._map, prior, self._since_fit)
+
+    def _take(self, match: Match, before: Array, prior: Array, Q: Array, stands: bool) -> None:
+        """The pose of a match, and what it says of the motion, and of where the robot is."""
+        self._pose = match.T_map_base
+        off = se2.off(match.T_map_base, prior)
+        if float(off @ np.linalg.solve(self._since_fit, off)) > _CHI2:
+            # Scan and motion contradict each other: one of them is wrong, or the match has led back
+            # to what was mapped before, which is no motion.
+            self._jump = self._jump + np.outer(off, off)
+        if match.fit >= self.config.match_least_fit:
+            by_scan = turned(match.by_scan, -float(before[2]))
+            self._motion.learn(se2.between(before, match.T_map_base), by_scan)
+            self._since_fit = np.zeros((3, 3))
+        else:
+            self._since_fit = np.asarray(np.linalg.inv(match.information))
+            self._motion.interrupt()
+        if not stands:
+            known = np.linalg.inv(self._since_learned + Q)
+            self._since_learned = np.asarray(np.linalg.inv(known + match.by_scan))
+        self._judge(match)
+
+    def _judge(self, match: Match) -> None:
+        """Whether scans contradict the map.
+
+        Cumulative sum of the share of points that do, less that of those that fit. Source: Page,
+        "Continuous inspection schemes", 1954.
+        """
+        most = self.config.lost_evidence
+        self._evidence = max(self._evidence + match.contradicted - match.fit, 0.0)
+        if self._is_unplaced:
+            self._evidence = min(self._evidence, most)
+            self._is_unplaced = self._evidence > 0.0 or match.fit < self.config.match_least_fit
+
+    def _learn(self, scan: Scan, points: Array) -> None:
+        """Take the scan into the map, if the robot has moved since it last learned."""
+        moved = np.zeros(3) if self._T_learned is None else se2.between(self._T_learned, self._pose)
+        way_m = math.hypot(moved[0], moved[1])
+        turn = abs(float(moved[2]))
+        config = self.config
+        near = way_m < config.map_distance_m and turn < config.map_turn_rad
+        if self._T_learned is not None and near:
+            return
+        self._adrift_m = max(self._adrift_m - way_m, 0.0)
+        if self._evidence > config.lost_evidence:
+            self._begin_submap()
+        self._map.add_scan(points, scan.T_base_laser, self._pose)
+        if config.slam != 'off':
+            self._lines.observe(scan, self._pose, self._since_learned)
+        share = min(1.0, way_m / _VIEW_M + turn)
+        self._since_anchor = self._since_anchor + share * self._since_learned
+        self._since_learned = np.zeros((3, 3))
+        self._T_learned = self._pose
+        if len(points) >= FEWEST_POINTS and self._loops.is_due(self._pose):
+            self._keep(scan, points)
+
+    def _keep(self, scan: Scan, points: Array) -> None:
+        """Make the scan a keyframe."""
+        loops = self._loops
+        anchor = loops.keyframes.anchor
+        theta = 0.0 if anchor < 0 else float(self.keyframes[anchor].T_map_base[2])
+        step = turned(self._since_anchor, -theta) + np.diag(np.square(_STEP_SIGMAS))
+        path_m = loops.path_m(self._pose)
+        frame = Keyframe(scan, points, self._pose, path_m, self._covariance(), self._submap)
+        loops.add(frame, step, turned(self._jump, -theta))
+        self._since_anchor = np.zeros((3, 3))
+        self._jump = np.zeros((3, 3))
+
+    def _begin_submap(self) -> None:
+        """Go on in a new local map: where the robot is in the old one is not known any more."""
+        sigma = _SIGMAS * np.array([self.config.slip_m] * 2 + [self.config.slip_rad])
+        self._jump = self._jump + np.diag(np.square(sigma)) + self._since_fit
+        self._since_anchor = self._since_anchor + np.diag(np.square(sigma)) + self._since_fit
+        self._map = LocalMap(self.config)
+        self._due = []
+        self._submap += 1
+        self._evidence = 0.0
+        self._since_fit = np.zeros((3, 3))
+        self._adrift_m = _ADRIFT_M
+
+    def _apply(self, correction: Correction) -> None:
+        """A loop was closed: pose, features and local map go where the keyframes have gone."""
+        self._pose = correction.moved(self._loops.keyframes.anchor, self._pose)
+        self._T_learned = self._pose
+        self._adrift_m = 0.0
+        self._lines.move(correction)
+        self._draw_anew()
+
+    def _draw_anew(self) -> None:
+        """Begin to draw the local map anew from the keyframes, the nearest first."""
+        self._map = LocalMap(self.config)
+        if self._given is not None:
+            self._map.restore(self._given)
+        poses = self._loops.keyframes.poses()
+        away = np.hypot(*(poses[:, :2] - self._pose[:2]).T)
+        self._due = np.argsort(-away).tolist()
+        self._draw(_AT_ONCE)
+
+    def _draw(self, count: int) -> None:
+        """Draw some of the keyframes that are due."""
+        for _ in range(min(count, len(self._due))):
+            frame = self.keyframes[self._due.pop()]
+            self._map.add_scan(frame.points_base, frame.scan.T_base_laser, frame.T_map_base)
+
+    def _note(self, scan: Scan) -> None:
+        """Keep the pose of the step, as seen from the anchor."""
+        anchor = self._loops.keyframes.anchor
+        seen_from = np.zeros(3) if anchor < 0 else self.keyframes[anchor].T_map_base
+        self._path.add(scan.stamp_ns, anchor, se2.between(seen_from, self._pose))
+
+    def _covariance(self) -> Array:
+        """Covariance (3, 3) of the pose, map frame."""
+        own = self._since_anchor + self._since_learned
+        anchor = self._loops.keyframes.anchor
+        if anchor >= 0:
+            frame = self.keyframes[anchor]
+            own = own + carried(frame.covariance, self._pose[:2] - frame.T_map_base[:2])
+        return np.asarray(0.5 * (own + own.T))
+
+    def _estimate(self, match: Match | None, correction: Correction | None) -> Estimate:
+        T_odom_base = np.zeros(3) if self._T_odom_base is None else self._T_odom_base
+        lost = self._adrift_m > 0.0 or (self._is_unplaced and self._evidence > 0.0)
+        covariance = self._covariance()
+        if lost:
+            covariance = covariance + np.diag([_UNKNOWN_M**2, _UNKNOWN_M**2, math.pi**2])
+        return Estimate(
+            self._pose,
+            covariance,
+            se2.compose(self._pose, se2.invert(T_odom_base)),
+            self._lines.observed,
+            self._lines.matched,
+            len(self._lines),
+            self._lines.local_count,
+            0.0 if match is None else match.fit,
+            lost,
+            correction,
+        )
