@@ -32,12 +32,16 @@ CELL = np.dtype(
         ('to_col', np.uint8),
         ('x', np.float32),  # mean of the hits, in cells from the middle of this one
         ('y', np.float32),
+        ('normal', np.uint8),  # of the wall, as a code; 0: it has none
     ]
 )
 HERE = 100
 _SHIFT = TILE.bit_length() - 1
 _MASK = TILE - 1
 _MOST_SEEN = 255
+_CODES = 255  # of normals: 1 to so many
+_NORMAL_CELLS = 2  # to each side, that tell the normal of a wall
+_FLAT = 0.25  # variance across a wall, at most, for one along it
 
 
 @dataclass(frozen=True)
@@ -215,6 +219,66 @@ def interpolated(
     return lower + v * (upper - lower), by_x, upper - lower
 
 
+@inlined
+def normal_of(
+    pool: NDArray[Any], directory: NDArray[np.int32], row: int, col: int
+) -> tuple[float, float]:
+    """Normal of the wall at a cell; (0, 0) where it has none."""
+    slot = slot_of(directory, row, col)
+    if slot == NO_TILE:
+        return 0.0, 0.0
+    code = int(pool[slot, row & _MASK, col & _MASK]['normal'])
+    if code == 0:
+        return 0.0, 0.0
+    along = math.pi * ((code - 1) / (_CODES - 1) - 0.5)
+    return -math.sin(along), math.cos(along)
+
+
+@inlined
+def wall_normal(
+    pool: NDArray[Any], directory: NDArray[np.int32], x: float, y: float
+) -> tuple[float, float]:
+    """Normal of the wall that is nearest to (x, y), in cells; (0, 0) where it has none."""
+    row, col = int(math.floor(y)), int(math.floor(x))
+    slot = slot_of(directory, row, col)
+    if slot == NO_TILE:
+        return 0.0, 0.0
+    cell = pool[slot, row & _MASK, col & _MASK]
+    if cell['to_row'] == 0:
+        return 0.0, 0.0
+    return normal_of(
+        pool, directory, row + int(cell['to_row']) - HERE, col + int(cell['to_col']) - HERE
+    )
+
+
+@kernel
+def _fitted_normal(pool: NDArray[Any], directory: NDArray[np.int32], row: int, col: int) -> int:
+    """Code of the normal of the wall at a cell, by the means of those around; 0: it has none."""
+    n, mx, my, xx, xy, yy = 0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(-_NORMAL_CELLS, _NORMAL_CELLS + 1):
+        for k in range(-_NORMAL_CELLS, _NORMAL_CELLS + 1):
+            slot = slot_of(directory, row + i, col + k)
+            if slot == NO_TILE:
+                continue
+            cell = pool[slot, (row + i) & _MASK, (col + k) & _MASK]
+            if cell['to_row'] != HERE or cell['to_col'] != HERE:
+                continue
+            x, y = k + cell['x'], i + cell['y']
+            n, mx, my = n + 1, mx + x, my + y
+            xx, xy, yy = xx + x * x, xy + x * y, yy + y * y
+    if n < 3:
+        return 0
+    mx, my = mx / n, my / n
+    xx, xy, yy = xx / n - mx * mx, xy / n - mx * my, yy / n - my * my
+    spread = math.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
+    small = 0.5 * (xx + yy) - spread
+    if small > _FLAT * 2.0 * spread:
+        return 0
+    along = 0.5 * math.atan2(2.0 * xy, xx - yy)
+    turn = (along / math.pi + 0.5) % 1.0
+    return 1 + int(turn * (_CODES - 1) + 0.5) % (_CODES - 1)
+
+
 @kernel
 def _distances(
     points: Array,
@@ -333,6 +397,13 @@ def _hit(
         cell['y'] += np.float32((y - row - 0.5 - cell['y']) / cell['hits'])
         if not was_wall and _is_wall(cell, share):
             _appear(pool, directory, row, col, reach)
+    for i in range(len(points)):
+        x, y = points[i, 0] / cell_m - first[1], points[i, 1] / cell_m - first[0]
+        row, col = int(math.floor(y)), int(math.floor(x))
+        slot = slot_of(directory, row, col)
+        if slot != NO_TILE:
+            code = _fitted_normal(pool, directory, row, col)
+            pool[slot, row & _MASK, col & _MASK]['normal'] = code
 
 
 @kernel
@@ -353,6 +424,14 @@ def _lead(
                 slot = slot_of(directory, row, col)
                 if _is_wall(pool[slot, row & _MASK, col & _MASK], share):
                     _appear(pool, directory, row, col, reach)
+    for i in range(len(corners)):
+        top, left = corners[i, 0] - first[0], corners[i, 1] - first[1]
+        for row in range(top, top + TILE):
+            for col in range(left, left + TILE):
+                slot = slot_of(directory, row, col)
+                if _is_wall(pool[slot, row & _MASK, col & _MASK], share):
+                    code = _fitted_normal(pool, directory, row, col)
+                    pool[slot, row & _MASK, col & _MASK]['normal'] = code
 
 
 @kernel

@@ -27,14 +27,15 @@ from thinmap_ros.core.slam.local_map import (
     LocalMapConfig,
     cell_distance,
     interpolated,
+    normal_of,
     slot_of,
+    wall_normal,
 )
 
 _ROUNDS = 30
+_ALONG = 0.3  # share that the distance along a wall counts
 _USUAL_LOSS = 1.0
 _FITS_SIGMAS = 3.0
-_NORMAL_CELLS = 2  # to each side, that tell the normal of a wall
-_FLAT = 0.25  # variance across a wall, at most, for one along it
 _MASK = TILE - 1
 _SETTLED = 1e-4  # m and rad: a step that is smaller is the last
 _SIGMAS = 3.0  # a search goes as far as the motion is uncertain, so many sigmas
@@ -336,6 +337,11 @@ def _evaluated(
         if error < _FITS_SIGMAS:
             fitting += weight
         w = weight / (1.0 + error * error / (width * width))
+        nx, ny = wall_normal(pool, directory, x, y)
+        if nx != 0.0 or ny != 0.0:
+            # Along a wall the distance says little: its end may be where the map ends.
+            across = (1.0 - _ALONG) * (by_x * nx + by_y * ny)
+            by_x, by_y = _ALONG * by_x + across * nx, _ALONG * by_y + across * ny
         j[0], j[1] = by_x / sigma, by_y / sigma
         j[2] = (-by_x * py + by_y * px) / sigma
         for a in range(3):
@@ -393,8 +399,8 @@ def _information(
         slot = slot_of(directory, row, col)
         cell = pool[slot, row & _MASK, col & _MASK]
         row, col = row + int(cell['to_row']) - HERE, col + int(cell['to_col']) - HERE
-        nx, ny, formed = _normal(pool, directory, row, col)
-        if not formed:
+        nx, ny = normal_of(pool, directory, row, col)
+        if nx == 0.0 and ny == 0.0:
             continue
         w = scan[i, 2] / (sigma * sigma) / (1.0 + d * d / (outlier * outlier))
         j[0], j[1], j[2] = nx, ny, -nx * py + ny * px
@@ -402,35 +408,6 @@ def _information(
             for b in range(3):
                 H[a, b] += w * j[a] * j[b]
     return H
-
-
-@inlined
-def _normal(
-    pool: NDArray[Any], directory: NDArray[np.int32], row: int, col: int
-) -> tuple[float, float, bool]:
-    """Normal of the wall at a cell, by the means of the walls around, and whether there is one."""
-    n, mx, my, xx, xy, yy = 0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for i in range(-_NORMAL_CELLS, _NORMAL_CELLS + 1):
-        for k in range(-_NORMAL_CELLS, _NORMAL_CELLS + 1):
-            slot = slot_of(directory, row + i, col + k)
-            if slot == NO_TILE:
-                continue
-            cell = pool[slot, (row + i) & _MASK, (col + k) & _MASK]
-            if cell['to_row'] != HERE or cell['to_col'] != HERE:
-                continue
-            x, y = k + cell['x'], i + cell['y']
-            n, mx, my = n + 1, mx + x, my + y
-            xx, xy, yy = xx + x * x, xy + x * y, yy + y * y
-    if n < 3:
-        return 0.0, 0.0, False
-    mx, my = mx / n, my / n
-    xx, xy, yy = xx / n - mx * mx, xy / n - mx * my, yy / n - my * my
-    spread = math.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
-    small = 0.5 * (xx + yy) - spread
-    if small > _FLAT * 2.0 * spread:
-        return 0.0, 0.0, False
-    along = 0.5 * math.atan2(2.0 * xy, xx - yy)
-    return -math.sin(along), math.cos(along), True
 
 
 @kernel

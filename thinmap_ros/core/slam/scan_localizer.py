@@ -25,7 +25,7 @@ from thinmap_ros.core.slam.anchors import AnchoredPoses
 from thinmap_ros.core.slam.correction import Correction
 from thinmap_ros.core.slam.feature_map import FeatureConfig
 from thinmap_ros.core.slam.features import LineFeature
-from thinmap_ros.core.slam.keyframes import Keyframe, carried, turned
+from thinmap_ros.core.slam.keyframes import Keyframe, carried, inverse, turned
 from thinmap_ros.core.slam.line_map import LineMap
 from thinmap_ros.core.slam.lines import LineConfig
 from thinmap_ros.core.slam.local_map import LocalMap
@@ -113,6 +113,7 @@ class ScanLocalizer:
         self._since_fit = np.zeros((3, 3))
         self._since_learned = np.zeros((3, 3))
         self._since_anchor = np.zeros((3, 3))
+        self._by_motion = np.zeros((3, 3))  # the part of `_since_learned` that the motion leaves
         self._jump = np.zeros((3, 3))
         self._evidence = 0.0
         self._is_unplaced = False  # in a map that was given, or put somewhere by hand
@@ -223,7 +224,9 @@ class ScanLocalizer:
         match = self._match(scan, points, prior)
         if match is None:
             self._pose = prior
-            self._since_learned = self._since_learned + (0.0 if motion.stands else 1.0) * Q
+            if not motion.stands:
+                self._since_learned = self._since_learned + Q
+            self._by_motion = self._since_learned
             self._motion.interrupt()
         else:
             self._take(match, before, prior, Q, motion.stands)
@@ -305,8 +308,9 @@ class ScanLocalizer:
             self._since_fit = np.asarray(np.linalg.inv(match.information))
             self._motion.interrupt()
         if not stands:
-            known = np.linalg.inv(self._since_learned + Q)
-            self._since_learned = np.asarray(np.linalg.inv(known + match.by_scan))
+            by_motion = inverse(self._since_learned + Q)
+            self._since_learned = inverse(by_motion + match.by_scan)
+            self._by_motion = self._since_learned @ by_motion @ self._since_learned
         self._judge(match)
 
     def _judge(self, match: Match) -> None:
@@ -336,9 +340,13 @@ class ScanLocalizer:
         self._map.add_scan(points, scan.T_base_laser, self._pose)
         if config.slam != 'off':
             self._lines.observe(scan, self._pose, self._since_learned)
+        # What the motion leaves is new with every step; what the scan leaves is much the same error
+        # as in the step before, as long as the same walls are seen.
         share = min(1.0, way_m / _VIEW_M + turn)
-        self._since_anchor = self._since_anchor + share * self._since_learned
+        by_scan = self._since_learned - self._by_motion
+        self._since_anchor = self._since_anchor + self._by_motion + share * by_scan
         self._since_learned = np.zeros((3, 3))
+        self._by_motion = np.zeros((3, 3))
         self._T_learned = self._pose
         if len(points) >= FEWEST_POINTS and self._loops.is_due(self._pose):
             self._keep(scan, points)
