@@ -165,7 +165,9 @@ def _covariances(poses: Array, edges: list[Edge]) -> list[Array]:
         if edge.b < len(poses):
             own = turned(inverse(edge.information), float(poses[edge.a, 2]))
             ties[edge.a].append((edge.b, own))
-            ties[edge.b].append((edge.a, own))
+            # The other way its error in heading acts at the far end.
+            back = carried(own, poses[edge.a, :2] - poses[edge.b, :2])
+            ties[edge.b].append((edge.a, back))
     found: list[Array | None] = [None] * len(poses)
     heap: list[tuple[float, int, int, Array]] = [(0.0, 0, 0, np.zeros((3, 3)))]
     count = 0
