@@ -234,23 +234,6 @@ def normal_of(
     return -math.sin(along), math.cos(along)
 
 
-@inlined
-def wall_normal(
-    pool: NDArray[Any], directory: NDArray[np.int32], x: float, y: float
-) -> tuple[float, float]:
-    """Normal of the wall that is nearest to (x, y), in cells; (0, 0) where it has none."""
-    row, col = int(math.floor(y)), int(math.floor(x))
-    slot = slot_of(directory, row, col)
-    if slot == NO_TILE:
-        return 0.0, 0.0
-    cell = pool[slot, row & _MASK, col & _MASK]
-    if cell['to_row'] == 0:
-        return 0.0, 0.0
-    return normal_of(
-        pool, directory, row + int(cell['to_row']) - HERE, col + int(cell['to_col']) - HERE
-    )
-
-
 @kernel
 def _fitted_normal(pool: NDArray[Any], directory: NDArray[np.int32], row: int, col: int) -> int:
     """Code of the normal of the wall at a cell, by the means of those around; 0: it has none."""

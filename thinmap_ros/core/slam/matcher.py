@@ -29,11 +29,9 @@ from thinmap_ros.core.slam.local_map import (
     interpolated,
     normal_of,
     slot_of,
-    wall_normal,
 )
 
 _ROUNDS = 30
-_ALONG = 0.3  # share that the distance along a wall counts
 _USUAL_LOSS = 1.0
 _FITS_SIGMAS = 3.0
 _MASK = TILE - 1
@@ -337,11 +335,6 @@ def _evaluated(
         if error < _FITS_SIGMAS:
             fitting += weight
         w = weight / (1.0 + error * error / (width * width))
-        nx, ny = wall_normal(pool, directory, x, y)
-        if nx != 0.0 or ny != 0.0:
-            # Along a wall the distance says little: its end may be where the map ends.
-            across = (1.0 - _ALONG) * (by_x * nx + by_y * ny)
-            by_x, by_y = _ALONG * by_x + across * nx, _ALONG * by_y + across * ny
         j[0], j[1] = by_x / sigma, by_y / sigma
         j[2] = (-by_x * py + by_y * px) / sigma
         for a in range(3):
