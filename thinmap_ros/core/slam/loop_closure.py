@@ -23,6 +23,7 @@ from thinmap_ros.core.slam.keyframes import (
     Keyframe,
     KeyframeConfig,
     Keyframes,
+    carried,
     inverse,
     turned,
     unlike,
@@ -229,7 +230,8 @@ class LoopClosure:
                 T_a_here = se2.between(self.keyframes.frames[anchor].T_map_base, here.T_map_base)
                 T_a_j = se2.compose(T_a_here, se2.invert(edge.T_a_b))
                 covariance = turned(inverse(edge.information), float(T_a_j[2]))
-                covariance = covariance + pending[1]
+                lever = T_a_j[:2] - T_a_here[:2]
+                covariance = carried(covariance + pending[1], lever)
                 self.edges.append(Edge(anchor, edge.a, T_a_j, inverse(covariance), True))
             self._reuse(edge.a)
             return
