@@ -292,3 +292,37 @@ def test_the_step_covariance_is_that_of_the_step(rng):
         loops.add(Keyframe(scan, scan.points_base(), pose, float(k), NONE, 0), STEP, NONE)
     loops.finish()
     np.testing.assert_allclose(inverse(loops.keyframes.steps[0].information), STEP)
+
+
+def test_an_edge_to_what_is_seen_again_holds_the_errors_of_step_and_match(rng):
+    """From the anchor to an earlier keyframe, by way of a scan that both see; against sampling."""
+    loops = LoopClosure(LoopConfig(), Matcher())
+    poses = [se2.pose(2.0, 2.0, 0.3), se2.pose(4.0, 2.0, 2.0), se2.pose(2.3, 2.5, 0.8)]
+    frames = []
+    for k, pose in enumerate(poses):
+        scan = scan_in(ROOM, pose, stamp_ns=k)
+        frames.append(Keyframe(scan, scan.points_base(), pose, 10.0 * k, NONE, 0))
+    for frame in frames[:2]:
+        loops.keyframes.keep(frame, STEP)
+    by_match, by_step = np.diag(np.square([0.02, 0.01, 0.05])), np.diag([4e-4, 1e-4, 4e-4])
+    loops._pending = (frames[2], by_step)
+    T_j_here = se2.between(poses[0], poses[2])
+    T_a_here = se2.between(poses[1], poses[2])
+    loops._agree(Edge(0, 2, T_j_here, inverse(by_match), True))
+    edge = loops.edges[0]
+    assert (edge.a, edge.b) == (1, 0)
+    assert loops.keyframes.anchor == 0
+    np.testing.assert_allclose(edge.T_a_b, se2.between(poses[1], poses[0]), atol=1e-12)
+    sampled = np.array(
+        [
+            se2.compose(T_a_here + step, se2.invert(T_j_here + match))
+            for step, match in zip(
+                rng.multivariate_normal(np.zeros(3), by_step, 20000),
+                rng.multivariate_normal(np.zeros(3), by_match, 20000),
+                strict=True,
+            )
+        ]
+    )
+    truth = np.cov(sampled, rowvar=False)
+    scale = np.sqrt(np.outer(np.diag(truth), np.diag(truth)))
+    np.testing.assert_allclose(inverse(edge.information) / scale, truth / scale, atol=0.06)
