@@ -1,7 +1,9 @@
 """bag_repair keeps all that is whole of a cut or damaged file; the result is an ordinary bag."""
 
+import os
 import subprocess
 import sys
+from bisect import bisect_right
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ from thinmap_ros.adapters import bag_qos
 from thinmap_ros.adapters.bag_writer import BagWriter
 from thinmap_ros.adapters.bags import Bag
 from thinmap_ros.adapters.mcap_files import Damage, McapFile, whole_records
+from thinmap_ros.adapters.mcap_records import HEAD, MAGIC
 
 STRING = 'std_msgs/msg/String'
 COUNT, PER_CHUNK = 200, 10
@@ -64,6 +67,40 @@ def test_what_is_flushed_is_readable_at_once(tmp_path: Path) -> None:
     writer.write('/said', STRING, 2 * 10**9, text(writer, 5))
     writer.close()
     assert numbers(tmp_path / 'bag') == list(range(6))
+
+
+def record_ends(content: bytes) -> list[int]:
+    """Where the records of a whole file end, and the file."""
+    ends = [len(MAGIC)]
+    while ends[-1] < len(content) - len(MAGIC):
+        _, length = HEAD.unpack_from(content, ends[-1])
+        ends.append(ends[-1] + HEAD.size + length)
+    return [*ends, len(content)]
+
+
+def test_a_file_may_grow_while_it_is_read(tmp_path: Path) -> None:
+    whole = (write(tmp_path / 'bag', 5 * PER_CHUNK) / 'bag.mcap').read_bytes()
+    ends = record_ends(whole)
+
+    class Growing(type(tmp_path)):  # type: ignore[misc]
+        """A file that a recorder adds a record to whenever its size has just been looked at."""
+
+        def stat(self, *, follow_symlinks: bool = True) -> os.stat_result:
+            found: os.stat_result = super().stat(follow_symlinks=follow_symlinks)
+            sizes.append(found.st_size)
+            following = min(bisect_right(ends, found.st_size), len(ends) - 1)
+            self.write_bytes(whole[: ends[following]])
+            return found
+
+    still = tmp_path / 'still.mcap'
+    for end in ends:
+        sizes: list[int] = []
+        growing = Growing(tmp_path / 'growing.mcap')
+        growing.write_bytes(whole[:end])
+        read = McapFile(growing)
+        still.write_bytes(whole[: sizes[-1]])
+        wanted = McapFile(still)
+        assert list(read.messages()) == list(wanted.messages()) and read.damage == wanted.damage
 
 
 def test_a_cut_off_bag_gets_index_metadata_and_its_qualities_back(tmp_path: Path) -> None:

@@ -246,12 +246,15 @@ def _walk(path: Path, summary: Summary, damage: Damage) -> Iterator[tuple[Block,
 
 
 def _blocks(stream: BinaryIO, size: int, chunks: list[int], damage: Damage) -> Iterator[Block]:
-    """Blocks of a file of `size` bytes; `chunks`: where its summary says that chunks begin."""
+    """Blocks of a file of `size` bytes; `chunks`: where its summary says that chunks begin.
+
+    What a recorder has added since is left alone.
+    """
     at = len(MAGIC)
     stretch = at
     while True:
         stream.seek(at)
-        head = stream.read(HEAD.size)
+        head = stream.read(HEAD.size) if at + HEAD.size <= size else b''
         code, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
         end = at + HEAD.size + length
         plain = code in _PLAIN and end <= size and length <= LARGEST_CHUNK
