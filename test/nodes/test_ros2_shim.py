@@ -13,12 +13,15 @@ from pathlib import Path
 import pytest
 import yaml
 from action_msgs.msg import GoalStatus, GoalStatusArray
+from action_msgs.srv import CancelGoal
 from domains import free_domain
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import OccupancyGrid
 from nodes.conftest import PATIENCE_S, Graph
+from rclpy.duration import Duration
 from std_msgs.msg import String
 
+from thinmap_msgs.action import NavigateToPose
 from thinmap_ros.adapters import qos
 
 pytestmark = pytest.mark.live
@@ -251,8 +254,53 @@ def test_a_goal_is_followed_to_its_end(robot):
         'Result:\n    success: true\n',
         'Goal finished with status: SUCCEEDED\n',
     ]
-    places = [said.find(text) for text in wanted]
+    are_in_order(said, wanted)
+
+
+def are_in_order(said, texts):
+    places = [said.find(text) for text in texts]
     assert -1 not in places and places == sorted(places), said
+
+
+def serve_feedback_first(node, name):
+    """Serve an action by hand: a goal's feedback has arrived before its acceptance is sent."""
+    parts = NavigateToPose.Impl
+    told = node.create_publisher(parts.FeedbackMessage, f'{name}/_action/feedback', 10)
+    node.create_publisher(GoalStatusArray, f'{name}/_action/status', qos.LATCHED)
+
+    def accept(request, response):
+        wait_for(lambda: told.get_subscription_count() > 0, 'the client hears feedback')
+        told.publish(parts.FeedbackMessage(goal_id=request.goal_id))
+        assert told.wait_for_all_acked(Duration(seconds=PATIENCE_S))
+        response.accepted = True
+        return response
+
+    def end(_, response):
+        response.status = GoalStatus.STATUS_SUCCEEDED
+        return response
+
+    node.create_service(parts.SendGoalService, f'{name}/_action/send_goal', accept)
+    node.create_service(parts.GetResultService, f'{name}/_action/get_result', end)
+    node.create_service(CancelGoal, f'{name}/_action/cancel_goal', lambda _, response: response)
+
+
+def wait_for(condition, what):
+    end = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < end, f'never came: {what}'
+        time.sleep(0.01)
+
+
+def test_that_a_goal_was_taken_is_said_before_its_feedback(graph):
+    serve_feedback_first(graph.node, '/hasty')
+    kind = 'thinmap_msgs/action/NavigateToPose'
+    goal = start('action', 'send_goal', '--feedback', '/hasty', kind, GO)
+    graph.until(lambda: goal.poll() is not None, 'the goal ends')
+    said, complaints = goal.communicate()
+    assert not complaints and said.count('Feedback:') == 1
+    are_in_order(
+        said, ['Goal accepted with ID: ', 'Feedback:\n    ', 'Goal finished with status: ']
+    )
 
 
 def test_ctrl_c_cancels_the_goal(robot):

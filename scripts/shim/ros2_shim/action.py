@@ -81,9 +81,10 @@ def _send_goal(args: Namespace) -> None:
         session.until(client.server_is_ready)
         session.introduce(session.server_of(f'{name}/_action/send_goal'))
         say(f'Sending goal:\n     {values.to_yaml(goal)}')
-        sent = client.send_goal_async(goal, _tell if args.feedback else None)
+        feedback = _Feedback()
+        sent = client.send_goal_async(goal, feedback.hear if args.feedback else None)
         try:
-            _follow(session, sent)
+            _follow(session, sent, feedback)
         except (KeyboardInterrupt, BrokenPipeError):
             _cancel(session, sent)
             raise
@@ -91,17 +92,37 @@ def _send_goal(args: Namespace) -> None:
             client.destroy()
 
 
-def _tell(message: Any) -> None:
-    say(f'Feedback:\n    {values.to_yaml(message.feedback)}')
+class _Feedback:
+    """Says what is told meanwhile, once it is said that the goal was taken.
+
+    The answer whether it was, and the feedback, come on ways of their own: either may be first.
+    """
+
+    def __init__(self) -> None:
+        self._held: list[Any] | None = []
+
+    def hear(self, message: Any) -> None:
+        """Say it, or hold it back."""
+        if self._held is None:
+            say(f'Feedback:\n    {values.to_yaml(message.feedback)}')
+        else:
+            self._held.append(message)
+
+    def release(self) -> None:
+        """Say what was held back, and hold back no more."""
+        held, self._held = self._held or [], None
+        for message in held:
+            self.hear(message)
 
 
-def _follow(session: Session, sent: Future) -> None:
+def _follow(session: Session, sent: Future, feedback: _Feedback) -> None:
     """Say what becomes of a goal until it has ended."""
     handle = session.result(sent)
     if not handle.accepted:
         say('Goal was rejected.')
         return
     say(f'Goal accepted with ID: {bytes(handle.goal_id.uuid).hex()}\n')
+    feedback.release()
     ended = session.result(handle.get_result_async())
     say(f'Result:\n    {values.to_yaml(ended.result)}')
     say(f'Goal finished with status: {_STATUS.get(ended.status, "UNKNOWN")}')
