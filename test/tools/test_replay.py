@@ -4,11 +4,15 @@ import gzip
 import json
 import subprocess
 import sys
+import threading
+import time
 from collections import Counter
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 from hidden import hide
+from patience import PATIENCE_S
 
 from thinmap_ros.adapters import map_files, rerun_streams
 from thinmap_ros.adapters.bag_writer import BagWriter
@@ -307,15 +311,45 @@ def test_a_recording_holds_the_whole_replay_or_is_not_written(log, tmp_path):
     assert done.returncode == 2 and not (tmp_path / 'other.rrd').exists()
 
 
+def rows_received(path, entity):
+    """Rows so far of a file that is still being written."""
+    try:
+        return rows_of(path, entity)
+    except (RuntimeError, ValueError):
+        return 0
+
+
+@contextmanager
+def closed_when(mark, condition):
+    """Write a mark when a condition holds, or when it never does."""
+    ended = threading.Event()
+
+    def watch():
+        end = time.monotonic() + PATIENCE_S
+        try:
+            while time.monotonic() < end and not ended.is_set() and not condition():
+                ended.wait(0.1)
+        finally:
+            mark.touch()
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        watcher.join()
+
+
 @needs_rerun
 def test_the_viewer_shows_the_replay_until_it_is_closed(log, tmp_path, monkeypatch, capsys):
     # The real program, told to write down what it receives where it would open a window; closed
-    # when the results are there and it has had time to be looked at.
-    received, stand_in = tmp_path / 'received.rrd', tmp_path / 'viewer'
+    # when the results are there and it has shown all of it.
+    received, stand_in, seen = (tmp_path / name for name in ('received.rrd', 'viewer', 'seen'))
     report = tmp_path / 'out' / 'report.json'
     stand_in.write_text(
         f'#!/bin/sh\n"{rerun_streams.viewer_program()}" --save "{received}" "$@" &\n'
-        f'while [ ! -e "{report}" ]; do sleep 0.1; done; sleep 2; kill $!; wait $!\n'
+        f'while [ ! -e "{seen}" ]; do sleep 0.1; done; kill $!; wait $!\n'
     )
     stand_in.chmod(0o755)
     monkeypatch.setattr(rerun_streams, 'viewer_program', lambda: str(stand_in))
@@ -323,7 +357,9 @@ def test_the_viewer_shows_the_replay_until_it_is_closed(log, tmp_path, monkeypat
     monkeypatch.setattr(
         sys, 'argv', ['replay', str(log), '-o', str(tmp_path / 'out'), '--quiet', '--view']
     )
-    main()
+    with closed_when(seen, lambda: report.exists() and rows_received(received, '/map/robot') >= 30):
+        main()
+        assert seen.exists(), 'it waits for the viewer'
     assert 'close the viewer to end' in capsys.readouterr().err
     assert {path.name for path in (tmp_path / 'out').iterdir()} == FILES
     assert rows_of(received, '/map/robot') == 30, 'it was sent all of it'
