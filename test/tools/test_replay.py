@@ -91,6 +91,15 @@ def test_files_and_figures(log, tmp_path, form):
     assert patch.occupied[wall[0], wall[1] - 1 : wall[1] + 2].any()
 
 
+def test_the_core_that_is_to_come_replays_it_too(log, tmp_path):
+    done = run(log, '-o', tmp_path / 'out', '--core', 'scan', '--slam', 'off')
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / 'out' / 'report.json').read_text())
+    assert (report['scans'], report['skipped'], report['features']) == (30, 0, 0)
+    trajectory = np.loadtxt(tmp_path / 'out' / 'trajectory.tum')
+    assert np.abs(trajectory[:, 1] - 0.03 * np.arange(30)).max() < 0.05
+
+
 @pytest.mark.parametrize('share', [0.5, 0.97])
 def test_a_cut_off_bag_is_replayed_as_far_as_bag_repair_reads_it(log, tmp_path, share):
     convert(CarmenLog(log, LaserOptions()), tmp_path / 'bag.mcap')

@@ -153,7 +153,7 @@ def _view(arguments: argparse.Namespace) -> Iterator[View | None]:
 
 def _play(arguments: argparse.Namespace, shown: ReplayView | None) -> None:
     config = PipelineConfig(
-        localizer=CORES[arguments.core](slam=arguments.slam),
+        localizer=cli.config_from(arguments, CORES[arguments.core]),
         grid=cli.config_from(arguments, OccupancyConfig),
     )
     wall, cpu = time.perf_counter(), time.process_time()
