@@ -214,9 +214,9 @@ def test_a_step_does_one_match_or_one_round(monkeypatch):
     counts = {'matches': 0, 'rounds': 0}
     match, rounds = LoopClosure._match, module.rounds
 
-    def counted_match(self, j, k):
+    def counted_match(self, job):
         counts['matches'] += 1
-        match(self, j, k)
+        match(self, job)
 
     def counted_rounds(poses, edges):
         for each in rounds(poses, edges):

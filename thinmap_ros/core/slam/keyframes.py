@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.grid.buckets import Buckets
+from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.anchors import AnchoredPoses
@@ -97,7 +98,7 @@ class Keyframes:
 
     def move(self, poses: Array, edges: list[Edge]) -> None:
         """The first (N,) keyframes are at poses (N, 3); `edges` tie them besides the steps."""
-        covariances = _covariances(poses, self.steps + edges)
+        covariances = covariances_from(0, poses, self.steps + edges)
         for number, T in enumerate(poses):
             self.frames[number] = replace(
                 self.frames[number], T_map_base=T, covariance=covariances[number]
@@ -155,30 +156,72 @@ def turned(covariance: Array, theta: float) -> Array:
     return np.asarray(R @ covariance @ R.T)
 
 
-def _covariances(poses: Array, edges: list[Edge]) -> list[Array]:
-    """Covariance (3, 3) of each pose (N, 3) along the chain of edges that leaves it the least.
+def covariances_from(root: int, poses: Array, edges: list[Edge]) -> Array:
+    """Covariance (N, 3, 3) of each pose (N, 3) as seen from one of them, map frame.
 
-    An upper bound, as if there were no other chain; the first pose is certain.
+    Along the chain of edges that leaves it the least: an upper bound, as if there were no other
+    chain. Poses that no chain leads to are as uncertain as can be; edges to others are left out.
     """
-    ties: list[list[tuple[int, Array]]] = [[] for _ in poses]
-    for edge in edges:
-        if edge.b < len(poses):
-            own = turned(inverse(edge.information), float(poses[edge.a, 2]))
-            ties[edge.a].append((edge.b, own))
-            # The other way its error in heading acts at the far end.
-            back = carried(own, poses[edge.a, :2] - poses[edge.b, :2])
-            ties[edge.b].append((edge.a, back))
-    found: list[Array | None] = [None] * len(poses)
-    heap: list[tuple[float, int, int, Array]] = [(0.0, 0, 0, np.zeros((3, 3)))]
-    count = 0
-    while heap:
-        _, _, k, covariance = heapq.heappop(heap)
-        if found[k] is not None:
+    edges = [edge for edge in edges if edge.b < len(poses)]
+    a = np.array([edge.a for edge in edges], dtype=np.int64)
+    b = np.array([edge.b for edge in edges], dtype=np.int64)
+    covariances = np.linalg.inv(np.array([edge.information for edge in edges]).reshape(-1, 3, 3))
+    c, s = np.cos(poses[a, 2]), np.sin(poses[a, 2])
+    R = np.zeros((len(edges), 3, 3))
+    R[:, 0, 0], R[:, 0, 1], R[:, 1, 0], R[:, 1, 1], R[:, 2, 2] = c, -s, s, c, 1.0
+    order = np.argsort(np.concatenate([a, b]), kind='stable')
+    first = np.searchsorted(np.concatenate([a, b])[order], np.arange(len(poses) + 1))
+    own = R @ covariances @ R.transpose(0, 2, 1)
+    found: Array = _covariances(root, poses, first, order, a, b, own)
+    return found
+
+
+@inlined
+def _carry(covariance: Array, x: float, y: float) -> Array:
+    """`carried` by a lever (x, y)."""
+    F = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
+    carried_there: Array = F @ covariance @ F.T
+    return carried_there
+
+
+@kernel
+def _covariances(
+    root: int,
+    poses: Array,
+    first: NDArray[np.int64],
+    order: NDArray[np.int64],
+    a: NDArray[np.int64],
+    b: NDArray[np.int64],
+    own: Array,
+) -> Array:
+    """Dijkstra's algorithm, by the variance of the position.
+
+    Ties of pose k are order[first[k]] to order[first[k + 1]]; from M on they are those edges the
+    other way.
+    """
+    found = np.full((len(poses), 3, 3), np.inf)
+    best = np.full(len(poses), np.inf)
+    done = np.zeros(len(poses), dtype=np.bool_)
+    found[root] = 0.0
+    best[root] = 0.0
+    heap = [(0.0, root)]
+    while len(heap):
+        _, k = heapq.heappop(heap)
+        if done[k]:
             continue
-        found[k] = covariance
-        for other, own in ties[k]:
-            if found[other] is None:
-                count += 1
-                new = carried(covariance, poses[other, :2] - poses[k, :2]) + own
-                heapq.heappush(heap, (float(new[0, 0] + new[1, 1]), count, other, new))
-    return [np.zeros((3, 3)) if each is None else each for each in found]
+        done[k] = True
+        for tie in order[first[k] : first[k + 1]]:
+            edge = tie % len(a)
+            other = b[edge] if tie < len(a) else a[edge]
+            if done[other]:
+                continue
+            x, y = poses[other, 0] - poses[k, 0], poses[other, 1] - poses[k, 1]
+            # Against its direction the edge's error in heading acts at the far end.
+            step = own[edge] if tie < len(a) else _carry(own[edge], x, y)
+            new = _carry(found[k], x, y) + step
+            variance = new[0, 0] + new[1, 1]
+            if variance < best[other]:
+                best[other] = variance
+                found[other] = new
+                heapq.heappush(heap, (variance, other))
+    return found

@@ -12,7 +12,7 @@ dynamic environments", 2013, for distances that follow a changing map.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +40,11 @@ _SHIFT = TILE.bit_length() - 1
 _MASK = TILE - 1
 _MOST_SEEN = 255
 _CODES = 255  # of normals: 1 to so many
+_ALONG = np.pi * (np.arange(_CODES) / (_CODES - 1) - 0.5)
+_NORMALS = np.vstack([np.zeros((1, 2)), np.column_stack([-np.sin(_ALONG), np.cos(_ALONG)])])
 _NORMAL_CELLS = 2  # to each side, that tell the normal of a wall
+_HALF_WALL = 1.0  # to either side of the hits of a cell its wall goes on so many cells
+_PARALLEL = 0.7  # cosine: normals that are nearer to each other are of one wall
 _FLAT = 0.25  # variance across a wall, at most, for one along it
 
 
@@ -61,6 +65,21 @@ class LocalMapConfig(Config):
     )
 
 
+class Lattice(NamedTuple):
+    """The cells as kernels take them.
+
+    pool: tiles of cells, CELL; directory: the slot of each tile, or NO_TILE; first_row, first_col:
+    its first cell; reach: in cells.
+    """
+
+    pool: NDArray[Any]
+    directory: NDArray[np.int32]
+    first_row: int
+    first_col: int
+    cell_m: float
+    reach: int
+
+
 class LocalMap:
     """Cells that grow in any direction, in tiles, in the frame of the map."""
 
@@ -74,19 +93,25 @@ class LocalMap:
         return self.tiles.used == 0
 
     @property
-    def lattice(self) -> 'Lattice':
-        """The cells as kernels take them: pool, directory, first cell (2,), cell edge, reach."""
+    def lattice(self) -> Lattice:
+        """The cells as kernels take them, until the map grows."""
         tiles, config = self.tiles, self.config
-        first = np.array([tiles.first_row, tiles.first_col]) * TILE
         reach = int(math.ceil(config.match_reach_m / config.match_cell_m))
-        return tiles.pool, tiles.directory, first, config.match_cell_m, min(reach, HERE - 1)
+        return Lattice(
+            tiles.pool,
+            tiles.directory,
+            tiles.first_row * TILE,
+            tiles.first_col * TILE,
+            config.match_cell_m,
+            min(reach, HERE - 1),
+        )
 
     def add(self, points_map: Array, laser_map: Array) -> None:
         """Take in the points (N, 2) that beams from a laser at (2,) met, map frame."""
         if len(points_map) == 0:
             return
         self._reach(points_map, laser_map)
-        _add(points_map, laser_map, *self.lattice, self.config.match_wall_share)
+        _add(points_map, laser_map, self.lattice, self.config.match_wall_share)
 
     def add_scan(self, points_base: Array, T_base_laser: Array, T_map_base: Array) -> None:
         """Take in the points (N, 2), robot frame, of a scan at a pose (3,)."""
@@ -95,7 +120,7 @@ class LocalMap:
 
     def distances(self, points_map: Array) -> Array:
         """Distances (N,) of points (N, 2) from the walls, m; `match_reach_m` where none is near."""
-        return _distances(points_map, *self.lattice)
+        return np.abs(_distances(points_map, self.lattice))
 
     def add_walls(self, points_map: Array) -> None:
         """Take in points (N, 2) of walls that were not seen by a scan, as of an occupancy map."""
@@ -104,7 +129,7 @@ class LocalMap:
             _, once = np.unique(cells, axis=0, return_index=True)
             points = points_map[np.sort(once)]
             self._reach(points, points[0])
-            _hit(points, *self.lattice, self.config.match_wall_share)
+            _hit(points, self.lattice, self.config.match_wall_share)
 
     def state(self) -> dict[str, NDArray[Any]]:
         """All cells as arrays by name, for `restore`."""
@@ -139,7 +164,7 @@ class LocalMap:
         cells['seen'] = state['seen']
         cells['x'] = state['means'][..., 0]
         cells['y'] = state['means'][..., 1]
-        _lead(places * TILE, *self.lattice, self.config.match_wall_share)
+        _lead(places * TILE, self.lattice, self.config.match_wall_share)
 
     def _reach(self, points_map: Array, laser_map: Array) -> None:
         """Have all tiles that the beams touch, and those within reach of their ends."""
@@ -166,84 +191,121 @@ FIELDS = {
     'seen': Field(np.uint8, ('t', TILE, TILE), 0, 255),
     'means': Field(np.float32, ('t', TILE, TILE, 2), -0.5, 0.5),
 }
-Lattice = tuple[NDArray[Any], NDArray[np.int32], NDArray[np.int64], float, int]
 
 
 @inlined
-def slot_of(directory: NDArray[np.int32], row: int, col: int) -> int:
+def _cell_of(at: float) -> int:
+    return int(math.floor(at))
+
+
+@inlined
+def slot_of(lattice: Lattice, row: int, col: int) -> int:
     """Slot of the tile with a cell, counted from the first one, or NO_TILE."""
     tile_row, tile_col = row >> _SHIFT, col >> _SHIFT
     if tile_row < 0 or tile_col < 0:
         return NO_TILE
-    if tile_row >= directory.shape[0] or tile_col >= directory.shape[1]:
+    if tile_row >= lattice.directory.shape[0] or tile_col >= lattice.directory.shape[1]:
         return NO_TILE
-    return int(directory[tile_row, tile_col])
+    return int(lattice.directory[tile_row, tile_col])
 
 
 @inlined
-def cell_distance(
-    pool: NDArray[Any], directory: NDArray[np.int32], row: int, col: int, far: float
-) -> float:
-    """Distance, in cells, from the middle of a cell to the hits of its nearest wall, or far."""
-    slot = slot_of(directory, row, col)
+def nearest_wall(lattice: Lattice, row: int, col: int) -> tuple[int, int, int]:
+    """Slot, row and column of the wall nearest to a cell; NO_TILE where none is within reach."""
+    slot = slot_of(lattice, row, col)
     if slot == NO_TILE:
-        return far
-    cell = pool[slot, row & _MASK, col & _MASK]
+        return NO_TILE, row, col
+    cell = lattice.pool[slot, row & _MASK, col & _MASK]
     if cell['to_row'] == 0:
-        return far
-    down, right = int(cell['to_row']) - HERE, int(cell['to_col']) - HERE
-    wall_slot = slot_of(directory, row + down, col + right)
-    if wall_slot == NO_TILE:
-        return far
-    wall = pool[wall_slot, (row + down) & _MASK, (col + right) & _MASK]
-    dx, dy = right + wall['x'], down + wall['y']
-    return min(math.sqrt(dx * dx + dy * dy), far)
+        return NO_TILE, row, col
+    row, col = row + int(cell['to_row']) - HERE, col + int(cell['to_col']) - HERE
+    return slot_of(lattice, row, col), row, col
 
 
 @inlined
-def interpolated(
-    pool: NDArray[Any], directory: NDArray[np.int32], x: float, y: float, far: float
-) -> tuple[float, float, float]:
+def cell_distance(lattice: Lattice, row: int, col: int) -> float:
+    """Distance, in cells, from the middle of a cell to the hits of its nearest wall, or `reach`."""
+    slot, wall_row, wall_col = nearest_wall(lattice, row, col)
+    if slot == NO_TILE:
+        return float(lattice.reach)
+    wall = lattice.pool[slot, wall_row & _MASK, wall_col & _MASK]
+    dx, dy = wall_col - col + wall['x'], wall_row - row + wall['y']
+    return min(math.sqrt(dx * dx + dy * dy), float(lattice.reach))
+
+
+@inlined
+def normal_of(code: int) -> tuple[float, float]:
+    """Normal of a wall, by its code; (0, 0) where it has none."""
+    return _NORMALS[code, 0], _NORMALS[code, 1]
+
+
+@inlined
+def _off_wall(lattice: Lattice, row: int, col: int) -> tuple[float, float, float]:
+    """Distance, in cells, from the middle of a cell to its nearest wall, with the wall's normal.
+
+    Negative behind the wall, as the normal points; a wall without one is a point, and (0, 0).
+    """
+    slot, wall_row, wall_col = nearest_wall(lattice, row, col)
+    if slot == NO_TILE:
+        return float(lattice.reach), 0.0, 0.0
+    wall = lattice.pool[slot, wall_row & _MASK, wall_col & _MASK]
+    dx, dy = col - wall_col - wall['x'], row - wall_row - wall['y']
+    code = int(wall['normal'])
+    if code == 0:
+        return min(math.sqrt(dx * dx + dy * dy), float(lattice.reach)), 0.0, 0.0
+    nx, ny = _NORMALS[code, 0], _NORMALS[code, 1]
+    across = nx * dx + ny * dy
+    beyond = max(abs(nx * dy - ny * dx) - _HALF_WALL, 0.0)
+    distance = min(math.sqrt(across * across + beyond * beyond), float(lattice.reach))
+    return math.copysign(distance, across), nx, ny
+
+
+@inlined
+def interpolated(lattice: Lattice, x: float, y: float) -> tuple[float, float, float]:
     """Distance at (x, y), and its slopes, by the four cells around; all in cells.
 
-    far: distance where no wall is within reach.
+    It changes its sign where a wall runs between the cells: without, it would be the same
+    anywhere between two cells on either side.
     """
-    col, row = int(math.floor(x - 0.5)), int(math.floor(y - 0.5))
+    col, row = _cell_of(x - 0.5), _cell_of(y - 0.5)
     u, v = x - 0.5 - col, y - 0.5 - row
-    d00 = cell_distance(pool, directory, row, col, far)
-    d01 = cell_distance(pool, directory, row, col + 1, far)
-    d10 = cell_distance(pool, directory, row + 1, col, far)
-    d11 = cell_distance(pool, directory, row + 1, col + 1, far)
+    d00, nx, ny = _off_wall(lattice, row, col)
+    d01, nx01, ny01 = _off_wall(lattice, row, col + 1)
+    d10, nx10, ny10 = _off_wall(lattice, row + 1, col)
+    d11, nx11, ny11 = _off_wall(lattice, row + 1, col + 1)
+    s01, s10, s11 = nx * nx01 + ny * ny01, nx * nx10 + ny * ny10, nx * nx11 + ny * ny11
+    if min(abs(s01), abs(s10), abs(s11)) > _PARALLEL:
+        d01 = math.copysign(1.0, s01) * d01
+        d10 = math.copysign(1.0, s10) * d10
+        d11 = math.copysign(1.0, s11) * d11
+    else:
+        d00, d01, d10, d11 = abs(d00), abs(d01), abs(d10), abs(d11)
     lower, upper = d00 + u * (d01 - d00), d10 + u * (d11 - d10)
     by_x = (1.0 - v) * (d01 - d00) + v * (d11 - d10)
     return lower + v * (upper - lower), by_x, upper - lower
 
 
-@inlined
-def normal_of(
-    pool: NDArray[Any], directory: NDArray[np.int32], row: int, col: int
-) -> tuple[float, float]:
-    """Normal of the wall at a cell; (0, 0) where it has none."""
-    slot = slot_of(directory, row, col)
-    if slot == NO_TILE:
-        return 0.0, 0.0
-    code = int(pool[slot, row & _MASK, col & _MASK]['normal'])
-    if code == 0:
-        return 0.0, 0.0
-    along = math.pi * ((code - 1) / (_CODES - 1) - 0.5)
-    return -math.sin(along), math.cos(along)
+@kernel
+def _distances(points: Array, lattice: Lattice) -> Array:
+    """Distances (N,) of points (N, 2), m, with the sign that they have there."""
+    found = np.empty(len(points))
+    for i in range(len(points)):
+        x = points[i, 0] / lattice.cell_m - lattice.first_col
+        y = points[i, 1] / lattice.cell_m - lattice.first_row
+        found[i] = lattice.cell_m * interpolated(lattice, x, y)[0]
+    return found
 
 
 @kernel
-def _fitted_normal(pool: NDArray[Any], directory: NDArray[np.int32], row: int, col: int) -> int:
+def _fitted_normal(lattice: Lattice, row: int, col: int) -> int:
     """Code of the normal of the wall at a cell, by the means of those around; 0: it has none."""
     n, mx, my, xx, xy, yy = 0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(-_NORMAL_CELLS, _NORMAL_CELLS + 1):
         for k in range(-_NORMAL_CELLS, _NORMAL_CELLS + 1):
-            slot = slot_of(directory, row + i, col + k)
+            slot = slot_of(lattice, row + i, col + k)
             if slot == NO_TILE:
                 continue
-            cell = pool[slot, (row + i) & _MASK, (col + k) & _MASK]
+            cell = lattice.pool[slot, (row + i) & _MASK, (col + k) & _MASK]
             if cell['to_row'] != HERE or cell['to_col'] != HERE:
                 continue
             x, y = k + cell['x'], i + cell['y']
@@ -260,23 +322,6 @@ def _fitted_normal(pool: NDArray[Any], directory: NDArray[np.int32], row: int, c
     along = 0.5 * math.atan2(2.0 * xy, xx - yy)
     turn = (along / math.pi + 0.5) % 1.0
     return 1 + int(turn * (_CODES - 1) + 0.5) % (_CODES - 1)
-
-
-@kernel
-def _distances(
-    points: Array,
-    pool: NDArray[Any],
-    directory: NDArray[np.int32],
-    first: NDArray[np.int64],
-    cell_m: float,
-    reach: int,
-) -> Array:
-    found = np.empty(len(points))
-    for i in range(len(points)):
-        x = points[i, 0] / cell_m - first[1]
-        y = points[i, 1] / cell_m - first[0]
-        found[i] = cell_m * interpolated(pool, directory, x, y, float(reach))[0]
-    return found
 
 
 @kernel
@@ -324,18 +369,20 @@ def _observe(cell: Any, hit: int) -> None:
 def _add(
     points: Array,
     laser: Array,
-    pool: NDArray[Any],
-    directory: NDArray[np.int32],
-    first: NDArray[np.int64],
-    cell_m: float,
-    reach: int,
+    lattice: Lattice,
     share: float,
 ) -> None:
     """Count what beams saw, then bring the ways to the walls up to date."""
     gone = [(0, 0) for _ in range(0)]
-    x0, y0 = laser[0] / cell_m - first[1], laser[1] / cell_m - first[0]
+    x0, y0 = (
+        laser[0] / lattice.cell_m - lattice.first_col,
+        laser[1] / lattice.cell_m - lattice.first_row,
+    )
     for i in range(len(points)):
-        x1, y1 = points[i, 0] / cell_m - first[1], points[i, 1] / cell_m - first[0]
+        x1, y1 = (
+            points[i, 0] / lattice.cell_m - lattice.first_col,
+            points[i, 1] / lattice.cell_m - lattice.first_row,
+        )
         end_row, end_col = int(math.floor(y1)), int(math.floor(x1))
         steps = int(max(abs(x1 - x0), abs(y1 - y0))) + 1
         step_x, step_y = (x1 - x0) / steps, (y1 - y0) / steps
@@ -343,117 +390,107 @@ def _add(
         for _ in range(steps):
             row, col = int(math.floor(y)), int(math.floor(x))
             x, y = x + step_x, y + step_y
-            slot = slot_of(directory, row, col)
+            slot = slot_of(lattice, row, col)
             if slot == NO_TILE or (row == end_row and col == end_col):
                 continue
-            cell = pool[slot, row & _MASK, col & _MASK]
+            cell = lattice.pool[slot, row & _MASK, col & _MASK]
             was_wall = _is_wall(cell, share)
             _observe(cell, 0)
             if was_wall and not _is_wall(cell, share):
                 gone.append((row, col))
-    _hit(points, pool, directory, first, cell_m, reach, share)
+    _hit(points, lattice, share)
     if len(gone):
-        _vanish(pool, directory, gone, reach, share)
+        _vanish(lattice, gone, share)
 
 
 @kernel
 def _hit(
     points: Array,
-    pool: NDArray[Any],
-    directory: NDArray[np.int32],
-    first: NDArray[np.int64],
-    cell_m: float,
-    reach: int,
+    lattice: Lattice,
     share: float,
 ) -> None:
     """Count the points that beams met."""
     for i in range(len(points)):
-        x, y = points[i, 0] / cell_m - first[1], points[i, 1] / cell_m - first[0]
+        x, y = (
+            points[i, 0] / lattice.cell_m - lattice.first_col,
+            points[i, 1] / lattice.cell_m - lattice.first_row,
+        )
         row, col = int(math.floor(y)), int(math.floor(x))
-        slot = slot_of(directory, row, col)
+        slot = slot_of(lattice, row, col)
         if slot == NO_TILE:
             continue
-        cell = pool[slot, row & _MASK, col & _MASK]
+        cell = lattice.pool[slot, row & _MASK, col & _MASK]
         was_wall = _is_wall(cell, share)
         _observe(cell, 1)
         cell['x'] += np.float32((x - col - 0.5 - cell['x']) / cell['hits'])
         cell['y'] += np.float32((y - row - 0.5 - cell['y']) / cell['hits'])
         if not was_wall and _is_wall(cell, share):
-            _appear(pool, directory, row, col, reach)
+            _appear(lattice, row, col)
     for i in range(len(points)):
-        x, y = points[i, 0] / cell_m - first[1], points[i, 1] / cell_m - first[0]
+        x, y = (
+            points[i, 0] / lattice.cell_m - lattice.first_col,
+            points[i, 1] / lattice.cell_m - lattice.first_row,
+        )
         row, col = int(math.floor(y)), int(math.floor(x))
-        slot = slot_of(directory, row, col)
+        slot = slot_of(lattice, row, col)
         if slot != NO_TILE:
-            code = _fitted_normal(pool, directory, row, col)
-            pool[slot, row & _MASK, col & _MASK]['normal'] = code
+            code = _fitted_normal(lattice, row, col)
+            lattice.pool[slot, row & _MASK, col & _MASK]['normal'] = code
 
 
 @kernel
 def _lead(
     corners: NDArray[np.int64],
-    pool: NDArray[Any],
-    directory: NDArray[np.int32],
-    first: NDArray[np.int64],
-    cell_m: float,
-    reach: int,
+    lattice: Lattice,
     share: float,
 ) -> None:
     """Have all cells of tiles with first cells (N, 2) know their nearest walls."""
     for i in range(len(corners)):
-        top, left = corners[i, 0] - first[0], corners[i, 1] - first[1]
+        top, left = corners[i, 0] - lattice.first_row, corners[i, 1] - lattice.first_col
         for row in range(top, top + TILE):
             for col in range(left, left + TILE):
-                slot = slot_of(directory, row, col)
-                if _is_wall(pool[slot, row & _MASK, col & _MASK], share):
-                    _appear(pool, directory, row, col, reach)
+                slot = slot_of(lattice, row, col)
+                if _is_wall(lattice.pool[slot, row & _MASK, col & _MASK], share):
+                    _appear(lattice, row, col)
     for i in range(len(corners)):
-        top, left = corners[i, 0] - first[0], corners[i, 1] - first[1]
+        top, left = corners[i, 0] - lattice.first_row, corners[i, 1] - lattice.first_col
         for row in range(top, top + TILE):
             for col in range(left, left + TILE):
-                slot = slot_of(directory, row, col)
-                if _is_wall(pool[slot, row & _MASK, col & _MASK], share):
-                    code = _fitted_normal(pool, directory, row, col)
-                    pool[slot, row & _MASK, col & _MASK]['normal'] = code
+                slot = slot_of(lattice, row, col)
+                if _is_wall(lattice.pool[slot, row & _MASK, col & _MASK], share):
+                    code = _fitted_normal(lattice, row, col)
+                    lattice.pool[slot, row & _MASK, col & _MASK]['normal'] = code
 
 
 @kernel
-def _appear(
-    pool: NDArray[Any], directory: NDArray[np.int32], row: int, col: int, reach: int
-) -> None:
+def _appear(lattice: Lattice, row: int, col: int) -> None:
     """A cell has become a wall: those around to which it is the nearest lead there."""
-    for down in range(-reach, reach + 1):
-        for right in range(-reach, reach + 1):
+    for down in range(-lattice.reach, lattice.reach + 1):
+        for right in range(-lattice.reach, lattice.reach + 1):
             squared = down * down + right * right
-            slot = slot_of(directory, row + down, col + right)
-            if slot == NO_TILE or squared > reach * reach:
+            slot = slot_of(lattice, row + down, col + right)
+            if slot == NO_TILE or squared > lattice.reach * lattice.reach:
                 continue
-            cell = pool[slot, (row + down) & _MASK, (col + right) & _MASK]
+            cell = lattice.pool[slot, (row + down) & _MASK, (col + right) & _MASK]
             to_row, to_col = int(cell['to_row']) - HERE, int(cell['to_col']) - HERE
             if cell['to_row'] == 0 or squared < to_row * to_row + to_col * to_col:
                 cell['to_row'], cell['to_col'] = HERE - down, HERE - right
 
 
 @kernel
-def _vanish(
-    pool: NDArray[Any],
-    directory: NDArray[np.int32],
-    gone: list[tuple[int, int]],
-    reach: int,
-    share: float,
-) -> None:
+def _vanish(lattice: Lattice, gone: list[tuple[int, int]], share: float) -> None:
     """Cells are walls no more: those that led there take the nearest wall of their neighbours."""
     led = [(0, 0) for _ in range(0)]
     for row, col in gone:
-        slot = slot_of(directory, row, col)
-        if _is_wall(pool[slot, row & _MASK, col & _MASK], share):
+        slot = slot_of(lattice, row, col)
+        if _is_wall(lattice.pool[slot, row & _MASK, col & _MASK], share):
             continue
-        for down in range(-reach, reach + 1):
-            for right in range(-reach, reach + 1):
-                slot = slot_of(directory, row + down, col + right)
+        for down in range(-lattice.reach, lattice.reach + 1):
+            for right in range(-lattice.reach, lattice.reach + 1):
+                slot = slot_of(lattice, row + down, col + right)
                 if slot == NO_TILE:
                     continue
-                cell = pool[slot, (row + down) & _MASK, (col + right) & _MASK]
+                cell = lattice.pool[slot, (row + down) & _MASK, (col + right) & _MASK]
                 if cell['to_row'] == HERE - down and cell['to_col'] == HERE - right:
                     cell['to_row'] = 0
                     led.append((row + down, col + right))
@@ -461,21 +498,21 @@ def _vanish(
     while changed:
         changed = False
         for row, col in led:
-            slot = slot_of(directory, row, col)
-            changed |= _ask(pool, directory, row, col, reach)
+            slot = slot_of(lattice, row, col)
+            changed |= _ask(lattice, row, col)
 
 
 @inlined
-def _ask(pool: NDArray[Any], directory: NDArray[np.int32], row: int, col: int, reach: int) -> bool:
+def _ask(lattice: Lattice, row: int, col: int) -> bool:
     """Whether one of its neighbours knows a nearer wall for a cell, which leads there then."""
     changed = False
-    cell = pool[slot_of(directory, row, col), row & _MASK, col & _MASK]
+    cell = lattice.pool[slot_of(lattice, row, col), row & _MASK, col & _MASK]
     for i in range(-1, 2):
         for j in range(-1, 2):
-            slot = slot_of(directory, row + i, col + j)
+            slot = slot_of(lattice, row + i, col + j)
             if slot == NO_TILE:
                 continue
-            other = pool[slot, (row + i) & _MASK, (col + j) & _MASK]
+            other = lattice.pool[slot, (row + i) & _MASK, (col + j) & _MASK]
             if other['to_row'] == 0:
                 continue
             down = i + int(other['to_row']) - HERE
@@ -483,7 +520,7 @@ def _ask(pool: NDArray[Any], directory: NDArray[np.int32], row: int, col: int, r
             to_row, to_col = int(cell['to_row']) - HERE, int(cell['to_col']) - HERE
             squared = down * down + right * right
             nearer = cell['to_row'] == 0 or squared < to_row * to_row + to_col * to_col
-            if squared <= reach * reach and nearer:
+            if squared <= lattice.reach * lattice.reach and nearer:
                 cell['to_row'], cell['to_col'] = HERE + down, HERE + right
                 changed = True
     return changed

@@ -24,6 +24,7 @@ from thinmap_ros.core.slam.keyframes import (
     KeyframeConfig,
     Keyframes,
     carried,
+    covariances_from,
     inverse,
     turned,
     unlike,
@@ -58,6 +59,15 @@ class LoopConfig(KeyframeConfig):
     loop_matches: int = parameter(5, 'consistent matches that make a loop', low=1, high=_RECENT)
 
 
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """Keyframe k is to be matched with keyframe j; its covariance (3, 3) as seen from there."""
+
+    j: int
+    k: int
+    covariance: Array
+
+
 class LoopClosure:
     """The pose graph of the keyframes, and the search for edges that close loops."""
 
@@ -65,7 +75,7 @@ class LoopClosure:
         self.keyframes = Keyframes(config)
         self.edges: list[Edge] = []
         self._config, self._matcher = config, matcher
-        self._jobs: deque[tuple[int, int]] = deque()
+        self._jobs: deque[_Job] = deque()
         self._pending: tuple[Keyframe, Array] | None = None
         self._requested: deque[Edge] = deque(maxlen=_RECENT)
         self._here: Keyframe | None = None  # the last of them, kept or not
@@ -97,13 +107,16 @@ class LoopClosure:
         self._here = frame
         jumped = bool(jump.any()) and len(self.keyframes) > 0
         if jumped:
-            self._jobs.append((self.keyframes.anchor, len(self.keyframes)))
+            anchor = self.keyframes.anchor
+            theta = float(self.keyframes.frames[anchor].T_map_base[2])
+            self._jobs.append(
+                _Job(anchor, len(self.keyframes), turned(step_covariance + jump, theta))
+            )
         recent = None if jumped else self._recent_alike(frame)
         if recent is not None:
             self._reuse(recent)
             return
-        number = len(self.keyframes)
-        self._jobs.extend((j, number) for j in self._earlier_visits(frame))
+        self._jobs.extend(self._earlier_visits(frame))
         if jumped:
             self._settle()
         if not self._is_pending_matched():
@@ -116,43 +129,51 @@ class LoopClosure:
             return None
         return j if frame.path_m - self.keyframes.frames[j].path_m < _AGAIN_M else None
 
-    def _earlier_visits(self, here: Keyframe) -> list[int]:
+    def _earlier_visits(self, here: Keyframe) -> list[_Job]:
         """The keyframe most like this one of each earlier visit, likest first."""
         frames = self.keyframes.frames
         spread = math.sqrt(float(np.linalg.eigvalsh(here.covariance[:2, :2])[-1]))
         near = self.keyframes.near(here.T_map_base, self._config.loop_reach_m + _SIGMAS * spread)
+        near = [j for j in near if self._is_earlier(j, here)]
+        if not near:
+            return []
+        covariances = self._as_seen_from(near, here)
         ranked = []
-        for j in near:
-            if frames[j].path_m > here.path_m - _AGAIN_M and frames[j].submap == here.submap:
-                continue
-            reach = self._config.loop_reach_m + _SIGMAS * self._sigma_m(j, here)
+        for i, (j, covariance) in enumerate(zip(near, covariances, strict=True)):
+            sigma = math.sqrt(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
+            reach = self._config.loop_reach_m + _SIGMAS * sigma
             if math.dist(frames[j].T_map_base[:2], here.T_map_base[:2]) <= reach:
-                ranked.append((unlike(frames[j].T_map_base, here.T_map_base), j))
+                ranked.append((unlike(frames[j].T_map_base, here.T_map_base), i))
         ranked.sort()
-        found: list[int] = []
-        for _, j in ranked:
-            if all(abs(frames[j].path_m - frames[i].path_m) > _AGAIN_M for i in found):
-                found.append(j)
+        found: list[_Job] = []
+        for _, i in ranked:
+            path_m = frames[near[i]].path_m
+            if all(abs(path_m - frames[job.j].path_m) > _AGAIN_M for job in found):
+                found.append(_Job(near[i], len(frames), covariances[i]))
         return found[:_VISITS]
 
-    def _relative(self, j: int, here: Keyframe) -> Array:
-        """Covariance (3, 3) of a keyframe seen from keyframe j, map frame, at least roughly.
+    def _is_earlier(self, j: int, here: Keyframe) -> bool:
+        frame = self.keyframes.frames[j]
+        return frame.path_m <= here.path_m - _AGAIN_M or frame.submap != here.submap
 
-        What both have in common is taken to be the covariance of the earlier.
-        """
-        difference = here.covariance - self.keyframes.frames[j].covariance
-        values, vectors = np.linalg.eigh(difference)
-        return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
-
-    def _sigma_m(self, j: int, here: Keyframe) -> float:
-        return math.sqrt(float(np.linalg.eigvalsh(self._relative(j, here)[:2, :2])[-1]))
+    def _as_seen_from(self, near: list[int], here: Keyframe) -> list[Array]:
+        """Covariance (3, 3), map frame, of the pending keyframe as seen from each of some."""
+        assert self._pending is not None
+        keyframes = self.keyframes
+        poses = keyframes.poses()
+        anchor = keyframes.anchor
+        there = covariances_from(anchor, poses, keyframes.steps + self.edges)
+        step = turned(self._pending[1], float(poses[anchor, 2]))
+        lever = here.T_map_base[:2] - poses[anchor, :2]
+        back = [carried(there[j], poses[anchor, :2] - poses[j, :2]) for j in near]
+        return [carried(covariance, lever) + step for covariance in back]
 
     def work(self) -> Correction | None:
         """Do one match that is due, or one round of the optimization; to be called once a step."""
         if self._rounds is not None:
             return self._optimize()
         if self._jobs:
-            self._match(*self._jobs.popleft())
+            self._match(self._jobs.popleft())
             if not self._is_pending_matched():
                 self._settle()
             consistent = self._consistent()
@@ -187,14 +208,15 @@ class LoopClosure:
         self._submap = None
         return Correction(before, poses)
 
-    def _match(self, j: int, k: int) -> None:
+    def _match(self, job: _Job) -> None:
         """Match keyframe k, or the pending one, with the submap around j."""
+        j, k = job.j, job.k
         here = self._frame(k)
         base, submap = self._submap_of(j, here)
         config = self._config
         floor = np.diag(np.square([2.0 * config.loop_sigma_m] * 2 + [2.0 * config.loop_sigma_rad]))
         prior = se2.between(base, here.T_map_base)
-        relative = turned(self._relative(j, here), -float(base[2])) + floor
+        relative = turned(job.covariance, -float(base[2])) + floor
         match = self._matcher.match(
             here.points_base, here.scan.T_base_laser, submap, prior, relative
         )
@@ -202,6 +224,9 @@ class LoopClosure:
             return
         own = np.diag(np.square([config.loop_sigma_m] * 2 + [config.loop_sigma_rad]))
         covariance = inverse(match.by_scan + 1e-3 * np.eye(3)) + own
+        off = se2.off(match.T_map_base, prior)
+        if float(off @ np.linalg.solve(relative + covariance, off)) > _CHI2:
+            return
         T_j_base = se2.between(self.keyframes.frames[j].T_map_base, base)
         covariance = turned(covariance, float(T_j_base[2]))
         T_j_k = se2.compose(T_j_base, match.T_map_base)
@@ -299,7 +324,7 @@ class LoopClosure:
 
     def _is_pending_matched(self) -> bool:
         """Whether matches of the pending keyframe are due."""
-        return bool(self._jobs) and self._jobs[-1][1] == len(self.keyframes)
+        return bool(self._jobs) and self._jobs[-1].k == len(self.keyframes)
 
     def _settle(self) -> None:
         """Make the pending keyframe one, if there is one."""
@@ -314,13 +339,13 @@ class LoopClosure:
         frame, _ = self._pending
         self._pending = None
         number = len(self.keyframes)
-        self._jobs = deque(job for job in self._jobs if job[1] != number)
+        self._jobs = deque(job for job in self._jobs if job.k != number)
         self.keyframes.reuse(j, frame)
 
     def finish(self) -> Array:
         """Do all matches that are due; poses (N, 3) of the keyframes that agree best with all."""
         while self._jobs:
-            self._match(*self._jobs.popleft())
+            self._match(self._jobs.popleft())
         self._settle()
         return optimized(self.keyframes.poses(), self.keyframes.steps + self.edges)
 

@@ -2,15 +2,15 @@
 
 One sum of squares holds the distance of each point of the scan from the nearest wall, with a Cauchy
 kernel, and the motion that is expected, with its covariance. It is minimised by the method of
-Levenberg and Marquardt. Where the scan does not fit then, the poses within the uncertainty of the
-motion are searched, and the lower sum wins.
+Levenberg and Marquardt. Where the scan does not fit then, or the motion is too uncertain for the
+minimum that is nearest to be the right one, the poses within that uncertainty are searched, and the
+likelier one wins.
 Source: Kohlbrecher et al., "A flexible and scalable SLAM system with full 3D motion estimation",
 2011, for the smooth map; Olson, "Real-time correlative scan matching", 2009, for the search.
 """
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +23,12 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.keyframes import inverse
 from thinmap_ros.core.slam.local_map import (
     HERE,
+    Lattice,
     LocalMap,
     LocalMapConfig,
     cell_distance,
     interpolated,
+    nearest_wall,
     normal_of,
     slot_of,
 )
@@ -105,39 +107,37 @@ class Matcher:
         points_base: in the order of the beams, robot frame; T_base_laser (3,): where the laser is.
         """
         laser = np.ascontiguousarray(T_base_laser[:2])
+        lattice = local_map.lattice
         scan = self.weighted(points_base)
         information = inverse(covariance)
-        match = self._refined(scan, local_map, prior, prior, information)
-        if match.fit >= self.config.match_least_fit:
+        match = self._refined(scan, lattice, prior, prior, information)
+        if match.fit >= self.config.match_least_fit and self._is_near(covariance):
             return match
-        start = self._search(scan, local_map, prior, covariance, information)
-        other = self._refined(scan, local_map, start, prior, information)
+        start = self._search(scan, lattice, prior, covariance, information)
+        other = self._refined(scan, lattice, start, prior, information)
         return min(
             match,
             other,
-            key=lambda each: self._beam_cost(scan, laser, local_map, each, prior, information),
+            key=lambda each: self._beam_cost(scan, laser, lattice, each, prior, information),
         )
+
+    def _is_near(self, covariance: Array) -> bool:
+        """Whether points at a prior with covariance (3, 3) lie where their walls draw them."""
+        sigma_m = math.sqrt(max(covariance[0, 0], covariance[1, 1]))
+        return _SIGMAS * sigma_m <= self.config.match_outlier_m
 
     def _beam_cost(
         self,
         scan: Array,
         laser: Array,
-        local_map: LocalMap,
+        lattice: Lattice,
         match: Match,
         prior: Array,
         information: Array,
     ) -> float:
         """Cost of a match (beams and motion), to be compared with that of another one."""
         off = se2.off(match.T_map_base, prior)
-        config = self.config
-        beams = _beam_cost(
-            scan,
-            laser,
-            match.T_map_base,
-            *local_map.lattice,
-            config.match_sigma_m,
-            config.match_outlier_m,
-        )
+        beams = _beam_cost(scan, laser, match.T_map_base, lattice, *self._noise)
         return beams + _loss(float(off @ information @ off), _SIGMAS)
 
     def weighted(self, points_base: Array) -> Array:
@@ -151,45 +151,30 @@ class Matcher:
         weights = self.config.match_weight * np.minimum(around / self.config.match_cell_m, 1.0)
         return np.column_stack([points_base, weights])
 
-    def _refined(
-        self, scan: Array, local_map: LocalMap, start: Array, prior: Array, information: Array
-    ) -> Match:
+    @property
+    def _noise(self) -> tuple[float, float]:
+        """Standard deviation, in cells, of a point on its wall, and how many count it half."""
         config = self.config
-        pose, posterior, slopes, sums = _minimised(
-            scan,
-            start,
-            prior,
-            information,
-            *local_map.lattice,
-            config.match_sigma_m,
-            config.match_outlier_m,
+        return (
+            config.match_sigma_m / config.match_cell_m,
+            config.match_outlier_m / config.match_sigma_m,
+        )
+
+    def _refined(
+        self, scan: Array, lattice: Lattice, start: Array, prior: Array, information: Array
+    ) -> Match:
+        pose, posterior, by_scan, sums = _minimised(
+            scan, start, prior, information, lattice, *self._noise
         )
         pose[2] = se2.wrap(float(pose[2]))
-        total, known, fitting, cost, doubt = sums
-        lattice = local_map.lattice
-        by_scan = doubt * _information(
-            scan, pose, *lattice, config.match_sigma_m, config.match_outlier_m
-        )
-        by_prior = posterior - slopes
-        posterior = by_prior + by_scan
-        total = max(total, 1e-9)
-        contradicted = _contradicted(
-            scan,
-            pose,
-            *local_map.lattice,
-            _FITS_SIGMAS * config.match_sigma_m / config.match_cell_m,
-        )
+        total, known, fitting, cost, _ = sums
+        contradicted = _contradicted(scan, pose, lattice, _FITS_SIGMAS * self._noise[0])
         return Match(
             pose, posterior, by_scan, fitting / total, known / total, contradicted / total, cost
         )
 
     def _search(
-        self,
-        scan: Array,
-        local_map: LocalMap,
-        prior: Array,
-        covariance: Array,
-        information: Array,
+        self, scan: Array, lattice: Lattice, prior: Array, covariance: Array, information: Array
     ) -> Array:
         """The pose (3,) within the uncertainty of a prior at which the sum is lowest."""
         step_m = 2.0 * self.config.match_cell_m
@@ -198,19 +183,11 @@ class Matcher:
         far = float(np.median(np.hypot(sparse[:, 0], sparse[:, 1])))
         step_rad = min(step_m / max(far, 1.0), 0.1)
         slip = np.array([self.config.slip_m, self.config.slip_m, self.config.slip_rad])
-        reach_ = _SIGMAS * np.sqrt(np.diag(covariance) + slip**2)
-        steps = np.ceil(reach_ / [step_m, step_m, step_rad]).astype(np.int64)
+        reach = _SIGMAS * np.sqrt(np.diag(covariance) + slip**2)
+        steps = np.ceil(reach / [step_m, step_m, step_rad]).astype(np.int64)
         steps = np.minimum(steps, [20, 20, 60])
-        return _searched(
-            sparse,
-            prior,
-            steps,
-            np.array([step_m, step_rad]),
-            information,
-            *local_map.lattice,
-            self.config.match_sigma_m,
-            self.config.match_outlier_m,
-        )
+        sizes = np.array([step_m, step_rad])
+        return _searched(sparse, prior, steps, sizes, information, lattice, *self._noise)
 
 
 @inlined
@@ -235,59 +212,75 @@ def _tempered(cost: float, weight: float) -> float:
     return _USUAL_LOSS * weight * math.log1p(cost / (_USUAL_LOSS * weight))
 
 
+@inlined
+def _cell_of(at: float) -> int:
+    return int(math.floor(at))
+
+
+@inlined
+def _is_crossed(lattice: Lattice, x0: float, y0: float, x1: float, y1: float) -> bool:
+    """Whether a beam from (x0, y0) to (x1, y1), in cells, crosses a wall well before its end."""
+    length = math.hypot(x1 - x0, y1 - y0)
+    for k in range(1, int(length) - lattice.reach):
+        along = k / length
+        row, col = _cell_of(y0 + along * (y1 - y0)), _cell_of(x0 + along * (x1 - x0))
+        slot = slot_of(lattice, row, col)
+        if slot != NO_TILE:
+            cell = lattice.pool[slot, row & _MASK, col & _MASK]
+            if cell['to_row'] == HERE and cell['to_col'] == HERE and cell['hits'] >= 3:
+                return True
+    return False
+
+
+@inlined
+def _is_seen(lattice: Lattice, row: int, col: int) -> bool:
+    slot = slot_of(lattice, row, col)
+    return slot != NO_TILE and lattice.pool[slot, row & _MASK, col & _MASK]['seen'] > 0
+
+
 @kernel
 def _beam_cost(
-    scan: Array,
-    laser: Array,
-    pose: Array,
-    pool: NDArray[Any],
-    directory: NDArray[np.int32],
-    first: NDArray[np.int64],
-    cell_m: float,
-    reach: int,
-    sigma: float,
-    outlier: float,
+    scan: Array, laser: Array, pose: Array, lattice: Lattice, sigma: float, width: float
 ) -> float:
     """Cost of the beams of a scan at a pose: their ends, and the walls that they would cross.
 
     An end where nobody has looked yet costs half as much as one in the open.
     """
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
-    x0 = (pose[0] + cos * laser[0] - sin * laser[1]) / cell_m - first[1]
-    y0 = (pose[1] + sin * laser[0] + cos * laser[1]) / cell_m - first[0]
-    width = outlier / sigma
-    gross = _loss((reach * cell_m / sigma) ** 2, width)
+    cell_m, reach = lattice.cell_m, float(lattice.reach)
+    x0 = (pose[0] + cos * laser[0] - sin * laser[1]) / cell_m - lattice.first_col
+    y0 = (pose[1] + sin * laser[0] + cos * laser[1]) / cell_m - lattice.first_row
+    gross = _loss((reach / sigma) ** 2, width)
     cost = 0.0
     for i in range(len(scan)):
-        x1 = (pose[0] + cos * scan[i, 0] - sin * scan[i, 1]) / cell_m - first[1]
-        y1 = (pose[1] + sin * scan[i, 0] + cos * scan[i, 1]) / cell_m - first[0]
-        length = math.hypot(x1 - x0, y1 - y0)
-        steps = int(length)
-        crossed = False
-        for k in range(1, steps - reach):
-            along = k / length
-            row = int(math.floor(y0 + along * (y1 - y0)))
-            col = int(math.floor(x0 + along * (x1 - x0)))
-            slot = slot_of(directory, row, col)
-            if slot == NO_TILE:
-                continue
-            cell = pool[slot, row & _MASK, col & _MASK]
-            if cell['to_row'] == HERE and cell['to_col'] == HERE and cell['hits'] >= 3:
-                crossed = True
-                break
-        if crossed:
+        x1 = (pose[0] + cos * scan[i, 0] - sin * scan[i, 1]) / cell_m - lattice.first_col
+        y1 = (pose[1] + sin * scan[i, 0] + cos * scan[i, 1]) / cell_m - lattice.first_row
+        row, col = _cell_of(y1), _cell_of(x1)
+        error = cell_distance(lattice, row, col) / sigma
+        if _is_crossed(lattice, x0, y0, x1, y1):
             cost += scan[i, 2] * gross
-            continue
-        row, col = int(math.floor(y1)), int(math.floor(x1))
-        d = cell_distance(pool, directory, row, col, float(reach))
-        if d < reach:
-            error = d * cell_m / sigma
+        elif error < reach / sigma:
             cost += scan[i, 2] * _loss(error * error, width)
-            continue
-        slot = slot_of(directory, row, col)
-        unseen = slot == NO_TILE or pool[slot, row & _MASK, col & _MASK]['seen'] == 0
-        cost += scan[i, 2] * gross * (0.5 if unseen else 1.0)
+        else:
+            cost += scan[i, 2] * gross * (1.0 if _is_seen(lattice, row, col) else 0.5)
     return _tempered(cost, scan[:, 2].sum())
+
+
+@inlined
+def _add_outer(H: Array, w: float, jx: float, jy: float, jt: float) -> None:
+    """Add w times the product of (jx, jy, jt) with itself to the upper half of H (3, 3)."""
+    H[0, 0] += w * jx * jx
+    H[0, 1] += w * jx * jy
+    H[0, 2] += w * jx * jt
+    H[1, 1] += w * jy * jy
+    H[1, 2] += w * jy * jt
+    H[2, 2] += w * jt * jt
+
+
+@inlined
+def _mirror(H: Array) -> None:
+    """Fill the lower half of a symmetric matrix."""
+    H[1, 0], H[2, 0], H[2, 1] = H[0, 1], H[0, 2], H[1, 2]
 
 
 @kernel
@@ -296,135 +289,95 @@ def _evaluated(
     pose: Array,
     prior: Array,
     by_prior: Array,
-    pool: NDArray[Any],
-    directory: NDArray[np.int32],
-    first: NDArray[np.int64],
-    cell_m: float,
-    reach: int,
+    lattice: Lattice,
     sigma: float,
-    outlier: float,
-    H: Array,
-    H_scan: Array,
-    g: Array,
-) -> tuple[float, float, float, float, float]:
+    width: float,
+) -> tuple[Array, Array, Array, tuple[float, float, float, float, float]]:
     """Normal equations at a pose.
 
-    Returns the weights of all points, of known and of fitting ones, the cost, and what a point
-    proves.
+    Returns H (3, 3) and g (3,) of scan and prior, the part of H that is the prior's, and: the
+    weights of all points, of known and of fitting ones, the cost, and what a point proves.
     """
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
-    total, known, fitting, cost = 0.0, 0.0, 0.0, 0.0
-    H_scan[:] = 0.0
-    g[:] = 0.0
-    width = outlier / sigma
-    far = float(reach)
-    j = np.empty(3)
+    cell_m = lattice.cell_m
+    sigma_m = sigma * cell_m
+    total, known, fitting, cost = 1e-9, 0.0, 0.0, 0.0
+    H, g = np.zeros((3, 3)), np.zeros(3)
+    far = lattice.reach / sigma
     for i in range(len(scan)):
-        px = cos * scan[i, 0] - sin * scan[i, 1]
-        py = sin * scan[i, 0] + cos * scan[i, 1]
-        x = (pose[0] + px) / cell_m - first[1]
-        y = (pose[1] + py) / cell_m - first[0]
-        d, by_x, by_y = interpolated(pool, directory, x, y, far)
+        px, py = cos * scan[i, 0] - sin * scan[i, 1], sin * scan[i, 0] + cos * scan[i, 1]
+        x = (pose[0] + px) / cell_m - lattice.first_col
+        y = (pose[1] + py) / cell_m - lattice.first_row
+        d, by_x, by_y = interpolated(lattice, x, y)
+        error = d / sigma
         weight = scan[i, 2]
         total += weight
-        error = d * cell_m / sigma
         cost += weight * _loss(error * error, width)
-        if d >= far:
+        if abs(error) >= far:
             continue
         known += weight
-        if error < _FITS_SIGMAS:
+        if abs(error) < _FITS_SIGMAS:
             fitting += weight
         w = weight / (1.0 + error * error / (width * width))
-        j[0], j[1] = by_x / sigma, by_y / sigma
-        j[2] = (-by_x * py + by_y * px) / sigma
-        for a in range(3):
-            g[a] -= w * j[a] * error
-            for b in range(a + 1):
-                H_scan[a, b] += w * j[a] * j[b]
-    H_scan[0, 1], H_scan[0, 2], H_scan[1, 2] = H_scan[1, 0], H_scan[2, 0], H_scan[2, 1]
+        jx, jy = by_x / sigma_m, by_y / sigma_m
+        jt = -jx * py + jy * px
+        g[0] -= w * jx * error
+        g[1] -= w * jy * error
+        g[2] -= w * jt * error
+        _add_outer(H, w, jx, jy, jt)
     doubt = 1.0 / (1.0 + cost / (_USUAL_LOSS * total))
-    cost = _tempered(cost, total)
-    for a in range(3):
-        g[a] *= doubt
-        for b in range(3):
-            H_scan[a, b] *= doubt
+    _mirror(H)
     turn = math.atan2(math.sin(pose[2] - prior[2]), math.cos(pose[2] - prior[2]))
     off = np.array([pose[0] - prior[0], pose[1] - prior[1], turn])
     pull = by_prior @ off
     squared = off @ pull
     w = prior_weight(squared)
-    cost += _loss(squared, _SIGMAS)
-    for a in range(3):
-        g[a] -= w * pull[a]
-        for b in range(3):
-            H[a, b] = H_scan[a, b] + w * by_prior[a, b]
-    return total, known, fitting, cost, doubt
+    return (
+        doubt * H + w * by_prior,
+        doubt * g - w * pull,
+        w * by_prior,
+        (total, known, fitting, _tempered(cost, total) + _loss(squared, _SIGMAS), doubt),
+    )
 
 
 @kernel
-def _information(
-    scan: Array,
-    pose: Array,
-    pool: NDArray[Any],
-    directory: NDArray[np.int32],
-    first: NDArray[np.int64],
-    cell_m: float,
-    reach: int,
-    sigma: float,
-    outlier: float,
-) -> Array:
-    """Information (3, 3) that the points of a scan hold on its pose, by the normals of the walls.
+def _information(scan: Array, pose: Array, lattice: Lattice, sigma: float, width: float) -> Array:
+    """Information (3, 3) of the points of a scan on its pose, by the normals of the walls.
 
-    The slope of the distance is no measure of it: along a wall it wavers with the means of the
-    cells, and would tell a pose along a corridor that the scan does not know.
+    The slope of the distance is no measure of it: along a wall it wavers, and would tell a pose
+    along a corridor that the scan does not know.
     """
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    cell_m = lattice.cell_m
+    sigma_m = sigma * cell_m
     H = np.zeros((3, 3))
-    j = np.empty(3)
     for i in range(len(scan)):
-        px = cos * scan[i, 0] - sin * scan[i, 1]
-        py = sin * scan[i, 0] + cos * scan[i, 1]
-        x, y = (pose[0] + px) / cell_m - first[1], (pose[1] + py) / cell_m - first[0]
-        row, col = int(math.floor(y)), int(math.floor(x))
-        d = cell_distance(pool, directory, row, col, float(reach)) * cell_m
-        if d >= _FITS_SIGMAS * sigma:
+        px, py = cos * scan[i, 0] - sin * scan[i, 1], sin * scan[i, 0] + cos * scan[i, 1]
+        row = _cell_of((pose[1] + py) / cell_m) - lattice.first_row
+        col = _cell_of((pose[0] + px) / cell_m) - lattice.first_col
+        error = cell_distance(lattice, row, col) / sigma
+        slot, row, col = nearest_wall(lattice, row, col)
+        if slot == NO_TILE or error >= _FITS_SIGMAS:
             continue
-        slot = slot_of(directory, row, col)
-        cell = pool[slot, row & _MASK, col & _MASK]
-        row, col = row + int(cell['to_row']) - HERE, col + int(cell['to_col']) - HERE
-        nx, ny = normal_of(pool, directory, row, col)
-        if nx == 0.0 and ny == 0.0:
-            continue
-        w = scan[i, 2] / (sigma * sigma) / (1.0 + d * d / (outlier * outlier))
-        j[0], j[1], j[2] = nx, ny, -nx * py + ny * px
-        for a in range(3):
-            for b in range(3):
-                H[a, b] += w * j[a] * j[b]
+        nx, ny = normal_of(int(lattice.pool[slot, row & _MASK, col & _MASK]['normal']))
+        w = scan[i, 2] / (1.0 + error * error / (width * width))
+        jx, jy = nx / sigma_m, ny / sigma_m
+        _add_outer(H, w, jx, jy, -jx * py + jy * px)
+    _mirror(H)
     return H
 
 
 @kernel
-def _contradicted(
-    scan: Array,
-    pose: Array,
-    pool: NDArray[Any],
-    directory: NDArray[np.int32],
-    first: NDArray[np.int64],
-    cell_m: float,
-    reach: int,
-    far: float,
-) -> float:
+def _contradicted(scan: Array, pose: Array, lattice: Lattice, far: float) -> float:
     """Weight of the points in cells that were seen through, and are farther than far from walls."""
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     found = 0.0
     for i in range(len(scan)):
-        x = (pose[0] + cos * scan[i, 0] - sin * scan[i, 1]) / cell_m - first[1]
-        y = (pose[1] + sin * scan[i, 0] + cos * scan[i, 1]) / cell_m - first[0]
-        row, col = int(math.floor(y)), int(math.floor(x))
-        slot = slot_of(directory, row, col)
-        if slot == NO_TILE or pool[slot, row & _MASK, col & _MASK]['seen'] == 0:
-            continue
-        if cell_distance(pool, directory, row, col, float(reach)) >= far:
+        x = pose[0] + cos * scan[i, 0] - sin * scan[i, 1]
+        y = pose[1] + sin * scan[i, 0] + cos * scan[i, 1]
+        row = _cell_of(y / lattice.cell_m) - lattice.first_row
+        col = _cell_of(x / lattice.cell_m) - lattice.first_col
+        if _is_seen(lattice, row, col) and cell_distance(lattice, row, col) >= far:
             found += scan[i, 2]
     return found
 
@@ -435,34 +388,13 @@ def _minimised(
     start: Array,
     prior: Array,
     by_prior: Array,
-    pool: NDArray[Any],
-    directory: NDArray[np.int32],
-    first: NDArray[np.int64],
-    cell_m: float,
-    reach: int,
+    lattice: Lattice,
     sigma: float,
-    outlier: float,
+    width: float,
 ) -> tuple[Array, Array, Array, tuple[float, float, float, float, float]]:
-    """Pose (3,), information (3, 3) of all, of the scan, and what `_evaluated` returns."""
+    """Pose (3,), information (3, 3) of scan and prior, of the scan, and sums of `_evaluated`."""
     pose = start.copy()
-    H, H_scan, g = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
-    H_new, H_scan_new, g_new = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
-    sums = _evaluated(
-        scan,
-        pose,
-        prior,
-        by_prior,
-        pool,
-        directory,
-        first,
-        cell_m,
-        reach,
-        sigma,
-        outlier,
-        H,
-        H_scan,
-        g,
-    )
+    H, g, of_prior, sums = _evaluated(scan, pose, prior, by_prior, lattice, sigma, width)
     damping = 1e-3
     for _ in range(_ROUNDS):
         A = H.copy()
@@ -470,31 +402,25 @@ def _minimised(
             A[a, a] *= 1.0 + damping
         step = np.linalg.solve(A, g)
         tried = pose + step
-        new = _evaluated(
-            scan,
-            tried,
-            prior,
-            by_prior,
-            pool,
-            directory,
-            first,
-            cell_m,
-            reach,
-            sigma,
-            outlier,
-            H_new,
-            H_scan_new,
-            g_new,
-        )
-        if new[3] < sums[3]:
-            pose, sums = tried, new
-            H[:], H_scan[:], g[:] = H_new, H_scan_new, g_new
+        new = _evaluated(scan, tried, prior, by_prior, lattice, sigma, width)
+        if new[3][3] < sums[3]:
+            pose = tried
+            H, g, of_prior, sums = new
             damping = max(damping * 0.1, 1e-6)
         else:
             damping *= 10.0
         if np.abs(step).max() < _SETTLED or damping > 1e3:
             break
-    return pose, H, H_scan, sums
+    by_scan = sums[4] * _information(scan, pose, lattice, sigma, width)
+    return pose, of_prior + by_scan, by_scan, sums
+
+
+@inlined
+def _quadratic(A: Array, dx: float, dy: float, turn: float) -> float:
+    """Square of (dx, dy, turn) in the metric of a symmetric A (3, 3)."""
+    mixed = A[0, 1] * dx * dy + A[0, 2] * dx * turn + A[1, 2] * dy * turn
+    square = A[0, 0] * dx * dx + A[1, 1] * dy * dy + A[2, 2] * turn * turn + 2.0 * mixed
+    return float(square)
 
 
 @kernel
@@ -504,71 +430,44 @@ def _searched(
     steps: NDArray[np.int64],
     sizes: Array,
     by_prior: Array,
-    pool: NDArray[Any],
-    directory: NDArray[np.int32],
-    first: NDArray[np.int64],
-    cell_m: float,
-    reach: int,
+    lattice: Lattice,
     sigma: float,
-    outlier: float,
+    width: float,
 ) -> Array:
     """The pose (3,) of a lattice round a prior with the lowest sum."""
-    # Cost of every cell in sight, once.
-    lookup = int(np.hypot(scan[:, 0], scan[:, 1]).max() / cell_m) + 4
+    cell_m = lattice.cell_m
     stride = int(round(sizes[0] / cell_m))
-    rim_r, rim_c = stride * steps[1], stride * steps[0]
-    rows, cols = 2 * (lookup + rim_r) + 1, 2 * (lookup + rim_c) + 1
-    middle_row = int(math.floor(prior[1] / cell_m)) - first[0]
-    middle_col = int(math.floor(prior[0] / cell_m)) - first[1]
-    width = outlier / sigma
-    costs = np.full((rows, cols), np.float32(-1.0))
+    # Cost of every cell in sight, once it is asked for.
+    rim = int(np.hypot(scan[:, 0], scan[:, 1]).max() / cell_m) + 4 + stride * steps[:2].max()
+    corner_row = _cell_of(prior[1] / cell_m) - lattice.first_row - rim
+    corner_col = _cell_of(prior[0] / cell_m) - lattice.first_col - rim
+    costs = np.full((2 * rim + 1, 2 * rim + 1), np.float32(-1.0))
     best = prior.copy()
-    n = len(scan)
     usual = _USUAL_LOSS * scan[:, 2].sum()
     lowest = 700.0 * usual
-    at_row, at_col = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
+    at = np.empty((len(scan), 2), dtype=np.int64)
     for k in range(-steps[2], steps[2] + 1):
         turn = k * sizes[1]
         cos, sin = math.cos(prior[2] + turn), math.sin(prior[2] + turn)
-        for i in range(n):
+        for i in range(len(scan)):
             x = prior[0] + cos * scan[i, 0] - sin * scan[i, 1]
             y = prior[1] + sin * scan[i, 0] + cos * scan[i, 1]
-            at_row[i] = int(math.floor(y / cell_m)) - first[0] - middle_row + lookup + rim_r
-            at_col[i] = int(math.floor(x / cell_m)) - first[1] - middle_col + lookup + rim_c
+            at[i, 0] = _cell_of(y / cell_m) - lattice.first_row - corner_row
+            at[i, 1] = _cell_of(x / cell_m) - lattice.first_col - corner_col
         for a in range(-steps[1], steps[1] + 1):
             for b in range(-steps[0], steps[0] + 1):
                 dx, dy = b * sizes[0], a * sizes[0]
-                squared = (
-                    by_prior[0, 0] * dx * dx
-                    + by_prior[1, 1] * dy * dy
-                    + by_prior[2, 2] * turn * turn
-                    + 2.0
-                    * (
-                        by_prior[0, 1] * dx * dy
-                        + by_prior[0, 2] * dx * turn
-                        + by_prior[1, 2] * dy * turn
-                    )
-                )
-                by_motion = _loss(squared, _SIGMAS)
+                by_motion = _loss(_quadratic(by_prior, dx, dy, turn), _SIGMAS)
                 if by_motion >= lowest:
                     continue
                 most = usual * math.expm1((lowest - by_motion) / usual)
                 cost = 0.0
-                for i in range(n):
-                    r, c = at_row[i] + stride * a, at_col[i] + stride * b
-                    value = costs[r, c]
-                    if value < 0.0:
-                        d = cell_distance(
-                            pool,
-                            directory,
-                            r - lookup - rim_r + middle_row,
-                            c - lookup - rim_c + middle_col,
-                            float(reach),
-                        )
-                        error = d * cell_m / sigma
-                        value = np.float32(_loss(error * error, width))
-                        costs[r, c] = value
-                    cost += scan[i, 2] * value
+                for i in range(len(scan)):
+                    r, c = at[i, 0] + stride * a, at[i, 1] + stride * b
+                    if costs[r, c] < 0.0:
+                        error = cell_distance(lattice, r + corner_row, c + corner_col) / sigma
+                        costs[r, c] = np.float32(_loss(error * error, width))
+                    cost += scan[i, 2] * costs[r, c]
                     if cost >= most:
                         break
                 if cost < most:
