@@ -16,7 +16,7 @@ from benchmarks.timing import CpuTimedPipeline
 from thinmap_ros.adapters.resources import world_path
 from thinmap_ros.adapters.world_files import read_tour, read_world
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import LocalizerConfig
+from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
 from thinmap_ros.pipeline import PipelineConfig
 from thinmap_ros.sim.lms200 import Lms200Config
 from thinmap_ros.sim.pioneer import PRESETS
@@ -102,7 +102,7 @@ def _drive(looks: Iterator[Look], marks_m: list[float]) -> Iterator[_Mark]:
             x, y, yaw = look.T_world_base.tolist()
             pipeline = CpuTimedPipeline(
                 PipelineConfig(
-                    localizer=LocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=yaw)
+                    localizer=ScanLocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=yaw)
                 )
             )
         way_m += 0.0 if last is None else float(np.hypot(*(look.T_world_base - last)[:2]))

@@ -19,11 +19,11 @@ from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig
 class PipelineConfig:
     """Parameters of all stages.
 
-    localizer: its type says which of the two there are it is. scans_per_graph: the graph is brought
+    localizer: its type says which of CORES it is. scans_per_graph: the graph is brought
     up to date with every so many scans.
     """
 
-    localizer: LocalizerConfig | ScanLocalizerConfig = field(default_factory=LocalizerConfig)
+    localizer: LocalizerConfig | ScanLocalizerConfig = field(default_factory=ScanLocalizerConfig)
     grid: OccupancyConfig = field(default_factory=OccupancyConfig)
     window: WindowConfig = field(default_factory=WindowConfig)
     topology: TopologyConfig = field(default_factory=TopologyConfig)
@@ -113,10 +113,10 @@ class Pipeline:
         self.stage_seconds.setdefault(stage, []).append(perf_counter() - started)
 
 
-# The localizers that there are: today's, and the one that is to take its place.
+# The localizers that there are, the default first; the other one is that of the third paper.
 CORES: dict[str, type[LocalizerConfig | ScanLocalizerConfig]] = {
-    'ekf': LocalizerConfig,
     'scan': ScanLocalizerConfig,
+    'ekf': LocalizerConfig,
 }
 
 

@@ -23,15 +23,6 @@ _SCANS, _PERIOD_S, _STEP_M, _TURN_RAD = 12, 0.2, 0.12, 0.11
 
 def localizer() -> None:
     """Rehearse localization."""
-    from thinmap_ros.core.slam.localizer import Localizer
-
-    rehearsed = Localizer()
-    for scan, T_map_base in _drive():
-        rehearsed.step(scan, T_map_base)
-
-
-def scan_localizer() -> None:
-    """Rehearse the localizer that is to take the place of the other."""
     from thinmap_ros.core.slam.scan_localizer import ScanLocalizer
 
     rehearsed = ScanLocalizer()
@@ -40,6 +31,15 @@ def scan_localizer() -> None:
     # A scan that fits nowhere is searched for; a map that was saved is taken up.
     rehearsed.step(_odd_scan(), T_map_base)
     ScanLocalizer.from_state(rehearsed.state())
+
+
+def ekf_localizer() -> None:
+    """Rehearse the localizer of the third paper, `replay --core ekf`."""
+    from thinmap_ros.core.slam.localizer import Localizer
+
+    rehearsed = Localizer()
+    for scan, T_map_base in _drive():
+        rehearsed.step(scan, T_map_base)
 
 
 def grid_mapper() -> None:

@@ -19,7 +19,7 @@ from thinmap_ros.pipeline import CORES
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.runs import Failure, add_run_options, complaint, read_report, run_missing
 
-_CORE = 'ekf'
+_CORE = 'scan'
 _SHARED = Path(__file__).resolve().parents[3] / 'shared'
 _SHORT = Path(__file__).parent / 'short.txt'
 
@@ -55,7 +55,7 @@ def _parser() -> argparse.ArgumentParser:
         '--core',
         choices=tuple(CORES),
         default=_CORE,
-        help='the localizer: ekf, or scan, which is to take its place',
+        help=f'the localizer (default {_CORE})',
     )
     parser.add_argument('--quiet', action='store_true', help='no bar of progress')
     add_run_options(parser)
@@ -115,7 +115,7 @@ def _short_names() -> list[str]:
 def _options(words: list[str], core: str = _CORE) -> Numbers:
     """Options of the localizer, each of the type of its default."""
     defaults = vars(CORES[core]())
-    options: Numbers = {} if core == _CORE else {'core': core}
+    options: Numbers = {'core': core}
     for word in words:
         name, _, value = word.partition('=')
         if name not in defaults:

@@ -23,7 +23,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.odometry import ScanPairing
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
+from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
 from thinmap_ros.pipeline import CORES, PipelineConfig, Step
 from thinmap_ros.tools.experiments.logs import laser_of
@@ -231,7 +231,7 @@ def _consistency(played: Played, truth: Array) -> Numbers:
 def config_of(options: Numbers) -> LocalizerConfig | ScanLocalizerConfig:
     """Configuration of the localizer that the option `core` names."""
     own = dict(options)
-    return CORES[own.pop('core', 'ekf')](**own)
+    return CORES[own.pop('core', 'scan')](**own)
 
 
 def _play(
@@ -267,8 +267,7 @@ def _rehearse(config: LocalizerConfig | ScanLocalizerConfig) -> None:
     """Load the compiled kernels before anything is timed."""
     from thinmap_ros import warm_up
 
-    warm_up.localizer()
-    warm_up.scan_localizer()
+    is_scan = isinstance(config, ScanLocalizerConfig)
+    (warm_up.localizer if is_scan else warm_up.ekf_localizer)()
     warm_up.grid_mapper()
     warm_up.topology_builder()
-    Localizer(config)

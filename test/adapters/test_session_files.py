@@ -31,7 +31,7 @@ from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.se2 import Array, pose
-from thinmap_ros.core.slam.localizer import Localizer
+from thinmap_ros.core.slam.scan_localizer import ScanLocalizer
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.core.topology.update import TopologyBuilder
@@ -241,7 +241,7 @@ def test_what_an_exploration_learned_is_the_same_after_a_start(tmp_path):
 def test_features_are_kept_set_aside_or_refused_in_words(tmp_path):
     stem = str(tmp_path / 'office')
     assert load_features(stem) is None
-    localizer, world, laser = Localizer(), building(), Lms200(Lms200Config(), 1)
+    localizer, world, laser = ScanLocalizer(), building(), Lms200(Lms200Config(), 1)
     for k in range(30):
         T = pose(3.0 + 0.1 * k, 6.0, 0.0)
         localizer.step(laser.scan(world, T, k), T)

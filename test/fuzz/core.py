@@ -18,7 +18,7 @@ from thinmap_ros.core.localization.global_localization import GlobalLocalization
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
+from thinmap_ros.core.slam.scan_localizer import ScanLocalizer, ScanLocalizerConfig
 from thinmap_ros.core.topology.update import TopologyBuilder
 
 _PERIOD_NS = 200_000_000
@@ -112,8 +112,8 @@ def map_and_graph(shared: None, rng: np.random.Generator, folder: Path) -> None:
 
 def localize(shared: None, rng: np.random.Generator, folder: Path) -> None:
     drive = Drive(rng, folder)
-    config = LocalizerConfig(slam=str(chosen(rng, ('ti', 'full', 'off'))))
-    localizer = Localizer(config)
+    config = ScanLocalizerConfig(slam=str(chosen(rng, ('ti', 'full', 'off'))))
+    localizer = ScanLocalizer(config)
     graph = small_graph()
     for _ in range(int(rng.integers(1, 20))):
         drive.move()
@@ -128,7 +128,7 @@ def localize(shared: None, rng: np.random.Generator, folder: Path) -> None:
         if rng.random() < 0.1:
             localizer.set_topology(graph)
     finite(localizer.corrected_path())
-    tried(lambda: Localizer.from_state(localizer.state(), config))
+    tried(lambda: ScanLocalizer.from_state(localizer.state(), config))
 
 
 def known_room(folder: Path) -> tuple[GridPatch, Any]:

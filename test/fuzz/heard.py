@@ -17,7 +17,7 @@ from thinmap_ros.core.exploration.explorer import ExplorerConfig
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.localization.config import GlobalLocalizationConfig
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
-from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
+from thinmap_ros.core.slam.scan_localizer import ScanLocalizer, ScanLocalizerConfig
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.update import TopologyBuilder
 
@@ -27,13 +27,13 @@ _CONFIGS: tuple[type[Config], ...] = (
     ExplorerConfig,
     GlobalLocalizationConfig,
     LaserOptions,
-    LocalizerConfig,
+    ScanLocalizerConfig,
     NavigatorConfig,
     OccupancyConfig,
     TopologyConfig,
 )
 _MADE: dict[type[Config], Any] = {
-    LocalizerConfig: Localizer,
+    ScanLocalizerConfig: ScanLocalizer,
     NavigatorConfig: Navigator,
     OccupancyConfig: OccupancyGrid,
     TopologyConfig: TopologyBuilder,

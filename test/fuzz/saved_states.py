@@ -12,7 +12,7 @@ from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
-from thinmap_ros.core.slam.localizer import Localizer
+from thinmap_ros.core.slam.scan_localizer import ScanLocalizer
 from thinmap_ros.core.topology.update import TopologyBuilder
 from thinmap_ros.sim.world import World
 from thinmap_ros.tools.explore_world import ClosedLoop, Options, coverable, make_loop
@@ -70,7 +70,7 @@ class Explored:
         return lambda scan, T: explorer.step(pipeline.topology.map, patch, scan, T)
 
     def _use_features(self, state: State) -> Work:
-        localizer = Localizer.from_state(state, self.loop.pipeline.localizer.config)
+        localizer = ScanLocalizer.from_state(state, self.loop.pipeline.localizer.config)
         localizer.set_pose(self.scans[-STEPS][1], 1e-4 * np.eye(3))
 
         def work(scan: Any, T: Any) -> None:

@@ -19,7 +19,7 @@ from thinmap_ros.adapters.bags import BagLog
 from thinmap_ros.adapters.carmen import CarmenLog, LaserOptions
 from thinmap_ros.adapters.events import OdometryEvent, ScanEvent, Skipped
 from thinmap_ros.adapters.world_files import read_world
-from thinmap_ros.core.slam.localizer import LocalizerConfig
+from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
 from thinmap_ros.pipeline import PipelineConfig
 from thinmap_ros.sim.lms200 import Lms200Config
 from thinmap_ros.sim.pioneer import PRESETS
@@ -146,7 +146,7 @@ def test_simulated_log_bag_and_live_graph_agree(graph, tmp_path):
 
 def test_a_closed_loop_corrects_the_live_map_as_it_does_the_replayed_one(graph, tmp_path):
     start = {'start_x_m': 3.0, 'start_y_m': 1.2}
-    expected = replay(LoopLog(), PipelineConfig(localizer=LocalizerConfig(**start)))
+    expected = replay(LoopLog(), PipelineConfig(localizer=ScanLocalizerConfig(**start)))
     assert 'rebuild' in expected.pipeline.stage_seconds
     convert(LoopLog(), tmp_path / 'bag')
     trajectories = graph.heard('trajectory', Path, qos.LATCHED)

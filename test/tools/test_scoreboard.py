@@ -122,9 +122,11 @@ def test_another_run_beside_it(reports):
 
 
 def test_options_of_the_localizer_have_the_types_of_their_defaults():
-    words = ['slam=off', 'start_x_m=2', 'square_walls=false']
-    assert program._options(words) == {'slam': 'off', 'start_x_m': 2.0, 'square_walls': False}
-    for word in ('slan=off', 'start_x_m=far', 'square_walls=no', 'slam=full_of_hope'):
+    words = ['slam=off', 'start_x_m=2', 'mapping=false']
+    options = {'slam': 'off', 'start_x_m': 2.0, 'mapping': False}
+    assert program._options(words) == {'core': 'scan', **options}
+    assert program._options(['square_walls=false'], 'ekf') == {'core': 'ekf', 'square_walls': False}
+    for word in ('slan=off', 'start_x_m=far', 'mapping=no', 'slam=full_of_hope', 'square_walls=no'):
         with pytest.raises(ConfigError):
             program._options([word])
 

@@ -2,7 +2,7 @@
 
 A session has a path STEM: STEM.grid.npz holds the grid, STEM.pgm and STEM.yaml the same as a
 map_server map, STEM.topology.npz the graph with its ids, STEM.features.npz the localizer's features
-and map of points, and STEM.exploration.npz what an exploration of it has learned.
+and local map, and STEM.exploration.npz what an exploration of it has learned.
 """
 
 from collections.abc import Mapping
@@ -18,11 +18,11 @@ from thinmap_ros.adapters.map_files import read_map, write_map
 from thinmap_ros.core.errors import InputError, reason_of, shown
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
-from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
+from thinmap_ros.core.slam.scan_localizer import ScanLocalizer, ScanLocalizerConfig
 from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig
 
 _FORMAT = 'thinmap_format'
-_GRID, _TOPOLOGY, _EXPLORATION, _FEATURES = 'grid 1', 'topology 1', 'exploration 1', 'features 1'
+_GRID, _TOPOLOGY, _EXPLORATION, _FEATURES = 'grid 1', 'topology 1', 'exploration 1', 'features 2'
 _GRID_END, _TOPOLOGY_END, _MAP_END = '.grid.npz', '.topology.npz', '.yaml'
 _EXPLORATION_END, _FEATURES_END = '.exploration.npz', '.features.npz'
 # Of all files that a session may consist of, or that are set aside with a new one.
@@ -123,14 +123,14 @@ def load_exploration(path: str, config: ExplorerConfig | None = None) -> Explore
         raise InputError(f'{file}: {error}') from error
 
 
-def save_features(path: str, localizer: Localizer) -> str:
+def save_features(path: str, localizer: ScanLocalizer) -> str:
     """Write STEM.features.npz; returns its name. Raises OSError where that fails."""
     file = _named(stem_of(path), _FEATURES_END)
     _write(file, _FEATURES, localizer.state())
     return str(file)
 
 
-def load_features(path: str, config: LocalizerConfig | None = None) -> Localizer | None:
+def load_features(path: str, config: ScanLocalizerConfig | None = None) -> ScanLocalizer | None:
     """Read STEM.features.npz; None where the session has none.
 
     Raises InputError where it is broken.
@@ -139,7 +139,7 @@ def load_features(path: str, config: LocalizerConfig | None = None) -> Localizer
     if not _is_there(file):
         return None
     try:
-        return Localizer.from_state(_read(file, _FEATURES), config)
+        return ScanLocalizer.from_state(_read(file, _FEATURES), config)
     except InputError as error:
         raise InputError(f'{file}: {error}') from error
 

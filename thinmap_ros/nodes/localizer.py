@@ -31,7 +31,8 @@ from thinmap_ros.core.odometry import LastPose, ScanPairing
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.features import LineFeature as Feature
-from thinmap_ros.core.slam.localizer import Estimate, Localizer, LocalizerConfig
+from thinmap_ros.core.slam.localizer import Estimate
+from thinmap_ros.core.slam.scan_localizer import ScanLocalizer, ScanLocalizerConfig
 from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 
 _MAP_WAIT_S = 3.0  # after a restart; the navigator drives on for so long without a new pose
@@ -53,7 +54,7 @@ class LocalizerNode(LiveNode):
 
     def __init__(self) -> None:
         super().__init__('localizer', recovers=True)
-        self._config = parameters.declare(self, LocalizerConfig)
+        self._config = parameters.declare(self, ScanLocalizerConfig)
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
         self._odom_frame = parameters.declare_value(
             self, 'odom_frame', 'odom', 'frame of the odometry'
@@ -103,13 +104,13 @@ class LocalizerNode(LiveNode):
         self._resumed = LastPose.from_state(left)
         self._listen_for_the_map()
 
-    def _made(self, config: LocalizerConfig) -> Localizer:
+    def _made(self, config: ScanLocalizerConfig) -> ScanLocalizer:
         """A localizer that begins at its start, in the map of the session if there is one."""
         return (
             session_files.load_features(self._session, config) if self._session else None
-        ) or Localizer(config)
+        ) or ScanLocalizer(config)
 
-    def _at(self, T_map_base: Array) -> LocalizerConfig:
+    def _at(self, T_map_base: Array) -> ScanLocalizerConfig:
         """The configuration of a robot that starts at a pose (3,)."""
         x, y, yaw = T_map_base.tolist()
         return replace(self._config, start_x_m=x, start_y_m=y, start_yaw_rad=yaw)
@@ -183,7 +184,7 @@ class LocalizerNode(LiveNode):
             )
             self._localizer = self._made(self._at(se2.compose(last.T_map_odom, T_odom_base)))
         else:
-            self._localizer = Localizer.resumed(self._latched, last, T_odom_base, self._config)
+            self._localizer = ScanLocalizer.resumed(self._latched, last, T_odom_base, self._config)
         if self._topology is not None:
             self._localizer.set_topology(self._topology)
         self._resumed = self._latched = None

@@ -31,7 +31,8 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import Estimate, LocalizerConfig
+from thinmap_ros.core.slam.localizer import Estimate
+from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.sim.coverage import Coverable, coverable
@@ -234,7 +235,7 @@ def make_loop(world: World, start: Array, options: Options) -> ClosedLoop:
     """All parts as the options want them."""
     simulation = Simulation(world, start, PRESETS[options.robot], options.laser, options.seed)
     x, y, theta = (float(number) for number in start)
-    localizer = LocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=theta)
+    localizer = ScanLocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=theta)
     source = true_pose_source(simulation) if options.localization == 'truth' else None
     # A beam that met nothing has seen as far as this laser can.
     grid = OccupancyConfig(no_return_range_m=options.laser.range_max_m)

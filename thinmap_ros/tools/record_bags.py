@@ -13,7 +13,8 @@ from thinmap_ros.adapters.files import write_text
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, shown
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import Estimate, LocalizerConfig
+from thinmap_ros.core.slam.localizer import Estimate
+from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.sim.tours import Look
 from thinmap_ros.tools import cli
@@ -97,7 +98,8 @@ def record(path: Path, looks: Iterable[Look], localized: bool) -> int:
 def _pipeline(first: Look, localized: bool) -> tuple[Pipeline, list[Array]]:
     """A pipeline for a drive that begins so, and the list that is to take each scan's true pose."""
     x, y, yaw = (float(number) for number in first.T_world_base)
-    config = PipelineConfig(localizer=LocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=yaw))
+    localizer = ScanLocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=yaw)
+    config = PipelineConfig(localizer=localizer)
     truth: list[Array] = []
 
     def known(scan: object, T_odom_base: Array) -> Estimate:

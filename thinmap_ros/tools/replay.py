@@ -26,7 +26,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.odometry import ScanPairing
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import LocalizerConfig
+from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
 from thinmap_ros.pipeline import CORES, Pipeline, PipelineConfig
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.replay_view import ReplayView
@@ -183,10 +183,11 @@ def main() -> None:
     parser.add_argument(
         '--core',
         choices=tuple(CORES),
-        default='ekf',
-        help='the localizer: ekf, or scan, which is to take its place',
+        default='scan',
+        help='the localizer: scan matching with a pose graph, or the EKF on line features '
+        '(default scan)',
     )
-    cli.add_config(parser, LocalizerConfig, ['slam'])
+    cli.add_config(parser, ScanLocalizerConfig, ['slam'])
     cli.add_config(parser, OccupancyConfig, ['resolution_m', 'no_return_range_m', 'usable_range_m'])
     cli.run(_work, parser)
 

@@ -9,7 +9,7 @@ from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import LastPose
-from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
+from thinmap_ros.core.slam.scan_localizer import ScanLocalizer, ScanLocalizerConfig
 from thinmap_ros.core.slam.wall_points import wall_points
 
 START = np.array([2.0, 2.0, 0.0])
@@ -43,8 +43,8 @@ def test_a_map_without_walls_has_no_points():
 def test_a_killed_localizer_does_not_bend_the_map(seed, resolution, slip):
     """Killed for two metres; the wheels slip meanwhile. Then it goes on, and draws what it sees."""
     rng = np.random.default_rng(seed)
-    config = LocalizerConfig(start_x_m=2.0, start_y_m=2.0)
-    localizer, last = Localizer(config), None
+    config = ScanLocalizerConfig(start_x_m=2.0, start_y_m=2.0)
+    localizer, last = ScanLocalizer(config), None
     grid = OccupancyGrid(OccupancyConfig(resolution_m=resolution))
     off = se2.pose(slip[0], 0.0, slip[1])
     worst = 0.0
@@ -57,7 +57,7 @@ def test_a_killed_localizer_does_not_bend_the_map(seed, resolution, slip):
         elif k >= 450:
             if k == 450:
                 slipped = se2.compose(odom, off)
-                localizer = Localizer.resumed(grid.patch(), last, slipped, config)
+                localizer = ScanLocalizer.resumed(grid.patch(), last, slipped, config)
             estimate = localizer.step(scan, se2.compose(odom, off))
             worst = max(worst, float(np.hypot(*(estimate.T_map_base - truth)[:2])))
     assert not estimate.lost

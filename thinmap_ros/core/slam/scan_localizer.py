@@ -176,6 +176,8 @@ class ScanLocalizer:
         It is lost until scans fit there. Raises InputError where it is no such state.
         """
         checked = snapshot.check(state, FIELDS, 'features')
+        possible = bool((checked['hits'] <= checked['seen']).all())
+        snapshot.require(possible, 'features: hits: more than seen', 'no more hits than looks')
         localizer = ScanLocalizer(config)
         localizer._map.restore(checked)
         localizer._lines.restore(
