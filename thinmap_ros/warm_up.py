@@ -13,6 +13,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
 from thinmap_ros.core.grid.raytrace import cast_rays
+from thinmap_ros.core.odometry import LastPose
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
@@ -28,9 +29,10 @@ def localizer() -> None:
     rehearsed = ScanLocalizer()
     for scan, T_map_base in _drive():
         rehearsed.step(scan, T_map_base)
-    # A scan that fits nowhere is searched for; a map that was saved is taken up.
+    # A scan that fits nowhere is searched for; a map that was saved or drawn is taken up.
     rehearsed.step(_odd_scan(), T_map_base)
     ScanLocalizer.from_state(rehearsed.state())
+    ScanLocalizer.resumed(_room(), LastPose(0, T_map_base, T_map_base), T_map_base)
 
 
 def ekf_localizer() -> None:
