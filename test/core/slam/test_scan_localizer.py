@@ -158,6 +158,40 @@ def test_standing_still_adds_no_uncertainty(trembling):
     assert not estimate.lost
 
 
+def straight(localizer, poses, rng, first=0):
+    """Estimates on the way through poses (N, 3), with a true odometry."""
+    return [
+        localizer.step(scan_in(ROOM, T, rng, (first + k) * PERIOD_NS), T - START)
+        for k, T in enumerate(poses)
+    ]
+
+
+def test_a_robot_that_stands_is_as_sure_as_before():
+    rng = np.random.default_rng(5)
+    localizer = at_start()
+    straight(localizer, [START + [0.05 * k, 0.0, 0.0] for k in range(21)], rng)
+    stood = straight(localizer, 200 * [START + [1.0, 0.0, 0.0]], rng, 21)
+    np.testing.assert_allclose(stood[-1].covariance, stood[0].covariance, rtol=1e-9, atol=1e-15)
+
+
+def test_a_robot_that_creeps_is_less_sure_with_every_metre():
+    rng = np.random.default_rng(5)
+    crept = straight(at_start(), [START + [0.02 * k, 0.0, 0.0] for k in range(101)], rng)
+    sigmas = np.array([np.sqrt(np.diag(estimate.covariance)) for estimate in crept])
+    assert (sigmas[50] > 0.002).all()
+    assert (sigmas[100] > sigmas[50]).all()
+
+
+def test_a_scan_whose_points_are_one_tells_no_pose():
+    _, localizer = driven(60)
+    before = localizer.pose
+    scan = Scan.create(60 * PERIOD_NS, np.full(181, 2.0), 0.5, 1e-18, 0.05, 8.0)
+    estimate = localizer.step(scan, np.zeros(3))
+    assert np.isfinite(estimate.T_map_base).all()
+    assert estimate.match_quality == 0.0
+    assert localizer.pose[:2] == pytest.approx(before[:2], abs=4.0)
+
+
 def test_a_robot_that_is_pushed_while_its_wheels_stand_is_followed():
     rng = np.random.default_rng(3)
     rows, localizer = driven(120)

@@ -108,6 +108,7 @@ class ScanLocalizer:
         self._T_odom_base: Array | None = None
         self._stamp_ns: int | None = None
         self._T_learned: Array | None = None
+        self._T_stood = self._pose  # where the robot was when it last moved
         # Covariances (3, 3), map frame: of the motion since a scan fitted, of the pose since the
         # map learned, of the place where it did since the anchor, and of contradictions on the way.
         self._since_fit = np.zeros((3, 3))
@@ -150,6 +151,7 @@ class ScanLocalizer:
             return
         least = np.diag(np.square(_STEP_SIGMAS))
         self._pose = se2.pose(*T_map_base.tolist())
+        self._T_stood = self._pose
         self._since_fit = 0.5 * (covariance + covariance.T) + least
         self._since_anchor = np.zeros((3, 3))
         self._since_learned = self._since_fit
@@ -219,19 +221,23 @@ class ScanLocalizer:
         before = self._pose
         Q = turned(np.diag(motion.variances), float(before[2]))
         prior = se2.compose(before, motion.increment)
-        lever = prior[:2] - before[:2]
-        self._since_fit = carried(self._since_fit, lever) + Q
-        self._since_anchor = carried(self._since_anchor, lever)
-        self._since_learned = carried(self._since_learned, lever)
+        stands = motion.stands and self._is_near(self._T_stood, prior)
+        self._since_fit = carried(self._since_fit, prior[:2] - before[:2]) + Q
+        if not stands:
+            lever = prior[:2] - self._T_stood[:2]
+            self._since_anchor = carried(self._since_anchor, lever)
+            self._since_learned = carried(self._since_learned, lever)
         match = self._match(scan, points, prior)
         if match is None:
             self._pose = prior
-            if not motion.stands:
+            if not stands:
                 self._since_learned = self._since_learned + Q
             self._by_motion = self._since_learned
             self._motion.interrupt()
         else:
-            self._take(match, before, prior, Q, motion.stands)
+            self._take(match, before, prior, Q, stands)
+        if not stands:
+            self._T_stood = self._pose
         self._lines.rest()
         if self.config.mapping and not self._is_unplaced:
             self._learn(scan, points)
@@ -261,6 +267,12 @@ class ScanLocalizer:
         self._evidence = self.config.lost_evidence
         sigma = _SIGMAS * np.array([self.config.slip_m] * 2 + [self.config.slip_rad])
         self._since_fit = np.diag(np.square(sigma))
+
+    def _is_near(self, T_map_base: Array, other: Array) -> bool:
+        """Whether two poses (3,) are no farther apart than odometry errs by in a step."""
+        off = np.abs(se2.off(other, T_map_base))
+        slip = [self.config.odom_slip_m, self.config.odom_slip_m, self.config.odom_slip_rad]
+        return bool((off <= _SIGMAS * np.array(slip)).all())
 
     def _expect(self, scan: Scan, T_odom_base: Array) -> Motion:
         """The motion since the last scan."""
@@ -292,6 +304,8 @@ class ScanLocalizer:
     def _match(self, scan: Scan, points: Array, prior: Array) -> Match | None:
         if len(points) < FEWEST_POINTS or self._map.is_empty:
             return None
+        if np.ptp(points, axis=0).max() < self.config.match_cell_m:
+            return None  # all in one place: they tell no pose
         return self._matcher.match(points, scan.T_base_laser, self._map, prior, self._since_fit)
 
     def _take(self, match: Match, before: Array, prior: Array, Q: Array, stands: bool) -> None:
@@ -381,6 +395,7 @@ class ScanLocalizer:
         """A loop was closed: pose, features and local map go where the keyframes have gone."""
         self._pose = correction.moved(self._loops.keyframes.anchor, self._pose)
         self._T_learned = self._pose
+        self._T_stood = self._pose
         self._adrift_m = 0.0
         self._lines.move(correction)
         self._draw_anew()
@@ -413,7 +428,7 @@ class ScanLocalizer:
         anchor = self._loops.keyframes.anchor
         if anchor >= 0:
             frame = self.keyframes[anchor]
-            own = own + carried(frame.covariance, self._pose[:2] - frame.T_map_base[:2])
+            own = own + carried(frame.covariance, self._T_stood[:2] - frame.T_map_base[:2])
         return np.asarray(0.5 * (own + own.T))
 
     def _estimate(self, match: Match | None, correction: Correction | None) -> Estimate:
