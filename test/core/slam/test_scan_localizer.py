@@ -185,7 +185,7 @@ def test_a_robot_that_creeps_is_less_sure_with_every_metre():
 def test_a_scan_whose_points_are_one_tells_no_pose():
     _, localizer = driven(60)
     before = localizer.pose
-    scan = Scan.create(60 * PERIOD_NS, np.full(181, 2.0), 0.5, 1e-18, 0.05, 8.0)
+    scan = Scan.create(60 * PERIOD_NS, np.full(16, 2.0), 0.5, 1e-18, 0.05, 8.0)
     estimate = localizer.step(scan, np.zeros(3))
     assert np.isfinite(estimate.T_map_base).all()
     assert estimate.match_quality == 0.0
