@@ -91,13 +91,31 @@ def test_files_and_figures(log, tmp_path, form):
     assert patch.occupied[wall[0], wall[1] - 1 : wall[1] + 2].any()
 
 
-def test_the_core_that_is_to_come_replays_it_too(log, tmp_path):
-    done = run(log, '-o', tmp_path / 'out', '--core', 'scan', '--slam', 'off')
+@pytest.mark.parametrize('core', ['scan', 'ekf'])
+@pytest.mark.parametrize('slam', ['off', 'ti', 'full'])
+def test_each_core_replays_it_with_and_without_line_features(tmp_path, core, slam):
+    log = tmp_path / 'log.clf'
+    log.write_text('\n'.join(carmen_lines(scans=60)) + '\n')
+    done = run(log, '-o', tmp_path / 'out', '--core', core, '--slam', slam)
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / 'out' / 'report.json').read_text())
-    assert (report['scans'], report['skipped'], report['features']) == (30, 0, 0)
+    assert (report['scans'], report['skipped']) == (60, 0)
+    assert (report['features'] == 0) == (slam == 'off')
     trajectory = np.loadtxt(tmp_path / 'out' / 'trajectory.tum')
-    assert np.abs(trajectory[:, 1] - 0.03 * np.arange(30)).max() < 0.05
+    assert np.abs(trajectory[:, 1] - 0.03 * np.arange(60)).max() < 0.05
+
+
+def test_the_core_is_the_scan_matcher_unless_it_is_told(log, tmp_path):
+    for name, options in (
+        ('default', []),
+        ('scan', ['--core', 'scan']),
+        ('ekf', ['--core', 'ekf']),
+    ):
+        assert run(log, '-o', tmp_path / name, *options).returncode == 0
+    default, scan, ekf = (
+        (tmp_path / name / 'trajectory.tum').read_bytes() for name in ('default', 'scan', 'ekf')
+    )
+    assert default == scan != ekf
 
 
 @pytest.mark.parametrize('share', [0.5, 0.97])
