@@ -1,4 +1,4 @@
-"""The localizer: one step for each scan, live and offline."""
+"""The localizer of the third paper, `--core ekf`: one step for each scan, offline."""
 
 import math
 from collections.abc import Mapping

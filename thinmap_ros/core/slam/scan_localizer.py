@@ -1,4 +1,4 @@
-"""The localizer that is to take the place of `localizer`, beside it until it is better everywhere.
+"""The localizer: one step for each scan, live and offline.
 
 A scan is matched with the local map from where odometry and velocity expect it. The local map grows
 where the robot moves; keyframes and loop closure keep the whole consistent. A robot whose scans
