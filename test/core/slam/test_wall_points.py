@@ -47,13 +47,14 @@ def test_a_killed_localizer_does_not_bend_the_map(seed, resolution, slip):
     localizer, last = ScanLocalizer(config), None
     grid = OccupancyGrid(OccupancyConfig(resolution_m=resolution))
     off = se2.pose(slip[0], 0.0, slip[1])
-    worst = 0.0
+    before, worst = 0.0, 0.0
     for k, (truth, odom) in enumerate(drive(700, rng, START)):
         scan = scan_in(ROOM, truth, rng, k)
         if k < 400:
             estimate = localizer.step(scan, odom)
             grid.update(scan, estimate.T_map_base)
             last = LastPose(k, estimate.T_map_odom, odom)
+            before = max(before, float(np.hypot(*(estimate.T_map_base - truth)[:2])))
         elif k >= 450:
             if k == 450:
                 slipped = se2.compose(odom, off)
@@ -61,4 +62,6 @@ def test_a_killed_localizer_does_not_bend_the_map(seed, resolution, slip):
             estimate = localizer.step(scan, se2.compose(odom, off))
             worst = max(worst, float(np.hypot(*(estimate.T_map_base - truth)[:2])))
     assert not estimate.lost
-    assert worst < 0.06
+    # Than the map that it was given, and a cell.
+    assert worst < before + 0.05
+    assert worst < 0.1
