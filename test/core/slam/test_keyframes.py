@@ -7,12 +7,14 @@ import pytest
 from slam_room import ROOM, scan_in
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.slam import keyframes as module
 from thinmap_ros.core.slam.edges import Edge
 from thinmap_ros.core.slam.keyframes import (
     Keyframe,
     KeyframeConfig,
     Keyframes,
     carried,
+    covariances_from,
     inverse,
     turned,
     unlike,
@@ -210,3 +212,19 @@ def test_a_carried_covariance_is_that_of_what_is_bound_to_it(rng):
     )
     np.testing.assert_allclose(carried(covariance, lever), np.cov(ends.T), atol=2e-4)
     np.testing.assert_array_equal(carried(covariance, np.zeros(2)), covariance)
+
+
+def test_covariances_along_the_graph_are_the_same_in_plain_python(rng, monkeypatch):
+    poses = np.column_stack([rng.uniform(-5, 5, (12, 2)), rng.uniform(-3, 3, 12)])
+    pairs = [(i, i + 1) for i in range(10)] + [(8, 2), (0, 7)]
+    edges = []
+    for a, b in pairs:
+        A = rng.normal(0.0, 1.0, (3, 3))
+        information = inverse(A @ A.T * 1e-3 + 1e-4 * np.eye(3))
+        edges.append(Edge(a, b, se2.between(poses[a], poses[b]), information, False))
+    compiled = covariances_from(3, poses, edges)
+    assert np.isinf(compiled[11]).all(), 'no chain leads there'
+    assert (compiled[3] == 0.0).all()
+    np.testing.assert_allclose(compiled, np.swapaxes(compiled, 1, 2), atol=1e-12)
+    monkeypatch.setattr(module, '_covariances', module._covariances.py_func)
+    np.testing.assert_allclose(covariances_from(3, poses, edges), compiled, rtol=1e-12)
