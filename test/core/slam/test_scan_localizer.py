@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from slam_room import BLIND, ROOM, drive, scan_in
+from slam_room import BLIND, ROOM, drive, drive_round_the_block, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
@@ -497,3 +497,15 @@ def test_a_state_that_is_none_is_refused_in_words(whole_drive, name, value):
         state[name] = value
     with pytest.raises(InputError, match='expected'):
         ScanLocalizer.from_state(state)
+
+
+def test_a_loop_that_is_closed_while_the_robot_slides_into_the_old_map_is_closed_well():
+    """Back at the start, the old walls take the robot over before the loop is closed."""
+    localizer = at_start(start_x_m=3.0, start_y_m=1.2)
+    corrections, away = 0, []
+    for scan, odom, truth in drive_round_the_block():
+        estimate = localizer.step(scan, odom)
+        corrections += estimate.correction is not None
+        away.append(np.hypot(*se2.between(truth, estimate.T_map_base)[:2]))
+    assert corrections > 1, 'the step into the old map is measured after the loop'
+    assert away[-1] < 0.5

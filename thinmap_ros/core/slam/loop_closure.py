@@ -181,8 +181,7 @@ class LoopClosure:
                 self._settle()
                 self._requested.clear()
                 self.edges += consistent
-                self._before = self.keyframes.poses()
-                self._rounds = rounds(self._before, self.keyframes.steps + self.edges)
+                self._begin_rounds()
         return None
 
     def _optimize(self) -> Correction | None:
@@ -206,7 +205,30 @@ class LoopClosure:
             last = self.keyframes.anchor
             self._pending = (_moved(frame, before[last], poses[last]), covariance)
         self._submap = None
+        self._measure_jumps()
         return Correction(before, poses)
+
+    def _measure_jumps(self) -> None:
+        """Optimize again where a step that was taken meanwhile led to another map of the place.
+
+        The scans that closed the loop lie in the new map, those after such a step in the old one.
+        """
+        last = len(self.keyframes)
+        jumps = [job for job in self._jobs if job.k < last and self._is_step(job.j, job.k)]
+        for job in jumps:
+            self._jobs.remove(job)
+            known = len(self.edges)
+            self._match(job)
+            if any(self._mahalanobis(edge) > _CHI2 for edge in self.edges[known:]):
+                self._begin_rounds()
+
+    def _is_step(self, j: int, k: int) -> bool:
+        """Whether keyframe j was the anchor of keyframe k."""
+        return k < len(self.keyframes) and self.keyframes.steps[k - 1].a == j
+
+    def _begin_rounds(self) -> None:
+        self._before = self.keyframes.poses()
+        self._rounds = rounds(self._before, self.keyframes.steps + self.edges)
 
     def _match(self, job: _Job) -> None:
         """Match keyframe k, or the pending one, with the submap around j."""
@@ -231,7 +253,7 @@ class LoopClosure:
         covariance = turned(covariance, float(T_j_base[2]))
         T_j_k = se2.compose(T_j_base, match.T_map_base)
         edge = Edge(j, k, T_j_k, inverse(covariance), True)
-        if k < len(self.keyframes) and self.keyframes.steps[k - 1].a == j:
+        if self._is_step(j, k):
             self.edges.append(edge)
         elif self._mahalanobis(edge) < _CHI2:
             self._agree(edge)
