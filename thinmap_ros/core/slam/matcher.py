@@ -40,6 +40,7 @@ _MASK = TILE - 1
 _SETTLED = 1e-4  # m and rad: a step that is smaller is the last
 _SIGMAS = 3.0  # a search goes as far as the motion is uncertain, so many sigmas
 FEWEST_POINTS = 10
+_UNDECIDED = 2.5  # costs of beams waver by so much along a corridor that says nothing
 _SEARCHED_POINTS = 80
 
 
@@ -111,15 +112,16 @@ class Matcher:
         scan = self.weighted(points_base)
         information = inverse(covariance)
         match = self._refined(scan, lattice, prior, prior, information)
-        if match.fit >= self.config.match_least_fit and self._is_near(covariance):
+        fits = match.fit >= self.config.match_least_fit
+        if fits and self._is_near(covariance):
             return match
         start = self._search(scan, lattice, prior, covariance, information)
         other = self._refined(scan, lattice, start, prior, information)
-        return min(
-            match,
-            other,
-            key=lambda each: self._beam_cost(scan, laser, lattice, each, prior, information),
+        here, there = (
+            self._beam_cost(scan, laser, lattice, each, prior, information)
+            for each in (match, other)
         )
+        return other if there < here - (_UNDECIDED if fits else 0.0) else match
 
     def _is_near(self, covariance: Array) -> bool:
         """Whether points at a prior with covariance (3, 3) lie where their walls draw them."""
