@@ -353,6 +353,34 @@ def test_a_robot_that_is_carried_off_begins_a_new_map_and_says_so():
     np.testing.assert_allclose(found, steps, atol=0.06)
 
 
+def crowd(at, rng):
+    """The room, and people who crowd round a place, at other places in each scan."""
+    angles = rng.uniform(-np.pi, np.pi, 30)
+    outward = np.column_stack([np.cos(angles), np.sin(angles)])
+    middles = at + rng.uniform(0.6, 1.6, 30)[:, None] * outward
+    across = 0.2 * outward[:, ::-1] * [-1.0, 1.0]
+    return np.vstack([ROOM, np.hstack([middles - across, middles + across])])
+
+
+@pytest.mark.parametrize('seed', [1, 2, 3, 5, 6, 7])
+def test_a_crowd_does_not_move_a_robot_whose_wheels_know_better(seed):
+    """It is lost, and its new map lies where the wheels have led."""
+    rng = np.random.default_rng(seed)
+    rows, localizer = driven(150, seed=seed)
+    rows = on(localizer, 10, rows[-1][0], rows[-1][2], rng)
+    truth, estimate, odom = rows[-1]
+    before = estimate.T_map_base - truth
+    for _ in range(40):
+        segments = crowd(truth[:2], rng)
+        (truth, estimate, odom), *_ = on(localizer, 1, truth, odom, rng, segments)
+        if estimate.lost:
+            break
+    assert estimate.lost
+    off = estimate.T_map_base - truth - before
+    assert np.hypot(off[0], off[1]) < 0.05
+    assert abs(se2.wrap(off[2])) < 0.02
+
+
 def test_a_robot_that_is_brought_back_knows_its_path():
     """Old keyframes stay where they were."""
     rng = np.random.default_rng(8)

@@ -117,6 +117,8 @@ class ScanLocalizer:
         self._by_motion = np.zeros((3, 3))  # the part of `_since_learned` that the motion leaves
         self._jump = np.zeros((3, 3))
         self._evidence = 0.0
+        # Where the motion alone leads since a scan agreed with the map: pose, covariance.
+        self._reckoned = (self._pose, np.zeros((3, 3)))
         self._is_unplaced = False  # in a map that was given, or put somewhere by hand
         self._adrift_m = 0.0  # path for which a new local map is not yet part of the map
         self._submap = 0
@@ -160,6 +162,7 @@ class ScanLocalizer:
         self._is_unplaced = True
         self._adrift_m = 0.0
         self._evidence = 0.0
+        self._reckoned = (self._pose, self._since_fit)
         self._draw_anew()
 
     def state(self) -> dict[str, NDArray[Any]]:
@@ -227,8 +230,11 @@ class ScanLocalizer:
             lever = prior[:2] - self._T_stood[:2]
             self._since_anchor = carried(self._since_anchor, lever)
             self._since_learned = carried(self._since_learned, lever)
+        self._reckon(motion)
         match = self._match(scan, points, prior)
-        if match is None:
+        if match is not None:
+            self._judge(match)
+        if match is None or self._is_refused(match, prior):
             self._pose = prior
             if not stands:
                 self._since_learned = self._since_learned + Q
@@ -236,6 +242,8 @@ class ScanLocalizer:
             self._motion.interrupt()
         else:
             self._take(match, before, prior, Q, stands)
+        if self._evidence == 0.0:
+            self._reckoned = (self._pose, self._since_fit)
         if not stands:
             self._T_stood = self._pose
         self._lines.rest()
@@ -296,6 +304,13 @@ class ScanLocalizer:
             return Motion(motion.increment, motion.variances + unknown, False)
         return self._motion.expect(increment, seconds)
 
+    def _reckon(self, motion: Motion) -> None:
+        """Carry the pose that the motion alone leads to on by a step."""
+        before, covariance = self._reckoned
+        after = se2.compose(before, motion.increment)
+        Q = turned(np.diag(motion.variances), float(before[2]))
+        self._reckoned = (after, carried(covariance, after[:2] - before[:2]) + Q)
+
     def _points(self, scan: Scan) -> Array:
         """Points (N, 2) that can be matched, robot frame."""
         near = scan.ranges_m[scan.hit] < self.config.match_range_m
@@ -312,7 +327,7 @@ class ScanLocalizer:
         """The pose of a match, and what it says of the motion, and of where the robot is."""
         self._pose = match.T_map_base
         off = se2.off(match.T_map_base, prior)
-        if float(off @ np.linalg.solve(self._since_fit, off)) > _CHI2:
+        if self._is_unexpected(match, prior):
             # Scan and motion contradict each other: one of them is wrong, or the match has led back
             # to what was mapped before, which is no motion.
             self._jump = self._jump + np.outer(off, off)
@@ -327,7 +342,19 @@ class ScanLocalizer:
             by_motion = inverse(self._since_learned + Q)
             self._since_learned = inverse(by_motion + match.by_scan)
             self._by_motion = self._since_learned @ by_motion @ self._since_learned
-        self._judge(match)
+
+    def _is_unexpected(self, match: Match, prior: Array) -> bool:
+        """Whether a match contradicts the motion."""
+        off = se2.off(match.T_map_base, prior)
+        return float(off @ np.linalg.solve(self._since_fit, off)) > _CHI2
+
+    def _is_refused(self, match: Match, prior: Array) -> bool:
+        """Whether a match contradicts the motion, and most of its points the map: it is chance.
+
+        Not of a robot that was put somewhere: where it was before says nothing.
+        """
+        by_chance = match.contradicted > match.fit and self._is_unexpected(match, prior)
+        return by_chance and not self._is_unplaced
 
     def _judge(self, match: Match) -> None:
         """Whether scans contradict the map.
@@ -380,10 +407,17 @@ class ScanLocalizer:
         self._jump = np.zeros((3, 3))
 
     def _begin_submap(self) -> None:
-        """Go on in a new local map: where the robot is in the old one is not known any more."""
+        """Go on in a new local map: where the robot is in the old one is not known any more.
+
+        The new one lies where the motion has led since a scan agreed with the old one: the matches
+        since then were with what contradicts them, as in a crowd.
+        """
         sigma = _SIGMAS * np.array([self.config.slip_m] * 2 + [self.config.slip_rad])
-        self._jump = self._jump + np.diag(np.square(sigma)) + self._since_fit
-        self._since_anchor = self._since_anchor + np.diag(np.square(sigma)) + self._since_fit
+        self._pose, covariance = self._reckoned
+        self._T_stood = self._pose
+        covariance = covariance + np.diag(np.square(sigma))
+        self._jump = self._jump + covariance
+        self._since_anchor = self._since_anchor + covariance
         self._map = LocalMap(self.config)
         self._due = []
         self._submap += 1
@@ -393,7 +427,9 @@ class ScanLocalizer:
 
     def _apply(self, correction: Correction) -> None:
         """A loop was closed: pose, features and local map go where the keyframes have gone."""
-        self._pose = correction.moved(self._loops.keyframes.anchor, self._pose)
+        anchor = self._loops.keyframes.anchor
+        self._pose = correction.moved(anchor, self._pose)
+        self._reckoned = (correction.moved(anchor, self._reckoned[0]), self._reckoned[1])
         self._T_learned = self._pose
         self._T_stood = self._pose
         self._adrift_m = 0.0
