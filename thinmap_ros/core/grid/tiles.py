@@ -14,6 +14,7 @@ NO_TILE = -1
 _MOST_TILES = 1 << 15  # 134 million cells, some 1.1 km in each direction at 0.1 m
 MOST_CELLS = _MOST_TILES * TILE * TILE
 FARTHEST_TILE = int(FARTHEST_M / FINEST_M) // TILE  # of the finest cells
+_FIRST = 64  # tiles that there is room for at first; what is not used costs no memory
 _BORDER = 4  # tiles by which the directory grows at a time
 
 
@@ -24,12 +25,12 @@ class TileStore:
     `directory` (R, C) int32 says for each tile of a bounding rectangle which slot of `pool`
     (N, TILE, TILE, *per_cell) holds it, or NO_TILE; `first_row`, `first_col`: tile coordinates of
     directory[0, 0]. Only the directory, one number a tile, is ever laid anew when the map grows;
-    the pool is lengthened by half.
+    the pool is lengthened by half, or more where more is needed at once.
     """
 
     def __init__(self, dtype: DTypeLike = np.int16, per_cell: tuple[int, ...] = ()) -> None:
         self.directory: NDArray[np.int32] = np.full((1, 1), NO_TILE, dtype=np.int32)
-        self.pool: NDArray[Any] = np.zeros((4, TILE, TILE, *per_cell), dtype=dtype)
+        self.pool: NDArray[Any] = np.zeros((_FIRST, TILE, TILE, *per_cell), dtype=dtype)
         self.first_row = 0
         self.first_col = 0
         self.used = 0
@@ -56,17 +57,22 @@ class TileStore:
         self.directory, self.first_row, self.first_col = wider, low_row, low_col
 
     def ensure(self, tiles: NDArray[np.int64]) -> None:
-        """Make the tiles (N, 2), (row, col) in tile coordinates inside the directory, exist."""
-        for row, col in tiles:
-            place = (row - self.first_row, col - self.first_col)
-            if self.directory[place] == NO_TILE:
-                if self.used == self.pool.shape[0]:
-                    size = self.used + self.used // 2
-                    longer = np.zeros((size, *self.pool.shape[1:]), dtype=self.pool.dtype)
-                    longer[: self.used] = self.pool
-                    self.pool = longer
-                self.directory[place] = self.used
-                self.used += 1
+        """Make the tiles (N, 2), (row, col) in tile coordinates inside the directory, exist.
+
+        Those that did not are stored in the order in which they are given.
+        """
+        at = tiles - (self.first_row, self.first_col)
+        missing = at[self.directory[at[:, 0], at[:, 1]] == NO_TILE]
+        missing = np.array(list(dict.fromkeys(map(tuple, missing.tolist()))), dtype=np.int64)
+        missing = missing.reshape(-1, 2)
+        used = self.used + len(missing)
+        if used > self.pool.shape[0]:
+            size = max(used, self.used + self.used // 2)
+            longer = np.zeros((size, *self.pool.shape[1:]), dtype=self.pool.dtype)
+            longer[: self.used] = self.pool[: self.used]
+            self.pool = longer
+        self.directory[missing[:, 0], missing[:, 1]] = np.arange(self.used, used)
+        self.used = used
 
     def places(self) -> NDArray[np.int64]:
         """Tile coordinates (N, 2) as (row, col) of the tiles in the order of their slots."""

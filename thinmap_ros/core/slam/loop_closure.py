@@ -74,7 +74,9 @@ class LoopClosure:
     def __init__(self, config: LoopConfig, matcher: Matcher) -> None:
         self.keyframes = Keyframes(config)
         self.edges: list[Edge] = []
-        self._config, self._matcher = config, matcher
+        self._config = config
+        # By how much wheels may have slipped is part of the covariance along the graph.
+        self._matcher = Matcher(replace(matcher.config, slip_m=0.001, slip_rad=0.001))
         self._jobs: deque[_Job] = deque()
         self._pending: tuple[Keyframe, Array] | None = None
         self._requested: deque[Edge] = deque(maxlen=_RECENT)
