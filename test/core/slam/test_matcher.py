@@ -122,6 +122,28 @@ def test_a_wide_doubt_is_searched_though_the_nearest_minimum_fits(rng):
     assert abs(match(local_map, points, prior, doubt).T_map_base[0]) < 0.03
 
 
+def near_points(pose, rng):
+    """What a laser of 6 m sees of the corridor, (N, 2), robot frame."""
+    points = scan_in(CORRIDOR, pose, rng).points_base()
+    return points[np.hypot(*points.T) < 6.0]
+
+
+def test_a_robot_that_sees_no_end_of_a_corridor_goes_on_along_it():
+    """Where it was before, all that it sees is known; where it is now, some of it is not."""
+    here, truth = np.zeros(3), np.array([1.0, 0.0, 0.0])
+    doubt = np.diag(np.square([0.12, 0.12, 0.02]))
+    back = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        local_map = LocalMap(MATCHER.config)
+        for x in np.arange(-10.0, 0.1, 1.0):
+            pose = np.array([x, 0.0, 0.0])
+            local_map.add_scan(near_points(pose, rng), here, pose)
+        found = match(local_map, near_points(truth, rng), truth, doubt)
+        back.append(truth[0] - found.T_map_base[0])
+    assert np.median(np.abs(back)) < 0.25
+
+
 @pytest.mark.parametrize('angle', [0.0, 0.4, 0.785, 1.2])
 def test_along_a_slanted_corridor_the_scan_says_nothing_either(rng, angle):
     turn = np.array([0.0, 0.0, angle])
@@ -317,13 +339,21 @@ def test_kernels_are_what_they_are_in_plain_python(room, scan):
         )
 
 
+def is_seen(local_map, points):
+    """Whether a beam has passed through or ended in the cells of points (N, 2), (N,)."""
+    cells = np.floor(points / local_map.config.match_cell_m).astype(int)
+    seen = [local_map.tiles.read(int(y), int(x), 1, 1)['seen'][0, 0] > 0 for x, y in cells]
+    return np.array(seen)
+
+
 def test_the_search_finds_the_least_of_its_lattice(rng, room, scan):
     """Against trying every pose of it."""
     thin = np.ascontiguousarray(scan[::9])
     information = np.linalg.inv(np.diag(np.square([0.2, 0.2, 0.1])))
     prior = TRUTH + [0.13, -0.08, 0.06]
     steps, sizes = np.array([3, 3, 4]), np.array([0.1, 0.03])
-    found = module._searched(thin, prior, steps, sizes, information, room.lattice, *MATCHER._noise)
+    rest = (information, room.lattice, *MATCHER._noise, 3.0, 0.5)
+    found = module._searched(thin, prior, steps, sizes, *rest)
     sigma, outlier = NOISE
     cell_m = room.config.match_cell_m
     least, best = np.inf, None
@@ -333,7 +363,10 @@ def test_the_search_finds_the_least_of_its_lattice(rng, room, scan):
                 pose = prior + [0.1 * b, 0.1 * a, 0.03 * k]
                 middles = (np.floor(world(thin[:, :2], pose) / cell_m) + 0.5) * cell_m
                 errors = room.distances(middles) / sigma
-                scans = (thin[:, 2] * cauchy(errors**2, outlier / sigma)).sum()
+                costs = cauchy(errors**2, outlier / sigma)
+                far = errors >= room.config.match_reach_m / sigma
+                costs[far & ~is_seen(room, middles)] *= 0.5
+                scans = (thin[:, 2] * costs).sum()
                 away = pose - prior
                 cost = tempered(scans, thin[:, 2].sum())
                 cost += cauchy(away @ information @ away, 3.0)

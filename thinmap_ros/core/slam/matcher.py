@@ -40,6 +40,8 @@ _MASK = TILE - 1
 _SETTLED = 1e-4  # m and rad: a step that is smaller is the last
 _SIGMAS = 3.0  # a search goes as far as the motion is uncertain, so many sigmas
 FEWEST_POINTS = 10
+_NEVER = 1e6  # sigmas of the motion beyond which wheels have slipped, where they have not
+_UNSEEN = 0.5  # cost of a point where nobody has looked yet, for one in the open
 _UNDECIDED = 2.5  # costs of beams waver by so much along a corridor that says nothing
 _SEARCHED_POINTS = 80
 
@@ -115,10 +117,14 @@ class Matcher:
         fits = match.fit >= self.config.match_least_fit
         if fits and self._is_near(covariance):
             return match
-        start = self._search(scan, lattice, prior, covariance, information)
+        # Where a pose that the motion allows tells the scan, wheels have not slipped. Where none
+        # does, the robot is rather where more of what it sees is known.
+        slipped = _NEVER if fits else _SIGMAS
+        unseen = _UNSEEN if fits else 1.0
+        start = self._search(scan, lattice, prior, covariance, information, slipped, unseen)
         other = self._refined(scan, lattice, start, prior, information)
         here, there = (
-            self._beam_cost(scan, laser, lattice, each, prior, information)
+            self._beam_cost(scan, laser, lattice, each, prior, information, slipped)
             for each in (match, other)
         )
         return other if there < here - (_UNDECIDED if fits else 0.0) else match
@@ -136,11 +142,12 @@ class Matcher:
         match: Match,
         prior: Array,
         information: Array,
+        slipped: float,
     ) -> float:
         """Cost of a match (beams and motion), to be compared with that of another one."""
         off = se2.off(match.T_map_base, prior)
         beams = _beam_cost(scan, laser, match.T_map_base, lattice, *self._noise)
-        return beams + _loss(float(off @ information @ off), _SIGMAS)
+        return beams + _loss(float(off @ information @ off), slipped)
 
     def weighted(self, points_base: Array) -> Array:
         """A scan as the kernels take it, (N, 3): x, y, weight.
@@ -176,9 +183,20 @@ class Matcher:
         )
 
     def _search(
-        self, scan: Array, lattice: Lattice, prior: Array, covariance: Array, information: Array
+        self,
+        scan: Array,
+        lattice: Lattice,
+        prior: Array,
+        covariance: Array,
+        information: Array,
+        slipped: float,
+        unseen: float,
     ) -> Array:
-        """The pose (3,) within the uncertainty of a prior at which the sum is lowest."""
+        """The pose (3,) within the uncertainty of a prior at which the sum is lowest.
+
+        slipped: so many sigmas off the prior, wheels have slipped as likely as not; unseen: cost of
+        a point where nobody has looked yet, for one in the open.
+        """
         step_m = 2.0 * self.config.match_cell_m
         sparse = np.ascontiguousarray(scan[:: max(1, len(scan) // _SEARCHED_POINTS)])
         sparse[:, 2] *= len(scan) / len(sparse)
@@ -189,7 +207,8 @@ class Matcher:
         steps = np.ceil(reach / [step_m, step_m, step_rad]).astype(np.int64)
         steps = np.minimum(steps, [20, 20, 60])
         sizes = np.array([step_m, step_rad])
-        return _searched(sparse, prior, steps, sizes, information, lattice, *self._noise)
+        rest = (*self._noise, slipped, unseen)
+        return _searched(sparse, prior, steps, sizes, information, lattice, *rest)
 
 
 @inlined
@@ -240,14 +259,27 @@ def _is_seen(lattice: Lattice, row: int, col: int) -> bool:
     return slot != NO_TILE and lattice.pool[slot, row & _MASK, col & _MASK]['seen'] > 0
 
 
+@inlined
+def _end_cost(
+    lattice: Lattice, row: int, col: int, sigma: float, width: float, unseen: float
+) -> float:
+    """Cost of a beam that ends in a cell.
+
+    Where nobody has looked yet it costs less than in the open: ahead of a robot that moves there
+    are such ends, and a pose farther back, where there are none, would seem the likelier.
+    """
+    error = cell_distance(lattice, row, col) / sigma
+    cost = _loss(error * error, width)
+    if error >= lattice.reach / sigma and not _is_seen(lattice, row, col):
+        cost *= unseen
+    return cost
+
+
 @kernel
 def _beam_cost(
     scan: Array, laser: Array, pose: Array, lattice: Lattice, sigma: float, width: float
 ) -> float:
-    """Cost of the beams of a scan at a pose: their ends, and the walls that they would cross.
-
-    An end where nobody has looked yet costs half as much as one in the open.
-    """
+    """Cost of the beams of a scan at a pose: their ends, and the walls that they would cross."""
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     cell_m, reach = lattice.cell_m, float(lattice.reach)
     x0 = (pose[0] + cos * laser[0] - sin * laser[1]) / cell_m - lattice.first_col
@@ -257,14 +289,11 @@ def _beam_cost(
     for i in range(len(scan)):
         x1 = (pose[0] + cos * scan[i, 0] - sin * scan[i, 1]) / cell_m - lattice.first_col
         y1 = (pose[1] + sin * scan[i, 0] + cos * scan[i, 1]) / cell_m - lattice.first_row
-        row, col = _cell_of(y1), _cell_of(x1)
-        error = cell_distance(lattice, row, col) / sigma
         if _is_crossed(lattice, x0, y0, x1, y1):
             cost += scan[i, 2] * gross
-        elif error < reach / sigma:
-            cost += scan[i, 2] * _loss(error * error, width)
         else:
-            cost += scan[i, 2] * gross * (1.0 if _is_seen(lattice, row, col) else 0.5)
+            row, col = _cell_of(y1), _cell_of(x1)
+            cost += scan[i, 2] * _end_cost(lattice, row, col, sigma, width, _UNSEEN)
     return _tempered(cost, scan[:, 2].sum())
 
 
@@ -441,6 +470,8 @@ def _searched(
     lattice: Lattice,
     sigma: float,
     width: float,
+    slipped: float,
+    unseen: float,
 ) -> Array:
     """The pose (3,) of a lattice round a prior with the lowest sum."""
     cell_m = lattice.cell_m
@@ -467,7 +498,7 @@ def _searched(
             for j in range(2 * steps[0] + 1):
                 a, b = _outwards(i), _outwards(j)
                 dx, dy = b * sizes[0], a * sizes[0]
-                by_motion = _loss(_quadratic(by_prior, dx, dy, turn), _SIGMAS)
+                by_motion = _loss(_quadratic(by_prior, dx, dy, turn), slipped)
                 if by_motion >= lowest:
                     continue
                 most = usual * math.expm1((lowest - by_motion) / usual)
@@ -475,8 +506,9 @@ def _searched(
                 for p in range(len(scan)):
                     r, c = at[p, 0] + stride * a, at[p, 1] + stride * b
                     if costs[r, c] < 0.0:
-                        error = cell_distance(lattice, r + corner_row, c + corner_col) / sigma
-                        costs[r, c] = np.float32(_loss(error * error, width))
+                        row, col = r + corner_row, c + corner_col
+                        end = _end_cost(lattice, row, col, sigma, width, unseen)
+                        costs[r, c] = np.float32(end)
                     cost += scan[p, 2] * costs[r, c]
                     if cost >= most:
                         break
