@@ -117,8 +117,8 @@ class Matcher:
         fits = match.fit >= self.config.match_least_fit
         if fits and self._is_near(covariance):
             return match
-        # Where a pose that the motion allows tells the scan, wheels have not slipped. Where none
-        # does, the robot is rather where more of what it sees is known.
+        # Wheel slip is considered only where no pose that the motion allows explains the scan; then
+        # the robot is rather where more of what it sees is known.
         slipped = _NEVER if fits else _SIGMAS
         unseen = _UNSEEN if fits else 1.0
         start = self._search(scan, lattice, prior, covariance, information, slipped, unseen)
