@@ -95,6 +95,25 @@ def test_the_whole_path_is_told_afterwards(whole_drive):
     assert len(localizer.keyframes) < len(stamps)
 
 
+GRAZING = pytest.mark.xfail(strict=True, reason='far points on grazing walls draw matches back')
+
+
+@GRAZING
+def test_the_whole_path_is_within_4_cm(whole_drive):
+    rows, localizer = whole_drive
+    off = (localizer.corrected_path() - np.array([truth for truth, *_ in rows]))[:, :2]
+    assert np.sqrt(np.mean(np.square(off).sum(axis=1))) < 0.04
+
+
+@GRAZING
+def test_a_pose_that_is_set_is_within_5_cm():
+    rows, localizer = driven(300)
+    truth, _, odom = rows[-1]
+    localizer.set_pose(truth + [0.1, -0.1, 0.05], np.diag([0.04, 0.04, 0.01]))
+    after = on(localizer, 10, truth, odom, np.random.default_rng(9))
+    assert np.hypot(*errors_of(after)[-1][:2]) < 0.05
+
+
 def test_drives_are_as_true_as_their_first_scans():
     """Whatever the noise was: on average over drives."""
     rms = []
@@ -362,7 +381,12 @@ def crowd(at, rng):
     return np.vstack([ROOM, np.hstack([middles - across, middles + across])])
 
 
-@pytest.mark.parametrize('seed', [1, 2, 3, 5, 6, 7])
+CHANCE = pytest.mark.xfail(strict=True, reason='more points of the crowd fit by chance than not')
+
+
+@pytest.mark.parametrize(
+    'seed', [pytest.param(k, marks=CHANCE) if k in (0, 4) else k for k in range(8)]
+)
 def test_a_crowd_does_not_move_a_robot_whose_wheels_know_better(seed):
     """It is lost, and its new map lies where the wheels have led."""
     rng = np.random.default_rng(seed)
