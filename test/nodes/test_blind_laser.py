@@ -52,6 +52,7 @@ def test_a_blind_laser_stops_an_exploration_which_goes_on_when_it_sees_again(gra
     graph.start('sim', start='2.0,2.0,0.9', remap=('scan:=raw_scan',), hold_for_subscribers=1)
     client = ActionClient(graph.node, Explore, 'explore')
     graph.send_goal(client, Explore.Goal())
+    graph.until(lambda: truth and statuses, 'where it is, and how it stands')
 
     def place():
         return np.array([truth[-1].pose.position.x, truth[-1].pose.position.y])

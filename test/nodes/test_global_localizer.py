@@ -79,6 +79,7 @@ def test_a_robot_that_drives_about_finds_itself_when_asked(graph, map_file):
         return poses
 
     graph.until(found, 'a pose')
+    graph.until(lambda: samples, 'samples')
     pose = poses[-1]
     ns = messages.stamp_ns(pose.header.stamp)
     graph.until(lambda: messages.stamp_ns(truth[-1].header.stamp) >= ns, 'where it was then')
@@ -119,7 +120,7 @@ def test_a_robot_that_may_drive_finds_itself_alone_and_stops(graph, tmp_path):
         'global_localizer', map=str(map_file), automatic=True, active=True, use_sim_time=True
     )
     graph.start('sim', world=str(tmp_path / 'twins.yaml'), rate=4.0, lockstep='localization_status')
-    graph.until(lambda: poses, 'a pose')
+    graph.until(lambda: poses and truth and commands, 'a pose, the true one and commands')
     ns = messages.stamp_ns(poses[-1].header.stamp)
     graph.until(lambda: messages.stamp_ns(truth[-1].header.stamp) >= ns, 'where it was then')
     at = min(truth, key=lambda message: abs(messages.stamp_ns(message.header.stamp) - ns))

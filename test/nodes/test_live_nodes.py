@@ -61,11 +61,18 @@ def test_a_scan_becomes_a_pose_a_map_and_a_graph(graph, tmp_path):
     status = graph.heard('slam_status', SlamStatus)
     scans, frames = graph.heard('scan', LaserScan, qos.SENSOR), graph.heard('/tf', TFMessage)
     local_maps = graph.heard('local_map', OccupancyGrid, qos.LATCHED)
+
+    def links():
+        return {(t.header.frame_id, t.child_frame_id) for m in frames for t in m.transforms}
+
     graph.start('localizer', use_sim_time=True, **AT_START)
     graph.start('grid_mapper', use_sim_time=True)
     graph.start('topology_builder', use_sim_time=True)
     graph.start('sim', start=START, rate=4.0, lockstep='local_topology', hold_for_subscribers=3)
-    graph.until(lambda: len(local_maps) > 8, 'local maps')
+    graph.until(
+        lambda: len(local_maps) > 8 and poses and status and scans and ('map', 'odom') in links(),
+        'local maps, poses, status, scans and the frame of the odometry',
+    )
     # Not set against the scans heard here: sensor data may be lost on the way to one listener and
     # not to another.
     assert not np.mod(np.array(stamps(poses)) - stamps(scans)[0], SCAN_PERIOD_NS).any()
@@ -74,9 +81,6 @@ def test_a_scan_becomes_a_pose_a_map_and_a_graph(graph, tmp_path):
         np.hypot(poses[-1].pose.pose.position.x - 2.0, poses[-1].pose.pose.position.y - 2.0) < 0.05
     )
     assert status[-1].state == SlamStatus.TRACKING
-    assert ('map', 'odom') in {
-        (t.header.frame_id, t.child_frame_id) for m in frames for t in m.transforms
-    }
     # Who comes later still gets map and graph: both are transient local.
     maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
     graphs = graph.heard('topology', TopologicalMap, qos.LATCHED)
