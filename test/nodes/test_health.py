@@ -2,7 +2,7 @@
 
 import pytest
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
@@ -186,8 +186,14 @@ def test_pause_and_reset(graph):
     graph.start('sim', start=START, hold_for_subscribers=2, rate=4.0)
     graph.until(lambda: maps and graphs and graphs[-1].nodes, 'map and graph')
     assert graph.call(SetBool, '/localizer/pause', SetBool.Request(data=True)).success
-    graph.until(lambda: doctor.value('localizer', 'paused') == 'True', 'it is told')
-    assert doctor.status('localizer').message == 'paused', 'and not that it tracks'
+
+    def said_of_a_paused_one():
+        statuses = [s for array in doctor.heard for s in array.status if 'localizer' in s.name]
+        return [s.message for s in statuses if KeyValue(key='paused', value='True') in s.values]
+
+    # On a busy machine it may have scans to tell of that were lost before.
+    graph.until(lambda: 'paused' in said_of_a_paused_one(), 'it is told')
+    assert 'tracking' not in said_of_a_paused_one()
 
     def some_scans():
         heard = doctor.number('localizer', 'scan: heard')
