@@ -203,6 +203,26 @@ def test_a_robot_that_stands_is_as_sure_as_before():
     np.testing.assert_allclose(stood[-1].covariance, stood[0].covariance, rtol=1e-9, atol=1e-15)
 
 
+@pytest.mark.parametrize('seed', range(10))
+def test_driving_adds_uncertainty_whichever_scans_were_lost(seed):
+    rng, losses = np.random.default_rng(seed), np.random.default_rng(1000 + seed)
+    localizer = at_start()
+
+    def sigmas(metres, count):
+        """Deviations (3,) after so many scans at a place ahead, half of which get lost."""
+        pose = START + [metres, 0.0, 0.0]
+        for k in range(count):
+            scan = scan_in(ROOM, pose, rng, k * PERIOD_NS)
+            if k == 0 or losses.random() < 0.5:
+                estimate = localizer.step(scan, pose - START)
+        return np.sqrt(np.diag(estimate.covariance))
+
+    for metres in np.arange(0.0, 1.0, 0.05):
+        sigmas(metres, 2)
+    standing = sigmas(1.0, 40)
+    assert (sigmas(1.5, 8) > standing).any()
+
+
 def test_a_robot_that_creeps_is_less_sure_with_every_metre():
     rng = np.random.default_rng(5)
     crept = straight(at_start(), [START + [0.02 * k, 0.0, 0.0] for k in range(101)], rng)

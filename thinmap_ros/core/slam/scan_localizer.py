@@ -115,6 +115,8 @@ class ScanLocalizer:
         self._since_learned = np.zeros((3, 3))
         self._since_anchor = np.zeros((3, 3))
         self._by_motion = np.zeros((3, 3))  # the part of `_since_learned` that the motion leaves
+        # The part of the error of the scan that the map learned from that `_since_anchor` has not.
+        self._at_learning = np.zeros((3, 3))
         self._jump = np.zeros((3, 3))
         self._evidence = 0.0
         # Where the motion alone leads since a scan agreed with the map: pose, covariance.
@@ -156,6 +158,7 @@ class ScanLocalizer:
         self._T_stood = self._pose
         self._since_fit = 0.5 * (covariance + covariance.T) + least
         self._since_anchor = np.zeros((3, 3))
+        self._at_learning = np.zeros((3, 3))
         self._since_learned = self._since_fit
         self._jump = self._jump + self._since_fit + np.diag([_UNKNOWN_M**2, _UNKNOWN_M**2, 10.0])
         self._motion.interrupt()
@@ -388,6 +391,7 @@ class ScanLocalizer:
         share = min(1.0, way_m / _VIEW_M + turn)
         by_scan = self._since_learned - self._by_motion
         self._since_anchor = self._since_anchor + self._by_motion + share * by_scan
+        self._at_learning = (1.0 - share) * by_scan
         self._since_learned = np.zeros((3, 3))
         self._by_motion = np.zeros((3, 3))
         self._T_learned = self._pose
@@ -404,6 +408,7 @@ class ScanLocalizer:
         frame = Keyframe(scan, points, self._pose, path_m, self._covariance(), self._submap)
         loops.add(frame, step, turned(self._jump, -theta))
         self._since_anchor = np.zeros((3, 3))
+        self._at_learning = np.zeros((3, 3))
         self._jump = np.zeros((3, 3))
 
     def _begin_submap(self) -> None:
@@ -460,7 +465,9 @@ class ScanLocalizer:
 
     def _covariance(self) -> Array:
         """Covariance (3, 3) of the pose, map frame."""
-        own = self._since_anchor + self._since_learned
+        # The pose errs as the scan that the map learned from, until it errs by more.
+        here = max(self._at_learning, self._since_learned, key=np.trace)
+        own = self._since_anchor + here
         anchor = self._loops.keyframes.anchor
         if anchor >= 0:
             frame = self.keyframes[anchor]
