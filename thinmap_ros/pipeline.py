@@ -10,7 +10,8 @@ from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, Wind
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import Estimate, Localizer, LocalizerConfig
+from thinmap_ros.core.slam.estimate import Estimate
+from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
 from thinmap_ros.core.slam.scan_localizer import ScanLocalizer, ScanLocalizerConfig
 from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig
 

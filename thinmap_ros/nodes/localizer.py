@@ -30,8 +30,8 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import LastPose, ScanPairing
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.estimate import Estimate
 from thinmap_ros.core.slam.features import LineFeature as Feature
-from thinmap_ros.core.slam.localizer import Estimate
 from thinmap_ros.core.slam.scan_localizer import ScanLocalizer, ScanLocalizerConfig
 from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 

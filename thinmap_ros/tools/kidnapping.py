@@ -12,7 +12,7 @@ from thinmap_ros.core.localization.global_localization import GlobalLocalization
 from thinmap_ros.core.planning.navigator import Navigator
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import Estimate
+from thinmap_ros.core.slam.estimate import Estimate
 from thinmap_ros.pipeline import Pipeline
 
 if TYPE_CHECKING:

@@ -20,6 +20,7 @@ from thinmap_ros.core.slam.correction import Correction
 from thinmap_ros.core.slam.doubt import Doubt, Evidence
 from thinmap_ros.core.slam.ekf import EkfSlam
 from thinmap_ros.core.slam.ekf_ti import CompressedEkf
+from thinmap_ros.core.slam.estimate import Estimate
 from thinmap_ros.core.slam.feature_map import FeatureConfig, FeatureMap
 from thinmap_ros.core.slam.features import LineFeature
 from thinmap_ros.core.slam.lines import LineConfig, Lines, extract_lines, no_lines
@@ -112,32 +113,6 @@ class LocalizerConfig(MotionConfig, MatchConfig, LineConfig, FeatureConfig, Loop
     lost_scans: int = parameter(
         5, 'lost after so many scans in a row that do not fit', low=1, high=1000
     )
-
-
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """What a step found.
-
-    T_map_base (3,) with covariance (3, 3), T_map_odom (3,), and how it was found.
-
-    observed, matched: lines of this scan, and those found among the features (both 0 where the
-    robot stands still and the scan has nothing new to say); n_features, n_local: features in the
-    map, and in the local area; match_quality: share of the scan's points on known ground that fit
-    the map. lost: it could be anywhere, as the covariance says.
-    correction: where a loop was closed in this step, what it did to the keyframes; T_map_base is
-    then the corrected pose.
-    """
-
-    T_map_base: Array
-    covariance: Array
-    T_map_odom: Array
-    observed: int = 0
-    matched: int = 0
-    n_features: int = 0
-    n_local: int = 0
-    match_quality: float = 0.0
-    lost: bool = False
-    correction: Correction | None = None
 
 
 class Localizer:

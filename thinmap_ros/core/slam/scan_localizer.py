@@ -23,13 +23,13 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam import feature_map, local_map
 from thinmap_ros.core.slam.anchors import AnchoredPoses
 from thinmap_ros.core.slam.correction import Correction
+from thinmap_ros.core.slam.estimate import Estimate
 from thinmap_ros.core.slam.feature_map import FeatureConfig
 from thinmap_ros.core.slam.features import LineFeature
 from thinmap_ros.core.slam.keyframes import Keyframe, carried, inverse, turned
 from thinmap_ros.core.slam.line_map import LineMap
 from thinmap_ros.core.slam.lines import LineConfig
 from thinmap_ros.core.slam.local_map import LocalMap
-from thinmap_ros.core.slam.localizer import Estimate
 from thinmap_ros.core.slam.loop_closure import LoopClosure, LoopConfig
 from thinmap_ros.core.slam.matcher import FEWEST_POINTS, Match, Matcher, MatcherConfig
 from thinmap_ros.core.slam.motion import Motion, MotionConfig, MotionModel
