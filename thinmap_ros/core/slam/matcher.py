@@ -314,6 +314,17 @@ def _mirror(H: Array) -> None:
     H[1, 0], H[2, 0], H[2, 1] = H[0, 1], H[0, 2], H[1, 2]
 
 
+@inlined
+def _of_prior(pose: Array, prior: Array, by_prior: Array) -> tuple[Array, Array, float]:
+    """Information (3, 3) that the prior has left at a pose (3,), its pull (3,), and its cost."""
+    turn = math.atan2(math.sin(pose[2] - prior[2]), math.cos(pose[2] - prior[2]))
+    off = np.array([pose[0] - prior[0], pose[1] - prior[1], turn])
+    pull = by_prior @ off
+    squared = off @ pull
+    w = prior_weight(squared)
+    return w * by_prior, w * pull, _loss(squared, _SIGMAS)
+
+
 @kernel
 def _evaluated(
     scan: Array,
@@ -358,16 +369,12 @@ def _evaluated(
         _add_outer(H, w, jx, jy, jt)
     doubt = 1.0 / (1.0 + cost / (_USUAL_LOSS * total))
     _mirror(H)
-    turn = math.atan2(math.sin(pose[2] - prior[2]), math.cos(pose[2] - prior[2]))
-    off = np.array([pose[0] - prior[0], pose[1] - prior[1], turn])
-    pull = by_prior @ off
-    squared = off @ pull
-    w = prior_weight(squared)
+    of_prior, pull, by_motion = _of_prior(pose, prior, by_prior)
     return (
-        doubt * H + w * by_prior,
-        doubt * g - w * pull,
-        w * by_prior,
-        (total, known, fitting, _tempered(cost, total) + _loss(squared, _SIGMAS), doubt),
+        doubt * H + of_prior,
+        doubt * g - pull,
+        of_prior,
+        (total, known, fitting, _tempered(cost, total) + by_motion, doubt),
     )
 
 
@@ -460,6 +467,26 @@ def _outwards(n: int) -> int:
     return (n + 1) // 2 if n % 2 else -(n // 2)
 
 
+@inlined
+def _note_cells(
+    scan: Array,
+    prior: Array,
+    turn: float,
+    lattice: Lattice,
+    corner_row: int,
+    corner_col: int,
+    at: NDArray[np.int64],
+) -> None:
+    """Put the cells (N, 2) of a scan that is turned at a prior into `at`, counted from a corner."""
+    cell_m = lattice.cell_m
+    cos, sin = math.cos(prior[2] + turn), math.sin(prior[2] + turn)
+    for i in range(len(scan)):
+        x = prior[0] + cos * scan[i, 0] - sin * scan[i, 1]
+        y = prior[1] + sin * scan[i, 0] + cos * scan[i, 1]
+        at[i, 0] = _cell_of(y / cell_m) - lattice.first_row - corner_row
+        at[i, 1] = _cell_of(x / cell_m) - lattice.first_col - corner_col
+
+
 @kernel
 def _searched(
     scan: Array,
@@ -488,12 +515,7 @@ def _searched(
     # From the prior outwards: a low sum that is found early spares the most of the others.
     for k in range(2 * steps[2] + 1):
         turn = _outwards(k) * sizes[1]
-        cos, sin = math.cos(prior[2] + turn), math.sin(prior[2] + turn)
-        for i in range(len(scan)):
-            x = prior[0] + cos * scan[i, 0] - sin * scan[i, 1]
-            y = prior[1] + sin * scan[i, 0] + cos * scan[i, 1]
-            at[i, 0] = _cell_of(y / cell_m) - lattice.first_row - corner_row
-            at[i, 1] = _cell_of(x / cell_m) - lattice.first_col - corner_col
+        _note_cells(scan, prior, turn, lattice, corner_row, corner_col, at)
         for i in range(2 * steps[1] + 1):
             for j in range(2 * steps[0] + 1):
                 a, b = _outwards(i), _outwards(j)
