@@ -184,9 +184,7 @@ def test_the_navigator_drives_to_a_goal_and_refuses_one_in_a_wall(graph):
     goal.pose.pose.orientation.w = 1.0
     ended = graph.act(NavigateToPose, 'navigate_to_pose', goal)
     assert ended.status == GoalStatus.STATUS_SUCCEEDED, ended.result
-    graph.until(lambda: truth, 'true pose')
-    position = truth[-1].pose.position
-    assert np.hypot(position.x - 3.0, position.y - 2.0) < 0.3
+    graph.until_it_stays(truth, 3.0, 2.0, 0.3)
     goal.pose.pose.position.x = 60.0
     ended = graph.act(NavigateToPose, 'navigate_to_pose', goal)
     assert ended.status == GoalStatus.STATUS_ABORTED

@@ -52,8 +52,7 @@ def test_one_process_locates_maps_and_drives(graph):
     goal.pose.pose.orientation.w = 1.0
     ended = graph.act(NavigateToPose, 'navigate_to_pose', goal)
     assert ended.status == GoalStatus.STATUS_SUCCEEDED, ended.result
-    graph.until(lambda: truth, 'where it is')
-    assert np.hypot(truth[-1].pose.position.x - 3.0, truth[-1].pose.position.y - 2.0) < 0.3
+    graph.until_it_stays(truth, 3.0, 2.0, 0.3)
 
     def well():
         return {
