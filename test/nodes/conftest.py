@@ -124,21 +124,6 @@ class Graph:
                 logs = '\n'.join(f'{name}: {self.log(name)[-2000:]}' for name in self.processes)
                 pytest.fail(f'never came: {what}\n{logs}')
 
-    def until_it_stays(self, truth: list[Any], x: float, y: float, metres: float) -> None:
-        """Hear the robot come so near to a place, m, and stay there.
-
-        An action's result may be heard before the true poses (PoseStamped) of the way there.
-        """
-
-        def is_near() -> bool:
-            place = truth[-1].pose.position if truth else None
-            return place is not None and math.hypot(place.x - x, place.y - y) < metres
-
-        self.until(is_near, f'the robot at {x}, {y}')
-        heard = len(truth) + 10
-        self.until(lambda: len(truth) > heard, 'where it is after that')
-        assert is_near(), f'the robot has not stayed at {x}, {y}'
-
     def client(self, kind: type, name: str) -> Client:
         """Client of a service, the same each time: that both sides know each other takes a while.
 

@@ -35,8 +35,8 @@ def no_shared_memory(monkeypatch):
     """Fast DDS without its shared memory, of all participants made from now on.
 
     Whoever opens the shared memory of a process that has not answered for a second takes it for
-    crashed and makes another one (healthy_check_timeout_ms); a process that was only halted goes on
-    to listen to the old one, and hears nothing any more. That is not what is asked here.
+    crashed and makes another one (healthy_check_timeout_ms); a process that was only halted may
+    then go on to listen to the old one, and hear nothing any more. That is not what is asked here.
     """
     monkeypatch.setenv('FASTDDS_BUILTIN_TRANSPORTS', 'UDPv4')
 
