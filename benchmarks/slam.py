@@ -1,4 +1,4 @@
-"""What a step of the localizer costs as the map grows.
+"""What a step of the paper's filter costs as the map grows.
 
 The filter over the local area against the filter over all.
 """
@@ -13,8 +13,8 @@ import numpy as np
 
 from benchmarks.table import Row, at_least, at_most
 from thinmap_ros.core import se2
+from thinmap_ros.core.ekf_slam.localizer import EkfConfig, EkfLocalizer
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
 from thinmap_ros.sim.lms200 import Lms200, Lms200Config
 from thinmap_ros.sim.world import World
 
@@ -27,7 +27,7 @@ _WHEELS = 1.01  # what the odometry makes of a metre
 def run(worlds: Path, quick: bool) -> Iterator[Row]:
     """Rows of the cost of a step by the number of features in the map."""
     numbers = [25, 88, 400] if quick else [25, 88, 400, 1000, 3000]
-    local = dict(_cost('ti', numbers))
+    local = dict(_cost('ekf_ti', numbers))
     for number, (median, longest) in local.items():
         limit = 15.0 if number <= 1000 else 50.0
         yield at_most(f'ti, {number} features: step, median', median, 3.0, 'ms')
@@ -38,7 +38,7 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
         local[numbers[-1]][0] / local[numbers[0]][0],
         1.5,
     )
-    whole = dict(_cost('full', [number for number in numbers if number <= 1000]))
+    whole = dict(_cost('ekf_full', [number for number in numbers if number <= 1000]))
     for number, (median, _) in whole.items():
         yield Row(f'full, {number} features: step, median', f'{median:.3g} ms')
     most = max(whole)
@@ -54,7 +54,7 @@ def _cost(slam: str, numbers: list[int]) -> Iterator[tuple[int, tuple[float, flo
     length = 1.5 * numbers[-1] + 60.0
     world, laser = _floor(length), Lms200(Lms200Config(), 0)
     truth = np.array([1.0, 0.5 * _WIDTH_M, 0.0])
-    localizer = Localizer(LocalizerConfig(slam=slam, start_x_m=truth[0], start_y_m=truth[1]))
+    localizer = EkfLocalizer(EkfConfig(slam=slam, start_x_m=truth[0], start_y_m=truth[1]))
     odom, taken, left, number = np.zeros(3), [0.0], list(numbers), 0
     while left and truth[0] < length - 2.0:
         scan = laser.scan(world, truth, 200_000_000 * number)

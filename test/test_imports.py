@@ -17,7 +17,8 @@ ROOMS = {
     'core.topology': TOPOLOGY,
     'core.planning': TOPOLOGY | {'core.planning'},
     'core.exploration': TOPOLOGY | {'core.planning', 'core.exploration'},
-    'core.slam': TOPOLOGY | {'core.slam'},
+    'core.ekf_slam': TOPOLOGY | {'core.ekf_slam'},
+    'core.slam': TOPOLOGY | {'core.ekf_slam', 'core.slam'},
     'core.localization': TOPOLOGY | {'core.planning', 'core.localization'},
 }
 ALL_CORE = set(ROOMS)

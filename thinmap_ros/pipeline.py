@@ -5,14 +5,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from time import perf_counter
 
+from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.grid.history import GridHistory
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, WindowConfig
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.estimate import Estimate
 from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
-from thinmap_ros.core.slam.scan_localizer import ScanLocalizer, ScanLocalizerConfig
+from thinmap_ros.core.slam.modes import AnyLocalizer, localizer_class
+from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
 from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig
 
 
@@ -121,6 +122,8 @@ CORES: dict[str, type[LocalizerConfig | ScanLocalizerConfig]] = {
 }
 
 
-def _localizer(config: LocalizerConfig | ScanLocalizerConfig) -> Localizer | ScanLocalizer:
+def _localizer(config: LocalizerConfig | ScanLocalizerConfig) -> Localizer | AnyLocalizer:
     """The localizer that a configuration is of."""
-    return ScanLocalizer(config) if isinstance(config, ScanLocalizerConfig) else Localizer(config)
+    if isinstance(config, LocalizerConfig):
+        return Localizer(config)
+    return localizer_class(config)(config)

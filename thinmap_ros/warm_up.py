@@ -40,7 +40,7 @@ def localizer() -> None:
 
 
 def ekf_localizer() -> None:
-    """Rehearse the localizer of the third paper, `replay --core ekf`."""
+    """Rehearse the localizer before, `replay --core ekf`."""
     from thinmap_ros.core.slam.localizer import Localizer
 
     rehearsed = Localizer()

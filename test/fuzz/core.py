@@ -112,7 +112,7 @@ def map_and_graph(shared: None, rng: np.random.Generator, folder: Path) -> None:
 
 def localize(shared: None, rng: np.random.Generator, folder: Path) -> None:
     drive = Drive(rng, folder)
-    config = ScanLocalizerConfig(slam=str(chosen(rng, ('ti', 'full', 'off'))))
+    config = ScanLocalizerConfig(slam=str(chosen(rng, ('ti', 'off', 'ekf_ti', 'ekf_full'))))
     localizer = ScanLocalizer(config)
     graph = small_graph()
     for _ in range(int(rng.integers(1, 20))):

@@ -91,8 +91,11 @@ def test_files_and_figures(log, tmp_path, form):
     assert patch.occupied[wall[0], wall[1] - 1 : wall[1] + 2].any()
 
 
-@pytest.mark.parametrize('core', ['scan', 'ekf'])
-@pytest.mark.parametrize('slam', ['off', 'ti', 'full'])
+@pytest.mark.parametrize(
+    ('core', 'slam'),
+    [('scan', mode) for mode in ('off', 'ti', 'ekf_ti', 'ekf_full')]
+    + [('ekf', mode) for mode in ('off', 'ti')],
+)
 def test_each_core_replays_it_with_and_without_line_features(tmp_path, core, slam):
     log = tmp_path / 'log.clf'
     log.write_text('\n'.join(carmen_lines(scans=60)) + '\n')

@@ -18,7 +18,8 @@ from thinmap_ros.adapters.map_files import read_map, write_map
 from thinmap_ros.core.errors import InputError, reason_of, shown
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
-from thinmap_ros.core.slam.scan_localizer import ScanLocalizer, ScanLocalizerConfig
+from thinmap_ros.core.slam.modes import AnyLocalizer, localizer_class
+from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
 from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig
 
 _FORMAT = 'thinmap_format'
@@ -123,14 +124,14 @@ def load_exploration(path: str, config: ExplorerConfig | None = None) -> Explore
         raise InputError(f'{file}: {error}') from error
 
 
-def save_features(path: str, localizer: ScanLocalizer) -> str:
+def save_features(path: str, localizer: AnyLocalizer) -> str:
     """Write STEM.features.npz; returns its name. Raises OSError where that fails."""
     file = _named(stem_of(path), _FEATURES_END)
     _write(file, _FEATURES, localizer.state())
     return str(file)
 
 
-def load_features(path: str, config: ScanLocalizerConfig | None = None) -> ScanLocalizer | None:
+def load_features(path: str, config: ScanLocalizerConfig | None = None) -> AnyLocalizer | None:
     """Read STEM.features.npz; None where the session has none.
 
     Raises InputError where it is broken.
@@ -139,7 +140,8 @@ def load_features(path: str, config: ScanLocalizerConfig | None = None) -> ScanL
     if not _is_there(file):
         return None
     try:
-        return ScanLocalizer.from_state(_read(file, _FEATURES), config)
+        kind = localizer_class(config or ScanLocalizerConfig())
+        return kind.from_state(_read(file, _FEATURES), config)
     except InputError as error:
         raise InputError(f'{file}: {error}') from error
 

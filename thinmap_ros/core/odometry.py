@@ -82,6 +82,7 @@ class OdometryBuffer:
 _FASTEST_M_S = 3.0
 _STEP_BACK_NS = 1_000_000_000
 _LONGEST_GAP_NS = 120_000_000_000
+_JUMP_M = 0.5  # where odometry says more than this and that speed, it was set anew
 FIELDS = {
     'stamp_ns': Field(np.int64, (), 0, LARGEST_COUNT),
     'T_map_odom': Field(np.float64, (3,), -FAR_M, FAR_M),
@@ -118,7 +119,51 @@ class LastPose:
         """
         gap_ns = stamp_ns - self.stamp_ns
         moved = math.dist(self.T_odom_base[:2], T_odom_base[:2])
-        return 0 <= gap_ns <= _LONGEST_GAP_NS and moved <= 0.5 + _FASTEST_M_S * gap_ns / 1e9
+        return 0 <= gap_ns <= _LONGEST_GAP_NS and moved <= _JUMP_M + _FASTEST_M_S * gap_ns / 1e9
+
+
+@dataclass(frozen=True, eq=False)
+class Increment:
+    """What odometry tells of the motion since the scan before.
+
+    T_before_base (3,), in so many seconds. bound_m: 0, or where odometry was set anew and tells
+    nothing, how far the robot may have come.
+    """
+
+    T_before_base: Array
+    seconds: float
+    bound_m: float
+
+
+class OdometryIncrements:
+    """Motions from scan to scan by the odometry poses at their stamps.
+
+    What is not finite, or faster than any robot, is refused and counted in `refused`.
+    """
+
+    def __init__(self) -> None:
+        self.refused = 0
+        self.T_odom_base: Array = np.zeros(3)  # of the last scan
+        self._is_begun = False
+        self.stamp_ns: int | None = None  # of the last scan
+
+    def next(self, stamp_ns: int, T_odom_base: Array) -> Increment:
+        """The motion up to an odometry pose (3,) at a stamp; none up to the first."""
+        seconds = 0.0 if self.stamp_ns is None else (stamp_ns - self.stamp_ns) / 1e9
+        self.stamp_ns = stamp_ns
+        if not se2.is_finite(T_odom_base):
+            self.refused += 1
+            return Increment(np.zeros(3), seconds, 0.0)
+        before = self.T_odom_base if self._is_begun else T_odom_base
+        self._is_begun = True
+        self.T_odom_base = np.array(T_odom_base, dtype=np.float64)
+        # Text logs, bags and messages differ by less, and are to lead to the same.
+        moved = np.round(se2.between(before, self.T_odom_base), 9)
+        bound_m = _JUMP_M + _FASTEST_M_S * max(seconds, 1.0)
+        if math.hypot(moved[0], moved[1]) <= bound_m:
+            return Increment(moved, seconds, 0.0)
+        self.refused += 1
+        return Increment(np.zeros(3), seconds, bound_m)
 
 
 class ScanPairing:

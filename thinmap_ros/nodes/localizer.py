@@ -25,14 +25,15 @@ from thinmap_ros.adapters.save_folder import SaveFolder
 from thinmap_ros.adapters.services import answer
 from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.core import se2
+from thinmap_ros.core.ekf_slam.features import LineFeature as Feature
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import LastPose, ScanPairing
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.estimate import Estimate
-from thinmap_ros.core.slam.features import LineFeature as Feature
-from thinmap_ros.core.slam.scan_localizer import ScanLocalizer, ScanLocalizerConfig
+from thinmap_ros.core.slam.modes import AnyLocalizer, localizer_class
+from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
 from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 
 _MAP_WAIT_S = 3.0  # after a restart; the navigator drives on for so long without a new pose
@@ -104,11 +105,10 @@ class LocalizerNode(LiveNode):
         self._resumed = LastPose.from_state(left)
         self._listen_for_the_map()
 
-    def _made(self, config: ScanLocalizerConfig) -> ScanLocalizer:
+    def _made(self, config: ScanLocalizerConfig) -> AnyLocalizer:
         """A localizer that begins at its start, in the map of the session if there is one."""
-        return (
-            session_files.load_features(self._session, config) if self._session else None
-        ) or ScanLocalizer(config)
+        loaded = session_files.load_features(self._session, config) if self._session else None
+        return loaded or localizer_class(config)(config)
 
     def _at(self, T_map_base: Array) -> ScanLocalizerConfig:
         """The configuration of a robot that starts at a pose (3,)."""
@@ -184,7 +184,8 @@ class LocalizerNode(LiveNode):
             )
             self._localizer = self._made(self._at(se2.compose(last.T_map_odom, T_odom_base)))
         else:
-            self._localizer = ScanLocalizer.resumed(self._latched, last, T_odom_base, self._config)
+            kind = localizer_class(self._config)
+            self._localizer = kind.resumed(self._latched, last, T_odom_base, self._config)
         if self._topology is not None:
             self._localizer.set_topology(self._topology)
         self._resumed = self._latched = None

@@ -24,6 +24,7 @@ from thinmap_ros.baselines.exploration import (
 )
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.exploration.decision import Decision
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
@@ -31,7 +32,6 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.estimate import Estimate
 from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.pipeline import Pipeline, PipelineConfig

@@ -8,11 +8,11 @@ import numpy as np
 from thinmap_ros.baselines.exploration import NearestFrontier
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.localization.global_localization import GlobalLocalization
 from thinmap_ros.core.planning.navigator import Navigator
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.estimate import Estimate
 from thinmap_ros.pipeline import Pipeline
 
 if TYPE_CHECKING:

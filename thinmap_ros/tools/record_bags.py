@@ -12,8 +12,8 @@ from thinmap_ros.adapters.bag_writer import BagWriter
 from thinmap_ros.adapters.files import write_text
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, shown
+from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.estimate import Estimate
 from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.sim.tours import Look

@@ -184,8 +184,7 @@ def main() -> None:
         '--core',
         choices=tuple(CORES),
         default='scan',
-        help='the localizer: scan matching with a pose graph, or the EKF on line features '
-        '(default scan)',
+        help='the localizer: this one (scan), or the one before (ekf; default scan)',
     )
     cli.add_config(parser, ScanLocalizerConfig, ['slam'])
     cli.add_config(parser, OccupancyConfig, ['resolution_m', 'no_return_range_m', 'usable_range_m'])

@@ -4,9 +4,9 @@ import numpy as np
 
 from thinmap_ros.adapters.views import NullView
 from thinmap_ros.core import se2
+from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.estimate import Estimate
 from thinmap_ros.pipeline import Pipeline
 
 # What is large is put together once a second, as a view does not draw it more often.

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.slam.doubt import Evidence
-from thinmap_ros.core.slam.models import MotionConfig, odometry_covariance, odometry_variances
 from thinmap_ros.core.slam.odometry_noise import OdometryNoise
+from thinmap_ros.core.slam.wheel_noise import MotionConfig, odometry_covariance, odometry_variances
 
 CONFIG = MotionConfig()
 SURE = Evidence(np.eye(3), np.eye(3), 100.0 * np.eye(3))

@@ -59,7 +59,7 @@ def on(localizer, steps, truth, odom, rng, segments=ROOM, turn=0.1):
     for _ in range(steps):
         step = se2.pose(0.02, 0.0, turn)
         truth, odom = se2.compose(truth, step), se2.compose(odom, step)
-        stamp = localizer._stamp_ns + PERIOD_NS
+        stamp = (localizer._odometry.stamp_ns or 0) + PERIOD_NS
         rows.append((truth, localizer.step(scan_in(segments, truth, rng, stamp), odom), odom))
     return rows
 
@@ -95,17 +95,12 @@ def test_the_whole_path_is_told_afterwards(whole_drive):
     assert len(localizer.keyframes) < len(stamps)
 
 
-GRAZING = pytest.mark.xfail(strict=True, reason='far points on grazing walls draw matches back')
-
-
-@GRAZING
 def test_the_whole_path_is_within_4_cm(whole_drive):
     rows, localizer = whole_drive
     off = (localizer.corrected_path() - np.array([truth for truth, *_ in rows]))[:, :2]
     assert np.sqrt(np.mean(np.square(off).sum(axis=1))) < 0.04
 
 
-@GRAZING
 def test_a_pose_that_is_set_is_within_5_cm():
     rows, localizer = driven(300)
     truth, _, odom = rows[-1]
@@ -146,7 +141,7 @@ def test_the_estimate_is_told_in_a_consistent_way(whole_drive):
         assert 0.0 <= estimate.match_quality <= 1.0
 
 
-@pytest.mark.parametrize('slam', ['ti', 'full', 'off'])
+@pytest.mark.parametrize('slam', ['ti', 'off'])
 def test_features_are_mapped_unless_they_are_off(slam):
     rows, localizer = driven(300, slam=slam)
     assert (len(localizer.features) > 3) == (slam != 'off')
@@ -404,9 +399,7 @@ def crowd(at, rng):
 CHANCE = pytest.mark.xfail(strict=True, reason='more points of the crowd fit by chance than not')
 
 
-@pytest.mark.parametrize(
-    'seed', [pytest.param(k, marks=CHANCE) if k in (0, 4) else k for k in range(8)]
-)
+@pytest.mark.parametrize('seed', [pytest.param(k, marks=CHANCE) if k == 0 else k for k in range(8)])
 def test_a_crowd_does_not_move_a_robot_whose_wheels_know_better(seed):
     """It is lost, and its new map lies where the wheels have led."""
     rng = np.random.default_rng(seed)
@@ -573,7 +566,7 @@ def test_a_state_that_is_none_is_refused_in_words(whole_drive, name, value):
 
 def test_a_loop_that_is_closed_while_the_robot_slides_into_the_old_map_is_closed_well():
     """Back at the start, the old walls take the robot over before the loop is closed."""
-    localizer = at_start(start_x_m=3.0, start_y_m=1.2)
+    localizer = at_start(start_x_m=3.0, start_y_m=1.2, slam='off')
     corrections, away = 0, []
     for scan, odom, truth in drive_round_the_block():
         estimate = localizer.step(scan, odom)
@@ -581,3 +574,50 @@ def test_a_loop_that_is_closed_while_the_robot_slides_into_the_old_map_is_closed
         away.append(np.hypot(*se2.between(truth, estimate.T_map_base)[:2]))
     assert corrections > 1, 'the step into the old map is measured after the loop'
     assert away[-1] < 0.5
+
+
+def test_lines_hold_the_heading_along_corridors():
+    """Until the loop round the block is closed, the error with lines is less than half of that."""
+    heading = {}
+    for slam in ('ti', 'off'):
+        localizer = at_start(start_x_m=3.0, start_y_m=1.2, slam=slam)
+        off = []
+        for scan, odom, truth in drive_round_the_block():
+            estimate = localizer.step(scan, odom)
+            if estimate.correction is not None:
+                break
+            off.append(se2.off(estimate.T_map_base, truth)[2])
+        heading[slam] = np.sqrt(np.mean(np.square(off)))
+    assert heading['ti'] < 0.5 * heading['off']
+
+
+SMOOTH = np.array([[-1.0, -1.2, 60.0, -1.2], [60.0, 1.2, -1.0, 1.2], [-1.0, 1.2, -1.0, -1.2]])
+
+
+@pytest.mark.parametrize(
+    'step_m',
+    [
+        pytest.param(
+            0.01,
+            marks=pytest.mark.xfail(
+                strict=True, reason='the pattern of the beams holds what moves less than it slips'
+            ),
+        ),
+        0.02,
+        0.04,
+        0.1,
+        0.2,
+    ],
+)
+def test_along_a_smooth_corridor_the_wheels_are_believed(step_m):
+    """Where no scan tells how far the robot has come, the pattern of its beams does not, either."""
+    rng = np.random.default_rng(0)
+    localizer = ScanLocalizer()
+    truth = np.zeros(3)
+    odom = np.zeros(3)
+    for k in range(round(10.0 / step_m)):
+        truth = se2.compose(truth, se2.pose(step_m, 0.0, 0.0))
+        odom = se2.compose(odom, se2.pose(1.01 * step_m, 0.0, 0.0))
+        estimate = localizer.step(scan_in(SMOOTH, truth, rng, k * PERIOD_NS), odom)
+    assert 8.0 < estimate.T_map_base[0] < 10.5
+    assert abs(estimate.T_map_base[1]) < 0.1

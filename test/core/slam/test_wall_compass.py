@@ -5,7 +5,7 @@ import pytest
 from slam_room import ROOM, corridor, scan_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.slam.lines import LineConfig, extract_lines, no_lines
+from thinmap_ros.core.ekf_slam.lines import LineConfig, extract_lines, no_lines
 from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
 from thinmap_ros.core.slam.wall_compass import WallCompass
 

@@ -1,4 +1,4 @@
-"""The localizer of the third paper, `--core ekf`: one step for each scan, offline."""
+"""The localizer before, `--core ekf`: one step for each scan, offline."""
 
 import math
 from collections.abc import Mapping
@@ -10,28 +10,22 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import parameter
+from thinmap_ros.core.ekf_slam import feature_map
+from thinmap_ros.core.ekf_slam.ekf import EkfSlam
+from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
+from thinmap_ros.core.ekf_slam.feature_map import FeatureConfig, FeatureMap
+from thinmap_ros.core.ekf_slam.features import LineFeature
+from thinmap_ros.core.ekf_slam.lines import LineConfig, Lines, extract_lines, no_lines
+from thinmap_ros.core.ekf_slam.models import motion_jacobians, rotation
+from thinmap_ros.core.estimate import Correction, Estimate
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import LastPose
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam import feature_map, point_map
+from thinmap_ros.core.slam import point_map
 from thinmap_ros.core.slam.anchors import AnchoredPoses
-from thinmap_ros.core.slam.correction import Correction
 from thinmap_ros.core.slam.doubt import Doubt, Evidence
-from thinmap_ros.core.slam.ekf import EkfSlam
-from thinmap_ros.core.slam.ekf_ti import CompressedEkf
-from thinmap_ros.core.slam.estimate import Estimate
-from thinmap_ros.core.slam.feature_map import FeatureConfig, FeatureMap
-from thinmap_ros.core.slam.features import LineFeature
-from thinmap_ros.core.slam.lines import LineConfig, Lines, extract_lines, no_lines
 from thinmap_ros.core.slam.loops import LEAP_SIGMAS, Keyframe, LoopConfig, Loops
-from thinmap_ros.core.slam.models import (
-    MotionConfig,
-    motion_jacobians,
-    odometry_covariance,
-    odometry_variances,
-    rotation,
-)
 from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
 from thinmap_ros.core.slam.odometry_noise import OdometryNoise
 from thinmap_ros.core.slam.point_map import PointMap
@@ -40,6 +34,11 @@ from thinmap_ros.core.slam.scan_matching import FEWEST_POINTS, Match, MatchConfi
 from thinmap_ros.core.slam.tracking import SEEN_AGAIN, Tracking, share_seen_again
 from thinmap_ros.core.slam.wall_compass import WallCompass
 from thinmap_ros.core.slam.wall_points import wall_points
+from thinmap_ros.core.slam.wheel_noise import (
+    MotionConfig,
+    odometry_covariance,
+    odometry_variances,
+)
 from thinmap_ros.core.snapshot import Field
 from thinmap_ros.core.topology.graph import TopologicalMap
 
@@ -90,6 +89,9 @@ class LocalizerConfig(MotionConfig, MatchConfig, LineConfig, FeatureConfig, Loop
         'ti: EKF over line features, local by topology; full: EKF over all; '
         'off: scan matching alone',
         choices=('ti', 'full', 'off'),
+    )
+    gap_m: float = parameter(
+        0.3, 'seen part and feature may lie this far apart along the line, m', low=0.0, high=5.0
     )
     start_x_m: float = parameter(
         0.0, 'where the robot starts in the map, m', low=-se2.FARTHEST_M, high=se2.FARTHEST_M

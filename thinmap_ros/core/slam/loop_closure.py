@@ -16,8 +16,8 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import parameter
+from thinmap_ros.core.estimate import Correction
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.correction import Correction
 from thinmap_ros.core.slam.edges import Edge, optimized, rounds
 from thinmap_ros.core.slam.keyframes import (
     Keyframe,

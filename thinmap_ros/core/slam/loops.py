@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.ekf_slam.models import rotation
+from thinmap_ros.core.estimate import Correction
 from thinmap_ros.core.grid.buckets import Buckets
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.anchors import AnchoredPoses
-from thinmap_ros.core.slam.correction import Correction
-from thinmap_ros.core.slam.models import rotation
 from thinmap_ros.core.slam.point_map import PointMap
 from thinmap_ros.core.slam.pose_graph import Measured, relax
 from thinmap_ros.core.slam.scan_matching import Match, MatchConfig, ScanMatcher

@@ -8,13 +8,13 @@ Source: Mehra, "On the identification of variances and adaptive Kalman filtering
 Siegwart and Nourbakhsh, "Introduction to autonomous mobile robots", for the odometry's noise.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.config import parameter
+from thinmap_ros.core.ekf_slam.models import OdometryConfig, odometry_slip, odometry_variances
 from thinmap_ros.core.se2 import Array
 
 _MOST_SIGMAS = 3.0
@@ -22,18 +22,9 @@ _LEAST_SHARE = 1.0  # of the variance that the model allows: good wheels slip, t
 
 
 @dataclass(frozen=True)
-class MotionConfig(Config):
+class MotionConfig(OdometryConfig):
     """Noise of the motion, 1 sigma, as it is taken to be before the scans have told."""
 
-    odom_noise: float = parameter(
-        0.1, 'odometry error for each metre or radian of a motion, m or rad', low=0.001, high=2.0
-    )
-    odom_slip_m: float = parameter(
-        0.01, 'error of any odometry increment, in each direction, m', low=1e-5, high=1.0
-    )
-    odom_slip_rad: float = parameter(
-        0.01, 'error of any odometry increment, rad', low=1e-5, high=1.0
-    )
     acceleration_m_s2: float = parameter(
         0.5, 'change of velocity in a second, m/s', low=0.01, high=50.0
     )
@@ -88,12 +79,9 @@ class MotionModel:
         increment (3,): of the odometry.
         """
         config = self._config
-        slip = np.array([config.odom_slip_m, config.odom_slip_m, config.odom_slip_rad])
-        way, turn = math.hypot(increment[0], increment[1]), abs(float(increment[2]))
-        sigma_m = config.odom_slip_m + config.odom_noise * way
-        sigma_rad = config.odom_slip_rad + config.odom_noise * turn
+        slip = odometry_slip(config)
         self._odometry.increment = increment
-        self._odometry.allowed = np.square([sigma_m, sigma_m, sigma_rad])
+        self._odometry.allowed = odometry_variances(increment, config)
         self._seconds = seconds
         self._velocity.allowed = np.full(3, np.inf)
         if self._moved is not None and seconds > 0.0:

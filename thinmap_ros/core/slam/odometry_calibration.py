@@ -15,8 +15,8 @@ import math
 import numpy as np
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.ekf_slam.models import rotation
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.models import rotation
 
 _PRIOR_SIGMAS = (0.05, 0.05, 0.1, 0.05)  # of what is known before the first span
 _WANDER_SIGMAS = (0.001, 0.001, 0.001, 0.0002)  # in a metre or radian: floors and loads change

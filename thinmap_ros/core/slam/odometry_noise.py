@@ -13,7 +13,7 @@ import numpy as np
 
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.doubt import Evidence
-from thinmap_ros.core.slam.models import MotionConfig, odometry_variances
+from thinmap_ros.core.slam.wheel_noise import MotionConfig, odometry_variances
 
 _MEMORY = 0.998  # of what earlier matches said, from one to the next: floors and loads change
 _LEAST = 0.1  # wheels that hardly ever err may slip at the next door-sill

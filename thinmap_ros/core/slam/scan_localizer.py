@@ -16,19 +16,19 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import parameter
+from thinmap_ros.core.ekf_slam import feature_map
+from thinmap_ros.core.ekf_slam.features import LineFeature
+from thinmap_ros.core.ekf_slam.line_map import LineMap
+from thinmap_ros.core.ekf_slam.localizer import EkfConfig
+from thinmap_ros.core.ekf_slam.models import odometry_slip
+from thinmap_ros.core.estimate import Correction, Estimate
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.odometry import LastPose
+from thinmap_ros.core.odometry import LastPose, OdometryIncrements
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam import feature_map, local_map
+from thinmap_ros.core.slam import local_map
 from thinmap_ros.core.slam.anchors import AnchoredPoses
-from thinmap_ros.core.slam.correction import Correction
-from thinmap_ros.core.slam.estimate import Estimate
-from thinmap_ros.core.slam.feature_map import FeatureConfig
-from thinmap_ros.core.slam.features import LineFeature
 from thinmap_ros.core.slam.keyframes import Keyframe, carried, inverse, turned
-from thinmap_ros.core.slam.line_map import LineMap
-from thinmap_ros.core.slam.lines import LineConfig
 from thinmap_ros.core.slam.local_map import LocalMap
 from thinmap_ros.core.slam.loop_closure import LoopClosure, LoopConfig
 from thinmap_ros.core.slam.matcher import FEWEST_POINTS, Match, Matcher, MatcherConfig
@@ -36,8 +36,6 @@ from thinmap_ros.core.slam.motion import Motion, MotionConfig, MotionModel
 from thinmap_ros.core.slam.wall_points import wall_points
 from thinmap_ros.core.topology.graph import TopologicalMap
 
-_FASTEST_M_S = 3.0
-_JUMP_M = 0.5  # where odometry says more than this and that speed, it was set anew
 _CHI2 = 11.34  # 99 % of three degrees of freedom
 _VIEW_M = 1.0  # after a path of this length a match errs by other points than before
 _STANDS_M = 1e-3  # odometry of a robot that stands, and a scan's worth of turning
@@ -46,34 +44,21 @@ _AT_ONCE = 20  # keyframes drawn at once after a correction
 _A_STEP = 2  # and in each step after it
 _UNKNOWN_M = 300.0  # uncertainty of a pose that could be anywhere
 _ADRIFT_M = 10.0  # path in a new local map after which it is part of the map for good
+# Covariance of a matched pose, as seen from walls that were seen some way back: what matching adds
+# there to the error. Lines are surer of the heading, as they are long; of the place cells are.
+_BESIDE_WALLS = np.diag(np.square([5e-3, 5e-3, 3e-3]))
 _STEP_SIGMAS = (2e-3, 2e-3, 5e-4)  # of a step between keyframes, at least
 FIELDS = {**feature_map.FIELDS, **local_map.FIELDS}
 
 
 @dataclass(frozen=True)
-class ScanLocalizerConfig(MotionConfig, MatcherConfig, LoopConfig, LineConfig, FeatureConfig):
+class ScanLocalizerConfig(EkfConfig, MotionConfig, MatcherConfig, LoopConfig):
     """Parameters of the localizer and of its parts."""
 
-    slam: str = parameter(
-        'ti',
-        'ti: map line features, those of the local area by topology; full: compare with all; '
-        'off: no line features',
-        choices=('ti', 'full', 'off'),
-    )
-    start_x_m: float = parameter(
-        0.0, 'where the robot starts in the map, m', low=-se2.FARTHEST_M, high=se2.FARTHEST_M
-    )
-    start_y_m: float = parameter(
-        0.0, 'where the robot starts in the map, m', low=-se2.FARTHEST_M, high=se2.FARTHEST_M
-    )
-    start_yaw_rad: float = parameter(0.0, 'heading at the start, rad')
     map_distance_m: float = parameter(
         0.2, 'the local map learns after a path of this length, m', low=0.0, high=5.0
     )
     map_turn_rad: float = parameter(0.2, 'or after such a turn, rad', low=0.0, high=3.0)
-    mapping: bool = parameter(
-        True, 'learn what is seen; false: only find the place in the map that there is'
-    )
     lost_evidence: float = parameter(
         1.5,
         'lost when this many scans more contradict the map than fit it, each by its share',
@@ -91,8 +76,8 @@ class ScanLocalizer:
 
     def __init__(self, config: ScanLocalizerConfig | None = None) -> None:
         self.config = config or ScanLocalizerConfig()
-        self.refused = 0
         self._matcher = Matcher(self.config)
+        self._refused = 0
         self.reset()
 
     def reset(self) -> None:
@@ -105,8 +90,7 @@ class ScanLocalizer:
         self._loops = LoopClosure(config, self._matcher)
         self._lines = LineMap(config, config, config.slam == 'ti')
         self._path = AnchoredPoses()
-        self._T_odom_base: Array | None = None
-        self._stamp_ns: int | None = None
+        self._odometry = OdometryIncrements()
         self._T_learned: Array | None = None
         self._T_stood = self._pose  # where the robot was when it last moved
         # Covariances (3, 3), map frame: of the motion since a scan fitted, of the pose since the
@@ -125,6 +109,11 @@ class ScanLocalizer:
         self._adrift_m = 0.0  # path for which a new local map is not yet part of the map
         self._submap = 0
         self._due: list[int] = []
+
+    @property
+    def refused(self) -> int:
+        """Odometry poses and poses from outside that made no sense."""
+        return self._refused + self._odometry.refused
 
     @property
     def pose(self) -> Array:
@@ -151,7 +140,7 @@ class ScanLocalizer:
         The next scans settle it; nothing is learned before.
         """
         if not (se2.is_on_earth(T_map_base) and np.isfinite(covariance).all()):
-            self.refused += 1
+            self._refused += 1
             return
         least = np.diag(np.square(_STEP_SIGMAS))
         self._pose = se2.pose(*T_map_base.tolist())
@@ -282,30 +271,16 @@ class ScanLocalizer:
     def _is_near(self, T_map_base: Array, other: Array) -> bool:
         """Whether two poses (3,) are no farther apart than odometry errs by in a step."""
         off = np.abs(se2.off(other, T_map_base))
-        slip = [self.config.odom_slip_m, self.config.odom_slip_m, self.config.odom_slip_rad]
-        return bool((off <= _SIGMAS * np.array(slip)).all())
+        return bool((off <= _SIGMAS * odometry_slip(self.config)).all())
 
     def _expect(self, scan: Scan, T_odom_base: Array) -> Motion:
         """The motion since the last scan."""
-        last = self._T_odom_base
-        seconds = 0.0 if self._stamp_ns is None else (scan.stamp_ns - self._stamp_ns) / 1e9
-        self._stamp_ns = scan.stamp_ns
-        increment: Array = np.zeros(3)
-        if not se2.is_finite(T_odom_base):
-            self.refused += 1
-        else:
-            self._T_odom_base = np.array(T_odom_base, dtype=np.float64)
-            if last is not None:
-                # Text logs, bags and messages differ by less, and are to lead to the same.
-                increment = np.round(se2.between(last, self._T_odom_base), 9)
-        farthest = _JUMP_M + _FASTEST_M_S * max(seconds, 1.0)
-        if math.hypot(increment[0], increment[1]) > farthest:
-            self.refused += 1
-            increment = np.zeros(3)
-            motion = self._motion.expect(increment, seconds)
-            unknown = np.square([farthest, farthest, 1.0])
-            return Motion(motion.increment, motion.variances + unknown, False)
-        return self._motion.expect(increment, seconds)
+        increment = self._odometry.next(scan.stamp_ns, T_odom_base)
+        motion = self._motion.expect(increment.T_before_base, increment.seconds)
+        if increment.bound_m == 0.0:
+            return motion
+        unknown = np.square([increment.bound_m, increment.bound_m, 1.0])
+        return Motion(motion.increment, motion.variances + unknown, False)
 
     def _reckon(self, motion: Motion) -> None:
         """Carry the pose that the motion alone leads to on by a step."""
@@ -383,9 +358,11 @@ class ScanLocalizer:
         self._adrift_m = max(self._adrift_m - way_m, 0.0)
         if self._evidence > config.lost_evidence:
             self._begin_submap()
-        self._map.add_scan(points, scan.T_base_laser, self._pose)
         if config.slam != 'off':
-            self._lines.observe(scan, self._pose, self._since_learned)
+            heading = self._lines.observe(scan, self._pose, _BESIDE_WALLS)
+            if self._evidence == 0.0:
+                self._pose[2] = heading
+        self._map.add_scan(points, scan.T_base_laser, self._pose)
         # What the motion leaves is new with every step; what the scan leaves is much the same error
         # as in the step before, as long as the same walls are seen.
         share = min(1.0, way_m / _VIEW_M + turn)
@@ -475,7 +452,6 @@ class ScanLocalizer:
         return np.asarray(0.5 * (own + own.T))
 
     def _estimate(self, match: Match | None, correction: Correction | None) -> Estimate:
-        T_odom_base = np.zeros(3) if self._T_odom_base is None else self._T_odom_base
         lost = self._adrift_m > 0.0 or (self._is_unplaced and self._evidence > 0.0)
         covariance = self._covariance()
         if lost:
@@ -483,7 +459,7 @@ class ScanLocalizer:
         return Estimate(
             self._pose,
             covariance,
-            se2.compose(self._pose, se2.invert(T_odom_base)),
+            se2.compose(self._pose, se2.invert(self._odometry.T_odom_base)),
             self._lines.observed,
             self._lines.matched,
             len(self._lines),

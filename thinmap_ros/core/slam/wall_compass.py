@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from thinmap_ros.core.ekf_slam.lines import Lines
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.lines import Lines
 
 _QUARTER = 0.5 * math.pi
 _BINS = 180  # of half a degree

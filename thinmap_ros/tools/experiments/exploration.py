@@ -14,11 +14,11 @@ from thinmap_ros.adapters.plots import (
     Robots,
     Words,
 )
+from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.exploration.decision import FIRST_STAND_IN_ID, Decision
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.estimate import Estimate
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.sim.coverage import coverable

@@ -5,8 +5,8 @@ from time import process_time
 import numpy as np
 
 from thinmap_ros.adapters.plots import Curve, Panel, Plot
+from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.ekf_ti import CompressedEkf
 from thinmap_ros.tools.experiments.drives import Source
 from thinmap_ros.tools.experiments.outcome import Comparison, Outcome, Table
 

@@ -14,11 +14,12 @@ _QUICK_SCANS = 150
 
 
 def run(source: Source) -> Outcome:
-    """Map the office with EKF-SLAM/TI."""
+    """Map the office with EKF-SLAM/TI, and with our localizer."""
     world = world_of('office')
-    done = run_slam(islice(source.looks('office'), _QUICK_SCANS if source.quick else None))
+    looks = list(islice(source.looks('office'), _QUICK_SCANS if source.quick else None))
+    done = run_slam(looks)
+    ours = run_slam(looks, 'ti')
     error = map_error.map_error(done.pipeline.grid.patch(), world)
-    off = np.hypot(*done.errors()[:, :2].T)
     wheels = np.hypot(*done.errors(done.odometry)[:, :2].T)
     row = map_error.row('office', error)
     return Outcome(
@@ -48,8 +49,8 @@ def run(source: Source) -> Outcome:
             Comparison(
                 'pose',
                 '',
-                f'{100 * off.mean():.1f} cm off (mean), {100 * off.max():.1f} cm (most); '
-                f'wheels alone {wheels[-1]:.2f} m at the end',
+                f'off by {done.position_error}; wheels alone {wheels[-1]:.2f} m at the end',
+                remark=f'scan matching with lines (`slam: ti`): {ours.position_error}',
             ),
         ],
     )

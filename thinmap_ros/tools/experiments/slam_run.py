@@ -8,7 +8,7 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import LocalizerConfig
+from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
 from thinmap_ros.pipeline import Pipeline, PipelineConfig, Step
 from thinmap_ros.sim.tours import Look
 
@@ -42,21 +42,28 @@ class Run:
         return np.array([se2.between(T, other) for T, other in zip(self.truth, found, strict=True)])
 
     @property
+    def position_error(self) -> str:
+        """How far positions are off, in words."""
+        off = 100.0 * np.hypot(*self.errors()[:, :2].T)
+        return f'{off.mean():.1f} cm (mean), {off.max():.1f} cm (most)'
+
+    @property
     def way_m(self) -> float:
         """Length of the true path, m."""
         return float(np.hypot(*np.diff(np.array(self.truth)[:, :2], axis=0).T).sum())
 
 
-def run_slam(looks: Iterable[Look], slam: str = 'ti', watch: Watch | None = None) -> Run:
+def run_slam(looks: Iterable[Look], slam: str = 'ekf_ti', watch: Watch | None = None) -> Run:
     """Run a drive; the map's frame is the world's.
 
-    watch is called after each scan with its number.
+    slam: ekf_ti and ekf_full are the paper's filter, ti is ours. watch is called after each scan
+    with its number.
     """
     run: Run | None = None
     for k, look in enumerate(looks):
         if run is None:
             x, y, yaw = (float(v) for v in look.T_world_base)
-            config = LocalizerConfig(slam=slam, start_x_m=x, start_y_m=y, start_yaw_rad=yaw)
+            config = ScanLocalizerConfig(slam=slam, start_x_m=x, start_y_m=y, start_yaw_rad=yaw)
             run, start = Run(Pipeline(PipelineConfig(localizer=config))), look
         began = process_time()
         step = run.pipeline.step(look.scan, look.T_odom_base)

@@ -8,12 +8,12 @@ from scipy.stats import chi2
 from slam_room import BLIND, ROOM, drive, scan_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.slam.association import AssociationConfig, associate, mahalanobis
-from thinmap_ros.core.slam.ekf import EkfSlam
-from thinmap_ros.core.slam.ekf_ti import CompressedEkf
-from thinmap_ros.core.slam.feature_map import FeatureConfig, FeatureMap
-from thinmap_ros.core.slam.features import Feature
-from thinmap_ros.core.slam.lines import LineConfig, Lines, extract_lines
+from thinmap_ros.core.ekf_slam.association import AssociationConfig, associate, mahalanobis
+from thinmap_ros.core.ekf_slam.ekf import EkfSlam
+from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
+from thinmap_ros.core.ekf_slam.feature_map import FeatureConfig, FeatureMap
+from thinmap_ros.core.ekf_slam.features import Feature
+from thinmap_ros.core.ekf_slam.lines import LineConfig, Lines, extract_lines
 
 R = np.diag([0.02**2, 0.01**2])
 SURE = 1e-8 * np.eye(3)
@@ -34,7 +34,7 @@ def known(walls, pose=(0.0, 0.0, 0.0), P=SURE):
     """A filter that knows some walls, and the features beside it."""
     lines = seen_lines(*walls)
     ekf = CompressedEkf(np.array(pose), P)
-    features = FeatureMap(FeatureConfig(sightings=1), local_areas=False)
+    features = FeatureMap(FeatureConfig(sightings=1, gap_m=0.3), local_areas=False)
     features.observe(ekf, lines, BLIND)
     return ekf, features
 
@@ -146,7 +146,8 @@ def test_two_features_that_turn_out_to_be_one_wall_merge():
 def test_a_drive_through_a_room_finds_its_walls_once(rng, local_areas):
     """All features are walls, and no wall is there twice."""
     truths = [truth for truth, _ in drive(500, rng, np.array([2.0, 2.0, 0.0]))][::3]
-    ekf, features = CompressedEkf(truths[0], SURE), FeatureMap(FeatureConfig(), local_areas)
+    ekf = CompressedEkf(truths[0], SURE)
+    features = FeatureMap(FeatureConfig(gap_m=0.3), local_areas)
     for truth in truths:
         ekf.local.set_pose(truth, SURE)
         scan = scan_in(ROOM, truth, rng)

@@ -1,7 +1,8 @@
 """The line features of a building, mapped from poses that scan matching has found.
 
-They are kept as the filter of EKF-SLAM/TI keeps them, local by the topological map; the pose is not
-theirs to move.
+They are kept as the filter of EKF-SLAM/TI keeps them, local by the topological map. They hold the
+heading: a line is longer than what a scan is matched with, so its direction is known better. The
+place is not theirs to move: real walls are farther off a line than off the cells of a local map.
 """
 
 from collections.abc import Mapping
@@ -10,13 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
+from thinmap_ros.core.ekf_slam.feature_map import FeatureConfig, FeatureMap
+from thinmap_ros.core.ekf_slam.features import LineFeature
+from thinmap_ros.core.ekf_slam.lines import LineConfig, extract_lines
+from thinmap_ros.core.estimate import Correction
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.correction import Correction
-from thinmap_ros.core.slam.ekf_ti import CompressedEkf
-from thinmap_ros.core.slam.feature_map import FeatureConfig, FeatureMap
-from thinmap_ros.core.slam.features import LineFeature
-from thinmap_ros.core.slam.lines import LineConfig, extract_lines
 from thinmap_ros.core.topology.graph import TopologicalMap
 
 _LEAST = np.diag(np.square([1e-3, 1e-3, 1e-4]))  # to which a pose is known at best
@@ -49,12 +50,16 @@ class LineMap:
         """Take the topological map by which features are stored."""
         self._map.area.set_topology(topology)
 
-    def observe(self, scan: Scan, T_map_base: Array, covariance: Array) -> None:
-        """Take in the lines of a scan from a pose (3,) with covariance (3, 3)."""
+    def observe(self, scan: Scan, T_map_base: Array, covariance: Array) -> float:
+        """Take in the lines of a scan from a pose (3,) with covariance (3, 3).
+
+        Returns the heading that pose and features together tell, rad.
+        """
         lines = extract_lines(scan, self._lines)
         self._filter.local.set_pose(T_map_base, covariance + _LEAST)
         self.observed = len(lines)
         self.matched, _ = self._map.observe(self._filter, lines, scan)
+        return float(self._filter.local.pose[2])
 
     def work_off(self) -> None:
         """Do a piece of what the filter has put off; to be called once a step."""

@@ -16,15 +16,12 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import parameter
-from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.se2 import Array, transform_points
-from thinmap_ros.core.slam import local_area
-from thinmap_ros.core.slam.association import AssociationConfig, associate, mahalanobis, meeting
-from thinmap_ros.core.slam.candidates import Candidate, Candidates
-from thinmap_ros.core.slam.correction import Correction
-from thinmap_ros.core.slam.ekf import EkfSlam
-from thinmap_ros.core.slam.ekf_ti import CompressedEkf
-from thinmap_ros.core.slam.features import (
+from thinmap_ros.core.ekf_slam import local_area
+from thinmap_ros.core.ekf_slam.association import AssociationConfig, associate, mahalanobis, meeting
+from thinmap_ros.core.ekf_slam.candidates import Candidate, Candidates
+from thinmap_ros.core.ekf_slam.ekf import EkfSlam
+from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
+from thinmap_ros.core.ekf_slam.features import (
     Feature,
     LineFeature,
     as_seen,
@@ -33,9 +30,12 @@ from thinmap_ros.core.slam.features import (
     moved_line,
     normals_of,
 )
-from thinmap_ros.core.slam.lines import Lines
-from thinmap_ros.core.slam.local_area import LocalArea
-from thinmap_ros.core.slam.visibility import seen_through
+from thinmap_ros.core.ekf_slam.lines import Lines
+from thinmap_ros.core.ekf_slam.local_area import LocalArea
+from thinmap_ros.core.ekf_slam.visibility import seen_through
+from thinmap_ros.core.estimate import Correction
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array, transform_points
 from thinmap_ros.core.snapshot import FAR_M, LARGEST_COUNT, LARGEST_ID, Field
 
 _SPARE = 8  # features that the local area may hold beyond those it should
@@ -136,19 +136,28 @@ class FeatureMap:
         ]
 
     def observe(
-        self, ekf: CompressedEkf, lines: Lines, scan: Scan, leeway: Array | None = None
+        self,
+        ekf: CompressedEkf,
+        lines: Lines,
+        scan: Scan,
+        leeway: Array | None = None,
+        learn: bool = True,
     ) -> tuple[int, bool]:
         """Associate and correct the filter by the lines of a scan, then look after the features.
 
         leeway (3, 3): the covariance with which the pose is known by other means, where it is.
+        learn: whether features may grow, come and go.
         Returns how many were matched, and whether the filter took the update.
         """
         if self._local_areas:
             self._choose_area(ekf, scan)
-        lines = Lines(lines.z, lines.covariances + self._wall, lines.ends)
+        lines = Lines(lines.z, lines.covariances + self._walls(lines), lines.ends)
         laser_map = transform_points(ekf.local.pose, scan.T_base_laser[None, :2])[0]
         chosen, taken = self._correct(ekf, lines, laser_map, leeway)
-        matched, unknown = np.flatnonzero(chosen >= 0), np.flatnonzero(chosen < 0)
+        matched = np.flatnonzero(chosen >= 0)
+        unknown = np.flatnonzero(chosen < 0)
+        if not learn:
+            return len(matched), taken
         seen = self._grow(ekf, chosen[matched], lines.chosen(matched))
         ripe = self._candidates.take(ekf.local.pose, lines.chosen(unknown), laser_map)
         self._miss(ekf, seen, scan)
@@ -156,6 +165,18 @@ class FeatureMap:
         new = [i for candidate in ripe for i in self._take_up(ekf, candidate)]
         self.area.store(ekf.local.pose, [i for i in (*seen, *new) if i in self._features])
         return len(matched), taken
+
+    def _walls(self, lines: Lines) -> Array:
+        """Covariances (K, 2, 2) of lines as real walls are off straight ones.
+
+        By as much at their ends as anywhere: a short piece of wall tells its direction badly.
+        """
+        lengths = np.hypot(*(lines.ends[:, 1] - lines.ends[:, 0]).T)
+        sigma_m = self._config.wall_sigma_m
+        walls = np.zeros((len(lines), 2, 2))
+        walls[:, 0, 0] = sigma_m**2
+        walls[:, 1, 1] = np.square(sigma_m / np.maximum(lengths, sigma_m))
+        return walls
 
     def _correct(
         self, ekf: CompressedEkf, lines: Lines, laser_map: Array, leeway: Array | None

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from thinmap_ros.core.ekf_slam.association import mahalanobis, meeting
+from thinmap_ros.core.ekf_slam.ekf import line_difference
+from thinmap_ros.core.ekf_slam.features import Feature, interval
+from thinmap_ros.core.ekf_slam.lines import Lines
+from thinmap_ros.core.ekf_slam.models import place_line
 from thinmap_ros.core.se2 import Array, transform_points
-from thinmap_ros.core.slam.association import mahalanobis, meeting
-from thinmap_ros.core.slam.ekf import line_difference
-from thinmap_ros.core.slam.features import Feature, interval
-from thinmap_ros.core.slam.lines import Lines
-from thinmap_ros.core.slam.models import place_line
 
 
 @dataclass(eq=False)

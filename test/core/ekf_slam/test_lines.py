@@ -8,8 +8,8 @@ from scipy.optimize import least_squares
 from slam_room import ROOM, scan_in
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.ekf_slam.lines import LineConfig, extract_lines
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.slam.lines import LineConfig, extract_lines
 
 BOX = np.array([[-2, -3, 4, -3], [4, -3, 4, 2], [4, 2, -2, 2], [-2, 2, -2, -3]], dtype=float)
 

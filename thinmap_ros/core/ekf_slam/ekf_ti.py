@@ -25,8 +25,8 @@ from contextlib import suppress
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core.ekf_slam.ekf import EkfSlam
 from thinmap_ros.core.se2 import Array, wrap
-from thinmap_ros.core.slam.ekf import EkfSlam
 
 _ROOM = 8200  # numbers by which the store grows; memory is taken up only where it is written
 _CHUNK = 256  # numbers by which what is computed with grows

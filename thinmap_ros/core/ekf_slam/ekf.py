@@ -9,9 +9,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core.ekf_slam.models import motion_jacobians, observe_line, place_line
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.se2 import Array, wrap
-from thinmap_ros.core.slam.models import motion_jacobians, observe_line, place_line
 
 _POSE_GATE = 11.34  # largest squared Mahalanobis distance of a step of the pose (99 %, 3 dof)
 

@@ -8,22 +8,16 @@ from scipy.stats import chi2
 from slam_room import BLIND
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.slam.ekf_ti import CompressedEkf
-from thinmap_ros.core.slam.feature_map import FeatureConfig, FeatureMap
-from thinmap_ros.core.slam.lines import Lines
-from thinmap_ros.core.slam.models import MotionConfig, observe_line, odometry_covariance
+from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
+from thinmap_ros.core.ekf_slam.feature_map import FeatureConfig, FeatureMap
+from thinmap_ros.core.ekf_slam.lines import Lines
+from thinmap_ros.core.ekf_slam.models import observe_line
 
 FEATURES = FeatureConfig()
-# What wheels leave open after scan matching.
-MOTION = MotionConfig(
-    odom_distance_sigma=0.02,
-    odom_turn_sigma=0.03,
-    odom_drift_sigma=0.01,
-    odom_slip_m=0.002,
-    odom_slip_rad=0.002,
-)
+# What wheels leave open after scan matching: of a step ahead, and of one of a turn.
+AHEAD = np.diag(np.square([0.011, 0.003, 0.006]))
+TURN = np.diag(np.square([0.002, 0.002, 0.017]))
 SEEN = np.diag([0.01**2, 0.005**2])
-WALL = np.diag(np.square([FEATURES.wall_sigma_m, FEATURES.wall_sigma_rad]))
 RANGE_M = 8.0
 
 
@@ -54,9 +48,11 @@ def look(rng, truth):
     seen = np.flatnonzero((np.hypot(*off.T) < RANGE_M) & (off[:, 0] > -0.5))
     z = np.array([observe_line(truth, TRUE_LINES[i])[0] for i in seen]).reshape(-1, 2)
     seen, z = seen[z[:, 0] > 0.3], z[z[:, 0] > 0.3]
-    z = z + rng.multivariate_normal([0.0, 0.0], SEEN + WALL, len(z))
     ends = np.array([se2.transform_points(se2.invert(truth), WALLS[i]) for i in seen])
     ends = ends.reshape(-1, 2, 2)
+    lengths = np.hypot(*(ends[:, 1] - ends[:, 0]).T)
+    wall = FEATURES.wall_sigma_m * np.column_stack([np.ones(len(z)), 1.0 / lengths])
+    z = z + rng.multivariate_normal([0.0, 0.0], SEEN, len(z)) + wall * rng.normal(size=(len(z), 2))
     return Lines(z, np.tile(SEEN, (len(z), 1, 1)), ends)
 
 
@@ -70,7 +66,7 @@ def nees_of_a_run(seed, local_areas, looks):
         turning = step % 120 >= 110
         increment = np.array([0.0 if turning else 0.3, 0.0, math.pi / 10.0 if turning else 0.0])
         truth = se2.compose(truth, increment)
-        Q = odometry_covariance(increment, MOTION)
+        Q = TURN if turning else AHEAD
         measured = increment + rng.multivariate_normal(np.zeros(3), Q)
         ekf.local.predict(se2.compose(ekf.local.pose, measured), measured, Q)
         features.observe(ekf, look(rng, truth), BLIND)

@@ -11,12 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from thinmap_ros.core import se2
-from thinmap_ros.core.slam.models import (
-    MotionConfig,
+from thinmap_ros.core.ekf_slam.models import (
+    OdometryConfig,
     motion_jacobians,
     observe_line,
-    odometry_covariance,
+    odometry_variances,
     place_line,
 )
 
@@ -103,38 +102,9 @@ def test_a_line_passed_by_is_seen_from_its_other_side():
     np.testing.assert_allclose(observe_line(np.array([5.0, 1.0, 0.0]), wall)[0], [3.0, math.pi])
 
 
-@given(increments)
-def test_odometry_noise_is_a_covariance(increment):
-    Q = odometry_covariance(increment, MotionConfig())
-    np.testing.assert_array_equal(Q, Q.T)
-    assert np.linalg.eigvalsh(Q).min() > 0.0
-
-
-def test_doubt_after_a_drive_does_not_depend_on_the_number_of_scans():
-    config = MotionConfig(odom_slip_m=1e-5, odom_slip_rad=1e-5)
-
-    def after(steps):
-        P, pose, u = np.zeros((3, 3)), np.zeros(3), np.array([4.0 / steps, 0.0, 0.0])
-        for _ in range(steps):
-            F_x, F_u = motion_jacobians(pose, u)
-            P = F_x @ P @ F_x.T + F_u @ odometry_covariance(u, config) @ F_u.T
-            pose = se2.compose(pose, u)
-        return P
-
-    np.testing.assert_allclose(after(40), after(400), rtol=0.05, atol=1e-7)
-    assert math.sqrt(after(40)[0, 0]) == pytest.approx(2.0 * config.odom_distance_sigma, rel=1e-6)
-
-
-def test_turning_noise_matches_an_arc_driven_many_times(rng):
-    config = MotionConfig(odom_slip_m=1e-5, odom_slip_rad=1e-5)
-    d, phi = 0.5, 0.6
-    noise = [config.odom_distance_sigma * math.sqrt(d)]
-    noise.append(
-        math.hypot(config.odom_turn_sigma * math.sqrt(phi), config.odom_drift_sigma * math.sqrt(d))
-    )
-    off = np.array(noise)[:, None] * rng.normal(size=(2, 20000)) * 0.2
-    chords, turns = np.array([d, phi])[:, None] + off
-    samples = np.stack([chords * np.cos(turns / 2.0), chords * np.sin(turns / 2.0), turns])
-    mean = np.array([d * math.cos(phi / 2.0), d * math.sin(phi / 2.0), phi])
-    expected = odometry_covariance(mean, config)
-    np.testing.assert_allclose(np.cov(samples) / 0.04, expected, rtol=0.1, atol=2e-5)
+@pytest.mark.parametrize('metres, radians', [(0.0, 0.0), (0.5, 0.0), (0.0, -0.4), (-0.3, 0.2)])
+def test_odometry_errs_by_its_slip_and_a_share_of_the_motion(metres, radians):
+    config = OdometryConfig(odom_noise=0.1, odom_slip_m=0.01, odom_slip_rad=0.02)
+    sigmas = np.sqrt(odometry_variances(np.array([0.6 * metres, 0.8 * metres, radians]), config))
+    along = 0.01 + 0.1 * abs(metres)
+    np.testing.assert_allclose(sigmas, [along, along, 0.02 + 0.1 * abs(radians)])

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from dense_filter import DenseFilter
 
+from thinmap_ros.core.ekf_slam.ekf import EkfSlam
+from thinmap_ros.core.ekf_slam.models import observe_line
 from thinmap_ros.core.se2 import compose
-from thinmap_ros.core.slam.ekf import EkfSlam
-from thinmap_ros.core.slam.models import observe_line
 
 P0, Q = np.diag([0.01, 0.02, 0.003]), np.diag([1e-4, 5e-5, 4e-5])
 R = np.array([[4e-4, 1e-5], [1e-5, 1e-4]])

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.ekf_slam.ekf import EkfSlam
+from thinmap_ros.core.ekf_slam.features import Feature, normals_of, sides_of, tangents_of
+from thinmap_ros.core.ekf_slam.lines import Lines
 from thinmap_ros.core.se2 import Array, transform_points, wrap
-from thinmap_ros.core.slam.ekf import EkfSlam
-from thinmap_ros.core.slam.features import Feature, normals_of, sides_of, tangents_of
-from thinmap_ros.core.slam.lines import Lines
 
 # Only pairs nearer than this are put to the statistical test at all.
 _NEAR_M = 0.5
@@ -33,7 +33,10 @@ class AssociationConfig(Config):
         5.99, 'largest squared Mahalanobis distance of a match (95 %, 2 dof)', low=0.1, high=50.0
     )
     gap_m: float = parameter(
-        0.3, 'seen part and feature may lie this far apart along the line, m', low=0.0, high=5.0
+        3.0,
+        'seen part and feature may lie this far apart along the line, m: as at a door',
+        low=0.0,
+        high=20.0,
     )
 
 

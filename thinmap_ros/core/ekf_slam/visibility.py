@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core.ekf_slam.features import Feature, normals_of, tangents_of
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, compose
-from thinmap_ros.core.slam.features import Feature, normals_of, tangents_of
 
 _BEYOND_M = 0.3  # a beam that ends this far behind a wall went through where the wall should be
 _END_M = 0.15  # nothing is expected of the ends of a feature

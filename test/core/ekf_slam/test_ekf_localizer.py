@@ -1,0 +1,114 @@
+"""The paper's filter alone behind the interface of a localizer: odometry and line features."""
+
+import numpy as np
+import pytest
+from slam_room import ROOM, drive, scan_in
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.ekf_slam.localizer import EkfConfig, EkfLocalizer
+from thinmap_ros.core.errors import ConfigError, InputError
+from thinmap_ros.core.odometry import LastPose
+
+PERIOD_NS = 200_000_000
+START = se2.pose(2.0, 2.0, 0.0)
+
+
+def at_start(slam='ekf_ti', **options):
+    return EkfLocalizer(EkfConfig(slam=slam, start_x_m=2.0, start_y_m=2.0, **options))
+
+
+def driven(localizer, steps):
+    """Errors (N, 3) of a drive through the room on worn wheels, and the last estimate."""
+    rng = np.random.default_rng(3)
+    errors = []
+    estimate = None
+    for k, (truth, odom) in enumerate(drive(steps, rng, START)):
+        scan = scan_in(ROOM, truth, rng, PERIOD_NS * k)
+        estimate = localizer.step(scan, odom)
+        errors.append(se2.between(truth, estimate.T_map_base))
+    return np.array(errors), estimate
+
+
+@pytest.mark.parametrize('slam', ['ekf_ti', 'ekf_full'])
+def test_line_features_hold_the_pose_of_worn_wheels(slam):
+    errors, estimate = driven(at_start(slam), 600)
+    off = np.hypot(*errors[:, :2].T)
+    assert off.max() < 0.2
+    assert np.abs(errors[:, 2]).max() < 0.1
+    assert estimate.n_features > 5
+    sigma = np.sqrt(np.trace(estimate.covariance[:2, :2]))
+    assert off[-1] < 3.0 * sigma < 1.0
+
+
+def test_the_local_area_estimates_what_all_features_do():
+    local, _ = driven(at_start('ekf_ti'), 300)
+    full, _ = driven(at_start('ekf_full'), 300)
+    assert np.abs(local - full)[:, :2].max() < 0.03
+
+
+def test_a_robot_that_stands_grows_neither_surer_nor_less_sure():
+    localizer = at_start()
+    _, before = driven(localizer, 100)
+    rng = np.random.default_rng(1)
+    odom = localizer._odometry.T_odom_base
+    for k in range(500):
+        trembling = odom + rng.normal(0.0, 0.002, 3)
+        scan = scan_in(ROOM, localizer.pose, rng, PERIOD_NS * (100 + k))
+        estimate = localizer.step(scan, trembling)
+    np.testing.assert_allclose(estimate.covariance, before.covariance, rtol=0.3)
+
+
+def test_a_state_is_a_map_that_another_day_goes_on_in():
+    localizer = at_start()
+    driven(localizer, 600)
+    state = localizer.state()
+    second = EkfLocalizer.from_state(state, EkfConfig(slam='ekf_ti', start_x_m=2.1, start_y_m=1.9))
+    assert {f.id for f in second.features} == {f.id for f in localizer.features}
+    errors, _ = driven(second, 100)
+    assert np.hypot(*errors[-1, :2]) < 0.1
+    with pytest.raises(InputError, match='expected'):
+        EkfLocalizer.from_state({**state, 'lines': np.zeros((1, 3))})
+
+
+def test_without_mapping_no_feature_comes_grows_or_goes():
+    localizer = at_start()
+    driven(localizer, 600)
+    config = EkfConfig(slam='ekf_ti', start_x_m=2.0, start_y_m=2.0, mapping=False)
+    second = EkfLocalizer.from_state(localizer.state(), config)
+    before = {f.id: (f.start, f.end) for f in second.features}
+    errors, _ = driven(second, 100)
+    assert {f.id for f in second.features} == set(before)
+    assert np.hypot(*errors[-1, :2]) < 0.1
+    alone = at_start(mapping=False)
+    driven(alone, 100)
+    assert alone.features == []
+
+
+def test_it_goes_on_after_a_restart_where_odometry_leads():
+    last = LastPose(0, se2.pose(1.0, 2.0, 0.5), se2.pose(1.0, 0.0, 0.0))
+    resumed = EkfLocalizer.resumed(None, last, se2.pose(2.0, 0.0, 0.0))
+    expected = se2.compose(last.T_map_odom, se2.pose(2.0, 0.0, 0.0))
+    np.testing.assert_allclose(resumed.pose, expected)
+
+
+def test_input_that_makes_no_sense_is_refused():
+    localizer = at_start()
+    driven(localizer, 50)
+    pose = localizer.pose
+    localizer.set_pose(np.array([np.nan, 0.0, 0.0]), np.eye(3))
+    scan = scan_in(ROOM, pose, None, PERIOD_NS * 50)
+    localizer.step(scan, np.array([np.inf, 0.0, 0.0]))
+    localizer.step(scan, localizer._odometry.T_odom_base + [500.0, 0.0, 0.0])
+    assert localizer.refused == 3
+    np.testing.assert_allclose(localizer.pose, pose, atol=0.3)
+    with pytest.raises(ConfigError, match='ekf_full'):
+        EkfConfig(slam='full')
+
+
+def test_its_path_is_what_it_said():
+    localizer = at_start()
+    errors, _ = driven(localizer, 50)
+    assert localizer.corrected_path().shape == errors.shape
+    np.testing.assert_array_equal(localizer.corrected_path()[-1], localizer.pose)
+    stamps, poses = localizer.past()
+    assert (stamps.shape, poses.shape) == ((0,), (0, 3))

@@ -1,0 +1,93 @@
+"""Motion of a differential drive and observation of a line, with their Jacobians."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.se2 import Array, wrap
+
+
+@dataclass(frozen=True)
+class OdometryConfig(Config):
+    """Noise of odometry, 1 sigma."""
+
+    odom_noise: float = parameter(
+        0.1, 'odometry error for each metre or radian of a motion, m or rad', low=0.001, high=2.0
+    )
+    odom_slip_m: float = parameter(
+        0.01, 'error of any odometry increment, in each direction, m', low=1e-5, high=1.0
+    )
+    odom_slip_rad: float = parameter(
+        0.01, 'error of any odometry increment, rad', low=1e-5, high=1.0
+    )
+
+
+def odometry_slip(config: OdometryConfig) -> Array:
+    """Error (3,), 1 sigma, of any odometry increment."""
+    return np.array([config.odom_slip_m, config.odom_slip_m, config.odom_slip_rad])
+
+
+def odometry_variances(increment: Array, config: OdometryConfig) -> Array:
+    """Variances (3,) of an odometry increment (3,), in the robot frame before the motion."""
+    way_m = math.hypot(increment[0], increment[1])
+    turn = abs(float(increment[2]))
+    sigmas = odometry_slip(config) + config.odom_noise * np.array([way_m, way_m, turn])
+    return np.square(sigmas)
+
+
+def rotation(theta: float) -> Array:
+    """(3, 3): turns increments, and by R C R' covariances, from the robot frame to theta's."""
+    c, s = math.cos(theta), math.sin(theta)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def motion_jacobians(T_map_base: Array, increment: Array) -> tuple[Array, Array]:
+    """F_x and F_u, (3, 3) each, of T_map_base o increment.
+
+    Source: EKF-SLAM/TI paper eqs. (10), (11).
+    """
+    F_u = rotation(float(T_map_base[2]))
+    dx, dy, _ = F_u @ increment
+    F_x = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
+    return F_x, F_u
+
+
+def observe_line(T_map_base: Array, line: Array) -> tuple[Array, Array, Array]:
+    """A map line (r, alpha) as the robot sees it.
+
+    Prediction (2,), Jacobians by pose (2, 3) and by line (2, 2).
+
+    Source: EKF-SLAM/TI paper eq. (3), lost in the text; with x cos(alpha) + y sin(alpha) = r it is
+    r^R = r - (x cos(alpha) + y sin(alpha)), alpha^R = alpha - theta,
+    and where r^R < 0: -r^R, alpha^R + pi.
+    """
+    x, y, theta = (float(v) for v in T_map_base)
+    r, alpha = float(line[0]), float(line[1])
+    c, s = math.cos(alpha), math.sin(alpha)
+    distance, bearing, sign = r - (x * c + y * s), alpha - theta, 1.0
+    if distance < 0.0:
+        distance, bearing, sign = -distance, bearing + math.pi, -1.0
+    by_pose = np.array([[-sign * c, -sign * s, 0.0], [0.0, 0.0, -1.0]])
+    by_line = np.array([[sign, sign * (x * s - y * c)], [0.0, 1.0]])
+    return np.array([distance, wrap(bearing)]), by_pose, by_line
+
+
+def place_line(T_map_base: Array, seen: Array) -> tuple[Array, Array, Array]:
+    """A line (r, alpha) seen by the robot, in the map.
+
+    Line (2,), Jacobians by pose (2, 3) and by what was seen (2, 2).
+
+    The inverse of `observe_line`; r >= 0 in the map as well.
+    """
+    x, y, theta = (float(v) for v in T_map_base)
+    alpha = float(seen[1]) + theta
+    c, s = math.cos(alpha), math.sin(alpha)
+    r, sign = float(seen[0]) + x * c + y * s, 1.0
+    if r < 0.0:
+        r, alpha, sign = -r, alpha + math.pi, -1.0
+    turn = sign * (-x * s + y * c)
+    by_pose = np.array([[sign * c, sign * s, turn], [0.0, 0.0, 1.0]])
+    by_seen = np.array([[sign, turn], [0.0, 1.0]])
+    return np.array([r, wrap(alpha)]), by_pose, by_seen
