@@ -145,7 +145,8 @@ def test_simulated_log_bag_and_live_graph_agree(graph, tmp_path):
 
 
 def test_a_closed_loop_corrects_the_live_map_as_it_does_the_replayed_one(graph, tmp_path):
-    start = {'start_x_m': 3.0, 'start_y_m': 1.2}
+    # Without lines: with them the robot does not drift enough for a loop to be corrected.
+    start = {'start_x_m': 3.0, 'start_y_m': 1.2, 'slam': 'off'}
     expected = replay(LoopLog(), PipelineConfig(localizer=ScanLocalizerConfig(**start)))
     assert 'rebuild' in expected.pipeline.stage_seconds
     convert(LoopLog(), tmp_path / 'bag')

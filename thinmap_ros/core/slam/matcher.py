@@ -44,7 +44,6 @@ _NEVER = 1e6  # sigmas of the motion beyond which wheels have slipped, where the
 _UNSEEN = 0.5  # cost of a point where nobody has looked yet, for one in the open
 _UNDECIDED = 2.5  # costs of beams waver by so much along a corridor that says nothing
 _SEARCHED_POINTS = 80
-_FEWEST_HITS = 3  # of a wall that is more than where beams happened to end
 
 
 @dataclass(frozen=True)
@@ -112,7 +111,7 @@ class Matcher:
         """
         laser = np.ascontiguousarray(T_base_laser[:2])
         lattice = local_map.lattice
-        scan = self.weighted(points_base, self._isolated_weight(covariance))
+        scan = self.weighted(points_base)
         information = inverse(covariance)
         match = self._refined(scan, lattice, prior, prior, information)
         fits = match.fit >= self.config.match_least_fit
@@ -150,19 +149,8 @@ class Matcher:
         beams = _beam_cost(scan, laser, match.T_map_base, lattice, *self._noise)
         return beams + _loss(float(off @ information @ off), slipped)
 
-    def _isolated_weight(self, covariance: Array) -> float:
-        """Weight of a point whose wall is an isolated hit, for one whose wall has a direction.
-
-        Such hits are where beams happened to meet a wall that goes on between them. From near by,
-        beams meet it in the same pattern, and the pattern matches where the robot has not moved:
-        along a smooth corridor it would stay where it is. So these hits count the less, the less
-        the motion is uncertain.
-        """
-        sigma_m = math.sqrt(max(covariance[0, 0], covariance[1, 1]))
-        return min(1.0, sigma_m / self.config.match_sigma_m)
-
-    def weighted(self, points_base: Array, isolated: float = 1.0) -> Array:
-        """A scan as the kernels take it, (N, 4): x, y, weight, share of it at an isolated hit.
+    def weighted(self, points_base: Array) -> Array:
+        """A scan as the kernels take it, (N, 3): x, y, weight.
 
         Points nearer to each other than a cell see the same piece of wall, and say it once.
         """
@@ -170,7 +158,7 @@ class Matcher:
         ends = np.concatenate([gaps[:1], gaps, gaps[-1:]])
         around = 0.5 * (ends[:-1] + ends[1:])
         weights = self.config.match_weight * np.minimum(around / self.config.match_cell_m, 1.0)
-        return np.column_stack([points_base, weights, np.full(len(weights), isolated)])
+        return np.column_stack([points_base, weights])
 
     @property
     def _noise(self) -> tuple[float, float]:
@@ -260,7 +248,7 @@ def _is_crossed(lattice: Lattice, x0: float, y0: float, x1: float, y1: float) ->
         slot = slot_of(lattice, row, col)
         if slot != NO_TILE:
             cell = lattice.pool[slot, row & _MASK, col & _MASK]
-            if cell['to_row'] == HERE and cell['to_col'] == HERE and cell['hits'] >= _FEWEST_HITS:
+            if cell['to_row'] == HERE and cell['to_col'] == HERE and cell['hits'] >= 3:
                 return True
     return False
 
@@ -307,16 +295,6 @@ def _beam_cost(
             row, col = _cell_of(y1), _cell_of(x1)
             cost += scan[i, 2] * _end_cost(lattice, row, col, sigma, width, _UNSEEN)
     return _tempered(cost, scan[:, 2].sum())
-
-
-@inlined
-def _is_isolated(lattice: Lattice, row: int, col: int) -> bool:
-    """Whether the wall nearest to a cell is a hit or two, without a direction."""
-    slot, row, col = nearest_wall(lattice, row, col)
-    if slot == NO_TILE:
-        return False
-    cell = lattice.pool[slot, row & _MASK, col & _MASK]
-    return bool(cell['normal'] == 0 and cell['hits'] < _FEWEST_HITS)
 
 
 @inlined
@@ -376,14 +354,12 @@ def _evaluated(
         error = d / sigma
         weight = scan[i, 2]
         total += weight
-        is_near = abs(error) < far
-        known += weight * is_near
-        fitting += weight * (abs(error) < _FITS_SIGMAS)
-        if _is_isolated(lattice, _cell_of(y), _cell_of(x)):
-            weight *= scan[i, 3]
         cost += weight * _loss(error * error, width)
-        if not is_near:
+        if abs(error) >= far:
             continue
+        known += weight
+        if abs(error) < _FITS_SIGMAS:
+            fitting += weight
         w = weight / (1.0 + error * error / (width * width))
         jx, jy = by_x / sigma_m, by_y / sigma_m
         jt = -jx * py + jy * px
