@@ -18,7 +18,8 @@ from thinmap_ros.core.localization.global_localization import GlobalLocalization
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.scan_localizer import ScanLocalizer, ScanLocalizerConfig
+from thinmap_ros.core.slam.modes import localizer_class
+from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
 from thinmap_ros.core.topology.update import TopologyBuilder
 
 _PERIOD_NS = 200_000_000
@@ -113,7 +114,8 @@ def map_and_graph(shared: None, rng: np.random.Generator, folder: Path) -> None:
 def localize(shared: None, rng: np.random.Generator, folder: Path) -> None:
     drive = Drive(rng, folder)
     config = ScanLocalizerConfig(slam=str(chosen(rng, ('ti', 'off', 'ekf_ti', 'ekf_full'))))
-    localizer = ScanLocalizer(config)
+    kind = localizer_class(config)
+    localizer = kind(config)
     graph = small_graph()
     for _ in range(int(rng.integers(1, 20))):
         drive.move()
@@ -128,7 +130,7 @@ def localize(shared: None, rng: np.random.Generator, folder: Path) -> None:
         if rng.random() < 0.1:
             localizer.set_topology(graph)
     finite(localizer.corrected_path())
-    tried(lambda: ScanLocalizer.from_state(localizer.state(), config))
+    tried(lambda: kind.from_state(localizer.state(), config))
 
 
 def known_room(folder: Path) -> tuple[GridPatch, Any]:

@@ -144,6 +144,14 @@ def test_simulated_log_bag_and_live_graph_agree(graph, tmp_path):
     assert_live_is_same(graph, tmp_path / 'bag', from_log, tmp_path)
 
 
+def test_the_filter_of_the_paper_says_live_what_it_says_replayed(graph, tmp_path):
+    config = PipelineConfig(localizer=ScanLocalizerConfig(slam='ekf_ti'))
+    expected = replay(SimulatedLog(), config)
+    assert len(expected.pipeline.localizer.features) > 3
+    convert(SimulatedLog(), tmp_path / 'bag')
+    assert_live_is_same(graph, tmp_path / 'bag', expected, tmp_path, slam='ekf_ti')
+
+
 def test_a_closed_loop_corrects_the_live_map_as_it_does_the_replayed_one(graph, tmp_path):
     # Without lines: with them the robot does not drift enough for a loop to be corrected.
     start = {'start_x_m': 3.0, 'start_y_m': 1.2, 'slam': 'off'}

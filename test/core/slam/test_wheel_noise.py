@@ -1,4 +1,4 @@
-"""Noise of wheel odometry of the EKF localizer."""
+"""Noise of wheel odometry of the localizer before."""
 
 import math
 

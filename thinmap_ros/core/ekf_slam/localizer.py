@@ -2,9 +2,11 @@
 
 Source: EKF-SLAM/TI paper sections 2 to 4. The state holds the pose and the features of the local
 area, which the topological map picks (`ekf_ti`), or all features (`ekf_full`); both estimate the
-same. There is no scan matching and no pose graph: what the filter once believed of a line stays.
+same. There is no scan matching and no pose graph: what the filter once believed of a line stays,
+and a robot that was carried off is not noticed.
 """
 
+from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -80,7 +82,7 @@ class EkfLocalizer:
         self._odometry = OdometryIncrements()
         self._moved: Array = np.zeros(3)  # since the filter's pose
         self._is_observation_due = True
-        self._path: list[Array] = []
+        self._path = array('d')
 
     @property
     def refused(self) -> int:
@@ -160,7 +162,7 @@ class EkfLocalizer:
             self._refused += not is_valid
             self._is_observation_due = False  # the same scan again tells no more
         self._filter.work_off()
-        self._path.append(self.pose)
+        self._path.extend(self.pose.tolist())
         return Estimate(
             self.pose,
             self._filter.local.pose_covariance,
@@ -173,7 +175,7 @@ class EkfLocalizer:
 
     def corrected_path(self) -> Array:
         """Poses (N, 3) of all steps; a filter corrects none of the past."""
-        return np.array(self._path).reshape(-1, 3)
+        return np.array(self._path, dtype=np.float64).reshape(-1, 3)
 
     def past(self) -> tuple[NDArray[np.int64], Array]:
         """Stamps (0,) and poses (0, 3): nothing of the past is ever corrected."""

@@ -359,9 +359,7 @@ class ScanLocalizer:
         if self._evidence > config.lost_evidence:
             self._begin_submap()
         if config.slam != 'off':
-            heading = self._lines.observe(scan, self._pose, _BESIDE_WALLS)
-            if self._evidence == 0.0:
-                self._pose[2] = heading
+            self._observe_lines(scan)
         self._map.add_scan(points, scan.T_base_laser, self._pose)
         # What the motion leaves is new with every step; what the scan leaves is much the same error
         # as in the step before, as long as the same walls are seen.
@@ -374,6 +372,14 @@ class ScanLocalizer:
         self._T_learned = self._pose
         if len(points) >= FEWEST_POINTS and self._loops.is_due(self._pose):
             self._keep(scan, points)
+
+    def _observe_lines(self, scan: Scan) -> None:
+        """Update the line features, and the heading by them where scans agree with the map."""
+        heading = self._lines.observe(scan, self._pose, _BESIDE_WALLS)
+        if self._evidence == 0.0:
+            self._pose = se2.pose(float(self._pose[0]), float(self._pose[1]), heading)
+            self._T_stood = self._pose
+            self._reckoned = (self._pose, self._since_fit)
 
     def _keep(self, scan: Scan, points: Array) -> None:
         """Make the scan a keyframe."""

@@ -1,4 +1,4 @@
-"""Noise of wheel odometry of the EKF localizer, `--core ekf`."""
+"""Noise of wheel odometry of the localizer before, `--core ekf`."""
 
 import math
 from dataclasses import dataclass
