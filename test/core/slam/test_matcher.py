@@ -8,6 +8,7 @@ from slam_room import ROOM, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam import matcher as module
+from thinmap_ros.core.slam.keyframes import turned
 from thinmap_ros.core.slam.local_map import LocalMap
 from thinmap_ros.core.slam.matcher import Matcher, MatcherConfig
 
@@ -276,9 +277,14 @@ def reference_cost(local_map, scan, pose, prior, information):
     return tempered(scans, scan[:, 2].sum()) + cauchy(away @ information @ away, 3.0)
 
 
-def evaluated(local_map, scan, pose, prior, information, function=module._evaluated):
+NOTHING_OPEN = (1.0, 0.0, 1.0)
+
+
+def evaluated(
+    local_map, scan, pose, prior, information, metric=NOTHING_OPEN, function=module._evaluated
+):
     H, g, by_motion, sums = function(
-        scan, pose, prior, information, local_map.lattice, *MATCHER._noise
+        scan, pose, prior, information, local_map.lattice, *MATCHER._noise, metric
     )
     return sums, H, by_motion, g
 
@@ -326,6 +332,55 @@ def test_the_gradient_is_that_of_numeric_differences(rng, room, scan):
     assert agree >= 18
 
 
+@pytest.fixture
+def posts():
+    """Single hits a metre apart on either side of a corridor."""
+    local_map = LocalMap()
+    x = np.arange(2.02, 12.0)
+    local_map.add(np.vstack([np.column_stack([x, 0 * x + y]) for y in (1.02, -1.03)]), np.zeros(2))
+    return local_map
+
+
+def test_single_hits_draw_only_across_what_is_open(posts):
+    x = np.arange(2.12, 12.0)
+    seen = np.vstack([np.column_stack([x, 0 * x + y]) for y in (1.12, -0.93)])
+    scan = np.column_stack([seen, np.ones(len(seen))])
+    none = 1e-9 * np.eye(3)
+    draws = {}
+    for metric in (NOTHING_OPEN, (0.0, 0.0, 1.0), (0.5, 0.0, 1.0), (0.5, 0.5, 0.5)):
+        sums, H, _, g = evaluated(posts, scan, np.zeros(3), np.zeros(3), none, metric)
+        assert sums[2] == pytest.approx(len(scan)), 'they fit, whichever way they are measured'
+        draws[metric] = g, H
+    (full, _), (across, H), (half, _), (oblique, _) = draws.values()
+    assert full[0] < -50.0
+    assert full[1] < -50.0
+    assert abs(across[0]) < 1e-2 * abs(full[0])
+    assert across[1] < full[1], 'what is not off along the corridor is no less certain'
+    assert H[0, 0] < 1e-2 * H[1, 1]
+    assert across[0] > half[0] > full[0]
+    assert oblique[0] == pytest.approx(oblique[1])
+
+
+def test_what_is_open_is_where_walls_tell_less_than_the_motion():
+    walls, motion = np.diag([100.0, 1000.0, 1e6]), np.diag([900.0, 900.0, 1e4])
+    metric = module._open_metric
+    np.testing.assert_allclose(metric(walls, motion), (0.2, 0.0, 1.0), atol=1e-9)
+    np.testing.assert_allclose(metric(walls, motion / 9.0), NOTHING_OPEN, atol=1e-9)
+    aslant = turned(walls, 0.25 * math.pi)
+    np.testing.assert_allclose(metric(aslant, motion), (0.6, -0.4, 0.6), atol=1e-9)
+    nothing = np.zeros((3, 3))
+    assert sum(metric(nothing, motion)[0::2]) == pytest.approx(1.0), 'one direction is open'
+
+
+def test_a_wall_tells_the_place_as_far_as_the_heading_is_known():
+    """A wall 10 m ahead on one side, seen by itself, and one that the robot drives along."""
+    ahead = 1e4 * np.outer([1.0, 0.0, -10.0], [1.0, 0.0, -10.0])
+    walls = np.diag([0.0, 1e4, 0.0]) + ahead
+    loose, tight = np.diag([100.0, 100.0, 1.0]), np.diag([100.0, 100.0, 1e8])
+    assert module._open_metric(walls, loose)[0] < 0.01
+    np.testing.assert_allclose(module._open_metric(walls, tight), NOTHING_OPEN, atol=1e-9)
+
+
 def test_kernels_are_what_they_are_in_plain_python(room, scan):
     thin = np.ascontiguousarray(scan[::6])
     information = np.linalg.inv(DOUBT)
@@ -333,7 +388,7 @@ def test_kernels_are_what_they_are_in_plain_python(room, scan):
     rest = (room.lattice, *MATCHER._noise)
     for compiled, plain in zip(
         evaluated(room, thin, pose, prior, information),
-        evaluated(room, thin, pose, prior, information, module._evaluated.py_func),
+        evaluated(room, thin, pose, prior, information, function=module._evaluated.py_func),
         strict=True,
     ):
         np.testing.assert_allclose(compiled, plain, rtol=1e-9, atol=1e-9)

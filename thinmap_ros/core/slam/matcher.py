@@ -2,11 +2,14 @@
 
 One sum of squares holds the distance of each point of the scan from the nearest wall, with a Cauchy
 kernel, and the motion that is expected, with its covariance. It is minimised by the method of
-Levenberg and Marquardt. Where the scan does not fit then, or the motion is too uncertain for the
-minimum that is nearest to be the right one, the poses within that uncertainty are searched, and the
-likelier one wins.
+Levenberg and Marquardt. In the direction that walls leave open, as along a corridor, what beams met
+now and then tells nothing beside the motion (`_open_metric`). Where the scan does not fit then, or
+the motion is too uncertain for the minimum that is nearest to be the right one, the poses within
+that uncertainty are searched, and the likelier one wins.
 Source: Kohlbrecher et al., "A flexible and scalable SLAM system with full 3D motion estimation",
-2011, for the smooth map; Olson, "Real-time correlative scan matching", 2009, for the search.
+2011, for the smooth map; Zhang, Kaess and Singh, "On degeneracy of optimization-based state
+estimation problems", 2016, for directions that are left open; Olson, "Real-time correlative scan
+matching", 2009, for the search.
 """
 
 import math
@@ -44,6 +47,7 @@ _NEVER = 1e6  # sigmas of the motion beyond which wheels have slipped, where the
 _UNSEEN = 0.5  # cost of a point where nobody has looked yet, for one in the open
 _UNDECIDED = 2.5  # costs of beams waver by so much along a corridor that says nothing
 _SEARCHED_POINTS = 80
+_OFTEN = 3  # hits of a cell that is no chance
 
 
 @dataclass(frozen=True)
@@ -248,7 +252,7 @@ def _is_crossed(lattice: Lattice, x0: float, y0: float, x1: float, y1: float) ->
         slot = slot_of(lattice, row, col)
         if slot != NO_TILE:
             cell = lattice.pool[slot, row & _MASK, col & _MASK]
-            if cell['to_row'] == HERE and cell['to_col'] == HERE and cell['hits'] >= 3:
+            if cell['to_row'] == HERE and cell['to_col'] == HERE and cell['hits'] >= _OFTEN:
                 return True
     return False
 
@@ -325,6 +329,28 @@ def _of_prior(pose: Array, prior: Array, by_prior: Array) -> tuple[Array, Array,
     return w * by_prior, w * pull, _loss(squared, _SIGMAS)
 
 
+@inlined
+def _is_chance(lattice: Lattice, row: int, col: int) -> bool:
+    """Whether the wall nearest to a cell was hardly ever met, and has no direction."""
+    slot, row, col = nearest_wall(lattice, row, col)
+    if slot == NO_TILE:
+        return False
+    cell = lattice.pool[slot, row & _MASK, col & _MASK]
+    return bool(cell['normal'] == 0 and cell['hits'] < _OFTEN)
+
+
+@inlined
+def _measured(
+    d: float, by_x: float, by_y: float, metric: tuple[float, float, float]
+) -> tuple[float, float, float]:
+    """A distance and its slopes by a metric (xx, xy, yy)."""
+    xx, xy, yy = metric
+    mx, my = xx * by_x + xy * by_y, xy * by_x + yy * by_y
+    squared = by_x * by_x + by_y * by_y
+    scale = math.sqrt(max((mx * by_x + my * by_y) / max(squared, 1e-9), 1e-6))
+    return scale * d, mx / scale, my / scale
+
+
 @kernel
 def _evaluated(
     scan: Array,
@@ -334,8 +360,9 @@ def _evaluated(
     lattice: Lattice,
     sigma: float,
     width: float,
+    metric: tuple[float, float, float],
 ) -> tuple[Array, Array, Array, tuple[float, float, float, float, float]]:
-    """Normal equations at a pose.
+    """Normal equations at a pose, where distances from chance hits are measured by a metric.
 
     Returns H (3, 3) and g (3,) of scan and prior, the part of H that is the prior's, and: the
     weights of all points, of known and of fitting ones, the cost, and what a point proves.
@@ -351,15 +378,19 @@ def _evaluated(
         x = (pose[0] + px) / cell_m - lattice.first_col
         y = (pose[1] + py) / cell_m - lattice.first_row
         d, by_x, by_y = interpolated(lattice, x, y)
-        error = d / sigma
+        off = abs(d) / sigma
         weight = scan[i, 2]
         total += weight
+        if off < far:
+            known += weight
+            if off < _FITS_SIGMAS:
+                fitting += weight
+            if _is_chance(lattice, _cell_of(y), _cell_of(x)):
+                d, by_x, by_y = _measured(d, by_x, by_y, metric)
+        error = d / sigma
         cost += weight * _loss(error * error, width)
-        if abs(error) >= far:
+        if off >= far:
             continue
-        known += weight
-        if abs(error) < _FITS_SIGMAS:
-            fitting += weight
         w = weight / (1.0 + error * error / (width * width))
         jx, jy = by_x / sigma_m, by_y / sigma_m
         jt = -jx * py + jy * px
@@ -405,6 +436,36 @@ def _information(scan: Array, pose: Array, lattice: Lattice, sigma: float, width
     return H
 
 
+@inlined
+def _quadratic(A: Array, dx: float, dy: float, turn: float) -> float:
+    """Square of (dx, dy, turn) in the metric of a symmetric A (3, 3)."""
+    mixed = A[0, 1] * dx * dy + A[0, 2] * dx * turn + A[1, 2] * dy * turn
+    square = A[0, 0] * dx * dx + A[1, 1] * dy * dy + A[2, 2] * turn * turn + 2.0 * mixed
+    return float(square)
+
+
+@inlined
+def _open_metric(walls: Array, by_prior: Array) -> tuple[float, float, float]:
+    """Metric (xx, xy, yy) by which a point is off what beams met once or twice.
+
+    walls, by_prior: information (3, 3) of walls that have a direction, and of the motion. Far down
+    a corridor beams meet the walls here and there, in a pattern that moves with the robot: matched,
+    it says that the robot stays. So in the direction that walls tell worst such hits count by twice
+    the share that walls have in what walls and motion tell: fully where the walls tell as much as
+    the motion, not at all where they tell nothing. Across it they count fully.
+    """
+    turn = max(walls[2, 2] + by_prior[2, 2], 1e-12)
+    xx = walls[0, 0] - walls[0, 2] * walls[0, 2] / turn
+    xy = walls[0, 1] - walls[0, 2] * walls[1, 2] / turn
+    yy = walls[1, 1] - walls[1, 2] * walls[1, 2] / turn
+    least = 0.5 * (xx + yy) - math.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
+    along = 0.5 * math.atan2(2.0 * xy, xx - yy) + 0.5 * math.pi
+    ux, uy = math.cos(along), math.sin(along)
+    least = max(least, 1e-12)
+    less = 1.0 - min(1.0, 2.0 * least / (least + _quadratic(by_prior, ux, uy, 0.0)))
+    return 1.0 - less * ux * ux, -less * ux * uy, 1.0 - less * uy * uy
+
+
 @kernel
 def _contradicted(scan: Array, pose: Array, lattice: Lattice, far: float) -> float:
     """Weight of the points in cells that were seen through, and are farther than far from walls."""
@@ -432,7 +493,9 @@ def _minimised(
 ) -> tuple[Array, Array, Array, tuple[float, float, float, float, float]]:
     """Pose (3,), information (3, 3) of scan and prior, of the scan, and sums of `_evaluated`."""
     pose = start.copy()
-    H, g, of_prior, sums = _evaluated(scan, pose, prior, by_prior, lattice, sigma, width)
+    walls = _information(scan, prior, lattice, sigma, width)
+    rest = (prior, by_prior, lattice, sigma, width, _open_metric(walls, by_prior))
+    H, g, of_prior, sums = _evaluated(scan, pose, *rest)
     damping = 1e-3
     for _ in range(_ROUNDS):
         A = H.copy()
@@ -440,7 +503,7 @@ def _minimised(
             A[a, a] *= 1.0 + damping
         step = np.linalg.solve(A, g)
         tried = pose + step
-        new = _evaluated(scan, tried, prior, by_prior, lattice, sigma, width)
+        new = _evaluated(scan, tried, *rest)
         if new[3][3] < sums[3]:
             pose = tried
             H, g, of_prior, sums = new
@@ -451,14 +514,6 @@ def _minimised(
             break
     by_scan = sums[4] * _information(scan, pose, lattice, sigma, width)
     return pose, of_prior + by_scan, by_scan, sums
-
-
-@inlined
-def _quadratic(A: Array, dx: float, dy: float, turn: float) -> float:
-    """Square of (dx, dy, turn) in the metric of a symmetric A (3, 3)."""
-    mixed = A[0, 1] * dx * dy + A[0, 2] * dx * turn + A[1, 2] * dy * turn
-    square = A[0, 0] * dx * dx + A[1, 1] * dy * dy + A[2, 2] * turn * turn + 2.0 * mixed
-    return float(square)
 
 
 @inlined

@@ -40,6 +40,7 @@ _CHI2 = 11.34  # 99 % of three degrees of freedom
 _VIEW_M = 1.0  # after a path of this length a match errs by other points than before
 _STANDS_M = 1e-3  # odometry of a robot that stands, and a scan's worth of turning
 _SIGMAS = 3.0
+_FOR_A_SLIP = 3.0  # points that fit, for one that contradicts, where scan and motion disagree
 _AT_ONCE = 20  # keyframes drawn at once after a correction
 _A_STEP = 2  # and in each step after it
 _UNKNOWN_M = 300.0  # uncertainty of a pose that could be anywhere
@@ -327,12 +328,12 @@ class ScanLocalizer:
         return float(off @ np.linalg.solve(self._since_fit, off)) > _CHI2
 
     def _is_refused(self, match: Match, prior: Array) -> bool:
-        """Whether a match contradicts the motion, and most of its points the map: it is chance.
+        """Whether a match contradicts the motion, and many of its points the map: it is chance.
 
         Not of a robot that was put somewhere: where it was before says nothing.
         """
-        by_chance = match.contradicted > match.fit and self._is_unexpected(match, prior)
-        return by_chance and not self._is_unplaced
+        by_chance = match.fit < _FOR_A_SLIP * match.contradicted
+        return by_chance and self._is_unexpected(match, prior) and not self._is_unplaced
 
     def _judge(self, match: Match) -> None:
         """Whether scans contradict the map.
