@@ -7,7 +7,7 @@ import pytest
 from slam_room import ROOM, scan_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.slam import matcher as module
+from thinmap_ros.core.slam import least_squares, pose_search
 from thinmap_ros.core.slam.keyframes import turned
 from thinmap_ros.core.slam.local_map import LocalMap
 from thinmap_ros.core.slam.matcher import Matcher, MatcherConfig
@@ -281,7 +281,7 @@ NOTHING_OPEN = (1.0, 0.0, 1.0)
 
 
 def evaluated(
-    local_map, scan, pose, prior, information, metric=NOTHING_OPEN, function=module._evaluated
+    local_map, scan, pose, prior, information, metric=NOTHING_OPEN, function=least_squares.evaluated
 ):
     H, g, by_motion, sums = function(
         scan, pose, prior, information, local_map.lattice, *MATCHER._noise, metric
@@ -363,7 +363,7 @@ def test_single_hits_draw_only_across_what_is_open(posts):
 
 def test_what_is_open_is_where_walls_tell_less_than_the_motion():
     walls, motion = np.diag([100.0, 1000.0, 1e6]), np.diag([900.0, 900.0, 1e4])
-    metric = module._open_metric
+    metric = least_squares.open_metric
     np.testing.assert_allclose(metric(walls, motion), (0.2, 0.0, 1.0), atol=1e-9)
     np.testing.assert_allclose(metric(walls, motion / 9.0), NOTHING_OPEN, atol=1e-9)
     aslant = turned(walls, 0.25 * math.pi)
@@ -377,8 +377,8 @@ def test_a_wall_tells_the_place_as_far_as_the_heading_is_known():
     ahead = 1e4 * np.outer([1.0, 0.0, -10.0], [1.0, 0.0, -10.0])
     walls = np.diag([0.0, 1e4, 0.0]) + ahead
     loose, tight = np.diag([100.0, 100.0, 1.0]), np.diag([100.0, 100.0, 1e8])
-    assert module._open_metric(walls, loose)[0] < 0.01
-    np.testing.assert_allclose(module._open_metric(walls, tight), NOTHING_OPEN, atol=1e-9)
+    assert least_squares.open_metric(walls, loose)[0] < 0.01
+    np.testing.assert_allclose(least_squares.open_metric(walls, tight), NOTHING_OPEN, atol=1e-9)
 
 
 def test_kernels_are_what_they_are_in_plain_python(room, scan):
@@ -388,14 +388,14 @@ def test_kernels_are_what_they_are_in_plain_python(room, scan):
     rest = (room.lattice, *MATCHER._noise)
     for compiled, plain in zip(
         evaluated(room, thin, pose, prior, information),
-        evaluated(room, thin, pose, prior, information, function=module._evaluated.py_func),
+        evaluated(room, thin, pose, prior, information, function=least_squares.evaluated.py_func),
         strict=True,
     ):
         np.testing.assert_allclose(compiled, plain, rtol=1e-9, atol=1e-9)
     for kernel, arguments in (
-        (module._information, (thin, pose, *rest)),
-        (module._beam_cost, (thin, np.zeros(2), pose, *rest)),
-        (module._contradicted, (thin, pose, room.lattice, 3.0)),
+        (least_squares.information, (thin, pose, *rest)),
+        (pose_search.beam_cost, (thin, np.zeros(2), pose, *rest)),
+        (least_squares.contradicted, (thin, pose, room.lattice, 3.0)),
     ):
         np.testing.assert_allclose(
             kernel(*arguments), kernel.py_func(*arguments), rtol=1e-9, atol=1e-9
@@ -416,7 +416,7 @@ def test_the_search_finds_the_least_of_its_lattice(rng, room, scan):
     prior = TRUTH + [0.13, -0.08, 0.06]
     steps, sizes = np.array([3, 3, 4]), np.array([0.1, 0.03])
     rest = (information, room.lattice, *MATCHER._noise, 3.0, 0.5)
-    found = module._searched(thin, prior, steps, sizes, *rest)
+    found = pose_search.searched(thin, prior, steps, sizes, *rest)
     sigma, outlier = NOISE
     cell_m = room.config.match_cell_m
     least, best = np.inf, None
@@ -465,7 +465,7 @@ def test_a_wall_that_would_be_crossed_costs(rng):
         MATCHER.weighted(points[np.abs(points[:, 1]) < 1.0]) for points in (through, ahead)
     )
     rest = (np.zeros(2), np.zeros(3), local_map.lattice, *MATCHER._noise)
-    by_point = [module._beam_cost(scan, *rest) / scan[:, 2].sum() for scan in (through, ahead)]
+    by_point = [pose_search.beam_cost(scan, *rest) / scan[:, 2].sum() for scan in (through, ahead)]
     assert by_point[0] > 5.0 * by_point[1]
 
 

@@ -194,7 +194,8 @@ FIELDS = {
 
 
 @inlined
-def _cell_of(at: float) -> int:
+def cell_of(at: float) -> int:
+    """Row or column of the cell at a place, in cells."""
     return int(math.floor(at))
 
 
@@ -267,7 +268,7 @@ def interpolated(lattice: Lattice, x: float, y: float) -> tuple[float, float, fl
     It changes its sign where a wall runs between the cells: without, it would be the same
     anywhere between two cells on either side.
     """
-    col, row = _cell_of(x - 0.5), _cell_of(y - 0.5)
+    col, row = cell_of(x - 0.5), cell_of(y - 0.5)
     u, v = x - 0.5 - col, y - 0.5 - row
     d00, nx, ny = _off_wall(lattice, row, col)
     d01, nx01, ny01 = _off_wall(lattice, row, col + 1)
