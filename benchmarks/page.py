@@ -17,7 +17,7 @@ and that all times are much too long.
 
 How well the localizer does on real logs, on degraded ones and in generated buildings is told by
 another program: `python -m benchmarks.scoreboard -o DIR` (`--short`: two minutes of its worst
-cases) leaves its page in `DIR/scoreboard.md`.
+cases) leaves its page in `DIR/scoreboard.md`. A complete run: [scoreboard.md](scoreboard.md).
 
 Machine: {machine}.
 """

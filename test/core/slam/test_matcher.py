@@ -277,11 +277,17 @@ def reference_cost(local_map, scan, pose, prior, information):
     return tempered(scans, scan[:, 2].sum()) + cauchy(away @ information @ away, 3.0)
 
 
-NOTHING_OPEN = (1.0, 0.0, 1.0)
+NOT_DEGENERATE = (1.0, 0.0, 1.0)
 
 
 def evaluated(
-    local_map, scan, pose, prior, information, metric=NOTHING_OPEN, function=least_squares.evaluated
+    local_map,
+    scan,
+    pose,
+    prior,
+    information,
+    metric=NOT_DEGENERATE,
+    function=least_squares.evaluated,
 ):
     H, g, by_motion, sums = function(
         scan, pose, prior, information, local_map.lattice, *MATCHER._noise, metric
@@ -341,13 +347,13 @@ def posts():
     return local_map
 
 
-def test_single_hits_draw_only_across_what_is_open(posts):
+def test_isolated_hits_draw_only_across_a_degenerate_direction(posts):
     x = np.arange(2.12, 12.0)
     seen = np.vstack([np.column_stack([x, 0 * x + y]) for y in (1.12, -0.93)])
     scan = np.column_stack([seen, np.ones(len(seen))])
     none = 1e-9 * np.eye(3)
     draws = {}
-    for metric in (NOTHING_OPEN, (0.0, 0.0, 1.0), (0.5, 0.0, 1.0), (0.5, 0.5, 0.5)):
+    for metric in (NOT_DEGENERATE, (0.0, 0.0, 1.0), (0.5, 0.0, 1.0), (0.5, 0.5, 0.5)):
         sums, H, _, g = evaluated(posts, scan, np.zeros(3), np.zeros(3), none, metric)
         assert sums[2] == pytest.approx(len(scan)), 'they fit, whichever way they are measured'
         draws[metric] = g, H
@@ -361,15 +367,15 @@ def test_single_hits_draw_only_across_what_is_open(posts):
     assert oblique[0] == pytest.approx(oblique[1])
 
 
-def test_what_is_open_is_where_walls_tell_less_than_the_motion():
+def test_a_direction_is_degenerate_where_walls_tell_less_than_the_motion():
     walls, motion = np.diag([100.0, 1000.0, 1e6]), np.diag([900.0, 900.0, 1e4])
-    metric = least_squares.open_metric
+    metric = least_squares.degeneracy_metric
     np.testing.assert_allclose(metric(walls, motion), (0.2, 0.0, 1.0), atol=1e-9)
-    np.testing.assert_allclose(metric(walls, motion / 9.0), NOTHING_OPEN, atol=1e-9)
+    np.testing.assert_allclose(metric(walls, motion / 9.0), NOT_DEGENERATE, atol=1e-9)
     aslant = turned(walls, 0.25 * math.pi)
     np.testing.assert_allclose(metric(aslant, motion), (0.6, -0.4, 0.6), atol=1e-9)
     nothing = np.zeros((3, 3))
-    assert sum(metric(nothing, motion)[0::2]) == pytest.approx(1.0), 'one direction is open'
+    assert sum(metric(nothing, motion)[0::2]) == pytest.approx(1.0), 'one direction is degenerate'
 
 
 def test_a_wall_tells_the_place_as_far_as_the_heading_is_known():
@@ -377,8 +383,10 @@ def test_a_wall_tells_the_place_as_far_as_the_heading_is_known():
     ahead = 1e4 * np.outer([1.0, 0.0, -10.0], [1.0, 0.0, -10.0])
     walls = np.diag([0.0, 1e4, 0.0]) + ahead
     loose, tight = np.diag([100.0, 100.0, 1.0]), np.diag([100.0, 100.0, 1e8])
-    assert least_squares.open_metric(walls, loose)[0] < 0.01
-    np.testing.assert_allclose(least_squares.open_metric(walls, tight), NOTHING_OPEN, atol=1e-9)
+    assert least_squares.degeneracy_metric(walls, loose)[0] < 0.01
+    np.testing.assert_allclose(
+        least_squares.degeneracy_metric(walls, tight), NOT_DEGENERATE, atol=1e-9
+    )
 
 
 def test_kernels_are_what_they_are_in_plain_python(room, scan):

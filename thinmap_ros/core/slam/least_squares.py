@@ -1,10 +1,10 @@
 """The sum of squares that a match minimises: distances of points from walls, and the motion.
 
-In the direction that walls leave open, as along a corridor, what beams met now and then tells
-nothing beside the motion (`open_metric`).
+In a direction that is degenerate, as along a corridor, isolated hits tell nothing beside the
+motion (`degeneracy_metric`).
 Source: Kohlbrecher et al., "A flexible and scalable SLAM system with full 3D motion estimation",
 2011, for the smooth map; Zhang, Kaess and Singh, "On degeneracy of optimization-based state
-estimation problems", 2016, for directions that are left open.
+estimation problems", 2016, for degenerate directions.
 """
 
 import math
@@ -27,7 +27,7 @@ from thinmap_ros.core.slam.local_map import (
 USUAL_LOSS = 1.0
 FITS_SIGMAS = 3.0
 SIGMAS = 3.0  # of the motion, beyond which wheels have slipped
-OFTEN = 3  # hits of a cell that is no chance
+RELIABLE_HITS = 3  # of a cell that is a wall for sure
 _ROUNDS = 30
 _SETTLED = 1e-4  # m and rad: a step that is smaller is the last
 _MASK = TILE - 1
@@ -91,25 +91,31 @@ def _of_prior(pose: Array, prior: Array, by_prior: Array) -> tuple[Array, Array,
 
 
 @inlined
-def _is_chance(lattice: Lattice, row: int, col: int) -> bool:
-    """Whether the wall nearest to a cell was hardly ever met, and has no direction."""
+def _is_isolated(lattice: Lattice, row: int, col: int) -> bool:
+    """Whether the wall nearest to a cell was met once or twice, and has no normal."""
     slot, row, col = nearest_wall(lattice, row, col)
     if slot == NO_TILE:
         return False
     cell = lattice.pool[slot, row & _MASK, col & _MASK]
-    return bool(cell['normal'] == 0 and cell['hits'] < OFTEN)
+    return bool(cell['normal'] == 0 and cell['hits'] < RELIABLE_HITS)
 
 
 @inlined
-def _measured(
-    d: float, by_x: float, by_y: float, metric: tuple[float, float, float]
-) -> tuple[float, float, float]:
-    """A distance and its slopes by a metric (xx, xy, yy)."""
+def _distance(
+    lattice: Lattice, x: float, y: float, metric: tuple[float, float, float]
+) -> tuple[float, float, float, float]:
+    """Distance at (x, y), in cells, as it is, by a metric (xx, xy, yy), and slopes by that.
+
+    Only isolated hits are measured by the metric.
+    """
+    d, by_x, by_y = interpolated(lattice, x, y)
+    if abs(d) >= lattice.reach or not _is_isolated(lattice, cell_of(y), cell_of(x)):
+        return abs(d), d, by_x, by_y
     xx, xy, yy = metric
     mx, my = xx * by_x + xy * by_y, xy * by_x + yy * by_y
     squared = by_x * by_x + by_y * by_y
     scale = math.sqrt(max((mx * by_x + my * by_y) / max(squared, 1e-9), 1e-6))
-    return scale * d, mx / scale, my / scale
+    return abs(d), scale * d, mx / scale, my / scale
 
 
 @kernel
@@ -123,35 +129,29 @@ def evaluated(
     width: float,
     metric: tuple[float, float, float],
 ) -> tuple[Array, Array, Array, tuple[float, float, float, float, float]]:
-    """Normal equations at a pose, where distances from chance hits are measured by a metric.
+    """Normal equations at a pose, where distances from isolated hits are measured by a metric.
 
     Returns H (3, 3) and g (3,) of scan and prior, the part of H that is the prior's, and: the
     weights of all points, of known and of fitting ones, the cost, and what a point proves.
     """
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
-    cell_m = lattice.cell_m
-    sigma_m = sigma * cell_m
+    cell_m, sigma_m = lattice.cell_m, sigma * lattice.cell_m
     total, known, fitting, cost = 1e-9, 0.0, 0.0, 0.0
     H, g = np.zeros((3, 3)), np.zeros(3)
-    far = lattice.reach / sigma
     for i in range(len(scan)):
         px, py = cos * scan[i, 0] - sin * scan[i, 1], sin * scan[i, 0] + cos * scan[i, 1]
         x = (pose[0] + px) / cell_m - lattice.first_col
         y = (pose[1] + py) / cell_m - lattice.first_row
-        d, by_x, by_y = interpolated(lattice, x, y)
-        off = abs(d) / sigma
+        off, d, by_x, by_y = _distance(lattice, x, y, metric)
+        error = d / sigma
         weight = scan[i, 2]
         total += weight
-        if off < far:
-            known += weight
-            if off < FITS_SIGMAS:
-                fitting += weight
-            if _is_chance(lattice, cell_of(y), cell_of(x)):
-                d, by_x, by_y = _measured(d, by_x, by_y, metric)
-        error = d / sigma
         cost += weight * loss(error * error, width)
-        if off >= far:
+        if off >= lattice.reach:
             continue
+        known += weight
+        if off < FITS_SIGMAS * sigma:
+            fitting += weight
         w = weight / (1.0 + error * error / (width * width))
         jx, jy = by_x / sigma_m, by_y / sigma_m
         jt = -jx * py + jy * px
@@ -206,10 +206,10 @@ def quadratic(A: Array, dx: float, dy: float, turn: float) -> float:
 
 
 @inlined
-def open_metric(walls: Array, by_prior: Array) -> tuple[float, float, float]:
-    """Metric (xx, xy, yy) by which a point is off what beams met once or twice.
+def degeneracy_metric(walls: Array, by_prior: Array) -> tuple[float, float, float]:
+    """Metric (xx, xy, yy) by which a point is off isolated hits.
 
-    walls, by_prior: information (3, 3) of walls that have a direction, and of the motion. Far down
+    walls, by_prior: information (3, 3) of walls that have a normal, and of the motion. Far down
     a corridor beams meet the walls here and there, in a pattern that moves with the robot: matched,
     it says that the robot stays. So in the direction that walls tell worst such hits count by twice
     the share that walls have in what walls and motion tell: fully where the walls tell as much as
@@ -255,7 +255,7 @@ def minimised(
     """Pose (3,), information (3, 3) of scan and prior, of the scan, and sums of `evaluated`."""
     pose = start.copy()
     walls = information(scan, prior, lattice, sigma, width)
-    rest = (prior, by_prior, lattice, sigma, width, open_metric(walls, by_prior))
+    rest = (prior, by_prior, lattice, sigma, width, degeneracy_metric(walls, by_prior))
     H, g, of_prior, sums = evaluated(scan, pose, *rest)
     damping = 1e-3
     for _ in range(_ROUNDS):

@@ -12,7 +12,7 @@ from thinmap_ros.core.grid.tiles import NO_TILE, TILE
 from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.least_squares import (
-    OFTEN,
+    RELIABLE_HITS,
     USUAL_LOSS,
     is_seen,
     loss,
@@ -35,7 +35,7 @@ def _is_crossed(lattice: Lattice, x0: float, y0: float, x1: float, y1: float) ->
         slot = slot_of(lattice, row, col)
         if slot != NO_TILE:
             cell = lattice.pool[slot, row & _MASK, col & _MASK]
-            if cell['to_row'] == HERE and cell['to_col'] == HERE and cell['hits'] >= OFTEN:
+            if cell['to_row'] == HERE and cell['to_col'] == HERE and cell['hits'] >= RELIABLE_HITS:
                 return True
     return False
 
