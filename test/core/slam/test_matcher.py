@@ -131,6 +131,23 @@ def test_a_wide_doubt_is_searched_though_the_nearest_minimum_fits(rng):
     assert abs(match(local_map, points, prior, doubt).T_map_base[0]) < 0.03
 
 
+def test_an_unknown_heading_is_searched_though_the_nearest_minimum_fits(rng):
+    """A square room, that looks nearly the same after a quarter turn, but for a piece of wall."""
+    corners = 3.0 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    walls = np.vstack([np.hstack([corners, np.roll(corners, -1, axis=0)]), [[1.0, 1.0, 1.2, 1.0]]])
+    truth = np.zeros(3)
+    local_map = map_of(walls, around(truth, 10, rng), rng)
+    points = scan_in(walls, truth, rng).points_base()
+    prior = np.array([0.0, 0.0, 1.2])
+    doubt = np.diag(np.square([0.03, 0.03, 0.6]))
+    alone = MATCHER._refined(
+        MATCHER.weighted(points), local_map.lattice, prior, prior, np.linalg.inv(doubt)
+    )
+    assert alone.fit > MATCHER.config.match_least_fit
+    assert abs(alone.T_map_base[2]) > 1.0
+    assert abs(match(local_map, points, prior, doubt).T_map_base[2]) < 0.02
+
+
 def near_points(pose, rng):
     """What a laser of 6 m sees of the corridor, (N, 2), robot frame."""
     points = scan_in(CORRIDOR, pose, rng).points_base()

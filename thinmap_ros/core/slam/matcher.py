@@ -116,9 +116,14 @@ class Matcher:
         return other if there < here - (_UNDECIDED if fits else 0.0) else match
 
     def _is_near(self, covariance: Array) -> bool:
-        """Whether points at a prior with covariance (3, 3) lie where their walls draw them."""
+        """Whether points at a prior with covariance (3, 3) lie where their walls draw them.
+
+        Where the heading is no better known than after a slip, they do not.
+        """
+        config = self.config
         sigma_m = math.sqrt(max(covariance[0, 0], covariance[1, 1]))
-        return SIGMAS * sigma_m <= self.config.match_outlier_m
+        sigma_rad = math.sqrt(covariance[2, 2])
+        return SIGMAS * sigma_m <= config.match_outlier_m and sigma_rad <= config.slip_rad
 
     def _beam_cost(
         self,
