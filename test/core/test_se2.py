@@ -50,18 +50,3 @@ def test_a_step_ahead_of_a_robot_facing_north_goes_north():
 def test_interpolation_turns_the_shorter_way():
     middle = se2.interpolate(se2.pose(0, 0, 3.0), se2.pose(2, 0, -3.0), 0.5)
     np.testing.assert_allclose(middle, [1.0, 0.0, math.pi])
-
-
-@pytest.mark.parametrize(
-    ('matrix', 'is_one'),
-    [
-        (np.zeros((3, 3)), True),
-        (np.diag([1e9, 1e-9, 0.1]), True),
-        (np.ones((3, 3)), True),
-        (np.diag([0.1, 0.1, -0.01]), False),
-        (np.array([[1.0, 2.0], [2.0, 1.0]]), False),
-        (np.diag([1.0, np.inf, 1.0]), False),
-    ],
-)
-def test_a_covariance_is_finite_and_nowhere_negative(matrix, is_one):
-    assert se2.is_covariance(matrix) is is_one

@@ -14,7 +14,6 @@ Array = NDArray[np.float64]
 # No robot gets farther from where its map began. Beyond 1e15 m a coordinate cannot even tell cells
 # apart, and what is computed from it lies outside of every array.
 FARTHEST_M = 1e6
-_ROUNDING = 1e-9  # of the largest variance
 
 
 @overload
@@ -74,14 +73,6 @@ def interpolate(T_a: Array, T_b: Array, share: float) -> Array:
 def is_on_earth(T: Array) -> bool:
     """Whether a pose (3,) is finite and no farther than FARTHEST_M from the origin of its frame."""
     return is_finite(T) and abs(T[0]) <= FARTHEST_M and abs(T[1]) <= FARTHEST_M
-
-
-def is_covariance(matrix: Array) -> bool:
-    """Whether a matrix (N, N) is finite and, up to rounding, says no variance below zero."""
-    if not np.isfinite(matrix).all():
-        return False
-    variances = np.linalg.eigvalsh(0.5 * (matrix + matrix.T))
-    return bool(variances[0] >= -_ROUNDING * max(variances[-1], 1.0))
 
 
 def is_finite(T: Array) -> bool:

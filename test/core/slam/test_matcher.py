@@ -35,6 +35,12 @@ def match(local_map, points, prior, covariance=DOUBT):
     return MATCHER.match(points, np.zeros(3), local_map, prior, covariance)
 
 
+def nearest_minimum(local_map, points, prior, covariance):
+    """The match without a search."""
+    scan, information = MATCHER.weighted(points), np.linalg.inv(covariance)
+    return MATCHER._refined(scan, local_map.lattice, prior, prior, information)
+
+
 def off(match_, truth=TRUTH):
     return se2.off(match_.T_map_base, truth)
 
@@ -123,9 +129,7 @@ def test_a_wide_doubt_is_searched_though_the_nearest_minimum_fits(rng):
     points = scan_in(walls, truth, rng).points_base()
     prior = np.array([0.6, 0.0, 0.0])
     doubt = np.diag(np.square([0.3, 0.05, 0.02]))
-    alone = MATCHER._refined(
-        MATCHER.weighted(points), local_map.lattice, prior, prior, np.linalg.inv(doubt)
-    )
+    alone = nearest_minimum(local_map, points, prior, doubt)
     assert alone.fit > MATCHER.config.match_least_fit
     assert abs(alone.T_map_base[0]) > 0.3
     assert abs(match(local_map, points, prior, doubt).T_map_base[0]) < 0.03
@@ -140,9 +144,7 @@ def test_an_unknown_heading_is_searched_though_the_nearest_minimum_fits(rng):
     points = scan_in(walls, truth, rng).points_base()
     prior = np.array([0.0, 0.0, 1.2])
     doubt = np.diag(np.square([0.03, 0.03, 0.6]))
-    alone = MATCHER._refined(
-        MATCHER.weighted(points), local_map.lattice, prior, prior, np.linalg.inv(doubt)
-    )
+    alone = nearest_minimum(local_map, points, prior, doubt)
     assert alone.fit > MATCHER.config.match_least_fit
     assert abs(alone.T_map_base[2]) > 1.0
     assert abs(match(local_map, points, prior, doubt).T_map_base[2]) < 0.02

@@ -105,7 +105,7 @@ class EkfLocalizer:
 
     def set_pose(self, T_map_base: Array, covariance: Array) -> None:
         """Put the robot at a pose (3,) with covariance (3, 3) in the map that it has."""
-        if not (se2.is_on_earth(T_map_base) and se2.is_covariance(covariance)):
+        if not (se2.is_on_earth(T_map_base) and np.isfinite(covariance).all()):
             self._refused += 1
             return
         self._filter.local.set_pose(T_map_base, covariance + _START)

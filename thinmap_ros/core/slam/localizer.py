@@ -160,7 +160,7 @@ class Localizer:
 
         The next scans settle it.
         """
-        if not (se2.is_on_earth(T_map_base) and se2.is_covariance(covariance)):
+        if not (se2.is_on_earth(T_map_base) and np.isfinite(covariance).all()):
             self.refused += 1
             return
         floor = np.diag(np.square(_START_SIGMAS))

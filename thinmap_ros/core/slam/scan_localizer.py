@@ -140,7 +140,7 @@ class ScanLocalizer:
 
         The next scans settle it; nothing is learned before.
         """
-        if not (se2.is_on_earth(T_map_base) and se2.is_covariance(covariance)):
+        if not (se2.is_on_earth(T_map_base) and np.isfinite(covariance).all()):
             self._refused += 1
             return
         least = np.diag(np.square(_STEP_SIGMAS))
