@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.alignment import between_paths
 from benchmarks.lost_robots import Map, Record, fresh, prepared, search
 from thinmap_ros.adapters.carmen import CarmenLog
 from thinmap_ros.adapters.events import OdometryEvent
@@ -93,7 +94,7 @@ def _halves(log: Path) -> _Halves:
     for scan, T_odom_base in pairs[half:]:
         pipeline.step(scan, T_odom_base)
     whole = pipeline.localizer.corrected_path()
-    T_first_whole = _between_paths(whole[:half], first)
+    T_first_whole = between_paths(whole[:half], first)
     poses = [se2.compose(T_first_whole, T) for T in whole]
     return _Halves([Look(*pair, T) for pair, T in zip(pairs, poses, strict=True)], half, known)
 
@@ -107,12 +108,3 @@ def _pairs(log: Path) -> list[tuple[Scan, Array]]:
         else:
             pairs += pairing.add_scan(event.scan)
     return pairs
-
-
-def _between_paths(path: Array, onto: Array) -> Array:
-    """Rigid motion (3,) that lays a path (N, 3) onto another: least squares of the positions."""
-    middle, onto_middle = path[:, :2].mean(axis=0), onto[:, :2].mean(axis=0)
-    a, b = path[:, :2] - middle, onto[:, :2] - onto_middle
-    turn = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
-    turned = se2.transform_points(se2.pose(0.0, 0.0, float(turn)), middle[None])[0]
-    return se2.pose(*(onto_middle - turned).tolist(), float(turn))

@@ -18,6 +18,9 @@ and that all times are much too long.
 How well the localizer does on real logs, on degraded ones and in generated buildings is told by
 another program: `python -m benchmarks.scoreboard -o DIR` (`--short`: two minutes of its worst
 cases) leaves its page in `DIR/scoreboard.md`. A complete run: [scoreboard.md](scoreboard.md).
+Where small causes have large effects, as where a loop is found a scan later, one run tells little:
+`--runs 8` runs each case eight times, all but the first with odometry disturbed by less than wheels
+err by, and tells mean and worst.
 
 Machine: {machine}.
 """

@@ -10,7 +10,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 
 from benchmarks.scoreboard.against import against
-from benchmarks.scoreboard.cases import BY_HAND, Case, all_cases, compared_with
+from benchmarks.scoreboard.cases import BY_HAND, Case, all_cases, compared_with, repeated
 from benchmarks.scoreboard.measure import Numbers, Task, config_of, measure
 from benchmarks.scoreboard.page import page, shortened, worst_tenth
 from thinmap_ros.adapters.files import read_text, write_text
@@ -58,15 +58,26 @@ def _parser() -> argparse.ArgumentParser:
         help=f'the localizer (default {_CORE})',
     )
     parser.add_argument('--quiet', action='store_true', help='no bar of progress')
+    parser.add_argument(
+        '--runs',
+        type=int,
+        default=1,
+        metavar='N',
+        help='run each case N times, all but the first with odometry disturbed by less than wheels '
+        'err by: a case in which small causes have large effects is not told by one run',
+    )
     add_run_options(parser)
     return parser
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    if arguments.write_short and (arguments.short or arguments.only != '*'):
-        raise ConfigError('--write-short: expected a complete run: neither --short nor --only')
+    if arguments.runs < 1:
+        raise ConfigError(f'--runs {arguments.runs}: expected 1 or more')
+    partial = arguments.short or arguments.only != '*' or arguments.runs > 1
+    if arguments.write_short and partial:
+        raise ConfigError('--write-short: expected a complete run: no --short, --only or --runs')
     options = _options(arguments.set, arguments.core)
-    cases = _chosen(arguments)
+    cases = repeated(_chosen(arguments), arguments.runs)
     for case in cases:
         if _file(arguments.out, case.name).exists():
             read_report(_file(arguments.out, case.name), options)  # before hours of work

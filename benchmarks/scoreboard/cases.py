@@ -1,6 +1,7 @@
 """What is on the scoreboard: logs, degraded logs, and drives in buildings."""
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from thinmap_ros.core.errors import InputError
@@ -52,32 +53,47 @@ BY_HAND = (
 class LogCase:
     """A log of a folder, perhaps degraded; exact_s: how near a pose must be to a relation's stamp.
 
-    options: of degrade_log.py.
+    options: of degrade_log.py; run: as in `repeated`.
     """
 
     log: str
     version: str = ''
     options: tuple[str, ...] = ()
     exact_s: float = 0.1
+    run: int = 0
+
+    @property
+    def first(self) -> str:
+        """Name of the run that is not disturbed."""
+        return f'{self.log}.{self.version}' if self.version else self.log
 
     @property
     def name(self) -> str:
         """What it is called on the page, and its file."""
-        return f'{self.log}.{self.version}' if self.version else self.log
+        return _numbered(self.first, self.run)
 
 
 @dataclass(frozen=True)
 class BuildingCase:
-    """A drive through a generated building; noise: times that of the robot's odometry."""
+    """A drive through a generated building; noise: times that of the robot's odometry.
+
+    run: as in `repeated`.
+    """
 
     seed: int
     robot: str
     noise: float
+    run: int = 0
+
+    @property
+    def first(self) -> str:
+        """Name of the run that is not disturbed."""
+        return f'building_{self.seed:03d}.{self.robot}_x{self.noise:g}'
 
     @property
     def name(self) -> str:
         """What it is called on the page, and its file."""
-        return f'building_{self.seed:03d}.{self.robot}_x{self.noise:g}'
+        return _numbered(self.first, self.run)
 
 
 Case = LogCase | BuildingCase
@@ -106,6 +122,15 @@ def all_cases(logs: Path) -> list[Case]:
     return cases
 
 
+def repeated(cases: Iterable[Case], runs: int) -> list[Case]:
+    """Each case so many times: all runs but the first (number 0) with odometry a little disturbed.
+
+    A case in which small causes have large effects, as where a loop is found a scan later or not at
+    all, is not told by a single run.
+    """
+    return [replace(case, run=run) for case in cases for run in range(runs)]
+
+
 def compared_with(case: Case, logs: Path) -> str:
     """Name of the case that a case is judged by: the undegraded log where there are no relations.
 
@@ -114,6 +139,10 @@ def compared_with(case: Case, logs: Path) -> str:
     if isinstance(case, LogCase) and not (logs / case.log / 'relations').exists():
         return case.log
     return case.name
+
+
+def _numbered(name: str, run: int) -> str:
+    return f'{name}.run_{run}' if run else name
 
 
 def _log(name: str, version: str = '', options: tuple[str, ...] = ()) -> LogCase:

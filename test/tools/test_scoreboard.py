@@ -4,12 +4,13 @@ import argparse
 import json
 import math
 import sys
-from itertools import count
+from itertools import count, pairwise
 from unittest.mock import patch
 
 import numpy as np
 import pytest
 
+from benchmarks.alignment import aligned_rms
 from benchmarks.scoreboard import __main__ as program
 from benchmarks.scoreboard import drives
 from benchmarks.scoreboard.against import against
@@ -21,9 +22,11 @@ from benchmarks.scoreboard.cases import (
     LogCase,
     all_cases,
     compared_with,
+    repeated,
 )
-from benchmarks.scoreboard.measure import Played, Task, _consistency, measure
+from benchmarks.scoreboard.measure import Played, Task, _consistency, _disturbed, measure
 from benchmarks.scoreboard.page import MOST_M, errors, page, shortened, worst_tenth
+from thinmap_ros.core import se2
 from thinmap_ros.core.errors import ConfigError
 from thinmap_ros.sim.buildings import DEVELOPMENT_SEEDS, BuildingConfig, building
 from thinmap_ros.sim.pioneer import PRESETS
@@ -208,6 +211,45 @@ def test_a_covariance_that_is_right_is_found_to_be():
     assert found['wrong_and_sure'] == np.count_nonzero(metres > 0.6)
 
 
+def test_a_map_that_is_turned_as_a_whole_has_no_error_once_aligned():
+    rng = np.random.default_rng(7)
+    truth = np.column_stack([rng.uniform(0.0, 30.0, (500, 2)), np.zeros(500)])
+    T = se2.pose(4.0, -2.0, 0.6)
+    turned = np.array([se2.compose(T, pose) for pose in truth])
+    assert aligned_rms(turned, truth) < 1e-9
+    turned[:, :2] += rng.normal(0.0, 0.2, (500, 2))
+    assert aligned_rms(turned, truth) == pytest.approx(0.2 * math.sqrt(2.0), rel=0.05)
+
+
+def test_a_disturbed_run_has_noise_of_its_own_and_the_first_has_none():
+    driven = [np.array([0.1 * k, 0.02 * k, 0.01 * k]) for k in range(2000)]
+
+    def poses(run):
+        return np.array([T for _, T in _disturbed(((None, T) for T in driven), run)])
+
+    np.testing.assert_array_equal(poses(0), driven)
+    np.testing.assert_array_equal(poses(1), poses(1))
+    assert not np.array_equal(poses(1), poses(2))
+    np.testing.assert_array_equal(poses(1)[0], driven[0])
+    off = [
+        se2.between(a, b) - se2.between(driven[k], driven[k + 1])
+        for k, (a, b) in enumerate(pairwise(poses(1)))
+    ]
+    np.testing.assert_allclose(np.std(off, axis=0), 5e-4, rtol=0.1)
+
+
+def test_the_page_tells_mean_and_worst_of_several_runs(reports):
+    cases = repeated([LOGS[0], DRIVES[0]], 2)
+    names = ['hall', 'hall.run_1', 'building_000.2dx_x1', 'building_000.2dx_x1.run_1']
+    assert [case.name for case in cases] == names
+    runs = [of_building(cases[2], 0.1), of_building(cases[3], 0.4) | {'final_m': 0.9}]
+    own = [of_log(cases[0], straight(0.0)), of_log(cases[1], straight(0.5))]
+    text = page(cases, own + runs)
+    assert '| hall | 2 | 0.021 | 0.426 | | |' in text
+    assert '| building_000.2dx_x1 | 2 | 0.200 | 0.400 | 0.300 | 0.900 |' in text
+    assert 'Several runs' not in page(CASES, reports)
+
+
 def called(*words):
     """Call the program in this process; exit code."""
     with patch.object(sys, 'argv', ['scoreboard', *map(str, words)]):
@@ -257,6 +299,14 @@ def test_it_goes_on_where_it_was_and_one_that_fails_stops_no_other(tmp_path, cap
     assert '## Against another run (2 of 2 cases)' in (out / 'scoreboard.md').read_text()
     assert called(*words, '--against', tmp_path) == 2
     assert called(*words, '--write-short') == 2
+    capsys.readouterr()
+    assert called('-o', out, '--runs', 2, '--write-short') == 2
+    assert 'no --short, --only or --runs' in capsys.readouterr().err
+    assert called(*words, '--runs', 0) == 2
+    assert '--runs 0: expected 1 or more' in capsys.readouterr().err
+    assert called(*words, '--runs', 2) == 0
+    disturbed = json.loads((out / 'results' / 'try_2.run_1.json').read_text())
+    assert 0.0 < np.abs(np.array(disturbed['path'])[1:, 1:]).max() < 0.01
 
 
 def test_a_drive_in_a_small_building(tmp_path, monkeypatch):
@@ -271,6 +321,7 @@ def test_a_drive_in_a_small_building(tmp_path, monkeypatch):
     assert 0.0 <= report['unmapped'] <= 1.0
     assert report['live_m'] < 0.3
     assert report['live_m'] <= report['live_most_m']
+    assert 0.0 < report['live_aligned_m'] <= report['live_m']
     assert 0.0 < report['ms_median'] <= report['ms_99'] <= report['stall_ms']
     assert report['mb'] > report['mb_more'] >= 0.0
     assert 'building_003.2dx_x3' in page([case], [report])
