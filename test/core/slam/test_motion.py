@@ -63,21 +63,6 @@ def test_what_was_expected_is_weighted_by_information():
     np.testing.assert_allclose(motion.variances, 1.0 / (by_odometry + by_velocity))
 
 
-@pytest.mark.parametrize('turn', [0.6, -0.6])
-def test_models_that_contradict_each_other_leave_the_motion_open(turn):
-    """As after a scan that comes late, with the odometry of its time, while the robot turns."""
-    model = MotionModel(CONFIG)
-    back = np.array([0.0, 0.0, -0.8 * turn])
-    told(model, [STEP, back], [STEP, back])
-    motion = model.expect(np.array([0.0, 0.0, turn]), 0.5 * SECONDS)
-    reach = 3.0 * np.sqrt(motion.variances[2])
-    assert abs(turn - motion.increment[2]) < reach
-    assert abs(0.5 * back[2] - motion.increment[2]) < reach
-    assert reach < 2.0
-    # Of the way both say the same.
-    assert motion.variances[0] < allowed(np.zeros(3))[0]
-
-
 def test_two_headings_either_side_of_the_wrap_have_their_mean_there():
     """Turns of almost half a circle, one way and the other."""
     model = MotionModel(CONFIG)

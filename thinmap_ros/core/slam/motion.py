@@ -2,9 +2,8 @@
 
 Two models tell it: the odometry, and the velocity that the last matches gave. How far each was off
 what the scans found is remembered, for translation and rotation, and scales the noise that its
-model allows. The expectation is the mean of both, weighted by their information, and the less
-certain the farther they are apart. An odometry that slips, lags or does not turn at all thereby
-counts less, without any rule for it.
+model allows. The expectation is the mean of both, weighted by their information. An odometry that
+slips, lags or does not turn at all thereby counts less, without any rule for it.
 Source: Mehra, "On the identification of variances and adaptive Kalman filtering", 1970;
 Siegwart and Nourbakhsh, "Introduction to autonomous mobile robots", for the odometry's noise.
 """
@@ -91,28 +90,13 @@ class MotionModel:
             sigma_m = jitter * config.odom_slip_m + config.acceleration_m_s2 * seconds**2
             sigma_rad = jitter * config.odom_slip_rad + config.acceleration_rad_s2 * seconds**2
             self._velocity.allowed = np.square([sigma_m, sigma_m, sigma_rad])
-        self._expected, variances = self._fused()
+        by_odometry, by_velocity = 1.0 / self._odometry.variances, 1.0 / self._velocity.variances
+        variances = 1.0 / (by_odometry + by_velocity)
+        difference = _difference(self._velocity.increment, increment)
+        self._expected = increment + variances * by_velocity * difference
         self._variances = variances
         moves = np.abs(self._expected) > _MOST_SIGMAS * slip
         return Motion(self._expected, variances, not moves.any())
-
-    def _fused(self) -> tuple[Array, Array]:
-        """Motion (3,), the mean of both models by information, and its variances (3,).
-
-        Where they are farther apart than by three sigmas, one of them is wrong, and nobody knows
-        which: the variance between them is added, as that of a mixture.
-        Source: Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and
-        navigation", 2001, for the moments of a mixture.
-        """
-        odometry, velocity = self._odometry, self._velocity
-        say = 1.0 / (1.0 + velocity.variances / odometry.variances)  # of the velocity; 0: unknown
-        apart = _difference(velocity.increment, odometry.increment)
-        mean = odometry.increment + say * apart
-        within = odometry.variances * (1.0 - say)
-        # No velocity is known with infinite variances: nothing is in excess of them.
-        allowed = odometry.variances + velocity.variances
-        excess = np.square(apart) - _MOST_SIGMAS**2 * allowed
-        return mean, within + say * (1.0 - say) * np.maximum(excess, 0.0)
 
     def learn(self, found: Array, by_scan: Array) -> None:
         """A scan found the motion (3,) to be that, with information (3, 3), robot frame."""
