@@ -36,7 +36,7 @@ _STANDS_RAD = math.radians(0.5)
 _KNOWN_AGAIN_M = 30.0  # of way after a slip or a gap, from which on relations over it are judged
 _CHI2_95 = 5.991  # of two degrees of freedom
 _WRONG_M = 0.5
-_DISTURBED = (5e-4, 5e-4, 5e-4)  # of odometry between scans, m, m, rad, in runs but the first
+DISTURBED = (5e-4, 5e-4, 5e-4)  # of odometry between scans, m, m, rad, in runs but the first
 
 
 @dataclass(eq=False)
@@ -168,7 +168,10 @@ def _over_the_event(own: Path, times: Array, poses: Array, exact_s: float) -> Nu
 
 
 def _degraded(case: LogCase, own: Path, degrade: Path, folder: Path) -> Path:
-    """Folder of the degraded log, made where it is not there yet."""
+    """Folder of the degraded log, made where it is not there yet.
+
+    Each run has its own: two that run at once would write into one.
+    """
     made = folder / case.name
     if not (made / 'done').exists():
         log = next(own.glob('log.clf*'))
@@ -205,7 +208,7 @@ def _disturbed(pairs: Iterator[tuple[Scan, Array]], run: int) -> Iterator[tuple[
         if last is None:
             T_odom_base = T
         else:
-            increment = se2.between(last, T) + rng.normal(0.0, _DISTURBED)
+            increment = se2.between(last, T) + rng.normal(0.0, DISTURBED)
             T_odom_base = se2.compose(T_odom_base, increment)
         last = T
         yield scan, T_odom_base

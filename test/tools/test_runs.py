@@ -4,6 +4,9 @@ import argparse
 import json
 import os
 import signal
+import subprocess
+import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +15,24 @@ import pytest
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.tools.runs import Failure, complaint, read_report, run_missing
 
+LONG = """
+import argparse, os, time
+from dataclasses import dataclass
+from pathlib import Path
+from thinmap_ros.tools.runs import run_missing
+
+@dataclass(frozen=True)
+class Rest:
+    name: str
+
+def rest(job):
+    print(os.getpid(), flush=True)
+    time.sleep(600.0)
+
+if __name__ == '__main__':
+    where = argparse.Namespace(processes=1, scheduler='')
+    run_missing(rest, [Rest('a')], lambda job: Path(job.name), where, quiet=True)
+"""
 ONE_CORE = argparse.Namespace(processes=1, scheduler='')
 
 
@@ -29,6 +50,14 @@ def add(job):
     if job.name == 'killed':
         os.kill(os.getpid(), signal.SIGKILL)
     return {'options': list(job.numbers), 'sum': sum(job.numbers), 'process': os.getpid()}
+
+
+def is_alive(pid):
+    """Whether a process runs: one that has ended and waits to be collected does not."""
+    try:
+        return Path(f'/proc/{pid}/stat').read_text().rsplit(')', 1)[1].split()[0] != 'Z'
+    except FileNotFoundError:
+        return False
 
 
 def run(folder, jobs, where=ONE_CORE):
@@ -79,3 +108,17 @@ def test_a_cluster_tells_what_fails_as_well(tmp_path: Path) -> None:
         failures = run(tmp_path, jobs, where)
     assert failures == {'refused': Failure('refused: no numbers')}
     assert read_report(tmp_path / 'a.json', [1.0])['sum'] == 1.0
+
+
+@pytest.mark.parametrize('end', [signal.SIGTERM, signal.SIGKILL])
+def test_a_job_ends_with_the_program_that_runs_it(tmp_path: Path, end: signal.Signals) -> None:
+    program = tmp_path / 'long.py'
+    program.write_text(LONG)
+    with subprocess.Popen([sys.executable, program], stdout=subprocess.PIPE) as running:
+        assert running.stdout is not None
+        job = int(running.stdout.readline())
+        running.send_signal(end)
+    deadline = time.monotonic() + 60.0
+    while is_alive(job) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not is_alive(job)

@@ -2,7 +2,6 @@
 
 import argparse
 import contextlib
-import ctypes
 import importlib.util
 import json
 import os
@@ -20,6 +19,7 @@ from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.sim.pioneer import PRESETS
 from thinmap_ros.tools import cli, demo_results
+from thinmap_ros.tools.processes import end_with_parent
 
 # Nodes end at once, but not on a machine that is busy; a recorder that is killed leaves half a bag.
 _PATIENCE_S = 20.0
@@ -27,7 +27,6 @@ _NODES = ('localizer', 'grid_mapper', 'topology_builder', 'explorer', 'navigator
 # These listen to /scan: time stands still until all of them do.
 _SCAN_LISTENERS = 5
 _SLEEP_S = 0.05
-_DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG
 
 
 @dataclass(eq=False)
@@ -51,7 +50,7 @@ class Processes:
                 stdout=log if quiet else None,
                 stderr=log if quiet else None,
                 start_new_session=True,
-                preexec_fn=_die_with_parent,
+                preexec_fn=end_with_parent,
             )
 
     def ended(self) -> str | None:
@@ -76,11 +75,6 @@ class Processes:
             if process.poll() is None:
                 with contextlib.suppress(ProcessLookupError):
                     os.killpg(process.pid, number)
-
-
-def _die_with_parent() -> None:
-    """However the demo itself ends, its nodes do not stay behind (Linux)."""
-    ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGTERM)
 
 
 def _raise_interrupt(number: int, frame: object) -> None:

@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from thinmap_ros.adapters.files import read_text, write_text
 from thinmap_ros.core.errors import InputError, ThinmapError, reason_of
+from thinmap_ros.tools.processes import end_with_parent
 
 Report = dict[str, Any]
 
@@ -136,6 +137,7 @@ def _started(work: Callable[[AnyJob], Report], job: AnyJob) -> tuple[Connection,
 
 
 def _send(connection: Connection, work: Callable[[AnyJob], Report], job: AnyJob) -> None:
+    end_with_parent()
     # Ctrl-C goes to all processes of a terminal; the parent ends this one.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     connection.send(_attempted(work, job))
