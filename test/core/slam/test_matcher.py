@@ -16,6 +16,7 @@ TRUTH = np.array([2.0, 2.0, 0.3])
 DOUBT = np.diag(np.square([0.1, 0.1, 0.1]))
 CORRIDOR = np.array([[-50.0, -1.0, 50.0, -1.0], [50.0, 1.0, -50.0, 1.0]])
 MATCHER = Matcher()
+LASER = np.zeros(2)
 NOISE = (MATCHER.config.match_sigma_m, MATCHER.config.match_outlier_m)
 
 
@@ -37,7 +38,7 @@ def match(local_map, points, prior, covariance=DOUBT):
 
 def nearest_minimum(local_map, points, prior, covariance):
     """The match without a search."""
-    scan, information = MATCHER.weighted(points), np.linalg.inv(covariance)
+    scan, information = MATCHER.weighted(points, LASER), np.linalg.inv(covariance)
     return MATCHER._refined(scan, local_map.lattice, prior, prior, information)
 
 
@@ -86,7 +87,7 @@ def test_a_prior_far_off_is_searched_for(rng, room):
             points = scan_in(ROOM, TRUTH, rng).points_base()
             prior = TRUTH + [*shift, turn]
             information = np.linalg.inv(wide)
-            scan = MATCHER.weighted(points)
+            scan = MATCHER.weighted(points, LASER)
             alone = MATCHER._refined(scan, room.lattice, prior, prior, information)
             missed += np.hypot(*off(alone)[:2]) > 0.1
             searched = match(room, points, prior, wide)
@@ -252,7 +253,7 @@ def test_ground_that_is_new_contradicts_nothing(rng, room):
 
 def test_a_point_says_as_much_as_its_gap_to_the_next():
     points = np.column_stack([np.array([0.0, 0.01, 0.02, 0.03, 1.0, 2.0]), np.zeros(6)])
-    scan = MATCHER.weighted(points)
+    scan = MATCHER.weighted(points, LASER)
     np.testing.assert_array_equal(scan[:, :2], points)
     np.testing.assert_allclose(scan[:, 2], [0.2, 0.2, 0.2, 1.0, 1.0, 1.0])
 
@@ -316,7 +317,7 @@ def evaluated(
 
 @pytest.fixture
 def scan(rng):
-    return MATCHER.weighted(scan_in(ROOM, TRUTH, rng).points_base())
+    return MATCHER.weighted(scan_in(ROOM, TRUTH, rng).points_base(), LASER)
 
 
 def test_the_cost_is_that_of_the_reference(rng, room, scan):
@@ -489,7 +490,7 @@ def test_a_wall_that_would_be_crossed_costs(rng):
     # A wall 4 m ahead: through the near one only.
     through, ahead = (scan_in(walls[k : k + 1], np.zeros(3)).points_base() for k in (1, 0))
     through, ahead = (
-        MATCHER.weighted(points[np.abs(points[:, 1]) < 1.0]) for points in (through, ahead)
+        MATCHER.weighted(points[np.abs(points[:, 1]) < 1.0], LASER) for points in (through, ahead)
     )
     rest = (np.zeros(2), np.zeros(3), local_map.lattice, *MATCHER._noise)
     by_point = [pose_search.beam_cost(scan, *rest) / scan[:, 2].sum() for scan in (through, ahead)]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
 from thinmap_ros.core.ekf_slam.feature_map import FeatureConfig, FeatureMap
 from thinmap_ros.core.ekf_slam.features import LineFeature
-from thinmap_ros.core.ekf_slam.lines import LineConfig, extract_lines
+from thinmap_ros.core.ekf_slam.lines import LineConfig, Lines, extract_lines, no_lines
 from thinmap_ros.core.estimate import Correction
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -30,6 +30,7 @@ class LineMap:
         self._lines = lines
         self._filter = CompressedEkf(np.zeros(3), _LEAST)
         self._map = FeatureMap(features, local_areas)
+        self.lines: Lines = no_lines()  # of the last observation, robot frame
         self.observed = 0
         self.matched = 0
 
@@ -55,7 +56,7 @@ class LineMap:
 
         Returns the heading that pose and features together tell, rad.
         """
-        lines = extract_lines(scan, self._lines)
+        self.lines = lines = extract_lines(scan, self._lines)
         self._filter.local.set_pose(T_map_base, covariance + _LEAST)
         self.observed = len(lines)
         self.matched, _ = self._map.observe(self._filter, lines, scan)

@@ -8,7 +8,7 @@ and a robot that was carried off is not noticed.
 
 from array import array
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -31,9 +31,10 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 
 _START = np.diag(np.square([1e-4, 1e-4, 1e-4]))  # the map begins where the robot stands
 _IN_SESSION = np.diag(np.square([0.3, 0.3, 0.15]))  # of a start in the map of another day
-# Errors of odometry repeat from step to step. A filter takes them to be independent: then they have
-# to be so many times larger to add up to as much.
-_REPEATED = 2.0
+# The systematic errors of odometry repeat from step to step, and this filter does not calibrate
+# them. It takes errors to be independent: these have to be so many times larger to add up to as
+# much.
+_REPEATED = 5.0
 _SLIP_SIGMAS = 3.0  # a motion within so much of the slip is not counted yet
 
 
@@ -69,7 +70,6 @@ class EkfLocalizer:
 
     def __init__(self, config: EkfConfig | None = None) -> None:
         self.config = config or EkfConfig(slam='ekf_ti')
-        self._noise = replace(self.config, odom_noise=_REPEATED * self.config.odom_noise)
         self._refused = 0
         self.reset()
 
@@ -142,8 +142,9 @@ class EkfLocalizer:
         """
         localizer = EkfLocalizer(config)
         moved = se2.between(last.T_odom_base, T_odom_base)
-        variances = odometry_variances(moved, localizer._noise)
-        localizer.set_pose(se2.compose(last.T_map_odom, T_odom_base), np.diag(variances))
+        localizer.set_pose(
+            se2.compose(last.T_map_odom, T_odom_base), localizer._motion_noise(moved)
+        )
         return localizer
 
     def step(self, scan: Scan, T_odom_base: Array) -> Estimate:
@@ -181,6 +182,10 @@ class EkfLocalizer:
         """Stamps (0,) and poses (0, 3): nothing of the past is ever corrected."""
         return np.empty(0, dtype=np.int64), np.empty((0, 3))
 
+    def _motion_noise(self, moved: Array) -> Array:
+        """Covariance (3, 3) of a motion (3,) by odometry, robot frame before it."""
+        return np.diag(_REPEATED**2 * odometry_variances(moved, self.config))
+
     def _predict(self, increment: Increment) -> None:
         """Eqs. (10) and (11), once the robot has moved by more than odometry slips.
 
@@ -193,8 +198,8 @@ class EkfLocalizer:
             self._is_observation_due = True
             return
         self._moved = se2.compose(self._moved, increment.T_before_base)
-        if (np.abs(self._moved) > _SLIP_SIGMAS * odometry_slip(self._noise)).any():
-            Q = np.diag(odometry_variances(self._moved, self._noise))
-            ekf.predict(self.pose, self._moved, Q)
+        slip = _REPEATED * odometry_slip(self.config)
+        if (np.abs(self._moved) > _SLIP_SIGMAS * slip).any():
+            ekf.predict(self.pose, self._moved, self._motion_noise(self._moved))
             self._moved = np.zeros(3)
             self._is_observation_due = True

@@ -14,13 +14,13 @@ class OdometryConfig(Config):
     """Noise of odometry, 1 sigma."""
 
     odom_noise: float = parameter(
-        0.1, 'odometry error for each metre or radian of a motion, m or rad', low=0.001, high=2.0
+        0.03, 'odometry error for each metre or radian of a motion, m or rad', low=0.001, high=2.0
     )
     odom_slip_m: float = parameter(
-        0.01, 'error of any odometry increment, in each direction, m', low=1e-5, high=1.0
+        0.003, 'error of any odometry increment, in each direction, m', low=1e-5, high=1.0
     )
     odom_slip_rad: float = parameter(
-        0.01, 'error of any odometry increment, rad', low=1e-5, high=1.0
+        0.003, 'error of any odometry increment, rad', low=1e-5, high=1.0
     )
 
 

@@ -101,6 +101,19 @@ def _is_isolated(lattice: Lattice, row: int, col: int) -> bool:
 
 
 @inlined
+def _is_behind(lattice: Lattice, row: int, col: int, to_x: float, to_y: float) -> bool:
+    """Whether the wall nearest to a cell was seen only from the other side than by a beam.
+
+    to_x, to_y: back along the beam. The two faces of a wall are two walls.
+    """
+    slot, row, col = nearest_wall(lattice, row, col)
+    if slot == NO_TILE:
+        return False
+    nx, ny = normal_of(int(lattice.pool[slot, row & _MASK, col & _MASK]['normal']))
+    return nx * to_x + ny * to_y < 0.0
+
+
+@inlined
 def _distance(
     lattice: Lattice, x: float, y: float, metric: tuple[float, float, float]
 ) -> tuple[float, float, float, float]:
@@ -149,6 +162,9 @@ def evaluated(
         cost += weight * loss(error * error, width)
         if off >= lattice.reach:
             continue
+        to_x, to_y = cos * scan[i, 3] - sin * scan[i, 4], sin * scan[i, 3] + cos * scan[i, 4]
+        if _is_behind(lattice, cell_of(y), cell_of(x), to_x, to_y):
+            continue
         known += weight
         if off < FITS_SIGMAS * sigma:
             fitting += weight
@@ -190,6 +206,9 @@ def information(scan: Array, pose: Array, lattice: Lattice, sigma: float, width:
         if slot == NO_TILE or error >= FITS_SIGMAS:
             continue
         nx, ny = normal_of(int(lattice.pool[slot, row & _MASK, col & _MASK]['normal']))
+        to_x, to_y = cos * scan[i, 3] - sin * scan[i, 4], sin * scan[i, 3] + cos * scan[i, 4]
+        if nx * to_x + ny * to_y < 0.0:
+            continue
         w = scan[i, 2] / (1.0 + error * error / (width * width))
         jx, jy = nx / sigma_m, ny / sigma_m
         _add_outer(H, w, jx, jy, -jx * py + jy * px)

@@ -40,12 +40,14 @@ _SHIFT = TILE.bit_length() - 1
 _MASK = TILE - 1
 _MOST_SEEN = 255
 _CODES = 255  # of normals: 1 to so many
-_ALONG = np.pi * (np.arange(_CODES) / (_CODES - 1) - 0.5)
+_ALONG = 2.0 * np.pi * np.arange(_CODES) / _CODES
 _NORMALS = np.vstack([np.zeros((1, 2)), np.column_stack([-np.sin(_ALONG), np.cos(_ALONG)])])
-_NORMAL_CELLS = 2  # to each side, that tell the normal of a wall
-_HALF_WALL = 1.0  # to either side of the hits of a cell its wall goes on so many cells
+_NORMAL_CELLS = (8, 4, 2)  # to each side, that tell the normal of a wall: the most that lie in line
+_TILT = 0.07  # of a normal, rad, 1 sigma: one that is known no better is none
+_NOISE = 0.2  # of the mean of a cell's hits, cells, 1 sigma
+_HALF_WALL = 4.0  # to either side of the hits of a cell its wall goes on so many cells
 _PARALLEL = 0.7  # cosine: normals that are nearer to each other are of one wall
-_FLAT = 0.25  # variance across a wall, at most, for one along it
+_THICK = 0.55  # of what lies in line, cells, 1 sigma
 
 
 @dataclass(frozen=True)
@@ -129,7 +131,7 @@ class LocalMap:
             _, once = np.unique(cells, axis=0, return_index=True)
             points = points_map[np.sort(once)]
             self._reach(points, points[0])
-            _hit(points, self.lattice, self.config.match_wall_share)
+            _hit(points, points.mean(axis=0), self.lattice, self.config.match_wall_share)
 
     def state(self) -> dict[str, NDArray[Any]]:
         """All cells as arrays by name, for `restore`."""
@@ -298,17 +300,32 @@ def _distances(points: Array, lattice: Lattice) -> Array:
 
 
 @kernel
-def _fitted_normal(lattice: Lattice, row: int, col: int) -> int:
+def _fitted_normal(lattice: Lattice, row: int, col: int, to_x: float, to_y: float) -> int:
     """Code of the normal of the wall at a cell, by the means of those around; 0: it has none."""
+    for cells in _NORMAL_CELLS:
+        code = _normal_within(lattice, row, col, cells, to_x, to_y)
+        if code:
+            return code
+    return 0
+
+
+@kernel
+def _normal_within(
+    lattice: Lattice, row: int, col: int, cells: int, to_x: float, to_y: float
+) -> int:
+    """The same, by the cells within so many to each side."""
     n, mx, my, xx, xy, yy = 0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for i in range(-_NORMAL_CELLS, _NORMAL_CELLS + 1):
-        for k in range(-_NORMAL_CELLS, _NORMAL_CELLS + 1):
+    for i in range(-cells, cells + 1):
+        for k in range(-cells, cells + 1):
             slot = slot_of(lattice, row + i, col + k)
             if slot == NO_TILE:
                 continue
             cell = lattice.pool[slot, (row + i) & _MASK, (col + k) & _MASK]
             if cell['to_row'] != HERE or cell['to_col'] != HERE:
                 continue
+            code = int(cell['normal'])
+            if code and _NORMALS[code, 0] * to_x + _NORMALS[code, 1] * to_y < 0.0:
+                continue  # the other face of a thin wall
             x, y = k + cell['x'], i + cell['y']
             n, mx, my = n + 1, mx + x, my + y
             xx, xy, yy = xx + x * x, xy + x * y, yy + y * y
@@ -317,12 +334,13 @@ def _fitted_normal(lattice: Lattice, row: int, col: int) -> int:
     mx, my = mx / n, my / n
     xx, xy, yy = xx / n - mx * mx, xy / n - mx * my, yy / n - my * my
     spread = math.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
-    small = 0.5 * (xx + yy) - spread
-    if small > _FLAT * 2.0 * spread:
+    across, along = max(0.5 * (xx + yy) - spread, 0.0), 0.5 * (xx + yy) + spread
+    if across > _THICK**2 or max(across, _NOISE**2) > n * along * _TILT**2:
         return 0
-    along = 0.5 * math.atan2(2.0 * xy, xx - yy)
-    turn = (along / math.pi + 0.5) % 1.0
-    return 1 + int(turn * (_CODES - 1) + 0.5) % (_CODES - 1)
+    angle = 0.5 * math.atan2(2.0 * xy, xx - yy)
+    if -math.sin(angle) * to_x + math.cos(angle) * to_y < 0.0:
+        angle += math.pi
+    return 1 + int(angle / (2.0 * math.pi) * _CODES + 0.5) % _CODES
 
 
 @kernel
@@ -399,7 +417,7 @@ def _add(
             _observe(cell, 0)
             if was_wall and not _is_wall(cell, share):
                 gone.append((row, col))
-    _hit(points, lattice, share)
+    _hit(points, laser, lattice, share)
     if len(gone):
         _vanish(lattice, gone, share)
 
@@ -407,6 +425,7 @@ def _add(
 @kernel
 def _hit(
     points: Array,
+    laser: Array,
     lattice: Lattice,
     share: float,
 ) -> None:
@@ -435,7 +454,9 @@ def _hit(
         row, col = int(math.floor(y)), int(math.floor(x))
         slot = slot_of(lattice, row, col)
         if slot != NO_TILE:
-            code = _fitted_normal(lattice, row, col)
+            code = _fitted_normal(
+                lattice, row, col, laser[0] - points[i, 0], laser[1] - points[i, 1]
+            )
             lattice.pool[slot, row & _MASK, col & _MASK]['normal'] = code
 
 
@@ -459,7 +480,7 @@ def _lead(
             for col in range(left, left + TILE):
                 slot = slot_of(lattice, row, col)
                 if _is_wall(lattice.pool[slot, row & _MASK, col & _MASK], share):
-                    code = _fitted_normal(lattice, row, col)
+                    code = _fitted_normal(lattice, row, col, 0.0, 0.0)
                     lattice.pool[slot, row & _MASK, col & _MASK]['normal'] = code
 
 

@@ -30,6 +30,7 @@ FEWEST_POINTS = 10
 _NEVER = 1e6  # sigmas of the motion beyond which wheels have slipped, where they have not
 _UNDECIDED = 2.5  # costs of beams waver by so much along a corridor that says nothing
 _SEARCHED_POINTS = 80
+_CONTRADICTS = 0.1  # share of a scan that has to lie in the open, for wheels to have slipped
 
 
 @dataclass(frozen=True)
@@ -97,10 +98,12 @@ class Matcher:
         """
         laser = np.ascontiguousarray(T_base_laser[:2])
         lattice = local_map.lattice
-        scan = self.weighted(points_base)
+        scan = self.weighted(points_base, laser)
         information = inverse(covariance)
         match = self._refined(scan, lattice, prior, prior, information)
-        fits = match.fit >= self.config.match_least_fit
+        # What lies where nobody has looked yet contradicts nothing: it is new ground, and no slip.
+        new_ground = match.contradicted < _CONTRADICTS and match.fit >= 0.5 * match.known
+        fits = match.fit >= self.config.match_least_fit or new_ground
         if fits and self._is_near(covariance):
             return match
         # Wheel slip is considered only where no pose that the motion allows explains the scan; then
@@ -140,8 +143,8 @@ class Matcher:
         beams = beam_cost(scan, laser, match.T_map_base, lattice, *self._noise)
         return beams + loss(float(off @ information @ off), slipped)
 
-    def weighted(self, points_base: Array) -> Array:
-        """A scan as the kernels take it, (N, 3): x, y, weight.
+    def weighted(self, points_base: Array, laser: Array) -> Array:
+        """A scan as the kernels take it, (N, 5): x, y, weight, and back to the laser.
 
         Points nearer to each other than a cell see the same piece of wall, and say it once.
         """
@@ -149,7 +152,7 @@ class Matcher:
         ends = np.concatenate([gaps[:1], gaps, gaps[-1:]])
         around = 0.5 * (ends[:-1] + ends[1:])
         weights = self.config.match_weight * np.minimum(around / self.config.match_cell_m, 1.0)
-        return np.column_stack([points_base, weights])
+        return np.column_stack([points_base, weights, laser - points_base])
 
     @property
     def _noise(self) -> tuple[float, float]:

@@ -18,7 +18,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.ekf_slam.models import rotation
 from thinmap_ros.core.se2 import Array
 
-_PRIOR_SIGMAS = (0.05, 0.05, 0.1, 0.05)  # of what is known before the first span
+_PRIOR_SIGMAS = (0.02, 0.02, 0.05, 0.02)  # of what is known before the first span
 _WANDER_SIGMAS = (0.001, 0.001, 0.001, 0.0002)  # in a metre or radian: floors and loads change
 # What is compared: long enough for the doubt of its two ends to be small beside it.
 _SPAN_M = 1.0

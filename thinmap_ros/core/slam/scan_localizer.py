@@ -1,14 +1,14 @@
 """The localizer: one step for each scan, live and offline.
 
-A scan is matched with the local map from where odometry and velocity expect it. The local map grows
-where the robot moves; keyframes and loop closure keep the whole consistent. A robot whose scans
-contradict the map goes on in a new local map, which hangs on the old one by a step as uncertain as
-it is.
+A scan is matched with the local map from where the calibrated odometry expects it. The local map
+grows where the robot moves; keyframes and loop closure keep the whole consistent. A robot whose
+scans contradict the map goes on in a new local map, which hangs on the old one by a step as
+uncertain as it is.
 """
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from thinmap_ros.core.ekf_slam import feature_map
 from thinmap_ros.core.ekf_slam.features import LineFeature
 from thinmap_ros.core.ekf_slam.line_map import LineMap
 from thinmap_ros.core.ekf_slam.localizer import EkfConfig
-from thinmap_ros.core.ekf_slam.models import odometry_slip
+from thinmap_ros.core.ekf_slam.models import odometry_slip, odometry_variances
 from thinmap_ros.core.estimate import Correction, Estimate
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import LastPose, OdometryIncrements
@@ -33,6 +33,8 @@ from thinmap_ros.core.slam.local_map import LocalMap
 from thinmap_ros.core.slam.loop_closure import LoopClosure, LoopConfig
 from thinmap_ros.core.slam.matcher import FEWEST_POINTS, Match, Matcher, MatcherConfig
 from thinmap_ros.core.slam.motion import Motion, MotionConfig, MotionModel
+from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
+from thinmap_ros.core.slam.wall_compass import WallCompass
 from thinmap_ros.core.slam.wall_points import wall_points
 from thinmap_ros.core.topology.graph import TopologicalMap
 
@@ -49,6 +51,7 @@ _ADRIFT_M = 10.0  # path in a new local map after which it is part of the map fo
 # there to the error. Lines are surer of the heading, as they are long; of the place cells are.
 _BESIDE_WALLS = np.diag(np.square([5e-3, 5e-3, 3e-3]))
 _STEP_SIGMAS = (2e-3, 2e-3, 5e-4)  # of a step between keyframes, at least
+_NEW_SHARE = 0.2  # of the error of a match, from one look to the next
 FIELDS = {**feature_map.FIELDS, **local_map.FIELDS}
 
 
@@ -66,6 +69,24 @@ class ScanLocalizerConfig(EkfConfig, MotionConfig, MatcherConfig, LoopConfig):
         low=0.1,
         high=1000.0,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Reversal:
+    """What the next motion takes back of one that contradicted its scan, map frame.
+
+    mean (3,), covariance (3, 3). A reading of the odometry that was wrong is put right by the next
+    one, what wheels have slipped is not; one is as likely as the other.
+    """
+
+    mean: Array = field(default_factory=lambda: np.zeros(3))
+    covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
+
+
+def _half_squared(T_a: Array, T_b: Array) -> Array:
+    """Covariance (3, 3) of a pose that is as likely at one pose (3,) as at another."""
+    half = 0.5 * se2.off(T_a, T_b)
+    return np.outer(half, half)
 
 
 class ScanLocalizer:
@@ -92,6 +113,9 @@ class ScanLocalizer:
         self._lines = LineMap(config, config, config.slam == 'ti')
         self._path = AnchoredPoses()
         self._odometry = OdometryIncrements()
+        self._calibration = OdometryCalibration()
+        self._compass = WallCompass()
+        self._yaw_variance = _STEP_SIGMAS[2] ** 2  # of the heading since the compass told it
         self._T_learned: Array | None = None
         self._T_stood = self._pose  # where the robot was when it last moved
         # Covariances (3, 3), map frame: of the motion since a scan fitted, of the pose since the
@@ -103,6 +127,7 @@ class ScanLocalizer:
         # The part of the error of the scan that the map learned from that `_since_anchor` has not.
         self._at_learning = np.zeros((3, 3))
         self._jump = np.zeros((3, 3))
+        self._reversal = Reversal()
         self._evidence = 0.0
         # Where the motion alone leads since a scan agreed with the map: pose, covariance.
         self._reckoned = (self._pose, np.zeros((3, 3)))
@@ -151,7 +176,7 @@ class ScanLocalizer:
         self._at_learning = np.zeros((3, 3))
         self._since_learned = self._since_fit
         self._jump = self._jump + self._since_fit + np.diag([_UNKNOWN_M**2, _UNKNOWN_M**2, 10.0])
-        self._motion.interrupt()
+        self._calibration.interrupt()
         self._is_unplaced = True
         self._adrift_m = 0.0
         self._evidence = 0.0
@@ -202,7 +227,7 @@ class ScanLocalizer:
         localizer._begin_in(localizer._map.state())
         moved = se2.between(last.T_odom_base, T_odom_base)
         turn = float(last.T_map_odom[2] + last.T_odom_base[2])
-        variances = MotionModel(localizer.config).expect(moved, 0.0).variances
+        variances = odometry_variances(moved, localizer.config)
         cell = np.full(3, patch.frame.resolution)
         localizer.set_pose(
             se2.compose(last.T_map_odom, T_odom_base),
@@ -215,8 +240,11 @@ class ScanLocalizer:
         motion = self._expect(scan, T_odom_base)
         points = self._points(scan)
         before = self._pose
-        Q = turned(np.diag(motion.variances), float(before[2]))
-        prior = se2.compose(before, motion.increment)
+        reversal = self._reversal
+        self._reversal = Reversal()
+        Q = turned(motion.covariance, float(before[2])) + reversal.covariance
+        expected = se2.compose(before, motion.increment) + reversal.mean
+        prior = se2.pose(*expected.tolist())
         stands = motion.stands and self._is_near(self._T_stood, prior)
         self._since_fit = carried(self._since_fit, prior[:2] - before[:2]) + Q
         if not stands:
@@ -229,10 +257,11 @@ class ScanLocalizer:
             self._judge(match)
         if match is None or self._is_refused(match, prior):
             self._pose = prior
+            if match is not None:
+                self._reversal = Reversal(np.zeros(3), _half_squared(match.T_map_base, prior))
             if not stands:
                 self._since_learned = self._since_learned + Q
             self._by_motion = self._since_learned
-            self._motion.interrupt()
         else:
             self._take(match, before, prior, Q, stands)
         if self._evidence == 0.0:
@@ -277,17 +306,20 @@ class ScanLocalizer:
     def _expect(self, scan: Scan, T_odom_base: Array) -> Motion:
         """The motion since the last scan."""
         increment = self._odometry.next(scan.stamp_ns, T_odom_base)
-        motion = self._motion.expect(increment.T_before_base, increment.seconds)
+        variances = odometry_variances(increment.T_before_base, self.config)[[0, 2]]
+        moved, systematic = self._calibration.corrected(increment.T_before_base, variances)
+        motion = self._motion.expect(moved, systematic)
         if increment.bound_m == 0.0:
             return motion
-        unknown = np.square([increment.bound_m, increment.bound_m, 1.0])
-        return Motion(motion.increment, motion.variances + unknown, False)
+        self._calibration.interrupt()
+        unknown = np.diag(np.square([increment.bound_m, increment.bound_m, 1.0]))
+        return Motion(motion.increment, motion.covariance + unknown, False)
 
     def _reckon(self, motion: Motion) -> None:
         """Carry the pose that the motion alone leads to on by a step."""
         before, covariance = self._reckoned
         after = se2.compose(before, motion.increment)
-        Q = turned(np.diag(motion.variances), float(before[2]))
+        Q = turned(motion.covariance, float(before[2]))
         self._reckoned = (after, carried(covariance, after[:2] - before[:2]) + Q)
 
     def _points(self, scan: Scan) -> Array:
@@ -310,17 +342,21 @@ class ScanLocalizer:
             # Scan and motion contradict each other: one of them is wrong, or the match has led back
             # to what was mapped before, which is no motion.
             self._jump = self._jump + np.outer(off, off)
+            if not self._is_unplaced:
+                half = _half_squared(match.T_map_base, prior)
+                self._reversal = Reversal(-0.5 * off, half)
         if match.fit >= self.config.match_least_fit:
             by_scan = turned(match.by_scan, -float(before[2]))
             self._motion.learn(se2.between(before, match.T_map_base), by_scan)
             self._since_fit = np.zeros((3, 3))
         else:
             self._since_fit = np.asarray(np.linalg.inv(match.information))
-            self._motion.interrupt()
         if not stands:
             by_motion = inverse(self._since_learned + Q)
             self._since_learned = inverse(by_motion + match.by_scan)
             self._by_motion = self._since_learned @ by_motion @ self._since_learned
+        if match.fit >= self.config.match_least_fit:
+            self._calibration.follow(self._pose, match.by_scan)
 
     def _is_unexpected(self, match: Match, prior: Array) -> bool:
         """Whether a match contradicts the motion."""
@@ -375,9 +411,21 @@ class ScanLocalizer:
             self._keep(scan, points)
 
     def _observe_lines(self, scan: Scan) -> None:
-        """Update the line features, and the heading by them where scans agree with the map."""
+        """Update the line features, and the heading by them where scans agree with the map.
+
+        The direction of the walls of the building tells it, too: new walls are then drawn straight.
+        """
+        by_scan = self._since_learned - self._by_motion
+        self._yaw_variance += float(self._by_motion[2, 2] + _NEW_SHARE * by_scan[2, 2])
         heading = self._lines.observe(scan, self._pose, _BESIDE_WALLS)
         if self._evidence == 0.0:
+            lines = self._lines.lines
+            told = self._compass.read(lines, heading, self._yaw_variance)
+            if told is not None:
+                gain = self._yaw_variance / (self._yaw_variance + told.variance)
+                heading = float(se2.wrap(heading + gain * (told.yaw - heading)))
+                self._yaw_variance *= 1.0 - gain
+            self._compass.learn(lines, heading, self._loops.path_m(self._pose))
             self._pose = se2.pose(float(self._pose[0]), float(self._pose[1]), heading)
             self._T_stood = self._pose
             self._reckoned = (self._pose, self._since_fit)
@@ -403,6 +451,7 @@ class ScanLocalizer:
         """
         sigma = _SIGMAS * np.array([self.config.slip_m] * 2 + [self.config.slip_rad])
         self._pose, covariance = self._reckoned
+        self._calibration.interrupt()
         self._T_stood = self._pose
         covariance = covariance + np.diag(np.square(sigma))
         self._jump = self._jump + covariance
@@ -417,6 +466,7 @@ class ScanLocalizer:
     def _apply(self, correction: Correction) -> None:
         """A loop was closed: pose, features and local map go where the keyframes have gone."""
         anchor = self._loops.keyframes.anchor
+        self._calibration.interrupt()
         self._pose = correction.moved(anchor, self._pose)
         self._reckoned = (correction.moved(anchor, self._reckoned[0]), self._reckoned[1])
         self._T_learned = self._pose
