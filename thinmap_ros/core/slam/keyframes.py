@@ -38,14 +38,14 @@ class KeyframeConfig(Config):
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    """A scan that is kept, its points (N, 2), robot frame, and its pose (3,).
+    """A scan that is kept, its surface points (N, 5), robot frame, and its pose (3,).
 
     path_m: length of the path when the robot was there last; covariance (3, 3): of the pose, map
     frame; submap: number of the local map that it is part of.
     """
 
     scan: Scan
-    points_base: Array
+    points: Array
     T_map_base: Array
     path_m: float
     covariance: Array

@@ -22,6 +22,7 @@ from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.grid.tiles import FARTHEST_TILE, NO_TILE, TILE, TileStore
 from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.surface import COLUMNS
 from thinmap_ros.core.snapshot import Field
 
 CELL = np.dtype(
@@ -30,24 +31,20 @@ CELL = np.dtype(
         ('seen', np.uint8),
         ('to_row', np.uint8),  # the nearest wall, in cells from here, + HERE; 0: none within reach
         ('to_col', np.uint8),
-        ('x', np.float32),  # mean of the hits, in cells from the middle of this one
+        ('x', np.float32),  # mean of the hits, in cells from the corner of this one
         ('y', np.float32),
-        ('normal', np.uint8),  # of the wall, as a code; 0: it has none
+        ('cos2', np.float32),  # mean of the double angle of the surface's normal
+        ('sin2', np.float32),
+        ('face_x', np.float32),  # mean of the normal towards the laser: 0 where both sides were hit
+        ('face_y', np.float32),
     ]
 )
 HERE = 100
+UNSEEN, OPEN, WALL = 0, 1, 2  # states of a point
 _SHIFT = TILE.bit_length() - 1
 _MASK = TILE - 1
 _MOST_SEEN = 255
-_CODES = 255  # of normals: 1 to so many
-_ALONG = 2.0 * np.pi * np.arange(_CODES) / _CODES
-_NORMALS = np.vstack([np.zeros((1, 2)), np.column_stack([-np.sin(_ALONG), np.cos(_ALONG)])])
-_NORMAL_CELLS = (8, 4, 2)  # to each side, that tell the normal of a wall: the most that lie in line
-_TILT = 0.07  # of a normal, rad, 1 sigma: one that is known no better is none
-_NOISE = 0.2  # of the mean of a cell's hits, cells, 1 sigma
-_HALF_WALL = 4.0  # to either side of the hits of a cell its wall goes on so many cells
-_PARALLEL = 0.7  # cosine: normals that are nearer to each other are of one wall
-_THICK = 0.55  # of what lies in line, cells, 1 sigma
+_FAR_M = 1e4  # walls of an occupancy map are seen from so far in front of them
 
 
 @dataclass(frozen=True)
@@ -108,30 +105,31 @@ class LocalMap:
             min(reach, HERE - 1),
         )
 
-    def add(self, points_map: Array, laser_map: Array) -> None:
-        """Take in the points (N, 2) that beams from a laser at (2,) met, map frame."""
-        if len(points_map) == 0:
+    def add_scan(self, points: Array, T_base_laser: Array, T_map_base: Array) -> None:
+        """Add surface points (N, 5), robot frame, of a scan at a pose (3,)."""
+        if len(points) == 0:
             return
-        self._reach(points_map, laser_map)
-        _add(points_map, laser_map, self.lattice, self.config.match_wall_share)
-
-    def add_scan(self, points_base: Array, T_base_laser: Array, T_map_base: Array) -> None:
-        """Take in the points (N, 2), robot frame, of a scan at a pose (3,)."""
-        laser = se2.transform_points(T_map_base, T_base_laser[None, :2])[0]
-        self.add(se2.transform_points(T_map_base, points_base), laser)
+        laser = np.ascontiguousarray(T_base_laser[:2])
+        ends_map = se2.transform_points(T_map_base, points[:, :2])
+        self._reach(ends_map, se2.transform_points(T_map_base, laser[None])[0])
+        _add(points, laser, T_map_base, self.lattice, self.config.match_wall_share)
 
     def distances(self, points_map: Array) -> Array:
         """Distances (N,) of points (N, 2) from the walls, m; `match_reach_m` where none is near."""
-        return np.abs(_distances(points_map, self.lattice))
+        return _distances(points_map, self.lattice)
 
-    def add_walls(self, points_map: Array) -> None:
-        """Take in points (N, 2) of walls that were not seen by a scan, as of an occupancy map."""
+    def add_walls(self, points_map: Array, normal: Array) -> None:
+        """Add points (N, 2), map frame, of walls with a normal (2,), as of an occupancy map."""
         if len(points_map):
             cells = np.floor(points_map / self.config.match_cell_m).astype(np.int64)
             _, once = np.unique(cells, axis=0, return_index=True)
-            points = points_map[np.sort(once)]
-            self._reach(points, points[0])
-            _hit(points, points.mean(axis=0), self.lattice, self.config.match_wall_share)
+            points = np.zeros((len(once), COLUMNS))
+            points[:, :2] = points_map[np.sort(once)]
+            points[:, 2] = normal[0] ** 2 - normal[1] ** 2
+            points[:, 3] = 2.0 * normal[0] * normal[1]
+            self._reach(np.ascontiguousarray(points[:, :2]), points[0, :2])
+            far = points[:, :2].mean(axis=0) + _FAR_M * normal
+            _hit(points, far, np.zeros(3), self.lattice, self.config.match_wall_share)
 
     def state(self) -> dict[str, NDArray[Any]]:
         """All cells as arrays by name, for `restore`."""
@@ -143,6 +141,8 @@ class LocalMap:
             'hits': cells['hits'],
             'seen': cells['seen'],
             'means': np.stack([cells['x'], cells['y']], axis=-1),
+            'normals': np.stack([cells['cos2'], cells['sin2']], axis=-1),
+            'faces': np.stack([cells['face_x'], cells['face_y']], axis=-1),
         }
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
@@ -166,6 +166,10 @@ class LocalMap:
         cells['seen'] = state['seen']
         cells['x'] = state['means'][..., 0]
         cells['y'] = state['means'][..., 1]
+        cells['cos2'] = state['normals'][..., 0]
+        cells['sin2'] = state['normals'][..., 1]
+        cells['face_x'] = state['faces'][..., 0]
+        cells['face_y'] = state['faces'][..., 1]
         _lead(places * TILE, self.lattice, self.config.match_wall_share)
 
     def _reach(self, points_map: Array, laser_map: Array) -> None:
@@ -191,7 +195,9 @@ FIELDS = {
     'tiles': Field(np.int64, ('t', 2), -FARTHEST_TILE, FARTHEST_TILE),
     'hits': Field(np.uint8, ('t', TILE, TILE), 0, 255),
     'seen': Field(np.uint8, ('t', TILE, TILE), 0, 255),
-    'means': Field(np.float32, ('t', TILE, TILE, 2), -0.5, 0.5),
+    'means': Field(np.float32, ('t', TILE, TILE, 2), 0.0, 1.0),
+    'normals': Field(np.float32, ('t', TILE, TILE, 2), -1.001, 1.001),
+    'faces': Field(np.float32, ('t', TILE, TILE, 2), -1.001, 1.001),
 }
 
 
@@ -226,121 +232,34 @@ def nearest_wall(lattice: Lattice, row: int, col: int) -> tuple[int, int, int]:
 
 
 @inlined
-def cell_distance(lattice: Lattice, row: int, col: int) -> float:
-    """Distance, in cells, from the middle of a cell to the hits of its nearest wall, or `reach`."""
-    slot, wall_row, wall_col = nearest_wall(lattice, row, col)
-    if slot == NO_TILE:
-        return float(lattice.reach)
-    wall = lattice.pool[slot, wall_row & _MASK, wall_col & _MASK]
-    dx, dy = wall_col - col + wall['x'], wall_row - row + wall['y']
-    return min(math.sqrt(dx * dx + dy * dy), float(lattice.reach))
+def off_wall(lattice: Lattice, x: float, y: float) -> tuple[int, float, float, Any]:
+    """State of a point (x, y), in cells, what it is off its nearest wall, and the wall's cell.
 
-
-@inlined
-def normal_of(code: int) -> tuple[float, float]:
-    """Normal of a wall, by its code; (0, 0) where it has none."""
-    return _NORMALS[code, 0], _NORMALS[code, 1]
-
-
-@inlined
-def _off_wall(lattice: Lattice, row: int, col: int) -> tuple[float, float, float]:
-    """Distance, in cells, from the middle of a cell to its nearest wall, with the wall's normal.
-
-    Negative behind the wall, as the normal points; a wall without one is a point, and (0, 0).
+    State 0: nobody has looked there; 1: no wall within reach; 2: there is one.
     """
-    slot, wall_row, wall_col = nearest_wall(lattice, row, col)
+    row, col = cell_of(y), cell_of(x)
+    slot = slot_of(lattice, row, col)
     if slot == NO_TILE:
-        return float(lattice.reach), 0.0, 0.0
-    wall = lattice.pool[slot, wall_row & _MASK, wall_col & _MASK]
-    dx, dy = col - wall_col - wall['x'], row - wall_row - wall['y']
-    code = int(wall['normal'])
-    if code == 0:
-        return min(math.sqrt(dx * dx + dy * dy), float(lattice.reach)), 0.0, 0.0
-    nx, ny = _NORMALS[code, 0], _NORMALS[code, 1]
-    across = nx * dx + ny * dy
-    beyond = max(abs(nx * dy - ny * dx) - _HALF_WALL, 0.0)
-    distance = min(math.sqrt(across * across + beyond * beyond), float(lattice.reach))
-    return math.copysign(distance, across), nx, ny
-
-
-@inlined
-def interpolated(lattice: Lattice, x: float, y: float) -> tuple[float, float, float]:
-    """Distance at (x, y), and its slopes, by the four cells around; all in cells.
-
-    It changes its sign where a wall runs between the cells: without, it would be the same
-    anywhere between two cells on either side.
-    """
-    col, row = cell_of(x - 0.5), cell_of(y - 0.5)
-    u, v = x - 0.5 - col, y - 0.5 - row
-    d00, nx, ny = _off_wall(lattice, row, col)
-    d01, nx01, ny01 = _off_wall(lattice, row, col + 1)
-    d10, nx10, ny10 = _off_wall(lattice, row + 1, col)
-    d11, nx11, ny11 = _off_wall(lattice, row + 1, col + 1)
-    s01, s10, s11 = nx * nx01 + ny * ny01, nx * nx10 + ny * ny10, nx * nx11 + ny * ny11
-    if min(abs(s01), abs(s10), abs(s11)) > _PARALLEL:
-        d01 = math.copysign(1.0, s01) * d01
-        d10 = math.copysign(1.0, s10) * d10
-        d11 = math.copysign(1.0, s11) * d11
-    else:
-        d00, d01, d10, d11 = abs(d00), abs(d01), abs(d10), abs(d11)
-    lower, upper = d00 + u * (d01 - d00), d10 + u * (d11 - d10)
-    by_x = (1.0 - v) * (d01 - d00) + v * (d11 - d10)
-    return lower + v * (upper - lower), by_x, upper - lower
+        return UNSEEN, 0.0, 0.0, lattice.pool[0, 0, 0]
+    cell = lattice.pool[slot, row & _MASK, col & _MASK]
+    if cell['to_row'] == 0:
+        return (OPEN if cell['seen'] > 0 else UNSEEN), 0.0, 0.0, cell
+    row, col = row + int(cell['to_row']) - HERE, col + int(cell['to_col']) - HERE
+    wall = lattice.pool[slot_of(lattice, row, col), row & _MASK, col & _MASK]
+    return WALL, x - col - wall['x'], y - row - wall['y'], wall
 
 
 @kernel
 def _distances(points: Array, lattice: Lattice) -> Array:
-    """Distances (N,) of points (N, 2), m, with the sign that they have there."""
-    found = np.empty(len(points))
+    """Distances (N,) of points (N, 2) from the means of their nearest walls, m."""
+    found = np.full(len(points), lattice.reach * lattice.cell_m)
     for i in range(len(points)):
         x = points[i, 0] / lattice.cell_m - lattice.first_col
         y = points[i, 1] / lattice.cell_m - lattice.first_row
-        found[i] = lattice.cell_m * interpolated(lattice, x, y)[0]
+        state, dx, dy, _ = off_wall(lattice, x, y)
+        if state == WALL:
+            found[i] = min(found[i], lattice.cell_m * math.hypot(dx, dy))
     return found
-
-
-@kernel
-def _fitted_normal(lattice: Lattice, row: int, col: int, to_x: float, to_y: float) -> int:
-    """Code of the normal of the wall at a cell, by the means of those around; 0: it has none."""
-    for cells in _NORMAL_CELLS:
-        code = _normal_within(lattice, row, col, cells, to_x, to_y)
-        if code:
-            return code
-    return 0
-
-
-@kernel
-def _normal_within(
-    lattice: Lattice, row: int, col: int, cells: int, to_x: float, to_y: float
-) -> int:
-    """The same, by the cells within so many to each side."""
-    n, mx, my, xx, xy, yy = 0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for i in range(-cells, cells + 1):
-        for k in range(-cells, cells + 1):
-            slot = slot_of(lattice, row + i, col + k)
-            if slot == NO_TILE:
-                continue
-            cell = lattice.pool[slot, (row + i) & _MASK, (col + k) & _MASK]
-            if cell['to_row'] != HERE or cell['to_col'] != HERE:
-                continue
-            code = int(cell['normal'])
-            if code and _NORMALS[code, 0] * to_x + _NORMALS[code, 1] * to_y < 0.0:
-                continue  # the other face of a thin wall
-            x, y = k + cell['x'], i + cell['y']
-            n, mx, my = n + 1, mx + x, my + y
-            xx, xy, yy = xx + x * x, xy + x * y, yy + y * y
-    if n < 3:
-        return 0
-    mx, my = mx / n, my / n
-    xx, xy, yy = xx / n - mx * mx, xy / n - mx * my, yy / n - my * my
-    spread = math.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
-    across, along = max(0.5 * (xx + yy) - spread, 0.0), 0.5 * (xx + yy) + spread
-    if across > _THICK**2 or max(across, _NOISE**2) > n * along * _TILT**2:
-        return 0
-    angle = 0.5 * math.atan2(2.0 * xy, xx - yy)
-    if -math.sin(angle) * to_x + math.cos(angle) * to_y < 0.0:
-        angle += math.pi
-    return 1 + int(angle / (2.0 * math.pi) * _CODES + 0.5) % _CODES
 
 
 @kernel
@@ -385,79 +304,81 @@ def _observe(cell: Any, hit: int) -> None:
 
 
 @kernel
-def _add(
-    points: Array,
-    laser: Array,
-    lattice: Lattice,
-    share: float,
-) -> None:
-    """Count what beams saw, then bring the ways to the walls up to date."""
+def _add(points: Array, laser: Array, T_map_base: Array, lattice: Lattice, share: float) -> None:
+    """Count what beams went through, then where they ended; update the nearest walls."""
+    cos, sin = math.cos(T_map_base[2]), math.sin(T_map_base[2])
+    x0 = (T_map_base[0] + cos * laser[0] - sin * laser[1]) / lattice.cell_m - lattice.first_col
+    y0 = (T_map_base[1] + sin * laser[0] + cos * laser[1]) / lattice.cell_m - lattice.first_row
     gone = [(0, 0) for _ in range(0)]
-    x0, y0 = (
-        laser[0] / lattice.cell_m - lattice.first_col,
-        laser[1] / lattice.cell_m - lattice.first_row,
-    )
     for i in range(len(points)):
-        x1, y1 = (
-            points[i, 0] / lattice.cell_m - lattice.first_col,
-            points[i, 1] / lattice.cell_m - lattice.first_row,
-        )
-        end_row, end_col = int(math.floor(y1)), int(math.floor(x1))
+        px, py = points[i, 0], points[i, 1]
+        x1 = (T_map_base[0] + cos * px - sin * py) / lattice.cell_m - lattice.first_col
+        y1 = (T_map_base[1] + sin * px + cos * py) / lattice.cell_m - lattice.first_row
+        end_row, end_col = cell_of(y1), cell_of(x1)
         steps = int(max(abs(x1 - x0), abs(y1 - y0))) + 1
         step_x, step_y = (x1 - x0) / steps, (y1 - y0) / steps
         x, y = x0 + 0.5 * step_x, y0 + 0.5 * step_y
         for _ in range(steps):
-            row, col = int(math.floor(y)), int(math.floor(x))
+            row, col = cell_of(y), cell_of(x)
             x, y = x + step_x, y + step_y
             slot = slot_of(lattice, row, col)
-            if slot == NO_TILE or (row == end_row and col == end_col):
+            # A beam that grazes a wall says nothing against the cells beside its end.
+            if slot == NO_TILE or (abs(row - end_row) <= 1 and abs(col - end_col) <= 1):
                 continue
             cell = lattice.pool[slot, row & _MASK, col & _MASK]
             was_wall = _is_wall(cell, share)
             _observe(cell, 0)
             if was_wall and not _is_wall(cell, share):
                 gone.append((row, col))
-    _hit(points, laser, lattice, share)
+    _hit(points, laser, T_map_base, lattice, share)
     if len(gone):
         _vanish(lattice, gone, share)
 
 
+@inlined
+def _learn_surface(cell: Any, x: float, y: float, normal: tuple[float, float, float]) -> None:
+    """Update the means of a cell by a hit at (x, y), in cells from its corner.
+
+    normal: cosine and sine of the double angle of the surface's normal, and how far the laser is to
+    the side that half of that angle points to, positive or negative.
+    """
+    gain = np.float32(1.0 / cell['hits'])
+    cos2, sin2, side = normal
+    half = 0.5 * math.atan2(sin2, cos2)
+    sign = math.copysign(1.0, side)
+    cell['x'] += gain * np.float32(x - cell['x'])
+    cell['y'] += gain * np.float32(y - cell['y'])
+    cell['cos2'] += gain * np.float32(cos2 - cell['cos2'])
+    cell['sin2'] += gain * np.float32(sin2 - cell['sin2'])
+    cell['face_x'] += gain * np.float32(sign * math.cos(half) - cell['face_x'])
+    cell['face_y'] += gain * np.float32(sign * math.sin(half) - cell['face_y'])
+
+
 @kernel
-def _hit(
-    points: Array,
-    laser: Array,
-    lattice: Lattice,
-    share: float,
-) -> None:
+def _hit(points: Array, laser: Array, T_map_base: Array, lattice: Lattice, share: float) -> None:
     """Count the points that beams met."""
+    cos, sin = math.cos(T_map_base[2]), math.sin(T_map_base[2])
+    cos2, sin2 = math.cos(2.0 * T_map_base[2]), math.sin(2.0 * T_map_base[2])
     for i in range(len(points)):
-        x, y = (
-            points[i, 0] / lattice.cell_m - lattice.first_col,
-            points[i, 1] / lattice.cell_m - lattice.first_row,
-        )
-        row, col = int(math.floor(y)), int(math.floor(x))
+        px, py = points[i, 0], points[i, 1]
+        x = (T_map_base[0] + cos * px - sin * py) / lattice.cell_m - lattice.first_col
+        y = (T_map_base[1] + sin * px + cos * py) / lattice.cell_m - lattice.first_row
+        row, col = cell_of(y), cell_of(x)
         slot = slot_of(lattice, row, col)
         if slot == NO_TILE:
             continue
         cell = lattice.pool[slot, row & _MASK, col & _MASK]
         was_wall = _is_wall(cell, share)
         _observe(cell, 1)
-        cell['x'] += np.float32((x - col - 0.5 - cell['x']) / cell['hits'])
-        cell['y'] += np.float32((y - row - 0.5 - cell['y']) / cell['hits'])
+        c2, s2 = points[i, 2], points[i, 3]
+        back_x = cos * (laser[0] - px) - sin * (laser[1] - py)
+        back_y = sin * (laser[0] - px) + cos * (laser[1] - py)
+        turned = (cos2 * c2 - sin2 * s2, sin2 * c2 + cos2 * s2)
+        own = 0.5 * math.atan2(turned[1], turned[0])
+        side = math.cos(own) * back_x + math.sin(own) * back_y
+        _learn_surface(cell, x - col, y - row, (turned[0], turned[1], side))
         if not was_wall and _is_wall(cell, share):
             _appear(lattice, row, col)
-    for i in range(len(points)):
-        x, y = (
-            points[i, 0] / lattice.cell_m - lattice.first_col,
-            points[i, 1] / lattice.cell_m - lattice.first_row,
-        )
-        row, col = int(math.floor(y)), int(math.floor(x))
-        slot = slot_of(lattice, row, col)
-        if slot != NO_TILE:
-            code = _fitted_normal(
-                lattice, row, col, laser[0] - points[i, 0], laser[1] - points[i, 1]
-            )
-            lattice.pool[slot, row & _MASK, col & _MASK]['normal'] = code
 
 
 @kernel
@@ -474,14 +395,6 @@ def _lead(
                 slot = slot_of(lattice, row, col)
                 if _is_wall(lattice.pool[slot, row & _MASK, col & _MASK], share):
                     _appear(lattice, row, col)
-    for i in range(len(corners)):
-        top, left = corners[i, 0] - lattice.first_row, corners[i, 1] - lattice.first_col
-        for row in range(top, top + TILE):
-            for col in range(left, left + TILE):
-                slot = slot_of(lattice, row, col)
-                if _is_wall(lattice.pool[slot, row & _MASK, col & _MASK], share):
-                    code = _fitted_normal(lattice, row, col, 0.0, 0.0)
-                    lattice.pool[slot, row & _MASK, col & _MASK]['normal'] = code
 
 
 @kernel

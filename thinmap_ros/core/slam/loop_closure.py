@@ -241,9 +241,7 @@ class LoopClosure:
         floor = np.diag(np.square([2.0 * config.loop_sigma_m] * 2 + [2.0 * config.loop_sigma_rad]))
         prior = se2.between(base, here.T_map_base)
         relative = turned(job.covariance, -float(base[2])) + floor
-        match = self._matcher.match(
-            here.points_base, here.scan.T_base_laser, submap, prior, relative
-        )
+        match = self._matcher.match(here.points, here.scan.T_base_laser, submap, prior, relative)
         if match.fit < config.loop_fit:
             return
         own = np.diag(np.square([config.loop_sigma_m] * 2 + [config.loop_sigma_rad]))
@@ -337,7 +335,7 @@ class LoopClosure:
                 same = frames[i].submap == frames[j].submap
                 if same and (i <= j or here.path_m - frames[i].path_m > _AGAIN_M):
                     T = se2.between(base, frames[i].T_map_base)
-                    submap.add_scan(frames[i].points_base, frames[i].scan.T_base_laser, T)
+                    submap.add_scan(frames[i].points, frames[i].scan.T_base_laser, T)
             self._submap = (j, len(frames), submap)
         return base, self._submap[2]
 

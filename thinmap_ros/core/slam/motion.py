@@ -74,7 +74,7 @@ class MotionModel:
         share = self._share[[0, 0, 1]]
         # What is farther off has slipped once, and says no more than this of the noise.
         change = np.minimum(beyond / self._allowed, _MOST_SIGMAS**2 * share) - share
-        change *= gain
+        change *= np.maximum(gain**2, beyond / np.maximum(squared, 1e-12))
         self._learned += 1
         rate = max(1.0 / self._config.noise_memory, 1.0 / (1.0 + self._learned))
         self._share[0] += rate * 0.5 * (change[0] + change[1])

@@ -1,157 +1,128 @@
-"""Poses within the uncertainty of the motion, by what the beams of a scan would meet at them.
+"""Branch and bound over the poses within the uncertainty of a prior.
 
-Source: Olson, "Real-time correlative scan matching", 2009.
+Source: Olson, "Real-time correlative scan matching", 2009; Hess et al., "Real-time loop closure in
+2D LIDAR SLAM", 2016, for branch and bound. The bound of a node is read off the distance to the
+nearest wall, which no motion changes by more than its length; a point out of reach of any wall is
+taken to stay so.
 """
 
+import heapq
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.tiles import NO_TILE, TILE
 from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.least_squares import (
-    RELIABLE_HITS,
-    USUAL_LOSS,
-    is_seen,
-    loss,
-    quadratic,
-    tempered,
-)
-from thinmap_ros.core.slam.local_map import HERE, Lattice, cell_distance, cell_of, slot_of
+from thinmap_ros.core.slam.least_squares import UNSEEN_COST, by_prior, far_cost, loss
+from thinmap_ros.core.slam.local_map import HERE, Lattice, cell_of, slot_of
 
-UNSEEN = 0.5  # cost of a point where nobody has looked yet, for one in the open
+_ROOT = 4.0  # half the size of a root node, in cells
+_LEVELS = 2  # of nodes below
+_DIAGONAL = 1.4  # of what a translation within a node moves a point by
 _MASK = TILE - 1
 
 
 @inlined
-def _is_crossed(lattice: Lattice, x0: float, y0: float, x1: float, y1: float) -> bool:
-    """Whether a beam from (x0, y0) to (x1, y1), in cells, crosses a wall well before its end."""
-    length = math.hypot(x1 - x0, y1 - y0)
-    for k in range(1, int(length) - lattice.reach):
-        along = k / length
-        row, col = cell_of(y0 + along * (y1 - y0)), cell_of(x0 + along * (x1 - x0))
+def _cost(
+    scan: Array,
+    pose: Array,
+    lattice: Lattice,
+    sigma: float,
+    width: float,
+    slack: float,
+    most: float,
+) -> float:
+    """Cost of a scan at a pose (3,), where points may be nearer to walls by a slack, in cells.
+
+    scan (N, 4): x, y, weight, and by how many slacks a point moves. Ends where it exceeds `most`.
+    """
+    scale = lattice.cell_m / sigma
+    far = far_cost(lattice, sigma, width)
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    cost = 0.0
+    for i in range(len(scan)):
+        x = pose[0] + cos * scan[i, 0] - sin * scan[i, 1]
+        y = pose[1] + sin * scan[i, 0] + cos * scan[i, 1]
+        row = cell_of(y / lattice.cell_m) - lattice.first_row
+        col = cell_of(x / lattice.cell_m) - lattice.first_col
         slot = slot_of(lattice, row, col)
+        share = UNSEEN_COST
+        away = -1.0
         if slot != NO_TILE:
             cell = lattice.pool[slot, row & _MASK, col & _MASK]
-            if cell['to_row'] == HERE and cell['to_col'] == HERE and cell['hits'] >= RELIABLE_HITS:
-                return True
-    return False
-
-
-@inlined
-def _end_cost(
-    lattice: Lattice, row: int, col: int, sigma: float, width: float, unseen: float
-) -> float:
-    """Cost of a beam that ends in a cell.
-
-    Where nobody has looked yet it costs less than in the open: ahead of a robot that moves there
-    are such ends, and a pose farther back, where there are none, would seem the likelier.
-    """
-    error = cell_distance(lattice, row, col) / sigma
-    cost = loss(error * error, width)
-    if error >= lattice.reach / sigma and not is_seen(lattice, row, col):
-        cost *= unseen
+            share = 1.0 if cell['seen'] > 0 else UNSEEN_COST
+            if cell['to_row'] != 0:
+                down, right = int(cell['to_row']) - HERE, int(cell['to_col']) - HERE
+                away = math.sqrt(down * down + right * right)
+        if away < 0.0:
+            cost += scan[i, 2] * share * far
+        else:
+            nearest = max(away - slack * scan[i, 3], 0.0) * scale
+            cost += scan[i, 2] * loss(nearest * nearest, width)
+        if cost >= most:
+            break
     return cost
 
 
 @kernel
-def beam_cost(
-    scan: Array, laser: Array, pose: Array, lattice: Lattice, sigma: float, width: float
-) -> float:
-    """Cost of the beams of a scan at a pose: their ends, and the walls that they would cross."""
-    cos, sin = math.cos(pose[2]), math.sin(pose[2])
-    cell_m, reach = lattice.cell_m, float(lattice.reach)
-    x0 = (pose[0] + cos * laser[0] - sin * laser[1]) / cell_m - lattice.first_col
-    y0 = (pose[1] + sin * laser[0] + cos * laser[1]) / cell_m - lattice.first_row
-    gross = loss((reach / sigma) ** 2, width)
-    cost = 0.0
-    for i in range(len(scan)):
-        x1 = (pose[0] + cos * scan[i, 0] - sin * scan[i, 1]) / cell_m - lattice.first_col
-        y1 = (pose[1] + sin * scan[i, 0] + cos * scan[i, 1]) / cell_m - lattice.first_row
-        if _is_crossed(lattice, x0, y0, x1, y1):
-            cost += scan[i, 2] * gross
-        else:
-            row, col = cell_of(y1), cell_of(x1)
-            cost += scan[i, 2] * _end_cost(lattice, row, col, sigma, width, UNSEEN)
-    return tempered(cost, scan[:, 2].sum())
-
-
-@inlined
-def _outwards(n: int) -> int:
-    """0, 1, -1, 2, -2 and so on."""
-    return (n + 1) // 2 if n % 2 else -(n // 2)
-
-
-@inlined
-def _note_cells(
+def search(
     scan: Array,
     prior: Array,
-    turn: float,
-    lattice: Lattice,
-    corner_row: int,
-    corner_col: int,
-    at: NDArray[np.int64],
-) -> None:
-    """Put the cells (N, 2) of a scan that is turned at a prior into `at`, counted from a corner."""
-    cell_m = lattice.cell_m
-    cos, sin = math.cos(prior[2] + turn), math.sin(prior[2] + turn)
-    for i in range(len(scan)):
-        x = prior[0] + cos * scan[i, 0] - sin * scan[i, 1]
-        y = prior[1] + sin * scan[i, 0] + cos * scan[i, 1]
-        at[i, 0] = cell_of(y / cell_m) - lattice.first_row - corner_row
-        at[i, 1] = cell_of(x / cell_m) - lattice.first_col - corner_col
-
-
-@kernel
-def searched(
-    scan: Array,
-    prior: Array,
-    steps: NDArray[np.int64],
-    sizes: Array,
-    by_prior: Array,
+    information: Array,
+    half: Array,
+    incumbent: Array,
     lattice: Lattice,
     sigma: float,
     width: float,
-    slipped: float,
-    unseen: float,
+    most_nodes: int,
 ) -> Array:
-    """The pose (3,) of a lattice round a prior with the lowest sum."""
-    cell_m = lattice.cell_m
-    stride = int(round(sizes[0] / cell_m))
-    # Cost of every cell in sight, once it is asked for.
-    rim = int(np.hypot(scan[:, 0], scan[:, 1]).max() / cell_m) + 4 + stride * steps[:2].max()
-    corner_row = cell_of(prior[1] / cell_m) - lattice.first_row - rim
-    corner_col = cell_of(prior[0] / cell_m) - lattice.first_col - rim
-    costs = np.full((2 * rim + 1, 2 * rim + 1), np.float32(-1.0))
-    best = prior.copy()
-    usual = USUAL_LOSS * scan[:, 2].sum()
-    lowest = 700.0 * usual
-    at = np.empty((len(scan), 2), dtype=np.int64)
-    # From the prior outwards: a low sum that is found early spares the most of the others.
-    for k in range(2 * steps[2] + 1):
-        turn = _outwards(k) * sizes[1]
-        _note_cells(scan, prior, turn, lattice, corner_row, corner_col, at)
-        for i in range(2 * steps[1] + 1):
-            for j in range(2 * steps[0] + 1):
-                a, b = _outwards(i), _outwards(j)
-                dx, dy = b * sizes[0], a * sizes[0]
-                by_motion = loss(quadratic(by_prior, dx, dy, turn), slipped)
-                if by_motion >= lowest:
-                    continue
-                most = usual * math.expm1((lowest - by_motion) / usual)
-                cost = 0.0
-                for p in range(len(scan)):
-                    r, c = at[p, 0] + stride * a, at[p, 1] + stride * b
-                    if costs[r, c] < 0.0:
-                        row, col = r + corner_row, c + corner_col
-                        end = _end_cost(lattice, row, col, sigma, width, unseen)
-                        costs[r, c] = np.float32(end)
-                    cost += scan[p, 2] * costs[r, c]
-                    if cost >= most:
-                        break
-                if cost < most:
-                    lowest = by_motion + usual * math.log1p(cost / usual)
-                    best[0], best[1], best[2] = prior[0] + dx, prior[1] + dy, prior[2] + turn
+    """The pose (3,) within half (3,) of a prior (3,) with the lowest cost, or the incumbent.
+
+    scan (N, 3): x, y, weight; half: m, m, rad; information (3, 3) of the prior.
+    """
+    away = np.sqrt(scan[:, 0] ** 2 + scan[:, 1] ** 2)
+    radius = max(np.median(away), 1.0)
+    moving = np.empty((len(scan), 4))
+    moving[:, :3] = scan
+    for i in range(len(scan)):
+        moving[i, 3] = _DIAGONAL + away[i] / radius
+    size = np.array([1.0, 1.0, 1.0 / radius]) * _ROOT * lattice.cell_m
+    best = incumbent.copy()
+    _, _, cost = by_prior(best, prior, information)
+    lowest = cost + _cost(moving, best, lattice, sigma, width, 0.0, np.inf)
+    counts = [int(half[k] / (2.0 * size[k]) + 0.5) for k in range(3)]
+    children = [
+        (0, 2.0 * size[0] * i, 2.0 * size[1] * j, 2.0 * size[2] * m)
+        for i in range(-counts[0], counts[0] + 1)
+        for j in range(-counts[1], counts[1] + 1)
+        for m in range(-counts[2], counts[2] + 1)
+    ]
+    spent = -len(children)
+    heap = [(0.0, 0, 0.0, 0.0, 0.0) for _ in range(0)]
+    while True:
+        spent += len(children)
+        for level, dx, dy, turn in children:
+            pose = prior + np.array([dx, dy, turn])
+            _, _, cost = by_prior(pose, prior, information)
+            slack = _ROOT * 0.5**level if level < _LEVELS else 0.0
+            if cost < lowest:
+                cost += _cost(moving, pose, lattice, sigma, width, slack, lowest - cost)
+            if cost < lowest and level < _LEVELS:
+                heapq.heappush(heap, (cost, level, dx, dy, turn))
+            elif cost < lowest:
+                lowest = cost
+                best = pose
+        if len(heap) == 0 or spent > most_nodes:
+            break
+        bound, level, dx, dy, turn = heapq.heappop(heap)
+        if bound >= lowest:
+            break
+        part = 0.5 ** (level + 1) * size
+        children = [
+            (level + 1, dx + a * part[0], dy + b * part[1], turn + c * part[2])
+            for a in (-1, 1)
+            for b in (-1, 1)
+            for c in (-1, 1)
+        ]
     return best

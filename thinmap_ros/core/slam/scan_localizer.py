@@ -34,6 +34,7 @@ from thinmap_ros.core.slam.loop_closure import LoopClosure, LoopConfig
 from thinmap_ros.core.slam.matcher import FEWEST_POINTS, Match, Matcher, MatcherConfig
 from thinmap_ros.core.slam.motion import Motion, MotionConfig, MotionModel
 from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
+from thinmap_ros.core.slam.surface import surface_points
 from thinmap_ros.core.slam.wall_compass import WallCompass
 from thinmap_ros.core.slam.wall_points import wall_points
 from thinmap_ros.core.topology.graph import TopologicalMap
@@ -223,7 +224,7 @@ class ScanLocalizer:
         """
         localizer = ScanLocalizer(config)
         for faces in wall_points(patch):
-            localizer._map.add_walls(faces.points)
+            localizer._map.add_walls(faces.points, faces.normal)
         localizer._begin_in(localizer._map.state())
         moved = se2.between(last.T_odom_base, T_odom_base)
         turn = float(last.T_map_odom[2] + last.T_odom_base[2])
@@ -323,14 +324,13 @@ class ScanLocalizer:
         self._reckoned = (after, carried(covariance, after[:2] - before[:2]) + Q)
 
     def _points(self, scan: Scan) -> Array:
-        """Points (N, 2) that can be matched, robot frame."""
-        near = scan.ranges_m[scan.hit] < self.config.match_range_m
-        return np.ascontiguousarray(scan.points_base()[near])
+        """Surface points (N, 5) that can be matched, robot frame."""
+        return surface_points(scan, self.config.match_range_m)
 
     def _match(self, scan: Scan, points: Array, prior: Array) -> Match | None:
         if len(points) < FEWEST_POINTS or self._map.is_empty:
             return None
-        if np.ptp(points, axis=0).max() < self.config.match_cell_m:
+        if np.ptp(points[:, :2], axis=0).max() < self.config.match_cell_m:
             return None  # all in one place: they tell no pose
         return self._matcher.match(points, scan.T_base_laser, self._map, prior, self._since_fit)
 
@@ -350,7 +350,7 @@ class ScanLocalizer:
             self._motion.learn(se2.between(before, match.T_map_base), by_scan)
             self._since_fit = np.zeros((3, 3))
         else:
-            self._since_fit = np.asarray(np.linalg.inv(match.information))
+            self._since_fit = match.covariance
         if not stands:
             by_motion = inverse(self._since_learned + Q)
             self._since_learned = inverse(by_motion + match.by_scan)
@@ -489,7 +489,7 @@ class ScanLocalizer:
         """Draw some of the keyframes that are due."""
         for _ in range(min(count, len(self._due))):
             frame = self.keyframes[self._due.pop()]
-            self._map.add_scan(frame.points_base, frame.scan.T_base_laser, frame.T_map_base)
+            self._map.add_scan(frame.points, frame.scan.T_base_laser, frame.T_map_base)
 
     def _note(self, scan: Scan) -> None:
         """Keep the pose of the step, as seen from the anchor."""

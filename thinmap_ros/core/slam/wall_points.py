@@ -9,16 +9,15 @@ from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
 
-_FAR_M = 1e4  # all faces to one side look towards one place there
 # (row, col) from an occupied cell to the free one beside it.
 _SIDES = ((0, 1), (0, -1), (1, 0), (-1, 0))
 
 
 class Faces(NamedTuple):
-    """Points (N, 2) on walls, m, in order along each, and a place (2,) that all of them face."""
+    """Points (N, 2) on walls, m, in order along each, and the normal (2,) of all of them."""
 
     points: Array
-    seen_from: Array
+    normal: Array
 
 
 def wall_points(patch: GridPatch) -> list[Faces]:
@@ -44,7 +43,7 @@ def _faces(patch: GridPatch, row: int, col: int, depth_m: float) -> Faces:
     middles = patch.frame.centres_of(cells) + (0.5 * edge - depth_m) * side
     along = 0.25 * edge * np.abs(side[::-1])
     points = np.stack([middles - along, middles + along], axis=1).reshape(-1, 2)
-    return Faces(points, middles.mean(axis=0) + _FAR_M * side if len(middles) else side)
+    return Faces(points, side)
 
 
 def _along(cells: NDArray[np.int64], row: int) -> NDArray[np.int64]:
