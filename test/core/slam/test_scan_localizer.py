@@ -59,7 +59,7 @@ def on(localizer, steps, truth, odom, rng, segments=ROOM, turn=0.1):
     for _ in range(steps):
         step = se2.pose(0.02, 0.0, turn)
         truth, odom = se2.compose(truth, step), se2.compose(odom, step)
-        stamp = (localizer._odometry.stamp_ns or 0) + PERIOD_NS
+        stamp = (localizer._prediction.stamp_ns or 0) + PERIOD_NS
         rows.append((truth, localizer.step(scan_in(segments, truth, rng, stamp), odom), odom))
     return rows
 

@@ -14,10 +14,12 @@ import numpy as np
 
 from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.local_map import OPEN, WALL, Lattice, off_wall
+from thinmap_ros.core.slam.local_map import Lattice, off_wall
 
 SLIP_SIGMAS = 10.0  # of a prior, beyond which wheels have rather slipped than scans erred
 FITS_SIGMAS = 2.0  # of a point, within which it lies on its wall
+_OFF_SIGMAS = 3.0  # and beyond which it does not
+_HALF_WALL = 5.0  # to either side of the hits of a cell its wall goes on so many cells
 UNSEEN_COST = 0.5  # of a point where nobody has looked yet, for one in the open
 _YOUNG_HITS = 1.0  # a wall that was hit so often weighs half: who walks by is seen once
 _BEHIND = -0.1  # cosine to a wall's normal from which on a beam comes from behind
@@ -81,15 +83,15 @@ def evaluate(
         sums[1] += weight
         x = (pose[0] + px) / cell_m - lattice.first_col
         y = (pose[1] + py) / cell_m - lattice.first_row
-        state, dx, dy, wall = off_wall(lattice, x, y)
-        if state == WALL:
-            to_x, to_y = cos * scan[i, 3] - sin * scan[i, 4], sin * scan[i, 3] + cos * scan[i, 4]
-            if wall['face_x'] * to_x + wall['face_y'] * to_y < _BEHIND:
-                sums[0] += weight * far * UNSEEN_COST  # the other face is another wall
-                continue
-        if state != WALL:
-            sums[0] += weight * far * (1.0 if state == OPEN else UNSEEN_COST)
-            sums[3] += weight * (state == OPEN)
+        is_seen, is_near, dx, dy, wall = off_wall(lattice, x, y)
+        if not is_near:
+            sums[0] += weight * far * (1.0 if is_seen else UNSEEN_COST)
+            sums[3] += weight * is_seen
+            continue
+        to_x = cos * scan[i, 3] - sin * scan[i, 4]
+        to_y = sin * scan[i, 3] + cos * scan[i, 4]
+        if wall['face_x'] * to_x + wall['face_y'] * to_y < _BEHIND:
+            sums[0] += weight * far * UNSEEN_COST  # the other face is another wall
             continue
         w = weight * wall['hits'] / (wall['hits'] + _YOUNG_HITS)
         xx, xy, yy = _normal_matrix(wall['cos2'], wall['sin2'])
@@ -97,8 +99,11 @@ def evaluate(
         squared = (dx * ex + dy * ey) * scale * scale
         sums[0] += w * loss(squared, width)
         sums[4] += (weight - w) * far * UNSEEN_COST
-        if squared < FITS_SIGMAS * FITS_SIGMAS:
+        is_beyond = dx * dx + dy * dy > _HALF_WALL * _HALF_WALL
+        if squared < FITS_SIGMAS * FITS_SIGMAS and not is_beyond:
             sums[2] += weight
+        elif squared > _OFF_SIGMAS * _OFF_SIGMAS or is_beyond:
+            sums[3] += weight * is_seen
         w /= (1.0 + squared / (width * width)) * sigma * sigma
         ex, ey = ex * cell_m, ey * cell_m
         g[0] -= w * ex

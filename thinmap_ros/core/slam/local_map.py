@@ -40,7 +40,6 @@ CELL = np.dtype(
     ]
 )
 HERE = 100
-UNSEEN, OPEN, WALL = 0, 1, 2  # states of a point
 _SHIFT = TILE.bit_length() - 1
 _MASK = TILE - 1
 _MOST_SEEN = 255
@@ -232,21 +231,25 @@ def nearest_wall(lattice: Lattice, row: int, col: int) -> tuple[int, int, int]:
 
 
 @inlined
-def off_wall(lattice: Lattice, x: float, y: float) -> tuple[int, float, float, Any]:
-    """State of a point (x, y), in cells, what it is off its nearest wall, and the wall's cell.
+def off_wall(lattice: Lattice, x: float, y: float) -> tuple[bool, bool, float, float, Any]:
+    """What a point (x, y), in cells, is off its nearest wall.
 
-    State 0: nobody has looked there; 1: no wall within reach; 2: there is one.
+    Returns whether a beam has met or crossed the point's cell, whether a wall is within reach, what
+    the point is off the mean of the wall's hits (2), in cells, and the wall's cell.
     """
-    row, col = cell_of(y), cell_of(x)
+    row = cell_of(y)
+    col = cell_of(x)
     slot = slot_of(lattice, row, col)
     if slot == NO_TILE:
-        return UNSEEN, 0.0, 0.0, lattice.pool[0, 0, 0]
+        return False, False, 0.0, 0.0, lattice.pool[0, 0, 0]
     cell = lattice.pool[slot, row & _MASK, col & _MASK]
+    is_seen = bool(cell['seen'] > 0)
     if cell['to_row'] == 0:
-        return (OPEN if cell['seen'] > 0 else UNSEEN), 0.0, 0.0, cell
-    row, col = row + int(cell['to_row']) - HERE, col + int(cell['to_col']) - HERE
+        return is_seen, False, 0.0, 0.0, cell
+    row += int(cell['to_row']) - HERE
+    col += int(cell['to_col']) - HERE
     wall = lattice.pool[slot_of(lattice, row, col), row & _MASK, col & _MASK]
-    return WALL, x - col - wall['x'], y - row - wall['y'], wall
+    return is_seen, True, x - col - wall['x'], y - row - wall['y'], wall
 
 
 @kernel
@@ -256,8 +259,8 @@ def _distances(points: Array, lattice: Lattice) -> Array:
     for i in range(len(points)):
         x = points[i, 0] / lattice.cell_m - lattice.first_col
         y = points[i, 1] / lattice.cell_m - lattice.first_row
-        state, dx, dy, _ = off_wall(lattice, x, y)
-        if state == WALL:
+        _, is_near, dx, dy, _ = off_wall(lattice, x, y)
+        if is_near:
             found[i] = min(found[i], lattice.cell_m * math.hypot(dx, dy))
     return found
 

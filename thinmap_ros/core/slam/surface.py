@@ -86,7 +86,7 @@ def _surface(points: Array, beams: NDArray[np.int64]) -> Array:
         spread = math.hypot(0.5 * (xx - yy), xy)
         across = max(0.5 * (xx + yy) - spread - _RANGE_NOISE_M * _RANGE_NOISE_M, 0.0)
         along = 0.5 * (xx + yy) + spread
-        length = (along - across) / (along + across) / max(spread, 1e-12)
+        length = (along - across) / max((along + across) * spread, 1e-12)
         found[used, 0], found[used, 1] = points[i, 0], points[i, 1]
         found[used, 2] = -length * 0.5 * (xx - yy)
         found[used, 3] = -length * xy

@@ -1,119 +1,103 @@
-"""Whether the robot is where the localizer takes it to be.
+"""Whether scans agree with the map: tracking, lost in a new local map, or not yet placed in one."""
 
-Scans that fit, and those that suddenly do not.
-"""
-
-from dataclasses import replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.scan_matching import Match
+from thinmap_ros.core.slam.keyframes import carried, turned
+from thinmap_ros.core.slam.matcher import Match
+from thinmap_ros.core.slam.prediction import Prediction
 
-# From one scan to the next; a robot that is faster sees too much that is new.
-_NEAR_M = 0.2
-_NEAR_RAD = 0.2
-_TURNED_RAD = 1.0  # up to here much of what was seen is still in view, if less surely in its place
-# What is seen twice is as far away, give or take so much and so much of its range.
-_SAME_M = 0.2
-_SAME_SHARE = 0.05
-_FEWEST_POINTS = 20
-# Share of what was just seen that has to be there still; carried off, it is 0.1, seldom above 0.4.
-SEEN_AGAIN = 0.45
-_SEEN_AGAIN_TURNED = 0.2  # and so much of it in a turn
-# Share of the points that usually fit; the second where something is wrong.
-_AS_WELL = 0.5
-_AS_WELL_AGAIN = 0.8
-_USUAL_MEMORY = 0.9  # of what usually fits, from one scan to the next
+FOR_A_SLIP = 3.0  # points that fit, for one that contradicts, where scan and motion disagree
+_ADRIFT_M = 10.0  # path in a new local map after which it is part of the map for good
+_UNPLACED_EVIDENCE = 0.5  # of a robot that has been put into a map: a scan or two that fit
+
+
+@dataclass(frozen=True, eq=False)
+class DeadReckoning:
+    """Where the motion alone leads since a scan agreed with the map: pose (3,), cov. (3, 3)."""
+
+    T_map_base: Array
+    covariance: Array
+
+    def moved(self, prediction: Prediction) -> 'DeadReckoning':
+        """The same after one more motion."""
+        motion = prediction.motion
+        after = se2.compose(self.T_map_base, motion.increment)
+        Q = turned(motion.covariance, float(self.T_map_base[2]))
+        lever = after[:2] - self.T_map_base[:2]
+        return DeadReckoning(after, carried(self.covariance, lever) + Q)
 
 
 class Tracking:
-    """Lost after so many scans in a row that do not fit, or one unlike the one before it.
+    """Evidence against the map.
 
-    Of the scan of a robot that was carried off many points fit somehow, too: so a scan has to fit
-    about as well as those before it, and a robot that was carried off is found when as many in a
-    row do. usual: share of a scan's points that lie on surfaces of the map, on an average; carried:
-    whether the robot may be anywhere.
+    A cumulative sum of the share of points that contradict the map, less a third of those that fit.
+    Source: Page, "Continuous inspection schemes", 1954.
     """
 
-    def __init__(self, lost_scans: int, usual: float = 0.0, carried: bool = False) -> None:
-        self.usual, self._carried = usual, carried
-        self._lost_scans = lost_scans
-        self._misfits, self._fits = 0, 0
-        self._points_before: Array | None = None
+    def __init__(self, lost_evidence: float, least_fit: float, T_map_base: Array) -> None:
+        self.evidence = 0.0
+        self.is_unplaced = False  # in a map that was given, or put somewhere by hand
+        self.reckoned = DeadReckoning(T_map_base, np.zeros((3, 3)))
+        self._lost_evidence = lost_evidence
+        self._least_fit = least_fit
+        self._adrift_m = 0.0  # path for which a new local map is not yet part of the map
 
     @property
-    def lost(self) -> bool:
-        """Whether the robot is not where it was taken to be."""
-        return self._carried or self._misfits >= self._lost_scans
+    def agrees(self) -> bool:
+        """Whether nothing speaks against the map."""
+        return self.evidence == 0.0
 
-    def found(self) -> None:
-        """Somebody has said where the robot is."""
-        self._carried, self._misfits, self._fits = False, 0, 0
+    @property
+    def is_lost(self) -> bool:
+        """Whether the pose is in no map that others know."""
+        return self._adrift_m > 0.0 or (self.is_unplaced and self.evidence > 0.0)
 
-    def judged(
-        self, match: Match, points_base: Array, scan: Scan, increment: Array, near: bool
-    ) -> Match:
-        """A match that counts as good only where it is good enough.
+    @property
+    def needs_new_map(self) -> bool:
+        """Whether scans contradict the map for good."""
+        return self.evidence > self._lost_evidence
 
-        points_base (N, 2): of the scan; increment (3,): of the odometry since the scan before;
-        near: whether the robot is where the map has just learned, so that most of the scan must be
-        known.
-        """
-        before, self._points_before = self._points_before, points_base
-        way, turn = float(np.hypot(increment[0], increment[1])), abs(float(increment[2]))
-        strange = False
-        if (
-            before is not None
-            and len(before)
-            and len(points_base)
-            and way <= _NEAR_M
-            and turn <= _TURNED_RAD
-        ):
-            least = SEEN_AGAIN if turn <= _NEAR_RAD else _SEEN_AGAIN_TURNED
-            strange = share_seen_again(before, increment, scan) < least
-        share = match.overlap * match.fit
-        if strange or self._carried:
-            good = match.good and share >= _AS_WELL_AGAIN * self.usual
-        else:
-            known = near or 0 < self._misfits < self._lost_scans
-            good = match.good and (share >= _AS_WELL * self.usual or not known)
-        if good:
-            self.usual = _USUAL_MEMORY * (self.usual or share) + (1.0 - _USUAL_MEMORY) * share
-        elif strange:
-            self._carried, self._fits = True, 0
-        return replace(match, good=good)
+    def judge(self, match: Match | None) -> None:
+        """Update the evidence by a match; None: nothing could be matched, and nothing is told."""
+        if match is None:
+            return
+        more = match.contradicted - match.fit / FOR_A_SLIP
+        self.evidence = max(self.evidence + more, 0.0)
+        if self.is_unplaced:
+            self.evidence = min(self.evidence, self._lost_evidence)
+            self.is_unplaced = self.evidence > 0.0 or match.fit < self._least_fit
 
-    def count(self, good: bool, on_new_ground: bool) -> None:
-        """Count a scan that fits, or does not though it lies on known ground."""
-        if good:
-            self._misfits, self._fits = 0, self._fits + 1
-        else:
-            self._misfits, self._fits = self._misfits + (not on_new_ground), 0
-        self._carried &= self._fits < self._lost_scans
+    def note(self, T_map_base: Array, covariance: Array) -> None:
+        """The pose of this scan is (3,): dead reckoning begins there where the map agrees."""
+        if self.agrees:
+            self.reckoned = DeadReckoning(T_map_base, covariance)
 
+    def place(self, T_map_base: Array, covariance: Array) -> None:
+        """The robot was put at a pose (3,) with covariance (3, 3)."""
+        self.is_unplaced = True
+        self._adrift_m = 0.0
+        self.evidence = 0.0
+        self.reckoned = DeadReckoning(T_map_base, covariance)
 
-def share_seen_again(before: Array, increment: Array, scan: Scan) -> float:
-    """Share of the points (N, 2) of one scan that the next one sees, too.
+    def begin_in_map(self) -> None:
+        """A map was given, and the robot is somewhere in it."""
+        self.is_unplaced = True
+        self.evidence = _UNPLACED_EVIDENCE
 
-    1 where few lie in its field of view.
+    def begin_submap(self) -> None:
+        """Go on in a new local map."""
+        self.evidence = 0.0
+        self._adrift_m = _ADRIFT_M
 
-    before: in the robot frame of then; increment (3,): how the robot has moved since.
-    """
-    if scan.ranges_m.size < _FEWEST_POINTS:
-        return 1.0
-    T_before_laser = se2.compose(increment, scan.T_base_laser)
-    points = se2.transform_points(se2.invert(T_before_laser), before)
-    ranges = np.hypot(points[:, 0], points[:, 1])
-    bearings = np.arctan2(points[:, 1], points[:, 0])
-    turns = (bearings - scan.angle_min_rad) * np.sign(scan.angle_increment_rad)
-    beams = np.round(turns % (2.0 * np.pi) / abs(scan.angle_increment_rad)).astype(np.int64)
-    seen = (beams >= 1) & (beams < scan.ranges_m.size - 1)
-    if int(seen.sum()) < _FEWEST_POINTS:
-        return 1.0
-    measured = np.where(scan.hit, scan.ranges_m, np.inf)
-    beams, ranges = beams[seen], ranges[seen]
-    off = np.abs(np.stack([measured[beams + k] for k in (-1, 0, 1)]) - ranges).min(axis=0)
-    return float((off <= _SAME_M + _SAME_SHARE * ranges).mean())
+    def travel(self, path_m: float) -> None:
+        """The map has grown after a path of this length, m."""
+        self._adrift_m = max(self._adrift_m - path_m, 0.0)
+
+    def join(self, T_map_base: Array) -> None:
+        """A loop was closed: the new local map is part of the map, the pose is (3,)."""
+        self._adrift_m = 0.0
+        self.reckoned = DeadReckoning(T_map_base, self.reckoned.covariance)

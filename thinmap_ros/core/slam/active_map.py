@@ -1,0 +1,62 @@
+"""The local map that scans are matched with, rendered again from keyframes after a correction."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.keyframes import Keyframe
+from thinmap_ros.core.slam.local_map import LocalMap, LocalMapConfig
+
+_AT_ONCE = 20  # keyframes rendered at once after a correction
+_A_STEP = 2  # and in each step after it
+
+
+class ActiveMap:
+    """A local map, what it was given to begin with, and the keyframes that it still lacks."""
+
+    def __init__(self, config: LocalMapConfig) -> None:
+        self._config = config
+        self.map = LocalMap(config)
+        self.number = 0  # of the submap
+        self.T_learned: Array | None = None  # pose (3,) of the scan that it learned from last
+        self._given: Mapping[str, NDArray[Any]] | None = None
+        self._due: list[int] = []
+
+    def begin_in(self, given: Mapping[str, NDArray[Any]]) -> None:
+        """The map has the cells of a state from the beginning."""
+        self._given = given
+
+    def add_scan(self, points: Array, T_base_laser: Array, T_map_base: Array) -> None:
+        """Add surface points (N, 5), robot frame, of a scan at a pose (3,)."""
+        self.map.add_scan(points, T_base_laser, T_map_base)
+        self.T_learned = T_map_base
+
+    def moved(self, T_map_base: Array) -> Array | None:
+        """The motion (3,) since the map last learned, to a pose (3,); None before the first."""
+        return None if self.T_learned is None else se2.between(self.T_learned, T_map_base)
+
+    def begin_submap(self) -> None:
+        """Go on in an empty map."""
+        self.map = LocalMap(self._config)
+        self._due = []
+        self.number += 1
+
+    def rerender(self, keyframes: Sequence[Keyframe], T_map_base: Array) -> None:
+        """Render the map again from its keyframes, those nearest to a pose (3,) first."""
+        self.map = LocalMap(self._config)
+        if self._given is not None:
+            self.map.restore(self._given)
+        places = np.array([frame.T_map_base for frame in keyframes]).reshape(-1, 3)[:, :2]
+        away = np.hypot(*(places - T_map_base[:2]).T)
+        self._due = np.argsort(-away).tolist()
+        self.render(keyframes, _AT_ONCE)
+
+    def render(self, keyframes: Sequence[Keyframe], count: int = _A_STEP) -> None:
+        """Render some of the keyframes that are due."""
+        for _ in range(min(count, len(self._due))):
+            frame = keyframes[self._due.pop()]
+            self.map.add_scan(frame.points, frame.scan.T_base_laser, frame.T_map_base)
