@@ -39,15 +39,6 @@ def localizer() -> None:
     covariances_from(0, np.zeros((2, 3)), [Edge(0, 1, np.zeros(3), np.eye(3), False)])
 
 
-def ekf_localizer() -> None:
-    """Rehearse the localizer before, `replay --core ekf`."""
-    from thinmap_ros.core.slam.localizer import Localizer
-
-    rehearsed = Localizer()
-    for scan, T_map_base in _drive():
-        rehearsed.step(scan, T_map_base)
-
-
 def grid_mapper() -> None:
     """Rehearse the map update and its windows."""
     from thinmap_ros.core.grid.occupancy import OccupancyGrid, WindowConfig
