@@ -24,8 +24,8 @@ _SCANS, _PERIOD_S, _STEP_M, _TURN_RAD = 12, 0.2, 0.12, 0.11
 
 def localizer() -> None:
     """Rehearse localization."""
-    from thinmap_ros.core.slam.edges import Edge
     from thinmap_ros.core.slam.keyframes import covariances_from
+    from thinmap_ros.core.slam.pose_graph import Edge
     from thinmap_ros.core.slam.scan_localizer import ScanLocalizer
 
     rehearsed = ScanLocalizer()
