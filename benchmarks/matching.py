@@ -18,7 +18,8 @@ from benchmarks.worlds import floors
 from thinmap_ros.core import se2
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.scan_matching import MatchConfig, ScanMatcher
+from thinmap_ros.core.slam.local_map import LocalMap
+from thinmap_ros.core.slam.matcher import Matcher
 from thinmap_ros.sim.lms200 import Lms200, Lms200Config
 
 _QUICK = ('kth/50052751',)
@@ -114,13 +115,16 @@ def _measure(
 
 def _ours(before: list[tuple[Scan, Array]], errors: tuple[float, float]) -> Match:
     """The matcher of this project, told how good the prior is."""
-    matcher = ScanMatcher(MatchConfig())
+    matcher = Matcher()
+    local_map = LocalMap(matcher.config)
     for scan, T in before:
-        matcher.add(se2.transform_points(T, scan.points_base()), T[:2])
+        local_map.add_scan(scan.points_base(), scan.T_base_laser, T)
     sigmas = np.array([errors[0], errors[0], np.radians(errors[1])]) / np.sqrt(3.0)
     covariance = np.diag(np.square(sigmas))
     return lambda scan, prior: (
-        matcher.match(scan.points_base(), np.zeros(2), prior, covariance).T_map_base
+        matcher.match(
+            scan.points_base(), scan.T_base_laser, local_map, prior, covariance
+        ).T_map_base
     )
 
 

@@ -38,8 +38,8 @@ _ABOUT = {
     'matching': 'A scan against ten others round its place: the scan matcher of the localizer, and '
     'that of OpenKarto (package karto-scanmatcher, where it is installed), which makes its map '
     'anew for each match.',
-    'slam': 'A step of the localizer by the number of features in the map: the filter over the '
-    'local area (ti), over all features (full).',
+    'slam': "A step of the paper's filter by the number of features in the map: with those of the "
+    'local area in the state (ti), with all of them (full).',
     'growth': 'Localizer, grid and graph together on a long drive through the warehouse of '
     '200 x 200 m.',
 }

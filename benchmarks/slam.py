@@ -22,6 +22,7 @@ _CELL_M, _WALL_M = 0.05, 0.1
 _WIDTH_M, _CORRIDOR_M, _ROOM_M, _DOOR_M = 10.0, 2.0, 3.0, 1.0
 _STEP_M, _AROUND = 0.1, 100  # steps before a number of features is reached that count for it
 _WHEELS = 1.01  # what the odometry makes of a metre
+_GAP_M = 0.3  # the walls on both sides of a door are two features, so that there are many
 
 
 def run(worlds: Path, quick: bool) -> Iterator[Row]:
@@ -54,7 +55,9 @@ def _cost(slam: str, numbers: list[int]) -> Iterator[tuple[int, tuple[float, flo
     length = 1.5 * numbers[-1] + 60.0
     world, laser = _floor(length), Lms200(Lms200Config(), 0)
     truth = np.array([1.0, 0.5 * _WIDTH_M, 0.0])
-    localizer = EkfLocalizer(EkfConfig(slam=slam, start_x_m=truth[0], start_y_m=truth[1]))
+    localizer = EkfLocalizer(
+        EkfConfig(slam=slam, gap_m=_GAP_M, start_x_m=truth[0], start_y_m=truth[1])
+    )
     odom, taken, left, number = np.zeros(3), [0.0], list(numbers), 0
     while left and truth[0] < length - 2.0:
         scan = laser.scan(world, truth, 200_000_000 * number)

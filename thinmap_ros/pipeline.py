@@ -11,8 +11,7 @@ from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, Wind
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
-from thinmap_ros.core.slam.modes import AnyLocalizer, localizer_class
+from thinmap_ros.core.slam.localizers import localizer_class
 from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
 from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig
 
@@ -21,11 +20,10 @@ from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig
 class PipelineConfig:
     """Parameters of all stages.
 
-    localizer: its type says which of CORES it is. scans_per_graph: the graph is brought
-    up to date with every so many scans.
+    scans_per_graph: the graph is brought up to date with every so many scans.
     """
 
-    localizer: LocalizerConfig | ScanLocalizerConfig = field(default_factory=ScanLocalizerConfig)
+    localizer: ScanLocalizerConfig = field(default_factory=ScanLocalizerConfig)
     grid: OccupancyConfig = field(default_factory=OccupancyConfig)
     window: WindowConfig = field(default_factory=WindowConfig)
     topology: TopologyConfig = field(default_factory=TopologyConfig)
@@ -55,7 +53,7 @@ class Pipeline:
         pose_source: Callable[[Scan, Array], Estimate] | None = None,
     ) -> None:
         self.config = config or PipelineConfig()
-        self.localizer = _localizer(self.config.localizer)
+        self.localizer = localizer_class(self.config.localizer)(self.config.localizer)
         self.grid = OccupancyGrid(self.config.grid)
         self.topology = TopologyBuilder(self.config.topology)
         self.stage_seconds: dict[str, list[float]] = {}
@@ -113,17 +111,3 @@ class Pipeline:
         started = perf_counter()
         yield
         self.stage_seconds.setdefault(stage, []).append(perf_counter() - started)
-
-
-# The localizers that there are, the default first; the other one is that of the third paper.
-CORES: dict[str, type[LocalizerConfig | ScanLocalizerConfig]] = {
-    'scan': ScanLocalizerConfig,
-    'ekf': LocalizerConfig,
-}
-
-
-def _localizer(config: LocalizerConfig | ScanLocalizerConfig) -> Localizer | AnyLocalizer:
-    """The localizer that a configuration is of."""
-    if isinstance(config, LocalizerConfig):
-        return Localizer(config)
-    return localizer_class(config)(config)

@@ -24,8 +24,8 @@ _SCANS, _PERIOD_S, _STEP_M, _TURN_RAD = 12, 0.2, 0.12, 0.11
 
 def localizer() -> None:
     """Rehearse localization."""
-    from thinmap_ros.core.slam.edges import Edge
     from thinmap_ros.core.slam.keyframes import covariances_from
+    from thinmap_ros.core.slam.pose_graph import Edge
     from thinmap_ros.core.slam.scan_localizer import ScanLocalizer
 
     rehearsed = ScanLocalizer()
@@ -37,15 +37,6 @@ def localizer() -> None:
     ScanLocalizer.resumed(_room(), LastPose(0, T_map_base, T_map_base), T_map_base)
     # As soon as a place is seen again, covariances along the graph are asked for.
     covariances_from(0, np.zeros((2, 3)), [Edge(0, 1, np.zeros(3), np.eye(3), False)])
-
-
-def ekf_localizer() -> None:
-    """Rehearse the localizer before, `replay --core ekf`."""
-    from thinmap_ros.core.slam.localizer import Localizer
-
-    rehearsed = Localizer()
-    for scan, T_map_base in _drive():
-        rehearsed.step(scan, T_map_base)
 
 
 def grid_mapper() -> None:

@@ -18,7 +18,7 @@ from thinmap_ros.core.localization.global_localization import GlobalLocalization
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.modes import localizer_class
+from thinmap_ros.core.slam.localizers import localizer_class
 from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
 from thinmap_ros.core.topology.update import TopologyBuilder
 

@@ -91,15 +91,11 @@ def test_files_and_figures(log, tmp_path, form):
     assert patch.occupied[wall[0], wall[1] - 1 : wall[1] + 2].any()
 
 
-@pytest.mark.parametrize(
-    ('core', 'slam'),
-    [('scan', mode) for mode in ('off', 'ti', 'ekf_ti', 'ekf_full')]
-    + [('ekf', mode) for mode in ('off', 'ti')],
-)
-def test_each_core_replays_it_with_and_without_line_features(tmp_path, core, slam):
+@pytest.mark.parametrize('slam', ['off', 'ti', 'ekf_ti', 'ekf_full'])
+def test_each_localizer_replays_it_with_and_without_line_features(tmp_path, slam):
     log = tmp_path / 'log.clf'
     log.write_text('\n'.join(carmen_lines(scans=60)) + '\n')
-    done = run(log, '-o', tmp_path / 'out', '--core', core, '--slam', slam)
+    done = run(log, '-o', tmp_path / 'out', '--slam', slam)
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / 'out' / 'report.json').read_text())
     assert (report['scans'], report['skipped']) == (60, 0)
@@ -108,17 +104,17 @@ def test_each_core_replays_it_with_and_without_line_features(tmp_path, core, sla
     assert np.abs(trajectory[:, 1] - 0.03 * np.arange(60)).max() < 0.05
 
 
-def test_the_core_is_the_scan_matcher_unless_it_is_told(log, tmp_path):
+def test_the_localizer_is_the_scan_matcher_unless_it_is_told(log, tmp_path):
     for name, options in (
         ('default', []),
-        ('scan', ['--core', 'scan']),
-        ('ekf', ['--core', 'ekf']),
+        ('scans', ['--slam', 'ti']),
+        ('filter', ['--slam', 'ekf_ti']),
     ):
         assert run(log, '-o', tmp_path / name, *options).returncode == 0
-    default, scan, ekf = (
-        (tmp_path / name / 'trajectory.tum').read_bytes() for name in ('default', 'scan', 'ekf')
+    default, scans, by_filter = (
+        (tmp_path / name / 'trajectory.tum').read_bytes() for name in ('default', 'scans', 'filter')
     )
-    assert default == scan != ekf
+    assert default == scans != by_filter
 
 
 @pytest.mark.parametrize('share', [0.5, 0.97])

@@ -38,7 +38,6 @@ class Field:
     low: float | tuple[float, ...] = -math.inf
     high: float | tuple[float, ...] = math.inf
     nan: bool = False
-    optional: bool = False
 
 
 Fields = Mapping[str, Field]
@@ -58,10 +57,9 @@ def check(state: State, fields: Fields, what: str) -> dict[str, NDArray[Any]]:
     sizes: dict[str, int] = {}
     checked = {}
     for name, field in fields.items():
-        if name in state:
-            checked[name] = _checked(np.asarray(state[name]), field, sizes, f'saved {what}: {name}')
-        elif not field.optional:
+        if name not in state:
             raise InputError(f'saved {what}: no {name}: expected {", ".join(fields)}')
+        checked[name] = _checked(np.asarray(state[name]), field, sizes, f'saved {what}: {name}')
     return checked
 
 

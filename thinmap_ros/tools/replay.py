@@ -27,7 +27,7 @@ from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.odometry import ScanPairing
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
-from thinmap_ros.pipeline import CORES, Pipeline, PipelineConfig
+from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.replay_view import ReplayView
 
@@ -153,7 +153,7 @@ def _view(arguments: argparse.Namespace) -> Iterator[View | None]:
 
 def _play(arguments: argparse.Namespace, shown: ReplayView | None) -> None:
     config = PipelineConfig(
-        localizer=cli.config_from(arguments, CORES[arguments.core]),
+        localizer=cli.config_from(arguments, ScanLocalizerConfig),
         grid=cli.config_from(arguments, OccupancyConfig),
     )
     wall, cpu = time.perf_counter(), time.process_time()
@@ -180,12 +180,6 @@ def main() -> None:
         '--view', action='store_true', help='show it in rerun, until the viewer is closed'
     )
     parser.add_argument('--recording', type=Path, help="file for rerun's recording (.rrd)")
-    parser.add_argument(
-        '--core',
-        choices=tuple(CORES),
-        default='scan',
-        help='the localizer: this one (scan), or the one before (ekf; default scan)',
-    )
     cli.add_config(parser, ScanLocalizerConfig, ['slam'])
     cli.add_config(parser, OccupancyConfig, ['resolution_m', 'no_return_range_m', 'usable_range_m'])
     cli.run(_work, parser)

@@ -11,7 +11,6 @@ from thinmap_ros.tools import cli, explore_world
 
 _REHEARSALS = (
     warm_up.localizer,
-    warm_up.ekf_localizer,
     warm_up.grid_mapper,
     warm_up.topology_builder,
     warm_up.explorer,

@@ -11,7 +11,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.tiles import TILE
 from thinmap_ros.core.odometry import OdometryBuffer
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.slam.point_map import PointMap
+from thinmap_ros.core.slam.local_map import LocalMap
 
 
 def scan_of(ranges, mount=(0.0, 0.0, 0.0)):
@@ -88,25 +88,32 @@ def test_odometry_from_nowhere_is_refused(x):
         OdometryBuffer().add(0, np.array([x, 0.0, 0.0]))
 
 
-def test_points_from_nowhere_are_refused():
-    points = PointMap(0.05, 15.0)
-    points.add(np.array([[1.0, 1.0], [1.02, 1.0]]), np.zeros(2))
-    before = points.state()
-    for far in (1e7, 1e18, np.nan):
-        with pytest.raises(InputError):
-            points.add(np.array([[1.0, 1.0], [far, 1.0]]), np.zeros(2))
-    np.testing.assert_array_equal(points.state()['points'], before['points'])
+@pytest.mark.parametrize('far', [1e7, -1e7, 1e15])
+def test_points_from_nowhere_are_refused(far):
+    local_map = seen_map()
+    before = {name: array.copy() for name, array in local_map.state().items()}
+    points = np.array([[1.0, 1.0], [far, 1.0]])
+    with pytest.raises(InputError, match='tiles'):
+        local_map.add(points, np.zeros(2))
+    with pytest.raises(InputError, match='tiles'):
+        local_map.add_walls(points)
+    for name, array in local_map.state().items():
+        np.testing.assert_array_equal(array, before[name])
 
 
-@pytest.mark.parametrize('far', [2**62, -(2**62)])
-def test_a_saved_map_of_points_from_nowhere_is_refused(far):
-    points = PointMap(0.05, 15.0)
-    points.add(np.array([[1.0, 1.0], [1.02, 1.0]]), np.zeros(2))
-    state = points.state()
-    cells = state['cells'].copy()
-    cells[0, 0] = far
-    with pytest.raises(InputError):
-        PointMap(0.05, 15.0).restore({**state, 'cells': cells})
+@pytest.mark.parametrize('far', [2**62, -(2**62), 2**30])
+def test_a_saved_local_map_from_nowhere_is_refused(far):
+    state = seen_map().state()
+    tiles = state['tiles'].copy()
+    tiles[0, 0] = far
+    with pytest.raises(InputError, match='tiles'):
+        LocalMap().restore({**state, 'tiles': tiles})
+
+
+def seen_map():
+    local_map = LocalMap()
+    local_map.add(np.array([[1.0, 1.0], [1.02, 1.0]]), np.zeros(2))
+    return local_map
 
 
 def test_windows_that_wander_off_do_not_grow_a_map_without_end():

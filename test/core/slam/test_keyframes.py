@@ -8,7 +8,6 @@ from slam_room import ROOM, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam import keyframes as module
-from thinmap_ros.core.slam.edges import Edge
 from thinmap_ros.core.slam.keyframes import (
     Keyframe,
     KeyframeConfig,
@@ -19,6 +18,7 @@ from thinmap_ros.core.slam.keyframes import (
     turned,
     unlike,
 )
+from thinmap_ros.core.slam.pose_graph import Edge
 
 STEP = np.diag(np.square([0.02, 0.01, 0.01]))
 

@@ -8,10 +8,10 @@ from slam_room import ROOM, corridor_ring, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam import loop_closure as module
-from thinmap_ros.core.slam.edges import Edge
 from thinmap_ros.core.slam.keyframes import Keyframe, carried, inverse, turned
 from thinmap_ros.core.slam.loop_closure import LoopClosure, LoopConfig
 from thinmap_ros.core.slam.matcher import FEWEST_POINTS, Matcher
+from thinmap_ros.core.slam.pose_graph import Edge
 
 SIGMAS = np.array([0.02, 0.02, 0.003])
 STEP = np.diag(np.square(SIGMAS))

@@ -497,6 +497,22 @@ def test_a_wall_that_would_be_crossed_costs(rng):
     assert by_point[0] > 5.0 * by_point[1]
 
 
+@pytest.mark.xfail(strict=True, reason='the two faces of a thin wall are matched with each other')
+def test_a_thin_wall_is_matched_by_the_face_that_is_seen(rng):
+    """From the far side of a wall 10 cm thick the near face must not draw the scan through it."""
+    faces = np.array(
+        [[2.0, -3.0, 2.0, 3.0], [2.1, -3.0, 2.1, 3.0], [0.0, -3.0, 5.0, -3.0], [0.0, 3.0, 5.0, 3.0]]
+    )
+    west = np.zeros(3)
+    east = np.array([4.0, 0.0, math.pi])
+    local_map = map_of(faces[[0, 2, 3]], around(west, 15, rng), rng)
+    for _ in range(15):
+        scan = scan_in(faces[[1, 2, 3]], east, rng)
+        local_map.add_scan(scan.points_base(), np.zeros(3), east)
+    found = match(local_map, scan_in(faces[[1, 2, 3]], east, rng).points_base(), east)
+    assert abs(off(found, east)[0]) < 0.01
+
+
 def test_wide_headings_are_wrapped(rng):
     """Priors beside half a turn."""
     truth = np.array([2.0, 2.0, math.pi - 0.01])

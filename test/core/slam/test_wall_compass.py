@@ -6,7 +6,7 @@ from slam_room import ROOM, corridor, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.ekf_slam.lines import LineConfig, extract_lines, no_lines
-from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
+from thinmap_ros.core.slam.scan_localizer import ScanLocalizer
 from thinmap_ros.core.slam.wall_compass import WallCompass
 
 PLACES = np.array(
@@ -81,8 +81,10 @@ def test_a_wing_that_stands_askew_is_mapped_as_it_stands(askew_deg, rng):
         [22.9, -1.2, *se2.transform_points(wing, np.array([[0.0, -1.2]]))[0]],
     ]
     walls = np.vstack([walls, corner])
-    odom, localizer = np.zeros(3), Localizer(LocalizerConfig())
+    localizer = ScanLocalizer()
+    odom = np.zeros(3)
     truth = np.zeros(3)
+    stamp_ns = 0
     goals = [[20.8, 0.0], *se2.transform_points(wing, np.array([[0.5, 0.0], [12.0, 0.0]]))]
     for goal in goals:
         while np.hypot(*(goal - truth[:2])) > 0.15:
@@ -92,7 +94,8 @@ def test_a_wing_that_stands_askew_is_mapped_as_it_stands(askew_deg, rng):
             step = np.array([0.1 if abs(turn) < 0.1 else 0.0, 0.0, turn])
             truth = se2.compose(truth, step)
             odom = se2.compose(odom, step + [0.0, 0.0, rng.normal(0.0, 0.003)])
-            estimate = localizer.step(scan_in(walls, truth, rng), odom)
+            stamp_ns += 200_000_000
+            estimate = localizer.step(scan_in(walls, truth, rng, stamp_ns), odom)
             off = se2.between(truth, estimate.T_map_base)
             assert abs(off[2]) < 0.02
     assert np.hypot(*off[:2]) < 0.25

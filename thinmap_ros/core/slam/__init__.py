@@ -1,1 +1,1 @@
-"""EKF-SLAM on line features; matching scans with the map of points sharpens predictions."""
+"""Scan matching with a local map, and a pose graph of keyframes with loop closure."""

@@ -20,7 +20,7 @@ from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.anchors import AnchoredPoses
-from thinmap_ros.core.slam.edges import Edge
+from thinmap_ros.core.slam.pose_graph import Edge
 
 _BUCKET_M = 4.0
 _RADIAN_M = 1.0  # a radian of turn makes two scans as different as so many metres

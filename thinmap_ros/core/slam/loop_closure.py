@@ -18,7 +18,6 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.config import parameter
 from thinmap_ros.core.estimate import Correction
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.edges import Edge, optimized, rounds
 from thinmap_ros.core.slam.keyframes import (
     Keyframe,
     KeyframeConfig,
@@ -31,6 +30,7 @@ from thinmap_ros.core.slam.keyframes import (
 )
 from thinmap_ros.core.slam.local_map import LocalMap
 from thinmap_ros.core.slam.matcher import Matcher
+from thinmap_ros.core.slam.pose_graph import Edge, optimized, rounds
 
 _AROUND = 4  # keyframes to either side that make a submap
 _AGAIN_M = 8.0  # a path of this length lies between leaving a place and coming back

@@ -1,11 +1,13 @@
-"""Poses that agree best with measured relative poses between them.
+"""Edges of the pose graph, and the poses that agree best with them.
 
 Source: Grisetti, Kuemmerle, Stachniss and Burgard, "A tutorial on graph-based SLAM", 2010.
-Measurements that may be wrong are held down by the loss of Geman and McClure, which is narrowed
-round by round, so that true loops have time to close: Yang et al., "Graduated non-convexity for
-robust spatial perception", 2020.
+Edges that may be wrong are held down by the loss of Geman and McClure, which is narrowed round by
+round, so that true loops have time to close: Yang et al., "Graduated non-convexity for robust
+spatial perception", 2020.
 """
 
+from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,53 +17,59 @@ from thinmap_ros.core.se2 import Array, wrap
 
 _ROUNDS = 30
 _SETTLED = 1e-5  # m and rad
-_LARGE = 16.0  # a squared error, in sigmas, that costs a loop three quarters of its weight
+_LARGE = 16.0  # a squared error, in sigmas, that costs an edge three quarters of its weight
 _NARROWING = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
-    """Pose b seen from pose a, T_a_b (3,), with its information (3, 3).
+class Edge:
+    """Pose b seen from pose a, T_a_b (3,), with its information (3, 3), frame of a.
 
-    doubtful: whether it may be all wrong.
+    robust: whether it may be all wrong.
     """
 
     a: int
     b: int
     T_a_b: Array
     information: Array
-    doubtful: bool
+    robust: bool
 
 
-def relax(poses: Array, measured: list[Measured]) -> Array:
-    """Poses (N, 3) moved by Gauss-Newton to agree with what was measured; the first stays."""
+def optimized(poses: Array, edges: list[Edge]) -> Array:
+    """Poses (N, 3) moved to agree with edges; the first stays."""
+    return deque(rounds(poses, edges), maxlen=1)[0]
+
+
+def rounds(poses: Array, edges: list[Edge]) -> Iterator[Array]:
+    """Poses (N, 3) after each round of Gauss-Newton, so that a caller can do one at a time."""
     poses = poses.copy()
-    if len(poses) < 2 or not measured:
-        return poses
-    edges = _Edges(measured)
+    if len(poses) < 2 or not edges:
+        yield poses
+        return
+    arrays = _Edges(edges)
     width: float | None = None
     for _ in range(_ROUNDS):
-        e, by_a, by_b = _linearise(poses, edges)
-        squared = np.einsum('ki,kij,kj->k', e, edges.information, e)
+        e, by_a, by_b = _linearise(poses, arrays)
+        squared = np.einsum('ki,kij,kj->k', e, arrays.information, e)
         width = 2.0 * float(squared.max()) if width is None else width / _NARROWING
-        scale = np.where(edges.doubtful, (1.0 + squared / max(width, _LARGE)) ** -2, 1.0)
-        step = _step(edges, e, by_a, by_b, scale[:, None, None] * edges.information)
+        scale = np.where(arrays.robust, (1.0 + squared / max(width, _LARGE)) ** -2, 1.0)
+        step = _step(arrays, e, by_a, by_b, scale[:, None, None] * arrays.information)
         poses[1:] += step
         poses[:, 2] = wrap(poses[:, 2])
+        yield poses
         if width <= _LARGE and np.abs(step).max() < _SETTLED:
             break
-    return poses
 
 
 class _Edges:
-    """Measurements as arrays."""
+    """Edges as arrays."""
 
-    def __init__(self, measured: list[Measured]) -> None:
-        self.a = np.array([m.a for m in measured])
-        self.b = np.array([m.b for m in measured])
-        self.T_a_b = np.array([m.T_a_b for m in measured])
-        self.information = np.array([m.information for m in measured])
-        self.doubtful = np.array([m.doubtful for m in measured])
+    def __init__(self, edges: list[Edge]) -> None:
+        self.a = np.array([edge.a for edge in edges])
+        self.b = np.array([edge.b for edge in edges])
+        self.T_a_b = np.array([edge.T_a_b for edge in edges])
+        self.information = np.array([edge.information for edge in edges])
+        self.robust = np.array([edge.robust for edge in edges])
 
 
 def _linearise(poses: Array, edges: _Edges) -> tuple[Array, Array, Array]:

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.slam.edges import Edge, _Edges, _linearise, optimized, rounds
+from thinmap_ros.core.slam.pose_graph import Edge, _Edges, _linearise, optimized, rounds
 
 STEP = np.diag(1.0 / np.square([0.05, 0.05, 0.02]))
 CORRELATED = np.array([[400.0, 150.0, -80.0], [150.0, 300.0, 60.0], [-80.0, 60.0, 900.0]])

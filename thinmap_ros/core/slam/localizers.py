@@ -1,4 +1,4 @@
-"""Which localizer a configuration asks for."""
+"""The localizers, and which of them a configuration asks for."""
 
 from thinmap_ros.core.ekf_slam.localizer import EkfLocalizer
 from thinmap_ros.core.slam.scan_localizer import ScanLocalizer, ScanLocalizerConfig
