@@ -36,6 +36,7 @@ _AROUND = 4  # keyframes to either side that make a submap
 _AGAIN_M = 8.0  # a path of this length lies between leaving a place and coming back
 _VISITS = 3  # earlier visits with which a keyframe is matched, at most
 _SIGMAS = 3.0
+_FARTHEST_M = 8.0  # of the uncertainty that is searched: places beyond need recognition
 _CHI2 = 11.34  # 99 % of three degrees of freedom
 _RECENT = 8  # matches among which consistent ones are looked for
 
@@ -48,7 +49,7 @@ class LoopConfig(KeyframeConfig):
         2.0, 'places nearer than this, and the uncertainty, are matched, m', low=0.1, high=20.0
     )
     loop_fit: float = parameter(
-        0.8, 'share of points that must lie on the walls of an earlier visit', low=0.0, high=1.0
+        0.75, 'share of points that must lie on the walls of an earlier visit', low=0.0, high=1.0
     )
     loop_sigma_m: float = parameter(
         0.05, 'uncertainty of a match of two visits, 1 sigma, m', low=0.001, high=1.0
@@ -81,6 +82,7 @@ class LoopClosure:
         self._pending: tuple[Keyframe, Array] | None = None
         self._requested: deque[Edge] = deque(maxlen=_RECENT)
         self._here: Keyframe | None = None  # the last of them, kept or not
+        self._is_strained = False  # whether a step, measured again, contradicts the poses
         self._submap: tuple[int, int, LocalMap] | None = None
         self._rounds: Iterator[Array] | None = None
         self._before: Array = np.zeros((0, 3))
@@ -135,16 +137,16 @@ class LoopClosure:
         """The keyframe most like this one of each earlier visit, likest first."""
         frames = self.keyframes.frames
         spread = math.sqrt(float(np.linalg.eigvalsh(here.covariance[:2, :2])[-1]))
-        near = self.keyframes.near(here.T_map_base, self._config.loop_reach_m + _SIGMAS * spread)
-        near = [j for j in near if self._is_earlier(j, here)]
+        near = self.keyframes.near(here.T_map_base, self._reach_m(spread))
+        due = {job.j for job in self._jobs if job.k == len(frames)}  # the step, measured again
+        near = [j for j in near if self._is_earlier(j, here) and j not in due]
         if not near:
             return []
         covariances = self._as_seen_from(near, here)
         ranked = []
         for i, (j, covariance) in enumerate(zip(near, covariances, strict=True)):
             sigma = math.sqrt(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
-            reach = self._config.loop_reach_m + _SIGMAS * sigma
-            if math.dist(frames[j].T_map_base[:2], here.T_map_base[:2]) <= reach:
+            if math.dist(frames[j].T_map_base[:2], here.T_map_base[:2]) <= self._reach_m(sigma):
                 ranked.append((unlike(frames[j].T_map_base, here.T_map_base), i))
         ranked.sort()
         found: list[_Job] = []
@@ -153,6 +155,10 @@ class LoopClosure:
             if all(abs(path_m - frames[job.j].path_m) > _AGAIN_M for job in found):
                 found.append(_Job(near[i], len(frames), covariances[i]))
         return found[:_VISITS]
+
+    def _reach_m(self, sigma: float) -> float:
+        """How far places that are matched may lie, where the place is uncertain by sigma, m."""
+        return self._config.loop_reach_m + min(_SIGMAS * sigma, _FARTHEST_M)
 
     def _is_earlier(self, j: int, here: Keyframe) -> bool:
         frame = self.keyframes.frames[j]
@@ -255,6 +261,7 @@ class LoopClosure:
         edge = Edge(j, k, T_j_k, inverse(covariance), True)
         if self._is_step(j, k):
             self.edges.append(edge)
+            self._is_strained |= self._mahalanobis(edge) > _CHI2
         elif self._mahalanobis(edge) < _CHI2:
             self._agree(edge)
         else:
@@ -264,6 +271,13 @@ class LoopClosure:
         """A match says that old and new map agree here."""
         here = self._frame(edge.b)
         self._requested.clear()
+        if self._is_strained:
+            # The robot has slid onto the old map: the loop is closed, the path up to it is bent.
+            self._is_strained = False
+            self._settle()
+            self.edges.append(edge)
+            self._begin_rounds()
+            return
         pending = self._pending
         if (
             pending is not None

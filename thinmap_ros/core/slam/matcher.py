@@ -18,7 +18,6 @@ from thinmap_ros.core.slam.pose_search import search
 
 FEWEST_POINTS = 10
 _SIGMAS = 3.0  # of a prior, within which poses are searched
-_SURE_FIT = 0.9  # share of points on walls from which on no search is made
 _BASIN = (0.3, 0.15)  # m, rad: three sigmas of a prior within which the nearest minimum is the one
 _WIDEST = (3.0, 3.0, 1.5)  # m, m, rad: half of what is searched, at most
 _SEARCHED_POINTS = 90
@@ -91,7 +90,7 @@ class Matcher:
         reach = _SIGMAS * np.sqrt(np.diag(covariance))
         fits_badly = match.fit < self.config.match_least_fit
         is_wide = max(reach[0], reach[1]) > _BASIN[0] or reach[2] > _BASIN[1]
-        if not fits_badly and not (is_wide and match.fit < _SURE_FIT):
+        if not fits_badly and not is_wide:
             return match
         if fits_badly:  # wheels may have slipped
             slip = np.array([self.config.slip_m, self.config.slip_m, self.config.slip_rad])

@@ -1,4 +1,4 @@
-"""Where odometry leads the robot from scan to scan: calibrated, with what is known of its errors."""
+"""Where odometry leads the robot from scan to scan, and how uncertain that is."""
 
 from dataclasses import dataclass, field
 
@@ -61,7 +61,7 @@ class OdometryPrediction:
         return self._increments.stamp_ns
 
     @property
-    def T_odom_base(self) -> Array:
+    def T_odom_base(self) -> Array:  # noqa: N802
         """Odometry pose (3,) of the last scan."""
         return self._increments.T_odom_base
 

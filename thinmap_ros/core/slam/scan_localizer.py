@@ -146,7 +146,9 @@ class ScanLocalizer:
         """
         checked = snapshot.check(state, FIELDS, 'features')
         possible = bool((checked['hits'] <= checked['seen']).all())
-        snapshot.require(possible, 'features: hits: more than seen', 'no more hits than observations')
+        snapshot.require(
+            possible, 'features: hits: more than seen', 'no more hits than observations'
+        )
         localizer = ScanLocalizer(config)
         localizer._map.map.restore(checked)
         localizer._lines.restore(
@@ -223,7 +225,9 @@ class ScanLocalizer:
     def _slip_covariance(self) -> Array:
         """Covariance (3, 3) of a pose after wheels have slipped as far as they ever do."""
         config = self.config
-        return np.diag(np.square(_SIGMAS * np.array([config.slip_m, config.slip_m, config.slip_rad])))
+        return np.diag(
+            np.square(_SIGMAS * np.array([config.slip_m, config.slip_m, config.slip_rad]))
+        )
 
     def _stands(self, prediction: Prediction) -> bool:
         """Whether the robot has not moved by more than odometry errs by."""
