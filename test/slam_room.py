@@ -1,13 +1,15 @@
 """A small room made of segments, and a robot that drives through it."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import pairwise
 
 import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.slam.local_map import LocalMap, LocalMapConfig
+from thinmap_ros.core.slam.surface import COLUMNS, surface_points
 
 RANGE_MAX_M = 8.0
 
@@ -63,6 +65,43 @@ def scan_in(
         ranges = mixed(ranges, rng) + rng.normal(0.0, 0.01, beams)
     ranges = np.where(ranges < RANGE_MAX_M, ranges, np.inf)
     return Scan.create(stamp_ns, ranges, start, step, 0.05, RANGE_MAX_M, mount)
+
+
+def seen_in(
+    segments: np.ndarray, T_world_base: np.ndarray, rng: np.random.Generator | None = None
+) -> np.ndarray:
+    """Surface points (N, 5) of a scan, robot frame."""
+    return surface_points(scan_in(segments, T_world_base, rng), RANGE_MAX_M)
+
+
+def on_wall(points: np.ndarray, angle_rad: float = math.pi / 2.0, share: float = 1.0) -> np.ndarray:
+    """Surface points (N, 5) at points (N, 2) of a wall whose normal is at an angle.
+
+    share: how sure the normal is. They are so far apart that each of them counts fully.
+    """
+    surface = np.ones((len(points), COLUMNS))
+    surface[:, :2] = points
+    surface[:, 2] = share * math.cos(2.0 * angle_rad)
+    surface[:, 3] = share * math.sin(2.0 * angle_rad)
+    return surface
+
+
+def map_of(
+    segments: np.ndarray,
+    poses: Iterable[np.ndarray],
+    rng: np.random.Generator | None = None,
+    config: LocalMapConfig | None = None,
+) -> LocalMap:
+    """The local map of scans at some poses (3,)."""
+    local_map = LocalMap(config)
+    for pose in poses:
+        local_map.add_scan(seen_in(segments, pose, rng), np.zeros(3), pose)
+    return local_map
+
+
+def around(pose: np.ndarray, number: int, rng: np.random.Generator) -> list[np.ndarray]:
+    """Poses (3,) beside one: within some 20 cm and 11 degrees."""
+    return [pose + rng.normal(0.0, [0.2, 0.2, 0.2]) for _ in range(number)]
 
 
 def mixed(ranges: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The local map: its counts, its distances, and how it follows walls that vanish."""
+"""The local map: its counts, its means, its distances, and how it follows walls that vanish."""
 
 import math
 
@@ -7,17 +7,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import distance_transform_edt
-from slam_room import ROOM, scan_in
+from slam_room import ROOM, map_of, on_wall, seen_in
 
-from thinmap_ros.core import se2
+from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.tiles import TILE
-from thinmap_ros.core.slam.local_map import HERE, LocalMap, LocalMapConfig
+from thinmap_ros.core.slam import local_map as module
+from thinmap_ros.core.slam.local_map import FIELDS, HERE, LocalMap, LocalMapConfig
 
 CELL_M = LocalMapConfig().match_cell_m
 REACH = round(LocalMapConfig().match_reach_m / CELL_M)
 BOX = ROOM[6:]
 WITHOUT_BOX = ROOM[:6]
+NOTHING = np.empty((0, 5))
 # In sight of the box from all sides.
 AROUND_BOX = [
     np.array([x, y, math.atan2(2.5 - y, 7.5 - x)])
@@ -26,8 +28,17 @@ AROUND_BOX = [
 
 
 def add_scan(local_map, segments, pose, rng=None):
-    scan = scan_in(segments, pose, rng)
-    local_map.add_scan(scan.points_base(), scan.T_base_laser, pose)
+    local_map.add_scan(seen_in(segments, pose, rng), np.zeros(3), pose)
+
+
+def add(local_map, points, laser=(0.0, 0.0), angle_rad=math.pi / 2.0):
+    """Points (N, 2), map frame, of a wall with a normal at an angle, seen by a laser."""
+    local_map.add_scan(on_wall(points, angle_rad), np.array([*laser, 0.0]), np.zeros(3))
+
+
+def cell_at(local_map, x, y):
+    row, col = math.floor(y / CELL_M), math.floor(x / CELL_M)
+    return local_map.tiles.read(row, col, 1, 1)[0, 0]
 
 
 def random_pose(rng):
@@ -96,7 +107,7 @@ def test_distances_follow_walls_that_come_and_go(seed):
     local_map = LocalMap()
     for _ in range(int(rng.integers(1, 12))):
         laser = rng.uniform(-1.0, 1.0, 2)
-        local_map.add(laser + rng.uniform(-1.5, 1.5, (int(rng.integers(1, 60)), 2)), laser)
+        add(local_map, laser + rng.uniform(-1.5, 1.5, (int(rng.integers(1, 60)), 2)), laser)
     cells, *_ = cells_of(local_map)
     truth, found = nearest(cells), told(cells)
     np.testing.assert_array_equal(np.isfinite(found), np.isfinite(truth))
@@ -108,52 +119,117 @@ def test_distances_follow_walls_that_come_and_go(seed):
 
 
 def test_a_cell_keeps_the_mean_of_its_hits(rng):
+    """Of their places, of their normals, and of the side that they were seen from."""
     points = np.array([2.0, -1.0]) + rng.uniform(0.0, CELL_M, (40, 2)) * 0.999
+    angles = rng.normal(0.3, 0.2, 40)
+    T_base_laser = np.array([0.1, 0.2, 0.0])
     local_map = LocalMap()
-    local_map.add(points, np.zeros(2))
-    cells, top, left = cells_of(local_map)
-    cell = cells[round(-1.0 / CELL_M) - top, round(2.0 / CELL_M) - left]
+    for point, angle in zip(points, angles, strict=True):
+        local_map.add_scan(on_wall(point[None], angle, 0.9), T_base_laser, np.zeros(3))
+    cell = cell_at(local_map, 2.025, -0.975)
     assert cell['hits'] == cell['seen'] == 40
-    mean = (points.mean(axis=0) - [2.0, -1.0]) / CELL_M - 0.5
+    mean = (points.mean(axis=0) - [2.0, -1.0]) / CELL_M
     np.testing.assert_allclose([cell['x'], cell['y']], mean, atol=1e-5)
+    normals = 0.9 * np.array([np.cos(2.0 * angles).mean(), np.sin(2.0 * angles).mean()])
+    np.testing.assert_allclose([cell['cos2'], cell['sin2']], normals, atol=1e-5)
+    faces = -np.array([np.cos(angles).mean(), np.sin(angles).mean()])  # the laser is on their left
+    np.testing.assert_allclose([cell['face_x'], cell['face_y']], faces, atol=1e-5)
+
+
+@pytest.mark.parametrize('heading', [0.0, 0.7, 2.0, -1.6, 3.1])
+def test_normals_and_faces_are_turned_with_the_robot(heading):
+    """A wall 2 m before a robot that has turned, with its laser in front: it faces the laser."""
+    pose = np.array([1.0, -2.0, heading])
+    points = on_wall(np.column_stack([np.full(21, 2.0), np.linspace(-0.5, 0.5, 21)]), 0.0)
+    local_map = LocalMap()
+    local_map.add_scan(points, np.array([0.3, 0.0, 0.0]), pose)
+    for x, y in se2.transform_points(pose, points[:, :2]):
+        cell = cell_at(local_map, x, y)
+        double = [math.cos(2.0 * heading), math.sin(2.0 * heading)]
+        np.testing.assert_allclose([cell['cos2'], cell['sin2']], double, atol=1e-5)
+        face = [-math.cos(heading), -math.sin(heading)]
+        np.testing.assert_allclose([cell['face_x'], cell['face_y']], face, atol=1e-5)
+
+
+def test_a_wall_that_is_hit_from_both_sides_has_no_face():
+    local_map = LocalMap()
+    point = np.array([[1.02, 0.02]])
+    add(local_map, point, (0.0, 0.0), 0.0)
+    assert cell_at(local_map, 1.02, 0.02)['face_x'] == pytest.approx(-1.0)
+    add(local_map, point, (2.0, 0.0), 0.0)
+    cell = cell_at(local_map, 1.02, 0.02)
+    np.testing.assert_allclose([cell['face_x'], cell['face_y']], 0.0, atol=1e-6)
+    np.testing.assert_allclose([cell['cos2'], cell['sin2']], [1.0, 0.0], atol=1e-6)
+
+
+def test_the_faces_of_a_thin_wall_are_kept_apart():
+    """A wall of 10 cm between two rooms: each face looks into the room that it was seen from."""
+    wall = np.array([[-4.0, 0.02, 4.0, 0.02], [4.0, 0.12, -4.0, 0.12]])
+    local_map = map_of(wall[:1], [np.array([x, -2.0, math.pi / 2.0]) for x in (-1.0, 0.0, 1.0)])
+    for x in (-1.0, 0.0, 1.0):
+        add_scan(local_map, wall[1:], np.array([x, 2.0, -math.pi / 2.0]))
+    cells, top, _ = cells_of(local_map)
+    for row, face in ((0, -1.0), (2, 1.0)):
+        face_y = cells[row - top]['face_y']
+        hit = cells[row - top]['hits'] > 0
+        assert np.count_nonzero(hit) > 50
+        np.testing.assert_allclose(face_y[hit], face, atol=1e-3)
 
 
 def test_hits_and_looks_through_are_counted():
+    """A beam says nothing of the cells beside its end, that it may graze."""
     local_map = LocalMap()
-    local_map.add(np.array([[0.525, 0.025]]), np.array([0.025, 0.025]))
+    add(local_map, np.array([[0.525, 0.025]]), (0.025, 0.025), 0.0)
     cells, top, left = cells_of(local_map)
     row = cells[-top]
     assert row['hits'][-left : 11 - left].tolist() == [0] * 10 + [1]
-    assert row['seen'][-left : 11 - left].tolist() == [1] * 11
-    assert cells['seen'].sum() == 11
+    assert row['seen'][-left : 11 - left].tolist() == [1] * 9 + [0, 1]
+    assert cells['seen'].sum() == 10
 
 
 def test_counts_forget_and_do_not_run_over():
     local_map = LocalMap()
     laser, point = np.array([0.025, 0.025]), np.array([[1.025, 0.025]])
     for _ in range(600):
-        local_map.add(point, laser)
+        add(local_map, point, laser, 0.0)
     cells, *_ = cells_of(local_map)
-    assert cells['seen'].max() <= 255
+    assert 127 < cells['seen'].max() <= 255
     assert (cells['hits'] <= cells['seen']).all()
     assert local_map.distances(point)[0] < 0.03
     beyond = np.array([[2.025, 0.025]])
     looks = 0
     while local_map.distances(point)[0] < 0.1:
-        local_map.add(beyond, laser)
+        add(local_map, beyond, laser, 0.0)
         looks += 1
     assert looks < 600, 'seen 600 times, forgotten sooner'
 
 
+def test_a_cell_is_a_wall_while_enough_of_its_observations_are_hits():
+    """One hit, and three beams that pass: at a quarter it is none."""
+    local_map, point = LocalMap(), np.array([[1.025, 0.025]])
+    add(local_map, point, (0.025, 0.025), 0.0)
+    for passes in range(4):
+        is_wall = passes < 3
+        assert bool(local_map.distances(point)[0] < 0.01) is is_wall
+        add(local_map, np.array([[2.025, 0.025]]), (0.025, 0.025), 0.0)
+    cell = cell_at(local_map, 1.025, 0.025)
+    assert (cell['hits'], cell['seen']) == (1, 5)
+    add(local_map, point, (0.025, 0.025), 0.0)
+    assert local_map.distances(point)[0] < 0.01, 'it is one again'
+
+
 @pytest.mark.parametrize('wall_m', [1.003, 1.013, 1.025, 1.041])
 def test_distances_from_a_wall_are_finer_than_a_cell(wall_m):
+    """To the mean of the hits of the nearest cell, which lies on the wall within half a cell."""
     along = np.arange(-2.0, 2.0, 0.01) + 0.005
     local_map = LocalMap()
-    local_map.add(np.column_stack([along, np.full(len(along), wall_m)]), np.zeros(2))
-    x, away = np.meshgrid(np.linspace(-1.0, 1.0, 41), np.linspace(0.06, 0.4, 18))
+    add(local_map, np.column_stack([along, np.full(len(along), wall_m)]))
+    x, away = np.meshgrid(np.linspace(-0.995, 1.0, 58), np.linspace(0.06, 0.4, 18))
+    beside = (x / CELL_M - np.floor(x / CELL_M) - 0.5) * CELL_M
     for side in (-1.0, 1.0):
         points = np.column_stack([x.ravel(), wall_m + side * away.ravel()])
-        np.testing.assert_allclose(local_map.distances(points), away.ravel(), atol=1e-3)
+        found = local_map.distances(points)
+        np.testing.assert_allclose(found, np.hypot(away, beside).ravel(), atol=1e-6)
 
 
 @pytest.mark.parametrize('angle', np.linspace(0.1, 1.4, 6))
@@ -162,10 +238,8 @@ def test_distances_from_a_slanted_noisy_wall(rng, angle):
     tangent = np.array([-normal[1], normal[0]])
     along = rng.uniform(-2.0, 2.0, 4000)
     local_map = LocalMap()
-    local_map.add(
-        2.0 * normal + along[:, None] * tangent + rng.normal(0.0, 0.005, (4000, 1)) * normal,
-        np.zeros(2),
-    )
+    wall = 2.0 * normal + along[:, None] * tangent
+    add(local_map, wall + rng.normal(0.0, 0.005, (4000, 1)) * normal, angle_rad=angle)
     away = rng.uniform(0.1, 0.4, 300)
     points = (2.0 - away)[:, None] * normal + rng.uniform(-1.0, 1.0, (300, 1)) * tangent
     off = local_map.distances(points) - away
@@ -177,8 +251,11 @@ def test_a_state_is_restored(rng):
     for pose in AROUND_BOX:
         add_scan(local_map, ROOM, pose - [8.0, 20.0, 0.0], rng)
         add_scan(local_map, ROOM, pose, rng)
-    again.restore(local_map.state())
-    for name, array in local_map.state().items():
+    state = local_map.state()
+    again.restore(snapshot.check(state, FIELDS, 'local map'))
+    assert set(state) == set(FIELDS)
+    for name, array in state.items():
+        assert np.any(array), name
         np.testing.assert_array_equal(again.state()[name], array)
     # Of walls that are equally near it may be another one that a cell leads to.
     for each in (local_map, again):
@@ -187,7 +264,8 @@ def test_a_state_is_restored(rng):
     # Both go on alike.
     for each in (local_map, again):
         add_scan(each, ROOM, np.array([4.0, 7.0, 0.5]))
-    np.testing.assert_array_equal(again.state()['hits'], local_map.state()['hits'])
+    for name, array in local_map.state().items():
+        np.testing.assert_array_equal(again.state()[name], array)
 
 
 def test_an_empty_state_is_restored():
@@ -214,29 +292,49 @@ def test_a_tile_that_is_there_twice_is_refused(rng):
         LocalMap().restore(state)
 
 
-def test_walls_of_an_occupancy_map_are_added():
+@pytest.mark.parametrize('normal', [(0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0)])
+def test_walls_of_an_occupancy_map_are_added(normal):
     """Each cell once, however many points lie in it, and nothing is seen through."""
-    points = np.column_stack([np.arange(0.0, 3.0, 0.01), np.full(300, 2.02)])
+    normal = np.array(normal)
+    along = np.abs(normal[::-1])
+    points = np.arange(0.0, 3.0, 0.01)[:, None] * along + 2.02 * np.abs(normal)
     local_map = LocalMap()
-    local_map.add_walls(points)
+    local_map.add_walls(points, normal)
     cells, *_ = cells_of(local_map)
-    assert cells['hits'].sum() == cells['seen'].sum() == 60
+    walls = cells[walls_of(cells)]
+    assert cells['hits'].sum() == cells['seen'].sum() == len(walls) == 60
     np.testing.assert_array_equal(told(cells), nearest(cells))
     assert (local_map.distances(points[50:-50]) < CELL_M).all()
-    local_map.add_walls(np.empty((0, 2)))
+    np.testing.assert_allclose(walls['cos2'], normal[0] ** 2 - normal[1] ** 2, atol=1e-6)
+    np.testing.assert_allclose(walls['sin2'], 0.0, atol=1e-6)
+    np.testing.assert_allclose(walls['face_x'], normal[0], atol=1e-6)
+    np.testing.assert_allclose(walls['face_y'], normal[1], atol=1e-6)
+    local_map.add_walls(np.empty((0, 2)), normal)
     assert cells_of(local_map)[0]['seen'].sum() == 60
 
 
 def test_an_empty_scan_changes_nothing(rng):
     local_map = LocalMap()
-    local_map.add(np.empty((0, 2)), np.zeros(2))
-    local_map.add_walls(np.empty((0, 2)))
+    local_map.add_scan(NOTHING, np.zeros(3), np.zeros(3))
+    local_map.add_walls(np.empty((0, 2)), np.array([0.0, 1.0]))
     assert local_map.is_empty
     add_scan(local_map, ROOM, AROUND_BOX[0], rng)
     before = {name: array.copy() for name, array in local_map.state().items()}
-    local_map.add(np.empty((0, 2)), np.array([1e3, 1e3]))
+    local_map.add_scan(NOTHING, np.zeros(3), np.array([1e3, 1e3, 0.0]))
     for name, array in local_map.state().items():
         np.testing.assert_array_equal(array, before[name])
+
+
+def test_points_that_are_added_stay_as_they_are(rng):
+    points, pose = seen_in(ROOM, AROUND_BOX[0], rng), AROUND_BOX[0]
+    copies = points.copy(), pose.copy()
+    LocalMap().add_scan(points, np.zeros(3), pose)
+    np.testing.assert_array_equal(points, copies[0])
+    np.testing.assert_array_equal(pose, copies[1])
+    faces = np.column_stack([np.arange(0.0, 1.0, 0.01), np.ones(100)])
+    copy = faces.copy()
+    LocalMap().add_walls(faces, np.array([0.0, 1.0]))
+    np.testing.assert_array_equal(faces, copy)
 
 
 def test_far_from_all_tiles_there_is_no_wall(rng):
@@ -256,7 +354,7 @@ def test_walls_at_the_rim_of_a_tile_are_known_in_the_next(corner):
     inside = np.array([[0.02, 0.02], [0.02, -0.02], [-0.02, 0.02], [-0.02, -0.02]])
     points = low + inside % edge_m
     local_map = LocalMap()
-    local_map.add(points, low + 0.5 * edge_m)
+    add(local_map, points, low + 0.5 * edge_m)
     cells, *_ = cells_of(local_map)
     np.testing.assert_array_equal(told(cells), nearest(cells))
     outwards = np.sign(points - low - 0.5 * edge_m) * [0.2, 0.2]
@@ -264,14 +362,39 @@ def test_walls_at_the_rim_of_a_tile_are_known_in_the_next(corner):
     np.testing.assert_allclose(local_map.distances(points + outwards), expected, atol=0.015)
 
 
-def test_a_scan_is_put_where_the_robot_is(rng):
+def test_a_scan_is_put_where_the_robot_is():
     T_base_laser = np.array([0.2, -0.1, 0.3])
     pose = np.array([3.0, 2.0, 1.0])
-    scan = scan_in(ROOM, pose, T_base_laser=T_base_laser)
+    points = seen_in(ROOM, pose)
     local_map, by_hand = LocalMap(), LocalMap()
-    local_map.add_scan(scan.points_base(), scan.T_base_laser, pose)
-    laser = se2.compose(pose, T_base_laser)[:2]
-    by_hand.add(se2.transform_points(pose, scan.points_base()), laser)
-    np.testing.assert_array_equal(local_map.state()['seen'], by_hand.state()['seen'])
-    on_wall = se2.transform_points(pose, scan.points_base())
-    assert local_map.distances(on_wall).max() < 1.5 * CELL_M
+    local_map.add_scan(points, T_base_laser, pose)
+    laser = se2.compose(pose, T_base_laser)
+    points_map = points.copy()
+    points_map[:, :2] = se2.transform_points(pose, points[:, :2])
+    by_hand.add_scan(points_map, laser, np.zeros(3))
+    for name in ('tiles', 'hits'):
+        np.testing.assert_array_equal(local_map.state()[name], by_hand.state()[name])
+    looked = local_map.state()['seen'].astype(int) - by_hand.state()['seen']
+    assert np.count_nonzero(looked) < 0.01 * np.count_nonzero(by_hand.state()['seen'])
+    assert local_map.distances(points_map[:, :2]).max() < 1.5 * CELL_M
+
+
+def test_kernels_are_what_they_are_in_plain_python(rng, monkeypatch):
+    """The box comes and goes."""
+    compiled, plain = LocalMap(), LocalMap()
+    scans = [
+        (seen_in(segments, pose, rng)[::7], pose)
+        for segments in (ROOM, WITHOUT_BOX, WITHOUT_BOX, WITHOUT_BOX)
+        for pose in AROUND_BOX[:3]
+    ]
+    assert len(scans[0][0]) > 10
+    for points, pose in scans:
+        compiled.add_scan(np.ascontiguousarray(points), np.zeros(3), pose)
+    for name in ('_touched', '_add', '_hit', '_appear', '_vanish'):
+        monkeypatch.setattr(module, name, getattr(module, name).py_func)
+    for points, pose in scans:
+        plain.add_scan(np.ascontiguousarray(points), np.zeros(3), pose)
+    ours, theirs = (cells_of(each)[0] for each in (compiled, plain))
+    assert (ours['seen'] > 0).any()
+    for name in ours.dtype.names:
+        np.testing.assert_allclose(ours[name], theirs[name], atol=1e-6, err_msg=name)
