@@ -1,4 +1,7 @@
-"""Run the scoreboard: python -m benchmarks.scoreboard -o DIR [--short].
+"""Run the scoreboard: python -m benchmarks.scoreboard -o DIR [--short | --board].
+
+The board (--board) is one table of what is asked of the localizer, met or missed: some logs and
+buildings, recorded drives (drive_WORLD.odometry_SEED) and the closed loop (loop_WORLD.LASER_SEED).
 
 What is finished is kept: started again with the same folder and options, only what is missing is
 run. A case that fails is named on the page, and is tried again by the next run.
