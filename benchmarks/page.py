@@ -22,6 +22,17 @@ Where small causes have large effects, as where a loop is found a scan later, on
 `--runs 8` runs each case eight times, all but the first with odometry disturbed by less than wheels
 err by, and tells mean and worst.
 
+`--board` makes one table in `DIR/board.md` (each case: `DIR/cases.md`): what is asked of the
+localizer, what was measured, met or missed. Beside logs and buildings it has recorded drives and
+the closed loop, also with lasers of 3.5 m and 12 m. A *recorded drive* is the first 20 minutes of
+an exploration by the true pose; its scans are replayed with the wheel odometry that a simulation
+with another seed would have. It is recorded once, into `DIR/drives` or the folder of
+`--recordings`, which several runs may share; delete it when the simulator or the explorer changes.
+On the largest floor, `kth/50037764_PLAN1`, the closed loop is cut short after 20 simulated minutes.
+`--board --only 'drive_kth*'` runs a part; `--set`, `--against` and `--processes` work as elsewhere.
+The graph is updated with each tenth scan of a drive, a building or a dense log, so that errors
+differ a little from those of the complete scoreboard.
+
 Machine: {machine}.
 """
 # In this order, what each is about.

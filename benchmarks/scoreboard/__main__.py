@@ -1,25 +1,29 @@
-"""Run the scoreboard: python -m benchmarks.scoreboard -o DIR [--short].
+"""Run the scoreboard: python -m benchmarks.scoreboard -o DIR [--short | --board].
+
+The board (--board) is one table of what is asked of the localizer, met or missed: some logs and
+buildings, recorded drives (drive_WORLD.odometry_SEED) and the closed loop (loop_WORLD.LASER_SEED).
 
 What is finished is kept: started again with the same folder and options, only what is missing is
 run. A case that fails is named on the page, and is tried again by the next run.
 """
 
 import argparse
-import json
 from fnmatch import fnmatch
 from pathlib import Path
 
 from benchmarks.scoreboard.against import against
+from benchmarks.scoreboard.board_run import run_board
 from benchmarks.scoreboard.cases import BY_HAND, Case, all_cases, compared_with, repeated
-from benchmarks.scoreboard.measure import Numbers, Task, config_of, measure
+from benchmarks.scoreboard.measure import Task, config_of, measure
 from benchmarks.scoreboard.page import page, shortened, worst_tenth
+from benchmarks.scoreboard.played import Numbers
+from benchmarks.scoreboard.reports import report_file, report_of, reports_there
 from thinmap_ros.adapters.files import read_text, write_text
 from thinmap_ros.core.errors import ConfigError, InputError
-from thinmap_ros.pipeline import CORES
+from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.runs import Failure, add_run_options, complaint, read_report, run_missing
 
-_CORE = 'scan'
 _SHARED = Path(__file__).resolve().parents[3] / 'shared'
 _SHORT = Path(__file__).parent / 'short.txt'
 
@@ -39,6 +43,19 @@ def _parser() -> argparse.ArgumentParser:
         help='only the cases of short.txt, the worst tenth of a complete run: some 2 minutes on 2 '
         'cores. Where it is missing or names none: some that were chosen by hand',
     )
+    parser.add_argument(
+        '--board',
+        action='store_true',
+        help='what is asked of the localizer, a row each: some logs and buildings, recorded '
+        'drives, the closed loop, other lasers. Pages: DIR/board.md, DIR/cases.md',
+    )
+    parser.add_argument(
+        '--recordings',
+        type=Path,
+        metavar='DIR',
+        help='folder of the recorded drives of the board, which several runs may share '
+        '(default: drives in the folder for all results)',
+    )
     parser.add_argument('--only', default='*', help='cases whose names match, such as "intel*"')
     parser.add_argument(
         '--set', action='append', default=[], metavar='NAME=VALUE', help='option of the localizer'
@@ -50,12 +67,6 @@ def _parser() -> argparse.ArgumentParser:
         '--write-short',
         action='store_true',
         help='write short.txt anew from the complete run in DIR (what is missing is run first)',
-    )
-    parser.add_argument(
-        '--core',
-        choices=tuple(CORES),
-        default=_CORE,
-        help=f'the localizer (default {_CORE})',
     )
     parser.add_argument('--quiet', action='store_true', help='no bar of progress')
     parser.add_argument(
@@ -73,19 +84,24 @@ def _parser() -> argparse.ArgumentParser:
 def _run(arguments: argparse.Namespace) -> None:
     if arguments.runs < 1:
         raise ConfigError(f'--runs {arguments.runs}: expected 1 or more')
+    if arguments.board:
+        if arguments.short or arguments.runs > 1 or arguments.write_short:
+            raise ConfigError('--board: expected no --short, --runs or --write-short')
+        run_board(arguments, _options(arguments.set))
+        return
     partial = arguments.short or arguments.only != '*' or arguments.runs > 1
     if arguments.write_short and partial:
         raise ConfigError('--write-short: expected a complete run: no --short, --only or --runs')
-    options = _options(arguments.set, arguments.core)
+    options = _options(arguments.set)
     cases = repeated(_chosen(arguments), arguments.runs)
     for case in cases:
-        if _file(arguments.out, case.name).exists():
-            read_report(_file(arguments.out, case.name), options)  # before hours of work
+        if report_file(arguments.out, case.name).exists():
+            read_report(report_file(arguments.out, case.name), options)  # before hours of work
     failures = _run_cases(cases, options, arguments)
-    reports = [_report(arguments.out, case.name, options, failures) for case in cases]
+    reports = [report_of(arguments.out, case.name, options, failures) for case in cases]
     text = page(cases, reports)
     if arguments.against:
-        text += '\n' + against(cases, reports, _reports_there(arguments.against, cases))
+        text += '\n' + against(cases, reports, reports_there(arguments.against, cases))
     write_text(arguments.out / 'scoreboard.md', text)
     print(f'worst tenth, live: {worst_tenth(cases, reports):.3f} m; {arguments.out}/scoreboard.md')
     if failures:
@@ -101,7 +117,11 @@ def _run_cases(
     degrade = arguments.shared / 'tools' / 'degrade_log.py'
     tasks = [Task(case, logs, degrade, arguments.out / 'logs', options) for case in cases]
     return run_missing(
-        measure, tasks, lambda task: _file(arguments.out, task.name), arguments, arguments.quiet
+        measure,
+        tasks,
+        lambda task: report_file(arguments.out, task.name),
+        arguments,
+        arguments.quiet,
     )
 
 
@@ -123,10 +143,10 @@ def _short_names() -> list[str]:
     return names or list(BY_HAND)
 
 
-def _options(words: list[str], core: str = _CORE) -> Numbers:
+def _options(words: list[str]) -> Numbers:
     """Options of the localizer, each of the type of its default."""
-    defaults = vars(CORES[core]())
-    options: Numbers = {'core': core}
+    defaults = vars(ScanLocalizerConfig())
+    options: Numbers = {}
     for word in words:
         name, _, value = word.partition('=')
         if name not in defaults:
@@ -139,24 +159,6 @@ def _options(words: list[str], core: str = _CORE) -> Numbers:
             raise ConfigError(f'--set {word}: expected a value like {like}') from None
     config_of(options)
     return options
-
-
-def _file(out: Path, name: str) -> Path:
-    return out / 'results' / f'{name}.json'
-
-
-def _report(out: Path, name: str, options: Numbers, failures: dict[str, Failure]) -> Numbers:
-    if name in failures:
-        return {'name': name, 'error': failures[name].reason}
-    return read_report(_file(out, name), options)
-
-
-def _reports_there(out: Path, cases: list[Case]) -> list[Numbers | None]:
-    """Reports of another folder, whatever its options; None for a case that is not there."""
-    files = [_file(out, case.name) for case in cases]
-    if not any(file.exists() for file in files):
-        raise InputError(f'--against {out}: none of these cases has a result there')
-    return [json.loads(read_text(file)) if file.exists() else None for file in files]
 
 
 if __name__ == '__main__':

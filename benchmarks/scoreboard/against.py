@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from benchmarks.scoreboard.cases import Case
-from benchmarks.scoreboard.measure import Numbers
 from benchmarks.scoreboard.page import MOST_M, errors, worst_tenth
+from benchmarks.scoreboard.played import Numbers
 
 _SAME = 0.05  # a change of an error by a smaller share, or by less than 5 mm, is not listed
 _SAME_M = 0.005

@@ -1,4 +1,4 @@
-"""What is on the scoreboard: logs, degraded logs, and drives in buildings."""
+"""What can be on the scoreboard: logs, degraded logs, drives, and explorations."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -96,7 +96,51 @@ class BuildingCase:
         return _numbered(self.first, self.run)
 
 
-Case = LogCase | BuildingCase
+@dataclass(frozen=True)
+class DriveCase:
+    """A recorded exploration of a world, replayed with the odometry noise of a seed."""
+
+    world: str
+    odometry_seed: int
+    run: int = 0
+
+    @property
+    def first(self) -> str:
+        """Name of the run that is not disturbed."""
+        return self.name
+
+    @property
+    def name(self) -> str:
+        """What it is called on the page, and its file."""
+        return f'drive_{flat(self.world)}.odometry_{self.odometry_seed}'
+
+
+@dataclass(frozen=True)
+class LoopCase:
+    """An exploration of a world by the estimated pose; laser: a name of LASERS."""
+
+    world: str
+    seed: int
+    laser: str = 'lms200'
+    run: int = 0
+
+    @property
+    def first(self) -> str:
+        """Name of the run that is not disturbed."""
+        return self.name
+
+    @property
+    def name(self) -> str:
+        """What it is called on the page, and its file."""
+        return f'loop_{flat(self.world)}.{self.laser}_{self.seed}'
+
+
+Case = LogCase | BuildingCase | DriveCase | LoopCase
+
+
+def flat(world: str) -> str:
+    """Name of a world as part of a file's name."""
+    return world.replace('/', '_')
 
 
 def all_cases(logs: Path) -> list[Case]:

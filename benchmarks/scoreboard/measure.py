@@ -1,22 +1,24 @@
 """One case of the scoreboard: the numbers that stand for it."""
 
-import math
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from itertools import pairwise
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from benchmarks.alignment import aligned_rms
-from benchmarks.memory import forget_peak, peak_mb, resident_mb
+from benchmarks.memory import forget_peak, peak_mb
 from benchmarks.scoreboard.cases import EXACT_S, BuildingCase, Case, LogCase
 from benchmarks.scoreboard.drives import looks
-from benchmarks.timing import CpuTimedPipeline
+from benchmarks.scoreboard.played import (
+    Numbers,
+    Played,
+    PlayedPipeline,
+    rehearse,
+    simulated_numbers,
+)
 from thinmap_ros.adapters.carmen import CarmenLog
 from thinmap_ros.adapters.events import OdometryEvent
 from thinmap_ros.core import se2
@@ -24,57 +26,13 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.odometry import ScanPairing
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
-from thinmap_ros.pipeline import CORES, PipelineConfig, Step
+from thinmap_ros.pipeline import PipelineConfig
 from thinmap_ros.tools.experiments.logs import laser_of
 from thinmap_ros.tools.experiments.relations import read_columns, relation_errors
 
-Numbers = dict[str, Any]
-_STANDS_M = 0.01
-_STANDS_RAD = math.radians(0.5)
 _KNOWN_AGAIN_M = 30.0  # of way after a slip or a gap, from which on relations over it are judged
-_CHI2_95 = 5.991  # of two degrees of freedom
-_WRONG_M = 0.5
 DISTURBED = (5e-4, 5e-4, 5e-4)  # of odometry between scans, m, m, rad, in runs but the first
-
-
-@dataclass(eq=False)
-class Played:
-    """What a pipeline made of a drive: (N,) and (N, 3) by scan."""
-
-    stamps_ns: list[int] = field(default_factory=list)
-    poses: list[Array] = field(default_factory=list)
-    covariances: list[Array] = field(default_factory=list)
-    lost: list[bool] = field(default_factory=list)
-    localizer_ms: list[float] = field(default_factory=list)
-    stall_ms: list[float] = field(default_factory=list)
-    final: Array = field(default_factory=lambda: np.zeros((0, 3)))
-    before_mb: float = 0.0
-    peak_mb: float = 0.0
-
-    def numbers(self) -> Numbers:
-        """What every case is judged by; times of the processor."""
-        taken = np.array(self.localizer_ms)
-        return {
-            'scans': len(self.poses),
-            'unmapped': self._unmapped(),
-            'ms_median': float(np.median(taken)),
-            'ms_mean': float(taken.mean()),
-            'ms_99': float(np.percentile(taken, 99.0)),
-            'stall_ms': max(self.stall_ms),
-            'mb': self.peak_mb,
-            'mb_more': self.peak_mb - self.before_mb,
-        }
-
-    def _unmapped(self) -> float:
-        """Share of scans, standing ones aside, whose pose is in no map that is being extended."""
-        moves = [True]
-        for before, after in pairwise(self.poses):
-            x, y, turn = se2.between(before, after)
-            moves.append(math.hypot(x, y) > _STANDS_M or abs(turn) > _STANDS_RAD)
-        moving = np.array(moves)
-        return float(np.array(self.lost)[moving].mean())
 
 
 @dataclass(frozen=True)
@@ -102,18 +60,20 @@ def measure(task: Task) -> Numbers:
     began = time.process_time()
     case = task.case
     if isinstance(case, LogCase):
-        numbers = _measure_log(case, task)
+        numbers = measure_log(case, task)
     else:
-        numbers = _measure_building(case, task.options)
+        numbers = measure_building(case, task.options)
     taken = {'cpu_s': time.process_time() - began}
     return {'name': task.name, 'options': task.options, **taken, **numbers}
 
 
-def _measure_log(case: LogCase, task: Task) -> Numbers:
+def measure_log(case: LogCase, task: Task, scans_per_graph: int = 1) -> Numbers:
+    """Numbers of a log, degraded if the case says so; scans_per_graph: as of the pipeline."""
     own = task.logs / case.log
     if case.version:
         own = _degraded(case, own, task.degrade, task.folder)
-    played = _play(_disturbed(_scans(own, case.log), case.run), config_of(task.options))
+    scans = _disturbed(_scans(own, case.log), case.run)
+    played = play(scans, config_of(task.options), scans_per_graph)
     numbers = played.numbers()
     times = np.array(played.stamps_ns) / 1e9
     live = np.array(played.poses)
@@ -214,88 +174,38 @@ def _disturbed(pairs: Iterator[tuple[Scan, Array]], run: int) -> Iterator[tuple[
         yield scan, T_odom_base
 
 
-def _measure_building(case: BuildingCase, options: Numbers) -> Numbers:
+def measure_building(case: BuildingCase, options: Numbers, scans_per_graph: int = 1) -> Numbers:
+    """Numbers of a drive through a generated building; scans_per_graph: as of the pipeline."""
     drive = list(looks(case.seed, case.robot, case.noise))
     truth = np.array([look.T_world_base for look in drive])
-    x, y, yaw = truth[0].tolist()
-    start = {'start_x_m': x, 'start_y_m': y, 'start_yaw_rad': yaw}
-    config = config_of(options | start)
+    config = config_of(options, truth[0])
     pairs = ((look.scan, look.T_odom_base) for look in drive)
-    played = _play(_disturbed(pairs, case.run), config)
-    numbers = played.numbers()
-    for name, path in (('live', np.array(played.poses)), ('final', played.final)):
-        off = np.hypot(*(path - truth)[:, :2].T)
-        numbers[f'{name}_m'] = float(np.sqrt((off**2).mean()))
-        numbers[f'{name}_most_m'] = float(off.max())
-        numbers[f'{name}_aligned_m'] = aligned_rms(path, truth)
-    return numbers | _consistency(played, truth)
+    return simulated_numbers(play(_disturbed(pairs, case.run), config, scans_per_graph), truth)
 
 
-def _consistency(played: Played, truth: Array) -> Numbers:
-    """How well the covariance of the position tells the errors of the live poses.
-
-    Normalized estimation error squared of two dimensions, chi-square distributed where it does;
-    sigma: root of the mean trace, what the rms error would be; of scans that are not lost, as one
-    that is has a sigma of hundreds of metres, which a few scans more or less would decide.
-    """
-    errors = (np.array(played.poses) - truth)[:, :2]
-    covariances = np.array(played.covariances)[:, :2, :2] + 1e-12 * np.eye(2)
-    whitened = np.linalg.solve(covariances, errors[:, :, None])[:, :, 0]
-    squared = np.einsum('ni,ni->n', errors, whitened)
-    widest = np.sqrt(np.linalg.eigvalsh(covariances)[:, -1])
-    metres = np.hypot(*errors.T)
-    known = ~np.array(played.lost)
-    if not known.any():
-        known[:] = True
-    rms = math.sqrt(float((metres[known] ** 2).mean()))
-    sigma = math.sqrt(float(np.trace(covariances[known], axis1=1, axis2=2).mean()))
-    return {
-        'inside_95': float((squared < _CHI2_95).mean()),
-        'sigma_of_rms': sigma / max(rms, 1e-3),
-        'wrong_and_sure': int(((metres > _WRONG_M) & (3.0 * widest < metres)).sum()),
-    }
+def config_of(options: Numbers, start: Array | None = None) -> ScanLocalizerConfig:
+    """Configuration of the localizer by its options, with a start pose (3,) where one is given."""
+    if start is None:
+        return ScanLocalizerConfig(**options)
+    x, y, yaw = start.tolist()
+    return ScanLocalizerConfig(**options | {'start_x_m': x, 'start_y_m': y, 'start_yaw_rad': yaw})
 
 
-def config_of(options: Numbers) -> LocalizerConfig | ScanLocalizerConfig:
-    """Configuration of the localizer that the option `core` names."""
-    own = dict(options)
-    return CORES[own.pop('core', 'scan')](**own)
-
-
-def _play(
-    scans: Iterator[tuple[Scan, Array]], config: LocalizerConfig | ScanLocalizerConfig
+def play(
+    scans: Iterator[tuple[Scan, Array]], config: ScanLocalizerConfig, scans_per_graph: int = 1
 ) -> Played:
-    """All scans through localizer, grid and topology."""
-    _rehearse(config)
-    pipeline = CpuTimedPipeline(PipelineConfig(localizer=config))
+    """All scans with their odometry poses (3,) through localizer, grid and topology.
+
+    Raises InputError where there is no scan.
+    """
+    rehearse()
+    pipeline = PlayedPipeline(PipelineConfig(localizer=config, scans_per_graph=scans_per_graph))
     forget_peak()
-    played = Played(before_mb=resident_mb())
     for scan, T_odom_base in scans:
-        rebuilds = len(pipeline.stage_seconds.get('rebuild', []))
-        _keep(played, scan, pipeline.step(scan, T_odom_base))
-        stages = pipeline.stage_seconds
-        rebuild_s = sum(stages.get('rebuild', [])[rebuilds:])
-        played.localizer_ms.append(1e3 * stages['localizer'][-1])
-        played.stall_ms.append(1e3 * (stages['localizer'][-1] + stages['grid'][-1] + rebuild_s))
+        pipeline.step(scan, T_odom_base)
+    played = pipeline.played
     if not played.poses:
         raise InputError('no scan with odometry around its stamp')
     played.final = pipeline.localizer.corrected_path()
     played.peak_mb = peak_mb()
     return played
-
-
-def _keep(played: Played, scan: Scan, step: Step) -> None:
-    played.stamps_ns.append(scan.stamp_ns)
-    played.poses.append(step.estimate.T_map_base)
-    played.covariances.append(step.estimate.covariance)
-    played.lost.append(step.estimate.lost)
-
-
-def _rehearse(config: LocalizerConfig | ScanLocalizerConfig) -> None:
-    """Load the compiled kernels before anything is timed."""
-    from thinmap_ros import warm_up
-
-    is_scan = isinstance(config, ScanLocalizerConfig)
-    (warm_up.localizer if is_scan else warm_up.ekf_localizer)()
-    warm_up.grid_mapper()
-    warm_up.topology_builder()

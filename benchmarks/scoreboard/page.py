@@ -5,8 +5,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from benchmarks.scoreboard.cases import BuildingCase, Case, LogCase
-from benchmarks.scoreboard.measure import DISTURBED, Numbers
+from benchmarks.scoreboard.cases import BuildingCase, Case, DriveCase, LogCase, LoopCase
+from benchmarks.scoreboard.measure import DISTURBED
+from benchmarks.scoreboard.played import Numbers
 from thinmap_ros.core import se2
 
 MOST_M = 10.0  # an error beyond says no more
@@ -35,6 +36,12 @@ grid, with loop closing and all that is made anew after it, CPU time. *peak MB*:
 memory of the process, libraries and, for buildings, the simulated drive included. *MB more*: that
 without what the process held before the first scan.
 """
+_KINDS = (
+    ('Logs', LogCase),
+    ('Buildings', BuildingCase),
+    ('Recorded drives', DriveCase),
+    ('Closed loop', LoopCase),
+)
 _COLUMNS = (
     ('live', 'live_m', '.3f'),
     ('final', 'final_m', '.3f'),
@@ -49,6 +56,8 @@ _COLUMNS = (
     ('in 95 %', 'inside_95', '.0%'),
     ('sigma / rms', 'sigma_of_rms', '.1f'),
     ('wrong and sure', 'wrong_and_sure', 'd'),
+    ('coverage', 'coverage', '.1%'),
+    ('collisions', 'collisions', 'd'),
     ('ms median', 'ms_median', '.2f'),
     ('mean', 'ms_mean', '.2f'),
     ('99 %', 'ms_99', '.1f'),
@@ -71,12 +80,20 @@ def page(cases: Sequence[Case], reports: Sequence[Numbers]) -> str:
         _PEERS,
         *([f'**Failed**: {", ".join(failed)}.\n'] if failed else []),
     ]
-    for title, kind in (('Logs', LogCase), ('Buildings', BuildingCase)):
+    parts.append(case_tables(cases, reports))
+    if any(case.run for case in cases):
+        parts.append(_repeated(cases, reports, live))
+    return '\n'.join(parts)
+
+
+def case_tables(cases: Sequence[Case], reports: Sequence[Numbers]) -> str:
+    """Markdown: a table of the cases of each kind."""
+    live = errors(cases, reports)
+    parts = []
+    for title, kind in _KINDS:
         rows = [k for k, case in enumerate(cases) if isinstance(case, kind)]
         if rows:
             parts.append(f'## {title}\n\n' + _table(rows, cases, reports, live))
-    if any(case.run for case in cases):
-        parts.append(_repeated(cases, reports, live))
     return '\n'.join(parts)
 
 

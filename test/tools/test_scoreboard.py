@@ -24,8 +24,9 @@ from benchmarks.scoreboard.cases import (
     compared_with,
     repeated,
 )
-from benchmarks.scoreboard.measure import Played, Task, _consistency, _disturbed, measure
+from benchmarks.scoreboard.measure import Task, _disturbed, measure
 from benchmarks.scoreboard.page import MOST_M, errors, page, shortened, worst_tenth
+from benchmarks.scoreboard.played import Played, consistency
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import ConfigError
 from thinmap_ros.sim.buildings import DEVELOPMENT_SEEDS, BuildingConfig, building
@@ -127,8 +128,7 @@ def test_another_run_beside_it(reports):
 def test_options_of_the_localizer_have_the_types_of_their_defaults():
     words = ['slam=off', 'start_x_m=2', 'mapping=false']
     options = {'slam': 'off', 'start_x_m': 2.0, 'mapping': False}
-    assert program._options(words) == {'core': 'scan', **options}
-    assert program._options(['square_walls=false'], 'ekf') == {'core': 'ekf', 'square_walls': False}
+    assert program._options(words) == options
     for word in ('slan=off', 'start_x_m=far', 'mapping=no', 'slam=full_of_hope', 'square_walls=no'):
         with pytest.raises(ConfigError):
             program._options([word])
@@ -197,15 +197,15 @@ def test_a_covariance_that_is_right_is_found_to_be():
     covariance = np.diag([0.04, 0.01, 1.0])
     poses = rng.normal(size=(4000, 3)) * (0.2, 0.1, 0.0)
     right = Played(poses=list(poses), covariances=[covariance] * 4000, lost=[False] * 4000)
-    found = _consistency(right, truth)
+    found = consistency(right, truth)
     assert found['inside_95'] == pytest.approx(0.95, abs=0.015)
     assert found['sigma_of_rms'] == pytest.approx(1.0, abs=0.03)
     assert found['wrong_and_sure'] <= 60
     right.covariances[:5] = [9e4 * np.eye(3)] * 5
     right.lost[:5] = [True] * 5
-    assert _consistency(right, truth)['sigma_of_rms'] == pytest.approx(1.0, abs=0.03)
+    assert consistency(right, truth)['sigma_of_rms'] == pytest.approx(1.0, abs=0.03)
     sure = Played(poses=list(10.0 * poses), covariances=[covariance] * 4000, lost=[False] * 4000)
-    found = _consistency(sure, truth)
+    found = consistency(sure, truth)
     assert found['sigma_of_rms'] == pytest.approx(0.1, abs=0.003)
     metres = 10.0 * np.hypot(*poses[:, :2].T)
     assert found['wrong_and_sure'] == np.count_nonzero(metres > 0.6)

@@ -60,6 +60,34 @@ PRESETS = {
 }
 
 
+class WheelOdometry:
+    """Odometry T_odom_base (3,) from zero that drifts by its seed, over exact steps of a robot."""
+
+    def __init__(self, config: PioneerConfig, seed: int) -> None:
+        self.config = config
+        self.T_odom_base = np.zeros(3)
+        self._rng = np.random.default_rng(seed)
+        self._scale = 1.0 + self._rng.normal(0.0, config.scale_sigma)
+        self._turn_scale = 1.0 + self._rng.normal(0.0, config.turn_scale_sigma)
+        self._drift_rad_m = self._rng.normal(0.0, config.drift_sigma_rad_m)
+
+    def add_step(self, distance_m: float, turn_rad: float) -> Array:
+        """Return the odometry pose (3,) after a step of an exact distance and turn."""
+        distance, turn = self._measured(distance_m, turn_rad)
+        self.T_odom_base = after_arc(self.T_odom_base, distance, turn)
+        return self.T_odom_base
+
+    def _measured(self, distance: float, turn: float) -> tuple[float, float]:
+        """Return distance (m) and turn (rad) as the wheels count them."""
+        metres, radians = abs(distance), abs(turn)
+        noise = self._rng.normal(size=2).tolist()
+        root = math.sqrt(metres)
+        seen_distance = distance * self._scale + noise[0] * self.config.distance_noise * root
+        sigma = self.config.turn_noise * math.sqrt(radians) + self.config.turn_noise_driving * root
+        seen_turn = turn * self._turn_scale + self._drift_rad_m * metres + noise[1] * sigma
+        return seen_distance, seen_turn
+
+
 @dataclass(eq=False)
 class Pioneer:
     """A robot at T_world_base (3,), odometry T_odom_base (3,) from zero that drifts by its seed."""
@@ -75,10 +103,7 @@ class Pioneer:
     touching: bool = False
 
     def __post_init__(self) -> None:
-        self._rng = np.random.default_rng(self.seed)
-        self._scale = 1.0 + self._rng.normal(0.0, self.config.scale_sigma)
-        self._turn_scale = 1.0 + self._rng.normal(0.0, self.config.turn_scale_sigma)
-        self._drift_rad_m = self._rng.normal(0.0, self.config.drift_sigma_rad_m)
+        self._odometry = WheelOdometry(self.config, self.seed)
 
     def step(self, v: float, w: float, dt_s: float) -> None:
         """Drive for dt_s towards a commanded speed v (m/s) and turn rate w (rad/s), within limits.
@@ -105,19 +130,7 @@ class Pioneer:
             self.touching
             and not self.world.is_clear(moved[0], moved[1], self.config.radius_m + _AWAY_M)
         )
-        self.T_odom_base = after_arc(
-            self.T_odom_base, *self._measured(self.v * dt_s, self.w * dt_s)
-        )
-
-    def _measured(self, distance: float, turn: float) -> tuple[float, float]:
-        """Return the way and the turn as the wheels count them."""
-        metres, radians = abs(distance), abs(turn)
-        noise = self._rng.normal(size=2).tolist()
-        root = math.sqrt(metres)
-        seen_distance = distance * self._scale + noise[0] * self.config.distance_noise * root
-        sigma = self.config.turn_noise * math.sqrt(radians) + self.config.turn_noise_driving * root
-        seen_turn = turn * self._turn_scale + self._drift_rad_m * metres + noise[1] * sigma
-        return seen_distance, seen_turn
+        self.T_odom_base = self._odometry.add_step(self.v * dt_s, self.w * dt_s)
 
 
 def after_arc(T: Array, distance: float, turn: float) -> Array:

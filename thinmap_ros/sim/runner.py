@@ -40,9 +40,8 @@ class Simulation:
     ) -> None:
         _check_fits(world, start, robot)
         self.world = world
-        seeds = np.random.SeedSequence(seed).generate_state(2)
-        self.robot = Pioneer(robot, world, start, int(seeds[0]))
-        self.laser = Lms200(laser, int(seeds[1]))
+        self.robot = Pioneer(robot, world, start, odometry_seed(seed))
+        self.laser = Lms200(laser, _seeds(seed)[1])
         self._scan_period_ns = round(1e9 / laser.rate_hz)
         self._next_scan_ns = 0
         self.stamp_ns = 0
@@ -70,6 +69,16 @@ class Simulation:
         self.robot.step(v, w, STEP_NS / 1e9)
         self.stamp_ns += STEP_NS
         return self.sense()
+
+
+def odometry_seed(seed: int) -> int:
+    """Seed of the wheel odometry in a simulation with a seed."""
+    return _seeds(seed)[0]
+
+
+def _seeds(seed: int) -> list[int]:
+    """Independent seeds of the wheel odometry and of the laser."""
+    return [int(word) for word in np.random.SeedSequence(seed).generate_state(2)]
 
 
 def _check_fits(world: World, T_world_base: Array, robot: PioneerConfig) -> None:

@@ -1,0 +1,38 @@
+"""Reports of finished cases in a folder."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from benchmarks.scoreboard.cases import Case
+from benchmarks.scoreboard.played import Numbers
+from thinmap_ros.adapters.files import read_text
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.tools.runs import Failure, read_report
+
+RESULTS = 'results'
+
+
+def report_file(out: Path, name: str, folder: str = RESULTS) -> Path:
+    """File of the report of a case."""
+    return out / folder / f'{name}.json'
+
+
+def report_of(
+    out: Path, name: str, options: Numbers, failures: dict[str, Failure], folder: str = RESULTS
+) -> Numbers:
+    """Report of a case, or why it failed."""
+    if name in failures:
+        return {'name': name, 'error': failures[name].reason}
+    return read_report(report_file(out, name, folder), options)
+
+
+def reports_there(out: Path, cases: Sequence[Case], folder: str = RESULTS) -> list[Numbers | None]:
+    """Reports of another folder, whatever its options; None for a case that is not there.
+
+    Raises InputError where none is.
+    """
+    files = [report_file(out, case.name, folder) for case in cases]
+    if not any(file.exists() for file in files):
+        raise InputError(f'--against {out}: none of these cases has a result there')
+    return [json.loads(read_text(file)) if file.exists() else None for file in files]
