@@ -83,7 +83,7 @@ class ScanLocalizer:
         self._uncertainty = PoseUncertainty(self._pose)
         self._tracking = Tracking(config.lost_evidence, config.match_least_fit, self._pose)
         self._map = ActiveMap(config)
-        self._heading = HeadingCorrection(LineMap(config, config, config.slam == 'ti'))
+        self._heading = HeadingCorrection(config)
         self._loops = LoopClosure(config, self._matcher)
         self._path = AnchoredPoses()
 
@@ -278,8 +278,7 @@ class ScanLocalizer:
         self._tracking.travel(path_m)
         if self._tracking.needs_new_map:
             self._begin_submap()
-        if config.slam != 'off':
-            self._correct_heading(scan)
+        self._correct_heading(scan)
         self._map.add_scan(points, scan.T_base_laser, self._pose)
         # What the motion leaves is new with every step; what the scan leaves is much the same error
         # as in the step before, as long as the same walls are seen.
