@@ -188,6 +188,25 @@ class TileStore:
                 row_a - row : row_b - row, col_a - col : col_b - col
             ]
 
+    def read_tiles(self, tiles: NDArray[np.int64]) -> NDArray[Any]:
+        """Copy of the tiles (N, 2), (row, col) in tile coordinates; 0 where no tile is."""
+        cells = np.zeros((len(tiles), *self.pool.shape[1:]), dtype=self.pool.dtype)
+        at = tiles - (self.first_row, self.first_col)
+        inside = np.flatnonzero(np.all((at >= 0) & (at < self.directory.shape), axis=1))
+        slots = self.directory[at[inside, 0], at[inside, 1]]
+        exist = slots != NO_TILE
+        cells[inside[exist]] = self.pool[slots[exist]]
+        return cells
+
+    def write_tiles(self, tiles: NDArray[np.int64], cells: NDArray[Any]) -> None:
+        """Set the tiles (N, 2), (row, col) in tile coordinates, to cells (N, TILE, TILE, ...)."""
+        low_row, low_col = tiles.min(axis=0).tolist()
+        high_row, high_col = tiles.max(axis=0).tolist()
+        self.reach(low_row, low_col, high_row, high_col)
+        self.ensure(tiles)
+        at = tiles - (self.first_row, self.first_col)
+        self.pool[self.directory[at[:, 0], at[:, 1]]] = cells
+
     def _tiles_within(self, row: int, col: int, rows: int, cols: int) -> list[tuple[int, int, int]]:
         """Existing tiles that touch a rectangle of cells: tile row, tile col, slot."""
         low = (row // TILE - self.first_row, col // TILE - self.first_col)
