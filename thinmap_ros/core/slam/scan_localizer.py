@@ -56,7 +56,9 @@ class ScanLocalizerConfig(EkfConfig, MotionConfig, MatcherConfig, LoopConfig):
     map_turn_rad: float = parameter(0.2, 'or after such a turn, rad', low=0.0, high=3.0)
     lost_evidence: float = parameter(
         4.0,
-        'lost when this many scans more contradict the map than fit it, each by its share',
+        'evidence against the map at which a new one begins: a sum over scans of the share of '
+        'points that contradict the map, less a third of those that fit. Raise it where crowds '
+        'make the robot lost, lower it to notice sooner that it was moved',
         low=0.1,
         high=1000.0,
     )
