@@ -51,7 +51,7 @@ class CorrectableGrid:
         return True
 
     def update(self, scan: Scan | None, T_map_base: Array) -> MovedPoses | None:
-        """Go on with the re-rendering, then add a scan made at a robot pose (3,).
+        """Continue the re-rendering, then add a scan made at a robot pose (3,).
 
         scan: None where nobody knows where it was made. Returns the moved poses when a
         re-rendering is completed, without that of this scan. Raises InputError as
