@@ -66,11 +66,11 @@ def _normal_matrix(cos2: float, sin2: float) -> tuple[float, float, float]:
 def evaluate(
     scan: Array, pose: Array, lattice: Lattice, sigma: float, width: float
 ) -> tuple[Array, Array, Array]:
-    """Normal equations H (3, 3), g (3,) of a scan at a pose (3,), and sums (4,).
+    """Normal equations H (3, 3), g (3,) of a scan at a pose (3,), and sums (5,).
 
     scan (N, 5): x, y, weight, and the direction back to the laser; sigma: of a point on its wall,
     m; width: of the loss, in sigmas. Sums: cost, and weights of all points, of those on their
-    walls, and of those in the open.
+    walls, of those in the open, and the cost that young walls leave out.
     """
     H, g, sums = np.zeros((3, 3)), np.zeros(3), np.zeros(5)
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
