@@ -185,8 +185,8 @@ def _mean_and_worst(key: str, asked: float) -> tuple[str, Judge]:
 
 def _coverage(asked: float) -> tuple[str, Judge]:
     def judge(found: Found) -> tuple[str, bool]:
-        # An exploration that is cut short has no coverage to speak of.
-        whole = [report for report in found if not report['is_cut_short']]
+        # An exploration that is cut short has none.
+        whole = [report for report in found if 'coverage' in report]
         if not whole:
             return 'none that is not cut short', True
         least = min(whole, key=lambda report: float(report['coverage']))

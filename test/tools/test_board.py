@@ -151,9 +151,9 @@ def test_a_row_says_what_failed_and_what_was_not_run():
 
 def test_loops_logs_and_buildings_are_judged():
     loops = [
-        report('loop_a.lms200_1', live_m=0.1, coverage=0.99, collisions=0, is_cut_short=False),
-        report('loop_a.lms200_3', live_m=0.2, coverage=0.97, collisions=2, is_cut_short=False),
-        report('loop_b.lms200_1', live_m=0.1, coverage=0.4, collisions=0, is_cut_short=True),
+        report('loop_a.lms200_1', live_m=0.1, coverage=0.99, collisions=0),
+        report('loop_a.lms200_3', live_m=0.2, coverage=0.97, collisions=2),
+        report('loop_b.lms200_1', live_m=0.1, collisions=0),
         report('loop_a.turtlebot3_1', live_m=0.3, coverage=0.5, collisions=7),
     ]
     found = verdicts(loops)
