@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 from time import perf_counter
 
 from thinmap_ros.core.estimate import Estimate
-from thinmap_ros.core.grid.history import GridHistory
+from thinmap_ros.core.grid.correctable import CorrectableGrid
+from thinmap_ros.core.grid.history import MovedPoses
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, WindowConfig
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
@@ -54,56 +55,54 @@ class Pipeline:
     ) -> None:
         self.config = config or PipelineConfig()
         self.localizer = localizer_class(self.config.localizer)(self.config.localizer)
-        self.grid = OccupancyGrid(self.config.grid)
+        # Poses that are known from elsewhere are never corrected.
+        self._grid = CorrectableGrid(OccupancyGrid(self.config.grid), not pose_source)
+        self.corrections = 0
         self.topology = TopologyBuilder(self.config.topology)
         self.stage_seconds: dict[str, list[float]] = {}
         self._scans = 0
         self._window: GridPatch | None = None
         self._locate = pose_source or self.localizer.step
-        # Poses that are known from elsewhere are never corrected.
-        self._history = None if pose_source else GridHistory()
+
+    @property
+    def grid(self) -> OccupancyGrid:
+        """The map as it is shown; another object after a correction."""
+        return self._grid.shown
 
     def step(self, scan: Scan, T_odom_base: Array) -> Step:
-        """Take in one scan with the odometry pose (3,) at its stamp."""
+        """Localize and map one scan with the odometry pose (3,) at its stamp."""
         with self._timed('localizer'):
             estimate = self._locate(scan, T_odom_base)
-        if self._history is not None and estimate.correction is not None:
-            self._rebuild(self._history, scan.stamp_ns)
         with self._timed('grid'):
-            self._draw(scan, estimate)
+            if estimate.correction is not None:
+                self.corrections += self._grid.correct(*self.localizer.past(), scan.stamp_ns)
+            moved = self._grid.update(None if estimate.lost else scan, estimate.T_map_base)
+        if moved is not None:
+            self._rebuild(moved)
         if self._window is None or self._scans % self.config.scans_per_graph == 0:
             self._window = self._thin(estimate.T_map_base)
         self._scans += 1
         return Step(estimate, self._window)
 
-    def _draw(self, scan: Scan, estimate: Estimate) -> None:
-        """Into the map with it, unless nobody knows where it was made."""
-        if estimate.lost:
-            return
-        self.grid.update(scan, estimate.T_map_base)
-        if self._history is not None:
-            self._history.add(scan, estimate.T_map_base)
+    def finish(self) -> None:
+        """Complete what a correction has left to be done, after the last scan."""
+        moved = self._grid.finish()
+        if moved is not None:
+            self._rebuild(moved)
 
     def _thin(self, T_map_base: Array) -> GridPatch:
+        """Bring the graph up to date, but not from a map of which a part is not corrected yet."""
         with self._timed('topology'):
             window = self.grid.window(T_map_base[0], T_map_base[1], self.config.window.window_m)
-            if self.topology.update(window, T_map_base):
+            if not self._grid.is_rerendering and self.topology.update(window, T_map_base):
                 self.localizer.set_topology(self.topology.map)
         return window
 
-    def _rebuild(self, history: GridHistory, since_ns: int) -> None:
-        """A loop was closed.
-
-        Grid and topology are made anew from what was seen at the poses as they are known now.
-        """
-        before = history.past.poses()
+    def _rebuild(self, moved: MovedPoses) -> None:
+        """Build the graph again: the grid has undergone a correction."""
         with self._timed('rebuild'):
-            history.past.correct(*self.localizer.past(), since_ns)
-            self.grid = history.draw(self.grid)
             size = self.config.window.window_m
-            self.topology.rebuild(
-                lambda x, y: self.grid.window(x, y, size), before, history.past.poses()
-            )
+            self.topology.rebuild(lambda x, y: self.grid.window(x, y, size), *moved)
             self.localizer.set_topology(self.topology.map)
 
     @contextmanager

@@ -212,7 +212,7 @@ def trajectory_from(message: Path) -> tuple[NDArray[np.int64], Array]:
 
 
 def grid_msg(patch: GridPatch, frame_id: str, ns: int, corrected_ns: int = 0) -> OccupancyGrid:
-    """Map message; corrected_ns: stamp of the trajectory by which its grid was last drawn anew."""
+    """Map message; corrected_ns: stamp of the newest trajectory that its grid has undergone."""
     message = OccupancyGrid(header=header(frame_id, ns))
     message.info.map_load_time = time_msg(corrected_ns)
     message.info.resolution = patch.frame.resolution

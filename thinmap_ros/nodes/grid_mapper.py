@@ -1,4 +1,4 @@
-"""The occupancy grid: each scan drawn in at the pose that the localizer found for it."""
+"""The occupancy grid: each scan is added at the pose that the localizer found for it."""
 
 from collections.abc import Callable
 
@@ -22,9 +22,8 @@ from thinmap_ros.adapters.stamps import StampMatcher
 from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.errors import ThinmapError
-from thinmap_ros.core.grid.history import GridHistory
+from thinmap_ros.core.grid.correctable import CorrectableGrid
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, WindowConfig
-from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
 _LOST_SIGMA_M = 200.0  # a pose that is not known better than this is that of a lost robot
@@ -36,7 +35,9 @@ class GridMapperNode(LiveNode):
 
     Services save_map and load_map.
 
-    After a /trajectory the map is drawn anew; map_load_time of both says by which one it was.
+    After a /trajectory the map is re-rendered, a slice with each scan, near tiles first; meanwhile
+    tiles that are not complete are shown as they were. map_load_time of both is the stamp of the
+    newest trajectory that all of the map follows.
     """
 
     def __init__(self) -> None:
@@ -83,11 +84,11 @@ class GridMapperNode(LiveNode):
         """Forget the map, or go back to the session that the node was started with."""
         self._matcher: StampMatcher[LaserScan, tuple[Array, bool]] = StampMatcher()
         known = self._session or self._latest_ns is not None
-        # None: the map began with a grid of which the scans are not known.
-        self._history: GridHistory | None = None if self._session else GridHistory()
-        self._corrected_ns = 0
         self._latest_ns = None
-        self._grid = self._of_session() if self._session else OccupancyGrid(self._config)
+        if self._session:
+            self._grid = CorrectableGrid(self._of_session(), keeps_scans=False)
+        else:
+            self._grid = CorrectableGrid(OccupancyGrid(self._config))
         if known:
             self._latest_ns = self.get_clock().now().nanoseconds
             self._publish_map()
@@ -95,29 +96,29 @@ class GridMapperNode(LiveNode):
     def _state(self) -> State | None:
         if self._latest_ns is None:
             return None
-        return {**self._grid.state(), 'latest_ns': np.array(self._latest_ns)}
+        return {**self._grid.shown.state(), 'latest_ns': np.array(self._latest_ns)}
 
     def _resume(self, left: State) -> None:
         """Take over the map of a killed mapper. Raises InputError where it is no such map."""
         latest_ns, cells = snapshot.check_stamp(left)
         grid = OccupancyGrid.from_state(cells, self._config)
         self._resumed_ns = self._latest_ns = self._taken_over_ns = latest_ns
-        self._take_over(grid)
+        self._replace_map(grid)
 
     def _of_session(self) -> OccupancyGrid:
         return session_files.load_grid(self._session, self._config)
 
     def _on_scan(self, message: LaserScan) -> None:
-        self._take(self._matcher.left(messages.stamp_ns(message.header.stamp), message))
+        self._add_scan(self._matcher.left(messages.stamp_ns(message.header.stamp), message))
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         is_known = bool(messages.covariance_from(message)[0, 0] < _LOST_SIGMA_M**2)
         T_map_base = messages.pose_from(message.pose.pose)
-        self._take(
+        self._add_scan(
             self._matcher.right(messages.stamp_ns(message.header.stamp), (T_map_base, is_known))
         )
 
-    def _take(self, pair: tuple[LaserScan, tuple[Array, bool]] | None) -> None:
+    def _add_scan(self, pair: tuple[LaserScan, tuple[Array, bool]] | None) -> None:
         self.health.dropped_in_all('scans and poses without a partner', self._matcher.dropped)
         if pair is None:
             return
@@ -127,56 +128,56 @@ class GridMapperNode(LiveNode):
             self.begin_anew()  # the robot has begun anew as well
         self._resumed_ns = None
         with self.health.timed('map update'):
-            if self._mapping and is_known:
-                self._draw(scan, T_map_base)
-            window = self._grid.window(T_map_base[0], T_map_base[1], self._window_m)
+            is_mapped = self._mapping and is_known
+            moved = self._grid.update(scan if is_mapped else None, T_map_base)
+            window = self._grid.shown.window(T_map_base[0], T_map_base[1], self._window_m)
         self._latest_ns = scan.stamp_ns
+        if moved is not None:
+            self._publish_map()  # before the windows of the corrected map
         self._local_map.publish(
-            messages.grid_msg(window, self._map_frame, scan.stamp_ns, self._corrected_ns)
+            messages.grid_msg(window, self._map_frame, scan.stamp_ns, self._grid.corrected_ns)
         )
-
-    def _draw(self, scan: Scan, T_map_base: Array) -> None:
-        self._grid.update(scan, T_map_base)
-        if self._history is not None:
-            self._history.add(scan, T_map_base)
 
     def _publish_map(self) -> None:
         if self._latest_ns is not None:
-            patch = self._grid.patch()
+            patch = self._grid.shown.patch()
+            corrected_ns = self._grid.corrected_ns
             self._map.publish(
-                messages.grid_msg(patch, self._map_frame, self._latest_ns, self._corrected_ns)
+                messages.grid_msg(patch, self._map_frame, self._latest_ns, corrected_ns)
             )
 
     def _on_trajectory(self, message: Path) -> None:
-        """A loop was closed: draw the map anew where the scans were really made."""
-        self._corrected_ns = messages.stamp_ns(message.header.stamp)
-        if self._latest_ns is None or self._corrected_ns <= self._taken_over_ns:
-            return  # latched, and older than the map: that has undergone it, or is a new one
-        if self._history is None:
+        """A loop was closed: correct where the scans of the map were made."""
+        corrected_ns = messages.stamp_ns(message.header.stamp)
+        if self._latest_ns is None or corrected_ns <= self._taken_over_ns:
+            # Latched, and older than the map: that has undergone it, or is a new one.
+            self._grid.corrected_ns = corrected_ns
+            return
+        with self.health.timed('map correction'):
+            stamps_ns, poses = messages.trajectory_from(message)
+            is_followed = self._grid.correct(stamps_ns, poses, since_ns=corrected_ns)
+        if not is_followed:
             self.get_logger().warning(
                 'a loop is closed, but the map was loaded, not drawn here: it stays as it was'
             )
-        else:
-            with self.health.timed('map drawn anew'):
-                self._history.past.correct(
-                    *messages.trajectory_from(message), since_ns=self._corrected_ns
-                )
-                self._grid = self._history.draw(self._grid)
+            self._publish_map()
+
+    def _replace_map(self, grid: OccupancyGrid) -> None:
+        corrected_ns = self._grid.corrected_ns
+        self._grid = CorrectableGrid(grid, keeps_scans=False, corrected_ns=corrected_ns)
+        self._latest_ns = self._latest_ns or self.get_clock().now().nanoseconds
         self._publish_map()
 
-    def _take_over(self, grid: OccupancyGrid) -> None:
-        self._grid, self._latest_ns = grid, self._latest_ns or self.get_clock().now().nanoseconds
-        self._history = None
-        self._publish_map()
+    def _save_grid(self, path: str) -> str:
+        """Save the map, after all of it has undergone the newest correction."""
+        if self._grid.finish() is not None:
+            self._publish_map()
+        return f'saved {session_files.save_grid(path, self._grid.shown)}'
 
     async def _on_save(
         self, request: SaveMap.Request, response: SaveMap.Response
     ) -> SaveMap.Response:
-        def save() -> str:
-            path = self._saves.inside(request.path)
-            return f'saved {session_files.save_grid(path, self._grid)}'
-
-        answer(response, save)
+        answer(response, lambda: self._save_grid(self._saves.inside(request.path)))
         if not response.success:
             return response
         path = str(session_files.stem_of(self._saves.inside(request.path)))
@@ -225,7 +226,7 @@ class GridMapperNode(LiveNode):
         response.success = graph is None or graph.success
         response.message = _NO_BUILDER if graph is None else graph.message
         if response.success:
-            self._take_over(grid)
+            self._replace_map(grid)
             response.message = f'grid taken over; {response.message}'
             features = await ask(self, self._load_features, LoadMap.Request(path=stem))
             if features is not None:

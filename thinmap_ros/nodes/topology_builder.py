@@ -27,8 +27,8 @@ class TopologyBuilderNode(LiveNode):
     """/local_map and /pose in; /local_topology and /topology out.
 
     Services save_topology and load_topology.
-    After a /trajectory the graph is built anew from the /map that has been drawn by it; nodes keep
-    their ids.
+    After a /trajectory the graph is rebuilt from the /map that has undergone that correction; until
+    it comes the graph stays as it is. Nodes keep their ids.
     """
 
     def __init__(self) -> None:
@@ -103,8 +103,8 @@ class TopologyBuilderNode(LiveNode):
         self._resumed_ns, self._latest_ns = None, stamp_ns
         window, T_map_base = pair
         with self.health.timed('graph update'):
-            changed = self._rebuilding.may_take() and self._builder.update(window, T_map_base)
-        self._rebuilding.took(stamp_ns, T_map_base)
+            changed = self._rebuilding.accepts_window() and self._builder.update(window, T_map_base)
+        self._rebuilding.add_pose(stamp_ns, T_map_base)
         if changed:
             self._publish(stamp_ns)
         # The local map comes last: who hears it knows that all of this scan is said.
@@ -116,12 +116,12 @@ class TopologyBuilderNode(LiveNode):
         corrected_ns = messages.stamp_ns(message.header.stamp)
         # A latched one may be of before the graph that was taken over, which then has undergone it.
         if self._latest_ns is not None and corrected_ns > self._taken_over_ns:
-            self._rebuilding.expect(corrected_ns, *messages.trajectory_from(message))
+            self._rebuilding.correct(corrected_ns, *messages.trajectory_from(message))
 
     def _on_map(self, message: OccupancyGrid) -> None:
-        if not self._rebuilding.waits_for(messages.stamp_ns(message.info.map_load_time)):
+        if not self._rebuilding.awaits(messages.stamp_ns(message.info.map_load_time)):
             return
-        with self.health.timed('graph built anew'):
+        with self.health.timed('graph rebuilt'):
             self._rebuilding.rebuild(self._builder, messages.patch_from(message))
         self._publish(messages.stamp_ns(message.header.stamp))
 

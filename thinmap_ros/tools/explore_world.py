@@ -126,6 +126,7 @@ class ClosedLoop:
             if steps % _CONTROL_STEPS == 0:
                 self._control(moment)
             moment, steps = self.simulation.step(*self._command), steps + 1
+        self.pipeline.finish()
         show(*self._measure(goal))
         finished = self.decision is not None and self.is_finished
         reason = (

@@ -66,6 +66,7 @@ def replay(
             if shown is not None:
                 shown.step(scan, T_odom_base, step.estimate, result.pipeline)
         tidy_up()
+    result.pipeline.finish()
     result.skipped = log.skipped.count + pairing.dropped + pairing.waiting
     result.first_skipped = log.skipped.first
     if not result.poses:
@@ -105,7 +106,7 @@ def _report(result: Replay, poses: Array, seconds: tuple[float, float]) -> dict[
         'wall_s': round(seconds[0], 3),
         'cpu_s': round(seconds[1], 3),
         'peak_mb': round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
-        'loops_closed': rebuilds.size,
+        'loops_closed': result.pipeline.corrections,
         'rebuild_ms': round(1000.0 * float(rebuilds.max(initial=0.0)), 1),
         'ms_per_scan': {name: _spread(1000.0 * taken) for name, taken in stages.items()},
         'features': len(result.pipeline.localizer.features),

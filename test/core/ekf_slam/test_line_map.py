@@ -6,16 +6,17 @@ from slam_room import ROOM, drive, scan_in
 from thinmap_ros.core import se2
 from thinmap_ros.core.ekf_slam.feature_map import FeatureConfig
 from thinmap_ros.core.ekf_slam.line_map import LineMap
-from thinmap_ros.core.ekf_slam.lines import LineConfig
+from thinmap_ros.core.ekf_slam.lines import LineConfig, extract_lines
 from thinmap_ros.core.estimate import Correction
 
 
 def test_after_a_loop_features_go_where_the_keyframes_have_gone(rng):
-    lines = LineMap(LineConfig(), FeatureConfig(), local_areas=True)
+    lines = LineMap(FeatureConfig(), local_areas=True)
     keyframes = []
     for k, (truth, _) in enumerate(drive(300, rng, np.array([2.0, 2.0, 0.0]))):
         if k % 5 == 0:
-            lines.observe(scan_in(ROOM, truth, rng), truth, 1e-6 * np.eye(3))
+            scan = scan_in(ROOM, truth, rng)
+            lines.observe(scan, extract_lines(scan, LineConfig()), truth, 1e-6 * np.eye(3))
             keyframes.append(truth)
     before = {feature.id: feature for feature in lines.features}
     assert len(before) > 3

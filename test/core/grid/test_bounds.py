@@ -94,9 +94,9 @@ def test_points_from_nowhere_are_refused(far):
     before = {name: array.copy() for name, array in local_map.state().items()}
     points = np.array([[1.0, 1.0], [far, 1.0]])
     with pytest.raises(InputError, match='tiles'):
-        local_map.add(points, np.zeros(2))
+        local_map.add_scan(on_a_wall(points), np.zeros(3), np.zeros(3))
     with pytest.raises(InputError, match='tiles'):
-        local_map.add_walls(points)
+        local_map.add_walls(points, np.array([1.0, 0.0]))
     for name, array in local_map.state().items():
         np.testing.assert_array_equal(array, before[name])
 
@@ -112,8 +112,13 @@ def test_a_saved_local_map_from_nowhere_is_refused(far):
 
 def seen_map():
     local_map = LocalMap()
-    local_map.add(np.array([[1.0, 1.0], [1.02, 1.0]]), np.zeros(2))
+    local_map.add_scan(on_a_wall([[1.0, 1.0], [1.02, 1.0]]), np.zeros(3), np.zeros(3))
     return local_map
+
+
+def on_a_wall(points):
+    """Surface points (N, 5) with one normal."""
+    return np.array([[*point, 1.0, 0.0, 0.05] for point in points])
 
 
 def test_windows_that_wander_off_do_not_grow_a_map_without_end():

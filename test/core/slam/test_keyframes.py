@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from slam_room import ROOM, scan_in
+from slam_room import RANGE_MAX_M, ROOM, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam import keyframes as module
@@ -19,6 +19,7 @@ from thinmap_ros.core.slam.keyframes import (
     unlike,
 )
 from thinmap_ros.core.slam.pose_graph import Edge
+from thinmap_ros.core.slam.surface import surface_points
 
 STEP = np.diag(np.square([0.02, 0.01, 0.01]))
 
@@ -27,7 +28,7 @@ def frame(pose, path_m=0.0, stamp_ns=0, covariance=None):
     pose = np.asarray(pose, dtype=np.float64)
     scan = scan_in(ROOM, pose, stamp_ns=stamp_ns)
     covariance = np.zeros((3, 3)) if covariance is None else covariance
-    return Keyframe(scan, scan.points_base(), pose, path_m, covariance, 0)
+    return Keyframe(scan, surface_points(scan, RANGE_MAX_M), pose, path_m, covariance, 0)
 
 
 def along(poses, steps=STEP):

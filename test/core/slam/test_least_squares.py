@@ -89,6 +89,10 @@ def is_behind(point, pose, wall):
     return back @ [wall['face_x'], wall['face_y']] < -0.1
 
 
+HALF_WALL_M = 0.25  # a wall goes on so far to either side of its hits
+OFF_SIGMAS = 3.0  # a point that is farther off its wall contradicts it, where a beam went through
+
+
 def reference(local_map, scan, pose):
     """H (3, 3) and sums (5,)."""
     H, sums = np.zeros((3, 3)), np.zeros(5)
@@ -111,7 +115,9 @@ def reference(local_map, scan, pose):
         share = float(wall['hits']) / (float(wall['hits']) + 1.0)
         sums[0] += weight * share * cauchy(squared, WIDTH)
         sums[4] += weight * (1.0 - share) * far * UNSEEN_COST
-        sums[2] += weight * (squared < FITS_SIGMAS**2)
+        is_beyond = np.hypot(*off) > HALF_WALL_M
+        sums[2] += weight * (squared < FITS_SIGMAS**2 and not is_beyond)
+        sums[3] += weight * seen * (squared > OFF_SIGMAS**2 or is_beyond)
         J = np.array([[1.0, 0.0, -arm[1]], [0.0, 1.0, arm[0]]])
         robust = 1.0 / (1.0 + squared / WIDTH**2)
         H += weight * share * robust / SIGMA_M**2 * J.T @ metric @ J

@@ -313,6 +313,15 @@ def test_walls_of_an_occupancy_map_are_added(normal):
     assert cells_of(local_map)[0]['seen'].sum() == 60
 
 
+def test_a_corridor_of_a_kilometre_is_mapped():
+    local_map = LocalMap()
+    for x in range(0, 1001, 20):
+        walls = [[x - 15.0, 1.2, x + 15.0, 1.2], [x - 15.0, -1.2, x + 15.0, -1.2]]
+        add_scan(local_map, np.array(walls), se2.pose(float(x), 0.0, 0.0))
+    off = local_map.distances(np.array([[1.0, 1.3], [501.0, 1.3], [1001.0, 1.3]]))
+    np.testing.assert_allclose(off, 0.1, atol=0.03)
+
+
 def test_an_empty_scan_changes_nothing(rng):
     local_map = LocalMap()
     local_map.add_scan(NOTHING, np.zeros(3), np.zeros(3))

@@ -104,6 +104,35 @@ def test_a_scan_that_measures_nothing_teaches_nothing():
     np.testing.assert_allclose(sigmas_of(model), np.sqrt(allowed(STEP)))
 
 
+def test_a_scan_that_only_half_decides_teaches_by_the_square_of_its_share():
+    """It halves the motion's error: the match shows half of it, and much of that is the scan's."""
+    model = MotionModel(CONFIG)
+    variances = allowed(STEP)
+    model.expect(STEP, CALIBRATED)
+    model._share[:] = 4.0
+    motion = np.diag(model.expect(STEP, CALIBRATED).covariance).copy()
+    np.testing.assert_allclose(motion, 4.0 * variances)
+    model.learn(STEP, np.diag(1.0 / motion))  # no innovation, and half the weight
+    # The first scan counts half, a quarter of that, and takes the excess away.
+    np.testing.assert_allclose(model._share, 4.0 * (1.0 - 0.5 * 0.25))
+
+
+def test_a_clear_error_teaches_though_the_scan_decides_little():
+    """What lies far beyond the scan's own error is the odometry's, whatever the weights are."""
+    shares = []
+    for off in (0.5, 2.0, 50.0):
+        model = MotionModel(CONFIG)
+        motion = np.diag(model.expect(STEP, CALIBRATED).covariance).copy()
+        by_scan = np.diag(1.0 / (9.0 * motion))  # a gain of a tenth
+        slip = np.array([off * 3.0 * np.sqrt(motion[0]), 0.0, 0.0])
+        model.learn(STEP + 0.1 * slip, by_scan)
+        shares.append(model._share[0])
+    assert shares[0] == 1.0, "within the scan's error"
+    assert shares[0] < shares[1] < shares[2]
+    # 0.5 of the first scan, half for one of two axes, up to the most of nine shares, less one.
+    assert shares[2] == pytest.approx(1.0 + 0.25 * 8.0 - 0.25 * 0.01, rel=0.01)
+
+
 @pytest.mark.parametrize('axis', range(3))
 @pytest.mark.parametrize('sign', [-1.0, 1.0])
 def test_more_than_slip_is_motion(axis, sign):

@@ -1,4 +1,4 @@
-"""A graph built anew where trajectory, grid and windows are heard of one after the other."""
+"""A graph that is rebuilt where trajectory, grid and windows come one after the other."""
 
 import numpy as np
 import pytest
@@ -23,9 +23,9 @@ def built(rebuilding):
     builder = TopologyBuilder()
     for stamp, T in zip(STAMPS.tolist(), POSES, strict=True):
         rebuilding.window(hall(), 0)
-        assert rebuilding.may_take()
+        assert rebuilding.accepts_window()
         builder.update(hall(), T)
-        rebuilding.took(stamp, T)
+        rebuilding.add_pose(stamp, T)
     return builder
 
 
@@ -36,8 +36,8 @@ def test_the_graph_goes_where_the_grid_has_gone_and_its_nodes_keep_their_ids(fro
     before = {i: node.position for i, node in builder.map.nodes.items()}
     assert before
     moved = POSES + [1.0, 0.0, 0.0]
-    rebuilding.expect(9, STAMPS, moved)
-    assert rebuilding.waits_for(9) and not rebuilding.waits_for(8)
+    rebuilding.correct(9, STAMPS, moved)
+    assert rebuilding.awaits(9) and not rebuilding.awaits(8)
     rebuilding.rebuild(builder, hall(1.0))
     assert len(builder.map.nodes) == len(before)
     if from_the_start:
@@ -50,34 +50,34 @@ def test_the_graph_goes_where_the_grid_has_gone_and_its_nodes_keep_their_ids(fro
 def test_between_the_news_and_the_grid_nothing_is_taken_nor_what_is_out_of_date():
     rebuilding = Rebuilding()
     builder = built(rebuilding)
-    rebuilding.expect(9, STAMPS, POSES)
+    rebuilding.correct(9, STAMPS, POSES)
     rebuilding.window(hall(), 0)
-    assert not rebuilding.may_take()
+    assert not rebuilding.accepts_window()
     rebuilding.rebuild(builder, hall())
-    assert not rebuilding.may_take(), 'cut out before'
+    assert not rebuilding.accepts_window(), 'cut out before'
     rebuilding.window(hall(), 9)
-    assert rebuilding.may_take()
+    assert rebuilding.accepts_window()
 
 
 def test_a_builder_that_is_new_takes_windows_of_a_grid_that_was_corrected_before():
     rebuilding = Rebuilding()
     rebuilding.window(hall(), 7)
-    assert rebuilding.may_take()
+    assert rebuilding.accepts_window()
 
 
 def test_a_mapper_that_begins_anew_after_a_correction_is_followed():
     rebuilding = Rebuilding()
     builder = built(rebuilding)
-    rebuilding.expect(9, STAMPS, POSES)
+    rebuilding.correct(9, STAMPS, POSES)
     rebuilding.rebuild(builder, hall())
     for corrected_ns in (9, 0):
         rebuilding.window(hall(), corrected_ns)
-        assert rebuilding.may_take()
+        assert rebuilding.accepts_window()
 
 
 def test_a_grid_that_never_comes_is_not_waited_for_for_ever():
     rebuilding = Rebuilding()
     built(rebuilding)
-    rebuilding.expect(9, STAMPS, POSES)
+    rebuilding.correct(9, STAMPS, POSES)
     rebuilding.window(hall(), 9)
-    assert any(rebuilding.may_take() for _ in range(200))
+    assert any(rebuilding.accepts_window() for _ in range(2000))

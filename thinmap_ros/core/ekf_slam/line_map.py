@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
 from thinmap_ros.core.ekf_slam.feature_map import FeatureConfig, FeatureMap
 from thinmap_ros.core.ekf_slam.features import LineFeature
-from thinmap_ros.core.ekf_slam.lines import LineConfig, Lines, extract_lines, no_lines
+from thinmap_ros.core.ekf_slam.lines import Lines
 from thinmap_ros.core.estimate import Correction
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -26,11 +26,9 @@ _LEAST = np.diag(np.square([1e-3, 1e-3, 1e-4]))  # to which a pose is known at b
 class LineMap:
     """Line features, and what the last observation found."""
 
-    def __init__(self, lines: LineConfig, features: FeatureConfig, local_areas: bool) -> None:
-        self._lines = lines
+    def __init__(self, features: FeatureConfig, local_areas: bool) -> None:
         self._filter = CompressedEkf(np.zeros(3), _LEAST)
         self._map = FeatureMap(features, local_areas)
-        self.lines: Lines = no_lines()  # of the last observation, robot frame
         self.observed = 0
         self.matched = 0
 
@@ -51,12 +49,11 @@ class LineMap:
         """Take the topological map by which features are stored."""
         self._map.area.set_topology(topology)
 
-    def observe(self, scan: Scan, T_map_base: Array, covariance: Array) -> float:
-        """Take in the lines of a scan from a pose (3,) with covariance (3, 3).
+    def observe(self, scan: Scan, lines: Lines, T_map_base: Array, covariance: Array) -> float:
+        """Update the features by the lines of a scan at a pose (3,) with covariance (3, 3).
 
         Returns the heading that pose and features together tell, rad.
         """
-        self.lines = lines = extract_lines(scan, self._lines)
         self._filter.local.set_pose(T_map_base, covariance + _LEAST)
         self.observed = len(lines)
         self.matched, _ = self._map.observe(self._filter, lines, scan)

@@ -14,7 +14,11 @@ class OdometryConfig(Config):
     """Noise of odometry, 1 sigma."""
 
     odom_noise: float = parameter(
-        0.03, 'odometry error for each metre or radian of a motion, m or rad', low=0.001, high=2.0
+        0.03,
+        'odometry noise (1 sigma) for each metre or radian of a motion, m or rad, beside the '
+        'systematic error, which is calibrated; it grows by itself where scans find it larger',
+        low=0.001,
+        high=2.0,
     )
     odom_slip_m: float = parameter(
         0.003, 'error of any odometry increment, in each direction, m', low=1e-5, high=1.0

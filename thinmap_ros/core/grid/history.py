@@ -1,151 +1,154 @@
-"""What a grid was drawn from, to draw it anew when the robot turns out to have been elsewhere.
-
-It grows with the area that was seen, not with time: of each place and direction the newest few
-scans are kept.
-"""
+"""The poses of all scans, corrected after loop closures, and the scans kept to render maps from."""
 
 import math
 from array import array
 from collections import deque
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.grid.occupancy import OccupancyGrid
-from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
-_APART_M, _APART_RAD = 0.25, 0.25
+_APART_M = 0.25
+_APART_RAD = 0.25
 _PLACE_M = 1.0  # edge of a place
 _DIRECTIONS = 8  # of the robot, that are told apart there
-_OF_A_PLACE = 4  # scans of each place and direction: about one visit
-_Place = tuple[int, int, int]
+_PER_PLACE = 4  # scans kept of each place and direction: about one visit
+_FARTHEST_PLACE = 1 << 26  # more than any place on earth is from the origin
+Kept = TypeVar('Kept')
 
 
-class PoseHistory:
-    """The pose of every scan.
+class MovedPoses(NamedTuple):
+    """Poses (N, 3) of the kept scans before and after the corrections that a map has undergone."""
 
-    Those that lie 0.25 m or 0.25 rad apart are the ones that are asked for.
-    Of many of these at one place the newest are asked for. A correction names some of the scans by
-    their stamps and says where they were made. All others go with the last of these before them, in
-    the order in which they came: stamps of real robots step back now and then.
+    before: Array
+    after: Array
+
+
+class PoseHistory(Generic[Kept]):
+    """The pose of every scan, and what is kept of some of them.
+
+    Of the scans that lie 0.25 m or 0.25 rad apart, the newest four of each place and direction are
+    kept: their number grows with the area that was seen, not with time. A correction gives the
+    poses of some scans, by their stamps. Every other scan moves with the last of these before it,
+    in the order in which the scans were added: stamps of real robots step back now and then.
     """
 
     def __init__(self) -> None:
         self._stamps = array('q')
         self._poses = array('d')
         self._last_apart = -1
-        self._asked_for: dict[int, Scan | None] = {}  # by the number of scans that came before
-        self._at_place: dict[_Place, deque[int]] = {}
+        self._kept: dict[int, Kept] = {}  # by the number of scans that came before
+        self._at_place: dict[int, deque[int]] = {}
+        # All poses as they were before the first correction that no map has undergone yet.
+        self._before: Array | None = None
 
-    def add(self, stamp_ns: int, T_map_base: Array, scan: Scan | None = None) -> None:
-        """Take in the pose (3,) of a scan, and the scan itself, if it is wanted again."""
+    def add(self, stamp_ns: int, T_map_base: Array, kept: Kept) -> None:
+        """Add the pose (3,) of a scan, and what is to be kept of the scan, if any scan is."""
         number = len(self._stamps)
         self._stamps.append(stamp_ns)
         self._poses.extend(T_map_base.tolist())
         if self._last_apart >= 0:
-            moved = se2.between(self._pose(self._last_apart), T_map_base)
+            last = np.array(self._poses[3 * self._last_apart : 3 * self._last_apart + 3])
+            moved = se2.between(last, T_map_base)
             if math.hypot(moved[0], moved[1]) < _APART_M and abs(float(moved[2])) < _APART_RAD:
                 return
         self._last_apart = number
-        self._ask_for(number, scan)
+        self._kept[number] = kept
+        at_place = self._at_place.setdefault(int(_places_of(T_map_base[None])[0]), deque())
+        at_place.append(number)
+        while len(at_place) > _PER_PLACE:
+            del self._kept[at_place.popleft()]
 
-    def scans(self) -> list[Scan | None]:
-        """The scans that are asked for, as they came."""
-        return list(self._asked_for.values())
+    def kept(self) -> list[Kept]:
+        """What is kept, in the order in which it was added."""
+        return list(self._kept.values())
 
-    def poses(self) -> Array:
-        """Poses (N, 3) of the scans that are asked for, as they are known now."""
-        return self._all_poses()[np.array(list(self._asked_for), dtype=np.int64)]
+    def kept_poses(self) -> Array:
+        """Poses (N, 3) of the kept scans, as they are known now."""
+        return self._all_poses()[self._kept_numbers()]
 
     def correct(self, stamps_ns: NDArray[np.int64], poses: Array, since_ns: int) -> None:
-        """Move everything as the scans of these stamps (M,) move, which were made at poses (M, 3).
+        """Correct all poses: the scans of these stamps (M,) were made at poses (M, 3).
 
-        since_ns: stamp of the scan from which on poses are right already, whether it has come yet
-        or not.
+        since_ns: stamp of the first scan whose pose is right already, whether it was added yet or
+        not. Stamps of no scan are ignored.
         """
-        before = self._all_poses()
-        right = self._stamps.index(since_ns) if since_ns in self._stamps else len(self._stamps)
-        numbers, named = self._numbers(stamps_ns, right)
+        stamps = np.array(self._stamps, dtype=np.int64)
+        right_already = np.flatnonzero(stamps == since_ns)
+        count = int(right_already[0]) if right_already.size else len(stamps)
+        numbers, named = _numbers_of(stamps_ns, stamps[:count])
         if numbers.size == 0:
             return
-        anchors = np.maximum(np.searchsorted(numbers, np.arange(right), side='right') - 1, 0)
-        after = _carried(before[:right], before[numbers][anchors], poses[named][anchors])
-        self._poses[: 3 * right] = array('d', after.ravel().tolist())
-        # Before and after, the same ones are asked for: what is too many now is dropped when more
-        # come.
+        before = self._all_poses()[:count]
+        if self._before is None:
+            self._before = before
+        anchors = np.maximum(np.searchsorted(numbers, np.arange(count), side='right') - 1, 0)
+        after = _moved_along(before, before[numbers][anchors], poses[named][anchors])
+        np.frombuffer(self._poses)[: 3 * count] = after.ravel()
+        # Places with too many scans now lose the oldest ones when more come.
+        kept = self._kept_numbers()
         self._at_place = {}
-        for number in self._asked_for:
-            self._here(number).append(number)
+        places = _places_of(self._all_poses()[kept])
+        for number, place in zip(kept.tolist(), places.tolist(), strict=True):
+            self._at_place.setdefault(place, deque()).append(number)
 
-    def _ask_for(self, number: int, scan: Scan | None) -> None:
-        """Put a scan at its place.
+    def accept_corrections(self) -> MovedPoses:
+        """Poses of the kept scans before and after the corrections since the last call.
 
-        The oldest there are asked for no more, if there are too many.
+        Those of scans that came after the first of these corrections are given before it as if the
+        robot had gone on without it.
         """
-        here = self._here(number)
-        here.append(number)
-        self._asked_for[number] = scan
-        while len(here) > _OF_A_PLACE:
-            del self._asked_for[here.popleft()]
+        after = self._all_poses()
+        before = after
+        if self._before is not None and len(self._before):
+            corrected = len(self._before)
+            last = corrected - 1
+            later = _moved_along(after[corrected:], after[last][None], self._before[last][None])
+            before = np.vstack([self._before, later])
+        self._before = None
+        kept = self._kept_numbers()
+        return MovedPoses(before[kept], after[kept])
 
-    def _here(self, number: int) -> deque[int]:
-        """What is asked for at the place, and in the direction, of a scan."""
-        x, y, heading = self._pose(number).tolist()
-        turn = math.floor(heading % (2.0 * math.pi) / (2.0 * math.pi) * _DIRECTIONS)
-        place = (math.floor(x / _PLACE_M), math.floor(y / _PLACE_M), turn)
-        return self._at_place.setdefault(place, deque())
-
-    def _pose(self, number: int) -> Array:
-        return np.array(self._poses[3 * number : 3 * number + 3])
+    def _kept_numbers(self) -> NDArray[np.int64]:
+        return np.array(list(self._kept), dtype=np.int64)
 
     def _all_poses(self) -> Array:
         return np.array(self._poses).reshape(-1, 3)
 
-    def _numbers(
-        self, stamps_ns: NDArray[np.int64], end: int
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Numbers before `end` of the scans with these stamps, and which of the stamps each has.
 
-        Stamps of no scan are left out.
-        """
-        number_of = {stamp: number for number, stamp in enumerate(self._stamps[:end])}
-        found = sorted(
-            (number_of[stamp], k)
-            for k, stamp in enumerate(stamps_ns.tolist())
-            if stamp in number_of
-        )
-        pairs = np.array(found, dtype=np.int64).reshape(-1, 2)
-        return pairs[:, 0], pairs[:, 1]
+def _places_of(poses: Array) -> NDArray[np.int64]:
+    """Number (N,) of the place and direction of each pose (N, 3)."""
+    turn = np.floor(poses[:, 2] % (2.0 * math.pi) / (2.0 * math.pi) * _DIRECTIONS)
+    x, y = np.floor(poses[:, :2] / _PLACE_M).astype(np.int64).T
+    places: NDArray[np.int64] = (x * _FARTHEST_PLACE + y) * _DIRECTIONS + turn.astype(np.int64)
+    return places
 
 
-def _carried(poses: Array, before: Array, after: Array) -> Array:
-    """Poses (N, 3) after each went along with another, from `before` (N, 3) to `after` (N, 3)."""
-    turn = after[:, 2] - before[:, 2]
-    c, s = np.cos(turn), np.sin(turn)
-    dx, dy = (poses - before)[:, 0], (poses - before)[:, 1]
-    x, y = after[:, 0] + c * dx - s * dy, after[:, 1] + s * dx + c * dy
-    return np.column_stack([x, y, se2.wrap(poses[:, 2] + turn)])
+def _numbers_of(
+    wanted: NDArray[np.int64], stamps: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Indices of the wanted stamps (M,) among all (N,), ascending, and which of them each is.
 
-
-class GridHistory:
-    """The scans that a grid can be drawn from anew.
-
-    They take 10 kB a metre of what is new, at most 30 kB a square metre.
+    Of equal stamps the last is found; what is not found is left out.
     """
+    order = np.argsort(stamps, kind='stable')
+    at = np.searchsorted(stamps[order], wanted, side='right') - 1
+    named = np.flatnonzero(at >= 0)
+    numbers = order[at[named]]
+    found = stamps[numbers] == wanted[named]
+    ascending = np.argsort(numbers[found], kind='stable')
+    return numbers[found][ascending], named[found][ascending]
 
-    def __init__(self) -> None:
-        self.past = PoseHistory()
 
-    def add(self, scan: Scan, T_map_base: Array) -> None:
-        """Take in a scan that was drawn at a pose (3,)."""
-        self.past.add(scan.stamp_ns, T_map_base, scan)
-
-    def draw(self, like: OccupancyGrid) -> OccupancyGrid:
-        """The grid of the kept scans at their poses, with cells and configuration of another."""
-        grid = OccupancyGrid(like.config, like.frame)
-        for scan, T in zip(self.past.scans(), self.past.poses(), strict=True):
-            if scan is not None:
-                grid.update(scan, T)
-        return grid
+def _moved_along(poses: Array, before: Array, after: Array) -> Array:
+    """Poses (N, 3), each moved as another that went from `before` to `after`, (N, 3) or (1, 3)."""
+    turn = after[:, 2] - before[:, 2]
+    c = np.cos(turn)
+    s = np.sin(turn)
+    dx, dy = (poses - before)[:, :2].T
+    x = after[:, 0] + c * dx - s * dy
+    y = after[:, 1] + s * dx + c * dy
+    return np.column_stack([x, y, se2.wrap(poses[:, 2] + turn)])

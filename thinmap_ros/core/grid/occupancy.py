@@ -225,6 +225,27 @@ class OccupancyGrid:
             tiles.ensure(_tiles_of(self._news, box) + (tile_row, tile_col))
             _apply(tiles.pool, tiles.directory, place, self._news, box, self._steps)
 
+    def tiles(self) -> NDArray[np.int64]:
+        """Tile coordinates (N, 2) as (row, col) of the tiles that exist."""
+        return self._tiles.places()
+
+    def set_tiles(self, tiles: NDArray[np.int64], *grids: 'OccupancyGrid') -> None:
+        """Make tiles (N, 2) hold the sum of what some grids of the same cells hold there."""
+        if not len(tiles):
+            return
+        odds = np.zeros((len(tiles), TILE, TILE), dtype=np.int16)
+        seen = np.zeros(odds.shape, dtype=np.bool_)
+        for grid in grids:
+            part = grid._tiles.read_tiles(tiles)
+            odds += part
+            seen |= part != 0
+        odds[seen & (odds == 0)] = 1  # 0 is kept for cells never seen
+        low, high = self._steps[2:4]
+        self._tiles.write_tiles(tiles, np.clip(odds, low, high))
+        row, col = (tiles.min(axis=0) * TILE).tolist()
+        end_row, end_col = ((tiles.max(axis=0) + 1) * TILE).tolist()
+        self._picture.touch(row, col, end_row, end_col)
+
     def window(self, x: float, y: float, size_m: float) -> GridPatch:
         """Square of size_m around a point, aligned with the cells, copied out of the tiles."""
         count = max(1, round(size_m / self.frame.resolution))

@@ -1,6 +1,8 @@
 """Tiles: storage for maps growing in any direction, in memory proportional to what was touched."""
 
-from typing import Any
+import resource
+from contextlib import suppress
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -14,8 +16,39 @@ NO_TILE = -1
 _MOST_TILES = 1 << 15  # 134 million cells, some 1.1 km in each direction at 0.1 m
 MOST_CELLS = _MOST_TILES * TILE * TILE
 FARTHEST_TILE = int(FARTHEST_M / FINEST_M) // TILE  # of the finest cells
-_FIRST = 64  # tiles that there is room for at first; what is not used costs no memory
-_BORDER = 4  # tiles by which the directory grows at a time
+_FEWEST = 64  # tiles that any pool has room for
+# Room beyond what is needed, on a side of the directory that grows: a share of its length, and at
+# least some tiles.
+_ROOM_SHARE = 0.25
+_LEAST_ROOM = 4
+
+
+class _Span(NamedTuple):
+    """Rows or columns of tiles from `first` to `end`, exclusive."""
+
+    first: int
+    end: int
+
+    @property
+    def length(self) -> int:
+        """Number of rows or columns."""
+        return self.end - self.first
+
+    def covers(self, other: '_Span') -> bool:
+        """Whether another span lies in this one."""
+        return self.first <= other.first and other.end <= self.end
+
+    def covering(self, other: '_Span') -> '_Span':
+        """The smallest span that holds this one and another."""
+        return _Span(min(self.first, other.first), max(self.end, other.end))
+
+    def grown_to(self, other: '_Span') -> '_Span':
+        """A span that holds this one and another, with room to spare on each side that grew."""
+        first, end = self.covering(other)
+        room = max(_LEAST_ROOM, int(_ROOM_SHARE * (end - first)))
+        return _Span(
+            first - room if first < self.first else first, end + room if end > self.end else end
+        )
 
 
 class TileStore:
@@ -24,37 +57,67 @@ class TileStore:
     A cell is a number of the given type, or an array of them of shape per_cell; it begins as 0.
     `directory` (R, C) int32 says for each tile of a bounding rectangle which slot of `pool`
     (N, TILE, TILE, *per_cell) holds it, or NO_TILE; `first_row`, `first_col`: tile coordinates of
-    directory[0, 0]. Only the directory, one number a tile, is ever laid anew when the map grows;
-    the pool is lengthened by half, or more where more is needed at once.
+    directory[0, 0]. When the map grows, the directory, one number a tile, is copied into a larger
+    one. The pool is not copied: it is as long as that of the largest map, and the system gives it
+    memory page by page, when it is first written to. Only where so much address space is not to be
+    had, the pool is copied into one that is longer by half.
     """
 
     def __init__(self, dtype: DTypeLike = np.int16, per_cell: tuple[int, ...] = ()) -> None:
         self.directory: NDArray[np.int32] = np.full((1, 1), NO_TILE, dtype=np.int32)
-        self.pool: NDArray[Any] = np.zeros((_FIRST, TILE, TILE, *per_cell), dtype=dtype)
+        self.pool: NDArray[Any] = _empty_pool((TILE, TILE, *per_cell), dtype, _FEWEST)
         self.first_row = 0
         self.first_col = 0
         self.used = 0
 
     def reach(self, row_a: int, col_a: int, row_b: int, col_b: int) -> None:
-        """Lay out the directory for the tiles from (row_a, col_a) to (row_b, col_b), inclusive.
+        """Extend the directory to the tiles from (row_a, col_a) to (row_b, col_b), inclusive.
 
-        Raises InputError where that would make it larger than any building: a pose is wrong then.
+        A side that grows gets room to spare, the others do not: a long building is not wide.
+        Raises InputError where the directory would become larger than that of any building: a pose
+        is wrong then.
         """
-        rows, cols = self.directory.shape
-        low_row, low_col = min(row_a, self.first_row), min(col_a, self.first_col)
-        high_row = max(row_b + 1, self.first_row + rows)
-        high_col = max(col_b + 1, self.first_col + cols)
-        if (high_row - low_row, high_col - low_col) == (rows, cols):
+        rows = _Span(row_a, row_b + 1)
+        cols = _Span(col_a, col_b + 1)
+        height, width = self._spans()
+        if height.covers(rows) and width.covers(cols):
             return
-        low_row, low_col = low_row - _BORDER, low_col - _BORDER
-        high_row, high_col = high_row + _BORDER, high_col + _BORDER
-        if (high_row - low_row) * (high_col - low_col) > _MOST_TILES:
-            size = f'{high_row - low_row} x {high_col - low_col}'
+        taller = height.grown_to(rows)
+        wider = width.grown_to(cols)
+        if taller.length * wider.length > _MOST_TILES:
+            # Room that was never used is given up.
+            used_height, used_width = self._used_spans()
+            taller = used_height.covering(rows)
+            wider = used_width.covering(cols)
+        if taller.length * wider.length > _MOST_TILES:
+            size = f'{taller.length} x {wider.length}'
             raise InputError(f'map of {size} tiles: expected {_MOST_TILES} at most')
-        wider = np.full((high_row - low_row, high_col - low_col), NO_TILE, dtype=np.int32)
-        row, col = self.first_row - low_row, self.first_col - low_col
-        wider[row : row + rows, col : col + cols] = self.directory
-        self.directory, self.first_row, self.first_col = wider, low_row, low_col
+        self._lay_out(taller, wider)
+
+    def _spans(self) -> tuple['_Span', '_Span']:
+        """Rows and columns of tiles of the directory."""
+        rows, cols = self.directory.shape
+        height = _Span(self.first_row, self.first_row + rows)
+        width = _Span(self.first_col, self.first_col + cols)
+        return height, width
+
+    def _used_spans(self) -> tuple['_Span', '_Span']:
+        """Rows and columns of the tiles that exist; those of the directory if there are none."""
+        places = self.places()
+        if not len(places):
+            return self._spans()
+        low_row, low_col = places.min(axis=0).tolist()
+        high_row, high_col = places.max(axis=0).tolist()
+        return _Span(low_row, high_row + 1), _Span(low_col, high_col + 1)
+
+    def _lay_out(self, height: '_Span', width: '_Span') -> None:
+        """Give the directory these rows and columns of tiles, all that exist among them."""
+        places = self.places()
+        self.directory = np.full((height.length, width.length), NO_TILE, dtype=np.int32)
+        self.first_row = height.first
+        self.first_col = width.first
+        at = places - (self.first_row, self.first_col)
+        self.directory[at[:, 0], at[:, 1]] = np.arange(len(at))
 
     def ensure(self, tiles: NDArray[np.int64]) -> None:
         """Make the tiles (N, 2), (row, col) in tile coordinates inside the directory, exist.
@@ -67,12 +130,16 @@ class TileStore:
         missing = missing.reshape(-1, 2)
         used = self.used + len(missing)
         if used > self.pool.shape[0]:
-            size = max(used, self.used + self.used // 2)
-            longer = np.zeros((size, *self.pool.shape[1:]), dtype=self.pool.dtype)
+            least = max(used, self.used + self.used // 2)
+            longer = _empty_pool(self.pool.shape[1:], self.pool.dtype, least)
             longer[: self.used] = self.pool[: self.used]
             self.pool = longer
         self.directory[missing[:, 0], missing[:, 1]] = np.arange(self.used, used)
         self.used = used
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What copies and pickles hold: not the unused room, which would become memory in them."""
+        return {**self.__dict__, 'pool': self.pool[: self.used].copy()}
 
     def places(self) -> NDArray[np.int64]:
         """Tile coordinates (N, 2) as (row, col) of the tiles in the order of their slots."""
@@ -121,6 +188,25 @@ class TileStore:
                 row_a - row : row_b - row, col_a - col : col_b - col
             ]
 
+    def read_tiles(self, tiles: NDArray[np.int64]) -> NDArray[Any]:
+        """Copy of the tiles (N, 2), (row, col) in tile coordinates; 0 where no tile is."""
+        cells = np.zeros((len(tiles), *self.pool.shape[1:]), dtype=self.pool.dtype)
+        at = tiles - (self.first_row, self.first_col)
+        inside = np.flatnonzero(np.all((at >= 0) & (at < self.directory.shape), axis=1))
+        slots = self.directory[at[inside, 0], at[inside, 1]]
+        exist = slots != NO_TILE
+        cells[inside[exist]] = self.pool[slots[exist]]
+        return cells
+
+    def write_tiles(self, tiles: NDArray[np.int64], cells: NDArray[Any]) -> None:
+        """Set the tiles (N, 2), (row, col) in tile coordinates, to cells (N, TILE, TILE, ...)."""
+        low_row, low_col = tiles.min(axis=0).tolist()
+        high_row, high_col = tiles.max(axis=0).tolist()
+        self.reach(low_row, low_col, high_row, high_col)
+        self.ensure(tiles)
+        at = tiles - (self.first_row, self.first_col)
+        self.pool[self.directory[at[:, 0], at[:, 1]]] = cells
+
     def _tiles_within(self, row: int, col: int, rows: int, cols: int) -> list[tuple[int, int, int]]:
         """Existing tiles that touch a rectangle of cells: tile row, tile col, slot."""
         low = (row // TILE - self.first_row, col // TILE - self.first_col)
@@ -139,3 +225,14 @@ class TileStore:
             )
             for r, c in found
         ]
+
+
+def _empty_pool(tile: tuple[int, ...], dtype: DTypeLike, least: int) -> NDArray[Any]:
+    """Zeros (N, *tile) with room for the largest map, or for at least so many tiles.
+
+    The latter where the address space of the process is limited, or the system refuses that much.
+    """
+    if resource.getrlimit(resource.RLIMIT_AS)[0] == resource.RLIM_INFINITY:
+        with suppress(MemoryError):
+            return np.zeros((_MOST_TILES, *tile), dtype=dtype)
+    return np.zeros((least, *tile), dtype=dtype)

@@ -40,7 +40,7 @@ class ActiveMap:
         return None if self.T_learned is None else se2.between(self.T_learned, T_map_base)
 
     def begin_submap(self) -> None:
-        """Go on in an empty map."""
+        """Continue in an empty map."""
         self.map = LocalMap(self._config)
         self._due = []
         self.number += 1

@@ -8,6 +8,8 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.ekf_slam.line_map import LineMap
+from thinmap_ros.core.ekf_slam.lines import extract_lines
+from thinmap_ros.core.ekf_slam.localizer import EkfConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.uncertainty import PoseUncertainty
@@ -23,8 +25,9 @@ _LEAST_VARIANCE = 5e-4**2
 class HeadingCorrection:
     """Corrects the heading of scans that the map learns from."""
 
-    def __init__(self, lines: LineMap) -> None:
-        self.lines = lines
+    def __init__(self, config: EkfConfig) -> None:
+        self.lines = LineMap(config, config.slam == 'ti')
+        self._config = config
         self._compass = WallCompass()
         self._variance = _LEAST_VARIANCE  # of the heading since the walls' direction told it
 
@@ -36,10 +39,12 @@ class HeadingCorrection:
         path_m: length of the path so far, m: the compass trusts the beginning of the map most.
         """
         self._variance += float(pose.by_motion[2, 2] + _NEW_SHARE * pose.by_scan[2, 2])
-        heading = self.lines.observe(scan, T_map_base, _BESIDE_WALLS)
+        lines = extract_lines(scan, self._config)
+        heading = float(T_map_base[2])
+        if self._config.slam == 'ti':
+            heading = self.lines.observe(scan, lines, T_map_base, _BESIDE_WALLS)
         if not fits:
             return T_map_base
-        lines = self.lines.lines
         told = self._compass.read(lines, heading, self._variance)
         if told is not None:
             gain = self._variance / (self._variance + told.variance)

@@ -47,7 +47,7 @@ def by_prior(pose: Array, prior: Array, information: Array) -> tuple[Array, floa
     off = pose - prior
     off[2] = math.atan2(math.sin(off[2]), math.cos(off[2]))
     pull = information @ off
-    squared = off @ pull
+    squared = float(off @ pull)
     weight = 1.0 / (1.0 + squared / (SLIP_SIGMAS * SLIP_SIGMAS))
     return weight * pull, weight, loss(squared, SLIP_SIGMAS)
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from thinmap_ros.core.config import parameter
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.keyframes import inverse
 from thinmap_ros.core.slam.least_squares import minimize
 from thinmap_ros.core.slam.local_map import LocalMap, LocalMapConfig
 from thinmap_ros.core.slam.pose_search import search
@@ -85,7 +86,7 @@ class Matcher:
         points (N, 5): surface points, robot frame; T_base_laser (3,): where the laser is.
         """
         scan = self.weighted(points, T_base_laser)
-        information = np.linalg.inv(covariance)
+        information = inverse(covariance)
         match = self._refined(scan, local_map, prior, prior, information)
         reach = _SIGMAS * np.sqrt(np.diag(covariance))
         fits_badly = match.fit < self.config.match_least_fit

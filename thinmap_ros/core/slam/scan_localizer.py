@@ -56,7 +56,9 @@ class ScanLocalizerConfig(EkfConfig, MotionConfig, MatcherConfig, LoopConfig):
     map_turn_rad: float = parameter(0.2, 'or after such a turn, rad', low=0.0, high=3.0)
     lost_evidence: float = parameter(
         4.0,
-        'lost when this many scans more contradict the map than fit it, each by its share',
+        'evidence against the map at which a new one begins: a sum over scans of the share of '
+        'points that contradict the map, less a third of those that fit. Raise it where crowds '
+        'make the robot lost, lower it to notice sooner that it was moved',
         low=0.1,
         high=1000.0,
     )
@@ -83,7 +85,7 @@ class ScanLocalizer:
         self._uncertainty = PoseUncertainty(self._pose)
         self._tracking = Tracking(config.lost_evidence, config.match_least_fit, self._pose)
         self._map = ActiveMap(config)
-        self._heading = HeadingCorrection(LineMap(config, config, config.slam == 'ti'))
+        self._heading = HeadingCorrection(config)
         self._loops = LoopClosure(config, self._matcher)
         self._path = AnchoredPoses()
 
@@ -278,8 +280,7 @@ class ScanLocalizer:
         self._tracking.travel(path_m)
         if self._tracking.needs_new_map:
             self._begin_submap()
-        if config.slam != 'off':
-            self._correct_heading(scan)
+        self._correct_heading(scan)
         self._map.add_scan(points, scan.T_base_laser, self._pose)
         # What the motion leaves is new with every step; what the scan leaves is much the same error
         # as in the step before, as long as the same walls are seen.

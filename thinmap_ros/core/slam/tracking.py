@@ -89,7 +89,7 @@ class Tracking:
         self.evidence = _UNPLACED_EVIDENCE
 
     def begin_submap(self) -> None:
-        """Go on in a new local map."""
+        """Continue in a new local map."""
         self.evidence = 0.0
         self._adrift_m = _ADRIFT_M
 

@@ -1,0 +1,269 @@
+"""A grid that follows corrections in slices: in the end it is what rendering in one go gives."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from slam_room import corridor_ring, scan_in
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.grid import rerendering
+from thinmap_ros.core.grid.correctable import CorrectableGrid
+from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, log_odds
+from thinmap_ros.core.grid.rerendering import KeptScan, Rerendering
+from thinmap_ros.core.grid.tiles import TILE
+from thinmap_ros.core.scan import Scan
+
+WALLS = corridor_ring()
+CORNERS = np.array([[1.2, 1.2], [38.8, 1.2], [38.8, 18.8], [1.2, 18.8], [1.2, 1.2]])
+APART_M = 0.4
+
+
+def ring_poses():
+    """True poses (N, 3) once round the corridor."""
+    poses = []
+    for a, b in pairwise(CORNERS):
+        heading = np.arctan2(*(b - a)[::-1])
+        for s in np.arange(0.0, np.hypot(*(b - a)), APART_M):
+            poses.append([*(a + s * np.array([np.cos(heading), np.sin(heading)])), heading])
+    return np.array(poses)
+
+
+TRUE = ring_poses()
+SCANS = [
+    scan_in(WALLS, T, np.random.default_rng(k), k, se2.pose(0.1, 0.05, 0.3))
+    for k, T in enumerate(TRUE)
+]
+
+
+@pytest.fixture
+def small_slices(monkeypatch):
+    monkeypatch.setattr(rerendering, '_TILES_PER_SLICE', 24)
+
+
+def drifted(poses, rad_a_step):
+    """Poses (N, 3) of a robot whose heading drifts."""
+    believed = [poses[0]]
+    for a, b in pairwise(poses):
+        believed.append(se2.compose(believed[-1], se2.between(a, b) + [0.0, 0.0, rad_a_step]))
+    return np.array(believed)
+
+
+def correction(rng, count, spread_m):
+    """Stamps (M,) of some of the first scans, and poses (M, 3) somewhere near the true ones."""
+    stamps = np.flatnonzero(rng.random(count) < 0.2)
+    return stamps, TRUE[stamps] + rng.normal(0.0, spread_m, (len(stamps), 3)) * [1.0, 1.0, 0.1]
+
+
+class Drive:
+    """The same drive and corrections with a grid that is re-rendered in slices or in one go."""
+
+    def __init__(self, in_one_go):
+        self.map = CorrectableGrid(OccupancyGrid())
+        self.in_one_go = in_one_go
+        self.moved = []
+
+    def correct(self, stamps, poses, since_ns, T_map_base):
+        self.map.correct(stamps, poses, since_ns)
+        if self.in_one_go:
+            self.note(self.map.update(None, T_map_base) or self.map.finish())
+
+    def add(self, k, T_map_base, is_lost):
+        self.note(self.map.update(None if is_lost else SCANS[k], T_map_base))
+
+    def note(self, moved):
+        if moved is not None:
+            self.moved.append(moved)
+
+
+def run(seed, times, in_one_go):
+    """A drive of 200 scans with corrections before the scans of these numbers."""
+    rng = np.random.default_rng(seed)
+    drive = Drive(in_one_go)
+    believed = drifted(TRUE[:200], 0.002)
+    for k in range(200):
+        if k in times:
+            stamps, poses = correction(rng, k, 0.2)
+            drive.correct(stamps, poses, k, TRUE[k])
+            believed[k:] = drifted(TRUE[k:200], 0.001)
+        drive.add(k, believed[k], is_lost=rng.random() < 0.05)
+    drive.note(drive.map.finish())
+    return drive
+
+
+@pytest.mark.usefixtures('small_slices')
+@settings(max_examples=12, deadline=None)
+@given(st.integers(0, 10**6), st.sets(st.integers(1, 199), min_size=1, max_size=4))
+def test_in_the_end_slices_give_what_rendering_in_one_go_gives(seed, times):
+    sliced, at_once = run(seed, times, False), run(seed, times, True)
+    assert len(at_once.moved) == len(times) and 1 <= len(sliced.moved) <= len(times)
+    assert sliced.map.corrected_ns == at_once.map.corrected_ns == max(times)
+    one, other = sliced.map.shown.patch(), at_once.map.shown.patch()
+    assert one.frame == other.frame
+    np.testing.assert_array_equal(one.cells, other.cells)
+
+
+@pytest.mark.usefixtures('small_slices')
+def test_a_correction_during_a_rerendering_starts_it_again():
+    drive = run(3, {150, 152}, False)
+    assert len(drive.moved) == 1 and drive.map.corrected_ns == 152
+    believed = drifted(TRUE[:200], 0.002)[:150]
+    first = drive.moved[0].before[:130]
+    off = [np.abs(believed - T).sum(axis=1).min() for T in first]
+    assert max(off) < 1e-9, 'moved from where they were before the first of the two'
+
+
+def drifted_map(count):
+    grid = CorrectableGrid(OccupancyGrid())
+    for k, T in enumerate(drifted(TRUE[:count], 0.003)):
+        grid.update(SCANS[k], T)
+    return grid
+
+
+def tiles_of(grid):
+    """Log odds of each tile by its place."""
+    state = grid.state()
+    return dict(zip(map(tuple, state['tiles'].tolist()), state['log_odds'], strict=True))
+
+
+@pytest.mark.usefixtures('small_slices')
+def test_each_tile_shows_the_old_rendering_until_its_new_one_is_complete_near_ones_first():
+    grid, whole = drifted_map(250), drifted_map(250)
+    old = tiles_of(grid.shown)
+    stamps = np.arange(250)
+    for each in (grid, whole):
+        each.correct(stamps, TRUE[:250], 250)
+    whole.update(None, TRUE[250])
+    whole.finish()
+    new = tiles_of(whole.shown)
+    nothing = np.zeros((TILE, TILE), dtype=np.int16)
+    robot = tuple((OccupancyGrid().frame.cells_of(TRUE[250:251, :2])[0] // TILE).tolist())
+    shown_at = {}
+    step = 0
+    while grid.is_rerendering:
+        grid.update(None, TRUE[250])
+        step += 1
+        for place, cells in tiles_of(grid.shown).items():
+            is_new = np.array_equal(cells, new.get(place, nothing))
+            assert is_new or np.array_equal(cells, old.get(place, nothing)), place
+            if is_new:
+                shown_at.setdefault(place, step)
+    assert step > 20
+    changed = {p for p in new if not np.array_equal(new[p], old.get(p, nothing))}
+    ring = {p: max(abs(p[0] - robot[0]), abs(p[1] - robot[1])) for p in changed}
+    first = [min(shown_at[p] for p in changed if ring[p] == r) for r in sorted({*ring.values()})]
+    assert first == sorted(first) and first[0] < first[-1]
+    assert shown_at[robot] < step / 2
+
+
+@pytest.mark.usefixtures('small_slices')
+def test_new_scans_are_shown_at_once_and_stay_shown():
+    grid = drifted_map(120)
+    grid.correct(np.arange(120), TRUE[:120], 120)
+    news = OccupancyGrid()
+    k = 120
+    while grid.is_rerendering:
+        grid.update(SCANS[k], TRUE[k])
+        news.update(SCANS[k], TRUE[k])
+        for row, col in np.argwhere(news.patch().cells >= 0)[::7].tolist():
+            x, y = news.patch().frame.centres_of(np.array([[row, col]]))[0]
+            assert grid.shown.window(x, y, 0.1).cells[0, 0] >= 0, (x, y)
+        k += 1
+    assert k > 150
+
+
+def test_a_slice_does_a_bounded_part_of_the_work(monkeypatch):
+    """However long the drive was, a slice renders scans of at most so many tiles."""
+    done = []
+    pop = rerendering._Queue.pop
+    monkeypatch.setattr(rerendering._Queue, 'pop', lambda self: done.append(pop(self)) or done[-1])
+    kept = [KeptScan.of(scan, OccupancyConfig()) for scan in SCANS]
+    work = Rerendering(OccupancyGrid(), kept * 2, np.tile(TRUE, (2, 1)), TRUE[0])
+    shown = OccupancyGrid()
+    slices = []
+    while not work.is_complete:
+        before = len(done)
+        work.render_slice(shown)
+        slices.append(sum(task.tiles for task in done[before:]))
+    assert len(done) == 2 * len(SCANS)
+    assert max(slices) <= rerendering._TILES_PER_SLICE
+    assert len(slices) < 1.2 * sum(slices) / rerendering._TILES_PER_SLICE + 1
+
+
+def test_however_large_its_scans_a_rerendering_goes_faster_than_scans_come(monkeypatch):
+    monkeypatch.setattr(rerendering, '_TILES_PER_SLICE', 0)
+    grid = drifted_map(40)
+    grid.correct(np.arange(40), TRUE[:40], 40)
+    for k in range(40, 90):
+        grid.update(SCANS[k], TRUE[k])
+    assert not grid.is_rerendering
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_a_scan_touches_no_tile_beyond_those_that_it_is_thought_to(seed):
+    rng = np.random.default_rng(seed)
+    config = OccupancyConfig(
+        resolution_m=float(rng.choice([0.02, 0.05, 0.1])),
+        usable_range_m=float(rng.uniform(2.0, 9.0)),
+        no_return_range_m=float(rng.uniform(0.0, 9.0)),
+        surface_depth_m=float(rng.uniform(0.0, 0.5)),
+    )
+    ranges = rng.uniform(0.0, rng.uniform(1.0, 8.0), 90)
+    ranges[rng.random(90) < 0.3] = np.inf
+    mount = se2.pose(*rng.uniform(-1.0, 1.0, 2), rng.uniform(-3.0, 3.0))
+    scan = Scan.create(0, ranges, rng.uniform(-3.0, 3.0), 0.02, 0.1, 8.0, mount)
+    T = se2.pose(*rng.uniform(-50.0, 50.0, 2), rng.uniform(-3.0, 3.0))
+    grid = OccupancyGrid(config)
+    grid.update(scan, T)
+    extent = KeptScan.of(scan, config).extent
+    low, high = rerendering._tile_boxes([extent], T[None], grid.frame)[0]
+    touched = grid.tiles()
+    assert (touched >= low).all() and (touched <= high).all()
+    longest = 2.0 * max(config.usable_range_m, 1.0) / config.resolution_m / TILE
+    assert (high - low <= 1.5 * longest + 3).all()
+
+
+def test_what_is_rendered_again_at_the_same_poses_is_what_was_there():
+    """All scans touch the tile of the robot: they are rendered in the order in which they came."""
+    grid = CorrectableGrid(OccupancyGrid())
+    poses = [se2.pose(3.0 + 0.3 * k, 1.2, 0.0) for k in range(12)]
+    for k, T in enumerate(poses):
+        grid.update(SCANS[k], T)
+    before = grid.shown
+    grid.correct(np.arange(12), np.array(poses), 12)
+    assert grid.update(None, poses[-1]) is None and grid.shown is before
+    assert grid.update(None, poses[-1]) is not None and grid.shown is not before
+    np.testing.assert_array_equal(grid.shown.patch().cells, before.patch().cells)
+
+
+def test_a_grid_whose_scans_are_not_known_stays_as_it_is():
+    grid = CorrectableGrid(OccupancyGrid(), keeps_scans=False)
+    grid.update(SCANS[0], TRUE[0])
+    before = grid.shown.patch()
+    assert not grid.correct(np.array([0]), TRUE[[5]], 1)
+    assert not grid.is_rerendering and grid.corrected_ns == 1
+    assert grid.update(None, TRUE[0]) is None
+    np.testing.assert_array_equal(grid.shown.patch().cells, before.cells)
+
+
+def test_tiles_hold_the_sum_of_grids_within_the_limits():
+    one, other, total = OccupancyGrid(), OccupancyGrid(), OccupancyGrid()
+    for k in range(6):
+        one.update(SCANS[0], TRUE[0])
+        if k % 2:
+            other.update(SCANS[20], TRUE[20])
+    places = np.unique(np.vstack([one.tiles(), other.tiles()]), axis=0)
+    total.set_tiles(places, one, other)
+    single, added, both = tiles_of(one), tiles_of(other), tiles_of(total)
+    nothing = np.zeros((TILE, TILE), dtype=np.int16)
+    low, high = (round(1000 * log_odds(p)) for p in (one.config.p_lowest, one.config.p_highest))
+    for place in map(tuple, places.tolist()):
+        a, b = single.get(place, nothing), added.get(place, nothing)
+        known = (a != 0) | (b != 0)
+        np.testing.assert_array_equal(both[place] != 0, known)
+        expected = np.clip(a + b, low, high)
+        off = np.abs(both[place] - expected)
+        assert off.max() <= 1, 'even odds are a thousandth off'
+        assert not off[expected != 0].any()

@@ -1,0 +1,148 @@
+"""Storage in tiles: it grows with the building, whatever its shape, without long copies."""
+
+import copy
+import mmap
+import pickle
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
+from thinmap_ros.core.grid.tiles import TILE, TileStore
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import pose
+
+KILOMETRE = 313  # tiles of 64 cells of 0.05 m
+CELL = np.dtype([('hits', np.uint8), ('x', np.float64)])
+
+
+def line_of_tiles(first, end):
+    return np.column_stack([np.zeros(end - first, dtype=np.int64), np.arange(first, end)])
+
+
+def resident_bytes():
+    return int(Path('/proc/self/statm').read_text().split()[1]) * mmap.PAGESIZE
+
+
+def test_the_directory_of_a_corridor_of_a_kilometre_grows_a_few_times():
+    tiles = TileStore()
+    grown = 0
+    for col in range(KILOMETRE):
+        before = tiles.directory.shape
+        tiles.reach(0, col, 0, col)
+        grown += tiles.directory.shape != before
+    rows, cols = tiles.directory.shape
+    assert rows == 1 and cols >= KILOMETRE
+    assert grown < 20
+
+
+def test_only_a_side_that_grew_gets_room_to_spare():
+    tiles = TileStore()
+    tiles.reach(0, 0, 0, 100)
+    assert (tiles.first_row, tiles.first_col) == (0, 0)
+    tiles.reach(-1, 0, 0, 0)
+    assert tiles.first_row < -1
+    assert tiles.first_row + tiles.directory.shape[0] == 1
+    assert tiles.first_col == 0
+
+
+def test_the_directory_may_take_all_the_tiles_that_there_can_be():
+    tiles = TileStore()
+    tiles.reach(0, 0, 180, 180)
+    before = tiles.directory.shape
+    with pytest.raises(InputError, match='tiles: expected'):
+        tiles.reach(0, 0, 181, 181)
+    assert tiles.directory.shape == before
+
+
+def test_room_that_was_never_used_is_given_up_before_a_map_is_too_large():
+    tiles = TileStore()
+    for col in range(0, 250, 10):
+        tiles.write(0, col * TILE, np.ones((1, 1), dtype=np.int16))
+    assert tiles.directory.shape[1] > 250
+    tiles.reach(0, 0, 130, 240)
+    assert tiles.directory.shape == (131, 241)
+    with pytest.raises(InputError, match='tiles: expected'):
+        tiles.reach(0, 0, 137, 240)
+    assert (tiles.read(0, 0, 1, 241 * TILE)[0, :: 10 * TILE] == 1).all()
+
+
+def test_tiles_stay_where_they_are_when_the_directory_grows():
+    tiles = TileStore()
+    cells = np.arange(TILE * TILE, dtype=np.int16).reshape(TILE, TILE)
+    tiles.write(-TILE, 5 * TILE, cells)
+    for row, col in [(-9, 5), (7, 5), (0, -12), (0, 40)]:
+        tiles.reach(row, col, row, col)
+        np.testing.assert_array_equal(tiles.read(-TILE, 5 * TILE, TILE, TILE), cells)
+
+
+@pytest.mark.parametrize('first, step', [(0, 40.0), (980, -40.0)])
+def test_a_corridor_of_a_kilometre_in_cells_of_5_cm_is_mapped(first, step):
+    grid = OccupancyGrid(OccupancyConfig(resolution_m=0.05))
+    bearings = np.radians(np.arange(-90, 91))
+    ranges = np.minimum(1.2 / np.maximum(np.abs(np.sin(bearings)), 1e-9), 29.0)
+    scan = Scan.create(0, ranges, bearings[0], np.radians(1.0), 0.05, 30.0)
+    for k in range(26):
+        grid.update(scan, pose(first + step * k, 0.02, 0.0))
+    patch = grid.patch()
+    assert patch.shape[1] > 1000.0 / 0.05
+    middle = patch.frame.cells_of(np.array([[0.5, 0.02], [1000.5, 0.02]]))
+    assert (patch.cells[tuple(middle.T)] == 35).all()
+
+
+@pytest.mark.skipif(
+    resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY,
+    reason='the address space is limited here',
+)
+def test_the_pool_is_not_copied_and_takes_memory_where_it_is_written():
+    tiles = TileStore(CELL)
+    tiles.reach(0, 0, 0, 5000)
+    pool = tiles.pool
+    before = resident_bytes()
+    tiles.ensure(line_of_tiles(0, 4000))
+    assert tiles.pool is pool
+    tile_bytes = pool[0].nbytes
+    assert resident_bytes() - before < 200 * tile_bytes
+    pool[:1000]['hits'] = 1
+    assert 900 * tile_bytes < resident_bytes() - before < 1500 * tile_bytes
+
+
+LIMITED = """
+import resource
+from pathlib import Path
+import numpy as np
+from thinmap_ros.core.grid.tiles import TileStore
+
+now = int(Path('/proc/self/statm').read_text().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (now + 2**28, resource.RLIM_INFINITY))
+tiles = TileStore(np.int64)
+tiles.reach(0, 0, 0, 2000)
+for col in range(2000):
+    tiles.ensure(np.array([[0, col]]))
+    tiles.pool[col] = col
+assert (tiles.pool[:2000, 7, 7] == np.arange(2000)).all()
+"""
+
+
+def test_where_the_address_space_is_limited_the_pool_grows_by_copies():
+    """Room for the largest map would be 1 GB of this type: four times what there is."""
+    done = subprocess.run([sys.executable, '-c', LIMITED], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize('copied', [copy.deepcopy, lambda tiles: pickle.loads(pickle.dumps(tiles))])
+def test_copies_hold_the_tiles_and_not_the_room(copied):
+    tiles = TileStore()
+    tiles.write(3, -70, np.full((200, 100), 5, dtype=np.int16))
+    other = copied(tiles)
+    assert len(other.pool) == tiles.used
+    other.write(0, 500, np.full((10, 10), 7, dtype=np.int16))
+    other.write(3, -70, np.full((1, 1), 6, dtype=np.int16))
+    np.testing.assert_array_equal(tiles.read(3, -70, 200, 100), 5)
+    assert other.read(3, -70, 2, 1).ravel().tolist() == [6, 5]
+    assert not tiles.read(0, 500, 10, 10).any() and (other.read(0, 500, 10, 10) == 7).all()
