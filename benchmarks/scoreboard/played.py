@@ -25,13 +25,18 @@ _WRONG_M = 0.5
 
 @dataclass(eq=False)
 class Played:
-    """What a pipeline made of a drive: (N,) and (N, 3) by scan."""
+    """What a pipeline made of a drive: (N,) and (N, 3) by scan.
+
+    step_ms: localizer and grid, corrections included; stall_ms: the same, and the graph where it is
+    rebuilt after a correction.
+    """
 
     stamps_ns: list[int] = field(default_factory=list)
     poses: list[Array] = field(default_factory=list)
     covariances: list[Array] = field(default_factory=list)
     lost: list[bool] = field(default_factory=list)
     localizer_ms: list[float] = field(default_factory=list)
+    step_ms: list[float] = field(default_factory=list)
     stall_ms: list[float] = field(default_factory=list)
     final: Array = field(default_factory=lambda: np.zeros((0, 3)))
     before_mb: float = 0.0
@@ -46,6 +51,7 @@ class Played:
             'ms_median': float(np.median(taken)),
             'ms_mean': float(taken.mean()),
             'ms_99': float(np.percentile(taken, 99.0)),
+            'step_ms': max(self.step_ms),
             'stall_ms': max(self.stall_ms),
             'mb': self.peak_mb,
             'mb_more': self.peak_mb - self.before_mb,
@@ -75,9 +81,11 @@ class PlayedPipeline(CpuTimedPipeline):
         step = super().step(scan, T_odom_base)
         rebuild_s = sum(stages.get('rebuild', [])[rebuilds:])
         localizer_s = stages['localizer'][-1]
+        step_s = localizer_s + stages['grid'][-1]
         played = self.played
         played.localizer_ms.append(1e3 * localizer_s)
-        played.stall_ms.append(1e3 * (localizer_s + stages['grid'][-1] + rebuild_s))
+        played.step_ms.append(1e3 * step_s)
+        played.stall_ms.append(1e3 * (step_s + rebuild_s))
         played.stamps_ns.append(scan.stamp_ns)
         played.poses.append(step.estimate.T_map_base)
         played.covariances.append(step.estimate.covariance)
