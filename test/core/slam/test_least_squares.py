@@ -288,7 +288,8 @@ def test_the_prior_pulls_as_its_cost_falls(rng):
     information = np.linalg.inv(DOUBT)
     prior = np.array([1.0, -2.0, 3.1])
     for scale in (0.1, 1.0, 10.0):
-        pose = prior + scale * rng.normal(0.0, 0.1, 3)
+        pose = prior + scale * np.array([*rng.normal(0.0, 0.1, 2), 0.1])
+        pose[2] = se2.wrap(float(pose[2]))
         pull, weight, cost = by_prior(pose, prior, information)
         off = se2.off(pose, prior)
         squared = off @ information @ off
@@ -314,8 +315,10 @@ def test_a_minimum_is_one(rng, room, scan):
     """No higher than where it began, and what is told of it is what is there."""
     information = np.linalg.inv(DOUBT)
     settled = 0
-    for _ in range(30):
-        start = TRUTH + rng.normal(0.0, [0.1, 0.1, 0.1])
+    for k in range(60):
+        if k == 30:  # points that change their walls at every step, of which some lead uphill
+            scan = strange_scan(rng)
+        start = TRUTH + rng.normal(0.0, 0.1, 3)
         given = start.copy()
         pose, H, sums, weight = minimize(scan, start, TRUTH, information, room.lattice, *NOISE)
         np.testing.assert_array_equal(start, given)
@@ -328,7 +331,7 @@ def test_a_minimum_is_one(rng, room, scan):
         np.testing.assert_allclose(H, H_there, rtol=1e-9, atol=1e-6)
         assert weight == pytest.approx(weight_there)
         step = np.linalg.solve(H + weight * information, g - pull)
-        settled += np.abs(step).max() < 2e-3
+        settled += k < 30 and np.abs(step).max() < 2e-3
     assert settled >= 27
 
 
@@ -351,9 +354,10 @@ def test_headings_of_minima_are_wrapped(rng):
     information = np.linalg.inv(DOUBT)
     for start in (math.pi + 0.03, -math.pi + 0.03, -math.pi - 0.05):
         prior = np.array([2.0, 2.0, -math.pi + 0.01])
-        pose, *_ = minimize(
+        pose, _, _, weight = minimize(
             scan, np.array([2.0, 2.0, start]), prior, information, room.lattice, *NOISE
         )
+        assert weight > 0.9, 'the prior is not a turn away'
         assert abs(pose[2]) <= math.pi
         assert abs(se2.wrap(float(pose[2] - truth[2]))) < 0.01
 

@@ -236,6 +236,21 @@ def test_in_a_crowd_the_prior_holds(seed, number):
     assert np.trace(crowd.by_scan) < np.trace(clean.by_scan), 'what is hidden says nothing'
 
 
+def test_a_search_never_makes_a_match_worse():
+    """It tries some of the points alone, and may take a pose for better than it is."""
+    searched = 0
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        room = map_of(ROOM, around(TRUTH, 4, rng), rng)
+        points = seen_in(np.vstack([ROOM, people(TRUTH, 12, rng)]), TRUTH, rng)
+        prior = TRUTH + rng.normal(0.0, 0.05, 3)
+        covariance = np.diag(np.square([0.05, 0.05, 0.05]))
+        alone = nearest_minimum(room, points, prior, covariance)
+        searched += alone.fit < MATCHER.config.match_least_fit
+        assert match(room, points, prior, covariance).cost <= alone.cost
+    assert searched > 40
+
+
 def test_two_thirds_of_gross_outliers_do_not_pull(rng, room):
     points = np.vstack([seen_in(ROOM, TRUTH, rng)[::2], clutter(rng, 160)])
     found = match(room, points, TRUTH, np.diag(np.square([0.01, 0.01, 0.01])))

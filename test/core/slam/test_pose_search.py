@@ -196,11 +196,12 @@ def test_the_cost_is_that_of_the_reference_and_its_bound_is_lower(rng):
             return pose_search._cost(moving, pose, lattice, *NOISE, slack, np.inf)
 
         flat = 1e-12 * np.eye(3)
+        reference = Exhaustive(case.local_map)
         for _ in range(20):
             node = case.truth + rng.normal(0.0, [0.05, 0.05, 0.02])
-            reference = Exhaustive(case.local_map)
-            expected = reference.costs(case.scan, node[None], case.truth, flat)[0]
-            assert cost(node, 0.0) == pytest.approx(expected, rel=1e-9, abs=1e-9)
+            for pose in (node, node + rng.uniform(-5.0, 5.0, 3)):
+                expected = reference.costs(case.scan, pose[None], pose, flat)[0]
+                assert cost(pose, 0.0) == pytest.approx(expected, rel=1e-9, abs=1e-9)
             for slack in (2.0, 4.0):
                 leaf = 0.75 if slack == 4.0 else 0.5
                 corner = rng.choice([-leaf, leaf], 3) * slack * CELL_M
