@@ -12,7 +12,7 @@ from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, Wind
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizers import localizer_class
+from thinmap_ros.core.slam.localizers import localizer_class, set_topology
 from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
 from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig
 
@@ -95,7 +95,7 @@ class Pipeline:
         with self._timed('topology'):
             window = self.grid.window(T_map_base[0], T_map_base[1], self.config.window.window_m)
             if not self._grid.is_rerendering and self.topology.update(window, T_map_base):
-                self.localizer.set_topology(self.topology.map)
+                set_topology(self.localizer, self.topology.map)
         return window
 
     def _rebuild(self, moved: MovedPoses) -> None:
@@ -103,7 +103,7 @@ class Pipeline:
         with self._timed('rebuild'):
             size = self.config.window.window_m
             self.topology.rebuild(lambda x, y: self.grid.window(x, y, size), *moved)
-            self.localizer.set_topology(self.topology.map)
+            set_topology(self.localizer, self.topology.map)
 
     @contextmanager
     def _timed(self, stage: str) -> Iterator[None]:

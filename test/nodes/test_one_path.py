@@ -153,8 +153,7 @@ def test_the_filter_of_the_paper_says_live_what_it_says_replayed(graph, tmp_path
 
 
 def test_a_closed_loop_corrects_the_live_map_as_it_does_the_replayed_one(graph, tmp_path):
-    # Without lines: with them the robot does not drift enough for a loop to be corrected.
-    start = {'start_x_m': 3.0, 'start_y_m': 1.2, 'slam': 'off'}
+    start = {'start_x_m': 3.0, 'start_y_m': 1.2}
     expected = replay(LoopLog(), PipelineConfig(localizer=ScanLocalizerConfig(**start)))
     assert 'rebuild' in expected.pipeline.stage_seconds
     convert(LoopLog(), tmp_path / 'bag')

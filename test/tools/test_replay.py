@@ -91,15 +91,15 @@ def test_files_and_figures(log, tmp_path, form):
     assert patch.occupied[wall[0], wall[1] - 1 : wall[1] + 2].any()
 
 
-@pytest.mark.parametrize('slam', ['off', 'ti', 'ekf_ti', 'ekf_full'])
-def test_each_localizer_replays_it_with_and_without_line_features(tmp_path, slam):
+@pytest.mark.parametrize('slam', ['scan_matching', 'ekf_ti', 'ekf_full'])
+def test_each_localizer_replays_it(tmp_path, slam):
     log = tmp_path / 'log.clf'
     log.write_text('\n'.join(carmen_lines(scans=60)) + '\n')
     done = run(log, '-o', tmp_path / 'out', '--slam', slam)
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / 'out' / 'report.json').read_text())
     assert (report['scans'], report['skipped']) == (60, 0)
-    assert (report['features'] == 0) == (slam == 'off')
+    assert (report['features'] == 0) == (slam == 'scan_matching')
     trajectory = np.loadtxt(tmp_path / 'out' / 'trajectory.tum')
     assert np.abs(trajectory[:, 1] - 0.03 * np.arange(60)).max() < 0.05
 
@@ -107,7 +107,7 @@ def test_each_localizer_replays_it_with_and_without_line_features(tmp_path, slam
 def test_the_localizer_is_the_scan_matcher_unless_it_is_told(log, tmp_path):
     for name, options in (
         ('default', []),
-        ('scans', ['--slam', 'ti']),
+        ('scans', ['--slam', 'scan_matching']),
         ('filter', ['--slam', 'ekf_ti']),
     ):
         assert run(log, '-o', tmp_path / name, *options).returncode == 0

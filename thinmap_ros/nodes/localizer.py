@@ -32,7 +32,12 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import LastPose, ScanPairing
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizers import AnyLocalizer, localizer_class
+from thinmap_ros.core.slam.localizers import (
+    AnyLocalizer,
+    line_features,
+    localizer_class,
+    set_topology,
+)
 from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
 from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 
@@ -130,7 +135,7 @@ class LocalizerNode(LiveNode):
 
     def _on_topology(self, message: TopologicalMap) -> None:
         self._topology = messages.topology_from(message)
-        self._localizer.set_topology(self._topology)
+        set_topology(self._localizer, self._topology)
 
     def _take(self, ready: list[tuple[Scan, Array]]) -> None:
         if self._resumed is not None:
@@ -187,7 +192,7 @@ class LocalizerNode(LiveNode):
             kind = localizer_class(self._config)
             self._localizer = kind.resumed(self._latched, last, T_odom_base, self._config)
         if self._topology is not None:
-            self._localizer.set_topology(self._topology)
+            set_topology(self._localizer, self._topology)
         self._resumed = self._latched = None
         self.destroy_subscription(self._map_topic)
         return self._newest
@@ -210,8 +215,9 @@ class LocalizerNode(LiveNode):
             return 'no features are saved: the localizer keeps its own'
         self._localizer = loaded
         if self._topology is not None:
-            loaded.set_topology(self._topology)
-        return f'{len(loaded.features)} features'
+            set_topology(loaded, self._topology)
+        features = line_features(loaded)
+        return f'{len(features)} line features' if features else 'the local map'
 
     def _publish(self, scan: Scan, estimate: Estimate, step_ms: float) -> None:
         ns = scan.stamp_ns
@@ -229,7 +235,7 @@ class LocalizerNode(LiveNode):
         )
         self._tf.publish(TFMessage(transforms=[transform]))
         header = messages.header(self._map_frame, ns)
-        features = [_feature_msg(feature) for feature in self._localizer.features]
+        features = [_feature_msg(feature) for feature in line_features(self._localizer)]
         self._features.publish(LineFeatureArray(header=header, features=features))
         self._status.publish(
             SlamStatus(

@@ -26,6 +26,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.odometry import ScanPairing
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.localizers import line_features
 from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.tools import cli
@@ -109,7 +110,7 @@ def _report(result: Replay, poses: Array, seconds: tuple[float, float]) -> dict[
         'loops_closed': result.pipeline.corrections,
         'rebuild_ms': round(1000.0 * float(rebuilds.max(initial=0.0)), 1),
         'ms_per_scan': {name: _spread(1000.0 * taken) for name, taken in stages.items()},
-        'features': len(result.pipeline.localizer.features),
+        'features': len(line_features(result.pipeline.localizer)),
         'features_local_median': float(np.median(result.local_features)),
         'refused': result.pipeline.localizer.refused,
         'distance': round(float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum()), 3),

@@ -7,6 +7,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.localizers import line_features
 from thinmap_ros.pipeline import Pipeline
 
 # What is large is put together once a second, as a view does not draw it more often.
@@ -55,7 +56,7 @@ class ReplayView:
         view.grid(ns, pipeline.grid.patch())
         view.topology(ns, topology)
         view.number(ns, 'count', 'nodes', float(len(topology.nodes)))
-        features = pipeline.localizer.features
+        features = line_features(pipeline.localizer)
         ends = np.array([[feature.start, feature.end] for feature in features]).reshape(-1, 2, 2)
         view.lines(ns, ends, np.array([feature.local for feature in features], dtype=bool))
         near = {node for feature in features if feature.local for node in feature.nodes}

@@ -120,34 +120,3 @@ def test_an_update_with_nonsense_changes_nothing(rng, bad):
     np.testing.assert_array_equal(fast.pose, pose)
     np.testing.assert_array_equal(fast.covariance, P)
     assert fast.update(np.array([], dtype=np.int64), np.empty((0, 2)), np.empty((0, 2, 2)))
-
-
-def test_an_update_that_moves_the_pose_too_far_is_left_out(rng):
-    fast, _ = both(rng, 3)
-    fast.predict(fast.pose, np.zeros(3), Q)
-    tight, before = 1e-8 * np.eye(3), (fast.mean, fast.covariance)
-    z = look(rng, fast, [0, 2]) + [0.1, 0.0]
-    assert fast.update(np.array([0, 2]), z, np.tile(R, (2, 1, 1)), tight)
-    np.testing.assert_array_equal(fast.mean, before[0])
-    np.testing.assert_array_equal(fast.covariance, before[1])
-    free, plain = both(rng, 3)
-    assert free.update(
-        np.array([0, 2]), look(rng, free, [0, 2]), np.tile(R, (2, 1, 1)), 1e3 * np.eye(3)
-    )
-    assert not np.array_equal(free.covariance, plain.P)
-
-
-def test_what_updates_did_to_the_features_can_be_taken_back(rng):
-    fast, _ = both(rng, 4)
-    before = fast.mean
-    assert fast.update(np.array([0, 2]), look(rng, fast, [0, 2]), np.tile(R, (2, 1, 1)))
-    moved = fast.mean - before
-    np.testing.assert_allclose(fast.moved_by_updates(), moved[:3], atol=1e-15)
-    fast.add(np.array([3.0, 0.5]), R)
-    fast.remove(1)
-    fast.take_back(0.5)
-    kept = [0, 1, 2, 3, 4, 7, 8, 9, 10]
-    np.testing.assert_allclose(fast.mean[3:9], (before + 0.5 * moved)[kept[3:]], atol=1e-12)
-    np.testing.assert_array_equal(fast.pose, (before + moved)[:3])
-    fast.take_back(1.0)
-    np.testing.assert_allclose(fast.mean[3:9], (before + 0.5 * moved)[kept[3:]], atol=1e-12)

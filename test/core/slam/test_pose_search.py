@@ -122,7 +122,7 @@ def test_the_search_finds_the_least_of_its_lattice(most_nodes):
 def test_where_wheels_have_slipped_the_search_finds_nearly_the_least():
     """Far from a sharp prior, whose cost differs much within a node and is taken at its middle."""
     found, gaps = exact([Case(seed, slips=True) for seed in range(60)], 1000)
-    assert found.mean() >= 0.75
+    assert found.mean() >= 0.95
     assert gaps.max() < 20.0
 
 

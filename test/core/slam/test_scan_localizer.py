@@ -146,17 +146,7 @@ def test_the_estimate_is_told_in_a_consistent_way(whole_drive):
         )
         np.testing.assert_array_equal(estimate.covariance, estimate.covariance.T)
         assert np.linalg.eigvalsh(estimate.covariance).min() >= -1e-12
-        assert estimate.matched <= estimate.observed
-        assert estimate.n_local <= estimate.n_features
         assert 0.0 <= estimate.match_quality <= 1.0
-
-
-@pytest.mark.parametrize('slam', ['ti', 'off'])
-def test_features_are_mapped_unless_they_are_off(slam):
-    rows, localizer = driven(300, slam=slam)
-    assert (len(localizer.features) > 3) == (slam != 'off')
-    assert (sum(estimate.observed for _, estimate, _ in rows) > 0) == (slam != 'off')
-    assert worst(rows) < 0.08
 
 
 def test_the_same_input_gives_the_same_output():
@@ -178,10 +168,7 @@ def test_a_robot_that_stands_learns_nothing_new():
     localizer = at_start()
     scans = [scan_in(ROOM, START, rng, k * PERIOD_NS) for k in range(60)]
     estimates = [localizer.step(scan, np.zeros(3)) for scan in scans]
-    assert estimates[0].observed > 0
-    assert all(estimate.observed == 0 for estimate in estimates[1:])
     assert np.abs(np.array([e.T_map_base for e in estimates]) - START).max() < 0.02
-    assert not localizer.features
     assert len(localizer.keyframes) == 1
 
 
@@ -315,7 +302,6 @@ def test_without_any_wall_the_odometry_is_followed():
     # The first scan is where the robot starts.
     moved = se2.between(se2.pose(0.1, 0.0, 0.02), odom)
     np.testing.assert_allclose(estimate.T_map_base, se2.compose(START, moved), atol=1e-6)
-    assert not localizer.features
     assert np.linalg.eigvalsh(estimate.covariance)[-1] > 1e-3
 
 
@@ -573,7 +559,6 @@ def test_a_robot_that_was_put_somewhere_roughly_draws_nothing_until_a_scan_fits(
 def test_after_a_reset_everything_is_forgotten():
     rows, localizer = driven(200)
     localizer.reset()
-    assert not localizer.features
     assert not localizer.keyframes
     assert localizer.corrected_path().shape == (0, 3)
     estimate = localizer.step(scan_in(ROOM, START), rows[-1][2])
@@ -581,26 +566,19 @@ def test_after_a_reset_everything_is_forgotten():
 
 
 def test_a_map_is_taken_over_by_another_localizer(whole_drive):
-    """A saved map: the robot is lost in it until it fits, then goes on; features keep their ids."""
+    """A saved map: the robot is lost in it until it fits, then goes on."""
     _, first = whole_drive
     state = {name: array.copy() for name, array in first.state().items()}
-    before = {f.id: (f.r_m, f.alpha_rad, f.nodes) for f in first.features}
     second = ScanLocalizer.from_state(state, ScanLocalizerConfig(**AT_START))
-    assert {f.id: (f.r_m, f.alpha_rad, f.nodes) for f in second.features} == before
-    np.testing.assert_array_equal(
-        [f.covariance for f in second.features], [f.covariance for f in first.features]
-    )
     rows, _ = driven(200, seed=8, localizer=second)
     lost = [estimate.lost for _, estimate, _ in rows]
     assert lost[0]
     assert not any(lost[10:])
     assert worst(rows[10:]) < 0.08
-    assert sum(f.id in before for f in second.features) > 0.7 * len(before)
 
 
 def test_a_robot_that_is_put_elsewhere_in_a_given_map_goes_on_in_it(whole_drive):
     _, first = whole_drive
-    before = {f.id for f in first.features}
     second = ScanLocalizer.from_state(first.state())
     rng = np.random.default_rng(8)
     elsewhere = np.array([8.0, 8.0, np.pi / 2.0])
@@ -611,8 +589,6 @@ def test_a_robot_that_is_put_elsewhere_in_a_given_map_goes_on_in_it(whole_drive)
         rows.append((truth, estimate, odom))
     assert not any(estimate.lost for _, estimate, _ in rows[10:])
     assert worst(rows[10:]) < 0.1
-    assert sum(f.id in before for f in second.features) > 0.7 * len(before)
-    assert sum(estimate.matched for _, estimate, _ in rows) > 100
 
 
 def test_a_robot_that_is_not_where_a_given_map_says_stays_lost(whole_drive):
@@ -661,9 +637,11 @@ def test_a_killed_localizer_goes_on_in_the_occupancy_map(slip):
             last = LastPose(scan.stamp_ns, estimate.T_map_odom, odom)
         elif k >= 450:
             if k == 450:
-                slipped = se2.compose(odom, off)
-                localizer = ScanLocalizer.resumed(grid.patch(), last, slipped, config)
-            rows.append((truth, localizer.step(scan, se2.compose(odom, off)), odom))
+                began = odom
+                began_slipped = se2.compose(odom, off)
+                localizer = ScanLocalizer.resumed(grid.patch(), last, began_slipped, config)
+            slipped = se2.compose(began_slipped, se2.between(began, odom))
+            rows.append((truth, localizer.step(scan, slipped), odom))
     assert not rows[-1][1].lost
     assert worst(rows[10:]) < 0.1
 
@@ -675,8 +653,6 @@ def test_a_killed_localizer_goes_on_in_the_occupancy_map(slip):
         ('tiles', np.zeros((3, 3), dtype=np.int64)),
         ('means', np.full((1, 64, 64, 2), np.nan, dtype=np.float32)),
         ('hits', None),
-        ('lines', np.zeros((1, 3))),
-        ('next_id', np.array(1)),
     ],
 )
 def test_a_state_that_is_none_is_refused_in_words(whole_drive, name, value):
@@ -690,7 +666,7 @@ def test_a_state_that_is_none_is_refused_in_words(whole_drive, name, value):
 
 def test_a_loop_that_is_closed_while_the_robot_slides_into_the_old_map_is_closed_well():
     """Back at the start, the old walls take the robot over before the loop is closed."""
-    localizer = at_start(start_x_m=3.0, start_y_m=1.2, slam='off')
+    localizer = at_start(start_x_m=3.0, start_y_m=1.2)
     corrections = 0
     away = []
     for scan, odom, truth in drive_round_the_block():
@@ -746,10 +722,9 @@ def test_the_map_is_rendered_again_the_nearest_part_first(round_the_block):
     assert known().mean() > 0.98
 
 
-@pytest.mark.parametrize('slam', ['ti', 'off'])
-def test_the_heading_is_held_along_corridors(slam):
+def test_the_heading_is_held_along_corridors():
     """Until the loop round the block is closed."""
-    localizer = at_start(start_x_m=3.15, start_y_m=1.2, slam=slam)
+    localizer = at_start(start_x_m=3.15, start_y_m=1.2)
     off = []
     for scan, odom, truth in drive_round_the_block():
         estimate = localizer.step(scan, odom)

@@ -57,10 +57,6 @@ class Candidates:
         self._all = [c for c in self._all if c.last_look >= oldest and c not in ripe]
         return ripe
 
-    def forget(self) -> None:
-        """Drop them all: what they were compared with has moved."""
-        self._all.clear()
-
     def _take(
         self, pose: Array, z: Array, covariance: Array, ends_map: Array, laser_map: Array
     ) -> Candidate:

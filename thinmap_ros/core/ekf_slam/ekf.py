@@ -13,8 +13,6 @@ from thinmap_ros.core.ekf_slam.models import motion_jacobians, observe_line, pla
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.se2 import Array, wrap
 
-_POSE_GATE = 11.34  # largest squared Mahalanobis distance of a step of the pose (99 %, 3 dof)
-
 
 class EkfSlam:
     """The filter. Features are addressed by their place in the state, 0 to count - 1.
@@ -28,8 +26,6 @@ class EkfSlam:
         self.first = 3 + carried  # where the features begin
         self._x: Array = np.zeros(self.first + 2 * 32)
         self._P: Array = np.zeros((self._x.size, self._x.size))
-        # What updates did to the mean since `take_back` was last called.
-        self._step: Array = np.zeros(self._x.size)
         self.count = 0
         self.set_pose(T_map_base, covariance)
 
@@ -81,7 +77,6 @@ class EkfSlam:
         self._reserve(n)
         self.count = (n - self.first) // 2
         self._x[:n], self._P[:n, :n] = mean, covariance
-        self._step[:] = 0.0
 
     def set_pose(self, T_map_base: Array, covariance: Array) -> None:
         """Put the robot at a pose (3,) with covariance (3, 3), independent of the features."""
@@ -90,12 +85,6 @@ class EkfSlam:
         self._x[2] = wrap(float(T_map_base[2]))
         self._P[:3, :n], self._P[:n, :3] = 0.0, 0.0
         self._P[:3, :3] = 0.5 * (covariance + covariance.T)
-        self._step[:] = 0.0
-
-    def move_pose(self, T_map_base: Array) -> None:
-        """Put the robot at a pose (3,), as doubtful, and as bound to the features, as it was."""
-        self._x[:3] = T_map_base
-        self._x[2] = wrap(float(T_map_base[2]))
 
     def predict(self, T_map_base: Array, increment: Array, increment_covariance: Array) -> None:
         """Move to T_map_base = pose o increment of covariance (3, 3), by eqs. (10) and (11).
@@ -118,29 +107,11 @@ class EkfSlam:
         H = np.hstack([by_pose, by_line])
         return expected, H @ self._P[np.ix_(at, at)] @ H.T, H
 
-    def moved_by_updates(self) -> Array:
-        """How far the updates since the last `take_back` moved the pose, (3,)."""
-        return self._step[:3].copy()
-
-    def take_back(self, share: float) -> None:
-        """Move the features back by a share of what these updates moved them.
-
-        The pose is left to the caller.
-        """
-        n = self.size
-        self._x[3:n] -= share * self._step[3:n]
-        self._step[:] = 0.0
-        self._normalise()
-
-    def update(
-        self, indices: NDArray[np.int64], z: Array, R: Array, leeway: Array | None = None
-    ) -> bool:
+    def update(self, indices: NDArray[np.int64], z: Array, R: Array) -> bool:
         """Correct by features (M,) seen as lines z (M, 2) of covariances R (M, 2, 2), eqs. (6)-(9).
 
-        Returns False, and changes nothing, where the numbers do not make an update. An update that
-        would move the pose farther than a leeway (3, 3), a covariance, allows contradicts what is
-        known from elsewhere, and is left out. H has five nonzero columns a line, so H P takes these
-        rows only.
+        Returns False, and changes nothing, where the numbers do not make an update. H has five
+        nonzero columns a line, so H P takes these rows only.
         """
         if len(indices) == 0:
             return True
@@ -158,14 +129,7 @@ class EkfSlam:
             rows = slice(2 * k, 2 * k + 2)
             S[:, rows] = HP[:, :3] @ by_pose.T + HP[:, at] @ by_line.T
             S[rows, rows] += R[k]
-        if leeway is not None and _beyond(HP[:, :3].T @ np.linalg.solve(S, v), leeway):
-            return True
-        before = self._x[:n].copy()
-        taken = self._correct(v, S, HP)
-        self._step[:n] += self._x[:n] - before
-        for angles in (self._step[2:3], self._step[self.first + 1 : n : 2]):
-            angles[:] = wrap(angles)
-        return taken
+        return self._correct(v, S, HP)
 
     def tie(self, kept: int, dropped: int, covariance: Array) -> bool:
         """Let two features be one wall: their difference is 0 up to a covariance (2, 2).
@@ -192,7 +156,7 @@ class EkfSlam:
         n = self.size
         self._reserve(n + 2)
         line, by_pose, by_seen = place_line(self._x[:3], seen)
-        self._x[n : n + 2], self._step[n : n + 2] = line, 0.0
+        self._x[n : n + 2] = line
         self._P[n : n + 2, :n] = by_pose @ self._P[:3, :n]
         self._P[:n, n : n + 2] = self._P[n : n + 2, :n].T
         own = by_pose @ self._P[:3, :3] @ by_pose.T + by_seen @ covariance @ by_seen.T
@@ -204,7 +168,7 @@ class EkfSlam:
         """Drop a feature; those behind it move up by one."""
         keep = np.delete(np.arange(self.size), np.r_[self.place(index)])
         n = keep.size
-        self._x[:n], self._step[:n] = self._x[keep], self._step[keep]
+        self._x[:n] = self._x[keep]
         self._P[:n, :n] = self._P[np.ix_(keep, keep)]
         self.count -= 1
 
@@ -222,10 +186,13 @@ class EkfSlam:
         if size <= self._x.size:
             return
         wider = max(size, 2 * self._x.size)
-        x, step, P = np.zeros(wider), np.zeros(wider), np.zeros((wider, wider))
+        x = np.zeros(wider)
+        P = np.zeros((wider, wider))
         n = self.size
-        x[:n], step[:n], P[:n, :n] = self._x[:n], self._step[:n], self._P[:n, :n]
-        self._x, self._step, self._P = x, step, P
+        x[:n] = self._x[:n]
+        P[:n, :n] = self._P[:n, :n]
+        self._x = x
+        self._P = P
 
     def _normalise(self) -> None:
         """Angles into (-pi, pi].
@@ -238,10 +205,6 @@ class EkfSlam:
 
 def _difference(seen: Array, expected: Array) -> Array:
     return np.array([seen[0] - expected[0], wrap(float(seen[1] - expected[1]))])
-
-
-def _beyond(step: Array, leeway: Array) -> bool:
-    return bool(step @ np.linalg.solve(leeway, step) > _POSE_GATE)
 
 
 def line_difference(a: Array, b: Array) -> tuple[Array, Array]:

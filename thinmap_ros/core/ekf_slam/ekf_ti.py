@@ -95,15 +95,6 @@ class CompressedEkf:
         self.local = _carrying(self.local.pose, mean, 0.5 * (own + own.T), len(self._cross))
         self.area = list(ids)
 
-    def move(self, lines: dict[int, Array]) -> None:
-        """Put features at other lines (r, alpha), as doubtful as they were."""
-        self.enter(self.area)
-        for feature_id, line in lines.items():
-            place = 2 * self._places[feature_id]
-            self._store.mean[place : place + 2] = line
-        for index, feature_id in enumerate(self.area):
-            self.local.lines[index] = lines.get(feature_id, self.local.lines[index])
-
     def work_off(self) -> None:
         """Work some rows of what was folded into the store; to be called once a step."""
         self._store.sweep()

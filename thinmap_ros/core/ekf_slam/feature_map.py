@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core import se2, snapshot
+from thinmap_ros.core import snapshot
 from thinmap_ros.core.config import parameter
 from thinmap_ros.core.ekf_slam import local_area
 from thinmap_ros.core.ekf_slam.association import AssociationConfig, associate, mahalanobis, meeting
@@ -27,13 +27,11 @@ from thinmap_ros.core.ekf_slam.features import (
     as_seen,
     ends_of,
     interval,
-    moved_line,
     normals_of,
 )
 from thinmap_ros.core.ekf_slam.lines import Lines
 from thinmap_ros.core.ekf_slam.local_area import LocalArea
 from thinmap_ros.core.ekf_slam.visibility import seen_through
-from thinmap_ros.core.estimate import Correction
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, transform_points
 from thinmap_ros.core.snapshot import FAR_M, LARGEST_COUNT, LARGEST_ID, Field
@@ -140,12 +138,10 @@ class FeatureMap:
         ekf: CompressedEkf,
         lines: Lines,
         scan: Scan,
-        leeway: Array | None = None,
         learn: bool = True,
     ) -> tuple[int, bool]:
         """Associate and correct the filter by the lines of a scan, then look after the features.
 
-        leeway (3, 3): the covariance with which the pose is known by other means, where it is.
         learn: whether features may grow, come and go.
         Returns how many were matched, and whether the filter took the update.
         """
@@ -153,7 +149,7 @@ class FeatureMap:
             self._choose_area(ekf, scan)
         lines = Lines(lines.z, lines.covariances + self._walls(lines), lines.ends)
         laser_map = transform_points(ekf.local.pose, scan.T_base_laser[None, :2])[0]
-        chosen, taken = self._correct(ekf, lines, laser_map, leeway)
+        chosen, taken = self._correct(ekf, lines, laser_map)
         matched = np.flatnonzero(chosen >= 0)
         unknown = np.flatnonzero(chosen < 0)
         if not learn:
@@ -179,7 +175,7 @@ class FeatureMap:
         return walls
 
     def _correct(
-        self, ekf: CompressedEkf, lines: Lines, laser_map: Array, leeway: Array | None
+        self, ekf: CompressedEkf, lines: Lines, laser_map: Array
     ) -> tuple[NDArray[np.int64], bool]:
         """Update by the lines that can only be one feature, then by the others.
 
@@ -188,33 +184,15 @@ class FeatureMap:
         features = self._local(ekf)
         choice = associate(ekf.local, features, lines, laser_map, self._config)
         chosen = np.where(choice.ambiguous, -1, choice.index)
-        taken = _update(ekf.local, chosen, lines, leeway)
+        taken = _update(ekf.local, chosen, lines)
         left = np.flatnonzero(choice.ambiguous)
         if left.size:
             again = associate(
                 ekf.local, features, lines.chosen(left), laser_map, self._config
             ).index
-            taken &= _update(ekf.local, again, lines.chosen(left), leeway)
+            taken &= _update(ekf.local, again, lines.chosen(left))
             chosen[left] = again
         return chosen, taken
-
-    def move(self, ekf: CompressedEkf, correction: Correction) -> None:
-        """Take features where the keyframes nearest to where they were first seen from have gone.
-
-        How doubtful they are stays as it was. Two that turn out to be one wall are merged when they
-        are seen next.
-        """
-        places, moved = correction.before[:, :2], {}
-        for feature_id, line in ekf.lines().items():
-            feature = self._features[feature_id]
-            k = int(np.hypot(*(places - feature.seen_from).T).argmin())
-            T = se2.compose(correction.after[k], se2.invert(correction.before[k]))
-            ends = transform_points(T, ends_of(feature, line))
-            moved[feature_id] = moved_line(T, line)
-            feature.low, feature.high = interval(moved[feature_id], ends)
-            feature.seen_from = transform_points(T, feature.seen_from[None])[0]
-        ekf.move(moved)
-        self._candidates.forget()
 
     def _local(self, ekf: CompressedEkf) -> list[Feature]:
         return [self._features[i] for i in ekf.area]
@@ -353,6 +331,6 @@ def _is_covariance(P: Array) -> bool:
     return True
 
 
-def _update(ekf: EkfSlam, chosen: NDArray[np.int64], lines: Lines, leeway: Array | None) -> bool:
+def _update(ekf: EkfSlam, chosen: NDArray[np.int64], lines: Lines) -> bool:
     matched = np.flatnonzero(chosen >= 0)
-    return ekf.update(chosen[matched], lines.z[matched], lines.covariances[matched], leeway)
+    return ekf.update(chosen[matched], lines.z[matched], lines.covariances[matched])

@@ -84,15 +84,6 @@ def point_on(line: Array, position: float) -> Array:
     return np.asarray(line[0] * normals_of(line[None])[0] + position * tangents_of(line[None])[0])
 
 
-def moved_line(T: Array, line: Array) -> Array:
-    """Line (r, alpha) after a motion T (3,) of the plane.
-
-    Its r may become negative, as its normal turns with it.
-    """
-    alpha = wrap(float(line[1] + T[2]))
-    return np.array([line[0] + T[0] * np.cos(alpha) + T[1] * np.sin(alpha), alpha])
-
-
 def ends_of(feature: Feature, line: Array) -> Array:
     """Ends (2, 2) of a feature on its line (r, alpha), map frame."""
     return np.stack([point_on(line, feature.low), point_on(line, feature.high)])

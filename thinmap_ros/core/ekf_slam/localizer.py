@@ -43,11 +43,10 @@ class EkfConfig(OdometryConfig, LineConfig, FeatureConfig):
     """Parameters of the filter, and of every localizer."""
 
     slam: str = parameter(
-        'ti',
-        'ti: scan matching with a pose graph, and line features, local by topology; off: without '
-        'line features; ekf_ti: EKF-SLAM/TI on odometry and line features alone; ekf_full: the '
-        'same with all features in the state',
-        choices=('ti', 'off', 'ekf_ti', 'ekf_full'),
+        'scan_matching',
+        'scan_matching: scan matching with a pose graph; ekf_ti: EKF-SLAM/TI on odometry and line '
+        'features alone; ekf_full: the same with all features in the state',
+        choices=('scan_matching', 'ekf_ti', 'ekf_full'),
     )
     start_x_m: float = parameter(
         0.0, 'where the robot starts in the map, m', low=-se2.FARTHEST_M, high=se2.FARTHEST_M

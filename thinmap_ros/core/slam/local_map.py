@@ -53,13 +53,16 @@ class LocalMapConfig(Config):
     match_cell_m: float = parameter(0.05, 'edge of a cell of the local map, m', low=0.01, high=0.5)
     match_range_m: float = parameter(30.0, 'farther points are not matched, m', low=1.0, high=200.0)
     match_reach_m: float = parameter(
-        0.5, 'a point looks for the nearest wall within, m', low=0.05, high=2.0
+        0.5,
+        f'a point looks for the nearest wall within, m; at most {TILE - 1} cells',
+        low=0.05,
+        high=2.0,
     )
     match_wall_share: float = parameter(
         0.25,
         'share of hits among the observations of a cell that make it a wall',
         low=0.01,
-        high=1.0,
+        high=0.95,
     )
 
 
@@ -93,16 +96,21 @@ class LocalMap:
     @property
     def lattice(self) -> Lattice:
         """The cells as kernels take them, until the map grows."""
-        tiles, config = self.tiles, self.config
-        reach = int(math.ceil(config.match_reach_m / config.match_cell_m))
+        tiles = self.tiles
         return Lattice(
             tiles.pool,
             tiles.directory,
             tiles.first_row * TILE,
             tiles.first_col * TILE,
-            config.match_cell_m,
-            min(reach, HERE - 1),
+            self.config.match_cell_m,
+            self._reach_cells,
         )
+
+    @property
+    def _reach_cells(self) -> int:
+        """`match_reach_m` in cells, less than a tile: only tiles beside a beam's end are touched."""
+        cells = math.ceil(self.config.match_reach_m / self.config.match_cell_m)
+        return min(int(cells), TILE - 1)
 
     def add_scan(self, points: Array, T_base_laser: Array, T_map_base: Array) -> None:
         """Add surface points (N, 5), robot frame, of a scan at a pose (3,)."""
@@ -114,7 +122,7 @@ class LocalMap:
         _add(points, laser, T_map_base, self.lattice, self.config.match_wall_share)
 
     def distances(self, points_map: Array) -> Array:
-        """Distances (N,) of points (N, 2) from the walls, m; `match_reach_m` where none is near."""
+        """Distances (N,) of points (N, 2) from the walls, m; that of its reach where none is near."""
         return _distances(points_map, self.lattice)
 
     def add_walls(self, points_map: Array, normal: Array) -> None:
@@ -173,7 +181,7 @@ class LocalMap:
 
     def _reach(self, points_map: Array, laser_map: Array) -> None:
         """Have all tiles that the beams touch, and those within reach of their ends."""
-        reach = self.config.match_reach_m
+        reach = self._reach_cells * self.config.match_cell_m
         edge_m = TILE * self.config.match_cell_m
         both = np.vstack([points_map, laser_map])
         low = np.floor((both.min(axis=0) - reach) / edge_m).astype(np.int64)[::-1]
@@ -215,19 +223,6 @@ def slot_of(lattice: Lattice, row: int, col: int) -> int:
     if tile_row >= lattice.directory.shape[0] or tile_col >= lattice.directory.shape[1]:
         return NO_TILE
     return int(lattice.directory[tile_row, tile_col])
-
-
-@inlined
-def nearest_wall(lattice: Lattice, row: int, col: int) -> tuple[int, int, int]:
-    """Slot, row and column of the wall nearest to a cell; NO_TILE where none is within reach."""
-    slot = slot_of(lattice, row, col)
-    if slot == NO_TILE:
-        return NO_TILE, row, col
-    cell = lattice.pool[slot, row & _MASK, col & _MASK]
-    if cell['to_row'] == 0:
-        return NO_TILE, row, col
-    row, col = row + int(cell['to_row']) - HERE, col + int(cell['to_col']) - HERE
-    return slot_of(lattice, row, col), row, col
 
 
 @inlined

@@ -65,6 +65,17 @@ def _cost(
     return cost
 
 
+@inlined
+def _least_by_prior(middle: Array, half: Array, prior: Array, information: Array) -> float:
+    """Cost of the prior at the point of a node that is nearest to it along each axis.
+
+    middle, half (3,): of the node, as seen from the prior.
+    """
+    nearest = np.sign(middle) * np.maximum(np.abs(middle) - half, 0.0)
+    _, _, cost = by_prior(prior + nearest, prior, information)
+    return cost
+
+
 @kernel
 def search(
     scan: Array,
@@ -77,9 +88,10 @@ def search(
     width: float,
     most_nodes: int,
 ) -> Array:
-    """The pose (3,) within half (3,) of a prior (3,) with the lowest cost, or the incumbent.
+    """The pose (3,) around a prior (3,) with the lowest cost, or the incumbent.
 
-    scan (N, 3): x, y, weight; half: m, m, rad; information (3, 3) of the prior.
+    scan (N, 3): x, y, weight; half (3,): half the size of what is searched, m, m, rad, rounded to
+    whole roots; information (3, 3) of the prior.
     """
     away = np.sqrt(scan[:, 0] ** 2 + scan[:, 1] ** 2)
     radius = max(np.median(away), 1.0)
@@ -103,9 +115,14 @@ def search(
     while True:
         spent += len(children)
         for level, dx, dy, turn in children:
-            pose = prior + np.array([dx, dy, turn])
-            _, _, cost = by_prior(pose, prior, information)
-            slack = _ROOT * 0.5**level if level < _LEVELS else 0.0
+            away_from_prior = np.array([dx, dy, turn])
+            pose = prior + away_from_prior
+            slack = 0.0
+            if level < _LEVELS:
+                slack = _ROOT * 0.5**level
+                cost = _least_by_prior(away_from_prior, 0.5**level * size, prior, information)
+            else:
+                _, _, cost = by_prior(pose, prior, information)
             if cost < lowest:
                 cost += _cost(moving, pose, lattice, sigma, width, slack, lowest - cost)
             if cost < lowest and level < _LEVELS:

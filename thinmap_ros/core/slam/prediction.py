@@ -49,6 +49,7 @@ class OdometryPrediction:
         self._calibration = OdometryCalibration()
         self._model = MotionModel(config)
         self._reversal = Reversal()
+        self._begins_known = False  # whether a match told where the next motion begins
 
     @property
     def refused(self) -> int:
@@ -82,12 +83,15 @@ class OdometryPrediction:
 
     def learn(self, prediction: Prediction, match: Match) -> None:
         """A match that fits has told where the robot is, and so what odometry was off."""
-        by_scan = turned(match.by_scan, -float(prediction.T_before[2]))
-        self._model.learn(se2.between(prediction.T_before, match.T_map_base), by_scan)
+        if self._begins_known:
+            by_scan = turned(match.by_scan, -float(prediction.T_before[2]))
+            self._model.learn(se2.between(prediction.T_before, match.T_map_base), by_scan)
+        self._begins_known = True
         self._calibration.follow(match.T_map_base, match.by_scan)
 
     def interrupt(self) -> None:
         """The pose was not found but put, moved or lost: the next motion begins from elsewhere."""
+        self._begins_known = False
         self._calibration.interrupt()
 
     def _motion(self, scan: Scan, T_odom_base: Array) -> Motion:

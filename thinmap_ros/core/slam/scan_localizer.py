@@ -16,9 +16,6 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import parameter
-from thinmap_ros.core.ekf_slam import feature_map
-from thinmap_ros.core.ekf_slam.features import LineFeature
-from thinmap_ros.core.ekf_slam.line_map import LineMap
 from thinmap_ros.core.ekf_slam.localizer import EkfConfig
 from thinmap_ros.core.ekf_slam.models import odometry_slip, odometry_variances
 from thinmap_ros.core.estimate import Correction, Estimate
@@ -39,11 +36,9 @@ from thinmap_ros.core.slam.surface import surface_points
 from thinmap_ros.core.slam.tracking import FOR_A_SLIP, Tracking
 from thinmap_ros.core.slam.uncertainty import UNKNOWN, PoseUncertainty
 from thinmap_ros.core.slam.wall_points import wall_points
-from thinmap_ros.core.topology.graph import TopologicalMap
 
 _SIGMAS = 3.0
 _VIEW_M = 1.0  # after a path of this length a match errs by other points than before
-FIELDS = {**feature_map.FIELDS, **local_map.FIELDS}
 
 
 @dataclass(frozen=True)
@@ -100,22 +95,9 @@ class ScanLocalizer:
         return self._pose.copy()
 
     @property
-    def features(self) -> list[LineFeature]:
-        """The line features of the map."""
-        return self._lines.features
-
-    @property
     def keyframes(self) -> list[Keyframe]:
         """The scans that were kept, at their poses as they are known now."""
         return self._loops.keyframes.frames
-
-    @property
-    def _lines(self) -> LineMap:
-        return self._heading.lines
-
-    def set_topology(self, topology: TopologicalMap) -> None:
-        """Set the topological map by which features are stored."""
-        self._lines.set_topology(topology)
 
     def set_pose(self, T_map_base: Array, covariance: Array) -> None:
         """Put the robot at a pose (3,) with covariance (3, 3) in the map that it has.
@@ -132,11 +114,8 @@ class ScanLocalizer:
         self._map.rerender(self.keyframes, self._pose)
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """The features and the local map as arrays by name, for `from_state`.
-
-        Not where the robot is.
-        """
-        return {**self._lines.state(), **self._map.map.state()}
+        """The local map as arrays by name, for `from_state`; not where the robot is."""
+        return self._map.map.state()
 
     @staticmethod
     def from_state(
@@ -146,17 +125,15 @@ class ScanLocalizer:
 
         It is lost until scans fit there. Raises InputError where it is no such state.
         """
-        checked = snapshot.check(state, FIELDS, 'features')
+        own = {name: array for name, array in state.items() if name in local_map.FIELDS}
+        checked = snapshot.check(own, local_map.FIELDS, 'local map')
         possible = bool((checked['hits'] <= checked['seen']).all())
         snapshot.require(
-            possible, 'features: hits: more than seen', 'no more hits than observations'
+            possible, 'local map: hits: more than seen', 'no more hits than observations'
         )
         localizer = ScanLocalizer(config)
         localizer._map.map.restore(checked)
-        localizer._lines.restore(
-            {name: array for name, array in checked.items() if name in feature_map.FIELDS}
-        )
-        localizer._begin_in({name: checked[name] for name in local_map.FIELDS})
+        localizer._begin_in(checked)
         return localizer
 
     @staticmethod
@@ -196,10 +173,8 @@ class ScanLocalizer:
         self._tracking.judge(match)
         self._update(match, prediction, stands)
         self._tracking.note(self._pose, self._uncertainty.since_fit)
-        self._lines.rest()
         if self.config.mapping and not self._tracking.is_unplaced:
             self._learn(scan, points)
-        self._lines.work_off()
         correction = self._loops.work()
         if correction is not None:
             self._apply(correction)
@@ -289,7 +264,7 @@ class ScanLocalizer:
             self._keep(scan, points)
 
     def _correct_heading(self, scan: Scan) -> None:
-        """Correct the heading by lines and walls, where scans agree with the map."""
+        """Correct the heading by the directions of walls, where scans agree with the map."""
         path_m = self._loops.path_m(self._pose)
         agrees = self._tracking.agrees
         self._pose = self._heading.correct(scan, self._pose, self._uncertainty, path_m, agrees)
@@ -322,14 +297,13 @@ class ScanLocalizer:
         self._tracking.begin_submap()
 
     def _apply(self, correction: Correction) -> None:
-        """A loop was closed: pose, features and local map go where the keyframes have gone."""
+        """A loop was closed: pose and local map go where the keyframes have gone."""
         anchor = self._loops.keyframes.anchor
         self._prediction.interrupt()
         self._pose = correction.moved(anchor, self._pose)
         self._map.T_learned = self._pose
         self._uncertainty.move(self._pose)
         self._tracking.join(correction.moved(anchor, self._tracking.reckoned.T_map_base))
-        self._lines.move(correction)
         self._map.rerender(self.keyframes, self._pose)
 
     def _note(self, scan: Scan) -> None:
@@ -354,11 +328,7 @@ class ScanLocalizer:
             self._pose,
             covariance,
             se2.compose(self._pose, se2.invert(self._prediction.T_odom_base)),
-            self._lines.observed,
-            self._lines.matched,
-            len(self._lines),
-            self._lines.local_count,
-            0.0 if match is None else match.fit,
-            self._tracking.is_lost,
-            correction,
+            match_quality=0.0 if match is None else match.fit,
+            lost=self._tracking.is_lost,
+            correction=correction,
         )

@@ -19,6 +19,7 @@ from thinmap_ros.adapters.plots import (
 from thinmap_ros.core.ekf_slam.features import LineFeature
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array, wrap
+from thinmap_ros.core.slam.localizers import line_features
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.pipeline import Pipeline, Step
 from thinmap_ros.sim.tours import Look
@@ -45,7 +46,7 @@ class _Glance:
     def __call__(self, k: int, look: Look, pipeline: Pipeline, step: Step) -> None:
         if k == self.number:
             self.patch, self.graph = pipeline.grid.patch(), pipeline.topology.map.copy()
-            self.features, self.pose = pipeline.localizer.features, step.estimate.T_map_base
+            self.features, self.pose = line_features(pipeline.localizer), step.estimate.T_map_base
 
 
 def run(source: Source) -> Outcome:
@@ -55,7 +56,7 @@ def run(source: Source) -> Outcome:
     glance = _Glance(round(_LOCAL_AT * len(looks)))
     ti = run_slam(looks, 'ekf_ti', glance)
     full = run_slam(looks, 'ekf_full')
-    ours = run_slam(looks, 'ti')
+    ours = run_slam(looks, 'scan_matching')
     error = map_error.map_error(ti.pipeline.grid.patch(), world)
     apart = np.hypot(*(np.array(ti.estimate) - np.array(full.estimate))[:, :2].T)
     used, known = float(np.median(ti.local)), ti.features[-1]
@@ -127,7 +128,7 @@ def _errors_beside(ti: Run, ours: Run) -> Comparison:
         'error of the position',
         '',
         ti.position_error,
-        remark=f'scan matching with lines (`slam: ti`): {ours.position_error}',
+        remark=f'scan matching (`slam: scan_matching`): {ours.position_error}',
     )
 
 
@@ -197,7 +198,7 @@ def _path_rows(ti: Run, full: Run) -> list[list[float]]:
 
 
 def _feature_rows(pipeline: Pipeline) -> Rows:
-    found = sorted(pipeline.localizer.features, key=lambda feature: feature.id)
+    found = sorted(line_features(pipeline.localizer), key=lambda feature: feature.id)
     return [[f.id, f.r_m, f.alpha_rad, float(np.hypot(*(f.end - f.start))), f.local] for f in found]
 
 
@@ -227,7 +228,7 @@ def _local_area(glance: _Glance) -> Plot:
 def _paths(ti: Run, full: Run) -> Plot:
     panels = []
     for done, name in ((full, '(a) conventional EKF-SLAM'), (ti, '(b) EKF-SLAM/TI')):
-        features = done.pipeline.localizer.features
+        features = line_features(done.pipeline.localizer)
         odometry, estimate = np.array(done.odometry), np.array(done.estimate)
         layers: list[Layer] = [
             Segments(_ends(features, False), 'features', 'black', 1.2),

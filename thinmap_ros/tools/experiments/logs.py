@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 
 from thinmap_ros.adapters.carmen import CarmenLog, LaserOptions
-from thinmap_ros.adapters.plots import Curve, GraphLayer, MapLayer, Panel, Plot, Segments
+from thinmap_ros.adapters.plots import Curve, GraphLayer, MapLayer, Panel, Plot
 from thinmap_ros.adapters.yaml_files import read_mapping
 from thinmap_ros.core.errors import ConfigError, InputError, reason_of
-from thinmap_ros.core.se2 import Array
 from thinmap_ros.pipeline import PipelineConfig
 from thinmap_ros.tools.experiments.outcome import Comparison, Outcome, Table
 from thinmap_ros.tools.experiments.relations import RelationErrors, read_columns, relation_errors
@@ -159,30 +158,19 @@ def _means(errors: RelationErrors) -> tuple[float, float]:
 def _plot(folder: Path, result: Replay) -> Plot:
     pipeline, graph = result.pipeline, result.pipeline.topology.map
     patch, final = pipeline.grid.patch(), pipeline.localizer.corrected_path()
-    lines = np.array([[*f.start, *f.end] for f in pipeline.localizer.features]).reshape(-1, 4)
     way = Curve(final[:, :2], 'trajectory', 3, width=1.0)
     rows, cols = patch.shape
     width = min(7.0, 6.0 * cols / rows)
     return Plot(
         folder.name,
-        f'{folder.name}: map and trajectory; topological map; line features.',
+        f'{folder.name}: map and trajectory; topological map.',
         [
             Panel([MapLayer(patch), way], 'map and trajectory'),
             Panel([MapLayer(patch), GraphLayer(graph, 3.0)], f'{len(graph.nodes)} nodes'),
-            Panel(
-                [Segments(lines, 'line features', 'black', 1.2), way],
-                f'{len(lines)} features',
-                limits=_box(final),
-            ),
         ],
-        columns=3,
+        columns=2,
         panel_inches=(width, min(6.0, width * rows / cols + 0.8)),
     )
-
-
-def _box(path: Array) -> tuple[float, float, float, float]:
-    low, high = path[:, :2].min(axis=0) - 8.0, path[:, :2].max(axis=0) + 8.0
-    return float(low[0]), float(high[0]), float(low[1]), float(high[1])
 
 
 def _comparisons(row: list[Any]) -> list[Comparison]:

@@ -68,7 +68,7 @@ def run(source: Source) -> Outcome:
     marks = _Marks(len(looks))
     ti = run_slam(looks, 'ekf_ti', marks)
     full = run_slam(looks, 'ekf_full')
-    ours = run_slam(looks, 'ti')
+    ours = run_slam(looks, 'scan_matching')
     error = map_error.map_error(ti.pipeline.grid.patch(), world)
     off = np.hypot(*ti.errors()[:, :2].T)
     turned = np.degrees(np.abs(ti.errors()[:, 2]))
@@ -205,7 +205,7 @@ def _comparisons(ti: Run, full: Run, ours: Run, turned: Array) -> list[Compariso
             'about 20 cm',
             ti.position_error,
             bool(np.hypot(*ti.errors()[:, :2].T).max() <= _PAPER_M),
-            remark=f'scan matching with lines (`slam: ti`): {ours.position_error}',
+            remark=f'scan matching (`slam: scan_matching`): {ours.position_error}',
         ),
         Comparison(
             'error of the heading',

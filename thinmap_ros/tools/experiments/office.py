@@ -18,7 +18,7 @@ def run(source: Source) -> Outcome:
     world = world_of('office')
     looks = list(islice(source.looks('office'), _QUICK_SCANS if source.quick else None))
     done = run_slam(looks)
-    ours = run_slam(looks, 'ti')
+    ours = run_slam(looks, 'scan_matching')
     error = map_error.map_error(done.pipeline.grid.patch(), world)
     wheels = np.hypot(*done.errors(done.odometry)[:, :2].T)
     row = map_error.row('office', error)
@@ -50,7 +50,7 @@ def run(source: Source) -> Outcome:
                 'pose',
                 '',
                 f'off by {done.position_error}; wheels alone {wheels[-1]:.2f} m at the end',
-                remark=f'scan matching with lines (`slam: ti`): {ours.position_error}',
+                remark=f'scan matching (`slam: scan_matching`): {ours.position_error}',
             ),
         ],
     )
