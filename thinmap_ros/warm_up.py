@@ -36,7 +36,7 @@ def localizer() -> None:
     ScanLocalizer.from_state(rehearsed.state())
     ScanLocalizer.resumed(_room(), LastPose(0, T_map_base, T_map_base), T_map_base)
     # As soon as a place is seen again, covariances along the graph are asked for.
-    covariances_from(0, np.zeros((2, 3)), [Edge(0, 1, np.zeros(3), np.eye(3), False)])
+    covariances_from(0, np.zeros((2, 3)), [Edge(0, 1, np.zeros(3), np.eye(3), False)], np.ones(2))
 
 
 def grid_mapper() -> None:

@@ -5,7 +5,7 @@ from thinmap_ros.core.ekf_slam.lines import LineConfig, extract_lines
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.uncertainty import PoseUncertainty
-from thinmap_ros.core.slam.wall_compass import WallCompass
+from thinmap_ros.core.slam.wall_compass import Heading, WallCompass
 
 _NEW_SHARE = 0.2  # of the error of a match, from one update of the map to the next
 _LEAST_VARIANCE = 5e-4**2
@@ -18,6 +18,7 @@ class HeadingCorrection:
         self._config = config
         self._compass = WallCompass()
         self._variance = _LEAST_VARIANCE  # of the heading since the walls' direction told it
+        self.measured: Heading | None = None  # of the scan that was corrected last
 
     def correct(
         self, scan: Scan, T_map_base: Array, pose: PoseUncertainty, path_m: float, fits: bool
@@ -26,15 +27,18 @@ class HeadingCorrection:
 
         path_m: length of the path so far, m: the compass trusts the beginning of the map most.
         """
+        # Narrower than what the pose is known to: a heading that is far off takes the local map
+        # with it, and to turn the robot alone would have it lost.
         self._variance += float(pose.by_motion[2, 2] + _NEW_SHARE * pose.by_scan[2, 2])
+        self.measured = None
         if not fits:
             return T_map_base
         lines = extract_lines(scan, self._config)
         x, y, heading = T_map_base.tolist()
-        measured = self._compass.read(lines, heading, self._variance)
-        if measured is not None:
-            gain = self._variance / (self._variance + measured.variance)
-            heading = float(se2.wrap(heading + gain * (measured.yaw - heading)))
+        self.measured = self._compass.read(lines, heading, self._variance)
+        if self.measured is not None:
+            gain = self._variance / (self._variance + self.measured.variance)
+            heading = float(se2.wrap(heading + gain * (self.measured.yaw - heading)))
             self._variance *= 1.0 - gain
         self._compass.learn(lines, heading, path_m)
         return se2.pose(x, y, heading)

@@ -21,6 +21,7 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.anchors import AnchoredPoses
 from thinmap_ros.core.slam.pose_graph import Edge
+from thinmap_ros.core.slam.wall_compass import Heading
 
 _BUCKET_M = 4.0
 _RADIAN_M = 1.0  # a radian of turn makes two scans as different as so many metres
@@ -41,7 +42,8 @@ class Keyframe:
     """A scan that is kept, its surface points (N, 5), robot frame, and its pose (3,).
 
     path_m: length of the path when the robot was there last; covariance (3, 3): of the pose, map
-    frame; submap: number of the local map that it is part of.
+    frame; submap: number of the local map that it is part of; heading: in the map, by the walls'
+    directions, where they tell it.
     """
 
     scan: Scan
@@ -50,6 +52,7 @@ class Keyframe:
     path_m: float
     covariance: Array
     submap: int
+    heading: Heading | None = None
 
 
 class Keyframes:
@@ -92,13 +95,36 @@ class Keyframes:
         offset = se2.between(earlier.T_map_base, frame.T_map_base)
         self._path.add(frame.scan.stamp_ns, number, offset)
 
+    @property
+    def headings(self) -> list[Edge]:
+        """Measured headings, as edges from the first keyframe, which has that of the map."""
+        first = float(self.frames[0].T_map_base[2])
+        return [
+            _heading_edge(number, frame.heading, first)
+            for number, frame in enumerate(self.frames)
+            if number and frame.heading is not None
+        ]
+
+    def covariances_from(self, root: int, poses: Array, edges: list[Edge]) -> Array:
+        """Covariance (N, 3, 3) of each pose (N, 3) as seen from one of them, map frame.
+
+        edges: what ties keyframes besides the steps.
+        """
+        variances = np.array(
+            [math.inf if frame.heading is None else frame.heading.variance for frame in self.frames]
+        )
+        variances[0] = 0.0
+        return covariances_from(
+            root, poses, self.steps + edges, variances[root] + variances[: len(poses)]
+        )
+
     def poses(self) -> Array:
         """Poses (N, 3) of the keyframes."""
         return np.array([frame.T_map_base for frame in self.frames]).reshape(-1, 3)
 
     def move(self, poses: Array, edges: list[Edge]) -> None:
         """The first (N,) keyframes are at poses (N, 3); `edges` tie them besides the steps."""
-        covariances = covariances_from(0, poses, self.steps + edges)
+        covariances = self.covariances_from(0, poses, edges)
         for number, T in enumerate(poses):
             self.frames[number] = replace(
                 self.frames[number], T_map_base=T, covariance=covariances[number]
@@ -144,6 +170,12 @@ def carried(covariance: Array, lever: Array) -> Array:
     return np.asarray(F @ covariance @ F.T)
 
 
+def with_heading(covariance: Array, variance: float) -> Array:
+    """Covariance (3, 3) of a pose of which the heading was measured, too, with a variance."""
+    gain = covariance[:, 2] / (covariance[2, 2] + variance)
+    return np.asarray(covariance - np.outer(gain, covariance[2]))
+
+
 def inverse(matrix: Array) -> Array:
     """Information (3, 3) of a covariance, and the other way round."""
     return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
@@ -156,11 +188,19 @@ def turned(covariance: Array, theta: float) -> Array:
     return np.asarray(R @ covariance @ R.T)
 
 
-def covariances_from(root: int, poses: Array, edges: list[Edge]) -> Array:
+def _heading_edge(number: int, heading: Heading, first: float) -> Edge:
+    information = np.zeros((3, 3))
+    information[2, 2] = 1.0 / heading.variance
+    return Edge(0, number, np.array([0.0, 0.0, heading.yaw - first]), information, True)
+
+
+def covariances_from(root: int, poses: Array, edges: list[Edge], heading_variances: Array) -> Array:
     """Covariance (N, 3, 3) of each pose (N, 3) as seen from one of them, map frame.
 
     Along the chain of edges that leaves it the least: an upper bound, as if there were no other
     chain. Poses that no chain leads to are as uncertain as can be; edges to others are left out.
+    heading_variances (N,): of the heading of each, as seen from the root, where it was measured;
+    infinite elsewhere.
     """
     edges = [edge for edge in edges if edge.b < len(poses)]
     a = np.array([edge.a for edge in edges], dtype=np.int64)
@@ -172,7 +212,7 @@ def covariances_from(root: int, poses: Array, edges: list[Edge]) -> Array:
     order = np.argsort(np.concatenate([a, b]), kind='stable')
     first = np.searchsorted(np.concatenate([a, b])[order], np.arange(len(poses) + 1))
     own = R @ covariances @ R.transpose(0, 2, 1)
-    found: Array = _covariances(root, poses, first, order, a, b, own)
+    found: Array = _covariances(root, poses, first, order, a, b, own, heading_variances)
     return found
 
 
@@ -193,6 +233,7 @@ def _covariances(
     a: NDArray[np.int64],
     b: NDArray[np.int64],
     own: Array,
+    heading_variances: Array,
 ) -> Array:
     """Dijkstra's algorithm, by the variance of the position.
 
@@ -219,6 +260,8 @@ def _covariances(
             # Against its direction the edge's error in heading acts at the far end.
             step = own[edge] if tie < len(a) else _carry(own[edge], x, y)
             new = _carry(found[k], x, y) + step
+            gain = new[:, 2] / (new[2, 2] + heading_variances[other])
+            new -= np.outer(gain, new[2])
             variance = new[0, 0] + new[1, 1]
             if variance < best[other]:
                 best[other] = variance

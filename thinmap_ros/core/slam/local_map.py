@@ -108,7 +108,7 @@ class LocalMap:
 
     @property
     def _reach_cells(self) -> int:
-        """`match_reach_m` in cells, less than a tile: only tiles beside a beam's end are touched."""
+        """`match_reach_m` in cells; less than a tile: of others, only neighbours are touched."""
         cells = math.ceil(self.config.match_reach_m / self.config.match_cell_m)
         return min(int(cells), TILE - 1)
 
@@ -122,7 +122,7 @@ class LocalMap:
         _add(points, laser, T_map_base, self.lattice, self.config.match_wall_share)
 
     def distances(self, points_map: Array) -> Array:
-        """Distances (N,) of points (N, 2) from the walls, m; that of its reach where none is near."""
+        """Distances (N,) of points (N, 2) from the walls, m; the reach where none is near."""
         return _distances(points_map, self.lattice)
 
     def add_walls(self, points_map: Array, normal: Array) -> None:

@@ -23,7 +23,6 @@ from thinmap_ros.core.slam.keyframes import (
     KeyframeConfig,
     Keyframes,
     carried,
-    covariances_from,
     inverse,
     turned,
     unlike,
@@ -170,7 +169,7 @@ class LoopClosure:
         keyframes = self.keyframes
         poses = keyframes.poses()
         anchor = keyframes.anchor
-        there = covariances_from(anchor, poses, keyframes.steps + self.edges)
+        there = keyframes.covariances_from(anchor, poses, self.edges)
         step = turned(self._pending[1], float(poses[anchor, 2]))
         lever = here.T_map_base[:2] - poses[anchor, :2]
         back = [carried(there[j], poses[anchor, :2] - poses[j, :2]) for j in near]
@@ -236,7 +235,11 @@ class LoopClosure:
 
     def _begin_rounds(self) -> None:
         self._before = self.keyframes.poses()
-        self._rounds = rounds(self._before, self.keyframes.steps + self.edges)
+        self._rounds = rounds(self._before, self._all_edges)
+
+    @property
+    def _all_edges(self) -> list[Edge]:
+        return self.keyframes.steps + self.edges + self.keyframes.headings
 
     def _match(self, job: _Job) -> None:
         """Match keyframe k, or the pending one, with the submap around j."""
@@ -383,7 +386,7 @@ class LoopClosure:
         while self._jobs:
             self._match(self._jobs.popleft())
         self._settle()
-        return optimized(self.keyframes.poses(), self.keyframes.steps + self.edges)
+        return optimized(self.keyframes.poses(), self._all_edges)
 
 
 def _moved(frame: Keyframe, before: Array, after: Array) -> Keyframe:
