@@ -1,6 +1,7 @@
 """Keyframes: what stands for what, and what their poses are known to."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,14 +15,18 @@ from thinmap_ros.core.slam.keyframes import (
     Keyframes,
     carried,
     covariances_from,
+    heading_variance,
     inverse,
     turned,
     unlike,
+    with_heading,
 )
 from thinmap_ros.core.slam.pose_graph import Edge
 from thinmap_ros.core.slam.surface import surface_points
+from thinmap_ros.core.slam.wall_compass import Heading
 
 STEP = np.diag(np.square([0.02, 0.01, 0.01]))
+MAP = 0.005**2  # variance of the direction of the map's walls
 
 
 def frame(pose, path_m=0.0, stamp_ns=0, covariance=None):
@@ -223,9 +228,54 @@ def test_covariances_along_the_graph_are_the_same_in_plain_python(rng, monkeypat
         A = rng.normal(0.0, 1.0, (3, 3))
         information = inverse(A @ A.T * 1e-3 + 1e-4 * np.eye(3))
         edges.append(Edge(a, b, se2.between(poses[a], poses[b]), information, False))
-    compiled = covariances_from(3, poses, edges)
+    headings = np.where(rng.random(12) < 0.5, rng.uniform(1e-5, 1e-2, 12), np.inf)
+    compiled = covariances_from(3, poses, edges, headings)
     assert np.isinf(compiled[11]).all(), 'no chain leads there'
     assert (compiled[3] == 0.0).all()
     np.testing.assert_allclose(compiled, np.swapaxes(compiled, 1, 2), atol=1e-12)
+    assert (compiled[:11, 2, 2] <= headings[:11] + 1e-12).all()
     monkeypatch.setattr(module, '_covariances', module._covariances.py_func)
-    np.testing.assert_allclose(covariances_from(3, poses, edges), compiled, rtol=1e-12)
+    np.testing.assert_allclose(covariances_from(3, poses, edges, headings), compiled, rtol=1e-12)
+
+
+def test_a_measured_heading_makes_the_covariance_that_of_a_bayes_update(rng):
+    covariance, variance = random_covariance(rng), 1e-4
+    information = inverse(covariance) + np.diag([0.0, 0.0, 1.0 / variance])
+    np.testing.assert_allclose(with_heading(covariance, variance), inverse(information), atol=1e-12)
+    np.testing.assert_array_equal(with_heading(covariance, np.inf), covariance)
+
+
+def test_a_pose_off_its_measured_heading_is_as_uncertain_as_that():
+    heading = Heading(3.1, 1e-4)
+    assert heading_variance(heading, se2.pose(1.0, 2.0, 3.1)) == pytest.approx(1e-4 + MAP)
+    assert heading_variance(heading, se2.pose(1.0, 2.0, -3.1)) == pytest.approx(
+        1e-4 + MAP + (2.0 * np.pi - 6.2) ** 2
+    )
+    assert heading_variance(None, np.zeros(3)) == np.inf
+
+
+def test_measured_headings_bound_the_covariance_along_the_path():
+    """Without them the lateral error of a straight path grows with its length to 3/2."""
+    poses = np.array([se2.pose(k, 0.0, 0.0) for k in range(40)])
+    blind = along(poses).covariances_from(0, poses, [])[-1]
+    keyframes = Keyframes(KeyframeConfig())
+    for k, pose in enumerate(poses):
+        kept = replace(frame(pose, float(k), k), heading=Heading(0.0, 0.005**2))
+        keyframes.keep(kept, STEP)
+    guided = keyframes.covariances_from(0, poses, [])[-1]
+    assert np.sqrt(blind[1, 1]) > 1.0
+    assert np.sqrt(guided[1, 1]) < 0.2
+    assert np.sqrt(guided[2, 2]) <= 0.0071
+    seen_from_there = keyframes.covariances_from(39, poses, [])[0]
+    np.testing.assert_allclose(seen_from_there[0, 0], guided[0, 0], rtol=0.05)
+    assert seen_from_there[2, 2] <= 4.0 * 0.005**2
+
+
+def test_measured_headings_are_edges_from_the_first_keyframe():
+    keyframes = Keyframes(KeyframeConfig())
+    for k, heading in enumerate([None, Heading(0.45, 1e-4), None]):
+        keyframes.keep(replace(frame(se2.pose(k, 0.0, 0.4), float(k), k), heading=heading), STEP)
+    (edge,) = keyframes.headings
+    assert (edge.a, edge.b, edge.robust) == (0, 1, True)
+    np.testing.assert_allclose(edge.T_a_b[2], 0.05)
+    np.testing.assert_array_equal(edge.information, np.diag([0.0, 0.0, 1.0 / (1e-4 + MAP)]))

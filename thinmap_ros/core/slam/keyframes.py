@@ -24,6 +24,8 @@ from thinmap_ros.core.slam.pose_graph import Edge
 from thinmap_ros.core.slam.wall_compass import Heading
 
 _BUCKET_M = 4.0
+# Of the direction of the walls in the map, which its first scans tell, as seen from the start.
+_MAP_VARIANCE = 0.005**2
 _RADIAN_M = 1.0  # a radian of turn makes two scans as different as so many metres
 
 
@@ -98,9 +100,8 @@ class Keyframes:
     @property
     def headings(self) -> list[Edge]:
         """Measured headings, as edges from the first keyframe, which has that of the map."""
-        first = float(self.frames[0].T_map_base[2])
         return [
-            _heading_edge(number, frame.heading, first)
+            _heading_edge(number, frame.heading, float(self.frames[0].T_map_base[2]))
             for number, frame in enumerate(self.frames)
             if number and frame.heading is not None
         ]
@@ -111,12 +112,13 @@ class Keyframes:
         edges: what ties keyframes besides the steps.
         """
         variances = np.array(
-            [math.inf if frame.heading is None else frame.heading.variance for frame in self.frames]
+            [
+                heading_variance(frame.heading, T)
+                for frame, T in zip(self.frames, poses, strict=False)
+            ]
         )
         variances[0] = 0.0
-        return covariances_from(
-            root, poses, self.steps + edges, variances[root] + variances[: len(poses)]
-        )
+        return covariances_from(root, poses, self.steps + edges, variances[root] + variances)
 
     def poses(self) -> Array:
         """Poses (N, 3) of the keyframes."""
@@ -170,8 +172,18 @@ def carried(covariance: Array, lever: Array) -> Array:
     return np.asarray(F @ covariance @ F.T)
 
 
+def heading_variance(heading: Heading | None, T_map_base: Array) -> float:
+    """Variance of the heading of a pose (3,) by a measured one, from which it may differ."""
+    if heading is None:
+        return math.inf
+    off = float(se2.wrap(heading.yaw - float(T_map_base[2])))
+    return _MAP_VARIANCE + heading.variance + off**2
+
+
 def with_heading(covariance: Array, variance: float) -> Array:
-    """Covariance (3, 3) of a pose of which the heading was measured, too, with a variance."""
+    """Covariance (3, 3) of a pose of which the heading is known to a variance by other means."""
+    if not math.isfinite(variance):
+        return covariance
     gain = covariance[:, 2] / (covariance[2, 2] + variance)
     return np.asarray(covariance - np.outer(gain, covariance[2]))
 
@@ -190,7 +202,7 @@ def turned(covariance: Array, theta: float) -> Array:
 
 def _heading_edge(number: int, heading: Heading, first: float) -> Edge:
     information = np.zeros((3, 3))
-    information[2, 2] = 1.0 / heading.variance
+    information[2, 2] = 1.0 / (_MAP_VARIANCE + heading.variance)
     return Edge(0, number, np.array([0.0, 0.0, heading.yaw - first]), information, True)
 
 

@@ -27,14 +27,13 @@ from thinmap_ros.core.slam.keyframes import (
     turned,
     unlike,
 )
-from thinmap_ros.core.slam.local_map import LocalMap
 from thinmap_ros.core.slam.matcher import Matcher
 from thinmap_ros.core.slam.pose_graph import Edge, optimized, rounds
+from thinmap_ros.core.slam.submaps import AGAIN_M, Submaps
 
-_AROUND = 4  # keyframes to either side that make a submap
-_AGAIN_M = 8.0  # a path of this length lies between leaving a place and coming back
 _VISITS = 3  # earlier visits with which a keyframe is matched, at most
 _SIGMAS = 3.0
+_DRIFT = 0.005  # of the path: errors that repeat from step to step, which steps take to be chance
 _FARTHEST_M = 8.0  # of the uncertainty that is searched: places beyond need recognition
 _CHI2 = 11.34  # 99 % of three degrees of freedom
 _RECENT = 8  # matches among which consistent ones are looked for
@@ -82,7 +81,7 @@ class LoopClosure:
         self._requested: deque[Edge] = deque(maxlen=_RECENT)
         self._here: Keyframe | None = None  # the last of them, kept or not
         self._is_strained = False  # whether a step, measured again, contradicts the poses
-        self._submap: tuple[int, int, LocalMap] | None = None
+        self._submaps = Submaps(matcher.config)
         self._rounds: Iterator[Array] | None = None
         self._before: Array = np.zeros((0, 3))
         self._after: Array = np.zeros((0, 3))
@@ -130,7 +129,7 @@ class LoopClosure:
         j = self.keyframes.alike(frame.T_map_base)
         if j is None or self.keyframes.frames[j].submap != frame.submap:
             return None
-        return j if frame.path_m - self.keyframes.frames[j].path_m < _AGAIN_M else None
+        return j if frame.path_m - self.keyframes.frames[j].path_m < AGAIN_M else None
 
     def _earlier_visits(self, here: Keyframe) -> list[_Job]:
         """The keyframe most like this one of each earlier visit, likest first."""
@@ -151,7 +150,7 @@ class LoopClosure:
         found: list[_Job] = []
         for _, i in ranked:
             path_m = frames[near[i]].path_m
-            if all(abs(path_m - frames[job.j].path_m) > _AGAIN_M for job in found):
+            if all(abs(path_m - frames[job.j].path_m) > AGAIN_M for job in found):
                 found.append(_Job(near[i], len(frames), covariances[i]))
         return found[:_VISITS]
 
@@ -161,7 +160,7 @@ class LoopClosure:
 
     def _is_earlier(self, j: int, here: Keyframe) -> bool:
         frame = self.keyframes.frames[j]
-        return frame.path_m <= here.path_m - _AGAIN_M or frame.submap != here.submap
+        return frame.path_m <= here.path_m - AGAIN_M or frame.submap != here.submap
 
     def _as_seen_from(self, near: list[int], here: Keyframe) -> list[Array]:
         """Covariance (3, 3), map frame, of the pending keyframe as seen from each of some."""
@@ -173,7 +172,12 @@ class LoopClosure:
         step = turned(self._pending[1], float(poses[anchor, 2]))
         lever = here.T_map_base[:2] - poses[anchor, :2]
         back = [carried(there[j], poses[anchor, :2] - poses[j, :2]) for j in near]
-        return [carried(covariance, lever) + step for covariance in back]
+        drift = [self._drift(here.path_m - keyframes.frames[j].path_m) for j in near]
+        return [carried(there, lever) + step + own for there, own in zip(back, drift, strict=True)]
+
+    def _drift(self, path_m: float) -> Array:
+        """Covariance (3, 3) of what errors that repeat add up to along a path, m."""
+        return np.diag(np.square([_DRIFT * path_m, _DRIFT * path_m, 0.0]))
 
     def work(self) -> Correction | None:
         """Do one match that is due, or one round of the optimization; to be called once a step."""
@@ -211,7 +215,7 @@ class LoopClosure:
             frame, covariance = self._pending
             last = self.keyframes.anchor
             self._pending = (_moved(frame, before[last], poses[last]), covariance)
-        self._submap = None
+        self._submaps.clear()
         self._measure_jumps()
         return Correction(before, poses)
 
@@ -245,7 +249,12 @@ class LoopClosure:
         """Match keyframe k, or the pending one, with the submap around j."""
         j, k = job.j, job.k
         here = self._frame(k)
-        base, submap = self._submap_of(j, here)
+        frames = self.keyframes.frames
+        is_step = self._is_step(j, k)
+        if is_step:
+            base, submap = self._submaps.before(frames, j)
+        else:
+            base, submap = self._submaps.around(frames, j, here.path_m)
         config = self._config
         floor = np.diag(np.square([2.0 * config.loop_sigma_m] * 2 + [2.0 * config.loop_sigma_rad]))
         prior = se2.between(base, here.T_map_base)
@@ -258,11 +267,11 @@ class LoopClosure:
         off = se2.off(match.T_map_base, prior)
         if float(off @ np.linalg.solve(relative + covariance, off)) > _CHI2:
             return
-        T_j_base = se2.between(self.keyframes.frames[j].T_map_base, base)
+        T_j_base = se2.between(frames[j].T_map_base, base)
         covariance = turned(covariance, float(T_j_base[2]))
         T_j_k = se2.compose(T_j_base, match.T_map_base)
         edge = Edge(j, k, T_j_k, inverse(covariance), True)
-        if self._is_step(j, k):
+        if is_step:
             self.edges.append(edge)
             self._is_strained |= self._mahalanobis(edge) > _CHI2
         elif self._mahalanobis(edge) < _CHI2:
@@ -341,20 +350,6 @@ class LoopClosure:
         covariance = inverse(one.information) + inverse(other.information)
         covariance[2, 2] += 1e-6
         return float(off @ np.linalg.solve(covariance, off)) < _CHI2
-
-    def _submap_of(self, j: int, here: Keyframe) -> tuple[Array, LocalMap]:
-        """Pose (3,) of keyframe j and what it and its neighbours saw, in its frame."""
-        frames = self.keyframes.frames
-        base = frames[j].T_map_base
-        if self._submap is None or self._submap[0] != j:
-            submap = LocalMap(self._matcher.config)
-            for i in range(max(0, j - _AROUND), min(j + _AROUND + 1, len(frames))):
-                same = frames[i].submap == frames[j].submap
-                if same and (i <= j or here.path_m - frames[i].path_m > _AGAIN_M):
-                    T = se2.between(base, frames[i].T_map_base)
-                    submap.add_scan(frames[i].points, frames[i].scan.T_base_laser, T)
-            self._submap = (j, len(frames), submap)
-        return base, self._submap[2]
 
     def _frame(self, k: int) -> Keyframe:
         if k < len(self.keyframes) or self._pending is None:

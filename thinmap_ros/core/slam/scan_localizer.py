@@ -27,7 +27,7 @@ from thinmap_ros.core.slam import local_map
 from thinmap_ros.core.slam.active_map import ActiveMap
 from thinmap_ros.core.slam.anchors import AnchoredPoses
 from thinmap_ros.core.slam.heading import HeadingCorrection
-from thinmap_ros.core.slam.keyframes import Keyframe, turned, with_heading
+from thinmap_ros.core.slam.keyframes import Keyframe, heading_variance, turned, with_heading
 from thinmap_ros.core.slam.loop_closure import LoopClosure, LoopConfig
 from thinmap_ros.core.slam.matcher import FEWEST_POINTS, Match, Matcher, MatcherConfig
 from thinmap_ros.core.slam.motion import MotionConfig
@@ -279,9 +279,8 @@ class ScanLocalizer:
         step, jump = self._uncertainty.step_from(yaw)
         path_m = loops.path_m(self._pose)
         heading = self._heading.measured
-        covariance = self._covariance()
-        if heading is not None:
-            covariance = with_heading(covariance, heading.variance)
+        variance = heading_variance(heading, self._pose)
+        covariance = with_heading(self._covariance(), variance)
         frame = Keyframe(scan, points, self._pose, path_m, covariance, self._map.number, heading)
         loops.add(frame, step, jump)
         self._uncertainty.begin_step()

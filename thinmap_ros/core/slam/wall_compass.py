@@ -20,6 +20,8 @@ from thinmap_ros.core.se2 import Array
 _QUARTER = 0.5 * math.pi
 _BINS = 180  # of half a degree
 _NEAR_BINS = 3  # to either side of the fullest: walls of its direction
+_AROUND = np.arange(-_NEAR_BINS, _NEAR_BINS + 1)
+_BESIDE = (np.arange(_BINS)[:, None] + [-1, 0, 1]) % _BINS  # each bin with its neighbours
 _LEAST_M = 60.0  # of wall, scan by scan, before a direction is believed
 _MOST = 0.7  # share of them that stands in it
 # The heading is surest where the map begins: after so much way a wall weighs half as much, and in
@@ -57,13 +59,14 @@ class WallCompass:
     def direction(self) -> float | None:
         """That of most walls, rad, from 0 to a right angle; None where there is none."""
         total = float(self._metres.sum())
-        fullest = int(np.argmax(sum(np.roll(self._metres, k) for k in (-1, 0, 1))))
-        around = np.arange(-_NEAR_BINS, _NEAR_BINS + 1)
-        near = (fullest + around) % _BINS
-        metres = float(self._metres[near].sum())
-        if total < _LEAST_M or metres < _MOST * total:
+        if total < _LEAST_M:
             return None
-        mean = (self._places[near].sum() + self._metres[near] @ around) / metres
+        fullest = int(np.argmax(self._metres[_BESIDE].sum(axis=1)))
+        near = (fullest + _AROUND) % _BINS
+        metres = float(self._metres[near].sum())
+        if metres < _MOST * total:
+            return None
+        mean = (self._places[near].sum() + self._metres[near] @ _AROUND) / metres
         return float((fullest + mean) * _QUARTER / _BINS) % _QUARTER
 
     def read(self, lines: Lines, yaw: float, variance: float) -> Heading | None:
