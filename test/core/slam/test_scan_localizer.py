@@ -566,7 +566,7 @@ def test_after_a_reset_everything_is_forgotten():
 
 
 def test_a_map_is_taken_over_by_another_localizer(whole_drive):
-    """A saved map: the robot is lost in it until it fits, then goes on."""
+    """A saved map: the robot is lost in it until it fits, then tracks."""
     _, first = whole_drive
     state = {name: array.copy() for name, array in first.state().items()}
     second = ScanLocalizer.from_state(state, ScanLocalizerConfig(**AT_START))

@@ -27,8 +27,8 @@ class HeadingCorrection:
 
         path_m: length of the path so far, m: the compass trusts the beginning of the map most.
         """
-        # Narrower than what the pose is known to: a heading that is far off takes the local map
-        # with it, and to turn the robot alone would have it lost.
+        # Narrower than the variance of the pose: where the heading errs by more, the local map errs
+        # with it, and a robot that is turned alone does not fit that map any more.
         self._variance += float(pose.by_motion[2, 2] + _NEW_SHARE * pose.by_scan[2, 2])
         self.measured = None
         if not fits:

@@ -278,7 +278,8 @@ class ScanLocalizer:
         yaw = 0.0 if anchor < 0 else float(self.keyframes[anchor].T_map_base[2])
         step, jump = self._uncertainty.step_from(yaw)
         path_m = loops.path_m(self._pose)
-        heading = self._heading.measured
+        # In a new local map the robot may be turned by any angle, also by a right one.
+        heading = None if self._tracking.is_lost else self._heading.measured
         variance = heading_variance(heading, self._pose)
         covariance = with_heading(self._covariance(), variance)
         frame = Keyframe(scan, points, self._pose, path_m, covariance, self._map.number, heading)
