@@ -150,3 +150,18 @@ def test_variances_are_those_of_the_errors(rng):
     scaled = np.sqrt(np.mean(np.square(errors[100:] / sigmas[100:]), axis=0))
     assert (scaled < 1.5).all()
     assert (scaled > 0.6).all()
+
+
+@pytest.mark.parametrize(('along', 'is_open'), [(3e4, True), (500.0, False)])
+def test_a_scan_that_slides_along_a_corridor_is_no_error_of_the_odometry(along, is_open):
+    """A corridor looks the same everywhere: scans that say so, again and again, are all wrong."""
+    information = np.diag([along, 3e4, 1e5])
+    model = MotionModel(CONFIG)
+    odometry = np.array([0.14, 0.0, 0.0])
+    before = sigmas_of(model, odometry)
+    for _ in range(60):
+        motion = model.expect(odometry, CALIBRATED)
+        gain = motion.covariance[0, 0] / (motion.covariance[0, 0] + 1.0 / along)
+        slid = odometry - [gain * 0.14, 0.0, 0.0]  # the scan alone says that the robot stands
+        model.learn(slid, information)
+    assert (sigmas_of(model, odometry)[0] > 3.0 * before[0]) == is_open

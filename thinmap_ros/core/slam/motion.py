@@ -17,6 +17,7 @@ from thinmap_ros.core.ekf_slam.models import OdometryConfig, odometry_slip, odom
 from thinmap_ros.core.se2 import Array
 
 _MOST_SIGMAS = 3.0
+_DISTINCT = 0.2  # of the information across walls: that much along them is no smooth corridor
 _LEAST_SHARE = 1.0  # of the variance that the model allows: good wheels slip, too
 
 
@@ -39,6 +40,16 @@ class Motion:
     increment: Array
     covariance: Array
     stands: bool
+
+
+def _distinctness(information: Array) -> Array:
+    """How far a scan is to be believed on each coordinate of the position (2,): 0 to 1.
+
+    Along a smooth corridor it tells little, and errs by more than its information claims: what it
+    moves a robot by there is no error of the odometry.
+    """
+    own = np.diag(information)[:2]
+    return np.asarray(np.minimum(own / max(_DISTINCT * float(own.max()), 1e-12), 1.0))
 
 
 class MotionModel:
@@ -75,6 +86,7 @@ class MotionModel:
         # What is farther off has slipped once, and says no more than this of the noise.
         change = np.minimum(beyond / self._allowed, _MOST_SIGMAS**2 * share) - share
         change *= np.maximum(gain**2, beyond / np.maximum(squared, 1e-12))
+        change[:2] *= np.where(change[:2] > 0.0, _distinctness(by_scan), 1.0)
         self._learned += 1
         rate = max(1.0 / self._config.noise_memory, 1.0 / (1.0 + self._learned))
         self._share[0] += rate * 0.5 * (change[0] + change[1])
