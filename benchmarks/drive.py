@@ -11,9 +11,9 @@ from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, Wind
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.se2 import Array, pose, wrap
+from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig, build
 from thinmap_ros.core.topology.graph import Node, TopologicalMap
-from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig, build
-from thinmap_ros.sim.lms200 import Lms200, Lms200Config
+from thinmap_ros.sim.laser import Lms200, Lms200Config
 from thinmap_ros.sim.world import World
 
 WINDOW_M = WindowConfig().window_m

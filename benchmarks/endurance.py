@@ -23,10 +23,10 @@ from typing import Any
 import numpy as np
 import psutil
 
-from thinmap_ros.adapters import resources
-from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core.errors import InputError, ThinmapError
-from thinmap_ros.sim.tours import random_start
+from thinmap_ros.files import package_data as resources
+from thinmap_ros.files.worlds import read_world
+from thinmap_ros.sim.drives import random_start
 from thinmap_ros.sim.world import World
 from thinmap_ros.tools import cli
 
@@ -79,7 +79,7 @@ class Driver:
         from rclpy.qos import QoSProfile
 
         from thinmap_msgs.action import Explore, NavigateToPose
-        from thinmap_ros.adapters import messages
+        from thinmap_ros.ros import messages
 
         rclpy.init()
         self._rclpy, self._messages, self._goal = rclpy, messages, NavigateToPose.Goal

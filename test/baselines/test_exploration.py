@@ -13,7 +13,7 @@ from thinmap_ros.baselines.exploration import (
     NearestFrontier,
     VisitAllEndNodes,
 )
-from thinmap_ros.baselines.frontiers import Frontier
+from thinmap_ros.baselines.frontier_map import Frontier
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan

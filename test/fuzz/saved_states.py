@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
-from thinmap_ros.core.slam.scan_localizer import ScanLocalizer
-from thinmap_ros.core.topology.update import TopologyBuilder
+from thinmap_ros.core.slam.localizer import ScanLocalizer
+from thinmap_ros.core.topology.builder import TopologyBuilder
+from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.world import World
 from thinmap_ros.tools.explore_world import ClosedLoop, Options, coverable, make_loop
 

@@ -15,7 +15,7 @@ from nav_msgs.msg import OccupancyGrid, Odometry
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.msg import TopologicalEdge, TopologicalMap, TopologicalNode
-from thinmap_ros.adapters import messages
+from thinmap_ros.ros import messages
 
 STRANGE = st.sampled_from(
     [

@@ -10,9 +10,9 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.sim.buildings import BuildingConfig, building
 from thinmap_ros.sim.floor_plan import Kind, floor_plan
-from thinmap_ros.sim.lms200 import Lms200, Lms200Config
-from thinmap_ros.sim.moving import Leaves, Moving, People
-from thinmap_ros.sim.pioneer import PioneerConfig
+from thinmap_ros.sim.laser import Lms200, Lms200Config
+from thinmap_ros.sim.moving_obstacles import Leaves, Moving, People
+from thinmap_ros.sim.robot import PioneerConfig
 from thinmap_ros.sim.surfaces import inside_of
 from thinmap_ros.sim.world import World
 

@@ -8,8 +8,8 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.world import World
 
 ROOM = Path(__file__).parents[2] / 'worlds' / 'room_10x10.yaml'

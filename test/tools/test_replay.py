@@ -11,17 +11,18 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from hidden import hide
-from patience import PATIENCE_S
+from support.hidden_library import hide
+from support.timeouts import PATIENCE_S
 
-from thinmap_ros.adapters import map_files, rerun_streams
-from thinmap_ros.adapters.bag_writer import BagWriter
-from thinmap_ros.adapters.carmen import CarmenLog, LaserOptions
-from thinmap_ros.adapters.views import NullView
+from thinmap_ros.files import occupancy_maps as map_files
+from thinmap_ros.logs.bag_writer import BagWriter
+from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
 from thinmap_ros.pipeline import PipelineConfig
 from thinmap_ros.tools.carmen_to_bag import convert
 from thinmap_ros.tools.replay import main, replay
 from thinmap_ros.tools.replay_view import ReplayView
+from thinmap_ros.view import rerun_sinks as rerun_streams
+from thinmap_ros.view.null_view import NullView
 
 TRAJECTORIES = {'trajectory.tum', 'trajectory_final.tum'}
 FILES = TRAJECTORIES | {'map.pgm', 'map.yaml', 'topology.geojson', 'summary.png', 'report.json'}

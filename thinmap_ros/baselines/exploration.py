@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.baselines.frontiers import Frontier, FrontierMap
+from thinmap_ros.baselines.frontier_map import Frontier, FrontierMap
 from thinmap_ros.core import se2
-from thinmap_ros.core.exploration.decision import Decision, EndNode, FinishCode
+from thinmap_ros.core.exploration.strategy import Decision, EndNode, FinishCode
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import axis_setup
 from thinmap_ros.core.jit import kernel

@@ -14,16 +14,18 @@ from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock as ClockMsg
 from std_srvs.srv import SetBool, Trigger
 
-from thinmap_ros.adapters import checks, messages, parameters, qos, runtime
-from thinmap_ros.adapters.bag_storage import RawMessage
-from thinmap_ros.adapters.bags import Bag
-from thinmap_ros.adapters.health import OK, WARN, Health
-from thinmap_ros.adapters.lockstep import NONE, PATIENCE_S, PATIENCE_WORDS, TOPICS, Lockstep
-from thinmap_ros.adapters.playback import Playback, is_scan
-from thinmap_ros.adapters.services import answer
-from thinmap_ros.adapters.types import message_class
+from thinmap_ros.core import validation as checks
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import ConfigError, InputError
+from thinmap_ros.logs.bag import Bag
+from thinmap_ros.logs.playback import Playback, is_scan
+from thinmap_ros.logs.storage import RawMessage
+from thinmap_ros.ros import messages, parameters, qos
+from thinmap_ros.ros import node_main as runtime
+from thinmap_ros.ros.diagnostics import OK, WARN, Health
+from thinmap_ros.ros.lockstep import NONE, PATIENCE_S, PATIENCE_WORDS, TOPICS, Lockstep
+from thinmap_ros.ros.services import answer
+from thinmap_ros.ros.types import message_class
 
 _TICK_S = 0.002
 _CLOCK_PERIOD_S = 0.02

@@ -15,12 +15,14 @@ from tqdm import tqdm
 
 from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import ExplorationStatus
-from thinmap_ros.adapters import messages, parameters, qos, resources, runtime
-from thinmap_ros.adapters.files import write_text
-from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.files import package_data as resources
+from thinmap_ros.files.atomic import write_text
+from thinmap_ros.files.worlds import read_world
+from thinmap_ros.ros import messages, parameters, qos
+from thinmap_ros.ros import node_main as runtime
 from thinmap_ros.sim.coverage import coverable
-from thinmap_ros.sim.pioneer import PRESETS
+from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
 
 _LOOK_PERIOD_S = 0.5

@@ -14,22 +14,25 @@ from thinmap_msgs.action import Explore, NavigateToPose
 from thinmap_msgs.msg import EndNode as EndNodeMsg
 from thinmap_msgs.msg import EndNodeArray, ExplorationStatus, SlamStatus, TopologicalMap
 from thinmap_msgs.srv import SaveMap
-from thinmap_ros import warm_up
-from thinmap_ros.adapters import checks, messages, parameters, qos, runtime, session_files
-from thinmap_ros.adapters.actions import Outcome, SingleGoalServer
-from thinmap_ros.adapters.listening import listen
-from thinmap_ros.adapters.live_node import LiveNode
-from thinmap_ros.adapters.save_folder import SaveFolder
-from thinmap_ros.adapters.services import answer
-from thinmap_ros.adapters.stamps import StampMatcher
-from thinmap_ros.adapters.transforms import LaserMount
+from thinmap_ros.core import validation as checks
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.area import fenced
-from thinmap_ros.core.exploration.decision import Decision, EndNode
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
 from thinmap_ros.core.exploration.session import Budget, Odometer
-from thinmap_ros.core.grid.mirror import MapMirror
+from thinmap_ros.core.exploration.strategy import Decision, EndNode
+from thinmap_ros.core.grid.map_mirror import MapMirror
 from thinmap_ros.core.se2 import Array, wrap
+from thinmap_ros.core.stamp_matcher import StampMatcher
+from thinmap_ros.files import sessions as session_files
+from thinmap_ros.kernels import warm_up
+from thinmap_ros.ros import messages, parameters, qos
+from thinmap_ros.ros import node_main as runtime
+from thinmap_ros.ros.action_server import Outcome, SingleGoalServer
+from thinmap_ros.ros.laser_transform import LaserMount
+from thinmap_ros.ros.lifecycle_node import LiveNode
+from thinmap_ros.ros.save_folder import SaveFolder
+from thinmap_ros.ros.services import answer
+from thinmap_ros.ros.subscription import listen
 
 _WARN_PERIOD_S = 5.0
 _FEEDBACK_PERIOD_S = 1.0

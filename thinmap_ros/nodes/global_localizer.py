@@ -8,26 +8,28 @@ from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.msg import LocalizationStatus, SlamStatus, TopologicalMap
 from thinmap_msgs.srv import LocalizeGlobally
-from thinmap_ros import warm_up
-from thinmap_ros.adapters import map_files, messages, parameters, qos, runtime
-from thinmap_ros.adapters.listening import listen
-from thinmap_ros.adapters.live_node import LiveNode
-from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.exploration.active_localization import ActiveSearch
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.localization.active import ActiveSearch
-from thinmap_ros.core.localization.global_localization import (
+from thinmap_ros.core.odometry import ScanPairing
+from thinmap_ros.core.places.global_localizer import (
     GlobalLocalization,
     GlobalLocalizationConfig,
     Result,
     State,
 )
-from thinmap_ros.core.odometry import ScanPairing
 from thinmap_ros.core.planning.navigator import NavigatorConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.builder import TopologyConfig, build
 from thinmap_ros.core.topology.graph import TopologicalMap as Topology
-from thinmap_ros.core.topology.update import TopologyConfig, build
+from thinmap_ros.files import occupancy_maps as map_files
+from thinmap_ros.kernels import warm_up
+from thinmap_ros.ros import messages, parameters, qos
+from thinmap_ros.ros import node_main as runtime
+from thinmap_ros.ros.laser_transform import LaserMount
+from thinmap_ros.ros.lifecycle_node import LiveNode
+from thinmap_ros.ros.subscription import listen
 
 _WARN_PERIOD_S = 5.0
 _CONTROL_PERIOD_S, _SILENCE_NS = 0.1, 400_000_000

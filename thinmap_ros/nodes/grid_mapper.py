@@ -11,20 +11,22 @@ from rclpy.client import Client
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.srv import LoadMap, SaveMap
-from thinmap_ros import warm_up
-from thinmap_ros.adapters import messages, parameters, qos, runtime, session_files
-from thinmap_ros.adapters.listening import listen
-from thinmap_ros.adapters.live_node import LiveNode
-from thinmap_ros.adapters.recovery import State
-from thinmap_ros.adapters.save_folder import SaveFolder
-from thinmap_ros.adapters.services import answer, ask
-from thinmap_ros.adapters.stamps import StampMatcher
-from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.errors import ThinmapError
 from thinmap_ros.core.grid.correctable import CorrectableGrid
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, WindowConfig
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.stamp_matcher import StampMatcher
+from thinmap_ros.files import sessions as session_files
+from thinmap_ros.kernels import warm_up
+from thinmap_ros.ros import messages, parameters, qos
+from thinmap_ros.ros import node_main as runtime
+from thinmap_ros.ros.checkpoint import State
+from thinmap_ros.ros.laser_transform import LaserMount
+from thinmap_ros.ros.lifecycle_node import LiveNode
+from thinmap_ros.ros.save_folder import SaveFolder
+from thinmap_ros.ros.services import answer, ask
+from thinmap_ros.ros.subscription import listen
 
 _LOST_SIGMA_M = 200.0  # a pose that is not known better than this is that of a lost robot
 _NO_BUILDER = 'no graph: there is no topology_builder'

@@ -15,15 +15,6 @@ from tf2_msgs.msg import TFMessage
 
 from thinmap_msgs.msg import LineFeature, LineFeatureArray, SlamStatus, TopologicalMap
 from thinmap_msgs.srv import LoadMap, SaveMap
-from thinmap_ros import warm_up
-from thinmap_ros.adapters import messages, parameters, qos, runtime, session_files
-from thinmap_ros.adapters.health import ERROR, OK
-from thinmap_ros.adapters.listening import listen
-from thinmap_ros.adapters.live_node import LiveNode
-from thinmap_ros.adapters.recovery import State
-from thinmap_ros.adapters.save_folder import SaveFolder
-from thinmap_ros.adapters.services import answer
-from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.core import se2
 from thinmap_ros.core.ekf_slam.features import LineFeature as Feature
 from thinmap_ros.core.errors import InputError
@@ -32,14 +23,25 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import LastPose, ScanPairing
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
 from thinmap_ros.core.slam.localizers import (
     AnyLocalizer,
     line_features,
     localizer_class,
     set_topology,
 )
-from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
 from thinmap_ros.core.topology.graph import TopologicalMap as Graph
+from thinmap_ros.files import sessions as session_files
+from thinmap_ros.kernels import warm_up
+from thinmap_ros.ros import messages, parameters, qos
+from thinmap_ros.ros import node_main as runtime
+from thinmap_ros.ros.checkpoint import State
+from thinmap_ros.ros.diagnostics import ERROR, OK
+from thinmap_ros.ros.laser_transform import LaserMount
+from thinmap_ros.ros.lifecycle_node import LiveNode
+from thinmap_ros.ros.save_folder import SaveFolder
+from thinmap_ros.ros.services import answer
+from thinmap_ros.ros.subscription import listen
 
 _MAP_WAIT_S = 3.0  # after a restart; the navigator drives on for so long without a new pose
 _HEALTH = {

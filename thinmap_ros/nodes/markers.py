@@ -9,9 +9,11 @@ from typing import Any
 from visualization_msgs.msg import MarkerArray
 
 from thinmap_msgs.msg import EndNodeArray, LineFeatureArray, TopologicalMap
-from thinmap_ros.adapters import markers, parameters, qos, runtime
-from thinmap_ros.adapters.listening import listen
-from thinmap_ros.adapters.live_node import LiveNode
+from thinmap_ros.nodes import merge_markers as markers
+from thinmap_ros.ros import node_main as runtime
+from thinmap_ros.ros import parameters, qos
+from thinmap_ros.ros.lifecycle_node import LiveNode
+from thinmap_ros.ros.subscription import listen
 
 
 class MarkersNode(LiveNode):

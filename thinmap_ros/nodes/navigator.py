@@ -6,20 +6,21 @@ from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.action import NavigateToPose
-from thinmap_ros import warm_up
-from thinmap_ros.adapters import messages, parameters, qos, runtime
-from thinmap_ros.adapters.actions import Outcome, SingleGoalServer
-from thinmap_ros.adapters.health import OK, WARN
-from thinmap_ros.adapters.listening import listen
-from thinmap_ros.adapters.live_node import LiveNode
-from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.mirror import MapMirror
+from thinmap_ros.core.grid.map_mirror import MapMirror
 from thinmap_ros.core.odometry import OdometryBuffer
 from thinmap_ros.core.planning.navigator import Command, Navigator, NavigatorConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.kernels import warm_up
+from thinmap_ros.ros import messages, parameters, qos
+from thinmap_ros.ros import node_main as runtime
+from thinmap_ros.ros.action_server import Outcome, SingleGoalServer
+from thinmap_ros.ros.diagnostics import OK, WARN
+from thinmap_ros.ros.laser_transform import LaserMount
+from thinmap_ros.ros.lifecycle_node import LiveNode
+from thinmap_ros.ros.subscription import listen
 
 _WARN_PERIOD_S = 5.0
 _CONTROL_PERIOD_S = 0.1

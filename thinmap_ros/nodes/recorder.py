@@ -9,12 +9,15 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-from thinmap_ros.adapters import bag_qos, parameters, resources, runtime
-from thinmap_ros.adapters.bag_writer import BagWriter
-from thinmap_ros.adapters.health import Health
-from thinmap_ros.adapters.types import message_class
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.files import package_data as resources
+from thinmap_ros.logs import qos as bag_qos
+from thinmap_ros.logs.bag_writer import BagWriter
+from thinmap_ros.ros import node_main as runtime
+from thinmap_ros.ros import parameters
+from thinmap_ros.ros.diagnostics import Health
+from thinmap_ros.ros.types import message_class
 
 _LOOK_AROUND_S = 0.25
 _FLUSH_S = 0.5

@@ -16,17 +16,19 @@ from sensor_msgs.msg import LaserScan
 from std_msgs.msg import UInt32
 from tf2_msgs.msg import TFMessage
 
-from thinmap_ros.adapters import messages, parameters, qos, resources, runtime
-from thinmap_ros.adapters.health import OK, WARN, Health
-from thinmap_ros.adapters.lockstep import NONE, PATIENCE_S, PATIENCE_WORDS, TOPICS, Lockstep
-from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import ConfigError, InputError, shown
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.sim.lms200 import Lms200Config
-from thinmap_ros.sim.pioneer import PRESETS
-from thinmap_ros.sim.runner import STEP_NS, Moment, Simulation
+from thinmap_ros.files import package_data as resources
+from thinmap_ros.files.worlds import read_world
+from thinmap_ros.ros import messages, parameters, qos
+from thinmap_ros.ros import node_main as runtime
+from thinmap_ros.ros.diagnostics import OK, WARN, Health
+from thinmap_ros.ros.lockstep import NONE, PATIENCE_S, PATIENCE_WORDS, TOPICS, Lockstep
+from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.robot import PRESETS
+from thinmap_ros.sim.simulation import STEP_NS, Moment, Simulation
 from thinmap_ros.sim.world import World
 
 _COMMAND_TIMEOUT_NS = 500_000_000

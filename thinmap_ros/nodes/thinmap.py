@@ -8,7 +8,7 @@ from importlib import import_module
 from rclpy.node import Node
 from rclpy.utilities import remove_ros_args
 
-from thinmap_ros.adapters import runtime
+from thinmap_ros.ros import node_main as runtime
 
 _NODES = ('localizer', 'grid_mapper', 'topology_builder', 'navigator', 'explorer')
 _OTHERS = ('global_localizer', 'sim', 'recorder', 'bag_player', 'rerun_viewer', 'markers')

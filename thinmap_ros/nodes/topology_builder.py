@@ -6,19 +6,21 @@ from nav_msgs.msg import OccupancyGrid, Path
 
 from thinmap_msgs.msg import TopologicalMap
 from thinmap_msgs.srv import LoadMap, SaveMap
-from thinmap_ros import warm_up
-from thinmap_ros.adapters import messages, parameters, qos, runtime, session_files
-from thinmap_ros.adapters.listening import listen
-from thinmap_ros.adapters.live_node import LiveNode
-from thinmap_ros.adapters.recovery import State
-from thinmap_ros.adapters.save_folder import SaveFolder
-from thinmap_ros.adapters.services import answer
-from thinmap_ros.adapters.stamps import StampMatcher
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.topology.rebuilding import Rebuilding
-from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig
+from thinmap_ros.core.stamp_matcher import StampMatcher
+from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
+from thinmap_ros.core.topology.rebuild import Rebuilding
+from thinmap_ros.files import sessions as session_files
+from thinmap_ros.kernels import warm_up
+from thinmap_ros.ros import messages, parameters, qos
+from thinmap_ros.ros import node_main as runtime
+from thinmap_ros.ros.checkpoint import State
+from thinmap_ros.ros.lifecycle_node import LiveNode
+from thinmap_ros.ros.save_folder import SaveFolder
+from thinmap_ros.ros.services import answer
+from thinmap_ros.ros.subscription import listen
 
 _UNTOLD_IDS = 1000  # ids that a builder may have given after its state was kept last
 

@@ -14,7 +14,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.sim.floor_plan import WALL_M, FloorPlan, Kind, Opening, Part, floor_plan
-from thinmap_ros.sim.moving import Leaves, Moving, People
+from thinmap_ros.sim.moving_obstacles import Leaves, Moving, People
 from thinmap_ros.sim.world import World
 
 DEVELOPMENT_SEEDS = range(1000)  # others are for judging

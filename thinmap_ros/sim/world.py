@@ -11,7 +11,7 @@ from thinmap_ros.core.grid.distance import distance_cells
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.sim.moving import Moving
+from thinmap_ros.sim.moving_obstacles import Moving
 
 
 @dataclass(frozen=True, eq=False)

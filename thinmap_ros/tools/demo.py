@@ -13,13 +13,14 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from thinmap_ros.adapters import resources
-from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.sim.pioneer import PRESETS
-from thinmap_ros.tools import cli, demo_results
-from thinmap_ros.tools.processes import end_with_parent
+from thinmap_ros.evaluation import recorded_run as demo_results
+from thinmap_ros.evaluation.processes import end_with_parent
+from thinmap_ros.files import package_data as resources
+from thinmap_ros.files.worlds import read_world
+from thinmap_ros.sim.robot import PRESETS
+from thinmap_ros.tools import cli
 
 # Nodes end at once, but not on a machine that is busy; a recorder that is killed leaves half a bag.
 _PATIENCE_S = 20.0

@@ -12,9 +12,6 @@ from typing import Any, Protocol
 import numpy as np
 from tqdm import tqdm
 
-from thinmap_ros.adapters import figures, graph_files, map_files, trajectory_files
-from thinmap_ros.adapters.files import write_text
-from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.baselines.exploration import (
     DistanceAdvantage,
     ExploreLite,
@@ -25,24 +22,35 @@ from thinmap_ros.baselines.exploration import (
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.estimate import Estimate
-from thinmap_ros.core.exploration.decision import Decision
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
+from thinmap_ros.core.exploration.strategy import Decision
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
+from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
 from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.evaluation.exploration_metrics import (
+    Ending,
+    EndNodeCensus,
+    TargetLog,
+    exploration_report,
+)
+from thinmap_ros.evaluation.kidnapping import Kidnapping
+from thinmap_ros.files import graphs as graph_files
+from thinmap_ros.files import occupancy_maps as map_files
+from thinmap_ros.files import trajectories as trajectory_files
+from thinmap_ros.files.atomic import write_text
+from thinmap_ros.files.worlds import read_world
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.sim.coverage import Coverable, coverable
-from thinmap_ros.sim.lms200 import Lms200Config
-from thinmap_ros.sim.pioneer import PRESETS
-from thinmap_ros.sim.runner import STEP_NS, Moment, Simulation
+from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.robot import PRESETS
+from thinmap_ros.sim.simulation import STEP_NS, Moment, Simulation
 from thinmap_ros.sim.world import World
 from thinmap_ros.tools import cli
-from thinmap_ros.tools.kidnapping import Kidnapping
-from thinmap_ros.tools.report import Ending, EndNodeCensus, TargetLog, exploration_report
+from thinmap_ros.view import figures
 
 _CONTROL_STEPS = 2
 _MEASURE_SCANS = 5

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from thinmap_ros.adapters import figures, graph_files, map_files
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.topology.update import TopologyConfig, build
+from thinmap_ros.core.topology.builder import TopologyConfig, build
+from thinmap_ros.files import graphs as graph_files
+from thinmap_ros.files import occupancy_maps as map_files
 from thinmap_ros.tools import cli
+from thinmap_ros.view import figures
 
 _DEFAULTS = TopologyConfig()
 

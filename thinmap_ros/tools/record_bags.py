@@ -6,19 +6,19 @@ from pathlib import Path
 
 import numpy as np
 
-from thinmap_ros.adapters import resources
-from thinmap_ros.adapters.bag_objects import BagObjects
-from thinmap_ros.adapters.bag_writer import BagWriter
-from thinmap_ros.adapters.files import write_text
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, shown
 from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
+from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
+from thinmap_ros.experiments.drives import RECIPES, TRUTH_TOPIC, Source
+from thinmap_ros.files import package_data as resources
+from thinmap_ros.files.atomic import write_text
+from thinmap_ros.logs.bag_writer import BagWriter
+from thinmap_ros.logs.encode import BagObjects
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
-from thinmap_ros.sim.tours import Look
+from thinmap_ros.sim.drives import Look
 from thinmap_ros.tools import cli
-from thinmap_ros.tools.experiments.drives import RECIPES, TRUTH_TOPIC, Source
 
 _MAP_EVERY = 300  # scans: a minute
 _TYPES = {

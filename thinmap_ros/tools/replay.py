@@ -17,20 +17,23 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from thinmap_ros.adapters import figures, graph_files, map_files, trajectory_files
-from thinmap_ros.adapters.events import Log, OdometryEvent
-from thinmap_ros.adapters.files import write_text, written_aside
-from thinmap_ros.adapters.pages import give_back_pages, release_compiler_pages
-from thinmap_ros.adapters.rerun_view import View
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.odometry import ScanPairing
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
 from thinmap_ros.core.slam.localizers import line_features
-from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
+from thinmap_ros.files import graphs as graph_files
+from thinmap_ros.files import occupancy_maps as map_files
+from thinmap_ros.files import trajectories as trajectory_files
+from thinmap_ros.files.atomic import write_text, written_aside
+from thinmap_ros.kernels.memory import give_back_pages, release_compiler_pages
+from thinmap_ros.logs.log import Log, OdometryEvent
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.replay_view import ReplayView
+from thinmap_ros.view import figures
+from thinmap_ros.view.rerun_view import View
 
 
 @dataclass(eq=False)

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from thinmap_ros.adapters.views import NullView
 from thinmap_ros.core import se2
 from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizers import line_features
 from thinmap_ros.pipeline import Pipeline
+from thinmap_ros.view.null_view import NullView
 
 # What is large is put together once a second, as a view does not draw it more often.
 _PERIOD_NS = 1_000_000_000

@@ -2,10 +2,10 @@
 
 import argparse
 
-from thinmap_ros import warm_up
-from thinmap_ros.adapters import resources
-from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core import kernel_cache
+from thinmap_ros.files import package_data as resources
+from thinmap_ros.files.worlds import read_world
+from thinmap_ros.kernels import warm_up
 from thinmap_ros.sim.world import World
 from thinmap_ros.tools import cli, explore_world
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from slam_room import BLIND, ROOM, drive, scan_in
+from support.slam_room import BLIND, ROOM, drive, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.ekf_slam.association import AssociationConfig, associate, mahalanobis
@@ -13,7 +13,7 @@ from thinmap_ros.core.ekf_slam.ekf import EkfSlam
 from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
 from thinmap_ros.core.ekf_slam.feature_map import FeatureConfig, FeatureMap
 from thinmap_ros.core.ekf_slam.features import Feature
-from thinmap_ros.core.ekf_slam.lines import LineConfig, Lines, extract_lines
+from thinmap_ros.core.ekf_slam.line_extraction import LineConfig, Lines, extract_lines
 
 R = np.diag([0.02**2, 0.01**2])
 SURE = 1e-8 * np.eye(3)

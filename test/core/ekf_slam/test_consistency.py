@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from slam_room import BLIND
+from support.slam_room import BLIND
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
 from thinmap_ros.core.ekf_slam.feature_map import FeatureConfig, FeatureMap
-from thinmap_ros.core.ekf_slam.lines import Lines
+from thinmap_ros.core.ekf_slam.line_extraction import Lines
 from thinmap_ros.core.ekf_slam.models import observe_line
 
 FEATURES = FeatureConfig()

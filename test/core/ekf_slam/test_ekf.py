@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from dense_filter import DenseFilter
+from reference_filter import DenseFilter
 
 from thinmap_ros.core.ekf_slam.ekf import EkfSlam
 from thinmap_ros.core.ekf_slam.models import observe_line

@@ -9,19 +9,19 @@ import pytest
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.exploration.decision import FIRST_STAND_IN_ID, Decision, FinishCode
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
+from thinmap_ros.core.exploration.strategy import FIRST_STAND_IN_ID, Decision, FinishCode
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.core.topology.graph import TopologicalMap
-from thinmap_ros.core.topology.update import TopologyBuilder
 from thinmap_ros.sim.coverage import coverable
-from thinmap_ros.sim.lms200 import Lms200Config
-from thinmap_ros.sim.pioneer import PRESETS
-from thinmap_ros.sim.runner import Simulation
+from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.robot import PRESETS
+from thinmap_ros.sim.simulation import Simulation
 from thinmap_ros.sim.world import World
 
 START = np.array([1.0, 1.0, 0.0])

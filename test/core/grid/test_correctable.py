@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from slam_room import corridor_ring, scan_in
+from support.slam_room import corridor_ring, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid import rerendering

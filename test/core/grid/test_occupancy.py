@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from plain_grid import PlainGrid
+from reference_grid import PlainGrid
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, log_odds

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from plain_grid import crossed
+from reference_grid import crossed
 
 from thinmap_ros.core.grid.raytrace import cast_rays, fill_segment, line_is_clear
 

@@ -8,7 +8,7 @@ import pytest
 
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.planning.grid_search import WayTable, coarse, field_from, ways_from
-from thinmap_ros.core.planning.reach import reached_from
+from thinmap_ros.core.planning.traversability import reached_from
 
 
 def dijkstra(allowed, start):

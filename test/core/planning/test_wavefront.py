@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.reach import nearest_true
+from thinmap_ros.core.planning.traversability import nearest_true
 from thinmap_ros.core.planning.wavefront import (
     WavefrontConfig,
     cost_of_cells,

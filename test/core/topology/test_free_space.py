@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from drawings import drawn, patch_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
-from topology_drawings import drawn, patch_of
 
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.components import label, reachable
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.free_space import (
     column_distance,
@@ -16,7 +17,6 @@ from thinmap_ros.core.topology.free_space import (
     squared_clearance,
     standing_room,
 )
-from thinmap_ros.core.topology.parts import label, reachable
 
 
 def random_mask(seed):

@@ -2,16 +2,16 @@
 
 import numpy as np
 import pytest
+from drawings import drawn, patch_of, place, world
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
-from topology_drawings import drawn, patch_of, place, world
 
 from thinmap_ros.core.grid.raytrace import line_is_clear
+from thinmap_ros.core.topology.builder import build
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.free_space import select_free_space
 from thinmap_ros.core.topology.graph import NodeKind
-from thinmap_ros.core.topology.update import build
 
 E, B, C = NodeKind.END, NodeKind.BRANCH, NodeKind.CORNER
 CONFIG = TopologyConfig()

@@ -3,10 +3,10 @@
 import cv2
 import numpy as np
 import pytest
+from drawings import world
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
-from topology_drawings import world
 
 from thinmap_ros.core.topology.thinning import thin
 

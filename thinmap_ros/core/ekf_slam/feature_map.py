@@ -18,9 +18,9 @@ from thinmap_ros.core import snapshot
 from thinmap_ros.core.config import parameter
 from thinmap_ros.core.ekf_slam import local_area
 from thinmap_ros.core.ekf_slam.association import AssociationConfig, associate, mahalanobis, meeting
-from thinmap_ros.core.ekf_slam.candidates import Candidate, Candidates
 from thinmap_ros.core.ekf_slam.ekf import EkfSlam
 from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
+from thinmap_ros.core.ekf_slam.feature_candidates import Candidate, Candidates
 from thinmap_ros.core.ekf_slam.features import (
     Feature,
     LineFeature,
@@ -29,7 +29,7 @@ from thinmap_ros.core.ekf_slam.features import (
     interval,
     normals_of,
 )
-from thinmap_ros.core.ekf_slam.lines import Lines
+from thinmap_ros.core.ekf_slam.line_extraction import Lines
 from thinmap_ros.core.ekf_slam.local_area import LocalArea
 from thinmap_ros.core.ekf_slam.visibility import seen_through
 from thinmap_ros.core.scan import Scan

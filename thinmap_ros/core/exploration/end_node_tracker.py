@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.exploration.field_of_view import field_of_view
 from thinmap_ros.core.exploration.position_probability import (
     angle_difference,
     angle_index,
@@ -38,7 +39,6 @@ from thinmap_ros.core.exploration.position_probability import (
     nearest_distance,
     reliability,
 )
-from thinmap_ros.core.exploration.views import field_of_view
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.jit import kernel

@@ -23,17 +23,17 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import parameter
-from thinmap_ros.core.exploration.decision import Decision, verdict
-from thinmap_ros.core.exploration.failures import Failures
-from thinmap_ros.core.exploration.survey import (
+from thinmap_ros.core.exploration.blacklist import Failures
+from thinmap_ros.core.exploration.candidates import (
     Candidate,
     Place,
     SurveyConfig,
     Surveyor,
     end_node_of,
 )
+from thinmap_ros.core.exploration.field_of_view import box_of_scan, directions_of_view
+from thinmap_ros.core.exploration.strategy import Decision, verdict
 from thinmap_ros.core.exploration.tour import tours_by_first
-from thinmap_ros.core.exploration.views import box_of_scan, directions_of_view
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.graph_search import costs_to
 from thinmap_ros.core.planning.grid_search import WayTable

@@ -13,8 +13,8 @@ from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import COARSEST_M, FINEST_M, GridFrame
 from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
-from thinmap_ros.core.grid.picture import Picture
 from thinmap_ros.core.grid.raytrace import fill_segment
+from thinmap_ros.core.grid.rendered_map import Picture
 from thinmap_ros.core.grid.tiles import FARTHEST_TILE, TILE, TileStore
 from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.scan import Scan

@@ -13,9 +13,14 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.config import parameter
 from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, GridPatch
 from thinmap_ros.core.jit import kernel
-from thinmap_ros.core.planning.follower import Follower, FollowerConfig, length_from, nearest_point
-from thinmap_ros.core.planning.seen_points import SeenPoints
-from thinmap_ros.core.planning.trail import Trail
+from thinmap_ros.core.planning.obstacle_points import SeenPoints
+from thinmap_ros.core.planning.path_follower import (
+    Follower,
+    FollowerConfig,
+    length_from,
+    nearest_point,
+)
+from thinmap_ros.core.planning.recent_path import Trail
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.jit import kernel
-from thinmap_ros.core.planning.reach import disc, nearest_true, reached_from
+from thinmap_ros.core.planning.traversability import disc, nearest_true, reached_from
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.free_space import column_distance, known_free

@@ -11,7 +11,7 @@ from thinmap_ros.core import snapshot
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.snapshot import FAR_CELLS, LARGEST_COUNT, Field
 from thinmap_ros.core.topology.net import Net, chains_of
-from thinmap_ros.core.topology.web import Chain, Spot, Web
+from thinmap_ros.core.topology.skeleton_graph import Chain, Spot, Web
 
 Cells = NDArray[np.int64]
 _BLOCK = 6  # chains are listed by blocks of 2**6 cells

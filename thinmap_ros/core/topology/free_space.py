@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.components import label, reachable
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.topology.config import TopologyConfig
-from thinmap_ros.core.topology.parts import label, reachable
 
 Cells = NDArray[np.int64]
 Mask = NDArray[np.bool_]

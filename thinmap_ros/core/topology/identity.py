@@ -18,7 +18,7 @@ from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.corners import corner_indices
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.core.topology.skeleton import edge_of, kind_of, node_of
-from thinmap_ros.core.topology.web import Chain, room_along
+from thinmap_ros.core.topology.skeleton_graph import Chain, room_along
 
 _NEW = 0  # id of a node that has none yet
 _OTHER_KIND = 0.5  # share of same_place_m by which a node of another kind counts as farther away

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.jit import inlined, kernel
-from thinmap_ros.core.topology.web import Chain, Spot, Web
+from thinmap_ros.core.topology.skeleton_graph import Chain, Spot, Web
 
 Cells = NDArray[np.int64]
 Mask = NDArray[np.bool_]

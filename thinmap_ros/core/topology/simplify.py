@@ -31,8 +31,8 @@ from thinmap_ros.core.topology.net import (
     merge,
     state_of,
 )
-from thinmap_ros.core.topology.spurs import Limits, Outlook, drop_spurs
-from thinmap_ros.core.topology.web import Web
+from thinmap_ros.core.topology.pruning import Limits, Outlook, drop_spurs
+from thinmap_ros.core.topology.skeleton_graph import Web
 
 Cells = NDArray[np.int64]
 Mask = NDArray[np.bool_]

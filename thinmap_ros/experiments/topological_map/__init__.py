@@ -1,0 +1,1 @@
+"""topological_map."""

@@ -1,0 +1,125 @@
+"""Storage of a bag: MCAP files, read within limits, and SQLite files, read by rosbags."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from mcap.records import Schema
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import ConnectionExtRosbag2, Qos
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
+
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.logs import bag_types
+from thinmap_ros.logs import qos as bag_qos
+from thinmap_ros.logs.mcap_reader import Damage, McapFile
+
+
+@dataclass(frozen=True)
+class RawMessage:
+    """A message as it lies in a bag: topic, type, log time, CDR bytes."""
+
+    topic: str
+    type_name: str
+    log_ns: int
+    data: bytes
+
+
+class Storage(Protocol):
+    """One file of a bag: `topics` and their types, `offers` (QoS) of their publishers, `damage`."""
+
+    topics: dict[str, str]
+    offers: dict[str, list[Qos]]
+    damage: Damage
+
+    @property
+    def has_messages(self) -> bool:
+        """Whether there are messages in it."""
+        ...
+
+    def typestore(self, type_name: str) -> Typestore:
+        """Types to decode messages of a type with."""
+        ...
+
+    def messages(self, topics: set[str] | None) -> Iterator[RawMessage]:
+        """Whole messages of the given topics, or of all, in log order."""
+        ...
+
+
+class McapStorage:
+    """An MCAP file, whole, cut off or damaged."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = McapFile(path)
+        self.damage = self._file.damage
+        self.has_messages = self._file.has_messages
+        self.topics: dict[str, str] = {}
+        self.offers: dict[str, list[Qos]] = {}
+        self._schemas: dict[str, Schema] = {}
+        self._typestores: dict[str, Typestore] = {}
+        for number, channel in self._file.definitions.channels.items():
+            known = self._file.definitions.of(number)
+            if known is not None:
+                self.topics[channel.topic] = known[0].name
+                self.offers.setdefault(channel.topic, []).extend(bag_qos.of_channel(channel))
+                self._schemas[known[0].name] = known[0]
+
+    def typestore(self, type_name: str) -> Typestore:
+        """Types as the file defines them; ROS 2 Jazzy's where it does not."""
+        if type_name not in self._typestores:
+            self._typestores[type_name] = bag_types.typestore_of(self._schemas[type_name])
+        return self._typestores[type_name]
+
+    def messages(self, topics: set[str] | None) -> Iterator[RawMessage]:
+        """Messages in the order of the log."""
+        for schema, channel, message in self._file.messages(topics):
+            yield RawMessage(channel.topic, schema.name, message.log_time, message.data)
+
+
+class SqliteStorage:
+    """An SQLite file of a rosbag2 folder."""
+
+    has_messages = True
+
+    def __init__(self, path: Path) -> None:
+        """Raises InputError where it cannot be opened."""
+        self._path = path
+        self.damage = Damage()
+        self.topics: dict[str, str] = {}
+        self.offers: dict[str, list[Qos]] = {}
+        try:
+            with self._reader() as reader:
+                for connection in reader.connections:
+                    self.topics[connection.topic] = connection.msgtype
+                    if isinstance(connection.ext, ConnectionExtRosbag2):
+                        self.offers.setdefault(connection.topic, []).extend(
+                            connection.ext.offered_qos_profiles
+                        )
+                self._typestore = reader.typestore
+        except Exception as error:  # rosbags' readers raise whatever they stumble over
+            reason = ' '.join(str(error).split())[:200] or type(error).__name__
+            raise InputError(f'{path}: {reason}') from error
+
+    def typestore(self, type_name: str) -> Typestore:
+        """Types of the whole file."""
+        return self._typestore
+
+    def messages(self, topics: set[str] | None) -> Iterator[RawMessage]:
+        """Messages in the order of the log."""
+        try:
+            with self._reader() as reader:
+                chosen = [c for c in reader.connections if topics is None or c.topic in topics]
+                for connection, log_ns, data in reader.messages(chosen) if chosen else ():
+                    yield RawMessage(connection.topic, connection.msgtype, log_ns, bytes(data))
+        except Exception:  # as above: what came before it counts
+            self.damage.cut_off = True
+
+    def _reader(self) -> AnyReader:
+        return AnyReader([self._path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
+
+
+def storage_of(path: Path) -> Storage:
+    """Open a file of a bag. Raises InputError where it is none."""
+    return SqliteStorage(path) if path.suffix == '.db3' else McapStorage(path)
