@@ -40,7 +40,8 @@ _STEPS = {
 _MEDIAN = re.compile(r'median (\d+\.\d+) ms')
 _SCAN_S = 0.2
 _FLAT = 1.05
-_STOP_S, _START_S = 10.0, 120.0
+_STOP_S = 10.0
+_START_S = 120.0
 _LAG = 5  # scans whose pose may still be under way at the end
 _DEPTH = 1000
 _FEWEST_SAMPLES = 4  # a quarter of them is looked at
@@ -82,14 +83,23 @@ class Driver:
         from thinmap_ros.ros import messages
 
         rclpy.init()
-        self._rclpy, self._messages, self._goal = rclpy, messages, NavigateToPose.Goal
-        self._world, self._chance = world, np.random.default_rng(seed)
+        self._rclpy = rclpy
+        self._messages = messages
+        self._goal = NavigateToPose.Goal
+        self._world = world
+        self._chance = np.random.default_rng(seed)
         self._node = rclpy.create_node('endurance')
         self._explore = ActionClient(self._node, Explore, 'explore')
         self._navigate = ActionClient(self._node, NavigateToPose, 'navigate_to_pose')
-        self._explored, self._busy = Explore.Goal(), False
-        self.explores, self.goals, self.reached = True, 0, 0
-        self.poses, self.first_s, self.simulated_s, self.step_ms = 0, 0.0, 0.0, {}
+        self._explored = Explore.Goal()
+        self._busy = False
+        self.explores = True
+        self.goals = 0
+        self.reached = 0
+        self.poses = 0
+        self.first_s = 0.0
+        self.simulated_s = 0.0
+        self.step_ms = {}
         deep = QoSProfile(depth=_DEPTH)
         self._node.create_subscription(PoseWithCovarianceStamped, 'pose', self._on_pose, deep)
         self._node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, deep)
@@ -115,7 +125,8 @@ class Driver:
         if self.explores:
             return self._explored
         self.goals += 1
-        goal, place = self._goal(use_heading=True), random_start(self._world, self._chance)
+        goal = self._goal(use_heading=True)
+        place = random_start(self._world, self._chance)
         goal.pose = self._messages.pose_stamped_msg(place, 'map', 0)
         return goal
 
@@ -183,7 +194,8 @@ def measure(
         'cpu_s',
         'lost',
     ]
-    samples, begun = Samples(columns), time.monotonic()
+    samples = Samples(columns)
+    begun = time.monotonic()
     every_s = 60.0 * arguments.minutes / arguments.samples
     with path.open('w', encoding='utf-8', newline='', buffering=1) as file:
         writer = csv.writer(file, lineterminator='\n')

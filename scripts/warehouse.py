@@ -6,9 +6,15 @@ It is printed by python -m scripts.warehouse.
 import numpy as np
 
 _SIDE_M = 200.0
-_RACK_M, _LENGTH_M = 2.4, 16.0  # two racks back to back
-_FIRST_M, _ACROSS_M, _ALONG_M = (6.0, 6.0), 7.4, 21.0  # aisles of 5 m both ways
-_COLUMNS, _ROWS = 26, 9
+# Two racks back to back
+_RACK_M = 2.4
+_LENGTH_M = 16.0
+# Aisles of 5 m both ways
+_FIRST_M = (6.0, 6.0)
+_ACROSS_M = 7.4
+_ALONG_M = 21.0
+_COLUMNS = 26
+_ROWS = 9
 _GOODS_M = (1.2, 0.8)  # a pallet on the floor, along the rack and out into the aisle
 _SEED = 0
 
@@ -27,7 +33,8 @@ def warehouse() -> str:
     solids = []
     for column in range(_COLUMNS):
         for row in range(_ROWS):
-            x, y = _FIRST_M[0] + column * _ACROSS_M, _FIRST_M[1] + row * _ALONG_M
+            x = _FIRST_M[0] + column * _ACROSS_M
+            y = _FIRST_M[1] + row * _ALONG_M
             solids.append(_box(x, y, _RACK_M, _LENGTH_M))
             for at_x in (x - _GOODS_M[1], x + _RACK_M):
                 if rng.random() < 0.5:
@@ -51,7 +58,8 @@ def _box(x: float, y: float, width: float, depth: float) -> str:
 
 def _tour() -> list[tuple[float, float]]:
     """Up one aisle and down the next but one, then home along the lower wall."""
-    low, high = 3.0, _SIDE_M - 3.0
+    low = 3.0
+    high = _SIDE_M - 3.0
     points = []
     for number, column in enumerate(range(0, _COLUMNS - 1, 2)):
         x = _FIRST_M[0] + column * _ACROSS_M + 0.5 * (_RACK_M + _ACROSS_M)

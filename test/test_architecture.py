@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).resolve().parents[1] / 'thinmap_ros'
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / 'thinmap_ros'
 # What each room may import from the others; core's ground floor is 'core' and 'core.grid'.
 CORE = {'core', 'core.grid'}
 TOPOLOGY = CORE | {'core.topology'}
@@ -121,3 +122,46 @@ for module in {modules!r}:
         [sys.executable, '-c', code], capture_output=True, text=True, cwd=PACKAGE.parent
     )
     assert done.returncode == 0, done.stderr
+
+
+def packed(tree):
+    """Lines of assignments of several values to several names, but swaps."""
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Assign) or not isinstance(node.value, ast.Tuple):
+            continue
+        target = node.targets[0]
+        if not isinstance(target, ast.Tuple):
+            continue
+        targets = {ast.unparse(element) for element in target.elts}
+        values = {ast.unparse(element) for element in node.value.elts}
+        if not targets & values:
+            yield node.lineno
+
+
+def test_packed_assignments_are_found():
+    assert list(packed(ast.parse('a, b = 1, 2'))) == [1]
+    assert not list(packed(ast.parse('a, b = b, a\nc, d = f()\ne = 1, 2')))
+
+
+def test_one_statement_a_line():
+    found = [
+        f'{path.relative_to(ROOT)}:{line}'
+        for folder in ('thinmap_ros', 'benchmarks', 'test', 'scripts')
+        for path in sorted((ROOT / folder).rglob('*.py'))
+        for line in packed(ast.parse(path.read_text()))
+    ]
+    assert not found
+
+
+MOST_FILES = 15
+
+
+@pytest.mark.parametrize('top', ['thinmap_ros', 'benchmarks', 'test'])
+def test_a_folder_holds_few_files(top):
+    folders = [ROOT / top, *(path for path in (ROOT / top).rglob('*') if path.is_dir())]
+    full = {
+        str(folder.relative_to(ROOT)): len(list(folder.glob('*.py')))
+        for folder in folders
+        if len(list(folder.glob('*.py'))) > MOST_FILES
+    }
+    assert not full

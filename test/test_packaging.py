@@ -94,7 +94,8 @@ CHECKERS = {'ruff', 'mypy', 'types-pyyaml', 'types-tqdm', 'scipy-stubs'}
     ],
 )
 def test_every_import_has_its_key_in_package_xml(folder, tags):
-    wanted, own = set(), {'thinmap_ros'} | {path.stem for path in (ROOT / 'test').rglob('*.py')}
+    wanted = set()
+    own = {'thinmap_ros'} | {path.stem for path in (ROOT / 'test').rglob('*.py')}
     # A test names a helper in another folder of the tests by both.
     own |= {path.name for path in (ROOT / 'test').iterdir() if path.is_dir()}
     own |= {'benchmarks', 'fuzz'} if folder == 'test' else set()

@@ -13,7 +13,8 @@ from thinmap_ros.evaluation.strategy_comparison import OURS, markdown, saved
 
 Report = dict[str, Any]
 _PAGE = Path(__file__).resolve().parent.parent / 'docs' / 'exploration.md'
-_FULL_COVERAGE, _NEARLY_ALL = 0.99, 0.995
+_FULL_COVERAGE = 0.99
+_NEARLY_ALL = 0.995
 _HEAD = """\
 # Exploration, measured
 
@@ -54,7 +55,8 @@ def page(reports: list[Report]) -> str:
 
 
 def _conditions(options: dict[str, Any]) -> str:
-    laser, known = options['laser'], options['localization'] == 'truth'
+    laser = options['laser']
+    known = options['localization'] == 'truth'
     return (
         f'{laser["beams"]} beams over {laser["field_of_view_deg"]:g} degrees, '
         f'{laser["range_max_m"]:g} m, '

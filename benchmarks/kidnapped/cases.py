@@ -19,9 +19,12 @@ from thinmap_ros.sim.world import World
 from thinmap_ros.tools.explore_world import Options, explore
 
 _STEP_SCANS = 3  # a step of the laboratory's experiment: at 0.5 m/s and 5 Hz, up to 0.3 m
-_WAY_M, _TWIN_WAY_M, _FOREIGN_WAY_M = 40.0, 30.0, 20.0
+_WAY_M = 40.0
+_TWIN_WAY_M = 30.0
+_FOREIGN_WAY_M = 20.0
 _AT_A_TIME = 5  # drives in a world, before its map makes way for the next one's
-_CARRIED_S, _LIMIT_S = 150.0, 300.0
+_CARRIED_S = 150.0
+_LIMIT_S = 300.0
 _SHIFT_M = (-12.34, 56.785)
 _FULL = Lms200Config()
 LASERS = {
@@ -106,7 +109,8 @@ def _floor_by_floor(
 
 
 def _in_building(folder: Path, name: str, number: int) -> Record:
-    world, laser = lost_robots.floor_of(folder, name), _FULL
+    world = lost_robots.floor_of(folder, name)
+    laser = _FULL
     start = random_start(world, np.random.default_rng([2, number]))
     return search(
         fresh(_finder(folder, name, '', 1)), random_drive(world, start, number, laser=laser), _WAY_M
@@ -118,7 +122,8 @@ def _finder(
     folder: Path, name: str, laser: str, finer: int, driven: bool = False
 ) -> GlobalLocalization:
     """A search that is ready to begin in a world's map."""
-    world, kind = lost_robots.floor_of(folder, name), LASERS.get(laser, _FULL)
+    world = lost_robots.floor_of(folder, name)
+    kind = LASERS.get(laser, _FULL)
     shift = _SHIFT_M if finer > 1 else (0.0, 0.0)
     if driven:
         known = lost_robots.driven_map(world, kind)
@@ -260,7 +265,8 @@ def _log_elsewhere(setting: Setting, name: str) -> Record:
 
 
 def _in_log_map(setting: Setting, name: str) -> Record:
-    world, known = lost_robots.floor_of(setting.worlds, name), lost_log.first_half(setting.log)
+    world = lost_robots.floor_of(setting.worlds, name)
+    known = lost_log.first_half(setting.log)
     drive = random_drive(world, random_start(world, np.random.default_rng(6)), 6)
     return lost_robots.watch_foreign(
         GlobalLocalization(known.patch, known.topology, seed=1), drive, _FOREIGN_WAY_M

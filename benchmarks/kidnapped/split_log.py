@@ -24,9 +24,12 @@ from thinmap_ros.pipeline import Pipeline
 from thinmap_ros.sim.drives import Look
 
 SCANS = 60
-_STARTS, _RIGHT_M = 100, 0.5
+_STARTS = 100
+_RIGHT_M = 0.5
 _EVERY = 10  # scan that is looked at to tell whether a place is in the map
-_SHOWN, _AGREES = 0.7, 0.8  # shares of the beams
+# Shares of the beams
+_SHOWN = 0.7
+_AGREES = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +69,9 @@ def _finder(log: Path) -> GlobalLocalization:
 
 def _in_map(finder: GlobalLocalization, looks: list[Look]) -> tuple[float, float]:
     """Of how many beams the map tells, from true poses, and with how many of these it agrees."""
-    asked, agreed, beams = 0.0, 0.0, 0
+    asked = 0.0
+    agreed = 0.0
+    beams = 0
     model = calibrate(finder.places, looks[0].scan, finder.config, np.random.default_rng(0))
     judge = Judge(finder.places, finder.config, model)
     for look in looks[: SCANS // 2 : _EVERY // 2]:
@@ -86,7 +91,8 @@ def is_in_map(record: dict[str, str]) -> bool:
 @lru_cache(maxsize=1)
 def _halves(log: Path) -> _Halves:
     pairs = _pairs(log)
-    half, pipeline = len(pairs) // 2, Pipeline()
+    half = len(pairs) // 2
+    pipeline = Pipeline()
     for scan, T_odom_base in pairs[:half]:
         pipeline.step(scan, T_odom_base)
     known = Map(pipeline.grid.patch(), copy.deepcopy(pipeline.topology.map))
@@ -101,7 +107,8 @@ def _halves(log: Path) -> _Halves:
 
 def _pairs(log: Path) -> list[tuple[Scan, Array]]:
     """Scans with their odometry poses."""
-    pairing, pairs = ScanPairing(), []
+    pairing = ScanPairing()
+    pairs = []
     for event in CarmenLog(log).events():
         if isinstance(event, OdometryEvent):
             pairs += pairing.add_odometry(event.stamp_ns, event.T_odom_base)

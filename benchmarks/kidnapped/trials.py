@@ -102,7 +102,8 @@ def fresh(finder: GlobalLocalization) -> GlobalLocalization:
 
 def along(looks: Iterable[Look], way_m: float) -> Iterator[tuple[Look, float]]:
     """Each look, and the way that has been driven up to there, until that is longer than way_m."""
-    way, last = 0.0, None
+    way = 0.0
+    last = None
     for look in looks:
         way += 0.0 if last is None else float(np.hypot(*(look.T_world_base - last)[:2]))
         last = look.T_world_base
@@ -130,7 +131,10 @@ def search(
 
     shift_m: where the map's frame is, seen from the world's.
     """
-    seconds, count, result, driven_m = [], 0, None, 0.0
+    seconds = []
+    count = 0
+    result = None
+    driven_m = 0.0
     for k, (look, way) in enumerate(along(looks, way_m)):
         if k % every:
             continue

@@ -20,7 +20,8 @@ def against(
     common = [cases[k] for k in both]
     ours = [reports[k] for k in both]
     theirs = [other for other in others if other is not None]
-    here, there = errors(common, ours), errors(common, theirs)
+    here = errors(common, ours)
+    there = errors(common, theirs)
     ratio = (here + 1e-6) / (there + 1e-6)
     lines = [
         f'## Against another run ({len(both)} of {len(cases)} cases)\n',

@@ -18,9 +18,15 @@ from thinmap_ros.evaluation.table import Row, at_least, at_most
 from thinmap_ros.sim.laser import Lms200, Lms200Config
 from thinmap_ros.sim.world import World
 
-_CELL_M, _WALL_M = 0.05, 0.1
-_WIDTH_M, _CORRIDOR_M, _ROOM_M, _DOOR_M = 10.0, 2.0, 3.0, 1.0
-_STEP_M, _AROUND = 0.1, 100  # steps before a number of features is reached that count for it
+_CELL_M = 0.05
+_WALL_M = 0.1
+_WIDTH_M = 10.0
+_CORRIDOR_M = 2.0
+_ROOM_M = 3.0
+_DOOR_M = 1.0
+# Steps before a number of features is reached that count for it
+_STEP_M = 0.1
+_AROUND = 100
 _WHEELS = 1.01  # what the odometry makes of a metre
 _GAP_M = 0.3  # the walls on both sides of a door are two features, so that there are many
 
@@ -53,12 +59,16 @@ def _cost(slam: str, numbers: list[int]) -> Iterator[tuple[int, tuple[float, flo
     Median and longest step of the last ones before the map holds so many, ms.
     """
     length = 1.5 * numbers[-1] + 60.0
-    world, laser = _floor(length), Lms200(Lms200Config(), 0)
+    world = _floor(length)
+    laser = Lms200(Lms200Config(), 0)
     truth = np.array([1.0, 0.5 * _WIDTH_M, 0.0])
     localizer = EkfLocalizer(
         EkfConfig(slam=slam, gap_m=_GAP_M, start_x_m=truth[0], start_y_m=truth[1])
     )
-    odom, taken, left, number = np.zeros(3), [0.0], list(numbers), 0
+    odom = np.zeros(3)
+    taken = [0.0]
+    left = list(numbers)
+    number = 0
     while left and truth[0] < length - 2.0:
         scan = laser.scan(world, truth, 200_000_000 * number)
         started = time.process_time()
@@ -68,7 +78,8 @@ def _cost(slam: str, numbers: list[int]) -> Iterator[tuple[int, tuple[float, flo
             last = np.array(taken[-_AROUND:])
             yield left.pop(0), (float(np.median(last)), float(last.max()))
         step = np.array([_STEP_M, 0.0, 0.002 * math.cos(0.05 * number)])
-        truth, odom = se2.compose(truth, step), se2.compose(odom, step * [_WHEELS, 1.0, 1.0])
+        truth = se2.compose(truth, step)
+        odom = se2.compose(odom, step * [_WHEELS, 1.0, 1.0])
         number += 1
 
 
@@ -88,7 +99,8 @@ def _floor(length_m: float) -> World:
                 (door + _DOOR_M, y, b, y + _WALL_M),
                 (b, low, b + _WALL_M, high),
             )
-            x, depth = rng.uniform(a + 0.2, b - 1.4), rng.uniform(0.4, 0.8)
+            x = rng.uniform(a + 0.2, b - 1.4)
+            depth = rng.uniform(0.4, 0.8)
             _fill(
                 cells,
                 (x, low, x + 1.2, low + depth) if low == 0.0 else (x, high - depth, x + 1.2, high),

@@ -11,9 +11,12 @@ from benchmarks.worlds import Floor, floors
 from thinmap_ros.evaluation.table import Row, at_least, at_most
 from thinmap_ros.tools.explore_world import Options, explore
 
-_LARGEST, _DUNGEON, _DUNGEON_QUICK = 'kth/50037764_PLAN1', 'dungeon/', 'dungeon/d114'
+_LARGEST = 'kth/50037764_PLAN1'
+_DUNGEON = 'dungeon/'
+_DUNGEON_QUICK = 'dungeon/d114'
 _FAST = Options(speed_m_s=0.5)
-_PART_S, _PART_QUICK_S = 3000.0, 200.0
+_PART_S = 3000.0
+_PART_QUICK_S = 200.0
 
 
 def run(worlds: Path, quick: bool) -> Iterator[Row]:
@@ -25,7 +28,8 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
 def _dungeons(chosen: list[Floor]) -> Iterator[Row]:
     # Compile, fill caches.
     explore(chosen[0].world, chosen[0].starts[0], replace(_FAST, time_limit_s=30.0))
-    reports, speeds = [], []
+    reports = []
+    speeds = []
     for floor in chosen:
         began = time.process_time()
         _, report = explore(floor.world, floor.starts[0], _FAST)

@@ -24,7 +24,8 @@ from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import Simulation
 from thinmap_ros.sim.world import World
 
-_SPEED_M_S, _ROBOT = 1.0, '2dx'
+_SPEED_M_S = 1.0
+_ROBOT = '2dx'
 _MARKS_M = (100.0, 500.0, 1000.0, 2000.0, 3000.0, 5000.0, 7500.0, 10_000.0)
 _MARKS_QUICK_M = (100.0, 500.0, 1000.0)
 _SPAN_M = 100.0  # before a mark, over which its time is measured
@@ -85,7 +86,8 @@ def _rows(mark: _Mark) -> Iterator[Row]:
 
 
 def _ratios(where: str, mark: _Mark, first: _Mark) -> Iterator[Row]:
-    now, then = mark.taken_ms['all'], first.taken_ms['all']
+    now = mark.taken_ms['all']
+    then = first.taken_ms['all']
     yield at_most(
         f'  {where}, against the first time: median', float(np.median(now) / np.median(then)), 1.2
     )
@@ -95,7 +97,9 @@ def _ratios(where: str, mark: _Mark, first: _Mark) -> Iterator[Row]:
 def _drive(looks: Iterator[Look], marks_m: list[float]) -> Iterator[_Mark]:
     """Marks after these lengths of the drive."""
     pipeline: CpuTimedPipeline | None = None
-    way_m, last, ways = 0.0, None, []
+    way_m = 0.0
+    last = None
+    ways = []
     taken: dict[str, list[float]] = {part: [] for part in ('all', *_PARTS)}
     for look in looks:
         if pipeline is None:
@@ -131,7 +135,8 @@ def _drive(looks: Iterator[Look], marks_m: list[float]) -> Iterator[_Mark]:
 def _looks() -> tuple[Iterator[Look], float]:
     """The tour of the warehouse, again and again, and its length, m."""
     path = world_path('warehouse')
-    world, tour = World.from_patch(*read_world(path)), read_tour(path)
+    world = World.from_patch(*read_world(path))
+    tour = read_tour(path)
     robot = PRESETS[_ROBOT]
     simulation = Simulation(world, world.start, robot, Lms200Config(range_max_m=_RANGE_M), 0)
     ways = list(ways_along(world, tour, robot.radius_m))  # closed: it begins where it ends

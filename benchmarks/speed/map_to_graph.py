@@ -24,7 +24,8 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
         def work(path: Path = floor.path) -> TopologicalMap:
             return build(read_map(path), None, config)
 
-        graph, patch = work(), read_map(floor.path)
+        graph = work()
+        patch = read_map(floor.path)
         yield Row(floor.name, f'{len(graph.nodes)} nodes')
         if floor.name in _SECONDS:
             seconds = best_seconds({'work': work}, 5)['work']

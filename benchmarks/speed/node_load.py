@@ -117,7 +117,8 @@ class _Listener:
 
         if not rclpy.ok():
             rclpy.init()
-        self._rclpy, self._command = rclpy, messages.twist_msg(0.15, 0.15)
+        self._rclpy = rclpy
+        self._command = messages.twist_msg(0.15, 0.15)
         self._node = rclpy.create_node('listener')
         self._cmd_vel = self._node.create_publisher(Twist, 'cmd_vel', qos.STREAM)
         self._heard: dict[str, dict[int, float]] = {}
@@ -139,7 +140,8 @@ class _Listener:
 
     def listen(self, seconds: float) -> None:
         """Listen for so long."""
-        end, commanded = time.monotonic() + seconds, 0.0
+        end = time.monotonic() + seconds
+        commanded = 0.0
         while time.monotonic() < end:
             self._rclpy.spin_once(self._node, timeout_sec=0.02)
             if time.monotonic() - commanded > 0.1:
@@ -160,7 +162,8 @@ class _Listener:
 
     def of(self, topic: str) -> list[float]:
         """Milliseconds from each scan to the message of its stamp."""
-        scans, answers = self._heard.get('scan', {}), self._heard.get(topic, {})
+        scans = self._heard.get('scan', {})
+        answers = self._heard.get(topic, {})
         return [1e3 * (answers[ns] - at) for ns, at in scans.items() if ns in answers] or [
             float('inf')
         ]
@@ -170,12 +173,15 @@ def _traffic(bag: Path) -> Iterator[Row]:
     from thinmap_ros.logs.bag import Bag
 
     sizes: dict[str, list[int]] = {}
-    first, last = None, 0
+    first = None
+    last = 0
     for message in Bag(bag).messages():
         sizes.setdefault(message.topic, []).append(len(message.data))
-        first, last = message.log_ns if first is None else first, message.log_ns
+        first = message.log_ns if first is None else first
+        last = message.log_ns
     seconds = max((last - (first or 0)) / 1e9, 1.0)
     yield Row('traffic', f'{seconds:.0f} s')
     for topic, found in sorted(sizes.items(), key=lambda item: -sum(item[1])):
-        rate, size = len(found) / seconds, sum(found) / len(found) / 1e3
+        rate = len(found) / seconds
+        size = sum(found) / len(found) / 1e3
         yield Row(f'  {topic}: {rate:.1f} a second of {size:.2f} kB', f'{rate * size:.1f} kB/s')

@@ -20,7 +20,8 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.table import Row, at_least, at_most
 from thinmap_ros.files.occupancy_maps import read_map
 
-_GOALS, _GOALS_QUICK = 1000, 60
+_GOALS = 1000
+_GOALS_QUICK = 60
 _HAIR = 1e-6
 
 
@@ -45,7 +46,8 @@ class _Tally:
 
 def run(worlds: Path, quick: bool) -> Iterator[Row]:
     """Rows over all worlds."""
-    rng, tally = np.random.default_rng(0), _Tally()
+    rng = np.random.default_rng(0)
+    tally = _Tally()
     chosen = floors(worlds, 'kth/50052751' if quick else '')
     for floor in chosen:
         for _ in range(-(-(_GOALS_QUICK if quick else _GOALS) // len(chosen))):
@@ -66,7 +68,8 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
 
 def _try(floor: Floor, patch: GridPatch, rng: np.random.Generator, tally: _Tally) -> None:
     """Plan from one of the starts of a floor to a point anywhere on its map."""
-    config, resolution = WavefrontConfig(), patch.frame.resolution
+    config = WavefrontConfig()
+    resolution = patch.frame.resolution
     start = floor.starts[rng.integers(len(floor.starts))]
     cell = np.array([rng.integers(size) for size in patch.shape])
     goal = patch.frame.centres_of(cell[None])[0]
@@ -84,12 +87,14 @@ def _try(floor: Floor, patch: GridPatch, rng: np.random.Generator, tally: _Tally
     path = plan(patch, (float(start[0]), float(start[1])), (float(goal[0]), float(goal[1])), config)
     seconds = time.perf_counter() - began
     if expected:
-        tally.reachable, tally.reached = tally.reachable + 1, tally.reached + (path is not None)
+        tally.reachable = tally.reachable + 1
+        tally.reached = tally.reached + (path is not None)
         tally.plan_s.append(seconds)
         if path is not None:
             _judge(path, patch, clearance_m, tally, config.robot_radius_m)
     else:
-        tally.unreachable, tally.refused = tally.unreachable + 1, tally.refused + (path is None)
+        tally.unreachable = tally.unreachable + 1
+        tally.refused = tally.refused + (path is None)
         tally.refuse_s.append(seconds)
 
 

@@ -25,11 +25,14 @@ from thinmap_ros.sim.laser import Lms200, Lms200Config
 _QUICK = ('kth/50052751',)
 _WORLDS = ('kth/50052751', 'kth/50052748', 'dungeon/d114', 'dungeon/d2555')
 # Scans that make the map, poses of a tour between them, and between cases.
-_BEFORE, _APART, _EVERY = 10, 5, 12
+_BEFORE = 10
+_APART = 5
+_EVERY = 12
 _RANGE_M = 30.0  # the laser's other mode; both are made for it
 # Greatest error of a prior in each direction, m, and in degrees.
 _PRIORS = {'near': (0.1, 5.0), 'far': (0.4, 15.0)}
-_RIGHT_M, _RIGHT_DEG = 0.1, 2.0
+_RIGHT_M = 0.1
+_RIGHT_DEG = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +68,8 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
         )
         found = {name: _measure(maker, cases, errors) for name, maker in makers.items()}
         for name, (match_ms, drawn_ms, off) in found.items():
-            off_m, off_deg = np.hypot(off[:, 0], off[:, 1]), np.degrees(np.abs(off[:, 2]))
+            off_m = np.hypot(off[:, 0], off[:, 1])
+            off_deg = np.degrees(np.abs(off[:, 2]))
             right = float(((off_m <= _RIGHT_M) & (off_deg <= _RIGHT_DEG)).mean())
             yield Row(f'  {name}: CPU of a match, median', f'{np.median(match_ms):.3g} ms')
             yield Row(
@@ -97,7 +101,8 @@ def _measure(
 ) -> tuple[Array, Array, Array]:
     """CPU of each match without and with drawing its map, ms, and how far it is off, (N, 3)."""
     rng = np.random.default_rng(0)
-    taken, off = [], []
+    taken = []
+    off = []
     for case in (cases[0], *cases):  # the first one twice: it compiles
         prior = se2.compose(
             case.T_map_base,
@@ -137,7 +142,8 @@ def _karto(karto: Any) -> Maker:
     def maker(before: list[tuple[Scan, Array]], errors: tuple[float, float]) -> Match:
         config = karto.ScanMatcherConfig()
         config.search_size = max(config.search_size, 2.0 * errors[0] + 0.1)
-        matcher, laser = karto.Wrapper(config), _karto_laser(karto, before[0][0])
+        matcher = karto.Wrapper(config)
+        laser = _karto_laser(karto, before[0][0])
         known = [_karto_scan(karto, laser, scan, T, k) for k, (scan, T) in enumerate(before)]
 
         def match(scan: Scan, prior: Array) -> Array:

@@ -25,7 +25,8 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
         drive.run(poses)
         milliseconds = 1e3 * np.array(drive.ledger.seconds[_WARM_UP:])[:_RUN]
         tenth = len(milliseconds) // 10
-        graph, batch = drive.builder.map, final_map(drive, floor.starts[0])
+        graph = drive.builder.map
+        batch = final_map(drive, floor.starts[0])
         there, back = agreement(graph, batch, 0.5)
         yield from [
             Row(name, f'{len(poses)} scans', '', None),

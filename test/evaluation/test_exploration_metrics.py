@@ -38,7 +38,8 @@ def test_two_at_once_are_two_places_however_near():
 
 
 def test_what_did_not_last_is_not_counted():
-    blink, stay = (1, 5.0, 5.0), (2, 0.0, 0.0)
+    blink = (1, 5.0, 5.0)
+    stay = (2, 0.0, 0.0)
     decisions = [[blink, stay]] * (FEWEST_SIGHTINGS - 1) + [[stay]]
     assert census_of(*decisions).seen == 1
 

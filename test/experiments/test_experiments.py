@@ -184,7 +184,8 @@ def test_logs_of_the_users_own(tmp_path: Path) -> None:
     for look in looks:
         ranges = ' '.join(f'{r if np.isfinite(r) else 81.0:.3f}' for r in look.scan.ranges_m)
         x, y, theta = look.T_odom_base
-        pose, t = f'{x:.6f} {y:.6f} {theta:.6f}', look.scan.stamp_ns / 1e9
+        pose = f'{x:.6f} {y:.6f} {theta:.6f}'
+        t = look.scan.stamp_ns / 1e9
         lines.append(f'FLASER 181 {ranges} {pose} {pose} {t:.6f} host {t:.6f}\n')
     (tmp_path / 'logs' / 'mine' / 'log.clf').write_text(''.join(lines))
     (tmp_path / 'logs' / 'mine' / 'odom.txt').write_text('0 0 0 0\n20 0 0 0\n')

@@ -53,7 +53,8 @@ def test_it_is_what_the_route_server_reads(tmp_path: Path) -> None:
     for f in features:
         assert all(isinstance(v, str | int | float) for v in f['properties']['metadata'].values())
         if f['geometry']['type'] == 'MultiLineString':
-            start, end = f['properties']['startid'], f['properties']['endid']
+            start = f['properties']['startid']
+            end = f['properties']['endid']
             (line,) = f['geometry']['coordinates']
             assert line[0] == nodes[start]['geometry']['coordinates']
             assert line[-1] == nodes[end]['geometry']['coordinates']
@@ -64,7 +65,8 @@ def test_it_is_what_the_route_server_reads(tmp_path: Path) -> None:
 
 def test_round_trip(tmp_path: Path) -> None:
     written(tmp_path)
-    again, before = read_geojson(tmp_path / 'g.geojson'), example()
+    again = read_geojson(tmp_path / 'g.geojson')
+    before = example()
     assert again.nodes.keys() == before.nodes.keys() and again.edges.keys() == before.edges.keys()
     for i, node in before.nodes.items():
         assert again.nodes[i].kind == node.kind

@@ -65,7 +65,8 @@ def test_each_state_is_read_back_as_what_it_is(tmp_path: Path) -> None:
 
 def test_rows_are_turned_over_and_the_image_is_a_pgm(tmp_path: Path) -> None:
     cells = np.full((3, 2), UNKNOWN, dtype=np.int8)
-    cells[0, 0], cells[2, 1] = 100, 0
+    cells[0, 0] = 100
+    cells[2, 1] = 0
     path = write_map(tmp_path / 'sub' / 'map', GridPatch(GridFrame(1.0, 2.0, 0.1), cells))
     assert path == tmp_path / 'sub' / 'map.yaml'
     assert (tmp_path / 'sub' / 'map.pgm').read_bytes().startswith(b'P5')

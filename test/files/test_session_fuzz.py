@@ -96,7 +96,8 @@ LOADERS: dict[str, Callable[[str], Any]] = {
 }
 FORMATS = {kind: f'{kind} {2 if kind == "features" else 1}' for kind in LOADERS}
 # The largest number of whole numbers, or one of 300 digits; -1 in whole numbers, NaN in others.
-LARGE, MINUS_ONE = b'\x7f', b'\xff'
+LARGE = b'\x7f'
+MINUS_ONE = b'\xff'
 # Where -1 is a number like others, and where NaN stands for "not known".
 MAY_BE_NEGATIVE = {
     'topology': {'low', 'memory'},

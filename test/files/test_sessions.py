@@ -60,7 +60,8 @@ def way() -> list[Array]:
     ]
     poses = []
     for (x, y), (to_x, to_y) in pairwise(corners):
-        heading, steps = math.atan2(to_y - y, to_x - x), int(math.hypot(to_x - x, to_y - y) / 0.25)
+        heading = math.atan2(to_y - y, to_x - x)
+        steps = int(math.hypot(to_x - x, to_y - y) / 0.25)
         poses += [
             pose(x + k / steps * (to_x - x), y + k / steps * (to_y - y), heading)
             for k in range(steps)
@@ -69,7 +70,8 @@ def way() -> list[Array]:
 
 
 def drive(grid: OccupancyGrid, builder: TopologyBuilder, poses: list[Array], seed: int) -> None:
-    laser, world = Lms200(Lms200Config(), seed), building()
+    laser = Lms200(Lms200Config(), seed)
+    world = building()
     for k, T in enumerate(poses):
         grid.update(laser.scan(world, T, k), T)
         builder.update(grid.window(T[0], T[1], 10.0), T)
@@ -90,12 +92,14 @@ def assert_same(one: TopologicalMap, other: TopologicalMap) -> None:
 
 
 def test_work_goes_on_as_if_it_had_never_stopped(tmp_path: Path) -> None:
-    grid, builder = OccupancyGrid(), TopologyBuilder()
+    grid = OccupancyGrid()
+    builder = TopologyBuilder()
     poses = way()
     drive(grid, builder, poses[:120], 0)
     write_grid(tmp_path / 'a.grid.npz', grid)
     write_topology(tmp_path / 'a.topology.npz', builder)
-    again, restored = read_grid(tmp_path / 'a.grid.npz'), read_topology(tmp_path / 'a.topology.npz')
+    again = read_grid(tmp_path / 'a.grid.npz')
+    restored = read_topology(tmp_path / 'a.topology.npz')
     assert len(builder.map.nodes) > 2
     assert_same(builder.map, restored.map)
     drive(grid, builder, poses[120:], 1)
@@ -118,7 +122,8 @@ def test_nothing_seen_yet(tmp_path: Path) -> None:
 
 
 def test_what_does_not_fit_is_said(tmp_path: Path) -> None:
-    grid, builder = OccupancyGrid(), TopologyBuilder()
+    grid = OccupancyGrid()
+    builder = TopologyBuilder()
     drive(grid, builder, way()[:5], 0)
     write_grid(tmp_path / 'a.npz', grid)
     write_topology(tmp_path / 'b.npz', builder)
@@ -135,7 +140,8 @@ def test_what_does_not_fit_is_said(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('end', ['', '.grid.npz', '.topology.npz', '.yaml', '.pgm'])
 def test_a_session_is_named_by_its_stem_or_one_of_its_files(tmp_path: Path, end: str) -> None:
-    grid, builder = OccupancyGrid(), TopologyBuilder()
+    grid = OccupancyGrid()
+    builder = TopologyBuilder()
     drive(grid, builder, way()[:5], 0)
     path = str(tmp_path / 'v1.2' / 'room.one') + end
     assert not has_topology(path)
@@ -185,10 +191,13 @@ def test_a_grid_of_nonsense_is_refused(wrong: dict[str, Array]) -> None:
 
 def test_a_corrected_past_moves_the_nodes_and_they_keep_their_ids() -> None:
     """The robot's heading was wrong by a little more with each metre; then a loop was closed."""
-    world, poses = building(), way()
+    world = building()
+    poses = way()
     believed = [pose(T[0] + 0.004 * k, T[1] + 0.002 * k, T[2]) for k, T in enumerate(poses)]
-    drifted, corrected = OccupancyGrid(), OccupancyGrid()
-    builder, straight = TopologyBuilder(), TopologyBuilder()
+    drifted = OccupancyGrid()
+    corrected = OccupancyGrid()
+    builder = TopologyBuilder()
+    straight = TopologyBuilder()
     laser = Lms200(Lms200Config(), 0)
     for k, (T, wrong) in enumerate(zip(poses, believed, strict=True)):
         scan = laser.scan(world, T, k)
@@ -198,7 +207,8 @@ def test_a_corrected_past_moves_the_nodes_and_they_keep_their_ids() -> None:
         straight.update(corrected.window(T[0], T[1], 10.0), T)
     before = dict(builder.map.nodes)
     builder.rebuild(lambda x, y: corrected.window(x, y, 10.0), np.array(believed), np.array(poses))
-    after, wanted = builder.map, straight.map
+    after = builder.map
+    wanted = straight.map
     places = np.array([node.position for node in wanted.nodes.values()])
     near = [np.hypot(*(places - node.position).T).min() <= 0.5 for node in after.nodes.values()]
     assert np.mean(near) >= 0.8
@@ -220,7 +230,8 @@ def test_a_correction_before_the_first_window() -> None:
 
 
 def test_what_an_exploration_learned_is_the_same_after_a_start(tmp_path):
-    explorer, stem = Explorer(), str(tmp_path / 'room')
+    explorer = Explorer()
+    stem = str(tmp_path / 'room')
     assert load_exploration(stem) is None
     explorer.surveyor.follow({7: (1.0, 2.0), 9: (3.0, 2.5)})
     explorer.surveyor.tracker.tracks[9].probability = 0.8
@@ -241,7 +252,9 @@ def test_what_an_exploration_learned_is_the_same_after_a_start(tmp_path):
 def test_features_are_kept_set_aside_or_refused_in_words(tmp_path):
     stem = str(tmp_path / 'office')
     assert load_features(stem) is None
-    localizer, world, laser = ScanLocalizer(), building(), Lms200(Lms200Config(), 1)
+    localizer = ScanLocalizer()
+    world = building()
+    laser = Lms200(Lms200Config(), 1)
     for k in range(30):
         T = pose(3.0 + 0.1 * k, 6.0, 0.0)
         localizer.step(laser.scan(world, T, k), T)

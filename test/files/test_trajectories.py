@@ -18,7 +18,8 @@ POSE = st.tuples(st.floats(-1e4, 1e4), st.floats(-1e4, 1e4), st.floats(-math.pi,
 @settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.tuples(st.integers(0, 2**62), POSE), max_size=20))
 def test_round_trip(tmp_path: Path, samples: list[tuple[int, tuple[float, float, float]]]) -> None:
-    stamps, poses = [s for s, _ in samples], [np.array(p) for _, p in samples]
+    stamps = [s for s, _ in samples]
+    poses = [np.array(p) for _, p in samples]
     write_tum(tmp_path / 't.tum', stamps, poses)
     stamps_again, poses_again = read_tum(tmp_path / 't.tum')
     assert stamps_again == stamps

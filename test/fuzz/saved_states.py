@@ -65,7 +65,8 @@ class Explored:
         return work
 
     def _use_exploration(self, state: State) -> Work:
-        explorer, pipeline = Explorer.from_state(state), self.loop.pipeline
+        explorer = Explorer.from_state(state)
+        pipeline = self.loop.pipeline
         patch = pipeline.grid.patch()
         return lambda scan, T: explorer.step(pipeline.topology.map, patch, scan, T)
 

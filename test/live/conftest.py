@@ -33,7 +33,8 @@ class Graph:
     """Node processes, and a node of the test's own that listens and asks."""
 
     def __init__(self, domain: int, folder: Path) -> None:
-        self.folder, self.processes = folder, {}
+        self.folder = folder
+        self.processes = {}
         self._clients: dict[str, Client] = {}
         self._pacemaker: Publisher | None = None
         self._heard = 0
@@ -103,7 +104,8 @@ class Graph:
 
     def hear_out(self) -> None:
         """Hear what still waits, until it is quiet: those that have stopped send nothing later."""
-        last_heard, quiet = self._heard, 0
+        last_heard = self._heard
+        quiet = 0
 
         def is_quiet() -> bool:
             nonlocal last_heard, quiet

@@ -21,7 +21,8 @@ from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live
-STRING, SCAN = 'std_msgs/msg/String', 'sensor_msgs/msg/LaserScan'
+STRING = 'std_msgs/msg/String'
+SCAN = 'sensor_msgs/msg/LaserScan'
 BEST_EFFORT = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
@@ -50,7 +51,8 @@ def on_disk(graph, talk, doctor, least):
     It flushes twice for each time that it tells how it is. Returns how many must be there.
     """
     graph.until(lambda: talk() and doctor.number('recorder', 'messages written') > least, 'some')
-    written, told = doctor.number('recorder', 'messages written'), doctor.times('recorder') + 3
+    written = doctor.number('recorder', 'messages written')
+    told = doctor.times('recorder') + 3
     graph.until(lambda: talk() and doctor.times('recorder') >= told, 'time to flush')
     return written
 
@@ -72,7 +74,8 @@ def test_a_killed_recorder_loses_no_more_than_what_came_since_the_last_flush(gra
 def test_a_full_disk_ends_the_recording_in_words_and_what_is_written_stays_readable(
     graph, tmp_path
 ):
-    doctor, recorder = Doctor(graph), graph.start('recorder', bag=str(tmp_path / 'bag'))
+    doctor = Doctor(graph)
+    recorder = graph.start('recorder', bag=str(tmp_path / 'bag'))
     talk = talks(graph, 'said', size=1000)
     on_disk(graph, talk, doctor, 20)
     size = (tmp_path / 'bag' / 'bag.mcap').stat().st_size
@@ -168,8 +171,10 @@ def test_a_bag_is_offered_as_it_was_recorded_and_under_other_names(graph, bag):
 
 
 def test_a_bag_is_paused_stepped_and_begun_in_its_middle(graph, bag):
-    scans, clock = graph.heard('/robot/scan', LaserScan), graph.heard('/clock', Clock)
-    signs, doctor = graph.heard('/sign', String, qos.LATCHED), Doctor(graph)
+    scans = graph.heard('/robot/scan', LaserScan)
+    clock = graph.heard('/clock', Clock)
+    signs = graph.heard('/sign', String, qos.LATCHED)
+    doctor = Doctor(graph)
     graph.start('bag_player', bag=str(bag), start_offset_s=4.0, start_paused=True, rate=0.5)
 
     def step():

@@ -97,7 +97,8 @@ class Mapping:
 def test_windows_name_a_correction_when_all_of_the_map_has_undergone_it(graph):
     mapping = Mapping(graph)
     corrected_ns = mapping.drive_and_correct()
-    named, expected = [0], [0]
+    named = [0]
+    expected = [0]
     while mapping.by_hand.is_rerendering:
         k = COUNT + len(named)
         named.append(mapping.add(k, TRUE[k]))

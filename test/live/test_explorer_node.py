@@ -37,7 +37,8 @@ SPEAK_S = 0.02
 def room(known_cols):
     """A walled room of 6 x 4 m, known up to a column."""
     cells = np.zeros((40, 60), dtype=np.int8)
-    cells[[0, -1]], cells[:, [0, -1]] = 100, 100
+    cells[[0, -1]] = 100
+    cells[:, [0, -1]] = 100
     cells[:, known_cols:] = UNKNOWN
     return GridPatch(GridFrame(0.0, 0.0, 0.1), cells)
 
@@ -46,7 +47,9 @@ class Robot:
     """Says what the other nodes of a robot would say that stands in a room."""
 
     def __init__(self, graph):
-        self.graph, self.node, self.numbers = graph, graph.node, count(1)
+        self.graph = graph
+        self.node = graph.node
+        self.numbers = count(1)
         self.hears_scans = self.is_tracked = True
         self.end_nodes = graph.heard('end_nodes', EndNodeArray, qos.LATCHED)
         self.map = self.node.create_publisher(OccupancyGrid, 'map', qos.LATCHED)
@@ -118,7 +121,8 @@ def test_it_says_why_it_ended(robot):
     )
     robot.is_tracked = False
     assert robot.explores() == (ExplorationStatus.LOCALIZATION_LOST, GoalStatus.STATUS_ABORTED)
-    robot.is_tracked, robot.hears_scans = True, False
+    robot.is_tracked = True
+    robot.hears_scans = False
     assert robot.explores() == (ExplorationStatus.SENSOR_SILENT, GoalStatus.STATUS_ABORTED)
     robot.hears_scans = True
     robot.refuses_to_drive()

@@ -74,7 +74,8 @@ def test_a_robot_that_drives_about_finds_itself_when_asked(graph, map_file):
     answer = graph.call(LocalizeGlobally, 'localize_globally', LocalizeGlobally.Request(clear=True))
     assert answer.accepted, answer.message
     ahead = Twist()
-    ahead.linear.x, ahead.angular.z = 0.25, 0.35
+    ahead.linear.x = 0.25
+    ahead.angular.z = 0.35
 
     def found():
         commands.publish(ahead)
@@ -170,7 +171,8 @@ def test_what_is_wrong_with_the_input_is_said_in_words_and_no_pose_comes_of_it(g
 
         graph.until(said, words)
 
-    wall, nothing = np.full(181, 3.0), np.full(181, np.nan)
+    wall = np.full(181, 3.0)
+    nothing = np.full(181, np.nan)
     walls = GridPatch(good.frame, np.full(good.shape, 100, dtype=np.int8))
     open_field = GridPatch(good.frame, np.zeros(good.shape, dtype=np.int8))
     for patch, nodes, words in (

@@ -180,7 +180,8 @@ def test_a_node_that_becomes_active_has_what_was_latched(graph):
 
 
 def test_pause_and_reset(graph):
-    doctor, poses = Doctor(graph), graph.heard('pose', PoseWithCovarianceStamped)
+    doctor = Doctor(graph)
+    poses = graph.heard('pose', PoseWithCovarianceStamped)
     maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
     graphs = graph.heard('topology', TopologicalMap, qos.LATCHED)
     graph.start('thinmap', arguments=MAPPING, use_sim_time=True, **AT_START)

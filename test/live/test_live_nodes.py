@@ -29,8 +29,10 @@ def stamps(heard):
 
 
 def test_the_simulated_robot_drives_as_told_and_stops_without_commands(graph):
-    scans, odometry = graph.heard('scan', LaserScan, qos.SENSOR), graph.heard('odom', Odometry)
-    clock, frames = graph.heard('/clock', Clock), graph.heard('/tf', TFMessage)
+    scans = graph.heard('scan', LaserScan, qos.SENSOR)
+    odometry = graph.heard('odom', Odometry)
+    clock = graph.heard('/clock', Clock)
+    frames = graph.heard('/tf', TFMessage)
     graph.start('sim', start=START, rate=4.0)
     graph.until(
         lambda: len(scans) > 3 and odometry and clock and frames, 'scans, odometry, time and frames'
@@ -60,7 +62,8 @@ def test_the_simulated_robot_drives_as_told_and_stops_without_commands(graph):
 def test_a_scan_becomes_a_pose_a_map_and_a_graph(graph, tmp_path):
     poses = graph.heard('pose', PoseWithCovarianceStamped)
     status = graph.heard('slam_status', SlamStatus)
-    scans, frames = graph.heard('scan', LaserScan, qos.SENSOR), graph.heard('/tf', TFMessage)
+    scans = graph.heard('scan', LaserScan, qos.SENSOR)
+    frames = graph.heard('/tf', TFMessage)
     local_maps = graph.heard('local_map', OccupancyGrid, qos.LATCHED)
 
     def links():
@@ -110,11 +113,14 @@ def test_bad_messages_are_refused_in_words_and_nothing_dies(graph):
     def say(seconds, x, count=181, increment=np.pi / 180.0):
         odometry = Odometry()
         odometry.header.stamp = messages.time_msg(int(seconds * 1e9))
-        odometry.header.frame_id, odometry.child_frame_id = 'odom', 'base_link'
-        odometry.pose.pose.position.x, odometry.pose.pose.orientation.w = x, 1.0
+        odometry.header.frame_id = 'odom'
+        odometry.child_frame_id = 'base_link'
+        odometry.pose.pose.position.x = x
+        odometry.pose.pose.orientation.w = 1.0
         odom_topic.publish(odometry)
         scan = LaserScan(angle_min=-1.57, angle_increment=increment, range_min=0.05, range_max=8.0)
-        scan.header.stamp, scan.header.frame_id = odometry.header.stamp, 'laser'
+        scan.header.stamp = odometry.header.stamp
+        scan.header.frame_id = 'laser'
         scan.ranges = [2.0] * count
         scan_topic.publish(scan)
 
@@ -189,7 +195,8 @@ def test_the_navigator_drives_to_a_goal_and_refuses_one_in_a_wall(graph):
     graph.until(lambda: maps and is_free(maps[-1], 3.0, 2.0), 'a map that knows the goal')
     goal = NavigateToPose.Goal()
     goal.pose.header.frame_id = 'map'
-    goal.pose.pose.position.x, goal.pose.pose.position.y = 3.0, 2.0
+    goal.pose.pose.position.x = 3.0
+    goal.pose.pose.position.y = 2.0
     goal.pose.pose.orientation.w = 1.0
     ended = graph.act(NavigateToPose, 'navigate_to_pose', goal)
     assert ended.status == GoalStatus.STATUS_SUCCEEDED, ended.result

@@ -65,7 +65,8 @@ def test_end_nodes_say_how_sure_they_are():
 
 def test_line_features_from_end_to_end():
     feature = LineFeature(id=4, in_local_area=True)
-    feature.start.x, feature.end.y = 1.0, 2.0
+    feature.start.x = 1.0
+    feature.end.y = 2.0
     (lines,) = by_name(markers.line_features(LineFeatureArray(features=[feature]))).values()
     assert (
         np.allclose([(p.x, p.y) for p in lines.points], [(1.0, 0.0), (0.0, 2.0)])

@@ -109,7 +109,8 @@ def connections(doctor):
 
 
 def assert_live_is_same(graph, bag, expected, tmp_path, **localizer):
-    doctor, poses = Doctor(graph), graph.heard('pose', PoseWithCovarianceStamped)
+    doctor = Doctor(graph)
+    poses = graph.heard('pose', PoseWithCovarianceStamped)
     resume = graph.client(SetBool, '/bag_player/pause')
     for name in ('localizer', 'grid_mapper', 'topology_builder'):
         graph.start(name, use_sim_time=True, **(localizer if name == 'localizer' else {}))

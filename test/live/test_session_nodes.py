@@ -90,7 +90,8 @@ def test_ids_and_cells_are_the_same_tomorrow_and_mapping_goes_on(graph, tmp_path
     for name in MAPPERS:
         assert graph.stop(name) == 0
     graph.hear_out()
-    before, edges = places(graphs[-1]), {edge.id for edge in graphs[-1].edges}
+    before = places(graphs[-1])
+    edges = {edge.id for edge in graphs[-1].edges}
     known = session_files.load_grid(str(stem)).patch()
     assert len(before) > 3
     maps.clear(), graphs.clear(), local.clear()
@@ -117,8 +118,11 @@ def test_ids_and_cells_are_the_same_tomorrow_and_mapping_goes_on(graph, tmp_path
 def room_of(resolution=0.1):
     """Grid and graph of a room of 6 x 6 m as seen from its middle."""
     occupied = np.zeros((60, 60), dtype=np.uint8)
-    occupied[[0, -1]], occupied[:, [0, -1]], occupied[20:25, 35:40] = 1, 1, 1
-    grid, builder = OccupancyGrid(OccupancyConfig(resolution_m=resolution)), TopologyBuilder()
+    occupied[[0, -1]] = 1
+    occupied[:, [0, -1]] = 1
+    occupied[20:25, 35:40] = 1
+    grid = OccupancyGrid(OccupancyConfig(resolution_m=resolution))
+    builder = TopologyBuilder()
     world = World('room', occupied, OccupancyGrid().frame, pose(2.0, 2.0, 0.0))
     laser = Lms200(Lms200Config(), 1)
     for k in range(12):
@@ -213,7 +217,8 @@ def files_below(folder):
 
 
 def test_services_touch_nothing_outside_of_their_folder(graph, tmp_path):
-    folder, outside = tmp_path / 'maps', tmp_path / 'outside'
+    folder = tmp_path / 'maps'
+    outside = tmp_path / 'outside'
     folder.mkdir(), outside.mkdir()
     save(outside / 'room', *room_of())
     map_files.write_map(outside / 'drawn', room_of()[0].patch())

@@ -20,7 +20,9 @@ import sys
 import time
 
 _CLONE_NEWNET = 0x40000000
-_TUNSETIFF, _IFF_TAP, _IFF_NO_PI = 0x400454CA, 0x0002, 0x1000
+_TUNSETIFF = 0x400454CA
+_IFF_TAP = 0x0002
+_IFF_NO_PI = 0x1000
 _LARGEST_FRAME = 65_536
 
 
@@ -49,7 +51,9 @@ class Link:
 
     def __init__(self, ends: tuple[int, int], loss: float, delay_s: float, seed: int) -> None:
         self._other = {ends[0]: ends[1], ends[1]: ends[0]}
-        self._loss, self._delay_s, self._chance = loss, delay_s, random.Random(seed)
+        self._loss = loss
+        self._delay_s = delay_s
+        self._chance = random.Random(seed)
         self._under_way: list[tuple[float, int, int, bytes]] = []
         self.carried = self.lost = 0
         self.ended = False

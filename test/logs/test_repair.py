@@ -25,7 +25,8 @@ from thinmap_ros.logs.mcap_reader import Damage, McapFile, whole_records
 from thinmap_ros.logs.mcap_records import HEAD, MAGIC
 
 STRING = 'std_msgs/msg/String'
-COUNT, PER_CHUNK = 200, 10
+COUNT = 200
+PER_CHUNK = 10
 
 
 def write(path: Path, count: int = COUNT) -> Path:

@@ -26,7 +26,10 @@ def box(width_m: float = 6.0, height_m: float = 4.0, pillar: bool = False) -> Wo
     cells = np.zeros(
         (round((height_m + 0.2) / resolution), round((width_m + 0.2) / resolution)), dtype=np.uint8
     )
-    cells[:5], cells[-5:], cells[:, :5], cells[:, -5:] = 1, 1, 1, 1
+    cells[:5] = 1
+    cells[-5:] = 1
+    cells[:, :5] = 1
+    cells[:, -5:] = 1
     if pillar:
         cells[95:115, 195:215] = 1
     return World('box', cells, GridFrame(-0.1, -0.1, resolution), np.array([1.0, 2.0, 0.0]))
@@ -40,7 +43,8 @@ def analytic(
 ) -> np.ndarray:
     """Range to the walls of the empty box, 4 m high."""
     height = 4.0
-    dx, dy = np.cos(angles + theta), np.sin(angles + theta)
+    dx = np.cos(angles + theta)
+    dy = np.sin(angles + theta)
     with np.errstate(divide='ignore'):
         to_x = np.where(dx > 0, (width - x) / dx, np.where(dx < 0, -x / dx, np.inf))
         to_y = np.where(dy > 0, (height - y) / dy, np.where(dy < 0, -y / dy, np.inf))
@@ -137,7 +141,8 @@ def test_mixed_pixels_lie_between_the_two_surfaces_and_only_at_edges() -> None:
 
 def test_mixed_pixels_favour_neither_side() -> None:
     """A pillar straight ahead: what its left edge does on average, its right edge does as well."""
-    world, pose = box(pillar=True), np.array([1.0, 2.0, 0.0])
+    world = box(pillar=True)
+    pose = np.array([1.0, 2.0, 0.0])
     laser = Lms200(Lms200Config(noise_m=0.0, rounding_m=0.0, mixed_pixels=1.0), 1)
     mean = np.mean([laser.scan(world, pose, i).ranges_m for i in range(1000)], axis=0)
     off = mean - Lms200(EXACT, 0).scan(world, pose, 0).ranges_m

@@ -24,7 +24,10 @@ EXACT = PioneerConfig(
 
 def hall(size_m: float = 40.0) -> World:
     cells = np.zeros((round(size_m / 0.1),) * 2, dtype=np.uint8)
-    cells[0], cells[-1], cells[:, 0], cells[:, -1] = 1, 1, 1, 1
+    cells[0] = 1
+    cells[-1] = 1
+    cells[:, 0] = 1
+    cells[:, -1] = 1
     return World('hall', cells, GridFrame(-size_m / 2, -size_m / 2, 0.1), np.zeros(3))
 
 
@@ -49,7 +52,8 @@ def test_an_arc_has_no_jump_where_it_becomes_straight(turn: float) -> None:
 
 def test_a_full_circle_comes_back() -> None:
     robot = Pioneer(EXACT, HALL, np.array([1.0, 2.0, 0.3]), 0)
-    robot.v, robot.w = 0.2, 2 * math.pi / 10
+    robot.v = 0.2
+    robot.w = 2 * math.pi / 10
     for _ in range(200):
         robot.step(0.2, 2 * math.pi / 10, 0.05)
     assert np.allclose(robot.T_world_base, [1.0, 2.0, 0.3], atol=1e-9)
@@ -103,7 +107,9 @@ def drift(name: str, seed: int) -> tuple[float, float, float]:
         robot.step(0.5, 0.0, 0.05)
     heading = float(robot.T_odom_base[2])
     path = np.hypot(*robot.T_odom_base[:2]) / 20.0 - 1.0
-    turned, counted, last = 0.0, 0.0, robot.T_odom_base[2]
+    turned = 0.0
+    counted = 0.0
+    last = robot.T_odom_base[2]
     while turned < 20 * math.pi:
         robot.step(0.0, 1.0, 0.05)
         turned += robot.w * 0.05

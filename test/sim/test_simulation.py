@@ -13,7 +13,10 @@ from thinmap_ros.sim.world import World
 
 def simulation(seed: int = 1, rate_hz: float = 5.0) -> Simulation:
     cells = np.zeros((60, 60), dtype=np.uint8)
-    cells[0], cells[-1], cells[:, 0], cells[:, -1] = 1, 1, 1, 1
+    cells[0] = 1
+    cells[-1] = 1
+    cells[:, 0] = 1
+    cells[:, -1] = 1
     world = World('box', cells, GridFrame(0.0, 0.0, 0.1), np.array([3.0, 3.0, 0.0]))
     return Simulation(world, world.start, PRESETS['2dx'], Lms200Config(rate_hz=rate_hz), seed)
 

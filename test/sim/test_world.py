@@ -183,7 +183,10 @@ def test_a_map_is_a_world(tmp_path: Path) -> None:
     from PIL import Image
 
     grey = np.full((20, 30), 254, dtype=np.uint8)
-    grey[0], grey[-1], grey[:, 0], grey[:, -1] = 0, 0, 0, 0
+    grey[0] = 0
+    grey[-1] = 0
+    grey[:, 0] = 0
+    grey[:, -1] = 0
     grey[2, 5] = 205
     Image.fromarray(grey).save(tmp_path / 'm.pgm')
     (tmp_path / 'm.yaml').write_text(

@@ -13,7 +13,9 @@ from contextlib import contextmanager
 # Above, the ports of a domain are such as the system gives to programs that ask for any.
 DOMAINS = range(1, 102)
 # How DDS numbers its ports: of each participant of a domain, where others ask for it.
-_FIRST_PORT, _PORTS_A_DOMAIN, _PORTS_A_PARTICIPANT = 7410, 250, 2
+_FIRST_PORT = 7410
+_PORTS_A_DOMAIN = 250
+_PORTS_A_PARTICIPANT = 2
 _PARTICIPANTS = 32
 # So that each test takes another, and processes begin at different ones.
 _turns = itertools.count(os.getpid())

@@ -35,7 +35,8 @@ def ranges_in(segments: np.ndarray, T_world_laser: np.ndarray, angles: np.ndarra
     directions = np.column_stack(
         [np.cos(angles + T_world_laser[2]), np.sin(angles + T_world_laser[2])]
     )
-    starts, along = segments[:, :2] - T_world_laser[:2], segments[:, 2:] - segments[:, :2]
+    starts = segments[:, :2] - T_world_laser[:2]
+    along = segments[:, 2:] - segments[:, :2]
     cross = directions[:, None, 0] * along[None, :, 1] - directions[:, None, 1] * along[None, :, 0]
     with np.errstate(divide='ignore', invalid='ignore'):
         t = (starts[:, 0] * along[:, 1] - starts[:, 1] * along[:, 0])[None] / cross
@@ -59,7 +60,8 @@ def scan_in(
     """A 180 degree scan; with rng: 1 cm of noise, a third of depth edges give ranges in between."""
     mount = np.zeros(3) if T_base_laser is None else T_base_laser
     sign = -1.0 if clockwise else 1.0
-    start, step = -sign * math.pi / 2.0, sign * math.pi / (beams - 1)
+    start = -sign * math.pi / 2.0
+    step = sign * math.pi / (beams - 1)
     ranges = ranges_in(segments, se2.compose(T_world_base, mount), start + step * np.arange(beams))
     if rng is not None:
         ranges = mixed(ranges, rng) + rng.normal(0.0, 0.01, beams)
@@ -105,7 +107,8 @@ def around(pose: np.ndarray, number: int, rng: np.random.Generator) -> list[np.n
 
 
 def mixed(ranges: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    low, high = np.minimum(ranges[:-1], ranges[1:]), np.maximum(ranges[:-1], ranges[1:])
+    low = np.minimum(ranges[:-1], ranges[1:])
+    high = np.maximum(ranges[:-1], ranges[1:])
     with np.errstate(invalid='ignore'):
         edge = np.isfinite(high) & (high - low > 0.3) & (rng.random(low.size) < 0.3)
         between = low + rng.random(low.size) * (high - low)
@@ -134,7 +137,9 @@ def drive(
             [8.5, 5.0],
         ]
     )
-    truth, odom, goal = start, np.zeros(3), 1
+    truth = start
+    odom = np.zeros(3)
+    goal = 1
     for _ in range(steps):
         yield truth, odom
         off = way[goal % len(way)] - truth[:2]
@@ -153,9 +158,11 @@ BLIND = scan_in(np.array([[1e3, -1.0, 1e3, 1.0]]), np.zeros(3))  # a scan that m
 
 def corridor_ring() -> np.ndarray:
     """Walls (N, 4) of a corridor of 2.4 m round a block of 35 x 15 m; niches tell sides apart."""
-    outer, inner = np.array([40.0, 20.0]), 2.4
+    outer = np.array([40.0, 20.0])
+    inner = 2.4
     corners = [np.array([[0.0, 0.0], [outer[0], 0.0], outer, [0.0, outer[1]], [0.0, 0.0]])]
-    low, high = np.array([inner, inner]), outer - inner
+    low = np.array([inner, inner])
+    high = outer - inner
     corners.append(np.array([low, [high[0], low[1]], high, [low[0], high[1]], low]))
     walls = [np.hstack([a, b]) for ring_ in corners for a, b in pairwise(ring_)]
     for x in (6.0, 13.0, 17.5, 26.0, 33.0):
@@ -185,8 +192,12 @@ def corridor(length_m: float) -> np.ndarray:
 
 def drive_round_the_block() -> Iterator[tuple[Scan, np.ndarray, np.ndarray]]:
     """Scan, odometry, truth of a drive once round the corridor and on; the wheels wear and slip."""
-    rng, slips, walls = np.random.default_rng(5), np.random.default_rng(6), corridor_ring()
-    truth, odom, number = np.array([3.0, 1.2, 0.0]), np.zeros(3), 0
+    rng = np.random.default_rng(5)
+    slips = np.random.default_rng(6)
+    walls = corridor_ring()
+    truth = np.array([3.0, 1.2, 0.0])
+    odom = np.zeros(3)
+    number = 0
     for goal in [(38.8, 1.2), (38.8, 18.8), (1.2, 18.8), (1.2, 1.2), (20.0, 1.2)]:
         while np.hypot(*(goal - truth[:2])) > 0.15:
             turn = float(

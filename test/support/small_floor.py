@@ -15,7 +15,8 @@ CELL_M = 0.1
 def floor(*walls, rows=60, cols=90):
     """Cells (H, W) of a closed hall with walls (row, col, end row, end col)."""
     cells = np.zeros((rows, cols), dtype=np.int8)
-    cells[[0, -1]], cells[:, [0, -1]] = 100, 100
+    cells[[0, -1]] = 100
+    cells[:, [0, -1]] = 100
     for row, col, end_row, end_col in walls:
         cells[row:end_row, col:end_col] = 100
     return cells
@@ -47,9 +48,11 @@ def drive(cells, start, moves, seed=0, odometry_at=(5.0, -3.0, 0.7)):
 
     Moves: (m ahead, rad turned), one a step.
     """
-    world, laser = world_of(cells), Lms200(Lms200Config(), seed)
+    world = world_of(cells)
+    laser = Lms200(Lms200Config(), seed)
     rng = np.random.default_rng(seed)
-    T, odometry = se2.pose(*start), se2.pose(*odometry_at)
+    T = se2.pose(*start)
+    odometry = se2.pose(*odometry_at)
     for k, (ahead, turn) in enumerate([(0.0, 0.0), *moves]):
         step = se2.pose(ahead, 0.0, turn)
         T = se2.compose(T, step)

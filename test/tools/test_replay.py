@@ -49,7 +49,8 @@ def box_ranges(x, theta, half=3.0):
 def carmen_lines(scans=30, beams=BEAMS, start_s=0.0):
     lines = ['# a robot that drives along x through a square room']
     for k in range(scans):
-        x, stamp = 0.03 * k, start_s + 0.2 * k
+        x = 0.03 * k
+        stamp = start_s + 0.2 * k
         readings = ' '.join(f'{r:.3f}' for r in box_ranges(x, 0.0)[:beams])
         tail = f'{x:.4f} 0 0 {x:.4f} 0 0 {stamp:.3f} robot {stamp:.3f}'
         lines += [
@@ -264,7 +265,8 @@ class Diary(NullView):
     """What a view was told: how often of what, and the last map."""
 
     def __init__(self):
-        self.told, self.map_shown = Counter(), None
+        self.told = Counter()
+        self.map_shown = None
 
     def pose(self, ns, T_map_base, covariance):
         self.told['pose'] += 1

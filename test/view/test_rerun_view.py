@@ -33,7 +33,8 @@ def read_back(path):
     """Rows (seconds since the first, columns by component) of each entity; number of blueprints."""
     from rerun.chunk import RrdReader
 
-    reader, rows = RrdReader(path), {}
+    reader = RrdReader(path)
+    rows = {}
     assert len(reader.recordings()) == 1
     for chunk in reader.stream():
         columns = chunk.to_record_batch().to_pydict()
@@ -178,7 +179,8 @@ def test_viewer_without_a_screen_is_refused(tmp_path, monkeypatch):
 @needs_rerun
 def test_viewer_is_sent_what_the_file_holds_and_ends_with_the_view(tmp_path, monkeypatch):
     # The real program, told to write down what it receives where it would open a window.
-    received, stand_in = tmp_path / 'received.rrd', tmp_path / 'viewer'
+    received = tmp_path / 'received.rrd'
+    stand_in = tmp_path / 'viewer'
     stand_in.write_text(
         f'#!/bin/sh\nexec "{rerun_streams.viewer_program()}" --save "{received}" "$@"\n'
     )
@@ -265,10 +267,12 @@ def test_null_view_takes_all_that_a_view_takes():
 def test_feed_refuses_what_makes_no_sense():
     class Header:
         class stamp:  # noqa: N801
-            sec, nanosec = 1, 0
+            sec = 1
+            nanosec = 0
 
     class Message:
-        header, nodes = Header, [type('N', (), {'id': 1, 'kind': 9})]
+        header = Header
+        nodes = (type('N', (), {'id': 1, 'kind': 9}),)
 
     with pytest.raises(InputError):
         Feed(NullView(), lambda frame: None).take('topology', Message)
@@ -278,7 +282,8 @@ class Diary(NullView):
     """What a view was told."""
 
     def __init__(self):
-        self.numbers, self.near = [], None
+        self.numbers = []
+        self.near = None
 
     def number(self, ns, plot, curve, value):
         self.numbers.append((plot, curve, value))

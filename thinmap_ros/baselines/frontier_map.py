@@ -100,7 +100,8 @@ class FrontierMap:
 
     def _reach_from(self, standing: Mask, xy: tuple[float, float]) -> Mask:
         """Cells (H, W) to which the robot can get from a point (m)."""
-        free, frame = self.borders.free, self.borders.frame
+        free = self.borders.free
+        frame = self.borders.frame
         row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
         if not (0 <= row < free.shape[0] and 0 <= col < free.shape[1]):
             return np.zeros_like(standing)

@@ -8,8 +8,10 @@ from thinmap_ros.core.se2 import Array
 
 def between_paths(path: Array, onto: Array) -> Array:
     """Rigid motion (3,) that lays a path (N, 3) onto another: least squares of the positions."""
-    middle, onto_middle = path[:, :2].mean(axis=0), onto[:, :2].mean(axis=0)
-    a, b = path[:, :2] - middle, onto[:, :2] - onto_middle
+    middle = path[:, :2].mean(axis=0)
+    onto_middle = onto[:, :2].mean(axis=0)
+    a = path[:, :2] - middle
+    b = onto[:, :2] - onto_middle
     turn = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
     turned = se2.transform_points(se2.pose(0.0, 0.0, float(turn)), middle[None])[0]
     x, y = (onto_middle - turned).tolist()

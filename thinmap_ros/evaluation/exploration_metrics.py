@@ -65,7 +65,9 @@ class EndNodeCensus:
         idle = [place for place in self._places if place.node_id not in nodes]
         for node_id, (x, y) in nodes.items():
             place = alive.get(node_id) or self._continued(idle, x, y)
-            place.node_id, place.x, place.y = node_id, x, y
+            place.node_id = node_id
+            place.x = x
+            place.y = y
             place.sightings += 1
             place.visited |= math.dist((x, y), T_map_base[:2]) < NEAR_M
 

@@ -34,7 +34,8 @@ def drivable_share(patch: GridPatch, graph: TopologicalMap, radius_m: float) -> 
     clearance = clearance_m(patch)
     good = 0
     for edge in graph.edges.values():
-        a, b = graph.nodes[edge.a].position, graph.nodes[edge.b].position
+        a = graph.nodes[edge.a].position
+        b = graph.nodes[edge.b].position
         count = max(
             2, math.ceil(float(np.hypot(*(b - a))) / (_SAMPLE_CELLS * patch.frame.resolution)) + 1
         )
@@ -72,9 +73,12 @@ class GridPaths:
 
     def _neighbours(self, standing: Mask) -> Any:
         rows, cols = standing.shape
-        sources, targets, lengths = [], [], []
+        sources = []
+        targets = []
+        lengths = []
         for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
-            low, high = max(0, -right), cols - max(0, right)
+            low = max(0, -right)
+            high = cols - max(0, right)
             here = self.numbers[: rows - down, low:high]
             there = self.numbers[down:, low + right : high + right]
             both = (here >= 0) & (there >= 0)
@@ -105,9 +109,11 @@ def completeness(
     between = csgraph.dijkstra(
         _straight_lines(graph, order, patch.frame.resolution), directed=False
     )
-    found, best = [], []
+    found = []
+    best = []
     for source, target in zip(sources.tolist(), targets, strict=True):
-        from_source, from_target = paths.lengths_from(source), paths.lengths_from(target)
+        from_source = paths.lengths_from(source)
+        from_target = paths.lengths_from(target)
         first, last = (_nearest(lengths, at_nodes) for lengths in (from_source, from_target))
         ways = (
             from_source[at_nodes[first], None]

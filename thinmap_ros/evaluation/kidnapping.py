@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 _MARGIN_M = 0.1
 _FAR_M = 3.0
-_RIGHT_M, _RIGHT_RAD = 0.5, math.radians(10.0)
+_RIGHT_M = 0.5
+_RIGHT_RAD = math.radians(10.0)
 
 
 class Kidnapping:
@@ -32,7 +33,8 @@ class Kidnapping:
     """
 
     def __init__(self, at_s: float, seed: int) -> None:
-        self._at_s, self._seed = at_s, seed
+        self._at_s = at_s
+        self._seed = seed
         self._carried_s: float | None = None
         self._detected_s: float | None = None
         self._found_s: float | None = None
@@ -113,7 +115,8 @@ class Kidnapping:
     ) -> None:
         """One scan of a lost robot, for all of its localizers."""
         assert self._own is not None
-        localizer, T_world_base = self._own[0].localizer, loop.simulation.robot.T_world_base
+        localizer = self._own[0].localizer
+        T_world_base = loop.simulation.robot.T_world_base
         estimate = self._own[0].step(scan, T_odom_base).estimate
         self._way_m += float(np.hypot(*(T_world_base - loop.log.true_poses[-1])[:2]))
         loop.note(scan, estimate)

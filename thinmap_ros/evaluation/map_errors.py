@@ -11,7 +11,9 @@ from thinmap_ros.sim.surfaces import surfaces
 from thinmap_ros.sim.world import World
 from thinmap_ros.view.plots import MapLayer, Panel, Raster, Segments
 
-_SHORTEST_M, _SPACING_M, _FOUND_M = 0.2, 0.05, 0.2
+_SHORTEST_M = 0.2
+_SPACING_M = 0.05
+_FOUND_M = 0.2
 _SHOWN_M = 0.3
 
 
@@ -57,7 +59,8 @@ def panels(error: MapError, world: World) -> list[Panel]:
     """The world as it is, the map, and how far the map is off."""
     lines = surfaces(world, 0.1)
     corners = lines.reshape(-1, 2)
-    (left, bottom), (right, top) = corners.min(axis=0) - 0.5, corners.max(axis=0) + 0.5
+    (left, bottom) = corners.min(axis=0) - 0.5
+    (right, top) = corners.max(axis=0) + 0.5
     limits = (left, right, bottom, top)
     raster = Raster(error.off_m, error.patch.frame, 'cell off by (m)', (0.0, _SHOWN_M))
     return [

@@ -55,7 +55,8 @@ class Recording:
 
 def read(path: Path) -> Recording:
     """Read what counts from a bag of a run. Raises InputError where a topic is missing."""
-    bag, recording = Bag(path), Recording()
+    bag = Bag(path)
+    recording = Recording()
     for raw in bag.messages(_TOPICS):
         message = bag.decode(raw)
         if raw.topic == '/collisions':
@@ -116,7 +117,8 @@ def write(out: Path, world_file: Path, robot: str, result: dict[str, Any]) -> di
 
 
 def _report(recording: Recording, seen: Coverable, result: dict[str, Any]) -> dict[str, Any]:
-    start_ns, end_ns = int(result['start_ns']), int(result['end_ns'])
+    start_ns = int(result['start_ns'])
+    end_ns = int(result['end_ns'])
     stamps = [ns for ns in recording.true if start_ns <= ns <= end_ns and ns in recording.estimated]
     true = np.array([recording.true[ns] for ns in stamps])
     estimated = np.array([recording.estimated[ns] for ns in stamps])

@@ -64,7 +64,8 @@ def run_slam(looks: Iterable[Look], slam: str = 'ekf_ti', watch: Watch | None = 
         if run is None:
             x, y, yaw = (float(v) for v in look.T_world_base)
             config = ScanLocalizerConfig(slam=slam, start_x_m=x, start_y_m=y, start_yaw_rad=yaw)
-            run, start = Run(Pipeline(PipelineConfig(localizer=config))), look
+            run = Run(Pipeline(PipelineConfig(localizer=config)))
+            start = look
         began = process_time()
         step = run.pipeline.step(look.scan, look.T_odom_base)
         run.step_ms.append(1e3 * (process_time() - began))

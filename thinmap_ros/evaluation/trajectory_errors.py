@@ -52,10 +52,15 @@ def relation_errors(
     odometry: a file of `t x y theta`, along which a pose is moved to a stamp from which it is
     farther than near_s.
     """
-    known, wheels = read_columns(relations, [0, 1, 2, 3, 7]), read_columns(odometry, [0, 1, 2, 3])
-    order, wheel_order = np.argsort(times_s, kind='stable'), np.argsort(wheels[:, 0], kind='stable')
-    times, path, wheels = times_s[order], poses[order], wheels[wheel_order]
-    metres, degrees = [], []
+    known = read_columns(relations, [0, 1, 2, 3, 7])
+    wheels = read_columns(odometry, [0, 1, 2, 3])
+    order = np.argsort(times_s, kind='stable')
+    wheel_order = np.argsort(wheels[:, 0], kind='stable')
+    times = times_s[order]
+    path = poses[order]
+    wheels = wheels[wheel_order]
+    metres = []
+    degrees = []
     for t1, t2, *motion in known:
         a, b = (_pose_at(t, times, path, wheels, near_s) for t in (t1, t2))
         off = se2.between(np.array(motion), se2.between(a, b))

@@ -28,7 +28,8 @@ from thinmap_ros.tools.explore_world import Options, Strategy, make_loop, nothin
 
 SPEED_M_S = 0.2  # of all three papers
 # A step of global localization: at 0.5 m/s and 5 Hz, up to 0.3 m.
-LOST_STEPS, LOST_STEP_SCANS = 15, 3
+LOST_STEPS = 15
+LOST_STEP_SCANS = 3
 TRUTH_TOPIC = '/ground_truth'
 _LOOKS_AT_A_STOP = 4
 _EXPLORE_LIMIT_S = 1000.0
@@ -59,14 +60,17 @@ class Recipe:
 
 
 def _tour(recipe: Recipe, seed: int) -> Iterator[Look]:
-    world, robot = world_of(recipe.world), PRESETS[recipe.robot]
+    world = world_of(recipe.world)
+    robot = PRESETS[recipe.robot]
     simulation = Simulation(world, world.start, robot, Lms200Config(), seed)
     return drive(simulation, ways_along(world, tour_of(recipe.world), robot.radius_m), SPEED_M_S)
 
 
 def _stops(recipe: Recipe, seed: int) -> Iterator[Look]:
     """Put down by hand at each stop, looking two ways: the papers' robot had no odometry either."""
-    world, laser, stamp_ns = world_of(recipe.world), Lms200(Lms200Config(), seed), 0
+    world = world_of(recipe.world)
+    laser = Lms200(Lms200Config(), seed)
+    stamp_ns = 0
     for x, y in tour_of(recipe.world):
         for heading in (0.0, np.pi):
             for _ in range(_LOOKS_AT_A_STOP):
@@ -86,7 +90,8 @@ class _Watched:
     """A strategy that keeps what the robot had when it was asked."""
 
     def __init__(self, strategy: Strategy, simulation: Simulation) -> None:
-        self._strategy, self._simulation = strategy, simulation
+        self._strategy = strategy
+        self._simulation = simulation
         self.looks: list[Look] = []
 
     def step(

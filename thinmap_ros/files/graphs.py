@@ -301,14 +301,16 @@ def _id(value: Any) -> int:
 
 
 def _node(feature: dict[str, Any]) -> Node:
-    properties, (x, y) = feature['properties'], feature['geometry']['coordinates']
+    properties = feature['properties']
+    (x, y) = feature['geometry']['coordinates']
     metadata = properties['metadata']
     kind = NodeKind[str(metadata['kind']).upper()]
     return Node(_id(properties['id']), kind, _number(x), _number(y), _number(metadata['clearance']))
 
 
 def _edge(feature: dict[str, Any]) -> Edge:
-    properties, (line,) = feature['properties'], feature['geometry']['coordinates']
+    properties = feature['properties']
+    (line,) = feature['geometry']['coordinates']
     path = np.array([[_number(x), _number(y)] for x, y in line])
     if len(path) < 2:
         raise ValueError(f'a line of {len(path)} points')

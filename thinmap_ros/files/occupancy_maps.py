@@ -24,12 +24,15 @@ if TYPE_CHECKING:
     from PIL import Image
 
 # Grey values of a trinary map, as map_saver writes them.
-_GREY_FREE, _GREY_UNKNOWN, _GREY_OCCUPIED = 254, 205, 0
+_GREY_FREE = 254
+_GREY_UNKNOWN = 205
+_GREY_OCCUPIED = 0
 _MOST_PIXELS = 8192 * 8192
 _LONGEST_NAME = 200
 # Only these: the readers of others run programs, or decode before they know the size.
 _FORMATS = ('PPM', 'PNG', 'BMP', 'JPEG')
-_GREYS_8, _GREYS_16 = 1 << 8, 1 << 16
+_GREYS_8 = 1 << 8
+_GREYS_16 = 1 << 16
 
 
 def write_map(stem: Path, patch: GridPatch) -> Path:
@@ -39,7 +42,8 @@ def write_map(stem: Path, patch: GridPatch) -> Path:
     grey = np.full(patch.shape, _GREY_UNKNOWN, dtype=np.uint8)
     grey[patch.free] = _GREY_FREE
     grey[patch.occupied] = _GREY_OCCUPIED
-    image, description = stem.with_name(stem.name + '.pgm'), stem.with_name(stem.name + '.yaml')
+    image = stem.with_name(stem.name + '.pgm')
+    description = stem.with_name(stem.name + '.yaml')
     with written_aside(image) as aside:
         Image.fromarray(grey[::-1]).save(aside, format='PPM')
         # The image takes its name last: where there is no room for both, the old map stays as it

@@ -23,9 +23,15 @@ from thinmap_ros.files.npz import opened, read_arrays
 from thinmap_ros.files.occupancy_maps import read_map, write_map
 
 _FORMAT = 'thinmap_format'
-_GRID, _TOPOLOGY, _EXPLORATION, _FEATURES = 'grid 1', 'topology 1', 'exploration 1', 'features 2'
-_GRID_END, _TOPOLOGY_END, _MAP_END = '.grid.npz', '.topology.npz', '.yaml'
-_EXPLORATION_END, _FEATURES_END = '.exploration.npz', '.features.npz'
+_GRID = 'grid 1'
+_TOPOLOGY = 'topology 1'
+_EXPLORATION = 'exploration 1'
+_FEATURES = 'features 2'
+_GRID_END = '.grid.npz'
+_TOPOLOGY_END = '.topology.npz'
+_MAP_END = '.yaml'
+_EXPLORATION_END = '.exploration.npz'
+_FEATURES_END = '.features.npz'
 # Of all files that a session may consist of, or that are set aside with a new one.
 _OLD = '.old'
 _KEPT = (_TOPOLOGY_END, _EXPLORATION_END, _FEATURES_END)
@@ -68,7 +74,8 @@ def load_grid(
     one is broken or of another resolution.
     """
     stem = stem_of(path)
-    exact, description = _named(stem, _GRID_END), _named(stem, _MAP_END)
+    exact = _named(stem, _GRID_END)
+    description = _named(stem, _MAP_END)
     if _is_there(exact) or path.endswith(_GRID_END):
         return read_grid(exact, config)
     if not _is_there(description):

@@ -26,7 +26,8 @@ def write_tum(path: Path, stamps_ns: Sequence[int], poses: Sequence[Array]) -> N
 
 def read_tum(path: Path) -> tuple[list[int], Array]:
     """Stamps in ns and poses (N, 3). Raises InputError naming file and line."""
-    stamps, poses = [], []
+    stamps = []
+    poses = []
     for number, line in enumerate(read_text(path).split('\n'), start=1):
         fields = line.split('#', 1)[0].split()
         if not fields:

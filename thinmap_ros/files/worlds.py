@@ -19,7 +19,8 @@ _MARGIN_M = 0.2
 _NUDGE_M = 1e-9
 _MOST_CELLS = 100_000_000
 _LONGEST_NAME = 200
-_FREE, _SOLID = 0, 100
+_FREE = 0
+_SOLID = 100
 
 
 def read_world(path: Path) -> tuple[str, GridPatch, Array]:
@@ -105,7 +106,8 @@ def _of_drawing(path: Path, content: dict[str, Any]) -> tuple[str, GridPatch, Ar
             f'{path}: wall_thickness: {thickness}: '
             f'expected at least two cells ({2.0 * resolution} m)'
         )
-    walls, polygons = _polylines(path, content, 'walls', 2), _polylines(path, content, 'solids', 3)
+    walls = _polylines(path, content, 'walls', 2)
+    polygons = _polylines(path, content, 'solids', 3)
     polygons += [_slab(a, b, thickness) for wall in walls for a, b in pairwise(wall)]
     if not polygons:
         raise InputError(f'{path}: walls: expected at least one wall or solid')
@@ -173,5 +175,6 @@ def _slab(a: Array, b: Array, thickness: float) -> Array:
     length = float(np.hypot(*(b - a)))
     along = (b - a) / length if length > 0.0 else np.array([1.0, 0.0])
     across = np.array([-along[1], along[0]]) * thickness / 2.0
-    a, b = a - along * thickness / 2.0, b + along * thickness / 2.0
+    a = a - along * thickness / 2.0
+    b = b + along * thickness / 2.0
     return np.array([a + across, b + across, b - across, a - across])

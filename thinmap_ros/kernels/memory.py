@@ -16,7 +16,8 @@ def give_back_pages() -> Callable[[], None]:
 
     What gives its pages back, now and then.
     """
-    looked_at, least = monotonic(), _shared_bytes()
+    looked_at = monotonic()
+    least = _shared_bytes()
 
     def look() -> None:
         nonlocal looked_at, least

@@ -17,9 +17,15 @@ from thinmap_ros.core.odometry import LastPose
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
-_CELL_M, _RANGE_M, _BEAMS = 0.1, 8.0, 181
-_ROOM_CELLS, _PASSAGE = 80, slice(30, 50)
-_SCANS, _PERIOD_S, _STEP_M, _TURN_RAD = 12, 0.2, 0.12, 0.11
+_CELL_M = 0.1
+_RANGE_M = 8.0
+_BEAMS = 181
+_ROOM_CELLS = 80
+_PASSAGE = slice(30, 50)
+_SCANS = 12
+_PERIOD_S = 0.2
+_STEP_M = 0.12
+_TURN_RAD = 0.11
 
 
 def localizer() -> None:
@@ -55,7 +61,8 @@ def topology_builder() -> None:
     from thinmap_ros.core.grid.occupancy import OccupancyGrid, WindowConfig
     from thinmap_ros.core.topology.builder import TopologyBuilder
 
-    grid, rehearsed = OccupancyGrid(), TopologyBuilder()
+    grid = OccupancyGrid()
+    rehearsed = TopologyBuilder()
     for scan, T_map_base in _drive():
         grid.update(scan, T_map_base)
         rehearsed.update(
@@ -69,7 +76,8 @@ def explorer() -> None:
     from thinmap_ros.core.exploration.explorer import Explorer
     from thinmap_ros.core.topology.builder import TopologyConfig, build
 
-    patch, rehearsed = _room(), Explorer()
+    patch = _room()
+    rehearsed = Explorer()
     topology = build(patch, (2.0, 2.0), TopologyConfig())
     for scan, T_map_base in _drive():
         rehearsed.step(topology, patch, scan, T_map_base)
@@ -79,7 +87,8 @@ def navigator() -> None:
     """Rehearse planning and driving."""
     from thinmap_ros.core.planning.navigator import Navigator
 
-    patch, rehearsed = _room(), Navigator()
+    patch = _room()
+    rehearsed = Navigator()
     rehearsed.set_goal(4.0, 3.0, 0.0)
     for scan, T_map_base in _drive():
         rehearsed.step(T_map_base, patch, scan, _PERIOD_S)
@@ -99,9 +108,11 @@ def global_localizer() -> None:
 def _room() -> GridPatch:
     """A room with a pillar, and a passage into the unknown."""
     cells = np.zeros((_ROOM_CELLS, _ROOM_CELLS), dtype=np.int8)
-    cells[[0, -1]], cells[:, [0, -1]] = 100, 100
+    cells[[0, -1]] = 100
+    cells[:, [0, -1]] = 100
     cells[40:46, 40:46] = 100
-    cells[_PASSAGE, -1], cells[:, -20:-1] = 0, UNKNOWN
+    cells[_PASSAGE, -1] = 0
+    cells[:, -20:-1] = UNKNOWN
     return GridPatch(GridFrame(0.0, 0.0, _CELL_M), cells)
 
 

@@ -163,7 +163,8 @@ class CarmenLog:
             12,
             f'{count} ranges, {remissions} remissions, two poses, five numbers and a stamp',
         )
-        T_odom_laser, T_odom_base = _pose(rest[0:3]), _pose(rest[3:6])
+        T_odom_laser = _pose(rest[0:3])
+        T_odom_base = _pose(rest[3:6])
         if self._T_base_laser is None:
             # A mount is rigid: the first line's stands for all, without the last digits that
             # rounding made up.

@@ -117,7 +117,8 @@ class BagObjects:
     def grid(self, ns: int, patch: GridPatch) -> Any:
         """nav_msgs/OccupancyGrid in the map."""
         rows, cols = patch.shape
-        frame, header = patch.frame, self.header('map', ns)
+        frame = patch.frame
+        header = self.header('map', ns)
         info = self._make(
             'nav_msgs/msg/MapMetaData',
             map_load_time=header.stamp,

@@ -26,7 +26,10 @@ def rotation_matrix(q: Any) -> Array:
     norm = math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
     if not abs(norm - 1.0) < 0.01:
         raise InputError(f'quaternion ({q.x}, {q.y}, {q.z}, {q.w}): expected norm 1, not {norm}')
-    x, y, z, w = q.x, q.y, q.z, q.w
+    x = q.x
+    y = q.y
+    z = q.z
+    w = q.w
     return np.array(
         [
             [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
@@ -85,7 +88,8 @@ class StaticTransforms:
 
         Raises InputError where it is tilted: its scans are no floor plan then.
         """
-        rotation, translation = np.eye(3), np.zeros(3)
+        rotation = np.eye(3)
+        translation = np.zeros(3)
         frame = _plain(laser_frame)
         for _ in range(len(self._parents) + 1):
             if frame == _plain(base_frame):
@@ -93,7 +97,8 @@ class StaticTransforms:
             if frame not in self._parents:
                 return None
             frame, turned, moved = self._parents[frame]
-            rotation, translation = turned @ rotation, turned @ translation + moved
+            rotation = turned @ rotation
+            translation = turned @ translation + moved
         return None  # frames that are each other's parents
 
 

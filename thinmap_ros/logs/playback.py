@@ -28,7 +28,9 @@ class Playback:
 
     def __init__(self, bag: Bag, topics: set[str], start_offset_s: float, loop: bool) -> None:
         """Read up to the offset. Raises InputError where the bag ends before it."""
-        self._bag, self._topics, self._loop = bag, topics, loop
+        self._bag = bag
+        self._topics = topics
+        self._loop = loop
         self._first_ns = 0
         self.known_before = self._read_known(start_offset_s)
         self._messages: Iterator[RawMessage] = iter(())

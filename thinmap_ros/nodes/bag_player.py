@@ -139,7 +139,8 @@ class BagPlayerNode(Node):
 
     def _tick(self) -> None:
         now = monotonic()
-        passed_s, self._ticked_at = now - self._ticked_at, now
+        passed_s = now - self._ticked_at
+        self._ticked_at = now
         if self._begins_at is None:
             # Who listens to scans finds the other topics a moment later.
             self._begins_at = now + _SETTLE_S if self._has_listeners() else None

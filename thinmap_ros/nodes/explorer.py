@@ -39,7 +39,8 @@ _FEEDBACK_PERIOD_S = 1.0
 _SILENCE_S = 60.0
 _DEAF_S = 3.0
 _LOST_S = 10.0
-_SAME_GOAL_M, _SAME_GOAL_RAD = 0.1, 0.2
+_SAME_GOAL_M = 0.1
+_SAME_GOAL_RAD = 0.2
 _GIVE_UP_HOME = 3
 
 
@@ -83,7 +84,8 @@ class ExplorerNode(LiveNode):
         self._state = ExplorationStatus.IDLE
 
     def _on_config(self, config: ExplorerConfig) -> None:
-        self._config, self._learned = config, None
+        self._config = config
+        self._learned = None
 
     def stand_still(self) -> None:
         """End the exploration."""
@@ -249,7 +251,8 @@ class ExplorerNode(LiveNode):
         if self._handle is not None:
             self._handle.cancel_goal_async()
         self._handle = self._goal_sent = None
-        self._ending, self._state = (code, reason), ExplorationStatus.FINISHED
+        self._ending = (code, reason)
+        self._state = ExplorationStatus.FINISHED
         if code in (ExplorationStatus.ALL_RESOLVED, ExplorationStatus.NOTHING_REACHABLE):
             self._learned = None
         status = self._status_msg()
@@ -278,7 +281,8 @@ class ExplorerNode(LiveNode):
         if not self._navigator.server_is_ready():
             self.get_logger().warning('no navigator yet', throttle_duration_sec=_WARN_PERIOD_S)
             return
-        self._goal_sent, self._answered_at = goal, self._now()
+        self._goal_sent = goal
+        self._answered_at = self._now()
         request = NavigateToPose.Goal(use_heading=True)
         request.pose = messages.pose_stamped_msg(
             goal, self._map_frame, self.get_clock().now().nanoseconds
@@ -296,7 +300,9 @@ class ExplorerNode(LiveNode):
         self.get_logger().warning(
             'the navigator is silent: asking again', throttle_duration_sec=_WARN_PERIOD_S
         )
-        goal, self._goal_sent, self._handle = self._goal_sent, None, None
+        goal = self._goal_sent
+        self._goal_sent = None
+        self._handle = None
         if self._state == ExplorationStatus.RETURNING:
             self._drive_to(goal)
 
@@ -361,7 +367,8 @@ class ExplorerNode(LiveNode):
                 1 for n in self._decision.end_nodes if n.open_border_m > 0.0
             )
             if target is not None:
-                status.has_target, status.target = True, target.node_id
+                status.has_target = True
+                status.target = target.node_id
                 status.target_position = Point(x=target.x, y=target.y)
         return status
 

@@ -205,7 +205,8 @@ class GridMapperNode(LiveNode):
 
         Without that node, what is there of an earlier map must not pass for this one's.
         """
-        saved, part = response.message, await ask(self, client, SaveMap.Request(path=path))
+        saved = response.message
+        part = await ask(self, client, SaveMap.Request(path=path))
         if part is not None:
             response.success = response.success and part.success
             response.message = f'{saved}; {part.message}'
@@ -222,7 +223,8 @@ class GridMapperNode(LiveNode):
             stem = str(session_files.stem_of(inside))
             path = stem if session_files.has_topology(stem) else ''
         except ThinmapError as error:
-            response.success, response.message = False, str(error)
+            response.success = False
+            response.message = str(error)
             return response
         graph = await ask(self, self._load_topology, LoadMap.Request(path=path))
         response.success = graph is None or graph.success

@@ -100,7 +100,8 @@ class LocalizerNode(LiveNode):
 
         The robot is at its start.
         """
-        self._localizer, self._pairing = self._made(self._config), ScanPairing()
+        self._localizer = self._made(self._config)
+        self._pairing = ScanPairing()
         self._last: LastPose | None = None
         self._topology: Graph | None = None
         self._resumed = self._latched = None

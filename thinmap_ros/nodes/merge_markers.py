@@ -12,10 +12,17 @@ from thinmap_ros.core.topology.graph import NodeKind
 from thinmap_ros.ros import messages
 from thinmap_ros.view import palette as colours
 
-_EDGE_M, _NODE_M, _LINE_M, _TEXT_M = 0.04, 0.2, 0.06, 0.3
-_EDGE_Z, _NODE_Z, _LINE_Z, _TEXT_Z = 0.02, 0.05, 0.04, 0.4
+_EDGE_M = 0.04
+_NODE_M = 0.2
+_LINE_M = 0.06
+_TEXT_M = 0.3
+_EDGE_Z = 0.02
+_NODE_Z = 0.05
+_LINE_Z = 0.04
+_TEXT_Z = 0.4
 _END = colours.NODES[NodeKind.END]
-_REMOTE, _TEXT = '#999999', '#000000'
+_REMOTE = '#999999'
+_TEXT = '#000000'
 
 
 def topology(message: TopologicalMap) -> MarkerArray:
@@ -52,10 +59,12 @@ def end_nodes(message: EndNodeArray) -> MarkerArray:
             _NODE_M * (2.0 if node.is_target else 1.2),
             _END,
         )
-        ball.id, ball.color.a = len(markers), 0.3 + 0.7 * node.position_probability
+        ball.id = len(markers)
+        ball.color.a = 0.3 + 0.7 * node.position_probability
         ball.pose.position = _point(node.position.x, node.position.y, _NODE_Z)
         text = _marker(message.header, 'probabilities', Marker.TEXT_VIEW_FACING, _TEXT_M, _TEXT)
-        text.id, text.text = len(markers), f'{node.position_probability:.2f}'
+        text.id = len(markers)
+        text.text = f'{node.position_probability:.2f}'
         text.pose.position = _point(node.position.x, node.position.y, _TEXT_Z)
         markers += [ball, text]
     return _shown(markers)

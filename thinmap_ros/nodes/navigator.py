@@ -68,7 +68,8 @@ class NavigatorNode(LiveNode):
 
     def _on_config(self, config: NavigatorConfig) -> None:
         """Drive on with other parameters: to the same goal, on a new path."""
-        self._config, self._navigator = config, Navigator(config)
+        self._config = config
+        self._navigator = Navigator(config)
         if self._goals.active:
             self._navigator.set_goal(*self._goal)
 

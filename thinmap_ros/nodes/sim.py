@@ -68,7 +68,8 @@ class SimNode(Node):
         start = _start(self._config.start, world)
         self._sim = Simulation(world, start, PRESETS[self._config.robot], laser, self._config.seed)
         self._scan_time_s = 1.0 / laser.rate_hz
-        self._command, self._command_ns = (0.0, 0.0), 0
+        self._command = (0.0, 0.0)
+        self._command_ns = 0
         self._lockstep = Lockstep(self, self._config.lockstep, self._config.lockstep_patience_s)
         self._last_scan: LaserScan | None = None
         self._repeated_at = 0.0
@@ -97,7 +98,8 @@ class SimNode(Node):
         if not np.isfinite(command).all():
             self._health.refused('cmd_vel', f'command {command}: expected finite numbers')
             return
-        self._command, self._command_ns = command, self._sim.stamp_ns
+        self._command = command
+        self._command_ns = self._sim.stamp_ns
 
     def _on_carry(self, message: PoseStamped) -> None:
         """Somebody lifts the robot up and puts it down at a pose in the world.

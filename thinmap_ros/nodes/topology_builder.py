@@ -102,7 +102,8 @@ class TopologyBuilderNode(LiveNode):
             return
         if self._resumed_ns is not None and stamp_ns < self._resumed_ns:
             self.begin_anew()  # the robot has begun anew as well
-        self._resumed_ns, self._latest_ns = None, stamp_ns
+        self._resumed_ns = None
+        self._latest_ns = stamp_ns
         window, T_map_base = pair
         with self.health.timed('graph update'):
             changed = self._rebuilding.accepts_window() and self._builder.update(window, T_map_base)
@@ -158,7 +159,8 @@ class TopologyBuilderNode(LiveNode):
             inside = self._saves.inside(path)
             resolution_m = self._builder.resolution_m
             loaded = session_files.load_topology(inside, self._config, resolution_m)
-        self._builder, self._matcher = loaded, StampMatcher()
+        self._builder = loaded
+        self._matcher = StampMatcher()
         self._rebuilding = Rebuilding(from_the_start=not path)
         self._publish(self.get_clock().now().nanoseconds)
         return f'graph of {len(loaded.map.nodes)} nodes' if path else 'the graph begins anew'

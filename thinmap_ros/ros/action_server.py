@@ -37,7 +37,9 @@ class SingleGoalServer:
         on_cancel: Callable[[], None],
         preempted: Callable[[], Any],
     ) -> None:
-        self._on_goal, self._on_cancel, self._preempted = on_goal, on_cancel, preempted
+        self._on_goal = on_goal
+        self._on_cancel = on_cancel
+        self._preempted = preempted
         self._handle: ServerGoalHandle | None = None
         self._endings: dict[bytes, tuple[Outcome, Any]] = {}
         self._server = ActionServer(
@@ -64,7 +66,8 @@ class SingleGoalServer:
 
     def finish(self, outcome: Outcome, result: Any) -> None:
         """End the goal with a result; nothing where there is none."""
-        handle, self._handle = self._handle, None
+        handle = self._handle
+        self._handle = None
         if handle is not None:
             self._endings[bytes(handle.goal_id.uuid)] = (outcome, result)
             handle.execute()

@@ -22,7 +22,9 @@ _OF_EVERY_NODE = ('/parameter_events', '/rosout', '/diagnostics', '/clock')
 # So many kinds of refusal are told apart on a topic: a broken sensor must not fill the memory.
 _REASONS = 8
 _NUMBER = re.compile(r'-?\b(\d+\.?\d*(e[+-]?\d+)?|inf|nan)\b')
-OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+OK = DiagnosticStatus.OK
+WARN = DiagnosticStatus.WARN
+ERROR = DiagnosticStatus.ERROR
 
 
 @dataclass
@@ -112,7 +114,8 @@ class Health:
 
     def dropped_in_all(self, cause: str, count: int) -> None:
         """Tell a count of drops that somebody else keeps; one that begins anew is counted on."""
-        last, self._totals[cause] = self._totals[cause], count
+        last = self._totals[cause]
+        self._totals[cause] = count
         self.dropped(cause, count - last if count >= last else count)
 
     def took(self, step: str, milliseconds: float) -> None:
@@ -188,7 +191,8 @@ class Health:
         array = DiagnosticArray(status=[status])
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._topic.publish(array)
-        self._told_at, self._told_bad = now, self._bad
+        self._told_at = now
+        self._told_bad = self._bad
         for entry in self._topics.values():
             entry.told = entry.heard
 

@@ -19,7 +19,8 @@ from thinmap_ros.ros.services import answer
 
 _KEEP_S = 0.5
 # Between two times of keeping, in times that it took.
-_LEAST_PAUSES, _LEAST_PAUSES_NEWS = 50.0, 10.0
+_LEAST_PAUSES = 50.0
+_LEAST_PAUSES_NEWS = 10.0
 RCLError = rclpy_implementation.RCLError
 _SET_BACK = JumpThreshold(
     min_forward=None, min_backward=Duration(seconds=-1.0), on_clock_change=False
@@ -47,7 +48,8 @@ class LiveNode(LifecycleNode):
         self.health = Health(self)
         self.is_active = False
         self.is_paused = False
-        self._set_back, self.set_backs = False, 0
+        self._set_back = False
+        self.set_backs = 0
         self._before_ns = self._back_ns = 0
         self._recovery: Recovery | None = None
         self._on_activation: list[Callable[[], None]] = []
@@ -91,7 +93,8 @@ class LiveNode(LifecycleNode):
         predecessor left that was killed a short time ago. Where it raises a ThinmapError, as the
         node was started with other parameters, the node begins anew.
         """
-        self._recovery, self._state_of = Recovery(self, self._recover_s), state
+        self._recovery = Recovery(self, self._recover_s)
+        self._state_of = state
         self._kept_at = monotonic()
         self._keeping_s = 0.0
         self.create_timer(_KEEP_S, self._keep, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -135,7 +138,8 @@ class LiveNode(LifecycleNode):
     def settle(self) -> None:
         """Begin anew if the clock was set back: before anything of the new time is taken."""
         if self._set_back:
-            self._set_back, self.set_backs = False, self.set_backs + 1
+            self._set_back = False
+            self.set_backs = self.set_backs + 1
             self.get_logger().warning('the clock was set back: beginning anew')
             self.health.dropped('begun anew: the clock was set back', 1)
             self._forget()
@@ -146,7 +150,8 @@ class LiveNode(LifecycleNode):
 
     def _on_jump(self, jump: TimeJump) -> None:
         # Only noted: whoever sets the clock must not be kept waiting.
-        self._set_back, self._back_ns = True, -jump.delta.nanoseconds
+        self._set_back = True
+        self._back_ns = -jump.delta.nanoseconds
         self._before_ns = self.get_clock().now().nanoseconds + self._back_ns
 
     def _forget(self) -> None:

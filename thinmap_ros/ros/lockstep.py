@@ -44,7 +44,8 @@ class Lockstep:
     def sent(self, stamp_ns: int) -> None:
         """Take note that a scan was published."""
         if self._topic != NONE:
-            self._awaited_ns, self._since = stamp_ns, monotonic()
+            self._awaited_ns = stamp_ns
+            self._since = monotonic()
 
     @property
     def waits(self) -> bool:

@@ -13,7 +13,8 @@ class Losses:
     """
 
     def __init__(self) -> None:
-        self._last_ns, self._last_number = 0, 0
+        self._last_ns = 0
+        self._last_number = 0
         self._steps_ns: deque[int] = deque(maxlen=50)
 
     def came(self, stamp_ns: int, number: int | None) -> tuple[int, int]:
@@ -22,8 +23,10 @@ class Losses:
         Returns how many between it and the last one were lost on the way, and how many more are
         missing: never sent, or without numbers nobody knows.
         """
-        step_ns, self._last_ns = stamp_ns - self._last_ns, stamp_ns
-        skipped, self._last_number = (number or 0) - self._last_number - 1, number or 0
+        step_ns = stamp_ns - self._last_ns
+        self._last_ns = stamp_ns
+        skipped = (number or 0) - self._last_number - 1
+        self._last_number = number or 0
         if step_ns <= 0:
             return 0, 0
         spaces = round(step_ns / min(self._steps_ns, default=step_ns)) - 1

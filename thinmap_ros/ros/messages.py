@@ -177,14 +177,16 @@ def odometry_msg(
 def twist_msg(v: float, w: float) -> Twist:
     """Velocity command: v m/s ahead, w rad/s to the left."""
     message = Twist()
-    message.linear.x, message.angular.z = v, w
+    message.linear.x = v
+    message.angular.z = w
     return message
 
 
 def transform_msg(T: Array, frame_id: str, child_frame_id: str, ns: int) -> TransformStamped:
     """Planar transform (3,)."""
     message = TransformStamped(header=header(frame_id, ns), child_frame_id=child_frame_id)
-    message.transform.translation.x, message.transform.translation.y = float(T[0]), float(T[1])
+    message.transform.translation.x = float(T[0])
+    message.transform.translation.y = float(T[1])
     message.transform.rotation = quaternion_msg(float(T[2]))
     return message
 

@@ -61,7 +61,10 @@ class _Changes(Generic[AnyConfig]):
     def __init__(
         self, node: Node, current: AnyConfig, free: set[str], changed: Callable[[AnyConfig], None]
     ) -> None:
-        self._node, self._current, self._free, self._changed = node, current, free, changed
+        self._node = node
+        self._current = current
+        self._free = free
+        self._changed = changed
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._take)
 
@@ -133,7 +136,9 @@ def check_unknown(node: Node) -> None:
         shared.known |= known
         if len(shared.names) < shared.count:
             return
-        given, known, names = shared.given, shared.known, ', '.join(shared.names)
+        given = shared.given
+        known = shared.known
+        names = ', '.join(shared.names)
     else:
         names = str(node.get_name())
     if unknown := sorted(given - known):

@@ -15,9 +15,11 @@ _LIMIT_S = 10.0
 def answer(response: Any, work: Callable[[], str]) -> Any:
     """Fill in a response: success and what `work` says that it did, or what kept it from that."""
     try:
-        response.message, response.success = work(), True
+        response.message = work()
+        response.success = True
     except (ThinmapError, OSError) as error:
-        response.message, response.success = str(error), False
+        response.message = str(error)
+        response.success = False
     return response
 
 

@@ -39,12 +39,15 @@ class _Listener:
         take: Callable[[Any], None],
         profile: QoSProfile,
     ) -> None:
-        self._node, self._topic, self._take = node, topic, take
+        self._node = node
+        self._topic = topic
+        self._take = take
         self._is_scan = kind is LaserScan
         self._is_latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
         self._held: Any = None
         self._said_at = -_QUIET_S
-        self._last_ns, self._set_backs = 0, 0
+        self._last_ns = 0
+        self._set_backs = 0
         self._losses = Losses()
         node.health.expects(topic)
         node.create_subscription(kind, topic, self._on_message, profile)
@@ -56,7 +59,8 @@ class _Listener:
     def _on_message(self, message: Any, info: dict[str, Any]) -> None:
         node = self._node
         node.health.heard(self._topic)
-        last_ns, self._last_ns = self._last_ns, _stamp_ns(message)
+        last_ns = self._last_ns
+        self._last_ns = _stamp_ns(message)
         if not self._is_latched:
             self._count_losses(info.get('publication_sequence_number'))
         node.settle()
@@ -98,7 +102,8 @@ class _Listener:
                 self._node.get_logger().warning(f'{self._topic}: {error}')
 
     def _take_held(self) -> None:
-        message, self._held = self._held, None
+        message = self._held
+        self._held = None
         if message is not None:
             self._guarded(message)
 

@@ -131,7 +131,8 @@ def _random_ways(
     patch = patch_of(world)
     config = WavefrontConfig(robot_radius_m=PioneerConfig().radius_m + MARGIN_M)
     while True:
-        T, goal = simulation.robot.T_world_base, random_start(world, rng, within)
+        T = simulation.robot.T_world_base
+        goal = random_start(world, rng, within)
         if np.hypot(*(goal[:2] - T[:2])) < _NEAREST_GOAL_M:
             continue
         way = plan(patch, (float(T[0]), float(T[1])), (float(goal[0]), float(goal[1])), config)

@@ -94,7 +94,8 @@ class Lms200:
         """
         edges = _edges(ranges, self.config.edge_m, self._increment / math.sin(_FLATTEST_RAD))
         mixed = edges[self._rng.random(ranges.size - 1)[edges] < self.config.mixed_pixels]
-        share, side = self._rng.random(mixed.size), self._rng.integers(0, 2, mixed.size)
+        share = self._rng.random(mixed.size)
+        side = self._rng.integers(0, 2, mixed.size)
         nearer = np.minimum(ranges[mixed], ranges[mixed + 1])
         farther = np.maximum(ranges[mixed], ranges[mixed + 1])
         result = ranges.copy()
@@ -123,7 +124,8 @@ def _edges(ranges: Array, edge_m: float, along_a_wall: float) -> NDArray[np.int6
     found = np.empty(ranges.size, dtype=np.int64)
     count = 0
     for i in range(ranges.size - 1):
-        nearer, farther = min(ranges[i], ranges[i + 1]), max(ranges[i], ranges[i + 1])
+        nearer = min(ranges[i], ranges[i + 1])
+        farther = max(ranges[i], ranges[i + 1])
         if math.isfinite(farther) and farther - nearer > max(edge_m, nearer * along_a_wall):
             found[count] = i
             count += 1

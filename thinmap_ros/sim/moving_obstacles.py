@@ -43,9 +43,11 @@ class People:
         now = seconds % self._times[:, -1]
         who = np.arange(len(now))
         span = (self._times[:, 1:-1] <= now[:, None]).sum(axis=1)
-        begun, ended = self._times[who, span], self._times[who, span + 1]
+        begun = self._times[who, span]
+        ended = self._times[who, span + 1]
         share = (now - begun) / (ended - begun)
-        start, goal = self._stations[who, span], self._stations[who, span + 1]
+        start = self._stations[who, span]
+        goal = self._stations[who, span + 1]
         places: Array = start + share[:, None] * (goal - start)
         return places
 

@@ -79,7 +79,8 @@ class WheelOdometry:
 
     def _measured(self, distance: float, turn: float) -> tuple[float, float]:
         """Return distance (m) and turn (rad) as the wheels count them."""
-        metres, radians = abs(distance), abs(turn)
+        metres = abs(distance)
+        radians = abs(turn)
         noise = self._rng.normal(size=2).tolist()
         root = math.sqrt(metres)
         seen_distance = distance * self._scale + noise[0] * self.config.distance_noise * root
@@ -137,9 +138,11 @@ def after_arc(T: Array, distance: float, turn: float) -> Array:
     """Pose (3,) after a circular arc of a length (m) from a pose (3,), with a turn (rad)."""
     half = turn / 2.0
     chord = distance if half == 0.0 else distance * math.sin(half) / half
-    dx, dy = chord * math.cos(half), chord * math.sin(half)
+    dx = chord * math.cos(half)
+    dy = chord * math.sin(half)
     x, y, theta = T.tolist()
-    c, s = math.cos(theta), math.sin(theta)
+    c = math.cos(theta)
+    s = math.sin(theta)
     return se2.pose(x + c * dx - s * dy, y + s * dx + c * dy, theta + se2.wrap(turn))
 
 

@@ -46,7 +46,8 @@ class World:
         """Whether a disc whose centre lies within the world touches no solid cell; exact."""
         if not (math.isfinite(x) and math.isfinite(y)):
             return False
-        frame, (rows, cols) = self.frame, self.occupied.shape
+        frame = self.frame
+        (rows, cols) = self.occupied.shape
         row = math.floor((y - frame.origin_y) / frame.resolution)
         col = math.floor((x - frame.origin_x) / frame.resolution)
         if not (0 <= row < rows and 0 <= col < cols):

@@ -17,7 +17,8 @@ from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
 from thinmap_ros.logs.log import Log
 from thinmap_ros.logs.log_formats import is_mcap
 
-BAD_INPUT, INTERRUPTED = 2, 130
+BAD_INPUT = 2
+INTERRUPTED = 130
 AnyConfig = TypeVar('AnyConfig', bound=Config)
 # A parser or a group of its options: argparse's own name for what both are.
 Options = argparse._ActionsContainer

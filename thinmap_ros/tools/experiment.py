@@ -44,7 +44,9 @@ EXPERIMENTS: dict[str, Callable[[Source], Outcome]] = {
     'feature_count': feature_count.run,
     'long_floor': long_floor.run,
 }
-LOGS, PAGE = 'logs', 'page'  # need logs, or results: not among all
+# Need logs, or results: not among all
+LOGS = 'logs'
+PAGE = 'page'
 _LONGEST = ('strategies', 'feature_count', 'long_floor', 'convergence')
 
 

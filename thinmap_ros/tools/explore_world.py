@@ -123,7 +123,8 @@ class ClosedLoop:
 
         `show` is told time (s) and coverage now and then.
         """
-        moment, steps = self.simulation.sense(), 0
+        moment = self.simulation.sense()
+        steps = 0
         while moment.stamp_ns < limit_s * 1e9:
             if moment.scan is not None:
                 self._take(moment.scan, moment.T_odom_base)
@@ -133,7 +134,8 @@ class ClosedLoop:
                     break
             if steps % _CONTROL_STEPS == 0:
                 self._control(moment)
-            moment, steps = self.simulation.step(*self._command), steps + 1
+            moment = self.simulation.step(*self._command)
+            steps = steps + 1
         self.pipeline.finish()
         show(*self._measure(goal))
         finished = self.decision is not None and self.is_finished
@@ -169,7 +171,8 @@ class ClosedLoop:
 
     def decide(self, scan: Scan, estimate: Estimate) -> None:
         """Say where to go, by the map as it is now."""
-        self._scan, self._T_map_odom = scan, estimate.T_map_odom
+        self._scan = scan
+        self._T_map_odom = estimate.T_map_odom
         self._patch = self.pipeline.grid.patch()
         # The processor's time: what else the machine does is not the strategy's.
         began = time.thread_time()
@@ -192,8 +195,13 @@ class ClosedLoop:
     def drive_by(self, pipeline: Pipeline, strategy: Strategy, navigator: Navigator) -> None:
         """Have other parts decide where to go from now on."""
         self.navigator.cancel()
-        self.pipeline, self.strategy, self.navigator = pipeline, strategy, navigator
-        self.decision, self._patch, self._goal, self._command = None, None, None, (0.0, 0.0)
+        self.pipeline = pipeline
+        self.strategy = strategy
+        self.navigator = navigator
+        self.decision = None
+        self._patch = None
+        self._goal = None
+        self._command = (0.0, 0.0)
 
     def _control(self, moment: Moment) -> None:
         if self._patch is None:
@@ -271,9 +279,11 @@ def explore(
     """Explore a world from a start (3,); returns what is left of it and the report."""
     loop = make_loop(world, start, options)
     goal = coverable(world, start, PRESETS[options.robot].radius_m, options.laser.range_max_m)
-    began, cpu_began = time.perf_counter(), time.process_time()
+    began = time.perf_counter()
+    cpu_began = time.process_time()
     ending = loop.run(goal, options.time_limit_s, show)
-    wall_s, cpu_s = time.perf_counter() - began, time.process_time() - cpu_began
+    wall_s = time.perf_counter() - began
+    cpu_s = time.process_time() - cpu_began
     log = loop.log
     report = exploration_report(
         ending,
@@ -283,7 +293,8 @@ def explore(
         np.array(log.coverage),
         log.census,
     )
-    report['target_changes'], report['reversals'] = log.targets.changes, log.targets.reversals
+    report['target_changes'] = log.targets.changes
+    report['reversals'] = log.targets.reversals
     milliseconds = 1e3 * np.array(log.decision_s)
     report['decision_ms'] = {
         'median': round(float(np.median(milliseconds)), 2),
@@ -293,14 +304,17 @@ def explore(
     report['world'] = world.name
     report['strategy'] = options.strategy
     report['options'] = asdict(options)
-    report['wall_s'], report['cpu_s'] = round(wall_s, 3), round(cpu_s, 3)
+    report['wall_s'] = round(wall_s, 3)
+    report['cpu_s'] = round(cpu_s, 3)
     return loop, report
 
 
 def write_outputs(loop: ClosedLoop, report: dict[str, Any], folder: Path) -> None:
     """Write all files into a folder."""
-    log, pipeline = loop.log, loop.pipeline
-    patch, topology = pipeline.grid.patch(), pipeline.topology.map
+    log = loop.log
+    pipeline = loop.pipeline
+    patch = pipeline.grid.patch()
+    topology = pipeline.topology.map
     folder.mkdir(parents=True, exist_ok=True)
     trajectory_files.write_tum(folder / 'trajectory.tum', log.stamps_ns, log.poses)
     map_files.write_map(folder / 'map', patch)
@@ -309,7 +323,8 @@ def write_outputs(loop: ClosedLoop, report: dict[str, Any], folder: Path) -> Non
         f'{report["world"]}: {report["coverage"]:.1%} in {report["time"]:.0f} s, '
         f'{report["distance"]:.0f} m'
     )
-    poses, true_poses = np.array(log.poses), np.array(log.true_poses)
+    poses = np.array(log.poses)
+    true_poses = np.array(log.true_poses)
     figures.summary_figure(folder / 'summary.png', patch, topology, poses, true_poses, title=title)
     write_text(folder / 'report.json', json.dumps(report, indent=2) + '\n')
 

@@ -44,7 +44,8 @@ def _work(arguments: argparse.Namespace) -> None:
     graph_files.writer_of(arguments.out)  # a wrong name is said before any work
     if arguments.picture is not None and arguments.picture.suffix != '.png':
         raise InputError(f'{arguments.picture}: expected a name that ends in .png')
-    start, config = _start(arguments.start), _config(arguments)
+    start = _start(arguments.start)
+    config = _config(arguments)
     patch = map_files.read_map(arguments.map)
     topology = build(patch, start, config)
     graph_files.write_graph(arguments.out, topology)

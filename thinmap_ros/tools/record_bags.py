@@ -47,14 +47,16 @@ class _Recording:
 
     def mount(self, look: Look) -> None:
         """Where the laser sits."""
-        ns, made = look.scan.stamp_ns, self._objects
+        ns = look.scan.stamp_ns
+        made = self._objects
         self._write(
             '/tf_static', ns, made.transform(ns, ('base_link', 'laser'), look.scan.T_base_laser)
         )
 
     def sensed(self, look: Look) -> None:
         """What the robot had at a scan, and where it truly was."""
-        ns, made = look.scan.stamp_ns, self._objects
+        ns = look.scan.stamp_ns
+        made = self._objects
         self._write(TRUTH_TOPIC, ns, made.pose(ns, 'map', look.T_world_base))
         self._write('/odom', ns, made.odometry(ns, look.T_odom_base))
         self._write('/tf', ns, made.transform(ns, ('odom', 'base_link'), look.T_odom_base))
@@ -77,7 +79,9 @@ def record(path: Path, looks: Iterable[Look], localized: bool) -> int:
 
     localized: by the localizer, else by ground truth.
     """
-    definitions, scans, pipeline = resources.message_definitions('thinmap_msgs'), 0, None
+    definitions = resources.message_definitions('thinmap_msgs')
+    scans = 0
+    pipeline = None
     with BagWriter(path, definitions=definitions, compressed=True) as writer:
         recording = _Recording(writer)
         for look in looks:

@@ -56,7 +56,8 @@ def replay(
     Raises InputError where the log has nothing to play.
     """
     result = Replay(Pipeline(config))
-    pairing, tidy_up = ScanPairing(), give_back_pages()
+    pairing = ScanPairing()
+    tidy_up = give_back_pages()
     for event in tqdm(log.events(), unit=' events', disable=not show_progress):
         if isinstance(event, OdometryEvent):
             ready = pairing.add_odometry(event.stamp_ns, event.T_odom_base)
@@ -85,7 +86,8 @@ def write_outputs(
 ) -> dict[str, Any]:
     """Write all files into a folder; seconds: wall and CPU time taken. Returns the report."""
     pipeline = result.pipeline
-    patch, poses = pipeline.grid.patch(), np.array(result.poses)
+    patch = pipeline.grid.patch()
+    poses = np.array(result.poses)
     folder.mkdir(parents=True, exist_ok=True)
     trajectory_files.write_tum(folder / 'trajectory.tum', result.stamps_ns, result.poses)
     final = list(pipeline.localizer.corrected_path())
@@ -161,7 +163,8 @@ def _play(arguments: argparse.Namespace, shown: ReplayView | None) -> None:
         localizer=cli.config_from(arguments, ScanLocalizerConfig),
         grid=cli.config_from(arguments, OccupancyConfig),
     )
-    wall, cpu = time.perf_counter(), time.process_time()
+    wall = time.perf_counter()
+    cpu = time.process_time()
     result = replay(cli.open_log(arguments), config, show_progress=not arguments.quiet, shown=shown)
     seconds = (time.perf_counter() - wall, time.process_time() - cpu)
     title = f'{arguments.log.name}: {len(result.poses)} scans'

@@ -29,7 +29,8 @@ class ReplayView:
 
     def step(self, scan: Scan, T_odom_base: Array, estimate: Estimate, pipeline: Pipeline) -> None:
         """Show what came of a scan with the odometry pose (3,) at its stamp."""
-        ns, view = scan.stamp_ns, self._view
+        ns = scan.stamp_ns
+        view = self._view
         view.pose(ns, estimate.T_map_base, estimate.covariance)
         view.scan(ns, scan)
         if self._T_map_odom is None:
@@ -52,7 +53,8 @@ class ReplayView:
     def last(self, ns: int, pipeline: Pipeline) -> None:
         """Show map, graph and features as they are now."""
         self._drawn_ns = ns
-        view, topology = self._view, pipeline.topology.map
+        view = self._view
+        topology = pipeline.topology.map
         view.grid(ns, pipeline.grid.patch())
         view.topology(ns, topology)
         view.number(ns, 'count', 'nodes', float(len(topology.nodes)))

@@ -78,7 +78,8 @@ def summary_figure(
 def draw_map(axes: 'Axes', patch: GridPatch) -> None:
     """Draw the cells of a grid: free white, occupied black, unknown grey."""
     shade = np.full((*patch.shape, 3), _GREY, dtype=np.uint8)
-    shade[patch.free], shade[patch.occupied] = 255, 0
+    shade[patch.free] = 255
+    shade[patch.occupied] = 0
     rows, cols = patch.shape
     x = patch.frame.origin_x + patch.frame.resolution * np.arange(cols + 1)
     y = patch.frame.origin_y + patch.frame.resolution * np.arange(rows + 1)

@@ -35,7 +35,9 @@ class Feed:
     def __init__(
         self, view: NullView, laser_pose: Callable[[str], Array | None], namespace: str = ''
     ) -> None:
-        self._view, self._laser_pose, self._namespace = view, laser_pose, namespace.strip('/')
+        self._view = view
+        self._laser_pose = laser_pose
+        self._namespace = namespace.strip('/')
         self._places: dict[int, Array] = {}
         self._T_odom_base: Array | None = None
         self._T_map_odom: Array | None = None

@@ -3,7 +3,9 @@
 from thinmap_ros.core.topology.graph import NodeKind
 
 NODES = {NodeKind.END: '#D55E00', NodeKind.BRANCH: '#0072B2', NodeKind.CORNER: '#E69F00'}
-EDGE, ESTIMATE, TRUTH = '#009E73', '#CC79A7', '#56B4E9'
+EDGE = '#009E73'
+ESTIMATE = '#CC79A7'
+TRUTH = '#56B4E9'
 
 # For curves, in the order in which they are told apart best.
 PALETTE = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '#555555')

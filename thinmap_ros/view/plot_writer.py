@@ -30,7 +30,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_DPI, _PAD = 110, 0.1  # dots and margin, in inches
+# Dots and margin, in inches
+_DPI = 110
+_PAD = 0.1
 _MANY = 2000  # points: more make an SVG needlessly large
 # Text stays text in an SVG, and its ids do not change from run to run.
 _SETTINGS: Any = {
@@ -216,8 +218,10 @@ def _(layer: GraphLayer, axes: 'Axes') -> None:
 
 @_draw.register(Raster)
 def _(layer: Raster, axes: 'Axes') -> None:
-    frame, (rows, cols) = layer.frame, layer.values.shape
-    right, top = frame.origin_x + cols * frame.resolution, frame.origin_y + rows * frame.resolution
+    frame = layer.frame
+    (rows, cols) = layer.values.shape
+    right = frame.origin_x + cols * frame.resolution
+    top = frame.origin_y + rows * frame.resolution
     low, high = layer.limits or (float(np.nanmin(layer.values)), float(np.nanmax(layer.values)))
     image = axes.imshow(
         layer.values,

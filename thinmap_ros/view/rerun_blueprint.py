@@ -12,7 +12,8 @@ _ASPECT = 1.3  # width over height of the map's part of the window, or less
 _HALF_VIEW = math.radians(55.0) / 2.0  # rerun's eye sees so far up and down
 _TILT = 0.25  # so much of its height the eye stands south of what it looks at
 _MARGIN = 1.15
-_WIDTHS, _HEIGHTS = (5, 2), (3, 3, 3, 3, 3)
+_WIDTHS = (5, 2)
+_HEIGHTS = (3, 3, 3, 3, 3)
 LEGEND = """**orange** end node, with its position probability; **grey** it will stay ·
 **dark blue** branch · **amber** corner · **green** skeleton ·
 **blue** features of the local area, its nodes ringed;

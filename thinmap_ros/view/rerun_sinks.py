@@ -17,9 +17,11 @@ import numpy as np
 
 from thinmap_ros.core.errors import InputError
 
-APPLICATION, TIMELINE = 'thinmap', 'time'
+APPLICATION = 'thinmap'
+TIMELINE = 'time'
 # Beyond this a viewer forgets the oldest.
-_MEMORY_LIMIT, _SERVER_MEMORY_LIMIT = '1GB', '256MB'
+_MEMORY_LIMIT = '1GB'
+_SERVER_MEMORY_LIMIT = '256MB'
 _LOCALHOST = '127.0.0.1'
 _FLUSH_S = 0.8
 

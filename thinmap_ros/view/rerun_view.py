@@ -24,9 +24,17 @@ _TRAIL_STEP_M = 0.05
 _OUTGROWN = 1.4  # a map so much larger than what was in view is brought into view
 _OUTLINE = 33
 _SIGMA2_95 = 5.991  # chi-square, 95 %, 2 degrees of freedom
-_HEADING_M, _HEADING_SIGMAS = 1.0, 1.96  # the wedge in which the robot looks in 95 of 100 cases
-_ODOMETRY, _SCAN, _PLAN, _TARGET, _SAMPLE = '#777777', '#CC0000', '#F0E442', '#F0E442', '#7B3FA0'
-_LOCAL_LINE, _LINE, _LOCAL_NODE = '#0072B2', '#8FBEDB', '#0072B2'
+# The wedge in which the robot looks in 95 of 100 cases
+_HEADING_M = 1.0
+_HEADING_SIGMAS = 1.96
+_ODOMETRY = '#777777'
+_SCAN = '#CC0000'
+_PLAN = '#F0E442'
+_TARGET = '#F0E442'
+_SAMPLE = '#7B3FA0'
+_LOCAL_LINE = '#0072B2'
+_LINE = '#8FBEDB'
+_LOCAL_NODE = '#0072B2'
 _STAYS = (125, 125, 125)  # an end node of which is sure that it will stay
 _TRAILS = {'estimate': colours.ESTIMATE, 'truth': colours.TRUTH, 'odometry': _ODOMETRY}
 # Heights above the map, so that what matters more covers what matters less, m.
@@ -81,7 +89,8 @@ class View(NullView):
         """
 
         def draw() -> None:
-            rr, frame = self._rr, patch.frame
+            rr = self._rr
+            frame = patch.frame
             rows, cols = patch.shape
             form = rr.components.ImageFormat(
                 width=cols, height=rows, color_model='L', channel_datatype='U8'

@@ -38,10 +38,12 @@ def test_the_fit_is_the_minimum_that_a_general_solver_finds(rng):
     config = LineConfig()
     scan = scan_in(BOX[1:2], np.zeros(3), rng)
     lines = extract_lines(scan, config)
-    rho, phi = scan.ranges_m[scan.hit], scan.angles_rad[scan.hit]
+    rho = scan.ranges_m[scan.hit]
+    phi = scan.angles_rad[scan.hit]
 
     def residuals(x):
-        d, off = rho * np.cos(phi - x[1]) - x[0], phi - lines.z[0, 1]
+        d = rho * np.cos(phi - x[1]) - x[0]
+        off = phi - lines.z[0, 1]
         along = config.bearing_sigma_rad * rho * np.sin(off)
         return d / np.sqrt((config.range_sigma_m * np.cos(off)) ** 2 + along**2 + 1e-8)
 
@@ -57,8 +59,10 @@ def test_the_covariance_is_what_many_scans_show(rng, mount):
     config = LineConfig(range_sigma_m=0.02, bearing_sigma_rad=0.002)
     pose = np.array([0.3, -0.4, 0.2])
     exact = scan_in(BOX[1:2], pose, T_base_laser=mount)
-    hit, normal = exact.hit, se2.compose(pose, mount)[2]
-    found, claimed = [], []
+    hit = exact.hit
+    normal = se2.compose(pose, mount)[2]
+    found = []
+    claimed = []
     for _ in range(400):
         # Bearing noise moves the range on the wall at hand: rho = d / cos(phi - alpha).
         off = exact.angles_rad[hit] + normal
@@ -74,7 +78,8 @@ def test_the_covariance_is_what_many_scans_show(rng, mount):
         assert len(lines) == 1
         found.append(lines.z[0])
         claimed.append(lines.covariances[0])
-    shown, said = np.cov(np.array(found).T), np.mean(claimed, axis=0)
+    shown = np.cov(np.array(found).T)
+    said = np.mean(claimed, axis=0)
     np.testing.assert_allclose(np.diag(shown), np.diag(said), rtol=0.25)
     correlations = [C[0, 1] / math.sqrt(C[0, 0] * C[1, 1]) for C in (shown, said)]
     assert correlations[0] == pytest.approx(correlations[1], abs=0.15)

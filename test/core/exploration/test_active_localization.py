@@ -47,7 +47,8 @@ def seconds_driven_by_itself(finder, start, seed):
     )
     # As those that roam.
     search = ActiveSearch(finder.places, finder.config, NavigatorConfig(max_speed_m_s=0.5))
-    moment, scan = simulation.sense(), None
+    moment = simulation.sense()
+    scan = None
     for k in itertools.count():
         if moment.scan is not None:
             scan = moment.scan
@@ -111,7 +112,8 @@ def test_where_nothing_tells_places_apart_the_robot_goes_on_and_stands_when_all_
     shut[70:72] = 100
     places = Places.of(*map_of(shut), CONFIG)
     starts = in_both_rooms(*STARTS[0])
-    half, driving = np.array([0.5, 0.5]), NavigatorConfig()
+    half = np.array([0.5, 0.5])
+    driving = NavigatorConfig()
     view = best_viewpoint(places, np.zeros(3), starts, half, 15.0, driving)
     assert view.gain == 0.0
     assert np.hypot(*view.T_odom_view[:2]) > 2.0

@@ -29,7 +29,8 @@ def corridor():
     """12 x 4 m between walls, known up to x = 9 m."""
     cells = np.full((40, 120), -1)
     cells[:, :90] = 0
-    cells[[0, -1]], cells[:, 0] = 100, 100
+    cells[[0, -1]] = 100
+    cells[:, 0] = 100
     return cells
 
 
@@ -37,11 +38,13 @@ def corner():
     """A room of 4 x 4 m with a side room to the north, hidden where it lies behind the corner."""
     cells = np.full((90, 90), -1)
     cells[:40, :40] = 0
-    cells[[0, 39], :40], cells[:40, [0, 39]] = 100, 100
+    cells[[0, 39], :40] = 100
+    cells[:40, [0, 39]] = 100
     cells[39, 25:35] = 0
     for row in range(40, 80):
         cells[row, 25 + (row - 40) // 2 : 35 + (row - 40)] = 0
-    cells[80, 25:], cells[40:81, 76:] = 100, 100
+    cells[80, 25:] = 100
+    cells[40:81, 76:] = 100
     return cells
 
 
@@ -89,14 +92,16 @@ def open_hall(seen_to_m):
     """36 x 20 m, all of it seen up to x: the border is as long as the hall is wide."""
     cells = np.full((200, 360), -1)
     cells[:, : int(10 * seen_to_m)] = 0
-    cells[[0, -1]], cells[:, 0] = 100, 100
+    cells[[0, -1]] = 100
+    cells[:, 0] = 100
     return cells
 
 
 def test_of_a_border_longer_than_the_laser_reaches_a_part_is_looked_at_from_the_nearest_place():
     """No place shows most of it; the goal is not right at it, but as far as the range allows."""
     surveyor = surveyor_of(open_hall(12.0))
-    near, far = se2.pose(2.0, 4.0, 0.0), se2.pose(2.0, 16.0, 0.0)
+    near = se2.pose(2.0, 4.0, 0.0)
+    far = se2.pose(2.0, 16.0, 0.0)
     for at in (near, far):
         (candidate,) = surveyor.survey(at, 8.0)
         assert len(candidate.cells) == 198

@@ -28,7 +28,8 @@ def half_known():
     """A walled room of 4 x 3 m, known up to x = 2 m: one border, 2.8 m long."""
     cells = np.full((30, 40), -1)
     cells[:, :20] = 0
-    cells[[0, -1], :20], cells[:, 0] = 100, 100
+    cells[[0, -1], :20] = 100
+    cells[:, 0] = 100
     return cells
 
 
@@ -66,7 +67,8 @@ def test_updates_near_the_robot_give_what_a_new_look_at_the_whole_map_gives():
     known = np.full(world.shape, -1)
     local = OpenBorders(0.4)
     for _ in range(60):
-        row, col = rng.integers(8, 72), rng.integers(8, 82)
+        row = rng.integers(8, 72)
+        col = rng.integers(8, 82)
         known[row - 6 : row + 7, col - 6 : col + 7] = world[row - 6 : row + 7, col - 6 : col + 7]
         local.update(patch_of(known), np.array([[col - 10, row - 10], [col + 11, row + 11]]) * 0.1)
         whole = borders_of(known)

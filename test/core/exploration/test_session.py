@@ -7,7 +7,8 @@ from thinmap_ros.core.exploration.session import Budget, Odometer
 
 
 def test_noise_at_a_standstill_is_no_distance_but_a_slow_robot_gets_on():
-    odometer, rng = Odometer(), np.random.default_rng(1)
+    odometer = Odometer()
+    rng = np.random.default_rng(1)
     for _ in range(500):
         odometer.add(np.append(rng.normal(0.0, 0.002, 2), 0.0))
     assert odometer.distance_m == 0.0

@@ -10,7 +10,10 @@ import numpy as np
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, log_odds
 
-FLAT_M, LONGEST_SURFACE_M, GRAZED_M, SURELY_OCCUPIED = 0.06, 3.0, 0.4, 0.9
+FLAT_M = 0.06
+LONGEST_SURFACE_M = 3.0
+GRAZED_M = 0.4
+SURELY_OCCUPIED = 0.9
 
 
 def crossed(start, end):
@@ -44,7 +47,8 @@ class PlainGrid:
         T = se2.compose(T_map_base, scan.T_base_laser)
         self.laser = (T[0] / self.config.resolution_m, T[1] / self.config.resolution_m)
         ends = [self.end_of(scan, i, T[2]) for i in range(scan.ranges_m.size)]
-        passed, surface = set(), set()
+        passed = set()
+        surface = set()
         for i, end in enumerate(ends):
             if end is not None:
                 passed |= crossed(self.laser, end)
@@ -71,14 +75,16 @@ class PlainGrid:
 
     def end_of(self, scan, i, heading):
         """Where a beam ends (x, y), in cells; None where it says nothing."""
-        config, length = self.config, 0.0
+        config = self.config
+        length = 0.0
         if self.is_hit(scan, i):
             length = min(scan.ranges_m[i] + config.surface_depth_m, config.usable_range_m)
         elif scan.hit[i]:
             length = config.usable_range_m
         elif scan.no_return[i]:
             length = min(config.no_return_range_m, scan.range_max_m, config.usable_range_m)
-        angle, reach = heading + scan.angles_rad[i], length / config.resolution_m
+        angle = heading + scan.angles_rad[i]
+        reach = length / config.resolution_m
         return (
             (self.laser[0] + reach * math.cos(angle), self.laser[1] + reach * math.sin(angle))
             if length
@@ -100,7 +106,8 @@ class PlainGrid:
         if self.odds.get(cell, 0) < sure:
             return False
         away = np.array([cell[0] + 0.5 - self.laser[1], cell[1] + 0.5 - self.laser[0]])
-        step, run = away / np.abs(away).max(), 1
+        step = away / np.abs(away).max()
+        run = 1
         for sign in (-1, 1):
             k = 1
             while (
@@ -109,7 +116,8 @@ class PlainGrid:
                 )
                 >= sure
             ):
-                run, k = run + 1, k + 1
+                run = run + 1
+                k = k + 1
         return run >= max(3, round(GRAZED_M / config.resolution_m))
 
     def add(self, cell, step):
@@ -117,5 +125,6 @@ class PlainGrid:
 
         Even odds stay a thousandth off, because 0 is a cell never seen.
         """
-        low, high = self.thousandths(self.config.p_lowest), self.thousandths(self.config.p_highest)
+        low = self.thousandths(self.config.p_lowest)
+        high = self.thousandths(self.config.p_highest)
         self.odds[cell] = min(max((self.odds.get(cell, 0) + step) or 1, low), high)

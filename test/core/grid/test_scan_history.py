@@ -49,7 +49,8 @@ def test_unknown_stamps_and_stamps_that_step_back_are_borne():
 
 
 def test_named_scans_may_come_in_any_order():
-    history, other = filled(POSES, range(12)), filled(POSES, range(12))
+    history = filled(POSES, range(12))
+    other = filled(POSES, range(12))
     stamps = np.array([7, 2, 10])
     moved = POSES[stamps] + [[0.0, 1.0, 0.1], [0.5, 0.0, 0.0], [0.0, 0.0, -0.3]]
     history.correct(stamps, moved, since_ns=12)

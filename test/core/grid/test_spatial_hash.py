@@ -9,7 +9,8 @@ from thinmap_ros.core.grid.spatial_hash import Buckets
 
 def test_all_that_is_near_is_found_and_little_else():
     rng = np.random.default_rng(0)
-    places, buckets = rng.uniform(-50.0, 50.0, (500, 2)), Buckets(4.0)
+    places = rng.uniform(-50.0, 50.0, (500, 2))
+    buckets = Buckets(4.0)
     for number, (x, y) in enumerate(places.tolist()):
         buckets.put(number, x, y)
     for x, y in rng.uniform(-60.0, 60.0, (50, 2)).tolist():

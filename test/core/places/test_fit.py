@@ -26,6 +26,7 @@ def test_smooth_walls_explain_nearly_all_and_a_floor_full_of_small_things_less()
     littered = OFFICE.copy()
     inner = littered[2:-2, 2:-2]
     inner[np.random.default_rng(3).random(inner.shape) < 0.04] = 100
-    clean, rough = share_in(OFFICE), share_in(littered)
+    clean = share_in(OFFICE)
+    rough = share_in(littered)
     assert clean > 0.97
     assert 0.7 <= rough < clean - 0.02

@@ -62,7 +62,8 @@ def test_range_scores_are_the_sums_of_a_table(places, seen, poses):
 
 
 def nodes_in_sight(places, block):
-    low, high = places.first[block], places.first[block + 1]
+    low = places.first[block]
+    high = places.first[block + 1]
     row, col = np.argwhere(places.blocks == block)[0]
     corner = np.array([col, row]) * places.block_cells * CELL_M + origin(places)
     return corner + places.in_sight[:, low:high].T * SIGHT_UNIT_M
@@ -92,7 +93,8 @@ def test_nodes_in_sight_of_a_block_are_those_of_the_map_that_nothing_hides(place
 
 def test_node_scores_are_those_of_the_nearest_node_in_sight(places, poses):
     rng = np.random.default_rng(1)
-    nodes, kinds = rng.normal(0.0, 2.0, (10, 2)), rng.integers(0, 3, 10)
+    nodes = rng.normal(0.0, 2.0, (10, 2))
+    kinds = rng.integers(0, 3, 10)
     nodes[0] = (300.0, -200.0)
     model = np.array([0.3, 0.8, 0.5]), np.array([0.4, 0.3, 0.5]), np.array([20.0, 30.0, 10.0])
     sights = (places.blocks, places.first, places.in_sight)
@@ -117,7 +119,8 @@ def test_node_scores_are_those_of_the_nearest_node_in_sight(places, poses):
 def marched(states, x, y, angle, most):
     """Way to the first cell that is not free, in small steps."""
     for way in np.arange(0.0, most, 0.002):
-        row, col = math.floor(y + way * math.sin(angle)), math.floor(x + way * math.cos(angle))
+        row = math.floor(y + way * math.sin(angle))
+        col = math.floor(x + way * math.cos(angle))
         if not (0 <= row < states.shape[0] and 0 <= col < states.shape[1]):
             return way, 2
         if states[row, col]:
@@ -128,7 +131,9 @@ def marched(states, x, y, angle, most):
 def test_free_way_ends_where_small_steps_do(places):
     rng = np.random.default_rng(2)
     for row, col in places.standing[rng.integers(len(places.standing), size=40)]:
-        x, y, angle = col + rng.random(), row + rng.random(), rng.uniform(-4.0, 4.0)
+        x = col + rng.random()
+        y = row + rng.random()
+        angle = rng.uniform(-4.0, 4.0)
         way, state = free_way(places.states, x, y, angle, 30.0)
         plain_way, plain_state = marched(places.states, x, y, angle, 30.0)
         assert state == plain_state
@@ -179,7 +184,8 @@ def test_of_the_unknown_the_map_says_nothing(places, seen):
 
 def test_refinement_comes_back_to_the_true_pose_and_never_fits_worse(places, seen):
     table = np.exp(-0.5 * (np.arange(256) * NEAR_UNIT_M / 0.15) ** 2)
-    ends, steps = seen.ends[seen.met], np.array([[0.08, 0.03], [0.04, 0.015], [0.02, 0.008]])
+    ends = seen.ends[seen.met]
+    steps = np.array([[0.08, 0.03], [0.04, 0.015], [0.02, 0.008]])
     starts = se2.pose(*START) + np.array([[0.1, -0.1, 0.05], [-0.12, 0.05, -0.06], [0.0, 0.0, 0.0]])
     free = np.zeros((3, 3, 3))
     before = matching.range_scores(starts, ends, places.near, origin(places), CELL_M, table)

@@ -52,7 +52,8 @@ def plain_point_ahead(path, xy, reach_m, stray_m):
 @pytest.mark.parametrize('seed', SEEDS)
 def test_the_point_to_steer_for(seed):
     rng = np.random.default_rng(seed)
-    path, xy = wandering(rng), rng.normal(0.0, 0.4, 2)
+    path = wandering(rng)
+    xy = rng.normal(0.0, 0.4, 2)
     nearest = nearest_point(path, *xy)
     assert nearest == int(np.square(path - xy).sum(axis=1).argmin())
     assert length_from(path, nearest) == pytest.approx(
@@ -65,7 +66,8 @@ def test_the_point_to_steer_for(seed):
 @pytest.mark.parametrize('seed', SEEDS)
 def test_how_far_a_disc_can_be_moved(seed):
     rng = np.random.default_rng(seed)
-    centres, points = wandering(rng), rng.uniform(-1.0, 2.5, (12, 2))
+    centres = wandering(rng)
+    points = rng.uniform(-1.0, 2.5, (12, 2))
     distances = np.hypot(*(centres[:, None] - points[None]).transpose(2, 0, 1))
     blocked = (distances < np.minimum(0.24, distances[0])).any(axis=1)
     expected = max(int(blocked.argmax()) - 1, 0) if blocked.any() else len(centres) - 1
@@ -99,14 +101,16 @@ def test_points_around_are_those_of_the_scan_and_earlier_ones_near_and_out_of_vi
     rng = np.random.default_rng(seed)
     ranges = np.repeat(rng.uniform(0.0, 9.0, 25), 4) + rng.normal(0.0, 0.015, 100)
     scan = Scan.create(0, ranges, -1.2, 0.02, 0.05, 8.0, se2.pose(0.2, -0.1, 0.3))
-    robot, earlier = se2.pose(*rng.normal(size=3)), rng.normal(0.0, 1.0, (50, 2))
+    robot = se2.pose(*rng.normal(size=3))
+    earlier = rng.normal(0.0, 1.0, (50, 2))
     laser = se2.compose(robot, scan.T_base_laser)
     bearings = np.arctan2(*(earlier - laser[:2]).T[::-1]) - laser[2]
     middle = 0.5 * (scan.angles_rad[0] + scan.angles_rad[-1])
     in_view = np.abs(se2.wrap(bearings - middle)) <= 0.5 * 99 * 0.02
     kept = earlier[(np.hypot(*(earlier - robot[:2]).T) < 1.0) & ~in_view]
     hits = np.where(scan.hit, scan.ranges_m, np.nan)
-    angles, smoothed = scan.angles_rad[scan.hit], plain_smoothed(hits)
+    angles = scan.angles_rad[scan.hit]
+    smoothed = plain_smoothed(hits)
     seen = se2.transform_points(
         laser, np.column_stack([smoothed * np.cos(angles), smoothed * np.sin(angles)])
     )
@@ -131,7 +135,8 @@ def test_standing_places_are_renewed_where_something_changed(seed):
     free = rng.random((60, 70)) < 0.97
     standing = standing_places(free, 0.25, 0.1)
     for _ in range(10):
-        top, left = int(rng.integers(0, 55)), int(rng.integers(0, 65))
+        top = int(rng.integers(0, 55))
+        left = int(rng.integers(0, 65))
         bottom = min(top + int(rng.integers(1, 20)), 60)
         right = min(left + int(rng.integers(1, 20)), 70)
         part = (top, left, bottom, right)
@@ -144,7 +149,8 @@ def test_standing_places_are_renewed_where_something_changed(seed):
 @pytest.mark.parametrize('seed', SEEDS)
 def test_places_in_sight(seed):
     rng = np.random.default_rng(seed)
-    frame, free = GridFrame(-1.0, 2.0, 0.1), rng.random((60, 70)) < 0.97
+    frame = GridFrame(-1.0, 2.0, 0.1)
+    free = rng.random((60, 70)) < 0.97
     places = frame.centres_of(rng.integers(0, 60, (40, 2)))
     laser = np.append(frame.centres_of(np.array([[30, 30]])), 2.5)
     bearings = np.arctan2(*(places - laser[:2]).T[::-1]) - laser[2]
@@ -157,7 +163,8 @@ def test_places_in_sight(seed):
 @pytest.mark.parametrize('seed', SEEDS)
 def test_the_cost_of_cells_falls_with_the_distance_to_what_is_not_free(seed):
     rng = np.random.default_rng(seed)
-    config, free = WavefrontConfig(), ndimage.binary_opening(rng.random((40, 50)) < 0.97)
+    config = WavefrontConfig()
+    free = ndimage.binary_opening(rng.random((40, 50)) < 0.97)
     cost = cost_of_cells(
         GridPatch(GridFrame(0.0, 0.0, 0.1), np.where(free, 0, 100).astype(np.int8)), config
     )
@@ -188,7 +195,8 @@ def test_what_is_joined(seed):
 @pytest.mark.parametrize('seed', SEEDS)
 def test_squares_of_cells_and_back(seed):
     rng = np.random.default_rng(seed)
-    cells, factor = rng.random((31, 44)) < 0.1, int(rng.integers(1, 5))
+    cells = rng.random((31, 44)) < 0.1
+    factor = int(rng.integers(1, 5))
     padded = np.pad(cells, [(0, -size % factor) for size in cells.shape])
     shape = (padded.shape[0] // factor, factor, padded.shape[1] // factor, factor)
     expected = padded.reshape(shape).any(axis=(1, 3))
@@ -213,7 +221,8 @@ def test_which_cells_are_near_a_true_one(seed):
 @pytest.mark.parametrize('seed', SEEDS)
 def test_owners_without_scraps(seed):
     rng = np.random.default_rng(seed)
-    owners, numbers = rng.integers(-1, 4, 60), np.sort(rng.integers(0, 5, 60))
+    owners = rng.integers(-1, 4, 60)
+    numbers = np.sort(rng.integers(0, 5, 60))
     expected = owners.copy()
     for number in np.unique(numbers):
         part = owners[numbers == number]
@@ -225,8 +234,10 @@ def test_owners_without_scraps(seed):
 @pytest.mark.parametrize('seed', SEEDS)
 def test_an_arc(seed):
     start = np.random.default_rng(seed).normal(size=(3, 3))[0]
-    curvature, length = 0.7 * seed - 5.0, 1.3
-    pose, count = start, 2600
+    curvature = 0.7 * seed - 5.0
+    length = 1.3
+    pose = start
+    count = 2600
     for _ in range(count):
         pose = se2.compose(pose, se2.pose(length / count, 0.0, curvature * length / count))
     points = _arc(start, curvature, length, 13)

@@ -13,7 +13,9 @@ DT = 0.1
 def drive(path, start, config=None, seconds=60.0):
     """Exact unicycle driven by the follower: poses and commands."""
     follower = Follower(config or FollowerConfig())
-    pose, poses, commands = np.array(start, dtype=np.float64), [], []
+    pose = np.array(start, dtype=np.float64)
+    poses = []
+    commands = []
     for _ in range(int(seconds / DT)):
         v, w = follower.command(pose, path, DT)
         pose = se2.compose(
@@ -75,7 +77,8 @@ def test_it_slows_down_to_stop_at_the_end():
 
 
 def test_turning_to_a_heading_ends_there():
-    follower, heading = Follower(FollowerConfig()), 0.0
+    follower = Follower(FollowerConfig())
+    heading = 0.0
     for _ in range(100):
         v, w = follower.turn_to(np.array([0.0, 0.0, heading]), 2.0, DT)
         assert v == 0.0

@@ -13,7 +13,8 @@ FRAME = GridFrame(-1.0, 2.0, 0.1)
 
 @pytest.mark.parametrize('seed', range(10))
 def test_its_cells_are_those_that_it_led_over_each_beside_the_one_before(seed):
-    rng, trail = np.random.default_rng(seed), Trail()
+    rng = np.random.default_rng(seed)
+    trail = Trail()
     way = np.cumsum(rng.normal(0.05, 0.1, (200, 2)), axis=0) + (0.0, 4.0)
     for x, y in way:
         trail.add(np.array([x, y, 0.0]))
@@ -41,7 +42,8 @@ def test_a_jump_begins_it_anew_and_it_forgets_what_is_long_past():
 
 @pytest.mark.parametrize('count', [1300, 1301, 2600, 2601, 3899, 3901, 9000])
 def test_of_a_long_way_it_keeps_the_last_points(count):
-    trail, way = Trail(), np.arange(count) * 0.05
+    trail = Trail()
+    way = np.arange(count) * 0.05
     for x in way:
         trail.add(np.array([x, 3.0, 0.0]))
     columns = FRAME.cells_of(np.stack([way[-1300:], np.full(1300, 3.0)], axis=1))[:, 1]
@@ -60,13 +62,18 @@ def test_a_pose_that_is_not_finite_leaves_no_trail():
 
 def test_the_way_back_is_open_though_a_speck_makes_it_too_narrow_but_not_through_what_is_there():
     cells = np.zeros((60, 80), dtype=np.int8)
-    cells[[0, -1]], cells[:, [0, -1]] = 100, 100
-    cells[:28, 40], cells[33:, 40] = 100, 100
+    cells[[0, -1]] = 100
+    cells[:, [0, -1]] = 100
+    cells[:28, 40] = 100
+    cells[33:, 40] = 100
     trail = Trail()
     for x in np.arange(2.0, 6.0, 0.05):
         trail.add(np.array([x, 3.05, 0.0]))
-    frame, config = GridFrame(0.0, 0.0, 0.1), WavefrontConfig()
-    back, start, goal = trail.cells(frame, cells.shape), (6.0, 3.05), (2.0, 3.05)
+    frame = GridFrame(0.0, 0.0, 0.1)
+    config = WavefrontConfig()
+    back = trail.cells(frame, cells.shape)
+    start = (6.0, 3.05)
+    goal = (2.0, 3.05)
     assert plan(GridPatch(frame, cells), start, goal, config) is not None
     cells[28, 40] = 100
     assert plan(GridPatch(frame, cells), start, goal, config) is None

@@ -66,7 +66,8 @@ def on(localizer, steps, truth, odom, rng, segments=ROOM, turn=0.1):
     rows = []
     for _ in range(steps):
         step = se2.pose(0.02, 0.0, turn)
-        truth, odom = se2.compose(truth, step), se2.compose(odom, step)
+        truth = se2.compose(truth, step)
+        odom = se2.compose(odom, step)
         stamp = (localizer._prediction.stamp_ns or 0) + PERIOD_NS
         rows.append((truth, localizer.step(scan_in(segments, truth, rng, stamp), odom), odom))
     return rows
@@ -209,7 +210,8 @@ def test_a_robot_that_stands_is_as_sure_as_before():
 
 @pytest.mark.parametrize('seed', range(10))
 def test_driving_adds_uncertainty_whichever_scans_were_lost(seed):
-    rng, losses = np.random.default_rng(seed), np.random.default_rng(1000 + seed)
+    rng = np.random.default_rng(seed)
+    losses = np.random.default_rng(1000 + seed)
     localizer = at_start()
 
     def sigmas(metres, count):
@@ -308,10 +310,13 @@ def test_without_any_wall_the_odometry_is_followed():
 def test_wheels_that_slip_are_caught_by_the_walls():
     """Jumps of 0.3 m or 10 degrees in the odometry, now and then."""
     rng = np.random.default_rng(4)
-    localizer, most = at_start(), 0.0
-    measured, last = np.zeros(3), np.zeros(3)
+    localizer = at_start()
+    most = 0.0
+    measured = np.zeros(3)
+    last = np.zeros(3)
     for i, (truth, odom) in enumerate(drive(500, rng, START)):
-        measured, last = se2.compose(measured, se2.between(last, odom)), odom
+        measured = se2.compose(measured, se2.between(last, odom))
+        last = odom
         if i % 100 == 60:
             slip = [0.3, 0.0, 0.0] if i % 200 == 60 else [0.0, 0.0, np.radians(10.0)]
             measured = se2.compose(measured, np.array(slip))
@@ -430,7 +435,8 @@ def legs_round(at, i):
 
 def from_walls(points):
     """Distance of points (N, 2) from the nearest wall of the room."""
-    start, along = ROOM[:, :2], ROOM[:, 2:] - ROOM[:, :2]
+    start = ROOM[:, :2]
+    along = ROOM[:, 2:] - ROOM[:, :2]
     off = points[:, None] - start
     u = np.clip((off * along).sum(axis=-1) / (along**2).sum(axis=-1), 0.0, 1.0)
     return np.linalg.norm(off - u[..., None] * along, axis=-1).min(axis=1)
@@ -449,7 +455,8 @@ def walls_in(localizer):
 
 def test_people_who_walk_through_do_not_become_walls():
     rng = np.random.default_rng(7)
-    localizer, most = at_start(), 0.0
+    localizer = at_start()
+    most = 0.0
     for i, (truth, odom) in enumerate(drive(500, rng, START)):
         segments = np.vstack([ROOM, legs_round(truth[:2], i)])
         estimate = localizer.step(scan_in(segments, truth, rng, i * PERIOD_NS), odom)
@@ -638,7 +645,9 @@ def test_a_killed_localizer_goes_on_in_the_occupancy_map(slip):
     """Killed for two metres; the wheels slip meanwhile."""
     rng = np.random.default_rng(0)
     config = ScanLocalizerConfig(**AT_START)
-    localizer, last, rows = ScanLocalizer(config), None, []
+    localizer = ScanLocalizer(config)
+    last = None
+    rows = []
     grid = OccupancyGrid(OccupancyConfig(resolution_m=0.05))
     off = se2.pose(slip[0], 0.0, slip[1])
     for k, (truth, odom) in enumerate(drive(600, rng, START)):

@@ -29,7 +29,8 @@ def dissolve(web, spots):
         first, second = web.chains_at(spot)
         if first == second:
             continue
-        one, two = web.chains[first], web.chains[second]
+        one = web.chains[first]
+        two = web.chains[second]
         web.drop_chain(first)
         web.drop_chain(second)
         web.drop_spot(spot)

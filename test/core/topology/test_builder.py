@@ -42,8 +42,10 @@ def building():
     cells[40:180, 40:280] = 0
     cells[60:160, 60:150] = cells[60:160, 170:260] = 100
     for col in (60, 120, 200):
-        cells[184:210, col : col + 40], cells[178:186, col + 15 : col + 25] = 0, 0
-    cells[8:36, 100:180], cells[34:42, 130:142] = 0, 0
+        cells[184:210, col : col + 40] = 0
+        cells[178:186, col + 15 : col + 25] = 0
+    cells[8:36, 100:180] = 0
+    cells[34:42, 130:142] = 0
     return patch_of(cells)
 
 
@@ -63,7 +65,8 @@ def assert_like(graph, batch):
 
 
 def test_a_drive_leads_to_the_map_of_the_whole():
-    patch, builder = building(), TopologyBuilder()
+    patch = building()
+    builder = TopologyBuilder()
     round_trip = legs(
         (5, 5), (5, 17), (16, 17), (27, 17), (27, 5), (16, 5), (16, 17), (27, 17), (27, 5), (5, 5)
     )
@@ -77,7 +80,8 @@ def test_a_drive_leads_to_the_map_of_the_whole():
 
 
 def test_what_only_the_far_ends_of_beams_change_is_drawn_in_too():
-    patch, here = building(), [(5.0, 12.0)]
+    patch = building()
+    here = [(5.0, 12.0)]
     builder = TopologyBuilder()
     ((open_window, T),) = windows(patch, here, size=160)
     builder.update(open_window, T)
@@ -95,7 +99,8 @@ def test_what_only_the_far_ends_of_beams_change_is_drawn_in_too():
 
 
 def test_ids_stay_while_nothing_changes():
-    patch, builder = building(), TopologyBuilder()
+    patch = building()
+    builder = TopologyBuilder()
     way = legs((5, 5), (5, 17), (16, 17), (16, 5), (5, 5))
     for window, T in windows(patch, way):
         builder.update(window, T)
@@ -107,16 +112,19 @@ def test_ids_stay_while_nothing_changes():
         for number, node in before.items():
             in_view = max(abs(node.x - T[0]), abs(node.y - T[1])) < 3.0
             if in_view and (np.hypot(*(places - node.position).T) < 0.5).any():
-                asked, kept = asked + 1, kept + (number in builder.map.nodes)
+                asked = asked + 1
+                kept = kept + (number in builder.map.nodes)
     assert asked > 100 and kept >= 0.99 * asked
 
 
 def test_ids_given_after_a_state_was_kept_are_not_given_again_to_other_places():
-    patch, builder = building(), TopologyBuilder()
+    patch = building()
+    builder = TopologyBuilder()
     seen = list(windows(patch, legs((5, 5), (5, 17), (16, 17), (16, 5), (5, 5))))
     for window, T in seen[:20]:
         builder.update(window, T)
-    state, told = builder.state(), {*builder.map.nodes, *builder.map.edges}
+    state = builder.state()
+    told = {*builder.map.nodes, *builder.map.edges}
     for window, T in seen[20:60]:
         builder.update(window, T)
         told |= {*builder.map.nodes, *builder.map.edges}
@@ -131,7 +139,8 @@ def test_ids_given_after_a_state_was_kept_are_not_given_again_to_other_places():
 
 
 def test_a_place_that_changed_is_replaced():
-    patch, builder = building(), TopologyBuilder()
+    patch = building()
+    builder = TopologyBuilder()
     way = legs((5, 5), (16, 5), (16, 17), (5, 17), (5, 5))
     for window, T in windows(patch, way):
         builder.update(window, T)
@@ -144,7 +153,9 @@ def test_a_place_that_changed_is_replaced():
 
 
 def test_jumps_and_far_away_windows_do_not_break_the_map():
-    patch, builder, rng = building(), TopologyBuilder(), np.random.default_rng(0)
+    patch = building()
+    builder = TopologyBuilder()
+    rng = np.random.default_rng(0)
     free = patch.frame.centres_of(np.argwhere(patch.free))
     sizes = []
     for _ in range(8):
@@ -159,7 +170,8 @@ def test_jumps_and_far_away_windows_do_not_break_the_map():
 
 
 def test_windows_off_the_lattice_are_refused():
-    patch, builder = building(), TopologyBuilder()
+    patch = building()
+    builder = TopologyBuilder()
     ((window, T),) = windows(patch, [(5.0, 5.0)])
     builder.update(window, T)
     shifted = GridFrame(window.frame.origin_x + 0.04, window.frame.origin_y, 0.1)
@@ -177,13 +189,15 @@ def test_drives_through_floors_lead_to_the_map_of_the_whole(shared_data, name):
     patch, start = world(shared_data, name)
     config = TopologyConfig()
     batch = build(patch, start, config)
-    way, goals = [start], [(node.x, node.y) for node in batch.nodes.values()]
+    way = [start]
+    goals = [(node.x, node.y) for node in batch.nodes.values()]
     while goals:
         goal = min(goals, key=lambda at: math.dist(at, way[-1]))
         goals.remove(goal)
         leg = plan(patch, way[-1], goal, WavefrontConfig())
         way += [] if leg is None else [tuple(at) for at in leg[::6].tolist()] + [goal]
-    builder, shown = TopologyBuilder(config), np.full_like(np.pad(patch.cells, PAD), UNKNOWN)
+    builder = TopologyBuilder(config)
+    shown = np.full_like(np.pad(patch.cells, PAD), UNKNOWN)
     for window, T in windows(patch, way):
         builder.update(window, T)
         row, col = (

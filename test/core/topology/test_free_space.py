@@ -71,7 +71,8 @@ def test_unknown_specks_between_beams_are_closed_but_no_larger_hole():
 
 def test_gap_beside_an_obstacle_stays_unknown():
     cells = np.zeros((9, 9))
-    cells[:, 4], cells[:, 5] = 100, -1
+    cells[:, 4] = 100
+    cells[:, 5] = -1
     assert not known_free(patch_of(cells), TopologyConfig()).all(axis=0)[4:6].any()
 
 

@@ -15,7 +15,8 @@ STAMPS = np.arange(1, 6)
 def hall(shift_m=0.0):
     """A hall of 8 x 4 m in the middle of what is unknown, cells of 10 cm."""
     cells = np.full((160, 160), UNKNOWN, dtype=np.int8)
-    cells[29:72, 20:102], cells[30:71, 21:101] = 100, 0
+    cells[29:72, 20:102] = 100
+    cells[30:71, 21:101] = 0
     return GridPatch(GridFrame(shift_m, 0.0, 0.1), cells)
 
 

@@ -39,14 +39,16 @@ class Relay:
         self._scans.publish(message)
 
     def whole(self):
-        self.spoil, self.spoiled = None, 0
+        self.spoil = None
+        self.spoiled = 0
 
 
 def test_a_blind_laser_stops_an_exploration_which_goes_on_when_it_sees_again(graph):
     truth = graph.heard('ground_truth', PoseStamped)
     commands = graph.heard('cmd_vel', Twist)
     statuses = graph.heard('slam_status', SlamStatus)
-    doctor, relay = Doctor(graph), Relay(graph)
+    doctor = Doctor(graph)
+    relay = Relay(graph)
     start = {'start_x_m': 2.0, 'start_y_m': 2.0, 'start_yaw_rad': 0.9}
     graph.start('thinmap', arguments=NODES, use_sim_time=True, max_speed_m_s=0.5, **start)
     graph.start('sim', start='2.0,2.0,0.9', remap=('scan:=raw_scan',), hold_for_subscribers=1)
@@ -95,7 +97,8 @@ class Robot:
     def drive(self):
         """Ask for it anew."""
         goal = NavigateToPose.Goal()
-        goal.pose.pose.position.x, goal.pose.pose.orientation.w = 4.0, 1.0
+        goal.pose.pose.position.x = 4.0
+        goal.pose.pose.orientation.w = 1.0
         self.handle = self.graph.send_goal(self.client, goal)
 
     def say(self, ranges):

@@ -147,7 +147,8 @@ def test_mapping_goes_on_after_each_node_was_killed(graph):
     for name in MAPPING:
         robot.settle()
         kept(graph)
-        known, before = (np.array(maps[-1].data) >= 0).sum(), places(graphs[-1])
+        known = (np.array(maps[-1].data) >= 0).sum()
+        before = places(graphs[-1])
         kill(graph, name)
         maps.clear(), robot.poses.clear(), graphs.clear()
         start_one(graph, name)
@@ -173,7 +174,8 @@ def test_mapping_goes_on_after_each_node_was_killed(graph):
 
 def test_a_killed_localizer_goes_on_in_the_map_and_does_not_bend_it(graph):
     """The robot drives on meanwhile; without the map, the error grew from 0.005 to 0.345 m."""
-    robot, doctor = Robot(graph), Doctor(graph)
+    robot = Robot(graph)
+    doctor = Doctor(graph)
     start_mapping(graph, rate=2.0, lockstep='none')
     graph.until(lambda: robot.poses, 'it maps')
     robot.drive(2.0)
@@ -283,7 +285,8 @@ def test_time_set_back_begins_everything_anew(graph):
 
 
 def test_what_waited_while_the_clock_was_set_back_does_not_begin_the_new_map(graph):
-    poses, doctor = graph.heard('pose', PoseWithCovarianceStamped), Doctor(graph)
+    poses = graph.heard('pose', PoseWithCovarianceStamped)
+    doctor = Doctor(graph)
     graph.start('localizer', laser_pose='0,0,0', use_sim_time=True)
     clock = graph.node.create_publisher(Clock, '/clock', qos.STREAM)
     scan = graph.node.create_publisher(LaserScan, 'scan', qos.STREAM)
@@ -303,7 +306,8 @@ def test_what_waited_while_the_clock_was_set_back_does_not_begin_the_new_map(gra
         say(now[0], x)
 
     graph.until(lambda: go_on(4.0) or len(poses) > 5, 'poses')
-    last, now[0] = now[0], 1.0
+    last = now[0]
+    now[0] = 1.0
     set_back = Clock(clock=messages.time_msg(10**9))
     graph.until(
         lambda: clock.publish(set_back) or 'the clock was set back' in graph.log('localizer'),
@@ -352,7 +356,9 @@ def test_a_silent_laser_stops_the_robot_and_it_goes_on(graph):
     free = graph.node.create_publisher(OccupancyGrid, 'map', qos.LATCHED)
     clock = graph.node.create_publisher(Clock, '/clock', qos.STREAM)
     silent = set()
-    now_ns, answered, said_at = [10**12], [-1], [0.0]
+    now_ns = [10**12]
+    answered = [-1]
+    said_at = [0.0]
 
     def speak():
         """A robot in an empty hall, the next 0.1 s after each command.
@@ -362,7 +368,8 @@ def test_a_silent_laser_stops_the_robot_and_it_goes_on(graph):
         waits = len(commands) == answered[0] if commands else time.monotonic() - said_at[0] < 0.1
         if waits:
             return
-        answered[0], said_at[0] = len(commands), time.monotonic()
+        answered[0] = len(commands)
+        said_at[0] = time.monotonic()
         now_ns[0] += TICK_NS
         ns = now_ns[0]
         clock.publish(Clock(clock=messages.time_msg(ns)))
@@ -378,7 +385,8 @@ def test_a_silent_laser_stops_the_robot_and_it_goes_on(graph):
     free.publish(empty_hall())
     client = ActionClient(graph.node, NavigateToPose, 'navigate_to_pose')
     goal = NavigateToPose.Goal()
-    goal.pose.pose.position.x, goal.pose.pose.orientation.w = 4.0, 1.0
+    goal.pose.pose.position.x = 4.0
+    goal.pose.pose.orientation.w = 1.0
     graph.send_goal(client, goal)
 
     def drives():
@@ -408,7 +416,8 @@ def test_a_robot_that_stands_for_minutes_is_as_sure_of_its_pose_as_before(graph)
     graph.start('localizer', laser_pose='0,0,0', start_x_m=2.0, start_y_m=2.0)
     scan = graph.node.create_publisher(LaserScan, 'scan', qos.STREAM)
     odometry = graph.node.create_publisher(Odometry, 'odom', qos.STREAM)
-    rng, stamp = np.random.default_rng(5), [0]
+    rng = np.random.default_rng(5)
+    stamp = [0]
     here = np.array([2.0, 2.0, 0.0])
 
     def say(T_map_base):
@@ -447,14 +456,16 @@ def test_a_robot_that_stands_for_minutes_is_as_sure_of_its_pose_as_before(graph)
 
 
 def test_a_burst_of_scans_leaves_no_queue_and_what_is_lost_is_counted(graph):
-    poses, doctor = graph.heard('pose', PoseWithCovarianceStamped), Doctor(graph)
+    poses = graph.heard('pose', PoseWithCovarianceStamped)
+    doctor = Doctor(graph)
     graph.start('localizer', laser_pose='0,0,0')
     scan = graph.node.create_publisher(LaserScan, 'scan', qos.STREAM)
     odometry = graph.node.create_publisher(Odometry, 'odom', qos.STREAM)
     graph.until(
         lambda: scan.get_subscription_count() and odometry.get_subscription_count(), 'localizer'
     )
-    period_ns, now = 25_000_000, [10**12]
+    period_ns = 25_000_000
+    now = [10**12]
     message = LaserScan(angle_min=-1.5, angle_increment=0.05, range_min=0.05, range_max=8.0)
     message.ranges = 61 * [3.0]
 
@@ -542,7 +553,8 @@ def test_a_full_disk_leaves_the_old_session_as_it_was(graph, tmp_path):
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_an_exploration_finishes_though_every_node_is_killed_once(graph):
-    robot, maps = Robot(graph), graph.heard('map', OccupancyGrid, qos.LATCHED)
+    robot = Robot(graph)
+    maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
     status = graph.heard('exploration_status', ExplorationStatus, qos.LATCHED)
     names = [*MAPPING, 'navigator', 'explorer']
     for name in names[3:]:

@@ -14,7 +14,9 @@ from thinmap_ros.core import se2
 from thinmap_ros.ros import messages, qos
 
 pytestmark = [pytest.mark.live, pytest.mark.slow, pytest.mark.timeout(400)]
-START, ELSEWHERE, THERE = (2.0, 2.0, 0.0), (5.5, 2.0, 1.0), (3.8, 7.6, -1.2)
+START = (2.0, 2.0, 0.0)
+ELSEWHERE = (5.5, 2.0, 1.0)
+THERE = (3.8, 7.6, -1.2)
 NODES = ('grid_mapper', 'topology_builder', 'localizer')
 
 
@@ -31,7 +33,8 @@ class Robot:
 
     def drive_until(self, condition, what):
         ahead = Twist()
-        ahead.linear.x, ahead.angular.z = 0.25, 0.3
+        ahead.linear.x = 0.25
+        ahead.angular.z = 0.3
 
         def met():
             self.commands.publish(ahead)
@@ -67,7 +70,8 @@ def start_sim(graph, at, subscribers):
 def test_a_robot_finds_itself_in_a_saved_map_and_maps_on_also_when_it_is_carried_off(
     graph, tmp_path
 ):
-    robot, stem = Robot(graph), tmp_path / 'room'
+    robot = Robot(graph)
+    stem = tmp_path / 'room'
     x, y, yaw = START
     for name in NODES:
         start = (

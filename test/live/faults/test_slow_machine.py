@@ -18,11 +18,14 @@ from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live
 MAPPING = ('localizer', 'grid_mapper', 'topology_builder')
-RATE, SCANS_WHILE_HALTED, SCANS_IN_ALL = 8.0, 18, 500
+RATE = 8.0
+SCANS_WHILE_HALTED = 18
+SCANS_IN_ALL = 500
 SCAN_PERIOD_NS = 200_000_000
 # What may wait between the newest scan and the one that a pose is of: the queue of the
 # subscription, and the scans that wait for their odometry.
-QUEUE, WAITING = qos.SENSOR.depth, 20
+QUEUE = qos.SENSOR.depth
+WAITING = 20
 DROPS = ('scan: lost on the way or in a full queue', 'scans without odometry at their time')
 
 
@@ -42,7 +45,8 @@ def no_shared_memory(monkeypatch):
 
 
 def test_old_scans_are_dropped_and_counted_and_the_delay_does_not_grow(no_shared_memory, graph):
-    doctor, scans = Doctor(graph), graph.heard('scan', LaserScan)
+    doctor = Doctor(graph)
+    scans = graph.heard('scan', LaserScan)
     poses = graph.heard('pose', PoseWithCovarianceStamped)
     graphs = graph.heard('local_topology', TopologicalMap)
     start = {'start_x_m': 2.0, 'start_y_m': 2.0, 'start_yaw_rad': 0.9}
@@ -52,7 +56,8 @@ def test_old_scans_are_dropped_and_counted_and_the_delay_does_not_grow(no_shared
     graph.until(
         lambda: len(poses) > 20 and graphs and scans, 'poses and graphs, before it becomes slow'
     )
-    behind, begun = {}, [len(scans), len(scans)]
+    behind = {}
+    begun = [len(scans), len(scans)]
 
     def look():
         """Note how many scans the newest is ahead of a pose, as each pose comes.
@@ -66,7 +71,8 @@ def test_old_scans_are_dropped_and_counted_and_the_delay_does_not_grow(no_shared
         return len(behind)
 
     look()
-    already, first = len(behind), len(scans)
+    already = len(behind)
+    first = len(scans)
     while len(scans) < first + SCANS_IN_ALL:
         process.send_signal(signal.SIGSTOP)
         halted = len(scans) + SCANS_WHILE_HALTED
@@ -82,7 +88,8 @@ def test_old_scans_are_dropped_and_counted_and_the_delay_does_not_grow(no_shared
     graph.until(lambda: len(poses) > enough and len(graphs) > 20, 'it goes on as before')
     assert graph.stop('sim') == 0
     graph.hear_out()
-    sent, located = {ns for ns in stamps(scans) if ns >= stamps(poses)[0]}, set(stamps(poses))
+    sent = {ns for ns in stamps(scans) if ns >= stamps(poses)[0]}
+    located = set(stamps(poses))
     missing = len(sent - located)
 
     def counted():

@@ -131,7 +131,8 @@ def set_to_work(graph, name):
     graph.until(client.server_is_ready, action)
     goal = kind.Goal()
     if name == 'navigator':
-        goal.pose.pose.position.x, goal.pose.pose.orientation.w = 1.2, 1.0
+        goal.pose.pose.position.x = 1.2
+        goal.pose.pose.orientation.w = 1.0
     sent = client.send_goal_async(goal)
     graph.until(sent.done, 'the goal is taken')
 
@@ -179,7 +180,8 @@ def test_a_node_lives_through_them_publishes_no_nan_and_counts_what_it_refused(g
         assert all(math.isfinite(number) for message in said for number in numbers(message)), topic
     # It still works; fresh stamps, as all that was said before may lie ahead of these.
     answers = heard[ANSWERS[name]]
-    before, ns = len(answers), [3 * 10**12]
+    before = len(answers)
+    ns = [3 * 10**12]
 
     def good_again():
         ns[0] += 10**8

@@ -38,7 +38,10 @@ class Candidates:
 
         Patience: looks without it after which it is dropped.
         """
-        self._sightings, self._patience, self._gate, self._gap_m = sightings, patience, gate, gap_m
+        self._sightings = sightings
+        self._patience = patience
+        self._gate = gate
+        self._gap_m = gap_m
         self._all: list[Candidate] = []
         self._looks = 0
 
@@ -69,7 +72,8 @@ class Candidates:
             if mahalanobis(v, S) <= self._gate:
                 candidate.line = v + signs * candidate.line
                 candidate.span.grow(*interval(candidate.line, ends_map))
-                candidate.z, candidate.covariance = z, covariance
+                candidate.z = z
+                candidate.covariance = covariance
                 candidate.sightings += candidate.last_look != self._looks
                 candidate.last_look = self._looks
                 return candidate
@@ -80,6 +84,7 @@ class Candidates:
     def _meeting(self, ends_map: Array, laser_map: Array) -> list[Candidate]:
         if not self._all:
             return []
-        lines, spans = np.array([c.line for c in self._all]), [c.span for c in self._all]
+        lines = np.array([c.line for c in self._all])
+        spans = [c.span for c in self._all]
         near = meeting(lines, spans, ends_map[None], laser_map, self._gap_m)[0]
         return [self._all[i] for i in np.flatnonzero(near)]

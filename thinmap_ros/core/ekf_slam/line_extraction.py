@@ -87,8 +87,10 @@ def extract_lines(scan: Scan, config: LineConfig) -> Lines:
         return no_lines()
     split_m = max(config.line_split_m, _SPLIT_SIGMAS * config.range_sigma_m)
     sigmas = np.array([config.range_sigma_m, config.bearing_sigma_rad, split_m])
-    ranges, angles = scan.ranges_m[beams], scan.angles_rad[beams]
-    x, y = ranges * np.cos(angles), ranges * np.sin(angles)
+    ranges = scan.ranges_m[beams]
+    angles = scan.angles_rad[beams]
+    x = ranges * np.cos(angles)
+    y = ranges * np.sin(angles)
     step = abs(scan.angle_increment_rad)
     fits, count = _extract(x, y, ranges, angles, beams, step, sigmas, config.line_points)
     fits = fits[:count]
@@ -103,14 +105,16 @@ def _in_robot_frame(fits: Array, T_base_laser: Array) -> Lines:
 
     Turned by the mount, r longer by the mount's part along n.
     """
-    r, alpha = fits[:, _R], fits[:, _ALPHA]
+    r = fits[:, _R]
+    alpha = fits[:, _ALPHA]
     normals = np.column_stack([np.cos(alpha), np.sin(alpha)])
     along = np.column_stack([-normals[:, 1], normals[:, 0]])
     feet = r[:, None] * normals
     ends = np.stack([feet + fits[:, [_LOW]] * along, feet + fits[:, [_HIGH]] * along], axis=1)
     alpha_base = alpha + T_base_laser[2]
     # r_base = r + m n(alpha_base), so an error of alpha moves r by m t(alpha_base).
-    c, s = np.cos(alpha_base), np.sin(alpha_base)
+    c = np.cos(alpha_base)
+    s = np.sin(alpha_base)
     r_base = r + T_base_laser[0] * c + T_base_laser[1] * s
     lever = -T_base_laser[0] * s + T_base_laser[1] * c
     rr = fits[:, _RR] + 2.0 * lever * fits[:, _RA] + lever**2 * fits[:, _AA]
@@ -138,10 +142,12 @@ def _extract(
 
     sigmas: range noise m, bearing noise rad, split distance m.
     """
-    fits, fit = np.empty((ranges.size, 10)), np.empty(10)
+    fits = np.empty((ranges.size, 10))
+    fit = np.empty(10)
     parts = np.empty((ranges.size + 2, 2), dtype=np.int64)
     stack = np.empty((ranges.size + 2, 2), dtype=np.int64)
-    count, first = 0, 0
+    count = 0
+    first = 0
     for end in range(1, ranges.size + 1):
         if end < ranges.size and not _apart(x, y, ranges, beams, step, sigmas[0], end):
             continue
@@ -149,7 +155,8 @@ def _extract(
         first = end
         k = 0
         while k < number:
-            a, b = parts[k, 0], parts[k, 1]
+            a = parts[k, 0]
+            b = parts[k, 1]
             # Merge with the parts that follow while one line explains both.
             while k + 1 < number:
                 _fit(x, y, ranges, angles, a, parts[k + 1, 1], sigmas, fit)
@@ -195,24 +202,33 @@ def _split(
 
     Returns how many.
     """
-    count, depth = 0, 1
-    stack[0, 0], stack[0, 1] = first, end
+    count = 0
+    depth = 1
+    stack[0, 0] = first
+    stack[0, 1] = end
     while depth > 0:
         depth -= 1
-        a, b = stack[depth, 0], stack[depth, 1]
-        dx, dy = x[b - 1] - x[a], y[b - 1] - y[a]
+        a = stack[depth, 0]
+        b = stack[depth, 1]
+        dx = x[b - 1] - x[a]
+        dy = y[b - 1] - y[a]
         length = max(math.hypot(dx, dy), 1e-9)
-        worst, at = distance, -1
+        worst = distance
+        at = -1
         for i in range(a + 1, b - 1):
             away = abs(dx * (y[i] - y[a]) - dy * (x[i] - x[a])) / length
             if away > worst:
-                worst, at = away, i
+                worst = away
+                at = i
         if at < 0:
-            parts[count, 0], parts[count, 1] = a, b
+            parts[count, 0] = a
+            parts[count, 1] = b
             count += 1
         else:
-            stack[depth, 0], stack[depth, 1] = at, b
-            stack[depth + 1, 0], stack[depth + 1, 1] = a, at + 1
+            stack[depth, 0] = at
+            stack[depth, 1] = b
+            stack[depth + 1, 0] = a
+            stack[depth + 1, 1] = at + 1
             depth += 2
     return count
 
@@ -232,7 +248,8 @@ def _fit_trimmed(
     """Fit points [a, b) without end points that the line does not explain; returns what is left."""
     for _ in range(4):
         _fit(x, y, ranges, angles, a, b, sigmas, fit)
-        start, stop = a, b
+        start = a
+        stop = b
         while b - a >= fewest and _off(x, y, ranges, angles, a, sigmas, fit) > _TRIM_SIGMAS:
             a += 1
         while b - a >= fewest and _off(x, y, ranges, angles, b - 1, sigmas, fit) > _TRIM_SIGMAS:
@@ -245,7 +262,8 @@ def _fit_trimmed(
 @kernel
 def _variance(rho: float, off: float, sigmas: Array) -> float:
     """Variance of a point across a line whose normal it sees at an angle off."""
-    across, along = sigmas[0] * math.cos(off), sigmas[1] * rho * math.sin(off)
+    across = sigmas[0] * math.cos(off)
+    along = sigmas[1] * rho * math.sin(off)
     return float(across * across + along * along + 1e-8)
 
 
@@ -270,36 +288,63 @@ def _fit(
     """
     chord = math.atan2(y[b - 1] - y[a], x[b - 1] - x[a])
     alpha = chord - 0.5 * math.pi
-    mx, my, total = 0.0, 0.0, 0.0
+    mx = 0.0
+    my = 0.0
+    total = 0.0
     for _ in range(2):
-        mx, my, total = 0.0, 0.0, 0.0
+        mx = 0.0
+        my = 0.0
+        total = 0.0
         for i in range(a, b):
             w = 1.0 / _variance(ranges[i], angles[i] - alpha, sigmas)
-            mx, my, total = mx + w * x[i], my + w * y[i], total + w
-        mx, my = mx / total, my / total
-        xx, xy, yy = 0.0, 0.0, 0.0
+            mx = mx + w * x[i]
+            my = my + w * y[i]
+            total = total + w
+        mx = mx / total
+        my = my / total
+        xx = 0.0
+        xy = 0.0
+        yy = 0.0
         for i in range(a, b):
             w = 1.0 / _variance(ranges[i], angles[i] - alpha, sigmas)
-            dx, dy = x[i] - mx, y[i] - my
-            xx, xy, yy = xx + w * dx * dx, xy + w * dx * dy, yy + w * dy * dy
+            dx = x[i] - mx
+            dy = y[i] - my
+            xx = xx + w * dx * dx
+            xy = xy + w * dx * dy
+            yy = yy + w * dy * dy
         alpha = 0.5 * math.atan2(-2.0 * xy, yy - xx)
-    c, s = math.cos(alpha), math.sin(alpha)
+    c = math.cos(alpha)
+    s = math.sin(alpha)
     r = mx * c + my * s
     if r < 0.0:
-        r, alpha, c, s = -r, alpha + math.pi, -c, -s
+        r = -r
+        alpha = alpha + math.pi
+        c = -c
+        s = -s
     foot = -mx * s + my * c
-    spread, chi2, low, high = 0.0, 0.0, np.inf, -np.inf
+    spread = 0.0
+    chi2 = 0.0
+    low = np.inf
+    high = -np.inf
     for i in range(a, b):
         w = 1.0 / _variance(ranges[i], angles[i] - alpha, sigmas)
-        t, d = -x[i] * s + y[i] * c, x[i] * c + y[i] * s - r
-        spread, chi2 = spread + w * (t - foot) ** 2, chi2 + w * d * d
-        low, high = min(low, t), max(high, t)
+        t = -x[i] * s + y[i] * c
+        d = x[i] * c + y[i] * s - r
+        spread = spread + w * (t - foot) ** 2
+        chi2 = chi2 + w * d * d
+        low = min(low, t)
+        high = max(high, t)
     spread = max(spread, 1e-12)
     # The mean's offset and the direction are independent; turning about the mean shifts r by foot
     # times the turn.
-    fit[_R], fit[_ALPHA], fit[_AA] = r, alpha, 1.0 / spread
-    fit[_RA], fit[_RR] = foot / spread, 1.0 / total + foot * foot / spread
-    fit[_CHI2], fit[_LOW], fit[_HIGH] = chi2 / max(b - a - 2, 1), low, high
+    fit[_R] = r
+    fit[_ALPHA] = alpha
+    fit[_AA] = 1.0 / spread
+    fit[_RA] = foot / spread
+    fit[_RR] = 1.0 / total + foot * foot / spread
+    fit[_CHI2] = chi2 / max(b - a - 2, 1)
+    fit[_LOW] = low
+    fit[_HIGH] = high
     fit[_BOW], fit[_BOW_SIGMA] = _bow(x, y, ranges, angles, a, b, sigmas, fit, foot, spread / total)
 
 
@@ -321,12 +366,16 @@ def _bow(
     middle, spread: mean and variance of the positions t along the line.
     """
     half = max(0.5 * (fit[_HIGH] - fit[_LOW]), 1e-6)
-    c, s = math.cos(fit[_ALPHA]), math.sin(fit[_ALPHA])
-    product, square = 0.0, 0.0
+    c = math.cos(fit[_ALPHA])
+    s = math.sin(fit[_ALPHA])
+    product = 0.0
+    square = 0.0
     for i in range(a, b):
         w = 1.0 / _variance(ranges[i], angles[i] - fit[_ALPHA], sigmas)
-        t, d = -x[i] * s + y[i] * c, x[i] * c + y[i] * s - fit[_R]
+        t = -x[i] * s + y[i] * c
+        d = x[i] * c + y[i] * s - fit[_R]
         shape = ((t - middle) ** 2 - spread) / (half * half)
-        product, square = product + w * d * shape, square + w * shape * shape
+        product = product + w * d * shape
+        square = square + w * shape * shape
     square = max(square, 1e-12)
     return abs(product / square), 1.0 / math.sqrt(square)

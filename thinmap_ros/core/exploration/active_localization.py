@@ -17,7 +17,9 @@ _LIKELY = 0.05  # of the weight of the best
 # A goal stands so long, or until it is reached, or the number of places in question changes.
 _THOUGHT_OVER_S = 4.0
 _CHANGED_S = 1.0  # but for so long at least
-_LOOK_M, _LOOK_RAD = 0.4, 0.4  # a look from elsewhere
+# A look from elsewhere
+_LOOK_M = 0.4
+_LOOK_RAD = 0.4
 
 
 class ActiveSearch:
@@ -34,10 +36,13 @@ class ActiveSearch:
     def __init__(
         self, places: Places, config: GlobalLocalizationConfig, driving: NavigatorConfig
     ) -> None:
-        self._places, self._range_m, self._driving = places, config.usable_range_m, driving
+        self._places = places
+        self._range_m = config.usable_range_m
+        self._driving = driving
         self._navigator = Navigator(driving)
         self._view: Viewpoint | None = None
-        self._starts, self._weights = np.empty((0, 3)), np.empty(0)
+        self._starts = np.empty((0, 3))
+        self._weights = np.empty(0)
         self._looked = np.empty((0, 3))
         self._chosen_of = 0
         self._age_s = math.inf
@@ -77,7 +82,9 @@ class ActiveSearch:
         return command
 
     def _choose(self, T_odom_base: Array) -> None:
-        self._age_s, self._chosen_of, self._view = 0.0, len(self._starts), None
+        self._age_s = 0.0
+        self._chosen_of = len(self._starts)
+        self._view = None
         if len(self._starts):
             self._view = best_viewpoint(
                 self._places,

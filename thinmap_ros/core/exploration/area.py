@@ -12,7 +12,8 @@ _WALL = np.int8(100)
 def inside(points: Array, polygon: Array) -> NDArray[np.bool_]:
     """Which points (N, 2) lie in a polygon (M, 2), by the even-odd rule, (N,)."""
     result = np.zeros(len(points), dtype=np.bool_)
-    x, y = points[:, 0], points[:, 1]
+    x = points[:, 0]
+    y = points[:, 1]
     for (ax, ay), (bx, by) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
         crosses = (ay > y) != (by > y)
         if ay != by:

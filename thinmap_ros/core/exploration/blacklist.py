@@ -34,7 +34,8 @@ class Failures:
         if failure is None:
             failure = _Failure(place, stamp_ns)
             self._failures.append(failure)
-        failure.times, failure.stamp_ns = failure.times + 1, stamp_ns
+        failure.times = failure.times + 1
+        failure.stamp_ns = stamp_ns
 
     def has(self, place: Place) -> bool:
         """Whether something failed at about this place."""

@@ -227,7 +227,8 @@ class Surveyor:
         what is left of it gets a stand-in with a place right at it; the border of a stand-in is
         exhausted.
         """
-        memory, node_id = self._memory, candidate.track.node_id
+        memory = self._memory
+        node_id = candidate.track.node_id
         middle = self.border_of(candidate)
         if (
             len(candidate.cells)
@@ -252,7 +253,8 @@ class Surveyor:
 
     def _look_around(self, T_map_base: Array) -> None:
         self._renew_standing()
-        free, standing = self.borders.free, self._standing
+        free = self.borders.free
+        standing = self._standing
         xy = (float(T_map_base[0]), float(T_map_base[1]))
         trail = self.trail.cells(self.frame, free.shape)
         ways = let_out(standing, free, self.frame, xy, _ESCAPE_M, trail)
@@ -265,9 +267,12 @@ class Surveyor:
 
         Both are found anew in the part of the map that has changed.
         """
-        borders, radius = self.borders, self.config.robot_radius_m
+        borders = self.borders
+        radius = self.config.robot_radius_m
         resolution = borders.frame.resolution
-        part, borders.changed, self.frame = borders.changed, NOTHING, borders.frame
+        part = borders.changed
+        borders.changed = NOTHING
+        self.frame = borders.frame
         if part is None:
             self._standing = standing_places(borders.free, radius, resolution)
             self.maybe = standing_places(borders.passable, radius, resolution)
@@ -288,7 +293,8 @@ class Surveyor:
             return np.full(len(cells), -1, dtype=np.int64)
         nodes = self.frame.cells_of(np.array([_place(self.tracker.tracks[int(i)]) for i in ids]))
         within = are_near(self.reached, nodes, _NEAR_VISIT_M / self.frame.resolution)
-        ids, nodes = ids[within], nodes[within]
+        ids = ids[within]
+        nodes = nodes[within]
         index = self.borders.owners(cells, nodes, self.config.attach_m)
         return np.where(index < 0, -1, ids[index]) if ids.size else index
 
@@ -331,7 +337,8 @@ class Surveyor:
     def _far_place_for(self, cells: Cells, range_m: float) -> Array | None:
         if self.config.mode == 'paper' or self._is_to_be_looked_at_closer(self._middle(cells)):
             return None
-        depth, reach = self.config.view_depth_m, range_m - _RIM_M
+        depth = self.config.view_depth_m
+        reach = range_m - _RIM_M
         return self.borders.place_to_view(cells, self.reached, self.ways, reach, depth)
 
     def still_shows(self, candidate: Candidate, goal: Array, range_m: float) -> bool:

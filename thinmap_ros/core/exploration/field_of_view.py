@@ -52,10 +52,17 @@ def _box(
     left = bottom = right = top = 0.0
     for i in range(ranges.size):
         if (ranges[i] >= limits[0] and ranges[i] > 0.0) or ranges[i] >= limits[1]:
-            reach, angle = min(ranges[i], limits[1]), first + step * i + laser[2]
-            x, y = reach * math.cos(angle), reach * math.sin(angle)
-            left, right, bottom, top = min(left, x), max(right, x), min(bottom, y), max(top, y)
+            reach = min(ranges[i], limits[1])
+            angle = first + step * i + laser[2]
+            x = reach * math.cos(angle)
+            y = reach * math.sin(angle)
+            left = min(left, x)
+            right = max(right, x)
+            bottom = min(bottom, y)
+            top = max(top, y)
     box = np.empty((2, 2))
-    box[0, 0], box[0, 1] = laser[0] + left - _RIM_M, laser[1] + bottom - _RIM_M
-    box[1, 0], box[1, 1] = laser[0] + right + _RIM_M, laser[1] + top + _RIM_M
+    box[0, 0] = laser[0] + left - _RIM_M
+    box[0, 1] = laser[1] + bottom - _RIM_M
+    box[1, 0] = laser[0] + right + _RIM_M
+    box[1, 1] = laser[1] + top + _RIM_M
     return box

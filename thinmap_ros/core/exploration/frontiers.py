@@ -79,7 +79,8 @@ class OpenBorders:
         origin_x, origin_y, resolution = state['frame'].tolist()
         looks = state['looks']
         rows, cols = looks.shape
-        borders.frame, borders._looks = GridFrame(origin_x, origin_y, resolution), looks
+        borders.frame = GridFrame(origin_x, origin_y, resolution)
+        borders._looks = looks
         borders.free, borders.mask = (np.zeros((rows, cols), dtype=np.bool_) for _ in range(2))
         borders.passable = np.ones((rows, cols), dtype=np.bool_)
         return borders
@@ -114,7 +115,8 @@ class OpenBorders:
         changed, more = _renew(
             part.cells, free, inner, offset, self.free, self.passable, self.mask, self._looks
         )
-        self.revision, self.known_cells = self.revision + changed, self.known_cells + more
+        self.revision = self.revision + changed
+        self.known_cells = self.known_cells + more
 
     def examine(self, xy: tuple[float, float], reach_m: float, faces: NDArray[np.float64]) -> None:
         """Count a close look from a point, m.
@@ -177,7 +179,8 @@ class OpenBorders:
         border is looked.
         """
         resolution = self.frame.resolution
-        depth, reach = round(depth_m / resolution), reach_m / resolution
+        depth = round(depth_m / resolution)
+        reach = reach_m / resolution
         return self._centre_of(
             place_for(self.free, self.passable, cells, allowed, ways, depth, reach)
         )
@@ -188,7 +191,8 @@ class OpenBorders:
         See viewpoints.shows_enough.
         """
         resolution = self.frame.resolution
-        depth, reach = round(depth_m / resolution), reach_m / resolution
+        depth = round(depth_m / resolution)
+        reach = reach_m / resolution
         cell = self._cell_of((float(place[0]), float(place[1])))
         return shows_enough(self.free, self.passable, cells, cell, depth, reach)
 
@@ -226,7 +230,9 @@ class OpenBorders:
         """Point (2,), m, in the middle of a cell (row, col)."""
         if cell is None:
             return None
-        x, y, resolution = self.frame.origin_x, self.frame.origin_y, self.frame.resolution
+        x = self.frame.origin_x
+        y = self.frame.origin_y
+        resolution = self.frame.resolution
         return np.array([(cell[1] + 0.5) * resolution + x, (cell[0] + 0.5) * resolution + y])
 
     def _fit(self, patch: GridPatch) -> tuple[int, int]:
@@ -252,9 +258,12 @@ class OpenBorders:
             )
             self.free = np.pad(self.free, more)
             self.passable = np.pad(self.passable, more, constant_values=True)
-            self.mask, self._looks = np.pad(self.mask, more), np.pad(self._looks, more)
-            self.frame, self.changed = self.frame.shifted(-more[0][0], -more[1][0]), None
-            row, col = row + more[0][0], col + more[1][0]
+            self.mask = np.pad(self.mask, more)
+            self._looks = np.pad(self._looks, more)
+            self.frame = self.frame.shifted(-more[0][0], -more[1][0])
+            self.changed = None
+            row = row + more[0][0]
+            col = col + more[1][0]
         return row, col
 
 
@@ -264,7 +273,8 @@ def _both(a: Part, b: Part) -> Part:
 
 def _part(patch: GridPatch, box: Array) -> tuple[slice, slice]:
     """Rows and columns of a map that lie in a box."""
-    frame, (rows, cols) = patch.frame, patch.shape
+    frame = patch.frame
+    (rows, cols) = patch.shape
     (left, top), (right, bottom) = (
         (
             math.floor((x - frame.origin_x) / frame.resolution),
@@ -272,7 +282,8 @@ def _part(patch: GridPatch, box: Array) -> tuple[slice, slice]:
         )
         for x, y in box.tolist()
     )
-    top, left = min(max(top, 0), rows), min(max(left, 0), cols)
+    top = min(max(top, 0), rows)
+    left = min(max(left, 0), cols)
     return slice(top, max(min(bottom + 1, rows), top)), slice(left, max(min(right + 1, cols), left))
 
 
@@ -296,21 +307,25 @@ def _renew(
     what lies outside of the part is unknown.
     """
     rows, cols = cells.shape
-    changed, more = False, 0
+    changed = False
+    more = 0
     for row in range(inner[0], inner[1]):
         for col in range(inner[2], inner[3]):
-            r, c = row + offset[0], col + offset[1]
+            r = row + offset[0]
+            c = col + offset[1]
             border = False
             if known[row, col] and looks[r, c] < _LOOKS:
                 for side in range(4):
-                    y, x = row + (side == 0) - (side == 1), col + (side == 2) - (side == 3)
+                    y = row + (side == 0) - (side == 1)
+                    x = col + (side == 2) - (side == 3)
                     if not (0 <= y < rows and 0 <= x < cols):
                         border = True
                     elif not known[y, x]:
                         border |= cells[y, x] < 0 or FREE_AT_MOST < cells[y, x] < OCCUPIED_AT_LEAST
             changed |= known[row, col] != free[r, c] or border != mask[r, c]
             more += int(known[row, col]) - int(free[r, c])
-            free[r, c], mask[r, c] = known[row, col], border
+            free[r, c] = known[row, col]
+            mask[r, c] = border
             passable[r, c] = cells[row, col] < OCCUPIED_AT_LEAST
     return changed, more
 
@@ -334,7 +349,9 @@ def _parts(shape: tuple[int, int], cells: Cells) -> tuple[NDArray[np.int64], NDA
     for first in range(places.size):
         if numbers[first] >= 0:
             continue
-        numbers[first], stack[0], count = parts, first, 1
+        numbers[first] = parts
+        stack[0] = first
+        count = 1
         while count > 0:
             count -= 1
             here = places[stack[count]]
@@ -342,7 +359,8 @@ def _parts(shape: tuple[int, int], cells: Cells) -> tuple[NDArray[np.int64], NDA
             for to in (-cols - 1, -cols, -cols + 1, -1, 1, cols - 1, cols, cols + 1):
                 i = at[here + to] - 1
                 if i >= 0 and numbers[i] < 0:
-                    numbers[i], stack[count] = parts, i
+                    numbers[i] = parts
+                    stack[count] = i
                     count += 1
         parts += 1
     return numbers, sizes[:parts].copy()
@@ -374,7 +392,8 @@ def _examine(
             if turn > faces[1] - faces[0]:
                 continue
             for side in range(4):
-                ur, uc = r + (side == 0) - (side == 1), c + (side == 2) - (side == 3)
+                ur = r + (side == 0) - (side == 1)
+                uc = c + (side == 2) - (side == 3)
                 inside = 0 <= ur < rows and 0 <= uc < cols
                 if not inside or free[ur, uc] or math.hypot(ur - row, uc - col) < away:
                     continue
@@ -383,7 +402,8 @@ def _examine(
                 if _sees_up_to(free, row, col, ur, uc):
                     looks[r, c] = min(looks[r, c] + 1, _LOOKS)
                     if looks[r, c] == _LOOKS:
-                        mask[r, c], exhausted = False, True
+                        mask[r, c] = False
+                        exhausted = True
                     break
     return exhausted
 
@@ -410,5 +430,6 @@ def _owners(free: Mask, cells: Cells, nodes: Cells, reach: float) -> Cells:
             if away < best and line_is_clear(
                 free, nodes[j, 0], nodes[j, 1], cells[i, 0], cells[i, 1]
             ):
-                best, owners[i] = away, j
+                best = away
+                owners[i] = j
     return owners

@@ -23,15 +23,19 @@ _SPACING_M = 0.6  # of the viewpoints that are compared
 _BEARINGS = 24
 # Ranges that differ by more than this, and by this share, tell two places apart; as many as this
 # share do so surely.
-_DIFFERENT_M, _DIFFERENT_SHARE, _ENOUGH = 0.4, 0.1, 0.25
+_DIFFERENT_M = 0.4
+_DIFFERENT_SHARE = 0.1
+_ENOUGH = 0.25
 _LEAST_GAIN = 0.05
 _CONFIRMED_M = 5.0  # of way, where one place only is left: it has then been seen from enough sides
 _NEAREST_M = 0.5  # nearer than this only a turn shows new things
 _WAY_M = 2.0  # so much way costs half of what is gained
 # Places this near to each other are one that is not known closely: nothing has to tell them apart.
-_SAME_M, _SAME_RAD = 1.0, 0.35
+_SAME_M = 1.0
+_SAME_RAD = 0.35
 # Who has looked from this near, and turned no more than this away, has seen it.
-_LOOKED_M, _LOOKED_RAD = 0.8, 0.8
+_LOOKED_M = 0.8
+_LOOKED_RAD = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,10 +142,12 @@ def _common_states(
     """
     result = np.full((count, count), FREE, dtype=np.uint8)
     for h in range(len(starts)):
-        c, s = math.cos(starts[h, 2]), math.sin(starts[h, 2])
+        c = math.cos(starts[h, 2])
+        s = math.sin(starts[h, 2])
         for i in range(count):
             for j in range(count):
-                x, y = corner[0] + (j + 0.5) * resolution, corner[1] + (i + 0.5) * resolution
+                x = corner[0] + (j + 0.5) * resolution
+                y = corner[1] + (i + 0.5) * resolution
                 col = int(math.floor((starts[h, 0] + c * x - s * y - origin[0]) / resolution))
                 row = int(math.floor((starts[h, 1] + s * x + c * y - origin[1]) / resolution))
                 inside = row >= 0 and col >= 0 and row < states.shape[0] and col < states.shape[1]
@@ -158,7 +164,8 @@ def _in_reach(
 
     Where it is comes first.
     """
-    resolution, xy = patch.frame.resolution, (float(T_odom_base[0]), float(T_odom_base[1]))
+    resolution = patch.frame.resolution
+    xy = (float(T_odom_base[0]), float(T_odom_base[1]))
     standing = standing_places(patch.free, driving.robot_radius_m, resolution)
     ways = let_out(standing, patch.free, patch.frame, xy, driving.escape_m)
     middle = patch.shape[0] // 2, patch.shape[1] // 2
@@ -166,7 +173,8 @@ def _in_reach(
     near_by = np.argwhere(standing & (metres >= _NEAREST_M) & np.isfinite(metres))
     step = max(1, round(_SPACING_M / resolution))
     cells = near_by[((near_by - middle) % step == 0).all(axis=1)]
-    at, far = patch.frame.centres_of(cells), metres[cells[:, 0], cells[:, 1]]
+    at = patch.frame.centres_of(cells)
+    far = metres[cells[:, 0], cells[:, 1]]
     return np.concatenate([T_odom_base[None, :2], at]), np.concatenate([[0.0], far])
 
 
@@ -177,14 +185,18 @@ def _gains(
 
     Points and bearings are of the odometry's frame.
     """
-    resolution, origin = places.frame.resolution, (places.frame.origin_x, places.frame.origin_y)
+    resolution = places.frame.resolution
+    origin = (places.frame.origin_x, places.frame.origin_y)
     views = np.stack([(se2.transform_points(T, at) - origin) / resolution for T in starts])
     ranges = _ranges(places.states, views, starts[:, 2], range_m / resolution) * resolution
-    gains, total, towards = np.zeros(len(at)), 0.0, np.zeros(len(at), dtype=np.complex128)
+    gains = np.zeros(len(at))
+    total = 0.0
+    towards = np.zeros(len(at), dtype=np.complex128)
     unit = np.exp(2j * np.pi * np.arange(_BEARINGS) / _BEARINGS)
     for i in range(len(starts)):
         for j in range(i):
-            nearer, farther = np.minimum(ranges[i], ranges[j]), np.maximum(ranges[i], ranges[j])
+            nearer = np.minimum(ranges[i], ranges[j])
+            farther = np.maximum(ranges[i], ranges[j])
             # Not where either is unknown.
             differs = farther - nearer > _DIFFERENT_M + _DIFFERENT_SHARE * nearer
             pair = float(weights[i] * weights[j])

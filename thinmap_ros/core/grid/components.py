@@ -43,14 +43,17 @@ def _runs(cells: Mask) -> tuple[Cells, Cells, Cells, int]:
     count = 0
     for row in range(rows):
         first[row] = count
-        was, line = False, cells[row]
+        was = False
+        line = cells[row]
         for col in range(cols):
             if line[col] == was:
                 continue
             if was:
                 runs[count - 1, 2] = col
             else:
-                runs[count, 0], runs[count, 1], runs[count, 2] = row, col, cols
+                runs[count, 0] = row
+                runs[count, 1] = col
+                runs[count, 2] = cols
                 count += 1
             was = not was
     first[rows] = count
@@ -62,10 +65,12 @@ def _runs(cells: Mask) -> tuple[Cells, Cells, Cells, int]:
                 above += 1
             other = above
             while other < first[row] and runs[other, 1] <= runs[k, 2]:
-                a, b = _root(owner, k), _root(owner, other)
+                a = _root(owner, k)
+                b = _root(owner, other)
                 owner[max(a, b)] = min(a, b)
                 other += 1
-    parts, number = np.empty(count, dtype=np.int64), 0
+    parts = np.empty(count, dtype=np.int64)
+    number = 0
     for k in range(count):
         root = _root(owner, k)
         if root == k:
@@ -91,7 +96,8 @@ def _root(owner: Cells, k: int) -> int:
 @kernel
 def _label(cells: Mask) -> tuple[NDArray[np.int32], Cells]:
     runs, _, parts, count = _runs(cells)
-    numbers, sizes = np.zeros(cells.shape, dtype=np.int32), np.zeros(count + 1, dtype=np.int64)
+    numbers = np.zeros(cells.shape, dtype=np.int32)
+    sizes = np.zeros(count + 1, dtype=np.int64)
     for k in range(parts.size):
         row = numbers[runs[k, 0]]
         for col in range(runs[k, 1], runs[k, 2]):

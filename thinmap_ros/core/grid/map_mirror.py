@@ -57,7 +57,8 @@ class MapMirror:
             ((before[0], after[0]), (before[1], after[1])),
             constant_values=UNKNOWN,
         )
-        row, col = row + before[0], col + before[1]
+        row = row + before[0]
+        col = col + before[1]
         cells[row : row + rows, col : col + cols] = window.cells
         self.patch = GridPatch(self.patch.frame.shifted(-before[0], -before[1]), cells)
         return self.patch

@@ -53,10 +53,12 @@ class Picture:
         if bounds is None or bounds == self._bounds:
             return
         cells = np.full((bounds[2] - bounds[0], bounds[3] - bounds[1]), UNKNOWN, dtype=np.int8)
-        row, col = self._bounds[0] - bounds[0], self._bounds[1] - bounds[1]
+        row = self._bounds[0] - bounds[0]
+        col = self._bounds[1] - bounds[1]
         if self._cells.size:
             cells[row : row + self._cells.shape[0], col : col + self._cells.shape[1]] = self._cells
-        self._cells, self._bounds = cells, bounds
+        self._cells = cells
+        self._bounds = bounds
 
     def _refresh(self, tiles: TileStore, row: int, col: int, end_row: int, end_col: int) -> None:
         if end_row <= row or end_col <= col:
@@ -66,7 +68,8 @@ class Picture:
         shown = self._percent[odds.astype(np.intp) + self._percent.size // 2]
         self._cells[row - top : end_row - top, col - left : end_col - left] = shown
         known = shown != UNKNOWN
-        rows, cols = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
+        rows = np.flatnonzero(known.any(axis=1))
+        cols = np.flatnonzero(known.any(axis=0))
         if rows.size:
             # What is known once stays so: the rectangle only grows.
             found = (

@@ -29,7 +29,8 @@ def usual_share(
     walls round empty rooms explain nearly all; a map in which there are legs of chairs, and edges
     wherever somebody went by, a good deal less.
     """
-    counts, asked = 0.0, 0.0
+    counts = 0.0
+    asked = 0.0
     for _ in range(_TRIALS):
         T = random_pose(places, rng)
         scan = made_up_scan(places, T, like)

@@ -28,17 +28,25 @@ __all__ = ['GlobalLocalization', 'GlobalLocalizationConfig', 'Hypothesis', 'Resu
 
 # Looks from about the same place meet the same errors of the map; they are independent after so
 # much motion.
-_NEW_WAY_M, _NEW_TURN_RAD = 0.5, 0.5
+_NEW_WAY_M = 0.5
+_NEW_TURN_RAD = 0.5
 # Independent looks that a place must have explained: more for each e-fold of places that looked
 # alike, and for each look before it turned up. A look counts the less, the more it leaves
 # unexplained of what it should explain in this map, and nothing from a share on: so many times what
 # the right one leaves unexplained there (no less than the least, as few scans were made in the map;
 # no more than the most), and more in rough maps, which draw things in part.
-_SURE_LOOKS, _SURE_LOOKS_CROWD, _SURE_LOOKS_LATE = 1.0, 0.75, 2.0
-_WORTHLESS_TIMES, _LEAST_WORTHLESS, _MOST_WORTHLESS, _WORTHLESS_ROUGH = 10.0, 0.0075, 0.03, 0.5
+_SURE_LOOKS = 1.0
+_SURE_LOOKS_CROWD = 0.75
+_SURE_LOOKS_LATE = 2.0
+_WORTHLESS_TIMES = 10.0
+_LEAST_WORTHLESS = 0.0075
+_MOST_WORTHLESS = 0.03
+_WORTHLESS_ROUGH = 0.5
 # After so many independent looks, a place that explains must have lasted for this share of them,
 # but not for ever.
-_MANY_LOOKS, _LASTING_SHARE, _LASTING_LOOKS = 16.0, 0.4, 20.0
+_MANY_LOOKS = 16.0
+_LASTING_SHARE = 0.4
+_LASTING_LOOKS = 20.0
 _VIEWS = 6
 _FRESH_SHARE = 0.2  # of the samples that are drawn anew all over the map while the search is on
 _FRESH_BEST = 100
@@ -49,10 +57,12 @@ _STANDING_NOISE = (0.01, 0.005)  # m, rad: samples do not fall together
 # A search that looked at all of the map and did not find the right place: this often. So who turns
 # up late is unlikely, but what one search misses the next ones may miss for the same reason: so
 # often they all do.
-_LOG_MISSED, _LEAST_LOG_PRIOR = math.log(0.3), math.log(0.05)
+_LOG_MISSED = math.log(0.3)
+_LEAST_LOG_PRIOR = math.log(0.05)
 _TRUST_FROM = 0.6  # share of the beams that must be explained for that
 # Looks: once all places are known, the map is searched less often.
-_FIRST_SEARCHES, _LATER_EVERY = 6, 4.0
+_FIRST_SEARCHES = 6
+_LATER_EVERY = 4.0
 
 
 class State(IntEnum):
@@ -186,7 +196,8 @@ class GlobalLocalization:
         if self._T_look is None:
             return 1.0
         motion = se2.between(self._T_look, T_odom_base)
-        way, turn = math.hypot(motion[0], motion[1]), abs(float(motion[2]))
+        way = math.hypot(motion[0], motion[1])
+        turn = abs(float(motion[2]))
         if way < self.config.look_m and turn < self.config.look_rad:
             return 0.0
         return min(1.0, way / _NEW_WAY_M + turn / _NEW_TURN_RAD)
@@ -243,7 +254,8 @@ class GlobalLocalization:
         if self._T_look is None:
             return
         motion = se2.between(self._T_look, T_odom_base)
-        way, turn = math.hypot(motion[0], motion[1]), abs(float(motion[2]))
+        way = math.hypot(motion[0], motion[1])
+        turn = abs(float(motion[2]))
         self._way_m += way
         noise = self.config.odometry_noise
         spread = (noise * way + _STANDING_NOISE[0], noise * (way + turn) + _STANDING_NOISE[1])
@@ -262,7 +274,9 @@ class GlobalLocalization:
             counts, silent = judged_before(
                 judge, self._views, poses, T_odom_base, self.config.odometry_noise
             )
-            new, missed, beams = slice(len(self._known), None), np.zeros(len(poses)), 0.0
+            new = slice(len(self._known), None)
+            missed = np.zeros(len(poses))
+            beams = 0.0
             for k, view in enumerate(self._views):
                 missed += missed_beams((counts[k], silent[k]), len(view.seen.ranges_m))
                 beams += len(view.seen.ranges_m)
@@ -314,7 +328,8 @@ class GlobalLocalization:
         if self._convinced < self.config.sure_looks:
             return False
         best = self._known.best()
-        age, missing = float(self._known.ages[best]), 1.0 - float(self._fits[best])
+        age = float(self._known.ages[best])
+        missing = 1.0 - float(self._fits[best])
         rough = 1.0 - self._usual
         varies = min(max(_WORTHLESS_TIMES * rough, _LEAST_WORTHLESS), _MOST_WORTHLESS)
         needed = _SURE_LOOKS + _SURE_LOOKS_CROWD * math.log(self._crowd)
@@ -325,7 +340,8 @@ class GlobalLocalization:
         return age * (1.0 - missing / (varies + _WORTHLESS_ROUGH * rough)) >= needed
 
     def _speaks_for_one(self) -> bool:
-        known, config = self._known, self.config
+        known = self._known
+        config = self.config
         if not len(known):
             return False
         best = known.best()
@@ -355,7 +371,9 @@ class GlobalLocalization:
         if not len(known):
             return Result(State.SEARCHING, 'the scans show too little to tell places apart', ())
         motion = np.zeros(3) if self._T_look is None else se2.between(self._T_look, T_odom_base)
-        poses, weights, shares = moved(known.poses, motion), known.weights, known.shares_explained
+        poses = moved(known.poses, motion)
+        weights = known.weights
+        shares = known.shares_explained
         order = np.lexsort((-shares, -known.log_weights))
         hypotheses = tuple(
             Hypothesis(poses[k], known.covariances[k], float(weights[k]), float(shares[k]))

@@ -13,17 +13,20 @@ from thinmap_ros.core.se2 import Array
 
 # Shares of the beams that fall to either side at edges: by chance, and, as the cells of the map
 # lie, always.
-_EDGE_SHARE, _LASTING_SHARE = 0.05, 0.01
+_EDGE_SHARE = 0.05
+_LASTING_SHARE = 0.01
 _SIGMAS = 3.0
 # Now and then a whole look tells nonsense (someone stands in the way, a door has moved): no look
 # settles the matter.
 _MOST_A_LOOK = 14.0  # beams
 _LEAST_LOG_WEIGHT = -14.0
 _MOST = 400
-_SAME_M, _SAME_RAD = 0.3, 0.15
+_SAME_M = 0.3
+_SAME_RAD = 0.15
 _LEAST_ASKED = 0.6  # share of the beams
 # Of those this near to each other one is kept: the place may be anywhere between.
-_NEW_SIGMA_M, _NEW_SIGMA_RAD = 0.5 * _SAME_M, 0.5 * _SAME_RAD
+_NEW_SIGMA_M = 0.5 * _SAME_M
+_NEW_SIGMA_RAD = 0.5 * _SAME_RAD
 _MEMORY = 0.85  # of what was explained, from one independent look to the next
 
 
@@ -68,8 +71,10 @@ class Hypotheses:
     @staticmethod
     def none() -> 'Hypotheses':
         """No hypothesis."""
-        empty, covariances = np.empty(0), np.empty((0, 3, 3))
-        poses, samples = np.empty((0, 3)), np.empty((0, 3))
+        empty = np.empty(0)
+        covariances = np.empty((0, 3, 3))
+        poses = np.empty((0, 3))
+        samples = np.empty((0, 3))
         owners = np.empty(0, dtype=np.int64)
         return Hypotheses(
             poses, empty, empty, empty, covariances, empty, empty, empty, empty, samples, owners
@@ -177,7 +182,8 @@ class Hypotheses:
             setattr(self, name, getattr(self, name)[kept])
         owners = renumbered[self.owners]
         order = np.argsort(owners, kind='stable')[int((owners < 0).sum()) :]
-        self.samples, self.owners = self.samples[order], owners[order]
+        self.samples = self.samples[order]
+        self.owners = owners[order]
 
     def some_samples(self, total: int) -> Array:
         """Some of the samples of each, as many for all: (H, K, 3).
@@ -247,17 +253,21 @@ def _moments(
     Those without samples keep theirs.
     """
     for h in range(len(poses)):
-        low, high = bounds[h], bounds[h + 1]
+        low = bounds[h]
+        high = bounds[h + 1]
         if low == high:
             continue
         top = logs[low:high].max()
-        total, squares = 0.0, 0.0
-        mean, second = np.zeros(3), np.zeros((3, 3))
+        total = 0.0
+        squares = 0.0
+        mean = np.zeros(3)
+        second = np.zeros((3, 3))
         for k in range(low, high):
             weight = math.exp(logs[k] - top)
             turn = math.pi - (math.pi - (samples[k, 2] - poses[h, 2])) % (2.0 * math.pi)
             off = np.array([samples[k, 0] - poses[h, 0], samples[k, 1] - poses[h, 1], turn])
-            total, squares = total + weight, squares + weight * weight
+            total = total + weight
+            squares = squares + weight * weight
             for i in range(3):
                 mean[i] += weight * off[i]
                 for j in range(3):
@@ -287,7 +297,8 @@ def _resampled(
     result = np.empty((quotas.sum(), 3))
     at = 0
     for h in range(len(poses)):
-        low, high = bounds[h], bounds[h + 1]
+        low = bounds[h]
+        high = bounds[h + 1]
         if low == high:
             for _ in range(quotas[h]):
                 for i in range(3):
@@ -296,10 +307,12 @@ def _resampled(
                         result[at, i] += spreads[h, i, j] * normal[at, j]
                 at += 1
             continue
-        top, total = logs[low:high].max(), 0.0
+        top = logs[low:high].max()
+        total = 0.0
         for k in range(low, high):
             total += math.exp(logs[k] - top)
-        k, sum_so_far = low, math.exp(logs[low] - top)
+        k = low
+        sum_so_far = math.exp(logs[low] - top)
         for n in range(quotas[h]):
             mark = (n + starts[h]) / quotas[h] * total
             while sum_so_far < mark and k < high - 1:

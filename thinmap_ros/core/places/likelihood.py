@@ -58,13 +58,15 @@ class Judge:
     def log_likelihoods(self, poses: Array, seen: Observation) -> Array:
         """Log likelihood of beams and nodes at poses (N, 3), up to a constant, (N,)."""
         ends = seen.ends[seen.met]
-        near, resolution = self._places.near, self._places.frame.resolution
+        near = self._places.near
+        resolution = self._places.frame.resolution
         scores = matching.range_scores(poses, ends, near, self._origin, resolution, self._log_table)
         return np.asarray(scores + self.node_log_ratios(poses, seen))
 
     def node_log_ratios(self, poses: Array, seen: Observation) -> Array:
         """Log likelihood ratio (N,) of observed nodes at poses (N, 3), against a pose anywhere."""
-        places, model = self._places, self._nodes
+        places = self._places
+        model = self._nodes
         ratios = matching.node_scores(
             poses,
             seen.nodes,
@@ -142,7 +144,8 @@ class Judge:
         expected: Array,
         held: Array,
     ) -> tuple[Array, Array]:
-        near, resolution = self._places.near, self._places.frame.resolution
+        near = self._places.near
+        resolution = self._places.frame.resolution
         ends = seen.ends[seen.met]
         return matching.refine(
             poses, ends, near, self._origin, resolution, table, steps, _ROUNDS, expected, held

@@ -18,10 +18,13 @@ from thinmap_ros.core.places.place_database import (
 from thinmap_ros.core.se2 import Array
 
 _ASIDE_M = 0.12  # a beam is stopped only where those beside it, this far off, are stopped too
-_NO, _YES, _SAYS_NOTHING = 0, 1, 2
+_NO = 0
+_YES = 1
+_SAYS_NOTHING = 2
 # Nodes lie within 13,000 units of their block; squares of differences from what is farther off than
 # this do not fit.
-_AFAR, _NOWHERE = 16_000.0, 2**31 - 1
+_AFAR = 16_000.0
+_NOWHERE = 2**31 - 1
 _SIGMAS = 5.0  # beyond so many sigma nodes do not agree at all
 _STEPS = 2048  # of squared distance up to there
 
@@ -69,8 +72,10 @@ def _range_score(
     resolution: float,
     table: Array,
 ) -> float:
-    c, s = math.cos(theta) / resolution, math.sin(theta) / resolution
-    at_x, at_y = x / resolution, y / resolution
+    c = math.cos(theta) / resolution
+    s = math.sin(theta) / resolution
+    at_x = x / resolution
+    at_y = y / resolution
     total = 0.0
     for j in range(len(ends)):
         col = int(math.floor(at_x + c * ends[j, 0] - s * ends[j, 1]))
@@ -111,8 +116,10 @@ def node_scores(
         inside = 0 <= row < blocks.shape[0] and 0 <= col < blocks.shape[1]
         block = blocks[row, col] if inside else np.int32(-1)
         low, high = (first[block], first[block + 1]) if block >= 0 else (np.int32(0), np.int32(0))
-        all_x, all_y = in_sight[0][low:high], in_sight[1][low:high]
-        c, s = math.cos(poses[i, 2]) / SIGHT_UNIT_M, math.sin(poses[i, 2]) / SIGHT_UNIT_M
+        all_x = in_sight[0][low:high]
+        all_y = in_sight[1][low:high]
+        c = math.cos(poses[i, 2]) / SIGHT_UNIT_M
+        s = math.sin(poses[i, 2]) / SIGHT_UNIT_M
         from_x = (poses[i, 0] - origin[0] - col * block_m) / SIGHT_UNIT_M
         from_y = (poses[i, 1] - origin[1] - row * block_m) / SIGHT_UNIT_M
         for j in range(len(seen)):
@@ -142,10 +149,12 @@ def _nearest_squared(all_x: Short, all_y: Short, x: float, y: float) -> float:
     A huge one where there is none.
     In numbers of four bytes throughout, so that the compiler takes eight points at a time.
     """
-    at_x, at_y = np.int32(min(max(x, -_AFAR), _AFAR)), np.int32(min(max(y, -_AFAR), _AFAR))
+    at_x = np.int32(min(max(x, -_AFAR), _AFAR))
+    at_y = np.int32(min(max(y, -_AFAR), _AFAR))
     nearest = np.int32(_NOWHERE)
     for k in range(len(all_x)):
-        d_x, d_y = np.int32(np.int32(all_x[k]) - at_x), np.int32(np.int32(all_y[k]) - at_y)
+        d_x = np.int32(np.int32(all_x[k]) - at_x)
+        d_y = np.int32(np.int32(all_y[k]) - at_y)
         nearest = min(nearest, np.int32(np.int32(d_x * d_x) + np.int32(d_y * d_y)))
     return float(nearest)
 
@@ -172,9 +181,12 @@ def refine(
     information matrices (N, 3, 3).
     """
     rows, cols = near.shape
-    result, scores = poses.copy(), np.zeros(len(poses))
+    result = poses.copy()
+    scores = np.zeros(len(poses))
     for i in range(len(poses)):
-        x, y, theta = poses[i, 0] - origin[0], poses[i, 1] - origin[1], poses[i, 2]
+        x = poses[i, 0] - origin[0]
+        y = poses[i, 1] - origin[1]
+        theta = poses[i, 2]
         mid = (expected[i, 0] - origin[0], expected[i, 1] - origin[1], expected[i, 2])
         best = _range_score(x, y, theta, ends, near, rows, cols, resolution, table)
         best -= _unlikely(x - mid[0], y - mid[1], theta - mid[2], information[i])
@@ -193,15 +205,18 @@ def refine(
                         x + d_x - mid[0], y + d_y - mid[1], theta + turn - mid[2], information[i]
                     )
                     if score > best + 1e-9:
-                        best, move = score, k
+                        best = score
+                        move = k
                 if move < 0:
                     break
                 sign = 1.0 if move % 2 else -1.0
                 x += sign * steps[step, 0] if move < 2 else 0.0
                 y += sign * steps[step, 0] if 2 <= move < 4 else 0.0
                 theta += sign * steps[step, 1] if move >= 4 else 0.0
-        result[i, 0], result[i, 1] = x + origin[0], y + origin[1]
-        result[i, 2], scores[i] = theta, best
+        result[i, 0] = x + origin[0]
+        result[i, 1] = y + origin[1]
+        result[i, 2] = theta
+        scores[i] = best
     return result, scores
 
 
@@ -240,9 +255,11 @@ def explained(
     something must end beside a wall, one that met nothing nowhere; on its way there must be no
     wall. Of what ends in or passes through the unknown the map says nothing.
     """
-    counts, silent = np.zeros(len(poses)), np.zeros(len(poses))
+    counts = np.zeros(len(poses))
+    silent = np.zeros(len(poses))
     for i in range(len(poses)):
-        c, s = math.cos(poses[i, 2]), math.sin(poses[i, 2])
+        c = math.cos(poses[i, 2])
+        s = math.sin(poses[i, 2])
         x = (poses[i, 0] + c * laser[0] - s * laser[1] - origin[0]) / resolution
         y = (poses[i, 1] + s * laser[0] + c * laser[1] - origin[1]) / resolution
         heading = poses[i, 2] + laser[2]
@@ -268,7 +285,8 @@ def _explains(
 ) -> int:
     """Whether the map explains a beam from a point (x, y, in cells): _YES, _NO or _SAYS_NOTHING."""
     states, near = maps
-    c, s = math.cos(angle), math.sin(angle)
+    c = math.cos(angle)
+    s = math.sin(angle)
     answer = _YES
     if met:
         row = int(math.floor(y + s * range_m / resolution))
@@ -310,7 +328,8 @@ def spot_scores(
     twice = np.empty(2 * directions, dtype=np.uint8)
     found = [(np.int32(0), np.int32(0), np.int32(0)) for _ in range(0)]
     for i in range(spots):
-        twice[:directions], twice[directions:] = around[i], around[i]
+        twice[:directions] = around[i]
+        twice[directions:] = around[i]
         for heading in range(directions):
             count = np.int32(0)
             for k in range(directions):
@@ -319,7 +338,8 @@ def spot_scores(
             counts[heading] = count
         for heading in range(directions):
             count = counts[heading]
-            before, after = counts[heading - 1], counts[(heading + 1) % directions]
+            before = counts[heading - 1]
+            after = counts[(heading + 1) % directions]
             if count >= least and count >= before and count > after:
                 found.append((np.int32(i), np.int32(heading), count))
     result = np.empty((3, len(found)), dtype=np.int32)

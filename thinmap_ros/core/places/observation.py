@@ -15,7 +15,8 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.builder import TopologyConfig, build
 
 # One scan alone has to make cells free and occupied.
-_P_FREE, _P_OCCUPIED = 0.2, 0.8
+_P_FREE = 0.2
+_P_OCCUPIED = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,10 +102,12 @@ def profile(observation: Observation) -> tuple[Array, NDArray[np.bool_], NDArray
     turns = np.arctan2(away[:, 1], away[:, 0]) * (DIRECTIONS / (2.0 * math.pi))
     bins = np.round(turns).astype(np.int64)
     result = np.full(DIRECTIONS, most)
-    known, met = np.zeros(DIRECTIONS, dtype=np.bool_), np.zeros(DIRECTIONS, dtype=np.bool_)
+    known = np.zeros(DIRECTIONS, dtype=np.bool_)
+    met = np.zeros(DIRECTIONS, dtype=np.bool_)
     # The nearest to a direction's middle comes last and stays.
     for k in np.argsort(-np.abs(turns - bins), kind='stable').tolist():
         at = bins[k] % DIRECTIONS
         result[at] = min(ranges[k], most)
-        known[at], met[at] = True, bool(observation.met[k]) and ranges[k] < most
+        known[at] = True
+        met[at] = bool(observation.met[k]) and ranges[k] < most
     return result, known, met

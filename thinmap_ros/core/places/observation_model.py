@@ -55,7 +55,8 @@ def calibrate(
             distances[kind].append(distance)
     chance = _chance(places)
     window = _VIEW_SHARE * config.active_window_m**2
-    found, spread = np.zeros(len(NodeKind)), np.full(len(NodeKind), places.frame.resolution)
+    found = np.zeros(len(NodeKind))
+    spread = np.full(len(NodeKind), places.frame.resolution)
     for kind in NodeKind:
         all_of_it = np.array(distances[kind])
         near = all_of_it[all_of_it < _SAME_NODE_M]

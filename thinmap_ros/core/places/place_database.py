@@ -28,7 +28,9 @@ _MOST_PLACES = 100_000
 _BLOCK_M = 0.5  # nodes in sight are listed for blocks of this size
 SIGHT_UNIT_M = 0.002  # of where these lie, from the corner of their block: up to 65 m in two bytes
 
-FREE, WALL, UNKNOWN = 0, 1, 2
+FREE = 0
+WALL = 1
+UNKNOWN = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,9 +184,13 @@ def free_way(states: Bytes, x: float, y: float, angle: float, most: float) -> tu
         if states[row, col] != FREE:
             return way, int(states[row, col])
         if next_x < next_y:
-            way, next_x, col = next_x, next_x + delta_x, col + step_x
+            way = next_x
+            next_x = next_x + delta_x
+            col = col + step_x
         else:
-            way, next_y, row = next_y, next_y + delta_y, row + step_y
+            way = next_y
+            next_y = next_y + delta_y
+            row = row + step_y
     return most, FREE
 
 

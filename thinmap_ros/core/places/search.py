@@ -42,7 +42,8 @@ def candidates(
     counts, silent = judge.explained(poses, seen)
     counts += SILENT_COUNTS * silent
     good = counts >= counts.max() - _BELOW_BEST * len(seen.ranges_m)
-    poses, counts = poses[good], counts[good]
+    poses = poses[good]
+    counts = counts[good]
     found = distinct(poses[np.argsort(-counts, kind='stable')], 0.3, 0.15, _MOST_LOOKED_AT_TWICE)
     return found, complete and len(found) < _MOST_LOOKED_AT_TWICE
 
@@ -98,8 +99,10 @@ def judged_before(
 
     Also of how many it says nothing; (V, N) each, by odometry back to there.
     """
-    counts, silent = np.zeros((len(views), len(poses))), np.zeros((len(views), len(poses)))
-    now, at = poses, T_odom_base
+    counts = np.zeros((len(views), len(poses)))
+    silent = np.zeros((len(views), len(poses)))
+    now = poses
+    at = T_odom_base
     for k in range(len(views) - 1, -1, -1):
         view = views[k]
         # From view to view: what odometry is off does not add up.
@@ -113,13 +116,15 @@ def judged_before(
 
 def _drift(motion: Array, noise: float) -> Array:
     """Covariance (3, 3) of a motion (3,) by odometry."""
-    way, turn = float(np.hypot(motion[0], motion[1])), abs(float(motion[2]))
+    way = float(np.hypot(motion[0], motion[1]))
+    turn = abs(float(motion[2]))
     return np.diag(np.square([noise * way, noise * way, noise * (way + turn)]))
 
 
 def moved(poses: Array, motion: Array) -> Array:
     """Poses (N, 3) after a motion (3,) in the robot frame."""
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    c = np.cos(poses[:, 2])
+    s = np.sin(poses[:, 2])
     x = poses[:, 0] + c * motion[0] - s * motion[1]
     y = poses[:, 1] + s * motion[0] + c * motion[1]
     return np.column_stack([x, y, se2.wrap(poses[:, 2] + motion[2])])

@@ -20,7 +20,9 @@ from thinmap_ros.core.se2 import Array
 # The narrowest thing that must not be driven over unseen: a leg. Sectors are sampled this densely.
 NARROWEST_M = 0.1
 _REMEMBERED_SCANS = 32
-_APART_M, _APART_RAD = 0.05, 0.1  # between two scans that are remembered
+# Between two scans that are remembered
+_APART_M = 0.05
+_APART_RAD = 0.1
 
 
 class _Observation(NamedTuple):

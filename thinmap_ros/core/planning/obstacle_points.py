@@ -40,7 +40,8 @@ class SeenPoints:
         if scan is None or scan is self._scan:
             return
         self._scan = scan
-        first, step = scan.angle_min_rad, scan.angle_increment_rad
+        first = scan.angle_min_rad
+        step = scan.angle_increment_rad
         T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
         hits = np.where(scan.hit, scan.ranges_m, np.nan)
         hits = np.where(scan.too_near, scan.range_min_m, hits)
@@ -92,7 +93,8 @@ def _room_along(path: Array, first: int, length_m: float, points: Array) -> floa
 
     Without points: inf.
     """
-    nearest, along = np.inf, 0.0
+    nearest = np.inf
+    along = 0.0
     for k in range(first, path.shape[0]):
         if k > first:
             along += math.hypot(path[k, 0] - path[k - 1, 0], path[k, 1] - path[k - 1, 1])
@@ -154,7 +156,8 @@ def _smoothed(ranges: Array, i: int) -> float:
     The nearest of many noisy points is nearer than the wall: without this, passages would seem
     narrower than they are.
     """
-    total, count = 0.0, 0
+    total = 0.0
+    count = 0
     for k in range(max(i - _BESIDE, 0), min(i + _BESIDE + 1, ranges.size)):
         if abs(ranges[k] - ranges[i]) < _SAME_M:
             total += ranges[k]
@@ -175,17 +178,21 @@ def _points_around(
     count = 0
     for i in range(ranges.size):
         if not math.isnan(ranges[i]):
-            angle, metres = laser[2] + first + step * i, _smoothed(ranges, i)
+            angle = laser[2] + first + step * i
+            metres = _smoothed(ranges, i)
             points[count, 0] = laser[0] + metres * math.cos(angle)
             points[count, 1] = laser[1] + metres * math.sin(angle)
             count += 1
     last = first + step * (ranges.size - 1)
-    middle, half = laser[2] + 0.5 * (first + last), 0.5 * abs(last - first)
+    middle = laser[2] + 0.5 * (first + last)
+    half = 0.5 * abs(last - first)
     for i in range(earlier.shape[0]):
-        dx, dy = earlier[i, 0] - laser[0], earlier[i, 1] - laser[1]
+        dx = earlier[i, 0] - laser[0]
+        dy = earlier[i, 1] - laser[1]
         off = math.pi - (math.pi - (math.atan2(dy, dx) - middle)) % (2.0 * math.pi)
         near = (earlier[i, 0] - robot[0]) ** 2 + (earlier[i, 1] - robot[1]) ** 2 < _REMEMBERED_M**2
         if near and abs(off) > half:
-            points[count, 0], points[count, 1] = earlier[i, 0], earlier[i, 1]
+            points[count, 0] = earlier[i, 0]
+            points[count, 1] = earlier[i, 1]
             count += 1
     return points[:count].copy()

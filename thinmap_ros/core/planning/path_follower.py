@@ -16,7 +16,9 @@ from thinmap_ros.core.se2 import Array, wrap
 
 # Where it is narrow: the shortest look ahead, how it grows with the room to spare, and a speed that
 # is always allowed.
-_SHORTEST_M, _SPARE_FACTOR, _SLOWEST_M_S = 0.1, 2.0, 0.1
+_SHORTEST_M = 0.1
+_SPARE_FACTOR = 2.0
+_SLOWEST_M_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,8 @@ class Follower:
         reach = min(max(config.lookahead_m, config.lookahead_s * self.v), narrow)
         x, y, theta = T_map_base.tolist()
         ahead_x, ahead_y, rest_m = _point_ahead(path, x, y, reach, config.stray_m)
-        dx, dy = ahead_x - x, ahead_y - y
+        dx = ahead_x - x
+        dy = ahead_y - y
         error = wrap(math.atan2(dy, dx) - theta) if dx or dy else 0.0
         # Once turning, on until the path is nearly straight ahead: no flickering at the limit.
         least = 0.3 * config.turn_in_place_rad if self._turning else config.turn_in_place_rad
@@ -100,7 +103,8 @@ class Follower:
 
     def slowed(self, v: float, w: float) -> tuple[float, float]:
         """Note that a command was made slower than the limits allow, for something right ahead."""
-        self.v, self.w = v, w
+        self.v = v
+        self.w = w
         return v, w
 
     def _turn_for(self, error: float, dt_s: float) -> float:
@@ -123,11 +127,13 @@ def _towards(value: float, goal: float, change: float) -> float:
 @kernel
 def nearest_point(path: Array, x: float, y: float) -> int:
     """Index of the point of a path (K, 2) nearest to (x, y); the first of equally near ones."""
-    best, nearest = np.inf, 0
+    best = np.inf
+    nearest = 0
     for k in range(path.shape[0]):
         squared = (path[k, 0] - x) ** 2 + (path[k, 1] - y) ** 2
         if squared < best:
-            best, nearest = squared, k
+            best = squared
+            nearest = k
     return nearest
 
 
@@ -149,9 +155,11 @@ def _point_ahead(
     It lies up to reach_m on along the path, and less far where the straight way to it would leave
     the path by more than stray_m: corners are not cut.
     """
-    first, end = nearest_point(path, x, y), path.shape[0] - 1
+    first = nearest_point(path, x, y)
+    end = path.shape[0] - 1
     left_m = max(length_from(path, first), math.hypot(path[end, 0] - x, path[end, 1] - y))
-    last, along = first, 0.0
+    last = first
+    along = 0.0
     while last < end and along < reach_m:
         last += 1
         along += math.hypot(path[last, 0] - path[last - 1, 0], path[last, 1] - path[last - 1, 1])
@@ -164,7 +172,8 @@ def _point_ahead(
 @kernel
 def _stray(path: Array, first: int, last: int, x: float, y: float) -> float:
     """Largest distance, m, of path points first to last from the line from (x, y) to the last."""
-    dx, dy = path[last, 0] - x, path[last, 1] - y
+    dx = path[last, 0] - x
+    dy = path[last, 1] - y
     length = max(math.hypot(dx, dy), 1e-9)
     most = 0.0
     for k in range(first, last):

@@ -13,7 +13,8 @@ from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.se2 import Array
 
-_STEP_M, _JUMP_M = 0.03, 0.5
+_STEP_M = 0.03
+_JUMP_M = 0.5
 _LONGEST = 1300  # points
 
 
@@ -50,7 +51,8 @@ class Trail:
     def _append(self, here: tuple[float, float]) -> None:
         if self._end == len(self._points):
             self._points[: _LONGEST - 1] = self._points[self._end - _LONGEST + 1 :]
-            self._begin, self._end = 0, _LONGEST - 1
+            self._begin = 0
+            self._end = _LONGEST - 1
         self._points[self._end] = here
         self._end += 1
         self._begin = max(self._begin, self._end - _LONGEST)
@@ -66,11 +68,14 @@ def _joined(cells: NDArray[np.int64], rows: int, cols: int) -> NDArray[np.int64]
     for k in range(1, cells.shape[0]):
         count += abs(cells[k, 0] - cells[k - 1, 0]) + abs(cells[k, 1] - cells[k - 1, 1])
     found = np.empty((count, 2), dtype=np.int64)
-    row, col, used = cells[0, 0], cells[0, 1], 0
+    row = cells[0, 0]
+    col = cells[0, 1]
+    used = 0
     for k in range(cells.shape[0]):
         while True:
             if 0 <= row < rows and 0 <= col < cols:
-                found[used, 0], found[used, 1] = row, col
+                found[used, 0] = row
+                found[used, 1] = col
                 used += 1
             if row != cells[k, 0]:
                 row += 1 if cells[k, 0] > row else -1

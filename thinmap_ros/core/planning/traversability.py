@@ -32,12 +32,15 @@ def renew_standing(
     See `standing_places`.
     """
     reach = math.ceil(radius_m / resolution) + 1
-    top, left = max(part[0] - reach, 0), max(part[1] - reach, 0)
-    bottom, right = part[2] + reach, part[3] + reach
+    top = max(part[0] - reach, 0)
+    left = max(part[1] - reach, 0)
+    bottom = part[2] + reach
+    right = part[3] + reach
     # As many cells again are read, so that the cut is no wall.
     wide = free[max(top - reach, 0) : bottom + reach, max(left - reach, 0) : right + reach]
     found = standing_places(np.ascontiguousarray(wide), radius_m, resolution)
-    row, col = top - max(top - reach, 0), left - max(left - reach, 0)
+    row = top - max(top - reach, 0)
+    col = left - max(left - reach, 0)
     renewed = standing[top:bottom, left:right]
     renewed[:] = found[row : row + renewed.shape[0], col : col + renewed.shape[1]]
 
@@ -79,7 +82,8 @@ def reached_from(allowed: Mask, start: tuple[int, int]) -> Mask:
 def nearest_true(allowed: Mask, cell: tuple[int, int], reach: float) -> tuple[int, int] | None:
     """The true cell nearest to one that lies anywhere, if there is one within `reach` cells."""
     whole = math.floor(reach)
-    top, left = max(cell[0] - whole, 0), max(cell[1] - whole, 0)
+    top = max(cell[0] - whole, 0)
+    left = max(cell[1] - whole, 0)
     part = allowed[top : max(cell[0] + whole + 1, 0), left : max(cell[1] + whole + 1, 0)]
     near = np.argwhere(part) + (top, left)
     squared = np.square(near - cell).sum(axis=1)
@@ -95,7 +99,8 @@ def are_near(allowed: Mask, cells: NDArray[np.int64], reach: float) -> Mask:
     whole = int(math.floor(reach))
     near = np.zeros(cells.shape[0], dtype=np.bool_)
     for i in range(cells.shape[0]):
-        row, col = cells[i, 0], cells[i, 1]
+        row = cells[i, 0]
+        col = cells[i, 1]
         for r in range(max(row - whole, 0), min(row + whole + 1, allowed.shape[0])):
             for c in range(max(col - whole, 0), min(col + whole + 1, allowed.shape[1])):
                 near[i] |= allowed[r, c] and (r - row) ** 2 + (c - col) ** 2 <= reach * reach
@@ -115,24 +120,29 @@ def disc(
 
 @kernel
 def _reached_from(allowed: Mask, start_row: int, start_col: int) -> Mask:
-    rows, cols = allowed.shape[0], allowed.shape[1] + 2
+    rows = allowed.shape[0]
+    cols = allowed.shape[1] + 2
     # An empty border saves the wave all questions about the rim.
     left = np.zeros((rows + 2, cols), dtype=np.bool_)
     left[1:-1, 1:-1] = allowed
     found = np.zeros((rows + 2, cols), dtype=np.bool_)
     if not (0 <= start_row < rows and 0 <= start_col < cols - 2):
         return found[1:-1, 1:-1].copy()
-    flat, reached = left.ravel(), found.ravel()
+    flat = left.ravel()
+    reached = found.ravel()
     stack = np.empty(flat.size, dtype=np.int64)
     start = (start_row + 1) * cols + start_col + 1
-    stack[0], count = start, int(flat[start])
-    reached[start], flat[start] = flat[start], False
+    stack[0] = start
+    count = int(flat[start])
+    reached[start] = flat[start]
+    flat[start] = False
     while count > 0:
         count -= 1
         at = stack[count]
         for to in (at - cols, at - 1, at + 1, at + cols):
             if flat[to]:
-                flat[to], reached[to] = False, True
+                flat[to] = False
+                reached[to] = True
                 stack[count] = to
                 count += 1
     return found[1:-1, 1:-1].copy()

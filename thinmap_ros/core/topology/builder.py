@@ -107,7 +107,8 @@ class TopologyBuilder:
 
     def local_map(self) -> TopologicalMap:
         """The map of what is near in the newest window, near_m wide, not merged; ids from 1."""
-        view, around = self._view, self._surroundings
+        view = self._view
+        around = self._surroundings
         if view is None or around is None:
             return TopologicalMap()
         low = np.array([around.near.row - around.box.row, around.near.col - around.box.col])
@@ -130,7 +131,9 @@ class TopologyBuilder:
         between the same two nodes keep theirs.
         """
         old = self._registry
-        self._atlas, self._surroundings, self._registry = Atlas(), None, None
+        self._atlas = Atlas()
+        self._surroundings = None
+        self._registry = None
         for T in _thinned_out(after):
             self._take(window_at(float(T[0]), float(T[1])), T, wide=True)
         if self._surroundings is None:
@@ -188,7 +191,8 @@ class TopologyBuilder:
     def _merge(self, view: '_View', known: tuple[Cells, Cells], box: Box) -> None:
         """Put the skeleton of the window into the atlas where it differs from what was there."""
         low = np.array([box.row, box.col])
-        old, fresh = _raster(known[0] - low, known[1], box.rows, box.cols), view.fresh()
+        old = _raster(known[0] - low, known[1], box.rows, box.cols)
+        fresh = view.fresh()
         if _agree(fresh, old, view.redrawn):
             return
         seam = Seam(fresh > 0, old > 0, view.redrawn, view.free, view.robot)
@@ -267,16 +271,20 @@ def _put_together(
     The clearances are the fresh ones where these take the old ones' place, and measured anew at
     cells that were neither.
     """
-    squared, changed = np.zeros_like(old), np.empty((old.size, 2), dtype=np.int64)
-    cell, count = np.empty((1, 2), dtype=np.int64), 0
+    squared = np.zeros_like(old)
+    changed = np.empty((old.size, 2), dtype=np.int64)
+    cell = np.empty((1, 2), dtype=np.int64)
+    count = 0
     for row in range(old.shape[0]):
         for col in range(old.shape[1]):
             if drawn[row, col]:
                 known = fresh[row, col] if where[row, col] else old[row, col]
-                cell[0, 0], cell[0, 1] = row, col
+                cell[0, 0] = row
+                cell[0, 1] = col
                 squared[row, col] = known if known > 0 else squared_clearance(distance, cell)[0]
             if squared[row, col] != old[row, col]:
-                changed[count, 0], changed[count, 1] = row, col
+                changed[count, 0] = row
+                changed[count, 1] = col
                 count += 1
     return squared, changed[:count].copy()
 

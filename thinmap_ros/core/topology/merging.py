@@ -48,7 +48,8 @@ def stitch(seam: Seam, joined_outside: Grouping) -> Mask:
     another place. joined_outside: says which numbered parts hang together outside, asked only where
     it matters.
     """
-    drawn, kept = seam.new & seam.window, seam.old & ~seam.window
+    drawn = seam.new & seam.window
+    kept = seam.old & ~seam.window
     result = drawn | kept
     targets = true_cells(drawn)
     for end in _loose(kept, seam.old & seam.window, drawn):
@@ -73,7 +74,8 @@ def _share_free_space(parts: NDArray[np.int32], free_parts: NDArray[np.int32], c
     owner = np.zeros(count, dtype=np.int32)
     for row in range(parts.shape[0]):
         for col in range(parts.shape[1]):
-            part, place = parts[row, col], free_parts[row, col]
+            part = parts[row, col]
+            place = free_parts[row, col]
             if part > 0 and place > 0:
                 if owner[place] > 0 and owner[place] != part:
                     return True
@@ -97,7 +99,8 @@ def _loose(cells: Mask, removed: Mask, others: Mask) -> Cells:
                     cut |= removed[r, c]
                     joined |= others[r, c]
             if cut and not joined:
-                found[count, 0], found[count, 1] = row, col
+                found[count, 0] = row
+                found[count, 1] = col
                 count += 1
     return found[:count]
 
@@ -161,10 +164,12 @@ def _draw_way(result: Mask, free: Mask, owner: Cells, source: int) -> int:
     rows, cols = free.shape
     before = np.full(free.size, -1, dtype=np.int64)
     queue = np.empty(free.size, dtype=np.int64)
-    size, head = 0, 0
+    size = 0
+    head = 0
     for at in range(free.size):
         if owner[at // cols, at % cols] == source and free[at // cols, at % cols]:
-            before[at], queue[size] = at, at
+            before[at] = at
+            queue[size] = at
             size += 1
     while head < size:
         at = queue[head]
@@ -178,7 +183,8 @@ def _draw_way(result: Mask, free: Mask, owner: Cells, source: int) -> int:
         for r in range(max(at // cols - 1, 0), min(at // cols + 2, rows)):
             for c in range(max(at % cols - 1, 0), min(at % cols + 2, cols)):
                 if free[r, c] and before[r * cols + c] < 0:
-                    before[r * cols + c], queue[size] = at, r * cols + c
+                    before[r * cols + c] = at
+                    queue[size] = r * cols + c
                     size += 1
     return source
 
@@ -231,7 +237,8 @@ def _drain(left: Mask, solid: Mask) -> None:
     The border is solid and not left.
     """
     cols = left.shape[1]
-    flat, walls = left.ravel(), solid.ravel()
+    flat = left.ravel()
+    walls = solid.ravel()
     steps = np.array([-cols, -1, 1, cols], dtype=np.int64)
     stack = np.empty(flat.size, dtype=np.int64)
     count = 0

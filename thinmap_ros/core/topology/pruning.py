@@ -101,7 +101,8 @@ def drop_spurs(net: Net, chosen: Mask, outlook: Outlook, limits: Limits) -> bool
     round go together, so that the two corners at the end of a corridor leave its middle as the end.
     """
     gone = np.empty(chain_count(net), dtype=np.int64)
-    tips, bases = np.empty(gone.size, dtype=np.int64), np.zeros(chosen.size, dtype=np.bool_)
+    tips = np.empty(gone.size, dtype=np.int64)
+    bases = np.zeros(chosen.size, dtype=np.bool_)
     count = 0
     for number in range(gone.size):
         tip = _tip(net, number) if is_among(net, number, chosen) else NONE
@@ -111,7 +112,9 @@ def drop_spurs(net: Net, chosen: Mask, outlook: Outlook, limits: Limits) -> bool
         is_noise = _adds_little(net, number, tip, base, outlook, limits)
         if not is_noise and (count > 0 or not _adds_nothing(net, number, base, limits.radius)):
             continue
-        gone[count], tips[count], bases[base] = number, tip, True
+        gone[count] = number
+        tips[count] = tip
+        bases[base] = True
         count += 1
         if not is_noise:
             break
@@ -125,8 +128,10 @@ def drop_spurs(net: Net, chosen: Mask, outlook: Outlook, limits: Limits) -> bool
 @kernel
 def _tip(net: Net, number: int) -> int:
     """The free end of a chain; of two free ends the one with less room; NONE without any."""
-    a, b = net.chains[number, A], net.chains[number, B]
-    free_a, free_b = net.spots[a, DEGREE] == 1, net.spots[b, DEGREE] == 1
+    a = net.chains[number, A]
+    b = net.chains[number, B]
+    free_a = net.spots[a, DEGREE] == 1
+    free_b = net.spots[b, DEGREE] == 1
     if free_a and free_b:
         return int(a if net.spots[a, SQUARED] <= net.spots[b, SQUARED] else b)
     return int(a if free_a else b if free_b else NONE)
@@ -153,7 +158,8 @@ def _looks_out(outlook: Outlook, spot: Cells) -> bool:
 
     Nobody knows that of a spot outside the cells: it may.
     """
-    row, col = spot[ROW] - outlook.row, spot[COL] - outlook.col
+    row = spot[ROW] - outlook.row
+    col = spot[COL] - outlook.col
     rows, cols = outlook.rim.shape
     if not (0 <= row < rows and 0 <= col < cols):
         return True
@@ -169,7 +175,8 @@ def _looks_out(outlook: Outlook, spot: Cells) -> bool:
 def _adds_nothing(net: Net, number: int, base: int, radius: float) -> bool:
     """Whether a spur lies wholly in the room round other chains at its base and the next spots."""
     others = _others_near(net, number, base)
-    start, count = net.chains[number, START], net.chains[number, COUNT]
+    start = net.chains[number, START]
+    count = net.chains[number, COUNT]
     # From the tip on: that is where most spurs stand out.
     from_a = net.chains[number, A] != base
     for k in range(count):
@@ -209,7 +216,8 @@ def _is_held(net: Net, cell: Cells, numbers: Cells, radius: float) -> bool:
     for number in numbers:
         start = net.chains[number, START]
         for k in range(start, start + net.chains[number, COUNT]):
-            row, col = cell[0] - net.cells[k, 0], cell[1] - net.cells[k, 1]
+            row = cell[0] - net.cells[k, 0]
+            col = cell[1] - net.cells[k, 1]
             # Most are too far off for any radius.
             if row * row + col * col > net.cells[k, 2]:
                 continue

@@ -38,7 +38,8 @@ class Rebuilding:
 
     def window(self, window: GridPatch, corrected_ns: int) -> None:
         """Take note of a window, and of the stamp of the correction that its grid had undergone."""
-        self._window, self._window_ns = window, corrected_ns
+        self._window = window
+        self._window_ns = corrected_ns
         if corrected_ns != self._stale_ns:
             self._stale_ns = None
 

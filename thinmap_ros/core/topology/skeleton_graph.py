@@ -66,8 +66,10 @@ def extent(cells: Cells) -> tuple[int, int, int, int]:
     low_row = high_row = cells[0, 0]
     low_col = high_col = cells[0, 1]
     for k in range(1, cells.shape[0]):
-        low_row, high_row = min(low_row, cells[k, 0]), max(high_row, cells[k, 0])
-        low_col, high_col = min(low_col, cells[k, 1]), max(high_col, cells[k, 1])
+        low_row = min(low_row, cells[k, 0])
+        high_row = max(high_row, cells[k, 0])
+        low_col = min(low_col, cells[k, 1])
+        high_col = max(high_col, cells[k, 1])
     return low_row, low_col, high_row, high_col
 
 

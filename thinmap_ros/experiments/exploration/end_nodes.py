@@ -35,7 +35,9 @@ _MARGIN_M = 0.4
 
 def run(source: Source) -> Outcome:
     """Follow the end node ahead in both hallways."""
-    plots, rows, ends = [], [], {}
+    plots = []
+    rows = []
+    ends = {}
     curves = []
     for k, (name, figure) in enumerate(_FIGURES.items()):
         moments, track = _follow(source, name)
@@ -57,7 +59,8 @@ def run(source: Source) -> Outcome:
     )
     caption = 'Paper 2, to Fig. 5 and 6: how far node A has moved.'
     plots.append(Plot('movement', caption, [panel], panel_inches=(6.5, 3.6), legend='inside'))
-    (dead, dead_rest), (joined, joined_rest) = ends['dead_end'], ends['joined_hallways']
+    (dead, dead_rest) = ends['dead_end']
+    (joined, joined_rest) = ends['joined_hallways']
     return Outcome(
         'End nodes move while there is something to see',
         'Exploration paper, section 3.1, Fig. 5 and 6',
@@ -88,10 +91,13 @@ Moment = tuple[float, Array, GridPatch, TopologicalMap, Array]
 
 def _follow(source: Source, name: str) -> tuple[list[Moment], list[list[float]]]:
     """State once a second (time, pose, map, graph, node A), and A at each scan: time, x, y, way."""
-    builder, grid = TopologyBuilder(TopologyConfig()), OccupancyGrid()
+    builder = TopologyBuilder(TopologyConfig())
+    grid = OccupancyGrid()
     moments: list[Moment] = []
     track: list[list[float]] = []
-    at, way, last = _AHEAD, 0.0, None
+    at = _AHEAD
+    way = 0.0
+    last = None
     for k, look in enumerate(source.looks(name)):
         T = look.T_world_base
         way += 0.0 if last is None else math.dist(T[:2], last[:2])
@@ -114,7 +120,8 @@ def _follow(source: Source, name: str) -> tuple[list[Moment], list[list[float]]]
 def _limits(name: str) -> tuple[float, float, float, float]:
     """Bounds of a world, x, x, y, y, with some margin, m."""
     corners = surfaces(world_of(name), _MARGIN_M).reshape(-1, 2)
-    (left, bottom), (right, top) = corners.min(axis=0) - _MARGIN_M, corners.max(axis=0) + _MARGIN_M
+    (left, bottom) = corners.min(axis=0) - _MARGIN_M
+    (right, top) = corners.max(axis=0) + _MARGIN_M
     return float(left), float(right), float(bottom), float(top)
 
 

@@ -110,12 +110,15 @@ def _relive(looks: list[Look]) -> tuple[list[_Moment], EndNodeCensus]:
     def here(scan: object, T_odom_base: Array) -> Estimate:
         return Estimate(truth, np.zeros((3, 3)), np.zeros(3))
 
-    pipeline, explorer = Pipeline(PipelineConfig(scans_per_graph=SCANS_PER_GRAPH), here), Explorer()
-    census, moments = EndNodeCensus(), []
+    pipeline = Pipeline(PipelineConfig(scans_per_graph=SCANS_PER_GRAPH), here)
+    explorer = Explorer()
+    census = EndNodeCensus()
+    moments = []
     for k, look in enumerate(looks):
         truth = look.T_world_base
         pipeline.step(look.scan, look.T_odom_base)
-        patch, graph = pipeline.grid.patch(), pipeline.topology.map
+        patch = pipeline.grid.patch()
+        graph = pipeline.topology.map
         decision = explorer.step(graph, patch, look.scan, truth)
         census.take([(n.node_id, n.x, n.y) for n in decision.end_nodes], truth)
         if k % 5 == 0 or k == len(looks) - 1:

@@ -19,8 +19,12 @@ _STRATEGIES = (
     'explore_lite',
     'information_gain',
 )
-_SEEDS, _LIMIT_S, _QUICK_S = 6, 3000.0, 10.0
-_FULL, _COMPLETE, _NEARLY = 0.99, 0.95, '0.98'
+_SEEDS = 6
+_LIMIT_S = 3000.0
+_QUICK_S = 10.0
+_FULL = 0.99
+_COMPLETE = 0.95
+_NEARLY = '0.98'
 _NORMAL_95 = 1.96
 
 
@@ -218,7 +222,8 @@ def _coverage(reports: list[Report]) -> Plot:
         units[key] = float(
             np.mean([report['distance'] for report in reports if _key(report) == key])
         )
-    shares, curves = np.linspace(0.0, 1.5, 151), []
+    shares = np.linspace(0.0, 1.5, 151)
+    curves = []
     for k, name in enumerate(_STRATEGIES):
         mine = [np.array(report['curve']) for report in reports if report['strategy'] == name]
         keys = [_key(report) for report in reports if report['strategy'] == name]
@@ -226,9 +231,11 @@ def _coverage(reports: list[Report]) -> Plot:
             np.interp(shares * units[key], run[:, 1], run[:, 2])
             for key, run in zip(keys, mine, strict=True)
         ]
-        mean, style = 100.0 * np.mean(lines, axis=0), ('-', '--', ':')[k % 3]
+        mean = 100.0 * np.mean(lines, axis=0)
+        style = ('-', '--', ':')[k % 3]
         curves.append(Curve(xy(shares, mean), name.replace('_', ' '), k, style, width=2.0))
-    limits, x_label = (0.0, 1.5, 40.0, 101.0), 'distance, of the mean of all strategies'
+    limits = (0.0, 1.5, 40.0, 101.0)
+    x_label = 'distance, of the mean of all strategies'
     panel = Panel(curves, '', x_label, 'coverage (%)', plan=False, limits=limits)
     caption = 'Paper 2: coverage over distance, mean over worlds and starts.'
     return Plot('coverage', caption, [panel], panel_inches=(7.0, 4.2), legend='inside')

@@ -87,7 +87,10 @@ def _sub_iteration(cells: Mask, first: bool) -> Mask:
     ]
     count = np.sum(p, axis=0)
     rises = np.sum([(p[k] == 0) & (p[(k + 1) % 8] == 1) for k in range(8)], axis=0)
-    north, east, south, west = p[0], p[2], p[4], p[6]
+    north = p[0]
+    east = p[2]
+    south = p[4]
+    west = p[6]
     if first:
         open_sides = (north * east * south == 0) & (east * south * west == 0)
     else:

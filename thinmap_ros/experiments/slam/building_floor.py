@@ -30,7 +30,9 @@ from thinmap_ros.view.plots import (
 
 _QUICK_SCANS = 200
 _LOCAL_AT = 0.45  # of the drive: Fig. 7 and 8
-_LINES, _PAPER_USED, _PAPER_ALL = 33, 7, 25
+_LINES = 33
+_PAPER_USED = 7
+_PAPER_ALL = 25
 _EVERY = 5
 _SIGMAS = 3.0
 _LIMITS = (-1.0, 41.0, -2.0, 12.0)  # the odometry alone goes far beyond
@@ -45,8 +47,10 @@ class _Glance:
 
     def __call__(self, k: int, look: Look, pipeline: Pipeline, step: Step) -> None:
         if k == self.number:
-            self.patch, self.graph = pipeline.grid.patch(), pipeline.topology.map.copy()
-            self.features, self.pose = line_features(pipeline.localizer), step.estimate.T_map_base
+            self.patch = pipeline.grid.patch()
+            self.graph = pipeline.topology.map.copy()
+            self.features = line_features(pipeline.localizer)
+            self.pose = step.estimate.T_map_base
 
 
 def run(source: Source) -> Outcome:
@@ -59,7 +63,8 @@ def run(source: Source) -> Outcome:
     ours = run_slam(looks, 'scan_matching')
     error = map_error.map_error(ti.pipeline.grid.patch(), world)
     apart = np.hypot(*(np.array(ti.estimate) - np.array(full.estimate))[:, :2].T)
-    used, known = float(np.median(ti.local)), ti.features[-1]
+    used = float(np.median(ti.local))
+    known = ti.features[-1]
     return Outcome(
         'A building floor with 33 lines',
         'SLAM paper, sections 4 and 5.1, Fig. 7, 8, 11 and 12',
@@ -229,7 +234,8 @@ def _paths(ti: Run, full: Run) -> Plot:
     panels = []
     for done, name in ((full, '(a) conventional EKF-SLAM'), (ti, '(b) EKF-SLAM/TI')):
         features = line_features(done.pipeline.localizer)
-        odometry, estimate = np.array(done.odometry), np.array(done.estimate)
+        odometry = np.array(done.odometry)
+        estimate = np.array(done.estimate)
         layers: list[Layer] = [
             Segments(_ends(features, False), 'features', 'black', 1.2),
             Segments(_ends(features, True), 'features used at the end', 1, 4.0),
@@ -247,8 +253,11 @@ def _paths(ti: Run, full: Run) -> Plot:
 
 
 def _bounds(done: Run) -> Plot:
-    seconds, errors, bounds = np.array(done.seconds), _errors(done), _SIGMAS * np.array(done.sigmas)
-    panels, rows = [], (('x', 'cm', 100.0), ('y', 'cm', 100.0), ('heading', 'deg', 180.0 / np.pi))
+    seconds = np.array(done.seconds)
+    errors = _errors(done)
+    bounds = _SIGMAS * np.array(done.sigmas)
+    panels = []
+    rows = (('x', 'cm', 100.0), ('y', 'cm', 100.0), ('heading', 'deg', 180.0 / np.pi))
     for k, (name, unit, scale) in enumerate(rows):
         layers: list[Layer] = [
             Band(seconds, -scale * bounds[:, k], scale * bounds[:, k], '3 sigma', 5),

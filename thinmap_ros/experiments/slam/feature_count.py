@@ -12,10 +12,15 @@ from thinmap_ros.view.plots import Curve, Panel, Plot
 
 _COUNTS = (25, 50, 88, 200, 400, 800, 1500, 3000)
 _COUNTS_QUICK = (25, 88)
-_LOCAL, _SEEN = 12, 7  # features of a local area, and of them those that a step sees
-_STEPS, _AREA_STEPS = 100, 25  # a metre at 0.2 m/s and 5 Hz
+# Features of a local area, and of them those that a step sees
+_LOCAL = 12
+_SEEN = 7
+# A metre at 0.2 m/s and 5 Hz
+_STEPS = 100
+_AREA_STEPS = 25
 _ONE_STEP = np.array([0.04, 0.0, 0.0])  # 0.2 m/s at 5 Hz
-_MOTION, _LINE = np.diag([1e-6, 1e-6, 1e-6]), np.diag([1e-4, 1e-5])
+_MOTION = np.diag([1e-6, 1e-6, 1e-6])
+_LINE = np.diag([1e-4, 1e-5])
 _SAME = 1e-6
 _FLAT = 1.5
 _HALF_WAY = 800
@@ -24,13 +29,15 @@ _HALF_WAY = 800
 def run(source: Source) -> Outcome:
     """Time both filters on the same steps."""
     counts = _COUNTS_QUICK if source.quick else _COUNTS
-    times, same = [], []
+    times = []
+    same = []
     for count in counts:
         local_ms, local_pose = _drive(source.seed, count, True)
         full_ms, full_pose = _drive(source.seed, count, False)
         times.append([count, *_spread(local_ms), *_spread(full_ms)])
         same.append([count, float(np.abs(local_pose - full_pose).max())])
-    first, last = times[0], times[-1]
+    first = times[0]
+    last = times[-1]
     half = next((row for row in times if row[0] >= _HALF_WAY), last)
     apart = max(row[1] for row in same)
     return Outcome(

@@ -102,7 +102,8 @@ _TIMED = ['log', 'cpu_ms_per_scan', 'wall_ms_median', 'wall_ms_p95', 'wall_ms_ma
 
 
 def _one(folder: Path, out: Path) -> _Result:
-    wall, cpu = time.perf_counter(), time.process_time()
+    wall = time.perf_counter()
+    cpu = time.process_time()
     result = replay(CarmenLog(folder / 'log.clf', laser_of(folder, folder.name)), PipelineConfig())
     seconds = (time.perf_counter() - wall, time.process_time() - cpu)
     report = write_outputs(result, out, folder.name, seconds)
@@ -140,7 +141,8 @@ def laser_of(folder: Path, log: str) -> LaserOptions:
 
 def _errors(folder: Path, result: Replay) -> list[float | None]:
     """Errors by relations: live m, deg, final m, deg, raw odometry m; None without relations."""
-    relations, odometry = folder / 'relations', folder / 'odom.txt'
+    relations = folder / 'relations'
+    odometry = folder / 'odom.txt'
     if not relations.exists():
         return [None] * 5
     times = np.array(result.stamps_ns) / 1e9
@@ -156,8 +158,10 @@ def _means(errors: RelationErrors) -> tuple[float, float]:
 
 
 def _plot(folder: Path, result: Replay) -> Plot:
-    pipeline, graph = result.pipeline, result.pipeline.topology.map
-    patch, final = pipeline.grid.patch(), pipeline.localizer.corrected_path()
+    pipeline = result.pipeline
+    graph = result.pipeline.topology.map
+    patch = pipeline.grid.patch()
+    final = pipeline.localizer.corrected_path()
     way = Curve(final[:, :2], 'trajectory', 3, width=1.0)
     rows, cols = patch.shape
     width = min(7.0, 6.0 * cols / rows)

@@ -16,7 +16,10 @@ from thinmap_ros.view.plots import Curve, GraphLayer, MapLayer, Panel, Plot, Rob
 _QUICK_SCANS = 150
 _MARKS = 'ABCDE'
 _WINDOW_M = 10.0
-_LINES, _PAPER_M, _PAPER_DEG, _PAPER_MS = 88, 0.20, 5.0, 40.0
+_LINES = 88
+_PAPER_M = 0.20
+_PAPER_DEG = 5.0
+_PAPER_MS = 40.0
 _EVERY = 10
 
 
@@ -37,7 +40,8 @@ class _Marks:
         T = step.estimate.T_map_base
         self._passed.append((self._at[k], T[:2]))
         names, places = zip(*self._passed, strict=True)
-        graph, robot = pipeline.topology.map.copy(), Robots(T[None], radius_m=0.32)
+        graph = pipeline.topology.map.copy()
+        robot = Robots(T[None], radius_m=0.32)
         words = Words(np.array(places), names, 11.0)
         title = (
             f'{self._at[k]}: after {look.scan.stamp_ns / 6e10:.1f} min, '
@@ -126,7 +130,8 @@ _PATH = [
 
 
 def _rows(done: Run) -> list[list[float]]:
-    off, wheels = done.errors(), done.errors(done.odometry)
+    off = done.errors()
+    wheels = done.errors(done.odometry)
     return [
         [
             done.seconds[k],
@@ -154,7 +159,8 @@ def _times(ti: Run, full: Run) -> list[list[float]]:
 
 
 def _over_time(ti: Run, full: Run, off: Array, turned: Array) -> Plot:
-    seconds, times = np.array(ti.seconds), np.array(_times(ti, full))
+    seconds = np.array(ti.seconds)
+    times = np.array(_times(ti, full))
     panels = [
         Panel(
             [Curve(xy(seconds, 100.0 * off), 'position', 0, width=1.0)],
@@ -189,7 +195,8 @@ def _over_time(ti: Run, full: Run, off: Array, turned: Array) -> Plot:
 
 
 def _comparisons(ti: Run, full: Run, ours: Run, turned: Array) -> list[Comparison]:
-    known, slowest = ti.features[-1], float(np.percentile(ti.step_ms, 99))
+    known = ti.features[-1]
+    slowest = float(np.percentile(ti.step_ms, 99))
     medians = [float(np.median(done.step_ms)) for done in (ti, full)]
     return [
         Comparison(

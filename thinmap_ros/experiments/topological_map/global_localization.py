@@ -16,9 +16,11 @@ from thinmap_ros.view.plots import Curve, MapLayer, Panel, Plot, Robots, xy
 
 _SHOWN = (0, 2, 7, 11)  # steps of the paper's pictures; 0: before the first
 _STEPS = 11
-_SEEDS, _SEEDS_QUICK = 20, 2
+_SEEDS = 20
+_SEEDS_QUICK = 2
 _LIKELY = 0.01  # weight from which on a hypothesis is a candidate
-_RIGHT_M, _RIGHT_RAD = 0.3, np.radians(10.0)
+_RIGHT_M = 0.3
+_RIGHT_RAD = np.radians(10.0)
 
 
 def run(source: Source) -> Outcome:

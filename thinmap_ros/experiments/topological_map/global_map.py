@@ -16,7 +16,9 @@ from thinmap_ros.sim.drives import Look
 from thinmap_ros.view.plots import GraphLayer, MapLayer, Panel, Plot, Robots
 
 _WINDOW_M = 16.0
-_FIRST, _SECOND = 2, 1  # the stops near (3 m, 8 m) and (2.3 m, 3 m)
+# The stops near (3 m, 8 m) and (2.3 m, 3 m)
+_FIRST = 2
+_SECOND = 1
 _SAME_M = 0.5
 
 
@@ -25,8 +27,11 @@ def run(source: Source) -> Outcome:
     by_place = groupby(source.looks('lab_stops'), lambda look: tuple(look.T_world_base[:2]))
     stops = [list(looks) for _, looks in by_place]
     order = [_FIRST, _SECOND, *(k for k in range(len(stops)) if k not in (_FIRST, _SECOND))]
-    builder, grid = TopologyBuilder(TopologyConfig()), OccupancyGrid()
-    growth, panels, states = [], [], []
+    builder = TopologyBuilder(TopologyConfig())
+    grid = OccupancyGrid()
+    growth = []
+    panels = []
+    states = []
     for number, stop in enumerate(order, 1):
         _visit(stops[stop], grid, builder)
         states.append(builder.map.copy())
@@ -40,7 +45,8 @@ def run(source: Source) -> Outcome:
     ]
     whole = grid_of(look for stop in stops for look in stop)
     batch = build(whole.patch(), _start(stops[0]), TopologyConfig())
-    share, back = _agreement(states[-1], batch), _agreement(batch, states[-1])
+    share = _agreement(states[-1], batch)
+    back = _agreement(batch, states[-1])
     gone = _redundant(states[1], states[-1])
     return Outcome(
         'Local topological maps become a global one',

@@ -98,7 +98,8 @@ def _timed(work: Callable[[], TopologicalMap]) -> tuple[float, TopologicalMap]:
 
 
 def _local_map(looks: list[Look]) -> Plot:
-    look, patch = looks[0], grid_of(looks).patch()
+    look = looks[0]
+    patch = grid_of(looks).patch()
     points = look.scan.points_base()
     xy = (float(look.T_world_base[0]), float(look.T_world_base[1]))
     graph = build(patch, xy, TopologyConfig())

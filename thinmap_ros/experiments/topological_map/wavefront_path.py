@@ -28,7 +28,8 @@ def run(source: Source) -> Outcome:
     patch = grid_of(source.looks('lab_stops')).patch()
     goals = [(float(x), float(y)) for x, y in tour_of('lab')]
     clearance_m = ndimage.distance_transform_edt(patch.free) * patch.frame.resolution
-    rows, paths = [], {}
+    rows = []
+    paths = {}
     for name, config in _COSTS.items():
         for goal in goals:
             path = plan(patch, _START, goal, config)

@@ -135,7 +135,8 @@ def sampled(chain, covariances, rng, number=20000):
     poses = np.zeros((number, 3))
     for T, covariance in zip(chain, covariances, strict=True):
         noisy = T + rng.multivariate_normal(np.zeros(3), covariance, number)
-        c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+        c = np.cos(poses[:, 2])
+        s = np.sin(poses[:, 2])
         poses = np.column_stack(
             [
                 poses[:, 0] + c * noisy[:, 0] - s * noisy[:, 1],
@@ -149,7 +150,8 @@ def sampled(chain, covariances, rng, number=20000):
 def test_covariances_along_a_chain_are_those_of_sampling(rng):
     chain = [np.array([1.0, 0.2, 0.4]), np.array([2.0, -0.5, -0.9]), np.array([0.5, 1.0, 0.3])] * 2
     covariances = [random_covariance(rng) for _ in chain]
-    poses, keyframes = [np.zeros(3)], Keyframes(KeyframeConfig())
+    poses = [np.zeros(3)]
+    keyframes = Keyframes(KeyframeConfig())
     keyframes.keep(frame(poses[0]), STEP)
     for k, (T, covariance) in enumerate(zip(chain, covariances, strict=True)):
         poses.append(se2.compose(poses[-1], T))
@@ -197,18 +199,22 @@ def test_a_loop_measured_the_other_way_is_turned_round(rng):
 
 
 def test_a_turned_covariance_is_that_of_turned_samples(rng):
-    covariance, theta = random_covariance(rng), 0.7
+    covariance = random_covariance(rng)
+    theta = 0.7
     samples = rng.multivariate_normal(np.zeros(3), covariance, 20000)
-    c, s = math.cos(theta), math.sin(theta)
+    c = math.cos(theta)
+    s = math.sin(theta)
     samples[:, :2] = samples[:, :2] @ np.array([[c, s], [-s, c]])
     np.testing.assert_allclose(turned(covariance, theta), np.cov(samples.T), atol=3e-5)
     np.testing.assert_allclose(turned(turned(covariance, theta), -theta), covariance, atol=1e-12)
 
 
 def test_a_carried_covariance_is_that_of_what_is_bound_to_it(rng):
-    covariance, lever = random_covariance(rng), np.array([2.0, -1.0])
+    covariance = random_covariance(rng)
+    lever = np.array([2.0, -1.0])
     samples = rng.multivariate_normal(np.zeros(3), covariance, 20000)
-    c, s = np.cos(samples[:, 2]), np.sin(samples[:, 2])
+    c = np.cos(samples[:, 2])
+    s = np.sin(samples[:, 2])
     ends = np.column_stack(
         [
             samples[:, 0] + c * lever[0] - s * lever[1],
@@ -239,7 +245,8 @@ def test_covariances_along_the_graph_are_the_same_in_plain_python(rng, monkeypat
 
 
 def test_a_measured_heading_makes_the_covariance_that_of_a_bayes_update(rng):
-    covariance, variance = random_covariance(rng), 1e-4
+    covariance = random_covariance(rng)
+    variance = 1e-4
     information = inverse(covariance) + np.diag([0.0, 0.0, 1.0 / variance])
     np.testing.assert_allclose(with_heading(covariance, variance), inverse(information), atol=1e-12)
     np.testing.assert_array_equal(with_heading(covariance, np.inf), covariance)

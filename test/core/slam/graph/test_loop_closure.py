@@ -44,9 +44,13 @@ class Driver:
     def __init__(self, walls=RING, seed=6, bias=(0.0, 0.0, 0.0), **config):
         self.rng = np.random.default_rng(seed)
         self.loops = LoopClosure(LoopConfig(**config), Matcher())
-        self.walls, self.bias = walls, np.array(bias)
-        self.truths, self.corrections, self.largest = [], [], 0.0
-        self.pose, self.covariance = None, NONE
+        self.walls = walls
+        self.bias = np.array(bias)
+        self.truths = []
+        self.corrections = []
+        self.largest = 0.0
+        self.pose = None
+        self.covariance = NONE
 
     def go(self, truth, works=1):
         """Be at the next true pose; returns what was corrected."""
@@ -173,7 +177,8 @@ def same_correction(loops, number):
     """Matches that all say that the way back lies half a metre farther north."""
     edges = []
     for k in range(number):
-        a, b = k, 22 - k
+        a = k
+        b = 22 - k
         frames = loops.keyframes.frames
         moved = frames[b].T_map_base + [0.0, 0.5, 0.0]
         T = se2.between(frames[a].T_map_base, moved)
@@ -214,7 +219,8 @@ def test_a_step_does_one_match_or_one_round(monkeypatch):
     """However much is due."""
     driver = Driver(bias=DRIFT)
     counts = {'matches': 0, 'rounds': 0}
-    match, rounds = LoopClosure._match, module.rounds
+    match = LoopClosure._match
+    rounds = module.rounds
 
     def counted_match(self, job):
         counts['matches'] += 1
@@ -310,7 +316,8 @@ def test_an_edge_to_what_is_seen_again_holds_the_errors_of_step_and_match(rng):
         frames.append(Keyframe(scan, surface_points(scan, RANGE_MAX_M), pose, 10.0 * k, NONE, 0))
     for frame in frames[:2]:
         loops.keyframes.keep(frame, STEP)
-    by_match, by_step = np.diag(np.square([0.02, 0.01, 0.05])), np.diag([4e-4, 1e-4, 4e-4])
+    by_match = np.diag(np.square([0.02, 0.01, 0.05]))
+    by_step = np.diag([4e-4, 1e-4, 4e-4])
     loops._pending = (frames[2], by_step)
     T_j_here = se2.between(poses[0], poses[2])
     T_a_here = se2.between(poses[1], poses[2])

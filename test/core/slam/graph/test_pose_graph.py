@@ -38,7 +38,8 @@ def worst(poses, truth):
 def test_two_measurements_of_one_step_meet_by_their_information():
     """A graph of two poses: the mean, weighted."""
     poses = np.array([[1.0, 2.0, 0.5], [0.0, 0.0, 0.0]])
-    once, twice = np.array([1.0, 0.0, 0.0]), np.array([1.4, 0.4, 0.2])
+    once = np.array([1.0, 0.0, 0.0])
+    twice = np.array([1.4, 0.4, 0.2])
     edges = [Edge(0, 1, once, np.eye(3), False), Edge(0, 1, twice, 3.0 * np.eye(3), False)]
     T = se2.between(poses[0], optimized(poses, edges)[1])
     np.testing.assert_allclose(T, 0.25 * once + 0.75 * twice, atol=1e-6)
@@ -95,7 +96,8 @@ def test_jacobians_are_those_of_numeric_differences(rng):
             off = se2.between(T_a, T_b) - edge.T_a_b
             return np.array([off[0], off[1], se2.wrap(float(off[2]))])
 
-        a, b = poses[edge.a], poses[edge.b]
+        a = poses[edge.a]
+        b = poses[edge.b]
         np.testing.assert_allclose(e[k], error(a, b), atol=1e-12)
         for i, axis in enumerate(np.eye(3)):
             numeric_a = (error(a + step * axis, b) - error(a - step * axis, b)) / (2.0 * step)

@@ -43,7 +43,8 @@ class Exhaustive:
         return by_scan + cauchy(squared, SLIP_SIGMAS)
 
     def _of_points(self, scan, poses):
-        c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
+        c = np.cos(poses[:, 2:])
+        s = np.sin(poses[:, 2:])
         x = poses[:, :1] + c * scan[:, 0] - s * scan[:, 1]
         y = poses[:, 1:2] + s * scan[:, 0] + c * scan[:, 1]
         row = np.floor(y / CELL_M).astype(int) - self.top
@@ -98,7 +99,8 @@ class Case:
 
 def exact(cases, most_nodes):
     """Which of some cases end at the least cost of all leaves and the incumbent; the gaps (N,)."""
-    gaps, better = [], 0
+    gaps = []
+    better = 0
     for case in cases:
         found = case.found(case.prior, most_nodes)
         cost, incumbent = case.costs(np.vstack([found, case.prior]))
@@ -184,7 +186,8 @@ def test_the_search_is_what_it_is_in_plain_python():
 
 def test_the_cost_is_that_of_the_reference_and_its_bound_is_lower(rng):
     """What a motion within a node changes, where all points are within reach of walls."""
-    violations, compared = 0, 0
+    violations = 0
+    compared = 0
     for seed in range(20):
         case = Case(seed)
         away = np.hypot(*case.scan[:, :2].T)

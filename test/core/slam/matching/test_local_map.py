@@ -37,7 +37,8 @@ def add(local_map, points, laser=(0.0, 0.0), angle_rad=math.pi / 2.0):
 
 
 def cell_at(local_map, x, y):
-    row, col = math.floor(y / CELL_M), math.floor(x / CELL_M)
+    row = math.floor(y / CELL_M)
+    col = math.floor(x / CELL_M)
     return local_map.tiles.read(row, col, 1, 1)[0, 0]
 
 
@@ -109,7 +110,8 @@ def test_distances_follow_walls_that_come_and_go(seed):
         laser = rng.uniform(-1.0, 1.0, 2)
         add(local_map, laser + rng.uniform(-1.5, 1.5, (int(rng.integers(1, 60)), 2)), laser)
     cells, *_ = cells_of(local_map)
-    truth, found = nearest(cells), told(cells)
+    truth = nearest(cells)
+    found = told(cells)
     np.testing.assert_array_equal(np.isfinite(found), np.isfinite(truth))
     near = np.isfinite(truth)
     # What a neighbour tells may be a little farther than the nearest wall, rarely.
@@ -189,7 +191,8 @@ def test_hits_and_looks_through_are_counted():
 
 def test_counts_forget_and_do_not_run_over():
     local_map = LocalMap()
-    laser, point = np.array([0.025, 0.025]), np.array([[1.025, 0.025]])
+    laser = np.array([0.025, 0.025])
+    point = np.array([[1.025, 0.025]])
     for _ in range(600):
         add(local_map, point, laser, 0.0)
     cells, *_ = cells_of(local_map)
@@ -206,7 +209,8 @@ def test_counts_forget_and_do_not_run_over():
 
 def test_a_cell_is_a_wall_while_enough_of_its_observations_are_hits():
     """One hit, and three beams that pass: at a quarter it is none."""
-    local_map, point = LocalMap(), np.array([[1.025, 0.025]])
+    local_map = LocalMap()
+    point = np.array([[1.025, 0.025]])
     add(local_map, point, (0.025, 0.025), 0.0)
     for passes in range(4):
         is_wall = passes < 3
@@ -247,7 +251,8 @@ def test_distances_from_a_slanted_noisy_wall(rng, angle):
 
 
 def test_a_state_is_restored(rng):
-    local_map, again = LocalMap(), LocalMap()
+    local_map = LocalMap()
+    again = LocalMap()
     for pose in AROUND_BOX:
         add_scan(local_map, ROOM, pose - [8.0, 20.0, 0.0], rng)
         add_scan(local_map, ROOM, pose, rng)
@@ -335,7 +340,8 @@ def test_an_empty_scan_changes_nothing(rng):
 
 
 def test_points_that_are_added_stay_as_they_are(rng):
-    points, pose = seen_in(ROOM, AROUND_BOX[0], rng), AROUND_BOX[0]
+    points = seen_in(ROOM, AROUND_BOX[0], rng)
+    pose = AROUND_BOX[0]
     copies = points.copy(), pose.copy()
     LocalMap().add_scan(points, np.zeros(3), pose)
     np.testing.assert_array_equal(points, copies[0])
@@ -375,7 +381,8 @@ def test_a_scan_is_put_where_the_robot_is():
     T_base_laser = np.array([0.2, -0.1, 0.3])
     pose = np.array([3.0, 2.0, 1.0])
     points = seen_in(ROOM, pose)
-    local_map, by_hand = LocalMap(), LocalMap()
+    local_map = LocalMap()
+    by_hand = LocalMap()
     local_map.add_scan(points, T_base_laser, pose)
     laser = se2.compose(pose, T_base_laser)
     points_map = points.copy()
@@ -390,7 +397,8 @@ def test_a_scan_is_put_where_the_robot_is():
 
 def test_kernels_are_what_they_are_in_plain_python(rng, monkeypatch):
     """The box comes and goes."""
-    compiled, plain = LocalMap(), LocalMap()
+    compiled = LocalMap()
+    plain = LocalMap()
     scans = [
         (seen_in(segments, pose, rng)[::7], pose)
         for segments in (ROOM, WITHOUT_BOX, WITHOUT_BOX, WITHOUT_BOX)

@@ -60,12 +60,14 @@ def assigned(local_map, scan, pose):
     """Of each point: whether its cell was seen, and the mean and cell of its wall, or None."""
     found = []
     for x, y in se2.transform_points(pose, np.ascontiguousarray(scan[:, :2])):
-        row, col = math.floor(y / CELL_M), math.floor(x / CELL_M)
+        row = math.floor(y / CELL_M)
+        col = math.floor(x / CELL_M)
         cell = cell_at(local_map, row, col)
         if cell['to_row'] == 0:
             found.append((cell['seen'] > 0, None, None))
             continue
-        row, col = row + int(cell['to_row']) - HERE, col + int(cell['to_col']) - HERE
+        row = row + int(cell['to_row']) - HERE
+        col = col + int(cell['to_col']) - HERE
         wall = cell_at(local_map, row, col)
         mean = CELL_M * np.array([col + float(wall['x']), row + float(wall['y'])])
         found.append((cell['seen'] > 0, mean, wall))
@@ -84,7 +86,8 @@ def metric_of(wall):
 
 
 def is_behind(point, pose, wall):
-    c, s = math.cos(pose[2]), math.sin(pose[2])
+    c = math.cos(pose[2])
+    s = math.sin(pose[2])
     back = np.array([[c, -s], [s, c]]) @ point[3:]
     return back @ [wall['face_x'], wall['face_y']] < -0.1
 
@@ -95,9 +98,11 @@ OFF_SIGMAS = 3.0  # a point that is farther off its wall contradicts it, where a
 
 def reference(local_map, scan, pose):
     """H (3, 3) and sums (5,)."""
-    H, sums = np.zeros((3, 3)), np.zeros(5)
+    H = np.zeros((3, 3))
+    sums = np.zeros(5)
     far = cauchy(FAR**2, WIDTH)
-    c, s = math.cos(pose[2]), math.sin(pose[2])
+    c = math.cos(pose[2])
+    s = math.sin(pose[2])
     for point, (seen, mean, wall) in zip(scan, assigned(local_map, scan, pose), strict=True):
         weight = point[2]
         sums[1] += weight
@@ -172,7 +177,8 @@ def test_the_sums_are_those_of_the_reference(rng, room, scan):
 
 def test_the_gradient_is_that_of_numeric_differences(rng, room, scan):
     """With the wall of each point held: away from where another one is the nearest."""
-    step, compared = 1e-6, 0
+    step = 1e-6
+    compared = 0
     for k in range(24):
         pose = TRUTH + rng.normal(0.0, [0.1, 0.1, 0.1])
         tried = scan if k % 2 else strange_scan(rng)
@@ -365,7 +371,8 @@ def test_headings_of_minima_are_wrapped(rng):
 def test_kernels_are_what_they_are_in_plain_python(rng, room, scan, monkeypatch):
     thin = np.ascontiguousarray(np.vstack([scan[::6], strange_scan(rng, 20)]))
     information = np.linalg.inv(DOUBT)
-    pose, prior = TRUTH + [0.04, 0.02, -0.03], TRUTH
+    pose = TRUTH + [0.04, 0.02, -0.03]
+    prior = TRUTH
     evaluated = evaluate(thin, pose, room.lattice, *NOISE)
     arguments = (thin, pose, prior, information, room.lattice, *NOISE)
     minimized = minimize(*arguments)

@@ -45,10 +45,8 @@ def test_normals_point_from_the_faces_to_free_cells():
         assert np.hypot(*normal) == 1.0
         for sign, free in ((1.0, True), (-1.0, False)):
             x, y = (points + sign * 0.05 * normal).T
-            rows, cols = (
-                np.floor((y - 2.0) / 0.1).astype(int),
-                np.floor((x + 1.0) / 0.1).astype(int),
-            )
+            rows = np.floor((y - 2.0) / 0.1).astype(int)
+            cols = np.floor((x + 1.0) / 0.1).astype(int)
             assert (patch.free[rows, cols] == free).all()
 
 
@@ -82,7 +80,9 @@ def killed(config, seed, resolution, slip):
     last = None
     grid = OccupancyGrid(OccupancyConfig(resolution_m=resolution))
     off = se2.pose(slip[0], 0.0, slip[1])
-    before, after, begin = 0.0, 0.0, np.zeros(3)
+    before = 0.0
+    after = 0.0
+    begin = np.zeros(3)
     for k, (truth, odom) in enumerate(drive(700, rng, START)):
         scan = scan_in(ROOM, truth, rng, k)
         if k < 400:

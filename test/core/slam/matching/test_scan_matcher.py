@@ -24,7 +24,8 @@ def match(local_map, points, prior, covariance=DOUBT):
 
 def nearest_minimum(local_map, points, prior, covariance):
     """The match without a search."""
-    scan, information = MATCHER.weighted(points, LASER), np.linalg.inv(covariance)
+    scan = MATCHER.weighted(points, LASER)
+    information = np.linalg.inv(covariance)
     return MATCHER._refined(scan, local_map, prior, prior, information)
 
 
@@ -40,7 +41,8 @@ def clutter(rng, number):
 
 def people(pose, number, rng):
     """Walls (N, 4) of as many octagons of 40 cm around a pose, 0.8 to 2 m before it."""
-    away, bearing = rng.uniform(0.8, 2.0, number), rng.uniform(-1.5, 1.5, number) + pose[2]
+    away = rng.uniform(0.8, 2.0, number)
+    bearing = rng.uniform(-1.5, 1.5, number) + pose[2]
     middles = pose[:2] + away[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
     turns = 0.25 * np.pi * np.arange(9)
     corners = middles[:, None] + 0.2 * np.column_stack([np.cos(turns), np.sin(turns)])
@@ -95,7 +97,8 @@ def test_the_covariance_is_that_of_scan_and_prior_together(rng, room):
 
 def test_a_prior_far_off_is_searched_for(rng, room):
     """Half a metre and twenty degrees: refinement alone ends elsewhere, the search finds it."""
-    missed, found = 0, 0
+    missed = 0
+    found = 0
     wide = np.diag(np.square([0.3, 0.3, 0.2]))
     shifts = ([0.35, 0.35], [-0.35, 0.35], [0.5, 0.0], [0.0, -0.5], [0.5, -0.5], [-0.5, -0.5])
     for turn in np.radians([-20.0, 20.0]):
@@ -115,7 +118,8 @@ def test_where_wheels_have_slipped_the_surroundings_are_searched(rng):
     room = map_of(ROOM, around(truth, 15, rng), rng)
     sharp = np.diag(np.square([0.01, 0.01, 0.01]))
     slips = ([0.4, 0.2, 0.4], [-0.4, 0.4, -0.4], [0.4, -0.4, 0.4], [0.0, 0.4, -0.3])
-    missed, found = 0, 0
+    missed = 0
+    found = 0
     for slip in slips:
         points = seen_in(ROOM, truth, rng)
         alone = nearest_minimum(room, points, truth + slip, sharp)
@@ -194,12 +198,11 @@ def test_a_robot_that_sees_no_end_of_a_corridor_goes_on_along_it():
 @pytest.mark.parametrize('away_m', [0.3, 0.6, 1.5])
 def test_a_scan_in_one_room_is_not_drawn_to_the_other_face_of_a_wall(rng, away_m):
     """A thin wall of 10 cm, seen from both rooms; where either face ends up decides nothing."""
-    south, north = [-4.0, 0.0, 4.0, 0.0], [4.0, 0.1, -4.0, 0.1]
+    south = [-4.0, 0.0, 4.0, 0.0]
+    north = [4.0, 0.1, -4.0, 0.1]
     sides = np.array([[-2.0, -3.0, -2.0, 0.0], [2.5, 3.0, 2.5, 0.1]])
-    below, above = (
-        np.array([south, sides[0]]),
-        np.array([north, sides[1]]),
-    )
+    below = np.array([south, sides[0]])
+    above = np.array([north, sides[1]])
     poses = [np.array([x, -away_m, math.pi / 2.0]) for x in np.linspace(-0.5, 0.5, 8)]
     local_map = map_of(below, poses, rng)
     turned = [np.array([x, 0.1 + away_m, -math.pi / 2.0]) for x in np.linspace(-0.5, 0.5, 8)]
@@ -332,7 +335,8 @@ def test_a_scan_of_twice_the_beams_says_no_more_of_what_is_near(room):
 
 def test_the_same_input_gives_the_same_output_and_stays_as_it_is(rng, room):
     points = seen_in(ROOM, TRUTH, rng)
-    prior, covariance = TRUTH + [0.4, 0.3, 0.2], DOUBT.copy()
+    prior = TRUTH + [0.4, 0.3, 0.2]
+    covariance = DOUBT.copy()
     copies = points.copy(), prior.copy(), {k: v.copy() for k, v in room.state().items()}
     first, second = (match(room, points, prior, covariance) for _ in range(2))
     np.testing.assert_array_equal(first.T_map_base, second.T_map_base)

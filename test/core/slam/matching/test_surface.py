@@ -131,7 +131,8 @@ def test_normals_of_a_flat_wall_at_all_incidences(rng, incidence, away_m):
     along = np.array([-normal[1], normal[0]])
     middle = np.array([away_m, 0.0])
     wall = np.array([[*(middle - 2.0 * along), *(middle + 2.0 * along)]])
-    off, number = [], 0
+    off = []
+    number = 0
     for _ in range(20):
         scan = scan_in(wall, np.zeros(3), rng, beams=361)
         points = surface_points(scan, RANGE_MAX_M)
@@ -174,7 +175,8 @@ def test_a_jump_between_two_walls_is_no_surface():
 
 def test_a_beam_that_met_nothing_parts_its_neighbours():
     """Two pieces of wall 20 cm apart and collinear; the beam through the gap does not return."""
-    points, beams = np.column_stack([np.ones(6), 0.2 * np.arange(6)]), np.arange(6)
+    points = np.column_stack([np.ones(6), 0.2 * np.arange(6)])
+    beams = np.arange(6)
     assert surface._links(points, beams)[1:6].all()
     beams[3:] += 1
     assert surface._links(points, beams)[1:6].tolist() == [True, True, False, True, True]
@@ -229,7 +231,8 @@ def test_points_that_are_left_out_part_the_scan_too():
 
 def test_lone_points_are_dropped():
     """A thin post before a wall, met by one beam, and the edges that are a range in between."""
-    wall, post = [4.0, -8.0, 4.0, 8.0], [2.0, -0.005, 2.0, 0.005]
+    wall = [4.0, -8.0, 4.0, 8.0]
+    post = [2.0, -0.005, 2.0, 0.005]
     points = seen_in(np.array([wall, post]), np.zeros(3))
     assert points[:, 0].min() > 3.9
     assert len(points) > 100
@@ -257,7 +260,8 @@ def test_what_scatters_has_no_sure_normal(rng):
 
 def test_the_spacing_is_the_gap_to_the_nearest_neighbour_on_the_surface():
     y = np.array([0.0, 0.02, 0.05, 0.15, 0.16])
-    points, beams = np.column_stack([np.ones(5), y]), np.array([0, 1, 2, 3, 5])
+    points = np.column_stack([np.ones(5), y])
+    beams = np.array([0, 1, 2, 3, 5])
     found = surface._surface(points, beams)
     np.testing.assert_array_equal(found[:, 1], y[:4], 'the last one is alone')
     np.testing.assert_allclose(found[:, 4], [0.02, 0.02, 0.03, 0.1])
@@ -285,10 +289,12 @@ def test_any_points_of_any_beams_have_a_surface(data, number):
     coordinates = st.sampled_from([-0.1, 0.0, 0.05, 0.1, 0.1000001, 2.0]) | st.floats(-30.0, 30.0)
     flat = data.draw(st.lists(coordinates, min_size=2 * number, max_size=2 * number))
     gaps = data.draw(st.lists(st.integers(1, 3), min_size=number, max_size=number))
-    points, beams = np.array(flat, dtype=float).reshape(-1, 2), np.cumsum(gaps, dtype=np.int64)
+    points = np.array(flat, dtype=float).reshape(-1, 2)
+    beams = np.cumsum(gaps, dtype=np.int64)
     # No laser has two adjacent beams that end in the very same place.
     assume(np.hypot(*np.diff(points, axis=0).T).min(initial=1.0) > 1e-9)
-    given_points, given_beams = points.copy(), beams.copy()
+    given_points = points.copy()
+    given_beams = beams.copy()
     found = surface._surface(points, beams)
     np.testing.assert_array_equal(points, given_points)
     np.testing.assert_array_equal(beams, given_beams)

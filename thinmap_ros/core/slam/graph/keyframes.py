@@ -195,7 +195,8 @@ def inverse(matrix: Array) -> Array:
 
 def turned(covariance: Array, theta: float) -> Array:
     """Covariance (3, 3) of a relative pose, turned from a frame at theta to that of the map."""
-    c, s = math.cos(theta), math.sin(theta)
+    c = math.cos(theta)
+    s = math.sin(theta)
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     return np.asarray(R @ covariance @ R.T)
 
@@ -218,9 +219,14 @@ def covariances_from(root: int, poses: Array, edges: list[Edge], heading_varianc
     a = np.array([edge.a for edge in edges], dtype=np.int64)
     b = np.array([edge.b for edge in edges], dtype=np.int64)
     covariances = np.linalg.inv(np.array([edge.information for edge in edges]).reshape(-1, 3, 3))
-    c, s = np.cos(poses[a, 2]), np.sin(poses[a, 2])
+    c = np.cos(poses[a, 2])
+    s = np.sin(poses[a, 2])
     R = np.zeros((len(edges), 3, 3))
-    R[:, 0, 0], R[:, 0, 1], R[:, 1, 0], R[:, 1, 1], R[:, 2, 2] = c, -s, s, c, 1.0
+    R[:, 0, 0] = c
+    R[:, 0, 1] = -s
+    R[:, 1, 0] = s
+    R[:, 1, 1] = c
+    R[:, 2, 2] = 1.0
     order = np.argsort(np.concatenate([a, b]), kind='stable')
     first = np.searchsorted(np.concatenate([a, b])[order], np.arange(len(poses) + 1))
     own = R @ covariances @ R.transpose(0, 2, 1)
@@ -268,7 +274,8 @@ def _covariances(
             other = b[edge] if tie < len(a) else a[edge]
             if done[other]:
                 continue
-            x, y = poses[other, 0] - poses[k, 0], poses[other, 1] - poses[k, 1]
+            x = poses[other, 0] - poses[k, 0]
+            y = poses[other, 1] - poses[k, 1]
             # Against its direction the edge's error in heading acts at the far end.
             step = own[edge] if tie < len(a) else _carry(own[edge], x, y)
             new = _carry(found[k], x, y) + step

@@ -247,7 +247,8 @@ class LoopClosure:
 
     def _match(self, job: _Job) -> None:
         """Match keyframe k, or the pending one, with the submap around j."""
-        j, k = job.j, job.k
+        j = job.j
+        k = job.k
         here = self._frame(k)
         frames = self.keyframes.frames
         is_step = self._is_step(j, k)

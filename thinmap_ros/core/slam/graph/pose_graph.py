@@ -74,15 +74,23 @@ class _Edges:
 
 def _linearise(poses: Array, edges: _Edges) -> tuple[Array, Array, Array]:
     """Error (M, 3) of each edge, in the frame of its pose a, and Jacobians (M, 3, 3) by a and b."""
-    a, b = poses[edges.a], poses[edges.b]
-    c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
-    dx, dy = (b - a)[:, 0], (b - a)[:, 1]
+    a = poses[edges.a]
+    b = poses[edges.b]
+    c = np.cos(a[:, 2])
+    s = np.sin(a[:, 2])
+    dx = (b - a)[:, 0]
+    dy = (b - a)[:, 1]
     e = np.column_stack([c * dx + s * dy, -s * dx + c * dy, b[:, 2] - a[:, 2]]) - edges.T_a_b
     e[:, 2] = wrap(e[:, 2])
     by_b = np.zeros((len(e), 3, 3))
-    by_b[:, 0, 0], by_b[:, 0, 1], by_b[:, 1, 0], by_b[:, 1, 1], by_b[:, 2, 2] = c, s, -s, c, 1.0
+    by_b[:, 0, 0] = c
+    by_b[:, 0, 1] = s
+    by_b[:, 1, 0] = -s
+    by_b[:, 1, 1] = c
+    by_b[:, 2, 2] = 1.0
     by_a = -by_b
-    by_a[:, 0, 2], by_a[:, 1, 2] = -s * dx + c * dy, -c * dx - s * dy
+    by_a[:, 0, 2] = -s * dx + c * dy
+    by_a[:, 1, 2] = -c * dx - s * dy
     return e, by_a, by_b
 
 
@@ -98,7 +106,9 @@ def _step(edges: _Edges, e: Array, by_a: Array, by_b: Array, W: Array) -> Array:
     number = int(max(edges.a.max(), edges.b.max())) + 1
     size = 3 * number
     gradient = np.zeros((number, 3))
-    blocks, rows, cols = [], [], []
+    blocks = []
+    rows = []
+    cols = []
     sides = ((edges.a, by_a), (edges.b, by_b))
     for i, J_i in sides:
         weighted = np.swapaxes(J_i, 1, 2) @ W

@@ -43,7 +43,8 @@ class AnchoredPoses:
             np.array(self._anchors, dtype=np.int64)
         ]
         moved = np.array(self._from_anchor).reshape(-1, 3)
-        c, s = np.cos(anchors[:, 2]), np.sin(anchors[:, 2])
+        c = np.cos(anchors[:, 2])
+        s = np.sin(anchors[:, 2])
         x = anchors[:, 0] + c * moved[:, 0] - s * moved[:, 1]
         y = anchors[:, 1] + s * moved[:, 0] + c * moved[:, 1]
         return np.column_stack([x, y, se2.wrap(anchors[:, 2] + moved[:, 2])])

@@ -39,7 +39,8 @@ def _cost(
     """
     scale = lattice.cell_m / sigma
     far = far_cost(lattice, sigma, width)
-    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    cos = math.cos(pose[2])
+    sin = math.sin(pose[2])
     cost = 0.0
     for i in range(len(scan)):
         x = pose[0] + cos * scan[i, 0] - sin * scan[i, 1]
@@ -53,7 +54,8 @@ def _cost(
             cell = lattice.pool[slot, row & _MASK, col & _MASK]
             share = 1.0 if cell['seen'] > 0 else UNSEEN_COST
             if cell['to_row'] != 0:
-                down, right = int(cell['to_row']) - HERE, int(cell['to_col']) - HERE
+                down = int(cell['to_row']) - HERE
+                right = int(cell['to_col']) - HERE
                 away = math.sqrt(down * down + right * right)
         if away < 0.0:
             cost += scan[i, 2] * share * far

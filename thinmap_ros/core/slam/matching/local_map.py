@@ -165,7 +165,8 @@ class LocalMap:
             return
         once = len(np.unique(places, axis=0)) == len(places)
         snapshot.require(once, 'features: tiles: one twice', 'each tile once')
-        low, high = places.min(axis=0), places.max(axis=0)
+        low = places.min(axis=0)
+        high = places.max(axis=0)
         self.tiles.reach(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
         self.tiles.ensure(places)
         cells = self.tiles.pool[: len(places)]
@@ -217,7 +218,8 @@ def cell_of(at: float) -> int:
 @inlined
 def slot_of(lattice: Lattice, row: int, col: int) -> int:
     """Slot of the tile with a cell, counted from the first one, or NO_TILE."""
-    tile_row, tile_col = row >> _SHIFT, col >> _SHIFT
+    tile_row = row >> _SHIFT
+    tile_col = col >> _SHIFT
     if tile_row < 0 or tile_col < 0:
         return NO_TILE
     if tile_row >= lattice.directory.shape[0] or tile_col >= lattice.directory.shape[1]:
@@ -272,11 +274,14 @@ def _touched(
     """Tiles from low to high that beams touch, or whose cells are within reach of their ends."""
     touched = np.zeros((high[0] - low[0] + 1, high[1] - low[1] + 1), dtype=np.bool_)
     for i in range(len(points)):
-        dx, dy = points[i, 0] - laser[0], points[i, 1] - laser[1]
+        dx = points[i, 0] - laser[0]
+        dy = points[i, 1] - laser[1]
         steps = int(2.0 * math.hypot(dx, dy) / edge_m) + 1
         for k in range(steps):
-            x, y = laser[0] + k / steps * dx, laser[1] + k / steps * dy
-            row, col = int(math.floor(y / edge_m)), int(math.floor(x / edge_m))
+            x = laser[0] + k / steps * dx
+            y = laser[1] + k / steps * dy
+            row = int(math.floor(y / edge_m))
+            col = int(math.floor(x / edge_m))
             touched[row - low[0], col - low[1]] = True
         for a in range(-1, 2):
             for b in range(-1, 2):
@@ -304,21 +309,28 @@ def _observe(cell: Any, hit: int) -> None:
 @kernel
 def _add(points: Array, laser: Array, T_map_base: Array, lattice: Lattice, share: float) -> None:
     """Count what beams went through, then where they ended; update the nearest walls."""
-    cos, sin = math.cos(T_map_base[2]), math.sin(T_map_base[2])
+    cos = math.cos(T_map_base[2])
+    sin = math.sin(T_map_base[2])
     x0 = (T_map_base[0] + cos * laser[0] - sin * laser[1]) / lattice.cell_m - lattice.first_col
     y0 = (T_map_base[1] + sin * laser[0] + cos * laser[1]) / lattice.cell_m - lattice.first_row
     gone = [(0, 0) for _ in range(0)]
     for i in range(len(points)):
-        px, py = points[i, 0], points[i, 1]
+        px = points[i, 0]
+        py = points[i, 1]
         x1 = (T_map_base[0] + cos * px - sin * py) / lattice.cell_m - lattice.first_col
         y1 = (T_map_base[1] + sin * px + cos * py) / lattice.cell_m - lattice.first_row
-        end_row, end_col = cell_of(y1), cell_of(x1)
+        end_row = cell_of(y1)
+        end_col = cell_of(x1)
         steps = int(max(abs(x1 - x0), abs(y1 - y0))) + 1
-        step_x, step_y = (x1 - x0) / steps, (y1 - y0) / steps
-        x, y = x0 + 0.5 * step_x, y0 + 0.5 * step_y
+        step_x = (x1 - x0) / steps
+        step_y = (y1 - y0) / steps
+        x = x0 + 0.5 * step_x
+        y = y0 + 0.5 * step_y
         for _ in range(steps):
-            row, col = cell_of(y), cell_of(x)
-            x, y = x + step_x, y + step_y
+            row = cell_of(y)
+            col = cell_of(x)
+            x = x + step_x
+            y = y + step_y
             slot = slot_of(lattice, row, col)
             # A beam that grazes a wall says nothing against the cells beside its end.
             if slot == NO_TILE or (abs(row - end_row) <= 1 and abs(col - end_col) <= 1):
@@ -355,20 +367,25 @@ def _learn_surface(cell: Any, x: float, y: float, normal: tuple[float, float, fl
 @kernel
 def _hit(points: Array, laser: Array, T_map_base: Array, lattice: Lattice, share: float) -> None:
     """Count the points that beams met."""
-    cos, sin = math.cos(T_map_base[2]), math.sin(T_map_base[2])
-    cos2, sin2 = math.cos(2.0 * T_map_base[2]), math.sin(2.0 * T_map_base[2])
+    cos = math.cos(T_map_base[2])
+    sin = math.sin(T_map_base[2])
+    cos2 = math.cos(2.0 * T_map_base[2])
+    sin2 = math.sin(2.0 * T_map_base[2])
     for i in range(len(points)):
-        px, py = points[i, 0], points[i, 1]
+        px = points[i, 0]
+        py = points[i, 1]
         x = (T_map_base[0] + cos * px - sin * py) / lattice.cell_m - lattice.first_col
         y = (T_map_base[1] + sin * px + cos * py) / lattice.cell_m - lattice.first_row
-        row, col = cell_of(y), cell_of(x)
+        row = cell_of(y)
+        col = cell_of(x)
         slot = slot_of(lattice, row, col)
         if slot == NO_TILE:
             continue
         cell = lattice.pool[slot, row & _MASK, col & _MASK]
         was_wall = _is_wall(cell, share)
         _observe(cell, 1)
-        c2, s2 = points[i, 2], points[i, 3]
+        c2 = points[i, 2]
+        s2 = points[i, 3]
         back_x = cos * (laser[0] - px) - sin * (laser[1] - py)
         back_y = sin * (laser[0] - px) + cos * (laser[1] - py)
         turned = (cos2 * c2 - sin2 * s2, sin2 * c2 + cos2 * s2)
@@ -387,7 +404,8 @@ def _lead(
 ) -> None:
     """Have all cells of tiles with first cells (N, 2) know their nearest walls."""
     for i in range(len(corners)):
-        top, left = corners[i, 0] - lattice.first_row, corners[i, 1] - lattice.first_col
+        top = corners[i, 0] - lattice.first_row
+        left = corners[i, 1] - lattice.first_col
         for row in range(top, top + TILE):
             for col in range(left, left + TILE):
                 slot = slot_of(lattice, row, col)
@@ -405,9 +423,11 @@ def _appear(lattice: Lattice, row: int, col: int) -> None:
             if slot == NO_TILE or squared > lattice.reach * lattice.reach:
                 continue
             cell = lattice.pool[slot, (row + down) & _MASK, (col + right) & _MASK]
-            to_row, to_col = int(cell['to_row']) - HERE, int(cell['to_col']) - HERE
+            to_row = int(cell['to_row']) - HERE
+            to_col = int(cell['to_col']) - HERE
             if cell['to_row'] == 0 or squared < to_row * to_row + to_col * to_col:
-                cell['to_row'], cell['to_col'] = HERE - down, HERE - right
+                cell['to_row'] = HERE - down
+                cell['to_col'] = HERE - right
 
 
 @kernel
@@ -450,10 +470,12 @@ def _ask(lattice: Lattice, row: int, col: int) -> bool:
                 continue
             down = i + int(other['to_row']) - HERE
             right = j + int(other['to_col']) - HERE
-            to_row, to_col = int(cell['to_row']) - HERE, int(cell['to_col']) - HERE
+            to_row = int(cell['to_row']) - HERE
+            to_col = int(cell['to_col']) - HERE
             squared = down * down + right * right
             nearer = cell['to_row'] == 0 or squared < to_row * to_row + to_col * to_col
             if squared <= lattice.reach * lattice.reach and nearer:
-                cell['to_row'], cell['to_col'] = HERE + down, HERE + right
+                cell['to_row'] = HERE + down
+                cell['to_col'] = HERE + right
                 changed = True
     return changed

@@ -72,13 +72,17 @@ def evaluate(
     m; width: of the loss, in sigmas. Sums: cost, and weights of all points, of those on their
     walls, of those in the open, and the cost that young walls leave out.
     """
-    H, g, sums = np.zeros((3, 3)), np.zeros(3), np.zeros(5)
-    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    H = np.zeros((3, 3))
+    g = np.zeros(3)
+    sums = np.zeros(5)
+    cos = math.cos(pose[2])
+    sin = math.sin(pose[2])
     cell_m = lattice.cell_m
     scale = cell_m / sigma
     far = far_cost(lattice, sigma, width)
     for i in range(len(scan)):
-        px, py = cos * scan[i, 0] - sin * scan[i, 1], sin * scan[i, 0] + cos * scan[i, 1]
+        px = cos * scan[i, 0] - sin * scan[i, 1]
+        py = sin * scan[i, 0] + cos * scan[i, 1]
         weight = scan[i, 2]
         sums[1] += weight
         x = (pose[0] + px) / cell_m - lattice.first_col
@@ -95,7 +99,8 @@ def evaluate(
             continue
         w = weight * wall['hits'] / (wall['hits'] + _YOUNG_HITS)
         xx, xy, yy = _normal_matrix(wall['cos2'], wall['sin2'])
-        ex, ey = xx * dx + xy * dy, xy * dx + yy * dy
+        ex = xx * dx + xy * dy
+        ey = xy * dx + yy * dy
         squared = (dx * ex + dy * ey) * scale * scale
         sums[0] += w * loss(squared, width)
         sums[4] += (weight - w) * far * UNSEEN_COST
@@ -105,18 +110,22 @@ def evaluate(
         elif squared > _OFF_SIGMAS * _OFF_SIGMAS or is_beyond:
             sums[3] += weight * is_seen
         w /= (1.0 + squared / (width * width)) * sigma * sigma
-        ex, ey = ex * cell_m, ey * cell_m
+        ex = ex * cell_m
+        ey = ey * cell_m
         g[0] -= w * ex
         g[1] -= w * ey
         g[2] -= w * (px * ey - py * ex)
-        tx, ty = -py * xx + px * xy, -py * xy + px * yy
+        tx = -py * xx + px * xy
+        ty = -py * xy + px * yy
         H[0, 0] += w * xx
         H[0, 1] += w * xy
         H[1, 1] += w * yy
         H[0, 2] += w * tx
         H[1, 2] += w * ty
         H[2, 2] += w * (px * ty - py * tx)
-    H[1, 0], H[2, 0], H[2, 1] = H[0, 1], H[0, 2], H[1, 2]
+    H[1, 0] = H[0, 1]
+    H[2, 0] = H[0, 2]
+    H[2, 1] = H[1, 2]
     return H, g, sums
 
 
@@ -135,7 +144,8 @@ def minimize(
     Returns the pose (3,), the information (3, 3) of the scan there, the sums of `evaluate` with the
     prior's cost, and the weight of the prior.
     """
-    pose, damping = start.copy(), 1e-4
+    pose = start.copy()
+    damping = 1e-4
     H, g, sums = evaluate(scan, pose, lattice, sigma, width)
     pull, weight, cost = by_prior(pose, prior, information)
     sums[0] += cost
@@ -149,7 +159,12 @@ def minimize(
         pull_new, weight_new, cost = by_prior(tried, prior, information)
         new[0] += cost
         if new[0] < sums[0]:
-            pose, H, g, sums, pull, weight = tried, H_new, g_new, new, pull_new, weight_new
+            pose = tried
+            H = H_new
+            g = g_new
+            sums = new
+            pull = pull_new
+            weight = weight_new
             damping = max(0.1 * damping, 1e-6)
         else:
             damping *= 10.0

@@ -67,27 +67,42 @@ def _surface(points: Array, beams: NDArray[np.int64]) -> Array:
     found = np.empty((len(points), COLUMNS))
     used = 0
     for i in range(len(points)):
-        m, mx, my, xx, xy, yy, gap = 1, 0.0, 0.0, 0.0, 0.0, 0.0, np.inf
+        m = 1
+        mx = 0.0
+        my = 0.0
+        xx = 0.0
+        xy = 0.0
+        yy = 0.0
+        gap = np.inf
         for side in (-1, 1):
             k = i
             while linked[k if side < 0 else k + 1]:
                 k += side
-                dx, dy = points[k, 0] - points[i, 0], points[k, 1] - points[i, 1]
-                m, mx, my = m + 1, mx + dx, my + dy
-                xx, xy, yy = xx + dx * dx, xy + dx * dy, yy + dy * dy
+                dx = points[k, 0] - points[i, 0]
+                dy = points[k, 1] - points[i, 1]
+                m = m + 1
+                mx = mx + dx
+                my = my + dy
+                xx = xx + dx * dx
+                xy = xy + dx * dy
+                yy = yy + dy * dy
                 away = math.hypot(dx, dy)
                 gap = min(gap, away)
                 if away >= WINDOW_M:
                     break
         if m == 1:
             continue
-        mx, my = mx / m, my / m
-        xx, xy, yy = xx / m - mx * mx, xy / m - mx * my, yy / m - my * my
+        mx = mx / m
+        my = my / m
+        xx = xx / m - mx * mx
+        xy = xy / m - mx * my
+        yy = yy / m - my * my
         spread = math.hypot(0.5 * (xx - yy), xy)
         across = max(0.5 * (xx + yy) - spread - _RANGE_NOISE_M * _RANGE_NOISE_M, 0.0)
         along = 0.5 * (xx + yy) + spread
         length = (along - across) / max((along + across) * spread, 1e-12)
-        found[used, 0], found[used, 1] = points[i, 0], points[i, 1]
+        found[used, 0] = points[i, 0]
+        found[used, 1] = points[i, 1]
         found[used, 2] = -length * 0.5 * (xx - yy)
         found[used, 3] = -length * xy
         found[used, 4] = gap
