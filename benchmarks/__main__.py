@@ -14,7 +14,7 @@ from benchmarks.speed import scan_matching as matching
 from benchmarks.speed import topology_update as online
 from benchmarks.worlds import WORLDS
 from thinmap_ros.evaluation.machine import machine
-from thinmap_ros.evaluation.table import Row, show
+from thinmap_ros.evaluation.outcome import Row, show
 
 _ALL: dict[str, Callable[[Path, bool], Iterable[Row]]] = {
     'thinning': thinning.run,

@@ -12,7 +12,7 @@ from typing import Any
 from thinmap_ros.evaluation.strategy_comparison import OURS, markdown, saved
 
 Report = dict[str, Any]
-_PAGE = Path(__file__).resolve().parent.parent / 'docs' / 'exploration.md'
+_PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'exploration.md'
 _FULL_COVERAGE = 0.99
 _NEARLY_ALL = 0.995
 _HEAD = """\

@@ -14,7 +14,7 @@ from pathlib import Path
 from benchmarks.kidnapped.cases import ROWS, Case, Setting
 from benchmarks.kidnapped.summary import Written, summary
 from benchmarks.worlds import WORLDS
-from thinmap_ros.evaluation.table import show
+from thinmap_ros.evaluation.outcome import show
 
 _LOG = WORLDS.parent / 'logs' / 'intel' / 'log.clf'
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from benchmarks.kidnapped.__main__ import read
 from benchmarks.kidnapped.summary import Written, by_group, summary
-from thinmap_ros.evaluation.table import VERDICTS
+from thinmap_ros.evaluation.outcome import VERDICTS
 
 _HEAD = """\
 # Global localization, measured
@@ -78,7 +78,5 @@ def _groups(records: list[Written]) -> list[str]:
 
 
 if __name__ == '__main__':
-    docs = (
-        Path(sys.argv[2]) if len(sys.argv) > 2 else Path(__file__).resolve().parent.parent / 'docs'
-    )
+    docs = Path(sys.argv[2]) if len(sys.argv) > 2 else Path(__file__).resolve().parents[2] / 'docs'
     (docs / 'localization.md').write_text(page(Path(sys.argv[1])), encoding='utf-8')

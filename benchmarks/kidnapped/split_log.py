@@ -17,7 +17,7 @@ from thinmap_ros.core.places.observation import observe
 from thinmap_ros.core.places.observation_model import calibrate
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.evaluation.alignment import between_paths
+from thinmap_ros.evaluation.trajectory_errors import between_paths
 from thinmap_ros.logs.carmen import CarmenLog
 from thinmap_ros.logs.log import OdometryEvent
 from thinmap_ros.pipeline import Pipeline

@@ -26,7 +26,7 @@ from thinmap_ros.sim.drives import Look, patch_of, random_drive, random_start
 from thinmap_ros.sim.laser import Lms200Config
 from thinmap_ros.sim.world import World
 
-LAB = Path(__file__).resolve().parent.parent / 'worlds' / 'lab.yaml'
+LAB = Path(__file__).resolve().parents[2] / 'worlds' / 'lab.yaml'
 LAB_START = (2.0, 2.0, -np.pi / 2.0)
 _RIGHT_RAD = np.radians(10.0)
 _MAPPED_WAY_M = 400.0

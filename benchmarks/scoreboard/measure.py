@@ -24,7 +24,7 @@ from thinmap_ros.core.odometry import ScanPairing
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
-from thinmap_ros.evaluation.memory import forget_peak, peak_mb
+from thinmap_ros.evaluation.machine import forget_peak, peak_mb
 from thinmap_ros.evaluation.trajectory_errors import read_columns, relation_errors
 from thinmap_ros.experiments.slam.logs import laser_of
 from thinmap_ros.logs.carmen import CarmenLog

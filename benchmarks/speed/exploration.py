@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.worlds import Floor, floors
-from thinmap_ros.evaluation.table import Row, at_least, at_most
+from thinmap_ros.evaluation.outcome import Row, at_least, at_most
 from thinmap_ros.tools.explore_world import Options, explore
 
 _LARGEST = 'kth/50037764_PLAN1'

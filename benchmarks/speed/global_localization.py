@@ -18,8 +18,8 @@ from thinmap_ros.core.places.observation import observe
 from thinmap_ros.core.places.observation_model import NodeModel, random_pose
 from thinmap_ros.core.places.place_database import Places
 from thinmap_ros.core.topology.graph import Node, NodeKind, TopologicalMap
-from thinmap_ros.evaluation.table import Row, at_most
-from thinmap_ros.evaluation.timing import median_seconds
+from thinmap_ros.evaluation.machine import median_seconds
+from thinmap_ros.evaluation.outcome import Row, at_most
 from thinmap_ros.sim.drives import random_drive
 
 _QUICK = {'paper': 5, 'lab': 20, 'voronoi': 20, 'twins': 2, 'foreign': 4, 'dungeon': 10}

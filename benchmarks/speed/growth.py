@@ -12,9 +12,8 @@ import numpy as np
 
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
-from thinmap_ros.evaluation.memory import resident_mb
-from thinmap_ros.evaluation.table import Row, at_most
-from thinmap_ros.evaluation.timing import CpuTimedPipeline
+from thinmap_ros.evaluation.machine import CpuTimedPipeline, resident_mb
+from thinmap_ros.evaluation.outcome import Row, at_most
 from thinmap_ros.files.package_data import world_path
 from thinmap_ros.files.worlds import read_tour, read_world
 from thinmap_ros.pipeline import PipelineConfig

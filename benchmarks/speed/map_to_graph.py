@@ -8,8 +8,8 @@ from thinmap_ros.baselines.voronoi import build_voronoi
 from thinmap_ros.core.topology.builder import TopologyConfig, build
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.evaluation.graph_metrics import completeness, drivable_share
-from thinmap_ros.evaluation.table import Row, at_least, at_most
-from thinmap_ros.evaluation.timing import best_seconds
+from thinmap_ros.evaluation.machine import best_seconds
+from thinmap_ros.evaluation.outcome import Row, at_least, at_most
 from thinmap_ros.files.occupancy_maps import read_map
 
 _SECONDS = {'kth/50052751': 0.1, 'kth/50037764_PLAN1': 0.5}

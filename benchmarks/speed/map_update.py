@@ -8,8 +8,8 @@ from benchmarks.worlds import floors
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.evaluation.table import Row, at_least
-from thinmap_ros.evaluation.timing import best_seconds
+from thinmap_ros.evaluation.machine import best_seconds
+from thinmap_ros.evaluation.outcome import Row, at_least
 from thinmap_ros.sim.laser import Lms200, Lms200Config
 
 _TARGET = 20_000.0

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from thinmap_ros.evaluation.table import Row, at_most
+from thinmap_ros.evaluation.outcome import Row, at_most
 
 _NODES = ('localizer', 'grid_mapper', 'topology_builder', 'navigator', 'explorer')
 _SETTLE_S = 5.0

@@ -19,7 +19,7 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.matching.local_map import LocalMap
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher
-from thinmap_ros.evaluation.table import Row, at_least
+from thinmap_ros.evaluation.outcome import Row, at_least
 from thinmap_ros.sim.laser import Lms200, Lms200Config
 
 _QUICK = ('kth/50052751',)

@@ -10,8 +10,8 @@ from skimage.morphology import skeletonize
 
 from benchmarks.worlds import floors
 from thinmap_ros.core.topology.thinning import thin
-from thinmap_ros.evaluation.table import Row, at_least, at_most
-from thinmap_ros.evaluation.timing import best_seconds
+from thinmap_ros.evaluation.machine import best_seconds
+from thinmap_ros.evaluation.outcome import Row, at_least, at_most
 
 Mask = NDArray[np.bool_]
 _FASTER = {400: (20.0, 40.0), 1000: (50.0, 100.0), 4000: (50.0, 100.0)}

@@ -8,7 +8,7 @@ import numpy as np
 from benchmarks.drive import Drive, final_map, tour
 from benchmarks.worlds import floors
 from thinmap_ros.evaluation.graph_metrics import agreement, drivable_share, loop_count
-from thinmap_ros.evaluation.table import Row, at_least, at_most
+from thinmap_ros.evaluation.outcome import Row, at_least, at_most
 
 _QUICK = ('dungeon/d114',)
 _WORLDS = ('dungeon/d114', 'dungeon/d2555', 'kth/50052751', 'kth/50052748')

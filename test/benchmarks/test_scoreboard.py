@@ -28,7 +28,7 @@ from benchmarks.scoreboard.page import MOST_M, errors, page, shortened, worst_te
 from benchmarks.scoreboard.played import Played, consistency
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import ConfigError
-from thinmap_ros.evaluation.alignment import aligned_rms
+from thinmap_ros.evaluation.trajectory_errors import aligned_rms
 from thinmap_ros.sim.buildings import DEVELOPMENT_SEEDS, BuildingConfig, building
 from thinmap_ros.sim.robot import PRESETS
 

@@ -1,8 +1,4 @@
-"""The error of a trajectory by known relations between its poses.
-
-Source: Kuemmerle et al., "On measuring the accuracy of SLAM algorithms", 2009: for each relation
-the difference of the true motion between two stamps and the estimated one.
-"""
+"""The error of a trajectory: by known relations between its poses, or laid onto the true one."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +12,28 @@ from thinmap_ros.files.atomic import read_text
 
 # A pose this near to a stamp is the one of that stamp; else it is moved along the odometry.
 _NEAR_S = 0.1
+
+
+def between_paths(path: Array, onto: Array) -> Array:
+    """Rigid motion (3,) that lays a path (N, 3) onto another: least squares of the positions."""
+    middle = path[:, :2].mean(axis=0)
+    onto_middle = onto[:, :2].mean(axis=0)
+    a = path[:, :2] - middle
+    b = onto[:, :2] - onto_middle
+    turn = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
+    turned = se2.transform_points(se2.pose(0.0, 0.0, float(turn)), middle[None])[0]
+    x, y = (onto_middle - turned).tolist()
+    return se2.pose(x, y, float(turn))
+
+
+def aligned_rms(path: Array, truth: Array) -> float:
+    """Rms error of the positions of a path (N, 3), m, after the rigid motion that suits it best.
+
+    The absolute trajectory error: what is left where the whole map may be turned and shifted.
+    Source: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", 2012.
+    """
+    aligned = se2.transform_points(between_paths(path, truth), path[:, :2])
+    return float(np.sqrt(np.square(aligned - truth[:, :2]).sum(axis=1).mean()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +67,10 @@ def relation_errors(
 ) -> RelationErrors:
     """Errors of poses (N, 3) at times (N,), s, by a file of relations `t1 t2 x y z roll pitch yaw`.
 
+    For each relation, the difference of the true motion between two stamps and the estimated one.
     odometry: a file of `t x y theta`, along which a pose is moved to a stamp from which it is
     farther than near_s.
+    Source: Kuemmerle et al., "On measuring the accuracy of SLAM algorithms", 2009.
     """
     known = read_columns(relations, [0, 1, 2, 3, 7])
     wheels = read_columns(odometry, [0, 1, 2, 3])

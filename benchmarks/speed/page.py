@@ -1,6 +1,6 @@
 """Make docs/benchmarks.md of the results of benchmarks.
 
-Usage: python -m thinmap_ros.evaluation.page CSV_DIR [DOCS_DIR].
+Usage: python -m benchmarks.speed.page CSV_DIR [DOCS_DIR].
 """
 
 import csv
@@ -10,7 +10,7 @@ from pathlib import Path
 _HEAD = """\
 # Benchmarks
 
-Made by `python -m thinmap_ros.evaluation.page out/benchmarks` of the files that
+Made by `python -m benchmarks.speed.page out/benchmarks` of the files that
 `python -m benchmarks --csv out/benchmarks` leaves (`--quick` where a table is short). Times are
 of one core; a load far above the number of cores says that the machine was busy with other things,
 and that all times are much too long.
@@ -81,7 +81,5 @@ def _indented(row: list[str]) -> list[str]:
 
 
 if __name__ == '__main__':
-    docs = (
-        Path(sys.argv[2]) if len(sys.argv) > 2 else Path(__file__).resolve().parent.parent / 'docs'
-    )
+    docs = Path(sys.argv[2]) if len(sys.argv) > 2 else Path(__file__).resolve().parents[2] / 'docs'
     (docs / 'benchmarks.md').write_text(page(Path(sys.argv[1])), encoding='utf-8')
