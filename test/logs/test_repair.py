@@ -1,4 +1,7 @@
-"""bag_repair keeps all that is whole of a cut or damaged file; the result is an ordinary bag."""
+"""bag_repair keeps all that is whole of a cut or damaged file; the result is an ordinary bag.
+
+Whatever happened to a bag, no program ends in a traceback.
+"""
 
 import os
 import subprocess
@@ -9,6 +12,7 @@ from typing import Any
 
 import pytest
 import yaml
+from fuzz.damaged_bags import CASES, run_cases, whole_bags
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.reader import NonSeekingReader, make_reader
@@ -278,3 +282,13 @@ def test_no_damage_makes_it_stumble_or_invent(
     if not cut and not noise:
         assert sum(isinstance(record, Message) for record in records) == COUNT
     assert len(records) <= COUNT + 10 + len(noise)
+
+
+@pytest.fixture(scope='module')
+def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    return whole_bags(tmp_path_factory.mktemp('whole'))
+
+
+def test_no_damage_ends_in_a_traceback(whole: dict[str, bytes], tmp_path: Path) -> None:
+    ends = run_cases(whole, tmp_path, seed=0, count=CASES)
+    assert ends['repaired'] > ends.total() / 2

@@ -17,8 +17,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.logs import decode as bag_messages
 from thinmap_ros.logs.bag_directory import bag_files, without_compression
 from thinmap_ros.logs.laser_mount import Mount, StaticTransforms, rotation_matrix
-from thinmap_ros.logs.log import Event, OdometryEvent, ScanEvent, Skipped
-from thinmap_ros.logs.log_formats import is_mcap, refuse_foreign
+from thinmap_ros.logs.log import Event, OdometryEvent, ScanEvent, Skipped, is_mcap, refuse_foreign
 from thinmap_ros.logs.mcap_records import LARGEST_CHUNK, DamagedError, unpacked
 from thinmap_ros.logs.storage import RawMessage, Storage, storage_of
 

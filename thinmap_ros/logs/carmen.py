@@ -20,8 +20,7 @@ from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError, shown
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.logs.log import Event, OdometryEvent, ScanEvent, Skipped
-from thinmap_ros.logs.log_formats import is_mcap, refuse_foreign
+from thinmap_ros.logs.log import Event, OdometryEvent, ScanEvent, Skipped, is_mcap, refuse_foreign
 
 _SECOND_NS = 1_000_000_000
 _LATEST_S = 2**31

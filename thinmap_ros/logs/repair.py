@@ -11,10 +11,10 @@ from rosbags.rosbag2.metadata import dump_qos_v9
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.files.atomic import write_text
-from thinmap_ros.logs import bag_types
 from thinmap_ros.logs import qos as bag_qos
 from thinmap_ros.logs.mcap_reader import Damage, Definitions, whole_records
 from thinmap_ros.logs.mcap_records import LARGEST_CHUNK, DamagedError, unpacked
+from thinmap_ros.logs.storage import own_typestore
 
 
 @dataclass
@@ -125,7 +125,7 @@ class _Copy:
 def _hash(schema: Schema) -> str:
     """Hash of a message type as ROS computes it; empty where its definition cannot be read."""
     try:
-        return bag_types.own_typestore(schema).hash_rihs01(schema.name)
+        return own_typestore(schema).hash_rihs01(schema.name)
     except Exception:
         # rosbags' parser and hasher raise whatever a broken definition makes them stumble over.
         return ''

@@ -1,20 +1,27 @@
-"""Storage of a bag: MCAP files, read within limits, and SQLite files, read by rosbags."""
+"""Storage of a bag: MCAP files, read within limits, and SQLite files, read by rosbags.
+
+Also the message types that a file carries along.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Protocol
 
 from mcap.records import Schema
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import ConnectionExtRosbag2, Qos
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.logs import bag_types
 from thinmap_ros.logs import qos as bag_qos
 from thinmap_ros.logs.mcap_reader import Damage, McapFile
+
+LARGEST_SCHEMA = 2**20
+"""Bytes of the definition of a message type with all that it is made of."""
+_IDL_SEPARATOR = '=' * 80 + '\n'
 
 
 @dataclass(frozen=True)
@@ -69,7 +76,7 @@ class McapStorage:
     def typestore(self, type_name: str) -> Typestore:
         """Types as the file defines them; ROS 2 Jazzy's where it does not."""
         if type_name not in self._typestores:
-            self._typestores[type_name] = bag_types.typestore_of(self._schemas[type_name])
+            self._typestores[type_name] = typestore_of(self._schemas[type_name])
         return self._typestores[type_name]
 
     def messages(self, topics: set[str] | None) -> Iterator[RawMessage]:
@@ -123,3 +130,44 @@ class SqliteStorage:
 def storage_of(path: Path) -> Storage:
     """Open a file of a bag. Raises InputError where it is none."""
     return SqliteStorage(path) if path.suffix == '.db3' else McapStorage(path)
+
+
+def typestore_of(schema: Schema) -> Typestore:
+    """Types to decode messages of a schema with: its own, or ROS 2 Jazzy's where these do not do.
+
+    That is where a definition cannot be read, lacks a type that it is made of, or lacks fields of a
+    type that Jazzy knows.
+    """
+    known = get_typestore(Stores.ROS2_JAZZY)
+    try:
+        own = own_typestore(schema)
+        own.hash_rihs01(schema.name)  # raises where a type is missing
+    except Exception:  # rosbags' parser raises whatever a broken definition makes it stumble over
+        return known
+    for name in own.fielddefs.keys() & known.fielddefs.keys():
+        fields = own.fielddefs[name][1]
+        if not all(field in fields for field in known.fielddefs[name][1]):
+            return known
+    return own
+
+
+def own_typestore(schema: Schema) -> Typestore:
+    """Types of one schema. Raises what rosbags' parser raises, and ValueError if too large."""
+    if len(schema.data) > LARGEST_SCHEMA:
+        raise ValueError(f'definition of {len(schema.data)} bytes: expected {LARGEST_SCHEMA}')
+    return _parsed(schema.name, schema.encoding, schema.data.decode())
+
+
+@lru_cache(maxsize=64)
+def _parsed(name: str, encoding: str, text: str) -> Typestore:
+    typestore = get_typestore(Stores.EMPTY)
+    if 'idl' not in encoding:
+        typestore.register(get_types_from_msg(text, name))
+        return typestore
+    # rosbag2 puts the files that a type needs one behind the other, each below its name.
+    parts = [part.partition('\n')[2] for part in text.split(_IDL_SEPARATOR)[1:]]
+    for part in parts or [text]:
+        types = get_types_from_idl(part)
+        unknown = types.keys() - typestore.types.keys()
+        typestore.register({name: types[name] for name in unknown})
+    return typestore

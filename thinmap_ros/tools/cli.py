@@ -14,8 +14,7 @@ from thinmap_ros.core.errors import ThinmapError
 from thinmap_ros.kernels.progress import report_compilation
 from thinmap_ros.logs.bag import BagLog
 from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
-from thinmap_ros.logs.log import Log
-from thinmap_ros.logs.log_formats import is_mcap
+from thinmap_ros.logs.log import Log, is_mcap
 
 BAD_INPUT = 2
 INTERRUPTED = 130
