@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scripts.warehouse import warehouse
+from scripts.make_warehouse import warehouse
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.raytrace import cast_rays
 from thinmap_ros.files.worlds import read_tour, read_world

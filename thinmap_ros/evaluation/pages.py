@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from thinmap_ros.files.atomic import read_text, write_text
-from thinmap_ros.view.pictures import write_small_png
+from thinmap_ros.view.figures import write_small_png
 
 About = dict[str, Any]
 _STYLE = """

@@ -24,8 +24,8 @@ from thinmap_ros.ros import messages, parameters, qos
 from thinmap_ros.ros import node_main as runtime
 from thinmap_ros.ros.diagnostics import OK, WARN, Health
 from thinmap_ros.ros.lockstep import NONE, PATIENCE_S, PATIENCE_WORDS, TOPICS, Lockstep
+from thinmap_ros.ros.messages import message_class
 from thinmap_ros.ros.services import answer
-from thinmap_ros.ros.types import message_class
 
 _TICK_S = 0.002
 _CLOCK_PERIOD_S = 0.02

@@ -17,7 +17,7 @@ from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.ros import node_main as runtime
 from thinmap_ros.ros import parameters
 from thinmap_ros.ros.diagnostics import Health
-from thinmap_ros.ros.types import message_class
+from thinmap_ros.ros.messages import message_class
 
 _LOOK_AROUND_S = 0.25
 _FLUSH_S = 0.5

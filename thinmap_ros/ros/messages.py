@@ -1,8 +1,14 @@
-"""ROS messages <-> core values; nothing else knows the layout of a message."""
+"""ROS messages <-> core values; nothing else knows the layout of a message.
+
+Also message classes by name.
+"""
 
 import math
+import re
 from array import array
 from collections.abc import Sequence
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Duration, Time
@@ -33,6 +39,22 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 
 SECOND_NS = 1_000_000_000
+# Nothing else is imported because a bag or a publisher names it.
+_TYPE_NAME = re.compile(r'([a-z]\w*)/msg/([A-Z]\w*)', re.ASCII)
+
+
+def message_class(type_name: str) -> Any:
+    """Class of a message type such as sensor_msgs/msg/LaserScan.
+
+    Raises InputError where it is not installed.
+    """
+    parts = _TYPE_NAME.fullmatch(type_name)
+    if parts is None:
+        raise InputError(f'message type {checks.short(type_name)}: expected PACKAGE/msg/NAME')
+    try:
+        return getattr(import_module(f'{parts[1]}.msg'), parts[2])
+    except (ImportError, AttributeError) as error:
+        raise InputError(f'message type {checks.short(type_name)}: not installed here') from error
 
 
 def stamp_ns(stamp: Time) -> int:

@@ -1,8 +1,10 @@
 """How nodes listen.
 
 Only while active, and what a message says wrongly is counted and said, and the node goes on.
+What of a stream did not come is counted too.
 """
 
+from collections import deque
 from collections.abc import Callable
 from time import monotonic
 from typing import Any
@@ -12,10 +14,10 @@ from sensor_msgs.msg import LaserScan
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.ros.lifecycle_node import LiveNode
-from thinmap_ros.ros.losses import Losses
 
 _QUIET_S = 5.0
 _SILENT_S = 3.0
+_LONGEST_GAP_NS = 5_000_000_000  # whoever says nothing for longer was silent
 
 
 def listen(
@@ -106,6 +108,38 @@ class _Listener:
         self._held = None
         if message is not None:
             self._guarded(message)
+
+
+class Losses:
+    """What of a stream was lost on the way, or never sent.
+
+    Counts by the numbers that a publisher gives its messages, and by their evenly spaced stamps.
+
+    Either alone is not enough: numbers of two publishers are mixed up, and a sensor that was silent
+    has lost nothing.
+    """
+
+    def __init__(self) -> None:
+        self._last_ns = 0
+        self._last_number = 0
+        self._steps_ns: deque[int] = deque(maxlen=50)
+
+    def came(self, stamp_ns: int, number: int | None) -> tuple[int, int]:
+        """Take note of a message and of its number, None where the middleware gives none.
+
+        Returns how many between it and the last one were lost on the way, and how many more are
+        missing: never sent, or without numbers nobody knows.
+        """
+        step_ns = stamp_ns - self._last_ns
+        self._last_ns = stamp_ns
+        skipped = (number or 0) - self._last_number - 1
+        self._last_number = number or 0
+        if step_ns <= 0:
+            return 0, 0
+        spaces = round(step_ns / min(self._steps_ns, default=step_ns)) - 1
+        self._steps_ns.append(step_ns)
+        lost = min(max(skipped, 0), max(spaces, 0))
+        return lost, spaces - lost if spaces > 0 and step_ns < _LONGEST_GAP_NS else 0
 
 
 def _stamp_ns(message: Any) -> int:

@@ -1,4 +1,4 @@
-"""Pictures of maps."""
+"""Pictures of maps, and pictures made small."""
 
 from collections import defaultdict
 from pathlib import Path
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _GREY = 204  # of 255: cells that nobody has seen
+_SMALL_COLOURS = 64
 # Each kind of node has a shape of its own as well as a colour.
 _MARKERS = {NodeKind.END: 'o', NodeKind.BRANCH: 's', NodeKind.CORNER: '^'}
 
@@ -147,3 +148,12 @@ def coverage_figure(path: Path, reports: list[dict[str, Any]]) -> None:
     axes.legend(fontsize=8, frameon=False)
     with written_aside(path) as aside:
         figure.savefig(aside, format='png', bbox_inches='tight')
+
+
+def write_small_png(source: Path, target: Path) -> None:
+    """Copy a PNG with so few colours that it takes a third of the space."""
+    from PIL import Image
+
+    with Image.open(source) as picture, written_aside(target) as aside:
+        small = picture.convert('RGB').quantize(_SMALL_COLOURS, dither=Image.Dither.NONE)
+        small.save(aside, format='PNG', optimize=True)

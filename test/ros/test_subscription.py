@@ -3,7 +3,7 @@
 Told from what was silent, and from what two publishers say in turn.
 """
 
-from thinmap_ros.ros.losses import Losses
+from thinmap_ros.ros.subscription import Losses
 
 STEP_NS = 200_000_000
 

@@ -1,6 +1,6 @@
 """Text of worlds/warehouse.yaml, 200 x 200 m of racks with goods in front.
 
-It is printed by python -m scripts.warehouse.
+It is printed by python -m scripts.make_warehouse.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ _GOODS_M = (1.2, 0.8)  # a pallet on the floor, along the rack and out into the 
 _SEED = 0
 
 _HEADER = f"""\
-# A warehouse of 200 x 200 m for scale, by scripts.warehouse (seed {_SEED}): racks back to
+# A warehouse of 200 x 200 m for scale, by scripts.make_warehouse (seed {_SEED}): racks back to
 # back, pallets on the floor in front of some. The tour goes up and down through every second aisle.
 name: warehouse
 resolution: 0.05
