@@ -16,9 +16,8 @@ from thinmap_msgs.msg import EndNodeArray, ExplorationStatus, SlamStatus, Topolo
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.core import validation as checks
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.exploration.area import fenced
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
-from thinmap_ros.core.exploration.session import Budget, Odometer
+from thinmap_ros.core.exploration.mission import Budget, Odometer, fenced
 from thinmap_ros.core.exploration.strategy import Decision, EndNode
 from thinmap_ros.core.grid.map_mirror import MapMirror
 from thinmap_ros.core.se2 import Array, wrap

@@ -7,8 +7,11 @@ import pytest
 from support.small_floor import floor, map_of, world_of
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.exploration.active_localization import ActiveSearch
-from thinmap_ros.core.exploration.merge_viewpoints import best_viewpoint, common_patch
+from thinmap_ros.core.exploration.active_localization import (
+    ActiveSearch,
+    best_viewpoint,
+    common_patch,
+)
 from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.places.global_localizer import GlobalLocalization, Hypothesis, Result, State
 from thinmap_ros.core.places.place_database import FREE, Places

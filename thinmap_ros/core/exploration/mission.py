@@ -1,12 +1,15 @@
-"""What an exploration has used up."""
+"""What a mission is bound by: what it may use up, what it has used up, and the area to stay in."""
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
 
 _SMALLEST_STEP_M = 0.02
+_WALL = np.int8(100)
 
 
 @dataclass(eq=False)
@@ -45,3 +48,25 @@ class Budget:
         if 0.0 < self.area_m2 <= area_m2:
             return f'area limit of {self.area_m2:.1f} m^2'
         return ''
+
+
+def inside(points: Array, polygon: Array) -> NDArray[np.bool_]:
+    """Which points (N, 2) lie in a polygon (M, 2), by the even-odd rule, (N,)."""
+    result = np.zeros(len(points), dtype=np.bool_)
+    x = points[:, 0]
+    y = points[:, 1]
+    for (ax, ay), (bx, by) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+        crosses = (ay > y) != (by > y)
+        if ay != by:
+            result ^= crosses & (x < ax + (y - ay) * (bx - ax) / (by - ay))
+    return result
+
+
+def fenced(patch: GridPatch, polygon: Array) -> GridPatch:
+    """The map as it is to somebody who must not leave a polygon (M, 2), m.
+
+    All cells outside are walls.
+    """
+    centres = patch.frame.centres_of(np.argwhere(np.ones(patch.shape, dtype=np.bool_)))
+    within = inside(centres, polygon).reshape(patch.shape)
+    return GridPatch(patch.frame, np.where(within, patch.cells, _WALL).astype(np.int8))
