@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import COARSEST_M as COARSEST_M
-from thinmap_ros.core.grid.frame import FINEST_M as FINEST_M
 
 FARTHEST_M = se2.FARTHEST_M
 LARGEST_ANGLE_RAD = 4.0 * np.pi

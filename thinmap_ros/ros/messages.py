@@ -32,7 +32,7 @@ from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
 from thinmap_ros.core import se2
 from thinmap_ros.core import validation as checks
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.frame import COARSEST_M, FINEST_M, GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -258,11 +258,11 @@ def patch_from(message: OccupancyGrid) -> GridPatch:
     # The message carries a float32; 0.1 has to be the same 0.1 on both sides.
     resolution = round(float(info.resolution), 6)
     size_fits = len(message.data) == info.width * info.height
-    if not size_fits or not checks.FINEST_M <= resolution <= checks.COARSEST_M:
+    if not size_fits or not FINEST_M <= resolution <= COARSEST_M:
         raise InputError(
             f'map of {info.width} x {info.height} cells of {resolution} m '
             f'with {len(message.data)} values: expected a value for each cell, '
-            f'and cells of {checks.FINEST_M} to {checks.COARSEST_M} m'
+            f'and cells of {FINEST_M} to {COARSEST_M} m'
         )
     origin = pose_from(info.origin)
     if abs(origin[2]) > 1e-6:

@@ -63,7 +63,7 @@ class Machines:
             pytest.skip(
                 'no frames can be lost or held up here: there is no /dev/net/tun that may be opened'
             )
-        program = Path(__file__).with_name('weak_link.py')
+        program = Path(__file__).resolve().parents[2] / 'support' / 'weak_link.py'
         command = [
             *self._inside(0),
             sys.executable,
