@@ -11,12 +11,13 @@ from benchmarks.kidnapped import split_log as lost_log
 from benchmarks.kidnapped import trials as lost_robots
 from benchmarks.kidnapped.trials import Map, Record, fresh, prepared, search
 from benchmarks.worlds import floors
+from thinmap_ros.closed_loop import Options
 from thinmap_ros.core.places.global_localizer import GlobalLocalization
 from thinmap_ros.core.se2 import pose
+from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.sim.drives import random_drive, random_start
 from thinmap_ros.sim.laser import Lms200Config
 from thinmap_ros.sim.world import World
-from thinmap_ros.tools.explore_world import Options, explore
 
 _STEP_SCANS = 3  # a step of the laboratory's experiment: at 0.5 m/s and 5 Hz, up to 0.3 m
 _WAY_M = 40.0

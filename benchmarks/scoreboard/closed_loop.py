@@ -10,6 +10,13 @@ from benchmarks.scoreboard.measure import config_of, play
 from benchmarks.scoreboard.played import Numbers, PlayedPipeline, rehearse, simulated_numbers
 from benchmarks.scoreboard.recordings import RecordedSimulation, Recording, read_recording
 from benchmarks.worlds import floors
+from thinmap_ros.closed_loop import (
+    SCANS_PER_GRAPH,
+    STRATEGIES,
+    ClosedLoop,
+    nothing_to_show,
+    true_pose_source,
+)
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
@@ -23,13 +30,6 @@ from thinmap_ros.sim.laser import Lms200Config
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import Simulation
 from thinmap_ros.sim.world import World
-from thinmap_ros.tools.explore_world import (
-    SCANS_PER_GRAPH,
-    STRATEGIES,
-    ClosedLoop,
-    nothing_to_show,
-    true_pose_source,
-)
 
 LASERS = {
     'lms200': Lms200Config(),

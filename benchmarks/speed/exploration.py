@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.worlds import Floor, floors
+from thinmap_ros.closed_loop import Options
+from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.evaluation.outcome import Row, at_least, at_most
-from thinmap_ros.tools.explore_world import Options, explore
 
 _LARGEST = 'kth/50037764_PLAN1'
 _DUNGEON = 'dungeon/'

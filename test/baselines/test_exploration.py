@@ -14,12 +14,13 @@ from thinmap_ros.baselines.exploration import (
     VisitAllEndNodes,
 )
 from thinmap_ros.baselines.frontier_map import Frontier
+from thinmap_ros.closed_loop import STRATEGIES, Options
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
+from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.sim.world import World
-from thinmap_ros.tools.explore_world import STRATEGIES, Options, explore
 
 START = np.array([1.0, 1.0, 0.0])
 

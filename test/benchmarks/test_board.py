@@ -14,10 +14,11 @@ from benchmarks.scoreboard.board_rows import board_rows, board_table, cases_of
 from benchmarks.scoreboard.cases import BuildingCase, DriveCase, LogCase, LoopCase
 from benchmarks.scoreboard.closed_loop import LASERS, record_drive, world_of
 from benchmarks.scoreboard.recordings import RecordedSimulation, read_recording
+from thinmap_ros.closed_loop import Options
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import Simulation
-from thinmap_ros.tools.explore_world import Options, explore
 
 # Turns, a wall that is run into, a way back.
 COMMANDS = [(0.3, 0.4)] * 60 + [(0.8, 0.0)] * 200 + [(0.0, -1.0)] * 40 + [(-0.3, 0.1)] * 60

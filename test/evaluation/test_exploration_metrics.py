@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
+from thinmap_ros.closed_loop import Ending
 from thinmap_ros.core.exploration.strategy import FIRST_STAND_IN_ID
 from thinmap_ros.evaluation.exploration_metrics import (
     FEWEST_SIGHTINGS,
-    Ending,
     EndNodeCensus,
     TargetLog,
     exploration_report,

@@ -8,14 +8,15 @@ from typing import Any
 
 import numpy as np
 
+from thinmap_ros.closed_loop import ClosedLoop, Options, make_loop
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.slam.localizer import ScanLocalizer
 from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.files.worlds import read_world
+from thinmap_ros.sim.coverage import coverable
 from thinmap_ros.sim.world import World
-from thinmap_ros.tools.explore_world import ClosedLoop, Options, coverable, make_loop
 
 ROOM = Path(__file__).resolve().parents[2] / 'worlds' / 'room_10x10.yaml'
 State = dict[str, np.ndarray]

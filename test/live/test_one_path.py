@@ -23,13 +23,13 @@ from thinmap_ros.logs.bag import BagLog
 from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
 from thinmap_ros.logs.log import OdometryEvent, ScanEvent, Skipped
 from thinmap_ros.pipeline import PipelineConfig
+from thinmap_ros.replaying import replay
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.sim.laser import Lms200Config
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import Simulation
 from thinmap_ros.sim.world import World
 from thinmap_ros.tools.carmen_to_bag import convert
-from thinmap_ros.tools.replay import replay
 
 pytestmark = pytest.mark.live
 # The test listens to the poses as well, the player to the local graph.

@@ -18,9 +18,9 @@ from thinmap_ros.files import occupancy_maps as map_files
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
 from thinmap_ros.pipeline import PipelineConfig
+from thinmap_ros.replaying import replay
 from thinmap_ros.tools.carmen_to_bag import convert
-from thinmap_ros.tools.replay import main, replay
-from thinmap_ros.tools.replay_view import ReplayView
+from thinmap_ros.tools.replay import ReplayView, main
 from thinmap_ros.view import rerun_sinks as rerun_streams
 from thinmap_ros.view.null_view import NullView
 
@@ -284,7 +284,7 @@ class Diary(NullView):
 
 def test_a_view_is_told_each_scan_and_the_map_as_it_is_in_the_end(log):
     diary = Diary()
-    result = replay(CarmenLog(log, LaserOptions()), PipelineConfig(), shown=ReplayView(diary))
+    result = replay(CarmenLog(log, LaserOptions()), PipelineConfig(), watcher=ReplayView(diary))
     assert len(result.poses) == diary.told['pose'] == diary.told['scan'] == 30
     assert diary.told['grid'] == 7, 'once a second of the log, and at its end'
     assert np.array_equal(diary.map_shown.cells, result.pipeline.grid.patch().cells)

@@ -92,7 +92,7 @@ class FrontierExplorer(ABC):
     def step(
         self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
     ) -> Decision:
-        """Say where to go; see tools/explore_world.Strategy."""
+        """Say where to go; see core/exploration/strategy.Strategy."""
         self.map.update(patch, scan, T_map_base)
         self._give_up_what_was_looked_at(T_map_base)
         if self._is_due(scan.stamp_ns):

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from thinmap_ros.closed_loop import Ending
 from thinmap_ros.core.exploration.position_probability import NEAR_M
 from thinmap_ros.core.exploration.strategy import FIRST_STAND_IN_ID
 from thinmap_ros.core.se2 import Array
@@ -100,18 +101,6 @@ class TargetLog:
         self.changes += bool(self._last)
         self.reversals += len(self._last) > 1 and math.dist(at, self._last[-2]) <= SAME_PLACE_M
         self._last = [*self._last[-1:], at]
-
-
-@dataclass(frozen=True)
-class Ending:
-    """How an exploration ended.
-
-    Whether by itself, why, and how often the robot touched something.
-    """
-
-    finished: bool
-    reason: str
-    collisions: int
 
 
 def exploration_report(

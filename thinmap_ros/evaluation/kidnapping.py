@@ -1,22 +1,21 @@
 """A robot carried off while it explores: if it notices, and how soon it knows where it is again."""
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from thinmap_ros.baselines.exploration import NearestFrontier
+from thinmap_ros.closed_loop import ClosedLoop
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.estimate import Estimate
+from thinmap_ros.core.exploration.strategy import Strategy
 from thinmap_ros.core.places.global_localizer import GlobalLocalization
 from thinmap_ros.core.planning.navigator import Navigator
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.pipeline import Pipeline
-
-if TYPE_CHECKING:
-    from thinmap_ros.tools.explore_world import ClosedLoop, Strategy
 
 _MARGIN_M = 0.1
 _FAR_M = 3.0
@@ -67,7 +66,7 @@ class Kidnapping:
         """Whether the robot looks for where it is."""
         return self._finder is not None
 
-    def takes(self, loop: 'ClosedLoop', scan: Scan, T_odom_base: Array) -> bool:
+    def takes(self, loop: ClosedLoop, scan: Scan, T_odom_base: Array) -> bool:
         """Whether a scan, of before the robot was carried or of a lost one, is not for the loop."""
         if self._carried_s is None and scan.stamp_ns >= 1e9 * self._at_s:
             self._carry(loop, scan.stamp_ns / 1e9)
@@ -77,7 +76,7 @@ class Kidnapping:
         self._search(loop, self._finder, scan, T_odom_base)
         return True
 
-    def hear(self, loop: 'ClosedLoop', scan: Scan, estimate: Estimate) -> None:
+    def hear(self, loop: ClosedLoop, scan: Scan, estimate: Estimate) -> None:
         """Begin to search once the robot is lost."""
         if (
             estimate.lost
@@ -92,7 +91,7 @@ class Kidnapping:
             self._own = loop.pipeline, loop.strategy, loop.navigator
             loop.drive_by(Pipeline(), NearestFrontier(), Navigator(loop.navigator.config))
 
-    def _carry(self, loop: 'ClosedLoop', seconds: float) -> None:
+    def _carry(self, loop: ClosedLoop, seconds: float) -> None:
         """Put the robot on some place that it has mapped, far from where it is."""
         world = loop.simulation.world
         robot = loop.simulation.robot
@@ -111,7 +110,7 @@ class Kidnapping:
         self._carried_s = seconds
 
     def _search(
-        self, loop: 'ClosedLoop', finder: GlobalLocalization, scan: Scan, T_odom_base: Array
+        self, loop: ClosedLoop, finder: GlobalLocalization, scan: Scan, T_odom_base: Array
     ) -> None:
         """One scan of a lost robot, for all of its localizers."""
         assert self._own is not None

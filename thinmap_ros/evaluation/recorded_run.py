@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from thinmap_ros.closed_loop import Ending
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
-from thinmap_ros.evaluation.exploration_metrics import Ending, EndNodeCensus, exploration_report
+from thinmap_ros.evaluation.exploration_metrics import EndNodeCensus, exploration_report
 from thinmap_ros.files import graphs as graph_files
 from thinmap_ros.files import occupancy_maps as map_files
 from thinmap_ros.files import trajectories as trajectory_files

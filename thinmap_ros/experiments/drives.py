@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from thinmap_ros.closed_loop import Options, make_loop, nothing_to_show
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.exploration.strategy import Decision
+from thinmap_ros.core.exploration.strategy import Decision, Strategy
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -24,7 +25,6 @@ from thinmap_ros.sim.laser import Lms200, Lms200Config
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import Simulation
 from thinmap_ros.sim.world import World
-from thinmap_ros.tools.explore_world import Options, Strategy, make_loop, nothing_to_show
 
 SPEED_M_S = 0.2  # of all three papers
 # A step of global localization: at 0.5 m/s and 5 Hz, up to 0.3 m.

@@ -1,10 +1,13 @@
-"""What an exploration strategy answers to a scan."""
+"""What decides where to go, and what it answers to a scan."""
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.graph import TopologicalMap
 
 # Ids from here on are those of what stands in for borders that no end node sees.
 FIRST_STAND_IN_ID = 2_000_000_000
@@ -55,6 +58,18 @@ class Decision:
     unreachable: list[int]
     coverage_estimate: float
     known_area_m2: float
+
+
+class Strategy(Protocol):
+    """What decides where to go: ours, and everything that it is compared with."""
+
+    def step(
+        self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
+    ) -> Decision:
+        """Say where to go, from the graph, the whole map and a scan made at a pose (3,)."""
+
+    def fail_target(self, reason: str) -> None:
+        """Hear that the present target could not be reached."""
 
 
 def verdict(finished: bool, unreachable: list[int], left: int) -> tuple[FinishCode, str]:

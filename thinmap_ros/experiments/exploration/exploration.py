@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from thinmap_ros.closed_loop import SCANS_PER_GRAPH
 from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.exploration.strategy import FIRST_STAND_IN_ID, Decision
@@ -18,7 +19,6 @@ from thinmap_ros.sim.coverage import coverable
 from thinmap_ros.sim.drives import Look
 from thinmap_ros.sim.laser import Lms200Config
 from thinmap_ros.sim.robot import PRESETS
-from thinmap_ros.tools.explore_world import SCANS_PER_GRAPH
 from thinmap_ros.view.plots import Curve, GraphLayer, Layer, MapLayer, Panel, Plot, Robots, Words
 
 _MOMENTS = (0.05, 0.2, 0.4, 0.6, 0.8, 1.0)

@@ -2,12 +2,13 @@
 
 import numpy as np
 
+from thinmap_ros.closed_loop import Options
+from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Rows, Table
 from thinmap_ros.evaluation.strategy_comparison import OURS, Report, saved
 from thinmap_ros.experiments.drives import Source, world_of
 from thinmap_ros.sim.drives import random_start
 from thinmap_ros.sim.world import World
-from thinmap_ros.tools.explore_world import Options, explore
 from thinmap_ros.view.plots import Bars, Curve, Panel, Plot, xy
 
 _WORLDS = ('room_10x10', 'office', 'lab')

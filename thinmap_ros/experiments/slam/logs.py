@@ -15,7 +15,7 @@ from thinmap_ros.evaluation.trajectory_errors import RelationErrors, read_column
 from thinmap_ros.files.yaml import read_mapping
 from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
 from thinmap_ros.pipeline import PipelineConfig
-from thinmap_ros.tools.replay import Replay, replay, write_outputs
+from thinmap_ros.replaying import Replay, replay, write_outputs
 from thinmap_ros.view.plots import Curve, GraphLayer, MapLayer, Panel, Plot
 
 # Lasers of known logs, by the folder's name; a file laser.yaml in a log's folder comes before.
