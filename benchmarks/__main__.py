@@ -4,29 +4,34 @@ import argparse
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from benchmarks.speed import ekf_step as slam
-from benchmarks.speed import exploration, growth, planning, thinning
-from benchmarks.speed import global_localization as localization
-from benchmarks.speed import map_to_graph as graphs
-from benchmarks.speed import map_update as mapping
-from benchmarks.speed import node_load as nodes
-from benchmarks.speed import scan_matching as matching
-from benchmarks.speed import topology_update as online
+from benchmarks.speed import (
+    ekf_step,
+    exploration,
+    global_localization,
+    growth,
+    map_to_graph,
+    map_update,
+    node_load,
+    planning,
+    scan_matching,
+    thinning,
+    topology_update,
+)
 from benchmarks.worlds import WORLDS
 from thinmap_ros.evaluation.machine import machine
 from thinmap_ros.evaluation.outcome import Row, show
 
 _ALL: dict[str, Callable[[Path, bool], Iterable[Row]]] = {
     'thinning': thinning.run,
-    'mapping': mapping.run,
-    'graphs': graphs.run,
-    'online': online.run,
-    'nodes': nodes.run,
-    'localization': localization.run,
-    'matching': matching.run,
+    'mapping': map_update.run,
+    'graphs': map_to_graph.run,
+    'online': topology_update.run,
+    'nodes': node_load.run,
+    'localization': global_localization.run,
+    'matching': scan_matching.run,
     'planning': planning.run,
     'exploration': exploration.run,
-    'slam': slam.run,
+    'slam': ekf_step.run,
     'growth': growth.run,
 }
 

@@ -24,7 +24,7 @@ import numpy as np
 import psutil
 
 from thinmap_ros.core.errors import InputError, ThinmapError
-from thinmap_ros.files import package_data as resources
+from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.drives import random_start
 from thinmap_ros.sim.world import World
@@ -263,7 +263,7 @@ def _work(arguments: argparse.Namespace) -> None:
         )
     os.environ['ROS_DOMAIN_ID'] = str(random.SystemRandom().randrange(1, 102))
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    path = resources.world_path(arguments.world)
+    path = package_data.world_path(arguments.world)
     world = World.from_patch(*read_world(path))
     arguments.out.mkdir(parents=True, exist_ok=True)
     driver = Driver(world, arguments.seed)

@@ -15,9 +15,7 @@ from thinmap_ros.core.odometry import ScanPairing
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizers import line_features
-from thinmap_ros.files import graphs as graph_files
-from thinmap_ros.files import occupancy_maps as map_files
-from thinmap_ros.files import trajectories as trajectory_files
+from thinmap_ros.files import graphs, occupancy_maps, trajectories
 from thinmap_ros.files.atomic import write_text
 from thinmap_ros.kernels.memory import give_back_pages, release_compiler_pages
 from thinmap_ros.logs.log import Log, OdometryEvent
@@ -88,11 +86,11 @@ def write_outputs(
     patch = pipeline.grid.patch()
     poses = np.array(result.poses)
     folder.mkdir(parents=True, exist_ok=True)
-    trajectory_files.write_tum(folder / 'trajectory.tum', result.stamps_ns, result.poses)
+    trajectories.write_tum(folder / 'trajectory.tum', result.stamps_ns, result.poses)
     final = list(pipeline.localizer.corrected_path())
-    trajectory_files.write_tum(folder / 'trajectory_final.tum', result.stamps_ns, final)
-    map_files.write_map(folder / 'map', patch)
-    graph_files.write_geojson(folder / 'topology.geojson', pipeline.topology.map)
+    trajectories.write_tum(folder / 'trajectory_final.tum', result.stamps_ns, final)
+    occupancy_maps.write_map(folder / 'map', patch)
+    graphs.write_geojson(folder / 'topology.geojson', pipeline.topology.map)
     release_compiler_pages()  # before matplotlib comes on top of them
     figures.summary_figure(folder / 'summary.png', patch, pipeline.topology.map, poses, title=title)
     report = _report(result, poses, seconds)

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.kidnapped import split_log as lost_log
-from benchmarks.kidnapped import trials as lost_robots
+from benchmarks.kidnapped import split_log, trials
 from benchmarks.kidnapped.trials import Map, Record, fresh, prepared, search
 from benchmarks.worlds import floors
 from thinmap_ros.closed_loop import Options
@@ -73,10 +72,10 @@ def voronoi(_: Setting) -> Iterator[Case]:
 
 
 def _in_lab(seed: int, steps: int, row: str) -> Record:
-    world = lost_robots.lab()
-    known = lost_robots.voronoi_lab_map() if row == 'voronoi' else lost_robots.lab_map()
+    world = trials.lab()
+    known = trials.voronoi_lab_map() if row == 'voronoi' else trials.lab_map()
     if row == 'paper':
-        start = pose(*lost_robots.LAB_START)
+        start = pose(*trials.LAB_START)
     else:
         start = random_start(world, np.random.default_rng([1, seed]))
     finder = GlobalLocalization(known.patch, known.topology, seed=seed)
@@ -110,7 +109,7 @@ def _floor_by_floor(
 
 
 def _in_building(folder: Path, name: str, number: int) -> Record:
-    world = lost_robots.floor_of(folder, name)
+    world = trials.floor_of(folder, name)
     laser = _FULL
     start = random_start(world, np.random.default_rng([2, number]))
     return search(
@@ -123,13 +122,10 @@ def _finder(
     folder: Path, name: str, laser: str, finer: int, driven: bool = False
 ) -> GlobalLocalization:
     """A search that is ready to begin in a world's map."""
-    world = lost_robots.floor_of(folder, name)
+    world = trials.floor_of(folder, name)
     kind = LASERS.get(laser, _FULL)
     shift = _SHIFT_M if finer > 1 else (0.0, 0.0)
-    if driven:
-        known = lost_robots.driven_map(world, kind)
-    else:
-        known = lost_robots.shifted_map(world, finer, shift)
+    known = trials.driven_map(world, kind) if driven else trials.shifted_map(world, finer, shift)
     start = random_start(world, np.random.default_rng(0))
     return prepared(known, next(random_drive(world, start, 0, laser=kind)), seed=1)
 
@@ -145,7 +141,7 @@ def lasers(setting: Setting) -> Iterator[Case]:
 
 
 def _with_laser(folder: Path, name: str, laser: str, number: int) -> Record:
-    world = lost_robots.floor_of(folder, name)
+    world = trials.floor_of(folder, name)
     start = random_start(world, np.random.default_rng([3, number]))
     drive = random_drive(world, start, number, laser=LASERS[laser])
     return search(fresh(_finder(folder, name, laser, 1)), drive, _WAY_M)
@@ -157,7 +153,7 @@ def fine(setting: Setting) -> Iterator[Case]:
 
 
 def _in_fine_map(folder: Path, name: str, number: int) -> Record:
-    world = lost_robots.floor_of(folder, name)
+    world = trials.floor_of(folder, name)
     drive = random_drive(world, random_start(world, np.random.default_rng([2, number])), number)
     return search(fresh(_finder(folder, name, '', 2)), drive, _WAY_M, shift_m=_SHIFT_M)
 
@@ -168,7 +164,7 @@ def driven(setting: Setting) -> Iterator[Case]:
 
 
 def _in_driven_map(folder: Path, name: str, number: int) -> Record:
-    world = lost_robots.floor_of(folder, name)
+    world = trials.floor_of(folder, name)
     finder = fresh(_finder(folder, name, '', 1, driven=True))
     within = np.zeros(world.occupied.shape, dtype=np.bool_)
     cells = world.frame.cells_of(
@@ -182,18 +178,18 @@ def _in_driven_map(folder: Path, name: str, number: int) -> Record:
 def twins(_: Setting) -> Iterator[Case]:
     """Places that look the same for ever: twin rooms, and a floor that is the same when turned."""
     for name, (world, within) in (
-        ('twin rooms', lost_robots.twin_rooms()),
-        ('floor', lost_robots.turned_floor()),
+        ('twin rooms', trials.twin_rooms()),
+        ('floor', trials.turned_floor()),
     ):
         for seed in range(20):
             yield Case(f'{name} {seed}', partial(_among_twins, world, within, seed))
 
 
 def _among_twins(world: World, within: np.ndarray, seed: int) -> Record:
-    known = lost_robots.coarse_map(world)
+    known = trials.coarse_map(world)
     finder = GlobalLocalization(known.patch, known.topology, seed=seed)
     start = random_start(world, np.random.default_rng(seed), within)
-    return lost_robots.watch_twins(finder, random_drive(world, start, seed, within), _TWIN_WAY_M)
+    return trials.watch_twins(finder, random_drive(world, start, seed, within), _TWIN_WAY_M)
 
 
 def foreign(setting: Setting) -> Iterator[Case]:
@@ -214,16 +210,16 @@ _COPRIME = 7  # to 25 worlds: all pairs come, and worlds of both kinds meet at o
 
 
 def _elsewhere(folder: Path, mapped: str, driven_in: str) -> Record:
-    world = lost_robots.lab() if driven_in == 'lab' else lost_robots.floor_of(folder, driven_in)
-    known: Map = lost_robots.lab_map() if mapped == 'lab' else _map_of(folder, mapped)
+    world = trials.lab() if driven_in == 'lab' else trials.floor_of(folder, driven_in)
+    known: Map = trials.lab_map() if mapped == 'lab' else _map_of(folder, mapped)
     start = random_start(world, np.random.default_rng([5, sum(map(ord, mapped + driven_in))]))
     finder = GlobalLocalization(known.patch, known.topology, seed=1)
-    return lost_robots.watch_foreign(finder, random_drive(world, start, 1), _FOREIGN_WAY_M)
+    return trials.watch_foreign(finder, random_drive(world, start, 1), _FOREIGN_WAY_M)
 
 
 @lru_cache(maxsize=1)
 def _map_of(folder: Path, name: str) -> Map:
-    return lost_robots.shifted_map(lost_robots.floor_of(folder, name), 1, (0.0, 0.0))
+    return trials.shifted_map(trials.floor_of(folder, name), 1, (0.0, 0.0))
 
 
 def kidnapped(setting: Setting) -> Iterator[Case]:
@@ -245,7 +241,7 @@ def _carried_off(folder: Path, name: str, seed: int) -> Record:
 def halves(setting: Setting) -> Iterator[Case]:
     """A real log: the map of its first half, started at 100 stamps of the second, 60 scans."""
     for number in range(100):
-        yield Case(f'{number}', partial(lost_log.in_second_half, setting.log, number))
+        yield Case(f'{number}', partial(split_log.in_second_half, setting.log, number))
 
 
 def foreign_log(setting: Setting) -> Iterator[Case]:
@@ -259,17 +255,17 @@ def foreign_log(setting: Setting) -> Iterator[Case]:
 
 def _log_elsewhere(setting: Setting, name: str) -> Record:
     known = _map_of(setting.worlds, name)
-    looks = lost_log.looks_from(setting.log, sum(map(ord, name)))
-    return lost_robots.watch_foreign(
+    looks = split_log.looks_from(setting.log, sum(map(ord, name)))
+    return trials.watch_foreign(
         GlobalLocalization(known.patch, known.topology, seed=1), looks, _FOREIGN_WAY_M
     )
 
 
 def _in_log_map(setting: Setting, name: str) -> Record:
-    world = lost_robots.floor_of(setting.worlds, name)
-    known = lost_log.first_half(setting.log)
+    world = trials.floor_of(setting.worlds, name)
+    known = split_log.first_half(setting.log)
     drive = random_drive(world, random_start(world, np.random.default_rng(6)), 6)
-    return lost_robots.watch_foreign(
+    return trials.watch_foreign(
         GlobalLocalization(known.patch, known.topology, seed=1), drive, _FOREIGN_WAY_M
     )
 

@@ -22,9 +22,8 @@ from live.conftest import PATIENCE_S
 from logs.test_log import ros1_bag
 from tools.test_replay import carmen_lines
 
-from docs import commands as documents
-from thinmap_ros.files import occupancy_maps as map_files
-from thinmap_ros.files import package_data as resources
+from docs import commands
+from thinmap_ros.files import occupancy_maps, package_data
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
 from thinmap_ros.tools.carmen_to_bag import convert
@@ -32,7 +31,7 @@ from thinmap_ros.tools.carmen_to_bag import convert
 pytestmark = [pytest.mark.live, pytest.mark.timeout(400)]
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENTS = [ROOT / 'README.md', ROOT / 'docs' / 'tutorials.md']
-COMMANDS = [command for path in DOCUMENTS for command in documents.commands(path)]
+COMMANDS = [command for path in DOCUMENTS for command in commands.commands(path)]
 
 # Marked in the documents, and why. No more than six marks.
 NOT_RUN = {
@@ -198,10 +197,10 @@ def place(tmp_path: Path) -> Path:
         convert(CarmenLog(tmp_path / 'LOG.clf', LaserOptions()), tmp_path / bag)
     ros1_bag(tmp_path / 'my.bag')
     (tmp_path / 'bags').symlink_to(ROOT / 'bags')
-    _, patch, _ = read_world(resources.world_path('room_10x10'))
+    _, patch, _ = read_world(package_data.world_path('room_10x10'))
     (tmp_path / 'maps').mkdir()
-    map_files.write_map(tmp_path / 'maps' / 'office', patch)
-    map_files.write_map(tmp_path / 'office', patch)
+    occupancy_maps.write_map(tmp_path / 'maps' / 'office', patch)
+    occupancy_maps.write_map(tmp_path / 'office', patch)
     _write_scripts(tmp_path / 'scripts')
     return tmp_path
 
@@ -295,7 +294,7 @@ def test_no_command_is_left_out():
     sections = {(c.document, c.section) for c in COMMANDS if not c.marked}
     assert sections <= set(SECTIONS), 'not covered: name the section in SECTIONS'
     assert {c.text for c in COMMANDS if c.marked} == set(NOT_RUN)
-    assert sum(documents.marks(path) for path in DOCUMENTS) <= MOST_MARKS
+    assert sum(commands.marks(path) for path in DOCUMENTS) <= MOST_MARKS
     texts = {c.text.split('#')[0].strip() for c in COMMANDS}
     assert set(HELP_ONLY) | set(SHORTER) <= texts
 
@@ -329,7 +328,7 @@ def test_commands_are_found_in_blocks_and_text(tmp_path):
         '```',
     ]
     document.write_text('\n'.join(lines))
-    found = [(c.section, c.text, c.marked) for c in documents.commands(document)]
+    found = [(c.section, c.text, c.marked) for c in commands.commands(document)]
     assert found == [
         ('Page', 'ros2 topic list', False),
         ('Page', 'ros2 run a b \\\n  -p c &', False),
@@ -340,4 +339,4 @@ def test_commands_are_found_in_blocks_and_text(tmp_path):
         ('Two', 'cat z', False),
         ('Two', 'echo w', False),
     ]
-    assert documents.marks(document) == 2
+    assert commands.marks(document) == 2

@@ -111,7 +111,7 @@ MAY_BE_NAN = {'features': {'spans'}, 'exploration': {'tracks'}}
 
 
 def saved(folder: Path, kind: str, state: State) -> Path:
-    """An archive as session_files writes it."""
+    """An archive as files.sessions writes it."""
     members = {name: npy(array) for name, array in state.items()}
     return archive(folder / f'a.{kind}.npz', thinmap_format=npy(np.array(FORMATS[kind])), **members)
 

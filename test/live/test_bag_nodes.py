@@ -15,9 +15,9 @@ from std_srvs.srv import SetBool, Trigger
 from support.timeouts import PATIENCE_S
 from test_health import Doctor
 
-from thinmap_ros.logs import qos as bag_qos
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_writer import BagWriter
+from thinmap_ros.logs.qos import recorded
 from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live
@@ -98,9 +98,9 @@ def bag(tmp_path):
     """Ten scans, ten words and two signs that are latched, one a second; the words best effort."""
     writer = BagWriter(tmp_path / 'bag', live=True)
     make = writer.typestore.types
-    writer.add_topic('/robot/scan', SCAN, [bag_qos.recorded(5, True, False)])
-    writer.add_topic('/said', STRING, [bag_qos.recorded(0, False, False)])
-    writer.add_topic('/sign', STRING, [bag_qos.recorded(1, True, True)])
+    writer.add_topic('/robot/scan', SCAN, [recorded(5, True, False)])
+    writer.add_topic('/said', STRING, [recorded(0, False, False)])
+    writer.add_topic('/sign', STRING, [recorded(1, True, True)])
     for i in range(10):
         ns = 10**12 + i * 10**9
         if i in (1, 6):

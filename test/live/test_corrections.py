@@ -15,7 +15,7 @@ from thinmap_msgs.srv import SaveMap
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.correctable import CorrectableGrid
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
-from thinmap_ros.files import sessions as session_files
+from thinmap_ros.files import sessions
 from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live
@@ -118,7 +118,7 @@ def test_a_map_that_is_saved_meanwhile_has_undergone_the_correction(graph, tmp_p
     response = graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(tmp_path / 'room')))
     assert response.success, response.message
     mapping.by_hand.finish()
-    saved = session_files.load_grid(str(tmp_path / 'room'), CONFIG)
+    saved = sessions.load_grid(str(tmp_path / 'room'), CONFIG)
     expected = mapping.by_hand.shown.patch()
     np.testing.assert_array_equal(saved.patch().cells, expected.cells)
     assert mapping.add(COUNT + 1, TRUE[COUNT + 1]) == corrected_ns

@@ -12,7 +12,7 @@ import pytest
 from support.hidden_library import hide
 from support.timeouts import PATIENCE_S, PROGRAM_S
 
-from thinmap_ros.files import occupancy_maps as map_files
+from thinmap_ros.files import occupancy_maps
 from thinmap_ros.logs.bag import Bag
 
 pytestmark = pytest.mark.live
@@ -72,7 +72,7 @@ def test_the_robot_explores_the_room_and_stops_by_itself(ros_domain, tmp_path):
     assert report['pose_rmse'] < 0.05
     assert report['end_nodes_visited'] < report['end_nodes_seen']
     assert report['reason'] in stdout
-    assert map_files.read_map(out / 'map.yaml').free.sum() > 8000
+    assert occupancy_maps.read_map(out / 'map.yaml').free.sum() > 8000
     assert len(json.loads((out / 'topology.geojson').read_text())['features']) > 5
     assert np.loadtxt(out / 'trajectory.tum').shape[1] == 8
     assert (out / 'summary.png').stat().st_size > 10_000

@@ -16,8 +16,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.topology.builder import TopologyConfig, build
 from thinmap_ros.core.topology.graph import TopologicalMap as TopologicalGraph
-from thinmap_ros.files import occupancy_maps as map_files
-from thinmap_ros.files import package_data as resources
+from thinmap_ros.files import occupancy_maps, package_data
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.ros import messages, qos
 
@@ -47,10 +46,10 @@ solids:
 
 def map_of(world, folder):
     """A map of a world of the simulator, in cells of 10 cm."""
-    _, patch, _ = read_world(resources.world_path(str(world)))
+    _, patch, _ = read_world(package_data.world_path(str(world)))
     rows, cols = (size // 5 * 5 for size in patch.shape)
     cells = patch.cells[:rows, :cols].reshape(rows // 5, 5, cols // 5, 5).max(axis=(1, 3))
-    map_files.write_map(
+    occupancy_maps.write_map(
         folder / 'map', GridPatch(GridFrame(patch.frame.origin_x, patch.frame.origin_y, 0.1), cells)
     )
     return folder / 'map.yaml'
@@ -154,7 +153,7 @@ def test_what_is_wrong_with_the_input_is_said_in_words_and_no_pose_comes_of_it(g
         )
     }
     graph.start('global_localizer', automatic=True, laser_pose='0.0,0.0,0.0')
-    good = map_files.read_map(map_file)
+    good = occupancy_maps.read_map(map_file)
     topology = build(good, None, TopologyConfig())
     seconds = itertools.count(1)
 

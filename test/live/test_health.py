@@ -13,8 +13,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from thinmap_msgs.action import NavigateToPose
 from thinmap_msgs.msg import TopologicalMap
-from thinmap_ros.ros import diagnostics as health
-from thinmap_ros.ros import qos
+from thinmap_ros.ros import diagnostics, qos
 
 pytestmark = pytest.mark.live
 AT_START = {'start_x_m': 2.0, 'start_y_m': 2.0, 'start_yaw_rad': 0.0}
@@ -101,11 +100,11 @@ def test_two_localizers_on_one_graph_are_detected_and_reported(graph):
 def test_what_is_over_is_not_told_first(ros_domain, monkeypatch):
     """A refusal of long ago was the first thing told whenever anything else was dropped."""
     now = [100.0]
-    monkeypatch.setattr(health, 'monotonic', lambda: now[0])
+    monkeypatch.setattr(diagnostics, 'monotonic', lambda: now[0])
     rclpy.init(domain_id=ros_domain)
     node = rclpy.create_node('patient')
     try:
-        told = health.Health(node)
+        told = diagnostics.Health(node)
         told.refused('odom', 'pose nan: expected finite numbers')
         told.dropped('scans without odometry at their time', 2)
         now[0] += 1.0

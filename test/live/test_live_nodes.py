@@ -14,7 +14,7 @@ from tf2_msgs.msg import TFMessage
 from thinmap_msgs.action import NavigateToPose
 from thinmap_msgs.msg import SlamStatus, TopologicalMap
 from thinmap_msgs.srv import SaveMap
-from thinmap_ros.files import occupancy_maps as map_files
+from thinmap_ros.files import occupancy_maps
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.ros import messages, qos
 
@@ -92,7 +92,7 @@ def test_a_scan_becomes_a_pose_a_map_and_a_graph(graph, tmp_path):
     assert maps[-1].info.resolution == pytest.approx(0.1)
     response = graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(tmp_path / 'room')))
     assert response.success, response.message
-    assert map_files.read_map(tmp_path / 'room.yaml').cells.shape[0] > 20
+    assert occupancy_maps.read_map(tmp_path / 'room.yaml').cells.shape[0] > 20
     response = graph.call(SaveMap, 'save_map', SaveMap.Request(path='/proc/nowhere/room'))
     assert not response.success
     assert '/proc/nowhere' in response.message

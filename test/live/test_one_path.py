@@ -15,9 +15,7 @@ from test_health import Doctor
 
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
-from thinmap_ros.files import occupancy_maps as map_files
-from thinmap_ros.files import package_data as resources
-from thinmap_ros.files import sessions as session_files
+from thinmap_ros.files import occupancy_maps, package_data, sessions
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.logs.bag import BagLog
 from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
@@ -66,7 +64,7 @@ class SimulatedLog:
         self.skipped = Skipped()
 
     def events(self):
-        world = World.from_patch(*read_world(resources.world_path('room_10x10')))
+        world = World.from_patch(*read_world(package_data.world_path('room_10x10')))
         simulation = Simulation(world, world.start, PRESETS['2dx'], Lms200Config(), 5)
         moment = simulation.sense()
         for _ in range(400):
@@ -135,7 +133,7 @@ def assert_live_is_same(graph, bag, expected, tmp_path, **localizer):
     assert np.abs(live - expected.poses).max() <= 1e-9
     response = graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(tmp_path / 'live')))
     assert response.success, response.message
-    map_files.write_map(tmp_path / 'replayed', expected.pipeline.grid.patch())
+    occupancy_maps.write_map(tmp_path / 'replayed', expected.pipeline.grid.patch())
     assert (tmp_path / 'live.pgm').read_bytes() == (tmp_path / 'replayed.pgm').read_bytes()
 
 
@@ -166,7 +164,7 @@ def test_a_closed_loop_corrects_the_live_map_as_it_does_the_replayed_one(graph, 
     assert len(trajectories) == expected.pipeline.corrections
     stamps, _ = messages.trajectory_from(trajectories[-1])
     assert set(stamps.tolist()) <= set(expected.stamps_ns)
-    live = session_files.load_topology(str(tmp_path / 'live')).map
+    live = sessions.load_topology(str(tmp_path / 'live')).map
     offline = expected.pipeline.topology.map
     assert live.nodes.keys() == offline.nodes.keys()
     for number, node in live.nodes.items():

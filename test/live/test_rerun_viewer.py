@@ -7,7 +7,7 @@ from geometry_msgs.msg import PoseStamped
 from support.hidden_library import hide
 
 from thinmap_ros.ros import messages, qos
-from thinmap_ros.view import rerun_sinks as rerun_streams
+from thinmap_ros.view import rerun_sinks
 
 pytestmark = pytest.mark.live
 
@@ -19,7 +19,7 @@ def test_without_anything_to_show_it_says_so_and_ends_on_a_signal(graph):
 
 
 @pytest.mark.skipif(
-    not rerun_streams.is_installed(),
+    not rerun_sinks.is_installed(),
     reason='needs rerun, which is not installed (the extra "viewer")',
 )
 def test_recording_can_be_read_after_a_signal(graph, tmp_path):

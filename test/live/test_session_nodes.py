@@ -15,8 +15,7 @@ from thinmap_msgs.srv import LoadMap, SaveMap
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.se2 import pose
 from thinmap_ros.core.topology.builder import TopologyBuilder
-from thinmap_ros.files import occupancy_maps as map_files
-from thinmap_ros.files import sessions as session_files
+from thinmap_ros.files import occupancy_maps, sessions
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.sim.laser import Lms200, Lms200Config
 from thinmap_ros.sim.world import World
@@ -92,7 +91,7 @@ def test_ids_and_cells_are_the_same_tomorrow_and_mapping_goes_on(graph, tmp_path
     graph.hear_out()
     before = places(graphs[-1])
     edges = {edge.id for edge in graphs[-1].edges}
-    known = session_files.load_grid(str(stem)).patch()
+    known = sessions.load_grid(str(stem)).patch()
     assert len(before) > 3
     maps.clear(), graphs.clear(), local.clear()
     for name in MAPPERS:
@@ -133,9 +132,9 @@ def room_of(resolution=0.1):
 
 
 def save(stem, grid, builder=None):
-    session_files.save_grid(str(stem), grid)
+    sessions.save_grid(str(stem), grid)
     if builder is not None:
-        session_files.save_topology(str(stem), builder)
+        sessions.save_topology(str(stem), builder)
 
 
 def write_bad_sessions(folder, grid, builder):
@@ -145,7 +144,7 @@ def write_bad_sessions(folder, grid, builder):
     save(folder / 'half', grid, builder)
     (folder / 'cut.grid.npz').write_bytes((folder / 'cut.grid.npz').read_bytes()[:-200])
     (folder / 'half.topology.npz').write_bytes((folder / 'half.topology.npz').read_bytes()[:300])
-    map_files.write_map(folder / 'fine_map', room_of(0.05)[0].patch())
+    occupancy_maps.write_map(folder / 'fine_map', room_of(0.05)[0].patch())
     save(folder / 'mixed', grid, room_of(0.05)[1])
     return {
         'fine': 'expected 0.1 m',
@@ -196,11 +195,11 @@ def test_sessions_are_loaded_into_running_nodes_or_refused_in_words(graph, tmp_p
     response = graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(tmp_path / 'again')))
     assert response.success, response.message
     assert places(graphs[-1]) == expected
-    again = session_files.load_grid(str(tmp_path / 'again'))
+    again = sessions.load_grid(str(tmp_path / 'again'))
     assert np.array_equal(again.state()['log_odds'], grid.state()['log_odds'])
-    assert session_files.load_topology(str(tmp_path / 'again')).map.nodes == builder.map.nodes
+    assert sessions.load_topology(str(tmp_path / 'again')).map.nodes == builder.map.nodes
     # Any map_server map will do; no graph belongs to it.
-    map_files.write_map(tmp_path / 'map', grid.patch())
+    occupancy_maps.write_map(tmp_path / 'map', grid.patch())
     response = load('map.yaml')
     assert response.success and 'anew' in response.message
     graph.until(lambda: not graphs[-1].nodes, 'an empty graph')
@@ -221,7 +220,7 @@ def test_services_touch_nothing_outside_of_their_folder(graph, tmp_path):
     outside = tmp_path / 'outside'
     folder.mkdir(), outside.mkdir()
     save(outside / 'room', *room_of())
-    map_files.write_map(outside / 'drawn', room_of()[0].patch())
+    occupancy_maps.write_map(outside / 'drawn', room_of()[0].patch())
     (folder / 'link').symlink_to(outside)
     (folder / 'circle').symlink_to(folder / 'circle')
     for end in ('.grid.npz', '.topology.npz'):

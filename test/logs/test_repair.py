@@ -22,7 +22,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 from rosbags.typesys import Stores, get_typestore
 
-from thinmap_ros.logs import qos as bag_qos
+from thinmap_ros.logs import qos
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.logs.mcap_reader import Damage, McapFile, whole_records
@@ -36,8 +36,8 @@ PER_CHUNK = 10
 def write(path: Path, count: int = COUNT) -> Path:
     """A bag of numbered messages, a chunk for every ten."""
     writer = BagWriter(path, live=True)
-    writer.add_topic('/said', STRING, [bag_qos.recorded(7, False, False)])
-    writer.add_topic('/map', STRING, [bag_qos.recorded(1, True, True)])
+    writer.add_topic('/said', STRING, [qos.recorded(7, False, False)])
+    writer.add_topic('/map', STRING, [qos.recorded(1, True, True)])
     for i in range(count):
         writer.write('/map' if i % 20 == 0 else '/said', STRING, 10**9 + i, text(writer, i))
         if i % PER_CHUNK == PER_CHUNK - 1:
@@ -126,9 +126,9 @@ def test_a_cut_off_bag_gets_index_metadata_and_its_qualities_back(tmp_path: Path
     assert metadata['starting_time']['nanoseconds_since_epoch'] == 10**9
     assert metadata['duration']['nanoseconds'] == len(found) - 1
     offers = Bag(good).offers
-    assert bag_qos.is_latched('/map', offers['/map'])
-    assert not bag_qos.is_latched('/said', offers['/said'])
-    assert not bag_qos.is_reliable(offers['/said']) and bag_qos.depth(offers['/said']) == 7
+    assert qos.is_latched('/map', offers['/map'])
+    assert not qos.is_latched('/said', offers['/said'])
+    assert not qos.is_reliable(offers['/said']) and qos.depth(offers['/said']) == 7
 
 
 def cut_file(tmp_path: Path, compression: CompressionType) -> Path:

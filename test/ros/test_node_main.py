@@ -9,7 +9,7 @@ pytestmark = pytest.mark.live
 PROGRAM = """
 import gc
 from rclpy.node import Node
-from thinmap_ros.ros import node_main as runtime
+from thinmap_ros.ros import node_main
 
 
 class Short(Node):
@@ -23,7 +23,7 @@ class Short(Node):
         return True
 
 
-runtime.run(Short)
+node_main.run(Short)
 """
 
 

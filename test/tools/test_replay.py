@@ -14,21 +14,21 @@ import pytest
 from support.hidden_library import hide
 from support.timeouts import PATIENCE_S
 
-from thinmap_ros.files import occupancy_maps as map_files
+from thinmap_ros.files import occupancy_maps
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
 from thinmap_ros.pipeline import PipelineConfig
 from thinmap_ros.replaying import replay
 from thinmap_ros.tools.carmen_to_bag import convert
 from thinmap_ros.tools.replay import ReplayView, main
-from thinmap_ros.view import rerun_sinks as rerun_streams
+from thinmap_ros.view import rerun_sinks
 from thinmap_ros.view.null_view import NullView
 
 TRAJECTORIES = {'trajectory.tum', 'trajectory_final.tum'}
 FILES = TRAJECTORIES | {'map.pgm', 'map.yaml', 'topology.geojson', 'summary.png', 'report.json'}
 BEAMS = 181
 needs_rerun = pytest.mark.skipif(
-    not rerun_streams.is_installed(),
+    not rerun_sinks.is_installed(),
     reason='needs rerun, which is not installed (the extra "viewer")',
 )
 
@@ -88,7 +88,7 @@ def test_files_and_figures(log, tmp_path, form):
     trajectory = np.loadtxt(out / 'trajectory.tum')
     assert trajectory.shape == (30, 8)
     assert np.abs(trajectory[:, 1] - 0.03 * np.arange(30)).max() < 0.03
-    patch = map_files.read_map(out / 'map.yaml')
+    patch = occupancy_maps.read_map(out / 'map.yaml')
     wall = patch.frame.cells_of(np.array([[3.0, 0.0]]))[0]
     assert patch.occupied[wall[0], wall[1] - 1 : wall[1] + 2].any()
 
@@ -377,11 +377,11 @@ def test_the_viewer_shows_the_replay_until_it_is_closed(log, tmp_path, monkeypat
     received, stand_in, seen = (tmp_path / name for name in ('received.rrd', 'viewer', 'seen'))
     report = tmp_path / 'out' / 'report.json'
     stand_in.write_text(
-        f'#!/bin/sh\n"{rerun_streams.viewer_program()}" --save "{received}" "$@" &\n'
+        f'#!/bin/sh\n"{rerun_sinks.viewer_program()}" --save "{received}" "$@" &\n'
         f'while [ ! -e "{seen}" ]; do sleep 0.1; done; kill $!; wait $!\n'
     )
     stand_in.chmod(0o755)
-    monkeypatch.setattr(rerun_streams, 'viewer_program', lambda: str(stand_in))
+    monkeypatch.setattr(rerun_sinks, 'viewer_program', lambda: str(stand_in))
     monkeypatch.setenv('DISPLAY', ':none')
     monkeypatch.setattr(
         sys, 'argv', ['replay', str(log), '-o', str(tmp_path / 'out'), '--quiet', '--view']

@@ -15,7 +15,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.logs.bag_writer import BagWriter
-from thinmap_ros.view import rerun_sinks as rerun_streams
+from thinmap_ros.view import rerun_sinks
 from thinmap_ros.view.message_view import Feed, recording_from_bag
 from thinmap_ros.view.null_view import NullView
 from thinmap_ros.view.rerun_view import View
@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[2]
 S = 1_000_000_000
 START = 1_700_000_000 * S
 needs_rerun = pytest.mark.skipif(
-    not rerun_streams.is_installed(),
+    not rerun_sinks.is_installed(),
     reason='needs rerun, which is not installed (the extra "viewer")',
 )
 
@@ -182,10 +182,10 @@ def test_viewer_is_sent_what_the_file_holds_and_ends_with_the_view(tmp_path, mon
     received = tmp_path / 'received.rrd'
     stand_in = tmp_path / 'viewer'
     stand_in.write_text(
-        f'#!/bin/sh\nexec "{rerun_streams.viewer_program()}" --save "{received}" "$@"\n'
+        f'#!/bin/sh\nexec "{rerun_sinks.viewer_program()}" --save "{received}" "$@"\n'
     )
     stand_in.chmod(0o755)
-    monkeypatch.setattr(rerun_streams, 'viewer_program', lambda: str(stand_in))
+    monkeypatch.setattr(rerun_sinks, 'viewer_program', lambda: str(stand_in))
     monkeypatch.setenv('DISPLAY', ':none')
     view = View(tmp_path / 'a.rrd', spawn=True)
     viewer = view._streams.viewer

@@ -15,18 +15,15 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.evaluation.exploration_metrics import EndNodeCensus, exploration_report
-from thinmap_ros.files import graphs as graph_files
-from thinmap_ros.files import occupancy_maps as map_files
-from thinmap_ros.files import trajectories as trajectory_files
+from thinmap_ros.files import graphs, occupancy_maps, trajectories
 from thinmap_ros.files.atomic import write_text
 from thinmap_ros.files.worlds import read_world
-from thinmap_ros.logs import decode as bag_messages
+from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.sim.coverage import Coverable, coverable
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
-from thinmap_ros.view import figures
-from thinmap_ros.view import rerun_sinks as rerun_streams
+from thinmap_ros.view import figures, rerun_sinks
 from thinmap_ros.view.message_view import recording_from_bag
 
 FILES = (
@@ -63,15 +60,15 @@ def read(path: Path) -> Recording:
         if raw.topic == '/collisions':
             recording.collisions = int(message.data)
             continue
-        ns = bag_messages.stamp_ns(message)
+        ns = decode.stamp_ns(message)
         if raw.topic == '/ground_truth':
-            recording.true[ns] = bag_messages.pose(message.pose)
+            recording.true[ns] = decode.pose(message.pose)
         elif raw.topic == '/pose':
-            recording.estimated[ns] = bag_messages.pose(message.pose.pose)
+            recording.estimated[ns] = decode.pose(message.pose.pose)
         elif raw.topic == '/map':
-            recording.maps.append((ns, bag_messages.patch(message)))
+            recording.maps.append((ns, decode.patch(message)))
         elif raw.topic == '/topology':
-            recording.topology = bag_messages.topology(message)
+            recording.topology = decode.topology(message)
         elif raw.topic == '/end_nodes':
             nodes = [(int(n.node_id), n.position.x, n.position.y) for n in message.end_nodes]
             recording.end_nodes.append((ns, nodes))
@@ -96,17 +93,17 @@ def write(out: Path, world_file: Path, robot: str, result: dict[str, Any]) -> di
     seen = coverable(world, start, PRESETS[robot].radius_m, recording.range_max_m)
     report = _report(recording, seen, result)
     patch = recording.maps[-1][1]
-    map_files.write_map(out / 'map', patch)
-    graph_files.write_geojson(out / 'topology.geojson', recording.topology)
+    occupancy_maps.write_map(out / 'map', patch)
+    graphs.write_geojson(out / 'topology.geojson', recording.topology)
     estimated = np.array(list(recording.estimated.values()))
-    trajectory_files.write_tum(out / 'trajectory.tum', list(recording.estimated), list(estimated))
+    trajectories.write_tum(out / 'trajectory.tum', list(recording.estimated), list(estimated))
     true = np.array(list(recording.true.values()))
     title = (
         f'{world.name}: {100.0 * report["coverage"]:.1f} % seen, '
         f'{report["distance"]:.1f} m, {report["time"]:.0f} s'
     )
     figures.summary_figure(out / 'summary.png', patch, recording.topology, estimated, true, title)
-    if rerun_streams.is_installed():
+    if rerun_sinks.is_installed():
         recording_from_bag(out / 'bag', out / 'recording.rrd')
     else:
         print(

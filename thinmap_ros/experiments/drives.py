@@ -14,9 +14,9 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
-from thinmap_ros.files import package_data as resources
+from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_tour, read_world
-from thinmap_ros.logs import decode as bag_messages
+from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag import Bag, BagLog
 from thinmap_ros.logs.log import OdometryEvent
 from thinmap_ros.sim.coverage import coverable
@@ -37,12 +37,12 @@ _EXPLORE_LIMIT_S = 1000.0
 
 def world_of(name: str) -> World:
     """One of the papers' worlds."""
-    return World.from_patch(*read_world(resources.world_path(name)))
+    return World.from_patch(*read_world(package_data.world_path(name)))
 
 
 def tour_of(name: str) -> Array:
     """Places (N, 2) of a world's tour."""
-    return read_tour(resources.world_path(name))
+    return read_tour(package_data.world_path(name))
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ def looks_of_bag(path: Path) -> Iterator[Look]:
     truth = {}
     for message in bag.messages({TRUTH_TOPIC}):
         decoded = bag.decode(message)
-        truth[bag_messages.stamp_ns(decoded)] = bag_messages.pose(decoded.pose)
+        truth[decode.stamp_ns(decoded)] = decode.pose(decoded.pose)
     T_odom_base: dict[int, Array] = {}
     for event in BagLog(path).events():
         if isinstance(event, OdometryEvent):

@@ -20,7 +20,7 @@ from xml.etree import ElementTree
 import numpy as np
 import yaml
 
-from thinmap_ros.core import validation as checks
+from thinmap_ros.core import validation
 from thinmap_ros.core.errors import InputError, reason_of, shown
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
@@ -289,7 +289,7 @@ def _rounded(points: Array) -> list[list[float]]:
 
 def _number(value: Any) -> float:
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not is_number or not abs(value) <= checks.FARTHEST_M:
+    if not is_number or not abs(value) <= validation.FARTHEST_M:
         raise ValueError(f'{shown(value)} is no finite number of m')
     return float(value)
 

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Qos
 
-from thinmap_ros.core import se2
-from thinmap_ros.core import validation as checks
+from thinmap_ros.core import se2, validation
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.logs import decode as bag_messages
+from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag_directory import bag_files, without_compression
 from thinmap_ros.logs.laser_mount import Mount, StaticTransforms, rotation_matrix
 from thinmap_ros.logs.log import Event, OdometryEvent, ScanEvent, Skipped, is_mcap, refuse_foreign
@@ -113,8 +112,10 @@ class Bag:
             Exception
         ) as error:  # any error of the deserializer means the same: these bytes are no such message
             reason = ' '.join(str(error).split())[:120] or type(error).__name__
-            where = f'{self.path}: {checks.short(message.topic)}'
-            raise InputError(f'{where}: no {checks.short(message.type_name)}: {reason}') from error
+            where = f'{self.path}: {validation.short(message.topic)}'
+            raise InputError(
+                f'{where}: no {validation.short(message.type_name)}: {reason}'
+            ) from error
 
     def _add(self, storage: Storage) -> None:
         self._storages.append(storage)
@@ -176,7 +177,7 @@ class BagLog:
             if count == 0:
                 first = f': {self.skipped.first}' if self.skipped.first else ''
                 raise InputError(
-                    f'{self.path}: {checks.short(topic)}: no message that can be used{first}'
+                    f'{self.path}: {validation.short(topic)}: no message that can be used{first}'
                 )
 
     def _event(self, bag: Bag, message: RawMessage) -> tuple[str, OdometryEvent | Scan] | None:
@@ -185,7 +186,7 @@ class BagLog:
             decoded = bag.decode(message)
             value = _odometry(decoded) if message.type_name == _ODOMETRY else _scan(decoded)
         except InputError as error:
-            where = f'{self.path}: {checks.short(message.topic)}: '
+            where = f'{self.path}: {validation.short(message.topic)}: '
             self.skipped.add(where + str(error).removeprefix(where))
             return None
         return decoded.header.frame_id, value
@@ -197,9 +198,11 @@ class BagLog:
         if not wanted and len(found) == 1:
             return found[0]
         if not found or wanted:
-            has = checks.listed([f'{topic} ({name})' for topic, name in sorted(bag.topics.items())])
+            has = validation.listed(
+                [f'{topic} ({name})' for topic, name in sorted(bag.topics.items())]
+            )
             raise InputError(f'{self.path}: no {what} ({wanted or type_name}); it has {has}')
-        names = checks.listed(found)
+        names = validation.listed(found)
         raise InputError(f'{self.path}: {what} on several topics, name one of {names}')
 
     def _static_transforms(self, bag: Bag) -> StaticTransforms:
@@ -210,7 +213,7 @@ class BagLog:
                 for transform in bag.decode(message).transforms:
                     transforms.add(transform)
             except InputError as error:
-                where = f'{self.path}: {checks.short(message.topic)}: '
+                where = f'{self.path}: {validation.short(message.topic)}: '
                 self.skipped.add(where + str(error).removeprefix(where))
         return transforms
 
@@ -222,8 +225,8 @@ class BagLog:
         except InputError as error:
             raise InputError(f'{self.path}: /tf_static: {error}') from error
         if mount is None:
-            known = checks.listed(transforms.frames)
-            where = f'where "{checks.short(frame)}" is on "{self.base_frame}"'
+            known = validation.listed(transforms.frames)
+            where = f'where "{validation.short(frame)}" is on "{self.base_frame}"'
             raise InputError(
                 f'{self.path}: /tf_static does not say {where} (it has {known}): '
                 'give --base-frame, or --offset-m for a laser straight ahead'
@@ -233,22 +236,22 @@ class BagLog:
 
 def _odometry(message: Any) -> OdometryEvent:
     rotation_matrix(message.pose.pose.orientation)  # raises where it is none
-    T_odom_base = bag_messages.pose(message.pose.pose)
+    T_odom_base = decode.pose(message.pose.pose)
     if not se2.is_finite(T_odom_base):
         raise InputError(f'pose {T_odom_base.tolist()}: expected finite numbers')
-    return OdometryEvent(bag_messages.stamp_ns(message), T_odom_base)
+    return OdometryEvent(decode.stamp_ns(message), T_odom_base)
 
 
 def _scan(message: Any) -> Scan:
     if len(message.ranges) == 0:
         raise InputError('a scan without ranges')
-    if len(message.ranges) > checks.MOST_BEAMS:
+    if len(message.ranges) > validation.MOST_BEAMS:
         raise InputError(
-            f'a scan of {len(message.ranges)} ranges: expected at most {checks.MOST_BEAMS}'
+            f'a scan of {len(message.ranges)} ranges: expected at most {validation.MOST_BEAMS}'
         )
     with np.errstate(invalid='ignore'):  # a NaN stays one, however it is made
         return Scan.create(
-            bag_messages.stamp_ns(message),
+            decode.stamp_ns(message),
             message.ranges,
             message.angle_min,
             message.angle_increment,

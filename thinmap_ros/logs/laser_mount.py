@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from thinmap_ros.core import se2
-from thinmap_ros.core import validation as checks
+from thinmap_ros.core import se2, validation
 from thinmap_ros.core.errors import InputError, shown
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -75,7 +74,7 @@ class StaticTransforms:
         """Take a geometry_msgs/TransformStamped. Raises InputError where it is no transform."""
         moved = message.transform.translation
         translation = np.array([moved.x, moved.y, moved.z], dtype=np.float64)
-        checks.within(f'transform to {shown(message.child_frame_id)}', translation.tolist())
+        validation.within(f'transform to {shown(message.child_frame_id)}', translation.tolist())
         rotation = rotation_matrix(message.transform.rotation)
         self._parents[_plain(message.child_frame_id)] = (
             _plain(message.header.frame_id),

@@ -11,7 +11,7 @@ from rosbags.rosbag2.metadata import dump_qos_v9
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.files.atomic import write_text
-from thinmap_ros.logs import qos as bag_qos
+from thinmap_ros.logs import qos
 from thinmap_ros.logs.mcap_reader import Damage, Definitions, whole_records
 from thinmap_ros.logs.mcap_records import LARGEST_CHUNK, DamagedError, unpacked
 from thinmap_ros.logs.storage import own_typestore
@@ -100,9 +100,9 @@ class _Copy:
                 schema.name, schema.encoding, schema.data
             )
         if channel.topic not in self._channel_ids:
-            if not bag_qos.of_channel(channel):
+            if not qos.of_channel(channel):
                 # What cannot be read would keep players from the whole bag.
-                kept = {key: value for key, value in channel.metadata.items() if key != bag_qos.KEY}
+                kept = {key: value for key, value in channel.metadata.items() if key != qos.KEY}
                 channel = replace(channel, metadata=kept)
             self._channel_ids[channel.topic] = self.writer.register_channel(
                 channel.topic,
@@ -150,7 +150,7 @@ def _metadata(
                 'name': topic,
                 'type': schemas[topic].name,
                 'serialization_format': channel.message_encoding,
-                'offered_qos_profiles': dump_qos_v9(bag_qos.of_channel(channel)),
+                'offered_qos_profiles': dump_qos_v9(qos.of_channel(channel)),
                 'type_description_hash': channel.metadata.get('topic_type_hash')
                 or _hash(schemas[topic]),
             },

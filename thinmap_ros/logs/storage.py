@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.logs import qos as bag_qos
+from thinmap_ros.logs import qos
 from thinmap_ros.logs.mcap_reader import Damage, McapFile
 
 LARGEST_SCHEMA = 2**20
@@ -70,7 +70,7 @@ class McapStorage:
             known = self._file.definitions.of(number)
             if known is not None:
                 self.topics[channel.topic] = known[0].name
-                self.offers.setdefault(channel.topic, []).extend(bag_qos.of_channel(channel))
+                self.offers.setdefault(channel.topic, []).extend(qos.of_channel(channel))
                 self._schemas[known[0].name] = known[0]
 
     def typestore(self, type_name: str) -> Typestore:

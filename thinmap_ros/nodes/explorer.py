@@ -14,7 +14,7 @@ from thinmap_msgs.action import Explore, NavigateToPose
 from thinmap_msgs.msg import EndNode as EndNodeMsg
 from thinmap_msgs.msg import EndNodeArray, ExplorationStatus, SlamStatus, TopologicalMap
 from thinmap_msgs.srv import SaveMap
-from thinmap_ros.core import validation as checks
+from thinmap_ros.core import validation
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
 from thinmap_ros.core.exploration.mission import Budget, Odometer, fenced
@@ -22,10 +22,9 @@ from thinmap_ros.core.exploration.strategy import Decision, EndNode
 from thinmap_ros.core.grid.map_mirror import MapMirror
 from thinmap_ros.core.se2 import Array, wrap
 from thinmap_ros.core.stamp_matcher import StampMatcher
-from thinmap_ros.files import sessions as session_files
+from thinmap_ros.files import sessions
 from thinmap_ros.kernels import warm_up
-from thinmap_ros.ros import messages, parameters, qos
-from thinmap_ros.ros import node_main as runtime
+from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.action_server import Outcome, SingleGoalServer
 from thinmap_ros.ros.laser_transform import LaserMount
 from thinmap_ros.ros.lifecycle_node import LiveNode
@@ -68,7 +67,7 @@ class ExplorerNode(LiveNode):
         """Forget map, graph and what was explored, or go back to the session of the start."""
         # What was learned is kept for the next goal, until an exploration is finished.
         self._learned = (
-            session_files.load_exploration(self._session, self._config) if self._session else None
+            sessions.load_exploration(self._session, self._config) if self._session else None
         )
         self._polygon = np.empty((0, 2))
         self._map = MapMirror()
@@ -111,7 +110,7 @@ class ExplorerNode(LiveNode):
         limits = (goal.time_limit_s, goal.distance_limit_m, goal.area_limit_m2)
         try:
             corners = [c for p in goal.area.points for c in (p.x, p.y)]
-            checks.within('goal: limit or corner of the area', [*limits, *corners])
+            validation.within('goal: limit or corner of the area', [*limits, *corners])
         except InputError as error:
             self._begin(Explore.Goal())
             self._end(ExplorationStatus.CANCELLED, str(error))
@@ -172,7 +171,7 @@ class ExplorerNode(LiveNode):
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:
             path = self._saves.inside(request.path)
-            return f'saved {session_files.save_exploration(path, self._explorer)}'
+            return f'saved {sessions.save_exploration(path, self._explorer)}'
 
         return answer(response, save)
 
@@ -388,7 +387,7 @@ def _end_node_msg(node: EndNode) -> EndNodeMsg:
 
 def main() -> None:
     """Run the node."""
-    runtime.run(ExplorerNode)
+    node_main.run(ExplorerNode)
 
 
 if __name__ == '__main__':

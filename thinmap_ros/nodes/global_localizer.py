@@ -23,10 +23,9 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.builder import TopologyConfig, build
 from thinmap_ros.core.topology.graph import TopologicalMap as Topology
-from thinmap_ros.files import occupancy_maps as map_files
+from thinmap_ros.files import occupancy_maps
 from thinmap_ros.kernels import warm_up
-from thinmap_ros.ros import messages, parameters, qos
-from thinmap_ros.ros import node_main as runtime
+from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.laser_transform import LaserMount
 from thinmap_ros.ros.lifecycle_node import LiveNode
 from thinmap_ros.ros.subscription import listen
@@ -92,7 +91,7 @@ class GlobalLocalizerNode(LiveNode):
         parameters.check_unknown(self)
         self._automatic = bool(automatic)
         self._lost_ns = round(1e9 * float(lost_s))
-        self._patch: GridPatch | None = map_files.read_map(Path(path)) if path else None
+        self._patch: GridPatch | None = occupancy_maps.read_map(Path(path)) if path else None
         self._topology: Topology | None = (
             build(self._patch, None, TopologyConfig()) if self._patch else None
         )
@@ -303,7 +302,7 @@ class GlobalLocalizerNode(LiveNode):
 
 def main() -> None:
     """Run the node."""
-    runtime.run(GlobalLocalizerNode)
+    node_main.run(GlobalLocalizerNode)
 
 
 if __name__ == '__main__':

@@ -31,10 +31,9 @@ from thinmap_ros.core.slam.localizers import (
     set_topology,
 )
 from thinmap_ros.core.topology.graph import TopologicalMap as Graph
-from thinmap_ros.files import sessions as session_files
+from thinmap_ros.files import sessions
 from thinmap_ros.kernels import warm_up
-from thinmap_ros.ros import messages, parameters, qos
-from thinmap_ros.ros import node_main as runtime
+from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import State
 from thinmap_ros.ros.diagnostics import ERROR, OK
 from thinmap_ros.ros.laser_transform import LaserMount
@@ -115,7 +114,7 @@ class LocalizerNode(LiveNode):
 
     def _made(self, config: ScanLocalizerConfig) -> AnyLocalizer:
         """A localizer that begins at its start, in the map of the session if there is one."""
-        loaded = session_files.load_features(self._session, config) if self._session else None
+        loaded = sessions.load_features(self._session, config) if self._session else None
         return loaded or localizer_class(config)(config)
 
     def _at(self, T_map_base: Array) -> ScanLocalizerConfig:
@@ -203,7 +202,7 @@ class LocalizerNode(LiveNode):
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:
             path = self._saves.inside(request.path)
-            return f'saved {session_files.save_features(path, self._localizer)}'
+            return f'saved {sessions.save_features(path, self._localizer)}'
 
         return answer(response, save)
 
@@ -213,7 +212,7 @@ class LocalizerNode(LiveNode):
     def _load(self, path: str) -> str:
         """Take over the features of a session; without any, those that there are stay."""
         config = self._at(self._localizer.pose)
-        loaded = session_files.load_features(self._saves.inside(path), config)
+        loaded = sessions.load_features(self._saves.inside(path), config)
         if loaded is None:
             return 'no features are saved: the localizer keeps its own'
         self._localizer = loaded
@@ -288,7 +287,7 @@ def _feature_msg(feature: Feature) -> LineFeature:
 
 def main() -> None:
     """Run the node."""
-    runtime.run(LocalizerNode)
+    node_main.run(LocalizerNode)
 
 
 if __name__ == '__main__':

@@ -14,8 +14,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from thinmap_msgs.msg import EndNodeArray, LineFeatureArray, TopologicalMap
 from thinmap_ros.core import validation
 from thinmap_ros.core.topology.graph import NodeKind
-from thinmap_ros.ros import messages, parameters, qos
-from thinmap_ros.ros import node_main as runtime
+from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.lifecycle_node import LiveNode
 from thinmap_ros.ros.subscription import listen
 from thinmap_ros.view import palette
@@ -141,7 +140,7 @@ def _colour(web: str) -> ColorRGBA:
 
 def main() -> None:
     """Run the node."""
-    runtime.run(MarkersNode)
+    node_main.run(MarkersNode)
 
 
 if __name__ == '__main__':

@@ -14,8 +14,7 @@ from thinmap_ros.core.planning.navigator import Command, Navigator, NavigatorCon
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.kernels import warm_up
-from thinmap_ros.ros import messages, parameters, qos
-from thinmap_ros.ros import node_main as runtime
+from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.action_server import Outcome, SingleGoalServer
 from thinmap_ros.ros.diagnostics import OK, WARN
 from thinmap_ros.ros.laser_transform import LaserMount
@@ -223,7 +222,7 @@ def _preempted() -> NavigateToPose.Result:
 
 def main() -> None:
     """Run the node."""
-    runtime.run(NavigatorNode)
+    node_main.run(NavigatorNode)
 
 
 if __name__ == '__main__':

@@ -21,8 +21,7 @@ from thinmap_msgs.msg import (
 )
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.ros import node_main as runtime
-from thinmap_ros.ros import parameters, qos
+from thinmap_ros.ros import node_main, parameters, qos
 from thinmap_ros.ros.diagnostics import Health
 from thinmap_ros.ros.laser_transform import LaserMount
 from thinmap_ros.view.message_view import Feed
@@ -95,7 +94,7 @@ class RerunViewerNode(Node):
 
 def main() -> None:
     """Run the node."""
-    runtime.run(RerunViewerNode)
+    node_main.run(RerunViewerNode)
 
 
 if __name__ == '__main__':

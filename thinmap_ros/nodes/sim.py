@@ -20,10 +20,9 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import ConfigError, InputError, shown
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.files import package_data as resources
+from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
-from thinmap_ros.ros import messages, parameters, qos
-from thinmap_ros.ros import node_main as runtime
+from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.diagnostics import OK, WARN, Health
 from thinmap_ros.ros.lockstep import NONE, PATIENCE_S, PATIENCE_WORDS, TOPICS, Lockstep
 from thinmap_ros.sim.laser import Lms200Config
@@ -64,7 +63,7 @@ class SimNode(Node):
         self._config = parameters.declare(self, SimConfig)
         laser = parameters.declare(self, Lms200Config)
         parameters.check_unknown(self)
-        world = World.from_patch(*read_world(resources.world_path(self._config.world)))
+        world = World.from_patch(*read_world(package_data.world_path(self._config.world)))
         start = _start(self._config.start, world)
         self._sim = Simulation(world, start, PRESETS[self._config.robot], laser, self._config.seed)
         self._scan_time_s = 1.0 / laser.rate_hz
@@ -192,7 +191,7 @@ def _start(text: str, world: World) -> Array:
 
 def main() -> None:
     """Run the node."""
-    runtime.run(SimNode)
+    node_main.run(SimNode)
 
 
 if __name__ == '__main__':

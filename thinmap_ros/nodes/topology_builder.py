@@ -12,10 +12,9 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamp_matcher import StampMatcher
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
 from thinmap_ros.core.topology.rebuild import Rebuilding
-from thinmap_ros.files import sessions as session_files
+from thinmap_ros.files import sessions
 from thinmap_ros.kernels import warm_up
-from thinmap_ros.ros import messages, parameters, qos
-from thinmap_ros.ros import node_main as runtime
+from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import State
 from thinmap_ros.ros.lifecycle_node import LiveNode
 from thinmap_ros.ros.save_folder import SaveFolder
@@ -83,7 +82,7 @@ class TopologyBuilderNode(LiveNode):
             self._publish(self.get_clock().now().nanoseconds)
 
     def _of_session(self) -> TopologyBuilder:
-        return session_files.load_topology(self._session, self._config)
+        return sessions.load_topology(self._session, self._config)
 
     def _on_window(self, message: OccupancyGrid) -> None:
         stamp_ns = messages.stamp_ns(message.header.stamp)
@@ -145,7 +144,7 @@ class TopologyBuilderNode(LiveNode):
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:
             path = self._saves.inside(request.path)
-            return f'saved {session_files.save_topology(path, self._builder)}'
+            return f'saved {sessions.save_topology(path, self._builder)}'
 
         return answer(response, save)
 
@@ -158,7 +157,7 @@ class TopologyBuilderNode(LiveNode):
         if path:
             inside = self._saves.inside(path)
             resolution_m = self._builder.resolution_m
-            loaded = session_files.load_topology(inside, self._config, resolution_m)
+            loaded = sessions.load_topology(inside, self._config, resolution_m)
         self._builder = loaded
         self._matcher = StampMatcher()
         self._rebuilding = Rebuilding(from_the_start=not path)
@@ -168,7 +167,7 @@ class TopologyBuilderNode(LiveNode):
 
 def main() -> None:
     """Run the node."""
-    runtime.run(TopologyBuilderNode)
+    node_main.run(TopologyBuilderNode)
 
 
 if __name__ == '__main__':

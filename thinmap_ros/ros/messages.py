@@ -29,8 +29,7 @@ from std_msgs.msg import Header
 
 from thinmap_msgs.msg import TopologicalEdge, TopologicalNode
 from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
-from thinmap_ros.core import se2
-from thinmap_ros.core import validation as checks
+from thinmap_ros.core import se2, validation
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import COARSEST_M, FINEST_M, GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
@@ -50,11 +49,13 @@ def message_class(type_name: str) -> Any:
     """
     parts = _TYPE_NAME.fullmatch(type_name)
     if parts is None:
-        raise InputError(f'message type {checks.short(type_name)}: expected PACKAGE/msg/NAME')
+        raise InputError(f'message type {validation.short(type_name)}: expected PACKAGE/msg/NAME')
     try:
         return getattr(import_module(f'{parts[1]}.msg'), parts[2])
     except (ImportError, AttributeError) as error:
-        raise InputError(f'message type {checks.short(type_name)}: not installed here') from error
+        raise InputError(
+            f'message type {validation.short(type_name)}: not installed here'
+        ) from error
 
 
 def stamp_ns(stamp: Time) -> int:
@@ -95,11 +96,11 @@ def scan_from(message: LaserScan, T_base_laser: Array, zero_is_no_return: bool =
     there are not.
     """
     count = len(message.ranges)
-    if not 0 < count <= checks.MOST_BEAMS:
-        raise InputError(f'{count} beams: expected 1 to {checks.MOST_BEAMS}')
+    if not 0 < count <= validation.MOST_BEAMS:
+        raise InputError(f'{count} beams: expected 1 to {validation.MOST_BEAMS}')
     last = message.angle_min + message.angle_increment * (count - 1)
-    checks.within(
-        'angle of the first or last beam', (message.angle_min, last), checks.LARGEST_ANGLE_RAD
+    validation.within(
+        'angle of the first or last beam', (message.angle_min, last), validation.LARGEST_ANGLE_RAD
     )
     return Scan.create(
         stamp_ns(message.header.stamp),
@@ -144,7 +145,7 @@ def quaternion_msg(yaw_rad: float) -> Quaternion:
 
 def pose_from(message: Pose) -> Array:
     """Planar pose (3,). Raises InputError where it is nowhere near (1000 km) or no rotation."""
-    checks.within('position', (message.position.x, message.position.y))
+    validation.within('position', (message.position.x, message.position.y))
     return se2.pose(message.position.x, message.position.y, yaw_of(message.orientation))
 
 
@@ -179,7 +180,7 @@ def covariance_from(message: PoseWithCovarianceStamped) -> Array:
     """
     full = np.asarray(message.pose.covariance, dtype=np.float64).reshape(6, 6)
     part = full[np.ix_((0, 1, 5), (0, 1, 5))]
-    checks.within('covariance', part.ravel().tolist())
+    validation.within('covariance', part.ravel().tolist())
     part = (part + part.T) / 2.0
     if np.linalg.eigvalsh(part).min() < -1e-9:
         raise InputError(f'covariance {part.tolist()}: expected no negative eigenvalue')
@@ -268,7 +269,7 @@ def patch_from(message: OccupancyGrid) -> GridPatch:
     if abs(origin[2]) > 1e-6:
         raise InputError(f'map turned by {origin[2]} rad: expected an origin without rotation')
     cells = np.frombuffer(message.data, dtype=np.int8).reshape(info.height, info.width)
-    checks.cells_in_range(cells)
+    validation.cells_in_range(cells)
     return GridPatch(GridFrame(float(origin[0]), float(origin[1]), resolution), cells)
 
 
@@ -307,8 +308,8 @@ def topology_from(message: TopologicalMapMsg) -> TopologicalMap:
     Raises InputError where a kind is unknown, an edge leads to no node, a number is given twice, or
     one is no number.
     """
-    checks.unique('nodes', [n.id for n in message.nodes])
-    checks.unique('edges', [e.id for e in message.edges])
+    validation.unique('nodes', [n.id for n in message.nodes])
+    validation.unique('edges', [e.id for e in message.edges])
     known = {n.id for n in message.nodes}
     for node in message.nodes:
         if node.kind not in list(NodeKind):
@@ -316,14 +317,14 @@ def topology_from(message: TopologicalMapMsg) -> TopologicalMap:
                 f'node {node.id}: kind {node.kind}: '
                 f'expected one of {[int(kind) for kind in NodeKind]}'
             )
-        checks.within(f'node {node.id}', (node.position.x, node.position.y, node.clearance_m))
+        validation.within(f'node {node.id}', (node.position.x, node.position.y, node.clearance_m))
     for edge in message.edges:
         if not {edge.node_a, edge.node_b} <= known:
             raise InputError(
                 f'edge {edge.id} from node {edge.node_a} to {edge.node_b}: '
                 'expected nodes of this map'
             )
-        checks.within(
+        validation.within(
             f'edge {edge.id}',
             (edge.length_m, edge.clearance_m, *(c for p in edge.path for c in (p.x, p.y))),
         )

@@ -9,7 +9,7 @@ from rclpy.qos import (
 )
 from rosbags.interfaces import Qos
 
-from thinmap_ros.logs import qos as bag_qos
+from thinmap_ros.logs.qos import depth, is_latched, is_reliable
 
 SENSOR = qos_profile_sensor_data
 STREAM = QoSProfile(
@@ -31,16 +31,16 @@ STATIC_TRANSFORMS = QoSProfile(
 
 def as_recorded(topic: str, offers: list[Qos]) -> QoSProfile:
     """What to offer when a topic of a bag is played: what was offered when it was recorded."""
-    latched = bag_qos.is_latched(topic, offers)
+    latched = is_latched(topic, offers)
     # Each part of the tree of static transforms came from somebody else; all of them are kept.
     least = (
         STATIC_TRANSFORMS.depth if topic.endswith('tf_static') else 1 if latched else STREAM.depth
     )
     return QoSProfile(
-        depth=max(bag_qos.depth(offers), least),
+        depth=max(depth(offers), least),
         history=HistoryPolicy.KEEP_LAST,
         reliability=ReliabilityPolicy.RELIABLE
-        if bag_qos.is_reliable(offers)
+        if is_reliable(offers)
         else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )

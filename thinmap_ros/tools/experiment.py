@@ -22,8 +22,12 @@ from thinmap_ros.experiments.exploration import (
     thinning_stages,
 )
 from thinmap_ros.experiments.slam import building_floor, feature_count, logs, long_floor, office
-from thinmap_ros.experiments.topological_map import global_localization as convergence
-from thinmap_ros.experiments.topological_map import global_map, thinning_voronoi, wavefront_path
+from thinmap_ros.experiments.topological_map import (
+    global_localization,
+    global_map,
+    thinning_voronoi,
+    wavefront_path,
+)
 from thinmap_ros.files.atomic import write_text
 from thinmap_ros.tools import cli
 from thinmap_ros.view.plot_writer import write_plot
@@ -32,7 +36,7 @@ from thinmap_ros.view.plot_writer import write_plot
 EXPERIMENTS: dict[str, Callable[[Source], Outcome]] = {
     'thinning_voronoi': thinning_voronoi.run,
     'global_map': global_map.run,
-    'convergence': convergence.run,
+    'convergence': global_localization.run,
     'wavefront_path': wavefront_path.run,
     'thinning_stages': thinning_stages.run,
     'node_kinds': node_kinds.run,

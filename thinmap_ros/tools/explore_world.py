@@ -14,9 +14,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.exploration_run import explore
-from thinmap_ros.files import graphs as graph_files
-from thinmap_ros.files import occupancy_maps as map_files
-from thinmap_ros.files import trajectories as trajectory_files
+from thinmap_ros.files import graphs, occupancy_maps, trajectories
 from thinmap_ros.files.atomic import write_text
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.laser import Lms200Config
@@ -33,9 +31,9 @@ def write_outputs(loop: ClosedLoop, report: dict[str, Any], folder: Path) -> Non
     patch = pipeline.grid.patch()
     topology = pipeline.topology.map
     folder.mkdir(parents=True, exist_ok=True)
-    trajectory_files.write_tum(folder / 'trajectory.tum', log.stamps_ns, log.poses)
-    map_files.write_map(folder / 'map', patch)
-    graph_files.write_geojson(folder / 'topology.geojson', topology)
+    trajectories.write_tum(folder / 'trajectory.tum', log.stamps_ns, log.poses)
+    occupancy_maps.write_map(folder / 'map', patch)
+    graphs.write_geojson(folder / 'topology.geojson', topology)
     title = (
         f'{report["world"]}: {report["coverage"]:.1%} in {report["time"]:.0f} s, '
         f'{report["distance"]:.0f} m'

@@ -12,7 +12,7 @@ from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
 from thinmap_ros.experiments.drives import RECIPES, TRUTH_TOPIC, Source
-from thinmap_ros.files import package_data as resources
+from thinmap_ros.files import package_data
 from thinmap_ros.files.atomic import write_text
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.logs.encode import BagObjects
@@ -79,7 +79,7 @@ def record(path: Path, looks: Iterable[Look], localized: bool) -> int:
 
     localized: by the localizer, else by ground truth.
     """
-    definitions = resources.message_definitions('thinmap_msgs')
+    definitions = package_data.message_definitions('thinmap_msgs')
     scans = 0
     pipeline = None
     with BagWriter(path, definitions=definitions, compressed=True) as writer:

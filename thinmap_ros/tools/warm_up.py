@@ -5,7 +5,7 @@ import argparse
 from thinmap_ros.closed_loop import Options
 from thinmap_ros.core import kernel_cache
 from thinmap_ros.evaluation.exploration_run import explore
-from thinmap_ros.files import package_data as resources
+from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.sim.world import World
@@ -30,7 +30,7 @@ def work(arguments: argparse.Namespace) -> None:
     """Rehearse every algorithm, and an exploration in the simulator."""
     for rehearse in _REHEARSALS:
         rehearse()
-    world = World.from_patch(*read_world(resources.world_path('office')))
+    world = World.from_patch(*read_world(package_data.world_path('office')))
     # What is needed only where there are several places to go to is reached by a whole exploration.
     explore(world, world.start, Options(localization='slam'))
     kept = kernel_cache.folder()

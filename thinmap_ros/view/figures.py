@@ -10,7 +10,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
 from thinmap_ros.files.atomic import written_aside
-from thinmap_ros.view import palette as colours
+from thinmap_ros.view import palette
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,7 +47,7 @@ def summary_figure(
             true[:, 0],
             true[:, 1],
             '-',
-            color=colours.TRUTH,
+            color=palette.TRUTH,
             linewidth=2.5,
             label='path driven',
             zorder=2,
@@ -56,7 +56,7 @@ def summary_figure(
         axes.plot(
             *estimated[:, :2].T,
             '-',
-            color=colours.ESTIMATE,
+            color=palette.ESTIMATE,
             linewidth=1.0,
             label='path estimated',
             zorder=3,
@@ -96,7 +96,7 @@ def draw_graph(axes: 'Axes', topology: TopologicalMap, size: float = 5.0) -> Non
             edge.path[:, 0],
             edge.path[:, 1],
             '-',
-            color=colours.EDGE,
+            color=palette.EDGE,
             linewidth=1.2,
             label=label,
             zorder=4,
@@ -109,7 +109,7 @@ def draw_graph(axes: 'Axes', topology: TopologicalMap, size: float = 5.0) -> Non
             axes.plot(
                 *places.T,
                 marker,
-                color=colours.NODES[kind],
+                color=palette.NODES[kind],
                 markersize=size,
                 markeredgecolor='black',
                 markeredgewidth=0.4,

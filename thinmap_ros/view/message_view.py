@@ -13,7 +13,7 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamp_matcher import StampMatcher
 from thinmap_ros.files.atomic import written_aside
-from thinmap_ros.logs import decode as bag_messages
+from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.laser_mount import StaticTransforms
 from thinmap_ros.view.null_view import NullView
@@ -69,12 +69,12 @@ class Feed:
         Raises InputError where it makes no sense.
         """
         try:
-            self._takers[topic](bag_messages.stamp_ns(message), message)
+            self._takers[topic](decode.stamp_ns(message), message)
         except ValueError as error:  # a kind of node that there is not, cells that are no rectangle
             raise InputError(' '.join(str(error).split())) from error
 
     def _on_map(self, ns: int, message: Any) -> None:
-        self._view.grid(ns, bag_messages.patch(message))
+        self._view.grid(ns, decode.patch(message))
 
     def _on_scan(self, ns: int, message: Any) -> None:
         T_base_laser = self._laser_pose(message.header.frame_id)
@@ -119,7 +119,7 @@ class Feed:
         self._view.number(ns, 'error', 'heading, deg', heading)
 
     def _on_topology(self, ns: int, message: Any) -> None:
-        topology = bag_messages.topology(message)
+        topology = decode.topology(message)
         self._places = {node.id: node.position for node in topology.nodes.values()}
         self._view.topology(ns, topology)
         self._view.number(ns, 'count', 'nodes', len(topology.nodes))
@@ -211,7 +211,7 @@ def _laser_pose(transforms: StaticTransforms, frame: str) -> Array | None:
 
 
 def _pose(message: Any) -> Array:
-    T = bag_messages.pose(message)
+    T = decode.pose(message)
     if not se2.is_finite(T):
         raise InputError(f'pose {T.tolist()}: expected finite numbers')
     return T

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thinmap_ros.files.atomic import written_aside
-from thinmap_ros.view import palette as colours
+from thinmap_ros.view import palette
 from thinmap_ros.view.figures import draw_graph, draw_map
 from thinmap_ros.view.plots import (
     Band,
@@ -110,7 +110,7 @@ def _draw_panel(axes: 'Axes', panel: Panel) -> None:
 
 
 def _colour(colour: int | str) -> str:
-    return colour if isinstance(colour, str) else colours.PALETTE[colour % len(colours.PALETTE)]
+    return colour if isinstance(colour, str) else palette.PALETTE[colour % len(palette.PALETTE)]
 
 
 @singledispatch
@@ -196,14 +196,14 @@ def _(layer: Robots, axes: 'Axes') -> None:
             (x, y),
             layer.radius_m,
             facecolor='none',
-            edgecolor=colours.ESTIMATE,
+            edgecolor=palette.ESTIMATE,
             linewidth=2.0,
             zorder=7,
         )
         disc.set_label(layer.label if k == 0 else '')
         axes.add_patch(disc)
         tip = (x + 1.8 * layer.radius_m * np.cos(theta), y + 1.8 * layer.radius_m * np.sin(theta))
-        axes.plot([x, tip[0]], [y, tip[1]], color=colours.ESTIMATE, linewidth=2.0, zorder=7)
+        axes.plot([x, tip[0]], [y, tip[1]], color=palette.ESTIMATE, linewidth=2.0, zorder=7)
 
 
 @_draw.register(MapLayer)

@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.view import palette as colours
+from thinmap_ros.view import palette
 from thinmap_ros.view.rerun_sinks import TIMELINE
 
 UNKNOWN_GREY = 205
@@ -40,10 +40,10 @@ def style(rr: Any) -> dict[str, Any]:
     """Names and colours of all curves, by entity."""
     return {
         entity(plot, curve): rr.SeriesLines(
-            colors=[colours.rgb(colour)], names=[curve], widths=[1.5]
+            colors=[palette.rgb(colour)], names=[curve], widths=[1.5]
         )
         for plot, (_, curves) in _PLOTS.items()
-        for curve, colour in zip(curves, colours.PALETTE, strict=False)
+        for curve, colour in zip(curves, palette.PALETTE, strict=False)
     }
 
 

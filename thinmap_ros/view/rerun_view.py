@@ -11,8 +11,7 @@ from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
-from thinmap_ros.view import palette as colours
-from thinmap_ros.view import rerun_blueprint as rerun_layout
+from thinmap_ros.view import palette, rerun_blueprint
 from thinmap_ros.view.null_view import NullView
 from thinmap_ros.view.palette import rgb
 from thinmap_ros.view.rerun_sinks import Streams, library
@@ -36,7 +35,7 @@ _LOCAL_LINE = '#0072B2'
 _LINE = '#8FBEDB'
 _LOCAL_NODE = '#0072B2'
 _STAYS = (125, 125, 125)  # an end node of which is sure that it will stay
-_TRAILS = {'estimate': colours.ESTIMATE, 'truth': colours.TRUTH, 'odometry': _ODOMETRY}
+_TRAILS = {'estimate': palette.ESTIMATE, 'truth': palette.TRUTH, 'odometry': _ODOMETRY}
 # Heights above the map, so that what matters more covers what matters less, m.
 _Z = {
     'skeleton': 0.02,
@@ -108,7 +107,7 @@ class View(NullView):
 
         self._patch = patch
         self._now_and_then('grid', ns, draw)
-        if rerun_layout.size_m(patch) > _OUTGROWN * self._framed_m:
+        if rerun_blueprint.size_m(patch) > _OUTGROWN * self._framed_m:
             self._frame(patch)
 
     def scan(self, ns: int, scan: Scan) -> None:
@@ -136,7 +135,7 @@ class View(NullView):
         strips = [_lifted(points, _Z['covariance']) for points in outline]
         self._log(
             'map/covariance',
-            rr.LineStrips3D(strips, colors=[rgb(colours.ESTIMATE)], radii=[self._px(1.0)]),
+            rr.LineStrips3D(strips, colors=[rgb(palette.ESTIMATE)], radii=[self._px(1.0)]),
         )
         self.trail(ns, 'estimate', T_map_base)
 
@@ -159,10 +158,10 @@ class View(NullView):
         paths = [_lifted(edge.path, _Z['skeleton']) for edge in topology.edges.values()]
         nodes = list(topology.nodes.values())
         places = _lifted(np.array([node.position for node in nodes]).reshape(-1, 2), _Z['nodes'])
-        shades = [rgb(colours.NODES[node.kind]) for node in nodes]
+        shades = [rgb(palette.NODES[node.kind]) for node in nodes]
 
         def draw() -> None:
-            strips = self._rr.LineStrips3D(paths, colors=[rgb(colours.EDGE)], radii=[self._px(1.2)])
+            strips = self._rr.LineStrips3D(paths, colors=[rgb(palette.EDGE)], radii=[self._px(1.2)])
             self._log('map/skeleton', strips)
             self._log('map/nodes', self._rr.Points3D(places, colors=shades, radii=[self._px(4.0)]))
 
@@ -175,7 +174,7 @@ class View(NullView):
         def draw() -> None:
             points = self._rr.Points3D(
                 _lifted(places, _Z['end_nodes']),
-                colors=[_faded(colours.NODES[NodeKind.END], float(p)) for p in probabilities],
+                colors=[_faded(palette.NODES[NodeKind.END], float(p)) for p in probabilities],
                 radii=[self._px(6.0)],
                 labels=labels,
                 show_labels=True,
@@ -249,7 +248,7 @@ class View(NullView):
     def number(self, ns: int, plot: str, curve: str, value: float) -> None:
         """Continue a curve of a plot (`error`, `progress`, `count`, `step`)."""
         self._at(ns)
-        self._log(rerun_layout.entity(plot, curve), self._rr.Scalars([value]))
+        self._log(rerun_blueprint.entity(plot, curve), self._rr.Scalars([value]))
 
     def wait_until_closed(self) -> None:
         """Show all that was told, and wait until the viewer that was opened is closed."""
@@ -280,16 +279,18 @@ class View(NullView):
         body = rr.Points3D([[0.0, 0.0, 0.0]], colors=[[0, 0, 0]], radii=[self._px(6.0)])
         self._log('map/robot/body', body, static=True)
         self._log(
-            'legend', rr.TextDocument(rerun_layout.LEGEND, media_type='text/markdown'), static=True
+            'legend',
+            rr.TextDocument(rerun_blueprint.LEGEND, media_type='text/markdown'),
+            static=True,
         )
-        for entity, style in rerun_layout.style(rr).items():
+        for entity, style in rerun_blueprint.style(rr).items():
             self._log(entity, style, static=True)
 
     def _frame(self, patch: GridPatch) -> None:
         """Bring the whole of a map into view."""
-        self._framed_m = rerun_layout.size_m(patch)
+        self._framed_m = rerun_blueprint.size_m(patch)
         self._streams.send_blueprint(
-            rerun_layout.blueprint(self._rr, patch, [f'map/{name}' for name in _TRAILS])
+            rerun_blueprint.blueprint(self._rr, patch, [f'map/{name}' for name in _TRAILS])
         )
 
     def _px(self, pixels: float) -> Any:
@@ -319,7 +320,7 @@ class View(NullView):
 def _shade(patch: GridPatch) -> NDArray[np.uint8]:
     """Grey of each cell (H, W): the likelier free, the lighter."""
     grey = np.round(2.55 * (100.0 - np.clip(patch.cells, 0, 100)))
-    return np.where(patch.cells == UNKNOWN, rerun_layout.UNKNOWN_GREY, grey).astype(np.uint8)
+    return np.where(patch.cells == UNKNOWN, rerun_blueprint.UNKNOWN_GREY, grey).astype(np.uint8)
 
 
 def _faded(colour: str, share: float) -> list[int]:

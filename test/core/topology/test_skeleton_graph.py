@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-import reference_pruning as plain_web
+import reference_pruning
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -123,7 +123,7 @@ def test_compiled_rules_are_the_plain_ones_wherever_they_are_applied(seed, every
     one, two = (web_of_net(net_along(skeleton, measure)) for _ in range(2))
     chosen = {spot for spot in one.spots if everywhere or rng.random() < 0.3}
     simplify(one, chosen, outlook, limits)
-    plain_web.simplify(two, chosen, looking(*outlook), limits)
+    reference_pruning.simplify(two, chosen, looking(*outlook), limits)
     assert said(one) == said(two)
     if everywhere:
         assert said(web_of_net(simplified(skeleton, measure, outlook, limits))) == said(two)
@@ -138,7 +138,7 @@ def test_what_was_left_out_at_first_is_fetched_where_it_is_needed(seed):
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(net, '_REACH', 1)
         simplify(one, chosen, EVERYWHERE, LIMITS)
-    plain_web.simplify(two, chosen, lambda spot: True, LIMITS)
+    reference_pruning.simplify(two, chosen, lambda spot: True, LIMITS)
     assert said(one) == said(two)
 
 

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import parameter
-from thinmap_ros.core.exploration import end_node_tracker
-from thinmap_ros.core.exploration import frontiers as open_borders
+from thinmap_ros.core.exploration import end_node_tracker, frontiers
 from thinmap_ros.core.exploration.end_node_tracker import EndNodeTracker, Track, TrackerConfig
 from thinmap_ros.core.exploration.frontiers import NOTHING, OpenBorders
 from thinmap_ros.core.exploration.strategy import FIRST_STAND_IN_ID, EndNode
@@ -49,7 +48,7 @@ _RIM_M = 0.5
 _PARTS: dict[str, Fields] = {
     'nodes': end_node_tracker.FIELDS,
     'stand_ins': end_node_tracker.FIELDS,
-    'borders': open_borders.FIELDS,
+    'borders': frontiers.FIELDS,
 }
 FIELDS = {
     # id, x, y of end nodes that were visited without success

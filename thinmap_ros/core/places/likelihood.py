@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from thinmap_ros.core.places import likelihood_kernels as matching
+from thinmap_ros.core.places import likelihood_kernels
 from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.places.observation import Observation
 from thinmap_ros.core.places.observation_model import NodeModel
@@ -60,14 +60,16 @@ class Judge:
         ends = seen.ends[seen.met]
         near = self._places.near
         resolution = self._places.frame.resolution
-        scores = matching.range_scores(poses, ends, near, self._origin, resolution, self._log_table)
+        scores = likelihood_kernels.range_scores(
+            poses, ends, near, self._origin, resolution, self._log_table
+        )
         return np.asarray(scores + self.node_log_ratios(poses, seen))
 
     def node_log_ratios(self, poses: Array, seen: Observation) -> Array:
         """Log likelihood ratio (N,) of observed nodes at poses (N, 3), against a pose anywhere."""
         places = self._places
         model = self._nodes
-        ratios = matching.node_scores(
+        ratios = likelihood_kernels.node_scores(
             poses,
             seen.nodes,
             seen.node_kinds,
@@ -147,14 +149,14 @@ class Judge:
         near = self._places.near
         resolution = self._places.frame.resolution
         ends = seen.ends[seen.met]
-        return matching.refine(
+        return likelihood_kernels.refine(
             poses, ends, near, self._origin, resolution, table, steps, _ROUNDS, expected, held
         )
 
     def explained(self, poses: Array, seen: Observation) -> tuple[Array, Array]:
         """How many beams the map explains from poses (N, 3), and is silent on, (N,) each."""
         places = self._places
-        return matching.explained(
+        return likelihood_kernels.explained(
             poses,
             seen.laser,
             seen.ranges_m,

@@ -9,7 +9,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array, wrap
 from thinmap_ros.core.slam.localizers import line_features
 from thinmap_ros.core.topology.graph import TopologicalMap
-from thinmap_ros.evaluation import map_errors as map_error
+from thinmap_ros.evaluation import map_errors
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Rows, Table
 from thinmap_ros.evaluation.slam_run import Run, run_slam
 from thinmap_ros.experiments.drives import Source, world_of
@@ -61,7 +61,7 @@ def run(source: Source) -> Outcome:
     ti = run_slam(looks, 'ekf_ti', glance)
     full = run_slam(looks, 'ekf_full')
     ours = run_slam(looks, 'scan_matching')
-    error = map_error.map_error(ti.pipeline.grid.patch(), world)
+    error = map_errors.map_error(ti.pipeline.grid.patch(), world)
     apart = np.hypot(*(np.array(ti.estimate) - np.array(full.estimate))[:, :2].T)
     used = float(np.median(ti.local))
     known = ti.features[-1]
@@ -72,7 +72,7 @@ def run(source: Source) -> Outcome:
         f'({ti.way_m:.0f} m). The same scans go through the conventional filter (all features) '
         'and through EKF-SLAM/TI (local areas), each on odometry and lines alone.',
         [
-            Table('map', map_error.COLUMNS, [map_error.row('floor_40x10', error)]),
+            Table('map', map_errors.COLUMNS, [map_errors.row('floor_40x10', error)]),
             Table('path', _PATH, _path_rows(ti, full)),
             Table(
                 'features',
@@ -86,7 +86,7 @@ def run(source: Source) -> Outcome:
                 'fig11',
                 'Paper 3, Fig. 11: (a) CAD data, (b) global grid map by EKF-SLAM/TI, '
                 '(c) its errors.',
-                map_error.panels(error, world),
+                map_errors.panels(error, world),
                 panel_inches=(9.0, 2.9),
             ),
             _paths(ti, full),
@@ -137,7 +137,7 @@ def _errors_beside(ti: Run, ours: Run) -> Comparison:
     )
 
 
-def _similar(error: map_error.MapError) -> Comparison:
+def _similar(error: map_errors.MapError) -> Comparison:
     off = error.cells_off_m
     return Comparison(
         'map against CAD data',

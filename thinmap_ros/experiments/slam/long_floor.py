@@ -5,7 +5,7 @@ from itertools import islice
 import numpy as np
 
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.evaluation import map_errors as map_error
+from thinmap_ros.evaluation import map_errors
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Table
 from thinmap_ros.evaluation.slam_run import Run, run_slam
 from thinmap_ros.experiments.drives import Source, world_of
@@ -73,7 +73,7 @@ def run(source: Source) -> Outcome:
     ti = run_slam(looks, 'ekf_ti', marks)
     full = run_slam(looks, 'ekf_full')
     ours = run_slam(looks, 'scan_matching')
-    error = map_error.map_error(ti.pipeline.grid.patch(), world)
+    error = map_errors.map_error(ti.pipeline.grid.patch(), world)
     off = np.hypot(*ti.errors()[:, :2].T)
     turned = np.degrees(np.abs(ti.errors()[:, 2]))
     return Outcome(
@@ -83,7 +83,7 @@ def run(source: Source) -> Outcome:
         f'{ti.way_m:.0f} m in {ti.seconds[-1] / 60.0:.0f} minutes.',
         [
             Table('path', _PATH, _rows(ti)),
-            Table('map', map_error.COLUMNS, [map_error.row('floor_70x10', error)]),
+            Table('map', map_errors.COLUMNS, [map_errors.row('floor_70x10', error)]),
             Table(
                 'times', ['time_s', 'features', 'ti_ms', 'full_ms'], _times(ti, full), timed=True
             ),
@@ -106,7 +106,7 @@ def run(source: Source) -> Outcome:
             Plot(
                 'map_error',
                 'Paper 3, to Fig. 14: the floor, its map, and the errors of the map.',
-                map_error.panels(error, world),
+                map_errors.panels(error, world),
                 panel_inches=(9.5, 2.4),
             ),
             _over_time(ti, full, off, turned),

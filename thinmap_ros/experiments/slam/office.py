@@ -4,7 +4,7 @@ from itertools import islice
 
 import numpy as np
 
-from thinmap_ros.evaluation import map_errors as map_error
+from thinmap_ros.evaluation import map_errors
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Table
 from thinmap_ros.evaluation.slam_run import run_slam
 from thinmap_ros.experiments.drives import Source, world_of
@@ -19,20 +19,20 @@ def run(source: Source) -> Outcome:
     looks = list(islice(source.looks('office'), _QUICK_SCANS if source.quick else None))
     done = run_slam(looks)
     ours = run_slam(looks, 'scan_matching')
-    error = map_error.map_error(done.pipeline.grid.patch(), world)
+    error = map_errors.map_error(done.pipeline.grid.patch(), world)
     wheels = np.hypot(*done.errors(done.odometry)[:, :2].T)
-    row = map_error.row('office', error)
+    row = map_errors.row('office', error)
     return Outcome(
         'The map of an office',
         'SLAM paper, section 5.1, Fig. 10',
         'The office of 9.5 x 7.5 m with furniture; a Pioneer 3-AT with an LMS200 drives its tour '
         f'at 0.2 m/s ({done.way_m:.0f} m). Cells of 0.1 m.',
-        [Table('map', map_error.COLUMNS, [row])],
+        [Table('map', map_errors.COLUMNS, [row])],
         [
             Plot(
                 'fig10',
                 'Paper 3, Fig. 10: (a) CAD data, (b) grid map by EKF-SLAM/TI, (c) its errors.',
-                map_error.panels(error, world),
+                map_errors.panels(error, world),
                 columns=3,
                 panel_inches=(4.6, 3.9),
             )

@@ -8,7 +8,7 @@ from support.slam_room import ROOM, around, map_of, seen_in
 from test_local_map import cells_of, nearest
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.slam.matching import correlative_search as pose_search
+from thinmap_ros.core.slam.matching import correlative_search
 from thinmap_ros.core.slam.matching.correlative_search import search
 from thinmap_ros.core.slam.matching.matching_cost import SLIP_SIGMAS, UNSEEN_COST
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher
@@ -156,13 +156,13 @@ def test_a_prior_at_half_a_turn_is_searched_on_both_sides():
 def test_no_more_nodes_are_tried_than_allowed(monkeypatch, most_nodes):
     """Besides the roots, and the last one's children."""
     tried = []
-    cost = pose_search._cost
+    cost = correlative_search._cost
 
     def counted(scan, pose, lattice, sigma, width, slack, most):
         tried.append(slack)
         return cost(scan, pose, lattice, sigma, width, slack, most)
 
-    monkeypatch.setattr(pose_search, '_cost', counted)
+    monkeypatch.setattr(correlative_search, '_cost', counted)
     ended = 0
     for seed in range(8):
         case = Case(seed)
@@ -196,7 +196,7 @@ def test_the_cost_is_that_of_the_reference_and_its_bound_is_lower(rng):
         lattice = case.local_map.lattice
 
         def cost(pose, slack, moving=moving, lattice=lattice):
-            return pose_search._cost(moving, pose, lattice, *NOISE, slack, np.inf)
+            return correlative_search._cost(moving, pose, lattice, *NOISE, slack, np.inf)
 
         flat = 1e-12 * np.eye(3)
         reference = Exhaustive(case.local_map)

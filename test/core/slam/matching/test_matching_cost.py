@@ -7,7 +7,7 @@ import pytest
 from support.slam_room import ROOM, around, map_of, on_wall, seen_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.slam.matching import matching_cost as least_squares
+from thinmap_ros.core.slam.matching import matching_cost
 from thinmap_ros.core.slam.matching.local_map import HERE, LocalMap, off_wall
 from thinmap_ros.core.slam.matching.matching_cost import (
     FITS_SIGMAS,
@@ -377,7 +377,7 @@ def test_kernels_are_what_they_are_in_plain_python(rng, room, scan, monkeypatch)
     arguments = (thin, pose, prior, information, room.lattice, *NOISE)
     minimized = minimize(*arguments)
     # A compiled function cannot hand a cell to plain Python.
-    monkeypatch.setattr(least_squares, 'off_wall', off_wall.py_func)
+    monkeypatch.setattr(matching_cost, 'off_wall', off_wall.py_func)
     for compiled, plain in zip(
         evaluated, evaluate.py_func(thin, pose, room.lattice, *NOISE), strict=True
     ):
