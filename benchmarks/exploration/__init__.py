@@ -1,1 +1,1 @@
-"""exploration."""
+"""The page of the explorations that `compare_exploration` has run."""

@@ -1,1 +1,1 @@
-"""kidnapped."""
+"""Robots that are switched on anywhere in a known map, by the hundred."""

@@ -1,1 +1,1 @@
-"""evaluation."""
+"""What judges a run: errors, metrics, reports, and runs side by side."""

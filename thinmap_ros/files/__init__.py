@@ -1,1 +1,1 @@
-"""files."""
+"""What lies on a disk, read within limits and written whole or not at all."""

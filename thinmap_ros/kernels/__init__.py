@@ -1,1 +1,1 @@
-"""kernels."""
+"""Compiled kernels: rehearsed, told of, and their compiler put away."""

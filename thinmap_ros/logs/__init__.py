@@ -1,1 +1,1 @@
-"""logs."""
+"""Recorded scans: bags and CARMEN logs, read, written, repaired and played."""

@@ -1,1 +1,1 @@
-"""ros."""
+"""What the nodes share: lifecycle, subscriptions, messages, parameters, diagnostics."""

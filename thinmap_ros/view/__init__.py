@@ -1,1 +1,1 @@
-"""view."""
+"""What people look at: figures, and rerun."""

@@ -1,4 +1,4 @@
-"""What a figure shows, as plain data: panels of layers. `plot_files` draws them."""
+"""What a figure shows, as plain data: panels of layers. `plot_writer` draws them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field

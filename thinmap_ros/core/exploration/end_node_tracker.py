@@ -13,7 +13,7 @@ What the paper leaves open, and how it is settled here:
   over the evidence of one that vanished at the same scan within `moved_m`; so a merged node keeps
   that of the nearest one.
 - *Rim of the range, and of the known.* A skeleton also ends where only knowledge ends. In mode
-  `open_border`, a node with unknown space at its neighbourhood's border (see `open_borders`) is not
+  `open_border`, a node with unknown space at its neighbourhood's border (see `frontiers`) is not
   made more reliable by any look (R is at most 0.5), and one without any cannot move any more: that
   counts as one look of reliability `closed_reliability`. In mode `paper` the looks are all there
   is.

@@ -1,1 +1,1 @@
-"""exploration."""
+"""The exploration paper's figures, and strategies compared."""

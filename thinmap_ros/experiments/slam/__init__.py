@@ -1,1 +1,1 @@
-"""slam."""
+"""The EKF paper's figures, and logs of real robots."""

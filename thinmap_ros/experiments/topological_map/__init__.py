@@ -1,1 +1,1 @@
-"""topological_map."""
+"""The figures of the paper on topological maps."""

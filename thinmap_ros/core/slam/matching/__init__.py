@@ -1,1 +1,1 @@
-"""matching."""
+"""Scans against a local map of cells."""

@@ -1,9 +1,9 @@
 """A scan against the local map: the pose that walls and motion together make most likely.
 
 One sum holds a robust loss of what each point is off the nearest wall, and the motion that is
-expected, with its covariance. Its minimum near the prior is refined (`least_squares.py`). Where the
+expected, with its covariance. Its minimum near the prior is refined (`matching_cost.py`). Where the
 scan fits badly there, or the prior is wider than a wall attracts, the poses within three sigmas of
-the prior are searched (`pose_search.py`); the lower sum wins.
+the prior are searched (`correlative_search.py`); the lower sum wins.
 """
 
 from dataclasses import dataclass
