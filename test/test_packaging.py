@@ -98,7 +98,7 @@ def test_every_import_has_its_key_in_package_xml(folder, tags):
     own = {'thinmap_ros'} | {path.stem for path in (ROOT / 'test').rglob('*.py')}
     # A test names a helper in another folder of the tests by both.
     own |= {path.name for path in (ROOT / 'test').iterdir() if path.is_dir()}
-    own |= {'benchmarks', 'fuzz'} if folder == 'test' else set()
+    own |= {'benchmarks', 'fuzz', 'scripts'} if folder == 'test' else set()
     for path in (ROOT / folder).rglob('*.py'):
         for node in ast.walk(ast.parse(path.read_text())):
             names = [n.name for n in node.names] if isinstance(node, ast.Import) else []

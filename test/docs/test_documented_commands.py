@@ -18,8 +18,8 @@ from typing import Any
 import psutil
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from live.conftest import PATIENCE_S
 from logs.test_log import ros1_bag
+from support.timeouts import PATIENCE_S
 from tools.test_replay import carmen_lines
 
 from docs import commands

@@ -15,11 +15,12 @@ import yaml
 from action_msgs.msg import GoalStatus, GoalStatusArray
 from action_msgs.srv import CancelGoal
 from geometry_msgs.msg import PoseStamped
-from live.conftest import PATIENCE_S, Graph
 from nav_msgs.msg import OccupancyGrid
 from rclpy.duration import Duration
 from std_msgs.msg import String
+from support.live_graph import Graph
 from support.ros_domains import free_domain
+from support.timeouts import PATIENCE_S
 
 from thinmap_msgs.action import NavigateToPose
 from thinmap_ros.ros import qos
