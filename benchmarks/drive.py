@@ -11,9 +11,9 @@ from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, Wind
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.se2 import Array, pose, wrap
+from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig, build
 from thinmap_ros.core.topology.graph import Node, TopologicalMap
-from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig, build
-from thinmap_ros.sim.lms200 import Lms200, Lms200Config
+from thinmap_ros.sim.laser import Lms200, Lms200Config
 from thinmap_ros.sim.world import World
 
 WINDOW_M = WindowConfig().window_m
@@ -80,7 +80,8 @@ def tour(world: World, start: Array, radius_m: float, goals: int, seed: int) -> 
     patch = GridPatch(world.frame, cells)
     config = WavefrontConfig(robot_radius_m=radius_m + 0.05)
     standing = world.frame.centres_of(np.argwhere(world.wall_distance_m > radius_m + 0.1))
-    poses, been = [start], [start[:2]]
+    poses = [start]
+    been = [start[:2]]
     unseen = np.full(len(standing), np.inf)
     for _ in range(goals):
         unseen = np.minimum(unseen, np.min([np.hypot(*(standing - at).T) for at in been], axis=0))
@@ -106,7 +107,8 @@ def _along(T: Array, way: Array) -> list[Array]:
     travelled = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))))
     marks = np.arange(_STEP_M, travelled[-1], _STEP_M)
     points = np.column_stack([np.interp(marks, travelled, way[:, axis]) for axis in (0, 1)])
-    poses, last = [], T
+    poses = []
+    last = T
     for point in points:
         heading = math.atan2(point[1] - last[1], point[0] - last[0])
         while abs(wrap(heading - last[2])) > _TURN_RAD:

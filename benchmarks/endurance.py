@@ -23,10 +23,10 @@ from typing import Any
 import numpy as np
 import psutil
 
-from thinmap_ros.adapters import resources
-from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core.errors import InputError, ThinmapError
-from thinmap_ros.sim.tours import random_start
+from thinmap_ros.files import package_data
+from thinmap_ros.files.worlds import read_world
+from thinmap_ros.sim.drives import random_start
 from thinmap_ros.sim.world import World
 from thinmap_ros.tools import cli
 
@@ -40,7 +40,8 @@ _STEPS = {
 _MEDIAN = re.compile(r'median (\d+\.\d+) ms')
 _SCAN_S = 0.2
 _FLAT = 1.05
-_STOP_S, _START_S = 10.0, 120.0
+_STOP_S = 10.0
+_START_S = 120.0
 _LAG = 5  # scans whose pose may still be under way at the end
 _DEPTH = 1000
 _FEWEST_SAMPLES = 4  # a quarter of them is looked at
@@ -79,17 +80,26 @@ class Driver:
         from rclpy.qos import QoSProfile
 
         from thinmap_msgs.action import Explore, NavigateToPose
-        from thinmap_ros.adapters import messages
+        from thinmap_ros.ros import messages
 
         rclpy.init()
-        self._rclpy, self._messages, self._goal = rclpy, messages, NavigateToPose.Goal
-        self._world, self._chance = world, np.random.default_rng(seed)
+        self._rclpy = rclpy
+        self._messages = messages
+        self._goal = NavigateToPose.Goal
+        self._world = world
+        self._chance = np.random.default_rng(seed)
         self._node = rclpy.create_node('endurance')
         self._explore = ActionClient(self._node, Explore, 'explore')
         self._navigate = ActionClient(self._node, NavigateToPose, 'navigate_to_pose')
-        self._explored, self._busy = Explore.Goal(), False
-        self.explores, self.goals, self.reached = True, 0, 0
-        self.poses, self.first_s, self.simulated_s, self.step_ms = 0, 0.0, 0.0, {}
+        self._explored = Explore.Goal()
+        self._busy = False
+        self.explores = True
+        self.goals = 0
+        self.reached = 0
+        self.poses = 0
+        self.first_s = 0.0
+        self.simulated_s = 0.0
+        self.step_ms = {}
         deep = QoSProfile(depth=_DEPTH)
         self._node.create_subscription(PoseWithCovarianceStamped, 'pose', self._on_pose, deep)
         self._node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, deep)
@@ -115,7 +125,8 @@ class Driver:
         if self.explores:
             return self._explored
         self.goals += 1
-        goal, place = self._goal(use_heading=True), random_start(self._world, self._chance)
+        goal = self._goal(use_heading=True)
+        place = random_start(self._world, self._chance)
         goal.pose = self._messages.pose_stamped_msg(place, 'map', 0)
         return goal
 
@@ -183,7 +194,8 @@ def measure(
         'cpu_s',
         'lost',
     ]
-    samples, begun = Samples(columns), time.monotonic()
+    samples = Samples(columns)
+    begun = time.monotonic()
     every_s = 60.0 * arguments.minutes / arguments.samples
     with path.open('w', encoding='utf-8', newline='', buffering=1) as file:
         writer = csv.writer(file, lineterminator='\n')
@@ -251,7 +263,7 @@ def _work(arguments: argparse.Namespace) -> None:
         )
     os.environ['ROS_DOMAIN_ID'] = str(random.SystemRandom().randrange(1, 102))
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    path = resources.world_path(arguments.world)
+    path = package_data.world_path(arguments.world)
     world = World.from_patch(*read_world(path))
     arguments.out.mkdir(parents=True, exist_ok=True)
     driver = Driver(world, arguments.seed)

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.world import World
 
 WORLDS = Path(__file__).resolve().parent.parent.parent / 'shared' / 'data' / 'worlds'

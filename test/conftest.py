@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from domains import free_domain
 from hypothesis import settings
+from support.ros_domains import free_domain
 
 ROOT = Path(__file__).resolve().parent.parent
 SHARED = next(

@@ -7,14 +7,14 @@ from time import perf_counter
 
 from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.grid.correctable import CorrectableGrid
-from thinmap_ros.core.grid.history import MovedPoses
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, WindowConfig
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.grid.scan_history import MovedPoses
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
 from thinmap_ros.core.slam.localizers import localizer_class, set_topology
-from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
-from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig
+from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
 
 
 @dataclass(frozen=True)

@@ -11,18 +11,24 @@ import argparse
 from fnmatch import fnmatch
 from pathlib import Path
 
-from benchmarks.scoreboard.against import against
 from benchmarks.scoreboard.board_run import run_board
 from benchmarks.scoreboard.cases import BY_HAND, Case, all_cases, compared_with, repeated
+from benchmarks.scoreboard.compare import against
 from benchmarks.scoreboard.measure import Task, config_of, measure
 from benchmarks.scoreboard.page import page, shortened, worst_tenth
 from benchmarks.scoreboard.played import Numbers
 from benchmarks.scoreboard.reports import report_file, report_of, reports_there
-from thinmap_ros.adapters.files import read_text, write_text
 from thinmap_ros.core.errors import ConfigError, InputError
-from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
+from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
+from thinmap_ros.evaluation.parallel_jobs import (
+    Failure,
+    add_run_options,
+    complaint,
+    read_report,
+    run_missing,
+)
+from thinmap_ros.files.atomic import read_text, write_text
 from thinmap_ros.tools import cli
-from thinmap_ros.tools.runs import Failure, add_run_options, complaint, read_report, run_missing
 
 _SHARED = Path(__file__).resolve().parents[3] / 'shared'
 _SHORT = Path(__file__).parent / 'short.txt'

@@ -7,18 +7,18 @@ from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
 
-from benchmarks.scoreboard.against import against
 from benchmarks.scoreboard.board import board_cases
 from benchmarks.scoreboard.board_rows import board_table
 from benchmarks.scoreboard.cases import BuildingCase, Case, DriveCase, LogCase, flat
 from benchmarks.scoreboard.closed_loop import measure_drive, measure_loop, record_drive
+from benchmarks.scoreboard.compare import against
 from benchmarks.scoreboard.measure import Task, measure_building, measure_log
 from benchmarks.scoreboard.page import case_tables
 from benchmarks.scoreboard.played import Numbers
 from benchmarks.scoreboard.reports import report_file, report_of, reports_there
-from thinmap_ros.adapters.files import write_text
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.tools.runs import Failure, complaint, read_report, run_missing
+from thinmap_ros.evaluation.parallel_jobs import Failure, complaint, read_report, run_missing
+from thinmap_ros.files.atomic import write_text
 
 FOLDER = 'board'  # of the results; a case of the complete scoreboard may have the same name
 # A graph costs more than a pose, and the pose needs little of it: of replayed drives there is a new

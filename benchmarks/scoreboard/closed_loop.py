@@ -4,32 +4,32 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.memory import forget_peak, peak_mb
 from benchmarks.scoreboard.board import LARGEST
 from benchmarks.scoreboard.cases import DriveCase, LoopCase, flat
 from benchmarks.scoreboard.measure import config_of, play
 from benchmarks.scoreboard.played import Numbers, PlayedPipeline, rehearse, simulated_numbers
 from benchmarks.scoreboard.recordings import RecordedSimulation, Recording, read_recording
 from benchmarks.worlds import floors
-from thinmap_ros.adapters.world_files import read_world
-from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.occupancy import OccupancyConfig
-from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
-from thinmap_ros.core.se2 import Array
-from thinmap_ros.pipeline import Pipeline, PipelineConfig
-from thinmap_ros.sim.coverage import Coverable, coverable
-from thinmap_ros.sim.lms200 import Lms200Config
-from thinmap_ros.sim.pioneer import PRESETS
-from thinmap_ros.sim.runner import Simulation
-from thinmap_ros.sim.world import World
-from thinmap_ros.tools.explore_world import (
+from thinmap_ros.closed_loop import (
     SCANS_PER_GRAPH,
     STRATEGIES,
     ClosedLoop,
     nothing_to_show,
     true_pose_source,
 )
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.occupancy import OccupancyConfig
+from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.evaluation.machine import forget_peak, peak_mb
+from thinmap_ros.files.worlds import read_world
+from thinmap_ros.pipeline import Pipeline, PipelineConfig
+from thinmap_ros.sim.coverage import Coverable, coverable
+from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.robot import PRESETS
+from thinmap_ros.sim.simulation import Simulation
+from thinmap_ros.sim.world import World
 
 LASERS = {
     'lms200': Lms200Config(),

@@ -11,10 +11,10 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.se2 import Array, transform_points
 from thinmap_ros.sim.buildings import Building, building
-from thinmap_ros.sim.lms200 import Lms200Config
-from thinmap_ros.sim.pioneer import PRESETS, PioneerConfig
-from thinmap_ros.sim.runner import Simulation
-from thinmap_ros.sim.tours import MARGIN_M, Look, drive, patch_of
+from thinmap_ros.sim.drives import MARGIN_M, Look, drive, patch_of
+from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.robot import PRESETS, PioneerConfig
+from thinmap_ros.sim.simulation import Simulation
 from thinmap_ros.sim.world import World
 
 _SPEED_M_S = 0.7

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.memory import forget_peak, peak_mb
 from benchmarks.scoreboard.cases import EXACT_S, BuildingCase, Case, LogCase
 from benchmarks.scoreboard.drives import looks
 from benchmarks.scoreboard.played import (
@@ -19,17 +18,18 @@ from benchmarks.scoreboard.played import (
     rehearse,
     simulated_numbers,
 )
-from thinmap_ros.adapters.carmen import CarmenLog
-from thinmap_ros.adapters.events import OdometryEvent
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.odometry import ScanPairing
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
+from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
+from thinmap_ros.evaluation.machine import forget_peak, peak_mb
+from thinmap_ros.evaluation.trajectory_errors import read_columns, relation_errors
+from thinmap_ros.experiments.slam.logs import laser_of
+from thinmap_ros.logs.carmen import CarmenLog
+from thinmap_ros.logs.log import OdometryEvent
 from thinmap_ros.pipeline import PipelineConfig
-from thinmap_ros.tools.experiments.logs import laser_of
-from thinmap_ros.tools.experiments.relations import read_columns, relation_errors
 
 _KNOWN_AGAIN_M = 30.0  # of way after a slip or a gap, from which on relations over it are judged
 DISTURBED = (5e-4, 5e-4, 5e-4)  # of odometry between scans, m, m, rad, in runs but the first

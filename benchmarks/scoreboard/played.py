@@ -7,13 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.alignment import aligned_rms
-from benchmarks.memory import resident_mb
-from benchmarks.timing import CpuTimedPipeline
-from thinmap_ros import warm_up
 from thinmap_ros.core import se2
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.evaluation.machine import CpuTimedPipeline, resident_mb
+from thinmap_ros.evaluation.trajectory_errors import aligned_rms
+from thinmap_ros.kernels import warm_up
 from thinmap_ros.pipeline import PipelineConfig, Step
 
 Numbers = dict[str, Any]

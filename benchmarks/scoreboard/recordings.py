@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.adapters.files import written_aside
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.sim.lms200 import Lms200Config
-from thinmap_ros.sim.pioneer import PioneerConfig, WheelOdometry
-from thinmap_ros.sim.runner import STEP_NS, Moment, Simulation, odometry_seed
-from thinmap_ros.sim.tours import Look
+from thinmap_ros.files.atomic import written_aside
+from thinmap_ros.sim.drives import Look
+from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.robot import PioneerConfig, WheelOdometry
+from thinmap_ros.sim.simulation import STEP_NS, Moment, Simulation, odometry_seed
 from thinmap_ros.sim.world import World
 
 _STEP_S = STEP_NS / 1e9

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from benchmarks.scoreboard.cases import Case
 from benchmarks.scoreboard.played import Numbers
-from thinmap_ros.adapters.files import read_text
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.tools.runs import Failure, read_report
+from thinmap_ros.evaluation.parallel_jobs import Failure, read_report
+from thinmap_ros.files.atomic import read_text
 
 RESULTS = 'results'
 

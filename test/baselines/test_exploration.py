@@ -13,21 +13,25 @@ from thinmap_ros.baselines.exploration import (
     NearestFrontier,
     VisitAllEndNodes,
 )
-from thinmap_ros.baselines.frontiers import Frontier
+from thinmap_ros.baselines.frontier_map import Frontier
+from thinmap_ros.closed_loop import STRATEGIES, Options
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
+from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.sim.world import World
-from thinmap_ros.tools.explore_world import STRATEGIES, Options, explore
 
 START = np.array([1.0, 1.0, 0.0])
 
 
 def two_rooms() -> World:
     cells = np.zeros((60, 90), dtype=np.uint8)
-    cells[[0, -1]], cells[:, [0, -1]] = 1, 1
-    cells[:25, 40:42], cells[35:, 40:42], cells[40:42, 60:] = 1, 1, 1
+    cells[[0, -1]] = 1
+    cells[:, [0, -1]] = 1
+    cells[:25, 40:42] = 1
+    cells[35:, 40:42] = 1
+    cells[40:42, 60:] = 1
     return World('two_rooms', cells, GridFrame(0.0, 0.0, 0.1), START)
 
 
@@ -62,7 +66,9 @@ def corridor() -> np.ndarray:
     """A corridor of 16 m, open at both ends, with a wide opening in the upper side's right half."""
     cells = np.full((80, 160), -1)
     cells[30:50] = 0
-    cells[29], cells[50, :120], cells[50:60, 120:150] = 100, 100, 0
+    cells[29] = 100
+    cells[50, :120] = 100
+    cells[50:60, 120:150] = 0
     return cells
 
 
@@ -104,7 +110,8 @@ def test_the_advantage_of_a_frontier_grows_with_the_way_back_to_it() -> None:
 
 
 def test_a_target_that_fails_is_left_for_later_and_the_end_says_so() -> None:
-    strategy, pose = NearestFrontier(), POSE
+    strategy = NearestFrontier()
+    pose = POSE
     scan = Scan.create(0, np.full(181, np.nan), -math.pi / 2, math.pi / 180, 0.05, 8.0)
     patch = GridPatch(GridFrame(0.0, 0.0, 0.1), corridor().astype(np.int8))
     topology = explore(two_rooms(), START, Options(time_limit_s=1.0))[0].pipeline.topology.map
@@ -148,8 +155,10 @@ def test_an_edge_is_followed_to_its_end_though_another_end_comes_nearer() -> Non
 
 
 def test_explore_lite_gives_up_what_comes_no_nearer_also_if_it_goes_to_and_fro() -> None:
-    strategy, patch = ExploreLite(), GridPatch(GridFrame(0.0, 0.0, 0.1), corridor().astype(np.int8))
-    places, failed = [], []
+    strategy = ExploreLite()
+    patch = GridPatch(GridFrame(0.0, 0.0, 0.1), corridor().astype(np.int8))
+    places = []
+    failed = []
     for second in range(120):
         # Now one is cheaper, then the other one, as where the map grows at its rims.
         pose = np.array([7.0 if second % 2 else 9.0, 4.0, 0.0])

@@ -37,7 +37,8 @@ def test_a_t_of_corridors() -> None:
 
 def test_a_ring_gets_a_node() -> None:
     cells = np.full((80, 80), 100)
-    cells[10:70, 10:70], cells[22:58, 22:58] = 0, 100
+    cells[10:70, 10:70] = 0
+    cells[22:58, 22:58] = 100
     graph = build_voronoi(patch_of(cells))
     assert len(graph.edges) == len(graph.nodes) >= 1 and len(graph.components()) == 1
 

@@ -20,7 +20,7 @@ def amplified(value):
     return GAIN * value
 """
 PROGRAM = """
-from thinmap_ros.adapters.compiling import report_compilation
+from thinmap_ros.kernels.progress import report_compilation
 report = report_compilation()
 from thinmap_ros.core import jit, kernel_cache
 from thinmap_ros.core.amplifier import amplified
@@ -36,7 +36,7 @@ class Install:
         self.folder = folder
         self.package = folder / 'thinmap_ros'
         leave_out = shutil.ignore_patterns('__pycache__')
-        for name in ('core', 'adapters'):
+        for name in ('core', 'files', 'kernels'):
             shutil.copytree(kernel_cache.PACKAGE / name, self.package / name, ignore=leave_out)
         (self.package / '__init__.py').touch()
         (self.package / 'core' / 'amplifier.py').write_text(MODULE)

@@ -14,17 +14,17 @@ from fuzz.damaged_bags import check as check_bag
 from fuzz.damaged_bags import damaged, drive, ended, read_log, whole_bags
 from fuzz.saved_states import KINDS, Explored, State, one_number_replaced, replaced
 from fuzz.saved_states import check as check_state
-from thinmap_ros.adapters import session_files
-from thinmap_ros.adapters.bag_writer import BagWriter
-from thinmap_ros.adapters.bags import Bag
-from thinmap_ros.adapters.recovery import Recovery
 from thinmap_ros.core.odometry import LastPose
+from thinmap_ros.files import sessions
+from thinmap_ros.logs.bag import Bag
+from thinmap_ros.logs.bag_writer import BagWriter
+from thinmap_ros.ros.checkpoint import Recovery
 
 _LOADERS: dict[str, Callable[[str], Any]] = {
-    'topology': session_files.load_topology,
-    'exploration': session_files.load_exploration,
-    'features': session_files.load_features,
-    'grid': session_files.load_grid,
+    'topology': sessions.load_topology,
+    'exploration': sessions.load_exploration,
+    'features': sessions.load_features,
+    'grid': sessions.load_grid,
 }
 
 

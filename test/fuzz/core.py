@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from slam_room import ROOM, scan_in
+from support.slam_room import ROOM, scan_in
 
 from fuzz.cases import Source, chosen, finite, nothing, tried
 from fuzz.files import small_graph, sound_graph, sound_patch
@@ -13,14 +13,14 @@ from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.localization.config import GlobalLocalizationConfig
-from thinmap_ros.core.localization.global_localization import GlobalLocalization
+from thinmap_ros.core.places.config import GlobalLocalizationConfig
+from thinmap_ros.core.places.global_localizer import GlobalLocalization
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
 from thinmap_ros.core.slam.localizers import localizer_class, set_topology
-from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
-from thinmap_ros.core.topology.update import TopologyBuilder
+from thinmap_ros.core.topology.builder import TopologyBuilder
 
 _PERIOD_NS = 200_000_000
 _STRANGE_RANGES = (np.nan, np.inf, -np.inf, 0.0, -1.0, 1e-30, 1e30, 7.999, 8.0, 400.0)

@@ -13,9 +13,9 @@ import numpy as np
 from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType, Writer
 
-from thinmap_ros.adapters.bag_writer import BagWriter
-from thinmap_ros.adapters.bags import Bag
-from thinmap_ros.adapters.carmen import CarmenLog, LaserOptions
+from thinmap_ros.logs.bag import Bag
+from thinmap_ros.logs.bag_writer import BagWriter
+from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
 from thinmap_ros.tools import bag_repair, cli
 from thinmap_ros.tools.carmen_to_bag import convert
 

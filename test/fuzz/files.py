@@ -10,14 +10,14 @@ import yaml
 from PIL import Image
 
 from fuzz.cases import NUMBERS, Source, chosen, damaged_bytes, damaged_text, finite, nothing, tried
-from thinmap_ros.adapters.carmen import CarmenLog, LaserOptions
-from thinmap_ros.adapters.events import OdometryEvent
-from thinmap_ros.adapters.graph_files import read_geojson, write_geojson
-from thinmap_ros.adapters.map_files import read_map
-from thinmap_ros.adapters.trajectory_files import read_tum, write_tum
-from thinmap_ros.adapters.world_files import read_tour, read_world
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
+from thinmap_ros.files.graphs import read_geojson, write_geojson
+from thinmap_ros.files.occupancy_maps import read_map
+from thinmap_ros.files.trajectories import read_tum, write_tum
+from thinmap_ros.files.worlds import read_tour, read_world
+from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
+from thinmap_ros.logs.log import OdometryEvent
 
 WORLDS = Path(__file__).resolve().parents[2] / 'worlds'
 _LARGEST_WORLD = 4_000

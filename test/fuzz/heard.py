@@ -9,17 +9,17 @@ import numpy as np
 from fuzz.cases import Source, chosen, nothing, tried
 from fuzz.files import strange_value
 from fuzz.strange_messages import CHECKS, made
-from thinmap_ros.adapters.carmen import LaserOptions
-from thinmap_ros.adapters.view_feed import Feed
-from thinmap_ros.adapters.views import NullView
 from thinmap_ros.core.config import Config
 from thinmap_ros.core.exploration.explorer import ExplorerConfig
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
-from thinmap_ros.core.localization.config import GlobalLocalizationConfig
+from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
-from thinmap_ros.core.slam.scan_localizer import ScanLocalizer, ScanLocalizerConfig
+from thinmap_ros.core.slam.localizer import ScanLocalizer, ScanLocalizerConfig
+from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.core.topology.config import TopologyConfig
-from thinmap_ros.core.topology.update import TopologyBuilder
+from thinmap_ros.logs.carmen import LaserOptions
+from thinmap_ros.view.message_view import Feed
+from thinmap_ros.view.null_view import NullView
 
 _COUNT = 10
 _KINDS = sorted(CHECKS, key=lambda kind: kind.__name__)

@@ -8,14 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from thinmap_ros.adapters.world_files import read_world
+from thinmap_ros.closed_loop import ClosedLoop, Options, make_loop
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
-from thinmap_ros.core.slam.scan_localizer import ScanLocalizer
-from thinmap_ros.core.topology.update import TopologyBuilder
+from thinmap_ros.core.slam.localizer import ScanLocalizer
+from thinmap_ros.core.topology.builder import TopologyBuilder
+from thinmap_ros.files.worlds import read_world
+from thinmap_ros.sim.coverage import coverable
 from thinmap_ros.sim.world import World
-from thinmap_ros.tools.explore_world import ClosedLoop, Options, coverable, make_loop
 
 ROOM = Path(__file__).resolve().parents[2] / 'worlds' / 'room_10x10.yaml'
 State = dict[str, np.ndarray]
@@ -65,7 +66,8 @@ class Explored:
         return work
 
     def _use_exploration(self, state: State) -> Work:
-        explorer, pipeline = Explorer.from_state(state), self.loop.pipeline
+        explorer = Explorer.from_state(state)
+        pipeline = self.loop.pipeline
         patch = pipeline.grid.patch()
         return lambda scan, T: explorer.step(pipeline.topology.map, patch, scan, T)
 

@@ -15,7 +15,7 @@ from nav_msgs.msg import OccupancyGrid, Odometry
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.msg import TopologicalEdge, TopologicalMap, TopologicalNode
-from thinmap_ros.adapters import messages
+from thinmap_ros.ros import messages
 
 STRANGE = st.sampled_from(
     [
@@ -46,7 +46,8 @@ PERIOD_NS = 100_000_000
 
 
 def stamped(draw, message, ns):
-    message.header.stamp.sec, message.header.stamp.nanosec = ns // 10**9, ns % 10**9
+    message.header.stamp.sec = ns // 10**9
+    message.header.stamp.nanosec = ns % 10**9
     if draw(st.integers(0, 9)) == 0:
         message.header.stamp.sec = draw(st.sampled_from([0, -1, -(2**31), 2**31 - 1, 4_000_000, 1]))
         message.header.stamp.nanosec = draw(st.sampled_from([0, 10**9, 2**32 - 1]))
@@ -66,7 +67,8 @@ def scans(draw, ns=10**9):
     message = stamped(
         draw, LaserScan(angle_min=-1.5, angle_max=1.5, range_min=0.05, range_max=8.0), ns
     )
-    message.header.frame_id, message.angle_increment = 'laser', 3.0 / 60.0
+    message.header.frame_id = 'laser'
+    message.angle_increment = 3.0 / 60.0
     ranges = np.full(61, 2.0, dtype=np.float32)
 
     def some_ranges():
@@ -111,13 +113,15 @@ def pose_setters(draw, pose):
 @st.composite
 def odometries(draw, ns=10**9):
     message = stamped(draw, Odometry(child_frame_id='base_link'), ns)
-    message.header.frame_id, message.pose.pose.orientation.w = 'odom', 1.0
+    message.header.frame_id = 'odom'
+    message.pose.pose.orientation.w = 1.0
 
     def covariance():
         message.pose.covariance[draw(st.integers(0, 35))] = draw(STRANGE)
 
     def frames():
-        message.header.frame_id, message.child_frame_id = draw(NAMES), draw(NAMES)
+        message.header.frame_id = draw(NAMES)
+        message.child_frame_id = draw(NAMES)
 
     changed(draw, [covariance, frames, *pose_setters(draw, message.pose.pose)])
     return message
@@ -126,7 +130,8 @@ def odometries(draw, ns=10**9):
 @st.composite
 def poses(draw, ns=10**9):
     message = stamped(draw, PoseWithCovarianceStamped(), ns)
-    message.header.frame_id, message.pose.pose.orientation.w = 'map', 1.0
+    message.header.frame_id = 'map'
+    message.pose.pose.orientation.w = 1.0
 
     def covariance():
         message.pose.covariance[draw(st.sampled_from([0, 1, 5, 6, 7, 11, 30, 35]))] = draw(STRANGE)
@@ -140,10 +145,15 @@ def grids(draw, ns=10**9):
     message = stamped(draw, OccupancyGrid(), ns)
     message.header.frame_id = 'map'
     info = message.info
-    info.resolution, info.width, info.height = 0.1, 40, 40
-    info.origin.position.x, info.origin.position.y, info.origin.orientation.w = -2.0, -2.0, 1.0
+    info.resolution = 0.1
+    info.width = 40
+    info.height = 40
+    info.origin.position.x = -2.0
+    info.origin.position.y = -2.0
+    info.origin.orientation.w = 1.0
     cells = np.zeros((40, 40), dtype=np.int8)
-    cells[[0, -1]], cells[:, [0, -1]] = 100, 100
+    cells[[0, -1]] = 100
+    cells[:, [0, -1]] = 100
 
     def cell():
         cells[draw(st.integers(0, 39))] = draw(st.integers(-128, 127))
@@ -155,7 +165,8 @@ def grids(draw, ns=10**9):
         info.resolution = draw(STRANGE_32)
 
     def flat():
-        info.width, info.height = 1600, 1
+        info.width = 1600
+        info.height = 1
 
     changed(draw, [cell, size, resolution, flat, *pose_setters(draw, info.origin)])
     data = array('b')
@@ -175,7 +186,8 @@ def topologies(draw, ns=10**9):
     message.edges = [
         TopologicalEdge(id=9, node_a=1, node_b=2, length_m=1.0, clearance_m=0.5, path=path)
     ]
-    node, edge = message.nodes[draw(st.integers(0, 2))], message.edges[0]
+    node = message.nodes[draw(st.integers(0, 2))]
+    edge = message.edges[0]
 
     def place():
         node.position.x = draw(STRANGE)

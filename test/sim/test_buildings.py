@@ -10,9 +10,9 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.sim.buildings import BuildingConfig, building
 from thinmap_ros.sim.floor_plan import Kind, floor_plan
-from thinmap_ros.sim.lms200 import Lms200, Lms200Config
-from thinmap_ros.sim.moving import Leaves, Moving, People
-from thinmap_ros.sim.pioneer import PioneerConfig
+from thinmap_ros.sim.laser import Lms200, Lms200Config
+from thinmap_ros.sim.moving_obstacles import Leaves, Moving, People
+from thinmap_ros.sim.robot import PioneerConfig
 from thinmap_ros.sim.surfaces import inside_of
 from thinmap_ros.sim.world import World
 
@@ -39,7 +39,8 @@ def test_a_robot_gets_into_every_part(seed):
         for part in wing.plan.parts:
             middle = np.array([[0.5 * (part.x0 + part.x1), 0.5 * (part.y0 + part.y1)]])
             x, y, turn = wing.T_world_wing
-            c, s = math.cos(turn), math.sin(turn)
+            c = math.cos(turn)
+            s = math.sin(turn)
             at = world.frame.cells_of(middle @ np.array([[c, s], [-s, c]]) + (x, y))[0]
             near = inside[at[0] - 12 : at[0] + 13, at[1] - 12 : at[1] + 13]
             assert near.any(), part
@@ -56,7 +57,9 @@ def test_parts_tile_the_plan():
 
 
 def test_a_seed_says_all_and_another_says_something_else():
-    one, same, other = building(5), building(5), building(6)
+    one = building(5)
+    same = building(5)
+    other = building(6)
     assert np.array_equal(one.world.occupied, same.world.occupied)
     assert one.world.frame == same.world.frame
     assert np.array_equal(one.world.start, same.world.start)
@@ -133,14 +136,16 @@ def test_people_are_seen_where_they_are_then_and_step_aside():
 
 def test_people_walk_evenly_from_point_to_point():
     rng = np.random.default_rng(2)
-    points, speeds = rng.uniform(0.0, 20.0, (6, 4, 2)), rng.uniform(0.5, 1.4, 6)
+    points = rng.uniform(0.0, 20.0, (6, 4, 2))
+    speeds = rng.uniform(0.5, 1.4, 6)
     points[3, 2] = points[3, 1]
     pauses = rng.exponential(8.0, (6, 4))
     pauses[4] = 0.0
     people = People(points, speeds, pauses)
     for seconds in (0.0, *rng.uniform(0.0, 500.0, 200)):
         for i, place in enumerate(people.places(seconds)):
-            times, stations = [0.0], [points[i, 0]]
+            times = [0.0]
+            stations = [points[i, 0]]
             for k, pause in enumerate(pauses[i]):
                 goal = points[i, (k + 1) % 4]
                 leg = np.hypot(*(goal - points[i, k])) / speeds[i]
@@ -152,10 +157,13 @@ def test_people_walk_evenly_from_point_to_point():
 
 
 def test_doors_swing_and_are_held_open_for_a_robot():
-    hinges, ends = np.array([[2.0, 1.5]]), np.array([[2.0, 2.5]])
-    open_rad, is_shut = np.array([[1.0, -0.5, 1.0]]), np.array([[False, False, True]])
+    hinges = np.array([[2.0, 1.5]])
+    ends = np.array([[2.0, 2.5]])
+    open_rad = np.array([[1.0, -0.5, 1.0]])
+    is_shut = np.array([[False, False, True]])
     leaves = Leaves(hinges, ends, np.array([10.0]), open_rad, is_shut)
-    far, near = np.array([-6.0, 2.0]), np.array([1.0, 2.0])
+    far = np.array([-6.0, 2.0])
+    near = np.array([1.0, 2.0])
 
     def angle(seconds, robot):
         leaf = leaves.segments(seconds, robot, 20.0)[0]

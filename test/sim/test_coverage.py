@@ -26,7 +26,10 @@ def walled(
             w = rng.integers(1, 12)
             cells[r : r + h, c : c + w] = 1
         cells[rows // 2 - 4 : rows // 2 + 5, cols // 2 - 4 : cols // 2 + 5] = 0
-    cells[0], cells[-1], cells[:, 0], cells[:, -1] = 1, 1, 1, 1
+    cells[0] = 1
+    cells[-1] = 1
+    cells[:, 0] = 1
+    cells[:, -1] = 1
     return World('test', cells, GridFrame(*origin, 0.1), np.zeros(3))
 
 
@@ -43,7 +46,8 @@ def reference(
         if standing[r, c] and not reached[r, c]:
             reached[r, c] = True
             todo.extend([(r + 1, c), (r - 1, c), (r, c + 1), (r, c - 1)])
-    seen, perhaps = np.zeros_like(solid), np.zeros_like(solid)
+    seen = np.zeros_like(solid)
+    perhaps = np.zeros_like(solid)
     from thinmap_ros.core.grid.raytrace import line_is_clear
 
     places = np.argwhere(reached)

@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thinmap_ros.adapters.world_files import read_tour, read_world
+from scripts.make_warehouse import warehouse
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.raytrace import cast_rays
-from thinmap_ros.sim.lms200 import Lms200Config
-from thinmap_ros.sim.pioneer import PRESETS
-from thinmap_ros.sim.runner import Simulation
+from thinmap_ros.files.worlds import read_tour, read_world
+from thinmap_ros.sim.drives import drive, ways_along
+from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.robot import PRESETS
+from thinmap_ros.sim.simulation import Simulation
 from thinmap_ros.sim.surfaces import surfaces
-from thinmap_ros.sim.tours import drive, ways_along
-from thinmap_ros.sim.warehouse import warehouse
 from thinmap_ros.sim.world import World
 
 WORLDS = Path(__file__).parents[2] / 'worlds'

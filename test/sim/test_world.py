@@ -8,8 +8,8 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.world import World
 
 ROOM = Path(__file__).parents[2] / 'worlds' / 'room_10x10.yaml'
@@ -183,7 +183,10 @@ def test_a_map_is_a_world(tmp_path: Path) -> None:
     from PIL import Image
 
     grey = np.full((20, 30), 254, dtype=np.uint8)
-    grey[0], grey[-1], grey[:, 0], grey[:, -1] = 0, 0, 0, 0
+    grey[0] = 0
+    grey[-1] = 0
+    grey[:, 0] = 0
+    grey[:, -1] = 0
     grey[2, 5] = 205
     Image.fromarray(grey).save(tmp_path / 'm.pgm')
     (tmp_path / 'm.yaml').write_text(

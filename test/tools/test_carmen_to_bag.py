@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from patience import PROGRAM_S
+from support.timeouts import PROGRAM_S
 
-from thinmap_ros.adapters.bags import Bag, BagLog
-from thinmap_ros.adapters.carmen import CarmenLog, LaserOptions
-from thinmap_ros.adapters.events import Event, OdometryEvent
 from thinmap_ros.core import se2
+from thinmap_ros.logs.bag import Bag, BagLog
+from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
+from thinmap_ros.logs.log import Event, OdometryEvent
 from thinmap_ros.tools.carmen_to_bag import convert
 
 LOGS = Path(__file__).parents[3] / 'shared' / 'data' / 'logs'

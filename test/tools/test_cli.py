@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thinmap_ros.adapters.bags import BagLog
-from thinmap_ros.adapters.carmen import CarmenLog, LaserOptions
 from thinmap_ros.core.errors import ConfigError, InputError
+from thinmap_ros.logs.bag import BagLog
+from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
 from thinmap_ros.tools import cli
 
 

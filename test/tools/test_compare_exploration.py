@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 import yaml
-from patience import PROGRAM_S
+from support.timeouts import PROGRAM_S
 
-from benchmarks.exploration_page import page
-from thinmap_ros.tools.comparison import markdown, saved
+from benchmarks.exploration.page import page
+from thinmap_ros.evaluation.strategy_comparison import markdown, saved
 
 ROOT = Path(__file__).resolve().parents[2]
 WORLD = {

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from patience import PROGRAM_S
+from support.timeouts import PROGRAM_S
 
 ROOT = Path(__file__).resolve().parents[2]
 ROOM = {

@@ -76,7 +76,8 @@ def test_three_formats_and_a_picture_of_one_graph(
 
 
 def test_options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path, out = written(tmp_path, corridors()), tmp_path / 'g.graphml'
+    path = written(tmp_path, corridors())
+    out = tmp_path / 'g.graphml'
 
     def nodes(*words: object) -> int:
         assert run(monkeypatch, path, '-o', out, *words) == 0

@@ -11,23 +11,24 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from hidden import hide
-from patience import PATIENCE_S
+from support.hidden_library import hide
+from support.timeouts import PATIENCE_S
 
-from thinmap_ros.adapters import map_files, rerun_streams
-from thinmap_ros.adapters.bag_writer import BagWriter
-from thinmap_ros.adapters.carmen import CarmenLog, LaserOptions
-from thinmap_ros.adapters.views import NullView
+from thinmap_ros.files import occupancy_maps
+from thinmap_ros.logs.bag_writer import BagWriter
+from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
 from thinmap_ros.pipeline import PipelineConfig
+from thinmap_ros.replaying import replay
 from thinmap_ros.tools.carmen_to_bag import convert
-from thinmap_ros.tools.replay import main, replay
-from thinmap_ros.tools.replay_view import ReplayView
+from thinmap_ros.tools.replay import ReplayView, main
+from thinmap_ros.view import rerun_sinks
+from thinmap_ros.view.null_view import NullView
 
 TRAJECTORIES = {'trajectory.tum', 'trajectory_final.tum'}
 FILES = TRAJECTORIES | {'map.pgm', 'map.yaml', 'topology.geojson', 'summary.png', 'report.json'}
 BEAMS = 181
 needs_rerun = pytest.mark.skipif(
-    not rerun_streams.is_installed(),
+    not rerun_sinks.is_installed(),
     reason='needs rerun, which is not installed (the extra "viewer")',
 )
 
@@ -48,7 +49,8 @@ def box_ranges(x, theta, half=3.0):
 def carmen_lines(scans=30, beams=BEAMS, start_s=0.0):
     lines = ['# a robot that drives along x through a square room']
     for k in range(scans):
-        x, stamp = 0.03 * k, start_s + 0.2 * k
+        x = 0.03 * k
+        stamp = start_s + 0.2 * k
         readings = ' '.join(f'{r:.3f}' for r in box_ranges(x, 0.0)[:beams])
         tail = f'{x:.4f} 0 0 {x:.4f} 0 0 {stamp:.3f} robot {stamp:.3f}'
         lines += [
@@ -86,7 +88,7 @@ def test_files_and_figures(log, tmp_path, form):
     trajectory = np.loadtxt(out / 'trajectory.tum')
     assert trajectory.shape == (30, 8)
     assert np.abs(trajectory[:, 1] - 0.03 * np.arange(30)).max() < 0.03
-    patch = map_files.read_map(out / 'map.yaml')
+    patch = occupancy_maps.read_map(out / 'map.yaml')
     wall = patch.frame.cells_of(np.array([[3.0, 0.0]]))[0]
     assert patch.occupied[wall[0], wall[1] - 1 : wall[1] + 2].any()
 
@@ -263,7 +265,8 @@ class Diary(NullView):
     """What a view was told: how often of what, and the last map."""
 
     def __init__(self):
-        self.told, self.map_shown = Counter(), None
+        self.told = Counter()
+        self.map_shown = None
 
     def pose(self, ns, T_map_base, covariance):
         self.told['pose'] += 1
@@ -281,7 +284,7 @@ class Diary(NullView):
 
 def test_a_view_is_told_each_scan_and_the_map_as_it_is_in_the_end(log):
     diary = Diary()
-    result = replay(CarmenLog(log, LaserOptions()), PipelineConfig(), shown=ReplayView(diary))
+    result = replay(CarmenLog(log, LaserOptions()), PipelineConfig(), watcher=ReplayView(diary))
     assert len(result.poses) == diary.told['pose'] == diary.told['scan'] == 30
     assert diary.told['grid'] == 7, 'once a second of the log, and at its end'
     assert np.array_equal(diary.map_shown.cells, result.pipeline.grid.patch().cells)
@@ -374,11 +377,11 @@ def test_the_viewer_shows_the_replay_until_it_is_closed(log, tmp_path, monkeypat
     received, stand_in, seen = (tmp_path / name for name in ('received.rrd', 'viewer', 'seen'))
     report = tmp_path / 'out' / 'report.json'
     stand_in.write_text(
-        f'#!/bin/sh\n"{rerun_streams.viewer_program()}" --save "{received}" "$@" &\n'
+        f'#!/bin/sh\n"{rerun_sinks.viewer_program()}" --save "{received}" "$@" &\n'
         f'while [ ! -e "{seen}" ]; do sleep 0.1; done; kill $!; wait $!\n'
     )
     stand_in.chmod(0o755)
-    monkeypatch.setattr(rerun_streams, 'viewer_program', lambda: str(stand_in))
+    monkeypatch.setattr(rerun_sinks, 'viewer_program', lambda: str(stand_in))
     monkeypatch.setenv('DISPLAY', ':none')
     monkeypatch.setattr(
         sys, 'argv', ['replay', str(log), '-o', str(tmp_path / 'out'), '--quiet', '--view']

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.baselines.frontiers import Frontier, FrontierMap
+from thinmap_ros.baselines.frontier_map import Frontier, FrontierMap
 from thinmap_ros.core import se2
-from thinmap_ros.core.exploration.decision import Decision, EndNode, FinishCode
+from thinmap_ros.core.exploration.strategy import Decision, EndNode, FinishCode
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import axis_setup
 from thinmap_ros.core.jit import kernel
@@ -24,7 +24,8 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
 
 _SURVEY_NS = 1_000_000_000
-_AT_GOAL_M, _AT_GOAL_RAD = 0.3, 0.35
+_AT_GOAL_M = 0.3
+_AT_GOAL_RAD = 0.35
 _LOOKS = 3
 _TRIES = 3
 _SAME_PLACE_M = 1.0
@@ -61,10 +62,12 @@ class _Patience:
             progress = _Progress((float(place[0]), float(place[1])), way_m)
             self._watched.append(progress)
         if way_m < progress.nearest_m - _PROGRESS_M:
-            progress.nearest_m, progress.waited_ns = way_m, 0
+            progress.nearest_m = way_m
+            progress.waited_ns = 0
         if self._driven is progress:
             progress.waited_ns += max(stamp_ns - self._stamp_ns, 0)
-        self._driven, self._stamp_ns = progress, stamp_ns
+        self._driven = progress
+        self._stamp_ns = stamp_ns
         if progress.waited_ns <= self._timeout_ns:
             return False
         self._watched.remove(progress)
@@ -89,11 +92,12 @@ class FrontierExplorer(ABC):
     def step(
         self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
     ) -> Decision:
-        """Say where to go; see tools/explore_world.Strategy."""
+        """Say where to go; see core/exploration/strategy.Strategy."""
         self.map.update(patch, scan, T_map_base)
         self._give_up_what_was_looked_at(T_map_base)
         if self._is_due(scan.stamp_ns):
-            self._survey_ns, self._frame = scan.stamp_ns, self.map.borders.frame
+            self._survey_ns = scan.stamp_ns
+            self._frame = self.map.borders.frame
             self._choose(T_map_base)
         self._nothing_left = self._nothing_left + 1 if self.target is None else 0
         return _decision(
@@ -118,7 +122,8 @@ class FrontierExplorer(ABC):
         left = [f for f in self.map.find(T_map_base) if self._tries(f) < _TRIES]
         fewest = min((self._tries(f) for f in left), default=0)
         left = [f for f in left if self._tries(f) == fewest]
-        before, self.target = self.target, None
+        before = self.target
+        self.target = None
         if left:
             best = left[int(np.argmin(self.costs(left, T_map_base)))]
             if before is None or math.dist(before.middle, best.middle) > _SAME_PLACE_M:
@@ -145,7 +150,8 @@ class FrontierExplorer(ABC):
             self.map.borders.exhaust(
                 self.target.cells, (float(T_map_base[0]), float(T_map_base[1]))
             )
-            self.target, self._at_goal = None, 0
+            self.target = None
+            self._at_goal = 0
 
 
 class NearestFrontier(FrontierExplorer):
@@ -346,7 +352,8 @@ def _decision(
     ]
     goal = target.goal if isinstance(target, Frontier) else target
     chosen = None if goal is None else _end_node(-number, goal, True)
-    code, reason = FinishCode.NONE, 'something is left'
+    code = FinishCode.NONE
+    reason = 'something is left'
     if finished:
         code = FinishCode.NOTHING_REACHABLE if failures else FinishCode.ALL_RESOLVED
         reason = 'what is left cannot be reached' if failures else 'nothing is left'
@@ -354,7 +361,8 @@ def _decision(
 
 
 def _end_node(node_id: int, goal: Array, is_target: bool) -> EndNode:
-    x, y = float(goal[0]), float(goal[1])
+    x = float(goal[0])
+    y = float(goal[1])
     return EndNode(node_id, x, y, 0.5, 0.0, 0.0, math.inf, 0.0, 0.0, is_target, goal)
 
 
@@ -379,7 +387,11 @@ def _unknown_in_sight(
                     seen[row, col] = i
                     areas[i] += 1.0
                 if next_x < next_y:
-                    travelled, next_x, col = next_x, next_x + delta_x, col + step_x
+                    travelled = next_x
+                    next_x = next_x + delta_x
+                    col = col + step_x
                 else:
-                    travelled, next_y, row = next_y, next_y + delta_y, row + step_y
+                    travelled = next_y
+                    next_y = next_y + delta_y
+                    row = row + step_y
     return areas

@@ -50,7 +50,8 @@ def build_voronoi(patch: GridPatch, config: VoronoiConfig | None = None) -> Topo
     if len(border) < 4 or not patch.free.any():
         return TopologicalMap()
     diagram = Voronoi(patch.frame.centres_of(border))
-    vertices, clearance = diagram.vertices, np.full(len(diagram.vertices), np.inf)
+    vertices = diagram.vertices
+    clearance = np.full(len(diagram.vertices), np.inf)
     ridges = np.array(diagram.ridge_vertices)
     centres = diagram.points[diagram.ridge_points[:, :1]]
     gap = np.hypot(*(vertices[np.maximum(ridges, 0)] - centres).transpose(2, 0, 1))

@@ -47,7 +47,8 @@ class OdometryBuffer:
                 f'{se2.FARTHEST_M:g} m'
             )
         if self._stamps and stamp_ns < self._stamps[-1] - self._span_ns:
-            self._stamps, self._poses = [], []
+            self._stamps = []
+            self._poses = []
         index = bisect_left(self._stamps, stamp_ns)
         if index < len(self._stamps) and self._stamps[index] == stamp_ns:
             self._poses[index] = T_odom_base
@@ -68,7 +69,8 @@ class OdometryBuffer:
             return self._poses[index]
         if index == 0:
             return None
-        before, after = self._stamps[index - 1], self._stamps[index]
+        before = self._stamps[index - 1]
+        after = self._stamps[index]
         share = (stamp_ns - before) / (after - before)
         return se2.interpolate(self._poses[index - 1], self._poses[index], share)
 

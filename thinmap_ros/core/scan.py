@@ -127,7 +127,8 @@ class Scan:
 
     def points_laser(self) -> Array:
         """End points of the beams that met something, laser frame, (M, 2)."""
-        ranges, angles = self.ranges_m[self.hit], self.angles_rad[self.hit]
+        ranges = self.ranges_m[self.hit]
+        angles = self.angles_rad[self.hit]
         return np.column_stack([ranges * np.cos(angles), ranges * np.sin(angles)])
 
     def points_base(self) -> Array:

@@ -37,13 +37,15 @@ def compose(T_a_b: Array, T_b_c: Array) -> Array:
     # Python's own numbers: one at a time they are much faster than elements of arrays.
     x, y, theta = T_a_b.tolist()
     dx, dy, turn = T_b_c.tolist()
-    c, s = math.cos(theta), math.sin(theta)
+    c = math.cos(theta)
+    s = math.sin(theta)
     return pose(x + c * dx - s * dy, y + s * dx + c * dy, theta + turn)
 
 
 def invert(T_a_b: Array) -> Array:
     """Pose of a in b, (3,)."""
-    c, s = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    c = math.cos(T_a_b[2])
+    s = math.sin(T_a_b[2])
     return pose(-c * T_a_b[0] - s * T_a_b[1], s * T_a_b[0] - c * T_a_b[1], -T_a_b[2])
 
 
@@ -60,7 +62,8 @@ def off(T: Array, T_expected: Array) -> Array:
 
 def transform_points(T_a_b: Array, points_b: Array) -> Array:
     """Points (N, 2) given in b, expressed in a, (N, 2)."""
-    c, s = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    c = math.cos(T_a_b[2])
+    s = math.sin(T_a_b[2])
     return np.asarray(points_b @ np.array([[c, s], [-s, c]]) + T_a_b[:2])
 
 

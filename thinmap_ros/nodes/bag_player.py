@@ -14,16 +14,17 @@ from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock as ClockMsg
 from std_srvs.srv import SetBool, Trigger
 
-from thinmap_ros.adapters import checks, messages, parameters, qos, runtime
-from thinmap_ros.adapters.bag_storage import RawMessage
-from thinmap_ros.adapters.bags import Bag
-from thinmap_ros.adapters.health import OK, WARN, Health
-from thinmap_ros.adapters.lockstep import NONE, PATIENCE_S, PATIENCE_WORDS, TOPICS, Lockstep
-from thinmap_ros.adapters.playback import Playback, is_scan
-from thinmap_ros.adapters.services import answer
-from thinmap_ros.adapters.types import message_class
+from thinmap_ros.core import validation
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import ConfigError, InputError
+from thinmap_ros.logs.bag import Bag
+from thinmap_ros.logs.playback import Playback, is_scan
+from thinmap_ros.logs.storage import RawMessage
+from thinmap_ros.ros import messages, node_main, parameters, qos
+from thinmap_ros.ros.diagnostics import OK, WARN, Health
+from thinmap_ros.ros.lockstep import NONE, PATIENCE_S, PATIENCE_WORDS, TOPICS, Lockstep
+from thinmap_ros.ros.messages import message_class
+from thinmap_ros.ros.services import answer
 
 _TICK_S = 0.002
 _CLOCK_PERIOD_S = 0.02
@@ -105,7 +106,7 @@ class BagPlayerNode(Node):
     def _chosen(self) -> list[str]:
         asked = {topic.strip() for topic in self._config.topics.split(',') if topic.strip()}
         if unknown := asked - set(self._bag.topics):
-            has = checks.listed(sorted(self._bag.topics))
+            has = validation.listed(sorted(self._bag.topics))
             raise InputError(f'{self._config.bag}: no topic {sorted(unknown)[0]}; it has {has}')
         # A recorded clock would run against the player's own.
         return sorted((asked or set(self._bag.topics)) - {'/clock'})
@@ -123,8 +124,8 @@ class BagPlayerNode(Node):
         except (InputError, NameValidationException) as error:
             reason = ' '.join(str(error).split())[:200]
             if self._config.topics:
-                raise InputError(f'{checks.short(topic)}: {reason}') from error
-            self.get_logger().warning(f'{checks.short(topic)} is not played: {reason}')
+                raise InputError(f'{validation.short(topic)}: {reason}') from error
+            self.get_logger().warning(f'{validation.short(topic)} is not played: {reason}')
 
     def _has_listeners(self) -> bool:
         scans = [t for t in self._publishers_by_topic if self._bag.topics[t] == _SCAN]
@@ -137,7 +138,8 @@ class BagPlayerNode(Node):
 
     def _tick(self) -> None:
         now = monotonic()
-        passed_s, self._ticked_at = now - self._ticked_at, now
+        passed_s = now - self._ticked_at
+        self._ticked_at = now
         if self._begins_at is None:
             # Who listens to scans finds the other topics a moment later.
             self._begins_at = now + _SETTLE_S if self._has_listeners() else None
@@ -199,7 +201,7 @@ class BagPlayerNode(Node):
 
 def main() -> None:
     """Run the node."""
-    runtime.run(BagPlayerNode)
+    node_main.run(BagPlayerNode)
 
 
 if __name__ == '__main__':

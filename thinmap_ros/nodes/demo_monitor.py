@@ -15,12 +15,13 @@ from tqdm import tqdm
 
 from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import ExplorationStatus
-from thinmap_ros.adapters import messages, parameters, qos, resources, runtime
-from thinmap_ros.adapters.files import write_text
-from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.files import package_data
+from thinmap_ros.files.atomic import write_text
+from thinmap_ros.files.worlds import read_world
+from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.sim.coverage import coverable
-from thinmap_ros.sim.pioneer import PRESETS
+from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
 
 _LOOK_PERIOD_S = 0.5
@@ -49,7 +50,7 @@ class DemoMonitorNode(Node):
         super().__init__('demo_monitor')
         self._config = parameters.declare(self, DemoMonitorConfig)
         parameters.check_unknown(self)
-        world = World.from_patch(*read_world(resources.world_path(self._config.world)))
+        world = World.from_patch(*read_world(package_data.world_path(self._config.world)))
         radius = PRESETS[self._config.robot].radius_m
         self._coverable = coverable(world, world.start, radius, self._config.range_max_m)
         self._coverage = 0.0
@@ -125,7 +126,7 @@ class DemoMonitorNode(Node):
 
 def main() -> None:
     """Run the node."""
-    runtime.run(DemoMonitorNode)
+    node_main.run(DemoMonitorNode)
 
 
 if __name__ == '__main__':

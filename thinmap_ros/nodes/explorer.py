@@ -14,29 +14,31 @@ from thinmap_msgs.action import Explore, NavigateToPose
 from thinmap_msgs.msg import EndNode as EndNodeMsg
 from thinmap_msgs.msg import EndNodeArray, ExplorationStatus, SlamStatus, TopologicalMap
 from thinmap_msgs.srv import SaveMap
-from thinmap_ros import warm_up
-from thinmap_ros.adapters import checks, messages, parameters, qos, runtime, session_files
-from thinmap_ros.adapters.actions import Outcome, SingleGoalServer
-from thinmap_ros.adapters.listening import listen
-from thinmap_ros.adapters.live_node import LiveNode
-from thinmap_ros.adapters.save_folder import SaveFolder
-from thinmap_ros.adapters.services import answer
-from thinmap_ros.adapters.stamps import StampMatcher
-from thinmap_ros.adapters.transforms import LaserMount
+from thinmap_ros.core import validation
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.exploration.area import fenced
-from thinmap_ros.core.exploration.decision import Decision, EndNode
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
-from thinmap_ros.core.exploration.session import Budget, Odometer
-from thinmap_ros.core.grid.mirror import MapMirror
+from thinmap_ros.core.exploration.mission import Budget, Odometer, fenced
+from thinmap_ros.core.exploration.strategy import Decision, EndNode
+from thinmap_ros.core.grid.map_mirror import MapMirror
 from thinmap_ros.core.se2 import Array, wrap
+from thinmap_ros.core.stamp_matcher import StampMatcher
+from thinmap_ros.files import sessions
+from thinmap_ros.kernels import warm_up
+from thinmap_ros.ros import messages, node_main, parameters, qos
+from thinmap_ros.ros.action_server import Outcome, SingleGoalServer
+from thinmap_ros.ros.laser_transform import LaserMount
+from thinmap_ros.ros.lifecycle_node import LiveNode
+from thinmap_ros.ros.save_folder import SaveFolder
+from thinmap_ros.ros.services import answer
+from thinmap_ros.ros.subscription import listen
 
 _WARN_PERIOD_S = 5.0
 _FEEDBACK_PERIOD_S = 1.0
 _SILENCE_S = 60.0
 _DEAF_S = 3.0
 _LOST_S = 10.0
-_SAME_GOAL_M, _SAME_GOAL_RAD = 0.1, 0.2
+_SAME_GOAL_M = 0.1
+_SAME_GOAL_RAD = 0.2
 _GIVE_UP_HOME = 3
 
 
@@ -65,7 +67,7 @@ class ExplorerNode(LiveNode):
         """Forget map, graph and what was explored, or go back to the session of the start."""
         # What was learned is kept for the next goal, until an exploration is finished.
         self._learned = (
-            session_files.load_exploration(self._session, self._config) if self._session else None
+            sessions.load_exploration(self._session, self._config) if self._session else None
         )
         self._polygon = np.empty((0, 2))
         self._map = MapMirror()
@@ -80,7 +82,8 @@ class ExplorerNode(LiveNode):
         self._state = ExplorationStatus.IDLE
 
     def _on_config(self, config: ExplorerConfig) -> None:
-        self._config, self._learned = config, None
+        self._config = config
+        self._learned = None
 
     def stand_still(self) -> None:
         """End the exploration."""
@@ -107,7 +110,7 @@ class ExplorerNode(LiveNode):
         limits = (goal.time_limit_s, goal.distance_limit_m, goal.area_limit_m2)
         try:
             corners = [c for p in goal.area.points for c in (p.x, p.y)]
-            checks.within('goal: limit or corner of the area', [*limits, *corners])
+            validation.within('goal: limit or corner of the area', [*limits, *corners])
         except InputError as error:
             self._begin(Explore.Goal())
             self._end(ExplorationStatus.CANCELLED, str(error))
@@ -168,7 +171,7 @@ class ExplorerNode(LiveNode):
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:
             path = self._saves.inside(request.path)
-            return f'saved {session_files.save_exploration(path, self._explorer)}'
+            return f'saved {sessions.save_exploration(path, self._explorer)}'
 
         return answer(response, save)
 
@@ -246,7 +249,8 @@ class ExplorerNode(LiveNode):
         if self._handle is not None:
             self._handle.cancel_goal_async()
         self._handle = self._goal_sent = None
-        self._ending, self._state = (code, reason), ExplorationStatus.FINISHED
+        self._ending = (code, reason)
+        self._state = ExplorationStatus.FINISHED
         if code in (ExplorationStatus.ALL_RESOLVED, ExplorationStatus.NOTHING_REACHABLE):
             self._learned = None
         status = self._status_msg()
@@ -275,7 +279,8 @@ class ExplorerNode(LiveNode):
         if not self._navigator.server_is_ready():
             self.get_logger().warning('no navigator yet', throttle_duration_sec=_WARN_PERIOD_S)
             return
-        self._goal_sent, self._answered_at = goal, self._now()
+        self._goal_sent = goal
+        self._answered_at = self._now()
         request = NavigateToPose.Goal(use_heading=True)
         request.pose = messages.pose_stamped_msg(
             goal, self._map_frame, self.get_clock().now().nanoseconds
@@ -293,7 +298,9 @@ class ExplorerNode(LiveNode):
         self.get_logger().warning(
             'the navigator is silent: asking again', throttle_duration_sec=_WARN_PERIOD_S
         )
-        goal, self._goal_sent, self._handle = self._goal_sent, None, None
+        goal = self._goal_sent
+        self._goal_sent = None
+        self._handle = None
         if self._state == ExplorationStatus.RETURNING:
             self._drive_to(goal)
 
@@ -358,7 +365,8 @@ class ExplorerNode(LiveNode):
                 1 for n in self._decision.end_nodes if n.open_border_m > 0.0
             )
             if target is not None:
-                status.has_target, status.target = True, target.node_id
+                status.has_target = True
+                status.target = target.node_id
                 status.target_position = Point(x=target.x, y=target.y)
         return status
 
@@ -379,7 +387,7 @@ def _end_node_msg(node: EndNode) -> EndNodeMsg:
 
 def main() -> None:
     """Run the node."""
-    runtime.run(ExplorerNode)
+    node_main.run(ExplorerNode)
 
 
 if __name__ == '__main__':

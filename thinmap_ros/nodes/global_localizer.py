@@ -8,31 +8,35 @@ from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.msg import LocalizationStatus, SlamStatus, TopologicalMap
 from thinmap_msgs.srv import LocalizeGlobally
-from thinmap_ros import warm_up
-from thinmap_ros.adapters import map_files, messages, parameters, qos, runtime
-from thinmap_ros.adapters.listening import listen
-from thinmap_ros.adapters.live_node import LiveNode
-from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.exploration.active_localization import ActiveSearch
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.localization.active import ActiveSearch
-from thinmap_ros.core.localization.global_localization import (
+from thinmap_ros.core.odometry import ScanPairing
+from thinmap_ros.core.places.global_localizer import (
     GlobalLocalization,
     GlobalLocalizationConfig,
     Result,
     State,
 )
-from thinmap_ros.core.odometry import ScanPairing
 from thinmap_ros.core.planning.navigator import NavigatorConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.builder import TopologyConfig, build
 from thinmap_ros.core.topology.graph import TopologicalMap as Topology
-from thinmap_ros.core.topology.update import TopologyConfig, build
+from thinmap_ros.files import occupancy_maps
+from thinmap_ros.kernels import warm_up
+from thinmap_ros.ros import messages, node_main, parameters, qos
+from thinmap_ros.ros.laser_transform import LaserMount
+from thinmap_ros.ros.lifecycle_node import LiveNode
+from thinmap_ros.ros.subscription import listen
 
 _WARN_PERIOD_S = 5.0
-_CONTROL_PERIOD_S, _SILENCE_NS = 0.1, 400_000_000
+_CONTROL_PERIOD_S = 0.1
+_SILENCE_NS = 400_000_000
 _SHOWN_NS = 1_000_000_000
-_PLANNED_M, _BODY_M = 0.05, 0.04  # wider than the robot: where it plans to go, and what stops it
+# Wider than the robot: where it plans to go, and what stops it
+_PLANNED_M = 0.05
+_BODY_M = 0.04
 _STATES = {
     State.WAITING: LocalizationStatus.WAITING,
     State.SEARCHING: LocalizationStatus.SEARCHING,
@@ -85,8 +89,9 @@ class GlobalLocalizerNode(LiveNode):
         )
         self._mount = LaserMount(self)
         parameters.check_unknown(self)
-        self._automatic, self._lost_ns = bool(automatic), round(1e9 * float(lost_s))
-        self._patch: GridPatch | None = map_files.read_map(Path(path)) if path else None
+        self._automatic = bool(automatic)
+        self._lost_ns = round(1e9 * float(lost_s))
+        self._patch: GridPatch | None = occupancy_maps.read_map(Path(path)) if path else None
         self._topology: Topology | None = (
             build(self._patch, None, TopologyConfig()) if self._patch else None
         )
@@ -166,14 +171,16 @@ class GlobalLocalizerNode(LiveNode):
         return response
 
     def _begin(self, clear: bool) -> None:
-        self._wanted, self._lost_since_ns = True, None
+        self._wanted = True
+        self._lost_since_ns = None
         if clear:
             self._finder = self._search = None
 
     def _on_odometry(self, message: Odometry) -> None:
         self._heard.add('odom')
         stamp_ns = messages.stamp_ns(message.header.stamp)
-        self._T_odom_base, self._odometry_ns = messages.pose_from(message.pose.pose), stamp_ns
+        self._T_odom_base = messages.pose_from(message.pose.pose)
+        self._odometry_ns = stamp_ns
         self._take(self._pairing.add_odometry(stamp_ns, self._T_odom_base))
 
     def _on_scan(self, message: LaserScan) -> None:
@@ -195,7 +202,8 @@ class GlobalLocalizerNode(LiveNode):
 
     def _drive(self) -> None:
         """Drive on while the robot is looked for and what it sees and has driven is heard of."""
-        scan, T_odom_base = self._scan, self._T_odom_base
+        scan = self._scan
+        T_odom_base = self._T_odom_base
         heard = scan is not None and abs(self._odometry_ns - scan.stamp_ns) <= _SILENCE_NS
         heard = heard and self.get_clock().now().nanoseconds - self._odometry_ns <= _SILENCE_NS
         if (
@@ -273,7 +281,10 @@ class GlobalLocalizerNode(LiveNode):
                 )
             )
             self.get_logger().info(f'localized: {result.reason}')
-            self._wanted, self._finder, self._search, self._found_ns = False, None, None, ns
+            self._wanted = False
+            self._finder = None
+            self._search = None
+            self._found_ns = ns
             self.stand_still()
 
     def _show_samples(self, ns: int) -> None:
@@ -291,7 +302,7 @@ class GlobalLocalizerNode(LiveNode):
 
 def main() -> None:
     """Run the node."""
-    runtime.run(GlobalLocalizerNode)
+    node_main.run(GlobalLocalizerNode)
 
 
 if __name__ == '__main__':

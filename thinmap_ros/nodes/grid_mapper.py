@@ -11,20 +11,21 @@ from rclpy.client import Client
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.srv import LoadMap, SaveMap
-from thinmap_ros import warm_up
-from thinmap_ros.adapters import messages, parameters, qos, runtime, session_files
-from thinmap_ros.adapters.listening import listen
-from thinmap_ros.adapters.live_node import LiveNode
-from thinmap_ros.adapters.recovery import State
-from thinmap_ros.adapters.save_folder import SaveFolder
-from thinmap_ros.adapters.services import answer, ask
-from thinmap_ros.adapters.stamps import StampMatcher
-from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.errors import ThinmapError
 from thinmap_ros.core.grid.correctable import CorrectableGrid
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, WindowConfig
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.stamp_matcher import StampMatcher
+from thinmap_ros.files import sessions
+from thinmap_ros.kernels import warm_up
+from thinmap_ros.ros import messages, node_main, parameters, qos
+from thinmap_ros.ros.checkpoint import State
+from thinmap_ros.ros.laser_transform import LaserMount
+from thinmap_ros.ros.lifecycle_node import LiveNode
+from thinmap_ros.ros.save_folder import SaveFolder
+from thinmap_ros.ros.services import answer, ask
+from thinmap_ros.ros.subscription import listen
 
 _LOST_SIGMA_M = 200.0  # a pose that is not known better than this is that of a lost robot
 _NO_BUILDER = 'no graph: there is no topology_builder'
@@ -106,7 +107,7 @@ class GridMapperNode(LiveNode):
         self._replace_map(grid)
 
     def _of_session(self) -> OccupancyGrid:
-        return session_files.load_grid(self._session, self._config)
+        return sessions.load_grid(self._session, self._config)
 
     def _on_scan(self, message: LaserScan) -> None:
         self._add_scan(self._matcher.left(messages.stamp_ns(message.header.stamp), message))
@@ -172,7 +173,7 @@ class GridMapperNode(LiveNode):
         """Save the map, after all of it has undergone the newest correction."""
         if self._grid.finish() is not None:
             self._publish_map()
-        return f'saved {session_files.save_grid(path, self._grid.shown)}'
+        return f'saved {sessions.save_grid(path, self._grid.shown)}'
 
     async def _on_save(
         self, request: SaveMap.Request, response: SaveMap.Response
@@ -180,20 +181,16 @@ class GridMapperNode(LiveNode):
         answer(response, lambda: self._save_grid(self._saves.inside(request.path)))
         if not response.success:
             return response
-        path = str(session_files.stem_of(self._saves.inside(request.path)))
+        path = str(sessions.stem_of(self._saves.inside(request.path)))
         graph = await ask(self, self._save_topology, SaveMap.Request(path=path))
         if graph is None:
             saved = response.message
-            answer(
-                response, lambda: f'{saved}; {_NO_BUILDER}{session_files.set_topology_aside(path)}'
-            )
+            answer(response, lambda: f'{saved}; {_NO_BUILDER}{sessions.set_topology_aside(path)}')
         else:
             response.success = graph.success
             response.message = f'{response.message}; {graph.message}'
-        await self._save_at(self._save_features, path, session_files.set_features_aside, response)
-        await self._save_at(
-            self._save_exploration, path, session_files.set_exploration_aside, response
-        )
+        await self._save_at(self._save_features, path, sessions.set_features_aside, response)
+        await self._save_at(self._save_exploration, path, sessions.set_exploration_aside, response)
         return response
 
     async def _save_at(
@@ -203,7 +200,8 @@ class GridMapperNode(LiveNode):
 
         Without that node, what is there of an earlier map must not pass for this one's.
         """
-        saved, part = response.message, await ask(self, client, SaveMap.Request(path=path))
+        saved = response.message
+        part = await ask(self, client, SaveMap.Request(path=path))
         if part is not None:
             response.success = response.success and part.success
             response.message = f'{saved}; {part.message}'
@@ -216,11 +214,12 @@ class GridMapperNode(LiveNode):
         """Take over grid and graph, or neither."""
         try:
             inside = self._saves.inside(request.path)
-            grid = session_files.load_grid(inside, self._config, self._saves.path)
-            stem = str(session_files.stem_of(inside))
-            path = stem if session_files.has_topology(stem) else ''
+            grid = sessions.load_grid(inside, self._config, self._saves.path)
+            stem = str(sessions.stem_of(inside))
+            path = stem if sessions.has_topology(stem) else ''
         except ThinmapError as error:
-            response.success, response.message = False, str(error)
+            response.success = False
+            response.message = str(error)
             return response
         graph = await ask(self, self._load_topology, LoadMap.Request(path=path))
         response.success = graph is None or graph.success
@@ -237,7 +236,7 @@ class GridMapperNode(LiveNode):
 
 def main() -> None:
     """Run the node."""
-    runtime.run(GridMapperNode)
+    node_main.run(GridMapperNode)
 
 
 if __name__ == '__main__':

@@ -15,15 +15,6 @@ from tf2_msgs.msg import TFMessage
 
 from thinmap_msgs.msg import LineFeature, LineFeatureArray, SlamStatus, TopologicalMap
 from thinmap_msgs.srv import LoadMap, SaveMap
-from thinmap_ros import warm_up
-from thinmap_ros.adapters import messages, parameters, qos, runtime, session_files
-from thinmap_ros.adapters.health import ERROR, OK
-from thinmap_ros.adapters.listening import listen
-from thinmap_ros.adapters.live_node import LiveNode
-from thinmap_ros.adapters.recovery import State
-from thinmap_ros.adapters.save_folder import SaveFolder
-from thinmap_ros.adapters.services import answer
-from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.core import se2
 from thinmap_ros.core.ekf_slam.features import LineFeature as Feature
 from thinmap_ros.core.errors import InputError
@@ -32,14 +23,24 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import LastPose, ScanPairing
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
 from thinmap_ros.core.slam.localizers import (
     AnyLocalizer,
     line_features,
     localizer_class,
     set_topology,
 )
-from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
 from thinmap_ros.core.topology.graph import TopologicalMap as Graph
+from thinmap_ros.files import sessions
+from thinmap_ros.kernels import warm_up
+from thinmap_ros.ros import messages, node_main, parameters, qos
+from thinmap_ros.ros.checkpoint import State
+from thinmap_ros.ros.diagnostics import ERROR, OK
+from thinmap_ros.ros.laser_transform import LaserMount
+from thinmap_ros.ros.lifecycle_node import LiveNode
+from thinmap_ros.ros.save_folder import SaveFolder
+from thinmap_ros.ros.services import answer
+from thinmap_ros.ros.subscription import listen
 
 _MAP_WAIT_S = 3.0  # after a restart; the navigator drives on for so long without a new pose
 _HEALTH = {
@@ -98,7 +99,8 @@ class LocalizerNode(LiveNode):
 
         The robot is at its start.
         """
-        self._localizer, self._pairing = self._made(self._config), ScanPairing()
+        self._localizer = self._made(self._config)
+        self._pairing = ScanPairing()
         self._last: LastPose | None = None
         self._topology: Graph | None = None
         self._resumed = self._latched = None
@@ -112,7 +114,7 @@ class LocalizerNode(LiveNode):
 
     def _made(self, config: ScanLocalizerConfig) -> AnyLocalizer:
         """A localizer that begins at its start, in the map of the session if there is one."""
-        loaded = session_files.load_features(self._session, config) if self._session else None
+        loaded = sessions.load_features(self._session, config) if self._session else None
         return loaded or localizer_class(config)(config)
 
     def _at(self, T_map_base: Array) -> ScanLocalizerConfig:
@@ -200,7 +202,7 @@ class LocalizerNode(LiveNode):
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:
             path = self._saves.inside(request.path)
-            return f'saved {session_files.save_features(path, self._localizer)}'
+            return f'saved {sessions.save_features(path, self._localizer)}'
 
         return answer(response, save)
 
@@ -210,7 +212,7 @@ class LocalizerNode(LiveNode):
     def _load(self, path: str) -> str:
         """Take over the features of a session; without any, those that there are stay."""
         config = self._at(self._localizer.pose)
-        loaded = session_files.load_features(self._saves.inside(path), config)
+        loaded = sessions.load_features(self._saves.inside(path), config)
         if loaded is None:
             return 'no features are saved: the localizer keeps its own'
         self._localizer = loaded
@@ -285,7 +287,7 @@ def _feature_msg(feature: Feature) -> LineFeature:
 
 def main() -> None:
     """Run the node."""
-    runtime.run(LocalizerNode)
+    node_main.run(LocalizerNode)
 
 
 if __name__ == '__main__':

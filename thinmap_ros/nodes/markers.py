@@ -4,14 +4,32 @@ These do not know thinmap's messages.
 """
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
-from visualization_msgs.msg import MarkerArray
+from geometry_msgs.msg import Point
+from std_msgs.msg import ColorRGBA, Header
+from visualization_msgs.msg import Marker, MarkerArray
 
 from thinmap_msgs.msg import EndNodeArray, LineFeatureArray, TopologicalMap
-from thinmap_ros.adapters import markers, parameters, qos, runtime
-from thinmap_ros.adapters.listening import listen
-from thinmap_ros.adapters.live_node import LiveNode
+from thinmap_ros.core import validation
+from thinmap_ros.core.topology.graph import NodeKind
+from thinmap_ros.ros import messages, node_main, parameters, qos
+from thinmap_ros.ros.lifecycle_node import LiveNode
+from thinmap_ros.ros.subscription import listen
+from thinmap_ros.view import palette
+
+_EDGE_M = 0.04
+_NODE_M = 0.2
+_LINE_M = 0.06
+_TEXT_M = 0.3
+_EDGE_Z = 0.02
+_NODE_Z = 0.05
+_LINE_Z = 0.04
+_TEXT_Z = 0.4
+_END = palette.NODES[NodeKind.END]
+_REMOTE = '#999999'
+_TEXT = '#000000'
 
 
 class MarkersNode(LiveNode):
@@ -20,18 +38,109 @@ class MarkersNode(LiveNode):
     def __init__(self) -> None:
         super().__init__('markers')
         parameters.check_unknown(self)
-        self._show(TopologicalMap, 'topology', markers.topology)
-        self._show(EndNodeArray, 'end_nodes', markers.end_nodes)
-        self._show(LineFeatureArray, 'line_features', markers.line_features)
+        self._show(TopologicalMap, 'topology', topology)
+        self._show(EndNodeArray, 'end_nodes', end_nodes)
+        self._show(LineFeatureArray, 'line_features', line_features)
 
     def _show(self, kind: type, topic: str, drawn: Callable[[Any], MarkerArray]) -> None:
         publisher = self.create_publisher(MarkerArray, f'{topic}_markers', qos.LATCHED)
         listen(self, kind, topic, lambda message: publisher.publish(drawn(message)), qos.LATCHED)
 
 
+def topology(message: TopologicalMap) -> MarkerArray:
+    """Edges as lines along their paths, nodes as spheres coloured by kind.
+
+    Raises InputError as `topology_from`.
+    """
+    graph = messages.topology_from(message)
+    edges = _marker(message.header, 'edges', Marker.LINE_LIST, _EDGE_M, palette.EDGE)
+    for edge in graph.edges.values():
+        points = [_point(float(x), float(y), _EDGE_Z) for x, y in edge.path]
+        for start, end in pairwise(points):
+            edges.points += [start, end]
+    nodes = _marker(message.header, 'nodes', Marker.SPHERE_LIST, _NODE_M, palette.EDGE)
+    for node in graph.nodes.values():
+        nodes.points.append(_point(node.x, node.y, _NODE_Z))
+        nodes.colors.append(_colour(palette.NODES[node.kind]))
+    return _shown([edges, nodes])
+
+
+def end_nodes(message: EndNodeArray) -> MarkerArray:
+    """End nodes as spheres, the paler the less sure, the target's larger, with their probability.
+
+    Raises InputError where a place or probability is no number.
+    """
+    markers: list[Marker] = []
+    for node in message.end_nodes:
+        validation.within(f'end node {node.node_id}', (node.position.x, node.position.y))
+        validation.within(
+            f'probability of end node {node.node_id}', (node.position_probability,), 1.0
+        )
+        ball = _marker(
+            message.header,
+            'end_nodes',
+            Marker.SPHERE,
+            _NODE_M * (2.0 if node.is_target else 1.2),
+            _END,
+        )
+        ball.id = len(markers)
+        ball.color.a = 0.3 + 0.7 * node.position_probability
+        ball.pose.position = _point(node.position.x, node.position.y, _NODE_Z)
+        text = _marker(message.header, 'probabilities', Marker.TEXT_VIEW_FACING, _TEXT_M, _TEXT)
+        text.id = len(markers)
+        text.text = f'{node.position_probability:.2f}'
+        text.pose.position = _point(node.position.x, node.position.y, _TEXT_Z)
+        markers += [ball, text]
+    return _shown(markers)
+
+
+def line_features(message: LineFeatureArray) -> MarkerArray:
+    """Line features, those of the local area in another colour.
+
+    Raises InputError where an end is no number.
+    """
+    lines = _marker(message.header, 'lines', Marker.LINE_LIST, _LINE_M, palette.ESTIMATE)
+    for feature in message.features:
+        ends = (feature.start, feature.end)
+        validation.within(f'line {feature.id}', [c for end in ends for c in (end.x, end.y)])
+        lines.points += [_point(end.x, end.y, _LINE_Z) for end in ends]
+        lines.colors += 2 * [_colour(palette.ESTIMATE if feature.in_local_area else _REMOTE)]
+    return _shown([lines])
+
+
+def _shown(markers: list[Marker]) -> MarkerArray:
+    """Markers in place of all shown before; lists without points are left out: RViz complains."""
+    lists = (Marker.LINE_LIST, Marker.SPHERE_LIST)
+    return MarkerArray(
+        markers=[
+            Marker(action=Marker.DELETEALL),
+            *(m for m in markers if m.type not in lists or m.points),
+        ]
+    )
+
+
+def _marker(header: Header, namespace: str, kind: int, size_m: float, colour: str) -> Marker:
+    marker = Marker(
+        header=header, ns=namespace, type=kind, action=Marker.ADD, color=_colour(colour)
+    )
+    marker.scale.x = marker.scale.y = marker.scale.z = size_m
+    marker.pose.orientation.w = 1.0
+    return marker
+
+
+def _point(x: float, y: float, z: float) -> Point:
+    return Point(x=x, y=y, z=z)
+
+
+def _colour(web: str) -> ColorRGBA:
+    """Colour of a web colour, #rrggbb."""
+    r, g, b = bytes.fromhex(web[1:])
+    return ColorRGBA(r=r / 255.0, g=g / 255.0, b=b / 255.0, a=1.0)
+
+
 def main() -> None:
     """Run the node."""
-    runtime.run(MarkersNode)
+    node_main.run(MarkersNode)
 
 
 if __name__ == '__main__':

@@ -6,20 +6,20 @@ from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.action import NavigateToPose
-from thinmap_ros import warm_up
-from thinmap_ros.adapters import messages, parameters, qos, runtime
-from thinmap_ros.adapters.actions import Outcome, SingleGoalServer
-from thinmap_ros.adapters.health import OK, WARN
-from thinmap_ros.adapters.listening import listen
-from thinmap_ros.adapters.live_node import LiveNode
-from thinmap_ros.adapters.transforms import LaserMount
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.mirror import MapMirror
+from thinmap_ros.core.grid.map_mirror import MapMirror
 from thinmap_ros.core.odometry import OdometryBuffer
 from thinmap_ros.core.planning.navigator import Command, Navigator, NavigatorConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.kernels import warm_up
+from thinmap_ros.ros import messages, node_main, parameters, qos
+from thinmap_ros.ros.action_server import Outcome, SingleGoalServer
+from thinmap_ros.ros.diagnostics import OK, WARN
+from thinmap_ros.ros.laser_transform import LaserMount
+from thinmap_ros.ros.lifecycle_node import LiveNode
+from thinmap_ros.ros.subscription import listen
 
 _WARN_PERIOD_S = 5.0
 _CONTROL_PERIOD_S = 0.1
@@ -67,7 +67,8 @@ class NavigatorNode(LiveNode):
 
     def _on_config(self, config: NavigatorConfig) -> None:
         """Drive on with other parameters: to the same goal, on a new path."""
-        self._config, self._navigator = config, Navigator(config)
+        self._config = config
+        self._navigator = Navigator(config)
         if self._goals.active:
             self._navigator.set_goal(*self._goal)
 
@@ -221,7 +222,7 @@ def _preempted() -> NavigateToPose.Result:
 
 def main() -> None:
     """Run the node."""
-    runtime.run(NavigatorNode)
+    node_main.run(NavigatorNode)
 
 
 if __name__ == '__main__':

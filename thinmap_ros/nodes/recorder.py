@@ -9,12 +9,14 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-from thinmap_ros.adapters import bag_qos, parameters, resources, runtime
-from thinmap_ros.adapters.bag_writer import BagWriter
-from thinmap_ros.adapters.health import Health
-from thinmap_ros.adapters.types import message_class
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.files import package_data
+from thinmap_ros.logs import qos
+from thinmap_ros.logs.bag_writer import BagWriter
+from thinmap_ros.ros import node_main, parameters
+from thinmap_ros.ros.diagnostics import Health
+from thinmap_ros.ros.messages import message_class
 
 _LOOK_AROUND_S = 0.25
 _FLUSH_S = 0.5
@@ -79,9 +81,9 @@ class RecorderNode(Node):
         latched = all(offer.durability == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers)
         try:
             kind = message_class(type_name)
-            self._writer.learn(resources.message_definitions(type_name.partition('/')[0]))
+            self._writer.learn(package_data.message_definitions(type_name.partition('/')[0]))
             self._writer.add_topic(
-                topic, type_name, [bag_qos.recorded(o.depth, reliable, latched) for o in offers]
+                topic, type_name, [qos.recorded(o.depth, reliable, latched) for o in offers]
             )
         except InputError as error:
             self.get_logger().warning(f'{topic} is not recorded: {error}')
@@ -135,7 +137,7 @@ def _wanted(reliable: bool, latched: bool) -> QoSProfile:
 
 def main() -> None:
     """Run the node."""
-    runtime.run(RecorderNode)
+    node_main.run(RecorderNode)
 
 
 if __name__ == '__main__':

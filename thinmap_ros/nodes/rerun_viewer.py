@@ -19,14 +19,14 @@ from thinmap_msgs.msg import (
     SlamStatus,
     TopologicalMap,
 )
-from thinmap_ros.adapters import parameters, qos, runtime
-from thinmap_ros.adapters.health import Health
-from thinmap_ros.adapters.rerun_view import View
-from thinmap_ros.adapters.transforms import LaserMount
-from thinmap_ros.adapters.view_feed import Feed
-from thinmap_ros.adapters.views import NullView
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.ros import node_main, parameters, qos
+from thinmap_ros.ros.diagnostics import Health
+from thinmap_ros.ros.laser_transform import LaserMount
+from thinmap_ros.view.message_view import Feed
+from thinmap_ros.view.null_view import NullView
+from thinmap_ros.view.rerun_view import View
 
 _WARN_PERIOD_S = 5.0
 _TOPICS = {
@@ -94,7 +94,7 @@ class RerunViewerNode(Node):
 
 def main() -> None:
     """Run the node."""
-    runtime.run(RerunViewerNode)
+    node_main.run(RerunViewerNode)
 
 
 if __name__ == '__main__':

@@ -16,17 +16,18 @@ from sensor_msgs.msg import LaserScan
 from std_msgs.msg import UInt32
 from tf2_msgs.msg import TFMessage
 
-from thinmap_ros.adapters import messages, parameters, qos, resources, runtime
-from thinmap_ros.adapters.health import OK, WARN, Health
-from thinmap_ros.adapters.lockstep import NONE, PATIENCE_S, PATIENCE_WORDS, TOPICS, Lockstep
-from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import ConfigError, InputError, shown
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.sim.lms200 import Lms200Config
-from thinmap_ros.sim.pioneer import PRESETS
-from thinmap_ros.sim.runner import STEP_NS, Moment, Simulation
+from thinmap_ros.files import package_data
+from thinmap_ros.files.worlds import read_world
+from thinmap_ros.ros import messages, node_main, parameters, qos
+from thinmap_ros.ros.diagnostics import OK, WARN, Health
+from thinmap_ros.ros.lockstep import NONE, PATIENCE_S, PATIENCE_WORDS, TOPICS, Lockstep
+from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.robot import PRESETS
+from thinmap_ros.sim.simulation import STEP_NS, Moment, Simulation
 from thinmap_ros.sim.world import World
 
 _COMMAND_TIMEOUT_NS = 500_000_000
@@ -62,11 +63,12 @@ class SimNode(Node):
         self._config = parameters.declare(self, SimConfig)
         laser = parameters.declare(self, Lms200Config)
         parameters.check_unknown(self)
-        world = World.from_patch(*read_world(resources.world_path(self._config.world)))
+        world = World.from_patch(*read_world(package_data.world_path(self._config.world)))
         start = _start(self._config.start, world)
         self._sim = Simulation(world, start, PRESETS[self._config.robot], laser, self._config.seed)
         self._scan_time_s = 1.0 / laser.rate_hz
-        self._command, self._command_ns = (0.0, 0.0), 0
+        self._command = (0.0, 0.0)
+        self._command_ns = 0
         self._lockstep = Lockstep(self, self._config.lockstep, self._config.lockstep_patience_s)
         self._last_scan: LaserScan | None = None
         self._repeated_at = 0.0
@@ -95,7 +97,8 @@ class SimNode(Node):
         if not np.isfinite(command).all():
             self._health.refused('cmd_vel', f'command {command}: expected finite numbers')
             return
-        self._command, self._command_ns = command, self._sim.stamp_ns
+        self._command = command
+        self._command_ns = self._sim.stamp_ns
 
     def _on_carry(self, message: PoseStamped) -> None:
         """Somebody lifts the robot up and puts it down at a pose in the world.
@@ -188,7 +191,7 @@ def _start(text: str, world: World) -> Array:
 
 def main() -> None:
     """Run the node."""
-    runtime.run(SimNode)
+    node_main.run(SimNode)
 
 
 if __name__ == '__main__':

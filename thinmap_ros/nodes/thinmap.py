@@ -8,7 +8,7 @@ from importlib import import_module
 from rclpy.node import Node
 from rclpy.utilities import remove_ros_args
 
-from thinmap_ros.adapters import runtime
+from thinmap_ros.ros import node_main
 
 _NODES = ('localizer', 'grid_mapper', 'topology_builder', 'navigator', 'explorer')
 _OTHERS = ('global_localizer', 'sim', 'recorder', 'bag_player', 'rerun_viewer', 'markers')
@@ -44,7 +44,7 @@ def main() -> None:
             file=sys.stderr,
         )
         sys.exit(2)
-    runtime.run_all(makers(names))
+    node_main.run_all(makers(names))
 
 
 if __name__ == '__main__':

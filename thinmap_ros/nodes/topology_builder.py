@@ -6,19 +6,20 @@ from nav_msgs.msg import OccupancyGrid, Path
 
 from thinmap_msgs.msg import TopologicalMap
 from thinmap_msgs.srv import LoadMap, SaveMap
-from thinmap_ros import warm_up
-from thinmap_ros.adapters import messages, parameters, qos, runtime, session_files
-from thinmap_ros.adapters.listening import listen
-from thinmap_ros.adapters.live_node import LiveNode
-from thinmap_ros.adapters.recovery import State
-from thinmap_ros.adapters.save_folder import SaveFolder
-from thinmap_ros.adapters.services import answer
-from thinmap_ros.adapters.stamps import StampMatcher
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.topology.rebuilding import Rebuilding
-from thinmap_ros.core.topology.update import TopologyBuilder, TopologyConfig
+from thinmap_ros.core.stamp_matcher import StampMatcher
+from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
+from thinmap_ros.core.topology.rebuild import Rebuilding
+from thinmap_ros.files import sessions
+from thinmap_ros.kernels import warm_up
+from thinmap_ros.ros import messages, node_main, parameters, qos
+from thinmap_ros.ros.checkpoint import State
+from thinmap_ros.ros.lifecycle_node import LiveNode
+from thinmap_ros.ros.save_folder import SaveFolder
+from thinmap_ros.ros.services import answer
+from thinmap_ros.ros.subscription import listen
 
 _UNTOLD_IDS = 1000  # ids that a builder may have given after its state was kept last
 
@@ -81,7 +82,7 @@ class TopologyBuilderNode(LiveNode):
             self._publish(self.get_clock().now().nanoseconds)
 
     def _of_session(self) -> TopologyBuilder:
-        return session_files.load_topology(self._session, self._config)
+        return sessions.load_topology(self._session, self._config)
 
     def _on_window(self, message: OccupancyGrid) -> None:
         stamp_ns = messages.stamp_ns(message.header.stamp)
@@ -100,7 +101,8 @@ class TopologyBuilderNode(LiveNode):
             return
         if self._resumed_ns is not None and stamp_ns < self._resumed_ns:
             self.begin_anew()  # the robot has begun anew as well
-        self._resumed_ns, self._latest_ns = None, stamp_ns
+        self._resumed_ns = None
+        self._latest_ns = stamp_ns
         window, T_map_base = pair
         with self.health.timed('graph update'):
             changed = self._rebuilding.accepts_window() and self._builder.update(window, T_map_base)
@@ -142,7 +144,7 @@ class TopologyBuilderNode(LiveNode):
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:
             path = self._saves.inside(request.path)
-            return f'saved {session_files.save_topology(path, self._builder)}'
+            return f'saved {sessions.save_topology(path, self._builder)}'
 
         return answer(response, save)
 
@@ -155,8 +157,9 @@ class TopologyBuilderNode(LiveNode):
         if path:
             inside = self._saves.inside(path)
             resolution_m = self._builder.resolution_m
-            loaded = session_files.load_topology(inside, self._config, resolution_m)
-        self._builder, self._matcher = loaded, StampMatcher()
+            loaded = sessions.load_topology(inside, self._config, resolution_m)
+        self._builder = loaded
+        self._matcher = StampMatcher()
         self._rebuilding = Rebuilding(from_the_start=not path)
         self._publish(self.get_clock().now().nanoseconds)
         return f'graph of {len(loaded.map.nodes)} nodes' if path else 'the graph begins anew'
@@ -164,7 +167,7 @@ class TopologyBuilderNode(LiveNode):
 
 def main() -> None:
     """Run the node."""
-    runtime.run(TopologyBuilderNode)
+    node_main.run(TopologyBuilderNode)
 
 
 if __name__ == '__main__':

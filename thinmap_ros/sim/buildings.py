@@ -14,15 +14,18 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.sim.floor_plan import WALL_M, FloorPlan, Kind, Opening, Part, floor_plan
-from thinmap_ros.sim.moving import Leaves, Moving, People
+from thinmap_ros.sim.moving_obstacles import Leaves, Moving, People
 from thinmap_ros.sim.world import World
 
 DEVELOPMENT_SEEDS = range(1000)  # others are for judging
 LARGEST_M2 = 100_000.0
 _SMALLEST_M2 = 150.0
-_FINE_M, _COARSE_M, _COARSE_FROM_M2 = 0.05, 0.1, 20_000.0
+_FINE_M = 0.05
+_COARSE_M = 0.1
+_COARSE_FROM_M2 = 20_000.0
 _MARGIN_M = 1.0
-_SOLID, _GLASS = 1, 2
+_SOLID = 1
+_GLASS = 2
 _ROWS_AT_ONCE = 256
 _LINK_M = (1.8, 3.0)  # width of what joins two wings
 _GAP_M = (2.0, 6.0)

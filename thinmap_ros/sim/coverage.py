@@ -148,9 +148,13 @@ def _look_around(
                     found[i] = True
                     break
                 if next_x < next_y:
-                    travelled, next_x, col = next_x, next_x + delta_x, col + step_x
+                    travelled = next_x
+                    next_x = next_x + delta_x
+                    col = col + step_x
                 else:
-                    travelled, next_y, row = next_y, next_y + delta_y, row + step_y
+                    travelled = next_y
+                    next_y = next_y + delta_y
+                    row = row + step_y
             if found[i]:
                 break
     return found

@@ -11,7 +11,7 @@ from thinmap_ros.core.grid.distance import distance_cells
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.sim.moving import Moving
+from thinmap_ros.sim.moving_obstacles import Moving
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,8 @@ class World:
         """Whether a disc whose centre lies within the world touches no solid cell; exact."""
         if not (math.isfinite(x) and math.isfinite(y)):
             return False
-        frame, (rows, cols) = self.frame, self.occupied.shape
+        frame = self.frame
+        (rows, cols) = self.occupied.shape
         row = math.floor((y - frame.origin_y) / frame.resolution)
         col = math.floor((x - frame.origin_x) / frame.resolution)
         if not (0 <= row < rows and 0 <= col < cols):

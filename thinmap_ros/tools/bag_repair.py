@@ -3,11 +3,11 @@
 import argparse
 from pathlib import Path
 
-from thinmap_ros.adapters.bag_folders import bag_files, mcap_files_in
-from thinmap_ros.adapters.bag_salvage import Salvage, repair
-from thinmap_ros.adapters.bag_writer import written_as_bag
-from thinmap_ros.adapters.log_formats import is_mcap, refuse_foreign
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.logs.bag_directory import bag_files, mcap_files_in
+from thinmap_ros.logs.bag_writer import written_as_bag
+from thinmap_ros.logs.log import is_mcap, refuse_foreign
+from thinmap_ros.logs.repair import Salvage, repair
 from thinmap_ros.tools import cli
 
 

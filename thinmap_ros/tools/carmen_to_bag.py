@@ -3,10 +3,10 @@
 import argparse
 from pathlib import Path
 
-from thinmap_ros.adapters.bag_objects import BagObjects
-from thinmap_ros.adapters.bag_writer import BagWriter
-from thinmap_ros.adapters.carmen import CarmenLog, LaserOptions
-from thinmap_ros.adapters.events import Event, OdometryEvent
+from thinmap_ros.logs.bag_writer import BagWriter
+from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
+from thinmap_ros.logs.encode import BagObjects
+from thinmap_ros.logs.log import Event, OdometryEvent
 from thinmap_ros.tools import cli
 
 

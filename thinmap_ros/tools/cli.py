@@ -9,15 +9,15 @@ from typing import TypeVar
 
 import numpy as np
 
-from thinmap_ros.adapters.bags import BagLog
-from thinmap_ros.adapters.carmen import CarmenLog, LaserOptions
-from thinmap_ros.adapters.compiling import report_compilation
-from thinmap_ros.adapters.events import Log
-from thinmap_ros.adapters.log_formats import is_mcap
 from thinmap_ros.core.config import Config
 from thinmap_ros.core.errors import ThinmapError
+from thinmap_ros.kernels.progress import report_compilation
+from thinmap_ros.logs.bag import BagLog
+from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
+from thinmap_ros.logs.log import Log, is_mcap
 
-BAD_INPUT, INTERRUPTED = 2, 130
+BAD_INPUT = 2
+INTERRUPTED = 130
 AnyConfig = TypeVar('AnyConfig', bound=Config)
 # A parser or a group of its options: argparse's own name for what both are.
 Options = argparse._ActionsContainer

@@ -10,17 +10,25 @@ from pathlib import Path
 
 import numpy as np
 
-from thinmap_ros.adapters import figures
-from thinmap_ros.adapters.files import read_text, write_text
-from thinmap_ros.adapters.world_files import read_world
+from thinmap_ros.closed_loop import STRATEGIES, Options
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.evaluation.exploration_run import explore
+from thinmap_ros.evaluation.parallel_jobs import (
+    Report,
+    add_run_options,
+    complaint,
+    read_report,
+    run_missing,
+)
+from thinmap_ros.evaluation.strategy_comparison import markdown
+from thinmap_ros.files.atomic import read_text, write_text
+from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.world import World
 from thinmap_ros.tools import cli
-from thinmap_ros.tools.comparison import markdown
-from thinmap_ros.tools.explore_world import STRATEGIES, Options, add_options, explore, options_from
-from thinmap_ros.tools.runs import Report, add_run_options, complaint, read_report, run_missing
+from thinmap_ros.tools.explore_world import add_options, options_from
+from thinmap_ros.view import figures
 
 
 @dataclass(frozen=True, eq=False)

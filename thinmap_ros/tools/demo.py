@@ -13,13 +13,14 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from thinmap_ros.adapters import resources
-from thinmap_ros.adapters.world_files import read_world
 from thinmap_ros.core.errors import InputError, ThinmapError
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.sim.pioneer import PRESETS
-from thinmap_ros.tools import cli, demo_results
-from thinmap_ros.tools.processes import end_with_parent
+from thinmap_ros.evaluation import recorded_run
+from thinmap_ros.evaluation.processes import end_with_parent
+from thinmap_ros.files import package_data
+from thinmap_ros.files.worlds import read_world
+from thinmap_ros.sim.robot import PRESETS
+from thinmap_ros.tools import cli
 
 # Nodes end at once, but not on a machine that is busy; a recorder that is killed leaves half a bag.
 _PATIENCE_S = 20.0
@@ -142,7 +143,7 @@ def _prepare(out: Path) -> None:
         for file in (out / 'bag').iterdir():
             file.unlink()
         (out / 'bag').rmdir()
-    for name in ('result.json', *demo_results.FILES):
+    for name in ('result.json', *recorded_run.FILES):
         (out / name).unlink(missing_ok=True)
 
 
@@ -160,14 +161,14 @@ def _choose_domain() -> None:
 def _work(arguments: argparse.Namespace) -> None:
     if arguments.view and importlib.util.find_spec('rerun') is None:
         raise InputError('--view: rerun is not installed: pip install "thinmap_ros[viewer]"')
-    world = resources.world_path(arguments.world)
+    world = package_data.world_path(arguments.world)
     _, _, start = read_world(world)
     signal.signal(signal.SIGTERM, _raise_interrupt)
     _prepare(arguments.out)
     _choose_domain()
     explore(arguments, world, start)
     result = json.loads((arguments.out / 'result.json').read_text())
-    report = demo_results.write(arguments.out, world, arguments.robot, result)
+    report = recorded_run.write(arguments.out, world, arguments.robot, result)
     print(
         f'{result["reason"]}: {100.0 * report["coverage"]:.1f} % seen, {report["distance"]:.1f} m, '
         f'{report["time"]:.1f} s, {report["collisions"]} collisions; results in {arguments.out}'

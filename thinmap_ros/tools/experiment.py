@@ -10,35 +10,33 @@ from dataclasses import asdict
 from multiprocessing import get_context
 from pathlib import Path
 
-from thinmap_ros.adapters.files import write_text
-from thinmap_ros.adapters.plot_files import write_plot
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.tools import cli
-from thinmap_ros.tools.experiments import (
-    building_floor,
-    convergence,
+from thinmap_ros.evaluation.outcome import Outcome
+from thinmap_ros.evaluation.pages import write_markdown, write_page
+from thinmap_ros.experiments.drives import Source
+from thinmap_ros.experiments.exploration import (
     end_nodes,
     exploration,
-    feature_count,
-    global_map,
-    logs,
-    long_floor,
     node_kinds,
-    office,
     strategies,
     thinning_stages,
+)
+from thinmap_ros.experiments.slam import building_floor, feature_count, logs, long_floor, office
+from thinmap_ros.experiments.topological_map import (
+    global_localization,
+    global_map,
     thinning_voronoi,
     wavefront_path,
 )
-from thinmap_ros.tools.experiments.drives import Source
-from thinmap_ros.tools.experiments.outcome import Outcome
-from thinmap_ros.tools.experiments.page import write_markdown, write_page
+from thinmap_ros.files.atomic import write_text
+from thinmap_ros.tools import cli
+from thinmap_ros.view.plot_writer import write_plot
 
 # In the order of the papers; the longest are begun first.
 EXPERIMENTS: dict[str, Callable[[Source], Outcome]] = {
     'thinning_voronoi': thinning_voronoi.run,
     'global_map': global_map.run,
-    'convergence': convergence.run,
+    'convergence': global_localization.run,
     'wavefront_path': wavefront_path.run,
     'thinning_stages': thinning_stages.run,
     'node_kinds': node_kinds.run,
@@ -50,7 +48,9 @@ EXPERIMENTS: dict[str, Callable[[Source], Outcome]] = {
     'feature_count': feature_count.run,
     'long_floor': long_floor.run,
 }
-LOGS, PAGE = 'logs', 'page'  # need logs, or results: not among all
+# Need logs, or results: not among all
+LOGS = 'logs'
+PAGE = 'page'
 _LONGEST = ('strategies', 'feature_count', 'long_floor', 'convergence')
 
 

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from thinmap_ros.adapters import figures, graph_files, map_files
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.topology.update import TopologyConfig, build
+from thinmap_ros.core.topology.builder import TopologyConfig, build
+from thinmap_ros.files import graphs, occupancy_maps
 from thinmap_ros.tools import cli
+from thinmap_ros.view import figures
 
 _DEFAULTS = TopologyConfig()
 
@@ -39,13 +40,14 @@ def _config(arguments: argparse.Namespace) -> TopologyConfig:
 
 
 def _work(arguments: argparse.Namespace) -> None:
-    graph_files.writer_of(arguments.out)  # a wrong name is said before any work
+    graphs.writer_of(arguments.out)  # a wrong name is said before any work
     if arguments.picture is not None and arguments.picture.suffix != '.png':
         raise InputError(f'{arguments.picture}: expected a name that ends in .png')
-    start, config = _start(arguments.start), _config(arguments)
-    patch = map_files.read_map(arguments.map)
+    start = _start(arguments.start)
+    config = _config(arguments)
+    patch = occupancy_maps.read_map(arguments.map)
     topology = build(patch, start, config)
-    graph_files.write_graph(arguments.out, topology)
+    graphs.write_graph(arguments.out, topology)
     if arguments.picture is not None:
         figures.summary_figure(
             arguments.picture, patch, topology, np.empty((0, 2)), title=arguments.map.stem

@@ -6,19 +6,19 @@ from pathlib import Path
 
 import numpy as np
 
-from thinmap_ros.adapters import resources
-from thinmap_ros.adapters.bag_objects import BagObjects
-from thinmap_ros.adapters.bag_writer import BagWriter
-from thinmap_ros.adapters.files import write_text
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, shown
 from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
+from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
+from thinmap_ros.experiments.drives import RECIPES, TRUTH_TOPIC, Source
+from thinmap_ros.files import package_data
+from thinmap_ros.files.atomic import write_text
+from thinmap_ros.logs.bag_writer import BagWriter
+from thinmap_ros.logs.encode import BagObjects
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
-from thinmap_ros.sim.tours import Look
+from thinmap_ros.sim.drives import Look
 from thinmap_ros.tools import cli
-from thinmap_ros.tools.experiments.drives import RECIPES, TRUTH_TOPIC, Source
 
 _MAP_EVERY = 300  # scans: a minute
 _TYPES = {
@@ -47,14 +47,16 @@ class _Recording:
 
     def mount(self, look: Look) -> None:
         """Where the laser sits."""
-        ns, made = look.scan.stamp_ns, self._objects
+        ns = look.scan.stamp_ns
+        made = self._objects
         self._write(
             '/tf_static', ns, made.transform(ns, ('base_link', 'laser'), look.scan.T_base_laser)
         )
 
     def sensed(self, look: Look) -> None:
         """What the robot had at a scan, and where it truly was."""
-        ns, made = look.scan.stamp_ns, self._objects
+        ns = look.scan.stamp_ns
+        made = self._objects
         self._write(TRUTH_TOPIC, ns, made.pose(ns, 'map', look.T_world_base))
         self._write('/odom', ns, made.odometry(ns, look.T_odom_base))
         self._write('/tf', ns, made.transform(ns, ('odom', 'base_link'), look.T_odom_base))
@@ -77,7 +79,9 @@ def record(path: Path, looks: Iterable[Look], localized: bool) -> int:
 
     localized: by the localizer, else by ground truth.
     """
-    definitions, scans, pipeline = resources.message_definitions('thinmap_msgs'), 0, None
+    definitions = package_data.message_definitions('thinmap_msgs')
+    scans = 0
+    pipeline = None
     with BagWriter(path, definitions=definitions, compressed=True) as writer:
         recording = _Recording(writer)
         for look in looks:

@@ -4,127 +4,82 @@ Trajectory, map, graph, report and picture.
 """
 
 import argparse
-import json
-import resource
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
-from thinmap_ros.adapters import figures, graph_files, map_files, trajectory_files
-from thinmap_ros.adapters.events import Log, OdometryEvent
-from thinmap_ros.adapters.files import write_text, written_aside
-from thinmap_ros.adapters.pages import give_back_pages, release_compiler_pages
-from thinmap_ros.adapters.rerun_view import View
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core import se2
+from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
-from thinmap_ros.core.odometry import ScanPairing
+from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
 from thinmap_ros.core.slam.localizers import line_features
-from thinmap_ros.core.slam.scan_localizer import ScanLocalizerConfig
+from thinmap_ros.files.atomic import written_aside
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
+from thinmap_ros.replaying import replay, write_outputs
 from thinmap_ros.tools import cli
-from thinmap_ros.tools.replay_view import ReplayView
+from thinmap_ros.view.null_view import NullView
+from thinmap_ros.view.rerun_view import View
+
+# What is large is put together once a second, as a view does not draw it more often.
+_PERIOD_NS = 1_000_000_000
+_STAGES = {'localizer': 'localizer', 'grid': 'map update', 'topology': 'graph update'}
 
 
-@dataclass(eq=False)
-class Replay:
-    """What came of a log: the pipeline at its end, and the pose (3,) of every scan."""
+class ReplayView:
+    """Tells a view what a pipeline makes of each scan: the same picture as of the live nodes.
 
-    pipeline: Pipeline
-    stamps_ns: list[int] = field(default_factory=list)
-    poses: list[Array] = field(default_factory=list)
-    local_features: list[int] = field(default_factory=list)
-    skipped: int = 0
-    first_skipped: str = ''
-
-
-def replay(
-    log: Log, config: PipelineConfig, show_progress: bool = False, shown: ReplayView | None = None
-) -> Replay:
-    """Play a log through the pipeline, shown or not.
-
-    Raises InputError where the log has nothing to play.
+    At the end `last` tells of the map and graph once more.
     """
-    result = Replay(Pipeline(config))
-    pairing, tidy_up = ScanPairing(), give_back_pages()
-    for event in tqdm(log.events(), unit=' events', disable=not show_progress):
-        if isinstance(event, OdometryEvent):
-            ready = pairing.add_odometry(event.stamp_ns, event.T_odom_base)
-        else:
-            ready = pairing.add_scan(event.scan)
-        for scan, T_odom_base in ready:
-            step = result.pipeline.step(scan, T_odom_base)
-            result.stamps_ns.append(scan.stamp_ns)
-            result.poses.append(step.estimate.T_map_base)
-            result.local_features.append(step.estimate.n_local)
-            if shown is not None:
-                shown.step(scan, T_odom_base, step.estimate, result.pipeline)
-        tidy_up()
-    result.pipeline.finish()
-    result.skipped = log.skipped.count + pairing.dropped + pairing.waiting
-    result.first_skipped = log.skipped.first
-    if not result.poses:
-        raise InputError(f'no scan with odometry around its stamp; {result.skipped} skipped')
-    if shown is not None:
-        shown.last(result.stamps_ns[-1], result.pipeline)
-    return result
 
+    def __init__(self, view: NullView) -> None:
+        """Begin with nothing shown."""
+        self._view = view
+        self._T_map_odom: Array | None = None
+        self._drawn_ns: int | None = None
 
-def write_outputs(
-    result: Replay, folder: Path, title: str, seconds: tuple[float, float]
-) -> dict[str, Any]:
-    """Write all files into a folder; seconds: wall and CPU time taken. Returns the report."""
-    pipeline = result.pipeline
-    patch, poses = pipeline.grid.patch(), np.array(result.poses)
-    folder.mkdir(parents=True, exist_ok=True)
-    trajectory_files.write_tum(folder / 'trajectory.tum', result.stamps_ns, result.poses)
-    final = list(pipeline.localizer.corrected_path())
-    trajectory_files.write_tum(folder / 'trajectory_final.tum', result.stamps_ns, final)
-    map_files.write_map(folder / 'map', patch)
-    graph_files.write_geojson(folder / 'topology.geojson', pipeline.topology.map)
-    release_compiler_pages()  # before matplotlib comes on top of them
-    figures.summary_figure(folder / 'summary.png', patch, pipeline.topology.map, poses, title=title)
-    report = _report(result, poses, seconds)
-    write_text(folder / 'report.json', json.dumps(report, indent=2) + '\n')
-    return report
+    def step(self, scan: Scan, T_odom_base: Array, estimate: Estimate, pipeline: Pipeline) -> None:
+        """Show what came of a scan with the odometry pose (3,) at its stamp."""
+        ns = scan.stamp_ns
+        view = self._view
+        view.pose(ns, estimate.T_map_base, estimate.covariance)
+        view.scan(ns, scan)
+        if self._T_map_odom is None:
+            self._T_map_odom = estimate.T_map_odom
+        # Odometry as if it had been all there is since the first pose.
+        view.trail(ns, 'odometry', se2.compose(self._T_map_odom, T_odom_base))
+        sigma_m = float(np.sqrt(max(np.linalg.eigvalsh(estimate.covariance[:2, :2])[-1], 0.0)))
+        view.number(ns, 'error', '2 sigma, cm', 200.0 * sigma_m)
+        for curve, count in (
+            ('features', estimate.n_features),
+            ('local features', estimate.n_local),
+            ('matched lines', estimate.matched),
+        ):
+            view.number(ns, 'count', curve, float(count))
+        for stage, curve in _STAGES.items():
+            view.number(ns, 'step', curve, 1000.0 * pipeline.stage_seconds[stage][-1])
+        if self._drawn_ns is None or abs(ns - self._drawn_ns) >= _PERIOD_NS:
+            self.last(ns, pipeline)
 
-
-def _report(result: Replay, poses: Array, seconds: tuple[float, float]) -> dict[str, Any]:
-    stages = {name: np.array(taken) for name, taken in result.pipeline.stage_seconds.items()}
-    rebuilds = stages.pop('rebuild', np.zeros(0))
-    stages['all'] = np.sum(list(stages.values()), axis=0)
-    return {
-        'scans': len(poses),
-        'skipped': result.skipped,
-        'first_skipped': result.first_skipped,
-        'wall_s': round(seconds[0], 3),
-        'cpu_s': round(seconds[1], 3),
-        'peak_mb': round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
-        'loops_closed': result.pipeline.corrections,
-        'rebuild_ms': round(1000.0 * float(rebuilds.max(initial=0.0)), 1),
-        'ms_per_scan': {name: _spread(1000.0 * taken) for name, taken in stages.items()},
-        'features': len(line_features(result.pipeline.localizer)),
-        'features_local_median': float(np.median(result.local_features)),
-        'refused': result.pipeline.localizer.refused,
-        'distance': round(float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum()), 3),
-        'nodes': len(result.pipeline.topology.map.nodes),
-        'edges': len(result.pipeline.topology.map.edges),
-    }
-
-
-def _spread(milliseconds: Array) -> dict[str, float]:
-    return {
-        'median': round(float(np.median(milliseconds)), 3),
-        'p95': round(float(np.percentile(milliseconds, 95)), 3),
-        'max': round(float(milliseconds.max()), 3),
-    }
+    def last(self, ns: int, pipeline: Pipeline) -> None:
+        """Show map, graph and features as they are now."""
+        self._drawn_ns = ns
+        view = self._view
+        topology = pipeline.topology.map
+        view.grid(ns, pipeline.grid.patch())
+        view.topology(ns, topology)
+        view.number(ns, 'count', 'nodes', float(len(topology.nodes)))
+        features = line_features(pipeline.localizer)
+        ends = np.array([[feature.start, feature.end] for feature in features]).reshape(-1, 2, 2)
+        view.lines(ns, ends, np.array([feature.local for feature in features], dtype=bool))
+        near = {node for feature in features if feature.local for node in feature.nodes}
+        places = [topology.nodes[node].position for node in sorted(near & topology.nodes.keys())]
+        view.local_area(ns, np.array(places).reshape(-1, 2))
 
 
 def _work(arguments: argparse.Namespace) -> None:
@@ -158,8 +113,11 @@ def _play(arguments: argparse.Namespace, shown: ReplayView | None) -> None:
         localizer=cli.config_from(arguments, ScanLocalizerConfig),
         grid=cli.config_from(arguments, OccupancyConfig),
     )
-    wall, cpu = time.perf_counter(), time.process_time()
-    result = replay(cli.open_log(arguments), config, show_progress=not arguments.quiet, shown=shown)
+    wall = time.perf_counter()
+    cpu = time.process_time()
+    result = replay(
+        cli.open_log(arguments), config, show_progress=not arguments.quiet, watcher=shown
+    )
     seconds = (time.perf_counter() - wall, time.process_time() - cpu)
     title = f'{arguments.log.name}: {len(result.poses)} scans'
     report = write_outputs(result, arguments.out, title, seconds)

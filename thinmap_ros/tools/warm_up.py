@@ -2,12 +2,14 @@
 
 import argparse
 
-from thinmap_ros import warm_up
-from thinmap_ros.adapters import resources
-from thinmap_ros.adapters.world_files import read_world
+from thinmap_ros.closed_loop import Options
 from thinmap_ros.core import kernel_cache
+from thinmap_ros.evaluation.exploration_run import explore
+from thinmap_ros.files import package_data
+from thinmap_ros.files.worlds import read_world
+from thinmap_ros.kernels import warm_up
 from thinmap_ros.sim.world import World
-from thinmap_ros.tools import cli, explore_world
+from thinmap_ros.tools import cli
 
 _REHEARSALS = (
     warm_up.localizer,
@@ -28,9 +30,9 @@ def work(arguments: argparse.Namespace) -> None:
     """Rehearse every algorithm, and an exploration in the simulator."""
     for rehearse in _REHEARSALS:
         rehearse()
-    world = World.from_patch(*read_world(resources.world_path('office')))
+    world = World.from_patch(*read_world(package_data.world_path('office')))
     # What is needed only where there are several places to go to is reached by a whole exploration.
-    explore_world.explore(world, world.start, explore_world.Options(localization='slam'))
+    explore(world, world.start, Options(localization='slam'))
     kept = kernel_cache.folder()
     print(
         f'all kernels are compiled, and kept in {kept}' if kept else 'there is no folder for them'

@@ -110,7 +110,8 @@ class _Feedback:
 
     def release(self) -> None:
         """Say what was held back, and hold back no more."""
-        held, self._held = self._held or [], None
+        held = self._held or []
+        self._held = None
         for message in held:
             self.hear(message)
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from slam_room import BLIND, ROOM, drive, scan_in
+from support.slam_room import BLIND, ROOM, drive, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.ekf_slam.association import AssociationConfig, associate, mahalanobis
@@ -13,7 +13,7 @@ from thinmap_ros.core.ekf_slam.ekf import EkfSlam
 from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
 from thinmap_ros.core.ekf_slam.feature_map import FeatureConfig, FeatureMap
 from thinmap_ros.core.ekf_slam.features import Feature
-from thinmap_ros.core.ekf_slam.lines import LineConfig, Lines, extract_lines
+from thinmap_ros.core.ekf_slam.line_extraction import LineConfig, Lines, extract_lines
 
 R = np.diag([0.02**2, 0.01**2])
 SURE = 1e-8 * np.eye(3)
@@ -71,7 +71,8 @@ def test_collinear_walls_of_two_rooms_are_two():
 
 
 def test_pieces_of_a_wall_beside_a_door_are_one_feature():
-    left, right = [[2, 1], [2, 3]], [[2, -3], [2, 0]]
+    left = [[2, 1], [2, 3]]
+    right = [[2, -3], [2, 0]]
     gap_m = AssociationConfig().gap_m
     assert chosen([left], [right], gap_m) == [0]
     assert chosen([left], [[[2.0, -3.0], [2.0, 0.9 - gap_m]]], gap_m) == [-1]
@@ -143,7 +144,8 @@ def test_a_feature_enters_after_several_sightings_and_keeps_its_id():
 def test_what_was_seen_once_and_then_no_more_is_forgotten():
     ekf = CompressedEkf(np.zeros(3), SURE)
     features = FeatureMap(FeatureConfig(sightings=2, patience=3), local_areas=False)
-    passer_by, wall = seen_lines([[1.0, -0.5], [1.0, 0.5]]), seen_lines([[4.0, -1.0], [4.0, 1.0]])
+    passer_by = seen_lines([[1.0, -0.5], [1.0, 0.5]])
+    wall = seen_lines([[4.0, -1.0], [4.0, 1.0]])
     features.observe(ekf, passer_by, BLIND)
     for _ in range(5):
         features.observe(ekf, wall, BLIND)
@@ -204,7 +206,8 @@ def test_features_follow_the_filter_not_the_robot():
 
 
 def test_a_door_that_opens_leaves_the_map_and_a_wall_behind_a_person_does_not():
-    door, far = [[2.0, -1.0], [2.0, 1.0]], [[5.0, -3.0], [5.0, 3.0]]
+    door = [[2.0, -1.0], [2.0, 1.0]]
+    far = [[5.0, -3.0], [5.0, 3.0]]
     ekf, features = known([door])
     person = np.array([[1.0, -0.8, 1.0, 0.8], [*far[0], *far[1]]])
     for _ in range(10):

@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from slam_room import BLIND
+from support.slam_room import BLIND
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
 from thinmap_ros.core.ekf_slam.feature_map import FeatureConfig, FeatureMap
-from thinmap_ros.core.ekf_slam.lines import Lines
+from thinmap_ros.core.ekf_slam.line_extraction import Lines
 from thinmap_ros.core.ekf_slam.models import observe_line
 
 FEATURES = FeatureConfig()
@@ -47,7 +47,8 @@ def look(rng, truth):
     off = se2.transform_points(se2.invert(truth), middles)
     seen = np.flatnonzero((np.hypot(*off.T) < RANGE_M) & (off[:, 0] > -0.5))
     z = np.array([observe_line(truth, TRUE_LINES[i])[0] for i in seen]).reshape(-1, 2)
-    seen, z = seen[z[:, 0] > 0.3], z[z[:, 0] > 0.3]
+    seen = seen[z[:, 0] > 0.3]
+    z = z[z[:, 0] > 0.3]
     ends = np.array([se2.transform_points(se2.invert(truth), WALLS[i]) for i in seen])
     ends = ends.reshape(-1, 2, 2)
     lengths = np.hypot(*(ends[:, 1] - ends[:, 0]).T)
@@ -61,7 +62,8 @@ def nees_of_a_run(seed, local_areas, looks):
     rng = np.random.default_rng(seed)
     truth = np.array([2.0, 5.0, 0.0])
     ekf = CompressedEkf(truth, 1e-8 * np.eye(3))
-    features, found = FeatureMap(FEATURES, local_areas), []
+    features = FeatureMap(FEATURES, local_areas)
+    found = []
     for step in range(looks):
         turning = step % 120 >= 110
         increment = np.array([0.0 if turning else 0.3, 0.0, math.pi / 10.0 if turning else 0.0])

@@ -2,19 +2,21 @@
 
 import numpy as np
 import pytest
-from dense_filter import DenseFilter
+from reference_filter import DenseFilter
 
 from thinmap_ros.core.ekf_slam.ekf import EkfSlam
 from thinmap_ros.core.ekf_slam.models import observe_line
 from thinmap_ros.core.se2 import compose
 
-P0, Q = np.diag([0.01, 0.02, 0.003]), np.diag([1e-4, 5e-5, 4e-5])
+P0 = np.diag([0.01, 0.02, 0.003])
+Q = np.diag([1e-4, 5e-5, 4e-5])
 R = np.array([[4e-4, 1e-5], [1e-5, 1e-4]])
 
 
 def both(rng, features):
     pose = np.array([1.0, -2.0, 0.4])
-    fast, plain = EkfSlam(pose, P0), DenseFilter(pose, P0)
+    fast = EkfSlam(pose, P0)
+    plain = DenseFilter(pose, P0)
     for _ in range(features):
         seen = np.array([rng.uniform(0.5, 8.0), rng.uniform(-3.1, 3.1)])
         fast.add(seen, R)
@@ -91,7 +93,8 @@ def test_more_looks_make_no_line_less_sure(rng):
 def test_one_wall_in_two_forms_is_tied_to_itself():
     """A wall through the origin may be noted as (r, alpha) or as (-r, alpha + pi)."""
     pose = np.array([1.0, 0.0, 0.0])
-    fast, plain = EkfSlam(pose, P0), DenseFilter(pose, P0)
+    fast = EkfSlam(pose, P0)
+    plain = DenseFilter(pose, P0)
     for filter_ in (fast, plain):
         filter_.add(np.array([0.99, np.pi]), R)
         filter_.add(np.array([1.02, np.pi]), R)
@@ -113,7 +116,8 @@ def test_a_pose_that_is_set_has_nothing_to_do_with_the_features(rng):
 @pytest.mark.parametrize('bad', [np.nan, np.inf])
 def test_an_update_with_nonsense_changes_nothing(rng, bad):
     fast, _ = both(rng, 3)
-    pose, P = fast.pose, fast.covariance
+    pose = fast.pose
+    P = fast.covariance
     assert not fast.update(np.array([0]), np.array([[bad, 0.0]]), R[None])
     assert not fast.update(np.array([1]), np.array([[1.0, 0.0]]), np.full((1, 2, 2), bad))
     assert not fast.update(np.array([1]), np.array([[1.0, 0.0]]), -100.0 * np.eye(2)[None])

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from slam_room import ROOM, drive, scan_in
+from support.slam_room import ROOM, drive, scan_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.ekf_slam.localizer import EkfConfig, EkfLocalizer
+from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig, EkfLocalizer
 from thinmap_ros.core.errors import ConfigError, InputError
 from thinmap_ros.core.odometry import LastPose
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from dense_filter import DenseFilter
+from reference_filter import DenseFilter
 
 from thinmap_ros.core.ekf_slam.ekf import EkfSlam
 from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
@@ -12,7 +12,8 @@ from thinmap_ros.core.ekf_slam.models import observe_line
 from thinmap_ros.core.se2 import compose
 
 STATUS = Path('/proc/self/status')
-P0, Q = np.diag([0.01, 0.02, 0.003]), np.diag([1e-4, 5e-5, 4e-5])
+P0 = np.diag([0.01, 0.02, 0.003])
+Q = np.diag([1e-4, 5e-5, 4e-5])
 R = np.array([[4e-4, 1e-5], [1e-5, 1e-4]])
 
 
@@ -129,7 +130,8 @@ def test_what_is_told_of_features_outside_the_area(rng):
     run(pair, rng, 60, 10, 30)
     ids = pair.local.ids
     pair.local.enter(ids[:3])
-    lines, covariances = pair.local.lines(), pair.local.line_covariances()
+    lines = pair.local.lines()
+    covariances = pair.local.line_covariances()
     at = [pair.ids.index(i) for i in ids]
     np.testing.assert_allclose([lines[i] for i in ids], pair.whole.lines[at], atol=1e-9)
     np.testing.assert_allclose(
@@ -152,7 +154,8 @@ def test_steps_touch_the_local_area_only(rng):
 )
 def test_some_hundred_features_take_little_memory(rng):
     """Their covariance is 2 MB; the store has room for far more, which must not count."""
-    before, ekf = held_mb(), CompressedEkf(np.array([1.0, -2.0, 0.4]), P0)
+    before = held_mb()
+    ekf = CompressedEkf(np.array([1.0, -2.0, 0.4]), P0)
     for feature_id in range(250):
         ekf.add(feature_id, new_line(rng), R)
     ekf.enter([0, 1])

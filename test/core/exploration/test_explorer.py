@@ -9,19 +9,19 @@ import pytest
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.exploration.decision import FIRST_STAND_IN_ID, Decision, FinishCode
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
+from thinmap_ros.core.exploration.strategy import FIRST_STAND_IN_ID, Decision, FinishCode
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.core.topology.graph import TopologicalMap
-from thinmap_ros.core.topology.update import TopologyBuilder
 from thinmap_ros.sim.coverage import coverable
-from thinmap_ros.sim.lms200 import Lms200Config
-from thinmap_ros.sim.pioneer import PRESETS
-from thinmap_ros.sim.runner import Simulation
+from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.robot import PRESETS
+from thinmap_ros.sim.simulation import Simulation
 from thinmap_ros.sim.world import World
 
 START = np.array([1.0, 1.0, 0.0])
@@ -30,7 +30,8 @@ START = np.array([1.0, 1.0, 0.0])
 def world_of(walls=(), size=(60, 60)):
     """A walled floor, 0.1 m a cell, with inner walls given as (rows, cols) slices."""
     cells = np.zeros(size, dtype=np.uint8)
-    cells[[0, -1]], cells[:, [0, -1]] = 1, 1
+    cells[[0, -1]] = 1
+    cells[:, [0, -1]] = 1
     for rows, cols in walls:
         cells[rows, cols] = 1
     return World('floor', cells, GridFrame(0.0, 0.0, 0.1), START)
@@ -45,9 +46,11 @@ class Run:
     """An exploration with known poses; fails(decision): which targets the navigator refuses."""
 
     def __init__(self, world, config=None, seed=1, fails=None, start=START):
-        self.world, self.fails = world, fails or (lambda decision: False)
+        self.world = world
+        self.fails = fails or (lambda decision: False)
         self.simulation = Simulation(world, start, PRESETS['2dx'], Lms200Config(), seed)
-        self.grid, self.topology = OccupancyGrid(), TopologyBuilder()
+        self.grid = OccupancyGrid()
+        self.topology = TopologyBuilder()
         self.explorer = Explorer(config)
         self.navigator = Navigator(NavigatorConfig(max_speed_m_s=0.5))
         self.decisions: list[Decision] = []
@@ -148,7 +151,8 @@ def test_it_decides_the_same_every_time():
 def comb(doors=45):
     """A corridor from which many openings lead into the unknown."""
     cells = np.full((60, 30 + 20 * doors), -1, dtype=np.int8)
-    cells[[9, 50], :], cells[10:50, :] = 100, 0
+    cells[[9, 50], :] = 100
+    cells[10:50, :] = 0
     cells[10:50, [0, -1]] = 100
     for door in range(doors):
         cells[50, 20 + 20 * door : 30 + 20 * door] = 0
@@ -201,7 +205,8 @@ def test_an_exploration_goes_on_from_its_state_as_if_it_had_not_been_interrupted
     run = Run(two_rooms()).go(8.0)
     state = {key: array.copy() for key, array in run.explorer.state().items()}
     again = Explorer.from_state(state)
-    before, after = run.explorer.surveyor, again.surveyor
+    before = run.explorer.surveyor
+    after = again.surveyor
     assert {
         i: (t.probability, t.distances_m, t.angle_span_deg)
         for i, t in before.tracker.tracks.items()
@@ -236,7 +241,8 @@ def test_the_literal_scheme_stops_by_itself_too():
 def hall_with_pockets(size=(160, 300)):
     """A free hall; 30 unknown pockets near the robot, two side by side at its far end (slices)."""
     cells = np.zeros(size, dtype=np.int8)
-    cells[[0, -1]], cells[:, [0, -1]] = 100, 100
+    cells[[0, -1]] = 100
+    cells[:, [0, -1]] = 100
     near = [
         (slice(row, row + 6), slice(col, col + 6))
         for row in range(20, 150, 25)
@@ -250,7 +256,8 @@ def hall_with_pockets(size=(160, 300)):
 
 def test_the_successor_of_a_target_may_lie_farther_off_than_all_that_is_toured():
     cells, far = hall_with_pockets()
-    explorer, pose = Explorer(), se2.pose(10.0, 8.2, 0.0)
+    explorer = Explorer()
+    pose = se2.pose(10.0, 8.2, 0.0)
 
     def step(seconds):
         nothing = Scan.create(

@@ -72,7 +72,8 @@ def test_update_is_bayes_rule(p, value):
 
 @given(shares, st.lists(shares, max_size=3))
 def test_the_order_of_looks_does_not_matter(p, values):
-    one, other = p, p
+    one = p
+    other = p
     for value in values:
         one = bayes_update(one, value)
     for value in reversed(values):

@@ -25,7 +25,8 @@ def test_tours_are_as_good_as_the_best_of_all_orders_or_nearly(count, weight):
     rng = np.random.default_rng(count)
     for _ in range(10):
         points = 20.0 * rng.random((count, 2))
-        ways, between = np.hypot(*points.T), between_of(points)
+        ways = np.hypot(*points.T)
+        between = between_of(points)
         found = tours_by_first(ways, between, np.full(count, weight), 10.0)
         for first in range(count):
             orders = [order for order in itertools.permutations(range(count)) if order[0] == first]
@@ -45,6 +46,7 @@ def test_a_place_that_would_have_to_be_come_back_to_comes_first():
 def test_waiting_makes_near_places_come_first():
     # Out to a far place and back past a near one is as long as the other way round.
     points = np.array([[1.0, 0.0], [10.0, 0.0], [-8.0, 0.0]])
-    between, ways = between_of(points), np.abs(points[:, 0])
+    between = between_of(points)
+    ways = np.abs(points[:, 0])
     assert int(tours_by_first(ways, between, np.zeros(3), 0.0).argmin()) == 2
     assert int(tours_by_first(ways, between, np.ones(3), 30.0).argmin()) == 0

@@ -5,13 +5,13 @@ import pytest
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.mirror import MapMirror
+from thinmap_ros.core.grid.map_mirror import MapMirror
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.tiles import TILE
 from thinmap_ros.core.odometry import OdometryBuffer
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.slam.local_map import LocalMap
+from thinmap_ros.core.slam.matching.local_map import LocalMap
 
 
 def scan_of(ranges, mount=(0.0, 0.0, 0.0)):

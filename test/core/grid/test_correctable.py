@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from slam_room import corridor_ring, scan_in
+from support.slam_room import corridor_ring, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid import rerendering
@@ -97,10 +97,12 @@ def run(seed, times, in_one_go):
 @settings(max_examples=12, deadline=None)
 @given(st.integers(0, 10**6), st.sets(st.integers(1, 199), min_size=1, max_size=4))
 def test_in_the_end_slices_give_what_rendering_in_one_go_gives(seed, times):
-    sliced, at_once = run(seed, times, False), run(seed, times, True)
+    sliced = run(seed, times, False)
+    at_once = run(seed, times, True)
     assert len(at_once.moved) == len(times) and 1 <= len(sliced.moved) <= len(times)
     assert sliced.map.corrected_ns == at_once.map.corrected_ns == max(times)
-    one, other = sliced.map.shown.patch(), at_once.map.shown.patch()
+    one = sliced.map.shown.patch()
+    other = at_once.map.shown.patch()
     assert one.frame == other.frame
     np.testing.assert_array_equal(one.cells, other.cells)
 
@@ -130,7 +132,8 @@ def tiles_of(grid):
 
 @pytest.mark.usefixtures('small_slices')
 def test_each_tile_shows_the_old_rendering_until_its_new_one_is_complete_near_ones_first():
-    grid, whole = drifted_map(250), drifted_map(250)
+    grid = drifted_map(250)
+    whole = drifted_map(250)
     old = tiles_of(grid.shown)
     stamps = np.arange(250)
     for each in (grid, whole):
@@ -249,18 +252,23 @@ def test_a_grid_whose_scans_are_not_known_stays_as_it_is():
 
 
 def test_tiles_hold_the_sum_of_grids_within_the_limits():
-    one, other, total = OccupancyGrid(), OccupancyGrid(), OccupancyGrid()
+    one = OccupancyGrid()
+    other = OccupancyGrid()
+    total = OccupancyGrid()
     for k in range(6):
         one.update(SCANS[0], TRUE[0])
         if k % 2:
             other.update(SCANS[20], TRUE[20])
     places = np.unique(np.vstack([one.tiles(), other.tiles()]), axis=0)
     total.set_tiles(places, one, other)
-    single, added, both = tiles_of(one), tiles_of(other), tiles_of(total)
+    single = tiles_of(one)
+    added = tiles_of(other)
+    both = tiles_of(total)
     nothing = np.zeros((TILE, TILE), dtype=np.int16)
     low, high = (round(1000 * log_odds(p)) for p in (one.config.p_lowest, one.config.p_highest))
     for place in map(tuple, places.tolist()):
-        a, b = single.get(place, nothing), added.get(place, nothing)
+        a = single.get(place, nothing)
+        b = added.get(place, nothing)
         known = (a != 0) | (b != 0)
         np.testing.assert_array_equal(both[place] != 0, known)
         expected = np.clip(a + b, low, high)

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from plain_grid import PlainGrid
+from reference_grid import PlainGrid
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, log_odds
@@ -34,7 +34,8 @@ def percent(grid, x, y):
 
 def reference(scan, T, config):
     """Cells passed and hit by fine sampling of beams: slow, obvious, blind only at cell corners."""
-    passed, hit = set(), set()
+    passed = set()
+    hit = set()
     ranges = np.where(scan.hit, scan.ranges_m + config.surface_depth_m, scan.ranges_m)
     for r, angle in zip(ranges, scan.angles_rad + T[2], strict=True):
         reach = min(r, config.usable_range_m) if r < scan.range_max_m else config.no_return_range_m
@@ -194,7 +195,8 @@ def test_beams_that_graze_a_wall_do_not_erase_it():
 
 
 def test_a_wall_on_the_border_of_two_cells_leaves_the_one_in_front_free():
-    grid, rng = OccupancyGrid(), np.random.default_rng(4)
+    grid = OccupancyGrid()
+    rng = np.random.default_rng(4)
     bearings = np.radians(np.arange(-90.0, 91.0))
     for _ in range(30):
         # A wall along x = 2.0, seen with 1 cm of noise.
@@ -247,7 +249,9 @@ def drive_through_clutter(seed, scans=25):
     """Scans on a curve among posts and walls, some beams lost, spoilt or without return."""
     rng = np.random.default_rng(seed)
     world = np.zeros((600, 600), dtype=np.uint8)
-    world[[0, -1]], world[:, [0, -1]], world[300:305, 100:420] = 1, 1, 1
+    world[[0, -1]] = 1
+    world[:, [0, -1]] = 1
+    world[300:305, 100:420] = 1
     for row, col in rng.integers(0, 580, (25, 2)):
         world[row : row + 8, col : col + 8] = 1
     T = pose(4.0, 4.0, 0.3)
@@ -286,7 +290,8 @@ def known_cells(grid):
     ],
 )
 def test_all_cells_are_those_of_the_plain_grid_bit_for_bit(seed, config):
-    grid, plain = OccupancyGrid(config), PlainGrid(config)
+    grid = OccupancyGrid(config)
+    plain = PlainGrid(config)
     for scan, T in drive_through_clutter(seed):
         # The way back, too: into columns and rows that are negative.
         for at in (T, np.array([-T[0], -T[1], T[2] + math.pi])):

@@ -5,20 +5,24 @@ import math
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from plain_grid import crossed
+from reference_grid import crossed
 
 from thinmap_ros.core.grid.raytrace import cast_rays, fill_segment, line_is_clear
 
 
 def room(rows=40, cols=60):
     occupied = np.zeros((rows, cols), dtype=np.uint8)
-    occupied[0], occupied[-1], occupied[:, 0], occupied[:, -1] = 1, 1, 1, 1
+    occupied[0] = 1
+    occupied[-1] = 1
+    occupied[:, 0] = 1
+    occupied[:, -1] = 1
     return occupied
 
 
 def distance_to_box(x, y, angle, left, bottom, right, top):
     """Where a ray from inside a box meets its border: the plain formula."""
-    cos, sin = math.cos(angle), math.sin(angle)
+    cos = math.cos(angle)
+    sin = math.sin(angle)
     along_x = (right - x) / cos if cos > 0 else (left - x) / cos if cos < 0 else math.inf
     along_y = (top - y) / sin if sin > 0 else (bottom - y) / sin if sin < 0 else math.inf
     return min(along_x, along_y)

@@ -8,7 +8,7 @@ import pytest
 
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.planning.grid_search import WayTable, coarse, field_from, ways_from
-from thinmap_ros.core.planning.reach import reached_from
+from thinmap_ros.core.planning.traversability import reached_from
 
 
 def dijkstra(allowed, start):
@@ -19,7 +19,8 @@ def dijkstra(allowed, start):
         if now > steps[row, col]:
             continue
         for dr, dc in [(dr, dc) for dr in (-1, 0, 1) for dc in (-1, 0, 1) if dr or dc]:
-            r, c = row + dr, col + dc
+            r = row + dr
+            c = col + dc
             inside = 0 <= r < allowed.shape[0] and 0 <= c < allowed.shape[1]
             if inside and allowed[r, c] and allowed[r, col] and allowed[row, c]:
                 reached = now + (7 if dr and dc else 5)
@@ -76,14 +77,16 @@ def test_a_coarse_square_is_set_where_any_of_its_cells_is():
 
 def test_a_table_of_ways_stays_true_while_the_map_grows_to_all_sides():
     table = WayTable(0.2, 1e9, 2)
-    frame, allowed = GridFrame(0.3, -0.5, 0.1), np.ones((60, 80), dtype=np.bool_)
+    frame = GridFrame(0.3, -0.5, 0.1)
+    allowed = np.ones((60, 80), dtype=np.bool_)
     allowed[28:33, :70] = False
     places = np.array([[1.05, 1.05], [1.05, 4.05], [7.05, 1.05], [7.95, 4.95]])
     first = table.update(allowed, np.zeros_like(allowed), frame, places, 0)
     assert np.allclose(first, first.T)
     assert first[0, 1] > 12.0
     grown = np.pad(allowed, ((3, 5), (7, 2)))
-    nothing, moved = np.zeros_like(grown), frame.shifted(-3, -7)
+    nothing = np.zeros_like(grown)
+    moved = frame.shifted(-3, -7)
     fresh = WayTable(0.2, 1e9, 2).update(grown, nothing, moved, places, 0)
     assert np.allclose(table.update(grown, nothing, moved, places, 5), first)
     assert np.abs(fresh - first).max() < 0.7
@@ -91,7 +94,8 @@ def test_a_table_of_ways_stays_true_while_the_map_grows_to_all_sides():
 
 def test_a_way_is_found_anew_once_it_is_old():
     table = WayTable(0.2, 10.0, 2)
-    allowed, frame = np.ones((60, 60), dtype=np.bool_), GridFrame(0.0, 0.0, 0.1)
+    allowed = np.ones((60, 60), dtype=np.bool_)
+    frame = GridFrame(0.0, 0.0, 0.1)
     allowed[28:33, 4:] = False
     places = np.array([[5.0, 1.0], [5.0, 5.0]])
     before = table.update(allowed, np.zeros_like(allowed), frame, places, 0)[0, 1]

@@ -17,7 +17,8 @@ DT = 0.1
 
 def room(rows=60, cols=80):
     cells = np.zeros((rows, cols), dtype=np.int8)
-    cells[[0, -1]], cells[:, [0, -1]] = 100, 100
+    cells[[0, -1]] = 100
+    cells[:, [0, -1]] = 100
     return cells
 
 
@@ -26,10 +27,13 @@ class Ride:
 
     def __init__(self, world, start, known=None, config=None, noise=None):
         self.noise = noise
-        self.world, self.pose = world, np.array(start, dtype=np.float64)
+        self.world = world
+        self.pose = np.array(start, dtype=np.float64)
         self.patch = GridPatch(GridFrame(0.0, 0.0, 0.1), world if known is None else known)
         self.navigator = Navigator(config or NavigatorConfig())
-        self.nearest_m, self.commands, self.seconds = math.inf, [], 0.0
+        self.nearest_m = math.inf
+        self.commands = []
+        self.seconds = 0.0
 
     def scan(self):
         angles = np.radians(np.arange(-90.0, 91.0))
@@ -44,7 +48,8 @@ class Ride:
 
     def step(self):
         command = self.navigator.step(self.pose, self.patch, self.scan(), DT)
-        v, w = command.v, command.w
+        v = command.v
+        w = command.w
         self.pose = se2.compose(
             self.pose,
             se2.pose(v * DT * math.cos(w * DT / 2), v * DT * math.sin(w * DT / 2), w * DT),
@@ -113,13 +118,16 @@ def test_it_stops_in_front_of_what_only_the_laser_knows_and_goes_around_it():
 def gap_of(cells):
     """A room with a wall across, and a gap in it."""
     world = room()
-    world[: 30 - cells // 2, 40:43], world[30 + cells - cells // 2 :, 40:43] = 100, 100
+    world[: 30 - cells // 2, 40:43] = 100
+    world[30 + cells - cells // 2 :, 40:43] = 100
     return world
 
 
 def rides_to_and_fro(ride, seconds):
     """How often a robot crosses to the other side in that time, how near it comes to walls, m."""
-    corners, nearest, crossings = np.argwhere(ride.world == 100)[:, ::-1] * 0.1, math.inf, 0
+    corners = np.argwhere(ride.world == 100)[:, ::-1] * 0.1
+    nearest = math.inf
+    crossings = 0
     sides = itertools.cycle([(7.0, 3.05), (1.0, 3.05)])
     goal = next(sides)
     ride.navigator.set_goal(*goal)
@@ -166,7 +174,8 @@ def test_a_path_that_the_map_shows_to_be_blocked_is_planned_anew():
     assert ride.navigator.path[:, 1].max() < 3.3
     changed = room()
     changed[10:45, 40] = 100
-    ride.world, ride.patch = changed, GridPatch(ride.patch.frame, changed)
+    ride.world = changed
+    ride.patch = GridPatch(ride.patch.frame, changed)
     ride.step()
     crossing = ride.navigator.path[np.abs(ride.navigator.path[:, 0] - 4.05) < 0.1]
     assert (crossing[:, 1] > 4.6).all() or (crossing[:, 1] < 0.9).all()
@@ -204,7 +213,8 @@ def test_speed_is_kept_low_enough_to_stop_before_what_stands_ahead():
 
 @pytest.mark.parametrize('dt_s', [0.01, 0.02, 0.05, 0.1, 0.2])
 def test_it_sets_out_in_free_space_however_often_it_is_asked(dt_s):
-    navigator, patch = Navigator(), GridPatch(GridFrame(0.0, 0.0, 0.1), room())
+    navigator = Navigator()
+    patch = GridPatch(GridFrame(0.0, 0.0, 0.1), room())
     scan = Scan.create(0, np.full(181, 3.0), -math.pi / 2, math.pi / 180, 0.02, 8.0)
     navigator.set_goal(6.0, 3.0)
     commands = [navigator.step(np.array([2.0, 3.0, 0.0]), patch, scan, dt_s) for _ in range(100)]
@@ -213,7 +223,8 @@ def test_it_sets_out_in_free_space_however_often_it_is_asked(dt_s):
 
 
 def test_it_remembers_what_is_beside_it_where_the_laser_does_not_look():
-    navigator, patch = Navigator(), GridPatch(GridFrame(0.0, 0.0, 0.1), room())
+    navigator = Navigator()
+    patch = GridPatch(GridFrame(0.0, 0.0, 0.1), room())
 
     def look(pose, ranges, stamp):
         scan = Scan.create(stamp, ranges, -math.pi / 2, math.pi / 180, 0.02, 8.0)

@@ -10,9 +10,9 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
-from thinmap_ros.sim.lms200 import Lms200Config
-from thinmap_ros.sim.pioneer import PRESETS
-from thinmap_ros.sim.runner import Simulation
+from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.robot import PRESETS
+from thinmap_ros.sim.simulation import Simulation
 from thinmap_ros.sim.world import World
 
 FRAME = GridFrame(0.0, 0.0, 0.1)
@@ -20,7 +20,8 @@ FRAME = GridFrame(0.0, 0.0, 0.1)
 
 def pillars(rng):
     cells = np.zeros((70, 70), dtype=np.uint8)
-    cells[[0, -1]], cells[:, [0, -1]] = 1, 1
+    cells[[0, -1]] = 1
+    cells[:, [0, -1]] = 1
     for row, col in rng.integers(2, 66, (16, 2)):
         height, width = rng.integers(1, 9, 2)
         cells[row : row + height, col : col + width] = 1
@@ -49,7 +50,10 @@ def rove(seed, speed, knows_pillars, seconds=40.0):
     )
     patch = GridPatch(FRAME, np.where(known, 100, 0).astype(np.int8))
     navigator = Navigator(NavigatorConfig(max_speed_m_s=speed))
-    moment, scan, until, way_m = robot.sense(), None, 0.0, 0.0
+    moment = robot.sense()
+    scan = None
+    until = 0.0
+    way_m = 0.0
     while moment.stamp_ns < seconds * 1e9:
         scan = moment.scan or scan
         if moment.stamp_ns >= until * 1e9:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.reach import nearest_true
+from thinmap_ros.core.planning.traversability import nearest_true
 from thinmap_ros.core.planning.wavefront import (
     WavefrontConfig,
     cost_of_cells,
@@ -32,7 +32,8 @@ def patch_of(drawing):
 
 def room(rows, cols):
     cells = np.zeros((rows, cols), dtype=np.int8)
-    cells[[0, -1]], cells[:, [0, -1]] = 100, 100
+    cells[[0, -1]] = 100
+    cells[:, [0, -1]] = 100
     return cells
 
 
@@ -43,7 +44,8 @@ def patch(cells):
 def reference(cost, goal):
     """The same upwind equation, cell by cell with Python's heap."""
     rows, cols = cost.shape
-    field, done = np.full(cost.shape, np.inf), set()
+    field = np.full(cost.shape, np.inf)
+    done = set()
     field[goal] = 0.0
     heap = [(0.0, goal)]
     while heap:
@@ -101,7 +103,8 @@ def test_stopping_at_the_start_leaves_the_way_there_as_it_was():
     rng = np.random.default_rng(5)
     cost = np.where(rng.random((60, 60)) < 0.2, np.inf, 1.0)
     cost[5, 5] = cost[20, 18] = 1.0
-    whole, partial = navigation_function(cost, (5, 5)), navigation_function(cost, (5, 5), (20, 18))
+    whole = navigation_function(cost, (5, 5))
+    partial = navigation_function(cost, (5, 5), (20, 18))
     assert partial[20, 18] == whole[20, 18]
     assert np.isinf(partial).sum() > np.isinf(whole).sum()
 
@@ -141,8 +144,10 @@ def test_no_point_of_a_path_is_nearer_to_an_obstacle_than_the_radius():
 
 def test_where_there_is_room_a_path_keeps_off_the_walls():
     cells = room(40, 100)
-    near, far = WavefrontConfig(keep_weight=0.0), WavefrontConfig(keep_m=1.0, keep_weight=5.0)
-    start, goal = (0.5, 0.5), (9.5, 0.5)
+    near = WavefrontConfig(keep_weight=0.0)
+    far = WavefrontConfig(keep_m=1.0, keep_weight=5.0)
+    start = (0.5, 0.5)
+    goal = (9.5, 0.5)
     middle = [np.median(plan(patch(cells), start, goal, config)[:, 1]) for config in (near, far)]
     assert middle[0] == pytest.approx(0.5, abs=0.1)
     assert middle[1] > 0.9

@@ -8,17 +8,23 @@ from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
 
 # A metre is told as 1.04 m and 0.03 rad too much of turn, a radian is told as 1.05, the laser sits
 # 1.5 deg askew.
-SCALE, DRIFT, TURN_SCALE, ASKEW = 1.04, 0.03, 1.05, 0.026
+SCALE = 1.04
+DRIFT = 0.03
+TURN_SCALE = 1.05
+ASKEW = 0.026
 NOISE = np.full(2, 2.5e-7)  # of a step's wheels
 KNOWN = np.diag([1e6, 1e6, 1e6])  # what the map says of where it ends
 
 
 def driven(steps, seed=0, backwards=False):
     """Poses, and increments that wheels with these errors and a little noise tell."""
-    rng, T = np.random.default_rng(seed), np.zeros(3)
+    rng = np.random.default_rng(seed)
+    T = np.zeros(3)
     for k in range(steps):
-        way, turn = (-0.1 if backwards else 0.1), 0.2 * np.sin(k / 7.0) * (k % 40 > 20)
-        c, s = np.cos(ASKEW + 0.5 * turn), np.sin(ASKEW + 0.5 * turn)
+        way = -0.1 if backwards else 0.1
+        turn = 0.2 * np.sin(k / 7.0) * (k % 40 > 20)
+        c = np.cos(ASKEW + 0.5 * turn)
+        s = np.sin(ASKEW + 0.5 * turn)
         T = se2.compose(T, np.array([way * c, way * s, turn]))
         told_turn = TURN_SCALE * turn + DRIFT * way
         told = np.array([np.cos(0.5 * told_turn), np.sin(0.5 * told_turn)]) * SCALE * way
@@ -27,7 +33,9 @@ def driven(steps, seed=0, backwards=False):
 
 @pytest.mark.parametrize('backwards', [False, True])
 def test_the_systematic_part_is_learned_and_taken_off(backwards):
-    calibration, last, off = OdometryCalibration(), np.zeros(3), []
+    calibration = OdometryCalibration()
+    last = np.zeros(3)
+    off = []
     for T, told in driven(600, backwards=backwards):
         found, _ = calibration.corrected(told, NOISE)
         calibration.follow(T, KNOWN)
@@ -39,7 +47,8 @@ def test_the_systematic_part_is_learned_and_taken_off(backwards):
 
 
 def test_what_is_left_to_know_shrinks_with_the_way():
-    calibration, left = OdometryCalibration(), []
+    calibration = OdometryCalibration()
+    left = []
     for T, told in driven(300):
         left.append(calibration.corrected(told, NOISE)[1])
         calibration.follow(T, KNOWN)
@@ -48,7 +57,8 @@ def test_what_is_left_to_know_shrinks_with_the_way():
 
 
 def test_a_slip_is_not_learned():
-    calibration, known = OdometryCalibration(), []
+    calibration = OdometryCalibration()
+    known = []
     for k, (T, told) in enumerate(driven(300)):
         calibration.corrected(told + [0.5, 0.0, 0.4] if k == 250 else told, NOISE)
         calibration.follow(T, KNOWN)

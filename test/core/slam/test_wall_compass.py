@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from slam_room import ROOM, corridor, scan_in
+from support.slam_room import ROOM, corridor, scan_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.ekf_slam.lines import LineConfig, extract_lines, no_lines
-from thinmap_ros.core.slam.scan_localizer import ScanLocalizer
+from thinmap_ros.core.ekf_slam.line_extraction import LineConfig, extract_lines, no_lines
+from thinmap_ros.core.slam.localizer import ScanLocalizer
 from thinmap_ros.core.slam.wall_compass import WallCompass
 
 PLACES = np.array(

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from drawings import drawn, patch_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
-from topology_drawings import drawn, patch_of
 
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.components import label, reachable
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.free_space import (
     column_distance,
@@ -16,7 +17,6 @@ from thinmap_ros.core.topology.free_space import (
     squared_clearance,
     standing_room,
 )
-from thinmap_ros.core.topology.parts import label, reachable
 
 
 def random_mask(seed):
@@ -71,7 +71,8 @@ def test_unknown_specks_between_beams_are_closed_but_no_larger_hole():
 
 def test_gap_beside_an_obstacle_stays_unknown():
     cells = np.zeros((9, 9))
-    cells[:, 4], cells[:, 5] = 100, -1
+    cells[:, 4] = 100
+    cells[:, 5] = -1
     assert not known_free(patch_of(cells), TopologyConfig()).all(axis=0)[4:6].any()
 
 

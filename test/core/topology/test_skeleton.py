@@ -2,18 +2,20 @@
 
 import numpy as np
 import pytest
+from drawings import drawn, patch_of, place, world
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
-from topology_drawings import drawn, patch_of, place, world
 
 from thinmap_ros.core.grid.raytrace import line_is_clear
+from thinmap_ros.core.topology.builder import build
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.free_space import select_free_space
 from thinmap_ros.core.topology.graph import NodeKind
-from thinmap_ros.core.topology.update import build
 
-E, B, C = NodeKind.END, NodeKind.BRANCH, NodeKind.CORNER
+E = NodeKind.END
+B = NodeKind.BRANCH
+C = NodeKind.CORNER
 CONFIG = TopologyConfig()
 
 
@@ -195,7 +197,8 @@ def test_bumps_of_noise_make_no_spurs():
 
 def test_ends_stand_at_the_rim_of_the_known():
     cells = np.full((60, 160), -1)
-    cells[20:22], cells[40:42] = 100, 100
+    cells[20:22] = 100
+    cells[40:42] = 100
     cells[22:40, 10:120] = 0
     cells[20:42, 8:10] = 100
     cells[22:40, 110:120] = np.where(np.random.default_rng(0).random((18, 10)) < 0.3, -1, 0)
@@ -209,13 +212,18 @@ def random_building(seed):
     rng = np.random.default_rng(seed)
     cells = np.full((90, 120), 100)
     for _ in range(9):
-        row, col = rng.integers(3, 70), rng.integers(3, 90)
+        row = rng.integers(3, 70)
+        col = rng.integers(3, 90)
         cells[row : row + rng.integers(8, 30), col : col + rng.integers(8, 40)] = 0
     for _ in range(rng.integers(0, 12)):
-        row, col = rng.integers(0, 86), rng.integers(0, 116)
+        row = rng.integers(0, 86)
+        col = rng.integers(0, 116)
         value = rng.choice([100, -1])
         cells[row : row + rng.integers(1, 4), col : col + rng.integers(1, 4)] = value
-    cells[:2], cells[-2:], cells[:, :2], cells[:, -2:] = 100, 100, 100, 100
+    cells[:2] = 100
+    cells[-2:] = 100
+    cells[:, :2] = 100
+    cells[:, -2:] = 100
     return patch_of(cells)
 
 

@@ -3,10 +3,10 @@
 import cv2
 import numpy as np
 import pytest
+from drawings import world
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
-from topology_drawings import world
 
 from thinmap_ros.core.topology.thinning import thin
 
@@ -19,9 +19,14 @@ def literal(free: np.ndarray) -> np.ndarray:
         for step in (1, 2):
             doomed = []
             for row, col in np.argwhere(cells):
-                p2, p3, p4 = cells[row - 1, col], cells[row - 1, col + 1], cells[row, col + 1]
-                p5, p6, p7 = cells[row + 1, col + 1], cells[row + 1, col], cells[row + 1, col - 1]
-                p8, p9 = cells[row, col - 1], cells[row - 1, col - 1]
+                p2 = cells[row - 1, col]
+                p3 = cells[row - 1, col + 1]
+                p4 = cells[row, col + 1]
+                p5 = cells[row + 1, col + 1]
+                p6 = cells[row + 1, col]
+                p7 = cells[row + 1, col - 1]
+                p8 = cells[row, col - 1]
+                p9 = cells[row - 1, col - 1]
                 ring = [p2, p3, p4, p5, p6, p7, p8, p9]
                 rises = sum(a == 0 and b == 1 for a, b in zip(ring, [*ring[1:], p2], strict=True))
                 first, second = (

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.ekf_slam.ekf import EkfSlam
 from thinmap_ros.core.ekf_slam.features import Feature, normals_of, sides_of, tangents_of
-from thinmap_ros.core.ekf_slam.lines import Lines
+from thinmap_ros.core.ekf_slam.line_extraction import Lines
 from thinmap_ros.core.se2 import Array, transform_points, wrap
 
 # Only pairs nearer than this are put to the statistical test at all.
@@ -75,7 +75,8 @@ def associate(
             continue
         passing[k] += 1
         if distance <= best[k]:
-            best[k], chosen[k] = distance, index
+            best[k] = distance
+            chosen[k] = index
     return Choice(chosen, passing > 1)
 
 
@@ -91,7 +92,8 @@ def meeting(
     chords = ends_map[:, 1] - ends_map[:, 0]
     rise = np.abs(chords @ normals_of(lines_map).T) / np.maximum(np.hypot(*chords.T), 1e-9)[:, None]
     along = ends_map @ tangents_of(lines_map).T
-    low, high = np.array([f.low for f in features]), np.array([f.high for f in features])
+    low = np.array([f.low for f in features])
+    high = np.array([f.high for f in features])
     gaps = np.maximum(low - along.max(axis=1), along.min(axis=1) - high)
     first_seen_from = np.array([f.seen_from for f in features]).reshape(-1, 2)
     facing = sides_of(lines_map, seen_from) == sides_of(lines_map, first_seen_from)

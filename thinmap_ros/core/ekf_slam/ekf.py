@@ -76,14 +76,16 @@ class EkfSlam:
         n = mean.size
         self._reserve(n)
         self.count = (n - self.first) // 2
-        self._x[:n], self._P[:n, :n] = mean, covariance
+        self._x[:n] = mean
+        self._P[:n, :n] = covariance
 
     def set_pose(self, T_map_base: Array, covariance: Array) -> None:
         """Put the robot at a pose (3,) with covariance (3, 3), independent of the features."""
         n = self.size
         self._x[:3] = T_map_base
         self._x[2] = wrap(float(T_map_base[2]))
-        self._P[:3, :n], self._P[:n, :3] = 0.0, 0.0
+        self._P[:3, :n] = 0.0
+        self._P[:n, :3] = 0.0
         self._P[:3, :3] = 0.5 * (covariance + covariance.T)
 
     def predict(self, T_map_base: Array, increment: Array, increment_covariance: Array) -> None:
@@ -115,12 +117,16 @@ class EkfSlam:
         """
         if len(indices) == 0:
             return True
-        n, m = self.size, 2 * len(indices)
-        v, S, HP = np.empty(m), np.zeros((m, m)), np.empty((m, n))
+        n = self.size
+        m = 2 * len(indices)
+        v = np.empty(m)
+        S = np.zeros((m, m))
+        HP = np.empty((m, n))
         P = self._P[:n, :n]
         jacobians = []
         for k, index in enumerate(indices):
-            rows, at = slice(2 * k, 2 * k + 2), self.place(int(index))
+            rows = slice(2 * k, 2 * k + 2)
+            at = self.place(int(index))
             expected, by_pose, by_line = observe_line(self._x[:3], self._x[at])
             v[rows] = _difference(z[k], expected)
             HP[rows] = by_pose @ P[:3] + by_line @ P[at]
@@ -136,7 +142,9 @@ class EkfSlam:
 
         Returns whether that could be done.
         """
-        n, a, b = self.size, self.place(kept), self.place(dropped)
+        n = self.size
+        a = self.place(kept)
+        b = self.place(dropped)
         v, S, signs = self.difference(kept, dropped)
         return self._correct(-v, S + covariance, self._P[a, :n] - signs[:, None] * self._P[b, :n])
 
@@ -145,7 +153,8 @@ class EkfSlam:
 
         (r, alpha) and (-r, alpha + pi) are one line; b is taken in the form that is nearer to a.
         """
-        at_a, at_b = self.place(a), self.place(b)
+        at_a = self.place(a)
+        at_b = self.place(b)
         v, signs = line_difference(self._x[at_a], self._x[at_b])
         cross = self._P[at_a, at_b] * signs
         S = self._P[at_a, at_a] + signs[:, None] * self._P[at_b, at_b] * signs - cross - cross.T

@@ -106,7 +106,8 @@ class CompressedEkf:
         """
         area = self.area
         self.enter(self.ids)
-        mean, covariance = self.local.mean, self.local.covariance
+        mean = self.local.mean
+        covariance = self.local.covariance
         self.enter(area)
         return mean, covariance
 
@@ -120,7 +121,8 @@ class CompressedEkf:
         self._cross = np.zeros((0, self._store.width))
         mean = np.concatenate([self.local.pose, lines.ravel()])
         own = np.zeros((3 + lines.size,) * 2)
-        own[:3, :3], own[3:, 3:] = self.local.pose_covariance, covariance
+        own[:3, :3] = self.local.pose_covariance
+        own[3:, 3:] = covariance
         self.local.set_state(mean, own)
         self.area = list(ids)
 
@@ -156,14 +158,19 @@ class CompressedEkf:
 
     def _fold(self) -> Array:
         """Bring the store up to date; returns cov(pose, each number of the store), (3, width)."""
-        mean, P, first = self.local.mean, self.local.covariance, self.local.first
-        at, e = self._numbers(self.area), slice(3, first)
+        mean = self.local.mean
+        P = self.local.covariance
+        first = self.local.first
+        at = self._numbers(self.area)
+        e = slice(3, first)
         self._store.move(mean[e] @ self._cross)
         squares, directions = np.linalg.eigh(-P[e, e])
         seen = squares > _ROUNDING * squares.max(initial=0.0)
         self._store.subtract((directions[:, seen] * np.sqrt(squares[seen])).T @ self._cross)
-        rows, pose_cross = P[first:, e] @ self._cross, P[:3, e] @ self._cross
-        rows[:, at], pose_cross[:, at] = P[first:, first:], P[:3, first:]
+        rows = P[first:, e] @ self._cross
+        pose_cross = P[:3, e] @ self._cross
+        rows[:, at] = P[first:, first:]
+        pose_cross[:, at] = P[:3, first:]
         self._store.write(at, mean[first:], rows)
         return np.asarray(pose_cross)
 
@@ -175,10 +182,13 @@ def _carrying(pose: Array, lines: Array, covariance: Array, carried: int) -> Ekf
     """
     local = EkfSlam(pose, covariance[:3, :3], carried)
     at = np.r_[0:3, 3 + carried : 3 + carried + lines.size]
-    mean, P = np.zeros(at.size + carried), np.zeros((at.size + carried, at.size + carried))
-    mean[at], P[np.ix_(at, at)] = np.concatenate([pose, lines]), covariance
+    mean = np.zeros(at.size + carried)
+    P = np.zeros((at.size + carried, at.size + carried))
+    mean[at] = np.concatenate([pose, lines])
+    P[np.ix_(at, at)] = covariance
     if carried:
-        P[at, 3 : 3 + carried], P[3 : 3 + carried, at] = np.eye(carried), np.eye(carried)
+        P[at, 3 : 3 + carried] = np.eye(carried)
+        P[3 : 3 + carried, at] = np.eye(carried)
     local.set_state(mean, P)
     return local
 
@@ -239,7 +249,8 @@ class _Store:
     def read(self, at: NDArray[np.int64]) -> tuple[Array, Array]:
         """Mean and rows of the covariance (len(at), width) at some numbers, up to date."""
         rows = self._P[at, : self.width]
-        late, row = at >= self._row, self._row
+        late = at >= self._row
+        row = self._row
         rows[late, row:] -= self._sweeping[:, at[late]].T @ self._sweeping[:, row:]
         rows -= self._waiting[:, at].T @ self._waiting
         return self.mean[at], rows
@@ -247,8 +258,10 @@ class _Store:
     def write(self, at: NDArray[np.int64], mean: Array, rows: Array) -> None:
         """Set mean and rows, and with them columns, of the covariance at some numbers."""
         self.mean[at] = mean
-        self._P[at, : self.width], self._P[: self.width, at] = rows, rows.T
-        self._sweeping[:, at], self._waiting[:, at] = 0.0, 0.0
+        self._P[at, : self.width] = rows
+        self._P[: self.width, at] = rows.T
+        self._sweeping[:, at] = 0.0
+        self._waiting[:, at] = 0.0
 
     def blocks(self, places: list[int]) -> Array:
         """Covariances (N, 2, 2) of the features at some places, up to date."""
@@ -272,7 +285,8 @@ class _Store:
             return
         # Rows grow shorter to the diagonal, so a step's share is one of the triangle; shares are
         # saved up for a block.
-        end, a = 2 * self._used, self._row
+        end = 2 * self._used
+        a = self._row
         self._due += 0.5 * end * end / _SWEEP_STEPS
         if self._due < _BLOCK * (end - a) and self._due < 0.5 * (end - a) ** 2:
             return

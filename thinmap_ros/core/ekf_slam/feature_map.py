@@ -18,9 +18,9 @@ from thinmap_ros.core import snapshot
 from thinmap_ros.core.config import parameter
 from thinmap_ros.core.ekf_slam import local_area
 from thinmap_ros.core.ekf_slam.association import AssociationConfig, associate, mahalanobis, meeting
-from thinmap_ros.core.ekf_slam.candidates import Candidate, Candidates
 from thinmap_ros.core.ekf_slam.ekf import EkfSlam
 from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
+from thinmap_ros.core.ekf_slam.feature_candidates import Candidate, Candidates
 from thinmap_ros.core.ekf_slam.features import (
     Feature,
     LineFeature,
@@ -29,7 +29,7 @@ from thinmap_ros.core.ekf_slam.features import (
     interval,
     normals_of,
 )
-from thinmap_ros.core.ekf_slam.lines import Lines
+from thinmap_ros.core.ekf_slam.line_extraction import Lines
 from thinmap_ros.core.ekf_slam.local_area import LocalArea
 from thinmap_ros.core.ekf_slam.visibility import seen_through
 from thinmap_ros.core.scan import Scan
@@ -82,7 +82,8 @@ class FeatureMap:
 
     def __init__(self, config: FeatureConfig, local_areas: bool) -> None:
         self.area = LocalArea()
-        self._config, self._local_areas = config, local_areas
+        self._config = config
+        self._local_areas = local_areas
         self._wall = np.diag(np.square([config.wall_sigma_m, config.wall_sigma_rad]))
         self._features: dict[int, Feature] = {}
         self._candidates = Candidates(config.sightings, config.patience, config.gate, config.gap_m)
@@ -127,7 +128,9 @@ class FeatureMap:
 
     def listed(self, ekf: CompressedEkf) -> list[LineFeature]:
         """The features as others see them."""
-        lines, covariances, local = ekf.lines(), ekf.line_covariances(), set(ekf.area)
+        lines = ekf.lines()
+        covariances = ekf.line_covariances()
+        local = set(ekf.area)
         return [
             as_seen(feature, lines[i].copy(), covariances[i], self.area.nodes_of(i), i in local)
             for i, feature in self._features.items()
@@ -229,8 +232,10 @@ class FeatureMap:
             twin = self._twin(ekf, feature_id) if feature_id in self._features else None
             if twin is None:
                 continue
-            kept, dropped = min(feature_id, twin), max(feature_id, twin)
-            a, b = ekf.area.index(kept), ekf.area.index(dropped)
+            kept = min(feature_id, twin)
+            dropped = max(feature_id, twin)
+            a = ekf.area.index(kept)
+            b = ekf.area.index(dropped)
             if ekf.local.tie(a, b, self._wall):
                 ends = ends_of(self._features[dropped], ekf.local.lines[b])
                 self._features[kept].grow(*interval(ekf.local.lines[a], ends))
@@ -241,7 +246,8 @@ class FeatureMap:
 
         It meets this one, and their difference passes the gate.
         """
-        index, lines = ekf.area.index(feature_id), ekf.local.lines
+        index = ekf.area.index(feature_id)
+        lines = ekf.local.lines
         ends = ends_of(self._features[feature_id], lines[index])
         near = meeting(
             lines, self._local(ekf), ends[None], self._features[feature_id].seen_from, 0.0
@@ -277,7 +283,8 @@ class FeatureMap:
         if known:
             self._called |= known - set(ekf.area)
             return []
-        feature_id, self._next_id = self._next_id, self._next_id + 1
+        feature_id = self._next_id
+        self._next_id = self._next_id + 1
         index = ekf.add(feature_id, candidate.z, candidate.covariance)
         span = interval(ekf.local.lines[index], ends_of(candidate.span, candidate.line))
         self._features[feature_id] = Feature(feature_id, *span, candidate.span.seen_from)
@@ -292,7 +299,8 @@ class FeatureMap:
             return set()
         ids, lines = ekf.line_array()
         start, end = ends_of(candidate.span, candidate.line)
-        middle, reach = 0.5 * (start + end), 0.25 * (end - start)
+        middle = 0.5 * (start + end)
+        reach = 0.25 * (end - start)
         near = np.abs(normals_of(lines) @ middle - lines[:, 0]) <= self._near
         # The few on whose lines it lies, of all that the map has.
         ids = ids[near]
@@ -306,9 +314,11 @@ class FeatureMap:
 
 def _check_references(state: Mapping[str, NDArray[Any]]) -> None:
     """Raise InputError unless ids are unique and known, spans in order, and P a covariance."""
-    ids, spans = state['ids'], state['spans']
+    ids = state['ids']
+    spans = state['spans']
     snapshot.require_unique(ids, 'features: id')
-    last, next_id = int(ids.max(initial=0)), int(state['next_id'])
+    last = int(ids.max(initial=0))
+    next_id = int(state['next_id'])
     snapshot.require(last < next_id, f'features: next id {next_id}', f'above {last}')
     snapshot.require_known(state['stored_at'][:, 0], ids, 'features: stored feature')
     in_order = bool((spans[:, 0] <= spans[:, 1]).all())

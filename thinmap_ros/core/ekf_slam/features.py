@@ -24,7 +24,8 @@ class Feature:
 
     def grow(self, low: float, high: float) -> None:
         """Become as long as to hold another interval of the line, m."""
-        self.low, self.high = min(self.low, low), max(self.high, high)
+        self.low = min(self.low, low)
+        self.high = max(self.high, high)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +62,8 @@ def tangents_of(lines: Array) -> Array:
 def _paired(x: Array, y: Array) -> Array:
     """(N, 2) of x (N,) and y (N,): asked for so often that np.column_stack would be felt."""
     pairs = np.empty((x.size, 2))
-    pairs[:, 0], pairs[:, 1] = x, y
+    pairs[:, 0] = x
+    pairs[:, 1] = y
     return pairs
 
 

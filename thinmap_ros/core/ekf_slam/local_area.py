@@ -59,8 +59,10 @@ class LocalArea:
         """
         if not topology.nodes:
             return
-        before, trail = self._topology, self._trail
-        self._topology, self._trail = topology, None
+        before = self._topology
+        trail = self._trail
+        self._topology = topology
+        self._trail = None
         if trail is not None:
             self._place_of = {i: before.nodes[i].position for i in self._features_at}
             self._hand_over(list(self._features_at))
@@ -85,15 +87,18 @@ class LocalArea:
         snapshot.require_unique(state['node_ids'], 'features: node')
         used = state['stored_at'][:, 1]
         snapshot.require_known(used, state['node_ids'], 'features: stored at node')
-        ids, places = state['node_ids'].tolist(), state['node_places']
+        ids = state['node_ids'].tolist()
+        places = state['node_places']
         if not ids:
             return
         nodes = [
             Node(i, NodeKind.CORNER, x, y, 0.0)
             for i, (x, y) in zip(ids, places.tolist(), strict=True)
         ]
-        self._topology, self._trail = TopologicalMap(nodes), None
-        self._ids, self._places = ids, places
+        self._topology = TopologicalMap(nodes)
+        self._trail = None
+        self._ids = ids
+        self._places = places
         self._place_of = dict(zip(ids, places, strict=True))
         for feature_id, node_id in state['stored_at'].tolist():
             self._put(feature_id, node_id)
@@ -160,14 +165,16 @@ class LocalArea:
         if math.dist(T_map_base[:2], self._listed_at) > _AS_NEAR_M:
             self._list_nodes(T_map_base)
         distances = np.hypot(*(self._places - T_map_base[:2]).T)
-        cost, best = math.inf, None
+        cost = math.inf
+        best = None
         for i in np.flatnonzero(distances <= distances.min(initial=np.inf) + _AS_NEAR_M):
             bearing, distance = _from_robot(T_map_base, self._places[i])
             if (
                 distance + _TURN_M_RAD * abs(bearing) < cost
                 and self._ids[i] in self._topology.nodes
             ):
-                cost, best = distance + _TURN_M_RAD * abs(bearing), self._ids[i]
+                cost = distance + _TURN_M_RAD * abs(bearing)
+                best = self._ids[i]
         return best
 
     def _list_nodes(self, T_map_base: Array) -> None:
@@ -175,7 +182,8 @@ class LocalArea:
 
         Once a metre, and only as far as it takes, whatever the size of the building.
         """
-        topology, (x, y) = self._topology, T_map_base[:2].tolist()
+        topology = self._topology
+        (x, y) = T_map_base[:2].tolist()
         near = topology.nodes_near(x, y, _LISTED_M)
         # After the next metre the nearest node may be one more away, and those about as near
         # another one.
@@ -233,8 +241,10 @@ class _Trail:
 
     def follow(self, T_map_base: Array) -> bool:
         """Take in where the robot is now, (3,); whether nodes or edges came of it."""
-        x, y = float(T_map_base[0]), float(T_map_base[1])
-        node, last = self._map.nearest_node(x, y), self._last
+        x = float(T_map_base[0])
+        y = float(T_map_base[1])
+        node = self._map.nearest_node(x, y)
+        last = self._last
         known = len(self._map.nodes) + len(self._map.edges)
         if node is None or math.dist(node.position, (x, y)) > _TRAIL_M:
             node = Node(self._take_id(), NodeKind.CORNER, x, y, 0.0)
@@ -253,5 +263,6 @@ class _Trail:
 
 def _from_robot(T_map_base: Array, place: Array) -> tuple[float, float]:
     """Bearing (rad, robot frame) and distance of a place (2,)."""
-    dx, dy = float(place[0] - T_map_base[0]), float(place[1] - T_map_base[1])
+    dx = float(place[0] - T_map_base[0])
+    dy = float(place[1] - T_map_base[1])
     return wrap(math.atan2(dy, dx) - float(T_map_base[2])), math.hypot(dx, dy)

@@ -43,7 +43,8 @@ def odometry_variances(increment: Array, config: OdometryConfig) -> Array:
 
 def rotation(theta: float) -> Array:
     """(3, 3): turns increments, and by R C R' covariances, from the robot frame to theta's."""
-    c, s = math.cos(theta), math.sin(theta)
+    c = math.cos(theta)
+    s = math.sin(theta)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
@@ -68,11 +69,17 @@ def observe_line(T_map_base: Array, line: Array) -> tuple[Array, Array, Array]:
     and where r^R < 0: -r^R, alpha^R + pi.
     """
     x, y, theta = (float(v) for v in T_map_base)
-    r, alpha = float(line[0]), float(line[1])
-    c, s = math.cos(alpha), math.sin(alpha)
-    distance, bearing, sign = r - (x * c + y * s), alpha - theta, 1.0
+    r = float(line[0])
+    alpha = float(line[1])
+    c = math.cos(alpha)
+    s = math.sin(alpha)
+    distance = r - (x * c + y * s)
+    bearing = alpha - theta
+    sign = 1.0
     if distance < 0.0:
-        distance, bearing, sign = -distance, bearing + math.pi, -1.0
+        distance = -distance
+        bearing = bearing + math.pi
+        sign = -1.0
     by_pose = np.array([[-sign * c, -sign * s, 0.0], [0.0, 0.0, -1.0]])
     by_line = np.array([[sign, sign * (x * s - y * c)], [0.0, 1.0]])
     return np.array([distance, wrap(bearing)]), by_pose, by_line
@@ -87,10 +94,14 @@ def place_line(T_map_base: Array, seen: Array) -> tuple[Array, Array, Array]:
     """
     x, y, theta = (float(v) for v in T_map_base)
     alpha = float(seen[1]) + theta
-    c, s = math.cos(alpha), math.sin(alpha)
-    r, sign = float(seen[0]) + x * c + y * s, 1.0
+    c = math.cos(alpha)
+    s = math.sin(alpha)
+    r = float(seen[0]) + x * c + y * s
+    sign = 1.0
     if r < 0.0:
-        r, alpha, sign = -r, alpha + math.pi, -1.0
+        r = -r
+        alpha = alpha + math.pi
+        sign = -1.0
     turn = sign * (-x * s + y * c)
     by_pose = np.array([[sign * c, sign * s, turn], [0.0, 0.0, 1.0]])
     by_seen = np.array([[sign, turn], [0.0, 1.0]])

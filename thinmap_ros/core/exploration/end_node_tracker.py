@@ -13,7 +13,7 @@ What the paper leaves open, and how it is settled here:
   over the evidence of one that vanished at the same scan within `moved_m`; so a merged node keeps
   that of the nearest one.
 - *Rim of the range, and of the known.* A skeleton also ends where only knowledge ends. In mode
-  `open_border`, a node with unknown space at its neighbourhood's border (see `open_borders`) is not
+  `open_border`, a node with unknown space at its neighbourhood's border (see `frontiers`) is not
   made more reliable by any look (R is at most 0.5), and one without any cannot move any more: that
   counts as one look of reliability `closed_reliability`. In mode `paper` the looks are all there
   is.
@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.exploration.field_of_view import field_of_view
 from thinmap_ros.core.exploration.position_probability import (
     angle_difference,
     angle_index,
@@ -38,7 +39,6 @@ from thinmap_ros.core.exploration.position_probability import (
     nearest_distance,
     reliability,
 )
-from thinmap_ros.core.exploration.views import field_of_view
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.jit import kernel
@@ -123,9 +123,13 @@ class Track:
 
     def forget(self) -> None:
         """Begin anew at the present place."""
-        self.began_at, self.probability = (self.x, self.y), PRIOR
-        self.last_seen_from, self.closed = None, False
-        self.distances_m, self.bearings_rad, self.angle_span_deg = [], [], 0.0
+        self.began_at = (self.x, self.y)
+        self.probability = PRIOR
+        self.last_seen_from = None
+        self.closed = False
+        self.distances_m = []
+        self.bearings_rad = []
+        self.angle_span_deg = 0.0
 
 
 class EndNodeTracker:
@@ -142,14 +146,17 @@ class EndNodeTracker:
         Returns the new id of each node that lives on under another one.
         """
         lost = {i: track for i, track in self.tracks.items() if i not in places}
-        tracks, renamed = {}, {}
+        tracks = {}
+        renamed = {}
         for node_id, (x, y) in places.items():
             track = self.tracks.get(node_id)
             if track is None:
                 track = self._heir(lost, x, y) or Track(node_id, x, y, (x, y))
                 if track.node_id != node_id:
-                    renamed[track.node_id], track.node_id = node_id, node_id
-            track.x, track.y = x, y
+                    renamed[track.node_id] = node_id
+                    track.node_id = node_id
+            track.x = x
+            track.y = y
             if math.dist((x, y), track.began_at) > self.config.moved_m:
                 track.forget()
             tracks[node_id] = track
@@ -173,7 +180,8 @@ class EndNodeTracker:
             return
         T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
         places = np.array([(track.x, track.y) for track in self.tracks.values()])
-        at, (low, high) = frame.as_array(), field_of_view(scan)
+        at = frame.as_array()
+        (low, high) = field_of_view(scan)
         seen = _in_sight(
             free, at, T_map_laser, places, scan.range_max_m, 0.5 * (low + high), 0.5 * (high - low)
         )
@@ -270,7 +278,8 @@ class EndNodeTracker:
 
 def _check_references(state: Mapping[str, NDArray[Any]]) -> None:
     """Raise InputError unless each node has its looks, and a place of the last one if any."""
-    counts, tracks = state['look_counts'], state['tracks']
+    counts = state['look_counts']
+    tracks = state['tracks']
     total = len(state['looks'])
     fits = bool((counts <= total).all()) and int(counts.sum()) == total
     snapshot.require(fits, f'exploration: {total} looks', 'as many as the nodes have')
@@ -302,11 +311,14 @@ def _in_sight(
     rad.
     """
     seen = np.zeros(places.shape[0], dtype=np.bool_)
-    x, y, resolution = frame[0], frame[1], frame[2]
+    x = frame[0]
+    y = frame[1]
+    resolution = frame[2]
     row = int(math.floor((laser[1] - y) / resolution))
     col = int(math.floor((laser[0] - x) / resolution))
     for i in range(places.shape[0]):
-        dx, dy = places[i, 0] - laser[0], places[i, 1] - laser[1]
+        dx = places[i, 0] - laser[0]
+        dy = places[i, 1] - laser[1]
         if dx * dx + dy * dy >= reach_m * reach_m:
             continue
         off = math.pi - (math.pi - (math.atan2(dy, dx) - (laser[2] + middle))) % (2.0 * math.pi)

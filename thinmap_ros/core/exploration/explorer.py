@@ -23,17 +23,17 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import parameter
-from thinmap_ros.core.exploration.decision import Decision, verdict
-from thinmap_ros.core.exploration.failures import Failures
-from thinmap_ros.core.exploration.survey import (
+from thinmap_ros.core.exploration.blacklist import Failures
+from thinmap_ros.core.exploration.candidates import (
     Candidate,
     Place,
     SurveyConfig,
     Surveyor,
     end_node_of,
 )
+from thinmap_ros.core.exploration.field_of_view import box_of_scan, directions_of_view
+from thinmap_ros.core.exploration.strategy import Decision, verdict
 from thinmap_ros.core.exploration.tour import tours_by_first
-from thinmap_ros.core.exploration.views import box_of_scan, directions_of_view
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.graph_search import costs_to
 from thinmap_ros.core.planning.grid_search import WayTable
@@ -47,7 +47,9 @@ _SUCCESSOR_M = 1.5
 _NEAR_VISIT_M = 0.3
 _NEAR_HEADING_RAD = 0.35
 _STEADY_RAD = 0.6
-_COARSE_M, _FORGET_S, _UNKNOWN_WEIGHT = 0.3, 20.0, 2
+_COARSE_M = 0.3
+_FORGET_S = 20.0
+_UNKNOWN_WEIGHT = 2
 _FIRST_GRAPH_S = 5.0
 # Through more places no tour is planned at a time: its cost grows with their number's fourth power.
 _MOST_PLACES = 20
@@ -129,7 +131,9 @@ class Explorer:
         self._failures = Failures(self.config.retry_s)
         self._ways = WayTable(_COARSE_M, _FORGET_S, _UNKNOWN_WEIGHT)
         self._memory = _Memory()
-        self._stamp_ns, self._began_ns, self._range_m = 0, 2**63, 0.0
+        self._stamp_ns = 0
+        self._began_ns = 2**63
+        self._range_m = 0.0
         self._last = _Survey([], 0, -1, {})
 
     def state(self) -> dict[str, NDArray[Any]]:
@@ -164,9 +168,11 @@ class Explorer:
 
         patch: the whole map, on one lattice from step to step. Deterministic; call it once a scan.
         """
-        self._stamp_ns, self._range_m = scan.stamp_ns, scan.range_max_m
+        self._stamp_ns = scan.stamp_ns
+        self._range_m = scan.range_max_m
         self._began_ns = min(self._began_ns, self._stamp_ns)
-        surveyor, borders = self.surveyor, self.surveyor.borders
+        surveyor = self.surveyor
+        borders = self.surveyor.borders
         surveyor.trail.add(T_map_base)
         xy = (float(T_map_base[0]), float(T_map_base[1]))
         borders.update(patch, box_of_scan(scan, T_map_base))
@@ -197,8 +203,10 @@ class Explorer:
 
         In between, what is left of the last.
         """
-        surveyor, borders = self.surveyor, self.surveyor.borders
-        memory, last = self._memory, self._last
+        surveyor = self.surveyor
+        borders = self.surveyor.borders
+        memory = self._memory
+        last = self._last
         end = NodeKind.END
         ends = {n.id: (n.x, n.y) for n in topology.nodes.values() if n.kind == end}
         renamed = surveyor.follow(ends)
@@ -284,7 +292,8 @@ class Explorer:
             or self.surveyor.still_shows(chosen, memory.goal, self._range_m)
         )
         on_the_way = same and math.dist(T_map_base[:2], memory.goal[:2]) > _NEAR_VISIT_M
-        memory.target, memory.target_at = chosen.track.node_id, at
+        memory.target = chosen.track.node_id
+        memory.target_at = at
         if not (on_the_way or _about_same(chosen.goal, memory.goal)):
             memory.goal = chosen.goal
         return chosen.track.node_id
@@ -353,7 +362,8 @@ class Explorer:
     def _decision(
         self, target: int | None, worth: dict[int, Candidate], candidates: list[Candidate]
     ) -> Decision:
-        surveyor, resolution = self.surveyor, self.surveyor.borders.frame.resolution
+        surveyor = self.surveyor
+        resolution = self.surveyor.borders.frame.resolution
         by_id = {c.track.node_id: c for c in candidates}
         goals = {} if target is None else {target: self._memory.goal}
         tracks = [*surveyor.tracker.tracks.values(), *surveyor.stand_ins.tracks.values()]

@@ -33,13 +33,18 @@ def middle_one(cells: Cells) -> int:
 
     The first of equally near ones.
     """
-    row, col = 0.0, 0.0
+    row = 0.0
+    col = 0.0
     for i in range(cells.shape[0]):
-        row, col = row + cells[i, 0], col + cells[i, 1]
-    row, col = row / cells.shape[0], col / cells.shape[0]
-    best, middle = np.inf, 0
+        row = row + cells[i, 0]
+        col = col + cells[i, 1]
+    row = row / cells.shape[0]
+    col = col / cells.shape[0]
+    best = np.inf
+    middle = 0
     for i in range(cells.shape[0]):
         away = (cells[i, 0] - row) ** 2 + (cells[i, 1] - col) ** 2
         if away < best:
-            best, middle = away, i
+            best = away
+            middle = i
     return middle

@@ -26,7 +26,8 @@ def tours_by_first(from_start: Array, between: Array, wait_weights: Array, wait_
     change the tour. from_start (N,): way from the robot to each place; between (N, N): ways between
     them, symmetric; all finite; wait_weights (N,).
     """
-    from_start, between = np.ascontiguousarray(from_start), np.ascontiguousarray(between)
+    from_start = np.ascontiguousarray(from_start)
+    between = np.ascontiguousarray(between)
     count = from_start.size
     return np.array(
         [_best_tour(from_start, between, first, wait_weights, wait_m) for first in range(count)]
@@ -61,16 +62,20 @@ def _best_tour(from_start: Array, between: Array, first: int, weights: Array, mo
                 if i < j:
                     tried[i : j + 1] = order[i : j + 1][::-1]
                 elif i > j:
-                    tried[j], tried[j + 1 : i + 1] = order[i], order[j:i]
+                    tried[j] = order[i]
+                    tried[j + 1 : i + 1] = order[j:i]
                 cost = _cost(tried, from_start, between, weights, most)
                 if cost < best - 1e-9:
-                    best, order = cost, tried
+                    best = cost
+                    order = tried
                 if i < j:
                     tried = order.copy()
-                    tried[j], tried[i:j] = order[i], order[i + 1 : j + 1]
+                    tried[j] = order[i]
+                    tried[i:j] = order[i + 1 : j + 1]
                     cost = _cost(tried, from_start, between, weights, most)
                     if cost < best - 1e-9:
-                        best, order = cost, tried
+                        best = cost
+                        order = tried
         if best >= before:
             break
     return best
@@ -81,10 +86,12 @@ def _nearest_next(order: Places, first: int, between: Array) -> None:
     """Begin with one place and go on to the nearest that is left, always."""
     count = order.size
     left = np.ones(count, dtype=np.bool_)
-    order[0], left[first] = first, False
+    order[0] = first
+    left[first] = False
     for k in range(1, count):
         best = -1
         for i in range(count):
             if left[i] and (best < 0 or between[order[k - 1], i] < between[order[k - 1], best]):
                 best = i
-        order[k], left[best] = best, False
+        order[k] = best
+        left[best] = False

@@ -25,9 +25,11 @@ Cell = tuple[int, int]
 SQUARE = 3
 # Most of what a border hides: so much of so many points. Of a long one, with a point every so many
 # cells, as many.
-_POINTS, _SHARE = 8, 0.7
+_POINTS = 8
+_SHARE = 0.7
 _SPACING = 10
-_SLACK, _STRIDE = 5, 4
+_SLACK = 5
+_STRIDE = 4
 
 
 def place_for(
@@ -82,21 +84,26 @@ def _hidden_points(free: Mask, passable: Mask, cells: Cells, depth: int, most: i
     points = np.empty((count, 2), dtype=np.int64)
     for i in range(count):
         k = (2 * i + 1) * cells.shape[0] // (2 * count)
-        row, col = cells[k, 0], cells[k, 1]
+        row = cells[k, 0]
+        col = cells[k, 1]
         # Which way the unknown lies, from the cells around.
-        down, right = 0.0, 0.0
+        down = 0.0
+        right = 0.0
         for r in range(max(row - 3, 0), min(row + 4, rows)):
             for c in range(max(col - 3, 0), min(col + 4, cols)):
                 if not free[r, c] and passable[r, c]:
                     down += r - row
                     right += c - col
         length = max(math.hypot(down, right), 1e-9)
-        points[i, 0], points[i, 1] = row, col
+        points[i, 0] = row
+        points[i, 1] = col
         for step in range(1, depth + 1):
-            r, c = int(round(row + step * down / length)), int(round(col + step * right / length))
+            r = int(round(row + step * down / length))
+            c = int(round(col + step * right / length))
             if r < 0 or r >= rows or c < 0 or c >= cols or not passable[r, c]:
                 break
-            points[i, 0], points[i, 1] = r, c
+            points[i, 0] = r
+            points[i, 1] = c
     return points
 
 
@@ -109,20 +116,29 @@ def _view_place(
     A line of sight runs over passable cells, and is shorter than reach.
     """
     rows, cols = allowed.shape
-    low_r, high_r = points[:, 0].min() - reach, points[:, 0].max() + reach
-    low_c, high_c = points[:, 1].min() - reach, points[:, 1].max() + reach
-    top, bottom = max(int(low_r) // factor, 0), min(int(high_r) // factor + 1, ways.shape[0])
-    left, right = max(int(low_c) // factor, 0), min(int(high_c) // factor + 1, ways.shape[1])
-    best, best_row, best_col = np.inf, -1, -1
+    low_r = points[:, 0].min() - reach
+    high_r = points[:, 0].max() + reach
+    low_c = points[:, 1].min() - reach
+    high_c = points[:, 1].max() + reach
+    top = max(int(low_r) // factor, 0)
+    bottom = min(int(high_r) // factor + 1, ways.shape[0])
+    left = max(int(low_c) // factor, 0)
+    right = min(int(high_c) // factor + 1, ways.shape[1])
+    best = np.inf
+    best_row = -1
+    best_col = -1
     # First a few squares here and there: with a good place in hand most others need no look.
     for stride in (_STRIDE, 1):
         for r in range(top, bottom, stride):
             for c in range(left, right, stride):
-                row, col = r * factor + factor // 2, c * factor + factor // 2
+                row = r * factor + factor // 2
+                col = c * factor + factor // 2
                 if ways[r, c] >= best or row >= rows or col >= cols or not allowed[row, col]:
                     continue
                 if _sees_enough(passable, row, col, points, reach, need):
-                    best, best_row, best_col = ways[r, c], row, col
+                    best = ways[r, c]
+                    best_row = row
+                    best_col = col
     return best_row, best_col
 
 
@@ -154,22 +170,34 @@ def _place_at(
     queue = np.empty((rows * cols, 3), dtype=np.int64)
     tail = 0
     for i in range(cells.shape[0]):
-        queue[tail, 0], queue[tail, 1], queue[tail, 2] = cells[i, 0], cells[i, 1], 0
+        queue[tail, 0] = cells[i, 0]
+        queue[tail, 1] = cells[i, 1]
+        queue[tail, 2] = 0
         seen[cells[i, 0], cells[i, 1]] = True
         tail += 1
-    head, best, best_row, best_col = 0, np.inf, -1, -1
+    head = 0
+    best = np.inf
+    best_row = -1
+    best_col = -1
     while head < tail and queue[head, 2] <= most_steps:
-        row, col, steps = queue[head, 0], queue[head, 1], queue[head, 2]
+        row = queue[head, 0]
+        col = queue[head, 1]
+        steps = queue[head, 2]
         head += 1
         away = math.hypot(row - to_row, col - to_col)
         if allowed[row, col] and away < best:
             if best_row < 0:
                 most_steps = min(most_steps, steps + _SLACK)
-            best, best_row, best_col = away, row, col
+            best = away
+            best_row = row
+            best_col = col
         for side in range(4):
-            r, c = row + (side == 0) - (side == 1), col + (side == 2) - (side == 3)
+            r = row + (side == 0) - (side == 1)
+            c = col + (side == 2) - (side == 3)
             if 0 <= r < rows and 0 <= c < cols and free[r, c] and not seen[r, c]:
                 seen[r, c] = True
-                queue[tail, 0], queue[tail, 1], queue[tail, 2] = r, c, steps + 1
+                queue[tail, 0] = r
+                queue[tail, 1] = c
+                queue[tail, 2] = steps + 1
                 tail += 1
     return best_row, best_col

@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.grid.history import MovedPoses, PoseHistory
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.grid.rerendering import KeptScan, Rerendering
+from thinmap_ros.core.grid.scan_history import MovedPoses, PoseHistory
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 

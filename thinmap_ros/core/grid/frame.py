@@ -50,7 +50,8 @@ class GridFrame:
 
     def shifted(self, rows: int, cols: int) -> 'GridFrame':
         """The same lattice with cell (rows, cols) as its new cell (0, 0)."""
-        x, y = self.origin_x + cols * self.resolution, self.origin_y + rows * self.resolution
+        x = self.origin_x + cols * self.resolution
+        y = self.origin_y + rows * self.resolution
         return GridFrame(x, y, self.resolution)
 
     def as_array(self) -> Array:

@@ -13,8 +13,8 @@ from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import COARSEST_M, FINEST_M, GridFrame
 from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
-from thinmap_ros.core.grid.picture import Picture
 from thinmap_ros.core.grid.raytrace import fill_segment
+from thinmap_ros.core.grid.rendered_map import Picture
 from thinmap_ros.core.grid.tiles import FARTHEST_TILE, TILE, TileStore
 from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.scan import Scan
@@ -182,13 +182,15 @@ class OccupancyGrid:
         if not se2.is_on_earth(T_map_laser):
             place = f'{T_map_laser[0]:g}, {T_map_laser[1]:g} m'
             raise InputError(f'scan at {scan.stamp_ns} ns: laser at {place}: too far to be mapped')
-        resolution, usable = self.frame.resolution, self.config.usable_range_m
+        resolution = self.frame.resolution
+        usable = self.config.usable_range_m
         depth = self.config.surface_depth_m
         x = (float(T_map_laser[0]) - self.frame.origin_x) / resolution
         y = (float(T_map_laser[1]) - self.frame.origin_y) / resolution
         without_return = min(self.config.no_return_range_m, scan.range_max_m, usable)
         radius = math.ceil(min(usable, scan.range_max_m + depth) / resolution) + 2
-        tile_row, tile_col = (math.floor(y) - radius) // TILE, (math.floor(x) - radius) // TILE
+        tile_row = (math.floor(y) - radius) // TILE
+        tile_col = (math.floor(x) - radius) // TILE
         laser = (x - tile_col * TILE, y - tile_row * TILE)
         # Before anything is drawn: what cannot be merged must not stay on the sheet.
         last_row = (math.floor(y) + radius) // TILE
@@ -196,7 +198,8 @@ class OccupancyGrid:
         self._tiles.reach(tile_row, tile_col, last_row, last_col)
         news = self._sheet(radius)
         self._follow(scan)
-        heading, bend = float(T_map_laser[2]), 2.0 * math.cos(scan.angle_increment_rad)
+        heading = float(T_map_laser[2])
+        bend = 2.0 * math.cos(scan.angle_increment_rad)
         turn = (math.cos(heading), math.sin(heading))
         beams = (scan.ranges_m, scan.hit, scan.no_return, self._cosines, self._sines)
         limits = (usable, without_return, depth, resolution, bend)
@@ -215,7 +218,8 @@ class OccupancyGrid:
         (tile_row, tile_col): where the news begin.
         """
         tiles = self._tiles
-        row, col = tile_row * TILE, tile_col * TILE
+        row = tile_row * TILE
+        col = tile_col * TILE
         self._picture.touch(row + box[0], col + box[2], row + box[1] + 1, col + box[3] + 1)
         place = (tile_row - tiles.first_row, tile_col - tiles.first_col)
         _spare(
@@ -280,7 +284,8 @@ class OccupancyGrid:
         fan = (scan.ranges_m.size, scan.angle_min_rad, scan.angle_increment_rad)
         if fan != self._fan:
             self._fan = fan
-            self._cosines, self._sines = np.cos(scan.angles_rad), np.sin(scan.angles_rad)
+            self._cosines = np.cos(scan.angles_rad)
+            self._sines = np.sin(scan.angles_rad)
 
 
 def _steps(config: OccupancyConfig) -> NDArray[np.int16]:
@@ -317,7 +322,9 @@ def _is_flat(ranges: Array, hit: NDArray[np.bool_], usable: float, bend: float, 
     """
     if i < 1 or i > ranges.size - 2 or not (hit[i - 1] and hit[i] and hit[i + 1]):
         return False
-    before, between, after = ranges[i - 1], ranges[i], ranges[i + 1]
+    before = ranges[i - 1]
+    between = ranges[i]
+    after = ranges[i + 1]
     if max(before, between, after) >= usable:
         return False
     flat: bool = abs(between - bend * before * after / (before + after)) < _FLAT_M
@@ -348,19 +355,26 @@ def _draw(
     and last row, first and last column of the box that holds all that is drawn.
     """
     usable, without_return, depth, resolution, bend = limits
-    cells, width = news.ravel(), news.shape[1]
+    cells = news.ravel()
+    width = news.shape[1]
     ends = np.empty((ranges.size, 2))
-    low_x, low_y, high_x, high_y = laser[0], laser[1], laser[0], laser[1]
+    low_x = laser[0]
+    low_y = laser[1]
+    high_x = laser[0]
+    high_y = laser[1]
     for i in range(ranges.size):
         length = min(ranges[i] + depth if ranges[i] < usable else usable, usable) if hit[i] else 0.0
         reach = (without_return if no_return[i] else length) / resolution
         x = laser[0] + reach * (turn[0] * cosines[i] - turn[1] * sines[i])
         y = laser[1] + reach * (turn[1] * cosines[i] + turn[0] * sines[i])
-        ends[i, 0], ends[i, 1] = x, y
+        ends[i, 0] = x
+        ends[i, 1] = y
         if reach > 0.0:
             fill_segment(cells, width, laser, (x, y), steps[0])
-            low_x, low_y = min(low_x, x), min(low_y, y)
-            high_x, high_y = max(high_x, x), max(high_y, y)
+            low_x = min(low_x, x)
+            low_y = min(low_y, y)
+            high_x = max(high_x, x)
+            high_y = max(high_y, y)
     _draw_ends(cells, width, ends, ranges, hit, usable, bend, steps[1])
     # One more on each side: a coordinate in fixed point may come to lie just beyond a border.
     return int(low_y) - 1, int(high_y) + 1, int(low_x) - 1, int(high_x) + 1
@@ -407,7 +421,8 @@ def _shades(odds: NDArray[np.int16], percent: NDArray[np.int8]) -> NDArray[np.in
 @inlined
 def _odds_at(pool: NDArray[np.int16], directory: NDArray[np.int32], row: int, col: int) -> int:
     """Log odds of a cell, counted from the directory's first one on; 0 where no tile is."""
-    tile_row, tile_col = row >> _TILE_BITS, col >> _TILE_BITS
+    tile_row = row >> _TILE_BITS
+    tile_col = col >> _TILE_BITS
     if (
         tile_row < 0
         or tile_col < 0
@@ -435,15 +450,18 @@ def _run_of(
     away: (x, y) from the laser to the cell, in cells.
     """
     longest = max(abs(away[0]), abs(away[1]), 1e-9)
-    step_x, step_y = away[0] / longest, away[1] / longest
+    step_x = away[0] / longest
+    step_y = away[1] / longest
     run = 1
     for sign in (-1, 1):
         k = 1
         while run < enough:
-            at_row, at_col = row + round(sign * k * step_y), col + round(sign * k * step_x)
+            at_row = row + round(sign * k * step_y)
+            at_col = col + round(sign * k * step_x)
             if _odds_at(pool, directory, at_row, at_col) < sure:
                 break
-            run, k = run + 1, k + 1
+            run = run + 1
+            k = k + 1
     return run
 
 
@@ -472,13 +490,17 @@ def _spare(
     place: (row, col) in the directory of the tile in which the news begin; laser: (x, y) in cells
     of them.
     """
-    sure, top, left = steps[4], place[0] * TILE, place[1] * TILE
+    sure = steps[4]
+    top = place[0] * TILE
+    left = place[1] * TILE
     for row in range(box[0], box[1] + 1):
         for tile in range(box[2] >> _TILE_BITS, (box[3] >> _TILE_BITS) + 1):
-            slot, first = directory[place[0] + (row >> _TILE_BITS), place[1] + tile], tile * TILE
+            slot = directory[place[0] + (row >> _TILE_BITS), place[1] + tile]
+            first = tile * TILE
             if slot < 0:
                 continue
-            added, odds = news[row, first : first + TILE], pool[slot, row & (TILE - 1)]
+            added = news[row, first : first + TILE]
+            odds = pool[slot, row & (TILE - 1)]
             if _holds(added, odds, sure):
                 for k in range(TILE):
                     if added[k] < 0 and odds[k] >= sure:
@@ -505,7 +527,10 @@ def _apply(
     additions one.
     """
     missing = False
-    low, high, one, none = steps[2], steps[3], np.int16(1), np.int16(0)
+    low = steps[2]
+    high = steps[3]
+    one = np.int16(1)
+    none = np.int16(0)
     for row in range(box[0], box[1] + 1):
         for tile in range(box[2] >> _TILE_BITS, (box[3] >> _TILE_BITS) + 1):
             slot = directory[place[0] + (row >> _TILE_BITS), place[1] + tile]

@@ -53,9 +53,13 @@ def cast_rays(
                 distances[i] = travelled
                 break
             if next_x < next_y:
-                travelled, next_x, col = next_x, next_x + delta_x, col + step_x
+                travelled = next_x
+                next_x = next_x + delta_x
+                col = col + step_x
             else:
-                travelled, next_y, row = next_y, next_y + delta_y, row + step_y
+                travelled = next_y
+                next_y = next_y + delta_y
+                row = row + step_y
     return distances
 
 
@@ -76,9 +80,11 @@ def line_is_clear(free: NDArray[np.bool_], row_a: int, col_a: int, row_b: int, c
         if row < 0 or row >= rows or col < 0 or col >= cols or not free[row, col]:
             return False
         if next_x < next_y:
-            next_x, col = next_x + delta_x, col + step_x
+            next_x = next_x + delta_x
+            col = col + step_x
         else:
-            next_y, row = next_y + delta_y, row + step_y
+            next_y = next_y + delta_y
+            row = row + step_y
     return True
 
 
@@ -97,23 +103,28 @@ def fill_segment(
     may be the same one; the rows of these are counted in fixed point, 2**-32 of a cell. No cell is
     left out but where the segment cuts less than a millionth of a cell off its corner.
     """
-    d_x, d_y = end[0] - start[0], end[1] - start[1]
+    d_x = end[0] - start[0]
+    d_y = end[1] - start[1]
     steep = abs(d_y) > abs(d_x)
     along, across = (start[1], start[0]) if steep else (start[0], start[1])
     along_end, across_end = (end[1], end[0]) if steep else (end[0], end[1])
     stride, side = (width, 1) if steep else (1, width)
-    first, last = int(math.floor(along)), int(math.floor(along_end))
+    first = int(math.floor(along))
+    last = int(math.floor(along_end))
     slope = (across_end - across) / max(abs(along_end - along), 1e-9)
     to_border = first + 1 - along if last > first else along - first
     crossing = int(math.floor((across + slope * to_border) * _ONE))
     rise = int(math.floor(slope * _ONE))
-    at, entered = first * stride, int(math.floor(across)) * side
+    at = first * stride
+    entered = int(math.floor(across)) * side
     stride = stride if last > first else -stride
     for _ in range(abs(last - first)):
         left = (crossing >> _FRACTION_BITS) * side
         # An unsigned index needs no test for counting from the end.
         cells[np.uint64(at + entered)] = value
         cells[np.uint64(at + left)] = value
-        at, entered, crossing = at + stride, left, crossing + rise
+        at = at + stride
+        entered = left
+        crossing = crossing + rise
     cells[np.uint64(at + entered)] = value
     cells[np.uint64(at + int(math.floor(across_end)) * side)] = value

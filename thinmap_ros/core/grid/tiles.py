@@ -155,17 +155,22 @@ class TileStore:
         rows, cols = np.nonzero(self.directory != NO_TILE)
         if rows.size == 0:
             return None
-        row_a, row_b = int(rows.min()) + self.first_row, int(rows.max()) + self.first_row + 1
-        col_a, col_b = int(cols.min()) + self.first_col, int(cols.max()) + self.first_col + 1
+        row_a = int(rows.min()) + self.first_row
+        row_b = int(rows.max()) + self.first_row + 1
+        col_a = int(cols.min()) + self.first_col
+        col_b = int(cols.max()) + self.first_col + 1
         return row_a * TILE, col_a * TILE, row_b * TILE, col_b * TILE
 
     def read(self, row: int, col: int, rows: int, cols: int) -> NDArray[Any]:
         """Copy of the cells [row, row + rows) x [col, col + cols); 0 where no tile is."""
         cells = np.zeros((rows, cols, *self.pool.shape[3:]), dtype=self.pool.dtype)
         for tile_row, tile_col, slot in self._tiles_within(row, col, rows, cols):
-            top, left = tile_row * TILE, tile_col * TILE
-            row_a, row_b = max(row, top), min(row + rows, top + TILE)
-            col_a, col_b = max(col, left), min(col + cols, left + TILE)
+            top = tile_row * TILE
+            left = tile_col * TILE
+            row_a = max(row, top)
+            row_b = min(row + rows, top + TILE)
+            col_a = max(col, left)
+            col_b = min(col + cols, left + TILE)
             cells[row_a - row : row_b - row, col_a - col : col_b - col] = self.pool[
                 slot, row_a - top : row_b - top, col_a - left : col_b - left
             ]
@@ -181,9 +186,12 @@ class TileStore:
         self.reach(int(tiles[0, 0]), int(tiles[0, 1]), int(tiles[-1, 0]), int(tiles[-1, 1]))
         self.ensure(tiles)
         for tile_row, tile_col, slot in self._tiles_within(row, col, rows, cols):
-            top, left = tile_row * TILE, tile_col * TILE
-            row_a, row_b = max(row, top), min(row + rows, top + TILE)
-            col_a, col_b = max(col, left), min(col + cols, left + TILE)
+            top = tile_row * TILE
+            left = tile_col * TILE
+            row_a = max(row, top)
+            row_b = min(row + rows, top + TILE)
+            col_a = max(col, left)
+            col_b = min(col + cols, left + TILE)
             self.pool[slot, row_a - top : row_b - top, col_a - left : col_b - left] = cells[
                 row_a - row : row_b - row, col_a - col : col_b - col
             ]

@@ -59,7 +59,8 @@ def shortest_path(topology: TopologicalMap, start_id: int, goal_id: int) -> Rout
             other = edge.other(node_id)
             cost = costs[node_id] + edge.length_m
             if cost < costs.get(other, np.inf):
-                costs[other], reached_by[other] = cost, (node_id, edge.id)
+                costs[other] = cost
+                reached_by[other] = (node_id, edge.id)
                 there = topology.nodes[other]
                 rest = ((there.x - goal.x) ** 2 + (there.y - goal.y) ** 2) ** 0.5
                 heapq.heappush(open_nodes, (cost + rest, other))
@@ -116,7 +117,8 @@ def costs_to(
     to_nodes = costs_from(topology, float(from_pose[0]), float(from_pose[1]))
     costs = {}
     for goal_id, goal in goals.items():
-        x, y = float(goal[0]), float(goal[1])
+        x = float(goal[0])
+        y = float(goal[1])
         joins = None if goal_id in topology.nodes else access(topology, x, y)
         ends = {goal_id: 0.0} if joins is None else joins.to_node_m
         ways = [to_nodes[i] + rest for i, rest in ends.items() if i in to_nodes]
@@ -145,7 +147,8 @@ def path_between(
     From each straight to the nearest edge.
     None where the map is empty or does not join them.
     """
-    start, goal = access(topology, *start_xy), access(topology, *goal_xy)
+    start = access(topology, *start_xy)
+    goal = access(topology, *goal_xy)
     if start is None or goal is None:
         return None
     best: tuple[float, Array] | None = None
@@ -210,7 +213,8 @@ def _length(points: Array) -> float:
 def _route(
     start_id: int, goal_id: int, reached_by: dict[int, tuple[int, int]], cost: float
 ) -> Route:
-    nodes, edges = [goal_id], []
+    nodes = [goal_id]
+    edges = []
     while nodes[-1] != start_id:
         node_id, edge_id = reached_by[nodes[-1]]
         nodes.append(node_id)

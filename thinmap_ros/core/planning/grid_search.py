@@ -18,7 +18,9 @@ Mask = NDArray[np.bool_]
 Cells = NDArray[np.int64]
 Key = tuple[int, int]
 # Buckets for steps of up to four times the diagonal one.
-_STRAIGHT, _DIAGONAL, _BUCKETS = 5, 7, 32
+_STRAIGHT = 5
+_DIAGONAL = 7
+_BUCKETS = 32
 _FAR = 2**31 - 1
 
 
@@ -169,7 +171,8 @@ def _coarse(allowed: Mask, factor: int, shift_row: int, shift_col: int) -> Mask:
     The first cell is (shift_row, shift_col) within its square.
     """
     rows, cols = allowed.shape
-    height, width = -(-(rows + shift_row) // factor), -(-(cols + shift_col) // factor)
+    height = -(-(rows + shift_row) // factor)
+    width = -(-(cols + shift_col) // factor)
     squares = np.zeros((height, width), dtype=np.bool_)
     line = np.zeros(width * factor, dtype=np.uint8)
     for square in range(height):
@@ -178,7 +181,8 @@ def _coarse(allowed: Mask, factor: int, shift_row: int, shift_col: int) -> Mask:
         bottom = min((square + 1) * factor - shift_row, rows)
         for row in range(top, bottom):
             # All rows of a square into one, many cells at a time; then its columns.
-            cells, part = allowed[row].view(np.uint8), line[shift_col : shift_col + cols]
+            cells = allowed[row].view(np.uint8)
+            part = line[shift_col : shift_col + cols]
             for col in range(cols):
                 part[col] |= cells[col]
         for col in range(width):
@@ -196,7 +200,8 @@ def _ways_from(
     found = np.full(goals.shape[0], _FAR, dtype=np.int32)
     left = 0
     for i in range(goals.shape[0]):
-        row, col = goals[i, 0], goals[i, 1]
+        row = goals[i, 0]
+        col = goals[i, 1]
         if (
             0 <= row < rows
             and 0 <= col < cols
@@ -207,7 +212,8 @@ def _ways_from(
             left += 1
     steps = _field(weights, start_row, start_col, wanted, left)
     for i in range(goals.shape[0]):
-        row, col = goals[i, 0], goals[i, 1]
+        row = goals[i, 0]
+        col = goals[i, 1]
         if (
             0 <= row < rows
             and 0 <= col < cols
@@ -234,14 +240,18 @@ def _field(
     # A border that cannot be entered saves all questions about the rim.
     framed = np.zeros((rows, cols), dtype=np.uint8)
     framed[1:-1, 1:-1] = weights
-    weight, asked = framed.ravel(), wanted.ravel()
+    weight = framed.ravel()
+    asked = wanted.ravel()
     steps = field.ravel()
     capacity = 2 * weight.size + 1
     queue = np.empty((_BUCKETS, capacity), dtype=np.int32)
     counts = np.zeros(_BUCKETS, dtype=np.int64)
     start = (start_row + 1) * cols + start_col + 1
-    steps[start], queue[0, 0], counts[0] = 0, start, 1
-    now, waiting = 0, 1
+    steps[start] = 0
+    queue[0, 0] = start
+    counts[0] = 1
+    now = 0
+    waiting = 1
     while waiting > 0 and left != 0:
         bucket = now % _BUCKETS
         while counts[bucket] > 0:

@@ -13,9 +13,14 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.config import parameter
 from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, GridPatch
 from thinmap_ros.core.jit import kernel
-from thinmap_ros.core.planning.follower import Follower, FollowerConfig, length_from, nearest_point
-from thinmap_ros.core.planning.seen_points import SeenPoints
-from thinmap_ros.core.planning.trail import Trail
+from thinmap_ros.core.planning.obstacle_points import SeenPoints
+from thinmap_ros.core.planning.path_follower import (
+    Follower,
+    FollowerConfig,
+    length_from,
+    nearest_point,
+)
+from thinmap_ros.core.planning.recent_path import Trail
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -26,7 +31,8 @@ _CREEP_M_S = 0.02
 _ROUNDING_M_S = 1e-9
 # Where nothing else is left, points may come so much nearer than the body's radius, but only so
 # slowly.
-_SQUEEZED_M, _SQUEEZED_M_S = 0.01, 0.1
+_SQUEEZED_M = 0.01
+_SQUEEZED_M_S = 0.1
 _AIM_RAD = 0.1
 _OBSTACLE = 'something stands in the way'
 _HIDDEN = 'the laser does not see the way: a sector of invalid beams'
@@ -97,9 +103,14 @@ class Navigator:
 
     def set_goal(self, x: float, y: float, theta: float | None = None) -> None:
         """Take a goal in the map frame, m; with a heading (rad) only where that matters."""
-        self._goal, self._heading_rad = (x, y), theta
-        self.path, self._path_age_s, self._blocked_s, self._remaining_m = None, 0.0, 0.0, 0.0
-        self._standstills, self._nearest_m = 0, math.inf
+        self._goal = (x, y)
+        self._heading_rad = theta
+        self.path = None
+        self._path_age_s = 0.0
+        self._blocked_s = 0.0
+        self._remaining_m = 0.0
+        self._standstills = 0
+        self._nearest_m = math.inf
 
     def halt(self) -> None:
         """Take note that the robot was stopped by somebody else; it goes on from rest."""
@@ -107,7 +118,9 @@ class Navigator:
 
     def cancel(self) -> None:
         """Forget the goal; the next steps bring the robot to rest."""
-        self._goal, self.path, self._remaining_m = None, None, 0.0
+        self._goal = None
+        self.path = None
+        self._remaining_m = 0.0
 
     def step(self, T_map_base: Array, patch: GridPatch, scan: Scan | None, dt_s: float) -> Command:
         """Command for the next dt_s from the pose (3,), the map as known now, and the newest scan.
@@ -144,11 +157,13 @@ class Navigator:
         return Command(*self._follower.stop(dt_s), 'reached')
 
     def _must_plan(self, T_map_base: Array, patch: GridPatch, dt_s: float) -> bool:
-        changed, self._patch = patch is not self._patch, patch
+        changed = patch is not self._patch
+        self._patch = patch
         self._path_age_s += dt_s
         if self.path is None or self._path_age_s >= self.config.replan_s:
             return True
-        x, y = float(T_map_base[0]), float(T_map_base[1])
+        x = float(T_map_base[0])
+        y = float(T_map_base[1])
         nearest = nearest_point(self.path, x, y)
         strayed = math.dist(self.path[nearest], (x, y)) > 2.0 * self.config.lookahead_m
         return bool(strayed or (changed and self._is_blocked(nearest, patch)))
@@ -197,7 +212,8 @@ class Navigator:
         nearest = nearest_point(self.path, float(T_map_base[0]), float(T_map_base[1]))
         self._remaining_m = length_from(self.path, nearest)
         if self._remaining_m < self._nearest_m - _PROGRESS_M:
-            self._standstills, self._nearest_m = 0, self._remaining_m
+            self._standstills = 0
+            self._nearest_m = self._remaining_m
         before = (self._follower.v, self._follower.w)
         room = self._seen.room_along(self.path, nearest, _NARROW_AHEAD_M)
         v, w = self._follower.command(T_map_base, self.path, dt_s, room - self.config.body_radius_m)
@@ -279,13 +295,15 @@ def _touches(
     frame: origin x, origin y and resolution of the map, m.
     """
     reach = int(math.ceil(radius))
-    last_row, last_col = -1, -1
+    last_row = -1
+    last_col = -1
     for k in range(path.shape[0]):
         row = int(math.floor((path[k, 1] - frame[1]) / frame[2]))
         col = int(math.floor((path[k, 0] - frame[0]) / frame[2]))
         if row == last_row and col == last_col:
             continue
-        last_row, last_col = row, col
+        last_row = row
+        last_col = col
         for r in range(max(row - reach, 0), min(row + reach + 1, cells.shape[0])):
             for c in range(max(col - reach, 0), min(col + reach + 1, cells.shape[1])):
                 if (

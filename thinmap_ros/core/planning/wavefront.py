@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.jit import kernel
-from thinmap_ros.core.planning.reach import disc, nearest_true, reached_from
+from thinmap_ros.core.planning.traversability import disc, nearest_true, reached_from
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.free_space import column_distance, known_free
@@ -78,7 +78,8 @@ def plan(
     cells = patch.frame.cells_of(np.array([start_xy, goal_xy]))
     if not patch.contains(np.array([start_xy, goal_xy])).all():
         return None
-    cost, occupied = cost_of_cells(patch, config), patch.occupied.copy()
+    cost = cost_of_cells(patch, config)
+    occupied = patch.occupied.copy()
     if points is not None:
         points = points[patch.contains(points)]
         at = patch.frame.cells_of(points)
@@ -86,7 +87,8 @@ def plan(
         cell_m = patch.frame.resolution
         keep = config.keep_m / cell_m
         _keep_away(cost, _in_cells(patch, points), body_radius_m / cell_m, keep, config.keep_weight)
-    start, wished = (int(cells[0, 0]), int(cells[0, 1])), (int(cells[1, 0]), int(cells[1, 1]))
+    start = (int(cells[0, 0]), int(cells[0, 1]))
+    wished = (int(cells[1, 0]), int(cells[1, 1]))
     if not math.isfinite(cost[start]):
         _let_out(cost, occupied, start, config.escape_m / patch.frame.resolution)
     if trail is not None:
@@ -168,10 +170,13 @@ def _keep_away(cost: Array, points: Array, radius: float, keep: float, weight: f
 
     As by the map, cells nearer than a radius are closed; from `keep` on a point costs nothing.
     """
-    reach, spread = int(math.ceil(max(radius, keep))) + 1, max(keep - radius, 1e-6)
+    reach = int(math.ceil(max(radius, keep))) + 1
+    spread = max(keep - radius, 1e-6)
     for i in range(points.shape[0]):
-        x, y = points[i, 0] - 0.5, points[i, 1] - 0.5
-        row, col = int(round(y)), int(round(x))
+        x = points[i, 0] - 0.5
+        y = points[i, 1] - 0.5
+        row = int(round(y))
+        col = int(round(x))
         for r in range(max(row - reach, 0), min(row + reach + 1, cost.shape[0])):
             for c in range(max(col - reach, 0), min(col + reach + 1, cost.shape[1])):
                 away = math.hypot(r - y, c - x)
@@ -218,15 +223,18 @@ def _push(keys: Array, cells: NDArray[np.int64], count: int, key: float, cell: i
         parent = (place - 1) // 2
         if keys[parent] <= key:
             break
-        keys[place], cells[place] = keys[parent], cells[parent]
+        keys[place] = keys[parent]
+        cells[place] = cells[parent]
         place = parent
-    keys[place], cells[place] = key, cell
+    keys[place] = key
+    cells[place] = cell
 
 
 @kernel
 def _drop_first(keys: Array, cells: NDArray[np.int64], count: int) -> None:
     """Take the smallest key out of a binary heap of `count` entries."""
-    key, cell = keys[count - 1], cells[count - 1]
+    key = keys[count - 1]
+    cell = cells[count - 1]
     place = 0
     while True:
         child = 2 * place + 1
@@ -236,9 +244,11 @@ def _drop_first(keys: Array, cells: NDArray[np.int64], count: int) -> None:
             child += 1
         if key <= keys[child]:
             break
-        keys[place], cells[place] = keys[child], cells[child]
+        keys[place] = keys[child]
+        cells[place] = cells[child]
         place = child
-    keys[place], cells[place] = key, cell
+    keys[place] = key
+    cells[place] = cell
 
 
 @kernel
@@ -249,11 +259,13 @@ def _march(cost: Array, goal_row: int, goal_col: int, start_row: int, start_col:
     keys = np.empty(4 * rows * cols + 1)
     cells = np.empty(4 * rows * cols + 1, dtype=np.int64)
     field[goal_row, goal_col] = 0.0
-    keys[0], cells[0] = 0.0, goal_row * cols + goal_col
+    keys[0] = 0.0
+    cells[0] = goal_row * cols + goal_col
     count = 1
     stop = np.inf
     while count > 0 and keys[0] <= stop:
-        row, col = cells[0] // cols, cells[0] % cols
+        row = cells[0] // cols
+        col = cells[0] % cols
         _drop_first(keys, cells, count)
         count -= 1
         if done[row, col]:
@@ -263,10 +275,12 @@ def _march(cost: Array, goal_row: int, goal_col: int, start_row: int, start_col:
             # A few cells more, so that the slope at the start is that of the finished field.
             stop = field[row, col] + 3.0 * cost[row, col]
         for side in range(4):
-            r, c = row + (side == 0) - (side == 1), col + (side == 2) - (side == 3)
+            r = row + (side == 0) - (side == 1)
+            c = col + (side == 2) - (side == 3)
             if r < 0 or r >= rows or c < 0 or c >= cols or done[r, c] or cost[r, c] == np.inf:
                 continue
-            across, along = np.inf, np.inf
+            across = np.inf
+            along = np.inf
             if r > 0:
                 across = field[r - 1, c]
             if r < rows - 1:
@@ -275,7 +289,9 @@ def _march(cost: Array, goal_row: int, goal_col: int, start_row: int, start_col:
                 along = field[r, c - 1]
             if c < cols - 1:
                 along = min(along, field[r, c + 1])
-            low, gap, f = min(across, along), abs(across - along), cost[r, c]
+            low = min(across, along)
+            gap = abs(across - along)
+            f = cost[r, c]
             value = low + f
             if gap < f:
                 value = 0.5 * (across + along + math.sqrt(2.0 * f * f - gap * gap))
@@ -291,7 +307,8 @@ def _slope(field: Array, row: int, col: int, out: Array) -> bool:
     """Downhill direction (x, y) in a cell from its lower neighbours; False where there is none."""
     rows, cols = field.shape
     here = field[row, col]
-    out[0], out[1] = 0.0, 0.0
+    out[0] = 0.0
+    out[1] = 0.0
     if here == np.inf:
         return False
     left = field[row, col - 1] if col > 0 else np.inf
@@ -305,7 +322,8 @@ def _slope(field: Array, row: int, col: int, out: Array) -> bool:
     length = math.hypot(out[0], out[1])
     if length == 0.0:
         return False
-    out[0], out[1] = out[0] / length, out[1] / length
+    out[0] = out[0] / length
+    out[1] = out[1] / length
     return True
 
 
@@ -313,7 +331,8 @@ def _slope(field: Array, row: int, col: int, out: Array) -> bool:
 def _lowest_around(field: Array, row: int, col: int) -> tuple[int, int]:
     """The lowest of the eight neighbours; over a corner only where both cells beside are open."""
     rows, cols = field.shape
-    best_row, best_col = row, col
+    best_row = row
+    best_col = col
     for r in range(max(row - 1, 0), min(row + 2, rows)):
         for c in range(max(col - 1, 0), min(col + 2, cols)):
             if (
@@ -321,7 +340,8 @@ def _lowest_around(field: Array, row: int, col: int) -> tuple[int, int]:
                 and field[r, col] < np.inf
                 and field[r, c] < field[best_row, best_col]
             ):
-                best_row, best_col = r, c
+                best_row = r
+                best_col = c
     return best_row, best_col
 
 
@@ -336,27 +356,42 @@ def _descend(field: Array, x: float, y: float, goal_row: int, goal_col: int) -> 
     rows, cols = field.shape
     path = np.empty((8 * field.size + 8, 2))
     slope = np.empty(2)
-    path[0, 0], path[0, 1] = x, y
-    row, col = int(math.floor(y)), int(math.floor(x))
-    count, stays = 1, 0
+    path[0, 0] = x
+    path[0, 1] = y
+    row = int(math.floor(y))
+    col = int(math.floor(x))
+    count = 1
+    stays = 0
     while (row != goal_row or col != goal_col) and count < path.shape[0] - 1:
-        dx, dy = 0.0, 0.0
-        first_row, first_col = int(math.floor(y - 0.5)), int(math.floor(x - 0.5))
+        dx = 0.0
+        dy = 0.0
+        first_row = int(math.floor(y - 0.5))
+        first_col = int(math.floor(x - 0.5))
         for r in range(max(first_row, 0), min(first_row + 2, rows)):
             for c in range(max(first_col, 0), min(first_col + 2, cols)):
                 if _slope(field, r, c, slope):
                     share = (1.0 - abs(x - c - 0.5)) * (1.0 - abs(y - r - 0.5))
-                    dx, dy = dx + share * slope[0], dy + share * slope[1]
+                    dx = dx + share * slope[0]
+                    dy = dy + share * slope[1]
         length = max(math.hypot(dx, dy), 1e-9)
-        next_x, next_y = x + _STEP_CELLS * dx / length, y + _STEP_CELLS * dy / length
-        r, c = int(math.floor(next_y)), int(math.floor(next_x))
+        next_x = x + _STEP_CELLS * dx / length
+        next_y = y + _STEP_CELLS * dy / length
+        r = int(math.floor(next_y))
+        c = int(math.floor(next_x))
         stays = stays + 1 if r == row and c == col else 0
         inside = 0 <= r < rows and 0 <= c < cols
         if stays > 3 or not inside or (stays == 0 and not field[r, c] < field[row, col]):
             r, c = _lowest_around(field, row, col)
-            next_x, next_y, stays = c + 0.5, r + 0.5, 0
-        x, y, row, col = next_x, next_y, r, c
-        path[count, 0], path[count, 1] = x, y
+            next_x = c + 0.5
+            next_y = r + 0.5
+            stays = 0
+        x = next_x
+        y = next_y
+        row = r
+        col = c
+        path[count, 0] = x
+        path[count, 1] = y
         count += 1
-    path[count, 0], path[count, 1] = goal_col + 0.5, goal_row + 0.5
+    path[count, 0] = goal_col + 0.5
+    path[count, 1] = goal_row + 0.5
     return path[: count + 1].copy()

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.keyframes import Keyframe
-from thinmap_ros.core.slam.local_map import LocalMap, LocalMapConfig
+from thinmap_ros.core.slam.graph.keyframes import Keyframe
+from thinmap_ros.core.slam.matching.local_map import LocalMap, LocalMapConfig
 
 _AT_ONCE = 20  # keyframes rendered at once after a correction
 _A_STEP = 2  # and in each step after it

@@ -1,10 +1,10 @@
 """The heading by the main directions of the building's walls: new walls are rendered straight."""
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.ekf_slam.lines import LineConfig, extract_lines
+from thinmap_ros.core.ekf_slam.line_extraction import LineConfig, extract_lines
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.uncertainty import PoseUncertainty
+from thinmap_ros.core.slam.covariance import PoseUncertainty
 from thinmap_ros.core.slam.wall_compass import Heading, WallCompass
 
 _NEW_SHARE = 0.2  # of the error of a match, from one update of the map to the next

@@ -1,8 +1,8 @@
 """The localizers, and which of them a configuration asks for."""
 
+from thinmap_ros.core.ekf_slam.ekf_localizer import EkfLocalizer
 from thinmap_ros.core.ekf_slam.features import LineFeature
-from thinmap_ros.core.ekf_slam.localizer import EkfLocalizer
-from thinmap_ros.core.slam.scan_localizer import ScanLocalizer, ScanLocalizerConfig
+from thinmap_ros.core.slam.localizer import ScanLocalizer, ScanLocalizerConfig
 from thinmap_ros.core.topology.graph import TopologicalMap
 
 AnyLocalizer = ScanLocalizer | EkfLocalizer

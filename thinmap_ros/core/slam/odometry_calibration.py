@@ -46,7 +46,8 @@ class OdometryCalibration:
 
     def interrupt(self) -> None:
         """Compare nothing across this moment: the pose was not found but put, moved or lost."""
-        self._begin, self._expected = None, np.zeros(3)
+        self._begin = None
+        self._expected = np.zeros(3)
         self._way_m = self._turned_rad = 0.0
         self._random = np.zeros(2)
 
@@ -57,12 +58,15 @@ class OdometryCalibration:
 
         variances (2,): of its chord, m^2, and of its turn, rad^2, by what it errs by at random.
         """
-        way, turned = _way(increment), float(increment[2])
+        way = _way(increment)
+        turned = float(increment[2])
         scale, drift, turn_scale, askew = self.known
         turn = turn_scale * turned + drift * way
         bent = askew + 0.5 * (turn - turned)  # the chord of an arc lies half of its turn off
-        c, s = scale * math.cos(bent), scale * math.sin(bent)
-        x, y = c * increment[0] - s * increment[1], s * increment[0] + c * increment[1]
+        c = scale * math.cos(bent)
+        s = scale * math.sin(bent)
+        x = c * increment[0] - s * increment[1]
+        y = s * increment[0] + c * increment[1]
         self._way_m += way
         self._turned_rad += turned
         self._random = self._random + variances
@@ -94,7 +98,8 @@ class OdometryCalibration:
             turn = rotation(float(self._begin[2]))
             self._learn(se2.between(self._begin, T_map_base), turn.T @ (doubt + self._doubt) @ turn)
         self.interrupt()
-        self._begin, self._doubt = T_map_base, doubt
+        self._begin = T_map_base
+        self._doubt = doubt
 
     def _learn(self, found: Array, doubt: Array) -> None:
         """Kalman updates with a span's turn, and its length along where it should have led.
@@ -110,7 +115,8 @@ class OdometryCalibration:
         if length > 0.5 * _SPAN_M:
             x, y = self._expected[:2] / length
             dx, dy = found[:2] - self._expected[:2]
-            along, across = np.array([x, y]), np.array([-y, x])
+            along = np.array([x, y])
+            across = np.array([-y, x])
             variance = _SIGMA_M**2 + self._random[0] + float(along @ doubt[:2, :2] @ along)
             self._update(
                 x * dx + y * dy, np.array([length / self.known[0], 0.0, 0.0, 0.0]), variance
@@ -140,5 +146,6 @@ class OdometryCalibration:
 
 def _way(increment: Array) -> float:
     """Signed length of an increment (3,): negative where the robot drove backwards."""
-    chord, half = math.hypot(increment[0], increment[1]), 0.5 * float(increment[2])
+    chord = math.hypot(increment[0], increment[1])
+    half = 0.5 * float(increment[2])
     return -chord if increment[0] * math.cos(half) + increment[1] * math.sin(half) < 0.0 else chord

@@ -6,9 +6,9 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.keyframes import carried, turned
-from thinmap_ros.core.slam.matcher import Match
-from thinmap_ros.core.slam.prediction import Prediction
+from thinmap_ros.core.slam.graph.keyframes import carried, turned
+from thinmap_ros.core.slam.matching.scan_matcher import Match
+from thinmap_ros.core.slam.odometry_prediction import Prediction
 
 FOR_A_SLIP = 3.0  # points that fit, for one that contradicts, where scan and motion disagree
 _ADRIFT_M = 10.0  # path in a new local map after which it is part of the map for good

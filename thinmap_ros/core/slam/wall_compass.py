@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thinmap_ros.core.ekf_slam.lines import Lines
+from thinmap_ros.core.ekf_slam.line_extraction import Lines
 from thinmap_ros.core.se2 import Array
 
 _QUARTER = 0.5 * math.pi
@@ -26,9 +26,11 @@ _LEAST_M = 60.0  # of wall, scan by scan, before a direction is believed
 _MOST = 0.7  # share of them that stands in it
 # The heading is surest where the map begins: after so much way a wall weighs half as much, and in
 # the end this much.
-_FADES_M, _LEAST_WEIGHT = 20.0, 0.02
+_FADES_M = 20.0
+_LEAST_WEIGHT = 0.02
 _ASKEW_RAD = 0.003  # by which walls are built askew, 1 sigma
-_GATE_SIGMAS, _WIDEST_RAD = 3.0, 0.35
+_GATE_SIGMAS = 3.0
+_WIDEST_RAD = 0.35
 _SHORTEST_M = 1.5  # of wall in a scan that tells a heading
 
 
@@ -45,7 +47,8 @@ class WallCompass:
     def __init__(self) -> None:
         # By direction: metres of wall, weighted, and these times where in the bin the walls stand
         # on an average.
-        self._metres, self._places = np.zeros(_BINS), np.zeros(_BINS)
+        self._metres = np.zeros(_BINS)
+        self._places = np.zeros(_BINS)
 
     def learn(self, lines: Lines, yaw: float, way_m: float) -> None:
         """Take in the walls of a scan made with a heading, rad, so far along the way, m."""
@@ -74,7 +77,8 @@ class WallCompass:
 
         None where the building has no such direction, or these lines do not tell it.
         """
-        direction, lengths = self.direction, _lengths(lines)
+        direction = self.direction
+        lengths = _lengths(lines)
         if direction is None:
             return None
         off = (lines.z[:, 1] + yaw - direction + 0.5 * _QUARTER) % _QUARTER - 0.5 * _QUARTER

@@ -11,7 +11,7 @@ from thinmap_ros.core import snapshot
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.snapshot import FAR_CELLS, LARGEST_COUNT, Field
 from thinmap_ros.core.topology.net import Net, chains_of
-from thinmap_ros.core.topology.web import Chain, Spot, Web
+from thinmap_ros.core.topology.skeleton_graph import Chain, Spot, Web
 
 Cells = NDArray[np.int64]
 _BLOCK = 6  # chains are listed by blocks of 2**6 cells
@@ -79,12 +79,14 @@ class Box:
 
     def middle(self, size: int) -> 'Box':
         """The square of at most so many rows and columns in its middle."""
-        rows, cols = max(self.rows - size, 0) // 2, max(self.cols - size, 0) // 2
+        rows = max(self.rows - size, 0) // 2
+        cols = max(self.cols - size, 0) // 2
         return Box(self.row + rows, self.col + cols, min(self.rows, size), min(self.cols, size))
 
     def within(self, outer: 'Box') -> tuple[slice, slice]:
         """Where it lies in an array of the outer one's cells."""
-        row, col = self.row - outer.row, self.col - outer.col
+        row = self.row - outer.row
+        col = self.col - outer.col
         return slice(row, row + self.rows), slice(col, col + self.cols)
 
     def meets(self, other: 'Box') -> bool:
@@ -143,7 +145,8 @@ class Atlas(Web):
         start = 0
         for number, a, b, count in state['chains'].tolist():
             part = state['cells'][start : start + count]
-            atlas._next, start = number - 1, start + count
+            atlas._next = number - 1
+            start = start + count
             atlas.add_chain(
                 Chain(a, b, np.ascontiguousarray(part[:, :2]), np.ascontiguousarray(part[:, 2]))
             )
@@ -157,7 +160,8 @@ class Atlas(Web):
         Also of the spots that got other chains.
         """
         changes = self._changed_spots, self._changed_chains
-        self._changed_spots, self._changed_chains = set(), set()
+        self._changed_spots = set()
+        self._changed_chains = set()
         return changes
 
     def add_spot(self, spot: Spot) -> int:
@@ -205,7 +209,8 @@ class Atlas(Web):
         squared = [chain.squared for chain in near] + [np.array([spot.squared]) for spot in alone]
         if not cells:
             return np.empty((0, 2), dtype=np.int64), np.empty(0, dtype=np.int64)
-        all_cells, all_squared = np.concatenate(cells), np.concatenate(squared)
+        all_cells = np.concatenate(cells)
+        all_squared = np.concatenate(squared)
         inside = box.holds(all_cells)
         return all_cells[inside], all_squared[inside]
 
@@ -271,7 +276,8 @@ class Atlas(Web):
         There, chains that are cut would touch each other.
         """
         while True:
-            reach, inner = box.grown(_RIM), box.grown(-_RIM)
+            reach = box.grown(_RIM)
+            inner = box.grown(-_RIM)
             ends = {
                 spot
                 for number in self._near(reach)
@@ -295,7 +301,8 @@ class Atlas(Web):
         left = {at for at in links if at > 0}
         groups = []
         while left:
-            group, open_ends = {left.pop()}, deque[int]()
+            group = {left.pop()}
+            open_ends = deque[int]()
             open_ends.extend(group)
             seen = {0, *group}
             while open_ends and left:
@@ -337,10 +344,13 @@ class Atlas(Web):
 
 def _check_references(state: Mapping[str, Cells]) -> None:
     """Raise InputError unless each chain runs, cell by cell, from one of the spots to another."""
-    spots, chains, cells = state['spots'], state['chains'], state['cells']
+    spots = state['spots']
+    chains = state['chains']
+    cells = state['cells']
     numbers = np.concatenate([spots[:, 0], chains[:, 0]])
     snapshot.require_unique(numbers, 'topology: number of a spot or chain')
-    last, newest = int(numbers.max(initial=0)), int(state['next'][0])
+    last = int(numbers.max(initial=0))
+    newest = int(state['next'][0])
     snapshot.require(last <= newest, f'topology: next {newest}', f'at least {last}')
     snapshot.require_known(chains[:, 1:3].ravel(), spots[:, 0], 'topology: spot of a chain')
     counts = chains[:, 3]
@@ -378,7 +388,8 @@ def _runs_outside(chain: Chain, box: Box) -> list[tuple[int, int]]:
 @kernel
 def _runs(cells: Cells, row: int, col: int, end_row: int, end_col: int) -> Cells:
     runs = np.empty((cells.shape[0] // 2 + 1, 2), dtype=np.int64)
-    count, was_outside = 0, False
+    count = 0
+    was_outside = False
     for k in range(cells.shape[0]):
         outside = not (row <= cells[k, 0] < end_row and col <= cells[k, 1] < end_col)
         if outside and not was_outside:

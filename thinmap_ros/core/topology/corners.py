@@ -46,8 +46,10 @@ def _is_clear(cells: Cells, room: Array, first: int, last: int) -> bool:
 
     At a cell's corner, both beside it.
     """
-    row, col = cells[first, 0], cells[first, 1]
-    rows, cols = abs(cells[last, 0] - row), abs(cells[last, 1] - col)
+    row = cells[first, 0]
+    col = cells[first, 1]
+    rows = abs(cells[last, 0] - row)
+    cols = abs(cells[last, 1] - col)
     up = 1 if cells[last, 0] > row else -1
     right = 1 if cells[last, 1] > col else -1
     i = j = 0
@@ -70,15 +72,19 @@ def _is_clear(cells: Cells, room: Array, first: int, last: int) -> bool:
 @inlined
 def _farthest(cells: Cells, first: int, last: int) -> int:
     """The member strictly between two others that is farthest from the line between them."""
-    d_row, d_col = cells[last, 0] - cells[first, 0], cells[last, 1] - cells[first, 1]
+    d_row = cells[last, 0] - cells[first, 0]
+    d_col = cells[last, 1] - cells[first, 1]
     squared = d_row * d_row + d_col * d_col
-    best, best_distance = (first + last) // 2, 1e-9
+    best = (first + last) // 2
+    best_distance = 1e-9
     for k in range(first + 1, last):
-        row, col = cells[k, 0] - cells[first, 0], cells[k, 1] - cells[first, 1]
+        row = cells[k, 0] - cells[first, 0]
+        col = cells[k, 1] - cells[first, 1]
         share = 0.0 if squared == 0 else min(max((row * d_row + col * d_col) / squared, 0.0), 1.0)
         distance = (row - share * d_row) ** 2 + (col - share * d_col) ** 2
         if distance > best_distance + 1e-9:
-            best, best_distance = k, distance
+            best = k
+            best_distance = distance
     return best
 
 
@@ -86,11 +92,13 @@ def _farthest(cells: Cells, first: int, last: int) -> int:
 def _split(cells: Cells, room: Array) -> NDArray[np.bool_]:
     broken = np.zeros(cells.shape[0], dtype=np.bool_)
     stack = np.empty((cells.shape[0] + 1, 2), dtype=np.int64)
-    stack[0, 0], stack[0, 1] = 0, cells.shape[0] - 1
+    stack[0, 0] = 0
+    stack[0, 1] = cells.shape[0] - 1
     count = 1
     while count > 0:
         count -= 1
-        first, last = stack[count, 0], stack[count, 1]
+        first = stack[count, 0]
+        last = stack[count, 1]
         if last - first < 2:
             continue
         closed = cells[first, 0] == cells[last, 0] and cells[first, 1] == cells[last, 1]
@@ -98,7 +106,9 @@ def _split(cells: Cells, room: Array) -> NDArray[np.bool_]:
             continue
         middle = _farthest(cells, first, last)
         broken[middle] = True
-        stack[count, 0], stack[count, 1] = first, middle
-        stack[count + 1, 0], stack[count + 1, 1] = middle, last
+        stack[count, 0] = first
+        stack[count, 1] = middle
+        stack[count + 1, 0] = middle
+        stack[count + 1, 1] = last
         count += 2
     return broken

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.components import label, reachable
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.topology.config import TopologyConfig
-from thinmap_ros.core.topology.parts import label, reachable
 
 Cells = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -110,9 +110,11 @@ def _close_gaps(states: NDArray[np.uint8], gap: int) -> Mask:
                     free[row, left + 1 : col] = True
                 if last_free[col] >= 0 and 1 < row - last_free[col] <= gap + 1:
                     free[last_free[col] + 1 : row, col] = True
-                left, last_free[col] = col, row
+                left = col
+                last_free[col] = row
             elif state == 0:
-                left, last_free[col] = -1, -1
+                left = -1
+                last_free[col] = -1
     return free
 
 
@@ -162,7 +164,8 @@ def squared_clearance(distance: NDArray[np.int16], cells: Cells) -> Cells:
     cols = distance.shape[1]
     squared = np.empty(cells.shape[0], dtype=np.int64)
     for i in range(cells.shape[0]):
-        row, col = cells[i, 0], cells[i, 1]
+        row = cells[i, 0]
+        col = cells[i, 1]
         best = np.int64(distance[row, col]) ** 2
         step = 1
         while step * step < best:
@@ -184,6 +187,7 @@ def true_cells(mask: Mask) -> Cells:
     for row in range(mask.shape[0]):
         for col in range(mask.shape[1]):
             if mask[row, col]:
-                cells[count, 0], cells[count, 1] = row, col
+                cells[count, 0] = row
+                cells[count, 1] = col
                 count += 1
     return cells[:count].copy()

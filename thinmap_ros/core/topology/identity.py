@@ -18,7 +18,7 @@ from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.corners import corner_indices
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.core.topology.skeleton import edge_of, kind_of, node_of
-from thinmap_ros.core.topology.web import Chain, room_along
+from thinmap_ros.core.topology.skeleton_graph import Chain, room_along
 
 _NEW = 0  # id of a node that has none yet
 _OTHER_KIND = 0.5  # share of same_place_m by which a node of another kind counts as farther away
@@ -164,7 +164,8 @@ class Registry:
         """Spots and corners that are new or may have changed, as nodes yet without id."""
         places = []
         for spot in sorted(spots & atlas.spots.keys()):
-            cell, squared = atlas.spots[spot].cell, atlas.spots[spot].squared
+            cell = atlas.spots[spot].cell
+            squared = atlas.spots[spot].squared
             places.append(
                 ((spot, -1), node_of(_NEW, kind_of(atlas, spot), cell, squared, self._lattice))
             )
@@ -226,7 +227,8 @@ class Registry:
 
     def _pieces_of(self, atlas: Atlas, number: int) -> list[tuple[int, int, Chain]]:
         """The pieces of a chain between its nodes, and the ids of these."""
-        chain, breaks = atlas.chains[number], self._breaks[number]
+        chain = atlas.chains[number]
+        breaks = self._breaks[number]
         ids = [
             self._nodes[chain.a, -1],
             *(self._nodes[number, k] for k in breaks),

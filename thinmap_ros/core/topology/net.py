@@ -11,16 +11,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.jit import inlined, kernel
-from thinmap_ros.core.topology.web import Chain, Spot, Web
+from thinmap_ros.core.topology.skeleton_graph import Chain, Spot, Web
 
 Cells = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 NONE = -1
 # Of a spot; squared clearance in cells, chain ends; degree NONE: gone.
-ROW, COL, SQUARED, DEGREE = 0, 1, 2, 3
-A, B, START, COUNT = 0, 1, 2, 3  # of a chain; a NONE: gone
-DONE, FULL, SHORT = 0, 1, 2  # how far one got: to the end, out of room, or past what was put in
-_CHAINS, _CELLS, _STATE = 0, 1, 2  # of what is used
+ROW = 0
+COL = 1
+SQUARED = 2
+DEGREE = 3
+# Of a chain; a NONE: gone
+A = 0
+B = 1
+START = 2
+COUNT = 3
+# How far one got: to the end, out of room, or past what was put in
+DONE = 0
+FULL = 1
+SHORT = 2
+# Of what is used
+_CHAINS = 0
+_CELLS = 1
+_STATE = 2
 _REACH = 4  # chains from a spot that are put in at first
 
 
@@ -50,7 +63,8 @@ def net_of(nodes: Cells, ends: Cells, starts: Cells, cells: Cells, room: int = 1
     ends (M, 2): nodes; starts (M + 1,): where in the cells (K, 3) each chain begins; room: for how
     many times as much.
     """
-    chains, count = len(ends) * (1 + room) + 64, len(cells) * (1 + 3 * room) + 4096
+    chains = len(ends) * (1 + room) + 64
+    count = len(cells) * (1 + 3 * room) + 4096
     net = Net(
         np.zeros((len(nodes), 4), dtype=np.int64),
         np.full((len(nodes), 2), NONE, dtype=np.int64),
@@ -95,7 +109,8 @@ def is_among(net: Net, number: int, chosen: Mask) -> bool:
 @kernel
 def length_of(net: Net, number: int) -> float:
     """Length of a chain along its cells, in cells."""
-    length, start = 0.0, net.chains[number, START]
+    length = 0.0
+    start = net.chains[number, START]
     for k in range(start + 1, start + net.chains[number, COUNT]):
         length += math.hypot(
             net.cells[k, 0] - net.cells[k - 1, 0], net.cells[k, 1] - net.cells[k - 1, 1]
@@ -127,12 +142,16 @@ def add_chain(net: Net, a: int, b: int, start: int, count: int) -> None:
     """Add a chain between two spots, along cells that are there."""
     number = net.used[_CHAINS]
     net.used[_CHAINS] += 1
-    net.chains[number, A], net.chains[number, B] = a, b
-    net.chains[number, START], net.chains[number, COUNT] = start, count
+    net.chains[number, A] = a
+    net.chains[number, B] = b
+    net.chains[number, START] = start
+    net.chains[number, COUNT] = count
     for side in range(2):
-        spot, end = net.chains[number, side], 2 * number + side
+        spot = net.chains[number, side]
+        end = 2 * number + side
         last = net.hooks[spot, 1]
-        net.ends[end, 0], net.ends[end, 1] = last, NONE
+        net.ends[end, 0] = last
+        net.ends[end, 1] = NONE
         if last == NONE:
             net.hooks[spot, 0] = end
         else:
@@ -145,8 +164,10 @@ def add_chain(net: Net, a: int, b: int, start: int, count: int) -> None:
 def drop_chain(net: Net, number: int) -> None:
     """Remove a chain; its spots and cells stay."""
     for side in range(2):
-        spot, end = net.chains[number, side], 2 * number + side
-        before, after = net.ends[end, 0], net.ends[end, 1]
+        spot = net.chains[number, side]
+        end = 2 * number + side
+        before = net.ends[end, 0]
+        after = net.ends[end, 1]
         if before == NONE:
             net.hooks[spot, 0] = after
         else:
@@ -184,11 +205,13 @@ def dissolve(net: Net, spot: int) -> None:
         return
     first = net.hooks[spot, 0]
     second = net.ends[first, 1]
-    one, two = first // 2, second // 2
+    one = first // 2
+    two = second // 2
     count = net.chains[one, COUNT] + net.chains[two, COUNT] - 1
     if one == two or not fits(net, count):
         return
-    a, b = net.chains[one, 1 - first % 2], net.chains[two, 1 - second % 2]
+    a = net.chains[one, 1 - first % 2]
+    b = net.chains[two, 1 - second % 2]
     append_cells(net, net.chains[one, START], net.chains[one, COUNT], first % 2 == 0, 0)
     append_cells(net, net.chains[two, START], net.chains[two, COUNT], second % 2 == 1, 1)
     drop_chain(net, one)
@@ -213,13 +236,16 @@ def merge(net: Net, number: int, kept: int) -> None:
     """
     backwards = net.chains[number, A] != kept
     gone = net.chains[number, A if backwards else B]
-    start, count = net.chains[number, START], net.chains[number, COUNT]
+    start = net.chains[number, START]
+    count = net.chains[number, COUNT]
     if not whole(net, gone):
         return
     drop_chain(net, number)
     while net.hooks[gone, 0] != NONE:
         other = net.hooks[gone, 0] // 2
-        a, b, length = net.chains[other, A], net.chains[other, B], net.chains[other, COUNT]
+        a = net.chains[other, A]
+        b = net.chains[other, B]
+        length = net.chains[other, COUNT]
         total = length + (count - 1) * (np.int64(a == gone) + np.int64(b == gone))
         if not fits(net, total):
             return
@@ -281,7 +307,8 @@ def change(web: Web, spots: set[int], act: Callable[[Net, Mask], None]) -> None:
     As much of the web is put into the net as the code turns out to need. Nothing but that is looked
     at, so the cost does not depend on the size of the web.
     """
-    reach, room = _REACH, 1
+    reach = _REACH
+    room = 1
     while True:
         numbers, chains, partial = _neighbourhood(web, spots, reach)
         net = _net_in(web, numbers, chains, partial, room)

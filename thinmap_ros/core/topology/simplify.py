@@ -31,8 +31,8 @@ from thinmap_ros.core.topology.net import (
     merge,
     state_of,
 )
-from thinmap_ros.core.topology.spurs import Limits, Outlook, drop_spurs
-from thinmap_ros.core.topology.web import Web
+from thinmap_ros.core.topology.pruning import Limits, Outlook, drop_spurs
+from thinmap_ros.core.topology.skeleton_graph import Web
 
 Cells = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -71,10 +71,12 @@ def _merge_close(net: Net, chosen: Mask, limit: float) -> None:
     count = 0
     for number in range(numbers.size):
         if is_among(net, number, chosen) and net.chains[number, COUNT] <= limit + 1.0:
-            numbers[count], lengths[count] = number, length_of(net, number)
+            numbers[count] = number
+            lengths[count] = length_of(net, number)
             count += 1
     for k in np.argsort(lengths[:count], kind='mergesort'):
-        a, b = net.chains[numbers[k], A], net.chains[numbers[k], B]
+        a = net.chains[numbers[k], A]
+        b = net.chains[numbers[k], B]
         if a in (NONE, b) or lengths[k] > limit:
             continue
         if net.spots[a, DEGREE] >= 3 and net.spots[b, DEGREE] >= 3:
@@ -97,7 +99,8 @@ def _drop_hollow(net: Net, chosen: Mask, radius: float) -> None:
     for number in range(beside.size):
         if not is_among(net, number, chosen):
             continue
-        a, b = net.chains[number, A], net.chains[number, B]
+        a = net.chains[number, A]
+        b = net.chains[number, B]
         count = _side_by_side(net, a if chosen[a] else b, b if chosen[a] else a, beside)
         # Once for all that lie side by side, and most chains are alone.
         if beside[0] == number and (count > 1 or a == b):
@@ -110,7 +113,8 @@ def _side_by_side(net: Net, spot: int, other: int, found: Cells) -> int:
 
     Returns how many.
     """
-    count, end = 0, net.hooks[spot, 0]
+    count = 0
+    end = net.hooks[spot, 0]
     while end != NONE:
         number = end // 2
         if net.chains[number, 1 - end % 2] == other and (count == 0 or found[count - 1] != number):
@@ -131,7 +135,8 @@ def _drop_narrow(net: Net, numbers: Cells, least: float) -> None:
     kept = np.empty(numbers.size, dtype=np.int64)
     count = 0
     for k in np.argsort(lengths, kind='mergesort'):
-        a, b = net.chains[numbers[k], A], net.chains[numbers[k], B]
+        a = net.chains[numbers[k], A]
+        b = net.chains[numbers[k], B]
         narrow = a == b and abs(twice[k]) / 2.0 < least
         for i in kept[:count]:
             back = twice[i] if net.chains[numbers[i], A] == b else -twice[i]
@@ -149,7 +154,8 @@ def _twice_area(net: Net, number: int) -> int:
 
     Gauss's shoelace formula.
     """
-    twice, start = 0, net.chains[number, START]
+    twice = 0
+    start = net.chains[number, START]
     for k in range(start, start + net.chains[number, COUNT] - 1):
         twice += net.cells[k, 0] * net.cells[k + 1, 1] - net.cells[k, 1] * net.cells[k + 1, 0]
     return twice
@@ -184,7 +190,8 @@ def _farthest_out(ring: Cells) -> int:
     middle_row = (ring[:, 0].min() + ring[:, 0].max()) / 2.0
     middle_col = (ring[:, 1].min() + ring[:, 1].max()) / 2.0
     distance = np.hypot(ring[:-1, 0] - middle_row, ring[:-1, 1] - middle_col)
-    limit, best = distance.max() - 2.0, NONE
+    limit = distance.max() - 2.0
+    best = NONE
     for k in range(distance.size):
         if distance[k] < limit:
             continue

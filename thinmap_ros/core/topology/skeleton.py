@@ -6,6 +6,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core.grid.components import reachable
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.topology.config import TopologyConfig
@@ -18,12 +19,11 @@ from thinmap_ros.core.topology.free_space import (
 )
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.core.topology.net import DONE, Net, net_of, state_of, web_of_net
-from thinmap_ros.core.topology.parts import reachable
+from thinmap_ros.core.topology.pruning import Limits, Outlook
 from thinmap_ros.core.topology.simplify import simplify_net
-from thinmap_ros.core.topology.spurs import Limits, Outlook
+from thinmap_ros.core.topology.skeleton_graph import Chain, Web, room_along
 from thinmap_ros.core.topology.thinning import thin
 from thinmap_ros.core.topology.tracing import trace
-from thinmap_ros.core.topology.web import Chain, Web, room_along
 
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.int64]

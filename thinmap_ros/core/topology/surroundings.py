@@ -21,7 +21,8 @@ from thinmap_ros.core.topology.config import TopologyConfig
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.int64]
 States = NDArray[np.int8]
-FREE, OCCUPIED = np.int8(0), np.int8(100)
+FREE = np.int8(0)
+OCCUPIED = np.int8(100)
 _NEVER = np.int8(-2)  # never in a window, or forgotten
 _BLOCK = 3  # painting looks first at blocks of 2**3 cells
 FIELDS = {
@@ -211,9 +212,11 @@ def _paint(cells: States, centres: Cells, squared: Cells) -> Mask:
         for col in range(cols):
             gaps[row >> _BLOCK, col >> _BLOCK] |= cells[row, col] == _NEVER
     for i in range(centres.shape[0]):
-        row, col = centres[i, 0], centres[i, 1]
+        row = centres[i, 0]
+        col = centres[i, 1]
         reach = int(np.sqrt(squared[i]))
-        low_row, low_col = max(row - reach, 0) >> _BLOCK, max(col - reach, 0) >> _BLOCK
+        low_row = max(row - reach, 0) >> _BLOCK
+        low_col = max(col - reach, 0) >> _BLOCK
         if not np.any(
             gaps[low_row : (row + reach >> _BLOCK) + 1, low_col : (col + reach >> _BLOCK) + 1]
         ):

@@ -11,7 +11,10 @@ Index = np.uintp  # unsigned: compiled code then asks no question about indices 
 _WORD = 64
 _LANES = 4  # words that processors work on at once
 _BAND = 8  # rows that are looked at together
-_TOP, _ANY, _BOTTOM = 0, 1, 2  # where in a band: in its first row, in any, in its last
+# Where in a band: in its first row, in any, in its last
+_TOP = 0
+_ANY = 1
+_BOTTOM = 2
 
 
 def thin(free: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -61,10 +64,14 @@ def _find(
     north: the first sub-iteration, which keeps what (c) and (d) say of p2 p4 p6 and p4 p6 p8; else
     the second.
     """
-    one, top, step = np.uint64(1), np.uint64(63), Index(1)
+    one = np.uint64(1)
+    top = np.uint64(63)
+    step = Index(1)
     for k in range(count):
         at = first + k
-        p2, p1, p6 = words[at - stride], words[at], words[at + stride]
+        p2 = words[at - stride]
+        p1 = words[at]
+        p6 = words[at + stride]
         p3 = (p2 >> one) | (words[at - stride + step] << top)
         p4 = (p1 >> one) | (words[at + step] << top)
         p5 = (p6 >> one) | (words[at + stride + step] << top)
@@ -72,7 +79,8 @@ def _find(
         p8 = (p1 << one) | (words[at - step] >> top)
         p7 = (p6 << one) | (words[at + stride - step] >> top)
         # S = 1 by counting the rises 0 -> 1 up to two: `some` has one or more, `many` two or more.
-        some, many = ~p2 & p3, np.uint64(0)
+        some = ~p2 & p3
+        many = np.uint64(0)
         for rise in (~p3 & p4, ~p4 & p5, ~p5 & p6, ~p6 & p7, ~p7 & p8, ~p8 & p9, ~p9 & p2):
             many |= some & rise
             some |= rise
@@ -99,12 +107,16 @@ def _thin_words(words: Words, stride: int) -> None:
     deleted = np.zeros(words.size, dtype=np.uint64)
     # Of the last two sub-iterations: bands (from 1 on) that changed;
     # first column of the changes there, and their end.
-    active, counts = np.empty((2, bands), dtype=np.int64), np.zeros(2, dtype=np.int64)
+    active = np.empty((2, bands), dtype=np.int64)
+    counts = np.zeros(2, dtype=np.int64)
     first = np.full((2, bands + 2, 3), stride, dtype=np.int64)
     end = np.zeros((2, bands + 2, 3), dtype=np.int64)
-    first[:, 1:-1], end[:, 1:-1] = 1, stride - 1
-    active[:], counts[:] = np.arange(1, bands + 1), bands
-    stamps, due = np.full(bands + 2, -1, dtype=np.int64), np.empty((bands, 3), dtype=np.int64)
+    first[:, 1:-1] = 1
+    end[:, 1:-1] = stride - 1
+    active[:] = np.arange(1, bands + 1)
+    counts[:] = bands
+    stamps = np.full(bands + 2, -1, dtype=np.int64)
+    due = np.empty((bands, 3), dtype=np.int64)
     turn = 0
     while counts[0] + counts[1] > 0:
         total = 0
@@ -112,11 +124,14 @@ def _thin_words(words: Words, stride: int) -> None:
             for middle in active[which, : counts[which]]:
                 for band in range(max(middle - 1, 1), min(middle + 2, bands + 1)):
                     if stamps[band] < turn:
-                        stamps[band], due[total, 0] = turn, band
+                        stamps[band] = turn
+                        due[total, 0] = band
                         due[total, 1], due[total, 2] = _columns(first, end, band, stride)
                         total += due[total, 1] < due[total, 2]
         for i in range(total):
-            band, low, high = due[i, 0], due[i, 1], due[i, 2]
+            band = due[i, 0]
+            low = due[i, 1]
+            high = due[i, 2]
             count = Index((high - low + _LANES - 1) // _LANES * _LANES)
             for row in range((band - 1) * _BAND + 1, min(band * _BAND, rows) + 1):
                 if turn % 2 == 0:
@@ -125,10 +140,13 @@ def _thin_words(words: Words, stride: int) -> None:
                     _find(words, Index(row * stride + low), count, Index(stride), False, deleted)
         which = turn % 2
         for band in active[which, : counts[which]]:
-            first[which, band], end[which, band] = stride, 0
+            first[which, band] = stride
+            end[which, band] = 0
         counts[which] = 0
         for i in range(total):
-            band, low, high = due[i, 0], due[i, 1], due[i, 2]
+            band = due[i, 0]
+            low = due[i, 1]
+            high = due[i, 2]
             rim = (band - 1) * _BAND + 1, min(band * _BAND, rows)
             _delete_band(
                 words, deleted, stride, rim, (low, high), first[which, band], end[which, band]
@@ -141,7 +159,8 @@ def _thin_words(words: Words, stride: int) -> None:
 @inlined
 def _columns(first: Cells, end: Cells, band: int, stride: int) -> tuple[int, int]:
     """First column of words, and their end, that changes touch in a band or the rows next to it."""
-    low, high = stride, 0
+    low = stride
+    high = 0
     for which in range(2):
         low = min(
             low,

@@ -83,7 +83,8 @@ def clean(
         left = cells.size
         count = 0
         for at in cells:
-            row, col = at // cols, at % cols
+            row = at // cols
+            col = at % cols
             if not pinned[row, col] and redundant[_code(kinds, row, col)]:
                 kinds[row, col] = 0
             else:
@@ -113,36 +114,50 @@ def place_nodes(
     cell has three or more crossings, if any has, and is the nearest such to the cluster's middle.
     """
     cols = kinds.shape[1]
-    flat, steps = kinds.ravel(), _steps(cols)
-    owner, parent = np.zeros(flat.size, dtype=np.int32), np.full(flat.size, -1, dtype=np.int64)
-    nodes, queue = np.empty(cells.size, dtype=np.int64), np.empty(cells.size, dtype=np.int64)
+    flat = kinds.ravel()
+    steps = _steps(cols)
+    owner = np.zeros(flat.size, dtype=np.int32)
+    parent = np.full(flat.size, -1, dtype=np.int64)
+    nodes = np.empty(cells.size, dtype=np.int64)
+    queue = np.empty(cells.size, dtype=np.int64)
     count = 0
     for at in cells:
         if flat[at] == 1 or owner[at]:
             continue
         count += 1
-        owner[at], queue[0], size, head = count, at, 1, 0
+        owner[at] = count
+        queue[0] = at
+        size = 1
+        head = 0
         while flat[at] == 2 and head < size:
             for step in steps:
                 to = queue[head] + step
                 if flat[to] == 2 and not owner[to]:
-                    owner[to], queue[size] = count, to
+                    owner[to] = count
+                    queue[size] = to
                     size += 1
             head += 1
-        row, col = (queue[:size] // cols).mean(), (queue[:size] % cols).mean()
-        best, best_score = at, np.inf
+        row = (queue[:size] // cols).mean()
+        col = (queue[:size] % cols).mean()
+        best = at
+        best_score = np.inf
         for cell in queue[:size]:
             score = (cell // cols - row) ** 2 + (cell % cols - col) ** 2
             score += 1e6 if crossings[_code(kinds, cell // cols, cell % cols)] < 3 else 0.0
             if score < best_score:
-                best, best_score = cell, score
+                best = cell
+                best_score = score
         nodes[count - 1] = best
-        parent[best], queue[0], size, head = best, best, 1, 0
+        parent[best] = best
+        queue[0] = best
+        size = 1
+        head = 0
         while head < size:
             for step in steps:
                 to = queue[head] + step
                 if owner[to] == count and parent[to] < 0:
-                    parent[to], queue[size] = queue[head], to
+                    parent[to] = queue[head]
+                    queue[size] = to
                     size += 1
             head += 1
     return nodes[:count], owner, parent
@@ -158,23 +173,29 @@ def follow(
     starts in the flat list of cells, (M + 1,); and that list, node cells included.
     """
     cols = kinds.shape[1]
-    flat, steps = kinds.ravel(), _steps(cols)
+    flat = kinds.ravel()
+    steps = _steps(cols)
     walked = np.zeros(flat.size, dtype=np.bool_)
     all_nodes = np.empty(cells.size, dtype=np.int64)
-    all_nodes[: nodes.size], count = nodes, nodes.size
+    all_nodes[: nodes.size] = nodes
+    count = nodes.size
     ends = np.empty((4 * cells.size + 1, 2), dtype=np.int64)
     starts = np.zeros(4 * cells.size + 2, dtype=np.int64)
     path = np.empty(8 * cells.size + 64, dtype=np.int64)
     scratch = np.empty(cells.size + 1, dtype=np.int64)
-    links, linked = np.empty((4 * cells.size + 1, 2), dtype=np.int64), 0
+    links = np.empty((4 * cells.size + 1, 2), dtype=np.int64)
+    linked = 0
     chains = length = 0
     for ring in range(2):
         for start in cells:
             if ring and (flat[start] != 1 or walked[start]):
                 continue
             if ring:
-                all_nodes[count], count = start, count + 1
-                owner[start], parent[start], walked[start] = count, start, True
+                all_nodes[count] = start
+                count = count + 1
+                owner[start] = count
+                parent[start] = start
+                walked[start] = True
             elif not owner[start]:
                 continue
             for step in steps:
@@ -188,7 +209,8 @@ def follow(
                 if not passage and not beside:
                     continue
                 if beside:
-                    links[linked, 0], links[linked, 1] = owner[start], owner[cell]
+                    links[linked, 0] = owner[start]
+                    links[linked, 1] = owner[cell]
                     linked += 1
                 if path.size - length < 3 * cells.size:
                     path = np.concatenate((path, np.empty(path.size, dtype=np.int64)))
@@ -231,7 +253,8 @@ def _through(
                 and (following < 0 or (owner[to] and not owner[following]))
             ):
                 following = to
-        before, cell = cell, following
+        before = cell
+        cell = following
     return cell, length
 
 

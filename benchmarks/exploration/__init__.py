@@ -1,0 +1,1 @@
+"""The page of the explorations that `compare_exploration` has run."""

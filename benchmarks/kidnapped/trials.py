@@ -1,0 +1,235 @@
+"""Robots switched on anywhere: the maps they have, their drives, how the search for them ends."""
+
+import copy
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.worlds import floors
+from thinmap_ros.baselines.voronoi import build_voronoi
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.places.global_localizer import GlobalLocalization, Hypothesis, Result, State
+from thinmap_ros.core.se2 import Array, wrap
+from thinmap_ros.core.topology.builder import TopologyConfig, build
+from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.experiments.drives import Source
+from thinmap_ros.experiments.maps import grid_of
+from thinmap_ros.files.worlds import read_world
+from thinmap_ros.sim.drives import Look, patch_of, random_drive, random_start
+from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.world import World
+
+LAB = Path(__file__).resolve().parents[2] / 'worlds' / 'lab.yaml'
+LAB_START = (2.0, 2.0, -np.pi / 2.0)
+_RIGHT_RAD = np.radians(10.0)
+_MAPPED_WAY_M = 400.0
+
+Record = dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Map:
+    """What a robot has of a world: grid and topological map."""
+
+    patch: GridPatch
+    topology: TopologicalMap
+
+
+def map_of_patch(patch: GridPatch) -> Map:
+    """A grid with the topological map of all of it."""
+    return Map(patch, build(patch, None, TopologyConfig()))
+
+
+@lru_cache(maxsize=2)
+def floor_of(folder: Path, name: str) -> World:
+    """World of a folder."""
+    return next(floor.world for floor in floors(folder, name) if floor.name == name)
+
+
+def lab() -> World:
+    """The laboratory of the topological map paper."""
+    return World.from_patch(*read_world(LAB))
+
+
+@lru_cache(maxsize=1)
+def lab_map() -> Map:
+    """Its map, merged from its stops."""
+    patch = grid_of(Source().looks('lab_stops')).patch()
+    return Map(patch, build(patch, LAB_START[:2], TopologyConfig()))
+
+
+@lru_cache(maxsize=1)
+def voronoi_lab_map() -> Map:
+    """The same with the nodes of a Voronoi diagram."""
+    return Map(lab_map().patch, build_voronoi(lab_map().patch))
+
+
+def shifted_map(world: World, finer: int, shift_m: tuple[float, float]) -> Map:
+    """A world itself as a map, in cells so many times finer, in a frame moved by this much."""
+    patch = patch_of(world)
+    cells = np.repeat(np.repeat(patch.cells, finer, axis=0), finer, axis=1)
+    frame = patch.frame
+    origin = (frame.origin_x + shift_m[0], frame.origin_y + shift_m[1])
+    shifted = GridFrame(*origin, frame.resolution / finer)
+    return map_of_patch(GridPatch(shifted, cells))
+
+
+def driven_map(world: World, laser: Lms200Config) -> Map:
+    """The map of a long drive with a laser at exact poses, full of what the robot did not see."""
+    looks = random_drive(world, random_start(world, np.random.default_rng(99)), 99, laser=laser)
+    return map_of_patch(grid_of(look for look, _ in along(looks, _MAPPED_WAY_M)).patch())
+
+
+def prepared(known: Map, look: Look, seed: int) -> GlobalLocalization:
+    """A search that has looked at its map, and knows the laser by the scan of a look."""
+    finder = GlobalLocalization(known.patch, known.topology, seed=seed)
+    finder.step(look.scan, look.T_odom_base)
+    finder.restart()
+    return finder
+
+
+def fresh(finder: GlobalLocalization) -> GlobalLocalization:
+    """A copy: each drive is searched as if it were the only one."""
+    return copy.deepcopy(finder)
+
+
+def along(looks: Iterable[Look], way_m: float) -> Iterator[tuple[Look, float]]:
+    """Each look, and the way that has been driven up to there, until that is longer than way_m."""
+    way = 0.0
+    last = None
+    for look in looks:
+        way += 0.0 if last is None else float(np.hypot(*(look.T_world_base - last)[:2]))
+        last = look.T_world_base
+        yield look, way
+        if way > way_m:
+            return
+
+
+def offset(found: Hypothesis, truth: Array) -> tuple[float, float]:
+    """How far a hypothesis is from where the robot truly is (3,): m and rad."""
+    off = found.T_map_base - truth
+    return float(np.hypot(off[0], off[1])), abs(wrap(float(off[2])))
+
+
+def search(
+    finder: GlobalLocalization,
+    looks: Iterable[Look],
+    way_m: float = np.inf,
+    every: int = 1,
+    steps: int = 10**9,
+    right_m: float = 0.3,
+    shift_m: tuple[float, float] = (0.0, 0.0),
+) -> Record:
+    """How the search ends for a robot that drives until it is sure, or steps or way are used up.
+
+    shift_m: where the map's frame is, seen from the world's.
+    """
+    seconds = []
+    count = 0
+    result = None
+    driven_m = 0.0
+    for k, (look, way) in enumerate(along(looks, way_m)):
+        if k % every:
+            continue
+        driven_m = way
+        began = time.process_time()
+        result = finder.step(look.scan, look.T_odom_base)
+        seconds.append(time.process_time() - began)
+        count += 1
+        if result.pose is not None or count == steps:
+            break
+    record: Record = {
+        'outcome': 'open',
+        'way_m': round(driven_m, 2),
+        'steps': count,
+        'off_m': '',
+        'off_deg': '',
+    }
+    if result is not None and result.pose is not None:
+        off_m, off_rad = offset(result.pose, look.T_world_base + (*shift_m, 0.0))
+        good = off_m <= right_m and off_rad <= _RIGHT_RAD
+        off = {'off_m': round(off_m, 3), 'off_deg': round(float(np.degrees(off_rad)), 2)}
+        record |= {'outcome': 'right' if good else 'wrong', **off}
+    return record | {'step_ms': round(1e3 * float(np.median(seconds)), 2)}
+
+
+def watch_twins(finder: GlobalLocalization, looks: Iterable[Look], way_m: float) -> Record:
+    """Counts of steps of a robot that cannot tell places apart.
+
+    How often it is sure, and how often the two likeliest places are equally likely.
+    """
+    results = [finder.step(look.scan, look.T_odom_base) for look, _ in along(looks, way_m)]
+    return {
+        'steps': len(results),
+        'sure': sum(result.state == State.LOCALIZED for result in results),
+        'equal': sum(_gap(result) < 0.1 for result in results),
+    }
+
+
+def _gap(result: Result) -> float:
+    """By how much the likeliest is likelier than the next."""
+    found = sorted((hypothesis.weight for hypothesis in result.hypotheses), reverse=True)
+    weights = [*found, 0.0, 0.0]
+    return weights[0] - weights[1]
+
+
+def watch_foreign(finder: GlobalLocalization, looks: Iterable[Look], way_m: float) -> Record:
+    """After how much way a robot in another building is told so, or sure, and how it ends.
+
+    It is looked for on and on, whether it was sure or not.
+    """
+    record: Record = {'said_m': '', 'sure_m': '', 'last': ''}
+    for look, way in along(looks, way_m):
+        state = finder.step(look.scan, look.T_odom_base).state
+        for key, wanted in (('said_m', State.NOT_IN_MAP), ('sure_m', State.LOCALIZED)):
+            if state == wanted and record[key] == '':
+                record[key] = round(way, 2)
+        record['last'] = state.name
+    return record
+
+
+def twin_rooms() -> tuple[World, NDArray[np.bool_]]:
+    """Two equal rooms, doors shut, not a whole number of cells apart; the robot is in the first."""
+    cells = np.ones((300, 700), dtype=np.uint8)
+    for left in (20, 367):
+        cells[20:270, left : left + 300] = 0
+        cells[110:140, left + 60 : left + 110] = 1
+        cells[210:270, left + 200 : left + 240] = 1
+    within = np.zeros(cells.shape, dtype=np.bool_)
+    within[25:265, 25:315] = True
+    return World('twin rooms', cells, GridFrame(0.0, 0.0, 0.02), np.zeros(3)), within
+
+
+def turned_floor() -> tuple[World, NDArray[np.bool_]]:
+    """A floor that looks the same when it is turned by 180 degrees about its middle."""
+    cells = np.zeros((440, 893), dtype=np.uint8)
+    cells[:5] = cells[-5:] = 1
+    cells[:, :5] = cells[:, -5:] = 1
+    walls = (
+        (100, 0, 105, 300),
+        (250, 200, 255, 420),
+        (0, 400, 180, 405),
+        (300, 80, 340, 140),
+        (30, 520, 60, 600),
+    )
+    for top, left, bottom, right in walls:
+        cells[top:bottom, left:right] = 1
+    cells |= cells[::-1, ::-1]
+    world = World('turned floor', cells, GridFrame(-0.013, -0.027, 0.02), np.zeros(3))
+    return world, np.ones(cells.shape, np.bool_)
+
+
+def coarse_map(world: World) -> Map:
+    """The map of a finer world in cells of 10 cm."""
+    k = round(0.1 / world.frame.resolution)
+    rows, cols = (size // k * k for size in world.occupied.shape)
+    cells = world.occupied[:rows, :cols].reshape(rows // k, k, cols // k, k).max(axis=(1, 3))
+    frame = replace(world.frame, resolution=0.1)
+    return map_of_patch(GridPatch(frame, np.where(cells != 0, np.int8(100), np.int8(0))))

@@ -1,0 +1,42 @@
+"""Two runs of the scoreboard beside each other."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from benchmarks.scoreboard.cases import Case
+from benchmarks.scoreboard.page import MOST_M, errors, worst_tenth
+from benchmarks.scoreboard.played import Numbers
+
+_SAME = 0.05  # a change of an error by a smaller share, or by less than 5 mm, is not listed
+_SAME_M = 0.005
+
+
+def against(
+    cases: Sequence[Case], reports: Sequence[Numbers], others: Sequence[Numbers | None]
+) -> str:
+    """Markdown: live errors here and there, of the cases that both runs have, worse ones first."""
+    both = [k for k, other in enumerate(others) if other is not None]
+    common = [cases[k] for k in both]
+    ours = [reports[k] for k in both]
+    theirs = [other for other in others if other is not None]
+    here = errors(common, ours)
+    there = errors(common, theirs)
+    ratio = (here + 1e-6) / (there + 1e-6)
+    lines = [
+        f'## Against another run ({len(both)} of {len(cases)} cases)\n',
+        f'Live error: median of the ratios {np.median(ratio):.3f}; worst tenth '
+        f'{worst_tenth(common, ours):.3f} m (there {worst_tenth(common, theirs):.3f} m); '
+        f'{MOST_M:g} m or failed: {np.count_nonzero(here >= MOST_M)} '
+        f'(there {np.count_nonzero(there >= MOST_M)}). Changes by more than {_SAME:.0%} and '
+        f'{1000 * _SAME_M:.0f} mm:\n',
+        '| case | here | there | ratio |',
+        '|---|---|---|---|',
+    ]
+    changed = (np.abs(ratio - 1.0) > _SAME) & (np.abs(here - there) > _SAME_M)
+    lines += [
+        f'| {common[k].name} | {here[k]:.3f} | {there[k]:.3f} | {ratio[k]:.2f} |'
+        for k in np.argsort(-ratio, kind='stable')
+        if changed[k]
+    ]
+    return '\n'.join(lines) + '\n'

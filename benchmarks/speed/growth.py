@@ -1,0 +1,143 @@
+"""What a scan and the map cost as it grows: a long drive through the warehouse of 200 x 200 m."""
+
+import math
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import cycle, islice
+from pathlib import Path
+
+import numpy as np
+
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
+from thinmap_ros.evaluation.machine import CpuTimedPipeline, resident_mb
+from thinmap_ros.evaluation.outcome import Row, at_most
+from thinmap_ros.files.package_data import world_path
+from thinmap_ros.files.worlds import read_tour, read_world
+from thinmap_ros.pipeline import PipelineConfig
+from thinmap_ros.sim.drives import Look, drive, ways_along
+from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.robot import PRESETS
+from thinmap_ros.sim.simulation import Simulation
+from thinmap_ros.sim.world import World
+
+_SPEED_M_S = 1.0
+_ROBOT = '2dx'
+_MARKS_M = (100.0, 500.0, 1000.0, 2000.0, 3000.0, 5000.0, 7500.0, 10_000.0)
+_MARKS_QUICK_M = (100.0, 500.0, 1000.0)
+_SPAN_M = 100.0  # before a mark, over which its time is measured
+_WARM_UP = 300  # scans of a drive that is thrown away
+_RANGE_M = 32.0  # another mode of the LMS200: with 8 m, aisles show too little
+_PARTS = ('localizer', 'grid', 'topology')
+
+
+@dataclass(frozen=True, eq=False)
+class _Mark:
+    """After a way, m: CPU of last scans by part, ms; free area, m2; memory, MB; pose error, m."""
+
+    way_m: float
+    taken_ms: dict[str, Array]
+    area_m2: float
+    resident_mb: float
+    off_m: float
+
+
+def run(worlds: Path, quick: bool) -> Iterator[Row]:
+    """Rows at some lengths of the drive, as they come."""
+    deque(_drive(islice(_looks()[0], _WARM_UP), [math.inf]), maxlen=0)  # compiles
+    looks, lap_m = _looks()
+    # Where the first stretch has been driven once more.
+    again = [lap * lap_m + _MARKS_M[0] for lap in range(1, 4)]
+    first: _Mark | None = None
+    new: _Mark | None = None  # the last one of the first lap
+    for mark in _drive(looks, sorted(_MARKS_QUICK_M if quick else {*_MARKS_M, *again})):
+        yield from _rows(mark)
+        first = first or mark
+        if mark is first:
+            continue
+        lap = again.index(mark.way_m) + 2 if mark.way_m in again else None
+        where = f'lap {lap}, on the first {_SPAN_M:.0f} m' if lap else f'after {mark.way_m:.0f} m'
+        yield from _ratios(where, mark, first)
+        if mark.way_m <= lap_m:
+            new = mark
+            grown_kb = 1e3 * (mark.resident_mb - first.resident_mb)
+            yield Row(
+                '  memory a square metre of new free area',
+                f'{grown_kb / (mark.area_m2 - first.area_m2):.3g} kB',
+            )
+        elif new is not None:
+            more_mb = (mark.resident_mb - new.resident_mb) / (1e-3 * (mark.way_m - new.way_m))
+            yield Row('  memory a kilometre on known ground', f'{more_mb:.3g} MB')
+
+
+def _rows(mark: _Mark) -> Iterator[Row]:
+    yield Row(f'after {mark.way_m:.0f} m: free area in the map', f'{mark.area_m2:.0f} m2')
+    every = mark.taken_ms['all']
+    yield Row('  CPU a scan, median and mean', f'{np.median(every):.3g} and {every.mean():.3g} ms')
+    for of, name in ((np.median, 'median'), (np.mean, 'mean')):
+        parts = ', '.join(f'{of(mark.taken_ms[part]):.2f}' for part in _PARTS)
+        yield Row(f'  {", ".join(_PARTS)}: {name}', f'{parts} ms')
+    yield Row('  CPU a scan, 99 of 100', f'{np.percentile(every, 99):.3g} ms')
+    yield Row('  memory', f'{mark.resident_mb:.0f} MB')
+    yield Row('  error of the pose', f'{mark.off_m:.2f} m')
+
+
+def _ratios(where: str, mark: _Mark, first: _Mark) -> Iterator[Row]:
+    now = mark.taken_ms['all']
+    then = first.taken_ms['all']
+    yield at_most(
+        f'  {where}, against the first time: median', float(np.median(now) / np.median(then)), 1.2
+    )
+    yield at_most('  the same, mean', float(now.mean() / then.mean()), 1.2)
+
+
+def _drive(looks: Iterator[Look], marks_m: list[float]) -> Iterator[_Mark]:
+    """Marks after these lengths of the drive."""
+    pipeline: CpuTimedPipeline | None = None
+    way_m = 0.0
+    last = None
+    ways = []
+    taken: dict[str, list[float]] = {part: [] for part in ('all', *_PARTS)}
+    for look in looks:
+        if pipeline is None:
+            x, y, yaw = look.T_world_base.tolist()
+            pipeline = CpuTimedPipeline(
+                PipelineConfig(
+                    localizer=ScanLocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=yaw)
+                )
+            )
+        way_m += 0.0 if last is None else float(np.hypot(*(look.T_world_base - last)[:2]))
+        last = look.T_world_base
+        began = time.process_time()
+        T_map_base = pipeline.step(look.scan, look.T_odom_base).estimate.T_map_base
+        taken['all'].append(time.process_time() - began)
+        for part in _PARTS:
+            taken[part].append(pipeline.stage_seconds[part][-1])
+        ways.append(way_m)
+        if way_m >= marks_m[0]:
+            on_span = np.array(ways) > way_m - _SPAN_M
+            patch = pipeline.grid.patch()
+            yield _Mark(
+                marks_m[0],
+                {part: 1e3 * np.array(each)[on_span] for part, each in taken.items()},
+                float(patch.free.sum()) * patch.frame.resolution**2,
+                resident_mb(),
+                float(np.hypot(*(T_map_base - look.T_world_base)[:2])),
+            )
+            marks_m = marks_m[1:]
+            if not marks_m:
+                return
+
+
+def _looks() -> tuple[Iterator[Look], float]:
+    """The tour of the warehouse, again and again, and its length, m."""
+    path = world_path('warehouse')
+    world = World.from_patch(*read_world(path))
+    tour = read_tour(path)
+    robot = PRESETS[_ROBOT]
+    simulation = Simulation(world, world.start, robot, Lms200Config(range_max_m=_RANGE_M), 0)
+    ways = list(ways_along(world, tour, robot.radius_m))  # closed: it begins where it ends
+    lap_m = float(sum(np.hypot(*np.diff(way, axis=0).T).sum() for way in ways))
+    return drive(simulation, islice(cycle(ways), 20 * len(ways)), _SPEED_M_S), lap_m

@@ -1,0 +1,36 @@
+"""Map update: scans a second in one thread."""
+
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.worlds import floors
+from thinmap_ros.core.grid.occupancy import OccupancyGrid
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.evaluation.machine import best_seconds
+from thinmap_ros.evaluation.outcome import Row, at_least
+from thinmap_ros.sim.laser import Lms200, Lms200Config
+
+_TARGET = 20_000.0
+_SCANS = 200
+
+
+def run(worlds: Path, quick: bool) -> list[Row]:
+    """One row: 181 beams, 8 m, 10 cm, a real floor, the robot turning on the spot at ten places."""
+    floor = floors(worlds, 'kth/50052748')[0]
+    laser = Lms200(Lms200Config(), 0)
+    turns = [
+        np.array([*start[:2], start[2] + 0.3 * k])
+        for start in floor.starts
+        for k in range(_SCANS // 10)
+    ]
+    scans = [(laser.scan(floor.world, T, 0), T) for T in turns]
+    grid = OccupancyGrid()
+    seconds = best_seconds({'update': lambda: _update(grid, scans)}, 10 if quick else 40)['update']
+    return [at_least('map update, 181 beams, 8 m, 10 cm', len(scans) / seconds, _TARGET, 'scans/s')]
+
+
+def _update(grid: OccupancyGrid, scans: list[tuple[Scan, Array]]) -> None:
+    for scan, T in scans:
+        grid.update(scan, T)

@@ -1,0 +1,187 @@
+"""Nodes at work, a simulated robot at 5 Hz in real time: processor, memory, delay, traffic.
+
+In a shell of scripts/env.
+
+One process with all nodes against a process for each. Delays are those that a listener sees, from
+scan to answer.
+"""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import psutil
+
+from thinmap_ros.evaluation.outcome import Row, at_most
+
+_NODES = ('localizer', 'grid_mapper', 'topology_builder', 'navigator', 'explorer')
+_SETTLE_S = 5.0
+_STOP_S = 10.0
+
+
+def run(worlds: Path, quick: bool) -> Iterator[Row]:
+    """Rows for one process and for many, then the traffic by topic."""
+    os.environ['ROS_DOMAIN_ID'] = str(random.SystemRandom().randrange(1, 102))
+    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+    seconds = 20.0 if quick else 120.0
+    with tempfile.TemporaryDirectory() as folder:
+        bag = Path(folder) / 'bag'
+        together = [['thinmap']]
+        apart = [[name] for name in _NODES]
+        yield from _measured('one process', together, seconds, bag, (40.0, 400.0))
+        yield from _measured('a process for each', apart, seconds, None, (None, None))
+        yield from _traffic(bag)
+
+
+def _start(words: list[str], parameters: str) -> psutil.Popen:
+    arguments = [word for parameter in parameters.split() for word in ('-p', parameter)]
+    command = [
+        sys.executable,
+        '-m',
+        f'thinmap_ros.nodes.{words[0]}',
+        *words[1:],
+        '--ros-args',
+        *arguments,
+    ]
+    return psutil.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def _measured(
+    what: str,
+    programs: list[list[str]],
+    seconds: float,
+    bag: Path | None,
+    limits: tuple[float | None, float | None],
+) -> Iterator[Row]:
+    start = 'start_x_m:=5.0 start_y_m:=2.0 start_yaw_rad:=0.0'
+    placed = ('localizer', 'thinmap')
+    nodes = [
+        _start(words, f'use_sim_time:=true {start if words[0] in placed else ""}')
+        for words in programs
+    ]
+    others = [_start(['sim'], 'start:=5.0,2.0,0.0 hold_for_subscribers:=5')]
+    if bag is not None:
+        others.append(_start(['recorder'], f'use_sim_time:=true bag:={bag}'))
+    delays = _Listener()
+    try:
+        while not delays.heard('local_topology'):
+            delays.listen(0.5)
+        delays.listen(_SETTLE_S)
+        delays.forget()
+        before = sum(_processor_s(node) for node in nodes)
+        delays.listen(seconds)
+        share = 100.0 * (sum(_processor_s(node) for node in nodes) - before) / seconds
+        memory = sum(node.memory_full_info().pss for node in nodes) / 1e6
+    finally:
+        for process in [*nodes, *others]:
+            process.send_signal(signal.SIGTERM)
+        delays.close()
+        psutil.wait_procs([*nodes, *others], timeout=_STOP_S)
+    yield Row(what, f'{len(delays.of("pose"))} scans')
+    for name, value, limit, unit in (
+        ('processor', share, limits[0], '%'),
+        ('memory', memory, limits[1], 'MB'),
+    ):
+        if limit is None:
+            yield Row(f'  {name}', f'{value:.3g} {unit}')
+        else:
+            yield at_most(f'  {name}', value, limit, unit)
+    for topic, limit in (('pose', 20.0), ('local_topology', 50.0)):
+        yield at_most(
+            f'  scan to {topic}, 99 %', float(np.percentile(delays.of(topic), 99.0)), limit, 'ms'
+        )
+
+
+def _processor_s(process: psutil.Process) -> float:
+    times = process.cpu_times()
+    return float(times.user + times.system)
+
+
+class _Listener:
+    """Hears scans and what comes of them; drives the robot in a circle."""
+
+    def __init__(self) -> None:
+        import rclpy
+        from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
+        from sensor_msgs.msg import LaserScan
+
+        from thinmap_msgs.msg import TopologicalMap
+        from thinmap_ros.ros import messages, qos
+
+        if not rclpy.ok():
+            rclpy.init()
+        self._rclpy = rclpy
+        self._command = messages.twist_msg(0.15, 0.15)
+        self._node = rclpy.create_node('listener')
+        self._cmd_vel = self._node.create_publisher(Twist, 'cmd_vel', qos.STREAM)
+        self._heard: dict[str, dict[int, float]] = {}
+        kinds = {
+            'scan': LaserScan,
+            'pose': PoseWithCovarianceStamped,
+            'local_topology': TopologicalMap,
+        }
+        for topic, kind in kinds.items():
+            self._node.create_subscription(
+                kind, topic, self._hears(topic, messages.stamp_ns), qos.STREAM
+            )
+
+    def _hears(self, topic, stamp_ns):  # type: ignore[no-untyped-def]
+        def hear(message) -> None:  # type: ignore[no-untyped-def]
+            self._heard.setdefault(topic, {})[stamp_ns(message.header.stamp)] = time.monotonic()
+
+        return hear
+
+    def listen(self, seconds: float) -> None:
+        """Listen for so long."""
+        end = time.monotonic() + seconds
+        commanded = 0.0
+        while time.monotonic() < end:
+            self._rclpy.spin_once(self._node, timeout_sec=0.02)
+            if time.monotonic() - commanded > 0.1:
+                commanded = time.monotonic()
+                self._cmd_vel.publish(self._command)
+
+    def heard(self, topic: str) -> bool:
+        """Whether anything came on a topic."""
+        return topic in self._heard
+
+    def close(self) -> None:
+        """Listen no more."""
+        self._node.destroy_node()
+
+    def forget(self) -> None:
+        """Forget what was heard so far."""
+        self._heard.clear()
+
+    def of(self, topic: str) -> list[float]:
+        """Milliseconds from each scan to the message of its stamp."""
+        scans = self._heard.get('scan', {})
+        answers = self._heard.get(topic, {})
+        return [1e3 * (answers[ns] - at) for ns, at in scans.items() if ns in answers] or [
+            float('inf')
+        ]
+
+
+def _traffic(bag: Path) -> Iterator[Row]:
+    from thinmap_ros.logs.bag import Bag
+
+    sizes: dict[str, list[int]] = {}
+    first = None
+    last = 0
+    for message in Bag(bag).messages():
+        sizes.setdefault(message.topic, []).append(len(message.data))
+        first = message.log_ns if first is None else first
+        last = message.log_ns
+    seconds = max((last - (first or 0)) / 1e9, 1.0)
+    yield Row('traffic', f'{seconds:.0f} s')
+    for topic, found in sorted(sizes.items(), key=lambda item: -sum(item[1])):
+        rate = len(found) / seconds
+        size = sum(found) / len(found) / 1e3
+        yield Row(f'  {topic}: {rate:.1f} a second of {size:.2f} kB', f'{rate * size:.1f} kB/s')

@@ -1,0 +1,57 @@
+"""Lost robots by the hundred.
+
+What is in the files is not run again, and the page is made of them.
+"""
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks.kidnapped.__main__ import read, run_missing
+from benchmarks.kidnapped.cases import Case
+from benchmarks.kidnapped.page import page
+from benchmarks.kidnapped.summary import summary
+from benchmarks.kidnapped.trials import Record
+
+
+def cases(ran: list[str], outcomes: dict[str, str]) -> list[Case]:
+    def run(name: str) -> Record:
+        ran.append(name)
+        return {
+            'outcome': outcomes[name],
+            'way_m': 2.5,
+            'steps': 12,
+            'off_m': '',
+            'off_deg': '',
+            'step_ms': 9.0,
+        }
+
+    return [Case(name, lambda name=name: run(name)) for name in outcomes]
+
+
+def test_a_row_is_gone_on_with_and_told_on_the_page(tmp_path: Path) -> None:
+    ran: list[str] = []
+    outcomes = {'kth/a 0': 'right', 'kth/a 1': 'open', 'kth/b 0': 'wrong'}
+    path = tmp_path / 'kth.csv'
+    run_missing(cases(ran, outcomes)[:2], path)
+    run_missing(cases(ran, outcomes), path)
+    assert ran == list(outcomes)
+    assert [record['outcome'] for record in read(path)] == list(outcomes.values())
+    rows = {row.what: row for row in summary('kth', read(path))}
+    assert rows['right, wrong, not sure'].value == '1, 1, 1'
+    assert rows['wrong and sure, of 100'].good is False
+    text = page(tmp_path)
+    assert '| kth/a | 2 | 1 | 0 | 1 | 2.5 | 2.5 |' in text
+    assert '| kth/b | 1 | 0 | 1 | 0 | 2.5 | 2.5 |' in text
+    assert '## Dungeons' not in text
+
+
+@pytest.mark.parametrize(
+    ('said', 'sure', 'good'), [('4.2', '', (True, True)), ('', '3.1', (False, False))]
+)
+def test_robots_elsewhere_are_to_be_told_so_and_never_sure(
+    said: str, sure: str, good: tuple[bool, bool]
+) -> None:
+    records = [{'case': 'a <- b', 'said_m': said, 'sure_m': sure, 'last': 'NOT_IN_MAP'}]
+    rows = {row.what: row.good for row in summary('foreign', records)}
+    assert (rows['told "not in this map", of 100'], rows['sure at some time, of 100']) == good

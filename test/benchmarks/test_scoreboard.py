@@ -1,0 +1,367 @@
+"""The scoreboard: its page and comparisons, what it runs again, and small real runs."""
+
+import argparse
+import json
+import math
+import sys
+from itertools import count, pairwise
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+
+from benchmarks.scoreboard import __main__ as program
+from benchmarks.scoreboard import drives
+from benchmarks.scoreboard.cases import (
+    BUILDINGS,
+    BY_HAND,
+    DEGRADED,
+    BuildingCase,
+    LogCase,
+    all_cases,
+    compared_with,
+    repeated,
+)
+from benchmarks.scoreboard.compare import against
+from benchmarks.scoreboard.measure import Task, _disturbed, measure
+from benchmarks.scoreboard.page import MOST_M, errors, page, shortened, worst_tenth
+from benchmarks.scoreboard.played import Played, consistency
+from thinmap_ros.core import se2
+from thinmap_ros.core.errors import ConfigError
+from thinmap_ros.evaluation.trajectory_errors import aligned_rms
+from thinmap_ros.sim.buildings import DEVELOPMENT_SEEDS, BuildingConfig, building
+from thinmap_ros.sim.robot import PRESETS
+
+COSTS = {
+    'scans': 100,
+    'unmapped': 0.125,
+    'ms_median': 1.0,
+    'ms_mean': 2.0,
+    'ms_99': 3.0,
+    'stall_ms': 40.0,
+    'mb': 250.0,
+    'mb_more': 20.0,
+    'cpu_s': 10.0,
+}
+DRIVES = [BuildingCase(seed, '2dx', 1.0) for seed in range(18)]
+LOGS = [LogCase('hall'), LogCase('hall', 'slip')]
+CASES = [*LOGS, *DRIVES]
+
+
+def of_building(case, live_m):
+    given = {'inside_95': 0.9, 'sigma_of_rms': 1.25, 'wrong_and_sure': 7, 'final_m': live_m}
+    return {'name': case.name, 'options': {}, 'live_m': live_m, **COSTS, **given}
+
+
+def of_log(case, path):
+    return {'name': case.name, 'options': {}, 'path': path, **COSTS}
+
+
+def straight(sideways_m):
+    """Path of 11 poses along x, from the third one on so far to the side."""
+    return [[float(k), float(k), sideways_m * (k > 2), 0.0] for k in range(11)]
+
+
+@pytest.fixture
+def reports():
+    found = [of_log(LOGS[0], straight(0.0)), of_log(LOGS[1], straight(0.5))]
+    return found + [of_building(case, 0.01 * (1 + k)) for k, case in enumerate(DRIVES)]
+
+
+def test_a_degraded_log_without_relations_is_judged_by_the_undegraded_one(reports):
+    found = errors(CASES, reports)
+    assert found[0] == 0.0
+    assert found[1] == pytest.approx(0.5 * math.sqrt(8 / 11))
+    assert errors(CASES[1:], reports[1:])[0] == MOST_M  # nothing to judge it by
+
+
+def test_the_worst_tenth_is_one_number_and_named(reports):
+    assert worst_tenth(CASES, reports) == pytest.approx(0.5 * (0.5 * math.sqrt(8 / 11) + 0.18))
+    text = page(CASES, reports)
+    assert '**Worst tenth, live: 0.303 m**' in text
+    assert 'It is: hall.slip 0.43, building_017.2dx_x1 0.18.' in text
+
+
+def test_the_page_has_each_case_with_all_its_numbers(reports):
+    text = page(CASES, reports)
+    assert '| hall | 100 | 0.000 (ours) | 12.5% | 1.00 | 2.00 | 3.0 | 40 | 250 | 20 |' in text
+    row = '0.010 | 0.010 | 12.5% | 90% | 1.2 | 7 | 1.00 | 2.00 | 3.0 | 40 | 250 | 20 |'
+    assert f'| building_000.2dx_x1 | 100 | {row}' in text
+    for title in ('in 95 %', 'sigma / rms', 'wrong and sure', 'stall ms', 'unmapped', '99 %'):
+        assert f'| {title} |' in text
+    assert 'Failed' not in text
+
+
+def test_a_case_that_failed_is_named_and_counts_as_the_worst(reports):
+    reports[5] = {'name': CASES[5].name, 'error': 'no scan'}
+    text = page(CASES, reports)
+    assert f'**Failed**: {CASES[5].name}.' in text
+    assert f'| {CASES[5].name} | | failed: no scan |' in text
+    assert errors(CASES, reports)[5] == MOST_M
+
+
+def test_the_short_form_is_the_worst_tenth_in_so_far_as_time_permits(reports):
+    lines = shortened(CASES, reports).splitlines()
+    assert lines[0].startswith('#')
+    assert lines[1:] == ['hall.slip', 'building_017.2dx_x1']
+    reports[1]['cpu_s'] = 10_000.0
+    lines = shortened(CASES, reports).splitlines()
+    assert lines[1:] == ['# too long, 10003 s: hall.slip', 'building_017.2dx_x1']
+
+
+def test_another_run_beside_it(reports):
+    others = [dict(report) for report in reports]
+    others[4]['live_m'] = 2.0 * reports[4]['live_m']
+    others[6] = of_building(CASES[6], 20.0)
+    others[7] = None
+    text = against(CASES, reports, others)
+    assert '(19 of 20 cases)' in text
+    assert 'median of the ratios 1.000' in text
+    assert '10 m or failed: 0 (there 1)' in text
+    rows = [line for line in text.splitlines() if line.startswith('| building')]
+    assert rows == [
+        f'| {CASES[4].name} | 0.030 | 0.060 | 0.50 |',
+        f'| {CASES[6].name} | 0.050 | 10.000 | 0.01 |',
+    ]
+
+
+def test_options_of_the_localizer_have_the_types_of_their_defaults():
+    words = ['slam=off', 'start_x_m=2', 'mapping=false']
+    options = {'slam': 'off', 'start_x_m': 2.0, 'mapping': False}
+    assert program._options(words) == options
+    for word in ('slan=off', 'start_x_m=far', 'mapping=no', 'slam=full_of_hope', 'square_walls=no'):
+        with pytest.raises(ConfigError):
+            program._options([word])
+
+
+def logs_in(folder, names):
+    for name in names:
+        (folder / name).mkdir(parents=True)
+        (folder / name / 'log.clf').touch()
+    return folder
+
+
+def test_all_that_was_asked_for_is_a_case(tmp_path):
+    names = ['aces', 'intel', 'intel_raw', 'mrpt_office', 'sena']
+    cases = all_cases(logs_in(tmp_path / 'logs', names))
+    assert len({case.name for case in cases}) == len(cases)
+    logs = {case.name: case for case in cases if isinstance(case, LogCase)}
+    assert {f'aces.{version}' for version in DEGRADED} | {*names} <= logs.keys()
+    for name in ('intel', 'sena', 'mrpt_office'):
+        assert {f'{name}.every_2', f'{name}.every_5', f'{name}.rate_1hz'} <= logs.keys()
+    # Poses are moved to the stamps of relations wherever these are meant to be exact.
+    assert {name for name, case in logs.items() if case.exact_s < 0.1} == {
+        name for name in logs if name.startswith('intel_raw') or name == 'intel.rate_1hz'
+    }
+    assert len(BUILDINGS) >= 30
+    assert set(BUILDINGS) <= set(DEVELOPMENT_SEEDS)
+    runs = [case for case in cases if isinstance(case, BuildingCase)]
+    assert {(case.robot, case.noise) for case in runs} == {
+        (robot, noise) for robot in ('2dx', '3at') for noise in (1.0, 3.0)
+    }
+    assert len(runs) == 4 * len(BUILDINGS)
+    (tmp_path / 'logs' / 'aces' / 'relations').touch()
+    assert compared_with(logs['aces.slip'], tmp_path / 'logs') == 'aces.slip'
+    assert compared_with(logs['sena.slip'], tmp_path / 'logs') == 'sena'
+    assert compared_with(runs[0], tmp_path / 'logs') == runs[0].name
+
+
+def test_every_real_log_is_a_case(shared_data):
+    names = {case.name for case in all_cases(shared_data / 'logs')}
+    assert {path.name for path in (shared_data / 'logs').iterdir() if path.is_dir()} <= names
+    assert set(BY_HAND) <= names
+    assert set(program._short_names()) <= names
+
+
+def test_a_short_list_that_names_none_gives_way_to_one_chosen_by_hand(tmp_path):
+    for text, names in (('', list(BY_HAND)), ('# none\n', list(BY_HAND)), ('# a\nb.c\n', ['b.c'])):
+        (tmp_path / 'short.txt').write_text(text)
+        with patch.object(program, '_SHORT', tmp_path / 'short.txt'):
+            assert program._short_names() == names
+    with patch.object(program, '_SHORT', tmp_path / 'nowhere.txt'):
+        assert program._short_names() == list(BY_HAND)
+
+
+def test_the_short_form_comes_with_what_its_cases_are_compared_with(tmp_path):
+    logs_in(tmp_path / 'data' / 'logs', ['sena'])
+    (tmp_path / 'short.txt').write_text('sena.slip\nbuilding_004.3at_x3\n')
+    arguments = argparse.Namespace(shared=tmp_path, short=True, only='*')
+    with patch.object(program, '_SHORT', tmp_path / 'short.txt'):
+        names = [case.name for case in program._chosen(arguments)]
+    assert names == ['sena', 'sena.slip', 'building_004.3at_x3']
+
+
+def test_a_covariance_that_is_right_is_found_to_be():
+    rng = np.random.default_rng(0)
+    truth = np.zeros((4000, 3))
+    covariance = np.diag([0.04, 0.01, 1.0])
+    poses = rng.normal(size=(4000, 3)) * (0.2, 0.1, 0.0)
+    right = Played(poses=list(poses), covariances=[covariance] * 4000, lost=[False] * 4000)
+    found = consistency(right, truth)
+    assert found['inside_95'] == pytest.approx(0.95, abs=0.015)
+    assert found['sigma_of_rms'] == pytest.approx(1.0, abs=0.03)
+    assert found['wrong_and_sure'] <= 60
+    right.covariances[:5] = [9e4 * np.eye(3)] * 5
+    right.lost[:5] = [True] * 5
+    assert consistency(right, truth)['sigma_of_rms'] == pytest.approx(1.0, abs=0.03)
+    sure = Played(poses=list(10.0 * poses), covariances=[covariance] * 4000, lost=[False] * 4000)
+    found = consistency(sure, truth)
+    assert found['sigma_of_rms'] == pytest.approx(0.1, abs=0.003)
+    metres = 10.0 * np.hypot(*poses[:, :2].T)
+    assert found['wrong_and_sure'] == np.count_nonzero(metres > 0.6)
+
+
+def test_a_map_that_is_turned_as_a_whole_has_no_error_once_aligned():
+    rng = np.random.default_rng(7)
+    truth = np.column_stack([rng.uniform(0.0, 30.0, (500, 2)), np.zeros(500)])
+    T = se2.pose(4.0, -2.0, 0.6)
+    turned = np.array([se2.compose(T, pose) for pose in truth])
+    assert aligned_rms(turned, truth) < 1e-9
+    turned[:, :2] += rng.normal(0.0, 0.2, (500, 2))
+    assert aligned_rms(turned, truth) == pytest.approx(0.2 * math.sqrt(2.0), rel=0.05)
+
+
+def test_a_disturbed_run_has_noise_of_its_own_and_the_first_has_none():
+    driven = [np.array([0.1 * k, 0.02 * k, 0.01 * k]) for k in range(2000)]
+
+    def poses(run):
+        return np.array([T for _, T in _disturbed(((None, T) for T in driven), run)])
+
+    np.testing.assert_array_equal(poses(0), driven)
+    np.testing.assert_array_equal(poses(1), poses(1))
+    assert not np.array_equal(poses(1), poses(2))
+    np.testing.assert_array_equal(poses(1)[0], driven[0])
+    off = [
+        se2.between(a, b) - se2.between(driven[k], driven[k + 1])
+        for k, (a, b) in enumerate(pairwise(poses(1)))
+    ]
+    np.testing.assert_allclose(np.std(off, axis=0), 5e-4, rtol=0.1)
+
+
+def test_the_page_tells_mean_and_worst_of_several_runs(reports):
+    cases = repeated([LOGS[0], DRIVES[0]], 2)
+    names = ['hall', 'hall.run_1', 'building_000.2dx_x1', 'building_000.2dx_x1.run_1']
+    assert [case.name for case in cases] == names
+    runs = [of_building(cases[2], 0.1), of_building(cases[3], 0.4) | {'final_m': 0.9}]
+    own = [of_log(cases[0], straight(0.0)), of_log(cases[1], straight(0.5))]
+    text = page(cases, own + runs)
+    assert '| hall | 2 | 0.021 | 0.426 | | |' in text
+    assert '| building_000.2dx_x1 | 2 | 0.200 | 0.400 | 0.300 | 0.900 |' in text
+    assert 'Several runs' not in page(CASES, reports)
+
+
+def called(*words):
+    """Call the program in this process; exit code."""
+    with patch.object(sys, 'argv', ['scoreboard', *map(str, words)]):
+        try:
+            program.main()
+        except SystemExit as end:
+            return end.code
+    return 0
+
+
+def write_log(folder, scans):
+    """A log of a robot that stands in a room of 6 x 6 m."""
+    angles = np.radians(np.arange(-90.0, 90.0))
+    ranges = 3.0 / np.maximum(np.abs(np.cos(angles)), np.abs(np.sin(angles)))
+    beams = ' '.join(f'{each:.3f}' for each in ranges)
+    folder.mkdir(parents=True, exist_ok=True)
+    stamps = [f'{0.2 * k:.3f}' for k in range(scans)]
+    lines = [f'FLASER 180 {beams} 0 0 0 0 0 0 {stamp} x {stamp}\n' for stamp in stamps]
+    (folder / 'log.clf').write_text(''.join(lines))
+
+
+def test_it_goes_on_where_it_was_and_one_that_fails_stops_no_other(tmp_path, capsys):
+    logs = tmp_path / 'shared' / 'data' / 'logs'
+    write_log(logs / 'try_1', 0)
+    write_log(logs / 'try_2', 8)
+    out = tmp_path / 'out'
+    words = ['-o', out, '--shared', tmp_path / 'shared', '--only', 'try_?', '--processes', 1]
+    words.append('--quiet')
+    assert called(*words) == 2
+    assert '1 failed: try_1: ' in capsys.readouterr().err
+    text = (out / 'scoreboard.md').read_text()
+    assert '| try_1 | | failed: ' in text
+    assert '| try_2 | 8 | 0.000 (ours) |' in text
+    # What is there is not run again; what failed is.
+    file = out / 'results' / 'try_2.json'
+    file.write_text(json.dumps(json.loads(file.read_text()) | {'scans': 12345}))
+    write_log(logs / 'try_1', 6)
+    assert called(*words) == 0
+    text = (out / 'scoreboard.md').read_text()
+    assert '| try_1 | 6 |' in text
+    assert '| try_2 | 12345 |' in text
+    assert 'worst tenth, live: 0.000 m' in capsys.readouterr().out
+    # Nor is what was run otherwise taken for it.
+    assert called(*words, '--set', 'slam=off') == 2
+    assert 'other options' in capsys.readouterr().err
+    assert called(*words, '--against', out) == 0
+    assert '## Against another run (2 of 2 cases)' in (out / 'scoreboard.md').read_text()
+    assert called(*words, '--against', tmp_path) == 2
+    assert called(*words, '--write-short') == 2
+    capsys.readouterr()
+    assert called('-o', out, '--runs', 2, '--write-short') == 2
+    assert 'no --short, --only or --runs' in capsys.readouterr().err
+    assert called(*words, '--runs', 0) == 2
+    assert '--runs 0: expected 1 or more' in capsys.readouterr().err
+    assert called(*words, '--runs', 2) == 0
+    disturbed = json.loads((out / 'results' / 'try_2.run_1.json').read_text())
+    assert 0.0 < np.abs(np.array(disturbed['path'])[1:, 1:]).max() < 0.01
+
+
+def test_a_drive_in_a_small_building(tmp_path, monkeypatch):
+    small = BuildingConfig(area_m2=200.0, wings=1, clutter=0.0, people_per_1000_m2=0.0)
+    monkeypatch.setattr(drives, 'building', lambda seed: building(seed, small))
+    monkeypatch.setattr(drives, '_LENGTH_M', 12.0)
+    case = BuildingCase(3, '2dx', 3.0)
+    report = measure(Task(case, tmp_path, tmp_path, tmp_path, {'slam': 'off'}))
+    assert report['name'] == 'building_003.2dx_x3'
+    assert report['options'] == {'slam': 'off'}
+    assert report['scans'] > 30
+    assert 0.0 <= report['unmapped'] <= 1.0
+    assert report['live_m'] < 0.3
+    assert report['live_m'] <= report['live_most_m']
+    assert 0.0 < report['live_aligned_m'] <= report['live_m']
+    assert 0.0 < report['ms_median'] <= report['ms_99'] <= report['stall_ms']
+    assert report['mb'] > report['mb_more'] >= 0.0
+    assert 'building_003.2dx_x3' in page([case], [report])
+
+
+def test_a_drive_ends_where_it_began_and_its_noise_is_what_is_asked_for():
+    robot = drives.noisy(PRESETS['3at'], 3.0)
+    assert robot.turn_noise == 3.0 * PRESETS['3at'].turn_noise
+    assert robot.radius_m == PRESETS['3at'].radius_m
+    made = building(11)
+    start = drives._start(made, robot)
+    paths = list(drives.ways(made, start, robot, 11))
+    assert len(paths) > 1
+    np.testing.assert_allclose(paths[-1][-1], start[:2], atol=0.2)
+
+
+def test_a_piece_of_a_real_log_and_the_same_made_worse(shared_data, tmp_path):
+    there = shared_data / 'logs' / 'aces'
+    own = tmp_path / 'shared' / 'data' / 'logs' / 'aces'
+    own.mkdir(parents=True)
+    (tmp_path / 'shared' / 'tools').symlink_to(shared_data.parent / 'tools')
+    lines = (there / 'log.clf').read_text().splitlines(keepends=True)
+    scans = count()
+    piece = [line for line in lines if not line.startswith('FLASER') or next(scans) < 60]
+    (own / 'log.clf').write_text(''.join(piece))
+    end = float(piece[-1].split()[-1])
+    for name, stamps in (('odom.txt', 1), ('relations', 2)):
+        kept = [
+            line
+            for line in (there / name).read_text().splitlines(keepends=True)
+            if all(float(word) <= end for word in line.split()[:stamps])
+        ]
+        (own / name).write_text(''.join(kept))
+    words = ['-o', tmp_path / 'out', '--shared', tmp_path / 'shared', '--processes', 2]
+    assert called(*words, '--only', 'aces.s*', '--quiet') == 0
+    results = tmp_path / 'out' / 'results'
+    reports = {path.stem: json.loads(path.read_text()) for path in results.iterdir()}
+    assert set(reports) == {'aces.scale', 'aces.slip'}
+    for report in reports.values():
+        assert report['scans'] == 60
+        assert report['live_m'] < 1.0
+        assert report['exact_live_m'] < 1.0
+    assert (tmp_path / 'out' / 'logs' / 'aces.slip' / 'slip.txt').exists()

@@ -1,0 +1,110 @@
+"""Poses of the past, corrected, and which scans are kept."""
+
+import numpy as np
+import pytest
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.grid.scan_history import PoseHistory
+
+POSES = np.array([se2.pose(0.3 * k, 0.0, 0.0) for k in range(12)])
+
+
+def filled(poses, stamps):
+    history = PoseHistory()
+    for T, stamp in zip(poses, stamps, strict=True):
+        history.add(stamp, T, stamp)
+    return history
+
+
+def test_scans_move_with_the_last_named_one_before_them():
+    """Scan 4 is moved to the side and scan 8 is turned.
+
+    Those after each go with it, those before the first as well.
+    """
+    history = filled(POSES, range(100, 112))
+    moved = np.array([POSES[4] + [0.0, 1.0, 0.0], POSES[8] + [0.0, 0.0, 0.5]])
+    history.correct(np.array([104, 108]), moved, since_ns=112)
+    after = history.kept_poses()
+    np.testing.assert_allclose(after[:8], POSES[:8] + [0.0, 1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(after[8], moved[1], atol=1e-12)
+    np.testing.assert_allclose(
+        se2.between(after[8], after[10]), se2.between(POSES[8], POSES[10]), atol=1e-12
+    )
+
+
+def test_scans_whose_poses_are_right_already_stay():
+    history = filled(POSES, range(12))
+    history.correct(np.array([0, 5]), POSES[[0, 5]] + [0.0, 0.0, 1.0], since_ns=9)
+    np.testing.assert_array_equal(history.kept_poses()[9:], POSES[9:])
+    assert not np.allclose(history.kept_poses()[8], POSES[8])
+
+
+def test_unknown_stamps_and_stamps_that_step_back_are_borne():
+    stamps = [0, 1, 2, 3, 2, 4, 5, 6, 7, 8, 9, 10]
+    history = filled(POSES, stamps)
+    history.correct(np.array([77]), POSES[:1] + 5.0, since_ns=100)
+    np.testing.assert_array_equal(history.kept_poses(), POSES)
+    history.correct(np.array([-3, 2]), POSES[[0, 4]] + [1.0, 0.0, 0.0], since_ns=100)
+    np.testing.assert_allclose(history.kept_poses(), POSES + [1.0, 0.0, 0.0], atol=1e-12)
+
+
+def test_named_scans_may_come_in_any_order():
+    history = filled(POSES, range(12))
+    other = filled(POSES, range(12))
+    stamps = np.array([7, 2, 10])
+    moved = POSES[stamps] + [[0.0, 1.0, 0.1], [0.5, 0.0, 0.0], [0.0, 0.0, -0.3]]
+    history.correct(stamps, moved, since_ns=12)
+    other.correct(stamps[[1, 0, 2]], moved[[1, 0, 2]], since_ns=12)
+    np.testing.assert_array_equal(history.kept_poses(), other.kept_poses())
+    np.testing.assert_allclose(history.kept_poses()[stamps], moved, atol=1e-12)
+
+
+def test_a_robot_that_stands_still_is_kept_once():
+    history = filled(np.zeros((50, 3)), range(50))
+    assert history.kept() == [0]
+
+
+def test_of_a_place_that_is_seen_again_and_again_the_newest_scans_are_kept():
+    laps = 30
+    history = filled(np.tile(POSES, (laps, 1)), range(12 * laps))
+    kept = history.kept()
+    assert len(kept) == len(history.kept_poses()) <= 12 * 4
+    assert min(kept) >= 12 * (laps - 5)
+    assert kept == sorted(kept)
+
+
+def test_places_are_those_after_a_correction():
+    """Two halves of a path turn out to be one: of what is seen there, the newest is kept."""
+    there = np.array([se2.pose(0.01 + k, 0.1, 0.1) for k in range(8)])
+    away = there + [0.0, 50.0, 0.0]
+    history = filled(np.concatenate([there] * 4 + [away] * 4), range(64))
+    history.correct(np.array([0, 32]), there[[0, 0]], since_ns=64)
+    assert history.kept() == list(range(64))
+    for k, T in enumerate(there):
+        history.add(64 + k, T, 64 + k)
+    assert len(history.kept()) == 32
+    assert min(history.kept()) == 40
+
+
+def test_poses_before_the_corrections_are_those_of_the_first_since_they_were_accepted():
+    """What comes after a correction is told before it as if the robot had gone on without it."""
+    history = filled(POSES[:6], range(6))
+    history.correct(np.array([0]), POSES[[0]] + [0.0, 1.0, 0.0], since_ns=6)
+    for k in (6, 7):
+        history.add(k, POSES[k] + [0.0, 1.0, 0.0], k)
+    history.correct(np.array([0]), POSES[[0]] + [0.0, 3.0, 0.0], since_ns=8)
+    history.add(8, POSES[8] + [0.0, 3.0, 0.0], 8)
+    moved = history.accept_corrections()
+    np.testing.assert_allclose(moved.before, POSES[:9], atol=1e-12)
+    np.testing.assert_allclose(moved.after, POSES[:9] + [0.0, 3.0, 0.0], atol=1e-12)
+    again = history.accept_corrections()
+    np.testing.assert_array_equal(again.before, again.after)
+
+
+@pytest.mark.parametrize('stamps', [[], [77]])
+def test_a_correction_that_names_no_scan_changes_nothing(stamps):
+    for poses in (POSES, POSES[:0]):
+        history = filled(poses, range(len(poses)))
+        history.correct(np.array(stamps, dtype=np.int64), POSES[: len(stamps)] + 1.0, since_ns=99)
+        np.testing.assert_array_equal(history.kept_poses(), poses)
+        np.testing.assert_array_equal(history.accept_corrections().before, poses)

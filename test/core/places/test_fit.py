@@ -1,0 +1,32 @@
+"""What a map explains from the right place.
+
+Nearly all where walls are smooth, less where small things stand about.
+"""
+
+import numpy as np
+from support.small_floor import OFFICE, START, drive, map_of
+
+from thinmap_ros.core.places.config import GlobalLocalizationConfig
+from thinmap_ros.core.places.fit import usual_share
+from thinmap_ros.core.places.likelihood import Judge
+from thinmap_ros.core.places.observation_model import calibrate
+from thinmap_ros.core.places.place_database import Places
+
+CONFIG = GlobalLocalizationConfig()
+
+
+def share_in(cells):
+    places = Places.of(*map_of(cells), CONFIG)
+    scan, _, _ = next(drive(OFFICE, START, []))
+    judge = Judge(places, CONFIG, calibrate(places, scan, CONFIG, np.random.default_rng(1)))
+    return usual_share(places, judge, scan, CONFIG, np.random.default_rng(2))
+
+
+def test_smooth_walls_explain_nearly_all_and_a_floor_full_of_small_things_less():
+    littered = OFFICE.copy()
+    inner = littered[2:-2, 2:-2]
+    inner[np.random.default_rng(3).random(inner.shape) < 0.04] = 100
+    clean = share_in(OFFICE)
+    rough = share_in(littered)
+    assert clean > 0.97
+    assert 0.7 <= rough < clean - 0.02

@@ -1,0 +1,84 @@
+"""Where a robot was it can go back: as cells, and for a planner whose map has a speck too many."""
+
+import numpy as np
+import pytest
+
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.planning.recent_path import Trail
+from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
+
+FRAME = GridFrame(-1.0, 2.0, 0.1)
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_its_cells_are_those_that_it_led_over_each_beside_the_one_before(seed):
+    rng = np.random.default_rng(seed)
+    trail = Trail()
+    way = np.cumsum(rng.normal(0.05, 0.1, (200, 2)), axis=0) + (0.0, 4.0)
+    for x, y in way:
+        trail.add(np.array([x, y, 0.0]))
+    shape = (150, 60)
+    cells = trail.cells(FRAME, shape)
+    assert ((cells >= 0) & (cells < shape)).all()
+    inside = (way[:, 0] < 5.0) & (way[:, 1] < 17.0) & (way[:, 0] > -1.0) & (way[:, 1] > 2.0)
+    gone_over = set(map(tuple, FRAME.cells_of(way[inside]).tolist()))
+    # Steps of less than 3 cm may be left out.
+    assert len(gone_over - set(map(tuple, cells.tolist()))) <= 0.05 * len(gone_over)
+    if inside.all():
+        assert (np.abs(np.diff(cells, axis=0)).sum(axis=1) <= 1).all()
+
+
+def test_a_jump_begins_it_anew_and_it_forgets_what_is_long_past():
+    trail = Trail()
+    for x in np.arange(0.0, 99.0, 0.05):
+        trail.add(np.array([x, 3.0, 0.0]))
+    cells = trail.cells(FRAME, (100, 1000))
+    assert cells[:, 1].min() > 100
+    trail.add(np.array([3.0, 3.0, 0.0]))
+    assert len(trail.cells(FRAME, (100, 1000))) == 1
+    assert len(Trail().cells(FRAME, (100, 1000))) == 0
+
+
+@pytest.mark.parametrize('count', [1300, 1301, 2600, 2601, 3899, 3901, 9000])
+def test_of_a_long_way_it_keeps_the_last_points(count):
+    trail = Trail()
+    way = np.arange(count) * 0.05
+    for x in way:
+        trail.add(np.array([x, 3.0, 0.0]))
+    columns = FRAME.cells_of(np.stack([way[-1300:], np.full(1300, 3.0)], axis=1))[:, 1]
+    kept = np.unique(trail.cells(FRAME, (100, 10_000))[:, 1])
+    assert kept.tolist() == np.unique(columns).tolist()
+
+
+def test_a_pose_that_is_not_finite_leaves_no_trail():
+    trail = Trail()
+    for x in (np.nan, 0.0, np.inf, 0.1):
+        trail.add(np.array([x, 3.0, 0.0]))
+    cells = trail.cells(FRAME, (100, 1000))
+    been = FRAME.cells_of(np.array([[0.0, 3.0], [0.1, 3.0]]))
+    assert np.unique(cells, axis=0).tolist() == been.tolist()
+
+
+def test_the_way_back_is_open_though_a_speck_makes_it_too_narrow_but_not_through_what_is_there():
+    cells = np.zeros((60, 80), dtype=np.int8)
+    cells[[0, -1]] = 100
+    cells[:, [0, -1]] = 100
+    cells[:28, 40] = 100
+    cells[33:, 40] = 100
+    trail = Trail()
+    for x in np.arange(2.0, 6.0, 0.05):
+        trail.add(np.array([x, 3.05, 0.0]))
+    frame = GridFrame(0.0, 0.0, 0.1)
+    config = WavefrontConfig()
+    back = trail.cells(frame, cells.shape)
+    start = (6.0, 3.05)
+    goal = (2.0, 3.05)
+    assert plan(GridPatch(frame, cells), start, goal, config) is not None
+    cells[28, 40] = 100
+    assert plan(GridPatch(frame, cells), start, goal, config) is None
+    path = plan(GridPatch(frame, cells), start, goal, config, trail=back)
+    assert path is not None
+    assert np.abs(path[:, 1] - 3.05)[np.abs(path[:, 0] - 4.05) < 0.1].max() < 0.1
+    cells[28:33, 40] = 100
+    assert plan(GridPatch(frame, cells), start, goal, config, trail=back) is None

@@ -1,0 +1,288 @@
+"""Keyframes: what stands for what, and what their poses are known to."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.slam_room import RANGE_MAX_M, ROOM, scan_in
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.slam.graph import keyframes as module
+from thinmap_ros.core.slam.graph.keyframes import (
+    Keyframe,
+    KeyframeConfig,
+    Keyframes,
+    carried,
+    covariances_from,
+    heading_variance,
+    inverse,
+    turned,
+    unlike,
+    with_heading,
+)
+from thinmap_ros.core.slam.graph.pose_graph import Edge
+from thinmap_ros.core.slam.matching.surface import surface_points
+from thinmap_ros.core.slam.wall_compass import Heading
+
+STEP = np.diag(np.square([0.02, 0.01, 0.01]))
+MAP = 0.005**2  # variance of the direction of the map's walls
+
+
+def frame(pose, path_m=0.0, stamp_ns=0, covariance=None):
+    pose = np.asarray(pose, dtype=np.float64)
+    scan = scan_in(ROOM, pose, stamp_ns=stamp_ns)
+    covariance = np.zeros((3, 3)) if covariance is None else covariance
+    return Keyframe(scan, surface_points(scan, RANGE_MAX_M), pose, path_m, covariance, 0)
+
+
+def along(poses, steps=STEP):
+    keyframes = Keyframes(KeyframeConfig())
+    for k, pose in enumerate(poses):
+        keyframes.keep(frame(pose, float(k), k), steps)
+    return keyframes
+
+
+def random_covariance(rng, size=0.02):
+    root = rng.normal(0.0, size, (3, 3))
+    return root @ root.T + 1e-6 * np.eye(3)
+
+
+def test_a_chain_of_keyframes_has_a_step_to_each_from_its_anchor():
+    poses = [se2.pose(k, 0.5 * k, 0.3 * k) for k in range(5)]
+    keyframes = along(poses)
+    assert len(keyframes) == 5
+    assert keyframes.anchor == 4
+    assert [(e.a, e.b) for e in keyframes.steps] == [(0, 1), (1, 2), (2, 3), (3, 4)]
+    for edge in keyframes.steps:
+        np.testing.assert_allclose(edge.T_a_b, se2.between(poses[edge.a], poses[edge.b]))
+        np.testing.assert_allclose(edge.information @ STEP, np.eye(3), atol=1e-9)
+        assert not edge.robust
+    np.testing.assert_array_equal(keyframes.poses(), poses)
+
+
+def test_before_the_first_there_is_no_anchor():
+    keyframes = Keyframes(KeyframeConfig())
+    assert keyframes.anchor == -1
+    assert keyframes.poses().shape == (0, 3)
+    assert keyframes.alike(np.zeros(3)) is None
+    stamps, poses = keyframes.path()
+    assert stamps.shape == (0,)
+    assert poses.shape == (0, 3)
+
+
+def test_an_earlier_keyframe_stands_for_one_that_sees_the_same():
+    keyframes = along([se2.pose(k, 1.0, 0.0) for k in range(4)])
+    back = frame([1.1, 1.05, 0.1], path_m=9.0, stamp_ns=77)
+    keyframes.reuse(1, back)
+    assert len(keyframes) == 4
+    assert keyframes.anchor == 1
+    assert keyframes.frames[1].path_m == 9.0
+    np.testing.assert_array_equal(keyframes.frames[1].T_map_base, [1.0, 1.0, 0.0])
+    stamps, poses = keyframes.path()
+    assert stamps.tolist() == [0, 1, 2, 3, 77]
+    np.testing.assert_allclose(poses[-1], back.T_map_base)
+    # What comes next hangs on it.
+    number = keyframes.keep(frame([1.0, 2.0, 0.0], 10.0), STEP)
+    assert (keyframes.steps[-1].a, keyframes.steps[-1].b) == (1, number)
+
+
+def test_scans_for_which_a_keyframe_stands_go_where_it_goes():
+    keyframes = along([se2.pose(k, 1.0, 0.0) for k in range(4)])
+    keyframes.reuse(1, frame([1.1, 1.05, 0.1], stamp_ns=77))
+    offset = se2.between(keyframes.frames[1].T_map_base, np.array([1.1, 1.05, 0.1]))
+    moved = keyframes.poses() + [0.5, -0.2, 0.4]
+    keyframes.move(moved, [])
+    np.testing.assert_allclose(keyframes.path()[1][-1], se2.compose(moved[1], offset))
+    assert keyframes.alike(moved[2]) == 2
+
+
+@pytest.mark.parametrize(
+    ('T', 'apart'),
+    [
+        ((0.69, 0.0, 0.0), False),
+        ((0.0, -0.71, 0.0), True),
+        ((0.5, 0.5, 0.0), True),
+        ((0.0, 0.0, 0.69), False),
+        ((0.0, 0.0, -0.71), True),
+    ],
+)
+def test_poses_are_apart_by_way_or_by_turn(T, apart):
+    keyframes = Keyframes(KeyframeConfig())
+    for start in (np.zeros(3), np.array([3.0, -2.0, 3.1])):
+        there = se2.compose(start, np.array(T))
+        assert keyframes.are_apart(start, there) is apart
+        assert keyframes.are_apart(there, start) is apart
+
+
+def test_the_most_alike_keyframe_is_found():
+    keyframes = along([se2.pose(0.3 * k, 0.0, 0.2 * k) for k in range(10)])
+    pose = np.array([1.25, 0.05, 0.78])
+    assert keyframes.alike(pose) == min(
+        range(10), key=lambda k: unlike(keyframes.frames[k].T_map_base, pose)
+    )
+    assert keyframes.alike(np.array([50.0, 0.0, 0.0])) is None
+    assert keyframes.alike(np.array([0.3, 0.0, 2.5])) is None
+
+
+def test_unlike_wraps():
+    assert unlike(np.array([0.0, 0.0, 3.1]), np.array([0.0, 0.0, -3.1])) < 0.1
+    assert unlike(np.zeros(3), np.array([3.0, 4.0, 0.5])) == pytest.approx(5.5)
+
+
+def sampled(chain, covariances, rng, number=20000):
+    """Covariance (3, 3) of the end of a chain of relative poses with noise, by sampling."""
+    poses = np.zeros((number, 3))
+    for T, covariance in zip(chain, covariances, strict=True):
+        noisy = T + rng.multivariate_normal(np.zeros(3), covariance, number)
+        c = np.cos(poses[:, 2])
+        s = np.sin(poses[:, 2])
+        poses = np.column_stack(
+            [
+                poses[:, 0] + c * noisy[:, 0] - s * noisy[:, 1],
+                poses[:, 1] + s * noisy[:, 0] + c * noisy[:, 1],
+                poses[:, 2] + noisy[:, 2],
+            ]
+        )
+    return np.cov(poses.T)
+
+
+def test_covariances_along_a_chain_are_those_of_sampling(rng):
+    chain = [np.array([1.0, 0.2, 0.4]), np.array([2.0, -0.5, -0.9]), np.array([0.5, 1.0, 0.3])] * 2
+    covariances = [random_covariance(rng) for _ in chain]
+    poses = [np.zeros(3)]
+    keyframes = Keyframes(KeyframeConfig())
+    keyframes.keep(frame(poses[0]), STEP)
+    for k, (T, covariance) in enumerate(zip(chain, covariances, strict=True)):
+        poses.append(se2.compose(poses[-1], T))
+        keyframes.keep(frame(poses[-1], float(k)), covariance)
+    keyframes.move(np.array(poses), [])
+    truth = sampled(chain, covariances, rng)
+    found = keyframes.frames[-1].covariance
+    scale = np.sqrt(np.outer(np.diag(truth), np.diag(truth)))
+    np.testing.assert_allclose(found / scale, truth / scale, atol=0.06)
+    np.testing.assert_allclose(keyframes.frames[0].covariance, 0.0)
+    traces = [np.trace(each.covariance) for each in keyframes.frames]
+    assert (np.diff(traces) > 0.0).all()
+
+
+def test_an_edge_that_closes_a_loop_leaves_less_uncertainty():
+    """The shortest chain counts: back at the start it is that of the loop."""
+    angles = np.linspace(0.0, 2.0 * np.pi, 20, endpoint=False)
+    poses = np.column_stack([3 * np.cos(angles), 3 * np.sin(angles), se2.wrap(angles + np.pi / 2)])
+    keyframes = along(poses)
+    keyframes.move(poses, [])
+    alone = [np.trace(each.covariance[:2, :2]) for each in keyframes.frames]
+    loop = Edge(0, 19, se2.between(poses[0], poses[19]), inverse(STEP), True)
+    keyframes.move(poses, [loop])
+    closed = [np.trace(each.covariance[:2, :2]) for each in keyframes.frames]
+    assert closed[19] == pytest.approx(alone[1], rel=0.3)
+    assert np.argmax(closed) in (9, 10, 11)
+    assert all(b <= a + 1e-12 for a, b in zip(alone, closed, strict=True))
+    # Edges to keyframes that are not yet among those that were optimized are left out.
+    keyframes.move(poses[:10], [loop])
+    assert np.trace(keyframes.frames[9].covariance[:2, :2]) == pytest.approx(alone[9])
+
+
+def test_a_loop_measured_the_other_way_is_turned_round(rng):
+    """A pose from which the first one was measured, 3 m away: its heading counts by the way."""
+    poses = np.array([[0.0, 0.0, 0.4], [3.0, 0.5, 1.3]])
+    T = se2.between(poses[1], poses[0])
+    covariance = np.diag(np.square([0.02, 0.01, 0.05]))
+    keyframes = along(poses, 1e6 * np.eye(3))
+    keyframes.move(poses, [Edge(1, 0, T, inverse(covariance), True)])
+    measured = T + rng.multivariate_normal(np.zeros(3), covariance, 20000)
+    truth = np.cov([se2.compose(poses[0], se2.invert(each)) for each in measured], rowvar=False)
+    found = keyframes.frames[1].covariance
+    scale = np.sqrt(np.outer(np.diag(truth), np.diag(truth)))
+    np.testing.assert_allclose(found / scale, truth / scale, atol=0.06)
+
+
+def test_a_turned_covariance_is_that_of_turned_samples(rng):
+    covariance = random_covariance(rng)
+    theta = 0.7
+    samples = rng.multivariate_normal(np.zeros(3), covariance, 20000)
+    c = math.cos(theta)
+    s = math.sin(theta)
+    samples[:, :2] = samples[:, :2] @ np.array([[c, s], [-s, c]])
+    np.testing.assert_allclose(turned(covariance, theta), np.cov(samples.T), atol=3e-5)
+    np.testing.assert_allclose(turned(turned(covariance, theta), -theta), covariance, atol=1e-12)
+
+
+def test_a_carried_covariance_is_that_of_what_is_bound_to_it(rng):
+    covariance = random_covariance(rng)
+    lever = np.array([2.0, -1.0])
+    samples = rng.multivariate_normal(np.zeros(3), covariance, 20000)
+    c = np.cos(samples[:, 2])
+    s = np.sin(samples[:, 2])
+    ends = np.column_stack(
+        [
+            samples[:, 0] + c * lever[0] - s * lever[1],
+            samples[:, 1] + s * lever[0] + c * lever[1],
+            samples[:, 2],
+        ]
+    )
+    np.testing.assert_allclose(carried(covariance, lever), np.cov(ends.T), atol=2e-4)
+    np.testing.assert_array_equal(carried(covariance, np.zeros(2)), covariance)
+
+
+def test_covariances_along_the_graph_are_the_same_in_plain_python(rng, monkeypatch):
+    poses = np.column_stack([rng.uniform(-5, 5, (12, 2)), rng.uniform(-3, 3, 12)])
+    pairs = [(i, i + 1) for i in range(10)] + [(8, 2), (0, 7)]
+    edges = []
+    for a, b in pairs:
+        A = rng.normal(0.0, 1.0, (3, 3))
+        information = inverse(A @ A.T * 1e-3 + 1e-4 * np.eye(3))
+        edges.append(Edge(a, b, se2.between(poses[a], poses[b]), information, False))
+    headings = np.where(rng.random(12) < 0.5, rng.uniform(1e-5, 1e-2, 12), np.inf)
+    compiled = covariances_from(3, poses, edges, headings)
+    assert np.isinf(compiled[11]).all(), 'no chain leads there'
+    assert (compiled[3] == 0.0).all()
+    np.testing.assert_allclose(compiled, np.swapaxes(compiled, 1, 2), atol=1e-12)
+    assert (compiled[:11, 2, 2] <= headings[:11] + 1e-12).all()
+    monkeypatch.setattr(module, '_covariances', module._covariances.py_func)
+    np.testing.assert_allclose(covariances_from(3, poses, edges, headings), compiled, rtol=1e-12)
+
+
+def test_a_measured_heading_makes_the_covariance_that_of_a_bayes_update(rng):
+    covariance = random_covariance(rng)
+    variance = 1e-4
+    information = inverse(covariance) + np.diag([0.0, 0.0, 1.0 / variance])
+    np.testing.assert_allclose(with_heading(covariance, variance), inverse(information), atol=1e-12)
+    np.testing.assert_array_equal(with_heading(covariance, np.inf), covariance)
+
+
+def test_a_pose_off_its_measured_heading_is_as_uncertain_as_that():
+    heading = Heading(3.1, 1e-4)
+    assert heading_variance(heading, se2.pose(1.0, 2.0, 3.1)) == pytest.approx(1e-4 + MAP)
+    assert heading_variance(heading, se2.pose(1.0, 2.0, -3.1)) == pytest.approx(
+        1e-4 + MAP + (2.0 * np.pi - 6.2) ** 2
+    )
+    assert heading_variance(None, np.zeros(3)) == np.inf
+
+
+def test_measured_headings_bound_the_covariance_along_the_path():
+    """Without them the lateral error of a straight path grows with its length to 3/2."""
+    poses = np.array([se2.pose(k, 0.0, 0.0) for k in range(40)])
+    blind = along(poses).covariances_from(0, poses, [])[-1]
+    keyframes = Keyframes(KeyframeConfig())
+    for k, pose in enumerate(poses):
+        kept = replace(frame(pose, float(k), k), heading=Heading(0.0, 0.005**2))
+        keyframes.keep(kept, STEP)
+    guided = keyframes.covariances_from(0, poses, [])[-1]
+    assert np.sqrt(blind[1, 1]) > 1.0
+    assert np.sqrt(guided[1, 1]) < 0.2
+    assert np.sqrt(guided[2, 2]) <= 0.0071
+    seen_from_there = keyframes.covariances_from(39, poses, [])[0]
+    np.testing.assert_allclose(seen_from_there[0, 0], guided[0, 0], rtol=0.05)
+    assert seen_from_there[2, 2] <= 4.0 * 0.005**2
+
+
+def test_measured_headings_are_edges_from_the_first_keyframe():
+    keyframes = Keyframes(KeyframeConfig())
+    for k, heading in enumerate([None, Heading(0.45, 1e-4), None]):
+        keyframes.keep(replace(frame(se2.pose(k, 0.0, 0.4), float(k), k), heading=heading), STEP)
+    (edge,) = keyframes.headings
+    assert (edge.a, edge.b, edge.robust) == (0, 1, True)
+    np.testing.assert_allclose(edge.T_a_b[2], 0.05)
+    np.testing.assert_array_equal(edge.information, np.diag([0.0, 0.0, 1.0 / (1e-4 + MAP)]))

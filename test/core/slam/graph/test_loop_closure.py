@@ -1,0 +1,341 @@
+"""Loops: a ring is closed by what earlier visits saw, and by nothing else."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.slam_room import RANGE_MAX_M, ROOM, corridor_ring, scan_in
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.slam.graph import loop_closure as module
+from thinmap_ros.core.slam.graph.keyframes import Keyframe, carried, inverse, turned
+from thinmap_ros.core.slam.graph.loop_closure import LoopClosure, LoopConfig
+from thinmap_ros.core.slam.graph.pose_graph import Edge
+from thinmap_ros.core.slam.matching.scan_matcher import FEWEST_POINTS, Matcher
+from thinmap_ros.core.slam.matching.surface import surface_points
+
+SIGMAS = np.array([0.02, 0.02, 0.003])
+STEP = np.diag(np.square(SIGMAS))
+NONE = np.zeros((3, 3))
+DRIFT = (0.005, 0.0, 0.0008)  # a metre: once round it is 2.5 sigmas of what the steps claim
+RING = corridor_ring()
+CORNERS = [(38.8, 1.2), (38.8, 18.8), (1.2, 18.8), (1.2, 1.2), (20.0, 1.2)]
+
+OTHER_ROOMS = [(-4.0, 16.0), (-4.0, 6.0), (-4.0, -4.0), (6.0, -4.0), (16.0, -4.0)]
+
+
+def round_the_block():
+    """True poses of a way once round the corridor and on, every 0.75 m or 0.5 rad."""
+    pose = np.array([3.0, 1.2, 0.0])
+    yield pose
+    for goal in CORNERS:
+        while np.hypot(*(goal - pose[:2])) > 0.5:
+            off = goal - pose[:2]
+            turn = np.clip(se2.wrap(np.arctan2(off[1], off[0]) - pose[2]), -0.5, 0.5)
+            ahead = 0.75 if abs(turn) < 0.3 else 0.2
+            pose = se2.compose(pose, np.array([0.0, 0.0, turn]))
+            pose = se2.compose(pose, np.array([ahead, 0.0, 0.0]))
+            yield pose
+
+
+class Driver:
+    """A robot whose odometry drifts, and its loop closure."""
+
+    def __init__(self, walls=RING, seed=6, bias=(0.0, 0.0, 0.0), **config):
+        self.rng = np.random.default_rng(seed)
+        self.loops = LoopClosure(LoopConfig(**config), Matcher())
+        self.walls = walls
+        self.bias = np.array(bias)
+        self.truths = []
+        self.corrections = []
+        self.largest = 0.0
+        self.pose = None
+        self.covariance = NONE
+
+    def go(self, truth, works=1):
+        """Be at the next true pose; returns what was corrected."""
+        if self.pose is None:
+            self.pose = truth
+        else:
+            step = se2.between(self.truths[-1], truth)
+            noise = self.rng.normal(0.0, SIGMAS) + np.hypot(step[0], step[1]) * self.bias
+            before = self.pose
+            self.pose = se2.compose(before, step + noise)
+            own = turned(STEP, float(before[2]))
+            self.covariance = carried(self.covariance, self.pose[:2] - before[:2]) + own
+        self.truths.append(truth)
+        self.largest = max(self.largest, float(np.hypot(*(self.pose - truth)[:2])))
+        scan = scan_in(self.walls, truth, self.rng, len(self.truths) - 1)
+        points = surface_points(scan, RANGE_MAX_M)
+        frame = Keyframe(scan, points, self.pose, self.path_m(), self.covariance, 0)
+        if len(points) >= FEWEST_POINTS and self.loops.is_due(self.pose):
+            self.loops.add(frame, STEP, NONE)
+        for _ in range(works):
+            correction = self.loops.work()
+            if correction is not None:
+                self.corrections.append(correction)
+                anchor = self.loops.keyframes.anchor
+                self.pose = correction.moved(anchor, self.pose)
+                self.covariance = self.loops.keyframes.frames[anchor].covariance
+
+    def path_m(self):
+        return self.loops.path_m(self.pose)
+
+    def errors(self, poses=None):
+        """Distance (N,) of keyframes from where they truly were."""
+        frames = self.loops.keyframes.frames
+        truths = np.array([self.truths[frame.scan.stamp_ns] for frame in frames])
+        poses = self.loops.keyframes.poses() if poses is None else poses
+        return np.hypot(*(poses[: len(truths)] - truths)[:, :2].T)
+
+
+@pytest.fixture(scope='module')
+def ring():
+    driver = Driver(bias=DRIFT)
+    for truth in round_the_block():
+        driver.go(truth, works=4)
+    return driver
+
+
+def test_a_ring_is_closed(ring):
+    assert ring.corrections
+    assert ring.largest > 1.0, 'without drift there is nothing to close'
+    assert ring.errors().max() < 0.6 * ring.largest
+    assert np.hypot(*(ring.pose - ring.truths[-1])[:2]) < 0.4
+    after = ring.loops.finish()
+    assert ring.errors(after).max() < 0.6 * ring.largest
+    np.testing.assert_array_equal(after[0], ring.loops.keyframes.poses()[0])
+
+
+def test_a_correction_tells_where_the_keyframes_were_and_are(ring):
+    first = ring.corrections[0]
+    assert first.before.shape == first.after.shape
+    np.testing.assert_array_equal(first.before[0], first.after[0])
+    moved = np.hypot(*(first.after - first.before)[:, :2].T)
+    assert moved.max() > 0.3
+    # The farther from the start, the more there was to correct: no jumps along the path.
+    assert np.abs(np.diff(moved)).max() < 0.2
+
+
+def test_a_closed_loop_leaves_less_uncertainty(ring):
+    open_ring = Driver(bias=DRIFT)
+    for truth in round_the_block():
+        open_ring.go(truth, works=0)
+    before = np.trace(open_ring.covariance[:2, :2])
+    assert np.trace(ring.covariance[:2, :2]) < 0.5 * before
+
+
+def test_a_closed_ring_reuses_its_keyframes(ring):
+    """The second time along the first side nothing new has to be kept, once it fits."""
+    number = len(ring.loops.keyframes)
+    stamps, poses = ring.loops.keyframes.path()
+    assert len(stamps) > number
+    truths = np.array([ring.truths[stamp] for stamp in stamps])
+    assert np.hypot(*(poses - truths)[-5:, :2].T).max() < 0.4
+
+
+def test_a_little_drift_is_not_made_worse():
+    driver = Driver()
+    for truth in round_the_block():
+        driver.go(truth, works=4)
+    assert driver.errors(driver.loops.finish()).max() < driver.largest
+
+
+def test_where_an_earlier_visit_saw_other_walls_nothing_is_closed():
+    """Another building stands there now: no match fits, and no edge comes of it."""
+    driver = Driver(bias=DRIFT)
+    way = list(round_the_block())
+    for k, truth in enumerate(way):
+        if k == 100:
+            driver.walls = np.vstack([ROOM + [x, y, x, y] for x, y in OTHER_ROOMS])
+        driver.go(truth, works=4)
+    assert not driver.corrections
+    assert not driver.loops.edges
+
+
+def edge_to(loops, a, b, off, sigma=0.03):
+    """A match of keyframes a and b that is that far (3,) from where they are."""
+    frames = loops.keyframes.frames
+    T = se2.between(frames[a].T_map_base, frames[b].T_map_base) + off
+    return Edge(a, b, T, np.eye(3) / sigma**2, True)
+
+
+@pytest.fixture
+def straight():
+    """Twelve keyframes out and twelve back beside them, along a hall; nothing is matched."""
+    loops = LoopClosure(LoopConfig(), Matcher())
+    poses = [se2.pose(k, 0.0, 0.0) for k in range(12)]
+    poses += [se2.pose(11 - k, 1.0, np.pi) for k in range(12)]
+    for k, pose in enumerate(poses):
+        scan = scan_in(ROOM, pose, stamp_ns=k)
+        frame = Keyframe(scan, surface_points(scan, RANGE_MAX_M), pose, float(k), NONE, 0)
+        loops.keyframes.keep(frame, STEP)
+    return loops
+
+
+def same_correction(loops, number):
+    """Matches that all say that the way back lies half a metre farther north."""
+    edges = []
+    for k in range(number):
+        a = k
+        b = 22 - k
+        frames = loops.keyframes.frames
+        moved = frames[b].T_map_base + [0.0, 0.5, 0.0]
+        T = se2.between(frames[a].T_map_base, moved)
+        edges.append(Edge(a, b, T, np.eye(3) / 0.03**2, True))
+    return edges
+
+
+def test_matches_that_ask_for_the_same_are_consistent(straight):
+    edges = same_correction(straight, 5)
+    straight._requested.extend(edges)
+    assert set(map(id, straight._consistent())) == set(map(id, edges))
+
+
+def test_a_false_match_is_left_out_of_consistent_ones(straight):
+    edges = same_correction(straight, 5)
+    false = edge_to(straight, 3, 16, [3.0, -1.0, 0.4])
+    straight._requested.extend([edges[0], false, *edges[1:]])
+    assert set(map(id, straight._consistent())) == set(map(id, edges))
+
+
+def test_matches_that_contradict_each_other_close_nothing(straight, rng):
+    for k in range(8):
+        off = np.array([3.0 * np.cos(2.0 * k), 3.0 * np.sin(2.0 * k), 0.3 * k])
+        straight._requested.append(edge_to(straight, k, 22 - k, off))
+    assert len(straight._consistent()) == 1
+    assert straight.work() is None
+    assert straight._rounds is None
+    assert not straight.edges
+
+
+def test_matches_of_one_keyframe_do_not_confirm_each_other(straight):
+    one = same_correction(straight, 1)[0]
+    straight._requested.extend([one, replace(one)])
+    assert len(straight._consistent()) == 1
+
+
+def test_a_step_does_one_match_or_one_round(monkeypatch):
+    """However much is due."""
+    driver = Driver(bias=DRIFT)
+    counts = {'matches': 0, 'rounds': 0}
+    match = LoopClosure._match
+    rounds = module.rounds
+
+    def counted_match(self, job):
+        counts['matches'] += 1
+        match(self, job)
+
+    def counted_rounds(poses, edges):
+        for each in rounds(poses, edges):
+            counts['rounds'] += 1
+            yield each
+
+    monkeypatch.setattr(LoopClosure, '_match', counted_match)
+    monkeypatch.setattr(module, 'rounds', counted_rounds)
+    for truth in round_the_block():
+        driver.go(truth, works=0)
+        for _ in range(4):
+            before = sum(counts.values())
+            correction = driver.loops.work()
+            assert sum(counts.values()) - before <= 1
+            if correction is not None:
+                driver.corrections.append(correction)
+                driver.pose = correction.moved(driver.loops.keyframes.anchor, driver.pose)
+    assert driver.corrections
+    assert counts['rounds'] > 1
+    # All is done at some time.
+    for _ in range(100):
+        driver.loops.work()
+    before = dict(counts)
+    assert driver.loops.work() is None
+    assert counts == before
+
+
+def test_a_robot_that_stands_about_keeps_one_scan(rng):
+    loops = LoopClosure(LoopConfig(), Matcher())
+    kept = 0
+    for k in range(50):
+        pose = np.array([2.0, 2.0, 0.0]) + rng.normal(0.0, 0.1, 3)
+        if loops.is_due(pose):
+            scan = scan_in(ROOM, pose, rng, k)
+            loops.add(
+                Keyframe(scan, surface_points(scan, RANGE_MAX_M), pose, 0.0, NONE, 0), STEP, NONE
+            )
+            kept += 1
+        loops.work()
+    assert kept == 1
+    assert loops.finish().shape == (1, 3)
+
+
+def test_the_path_is_measured_in_straight_lines():
+    loops = LoopClosure(LoopConfig(), Matcher())
+    assert loops.path_m(np.array([5.0, 5.0, 0.0])) == 0.0
+    for k, x in enumerate((0.0, 1.0, 2.0)):
+        pose = se2.pose(2.0 + x, 2.0, 0.0)
+        scan = scan_in(ROOM, pose, stamp_ns=k)
+        frame = Keyframe(scan, surface_points(scan, RANGE_MAX_M), pose, loops.path_m(pose), NONE, 0)
+        loops.add(frame, STEP, NONE)
+    assert loops.path_m(np.array([4.0, 5.0, 0.0])) == pytest.approx(5.0)
+
+
+def test_what_has_jumped_is_measured_anew(rng):
+    """Scan and motion contradicted each other on the way; the keyframes before see the same."""
+    loops = LoopClosure(LoopConfig(), Matcher())
+    truths = np.array([[1.2, 2.0, 0.3], [2.0, 2.0, 0.3], [2.8, 2.0, 0.3]])
+    told = truths + [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.3, 0.2, 0.05]]
+    for k, jump in enumerate([NONE, NONE, np.diag([0.1, 0.1, 0.01])]):
+        scan = scan_in(ROOM[:4] / 2.0, truths[k], rng, k, beams=361)
+        points = surface_points(scan, RANGE_MAX_M)
+        loops.add(Keyframe(scan, points, told[k], float(k), STEP + jump, 0), STEP, jump)
+        loops.work()
+    assert [(edge.a, edge.b) for edge in loops.edges] == [(1, 2)]
+    T = se2.between(truths[1], truths[2])
+    np.testing.assert_allclose(loops.edges[0].T_a_b, T, atol=0.05)
+    assert np.hypot(*(loops.finish()[2] - truths[2])[:2]) < 0.1
+
+
+def test_the_step_covariance_is_that_of_the_step(rng):
+    loops = LoopClosure(LoopConfig(), Matcher())
+    for k, pose in enumerate([np.zeros(3), np.array([1.0, 0.0, 0.2])]):
+        scan = scan_in(ROOM, pose + [2.0, 2.0, 0.0], rng, k)
+        loops.add(
+            Keyframe(scan, surface_points(scan, RANGE_MAX_M), pose, float(k), NONE, 0), STEP, NONE
+        )
+    loops.finish()
+    np.testing.assert_allclose(inverse(loops.keyframes.steps[0].information), STEP)
+
+
+def test_an_edge_to_what_is_seen_again_holds_the_errors_of_step_and_match(rng):
+    """From the anchor to an earlier keyframe, by way of a scan that both see; against sampling."""
+    loops = LoopClosure(LoopConfig(), Matcher())
+    poses = [se2.pose(2.0, 2.0, 0.3), se2.pose(4.0, 2.0, 2.0), se2.pose(2.3, 2.5, 0.8)]
+    frames = []
+    for k, pose in enumerate(poses):
+        scan = scan_in(ROOM, pose, stamp_ns=k)
+        frames.append(Keyframe(scan, surface_points(scan, RANGE_MAX_M), pose, 10.0 * k, NONE, 0))
+    for frame in frames[:2]:
+        loops.keyframes.keep(frame, STEP)
+    by_match = np.diag(np.square([0.02, 0.01, 0.05]))
+    by_step = np.diag([4e-4, 1e-4, 4e-4])
+    loops._pending = (frames[2], by_step)
+    T_j_here = se2.between(poses[0], poses[2])
+    T_a_here = se2.between(poses[1], poses[2])
+    loops._agree(Edge(0, 2, T_j_here, inverse(by_match), True))
+    edge = loops.edges[0]
+    assert (edge.a, edge.b) == (1, 0)
+    assert loops.keyframes.anchor == 0
+    np.testing.assert_allclose(edge.T_a_b, se2.between(poses[1], poses[0]), atol=1e-12)
+    sampled = np.array(
+        [
+            se2.compose(T_a_here + step, se2.invert(T_j_here + match))
+            for step, match in zip(
+                rng.multivariate_normal(np.zeros(3), by_step, 20000),
+                rng.multivariate_normal(np.zeros(3), by_match, 20000),
+                strict=True,
+            )
+        ]
+    )
+    truth = np.cov(sampled, rowvar=False)
+    scale = np.sqrt(np.outer(np.diag(truth), np.diag(truth)))
+    np.testing.assert_allclose(inverse(edge.information) / scale, truth / scale, atol=0.06)

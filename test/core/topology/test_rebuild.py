@@ -1,0 +1,84 @@
+"""A graph that is rebuilt where trajectory, grid and windows come one after the other."""
+
+import numpy as np
+import pytest
+
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
+from thinmap_ros.core.topology.builder import TopologyBuilder
+from thinmap_ros.core.topology.rebuild import Rebuilding
+
+POSES = np.array([[4.0 + 0.5 * k, 5.0, 0.0] for k in range(5)])
+STAMPS = np.arange(1, 6)
+
+
+def hall(shift_m=0.0):
+    """A hall of 8 x 4 m in the middle of what is unknown, cells of 10 cm."""
+    cells = np.full((160, 160), UNKNOWN, dtype=np.int8)
+    cells[29:72, 20:102] = 100
+    cells[30:71, 21:101] = 0
+    return GridPatch(GridFrame(shift_m, 0.0, 0.1), cells)
+
+
+def built(rebuilding):
+    builder = TopologyBuilder()
+    for stamp, T in zip(STAMPS.tolist(), POSES, strict=True):
+        rebuilding.window(hall(), 0)
+        assert rebuilding.accepts_window()
+        builder.update(hall(), T)
+        rebuilding.add_pose(stamp, T)
+    return builder
+
+
+@pytest.mark.parametrize('from_the_start', [True, False])
+def test_the_graph_goes_where_the_grid_has_gone_and_its_nodes_keep_their_ids(from_the_start):
+    rebuilding = Rebuilding(from_the_start)
+    builder = built(rebuilding)
+    before = {i: node.position for i, node in builder.map.nodes.items()}
+    assert before
+    moved = POSES + [1.0, 0.0, 0.0]
+    rebuilding.correct(9, STAMPS, moved)
+    assert rebuilding.awaits(9) and not rebuilding.awaits(8)
+    rebuilding.rebuild(builder, hall(1.0))
+    assert len(builder.map.nodes) == len(before)
+    if from_the_start:
+        for i, place in before.items():
+            np.testing.assert_allclose(
+                builder.map.nodes[i].position, np.add(place, [1.0, 0.0]), atol=0.15
+            )
+
+
+def test_between_the_news_and_the_grid_nothing_is_taken_nor_what_is_out_of_date():
+    rebuilding = Rebuilding()
+    builder = built(rebuilding)
+    rebuilding.correct(9, STAMPS, POSES)
+    rebuilding.window(hall(), 0)
+    assert not rebuilding.accepts_window()
+    rebuilding.rebuild(builder, hall())
+    assert not rebuilding.accepts_window(), 'cut out before'
+    rebuilding.window(hall(), 9)
+    assert rebuilding.accepts_window()
+
+
+def test_a_builder_that_is_new_takes_windows_of_a_grid_that_was_corrected_before():
+    rebuilding = Rebuilding()
+    rebuilding.window(hall(), 7)
+    assert rebuilding.accepts_window()
+
+
+def test_a_mapper_that_begins_anew_after_a_correction_is_followed():
+    rebuilding = Rebuilding()
+    builder = built(rebuilding)
+    rebuilding.correct(9, STAMPS, POSES)
+    rebuilding.rebuild(builder, hall())
+    for corrected_ns in (9, 0):
+        rebuilding.window(hall(), corrected_ns)
+        assert rebuilding.accepts_window()
+
+
+def test_a_grid_that_never_comes_is_not_waited_for_for_ever():
+    rebuilding = Rebuilding()
+    built(rebuilding)
+    rebuilding.correct(9, STAMPS, POSES)
+    rebuilding.window(hall(), 9)
+    assert any(rebuilding.accepts_window() for _ in range(2000))

@@ -1,0 +1,180 @@
+"""config/*.yaml says for people what the nodes declare: every parameter, its default, its meaning.
+
+THINMAP_WRITE_CONFIG=1 writes the files anew from what is declared.
+"""
+
+import dataclasses
+import importlib
+import json
+import os
+import textwrap
+from pathlib import Path
+
+import pytest
+import rclpy
+import yaml
+
+from thinmap_ros.core.errors import ConfigError
+from thinmap_ros.logs.bag_writer import BagWriter
+
+ROOT = Path(__file__).resolve().parents[2]
+# All but the one that runs the others.
+NODES = sorted(
+    path.stem
+    for path in (ROOT / 'thinmap_ros' / 'nodes').glob('[a-z]*.py')
+    if path.stem != 'thinmap'
+)
+# What rclpy declares in every node of its own accord.
+OF_EVERY_NODE = {'start_type_description_service'}
+# What a node must be told here that is not its default: a bag that exists; a test opens no window.
+NEEDED = {'bag_player': {'bag': 'some_bag'}, 'rerun_viewer': {'spawn': False}}
+OWN_WORDS = {'use_sim_time': 'follow /clock instead of the time of the machine'}
+
+
+def node_class(name):
+    module = importlib.import_module(f'thinmap_ros.nodes.{name}')
+    classes = [
+        c for c in vars(module).values() if isinstance(c, type) and c.__module__ == module.__name__
+    ]
+    (found,) = [c for c in classes if issubclass(c, rclpy.node.Node)]
+    return found
+
+
+def default_of(name, key):
+    """Default of a field of the config that a node's own module has."""
+    module = importlib.import_module(f'thinmap_ros.nodes.{name}')
+    configs = [
+        c
+        for c in vars(module).values()
+        if dataclasses.is_dataclass(c) and c.__module__ == module.__name__
+    ]
+    (default,) = [
+        field.default for c in configs for field in dataclasses.fields(c) if field.name == key
+    ]
+    return default
+
+
+@pytest.fixture
+def declared(ros_domain, tmp_path, monkeypatch):
+    """Value and descriptor of a node's parameters, by name, as it starts with some arguments."""
+    monkeypatch.chdir(tmp_path)
+    BagWriter(tmp_path / 'some_bag', live=True).close()
+
+    def start(name, *arguments):
+        rclpy.init(args=['--ros-args', *arguments])
+        try:
+            node = node_class(name)()
+            names = [
+                n
+                for n in node._parameters
+                if n not in OF_EVERY_NODE and not n.startswith('qos_overrides')
+            ]
+            found = {n: (node.get_parameter(n).value, node.describe_parameter(n)) for n in names}
+            getattr(node, 'close', lambda: None)()
+            node.destroy_node()
+            return found
+        finally:
+            rclpy.shutdown()
+
+    return start
+
+
+def described(name, value, descriptor):
+    text = OWN_WORDS.get(name, descriptor.description)
+    limits = [*descriptor.floating_point_range, *descriptor.integer_range]
+    if limits:
+        text += f'; {limits[0].from_value:g} to {limits[0].to_value:g}'
+    if descriptor.additional_constraints:
+        text += f'; {descriptor.additional_constraints}'
+    assert text, f'{name} has no description'
+    if not descriptor.read_only and name not in OWN_WORDS:
+        text += '; can be changed at run time'
+    lines = textwrap.wrap(text, 112, initial_indent='    # ', subsequent_indent='    # ')
+    return [*lines, '    ' + yaml.safe_dump({name: value}).strip()]
+
+
+def file_text(name, parameters):
+    lines = [f'# Parameters of the node {name}, with their defaults:', '#   ros2 run thinmap_ros']
+    lines[1] += f' {name} --ros-args --params-file config/{name}.yaml'
+    lines += ['/**:', '  ros__parameters:']
+    for parameter, (value, descriptor) in parameters.items():
+        lines += described(parameter, value, descriptor)
+    return '\n'.join(lines) + '\n'
+
+
+@pytest.mark.parametrize('name', NODES)
+def test_config_file_says_what_the_node_declares(declared, name):
+    path = ROOT / 'config' / f'{name}.yaml'
+    needed = NEEDED.get(name, {})
+    arguments = [
+        word for key, value in needed.items() for word in ('-p', f'{key}:={json.dumps(value)}')
+    ]
+    parameters = declared(name, *arguments)
+    for key in needed:
+        parameters[key] = (default_of(name, key), parameters[key][1])
+    text = file_text(name, parameters)
+    if 'THINMAP_WRITE_CONFIG' in os.environ:
+        path.write_text(text)
+    assert path.read_text() == text, (
+        f'{path.name}: see the top of {__file__} for how to write it anew'
+    )
+
+
+@pytest.mark.parametrize('name', NODES)
+def test_node_takes_its_config_file(declared, tmp_path, name):
+    content = yaml.safe_load((ROOT / 'config' / f'{name}.yaml').read_text())
+    values = content['/**']['ros__parameters']
+    # A value that is no default proves that the file is read at all.
+    values['use_sim_time'] = True
+    values |= NEEDED.get(name, {})
+    (tmp_path / 'given.yaml').write_text(yaml.safe_dump({'/**': {'ros__parameters': values}}))
+    found = declared(name, '--params-file', str(tmp_path / 'given.yaml'))
+    assert {n: value for n, (value, _) in found.items()} == values
+
+
+def test_unknown_key_of_a_file_is_an_error(declared, tmp_path):
+    (tmp_path / 'given.yaml').write_text(
+        yaml.safe_dump({'/**': {'ros__parameters': {'windwo_m': 3.0}}})
+    )
+    with pytest.raises(ConfigError, match=r'no parameter windwo_m; it has: .*window_m'):
+        declared('grid_mapper', '--params-file', str(tmp_path / 'given.yaml'))
+
+
+def test_there_is_a_file_for_each_node_and_no_other():
+    assert sorted(path.stem for path in (ROOT / 'config').glob('*.yaml')) == NODES
+
+
+PRESETS = sorted((ROOT / 'config' / 'sensors').glob('*'))
+
+
+@pytest.mark.parametrize('name', ['localizer', 'grid_mapper', 'sim'])
+@pytest.mark.parametrize('preset', PRESETS, ids=lambda path: path.stem)
+def test_sensor_presets_are_known_to_the_nodes_and_hold_in_any_namespace(declared, preset, name):
+    wanted = yaml.safe_load(preset.read_text())[f'/**/{name}']['ros__parameters']
+    for namespace in ('', '/robot1'):
+        remap = ('-r', f'__ns:={namespace}') if namespace else ()
+        found = declared(name, '--params-file', str(preset), *remap)
+        assert {key: found[key][0] for key in wanted} == wanted
+
+
+def test_the_preset_of_a_laser_that_publishes_zero_says_so_to_every_node_with_a_laser():
+    content = yaml.safe_load((ROOT / 'config' / 'sensors' / 'turtlebot3_lds.yaml').read_text())
+    parts = {key.removeprefix('/**/'): part['ros__parameters'] for key, part in content.items()}
+    told = {name for name, part in parts.items() if part.get('zero_is_no_return')}
+    files = (ROOT / 'config').glob('*.yaml')
+    declaring = {path.stem for path in files if 'zero_is_no_return' in path.read_text()}
+    assert told == declaring
+
+
+def test_presets_fit_together():
+    assert len(PRESETS) == 5
+    for preset in PRESETS:
+        content = yaml.safe_load(preset.read_text())
+        sim, grid, localizer = (
+            content[f'/**/{name}']['ros__parameters']
+            for name in ('sim', 'grid_mapper', 'localizer')
+        )
+        assert localizer['match_range_m'] <= sim['range_max_m']
+        assert grid['usable_range_m'] <= sim['range_max_m']
+        reach_m = max(grid['no_return_range_m'], min(grid['usable_range_m'], 4.0))
+        assert grid['window_m'] >= 2.0 * reach_m

@@ -1,0 +1,342 @@
+"""Every command line of README.md and docs/tutorials.md runs as it stands there.
+
+The commands of a section are given to bash one after the other, in a shell as `source scripts/env`
+makes it, in a folder where the files have the names that the text uses. A section that is new has
+to be named here, with what it needs beside it; its lines then run by themselves.
+"""
+
+import os
+import re
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from logs.test_log import ros1_bag
+from support.timeouts import PATIENCE_S
+from tools.test_replay import carmen_lines
+
+from docs import commands
+from thinmap_ros.files import occupancy_maps, package_data
+from thinmap_ros.files.worlds import read_world
+from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
+from thinmap_ros.tools.carmen_to_bag import convert
+
+pytestmark = [pytest.mark.live, pytest.mark.timeout(400)]
+ROOT = Path(__file__).resolve().parents[2]
+DOCUMENTS = [ROOT / 'README.md', ROOT / 'docs' / 'tutorials.md']
+COMMANDS = [command for path in DOCUMENTS for command in commands.commands(path)]
+
+# Marked in the documents, and why. No more than six marks.
+NOT_RUN = {
+    'scripts/demo --view': 'opens a window',
+    ".setup/venv/bin/pip install 'rerun-sdk>=0.41,<0.42'": 'fetches 740 MB',
+    'scripts/screenshot RUN.rrd OUT.png': 'needs rerun and an X server',
+    'cd ws/src && git clone <this repository> thinmap && cd ..': 'the workspace of a user',
+    'echo "yaml file://$PWD/src/thinmap/rosdep.yaml" | '
+    'sudo tee /etc/ros/rosdep/sources.list.d/50-thinmap.list': 'as above',
+    'rosdep update': 'as above',
+    'rosdep install --from-paths src/thinmap src/thinmap/thinmap_msgs --ignore-src -y': 'as above',
+    'colcon build --base-paths src/thinmap src/thinmap/thinmap_msgs': 'as above; CI does it',
+    'source install/setup.bash': 'as above',
+    'ros2 run thinmap_ros warm_up      # compiles the kernels: once, a minute or two': 'as above',
+    'ros2 run thinmap_ros localizer': 'as above; the tutorials have it, too',
+    'ros2 run thinmap_ros rerun_viewer': 'needs rerun, opens a window',
+}
+MOST_MARKS = 6
+
+# Too long for every run: these ask for help only, so that script, program and options are there.
+HELP_ONLY = {
+    'scripts/demo': 'test/live/test_demo.py runs the demo to its end',
+    'scripts/endurance': 'hours; scripts/endurance --minutes 10 is for releases',
+    'scripts/experiments/all.sh': 'test/experiments/test_experiments.py runs each experiment',
+}
+# Shortened by what the same lines of the documents say.
+SHORTER = {
+    'scripts/test': 'scripts/test test/core/topology/test_thinning.py',
+    'scripts/experiments/exploration.sh': 'scripts/experiments/exploration.sh --from-bag bags',
+}
+
+# Said by commands that end with 0 all the same.
+FAILED = ('Traceback', 'success=False', 'Setting parameter failed', 'Transitioning failed')
+
+
+@dataclass(frozen=True)
+class Section:
+    """What runs beside the commands of a section: nodes, with their parameters."""
+
+    beside: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+
+SIM = {'sim': {'start': '2.0,2.0,0.0'}}
+ALL_NODES = {
+    'thinmap': {'use_sim_time': True, 'start_x_m': 2.0, 'start_y_m': 2.0},
+    **SIM,
+}
+SECTIONS = {
+    ('README.md', 'Two commands'): Section(),
+    ('README.md', 'Your own bag or log'): Section(),
+    ('README.md', 'Other tools'): Section(),
+    ('README.md', "The papers' experiments"): Section(),
+    ('README.md', 'In your ROS 2 workspace'): Section(SIM),
+    ('README.md', 'Nodes'): Section(),
+    ('README.md', 'Going on tomorrow'): Section(ALL_NODES),
+    ('README.md', 'Where am I?'): Section(SIM),
+    ('tutorials.md', 'Tutorials'): Section(),
+    ('tutorials.md', 'Your robot in 10 minutes'): Section(SIM),
+    ('tutorials.md', 'Your bag in 5 minutes'): Section(),
+    ('tutorials.md', 'Your map to a Nav2 route graph in 2 minutes'): Section(),
+    ('tutorials.md', 'Two robots'): Section(),
+    ('tutorials.md', 'Left running'): Section({'localizer': {}}),
+}
+
+FIVE = ['localizer', 'grid_mapper', 'topology_builder', 'navigator', 'explorer']
+NODE_NAMES = re.compile(r"'(\w+)',")
+ENDS_BY_ITSELF = ('bag_player',)
+
+
+def nodes_of_package() -> set[str]:
+    listed = re.search(r'NODES = \[(.*?)\]', (ROOT / 'setup.py').read_text(), re.DOTALL)
+    assert listed
+    return set(NODE_NAMES.findall(listed[1])) - set(ENDS_BY_ITSELF)
+
+
+def told_by(text: str) -> list[str]:
+    """Names under which the nodes of a command tell on /diagnostics how they are."""
+    words = text.split('--ros-args')[0].split('#')[0].removesuffix('&').split()
+    program = words[3]
+    names = words[4:] or FIVE if program == 'thinmap' else [program]
+    space = re.search(r'__ns:=/(\S+)', text)
+    prefix = f'{space[1]}/' if space else ''
+    return [f'{prefix}{name}: thinmap' for name in names]
+
+
+def kind_of(text: str) -> str:
+    """What a command does in the end: goes on for ever (and how it is ended), or ends by itself."""
+    run = re.match(r'ros2 run thinmap_ros (\w+)', text)
+    if run and (run[1] in nodes_of_package() or 'start_paused:=true' in text):
+        return 'node'
+    if re.match(r'ros2 topic (hz|echo (?!.*--once))', text):
+        return 'listener'
+    return 'goal' if text.startswith('ros2 action send_goal') else 'program'
+
+
+class Line:
+    """A command of the documents, in a bash of its own, as in a terminal of its own."""
+
+    def __init__(self, text: str, number: int, folder: Path, environment: dict[str, str]) -> None:
+        self.text = text
+        self._log = folder / f'line{number}.txt'
+        # Jobs in the background have a group of their own, and hear Ctrl-C, as in a terminal.
+        script = f'set -m\n{text}\nstatus=$?\n[ -z "$!" ] || wait $! || exit\nexit $status'
+        with self._log.open('wb') as log:
+            self.process = subprocess.Popen(
+                ['bash', '-c', script],
+                cwd=folder,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+
+    def said(self) -> str:
+        return self._log.read_text()
+
+    def has_ended(self) -> bool:
+        return self.process.poll() is not None
+
+    def interrupt(self) -> None:
+        """Press Ctrl-C."""
+        for child in self._children():
+            os.killpg(child.pid, signal.SIGINT)
+
+    def _children(self) -> list[psutil.Process]:
+        try:
+            return psutil.Process(self.process.pid).children()
+        except psutil.NoSuchProcess:
+            return []
+
+    def end(self, code: int) -> None:
+        """Check the exit code, now or soon."""
+        self.process.wait(timeout=PATIENCE_S)
+        assert self.process.returncode == code, f'{self.text}\n{self.said()}'
+        for bad in FAILED:
+            assert bad not in self.said(), f'{self.text}\n{self.said()}'
+
+    def kill(self) -> None:
+        for child in self._children():
+            os.killpg(child.pid, signal.SIGKILL)
+        self.process.kill()
+        self.process.wait()
+
+
+@pytest.fixture(scope='module')
+def environment() -> dict[str, str]:
+    """Variables of a shell after `source scripts/env`."""
+    done = subprocess.run(
+        ['bash', '-c', f'source {ROOT}/scripts/env && env -0'], capture_output=True, check=True
+    )
+    pairs = done.stdout.decode().rstrip('\0').split('\0')
+    return dict(pair.split('=', 1) for pair in pairs)
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Path:
+    """A folder in which the files of the documents are, with the project's scripts."""
+    (tmp_path / 'LOG.clf').write_text('\n'.join(carmen_lines()) + '\n')
+    (tmp_path / 'FOLDER' / 'NAME').mkdir(parents=True)
+    (tmp_path / 'FOLDER' / 'NAME' / 'log.clf').write_text('\n'.join(carmen_lines()) + '\n')
+    for bag in ('BAG', 'my_bag'):
+        convert(CarmenLog(tmp_path / 'LOG.clf', LaserOptions()), tmp_path / bag)
+    ros1_bag(tmp_path / 'my.bag')
+    (tmp_path / 'bags').symlink_to(ROOT / 'bags')
+    _, patch, _ = read_world(package_data.world_path('room_10x10'))
+    (tmp_path / 'maps').mkdir()
+    occupancy_maps.write_map(tmp_path / 'maps' / 'office', patch)
+    occupancy_maps.write_map(tmp_path / 'office', patch)
+    _write_scripts(tmp_path / 'scripts')
+    return tmp_path
+
+
+def _write_scripts(folder: Path) -> None:
+    """The project's scripts by their documented names.
+
+    Experiments write here, not into the project's own results.
+    """
+    for path in (ROOT / 'scripts').rglob('*'):
+        inside = path.relative_to(ROOT / 'scripts')
+        if path.is_file() and os.access(path, os.X_OK) and inside.parts[0] != 'shim':
+            more = ' -o "$PWD/out/experiments"' if inside.parts[0] == 'experiments' else ''
+            (folder / inside).parent.mkdir(parents=True, exist_ok=True)
+            (folder / inside).write_text(f'#!/usr/bin/env bash\nexec {path} "$@"{more}\n')
+            (folder / inside).chmod(0o755)
+    (folder / 'env').write_text(f'. {ROOT}/scripts/env\n')
+
+
+def shortened(text: str) -> str:
+    """Command as it is run here: most as they stand."""
+    bare = text.split('#')[0].strip()
+    if bare in HELP_ONLY:
+        return f'{bare} --help'
+    return SHORTER.get(bare, text)
+
+
+def run_section(graph: Any, lines: list[str], place: Path, environment: dict[str, str]) -> None:
+    health = graph.heard('/diagnostics', DiagnosticArray)
+    running: list[Line] = []
+    try:
+        for number, text in enumerate(lines):
+            line = Line(shortened(text), number, place, environment)
+            running.append(line)
+            _follow(graph, line, health)
+        for line in running:
+            if not line.has_ended():
+                line.interrupt()
+            kind = kind_of(line.text)
+            line.end(0 if kind in ('node', 'program') else signal.SIGINT)
+    finally:
+        for line in running:
+            if not line.has_ended():
+                line.kill()
+
+
+def _follow(graph: Any, line: Line, health: list[DiagnosticArray]) -> None:
+    """Wait until a command has done what it is for."""
+    kind = kind_of(line.text)
+    if kind == 'node':
+        names = set(told_by(line.text))
+        _until(graph, line, lambda: names <= {s.name for a in health for s in a.status})
+        return
+    if line.text.endswith('&'):
+        return
+    if kind == 'program':
+        _until(graph, line, line.has_ended, PATIENCE_S * 3.0)
+        line.end(0)
+        return
+    _until(graph, line, lambda: ('Feedback:' if kind == 'goal' else '\n') in line.said())
+    line.interrupt()
+    line.end(signal.SIGINT)
+    assert kind != 'goal' or line.said().endswith('Goal canceled.\n')
+
+
+def _until(
+    graph: Any, line: Line, condition: Callable[[], Any], seconds: float = PATIENCE_S
+) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        graph.executor.spin_once(timeout_sec=0.05)
+        too_late = time.monotonic() > end
+        failed = line.process.poll() not in (None, 0)
+        if too_late or failed:
+            pytest.fail(f'{line.text}\n{line.process.poll()}\n{line.said()[-3000:]}')
+
+
+@pytest.mark.parametrize(('document', 'section'), SECTIONS)
+def test_the_commands_of_a_section_run(graph, place, environment, document, section):
+    wanted = [c for c in COMMANDS if (c.document, c.section) == (document, section)]
+    lines = [c.text for c in wanted if not c.marked]
+    assert lines, f'{document}, {section}: no commands any more'
+    for name, values in SECTIONS[document, section].beside.items():
+        graph.start(name, **values)
+    shell = {**environment, 'ROS_DOMAIN_ID': os.environ['ROS_DOMAIN_ID']}
+    shell['THINMAP_STATE_DIR'] = os.environ['THINMAP_STATE_DIR']
+    run_section(graph, lines, place, shell)
+
+
+def test_no_command_is_left_out():
+    sections = {(c.document, c.section) for c in COMMANDS if not c.marked}
+    assert sections <= set(SECTIONS), 'not covered: name the section in SECTIONS'
+    assert {c.text for c in COMMANDS if c.marked} == set(NOT_RUN)
+    assert sum(commands.marks(path) for path in DOCUMENTS) <= MOST_MARKS
+    texts = {c.text.split('#')[0].strip() for c in COMMANDS}
+    assert set(HELP_ONLY) | set(SHORTER) <= texts
+
+
+def test_commands_are_found_in_blocks_and_text(tmp_path):
+    document = tmp_path / 'page.md'
+    lines = [
+        '# Page',
+        '',
+        'Say `ros2 topic',
+        'list`, not `ros2 topic`.',
+        '',
+        '    ros2 run a b \\',
+        '      -p c &',
+        '    # none',
+        '    ls  # c',
+        '',
+        '<!-- not run -->',
+        '    rm x',
+        '',
+        '## Two',
+        '',
+        '1. A: <!-- not run --> `scripts/x`, `scripts/y`',
+        '',
+        '       cat z',
+        '',
+        '```',
+        'echo w',
+        '',
+        '# n',
+        '```',
+    ]
+    document.write_text('\n'.join(lines))
+    found = [(c.section, c.text, c.marked) for c in commands.commands(document)]
+    assert found == [
+        ('Page', 'ros2 topic list', False),
+        ('Page', 'ros2 run a b \\\n  -p c &', False),
+        ('Page', 'ls  # c', False),
+        ('Page', 'rm x', True),
+        ('Two', 'scripts/x', True),
+        ('Two', 'scripts/y', False),
+        ('Two', 'cat z', False),
+        ('Two', 'echo w', False),
+    ]
+    assert commands.marks(document) == 2

@@ -1,0 +1,151 @@
+"""docs/nodes.md says what a node listens to, says, offers and can be told, as the node declares it.
+
+THINMAP_WRITE_CONFIG=1 writes the page anew.
+"""
+
+import inspect
+import os
+from importlib.resources import files
+
+import pytest
+import rclpy
+from rclpy.action import get_action_server_names_and_types_by_node
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from test_config_files import NEEDED, NODES, OF_EVERY_NODE, OWN_WORDS, ROOT, default_of, node_class
+
+from thinmap_ros.logs.bag_writer import BagWriter
+
+PAGE = ROOT / 'docs' / 'nodes.md'
+# What rclpy and its lifecycle give to every node.
+COMMON = ('/parameter_events', '/rosout', '/clock', '/diagnostics', 'transition_event')
+HEAD = """# Nodes
+
+Made from the nodes themselves; do not edit (see `test/docs/test_node_reference.py`). Names without a leading slash are
+relative: a namespace goes before them. Every node but the monitor publishes `/diagnostics`; all follow `/clock` with
+`use_sim_time`. Nodes with the parameter `autostart` are lifecycle nodes (`~/change_state`, `~/get_state`, ...).
+"""  # noqa: E501
+
+
+@pytest.fixture
+def declared(ros_domain, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    BagWriter(tmp_path / 'some_bag', live=True).close()
+    arguments = [
+        word for name in NODES for k, v in NEEDED.get(name, {}).items() for word in rule(name, k, v)
+    ]
+    rclpy.init(args=['--ros-args', *arguments])
+    yield lambda name: node_class(name)()
+    rclpy.shutdown()
+
+
+def rule(name, key, value):
+    return ('-p', f'{name}:{key}:={str(value).lower() if isinstance(value, bool) else value}')
+
+
+def kind_of(message):
+    package, part = message.__module__.split('.')[:2]
+    return f'{package}/{part}/{message.__name__}'
+
+
+def quality(profile):
+    reliable = 'reliable' if profile.reliability == ReliabilityPolicy.RELIABLE else 'best effort'
+    latched = ', latched' if profile.durability == DurabilityPolicy.TRANSIENT_LOCAL else ''
+    return f'{reliable}{latched}, {profile.depth}'
+
+
+def relative(name, node):
+    own = f'/{node}/'
+    name = f'~/{name[len(own) :]}' if name.startswith(own) else name
+    return name if name in ('/tf', '/tf_static', '/clock') else name.removeprefix('/')
+
+
+def topics(entities, node):
+    rows = {
+        (relative(e.topic_name, node), kind_of(e.msg_type), quality(e.qos_profile))
+        for e in entities
+        if not e.topic_name.endswith(COMMON)
+    }
+    return [f'| `{topic}` | `{kind}` | {profile} |' for topic, kind, profile in sorted(rows)]
+
+
+def services(node, name):
+    found = {(relative(s.srv_name, name), kind_of(s.srv_type)) for s in node.services}
+    return [
+        f'`{topic}` (`{kind}`)'
+        for topic, kind in sorted(found)
+        if kind.startswith(('std_srvs', 'thinmap'))
+    ]
+
+
+def actions(node):
+    found = get_action_server_names_and_types_by_node(node, node.get_name(), node.get_namespace())
+    return [f'`{name.removeprefix("/")}` (`{types[0]}`)' for name, types in sorted(found)]
+
+
+def parameters(node, name):
+    for key in node._parameters:
+        if key in OF_EVERY_NODE or key in OWN_WORDS or key.startswith('qos_overrides'):
+            continue
+        value = (
+            default_of(name, key) if key in NEEDED.get(name, {}) else node.get_parameter(key).value
+        )
+        descriptor = node.describe_parameter(key)
+        limits = [*descriptor.floating_point_range, *descriptor.integer_range]
+        span = (
+            f'{limits[0].from_value:g} to {limits[0].to_value:g}'
+            if limits
+            else descriptor.additional_constraints
+        )
+        live = '' if descriptor.read_only else 'yes'
+        shown = f'`{value}`' if value != '' else ''
+        yield f'| `{key}` | {shown} | {span} | {live} | {descriptor.description} |'
+
+
+def section(name, node):
+    lines = [f'## {name}', '', inspect.getmodule(type(node)).__doc__.strip(), '']
+    lines += [' '.join(inspect.cleandoc(type(node).__doc__).split()), '']
+    for what, entities in (('Listens to', node.subscriptions), ('Says', node.publishers)):
+        if rows := topics(entities, name):
+            lines += [f'| {what} | type | quality, depth |', '|---|---|---|', *rows, '']
+    for what, found in (('Services', services(node, name)), ('Actions', actions(node))):
+        if found:
+            lines += [f'{what}: {", ".join(found)}', '']
+    if rows := list(parameters(node, name)):
+        lines += [
+            '| parameter | default | allowed | at run time | what |',
+            '|---|---|---|---|---|',
+            *rows,
+            '',
+        ]
+    return lines
+
+
+def message_texts():
+    lines = ['# Messages, services and actions', '']
+    for part in ('msg', 'srv', 'action'):
+        for path in sorted((ROOT / 'thinmap_msgs' / part).iterdir()):
+            lines += [
+                f'## thinmap_msgs/{part}/{path.stem}',
+                '',
+                '```',
+                path.read_text().strip(),
+                '```',
+                '',
+            ]
+    return lines
+
+
+def test_the_page_says_what_the_nodes_declare(declared):
+    lines = [HEAD]
+    for name in NODES:
+        node = declared(name)
+        lines += section(name, node)
+        getattr(node, 'close', lambda: None)()
+        node.destroy_node()
+    text = '\n'.join([*lines, *message_texts()])
+    if 'THINMAP_WRITE_CONFIG' in os.environ:
+        PAGE.write_text(text)
+    assert PAGE.read_text() == text, (
+        f'{PAGE.name}: see the top of {__file__} for how to write it anew'
+    )
+    assert files('thinmap_ros').joinpath('nodes', 'thinmap.py').is_file()

@@ -1,0 +1,96 @@
+"""The census of end nodes, and the numbers that sum up an exploration."""
+
+import json
+
+import numpy as np
+import pytest
+
+from thinmap_ros.closed_loop import Ending
+from thinmap_ros.core.exploration.strategy import FIRST_STAND_IN_ID
+from thinmap_ros.evaluation.exploration_metrics import (
+    FEWEST_SIGHTINGS,
+    EndNodeCensus,
+    TargetLog,
+    exploration_report,
+)
+
+AFAR = np.array([100.0, 100.0, 0.0])
+
+
+def census_of(*decisions, pose=AFAR):
+    census = EndNodeCensus()
+    for nodes in decisions:
+        census.take(nodes, pose)
+    return census
+
+
+def test_an_end_node_that_flickers_under_new_ids_is_one_place():
+    decisions = [[(i, 1.0 + 0.1 * (i % 2), 1.0)] for i in range(1, 40)]
+    assert census_of(*decisions).seen == 1
+
+
+def test_an_end_node_that_wanders_down_a_corridor_is_one_place():
+    assert census_of(*([(1, 0.2 * i, 0.0)] for i in range(60))).seen == 1
+
+
+def test_two_at_once_are_two_places_however_near():
+    assert census_of(*([[(1, 0.0, 0.0), (2, 0.4, 0.0)]] * 10)).seen == 2
+
+
+def test_what_did_not_last_is_not_counted():
+    blink = (1, 5.0, 5.0)
+    stay = (2, 0.0, 0.0)
+    decisions = [[blink, stay]] * (FEWEST_SIGHTINGS - 1) + [[stay]]
+    assert census_of(*decisions).seen == 1
+
+
+def test_what_stands_in_for_a_border_is_no_end_node():
+    assert census_of(*([[(FIRST_STAND_IN_ID, 0.0, 0.0), (1, 5.0, 5.0)]] * 10)).seen == 1
+
+
+def test_a_visit_is_nearer_than_half_a_metre():
+    census = census_of(*([[(1, 100.4, 100.0), (2, 100.6, 100.0)]] * 10))
+    assert (census.seen, census.visited) == (2, 1)
+
+
+def report_of(coverage, census=None):
+    times = np.arange(0.0, 10.1, 0.5)
+    poses = np.column_stack([0.5 * times, 0.0 * times, 0.1 * times])
+    return exploration_report(
+        Ending(True, 'done', 0),
+        times,
+        poses,
+        poses + (0.0, 0.03, 0.0),
+        np.array(coverage),
+        census or EndNodeCensus(),
+    )
+
+
+def test_distance_time_and_error_are_those_of_the_path():
+    report = report_of([(0.0, 0.1), (4.0, 0.93), (10.0, 0.985)])
+    assert report['distance'] == pytest.approx(5.0)
+    assert report['time'] == pytest.approx(10.0)
+    assert report['pose_rmse'] == pytest.approx(0.03)
+    assert report['turned_rad'] == pytest.approx(1.0)
+
+
+def test_milestones_are_when_a_coverage_was_first_measured_and_none_where_it_never_was():
+    report = report_of([(0.0, 0.1), (4.0, 0.93), (6.0, 0.951), (8.0, 0.94), (10.0, 0.985)])
+    assert report['time_at'] == {'0.90': 4.0, '0.95': 6.0, '0.98': 10.0, '0.99': None}
+    assert report['distance_at'] == {'0.90': 2.0, '0.95': 3.0, '0.98': 5.0, '0.99': None}
+    json.dumps(report)
+
+
+@pytest.mark.parametrize(
+    ('places', 'changes', 'reversals'),
+    [
+        ([0.0, 0.3, 0.6, None, 0.5], 0, 0),
+        ([0.0, 5.0, 10.0], 2, 0),
+        ([0.0, 5.0, 0.2, 5.1, 9.0], 4, 2),
+    ],
+)
+def test_a_target_that_goes_back_to_the_one_before_is_a_reversal(places, changes, reversals):
+    log = TargetLog()
+    for place in places:
+        log.take(None if place is None else np.array([place, 1.0, 0.0]))
+    assert (log.changes, log.reversals) == (changes, reversals)

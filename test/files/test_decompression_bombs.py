@@ -1,0 +1,278 @@
+"""Small files that describe something huge: refused within a moment, in one short line."""
+
+import json
+import struct
+import subprocess
+import sys
+import time
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from thinmap_ros.core.errors import InputError, shown
+from thinmap_ros.files.graphs import read_geojson
+from thinmap_ros.files.occupancy_maps import read_map
+from thinmap_ros.files.worlds import read_tour, read_world
+from thinmap_ros.files.yaml import load_yaml, parse_yaml
+
+WORLD = {'resolution': 0.1, 'wall_thickness': 0.2, 'start': [1, 1, 0], 'walls': [[[0, 0], [4, 0]]]}
+MAP = {'image': 'm.png', 'resolution': 0.05, 'origin': [0, 0, 0]}
+LONGEST = 500  # characters: a path, two values and what was expected
+
+
+def nested(levels: int, repeated: str) -> str:
+    """Lists of nine times the list before, as aliases."""
+    lines = [f'a0: &a0 [{repeated}]']
+    for i in range(1, levels):
+        lines.append(f'a{i}: &a{i} [{", ".join(9 * [f"*a{i - 1}"])}]')
+    return '\n'.join(lines)
+
+
+def merged(levels: int) -> str:
+    lines = ['a0: &a0 {k: 1}']
+    for i in range(1, levels):
+        lines.append(f'a{i}: &a{i} {{<<: [{", ".join(9 * [f"*a{i - 1}"])}]}}')
+    return '\n'.join(lines)
+
+
+BOMBS = {
+    'aliases': nested(7, 'x, x, x, x, x, x, x, x, x') + '\nimage: *a6\n',
+    'merge keys': merged(8) + '\nimage: m.png\n',
+    'one merge key': 'image: m.png\n<<: {resolution: 1}\n',
+    'a list in itself': '&a [*a]',
+    'depth': 'walls: ' + 100_000 * '[',
+    'depth, closed': 'walls: ' + 500 * '[' + 500 * ']',
+    'nodes': 'walls: [' + 300_000 * '1,' + ']',
+    'digits': 'resolution: ' + 400 * '9',
+    'more digits': 'resolution: ' + 100_000 * '9',
+    'sixties': 'resolution: 1' + 100_000 * ':1',
+    'hexadecimal': 'resolution: 0x' + 400_000 * 'f',
+    'a long key': 4_000_000 * 'k' + ': 1',
+    'a long tag': 'walls: !' + 200_000 * 't' + ' 1',
+    'an alias with a long name': 'walls: *' + 200_000 * 'a',
+    'a long text': 'image: ' + 2_000_000 * 'x',
+    'a long text for a number': 'resolution: ' + 2_000_000 * 'x',
+    'bytes': 5_000_000 * ' ',
+    'a date': 'start: 2001-99-99',
+}
+
+
+@pytest.mark.parametrize('name', BOMBS)
+@pytest.mark.parametrize('read', [read_map, read_world, read_tour])
+def test_yaml_bombs(tmp_path: Path, name: str, read: object) -> None:
+    path = tmp_path / 'm.yaml'
+    path.write_text(BOMBS[name])
+    begun = time.process_time()
+    try:
+        read(path)  # type: ignore[operator]
+    except InputError as error:
+        assert len(str(error)) <= LONGEST and '\n' not in str(error)
+    else:
+        assert read is read_tour, 'a tour is no more than a part of a world, which may have none'
+    # A moment's work on a slow machine, too: before, some of these took minutes.
+    assert time.process_time() - begun < 10.0
+
+
+def test_what_yaml_is_for_is_read(tmp_path: Path) -> None:
+    path = tmp_path / 'a.yaml'
+    path.write_text('a: [1, 2.5, 0x1f, 1:30, yes, null, 2001-02-03, text]\nb:\n  c: {d: "<<"}\n')
+    assert load_yaml(path) == yaml.safe_load(path.read_text())
+    assert parse_yaml('') is None
+
+
+@pytest.mark.parametrize('digits', [100, 101, 400, 5000])
+@pytest.mark.parametrize('key', ['resolution', 'wall_thickness', 'start', 'walls', 'tour', 'name'])
+def test_numbers_of_many_digits_in_a_world(tmp_path: Path, key: str, digits: int) -> None:
+    path = tmp_path / 'w.yaml'
+    value = {'start': '[{}, 0, 0]', 'walls': '[[[0, 0], [{}, 0]]]', 'tour': '[[{}, 0]]'}.get(
+        key, '{}'
+    )
+    lines = [f'{k}: {json.dumps(v)}' for k, v in WORLD.items() if k != key]
+    path.write_text('\n'.join([*lines, f'{key}: {value.format(digits * "9")}']))
+    if digits == 100 and key in ('start', 'tour', 'name'):
+        read_world(path), read_tour(path)
+        return
+    with pytest.raises(InputError) as error:
+        read_world(path)
+        read_tour(path)
+    assert len(str(error.value)) <= LONGEST
+
+
+def test_keys_of_several_kinds_in_a_world(tmp_path: Path) -> None:
+    path = tmp_path / 'w.yaml'
+    path.write_text(yaml.safe_dump(WORLD) + '1: 2\nzz: 3\n')
+    with pytest.raises(InputError, match='key 1: expected a name'):
+        read_world(path)
+
+
+@pytest.mark.parametrize('digits', [101, 400, 5000, 1_000_000])
+@pytest.mark.parametrize(
+    'place',
+    [
+        '"id": {}',
+        '"id": 1, "metadata": {{"kind": "end", "clearance": {}}}',
+        '"id": -{}',
+        '"id": 1e{}',
+    ],
+)
+def test_numbers_of_many_digits_in_geojson(tmp_path: Path, place: str, digits: int) -> None:
+    path = tmp_path / 'g.geojson'
+    for coordinates in ('1, 2', f'1, {digits * "9"}'):
+        path.write_text(
+            f'{{"features": [{{"geometry": {{"type": "Point", "coordinates": [{coordinates}]}},'
+            f'"properties": {{{place.format(digits * "9")}}}}}]}}'
+        )
+        with pytest.raises(InputError) as error:
+            read_geojson(path)
+        assert len(str(error.value)) <= LONGEST and '\n' not in str(error.value)
+
+
+def test_a_kind_of_a_million_letters_in_geojson(tmp_path: Path) -> None:
+    path = tmp_path / 'g.geojson'
+    node = {'geometry': {'type': 'Point', 'coordinates': [0, 0]}}
+    node['properties'] = {'id': 1, 'metadata': {'kind': 1_000_000 * 'k', 'clearance': 1}}
+    path.write_text(json.dumps({'features': [node]}))
+    with pytest.raises(InputError) as error:
+        read_geojson(path)
+    assert len(str(error.value)) <= LONGEST
+
+
+@pytest.mark.parametrize(
+    'value',
+    [
+        10**5000,
+        -(10**400),
+        10**7 * 'x',
+        10**6 * [1],
+        {10**4000: 1},
+        100_000 * '\n',
+        'a\x1b[31m\u2028b',
+        [[[[[1]]]]],
+    ],
+    ids=range(8),
+)
+def test_whatever_is_quoted_is_short_and_on_one_line(value: object) -> None:
+    text = shown(value)
+    assert 0 < len(text) <= 200 and text.isprintable()
+
+
+def chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack('>I', len(data)) + kind + data + struct.pack('>I', zlib.crc32(kind + data))
+
+
+def png(width: int, height: int, *extra: bytes) -> bytes:
+    """A PNG of one colour, 1 bit a pixel, compressed as far as it goes."""
+    row = b'\0' + (width + 7) // 8 * b'\xff'
+    packer = zlib.compressobj(9)
+    rows = b''.join(packer.compress(row) for _ in range(height)) + packer.flush()
+    header = chunk(b'IHDR', struct.pack('>IIBBBBB', width, height, 1, 0, 0, 0, 0))
+    return (
+        b'\x89PNG\r\n\x1a\n' + header + b''.join(extra) + chunk(b'IDAT', rows) + chunk(b'IEND', b'')
+    )
+
+
+def peak_mb(path: Path) -> tuple[float, str]:
+    """Peak memory of reading a map, MB above that of a small one, and its shape or the error."""
+    code = """
+import sys
+from pathlib import Path
+from thinmap_ros.files.occupancy_maps import read_map
+from thinmap_ros.core.errors import InputError
+
+def peak_kb():
+    # Not ru_maxrss: after a fork that is at least what the parent had.
+    return int(Path('/proc/self/status').read_text().split('VmHWM:')[1].split()[0])
+
+read_map(Path(sys.argv[1]))
+before = peak_kb()
+try:
+    said = str(read_map(Path(sys.argv[2])).shape)
+except InputError as error:
+    said = str(error)
+print((peak_kb() - before) / 1024.0, said)
+"""
+    small = path.parent / 'small.yaml'
+    small.write_text(yaml.safe_dump(MAP | {'image': 'small.png'}))
+    (path.parent / 'small.png').write_bytes(png(8, 8))
+    done = subprocess.run(
+        [sys.executable, '-c', code, small, path], capture_output=True, text=True, check=True
+    )
+    megabytes, said = done.stdout.split(' ', 1)
+    return float(megabytes), said.strip()
+
+
+BIG_HEADERS = {
+    'png': png(8, 8)[:8]
+    + chunk(b'IHDR', struct.pack('>IIBBBBB', 9000, 9000, 1, 0, 0, 0, 0))
+    + png(8, 8)[33:],
+    'pgm': b'P5\n100000 100000\n255\n' + 100 * b'\0',
+    'p2': b'P2\n9000 9000\n255\n' + 100 * b'0 ',
+}
+
+
+@pytest.mark.parametrize('size', [8_200, 23_000])
+def test_a_png_of_more_pixels_than_any_map_has(tmp_path: Path, size: int) -> None:
+    path = tmp_path / 'm.yaml'
+    path.write_text(yaml.safe_dump(MAP))
+    (tmp_path / 'm.png').write_bytes(png(size, size))
+    assert (tmp_path / 'm.png').stat().st_size < 100_000
+    megabytes, said = peak_mb(path)
+    assert megabytes < 50.0 and 'pixels' in said and len(said) <= LONGEST
+
+
+def test_the_largest_map_takes_a_few_bytes_a_pixel(tmp_path: Path) -> None:
+    path = tmp_path / 'm.yaml'
+    path.write_text(yaml.safe_dump(MAP))
+    (tmp_path / 'm.png').write_bytes(png(8192, 8192))
+    megabytes, said = peak_mb(path)
+    assert said == '(8192, 8192)'
+    assert megabytes < 8 * 64.0
+
+
+@pytest.mark.parametrize('kind', ['zTXt', 'iTXt', 'iCCP'])
+def test_bombs_beside_the_pixels(tmp_path: Path, kind: str) -> None:
+    packed = zlib.compress(bytes(200_000_000), 9)
+    heads = {'zTXt': b'Comment\0\0', 'iTXt': b'Comment\0\1\0\0\0', 'iCCP': b'profile\0\0'}
+    path = tmp_path / 'm.yaml'
+    path.write_text(yaml.safe_dump(MAP))
+    (tmp_path / 'm.png').write_bytes(png(8, 8, chunk(kind.encode(), heads[kind] + packed)))
+    megabytes, said = peak_mb(path)
+    assert megabytes < 50.0, said
+
+
+@pytest.mark.parametrize('header', ['png', 'pgm', 'p2'])
+def test_headers_that_say_more_than_is_there(tmp_path: Path, header: str) -> None:
+    path = tmp_path / 'm.yaml'
+    path.write_text(yaml.safe_dump(MAP))
+    (tmp_path / 'm.png').write_bytes(BIG_HEADERS[header])
+    with pytest.raises(InputError) as error:
+        read_map(path)
+    assert 'pixels' in str(error.value) and len(str(error.value)) <= LONGEST
+
+
+def test_images_that_a_program_would_have_to_be_run_for(tmp_path: Path) -> None:
+    path = tmp_path / 'm.yaml'
+    path.write_text(yaml.safe_dump(MAP))
+    Image.fromarray(np.zeros((4, 4), dtype=np.uint8)).save(tmp_path / 'm.png', format='EPS')
+    with pytest.raises(InputError, match='cannot identify image'):
+        read_map(path)
+
+
+@pytest.mark.parametrize('name', ['x\ny.png', 100_000 * 'x', 'a\0b', '../m.png', '/etc/hostname'])
+def test_names_of_images(tmp_path: Path, name: str) -> None:
+    path = tmp_path / 'below' / 'm.yaml'
+    path.parent.mkdir()
+    path.write_text(yaml.safe_dump(MAP | {'image': name}))
+    (tmp_path / 'm.png').write_bytes(png(8, 8))
+    with pytest.raises(InputError) as error:
+        read_map(path, path.parent.resolve())
+    assert len(str(error.value)) <= LONGEST and '\n' not in str(error.value)
+    (path.parent / 'link.png').symlink_to(tmp_path / 'm.png')
+    path.write_text(yaml.safe_dump(MAP | {'image': 'link.png'}))
+    assert read_map(path).shape == (8, 8)
+    with pytest.raises(InputError, match='expected a file below'):
+        read_map(path, path.parent.resolve())

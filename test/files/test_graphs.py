@@ -1,0 +1,156 @@
+"""Route graphs: what Nav2's reader asks for, and that nothing is lost on the way."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
+from thinmap_ros.files.graphs import read_geojson, write_geojson
+
+
+def edge(edge_id: int, a: int, b: int, *points: tuple[float, float]) -> Edge:
+    path = np.array(points)
+    return Edge(edge_id, a, b, path, float(np.hypot(*np.diff(path, axis=0).T).sum()), 0.35)
+
+
+def example() -> TopologicalMap:
+    nodes = [
+        Node(1, NodeKind.BRANCH, 0.0, 0.0, 1.2),
+        Node(3, NodeKind.END, 2.0, 0.0, np.float64(0.4)),  # type: ignore[arg-type]
+        Node(7, NodeKind.CORNER, 0.0, 3.123456, 0.5),
+    ]
+    edges = [
+        edge(2, 1, 3, (0.0, 0.0), (1.0, 0.5), (2.0, 0.0)),
+        edge(4, 3, 1, (2.0, 0.0), (1.0, -0.5), (0.0, 0.0)),
+        edge(9, 1, 7, (0.0, 0.0), (0.0, 3.123456)),
+        edge(5, 7, 7, (0.0, 3.123456), (1.0, 4.0), (-1.0, 4.0), (0.0, 3.123456)),
+    ]
+    return TopologicalMap(nodes, edges)
+
+
+def written(tmp_path: Path) -> list[dict[str, Any]]:
+    write_geojson(tmp_path / 'g.geojson', example(), 'floor')
+    content = json.loads((tmp_path / 'g.geojson').read_text())
+    assert content['type'] == 'FeatureCollection'
+    features: list[dict[str, Any]] = content['features']
+    return features
+
+
+def test_it_is_what_the_route_server_reads(tmp_path: Path) -> None:
+    features = written(tmp_path)
+    ids = [f['properties']['id'] for f in features]
+    assert len(set(ids)) == len(ids) == 3 + 2 * 4
+    assert all(isinstance(i, int) and 0 < i < 2**32 for i in ids)
+    nodes = {f['properties']['id']: f for f in features if f['geometry']['type'] == 'Point'}
+    assert {f['properties']['frame'] for f in nodes.values()} == {'floor'}
+    ways = set()
+    for f in features:
+        assert all(isinstance(v, str | int | float) for v in f['properties']['metadata'].values())
+        if f['geometry']['type'] == 'MultiLineString':
+            start = f['properties']['startid']
+            end = f['properties']['endid']
+            (line,) = f['geometry']['coordinates']
+            assert line[0] == nodes[start]['geometry']['coordinates']
+            assert line[-1] == nodes[end]['geometry']['coordinates']
+            ways.add((f['properties']['metadata']['edge'], start, end))
+    assert {(2, 1, 3), (2, 3, 1), (4, 3, 1), (4, 1, 3), (9, 1, 7), (9, 7, 1), (5, 7, 7)} == ways
+    assert nodes[3]['properties']['metadata'] == {'kind': 'end', 'clearance': 0.4}
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    written(tmp_path)
+    again = read_geojson(tmp_path / 'g.geojson')
+    before = example()
+    assert again.nodes.keys() == before.nodes.keys() and again.edges.keys() == before.edges.keys()
+    for i, node in before.nodes.items():
+        assert again.nodes[i].kind == node.kind
+        assert again.nodes[i].position == pytest.approx(node.position, abs=1e-4)
+    for i, one in before.edges.items():
+        other = again.edges[i]
+        assert (other.a, other.b) == (one.a, one.b)
+        assert other.path == pytest.approx(one.path, abs=1e-4)
+        assert other.length_m == pytest.approx(one.length_m, abs=1e-3)
+
+
+def test_an_empty_map(tmp_path: Path) -> None:
+    write_geojson(tmp_path / 'g.geojson', TopologicalMap())
+    assert not read_geojson(tmp_path / 'g.geojson').nodes
+
+
+def test_not_a_number_is_never_written(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match='JSON'):
+        write_geojson(
+            tmp_path / 'g.geojson', TopologicalMap([Node(1, NodeKind.END, np.nan, 0.0, 1.0)])
+        )
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ('place', 'value', 'said'),
+    [
+        (('properties', 'id'), 1.5, 'id 1.5'),
+        (('properties', 'metadata'), {}, 'kind'),
+        (('geometry', 'coordinates'), [1.0], 'features.0'),
+        (('geometry', 'coordinates'), [1.0, 'x'], 'no finite number'),
+        (('geometry',), None, 'features.0'),
+    ],
+)
+def test_what_is_wrong_is_said(
+    tmp_path: Path, place: tuple[str, ...], value: object, said: str
+) -> None:
+    features = written(tmp_path)
+    target = features[0]
+    for key in place[:-1]:
+        target = target[key]
+    target[place[-1]] = value
+    (tmp_path / 'g.geojson').write_text(json.dumps({'features': features}))
+    with pytest.raises(InputError, match=said) as error:
+        read_geojson(tmp_path / 'g.geojson')
+    assert str(tmp_path) in str(error.value)
+
+
+JSON = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-5, 5)
+    | st.floats(allow_nan=False)
+    | st.text(max_size=5),
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(st.sampled_from(['id', 'type', 'geometry']), inner)
+    ),
+    max_leaves=6,
+)
+
+
+@settings(
+    deadline=None, max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(JSON, st.integers(0, 10), st.sampled_from(['properties', 'geometry', None]))
+def test_damaged_features(tmp_path: Path, value: object, index: int, key: str | None) -> None:
+    features: list[Any] = written(tmp_path)
+    if key is None:
+        features[index] = value
+    else:
+        features[index][key] = value
+    (tmp_path / 'g.geojson').write_text(json.dumps({'features': features}))
+    try:
+        read_geojson(tmp_path / 'g.geojson')
+    except InputError as error:
+        assert '\n' not in str(error)
+
+
+@settings(
+    deadline=None, max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(st.binary(max_size=60))
+def test_arbitrary_bytes(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / 'g.geojson').write_bytes(content)
+    with pytest.raises(InputError):
+        read_geojson(tmp_path / 'g.geojson')

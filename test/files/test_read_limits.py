@@ -1,0 +1,223 @@
+"""What is read is bounded.
+
+A small file that expands or nests without end is refused in one line and little memory.
+"""
+
+import gzip
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import lz4.frame
+import pytest
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.records import Channel, Chunk, DataEnd, Footer, Header, Message, Schema
+
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.logs.bag import Bag
+from thinmap_ros.logs.bag_writer import BagWriter
+from thinmap_ros.logs.carmen import LONGEST_LINE, CarmenLog
+from thinmap_ros.logs.mcap_reader import Damage, whole_records
+from thinmap_ros.logs.mcap_records import LARGEST_CHUNK, DamagedError, records_of, unpacked
+
+MAGIC = b'\x89MCAP0\r\n'
+EXPANDED = 900 * 2**20
+MOST_MB = 300
+RUNNER = """
+import pathlib, runpy, sys
+del sys.argv[0]
+try:
+    runpy.run_module(sys.argv[0], run_name='__main__', alter_sys=True)
+finally:
+    # Not ru_maxrss: after a fork that is at least what the parent had.
+    status = pathlib.Path('/proc/self/status').read_text()
+    print('peak', int(status.split('VmHWM:')[1].split()[0]) // 1024)
+"""
+
+
+def run(tool: str, *arguments: Path | str) -> tuple[int, str, int]:
+    """Exit code, last line of complaint, and peak memory, MB, of a program."""
+    command = [sys.executable, '-c', RUNNER, f'thinmap_ros.tools.{tool}', *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert 'Traceback' not in done.stderr, done.stderr[-2000:]
+    peak = int(done.stdout.split()[-1])
+    return done.returncode, (done.stderr.splitlines() or [''])[-1], peak
+
+
+def bomb(path: Path, compression: str, packed: bytes, claimed: int) -> Path:
+    """An MCAP file of one chunk that claims to expand to so many bytes."""
+    builder = RecordBuilder()
+    Header('ros2', 'test').write(builder)
+    Schema(id=1, name='std_msgs/msg/String', encoding='ros2msg', data=b'string data').write(builder)
+    Channel(id=1, topic='/said', message_encoding='cdr', metadata={}, schema_id=1).write(builder)
+    Chunk(compression, packed, 5, 1, 0, claimed).write(builder)
+    DataEnd(0).write(builder)
+    Footer(0, 0, 0).write(builder)
+    path.write_bytes(MAGIC + builder.end() + MAGIC)
+    return path
+
+
+def packed_zeros(compression: str, size: int) -> bytes:
+    """So many zeros, compressed piece by piece."""
+    piece = bytes(2**20)
+    if compression == 'lz4':
+        packer = lz4.frame.LZ4FrameCompressor()
+        parts = [
+            packer.begin(),
+            *(packer.compress(piece) for _ in range(size // 2**20)),
+            packer.flush(),
+        ]
+        return b''.join(parts)
+    stream = zstandard.ZstdCompressor().compressobj()
+    return b''.join([*(stream.compress(piece) for _ in range(size // 2**20)), stream.flush()])
+
+
+@pytest.mark.parametrize('claimed', [2**20, EXPANDED, 2**62])
+@pytest.mark.parametrize('compression', ['lz4', 'zstd'])
+@pytest.mark.parametrize('tool', ['bag_repair', 'replay'])
+def test_a_chunk_that_expands_without_end(
+    tmp_path: Path, tool: str, compression: str, claimed: int
+) -> None:
+    packed = packed_zeros(compression, EXPANDED)
+    path = bomb(tmp_path / 'bomb.mcap', compression, packed, claimed)
+    code, line, peak_mb = run(tool, path, '-o', tmp_path / 'out')
+    assert code == 2
+    assert 'bomb.mcap' in line and 'bytes uncompressed' in line and len(line) < 500
+    assert peak_mb < MOST_MB
+    assert not (tmp_path / 'out').exists()
+
+
+def test_messages_beside_a_bomb_are_read(tmp_path: Path) -> None:
+    with (tmp_path / 'bag.mcap').open('wb') as out:
+        builder = RecordBuilder()
+        Header('ros2', 'test').write(builder)
+        Schema(1, data=b'string data', encoding='ros2msg', name='std_msgs/msg/String').write(
+            builder
+        )
+        Channel(id=1, topic='/said', message_encoding='cdr', metadata={}, schema_id=1).write(
+            builder
+        )
+        Message(channel_id=1, log_time=3, data=b'before', publish_time=3, sequence=0).write(builder)
+        Chunk('lz4', packed_zeros('lz4', EXPANDED), 5, 1, 0, 2**40).write(builder)
+        Message(channel_id=1, log_time=9, data=b'behind', publish_time=9, sequence=1).write(builder)
+        out.write(MAGIC + builder.end())
+    bag = Bag(tmp_path / 'bag.mcap')
+    assert [message.data for message in bag.messages()] == [b'before', b'behind']
+    assert 'expected at most' in bag.damage
+
+
+@pytest.mark.parametrize('compression', ['lz4', 'zstd'])
+def test_unpacked_is_exact_at_its_bound(compression: str) -> None:
+    packed = packed_zeros(compression, 3 * 2**20)
+    assert unpacked(compression, packed, 3 * 2**20) == bytes(3 * 2**20)
+    with pytest.raises(DamagedError, match='more than'):
+        unpacked(compression, packed, 3 * 2**20 - 1)
+    with pytest.raises(DamagedError, match='at most'):
+        unpacked(compression, packed, LARGEST_CHUNK + 1)
+    half = packed[: len(packed) // 2]
+    assert 0 < len(unpacked(compression, half, 3 * 2**20, whole=False)) < 3 * 2**20
+
+
+def test_definitions_without_end_are_refused(tmp_path: Path) -> None:
+    builder = RecordBuilder()
+    for number in range(2**16 + 2):
+        Schema(number % 2**16, data=b'', encoding='', name='a').write(builder)
+    with pytest.raises(DamagedError, match='schemas and channels'):
+        records_of(builder.end())
+    builder = RecordBuilder()
+    Header('ros2', 'test').write(builder)
+    for number in range(70):
+        Schema(number, data=bytes(2**20), encoding='ros2msg', name='a').write(builder)
+        Channel(number, f'/{number}', 'cdr', {}, number).write(builder)
+    (tmp_path / 'bag.mcap').write_bytes(MAGIC + builder.end())
+    with pytest.raises(InputError, match='schemas and channels: expected at most'):
+        Bag(tmp_path / 'bag.mcap')
+
+
+def laughs() -> str:
+    """A document of some hundred characters that stands for 10^9 values."""
+    lines = ['a0: &a0 [x, x, x, x, x, x, x, x, x, x]']
+    for k in range(1, 10):
+        names = ', '.join([f'*a{k - 1}'] * 10)
+        lines.append(f'a{k}: &a{k} [{names}]')
+    return '\n'.join([*lines, 'rosbag2_bagfile_information: {version: 9, storage_identifier: *a9}'])
+
+
+@pytest.fixture
+def in_short() -> Iterator[None]:
+    """No more than a moment of work; what others do on the machine meanwhile does not count."""
+    begun = time.process_time()
+    yield
+    assert time.process_time() - begun < 20.0
+
+
+YAML_BOMBS: dict[str, Callable[[], str]] = {
+    'anchors': laughs,
+    '20 levels': lambda: '[' * 100_000,
+    'at most 4194304': lambda: '#' * 5_000_000,
+    'at most 100': lambda: 'a: ' + '1:' * 100_000 + '1',
+}
+
+
+@pytest.mark.usefixtures('in_short')
+@pytest.mark.parametrize('said', YAML_BOMBS)
+def test_metadata_that_grow_in_memory_are_not_read(tmp_path: Path, said: str) -> None:
+    writer = BagWriter(tmp_path / 'bag')
+    writer.write('/said', 'std_msgs/msg/String', 5, b'\0\1\0\0\1\0\0\0\0')
+    writer.__exit__(None, None, None)
+    (tmp_path / 'bag' / 'metadata.yaml').write_text(YAML_BOMBS[said]())
+    bag = Bag(tmp_path / 'bag')
+    # The bag itself is whole, and is read without it.
+    assert set(bag.topics) == {'/said'}
+    assert re.search(f'metadata.yaml.*{said}', bag.damage)
+    assert len(bag.damage) < 400
+    (tmp_path / 'bag' / 'bag.mcap').unlink()
+    with pytest.raises(InputError) as error:
+        Bag(tmp_path / 'bag')
+    assert len(str(error.value)) < 400
+
+
+@pytest.mark.usefixtures('in_short')
+@pytest.mark.parametrize('said', YAML_BOMBS)
+def test_offers_that_cannot_be_read_are_left_out(tmp_path: Path, said: str) -> None:
+    builder = RecordBuilder()
+    Header('ros2', 'test').write(builder)
+    Schema(1, data=b'string data', encoding='ros2msg', name='std_msgs/msg/String').write(builder)
+    Channel(1, '/said', 'cdr', {'offered_qos_profiles': YAML_BOMBS[said]()}, 1).write(builder)
+    Message(channel_id=1, log_time=3, data=b'\0\1\0\0', publish_time=3, sequence=0).write(builder)
+    DataEnd(0).write(builder)
+    (tmp_path / 'bag.mcap').write_bytes(MAGIC + builder.end())
+    assert Bag(tmp_path / 'bag.mcap').offers == {'/said': []}
+    code, line, _ = run('bag_repair', tmp_path / 'bag.mcap', '-o', tmp_path / 'good')
+    assert code == 0, line
+    records = whole_records(tmp_path / 'good' / 'good.mcap', Damage())
+    channel = next(record for record in records if isinstance(record, Channel))
+    assert channel.metadata == {}
+
+
+def test_a_line_that_never_ends(tmp_path: Path) -> None:
+    path = tmp_path / 'log.clf.gz'
+    with gzip.open(path, 'wb', compresslevel=1) as out:
+        out.write(b'FLASER 180 1.0 2.0\n')
+        for _ in range(900):
+            out.write(b'1' * 2**20)
+    for tool, *arguments in (
+        ('replay', path, '-o', tmp_path / 'out'),
+        ('carmen_to_bag', path, tmp_path / 'out'),
+    ):
+        code, line, peak_mb = run(str(tool), *arguments)
+        assert code == 2
+        assert f'log.clf.gz:2: a line of more than {LONGEST_LINE} bytes' in line and len(line) < 400
+        assert peak_mb < MOST_MB
+    assert not (tmp_path / 'out').exists()
+
+
+def test_a_long_line_is_read(tmp_path: Path) -> None:
+    ranges = ' '.join(['1.25'] * 100_000)
+    path = tmp_path / 'log.clf'
+    path.write_text(f'FLASER 100000 {ranges} 0 0 0 0 0 0 1.0 host 1.0\n' * 2)
+    assert len(list(CarmenLog(path).events())) == 4

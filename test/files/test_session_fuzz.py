@@ -1,0 +1,249 @@
+"""Saved states with one array replaced: refused in one line, or as good as the saved one."""
+
+import json
+import os
+import pickle
+import re
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fuzz.saved_states import (
+    KINDS,
+    LONGEST,
+    Explored,
+    State,
+    archive,
+    check,
+    npy,
+    one_number_replaced,
+    plain,
+    replaced,
+    with_header,
+)
+
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.odometry import LastPose
+from thinmap_ros.core.topology.builder import TopologyBuilder
+from thinmap_ros.files.npz import read_arrays
+from thinmap_ros.files.sessions import load_exploration, load_features, load_grid, load_topology
+
+
+@pytest.fixture(scope='module')
+def explored() -> Explored:
+    return Explored()
+
+
+@pytest.mark.filterwarnings('ignore::numpy.exceptions.ComplexWarning', 'ignore:invalid value')
+@pytest.mark.parametrize('kind', KINDS)
+def test_each_array_replaced(explored: Explored, kind: str) -> None:
+    whole = explored.states[kind]
+    assert not check(explored, kind, whole, 'as it was saved')
+    refused = tried = 0
+    for name, array in whole.items():
+        assert check(explored, kind, {k: a for k, a in whole.items() if k != name}, f'no {name}')
+        for how, other in replaced(array):
+            tried += 1
+            refused += check(explored, kind, whole | {name: other}, f'{name}: {how}')
+    assert check(explored, kind, whole | {'more': np.zeros(3)}, 'one more')
+    assert check(explored, kind, whole | {100_000 * 'x': np.zeros(3)}, 'a long name')
+    assert check(explored, kind, {}, 'nothing') != (kind == 'topology'), (
+        'an empty graph is one, too'
+    )
+    assert refused > 0.5 * tried, 'these are hardly ever right'
+
+
+@pytest.mark.parametrize('kind', KINDS)
+@pytest.mark.parametrize('seed', range(4))
+def test_single_numbers_replaced(explored: Explored, kind: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    for _ in range(60):
+        what, state = one_number_replaced(explored.states[kind], rng)
+        check(explored, kind, state, what)
+
+
+def test_a_chain_that_leaps_is_not_taken_for_one(explored: Explored) -> None:
+    state = {name: array.copy() for name, array in explored.states['topology'].items()}
+    state['cells'][5, 0] = 10**9
+    with pytest.raises(InputError, match='cells'):
+        TopologyBuilder.from_state(state)
+    state['cells'][5, 0] = explored.states['topology']['cells'][5, 0] + 3
+    with pytest.raises(InputError, match='each beside the next'):
+        TopologyBuilder.from_state(state)
+
+
+def test_what_a_killed_localizer_left() -> None:
+    whole = LastPose(10**18, np.array([1.0, 2.0, 0.5]), np.array([0.1, 0.2, 0.3])).state()
+    assert LastPose.from_state(whole).stamp_ns == 10**18
+    for name, array in whole.items():
+        for _, other in replaced(array):
+            try:
+                LastPose.from_state(whole | {name: other}).leads_to(10**18, np.zeros(3))
+            except InputError as error:
+                assert len(str(error)) <= LONGEST
+
+
+# Archives.
+
+LOADERS: dict[str, Callable[[str], Any]] = {
+    'topology': load_topology,
+    'exploration': load_exploration,
+    'features': load_features,
+    'grid': load_grid,
+}
+FORMATS = {kind: f'{kind} {2 if kind == "features" else 1}' for kind in LOADERS}
+# The largest number of whole numbers, or one of 300 digits; -1 in whole numbers, NaN in others.
+LARGE = b'\x7f'
+MINUS_ONE = b'\xff'
+# Where -1 is a number like others, and where NaN stands for "not known".
+MAY_BE_NEGATIVE = {
+    'topology': {'low', 'memory'},
+    'grid': {'tiles', 'log_odds'},
+    'features': {'tiles'},
+    'exploration': set[str](),
+}
+# Counts of a byte each, of which any is possible.
+MAY_BE_ANY = {'features': {'seen'}}
+MAY_BE_NAN = {'features': {'spans'}, 'exploration': {'tracks'}}
+
+
+def saved(folder: Path, kind: str, state: State) -> Path:
+    """An archive as files.sessions writes it."""
+    members = {name: npy(array) for name, array in state.items()}
+    return archive(folder / f'a.{kind}.npz', thinmap_format=npy(np.array(FORMATS[kind])), **members)
+
+
+def overwritten(array: np.ndarray, byte: bytes) -> np.ndarray:
+    """An array of the same type and shape with every byte the same."""
+    return np.frombuffer(byte * array.nbytes, dtype=array.dtype).reshape(array.shape)
+
+
+@pytest.mark.parametrize('byte', [LARGE, MINUS_ONE])
+@pytest.mark.parametrize('kind', KINDS)
+def test_what_no_field_may_hold_is_refused_by_its_name(
+    explored: Explored, tmp_path: Path, kind: str, byte: bytes
+) -> None:
+    state = explored.states[kind]
+    assert LOADERS[kind](str(saved(tmp_path, kind, state))) is not None
+    bounded = 0
+    for name, array in state.items():
+        told = re.sub('^(nodes|stand_ins|borders)_', r'\1: ', name)
+        may = MAY_BE_NAN if array.dtype.kind == 'f' else MAY_BE_NEGATIVE
+        may_be = byte == MINUS_ONE and told.rpartition(' ')[2] in may.get(kind, ())
+        may_be |= name in MAY_BE_ANY.get(kind, ())
+        if array.size == 0 or array.dtype.kind == 'b' or may_be:
+            continue
+        path = saved(tmp_path, kind, state | {name: overwritten(array, byte)})
+        with pytest.raises(InputError) as error:
+            LOADERS[kind](str(path))
+        assert str(error.value).startswith(f'{path}: saved {kind}: {told}'), name
+        bounded += 1
+    assert bounded >= (1 if kind == 'grid' else 7)
+
+
+class Evil:
+    """An object that does something when it is unpickled."""
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, (self.path,)
+
+
+HEADERS = {
+    'far too large': with_header(plain((180_000_000_000,)), bytes(800)),
+    'larger than it is': with_header(plain((101,)), bytes(800)),
+    'smaller than it is': with_header(plain((99,)), bytes(800)),
+    'negative': with_header(plain((-100, -1)), bytes(800)),
+    'no bytes': with_header(plain((10**15,), '<U0'), b''),
+    'overflow': with_header(plain((2**62, 4)), b''),
+    'no header': b'',
+    'half a header': npy(np.zeros(3))[:40],
+    'a long header': with_header(plain(5000 * (1,)), bytes(8)),
+    'no such type': with_header(plain((1,), 'nonsense'), bytes(8)),
+    'version 3': b'\x93NUMPY\x03\x00' + npy(np.zeros(3))[8:],
+}
+
+
+@pytest.mark.parametrize('name', HEADERS)
+@pytest.mark.parametrize('load', [load_grid, load_topology, load_features, load_exploration])
+def test_headers_of_arrays(tmp_path: Path, load: Callable[[str], object], name: str) -> None:
+    end = load.__name__.removeprefix('load_')
+    label = npy(np.array(FORMATS[end]))
+    archive(tmp_path / f'a.{end}.npz', thinmap_format=label, frame=HEADERS[name])
+    with pytest.raises(InputError, match=rf'a\.{end}\.npz: .*expected') as error:
+        load(str(tmp_path / 'a'))
+    assert len(str(error.value)) <= LONGEST and str(error.value).isprintable()
+
+
+def test_nothing_is_unpickled(tmp_path: Path) -> None:
+    trap = tmp_path / 'sprung'
+    content = pickle.dumps(np.array([Evil(str(trap))], dtype=object), protocol=2)
+    # As many objects as fill the bytes that are there, for whoever compares the two.
+    content += bytes(-len(content) % 8)
+    member = with_header(plain((len(content) // 8,), '|O'), content)
+    path = archive(tmp_path / 'a.grid.npz', thinmap_format=npy(np.array('grid 1')), frame=member)
+    with pytest.raises(InputError, match='expected a saved grid'):
+        load_grid(str(path))
+    assert not trap.exists()
+
+
+def test_archives_that_unpack_to_more_than_any_map(tmp_path: Path) -> None:
+    path = tmp_path / 'a.grid.npz'
+    with (
+        zipfile.ZipFile(path, 'w', zipfile.ZIP_DEFLATED, compresslevel=9) as file,
+        file.open('frame.npy', 'w', force_zip64=True) as stream,
+    ):
+        stream.write(with_header(plain((600 << 20,), '|i1'), b''))
+        for _ in range(600):
+            stream.write(bytes(1 << 20))
+    assert path.stat().st_size < 1_000_000
+    with pytest.raises(InputError, match='bytes unpacked: expected at most'):
+        load_grid(str(path))
+
+
+def test_what_else_an_archive_may_hold(tmp_path: Path) -> None:
+    one = npy(np.zeros(3))
+    path = archive(tmp_path / 'many.npz', **{f'a{i}': one for i in range(100)})
+    with path.open('rb') as stream, pytest.raises(InputError, match='100 arrays'):
+        read_arrays(stream)
+    with zipfile.ZipFile(tmp_path / 'slow.npz', 'w', zipfile.ZIP_LZMA) as file:
+        file.writestr('a.npy', one)
+    with (tmp_path / 'slow.npz').open('rb') as stream, pytest.raises(InputError, match='deflated'):
+        read_arrays(stream)
+    with zipfile.ZipFile(tmp_path / 'other.npz', 'w') as file:
+        file.writestr('a.json', json.dumps({}))
+    with (tmp_path / 'other.npz').open('rb') as stream, pytest.raises(InputError, match='an array'):
+        read_arrays(stream)
+
+
+@pytest.mark.filterwarnings('ignore:Duplicate name')
+def test_an_array_that_is_there_twice_is_not_read_as_either(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / 'twice.npz', 'w') as file:
+        file.writestr('a.npy', npy(np.zeros(3)))
+        file.writestr('a.npy', npy(np.ones(3)))
+    with (tmp_path / 'twice.npz').open('rb') as stream, pytest.raises(InputError) as error:
+        read_arrays(stream)
+    assert str(error.value) == '2 arrays of 1 names: expected at most 64, each once'
+
+
+@pytest.mark.parametrize('more', [-8, -1, 1, 8, 800])
+def test_a_member_is_as_large_as_its_header_says(
+    explored: Explored, tmp_path: Path, more: int
+) -> None:
+    members = {name: npy(array) for name, array in explored.states['grid'].items()}
+    whole = members['frame']
+    members['frame'] = whole[:more] if more < 0 else whole + bytes(more)
+    path = archive(tmp_path / 'a.grid.npz', thinmap_format=npy(np.array('grid 1')), **members)
+    with pytest.raises(InputError, match=rf'expected an array of {24 + more} bytes: expected a'):
+        load_grid(str(path))
+
+
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / 'a.grid.npz')
+    with pytest.raises(InputError, match='expected a regular file'):
+        load_grid(str(tmp_path / 'a'))

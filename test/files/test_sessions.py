@@ -1,0 +1,271 @@
+"""Saved sessions: work goes on as if it had never stopped."""
+
+import math
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.exploration.explorer import Explorer
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
+from thinmap_ros.core.se2 import Array, pose
+from thinmap_ros.core.slam.localizer import ScanLocalizer
+from thinmap_ros.core.topology.builder import TopologyBuilder
+from thinmap_ros.core.topology.config import TopologyConfig
+from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.files.occupancy_maps import write_map
+from thinmap_ros.files.sessions import (
+    has_topology,
+    load_exploration,
+    load_features,
+    load_grid,
+    load_topology,
+    read_grid,
+    read_topology,
+    save_exploration,
+    save_features,
+    save_grid,
+    save_topology,
+    set_exploration_aside,
+    set_features_aside,
+    stem_of,
+    write_grid,
+    write_topology,
+)
+from thinmap_ros.sim.laser import Lms200, Lms200Config
+from thinmap_ros.sim.world import World
+
+
+def building() -> World:
+    """Corridors round a block, with a room to the left."""
+    occupied = np.ones((120, 300), dtype=np.uint8)
+    occupied[10:110, 110:290] = occupied[50:70, 80:110] = occupied[30:90, 10:80] = 0
+    occupied[35:85, 140:260] = 1
+    return World('building', occupied, GridFrame(0.0, 0.0, 0.1), pose(12.5, 6.0, 0.0))
+
+
+def way() -> list[Array]:
+    corners = [
+        (3.0, 6.0),
+        (12.5, 6.0),
+        (12.5, 10.0),
+        (27.5, 10.0),
+        (27.5, 2.0),
+        (12.5, 2.0),
+        (12.5, 6.0),
+        (3.0, 6.0),
+    ]
+    poses = []
+    for (x, y), (to_x, to_y) in pairwise(corners):
+        heading = math.atan2(to_y - y, to_x - x)
+        steps = int(math.hypot(to_x - x, to_y - y) / 0.25)
+        poses += [
+            pose(x + k / steps * (to_x - x), y + k / steps * (to_y - y), heading)
+            for k in range(steps)
+        ]
+    return poses
+
+
+def drive(grid: OccupancyGrid, builder: TopologyBuilder, poses: list[Array], seed: int) -> None:
+    laser = Lms200(Lms200Config(), seed)
+    world = building()
+    for k, T in enumerate(poses):
+        grid.update(laser.scan(world, T, k), T)
+        builder.update(grid.window(T[0], T[1], 10.0), T)
+
+
+def assert_same(one: TopologicalMap, other: TopologicalMap) -> None:
+    assert one.nodes == other.nodes
+    assert one.edges.keys() == other.edges.keys()
+    for number, edge in one.edges.items():
+        twin = other.edges[number]
+        assert (edge.a, edge.b, edge.length_m, edge.clearance_m) == (
+            twin.a,
+            twin.b,
+            twin.length_m,
+            twin.clearance_m,
+        )
+        assert np.array_equal(edge.path, twin.path)
+
+
+def test_work_goes_on_as_if_it_had_never_stopped(tmp_path: Path) -> None:
+    grid = OccupancyGrid()
+    builder = TopologyBuilder()
+    poses = way()
+    drive(grid, builder, poses[:120], 0)
+    write_grid(tmp_path / 'a.grid.npz', grid)
+    write_topology(tmp_path / 'a.topology.npz', builder)
+    again = read_grid(tmp_path / 'a.grid.npz')
+    restored = read_topology(tmp_path / 'a.topology.npz')
+    assert len(builder.map.nodes) > 2
+    assert_same(builder.map, restored.map)
+    drive(grid, builder, poses[120:], 1)
+    drive(again, restored, poses[120:], 1)
+    assert (
+        np.array_equal(grid.patch().cells, again.patch().cells)
+        and grid.patch().frame == again.patch().frame
+    )
+    assert_same(builder.map, restored.map)
+    for key, array in grid.state().items():
+        assert np.array_equal(array, again.state()[key]) or key in ('tiles', 'log_odds')
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_nothing_seen_yet(tmp_path: Path) -> None:
+    write_grid(tmp_path / 'a.npz', OccupancyGrid())
+    write_topology(tmp_path / 'b.npz', TopologyBuilder())
+    assert read_grid(tmp_path / 'a.npz').patch().unknown.all()
+    assert not read_topology(tmp_path / 'b.npz').map.nodes
+
+
+def test_what_does_not_fit_is_said(tmp_path: Path) -> None:
+    grid = OccupancyGrid()
+    builder = TopologyBuilder()
+    drive(grid, builder, way()[:5], 0)
+    write_grid(tmp_path / 'a.npz', grid)
+    write_topology(tmp_path / 'b.npz', builder)
+    for path in (tmp_path / 'b.npz', tmp_path / 'no.npz'):
+        with pytest.raises(InputError, match='npz'):
+            read_grid(path)
+    with pytest.raises(InputError, match='expected a saved topology'):
+        read_topology(tmp_path / 'a.npz')
+    with pytest.raises(InputError, match='resolution'):
+        read_grid(tmp_path / 'a.npz', OccupancyConfig(resolution_m=0.05))
+    with pytest.raises(InputError, match='memory_m'):
+        read_topology(tmp_path / 'b.npz', TopologyConfig(memory_m=20.0))
+
+
+@pytest.mark.parametrize('end', ['', '.grid.npz', '.topology.npz', '.yaml', '.pgm'])
+def test_a_session_is_named_by_its_stem_or_one_of_its_files(tmp_path: Path, end: str) -> None:
+    grid = OccupancyGrid()
+    builder = TopologyBuilder()
+    drive(grid, builder, way()[:5], 0)
+    path = str(tmp_path / 'v1.2' / 'room.one') + end
+    assert not has_topology(path)
+    save_grid(path, grid)
+    save_topology(path, builder)
+    assert {file.name for file in (tmp_path / 'v1.2').iterdir()} == {
+        f'room.one{each}' for each in ('.grid.npz', '.topology.npz', '.yaml', '.pgm')
+    }
+    assert has_topology(path)
+    assert np.array_equal(load_grid(path).state()['log_odds'], grid.state()['log_odds'])
+    assert_same(load_topology(path, None, 0.1).map, builder.map)
+    with pytest.raises(
+        InputError, match=r'room.one.topology.npz: made from 0.1 m a cell: expected 0.05 m'
+    ):
+        load_topology(path, None, 0.05)
+
+
+@pytest.mark.parametrize('path', ['', '.', '/', '.yaml', 'a\0b'])
+def test_what_names_no_session(path: str) -> None:
+    with pytest.raises(InputError, match='expected the path'):
+        stem_of(path)
+
+
+def test_a_map_is_read_where_there_is_no_saved_grid_and_only_there(tmp_path: Path) -> None:
+    grid = OccupancyGrid()
+    drive(grid, TopologyBuilder(), way()[:5], 0)
+    write_map(tmp_path / 'a', grid.patch())
+    assert load_grid(str(tmp_path / 'a')).patch().occupied.sum() == grid.patch().occupied.sum() > 50
+    with pytest.raises(InputError, match='resolution_m'):
+        load_grid(str(tmp_path / 'a.yaml'), OccupancyConfig(resolution_m=0.05))
+    with pytest.raises(InputError, match=r'a.grid.npz: No such file'):
+        load_grid(str(tmp_path / 'a.grid.npz'))
+    (tmp_path / 'a.grid.npz').write_bytes(b'no archive')
+    with pytest.raises(InputError, match=r'a.grid.npz: .*expected a saved grid'):
+        load_grid(str(tmp_path / 'a'))
+    with pytest.raises(InputError, match=r'neither b.grid.npz nor b.yaml'):
+        load_grid(str(tmp_path / 'b'))
+
+
+@pytest.mark.parametrize(
+    'wrong', [{'frame': np.array([0.0, np.nan, 0.1])}, {'tiles': np.zeros((0, 2))}]
+)
+def test_a_grid_of_nonsense_is_refused(wrong: dict[str, Array]) -> None:
+    with pytest.raises(InputError, match=r'saved grid: (frame|tiles).*: expected'):
+        OccupancyGrid.from_state(OccupancyGrid().state() | wrong)
+
+
+def test_a_corrected_past_moves_the_nodes_and_they_keep_their_ids() -> None:
+    """The robot's heading was wrong by a little more with each metre; then a loop was closed."""
+    world = building()
+    poses = way()
+    believed = [pose(T[0] + 0.004 * k, T[1] + 0.002 * k, T[2]) for k, T in enumerate(poses)]
+    drifted = OccupancyGrid()
+    corrected = OccupancyGrid()
+    builder = TopologyBuilder()
+    straight = TopologyBuilder()
+    laser = Lms200(Lms200Config(), 0)
+    for k, (T, wrong) in enumerate(zip(poses, believed, strict=True)):
+        scan = laser.scan(world, T, k)
+        drifted.update(scan, wrong)
+        corrected.update(scan, T)
+        builder.update(drifted.window(wrong[0], wrong[1], 10.0), wrong)
+        straight.update(corrected.window(T[0], T[1], 10.0), T)
+    before = dict(builder.map.nodes)
+    builder.rebuild(lambda x, y: corrected.window(x, y, 10.0), np.array(believed), np.array(poses))
+    after = builder.map
+    wanted = straight.map
+    places = np.array([node.position for node in wanted.nodes.values()])
+    near = [np.hypot(*(places - node.position).T).min() <= 0.5 for node in after.nodes.values()]
+    assert np.mean(near) >= 0.8
+    assert len(after.edges) - len(after.nodes) == len(wanted.edges) - len(wanted.nodes)
+    kept = before.keys() & after.nodes.keys()
+    assert len(kept) >= len(after.nodes) / 2
+    # Where a place of the wrong map is no more, its node's number is not given to another place.
+    shift = [np.hypot(*(after.nodes[k].position - before[k].position)) for k in kept]
+    assert max(shift) <= 2.0
+    builder.update(corrected.window(poses[-1][0], poses[-1][1], 10.0), poses[-1])
+
+
+def test_a_correction_before_the_first_window() -> None:
+    builder = TopologyBuilder()
+    builder.rebuild(
+        lambda x, y: OccupancyGrid().window(x, y, 10.0), np.empty((0, 3)), np.empty((0, 3))
+    )
+    assert not builder.map.nodes
+
+
+def test_what_an_exploration_learned_is_the_same_after_a_start(tmp_path):
+    explorer = Explorer()
+    stem = str(tmp_path / 'room')
+    assert load_exploration(stem) is None
+    explorer.surveyor.follow({7: (1.0, 2.0), 9: (3.0, 2.5)})
+    explorer.surveyor.tracker.tracks[9].probability = 0.8
+    save_exploration(stem, explorer)
+    again = load_exploration(stem)
+    assert again is not None
+    assert {i: (t.x, t.y, t.probability) for i, t in again.surveyor.tracker.tracks.items()} == {
+        7: (1.0, 2.0, 0.5),
+        9: (3.0, 2.5, 0.8),
+    }
+    (tmp_path / 'room.exploration.npz').write_bytes(b'no archive')
+    with pytest.raises(InputError, match=r'room\.exploration\.npz'):
+        load_exploration(stem)
+    assert 'room.exploration.npz.old' in set_exploration_aside(stem)
+    assert load_exploration(stem) is None
+
+
+def test_features_are_kept_set_aside_or_refused_in_words(tmp_path):
+    stem = str(tmp_path / 'office')
+    assert load_features(stem) is None
+    localizer = ScanLocalizer()
+    world = building()
+    laser = Lms200(Lms200Config(), 1)
+    for k in range(30):
+        T = pose(3.0 + 0.1 * k, 6.0, 0.0)
+        localizer.step(laser.scan(world, T, k), T)
+    save_features(stem, localizer)
+    loaded = load_features(stem)
+    assert loaded is not None
+    for name, value in localizer.state().items():
+        if name != 'points':
+            np.testing.assert_array_equal(loaded.state()[name], value)
+    (tmp_path / 'bad.features.npz').write_bytes(b'nothing')
+    with pytest.raises(InputError, match=r'bad\.features\.npz: .*expected'):
+        load_features(str(tmp_path / 'bad'))
+    assert 'office.features.npz.old' in set_features_aside(stem)
+    assert load_features(stem) is None

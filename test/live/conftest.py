@@ -1,0 +1,3 @@
+"""What all live tests share."""
+
+from support.live_graph import graph as graph

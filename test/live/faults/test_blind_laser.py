@@ -1,0 +1,179 @@
+"""A laser that says nothing, on a live graph.
+
+The robot stops, says why, and goes on when ranges come back.
+"""
+
+import math
+from array import array
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
+from nav_msgs.msg import Odometry
+from rclpy.action import ActionClient
+from sensor_msgs.msg import LaserScan
+from test_faults import empty_hall
+from test_health import Doctor
+
+from thinmap_msgs.action import Explore, NavigateToPose
+from thinmap_msgs.msg import SlamStatus
+from thinmap_ros.ros import messages, qos
+
+pytestmark = pytest.mark.live
+NODES = ('localizer', 'grid_mapper', 'topology_builder', 'explorer', 'navigator')
+
+
+class Relay:
+    """Between the laser and the nodes: passes the scans on, spoiled where the test wants it."""
+
+    def __init__(self, graph):
+        self.spoil = None
+        self.spoiled = 0
+        self._scans = graph.node.create_publisher(LaserScan, 'scan', qos.STREAM)
+        graph.node.create_subscription(LaserScan, 'raw_scan', self._pass_on, qos.STREAM)
+
+    def _pass_on(self, message):
+        if self.spoil is not None:
+            message.ranges = array('f', self.spoil(np.array(message.ranges)).astype(np.float32))
+            self.spoiled += 1
+        self._scans.publish(message)
+
+    def whole(self):
+        self.spoil = None
+        self.spoiled = 0
+
+
+def test_a_blind_laser_stops_an_exploration_which_goes_on_when_it_sees_again(graph):
+    truth = graph.heard('ground_truth', PoseStamped)
+    commands = graph.heard('cmd_vel', Twist)
+    statuses = graph.heard('slam_status', SlamStatus)
+    doctor = Doctor(graph)
+    relay = Relay(graph)
+    start = {'start_x_m': 2.0, 'start_y_m': 2.0, 'start_yaw_rad': 0.9}
+    graph.start('thinmap', arguments=NODES, use_sim_time=True, max_speed_m_s=0.5, **start)
+    graph.start('sim', start='2.0,2.0,0.9', remap=('scan:=raw_scan',), hold_for_subscribers=1)
+    client = ActionClient(graph.node, Explore, 'explore')
+    graph.send_goal(client, Explore.Goal())
+    graph.until(lambda: truth and statuses, 'where it is, and how it stands')
+
+    def place():
+        return np.array([truth[-1].pose.position.x, truth[-1].pose.position.y])
+
+    def stands():
+        return commands[-1].linear.x == commands[-1].angular.z == 0.0
+
+    for value in (0.0, -1.0, math.nan):
+        graph.until(lambda: commands and commands[-1].linear.x > 0.3, 'it drives')
+        before = place()
+        relay.spoil = lambda ranges, value=value: np.full_like(ranges, value)
+        graph.until(lambda: relay.spoiled > 2, 'it has heard of it')
+        graph.until(stands, 'it stops')
+        commands.clear()
+        graph.until(lambda: len(commands) > 10, 'it goes on saying so')
+        assert all(c.linear.x == c.angular.z == 0.0 for c in commands)
+        # Half a second at 0.5 m/s, and then a braking distance of 0.5 m/s^2.
+        assert np.hypot(*(place() - before)) < 0.5
+        for node in ('navigator', 'localizer'):
+            graph.until(lambda n=node: 'blind' in doctor.status(n).message, f'{node} says so')
+        graph.until(lambda: statuses[-1].state == SlamStatus.BLIND, 'the status says so')
+        relay.whole()
+        graph.until(lambda: statuses[-1].state == SlamStatus.TRACKING, 'it tracks again')
+    graph.until(lambda: commands[-1].linear.x > 0.3, 'it goes on')
+
+
+class Robot:
+    """A robot at rest in an empty hall, of which a navigator alone hears, with a goal ahead."""
+
+    def __init__(self, graph):
+        self.graph = graph
+        self.commands = graph.heard('cmd_vel', Twist)
+        self._scan = graph.node.create_publisher(LaserScan, 'scan', qos.STREAM)
+        self._odometry = graph.node.create_publisher(Odometry, 'odom', qos.STREAM)
+        self._pose = graph.node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
+        graph.node.create_publisher(type(empty_hall()), 'map', qos.LATCHED).publish(empty_hall())
+        self.client = ActionClient(graph.node, NavigateToPose, 'navigate_to_pose')
+        self.drive()
+
+    def drive(self):
+        """Ask for it anew."""
+        goal = NavigateToPose.Goal()
+        goal.pose.pose.position.x = 4.0
+        goal.pose.pose.orientation.w = 1.0
+        self.handle = self.graph.send_goal(self.client, goal)
+
+    def say(self, ranges):
+        ns = self.graph.node.get_clock().now().nanoseconds
+        still = messages.odometry_msg(np.zeros(3), (0.0, 0.0), ('odom', 'base_link'), ns)
+        self._odometry.publish(still)
+        message = LaserScan(angle_min=-1.5, angle_increment=0.05, range_min=0.05, range_max=8.0)
+        message.header = messages.header('laser', ns)
+        message.ranges = array('f', np.asarray(ranges, dtype=np.float32))
+        self._scan.publish(message)
+        self._pose.publish(messages.pose_with_covariance_msg(np.zeros(3), np.eye(3), 'map', ns))
+
+    def until(self, ranges, condition, what):
+        self.graph.until(
+            lambda: self.say(ranges) or (self.commands and condition(self.commands[-1])), what
+        )
+
+
+def drives(command):
+    return command.linear.x > 0.02
+
+
+def stands(command):
+    return command.linear.x == command.angular.z == 0.0
+
+
+def test_a_robot_does_not_drive_where_half_of_the_laser_does_not_see(graph):
+    graph.start('navigator', laser_pose='0,0,0')
+    robot = Robot(graph)
+    half = np.full(61, math.inf)
+    half[31:] = math.nan
+    ended = robot.handle.get_result_async()
+    graph.until(lambda: robot.say(half) or ended.done(), 'the goal is given up')
+    assert 'does not see' in ended.result().result.reason
+    assert robot.commands
+    assert not any(drives(command) for command in robot.commands)
+
+
+def test_a_hall_in_which_nothing_is_near_is_not_blind(graph):
+    doctor = Doctor(graph)
+    graph.start('navigator', laser_pose='0,0,0')
+    robot = Robot(graph)
+    for value in (math.inf, 8.0, 81.83):
+        robot.until(np.full(61, value), drives, f'it drives where all beams say {value}')
+    assert 'blind' not in doctor.status('navigator').message
+    near = np.full(61, math.inf)
+    robot.until(near, drives, 'it drives')
+    near[28:33] = -math.inf
+    robot.until(near, stands, 'it stops in front of what is nearer than can be measured')
+    robot.drive()
+    few = np.full(61, math.nan)
+    few[:7] = math.inf
+    robot.until(np.full(61, math.inf), drives, 'it drives')
+    few[6] = math.nan
+    robot.until(few, stands, 'fewer than a tenth of the beams')
+    graph.until(
+        lambda: robot.say(few) or 'blind' in doctor.status('navigator').message, 'it says so'
+    )
+
+
+def test_a_laser_that_is_blind_from_the_start_is_told(graph):
+    doctor = Doctor(graph)
+    graph.start('navigator', laser_pose='0,0,0')
+    robot = Robot(graph)
+    blind = np.full(61, math.nan)
+    graph.until(
+        lambda: robot.say(blind) or 'blind' in doctor.status('navigator').message, 'it says so'
+    )
+    assert not any(drives(command) for command in robot.commands)
+
+
+def test_zero_means_no_return_where_the_preset_says_so(graph):
+    doctor = Doctor(graph)
+    graph.start('navigator', laser_pose='0,0,0', zero_is_no_return=True)
+    robot = Robot(graph)
+    robot.until(np.zeros(61), drives, 'it drives')
+    robot.until(np.full(61, math.nan), stands, 'NaN is blind all the same')
+    graph.until(lambda: 'blind' in doctor.status('navigator').message, 'it says so')

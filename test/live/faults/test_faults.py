@@ -1,0 +1,590 @@
+"""Faults on a live graph: killed nodes, silence, time set back, bursts, a full disk."""
+
+import resource
+import signal
+import time
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
+from nav_msgs.msg import OccupancyGrid, Odometry
+from rclpy.action import ActionClient
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import LaserScan
+from support.slam_room import ROOM, scan_in
+from test_health import Doctor
+
+from thinmap_msgs.action import Explore, NavigateToPose
+from thinmap_msgs.msg import ExplorationStatus, TopologicalMap
+from thinmap_msgs.srv import SaveMap
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.ros import messages, qos
+
+pytestmark = pytest.mark.live
+START = '2.0,2.0,0.9'
+# While a node is dead, no scan leads to anything.
+LOCKSTEP_S = 2.0
+# However long a start takes.
+RECOVER_S = 1000.0
+TICK_NS = 100_000_000
+AT_START = {'start_x_m': 2.0, 'start_y_m': 2.0, 'start_yaw_rad': 0.9}
+MAPPING = ('localizer', 'grid_mapper', 'topology_builder')
+
+
+def start_mapping(graph, rate=4.0, lockstep='local_topology'):
+    for name in MAPPING:
+        start_one(graph, name)
+    graph.start(
+        'sim',
+        remap=graph.paced() if lockstep == 'local_topology' else (),
+        start=START,
+        hold_for_subscribers=2,
+        rate=rate,
+        lockstep=lockstep,
+        lockstep_patience_s=LOCKSTEP_S,
+    )
+
+
+def start_together(graph, *names, **simulation):
+    """The same in one process, as it is left running on a robot."""
+    graph.start('thinmap', arguments=names, use_sim_time=True, recover_s=RECOVER_S, **AT_START)
+    graph.start(
+        'sim',
+        remap=graph.paced(),
+        start=START,
+        hold_for_subscribers=len({*names} - {'topology_builder'}),
+        rate=4.0,
+        lockstep='local_topology',
+        lockstep_patience_s=LOCKSTEP_S,
+        **simulation,
+    )
+
+
+def start_one(graph, name):
+    own = {
+        'localizer': {**AT_START, 'recover_s': RECOVER_S},
+        'grid_mapper': {'recover_s': RECOVER_S},
+        'topology_builder': {'recover_s': RECOVER_S},
+    }
+    graph.start(name, use_sim_time=True, **own.get(name, {}))
+
+
+def kill(graph, name):
+    process = graph.processes.pop(name)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+
+
+class Robot:
+    """Where the robot is and where it is believed to be."""
+
+    def __init__(self, graph):
+        self.graph = graph
+        self.truth = graph.heard('ground_truth', PoseStamped)
+        self.poses = graph.heard('pose', PoseWithCovarianceStamped)
+        self.commands = graph.node.create_publisher(Twist, 'cmd_vel', 10)
+
+    def drive(self, metres, v=0.3, w=0.0):
+        """Drive so far as the crow flies."""
+        self.graph.until(lambda: self.truth, 'true pose')
+        start = self.truth[-1].pose.position
+        command = messages.twist_msg(v, w)
+
+        def far_enough():
+            self.commands.publish(command)
+            place = self.truth[-1].pose.position
+            return np.hypot(place.x - start.x, place.y - start.y) > metres
+
+        self.graph.until(far_enough, 'the robot makes its way')
+
+    def spin(self):
+        """Turn on the spot, for now."""
+        self.commands.publish(messages.twist_msg(0.0, 1.0))
+
+    def settle(self):
+        """Stand, and hear where it is."""
+        self.commands.publish(messages.twist_msg(0.0, 0.0))
+        said = len(self.poses) + 5
+        self.graph.until(lambda: len(self.poses) > said, 'poses of a robot that stands')
+
+    def error_m(self):
+        """How far the last pose is from the truth of its time, as soon as that is heard."""
+        self.graph.until(self._errors_m, 'a pose, and the true one of its time')
+        return self._errors_m()[-1]
+
+    def _errors_m(self):
+        truths = {messages.stamp_ns(m.header.stamp): m.pose.position for m in self.truth}
+        stamped = [(messages.stamp_ns(m.header.stamp), m.pose.pose.position) for m in self.poses]
+        pairs = [(truths[ns], believed) for ns, believed in stamped if ns in truths]
+        return [float(np.hypot(place.x - p.x, place.y - p.y)) for place, p in pairs]
+
+
+def kept(graph):
+    """Wait until each node has kept what it knows now: a robot that stands learns nothing."""
+    since_ns = time.time_ns()
+    state = graph.folder / 'state'
+
+    def is_kept(name):
+        (file,) = state.glob(f'[!.]*.{name}.npz')
+        return file.stat().st_mtime_ns > since_ns
+
+    graph.until(lambda: len(list(state.glob('[!.]*.npz'))) == len(MAPPING), 'a file of each')
+    graph.until(lambda: all(is_kept(name) for name in MAPPING), 'all is kept')
+
+
+def places(graph_message):
+    return {n.id: (n.position.x, n.position.y) for n in graph_message.nodes}
+
+
+def test_mapping_goes_on_after_each_node_was_killed(graph):
+    robot = Robot(graph)
+    maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
+    graphs = graph.heard('topology', TopologicalMap, qos.LATCHED)
+    start_mapping(graph)
+    robot.drive(3.2)
+    graph.until(lambda: maps and graphs and len(graphs[-1].nodes) > 2, 'map and graph')
+    for name in MAPPING:
+        robot.settle()
+        kept(graph)
+        known = (np.array(maps[-1].data) >= 0).sum()
+        before = places(graphs[-1])
+        kill(graph, name)
+        maps.clear(), robot.poses.clear(), graphs.clear()
+        start_one(graph, name)
+        graph.until(lambda n=name: 'goes on from what it had' in graph.log(n), 'it remembers')
+        # On a curve: where it had come up to a wall meanwhile, it turns away from it.
+        robot.drive(0.15, v=0.15, w=0.6)
+        graph.until(lambda: maps and len(robot.poses) > 5, 'mapping goes on')
+        assert (np.array(maps[-1].data) >= 0).sum() > 0.9 * known, name
+        assert robot.error_m() < 0.15, name
+        if name == 'topology_builder':
+            graph.until(lambda: graphs, 'graph')
+            after = places(graphs[-1])
+            same = [
+                k
+                for k in before.keys() & after.keys()
+                if np.hypot(*np.subtract(before[k], after[k])) < 0.5
+            ]
+            assert len(same) >= len(before) / 2
+    for name in MAPPING:
+        assert graph.stop(name) == 0
+    assert not list((graph.folder / 'state').iterdir()), 'who ends in order leaves nothing'
+
+
+def test_a_killed_localizer_goes_on_in_the_map_and_does_not_bend_it(graph):
+    """The robot drives on meanwhile; without the map, the error grew from 0.005 to 0.345 m."""
+    robot = Robot(graph)
+    doctor = Doctor(graph)
+    start_mapping(graph, rate=2.0, lockstep='none')
+    graph.until(lambda: robot.poses, 'it maps')
+    robot.drive(2.0)
+    # Once round, so that walls are known to all sides.
+    turned = len(robot.truth) + 130
+    graph.until(lambda: robot.spin() or len(robot.truth) > turned, 'it looks round')
+    robot.settle()
+    assert robot.error_m() < 0.05
+    kept(graph)
+    kill(graph, 'localizer')
+    robot.drive(0.5, w=0.4)
+    robot.poses.clear(), doctor.heard.clear()
+    # It waits 3 s for the map from the first scan on: how long it takes to find the mapper must not
+    # count.
+    graph.processes['sim'].send_signal(signal.SIGSTOP)
+    start_one(graph, 'localizer')
+    graph.until(lambda: 'goes on from what it had' in graph.log('localizer'), 'it remembers')
+    graph.until(lambda: doctor.number('localizer', 'map: speakers') == 1, 'it finds the mapper')
+    graph.processes['sim'].send_signal(signal.SIGCONT)
+    robot.drive(0.7, w=0.3)
+    graph.until(lambda: len(robot.poses) > 5, 'it goes on')
+    robot.drive(1.0, w=-0.3)
+    robot.settle()
+    assert 'no map came' not in graph.log('localizer')
+    assert robot.error_m() < 0.06
+
+
+def test_a_killed_node_that_is_started_otherwise_begins_anew_and_says_why(graph):
+    maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
+    local = graph.heard('local_topology', TopologicalMap, qos.LATCHED)
+    start_mapping(graph)
+    graph.until(lambda: maps and local, 'map and graph')
+    state = graph.folder / 'state'
+    graph.until(lambda: len(list(state.glob('[!.]*.npz'))) == 3, 'all is kept')
+    changed = {
+        'grid_mapper': ({'resolution_m': 0.05}, 'expected 0.05 m (resolution_m)'),
+        'topology_builder': ({'memory_m': 20.0}, '(memory_m, context_m)'),
+    }
+    for name, (values, said) in changed.items():
+        kill(graph, name)
+        maps.clear()
+        graph.start(name, use_sim_time=True, recover_s=RECOVER_S, **values)
+        graph.until(lambda n=name: 'begins anew' in graph.log(n), 'it says so')
+        assert said in graph.log(name), graph.log(name)
+    kill(graph, 'localizer')
+    (kept,) = state.glob('*.localizer.npz')
+    np.savez(kept, stamp_ns=np.array(1), T_map_odom=np.zeros(4), T_odom_base=np.zeros(3))
+    start_one(graph, 'localizer')
+    graph.until(lambda: 'T_map_odom: (4,)' in graph.log('localizer'), 'it says so')
+    assert 'was killed, but what it had is refused' in graph.log('localizer')
+    graph.until(lambda: maps and maps[-1].info.resolution < 0.06, 'a map with the new cells')
+    for name in MAPPING:
+        assert graph.stop(name) == 0
+
+
+@pytest.mark.slow
+def test_a_whole_robot_that_was_killed_and_begins_anew_is_not_mixed_with_the_one_before(graph):
+    robot = Robot(graph)
+    maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
+    start_together(graph, *MAPPING)
+    robot.drive(1.5)
+    graph.until(lambda: len(maps) > 3, 'time to be kept')
+    for name in ('thinmap', 'sim'):
+        kill(graph, name)
+    graph.hear_out()
+    robot.poses.clear(), robot.truth.clear(), maps.clear()
+    start_together(graph, *MAPPING)
+    graph.until(lambda: len(robot.poses) > 10 and len(maps) > 2, 'mapping anew')
+    assert graph.log('thinmap').count('goes on from what it had') == 3
+    assert 'odometry has begun anew' in graph.log('thinmap')
+    assert robot.error_m() < 0.1
+    # The robot stands where it began: it sees what one sees from there, and nothing of the drive is
+    # left.
+    place = robot.truth[-1].pose.position
+    assert np.hypot(place.x - 2.0, place.y - 2.0) < 0.05
+    patch = messages.patch_from(maps[-1])
+    behind = patch.frame.cells_of(np.array([[1.0, 1.0]]))[0]
+    inside = np.all((behind >= 0) & (behind < patch.shape))
+    assert not inside or patch.cells[tuple(behind)] == -1
+
+
+def test_time_set_back_begins_everything_anew(graph):
+    robot = Robot(graph)
+    maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
+    graphs = graph.heard('topology', TopologicalMap, qos.LATCHED)
+    names = (*MAPPING, 'explorer', 'navigator')
+    start_together(graph, *names)
+    robot.drive(1.5)
+    graph.until(lambda: maps and graphs and graphs[-1].nodes, 'map and graph')
+    assert graph.stop('sim') == 0
+    graph.hear_out()
+    robot.poses.clear(), robot.truth.clear(), maps.clear()
+    graph.start(
+        'sim', start=START, hold_for_subscribers=4, rate=4.0, lockstep='local_topology', seed=3
+    )
+    notices = [f'[{name}]: the clock was set back' for name in names]
+    graph.until(
+        lambda: all(notice in graph.log('thinmap') for notice in notices), 'all of them notice'
+    )
+    robot.poses.clear(), maps.clear()
+    graph.until(lambda: len(robot.poses) > 10 and robot.truth, 'new poses')
+    assert robot.error_m() < 0.1
+    graph.until(lambda: len(maps) > 3, 'new maps')
+    # What only the first drive could see is forgotten: the robot, at its start again, stood still.
+    assert all(graph.log('thinmap').count(notice) == 1 for notice in notices)
+    assert graph.stop('thinmap') == 0, graph.log('thinmap')
+
+
+def test_what_waited_while_the_clock_was_set_back_does_not_begin_the_new_map(graph):
+    poses = graph.heard('pose', PoseWithCovarianceStamped)
+    doctor = Doctor(graph)
+    graph.start('localizer', laser_pose='0,0,0', use_sim_time=True)
+    clock = graph.node.create_publisher(Clock, '/clock', qos.STREAM)
+    scan = graph.node.create_publisher(LaserScan, 'scan', qos.STREAM)
+    odometry = graph.node.create_publisher(Odometry, 'odom', qos.STREAM)
+    now = [100.0]
+
+    def say(seconds, x):
+        ns = int(1e9 * seconds)
+        odometry.publish(
+            messages.odometry_msg(np.array([x, 0.0, 0.0]), (0.0, 0.0), ('odom', 'base_link'), ns)
+        )
+        scan.publish(scan_of_nothing_near(ns))
+
+    def go_on(x):
+        now[0] += 0.1
+        clock.publish(Clock(clock=messages.time_msg(int(1e9 * now[0]))))
+        say(now[0], x)
+
+    graph.until(lambda: go_on(4.0) or len(poses) > 5, 'poses')
+    last = now[0]
+    now[0] = 1.0
+    set_back = Clock(clock=messages.time_msg(10**9))
+    graph.until(
+        lambda: clock.publish(set_back) or 'the clock was set back' in graph.log('localizer'),
+        'it notices',
+    )
+    said = 0
+
+    def left_over():
+        nonlocal said
+        said += 1
+        say(last + 0.1 * said, 4.0)
+        cause = 'dropped: scan: left over from before the clock was set back'
+        return doctor.number('localizer', cause) > 0
+
+    graph.until(left_over, 'it is counted')
+    graph.hear_out()
+    poses.clear()
+    graph.until(lambda: go_on(0.0) or len(poses) > 5, 'poses of the new time')
+    newest_ns = max(messages.stamp_ns(pose.header.stamp) for pose in poses)
+    assert newest_ns <= int(1e9 * now[0]) < 50 * 10**9
+    assert all(
+        np.hypot(pose.pose.pose.position.x, pose.pose.pose.position.y) < 0.05 for pose in poses
+    )
+
+
+def empty_hall():
+    """Map of 12 x 12 m around the origin in which all is free."""
+    cells = np.zeros((120, 120), dtype=np.int8)
+    return messages.grid_msg(GridPatch(GridFrame(-6.0, -6.0, 0.1), cells), 'map', 0)
+
+
+def scan_of_nothing_near(ns):
+    message = LaserScan(angle_min=-1.5, angle_increment=0.05, range_min=0.05, range_max=8.0)
+    message.header = messages.header('laser', ns)
+    message.ranges = 61 * [5.0]
+    return message
+
+
+def test_a_silent_laser_stops_the_robot_and_it_goes_on(graph):
+    commands = graph.heard('cmd_vel', Twist)
+    doctor = Doctor(graph)
+    graph.start('navigator', laser_pose='0,0,0', use_sim_time=True)
+    scan = graph.node.create_publisher(LaserScan, 'scan', qos.STREAM)
+    odometry = graph.node.create_publisher(Odometry, 'odom', qos.STREAM)
+    pose = graph.node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
+    free = graph.node.create_publisher(OccupancyGrid, 'map', qos.LATCHED)
+    clock = graph.node.create_publisher(Clock, '/clock', qos.STREAM)
+    silent = set()
+    now_ns = [10**12]
+    answered = [-1]
+    said_at = [0.0]
+
+    def speak():
+        """A robot in an empty hall, the next 0.1 s after each command.
+
+        Until the first one comes, time goes on by itself.
+        """
+        waits = len(commands) == answered[0] if commands else time.monotonic() - said_at[0] < 0.1
+        if waits:
+            return
+        answered[0] = len(commands)
+        said_at[0] = time.monotonic()
+        now_ns[0] += TICK_NS
+        ns = now_ns[0]
+        clock.publish(Clock(clock=messages.time_msg(ns)))
+        if 'odometry' not in silent:
+            odometry.publish(
+                messages.odometry_msg(np.zeros(3), (0.0, 0.0), ('odom', 'base_link'), ns)
+            )
+        if 'laser' not in silent:
+            scan.publish(scan_of_nothing_near(ns))
+        if 'localizer' not in silent:
+            pose.publish(messages.pose_with_covariance_msg(np.zeros(3), np.eye(3), 'map', ns))
+
+    free.publish(empty_hall())
+    client = ActionClient(graph.node, NavigateToPose, 'navigate_to_pose')
+    goal = NavigateToPose.Goal()
+    goal.pose.pose.position.x = 4.0
+    goal.pose.pose.orientation.w = 1.0
+    graph.send_goal(client, goal)
+
+    def drives():
+        speak()
+        return commands and commands[-1].linear.x > 0.02
+
+    def stands():
+        speak()
+        return commands and commands[-1].linear.x == commands[-1].angular.z == 0.0
+
+    for who, limit_s in (('laser', 0.5), ('odometry', 0.5), ('localizer', 3.5)):
+        silent.clear()
+        graph.until(drives, f'it drives before the {who} falls silent')
+        silent.add(who)
+        since_ns = now_ns[0]
+        graph.until(stands, f'it stops without {who}')
+        assert now_ns[0] - since_ns < (limit_s + 0.3) * 1e9
+        # Time stands still meanwhile.
+        graph.until(lambda w=who: f'{w} silent' in doctor.status('navigator').message, 'it says so')
+    silent.clear()
+    graph.until(drives, 'it goes on')
+
+
+def test_a_robot_that_stands_for_minutes_is_as_sure_of_its_pose_as_before(graph):
+    """In 600 s the deviation had grown to 0.10 m and 0.06 rad."""
+    poses = graph.heard('pose', PoseWithCovarianceStamped)
+    graph.start('localizer', laser_pose='0,0,0', start_x_m=2.0, start_y_m=2.0)
+    scan = graph.node.create_publisher(LaserScan, 'scan', qos.STREAM)
+    odometry = graph.node.create_publisher(Odometry, 'odom', qos.STREAM)
+    rng = np.random.default_rng(5)
+    stamp = [0]
+    here = np.array([2.0, 2.0, 0.0])
+
+    def say(T_map_base):
+        stamp[0] += 200_000_000
+        T_odom_base = T_map_base - here
+        odometry.publish(
+            messages.odometry_msg(T_odom_base, (0.0, 0.0), ('odom', 'base_link'), stamp[0])
+        )
+        seen = scan_in(ROOM, T_map_base, rng, stamp[0])
+        scan.publish(messages.scan_msg(seen, 'laser', 0.2))
+
+    def answered(T_map_base, count):
+        """Say where it is, over and over, until so many of these scans are behind the last pose."""
+        wanted = stamp[0] + count * 200_000_000
+
+        def is_answered():
+            say(T_map_base)
+            return poses and messages.stamp_ns(poses[-1].header.stamp) >= wanted
+
+        graph.until(is_answered, f'{count} poses')
+        return np.sqrt(np.diag(messages.covariance_from(poses[-1])))
+
+    answered(here, 5)
+    for k in range(20):
+        answered(here + (0.05 * k, 0.0, 0.0), 1)
+    there = here + (1.0, 0.0, 0.0)
+    before = answered(there, 10)
+    began = poses[-1].pose.pose.position
+    after = answered(there, 500)
+    assert np.abs(after - before).max() < 1e-6
+    place = poses[-1].pose.pose.position
+    assert np.hypot(place.x - began.x, place.y - began.y) < 0.02, 'it does not wander'
+    # How many scans of the drive were heard, and so how true it is, depends on the machine.
+    assert np.hypot(place.x - there[0], place.y - there[1]) < 0.04
+    assert (answered(there + (0.5, 0.0, 0.0), 1) > after).any(), 'driving adds'
+
+
+def test_a_burst_of_scans_leaves_no_queue_and_what_is_lost_is_counted(graph):
+    poses = graph.heard('pose', PoseWithCovarianceStamped)
+    doctor = Doctor(graph)
+    graph.start('localizer', laser_pose='0,0,0')
+    scan = graph.node.create_publisher(LaserScan, 'scan', qos.STREAM)
+    odometry = graph.node.create_publisher(Odometry, 'odom', qos.STREAM)
+    graph.until(
+        lambda: scan.get_subscription_count() and odometry.get_subscription_count(), 'localizer'
+    )
+    period_ns = 25_000_000
+    now = [10**12]
+    message = LaserScan(angle_min=-1.5, angle_increment=0.05, range_min=0.05, range_max=8.0)
+    message.ranges = 61 * [3.0]
+
+    def say():
+        now[0] += period_ns
+        odometry.publish(
+            messages.odometry_msg(np.zeros(3), (0.0, 0.0), ('odom', 'base_link'), now[0])
+        )
+        message.header = messages.header('laser', now[0])
+        scan.publish(message)
+
+    def steadily():
+        say()
+        time.sleep(0.02)
+        return len(poses) > 40
+
+    def all_told():
+        """Scans that the localizer says it heard or lost, when it has told of the last one."""
+        graph.until(lambda: messages.stamp_ns(poses[-1].header.stamp) == now[0], 'the last pose')
+        so_far = doctor.times('localizer')
+        graph.until(lambda: doctor.times('localizer') >= so_far + 2, 'diagnostics')
+        keys = ('scan: heard', 'dropped: scan: lost on the way or in a full queue')
+        return [doctor.number('localizer', key) for key in keys]
+
+    graph.until(steadily, 'poses at 40 Hz')
+    before = all_told()
+    first_ns = now[0]
+    for _ in range(400):
+        say()
+    last_ns = now[0]
+
+    def newest():
+        steadily()
+        return messages.stamp_ns(poses[-1].header.stamp) >= last_ns
+
+    graph.until(newest, 'the newest scan')
+    after = all_told()
+    assert after[1] > before[1], 'the queue is short'
+    assert sum(after) - sum(before) == (now[0] - first_ns) / period_ns, 'each is accounted for'
+    assert doctor.number('localizer', 'dropped: scan: gaps between the stamps') == 0.0, (
+        'each was sent'
+    )
+
+
+def test_a_full_disk_leaves_the_old_session_as_it_was(graph, tmp_path):
+    robot = Robot(graph)
+    start_mapping(graph)
+    robot.drive(0.3)
+    stem = tmp_path / 'maps' / 'room'
+
+    def save():
+        return graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(stem)))
+
+    parts = ('.topology.npz', '.features.npz')
+    graph.until(
+        lambda: all(part in save().message for part in parts), 'a session with all its parts'
+    )
+    before = {file.name: file.read_bytes() for file in stem.parent.iterdir()}
+    assert sorted(before) == [
+        'room.features.npz',
+        'room.grid.npz',
+        'room.pgm',
+        'room.topology.npz',
+        'room.yaml',
+    ]
+    robot.drive(0.5)
+    for name in ('grid_mapper', 'topology_builder'):
+        pid = graph.processes[name].pid
+        for size in (0, 300):
+            resource.prlimit(pid, resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
+            response = save()
+            told = (name, size, response.message)
+            assert not response.success and 'room' in response.message, told
+            if name == 'grid_mapper':
+                assert {file.name: file.read_bytes() for file in stem.parent.iterdir()} == before
+        resource.prlimit(
+            pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
+        )
+    assert (stem.parent / 'room.topology.npz').read_bytes() == before['room.topology.npz']
+    response = save()
+    assert response.success, response.message
+    assert sorted(file.name for file in stem.parent.iterdir()) == sorted(before)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_an_exploration_finishes_though_every_node_is_killed_once(graph):
+    robot = Robot(graph)
+    maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
+    status = graph.heard('exploration_status', ExplorationStatus, qos.LATCHED)
+    names = [*MAPPING, 'navigator', 'explorer']
+    for name in names[3:]:
+        start_one(graph, name)
+    start_mapping(graph, rate=5.0)
+    client = ActionClient(graph.node, Explore, 'explore')
+
+    def ask():
+        return graph.send_goal(client, Explore.Goal()).get_result_async()
+
+    ended = ask()
+    for name in names:
+        metres = status[-1].distance_m + 1.0 if status else 1.0
+        graph.until(
+            lambda m=metres: status and status[-1].distance_m > m,
+            f'a metre before {name} is killed',
+        )
+        assert not ended.done()
+        kill(graph, name)
+        time.sleep(1.0)
+        start_one(graph, name)
+        if name == 'explorer':
+            status.clear()
+            graph.until(lambda: 'finished' not in graph.log('explorer'), 'a new one')
+            ended = ask()
+    graph.until(ended.done, 'the exploration ends', 600.0)
+    result = ended.result().result.status
+    good = (ExplorationStatus.ALL_RESOLVED, ExplorationStatus.NOTHING_REACHABLE)
+    assert result.reason_code in good, result.reason
+    assert robot.error_m() < 0.3
+    patch = messages.patch_from(maps[-1])
+    assert patch.free.sum() * 0.01 > 80.0, 'nearly all of a room of 10 x 10 m'
+    assert patch.shape[0] < 115 and patch.shape[1] < 115, 'and nothing double'

@@ -1,0 +1,255 @@
+"""Whatever messages say.
+
+Conversions give sound values or refuse in one line, and no node dies or publishes NaN.
+"""
+
+import math
+from collections import Counter
+
+import pytest
+from action_msgs.msg import GoalStatus
+from fuzz.strange_messages import CHECKS, made, numbers
+from geometry_msgs.msg import Point32, PoseWithCovarianceStamped, Twist
+from lifecycle_msgs.srv import GetState
+from nav_msgs.msg import OccupancyGrid, Odometry, Path
+from rclpy.action import ActionClient
+from sensor_msgs.msg import LaserScan
+from test_health import Doctor
+from tf2_msgs.msg import TFMessage
+
+from thinmap_msgs.action import Explore, NavigateToPose
+from thinmap_msgs.msg import (
+    EndNodeArray,
+    ExplorationStatus,
+    LineFeatureArray,
+    SlamStatus,
+    TopologicalMap,
+)
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.ros import messages, qos
+
+pytestmark = pytest.mark.live
+
+
+def is_refused(message):
+    try:
+        CHECKS[type(message)](message)
+    except InputError as error:
+        assert '\n' not in str(error) and len(str(error)) < 500
+        return True
+    return False
+
+
+@pytest.mark.parametrize('kind', CHECKS)
+def test_conversions_give_sound_values_or_refuse_in_one_line(kind):
+    refused = Counter(is_refused(message) for message in made(kind, 800))
+    # Both happen, and often.
+    assert refused[True] > 80 and refused[False] > 80
+
+
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+def test_a_map_that_is_turned_is_refused_and_no_other(sign):
+    good = next(message for message in made(OccupancyGrid, 40) if not is_refused(message))
+    for turned, refused in ((0.0, False), (0.01, True), (1.5, True)):
+        good.info.origin.orientation = messages.quaternion_msg(sign * turned)
+        assert is_refused(good) == refused
+
+
+@pytest.mark.parametrize(
+    ('sec', 'nanosec', 'refused'),
+    [(0, 0, False), (-1, 0, True), (1, 10**9 - 1, False), (1, 10**9, True), (1, 2**32 - 1, True)],
+)
+def test_stamps(sec, nanosec, refused):
+    good = next(message for message in made(Odometry, 40) if not is_refused(message))
+    good.header.stamp.sec = sec
+    good.header.stamp.nanosec = nanosec
+    assert is_refused(good) == refused
+
+
+SPOKEN = {
+    'pose': PoseWithCovarianceStamped,
+    '/tf': TFMessage,
+    'line_features': LineFeatureArray,
+    'slam_status': SlamStatus,
+    'map': OccupancyGrid,
+    'local_map': OccupancyGrid,
+    'topology': TopologicalMap,
+    'local_topology': TopologicalMap,
+    'end_nodes': EndNodeArray,
+    'exploration_status': ExplorationStatus,
+    'cmd_vel': Twist,
+    'plan': Path,
+}
+LISTENERS = {
+    'localizer': {
+        'odom': Odometry,
+        'scan': LaserScan,
+        'topology': TopologicalMap,
+        'initialpose': PoseWithCovarianceStamped,
+    },
+    'grid_mapper': {'scan': LaserScan, 'pose': PoseWithCovarianceStamped},
+    'topology_builder': {'local_map': OccupancyGrid, 'pose': PoseWithCovarianceStamped},
+    'explorer': {
+        'local_map': OccupancyGrid,
+        'map': OccupancyGrid,
+        'topology': TopologicalMap,
+        'scan': LaserScan,
+        'pose': PoseWithCovarianceStamped,
+    },
+    'navigator': {
+        'local_map': OccupancyGrid,
+        'map': OccupancyGrid,
+        'odom': Odometry,
+        'scan': LaserScan,
+        'pose': PoseWithCovarianceStamped,
+    },
+}
+LATER = {  # looked into only when the message of another topic has come that belongs to it
+    'localizer': (),
+    'grid_mapper': ('scan',),
+    'topology_builder': (),
+    'explorer': ('scan',),
+    'navigator': ('pose',),
+}
+ANSWERS = {  # what each node says when it hears good messages
+    'localizer': 'pose',
+    'grid_mapper': 'local_map',
+    'topology_builder': 'local_topology',
+    'explorer': 'end_nodes',
+    'navigator': 'cmd_vel',
+}
+
+
+def set_to_work(graph, name):
+    """Give the nodes that work on goals a goal that they do not reach."""
+    if name not in ('explorer', 'navigator'):
+        return
+    kind, action = (
+        (Explore, 'explore') if name == 'explorer' else (NavigateToPose, 'navigate_to_pose')
+    )
+    client = ActionClient(graph.node, kind, action)
+    graph.until(client.server_is_ready, action)
+    goal = kind.Goal()
+    if name == 'navigator':
+        goal.pose.pose.position.x = 1.2
+        goal.pose.pose.orientation.w = 1.0
+    sent = client.send_goal_async(goal)
+    graph.until(sent.done, 'the goal is taken')
+
+
+def say(graph, name, publishers, count):
+    """Publish so many strange messages on each topic, stamp by stamp, as fast as they are taken.
+
+    A node that answers has taken what came before. Returns how many of each must be refused.
+    """
+    columns = {topic: made(kind, count) for topic, (kind, _) in publishers.items()}
+    for row in range(count):
+        for topic, (_, publisher) in publishers.items():
+            publisher.publish(columns[topic][row])
+        graph.call(GetState, f'/{name}/get_state', GetState.Request())
+    return {topic: sum(map(is_refused, column)) for topic, column in columns.items()}
+
+
+@pytest.mark.parametrize('name', LISTENERS)
+@pytest.mark.parametrize(
+    'count', [100, pytest.param(10_000, marks=[pytest.mark.slow, pytest.mark.timeout(1800)])]
+)
+def test_a_node_lives_through_them_publishes_no_nan_and_counts_what_it_refused(graph, name, count):
+    heard = {
+        topic: graph.heard(topic, kind)
+        for topic, kind in SPOKEN.items()
+        if topic not in LISTENERS[name]
+    }
+    doctor = Doctor(graph)
+    graph.start(name, laser_pose='0,0,0') if name != 'topology_builder' else graph.start(name)
+    publishers = {}
+    for topic, kind in LISTENERS[name].items():
+        profile = qos.LATCHED if kind in (OccupancyGrid, TopologicalMap) else qos.STREAM
+        publishers[topic] = (kind, graph.node.create_publisher(kind, topic, profile))
+    graph.until(
+        lambda: all(p.get_subscription_count() for _, p in publishers.values()), 'subscriptions'
+    )
+    set_to_work(graph, name)
+    expected = say(graph, name, publishers, count)
+    graph.until(lambda: counted(doctor, name, expected) == [], f'counts {expected}')
+    assert all(doctor.number(name, f'{topic}: heard') >= 0.7 * count for topic in expected)
+    assert doctor.value(name, 'scan: refused') == '' or any(
+        'refused: ' in p.key for p in doctor.status(name).values
+    )
+    for topic, said in heard.items():
+        assert all(math.isfinite(number) for message in said for number in numbers(message)), topic
+    # It still works; fresh stamps, as all that was said before may lie ahead of these.
+    answers = heard[ANSWERS[name]]
+    before = len(answers)
+    ns = [3 * 10**12]
+
+    def good_again():
+        ns[0] += 10**8
+        for kind, publisher in publishers.values():
+            publisher.publish(good(kind, ns[0]))
+        return len(answers) > before
+
+    if name in ('explorer', 'navigator'):
+        set_to_work(graph, name)
+    graph.until(good_again, f'an answer of {name}')
+    assert all(math.isfinite(number) for message in answers[before:] for number in numbers(message))
+    assert graph.processes[name].poll() is None
+    assert graph.stop(name) == 0, graph.log(name)
+
+
+def test_goals_that_are_no_goals_end_with_a_reason(graph):
+    for name in ('explorer', 'navigator'):
+        graph.start(name, laser_pose='0,0,0')
+    for wrong in (math.nan, math.inf, 1e30):
+        goal = Explore.Goal()
+        goal.area.points = [Point32(x=wrong), Point32(x=1.0), Point32(y=1.0)]
+        ended = graph.act(Explore, 'explore', goal)
+        assert (
+            ended.status == GoalStatus.STATUS_ABORTED
+            and 'corner of the area' in ended.result.status.reason
+        )
+        ended = graph.act(Explore, 'explore', Explore.Goal(time_limit_s=wrong))
+        assert ended.status == GoalStatus.STATUS_ABORTED and 'limit' in ended.result.status.reason
+        goal = NavigateToPose.Goal()
+        goal.pose.pose.position.x = wrong
+        ended = graph.act(NavigateToPose, 'navigate_to_pose', goal)
+        assert ended.status == GoalStatus.STATUS_ABORTED and 'position' in ended.result.reason
+    for name in ('explorer', 'navigator'):
+        assert graph.stop(name) == 0, graph.log(name)
+
+
+def counted(doctor, name, expected):
+    """Topics of which not enough refusals are counted.
+
+    Some messages are lost where they come this fast.
+    """
+    return [
+        t
+        for t, n in expected.items()
+        if doctor.number(name, f'{t}: refused') < 0.7 * n and t not in LATER[name]
+    ]
+
+
+def good(kind, ns):
+    """A message of a kind that nobody can refuse."""
+    found = next(m for m in made(kind, 40) if not is_refused(m) and is_plain(m))
+    found.header.stamp = messages.time_msg(ns)
+    return found
+
+
+def is_plain(message):
+    if isinstance(message, LaserScan):
+        return (
+            message.header.frame_id == 'laser'
+            and list(message.ranges) == 61 * [2.0]
+            and message.range_max == 8.0
+        )
+    if isinstance(message, OccupancyGrid):
+        return (
+            message.info.width == 40
+            and abs(message.info.origin.position.x + 2.0) < 1e-9
+            and message.data[41] == 0
+        )
+    if isinstance(message, TopologicalMap):
+        return True
+    return message.pose.pose.position.x == 0.0 and message.pose.pose.position.y == 0.0

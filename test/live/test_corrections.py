@@ -1,0 +1,158 @@
+"""A live map that is re-rendered after a correction, and saved or killed meanwhile."""
+
+import signal
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import OccupancyGrid as OccupancyGridMsg
+from nav_msgs.msg import Path
+from sensor_msgs.msg import LaserScan
+from support.slam_room import corridor_ring, scan_in
+from test_health import Doctor
+
+from thinmap_msgs.srv import SaveMap
+from thinmap_ros.core import se2
+from thinmap_ros.core.grid.correctable import CorrectableGrid
+from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
+from thinmap_ros.files import sessions
+from thinmap_ros.ros import messages, qos
+
+pytestmark = pytest.mark.live
+CONFIG = OccupancyConfig(resolution_m=0.03)
+SECOND_NS = 10**9
+COUNT = 110
+TRUE = np.array([se2.pose(2.0 + 0.32 * k, 1.2, 0.0) for k in range(COUNT + 40)])
+DRIFTED = TRUE + np.arange(len(TRUE))[:, None] * [0.0, 0.004, 0.0]
+WALLS = corridor_ring()
+
+
+def scan_of(k):
+    return scan_in(WALLS, TRUE[k], None, (k + 1) * SECOND_NS)
+
+
+def named_by(message):
+    """Stamp of the correction that a map has undergone."""
+    return messages.stamp_ns(message.info.map_load_time)
+
+
+class Mapping:
+    """A grid_mapper, which is told scans, poses and corrections, and the same done by hand."""
+
+    def __init__(self, graph):
+        self.graph = graph
+        self.by_hand = CorrectableGrid(OccupancyGrid(CONFIG))
+        self.maps = graph.heard('map', OccupancyGridMsg, qos.LATCHED)
+        self.windows = graph.heard('local_map', OccupancyGridMsg)
+        self._scans = graph.node.create_publisher(LaserScan, 'scan', qos.STREAM)
+        self._poses = graph.node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
+        self._paths = graph.node.create_publisher(Path, 'trajectory', qos.LATCHED)
+        self.start()
+
+    def start(self):
+        doctor = Doctor(self.graph)
+        self.graph.start('grid_mapper', laser_pose='0,0,0', recover_s=1000.0, resolution_m=0.03)
+        keys = ['scan: speakers', 'pose: speakers', 'trajectory: speakers', 'local_map: listeners']
+        self.graph.until(
+            lambda: (
+                all(doctor.number('grid_mapper', key) for key in keys)
+                and all(p.get_subscription_count() for p in (self._scans, self._poses, self._paths))
+            ),
+            'the mapper and the test have found each other',
+        )
+
+    def add(self, k, T_map_base):
+        """Add scan number k; returns the stamp of the correction that its local map names."""
+        self.by_hand.update(scan_of(k), T_map_base)
+        self.windows.clear()
+        self.publish(k, T_map_base)
+        self.graph.until(lambda: self.windows, 'a local map')
+        return named_by(self.windows[-1])
+
+    def publish(self, k, T_map_base):
+        scan = scan_of(k)
+        covariance = 1e-4 * np.eye(3)
+        pose = messages.pose_with_covariance_msg(T_map_base, covariance, 'map', scan.stamp_ns)
+        self._scans.publish(messages.scan_msg(scan, 'laser', 0.0))
+        self._poses.publish(pose)
+
+    def correct(self, k):
+        """The scans before number k were made where they really were."""
+        stamps = (np.arange(k) + 1) * SECOND_NS
+        ns = (k + 1) * SECOND_NS
+        self.by_hand.correct(stamps, TRUE[:k], ns)
+        self._paths.publish(messages.trajectory_msg(stamps.tolist(), TRUE[:k], 'map', ns))
+        return ns
+
+    def drive_and_correct(self):
+        """Until a re-rendering is under way; returns its stamp."""
+        for k in range(COUNT):
+            assert self.add(k, DRIFTED[k]) == 0
+        corrected_ns = self.correct(COUNT)
+        assert self.add(COUNT, TRUE[COUNT]) == 0
+        assert self.by_hand.is_rerendering
+        return corrected_ns
+
+
+def test_windows_name_a_correction_when_all_of_the_map_has_undergone_it(graph):
+    mapping = Mapping(graph)
+    corrected_ns = mapping.drive_and_correct()
+    named = [0]
+    expected = [0]
+    while mapping.by_hand.is_rerendering:
+        k = COUNT + len(named)
+        named.append(mapping.add(k, TRUE[k]))
+        expected.append(mapping.by_hand.corrected_ns)
+    assert named == expected and len(named) > 2
+
+    def is_corrected():
+        return named_by(mapping.maps[-1]) == corrected_ns
+
+    graph.until(is_corrected, 'the corrected map')
+    assert graph.stop('grid_mapper') == 0
+
+
+def test_a_map_that_is_saved_meanwhile_has_undergone_the_correction(graph, tmp_path):
+    mapping = Mapping(graph)
+    corrected_ns = mapping.drive_and_correct()
+    response = graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(tmp_path / 'room')))
+    assert response.success, response.message
+    mapping.by_hand.finish()
+    saved = sessions.load_grid(str(tmp_path / 'room'), CONFIG)
+    expected = mapping.by_hand.shown.patch()
+    np.testing.assert_array_equal(saved.patch().cells, expected.cells)
+    assert mapping.add(COUNT + 1, TRUE[COUNT + 1]) == corrected_ns
+    assert graph.stop('grid_mapper') == 0
+
+
+def test_a_mapper_that_is_killed_meanwhile_goes_on_with_the_map_that_was_shown(graph):
+    mapping = Mapping(graph)
+    corrected_ns = mapping.drive_and_correct()
+    shown = mapping.by_hand.shown.state()
+
+    def is_kept():
+        files = list((graph.folder / 'state').glob('[!.]*.grid_mapper.npz'))
+        if not files:
+            return False
+        with np.load(files[0]) as state:
+            return int(state['latest_ns']) == corrected_ns
+
+    graph.until(is_kept, 'its state')
+    graph.stop('grid_mapper', signal.SIGKILL)
+    graph.hear_out()
+    mapping.maps.clear()
+    mapping.start()
+    graph.until(lambda: mapping.maps, 'the map, at once')
+    known = messages.patch_from(mapping.maps[-1])
+    expected = OccupancyGrid.from_state(shown, CONFIG).patch()
+    np.testing.assert_array_equal(known.cells, expected.cells)
+    # What is published before the two have found each other is lost.
+    mapping.windows.clear()
+    graph.until(
+        lambda: (
+            mapping.publish(COUNT + 1, TRUE[COUNT + 1])
+            or any(named_by(window) == corrected_ns for window in mapping.windows)
+        ),
+        'a local map of the corrected grid, or others would wait for it',
+    )
+    assert graph.stop('grid_mapper') == 0

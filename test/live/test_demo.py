@@ -1,0 +1,130 @@
+"""The demo as a user runs it: the whole live graph, faster than real time."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import psutil
+import pytest
+from support.hidden_library import hide
+from support.timeouts import PATIENCE_S, PROGRAM_S
+
+from thinmap_ros.files import occupancy_maps
+from thinmap_ros.logs.bag import Bag
+
+pytestmark = pytest.mark.live
+REPORT = {
+    'finished',
+    'reason',
+    'coverage',
+    'distance',
+    'time',
+    'distance_at',
+    'time_at',
+    'collisions',
+    'end_nodes_seen',
+    'end_nodes_visited',
+    'pose_rmse',
+}
+TOPICS = {
+    '/scan',
+    '/odom',
+    '/pose',
+    '/map',
+    '/local_map',
+    '/topology',
+    '/local_topology',
+    '/end_nodes',
+    '/cmd_vel',
+}
+
+
+def demo(out, *arguments):
+    command = [sys.executable, '-m', 'thinmap_ros.tools.demo', '-o', str(out), *arguments]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def nodes_of(out):
+    """Processes of a demo.
+
+    Each has the results' folder in its arguments, or is a child of one that has.
+    """
+    found = []
+    for process in psutil.process_iter(['cmdline']):
+        if any(str(out) in part for part in process.info['cmdline'] or ()):
+            found.append(process)
+    return found
+
+
+def test_the_robot_explores_the_room_and_stops_by_itself(ros_domain, tmp_path):
+    process = demo(tmp_path / 'demo', '--rate', '20', '--seed', '4')
+    stdout, stderr = process.communicate(timeout=PROGRAM_S)
+    assert process.returncode == 0, stderr
+    out = tmp_path / 'demo'
+    report = json.loads((out / 'report.json').read_text())
+    assert set(report) >= REPORT
+    assert report['finished'] and 'resolved' in report['reason']
+    assert report['coverage'] >= 0.97
+    assert report['collisions'] == 0
+    assert report['pose_rmse'] < 0.05
+    assert report['end_nodes_visited'] < report['end_nodes_seen']
+    assert report['reason'] in stdout
+    assert occupancy_maps.read_map(out / 'map.yaml').free.sum() > 8000
+    assert len(json.loads((out / 'topology.geojson').read_text())['features']) > 5
+    assert np.loadtxt(out / 'trajectory.tum').shape[1] == 8
+    assert (out / 'summary.png').stat().st_size > 10_000
+    bag = Bag(out / 'bag')
+    assert set(bag.topics) >= TOPICS
+    assert not bag.cut_off
+    assert not nodes_of(out)
+
+
+def test_ctrl_c_ends_everything(ros_domain, tmp_path):
+    out = tmp_path / 'demo'
+    process = demo(out, '--rate', '5')
+    until = time.monotonic() + PATIENCE_S
+    while not (out / 'bag').exists() or len(process_tree(process)) < 8:
+        assert time.monotonic() < until and process.poll() is None, process.communicate()
+        time.sleep(0.1)
+    tree = process_tree(process)
+    process.send_signal(signal.SIGINT)
+    _, stderr = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 130
+    assert 'interrupted' in stderr and 'Traceback' not in stderr
+    assert not psutil.wait_procs(tree, timeout=PATIENCE_S)[1]
+    assert not (out / 'report.json').exists()
+
+
+def process_tree(process):
+    return psutil.Process(process.pid).children(recursive=True)
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'said'),
+    [
+        (['--world', 'atlantis'], 'atlantis'),
+        (['--robot', '4wd'], '4wd'),
+        (['--rate', 'fast'], 'fast'),
+    ],
+)
+def test_wrong_arguments_end_at_once(tmp_path, arguments, said):
+    process = demo(tmp_path / 'demo', *arguments)
+    _, stderr = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 2
+    assert said in stderr and 'Traceback' not in stderr
+
+
+def test_without_rerun_a_view_is_refused_before_anything_is_started(
+    tmp_path, tmp_path_factory, monkeypatch
+):
+    hide('rerun', tmp_path_factory.mktemp('hidden'), monkeypatch)
+    process = demo(tmp_path / 'out', '--view')
+    said = process.communicate(timeout=PATIENCE_S)[1].splitlines()
+    assert process.returncode == 2
+    assert said == [
+        'demo: error: --view: rerun is not installed: pip install "thinmap_ros[viewer]"'
+    ]
+    assert not (tmp_path / 'out').exists()

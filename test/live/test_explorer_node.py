@@ -1,0 +1,164 @@
+"""The explorer as a process on a live graph.
+
+Every way in which an exploration ends, and how it goes on afterwards.
+"""
+
+import math
+from itertools import count
+
+import numpy as np
+import pytest
+from action_msgs.msg import GoalStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import OccupancyGrid
+from rclpy.action import ActionClient, ActionServer
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import LaserScan
+
+from thinmap_msgs.action import Explore, NavigateToPose
+from thinmap_msgs.msg import EndNodeArray, ExplorationStatus, SlamStatus, TopologicalMap
+from thinmap_msgs.srv import SaveMap
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
+from thinmap_ros.core.grid.raytrace import cast_rays
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import pose
+from thinmap_ros.core.topology.builder import TopologyConfig, build
+from thinmap_ros.ros import messages, qos
+
+pytestmark = pytest.mark.live
+AT = pose(2.0, 2.0, 0.0)
+ANGLES = np.radians(np.arange(-90.0, 91.0))
+PERIOD_NS = 200_000_000
+# Ten times as fast as a robot's; the explorer goes by the robot's time.
+SPEAK_S = 0.02
+
+
+def room(known_cols):
+    """A walled room of 6 x 4 m, known up to a column."""
+    cells = np.zeros((40, 60), dtype=np.int8)
+    cells[[0, -1]] = 100
+    cells[:, [0, -1]] = 100
+    cells[:, known_cols:] = UNKNOWN
+    return GridPatch(GridFrame(0.0, 0.0, 0.1), cells)
+
+
+class Robot:
+    """Says what the other nodes of a robot would say that stands in a room."""
+
+    def __init__(self, graph):
+        self.graph = graph
+        self.node = graph.node
+        self.numbers = count(1)
+        self.hears_scans = self.is_tracked = True
+        self.end_nodes = graph.heard('end_nodes', EndNodeArray, qos.LATCHED)
+        self.map = self.node.create_publisher(OccupancyGrid, 'map', qos.LATCHED)
+        self.graph_map = self.node.create_publisher(TopologicalMap, 'topology', qos.LATCHED)
+        self.pose = self.node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
+        self.scan = self.node.create_publisher(LaserScan, 'scan', qos.STREAM)
+        self.slam = self.node.create_publisher(SlamStatus, 'slam_status', qos.STREAM)
+        self.clock = self.node.create_publisher(Clock, '/clock', qos.STREAM)
+        self.node.create_timer(SPEAK_S, self.speak)
+        self.knows(40)
+
+    def refuses_to_drive(self):
+        """From now on, goals fail.
+
+        Before, there is no navigator at all, and the explorer waits for it.
+        """
+
+        def refuse(handle):
+            handle.abort()
+            return NavigateToPose.Result(success=False, reason='the wheels are chained')
+
+        self.driver = ActionServer(self.node, NavigateToPose, 'navigate_to_pose', refuse)
+
+    def knows(self, cols):
+        patch = room(cols)
+        self.map.publish(messages.grid_msg(patch, 'map', 0))
+        self.graph_map.publish(
+            messages.topology_msg(build(patch, (2.0, 2.0), TopologyConfig()), 'map', 0)
+        )
+
+    def speak(self):
+        ns = next(self.numbers) * PERIOD_NS
+        self.clock.publish(Clock(clock=messages.time_msg(ns)))
+        ranges = 0.1 * cast_rays(
+            room(60).occupied.astype(np.uint8), 20.0, 20.0, ANGLES + AT[2], 80.0
+        )
+        scan = Scan.create(ns, ranges, -0.5 * math.pi, math.pi / 180.0, 0.05, 8.0)
+        if self.hears_scans:
+            self.scan.publish(messages.scan_msg(scan, 'laser', 0.2))
+            self.pose.publish(messages.pose_with_covariance_msg(AT, np.zeros((3, 3)), 'map', ns))
+        self.slam.publish(
+            SlamStatus(state=SlamStatus.TRACKING if self.is_tracked else SlamStatus.LOST)
+        )
+
+    def explores(self, **goal):
+        """Status with which an exploration ends, and whether it succeeded."""
+        ended = self.graph.act(Explore, 'explore', Explore.Goal(**goal))
+        return ended.result.status.reason_code, ended.status
+
+    def evidence(self):
+        """Probability and number of counted looks' closest distance by end node."""
+        return {
+            n.node_id: (n.position_probability, n.smallest_distance_m)
+            for n in self.end_nodes[-1].end_nodes
+        }
+
+
+@pytest.fixture
+def robot(graph):
+    robot = Robot(graph)
+    graph.start('explorer', laser_pose='0,0,0', use_sim_time=True)
+    return robot
+
+
+def test_it_says_why_it_ended(robot):
+    assert robot.explores(area_limit_m2=1.0) == (
+        ExplorationStatus.BUDGET,
+        GoalStatus.STATUS_SUCCEEDED,
+    )
+    robot.is_tracked = False
+    assert robot.explores() == (ExplorationStatus.LOCALIZATION_LOST, GoalStatus.STATUS_ABORTED)
+    robot.is_tracked = True
+    robot.hears_scans = False
+    assert robot.explores() == (ExplorationStatus.SENSOR_SILENT, GoalStatus.STATUS_ABORTED)
+    robot.hears_scans = True
+    robot.refuses_to_drive()
+    assert robot.explores() == (ExplorationStatus.NOTHING_REACHABLE, GoalStatus.STATUS_SUCCEEDED)
+    robot.knows(60)
+    assert robot.explores() == (ExplorationStatus.ALL_RESOLVED, GoalStatus.STATUS_SUCCEEDED)
+
+
+def test_it_goes_on_after_a_cancelled_goal_and_after_a_new_start(graph, robot, tmp_path):
+    client = ActionClient(graph.node, Explore, 'explore')
+    accepted = graph.send_goal(client, Explore.Goal())
+    graph.until(lambda: robot.end_nodes and any(robot.evidence().values()), 'end nodes')
+    # Nodes are looked at one after the other, and borders once a second: until nothing new comes
+    # for 30 looks.
+    seen = [(robot.evidence(), len(robot.end_nodes))]
+
+    def is_settled():
+        if robot.evidence() != seen[0][0]:
+            seen[0] = (robot.evidence(), len(robot.end_nodes))
+        return len(robot.end_nodes) - seen[0][1] > 30
+
+    graph.until(is_settled, 'all looks at end nodes')
+    accepted.cancel_goal_async()
+    ended = accepted.get_result_async()
+    graph.until(ended.done, 'the end')
+    assert ended.result().status == GoalStatus.STATUS_CANCELED
+    assert ended.result().result.status.reason_code == ExplorationStatus.CANCELLED
+    before = robot.evidence()
+    stem = tmp_path / 'room'
+    assert graph.call(SaveMap, 'save_exploration', SaveMap.Request(path=str(stem))).success
+    for session in ({}, {'session': str(stem)}):
+        if session:
+            assert graph.stop('explorer') == 0, graph.log('explorer')
+            graph.start('explorer', laser_pose='0,0,0', use_sim_time=True, **session)
+        robot.end_nodes.clear()
+        assert robot.explores(area_limit_m2=1.0)[0] == ExplorationStatus.BUDGET
+        graph.until(lambda: robot.end_nodes, 'what was looked at last')
+        # The robot has not moved: there is no new evidence, and what there was has been kept.
+        assert robot.evidence() == before

@@ -1,0 +1,231 @@
+"""/diagnostics of the nodes, their states, and the services that every node has."""
+
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from nav_msgs.msg import OccupancyGrid
+from rclpy.action import ActionClient
+from sensor_msgs.msg import LaserScan
+from std_srvs.srv import SetBool, Trigger
+
+from thinmap_msgs.action import NavigateToPose
+from thinmap_msgs.msg import TopologicalMap
+from thinmap_ros.ros import diagnostics, qos
+
+pytestmark = pytest.mark.live
+AT_START = {'start_x_m': 2.0, 'start_y_m': 2.0, 'start_yaw_rad': 0.0}
+START = '2.0,2.0,0.0'
+MAPPING = ('localizer', 'grid_mapper', 'topology_builder')
+
+
+class Doctor:
+    """What the nodes last said of themselves, by node."""
+
+    def __init__(self, graph):
+        self.heard = graph.heard('/diagnostics', DiagnosticArray)
+
+    def status(self, node):
+        found = [s for array in self.heard for s in array.status if s.name == f'{node}: thinmap']
+        return found[-1] if found else DiagnosticStatus(level=DiagnosticStatus.STALE)
+
+    def times(self, node):
+        """How often a node has said how it is."""
+        return sum(s.name == f'{node}: thinmap' for array in self.heard for s in array.status)
+
+    def value(self, node, key):
+        return {pair.key: pair.value for pair in self.status(node).values}.get(key, '')
+
+    def number(self, node, key):
+        text = self.value(node, key)
+        return float(text.split()[0]) if text else 0.0
+
+    def level(self, node):
+        return self.status(node).level
+
+
+def test_nodes_tell_rates_step_times_and_silence(graph):
+    doctor = Doctor(graph)
+    graph.start('thinmap', arguments=MAPPING, use_sim_time=True, **AT_START)
+    graph.start('sim', start=START, hold_for_subscribers=2)
+    nodes = ('localizer', 'grid_mapper', 'topology_builder', 'sim')
+    graph.until(
+        lambda: all(doctor.level(node) == DiagnosticStatus.OK for node in nodes), 'all is well'
+    )
+    graph.until(lambda: 3.0 < doctor.number('localizer', 'scan: rate') < 8.0, 'scans at 5 Hz')
+    graph.until(lambda: doctor.status('localizer').message == 'tracking', 'it tracks')
+    for node, step in (
+        ('localizer', 'localizer'),
+        ('grid_mapper', 'map update'),
+        ('topology_builder', 'graph update'),
+    ):
+        graph.until(
+            lambda n=node, s=step: 'median' in doctor.value(n, f'{s}: step time'),
+            f'step times of {node}',
+        )
+    graph.until(lambda: doctor.number('topology_builder', 'pose: heard') > 0, 'poses are counted')
+    graph.until(lambda: doctor.number('localizer', 'scan: heard') > 5, 'more than five scans')
+    graph.until(lambda: doctor.number('localizer', 'scan: speakers') == 1, 'the simulation')
+    graph.until(lambda: doctor.number('localizer', 'pose: listeners') == 2, 'mapper and builder')
+    graph.stop('sim')
+    graph.until(lambda: 'scan: silent for' in doctor.status('localizer').message, 'silence is told')
+    assert doctor.level('localizer') == DiagnosticStatus.WARN
+    assert 's ago' in doctor.value('localizer', 'scan: last')
+    assert 'silent for' in graph.log('thinmap')
+    assert doctor.number('localizer', 'scan: heard') > 5
+
+
+def test_two_localizers_on_one_graph_are_detected_and_reported(graph):
+    doctor = Doctor(graph)
+    graph.start('localizer', laser_pose='0,0,0')
+    graph.until(
+        lambda: doctor.level('localizer') == DiagnosticStatus.WARN,
+        'one localizer, which waits for scans',
+    )
+    rival = graph.node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
+    graph.until(
+        lambda: doctor.level('localizer') == DiagnosticStatus.ERROR, 'the second publisher of /pose'
+    )
+    message = doctor.status('localizer').message
+    assert (
+        '2 nodes publish /pose' in message and '/localizer' in message and '/test_client' in message
+    )
+    assert '2 nodes publish /pose' in graph.log('localizer')
+    graph.node.destroy_publisher(rival)
+    graph.until(lambda: doctor.level('localizer') == DiagnosticStatus.WARN, 'the complaint ends')
+
+
+def test_what_is_over_is_not_told_first(ros_domain, monkeypatch):
+    """A refusal of long ago was the first thing told whenever anything else was dropped."""
+    now = [100.0]
+    monkeypatch.setattr(diagnostics, 'monotonic', lambda: now[0])
+    rclpy.init(domain_id=ros_domain)
+    node = rclpy.create_node('patient')
+    try:
+        told = diagnostics.Health(node)
+        told.refused('odom', 'pose nan: expected finite numbers')
+        told.dropped('scans without odometry at their time', 2)
+        now[0] += 1.0
+        told.refused('scan', '0 beams: expected 1 to 200000')
+        message = told._status(now[0]).message
+        assert message.startswith('4 messages refused or dropped: scan: 0 beams')
+        assert 'odom: pose nan' in message and 'without odometry' in message
+        told._publish()
+        now[0] += 10.5
+        told.dropped('scan: gaps between the stamps', 1)
+        message = told._status(now[0]).message
+        assert message == '1 messages refused or dropped: scan: gaps between the stamps'
+        # How often it happened is told for good.
+        values = {pair.key: pair.value for pair in told._status(now[0]).values}
+        assert values['odom: refused'] == '1'
+    finally:
+        node.destroy_node()
+        rclpy.shutdown()
+
+
+def test_a_localizer_walks_through_its_states(graph):
+    poses = graph.heard('pose', PoseWithCovarianceStamped)
+    scans = graph.heard('scan', LaserScan, qos.SENSOR)
+    graph.start('localizer', use_sim_time=True, autostart=False, **AT_START)
+    graph.start('sim', start=START, hold_for_subscribers=2, rate=2.0)
+
+    def state():
+        return graph.call(GetState, '/localizer/get_state', GetState.Request()).current_state.id
+
+    def change(transition):
+        request = ChangeState.Request(transition=Transition(id=transition))
+        return graph.call(ChangeState, '/localizer/change_state', request).success
+
+    def some_scans():
+        count = len(scans) + 5
+        graph.until(lambda: len(scans) > count, 'scans')
+
+    assert state() == State.PRIMARY_STATE_UNCONFIGURED
+    some_scans()
+    assert change(Transition.TRANSITION_CONFIGURE) and state() == State.PRIMARY_STATE_INACTIVE
+    some_scans()
+    assert not poses
+    assert change(Transition.TRANSITION_ACTIVATE) and state() == State.PRIMARY_STATE_ACTIVE
+    graph.until(lambda: poses, 'poses of an active localizer')
+    assert not change(Transition.TRANSITION_CONFIGURE)
+    assert change(Transition.TRANSITION_DEACTIVATE) and change(Transition.TRANSITION_CLEANUP)
+    some_scans()
+    poses.clear()
+    some_scans()
+    assert not poses
+    assert graph.stop('localizer') == 0
+
+
+def test_a_node_that_becomes_active_has_what_was_latched(graph):
+    maps = graph.node.create_publisher(OccupancyGrid, 'local_map', qos.LATCHED)
+    poses = graph.node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
+    graphs = graph.heard('local_topology', TopologicalMap, qos.LATCHED)
+    graph.start('explorer', autostart=False, laser_pose='0,0,0')
+    doctor = Doctor(graph)
+    empty = OccupancyGrid()
+    empty.info.resolution = -1.0
+    maps.publish(empty)
+    graph.until(lambda: doctor.number('explorer', 'local_map: heard') == 1.0, 'the latched map')
+    assert doctor.number('explorer', 'local_map: refused') == 0.0
+    for transition in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
+        request = ChangeState.Request(transition=Transition(id=transition))
+        assert graph.call(ChangeState, '/explorer/change_state', request).success
+    graph.until(
+        lambda: doctor.number('explorer', 'local_map: refused') == 1.0, 'it is taken, and refused'
+    )
+    assert not graphs and poses
+
+
+def test_pause_and_reset(graph):
+    doctor = Doctor(graph)
+    poses = graph.heard('pose', PoseWithCovarianceStamped)
+    maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
+    graphs = graph.heard('topology', TopologicalMap, qos.LATCHED)
+    graph.start('thinmap', arguments=MAPPING, use_sim_time=True, **AT_START)
+    graph.start('sim', start=START, hold_for_subscribers=2, rate=4.0)
+    graph.until(lambda: maps and graphs and graphs[-1].nodes, 'map and graph')
+    assert graph.call(SetBool, '/localizer/pause', SetBool.Request(data=True)).success
+
+    def said_of_a_paused_one():
+        statuses = [s for array in doctor.heard for s in array.status if 'localizer' in s.name]
+        return [s.message for s in statuses if KeyValue(key='paused', value='True') in s.values]
+
+    # On a busy machine it may have scans to tell of that were lost before.
+    graph.until(lambda: 'paused' in said_of_a_paused_one(), 'it is told')
+    assert 'tracking' not in said_of_a_paused_one()
+
+    def some_scans():
+        heard = doctor.number('localizer', 'scan: heard')
+        graph.until(
+            lambda: doctor.number('localizer', 'scan: heard') > heard + 10,
+            'scans that are not taken',
+        )
+
+    some_scans()  # poses of before may still be on their way
+    poses.clear()
+    some_scans()
+    assert not poses
+    for name in ('grid_mapper', 'topology_builder'):
+        assert graph.call(Trigger, f'/{name}/reset', Trigger.Request()).success
+    graph.until(
+        lambda: not graphs[-1].nodes and (len(maps[-1].data) == 0 or max(maps[-1].data) == -1),
+        'emptiness',
+    )
+    assert graph.call(SetBool, '/localizer/pause', SetBool.Request(data=False)).success
+    graph.until(lambda: poses, 'poses')
+    graph.until(lambda: doctor.status('localizer').message == 'tracking', 'it tracks')
+    graph.until(lambda: graphs[-1].nodes, 'a graph')
+    graph.until(lambda: max(maps[-1].data) > 90, 'a map')
+
+
+def test_a_deactivated_navigator_takes_no_goal(graph):
+    graph.start('navigator', laser_pose='0,0,0')
+    request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
+    assert graph.call(ChangeState, '/navigator/change_state', request).success
+    client = ActionClient(graph.node, NavigateToPose, 'navigate_to_pose')
+    graph.until(client.server_is_ready, 'action')
+    future = client.send_goal_async(NavigateToPose.Goal())
+    graph.until(future.done, 'an answer')
+    assert not future.result().accepted

@@ -1,0 +1,93 @@
+"""Markers for RViz and Foxglove: what they show is what the messages say."""
+
+import math
+
+import numpy as np
+import pytest
+from fuzz.strange_messages import made, numbers
+from visualization_msgs.msg import Marker, MarkerArray
+
+from thinmap_msgs.msg import EndNode, EndNodeArray, LineFeature, LineFeatureArray, TopologicalMap
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.nodes import markers
+from thinmap_ros.ros import messages, qos
+
+pytestmark = pytest.mark.live
+
+
+def by_name(array):
+    assert array.markers[0].action == Marker.DELETEALL
+    return {marker.ns: marker for marker in array.markers[1:]}
+
+
+def test_a_graph_as_lines_and_balls():
+    message = next(m for m in made(TopologicalMap, 20) if len(m.edges[0].path) == 2 and is_sound(m))
+    shown = by_name(markers.topology(message))
+    assert [(p.x, p.y) for p in shown['nodes'].points] == [
+        (n.position.x, n.position.y) for n in message.nodes
+    ]
+    assert len(shown['nodes'].colors) == 3 and len(shown['edges'].points) == 2
+    assert shown['edges'].header.frame_id == 'map' and shown['edges'].type == Marker.LINE_LIST
+    assert [m.action for m in markers.topology(TopologicalMap()).markers] == [Marker.DELETEALL]
+
+
+def is_sound(message):
+    try:
+        messages.topology_from(message)
+    except InputError:
+        return False
+    return all(node.kind == 0 for node in message.nodes)
+
+
+def test_end_nodes_say_how_sure_they_are():
+    nodes = [
+        EndNode(node_id=i, position_probability=p, is_target=i == 1)
+        for i, p in enumerate((0.25, 0.9))
+    ]
+    balls = [
+        m
+        for m in markers.end_nodes(EndNodeArray(end_nodes=nodes)).markers
+        if m.type == Marker.SPHERE
+    ]
+    texts = [m.text for m in markers.end_nodes(EndNodeArray(end_nodes=nodes)).markers if m.text]
+    assert (
+        texts == ['0.25', '0.90']
+        and balls[0].color.a < balls[1].color.a
+        and balls[0].scale.x < balls[1].scale.x
+    )
+    assert len({(ball.ns, ball.id) for ball in balls}) == 2
+    for wrong in (math.nan, math.inf, 2.0):
+        with pytest.raises(InputError, match='probability of end node 7'):
+            markers.end_nodes(
+                EndNodeArray(end_nodes=[EndNode(node_id=7, position_probability=wrong)])
+            )
+
+
+def test_line_features_from_end_to_end():
+    feature = LineFeature(id=4, in_local_area=True)
+    feature.start.x = 1.0
+    feature.end.y = 2.0
+    (lines,) = by_name(markers.line_features(LineFeatureArray(features=[feature]))).values()
+    assert (
+        np.allclose([(p.x, p.y) for p in lines.points], [(1.0, 0.0), (0.0, 2.0)])
+        and len(lines.colors) == 2
+    )
+    feature.end.y = math.nan
+    with pytest.raises(InputError, match='line 4'):
+        markers.line_features(LineFeatureArray(features=[feature]))
+
+
+def test_the_node_shows_what_is_latched_and_no_nan(graph):
+    said = graph.node.create_publisher(TopologicalMap, 'topology', qos.LATCHED)
+    messages_made = made(TopologicalMap, 60)
+    good = [m for m in messages_made if is_sound(m)]
+    said.publish(good[0])
+    graph.start('markers')
+    shown = graph.heard('topology_markers', MarkerArray, qos.LATCHED)
+    graph.until(lambda: shown, 'the graph of before')
+    for message in [*messages_made, good[-1]]:
+        said.publish(message)
+        graph.executor.spin_once(timeout_sec=0.01)
+    graph.until(lambda: len(by_name(shown[-1])) == 2, 'the last graph')
+    assert all(math.isfinite(number) for array in shown for number in numbers(array))
+    assert graph.stop('markers') == 0

@@ -1,0 +1,144 @@
+"""All nodes in one process, and two robots on one graph.
+
+Each does what it does in a process of its own.
+"""
+
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import psutil
+import pytest
+from action_msgs.msg import GoalStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
+from nav_msgs.msg import OccupancyGrid
+from support.timeouts import PATIENCE_S
+from tf2_msgs.msg import TFMessage
+
+from thinmap_msgs.action import NavigateToPose
+from thinmap_msgs.msg import TopologicalMap
+from thinmap_ros.ros import messages, qos
+
+pytestmark = pytest.mark.live
+FIVE = ('localizer', 'grid_mapper', 'topology_builder', 'navigator', 'explorer')
+
+
+def free_at(map_message, x, y):
+    patch = messages.patch_from(map_message)
+    row, col = patch.frame.cells_of(np.array([[x, y]]))[0]
+    return bool(patch.contains(np.array([[x, y]]))[0]) and bool(patch.free[row, col])
+
+
+def test_one_process_locates_maps_and_drives(graph):
+    maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
+    graphs = graph.heard('topology', TopologicalMap, qos.LATCHED)
+    truth = graph.heard('ground_truth', PoseStamped)
+    health = graph.heard('/diagnostics', DiagnosticArray)
+    start = {'start_x_m': 2.0, 'start_y_m': 2.0, 'use_sim_time': True}
+    process = graph.start('thinmap', **start)
+    # Paced: else the result could be heard before the true poses of the way.
+    graph.start(
+        'sim',
+        remap=graph.paced(),
+        start='2.0,2.0,0.0',
+        rate=8.0,
+        lockstep='local_topology',
+        hold_for_subscribers=3,
+    )
+    graph.until(
+        lambda: maps and free_at(maps[-1], 3.0, 2.0) and graphs and graphs[-1].nodes,
+        'a map and a graph',
+    )
+    goal = NavigateToPose.Goal()
+    goal.pose.header.frame_id = 'map'
+    goal.pose.pose.position.x = 3.0
+    goal.pose.pose.position.y = 2.0
+    goal.pose.pose.orientation.w = 1.0
+    ended = graph.act(NavigateToPose, 'navigate_to_pose', goal)
+    assert ended.status == GoalStatus.STATUS_SUCCEEDED, ended.result
+    graph.until(lambda: truth, 'where it is')
+    assert np.hypot(truth[-1].pose.position.x - 3.0, truth[-1].pose.position.y - 2.0) < 0.3
+
+    def well():
+        return {
+            s.name.split(':')[0]
+            for array in health
+            for s in array.status
+            if s.level == DiagnosticStatus.OK
+        }
+
+    graph.until(lambda: well() >= set(FIVE), 'each says that it is well')
+    # The kernels' compiler and the libraries are there once, not five times.
+    assert psutil.Process(process.pid).memory_info().rss < 400e6
+    assert graph.stop('thinmap', signal.SIGTERM) == 0, graph.log('thinmap')
+
+
+ROBOT = ('/tf:=tf', '/tf_static:=tf_static', '/clock:=clock')
+
+
+def start_robot(graph, name, start, seed):
+    """A robot all by itself in a namespace, simulation included."""
+    x, y, _ = start.split(',')
+    graph.start(
+        'thinmap',
+        label=name,
+        remap=(f'__ns:=/{name}', *ROBOT),
+        start=start,
+        seed=seed,
+        use_sim_time=True,
+        start_x_m=float(x),
+        start_y_m=float(y),
+        start_yaw_rad=0.0,
+        hold_for_subscribers=2,
+        rate=2.0,
+        arguments=('sim', 'localizer', 'grid_mapper', 'topology_builder'),
+    )
+
+
+def test_two_robots_in_namespaces_keep_to_themselves(graph):
+    starts = {'robot1': '2.0,2.0,0.0', 'robot2': '8.0,3.0,0.0'}
+    heard = {name: graph.heard(f'/{name}/pose', PoseWithCovarianceStamped) for name in starts}
+    frames = {name: graph.heard(f'/{name}/tf', TFMessage) for name in starts}
+    nobody = graph.heard('/tf', TFMessage)
+    health = graph.heard('/diagnostics', DiagnosticArray)
+    for seed, (name, start) in enumerate(starts.items()):
+        start_robot(graph, name, start, seed)
+    commands = graph.node.create_publisher(Twist, '/robot1/cmd_vel', 10)
+    graph.until(lambda: all(len(poses) > 10 for poses in heard.values()), 'poses of both')
+
+    def drives():
+        commands.publish(messages.twist_msg(0.1, 0.3))
+        last = heard['robot1'][-1].pose.pose
+        return abs(messages.yaw_of(last.orientation)) > 0.5
+
+    graph.until(drives, 'the first one turns')
+    last = {name: messages.pose_from(poses[-1].pose.pose) for name, poses in heard.items()}
+    assert np.abs(last['robot2'] - [8.0, 3.0, 0.0]).max() < 0.1
+    assert np.hypot(last['robot1'][0] - 2.0, last['robot1'][1] - 2.0) < 1.0
+    assert all(frames.values()) and not nobody
+    names = {'robot1/localizer: thinmap', 'robot2/localizer: thinmap'}
+    graph.until(
+        lambda: names <= {s.name for array in health for s in array.status},
+        'both tell how they are',
+    )
+    assert not [s.message for array in health for s in array.status if 'nodes publish' in s.message]
+    for name in starts:
+        assert graph.stop(name) == 0, graph.log(name)
+
+
+def run(*arguments):
+    command = [sys.executable, '-m', 'thinmap_ros.nodes.thinmap', *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S)
+
+
+def test_what_cannot_be_run_is_said_in_one_line(ros_domain):
+    assert 'usage: thinmap' in run('--help').stdout
+    done = run('localizer', 'pilot')
+    assert done.returncode == 2 and done.stderr.startswith('error: pilot')
+    done = run('localizer', 'grid_mapper', '--ros-args', '-p', 'gaet:=1.0')
+    assert done.returncode == 2 and 'localizer, grid_mapper has no parameter gaet' in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    done = run('localizer', 'grid_mapper', '--ros-args', '-p', 'gate:=-1.0')
+    assert done.returncode == 2 and 'gate' in done.stderr and 'Traceback' not in done.stderr

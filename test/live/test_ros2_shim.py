@@ -1,0 +1,413 @@
+"""The small `ros2` for machines without ROS, each verb on a live graph.
+
+What a list shows is found when the middleware finds it: lists are asked again until it is there.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+from action_msgs.msg import GoalStatus, GoalStatusArray
+from action_msgs.srv import CancelGoal
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import OccupancyGrid
+from rclpy.duration import Duration
+from std_msgs.msg import String
+from support.live_graph import Graph
+from support.ros_domains import free_domain
+from support.timeouts import PATIENCE_S
+
+from thinmap_msgs.action import NavigateToPose
+from thinmap_ros.ros import qos
+
+pytestmark = pytest.mark.live
+ROOT = Path(__file__).resolve().parents[2]
+ROS2 = ROOT / 'scripts' / 'shim' / 'ros2'
+WAIT = ('--spin-time', str(PATIENCE_S))
+FIVE = ['/explorer', '/grid_mapper', '/localizer', '/navigator', '/sim']
+NODES = [name.lstrip('/') for name in FIVE]
+
+
+@pytest.fixture(scope='module')
+def robot(tmp_path_factory):
+    """A simulated robot whose nodes run; each test leaves them as it found them."""
+    with pytest.MonkeyPatch.context() as patch, free_domain() as domain:
+        folder = tmp_path_factory.mktemp('robot')
+        patch.setenv('THINMAP_STATE_DIR', str(folder / 'state'))
+        patch.setenv('ROS_DOMAIN_ID', str(domain))
+        patch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+        graph = Graph(domain, folder)
+        maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
+        graph.start(
+            'thinmap',
+            arguments=(*NODES, 'topology_builder'),
+            use_sim_time=True,
+            start='2.0,2.0,0.0',
+            start_x_m=2.0,
+            start_y_m=2.0,
+            rate=1.0,
+        )
+        graph.until(lambda: maps, 'a map')
+        yield graph
+        graph.close()
+
+
+def start(*words):
+    return subprocess.Popen(
+        [sys.executable, str(ROS2), *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def run(*words):
+    process = start(*words)
+    try:
+        stdout, stderr = process.communicate(timeout=2.0 * PATIENCE_S)
+    finally:
+        process.kill()
+    assert 'Traceback' not in stderr
+    return subprocess.CompletedProcess(words, process.returncode, stdout, stderr)
+
+
+def output(*words):
+    done = run(*words)
+    assert done.returncode == 0, done.stderr
+    assert not done.stderr
+    return done.stdout
+
+
+def listed(wanted, *words):
+    """Lines of a list, when what is wanted is among them."""
+    end = time.monotonic() + PATIENCE_S
+    while True:
+        lines = output(*words).splitlines()
+        if set(wanted) <= set(lines):
+            return lines
+        assert time.monotonic() < end, (wanted, lines)
+
+
+def test_lists_show_what_there_is(robot):
+    names = sorted([*FIVE, '/topology_builder', '/test_client'])
+    assert listed(names, 'node', 'list') == names
+    topics = listed(['/scan [sensor_msgs/msg/LaserScan]'], 'topic', 'list', '-t')
+    assert not [line for line in topics if '/_action/' in line]
+    listed(['/explore/_action/status'], 'topic', 'list', '--include-hidden-topics')
+    listed(['/save_map [thinmap_msgs/srv/SaveMap]'], 'service', 'list', '-t')
+    listed(['/save_map', '/localizer/get_state'], 'service', 'list')
+    actions = ['/explore [thinmap_msgs/action/Explore]']
+    listed(actions, 'action', 'list', '-t')
+    # Each command finds the graph anew, and on a busy machine not all of it at once.
+    robot.until(lambda: int(output('action', 'list', '-c')) > 0, 'actions to count')
+    states = listed(['/localizer', '/explorer'], 'lifecycle', 'nodes')
+    assert '/sim' not in states
+    listed(['Action: /explore', 'Action servers: 1', '    /explorer'], 'action', 'info', '/explore')
+    info = ['  Subscribers:', '    /scan: sensor_msgs/msg/LaserScan', '  Action Clients:']
+    listed(info, 'node', 'info', '/grid_mapper')
+
+
+def test_a_topic_is_described(robot):
+    assert output('topic', 'type', '/scan', *WAIT) == 'sensor_msgs/msg/LaserScan\n'
+    assert output('service', 'type', '/save_map', *WAIT) == 'thinmap_msgs/srv/SaveMap\n'
+    lines = listed(['Publisher count: 1'], 'topic', 'info', '/scan', *WAIT)
+    assert lines[0] == 'Type: sensor_msgs/msg/LaserScan'
+    assert lines[2].startswith('Subscription count: ')
+    wanted = ['Node name: sim', 'Endpoint type: PUBLISHER', 'Node name: grid_mapper']
+    listed([*wanted, '  Reliability: BEST_EFFORT'], 'topic', 'info', '-v', '/scan', *WAIT)
+
+
+def test_a_message_is_echoed_as_yaml(robot):
+    text = output('topic', 'echo', '--once', '/odom', *WAIT)
+    assert text.endswith('\n---\n')
+    message = yaml.safe_load(text.removesuffix('---\n'))
+    assert list(message) == ['header', 'child_frame_id', 'pose', 'twist']
+    assert message['header']['frame_id'] == 'odom'
+    assert len(message['pose']['covariance']) == 36
+    scan = yaml.safe_load(output('topic', 'echo', '--once', '/scan', *WAIT)[:-4])
+    assert len(scan['ranges']) == 129 and scan['ranges'][-1] == '...'
+    flow = output('topic', 'echo', '--once', '--no-arr', '--flow-style', '/scan', *WAIT)
+    assert "ranges: '<sequence type: float, length: 181>'" in flow and flow.count('\n') == 2
+    part = output('topic', 'echo', '--once', '--field', 'header.frame_id', '/scan', *WAIT)
+    assert part == 'laser\n---\n'
+    done = run('topic', 'echo', '--once', '--field', 'pose.nix', '/odom', *WAIT)
+    assert done.returncode == 1
+    assert done.stderr == "Invalid field 'pose.nix': no 'nix', there is pose, covariance\n"
+
+
+def test_what_was_said_before_is_heard_where_it_was_kept(robot):
+    text = output('topic', 'echo', '--once', '--no-arr', '/tf_static', *WAIT)
+    assert 'transforms: ' in text
+    kept = output('topic', 'echo', '--once', '--field', 'info.resolution', '/map', *WAIT)
+    assert kept == '0.10000000149011612\n---\n'
+
+
+def test_a_topic_may_come_later_and_of_both_kinds(robot):
+    listener = start('topic', 'echo', '--once', '--field', 'data', '/later', *WAIT)
+    publisher = robot.node.create_publisher(String, '/later', qos.SENSOR)
+
+    def heard():
+        publisher.publish(String(data='at last'))
+        return listener.poll() is not None
+
+    robot.until(heard, 'echo of a topic that came later')
+    assert listener.communicate()[0] == 'at last\n---\n'
+    robot.node.destroy_publisher(publisher)
+
+
+def test_a_closed_pipe_and_ctrl_c_end_it_quietly(robot):
+    command = f'{sys.executable} {ROS2} topic echo /odom --spin-time {PATIENCE_S} | head -n 1'
+    done = subprocess.run(
+        ['bash', '-c', command], capture_output=True, text=True, timeout=PATIENCE_S
+    )
+    assert (done.stdout, done.stderr) == ('header:\n', '')
+    rate = start('topic', 'hz', '/scan', *WAIT)
+    line = rate.stdout.readline()
+    assert line.startswith('average rate: ')
+    assert rate.stdout.readline().startswith('\tmin: ')
+    rate.send_signal(signal.SIGINT)
+    assert rate.communicate(timeout=PATIENCE_S)[1] == ''
+    assert rate.returncode == signal.SIGINT
+
+
+def test_messages_are_published(robot):
+    texts = robot.heard('/said', String)
+    poses = robot.heard('/there', PoseStamped)
+    once = start('topic', 'pub', '--once', '/said', 'std_msgs/msg/String', '{data: 5 o clock}')
+    robot.until(lambda: once.poll() is not None and texts, 'a text')
+    said = once.communicate()[0]
+    assert [text.data for text in texts] == ['5 o clock']
+    assert 'publisher: beginning loop\npublishing #1: ' in said
+    values = '{header: auto, pose: {position: {x: 1}}}'
+    kind = 'geometry_msgs/msg/PoseStamped'
+    twice = start('topic', 'pub', '-t', '2', '-r', '10', '/there', kind, values)
+    robot.until(lambda: twice.poll() is not None and len(poses) == 2, 'two poses')
+    twice.communicate()
+    assert poses[0].header.stamp.sec > 1_600_000_000 and poses[0].pose.position.x == 1.0
+
+
+def test_a_service_is_called(robot):
+    said = output('service', 'call', '/save_map', 'thinmap_msgs/srv/SaveMap', '{path: maps/room}')
+    assert "requester: making request: thinmap_msgs.srv.SaveMap_Request(path='maps/room')" in said
+    assert '\nresponse:\nthinmap_msgs.srv.SaveMap_Response(success=True' in said
+    assert (robot.folder / 'maps' / 'room.yaml').exists()
+    said = output('service', 'call', '/localizer/pause', 'std_srvs/srv/SetBool')
+    assert 'SetBool_Request(data=False)' in said and 'success=True' in said
+
+
+def test_parameters_are_read_and_set(robot):
+    names = output('param', 'list', '/navigator', *WAIT).splitlines()
+    assert '  max_speed_m_s' in names and names == sorted(names)
+    before = output('param', 'get', '--hide-type', 'navigator', 'max_speed_m_s', *WAIT).strip()
+    value = ('/navigator', 'max_speed_m_s')
+    assert output('param', 'set', *value, '0.15', *WAIT) == 'Set parameter successful\n'
+    assert output('param', 'get', *value, *WAIT) == 'Double value is: 0.15\n'
+    dumped = yaml.safe_load(output('param', 'dump', '/navigator', *WAIT))
+    assert dumped['/navigator']['ros__parameters']['max_speed_m_s'] == 0.15
+    refused = run('param', 'set', *value, '-0.2', *WAIT)
+    assert refused.returncode == 0 and not refused.stdout
+    assert refused.stderr.startswith('Setting parameter failed: ')
+    assert 'max_speed_m_s' in refused.stderr and len(refused.stderr.splitlines()) == 1
+    assert output('param', 'get', *value, *WAIT) == 'Double value is: 0.15\n'
+    output('param', 'set', *value, before, *WAIT)
+    # The test's own node does not answer while the test waits: that is said, and the rest listed.
+    everywhere = set()
+    end = time.monotonic() + PATIENCE_S
+    while not {'/navigator:', '/sim:', '  max_speed_m_s', '  lockstep'} <= everywhere:
+        assert time.monotonic() < end, everywhere
+        done = run('param', 'list', '--spin-time', '5')
+        assert done.returncode == 0
+        everywhere = set(done.stdout.splitlines())
+    unknown = run('param', 'get', '/navigator', 'nix', *WAIT)
+    assert unknown.returncode == 1
+    assert unknown.stderr == "Parameter not set: 'nix' of /navigator\n"
+
+
+def test_a_node_makes_transitions(robot):
+    node = '/grid_mapper'
+    assert output('lifecycle', 'get', node, *WAIT) == 'active [3]\n'
+    known = output('lifecycle', 'list', node, *WAIT)
+    assert known.startswith('- deactivate [4]\n\tStart: active\n\tGoal: deactivating\n')
+    done = 'Transitioning successful\n'
+    assert output('lifecycle', 'set', node, 'deactivate', *WAIT) == done
+    listed([f'{node}: inactive [2]'], 'lifecycle', 'get', *WAIT)
+    assert output('lifecycle', 'set', node, 'activate', *WAIT) == done
+    wrong = run('lifecycle', 'set', node, 'fly', *WAIT)
+    assert wrong.returncode == 1 and not wrong.stdout
+    assert wrong.stderr.startswith("Unknown transition requested: 'fly', available ones are: ")
+
+
+GO = '{pose: {header: {frame_id: map}, pose: {position: {x: 2.6, y: 2.0}, orientation: {w: 1}}}}'
+
+
+def test_a_goal_is_followed_to_its_end(robot):
+    kind = 'thinmap_msgs/action/NavigateToPose'
+    said = output('action', 'send_goal', '--feedback', '/navigate_to_pose', kind, GO)
+    wanted = [
+        'Waiting for an action server to become available...\n',
+        'Sending goal:\n     pose:\n  header:\n',
+        'Goal accepted with ID: ',
+        'Feedback:\n    ',
+        'Result:\n    success: true\n',
+        'Goal finished with status: SUCCEEDED\n',
+    ]
+    are_in_order(said, wanted)
+
+
+def are_in_order(said, texts):
+    places = [said.find(text) for text in texts]
+    assert -1 not in places and places == sorted(places), said
+
+
+def serve_feedback_first(node, name):
+    """Serve an action by hand: a goal's feedback has arrived before its acceptance is sent."""
+    parts = NavigateToPose.Impl
+    told = node.create_publisher(parts.FeedbackMessage, f'{name}/_action/feedback', 10)
+    node.create_publisher(GoalStatusArray, f'{name}/_action/status', qos.LATCHED)
+
+    def accept(request, response):
+        wait_for(lambda: told.get_subscription_count() > 0, 'the client hears feedback')
+        told.publish(parts.FeedbackMessage(goal_id=request.goal_id))
+        assert told.wait_for_all_acked(Duration(seconds=PATIENCE_S))
+        response.accepted = True
+        return response
+
+    def end(_, response):
+        response.status = GoalStatus.STATUS_SUCCEEDED
+        return response
+
+    node.create_service(parts.SendGoalService, f'{name}/_action/send_goal', accept)
+    node.create_service(parts.GetResultService, f'{name}/_action/get_result', end)
+    node.create_service(CancelGoal, f'{name}/_action/cancel_goal', lambda _, response: response)
+
+
+def wait_for(condition, what):
+    end = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < end, f'never came: {what}'
+        time.sleep(0.01)
+
+
+def test_that_a_goal_was_taken_is_said_before_its_feedback(graph):
+    serve_feedback_first(graph.node, '/hasty')
+    kind = 'thinmap_msgs/action/NavigateToPose'
+    goal = start('action', 'send_goal', '--feedback', '/hasty', kind, GO)
+    graph.until(lambda: goal.poll() is not None, 'the goal ends')
+    said, complaints = goal.communicate()
+    assert not complaints and said.count('Feedback:') == 1
+    are_in_order(
+        said, ['Goal accepted with ID: ', 'Feedback:\n    ', 'Goal finished with status: ']
+    )
+
+
+def test_ctrl_c_cancels_the_goal(robot):
+    statuses = robot.heard('/explore/_action/status', GoalStatusArray, qos.LATCHED)
+    goal = start('action', 'send_goal', '-f', '/explore', 'thinmap_msgs/action/Explore', '{}')
+    while 'Feedback:' not in goal.stdout.readline():
+        assert goal.poll() is None, goal.communicate()
+    goal.send_signal(signal.SIGINT)
+    stdout, stderr = goal.communicate(timeout=PATIENCE_S)
+    assert stdout.endswith('Canceling goal...\nGoal canceled.\n')
+    assert stderr == '' and goal.returncode == signal.SIGINT
+
+    def ended():
+        lists = [message.status_list for message in statuses if message.status_list]
+        return lists and lists[-1][-1].status == GoalStatus.STATUS_CANCELED
+
+    robot.until(ended, 'goal is canceled')
+
+
+def test_programs_packages_and_fields_need_no_graph():
+    assert 'thinmap_ros replay' in output('pkg', 'executables', 'thinmap_ros').splitlines()
+    assert {'rclpy', 'thinmap_ros'} <= set(output('pkg', 'list').splitlines())
+    share = Path(output('pkg', 'prefix', '--share', 'thinmap_ros').strip())
+    assert (share / 'config' / 'sensors' / 'turtlebot3_lds.yaml').exists()
+    assert share.is_relative_to(output('pkg', 'prefix', 'thinmap_ros').strip())
+    assert 'usage: replay' in output('run', 'thinmap_ros', 'replay', '--help')
+    shown = output('interface', 'show', 'geometry_msgs/msg/TwistStamped')
+    assert 'std_msgs/Header header\n\tbuiltin_interfaces/Time stamp\n\t\tint32 sec\n' in shown
+    assert '---\n' in output('interface', 'show', 'thinmap_msgs/action/Explore')
+
+
+def test_help_names_what_there_is():
+    for word in ('action', 'lifecycle', 'node', 'param', 'pkg', 'run', 'service', 'topic'):
+        assert f'\n  {word} ' in output('-h')
+    assert '\n  echo ' in output('topic', '-h')
+    assert '--field' in output('topic', 'echo', '-h')
+    assert 'program' in output('run', '-h')
+
+
+SAVE = ('service', 'call', '/save_map', 'thinmap_msgs/srv/SaveMap')
+POSE = ('topic', 'pub', '/x', 'geometry_msgs/msg/PoseStamped')
+AT_ONCE = ('--spin-time', '0.5')
+
+
+@pytest.mark.parametrize(
+    ('words', 'code', 'said'),
+    [
+        (['bag', 'record'], 2, 'no command bag: this is'),
+        (['topic', 'bw', '/scan'], 2, 'no verb bw: this is'),
+        (['topic', 'echo'], 2, 'topic_name'),
+        (['topic', 'hz', '/scan', '/odom'], 2, '/odom'),
+        (['run', 'thinmap_ros'], 2, 'program'),
+        (['run', 'thinmap_ros', 'pilot'], 1, 'thinmap_ros has no pilot; it has bag_player'),
+        (['run', 'nowhere', 'pilot'], 1, "Package 'nowhere' not found"),
+        (['pkg', 'prefix', 'nowhere'], 1, "Package 'nowhere' not found"),
+        (
+            [*SAVE[:-1], 'thinmap_msgs/srv/Nix'],
+            1,
+            "service type is invalid: 'thinmap_msgs/srv/Nix'",
+        ),
+        ([*SAVE[:-1], 'Nix'], 1, 'expected PACKAGE/srv/NAME'),
+        ([*SAVE, '{path: [}'], 1, "not YAML: '{path: [}'"),
+        ([*SAVE, 'room'], 1, "needs to be a dictionary in YAML format: 'room'"),
+        ([*SAVE, '{pahts: room}'], 1, "has no 'pahts'; it has path"),
+        ([*SAVE, '{path: [1]}'], 1, "SaveMap_Request.path: '[1]', expected string"),
+        ([*POSE, '{pose: {position: {x: far}}}'], 1, "Point.x: 'far', expected double"),
+        ([*POSE, '{pose: {position: 5}}'], 1, "Point: '5', expected a dictionary"),
+        ([*POSE, '{header: {stamp: {sec: 1.5}}}'], 1, "Time.sec: '1.5', expected int32"),
+        ([*POSE, '{header: {stamp: {sec: 1e12}}}'], 1, "Time.sec: '1e12', expected int32"),
+        (['topic', 'pub', '/a b', 'std_msgs/msg/String'], 1, "'/a b' is no name of a topic"),
+        (['topic', 'echo', '/a b', *AT_ONCE], 1, "'/a b' is no name of a topic"),
+        (['topic', 'echo', '/x', 'std_msgs/msg/Nix'], 1, 'message type is invalid'),
+        (['action', 'send_goal', '/x', 'x/action/X', '{}'], 1, 'action type is invalid'),
+        (['topic', 'type', '/nowhere', *AT_ONCE], 1, "Unknown topic '/nowhere'"),
+        (['service', 'type', '/nowhere', *AT_ONCE], 1, "Unknown service '/nowhere'"),
+        (['service', 'type'], 2, 'required: service_name'),
+        (['param', 'get', '/nobody', 'x', *AT_ONCE], 1, "Node not found: '/nobody'"),
+        (['lifecycle', 'set', 'nobody', 'activate', *AT_ONCE], 1, "Node not found: '/nobody'"),
+        (['node', 'info', '/nobody', *AT_ONCE], 1, "Node not found: '/nobody'"),
+        (['topic', 'list', '--spin-time', 'long'], 2, 'long'),
+        (['interface', 'show', 'nowhere/msg/X'], 1, "'nowhere/msg/X', expected PACKAGE/msg/NAME"),
+    ],
+)
+def test_what_cannot_be_done_is_said_in_one_line(ros_domain, words, code, said):
+    done = run(*words)
+    assert done.returncode == code
+    assert said in done.stderr and len(done.stderr.splitlines()) == 1
+    assert not done.stdout
+
+
+def test_a_topic_that_never_comes_is_told(ros_domain):
+    done = run('topic', 'echo', '/nowhere', *AT_ONCE)
+    assert done.returncode == 1
+    assert done.stdout == 'WARNING: topic [/nowhere] does not appear to be published yet\n'
+    assert done.stderr == 'Could not determine the type for the passed topic\n'
+
+
+def test_the_real_one_wins_where_there_is_one(tmp_path):
+    real = tmp_path / 'ros2'
+    real.write_text('#!/bin/sh\necho the real one\n')
+    real.chmod(0o755)
+    kept = [p for p in os.environ['PATH'].split(':') if not Path(p).samefile(ROS2.parent)]
+    environment = {**os.environ, 'PATH': ':'.join([str(tmp_path), *kept])}
+    command = f'source {ROOT}/scripts/env && ros2 topic list'
+    done = subprocess.run(
+        ['bash', '-c', command], env=environment, capture_output=True, text=True, timeout=170.0
+    )
+    assert done.stdout == 'the real one\n', done.stderr

@@ -1,0 +1,336 @@
+"""Sessions on a live graph.
+
+What was saved is there again after a new start, and mapping goes on from it.
+"""
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseStamped, Twist
+from nav_msgs.msg import OccupancyGrid as OccupancyGridMsg
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.task import Future
+
+from thinmap_msgs.msg import TopologicalMap
+from thinmap_msgs.srv import LoadMap, SaveMap
+from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
+from thinmap_ros.core.se2 import pose
+from thinmap_ros.core.topology.builder import TopologyBuilder
+from thinmap_ros.files import occupancy_maps, sessions
+from thinmap_ros.ros import messages, qos
+from thinmap_ros.sim.laser import Lms200, Lms200Config
+from thinmap_ros.sim.world import World
+
+pytestmark = pytest.mark.live
+MAPPERS = ('grid_mapper', 'topology_builder')
+
+
+def places(topology):
+    """Kind and place by id."""
+    return {n.id: (n.kind, n.position.x, n.position.y) for n in topology.nodes}
+
+
+def heard_maps(graph):
+    return (
+        graph.heard('map', OccupancyGridMsg, qos.LATCHED),
+        graph.heard('topology', TopologicalMap, qos.LATCHED),
+        graph.heard('local_topology', TopologicalMap, qos.LATCHED),
+    )
+
+
+def drive(graph, x, y, yaw, metres):
+    """Nodes of a robot that stands at a place, driven until it has made its way.
+
+    Then the robot alone is stopped.
+    """
+    truth = graph.heard('ground_truth', PoseStamped)
+    graph.start('localizer', use_sim_time=True, start_x_m=x, start_y_m=y, start_yaw_rad=yaw)
+    graph.start(
+        'sim',
+        remap=graph.paced(),
+        start=f'{x},{y},{yaw}',
+        rate=4.0,
+        lockstep='local_topology',
+        hold_for_subscribers=2,
+    )
+    commands = graph.node.create_publisher(Twist, 'cmd_vel', 10)
+    forward = Twist()
+    forward.linear.x = 0.3
+
+    def far_enough():
+        commands.publish(forward)
+        return (
+            truth
+            and np.hypot(truth[-1].pose.position.x - x, truth[-1].pose.position.y - y) > metres
+        )
+
+    graph.until(far_enough, 'the robot makes its way')
+    T = messages.pose_from(truth[-1].pose)
+    assert graph.stop('sim') == graph.stop('localizer') == 0
+    return T
+
+
+def test_ids_and_cells_are_the_same_tomorrow_and_mapping_goes_on(graph, tmp_path):
+    maps, graphs, local = heard_maps(graph)
+    for name in MAPPERS:
+        graph.start(name, use_sim_time=True)
+    T = drive(graph, 2.0, 2.0, 0.9, 3.2)
+    stem = tmp_path / 'today' / 'room'
+
+    def save_all():
+        return graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(stem)))
+
+    # The mapper may not know at once that the localizer has gone, and asks it for its part.
+    graph.until(lambda: 'no answer' not in save_all().message, 'an answer of all that are there')
+    response = save_all()
+    assert response.success, response.message
+    assert all(word in response.message for word in ('.pgm', '.yaml', '.grid.npz', '.topology.npz'))
+    ends = ['.grid.npz', '.pgm', '.topology.npz', '.yaml']
+    assert sorted(file.name for file in stem.parent.iterdir()) == [f'room{end}' for end in ends]
+    for name in MAPPERS:
+        assert graph.stop(name) == 0
+    graph.hear_out()
+    before = places(graphs[-1])
+    edges = {edge.id for edge in graphs[-1].edges}
+    known = sessions.load_grid(str(stem)).patch()
+    assert len(before) > 3
+    maps.clear(), graphs.clear(), local.clear()
+    for name in MAPPERS:
+        graph.start(name, use_sim_time=True, session=str(stem))
+    graph.until(lambda: maps and graphs, 'the saved map and graph, without a scan')
+    assert not local
+    assert places(graphs[-1]) == before and {edge.id for edge in graphs[-1].edges} == edges
+    assert np.array_equal(messages.patch_from(maps[-1]).cells, known.cells)
+    drive(graph, *T.tolist(), 0.3)
+    # Mapping has gone on from there: more is known, what stayed has its number, and no number is
+    # given twice.
+    assert (messages.patch_from(maps[-1]).cells >= 0).sum() >= (known.cells >= 0).sum()
+    after = places(graphs[-1])
+    stayed = [
+        k
+        for k in before.keys() & after.keys()
+        if np.hypot(*np.subtract(before[k], after[k])[1:]) < 0.5
+    ]
+    assert len(stayed) >= len(before) / 2
+    assert all(k > max(before.keys() | edges) for k in after.keys() - before.keys())
+
+
+def room_of(resolution=0.1):
+    """Grid and graph of a room of 6 x 6 m as seen from its middle."""
+    occupied = np.zeros((60, 60), dtype=np.uint8)
+    occupied[[0, -1]] = 1
+    occupied[:, [0, -1]] = 1
+    occupied[20:25, 35:40] = 1
+    grid = OccupancyGrid(OccupancyConfig(resolution_m=resolution))
+    builder = TopologyBuilder()
+    world = World('room', occupied, OccupancyGrid().frame, pose(2.0, 2.0, 0.0))
+    laser = Lms200(Lms200Config(), 1)
+    for k in range(12):
+        T = pose(2.0 + 0.1 * k, 3.0, 0.4 * k)
+        grid.update(laser.scan(world, T, k), T)
+        builder.update(grid.window(T[0], T[1], 10.0), T)
+    return grid, builder
+
+
+def save(stem, grid, builder=None):
+    sessions.save_grid(str(stem), grid)
+    if builder is not None:
+        sessions.save_topology(str(stem), builder)
+
+
+def write_bad_sessions(folder, grid, builder):
+    """Sessions that cannot be loaded: what is to be said of each, by its name."""
+    save(folder / 'fine', *room_of(0.05))
+    save(folder / 'cut', grid, builder)
+    save(folder / 'half', grid, builder)
+    (folder / 'cut.grid.npz').write_bytes((folder / 'cut.grid.npz').read_bytes()[:-200])
+    (folder / 'half.topology.npz').write_bytes((folder / 'half.topology.npz').read_bytes()[:300])
+    occupancy_maps.write_map(folder / 'fine_map', room_of(0.05)[0].patch())
+    save(folder / 'mixed', grid, room_of(0.05)[1])
+    return {
+        'fine': 'expected 0.1 m',
+        'fine_map.yaml': 'expected 0.1 m',
+        'cut': 'cut.grid.npz',
+        'half': 'half.topology.npz',
+        'mixed': 'mixed.topology.npz',
+        'nowhere': 'nowhere.yaml',
+        'nowhere.grid.npz': 'nowhere.grid.npz',
+        '': 'expected the path',
+    }
+
+
+def test_sessions_are_loaded_into_running_nodes_or_refused_in_words(graph, tmp_path):
+    grid, builder = room_of()
+    save(tmp_path / 'room', grid, builder)
+    maps, graphs, _ = heard_maps(graph)
+    graph.start('grid_mapper')
+    response = graph.call(
+        LoadMap, 'load_map', LoadMap.Request(path=str(tmp_path / 'room.grid.npz'))
+    )
+    assert response.success and 'no topology_builder' in response.message
+    response = graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(tmp_path / 'alone')))
+    assert response.success and 'no topology_builder' in response.message
+    assert not (tmp_path / 'alone.topology.npz').exists()
+    # The graph of an earlier grid must not be loaded with the new one.
+    response = graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(tmp_path / 'room')))
+    assert response.success and 'room.topology.npz.old' in response.message
+    assert (tmp_path / 'room.topology.npz.old').exists() and not (
+        tmp_path / 'room.topology.npz'
+    ).exists()
+    save(tmp_path / 'room', grid, builder)
+    graph.start('topology_builder')
+
+    def load(name):
+        path = str(tmp_path / name) if name else ''
+        return graph.call(LoadMap, 'load_map', LoadMap.Request(path=path))
+
+    graph.until(
+        lambda: 'no topology_builder' not in load('room').message, 'the mapper sees the builder'
+    )
+    graph.until(lambda: maps and graphs and graphs[-1].nodes, 'map and graph, published at once')
+    expected = places(messages.topology_msg(builder.map, 'map', 0))
+    assert places(graphs[-1]) == expected
+    for name, said in write_bad_sessions(tmp_path, grid, builder).items():
+        response = load(name)
+        assert not response.success and said in response.message, (name, response.message)
+    response = graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(tmp_path / 'again')))
+    assert response.success, response.message
+    assert places(graphs[-1]) == expected
+    again = sessions.load_grid(str(tmp_path / 'again'))
+    assert np.array_equal(again.state()['log_odds'], grid.state()['log_odds'])
+    assert sessions.load_topology(str(tmp_path / 'again')).map.nodes == builder.map.nodes
+    # Any map_server map will do; no graph belongs to it.
+    occupancy_maps.write_map(tmp_path / 'map', grid.patch())
+    response = load('map.yaml')
+    assert response.success and 'anew' in response.message
+    graph.until(lambda: not graphs[-1].nodes, 'an empty graph')
+    known = messages.patch_from(maps[-1])
+    assert np.array_equal(known.occupied, grid.patch().occupied)
+    for name in MAPPERS:
+        assert graph.stop(name) == 0
+
+
+def files_below(folder):
+    """Each file below a folder with its content, but for the logs of nodes and what they keep."""
+    files = [p for p in folder.rglob('*') if p.is_file() and p.suffix != '.log']
+    return {p: p.read_bytes() for p in files if 'state' not in p.parts}
+
+
+def test_services_touch_nothing_outside_of_their_folder(graph, tmp_path):
+    folder = tmp_path / 'maps'
+    outside = tmp_path / 'outside'
+    folder.mkdir(), outside.mkdir()
+    save(outside / 'room', *room_of())
+    occupancy_maps.write_map(outside / 'drawn', room_of()[0].patch())
+    (folder / 'link').symlink_to(outside)
+    (folder / 'circle').symlink_to(folder / 'circle')
+    for end in ('.grid.npz', '.topology.npz'):
+        (folder / f'linked{end}').symlink_to(outside / f'room{end}')
+    described = (outside / 'drawn.yaml').read_text()
+    (folder / 'seen.yaml').write_text(described.replace('drawn.pgm', '../outside/drawn.pgm'))
+    for name in ('grid_mapper', 'topology_builder', 'localizer', 'explorer'):
+        graph.start(name, save_folder='maps', **({} if name == 'explorer' else {'recover_s': 0.0}))
+    before = files_below(tmp_path)
+    wrong = [
+        str(outside / 'room'),
+        '../outside/room',
+        'link/room',
+        'linked',
+        'linked.grid.npz',
+        'circle/room',
+        '/etc/passwd',
+        '/proc/self/fd/1',
+        10_000 * 'x',
+        'a/../../outside/room',
+        'a\nb',
+    ]
+    calls = [
+        (kind, name)
+        for kind, names in (
+            (SaveMap, ('save_map', 'save_topology', 'save_features', 'save_exploration')),
+            (LoadMap, ('load_map', 'load_topology', 'load_features')),
+        )
+        for name in names
+    ]
+    for kind, name in calls:
+        for path in wrong:
+            response = graph.call(kind, name, kind.Request(path=path))
+            said = response.message
+            assert not response.success and said.startswith('path '), (name, path, said)
+            assert 'expected a file below' in said, (name, path, said)
+            assert len(said) < 600 and said.isprintable()
+    response = graph.call(LoadMap, 'load_map', LoadMap.Request(path='seen.yaml'))
+    assert not response.success and 'image' in response.message and 'below' in response.message
+    assert files_below(tmp_path) == before
+    response = graph.call(SaveMap, 'save_map', SaveMap.Request(path='new/room'))
+    assert response.success, response.message
+    assert (folder / 'new' / 'room.grid.npz').exists()
+    new = files_below(tmp_path).keys() - before.keys()
+    assert new and all(file.is_relative_to(folder / 'new') for file in new)
+    absolute = str(folder / 'new' / 'room.yaml')
+    response = graph.call(LoadMap, 'load_map', LoadMap.Request(path=absolute))
+    assert response.success, response.message
+    # What the operator names at the start is not confined.
+    assert graph.stop('grid_mapper') == 0
+    maps = graph.heard('map', OccupancyGridMsg, qos.LATCHED)
+    graph.start('grid_mapper', save_folder='maps', session=str(outside / 'room'))
+    graph.until(lambda: maps and max(maps[-1].data) > 50, 'the session from elsewhere')
+
+
+def test_a_session_of_nonsense_leaves_the_running_map_as_it_was(graph, tmp_path):
+    grid, builder = room_of()
+    save(tmp_path / 'room', grid, builder)
+    save(tmp_path / 'bad', grid, builder)
+    with np.load(tmp_path / 'bad.topology.npz') as archive:
+        arrays = dict(archive)
+    arrays['cells'][5, 0] = 10**9
+    np.savez(tmp_path / 'bad.topology.npz', **arrays)
+    maps, graphs, _ = heard_maps(graph)
+    for name in MAPPERS:
+        graph.start(name, session=str(tmp_path / 'room'))
+    graph.until(lambda: maps and graphs, 'map and graph')
+    before = places(graphs[-1])
+
+    def refused():
+        response = graph.call(LoadMap, 'load_map', LoadMap.Request(path='bad'))
+        return (
+            not response.success and 'bad.topology.npz: saved topology: cells' in response.message
+        )
+
+    graph.until(refused, 'the reason')
+    again = graph.heard('topology', TopologicalMap, qos.LATCHED)
+    graph.until(lambda: again, 'the graph as it is')
+    assert places(again[-1]) == before
+    for name in MAPPERS:
+        assert graph.stop(name) == 0
+
+
+def test_a_builder_that_does_not_answer_is_said_and_the_mapper_goes_on(graph, tmp_path):
+    async def never(request, response):
+        await Future()
+
+    asked = graph.node.create_service(
+        SaveMap, 'save_topology', never, callback_group=ReentrantCallbackGroup()
+    )
+    graph.start('grid_mapper')
+    # Asked before the two have found each other, the mapper sees no builder.
+    answers = []
+
+    def save_again():
+        answers.append(
+            graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(tmp_path / 'room')))
+        )
+        return not answers[-1].success
+
+    graph.until(save_again, 'the mapper asks')
+    assert 'save_topology: no answer' in answers[-1].message
+    assert (tmp_path / 'room.grid.npz').exists()
+    graph.node.destroy_service(asked)
+    assert graph.stop('grid_mapper') == 0
+
+
+@pytest.mark.parametrize('name', MAPPERS)
+def test_a_session_that_is_not_there_ends_the_start_with_one_clear_line(graph, name):
+    process = graph.start(name, session='/nowhere/room')
+    assert graph.ended(process) == 2
+    lines = graph.log(name).strip().splitlines()
+    assert '/nowhere/room' in lines[-1] and 'Traceback' not in graph.log(name)

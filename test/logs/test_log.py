@@ -1,0 +1,121 @@
+"""Logs in formats that are not read.
+
+Every program that opens a log says what they are and how to convert them.
+"""
+
+import shlex
+import sqlite3
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Writer
+from rosbags.typesys import Stores, get_typestore
+
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.logs.bag import Bag
+from thinmap_ros.logs.bag_writer import BagWriter
+
+PROGRAMS = {
+    'replay': ['-o', 'out'],
+    'carmen_to_bag': ['out'],
+    'bag_repair': ['-o', 'out'],
+}
+
+
+def ros1_bag(path: Path) -> None:
+    """A bag of one scan, with a header as ROS 1 has it."""
+    typestore = get_typestore(Stores.ROS1_NOETIC)
+    types = typestore.types
+    time = types['builtin_interfaces/msg/Time'](sec=1, nanosec=0)
+    header = types['std_msgs/msg/Header'](seq=7, stamp=time, frame_id='laser')
+    scan = types['sensor_msgs/msg/LaserScan'](
+        header=header,
+        angle_min=-1.0,
+        angle_max=1.0,
+        angle_increment=0.5,
+        time_increment=0.0,
+        scan_time=0.0,
+        range_min=0.1,
+        range_max=8.0,
+        ranges=np.full(5, 2.0, dtype=np.float32),
+        intensities=np.zeros(0, dtype=np.float32),
+    )
+    with Writer(path) as writer:
+        connection = writer.add_connection('/scan', scan.__msgtype__, typestore=typestore)
+        writer.write(connection, 10**9, typestore.serialize_ros1(scan, scan.__msgtype__))
+
+
+def sqlite_file(path: Path) -> None:
+    with sqlite3.connect(path) as database:
+        database.execute('CREATE TABLE messages(id INTEGER PRIMARY KEY)')
+    database.close()
+
+
+def run(folder: Path, program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, '-m', f'thinmap_ros.tools.{program}', *arguments]
+    return subprocess.run(command, capture_output=True, text=True, cwd=folder)
+
+
+@pytest.mark.parametrize('program', PROGRAMS)
+@pytest.mark.parametrize('name', ['old.bag', 'old.mcap', 'old.log'])
+def test_a_ros1_bag_is_named_with_the_command_that_converts_it(
+    tmp_path: Path, program: str, name: str
+) -> None:
+    ros1_bag(tmp_path / 'old.bag')
+    (tmp_path / 'old.bag').rename(tmp_path / name)
+    done = run(tmp_path, program, name, *PROGRAMS[program])
+    assert done.returncode == 2
+    line = done.stderr.splitlines()[-1]
+    assert f'{name}: a ROS 1 bag' in line and f'rosbags-convert --src {name} --dst old ' in line
+    assert not (tmp_path / 'out').exists()
+
+
+def test_the_command_makes_a_bag_that_is_read(tmp_path: Path) -> None:
+    ros1_bag(tmp_path / 'old.bag')
+    with pytest.raises(InputError, match='a ROS 1 bag') as error:
+        Bag(tmp_path / 'old.bag')
+    command = shlex.split(str(error.value).split('`')[1])
+    command[0] = str(Path(sys.executable).parent / command[0])
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    bag = Bag(tmp_path / 'old')
+    (message,) = bag.messages()
+    scan = bag.decode(message)
+    assert scan.ranges.tolist() == [2.0] * 5
+    assert not hasattr(scan.header, 'seq'), 'its bytes are not those of a ROS 2 message'
+
+
+@pytest.mark.parametrize('program', PROGRAMS)
+@pytest.mark.parametrize('name', ['bag_0.db3', 'bag_0.mcap'])
+def test_a_bare_sqlite_file_is_named_with_what_it_lacks(
+    tmp_path: Path, program: str, name: str
+) -> None:
+    sqlite_file(tmp_path / name)
+    done = run(tmp_path, program, name, *PROGRAMS[program])
+    assert done.returncode == 2
+    line = done.stderr.splitlines()[-1]
+    assert f'{name}: an SQLite file' in line and 'metadata.yaml' in line
+    assert 'ros2 bag reindex' in line and 'rosbags-convert --src' in line
+
+
+def test_a_folder_of_sqlite_files_without_metadata(tmp_path: Path) -> None:
+    (tmp_path / 'bag').mkdir()
+    sqlite_file(tmp_path / 'bag' / 'bag_0.db3')
+    with pytest.raises(InputError, match=r'metadata.yaml: No such file.*ros2 bag reindex'):
+        Bag(tmp_path / 'bag')
+    done = run(tmp_path, 'bag_repair', 'bag')
+    assert done.returncode == 2 and 'MCAP' in done.stderr
+
+
+def test_an_mcap_file_is_no_carmen_log_and_read_under_any_name(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / 'a.mcap') as writer:
+        writer.write('/said', 'std_msgs/msg/String', 5, b'\0\1\0\0\1\0\0\0\0')
+    (tmp_path / 'a.mcap').rename(tmp_path / 'a.active')
+    assert len(list(Bag(tmp_path / 'a.active').messages())) == 1
+    done = run(tmp_path, 'carmen_to_bag', 'a.active', 'out')
+    assert done.returncode == 2 and 'an MCAP file, which is a bag' in done.stderr
+    done = run(tmp_path, 'replay', 'a.active', '-o', 'out')
+    assert done.returncode == 2 and 'no laser scans' in done.stderr

@@ -1,0 +1,34 @@
+"""How the process of a node runs."""
+
+import subprocess
+import sys
+
+import pytest
+
+pytestmark = pytest.mark.live
+PROGRAM = """
+import gc
+from rclpy.node import Node
+from thinmap_ros.ros import node_main
+
+
+class Short(Node):
+    def __init__(self):
+        super().__init__('short')
+        self.objects = len(gc.get_objects())
+
+    @property
+    def finished(self):
+        print(len(gc.get_objects()) < 0.1 * self.objects)
+        return True
+
+
+node_main.run(Short)
+"""
+
+
+@pytest.mark.usefixtures('ros_domain')
+def test_the_collector_need_not_look_at_what_the_start_has_made():
+    command = [sys.executable, '-c', PROGRAM]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, 'True\n'), done.stderr

@@ -1,0 +1,198 @@
+"""A live ROS graph for a test: node processes on a private domain, and a client beside them."""
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import rclpy
+from rclpy.action import ActionClient
+from rclpy.client import Client
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from support.timeouts import PATIENCE_S
+
+from thinmap_msgs.msg import TopologicalMap
+from thinmap_ros.ros import qos
+
+_DEPTH = 1000
+# After so long an answer passes for lost.
+_ASK_AGAIN_S = 20.0
+
+
+class Graph:
+    """Node processes, and a node of the test's own that listens and asks."""
+
+    def __init__(self, domain: int, folder: Path) -> None:
+        self.folder = folder
+        self.processes = {}
+        self._clients: dict[str, Client] = {}
+        self._pacemaker: Publisher | None = None
+        self._heard = 0
+        self.context = Context()
+        rclpy.init(context=self.context, domain_id=domain)
+        self.node = Node('test_client', context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+
+    def start(
+        self,
+        name: str,
+        remap: tuple[str, ...] = (),
+        arguments: tuple[str, ...] = (),
+        label: str = '',
+        **values: Any,
+    ) -> subprocess.Popen[bytes]:
+        """Start a node with arguments, ROS's remapping rules and its parameters.
+
+        It is known by its label, or its name.
+        """
+        command = [sys.executable, '-m', f'thinmap_ros.nodes.{name}', *arguments, '--ros-args']
+        name = label or name
+        for rule in remap:
+            command += ['-r', rule]
+        for key, value in values.items():
+            text = f"'{value}'" if isinstance(value, str) else str(value).lower()
+            command += ['-p', f'{key}:={text}']
+        log = (self.folder / f'{name}.log').open('wb')
+        # Services save and load below the working directory.
+        process = subprocess.Popen(
+            command, stdout=log, stderr=subprocess.STDOUT, start_new_session=True, cwd=self.folder
+        )
+        log.close()
+        self.processes[name] = process
+        return process
+
+    def log(self, name: str) -> str:
+        return (self.folder / f'{name}.log').read_text()
+
+    def heard(self, topic: str, kind: type, profile: QoSProfile = qos.STREAM) -> list[Any]:
+        """List that fills with all messages of a topic as the test spins, however rare that is."""
+        messages: list[Any] = []
+        deep = QoSProfile(
+            depth=_DEPTH, reliability=profile.reliability, durability=profile.durability
+        )
+
+        def hear(message: Any) -> None:
+            self._heard += 1
+            messages.append(message)
+
+        self.node.create_subscription(kind, topic, hear, deep)
+        return messages
+
+    def paced(self) -> tuple[str, ...]:
+        """Remapping of a simulation in lockstep with the local graph: it waits for the test, too.
+
+        Else a test that hears late where the robot is would drive it on, into a wall.
+        """
+        if self._pacemaker is None:
+            heard_too = self.node.create_publisher(TopologicalMap, 'heard_too', qos.STREAM)
+            self.node.create_subscription(
+                TopologicalMap, 'local_topology', heard_too.publish, qos.STREAM
+            )
+            self._pacemaker = heard_too
+        return ('local_topology:=heard_too',)
+
+    def hear_out(self) -> None:
+        """Hear what still waits, until it is quiet: those that have stopped send nothing later."""
+        last_heard = self._heard
+        quiet = 0
+
+        def is_quiet() -> bool:
+            nonlocal last_heard, quiet
+            quiet = quiet + 1 if self._heard == last_heard else 0
+            last_heard = self._heard
+            return quiet > 3
+
+        self.until(is_quiet, 'quiet')
+
+    def until(self, condition: Callable[[], Any], what: str, seconds: float = PATIENCE_S) -> None:
+        end = time.monotonic() + seconds
+        while not condition():
+            self.executor.spin_once(timeout_sec=0.05)
+            for name, process in self.processes.items():
+                if process.poll() not in (None, 0):
+                    pytest.fail(f'{name} ended with {process.returncode}: {self.log(name)}')
+            if time.monotonic() > end:
+                logs = '\n'.join(f'{name}: {self.log(name)[-2000:]}' for name in self.processes)
+                pytest.fail(f'never came: {what}\n{logs}')
+
+    def client(self, kind: type, name: str) -> Client:
+        """Client of a service, the same each time: that both sides know each other takes a while.
+
+        Made before the server, it is known by the time that the server is ready.
+        """
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(kind, name)
+        return self._clients[name]
+
+    def call(self, kind: type, name: str, request: Any) -> Any:
+        client = self.client(kind, name)
+        self.until(client.service_is_ready, f'service {name}')
+        # A server that has just found its client may not be able to answer yet: asked again then.
+        return self._first(lambda: client.call_async(request), f'an answer of {name}')
+
+    def send_goal(self, client: ActionClient, goal: Any) -> Any:
+        """Handle of a goal that was taken.
+
+        A node that was killed passes for a server for a while: asked again then.
+        """
+        self.until(client.server_is_ready, 'action server')
+        return self._first(lambda: client.send_goal_async(goal), 'goal taken')
+
+    def _first(self, ask: Callable[[], Any], what: str) -> Any:
+        """The first answer that comes, asking again where none does for a while."""
+        asked: list[Any] = []
+        asked_at = -math.inf
+
+        def is_answered() -> bool:
+            nonlocal asked_at
+            if time.monotonic() - asked_at > _ASK_AGAIN_S:
+                asked_at = time.monotonic()
+                asked.append(ask())
+            return any(future.done() for future in asked)
+
+        self.until(is_answered, what)
+        return next(future for future in asked if future.done()).result()
+
+    def act(self, kind: type, name: str, goal: Any) -> Any:
+        """Result of an action's goal, with status."""
+        client = ActionClient(self.node, kind, name)
+        ended = self.send_goal(client, goal).get_result_async()
+        self.until(ended.done, f'{name} ends')
+        return ended.result()
+
+    def ended(self, process: subprocess.Popen[bytes]) -> int:
+        """Exit code of a node that ends by itself."""
+        return process.wait(timeout=PATIENCE_S)
+
+    def stop(self, name: str, number: int = signal.SIGINT) -> int:
+        """Exit code of a node after a signal."""
+        process = self.processes.pop(name)
+        process.send_signal(number)
+        return process.wait(timeout=PATIENCE_S)
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
+        for process in self.processes.values():
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+@pytest.fixture
+def graph(ros_domain: int, tmp_path: Path) -> Iterator[Graph]:
+    live = Graph(ros_domain, tmp_path)
+    yield live
+    live.close()

@@ -1,0 +1,71 @@
+"""ROS domains of tests: no two tests have the same at a time."""
+
+import socket
+import subprocess
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from support import ros_domains
+
+ANOTHER = 'import ros_domains; lock = ros_domains._lock({}); print(lock is not None); input()'
+NODE = """
+import rclpy
+rclpy.init()
+node = rclpy.create_node('a')
+print('up', flush=True)
+input()
+"""
+
+
+def test_no_domain_is_given_twice_and_all_can_be_had_again():
+    for _ in range(2):
+        with ExitStack() as stack:
+            taken = {stack.enter_context(ros_domains.free_domain()) for _ in range(20)}
+            assert len(taken) == 20 and taken <= set(ros_domains.DOMAINS)
+
+
+def test_a_domain_that_another_process_has_is_left_alone(monkeypatch):
+    with ros_domains.free_domain() as domain:
+        pass
+    other = subprocess.Popen(
+        [sys.executable, '-c', ANOTHER.format(domain)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        cwd=Path(ros_domains.__file__).parent,
+    )
+    assert other.stdout.readline() == b'True\n'
+    monkeypatch.setattr(ros_domains, 'DOMAINS', range(domain, domain + 1))
+    with pytest.raises(RuntimeError, match='none of the ROS domains'), ros_domains.free_domain():
+        pass
+    other.kill()
+    other.communicate()
+    with ros_domains.free_domain() as again:
+        assert again == domain
+
+
+def test_a_domain_on_which_a_node_listens_is_left_alone(monkeypatch):
+    with ros_domains.free_domain() as domain:
+        pass
+    monkeypatch.setattr(ros_domains, 'DOMAINS', range(domain, domain + 1))
+    # The third node of a domain, after the first two have gone.
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as node:
+        node.bind(('127.0.0.1', 7400 + 250 * domain + 10 + 2 * 2))
+        with (
+            pytest.raises(RuntimeError, match='none of the ROS domains'),
+            ros_domains.free_domain(),
+        ):
+            pass
+
+
+def test_nodes_are_seen_where_they_listen(ros_domain):
+    """The ports are where the middleware really has them."""
+    node = subprocess.Popen(
+        [sys.executable, '-c', NODE], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    assert node.stdout.readline() == b'up\n'
+    assert ros_domains._has_nodes(ros_domain)
+    node.kill()
+    node.communicate()
+    assert not ros_domains._has_nodes(ros_domain)

@@ -1,4 +1,0 @@
-"""Everything that touches the outside: ROS, bags, logs, image files, pictures.
-
-One file an outside thing.
-"""

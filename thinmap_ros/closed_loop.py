@@ -1,0 +1,266 @@
+"""Simulator, pipeline, strategy and navigator in a closed loop, without ROS."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from thinmap_ros.baselines.exploration import (
+    DistanceAdvantage,
+    ExploreLite,
+    InformationGain,
+    NearestFrontier,
+    VisitAllEndNodes,
+)
+from thinmap_ros.core import se2
+from thinmap_ros.core.estimate import Estimate
+from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
+from thinmap_ros.core.exploration.strategy import Decision, Strategy
+from thinmap_ros.core.grid.occupancy import OccupancyConfig
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
+from thinmap_ros.pipeline import Pipeline, PipelineConfig
+from thinmap_ros.sim.coverage import Coverable
+from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.robot import PRESETS
+from thinmap_ros.sim.simulation import STEP_NS, Moment, Simulation
+from thinmap_ros.sim.world import World
+
+_CONTROL_STEPS = 2
+_MEASURE_SCANS = 5
+# At the survey's pace; thinning costs more than all else together.
+SCANS_PER_GRAPH = 5
+Watch = Callable[[Decision, Array], None]
+"""Is told each decision, and the estimated pose (3,) at which it was made."""
+
+STRATEGIES: dict[str, Callable[[], Strategy]] = {
+    'position_probability': lambda: Explorer(ExplorerConfig()),
+    'paper': lambda: Explorer(ExplorerConfig(mode='paper')),
+    'nearest_frontier': NearestFrontier,
+    'visit_all_end_nodes': VisitAllEndNodes,
+    'explore_lite': ExploreLite,
+    'information_gain': InformationGain,
+    'distance_advantage': DistanceAdvantage,
+}
+
+
+@dataclass(eq=False)
+class Log:
+    """Scan by scan: stamps, poses (3,) true and estimated; coverage over time."""
+
+    stamps_ns: list[int] = field(default_factory=list)
+    true_poses: list[Array] = field(default_factory=list)
+    poses: list[Array] = field(default_factory=list)
+    coverage: list[tuple[float, float]] = field(default_factory=list)
+    decision_s: list[float] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How an exploration ended.
+
+    Whether by itself, why, and how often the robot touched something.
+    """
+
+    finished: bool
+    reason: str
+    collisions: int
+
+
+class Mishap(Protocol):
+    """What befalls the robot of a loop while it explores."""
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether the robot looks for where it is."""
+
+    def takes(self, loop: 'ClosedLoop', scan: Scan, T_odom_base: Array) -> bool:
+        """Whether a scan is not for the loop."""
+
+    def hear(self, loop: 'ClosedLoop', scan: Scan, estimate: Estimate) -> None:
+        """Hear where the robot thinks that it is."""
+
+
+class ClosedLoop:
+    """Simulator, pipeline, strategy and navigator, each called in turn as the live graph would."""
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        pipeline: Pipeline,
+        strategy: Strategy,
+        navigator: Navigator,
+        mishap: Mishap | None = None,
+        watch: Watch | None = None,
+    ) -> None:
+        self.simulation = simulation
+        self.pipeline = pipeline
+        self.strategy = strategy
+        self.navigator = navigator
+        self.mishap = mishap
+        self._watch = watch
+        self.log = Log()
+        self.decision: Decision | None = None
+        self._patch: GridPatch | None = None
+        self._scan: Scan | None = None
+        self._goal: Array | None = None
+        self._T_map_odom = np.zeros(3)
+        self._command = (0.0, 0.0)
+
+    def run(self, goal: Coverable, limit_s: float, show: Callable[[float, float], None]) -> Ending:
+        """Explore until the strategy is finished or the time is up.
+
+        `show` is told time (s) and coverage now and then.
+        """
+        moment = self.simulation.sense()
+        steps = 0
+        while moment.stamp_ns < limit_s * 1e9:
+            if moment.scan is not None:
+                self._take(moment.scan, moment.T_odom_base)
+                if len(self.log.poses) % _MEASURE_SCANS == 1:
+                    show(*self._measure(goal))
+                if self.is_finished:
+                    break
+            if steps % _CONTROL_STEPS == 0:
+                self._control(moment)
+            moment = self.simulation.step(*self._command)
+            steps = steps + 1
+        self.pipeline.finish()
+        show(*self._measure(goal))
+        finished = self.decision is not None and self.is_finished
+        reason = (
+            self.decision.reason
+            if self.decision is not None and finished
+            else f'time limit of {limit_s:.0f} s'
+        )
+        return Ending(finished, reason, self.simulation.robot.collisions)
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the strategy has nothing left to do; a lost robot has."""
+        lost = self.mishap is not None and self.mishap.is_lost
+        return self.decision is not None and self.decision.finished and not lost
+
+    def _take(self, scan: Scan, T_odom_base: Array) -> None:
+        """One scan through localization, map and graph to a decision."""
+        if self.mishap is not None and self.mishap.takes(self, scan, T_odom_base):
+            return
+        estimate = self.pipeline.step(scan, T_odom_base).estimate
+        self.note(scan, estimate)
+        if self.mishap is None or not self.mishap.is_lost:
+            self.decide(scan, estimate)
+
+    def note(self, scan: Scan, estimate: Estimate) -> None:
+        """Log where the robot is, and where it thinks that it is."""
+        self.log.stamps_ns.append(scan.stamp_ns)
+        self.log.poses.append(estimate.T_map_base)
+        self.log.true_poses.append(self.simulation.robot.T_world_base)
+        if self.mishap is not None:
+            self.mishap.hear(self, scan, estimate)
+
+    def decide(self, scan: Scan, estimate: Estimate) -> None:
+        """Say where to go, by the map as it is now."""
+        self._scan = scan
+        self._T_map_odom = estimate.T_map_odom
+        self._patch = self.pipeline.grid.patch()
+        # The processor's time: what else the machine does is not the strategy's.
+        began = time.thread_time()
+        self.decision = self.strategy.step(
+            self.pipeline.topology.map, self._patch, scan, estimate.T_map_base
+        )
+        self.log.decision_s.append(time.thread_time() - began)
+        if self._watch is not None:
+            self._watch(self.decision, estimate.T_map_base)
+        target = self.decision.target
+        if target is None:
+            self.navigator.cancel()
+            self._goal = None
+        elif self._goal is None or not np.array_equal(target.goal, self._goal):
+            self._goal = target.goal
+            self.navigator.set_goal(*(float(number) for number in target.goal))
+
+    def drive_by(self, pipeline: Pipeline, strategy: Strategy, navigator: Navigator) -> None:
+        """Have other parts decide where to go from now on."""
+        self.navigator.cancel()
+        self.pipeline = pipeline
+        self.strategy = strategy
+        self.navigator = navigator
+        self.decision = None
+        self._patch = None
+        self._goal = None
+        self._command = (0.0, 0.0)
+
+    def _control(self, moment: Moment) -> None:
+        if self._patch is None:
+            return
+        T_map_base = se2.compose(self._T_map_odom, moment.T_odom_base)
+        command = self.navigator.step(
+            T_map_base, self._patch, self._scan, _CONTROL_STEPS * STEP_NS / 1e9
+        )
+        self._command = (command.v, command.w)
+        if command.state == 'failed':
+            self.strategy.fail_target(command.reason)
+        if command.state in ('failed', 'reached'):
+            self._goal = None
+
+    def _measure(self, goal: Coverable) -> tuple[float, float]:
+        seconds = self.simulation.stamp_ns / 1e9
+        self.log.coverage.append((seconds, goal.share_known(self.pipeline.grid.patch())))
+        return self.log.coverage[-1]
+
+
+def true_pose_source(simulation: Simulation) -> Callable[[Scan, Array], Estimate]:
+    """Takes the localizer's place: the simulator's own pose."""
+
+    def locate(scan: Scan, T_odom_base: Array) -> Estimate:
+        T_map_base = simulation.robot.T_world_base
+        return Estimate(
+            T_map_base, np.zeros((3, 3)), se2.compose(T_map_base, se2.invert(T_odom_base))
+        )
+
+    return locate
+
+
+@dataclass(frozen=True)
+class Options:
+    """What an exploration is run with, beside world and start."""
+
+    strategy: str = 'position_probability'
+    seed: int = 0
+    speed_m_s: float = 0.2
+    localization: str = 'truth'
+    robot: str = '2dx'
+    laser: Lms200Config = field(default_factory=Lms200Config)
+    time_limit_s: float = 20_000.0
+    kidnap_at_s: float | None = None
+
+
+def make_loop(
+    world: World,
+    start: Array,
+    options: Options,
+    mishap: Mishap | None = None,
+    watch: Watch | None = None,
+) -> ClosedLoop:
+    """All parts as the options want them; what befalls the robot, and who watches, are given."""
+    simulation = Simulation(world, start, PRESETS[options.robot], options.laser, options.seed)
+    x, y, theta = (float(number) for number in start)
+    localizer = ScanLocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=theta)
+    source = true_pose_source(simulation) if options.localization == 'truth' else None
+    # A beam that met nothing has seen as far as this laser can.
+    grid = OccupancyConfig(no_return_range_m=options.laser.range_max_m)
+    pipeline = Pipeline(
+        PipelineConfig(localizer=localizer, grid=grid, scans_per_graph=SCANS_PER_GRAPH), source
+    )
+    navigator = Navigator(NavigatorConfig(max_speed_m_s=options.speed_m_s))
+    strategy = STRATEGIES[options.strategy]()
+    return ClosedLoop(simulation, pipeline, strategy, navigator, mishap, watch)
+
+
+def nothing_to_show(seconds: float, coverage: float) -> None:
+    """Take the place of a progress bar."""

@@ -1,0 +1,90 @@
+"""Lines that are not yet features.
+
+Only what is seen several times, at the same place, becomes one.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from thinmap_ros.core.ekf_slam.association import mahalanobis, meeting
+from thinmap_ros.core.ekf_slam.ekf import line_difference
+from thinmap_ros.core.ekf_slam.features import Feature, interval
+from thinmap_ros.core.ekf_slam.line_extraction import Lines
+from thinmap_ros.core.ekf_slam.models import place_line
+from thinmap_ros.core.se2 import Array, transform_points
+
+
+@dataclass(eq=False)
+class Candidate:
+    """A line (r, alpha) and what was seen of it, in the map.
+
+    The last look as it was seen, z (2,) with covariance.
+    """
+
+    line: Array
+    span: Feature
+    z: Array
+    covariance: Array
+    sightings: int
+    last_look: int
+
+
+class Candidates:
+    """The lines that have been seen too seldom so far."""
+
+    def __init__(self, sightings: int, patience: int, gate: float, gap_m: float) -> None:
+        """sightings: after how many a line is ripe.
+
+        Patience: looks without it after which it is dropped.
+        """
+        self._sightings = sightings
+        self._patience = patience
+        self._gate = gate
+        self._gap_m = gap_m
+        self._all: list[Candidate] = []
+        self._looks = 0
+
+    def take(self, pose: Array, lines: Lines, laser_map: Array) -> list[Candidate]:
+        """Take in lines of a scan from a pose (3,), with the laser at a place (2,).
+
+        Returns those that are ripe now.
+        """
+        self._looks += 1
+        seen = [
+            self._take(pose, z, covariance, transform_points(pose, ends), laser_map)
+            for z, covariance, ends in zip(lines.z, lines.covariances, lines.ends, strict=True)
+        ]
+        ripe = [c for c in dict.fromkeys(seen) if c.sightings >= self._sightings]
+        oldest = self._looks - self._patience
+        self._all = [c for c in self._all if c.last_look >= oldest and c not in ripe]
+        return ripe
+
+    def _take(
+        self, pose: Array, z: Array, covariance: Array, ends_map: Array, laser_map: Array
+    ) -> Candidate:
+        """The candidate that a seen line continues, brought up to date, or a new one."""
+        line, _, by_seen = place_line(pose, z)
+        # Two looks at one line differ by the noise of both; the robot hardly moved in between.
+        S = 2.0 * by_seen @ covariance @ by_seen.T
+        for candidate in self._meeting(ends_map, laser_map):
+            v, signs = line_difference(line, candidate.line)
+            if mahalanobis(v, S) <= self._gate:
+                candidate.line = v + signs * candidate.line
+                candidate.span.grow(*interval(candidate.line, ends_map))
+                candidate.z = z
+                candidate.covariance = covariance
+                candidate.sightings += candidate.last_look != self._looks
+                candidate.last_look = self._looks
+                return candidate
+        span = Feature(0, *interval(line, ends_map), laser_map)
+        self._all.append(Candidate(line, span, z, covariance, 1, self._looks))
+        return self._all[-1]
+
+    def _meeting(self, ends_map: Array, laser_map: Array) -> list[Candidate]:
+        if not self._all:
+            return []
+        lines = np.array([c.line for c in self._all])
+        spans = [c.span for c in self._all]
+        near = meeting(lines, spans, ends_map[None], laser_map, self._gap_m)[0]
+        return [self._all[i] for i in np.flatnonzero(near)]

@@ -1,0 +1,381 @@
+"""Line segments of a scan.
+
+Split where the beams jump or bend, merged where they go on, fitted by least squares.
+
+A run of beams ends where two neighbours lie farther apart than on a wall seen at the flattest
+usable angle. It is split at the point farthest from the chord of its ends while that is farther
+than noise can be (iterative end point fit); neighbouring parts that fit one line are merged again.
+What is then left has to pass for a wall: enough points, long enough, residuals that the noise of
+the beams explains, and no bow (round columns make short chords).
+Source: EKF-SLAM/TI paper section 4 (least-squares lines, reference [9] there); the breakpoints
+after Borges and Aldon, "Line extraction in 2D range images", 2004; the fit minimises
+sum w (rho cos(phi - alpha) - r)^2.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array, transform_points, wrap
+
+_FLATTEST_RAD = math.radians(10.0)  # walls are joined down to this angle between wall and beam
+_WIDEST_GAP_M = 0.6  # narrower than a door
+_MOST_MISSING = 2  # beams without return inside a wall
+_MOST_CHI2 = 3.0  # per degree of freedom: rough walls pass, clutter does not
+_SPLIT_SIGMAS = 4.0
+_TRIM_SIGMAS = 3.0  # end points farther off than this are mixed pixels or the next wall's
+# Columns of a fit.
+_R, _ALPHA, _RR, _RA, _AA, _CHI2, _BOW, _BOW_SIGMA, _LOW, _HIGH = range(10)
+
+
+@dataclass(frozen=True)
+class LineConfig(Config):
+    """Parameters of line extraction and the noise of the beams."""
+
+    range_sigma_m: float = parameter(
+        0.015, 'range noise of a beam, 1 sigma, m', low=0.0005, high=0.5
+    )
+    bearing_sigma_rad: float = parameter(
+        0.002, 'bearing noise of a beam, 1 sigma, rad', low=0.0, high=0.1
+    )
+    line_range_m: float = parameter(
+        20.0, 'points farther away make no lines, m', low=1.0, high=200.0
+    )
+    line_split_m: float = parameter(
+        0.05, 'a point this far from the chord splits a line, m', low=0.005, high=1.0
+    )
+    line_points: int = parameter(8, 'fewest points of a line', low=4, high=1000)
+    line_length_m: float = parameter(0.8, 'shortest line, m', low=0.05, high=10.0)
+    line_bow_m: float = parameter(
+        0.02, 'a bow that rises by more than this is no wall, m', low=0.001, high=1.0
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """Segments of a scan, robot frame.
+
+    z (K, 2) as (r, alpha), r >= 0, covariances (K, 2, 2), end points (K, 2, 2).
+    """
+
+    z: Array
+    covariances: Array
+    ends: Array
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+    def chosen(self, which: NDArray[np.int64]) -> 'Lines':
+        """Those at some indices (M,)."""
+        return Lines(self.z[which], self.covariances[which], self.ends[which])
+
+
+def no_lines() -> Lines:
+    """What an empty scan shows."""
+    return Lines(np.empty((0, 2)), np.empty((0, 2, 2)), np.empty((0, 2, 2)))
+
+
+def extract_lines(scan: Scan, config: LineConfig) -> Lines:
+    """Segments of a scan, in the robot frame, in the order of the beams."""
+    beams = np.flatnonzero(scan.hit & (scan.ranges_m < config.line_range_m))
+    if beams.size < config.line_points:
+        return no_lines()
+    split_m = max(config.line_split_m, _SPLIT_SIGMAS * config.range_sigma_m)
+    sigmas = np.array([config.range_sigma_m, config.bearing_sigma_rad, split_m])
+    ranges = scan.ranges_m[beams]
+    angles = scan.angles_rad[beams]
+    x = ranges * np.cos(angles)
+    y = ranges * np.sin(angles)
+    step = abs(scan.angle_increment_rad)
+    fits, count = _extract(x, y, ranges, angles, beams, step, sigmas, config.line_points)
+    fits = fits[:count]
+    length = fits[:, _HIGH] - fits[:, _LOW]
+    straight = (fits[:, _BOW] < config.line_bow_m) | (fits[:, _BOW] < 3.0 * fits[:, _BOW_SIGMA])
+    good = (length >= config.line_length_m) & (fits[:, _CHI2] < _MOST_CHI2) & straight
+    return _in_robot_frame(fits[good], scan.T_base_laser)
+
+
+def _in_robot_frame(fits: Array, T_base_laser: Array) -> Lines:
+    """Lines of the laser frame seen from the robot.
+
+    Turned by the mount, r longer by the mount's part along n.
+    """
+    r = fits[:, _R]
+    alpha = fits[:, _ALPHA]
+    normals = np.column_stack([np.cos(alpha), np.sin(alpha)])
+    along = np.column_stack([-normals[:, 1], normals[:, 0]])
+    feet = r[:, None] * normals
+    ends = np.stack([feet + fits[:, [_LOW]] * along, feet + fits[:, [_HIGH]] * along], axis=1)
+    alpha_base = alpha + T_base_laser[2]
+    # r_base = r + m n(alpha_base), so an error of alpha moves r by m t(alpha_base).
+    c = np.cos(alpha_base)
+    s = np.sin(alpha_base)
+    r_base = r + T_base_laser[0] * c + T_base_laser[1] * s
+    lever = -T_base_laser[0] * s + T_base_laser[1] * c
+    rr = fits[:, _RR] + 2.0 * lever * fits[:, _RA] + lever**2 * fits[:, _AA]
+    ra = fits[:, _RA] + lever * fits[:, _AA]
+    sign = np.where(r_base < 0.0, -1.0, 1.0)
+    z = np.column_stack([sign * r_base, wrap(alpha_base + np.where(sign < 0.0, np.pi, 0.0))])
+    covariances = np.stack([rr, sign * ra, sign * ra, fits[:, _AA]], axis=1).reshape(-1, 2, 2)
+    return Lines(
+        z, covariances, transform_points(T_base_laser, ends.reshape(-1, 2)).reshape(-1, 2, 2)
+    )
+
+
+@kernel
+def _extract(
+    x: Array,
+    y: Array,
+    ranges: Array,
+    angles: Array,
+    beams: NDArray[np.int64],
+    step: float,
+    sigmas: Array,
+    fewest: int,
+) -> tuple[Array, int]:
+    """Fits of all segments in the first rows, and how many these are.
+
+    sigmas: range noise m, bearing noise rad, split distance m.
+    """
+    fits = np.empty((ranges.size, 10))
+    fit = np.empty(10)
+    parts = np.empty((ranges.size + 2, 2), dtype=np.int64)
+    stack = np.empty((ranges.size + 2, 2), dtype=np.int64)
+    count = 0
+    first = 0
+    for end in range(1, ranges.size + 1):
+        if end < ranges.size and not _apart(x, y, ranges, beams, step, sigmas[0], end):
+            continue
+        number = _split(x, y, first, end, sigmas[2], parts, stack)
+        first = end
+        k = 0
+        while k < number:
+            a = parts[k, 0]
+            b = parts[k, 1]
+            # Merge with the parts that follow while one line explains both.
+            while k + 1 < number:
+                _fit(x, y, ranges, angles, a, parts[k + 1, 1], sigmas, fit)
+                if fit[_CHI2] > _MOST_CHI2 or fit[_BOW] > 0.5 * sigmas[2]:
+                    break
+                k += 1
+                b = parts[k, 1]
+            a, b = _fit_trimmed(x, y, ranges, angles, a, b, sigmas, fewest, fit)
+            if b - a >= fewest:
+                for column in range(fit.size):
+                    fits[count, column] = fit[column]
+                count += 1
+            k += 1
+    return fits, count
+
+
+@kernel
+def _apart(
+    x: Array, y: Array, ranges: Array, beams: NDArray[np.int64], step: float, sigma: float, i: int
+) -> bool:
+    """Whether point i lies too far from the point before it to be on the same wall."""
+    turn = (beams[i] - beams[i - 1]) * step
+    if beams[i] - beams[i - 1] > 1 + _MOST_MISSING or turn >= 0.9 * _FLATTEST_RAD:
+        return True
+    reach = (
+        min(ranges[i], ranges[i - 1]) * math.sin(turn) / math.sin(_FLATTEST_RAD - turn)
+        + 3.0 * sigma
+    )
+    return bool(math.hypot(x[i] - x[i - 1], y[i] - y[i - 1]) > min(reach, _WIDEST_GAP_M))
+
+
+@kernel
+def _split(
+    x: Array,
+    y: Array,
+    first: int,
+    end: int,
+    distance: float,
+    parts: NDArray[np.int64],
+    stack: NDArray[np.int64],
+) -> int:
+    """Break a run [first, end) of points into parts that stay near their chords.
+
+    Returns how many.
+    """
+    count = 0
+    depth = 1
+    stack[0, 0] = first
+    stack[0, 1] = end
+    while depth > 0:
+        depth -= 1
+        a = stack[depth, 0]
+        b = stack[depth, 1]
+        dx = x[b - 1] - x[a]
+        dy = y[b - 1] - y[a]
+        length = max(math.hypot(dx, dy), 1e-9)
+        worst = distance
+        at = -1
+        for i in range(a + 1, b - 1):
+            away = abs(dx * (y[i] - y[a]) - dy * (x[i] - x[a])) / length
+            if away > worst:
+                worst = away
+                at = i
+        if at < 0:
+            parts[count, 0] = a
+            parts[count, 1] = b
+            count += 1
+        else:
+            stack[depth, 0] = at
+            stack[depth, 1] = b
+            stack[depth + 1, 0] = a
+            stack[depth + 1, 1] = at + 1
+            depth += 2
+    return count
+
+
+@kernel
+def _fit_trimmed(
+    x: Array,
+    y: Array,
+    ranges: Array,
+    angles: Array,
+    a: int,
+    b: int,
+    sigmas: Array,
+    fewest: int,
+    fit: Array,
+) -> tuple[int, int]:
+    """Fit points [a, b) without end points that the line does not explain; returns what is left."""
+    for _ in range(4):
+        _fit(x, y, ranges, angles, a, b, sigmas, fit)
+        start = a
+        stop = b
+        while b - a >= fewest and _off(x, y, ranges, angles, a, sigmas, fit) > _TRIM_SIGMAS:
+            a += 1
+        while b - a >= fewest and _off(x, y, ranges, angles, b - 1, sigmas, fit) > _TRIM_SIGMAS:
+            b -= 1
+        if a == start and b == stop:
+            break
+    return a, b
+
+
+@kernel
+def _variance(rho: float, off: float, sigmas: Array) -> float:
+    """Variance of a point across a line whose normal it sees at an angle off."""
+    across = sigmas[0] * math.cos(off)
+    along = sigmas[1] * rho * math.sin(off)
+    return float(across * across + along * along + 1e-8)
+
+
+@kernel
+def _off(
+    x: Array, y: Array, ranges: Array, angles: Array, i: int, sigmas: Array, fit: Array
+) -> float:
+    """Distance of a point from a fitted line, in sigmas."""
+    distance = x[i] * math.cos(fit[_ALPHA]) + y[i] * math.sin(fit[_ALPHA]) - fit[_R]
+    return float(abs(distance)) / math.sqrt(_variance(ranges[i], angles[i] - fit[_ALPHA], sigmas))
+
+
+@kernel
+def _fit(
+    x: Array, y: Array, ranges: Array, angles: Array, a: int, b: int, sigmas: Array, fit: Array
+) -> None:
+    """Weighted total least squares through points [a, b), its covariance, and how well it fits.
+
+    The covariance is (J' W J)^-1, J the derivative of each point's distance by (r, alpha): the
+    normal equations of the fit itself. The bow is the parabola across the line that the distances
+    still contain.
+    """
+    chord = math.atan2(y[b - 1] - y[a], x[b - 1] - x[a])
+    alpha = chord - 0.5 * math.pi
+    mx = 0.0
+    my = 0.0
+    total = 0.0
+    for _ in range(2):
+        mx = 0.0
+        my = 0.0
+        total = 0.0
+        for i in range(a, b):
+            w = 1.0 / _variance(ranges[i], angles[i] - alpha, sigmas)
+            mx = mx + w * x[i]
+            my = my + w * y[i]
+            total = total + w
+        mx = mx / total
+        my = my / total
+        xx = 0.0
+        xy = 0.0
+        yy = 0.0
+        for i in range(a, b):
+            w = 1.0 / _variance(ranges[i], angles[i] - alpha, sigmas)
+            dx = x[i] - mx
+            dy = y[i] - my
+            xx = xx + w * dx * dx
+            xy = xy + w * dx * dy
+            yy = yy + w * dy * dy
+        alpha = 0.5 * math.atan2(-2.0 * xy, yy - xx)
+    c = math.cos(alpha)
+    s = math.sin(alpha)
+    r = mx * c + my * s
+    if r < 0.0:
+        r = -r
+        alpha = alpha + math.pi
+        c = -c
+        s = -s
+    foot = -mx * s + my * c
+    spread = 0.0
+    chi2 = 0.0
+    low = np.inf
+    high = -np.inf
+    for i in range(a, b):
+        w = 1.0 / _variance(ranges[i], angles[i] - alpha, sigmas)
+        t = -x[i] * s + y[i] * c
+        d = x[i] * c + y[i] * s - r
+        spread = spread + w * (t - foot) ** 2
+        chi2 = chi2 + w * d * d
+        low = min(low, t)
+        high = max(high, t)
+    spread = max(spread, 1e-12)
+    # The mean's offset and the direction are independent; turning about the mean shifts r by foot
+    # times the turn.
+    fit[_R] = r
+    fit[_ALPHA] = alpha
+    fit[_AA] = 1.0 / spread
+    fit[_RA] = foot / spread
+    fit[_RR] = 1.0 / total + foot * foot / spread
+    fit[_CHI2] = chi2 / max(b - a - 2, 1)
+    fit[_LOW] = low
+    fit[_HIGH] = high
+    fit[_BOW], fit[_BOW_SIGMA] = _bow(x, y, ranges, angles, a, b, sigmas, fit, foot, spread / total)
+
+
+@kernel
+def _bow(
+    x: Array,
+    y: Array,
+    ranges: Array,
+    angles: Array,
+    a: int,
+    b: int,
+    sigmas: Array,
+    fit: Array,
+    middle: float,
+    spread: float,
+) -> tuple[float, float]:
+    """Rise of the bow that the points make over half the line's length, and its sigma.
+
+    middle, spread: mean and variance of the positions t along the line.
+    """
+    half = max(0.5 * (fit[_HIGH] - fit[_LOW]), 1e-6)
+    c = math.cos(fit[_ALPHA])
+    s = math.sin(fit[_ALPHA])
+    product = 0.0
+    square = 0.0
+    for i in range(a, b):
+        w = 1.0 / _variance(ranges[i], angles[i] - fit[_ALPHA], sigmas)
+        t = -x[i] * s + y[i] * c
+        d = x[i] * c + y[i] * s - fit[_R]
+        shape = ((t - middle) ** 2 - spread) / (half * half)
+        product = product + w * d * shape
+        square = square + w * shape * shape
+    square = max(square, 1e-12)
+    return abs(product / square), 1.0 / math.sqrt(square)

@@ -1,0 +1,89 @@
+"""The whole of a grid as people and planners see it, in percent.
+
+It is worked out anew only where the grid has changed.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
+from thinmap_ros.core.grid.tiles import TileStore
+
+Bounds = tuple[int, int, int, int]
+
+
+class Picture:
+    """Cells (H, W) int8 of all tiles.
+
+    Also which part is out of date, and which rectangle holds all that is known.
+    """
+
+    def __init__(self, percent: NDArray[np.int8]) -> None:
+        """Begin with nothing; percent (2 L + 1,): what to show for log odds from -L to L."""
+        self._percent = percent
+        self._cells: NDArray[np.int8] = np.empty((0, 0), dtype=np.int8)
+        self._bounds: Bounds = (0, 0, 0, 0)
+        self._known: Bounds | None = None
+        self._stale: Bounds | None = None
+
+    def touch(self, row: int, col: int, end_row: int, end_col: int) -> None:
+        """Note that cells [row, end_row) x [col, end_col) may have changed."""
+        self._stale = _union(self._stale, (row, col, end_row, end_col))
+
+    def draw(self, tiles: TileStore, frame: GridFrame) -> GridPatch:
+        """The smallest rectangle that holds all that is known, as a copy.
+
+        One unknown cell where nothing is.
+        """
+        self._fit(tiles)
+        if self._stale is not None:
+            self._refresh(tiles, *_common(self._stale, self._bounds))
+            self._stale = None
+        if self._known is None:
+            return GridPatch(frame, np.full((1, 1), UNKNOWN, dtype=np.int8))
+        row, col, end_row, end_col = self._known
+        top, left = self._bounds[:2]
+        shown = self._cells[row - top : end_row - top, col - left : end_col - left]
+        return GridPatch(frame.shifted(row, col), shown.copy())
+
+    def _fit(self, tiles: TileStore) -> None:
+        """Lay the cells anew when tiles have come outside of them."""
+        bounds = tiles.bounds()
+        if bounds is None or bounds == self._bounds:
+            return
+        cells = np.full((bounds[2] - bounds[0], bounds[3] - bounds[1]), UNKNOWN, dtype=np.int8)
+        row = self._bounds[0] - bounds[0]
+        col = self._bounds[1] - bounds[1]
+        if self._cells.size:
+            cells[row : row + self._cells.shape[0], col : col + self._cells.shape[1]] = self._cells
+        self._cells = cells
+        self._bounds = bounds
+
+    def _refresh(self, tiles: TileStore, row: int, col: int, end_row: int, end_col: int) -> None:
+        if end_row <= row or end_col <= col:
+            return  # beyond all tiles
+        odds = tiles.read(row, col, end_row - row, end_col - col)
+        top, left = self._bounds[:2]
+        shown = self._percent[odds.astype(np.intp) + self._percent.size // 2]
+        self._cells[row - top : end_row - top, col - left : end_col - left] = shown
+        known = shown != UNKNOWN
+        rows = np.flatnonzero(known.any(axis=1))
+        cols = np.flatnonzero(known.any(axis=0))
+        if rows.size:
+            # What is known once stays so: the rectangle only grows.
+            found = (
+                row + int(rows[0]),
+                col + int(cols[0]),
+                row + int(rows[-1]) + 1,
+                col + int(cols[-1]) + 1,
+            )
+            self._known = _union(self._known, found)
+
+
+def _union(a: Bounds | None, b: Bounds) -> Bounds:
+    return b if a is None else (min(a[0], b[0]), min(a[1], b[1]), max(a[2], b[2]), max(a[3], b[3]))
+
+
+def _common(a: Bounds, b: Bounds) -> Bounds:
+    return max(a[0], b[0]), max(a[1], b[1]), min(a[2], b[2]), min(a[3], b[3])

@@ -1,0 +1,394 @@
+"""Where is the robot? Samples all over a finished map, until one place is left.
+
+They are matched with what each scan shows.
+"""
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.places.config import GlobalLocalizationConfig
+from thinmap_ros.core.places.fit import usual_share
+from thinmap_ros.core.places.hypotheses import Hypotheses, missed_beams
+from thinmap_ros.core.places.likelihood import Judge
+from thinmap_ros.core.places.observation import Observation, observe
+from thinmap_ros.core.places.observation_model import NodeModel, calibrate
+from thinmap_ros.core.places.place_database import Places
+from thinmap_ros.core.places.search import KeyView, candidates, judged_before, moved
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.graph import TopologicalMap
+
+__all__ = ['GlobalLocalization', 'GlobalLocalizationConfig', 'Hypothesis', 'Result', 'State']
+
+# Looks from about the same place meet the same errors of the map; they are independent after so
+# much motion.
+_NEW_WAY_M = 0.5
+_NEW_TURN_RAD = 0.5
+# Independent looks that a place must have explained: more for each e-fold of places that looked
+# alike, and for each look before it turned up. A look counts the less, the more it leaves
+# unexplained of what it should explain in this map, and nothing from a share on: so many times what
+# the right one leaves unexplained there (no less than the least, as few scans were made in the map;
+# no more than the most), and more in rough maps, which draw things in part.
+_SURE_LOOKS = 1.0
+_SURE_LOOKS_CROWD = 0.75
+_SURE_LOOKS_LATE = 2.0
+_WORTHLESS_TIMES = 10.0
+_LEAST_WORTHLESS = 0.0075
+_MOST_WORTHLESS = 0.03
+_WORTHLESS_ROUGH = 0.5
+# After so many independent looks, a place that explains must have lasted for this share of them,
+# but not for ever.
+_MANY_LOOKS = 16.0
+_LASTING_SHARE = 0.4
+_LASTING_LOOKS = 20.0
+_VIEWS = 6
+_FRESH_SHARE = 0.2  # of the samples that are drawn anew all over the map while the search is on
+_FRESH_BEST = 100
+# Samples whose beams are followed, where the likeliest pose of a place leaves some unexplained.
+_LOOKED_ALONG = 300
+_JUMP_RAD = 2.0
+_STANDING_NOISE = (0.01, 0.005)  # m, rad: samples do not fall together
+# A search that looked at all of the map and did not find the right place: this often. So who turns
+# up late is unlikely, but what one search misses the next ones may miss for the same reason: so
+# often they all do.
+_LOG_MISSED = math.log(0.3)
+_LEAST_LOG_PRIOR = math.log(0.05)
+_TRUST_FROM = 0.6  # share of the beams that must be explained for that
+# Looks: once all places are known, the map is searched less often.
+_FIRST_SEARCHES = 6
+_LATER_EVERY = 4.0
+
+
+class State(IntEnum):
+    """How the search stands."""
+
+    WAITING = 0
+    SEARCHING = 1
+    AMBIGUOUS = 2
+    LOCALIZED = 3
+    NOT_IN_MAP = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A place where the robot may be.
+
+    T_map_base (3,), covariance (3, 3), weight, and share of beams it explains.
+    """
+
+    T_map_base: Array
+    covariance: Array
+    weight: float
+    explained: float
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What is known after a step.
+
+    The state, why in words, and the hypotheses, the likeliest first.
+    """
+
+    state: State
+    reason: str
+    hypotheses: tuple[Hypothesis, ...]
+
+    @property
+    def pose(self) -> Hypothesis | None:
+        """The one place where the robot is, once it is sure; None before."""
+        return self.hypotheses[0] if self.state == State.LOCALIZED else None
+
+
+class GlobalLocalization:
+    """Finds a robot in a map that it may be in, at any place and heading.
+
+    The same seed gives the same answers.
+
+    1. Samples of x, y and heading are drawn over all places where the robot can stand.
+    2. All count the same.
+    3.-5. For each, the nodes are taken that the map has in sight within the active window, and
+       compared with those of the current scan's topological map by distance and angle.
+    6. Bayes' rule weighs them, and odometry moves them.
+
+    Where one or a few candidates are left, sampling goes on round these only.
+
+    Beyond the paper: every spot of the map is compared with the ranges of the scan, so that long
+    corridors, halls and scans without nodes tell something too; candidates must explain each beam,
+    on its whole way; each keeps samples of its own, so that none dies out by chance; what they
+    explain alike leaves them equally likely; and the robot is sure only of a place that explains
+    what it has seen, has no rival left, and is known closely.
+    Source: topological map paper section 3.1.
+    """
+
+    def __init__(
+        self,
+        patch: GridPatch,
+        topology: TopologicalMap,
+        config: GlobalLocalizationConfig | None = None,
+        seed: int = 0,
+    ) -> None:
+        """Look at a map.
+
+        Raises InputError where it has no wall, no free place, or the topology no node.
+        """
+        self.config = config or GlobalLocalizationConfig()
+        self.places = Places.of(patch, topology, self.config)
+        self._rng = np.random.default_rng(seed)
+        self._model: NodeModel | None = None
+        self._judge: Judge | None = None
+        self._usual = 1.0  # share that the right place explains in this map
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget everything but the map."""
+        self._known = Hypotheses.none()
+        self._views: list[KeyView] = []
+        self._T_step: Array | None = None
+        self._T_look: Array | None = None
+        self._way_m = 0.0
+        self._independent = 0.0  # looks
+        self._since_search = math.inf
+        self._searches = 0  # that were complete, since there were not too many places to keep
+        self._overview = 0.0  # looks in which all places that explain them have been known
+        self._convinced = 0  # looks in a row at which all spoke for one place
+        self._crowd = 1.0  # how many places looked alike at the most, counted by their weights
+        self._drawn = self._draw(self.config.samples)
+
+    @property
+    def samples(self) -> Array:
+        """The samples (N, 3) as of the last look."""
+        return self._known.samples if len(self._known) else self._drawn
+
+    def step(self, scan: Scan, T_odom_base: Array) -> Result:
+        """Take in a scan with the odometry pose (3,) at its stamp."""
+        if not se2.is_finite(T_odom_base):
+            return self._waiting(f'odometry {T_odom_base.tolist()}: expected finite numbers')
+        if self._jumped(T_odom_base):
+            self.restart()
+            self._T_step = T_odom_base
+            return self._waiting('odometry has jumped: all begins anew')
+        self._T_step = T_odom_base
+        if scan.is_blind or not (scan.hit | scan.no_return).any():
+            return self._waiting(f'scan at {scan.stamp_ns} ns: laser blind (too few valid beams)')
+        novelty = self._novelty(T_odom_base)
+        if novelty > 0.0:
+            self._look(scan, T_odom_base, novelty)
+        return self._result(T_odom_base)
+
+    def _jumped(self, T_odom_base: Array) -> bool:
+        if self._T_step is None:
+            return False
+        motion = se2.between(self._T_step, T_odom_base)
+        far = math.hypot(motion[0], motion[1]) > self.config.odometry_jump_m
+        return far or abs(float(motion[2])) > _JUMP_RAD
+
+    def _novelty(self, T_odom_base: Array) -> float:
+        """How much of an independent look this is, 0 to 1.
+
+        0: none, the robot is where it looked last.
+        """
+        if self._T_look is None:
+            return 1.0
+        motion = se2.between(self._T_look, T_odom_base)
+        way = math.hypot(motion[0], motion[1])
+        turn = abs(float(motion[2]))
+        if way < self.config.look_m and turn < self.config.look_rad:
+            return 0.0
+        return min(1.0, way / _NEW_WAY_M + turn / _NEW_TURN_RAD)
+
+    def _look(self, scan: Scan, T_odom_base: Array, novelty: float) -> None:
+        """One look: move, search if that is due, weigh, drop what does not explain the scan."""
+        judge = self._ready(scan)
+        seen = observe(scan, self.places.frame.resolution, self.config)
+        self._advance(T_odom_base)
+        self._since_search += novelty
+        self._independent += novelty
+        every = 1.0 if self._searches < _FIRST_SEARCHES or self._explains_badly() else _LATER_EVERY
+        if self._since_search >= every and not self.is_sure:
+            self._search(judge, seen, T_odom_base)
+        known = self._known
+        if len(known):
+            known.poses = self._refined(judge, seen)
+            judged = judge.explained(known.poses, seen)
+            known.take_evidence(judged, len(seen.ranges_m), novelty)
+            known.prune()
+            self._searches *= not known.are_too_many
+            known.resample(None, self.config.samples, self._rng) if not len(known.samples) else None
+            logs = judge.log_likelihoods(known.samples, seen)
+            known.weigh(logs)
+            known.resample(logs, self.config.samples, self._rng)
+        if len(known):
+            self._crowd = max(self._crowd, float(np.exp(known.log_weights).sum()))
+        self._overview = self._overview + novelty if self._searches else 0.0
+        self._convinced = self._convinced + 1 if self._speaks_for_one() else 0
+        self._T_look = T_odom_base
+
+    def _refined(self, judge: Judge, seen: Observation) -> Array:
+        """Poses (H, 3) of the hypotheses where this scan fits best.
+
+        Samples that fit lead out of a dead end.
+        """
+        known = self._known
+        if not len(known.samples):
+            return judge.refined(known.poses, seen, known.covariances)
+        others = known.best_samples(judge.log_likelihoods(known.samples, seen))
+        poses = judge.refined(known.poses, seen, known.covariances, others)
+        return judge.unblocked(poses, seen, known.some_samples(_LOOKED_ALONG))
+
+    def _ready(self, scan: Scan) -> Judge:
+        """The judge; the first scan tells which laser it is for."""
+        if self._judge is None:
+            self._model = calibrate(self.places, scan, self.config, self._rng)
+            self._judge = Judge(self.places, self.config, self._model)
+            self._usual = usual_share(self.places, self._judge, scan, self.config, self._rng)
+        return self._judge
+
+    def _advance(self, T_odom_base: Array) -> None:
+        """Move hypotheses and samples with the odometry since the last look."""
+        if self._T_look is None:
+            return
+        motion = se2.between(self._T_look, T_odom_base)
+        way = math.hypot(motion[0], motion[1])
+        turn = abs(float(motion[2]))
+        self._way_m += way
+        noise = self.config.odometry_noise
+        spread = (noise * way + _STANDING_NOISE[0], noise * (way + turn) + _STANDING_NOISE[1])
+        self._known.move(motion, spread, self._rng)
+        self._drawn = moved(self._drawn, motion)
+
+    def _search(self, judge: Judge, seen: Observation, T_odom_base: Array) -> None:
+        """Look for places all over the map that explain this scan and those before it."""
+        self._since_search = 0.0
+        self._drawn = self._draw(self.config.samples if not len(self._known) else self._fresh)
+        logs = judge.log_likelihoods(self._drawn, seen)
+        drawn = self._drawn[np.argsort(-logs, kind='stable')[:_FRESH_BEST]]
+        found, complete = candidates(self.places, judge, seen, drawn, self._rng)
+        if len(found):
+            poses = np.concatenate([self._known.poses, found])
+            counts, silent = judged_before(
+                judge, self._views, poses, T_odom_base, self.config.odometry_noise
+            )
+            new = slice(len(self._known), None)
+            missed = np.zeros(len(poses))
+            beams = 0.0
+            for k, view in enumerate(self._views):
+                missed += missed_beams((counts[k], silent[k]), len(view.seen.ranges_m))
+                beams += len(view.seen.ranges_m)
+            judged = counts.sum(axis=0)[new], silent.sum(axis=0)[new]
+            least = missed[self._known.best()] if len(self._known) else missed.min(initial=np.inf)
+            more = missed[new] - least
+            self._known.add(found, self._log_prior(), more, judged, beams)
+        self._searches += complete
+        self._views = [*self._views[-_VIEWS + 1 :], KeyView(seen, T_odom_base)]
+
+    def _log_prior(self) -> float:
+        """Log odds of a place that turns up late, against those that are known.
+
+        Less, the better these explain all.
+        """
+        most = float(self._fits.max(initial=0.0))
+        trust = min(max((most - _TRUST_FROM) / (1.0 - _TRUST_FROM), 0.0), 1.0)
+        return trust * max(self._searches * _LOG_MISSED, _LEAST_LOG_PRIOR)
+
+    def _explains_badly(self) -> bool:
+        """Whether no hypothesis explains enough to be sure of."""
+        return float(self._fits.max(initial=0.0)) < self.config.least_explained
+
+    @property
+    def _fits(self) -> Array:
+        """Share that each hypothesis explains of what the right place should, (H,)."""
+        return np.minimum(self._known.shares_explained / self._usual, 1.0)
+
+    @property
+    def _fresh(self) -> int:
+        return max(1, round(_FRESH_SHARE * self.config.samples))
+
+    def _draw(self, count: int) -> Array:
+        """Samples (N, 3) of all poses at which the robot can stand."""
+        places = self.places
+        cells = places.standing[self._rng.integers(len(places.standing), size=count)]
+        at = places.frame.centres_of(cells.astype(np.int64))
+        at += self._rng.uniform(-0.5, 0.5, at.shape) * places.frame.resolution
+        return np.column_stack([at, self._rng.uniform(-np.pi, np.pi, count)])
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether one place alone is left for some looks in a row, and has explained enough.
+
+        Enough of the looks since it turned up: the less it explains, the later it turned up, and
+        the more places of this map have looked alike, the more; a place in a map of another
+        building may look alike for a while.
+        """
+        if self._convinced < self.config.sure_looks:
+            return False
+        best = self._known.best()
+        age = float(self._known.ages[best])
+        missing = 1.0 - float(self._fits[best])
+        rough = 1.0 - self._usual
+        varies = min(max(_WORTHLESS_TIMES * rough, _LEAST_WORTHLESS), _MOST_WORTHLESS)
+        needed = _SURE_LOOKS + _SURE_LOOKS_CROWD * math.log(self._crowd)
+        # Bare walls explain the same share everywhere, at wrong places, too: there it takes more of
+        # them.
+        needed *= _MOST_WORTHLESS / varies
+        needed += _SURE_LOOKS_LATE * max(self._overview - age, 0.0)
+        return age * (1.0 - missing / (varies + _WORTHLESS_ROUGH * rough)) >= needed
+
+    def _speaks_for_one(self) -> bool:
+        known = self._known
+        config = self.config
+        if not len(known):
+            return False
+        best = known.best()
+        variance = float(np.linalg.eigvalsh(known.covariances[best][:2, :2])[-1])
+        sigma_m = math.sqrt(max(variance, 0.0))
+        return (
+            float(known.weights[best]) >= config.sure_share
+            and float(self._fits[best]) >= config.least_explained
+            and sigma_m <= config.sure_sigma_m
+            and math.sqrt(max(float(known.covariances[best][2, 2]), 0.0)) <= config.sure_sigma_rad
+        )
+
+    def _lasting(self) -> NDArray[np.bool_]:
+        """Hypotheses (H,) that explain enough, and for some time where much has been seen."""
+        known = self._known
+        enough = self._fits >= self.config.least_explained
+        if self._overview < _MANY_LOOKS:
+            return enough
+        least_age = min(_LASTING_SHARE * self._overview, _LASTING_LOOKS)
+        return np.asarray(enough & (known.ages >= least_age))
+
+    def _waiting(self, reason: str) -> Result:
+        return Result(State.WAITING, reason, ())
+
+    def _result(self, T_odom_base: Array) -> Result:
+        known = self._known
+        if not len(known):
+            return Result(State.SEARCHING, 'the scans show too little to tell places apart', ())
+        motion = np.zeros(3) if self._T_look is None else se2.between(self._T_look, T_odom_base)
+        poses = moved(known.poses, motion)
+        weights = known.weights
+        shares = known.shares_explained
+        order = np.lexsort((-shares, -known.log_weights))
+        hypotheses = tuple(
+            Hypothesis(poses[k], known.covariances[k], float(weights[k]), float(shares[k]))
+            for k in order.tolist()
+        )
+        best = hypotheses[0]
+        if self.is_sure:
+            reason = f'one place explains {best.explained:.0%} of what was seen'
+            return Result(State.LOCALIZED, reason, hypotheses)
+        if self._way_m >= self.config.foreign_way_m and not self._lasting().any():
+            share = self.config.least_explained * self._usual
+            reason = f'no place explains {share:.0%} of what was seen for long'
+            return Result(State.NOT_IN_MAP, reason, hypotheses)
+        likely = int((weights > 0.05 * weights.max()).sum())
+        if likely > 1:
+            return Result(State.AMBIGUOUS, f'{likely} places explain what was seen', hypotheses)
+        reason = f'one place, not yet sure: {best.explained:.0%} explained'
+        return Result(State.SEARCHING, reason, hypotheses)

@@ -1,0 +1,323 @@
+"""The places where the robot may be, each with the samples round it and the evidence for it."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.places.likelihood import LOG_ODDS_A_BEAM, SILENT_COUNTS
+from thinmap_ros.core.places.search import distinct_indices, moved
+from thinmap_ros.core.se2 import Array
+
+# Shares of the beams that fall to either side at edges: by chance, and, as the cells of the map
+# lie, always.
+_EDGE_SHARE = 0.05
+_LASTING_SHARE = 0.01
+_SIGMAS = 3.0
+# Now and then a whole look tells nonsense (someone stands in the way, a door has moved): no look
+# settles the matter.
+_MOST_A_LOOK = 14.0  # beams
+_LEAST_LOG_WEIGHT = -14.0
+_MOST = 400
+_SAME_M = 0.3
+_SAME_RAD = 0.15
+_LEAST_ASKED = 0.6  # share of the beams
+# Of those this near to each other one is kept: the place may be anywhere between.
+_NEW_SIGMA_M = 0.5 * _SAME_M
+_NEW_SIGMA_RAD = 0.5 * _SAME_RAD
+_MEMORY = 0.85  # of what was explained, from one independent look to the next
+
+
+def missed_beams(judged: tuple[Array, Array], beams: int) -> Array:
+    """Beams of a look that are not explained, more than by the best one, (N,).
+
+    judged: of so many beams, how many the map explains, and of how many it says nothing, (N,) each.
+    """
+    missing = beams - judged[0] - SILENT_COUNTS * judged[1]
+    return np.asarray(np.minimum(missing - missing.min(initial=np.inf), _MOST_A_LOOK))
+
+
+def allowed_beams(beams: Array) -> Array:
+    """How many of so many beams, over all looks, one place may explain more than its double."""
+    spread = np.sqrt(beams * _EDGE_SHARE * (1.0 - _EDGE_SHARE))
+    return np.asarray(_SIGMAS * spread + _LASTING_SHARE * beams)
+
+
+@dataclass(eq=False)
+class Hypotheses:
+    """Places of the robot as arrays over hypotheses (H); samples (N, 3) and owners (N,), in order.
+
+    poses (H, 3); priors (H,): log odds of each from the beginning; missed, compared (H,): beams
+    that it did not explain while the best one did, and of how many; covariances (H, 3, 3);
+    ages (H,): independent looks since each was found; explained, asked, beams (H,): sums over looks
+    of the beams that the map explains, of those it says something about, and of all; older ones
+    count less.
+    """
+
+    poses: Array
+    priors: Array
+    missed: Array
+    compared: Array
+    covariances: Array
+    ages: Array
+    explained: Array
+    asked: Array
+    beams: Array
+    samples: Array
+    owners: NDArray[np.int64]
+
+    @staticmethod
+    def none() -> 'Hypotheses':
+        """No hypothesis."""
+        empty = np.empty(0)
+        covariances = np.empty((0, 3, 3))
+        poses = np.empty((0, 3))
+        samples = np.empty((0, 3))
+        owners = np.empty(0, dtype=np.int64)
+        return Hypotheses(
+            poses, empty, empty, empty, covariances, empty, empty, empty, empty, samples, owners
+        )
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    @property
+    def are_too_many(self) -> bool:
+        """Whether there may be more places than can be kept."""
+        return len(self) == _MOST
+
+    @property
+    def log_weights(self) -> Array:
+        """Log odds (H,), the best one 0.
+
+        Differences that chance brings about at edges count for nothing, however often they come:
+        two rooms that look the same stay equally likely. What is allowed for chance grows with the
+        root of the looks, what a place that is not the right one misses grows with the looks.
+        """
+        if not len(self):
+            return np.empty(0)
+        best = int(self.missed.argmin())
+        allowed = allowed_beams(np.minimum(self.compared, self.compared[best]))
+        beyond = np.maximum(self.missed - self.missed[best] - allowed, 0.0)
+        logs = self.priors - LOG_ODDS_A_BEAM * beyond
+        return np.asarray(logs - logs.max())
+
+    @property
+    def weights(self) -> Array:
+        """Probability of each, given that one of them is right, (H,)."""
+        odds = np.exp(self.log_weights)
+        return np.asarray(odds / max(float(odds.sum()), 1e-300))
+
+    @property
+    def shares_explained(self) -> Array:
+        """Share (H,) of the beams of its looks that each explains.
+
+        Only beams that the map says something about count.
+        """
+        # Where that are few, they prove little.
+        asked = np.maximum(self.asked, _LEAST_ASKED * self.beams)
+        return np.asarray(self.explained / np.maximum(asked, 1e-9))
+
+    def move(self, motion: Array, noise: tuple[float, float], rng: np.random.Generator) -> None:
+        """Move all by odometry (3,), robot frame; samples with noise: 1 sigma, m and rad."""
+        self.poses = moved(self.poses, motion)
+        self.samples = moved(self.samples, motion)
+        spread = np.array([noise[0], noise[0], noise[1]])
+        self.samples += rng.normal(size=self.samples.shape) * spread
+        self.covariances = self.covariances + np.diag(spread**2)
+
+    def take_evidence(self, judged: tuple[Array, Array], beams: int, novelty: float) -> None:
+        """Take in a look: what each makes of so many beams (see missed_beams).
+
+        novelty: how much of a new look it is.
+        """
+        self.missed = self.missed + novelty * missed_beams(judged, beams)
+        self.compared = self.compared + novelty * beams
+        fade = _MEMORY**novelty
+        self.explained = fade * self.explained + novelty * judged[0]
+        self.asked = fade * self.asked + novelty * (beams - judged[1])
+        self.beams = fade * self.beams + novelty * beams
+        self.ages = self.ages + novelty
+
+    def add(
+        self, poses: Array, prior: float, missed: Array, judged: tuple[Array, Array], beams: float
+    ) -> None:
+        """Take up new ones (N, 3).
+
+        prior: log odds against those that are known; judged: what they make of so many beams of
+        earlier looks, and missed: how many of these they missed more than the best of the known
+        ones, (N,) each.
+        """
+        count = len(poses)
+        covariance = np.diag([_NEW_SIGMA_M**2, _NEW_SIGMA_M**2, _NEW_SIGMA_RAD**2])
+        fresh = np.broadcast_to(covariance, (count, 3, 3))
+        base = float(self.missed.min()) if len(self) else 0.0
+        for name, values in (
+            ('poses', poses),
+            ('priors', np.full(count, prior)),
+            ('missed', base + missed),
+            ('compared', np.full(count, beams)),
+            ('covariances', fresh),
+            ('ages', np.zeros(count)),
+            ('explained', judged[0]),
+            ('asked', beams - judged[1]),
+            ('beams', np.full(count, beams)),
+        ):
+            setattr(self, name, np.concatenate([getattr(self, name), values]))
+
+    def prune(self) -> None:
+        """Drop what is out of the question, and of what has come together all but the likeliest."""
+        logs = self.log_weights
+        order = np.lexsort((self.missed, -logs))
+        order = order[logs[order] > _LEAST_LOG_WEIGHT]
+        kept = order[distinct_indices(self.poses[order], _SAME_M, _SAME_RAD, _MOST)]
+        if len(kept) == len(self) == int(self.owners.max(initial=-1)) + 1:
+            return
+        renumbered = np.full(len(self.poses), -1)
+        renumbered[kept] = np.arange(len(kept))
+        names = ('poses', 'priors', 'missed', 'compared', 'covariances', 'ages')
+        for name in (*names, 'explained', 'asked', 'beams'):
+            setattr(self, name, getattr(self, name)[kept])
+        owners = renumbered[self.owners]
+        order = np.argsort(owners, kind='stable')[int((owners < 0).sum()) :]
+        self.samples = self.samples[order]
+        self.owners = owners[order]
+
+    def some_samples(self, total: int) -> Array:
+        """Some of the samples of each, as many for all: (H, K, 3).
+
+        Those of one without any are its pose.
+        """
+        count = max(1, total // len(self))
+        bounds = np.searchsorted(self.owners, np.arange(len(self) + 1))
+        sizes = np.diff(bounds)
+        picks = bounds[:-1, None] + np.arange(count) * sizes[:, None] // count
+        some = self.samples[np.minimum(picks, len(self.samples) - 1)]
+        return np.where(sizes[:, None, None] > 0, some, self.poses[:, None])
+
+    def best_samples(self, log_likelihoods: Array) -> Array:
+        """Of the samples of each, the one with the highest log likelihood (N,).
+
+        Its pose where it has none: (H, 3).
+        """
+        best = self.poses.copy()
+        order = np.lexsort((log_likelihoods, self.owners))
+        last = np.flatnonzero(np.diff(self.owners, append=-1))
+        best[self.owners[last]] = self.samples[order[last]]
+        return best
+
+    def weigh(self, log_likelihoods: Array) -> None:
+        """Mean and covariance of the samples of each, weighted by their log likelihoods (N,)."""
+        bounds = np.searchsorted(self.owners, np.arange(len(self) + 1))
+        _moments(self.samples, log_likelihoods, bounds, self.poses, self.covariances)
+
+    def resample(self, log_likelihoods: Array | None, total: int, rng: np.random.Generator) -> None:
+        """As many samples for each, drawn from its own by weight.
+
+        New ones get theirs from their covariance.
+        """
+        count = len(self)
+        if not count:
+            return
+        quotas = np.full(count, total // count)
+        quotas[: total - int(quotas.sum())] += 1
+        bounds = np.searchsorted(self.owners, np.arange(count + 1))
+        if log_likelihoods is None:
+            log_likelihoods = np.zeros(len(self.samples))
+        spreads = np.asarray(np.linalg.cholesky(self.covariances + np.diag([1e-8, 1e-8, 1e-8])))
+        self.samples = _resampled(
+            self.samples,
+            log_likelihoods,
+            bounds,
+            quotas,
+            self.poses,
+            spreads,
+            rng.random(count),
+            rng.normal(size=(total, 3)),
+        )
+        self.owners = np.repeat(np.arange(count), quotas)
+
+    def best(self) -> int:
+        """Number of the likeliest one; of equals that which explains most."""
+        return int(np.lexsort((-self.shares_explained, -self.log_weights))[0])
+
+
+@kernel
+def _moments(
+    samples: Array, logs: Array, bounds: NDArray[np.int64], poses: Array, covariances: Array
+) -> None:
+    """Covariances (H, 3, 3) of weighted samples about their mean.
+
+    Those without samples keep theirs.
+    """
+    for h in range(len(poses)):
+        low = bounds[h]
+        high = bounds[h + 1]
+        if low == high:
+            continue
+        top = logs[low:high].max()
+        total = 0.0
+        squares = 0.0
+        mean = np.zeros(3)
+        second = np.zeros((3, 3))
+        for k in range(low, high):
+            weight = math.exp(logs[k] - top)
+            turn = math.pi - (math.pi - (samples[k, 2] - poses[h, 2])) % (2.0 * math.pi)
+            off = np.array([samples[k, 0] - poses[h, 0], samples[k, 1] - poses[h, 1], turn])
+            total = total + weight
+            squares = squares + weight * weight
+            for i in range(3):
+                mean[i] += weight * off[i]
+                for j in range(3):
+                    second[i, j] += weight * off[i] * off[j]
+        for i in range(3):
+            for j in range(3):
+                covariances[h, i, j] = second[i, j] / total - mean[i] * mean[j] / total**2
+
+
+@kernel
+def _resampled(
+    samples: Array,
+    logs: Array,
+    bounds: NDArray[np.int64],
+    quotas: NDArray[np.int64],
+    poses: Array,
+    spreads: Array,
+    starts: Array,
+    normal: Array,
+) -> Array:
+    """Samples drawn by weight within each group, a comb for each.
+
+    Groups without any are drawn round their poses.
+    spreads (H, 3, 3): lower triangular; starts (H,): in [0, 1); normal (N, 3): standard normal
+    numbers.
+    """
+    result = np.empty((quotas.sum(), 3))
+    at = 0
+    for h in range(len(poses)):
+        low = bounds[h]
+        high = bounds[h + 1]
+        if low == high:
+            for _ in range(quotas[h]):
+                for i in range(3):
+                    result[at, i] = poses[h, i]
+                    for j in range(i + 1):
+                        result[at, i] += spreads[h, i, j] * normal[at, j]
+                at += 1
+            continue
+        top = logs[low:high].max()
+        total = 0.0
+        for k in range(low, high):
+            total += math.exp(logs[k] - top)
+        k = low
+        sum_so_far = math.exp(logs[low] - top)
+        for n in range(quotas[h]):
+            mark = (n + starts[h]) / quotas[h] * total
+            while sum_so_far < mark and k < high - 1:
+                k += 1
+                sum_so_far += math.exp(logs[k] - top)
+            result[at] = samples[k]
+            at += 1
+    return result

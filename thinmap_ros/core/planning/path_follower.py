@@ -1,0 +1,181 @@
+"""Path -> speed and turn rate for a differential drive.
+
+It is pure pursuit, with turns on the spot where the path bends hard.
+
+Source: Coulter, "Implementation of the pure pursuit path tracking algorithm", 1992.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.se2 import Array, wrap
+
+# Where it is narrow: the shortest look ahead, how it grows with the room to spare, and a speed that
+# is always allowed.
+_SHORTEST_M = 0.1
+_SPARE_FACTOR = 2.0
+_SLOWEST_M_S = 0.1
+
+
+@dataclass(frozen=True)
+class FollowerConfig(Config):
+    """Limits of the drive, and how closely a path is followed."""
+
+    max_speed_m_s: float = parameter(0.2, 'speed limit, m/s', low=0.01, high=5.0)
+    max_turn_rad_s: float = parameter(1.0, 'turn rate limit, rad/s', low=0.05, high=10.0)
+    max_acceleration_m_s2: float = parameter(0.4, 'acceleration limit, m/s^2', low=0.01, high=10.0)
+    max_turn_acceleration_rad_s2: float = parameter(
+        2.5, 'turn acceleration limit, rad/s^2', low=0.05, high=20.0
+    )
+    lookahead_m: float = parameter(
+        0.35, 'distance of the point on the path that is steered for, m', low=0.05, high=5.0
+    )
+    lookahead_s: float = parameter(
+        0.8, 'time ahead of the point that is steered for, s', low=0.0, high=10.0
+    )
+    stray_m: float = parameter(
+        0.05, 'corners of the path are cut by no more than this, m', low=0.0, high=1.0
+    )
+    turn_in_place_rad: float = parameter(
+        0.9, 'heading error from which on the robot turns on the spot, rad', low=0.1, high=3.0
+    )
+
+
+class Follower:
+    """Follows one path after the other.
+
+    Remembers the last command, so that the acceleration limits hold.
+    """
+
+    def __init__(self, config: FollowerConfig) -> None:
+        self.config = config
+        self.v = 0.0
+        self.w = 0.0
+        self._turning = False
+
+    def command(
+        self, T_map_base: Array, path: Array, dt_s: float, spare_m: float = math.inf
+    ) -> tuple[float, float]:
+        """Speed (m/s) and turn rate (rad/s) for the next dt_s along a path (K, 2) to a stop.
+
+        spare_m: room to either side of the path; where there is little, the robot keeps to it the
+        more closely.
+        """
+        config = self.config
+        narrow = _SHORTEST_M + _SPARE_FACTOR * max(spare_m, 0.0)
+        reach = min(max(config.lookahead_m, config.lookahead_s * self.v), narrow)
+        x, y, theta = T_map_base.tolist()
+        ahead_x, ahead_y, rest_m = _point_ahead(path, x, y, reach, config.stray_m)
+        dx = ahead_x - x
+        dy = ahead_y - y
+        error = wrap(math.atan2(dy, dx) - theta) if dx or dy else 0.0
+        # Once turning, on until the path is nearly straight ahead: no flickering at the limit.
+        least = 0.3 * config.turn_in_place_rad if self._turning else config.turn_in_place_rad
+        self._turning = abs(error) > least
+        if self._turning:
+            return self._limited(0.0, self._turn_for(error, dt_s), dt_s)
+        v = min(config.max_speed_m_s, math.sqrt(2.0 * config.max_acceleration_m_s2 * rest_m))
+        v = min(v, max(narrow / max(config.lookahead_s, 1e-9), _SLOWEST_M_S))
+        curvature = 2.0 * math.sin(error) / max(math.hypot(dx, dy), 0.05)
+        if abs(curvature) * v > config.max_turn_rad_s:
+            v = config.max_turn_rad_s / abs(curvature)
+        return self._limited(v, v * curvature, dt_s)
+
+    def turn_to(self, T_map_base: Array, heading_rad: float, dt_s: float) -> tuple[float, float]:
+        """Speed and turn rate for the next dt_s to stop, then turn to a heading, map frame."""
+        if self.v > 0.0:
+            return self.stop(dt_s)
+        error = wrap(heading_rad - float(T_map_base[2]))
+        return self._limited(0.0, self._turn_for(error, dt_s), dt_s)
+
+    def stop(self, dt_s: float) -> tuple[float, float]:
+        """Speed and turn rate for the next dt_s to come to rest on the arc that is being driven.
+
+        It does so within the limits. That arc was looked at when it was entered, up to where the
+        robot would stand; any other may end in a wall.
+        """
+        v = max(self.v - self.config.max_acceleration_m_s2 * dt_s, 0.0)
+        return self._limited(v, self.w * v / self.v if self.v > 0.0 else 0.0, dt_s)
+
+    def slowed(self, v: float, w: float) -> tuple[float, float]:
+        """Note that a command was made slower than the limits allow, for something right ahead."""
+        self.v = v
+        self.w = w
+        return v, w
+
+    def _turn_for(self, error: float, dt_s: float) -> float:
+        """Turn rate that can still be braked to rest at the wished heading."""
+        braking = math.sqrt(2.0 * 0.7 * self.config.max_turn_acceleration_rad_s2 * abs(error))
+        return math.copysign(min(braking, self.config.max_turn_rad_s, abs(error) / dt_s), error)
+
+    def _limited(self, v: float, w: float, dt_s: float) -> tuple[float, float]:
+        config = self.config
+        w = min(max(w, -config.max_turn_rad_s), config.max_turn_rad_s)
+        self.v = max(_towards(self.v, v, config.max_acceleration_m_s2 * dt_s), 0.0)
+        self.w = _towards(self.w, w, config.max_turn_acceleration_rad_s2 * dt_s)
+        return self.v, self.w
+
+
+def _towards(value: float, goal: float, change: float) -> float:
+    return min(max(goal, value - change), value + change)
+
+
+@kernel
+def nearest_point(path: Array, x: float, y: float) -> int:
+    """Index of the point of a path (K, 2) nearest to (x, y); the first of equally near ones."""
+    best = np.inf
+    nearest = 0
+    for k in range(path.shape[0]):
+        squared = (path[k, 0] - x) ** 2 + (path[k, 1] - y) ** 2
+        if squared < best:
+            best = squared
+            nearest = k
+    return nearest
+
+
+@kernel
+def length_from(path: Array, first: int) -> float:
+    """Length of a path (K, 2) from one of its points to its end."""
+    length = 0.0
+    for k in range(first + 1, path.shape[0]):
+        length += math.hypot(path[k, 0] - path[k - 1, 0], path[k, 1] - path[k - 1, 1])
+    return length
+
+
+@kernel
+def _point_ahead(
+    path: Array, x: float, y: float, reach_m: float, stray_m: float
+) -> tuple[float, float, float]:
+    """Point of a path (K, 2) to steer for from (x, y), and the length left from the nearest one, m.
+
+    It lies up to reach_m on along the path, and less far where the straight way to it would leave
+    the path by more than stray_m: corners are not cut.
+    """
+    first = nearest_point(path, x, y)
+    end = path.shape[0] - 1
+    left_m = max(length_from(path, first), math.hypot(path[end, 0] - x, path[end, 1] - y))
+    last = first
+    along = 0.0
+    while last < end and along < reach_m:
+        last += 1
+        along += math.hypot(path[last, 0] - path[last - 1, 0], path[last, 1] - path[last - 1, 1])
+    allowed = stray_m + math.hypot(path[first, 0] - x, path[first, 1] - y)
+    while last > first + 1 and _stray(path, first, last, x, y) > allowed:
+        last -= 1
+    return path[last, 0], path[last, 1], left_m
+
+
+@kernel
+def _stray(path: Array, first: int, last: int, x: float, y: float) -> float:
+    """Largest distance, m, of path points first to last from the line from (x, y) to the last."""
+    dx = path[last, 0] - x
+    dy = path[last, 1] - y
+    length = max(math.hypot(dx, dy), 1e-9)
+    most = 0.0
+    for k in range(first, last):
+        most = max(most, abs((path[k, 0] - x) * dy - (path[k, 1] - y) * dx))
+    return most / length

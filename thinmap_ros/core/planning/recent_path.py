@@ -1,0 +1,86 @@
+"""Where the robot has been of late.
+
+It can go back there, even where a speck in the map makes a passage too narrow.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.se2 import Array
+
+_STEP_M = 0.03
+_JUMP_M = 0.5
+_LONGEST = 1300  # points
+
+
+class Trail:
+    """The last of the robot's way.
+
+    A pose that jumps, as where the map was corrected, begins it anew.
+    """
+
+    def __init__(self) -> None:
+        # Twice the room: moved to the front only when it is full.
+        self._points = np.empty((2 * _LONGEST, 2))
+        self._begin = self._end = 0
+
+    def add(self, T_map_base: Array) -> None:
+        """Hear where the robot is, (3,); what is not finite is passed over."""
+        if not se2.is_finite(T_map_base):
+            return
+        here = float(T_map_base[0]), float(T_map_base[1])
+        away = math.dist(here, self._points[self._end - 1]) if self._end > self._begin else math.inf
+        if away > _JUMP_M:
+            self._begin = self._end = 0
+        if away >= _STEP_M:
+            self._append(here)
+
+    def cells(self, frame: GridFrame, shape: tuple[int, ...]) -> NDArray[np.int64]:
+        """Cells (N, 2) of a map (H, W) over which it led, each joined to the next by an edge."""
+        if self._end == self._begin:
+            return np.empty((0, 2), dtype=np.int64)
+        return np.asarray(
+            _joined(frame.cells_of(self._points[self._begin : self._end]), shape[0], shape[1])
+        )
+
+    def _append(self, here: tuple[float, float]) -> None:
+        if self._end == len(self._points):
+            self._points[: _LONGEST - 1] = self._points[self._end - _LONGEST + 1 :]
+            self._begin = 0
+            self._end = _LONGEST - 1
+        self._points[self._end] = here
+        self._end += 1
+        self._begin = max(self._begin, self._end - _LONGEST)
+
+
+@kernel
+def _joined(cells: NDArray[np.int64], rows: int, cols: int) -> NDArray[np.int64]:
+    """Cells (N, 2) and those between them, first along the column, then along the row.
+
+    Those outside the map are left out.
+    """
+    count = cells.shape[0]
+    for k in range(1, cells.shape[0]):
+        count += abs(cells[k, 0] - cells[k - 1, 0]) + abs(cells[k, 1] - cells[k - 1, 1])
+    found = np.empty((count, 2), dtype=np.int64)
+    row = cells[0, 0]
+    col = cells[0, 1]
+    used = 0
+    for k in range(cells.shape[0]):
+        while True:
+            if 0 <= row < rows and 0 <= col < cols:
+                found[used, 0] = row
+                found[used, 1] = col
+                used += 1
+            if row != cells[k, 0]:
+                row += 1 if cells[k, 0] > row else -1
+            elif col != cells[k, 1]:
+                col += 1 if cells[k, 1] > col else -1
+            else:
+                break
+    return found[:used].copy()

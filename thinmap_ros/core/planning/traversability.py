@@ -1,0 +1,148 @@
+"""Where a robot can stand, and to which of these places it can get."""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.topology.free_space import column_distance, standing_room
+
+Mask = NDArray[np.bool_]
+Cells = NDArray[np.int64]
+# Rows and columns of cells: first row, first column, row after the last, column after the last.
+Part = tuple[int, int, int, int]
+
+
+def standing_places(free: Mask, radius_m: float, resolution: float) -> Mask:
+    """Cells (H, W) in which the centre of a robot of a radius may be.
+
+    All that is not free counts as solid.
+    """
+    return standing_room(column_distance(free), radius_m / resolution)
+
+
+def renew_standing(
+    standing: Mask, free: Mask, part: Part, radius_m: float, resolution: float
+) -> None:
+    """Bring standing places (H, W) up to date where free cells have changed within a part.
+
+    See `standing_places`.
+    """
+    reach = math.ceil(radius_m / resolution) + 1
+    top = max(part[0] - reach, 0)
+    left = max(part[1] - reach, 0)
+    bottom = part[2] + reach
+    right = part[3] + reach
+    # As many cells again are read, so that the cut is no wall.
+    wide = free[max(top - reach, 0) : bottom + reach, max(left - reach, 0) : right + reach]
+    found = standing_places(np.ascontiguousarray(wide), radius_m, resolution)
+    row = top - max(top - reach, 0)
+    col = left - max(left - reach, 0)
+    renewed = standing[top:bottom, left:right]
+    renewed[:] = found[row : row + renewed.shape[0], col : col + renewed.shape[1]]
+
+
+def let_out(
+    standing: Mask,
+    free: Mask,
+    frame: GridFrame,
+    xy: tuple[float, float],
+    escape_m: float,
+    trail: Cells | None = None,
+) -> Mask:
+    """Cells (H, W) over which a robot that is at a point (m) may go.
+
+    These are its standing places, but where it stands too near to something it is let out over free
+    cells up to escape_m away, as a path would. trail: cells (N, 2) over which it came; over those
+    that are free it can go back.
+    """
+    ways = standing.copy()
+    if trail is not None:
+        ways[trail[:, 0], trail[:, 1]] |= free[trail[:, 0], trail[:, 1]]
+    row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
+    if not (0 <= row < free.shape[0] and 0 <= col < free.shape[1]) or standing[row, col]:
+        return ways
+    part, within = disc(ways, (row, col), escape_m / frame.resolution)
+    ways[part] |= within & free[part]
+    ways[row, col] = True
+    return ways
+
+
+def reached_from(allowed: Mask, start: tuple[int, int]) -> Mask:
+    """Allowed cells (H, W) to which the wave can get from a start (row, col).
+
+    It goes over edges of cells, not corners. None from a start beyond the mask.
+    """
+    return np.asarray(_reached_from(allowed, start[0], start[1]))
+
+
+def nearest_true(allowed: Mask, cell: tuple[int, int], reach: float) -> tuple[int, int] | None:
+    """The true cell nearest to one that lies anywhere, if there is one within `reach` cells."""
+    whole = math.floor(reach)
+    top = max(cell[0] - whole, 0)
+    left = max(cell[1] - whole, 0)
+    part = allowed[top : max(cell[0] + whole + 1, 0), left : max(cell[1] + whole + 1, 0)]
+    near = np.argwhere(part) + (top, left)
+    squared = np.square(near - cell).sum(axis=1)
+    if near.size == 0 or squared.min() > reach * reach:
+        return None
+    best = near[squared.argmin()]
+    return int(best[0]), int(best[1])
+
+
+@kernel
+def are_near(allowed: Mask, cells: NDArray[np.int64], reach: float) -> Mask:
+    """Whether a true cell of a mask (H, W) lies within `reach` cells of each cell (N, 2), (N,)."""
+    whole = int(math.floor(reach))
+    near = np.zeros(cells.shape[0], dtype=np.bool_)
+    for i in range(cells.shape[0]):
+        row = cells[i, 0]
+        col = cells[i, 1]
+        for r in range(max(row - whole, 0), min(row + whole + 1, allowed.shape[0])):
+            for c in range(max(col - whole, 0), min(col + whole + 1, allowed.shape[1])):
+                near[i] |= allowed[r, c] and (r - row) ** 2 + (c - col) ** 2 <= reach * reach
+    return near
+
+
+def disc(
+    of: NDArray[Any], centre: tuple[int, int], reach: float
+) -> tuple[tuple[slice, slice], Mask]:
+    """The part of an array (H, W) round a cell, and which of its cells lie within reach."""
+    whole = math.ceil(reach)
+    rows = slice(max(centre[0] - whole, 0), min(centre[0] + whole + 1, of.shape[0]))
+    cols = slice(max(centre[1] - whole, 0), min(centre[1] + whole + 1, of.shape[1]))
+    row, col = np.ogrid[rows, cols]
+    return (rows, cols), np.asarray(np.hypot(row - centre[0], col - centre[1]) <= reach)
+
+
+@kernel
+def _reached_from(allowed: Mask, start_row: int, start_col: int) -> Mask:
+    rows = allowed.shape[0]
+    cols = allowed.shape[1] + 2
+    # An empty border saves the wave all questions about the rim.
+    left = np.zeros((rows + 2, cols), dtype=np.bool_)
+    left[1:-1, 1:-1] = allowed
+    found = np.zeros((rows + 2, cols), dtype=np.bool_)
+    if not (0 <= start_row < rows and 0 <= start_col < cols - 2):
+        return found[1:-1, 1:-1].copy()
+    flat = left.ravel()
+    reached = found.ravel()
+    stack = np.empty(flat.size, dtype=np.int64)
+    start = (start_row + 1) * cols + start_col + 1
+    stack[0] = start
+    count = int(flat[start])
+    reached[start] = flat[start]
+    flat[start] = False
+    while count > 0:
+        count -= 1
+        at = stack[count]
+        for to in (at - cols, at - 1, at + 1, at + cols):
+            if flat[to]:
+                flat[to] = False
+                reached[to] = True
+                stack[count] = to
+                count += 1
+    return found[1:-1, 1:-1].copy()

@@ -1,0 +1,289 @@
+"""Keyframes: scans that are kept along the path, and what their poses are known to.
+
+Where the robot comes back to what it has mapped before, and both agree, an earlier keyframe is
+reused: their number follows the area, not the time.
+Source: Johannsson, Kaess, Fallon and Leonard, "Temporally scalable visual SLAM using a reduced pose
+graph", 2013.
+"""
+
+import heapq
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.grid.spatial_hash import Buckets
+from thinmap_ros.core.jit import inlined, kernel
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.graph.pose_graph import Edge
+from thinmap_ros.core.slam.graph.trajectory import AnchoredPoses
+from thinmap_ros.core.slam.wall_compass import Heading
+
+_BUCKET_M = 4.0
+# Of the direction of the walls in the map, which its first scans tell, as seen from the start.
+_MAP_VARIANCE = 0.005**2
+_RADIAN_M = 1.0  # a radian of turn makes two scans as different as so many metres
+
+
+@dataclass(frozen=True)
+class KeyframeConfig(Config):
+    """Parameters of keyframes."""
+
+    keyframe_m: float = parameter(
+        0.7, 'a scan is kept after a path of this length, m', low=0.1, high=10.0
+    )
+    keyframe_rad: float = parameter(0.7, 'or after a turn by this, rad', low=0.1, high=3.2)
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframe:
+    """A scan that is kept, its surface points (N, 5), robot frame, and its pose (3,).
+
+    path_m: length of the path when the robot was there last; covariance (3, 3): of the pose, map
+    frame; submap: number of the local map that it is part of; heading: in the map, by the walls'
+    directions, where they tell it.
+    """
+
+    scan: Scan
+    points: Array
+    T_map_base: Array
+    path_m: float
+    covariance: Array
+    submap: int
+    heading: Heading | None = None
+
+
+class Keyframes:
+    """The keyframes, the steps between them, and the path that is told by them."""
+
+    def __init__(self, config: KeyframeConfig) -> None:
+        self._config = config
+        self.frames: list[Keyframe] = []
+        self.steps: list[Edge] = []  # to each keyframe but the first, from its anchor
+        self._buckets = Buckets(_BUCKET_M)
+        self._path = AnchoredPoses()
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    @property
+    def anchor(self) -> int:
+        """Number of the keyframe that the robot was at last; -1 before the first."""
+        return self._path.last
+
+    def keep(self, frame: Keyframe, step_covariance: Array) -> int:
+        """Make a scan a keyframe; returns its number.
+
+        step_covariance (3, 3): of its pose seen from the anchor's, in the frame of the anchor.
+        """
+        number = len(self.frames)
+        if number:
+            anchor = self.anchor
+            T = se2.between(self.frames[anchor].T_map_base, frame.T_map_base)
+            self.steps.append(Edge(anchor, number, T, inverse(step_covariance), False))
+        self.frames.append(frame)
+        self._buckets.put(number, float(frame.T_map_base[0]), float(frame.T_map_base[1]))
+        self._path.add(frame.scan.stamp_ns, number, np.zeros(3))
+        return number
+
+    def reuse(self, number: int, frame: Keyframe) -> None:
+        """Have an earlier keyframe stand for a scan that sees about the same."""
+        earlier = self.frames[number]
+        self.frames[number] = replace(earlier, path_m=frame.path_m)
+        offset = se2.between(earlier.T_map_base, frame.T_map_base)
+        self._path.add(frame.scan.stamp_ns, number, offset)
+
+    @property
+    def headings(self) -> list[Edge]:
+        """Measured headings, as edges from the first keyframe, which has that of the map."""
+        return [
+            _heading_edge(number, frame.heading, float(self.frames[0].T_map_base[2]))
+            for number, frame in enumerate(self.frames)
+            if number and frame.heading is not None
+        ]
+
+    def covariances_from(self, root: int, poses: Array, edges: list[Edge]) -> Array:
+        """Covariance (N, 3, 3) of each pose (N, 3) as seen from one of them, map frame.
+
+        edges: what ties keyframes besides the steps.
+        """
+        variances = np.array(
+            [
+                heading_variance(frame.heading, T)
+                for frame, T in zip(self.frames, poses, strict=False)
+            ]
+        )
+        variances[0] = 0.0
+        return covariances_from(root, poses, self.steps + edges, variances[root] + variances)
+
+    def poses(self) -> Array:
+        """Poses (N, 3) of the keyframes."""
+        return np.array([frame.T_map_base for frame in self.frames]).reshape(-1, 3)
+
+    def move(self, poses: Array, edges: list[Edge]) -> None:
+        """The first (N,) keyframes are at poses (N, 3); `edges` tie them besides the steps."""
+        covariances = self.covariances_from(0, poses, edges)
+        for number, T in enumerate(poses):
+            self.frames[number] = replace(
+                self.frames[number], T_map_base=T, covariance=covariances[number]
+            )
+            self._buckets.put(number, float(T[0]), float(T[1]))
+
+    def path(self) -> tuple[NDArray[np.int64], Array]:
+        """Stamps (N,) and poses (N, 3) of the scans that are keyframes, or for which one stands."""
+        return self._path.stamps_ns, self._path.poses(self.poses())
+
+    def are_apart(self, T_a: Array, T_b: Array) -> bool:
+        """Whether two poses (3,) do not see about the same."""
+        x, y, turn = se2.between(T_a, T_b).tolist()
+        config = self._config
+        return math.hypot(x, y) >= config.keyframe_m or abs(turn) >= config.keyframe_rad
+
+    def near(self, T_map_base: Array, reach_m: float) -> list[int]:
+        """Keyframes within a reach of a pose (3,), and some that are farther."""
+        return self._buckets.near(float(T_map_base[0]), float(T_map_base[1]), reach_m)
+
+    def alike(self, T_map_base: Array) -> int | None:
+        """The keyframe that sees most nearly the same as one at a pose (3,), or None."""
+        near = self.near(T_map_base, self._config.keyframe_m)
+        near = [k for k in near if not self.are_apart(self.frames[k].T_map_base, T_map_base)]
+        if not near:
+            return None
+        return min(near, key=lambda k: unlike(self.frames[k].T_map_base, T_map_base))
+
+
+def unlike(T_a: Array, T_b: Array) -> float:
+    """How differently two poses (3,) see, in m."""
+    x, y, turn = se2.between(T_a, T_b).tolist()
+    return float(math.hypot(x, y) + _RADIAN_M * abs(turn))
+
+
+def carried(covariance: Array, lever: Array) -> Array:
+    """Covariance (3, 3) of a pose that is bound to another one of that covariance, map frame.
+
+    lever (2,): from the one to the other. Source: Smith, Self and Cheeseman, "Estimating uncertain
+    spatial relationships in robotics", 1990, compounding.
+    """
+    F = np.array([[1.0, 0.0, -lever[1]], [0.0, 1.0, lever[0]], [0.0, 0.0, 1.0]])
+    return np.asarray(F @ covariance @ F.T)
+
+
+def heading_variance(heading: Heading | None, T_map_base: Array) -> float:
+    """Variance of the heading of a pose (3,) by a measured one, from which it may differ."""
+    if heading is None:
+        return math.inf
+    off = float(se2.wrap(heading.yaw - float(T_map_base[2])))
+    return _MAP_VARIANCE + heading.variance + off**2
+
+
+def with_heading(covariance: Array, variance: float) -> Array:
+    """Covariance (3, 3) of a pose of which the heading is known to a variance by other means."""
+    if not math.isfinite(variance):
+        return covariance
+    gain = covariance[:, 2] / (covariance[2, 2] + variance)
+    return np.asarray(covariance - np.outer(gain, covariance[2]))
+
+
+def inverse(matrix: Array) -> Array:
+    """Information (3, 3) of a covariance, and the other way round."""
+    return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+
+
+def turned(covariance: Array, theta: float) -> Array:
+    """Covariance (3, 3) of a relative pose, turned from a frame at theta to that of the map."""
+    c = math.cos(theta)
+    s = math.sin(theta)
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray(R @ covariance @ R.T)
+
+
+def _heading_edge(number: int, heading: Heading, first: float) -> Edge:
+    information = np.zeros((3, 3))
+    information[2, 2] = 1.0 / (_MAP_VARIANCE + heading.variance)
+    return Edge(0, number, np.array([0.0, 0.0, heading.yaw - first]), information, True)
+
+
+def covariances_from(root: int, poses: Array, edges: list[Edge], heading_variances: Array) -> Array:
+    """Covariance (N, 3, 3) of each pose (N, 3) as seen from one of them, map frame.
+
+    Along the chain of edges that leaves it the least: an upper bound, as if there were no other
+    chain. Poses that no chain leads to are as uncertain as can be; edges to others are left out.
+    heading_variances (N,): of the heading of each, as seen from the root, where it was measured;
+    infinite elsewhere.
+    """
+    edges = [edge for edge in edges if edge.b < len(poses)]
+    a = np.array([edge.a for edge in edges], dtype=np.int64)
+    b = np.array([edge.b for edge in edges], dtype=np.int64)
+    covariances = np.linalg.inv(np.array([edge.information for edge in edges]).reshape(-1, 3, 3))
+    c = np.cos(poses[a, 2])
+    s = np.sin(poses[a, 2])
+    R = np.zeros((len(edges), 3, 3))
+    R[:, 0, 0] = c
+    R[:, 0, 1] = -s
+    R[:, 1, 0] = s
+    R[:, 1, 1] = c
+    R[:, 2, 2] = 1.0
+    order = np.argsort(np.concatenate([a, b]), kind='stable')
+    first = np.searchsorted(np.concatenate([a, b])[order], np.arange(len(poses) + 1))
+    own = R @ covariances @ R.transpose(0, 2, 1)
+    found: Array = _covariances(root, poses, first, order, a, b, own, heading_variances)
+    return found
+
+
+@inlined
+def _carry(covariance: Array, x: float, y: float) -> Array:
+    """`carried` by a lever (x, y)."""
+    F = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
+    carried_there: Array = F @ covariance @ F.T
+    return carried_there
+
+
+@kernel
+def _covariances(
+    root: int,
+    poses: Array,
+    first: NDArray[np.int64],
+    order: NDArray[np.int64],
+    a: NDArray[np.int64],
+    b: NDArray[np.int64],
+    own: Array,
+    heading_variances: Array,
+) -> Array:
+    """Dijkstra's algorithm, by the variance of the position.
+
+    Ties of pose k are order[first[k]] to order[first[k + 1]]; from M on they are those edges the
+    other way.
+    """
+    found = np.full((len(poses), 3, 3), np.inf)
+    best = np.full(len(poses), np.inf)
+    done = np.zeros(len(poses), dtype=np.bool_)
+    found[root] = 0.0
+    best[root] = 0.0
+    heap = [(0.0, root)]
+    while len(heap):
+        _, k = heapq.heappop(heap)
+        if done[k]:
+            continue
+        done[k] = True
+        for tie in order[first[k] : first[k + 1]]:
+            edge = tie % len(a)
+            other = b[edge] if tie < len(a) else a[edge]
+            if done[other]:
+                continue
+            x = poses[other, 0] - poses[k, 0]
+            y = poses[other, 1] - poses[k, 1]
+            # Against its direction the edge's error in heading acts at the far end.
+            step = own[edge] if tie < len(a) else _carry(own[edge], x, y)
+            new = _carry(found[k], x, y) + step
+            gain = new[:, 2] / (new[2, 2] + heading_variances[other])
+            new -= np.outer(gain, new[2])
+            variance = new[0, 0] + new[1, 1]
+            if variance < best[other]:
+                best[other] = variance
+                found[other] = new
+                heapq.heappush(heap, (variance, other))
+    return found

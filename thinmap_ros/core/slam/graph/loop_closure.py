@@ -1,0 +1,389 @@
+"""Loop closure: the robot is back where it has been, by another way.
+
+A new keyframe is matched with what earlier visits saw where it may be, as the covariance along the
+path says. Several matches that are consistent with each other make a loop; then the pose graph is
+optimized, one round a step.
+Source: Mangelson et al., "Pairwise consistent measurement set maximization for robust multi-robot
+map merging", 2018.
+"""
+
+import math
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.config import parameter
+from thinmap_ros.core.estimate import Correction
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.graph.keyframes import (
+    Keyframe,
+    KeyframeConfig,
+    Keyframes,
+    carried,
+    inverse,
+    turned,
+    unlike,
+)
+from thinmap_ros.core.slam.graph.pose_graph import Edge, optimized, rounds
+from thinmap_ros.core.slam.graph.submaps import AGAIN_M, Submaps
+from thinmap_ros.core.slam.matching.scan_matcher import Matcher
+
+_VISITS = 3  # earlier visits with which a keyframe is matched, at most
+_SIGMAS = 3.0
+_DRIFT = 0.005  # of the path: errors that repeat from step to step, which steps take to be chance
+_FARTHEST_M = 8.0  # of the uncertainty that is searched: places beyond need recognition
+_CHI2 = 11.34  # 99 % of three degrees of freedom
+_RECENT = 8  # matches among which consistent ones are looked for
+
+
+@dataclass(frozen=True)
+class LoopConfig(KeyframeConfig):
+    """Parameters of loop closure."""
+
+    loop_reach_m: float = parameter(
+        2.0, 'places nearer than this, and the uncertainty, are matched, m', low=0.1, high=20.0
+    )
+    loop_fit: float = parameter(
+        0.75, 'share of points that must lie on the walls of an earlier visit', low=0.0, high=1.0
+    )
+    loop_sigma_m: float = parameter(
+        0.05, 'uncertainty of a match of two visits, 1 sigma, m', low=0.001, high=1.0
+    )
+    loop_sigma_rad: float = parameter(
+        0.02, 'uncertainty of a match of two visits, 1 sigma, rad', low=0.001, high=1.0
+    )
+    loop_matches: int = parameter(5, 'consistent matches that make a loop', low=1, high=_RECENT)
+
+
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """Keyframe k is to be matched with keyframe j; its covariance (3, 3) as seen from there."""
+
+    j: int
+    k: int
+    covariance: Array
+
+
+class LoopClosure:
+    """The pose graph of the keyframes, and the search for edges that close loops."""
+
+    def __init__(self, config: LoopConfig, matcher: Matcher) -> None:
+        self.keyframes = Keyframes(config)
+        self.edges: list[Edge] = []
+        self._config = config
+        # By how much wheels may have slipped is part of the covariance along the graph.
+        self._matcher = Matcher(replace(matcher.config, slip_m=0.001, slip_rad=0.001))
+        self._jobs: deque[_Job] = deque()
+        self._pending: tuple[Keyframe, Array] | None = None
+        self._requested: deque[Edge] = deque(maxlen=_RECENT)
+        self._here: Keyframe | None = None  # the last of them, kept or not
+        self._is_strained = False  # whether a step, measured again, contradicts the poses
+        self._submaps = Submaps(matcher.config)
+        self._rounds: Iterator[Array] | None = None
+        self._before: Array = np.zeros((0, 3))
+        self._after: Array = np.zeros((0, 3))
+
+    def is_due(self, T_map_base: Array) -> bool:
+        """Whether a scan at a pose (3,) is to be the next keyframe."""
+        last = self._here
+        return last is None or self.keyframes.are_apart(last.T_map_base, T_map_base)
+
+    def path_m(self, T_map_base: Array) -> float:
+        """Length of the path up to a pose (3,), m, in straight lines between keyframes."""
+        last = self._here
+        if last is None:
+            return 0.0
+        return last.path_m + math.dist(last.T_map_base[:2], T_map_base[:2])
+
+    def add(self, frame: Keyframe, step_covariance: Array, jump: Array) -> None:
+        """Take in a keyframe that is due, with the covariance (3, 3) of the step from the anchor.
+
+        jump (3, 3): what comes on top where scans and motion contradicted each other on the way;
+        the step is then measured anew, by the keyframes before. The frame is the anchor's.
+        """
+        self._settle()
+        self._pending = (frame, step_covariance + jump)
+        self._here = frame
+        jumped = bool(jump.any()) and len(self.keyframes) > 0
+        if jumped:
+            anchor = self.keyframes.anchor
+            theta = float(self.keyframes.frames[anchor].T_map_base[2])
+            self._jobs.append(
+                _Job(anchor, len(self.keyframes), turned(step_covariance + jump, theta))
+            )
+        recent = None if jumped else self._recent_alike(frame)
+        if recent is not None:
+            self._reuse(recent)
+            return
+        self._jobs.extend(self._earlier_visits(frame))
+        if jumped:
+            self._settle()
+        if not self._is_pending_matched():
+            self._settle()
+
+    def _recent_alike(self, frame: Keyframe) -> int | None:
+        """A keyframe of this visit that sees about the same."""
+        j = self.keyframes.alike(frame.T_map_base)
+        if j is None or self.keyframes.frames[j].submap != frame.submap:
+            return None
+        return j if frame.path_m - self.keyframes.frames[j].path_m < AGAIN_M else None
+
+    def _earlier_visits(self, here: Keyframe) -> list[_Job]:
+        """The keyframe most like this one of each earlier visit, likest first."""
+        frames = self.keyframes.frames
+        spread = math.sqrt(float(np.linalg.eigvalsh(here.covariance[:2, :2])[-1]))
+        near = self.keyframes.near(here.T_map_base, self._reach_m(spread))
+        due = {job.j for job in self._jobs if job.k == len(frames)}  # the step, measured again
+        near = [j for j in near if self._is_earlier(j, here) and j not in due]
+        if not near:
+            return []
+        covariances = self._as_seen_from(near, here)
+        ranked = []
+        for i, (j, covariance) in enumerate(zip(near, covariances, strict=True)):
+            sigma = math.sqrt(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
+            if math.dist(frames[j].T_map_base[:2], here.T_map_base[:2]) <= self._reach_m(sigma):
+                ranked.append((unlike(frames[j].T_map_base, here.T_map_base), i))
+        ranked.sort()
+        found: list[_Job] = []
+        for _, i in ranked:
+            path_m = frames[near[i]].path_m
+            if all(abs(path_m - frames[job.j].path_m) > AGAIN_M for job in found):
+                found.append(_Job(near[i], len(frames), covariances[i]))
+        return found[:_VISITS]
+
+    def _reach_m(self, sigma: float) -> float:
+        """How far places that are matched may lie, where the place is uncertain by sigma, m."""
+        return self._config.loop_reach_m + min(_SIGMAS * sigma, _FARTHEST_M)
+
+    def _is_earlier(self, j: int, here: Keyframe) -> bool:
+        frame = self.keyframes.frames[j]
+        return frame.path_m <= here.path_m - AGAIN_M or frame.submap != here.submap
+
+    def _as_seen_from(self, near: list[int], here: Keyframe) -> list[Array]:
+        """Covariance (3, 3), map frame, of the pending keyframe as seen from each of some."""
+        assert self._pending is not None
+        keyframes = self.keyframes
+        poses = keyframes.poses()
+        anchor = keyframes.anchor
+        there = keyframes.covariances_from(anchor, poses, self.edges)
+        step = turned(self._pending[1], float(poses[anchor, 2]))
+        lever = here.T_map_base[:2] - poses[anchor, :2]
+        back = [carried(there[j], poses[anchor, :2] - poses[j, :2]) for j in near]
+        drift = [self._drift(here.path_m - keyframes.frames[j].path_m) for j in near]
+        return [carried(there, lever) + step + own for there, own in zip(back, drift, strict=True)]
+
+    def _drift(self, path_m: float) -> Array:
+        """Covariance (3, 3) of what errors that repeat add up to along a path, m."""
+        return np.diag(np.square([_DRIFT * path_m, _DRIFT * path_m, 0.0]))
+
+    def work(self) -> Correction | None:
+        """Do one match that is due, or one round of the optimization; to be called once a step."""
+        if self._rounds is not None:
+            return self._optimize()
+        if self._jobs:
+            self._match(self._jobs.popleft())
+            if not self._is_pending_matched():
+                self._settle()
+            consistent = self._consistent()
+            if len(consistent) >= self._config.loop_matches:
+                self._settle()
+                self._requested.clear()
+                self.edges += consistent
+                self._begin_rounds()
+        return None
+
+    def _optimize(self) -> Correction | None:
+        assert self._rounds is not None
+        after = next(self._rounds, None)
+        if after is not None:
+            self._after = after
+            return None
+        self._rounds = None
+        poses = self._after
+        # Keyframes that were added meanwhile go with their anchors.
+        for step in self.keyframes.steps[len(poses) - 1 :]:
+            poses = np.vstack([poses, se2.compose(poses[step.a], step.T_a_b)])
+        before = self.keyframes.poses()
+        self.keyframes.move(poses, self.edges)
+        if self._here is not None:
+            last = self.keyframes.anchor
+            self._here = _moved(self._here, before[last], poses[last])
+        if self._pending is not None:
+            frame, covariance = self._pending
+            last = self.keyframes.anchor
+            self._pending = (_moved(frame, before[last], poses[last]), covariance)
+        self._submaps.clear()
+        self._measure_jumps()
+        return Correction(before, poses)
+
+    def _measure_jumps(self) -> None:
+        """Optimize again where a step that was taken meanwhile led to another map of the place.
+
+        The scans that closed the loop lie in the new map, those after such a step in the old one.
+        """
+        last = len(self.keyframes)
+        jumps = [job for job in self._jobs if job.k < last and self._is_step(job.j, job.k)]
+        for job in jumps:
+            self._jobs.remove(job)
+            known = len(self.edges)
+            self._match(job)
+            if any(self._mahalanobis(edge) > _CHI2 for edge in self.edges[known:]):
+                self._begin_rounds()
+
+    def _is_step(self, j: int, k: int) -> bool:
+        """Whether keyframe j was the anchor of keyframe k."""
+        return k < len(self.keyframes) and self.keyframes.steps[k - 1].a == j
+
+    def _begin_rounds(self) -> None:
+        self._before = self.keyframes.poses()
+        self._rounds = rounds(self._before, self._all_edges)
+
+    @property
+    def _all_edges(self) -> list[Edge]:
+        return self.keyframes.steps + self.edges + self.keyframes.headings
+
+    def _match(self, job: _Job) -> None:
+        """Match keyframe k, or the pending one, with the submap around j."""
+        j = job.j
+        k = job.k
+        here = self._frame(k)
+        frames = self.keyframes.frames
+        is_step = self._is_step(j, k)
+        if is_step:
+            base, submap = self._submaps.before(frames, j)
+        else:
+            base, submap = self._submaps.around(frames, j, here.path_m)
+        config = self._config
+        floor = np.diag(np.square([2.0 * config.loop_sigma_m] * 2 + [2.0 * config.loop_sigma_rad]))
+        prior = se2.between(base, here.T_map_base)
+        relative = turned(job.covariance, -float(base[2])) + floor
+        match = self._matcher.match(here.points, here.scan.T_base_laser, submap, prior, relative)
+        if match.fit < config.loop_fit:
+            return
+        own = np.diag(np.square([config.loop_sigma_m] * 2 + [config.loop_sigma_rad]))
+        covariance = inverse(match.by_scan + 1e-3 * np.eye(3)) + own
+        off = se2.off(match.T_map_base, prior)
+        if float(off @ np.linalg.solve(relative + covariance, off)) > _CHI2:
+            return
+        T_j_base = se2.between(frames[j].T_map_base, base)
+        covariance = turned(covariance, float(T_j_base[2]))
+        T_j_k = se2.compose(T_j_base, match.T_map_base)
+        edge = Edge(j, k, T_j_k, inverse(covariance), True)
+        if is_step:
+            self.edges.append(edge)
+            self._is_strained |= self._mahalanobis(edge) > _CHI2
+        elif self._mahalanobis(edge) < _CHI2:
+            self._agree(edge)
+        else:
+            self._requested.append(edge)
+
+    def _agree(self, edge: Edge) -> None:
+        """A match says that old and new map agree here."""
+        here = self._frame(edge.b)
+        self._requested.clear()
+        if self._is_strained:
+            # The robot has slid onto the old map: the loop is closed, the path up to it is bent.
+            self._is_strained = False
+            self._settle()
+            self.edges.append(edge)
+            self._begin_rounds()
+            return
+        pending = self._pending
+        if (
+            pending is not None
+            and edge.b == len(self.keyframes)
+            and not self.keyframes.are_apart(
+                self.keyframes.frames[edge.a].T_map_base, here.T_map_base
+            )
+        ):
+            anchor = self.keyframes.anchor
+            if anchor != edge.a:
+                T_a_here = se2.between(self.keyframes.frames[anchor].T_map_base, here.T_map_base)
+                T_a_j = se2.compose(T_a_here, se2.invert(edge.T_a_b))
+                covariance = turned(inverse(edge.information), float(T_a_j[2]))
+                lever = T_a_j[:2] - T_a_here[:2]
+                covariance = carried(covariance + pending[1], lever)
+                self.edges.append(Edge(anchor, edge.a, T_a_j, inverse(covariance), True))
+            self._reuse(edge.a)
+            return
+        self._settle()
+        self.edges.append(edge)
+
+    def _mahalanobis(self, edge: Edge) -> float:
+        """Squared distance of an edge from the poses as they are, by its own covariance."""
+        T = se2.between(self.keyframes.frames[edge.a].T_map_base, self._frame(edge.b).T_map_base)
+        off = edge.T_a_b - T
+        off[2] = se2.wrap(float(off[2]))
+        return float(off @ edge.information @ off)
+
+    def _consistent(self) -> list[Edge]:
+        """The largest set of recent matches that ask for the same correction."""
+        edges = [edge for edge in self._requested if edge.b < len(self.keyframes)]
+        if not edges:
+            return []
+        n = len(edges)
+        agree = np.eye(n, dtype=np.bool_)
+        for i in range(n):
+            for j in range(i):
+                agree[i, j] = agree[j, i] = self._are_consistent(edges[i], edges[j])
+        best: list[int] = []
+        for i in range(n):
+            chosen = [i]
+            for j in np.argsort(-agree.sum(axis=0)):
+                if j != i and all(agree[j, k] for k in chosen):
+                    chosen.append(int(j))
+            best = max(best, chosen, key=len)
+        return [edges[i] for i in best] if len({edges[i].b for i in best}) == len(best) else []
+
+    def _are_consistent(self, one: Edge, other: Edge) -> bool:
+        """Whether the loop over two matches, back along the path, closes within its covariance."""
+        if one.b == other.b:
+            return False
+        frames = self.keyframes.frames
+        T_a_a = se2.between(frames[one.a].T_map_base, frames[other.a].T_map_base)
+        T_b_b = se2.between(frames[one.b].T_map_base, frames[other.b].T_map_base)
+        there = se2.compose(one.T_a_b, T_b_b)
+        back = se2.compose(T_a_a, other.T_a_b)
+        off = se2.off(there, back)
+        covariance = inverse(one.information) + inverse(other.information)
+        covariance[2, 2] += 1e-6
+        return float(off @ np.linalg.solve(covariance, off)) < _CHI2
+
+    def _frame(self, k: int) -> Keyframe:
+        if k < len(self.keyframes) or self._pending is None:
+            return self.keyframes.frames[k]
+        return self._pending[0]
+
+    def _is_pending_matched(self) -> bool:
+        """Whether matches of the pending keyframe are due."""
+        return bool(self._jobs) and self._jobs[-1].k == len(self.keyframes)
+
+    def _settle(self) -> None:
+        """Make the pending keyframe one, if there is one."""
+        if self._pending is not None:
+            frame, covariance = self._pending
+            self._pending = None
+            self.keyframes.keep(frame, covariance)
+
+    def _reuse(self, j: int) -> None:
+        """Have an earlier keyframe stand for the pending one."""
+        assert self._pending is not None
+        frame, _ = self._pending
+        self._pending = None
+        number = len(self.keyframes)
+        self._jobs = deque(job for job in self._jobs if job.k != number)
+        self.keyframes.reuse(j, frame)
+
+    def finish(self) -> Array:
+        """Do all matches that are due; poses (N, 3) of the keyframes that agree best with all."""
+        while self._jobs:
+            self._match(self._jobs.popleft())
+        self._settle()
+        return optimized(self.keyframes.poses(), self._all_edges)
+
+
+def _moved(frame: Keyframe, before: Array, after: Array) -> Keyframe:
+    return replace(frame, T_map_base=se2.compose(after, se2.between(before, frame.T_map_base)))

@@ -1,0 +1,1 @@
+"""Scans against a local map of cells."""

@@ -1,0 +1,147 @@
+"""Branch and bound over the poses within the uncertainty of a prior.
+
+Source: Olson, "Real-time correlative scan matching", 2009; Hess et al., "Real-time loop closure in
+2D LIDAR SLAM", 2016, for branch and bound. The bound of a node is read off the distance to the
+nearest wall, which no motion changes by more than its length; a point out of reach of any wall is
+taken to stay so.
+"""
+
+import heapq
+import math
+
+import numpy as np
+
+from thinmap_ros.core.grid.tiles import NO_TILE, TILE
+from thinmap_ros.core.jit import inlined, kernel
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.matching.local_map import HERE, Lattice, cell_of, slot_of
+from thinmap_ros.core.slam.matching.matching_cost import UNSEEN_COST, by_prior, far_cost, loss
+
+_ROOT = 4.0  # half the size of a root node, in cells
+_LEVELS = 2  # of nodes below
+_DIAGONAL = 1.4  # of what a translation within a node moves a point by
+_MASK = TILE - 1
+
+
+@inlined
+def _cost(
+    scan: Array,
+    pose: Array,
+    lattice: Lattice,
+    sigma: float,
+    width: float,
+    slack: float,
+    most: float,
+) -> float:
+    """Cost of a scan at a pose (3,), where points may be nearer to walls by a slack, in cells.
+
+    scan (N, 4): x, y, weight, and by how many slacks a point moves. Ends where it exceeds `most`.
+    """
+    scale = lattice.cell_m / sigma
+    far = far_cost(lattice, sigma, width)
+    cos = math.cos(pose[2])
+    sin = math.sin(pose[2])
+    cost = 0.0
+    for i in range(len(scan)):
+        x = pose[0] + cos * scan[i, 0] - sin * scan[i, 1]
+        y = pose[1] + sin * scan[i, 0] + cos * scan[i, 1]
+        row = cell_of(y / lattice.cell_m) - lattice.first_row
+        col = cell_of(x / lattice.cell_m) - lattice.first_col
+        slot = slot_of(lattice, row, col)
+        share = UNSEEN_COST
+        away = -1.0
+        if slot != NO_TILE:
+            cell = lattice.pool[slot, row & _MASK, col & _MASK]
+            share = 1.0 if cell['seen'] > 0 else UNSEEN_COST
+            if cell['to_row'] != 0:
+                down = int(cell['to_row']) - HERE
+                right = int(cell['to_col']) - HERE
+                away = math.sqrt(down * down + right * right)
+        if away < 0.0:
+            cost += scan[i, 2] * share * far
+        else:
+            nearest = max(away - slack * scan[i, 3], 0.0) * scale
+            cost += scan[i, 2] * loss(nearest * nearest, width)
+        if cost >= most:
+            break
+    return cost
+
+
+@inlined
+def _least_by_prior(middle: Array, half: Array, prior: Array, information: Array) -> float:
+    """Cost of the prior at the point of a node that is nearest to it along each axis.
+
+    middle, half (3,): of the node, as seen from the prior.
+    """
+    nearest = np.sign(middle) * np.maximum(np.abs(middle) - half, 0.0)
+    _, _, cost = by_prior(prior + nearest, prior, information)
+    return cost
+
+
+@kernel
+def search(
+    scan: Array,
+    prior: Array,
+    information: Array,
+    half: Array,
+    incumbent: Array,
+    lattice: Lattice,
+    sigma: float,
+    width: float,
+    most_nodes: int,
+) -> Array:
+    """The pose (3,) around a prior (3,) with the lowest cost, or the incumbent.
+
+    scan (N, 3): x, y, weight; half (3,): half the size of what is searched, m, m, rad, rounded to
+    whole roots; information (3, 3) of the prior.
+    """
+    away = np.sqrt(scan[:, 0] ** 2 + scan[:, 1] ** 2)
+    radius = max(np.median(away), 1.0)
+    moving = np.empty((len(scan), 4))
+    moving[:, :3] = scan
+    for i in range(len(scan)):
+        moving[i, 3] = _DIAGONAL + away[i] / radius
+    size = np.array([1.0, 1.0, 1.0 / radius]) * _ROOT * lattice.cell_m
+    best = incumbent.copy()
+    _, _, cost = by_prior(best, prior, information)
+    lowest = cost + _cost(moving, best, lattice, sigma, width, 0.0, np.inf)
+    counts = [int(half[k] / (2.0 * size[k]) + 0.5) for k in range(3)]
+    children = [
+        (0, 2.0 * size[0] * i, 2.0 * size[1] * j, 2.0 * size[2] * m)
+        for i in range(-counts[0], counts[0] + 1)
+        for j in range(-counts[1], counts[1] + 1)
+        for m in range(-counts[2], counts[2] + 1)
+    ]
+    spent = -len(children)
+    heap = [(0.0, 0, 0.0, 0.0, 0.0) for _ in range(0)]
+    while True:
+        spent += len(children)
+        for level, dx, dy, turn in children:
+            away_from_prior = np.array([dx, dy, turn])
+            pose = prior + away_from_prior
+            slack = 0.0
+            if level < _LEVELS:
+                slack = _ROOT * 0.5**level
+                cost = _least_by_prior(away_from_prior, 0.5**level * size, prior, information)
+            else:
+                _, _, cost = by_prior(pose, prior, information)
+            if cost < lowest:
+                cost += _cost(moving, pose, lattice, sigma, width, slack, lowest - cost)
+            if cost < lowest and level < _LEVELS:
+                heapq.heappush(heap, (cost, level, dx, dy, turn))
+            elif cost < lowest:
+                lowest = cost
+                best = pose
+        if len(heap) == 0 or spent > most_nodes:
+            break
+        bound, level, dx, dy, turn = heapq.heappop(heap)
+        if bound >= lowest:
+            break
+        part = 0.5 ** (level + 1) * size
+        children = [
+            (level + 1, dx + a * part[0], dy + b * part[1], turn + c * part[2])
+            for a in (-1, 1)
+            for b in (-1, 1)
+            for c in (-1, 1)
+        ]
+    return best

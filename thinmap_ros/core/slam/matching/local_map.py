@@ -1,0 +1,481 @@
+"""The local map that scans are matched with: cells with hits, and the way to the nearest wall.
+
+A cell counts how often a beam ended in it and how often one was seen through it or in it, and keeps
+the mean of its hits, which lies much nearer to the surface than the middle of the cell. A cell is a
+wall where enough of its observations are hits. Each cell near a wall knows the nearest one, so that
+the distance from any point to the walls is looked up, not searched.
+Source: Konolige et al., "Efficient sparse pose adjustment for 2D mapping", 2010, for the counts;
+Lau, Sprunk and Burgard, "Efficient grid-based spatial representations for robot navigation in
+dynamic environments", 2013, for distances that follow a changing map.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core import se2, snapshot
+from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.grid.tiles import FARTHEST_TILE, NO_TILE, TILE, TileStore
+from thinmap_ros.core.jit import inlined, kernel
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.matching.surface import COLUMNS
+from thinmap_ros.core.snapshot import Field
+
+CELL = np.dtype(
+    [
+        ('hits', np.uint8),
+        ('seen', np.uint8),
+        ('to_row', np.uint8),  # the nearest wall, in cells from here, + HERE; 0: none within reach
+        ('to_col', np.uint8),
+        ('x', np.float32),  # mean of the hits, in cells from the corner of this one
+        ('y', np.float32),
+        ('cos2', np.float32),  # mean of the double angle of the surface's normal
+        ('sin2', np.float32),
+        ('face_x', np.float32),  # mean of the normal towards the laser: 0 where both sides were hit
+        ('face_y', np.float32),
+    ]
+)
+HERE = 100
+_SHIFT = TILE.bit_length() - 1
+_MASK = TILE - 1
+_MOST_SEEN = 255
+_FAR_M = 1e4  # walls of an occupancy map are seen from so far in front of them
+
+
+@dataclass(frozen=True)
+class LocalMapConfig(Config):
+    """Parameters of the local map."""
+
+    match_cell_m: float = parameter(0.05, 'edge of a cell of the local map, m', low=0.01, high=0.5)
+    match_range_m: float = parameter(30.0, 'farther points are not matched, m', low=1.0, high=200.0)
+    match_reach_m: float = parameter(
+        0.5,
+        f'a point looks for the nearest wall within, m; at most {TILE - 1} cells',
+        low=0.05,
+        high=2.0,
+    )
+    match_wall_share: float = parameter(
+        0.25,
+        'share of hits among the observations of a cell that make it a wall',
+        low=0.01,
+        high=0.95,
+    )
+
+
+class Lattice(NamedTuple):
+    """The cells as kernels take them.
+
+    pool: tiles of cells, CELL; directory: the slot of each tile, or NO_TILE; first_row, first_col:
+    its first cell; reach: in cells.
+    """
+
+    pool: NDArray[Any]
+    directory: NDArray[np.int32]
+    first_row: int
+    first_col: int
+    cell_m: float
+    reach: int
+
+
+class LocalMap:
+    """Cells that grow in any direction, in tiles, in the frame of the map."""
+
+    def __init__(self, config: LocalMapConfig | None = None) -> None:
+        self.config = config or LocalMapConfig()
+        self.tiles = TileStore(CELL)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing was added yet."""
+        return self.tiles.used == 0
+
+    @property
+    def lattice(self) -> Lattice:
+        """The cells as kernels take them, until the map grows."""
+        tiles = self.tiles
+        return Lattice(
+            tiles.pool,
+            tiles.directory,
+            tiles.first_row * TILE,
+            tiles.first_col * TILE,
+            self.config.match_cell_m,
+            self._reach_cells,
+        )
+
+    @property
+    def _reach_cells(self) -> int:
+        """`match_reach_m` in cells; less than a tile: of others, only neighbours are touched."""
+        cells = math.ceil(self.config.match_reach_m / self.config.match_cell_m)
+        return min(int(cells), TILE - 1)
+
+    def add_scan(self, points: Array, T_base_laser: Array, T_map_base: Array) -> None:
+        """Add surface points (N, 5), robot frame, of a scan at a pose (3,)."""
+        if len(points) == 0:
+            return
+        laser = np.ascontiguousarray(T_base_laser[:2])
+        ends_map = se2.transform_points(T_map_base, points[:, :2])
+        self._reach(ends_map, se2.transform_points(T_map_base, laser[None])[0])
+        _add(points, laser, T_map_base, self.lattice, self.config.match_wall_share)
+
+    def distances(self, points_map: Array) -> Array:
+        """Distances (N,) of points (N, 2) from the walls, m; the reach where none is near."""
+        return _distances(points_map, self.lattice)
+
+    def add_walls(self, points_map: Array, normal: Array) -> None:
+        """Add points (N, 2), map frame, of walls with a normal (2,), as of an occupancy map."""
+        if len(points_map):
+            cells = np.floor(points_map / self.config.match_cell_m).astype(np.int64)
+            _, once = np.unique(cells, axis=0, return_index=True)
+            points = np.zeros((len(once), COLUMNS))
+            points[:, :2] = points_map[np.sort(once)]
+            points[:, 2] = normal[0] ** 2 - normal[1] ** 2
+            points[:, 3] = 2.0 * normal[0] * normal[1]
+            self._reach(np.ascontiguousarray(points[:, :2]), points[0, :2])
+            far = points[:, :2].mean(axis=0) + _FAR_M * normal
+            _hit(points, far, np.zeros(3), self.lattice, self.config.match_wall_share)
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """All cells as arrays by name, for `restore`."""
+        tiles = self.tiles
+        cells = tiles.pool[: tiles.used]
+        return {
+            'cell_m': np.array(self.config.match_cell_m),
+            'tiles': tiles.places(),
+            'hits': cells['hits'],
+            'seen': cells['seen'],
+            'means': np.stack([cells['x'], cells['y']], axis=-1),
+            'normals': np.stack([cells['cos2'], cells['sin2']], axis=-1),
+            'faces': np.stack([cells['face_x'], cells['face_y']], axis=-1),
+        }
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Take over the cells of a `state`, checked by FIELDS, into a map that is empty.
+
+        Raises InputError where they are of another size, or lie too far apart for one map.
+        """
+        cell_m = float(state['cell_m'])
+        own = self.config.match_cell_m
+        snapshot.require(cell_m == own, f'local map: cells of {cell_m} m', f'{own} m')
+        places = state['tiles']
+        if not len(places):
+            return
+        once = len(np.unique(places, axis=0)) == len(places)
+        snapshot.require(once, 'features: tiles: one twice', 'each tile once')
+        low = places.min(axis=0)
+        high = places.max(axis=0)
+        self.tiles.reach(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+        self.tiles.ensure(places)
+        cells = self.tiles.pool[: len(places)]
+        cells['hits'] = np.minimum(state['hits'], state['seen'])
+        cells['seen'] = state['seen']
+        cells['x'] = state['means'][..., 0]
+        cells['y'] = state['means'][..., 1]
+        cells['cos2'] = state['normals'][..., 0]
+        cells['sin2'] = state['normals'][..., 1]
+        cells['face_x'] = state['faces'][..., 0]
+        cells['face_y'] = state['faces'][..., 1]
+        _lead(places * TILE, self.lattice, self.config.match_wall_share)
+
+    def _reach(self, points_map: Array, laser_map: Array) -> None:
+        """Have all tiles that the beams touch, and those within reach of their ends."""
+        reach = self._reach_cells * self.config.match_cell_m
+        edge_m = TILE * self.config.match_cell_m
+        both = np.vstack([points_map, laser_map])
+        low = np.floor((both.min(axis=0) - reach) / edge_m).astype(np.int64)[::-1]
+        high = np.floor((both.max(axis=0) + reach) / edge_m).astype(np.int64)[::-1]
+        self.tiles.reach(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+        touched = _touched(points_map, laser_map, low, high, edge_m, reach)
+        first = (low[0] - self.tiles.first_row, low[1] - self.tiles.first_col)
+        rows, cols = touched.shape
+        missing = touched & (
+            self.tiles.directory[first[0] : first[0] + rows, first[1] : first[1] + cols] == NO_TILE
+        )
+        if missing.any():
+            self.tiles.ensure(np.argwhere(missing) + low)
+
+
+FIELDS = {
+    'cell_m': Field(np.float64, (), 1e-3, 10.0),
+    'tiles': Field(np.int64, ('t', 2), -FARTHEST_TILE, FARTHEST_TILE),
+    'hits': Field(np.uint8, ('t', TILE, TILE), 0, 255),
+    'seen': Field(np.uint8, ('t', TILE, TILE), 0, 255),
+    'means': Field(np.float32, ('t', TILE, TILE, 2), 0.0, 1.0),
+    'normals': Field(np.float32, ('t', TILE, TILE, 2), -1.001, 1.001),
+    'faces': Field(np.float32, ('t', TILE, TILE, 2), -1.001, 1.001),
+}
+
+
+@inlined
+def cell_of(at: float) -> int:
+    """Row or column of the cell at a place, in cells."""
+    return int(math.floor(at))
+
+
+@inlined
+def slot_of(lattice: Lattice, row: int, col: int) -> int:
+    """Slot of the tile with a cell, counted from the first one, or NO_TILE."""
+    tile_row = row >> _SHIFT
+    tile_col = col >> _SHIFT
+    if tile_row < 0 or tile_col < 0:
+        return NO_TILE
+    if tile_row >= lattice.directory.shape[0] or tile_col >= lattice.directory.shape[1]:
+        return NO_TILE
+    return int(lattice.directory[tile_row, tile_col])
+
+
+@inlined
+def off_wall(lattice: Lattice, x: float, y: float) -> tuple[bool, bool, float, float, Any]:
+    """What a point (x, y), in cells, is off its nearest wall.
+
+    Returns whether a beam has met or crossed the point's cell, whether a wall is within reach, what
+    the point is off the mean of the wall's hits (2), in cells, and the wall's cell.
+    """
+    row = cell_of(y)
+    col = cell_of(x)
+    slot = slot_of(lattice, row, col)
+    if slot == NO_TILE:
+        return False, False, 0.0, 0.0, lattice.pool[0, 0, 0]
+    cell = lattice.pool[slot, row & _MASK, col & _MASK]
+    is_seen = bool(cell['seen'] > 0)
+    if cell['to_row'] == 0:
+        return is_seen, False, 0.0, 0.0, cell
+    row += int(cell['to_row']) - HERE
+    col += int(cell['to_col']) - HERE
+    wall = lattice.pool[slot_of(lattice, row, col), row & _MASK, col & _MASK]
+    return is_seen, True, x - col - wall['x'], y - row - wall['y'], wall
+
+
+@kernel
+def _distances(points: Array, lattice: Lattice) -> Array:
+    """Distances (N,) of points (N, 2) from the means of their nearest walls, m."""
+    found = np.full(len(points), lattice.reach * lattice.cell_m)
+    for i in range(len(points)):
+        x = points[i, 0] / lattice.cell_m - lattice.first_col
+        y = points[i, 1] / lattice.cell_m - lattice.first_row
+        _, is_near, dx, dy, _ = off_wall(lattice, x, y)
+        if is_near:
+            found[i] = min(found[i], lattice.cell_m * math.hypot(dx, dy))
+    return found
+
+
+@kernel
+def _touched(
+    points: Array,
+    laser: Array,
+    low: NDArray[np.int64],
+    high: NDArray[np.int64],
+    edge_m: float,
+    reach_m: float,
+) -> NDArray[np.bool_]:
+    """Tiles from low to high that beams touch, or whose cells are within reach of their ends."""
+    touched = np.zeros((high[0] - low[0] + 1, high[1] - low[1] + 1), dtype=np.bool_)
+    for i in range(len(points)):
+        dx = points[i, 0] - laser[0]
+        dy = points[i, 1] - laser[1]
+        steps = int(2.0 * math.hypot(dx, dy) / edge_m) + 1
+        for k in range(steps):
+            x = laser[0] + k / steps * dx
+            y = laser[1] + k / steps * dy
+            row = int(math.floor(y / edge_m))
+            col = int(math.floor(x / edge_m))
+            touched[row - low[0], col - low[1]] = True
+        for a in range(-1, 2):
+            for b in range(-1, 2):
+                row = int(math.floor((points[i, 1] + a * reach_m) / edge_m))
+                col = int(math.floor((points[i, 0] + b * reach_m) / edge_m))
+                touched[row - low[0], col - low[1]] = True
+    return touched
+
+
+@inlined
+def _is_wall(cell: Any, share: float) -> bool:
+    return bool(cell['hits'] > share * cell['seen'])
+
+
+@inlined
+def _observe(cell: Any, hit: int) -> None:
+    """Count an observation; what is old counts less and less."""
+    if cell['seen'] == _MOST_SEEN:
+        cell['seen'] //= 2
+        cell['hits'] //= 2
+    cell['seen'] += 1
+    cell['hits'] += hit
+
+
+@kernel
+def _add(points: Array, laser: Array, T_map_base: Array, lattice: Lattice, share: float) -> None:
+    """Count what beams went through, then where they ended; update the nearest walls."""
+    cos = math.cos(T_map_base[2])
+    sin = math.sin(T_map_base[2])
+    x0 = (T_map_base[0] + cos * laser[0] - sin * laser[1]) / lattice.cell_m - lattice.first_col
+    y0 = (T_map_base[1] + sin * laser[0] + cos * laser[1]) / lattice.cell_m - lattice.first_row
+    gone = [(0, 0) for _ in range(0)]
+    for i in range(len(points)):
+        px = points[i, 0]
+        py = points[i, 1]
+        x1 = (T_map_base[0] + cos * px - sin * py) / lattice.cell_m - lattice.first_col
+        y1 = (T_map_base[1] + sin * px + cos * py) / lattice.cell_m - lattice.first_row
+        end_row = cell_of(y1)
+        end_col = cell_of(x1)
+        steps = int(max(abs(x1 - x0), abs(y1 - y0))) + 1
+        step_x = (x1 - x0) / steps
+        step_y = (y1 - y0) / steps
+        x = x0 + 0.5 * step_x
+        y = y0 + 0.5 * step_y
+        for _ in range(steps):
+            row = cell_of(y)
+            col = cell_of(x)
+            x = x + step_x
+            y = y + step_y
+            slot = slot_of(lattice, row, col)
+            # A beam that grazes a wall says nothing against the cells beside its end.
+            if slot == NO_TILE or (abs(row - end_row) <= 1 and abs(col - end_col) <= 1):
+                continue
+            cell = lattice.pool[slot, row & _MASK, col & _MASK]
+            was_wall = _is_wall(cell, share)
+            _observe(cell, 0)
+            if was_wall and not _is_wall(cell, share):
+                gone.append((row, col))
+    _hit(points, laser, T_map_base, lattice, share)
+    if len(gone):
+        _vanish(lattice, gone, share)
+
+
+@inlined
+def _learn_surface(cell: Any, x: float, y: float, normal: tuple[float, float, float]) -> None:
+    """Update the means of a cell by a hit at (x, y), in cells from its corner.
+
+    normal: cosine and sine of the double angle of the surface's normal, and how far the laser is to
+    the side that half of that angle points to, positive or negative.
+    """
+    gain = np.float32(1.0 / cell['hits'])
+    cos2, sin2, side = normal
+    half = 0.5 * math.atan2(sin2, cos2)
+    sign = math.copysign(1.0, side)
+    cell['x'] += gain * np.float32(x - cell['x'])
+    cell['y'] += gain * np.float32(y - cell['y'])
+    cell['cos2'] += gain * np.float32(cos2 - cell['cos2'])
+    cell['sin2'] += gain * np.float32(sin2 - cell['sin2'])
+    cell['face_x'] += gain * np.float32(sign * math.cos(half) - cell['face_x'])
+    cell['face_y'] += gain * np.float32(sign * math.sin(half) - cell['face_y'])
+
+
+@kernel
+def _hit(points: Array, laser: Array, T_map_base: Array, lattice: Lattice, share: float) -> None:
+    """Count the points that beams met."""
+    cos = math.cos(T_map_base[2])
+    sin = math.sin(T_map_base[2])
+    cos2 = math.cos(2.0 * T_map_base[2])
+    sin2 = math.sin(2.0 * T_map_base[2])
+    for i in range(len(points)):
+        px = points[i, 0]
+        py = points[i, 1]
+        x = (T_map_base[0] + cos * px - sin * py) / lattice.cell_m - lattice.first_col
+        y = (T_map_base[1] + sin * px + cos * py) / lattice.cell_m - lattice.first_row
+        row = cell_of(y)
+        col = cell_of(x)
+        slot = slot_of(lattice, row, col)
+        if slot == NO_TILE:
+            continue
+        cell = lattice.pool[slot, row & _MASK, col & _MASK]
+        was_wall = _is_wall(cell, share)
+        _observe(cell, 1)
+        c2 = points[i, 2]
+        s2 = points[i, 3]
+        back_x = cos * (laser[0] - px) - sin * (laser[1] - py)
+        back_y = sin * (laser[0] - px) + cos * (laser[1] - py)
+        turned = (cos2 * c2 - sin2 * s2, sin2 * c2 + cos2 * s2)
+        own = 0.5 * math.atan2(turned[1], turned[0])
+        side = math.cos(own) * back_x + math.sin(own) * back_y
+        _learn_surface(cell, x - col, y - row, (turned[0], turned[1], side))
+        if not was_wall and _is_wall(cell, share):
+            _appear(lattice, row, col)
+
+
+@kernel
+def _lead(
+    corners: NDArray[np.int64],
+    lattice: Lattice,
+    share: float,
+) -> None:
+    """Have all cells of tiles with first cells (N, 2) know their nearest walls."""
+    for i in range(len(corners)):
+        top = corners[i, 0] - lattice.first_row
+        left = corners[i, 1] - lattice.first_col
+        for row in range(top, top + TILE):
+            for col in range(left, left + TILE):
+                slot = slot_of(lattice, row, col)
+                if _is_wall(lattice.pool[slot, row & _MASK, col & _MASK], share):
+                    _appear(lattice, row, col)
+
+
+@kernel
+def _appear(lattice: Lattice, row: int, col: int) -> None:
+    """A cell has become a wall: those around to which it is the nearest lead there."""
+    for down in range(-lattice.reach, lattice.reach + 1):
+        for right in range(-lattice.reach, lattice.reach + 1):
+            squared = down * down + right * right
+            slot = slot_of(lattice, row + down, col + right)
+            if slot == NO_TILE or squared > lattice.reach * lattice.reach:
+                continue
+            cell = lattice.pool[slot, (row + down) & _MASK, (col + right) & _MASK]
+            to_row = int(cell['to_row']) - HERE
+            to_col = int(cell['to_col']) - HERE
+            if cell['to_row'] == 0 or squared < to_row * to_row + to_col * to_col:
+                cell['to_row'] = HERE - down
+                cell['to_col'] = HERE - right
+
+
+@kernel
+def _vanish(lattice: Lattice, gone: list[tuple[int, int]], share: float) -> None:
+    """Cells are walls no more: those that led there take the nearest wall of their neighbours."""
+    led = [(0, 0) for _ in range(0)]
+    for row, col in gone:
+        slot = slot_of(lattice, row, col)
+        if _is_wall(lattice.pool[slot, row & _MASK, col & _MASK], share):
+            continue
+        for down in range(-lattice.reach, lattice.reach + 1):
+            for right in range(-lattice.reach, lattice.reach + 1):
+                slot = slot_of(lattice, row + down, col + right)
+                if slot == NO_TILE:
+                    continue
+                cell = lattice.pool[slot, (row + down) & _MASK, (col + right) & _MASK]
+                if cell['to_row'] == HERE - down and cell['to_col'] == HERE - right:
+                    cell['to_row'] = 0
+                    led.append((row + down, col + right))
+    changed = len(led) > 0
+    while changed:
+        changed = False
+        for row, col in led:
+            slot = slot_of(lattice, row, col)
+            changed |= _ask(lattice, row, col)
+
+
+@inlined
+def _ask(lattice: Lattice, row: int, col: int) -> bool:
+    """Whether one of its neighbours knows a nearer wall for a cell, which leads there then."""
+    changed = False
+    cell = lattice.pool[slot_of(lattice, row, col), row & _MASK, col & _MASK]
+    for i in range(-1, 2):
+        for j in range(-1, 2):
+            slot = slot_of(lattice, row + i, col + j)
+            if slot == NO_TILE:
+                continue
+            other = lattice.pool[slot, (row + i) & _MASK, (col + j) & _MASK]
+            if other['to_row'] == 0:
+                continue
+            down = i + int(other['to_row']) - HERE
+            right = j + int(other['to_col']) - HERE
+            to_row = int(cell['to_row']) - HERE
+            to_col = int(cell['to_col']) - HERE
+            squared = down * down + right * right
+            nearer = cell['to_row'] == 0 or squared < to_row * to_row + to_col * to_col
+            if squared <= lattice.reach * lattice.reach and nearer:
+                cell['to_row'] = HERE + down
+                cell['to_col'] = HERE + right
+                changed = True
+    return changed

@@ -1,0 +1,151 @@
+"""A scan against the local map: the pose that walls and motion together make most likely.
+
+One sum holds a robust loss of what each point is off the nearest wall, and the motion that is
+expected, with its covariance. Its minimum near the prior is refined (`matching_cost.py`). Where the
+scan fits badly there, or the prior is wider than a wall attracts, the poses within three sigmas of
+the prior are searched (`correlative_search.py`); the lower sum wins.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from thinmap_ros.core.config import parameter
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.graph.keyframes import inverse
+from thinmap_ros.core.slam.matching.correlative_search import search
+from thinmap_ros.core.slam.matching.local_map import LocalMap, LocalMapConfig
+from thinmap_ros.core.slam.matching.matching_cost import minimize
+
+FEWEST_POINTS = 10
+_SIGMAS = 3.0  # of a prior, within which poses are searched
+_BASIN = (0.3, 0.15)  # m, rad: three sigmas of a prior within which the nearest minimum is the one
+_WIDEST = (3.0, 3.0, 1.5)  # m, m, rad: half of what is searched, at most
+_SEARCHED_POINTS = 90
+_MOST_NODES = 1000
+
+
+@dataclass(frozen=True)
+class MatcherConfig(LocalMapConfig):
+    """Parameters of scan matching."""
+
+    match_sigma_m: float = parameter(
+        0.05, 'uncertainty of a point on its wall (1 sigma), m', low=0.001, high=1.0
+    )
+    match_outlier_m: float = parameter(
+        0.15, 'points this far from the nearest wall count half, m', low=0.001, high=1.0
+    )
+    match_least_fit: float = parameter(
+        0.6,
+        'share of the points near walls below which the surroundings are searched',
+        low=0.0,
+        high=1.0,
+    )
+    slip_m: float = parameter(
+        0.2, 'error of the motion where wheels have slipped, m', low=0.001, high=5.0
+    )
+    slip_rad: float = parameter(
+        0.15, 'error of the motion where wheels have slipped, rad', low=0.001, high=3.0
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """A pose T_map_base (3,) with covariance (3, 3), map frame, of scan and prior together.
+
+    by_scan (3, 3): information of the scan alone; fit: share of the points on walls; contradicted:
+    share that lies where others have seen that nothing is; cost: what was minimized;
+    prior_weight: of the prior in it, less than 1 where the pose is an outlier to it.
+    """
+
+    T_map_base: Array
+    covariance: Array
+    by_scan: Array
+    fit: float
+    contradicted: float
+    cost: float
+    prior_weight: float
+
+
+class Matcher:
+    """Finds the pose at which a scan fits a local map."""
+
+    def __init__(self, config: MatcherConfig | None = None) -> None:
+        self.config = config or MatcherConfig()
+
+    def match(
+        self,
+        points: Array,
+        T_base_laser: Array,
+        local_map: LocalMap,
+        prior: Array,
+        covariance: Array,
+    ) -> Match:
+        """Pose near a prior (3,) with covariance (3, 3), map frame, that a scan fits best.
+
+        points (N, 5): surface points, robot frame; T_base_laser (3,): where the laser is.
+        """
+        scan = self.weighted(points, T_base_laser)
+        information = inverse(covariance)
+        match = self._refined(scan, local_map, prior, prior, information)
+        reach = _SIGMAS * np.sqrt(np.diag(covariance))
+        fits_badly = match.fit < self.config.match_least_fit
+        is_wide = max(reach[0], reach[1]) > _BASIN[0] or reach[2] > _BASIN[1]
+        if not fits_badly and not is_wide:
+            return match
+        if fits_badly:  # wheels may have slipped
+            slip = np.array([self.config.slip_m, self.config.slip_m, self.config.slip_rad])
+            reach = _SIGMAS * np.sqrt(np.diag(covariance) + slip**2)
+        start = search(
+            _thinned(scan),
+            prior,
+            information,
+            np.minimum(reach, _WIDEST),
+            match.T_map_base,
+            local_map.lattice,
+            *self._noise,
+            _MOST_NODES,
+        )
+        other = self._refined(scan, local_map, start, prior, information)
+        return other if other.cost < match.cost else match
+
+    def weighted(self, points: Array, T_base_laser: Array) -> Array:
+        """A scan as the kernels take it (N, 5): x, y, weight, and the direction to the laser.
+
+        Points nearer to each other than a cell see the same piece of wall, and count once.
+        """
+        weights = np.minimum(points[:, 4] / self.config.match_cell_m, 1.0)
+        back = T_base_laser[:2] - points[:, :2]
+        back /= np.maximum(np.hypot(back[:, 0], back[:, 1]), 1e-6)[:, None]
+        return np.column_stack([points[:, :2], weights, back])
+
+    @property
+    def _noise(self) -> tuple[float, float]:
+        """Standard deviation of a point on its wall, m, and in these the width of the loss."""
+        config = self.config
+        return config.match_sigma_m, config.match_outlier_m / config.match_sigma_m
+
+    def _refined(
+        self, scan: Array, local_map: LocalMap, start: Array, prior: Array, information: Array
+    ) -> Match:
+        pose, by_scan, sums, weight = minimize(
+            scan, start, prior, information, local_map.lattice, *self._noise
+        )
+        cost, total, fitting, in_the_open, _ = sums.tolist()
+        covariance = np.linalg.inv(by_scan + weight * information)
+        return Match(
+            pose,
+            np.asarray(covariance),
+            by_scan,
+            fitting / max(total, 1e-9),
+            in_the_open / max(total, 1e-9),
+            cost,
+            weight,
+        )
+
+
+def _thinned(scan: Array) -> Array:
+    """Some of the points of a scan (N, 3), with the weight of all."""
+    sparse = np.ascontiguousarray(scan[:: max(1, len(scan) // _SEARCHED_POINTS), :3])
+    sparse[:, 2] *= len(scan) / len(sparse)
+    return sparse

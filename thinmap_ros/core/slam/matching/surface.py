@@ -1,0 +1,110 @@
+"""The surface that each point of a scan lies on, by its neighbours in the scan.
+
+Only neighbouring beams on one surface tell a normal: the last beam of one wall and the first of the
+next are neighbours in the scan and not in space. A point without a neighbour on its surface is left
+out: where a beam meets something by chance is no feature of the building, and moves with the robot.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core.jit import inlined, kernel
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+
+COLUMNS = 5  # of surface points: x, y, double angle of the normal (cosine, sine), spacing
+WINDOW_M = 0.15  # neighbours that are nearer are on one surface and tell its normal
+_RANGE_NOISE_M = 0.02  # 1 sigma: points that scatter by no more lie on a plane
+_ALIGNED = 0.8  # squared cosine between two steps along one surface
+_ALIKE = 9.0  # squared ratio of their lengths, at most
+
+
+def surface_points(scan: Scan, range_m: float) -> Array:
+    """Points (N, 5) of a scan within a range, m, robot frame, in the order of the beams.
+
+    Columns: x, y, cosine and sine of twice the angle of the surface's normal, shortened where the
+    neighbours scatter by more than the noise of a range, and the spacing of the points, m.
+    """
+    near = scan.ranges_m[scan.hit] < range_m
+    points = np.ascontiguousarray(scan.points_base()[near])
+    return _surface(points, np.flatnonzero(scan.hit)[near])
+
+
+@inlined
+def _are_aligned(ax: float, ay: float, bx: float, by: float) -> bool:
+    """Whether two steps along a scan lead the same way, and are alike in length."""
+    a = ax * ax + ay * ay
+    b = bx * bx + by * by
+    dot = ax * bx + ay * by
+    return dot > 0.0 and dot * dot > _ALIGNED * a * b and max(a, b) < _ALIKE * min(a, b)
+
+
+@kernel
+def _links(points: Array, beams: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Whether each point (N + 1,) lies on one surface with the point before it."""
+    n = len(points)
+    linked = np.zeros(n + 1, dtype=np.bool_)
+    for k in range(1, n):
+        if beams[k] - beams[k - 1] != 1:
+            continue
+        dx = points[k, 0] - points[k - 1, 0]
+        dy = points[k, 1] - points[k - 1, 1]
+        linked[k] = dx * dx + dy * dy < WINDOW_M * WINDOW_M
+        for m in (k - 1, k + 1):
+            if 1 <= m < n and beams[m] - beams[m - 1] == 1:
+                ex = points[m, 0] - points[m - 1, 0]
+                ey = points[m, 1] - points[m - 1, 1]
+                linked[k] |= _are_aligned(dx, dy, ex, ey)
+    return linked
+
+
+@kernel
+def _surface(points: Array, beams: NDArray[np.int64]) -> Array:
+    """Surface points of the points (N, 2) of some beams (N,): those that have a neighbour."""
+    linked = _links(points, beams)
+    found = np.empty((len(points), COLUMNS))
+    used = 0
+    for i in range(len(points)):
+        m = 1
+        mx = 0.0
+        my = 0.0
+        xx = 0.0
+        xy = 0.0
+        yy = 0.0
+        gap = np.inf
+        for side in (-1, 1):
+            k = i
+            while linked[k if side < 0 else k + 1]:
+                k += side
+                dx = points[k, 0] - points[i, 0]
+                dy = points[k, 1] - points[i, 1]
+                m = m + 1
+                mx = mx + dx
+                my = my + dy
+                xx = xx + dx * dx
+                xy = xy + dx * dy
+                yy = yy + dy * dy
+                away = math.hypot(dx, dy)
+                gap = min(gap, away)
+                if away >= WINDOW_M:
+                    break
+        if m == 1:
+            continue
+        mx = mx / m
+        my = my / m
+        xx = xx / m - mx * mx
+        xy = xy / m - mx * my
+        yy = yy / m - my * my
+        spread = math.hypot(0.5 * (xx - yy), xy)
+        across = max(0.5 * (xx + yy) - spread - _RANGE_NOISE_M * _RANGE_NOISE_M, 0.0)
+        along = 0.5 * (xx + yy) + spread
+        length = (along - across) / max((along + across) * spread, 1e-12)
+        found[used, 0] = points[i, 0]
+        found[used, 1] = points[i, 1]
+        found[used, 2] = -length * 0.5 * (xx - yy)
+        found[used, 3] = -length * xy
+        found[used, 4] = gap
+        used += 1
+    return found[:used]

@@ -1,0 +1,160 @@
+"""The numbers that sum up an exploration, from plain arrays.
+
+The same for the simulator and for the live graph.
+"""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from thinmap_ros.closed_loop import Ending
+from thinmap_ros.core.exploration.position_probability import NEAR_M
+from thinmap_ros.core.exploration.strategy import FIRST_STAND_IN_ID
+from thinmap_ros.core.se2 import Array
+
+MILESTONES = (0.90, 0.95, 0.98, 0.99)
+SAME_PLACE_M = 1.0
+FEWEST_SIGHTINGS = 5
+
+
+@dataclass(eq=False)
+class _Place:
+    """A place where an end node was.
+
+    Where it is or was last (m), under which id, how often seen, whether come near.
+    """
+
+    node_id: int
+    x: float
+    y: float
+    sightings: int = 0
+    visited: bool = False
+
+
+class EndNodeCensus:
+    """At how many places there were end nodes, and to how many of them the robot came near.
+
+    An end node wanders as the map grows, and may come and go under new ids: one that appears within
+    SAME_PLACE_M of where another one was last, and is no more, continues that one. One that did not
+    last for FEWEST_SIGHTINGS decisions is not counted, and neither are what stands in for borders
+    that no end node sees.
+    """
+
+    def __init__(self) -> None:
+        self._places: list[_Place] = []
+
+    @property
+    def seen(self) -> int:
+        """Places where an end node lasted."""
+        return sum(place.sightings >= FEWEST_SIGHTINGS for place in self._places)
+
+    @property
+    def visited(self) -> int:
+        """Those of them to which the robot came near."""
+        return sum(place.visited and place.sightings >= FEWEST_SIGHTINGS for place in self._places)
+
+    def take(self, end_nodes: Iterable[tuple[int, float, float]], T_map_base: Array) -> None:
+        """Count the end nodes (id, x, y in m) known at a pose (3,).
+
+        Nearer than 0.5 m is a visit (equation (2)).
+        """
+        nodes = {node_id: (x, y) for node_id, x, y in end_nodes if node_id < FIRST_STAND_IN_ID}
+        alive = {place.node_id: place for place in self._places if place.node_id in nodes}
+        idle = [place for place in self._places if place.node_id not in nodes]
+        for node_id, (x, y) in nodes.items():
+            place = alive.get(node_id) or self._continued(idle, x, y)
+            place.node_id = node_id
+            place.x = x
+            place.y = y
+            place.sightings += 1
+            place.visited |= math.dist((x, y), T_map_base[:2]) < NEAR_M
+
+    def _continued(self, idle: list[_Place], x: float, y: float) -> _Place:
+        near = min(idle, key=lambda place: math.dist((x, y), (place.x, place.y)), default=None)
+        if near is not None and math.dist((x, y), (near.x, near.y)) <= SAME_PLACE_M:
+            idle.remove(near)
+            return near
+        self._places.append(_Place(0, x, y))
+        return self._places[-1]
+
+
+class TargetLog:
+    """How often the target changed, and how often it went back to the one before: oscillation."""
+
+    def __init__(self) -> None:
+        self.changes = self.reversals = 0
+        self._last: list[tuple[float, float]] = []
+
+    def take(self, goal: Array | None) -> None:
+        """Take the goal (x, y, ...), m, of a decision.
+
+        One less than SAME_PLACE_M from the last is the same.
+        """
+        if goal is None:
+            return
+        at = (float(goal[0]), float(goal[1]))
+        if self._last and math.dist(at, self._last[-1]) <= SAME_PLACE_M:
+            return
+        self.changes += bool(self._last)
+        self.reversals += len(self._last) > 1 and math.dist(at, self._last[-2]) <= SAME_PLACE_M
+        self._last = [*self._last[-1:], at]
+
+
+def exploration_report(
+    ending: Ending,
+    times_s: Array,
+    true_poses: Array,
+    estimated_poses: Array,
+    coverage: Array,
+    census: EndNodeCensus,
+) -> dict[str, Any]:
+    """Report of an exploration, ready for JSON.
+
+    times_s (N,): from the start on; true_poses, estimated_poses (N, 3): at these times, in the same
+    frame; coverage (M, 2): time in s and coverage, 0 to 1, whenever it was measured. distance and
+    the times and distances at which a coverage was first measured are of the true path, in m and s;
+    None where it was not reached. curve: time, distance and coverage whenever it was measured.
+    """
+    steps = np.hypot(*np.diff(true_poses[:, :2], axis=0).T)
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    times_at = {f'{share:.2f}': _first_time(coverage, share) for share in MILESTONES}
+    distances_at = {
+        share: None if time is None else round(float(np.interp(time, times_s, along)), 3)
+        for share, time in times_at.items()
+    }
+    errors = np.hypot(*(estimated_poses[:, :2] - true_poses[:, :2]).T)
+    return {
+        'finished': ending.finished,
+        'reason': ending.reason,
+        'coverage': round(float(coverage[-1, 1]), 5),
+        'distance': round(float(along[-1]), 3),
+        'time': round(float(times_s[-1] - times_s[0]), 3),
+        'distance_at': distances_at,
+        'time_at': times_at,
+        'collisions': ending.collisions,
+        'end_nodes_seen': census.seen,
+        'end_nodes_visited': census.visited,
+        'pose_rmse': round(float(np.sqrt(np.mean(errors**2))), 5),
+        'turned_rad': round(float(np.abs(_turns(true_poses)).sum()), 2),
+        'curve': [
+            [
+                round(float(time), 2),
+                round(float(np.interp(time, times_s, along)), 2),
+                round(float(share), 4),
+            ]
+            for time, share in coverage
+        ],
+    }
+
+
+def _first_time(coverage: Array, share: float) -> float | None:
+    reached = np.flatnonzero(coverage[:, 1] >= share)
+    return round(float(coverage[reached[0], 0]), 3) if reached.size else None
+
+
+def _turns(poses: Array) -> Array:
+    turns = np.diff(poses[:, 2])
+    return np.asarray((turns + np.pi) % (2.0 * np.pi) - np.pi)

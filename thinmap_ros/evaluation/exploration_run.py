@@ -1,0 +1,66 @@
+"""One exploration of a simulated world, and the report on it."""
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from thinmap_ros.closed_loop import ClosedLoop, Options, make_loop, nothing_to_show
+from thinmap_ros.core.exploration.strategy import Decision
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.evaluation.exploration_metrics import EndNodeCensus, TargetLog, exploration_report
+from thinmap_ros.evaluation.kidnapping import Kidnapping
+from thinmap_ros.sim.coverage import coverable
+from thinmap_ros.sim.robot import PRESETS
+from thinmap_ros.sim.world import World
+
+
+def explore(
+    world: World,
+    start: Array,
+    options: Options,
+    show: Callable[[float, float], None] = nothing_to_show,
+) -> tuple[ClosedLoop, dict[str, Any]]:
+    """Explore a world from a start (3,); returns what is left of it and the report."""
+    census = EndNodeCensus()
+    targets = TargetLog()
+
+    def watch(decision: Decision, T_map_base: Array) -> None:
+        census.take([(n.node_id, n.x, n.y) for n in decision.end_nodes], T_map_base)
+        targets.take(None if decision.target is None else decision.target.goal)
+
+    kidnapping = (
+        None if options.kidnap_at_s is None else Kidnapping(options.kidnap_at_s, options.seed)
+    )
+    loop = make_loop(world, start, options, kidnapping, watch)
+    goal = coverable(world, start, PRESETS[options.robot].radius_m, options.laser.range_max_m)
+    began = time.perf_counter()
+    cpu_began = time.process_time()
+    ending = loop.run(goal, options.time_limit_s, show)
+    wall_s = time.perf_counter() - began
+    cpu_s = time.process_time() - cpu_began
+    log = loop.log
+    report = exploration_report(
+        ending,
+        np.array(log.stamps_ns) / 1e9,
+        np.array(log.true_poses),
+        np.array(log.poses),
+        np.array(log.coverage),
+        census,
+    )
+    report['target_changes'] = targets.changes
+    report['reversals'] = targets.reversals
+    milliseconds = 1e3 * np.array(log.decision_s)
+    report['decision_ms'] = {
+        'median': round(float(np.median(milliseconds)), 2),
+        'max': round(milliseconds.max(), 2),
+    }
+    report |= {} if kidnapping is None else kidnapping.report()
+    report['world'] = world.name
+    report['strategy'] = options.strategy
+    report['options'] = asdict(options)
+    report['wall_s'] = round(wall_s, 3)
+    report['cpu_s'] = round(cpu_s, 3)
+    return loop, report

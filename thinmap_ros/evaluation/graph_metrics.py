@@ -1,0 +1,153 @@
+"""How good a topological map is: drivable, complete, like another one, with ids that stay."""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, sparse
+from scipy.sparse import csgraph
+from scipy.spatial import cKDTree
+
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.graph import TopologicalMap
+
+Mask = NDArray[np.bool_]
+_SAMPLE_CELLS = 0.1  # how finely straight lines are looked at
+_ATTACH = 8  # nodes that a place off the graph may go to first
+
+
+def loop_count(graph: TopologicalMap) -> int:
+    """Independent rings in a graph."""
+    return len(graph.edges) - len(graph.nodes) + len(graph.components())
+
+
+def clearance_m(patch: GridPatch) -> Array:
+    """Distance (H, W) of cells to the nearest occupied one, by centres, m; outside is occupied."""
+    distance = ndimage.distance_transform_edt(np.pad(~patch.occupied, 1))[1:-1, 1:-1]
+    return np.asarray(distance * patch.frame.resolution)
+
+
+def drivable_share(patch: GridPatch, graph: TopologicalMap, radius_m: float) -> float:
+    """Share of edges whose straight line, every tenth of a cell, keeps a radius from obstacles."""
+    clearance = clearance_m(patch)
+    good = 0
+    for edge in graph.edges.values():
+        a = graph.nodes[edge.a].position
+        b = graph.nodes[edge.b].position
+        count = max(
+            2, math.ceil(float(np.hypot(*(b - a))) / (_SAMPLE_CELLS * patch.frame.resolution)) + 1
+        )
+        cells = patch.frame.cells_of(a + np.linspace(0.0, 1.0, count)[:, None] * (b - a))
+        good += bool((clearance[cells[:, 0], cells[:, 1]] >= radius_m - 1e-9).all())
+    return good / max(len(graph.edges), 1)
+
+
+def agreement(one: TopologicalMap, other: TopologicalMap, reach_m: float) -> tuple[float, float]:
+    """Share of the nodes of each map that have a node of the other within reach."""
+    if not one.nodes or not other.nodes:
+        return (float(not other.nodes), float(not one.nodes))
+    first, second = (
+        np.array([node.position for node in graph.nodes.values()]) for graph in (one, other)
+    )
+    there = np.asarray(cKDTree(second).query(first)[0])
+    back = np.asarray(cKDTree(first).query(second)[0])
+    return float((there <= reach_m).mean()), float((back <= reach_m).mean())
+
+
+class GridPaths:
+    """Shortest ways over the cells on which a robot can stand, eight neighbours to a cell."""
+
+    def __init__(self, standing: Mask) -> None:
+        self.numbers = np.full(standing.shape, -1)
+        self.cells = np.argwhere(standing)
+        self.numbers[standing] = np.arange(len(self.cells))
+        self._links = self._neighbours(standing)
+        self.parts = ndimage.label(standing, np.ones((3, 3)))[0][standing]
+
+    def lengths_from(self, number: int) -> Array:
+        """Shortest way, in cells, from one cell to every other, inf where there is none."""
+        lengths: Array = csgraph.dijkstra(self._links, directed=False, indices=[number])[0]
+        return lengths
+
+    def _neighbours(self, standing: Mask) -> Any:
+        rows, cols = standing.shape
+        sources = []
+        targets = []
+        lengths = []
+        for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
+            low = max(0, -right)
+            high = cols - max(0, right)
+            here = self.numbers[: rows - down, low:high]
+            there = self.numbers[down:, low + right : high + right]
+            both = (here >= 0) & (there >= 0)
+            sources.append(here[both])
+            targets.append(there[both])
+            lengths.append(np.full(int(both.sum()), math.hypot(down, right)))
+        count = len(self.cells)
+        data = np.concatenate(lengths), (np.concatenate(sources), np.concatenate(targets))
+        return sparse.csr_matrix(data, shape=(count, count))
+
+
+def completeness(
+    patch: GridPatch, graph: TopologicalMap, radius_m: float, pairs: int, seed: int
+) -> tuple[float, float]:
+    """Share of reachable random pairs of cells joined by a graph, mean length against the best.
+
+    From a cell the robot goes over the grid to one of the nearest nodes (the way counts), then
+    along straight lines between nodes. The best way is the shortest one over cells with the same
+    clearance. Means are over all pairs that are joined.
+    """
+    paths = GridPaths(clearance_m(patch) >= radius_m - 1e-9)
+    rng = np.random.default_rng(seed)
+    sources = rng.integers(0, len(paths.cells), pairs)
+    targets = [int(rng.choice(np.flatnonzero(paths.parts == paths.parts[k]))) for k in sources]
+    order = list(graph.nodes)
+    places = patch.frame.cells_of(np.array([graph.nodes[k].position for k in order]))
+    at_nodes = paths.numbers[places[:, 0], places[:, 1]]
+    between = csgraph.dijkstra(
+        _straight_lines(graph, order, patch.frame.resolution), directed=False
+    )
+    found = []
+    best = []
+    for source, target in zip(sources.tolist(), targets, strict=True):
+        from_source = paths.lengths_from(source)
+        from_target = paths.lengths_from(target)
+        first, last = (_nearest(lengths, at_nodes) for lengths in (from_source, from_target))
+        ways = (
+            from_source[at_nodes[first], None]
+            + between[np.ix_(first, last)]
+            + from_target[at_nodes[last]]
+        )
+        length = float(ways.min(initial=np.inf))
+        if math.isfinite(length):
+            found.append(length)
+            best.append(float(from_source[target]))
+    return len(found) / pairs, sum(found) / max(sum(best), 1.0)
+
+
+def _nearest(lengths: Array, at_nodes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Indices of the nodes that are nearest over the grid."""
+    distance = np.where(at_nodes >= 0, lengths[at_nodes], np.inf)
+    nearest = np.argsort(distance, kind='stable')[:_ATTACH]
+    return nearest[np.isfinite(distance[nearest])]
+
+
+def _straight_lines(
+    graph: TopologicalMap, order: list[int], resolution: float
+) -> sparse.csr_matrix:
+    """Lengths, in cells, of straight lines between joined nodes; the shorter of parallel edges."""
+    index = {node: k for k, node in enumerate(order)}
+    lines: dict[tuple[int, int], float] = {}
+    for edge in graph.edges.values():
+        a, b = sorted((index[edge.a], index[edge.b]))
+        length = (
+            float(np.hypot(*(graph.nodes[edge.a].position - graph.nodes[edge.b].position)))
+            / resolution
+        )
+        lines[a, b] = min(lines.get((a, b), math.inf), length)
+    ends = np.array(list(lines), dtype=np.int64).reshape(-1, 2)
+    return sparse.csr_matrix(
+        (list(lines.values()), (ends[:, 0], ends[:, 1])), shape=(len(order), len(order))
+    )

@@ -1,0 +1,131 @@
+"""A robot carried off while it explores: if it notices, and how soon it knows where it is again."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from thinmap_ros.baselines.exploration import NearestFrontier
+from thinmap_ros.closed_loop import ClosedLoop
+from thinmap_ros.core import se2
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.estimate import Estimate
+from thinmap_ros.core.exploration.strategy import Strategy
+from thinmap_ros.core.places.global_localizer import GlobalLocalization
+from thinmap_ros.core.planning.navigator import Navigator
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.pipeline import Pipeline
+
+_MARGIN_M = 0.1
+_FAR_M = 3.0
+_RIGHT_M = 0.5
+_RIGHT_RAD = math.radians(10.0)
+
+
+class Kidnapping:
+    """What befalls a closed loop whose robot is carried, once, to a random place of its map.
+
+    When its localizer is lost, samples all over the map find it again. Until then it explores what
+    is around it, as a robot that has just been switched on, for itself: nothing of that gets into
+    the map.
+    """
+
+    def __init__(self, at_s: float, seed: int) -> None:
+        self._at_s = at_s
+        self._seed = seed
+        self._carried_s: float | None = None
+        self._detected_s: float | None = None
+        self._found_s: float | None = None
+        self._off: Array | None = None
+        self._way_m = 0.0
+        self._own: tuple[Pipeline, Strategy, Navigator] | None = None
+        self._finder: GlobalLocalization | None = None
+
+    def report(self) -> dict[str, Any]:
+        """What became of it, for the report: times in s, None for what has not happened."""
+
+        def after(since: float | None, until: float | None) -> float | None:
+            return None if since is None or until is None else round(until - since, 3)
+
+        off = self._off
+        right: bool | None = None
+        if off is not None:
+            right = bool(math.hypot(off[0], off[1]) <= _RIGHT_M and abs(off[2]) <= _RIGHT_RAD)
+        return {
+            'kidnapped_at_s': self._carried_s,
+            'detected_after_s': after(self._carried_s, self._detected_s),
+            'found_after_s': after(self._detected_s, self._found_s),
+            'found_after_m': None if self._found_s is None else round(self._way_m, 3),
+            'found_error_m': None if off is None else round(math.hypot(off[0], off[1]), 3),
+            'found_right': right,
+        }
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether the robot looks for where it is."""
+        return self._finder is not None
+
+    def takes(self, loop: ClosedLoop, scan: Scan, T_odom_base: Array) -> bool:
+        """Whether a scan, of before the robot was carried or of a lost one, is not for the loop."""
+        if self._carried_s is None and scan.stamp_ns >= 1e9 * self._at_s:
+            self._carry(loop, scan.stamp_ns / 1e9)
+            return True
+        if self._finder is None:
+            return False
+        self._search(loop, self._finder, scan, T_odom_base)
+        return True
+
+    def hear(self, loop: ClosedLoop, scan: Scan, estimate: Estimate) -> None:
+        """Begin to search once the robot is lost."""
+        if (
+            estimate.lost
+            and self._finder is None
+            and self._carried_s is not None
+            and self._found_s is None
+        ):
+            self._detected_s = scan.stamp_ns / 1e9
+            self._finder = GlobalLocalization(
+                loop.pipeline.grid.patch(), loop.pipeline.topology.map, seed=self._seed
+            )
+            self._own = loop.pipeline, loop.strategy, loop.navigator
+            loop.drive_by(Pipeline(), NearestFrontier(), Navigator(loop.navigator.config))
+
+    def _carry(self, loop: ClosedLoop, seconds: float) -> None:
+        """Put the robot on some place that it has mapped, far from where it is."""
+        world = loop.simulation.world
+        robot = loop.simulation.robot
+        patch = loop.pipeline.grid.patch()
+        at = patch.frame.centres_of(np.argwhere(patch.free))
+        at = at[np.hypot(*(at - robot.T_world_base[:2]).T) >= _FAR_M]
+        fits = [world.is_clear(x, y, robot.config.radius_m + _MARGIN_M) for x, y in at.tolist()]
+        if not any(fits):
+            raise InputError(
+                f'--kidnap-at={self._at_s:g}: nothing {_FAR_M:g} m off is known: '
+                'expected a later time'
+            )
+        rng = np.random.default_rng(self._seed)
+        x, y = rng.choice(at[fits])
+        loop.simulation.carry(se2.pose(float(x), float(y), float(rng.uniform(-math.pi, math.pi))))
+        self._carried_s = seconds
+
+    def _search(
+        self, loop: ClosedLoop, finder: GlobalLocalization, scan: Scan, T_odom_base: Array
+    ) -> None:
+        """One scan of a lost robot, for all of its localizers."""
+        assert self._own is not None
+        localizer = self._own[0].localizer
+        T_world_base = loop.simulation.robot.T_world_base
+        estimate = self._own[0].step(scan, T_odom_base).estimate
+        self._way_m += float(np.hypot(*(T_world_base - loop.log.true_poses[-1])[:2]))
+        loop.note(scan, estimate)
+        found = finder.step(scan, T_odom_base).pose
+        if found is not None:
+            localizer.set_pose(found.T_map_base, found.covariance)
+        if found is not None or not estimate.lost:
+            self._found_s = scan.stamp_ns / 1e9
+            self._off = se2.between(T_world_base, localizer.pose)
+            self._finder = None
+            loop.drive_by(*self._own)
+        else:
+            loop.decide(scan, loop.pipeline.step(scan, T_odom_base).estimate)

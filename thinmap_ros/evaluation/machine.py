@@ -1,0 +1,88 @@
+"""What the benchmarks ran on, and what they took of it: time and memory.
+
+Times can be compared: the best of several runs, taken in turns, or what a run takes of the
+processor.
+"""
+
+import os
+import platform
+import resource
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+
+from thinmap_ros.evaluation.outcome import Row
+from thinmap_ros.pipeline import Pipeline
+
+
+def machine() -> Iterator[Row]:
+    """Processor, cores, and versions."""
+    lines = Path('/proc/cpuinfo').read_text(encoding='utf-8').splitlines()
+    names = [line.partition(':')[2].strip() for line in lines if line.startswith('model name')]
+    yield Row('processor', names[0] if names else platform.processor())
+    yield Row('cores', str(os.cpu_count()))
+    yield Row('processes that wanted one of them (load)', f'{os.getloadavg()[2]:.0f}')
+    yield Row('Python', platform.python_version())
+    for package in ('numpy', 'scipy', 'numba'):
+        yield Row(package, version(package))
+
+
+class CpuTimedPipeline(Pipeline):
+    """A pipeline whose stages are timed in processor time: a busy machine changes it little."""
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        started = time.process_time()
+        yield
+        self.stage_seconds.setdefault(stage, []).append(time.process_time() - started)
+
+
+def best_seconds(works: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
+    """Shortest time of each work over some rounds.
+
+    All take turns, so that a busy machine is busy for all.
+    """
+    for work in works.values():
+        work()  # compile, fill caches
+    best = dict.fromkeys(works, float('inf'))
+    for _ in range(rounds):
+        for name, work in works.items():
+            started = time.perf_counter()
+            work()
+            best[name] = min(best[name], time.perf_counter() - started)
+    return best
+
+
+def median_seconds(work: Callable[[], object], rounds: int) -> float:
+    """Median time of the processor that a work takes over some rounds.
+
+    A busy machine changes it little.
+    """
+    work()  # compile, fill caches
+    taken = []
+    for _ in range(rounds):
+        started = time.process_time()
+        work()
+        taken.append(time.process_time() - started)
+    return statistics.median(taken)
+
+
+def resident_mb() -> float:
+    """Resident memory now, MB."""
+    pages = int(Path('/proc/self/statm').read_text().split()[1])
+    return pages * resource.getpagesize() / 1e6
+
+
+def peak_mb() -> float:
+    """Highest resident memory since the process began or `forget_peak`, MB."""
+    # Not ru_maxrss: after a fork that is at least what the parent had.
+    status = Path('/proc/self/status').read_text()
+    return int(status.split('VmHWM:')[1].split()[0]) * 1024 / 1e6
+
+
+def forget_peak() -> None:
+    """From now on the peak is that of what follows."""
+    Path('/proc/self/clear_refs').write_text('5')

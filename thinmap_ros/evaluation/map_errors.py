@@ -1,0 +1,99 @@
+"""How far a map is off what it shows."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.sim.surfaces import surfaces
+from thinmap_ros.sim.world import World
+from thinmap_ros.view.plots import MapLayer, Panel, Raster, Segments
+
+_SHORTEST_M = 0.2
+_SPACING_M = 0.05
+_FOUND_M = 0.2
+_SHOWN_M = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class MapError:
+    """Distance of each occupied cell's centre to what is solid, m, (H, W), NaN elsewhere.
+
+    Share of surfaces found.
+    """
+
+    off_m: Array
+    patch: GridPatch
+    found: float
+
+    @property
+    def cells_off_m(self) -> Array:
+        """Distances of the occupied cells, m, (N,)."""
+        return self.off_m[np.isfinite(self.off_m)]
+
+
+def map_error(patch: GridPatch, world: World) -> MapError:
+    """Compare a map with its world, in the same frame.
+
+    A surface is found where a cell within 0.2 m is occupied.
+    """
+    off_m = np.full(patch.shape, np.nan)
+    cells = np.argwhere(patch.occupied)
+    to_solid_m = ndimage.distance_transform_edt(world.occupied == 0) * world.frame.resolution
+    at = world.frame.cells_of(patch.frame.centres_of(cells))
+    at = np.clip(at, 0, np.array(world.occupied.shape) - 1)
+    off_m[cells[:, 0], cells[:, 1]] = to_solid_m[at[:, 0], at[:, 1]]
+    points = _points_on(surfaces(world, _SHORTEST_M))
+    to_cell_m = ndimage.distance_transform_edt(np.pad(~patch.occupied, 1, constant_values=True))[
+        1:-1, 1:-1
+    ]
+    inside = patch.contains(points)
+    there = patch.frame.cells_of(points[inside])
+    near = to_cell_m[there[:, 0], there[:, 1]] * patch.frame.resolution <= _FOUND_M
+    return MapError(off_m, patch, float(near.sum() / len(points)))
+
+
+def panels(error: MapError, world: World) -> list[Panel]:
+    """The world as it is, the map, and how far the map is off."""
+    lines = surfaces(world, 0.1)
+    corners = lines.reshape(-1, 2)
+    (left, bottom) = corners.min(axis=0) - 0.5
+    (right, top) = corners.max(axis=0) + 0.5
+    limits = (left, right, bottom, top)
+    raster = Raster(error.off_m, error.patch.frame, 'cell off by (m)', (0.0, _SHOWN_M))
+    return [
+        Panel([Segments(lines)], '(a) the world (CAD data)', limits=limits),
+        Panel([MapLayer(error.patch)], '(b) grid map', limits=limits),
+        Panel([raster], '(c) distance of occupied cells to what is solid', limits=limits),
+    ]
+
+
+def row(name: str, error: MapError) -> list[object]:
+    """Name, occupied cells, and how far they are off: mean, 95 of 100, share within a cell.
+
+    Share of surfaces found.
+    """
+    off = error.cells_off_m
+    within = float((off <= error.patch.frame.resolution).mean())
+    return [name, len(off), float(off.mean()), float(np.percentile(off, 95)), within, error.found]
+
+
+COLUMNS = [
+    'map',
+    'occupied_cells',
+    'mean_off_m',
+    'p95_off_m',
+    'share_within_a_cell',
+    'surfaces_found',
+]
+
+
+def _points_on(lines: Array) -> Array:
+    """Points (N, 2) along segments (M, 4)."""
+    parts = []
+    for line in lines:
+        count = max(2, round(float(np.hypot(*(line[2:] - line[:2]))) / _SPACING_M))
+        parts.append(line[:2] + np.linspace(0.0, 1.0, count)[:, None] * (line[2:] - line[:2]))
+    return np.concatenate(parts)

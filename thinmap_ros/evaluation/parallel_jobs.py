@@ -1,0 +1,181 @@
+"""Many jobs, a process each, on the cores of this machine or on a Dask cluster; resumable."""
+
+import argparse
+import json
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing import get_context
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+from tqdm import tqdm
+
+from thinmap_ros.core.errors import InputError, ThinmapError, reason_of
+from thinmap_ros.evaluation.processes import end_with_parent
+from thinmap_ros.files.atomic import read_text, write_text
+
+Report = dict[str, Any]
+
+
+class Job(Protocol):
+    """What a report is made of; it goes to another process as a pickle."""
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+
+
+AnyJob = TypeVar('AnyJob', bound=Job)
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A job without a report: why, in one line, and the traceback where the program is to blame."""
+
+    reason: str
+    trace: str = ''
+
+
+def add_run_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say where jobs run."""
+    parser.add_argument(
+        '--processes', type=int, default=os.cpu_count() or 1, help='runs at a time (default: cores)'
+    )
+    parser.add_argument(
+        '--scheduler', default='', help='address of a Dask scheduler, such as tcp://host:8786'
+    )
+
+
+def run_missing(
+    work: Callable[[AnyJob], Report],
+    jobs: Sequence[AnyJob],
+    file_of: Callable[[AnyJob], Path],
+    arguments: argparse.Namespace,
+    quiet: bool = False,
+) -> dict[str, Failure]:
+    """Run each job whose file is not there yet; its report is written as soon as it is there.
+
+    work: a function of a module, since other processes import it. arguments: those of
+    `add_run_options`. Returns the jobs that failed, by name; the others run all the same.
+    """
+    missing = [job for job in jobs if not file_of(job).exists()]
+    done = len(jobs) - len(missing)
+    failures: dict[str, Failure] = {}
+    with tqdm(total=len(jobs), initial=done, unit='run', disable=quiet) as bar:
+        for job, outcome in _outcomes(work, missing, arguments) if missing else ():
+            if isinstance(outcome, Failure):
+                failures[job.name] = outcome
+                bar.write(f'{job.name}: {outcome.reason}\n{outcome.trace}'.rstrip(), sys.stderr)
+            else:
+                write_text(file_of(job), json.dumps(outcome) + '\n')
+            bar.update()
+    return failures
+
+
+def read_report(path: Path, options: Any) -> Report:
+    """Report of a finished job; its entry `options` has to be these.
+
+    Raises InputError where it is not.
+    """
+    report: Report = json.loads(read_text(path))
+    if report.get('options') != options:
+        raise InputError(f'{path}: of a run with other options: expected another folder for these')
+    return report
+
+
+def complaint(failures: dict[str, Failure]) -> InputError:
+    """One error for all jobs that failed, each with its name and reason."""
+    reasons = [f'{name}: {failure.reason}' for name, failure in sorted(failures.items())]
+    return InputError(f'{len(failures)} failed: {"; ".join(reasons)}')
+
+
+def _outcomes(
+    work: Callable[[AnyJob], Report], jobs: Sequence[AnyJob], arguments: argparse.Namespace
+) -> Iterator[tuple[AnyJob, Report | Failure]]:
+    if arguments.scheduler:
+        return _on_cluster(work, jobs, arguments.scheduler)
+    return _on_cores(work, jobs, arguments.processes)
+
+
+def _on_cores(
+    work: Callable[[AnyJob], Report], jobs: Sequence[AnyJob], processes: int
+) -> Iterator[tuple[AnyJob, Report | Failure]]:
+    # No pool: one process that the system kills would end all of a pool's jobs. And the peak memory
+    # of a process is that of its job.
+    waiting = list(reversed(jobs))
+    running: dict[Connection, tuple[AnyJob, SpawnProcess]] = {}
+    try:
+        while waiting or running:
+            while waiting and len(running) < max(processes, 1):
+                job = waiting.pop()
+                connection, process = _started(work, job)
+                running[connection] = (job, process)
+            for ready in wait(list(running)):
+                assert isinstance(ready, Connection)
+                job, process = running.pop(ready)
+                yield job, _received(ready, process)
+    finally:
+        for _, process in running.values():
+            process.terminate()
+            process.join()
+
+
+def _started(work: Callable[[AnyJob], Report], job: AnyJob) -> tuple[Connection, SpawnProcess]:
+    context = get_context('spawn')
+    here, there = context.Pipe(duplex=False)
+    process = context.Process(target=_send, args=(there, work, job), daemon=True)
+    process.start()
+    there.close()  # so that the end of the process is the end of the pipe
+    return here, process
+
+
+def _send(connection: Connection, work: Callable[[AnyJob], Report], job: AnyJob) -> None:
+    end_with_parent()
+    # Ctrl-C goes to all processes of a terminal; the parent ends this one.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    connection.send(_attempted(work, job))
+
+
+def _received(connection: Connection, process: SpawnProcess) -> Report | Failure:
+    outcome: Report | Failure | None = None
+    with suppress(EOFError):  # of a process that was killed
+        outcome = connection.recv()
+    process.join()
+    connection.close()
+    return outcome or Failure(f'its process ended with exit code {process.exitcode}')
+
+
+def _on_cluster(
+    work: Callable[[AnyJob], Report], jobs: Sequence[AnyJob], address: str
+) -> Iterator[tuple[AnyJob, Report | Failure]]:
+    from dask.distributed import Client
+    from dask.distributed import as_completed as as_completed_there
+
+    with Client(address) as client:
+        running = {client.submit(_attempted, work, job, pure=False): job for job in jobs}
+        for future in as_completed_there(list(running)):
+            try:
+                outcome = future.result()
+            except Exception as error:  # of the cluster: a worker that was killed, a lost module
+                outcome = Failure(_named(error))
+            yield running[future], outcome
+
+
+def _attempted(work: Callable[[AnyJob], Report], job: AnyJob) -> Report | Failure:
+    try:
+        return work(job)
+    except (ThinmapError, OSError) as error:
+        return Failure(reason_of(error))
+    except Exception as error:
+        return Failure(_named(error), traceback.format_exc())
+
+
+def _named(error: Exception) -> str:
+    return f'{type(error).__name__}: {reason_of(error)}'

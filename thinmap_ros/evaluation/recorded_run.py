@@ -1,0 +1,140 @@
+"""What a run of the live graph leaves behind, read back from its bag."""
+
+import json
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thinmap_ros.closed_loop import Ending
+from thinmap_ros.core import se2
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.evaluation.exploration_metrics import EndNodeCensus, exploration_report
+from thinmap_ros.files import graphs, occupancy_maps, trajectories
+from thinmap_ros.files.atomic import write_text
+from thinmap_ros.files.worlds import read_world
+from thinmap_ros.logs import decode
+from thinmap_ros.logs.bag import Bag
+from thinmap_ros.sim.coverage import Coverable, coverable
+from thinmap_ros.sim.robot import PRESETS
+from thinmap_ros.sim.world import World
+from thinmap_ros.view import figures, rerun_sinks
+from thinmap_ros.view.message_view import recording_from_bag
+
+FILES = (
+    'map.pgm',
+    'map.yaml',
+    'topology.geojson',
+    'trajectory.tum',
+    'report.json',
+    'summary.png',
+    'recording.rrd',
+)
+_TOPICS = {'/ground_truth', '/pose', '/map', '/topology', '/end_nodes', '/collisions', '/scan'}
+
+
+@dataclass(eq=False)
+class Recording:
+    """The outputs of a run: paths by stamp, maps by stamp, the last graph, end nodes, contacts."""
+
+    true: dict[int, Array] = field(default_factory=dict)
+    estimated: dict[int, Array] = field(default_factory=dict)
+    maps: list[tuple[int, GridPatch]] = field(default_factory=list)
+    topology: TopologicalMap = field(default_factory=TopologicalMap)
+    end_nodes: list[tuple[int, list[tuple[int, float, float]]]] = field(default_factory=list)
+    collisions: int = 0
+    range_max_m: float = 8.0
+
+
+def read(path: Path) -> Recording:
+    """Read what counts from a bag of a run. Raises InputError where a topic is missing."""
+    bag = Bag(path)
+    recording = Recording()
+    for raw in bag.messages(_TOPICS):
+        message = bag.decode(raw)
+        if raw.topic == '/collisions':
+            recording.collisions = int(message.data)
+            continue
+        ns = decode.stamp_ns(message)
+        if raw.topic == '/ground_truth':
+            recording.true[ns] = decode.pose(message.pose)
+        elif raw.topic == '/pose':
+            recording.estimated[ns] = decode.pose(message.pose.pose)
+        elif raw.topic == '/map':
+            recording.maps.append((ns, decode.patch(message)))
+        elif raw.topic == '/topology':
+            recording.topology = decode.topology(message)
+        elif raw.topic == '/end_nodes':
+            nodes = [(int(n.node_id), n.position.x, n.position.y) for n in message.end_nodes]
+            recording.end_nodes.append((ns, nodes))
+        else:
+            recording.range_max_m = float(message.range_max)
+    if not (recording.true and recording.estimated and recording.maps):
+        raise InputError(
+            f'{path}: expected /ground_truth, /pose and /map; '
+            f'it has {", ".join(sorted(bag.topics))}'
+        )
+    return recording
+
+
+def write(out: Path, world_file: Path, robot: str, result: dict[str, Any]) -> dict[str, Any]:
+    """Write map, graph, trajectory, picture, report and, with rerun, recording of a run in out/bag.
+
+    Returns the report.
+    """
+    recording = read(out / 'bag')
+    world = World.from_patch(*read_world(world_file))
+    start = next(iter(recording.true.values()))
+    seen = coverable(world, start, PRESETS[robot].radius_m, recording.range_max_m)
+    report = _report(recording, seen, result)
+    patch = recording.maps[-1][1]
+    occupancy_maps.write_map(out / 'map', patch)
+    graphs.write_geojson(out / 'topology.geojson', recording.topology)
+    estimated = np.array(list(recording.estimated.values()))
+    trajectories.write_tum(out / 'trajectory.tum', list(recording.estimated), list(estimated))
+    true = np.array(list(recording.true.values()))
+    title = (
+        f'{world.name}: {100.0 * report["coverage"]:.1f} % seen, '
+        f'{report["distance"]:.1f} m, {report["time"]:.0f} s'
+    )
+    figures.summary_figure(out / 'summary.png', patch, recording.topology, estimated, true, title)
+    if rerun_sinks.is_installed():
+        recording_from_bag(out / 'bag', out / 'recording.rrd')
+    else:
+        print(
+            'no recording.rrd: rerun is not installed (pip install "thinmap_ros[viewer]")',
+            file=sys.stderr,
+        )
+    write_text(out / 'report.json', json.dumps(report, indent=2) + '\n')
+    return report
+
+
+def _report(recording: Recording, seen: Coverable, result: dict[str, Any]) -> dict[str, Any]:
+    start_ns = int(result['start_ns'])
+    end_ns = int(result['end_ns'])
+    stamps = [ns for ns in recording.true if start_ns <= ns <= end_ns and ns in recording.estimated]
+    true = np.array([recording.true[ns] for ns in stamps])
+    estimated = np.array([recording.estimated[ns] for ns in stamps])
+    times = (np.array(stamps) - start_ns) / 1e9
+    coverage = np.array(
+        [((ns - start_ns) / 1e9, seen.share_known(patch)) for ns, patch in recording.maps]
+    )
+    ending = Ending(bool(result['finished']), str(result['reason']), recording.collisions)
+    report = exploration_report(ending, times, true, estimated, coverage, _census(recording))
+    # Heading as well: a live run is judged by its poses, not by places alone.
+    turned = se2.wrap(np.asarray(estimated[:, 2] - true[:, 2]))
+    report['heading_rmse_deg'] = round(float(np.degrees(np.sqrt(np.mean(turned**2)))), 4)
+    return report
+
+
+def _census(recording: Recording) -> EndNodeCensus:
+    census = EndNodeCensus()
+    for ns, nodes in recording.end_nodes:
+        if ns in recording.estimated:
+            census.take(nodes, recording.estimated[ns])
+    return census

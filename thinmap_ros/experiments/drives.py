@@ -1,0 +1,184 @@
+"""The drives behind the experiments: simulated from a seed, or read from a recorded bag."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from thinmap_ros.closed_loop import Options, make_loop, nothing_to_show
+from thinmap_ros.core import se2
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.exploration.strategy import Decision, Strategy
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.files import package_data
+from thinmap_ros.files.worlds import read_tour, read_world
+from thinmap_ros.logs import decode
+from thinmap_ros.logs.bag import Bag, BagLog
+from thinmap_ros.logs.log import OdometryEvent
+from thinmap_ros.sim.coverage import coverable
+from thinmap_ros.sim.drives import Look, drive, random_drive, ways_along
+from thinmap_ros.sim.laser import Lms200, Lms200Config
+from thinmap_ros.sim.robot import PRESETS
+from thinmap_ros.sim.simulation import Simulation
+from thinmap_ros.sim.world import World
+
+SPEED_M_S = 0.2  # of all three papers
+# A step of global localization: at 0.5 m/s and 5 Hz, up to 0.3 m.
+LOST_STEPS = 15
+LOST_STEP_SCANS = 3
+TRUTH_TOPIC = '/ground_truth'
+_LOOKS_AT_A_STOP = 4
+_EXPLORE_LIMIT_S = 1000.0
+
+
+def world_of(name: str) -> World:
+    """One of the papers' worlds."""
+    return World.from_patch(*read_world(package_data.world_path(name)))
+
+
+def tour_of(name: str) -> Array:
+    """Places (N, 2) of a world's tour."""
+    return read_tour(package_data.world_path(name))
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A drive: its world, the robot, how it goes in words, and what makes it from a seed.
+
+    localized: a recording's poses are those of the localizer, else the true ones.
+    """
+
+    world: str
+    robot: str
+    how: str
+    looks: Callable[['Recipe', int], Iterator[Look]]
+    localized: bool = False
+
+
+def _tour(recipe: Recipe, seed: int) -> Iterator[Look]:
+    world = world_of(recipe.world)
+    robot = PRESETS[recipe.robot]
+    simulation = Simulation(world, world.start, robot, Lms200Config(), seed)
+    return drive(simulation, ways_along(world, tour_of(recipe.world), robot.radius_m), SPEED_M_S)
+
+
+def _stops(recipe: Recipe, seed: int) -> Iterator[Look]:
+    """Put down by hand at each stop, looking two ways: the papers' robot had no odometry either."""
+    world = world_of(recipe.world)
+    laser = Lms200(Lms200Config(), seed)
+    stamp_ns = 0
+    for x, y in tour_of(recipe.world):
+        for heading in (0.0, np.pi):
+            for _ in range(_LOOKS_AT_A_STOP):
+                T = se2.pose(float(x), float(y), heading)
+                yield Look(laser.scan(world, T, stamp_ns), T, T)
+                stamp_ns += 200_000_000
+
+
+def _lost(recipe: Recipe, seed: int) -> Iterator[Look]:
+    """From the paper's place to random ones, for as long as the localization lasts."""
+    world = world_of(recipe.world)
+    looks = random_drive(world, world.start, seed)
+    return (next(looks) for _ in range(1 + LOST_STEPS * LOST_STEP_SCANS))
+
+
+class _Watched:
+    """A strategy that keeps what the robot had when it was asked."""
+
+    def __init__(self, strategy: Strategy, simulation: Simulation) -> None:
+        self._strategy = strategy
+        self._simulation = simulation
+        self.looks: list[Look] = []
+
+    def step(
+        self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
+    ) -> Decision:
+        self.looks.append(
+            Look(scan, self._simulation.robot.T_odom_base, self._simulation.robot.T_world_base)
+        )
+        return self._strategy.step(topology, patch, scan, T_map_base)
+
+    def fail_target(self, reason: str) -> None:
+        self._strategy.fail_target(reason)
+
+
+def _exploration(recipe: Recipe, seed: int) -> Iterator[Look]:
+    world = world_of(recipe.world)
+    loop = make_loop(
+        world, world.start, Options(seed=seed, robot=recipe.robot, speed_m_s=SPEED_M_S)
+    )
+    watched = _Watched(loop.strategy, loop.simulation)
+    loop.strategy = watched
+    goal = coverable(world, world.start, PRESETS[recipe.robot].radius_m, Lms200Config().range_max_m)
+    loop.run(goal, _EXPLORE_LIMIT_S, nothing_to_show)
+    return iter(watched.looks)
+
+
+RECIPES = {
+    'lab_stops': Recipe(
+        'lab', '2dx', 'put down by hand at twelve stops, four scans to either side at each', _stops
+    ),
+    'lab_lost': Recipe('lab', '2dx', 'from (2 m, 2 m, 270 deg) to random places at 0.5 m/s', _lost),
+    'dead_end': Recipe('dead_end', '2dx', 'along the tour of the world at 0.2 m/s', _tour),
+    'joined_hallways': Recipe(
+        'joined_hallways', '2dx', 'along the tour of the world at 0.2 m/s', _tour
+    ),
+    'room_10x10': Recipe(
+        'room_10x10', '2dx', 'explored by position probability at up to 0.2 m/s', _exploration
+    ),
+    'office': Recipe(
+        'office', '3at', 'along the tour of the world at 0.2 m/s', _tour, localized=True
+    ),
+    'floor_40x10': Recipe(
+        'floor_40x10', '3at', 'along the tour of the world at 0.2 m/s', _tour, localized=True
+    ),
+    'floor_70x10': Recipe(
+        'floor_70x10', '3at', 'along the tour of the world at 0.2 m/s', _tour, localized=True
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where drives come from: a seed, or a folder of bags.
+
+    quick: experiments are made small, as for a test.
+    """
+
+    seed: int = 0
+    bags: Path | None = None
+    quick: bool = False
+
+    def looks(self, name: str) -> Iterator[Look]:
+        """A drive by its name in RECIPES."""
+        if self.bags is None:
+            recipe = RECIPES[name]
+            return recipe.looks(recipe, self.seed)
+        return looks_of_bag(self.bags / f'{name}.mcap')
+
+
+def looks_of_bag(path: Path) -> Iterator[Look]:
+    """The drive that a bag holds.
+
+    Raises InputError where a scan has no odometry or ground truth of its stamp.
+    """
+    bag = Bag(path)
+    truth = {}
+    for message in bag.messages({TRUTH_TOPIC}):
+        decoded = bag.decode(message)
+        truth[decode.stamp_ns(decoded)] = decode.pose(decoded.pose)
+    T_odom_base: dict[int, Array] = {}
+    for event in BagLog(path).events():
+        if isinstance(event, OdometryEvent):
+            T_odom_base[event.stamp_ns] = event.T_odom_base
+            continue
+        stamp_ns = event.scan.stamp_ns
+        if stamp_ns not in T_odom_base or stamp_ns not in truth:
+            raise InputError(
+                f'{path}: scan at {stamp_ns} ns: expected /odom and {TRUTH_TOPIC} of the same stamp'
+            )
+        yield Look(event.scan, T_odom_base[stamp_ns], truth[stamp_ns])

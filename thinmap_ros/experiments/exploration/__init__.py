@@ -1,0 +1,1 @@
+"""The exploration paper's figures, and strategies compared."""

@@ -1,0 +1,165 @@
+"""Paper 2, Fig. 10: an exploration, with the probabilities of the end nodes at six moments."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from thinmap_ros.closed_loop import SCANS_PER_GRAPH
+from thinmap_ros.core.estimate import Estimate
+from thinmap_ros.core.exploration.explorer import Explorer
+from thinmap_ros.core.exploration.strategy import FIRST_STAND_IN_ID, Decision
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.graph import TopologicalMap
+from thinmap_ros.evaluation.exploration_metrics import EndNodeCensus
+from thinmap_ros.evaluation.outcome import Comparison, Outcome, Rows, Table
+from thinmap_ros.experiments.drives import Source, world_of
+from thinmap_ros.pipeline import Pipeline, PipelineConfig
+from thinmap_ros.sim.coverage import coverable
+from thinmap_ros.sim.drives import Look
+from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.robot import PRESETS
+from thinmap_ros.view.plots import Curve, GraphLayer, Layer, MapLayer, Panel, Plot, Robots, Words
+
+_MOMENTS = (0.05, 0.2, 0.4, 0.6, 0.8, 1.0)
+_PAPER_S = 120.0
+_LIMITS = (-0.3, 10.6, -0.3, 10.3)
+_FULL = 0.99
+
+
+@dataclass(frozen=True, eq=False)
+class _Moment:
+    """What was known at a scan."""
+
+    seconds: float
+    T_map_base: Array
+    patch: GridPatch
+    graph: TopologicalMap
+    decision: Decision
+
+
+def run(source: Source) -> Outcome:
+    """Decide anew what was decided on the drive, from the same scans; look at what was known."""
+    world = world_of('room_10x10')
+    moments, census = _relive(list(source.looks('room_10x10')))
+    goal = coverable(world, world.start, PRESETS['2dx'].radius_m, Lms200Config().range_max_m)
+    coverage = [(m.seconds, goal.share_known(m.patch)) for m in moments]
+    last = moments[-1]
+    poses = np.array([moment.T_map_base for moment in moments])
+    way_m = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
+    shown = [moments[round(share * (len(moments) - 1))] for share in _MOMENTS]
+    unvisited = census.seen - census.visited
+    return Outcome(
+        'Exploration by position probability',
+        'Exploration paper, section 4, Fig. 10',
+        'The room of 10 x 10 m, cells of 10 cm, 181 beams over 180 degrees, at most 0.2 m/s, '
+        'with exact poses. Beside each end node stand its number and its position probability.',
+        [
+            Table('end_nodes', _COLUMNS, _rows(moments)),
+            Table('coverage', ['time_s', 'coverage'], coverage),
+        ],
+        [
+            Plot(
+                'fig10',
+                'Paper 2, Fig. 10: the exploration at six moments; '
+                'number and position probability beside each end node, the path so far.',
+                [_panel(m, poses[: moments.index(m) + 1]) for m in shown],
+                columns=3,
+                panel_inches=(4.6, 4.6),
+            )
+        ],
+        [
+            Comparison(
+                'time for the room',
+                f'under {_PAPER_S:.0f} s',
+                f'{last.seconds:.0f} s, {way_m:.1f} m',
+                last.seconds < _PAPER_S,
+            ),
+            Comparison(
+                'explored',
+                'the entire environment',
+                f'{coverage[-1][1]:.1%}',
+                coverage[-1][1] >= _FULL,
+            ),
+            Comparison(
+                'end nodes that were never visited',
+                'some',
+                f'{unvisited} of {census.seen}',
+                unvisited > 0,
+            ),
+        ],
+    )
+
+
+_COLUMNS = [
+    'time_s',
+    'end_node',
+    'x_m',
+    'y_m',
+    'probability',
+    'distance_index',
+    'angle_index',
+    'open_border_m',
+    'is_target',
+]
+
+
+def _relive(looks: list[Look]) -> tuple[list[_Moment], EndNodeCensus]:
+    """Once a second, and at the end, what is known."""
+
+    def here(scan: object, T_odom_base: Array) -> Estimate:
+        return Estimate(truth, np.zeros((3, 3)), np.zeros(3))
+
+    pipeline = Pipeline(PipelineConfig(scans_per_graph=SCANS_PER_GRAPH), here)
+    explorer = Explorer()
+    census = EndNodeCensus()
+    moments = []
+    for k, look in enumerate(looks):
+        truth = look.T_world_base
+        pipeline.step(look.scan, look.T_odom_base)
+        patch = pipeline.grid.patch()
+        graph = pipeline.topology.map
+        decision = explorer.step(graph, patch, look.scan, truth)
+        census.take([(n.node_id, n.x, n.y) for n in decision.end_nodes], truth)
+        if k % 5 == 0 or k == len(looks) - 1:
+            moments.append(_Moment(look.scan.stamp_ns / 1e9, truth, patch, graph.copy(), decision))
+    return moments, census
+
+
+def _rows(moments: list[_Moment]) -> Rows:
+    return [
+        [
+            m.seconds,
+            n.node_id,
+            n.x,
+            n.y,
+            n.probability,
+            n.distance_index,
+            n.angle_index,
+            n.open_border_m,
+            n.is_target,
+        ]
+        for m in moments
+        for n in m.decision.end_nodes
+        if n.node_id < FIRST_STAND_IN_ID
+    ]
+
+
+def _panel(moment: _Moment, path: Array) -> Panel:
+    nodes = [n for n in moment.decision.end_nodes if n.node_id < FIRST_STAND_IN_ID]
+    words = [f'{n.node_id}({n.probability:.2f})' for n in nodes]
+    at = np.array([[n.x, n.y] for n in nodes]).reshape(-1, 2)
+    target = moment.decision.target
+    goal = (
+        []
+        if target is None
+        else [Curve(target.goal[None, :2], 'looked at from', 3, '', 'X', size=9.0)]
+    )
+    layers: list[Layer] = [
+        MapLayer(moment.patch),
+        GraphLayer(moment.graph),
+        Curve(path[:, :2], 'path', 5),
+        *goal,
+    ]
+    layers += [Robots(moment.T_map_base[None]), Words(at, words)]
+    return Panel(layers, f'after {moment.seconds:.0f} s', limits=_LIMITS)

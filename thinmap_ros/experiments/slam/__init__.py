@@ -1,0 +1,1 @@
+"""The EKF paper's figures, and logs of real robots."""

@@ -1,0 +1,154 @@
+"""Paper 3, Fig. 13: time of a filter's step against the number of features."""
+
+from time import process_time
+
+import numpy as np
+
+from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.evaluation.outcome import Comparison, Outcome, Table
+from thinmap_ros.experiments.drives import Source
+from thinmap_ros.view.plots import Curve, Panel, Plot
+
+_COUNTS = (25, 50, 88, 200, 400, 800, 1500, 3000)
+_COUNTS_QUICK = (25, 88)
+# Features of a local area, and of them those that a step sees
+_LOCAL = 12
+_SEEN = 7
+# A metre at 0.2 m/s and 5 Hz
+_STEPS = 100
+_AREA_STEPS = 25
+_ONE_STEP = np.array([0.04, 0.0, 0.0])  # 0.2 m/s at 5 Hz
+_MOTION = np.diag([1e-6, 1e-6, 1e-6])
+_LINE = np.diag([1e-4, 1e-5])
+_SAME = 1e-6
+_FLAT = 1.5
+_HALF_WAY = 800
+
+
+def run(source: Source) -> Outcome:
+    """Time both filters on the same steps."""
+    counts = _COUNTS_QUICK if source.quick else _COUNTS
+    times = []
+    same = []
+    for count in counts:
+        local_ms, local_pose = _drive(source.seed, count, True)
+        full_ms, full_pose = _drive(source.seed, count, False)
+        times.append([count, *_spread(local_ms), *_spread(full_ms)])
+        same.append([count, float(np.abs(local_pose - full_pose).max())])
+    first = times[0]
+    last = times[-1]
+    half = next((row for row in times if row[0] >= _HALF_WAY), last)
+    apart = max(row[1] for row in same)
+    return Outcome(
+        'Time of a step against the number of features',
+        'SLAM paper, section 5.2, Fig. 13',
+        f'Maps of {counts[0]} to {counts[-1]} lines. A step predicts and corrects by {_SEEN} lines '
+        f'that are seen; a local area has {_LOCAL} features, and after every {_AREA_STEPS} steps, '
+        'or a metre, the robot is in another one. '
+        'The conventional filter takes the same steps with all features. '
+        'CPU time of the filter alone: what a whole scan costs is on the benchmark page.',
+        [
+            Table('times', _COLUMNS, times, timed=True),
+            Table('difference', ['features', 'largest_difference_of_pose'], same),
+        ],
+        [_plot(np.array(times))],
+        [
+            Comparison(
+                'EKF-SLAM/TI',
+                'nearly constant, 30-40 ms in all',
+                f'{first[1]:.2f} ms with {first[0]}, '
+                f'{last[1]:.2f} ms with {last[0]} features (medians)',
+                bool(half[1] <= _FLAT * first[1]),
+                timed=True,
+                remark=f'{half[1] / first[1]:.2f} times as much with {half[0]} '
+                f'as with {first[0]} features, '
+                f'{last[1] / first[1]:.2f} times with {last[0]}; '
+                f'mean {first[2]:.2f} and {last[2]:.2f} ms, '
+                f'a step into another area up to {last[3]:.0f} ms',
+            ),
+            Comparison(
+                'conventional EKF-SLAM',
+                'grows, rapidly from about 100 on',
+                f'{first[4]:.2f} ms with {first[0]}, '
+                f'{last[4]:.1f} ms with {last[0]} features (medians)',
+                bool(last[4] > 2.0 * first[4]),
+                timed=True,
+            ),
+            Comparison(
+                'both estimate the same',
+                'almost identical',
+                f'pose at most {apart:.1e} (m, rad) apart',
+                apart < _SAME,
+                remark='the compressed form loses nothing; the paper drops the rest',
+            ),
+        ],
+    )
+
+
+_COLUMNS = [
+    'features',
+    'ti_median_ms',
+    'ti_mean_ms',
+    'ti_longest_ms',
+    'full_median_ms',
+    'full_mean_ms',
+    'full_longest_ms',
+]
+
+
+def _drive(seed: int, count: int, local: bool) -> tuple[Array, Array]:
+    """Time of each step, ms, (N,), and the pose at the end (3,)."""
+    rng = np.random.default_rng([seed, count])
+    ekf = CompressedEkf(np.zeros(3), np.diag([1e-4, 1e-4, 1e-4]))
+    lines = np.column_stack([rng.uniform(1.0, 40.0, count), rng.uniform(-np.pi, np.pi, count)])
+    for number, line in enumerate(lines):
+        ekf.add(number, line, _LINE)
+    areas = [
+        rng.choice(count, min(_LOCAL, count), replace=False).tolist()
+        for _ in range(_STEPS // _AREA_STEPS)
+    ]
+    noise = rng.normal(0.0, 1.0, (_STEPS, min(_SEEN, count), 2)) * np.sqrt(np.diag(_LINE))
+    taken = []
+    for step in range(_STEPS):
+        area = areas[step // _AREA_STEPS]
+        began = process_time()
+        if local and step % _AREA_STEPS == 0:
+            ekf.enter(area)
+        _step(ekf, area[: len(noise[step])], noise[step])
+        taken.append(1e3 * (process_time() - began))
+    return np.array(taken[1:]), ekf.local.pose
+
+
+def _step(ekf: CompressedEkf, seen: list[int], noise: Array) -> None:
+    """Predict, and correct by the features that are seen."""
+    pose = ekf.local.pose
+    ahead = pose + [_ONE_STEP[0] * np.cos(pose[2]), _ONE_STEP[0] * np.sin(pose[2]), 0.0]
+    ekf.local.predict(ahead, _ONE_STEP, _MOTION)
+    indices = np.array([ekf.area.index(number) for number in seen])
+    z = np.array([ekf.local.innovations(int(k))[0] for k in indices]) + noise
+    ekf.local.update(indices, z, np.tile(_LINE, (len(indices), 1, 1)))
+    ekf.work_off()
+
+
+def _spread(taken: Array) -> list[float]:
+    return [float(np.median(taken)), float(taken.mean()), float(taken.max())]
+
+
+def _plot(times: Array) -> Plot:
+    layers = [
+        Curve(times[:, [0, 4]], 'conventional EKF-SLAM, median', 6, '-', marker='s'),
+        Curve(times[:, [0, 1]], 'EKF-SLAM/TI, median', 2, '--', marker='o'),
+        Curve(times[:, [0, 3]], 'EKF-SLAM/TI, longest step', 4, ':', marker='^'),
+    ]
+    panel = Panel(
+        layers,
+        '',
+        'features in the map',
+        'CPU time of a step (ms)',
+        plan=False,
+        log_x=True,
+        log_y=True,
+    )
+    caption = 'Paper 3, Fig. 13: processing time of EKF-SLAM (solid) and EKF-SLAM/TI (dashed).'
+    return Plot('fig13', caption, [panel], panel_inches=(7.0, 4.4), legend='inside')

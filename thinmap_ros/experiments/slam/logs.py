@@ -1,0 +1,206 @@
+"""Logs of real robots: map, graph, features, trajectory, and errors where relations are known."""
+
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thinmap_ros.core.errors import ConfigError, InputError, reason_of
+from thinmap_ros.evaluation.outcome import Comparison, Outcome, Table
+from thinmap_ros.evaluation.trajectory_errors import RelationErrors, read_columns, relation_errors
+from thinmap_ros.files.yaml import read_mapping
+from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
+from thinmap_ros.pipeline import PipelineConfig
+from thinmap_ros.replaying import Replay, replay, write_outputs
+from thinmap_ros.view.plots import Curve, GraphLayer, MapLayer, Panel, Plot
+
+# Lasers of known logs, by the folder's name; a file laser.yaml in a log's folder comes before.
+_LASERS = {
+    'sena': {'offset_m': 0.78},
+    'mrpt_office': {
+        'offset_m': 0.16,
+        'start_angle_deg': -110.0079,
+        'step_deg': 0.352025,
+        'max_range_m': 25.0,
+    },
+}
+# What others are said to reach on the Intel log: errors of translation in m, live and after all
+# corrections; CPU ms a scan; MB. Single runs of the programs with their defaults, Cartographer
+# tuned; the last three as published in 2009.
+_OTHERS: list[tuple[str, float | None, float, float | None, float | None]] = [
+    ('IRIS LaMa slam2d', 0.036, 0.033, 0.17, 13.0),
+    ('Karto', 0.073, 0.038, 12.3, 73.0),
+    ('GMapping, 30 particles', 0.104, 0.046, 8.7, 110.0),
+    ('slam_toolbox', 0.113, 0.056, 1.17, 45.0),
+    ('Cartographer 2D', 1.55, 0.081, 34.0, 257.0),
+    ('a public line-feature EKF-SLAM', 1.87, 1.87, 30.0, 79.0),
+    ('scan matching, 2009', None, 0.220, None, None),
+    ('RBPF, 2009', None, 0.070, None, None),
+    ('graph mapping, 2009', None, 0.031, None, None),
+]
+_OTHERS_LOG = 'intel'
+_COLUMNS = [
+    'log',
+    'scans',
+    'skipped',
+    'way_m',
+    'features',
+    'features_local',
+    'nodes',
+    'edges',
+    'loops',
+    'live_m',
+    'live_deg',
+    'final_m',
+    'final_deg',
+    'odometry_m',
+]
+
+
+@dataclass(frozen=True, eq=False)
+class _Result:
+    """Of one log: its row of numbers, its row of times, and its figure."""
+
+    row: list[Any]
+    timed: list[Any]
+    plot: Plot
+
+
+def run(folder: Path, out: Path) -> Outcome:
+    """Replay each folder with a log.clf in a process of its own; its files go to out/NAME."""
+    names = sorted(path.parent.name for path in folder.glob('*/log.clf'))
+    if not names:
+        raise InputError(f'{folder}: no NAME/log.clf in it: expected folders with logs')
+    results = []
+    for name in names:
+        # A process of its own: the memory that it took at the most is then that of this log.
+        with ProcessPoolExecutor(1, mp_context=get_context('spawn')) as pool:
+            results.append(pool.submit(_one, folder / name, out / name).result())
+    rows = [result.row for result in results]
+    return Outcome(
+        'Logs of real robots',
+        'Recorded with SICK lasers; none of it was simulated',
+        'Each log in file order through localizer, grid and topology. '
+        'live: the pose as known at its scan; final: after all corrections. '
+        'Errors are those of the known relations between poses '
+        '(mean of translation, and of rotation).',
+        [
+            Table('logs', _COLUMNS, rows),
+            Table('others', ['system', 'live_m', 'final_m', 'cpu_ms_per_scan', 'peak_mb'], _OTHERS),
+            Table('times', _TIMED, [result.timed for result in results], timed=True),
+        ],
+        [result.plot for result in results],
+        [comparison for row in rows for comparison in _comparisons(row)],
+    )
+
+
+_TIMED = ['log', 'cpu_ms_per_scan', 'wall_ms_median', 'wall_ms_p95', 'wall_ms_max', 'peak_mb']
+
+
+def _one(folder: Path, out: Path) -> _Result:
+    wall = time.perf_counter()
+    cpu = time.process_time()
+    result = replay(CarmenLog(folder / 'log.clf', laser_of(folder, folder.name)), PipelineConfig())
+    seconds = (time.perf_counter() - wall, time.process_time() - cpu)
+    report = write_outputs(result, out, folder.name, seconds)
+    ms = report['ms_per_scan']['all']
+    cpu_ms = 1000.0 * seconds[1] / report['scans']
+    timed = [folder.name, cpu_ms, ms['median'], ms['p95'], ms['max'], report['peak_mb']]
+    keys = (
+        'scans',
+        'skipped',
+        'distance',
+        'features',
+        'features_local_median',
+        'nodes',
+        'edges',
+        'loops_closed',
+    )
+    row = [folder.name, *(report[key] for key in keys), *_errors(folder, result)]
+    return _Result(row, timed, _plot(folder, result))
+
+
+def laser_of(folder: Path, log: str) -> LaserOptions:
+    """Options of the laser: those of laser.yaml in the folder, or of a known log of that name.
+
+    Raises InputError where it is bad.
+    """
+    path = folder / 'laser.yaml'
+    options = _LASERS.get(log, {})
+    if path.exists():
+        options = read_mapping(path, 'options of the laser')
+    try:
+        return LaserOptions(**options)
+    except (TypeError, ConfigError) as error:
+        raise InputError(f'{path}: {reason_of(error)}') from error
+
+
+def _errors(folder: Path, result: Replay) -> list[float | None]:
+    """Errors by relations: live m, deg, final m, deg, raw odometry m; None without relations."""
+    relations = folder / 'relations'
+    odometry = folder / 'odom.txt'
+    if not relations.exists():
+        return [None] * 5
+    times = np.array(result.stamps_ns) / 1e9
+    wheels = read_columns(odometry, [0, 1, 2, 3])
+    paths = [(times, np.array(result.poses)), (times, result.pipeline.localizer.corrected_path())]
+    live, final = (relation_errors(*path, relations, odometry) for path in paths)
+    raw = relation_errors(wheels[:, 0], wheels[:, 1:], relations, odometry)
+    return [*_means(live), *_means(final), float(raw.metres.mean())]
+
+
+def _means(errors: RelationErrors) -> tuple[float, float]:
+    return float(errors.metres.mean()), float(errors.degrees.mean())
+
+
+def _plot(folder: Path, result: Replay) -> Plot:
+    pipeline = result.pipeline
+    graph = result.pipeline.topology.map
+    patch = pipeline.grid.patch()
+    final = pipeline.localizer.corrected_path()
+    way = Curve(final[:, :2], 'trajectory', 3, width=1.0)
+    rows, cols = patch.shape
+    width = min(7.0, 6.0 * cols / rows)
+    return Plot(
+        folder.name,
+        f'{folder.name}: map and trajectory; topological map.',
+        [
+            Panel([MapLayer(patch), way], 'map and trajectory'),
+            Panel([MapLayer(patch), GraphLayer(graph, 3.0)], f'{len(graph.nodes)} nodes'),
+        ],
+        columns=2,
+        panel_inches=(width, min(6.0, width * rows / cols + 0.8)),
+    )
+
+
+def _comparisons(row: list[Any]) -> list[Comparison]:
+    """The errors of a log whose relations are known, beside those of others where there are any."""
+    values = dict(zip(_COLUMNS, row, strict=True))
+    if values['final_m'] is None:
+        return []
+    name = values['log']
+    ours = f'{values["final_m"]:.3f} m after all corrections, {values["live_m"]:.3f} m live'
+    degrees = (
+        f'{values["final_deg"]:.2f} deg, live {values["live_deg"]:.2f} deg; '
+        f'odometry {values["odometry_m"]:.2f} m'
+    )
+    rows = [Comparison(f'{name}: mean error of the relations', '', ours, remark=degrees)]
+    if name == _OTHERS_LOG:
+        rows += [
+            _against(system, live_m, final_m, values) for system, live_m, final_m, *_ in _OTHERS
+        ]
+    return rows
+
+
+def _against(
+    system: str, live_m: float | None, final_m: float, values: dict[str, Any]
+) -> Comparison:
+    theirs = f'{final_m:.3f} m' + ('' if live_m is None else f', {live_m:.3f} m live')
+    live = '' if live_m is None else f', {values["live_m"]:.3f} m live'
+    ours = f'{values["final_m"]:.3f} m' + live
+    better = values['final_m'] <= final_m and (live_m is None or values['live_m'] <= live_m)
+    return Comparison(f'{values["log"]}, against {system}', theirs, ours, bool(better))

@@ -1,0 +1,130 @@
+"""Paper 1, Fig. 10 and 11: 5,000 samples of a lost robot come together at one place."""
+
+from itertools import islice
+
+import numpy as np
+
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.places.global_localizer import GlobalLocalization, Result, State
+from thinmap_ros.core.se2 import Array, wrap
+from thinmap_ros.core.topology.builder import TopologyConfig, build
+from thinmap_ros.evaluation.outcome import Comparison, Outcome, Rows, Table
+from thinmap_ros.experiments.drives import LOST_STEP_SCANS, Source
+from thinmap_ros.experiments.maps import grid_of
+from thinmap_ros.sim.drives import Look
+from thinmap_ros.view.plots import Curve, MapLayer, Panel, Plot, Robots, xy
+
+_SHOWN = (0, 2, 7, 11)  # steps of the paper's pictures; 0: before the first
+_STEPS = 11
+_SEEDS = 20
+_SEEDS_QUICK = 2
+_LIKELY = 0.01  # weight from which on a hypothesis is a candidate
+_RIGHT_M = 0.3
+_RIGHT_RAD = np.radians(10.0)
+
+
+def run(source: Source) -> Outcome:
+    """Localize on one drive with many seeds of the samples; the first one is drawn."""
+    patch = grid_of(source.looks('lab_stops')).patch()
+    topology = build(patch, (2.0, 2.0), TopologyConfig())
+    looks = list(islice(source.looks('lab_lost'), 0, None, LOST_STEP_SCANS))
+    rows: Rows = []
+    steps: Rows = []
+    panels = []
+    seeds = range(source.seed, source.seed + (_SEEDS_QUICK if source.quick else _SEEDS))
+    for seed in seeds:
+        finder = GlobalLocalization(patch, topology, seed=seed)
+        if seed == source.seed:
+            panels.append(_panel(patch, finder.samples, None, 0))
+        first = None
+        for step, look in enumerate(looks, 1):
+            result = finder.step(look.scan, look.T_odom_base)
+            state = State(result.state).name.lower()
+            rows.append([seed, step, _candidates(result), state, *_error(result, look)])
+            if first is None and result.pose is not None:
+                first = step
+                steps.append([seed, step, *_error(result, look), _is_right(result, look)])
+            if seed == source.seed and step in _SHOWN:
+                panels.append(_panel(patch, finder.samples, look, step))
+    taken = np.array([row[1] for row in steps])
+    right = sum(bool(row[4]) for row in steps)
+    worst = float(np.max([row[2] for row in steps]))
+    return Outcome(
+        'Global localization: 5,000 samples converge',
+        'Topological map paper, sections 3.1 and 4.2, Fig. 10 and 11',
+        'The robot is switched on at (2 m, 2 m, 270 deg) of the laboratory, moves on continuously, '
+        'and knows only the map of the twelve stops. '
+        f'A step is {0.2 * LOST_STEP_SCANS:g} s, up to 0.3 m. '
+        f'The same drive is localized with {len(seeds)} seeds of the samples.',
+        [
+            Table('steps', ['seed', 'step', 'candidates', 'state', 'error_m', 'error_deg'], rows),
+            Table('convergence', ['seed', 'steps', 'error_m', 'error_deg', 'right'], steps),
+        ],
+        [_samples(panels), _curve(rows, len(looks))],
+        [
+            Comparison(
+                'one position left',
+                f'after {_STEPS} steps',
+                f'after {np.median(taken):.0f} (median), {taken.max()} (most) steps '
+                f'in {len(taken)} of {len(seeds)} runs',
+                len(taken) == len(seeds) and int(taken.max()) <= _STEPS,
+            ),
+            Comparison(
+                'it is the right one',
+                'yes',
+                f'{right} of {len(seeds)} runs, at most {worst:.2f} m off',
+                right == len(seeds),
+            ),
+        ],
+    )
+
+
+def _candidates(result: Result) -> int:
+    return sum(hypothesis.weight >= _LIKELY for hypothesis in result.hypotheses)
+
+
+def _error(result: Result, look: Look) -> tuple[float | None, float | None]:
+    """How far the likeliest place is off, m and degrees."""
+    if not result.hypotheses:
+        return None, None
+    off = result.hypotheses[0].T_map_base - look.T_world_base
+    return float(np.hypot(off[0], off[1])), float(np.degrees(abs(wrap(float(off[2])))))
+
+
+def _is_right(result: Result, look: Look) -> bool:
+    metres, degrees = _error(result, look)
+    return (
+        metres is not None
+        and degrees is not None
+        and metres <= _RIGHT_M
+        and degrees <= np.degrees(_RIGHT_RAD)
+    )
+
+
+def _panel(patch: GridPatch, samples: Array, look: Look | None, step: int) -> Panel:
+    title = f'after {step} steps' if step else f'at the start: {len(samples)} samples'
+    robot = [] if look is None else [Robots(look.T_world_base[None])]
+    return Panel(
+        [MapLayer(patch), Curve(samples[:, :2], 'samples', 1, '', '.', size=1.5), *robot], title
+    )
+
+
+def _samples(panels: list[Panel]) -> Plot:
+    caption = 'Paper 1, Fig. 10 and 11: the samples at the start and after 2, 7 and 11 steps.'
+    return Plot('fig10_11', caption, panels, columns=2, panel_inches=(6.0, 3.4))
+
+
+def _curve(rows: Rows, steps: int) -> Plot:
+    layers = []
+    table = np.array([[float(str(row[0])), float(str(row[1])), float(str(row[2]))] for row in rows])
+    for k, seed in enumerate(np.unique(table[:, 0])):
+        mine = table[table[:, 0] == seed]
+        label = 'one seed each' if k == 0 else ''
+        layers.append(Curve(xy(mine[:, 1], np.maximum(mine[:, 2], 0.5)), label, 5, width=0.8))
+    median = [float(np.median(table[table[:, 1] == step, 2])) for step in range(1, steps + 1)]
+    layers.append(
+        Curve(xy(np.arange(1.0, steps + 1.0), np.array(median)), 'median', 0, marker='o', width=2.0)
+    )
+    panel = Panel(layers, '', 'step', 'candidate positions', plan=False, log_y=True)
+    caption = 'Paper 1, to Fig. 11: candidate positions (of at least 1 % of the weight) over steps.'
+    return Plot('candidates', caption, [panel], panel_inches=(6.5, 3.6), legend='inside')

@@ -1,0 +1,152 @@
+"""Paper 1, Fig. 6 to 9: local maps at twelve stops merged into one topological map."""
+
+from itertools import groupby
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from thinmap_ros.core.grid.occupancy import OccupancyGrid
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig, build
+from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
+from thinmap_ros.evaluation.outcome import Comparison, Outcome, Rows, Table
+from thinmap_ros.experiments.drives import Source
+from thinmap_ros.experiments.maps import grid_of
+from thinmap_ros.sim.drives import Look
+from thinmap_ros.view.plots import GraphLayer, MapLayer, Panel, Plot, Robots
+
+_WINDOW_M = 16.0
+# The stops near (3 m, 8 m) and (2.3 m, 3 m)
+_FIRST = 2
+_SECOND = 1
+_SAME_M = 0.5
+
+
+def run(source: Source) -> Outcome:
+    """Merge stop by stop; the global grid is only used to judge the result."""
+    by_place = groupby(source.looks('lab_stops'), lambda look: tuple(look.T_world_base[:2]))
+    stops = [list(looks) for _, looks in by_place]
+    order = [_FIRST, _SECOND, *(k for k in range(len(stops)) if k not in (_FIRST, _SECOND))]
+    builder = TopologyBuilder(TopologyConfig())
+    grid = OccupancyGrid()
+    growth = []
+    panels = []
+    states = []
+    for number, stop in enumerate(order, 1):
+        _visit(stops[stop], grid, builder)
+        states.append(builder.map.copy())
+        sizes = (len(builder.map.nodes), len(builder.map.edges))
+        growth.append([number, *stops[stop][0].T_world_base[:2], *sizes])
+        if number == 2:
+            panels.append(_panel(grid, states[-1], 'merged from both'))
+    locals_ = [
+        _local_map(stops[stop], name)
+        for stop, name in ((_FIRST, 'local map 1'), (_SECOND, 'local map 2'))
+    ]
+    whole = grid_of(look for stop in stops for look in stop)
+    batch = build(whole.patch(), _start(stops[0]), TopologyConfig())
+    share = _agreement(states[-1], batch)
+    back = _agreement(batch, states[-1])
+    gone = _redundant(states[1], states[-1])
+    return Outcome(
+        'Local topological maps become a global one',
+        'Topological map paper, sections 2.2 and 4.1, Fig. 6 to 9',
+        'The robot stands at twelve places of the laboratory, one after the other, and sees a part '
+        'of it from each, looking two ways. The window of the map round the robot is thinned, '
+        'and merged into the global map. '
+        'The map made at one go from the grid of all scans tells how it should look.',
+        [
+            Table('growth', ['stop', 'x_m', 'y_m', 'nodes', 'edges'], growth),
+            Table('nodes', ['id', 'kind', 'x_m', 'y_m', 'clearance_m'], _rows(states[-1])),
+        ],
+        _plots([*locals_, *panels], whole, _panel(grid, states[-1], '')),
+        [
+            Comparison(
+                'stops merged into one map', '10 to 15', str(len(stops)), 10 <= len(stops) <= 15
+            ),
+            Comparison(
+                'one connected map',
+                'yes',
+                f'{len(states[-1].components())} part',
+                _is_one(states[-1]),
+            ),
+            Comparison(
+                'redundant nodes at the rim of the window are gone in the end',
+                'deleted after update',
+                f'{gone} of the {len(states[1].nodes)} nodes of the first two stops',
+            ),
+            Comparison(
+                f'nodes within {_SAME_M} m of a node of the map made at one go, '
+                'and the other way round',
+                '',
+                f'{share:.0%}, {back:.0%}',
+            ),
+        ],
+    )
+
+
+def _plots(early: list[Panel], whole: OccupancyGrid, final: Panel) -> list[Plot]:
+    return [
+        Plot(
+            'fig7_8',
+            'Paper 1, Fig. 7 and 8: the local maps of two stops, and the map merged from them.',
+            early,
+            columns=3,
+            panel_inches=(5.0, 4.6),
+        ),
+        Plot(
+            'fig6_9',
+            'Paper 1, Fig. 6 and 9: the global grid map (above; only for better understanding) '
+            'and the final global topological map.',
+            [Panel([MapLayer(whole.patch())]), final],
+            panel_inches=(9.0, 4.6),
+        ),
+    ]
+
+
+def _visit(looks: list[Look], grid: OccupancyGrid, builder: TopologyBuilder) -> None:
+    for look in looks:
+        grid.update(look.scan, look.T_world_base)
+        x, y, _ = look.T_world_base
+        builder.update(grid.window(float(x), float(y), _WINDOW_M), look.T_world_base)
+
+
+def _local_map(looks: list[Look], title: str) -> Panel:
+    grid = grid_of(looks)
+    graph = build(grid.patch(), _start(looks), TopologyConfig())
+    x, y = _start(looks)
+    return _panel(grid, graph, f'{title}, sensor at ({x:g} m, {y:g} m)', looks[0].T_world_base)
+
+
+def _panel(
+    grid: OccupancyGrid, graph: TopologicalMap, title: str, robot: Array | None = None
+) -> Panel:
+    robots = [] if robot is None else [Robots(robot[None], 'sensor')]
+    return Panel([MapLayer(grid.patch()), GraphLayer(graph), *robots], title)
+
+
+def _start(looks: list[Look]) -> tuple[float, float]:
+    return float(looks[0].T_world_base[0]), float(looks[0].T_world_base[1])
+
+
+def _agreement(one: TopologicalMap, other: TopologicalMap) -> float:
+    """Share of the nodes of one map that have a node of the other one near."""
+    first, second = (
+        np.array([node.position for node in graph.nodes.values()]) for graph in (one, other)
+    )
+    return float(np.mean(cKDTree(second).query(first)[0] <= _SAME_M))
+
+
+def _redundant(early: TopologicalMap, final: TopologicalMap) -> int:
+    """Nodes of an early map where the final one has none."""
+    return round(len(early.nodes) * (1.0 - _agreement(early, final)))
+
+
+def _is_one(graph: TopologicalMap) -> bool:
+    return len(graph.components()) == 1
+
+
+def _rows(graph: TopologicalMap) -> Rows:
+    return [
+        [n.id, NodeKind(n.kind).name.lower(), n.x, n.y, n.clearance_m] for n in graph.nodes.values()
+    ]

@@ -1,0 +1,328 @@
+"""Topological maps as route graphs.
+
+GeoJSON for Nav2's route server, GraphML, tmap2 for topological_navigation.
+
+GeoJSON: nodes are points, edges are lines along the cells that they were found in (the route server
+itself drives straight from node to node). Edges are directed there, so each of ours is written in
+both directions; ids are unsigned and unique over nodes and edges; metadata are flat and without
+nulls, on which its reader would throw. Lengths and clearances are in m everywhere.
+"""
+
+import json
+import math
+from collections import Counter
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import yaml
+
+from thinmap_ros.core import validation
+from thinmap_ros.core.errors import InputError, reason_of, shown
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
+from thinmap_ros.files.atomic import read_text, write_text
+
+_LARGEST_ID = 2**32 - 1
+_MOST_BYTES = 256 << 20
+_MOST_DIGITS = 100
+_BAD_FEATURE = (KeyError, TypeError, ValueError, InputError)
+_ARRIVED_M = 0.3  # distance at which topological_navigation counts a node as reached
+_UPRIGHT = {'w': 1.0, 'x': 0.0, 'y': 0.0, 'z': 0.0}
+_SIDES = 8  # of the polygon round a node, within which the robot counts as being there
+
+
+def write_graph(path: Path, topology: TopologicalMap) -> None:
+    """Write a topological map in the format that the file's name asks for, whole or not at all.
+
+    Raises InputError where the name has no such ending, or the format cannot hold the map.
+    """
+    writer_of(path)(path, topology)
+
+
+def writer_of(path: Path) -> Callable[[Path, TopologicalMap], None]:
+    """What writes the format that a file's name asks for.
+
+    Raises InputError where the name has no known ending.
+    """
+    for ending, writer in _WRITERS.items():
+        if path.name.endswith(ending) and path.name != ending:
+            return writer
+    raise InputError(f'{path}: expected a name that ends in {", ".join(_WRITERS)}')
+
+
+def write_geojson(path: Path, topology: TopologicalMap, frame_id: str = 'map') -> None:
+    """Write a topological map, whole or not at all.
+
+    The way back along an edge has an id above all others.
+
+    Raises InputError where an id is too large for an unsigned int.
+    """
+    highest = max([0, *topology.nodes, *topology.edges])
+    if highest + max([0, *topology.edges]) > _LARGEST_ID:
+        raise InputError(f'{path}: id {highest}: expected ids whose sum stays below {_LARGEST_ID}')
+    features = [_node_feature(node, frame_id) for node in topology.nodes.values()]
+    for edge in topology.edges.values():
+        features.append(_edge_feature(edge, edge.id, edge.a))
+        features.append(_edge_feature(edge, highest + edge.id, edge.b))
+    collection = {'type': 'FeatureCollection', 'name': path.stem, 'features': features}
+    write_text(path, json.dumps(collection, indent=1, allow_nan=False) + '\n')
+
+
+def write_graphml(path: Path, topology: TopologicalMap) -> None:
+    """Write an undirected GraphML graph: x, y, kind and clearance of nodes.
+
+    Length, clearance and path of edges.
+
+    A path is a list of points in one string: "x y x y ...".
+    """
+    root = ElementTree.Element('graphml', xmlns='http://graphml.graphdrawing.org/xmlns')
+    keys = {'node': ('x', 'y', 'kind', 'clearance'), 'edge': ('length', 'clearance', 'path')}
+    for owner, names in keys.items():
+        for name in names:
+            kind = 'string' if name in ('kind', 'path') else 'double'
+            attributes = {
+                'id': f'{owner}_{name}',
+                'for': owner,
+                'attr.name': name,
+                'attr.type': kind,
+            }
+            ElementTree.SubElement(root, 'key', attributes)
+    graph = ElementTree.SubElement(root, 'graph', id='topology', edgedefault='undirected')
+    for node in topology.nodes.values():
+        at = ElementTree.SubElement(graph, 'node', id=str(node.id))
+        x, y = _rounded(node.position[None])[0]
+        _put_data(
+            at,
+            'node',
+            {
+                'x': x,
+                'y': y,
+                'kind': node.kind.name.lower(),
+                'clearance': round(node.clearance_m, 3),
+            },
+        )
+    for edge in topology.edges.values():
+        ends = {'id': str(edge.id), 'source': str(edge.a), 'target': str(edge.b)}
+        at = ElementTree.SubElement(graph, 'edge', ends)
+        way = ' '.join(f'{x} {y}' for x, y in _rounded(edge.path))
+        values = {
+            'length': round(edge.length_m, 3),
+            'clearance': round(edge.clearance_m, 3),
+            'path': way,
+        }
+        _put_data(at, 'edge', values)
+    ElementTree.indent(root)
+    write_text(path, ElementTree.tostring(root, encoding='unicode', xml_declaration=True) + '\n')
+
+
+def _put_data(element: ElementTree.Element, owner: str, values: dict[str, Any]) -> None:
+    for name, value in values.items():
+        ElementTree.SubElement(element, 'data', key=f'{owner}_{name}').text = str(value)
+
+
+def write_tmap2(path: Path, topology: TopologicalMap, frame_id: str = 'map') -> None:
+    """Write a map for topological_navigation (LCAS).
+
+    Waypoints named NODE<id>, edges both ways to be driven by Nav2.
+
+    A robot counts as being at a node within its clearance.
+    """
+    name = path.name.split('.')[0]
+    edges: dict[int, list[dict[str, Any]]] = {node: [] for node in topology.nodes}
+    copies: Counter[tuple[int, int]] = Counter()
+    for edge in topology.edges.values():
+        for start in dict.fromkeys((edge.a, edge.b)):
+            end = edge.other(start)
+            copies[start, end] += 1
+            edges[start].append(_tmap2_edge(edge, start, end, copies[start, end]))
+    content = {
+        'meta': {'last_updated': datetime.now(UTC).strftime('%Y-%m-%d_%H-%M-%S')},
+        'metric_map': name,
+        'name': name,
+        'pointset': name,
+        'transformation': {
+            'child': 'topo_map',
+            'parent': frame_id,
+            'rotation': _UPRIGHT,
+            'translation': {'x': 0.0, 'y': 0.0, 'z': 0.0},
+        },
+        'nodes': [
+            _tmap2_node(node, edges[node.id], name, frame_id) for node in topology.nodes.values()
+        ],
+    }
+    write_text(path, yaml.dump(content, Dumper=_WithoutAliases, sort_keys=False))
+
+
+class _WithoutAliases(yaml.SafeDumper):
+    """Writes what occurs twice twice, as people expect of a map file."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+def _tmap2_edge(edge: Edge, start: int, end: int, copy: int) -> dict[str, Any]:
+    return {
+        'edge_id': f'NODE{start}_NODE{end}' + (f'_{copy}' if copy > 1 else ''),
+        'node': f'NODE{end}',
+        'action': 'navigate_to_pose',
+        'action_type': 'geometry_msgs/PoseStamped',
+        'goal': {
+            'target_pose': {'header': {'frame_id': '$node.parent_frame'}, 'pose': '$node.pose'}
+        },
+        'config': [],
+        'fail_policy': 'fail',
+        'fluid_navigation': True,
+        'recovery_behaviours_config': '',
+        'restrictions_planning': 'True',
+        'restrictions_runtime': 'True',
+        'properties': {'length': round(edge.length_m, 3), 'clearance': round(edge.clearance_m, 3)},
+    }
+
+
+def _tmap2_node(
+    node: Node, edges: list[dict[str, Any]], name: str, frame_id: str
+) -> dict[str, Any]:
+    x, y = _rounded(node.position[None])[0]
+    angles = 2.0 * math.pi * (np.arange(_SIDES) + 0.5) / _SIDES
+    corners = node.clearance_m * np.column_stack([np.cos(angles), np.sin(angles)])
+    return {
+        'meta': {'map': name, 'node': f'NODE{node.id}', 'pointset': name},
+        'node': {
+            'name': f'NODE{node.id}',
+            'parent_frame': frame_id,
+            'pose': {'position': {'x': x, 'y': y, 'z': 0.0}, 'orientation': _UPRIGHT},
+            'localise_by_topic': '',
+            'properties': {
+                'xy_goal_tolerance': _ARRIVED_M,
+                'yaw_goal_tolerance': round(2.0 * math.pi, 4),
+                'kind': node.kind.name.lower(),
+                'clearance': round(node.clearance_m, 3),
+            },
+            'restrictions_planning': 'True',
+            'restrictions_runtime': 'True',
+            'verts': [{'x': x, 'y': y} for x, y in _rounded(corners)],
+            'edges': edges,
+        },
+    }
+
+
+def read_geojson(path: Path) -> TopologicalMap:
+    """Read a topological map that `write_geojson` wrote, of at most 256 MiB.
+
+    Raises InputError naming the file and the feature.
+    """
+    expected = 'expected a GeoJSON collection of features'
+    text = read_text(path, _MOST_BYTES)
+    try:
+        features = json.loads(text, parse_int=_whole)['features']
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(f'{path}: {reason_of(error)}: {expected}') from error
+    if not isinstance(features, list):
+        raise InputError(f'{path}: features: {shown(features)}: {expected}')
+    topology = TopologicalMap()
+    lines: list[tuple[int, dict[str, Any]]] = []
+    for i, feature in enumerate(features):
+        try:
+            if feature['geometry']['type'] == 'Point':
+                topology.put_node(_node(feature))
+            else:
+                lines.append((i, feature))
+        except _BAD_FEATURE as error:
+            reason = reason_of(error)
+            expected = 'expected a node (point with id, kind)'
+            raise InputError(f'{path}: features[{i}]: {reason}: {expected}') from error
+    for i, feature in lines:
+        try:
+            if feature['properties']['id'] == feature['properties']['metadata']['edge']:
+                topology.put_edge(_edge(feature))
+        except _BAD_FEATURE as error:
+            reason = reason_of(error)
+            expected = 'expected an edge (line with ids, length)'
+            raise InputError(f'{path}: features[{i}]: {reason}: {expected}') from error
+    return topology
+
+
+def _whole(digits: str) -> int:
+    """A whole number of a JSON text; no id and no coordinate has hundreds of digits."""
+    if len(digits) > _MOST_DIGITS:
+        raise ValueError(f'a number of {len(digits)} digits: expected at most {_MOST_DIGITS}')
+    return int(digits)
+
+
+def _node_feature(node: Node, frame_id: str) -> dict[str, Any]:
+    metadata = {'kind': node.kind.name.lower(), 'clearance': round(float(node.clearance_m), 3)}
+    return {
+        'type': 'Feature',
+        'properties': {'id': int(node.id), 'frame': frame_id, 'metadata': metadata},
+        'geometry': {'type': 'Point', 'coordinates': _rounded(node.position[None])[0]},
+    }
+
+
+def _edge_feature(edge: Edge, feature_id: int, start: int) -> dict[str, Any]:
+    metadata = {
+        'edge': int(edge.id),
+        'length': round(float(edge.length_m), 3),
+        'clearance': round(float(edge.clearance_m), 3),
+    }
+    # A loop begins and ends at one node: its way back is told by its id.
+    path = edge.path if feature_id == edge.id else edge.path[::-1]
+    return {
+        'type': 'Feature',
+        'properties': {
+            'id': int(feature_id),
+            'startid': int(start),
+            'endid': int(edge.other(start)),
+            'metadata': metadata,
+        },
+        'geometry': {'type': 'MultiLineString', 'coordinates': [_rounded(path)]},
+    }
+
+
+def _rounded(points: Array) -> list[list[float]]:
+    """Points (N, 2) to a tenth of a millimetre."""
+    return [[round(float(x), 4), round(float(y), 4)] for x, y in points]
+
+
+def _number(value: Any) -> float:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not is_number or not abs(value) <= validation.FARTHEST_M:
+        raise ValueError(f'{shown(value)} is no finite number of m')
+    return float(value)
+
+
+def _id(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 < value <= _LARGEST_ID:
+        raise ValueError(f'id {shown(value)} is no whole number from 1 to {_LARGEST_ID}')
+    return value
+
+
+def _node(feature: dict[str, Any]) -> Node:
+    properties = feature['properties']
+    (x, y) = feature['geometry']['coordinates']
+    metadata = properties['metadata']
+    kind = NodeKind[str(metadata['kind']).upper()]
+    return Node(_id(properties['id']), kind, _number(x), _number(y), _number(metadata['clearance']))
+
+
+def _edge(feature: dict[str, Any]) -> Edge:
+    properties = feature['properties']
+    (line,) = feature['geometry']['coordinates']
+    path = np.array([[_number(x), _number(y)] for x, y in line])
+    if len(path) < 2:
+        raise ValueError(f'a line of {len(path)} points')
+    metadata = properties['metadata']
+    ends = (_id(properties['startid']), _id(properties['endid']))
+    measures = (_number(metadata['length']), _number(metadata['clearance']))
+    return Edge(_id(properties['id']), *ends, path, *measures)
+
+
+_WRITERS: dict[str, Callable[[Path, TopologicalMap], None]] = {
+    '.geojson': write_geojson,
+    '.graphml': write_graphml,
+    '.tmap2.yaml': write_tmap2,
+    '.tmap2': write_tmap2,
+}

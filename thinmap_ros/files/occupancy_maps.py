@@ -1,0 +1,191 @@
+"""map_server maps: an image and a YAML file <-> a patch of cells.
+
+Images are PGM (or another netpbm format), PNG, BMP or JPEG, of at most 8192 x 8192 pixels: a square
+of 400 m at 0.05 m a cell. The size in an image's header is checked before any pixel is decoded.
+"""
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from thinmap_ros.core.errors import InputError, reason_of, shown
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, UNKNOWN, GridPatch
+from thinmap_ros.core.se2 import FARTHEST_M
+from thinmap_ros.files.atomic import write_text, written_aside
+from thinmap_ros.files.yaml import read_mapping
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+# Grey values of a trinary map, as map_saver writes them.
+_GREY_FREE = 254
+_GREY_UNKNOWN = 205
+_GREY_OCCUPIED = 0
+_MOST_PIXELS = 8192 * 8192
+_LONGEST_NAME = 200
+# Only these: the readers of others run programs, or decode before they know the size.
+_FORMATS = ('PPM', 'PNG', 'BMP', 'JPEG')
+_GREYS_8 = 1 << 8
+_GREYS_16 = 1 << 16
+
+
+def write_map(stem: Path, patch: GridPatch) -> Path:
+    """Write STEM.pgm and STEM.yaml (trinary mode); returns the path of the YAML file."""
+    from PIL import Image  # here: most nodes that could write or read a map never do
+
+    grey = np.full(patch.shape, _GREY_UNKNOWN, dtype=np.uint8)
+    grey[patch.free] = _GREY_FREE
+    grey[patch.occupied] = _GREY_OCCUPIED
+    image = stem.with_name(stem.name + '.pgm')
+    description = stem.with_name(stem.name + '.yaml')
+    with written_aside(image) as aside:
+        Image.fromarray(grey[::-1]).save(aside, format='PPM')
+        # The image takes its name last: where there is no room for both, the old map stays as it
+        # was.
+        write_text(description, yaml.safe_dump(_description(image.name, patch), sort_keys=False))
+    return description
+
+
+def _description(image: str, patch: GridPatch) -> dict[str, Any]:
+    frame = patch.frame
+    return {
+        'image': image,
+        'mode': 'trinary',
+        'resolution': frame.resolution,
+        'origin': [round(frame.origin_x, 6), round(frame.origin_y, 6), 0.0],
+        'negate': 0,
+        'occupied_thresh': OCCUPIED_AT_LEAST / 100,
+        # Below the darkness of the grey for unknown (50/255): with 0.25, readers would take it for
+        # free.
+        'free_thresh': 0.196,
+    }
+
+
+def read_map(path: Path, folder: Path | None = None) -> GridPatch:
+    """Read a map from its YAML file; trinary and scale modes.
+
+    folder: where given, the image has to lie below it. Raises InputError naming the file, the key,
+    its value and what was expected.
+    """
+    content = read_mapping(path, 'a map_server YAML file')
+    image = _image_of(path, content, folder)
+    resolution = _number(path, content, 'resolution', 1e-3, 10.0)
+    origin = _origin(path, content)
+    shades = _Shades.of(path, content)
+    cells = _cells(path, image, shades)
+    return GridPatch(GridFrame(origin[0], origin[1], resolution), np.ascontiguousarray(cells[::-1]))
+
+
+def _image_of(path: Path, content: dict[str, Any], folder: Path | None) -> Path:
+    name = content.get('image')
+    if not isinstance(name, str) or not name.isprintable() or len(name) > _LONGEST_NAME:
+        raise InputError(f'{path}: image: {shown(name)}: expected the name of an image')
+    image = path.parent / name
+    if folder is not None and not image.resolve().is_relative_to(folder):
+        raise InputError(f'{path}: image: {shown(name)}: expected a file below {folder}')
+    return image
+
+
+def _number(
+    path: Path,
+    content: dict[str, Any],
+    key: str,
+    low: float,
+    high: float,
+    default: float | None = None,
+) -> float:
+    value = content.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+        raise InputError(f'{path}: {key}: {shown(value)}: expected a number from {low} to {high}')
+    return float(value)
+
+
+def _is_negated(path: Path, content: dict[str, Any]) -> bool:
+    value = content.get('negate', 0)
+    if value not in (0, 1):  # false and true count as such
+        raise InputError(f'{path}: negate: {shown(value)}: expected 0 or 1')
+    return bool(value)
+
+
+def _origin(path: Path, content: dict[str, Any]) -> list[float]:
+    value = content.get('origin')
+    numbers = value if isinstance(value, list) else []
+    fit = all(isinstance(v, int | float) and abs(v) <= FARTHEST_M for v in numbers)
+    if len(numbers) != 3 or not fit:
+        raise InputError(f'{path}: origin: {shown(value)}: expected [x, y, yaw] in m, m, rad')
+    if numbers[2] != 0:
+        raise InputError(f'{path}: origin: yaw {numbers[2]}: expected 0; turned maps are not read')
+    return [float(v) for v in numbers]
+
+
+@dataclass(frozen=True)
+class _Shades:
+    """Which shade stands for which cell."""
+
+    occupied: float
+    free: float
+    scale: bool
+    negate: bool
+
+    @staticmethod
+    def of(path: Path, content: dict[str, Any]) -> '_Shades':
+        occupied = _number(path, content, 'occupied_thresh', 0.0, 1.0, default=0.65)
+        free = _number(path, content, 'free_thresh', 0.0, 1.0, default=0.25)
+        mode = content.get('mode', 'trinary')
+        if mode not in ('trinary', 'scale'):
+            raise InputError(f'{path}: mode: {shown(mode)}: expected trinary or scale')
+        if not free < occupied:
+            expected = f'expected less than occupied_thresh ({occupied})'
+            raise InputError(f'{path}: free_thresh: {free}: {expected}')
+        return _Shades(occupied, free, mode == 'scale', _is_negated(path, content))
+
+    def table(self, greys: int) -> NDArray[np.int8]:
+        """The cell for each grey from 0 to greys - 1."""
+        shade = np.arange(greys) / (greys - 1)
+        darkness = shade if self.negate else 1.0 - shade
+        cells = np.full(greys, UNKNOWN, dtype=np.int8)
+        if self.scale:
+            share = np.clip((darkness - self.free) / (self.occupied - self.free), 0.0, 1.0)
+            cells = (1 + 98 * share).astype(np.int8)
+        cells[darkness < self.free] = 0
+        cells[darkness > self.occupied] = 100
+        return cells
+
+
+def _cells(path: Path, image: Path, shades: _Shades) -> NDArray[np.int8]:
+    """Cells (H, W) of an image, first row on top; unknown where it is transparent."""
+    from PIL import Image
+
+    try:
+        # Above its own, larger limit Pillow warns on stderr; here, that is an error like others.
+        with warnings.catch_warnings():
+            warnings.simplefilter('error', Image.DecompressionBombWarning)
+            with Image.open(image, formats=_FORMATS) as opened:
+                width, height = opened.size
+                if width * height > _MOST_PIXELS:
+                    raise ValueError(f'{width} x {height} pixels: expected at most {_MOST_PIXELS}')
+                opened.load()
+                return _cells_of(opened, shades)
+    except (
+        Exception
+    ) as error:  # Pillow's readers raise whatever a broken image makes them stumble over
+        reason = reason_of(error)
+        raise InputError(f'{image}: {reason}: expected an image that {path} names') from error
+
+
+def _cells_of(image: 'Image.Image', shades: _Shades) -> NDArray[np.int8]:
+    if image.mode.startswith(('I', 'F')):
+        greys = np.clip(np.asarray(image), 0, _GREYS_16 - 1).astype(np.uint16)
+        deep: NDArray[np.int8] = shades.table(_GREYS_16)[greys]
+        return deep
+    cells: NDArray[np.int8] = shades.table(_GREYS_8)[np.asarray(image.convert('L'))]
+    if 'A' in image.getbands():
+        transparent = np.asarray(image.getchannel('A')) == 0
+        cells[transparent] = UNKNOWN
+    return cells

@@ -1,0 +1,1 @@
+"""Compiled kernels: rehearsed, told of, and their compiler put away."""

@@ -1,0 +1,67 @@
+"""Memory pages that a process holds without need."""
+
+import ctypes
+import gc
+import mmap
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from time import monotonic
+
+_RELEASE_S = 3.0
+_RELEASE_BYTES = 4e6
+
+
+def give_back_pages() -> Callable[[], None]:
+    """Kernels that only a real message calls for bring the compiler back.
+
+    What gives its pages back, now and then.
+    """
+    looked_at = monotonic()
+    least = _shared_bytes()
+
+    def look() -> None:
+        nonlocal looked_at, least
+        if monotonic() - looked_at > _RELEASE_S:
+            if _shared_bytes() > least + _RELEASE_BYTES:
+                release_compiler_pages()
+                least = _shared_bytes()
+            looked_at = monotonic()
+
+    return look
+
+
+def _shared_bytes() -> int:
+    """Memory that the process has from files, as libraries are; 0 where there is no /proc."""
+    statm = Path('/proc/self/statm')
+    return int(statm.read_text().split()[2]) * mmap.PAGESIZE if statm.exists() else 0
+
+
+def release_compiler_pages() -> None:
+    """Give back the memory pages of the kernels' compiler.
+
+    Its library, some 100 MB, is idle once they are loaded.
+
+    Only mappings without a page of the process's own are dropped: the system reads them again from
+    the library's file whenever they are needed. Where there is no /proc, nothing happens.
+    """
+    gc.collect()
+    smaps = Path('/proc/self/smaps')
+    if not smaps.exists():
+        return
+    libc = ctypes.CDLL(None)
+    if hasattr(libc, 'malloc_trim'):
+        libc.malloc_trim(0)
+    for first, last in _clean_mappings(smaps.read_text(), 'llvmlite'):
+        libc.madvise(ctypes.c_void_p(first), ctypes.c_size_t(last - first), mmap.MADV_DONTNEED)
+
+
+def _clean_mappings(smaps: str, name: str) -> Iterator[tuple[int, int]]:
+    """Address ranges of the mappings of a file of which no page was changed."""
+    header = ''
+    for line in smaps.splitlines():
+        key = line.split(maxsplit=1)[0]
+        if not key.endswith(':'):
+            header = line
+        elif key == 'Anonymous:' and name in header and int(line.split()[1]) == 0:
+            first, last = header.split(maxsplit=1)[0].split('-')
+            yield int(first, 16), int(last, 16)

@@ -1,0 +1,1 @@
+"""Recorded scans: bags and CARMEN logs, read, written, repaired and played."""

@@ -1,0 +1,260 @@
+"""rosbag2 folders and MCAP files: read as scans and odometry, and read raw."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from rosbags.interfaces import Qos
+
+from thinmap_ros.core import se2, validation
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.logs import decode
+from thinmap_ros.logs.bag_directory import bag_files, without_compression
+from thinmap_ros.logs.laser_mount import Mount, StaticTransforms, rotation_matrix
+from thinmap_ros.logs.log import Event, OdometryEvent, ScanEvent, Skipped, is_mcap, refuse_foreign
+from thinmap_ros.logs.mcap_records import LARGEST_CHUNK, DamagedError, unpacked
+from thinmap_ros.logs.storage import RawMessage, Storage, storage_of
+
+_SCAN = 'sensor_msgs/msg/LaserScan'
+_ODOMETRY = 'nav_msgs/msg/Odometry'
+_TF = 'tf2_msgs/msg/TFMessage'
+_MOST_TOLD = 8
+
+
+class Bag:
+    """A bag opened for reading.
+
+    `topics` and their types, `offers` and the QoS of their publishers.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open a bag. Raises InputError naming the file where it is none or nothing is whole."""
+        if not path.exists():
+            raise InputError(
+                f'{path}: no such file or folder: expected a rosbag2 folder or an MCAP file'
+            )
+        refuse_foreign(path)
+        if not (path.is_dir() or path.suffix == '.mcap' or is_mcap(path)):
+            raise InputError(f'{path}: expected a rosbag2 folder or a file that ends in .mcap')
+        self.path = path
+        self.topics: dict[str, str] = {}
+        self.offers: dict[str, list[Qos]] = {}
+        self._storages: list[Storage] = []
+        self._unpacked: list[TemporaryDirectory[str] | None] = []
+        self._files = bag_files(path)
+        self._unreadable = 0
+        try:
+            for file, unpacked_into in without_compression(self._files.files):
+                self._unpacked.append(unpacked_into)
+                self._add(storage_of(file))
+        except OSError as error:
+            raise InputError(f'{path}: {error.strerror or error}') from error
+        if self.damage and not any(storage.has_messages for storage in self._storages):
+            expected = 'expected a rosbag2 folder or an MCAP file'
+            raise InputError(f'{path}: {self.damage}: no whole message: {expected}')
+
+    @property
+    def cut_off(self) -> bool:
+        """Whether the bag is read only as far as it is whole, which may show late."""
+        return bool(self.damage)
+
+    @property
+    def damage(self) -> str:
+        """What of the bag is not whole, in one line; empty where all of it is."""
+        words = [str(storage.damage) for storage in self._storages if storage.damage]
+        if self._files.without_metadata:
+            words.append(self._files.without_metadata)
+        if self._unreadable:
+            words.append(f'{self._unreadable} messages that cannot be unpacked')
+        return '; '.join(words[:_MOST_TOLD])
+
+    @property
+    def advice(self) -> str:
+        """What is not whole and what to do about it, in one line; empty where all is whole."""
+        if not self.damage:
+            return ''
+        read = 'read as far as it is whole'
+        return (
+            f'{self.path}: {self.damage}: {read}; `bag_repair {self.path}` makes a whole bag of it'
+        )
+
+    def messages(self, topics: set[str] | None = None) -> Iterator[RawMessage]:
+        """Whole messages of the given topics, or of all, in log order."""
+        for storage in self._storages:
+            for message in storage.messages(topics):
+                if not self._files.compressed_messages:
+                    yield message
+                    continue
+                try:
+                    data = unpacked('zstd', message.data, LARGEST_CHUNK)
+                except DamagedError:
+                    self._unreadable += 1
+                    continue
+                yield RawMessage(message.topic, message.type_name, message.log_ns, data)
+
+    def decode(self, message: RawMessage) -> Any:
+        """Message object of a raw message.
+
+        Raises InputError where its bytes do not fit its type.
+        """
+        holders = (s for s in self._storages if s.topics.get(message.topic) == message.type_name)
+        storage = next(holders, self._storages[0])
+        try:
+            return storage.typestore(message.type_name).deserialize_cdr(
+                message.data, message.type_name
+            )
+        except (
+            Exception
+        ) as error:  # any error of the deserializer means the same: these bytes are no such message
+            reason = ' '.join(str(error).split())[:120] or type(error).__name__
+            where = f'{self.path}: {validation.short(message.topic)}'
+            raise InputError(
+                f'{where}: no {validation.short(message.type_name)}: {reason}'
+            ) from error
+
+    def _add(self, storage: Storage) -> None:
+        self._storages.append(storage)
+        self.topics |= storage.topics
+        for topic, offers in storage.offers.items():
+            self.offers.setdefault(topic, offers)  # each file of a bag says the same of its topics
+
+
+@dataclass
+class BagLog:
+    """A bag as scans and odometry. Empty topic names: the only topic of that type.
+
+    T_base_laser (3,): the laser on the robot; None: from /tf_static.
+    """
+
+    path: Path
+    scan_topic: str = ''
+    odometry_topic: str = ''
+    T_base_laser: Array | None = None
+    base_frame: str = 'base_link'
+    skipped: Skipped = field(default_factory=Skipped)
+
+    def events(self) -> Iterator[Event]:
+        """Odometry and scans in the order of the log.
+
+        Raises InputError where the bag has no scans or no odometry (naming the topics that it has),
+        or nothing says where the laser sits. A message that cannot be used is skipped and counted.
+        """
+        bag = Bag(self.path)
+        self.skipped = Skipped()
+        try:
+            yield from self._events(bag)
+        except InputError as error:
+            if bag.damage and bag.damage not in str(error):
+                raise InputError(f'{error}; the bag is not whole: {bag.damage}') from error
+            raise
+
+    def _events(self, bag: Bag) -> Iterator[Event]:
+        used = {
+            self._topic(bag, _SCAN, self.scan_topic, 'laser scans'): 0,
+            self._topic(bag, _ODOMETRY, self.odometry_topic, 'odometry'): 0,
+        }
+        transforms = self._static_transforms(bag)
+        mounts: dict[str, Mount] = {}
+        for message in bag.messages(set(used)):
+            event = self._event(bag, message)
+            if event is None:
+                continue
+            frame, value = event
+            if isinstance(value, Scan):
+                mounts[frame] = mounts.get(frame) or self._mount(frame, transforms)
+                yield ScanEvent(mounts[frame].placed(value))
+            else:
+                yield value
+            used[message.topic] += 1
+        if bag.advice:
+            self.skipped.add_foremost(bag.advice)
+        for topic, count in used.items():
+            if count == 0:
+                first = f': {self.skipped.first}' if self.skipped.first else ''
+                raise InputError(
+                    f'{self.path}: {validation.short(topic)}: no message that can be used{first}'
+                )
+
+    def _event(self, bag: Bag, message: RawMessage) -> tuple[str, OdometryEvent | Scan] | None:
+        """Frame and value of a message; None, counted, where it is unusable."""
+        try:
+            decoded = bag.decode(message)
+            value = _odometry(decoded) if message.type_name == _ODOMETRY else _scan(decoded)
+        except InputError as error:
+            where = f'{self.path}: {validation.short(message.topic)}: '
+            self.skipped.add(where + str(error).removeprefix(where))
+            return None
+        return decoded.header.frame_id, value
+
+    def _topic(self, bag: Bag, type_name: str, wanted: str, what: str) -> str:
+        found = sorted(topic for topic, name in bag.topics.items() if name == type_name)
+        if wanted and wanted in found:
+            return wanted
+        if not wanted and len(found) == 1:
+            return found[0]
+        if not found or wanted:
+            has = validation.listed(
+                [f'{topic} ({name})' for topic, name in sorted(bag.topics.items())]
+            )
+            raise InputError(f'{self.path}: no {what} ({wanted or type_name}); it has {has}')
+        names = validation.listed(found)
+        raise InputError(f'{self.path}: {what} on several topics, name one of {names}')
+
+    def _static_transforms(self, bag: Bag) -> StaticTransforms:
+        transforms = StaticTransforms()
+        topics = {t for t, n in bag.topics.items() if n == _TF and t.endswith('tf_static')}
+        for message in bag.messages(topics) if topics and self.T_base_laser is None else ():
+            try:
+                for transform in bag.decode(message).transforms:
+                    transforms.add(transform)
+            except InputError as error:
+                where = f'{self.path}: {validation.short(message.topic)}: '
+                self.skipped.add(where + str(error).removeprefix(where))
+        return transforms
+
+    def _mount(self, frame: str, transforms: StaticTransforms) -> Mount:
+        if self.T_base_laser is not None:
+            return Mount(self.T_base_laser, upside_down=False)
+        try:
+            mount = transforms.mount(frame, self.base_frame)
+        except InputError as error:
+            raise InputError(f'{self.path}: /tf_static: {error}') from error
+        if mount is None:
+            known = validation.listed(transforms.frames)
+            where = f'where "{validation.short(frame)}" is on "{self.base_frame}"'
+            raise InputError(
+                f'{self.path}: /tf_static does not say {where} (it has {known}): '
+                'give --base-frame, or --offset-m for a laser straight ahead'
+            )
+        return mount
+
+
+def _odometry(message: Any) -> OdometryEvent:
+    rotation_matrix(message.pose.pose.orientation)  # raises where it is none
+    T_odom_base = decode.pose(message.pose.pose)
+    if not se2.is_finite(T_odom_base):
+        raise InputError(f'pose {T_odom_base.tolist()}: expected finite numbers')
+    return OdometryEvent(decode.stamp_ns(message), T_odom_base)
+
+
+def _scan(message: Any) -> Scan:
+    if len(message.ranges) == 0:
+        raise InputError('a scan without ranges')
+    if len(message.ranges) > validation.MOST_BEAMS:
+        raise InputError(
+            f'a scan of {len(message.ranges)} ranges: expected at most {validation.MOST_BEAMS}'
+        )
+    with np.errstate(invalid='ignore'):  # a NaN stays one, however it is made
+        return Scan.create(
+            decode.stamp_ns(message),
+            message.ranges,
+            message.angle_min,
+            message.angle_increment,
+            message.range_min,
+            message.range_max,
+        )

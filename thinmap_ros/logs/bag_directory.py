@@ -1,0 +1,111 @@
+"""Folders of rosbag2: which files make the bag, and how they are compressed (metadata.yaml)."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import zstandard
+
+from thinmap_ros.core.errors import InputError, reason_of
+from thinmap_ros.files.atomic import read_text
+from thinmap_ros.files.yaml import MOST_BYTES, parse_yaml
+
+LARGEST_FILE = 32 * 2**30
+"""Bytes that a file of a bag compressed file by file may expand to."""
+_PIECE = 2**20
+
+
+@dataclass(frozen=True)
+class BagFiles:
+    """The files of a bag in the order of recording.
+
+    compressed_messages: each message is compressed on its own; without_metadata: why metadata.yaml
+    was not used, empty where it was.
+    """
+
+    files: list[Path]
+    compressed_messages: bool = False
+    without_metadata: str = ''
+
+
+def bag_files(path: Path) -> BagFiles:
+    """Files of a bag: the one that is given, or those of a folder.
+
+    MCAP files are found without metadata.yaml, too, or where it cannot be read. Raises InputError
+    where there are no files.
+    """
+    if not path.is_dir():
+        return BagFiles([path])
+    metadata = path / 'metadata.yaml'
+    found = mcap_files_in(path)
+    try:
+        return _listed(path, _information(metadata))
+    except (InputError, KeyError, TypeError, ValueError, AttributeError) as error:
+        reason = f'{metadata}: {reason_of(error).removeprefix(f"{metadata}: ")}'
+    if found:
+        return BagFiles(found, without_metadata=reason)
+    if any(path.glob('*.db3')):
+        raise InputError(f'{reason}: `ros2 bag reindex -s sqlite3 {path}` writes a new one')
+    raise InputError(
+        f'{path}: expected a rosbag2 folder, with metadata.yaml and MCAP or SQLite files'
+    )
+
+
+def mcap_files_in(folder: Path) -> list[Path]:
+    """MCAP files of a folder in the order of recording."""
+    return sorted(folder.glob('*.mcap'), key=_number)
+
+
+def _number(file: Path) -> tuple[int, str]:
+    """rosbag2 numbers the files of a bag: name_0, name_1, ... name_10."""
+    number = file.stem.rpartition('_')[2]
+    return (int(number) if number.isdecimal() and len(number) < 10 else -1, file.name)
+
+
+def _information(metadata: Path) -> Any:
+    """Raises InputError, KeyError or TypeError where there is none, or beyond YAML's limits."""
+    content: Any = parse_yaml(read_text(metadata, MOST_BYTES))
+    return content['rosbag2_bagfile_information']
+
+
+def _listed(folder: Path, information: Any) -> BagFiles:
+    """Raises KeyError, TypeError, ValueError or AttributeError where the information is none."""
+    files = [folder / PurePath(name).name for name in information['relative_file_paths']]
+    missing = [file.name for file in files if not file.is_file()]
+    if missing or not files:
+        raise ValueError(
+            f'expected the file {missing[0][:80]}' if missing else 'expected the names of files'
+        )
+    mode = (information.get('compression_mode') or '').lower()
+    return BagFiles(files, compressed_messages=mode == 'message')
+
+
+def without_compression(
+    files: list[Path],
+) -> Iterator[tuple[Path, TemporaryDirectory[str] | None]]:
+    """Each file as it is, or, where its name ends in .zstd, unpacked into a temporary folder.
+
+    Raises InputError where a file is none, or expands to more than LARGEST_FILE.
+    """
+    for file in files:
+        if file.suffix != '.zstd':
+            yield file, None
+            continue
+        folder = TemporaryDirectory(prefix='thinmap_')
+        target = Path(folder.name) / file.stem
+        _unpack(file, target)
+        yield target, folder
+
+
+def _unpack(file: Path, target: Path) -> None:
+    try:
+        with file.open('rb') as packed, target.open('wb') as out:
+            reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
+            while piece := reader.read(_PIECE):
+                if out.tell() + len(piece) > LARGEST_FILE:
+                    raise InputError(f'{file}: more than {LARGEST_FILE} bytes unpacked')
+                out.write(piece)
+    except zstandard.ZstdError as error:
+        raise InputError(f'{file}: no zstd file: {str(error)[:120]}') from error

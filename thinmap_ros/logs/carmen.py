@@ -1,0 +1,224 @@
+"""CARMEN logs: FLASER, ROBOTLASER1 and ODOM lines, plain or gzip.
+
+Lines are played in the order of the file; their stamps are the robot's own and step back now and
+then. A line that cannot be read is skipped and counted, because logs are cut off and glued
+together; a file without any scan is an error.
+"""
+
+import gzip
+import math
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.errors import InputError, shown
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.logs.log import Event, OdometryEvent, ScanEvent, Skipped, is_mcap, refuse_foreign
+
+_SECOND_NS = 1_000_000_000
+_LATEST_S = 2**31
+LONGEST_LINE = 4 * 2**20
+"""Bytes of a line, unpacked. A scan of 1,000 beams takes 7,000."""
+
+
+@dataclass(frozen=True)
+class LaserOptions(Config):
+    """What a FLASER line does not say of its laser.
+
+    ROBOTLASER1 lines say it: an offset given here comes before.
+    """
+
+    start_angle_deg: float = parameter(
+        -90.0, 'bearing of the first beam, degrees', low=-360.0, high=360.0
+    )
+    step_deg: float = parameter(
+        0.0,
+        'angle between beams, degrees; 0: 1 for 180 beams, else 180 over the intervals',
+        low=-10.0,
+        high=10.0,
+    )
+    offset_m: float = parameter(0.0, 'laser ahead of the robot centre, m', low=-5.0, high=5.0)
+    range_min_m: float = parameter(0.02, 'nearest valid range, m', low=0.0, high=10.0)
+    max_range_m: float = parameter(
+        80.0, 'ranges from here on are "no return", m', low=0.1, high=1000.0
+    )
+
+
+@dataclass
+class CarmenLog:
+    """A CARMEN log file. `events()` plays it in file order; `skipped` says what was passed over."""
+
+    path: Path
+    options: LaserOptions = field(default_factory=LaserOptions)
+    skipped: Skipped = field(default_factory=Skipped)
+    _T_base_laser: Array | None = field(default=None, init=False)
+
+    def events(self) -> Iterator[Event]:
+        """Odometry and scans in file order; a scan line's odometry comes right before its scan.
+
+        That odometry has the scan's stamp. Raises InputError where there is no such file, it is no
+        text, or it has no scan.
+        """
+        self.skipped = Skipped()
+        self._T_base_laser = None
+        scans = 0
+        for number, line in self._lines():
+            try:
+                events = self._parse(line)
+            except (ValueError, IndexError, InputError, OverflowError) as error:
+                reason = (
+                    'too few words'
+                    if isinstance(error, IndexError)
+                    else ' '.join(str(error).split())[:120]
+                )
+                self.skipped.add(f'{self.path}:{number}: {reason}')
+                continue
+            scans += any(isinstance(event, ScanEvent) for event in events)
+            yield from events
+        if scans == 0:
+            reason = f'; first line passed over: {self.skipped.first}' if self.skipped.first else ''
+            raise InputError(f'{self.path}: no scan: expected FLASER or ROBOTLASER1 lines{reason}')
+
+    def _lines(self) -> Iterator[tuple[int, str]]:
+        refuse_foreign(self.path)
+        if is_mcap(self.path):
+            raise InputError(f'{self.path}: an MCAP file, which is a bag: expected a CARMEN log')
+        try:
+            with _open(self.path) as stream:
+                # One byte more than the limit: of a longer line no more is ever read.
+                lines = iter(lambda: stream.readline(LONGEST_LINE + 1), b'')
+                for number, line in enumerate(lines, start=1):
+                    if len(line) > LONGEST_LINE:
+                        raise InputError(
+                            f'{self.path}:{number}: a line of more than {LONGEST_LINE} bytes: '
+                            'expected a CARMEN log'
+                        )
+                    if b'\0' in line:
+                        raise InputError(
+                            f'{self.path}:{number}: a zero byte: expected a text file (CARMEN log)'
+                        )
+                    text = line.decode('utf-8', errors='replace')
+                    yield number, text if text.endswith('\n') else self._whole_words(number, text)
+        except (OSError, EOFError, zlib.error) as error:
+            if isinstance(error, EOFError | gzip.BadGzipFile | zlib.error):
+                self.skipped.add(f'{self.path}: {error}')
+                return
+            raise InputError(f'{self.path}: {error.strerror or error}') from error
+
+    def _whole_words(self, number: int, text: str) -> str:
+        """Return a line that was cut off without its last word, which may be half a number."""
+        whole = text.rstrip().rpartition(' ')[0]
+        if text.strip() and not whole:
+            self.skipped.add(f'{self.path}:{number}: {shown(text.strip()[:20])}: a line cut off')
+        return whole
+
+    def _parse(self, line: str) -> list[Event]:
+        words = line.split()
+        if not words:
+            return []
+        if words[0] == 'ODOM':
+            _check_length(words, 7 + 1, 'a pose, three numbers and a stamp')
+            return [OdometryEvent(_stamp(words[7]), _pose(words[1:4]))]
+        if words[0] == 'FLASER':
+            return self._flaser(words)
+        if words[0] == 'ROBOTLASER1':
+            return self._robotlaser(words)
+        return []
+
+    def _flaser(self, words: list[str]) -> list[Event]:
+        """FLASER n range... x y theta odom_x odom_y odom_theta stamp host logger_stamp."""
+        count = int(words[1])
+        rest = words[2 + count :]
+        _check_length(rest, 7, f'{count} ranges, two poses and a stamp')
+        step = self.options.step_deg or (1.0 if count == 180 else 180.0 / max(count - 1, 1))
+        fan = (math.radians(self.options.start_angle_deg), math.radians(step))
+        scan = self._scan(
+            _stamp(rest[6]), words[2 : 2 + count], fan, self.options.max_range_m, self._offset()
+        )
+        return [OdometryEvent(scan.stamp_ns, _pose(rest[3:6])), ScanEvent(scan)]
+
+    def _robotlaser(self, words: list[str]) -> list[Event]:
+        """Events of a line of these words.
+
+        ROBOTLASER1 type start fov step max_range accuracy mode n range...
+        m remission... lx ly lt x y t ...
+        """
+        start, _, step, max_range = (float(word) for word in words[2:6])
+        count = int(words[8])
+        after = 9 + count
+        remissions = int(words[after])
+        if remissions < 0:
+            raise ValueError(f'{remissions} remissions: expected none or more')
+        rest = words[after + 1 + remissions :]
+        _check_length(
+            rest,
+            12,
+            f'{count} ranges, {remissions} remissions, two poses, five numbers and a stamp',
+        )
+        T_odom_laser = _pose(rest[0:3])
+        T_odom_base = _pose(rest[3:6])
+        if self._T_base_laser is None:
+            # A mount is rigid: the first line's stands for all, without the last digits that
+            # rounding made up.
+            self._T_base_laser = np.round(se2.between(T_odom_base, T_odom_laser), 3)
+        mount = self._offset() if self.options.offset_m else self._T_base_laser
+        limit = min(max_range, self.options.max_range_m)
+        scan = self._scan(_stamp(rest[11]), words[9 : 9 + count], (start, step), limit, mount)
+        return [OdometryEvent(scan.stamp_ns, T_odom_base), ScanEvent(scan)]
+
+    def _offset(self) -> Array:
+        return np.array([self.options.offset_m, 0.0, 0.0])
+
+    def _scan(
+        self,
+        stamp_ns: int,
+        ranges: list[str],
+        fan: tuple[float, float],
+        limit: float,
+        T_base_laser: Array,
+    ) -> Scan:
+        if not ranges:
+            raise ValueError('no range: expected one or more')
+        values = np.array(ranges, dtype=np.float64)
+        with np.errstate(over='ignore'):  # a range beyond float32 is a "no return" as inf is
+            return Scan.create(
+                stamp_ns, values, *fan, self.options.range_min_m, limit, T_base_laser
+            )
+
+
+def _check_length(words: list[str], count: int, expected: str) -> None:
+    """Refuse a line whose words do not come out even; a host and logger's stamp may follow."""
+    if not count <= len(words) <= count + 2:
+        raise ValueError(
+            f'{len(words)} words where {count} to {count + 2} belong: expected {expected}'
+        )
+
+
+def _open(path: Path) -> BinaryIO:
+    with path.open('rb') as stream:
+        zipped = stream.read(2) == b'\x1f\x8b'
+    return gzip.open(path, 'rb') if zipped else path.open('rb')  # type: ignore[return-value]
+
+
+def _stamp(word: str) -> int:
+    """Seconds as written, exact to the nanosecond."""
+    seconds, _, fraction = word.partition('.')
+    if not (
+        seconds.isdigit() and (fraction == '' or fraction.isdigit()) and int(seconds) < _LATEST_S
+    ):
+        raise ValueError(f'stamp {shown(word)}: expected seconds from 0 to {_LATEST_S}')
+    return int(seconds) * _SECOND_NS + int(f'{fraction:0<9.9}')
+
+
+def _pose(words: list[str]) -> Array:
+    pose = np.array(words, dtype=np.float64)
+    if pose.shape != (3,) or not np.isfinite(pose).all():
+        raise ValueError(f'pose {words}: expected three finite numbers')
+    return se2.pose(*pose)

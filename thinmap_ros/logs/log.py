@@ -1,0 +1,91 @@
+"""What a log or bag holds for us, in the order in which it was written, and how its file begins."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.logs.mcap_records import MAGIC as _MCAP
+
+_ROS1 = b'#ROSBAG V'
+_SQLITE = b'SQLite format 3\0'
+
+
+@dataclass(frozen=True, eq=False)
+class OdometryEvent:
+    """An odometry sample: T_odom_base (3,) at stamp_ns."""
+
+    stamp_ns: int
+    T_odom_base: Array
+
+
+@dataclass(frozen=True, eq=False)
+class ScanEvent:
+    """A scan."""
+
+    scan: Scan
+
+
+Event = OdometryEvent | ScanEvent
+
+
+@dataclass
+class Skipped:
+    """What could not be used: how often, and the first case."""
+
+    count: int = 0
+    first: str = ''
+
+    def add(self, where: str) -> None:
+        """Count one more."""
+        self.count += 1
+        self.first = self.first or where
+
+    def add_foremost(self, where: str) -> None:
+        """Count one more, which is named before what came first."""
+        self.count += 1
+        self.first = where
+
+
+class Log(Protocol):
+    """A log file or bag."""
+
+    skipped: Skipped
+
+    def events(self) -> Iterator[Event]:
+        """Odometry and scans in the order of the file."""
+        ...
+
+
+def refuse_foreign(path: Path) -> None:
+    """Raise InputError, with the command that converts it, at a ROS 1 bag or a bare SQLite file."""
+    begin = _begin(path)
+    convert = f'rosbags-convert --src {path} --dst {path.stem} --dst-storage mcap'
+    if begin.startswith(_ROS1):
+        raise InputError(
+            f'{path}: a ROS 1 bag: expected a ROS 2 bag or a CARMEN log: convert it with '
+            f'`{convert} --dst-typestore ros2_jazzy`'
+        )
+    if begin.startswith(_SQLITE):
+        raise InputError(
+            f'{path}: an SQLite file of a rosbag2 bag: expected the folder that holds it and '
+            'metadata.yaml; a missing one is written by `ros2 bag reindex -s sqlite3 FOLDER`, '
+            f'or a new bag by `{convert}`'
+        )
+
+
+def is_mcap(path: Path) -> bool:
+    """Whether a file begins as MCAP files do, whatever its name is."""
+    return _begin(path).startswith(_MCAP)
+
+
+def _begin(path: Path) -> bytes:
+    """First bytes; none of what is no file or cannot be read: whoever opens it says so."""
+    try:
+        with path.open('rb') as stream:
+            return stream.read(16)
+    except OSError:
+        return b''

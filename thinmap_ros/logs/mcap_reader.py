@@ -1,0 +1,346 @@
+"""MCAP files, whole, cut off or damaged: their whole messages in log order or in file order.
+
+The `mcap` package has no recovery (`mcap recover` is a program written in Go), and neither it nor
+rosbags bounds what a compressed chunk expands to; of `mcap` the records are used.
+"""
+
+import heapq
+import struct
+import zlib
+from bisect import bisect_right
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from io import BytesIO
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, ChunkIndex, Message, Schema
+from numpy.typing import NDArray
+
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.logs.mcap_records import (
+    HEAD,
+    LARGEST_CHUNK,
+    MAGIC,
+    DamagedError,
+    Definition,
+    Records,
+    chunk_records,
+    definition,
+    records_of,
+)
+
+LARGEST_DEFINITIONS = 64 * 2**20
+"""Bytes of all schemas and channels of a file."""
+_LARGEST_SUMMARY = 64 * 2**20
+_MOST_HELD = 512 * 2**20
+_STRETCH = 2**20
+_FOOTER = struct.Struct('<QQI')
+_PLAIN = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
+_LAST_OPCODE = Opcode.DATA_END
+_PRIVATE = 0x80
+
+
+@dataclass
+class Damage:
+    """What of a file is not whole: by the byte where it begins, what was found there."""
+
+    cut_off: bool = False
+    parts: dict[int, str] = field(default_factory=dict)
+
+    def __bool__(self) -> bool:
+        return self.cut_off or bool(self.parts)
+
+    def __str__(self) -> str:
+        words = ['cut off'] if self.cut_off else []
+        if self.parts:
+            at, reason = next(iter(self.parts.items()))
+            n = len(self.parts)
+            count = 'a damaged part' if n == 1 else f'{n} damaged parts, the first'
+            words.append(f'{count} at byte {at}: {reason}')
+        return '; '.join(words)
+
+
+@dataclass
+class Definitions:
+    """Schemas and channels by their ids; of two with the same id the later one counts."""
+
+    path: Path
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    _bytes: int = 0
+
+    def add(self, record: Definition) -> None:
+        """Add a schema or channel. Raises InputError where they get too large altogether."""
+        known: dict[int, Any] = self.schemas if isinstance(record, Schema) else self.channels
+        if record == known.get(record.id):
+            return
+        known[record.id] = record
+        builder = RecordBuilder()
+        record.write(builder)
+        self._bytes += builder.count
+        if self._bytes > LARGEST_DEFINITIONS:
+            raise InputError(
+                f'{self.path}: schemas and channels: expected at most {LARGEST_DEFINITIONS} bytes'
+            )
+
+    def of(self, channel_id: int) -> tuple[Schema, Channel] | None:
+        """Channel and its schema; None where one of them is not known."""
+        channel = self.channels.get(channel_id)
+        schema = None if channel is None else self.schemas.get(channel.schema_id)
+        return None if channel is None or schema is None else (schema, channel)
+
+
+@dataclass(frozen=True)
+class Block:
+    """A chunk, or a stretch of records outside of chunks: from byte `start` to `end` of the file.
+
+    whole: it was not cut off; first_ns: log time of its earliest message; channel_ids: those that
+    it has messages of, None where that is not known.
+    """
+
+    start: int
+    end: int
+    is_chunk: bool
+    whole: bool = True
+    first_ns: int = 0
+    channel_ids: frozenset[int] | None = None
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a file that was closed says of itself at its end."""
+
+    definitions: list[Definition]
+    blocks: list[Block]
+
+
+class McapFile:
+    """An MCAP file opened for reading in log order: by its summary, or without one by a first pass.
+
+    damage: what is not whole, which may show late where there is a summary; has_messages: whether
+    there are any.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Raises InputError where it is no MCAP file, OSError where there is none."""
+        self.path = path
+        self.damage = Damage()
+        self.definitions = Definitions(path)
+        summary = summary_of(path)
+        for record in summary.definitions:
+            self.definitions.add(record)
+        self._blocks = summary.blocks if self.definitions.channels else []
+        if not self._blocks:
+            for block, records in _walk(path, summary, self.damage):
+                for record in records.definitions:
+                    self.definitions.add(record)
+                if records.log_ns.size:
+                    self._blocks.append(block)
+        self.has_messages = bool(self._blocks)
+
+    def messages(self, topics: set[str] | None = None) -> Iterator[tuple[Schema, Channel, Message]]:
+        """Messages of the given topics, or of all, in the order of the log."""
+        chosen = {
+            number: known
+            for number, channel in self.definitions.channels.items()
+            if (topics is None or channel.topic in topics)
+            and (known := self.definitions.of(number)) is not None
+        }
+        for message in self._in_log_order(frozenset(chosen)):
+            yield *chosen[message.channel_id], message
+
+    def _in_log_order(self, channel_ids: frozenset[int]) -> Iterator[Message]:
+        queue = _LogOrder(channel_ids)
+        blocks = [b for b in self._blocks if b.channel_ids is None or b.channel_ids & channel_ids]
+        with self.path.open('rb') as stream:
+            for block in sorted(blocks, key=lambda b: b.first_ns):
+                yield from queue.before(block.first_ns)
+                try:
+                    records = _load(stream, block)
+                except DamagedError as error:
+                    self.damage.parts[block.start] = str(error)
+                    continue
+                if records.damaged:
+                    self.damage.parts[block.start] = records.damaged
+                queue.add(records)
+        yield from queue.before(None)
+
+
+class _LogOrder:
+    """Merges the messages of blocks by log time.
+
+    It holds about _MOST_HELD bytes at most: beyond that, messages come out of order.
+    """
+
+    def __init__(self, channel_ids: frozenset[int]) -> None:
+        self._wanted = np.array(sorted(channel_ids), dtype=np.uint16)
+        self._loaded: dict[int, tuple[Records, NDArray[np.intp]]] = {}
+        self._heap: list[tuple[int, int, int]] = []
+        self._held = 0
+        self._number = 0
+
+    def add(self, records: Records) -> None:
+        """Add the records of a block."""
+        wanted = np.flatnonzero(np.isin(records.channel_ids, self._wanted))
+        order = wanted[np.argsort(records.log_ns[wanted], kind='stable')]
+        if order.size:
+            self._number += 1
+            self._loaded[self._number] = (records, order)
+            self._held += len(records.data)
+            heapq.heappush(self._heap, (int(records.log_ns[order[0]]), self._number, 0))
+
+    def before(self, log_ns: int | None) -> Iterator[Message]:
+        """Messages before a log time, or all that are left."""
+        while self._heap:
+            if not (log_ns is None or self._heap[0][0] < log_ns or self._held > _MOST_HELD):
+                return
+            _, number, place = self._heap[0]
+            records, order = self._loaded[number]
+            yield records.message(int(order[place]))
+            if place + 1 < order.size:
+                following = (int(records.log_ns[order[place + 1]]), number, place + 1)
+                heapq.heapreplace(self._heap, following)
+            else:
+                heapq.heappop(self._heap)
+                del self._loaded[number]
+                self._held -= len(records.data)
+
+
+def whole_records(path: Path, damage: Damage) -> Iterator[Definition | Message]:
+    """Whole schemas, channels and messages in file order; what is not whole is noted in `damage`.
+
+    Raises InputError where the file does not begin as MCAP files do.
+    """
+    summary = summary_of(path)
+    yield from summary.definitions
+    for _, records in _walk(path, summary, damage):
+        yield from records.definitions
+        yield from records.messages()
+
+
+def _walk(path: Path, summary: Summary, damage: Damage) -> Iterator[tuple[Block, Records]]:
+    """Blocks and their records in file order; what is not whole is noted in `damage`.
+
+    Where records no longer follow each other, it goes on at the next chunk of the summary.
+    Raises InputError where the file does not begin as MCAP files do.
+    """
+    with path.open('rb') as stream:
+        if stream.read(len(MAGIC)) != MAGIC:
+            raise InputError(f'{path}: no MCAP file: expected it to begin with {MAGIC!r}')
+        chunks = sorted(block.start for block in summary.blocks)
+        for block in _blocks(stream, path.stat().st_size, chunks, damage):
+            try:
+                records = _load(stream, block)
+            except DamagedError as error:
+                damage.parts[block.start] = str(error)
+                continue
+            if records.damaged:
+                damage.parts[block.start] = records.damaged
+            channel_ids = frozenset(np.unique(records.channel_ids).tolist())
+            yield replace(block, first_ns=records.first_ns, channel_ids=channel_ids), records
+
+
+def _blocks(stream: BinaryIO, size: int, chunks: list[int], damage: Damage) -> Iterator[Block]:
+    """Blocks of a file of `size` bytes; `chunks`: where its summary says that chunks begin.
+
+    What a recorder has added since is left alone.
+    """
+    at = len(MAGIC)
+    stretch = at
+    while True:
+        stream.seek(at)
+        head = stream.read(HEAD.size) if at + HEAD.size <= size else b''
+        code, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
+        end = at + HEAD.size + length
+        plain = code in _PLAIN and end <= size and length <= LARGEST_CHUNK
+        if stretch < at and (not plain or end - stretch > _STRETCH):
+            yield Block(stretch, at, is_chunk=False)
+            stretch = at
+        if (code, length) in ((Opcode.DATA_END, 4), (Opcode.FOOTER, _FOOTER.size)):
+            stream.seek(size - len(MAGIC))
+            damage.cut_off = stream.read() != MAGIC  # the messages are whole, the summary is not
+            return
+        if code == Opcode.CHUNK:
+            yield Block(at, min(end, size), is_chunk=True, whole=end <= size)
+        if end <= size and (0 < code <= _LAST_OPCODE or code >= _PRIVATE):
+            if code in _PLAIN and not plain:
+                damage.parts[at] = f'record of {length} bytes: expected at most {LARGEST_CHUNK}'
+            at = end
+            stretch = stretch if plain else at
+            continue
+        following = bisect_right(chunks, at)
+        if following == len(chunks):
+            damage.cut_off = True
+            return
+        damage.parts.setdefault(at, 'no record')
+        at = chunks[following]
+        stretch = at
+
+
+def _load(stream: BinaryIO, block: Block) -> Records:
+    """Records of a block. Raises DamagedError."""
+    stream.seek(block.start)
+    if not block.is_chunk:
+        return records_of(stream.read(block.end - block.start))
+    length = block.end - block.start - HEAD.size
+    if length > LARGEST_CHUNK:
+        raise DamagedError(f'chunk of {length} bytes: expected at most {LARGEST_CHUNK}')
+    head = stream.read(HEAD.size)
+    if block.whole and head != HEAD.pack(Opcode.CHUNK, length):
+        raise DamagedError(f'no chunk of {length} bytes')
+    return chunk_records(stream.read(length), block.whole)
+
+
+def summary_of(path: Path) -> Summary:
+    """Summary at the end of a file, empty where it was cut off or its summary cannot be read."""
+    size = path.stat().st_size
+    with path.open('rb') as stream:
+        footer_at = size - len(MAGIC) - HEAD.size - _FOOTER.size
+        stream.seek(max(footer_at, 0))
+        footer = stream.read()
+        if footer_at < 0 or footer[: HEAD.size] != HEAD.pack(Opcode.FOOTER, _FOOTER.size):
+            return Summary([], [])
+        start, _, checksum = _FOOTER.unpack_from(footer, HEAD.size)
+        if not len(MAGIC) <= start <= footer_at or footer_at - start > _LARGEST_SUMMARY:
+            return Summary([], [])
+        stream.seek(start)
+        content = stream.read(footer_at - start)
+    # The checksum covers the footer up to itself.
+    if checksum and zlib.crc32(content + footer[: HEAD.size + _FOOTER.size - 4]) != checksum:
+        return Summary([], [])
+    try:
+        return _parsed_summary(content, start)
+    except (DamagedError, McapError, struct.error, ValueError):
+        return Summary([], [])
+
+
+def _parsed_summary(content: bytes, data_end: int) -> Summary:
+    summary = Summary([], [])
+    at = 0
+    while at < len(content):
+        code, length = HEAD.unpack_from(content, at)
+        record = content[at + HEAD.size : at + HEAD.size + length]
+        if len(record) < length:
+            raise DamagedError(f'record of {length} bytes')
+        if code in (Opcode.SCHEMA, Opcode.CHANNEL):
+            summary.definitions.append(definition(code, record))
+        elif code == Opcode.CHUNK_INDEX:
+            summary.blocks.append(_indexed(record, data_end))
+        at += HEAD.size + length
+    return summary
+
+
+def _indexed(record: bytes, data_end: int) -> Block:
+    index = ChunkIndex.read(ReadDataStream(BytesIO(record)))
+    end = index.chunk_start_offset + index.chunk_length
+    if not len(MAGIC) <= index.chunk_start_offset <= end - HEAD.size <= data_end - HEAD.size:
+        raise DamagedError(f'chunk at byte {index.chunk_start_offset}')
+    # Writers may leave out which channels a chunk has messages of.
+    channel_ids = frozenset(index.message_index_offsets) or None
+    first_ns = index.message_start_time
+    return Block(index.chunk_start_offset, end, True, first_ns=first_ns, channel_ids=channel_ids)

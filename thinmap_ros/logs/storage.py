@@ -1,0 +1,173 @@
+"""Storage of a bag: MCAP files, read within limits, and SQLite files, read by rosbags.
+
+Also the message types that a file carries along.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Protocol
+
+from mcap.records import Schema
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import ConnectionExtRosbag2, Qos
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.logs import qos
+from thinmap_ros.logs.mcap_reader import Damage, McapFile
+
+LARGEST_SCHEMA = 2**20
+"""Bytes of the definition of a message type with all that it is made of."""
+_IDL_SEPARATOR = '=' * 80 + '\n'
+
+
+@dataclass(frozen=True)
+class RawMessage:
+    """A message as it lies in a bag: topic, type, log time, CDR bytes."""
+
+    topic: str
+    type_name: str
+    log_ns: int
+    data: bytes
+
+
+class Storage(Protocol):
+    """One file of a bag: `topics` and their types, `offers` (QoS) of their publishers, `damage`."""
+
+    topics: dict[str, str]
+    offers: dict[str, list[Qos]]
+    damage: Damage
+
+    @property
+    def has_messages(self) -> bool:
+        """Whether there are messages in it."""
+        ...
+
+    def typestore(self, type_name: str) -> Typestore:
+        """Types to decode messages of a type with."""
+        ...
+
+    def messages(self, topics: set[str] | None) -> Iterator[RawMessage]:
+        """Whole messages of the given topics, or of all, in log order."""
+        ...
+
+
+class McapStorage:
+    """An MCAP file, whole, cut off or damaged."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = McapFile(path)
+        self.damage = self._file.damage
+        self.has_messages = self._file.has_messages
+        self.topics: dict[str, str] = {}
+        self.offers: dict[str, list[Qos]] = {}
+        self._schemas: dict[str, Schema] = {}
+        self._typestores: dict[str, Typestore] = {}
+        for number, channel in self._file.definitions.channels.items():
+            known = self._file.definitions.of(number)
+            if known is not None:
+                self.topics[channel.topic] = known[0].name
+                self.offers.setdefault(channel.topic, []).extend(qos.of_channel(channel))
+                self._schemas[known[0].name] = known[0]
+
+    def typestore(self, type_name: str) -> Typestore:
+        """Types as the file defines them; ROS 2 Jazzy's where it does not."""
+        if type_name not in self._typestores:
+            self._typestores[type_name] = typestore_of(self._schemas[type_name])
+        return self._typestores[type_name]
+
+    def messages(self, topics: set[str] | None) -> Iterator[RawMessage]:
+        """Messages in the order of the log."""
+        for schema, channel, message in self._file.messages(topics):
+            yield RawMessage(channel.topic, schema.name, message.log_time, message.data)
+
+
+class SqliteStorage:
+    """An SQLite file of a rosbag2 folder."""
+
+    has_messages = True
+
+    def __init__(self, path: Path) -> None:
+        """Raises InputError where it cannot be opened."""
+        self._path = path
+        self.damage = Damage()
+        self.topics: dict[str, str] = {}
+        self.offers: dict[str, list[Qos]] = {}
+        try:
+            with self._reader() as reader:
+                for connection in reader.connections:
+                    self.topics[connection.topic] = connection.msgtype
+                    if isinstance(connection.ext, ConnectionExtRosbag2):
+                        self.offers.setdefault(connection.topic, []).extend(
+                            connection.ext.offered_qos_profiles
+                        )
+                self._typestore = reader.typestore
+        except Exception as error:  # rosbags' readers raise whatever they stumble over
+            reason = ' '.join(str(error).split())[:200] or type(error).__name__
+            raise InputError(f'{path}: {reason}') from error
+
+    def typestore(self, type_name: str) -> Typestore:
+        """Types of the whole file."""
+        return self._typestore
+
+    def messages(self, topics: set[str] | None) -> Iterator[RawMessage]:
+        """Messages in the order of the log."""
+        try:
+            with self._reader() as reader:
+                chosen = [c for c in reader.connections if topics is None or c.topic in topics]
+                for connection, log_ns, data in reader.messages(chosen) if chosen else ():
+                    yield RawMessage(connection.topic, connection.msgtype, log_ns, bytes(data))
+        except Exception:  # as above: what came before it counts
+            self.damage.cut_off = True
+
+    def _reader(self) -> AnyReader:
+        return AnyReader([self._path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
+
+
+def storage_of(path: Path) -> Storage:
+    """Open a file of a bag. Raises InputError where it is none."""
+    return SqliteStorage(path) if path.suffix == '.db3' else McapStorage(path)
+
+
+def typestore_of(schema: Schema) -> Typestore:
+    """Types to decode messages of a schema with: its own, or ROS 2 Jazzy's where these do not do.
+
+    That is where a definition cannot be read, lacks a type that it is made of, or lacks fields of a
+    type that Jazzy knows.
+    """
+    known = get_typestore(Stores.ROS2_JAZZY)
+    try:
+        own = own_typestore(schema)
+        own.hash_rihs01(schema.name)  # raises where a type is missing
+    except Exception:  # rosbags' parser raises whatever a broken definition makes it stumble over
+        return known
+    for name in own.fielddefs.keys() & known.fielddefs.keys():
+        fields = own.fielddefs[name][1]
+        if not all(field in fields for field in known.fielddefs[name][1]):
+            return known
+    return own
+
+
+def own_typestore(schema: Schema) -> Typestore:
+    """Types of one schema. Raises what rosbags' parser raises, and ValueError if too large."""
+    if len(schema.data) > LARGEST_SCHEMA:
+        raise ValueError(f'definition of {len(schema.data)} bytes: expected {LARGEST_SCHEMA}')
+    return _parsed(schema.name, schema.encoding, schema.data.decode())
+
+
+@lru_cache(maxsize=64)
+def _parsed(name: str, encoding: str, text: str) -> Typestore:
+    typestore = get_typestore(Stores.EMPTY)
+    if 'idl' not in encoding:
+        typestore.register(get_types_from_msg(text, name))
+        return typestore
+    # rosbag2 puts the files that a type needs one behind the other, each below its name.
+    parts = [part.partition('\n')[2] for part in text.split(_IDL_SEPARATOR)[1:]]
+    for part in parts or [text]:
+        types = get_types_from_idl(part)
+        unknown = types.keys() - typestore.types.keys()
+        typestore.register({name: types[name] for name in unknown})
+    return typestore

@@ -1,0 +1,129 @@
+"""A log or bag through localizer, grid and topology, and what came of it as files."""
+
+import json
+import resource
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from tqdm import tqdm
+
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.estimate import Estimate
+from thinmap_ros.core.odometry import ScanPairing
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.localizers import line_features
+from thinmap_ros.files import graphs, occupancy_maps, trajectories
+from thinmap_ros.files.atomic import write_text
+from thinmap_ros.kernels.memory import give_back_pages, release_compiler_pages
+from thinmap_ros.logs.log import Log, OdometryEvent
+from thinmap_ros.pipeline import Pipeline, PipelineConfig
+from thinmap_ros.view import figures
+
+
+@dataclass(eq=False)
+class Replay:
+    """What came of a log: the pipeline at its end, and the pose (3,) of every scan."""
+
+    pipeline: Pipeline
+    stamps_ns: list[int] = field(default_factory=list)
+    poses: list[Array] = field(default_factory=list)
+    local_features: list[int] = field(default_factory=list)
+    skipped: int = 0
+    first_skipped: str = ''
+
+
+class Watcher(Protocol):
+    """Is told what the pipeline makes of a log."""
+
+    def step(self, scan: Scan, T_odom_base: Array, estimate: Estimate, pipeline: Pipeline) -> None:
+        """Hear what came of a scan with the odometry pose (3,) at its stamp."""
+
+    def last(self, ns: int, pipeline: Pipeline) -> None:
+        """Hear that the last scan, with this stamp, is done."""
+
+
+def replay(
+    log: Log, config: PipelineConfig, show_progress: bool = False, watcher: Watcher | None = None
+) -> Replay:
+    """Play a log through the pipeline, watched or not.
+
+    Raises InputError where the log has nothing to play.
+    """
+    result = Replay(Pipeline(config))
+    pairing = ScanPairing()
+    tidy_up = give_back_pages()
+    for event in tqdm(log.events(), unit=' events', disable=not show_progress):
+        if isinstance(event, OdometryEvent):
+            ready = pairing.add_odometry(event.stamp_ns, event.T_odom_base)
+        else:
+            ready = pairing.add_scan(event.scan)
+        for scan, T_odom_base in ready:
+            step = result.pipeline.step(scan, T_odom_base)
+            result.stamps_ns.append(scan.stamp_ns)
+            result.poses.append(step.estimate.T_map_base)
+            result.local_features.append(step.estimate.n_local)
+            if watcher is not None:
+                watcher.step(scan, T_odom_base, step.estimate, result.pipeline)
+        tidy_up()
+    result.pipeline.finish()
+    result.skipped = log.skipped.count + pairing.dropped + pairing.waiting
+    result.first_skipped = log.skipped.first
+    if not result.poses:
+        raise InputError(f'no scan with odometry around its stamp; {result.skipped} skipped')
+    if watcher is not None:
+        watcher.last(result.stamps_ns[-1], result.pipeline)
+    return result
+
+
+def write_outputs(
+    result: Replay, folder: Path, title: str, seconds: tuple[float, float]
+) -> dict[str, Any]:
+    """Write all files into a folder; seconds: wall and CPU time taken. Returns the report."""
+    pipeline = result.pipeline
+    patch = pipeline.grid.patch()
+    poses = np.array(result.poses)
+    folder.mkdir(parents=True, exist_ok=True)
+    trajectories.write_tum(folder / 'trajectory.tum', result.stamps_ns, result.poses)
+    final = list(pipeline.localizer.corrected_path())
+    trajectories.write_tum(folder / 'trajectory_final.tum', result.stamps_ns, final)
+    occupancy_maps.write_map(folder / 'map', patch)
+    graphs.write_geojson(folder / 'topology.geojson', pipeline.topology.map)
+    release_compiler_pages()  # before matplotlib comes on top of them
+    figures.summary_figure(folder / 'summary.png', patch, pipeline.topology.map, poses, title=title)
+    report = _report(result, poses, seconds)
+    write_text(folder / 'report.json', json.dumps(report, indent=2) + '\n')
+    return report
+
+
+def _report(result: Replay, poses: Array, seconds: tuple[float, float]) -> dict[str, Any]:
+    stages = {name: np.array(taken) for name, taken in result.pipeline.stage_seconds.items()}
+    rebuilds = stages.pop('rebuild', np.zeros(0))
+    stages['all'] = np.sum(list(stages.values()), axis=0)
+    return {
+        'scans': len(poses),
+        'skipped': result.skipped,
+        'first_skipped': result.first_skipped,
+        'wall_s': round(seconds[0], 3),
+        'cpu_s': round(seconds[1], 3),
+        'peak_mb': round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+        'loops_closed': result.pipeline.corrections,
+        'rebuild_ms': round(1000.0 * float(rebuilds.max(initial=0.0)), 1),
+        'ms_per_scan': {name: _spread(1000.0 * taken) for name, taken in stages.items()},
+        'features': len(line_features(result.pipeline.localizer)),
+        'features_local_median': float(np.median(result.local_features)),
+        'refused': result.pipeline.localizer.refused,
+        'distance': round(float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum()), 3),
+        'nodes': len(result.pipeline.topology.map.nodes),
+        'edges': len(result.pipeline.topology.map.edges),
+    }
+
+
+def _spread(milliseconds: Array) -> dict[str, float]:
+    return {
+        'median': round(float(np.median(milliseconds)), 3),
+        'p95': round(float(np.percentile(milliseconds, 95)), 3),
+        'max': round(float(milliseconds.max()), 3),
+    }

@@ -1,0 +1,1 @@
+"""What the nodes share: lifecycle, subscriptions, messages, parameters, diagnostics."""

@@ -1,0 +1,104 @@
+"""Where the laser sits on the robot.
+
+From /tf_static, or from a parameter where the user chose so.
+"""
+
+import numpy as np
+from rclpy.node import Node
+from sensor_msgs.msg import LaserScan
+from tf2_msgs.msg import TFMessage
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.errors import ConfigError, InputError, shown
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.logs.laser_mount import Mount, StaticTransforms
+from thinmap_ros.ros import messages, parameters, qos
+
+_MOST_FRAMES = 1000
+
+
+class LaserMount:
+    """The pose of each laser frame on the robot.
+
+    Looked up in the static transforms, as bags are read. A node whose robot publishes none is given
+    the parameter `laser_pose` [x m, y m, yaw rad]; it then holds for every frame. Nothing is ever
+    assumed.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._base_frame = str(
+            parameters.declare_value(node, 'base_frame', 'base_link', 'frame of the robot')
+        )
+        given = parameters.declare_value(
+            node,
+            'laser_pose',
+            '',
+            'laser on the robot as "x,y,yaw" (m, m, rad); empty: from /tf_static',
+        )
+        self._zero_is_no_return = bool(
+            parameters.declare_value(
+                node,
+                'zero_is_no_return',
+                False,
+                'a range of 0 means that nothing was met (LDS of the TurtleBot 3); false: that the '
+                'beam is invalid',
+            )
+        )
+        self._fixed = Mount(_parse_pose(str(given)), upside_down=False) if given else None
+        self._transforms = StaticTransforms()
+        self._mounts: dict[str, Mount] = {}
+        if self._fixed is None:
+            node.create_subscription(
+                TFMessage, '/tf_static', self._on_static, qos.STATIC_TRANSFORMS
+            )
+
+    def scan(self, message: LaserScan) -> Scan:
+        """Scan of a message, with the pose of its laser.
+
+        Raises InputError where that is not known, or the message is no scan.
+        """
+        mount = self._mount(message.header.frame_id)
+        if mount is None:
+            raise InputError(
+                f'scan in frame {shown(message.header.frame_id)}: no static transform from '
+                f'"{self._base_frame}" to it; publish one on /tf_static or set the parameter '
+                'laser_pose'
+            )
+        scan = messages.scan_from(message, mount.T_base_laser, self._zero_is_no_return)
+        return mount.placed(scan)
+
+    def pose(self, frame_id: str) -> Array | None:
+        """T_base_laser (3,) of a laser frame, or None as long as it is not known."""
+        mount = self._mount(frame_id)
+        return None if mount is None else mount.T_base_laser
+
+    def _mount(self, frame_id: str) -> Mount | None:
+        if self._fixed is not None:
+            return self._fixed
+        if frame_id not in self._mounts:
+            found = self._transforms.mount(frame_id, self._base_frame)
+            if found is None:
+                return None
+            self._mounts[frame_id] = found
+        return self._mounts[frame_id]
+
+    def _on_static(self, message: TFMessage) -> None:
+        self._mounts.clear()
+        for transform in message.transforms:
+            try:
+                if len(self._transforms.frames) < _MOST_FRAMES:
+                    self._transforms.add(transform)
+            except InputError:
+                continue  # a transform that is none tells nothing: its frame stays unknown
+
+
+def _parse_pose(text: str) -> Array:
+    try:
+        x, y, yaw = (float(part) for part in text.split(','))
+        T = se2.pose(x, y, yaw)
+    except ValueError:
+        T = np.full(3, np.nan)
+    if not se2.is_finite(T):
+        raise ConfigError(f'laser_pose = {shown(text)}: expected "x,y,yaw" in m, m, rad')
+    return T

@@ -1,0 +1,345 @@
+"""ROS messages <-> core values; nothing else knows the layout of a message.
+
+Also message classes by name.
+"""
+
+import math
+import re
+from array import array
+from collections.abc import Sequence
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Duration, Time
+from geometry_msgs.msg import (
+    Point,
+    Point32,
+    Pose,
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    Quaternion,
+    TransformStamped,
+    Twist,
+)
+from nav_msgs.msg import OccupancyGrid, Odometry, Path
+from numpy.typing import NDArray
+from sensor_msgs.msg import LaserScan
+from std_msgs.msg import Header
+
+from thinmap_msgs.msg import TopologicalEdge, TopologicalNode
+from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
+from thinmap_ros.core import se2, validation
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.grid.frame import COARSEST_M, FINEST_M, GridFrame
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
+
+SECOND_NS = 1_000_000_000
+# Nothing else is imported because a bag or a publisher names it.
+_TYPE_NAME = re.compile(r'([a-z]\w*)/msg/([A-Z]\w*)', re.ASCII)
+
+
+def message_class(type_name: str) -> Any:
+    """Class of a message type such as sensor_msgs/msg/LaserScan.
+
+    Raises InputError where it is not installed.
+    """
+    parts = _TYPE_NAME.fullmatch(type_name)
+    if parts is None:
+        raise InputError(f'message type {validation.short(type_name)}: expected PACKAGE/msg/NAME')
+    try:
+        return getattr(import_module(f'{parts[1]}.msg'), parts[2])
+    except (ImportError, AttributeError) as error:
+        raise InputError(
+            f'message type {validation.short(type_name)}: not installed here'
+        ) from error
+
+
+def stamp_ns(stamp: Time) -> int:
+    """Time message as whole nanoseconds. Raises InputError where it is no time."""
+    if stamp.sec < 0 or stamp.nanosec >= SECOND_NS:
+        raise InputError(
+            f'stamp {stamp.sec} s, {stamp.nanosec} ns: '
+            f'expected a time after 1970, ns below {SECOND_NS}'
+        )
+    return int(stamp.sec) * SECOND_NS + int(stamp.nanosec)
+
+
+def time_msg(ns: int) -> Time:
+    """Whole nanoseconds as a time message."""
+    return Time(sec=ns // SECOND_NS, nanosec=ns % SECOND_NS)
+
+
+def duration_msg(seconds: float) -> Duration:
+    """Duration message of seconds."""
+    ns = round(max(seconds, 0.0) * SECOND_NS)
+    return Duration(sec=ns // SECOND_NS, nanosec=ns % SECOND_NS)
+
+
+def seconds(duration: Duration) -> float:
+    """Duration message as seconds."""
+    return float(duration.sec) + float(duration.nanosec) / SECOND_NS
+
+
+def header(frame_id: str, ns: int) -> Header:
+    """Header with frame and stamp."""
+    return Header(frame_id=frame_id, stamp=time_msg(ns))
+
+
+def scan_from(message: LaserScan, T_base_laser: Array, zero_is_no_return: bool = False) -> Scan:
+    """Scan from its message, the laser's pose on the robot and what a range of 0 means for it.
+
+    Raises InputError as `Scan.create`, and where it has no beams, too many, or beams at angles that
+    there are not.
+    """
+    count = len(message.ranges)
+    if not 0 < count <= validation.MOST_BEAMS:
+        raise InputError(f'{count} beams: expected 1 to {validation.MOST_BEAMS}')
+    last = message.angle_min + message.angle_increment * (count - 1)
+    validation.within(
+        'angle of the first or last beam', (message.angle_min, last), validation.LARGEST_ANGLE_RAD
+    )
+    return Scan.create(
+        stamp_ns(message.header.stamp),
+        np.frombuffer(message.ranges, dtype=np.float32),
+        message.angle_min,
+        message.angle_increment,
+        message.range_min,
+        message.range_max,
+        T_base_laser,
+        zero_is_no_return,
+    )
+
+
+def scan_msg(scan: Scan, frame_id: str, scan_time_s: float) -> LaserScan:
+    """Message of a scan."""
+    ranges = array('f')
+    ranges.frombytes(scan.ranges_m.astype(np.float32).tobytes())
+    return LaserScan(
+        header=header(frame_id, scan.stamp_ns),
+        angle_min=scan.angle_min_rad,
+        angle_max=scan.angle_min_rad + scan.angle_increment_rad * (scan.ranges_m.size - 1),
+        angle_increment=scan.angle_increment_rad,
+        range_min=scan.range_min_m,
+        range_max=scan.range_max_m,
+        scan_time=scan_time_s,
+        ranges=ranges,
+    )
+
+
+def yaw_of(q: Quaternion) -> float:
+    """Heading of a rotation, rad. Raises InputError where it is no rotation (norm not 1)."""
+    norm = math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
+    if not abs(norm - 1.0) < 0.01:
+        raise InputError(f'quaternion ({q.x}, {q.y}, {q.z}, {q.w}): expected norm 1, not {norm}')
+    return math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
+
+
+def quaternion_msg(yaw_rad: float) -> Quaternion:
+    """Rotation about z."""
+    return Quaternion(z=math.sin(yaw_rad / 2.0), w=math.cos(yaw_rad / 2.0))
+
+
+def pose_from(message: Pose) -> Array:
+    """Planar pose (3,). Raises InputError where it is nowhere near (1000 km) or no rotation."""
+    validation.within('position', (message.position.x, message.position.y))
+    return se2.pose(message.position.x, message.position.y, yaw_of(message.orientation))
+
+
+def pose_msg(T: Array) -> Pose:
+    """Planar pose (3,) as a message."""
+    return Pose(
+        position=Point(x=float(T[0]), y=float(T[1])), orientation=quaternion_msg(float(T[2]))
+    )
+
+
+def pose_stamped_msg(T: Array, frame_id: str, ns: int) -> PoseStamped:
+    """Planar pose (3,) in a frame at a time."""
+    return PoseStamped(header=header(frame_id, ns), pose=pose_msg(T))
+
+
+def pose_with_covariance_msg(
+    T: Array, covariance: Array, frame_id: str, ns: int
+) -> PoseWithCovarianceStamped:
+    """Planar pose (3,) with its covariance (3, 3) over x, y, theta."""
+    message = PoseWithCovarianceStamped(header=header(frame_id, ns))
+    message.pose.pose = pose_msg(T)
+    full = np.zeros((6, 6))
+    full[np.ix_((0, 1, 5), (0, 1, 5))] = covariance
+    message.pose.covariance = full.ravel()
+    return message
+
+
+def covariance_from(message: PoseWithCovarianceStamped) -> Array:
+    """Covariance (3, 3) over x, y, theta.
+
+    Raises InputError where it is none: not finite, or below 0.
+    """
+    full = np.asarray(message.pose.covariance, dtype=np.float64).reshape(6, 6)
+    part = full[np.ix_((0, 1, 5), (0, 1, 5))]
+    validation.within('covariance', part.ravel().tolist())
+    part = (part + part.T) / 2.0
+    if np.linalg.eigvalsh(part).min() < -1e-9:
+        raise InputError(f'covariance {part.tolist()}: expected no negative eigenvalue')
+    return part
+
+
+def odometry_msg(
+    T: Array, velocity: tuple[float, float], frames: tuple[str, str], ns: int
+) -> Odometry:
+    """Odometry: pose (3,), (v m/s, w rad/s), (frame, child frame)."""
+    message = Odometry(header=header(frames[0], ns), child_frame_id=frames[1])
+    message.pose.pose = pose_msg(T)
+    message.twist.twist.linear.x, message.twist.twist.angular.z = velocity
+    return message
+
+
+def twist_msg(v: float, w: float) -> Twist:
+    """Velocity command: v m/s ahead, w rad/s to the left."""
+    message = Twist()
+    message.linear.x = v
+    message.angular.z = w
+    return message
+
+
+def transform_msg(T: Array, frame_id: str, child_frame_id: str, ns: int) -> TransformStamped:
+    """Planar transform (3,)."""
+    message = TransformStamped(header=header(frame_id, ns), child_frame_id=child_frame_id)
+    message.transform.translation.x = float(T[0])
+    message.transform.translation.y = float(T[1])
+    message.transform.rotation = quaternion_msg(float(T[2]))
+    return message
+
+
+def path_msg(points: Array, frame_id: str, ns: int) -> Path:
+    """Path through points (N, 2) or poses (N, 3)."""
+    poses = points if points.shape[1] == 3 else np.column_stack([points, np.zeros(len(points))])
+    return Path(
+        header=header(frame_id, ns), poses=[pose_stamped_msg(T, frame_id, ns) for T in poses]
+    )
+
+
+def trajectory_msg(stamps_ns: list[int], poses: Array, frame_id: str, ns: int) -> Path:
+    """Path of poses (N, 3), each with a stamp of its own."""
+    message = path_msg(poses, frame_id, ns)
+    for pose, stamp in zip(message.poses, stamps_ns, strict=True):
+        pose.header.stamp = time_msg(stamp)
+    return message
+
+
+def trajectory_from(message: Path) -> tuple[NDArray[np.int64], Array]:
+    """Stamps (N,) and poses (N, 3) of a path. Raises InputError where a pose is none."""
+    stamps = np.array([stamp_ns(pose.header.stamp) for pose in message.poses], dtype=np.int64)
+    return stamps, np.array([pose_from(pose.pose) for pose in message.poses]).reshape(-1, 3)
+
+
+def grid_msg(patch: GridPatch, frame_id: str, ns: int, corrected_ns: int = 0) -> OccupancyGrid:
+    """Map message; corrected_ns: stamp of the newest trajectory that its grid has undergone."""
+    message = OccupancyGrid(header=header(frame_id, ns))
+    message.info.map_load_time = time_msg(corrected_ns)
+    message.info.resolution = patch.frame.resolution
+    message.info.height, message.info.width = patch.shape
+    message.info.origin = pose_msg(np.array([patch.frame.origin_x, patch.frame.origin_y, 0.0]))
+    data = array('b')
+    data.frombytes(np.ascontiguousarray(patch.cells).tobytes())
+    message.data = data
+    return message
+
+
+def patch_from(message: OccupancyGrid) -> GridPatch:
+    """Patch of a map message.
+
+    Raises InputError where size and data do not fit, the map is turned, or its cells or their size
+    make no sense.
+    """
+    info = message.info
+    # The message carries a float32; 0.1 has to be the same 0.1 on both sides.
+    resolution = round(float(info.resolution), 6)
+    size_fits = len(message.data) == info.width * info.height
+    if not size_fits or not FINEST_M <= resolution <= COARSEST_M:
+        raise InputError(
+            f'map of {info.width} x {info.height} cells of {resolution} m '
+            f'with {len(message.data)} values: expected a value for each cell, '
+            f'and cells of {FINEST_M} to {COARSEST_M} m'
+        )
+    origin = pose_from(info.origin)
+    if abs(origin[2]) > 1e-6:
+        raise InputError(f'map turned by {origin[2]} rad: expected an origin without rotation')
+    cells = np.frombuffer(message.data, dtype=np.int8).reshape(info.height, info.width)
+    validation.cells_in_range(cells)
+    return GridPatch(GridFrame(float(origin[0]), float(origin[1]), resolution), cells)
+
+
+def topology_msg(topology: TopologicalMap, frame_id: str, ns: int) -> TopologicalMapMsg:
+    """Message of a topological map."""
+    return TopologicalMapMsg(
+        header=header(frame_id, ns),
+        nodes=[_node_msg(node) for node in topology.nodes.values()],
+        edges=[_edge_msg(edge) for edge in topology.edges.values()],
+    )
+
+
+def _node_msg(node: Node) -> TopologicalNode:
+    return TopologicalNode(
+        id=node.id,
+        kind=int(node.kind),
+        position=Point(x=node.x, y=node.y),
+        clearance_m=node.clearance_m,
+    )
+
+
+def _edge_msg(edge: Edge) -> TopologicalEdge:
+    return TopologicalEdge(
+        id=edge.id,
+        node_a=edge.a,
+        node_b=edge.b,
+        length_m=edge.length_m,
+        clearance_m=edge.clearance_m,
+        path=[Point32(x=x, y=y) for x, y in edge.path.tolist()],
+    )
+
+
+def topology_from(message: TopologicalMapMsg) -> TopologicalMap:
+    """Topological map of a message.
+
+    Raises InputError where a kind is unknown, an edge leads to no node, a number is given twice, or
+    one is no number.
+    """
+    validation.unique('nodes', [n.id for n in message.nodes])
+    validation.unique('edges', [e.id for e in message.edges])
+    known = {n.id for n in message.nodes}
+    for node in message.nodes:
+        if node.kind not in list(NodeKind):
+            raise InputError(
+                f'node {node.id}: kind {node.kind}: '
+                f'expected one of {[int(kind) for kind in NodeKind]}'
+            )
+        validation.within(f'node {node.id}', (node.position.x, node.position.y, node.clearance_m))
+    for edge in message.edges:
+        if not {edge.node_a, edge.node_b} <= known:
+            raise InputError(
+                f'edge {edge.id} from node {edge.node_a} to {edge.node_b}: '
+                'expected nodes of this map'
+            )
+        validation.within(
+            f'edge {edge.id}',
+            (edge.length_m, edge.clearance_m, *(c for p in edge.path for c in (p.x, p.y))),
+        )
+        if not edge.path:
+            raise InputError(f'edge {edge.id}: a path without points')
+    nodes = [
+        Node(n.id, NodeKind(n.kind), n.position.x, n.position.y, float(n.clearance_m))
+        for n in message.nodes
+    ]
+    edges = [
+        Edge(e.id, e.node_a, e.node_b, _points(e.path), float(e.length_m), float(e.clearance_m))
+        for e in message.edges
+    ]
+    return TopologicalMap(nodes, edges)
+
+
+def _points(path: Sequence[Point32]) -> Array:
+    return np.array([[p.x, p.y] for p in path], dtype=np.float64).reshape(-1, 2)

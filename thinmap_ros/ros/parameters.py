@@ -1,0 +1,187 @@
+"""Config dataclasses of core <-> declared ROS parameters.
+
+One home for each default, seen from ROS.
+"""
+
+import dataclasses
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any, Generic, TypeVar
+
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from thinmap_ros.core.config import Config
+from thinmap_ros.core.errors import ConfigError
+
+AnyConfig = TypeVar('AnyConfig', bound=Config)
+
+
+def declare(
+    node: Node,
+    config: type[AnyConfig],
+    changed: Callable[[AnyConfig], None] | None = None,
+    live: Collection[str] | None = None,
+) -> AnyConfig:
+    """Declare each field of a config as a parameter of the node; return the config as it was set.
+
+    All are read-only, but where `changed` is given: then those named in `live` (None: all) can be
+    set at run time, and `changed` gets the new config. A setting that the config refuses is refused
+    with its reason.
+    Raises ConfigError where a value is outside its range or of the wrong type.
+    """
+    names = {field.name for field in dataclasses.fields(config)}
+    free = set() if changed is None else names if live is None else set(live)
+    values = {}
+    for field in dataclasses.fields(config):
+        descriptor = _descriptor(field, read_only=field.name not in free)
+        try:
+            values[field.name] = node.declare_parameter(field.name, field.default, descriptor).value
+        except Exception as error:
+            # rclpy has a class of its own for each way in which a value can be wrong.
+            raise ConfigError(
+                f'parameter {field.name} of node {node.get_name()}: {error}'
+            ) from error
+    current = config(**values)
+    if changed is not None:
+        _Changes(node, current, free, changed)
+    return current
+
+
+class _Changes(Generic[AnyConfig]):
+    """Takes new values of a config at run time: all that are set together, or none."""
+
+    def __init__(
+        self, node: Node, current: AnyConfig, free: set[str], changed: Callable[[AnyConfig], None]
+    ) -> None:
+        self._node = node
+        self._current = current
+        self._free = free
+        self._changed = changed
+        node.add_on_set_parameters_callback(self._check)
+        node.add_post_set_parameters_callback(self._take)
+
+    def _with(self, given: list[Parameter]) -> AnyConfig:
+        values = {
+            parameter.name: parameter.value for parameter in given if parameter.name in self._free
+        }
+        return dataclasses.replace(self._current, **values)
+
+    def _check(self, given: list[Parameter]) -> SetParametersResult:
+        try:
+            self._with(given)
+        except ConfigError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _take(self, given: list[Parameter]) -> None:
+        new = self._with(given)
+        if new != self._current:
+            self._current = new
+            told = ', '.join(f'{p.name} = {p.value}' for p in given if p.name in self._free)
+            self._node.get_logger().info(f'changed: {told}')
+            self._changed(new)
+
+
+def declare_value(node: Node, name: str, default: Any, description: str) -> Any:
+    """Declare one read-only parameter that belongs to the node itself, and return its value."""
+    descriptor = ParameterDescriptor(description=description, read_only=True)
+    try:
+        return node.declare_parameter(name, default, descriptor).value
+    except Exception as error:
+        raise ConfigError(f'parameter {name} of node {node.get_name()}: {error}') from error
+
+
+def declare_session(node: Node) -> str:
+    """Declare the parameter `session` and return its value."""
+    return str(
+        declare_value(
+            node, 'session', '', 'path STEM of a saved session to go on from; empty: begin anew'
+        )
+    )
+
+
+def declare_recovery(node: Node) -> float:
+    """Declare the parameter `recover_s` and return its value."""
+    return float(
+        declare_value(
+            node,
+            'recover_s',
+            30.0,
+            'killed and started again within so many s, go on from there; 0: never',
+        )
+    )
+
+
+def check_unknown(node: Node) -> None:
+    """Raise ConfigError where a parameter was given that the node does not have.
+
+    A typo must not go unseen. Where several nodes share a process, a parameter may be meant for
+    another one: the last of them raises.
+    """
+    # rclpy has no public way to see what was given but never declared.
+    given = set(node._parameter_overrides)
+    known = {name for name in node._parameters if not name.startswith('qos_overrides')}
+    shared = _SHARED.get()
+    if shared is not None:
+        shared.names.append(node.get_name())
+        shared.given |= given
+        shared.known |= known
+        if len(shared.names) < shared.count:
+            return
+        given = shared.given
+        known = shared.known
+        names = ', '.join(shared.names)
+    else:
+        names = str(node.get_name())
+    if unknown := sorted(given - known):
+        raise ConfigError(
+            f'node {names} has no parameter {", ".join(unknown)}; '
+            f'it has: {", ".join(sorted(known))}'
+        )
+
+
+@dataclasses.dataclass
+class _Shared:
+    """What nodes that share a process were given and know, together."""
+
+    count: int
+    names: list[str] = dataclasses.field(default_factory=list)
+    given: set[str] = dataclasses.field(default_factory=set)
+    known: set[str] = dataclasses.field(default_factory=set)
+
+
+_SHARED: ContextVar[_Shared | None] = ContextVar('shared', default=None)
+
+
+@contextmanager
+def shared_by(count: int) -> Iterator[None]:
+    """Let so many nodes, made inside, share what parameters they are given."""
+    token = _SHARED.set(_Shared(count) if count > 1 else None)
+    try:
+        yield
+    finally:
+        _SHARED.reset(token)
+
+
+def _descriptor(field: 'dataclasses.Field[Any]', read_only: bool) -> ParameterDescriptor:
+    keys = ('description', 'low', 'high', 'choices')
+    description, low, high, choices = (field.metadata[k] for k in keys)
+    descriptor = ParameterDescriptor(description=description, read_only=read_only)
+    if choices is not None:
+        descriptor.additional_constraints = 'one of: ' + ', '.join(choices)
+    if low is None or high is None or isinstance(field.default, bool):
+        return descriptor
+    if isinstance(field.default, int):
+        descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=1)]
+    elif isinstance(field.default, float):
+        allowed = FloatingPointRange(from_value=float(low), to_value=float(high))
+        descriptor.floating_point_range = [allowed]
+    return descriptor

@@ -1,0 +1,46 @@
+"""Qualities of service of the topics, by what they carry."""
+
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_profile_sensor_data,
+)
+from rosbags.interfaces import Qos
+
+from thinmap_ros.logs.qos import depth, is_latched, is_reliable
+
+SENSOR = qos_profile_sensor_data
+STREAM = QoSProfile(
+    depth=50, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE
+)
+COMMAND = QoSProfile(
+    depth=1, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE
+)
+LATCHED = QoSProfile(
+    depth=1,
+    history=HistoryPolicy.KEEP_LAST,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+STATIC_TRANSFORMS = QoSProfile(
+    depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+)
+
+
+def as_recorded(topic: str, offers: list[Qos]) -> QoSProfile:
+    """What to offer when a topic of a bag is played: what was offered when it was recorded."""
+    latched = is_latched(topic, offers)
+    # Each part of the tree of static transforms came from somebody else; all of them are kept.
+    least = (
+        STATIC_TRANSFORMS.depth if topic.endswith('tf_static') else 1 if latched else STREAM.depth
+    )
+    return QoSProfile(
+        depth=max(depth(offers), least),
+        history=HistoryPolicy.KEEP_LAST,
+        reliability=ReliabilityPolicy.RELIABLE
+        if is_reliable(offers)
+        else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )

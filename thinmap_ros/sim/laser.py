@@ -1,0 +1,132 @@
+"""A SICK LMS200: 181 beams over 180 degrees, with range noise and mixed pixels."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.grid.raytrace import cast_rays
+from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.sim.world import World
+
+# Neighbouring beams on a wall seen at this angle are no depth edge.
+_FLATTEST_RAD = math.radians(10.0)
+_INTO_CELL = 1e-6
+
+
+@dataclass(frozen=True)
+class Lms200Config(Config):
+    """A planar laser scanner; the defaults are those of an LMS200 in its 8 m mode."""
+
+    beams: int = parameter(181, 'beams of a scan', low=2, high=10_000)
+    field_of_view_deg: float = parameter(
+        180.0, 'angle between first and last beam, degrees', low=0.0, high=360.0
+    )
+    range_min_m: float = parameter(0.05, 'nearest range, m', low=0.0, high=10.0)
+    range_max_m: float = parameter(8.0, 'farthest range, m', low=0.1, high=200.0)
+    rate_hz: float = parameter(5.0, 'scans a second', low=0.1, high=20.0)
+    noise_m: float = parameter(0.01, 'range noise, 1 sigma, m', low=0.0, high=1.0)
+    rounding_m: float = parameter(0.001, 'ranges are whole multiples of this, m', low=0.0, high=0.1)
+    mixed_pixels: float = parameter(
+        0.3, 'share of depth edges that give a range in between', low=0.0, high=1.0
+    )
+    edge_m: float = parameter(
+        0.3, 'neighbouring beams that differ by more make a depth edge, m', low=0.01, high=10.0
+    )
+    mount_x_m: float = parameter(0.0, 'laser ahead of the robot centre, m', low=-2.0, high=2.0)
+
+
+class Lms200:
+    """Makes scans of a world; what no beam meets within the range reads +inf (REP 117)."""
+
+    def __init__(self, config: Lms200Config, seed: int) -> None:
+        self.config = config
+        self.T_base_laser = np.array([config.mount_x_m, 0.0, 0.0])
+        full_circle = config.field_of_view_deg >= 360.0
+        intervals = config.beams if full_circle else config.beams - 1
+        self._increment = math.radians(config.field_of_view_deg) / intervals
+        self._angle_min = -math.radians(config.field_of_view_deg) / 2.0
+        self._turns = self._increment * np.arange(config.beams)
+        self._rng = np.random.default_rng(seed)
+
+    def scan(self, world: World, T_world_base: Array, stamp_ns: int) -> Scan:
+        """Scan from a robot pose (3,) in the world."""
+        exact = self._exact(world, se2.compose(T_world_base, self.T_base_laser), stamp_ns)
+        ranges = self._mix(exact) + self._rng.normal(0.0, self.config.noise_m, exact.size)
+        if self.config.rounding_m > 0.0:
+            ranges = np.round(ranges / self.config.rounding_m) * self.config.rounding_m
+        ranges[~(ranges < self.config.range_max_m)] = np.inf
+        return Scan.create(
+            stamp_ns,
+            ranges,
+            self._angle_min,
+            self._increment,
+            self.config.range_min_m,
+            self.config.range_max_m,
+            self.T_base_laser,
+        )
+
+    def _exact(self, world: World, T_world_laser: Array, stamp_ns: int) -> Array:
+        frame = world.frame
+        x = (T_world_laser[0] - frame.origin_x) / frame.resolution
+        y = (T_world_laser[1] - frame.origin_y) / frame.resolution
+        angles = T_world_laser[2] + self._angle_min + self._turns
+        reach_m = self.config.range_max_m
+        cells = cast_rays(world.occupied, x, y, angles, reach_m / frame.resolution)
+        if world.glass is not None:
+            cells[_meets(world.glass, x, y, angles, cells)] = np.inf
+        ranges = cells * frame.resolution
+        if world.moving is None:
+            return ranges
+        nearer = world.moving.ranges(stamp_ns / 1e9, T_world_laser, angles, reach_m)
+        return np.minimum(ranges, nearer)
+
+    def _mix(self, ranges: Array) -> Array:
+        """Mixed pixels: at a depth edge a beam's spot is on both surfaces, the range in between.
+
+        Of the two beams beside an edge it is the one or the other: were it always the same one, the
+        pixels of a left and a right wall would be off to the same side.
+        """
+        edges = _edges(ranges, self.config.edge_m, self._increment / math.sin(_FLATTEST_RAD))
+        mixed = edges[self._rng.random(ranges.size - 1)[edges] < self.config.mixed_pixels]
+        share = self._rng.random(mixed.size)
+        side = self._rng.integers(0, 2, mixed.size)
+        nearer = np.minimum(ranges[mixed], ranges[mixed + 1])
+        farther = np.maximum(ranges[mixed], ranges[mixed + 1])
+        result = ranges.copy()
+        result[mixed + side] = nearer + share * (farther - nearer)
+        return result
+
+
+def _meets(
+    special: NDArray[np.bool_], x: float, y: float, angles: Array, cells: Array
+) -> NDArray[np.bool_]:
+    """Whether beams from (x, y) that end after so many cells (N,) end in a special cell."""
+    inside = np.where(np.isfinite(cells), cells, 0.0) + _INTO_CELL
+    cols = np.floor(x + inside * np.cos(angles)).astype(np.int64)
+    rows = np.floor(y + inside * np.sin(angles)).astype(np.int64)
+    there: NDArray[np.bool_] = (
+        (rows >= 0) & (rows < special.shape[0]) & (cols >= 0) & (cols < special.shape[1])
+    )
+    there &= np.isfinite(cells)
+    there[there] = special[rows[there], cols[there]]
+    return there
+
+
+@kernel
+def _edges(ranges: Array, edge_m: float, along_a_wall: float) -> NDArray[np.int64]:
+    """Beams whose range differs from the next by more than edge_m and than along_a_wall a metre."""
+    found = np.empty(ranges.size, dtype=np.int64)
+    count = 0
+    for i in range(ranges.size - 1):
+        nearer = min(ranges[i], ranges[i + 1])
+        farther = max(ranges[i], ranges[i + 1])
+        if math.isfinite(farther) and farther - nearer > max(edge_m, nearer * along_a_wall):
+            found[count] = i
+            count += 1
+    return found[:count].copy()

@@ -1,0 +1,159 @@
+"""Pictures of maps, and pictures made small."""
+
+from collections import defaultdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
+from thinmap_ros.files.atomic import written_aside
+from thinmap_ros.view import palette
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_GREY = 204  # of 255: cells that nobody has seen
+_SMALL_COLOURS = 64
+# Each kind of node has a shape of its own as well as a colour.
+_MARKERS = {NodeKind.END: 'o', NodeKind.BRANCH: 's', NodeKind.CORNER: '^'}
+
+
+def summary_figure(
+    path: Path,
+    patch: GridPatch,
+    topology: TopologicalMap,
+    estimated: Array,
+    true: Array | None = None,
+    title: str = '',
+) -> None:
+    """Write a PNG: map, skeleton, nodes by kind, paths (N, 2 or more), as estimated and driven."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    height, width = (count * patch.frame.resolution for count in patch.shape)
+    scale = 9.0 / max(height, width)
+    figure = Figure(
+        figsize=(width * scale + 1.2, height * scale + 1.6), dpi=110, layout='constrained'
+    )
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    draw_map(axes, patch)
+    draw_graph(axes, topology)
+    if true is not None and len(true):
+        axes.plot(
+            true[:, 0],
+            true[:, 1],
+            '-',
+            color=palette.TRUTH,
+            linewidth=2.5,
+            label='path driven',
+            zorder=2,
+        )
+    if len(estimated):
+        axes.plot(
+            *estimated[:, :2].T,
+            '-',
+            color=palette.ESTIMATE,
+            linewidth=1.0,
+            label='path estimated',
+            zorder=3,
+        )
+        axes.plot(
+            *estimated[0, :2],
+            marker='*',
+            color='black',
+            markersize=11,
+            linestyle='',
+            label='start',
+            zorder=6,
+        )
+    axes.set(xlabel='x (m)', ylabel='y (m)', title=title, aspect='equal')
+    axes.legend(loc='upper center', bbox_to_anchor=(0.5, -0.07), ncols=4, fontsize=8, frameon=False)
+    with written_aside(path) as aside:
+        figure.savefig(aside, format='png', bbox_inches='tight')
+
+
+def draw_map(axes: 'Axes', patch: GridPatch) -> None:
+    """Draw the cells of a grid: free white, occupied black, unknown grey."""
+    shade = np.full((*patch.shape, 3), _GREY, dtype=np.uint8)
+    shade[patch.free] = 255
+    shade[patch.occupied] = 0
+    rows, cols = patch.shape
+    x = patch.frame.origin_x + patch.frame.resolution * np.arange(cols + 1)
+    y = patch.frame.origin_y + patch.frame.resolution * np.arange(rows + 1)
+    # Not by imshow: that takes some 90 bytes for each pixel of the picture.
+    axes.pcolormesh(x, y, shade, antialiased=False, rasterized=True)
+
+
+def draw_graph(axes: 'Axes', topology: TopologicalMap, size: float = 5.0) -> None:
+    """Draw the paths of the edges and the nodes by kind, markers so many points wide."""
+    for i, edge in enumerate(topology.edges.values()):
+        label = 'skeleton' if i == 0 else None
+        axes.plot(
+            edge.path[:, 0],
+            edge.path[:, 1],
+            '-',
+            color=palette.EDGE,
+            linewidth=1.2,
+            label=label,
+            zorder=4,
+        )
+    for kind, marker in _MARKERS.items():
+        positions = [n.position for n in topology.nodes.values() if n.kind == kind]
+        places = np.array(positions).reshape(-1, 2)
+        if len(places):
+            label = f'{kind.name.lower()} nodes'
+            axes.plot(
+                *places.T,
+                marker,
+                color=palette.NODES[kind],
+                markersize=size,
+                markeredgecolor='black',
+                markeredgewidth=0.4,
+                linestyle='',
+                label=label,
+                zorder=5,
+            )
+
+
+def coverage_figure(path: Path, reports: list[dict[str, Any]]) -> None:
+    """Write a PNG: coverage over distance by strategy, the mean of all runs in `reports`.
+
+    Each report has its `curve`. A run's distance is given as a share of the mean distance of all
+    strategies from the same world and start.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    lengths: dict[tuple[str, int], list[float]] = defaultdict(list)
+    for report in reports:
+        lengths[report['world'], report['start_number']].append(report['distance'])
+    shares = np.linspace(0.0, 1.5, 151)
+    curves: dict[str, list[Array]] = defaultdict(list)
+    for report in reports:
+        unit = max(float(np.mean(lengths[report['world'], report['start_number']])), 1e-9)
+        _, along, coverage = np.array(report['curve']).T
+        curves[report['strategy']].append(np.interp(shares * unit, along, coverage))
+    figure = Figure(figsize=(8.0, 5.0), dpi=110, layout='constrained')
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    for strategy, runs in sorted(curves.items()):
+        axes.plot(shares, 100.0 * np.mean(runs, axis=0), label=f'{strategy} ({len(runs)})')
+    axes.set(
+        xlabel='distance, of the mean of all strategies', ylabel='coverage (%)', ylim=(0.0, 101.0)
+    )
+    axes.legend(fontsize=8, frameon=False)
+    with written_aside(path) as aside:
+        figure.savefig(aside, format='png', bbox_inches='tight')
+
+
+def write_small_png(source: Path, target: Path) -> None:
+    """Copy a PNG with so few colours that it takes a third of the space."""
+    from PIL import Image
+
+    with Image.open(source) as picture, written_aside(target) as aside:
+        small = picture.convert('RGB').quantize(_SMALL_COLOURS, dither=Image.Dither.NONE)
+        small.save(aside, format='PNG', optimize=True)

@@ -1,0 +1,217 @@
+"""Messages, live or from a bag, told to a view."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thinmap_ros.core import se2
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.stamp_matcher import StampMatcher
+from thinmap_ros.files.atomic import written_aside
+from thinmap_ros.logs import decode
+from thinmap_ros.logs.bag import Bag
+from thinmap_ros.logs.laser_mount import StaticTransforms
+from thinmap_ros.view.null_view import NullView
+from thinmap_ros.view.rerun_view import View
+
+_TF_STATIC = '/tf_static'
+_MEDIAN = re.compile(r'median (\d+\.\d+) ms')
+_STEPS = {'map update', 'graph update', 'explorer', 'global localization'}
+
+
+class Feed:
+    """Takes messages by topic and tells a view what they mean.
+
+    laser_pose gives T_base_laser (3,) of a laser's frame, or None as long as it is not known: its
+    scans are not shown.
+    namespace: of the nodes whose step times are shown, as /diagnostics are of all robots.
+    """
+
+    def __init__(
+        self, view: NullView, laser_pose: Callable[[str], Array | None], namespace: str = ''
+    ) -> None:
+        self._view = view
+        self._laser_pose = laser_pose
+        self._namespace = namespace.strip('/')
+        self._places: dict[int, Array] = {}
+        self._T_odom_base: Array | None = None
+        self._T_map_odom: Array | None = None
+        self._pairs: StampMatcher[Array, Array] = StampMatcher()
+        self._takers: dict[str, Callable[[int, Any], None]] = {
+            'map': self._on_map,
+            'scan': self._on_scan,
+            'pose': self._on_pose,
+            'odom': self._on_odometry,
+            'ground_truth': self._on_truth,
+            'topology': self._on_topology,
+            'end_nodes': self._on_end_nodes,
+            'line_features': self._on_lines,
+            'plan': self._on_plan,
+            'exploration_status': self._on_exploration,
+            'slam_status': self._on_slam,
+            'localization_samples': self._on_samples,
+            'diagnostics': self._on_diagnostics,
+        }
+
+    @property
+    def topics(self) -> set[str]:
+        """Topics that can be taken, relative names."""
+        return set(self._takers)
+
+    def take(self, topic: str, message: Any) -> None:
+        """Tell the view of a message (ROS's class or rosbags').
+
+        Raises InputError where it makes no sense.
+        """
+        try:
+            self._takers[topic](decode.stamp_ns(message), message)
+        except ValueError as error:  # a kind of node that there is not, cells that are no rectangle
+            raise InputError(' '.join(str(error).split())) from error
+
+    def _on_map(self, ns: int, message: Any) -> None:
+        self._view.grid(ns, decode.patch(message))
+
+    def _on_scan(self, ns: int, message: Any) -> None:
+        T_base_laser = self._laser_pose(message.header.frame_id)
+        if T_base_laser is None:
+            return
+        angles = (message.angle_min, message.angle_increment)
+        limits = (message.range_min, message.range_max)
+        self._view.scan(ns, Scan.create(ns, message.ranges, *angles, *limits, T_base_laser))
+
+    def _on_pose(self, ns: int, message: Any) -> None:
+        T_map_base = _pose(message.pose.pose)
+        full = np.asarray(message.pose.covariance, dtype=np.float64).reshape(6, 6)
+        covariance = full[np.ix_((0, 1, 5), (0, 1, 5))]
+        if not np.isfinite(covariance).all():
+            raise InputError('covariance: expected finite numbers')
+        self._view.pose(ns, T_map_base, covariance)
+        sigma_m = float(np.sqrt(max(np.linalg.eigvalsh(covariance[:2, :2])[-1], 0.0)))
+        self._view.number(ns, 'error', '2 sigma, cm', 200.0 * sigma_m)
+        self._compare(ns, self._pairs.left(ns, T_map_base))
+        if self._T_map_odom is None and self._T_odom_base is not None:
+            self._T_map_odom = se2.compose(T_map_base, se2.invert(self._T_odom_base))
+
+    def _on_odometry(self, ns: int, message: Any) -> None:
+        """Odometry as if it had been all there is since the first pose."""
+        self._T_odom_base = _pose(message.pose.pose)
+        if self._T_map_odom is not None:
+            self._view.trail(ns, 'odometry', se2.compose(self._T_map_odom, self._T_odom_base))
+
+    def _on_truth(self, ns: int, message: Any) -> None:
+        T_map_base = _pose(message.pose)
+        self._view.trail(ns, 'truth', T_map_base)
+        self._compare(ns, self._pairs.right(ns, T_map_base))
+
+    def _compare(self, ns: int, pair: tuple[Array, Array] | None) -> None:
+        if pair is None:
+            return
+        difference = pair[0] - pair[1]
+        self._view.number(
+            ns, 'error', 'position, cm', 100.0 * float(np.hypot(difference[0], difference[1]))
+        )
+        heading = abs(float(np.degrees(se2.wrap(float(difference[2])))))
+        self._view.number(ns, 'error', 'heading, deg', heading)
+
+    def _on_topology(self, ns: int, message: Any) -> None:
+        topology = decode.topology(message)
+        self._places = {node.id: node.position for node in topology.nodes.values()}
+        self._view.topology(ns, topology)
+        self._view.number(ns, 'count', 'nodes', len(topology.nodes))
+
+    def _on_end_nodes(self, ns: int, message: Any) -> None:
+        places = np.array([[n.position.x, n.position.y] for n in message.end_nodes]).reshape(-1, 2)
+        self._view.end_nodes(
+            ns, places, np.array([float(n.position_probability) for n in message.end_nodes])
+        )
+
+    def _on_lines(self, ns: int, message: Any) -> None:
+        ends = [[[f.start.x, f.start.y], [f.end.x, f.end.y]] for f in message.features]
+        local = np.array([f.in_local_area for f in message.features], dtype=bool)
+        self._view.lines(ns, np.array(ends, dtype=np.float64).reshape(-1, 2, 2), local)
+        near = {int(node) for f in message.features if f.in_local_area for node in f.node_ids}
+        places = [self._places[node] for node in sorted(near & self._places.keys())]
+        self._view.local_area(ns, np.array(places).reshape(-1, 2))
+
+    def _on_samples(self, ns: int, message: Any) -> None:
+        places = [[pose.position.x, pose.position.y] for pose in message.poses]
+        self._view.samples(ns, np.array(places, dtype=np.float64).reshape(-1, 2))
+
+    def _on_plan(self, ns: int, message: Any) -> None:
+        points = [[p.pose.position.x, p.pose.position.y] for p in message.poses]
+        self._view.plan(ns, np.array(points, dtype=np.float64).reshape(-1, 2))
+
+    def _on_exploration(self, ns: int, message: Any) -> None:
+        place = message.target_position
+        self._view.target(ns, np.array([place.x, place.y]) if message.has_target else None)
+        self._view.number(ns, 'progress', 'coverage, %', 100.0 * float(message.coverage_estimate))
+        self._view.number(ns, 'progress', 'distance, m', float(message.distance_m))
+        self._view.number(ns, 'count', 'end nodes left', float(message.end_nodes_left))
+
+    def _on_slam(self, ns: int, message: Any) -> None:
+        self._view.number(ns, 'step', 'localizer', float(message.step_time_ms))
+        self._view.number(ns, 'count', 'features', float(message.features))
+        self._view.number(ns, 'count', 'local features', float(message.local_features))
+        self._view.number(ns, 'count', 'matched lines', float(message.matched))
+
+    def _on_diagnostics(self, ns: int, message: Any) -> None:
+        """Step times of the nodes that publish none of their own."""
+        if ns <= 0:
+            return  # told before there was any time
+        for status in message.status:
+            if status.name.rpartition(': ')[0].rpartition('/')[0] != self._namespace:
+                continue
+            for pair in status.values:
+                step, _, key = pair.key.rpartition(': ')
+                median = _MEDIAN.match(pair.value)
+                if key == 'step time' and median and step in _STEPS:
+                    self._view.number(ns, 'step', step, float(median[1]))
+
+
+def recording_from_bag(bag_path: Path, out_rrd: Path) -> None:
+    """Write the .rrd of a bag of a run, whole or not at all.
+
+    Messages that make no sense are left out. Raises InputError where rerun is missing or the bag is
+    none.
+    """
+    bag = Bag(bag_path)
+    mounts = _static_transforms(bag)
+    with written_aside(out_rrd) as aside:
+        view = View(aside)
+        try:
+            _tell(bag, Feed(view, lambda frame: _laser_pose(mounts, frame)))
+        finally:
+            view.close()
+
+
+def _tell(bag: Bag, feed: Feed) -> None:
+    for raw in bag.messages({f'/{topic}' for topic in feed.topics}):
+        try:
+            feed.take(raw.topic.removeprefix('/'), bag.decode(raw))
+        except InputError:
+            continue
+
+
+def _static_transforms(bag: Bag) -> StaticTransforms:
+    transforms = StaticTransforms()
+    for raw in bag.messages({_TF_STATIC}):
+        for transform in bag.decode(raw).transforms:
+            transforms.add(transform)
+    return transforms
+
+
+def _laser_pose(transforms: StaticTransforms, frame: str) -> Array | None:
+    mount = transforms.mount(frame, 'base_link')
+    return None if mount is None else mount.T_base_laser
+
+
+def _pose(message: Any) -> Array:
+    T = decode.pose(message)
+    if not se2.is_finite(T):
+        raise InputError(f'pose {T.tolist()}: expected finite numbers')
+    return T

@@ -1,0 +1,143 @@
+"""What a figure shows, as plain data: panels of layers. `plot_writer` draws them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from thinmap_ros.core.grid.frame import GridFrame
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.graph import TopologicalMap
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """A line through points (N, 2), or markers alone where the style is empty.
+
+    Colour: a number in the palette.
+    """
+
+    points: Array
+    label: str = ''
+    colour: int | str = 0
+    style: str = '-'
+    marker: str = ''
+    width: float = 1.5
+    size: float = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """The space between low and high (N,) over x (N,)."""
+
+    x: Array
+    low: Array
+    high: Array
+    label: str = ''
+    colour: int | str = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Bars:
+    """A bar for each name, with its value (N,) written on it."""
+
+    names: Sequence[str]
+    values: Array
+    colours: Sequence[int]
+
+
+@dataclass(frozen=True, eq=False)
+class Segments:
+    """Straight lines (N, 4): x and y of one end, x and y of the other."""
+
+    ends: Array
+    label: str = ''
+    colour: int | str = 'black'
+    width: float = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class Words:
+    """A word at each of some points (N, 2)."""
+
+    at: Array
+    words: Sequence[str]
+    size: float = 8.0
+
+
+@dataclass(frozen=True, eq=False)
+class Robots:
+    """A disc with a heading for each pose (N, 3)."""
+
+    poses: Array
+    label: str = 'robot'
+    radius_m: float = 0.22
+
+
+@dataclass(frozen=True, eq=False)
+class MapLayer:
+    """A grid: free white, occupied black, unknown grey."""
+
+    patch: GridPatch
+
+
+@dataclass(frozen=True, eq=False)
+class GraphLayer:
+    """A topological map.
+
+    The paths of its edges, and its nodes with a shape and a colour for each kind.
+    """
+
+    topology: TopologicalMap
+    size: float = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class Raster:
+    """Values (H, W) on the cells of a frame, NaN: none, with a scale of colours beside it."""
+
+    values: Array
+    frame: GridFrame
+    label: str
+    limits: tuple[float, float] | None = None
+
+
+Layer = Curve | Band | Bars | Segments | Words | Robots | MapLayer | GraphLayer | Raster
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """Layers over one pair of axes; plan: x and y are metres of the same length.
+
+    limits: (x, x, y, y).
+    """
+
+    layers: Sequence[Layer]
+    title: str = ''
+    x_label: str = 'x (m)'
+    y_label: str = 'y (m)'
+    plan: bool = True
+    log_x: bool = False
+    log_y: bool = False
+    limits: tuple[float | None, float | None, float | None, float | None] = (None, None, None, None)
+
+
+@dataclass(frozen=True, eq=False)
+class Plot:
+    """A figure: the name of its files, what it shows, and its panels, row by row.
+
+    panel_inches: width and height.
+    """
+
+    name: str
+    caption: str
+    panels: Sequence[Panel]
+    columns: int = 1
+    panel_inches: tuple[float, float] = (5.0, 4.0)
+    legend: str = field(default='below')
+
+
+def xy(x: Array, y: Array) -> Array:
+    """Points (N, 2) of x (N,) and y (N,)."""
+    return np.column_stack([x, y])

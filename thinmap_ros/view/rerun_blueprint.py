@@ -1,0 +1,101 @@
+"""How rerun lays a view out: the map large, curves beside it, what the colours mean below them."""
+
+import math
+from typing import Any
+
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.view import palette
+from thinmap_ros.view.rerun_sinks import TIMELINE
+
+UNKNOWN_GREY = 205
+_ASPECT = 1.3  # width over height of the map's part of the window, or less
+_HALF_VIEW = math.radians(55.0) / 2.0  # rerun's eye sees so far up and down
+_TILT = 0.25  # so much of its height the eye stands south of what it looks at
+_MARGIN = 1.15
+_WIDTHS = (5, 2)
+_HEIGHTS = (3, 3, 3, 3, 3)
+LEGEND = """**orange** end node, with its position probability; **grey** it will stay ·
+**dark blue** branch · **amber** corner · **green** skeleton ·
+**blue** features of the local area, its nodes ringed;
+**pale blue** other features · **red dots** scan · **pink** pose and its 95 % · **sky** truth ·
+**yellow** path and target · **purple** samples"""
+# Each curve: name in the legend and colour, by plot.
+_PLOTS = {
+    'error': ('pose: error, 2 sigma', ('position, cm', 'heading, deg', '2 sigma, cm')),
+    'progress': ('progress', ('coverage, %', 'distance, m')),
+    'count': ('counts', ('features', 'local features', 'matched lines', 'nodes', 'end nodes left')),
+    'step': (
+        'step times, ms',
+        ('localizer', 'map update', 'graph update', 'explorer', 'global localization'),
+    ),
+}
+
+
+def entity(plot: str, curve: str) -> str:
+    """Where a curve is logged."""
+    return f'plots/{plot}/{curve.replace(",", "").replace("%", "percent").replace(" ", "_")}'
+
+
+def style(rr: Any) -> dict[str, Any]:
+    """Names and colours of all curves, by entity."""
+    return {
+        entity(plot, curve): rr.SeriesLines(
+            colors=[palette.rgb(colour)], names=[curve], widths=[1.5]
+        )
+        for plot, (_, curves) in _PLOTS.items()
+        for curve, colour in zip(curves, palette.PALETTE, strict=False)
+    }
+
+
+def blueprint(rr: Any, patch: GridPatch, trails: list[str]) -> Any:
+    """Layout in which the whole of a map is in view.
+
+    Trails (entities) are shown from their beginning.
+    """
+    rrb = rr.blueprint
+    past = {
+        'start': rrb.TimeRangeBoundary.infinite(),
+        'end': rrb.TimeRangeBoundary.cursor_relative(),
+    }
+    scene = rrb.Spatial3DView(
+        origin='map',
+        name='map',
+        eye_controls=_eye(rrb, patch),
+        background=rrb.Background(color=[UNKNOWN_GREY] * 3),
+        line_grid=rrb.LineGrid3D(visible=False),
+        overrides={name: rrb.VisibleTimeRanges(timeline=TIMELINE, **past) for name in trails},
+    )
+    corner = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop)
+    everything = rrb.TimeRange(
+        start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite()
+    )
+    axis = rrb.TimeAxis(view_range=everything)
+    curves = [
+        rrb.TimeSeriesView(origin=f'plots/{plot}', name=name, plot_legend=corner, axis_x=axis)
+        for plot, (name, _) in _PLOTS.items()
+    ]
+    legend = rrb.TextDocumentView(origin='legend', name='colours')
+    beside = rrb.Vertical(*curves, legend, row_shares=_HEIGHTS)
+    layout = rrb.Horizontal(scene, beside, column_shares=_WIDTHS)
+    # At the newest: a live view goes along, and a file opens at what came of it.
+    time = rrb.TimePanel(state='collapsed', play_state='following')
+    panels = rrb.BlueprintPanel(state='hidden'), rrb.SelectionPanel(state='hidden'), time
+    return rrb.Blueprint(layout, *panels)
+
+
+def size_m(patch: GridPatch) -> float:
+    """What of a map decides how far away the eye has to be."""
+    rows, cols = patch.shape
+    return patch.frame.resolution * max(rows, cols / _ASPECT)
+
+
+def _eye(rrb: Any, patch: GridPatch) -> Any:
+    """A little south of straight above."""
+    rows, cols = patch.shape
+    frame = patch.frame
+    x = frame.origin_x + frame.resolution * cols / 2.0
+    y = frame.origin_y + frame.resolution * rows / 2.0
+    height = _MARGIN * size_m(patch) / (2.0 * math.tan(_HALF_VIEW))
+    return rrb.EyeControls3D(
+        position=(x, y - _TILT * height, height), look_target=(x, y, 0.0), eye_up=(0.0, 0.0, 1.0)
+    )

@@ -1,0 +1,354 @@
+"""Core values shown in rerun, live or in an .rrd file."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
+from thinmap_ros.view import palette, rerun_blueprint
+from thinmap_ros.view.null_view import NullView
+from thinmap_ros.view.palette import rgb
+from thinmap_ros.view.rerun_sinks import Streams, library
+
+# What is large is drawn at most so often, and a trail grows by steps of so much: a recording grows
+# slowly.
+_PERIOD_NS = 1_000_000_000
+_TRAIL_STEP_M = 0.05
+_OUTGROWN = 1.4  # a map so much larger than what was in view is brought into view
+_OUTLINE = 33
+_SIGMA2_95 = 5.991  # chi-square, 95 %, 2 degrees of freedom
+# The wedge in which the robot looks in 95 of 100 cases
+_HEADING_M = 1.0
+_HEADING_SIGMAS = 1.96
+_ODOMETRY = '#777777'
+_SCAN = '#CC0000'
+_PLAN = '#F0E442'
+_TARGET = '#F0E442'
+_SAMPLE = '#7B3FA0'
+_LOCAL_LINE = '#0072B2'
+_LINE = '#8FBEDB'
+_LOCAL_NODE = '#0072B2'
+_STAYS = (125, 125, 125)  # an end node of which is sure that it will stay
+_TRAILS = {'estimate': palette.ESTIMATE, 'truth': palette.TRUTH, 'odometry': _ODOMETRY}
+# Heights above the map, so that what matters more covers what matters less, m.
+_Z = {
+    'skeleton': 0.02,
+    'lines': 0.03,
+    'samples': 0.035,
+    'odometry': 0.04,
+    'truth': 0.05,
+    'estimate': 0.06,
+    'plan': 0.07,
+    'local_area': 0.075,
+    'nodes': 0.08,
+    'target': 0.085,
+    'end_nodes': 0.09,
+    'covariance': 0.11,
+    'robot': 0.12,
+}
+
+
+class View(NullView):
+    """A recording in rerun: to a file, to a viewer that it opens, or to both. Close it.
+
+    Memory is bounded: what is large is logged at most once a second, a scan replaces the one
+    before, a trail is made of steps, and the viewer has a limit beyond which it forgets the oldest.
+    """
+
+    def __init__(self, recording: Path | None = None, spawn: bool = False) -> None:
+        """Begin a recording.
+
+        Raises InputError where rerun is missing, the file cannot be written, or there is no screen
+        for the viewer.
+        """
+        self._rr = library()
+        self._streams = Streams()
+        self._drawn_ns: dict[str, int] = {}
+        self._waiting: dict[str, tuple[int, Callable[[], None]]] = {}
+        self._trail_ends: dict[str, Array] = {}
+        self._target = np.zeros((0, 2))
+        self._patch: GridPatch | None = None
+        self._framed_m = 0.0
+        if spawn:
+            self._streams.open_viewer()
+        if recording is not None:
+            self._streams.open_file(recording)
+        self._log_static()
+
+    def grid(self, ns: int, patch: GridPatch) -> None:
+        """Show the map, at most once a second.
+
+        Where it has outgrown what is in view, the eye moves away.
+        """
+
+        def draw() -> None:
+            rr = self._rr
+            frame = patch.frame
+            rows, cols = patch.shape
+            form = rr.components.ImageFormat(
+                width=cols, height=rows, color_model='L', channel_datatype='U8'
+            )
+            origin = [frame.origin_x, frame.origin_y, 0.0]
+            # An image's first row is its upper one.
+            data = np.ascontiguousarray(_shade(patch)[::-1]).tobytes()
+            # Else a shade passes for a measurement, in all colours.
+            grey = rr.components.Colormap.Grayscale
+            size = frame.resolution
+            image = rr.GridMap(
+                data=data, format=form, cell_size=size, translation=origin, colormap=grey
+            )
+            self._log('map/grid', image)
+
+        self._patch = patch
+        self._now_and_then('grid', ns, draw)
+        if rerun_blueprint.size_m(patch) > _OUTGROWN * self._framed_m:
+            self._frame(patch)
+
+    def scan(self, ns: int, scan: Scan) -> None:
+        """Show a scan where the robot is; it replaces the one before."""
+        self._at(ns)
+        points = self._rr.Points3D(
+            _lifted(scan.points_base(), 0.0), colors=[rgb(_SCAN)], radii=[self._px(1.8)]
+        )
+        self._log('map/robot/scan', points)
+
+    def pose(self, ns: int, T_map_base: Array, covariance: Array) -> None:
+        """Show the robot with its covariance (3, 3) over x, y, theta.
+
+        Its way becomes the trail `estimate`.
+        """
+        rr = self._rr
+        self._at(ns)
+        x, y, theta = (float(v) for v in T_map_base)
+        turn = rr.RotationAxisAngle(axis=[0.0, 0.0, 1.0], radians=theta)
+        self._log('map/robot', rr.Transform3D(translation=[x, y, _Z['robot']], rotation=turn))
+        outline = [
+            _ellipse(T_map_base[:2], covariance[:2, :2]),
+            _wedge(T_map_base, float(covariance[2, 2])),
+        ]
+        strips = [_lifted(points, _Z['covariance']) for points in outline]
+        self._log(
+            'map/covariance',
+            rr.LineStrips3D(strips, colors=[rgb(palette.ESTIMATE)], radii=[self._px(1.0)]),
+        )
+        self.trail(ns, 'estimate', T_map_base)
+
+    def trail(self, ns: int, name: str, T_map_base: Array) -> None:
+        """Lengthen the trail of this name: `estimate`, `truth` or `odometry`."""
+        here = np.array(T_map_base[:2])
+        before = self._trail_ends.setdefault(name, here)
+        if np.hypot(*(here - before)) < _TRAIL_STEP_M:
+            return
+        self._trail_ends[name] = here
+        self._at(ns)
+        step = _lifted(np.array([before, here]), _Z[name])
+        self._log(
+            f'map/{name}',
+            self._rr.LineStrips3D([step], colors=[rgb(_TRAILS[name])], radii=[self._px(1.2)]),
+        )
+
+    def topology(self, ns: int, topology: TopologicalMap) -> None:
+        """Show the skeleton, and the nodes coloured by kind, at most once a second."""
+        paths = [_lifted(edge.path, _Z['skeleton']) for edge in topology.edges.values()]
+        nodes = list(topology.nodes.values())
+        places = _lifted(np.array([node.position for node in nodes]).reshape(-1, 2), _Z['nodes'])
+        shades = [rgb(palette.NODES[node.kind]) for node in nodes]
+
+        def draw() -> None:
+            strips = self._rr.LineStrips3D(paths, colors=[rgb(palette.EDGE)], radii=[self._px(1.2)])
+            self._log('map/skeleton', strips)
+            self._log('map/nodes', self._rr.Points3D(places, colors=shades, radii=[self._px(4.0)]))
+
+        self._now_and_then('topology', ns, draw)
+
+    def end_nodes(self, ns: int, places: Array, probabilities: Array) -> None:
+        """Show end nodes (N, 2) with their position probabilities (N,), at most once a second."""
+        labels = [f'{p:.2f}' for p in probabilities]
+
+        def draw() -> None:
+            points = self._rr.Points3D(
+                _lifted(places, _Z['end_nodes']),
+                colors=[_faded(palette.NODES[NodeKind.END], float(p)) for p in probabilities],
+                radii=[self._px(6.0)],
+                labels=labels,
+                show_labels=True,
+            )
+            self._log('map/end_nodes', points)
+
+        self._now_and_then('end_nodes', ns, draw)
+
+    def lines(self, ns: int, segments: Array, local: NDArray[np.bool_]) -> None:
+        """Show line features by their ends (N, 2, 2), at most once a second.
+
+        local (N,): which are in the local area.
+        """
+
+        def draw() -> None:
+            strips = [_lifted(ends, _Z['lines']) for ends in segments]
+            shades = [rgb(_LOCAL_LINE if near else _LINE) for near in local]
+            widths = [self._px(2.5 if near else 1.5) for near in local]
+            self._log('map/lines', self._rr.LineStrips3D(strips, colors=shades, radii=widths))
+
+        self._now_and_then('lines', ns, draw)
+
+    def local_area(self, ns: int, places: Array) -> None:
+        """Show the nodes (N, 2) of the local area, at most once a second."""
+
+        def draw() -> None:
+            colour = [*rgb(_LOCAL_NODE), 90]
+            points = _lifted(places, _Z['local_area'])
+            self._log(
+                'map/local_area', self._rr.Points3D(points, colors=[colour], radii=[self._px(9.0)])
+            )
+
+        self._now_and_then('local_area', ns, draw)
+
+    def samples(self, ns: int, places: Array) -> None:
+        """Show where the samples (N, 2) of global localization are, at most once a second."""
+
+        def draw() -> None:
+            points = _lifted(places, _Z['samples'])
+            self._log(
+                'map/samples',
+                self._rr.Points3D(points, colors=[rgb(_SAMPLE)], radii=[self._px(1.2)]),
+            )
+
+        self._now_and_then('samples', ns, draw)
+
+    def plan(self, ns: int, points: Array) -> None:
+        """Show the path (N, 2) that the robot follows, at most once a second."""
+
+        def draw() -> None:
+            strips = [_lifted(points, _Z['plan'])] if len(points) > 1 else []
+            self._log(
+                'map/plan',
+                self._rr.LineStrips3D(strips, colors=[rgb(_PLAN)], radii=[self._px(2.0)]),
+            )
+
+        self._now_and_then('plan', ns, draw)
+
+    def target(self, ns: int, place: Array | None) -> None:
+        """Show where the robot is going, (2,), or that it has no target."""
+        places = np.zeros((0, 2)) if place is None else place.reshape(1, 2)
+        if np.array_equal(places, self._target):
+            return
+        self._target = places
+        self._at(ns)
+        points = self._rr.Points3D(
+            _lifted(places, _Z['target']), colors=[rgb(_TARGET)], radii=[self._px(10.0)]
+        )
+        self._log('map/target', points)
+
+    def number(self, ns: int, plot: str, curve: str, value: float) -> None:
+        """Continue a curve of a plot (`error`, `progress`, `count`, `step`)."""
+        self._at(ns)
+        self._log(rerun_blueprint.entity(plot, curve), self._rr.Scalars([value]))
+
+    def wait_until_closed(self) -> None:
+        """Show all that was told, and wait until the viewer that was opened is closed."""
+        self._finish_drawing()
+        if self._streams.viewer is not None:
+            self._streams.viewer.wait()
+
+    def close(self) -> None:
+        """Draw what still waits, finish the file, and end the viewer.
+
+        The file then opens with the whole map in view.
+        Raises InputError where the file could not be written to its end.
+        """
+        self._finish_drawing()
+        self._streams.close()
+
+    def _finish_drawing(self) -> None:
+        for name in list(self._waiting):
+            self._draw(name)
+        if self._patch is not None:
+            self._frame(self._patch)
+
+    def _log_static(self) -> None:
+        rr = self._rr
+        self._log('map', rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        arrow = rr.Arrows3D(vectors=[[0.45, 0.0, 0.0]], colors=[[0, 0, 0]], radii=[self._px(2.5)])
+        self._log('map/robot/heading', arrow, static=True)
+        body = rr.Points3D([[0.0, 0.0, 0.0]], colors=[[0, 0, 0]], radii=[self._px(6.0)])
+        self._log('map/robot/body', body, static=True)
+        self._log(
+            'legend',
+            rr.TextDocument(rerun_blueprint.LEGEND, media_type='text/markdown'),
+            static=True,
+        )
+        for entity, style in rerun_blueprint.style(rr).items():
+            self._log(entity, style, static=True)
+
+    def _frame(self, patch: GridPatch) -> None:
+        """Bring the whole of a map into view."""
+        self._framed_m = rerun_blueprint.size_m(patch)
+        self._streams.send_blueprint(
+            rerun_blueprint.blueprint(self._rr, patch, [f'map/{name}' for name in _TRAILS])
+        )
+
+    def _px(self, pixels: float) -> Any:
+        """A radius in pixels: to be seen in a room and in a hall."""
+        return self._rr.Radius.ui_points(pixels)
+
+    def _now_and_then(self, name: str, ns: int, draw: Callable[[], None]) -> None:
+        """Draw now, or, where this was drawn a moment ago, let the newest wait for its turn."""
+        self._waiting[name] = (ns, draw)
+        drawn = self._drawn_ns.get(name)
+        if drawn is None or abs(ns - drawn) >= _PERIOD_NS:
+            self._draw(name)
+
+    def _draw(self, name: str) -> None:
+        ns, draw = self._waiting.pop(name)
+        self._drawn_ns[name] = ns
+        self._at(ns)
+        draw()
+
+    def _at(self, ns: int) -> None:
+        self._streams.at(ns)
+
+    def _log(self, entity: str, value: Any, static: bool = False) -> None:
+        self._streams.log(entity, value, static)
+
+
+def _shade(patch: GridPatch) -> NDArray[np.uint8]:
+    """Grey of each cell (H, W): the likelier free, the lighter."""
+    grey = np.round(2.55 * (100.0 - np.clip(patch.cells, 0, 100)))
+    return np.where(patch.cells == UNKNOWN, rerun_blueprint.UNKNOWN_GREY, grey).astype(np.uint8)
+
+
+def _faded(colour: str, share: float) -> list[int]:
+    """A colour, the closer to grey the larger the share, 0 to 1."""
+    return [
+        round((1.0 - share) * c + share * grey) for c, grey in zip(rgb(colour), _STAYS, strict=True)
+    ]
+
+
+def _lifted(points: Array, z: float) -> NDArray[np.float32]:
+    """Points (N, 2) at a height, (N, 3)."""
+    return np.column_stack([points, np.full(len(points), z)]).astype(np.float32)
+
+
+def _ellipse(centre: Array, covariance: Array) -> Array:
+    """Outline (N, 2) within which a place with this covariance (2, 2) lies in 95 of 100 cases."""
+    values, vectors = np.linalg.eigh(covariance)
+    angles = np.linspace(0.0, 2.0 * np.pi, _OUTLINE)
+    axes = vectors * np.sqrt(_SIGMA2_95 * np.maximum(values, 0.0))
+    return np.asarray(centre + np.column_stack([np.cos(angles), np.sin(angles)]) @ axes.T)
+
+
+def _wedge(T_map_base: Array, variance: float) -> Array:
+    """Outline (3, 2) of where the robot looks, given the variance of its heading."""
+    x, y, theta = T_map_base.tolist()
+    spread = min(_HEADING_SIGMAS * np.sqrt(max(variance, 0.0)), np.pi)
+    ends = [
+        (x + _HEADING_M * np.cos(theta + s), y + _HEADING_M * np.sin(theta + s))
+        for s in (-spread, spread)
+    ]
+    return np.array([ends[0], (x, y), ends[1]])
