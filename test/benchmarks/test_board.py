@@ -228,10 +228,10 @@ def test_a_small_board_goes_on_where_it_was(small_board, capsys):
     assert '| drive_office.odometry_1 |' in cases
     assert '| loop_office.turtlebot3_1 |' in cases
     # Other options need another folder, but not other recordings; two folders are compared.
-    assert called(*words, '--set', 'slam=off') == 2
+    assert called(*words, '--set', 'slam=ekf_ti') == 2
     assert 'other options' in capsys.readouterr().err
     other = ['-o', small_board / 'other', '--recordings', small_board / 'drives']
-    other += ['--against', small_board, '--only', '*_1', '--set', 'slam=off']
+    other += ['--against', small_board, '--only', '*_1', '--set', 'slam=ekf_ti']
     assert called(*other, '--processes', 1, '--quiet') == 0
     assert not (small_board / 'other' / 'drives').exists()
     text = (small_board / 'other' / 'board.md').read_text()

@@ -126,8 +126,8 @@ def test_another_run_beside_it(reports):
 
 
 def test_options_of_the_localizer_have_the_types_of_their_defaults():
-    words = ['slam=off', 'start_x_m=2', 'mapping=false']
-    options = {'slam': 'off', 'start_x_m': 2.0, 'mapping': False}
+    words = ['slam=ekf_ti', 'start_x_m=2', 'mapping=false']
+    options = {'slam': 'ekf_ti', 'start_x_m': 2.0, 'mapping': False}
     assert program._options(words) == options
     for word in ('slan=off', 'start_x_m=far', 'mapping=no', 'slam=full_of_hope', 'square_walls=no'):
         with pytest.raises(ConfigError):
@@ -293,7 +293,7 @@ def test_it_goes_on_where_it_was_and_one_that_fails_stops_no_other(tmp_path, cap
     assert '| try_2 | 12345 |' in text
     assert 'worst tenth, live: 0.000 m' in capsys.readouterr().out
     # Nor is what was run otherwise taken for it.
-    assert called(*words, '--set', 'slam=off') == 2
+    assert called(*words, '--set', 'slam=ekf_ti') == 2
     assert 'other options' in capsys.readouterr().err
     assert called(*words, '--against', out) == 0
     assert '## Against another run (2 of 2 cases)' in (out / 'scoreboard.md').read_text()
@@ -314,9 +314,9 @@ def test_a_drive_in_a_small_building(tmp_path, monkeypatch):
     monkeypatch.setattr(drives, 'building', lambda seed: building(seed, small))
     monkeypatch.setattr(drives, '_LENGTH_M', 12.0)
     case = BuildingCase(3, '2dx', 3.0)
-    report = measure(Task(case, tmp_path, tmp_path, tmp_path, {'slam': 'off'}))
+    report = measure(Task(case, tmp_path, tmp_path, tmp_path, {'slam': 'ekf_ti'}))
     assert report['name'] == 'building_003.2dx_x3'
-    assert report['options'] == {'slam': 'off'}
+    assert report['options'] == {'slam': 'ekf_ti'}
     assert report['scans'] > 30
     assert 0.0 <= report['unmapped'] <= 1.0
     assert report['live_m'] < 0.3

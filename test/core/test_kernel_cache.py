@@ -19,6 +19,24 @@ from thinmap_ros.core.jit import kernel
 def amplified(value):
     return GAIN * value
 """
+PAIR = """
+from typing import NamedTuple
+
+class Pair(NamedTuple):
+    first: float
+    second: float
+"""
+MODULE_OF_PAIRS = """
+from thinmap_ros.core.jit import kernel
+from thinmap_ros.core.pair import Pair
+
+@kernel
+def product(pair):
+    return pair.first * pair.second
+
+def amplified(value):
+    return product(Pair(value, 2.0))
+"""
 PROGRAM = """
 from thinmap_ros.kernels.progress import report_compilation
 report = report_compilation()
@@ -86,6 +104,19 @@ def test_a_kernel_follows_what_it_imports(install: Install) -> None:
     install.set_gain(5.0)
     (value, _), said = install.run()
     assert value == '15.0'
+    assert 'compiling' in said
+
+
+def test_a_kernel_whose_types_have_moved_is_compiled_again(install: Install) -> None:
+    """As when a module of an earlier version has another name in this one."""
+    core = install.package / 'core'
+    (core / 'pair.py').write_text(PAIR)
+    (core / 'amplifier.py').write_text(MODULE_OF_PAIRS)
+    assert install.run()[0][0] == '6.0'
+    (core / 'pair.py').rename(core / 'couple.py')
+    (core / 'amplifier.py').write_text(MODULE_OF_PAIRS.replace('core.pair', 'core.couple'))
+    (value, _), said = install.run()
+    assert value == '6.0'
     assert 'compiling' in said
 
 

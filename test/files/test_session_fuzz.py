@@ -139,7 +139,8 @@ def test_what_no_field_may_hold_is_refused_by_its_name(
         path = saved(tmp_path, kind, state | {name: overwritten(array, byte)})
         with pytest.raises(InputError) as error:
             LOADERS[kind](str(path))
-        assert str(error.value).startswith(f'{path}: saved {kind}: {told}'), name
+        what = 'local map' if kind == 'features' else kind
+        assert str(error.value).startswith(f'{path}: saved {what}: {told}'), name
         bounded += 1
     assert bounded >= (1 if kind == 'grid' else 7)
 

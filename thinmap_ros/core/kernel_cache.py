@@ -106,7 +106,20 @@ class KernelLocator:
         return str(self._line)
 
 
+class _KernelIndex(caching.IndexDataCacheFile):
+    """The kernels of a function by the types of their arguments."""
+
+    def _load_index(self) -> dict[Any, str]:
+        """Read the index; empty where it names types of modules that have been moved or renamed."""
+        try:
+            index: dict[Any, str] = super()._load_index()
+        except (ImportError, AttributeError):
+            return {}
+        return index
+
+
 caching.CacheImpl._locator_classes.insert(0, KernelLocator)
+caching.IndexDataCacheFile = _KernelIndex
 
 
 def _named() -> Path:

@@ -125,8 +125,7 @@ class ScanLocalizer:
 
         It is lost until scans fit there. Raises InputError where it is no such state.
         """
-        own = {name: array for name, array in state.items() if name in local_map.FIELDS}
-        checked = snapshot.check(own, local_map.FIELDS, 'local map')
+        checked = snapshot.check(state, local_map.FIELDS, 'local map')
         possible = bool((checked['hits'] <= checked['seen']).all())
         snapshot.require(
             possible, 'local map: hits: more than seen', 'no more hits than observations'
