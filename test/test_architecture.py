@@ -157,7 +157,7 @@ def test_one_statement_a_line():
 
 
 MOST_FILES = 15
-# Three files too many, until its merge of maps is written anew.
+# Three files too many, until its merge of maps is rebuilt.
 FULL = {'thinmap_ros/core/topology': 18}
 
 

@@ -36,7 +36,7 @@ _MEASURE_SCANS = 5
 # At the survey's pace; thinning costs more than all else together.
 SCANS_PER_GRAPH = 5
 Watch = Callable[[Decision, Array], None]
-"""Is told each decision, and the estimated pose (3,) at which it was made."""
+"""Receives each decision, and the estimated pose (3,) at which it was made."""
 
 STRATEGIES: dict[str, Callable[[], Strategy]] = {
     'position_probability': lambda: Explorer(ExplorerConfig()),
@@ -73,17 +73,17 @@ class Ending:
 
 
 class Mishap(Protocol):
-    """What befalls the robot of a loop while it explores."""
+    """An incident during exploration, such as a kidnapping."""
 
     @property
     def is_lost(self) -> bool:
-        """Whether the robot looks for where it is."""
+        """Whether the robot is lost."""
 
     def takes(self, loop: 'ClosedLoop', scan: Scan, T_odom_base: Array) -> bool:
         """Whether a scan is not for the loop."""
 
     def hear(self, loop: 'ClosedLoop', scan: Scan, estimate: Estimate) -> None:
-        """Hear where the robot thinks that it is."""
+        """Receive the estimate of a scan."""
 
 
 class ClosedLoop:
@@ -115,7 +115,7 @@ class ClosedLoop:
     def run(self, goal: Coverable, limit_s: float, show: Callable[[float, float], None]) -> Ending:
         """Explore until the strategy is finished or the time is up.
 
-        `show` is told time (s) and coverage now and then.
+        `show` receives time (s) and coverage every few scans.
         """
         moment = self.simulation.sense()
         steps = 0

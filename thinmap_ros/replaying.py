@@ -1,4 +1,4 @@
-"""A log or bag through localizer, grid and topology, and what came of it as files."""
+"""Replays a log or bag through localizer, grid and topology, and writes the results."""
 
 import json
 import resource
@@ -36,13 +36,13 @@ class Replay:
 
 
 class Watcher(Protocol):
-    """Is told what the pipeline makes of a log."""
+    """Receives the results of the pipeline, scan by scan."""
 
     def step(self, scan: Scan, T_odom_base: Array, estimate: Estimate, pipeline: Pipeline) -> None:
-        """Hear what came of a scan with the odometry pose (3,) at its stamp."""
+        """Receive the result of a scan with the odometry pose (3,) at its stamp."""
 
     def last(self, ns: int, pipeline: Pipeline) -> None:
-        """Hear that the last scan, with this stamp, is done."""
+        """Receive the end of the log, with the stamp of the last scan."""
 
 
 def replay(

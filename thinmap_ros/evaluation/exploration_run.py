@@ -23,7 +23,7 @@ def explore(
     options: Options,
     show: Callable[[float, float], None] = nothing_to_show,
 ) -> tuple[ClosedLoop, dict[str, Any]]:
-    """Explore a world from a start (3,); returns what is left of it and the report."""
+    """Explore a world from a start (3,); returns the finished loop and the report."""
     census = EndNodeCensus()
     targets = TargetLog()
 

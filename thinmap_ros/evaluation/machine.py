@@ -1,7 +1,6 @@
 """What the benchmarks ran on, and what they took of it: time and memory.
 
-Times can be compared: the best of several runs, taken in turns, or what a run takes of the
-processor.
+Times can be compared: the best of several alternating runs, or the processor time of one run.
 """
 
 import os
@@ -57,7 +56,7 @@ def best_seconds(works: dict[str, Callable[[], object]], rounds: int) -> dict[st
 
 
 def median_seconds(work: Callable[[], object], rounds: int) -> float:
-    """Median time of the processor that a work takes over some rounds.
+    """Median processor time of a function over some rounds.
 
     A busy machine changes it little.
     """

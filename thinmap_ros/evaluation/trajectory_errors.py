@@ -29,7 +29,7 @@ def between_paths(path: Array, onto: Array) -> Array:
 def aligned_rms(path: Array, truth: Array) -> float:
     """Rms error of the positions of a path (N, 3), m, after the rigid motion that suits it best.
 
-    The absolute trajectory error: what is left where the whole map may be turned and shifted.
+    The absolute trajectory error, after the whole map was rotated and shifted.
     Source: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", 2012.
     """
     aligned = se2.transform_points(between_paths(path, truth), path[:, :2])

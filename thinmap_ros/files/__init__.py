@@ -1,1 +1,1 @@
-"""What lies on a disk, read within limits and written whole or not at all."""
+"""Files on disk, read within limits and written atomically."""

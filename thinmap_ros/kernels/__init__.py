@@ -1,1 +1,1 @@
-"""Compiled kernels: rehearsed, told of, and their compiler put away."""
+"""Compiled kernels: warm-up, progress of compilation, memory of the compiler."""

@@ -17,7 +17,7 @@ from thinmap_ros.ros.lifecycle_node import LiveNode
 
 _QUIET_S = 5.0
 _SILENT_S = 3.0
-_LONGEST_GAP_NS = 5_000_000_000  # whoever says nothing for longer was silent
+_LONGEST_GAP_NS = 5_000_000_000  # longer gaps are pauses of the sensor, no losses
 
 
 def listen(

@@ -40,7 +40,7 @@ def _config(arguments: argparse.Namespace) -> TopologyConfig:
 
 
 def _work(arguments: argparse.Namespace) -> None:
-    graphs.writer_of(arguments.out)  # a wrong name is said before any work
+    graphs.writer_of(arguments.out)  # a wrong name is reported before any work
     if arguments.picture is not None and arguments.picture.suffix != '.png':
         raise InputError(f'{arguments.picture}: expected a name that ends in .png')
     start = _start(arguments.start)

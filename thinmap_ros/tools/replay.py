@@ -34,7 +34,7 @@ _STAGES = {'localizer': 'localizer', 'grid': 'map update', 'topology': 'graph up
 class ReplayView:
     """Tells a view what a pipeline makes of each scan: the same picture as of the live nodes.
 
-    At the end `last` tells of the map and graph once more.
+    At the end `last` shows the map and graph again.
     """
 
     def __init__(self, view: NullView) -> None:

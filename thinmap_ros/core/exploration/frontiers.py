@@ -89,7 +89,7 @@ class OpenBorders:
         """Find the borders of a map anew in a box, the first time and now and then everywhere.
 
         box (2, 2): its lower left and upper right corner, m (see field_of_view.box_of_scan).
-        What lies elsewhere changes only where the map was corrected.
+        Other cells change only where the map was corrected.
         """
         whole = self._updates % _WHOLE_EVERY == 0
         self._updates += 1

@@ -172,12 +172,8 @@ class LoopClosure:
         step = turned(self._pending[1], float(poses[anchor, 2]))
         lever = here.T_map_base[:2] - poses[anchor, :2]
         back = [carried(there[j], poses[anchor, :2] - poses[j, :2]) for j in near]
-        drift = [self._drift(here.path_m - keyframes.frames[j].path_m) for j in near]
+        drift = [_drift(here.path_m - keyframes.frames[j].path_m) for j in near]
         return [carried(there, lever) + step + own for there, own in zip(back, drift, strict=True)]
-
-    def _drift(self, path_m: float) -> Array:
-        """Covariance (3, 3) of what errors that repeat add up to along a path, m."""
-        return np.diag(np.square([_DRIFT * path_m, _DRIFT * path_m, 0.0]))
 
     def work(self) -> Correction | None:
         """Do one match that is due, or one round of the optimization; to be called once a step."""
@@ -383,6 +379,11 @@ class LoopClosure:
             self._match(self._jobs.popleft())
         self._settle()
         return optimized(self.keyframes.poses(), self._all_edges)
+
+
+def _drift(path_m: float) -> Array:
+    """Covariance (3, 3) of errors that repeat, accumulated along a path, m."""
+    return np.diag(np.square([_DRIFT * path_m, _DRIFT * path_m, 0.0]))
 
 
 def _moved(frame: Keyframe, before: Array, after: Array) -> Keyframe:
