@@ -9,6 +9,7 @@ import re
 import sys
 from glob import glob
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from setuptools import find_packages, setup
 
@@ -50,6 +51,8 @@ WHEEL_DATA = {
     f'{NAME}.data.{NAME}.worlds': 'worlds',
     f'{NAME}.data.thinmap_msgs.msg': 'thinmap_msgs/msg',
 }
+# Where a wheel is built: what an earlier one left in build/ would become part of it.
+BUILD = TemporaryDirectory()
 ROS_DATA = [
     ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
     (f'share/{NAME}', ['package.xml']),
@@ -74,6 +77,7 @@ setup(
         *find_packages(include=[NAME, f'{NAME}.*']),
         *(WHEEL_DATA if IS_WHEEL else []),
     ],
+    options={'build': {'build_base': BUILD.name}} if IS_WHEEL else {},
     package_dir=WHEEL_DATA if IS_WHEEL else {},
     package_data={NAME: ['py.typed'], '': ['*.yaml', '*.msg']},
     data_files=[] if IS_WHEEL else ROS_DATA,

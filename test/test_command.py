@@ -134,8 +134,12 @@ def test_pip_installs_one_command_with_its_data(installed: Path) -> None:
     assert (installed / 'thinmap_ros' / 'py.typed').exists()
 
 
-def test_the_installed_command_explores_and_makes_a_route_graph(thinmap, tmp_path: Path) -> None:
+def test_the_installed_command_replays_explores_and_makes_a_route_graph(
+    thinmap, tmp_path: Path
+) -> None:
     assert thinmap('--version') == f'thinmap {__version__}\n'
+    bag = str(ROOT / 'bags' / 'dead_end.mcap')
+    assert '219 scans' in thinmap('replay', bag, '-o', 'out/dead_end', '--quiet')
     assert 'coverage 100.0%' in thinmap('explore_world', 'room_10x10', '-o', 'out', '--quiet')
     assert 'nodes' in thinmap('map_to_graph', 'out/map.yaml', '-o', 'route.geojson')
     assert (tmp_path / 'route.geojson').exists()

@@ -10,10 +10,18 @@ import pytest
 from support.hidden_library import hide_ros
 
 import thinmap_ros
+from docs import commands
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = sorted((ROOT / 'examples').glob('*.py'))
 MOST_LINES = 40
+
+
+def output_of(folder: Path, *words: str) -> str:
+    command = [sys.executable, *words]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=folder)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 @pytest.fixture
@@ -23,10 +31,7 @@ def example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     hide_ros(tmp_path, monkeypatch)
 
     def run(name: str, *arguments: str) -> str:
-        command = [sys.executable, str(ROOT / 'examples' / f'{name}.py'), *arguments]
-        done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
-        return done.stdout
+        return output_of(tmp_path, str(ROOT / 'examples' / f'{name}.py'), *arguments)
 
     return run
 
@@ -72,3 +77,10 @@ def test_thinning(example) -> None:
 def test_find_the_robot(example) -> None:
     said = example('find_the_robot', 'lab', str(ROOT / 'bags' / 'lab_lost.mcap'))
     assert re.fullmatch(r'after \d+ scans: x 2\.\d+ m, y [12]\.\d+ m, heading \S+ rad\n', said)
+
+
+def test_python_in_the_readme_runs(example, tmp_path: Path) -> None:
+    (tmp_path / 'bags').symlink_to(ROOT / 'bags')
+    (block,) = commands.python_blocks(ROOT / 'README.md')
+    output_of(tmp_path, '-c', block)
+    assert (tmp_path / 'dead_end.geojson').exists()
