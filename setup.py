@@ -1,6 +1,15 @@
-"""The ROS package thinmap_ros: nodes and tools."""
+"""The package thinmap_ros, for ROS and for pip.
 
+colcon and the build farm call `setup.py develop` or `install`: each node and tool becomes a program
+in lib/thinmap_ros, and config and worlds go to share/thinmap_ros. pip builds a wheel: it has the
+one command `thinmap`, and the same data within the package.
+"""
+
+import re
+import sys
 from glob import glob
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from setuptools import find_packages, setup
 
@@ -33,18 +42,45 @@ TOOLS = [
     'record_bags',
 ]
 
+# What pip and `python -m build` run of this file.
+IS_WHEEL = bool({'bdist_wheel', 'dist_info', 'editable_wheel', 'sdist'} & set(sys.argv))
+# Folders of a wheel, as packages, and where they come from.
+WHEEL_DATA = {
+    f'{NAME}.data.{NAME}.config': 'config',
+    f'{NAME}.data.{NAME}.config.sensors': 'config/sensors',
+    f'{NAME}.data.{NAME}.worlds': 'worlds',
+    f'{NAME}.data.thinmap_msgs.msg': 'thinmap_msgs/msg',
+}
+# Where a wheel is built: what an earlier one left in build/ would become part of it.
+BUILD = TemporaryDirectory()
+ROS_DATA = [
+    ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
+    (f'share/{NAME}', ['package.xml']),
+    (f'share/{NAME}/config', glob('config/*.yaml')),
+    (f'share/{NAME}/config/sensors', glob('config/sensors/*.yaml')),
+    (f'share/{NAME}/worlds', glob('worlds/*.yaml')),
+]
+ROS_PROGRAMS = [f'{node} = {NAME}.nodes.{node}:main' for node in NODES]
+ROS_PROGRAMS += [f'{tool} = {NAME}.tools.{tool}:main' for tool in TOOLS]
+
+
+def version() -> str:
+    """The version that the package itself names."""
+    source = (Path(__file__).parent / NAME / '__init__.py').read_text()
+    return re.search("^__version__ = '(.+)'$", source, re.MULTILINE)[1]
+
+
 setup(
     name=NAME,
-    version='0.1.0',
-    packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={NAME: ['py.typed']},
-    data_files=[
-        ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
-        (f'share/{NAME}', ['package.xml']),
-        (f'share/{NAME}/config', glob('config/*.yaml')),
-        (f'share/{NAME}/config/sensors', glob('config/sensors/*.yaml')),
-        (f'share/{NAME}/worlds', glob('worlds/*.yaml')),
+    version=version(),
+    packages=[
+        *find_packages(include=[NAME, f'{NAME}.*']),
+        *(WHEEL_DATA if IS_WHEEL else []),
     ],
+    options={'build': {'build_base': BUILD.name}} if IS_WHEEL else {},
+    package_dir=WHEEL_DATA if IS_WHEEL else {},
+    package_data={NAME: ['py.typed'], '': ['*.yaml', '*.msg']},
+    data_files=[] if IS_WHEEL else ROS_DATA,
     install_requires=[
         'lz4',
         'matplotlib',
@@ -80,7 +116,6 @@ setup(
     'with one 2D laser scanner.',
     license='Apache-2.0',
     entry_points={
-        'console_scripts': [f'{node} = {NAME}.nodes.{node}:main' for node in NODES]
-        + [f'{tool} = {NAME}.tools.{tool}:main' for tool in TOOLS]
+        'console_scripts': [f'thinmap = {NAME}.__main__:main'] if IS_WHEEL else ROS_PROGRAMS
     },
 )

@@ -1,8 +1,123 @@
-"""thinmap: thinning-based topological mapping, exploration, SLAM for robots with one 2D laser."""
+"""2D laser SLAM, topological maps by thinning, and exploration for robots with one laser.
+
+The names of `__all__` are the public Python interface; other modules may change without notice.
+Each name is imported when it is first used: `import thinmap_ros` loads no library and needs no ROS.
+"""
 
 import os
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # for type checkers and editors, from the places in _PLACES
+    from thinmap_ros.closed_loop import Options as ExplorationOptions
+    from thinmap_ros.core.errors import ConfigError, InputError, ThinmapError
+    from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
+    from thinmap_ros.core.grid.occupancy import OccupancyGrid
+    from thinmap_ros.core.grid.patch import GridPatch
+    from thinmap_ros.core.places.global_localizer import GlobalLocalization as GlobalLocalizer
+    from thinmap_ros.core.planning.graph_search import shortest_path
+    from thinmap_ros.core.scan import Scan
+    from thinmap_ros.core.topology.builder import build as build_topology
+    from thinmap_ros.core.topology.config import TopologyConfig
+    from thinmap_ros.core.topology.graph import TopologicalMap
+    from thinmap_ros.core.topology.thinning import thin
+    from thinmap_ros.evaluation.exploration_run import explore
+    from thinmap_ros.files.graphs import write_graph
+    from thinmap_ros.files.occupancy_maps import read_map, write_map
+    from thinmap_ros.files.package_data import world_path
+    from thinmap_ros.files.worlds import read_world
+    from thinmap_ros.logs.log import open_log, paired_scans
+    from thinmap_ros.pipeline import Pipeline, PipelineConfig
+    from thinmap_ros.sim.world import World
+
+__all__ = [
+    'ConfigError',
+    'ExplorationOptions',
+    'Explorer',
+    'ExplorerConfig',
+    'GlobalLocalizer',
+    'GridPatch',
+    'InputError',
+    'OccupancyGrid',
+    'Pipeline',
+    'PipelineConfig',
+    'Scan',
+    'ThinmapError',
+    'TopologicalMap',
+    'TopologyConfig',
+    'World',
+    'build_topology',
+    'explore',
+    'open_log',
+    'paired_scans',
+    'read_map',
+    'read_world',
+    'shortest_path',
+    'thin',
+    'world_path',
+    'write_graph',
+    'write_map',
+]
 
 # Matrices here are small: sharing one among threads costs more than it saves, ten times in the
 # filter, and sums in another order on every number of cores, so that the same log gives other last
 # digits. It counts if NumPy comes later.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+# The only place of the version: setup.py reads it, and a test compares the two package.xml with it.
+__version__ = '0.1.0'
+
+_PLACES = {
+    # SLAM
+    'Pipeline': 'pipeline.Pipeline',
+    'PipelineConfig': 'pipeline.PipelineConfig',
+    'Scan': 'core.scan.Scan',
+    # logs
+    'open_log': 'logs.log.open_log',
+    'paired_scans': 'logs.log.paired_scans',
+    # maps
+    'GridPatch': 'core.grid.patch.GridPatch',
+    'OccupancyGrid': 'core.grid.occupancy.OccupancyGrid',
+    'read_map': 'files.occupancy_maps.read_map',
+    'write_map': 'files.occupancy_maps.write_map',
+    # topological maps
+    'TopologicalMap': 'core.topology.graph.TopologicalMap',
+    'TopologyConfig': 'core.topology.config.TopologyConfig',
+    'build_topology': 'core.topology.builder.build',
+    'shortest_path': 'core.planning.graph_search.shortest_path',
+    'thin': 'core.topology.thinning.thin',
+    'write_graph': 'files.graphs.write_graph',
+    # localization in a finished map
+    'GlobalLocalizer': 'core.places.global_localizer.GlobalLocalization',
+    # exploration, also in the simulator
+    'ExplorationOptions': 'closed_loop.Options',
+    'Explorer': 'core.exploration.explorer.Explorer',
+    'ExplorerConfig': 'core.exploration.explorer.ExplorerConfig',
+    'World': 'sim.world.World',
+    'explore': 'evaluation.exploration_run.explore',
+    'read_world': 'files.worlds.read_world',
+    'world_path': 'files.package_data.world_path',
+    # errors
+    'ConfigError': 'core.errors.ConfigError',
+    'InputError': 'core.errors.InputError',
+    'ThinmapError': 'core.errors.ThinmapError',
+}
+
+
+def _load(name: str) -> Any:
+    """Import a public name when it is first used."""
+    if name not in _PLACES:
+        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+    module, _, attribute = _PLACES[name].rpartition('.')
+    value = getattr(import_module(f'{__name__}.{module}'), attribute)
+    globals()[name] = value
+    return value
+
+
+if not TYPE_CHECKING:  # else no type checker would find a name that does not exist
+    __getattr__ = _load
+
+
+def __dir__() -> list[str]:
+    """The public names, imported or not."""
+    return [*__all__, '__version__']

@@ -1,6 +1,7 @@
 """Command lines in the documentation.
 
 A command is each line of a block of code, and each span of code in the text that begins like one.
+A block fenced as Python is no command: `python_blocks` gives it.
 `<!-- not run -->` on the line before a block or paragraph, or in front of a span, marks it.
 """
 
@@ -9,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 MARK = '<!-- not run -->'
+PYTHON = '```python'
 _SPAN = re.compile(rf'({re.escape(MARK)}\s+)?`([^`]+)`')
 _WHOLE = re.compile(
     r'ros2 (run \S+ \S+|-h|(topic|service|action|param|lifecycle|node|pkg|interface) \S+)'
@@ -52,17 +54,26 @@ def marks(path: Path) -> int:
     return path.read_text().count(MARK)
 
 
+def python_blocks(path: Path) -> list[str]:
+    """Blocks of a document that are fenced as Python, in order."""
+    return re.findall(rf'^{PYTHON}\n(.*?)^```$', path.read_text(), re.MULTILINE | re.DOTALL)
+
+
 def _parts(lines: list[str]) -> list[_Part]:
     parts: list[_Part] = []
     section = ''
     marked = False
     fenced = False
+    python = False
     open_part: _Part | None = None
     for line in lines:
         text = line.strip()
         if text.startswith('```'):
             fenced = not fenced
+            python = fenced and text == PYTHON
             open_part = None
+            continue
+        if python:
             continue
         if not fenced and (not text or text == MARK):
             marked = text == MARK

@@ -48,6 +48,13 @@ NOT_RUN = {
     'ros2 run thinmap_ros warm_up      # compiles the kernels: once, a minute or two': 'as above',
     'ros2 run thinmap_ros localizer': 'as above; the tutorials have it, too',
     'ros2 run thinmap_ros rerun_viewer': 'needs rerun, opens a window',
+    'pip install .                                   # in a virtual environment of Python 3.11 or '
+    'newer, on Linux': 'test/test_command.py installs a wheel and runs what follows',
+    'thinmap --help                                  # the tools above, each a subcommand of one '
+    'program': 'as above',
+    'thinmap replay bags/dead_end.mcap -o out/dead_end': 'as above',
+    'thinmap explore_world room_10x10 -o out/room': 'as above',
+    'thinmap map_to_graph out/room/map.yaml -o out/room.geojson': 'as above',
 }
 MOST_MARKS = 6
 
@@ -326,6 +333,9 @@ def test_commands_are_found_in_blocks_and_text(tmp_path):
         '',
         '# n',
         '```',
+        '```python',
+        'print(1)',
+        '```',
     ]
     document.write_text('\n'.join(lines))
     found = [(c.section, c.text, c.marked) for c in commands.commands(document)]
@@ -340,3 +350,4 @@ def test_commands_are_found_in_blocks_and_text(tmp_path):
         ('Two', 'echo w', False),
     ]
     assert commands.marks(document) == 2
+    assert commands.python_blocks(document) == ['print(1)\n']

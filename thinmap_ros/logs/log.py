@@ -3,12 +3,16 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.odometry import ScanPairing
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.logs.mcap_records import MAGIC as _MCAP
+
+if TYPE_CHECKING:
+    from thinmap_ros.logs.carmen import LaserOptions
 
 _ROS1 = b'#ROSBAG V'
 _SQLITE = b'SQLite format 3\0'
@@ -58,6 +62,44 @@ class Log(Protocol):
     def events(self) -> Iterator[Event]:
         """Odometry and scans in the order of the file."""
         ...
+
+
+def open_log(
+    path: Path | str,
+    laser: 'LaserOptions | None' = None,
+    scan_topic: str = '',
+    odometry_topic: str = '',
+    T_base_laser: Array | None = None,
+    base_frame: str = 'base_link',
+) -> Log:
+    """Return the log of a path: a rosbag2 folder, an MCAP file, or else a CARMEN log.
+
+    laser describes the laser of a CARMEN log. For a bag: scan_topic and odometry_topic, empty for
+    the only topic of their type; T_base_laser (3,), the laser on the robot, None for the one of
+    /tf_static; base_frame, the robot's frame. The log is read when its events are.
+    """
+    # Imported here: both modules import this one.
+    from thinmap_ros.logs.bag import BagLog
+    from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
+
+    path = Path(path)
+    if path.is_dir() or path.suffix == '.mcap' or is_mcap(path):
+        return BagLog(path, scan_topic, odometry_topic, T_base_laser, base_frame)
+    return CarmenLog(path, laser or LaserOptions())
+
+
+def paired_scans(log: Log) -> Iterator[tuple[Scan, Array]]:
+    """Scans of a log in their order, each with the odometry pose T_odom_base (3,) at its stamp.
+
+    A scan without odometry around its stamp is left out. Raises InputError where the log cannot be
+    read.
+    """
+    pairing = ScanPairing()
+    for event in log.events():
+        if isinstance(event, OdometryEvent):
+            yield from pairing.add_odometry(event.stamp_ns, event.T_odom_base)
+        else:
+            yield from pairing.add_scan(event.scan)
 
 
 def refuse_foreign(path: Path) -> None:

@@ -12,7 +12,7 @@ from thinmap_ros.ros import node_main
 
 _NODES = ('localizer', 'grid_mapper', 'topology_builder', 'navigator', 'explorer')
 _OTHERS = ('global_localizer', 'sim', 'recorder', 'bag_player', 'rerun_viewer', 'markers')
-_USAGE = f"""usage: thinmap [NODE ...] [--ros-args ...]
+_USAGE = f"""usage: {{program}} [NODE ...] [--ros-args ...]
 
 Runs nodes in one process. Without names: {', '.join(_NODES)}.
 There are also: {', '.join(_OTHERS)}.
@@ -33,14 +33,16 @@ def makers(names: list[str]) -> list[Callable[[], Node]]:
 
 def main() -> None:
     """Run the nodes that the command line names."""
-    names = remove_ros_args(sys.argv)[1:] or list(_NODES)
+    program, *names = remove_ros_args(sys.argv)
+    names = names or list(_NODES)
+    usage = _USAGE.format(program=program if program.startswith('thinmap ') else 'thinmap')
     if {'-h', '--help'} & set(names):
-        print(_USAGE)
+        print(usage)
         return
     unknown = [name for name in names if name not in (*_NODES, *_OTHERS)]
     if unknown or len(set(names)) < len(names):
         print(
-            f'error: {unknown[0] if unknown else "a name twice"}: no such choice\n{_USAGE}',
+            f'error: {unknown[0] if unknown else "a name twice"}: no such choice\n{usage}',
             file=sys.stderr,
         )
         sys.exit(2)

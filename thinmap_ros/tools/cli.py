@@ -12,9 +12,9 @@ import numpy as np
 from thinmap_ros.core.config import Config
 from thinmap_ros.core.errors import ThinmapError
 from thinmap_ros.kernels.progress import report_compilation
-from thinmap_ros.logs.bag import BagLog
-from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
-from thinmap_ros.logs.log import Log, is_mcap
+from thinmap_ros.logs import log
+from thinmap_ros.logs.carmen import LaserOptions
+from thinmap_ros.logs.log import Log
 
 BAD_INPUT = 2
 INTERRUPTED = 130
@@ -26,8 +26,11 @@ Options = argparse._ActionsContainer
 def run(work: Callable[[argparse.Namespace], None], parser: argparse.ArgumentParser) -> None:
     """Parse the arguments, do the work, and end.
 
-    0, 2 after one line on what is wrong, or 130 on Ctrl-C.
+    0, 2 after one line on what is wrong, or 130 on Ctrl-C. The program has the name by which the
+    command `thinmap` calls it, if it does.
     """
+    if sys.argv[0].startswith('thinmap '):
+        parser.prog = sys.argv[0]
     arguments = parser.parse_args()
     compilation = report_compilation()
     try:
@@ -95,13 +98,14 @@ def open_log(arguments: argparse.Namespace) -> Log:
 
     A laser offset that is given comes before a bag's /tf_static.
     """
-    path: Path = arguments.log
-    options = config_from(arguments, LaserOptions)
-    if not (path.is_dir() or path.suffix == '.mcap' or is_mcap(path)):
-        return CarmenLog(path, options)
     T_base_laser = (
-        np.array([options.offset_m, 0.0, 0.0]) if hasattr(arguments, 'offset_m') else None
+        np.array([arguments.offset_m, 0.0, 0.0]) if hasattr(arguments, 'offset_m') else None
     )
-    return BagLog(
-        path, arguments.scan_topic, arguments.odom_topic, T_base_laser, arguments.base_frame
+    return log.open_log(
+        arguments.log,
+        config_from(arguments, LaserOptions),
+        arguments.scan_topic,
+        arguments.odom_topic,
+        T_base_laser,
+        arguments.base_frame,
     )

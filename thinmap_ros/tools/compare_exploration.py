@@ -23,11 +23,12 @@ from thinmap_ros.evaluation.parallel_jobs import (
     run_missing,
 )
 from thinmap_ros.evaluation.strategy_comparison import markdown
+from thinmap_ros.files import package_data
 from thinmap_ros.files.atomic import read_text, write_text
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.world import World
 from thinmap_ros.tools import cli
-from thinmap_ros.tools.explore_world import add_options, options_from
+from thinmap_ros.tools.explore_world import WORLD_HELP, add_options, options_from
 from thinmap_ros.view import figures
 
 
@@ -54,7 +55,7 @@ def run_job(job: Job) -> Report:
 
 def _jobs(arguments: argparse.Namespace) -> list[Job]:
     jobs = []
-    for path in arguments.worlds:
+    for path in map(package_data.world_path, arguments.worlds):
         # Worlds of different folders may have the same file name.
         world = replace(
             World.from_patch(*read_world(path)), name=f'{path.resolve().parent.name}-{path.stem}'
@@ -106,7 +107,7 @@ def _work(arguments: argparse.Namespace) -> None:
 def main() -> None:
     """Run the program."""
     parser = argparse.ArgumentParser(prog='compare_exploration', description=__doc__)
-    parser.add_argument('worlds', type=Path, nargs='+', help='world YAMLs or map_server YAMLs')
+    parser.add_argument('worlds', nargs='+', help=WORLD_HELP)
     parser.add_argument('-o', '--out', type=Path, required=True, help='folder for the results')
     parser.add_argument(
         '--strategies', nargs='+', default=sorted(STRATEGIES), choices=sorted(STRATEGIES)

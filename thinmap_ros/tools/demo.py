@@ -21,6 +21,7 @@ from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.tools import cli
+from thinmap_ros.tools.ros_check import require_ros
 
 # Nodes end at once, but not on a machine that is busy; a recorder that is killed leaves half a bag.
 _PATIENCE_S = 20.0
@@ -159,6 +160,7 @@ def _choose_domain() -> None:
 
 
 def _work(arguments: argparse.Namespace) -> None:
+    require_ros()
     if arguments.view and importlib.util.find_spec('rerun') is None:
         raise InputError('--view: rerun is not installed: pip install "thinmap_ros[viewer]"')
     world = package_data.world_path(arguments.world)

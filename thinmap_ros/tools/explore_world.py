@@ -14,7 +14,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.exploration_run import explore
-from thinmap_ros.files import graphs, occupancy_maps, trajectories
+from thinmap_ros.files import graphs, occupancy_maps, package_data, trajectories
 from thinmap_ros.files.atomic import write_text
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.laser import Lms200Config
@@ -22,6 +22,8 @@ from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
 from thinmap_ros.tools import cli
 from thinmap_ros.view import figures
+
+WORLD_HELP = "world YAML, map_server YAML, or the name of one of the package's worlds"
 
 
 def write_outputs(loop: ClosedLoop, report: dict[str, Any], folder: Path) -> None:
@@ -91,7 +93,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _work(arguments: argparse.Namespace) -> None:
-    world = World.from_patch(*read_world(arguments.world))
+    world = World.from_patch(*read_world(package_data.world_path(arguments.world)))
     options = options_from(arguments, arguments.strategy)
     if options.kidnap_at_s is not None and options.localization == 'truth':
         raise InputError(
@@ -119,7 +121,7 @@ def _work(arguments: argparse.Namespace) -> None:
 def main() -> None:
     """Run the program."""
     parser = argparse.ArgumentParser(prog='explore_world', description=__doc__)
-    parser.add_argument('world', type=Path, help='world YAML or map_server YAML')
+    parser.add_argument('world', help=WORLD_HELP)
     parser.add_argument('-o', '--out', type=Path, required=True, help='folder for the results')
     parser.add_argument('--strategy', default='position_probability', choices=sorted(STRATEGIES))
     parser.add_argument('--start', help="X,Y,THETA in m, m, rad; without it the world's own")

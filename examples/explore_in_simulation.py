@@ -1,0 +1,23 @@
+"""A simulated robot explores a world until no end node of the graph is left to observe.
+
+Usage: python examples/explore_in_simulation.py [WORLD]
+WORLD: a world or map_server YAML, or the name of a world of the package (default: room_10x10).
+"""
+
+import sys
+
+from thinmap_ros import ExplorationOptions, World, explore, read_world, world_path
+
+
+def main(name: str) -> None:
+    """Explore a world and print how it went."""
+    world = World.from_patch(*read_world(world_path(name)))
+    options = ExplorationOptions(localization='slam', speed_m_s=0.3, seed=1)
+    loop, report = explore(world, world.start, options)
+    print(f'{report["reason"]} after {report["time"]:.0f} s and {report["distance"]:.1f} m')
+    print(f'{report["coverage"]:.1%} seen, {report["collisions"]} collisions')
+    print(f'{len(loop.pipeline.topology.map.nodes)} nodes in the graph')
+
+
+if __name__ == '__main__':
+    main(sys.argv[1] if len(sys.argv) > 1 else 'room_10x10')

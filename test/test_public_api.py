@@ -1,0 +1,74 @@
+"""`from thinmap_ros import ...`: the public names, without ROS."""
+
+import ast
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+from support.hidden_library import hide_ros
+
+import thinmap_ros
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(autouse=True)
+def without_ros(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    hide_ros(tmp_path, monkeypatch)
+
+
+def run(code: str) -> str:
+    command = [sys.executable, '-c', code]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_importing_the_package_loads_no_library() -> None:
+    loaded = run('import sys, thinmap_ros; dir(thinmap_ros); print(*sys.modules)').split()
+    assert 'thinmap_ros' in loaded
+    assert not {'numpy', 'numba', 'rclpy', 'rosbags', 'scipy'} & set(loaded)
+
+
+def test_every_name_resolves_without_ros() -> None:
+    code = """
+import sys
+from thinmap_ros import *
+import thinmap_ros
+print(*(type(globals()[name]).__name__ for name in thinmap_ros.__all__))
+print('rclpy' in sys.modules)
+"""
+    kinds, ros = run(code).splitlines()
+    assert len(kinds.split()) == len(thinmap_ros.__all__)
+    assert ros == 'False'
+
+
+def test_names_and_places_agree() -> None:
+    assert thinmap_ros.__all__ == sorted(thinmap_ros._PLACES)
+    for name, place in thinmap_ros._PLACES.items():
+        module, _, attribute = place.rpartition('.')
+        assert getattr(thinmap_ros, name) is getattr(
+            import_module(f'thinmap_ros.{module}'), attribute
+        )
+
+
+def test_type_checkers_see_the_same_names_at_the_same_places() -> None:
+    tree = ast.parse(Path(thinmap_ros.__file__).read_text())
+    block = next(node for node in tree.body if isinstance(node, ast.If))
+    assert ast.unparse(block.test) == 'TYPE_CHECKING'
+    seen = {
+        name.asname or name.name: f'{node.module}.{name.name}'.removeprefix('thinmap_ros.')
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for name in node.names
+    }
+    assert seen == thinmap_ros._PLACES
+
+
+def test_a_name_that_does_not_exist_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="'thinmap_ros' has no attribute 'nothing'"):
+        _ = thinmap_ros.nothing
+    with pytest.raises(ImportError):
+        from thinmap_ros import nothing  # noqa: F401

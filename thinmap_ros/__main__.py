@@ -1,0 +1,93 @@
+"""The command `thinmap`: all programs of the package, each as a subcommand."""
+
+import sys
+from importlib import import_module
+from typing import NamedTuple
+
+from thinmap_ros import __version__
+from thinmap_ros.core.errors import ThinmapError
+from thinmap_ros.tools.ros_check import require_ros
+
+_BAD_USE = 2
+
+
+class _Program(NamedTuple):
+    """A module of this package that has a `main`, in one line, and whether it needs ROS 2."""
+
+    module: str
+    summary: str
+    needs_ros: bool = False
+
+
+PROGRAMS = {
+    'replay': _Program('tools.replay', 'a log or bag into trajectory, map, graph and report'),
+    'explore_world': _Program('tools.explore_world', 'an exploration in the simulator'),
+    'compare_exploration': _Program(
+        'tools.compare_exploration', 'exploration strategies on worlds and starts, in one table'
+    ),
+    'map_to_graph': _Program('tools.map_to_graph', 'a map_server map into a route graph'),
+    'carmen_to_bag': _Program('tools.carmen_to_bag', 'a CARMEN log into a bag'),
+    'bag_repair': _Program('tools.bag_repair', 'a damaged bag (MCAP) into a whole one'),
+    'experiment': _Program('tools.experiment', "the papers' figures and tables"),
+    'record_bags': _Program('tools.record_bags', 'the drives of the experiments as bags'),
+    'warm_up': _Program('tools.warm_up', 'compile all kernels, once, so that programs start fast'),
+    'demo': _Program('tools.demo', 'a simulated robot explores a room on a live ROS 2 graph', True),
+    'nodes': _Program('nodes.thinmap', 'ROS 2 nodes in one process', True),
+}
+
+
+def _usage() -> str:
+    width = max(map(len, PROGRAMS))
+    lines = [
+        f'  {name:{width}}  {program.summary}{" (needs ROS 2)" if program.needs_ros else ""}'
+        for name, program in PROGRAMS.items()
+    ]
+    return '\n'.join(
+        [
+            'usage: thinmap SUBCOMMAND [ARGUMENT ...]',
+            '       thinmap --help | --version',
+            '',
+            *lines,
+            '',
+            'thinmap SUBCOMMAND --help lists the arguments of a subcommand.',
+        ]
+    )
+
+
+def _fail(message: str) -> None:
+    print(f'thinmap: error: {message}', file=sys.stderr)
+    sys.exit(_BAD_USE)
+
+
+def _run(name: str, arguments: list[str]) -> None:
+    program = PROGRAMS[name]
+    if program.needs_ros:
+        try:
+            require_ros()
+        except ThinmapError as error:
+            _fail(f'{name} {error}')
+    sys.argv = [f'thinmap {name}', *arguments]
+    import_module(f'thinmap_ros.{program.module}').main()
+
+
+def main() -> None:
+    """Run the subcommand that the command line names.
+
+    Ends with 2, after one line on what is wrong, where there is no such subcommand.
+    """
+    arguments = sys.argv[1:]
+    if not arguments:
+        _fail('expected a subcommand: thinmap --help lists them')
+    name = arguments[0]
+    if name in ('-h', '--help'):
+        print(_usage())
+    elif name == '--version':
+        print(f'thinmap {__version__}')
+    elif name in PROGRAMS:
+        _run(name, arguments[1:])
+    else:
+        _fail(f'{name!r}: no such subcommand: expected one of {", ".join(PROGRAMS)}')
+
+
+if __name__ == '__main__':
+    main()
