@@ -25,7 +25,7 @@ ROOMS = {
 ROOMS['core.exploration'] |= {'core.places'}
 ALL_CORE = set(ROOMS)
 BELOW = ALL_CORE | {'sim', 'baselines', 'pipeline', 'kernels', 'files', 'logs', 'view'}
-BELOW |= {'closed_loop', 'replaying'}
+BELOW |= {'strategies', 'closed_loop', 'replaying'}
 ROOMS |= {
     'sim': ALL_CORE | {'sim'},
     'baselines': ALL_CORE | {'baselines'},
@@ -34,7 +34,8 @@ ROOMS |= {
     'files': ALL_CORE | {'files'},
     'logs': ALL_CORE | {'files', 'logs'},
     'view': ALL_CORE | {'files', 'logs', 'view'},
-    'closed_loop': ALL_CORE | {'sim', 'baselines', 'pipeline', 'closed_loop'},
+    'strategies': ALL_CORE | {'baselines', 'strategies'},
+    'closed_loop': ALL_CORE | {'sim', 'strategies', 'pipeline', 'closed_loop'},
     'replaying': ALL_CORE | {'pipeline', 'kernels', 'files', 'logs', 'view', 'replaying'},
     'ros': ALL_CORE | {'files', 'logs', 'kernels', 'ros'},
     'evaluation': BELOW | {'evaluation'},

@@ -7,19 +7,11 @@ from typing import Protocol
 
 import numpy as np
 
-from thinmap_ros.baselines.exploration import (
-    DistanceAdvantage,
-    ExploreLite,
-    InformationGain,
-    NearestFrontier,
-    VisitAllEndNodes,
-)
 from thinmap_ros.core import se2
 from thinmap_ros.core.estimate import Estimate
-from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
+from thinmap_ros.core.exploration.observations import Observation
 from thinmap_ros.core.exploration.strategy import Decision, Strategy
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
-from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -30,28 +22,19 @@ from thinmap_ros.sim.laser import Lms200Config
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import STEP_NS, Moment, Simulation
 from thinmap_ros.sim.world import World
+from thinmap_ros.strategies import DEFAULT, make_strategy
 
 _CONTROL_STEPS = 2
 _MEASURE_SCANS = 5
-# At the survey's pace; thinning costs more than all else together.
+# As often as the strategy searches frontiers; thinning costs more than all else together.
 SCANS_PER_GRAPH = 5
 Watch = Callable[[Decision, Array], None]
 """Receives each decision, and the estimated pose (3,) at which it was made."""
 
-STRATEGIES: dict[str, Callable[[], Strategy]] = {
-    'position_probability': lambda: Explorer(ExplorerConfig()),
-    'paper': lambda: Explorer(ExplorerConfig(mode='paper')),
-    'nearest_frontier': NearestFrontier,
-    'visit_all_end_nodes': VisitAllEndNodes,
-    'explore_lite': ExploreLite,
-    'information_gain': InformationGain,
-    'distance_advantage': DistanceAdvantage,
-}
-
 
 @dataclass(eq=False)
-class Log:
-    """Scan by scan: stamps, poses (3,) true and estimated; coverage over time."""
+class RunLog:
+    """Stamps and poses (3,), true and estimated, of all scans; coverage over time."""
 
     stamps_ns: list[int] = field(default_factory=list)
     true_poses: list[Array] = field(default_factory=list)
@@ -62,10 +45,7 @@ class Log:
 
 @dataclass(frozen=True)
 class Ending:
-    """How an exploration ended.
-
-    Whether by itself, why, and how often the robot touched something.
-    """
+    """How an exploration ended; finished: whether the strategy ended it."""
 
     finished: bool
     reason: str
@@ -79,10 +59,10 @@ class Mishap(Protocol):
     def is_lost(self) -> bool:
         """Whether the robot is lost."""
 
-    def takes(self, loop: 'ClosedLoop', scan: Scan, T_odom_base: Array) -> bool:
-        """Whether a scan is not for the loop."""
+    def intercepts(self, loop: 'ClosedLoop', scan: Scan, T_odom_base: Array) -> bool:
+        """Whether the loop shall not process a scan."""
 
-    def hear(self, loop: 'ClosedLoop', scan: Scan, estimate: Estimate) -> None:
+    def add_estimate(self, loop: 'ClosedLoop', scan: Scan, estimate: Estimate) -> None:
         """Receive the estimate of a scan."""
 
 
@@ -104,10 +84,9 @@ class ClosedLoop:
         self.navigator = navigator
         self.mishap = mishap
         self._watch = watch
-        self.log = Log()
+        self.log = RunLog()
         self.decision: Decision | None = None
-        self._patch: GridPatch | None = None
-        self._scan: Scan | None = None
+        self._observation: Observation | None = None
         self._goal: Array | None = None
         self._T_map_odom = np.zeros(3)
         self._command = (0.0, 0.0)
@@ -121,7 +100,7 @@ class ClosedLoop:
         steps = 0
         while moment.stamp_ns < limit_s * 1e9:
             if moment.scan is not None:
-                self._take(moment.scan, moment.T_odom_base)
+                self._process_scan(moment.scan, moment.T_odom_base)
                 if len(self.log.poses) % _MEASURE_SCANS == 1:
                     show(*self._measure(goal))
                 if self.is_finished:
@@ -146,33 +125,33 @@ class ClosedLoop:
         lost = self.mishap is not None and self.mishap.is_lost
         return self.decision is not None and self.decision.finished and not lost
 
-    def _take(self, scan: Scan, T_odom_base: Array) -> None:
-        """One scan through localization, map and graph to a decision."""
-        if self.mishap is not None and self.mishap.takes(self, scan, T_odom_base):
+    def _process_scan(self, scan: Scan, T_odom_base: Array) -> None:
+        """Process one scan through localization, map and graph to a decision."""
+        if self.mishap is not None and self.mishap.intercepts(self, scan, T_odom_base):
             return
         estimate = self.pipeline.step(scan, T_odom_base).estimate
-        self.note(scan, estimate)
+        self.log_poses(scan, estimate)
         if self.mishap is None or not self.mishap.is_lost:
             self.decide(scan, estimate)
 
-    def note(self, scan: Scan, estimate: Estimate) -> None:
-        """Log where the robot is, and where it thinks that it is."""
+    def log_poses(self, scan: Scan, estimate: Estimate) -> None:
+        """RunLog where the robot is, and where it thinks that it is."""
         self.log.stamps_ns.append(scan.stamp_ns)
         self.log.poses.append(estimate.T_map_base)
         self.log.true_poses.append(self.simulation.robot.T_world_base)
         if self.mishap is not None:
-            self.mishap.hear(self, scan, estimate)
+            self.mishap.add_estimate(self, scan, estimate)
 
     def decide(self, scan: Scan, estimate: Estimate) -> None:
-        """Say where to go, by the map as it is now."""
-        self._scan = scan
+        """Have the strategy decide where to drive, by the present map."""
         self._T_map_odom = estimate.T_map_odom
-        self._patch = self.pipeline.grid.patch()
-        # The processor's time: what else the machine does is not the strategy's.
-        began = time.thread_time()
-        self.decision = self.strategy.step(
-            self.pipeline.topology.map, self._patch, scan, estimate.T_map_base
+        observation = Observation(
+            self.pipeline.topology.map, self.pipeline.grid.patch(), scan, estimate.T_map_base
         )
+        self._observation = observation
+        # Processor time of this thread: other processes do not count.
+        began = time.thread_time()
+        self.decision = self.strategy.step(*observation)
         self.log.decision_s.append(time.thread_time() - began)
         if self._watch is not None:
             self._watch(self.decision, estimate.T_map_base)
@@ -184,27 +163,30 @@ class ClosedLoop:
             self._goal = target.goal
             self.navigator.set_goal(*(float(number) for number in target.goal))
 
-    def drive_by(self, pipeline: Pipeline, strategy: Strategy, navigator: Navigator) -> None:
-        """Have other parts decide where to go from now on."""
+    def replace_strategy(
+        self, pipeline: Pipeline, strategy: Strategy, navigator: Navigator
+    ) -> None:
+        """Use other parts from now on; the robot stops first."""
         self.navigator.cancel()
         self.pipeline = pipeline
         self.strategy = strategy
         self.navigator = navigator
         self.decision = None
-        self._patch = None
+        self._observation = None
         self._goal = None
         self._command = (0.0, 0.0)
 
     def _control(self, moment: Moment) -> None:
-        if self._patch is None:
+        observation = self._observation
+        if observation is None:
             return
         T_map_base = se2.compose(self._T_map_odom, moment.T_odom_base)
         command = self.navigator.step(
-            T_map_base, self._patch, self._scan, _CONTROL_STEPS * STEP_NS / 1e9
+            T_map_base, observation.patch, observation.scan, _CONTROL_STEPS * STEP_NS / 1e9
         )
         self._command = (command.v, command.w)
         if command.state == 'failed':
-            self.strategy.fail_target(command.reason)
+            self.strategy.target_failed(command.reason)
         if command.state in ('failed', 'reached'):
             self._goal = None
 
@@ -214,8 +196,8 @@ class ClosedLoop:
         return self.log.coverage[-1]
 
 
-def true_pose_source(simulation: Simulation) -> Callable[[Scan, Array], Estimate]:
-    """Takes the localizer's place: the simulator's own pose."""
+def ground_truth_poses(simulation: Simulation) -> Callable[[Scan, Array], Estimate]:
+    """Replace the localizer by the simulator's true pose."""
 
     def locate(scan: Scan, T_odom_base: Array) -> Estimate:
         T_map_base = simulation.robot.T_world_base
@@ -228,9 +210,9 @@ def true_pose_source(simulation: Simulation) -> Callable[[Scan, Array], Estimate
 
 @dataclass(frozen=True)
 class Options:
-    """What an exploration is run with, beside world and start."""
+    """Options of an exploration, beside world and start."""
 
-    strategy: str = 'position_probability'
+    strategy: str = DEFAULT
     seed: int = 0
     speed_m_s: float = 0.2
     localization: str = 'truth'
@@ -247,20 +229,20 @@ def make_loop(
     mishap: Mishap | None = None,
     watch: Watch | None = None,
 ) -> ClosedLoop:
-    """All parts as the options want them; what befalls the robot, and who watches, are given."""
+    """Make all parts by the options. Raises ConfigError where there is no such strategy."""
     simulation = Simulation(world, start, PRESETS[options.robot], options.laser, options.seed)
     x, y, theta = (float(number) for number in start)
     localizer = ScanLocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=theta)
-    source = true_pose_source(simulation) if options.localization == 'truth' else None
-    # A beam that met nothing has seen as far as this laser can.
+    source = ground_truth_poses(simulation) if options.localization == 'truth' else None
+    # A beam without return has observed free space up to the laser's range.
     grid = OccupancyConfig(no_return_range_m=options.laser.range_max_m)
     pipeline = Pipeline(
         PipelineConfig(localizer=localizer, grid=grid, scans_per_graph=SCANS_PER_GRAPH), source
     )
     navigator = Navigator(NavigatorConfig(max_speed_m_s=options.speed_m_s))
-    strategy = STRATEGIES[options.strategy]()
+    strategy = make_strategy(options.strategy)
     return ClosedLoop(simulation, pipeline, strategy, navigator, mishap, watch)
 
 
-def nothing_to_show(seconds: float, coverage: float) -> None:
-    """Take the place of a progress bar."""
+def no_progress(seconds: float, coverage: float) -> None:
+    """Show no progress."""

@@ -12,10 +12,9 @@ from benchmarks.scoreboard.recordings import RecordedSimulation, Recording, read
 from benchmarks.worlds import floors
 from thinmap_ros.closed_loop import (
     SCANS_PER_GRAPH,
-    STRATEGIES,
     ClosedLoop,
-    nothing_to_show,
-    true_pose_source,
+    ground_truth_poses,
+    no_progress,
 )
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
@@ -30,6 +29,7 @@ from thinmap_ros.sim.laser import Lms200Config
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import Simulation
 from thinmap_ros.sim.world import World
+from thinmap_ros.strategies import DEFAULT, make_strategy
 
 LASERS = {
     'lms200': Lms200Config(),
@@ -53,9 +53,9 @@ def record_drive(world: str, worlds: Path, path: Path, limit_s: float = RECORDED
     place, start = world_of(world, worlds)
     laser = LASERS['lms200']
     simulation = RecordedSimulation(place, start, _ROBOT, laser, _RECORDED_SEED)
-    pipeline = Pipeline(_pipeline_config(laser), true_pose_source(simulation))
+    pipeline = Pipeline(_pipeline_config(laser), ground_truth_poses(simulation))
     loop = _closed_loop(simulation, pipeline)
-    ending = loop.run(_NOTHING, limit_s, nothing_to_show)
+    ending = loop.run(_NOTHING, limit_s, no_progress)
     recording = simulation.recording()
     recording.write(path)
     return {
@@ -92,7 +92,7 @@ def measure_loop(case: LoopCase, worlds: Path, options: Numbers) -> Numbers:
     pipeline = PlayedPipeline(_pipeline_config(laser, options, start))
     loop = _closed_loop(simulation, pipeline)
     forget_peak()
-    ending = loop.run(goal, _LIMITS_S.get(case.world, _LIMIT_S), nothing_to_show)
+    ending = loop.run(goal, _LIMITS_S.get(case.world, _LIMIT_S), no_progress)
     played = pipeline.played
     played.final = pipeline.localizer.corrected_path()
     played.peak_mb = peak_mb()
@@ -136,7 +136,7 @@ def _pipeline_config(
 
 def _closed_loop(simulation: Simulation, pipeline: Pipeline) -> ClosedLoop:
     navigator = Navigator(NavigatorConfig(max_speed_m_s=_SPEED_M_S))
-    return ClosedLoop(simulation, pipeline, STRATEGIES['position_probability'](), navigator)
+    return ClosedLoop(simulation, pipeline, make_strategy(DEFAULT), navigator)
 
 
 def _length_m(poses: Array) -> float:

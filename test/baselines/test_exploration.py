@@ -14,13 +14,14 @@ from thinmap_ros.baselines.exploration import (
     VisitAllEndNodes,
 )
 from thinmap_ros.baselines.frontier_map import Frontier
-from thinmap_ros.closed_loop import STRATEGIES, Options
+from thinmap_ros.closed_loop import Options
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.sim.world import World
+from thinmap_ros.strategies import NAMES
 
 START = np.array([1.0, 1.0, 0.0])
 
@@ -35,7 +36,7 @@ def two_rooms() -> World:
     return World('two_rooms', cells, GridFrame(0.0, 0.0, 0.1), START)
 
 
-@pytest.mark.parametrize('strategy', sorted(set(STRATEGIES) - {'paper'}))
+@pytest.mark.parametrize('strategy', sorted(set(NAMES) - {'paper'}))
 def test_each_strategy_sees_all_stops_by_itself_and_touches_nothing(strategy: str) -> None:
     _, report = explore(
         two_rooms(), START, Options(strategy=strategy, speed_m_s=0.5, time_limit_s=600.0)
@@ -124,7 +125,7 @@ def test_a_target_that_fails_is_left_for_later_and_the_end_says_so() -> None:
             break
         if decision.target is not None:
             tried.append(round(decision.target.x))
-            strategy.fail_target('no way')
+            strategy.target_failed('no way')
     assert decision.finished
     assert decision.reason == 'what is left cannot be reached'
     assert tried[0] != tried[1]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.closed_loop import Ending
-from thinmap_ros.core.exploration.strategy import FIRST_STAND_IN_ID
+from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID
 from thinmap_ros.evaluation.exploration_metrics import (
     FEWEST_SIGHTINGS,
     EndNodeCensus,
@@ -45,7 +45,7 @@ def test_what_did_not_last_is_not_counted():
 
 
 def test_what_stands_in_for_a_border_is_no_end_node():
-    assert census_of(*([[(FIRST_STAND_IN_ID, 0.0, 0.0), (1, 5.0, 5.0)]] * 10)).seen == 1
+    assert census_of(*([[(FIRST_FRONTIER_ID, 0.0, 0.0), (1, 5.0, 5.0)]] * 10)).seen == 1
 
 
 def test_a_visit_is_nearer_than_half_a_metre():

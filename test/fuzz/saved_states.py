@@ -34,13 +34,13 @@ class Explored:
         world = World(name, patch.occupied.astype(np.uint8), patch.frame, start)
         self.loop: ClosedLoop = make_loop(world, start, Options(localization='slam', speed_m_s=0.4))
         self.scans: list[tuple[Any, Any]] = []
-        note = self.loop.note
+        log_poses = self.loop.log_poses
 
         def noted(scan: Any, estimate: Any) -> None:
             self.scans.append((scan, estimate.T_map_base))
-            note(scan, estimate)
+            log_poses(scan, estimate)
 
-        self.loop.note = noted  # type: ignore[method-assign]
+        self.loop.log_poses = noted  # type: ignore[method-assign]
         self.loop.run(coverable(world, start, 0.3, 8.0), 40.0, lambda seconds, share: None)
         pipeline = self.loop.pipeline
         self.states: dict[str, State] = {

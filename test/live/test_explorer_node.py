@@ -1,9 +1,11 @@
 """The explorer as a process on a live graph.
 
-Every way in which an exploration ends, and how it goes on afterwards.
+All reasons for which an exploration ends, how it is resumed, and with which strategies.
 """
 
 import math
+import subprocess
+import sys
 from itertools import count
 
 import numpy as np
@@ -18,6 +20,8 @@ from sensor_msgs.msg import LaserScan
 from thinmap_msgs.action import Explore, NavigateToPose
 from thinmap_msgs.msg import EndNodeArray, ExplorationStatus, SlamStatus, TopologicalMap
 from thinmap_msgs.srv import SaveMap
+from thinmap_ros.core.exploration.mission import MissionState
+from thinmap_ros.core.exploration.strategy import FinishCode
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
 from thinmap_ros.core.grid.raytrace import cast_rays
@@ -32,6 +36,26 @@ ANGLES = np.radians(np.arange(-90.0, 91.0))
 PERIOD_NS = 200_000_000
 # Ten times as fast as a robot's; the explorer goes by the robot's time.
 SPEAK_S = 0.02
+# A strategy of a user's own: one target, and it is finished once that has failed twice.
+OWN_STRATEGY = """
+import numpy as np
+from thinmap_ros.core.exploration.strategy import Decision, EndNode, FinishCode
+
+class TwoAttempts:
+    def __init__(self):
+        self.attempts = 0
+
+    def step(self, topology, patch, scan, T_map_base):
+        goal = T_map_base + np.array([0.5, 0.0, 0.0])
+        target = EndNode(7, goal[0], goal[1], 0.5, 0.0, 0.0, 1.0, 0.0, 1.0, True, goal)
+        if self.attempts < 2:
+            return Decision(target, False, 'one left', FinishCode.NONE, [target], [], 0.5, 1.0)
+        code = FinishCode.NOTHING_REACHABLE
+        return Decision(None, True, 'two attempts failed', code, [target], [7], 0.5, 1.0)
+
+    def target_failed(self, reason):
+        self.attempts += 1
+"""
 
 
 def room(known_cols):
@@ -107,6 +131,13 @@ class Robot:
         }
 
 
+def test_codes_and_states_are_those_of_the_message():
+    for code in FinishCode:
+        assert getattr(ExplorationStatus, code.name) == code
+    for state in MissionState:
+        assert getattr(ExplorationStatus, state.name) == state
+
+
 @pytest.fixture
 def robot(graph):
     robot = Robot(graph)
@@ -162,3 +193,61 @@ def test_it_goes_on_after_a_cancelled_goal_and_after_a_new_start(graph, robot, t
         graph.until(lambda: robot.end_nodes, 'what was looked at last')
         # The robot has not moved: there is no new evidence, and what there was has been kept.
         assert robot.evidence() == before
+
+
+def test_a_users_own_strategy_explores(graph):
+    (graph.folder / 'own_strategy.py').write_text(OWN_STRATEGY)
+    robot = Robot(graph)
+    robot.refuses_to_drive()
+    graph.start(
+        'explorer',
+        laser_pose='0,0,0',
+        use_sim_time=True,
+        strategy='own_strategy:TwoAttempts',
+    )
+    ended = graph.act(Explore, 'explore', Explore.Goal())
+    assert ended.status == GoalStatus.STATUS_SUCCEEDED
+    assert ended.result.status.reason_code == ExplorationStatus.NOTHING_REACHABLE
+    assert ended.result.status.reason == 'two attempts failed'
+    assert list(robot.evidence()) == [7]
+    saved = graph.call(SaveMap, 'save_exploration', SaveMap.Request(path='room'))
+    assert saved.success
+    assert saved.message == 'strategy own_strategy:TwoAttempts has nothing to save'
+    assert graph.stop('explorer') == 0, graph.log('explorer')
+
+
+def test_a_baseline_explores(graph):
+    robot = Robot(graph)
+    robot.refuses_to_drive()
+    graph.start('explorer', laser_pose='0,0,0', use_sim_time=True, strategy='nearest_frontier')
+    assert robot.explores() == (ExplorationStatus.NOTHING_REACHABLE, GoalStatus.STATUS_SUCCEEDED)
+    robot.knows(60)
+    assert robot.explores() == (ExplorationStatus.ALL_RESOLVED, GoalStatus.STATUS_SUCCEEDED)
+    assert graph.stop('explorer') == 0, graph.log('explorer')
+
+
+@pytest.mark.parametrize('name', ['nearest', 'nowhere:strategy', 'math:pi'])
+def test_a_strategy_that_there_is_not_ends_the_start_with_a_line(ros_domain, name):
+    command = [sys.executable, '-m', 'thinmap_ros.nodes.explorer', '--ros-args']
+    done = subprocess.run(
+        [*command, '-p', f"strategy:='{name}'"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    assert 'Traceback' not in done.stderr
+    line = done.stderr.splitlines()[-1]
+    assert line.startswith(f'error: strategy = {name!r}: ')
+    assert line.endswith('or package.module:factory')
+
+
+def test_a_return_begins_when_there_is_a_navigator_at_last(graph, robot):
+    client = ActionClient(graph.node, Explore, 'explore')
+    accepted = graph.send_goal(client, Explore.Goal(area_limit_m2=1.0, return_home=True))
+    status = graph.heard('exploration_status', ExplorationStatus, qos.LATCHED)
+    graph.until(
+        lambda: status and status[-1].state == ExplorationStatus.RETURNING, 'the robot returns'
+    )
+    robot.refuses_to_drive()
+    ended = accepted.get_result_async()
+    graph.until(ended.done, 'the end')
+    assert ended.result().result.status.reason_code == ExplorationStatus.BUDGET
+    assert ended.result().result.status.reason.endswith('; not home: the wheels are chained')

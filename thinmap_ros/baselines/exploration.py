@@ -14,7 +14,12 @@ from numpy.typing import NDArray
 
 from thinmap_ros.baselines.frontier_map import Frontier, FrontierMap
 from thinmap_ros.core import se2
-from thinmap_ros.core.exploration.strategy import Decision, EndNode, FinishCode
+from thinmap_ros.core.exploration.strategy import (
+    FIRST_FRONTIER_ID,
+    Decision,
+    EndNode,
+    FinishCode,
+)
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import axis_setup
 from thinmap_ros.core.jit import kernel
@@ -104,7 +109,7 @@ class FrontierExplorer(ABC):
             topology, self.target, self._number, self._nothing_left >= _LOOKS, bool(self._failures)
         )
 
-    def fail_target(self, reason: str) -> None:
+    def target_failed(self, reason: str) -> None:
         """Remember where a target could not be reached."""
         if self.target is not None:
             self._failures.append((float(self.target.place[0]), float(self.target.place[1])))
@@ -192,7 +197,7 @@ class ExploreLite(FrontierExplorer):
         decision = super().step(topology, patch, scan, T_map_base)
         target = self.target
         if target is not None and self._patience.is_over(target.place, target.way_m, scan.stamp_ns):
-            self.fail_target('no progress')
+            self.target_failed('no progress')
         return decision
 
     def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
@@ -284,13 +289,13 @@ class VisitAllEndNodes(NearestFrontier):
             self._end_node = goal
         decision = _decision(topology, self._end_node, self._number, False, False)
         if self._patience.is_over(goal[:2], way_m, scan.stamp_ns):
-            self.fail_target('no progress')
+            self.target_failed('no progress')
         return decision
 
-    def fail_target(self, reason: str) -> None:
+    def target_failed(self, reason: str) -> None:
         """An end node that cannot be reached counts as visited."""
         if self._end_node is None:
-            super().fail_target(reason)
+            super().target_failed(reason)
         else:
             self._visited.append((float(self._end_node[0]), float(self._end_node[1])))
             self._end_node = None
@@ -351,7 +356,7 @@ def _decision(
         if node.kind == NodeKind.END
     ]
     goal = target.goal if isinstance(target, Frontier) else target
-    chosen = None if goal is None else _end_node(-number, goal, True)
+    chosen = None if goal is None else _end_node(FIRST_FRONTIER_ID + number, goal, True)
     code = FinishCode.NONE
     reason = 'something is left'
     if finished:

@@ -12,7 +12,7 @@ import numpy as np
 
 from thinmap_ros.closed_loop import Ending
 from thinmap_ros.core.exploration.position_probability import NEAR_M
-from thinmap_ros.core.exploration.strategy import FIRST_STAND_IN_ID
+from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID
 from thinmap_ros.core.se2 import Array
 
 MILESTONES = (0.90, 0.95, 0.98, 0.99)
@@ -61,7 +61,7 @@ class EndNodeCensus:
 
         Nearer than 0.5 m is a visit (equation (2)).
         """
-        nodes = {node_id: (x, y) for node_id, x, y in end_nodes if node_id < FIRST_STAND_IN_ID}
+        nodes = {node_id: (x, y) for node_id, x, y in end_nodes if node_id < FIRST_FRONTIER_ID}
         alive = {place.node_id: place for place in self._places if place.node_id in nodes}
         idle = [place for place in self._places if place.node_id not in nodes]
         for node_id, (x, y) in nodes.items():

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from thinmap_ros.closed_loop import ClosedLoop, Options, make_loop, nothing_to_show
+from thinmap_ros.closed_loop import ClosedLoop, Options, make_loop, no_progress
 from thinmap_ros.core.exploration.strategy import Decision
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.exploration_metrics import EndNodeCensus, TargetLog, exploration_report
@@ -21,7 +21,7 @@ def explore(
     world: World,
     start: Array,
     options: Options,
-    show: Callable[[float, float], None] = nothing_to_show,
+    show: Callable[[float, float], None] = no_progress,
 ) -> tuple[ClosedLoop, dict[str, Any]]:
     """Explore a world from a start (3,); returns the finished loop and the report."""
     census = EndNodeCensus()

@@ -66,7 +66,7 @@ class Kidnapping:
         """Whether the robot looks for where it is."""
         return self._finder is not None
 
-    def takes(self, loop: ClosedLoop, scan: Scan, T_odom_base: Array) -> bool:
+    def intercepts(self, loop: ClosedLoop, scan: Scan, T_odom_base: Array) -> bool:
         """Whether a scan, of before the robot was carried or of a lost one, is not for the loop."""
         if self._carried_s is None and scan.stamp_ns >= 1e9 * self._at_s:
             self._carry(loop, scan.stamp_ns / 1e9)
@@ -76,7 +76,7 @@ class Kidnapping:
         self._search(loop, self._finder, scan, T_odom_base)
         return True
 
-    def hear(self, loop: ClosedLoop, scan: Scan, estimate: Estimate) -> None:
+    def add_estimate(self, loop: ClosedLoop, scan: Scan, estimate: Estimate) -> None:
         """Begin to search once the robot is lost."""
         if (
             estimate.lost
@@ -89,7 +89,7 @@ class Kidnapping:
                 loop.pipeline.grid.patch(), loop.pipeline.topology.map, seed=self._seed
             )
             self._own = loop.pipeline, loop.strategy, loop.navigator
-            loop.drive_by(Pipeline(), NearestFrontier(), Navigator(loop.navigator.config))
+            loop.replace_strategy(Pipeline(), NearestFrontier(), Navigator(loop.navigator.config))
 
     def _carry(self, loop: ClosedLoop, seconds: float) -> None:
         """Put the robot on some place that it has mapped, far from where it is."""
@@ -118,7 +118,7 @@ class Kidnapping:
         T_world_base = loop.simulation.robot.T_world_base
         estimate = self._own[0].step(scan, T_odom_base).estimate
         self._way_m += float(np.hypot(*(T_world_base - loop.log.true_poses[-1])[:2]))
-        loop.note(scan, estimate)
+        loop.log_poses(scan, estimate)
         found = finder.step(scan, T_odom_base).pose
         if found is not None:
             localizer.set_pose(found.T_map_base, found.covariance)
@@ -126,6 +126,6 @@ class Kidnapping:
             self._found_s = scan.stamp_ns / 1e9
             self._off = se2.between(T_world_base, localizer.pose)
             self._finder = None
-            loop.drive_by(*self._own)
+            loop.replace_strategy(*self._own)
         else:
             loop.decide(scan, loop.pipeline.step(scan, T_odom_base).estimate)

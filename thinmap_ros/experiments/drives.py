@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from thinmap_ros.closed_loop import Options, make_loop, nothing_to_show
+from thinmap_ros.closed_loop import Options, make_loop, no_progress
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.strategy import Decision, Strategy
@@ -102,8 +102,8 @@ class _Watched:
         )
         return self._strategy.step(topology, patch, scan, T_map_base)
 
-    def fail_target(self, reason: str) -> None:
-        self._strategy.fail_target(reason)
+    def target_failed(self, reason: str) -> None:
+        self._strategy.target_failed(reason)
 
 
 def _exploration(recipe: Recipe, seed: int) -> Iterator[Look]:
@@ -114,7 +114,7 @@ def _exploration(recipe: Recipe, seed: int) -> Iterator[Look]:
     watched = _Watched(loop.strategy, loop.simulation)
     loop.strategy = watched
     goal = coverable(world, world.start, PRESETS[recipe.robot].radius_m, Lms200Config().range_max_m)
-    loop.run(goal, _EXPLORE_LIMIT_S, nothing_to_show)
+    loop.run(goal, _EXPLORE_LIMIT_S, no_progress)
     return iter(watched.looks)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from thinmap_ros.closed_loop import STRATEGIES, Options
+from thinmap_ros.closed_loop import Options
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
@@ -27,6 +27,7 @@ from thinmap_ros.files import package_data
 from thinmap_ros.files.atomic import read_text, write_text
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.world import World
+from thinmap_ros.strategies import NAMES
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.explore_world import WORLD_HELP, add_options, options_from
 from thinmap_ros.view import figures
@@ -109,9 +110,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog='compare_exploration', description=__doc__)
     parser.add_argument('worlds', nargs='+', help=WORLD_HELP)
     parser.add_argument('-o', '--out', type=Path, required=True, help='folder for the results')
-    parser.add_argument(
-        '--strategies', nargs='+', default=sorted(STRATEGIES), choices=sorted(STRATEGIES)
-    )
+    parser.add_argument('--strategies', nargs='+', default=sorted(NAMES), choices=sorted(NAMES))
     parser.add_argument(
         '--starts', type=int, default=3, help='how many of the starts in worlds.json (default 3)'
     )

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from thinmap_ros.closed_loop import STRATEGIES, ClosedLoop, Options
+from thinmap_ros.closed_loop import ClosedLoop, Options
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
@@ -20,6 +20,7 @@ from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.laser import Lms200Config
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
+from thinmap_ros.strategies import DEFAULT, NAMES
 from thinmap_ros.tools import cli
 from thinmap_ros.view import figures
 
@@ -123,7 +124,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog='explore_world', description=__doc__)
     parser.add_argument('world', help=WORLD_HELP)
     parser.add_argument('-o', '--out', type=Path, required=True, help='folder for the results')
-    parser.add_argument('--strategy', default='position_probability', choices=sorted(STRATEGIES))
+    parser.add_argument('--strategy', default=DEFAULT, choices=sorted(NAMES))
     parser.add_argument('--start', help="X,Y,THETA in m, m, rad; without it the world's own")
     add_options(parser)
     cli.run(_work, parser)

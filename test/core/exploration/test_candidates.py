@@ -7,7 +7,7 @@ import pytest
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.candidates import SurveyConfig, Surveyor
-from thinmap_ros.core.exploration.strategy import FIRST_STAND_IN_ID
+from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
@@ -50,7 +50,7 @@ def corner():
 
 def test_a_border_at_the_end_of_the_range_is_looked_at_from_a_little_nearer():
     (candidate,) = surveyor_of(corridor()).survey(AT, 8.0)
-    assert candidate.track.node_id == FIRST_STAND_IN_ID
+    assert candidate.track.node_id == FIRST_FRONTIER_ID
     assert len(candidate.cells) == 38
     # What lies 2 m behind the border at 9 m is in range from 3.5 m on.
     assert candidate.goal[0] == pytest.approx(11.0 - 7.5, abs=0.5)
@@ -68,7 +68,7 @@ def test_where_a_far_look_showed_nothing_the_robot_goes_to_the_node_and_then_to_
     assert near.goal[:2].tolist() == [8.0, 2.0]
     surveyor.examined(near, near.goal)
     (last,) = surveyor.survey(AT, 8.0)
-    assert last.track.node_id >= FIRST_STAND_IN_ID
+    assert last.track.node_id >= FIRST_FRONTIER_ID
     assert last.goal[0] > 8.2
     surveyor.examined(last, last.goal)
     assert sum(len(c.cells) for c in surveyor.survey(AT, 8.0)) < len(last.cells)

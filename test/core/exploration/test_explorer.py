@@ -10,7 +10,7 @@ import pytest
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
-from thinmap_ros.core.exploration.strategy import FIRST_STAND_IN_ID, Decision, FinishCode
+from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID, Decision, FinishCode
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
@@ -69,7 +69,7 @@ class Run:
             self.navigator.cancel()
             self.goal = None
         elif self.fails(decision):
-            self.explorer.fail_target('no way')
+            self.explorer.target_failed('no way')
         elif self.goal is None or not np.array_equal(decision.target.goal, self.goal):
             self.goal = decision.target.goal
             self.navigator.set_goal(*map(float, self.goal))
@@ -84,7 +84,7 @@ class Run:
                 self.simulation.robot.T_world_base, self.grid.patch(), self.scan, 0.05
             )
             if command.state == 'failed':
-                self.explorer.fail_target(command.reason)
+                self.explorer.target_failed(command.reason)
             if command.state in ('reached', 'failed'):
                 self.goal = None
             moment = self.simulation.step(command.v, command.w)
@@ -117,10 +117,10 @@ def test_at_the_end_every_end_node_is_reliable_and_none_has_a_border():
     nodes = finished_run().last.end_nodes
     assert nodes
     assert (
-        min(node.probability for node in nodes if node.node_id < FIRST_STAND_IN_ID)
+        min(node.probability for node in nodes if node.node_id < FIRST_FRONTIER_ID)
         >= ExplorerConfig().threshold
     )
-    assert all(node.open_border_m == 0.0 for node in nodes)
+    assert all(node.frontier_length_m == 0.0 for node in nodes)
 
 
 def test_what_is_told_is_told_consistently():
@@ -136,7 +136,7 @@ def test_what_is_told_is_told_consistently():
 
 def test_some_end_nodes_are_never_visited():
     run = finished_run()
-    nodes = [node for node in run.last.end_nodes if node.node_id < FIRST_STAND_IN_ID]
+    nodes = [node for node in run.last.end_nodes if node.node_id < FIRST_FRONTIER_ID]
     poses = np.array(run.poses)
     nearest = [np.hypot(poses[:, 0] - node.x, poses[:, 1] - node.y).min() for node in nodes]
     assert max(nearest) > 0.5
@@ -169,7 +169,7 @@ def test_of_many_places_the_target_is_a_near_one_and_stays():
             TopologicalMap(), comb(), replace(scan, stamp_ns=k * 400_000_000), pose
         )
         goals.append(decision.target.goal[:2])
-    assert sum(node.open_border_m > 0.0 for node in decision.end_nodes) == 45
+    assert sum(node.frontier_length_m > 0.0 for node in decision.end_nodes) == 45
     assert math.dist(goals[0], (50.0, 2.0)) < 4.0
     assert max(math.dist(goal, goals[0]) for goal in goals) < 0.5
 
@@ -181,7 +181,7 @@ def test_the_first_target_is_the_one_that_the_robot_faces(theta):
     turns = {
         node.node_id: abs(se2.wrap(math.atan2(node.goal[1] - 1.0, node.goal[0] - 1.0) - theta))
         for node in first.end_nodes
-        if node.open_border_m > 0.0
+        if node.frontier_length_m > 0.0
     }
     assert turns[first.target.node_id] == min(turns.values())
 

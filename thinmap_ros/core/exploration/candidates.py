@@ -23,7 +23,7 @@ from thinmap_ros.core.config import parameter
 from thinmap_ros.core.exploration import end_node_tracker, frontiers
 from thinmap_ros.core.exploration.end_node_tracker import EndNodeTracker, Track, TrackerConfig
 from thinmap_ros.core.exploration.frontiers import NOTHING, OpenBorders
-from thinmap_ros.core.exploration.strategy import FIRST_STAND_IN_ID, EndNode
+from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID, EndNode
 from thinmap_ros.core.exploration.stretches import middle_one, without_scraps
 from thinmap_ros.core.exploration.viewpoints import SQUARE
 from thinmap_ros.core.planning.grid_search import coarse, field_from, fine
@@ -54,7 +54,7 @@ FIELDS = {
     # id, x, y of end nodes that were visited without success
     'visited': Field(np.float64, ('v', 3), (1, -FAR_M, -FAR_M), (LARGEST_ID, FAR_M, FAR_M)),
     'look_closer': Field(np.float64, ('c', 2), -FAR_M, FAR_M),
-    'next_stand_in': Field(np.int64, (), FIRST_STAND_IN_ID, LARGEST_ID),
+    'next_stand_in': Field(np.int64, (), FIRST_FRONTIER_ID, LARGEST_ID),
 }
 
 
@@ -100,7 +100,7 @@ class _Memory:
 
     visited: dict[int, Place] = field(default_factory=dict)
     look_closer: list[Place] = field(default_factory=list)
-    next_stand_in: int = FIRST_STAND_IN_ID
+    next_stand_in: int = FIRST_FRONTIER_ID
 
 
 class Surveyor:
@@ -153,8 +153,8 @@ class Surveyor:
         snapshot.require(bool((ids == np.floor(ids)).all()), 'exploration: visited', 'whole ids')
         next_id = int(own['next_stand_in'])
         stand_ins = parts['stand_ins']['ids']
-        given = bool(((stand_ins >= FIRST_STAND_IN_ID) & (stand_ins < next_id)).all())
-        expected = f'from {FIRST_STAND_IN_ID} to below {next_id}'
+        given = bool(((stand_ins >= FIRST_FRONTIER_ID) & (stand_ins < next_id)).all())
+        expected = f'from {FIRST_FRONTIER_ID} to below {next_id}'
         snapshot.require(given, 'exploration: ids of stand-ins', expected)
         tracker = EndNodeTracker.from_state(parts['nodes'], self.config)
         self.stand_ins = EndNodeTracker.from_state(parts['stand_ins'], self.config)
@@ -235,7 +235,7 @@ class Surveyor:
             and not self._is_to_be_looked_at_closer(middle)
         ):
             memory.look_closer.append(middle)
-        elif node_id >= FIRST_STAND_IN_ID:
+        elif node_id >= FIRST_FRONTIER_ID:
             self.borders.exhaust(candidate.cells, (float(T_map_base[0]), float(T_map_base[1])))
         else:
             memory.visited[node_id] = candidate.place
@@ -411,7 +411,7 @@ def end_node_of(
         angle_index=track.angle_index,
         smallest_distance_m=track.smallest_distance_m,
         angle_span_deg=track.angle_span_deg,
-        open_border_m=0.0 if candidate is None else len(candidate.cells) * resolution,
+        frontier_length_m=0.0 if candidate is None else len(candidate.cells) * resolution,
         is_target=target_goal is not None,
         goal=goal,
     )

@@ -32,7 +32,7 @@ from thinmap_ros.core.exploration.candidates import (
     end_node_of,
 )
 from thinmap_ros.core.exploration.field_of_view import box_of_scan, directions_of_view
-from thinmap_ros.core.exploration.strategy import Decision, verdict
+from thinmap_ros.core.exploration.strategy import Decision, finish_reason
 from thinmap_ros.core.exploration.tour import tours_by_first
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.graph_search import costs_to
@@ -188,7 +188,7 @@ class Explorer:
         target = self._choose(topology, worth, T_map_base)
         return self._decision(target, worth, candidates)
 
-    def fail_target(self, reason: str) -> None:
+    def target_failed(self, reason: str) -> None:
         """Hear that the present target could not be reached; it is put aside for a while."""
         target = self._memory.target
         track = None if target is None else self.surveyor.track(target)
@@ -374,7 +374,7 @@ class Explorer:
             i for i, candidate in worth.items() if self._failures.has(candidate.place)
         )
         finished = self._memory.nothing_left >= _LOOKS
-        code, reason = verdict(finished, unreachable, len(worth))
+        code, reason = finish_reason(finished, unreachable, len(worth))
         known = surveyor.borders.known_cells * resolution**2
         expected = sum(len(c.cells) for c in worth.values()) * resolution * self.config.behind_m
         chosen = next((e for e in end_nodes if e.is_target), None)

@@ -1,15 +1,33 @@
-"""What a mission is bound by: what it may use up, what it has used up, and the area to stay in."""
+"""Mission: explore an area within budgets, then return to the start if asked to.
 
-from dataclasses import dataclass
+A mission asks a strategy where to drive, and answers what the robot shall do next. It has no clock
+and no ROS: time is an argument, in s.
+"""
+
+import math
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from thinmap_ros.core import validation
+from thinmap_ros.core.exploration.observations import Observation
+from thinmap_ros.core.exploration.strategy import Decision, FinishCode, Strategy
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.se2 import Array, wrap
 
 _SMALLEST_STEP_M = 0.02
 _WALL = np.int8(100)
+_MIN_CORNERS = 3
+_SCAN_TIMEOUT_S = 60.0
+_LOST_TIMEOUT_S = 10.0
+_NAVIGATOR_TIMEOUT_S = 3.0
+_SAME_GOAL_M = 0.1
+_SAME_GOAL_RAD = 0.2
+_MAX_RETURN_FAILURES = 3
+_EXPLORED = (FinishCode.ALL_RESOLVED, FinishCode.NOTHING_REACHABLE)
 
 
 @dataclass(eq=False)
@@ -20,10 +38,11 @@ class Odometer:
     distance_m: float = 0.0
     _last: Array | None = None
 
-    def add(self, T_map_base: Array) -> None:
-        """Take a pose."""
+    def add_pose(self, T_map_base: Array) -> None:
+        """Add the present pose (3,)."""
         if self._last is None:
-            self.start = self._last = T_map_base
+            self.start = T_map_base
+            self._last = T_map_base
             return
         step = float(np.hypot(*(T_map_base[:2] - self._last[:2])))
         if step >= _SMALLEST_STEP_M:
@@ -39,7 +58,7 @@ class Budget:
     distance_m: float = 0.0
     area_m2: float = 0.0
 
-    def used_up(self, time_s: float, distance_m: float, area_m2: float) -> str:
+    def exhausted_by(self, time_s: float, distance_m: float, area_m2: float) -> str:
         """Which limit is reached, in words; empty as long as none is."""
         if 0.0 < self.time_s <= time_s:
             return f'time limit of {self.time_s:.0f} s'
@@ -48,6 +67,224 @@ class Budget:
         if 0.0 < self.area_m2 <= area_m2:
             return f'area limit of {self.area_m2:.1f} m^2'
         return ''
+
+
+@dataclass(frozen=True, eq=False)
+class MissionGoal:
+    """What a mission shall do.
+
+    area: corners (N, 2) of a polygon in the map frame, m; with fewer than three, everywhere.
+    Raises InputError where a limit or a corner is no number, or too large.
+    """
+
+    budget: Budget = field(default_factory=Budget)
+    area: Array = field(default_factory=lambda: np.empty((0, 2)))
+    return_to_start: bool = False
+
+    def __post_init__(self) -> None:
+        limits = (self.budget.time_s, self.budget.distance_m, self.budget.area_m2)
+        corners = self.area.reshape(-1).tolist()
+        validation.within('goal: limit or corner of the area', [*limits, *corners])
+
+    def masked(self, patch: GridPatch) -> GridPatch:
+        """Map in which all outside the area is wall."""
+        return patch if len(self.area) < _MIN_CORNERS else masked_outside(patch, self.area)
+
+
+class MissionState(IntEnum):
+    """Progress of a mission, as in thinmap_msgs/ExplorationStatus."""
+
+    IDLE = 0
+    EXPLORING = 1
+    RETURNING = 2
+    FINISHED = 3
+
+
+class DriveTo(NamedTuple):
+    """Order to drive to a pose (3,) in the map frame, unless the robot is already on its way."""
+
+    goal: Array
+
+
+class Finish(NamedTuple):
+    """Order to stop, with the reason why the mission ended."""
+
+    code: FinishCode
+    reason: str
+
+    @property
+    def is_success(self) -> bool:
+        """Whether the mission ended as planned."""
+        return self.code in (*_EXPLORED, FinishCode.BUDGET)
+
+
+Action = DriveTo | Finish | None
+"""What the robot shall do now; None: continue."""
+
+
+@dataclass
+class DriveRequest:
+    """Goal (3,) that the navigator was given, and when it last reported on it, s."""
+
+    goal: Array
+    last_feedback_s: float
+
+    def is_same(self, goal: Array) -> bool:
+        """Whether another goal (3,) is so near that it need not be sent."""
+        near = math.dist(goal[:2], self.goal[:2]) <= _SAME_GOAL_M
+        return near and abs(wrap(float(goal[2] - self.goal[2]))) <= _SAME_GOAL_RAD
+
+    def is_silent(self, now_s: float) -> bool:
+        """Whether the navigator does not report; it may have been restarted and lost the goal."""
+        return now_s - self.last_feedback_s >= _NAVIGATOR_TIMEOUT_S
+
+
+@dataclass
+class InputWatchdog:
+    """When the laser last showed anything and the pose was last tracked, s."""
+
+    last_scan_s: float = 0.0
+    last_tracking_s: float = 0.0
+    is_lost: bool = False
+
+    def restart(self, now_s: float) -> None:
+        """Start all timeouts."""
+        self.last_scan_s = now_s
+        self.last_tracking_s = now_s
+
+    def add_scan(self, now_s: float) -> None:
+        """Register a scan that is not blind."""
+        self.last_scan_s = now_s
+
+    def add_tracking(self, is_lost: bool, now_s: float) -> None:
+        """Register the localizer's state.
+
+        A silent localizer does not count as lost: restarted, it continues where it was.
+        """
+        if not (is_lost and self.is_lost):
+            self.last_tracking_s = now_s
+        self.is_lost = is_lost
+
+    def failure(self, now_s: float) -> Finish | None:
+        """Reason to give up: no scans, or no pose, for too long."""
+        if now_s - self.last_scan_s > _SCAN_TIMEOUT_S:
+            reason = f'no scan that shows anything for {_SCAN_TIMEOUT_S:.0f} s'
+            return Finish(FinishCode.SENSOR_SILENT, reason)
+        if self.is_lost and now_s - self.last_tracking_s > _LOST_TIMEOUT_S:
+            reason = f'the pose has been lost for {_LOST_TIMEOUT_S:.0f} s'
+            return Finish(FinishCode.LOCALIZATION_LOST, reason)
+        return None
+
+
+class Mission:
+    """One exploration from its start to its end.
+
+    decision: the strategy's last one; end: why exploring ended, code NONE before.
+    """
+
+    def __init__(
+        self,
+        goal: MissionGoal,
+        strategy: Strategy,
+        watchdog: InputWatchdog,
+        now_s: float,
+        state: MissionState = MissionState.EXPLORING,
+    ) -> None:
+        self.goal = goal
+        self.strategy = strategy
+        self.state = state
+        self.odometer = Odometer()
+        self.decision: Decision | None = None
+        self.end = Finish(FinishCode.NONE, '')
+        self._watchdog = watchdog
+        self._started_s = now_s
+        self._return_failures = 0
+        self._is_cancel_requested = False
+        watchdog.restart(now_s)
+
+    def elapsed_s(self, now_s: float) -> float:
+        """Time since the start."""
+        return now_s - self._started_s
+
+    def is_resumed_by(self, goal: MissionGoal) -> bool:
+        """Whether a next mission continues with the strategy of this one.
+
+        It does where this one was interrupted. In another area, other walls block the view.
+        """
+        return self.end.code not in _EXPLORED and np.array_equal(self.goal.area, goal.area)
+
+    def step(self, observation: Observation) -> Action:
+        """Process a scan that is in the map; the strategy decides while the mission explores."""
+        self.odometer.add_pose(observation.T_map_base)
+        if self.state != MissionState.EXPLORING:
+            return None
+        patch = self.goal.masked(observation.patch)
+        self.decision = self.strategy.step(
+            observation.topology, patch, observation.scan, observation.T_map_base
+        )
+        if self.decision.finished:
+            return self._finish_exploring(Finish(self.decision.code, self.decision.reason))
+        target = self.decision.target
+        return None if target is None else DriveTo(target.goal)
+
+    def check(self, now_s: float, is_driving: bool) -> Action:
+        """Check requests, inputs and budgets, about once a second.
+
+        is_driving: whether the navigator reports on the goal that it was given.
+        """
+        if self._is_cancel_requested:
+            return self.cancel('cancelled')
+        failure = self._watchdog.failure(now_s)
+        if failure is not None:
+            return self._finish(failure)
+        if self.state == MissionState.RETURNING:
+            return None if is_driving else self._drive_to_start()
+        known_area_m2 = 0.0 if self.decision is None else self.decision.known_area_m2
+        exhausted = self.goal.budget.exhausted_by(
+            self.elapsed_s(now_s), self.odometer.distance_m, known_area_m2
+        )
+        if exhausted and self.state == MissionState.EXPLORING:
+            return self._finish_exploring(Finish(FinishCode.BUDGET, exhausted))
+        return None
+
+    def drive_ended(self, success: bool, reason: str) -> Action:
+        """Process the navigator's result for the goal that it was given last."""
+        if self.state != MissionState.RETURNING:
+            if not success:
+                self.strategy.target_failed(reason)
+            return None
+        if success:
+            return self._finish(self.end)
+        self._return_failures += 1
+        if self._return_failures < _MAX_RETURN_FAILURES:
+            return self._drive_to_start()
+        return self._finish(self.end._replace(reason=f'{self.end.reason}; not home: {reason}'))
+
+    def request_cancel(self) -> None:
+        """Have the next check cancel the mission."""
+        self._is_cancel_requested = True
+
+    def cancel(self, reason: str) -> Finish:
+        """End the mission before it is done."""
+        return self._finish(Finish(FinishCode.CANCELLED, reason))
+
+    def _finish_exploring(self, end: Finish) -> Action:
+        """Return to the start if that was asked for, else finish."""
+        self.end = end
+        action = self._drive_to_start()
+        if not self.goal.return_to_start or action is None:
+            return self._finish(end)
+        self.state = MissionState.RETURNING
+        return action
+
+    def _drive_to_start(self) -> DriveTo | None:
+        start = self.odometer.start
+        return None if start is None else DriveTo(start)
+
+    def _finish(self, end: Finish) -> Finish:
+        self.end = end
+        self.state = MissionState.FINISHED
+        return end
 
 
 def inside(points: Array, polygon: Array) -> NDArray[np.bool_]:
@@ -62,11 +299,8 @@ def inside(points: Array, polygon: Array) -> NDArray[np.bool_]:
     return result
 
 
-def fenced(patch: GridPatch, polygon: Array) -> GridPatch:
-    """The map as it is to somebody who must not leave a polygon (M, 2), m.
-
-    All cells outside are walls.
-    """
+def masked_outside(patch: GridPatch, polygon: Array) -> GridPatch:
+    """Map with all cells outside a polygon (M, 2) as walls; polygon in the map frame, m."""
     centres = patch.frame.centres_of(np.argwhere(np.ones(patch.shape, dtype=np.bool_)))
     within = inside(centres, polygon).reshape(patch.shape)
     return GridPatch(patch.frame, np.where(within, patch.cells, _WALL).astype(np.int8))

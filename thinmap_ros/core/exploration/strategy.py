@@ -1,31 +1,39 @@
-"""What decides where to go, and what it answers to a scan."""
+"""Exploration strategy: chooses where the robot drives next, from graph, map and scan."""
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
 
-# Ids from here on are those of what stands in for borders that no end node sees.
-FIRST_STAND_IN_ID = 2_000_000_000
+# Ids from here on are those of frontier candidates that no end node sees.
+FIRST_FRONTIER_ID = 2_000_000_000
 
 
 class FinishCode(IntEnum):
-    """Why an exploration ended, as in thinmap_msgs/ExplorationStatus."""
+    """Why an exploration ended, as in thinmap_msgs/ExplorationStatus.
+
+    A strategy ends it with ALL_RESOLVED or NOTHING_REACHABLE, a mission with any of the others.
+    """
 
     NONE = 0
     ALL_RESOLVED = 1
+    BUDGET = 2
+    CANCELLED = 3
     NOTHING_REACHABLE = 4
+    LOCALIZATION_LOST = 5
+    SENSOR_SILENT = 6
 
 
 class EndNode(NamedTuple):
-    """An end node as it stands: place x, y in m (map frame), probability and what it comes from.
+    """An end node at x, y in m (map frame), with its position probability and what it comes from.
 
-    goal: pose (3,) from which to look at it; open_border_m: length of the border to the unknown
-    that belongs to it.
+    node_id: id in the topological map, or from FIRST_FRONTIER_ID on, below 2^32; goal: pose (3,)
+    from which to observe it; frontier_length_m: length of the frontier that is
+    assigned to it.
     """
 
     node_id: int
@@ -36,18 +44,18 @@ class EndNode(NamedTuple):
     angle_index: float
     smallest_distance_m: float
     angle_span_deg: float
-    open_border_m: float
+    frontier_length_m: float
     is_target: bool
     goal: Array
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What to do now: drive to target.goal, or nothing more.
+    """What to do next: drive to target.goal, stay, or finish.
 
-    reason: words for the end, or for what is going on; unreachable: ids put aside because they
-    could not be reached; coverage_estimate: known free area over that and the area expected behind
-    open borders, 0 to 1.
+    reason: words for the end, or for the progress; unreachable: ids of end nodes that are ignored
+    for now because they could not be reached; coverage_estimate: known free area over that and the
+    area expected behind frontiers, 0 to 1.
     """
 
     target: EndNode | None
@@ -60,20 +68,21 @@ class Decision:
     known_area_m2: float
 
 
+@runtime_checkable
 class Strategy(Protocol):
-    """What decides where to go: ours, and everything that it is compared with."""
+    """An exploration strategy: the project's own, or any that is compared with it."""
 
     def step(
         self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
     ) -> Decision:
-        """Say where to go, from the graph, the whole map and a scan made at a pose (3,)."""
+        """Choose where to drive, from the graph, the whole map and a scan made at a pose (3,)."""
 
-    def fail_target(self, reason: str) -> None:
-        """Hear that the present target could not be reached."""
+    def target_failed(self, reason: str) -> None:
+        """Process that the present target could not be reached."""
 
 
-def verdict(finished: bool, unreachable: list[int], left: int) -> tuple[FinishCode, str]:
-    """Code and words for the state of an exploration with so many end nodes left."""
+def finish_reason(finished: bool, unreachable: list[int], left: int) -> tuple[FinishCode, str]:
+    """Code and words for the state of an exploration with a number of end nodes left."""
     if not finished:
         return FinishCode.NONE, f'{left} end nodes left'
     if not unreachable:

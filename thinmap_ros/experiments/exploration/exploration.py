@@ -7,7 +7,7 @@ import numpy as np
 from thinmap_ros.closed_loop import SCANS_PER_GRAPH
 from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.exploration.explorer import Explorer
-from thinmap_ros.core.exploration.strategy import FIRST_STAND_IN_ID, Decision
+from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID, Decision
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
@@ -136,17 +136,17 @@ def _rows(moments: list[_Moment]) -> Rows:
             n.probability,
             n.distance_index,
             n.angle_index,
-            n.open_border_m,
+            n.frontier_length_m,
             n.is_target,
         ]
         for m in moments
         for n in m.decision.end_nodes
-        if n.node_id < FIRST_STAND_IN_ID
+        if n.node_id < FIRST_FRONTIER_ID
     ]
 
 
 def _panel(moment: _Moment, path: Array) -> Panel:
-    nodes = [n for n in moment.decision.end_nodes if n.node_id < FIRST_STAND_IN_ID]
+    nodes = [n for n in moment.decision.end_nodes if n.node_id < FIRST_FRONTIER_ID]
     words = [f'{n.node_id}({n.probability:.2f})' for n in nodes]
     at = np.array([[n.x, n.y] for n in nodes]).reshape(-1, 2)
     target = moment.decision.target

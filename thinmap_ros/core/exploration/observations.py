@@ -1,0 +1,70 @@
+"""Scans with their poses, once the map contains them: what a strategy decides from."""
+
+from typing import NamedTuple
+
+from thinmap_ros.core.grid.map_mirror import MapMirror
+from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.core.scan import Scan
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.stamp_matcher import StampMatcher
+from thinmap_ros.core.topology.graph import TopologicalMap
+
+
+class Observation(NamedTuple):
+    """A scan made at a pose (3,) in the map frame, with the graph and the whole map of then."""
+
+    topology: TopologicalMap
+    patch: GridPatch
+    scan: Scan
+    T_map_base: Array
+
+
+class ObservationBuffer:
+    """Combines map, graph, scans and poses, which arrive in any order.
+
+    A scan is complete with the pose of its stamp. Where local maps are published, it also waits for
+    the local map of its stamp: evaluated against an older map, a scan shows nothing new.
+    """
+
+    def __init__(self, topology: TopologicalMap) -> None:
+        self.topology = topology
+        self._map = MapMirror()
+        self._has_local_map = False
+        self._pose_matcher: StampMatcher[Scan, Array] = StampMatcher()
+        self._mapped_scan_matcher: StampMatcher[tuple[Scan, Array], bool] = StampMatcher()
+
+    def replace_map(self, patch: GridPatch) -> None:
+        """Take a whole map in place of the present one."""
+        self._map.replace(patch)
+
+    def add_local_map(self, stamp_ns: int, patch: GridPatch) -> Observation | None:
+        """Add the local map of a stamp; returns the observation if it is complete now.
+
+        Raises InputError where the local map does not fit the map.
+        """
+        self._map.paste(patch)
+        self._has_local_map = True
+        match = self._mapped_scan_matcher.right(stamp_ns, True)
+        return None if match is None else self._observation(match[0])
+
+    def add_pose(self, stamp_ns: int, T_map_base: Array) -> Observation | None:
+        """Add the pose (3,) of a stamp; returns the observation if it is complete now."""
+        return self._add_pair(self._pose_matcher.right(stamp_ns, T_map_base))
+
+    def add_scan(self, scan: Scan) -> Observation | None:
+        """Add a scan; returns the observation if it is complete now."""
+        return self._add_pair(self._pose_matcher.left(scan.stamp_ns, scan))
+
+    def _add_pair(self, pair: tuple[Scan, Array] | None) -> Observation | None:
+        if pair is None:
+            return None
+        if not self._has_local_map:
+            return self._observation(pair)
+        match = self._mapped_scan_matcher.left(pair[0].stamp_ns, pair)
+        return None if match is None else self._observation(match[0])
+
+    def _observation(self, pair: tuple[Scan, Array]) -> Observation | None:
+        """Observation of a scan and its pose; None as long as there is no map."""
+        if self._map.patch is None:
+            return None
+        return Observation(self.topology, self._map.patch, *pair)

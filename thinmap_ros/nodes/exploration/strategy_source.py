@@ -1,0 +1,67 @@
+"""Strategies of the node explorer: by its parameters, from a session, or of the last mission."""
+
+from rclpy.node import Node
+
+from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
+from thinmap_ros.core.exploration.mission import Mission, MissionGoal
+from thinmap_ros.core.exploration.strategy import Strategy
+from thinmap_ros.files import sessions
+from thinmap_ros.ros import parameters
+from thinmap_ros.strategies import DEFAULT, NAMES, make_strategy
+
+
+class StrategySource:
+    """Makes the strategy that the node's parameters describe.
+
+    A config that is changed at run time holds from the next mission on.
+    """
+
+    def __init__(self, node: Node) -> None:
+        """Declare the parameters. Raises ConfigError where one is wrong."""
+        self._name = str(
+            parameters.declare_value(
+                node,
+                'strategy',
+                DEFAULT,
+                f'exploration strategy: {", ".join(NAMES)}, or your own as package.module:factory, '
+                'where factory() returns a Strategy; parameters of end nodes and frontiers hold '
+                'for position_probability and paper only',
+            )
+        )
+        self._config = parameters.declare(node, ExplorerConfig, self._on_config)
+        self._is_outdated = False
+
+    def initial(self, session: str) -> Strategy:
+        """Strategy to start with: of the session STEM where that has one, else new.
+
+        Raises InputError where the session is broken.
+        """
+        self._is_outdated = False
+        restored = None
+        if session and self._name == DEFAULT:
+            restored = sessions.load_exploration(session, self._config)
+        return restored or self._new()
+
+    def next(self, last: Mission, goal: MissionGoal) -> Strategy:
+        """Strategy for a goal: of the last mission where that was interrupted, else new."""
+        if self._is_outdated or not last.is_resumed_by(goal):
+            return self._new()
+        return last.strategy
+
+    def save(self, path: str, strategy: Strategy) -> str:
+        """Save what a strategy has learned, if it can be saved; returns what was done.
+
+        Raises OSError where writing fails.
+        """
+        if isinstance(strategy, Explorer):
+            return f'saved {sessions.save_exploration(path, strategy)}'
+        aside = sessions.set_exploration_aside(path)
+        return f'strategy {self._name} has nothing to save{aside}'
+
+    def _new(self) -> Strategy:
+        self._is_outdated = False
+        return make_strategy(self._name, self._config)
+
+    def _on_config(self, config: ExplorerConfig) -> None:
+        self._config = config
+        self._is_outdated = True
