@@ -23,7 +23,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
+from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.sim.coverage import Coverable
 from thinmap_ros.sim.laser import Lms200Config
@@ -250,7 +250,7 @@ def make_loop(
     """All parts as the options want them; what befalls the robot, and who watches, are given."""
     simulation = Simulation(world, start, PRESETS[options.robot], options.laser, options.seed)
     x, y, theta = (float(number) for number in start)
-    localizer = ScanLocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=theta)
+    localizer = LocalizerConfig(initial_x_m=x, initial_y_m=y, initial_yaw_rad=theta)
     source = true_pose_source(simulation) if options.localization == 'truth' else None
     # A beam that met nothing has seen as far as this laser can.
     grid = OccupancyConfig(no_return_range_m=options.laser.range_max_m)

@@ -174,7 +174,7 @@ def test_presets_fit_together():
             content[f'/**/{name}']['ros__parameters']
             for name in ('sim', 'grid_mapper', 'localizer')
         )
-        assert localizer['match_range_m'] <= sim['range_max_m']
+        assert localizer['matching.max_range_m'] <= sim['range_max_m']
         assert grid['usable_range_m'] <= sim['range_max_m']
         reach_m = max(grid['no_return_range_m'], min(grid['usable_range_m'], 4.0))
         assert grid['window_m'] >= 2.0 * reach_m

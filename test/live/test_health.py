@@ -16,7 +16,7 @@ from thinmap_msgs.msg import TopologicalMap
 from thinmap_ros.ros import diagnostics, qos
 
 pytestmark = pytest.mark.live
-AT_START = {'start_x_m': 2.0, 'start_y_m': 2.0, 'start_yaw_rad': 0.0}
+AT_START = {'initial_x_m': 2.0, 'initial_y_m': 2.0, 'initial_yaw_rad': 0.0}
 START = '2.0,2.0,0.0'
 MAPPING = ('localizer', 'grid_mapper', 'topology_builder')
 

@@ -20,7 +20,7 @@ from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live
 START = '2.0,2.0,0.0'
-AT_START = {'start_x_m': 2.0, 'start_y_m': 2.0, 'start_yaw_rad': 0.0}
+AT_START = {'initial_x_m': 2.0, 'initial_y_m': 2.0, 'initial_yaw_rad': 0.0}
 SCAN_PERIOD_NS = 200_000_000
 
 

@@ -36,7 +36,7 @@ def test_one_process_locates_maps_and_drives(graph):
     graphs = graph.heard('topology', TopologicalMap, qos.LATCHED)
     truth = graph.heard('ground_truth', PoseStamped)
     health = graph.heard('/diagnostics', DiagnosticArray)
-    start = {'start_x_m': 2.0, 'start_y_m': 2.0, 'use_sim_time': True}
+    start = {'initial_x_m': 2.0, 'initial_y_m': 2.0, 'use_sim_time': True}
     process = graph.start('thinmap', **start)
     # Paced: else the result could be heard before the true poses of the way.
     graph.start(
@@ -88,9 +88,9 @@ def start_robot(graph, name, start, seed):
         start=start,
         seed=seed,
         use_sim_time=True,
-        start_x_m=float(x),
-        start_y_m=float(y),
-        start_yaw_rad=0.0,
+        initial_x_m=float(x),
+        initial_y_m=float(y),
+        initial_yaw_rad=0.0,
         hold_for_subscribers=2,
         rate=2.0,
         arguments=('sim', 'localizer', 'grid_mapper', 'topology_builder'),

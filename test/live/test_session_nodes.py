@@ -43,7 +43,7 @@ def drive(graph, x, y, yaw, metres):
     Then the robot alone is stopped.
     """
     truth = graph.heard('ground_truth', PoseStamped)
-    graph.start('localizer', use_sim_time=True, start_x_m=x, start_y_m=y, start_yaw_rad=yaw)
+    graph.start('localizer', use_sim_time=True, initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
     graph.start(
         'sim',
         remap=graph.paced(),

@@ -1,9 +1,13 @@
-"""One home for each default: frozen dataclasses whose fields carry description and range."""
+"""One home for each default: frozen dataclasses whose fields carry description and range.
+
+A configuration is composed of others (`part`). Seen from ROS and the command line it is flat:
+parameters of a part have its name before theirs, `matching.noise_m`.
+"""
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, TypeVar
 
 from thinmap_ros.core.errors import ConfigError, shown
 
@@ -24,6 +28,11 @@ def parameter(
     return dataclasses.field(default=default, metadata=metadata)
 
 
+def part(config: type['Config']) -> Any:
+    """Declare a field of a Config that is itself a Config, with its defaults."""
+    return dataclasses.field(default_factory=config)
+
+
 @dataclasses.dataclass(frozen=True)
 class Config:
     """Base of every configuration: values are checked once, on construction.
@@ -35,6 +44,47 @@ class Config:
         for field in dataclasses.fields(self):
             if 'description' in field.metadata:
                 _check(field, getattr(self, field.name))
+
+
+AnyConfig = TypeVar('AnyConfig', bound=Config)
+
+
+def parameters_of(config: Config) -> Iterator[tuple[str, 'dataclasses.Field[Any]', Any]]:
+    """Full name, field and value of each parameter of a configuration and its parts."""
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if isinstance(value, Config):
+            for name, inner, own in parameters_of(value):
+                yield f'{field.name}.{name}', inner, own
+        else:
+            yield field.name, field, value
+
+
+def with_values(config: AnyConfig, values: Mapping[str, Any]) -> AnyConfig:
+    """Return a configuration with other values of some parameters, by their full names.
+
+    Raises ConfigError for a parameter that it does not have, or a value that is not allowed.
+    """
+    own: dict[str, Any] = {}
+    inner: dict[str, dict[str, Any]] = {}
+    for name, value in values.items():
+        first, _, rest = name.partition('.')
+        if rest:
+            inner.setdefault(first, {})[rest] = value
+        else:
+            own[first] = value
+    names = {field.name for field in dataclasses.fields(config)}
+    for name in [*own, *inner]:
+        is_part = name in names and isinstance(getattr(config, name), Config)
+        if name not in names or is_part != (name in inner):
+            known = ', '.join(known for known, _, _ in parameters_of(config))
+            raise ConfigError(f'no parameter {name}: expected one of {known}')
+    for name, given in inner.items():
+        try:
+            own[name] = with_values(getattr(config, name), given)
+        except ConfigError as error:
+            raise ConfigError(f'{name}.{error}') from error
+    return dataclasses.replace(config, **own)
 
 
 def _check(field: 'dataclasses.Field[Any]', value: Any) -> None:

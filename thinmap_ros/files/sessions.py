@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core.errors import InputError, reason_of, shown
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
-from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
+from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.core.slam.localizers import AnyLocalizer, localizer_class
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
 from thinmap_ros.files.atomic import written_aside
@@ -138,7 +138,7 @@ def save_features(path: str, localizer: AnyLocalizer) -> str:
     return str(file)
 
 
-def load_features(path: str, config: ScanLocalizerConfig | None = None) -> AnyLocalizer | None:
+def load_features(path: str, config: LocalizerConfig | None = None) -> AnyLocalizer | None:
     """Read STEM.features.npz; None where the session has none.
 
     Raises InputError where it is broken.
@@ -147,7 +147,7 @@ def load_features(path: str, config: ScanLocalizerConfig | None = None) -> AnyLo
     if not _is_there(file):
         return None
     try:
-        kind = localizer_class(config or ScanLocalizerConfig())
+        kind = localizer_class(config or LocalizerConfig())
         return kind.from_state(_read(file, _FEATURES), config)
     except InputError as error:
         raise InputError(f'{file}: {error}') from error

@@ -46,7 +46,10 @@ class GridMapperNode(LiveNode):
         self._config = parameters.declare(self, OccupancyConfig)
         self._window_m = parameters.declare(self, WindowConfig).window_m
         self._mapping = parameters.declare_value(
-            self, 'mapping', True, 'draw what is seen; false: the map stays'
+            self,
+            'update_map',
+            True,
+            'true: mapping. false: the map is published and does not change.',
         )
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
         self._mount = LaserMount(self)

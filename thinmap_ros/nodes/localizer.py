@@ -23,7 +23,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import LastPose, ScanPairing
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
+from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.core.slam.localizers import (
     AnyLocalizer,
     line_features,
@@ -61,7 +61,7 @@ class LocalizerNode(LiveNode):
 
     def __init__(self) -> None:
         super().__init__('localizer', recovers=True)
-        self._config = parameters.declare(self, ScanLocalizerConfig)
+        self._config = parameters.declare(self, LocalizerConfig)
         self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
         self._odom_frame = parameters.declare_value(
             self, 'odom_frame', 'odom', 'frame of the odometry'
@@ -112,15 +112,15 @@ class LocalizerNode(LiveNode):
         self._resumed = LastPose.from_state(left)
         self._listen_for_the_map()
 
-    def _made(self, config: ScanLocalizerConfig) -> AnyLocalizer:
+    def _made(self, config: LocalizerConfig) -> AnyLocalizer:
         """A localizer that begins at its start, in the map of the session if there is one."""
         loaded = sessions.load_features(self._session, config) if self._session else None
         return loaded or localizer_class(config)(config)
 
-    def _at(self, T_map_base: Array) -> ScanLocalizerConfig:
+    def _at(self, T_map_base: Array) -> LocalizerConfig:
         """The configuration of a robot that starts at a pose (3,)."""
         x, y, yaw = T_map_base.tolist()
-        return replace(self._config, start_x_m=x, start_y_m=y, start_yaw_rad=yaw)
+        return replace(self._config, initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
 
     def _on_odometry(self, message: Odometry) -> None:
         stamp_ns = messages.stamp_ns(message.header.stamp)

@@ -18,7 +18,7 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from thinmap_ros.core.config import Config
+from thinmap_ros.core.config import Config, parameters_of, with_values
 from thinmap_ros.core.errors import ConfigError
 
 AnyConfig = TypeVar('AnyConfig', bound=Config)
@@ -37,19 +37,18 @@ def declare(
     with its reason.
     Raises ConfigError where a value is outside its range or of the wrong type.
     """
-    names = {field.name for field in dataclasses.fields(config)}
+    declared = list(parameters_of(config()))
+    names = {name for name, _, _ in declared}
     free = set() if changed is None else names if live is None else set(live)
     values = {}
-    for field in dataclasses.fields(config):
-        descriptor = _descriptor(field, read_only=field.name not in free)
+    for name, field, default in declared:
+        descriptor = _descriptor(field, read_only=name not in free)
         try:
-            values[field.name] = node.declare_parameter(field.name, field.default, descriptor).value
+            values[name] = node.declare_parameter(name, default, descriptor).value
         except Exception as error:
             # rclpy has a class of its own for each way in which a value can be wrong.
-            raise ConfigError(
-                f'parameter {field.name} of node {node.get_name()}: {error}'
-            ) from error
-    current = config(**values)
+            raise ConfigError(f'parameter {name} of node {node.get_name()}: {error}') from error
+    current = with_values(config(), values)
     if changed is not None:
         _Changes(node, current, free, changed)
     return current
@@ -72,7 +71,7 @@ class _Changes(Generic[AnyConfig]):
         values = {
             parameter.name: parameter.value for parameter in given if parameter.name in self._free
         }
-        return dataclasses.replace(self._current, **values)
+        return with_values(self._current, values)
 
     def _check(self, given: list[Parameter]) -> SetParametersResult:
         try:

@@ -14,7 +14,7 @@ START = se2.pose(2.0, 2.0, 0.0)
 
 
 def at_start(slam='ekf_ti', **options):
-    return EkfLocalizer(EkfConfig(slam=slam, start_x_m=2.0, start_y_m=2.0, **options))
+    return EkfLocalizer(EkfConfig(slam=slam, initial_x_m=2.0, initial_y_m=2.0, **options))
 
 
 def driven(localizer, steps):
@@ -66,7 +66,9 @@ def test_a_state_is_a_map_that_another_day_goes_on_in():
     localizer = at_start()
     driven(localizer, 600)
     state = localizer.state()
-    second = EkfLocalizer.from_state(state, EkfConfig(slam='ekf_ti', start_x_m=2.1, start_y_m=1.9))
+    second = EkfLocalizer.from_state(
+        state, EkfConfig(slam='ekf_ti', initial_x_m=2.1, initial_y_m=1.9)
+    )
     assert {f.id for f in second.features} == {f.id for f in localizer.features}
     errors, _ = driven(second, 100)
     assert np.hypot(*errors[-1, :2]) < 0.1
@@ -77,13 +79,13 @@ def test_a_state_is_a_map_that_another_day_goes_on_in():
 def test_without_mapping_no_feature_comes_grows_or_goes():
     localizer = at_start()
     driven(localizer, 600)
-    config = EkfConfig(slam='ekf_ti', start_x_m=2.0, start_y_m=2.0, mapping=False)
+    config = EkfConfig(slam='ekf_ti', initial_x_m=2.0, initial_y_m=2.0, update_map=False)
     second = EkfLocalizer.from_state(localizer.state(), config)
     before = lengths_of(second)
     errors, _ = driven(second, 100)
     assert lengths_of(second) == pytest.approx(before, abs=1e-9)
     assert np.hypot(*errors[-1, :2]) < 0.1
-    alone = at_start(mapping=False)
+    alone = at_start(update_map=False)
     driven(alone, 100)
     assert alone.features == []
 

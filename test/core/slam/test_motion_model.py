@@ -6,7 +6,7 @@ import pytest
 from thinmap_ros.core.slam.motion_model import MotionConfig, MotionModel
 
 CONFIG = MotionConfig()
-SLIP = np.array([CONFIG.odom_slip_m, CONFIG.odom_slip_m, CONFIG.odom_slip_rad])
+SLIP = np.array([CONFIG.noise_floor_m, CONFIG.noise_floor_m, CONFIG.noise_floor_rad])
 KNOWN = np.diag([1e8, 1e8, 1e8])  # a scan that measures the motion all but exactly
 CALIBRATED = np.zeros((3, 3))
 STEP = np.array([0.1, 0.0, 0.05])
@@ -14,8 +14,8 @@ STEP = np.array([0.1, 0.0, 0.05])
 
 def allowed(increment):
     """Variances (3,) of an odometry increment, as documented."""
-    sigma_m = CONFIG.odom_slip_m + CONFIG.odom_noise * np.hypot(*increment[:2])
-    sigma_rad = CONFIG.odom_slip_rad + CONFIG.odom_noise * abs(increment[2])
+    sigma_m = CONFIG.noise_floor_m + CONFIG.noise_ratio * np.hypot(*increment[:2])
+    sigma_rad = CONFIG.noise_floor_rad + CONFIG.noise_ratio * abs(increment[2])
     return np.square([sigma_m, sigma_m, sigma_rad])
 
 

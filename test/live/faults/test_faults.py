@@ -28,7 +28,7 @@ LOCKSTEP_S = 2.0
 # However long a start takes.
 RECOVER_S = 1000.0
 TICK_NS = 100_000_000
-AT_START = {'start_x_m': 2.0, 'start_y_m': 2.0, 'start_yaw_rad': 0.9}
+AT_START = {'initial_x_m': 2.0, 'initial_y_m': 2.0, 'initial_yaw_rad': 0.9}
 MAPPING = ('localizer', 'grid_mapper', 'topology_builder')
 
 
@@ -413,7 +413,7 @@ def test_a_silent_laser_stops_the_robot_and_it_goes_on(graph):
 def test_a_robot_that_stands_for_minutes_is_as_sure_of_its_pose_as_before(graph):
     """In 600 s the deviation had grown to 0.10 m and 0.06 rad."""
     poses = graph.heard('pose', PoseWithCovarianceStamped)
-    graph.start('localizer', laser_pose='0,0,0', start_x_m=2.0, start_y_m=2.0)
+    graph.start('localizer', laser_pose='0,0,0', initial_x_m=2.0, initial_y_m=2.0)
     scan = graph.node.create_publisher(LaserScan, 'scan', qos.STREAM)
     odometry = graph.node.create_publisher(Odometry, 'odom', qos.STREAM)
     rng = np.random.default_rng(5)

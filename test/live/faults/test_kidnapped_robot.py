@@ -75,7 +75,9 @@ def test_a_robot_finds_itself_in_a_saved_map_and_maps_on_also_when_it_is_carried
     x, y, yaw = START
     for name in NODES:
         start = (
-            {'start_x_m': x, 'start_y_m': y, 'start_yaw_rad': yaw} if name == 'localizer' else {}
+            {'initial_x_m': x, 'initial_y_m': y, 'initial_yaw_rad': yaw}
+            if name == 'localizer'
+            else {}
         )
         graph.start(name, use_sim_time=True, **start)
     start_sim(graph, START, 2)

@@ -30,11 +30,16 @@ class AssociationConfig(Config):
     """Parameters of data association."""
 
     gate: float = parameter(
-        5.99, 'largest squared Mahalanobis distance of a match (95 %, 2 dof)', low=0.1, high=50.0
+        5.99,
+        'Largest squared Mahalanobis distance between a line and a feature (2 degrees of freedom: '
+        '95 %). Raise it if features double, lower it if different walls are merged.',
+        low=0.1,
+        high=50.0,
     )
-    gap_m: float = parameter(
+    max_gap_m: float = parameter(
         3.0,
-        'seen part and feature may lie this far apart along the line, m: as at a door',
+        'Largest gap along the line between an observed segment and the feature that it extends '
+        '(m); at least the width of a door. Lower it if collinear walls of different rooms merge.',
         low=0.0,
         high=20.0,
     )
@@ -64,7 +69,7 @@ def associate(
     if not features:
         return Choice(chosen, passing > 1)
     ends_map = transform_points(ekf.pose, lines.ends.reshape(-1, 2)).reshape(-1, 2, 2)
-    pairs = np.argwhere(meeting(ekf.lines, features, ends_map, laser_map, config.gap_m))
+    pairs = np.argwhere(meeting(ekf.lines, features, ends_map, laser_map, config.max_gap_m))
     best = np.full(len(lines), np.inf)
     for k, index in pairs:
         expected, spread, _ = ekf.innovations(int(index))

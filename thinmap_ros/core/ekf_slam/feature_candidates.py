@@ -26,20 +26,20 @@ class Candidate:
     span: Feature
     z: Array
     covariance: Array
-    sightings: int
+    observations: int
     last_look: int
 
 
 class Candidates:
     """The lines that have been seen too seldom so far."""
 
-    def __init__(self, sightings: int, patience: int, gate: float, gap_m: float) -> None:
-        """sightings: after how many a line is ripe.
+    def __init__(self, min_observations: int, max_misses: int, gate: float, gap_m: float) -> None:
+        """min_observations: after so many a line is ripe.
 
-        Patience: looks without it after which it is dropped.
+        max_misses: observations without it after which it is dropped.
         """
-        self._sightings = sightings
-        self._patience = patience
+        self._min_observations = min_observations
+        self._max_misses = max_misses
         self._gate = gate
         self._gap_m = gap_m
         self._all: list[Candidate] = []
@@ -55,8 +55,8 @@ class Candidates:
             self._take(pose, z, covariance, transform_points(pose, ends), laser_map)
             for z, covariance, ends in zip(lines.z, lines.covariances, lines.ends, strict=True)
         ]
-        ripe = [c for c in dict.fromkeys(seen) if c.sightings >= self._sightings]
-        oldest = self._looks - self._patience
+        ripe = [c for c in dict.fromkeys(seen) if c.observations >= self._min_observations]
+        oldest = self._looks - self._max_misses
         self._all = [c for c in self._all if c.last_look >= oldest and c not in ripe]
         return ripe
 
@@ -74,7 +74,7 @@ class Candidates:
                 candidate.span.grow(*interval(candidate.line, ends_map))
                 candidate.z = z
                 candidate.covariance = covariance
-                candidate.sightings += candidate.last_look != self._looks
+                candidate.observations += candidate.last_look != self._looks
                 candidate.last_look = self._looks
                 return candidate
         span = Feature(0, *interval(line, ends_map), laser_map)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import snapshot
-from thinmap_ros.core.config import parameter
+from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.ekf_slam import local_area
 from thinmap_ros.core.ekf_slam.association import AssociationConfig, associate, mahalanobis, meeting
 from thinmap_ros.core.ekf_slam.ekf import EkfSlam
@@ -55,21 +55,43 @@ FIELDS = {
 
 
 @dataclass(frozen=True)
-class FeatureConfig(AssociationConfig):
+class FeatureConfig(Config):
     """Parameters of the upkeep of features."""
 
-    wall_sigma_m: float = parameter(
-        0.02, 'how far real walls are from straight lines, 1 sigma, m', low=0.0, high=1.0
+    wall_flatness_m: float = parameter(
+        0.02,
+        'Standard deviation of real walls about a straight line (m). Raise it for rough walls: too '
+        'low, and the filter becomes overconfident.',
+        low=0.0,
+        high=1.0,
     )
-    wall_sigma_rad: float = parameter(
-        0.006, 'how far real walls are from straight lines, rad', low=0.0, high=0.5
+    wall_flatness_rad: float = parameter(
+        0.006,
+        'Standard deviation of the direction of real walls (rad). Raise it for rough walls: too '
+        'low, and the filter becomes overconfident.',
+        low=0.0,
+        high=0.5,
     )
-    sightings: int = parameter(4, 'a line enters the map after so many sightings', low=1, high=100)
-    patience: int = parameter(
-        15, 'a candidate not seen for so many looks is dropped', low=1, high=10_000
+    min_observations: int = parameter(
+        4,
+        'Number of observations after which a line becomes a feature. Raise it against features '
+        'on moving objects, lower it to use new walls sooner.',
+        low=1,
+        high=100,
     )
-    misses: int = parameter(
-        5, 'a feature seen through by so many looks in a row leaves the map', low=1, high=1000
+    candidate_max_misses: int = parameter(
+        15,
+        'Number of observations without a match after which a feature candidate is dropped. Raise '
+        'it for walls that are often hidden.',
+        low=1,
+        high=10_000,
+    )
+    max_misses: int = parameter(
+        5,
+        'Number of consecutive observations through a feature after which it is removed. Raise it '
+        'to keep walls longer, lower it to forget doors that have opened.',
+        low=1,
+        high=1000,
     )
 
 
@@ -80,13 +102,21 @@ class FeatureMap:
     without, all.
     """
 
-    def __init__(self, config: FeatureConfig, local_areas: bool) -> None:
+    def __init__(
+        self, config: FeatureConfig, association: AssociationConfig, local_areas: bool
+    ) -> None:
         self.area = LocalArea()
         self._config = config
+        self._association = association
         self._local_areas = local_areas
-        self._wall = np.diag(np.square([config.wall_sigma_m, config.wall_sigma_rad]))
+        self._wall = np.diag(np.square([config.wall_flatness_m, config.wall_flatness_rad]))
         self._features: dict[int, Feature] = {}
-        self._candidates = Candidates(config.sightings, config.patience, config.gate, config.gap_m)
+        self._candidates = Candidates(
+            config.min_observations,
+            config.candidate_max_misses,
+            association.gate,
+            association.max_gap_m,
+        )
         # Features outside the local area that the robot turned out to see.
         self._called: set[int] = set()
         self._next_id = 1
@@ -171,7 +201,7 @@ class FeatureMap:
         By as much at their ends as anywhere: a short piece of wall tells its direction badly.
         """
         lengths = np.hypot(*(lines.ends[:, 1] - lines.ends[:, 0]).T)
-        sigma_m = self._config.wall_sigma_m
+        sigma_m = self._config.wall_flatness_m
         walls = np.zeros((len(lines), 2, 2))
         walls[:, 0, 0] = sigma_m**2
         walls[:, 1, 1] = np.square(sigma_m / np.maximum(lengths, sigma_m))
@@ -185,13 +215,13 @@ class FeatureMap:
         Returns which feature each is (-1: none).
         """
         features = self._local(ekf)
-        choice = associate(ekf.local, features, lines, laser_map, self._config)
+        choice = associate(ekf.local, features, lines, laser_map, self._association)
         chosen = np.where(choice.ambiguous, -1, choice.index)
         taken = _update(ekf.local, chosen, lines)
         left = np.flatnonzero(choice.ambiguous)
         if left.size:
             again = associate(
-                ekf.local, features, lines.chosen(left), laser_map, self._config
+                ekf.local, features, lines.chosen(left), laser_map, self._association
             ).index
             taken &= _update(ekf.local, again, lines.chosen(left))
             chosen[left] = again
@@ -223,7 +253,7 @@ class FeatureMap:
             i for i, gone in zip(ekf.area, through, strict=True) if gone and i not in seen
         ]:
             self._features[feature_id].missed += 1
-            if self._features[feature_id].missed >= self._config.misses:
+            if self._features[feature_id].missed >= self._config.max_misses:
                 self._drop(ekf, feature_id, None)
 
     def _merge(self, ekf: CompressedEkf, seen: Iterable[int]) -> None:
@@ -261,12 +291,14 @@ class FeatureMap:
         v, S, _ = ekf.local.difference(a, b)
         ends = ends_of(self._features[ekf.area[b]], ekf.local.lines[b])
         apart = np.abs(ends @ normals_of(ekf.local.lines[[a]])[0] - ekf.local.lines[a, 0]).max()
-        return bool(apart <= self._near) and mahalanobis(v, S + self._wall) <= self._config.gate
+        return (
+            bool(apart <= self._near) and mahalanobis(v, S + self._wall) <= self._association.gate
+        )
 
     @property
     def _near(self) -> float:
         """Distance between two lines that may yet be one wall, m."""
-        return 3.0 * self._config.wall_sigma_m
+        return 3.0 * self._config.wall_flatness_m
 
     def _drop(self, ekf: CompressedEkf, feature_id: int, heir: int | None) -> None:
         ekf.remove(ekf.area.index(feature_id))

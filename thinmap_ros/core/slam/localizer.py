@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2, snapshot
-from thinmap_ros.core.config import parameter
+from thinmap_ros.core.config import parameter, part
 from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig
 from thinmap_ros.core.ekf_slam.models import odometry_slip, odometry_variances
 from thinmap_ros.core.estimate import Correction, Estimate
@@ -25,13 +25,25 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.active_map import ActiveMap
 from thinmap_ros.core.slam.covariance import UNKNOWN, PoseUncertainty
-from thinmap_ros.core.slam.graph.keyframes import Keyframe, heading_variance, turned, with_heading
-from thinmap_ros.core.slam.graph.loop_closure import LoopClosure, LoopConfig
+from thinmap_ros.core.slam.graph.keyframes import (
+    Keyframe,
+    KeyframeConfig,
+    heading_variance,
+    turned,
+    with_heading,
+)
+from thinmap_ros.core.slam.graph.loop_closure import LoopClosure, LoopClosureConfig
 from thinmap_ros.core.slam.graph.trajectory import AnchoredPoses
 from thinmap_ros.core.slam.heading import HeadingCorrection
 from thinmap_ros.core.slam.matching import local_map
+from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.core.slam.matching.occupancy_surfaces import wall_points
-from thinmap_ros.core.slam.matching.scan_matcher import FEWEST_POINTS, Match, Matcher, MatcherConfig
+from thinmap_ros.core.slam.matching.scan_matcher import (
+    FEWEST_POINTS,
+    Match,
+    Matcher,
+    MatchingConfig,
+)
 from thinmap_ros.core.slam.matching.surface import surface_points
 from thinmap_ros.core.slam.motion_model import MotionConfig
 from thinmap_ros.core.slam.odometry_prediction import OdometryPrediction, Prediction
@@ -42,46 +54,51 @@ _VIEW_M = 1.0  # after a path of this length a match errs by other points than b
 
 
 @dataclass(frozen=True)
-class ScanLocalizerConfig(EkfConfig, MotionConfig, MatcherConfig, LoopConfig):
+class LocalizerConfig(EkfConfig):
     """Parameters of the localizer and of its parts."""
 
-    map_distance_m: float = parameter(
-        0.2, 'the local map learns after a path of this length, m', low=0.0, high=5.0
-    )
-    map_turn_rad: float = parameter(0.2, 'or after such a turn, rad', low=0.0, high=3.0)
-    lost_evidence: float = parameter(
+    lost_threshold: float = parameter(
         4.0,
-        'evidence against the map at which a new one begins: a sum over scans of the share of '
-        'points that contradict the map, less a third of those that fit. Raise it where crowds '
-        'make the robot lost, lower it to notice sooner that it was moved',
+        'Evidence against the map at which the robot is lost and a new submap begins: the sum over '
+        'scans of the ratio of points that contradict the map, minus a third of the inlier ratio. '
+        'Raise it in crowded places, lower it to detect a kidnapped robot earlier.',
         low=0.1,
         high=1000.0,
     )
+    odometry: MotionConfig = part(MotionConfig)
+    matching: MatchingConfig = part(MatchingConfig)
+    local_map: LocalMapConfig = part(LocalMapConfig)
+    keyframes: KeyframeConfig = part(KeyframeConfig)
+    loop_closure: LoopClosureConfig = part(LoopClosureConfig)
 
 
-class ScanLocalizer:
+class Localizer:
     """Scan matching with a local map, keyframes and loop closure.
 
     Input that is not finite is refused and counted in `refused`: the robot is then taken to be
     where it was.
     """
 
-    def __init__(self, config: ScanLocalizerConfig | None = None) -> None:
-        self.config = config or ScanLocalizerConfig()
-        self._matcher = Matcher(self.config)
+    def __init__(self, config: LocalizerConfig | None = None) -> None:
+        self.config = config or LocalizerConfig()
+        self._matcher = Matcher(self.config.matching)
         self._refused = 0
         self.reset()
 
     def reset(self) -> None:
         """Forget everything: the next scan is the first, at the configured start."""
         config = self.config
-        self._pose = se2.pose(config.start_x_m, config.start_y_m, config.start_yaw_rad)
-        self._prediction = OdometryPrediction(config)
+        self._pose = se2.pose(config.initial_x_m, config.initial_y_m, config.initial_yaw_rad)
+        self._prediction = OdometryPrediction(config.odometry)
         self._uncertainty = PoseUncertainty(self._pose)
-        self._tracking = Tracking(config.lost_evidence, config.match_least_fit, self._pose)
-        self._map = ActiveMap(config)
-        self._heading = HeadingCorrection(config)
-        self._loops = LoopClosure(config, self._matcher)
+        self._tracking = Tracking(
+            config.lost_threshold, config.matching.min_inlier_ratio, self._pose
+        )
+        self._map = ActiveMap(config.local_map)
+        self._heading = HeadingCorrection(config.lines)
+        self._loops = LoopClosure(
+            config.loop_closure, config.keyframes, config.matching, config.local_map
+        )
         self._path = AnchoredPoses()
 
     @property
@@ -119,9 +136,9 @@ class ScanLocalizer:
 
     @staticmethod
     def from_state(
-        state: Mapping[str, NDArray[Any]], config: ScanLocalizerConfig | None = None
-    ) -> 'ScanLocalizer':
-        """ScanLocalizer in the map of another one's `state`, at the configured start.
+        state: Mapping[str, NDArray[Any]], config: LocalizerConfig | None = None
+    ) -> 'Localizer':
+        """Localizer in the map of another one's `state`, at the configured start.
 
         It is lost until scans fit there. Raises InputError where it is no such state.
         """
@@ -130,7 +147,7 @@ class ScanLocalizer:
         snapshot.require(
             possible, 'local map: hits: more than seen', 'no more hits than observations'
         )
-        localizer = ScanLocalizer(config)
+        localizer = Localizer(config)
         localizer._map.map.restore(checked)
         localizer._begin_in(checked)
         return localizer
@@ -140,20 +157,20 @@ class ScanLocalizer:
         patch: GridPatch,
         last: LastPose,
         T_odom_base: Array,
-        config: ScanLocalizerConfig | None = None,
-    ) -> 'ScanLocalizer':
-        """ScanLocalizer that goes on in an occupancy map, at T_odom_base (3,) after its last pose.
+        config: LocalizerConfig | None = None,
+    ) -> 'Localizer':
+        """Localizer that goes on in an occupancy map, at T_odom_base (3,) after its last pose.
 
         The pose is known to the noise of the odometry since then, and to a cell of the map (at a
         metre, for the heading).
         """
-        localizer = ScanLocalizer(config)
+        localizer = Localizer(config)
         for faces in wall_points(patch):
             localizer._map.map.add_walls(faces.points, faces.normal)
         localizer._begin_in(localizer._map.map.state())
         moved = se2.between(last.T_odom_base, T_odom_base)
         turn = float(last.T_map_odom[2] + last.T_odom_base[2])
-        variances = odometry_variances(moved, localizer.config)
+        variances = odometry_variances(moved, localizer.config.odometry)
         cell = np.full(3, patch.frame.resolution)
         localizer.set_pose(
             se2.compose(last.T_map_odom, T_odom_base),
@@ -166,13 +183,13 @@ class ScanLocalizer:
         prediction = self._prediction.predict(scan, T_odom_base, self._pose)
         stands = self._stands(prediction)
         self._uncertainty.predict(self._pose, prediction.T_map_base, prediction.covariance, stands)
-        points = surface_points(scan, self.config.match_range_m)
+        points = surface_points(scan, self.config.matching.max_range_m)
         match = self._match(scan, points, prediction.T_map_base)
         self._tracking.reckoned = self._tracking.reckoned.moved(prediction)
         self._tracking.judge(match)
         self._update(match, prediction, stands)
         self._tracking.note(self._pose, self._uncertainty.since_fit)
-        if self.config.mapping and not self._tracking.is_unplaced:
+        if self.config.update_map and not self._tracking.is_unplaced:
             self._learn(scan, points)
         correction = self._loops.work()
         if correction is not None:
@@ -200,14 +217,13 @@ class ScanLocalizer:
 
     def _slip_covariance(self) -> Array:
         """Covariance (3, 3) of a pose after wheels have slipped as far as they ever do."""
-        config = self.config
-        return np.diag(
-            np.square(_SIGMAS * np.array([config.slip_m, config.slip_m, config.slip_rad]))
-        )
+        config = self.config.matching
+        slip = np.array([*[config.wheel_slip_m] * 2, config.wheel_slip_rad])
+        return np.diag(np.square(_SIGMAS * slip))
 
     def _stands(self, prediction: Prediction) -> bool:
         """Whether the robot has not moved by more than odometry errs by."""
-        slip = _SIGMAS * odometry_slip(self.config)
+        slip = _SIGMAS * odometry_slip(self.config.odometry)
         is_still = self._uncertainty.stands(prediction.T_map_base, slip)
         return prediction.motion.stands and is_still
 
@@ -215,7 +231,7 @@ class ScanLocalizer:
         """The match of a scan with the local map; None where there is nothing to match."""
         if len(points) < FEWEST_POINTS or self._map.map.is_empty:
             return None
-        if np.ptp(points[:, :2], axis=0).max() < self.config.match_cell_m:
+        if np.ptp(points[:, :2], axis=0).max() < self.config.local_map.resolution_m:
             return None  # all in one place: they tell no pose
         covariance = self._uncertainty.since_fit
         return self._matcher.match(points, scan.T_base_laser, self._map.map, prior, covariance)
@@ -233,7 +249,7 @@ class ScanLocalizer:
             self._uncertainty.coast(prior, prediction.covariance, stands)
             return
         self._pose = match.T_map_base
-        fits = match.fit >= self.config.match_least_fit
+        fits = match.fit >= self.config.matching.min_inlier_ratio
         if fits:
             self._prediction.learn(prediction, match)
         self._uncertainty.update(match, prior, prediction.covariance, fits, stands)
@@ -244,12 +260,12 @@ class ScanLocalizer:
 
     def _learn(self, scan: Scan, points: Array) -> None:
         """Extend the map by the scan, if the robot has moved since it last grew."""
-        config = self.config
+        config = self.config.local_map
         moved = self._map.moved(self._pose)
         first = moved is None
         path_m = 0.0 if moved is None else math.hypot(moved[0], moved[1])
         turn = 0.0 if moved is None else abs(float(moved[2]))
-        if not first and path_m < config.map_distance_m and turn < config.map_turn_rad:
+        if not first and path_m < config.update_distance_m and turn < config.update_angle_rad:
             return
         self._tracking.travel(path_m)
         if self._tracking.needs_new_map:

@@ -25,8 +25,12 @@ _LEAST_SHARE = 1.0  # of the variance that the model allows: good wheels slip, t
 class MotionConfig(OdometryConfig):
     """Noise of the motion, 1 sigma, as it is taken to be before the scans have told."""
 
-    noise_memory: float = parameter(
-        20.0, 'scans after which an error of odometry is forgotten', low=1.0, high=1e4
+    noise_window: float = parameter(
+        20.0,
+        'Number of scans over which the odometry noise is estimated. Raise it for a steadier '
+        'estimate, lower it to follow changes of the floor sooner.',
+        low=1.0,
+        high=1e4,
     )
 
 
@@ -88,7 +92,7 @@ class MotionModel:
         change *= np.maximum(gain**2, beyond / np.maximum(squared, 1e-12))
         change[:2] *= np.where(change[:2] > 0.0, _distinctness(by_scan), 1.0)
         self._learned += 1
-        rate = max(1.0 / self._config.noise_memory, 1.0 / (1.0 + self._learned))
+        rate = max(1.0 / self._config.noise_window, 1.0 / (1.0 + self._learned))
         self._share[0] += rate * 0.5 * (change[0] + change[1])
         self._share[1] += rate * change[2]
         np.maximum(self._share, _LEAST_SHARE, out=self._share)

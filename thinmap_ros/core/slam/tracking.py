@@ -38,11 +38,11 @@ class Tracking:
     Source: Page, "Continuous inspection schemes", 1954.
     """
 
-    def __init__(self, lost_evidence: float, least_fit: float, T_map_base: Array) -> None:
+    def __init__(self, lost_threshold: float, least_fit: float, T_map_base: Array) -> None:
         self.evidence = 0.0
         self.is_unplaced = False  # in a map that was given, or put somewhere by hand
         self.reckoned = DeadReckoning(T_map_base, np.zeros((3, 3)))
-        self._lost_evidence = lost_evidence
+        self._lost_evidence = lost_threshold
         self._least_fit = least_fit
         self._adrift_m = 0.0  # path for which a new local map is not yet part of the map
 

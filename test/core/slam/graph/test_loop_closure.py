@@ -8,10 +8,11 @@ from support.slam_room import RANGE_MAX_M, ROOM, corridor_ring, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam.graph import loop_closure as module
-from thinmap_ros.core.slam.graph.keyframes import Keyframe, carried, inverse, turned
-from thinmap_ros.core.slam.graph.loop_closure import LoopClosure, LoopConfig
+from thinmap_ros.core.slam.graph.keyframes import Keyframe, KeyframeConfig, carried, inverse, turned
+from thinmap_ros.core.slam.graph.loop_closure import LoopClosure, LoopClosureConfig
 from thinmap_ros.core.slam.graph.pose_graph import Edge
-from thinmap_ros.core.slam.matching.scan_matcher import FEWEST_POINTS, Matcher
+from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
+from thinmap_ros.core.slam.matching.scan_matcher import FEWEST_POINTS, MatchingConfig
 from thinmap_ros.core.slam.matching.surface import surface_points
 
 SIGMAS = np.array([0.02, 0.02, 0.003])
@@ -22,6 +23,12 @@ RING = corridor_ring()
 CORNERS = [(38.8, 1.2), (38.8, 18.8), (1.2, 18.8), (1.2, 1.2), (20.0, 1.2)]
 
 OTHER_ROOMS = [(-4.0, 16.0), (-4.0, 6.0), (-4.0, -4.0), (6.0, -4.0), (16.0, -4.0)]
+
+
+def loop_closure(**config):
+    return LoopClosure(
+        LoopClosureConfig(**config), KeyframeConfig(), MatchingConfig(), LocalMapConfig()
+    )
 
 
 def round_the_block():
@@ -43,7 +50,7 @@ class Driver:
 
     def __init__(self, walls=RING, seed=6, bias=(0.0, 0.0, 0.0), **config):
         self.rng = np.random.default_rng(seed)
-        self.loops = LoopClosure(LoopConfig(**config), Matcher())
+        self.loops = loop_closure(**config)
         self.walls = walls
         self.bias = np.array(bias)
         self.truths = []
@@ -163,7 +170,7 @@ def edge_to(loops, a, b, off, sigma=0.03):
 @pytest.fixture
 def straight():
     """Twelve keyframes out and twelve back beside them, along a hall; nothing is matched."""
-    loops = LoopClosure(LoopConfig(), Matcher())
+    loops = loop_closure()
     poses = [se2.pose(k, 0.0, 0.0) for k in range(12)]
     poses += [se2.pose(11 - k, 1.0, np.pi) for k in range(12)]
     for k, pose in enumerate(poses):
@@ -253,7 +260,7 @@ def test_a_step_does_one_match_or_one_round(monkeypatch):
 
 
 def test_a_robot_that_stands_about_keeps_one_scan(rng):
-    loops = LoopClosure(LoopConfig(), Matcher())
+    loops = loop_closure()
     kept = 0
     for k in range(50):
         pose = np.array([2.0, 2.0, 0.0]) + rng.normal(0.0, 0.1, 3)
@@ -269,7 +276,7 @@ def test_a_robot_that_stands_about_keeps_one_scan(rng):
 
 
 def test_the_path_is_measured_in_straight_lines():
-    loops = LoopClosure(LoopConfig(), Matcher())
+    loops = loop_closure()
     assert loops.path_m(np.array([5.0, 5.0, 0.0])) == 0.0
     for k, x in enumerate((0.0, 1.0, 2.0)):
         pose = se2.pose(2.0 + x, 2.0, 0.0)
@@ -281,7 +288,7 @@ def test_the_path_is_measured_in_straight_lines():
 
 def test_what_has_jumped_is_measured_anew(rng):
     """Scan and motion contradicted each other on the way; the keyframes before see the same."""
-    loops = LoopClosure(LoopConfig(), Matcher())
+    loops = loop_closure()
     truths = np.array([[1.2, 2.0, 0.3], [2.0, 2.0, 0.3], [2.8, 2.0, 0.3]])
     told = truths + [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.3, 0.2, 0.05]]
     for k, jump in enumerate([NONE, NONE, np.diag([0.1, 0.1, 0.01])]):
@@ -296,7 +303,7 @@ def test_what_has_jumped_is_measured_anew(rng):
 
 
 def test_the_step_covariance_is_that_of_the_step(rng):
-    loops = LoopClosure(LoopConfig(), Matcher())
+    loops = loop_closure()
     for k, pose in enumerate([np.zeros(3), np.array([1.0, 0.0, 0.2])]):
         scan = scan_in(ROOM, pose + [2.0, 2.0, 0.0], rng, k)
         loops.add(
@@ -308,7 +315,7 @@ def test_the_step_covariance_is_that_of_the_step(rng):
 
 def test_an_edge_to_what_is_seen_again_holds_the_errors_of_step_and_match(rng):
     """From the anchor to an earlier keyframe, by way of a scan that both see; against sampling."""
-    loops = LoopClosure(LoopConfig(), Matcher())
+    loops = loop_closure()
     poses = [se2.pose(2.0, 2.0, 0.3), se2.pose(4.0, 2.0, 2.0), se2.pose(2.3, 2.5, 0.8)]
     frames = []
     for k, pose in enumerate(poses):

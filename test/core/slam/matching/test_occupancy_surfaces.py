@@ -9,7 +9,7 @@ from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import LastPose
-from thinmap_ros.core.slam.localizer import ScanLocalizer, ScanLocalizerConfig
+from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
 from thinmap_ros.core.slam.matching.local_map import LocalMap
 from thinmap_ros.core.slam.matching.occupancy_surfaces import wall_points
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher
@@ -76,7 +76,7 @@ def test_a_map_without_walls_has_no_points():
 def killed(config, seed, resolution, slip):
     """Farthest from the truth before it was killed, and after, m; the last estimate."""
     rng = np.random.default_rng(seed)
-    localizer = ScanLocalizer(config)
+    localizer = Localizer(config)
     last = None
     grid = OccupancyGrid(OccupancyConfig(resolution_m=resolution))
     off = se2.pose(slip[0], 0.0, slip[1])
@@ -94,7 +94,7 @@ def killed(config, seed, resolution, slip):
             begin = odom if k == 450 else begin
             slipped = se2.compose(se2.compose(begin, off), se2.between(begin, odom))
             if k == 450:
-                localizer = ScanLocalizer.resumed(grid.patch(), last, slipped, config)
+                localizer = Localizer.resumed(grid.patch(), last, slipped, config)
             estimate = localizer.step(scan, slipped)
             after = max(after, float(np.hypot(*(estimate.T_map_base - truth)[:2])))
     return before, after, estimate
@@ -105,7 +105,7 @@ def killed(config, seed, resolution, slip):
 @pytest.mark.parametrize('slip', [(0.0, 0.0), (0.3, 0.2)])
 def test_a_killed_localizer_does_not_bend_the_map(seed, resolution, slip):
     """Killed for two metres while the wheels slip: then it is as true as its map, and a cell."""
-    config = ScanLocalizerConfig(start_x_m=2.0, start_y_m=2.0)
+    config = LocalizerConfig(initial_x_m=2.0, initial_y_m=2.0)
     before, worst, estimate = killed(config, seed, resolution, slip)
     assert not estimate.lost
     assert worst < before + 0.05

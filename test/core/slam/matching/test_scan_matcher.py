@@ -7,8 +7,8 @@ import pytest
 from support.slam_room import RANGE_MAX_M, ROOM, around, map_of, on_wall, scan_in, seen_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.slam.matching.local_map import LocalMap
-from thinmap_ros.core.slam.matching.scan_matcher import Matcher, MatcherConfig
+from thinmap_ros.core.slam.matching.local_map import LocalMap, LocalMapConfig
+from thinmap_ros.core.slam.matching.scan_matcher import Matcher, MatchingConfig, weighted_points
 from thinmap_ros.core.slam.matching.surface import surface_points
 
 TRUTH = np.array([2.0, 2.0, 0.3])
@@ -24,7 +24,7 @@ def match(local_map, points, prior, covariance=DOUBT):
 
 def nearest_minimum(local_map, points, prior, covariance):
     """The match without a search."""
-    scan = MATCHER.weighted(points, LASER)
+    scan = weighted_points(points, LASER, LocalMapConfig().resolution_m)
     information = np.linalg.inv(covariance)
     return MATCHER._refined(scan, local_map, prior, prior, information)
 
@@ -156,7 +156,7 @@ def test_a_wide_covariance_is_searched_though_the_nearest_minimum_fits(rng):
     prior = np.array([0.6, 0.0, 0.0])
     covariance = np.diag(np.square([0.3, 0.05, 0.02]))
     alone = nearest_minimum(local_map, points, prior, covariance)
-    assert alone.fit > MATCHER.config.match_least_fit
+    assert alone.fit > MATCHER.config.min_inlier_ratio
     assert abs(alone.T_map_base[0]) > 0.3
     assert abs(match(local_map, points, prior, covariance).T_map_base[0]) < 0.03
 
@@ -183,7 +183,7 @@ def test_a_robot_that_sees_no_end_of_a_corridor_goes_on_along_it():
     back = []
     for seed in range(12):
         rng = np.random.default_rng(seed)
-        local_map = LocalMap(MATCHER.config)
+        local_map = LocalMap()
         for x in np.arange(-10.0, 0.1, 1.0):
             pose = np.array([x, 0.0, 0.0])
             local_map.add_scan(surface_points(scan_in(CORRIDOR, pose, rng), 6.0), LASER, pose)
@@ -249,7 +249,7 @@ def test_a_search_never_makes_a_match_worse():
         prior = TRUTH + rng.normal(0.0, 0.05, 3)
         covariance = np.diag(np.square([0.05, 0.05, 0.05]))
         alone = nearest_minimum(room, points, prior, covariance)
-        searched += alone.fit < MATCHER.config.match_least_fit
+        searched += alone.fit < MATCHER.config.min_inlier_ratio
         assert match(room, points, prior, covariance).cost <= alone.cost
     assert searched > 40
 
@@ -317,11 +317,13 @@ def test_ground_that_is_new_contradicts_nothing(rng, room):
 def test_a_point_counts_as_much_as_its_spacing():
     points = on_wall(np.column_stack([np.arange(5.0), np.ones(5)]))
     points[:, 4] = [0.01, 0.025, 0.05, 0.3, 2.0]
-    scan = MATCHER.weighted(points, np.array([0.5, 1.0, 0.0]))
+    scan = weighted_points(points, np.array([0.5, 1.0, 0.0]), LocalMapConfig().resolution_m)
     np.testing.assert_array_equal(scan[:, :2], points[:, :2])
     np.testing.assert_allclose(scan[:, 2], [0.2, 0.5, 1.0, 1.0, 1.0])
     np.testing.assert_allclose(scan[:, 3:], [[1.0, 0.0], *[[-1.0, 0.0]] * 4])
-    at_the_laser = MATCHER.weighted(points[:1], np.array([0.0, 1.0, 0.0]))
+    at_the_laser = weighted_points(
+        points[:1], np.array([0.0, 1.0, 0.0]), LocalMapConfig().resolution_m
+    )
     assert np.isfinite(at_the_laser).all()
 
 
@@ -378,7 +380,7 @@ def test_wide_headings_are_wrapped(rng):
 def test_another_configuration_is_used(rng, room):
     """Points that are twice as uncertain say a quarter."""
     points = seen_in(ROOM, TRUTH, rng)
-    timid = Matcher(MatcherConfig(match_sigma_m=0.1, match_outlier_m=0.3))
+    timid = Matcher(MatchingConfig(noise_m=0.1, kernel_scale_m=0.3))
     less = timid.match(points, LASER, room, TRUTH, DOUBT).by_scan
     np.testing.assert_allclose(
         np.diag(less), 0.25 * np.diag(match(room, points, TRUTH).by_scan), rtol=0.2

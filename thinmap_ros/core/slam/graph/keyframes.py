@@ -33,10 +33,20 @@ _RADIAN_M = 1.0  # a radian of turn makes two scans as different as so many metr
 class KeyframeConfig(Config):
     """Parameters of keyframes."""
 
-    keyframe_m: float = parameter(
-        0.7, 'a scan is kept after a path of this length, m', low=0.1, high=10.0
+    distance_m: float = parameter(
+        0.7,
+        'Travelled distance after which a scan becomes a keyframe (m). Lower: more loop-closure '
+        'candidates, more memory.',
+        low=0.1,
+        high=10.0,
     )
-    keyframe_rad: float = parameter(0.7, 'or after a turn by this, rad', low=0.1, high=3.2)
+    angle_rad: float = parameter(
+        0.7,
+        'Rotation after which a scan becomes a keyframe (rad). Lower: more loop-closure '
+        'candidates, more memory.',
+        low=0.1,
+        high=3.2,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +151,7 @@ class Keyframes:
         """Whether two poses (3,) do not see about the same."""
         x, y, turn = se2.between(T_a, T_b).tolist()
         config = self._config
-        return math.hypot(x, y) >= config.keyframe_m or abs(turn) >= config.keyframe_rad
+        return math.hypot(x, y) >= config.distance_m or abs(turn) >= config.angle_rad
 
     def near(self, T_map_base: Array, reach_m: float) -> list[int]:
         """Keyframes within a reach of a pose (3,), and some that are farther."""
@@ -149,7 +159,7 @@ class Keyframes:
 
     def alike(self, T_map_base: Array) -> int | None:
         """The keyframe that sees most nearly the same as one at a pose (3,), or None."""
-        near = self.near(T_map_base, self._config.keyframe_m)
+        near = self.near(T_map_base, self._config.distance_m)
         near = [k for k in near if not self.are_apart(self.frames[k].T_map_base, T_map_base)]
         if not near:
             return None

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.config import parameter
+from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.estimate import Correction
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.keyframes import (
@@ -29,7 +29,8 @@ from thinmap_ros.core.slam.graph.keyframes import (
 )
 from thinmap_ros.core.slam.graph.pose_graph import Edge, optimized, rounds
 from thinmap_ros.core.slam.graph.submaps import AGAIN_M, Submaps
-from thinmap_ros.core.slam.matching.scan_matcher import Matcher
+from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
+from thinmap_ros.core.slam.matching.scan_matcher import Matcher, MatchingConfig
 
 _VISITS = 3  # earlier visits with which a keyframe is matched, at most
 _SIGMAS = 3.0
@@ -40,22 +41,44 @@ _RECENT = 8  # matches among which consistent ones are looked for
 
 
 @dataclass(frozen=True)
-class LoopConfig(KeyframeConfig):
+class LoopClosureConfig(Config):
     """Parameters of loop closure."""
 
-    loop_reach_m: float = parameter(
-        2.0, 'places nearer than this, and the uncertainty, are matched, m', low=0.1, high=20.0
+    search_radius_m: float = parameter(
+        2.0,
+        'Radius around the pose, in addition to its uncertainty, within which keyframes of earlier '
+        'visits are matched (m). Raise it if loops are missed, lower it to save time.',
+        low=0.1,
+        high=20.0,
     )
-    loop_fit: float = parameter(
-        0.75, 'share of points that must lie on the walls of an earlier visit', low=0.0, high=1.0
+    min_inlier_ratio: float = parameter(
+        0.75,
+        'Smallest ratio of points on the walls of an earlier visit for a loop-closure candidate. '
+        'Raise it against false loops, lower it where furniture moves.',
+        low=0.0,
+        high=1.0,
     )
-    loop_sigma_m: float = parameter(
-        0.05, 'uncertainty of a match of two visits, 1 sigma, m', low=0.001, high=1.0
+    noise_m: float = parameter(
+        0.05,
+        'Standard deviation of the position in a loop-closure edge (m). Raise it to change the '
+        'path less, lower it to trust loops more.',
+        low=0.001,
+        high=1.0,
     )
-    loop_sigma_rad: float = parameter(
-        0.02, 'uncertainty of a match of two visits, 1 sigma, rad', low=0.001, high=1.0
+    noise_rad: float = parameter(
+        0.02,
+        'Standard deviation of the heading in a loop-closure edge (rad). Raise it to change the '
+        'path less, lower it to trust loops more.',
+        low=0.001,
+        high=1.0,
     )
-    loop_matches: int = parameter(5, 'consistent matches that make a loop', low=1, high=_RECENT)
+    min_consistent_matches: int = parameter(
+        5,
+        'Number of consistent candidates that close a loop. Raise it against false loops, lower it '
+        'to close loops earlier.',
+        low=1,
+        high=_RECENT,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,20 +93,25 @@ class _Job:
 class LoopClosure:
     """The pose graph of the keyframes, and the search for edges that close loops."""
 
-    def __init__(self, config: LoopConfig, matcher: Matcher) -> None:
-        self.keyframes = Keyframes(config)
+    def __init__(
+        self,
+        config: LoopClosureConfig,
+        keyframes: KeyframeConfig,
+        matching: MatchingConfig,
+        local_map: LocalMapConfig,
+    ) -> None:
+        self.keyframes = Keyframes(keyframes)
         self.edges: list[Edge] = []
         self._config = config
         # By how much wheels may have slipped is part of the covariance along the graph.
-        self._matcher = Matcher(replace(matcher.config, slip_m=0.001, slip_rad=0.001))
+        self._matcher = Matcher(replace(matching, wheel_slip_m=0.001, wheel_slip_rad=0.001))
         self._jobs: deque[_Job] = deque()
         self._pending: tuple[Keyframe, Array] | None = None
         self._requested: deque[Edge] = deque(maxlen=_RECENT)
         self._here: Keyframe | None = None  # the last of them, kept or not
         self._is_strained = False  # whether a step, measured again, contradicts the poses
-        self._submaps = Submaps(matcher.config)
+        self._submaps = Submaps(local_map)
         self._rounds: Iterator[Array] | None = None
-        self._before: Array = np.zeros((0, 3))
         self._after: Array = np.zeros((0, 3))
 
     def is_due(self, T_map_base: Array) -> bool:
@@ -156,7 +184,7 @@ class LoopClosure:
 
     def _reach_m(self, sigma: float) -> float:
         """How far places that are matched may lie, where the place is uncertain by sigma, m."""
-        return self._config.loop_reach_m + min(_SIGMAS * sigma, _FARTHEST_M)
+        return self._config.search_radius_m + min(_SIGMAS * sigma, _FARTHEST_M)
 
     def _is_earlier(self, j: int, here: Keyframe) -> bool:
         frame = self.keyframes.frames[j]
@@ -184,7 +212,7 @@ class LoopClosure:
             if not self._is_pending_matched():
                 self._settle()
             consistent = self._consistent()
-            if len(consistent) >= self._config.loop_matches:
+            if len(consistent) >= self._config.min_consistent_matches:
                 self._settle()
                 self._requested.clear()
                 self.edges += consistent
@@ -234,8 +262,7 @@ class LoopClosure:
         return k < len(self.keyframes) and self.keyframes.steps[k - 1].a == j
 
     def _begin_rounds(self) -> None:
-        self._before = self.keyframes.poses()
-        self._rounds = rounds(self._before, self._all_edges)
+        self._rounds = rounds(self.keyframes.poses(), self._all_edges)
 
     @property
     def _all_edges(self) -> list[Edge]:
@@ -253,13 +280,13 @@ class LoopClosure:
         else:
             base, submap = self._submaps.around(frames, j, here.path_m)
         config = self._config
-        floor = np.diag(np.square([2.0 * config.loop_sigma_m] * 2 + [2.0 * config.loop_sigma_rad]))
+        floor = np.diag(np.square([2.0 * config.noise_m] * 2 + [2.0 * config.noise_rad]))
         prior = se2.between(base, here.T_map_base)
         relative = turned(job.covariance, -float(base[2])) + floor
         match = self._matcher.match(here.points, here.scan.T_base_laser, submap, prior, relative)
-        if match.fit < config.loop_fit:
+        if match.fit < config.min_inlier_ratio:
             return
-        own = np.diag(np.square([config.loop_sigma_m] * 2 + [config.loop_sigma_rad]))
+        own = np.diag(np.square([config.noise_m] * 2 + [config.noise_rad]))
         covariance = inverse(match.by_scan + 1e-3 * np.eye(3)) + own
         off = se2.off(match.T_map_base, prior)
         if float(off @ np.linalg.solve(relative + covariance, off)) > _CHI2:
