@@ -24,7 +24,7 @@ from thinmap_ros.core.errors import ConfigError
 AnyConfig = TypeVar('AnyConfig', bound=Config)
 
 
-def declare(
+def declare_config(
     node: Node,
     config: type[AnyConfig],
     changed: Callable[[AnyConfig], None] | None = None,
@@ -66,7 +66,7 @@ class _Changes(Generic[AnyConfig]):
         self._free = free
         self._changed = changed
         node.add_on_set_parameters_callback(self._check)
-        node.add_post_set_parameters_callback(self._take)
+        node.add_post_set_parameters_callback(self._apply)
 
     def _with(self, given: list[Parameter]) -> AnyConfig:
         values = {
@@ -81,7 +81,7 @@ class _Changes(Generic[AnyConfig]):
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
-    def _take(self, given: list[Parameter]) -> None:
+    def _apply(self, given: list[Parameter]) -> None:
         new = self._with(given)
         if new != self._current:
             self._current = new
@@ -90,7 +90,7 @@ class _Changes(Generic[AnyConfig]):
             self._changed(new)
 
 
-def declare_value(node: Node, name: str, default: Any, description: str) -> Any:
+def declare_parameter(node: Node, name: str, default: Any, description: str) -> Any:
     """Declare one read-only parameter that belongs to the node itself, and return its value."""
     descriptor = ParameterDescriptor(description=description, read_only=True)
     try:
@@ -102,7 +102,7 @@ def declare_value(node: Node, name: str, default: Any, description: str) -> Any:
 def declare_session(node: Node) -> str:
     """Declare the parameter `session` and return its value."""
     return str(
-        declare_value(
+        declare_parameter(
             node, 'session', '', 'path STEM of a saved session to go on from; empty: begin anew'
         )
     )
@@ -111,7 +111,7 @@ def declare_session(node: Node) -> str:
 def declare_recovery(node: Node) -> float:
     """Declare the parameter `recover_s` and return its value."""
     return float(
-        declare_value(
+        declare_parameter(
             node,
             'recover_s',
             30.0,
@@ -120,7 +120,7 @@ def declare_recovery(node: Node) -> float:
     )
 
 
-def check_unknown(node: Node) -> None:
+def reject_unknown(node: Node) -> None:
     """Raise ConfigError where a parameter was given that the node does not have.
 
     A typo must not go unseen. Where several nodes share a process, a parameter may be meant for
@@ -162,7 +162,7 @@ _SHARED: ContextVar[_Shared | None] = ContextVar('shared', default=None)
 
 
 @contextmanager
-def shared_by(count: int) -> Iterator[None]:
+def shared_process(count: int) -> Iterator[None]:
     """Let so many nodes, made inside, share what parameters they are given."""
     token = _SHARED.set(_Shared(count) if count > 1 else None)
     try:
