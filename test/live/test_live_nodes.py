@@ -172,7 +172,7 @@ def test_a_wrong_parameter_ends_the_start_with_one_clear_line(graph, name, param
 
 
 def is_free(map_message, x, y):
-    patch = messages.patch_from(map_message)
+    patch = messages.grid_from_msg(map_message)
     point = np.array([[x, y]])
     row, col = patch.frame.cells_of(point)[0]
     return bool(patch.contains(point)[0]) and bool(patch.free[row, col])

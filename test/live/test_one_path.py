@@ -129,7 +129,7 @@ def assert_live_is_same(graph, bag, expected, tmp_path, **localizer):
     )
     assert 'going on without it' not in graph.log('bag_player')
     assert [messages.stamp_ns(pose.header.stamp) for pose in poses] == expected.stamps_ns
-    live = np.array([messages.pose_from(pose.pose.pose) for pose in poses])
+    live = np.array([messages.pose_from_msg(pose.pose.pose) for pose in poses])
     assert np.abs(live - expected.poses).max() <= 1e-9
     response = graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(tmp_path / 'live')))
     assert response.success, response.message
@@ -162,7 +162,7 @@ def test_a_closed_loop_corrects_the_live_map_as_it_does_the_replayed_one(graph, 
     trajectories = graph.heard('trajectory', Path, qos.LATCHED)
     assert_live_is_same(graph, tmp_path / 'bag', expected, tmp_path, **start)
     assert len(trajectories) == expected.pipeline.corrections
-    stamps, _ = messages.trajectory_from(trajectories[-1])
+    stamps, _ = messages.trajectory_from_msg(trajectories[-1])
     assert set(stamps.tolist()) <= set(expected.stamps_ns)
     live = sessions.load_topology(str(tmp_path / 'live')).map
     offline = expected.pipeline.topology.map

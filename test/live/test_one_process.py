@@ -26,7 +26,7 @@ FIVE = ('localizer', 'grid_mapper', 'topology_builder', 'navigator', 'explorer')
 
 
 def free_at(map_message, x, y):
-    patch = messages.patch_from(map_message)
+    patch = messages.grid_from_msg(map_message)
     row, col = patch.frame.cells_of(np.array([[x, y]]))[0]
     return bool(patch.contains(np.array([[x, y]]))[0]) and bool(patch.free[row, col])
 
@@ -114,7 +114,7 @@ def test_two_robots_in_namespaces_keep_to_themselves(graph):
         return abs(messages.yaw_of(last.orientation)) > 0.5
 
     graph.until(drives, 'the first one turns')
-    last = {name: messages.pose_from(poses[-1].pose.pose) for name, poses in heard.items()}
+    last = {name: messages.pose_from_msg(poses[-1].pose.pose) for name, poses in heard.items()}
     assert np.abs(last['robot2'] - [8.0, 3.0, 0.0]).max() < 0.1
     assert np.hypot(last['robot1'][0] - 2.0, last['robot1'][1] - 2.0) < 1.0
     assert all(frames.values()) and not nobody

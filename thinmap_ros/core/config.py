@@ -1,7 +1,8 @@
 """One home for each default: frozen dataclasses whose fields carry description and range.
 
 A configuration is composed of others (`part`). Seen from ROS and the command line it is flat:
-parameters of a part have its name before theirs, `matching.noise_m`.
+parameters of a part have its name before theirs, `matching.noise_m`; those that describe the robot
+(`robot_radius`) have one name everywhere.
 """
 
 import dataclasses
@@ -26,6 +27,18 @@ def parameter(
     """
     metadata = {'description': description, 'low': low, 'high': high, 'choices': choices}
     return dataclasses.field(default=default, metadata=metadata)
+
+
+def robot_radius() -> Any:
+    """Declare the field `robot_radius_m`: one name and one default for all parts and nodes."""
+    field = parameter(
+        0.25,
+        'Radius of the robot (m), the same for all nodes. Set it to the distance from the centre '
+        'of rotation to the farthest point of the footprint.',
+        low=0.0,
+        high=5.0,
+    )
+    return dataclasses.field(default=field.default, metadata={**field.metadata, 'shared': True})
 
 
 def part(config: type['Config']) -> Any:
@@ -55,7 +68,7 @@ def parameters_of(config: Config) -> Iterator[tuple[str, 'dataclasses.Field[Any]
         value = getattr(config, field.name)
         if isinstance(value, Config):
             for name, inner, own in parameters_of(value):
-                yield f'{field.name}.{name}', inner, own
+                yield name if _is_shared(inner) else f'{field.name}.{name}', inner, own
         else:
             yield field.name, field, value
 
@@ -65,26 +78,35 @@ def with_values(config: AnyConfig, values: Mapping[str, Any]) -> AnyConfig:
 
     Raises ConfigError for a parameter that it does not have, or a value that is not allowed.
     """
+    known = [name for name, _, _ in parameters_of(config)]
+    for name in values:
+        if name not in known:
+            raise ConfigError(f'no parameter {name}: expected one of {", ".join(known)}')
     own: dict[str, Any] = {}
-    inner: dict[str, dict[str, Any]] = {}
-    for name, value in values.items():
-        first, _, rest = name.partition('.')
-        if rest:
-            inner.setdefault(first, {})[rest] = value
-        else:
-            own[first] = value
-    names = {field.name for field in dataclasses.fields(config)}
-    for name in [*own, *inner]:
-        is_part = name in names and isinstance(getattr(config, name), Config)
-        if name not in names or is_part != (name in inner):
-            known = ', '.join(known for known, _, _ in parameters_of(config))
-            raise ConfigError(f'no parameter {name}: expected one of {known}')
-    for name, given in inner.items():
-        try:
-            own[name] = with_values(getattr(config, name), given)
-        except ConfigError as error:
-            raise ConfigError(f'{name}.{error}') from error
+    for field in dataclasses.fields(config):
+        inner = getattr(config, field.name)
+        if isinstance(inner, Config):
+            own[field.name] = _part_with(field.name, inner, values)
+        elif field.name in values:
+            own[field.name] = values[field.name]
     return dataclasses.replace(config, **own)
+
+
+def _part_with(prefix: str, config: AnyConfig, values: Mapping[str, Any]) -> AnyConfig:
+    """A part of a configuration with those of the values that are its own."""
+    own = {}
+    for name, field, _ in parameters_of(config):
+        full = name if _is_shared(field) else f'{prefix}.{name}'
+        if full in values:
+            own[name] = values[full]
+    try:
+        return with_values(config, own)
+    except ConfigError as error:
+        raise ConfigError(f'{prefix}.{error}') from error
+
+
+def _is_shared(field: 'dataclasses.Field[Any]') -> bool:
+    return bool(field.metadata.get('shared'))
 
 
 def _check(field: 'dataclasses.Field[Any]', value: Any) -> None:

@@ -26,11 +26,11 @@ from thinmap_ros.files import sessions
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.action_server import Outcome, SingleGoalServer
-from thinmap_ros.ros.laser_transform import LaserMount
-from thinmap_ros.ros.lifecycle_node import LiveNode
-from thinmap_ros.ros.save_folder import SaveFolder
-from thinmap_ros.ros.services import answer
-from thinmap_ros.ros.subscription import listen
+from thinmap_ros.ros.laser_transform import LaserTransform
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.save_directory import SaveDirectory
+from thinmap_ros.ros.services import fill_response
+from thinmap_ros.ros.subscription import subscribe_guarded
 
 _WARN_PERIOD_S = 5.0
 _FEEDBACK_PERIOD_S = 1.0
@@ -42,7 +42,7 @@ _SAME_GOAL_RAD = 0.2
 _GIVE_UP_HOME = 3
 
 
-class ExplorerNode(LiveNode):
+class ExplorerNode(ThinmapNode):
     """Maps, /topology, /pose, /scan in; navigator's goals, /end_nodes, /exploration_status out.
 
     Service save_exploration keeps what was learned beside the map and the graph of a session.
@@ -51,19 +51,19 @@ class ExplorerNode(LiveNode):
     def __init__(self) -> None:
         super().__init__('explorer')
         # A change holds from the next goal on.
-        self._config = parameters.declare(self, ExplorerConfig, self._on_config)
-        self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
-        self._mount = LaserMount(self)
+        self._config = parameters.declare_config(self, ExplorerConfig, self._on_config)
+        self._map_frame = parameters.declare_parameter(self, 'map_frame', 'map', 'frame of the map')
+        self._laser_transform = LaserTransform(self)
         self._session = parameters.declare_session(self)
-        self._saves = SaveFolder(self)
-        parameters.check_unknown(self)
+        self._save_directory = SaveDirectory(self)
+        parameters.reject_unknown(self)
         warm_up.explorer()
         self._goal_sent: Array | None = None
         self._handle: ClientGoalHandle | None = None
-        self.begin_anew()
+        self.reset_state()
         self._make_topics()
 
-    def begin_anew(self) -> None:
+    def reset_state(self) -> None:
         """Forget map, graph and what was explored, or go back to the session of the start."""
         # What was learned is kept for the next goal, until an exploration is finished.
         self._learned = (
@@ -71,7 +71,7 @@ class ExplorerNode(LiveNode):
         )
         self._polygon = np.empty((0, 2))
         self._map = MapMirror()
-        self._topology = messages.topology_from(TopologicalMap())
+        self._topology = messages.topology_from_msg(TopologicalMap())
         self._matcher: StampMatcher[LaserScan, Array] = StampMatcher()
         self._looks: StampMatcher[tuple[LaserScan, Array], bool] = StampMatcher()
         self._hears_windows = False
@@ -85,7 +85,7 @@ class ExplorerNode(LiveNode):
         self._config = config
         self._learned = None
 
-    def stand_still(self) -> None:
+    def stop(self) -> None:
         """End the exploration."""
         if self._goals.active:
             self._end(ExplorationStatus.CANCELLED, 'the explorer was stopped or begins anew')
@@ -93,24 +93,24 @@ class ExplorerNode(LiveNode):
     def _make_topics(self) -> None:
         self._end_nodes = self.create_publisher(EndNodeArray, 'end_nodes', qos.LATCHED)
         self._status = self.create_publisher(ExplorationStatus, 'exploration_status', qos.LATCHED)
-        listen(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
-        listen(self, OccupancyGrid, 'map', self._on_map, qos.LATCHED)
-        listen(self, OccupancyGrid, 'local_map', self._on_window, qos.LATCHED)
-        listen(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
-        listen(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
-        listen(self, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
+        subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
+        subscribe_guarded(self, OccupancyGrid, 'map', self._on_map, qos.LATCHED)
+        subscribe_guarded(self, OccupancyGrid, 'local_map', self._on_window, qos.LATCHED)
+        subscribe_guarded(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
+        subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
+        subscribe_guarded(self, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
         self._navigator = ActionClient(self, NavigateToPose, 'navigate_to_pose')
         self._goals = SingleGoalServer(
             self, Explore, 'explore', self._on_goal, self._on_cancel, self._preempted
         )
         self.create_service(SaveMap, 'save_exploration', self._on_save)
-        self.every(_FEEDBACK_PERIOD_S, self._every_second)
+        self.create_active_timer(_FEEDBACK_PERIOD_S, self._every_second)
 
     def _on_goal(self, goal: Explore.Goal) -> None:
         limits = (goal.time_limit_s, goal.distance_limit_m, goal.area_limit_m2)
         try:
             corners = [c for p in goal.area.points for c in (p.x, p.y)]
-            validation.within('goal: limit or corner of the area', [*limits, *corners])
+            validation.require_bounded('goal: limit or corner of the area', [*limits, *corners])
         except InputError as error:
             self._begin(Explore.Goal())
             self._end(ExplorationStatus.CANCELLED, str(error))
@@ -139,25 +139,25 @@ class ExplorerNode(LiveNode):
     # What is heard.
 
     def _on_topology(self, message: TopologicalMap) -> None:
-        self._topology = messages.topology_from(message)
+        self._topology = messages.topology_from_msg(message)
 
     def _on_map(self, message: OccupancyGrid) -> None:
-        self._map.replace(messages.patch_from(message))
+        self._map.replace(messages.grid_from_msg(message))
 
     def _on_window(self, message: OccupancyGrid) -> None:
-        self._map.paste(messages.patch_from(message))
+        self._map.paste(messages.grid_from_msg(message))
         self._hears_windows = True
-        self._look(self._looks.right(messages.stamp_ns(message.header.stamp), True))
+        self._look(self._looks.add_right(messages.stamp_ns(message.header.stamp), True))
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
-        T_map_base = messages.pose_from(message.pose.pose)
-        self._take(self._matcher.right(messages.stamp_ns(message.header.stamp), T_map_base))
+        T_map_base = messages.pose_from_msg(message.pose.pose)
+        self._take(self._matcher.add_right(messages.stamp_ns(message.header.stamp), T_map_base))
 
     def _on_scan(self, message: LaserScan) -> None:
-        if self._mount.scan(message).is_blind:
+        if self._laser_transform.to_scan(message).is_blind:
             return  # as good as silent: what lies in its field of view was not looked at
         self._heard_at = self._now()
-        self._take(self._matcher.left(messages.stamp_ns(message.header.stamp), message))
+        self._take(self._matcher.add_left(messages.stamp_ns(message.header.stamp), message))
 
     def _on_slam_status(self, message: SlamStatus) -> None:
         # Silence is none of it: a localizer that is started again goes on from where it was.
@@ -170,10 +170,10 @@ class ExplorerNode(LiveNode):
 
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:
-            path = self._saves.inside(request.path)
+            path = self._save_directory.resolve(request.path)
             return f'saved {sessions.save_exploration(path, self._explorer)}'
 
-        return answer(response, save)
+        return fill_response(response, save)
 
     # What is done.
 
@@ -185,7 +185,7 @@ class ExplorerNode(LiveNode):
             return
         # What a scan shows is in its window, which may come much later: a look at an older map
         # shows nothing new.
-        self._look(self._looks.left(messages.stamp_ns(pair[0].header.stamp), pair))
+        self._look(self._looks.add_left(messages.stamp_ns(pair[0].header.stamp), pair))
 
     def _look(self, complete: tuple[tuple[LaserScan, Array], bool] | None) -> None:
         """Go on with a scan, made at a pose, that is in the map now."""
@@ -197,11 +197,11 @@ class ExplorerNode(LiveNode):
         self._odometer.add(self._T_map_base)
         if self._state != ExplorationStatus.EXPLORING:
             return
-        scan = self._mount.scan(message)
+        scan = self._laser_transform.to_scan(message)
         patch = (
             self._map.patch if len(self._polygon) < 3 else fenced(self._map.patch, self._polygon)
         )
-        with self.health.timed('explorer'):
+        with self.diagnostics.time_step('explorer'):
             self._decision = self._explorer.step(self._topology, patch, scan, self._T_map_base)
         self._publish_end_nodes(self._decision, message)
         if self._decision.finished:

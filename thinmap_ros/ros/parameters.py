@@ -21,10 +21,20 @@ from rclpy.parameter import Parameter
 from thinmap_ros.core.config import Config, parameters_of, with_values
 from thinmap_ros.core.errors import ConfigError
 
+# What describes the robot: one file may give it to all nodes, also to those that do not need it.
+ROBOT = (
+    'robot_radius_m',
+    'laser_pose',
+    'zero_is_no_return',
+    'map_frame',
+    'odom_frame',
+    'base_frame',
+)
+
 AnyConfig = TypeVar('AnyConfig', bound=Config)
 
 
-def declare(
+def declare_config(
     node: Node,
     config: type[AnyConfig],
     changed: Callable[[AnyConfig], None] | None = None,
@@ -65,7 +75,7 @@ class _Changes(Generic[AnyConfig]):
         self._free = free
         self._changed = changed
         node.add_on_set_parameters_callback(self._check)
-        node.add_post_set_parameters_callback(self._take)
+        node.add_post_set_parameters_callback(self._apply)
 
     def _with(self, given: list[Parameter]) -> AnyConfig:
         values = {
@@ -80,7 +90,7 @@ class _Changes(Generic[AnyConfig]):
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
-    def _take(self, given: list[Parameter]) -> None:
+    def _apply(self, given: list[Parameter]) -> None:
         new = self._with(given)
         if new != self._current:
             self._current = new
@@ -89,7 +99,7 @@ class _Changes(Generic[AnyConfig]):
             self._changed(new)
 
 
-def declare_value(node: Node, name: str, default: Any, description: str) -> Any:
+def declare_parameter(node: Node, name: str, default: Any, description: str) -> Any:
     """Declare one read-only parameter that belongs to the node itself, and return its value."""
     descriptor = ParameterDescriptor(description=description, read_only=True)
     try:
@@ -101,7 +111,7 @@ def declare_value(node: Node, name: str, default: Any, description: str) -> Any:
 def declare_session(node: Node) -> str:
     """Declare the parameter `session` and return its value."""
     return str(
-        declare_value(
+        declare_parameter(
             node, 'session', '', 'path STEM of a saved session to go on from; empty: begin anew'
         )
     )
@@ -110,7 +120,7 @@ def declare_session(node: Node) -> str:
 def declare_recovery(node: Node) -> float:
     """Declare the parameter `recover_s` and return its value."""
     return float(
-        declare_value(
+        declare_parameter(
             node,
             'recover_s',
             30.0,
@@ -119,14 +129,14 @@ def declare_recovery(node: Node) -> float:
     )
 
 
-def check_unknown(node: Node) -> None:
+def reject_unknown(node: Node) -> None:
     """Raise ConfigError where a parameter was given that the node does not have.
 
-    A typo must not go unseen. Where several nodes share a process, a parameter may be meant for
-    another one: the last of them raises.
+    A typo must not go unseen. Parameters of the robot are accepted by every node. Where several
+    nodes share a process, a parameter may be meant for another one: the last of them raises.
     """
     # rclpy has no public way to see what was given but never declared.
-    given = set(node._parameter_overrides)
+    given = set(node._parameter_overrides).difference(ROBOT)
     known = {name for name in node._parameters if not name.startswith('qos_overrides')}
     shared = _SHARED.get()
     if shared is not None:
@@ -161,7 +171,7 @@ _SHARED: ContextVar[_Shared | None] = ContextVar('shared', default=None)
 
 
 @contextmanager
-def shared_by(count: int) -> Iterator[None]:
+def shared_process(count: int) -> Iterator[None]:
     """Let so many nodes, made inside, share what parameters they are given."""
     token = _SHARED.set(_Shared(count) if count > 1 else None)
     try:

@@ -19,7 +19,7 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.core.slam.localizers import line_features
-from thinmap_ros.files.atomic import written_aside
+from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.replaying import replay, write_outputs
 from thinmap_ros.tools import cli
@@ -101,7 +101,7 @@ def _view(arguments: argparse.Namespace) -> Iterator[View | None]:
         return
     with ExitStack() as stack:
         aside = (
-            stack.enter_context(written_aside(arguments.recording)) if arguments.recording else None
+            stack.enter_context(atomic_write(arguments.recording)) if arguments.recording else None
         )
         view = View(aside, arguments.view)
         stack.callback(view.close)
