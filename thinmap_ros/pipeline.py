@@ -75,7 +75,9 @@ class Pipeline:
             estimate = self._locate(scan, T_odom_base)
         with self._timed('grid'):
             if estimate.correction is not None:
-                self.corrections += self._grid.correct(*self.localizer.past(), scan.stamp_ns)
+                self.corrections += self._grid.correct(
+                    *self.localizer.keyframe_trajectory(), scan.stamp_ns
+                )
             moved = self._grid.update(None if estimate.lost else scan, estimate.T_map_base)
         if moved is not None:
             self._rebuild(moved)

@@ -87,7 +87,7 @@ def write_outputs(
     poses = np.array(result.poses)
     folder.mkdir(parents=True, exist_ok=True)
     trajectories.write_tum(folder / 'trajectory.tum', result.stamps_ns, result.poses)
-    final = list(pipeline.localizer.corrected_path())
+    final = list(pipeline.localizer.optimized_trajectory())
     trajectories.write_tum(folder / 'trajectory_final.tum', result.stamps_ns, final)
     occupancy_maps.write_map(folder / 'map', patch)
     graphs.write_geojson(folder / 'topology.geojson', pipeline.topology.map)

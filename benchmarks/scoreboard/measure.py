@@ -208,6 +208,6 @@ def play(
     played = pipeline.played
     if not played.poses:
         raise InputError('no scan with odometry around its stamp')
-    played.final = pipeline.localizer.corrected_path()
+    played.final = pipeline.localizer.optimized_trajectory()
     played.peak_mb = peak_mb()
     return played

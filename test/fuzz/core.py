@@ -129,7 +129,7 @@ def localize(shared: None, rng: np.random.Generator, folder: Path) -> None:
             assert np.linalg.eigvalsh(estimate.covariance).min() > -1e-6
         if rng.random() < 0.1:
             set_topology(localizer, graph)
-    finite(localizer.corrected_path())
+    finite(localizer.optimized_trajectory())
     tried(lambda: kind.from_state(localizer.state(), config))
 
 

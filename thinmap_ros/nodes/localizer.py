@@ -204,7 +204,9 @@ class LocalizerNode(ThinmapNode):
             )
         else:
             kind = localizer_class(self._config)
-            self._localizer = kind.resumed(self._latched_map, last, T_odom_base, self._config)
+            self._localizer = kind.from_occupancy_map(
+                self._latched_map, last, T_odom_base, self._config
+            )
         if self._topology is not None:
             set_topology(self._localizer, self._topology)
         self._restored_pose = self._latched_map = None
@@ -270,7 +272,7 @@ class LocalizerNode(ThinmapNode):
 
         Before the first pose that follows from it.
         """
-        stamps, poses = self._localizer.past()
+        stamps, poses = self._localizer.keyframe_trajectory()
         self._trajectory.publish(
             messages.trajectory_msg(stamps.tolist(), poses, self._map_frame, ns)
         )

@@ -12,7 +12,7 @@ from thinmap_ros.core.ekf_slam.association import AssociationConfig, associate, 
 from thinmap_ros.core.ekf_slam.ekf import EkfSlam
 from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
 from thinmap_ros.core.ekf_slam.feature_map import FeatureConfig, FeatureMap
-from thinmap_ros.core.ekf_slam.features import Feature
+from thinmap_ros.core.ekf_slam.features import FeatureTrack
 from thinmap_ros.core.ekf_slam.line_extraction import LineConfig, Lines, extract_lines
 
 R = np.diag([0.02**2, 0.01**2])
@@ -58,7 +58,7 @@ def chosen(walls, seen, gap_m=0.3):
     for line, ends in zip(seen_lines(*walls).z, np.array(walls).reshape(-1, 2, 2), strict=True):
         ekf.add(line, 1e-6 * np.eye(2))
         along = ends @ [-math.sin(line[1]), math.cos(line[1])]
-        features.append(Feature(1, along.min(), along.max(), np.zeros(2)))
+        features.append(FeatureTrack(1, along.min(), along.max(), np.zeros(2)))
     return associate(
         ekf, features, seen_lines(*seen), np.zeros(2), AssociationConfig(max_gap_m=gap_m)
     ).index.tolist()
@@ -123,7 +123,7 @@ def test_the_two_faces_of_a_thin_wall_are_two_features():
     ekf.local.set_pose(np.array([4.0, 0.0, math.pi]), SURE)
     for _ in range(3):
         features.observe(ekf, seen_lines([[1.95, -2.0], [1.95, 2.0]]), BLIND)
-    faces = sorted(f.r_m for f in features.listed(ekf))
+    faces = sorted(f.r_m for f in features.line_features(ekf))
     assert faces == pytest.approx([2.0, 2.05], abs=0.01)
 
 
@@ -136,9 +136,9 @@ def test_a_feature_enters_after_several_sightings_and_keeps_its_id():
         features.observe(ekf, wall, BLIND)
         counts.append(len(features))
     assert counts == [0, 0, 1, 1, 1]
-    (only,) = features.listed(ekf)
+    (only,) = features.line_features(ekf)
     features.observe(ekf, seen_lines([[2.0, -1.0], [2.0, 2.5]]), BLIND)
-    (grown,) = features.listed(ekf)
+    (grown,) = features.line_features(ekf)
     assert grown.id == only.id
     assert {round(float(p[1]), 1) for p in (grown.start, grown.end)} == {-1.0, 2.5}
 
@@ -156,18 +156,18 @@ def test_what_was_seen_once_and_then_no_more_is_forgotten():
     for _ in range(5):
         features.observe(ekf, wall, BLIND)
     features.observe(ekf, passer_by, BLIND)
-    assert [round(f.r_m) for f in features.listed(ekf)] == [4]
+    assert [round(f.r_m) for f in features.line_features(ekf)] == [4]
 
 
 def test_two_features_that_turn_out_to_be_one_wall_merge():
     ekf, features = known(
         [[[2.0, -3.0], [2.0, -1.0]], [[2.0, 1.0], [2.0, 3.0]], [[-1.0, 2.0], [1.0, 2.0]]]
     )
-    first = min(f.id for f in features.listed(ekf))
+    first = min(f.id for f in features.line_features(ekf))
     assert len(features) == 3
     features.observe(ekf, seen_lines([[2.0, -1.5], [2.0, 1.5]]), BLIND)
     assert len(features) == 2 == len(ekf)
-    (long,) = [f for f in features.listed(ekf) if f.id == first]
+    (long,) = [f for f in features.line_features(ekf) if f.id == first]
     assert sorted([long.start[1], long.end[1]]) == pytest.approx([-3.0, 3.0], abs=0.02)
 
 
@@ -181,7 +181,7 @@ def test_a_drive_through_a_room_finds_its_walls_once(rng, local_areas):
         ekf.local.set_pose(truth, SURE)
         scan = scan_in(ROOM, truth, rng)
         features.observe(ekf, extract_lines(scan, LineConfig()), scan)
-    walls = [wall_of(feature) for feature in features.listed(ekf)]
+    walls = [wall_of(feature) for feature in features.line_features(ekf)]
     assert -1 not in walls
     assert len(walls) >= 7
     inner = (4, 5)  # these have two faces
@@ -205,9 +205,9 @@ def wall_of(feature):
 
 def test_features_follow_the_filter_not_the_robot():
     ekf, features = known([[[2.0, -1.0], [2.0, 1.0]]])
-    before = features.listed(ekf)[0]
+    before = features.line_features(ekf)[0]
     ekf.local.set_pose(se2.pose(1.0, 0.5, 0.3), SURE)
-    after = features.listed(ekf)[0]
+    after = features.line_features(ekf)[0]
     np.testing.assert_array_equal(before.start, after.start)
 
 
@@ -218,11 +218,11 @@ def test_a_door_that_opens_leaves_the_map_and_a_wall_behind_a_person_does_not():
     person = np.array([[1.0, -0.8, 1.0, 0.8], [*far[0], *far[1]]])
     for _ in range(10):
         features.observe(ekf, seen_lines(far), scan_in(person, np.zeros(3)))
-    assert sorted(round(f.r_m) for f in features.listed(ekf)) == [2, 5]
+    assert sorted(round(f.r_m) for f in features.line_features(ekf)) == [2, 5]
     for _ in range(FeatureConfig().max_misses):
         assert len(features) == 2
         features.observe(ekf, seen_lines(far), scan_in(person[1:], np.zeros(3)))
-    left = features.listed(ekf)
+    left = features.line_features(ekf)
     assert [round(f.r_m) for f in left] == [5] == [f.id + 3 for f in left]
     assert len(ekf) == 1
 

@@ -73,7 +73,7 @@ def nees_of_a_run(seed, local_areas, looks):
         measured = increment + rng.multivariate_normal(np.zeros(3), Q)
         ekf.local.predict(se2.compose(ekf.local.pose, measured), measured, Q)
         features.observe(ekf, look(rng, truth), BLIND)
-        ekf.work_off()
+        ekf.flush_step()
         error = ekf.local.pose - truth
         error[2] = se2.wrap(float(error[2]))
         found.append(error @ np.linalg.solve(ekf.local.pose_covariance, error))

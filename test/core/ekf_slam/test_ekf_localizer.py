@@ -92,9 +92,9 @@ def test_without_mapping_no_feature_comes_grows_or_goes():
 
 def test_it_goes_on_after_a_restart_where_odometry_leads():
     last = LastPose(0, se2.pose(1.0, 2.0, 0.5), se2.pose(1.0, 0.0, 0.0))
-    resumed = EkfLocalizer.resumed(None, last, se2.pose(2.0, 0.0, 0.0))
+    from_occupancy_map = EkfLocalizer.from_occupancy_map(None, last, se2.pose(2.0, 0.0, 0.0))
     expected = se2.compose(last.T_map_odom, se2.pose(2.0, 0.0, 0.0))
-    np.testing.assert_allclose(resumed.pose, expected)
+    np.testing.assert_allclose(from_occupancy_map.pose, expected)
 
 
 def test_input_that_makes_no_sense_is_refused():
@@ -114,7 +114,7 @@ def test_input_that_makes_no_sense_is_refused():
 def test_its_path_is_what_it_said():
     localizer = at_start()
     errors, _ = driven(localizer, 50)
-    assert localizer.corrected_path().shape == errors.shape
-    np.testing.assert_array_equal(localizer.corrected_path()[-1], localizer.pose)
-    stamps, poses = localizer.past()
+    assert localizer.optimized_trajectory().shape == errors.shape
+    np.testing.assert_array_equal(localizer.optimized_trajectory()[-1], localizer.pose)
+    stamps, poses = localizer.keyframe_trajectory()
     assert (stamps.shape, poses.shape) == ((0,), (0, 3))

@@ -92,11 +92,11 @@ def test_a_drive_round_the_room_stays_on_its_path(whole_drive):
 
 def test_the_whole_path_is_told_afterwards(whole_drive):
     rows, localizer = whole_drive
-    path = localizer.corrected_path()
+    path = localizer.optimized_trajectory()
     assert path.shape == (len(rows), 3)
     truths = np.array([truth for truth, *_ in rows])
     assert np.sqrt(np.mean(np.square((path - truths)[:, :2]).sum(axis=1))) < 0.06
-    stamps, past = localizer.past()
+    stamps, past = localizer.keyframe_trajectory()
     assert (np.diff(stamps) > 0).all()
     off = (past - truths[stamps // PERIOD_NS])[:, :2]
     assert np.hypot(*off.T).max() < 0.1
@@ -108,7 +108,7 @@ def test_the_whole_path_is_told_afterwards(whole_drive):
 
 def test_the_whole_path_is_within_4_cm(whole_drive):
     rows, localizer = whole_drive
-    off = (localizer.corrected_path() - np.array([truth for truth, *_ in rows]))[:, :2]
+    off = (localizer.optimized_trajectory() - np.array([truth for truth, *_ in rows]))[:, :2]
     assert np.sqrt(np.mean(np.square(off).sum(axis=1))) < 0.04
 
 
@@ -474,17 +474,20 @@ def test_a_robot_that_is_carried_off_begins_a_new_map_and_says_so():
     rows, localizer = driven(300)
     before = len(localizer.keyframes)
     there = np.array([1.0, 2.0, 0.5])
-    carried = on(localizer, 60, there, rows[-1][2], rng, ELSEWHERE)
-    lost = [estimate.lost for _, estimate, _ in carried]
+    propagated_covariance = on(localizer, 60, there, rows[-1][2], rng, ELSEWHERE)
+    lost = [estimate.lost for _, estimate, _ in propagated_covariance]
     assert not any(estimate.lost for _, estimate, _ in rows)
     assert any(lost[:45])
     assert lost[-1], 'where the new map lies is not known'
-    assert carried[-1][1].match_quality > 0.9, 'it fits the new map'
-    assert carried[-1][1].covariance[0, 0] > 100.0
+    assert propagated_covariance[-1][1].match_quality > 0.9, 'it fits the new map'
+    assert propagated_covariance[-1][1].covariance[0, 0] > 100.0
     assert len(localizer.keyframes) > before
     # In the new map it goes on as ever.
-    steps = [se2.between(a[0], b[0]) for a, b in pairwise(carried[-20:])]
-    found = [se2.between(a[1].T_map_base, b[1].T_map_base) for a, b in pairwise(carried[-20:])]
+    steps = [se2.between(a[0], b[0]) for a, b in pairwise(propagated_covariance[-20:])]
+    found = [
+        se2.between(a[1].T_map_base, b[1].T_map_base)
+        for a, b in pairwise(propagated_covariance[-20:])
+    ]
     np.testing.assert_allclose(found, steps, atol=0.06)
 
 
@@ -521,7 +524,7 @@ def test_a_robot_that_is_brought_back_knows_its_path():
     rng = np.random.default_rng(8)
     rows, localizer = driven(300)
     on(localizer, 60, np.array([1.0, 2.0, 0.5]), rows[-1][2], rng, ELSEWHERE)
-    path = localizer.corrected_path()
+    path = localizer.optimized_trajectory()
     truths = np.array([truth for truth, *_ in rows])
     assert np.hypot(*(path[:300] - truths)[:, :2].T).max() < 0.1
 
@@ -568,7 +571,7 @@ def test_after_a_reset_everything_is_forgotten():
     rows, localizer = driven(200)
     localizer.reset()
     assert not localizer.keyframes
-    assert localizer.corrected_path().shape == (0, 3)
+    assert localizer.optimized_trajectory().shape == (0, 3)
     estimate = localizer.step(scan_in(ROOM, START), rows[-1][2])
     np.testing.assert_allclose(estimate.T_map_base, START)
 
@@ -661,7 +664,7 @@ def test_a_killed_localizer_goes_on_in_the_occupancy_map(slip):
             if k == 450:
                 began = odom
                 began_slipped = se2.compose(odom, off)
-                localizer = Localizer.resumed(grid.patch(), last, began_slipped, config)
+                localizer = Localizer.from_occupancy_map(grid.patch(), last, began_slipped, config)
             slipped = se2.compose(began_slipped, se2.between(began, odom))
             rows.append((truth, localizer.step(scan, slipped), odom))
     assert not rows[-1][1].lost
@@ -717,7 +720,7 @@ def test_a_loop_is_closed_while_the_robot_drives(round_the_block):
     closed = [k for k, (_, estimate, _) in enumerate(rows) if estimate.correction is not None]
     assert off[: closed[0]].max() > 0.3, 'without drift there is nothing to close'
     assert off[closed[-1] :].max() < 0.25
-    path = localizer.corrected_path()
+    path = localizer.optimized_trajectory()
     assert path.shape == (len(rows), 3)
     corrected = np.hypot(*(path - np.array([truth for truth, *_ in rows]))[:, :2].T)
     assert corrected.max() < 0.8 * off.max()

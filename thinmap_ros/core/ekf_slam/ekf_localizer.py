@@ -103,7 +103,7 @@ class EkfLocalizer:
     @property
     def features(self) -> list[LineFeature]:
         """The line features of the map."""
-        return self._features.listed(self._filter)
+        return self._features.line_features(self._filter)
 
     def set_topology(self, topology: TopologicalMap) -> None:
         """Take the topological map by which features are stored."""
@@ -139,7 +139,7 @@ class EkfLocalizer:
         return localizer
 
     @staticmethod
-    def resumed(
+    def from_occupancy_map(
         patch: GridPatch, last: LastPose, T_odom_base: Array, config: EkfConfig | None = None
     ) -> 'EkfLocalizer':
         """EkfLocalizer that goes on at T_odom_base (3,) after its last pose, with new features.
@@ -168,7 +168,7 @@ class EkfLocalizer:
             )
             self._refused += not is_valid
             self._is_observation_due = False  # the same scan again tells no more
-        self._filter.work_off()
+        self._filter.flush_step()
         self._path.extend(self.pose.tolist())
         return Estimate(
             self.pose,
@@ -180,11 +180,11 @@ class EkfLocalizer:
             len(self._filter.area),
         )
 
-    def corrected_path(self) -> Array:
+    def optimized_trajectory(self) -> Array:
         """Poses (N, 3) of all steps; a filter corrects none of the past."""
         return np.array(self._path, dtype=np.float64).reshape(-1, 3)
 
-    def past(self) -> tuple[NDArray[np.int64], Array]:
+    def keyframe_trajectory(self) -> tuple[NDArray[np.int64], Array]:
         """Stamps (0,) and poses (0, 3): nothing of the past is ever corrected."""
         return np.empty(0, dtype=np.int64), np.empty((0, 3))
 

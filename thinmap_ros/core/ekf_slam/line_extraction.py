@@ -101,7 +101,7 @@ class Lines:
     def __len__(self) -> int:
         return len(self.z)
 
-    def chosen(self, which: NDArray[np.int64]) -> 'Lines':
+    def select(self, which: NDArray[np.int64]) -> 'Lines':
         """Those at some indices (M,)."""
         return Lines(self.z[which], self.covariances[which], self.ends[which])
 

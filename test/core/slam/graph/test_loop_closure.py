@@ -8,7 +8,13 @@ from support.slam_room import RANGE_MAX_M, ROOM, corridor_ring, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam.graph import loop_closure as module
-from thinmap_ros.core.slam.graph.keyframes import Keyframe, KeyframeConfig, carried, inverse, turned
+from thinmap_ros.core.slam.graph.keyframes import (
+    Keyframe,
+    KeyframeConfig,
+    inverse,
+    propagated_covariance,
+    turned,
+)
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosure, LoopClosureConfig
 from thinmap_ros.core.slam.graph.pose_graph import Edge
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
@@ -69,16 +75,18 @@ class Driver:
             before = self.pose
             self.pose = se2.compose(before, step + noise)
             own = turned(STEP, float(before[2]))
-            self.covariance = carried(self.covariance, self.pose[:2] - before[:2]) + own
+            self.covariance = (
+                propagated_covariance(self.covariance, self.pose[:2] - before[:2]) + own
+            )
         self.truths.append(truth)
         self.largest = max(self.largest, float(np.hypot(*(self.pose - truth)[:2])))
         scan = scan_in(self.walls, truth, self.rng, len(self.truths) - 1)
         points = surface_points(scan, RANGE_MAX_M)
         frame = Keyframe(scan, points, self.pose, self.path_m(), self.covariance, 0)
-        if len(points) >= FEWEST_POINTS and self.loops.is_due(self.pose):
+        if len(points) >= FEWEST_POINTS and self.loops.needs_keyframe(self.pose):
             self.loops.add(frame, STEP, NONE)
         for _ in range(works):
-            correction = self.loops.work()
+            correction = self.loops.step()
             if correction is not None:
                 self.corrections.append(correction)
                 anchor = self.loops.keyframes.anchor
@@ -176,7 +184,7 @@ def straight():
     for k, pose in enumerate(poses):
         scan = scan_in(ROOM, pose, stamp_ns=k)
         frame = Keyframe(scan, surface_points(scan, RANGE_MAX_M), pose, float(k), NONE, 0)
-        loops.keyframes.keep(frame, STEP)
+        loops.keyframes.add(frame, STEP)
     return loops
 
 
@@ -211,7 +219,7 @@ def test_matches_that_contradict_each_other_close_nothing(straight, rng):
         off = np.array([3.0 * np.cos(2.0 * k), 3.0 * np.sin(2.0 * k), 0.3 * k])
         straight._requested.append(edge_to(straight, k, 22 - k, off))
     assert len(straight._consistent()) == 1
-    assert straight.work() is None
+    assert straight.step() is None
     assert straight._rounds is None
     assert not straight.edges
 
@@ -244,7 +252,7 @@ def test_a_step_does_one_match_or_one_round(monkeypatch):
         driver.go(truth, works=0)
         for _ in range(4):
             before = sum(counts.values())
-            correction = driver.loops.work()
+            correction = driver.loops.step()
             assert sum(counts.values()) - before <= 1
             if correction is not None:
                 driver.corrections.append(correction)
@@ -253,9 +261,9 @@ def test_a_step_does_one_match_or_one_round(monkeypatch):
     assert counts['rounds'] > 1
     # All is done at some time.
     for _ in range(100):
-        driver.loops.work()
+        driver.loops.step()
     before = dict(counts)
-    assert driver.loops.work() is None
+    assert driver.loops.step() is None
     assert counts == before
 
 
@@ -264,13 +272,13 @@ def test_a_robot_that_stands_about_keeps_one_scan(rng):
     kept = 0
     for k in range(50):
         pose = np.array([2.0, 2.0, 0.0]) + rng.normal(0.0, 0.1, 3)
-        if loops.is_due(pose):
+        if loops.needs_keyframe(pose):
             scan = scan_in(ROOM, pose, rng, k)
             loops.add(
                 Keyframe(scan, surface_points(scan, RANGE_MAX_M), pose, 0.0, NONE, 0), STEP, NONE
             )
             kept += 1
-        loops.work()
+        loops.step()
     assert kept == 1
     assert loops.finish().shape == (1, 3)
 
@@ -295,7 +303,7 @@ def test_what_has_jumped_is_measured_anew(rng):
         scan = scan_in(ROOM[:4] / 2.0, truths[k], rng, k, beams=361)
         points = surface_points(scan, RANGE_MAX_M)
         loops.add(Keyframe(scan, points, told[k], float(k), STEP + jump, 0), STEP, jump)
-        loops.work()
+        loops.step()
     assert [(edge.a, edge.b) for edge in loops.edges] == [(1, 2)]
     T = se2.between(truths[1], truths[2])
     np.testing.assert_allclose(loops.edges[0].T_a_b, T, atol=0.05)
@@ -322,13 +330,13 @@ def test_an_edge_to_what_is_seen_again_holds_the_errors_of_step_and_match(rng):
         scan = scan_in(ROOM, pose, stamp_ns=k)
         frames.append(Keyframe(scan, surface_points(scan, RANGE_MAX_M), pose, 10.0 * k, NONE, 0))
     for frame in frames[:2]:
-        loops.keyframes.keep(frame, STEP)
+        loops.keyframes.add(frame, STEP)
     by_match = np.diag(np.square([0.02, 0.01, 0.05]))
     by_step = np.diag([4e-4, 1e-4, 4e-4])
     loops._pending = (frames[2], by_step)
     T_j_here = se2.between(poses[0], poses[2])
     T_a_here = se2.between(poses[1], poses[2])
-    loops._agree(Edge(0, 2, T_j_here, inverse(by_match), True))
+    loops._confirm(Edge(0, 2, T_j_here, inverse(by_match), True))
     edge = loops.edges[0]
     assert (edge.a, edge.b) == (1, 0)
     assert loops.keyframes.anchor == 0

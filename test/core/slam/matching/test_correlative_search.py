@@ -37,11 +37,11 @@ class Exhaustive:
     def costs(self, scan, poses, prior, information):
         """Costs (P,) of a scan (N, 3) at poses (P, 3), with that of the prior."""
         parts = np.array_split(poses, 1 + len(poses) // 2000)
-        by_scan = np.concatenate([self._of_points(scan, part) for part in parts])
+        scan_information = np.concatenate([self._of_points(scan, part) for part in parts])
         off = poses - prior
         off[:, 2] = se2.wrap(off[:, 2])
         squared = np.einsum('ni,ij,nj->n', off, information, off)
-        return by_scan + cauchy(squared, SLIP_SIGMAS)
+        return scan_information + cauchy(squared, SLIP_SIGMAS)
 
     def _of_points(self, scan, poses):
         c = np.cos(poses[:, 2:])

@@ -22,10 +22,10 @@ from thinmap_ros.core.slam.graph.keyframes import (
     Keyframe,
     KeyframeConfig,
     Keyframes,
-    carried,
     inverse,
-    turned,
-    unlike,
+    propagated_covariance,
+    rotated_covariance,
+    view_difference_m,
 )
 from thinmap_ros.core.slam.graph.pose_graph import Edge, optimized, rounds
 from thinmap_ros.core.slam.graph.submaps import AGAIN_M, Submaps
@@ -114,10 +114,10 @@ class LoopClosure:
         self._rounds: Iterator[Array] | None = None
         self._after: Array = np.zeros((0, 3))
 
-    def is_due(self, T_map_base: Array) -> bool:
+    def needs_keyframe(self, T_map_base: Array) -> bool:
         """Whether a scan at a pose (3,) is to be the next keyframe."""
         last = self._here
-        return last is None or self.keyframes.are_apart(last.T_map_base, T_map_base)
+        return last is None or self.keyframes.differ(last.T_map_base, T_map_base)
 
     def path_m(self, T_map_base: Array) -> float:
         """Length of the path up to a pose (3,), m, in straight lines between keyframes."""
@@ -132,7 +132,7 @@ class LoopClosure:
         jump (3, 3): what comes on top where scans and motion contradicted each other on the way;
         the step is then measured anew, by the keyframes before. The frame is the anchor's.
         """
-        self._settle()
+        self._add_pending()
         self._pending = (frame, step_covariance + jump)
         self._here = frame
         jumped = bool(jump.any()) and len(self.keyframes) > 0
@@ -140,21 +140,21 @@ class LoopClosure:
             anchor = self.keyframes.anchor
             theta = float(self.keyframes.frames[anchor].T_map_base[2])
             self._jobs.append(
-                _Job(anchor, len(self.keyframes), turned(step_covariance + jump, theta))
+                _Job(anchor, len(self.keyframes), rotated_covariance(step_covariance + jump, theta))
             )
         recent = None if jumped else self._recent_alike(frame)
         if recent is not None:
-            self._reuse(recent)
+            self._reuse_keyframe(recent)
             return
         self._jobs.extend(self._earlier_visits(frame))
         if jumped:
-            self._settle()
+            self._add_pending()
         if not self._is_pending_matched():
-            self._settle()
+            self._add_pending()
 
     def _recent_alike(self, frame: Keyframe) -> int | None:
         """A keyframe of this visit that sees about the same."""
-        j = self.keyframes.alike(frame.T_map_base)
+        j = self.keyframes.most_similar(frame.T_map_base)
         if j is None or self.keyframes.frames[j].submap != frame.submap:
             return None
         return j if frame.path_m - self.keyframes.frames[j].path_m < AGAIN_M else None
@@ -173,7 +173,7 @@ class LoopClosure:
         for i, (j, covariance) in enumerate(zip(near, covariances, strict=True)):
             sigma = math.sqrt(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
             if math.dist(frames[j].T_map_base[:2], here.T_map_base[:2]) <= self._reach_m(sigma):
-                ranked.append((unlike(frames[j].T_map_base, here.T_map_base), i))
+                ranked.append((view_difference_m(frames[j].T_map_base, here.T_map_base), i))
         ranked.sort()
         found: list[_Job] = []
         for _, i in ranked:
@@ -197,23 +197,26 @@ class LoopClosure:
         poses = keyframes.poses()
         anchor = keyframes.anchor
         there = keyframes.covariances_from(anchor, poses, self.edges)
-        step = turned(self._pending[1], float(poses[anchor, 2]))
+        step = rotated_covariance(self._pending[1], float(poses[anchor, 2]))
         lever = here.T_map_base[:2] - poses[anchor, :2]
-        back = [carried(there[j], poses[anchor, :2] - poses[j, :2]) for j in near]
+        back = [propagated_covariance(there[j], poses[anchor, :2] - poses[j, :2]) for j in near]
         drift = [_drift(here.path_m - keyframes.frames[j].path_m) for j in near]
-        return [carried(there, lever) + step + own for there, own in zip(back, drift, strict=True)]
+        return [
+            propagated_covariance(there, lever) + step + own
+            for there, own in zip(back, drift, strict=True)
+        ]
 
-    def work(self) -> Correction | None:
+    def step(self) -> Correction | None:
         """Do one match that is due, or one round of the optimization; to be called once a step."""
         if self._rounds is not None:
             return self._optimize()
         if self._jobs:
             self._match(self._jobs.popleft())
             if not self._is_pending_matched():
-                self._settle()
+                self._add_pending()
             consistent = self._consistent()
             if len(consistent) >= self._config.min_consistent_matches:
-                self._settle()
+                self._add_pending()
                 self._requested.clear()
                 self.edges += consistent
                 self._begin_rounds()
@@ -282,35 +285,35 @@ class LoopClosure:
         config = self._config
         floor = np.diag(np.square([2.0 * config.noise_m] * 2 + [2.0 * config.noise_rad]))
         prior = se2.between(base, here.T_map_base)
-        relative = turned(job.covariance, -float(base[2])) + floor
+        relative = rotated_covariance(job.covariance, -float(base[2])) + floor
         match = self._matcher.match(here.points, here.scan.T_base_laser, submap, prior, relative)
-        if match.fit < config.min_inlier_ratio:
+        if match.inlier_ratio < config.min_inlier_ratio:
             return
         own = np.diag(np.square([config.noise_m] * 2 + [config.noise_rad]))
-        covariance = inverse(match.by_scan + 1e-3 * np.eye(3)) + own
+        covariance = inverse(match.scan_information + 1e-3 * np.eye(3)) + own
         off = se2.off(match.T_map_base, prior)
         if float(off @ np.linalg.solve(relative + covariance, off)) > _CHI2:
             return
         T_j_base = se2.between(frames[j].T_map_base, base)
-        covariance = turned(covariance, float(T_j_base[2]))
+        covariance = rotated_covariance(covariance, float(T_j_base[2]))
         T_j_k = se2.compose(T_j_base, match.T_map_base)
         edge = Edge(j, k, T_j_k, inverse(covariance), True)
         if is_step:
             self.edges.append(edge)
             self._is_strained |= self._mahalanobis(edge) > _CHI2
         elif self._mahalanobis(edge) < _CHI2:
-            self._agree(edge)
+            self._confirm(edge)
         else:
             self._requested.append(edge)
 
-    def _agree(self, edge: Edge) -> None:
+    def _confirm(self, edge: Edge) -> None:
         """A match says that old and new map agree here."""
         here = self._frame(edge.b)
         self._requested.clear()
         if self._is_strained:
             # The robot has slid onto the old map: the loop is closed, the path up to it is bent.
             self._is_strained = False
-            self._settle()
+            self._add_pending()
             self.edges.append(edge)
             self._begin_rounds()
             return
@@ -318,21 +321,19 @@ class LoopClosure:
         if (
             pending is not None
             and edge.b == len(self.keyframes)
-            and not self.keyframes.are_apart(
-                self.keyframes.frames[edge.a].T_map_base, here.T_map_base
-            )
+            and not self.keyframes.differ(self.keyframes.frames[edge.a].T_map_base, here.T_map_base)
         ):
             anchor = self.keyframes.anchor
             if anchor != edge.a:
                 T_a_here = se2.between(self.keyframes.frames[anchor].T_map_base, here.T_map_base)
                 T_a_j = se2.compose(T_a_here, se2.invert(edge.T_a_b))
-                covariance = turned(inverse(edge.information), float(T_a_j[2]))
+                covariance = rotated_covariance(inverse(edge.information), float(T_a_j[2]))
                 lever = T_a_j[:2] - T_a_here[:2]
-                covariance = carried(covariance + pending[1], lever)
+                covariance = propagated_covariance(covariance + pending[1], lever)
                 self.edges.append(Edge(anchor, edge.a, T_a_j, inverse(covariance), True))
-            self._reuse(edge.a)
+            self._reuse_keyframe(edge.a)
             return
-        self._settle()
+        self._add_pending()
         self.edges.append(edge)
 
     def _mahalanobis(self, edge: Edge) -> float:
@@ -384,14 +385,14 @@ class LoopClosure:
         """Whether matches of the pending keyframe are due."""
         return bool(self._jobs) and self._jobs[-1].k == len(self.keyframes)
 
-    def _settle(self) -> None:
+    def _add_pending(self) -> None:
         """Make the pending keyframe one, if there is one."""
         if self._pending is not None:
             frame, covariance = self._pending
             self._pending = None
-            self.keyframes.keep(frame, covariance)
+            self.keyframes.add(frame, covariance)
 
-    def _reuse(self, j: int) -> None:
+    def _reuse_keyframe(self, j: int) -> None:
         """Have an earlier keyframe stand for the pending one."""
         assert self._pending is not None
         frame, _ = self._pending
@@ -404,7 +405,7 @@ class LoopClosure:
         """Do all matches that are due; poses (N, 3) of the keyframes that agree best with all."""
         while self._jobs:
             self._match(self._jobs.popleft())
-        self._settle()
+        self._add_pending()
         return optimized(self.keyframes.poses(), self._all_edges)
 
 

@@ -86,7 +86,7 @@ class LocalMapConfig(Config):
     )
 
 
-class Lattice(NamedTuple):
+class LocalMapView(NamedTuple):
     """The cells as kernels take them.
 
     pool: tiles of cells, CELL; directory: the slot of each tile, or NO_TILE; first_row, first_col:
@@ -114,10 +114,10 @@ class LocalMap:
         return self.tiles.used == 0
 
     @property
-    def lattice(self) -> Lattice:
+    def lattice(self) -> LocalMapView:
         """The cells as kernels take them, until the map grows."""
         tiles = self.tiles
-        return Lattice(
+        return LocalMapView(
             tiles.pool,
             tiles.directory,
             tiles.first_row * TILE,
@@ -236,7 +236,7 @@ def cell_of(at: float) -> int:
 
 
 @inlined
-def slot_of(lattice: Lattice, row: int, col: int) -> int:
+def slot_of(lattice: LocalMapView, row: int, col: int) -> int:
     """Slot of the tile with a cell, counted from the first one, or NO_TILE."""
     tile_row = row >> _SHIFT
     tile_col = col >> _SHIFT
@@ -248,7 +248,7 @@ def slot_of(lattice: Lattice, row: int, col: int) -> int:
 
 
 @inlined
-def off_wall(lattice: Lattice, x: float, y: float) -> tuple[bool, bool, float, float, Any]:
+def off_wall(lattice: LocalMapView, x: float, y: float) -> tuple[bool, bool, float, float, Any]:
     """What a point (x, y), in cells, is off its nearest wall.
 
     Returns whether a beam has met or crossed the point's cell, whether a wall is within reach, what
@@ -270,7 +270,7 @@ def off_wall(lattice: Lattice, x: float, y: float) -> tuple[bool, bool, float, f
 
 
 @kernel
-def _distances(points: Array, lattice: Lattice) -> Array:
+def _distances(points: Array, lattice: LocalMapView) -> Array:
     """Distances (N,) of points (N, 2) from the means of their nearest walls, m."""
     found = np.full(len(points), lattice.reach * lattice.cell_m)
     for i in range(len(points)):
@@ -327,7 +327,9 @@ def _observe(cell: Any, hit: int) -> None:
 
 
 @kernel
-def _add(points: Array, laser: Array, T_map_base: Array, lattice: Lattice, share: float) -> None:
+def _add(
+    points: Array, laser: Array, T_map_base: Array, lattice: LocalMapView, share: float
+) -> None:
     """Count what beams went through, then where they ended; update the nearest walls."""
     cos = math.cos(T_map_base[2])
     sin = math.sin(T_map_base[2])
@@ -385,7 +387,9 @@ def _learn_surface(cell: Any, x: float, y: float, normal: tuple[float, float, fl
 
 
 @kernel
-def _hit(points: Array, laser: Array, T_map_base: Array, lattice: Lattice, share: float) -> None:
+def _hit(
+    points: Array, laser: Array, T_map_base: Array, lattice: LocalMapView, share: float
+) -> None:
     """Count the points that beams met."""
     cos = math.cos(T_map_base[2])
     sin = math.sin(T_map_base[2])
@@ -419,7 +423,7 @@ def _hit(points: Array, laser: Array, T_map_base: Array, lattice: Lattice, share
 @kernel
 def _lead(
     corners: NDArray[np.int64],
-    lattice: Lattice,
+    lattice: LocalMapView,
     share: float,
 ) -> None:
     """Have all cells of tiles with first cells (N, 2) know their nearest walls."""
@@ -434,7 +438,7 @@ def _lead(
 
 
 @kernel
-def _appear(lattice: Lattice, row: int, col: int) -> None:
+def _appear(lattice: LocalMapView, row: int, col: int) -> None:
     """A cell has become a wall: those around to which it is the nearest lead there."""
     for down in range(-lattice.reach, lattice.reach + 1):
         for right in range(-lattice.reach, lattice.reach + 1):
@@ -451,7 +455,7 @@ def _appear(lattice: Lattice, row: int, col: int) -> None:
 
 
 @kernel
-def _vanish(lattice: Lattice, gone: list[tuple[int, int]], share: float) -> None:
+def _vanish(lattice: LocalMapView, gone: list[tuple[int, int]], share: float) -> None:
     """Cells are walls no more: those that led there take the nearest wall of their neighbours."""
     led = [(0, 0) for _ in range(0)]
     for row, col in gone:
@@ -476,7 +480,7 @@ def _vanish(lattice: Lattice, gone: list[tuple[int, int]], share: float) -> None
 
 
 @inlined
-def _ask(lattice: Lattice, row: int, col: int) -> bool:
+def _ask(lattice: LocalMapView, row: int, col: int) -> bool:
     """Whether one of its neighbours knows a nearer wall for a cell, which leads there then."""
     changed = False
     cell = lattice.pool[slot_of(lattice, row, col), row & _MASK, col & _MASK]

@@ -76,16 +76,16 @@ class MatchingConfig(Config):
 class Match:
     """A pose T_map_base (3,) with covariance (3, 3), map frame, of scan and prior together.
 
-    by_scan (3, 3): information of the scan alone; fit: share of the points on walls; contradicted:
-    share that lies where others have seen that nothing is; cost: what was minimized;
+    scan_information (3, 3): of the scan alone; inlier_ratio: of points on walls;
+    contradiction_ratio: of points in cells that others have observed to be free; cost: the minimum;
     prior_weight: of the prior in it, less than 1 where the pose is an outlier to it.
     """
 
     T_map_base: Array
     covariance: Array
-    by_scan: Array
-    fit: float
-    contradicted: float
+    scan_information: Array
+    inlier_ratio: float
+    contradiction_ratio: float
     cost: float
     prior_weight: float
 
@@ -112,7 +112,7 @@ class Matcher:
         information = inverse(covariance)
         match = self._refined(scan, local_map, prior, prior, information)
         reach = _SIGMAS * np.sqrt(np.diag(covariance))
-        fits_badly = match.fit < self.config.min_inlier_ratio
+        fits_badly = match.inlier_ratio < self.config.min_inlier_ratio
         is_wide = max(reach[0], reach[1]) > _BASIN[0] or reach[2] > _BASIN[1]
         if not fits_badly and not is_wide:
             return match
@@ -141,15 +141,15 @@ class Matcher:
     def _refined(
         self, scan: Array, local_map: LocalMap, start: Array, prior: Array, information: Array
     ) -> Match:
-        pose, by_scan, sums, weight = minimize(
+        pose, scan_information, sums, weight = minimize(
             scan, start, prior, information, local_map.lattice, *self._noise
         )
         cost, total, fitting, in_the_open, _ = sums.tolist()
-        covariance = np.linalg.inv(by_scan + weight * information)
+        covariance = np.linalg.inv(scan_information + weight * information)
         return Match(
             pose,
             np.asarray(covariance),
-            by_scan,
+            scan_information,
             fitting / max(total, 1e-9),
             in_the_open / max(total, 1e-9),
             cost,
