@@ -165,7 +165,7 @@ def start(name: str, parameters: str) -> psutil.Popen:
 
 def start_all(world: str, at: np.ndarray, rate: float, seed: int) -> dict[str, psutil.Popen]:
     """Start nodes and simulator; returns the nodes, and the simulator as `sim`."""
-    pose = f'start_x_m:={at[0]} start_y_m:={at[1]} start_yaw_rad:={at[2]}'
+    pose = f'initial_x_m:={at[0]} initial_y_m:={at[1]} initial_yaw_rad:={at[2]}'
     found = {
         name: start(name, f'use_sim_time:=true {pose if name == "localizer" else ""}')
         for name in _NODES

@@ -15,7 +15,7 @@ from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
+from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.sim.coverage import Coverable
 from thinmap_ros.sim.laser import Lms200Config
@@ -232,7 +232,7 @@ def make_loop(
     """Make all parts by the options. Raises ConfigError where there is no such strategy."""
     simulation = Simulation(world, start, PRESETS[options.robot], options.laser, options.seed)
     x, y, theta = (float(number) for number in start)
-    localizer = ScanLocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=theta)
+    localizer = LocalizerConfig(initial_x_m=x, initial_y_m=y, initial_yaw_rad=theta)
     source = ground_truth_poses(simulation) if options.localization == 'truth' else None
     # A beam without return has observed free space up to the laser's range.
     grid = OccupancyConfig(no_return_range_m=options.laser.range_max_m)

@@ -12,7 +12,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.scan_history import MovedPoses
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
+from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.core.slam.localizers import localizer_class, set_topology
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
 
@@ -24,7 +24,7 @@ class PipelineConfig:
     scans_per_graph: the graph is brought up to date with every so many scans.
     """
 
-    localizer: ScanLocalizerConfig = field(default_factory=ScanLocalizerConfig)
+    localizer: LocalizerConfig = field(default_factory=LocalizerConfig)
     grid: OccupancyConfig = field(default_factory=OccupancyConfig)
     window: WindowConfig = field(default_factory=WindowConfig)
     topology: TopologyConfig = field(default_factory=TopologyConfig)
@@ -75,7 +75,9 @@ class Pipeline:
             estimate = self._locate(scan, T_odom_base)
         with self._timed('grid'):
             if estimate.correction is not None:
-                self.corrections += self._grid.correct(*self.localizer.past(), scan.stamp_ns)
+                self.corrections += self._grid.correct(
+                    *self.localizer.keyframe_trajectory(), scan.stamp_ns
+                )
             moved = self._grid.update(None if estimate.lost else scan, estimate.T_map_base)
         if moved is not None:
             self._rebuild(moved)

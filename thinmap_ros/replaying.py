@@ -17,7 +17,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizers import line_features
 from thinmap_ros.files import graphs, occupancy_maps, trajectories
 from thinmap_ros.files.atomic import write_text
-from thinmap_ros.kernels.memory import give_back_pages, release_compiler_pages
+from thinmap_ros.kernels.memory import compiler_memory_releaser, release_compiler_pages
 from thinmap_ros.logs.log import Log, OdometryEvent
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.view import figures
@@ -54,7 +54,7 @@ def replay(
     """
     result = Replay(Pipeline(config))
     pairing = ScanPairing()
-    tidy_up = give_back_pages()
+    tidy_up = compiler_memory_releaser()
     for event in tqdm(log.events(), unit=' events', disable=not show_progress):
         if isinstance(event, OdometryEvent):
             ready = pairing.add_odometry(event.stamp_ns, event.T_odom_base)
@@ -87,7 +87,7 @@ def write_outputs(
     poses = np.array(result.poses)
     folder.mkdir(parents=True, exist_ok=True)
     trajectories.write_tum(folder / 'trajectory.tum', result.stamps_ns, result.poses)
-    final = list(pipeline.localizer.corrected_path())
+    final = list(pipeline.localizer.optimized_trajectory())
     trajectories.write_tum(folder / 'trajectory_final.tum', result.stamps_ns, final)
     occupancy_maps.write_map(folder / 'map', patch)
     graphs.write_geojson(folder / 'topology.geojson', pipeline.topology.map)

@@ -96,10 +96,10 @@ def _halves(log: Path) -> _Halves:
     for scan, T_odom_base in pairs[:half]:
         pipeline.step(scan, T_odom_base)
     known = Map(pipeline.grid.patch(), copy.deepcopy(pipeline.topology.map))
-    first = pipeline.localizer.corrected_path()
+    first = pipeline.localizer.optimized_trajectory()
     for scan, T_odom_base in pairs[half:]:
         pipeline.step(scan, T_odom_base)
-    whole = pipeline.localizer.corrected_path()
+    whole = pipeline.localizer.optimized_trajectory()
     T_first_whole = between_paths(whole[:half], first)
     poses = [se2.compose(T_first_whole, T) for T in whole]
     return _Halves([Look(*pair, T) for pair, T in zip(pairs, poses, strict=True)], half, known)

@@ -18,8 +18,9 @@ from benchmarks.scoreboard.measure import Task, config_of, measure
 from benchmarks.scoreboard.page import page, shortened, worst_tenth
 from benchmarks.scoreboard.played import Numbers
 from benchmarks.scoreboard.reports import report_file, report_of, reports_there
+from thinmap_ros.core.config import parameters_of
 from thinmap_ros.core.errors import ConfigError, InputError
-from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
+from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.evaluation.parallel_jobs import (
     Failure,
     add_run_options,
@@ -151,7 +152,7 @@ def _short_names() -> list[str]:
 
 def _options(words: list[str]) -> Numbers:
     """Options of the localizer, each of the type of its default."""
-    defaults = vars(ScanLocalizerConfig())
+    defaults = {name: value for name, _, value in parameters_of(LocalizerConfig())}
     options: Numbers = {}
     for word in words:
         name, _, value = word.partition('=')

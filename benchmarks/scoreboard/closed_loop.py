@@ -94,7 +94,7 @@ def measure_loop(case: LoopCase, worlds: Path, options: Numbers) -> Numbers:
     forget_peak()
     ending = loop.run(goal, _LIMITS_S.get(case.world, _LIMIT_S), no_progress)
     played = pipeline.played
-    played.final = pipeline.localizer.corrected_path()
+    played.final = pipeline.localizer.optimized_trajectory()
     played.peak_mb = peak_mb()
     truth = np.array(loop.log.true_poses)
     coverage = {'coverage': loop.log.coverage[-1][1]} if is_whole else {}

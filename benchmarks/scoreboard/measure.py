@@ -19,11 +19,12 @@ from benchmarks.scoreboard.played import (
     simulated_numbers,
 )
 from thinmap_ros.core import se2
+from thinmap_ros.core.config import with_values
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.odometry import ScanPairing
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
+from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.evaluation.machine import forget_peak, peak_mb
 from thinmap_ros.evaluation.trajectory_errors import read_columns, relation_errors
 from thinmap_ros.experiments.slam.logs import laser_of
@@ -183,16 +184,17 @@ def measure_building(case: BuildingCase, options: Numbers, scans_per_graph: int 
     return simulated_numbers(play(_disturbed(pairs, case.run), config, scans_per_graph), truth)
 
 
-def config_of(options: Numbers, start: Array | None = None) -> ScanLocalizerConfig:
+def config_of(options: Numbers, start: Array | None = None) -> LocalizerConfig:
     """Configuration of the localizer by its options, with a start pose (3,) where one is given."""
     if start is None:
-        return ScanLocalizerConfig(**options)
+        return with_values(LocalizerConfig(), options)
     x, y, yaw = start.tolist()
-    return ScanLocalizerConfig(**options | {'start_x_m': x, 'start_y_m': y, 'start_yaw_rad': yaw})
+    pose = {'initial_x_m': x, 'initial_y_m': y, 'initial_yaw_rad': yaw}
+    return with_values(LocalizerConfig(), options | pose)
 
 
 def play(
-    scans: Iterator[tuple[Scan, Array]], config: ScanLocalizerConfig, scans_per_graph: int = 1
+    scans: Iterator[tuple[Scan, Array]], config: LocalizerConfig, scans_per_graph: int = 1
 ) -> Played:
     """All scans with their odometry poses (3,) through localizer, grid and topology.
 
@@ -206,6 +208,6 @@ def play(
     played = pipeline.played
     if not played.poses:
         raise InputError('no scan with odometry around its stamp')
-    played.final = pipeline.localizer.corrected_path()
+    played.final = pipeline.localizer.optimized_trajectory()
     played.peak_mb = peak_mb()
     return played

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.files.atomic import written_aside
+from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.sim.drives import Look
 from thinmap_ros.sim.laser import Lms200Config
 from thinmap_ros.sim.robot import PioneerConfig, WheelOdometry
@@ -50,7 +50,7 @@ class Recording:
 
     def write(self, path: Path) -> None:
         """Write the recording as an .npz file, whole or not at all."""
-        with written_aside(path) as aside, aside.open('wb') as stream:
+        with atomic_write(path) as aside, aside.open('wb') as stream:
             np.savez_compressed(stream, **vars(self))
 
 

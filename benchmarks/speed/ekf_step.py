@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.ekf_slam.association import AssociationConfig
 from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig, EkfLocalizer
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.evaluation.outcome import Row, at_least, at_most
@@ -63,7 +64,12 @@ def _cost(slam: str, numbers: list[int]) -> Iterator[tuple[int, tuple[float, flo
     laser = Lms200(Lms200Config(), 0)
     truth = np.array([1.0, 0.5 * _WIDTH_M, 0.0])
     localizer = EkfLocalizer(
-        EkfConfig(slam=slam, gap_m=_GAP_M, start_x_m=truth[0], start_y_m=truth[1])
+        EkfConfig(
+            slam=slam,
+            association=AssociationConfig(max_gap_m=_GAP_M),
+            initial_x_m=truth[0],
+            initial_y_m=truth[1],
+        )
     )
     odom = np.zeros(3)
     taken = [0.0]

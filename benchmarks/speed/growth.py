@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
+from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.evaluation.machine import CpuTimedPipeline, resident_mb
 from thinmap_ros.evaluation.outcome import Row, at_most
 from thinmap_ros.files.package_data import world_path
@@ -105,7 +105,7 @@ def _drive(looks: Iterator[Look], marks_m: list[float]) -> Iterator[_Mark]:
             x, y, yaw = look.T_world_base.tolist()
             pipeline = CpuTimedPipeline(
                 PipelineConfig(
-                    localizer=ScanLocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=yaw)
+                    localizer=LocalizerConfig(initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
                 )
             )
         way_m += 0.0 if last is None else float(np.hypot(*(look.T_world_base - last)[:2]))

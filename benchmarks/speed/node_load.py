@@ -60,7 +60,7 @@ def _measured(
     bag: Path | None,
     limits: tuple[float | None, float | None],
 ) -> Iterator[Row]:
-    start = 'start_x_m:=5.0 start_y_m:=2.0 start_yaw_rad:=0.0'
+    start = 'initial_x_m:=5.0 initial_y_m:=2.0 initial_yaw_rad:=0.0'
     placed = ('localizer', 'thinmap')
     nodes = [
         _start(words, f'use_sim_time:=true {start if words[0] in placed else ""}')

@@ -16,6 +16,7 @@ import yaml
 
 from thinmap_ros.core.errors import ConfigError
 from thinmap_ros.logs.bag_writer import BagWriter
+from thinmap_ros.ros import parameters
 
 ROOT = Path(__file__).resolve().parents[2]
 # All but the one that runs the others.
@@ -79,7 +80,7 @@ def declared(ros_domain, tmp_path, monkeypatch):
     return start
 
 
-def described(name, value, descriptor):
+def described(name, value, descriptor, indent):
     text = OWN_WORDS.get(name, descriptor.description)
     limits = [*descriptor.floating_point_range, *descriptor.integer_range]
     if limits:
@@ -89,16 +90,34 @@ def described(name, value, descriptor):
     assert text, f'{name} has no description'
     if not descriptor.read_only and name not in OWN_WORDS:
         text += '; can be changed at run time'
-    lines = textwrap.wrap(text, 112, initial_indent='    # ', subsequent_indent='    # ')
-    return [*lines, '    ' + yaml.safe_dump({name: value}).strip()]
+    comment = f'{indent}# '
+    lines = textwrap.wrap(text, 112, initial_indent=comment, subsequent_indent=comment)
+    return [*lines, indent + yaml.safe_dump({name.split('.')[-1]: value}).strip()]
+
+
+def flat(values, prefix=''):
+    """Parameters by their full names."""
+    found = {}
+    for key, value in values.items():
+        if isinstance(value, dict):
+            found |= flat(value, f'{prefix}{key}.')
+        else:
+            found[prefix + key] = value
+    return found
 
 
 def file_text(name, parameters):
     lines = [f'# Parameters of the node {name}, with their defaults:', '#   ros2 run thinmap_ros']
     lines[1] += f' {name} --ros-args --params-file config/{name}.yaml'
     lines += ['/**:', '  ros__parameters:']
+    group = []
     for parameter, (value, descriptor) in parameters.items():
-        lines += described(parameter, value, descriptor)
+        *parts, _ = parameter.split('.')
+        for depth, part in enumerate(parts):
+            if parts[: depth + 1] != group[: depth + 1]:
+                lines.append('  ' * (depth + 2) + f'{part}:')
+        group = parts
+        lines += described(parameter, value, descriptor, '  ' * (len(parts) + 2))
     return '\n'.join(lines) + '\n'
 
 
@@ -109,10 +128,10 @@ def test_config_file_says_what_the_node_declares(declared, name):
     arguments = [
         word for key, value in needed.items() for word in ('-p', f'{key}:={json.dumps(value)}')
     ]
-    parameters = declared(name, *arguments)
+    found = declared(name, *arguments)
     for key in needed:
-        parameters[key] = (default_of(name, key), parameters[key][1])
-    text = file_text(name, parameters)
+        found[key] = (default_of(name, key), found[key][1])
+    text = file_text(name, found)
     if 'THINMAP_WRITE_CONFIG' in os.environ:
         path.write_text(text)
     assert path.read_text() == text, (
@@ -129,7 +148,7 @@ def test_node_takes_its_config_file(declared, tmp_path, name):
     values |= NEEDED.get(name, {})
     (tmp_path / 'given.yaml').write_text(yaml.safe_dump({'/**': {'ros__parameters': values}}))
     found = declared(name, '--params-file', str(tmp_path / 'given.yaml'))
-    assert {n: value for n, (value, _) in found.items()} == values
+    assert {n: value for n, (value, _) in found.items()} == flat(values)
 
 
 def test_unknown_key_of_a_file_is_an_error(declared, tmp_path):
@@ -141,7 +160,26 @@ def test_unknown_key_of_a_file_is_an_error(declared, tmp_path):
 
 
 def test_there_is_a_file_for_each_node_and_no_other():
-    assert sorted(path.stem for path in (ROOT / 'config').glob('*.yaml')) == NODES
+    files = sorted(path.stem for path in (ROOT / 'config').glob('*.yaml'))
+    assert files == sorted([*NODES, 'robot'])
+
+
+def test_robot_file_is_accepted_by_every_node_and_has_its_defaults(declared):
+    """One file describes the robot to all nodes."""
+    path = ROOT / 'config' / 'robot.yaml'
+    values = yaml.safe_load(path.read_text())['/**']['ros__parameters']
+    assert sorted(values) == sorted(parameters.ROBOT)
+    seen = set()
+    for name in NODES:
+        needed = NEEDED.get(name, {})
+        arguments = [
+            word for key, value in needed.items() for word in ('-p', f'{key}:={json.dumps(value)}')
+        ]
+        found = declared(name, '--params-file', str(path), *arguments)
+        own = {key: found[key][0] for key in values if key in found}
+        assert own == {key: values[key] for key in own}
+        seen |= set(own)
+    assert seen == set(values)
 
 
 PRESETS = sorted((ROOT / 'config' / 'sensors').glob('*'))
@@ -154,16 +192,20 @@ def test_sensor_presets_are_known_to_the_nodes_and_hold_in_any_namespace(declare
     for namespace in ('', '/robot1'):
         remap = ('-r', f'__ns:={namespace}') if namespace else ()
         found = declared(name, '--params-file', str(preset), *remap)
-        assert {key: found[key][0] for key in wanted} == wanted
+        assert {key: found[key][0] for key in flat(wanted)} == flat(wanted)
 
 
-def test_the_preset_of_a_laser_that_publishes_zero_says_so_to_every_node_with_a_laser():
-    content = yaml.safe_load((ROOT / 'config' / 'sensors' / 'turtlebot3_lds.yaml').read_text())
-    parts = {key.removeprefix('/**/'): part['ros__parameters'] for key, part in content.items()}
-    told = {name for name, part in parts.items() if part.get('zero_is_no_return')}
+def test_preset_of_a_laser_that_publishes_zero_holds_for_every_node_with_a_laser(declared):
+    preset = ROOT / 'config' / 'sensors' / 'turtlebot3_lds.yaml'
     files = (ROOT / 'config').glob('*.yaml')
     declaring = {path.stem for path in files if 'zero_is_no_return' in path.read_text()}
-    assert told == declaring
+    for name in sorted(declaring - {'robot'}):
+        arguments = [
+            word
+            for key, value in NEEDED.get(name, {}).items()
+            for word in ('-p', f'{key}:={json.dumps(value)}')
+        ]
+        assert declared(name, '--params-file', str(preset), *arguments)['zero_is_no_return'][0]
 
 
 def test_presets_fit_together():
@@ -171,10 +213,10 @@ def test_presets_fit_together():
     for preset in PRESETS:
         content = yaml.safe_load(preset.read_text())
         sim, grid, localizer = (
-            content[f'/**/{name}']['ros__parameters']
+            flat(content[f'/**/{name}']['ros__parameters'])
             for name in ('sim', 'grid_mapper', 'localizer')
         )
-        assert localizer['match_range_m'] <= sim['range_max_m']
+        assert localizer['matching.max_range_m'] <= sim['range_max_m']
         assert grid['usable_range_m'] <= sim['range_max_m']
         reach_m = max(grid['no_return_range_m'], min(grid['usable_range_m'], 4.0))
         assert grid['window_m'] >= 2.0 * reach_m

@@ -83,7 +83,7 @@ class Section:
 
 SIM = {'sim': {'start': '2.0,2.0,0.0'}}
 ALL_NODES = {
-    'thinmap': {'use_sim_time': True, 'start_x_m': 2.0, 'start_y_m': 2.0},
+    'thinmap': {'use_sim_time': True, 'initial_x_m': 2.0, 'initial_y_m': 2.0},
     **SIM,
 }
 SECTIONS = {

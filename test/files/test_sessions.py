@@ -12,7 +12,7 @@ from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.se2 import Array, pose
-from thinmap_ros.core.slam.localizer import ScanLocalizer
+from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.graph import TopologicalMap
@@ -252,7 +252,7 @@ def test_what_an_exploration_learned_is_the_same_after_a_start(tmp_path):
 def test_features_are_kept_set_aside_or_refused_in_words(tmp_path):
     stem = str(tmp_path / 'office')
     assert load_features(stem) is None
-    localizer = ScanLocalizer()
+    localizer = Localizer()
     world = building()
     laser = Lms200(Lms200Config(), 1)
     for k in range(30):

@@ -18,7 +18,7 @@ from thinmap_ros.core.odometry import LastPose
 from thinmap_ros.files import sessions
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_writer import BagWriter
-from thinmap_ros.ros.checkpoint import Recovery
+from thinmap_ros.ros.checkpoint import Checkpoint
 
 _LOADERS: dict[str, Callable[[str], Any]] = {
     'topology': sessions.load_topology,
@@ -138,12 +138,12 @@ class _Node:
 def go_on_from_what_was_left(shared: State, rng: np.random.Generator, folder: Path) -> None:
     os.environ['THINMAP_STATE_DIR'] = str(folder / 'state')
     node = _Node()
-    recovery = Recovery(node, 1e9)
-    recovery.keep(shared)
+    checkpoint = Checkpoint(node, 1e9)
+    checkpoint.save(shared)
     (file,) = (folder / 'state').iterdir()
     content = _packed(rng, _members(file)) if rng.random() < 0.7 else file.read_bytes()
     file.write_bytes(damaged_bytes(rng, content))
-    left = recovery.left()
+    left = checkpoint.load()
     assert all(text.isprintable() and len(text) < 1000 for text in node.said), node.said
     if left is not None:
         tried(lambda: LastPose.from_state(left).leads_to(10**18, np.zeros(3)))
@@ -158,5 +158,5 @@ SOURCES = (
     Source('bag_bodies', drive_messages, read_strange_bodies),
     Source('states', explored, use_changed_state),
     Source('archives', explored_archives, load_damaged_archive),
-    Source('recovery', last_pose, go_on_from_what_was_left),
+    Source('checkpoint', last_pose, go_on_from_what_was_left),
 )

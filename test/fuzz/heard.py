@@ -14,7 +14,7 @@ from thinmap_ros.core.exploration.explorer import ExplorerConfig
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
-from thinmap_ros.core.slam.localizer import ScanLocalizer, ScanLocalizerConfig
+from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
 from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.logs.carmen import LaserOptions
@@ -27,13 +27,13 @@ _CONFIGS: tuple[type[Config], ...] = (
     ExplorerConfig,
     GlobalLocalizationConfig,
     LaserOptions,
-    ScanLocalizerConfig,
+    LocalizerConfig,
     NavigatorConfig,
     OccupancyConfig,
     TopologyConfig,
 )
 _MADE: dict[type[Config], Any] = {
-    ScanLocalizerConfig: ScanLocalizer,
+    LocalizerConfig: Localizer,
     NavigatorConfig: Navigator,
     OccupancyConfig: OccupancyGrid,
     TopologyConfig: TopologyBuilder,

@@ -12,7 +12,7 @@ from thinmap_ros.closed_loop import ClosedLoop, Options, make_loop
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
-from thinmap_ros.core.slam.localizer import ScanLocalizer
+from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.coverage import coverable
@@ -72,7 +72,7 @@ class Explored:
         return lambda scan, T: explorer.step(pipeline.topology.map, patch, scan, T)
 
     def _use_features(self, state: State) -> Work:
-        localizer = ScanLocalizer.from_state(state, self.loop.pipeline.localizer.config)
+        localizer = Localizer.from_state(state, self.loop.pipeline.localizer.config)
         localizer.set_pose(self.scans[-STEPS][1], 1e-4 * np.eye(3))
         return localizer.step
 

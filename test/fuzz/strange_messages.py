@@ -225,24 +225,24 @@ STRATEGIES = {
 
 
 def check_scan(message):
-    scan = messages.scan_from(message, np.zeros(3))
+    scan = messages.scan_from_msg(message, np.zeros(3))
     assert np.isfinite(scan.points_base()).all() and np.isfinite(scan.angles_rad).all()
     assert scan.ranges_m.size == len(message.ranges) > 0 and scan.stamp_ns >= 0
 
 
 def check_odometry(message):
     assert messages.stamp_ns(message.header.stamp) >= 0
-    assert np.isfinite(messages.pose_from(message.pose.pose)).all()
+    assert np.isfinite(messages.pose_from_msg(message.pose.pose)).all()
 
 
 def check_pose(message):
     check_odometry(message)
-    covariance = messages.covariance_from(message)
+    covariance = messages.covariance_from_msg(message)
     assert np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance).min() > -1e-8
 
 
 def check_grid(message):
-    patch = messages.patch_from(message)
+    patch = messages.grid_from_msg(message)
     assert (
         patch.cells.size == len(message.data)
         and patch.cells.min() >= -1
@@ -252,7 +252,7 @@ def check_grid(message):
 
 
 def check_topology(message):
-    found = messages.topology_from(message)
+    found = messages.topology_from_msg(message)
     assert len(found.nodes) == len(message.nodes) and len(found.edges) == len(message.edges)
     assert all(math.isfinite(node.x + node.y + node.clearance_m) for node in found.nodes.values())
     assert all(

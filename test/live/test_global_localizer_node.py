@@ -86,10 +86,10 @@ def test_a_robot_that_drives_about_finds_itself_when_asked(graph, map_file):
     ns = messages.stamp_ns(pose.header.stamp)
     graph.until(lambda: messages.stamp_ns(truth[-1].header.stamp) >= ns, 'where it was then')
     at = min(truth, key=lambda message: abs(messages.stamp_ns(message.header.stamp) - ns))
-    off = se2.between(messages.pose_from(at.pose), messages.pose_from(pose.pose.pose))
+    off = se2.between(messages.pose_from_msg(at.pose), messages.pose_from_msg(pose.pose.pose))
     assert np.hypot(off[0], off[1]) < 0.3
     assert abs(off[2]) < np.radians(10.0)
-    covariance = messages.covariance_from(pose)
+    covariance = messages.covariance_from_msg(pose)
     assert np.linalg.eigvalsh(covariance).min() > 0.0
     assert len(samples[-1].poses) == 5000
     assert all(
@@ -126,7 +126,7 @@ def test_a_robot_that_may_drive_finds_itself_alone_and_stops(graph, tmp_path):
     ns = messages.stamp_ns(poses[-1].header.stamp)
     graph.until(lambda: messages.stamp_ns(truth[-1].header.stamp) >= ns, 'where it was then')
     at = min(truth, key=lambda message: abs(messages.stamp_ns(message.header.stamp) - ns))
-    off = se2.between(messages.pose_from(at.pose), messages.pose_from(poses[-1].pose.pose))
+    off = se2.between(messages.pose_from_msg(at.pose), messages.pose_from_msg(poses[-1].pose.pose))
     assert np.hypot(off[0], off[1]) < 0.3
     assert abs(off[2]) < np.radians(10.0)
     assert any(command.linear.x > 0.1 for command in commands)

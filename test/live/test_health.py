@@ -16,7 +16,7 @@ from thinmap_msgs.msg import TopologicalMap
 from thinmap_ros.ros import diagnostics, qos
 
 pytestmark = pytest.mark.live
-AT_START = {'start_x_m': 2.0, 'start_y_m': 2.0, 'start_yaw_rad': 0.0}
+AT_START = {'initial_x_m': 2.0, 'initial_y_m': 2.0, 'initial_yaw_rad': 0.0}
 START = '2.0,2.0,0.0'
 MAPPING = ('localizer', 'grid_mapper', 'topology_builder')
 
@@ -104,17 +104,17 @@ def test_what_is_over_is_not_told_first(ros_domain, monkeypatch):
     rclpy.init(domain_id=ros_domain)
     node = rclpy.create_node('patient')
     try:
-        told = diagnostics.Health(node)
-        told.refused('odom', 'pose nan: expected finite numbers')
-        told.dropped('scans without odometry at their time', 2)
+        told = diagnostics.NodeDiagnostics(node)
+        told.message_rejected('odom', 'pose nan: expected finite numbers')
+        told.count_drops('scans without odometry at their time', 2)
         now[0] += 1.0
-        told.refused('scan', '0 beams: expected 1 to 200000')
+        told.message_rejected('scan', '0 beams: expected 1 to 200000')
         message = told._status(now[0]).message
         assert message.startswith('4 messages refused or dropped: scan: 0 beams')
         assert 'odom: pose nan' in message and 'without odometry' in message
         told._publish()
         now[0] += 10.5
-        told.dropped('scan: gaps between the stamps', 1)
+        told.count_drops('scan: gaps between the stamps', 1)
         message = told._status(now[0]).message
         assert message == '1 messages refused or dropped: scan: gaps between the stamps'
         # How often it happened is told for good.

@@ -20,7 +20,7 @@ from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live
 START = '2.0,2.0,0.0'
-AT_START = {'start_x_m': 2.0, 'start_y_m': 2.0, 'start_yaw_rad': 0.0}
+AT_START = {'initial_x_m': 2.0, 'initial_y_m': 2.0, 'initial_yaw_rad': 0.0}
 SCAN_PERIOD_NS = 200_000_000
 
 
@@ -172,7 +172,7 @@ def test_a_wrong_parameter_ends_the_start_with_one_clear_line(graph, name, param
 
 
 def is_free(map_message, x, y):
-    patch = messages.patch_from(map_message)
+    patch = messages.grid_from_msg(map_message)
     point = np.array([[x, y]])
     row, col = patch.frame.cells_of(point)[0]
     return bool(patch.contains(point)[0]) and bool(patch.free[row, col])

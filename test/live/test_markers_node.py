@@ -33,7 +33,7 @@ def test_a_graph_as_lines_and_balls():
 
 def is_sound(message):
     try:
-        messages.topology_from(message)
+        messages.topology_from_msg(message)
     except InputError:
         return False
     return all(node.kind == 0 for node in message.nodes)

@@ -14,7 +14,7 @@ from support.timeouts import PATIENCE_S
 from test_health import Doctor
 
 from thinmap_msgs.srv import SaveMap
-from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
+from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.files import occupancy_maps, package_data, sessions
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.logs.bag import BagLog
@@ -129,7 +129,7 @@ def assert_live_is_same(graph, bag, expected, tmp_path, **localizer):
     )
     assert 'going on without it' not in graph.log('bag_player')
     assert [messages.stamp_ns(pose.header.stamp) for pose in poses] == expected.stamps_ns
-    live = np.array([messages.pose_from(pose.pose.pose) for pose in poses])
+    live = np.array([messages.pose_from_msg(pose.pose.pose) for pose in poses])
     assert np.abs(live - expected.poses).max() <= 1e-9
     response = graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(tmp_path / 'live')))
     assert response.success, response.message
@@ -147,7 +147,7 @@ def test_simulated_log_bag_and_live_graph_agree(graph, tmp_path):
 
 
 def test_the_filter_of_the_paper_says_live_what_it_says_replayed(graph, tmp_path):
-    config = PipelineConfig(localizer=ScanLocalizerConfig(slam='ekf_ti'))
+    config = PipelineConfig(localizer=LocalizerConfig(slam='ekf_ti'))
     expected = replay(SimulatedLog(), config)
     assert len(expected.pipeline.localizer.features) > 3
     convert(SimulatedLog(), tmp_path / 'bag')
@@ -155,14 +155,14 @@ def test_the_filter_of_the_paper_says_live_what_it_says_replayed(graph, tmp_path
 
 
 def test_a_closed_loop_corrects_the_live_map_as_it_does_the_replayed_one(graph, tmp_path):
-    start = {'start_x_m': 3.0, 'start_y_m': 1.2}
-    expected = replay(LoopLog(), PipelineConfig(localizer=ScanLocalizerConfig(**start)))
+    start = {'initial_x_m': 3.0, 'initial_y_m': 1.2}
+    expected = replay(LoopLog(), PipelineConfig(localizer=LocalizerConfig(**start)))
     assert 'rebuild' in expected.pipeline.stage_seconds
     convert(LoopLog(), tmp_path / 'bag')
     trajectories = graph.heard('trajectory', Path, qos.LATCHED)
     assert_live_is_same(graph, tmp_path / 'bag', expected, tmp_path, **start)
     assert len(trajectories) == expected.pipeline.corrections
-    stamps, _ = messages.trajectory_from(trajectories[-1])
+    stamps, _ = messages.trajectory_from_msg(trajectories[-1])
     assert set(stamps.tolist()) <= set(expected.stamps_ns)
     live = sessions.load_topology(str(tmp_path / 'live')).map
     offline = expected.pipeline.topology.map

@@ -26,7 +26,7 @@ FIVE = ('localizer', 'grid_mapper', 'topology_builder', 'navigator', 'explorer')
 
 
 def free_at(map_message, x, y):
-    patch = messages.patch_from(map_message)
+    patch = messages.grid_from_msg(map_message)
     row, col = patch.frame.cells_of(np.array([[x, y]]))[0]
     return bool(patch.contains(np.array([[x, y]]))[0]) and bool(patch.free[row, col])
 
@@ -36,7 +36,7 @@ def test_one_process_locates_maps_and_drives(graph):
     graphs = graph.heard('topology', TopologicalMap, qos.LATCHED)
     truth = graph.heard('ground_truth', PoseStamped)
     health = graph.heard('/diagnostics', DiagnosticArray)
-    start = {'start_x_m': 2.0, 'start_y_m': 2.0, 'use_sim_time': True}
+    start = {'initial_x_m': 2.0, 'initial_y_m': 2.0, 'use_sim_time': True}
     process = graph.start('thinmap', **start)
     # Paced: else the result could be heard before the true poses of the way.
     graph.start(
@@ -88,9 +88,9 @@ def start_robot(graph, name, start, seed):
         start=start,
         seed=seed,
         use_sim_time=True,
-        start_x_m=float(x),
-        start_y_m=float(y),
-        start_yaw_rad=0.0,
+        initial_x_m=float(x),
+        initial_y_m=float(y),
+        initial_yaw_rad=0.0,
         hold_for_subscribers=2,
         rate=2.0,
         arguments=('sim', 'localizer', 'grid_mapper', 'topology_builder'),
@@ -114,7 +114,7 @@ def test_two_robots_in_namespaces_keep_to_themselves(graph):
         return abs(messages.yaw_of(last.orientation)) > 0.5
 
     graph.until(drives, 'the first one turns')
-    last = {name: messages.pose_from(poses[-1].pose.pose) for name, poses in heard.items()}
+    last = {name: messages.pose_from_msg(poses[-1].pose.pose) for name, poses in heard.items()}
     assert np.abs(last['robot2'] - [8.0, 3.0, 0.0]).max() < 0.1
     assert np.hypot(last['robot1'][0] - 2.0, last['robot1'][1] - 2.0) < 1.0
     assert all(frames.values()) and not nobody

@@ -48,8 +48,8 @@ def robot(tmp_path_factory):
             arguments=(*NODES, 'topology_builder'),
             use_sim_time=True,
             start='2.0,2.0,0.0',
-            start_x_m=2.0,
-            start_y_m=2.0,
+            initial_x_m=2.0,
+            initial_y_m=2.0,
             rate=1.0,
         )
         graph.until(lambda: maps, 'a map')

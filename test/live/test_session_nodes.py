@@ -43,7 +43,7 @@ def drive(graph, x, y, yaw, metres):
     Then the robot alone is stopped.
     """
     truth = graph.heard('ground_truth', PoseStamped)
-    graph.start('localizer', use_sim_time=True, start_x_m=x, start_y_m=y, start_yaw_rad=yaw)
+    graph.start('localizer', use_sim_time=True, initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
     graph.start(
         'sim',
         remap=graph.paced(),
@@ -64,7 +64,7 @@ def drive(graph, x, y, yaw, metres):
         )
 
     graph.until(far_enough, 'the robot makes its way')
-    T = messages.pose_from(truth[-1].pose)
+    T = messages.pose_from_msg(truth[-1].pose)
     assert graph.stop('sim') == graph.stop('localizer') == 0
     return T
 
@@ -99,11 +99,11 @@ def test_ids_and_cells_are_the_same_tomorrow_and_mapping_goes_on(graph, tmp_path
     graph.until(lambda: maps and graphs, 'the saved map and graph, without a scan')
     assert not local
     assert places(graphs[-1]) == before and {edge.id for edge in graphs[-1].edges} == edges
-    assert np.array_equal(messages.patch_from(maps[-1]).cells, known.cells)
+    assert np.array_equal(messages.grid_from_msg(maps[-1]).cells, known.cells)
     drive(graph, *T.tolist(), 0.3)
     # Mapping has gone on from there: more is known, what stayed has its number, and no number is
     # given twice.
-    assert (messages.patch_from(maps[-1]).cells >= 0).sum() >= (known.cells >= 0).sum()
+    assert (messages.grid_from_msg(maps[-1]).cells >= 0).sum() >= (known.cells >= 0).sum()
     after = places(graphs[-1])
     stayed = [
         k
@@ -203,7 +203,7 @@ def test_sessions_are_loaded_into_running_nodes_or_refused_in_words(graph, tmp_p
     response = load('map.yaml')
     assert response.success and 'anew' in response.message
     graph.until(lambda: not graphs[-1].nodes, 'an empty graph')
-    known = messages.patch_from(maps[-1])
+    known = messages.grid_from_msg(maps[-1])
     assert np.array_equal(known.occupied, grid.patch().occupied)
     for name in MAPPERS:
         assert graph.stop(name) == 0

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.files.atomic import parts_of, written_aside
-from thinmap_ros.ros.checkpoint import Recovery, state_folder
+from thinmap_ros.files.atomic import atomic_write, partial_files
+from thinmap_ros.ros.checkpoint import Checkpoint, checkpoint_directory
 
 STATE = {'a': np.arange(3), 'b': np.array(2.5)}
 
@@ -41,34 +41,34 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_a_state_is_found_again(folder: Path) -> None:
     node = FakeNode()
-    Recovery(node, 30.0).keep(STATE)
+    Checkpoint(node, 30.0).save(STATE)
     assert folder.stat().st_mode & 0o777 == 0o700
-    left = Recovery(node, 30.0).left()
+    left = Checkpoint(node, 30.0).load()
     assert left is not None and np.array_equal(left['a'], STATE['a']) and left['b'] == 2.5
-    Recovery(node, 30.0).forget()
-    assert Recovery(node, 30.0).left() is None and not node.said and not list(folder.iterdir())
-    off = Recovery(node, 0.0)
-    off.keep(STATE)
-    assert off.left() is None and not list(folder.iterdir())
+    Checkpoint(node, 30.0).delete()
+    assert Checkpoint(node, 30.0).load() is None and not node.said and not list(folder.iterdir())
+    off = Checkpoint(node, 0.0)
+    off.save(STATE)
+    assert off.load() is None and not list(folder.iterdir())
 
 
 def test_an_old_state_is_left_alone(folder: Path) -> None:
     node = FakeNode()
-    Recovery(node, 30.0).keep(STATE)
+    Checkpoint(node, 30.0).save(STATE)
     os.utime(folder / '7.robot.mapper.npz', (time.time() - 60.0, time.time() - 60.0))
-    assert Recovery(node, 30.0).left() is None and not node.said
+    assert Checkpoint(node, 30.0).load() is None and not node.said
 
 
 def test_links_are_not_followed(folder: Path, tmp_path: Path) -> None:
     node = FakeNode()
-    Recovery(node, 30.0).keep(STATE)
+    Checkpoint(node, 30.0).save(STATE)
     file = folder / '7.robot.mapper.npz'
     file.rename(tmp_path / 'elsewhere.npz')
     file.symlink_to(tmp_path / 'elsewhere.npz')
     before = (tmp_path / 'elsewhere.npz').read_bytes()
-    assert Recovery(node, 30.0).left() is None
+    assert Checkpoint(node, 30.0).load() is None
     assert 'symbolic link' in node.said[-1]
-    Recovery(node, 30.0).keep({'a': np.zeros(1000)})
+    Checkpoint(node, 30.0).save({'a': np.zeros(1000)})
     assert not file.is_symlink() and (tmp_path / 'elsewhere.npz').read_bytes() == before
 
 
@@ -82,12 +82,12 @@ def test_folders_that_are_not_of_this_user_alone(folder: Path, tmp_path: Path, w
     if wrong == 'open':
         folder.chmod(0o770)
     with pytest.raises(InputError, match='state: '):
-        state_folder()
+        checkpoint_directory()
     node = FakeNode()
-    recovery = Recovery(node, 30.0)
-    recovery.keep(STATE)
-    assert recovery.left() is None
-    recovery.forget()
+    checkpoint = Checkpoint(node, 30.0)
+    checkpoint.save(STATE)
+    assert checkpoint.load() is None
+    checkpoint.delete()
     assert 'expected' in node.said[0] and not list((tmp_path / 'other').glob('*'))
 
 
@@ -96,15 +96,15 @@ def test_a_folder_that_is_open_in_any_way(folder: Path, bit: int) -> None:
     folder.mkdir()
     folder.chmod(0o700 | bit)
     with pytest.raises(InputError, match=f'mode {0o700 | bit:o}: expected 700, closed to other'):
-        state_folder()
+        checkpoint_directory()
     folder.chmod(0o700)
-    assert state_folder() == folder
+    assert checkpoint_directory() == folder
 
 
 def test_a_new_folder_is_closed_whatever_new_files_are_else(folder: Path) -> None:
     before = os.umask(0)
     try:
-        assert state_folder() == folder
+        assert checkpoint_directory() == folder
     finally:
         os.umask(before)
     assert folder.stat().st_mode & 0o777 == 0o700
@@ -113,7 +113,7 @@ def test_a_new_folder_is_closed_whatever_new_files_are_else(folder: Path) -> Non
 def test_a_link_to_nowhere_is_no_folder(folder: Path, tmp_path: Path) -> None:
     folder.symlink_to(tmp_path / 'nowhere')
     with pytest.raises(InputError, match='state: '):
-        state_folder()
+        checkpoint_directory()
     assert not (tmp_path / 'nowhere').exists()
 
 
@@ -134,12 +134,12 @@ def test_where_nothing_is_chosen_states_lie_where_a_restart_removes_them(
             monkeypatch.setenv(name, value)
     monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path / 'temporary'))
     base = tmp_path / ('there' if runtime == 'there' else 'temporary')
-    assert state_folder() == base / f'thinmap-{os.getuid()}'
-    assert state_folder().stat().st_mode & 0o777 == 0o700
+    assert checkpoint_directory() == base / f'thinmap-{os.getuid()}'
+    assert checkpoint_directory().stat().st_mode & 0o777 == 0o700
     # What somebody else put there first is not used, and it is the node that says so.
-    state_folder().chmod(0o755)
+    checkpoint_directory().chmod(0o755)
     node = FakeNode()
-    Recovery(node, 30.0).keep(STATE)
+    Checkpoint(node, 30.0).save(STATE)
     assert 'mode 755' in node.said[0] and not list(base.glob('*/*'))
 
 
@@ -147,10 +147,10 @@ def test_a_file_of_another_user_is_left_alone(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     node = FakeNode()
-    recovery = Recovery(node, 30.0)
-    recovery.keep(STATE)
+    checkpoint = Checkpoint(node, 30.0)
+    checkpoint.save(STATE)
     monkeypatch.setattr(os, 'getuid', lambda: folder.stat().st_uid + 1)
-    assert recovery.left() is None
+    assert checkpoint.load() is None
     assert 'expected a file of this user' in node.said[-1]
 
 
@@ -158,16 +158,16 @@ def test_a_folder_of_another_user(folder: Path, monkeypatch: pytest.MonkeyPatch)
     folder.mkdir(mode=0o700)
     monkeypatch.setattr(os, 'getuid', lambda: folder.stat().st_uid + 1)
     with pytest.raises(InputError, match=r'of user .*: expected a folder of this user'):
-        state_folder()
+        checkpoint_directory()
 
 
 def test_broken_states_and_unfinished_files(folder: Path) -> None:
     node = FakeNode()
-    Recovery(node, 30.0).keep(STATE)
+    Checkpoint(node, 30.0).save(STATE)
     (folder / '7.robot.mapper.npz').write_bytes(b'no archive')
     unfinished = folder / '.7.robot.mapper.npz.0123456789abcdef.part'
     unfinished.write_bytes(b'half')
-    assert Recovery(node, 30.0).left() is None
+    assert Checkpoint(node, 30.0).load() is None
     assert 'beginning anew' in node.said[-1] and not unfinished.exists()
 
 
@@ -175,9 +175,9 @@ def test_a_file_beside_has_a_name_that_cannot_be_guessed(tmp_path: Path) -> None
     path = tmp_path / 'a.[b]'
     names = set()
     for _ in range(3):
-        with written_aside(path) as aside:
+        with atomic_write(path) as aside:
             names.add(aside.name)
             aside.write_text('whole')
-            assert parts_of(path) == [aside]
+            assert partial_files(path) == [aside]
     assert len(names) == 3 and all(str(os.getpid()) not in name.split('.') for name in names)
     assert path.read_text() == 'whole' and list(tmp_path.iterdir()) == [path]

@@ -3,15 +3,15 @@
 Told from what was silent, and from what two publishers say in turn.
 """
 
-from thinmap_ros.ros.subscription import Losses
+from thinmap_ros.ros.subscription import MessageLossCounter
 
 STEP_NS = 200_000_000
 
 
 def counted(came):
     """Sums of lost and missing over (time in steps, number) of what came."""
-    losses = Losses()
-    found = [losses.came(10**12 + steps * STEP_NS, number) for steps, number in came]
+    losses = MessageLossCounter()
+    found = [losses.record(10**12 + steps * STEP_NS, number) for steps, number in came]
     return sum(lost for lost, _ in found), sum(missing for _, missing in found)
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import Voronoi
 
-from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.config import Config, parameter, robot_radius
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
@@ -26,9 +26,7 @@ Numbers = NDArray[np.int64]
 class VoronoiConfig(Config):
     """Which parts of the diagram make the graph."""
 
-    robot_radius_m: float = parameter(
-        0.25, 'vertices and lines keep this from obstacles, m', low=0.0, high=5.0
-    )
+    robot_radius_m: float = robot_radius()
     prune_m: float = parameter(
         1.0, 'dead ends up to this long are dropped, again and again, m', low=0.0, high=50.0
     )

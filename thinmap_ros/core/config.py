@@ -1,9 +1,14 @@
-"""One home for each default: frozen dataclasses whose fields carry description and range."""
+"""One home for each default: frozen dataclasses whose fields carry description and range.
+
+A configuration is composed of others (`part`). Seen from ROS and the command line it is flat:
+parameters of a part have its name before theirs, `matching.noise_m`; those that describe the robot
+(`robot_radius`) have one name everywhere.
+"""
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, TypeVar
 
 from thinmap_ros.core.errors import ConfigError, shown
 
@@ -24,6 +29,23 @@ def parameter(
     return dataclasses.field(default=default, metadata=metadata)
 
 
+def robot_radius() -> Any:
+    """Declare the field `robot_radius_m`: one name and one default for all parts and nodes."""
+    field = parameter(
+        0.25,
+        'Radius of the robot (m), the same for all nodes. Set it to the distance from the centre '
+        'of rotation to the farthest point of the footprint.',
+        low=0.0,
+        high=5.0,
+    )
+    return dataclasses.field(default=field.default, metadata={**field.metadata, 'shared': True})
+
+
+def part(config: type['Config']) -> Any:
+    """Declare a field of a Config that is itself a Config, with its defaults."""
+    return dataclasses.field(default_factory=config)
+
+
 @dataclasses.dataclass(frozen=True)
 class Config:
     """Base of every configuration: values are checked once, on construction.
@@ -35,6 +57,56 @@ class Config:
         for field in dataclasses.fields(self):
             if 'description' in field.metadata:
                 _check(field, getattr(self, field.name))
+
+
+AnyConfig = TypeVar('AnyConfig', bound=Config)
+
+
+def parameters_of(config: Config) -> Iterator[tuple[str, 'dataclasses.Field[Any]', Any]]:
+    """Full name, field and value of each parameter of a configuration and its parts."""
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if isinstance(value, Config):
+            for name, inner, own in parameters_of(value):
+                yield name if _is_shared(inner) else f'{field.name}.{name}', inner, own
+        else:
+            yield field.name, field, value
+
+
+def with_values(config: AnyConfig, values: Mapping[str, Any]) -> AnyConfig:
+    """Return a configuration with other values of some parameters, by their full names.
+
+    Raises ConfigError for a parameter that it does not have, or a value that is not allowed.
+    """
+    known = [name for name, _, _ in parameters_of(config)]
+    for name in values:
+        if name not in known:
+            raise ConfigError(f'no parameter {name}: expected one of {", ".join(known)}')
+    own: dict[str, Any] = {}
+    for field in dataclasses.fields(config):
+        inner = getattr(config, field.name)
+        if isinstance(inner, Config):
+            own[field.name] = _part_with(field.name, inner, values)
+        elif field.name in values:
+            own[field.name] = values[field.name]
+    return dataclasses.replace(config, **own)
+
+
+def _part_with(prefix: str, config: AnyConfig, values: Mapping[str, Any]) -> AnyConfig:
+    """A part of a configuration with those of the values that are its own."""
+    own = {}
+    for name, field, _ in parameters_of(config):
+        full = name if _is_shared(field) else f'{prefix}.{name}'
+        if full in values:
+            own[name] = values[full]
+    try:
+        return with_values(config, own)
+    except ConfigError as error:
+        raise ConfigError(f'{prefix}.{error}') from error
+
+
+def _is_shared(field: 'dataclasses.Field[Any]') -> bool:
+    return bool(field.metadata.get('shared'))
 
 
 def _check(field: 'dataclasses.Field[Any]', value: Any) -> None:

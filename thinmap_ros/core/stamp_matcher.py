@@ -19,7 +19,7 @@ class StampMatcher(Generic[Left, Right]):
         self._capacity = capacity
         self.dropped = 0
 
-    def left(self, stamp_ns: int, value: Left) -> tuple[Left, Right] | None:
+    def add_left(self, stamp_ns: int, value: Left) -> tuple[Left, Right] | None:
         """Take a message of the first topic; returns the pair if it is complete now."""
         partner = self._rights.pop(stamp_ns, None)
         if partner is not None:
@@ -30,7 +30,7 @@ class StampMatcher(Generic[Left, Right]):
             self.dropped += 1
         return None
 
-    def right(self, stamp_ns: int, value: Right) -> tuple[Left, Right] | None:
+    def add_right(self, stamp_ns: int, value: Right) -> tuple[Left, Right] | None:
         """Take a message of the second topic; returns the pair if it is complete now."""
         partner = self._lefts.pop(stamp_ns, None)
         if partner is not None:

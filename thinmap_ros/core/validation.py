@@ -15,14 +15,14 @@ MOST_BEAMS = 200_000
 LONGEST_LIST = 200
 
 
-def within(what: str, values: Iterable[float], limit: float = FARTHEST_M) -> None:
+def require_bounded(what: str, values: Iterable[float], limit: float = FARTHEST_M) -> None:
     """Raise InputError, naming what, unless all values are finite and at most `limit` in size."""
     for value in values:
         if not abs(value) <= limit:
             raise InputError(f'{what}: {value}: expected a number from {-limit:g} to {limit:g}')
 
 
-def short(text: str, longest: int = 80) -> str:
+def abbreviated(text: str, longest: int = 80) -> str:
     """A topic, type or frame of a file as part of a message.
 
     One line of printable characters, unquoted, short.
@@ -35,7 +35,7 @@ def listed(names: Sequence[str]) -> str:
 
     The first of them, in short, and how many more there are.
     """
-    told = [short(name) for name in names]
+    told = [abbreviated(name) for name in names]
     lengths = accumulate(len(name) + 2 for name in told)
     count = max(1, sum(length <= LONGEST_LIST for length in lengths))
     more = f' and {len(told) - count} more' if len(told) > count else ''

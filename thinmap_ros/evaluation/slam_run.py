@@ -8,7 +8,7 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
+from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.pipeline import Pipeline, PipelineConfig, Step
 from thinmap_ros.sim.drives import Look
 
@@ -63,7 +63,7 @@ def run_slam(looks: Iterable[Look], slam: str = 'ekf_ti', watch: Watch | None = 
     for k, look in enumerate(looks):
         if run is None:
             x, y, yaw = (float(v) for v in look.T_world_base)
-            config = ScanLocalizerConfig(slam=slam, start_x_m=x, start_y_m=y, start_yaw_rad=yaw)
+            config = LocalizerConfig(slam=slam, initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
             run = Run(Pipeline(PipelineConfig(localizer=config)))
             start = look
         began = process_time()

@@ -14,7 +14,7 @@ _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 @contextmanager
-def written_aside(path: Path) -> Iterator[Path]:
+def atomic_write(path: Path) -> Iterator[Path]:
     """Give a path to write to.
 
     It takes the place of `path` when the block ends well and vanishes when not.
@@ -36,14 +36,14 @@ def written_aside(path: Path) -> Iterator[Path]:
         aside.unlink(missing_ok=True)
 
 
-def parts_of(path: Path) -> list[Path]:
-    """Unfinished files beside a file: those of a `written_aside` that was killed meanwhile."""
+def partial_files(path: Path) -> list[Path]:
+    """Unfinished files beside a file: those of an `atomic_write` that was killed meanwhile."""
     return sorted(path.parent.glob(f'.{escape(path.name)}.*.part'))
 
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file, whole or not at all."""
-    with written_aside(path) as aside:
+    with atomic_write(path) as aside:
         aside.write_text(text, encoding='utf-8')
 
 

@@ -28,7 +28,7 @@ _READ_ONLY = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK
 
 
 @contextmanager
-def opened(path: Path, flags: int = 0) -> Iterator[IO[bytes]]:
+def open_regular_file(path: Path, flags: int = 0) -> Iterator[IO[bytes]]:
     """Open a regular file to be read; flags: more of them for os.open, such as O_NOFOLLOW.
 
     Raises InputError where it is another kind of file (a pipe would block), OSError as open.

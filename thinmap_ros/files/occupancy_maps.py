@@ -17,7 +17,7 @@ from thinmap_ros.core.errors import InputError, reason_of, shown
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, UNKNOWN, GridPatch
 from thinmap_ros.core.se2 import FARTHEST_M
-from thinmap_ros.files.atomic import write_text, written_aside
+from thinmap_ros.files.atomic import atomic_write, write_text
 from thinmap_ros.files.yaml import read_mapping
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def write_map(stem: Path, patch: GridPatch) -> Path:
     grey[patch.occupied] = _GREY_OCCUPIED
     image = stem.with_name(stem.name + '.pgm')
     description = stem.with_name(stem.name + '.yaml')
-    with written_aside(image) as aside:
+    with atomic_write(image) as aside:
         Image.fromarray(grey[::-1]).save(aside, format='PPM')
         # The image takes its name last: where there is no room for both, the old map stays as it
         # was.

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from thinmap_ros.core.errors import InputError, reason_of, shown
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
-from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
+from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.core.slam.localizers import AnyLocalizer, localizer_class
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
-from thinmap_ros.files.atomic import written_aside
-from thinmap_ros.files.npz import opened, read_arrays
+from thinmap_ros.files.atomic import atomic_write
+from thinmap_ros.files.npz import open_regular_file, read_arrays
 from thinmap_ros.files.occupancy_maps import read_map, write_map
 
 _FORMAT = 'thinmap_format'
@@ -59,7 +59,7 @@ def save_grid(path: str, grid: OccupancyGrid) -> str:
     """
     stem = stem_of(path)
     # All files are written before any takes its name: a full disk leaves the old session as it was.
-    with written_aside(_named(stem, _GRID_END)) as aside:
+    with atomic_write(_named(stem, _GRID_END)) as aside:
         _write_to(aside, _GRID, grid.state())
         write_map(stem, grid.patch())
     return f'{stem}.pgm, {_MAP_END} and {_GRID_END}'
@@ -138,7 +138,7 @@ def save_features(path: str, localizer: AnyLocalizer) -> str:
     return str(file)
 
 
-def load_features(path: str, config: ScanLocalizerConfig | None = None) -> AnyLocalizer | None:
+def load_features(path: str, config: LocalizerConfig | None = None) -> AnyLocalizer | None:
     """Read STEM.features.npz; None where the session has none.
 
     Raises InputError where it is broken.
@@ -147,7 +147,7 @@ def load_features(path: str, config: ScanLocalizerConfig | None = None) -> AnyLo
     if not _is_there(file):
         return None
     try:
-        kind = localizer_class(config or ScanLocalizerConfig())
+        kind = localizer_class(config or LocalizerConfig())
         return kind.from_state(_read(file, _FEATURES), config)
     except InputError as error:
         raise InputError(f'{file}: {error}') from error
@@ -234,7 +234,7 @@ def _is_there(path: Path) -> bool:
 
 
 def _write(path: Path, what: str, arrays: Mapping[str, NDArray[Any]]) -> None:
-    with written_aside(path) as aside:
+    with atomic_write(path) as aside:
         _write_to(aside, what, arrays)
 
 
@@ -247,7 +247,7 @@ def _write_to(path: Path, what: str, arrays: Mapping[str, NDArray[Any]]) -> None
 def _read(path: Path, what: str) -> dict[str, NDArray[Any]]:
     expected = f'expected a saved {what.split()[0]}'
     try:
-        with opened(path) as stream:
+        with open_regular_file(path) as stream:
             arrays = read_arrays(stream)
     except OSError as error:
         raise InputError(error.strerror or reason_of(error)) from error

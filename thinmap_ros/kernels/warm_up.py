@@ -32,15 +32,15 @@ def localizer() -> None:
     """Rehearse localization."""
     from thinmap_ros.core.slam.graph.keyframes import covariances_from
     from thinmap_ros.core.slam.graph.pose_graph import Edge
-    from thinmap_ros.core.slam.localizer import ScanLocalizer
+    from thinmap_ros.core.slam.localizer import Localizer
 
-    rehearsed = ScanLocalizer()
+    rehearsed = Localizer()
     for scan, T_map_base in _drive():
         rehearsed.step(scan, T_map_base)
     # A scan that fits nowhere is searched for; a map that was saved or drawn is taken up.
     rehearsed.step(_odd_scan(), T_map_base)
-    ScanLocalizer.from_state(rehearsed.state())
-    ScanLocalizer.resumed(_room(), LastPose(0, T_map_base, T_map_base), T_map_base)
+    Localizer.from_state(rehearsed.state())
+    Localizer.from_occupancy_map(_room(), LastPose(0, T_map_base, T_map_base), T_map_base)
     # As soon as a place is seen again, covariances along the graph are asked for.
     covariances_from(0, np.zeros((2, 3)), [Edge(0, 1, np.zeros(3), np.eye(3), False)], np.ones(2))
 

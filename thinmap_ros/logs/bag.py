@@ -112,9 +112,9 @@ class Bag:
             Exception
         ) as error:  # any error of the deserializer means the same: these bytes are no such message
             reason = ' '.join(str(error).split())[:120] or type(error).__name__
-            where = f'{self.path}: {validation.short(message.topic)}'
+            where = f'{self.path}: {validation.abbreviated(message.topic)}'
             raise InputError(
-                f'{where}: no {validation.short(message.type_name)}: {reason}'
+                f'{where}: no {validation.abbreviated(message.type_name)}: {reason}'
             ) from error
 
     def _add(self, storage: Storage) -> None:
@@ -176,9 +176,8 @@ class BagLog:
         for topic, count in used.items():
             if count == 0:
                 first = f': {self.skipped.first}' if self.skipped.first else ''
-                raise InputError(
-                    f'{self.path}: {validation.short(topic)}: no message that can be used{first}'
-                )
+                name = validation.abbreviated(topic)
+                raise InputError(f'{self.path}: {name}: no message that can be used{first}')
 
     def _event(self, bag: Bag, message: RawMessage) -> tuple[str, OdometryEvent | Scan] | None:
         """Frame and value of a message; None, counted, where it is unusable."""
@@ -186,7 +185,7 @@ class BagLog:
             decoded = bag.decode(message)
             value = _odometry(decoded) if message.type_name == _ODOMETRY else _scan(decoded)
         except InputError as error:
-            where = f'{self.path}: {validation.short(message.topic)}: '
+            where = f'{self.path}: {validation.abbreviated(message.topic)}: '
             self.skipped.add(where + str(error).removeprefix(where))
             return None
         return decoded.header.frame_id, value
@@ -213,7 +212,7 @@ class BagLog:
                 for transform in bag.decode(message).transforms:
                     transforms.add(transform)
             except InputError as error:
-                where = f'{self.path}: {validation.short(message.topic)}: '
+                where = f'{self.path}: {validation.abbreviated(message.topic)}: '
                 self.skipped.add(where + str(error).removeprefix(where))
         return transforms
 
@@ -226,7 +225,7 @@ class BagLog:
             raise InputError(f'{self.path}: /tf_static: {error}') from error
         if mount is None:
             known = validation.listed(transforms.frames)
-            where = f'where "{validation.short(frame)}" is on "{self.base_frame}"'
+            where = f'where "{validation.abbreviated(frame)}" is on "{self.base_frame}"'
             raise InputError(
                 f'{self.path}: /tf_static does not say {where} (it has {known}): '
                 'give --base-frame, or --offset-m for a laser straight ahead'

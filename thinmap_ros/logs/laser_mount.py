@@ -74,7 +74,9 @@ class StaticTransforms:
         """Take a geometry_msgs/TransformStamped. Raises InputError where it is no transform."""
         moved = message.transform.translation
         translation = np.array([moved.x, moved.y, moved.z], dtype=np.float64)
-        validation.within(f'transform to {shown(message.child_frame_id)}', translation.tolist())
+        validation.require_bounded(
+            f'transform to {shown(message.child_frame_id)}', translation.tolist()
+        )
         rotation = rotation_matrix(message.transform.rotation)
         self._parents[_plain(message.child_frame_id)] = (
             _plain(message.header.frame_id),

@@ -21,10 +21,10 @@ from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.playback import Playback, is_scan
 from thinmap_ros.logs.storage import RawMessage
 from thinmap_ros.ros import messages, node_main, parameters, qos
-from thinmap_ros.ros.diagnostics import OK, WARN, Health
+from thinmap_ros.ros.diagnostics import OK, WARN, NodeDiagnostics
 from thinmap_ros.ros.lockstep import NONE, PATIENCE_S, PATIENCE_WORDS, TOPICS, Lockstep
 from thinmap_ros.ros.messages import message_class
-from thinmap_ros.ros.services import answer
+from thinmap_ros.ros.services import fill_response
 
 _TICK_S = 0.002
 _CLOCK_PERIOD_S = 0.02
@@ -65,8 +65,10 @@ class BagPlayerNode(Node):
 
     def __init__(self) -> None:
         super().__init__('bag_player')
-        self._config = parameters.declare(self, BagPlayerConfig, self._on_config, live=('rate',))
-        parameters.check_unknown(self)
+        self._config = parameters.declare_config(
+            self, BagPlayerConfig, self._on_config, live=('rate',)
+        )
+        parameters.reject_unknown(self)
         if not self._config.bag:
             raise ConfigError("bag = '': expected a rosbag2 folder or an MCAP file")
         self._bag = Bag(Path(self._config.bag))
@@ -85,8 +87,8 @@ class BagPlayerNode(Node):
         self._ticked_at = self._clock_at = 0.0
         self._lockstep = Lockstep(self, self._config.lockstep, self._config.lockstep_patience_s)
         self._sent: Counter[str] = Counter()
-        self._health = Health(self)
-        self._health.before_telling(self._tell_health)
+        self._diagnostics = NodeDiagnostics(self)
+        self._diagnostics.add_update_callback(self._publish_diagnostics)
         self.finished = False
         self.create_service(SetBool, '~/pause', self._on_pause)
         self.create_service(Trigger, '~/step', self._on_step)
@@ -124,8 +126,8 @@ class BagPlayerNode(Node):
         except (InputError, NameValidationException) as error:
             reason = ' '.join(str(error).split())[:200]
             if self._config.topics:
-                raise InputError(f'{validation.short(topic)}: {reason}') from error
-            self.get_logger().warning(f'{validation.short(topic)} is not played: {reason}')
+                raise InputError(f'{validation.abbreviated(topic)}: {reason}') from error
+            self.get_logger().warning(f'{validation.abbreviated(topic)} is not played: {reason}')
 
     def _has_listeners(self) -> bool:
         scans = [t for t in self._publishers_by_topic if self._bag.topics[t] == _SCAN]
@@ -146,46 +148,48 @@ class BagPlayerNode(Node):
         if self._begins_at is None or now < self._begins_at:
             return
         # Time that was waited does not count: what follows keeps its rhythm.
-        if not self._paused and (not self._lockstep.waits or self._lockstep.give_up()):
+        if not self._paused and (not self._lockstep.is_waiting or self._lockstep.timed_out()):
             self._play(passed_s)
         if now - self._clock_at > _CLOCK_PERIOD_S:
             self._clock_at = now
-            self._tell_time(self._playback.clock_ns)
-        self.finished = self._playback.finished and not self._lockstep.waits
+            self._publish_clock(self._playback.clock_ns)
+        self.finished = self._playback.finished and not self._lockstep.is_waiting
 
     def _play(self, passed_s: float) -> None:
         self._playback.advance(1e9 * passed_s * self._config.rate)
-        while not self._lockstep.waits and (message := self._playback.due()) is not None:
+        while not self._lockstep.is_waiting and (message := self._playback.due()) is not None:
             self._send(message)
 
     def _send(self, message: RawMessage) -> None:
-        self._tell_time(message.log_ns)
+        self._publish_clock(message.log_ns)
         self._publishers_by_topic[message.topic].publish(message.data)
         self._sent[message.topic] += 1
         if is_scan(message) and self._config.lockstep != NONE:
             with contextlib.suppress(InputError):  # a broken scan leads to nothing
-                self._lockstep.sent(messages.stamp_ns(self._bag.decode(message).header.stamp))
+                self._lockstep.scan_published(
+                    messages.stamp_ns(self._bag.decode(message).header.stamp)
+                )
 
-    def _tell_health(self) -> None:
+    def _publish_diagnostics(self) -> None:
         waits = self._begins_at is None
         words = 'waiting for subscribers' if waits else 'paused' if self._paused else 'playing'
-        self._health.state(WARN if waits else OK, words)
-        self._health.tell('bag time', self._where())
-        self._health.tell('rounds', self._playback.laps)
+        self._diagnostics.set_state(WARN if waits else OK, words)
+        self._diagnostics.set_value('bag time', self._where())
+        self._diagnostics.set_value('rounds', self._playback.laps)
         for topic, count in self._sent.items():
-            self._health.tell(f'{topic}: sent', count)
+            self._diagnostics.set_value(f'{topic}: sent', count)
 
-    def _tell_time(self, ns: int) -> None:
+    def _publish_clock(self, ns: int) -> None:
         self._clock_topic.publish(ClockMsg(clock=messages.time_msg(ns)))
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._paused = request.data
-        return answer(
+        return fill_response(
             response, lambda: f'{"paused" if self._paused else "playing"} at {self._where()}'
         )
 
     def _on_step(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return answer(response, self._step)
+        return fill_response(response, self._step)
 
     def _step(self) -> str:
         if not self._paused:

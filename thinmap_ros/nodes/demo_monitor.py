@@ -48,8 +48,8 @@ class DemoMonitorNode(Node):
 
     def __init__(self) -> None:
         super().__init__('demo_monitor')
-        self._config = parameters.declare(self, DemoMonitorConfig)
-        parameters.check_unknown(self)
+        self._config = parameters.declare_config(self, DemoMonitorConfig)
+        parameters.reject_unknown(self)
         world = World.from_patch(*read_world(package_data.world_path(self._config.world)))
         radius = PRESETS[self._config.robot].radius_m
         self._coverable = coverable(world, world.start, radius, self._config.range_max_m)
@@ -87,7 +87,7 @@ class DemoMonitorNode(Node):
         future.result().get_result_async().add_done_callback(self._on_result)
 
     def _on_map(self, message: OccupancyGrid) -> None:
-        self._coverage = self._coverable.share_known(messages.patch_from(message))
+        self._coverage = self._coverable.share_known(messages.grid_from_msg(message))
 
     def _on_feedback(self, message: Explore.Impl.FeedbackMessage) -> None:
         self._show(message.feedback.status)

@@ -29,16 +29,16 @@ from thinmap_ros.nodes.exploration.navigation_client import NavigationClient
 from thinmap_ros.nodes.exploration.strategy_source import StrategySource
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.action_server import Outcome, SingleGoalServer
-from thinmap_ros.ros.laser_transform import LaserMount
-from thinmap_ros.ros.lifecycle_node import LiveNode
-from thinmap_ros.ros.save_folder import SaveFolder
-from thinmap_ros.ros.services import answer
-from thinmap_ros.ros.subscription import listen
+from thinmap_ros.ros.laser_transform import LaserTransform
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.save_directory import SaveDirectory
+from thinmap_ros.ros.services import fill_response
+from thinmap_ros.ros.subscription import subscribe_guarded
 
 _CHECK_PERIOD_S = 1.0
 
 
-class ExplorerNode(LiveNode):
+class ExplorerNode(ThinmapNode):
     """Maps, /topology, /pose, /scan in; navigator's goals, /end_nodes, /exploration_status out.
 
     Service save_exploration saves what was learned beside the map and the graph of a session.
@@ -47,25 +47,25 @@ class ExplorerNode(LiveNode):
     def __init__(self) -> None:
         super().__init__('explorer')
         self._strategies = StrategySource(self)
-        self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
-        self._mount = LaserMount(self)
+        self._map_frame = parameters.declare_parameter(self, 'map_frame', 'map', 'frame of the map')
+        self._laser_transform = LaserTransform(self)
         self._session = parameters.declare_session(self)
-        self._save_directory = SaveFolder(self)
-        parameters.check_unknown(self)
+        self._save_directory = SaveDirectory(self)
+        parameters.reject_unknown(self)
         warm_up.explorer()
-        self.begin_anew()
+        self.reset_state()
         self._make_topics()
 
-    def begin_anew(self) -> None:
+    def reset_state(self) -> None:
         """Discard map, graph and what was learned, or restore the session of the start."""
-        self._buffer = ObservationBuffer(messages.topology_from(TopologicalMap()))
+        self._buffer = ObservationBuffer(messages.topology_from_msg(TopologicalMap()))
         self._watchdog = InputWatchdog()
         strategy = self._strategies.initial(self._session)
         self._mission = Mission(
             MissionGoal(), strategy, self._watchdog, self._now_s(), MissionState.IDLE
         )
 
-    def stand_still(self) -> None:
+    def stop(self) -> None:
         """End the exploration."""
         if self._goals.active:
             self._execute(self._mission.cancel('the explorer was stopped or begins anew'))
@@ -73,18 +73,18 @@ class ExplorerNode(LiveNode):
     def _make_topics(self) -> None:
         self._end_nodes = self.create_publisher(EndNodeArray, 'end_nodes', qos.LATCHED)
         self._status = self.create_publisher(ExplorationStatus, 'exploration_status', qos.LATCHED)
-        listen(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
-        listen(self, OccupancyGrid, 'map', self._on_map, qos.LATCHED)
-        listen(self, OccupancyGrid, 'local_map', self._on_local_map, qos.LATCHED)
-        listen(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
-        listen(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
-        listen(self, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
+        subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
+        subscribe_guarded(self, OccupancyGrid, 'map', self._on_map, qos.LATCHED)
+        subscribe_guarded(self, OccupancyGrid, 'local_map', self._on_local_map, qos.LATCHED)
+        subscribe_guarded(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
+        subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
+        subscribe_guarded(self, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
         self._navigation = NavigationClient(self, self._map_frame, self._on_drive_ended)
         self._goals = SingleGoalServer(
             self, Explore, 'explore', self._on_goal, self._on_cancel, self._on_preempted
         )
         self.create_service(SaveMap, 'save_exploration', self._on_save)
-        self.every(_CHECK_PERIOD_S, self._on_timer)
+        self.create_active_timer(_CHECK_PERIOD_S, self._on_timer)
 
     # Goals of the action.
 
@@ -110,21 +110,21 @@ class ExplorerNode(LiveNode):
     # Inputs.
 
     def _on_topology(self, message: TopologicalMap) -> None:
-        self._buffer.topology = messages.topology_from(message)
+        self._buffer.topology = messages.topology_from_msg(message)
 
     def _on_map(self, message: OccupancyGrid) -> None:
-        self._buffer.replace_map(messages.patch_from(message))
+        self._buffer.replace_map(messages.grid_from_msg(message))
 
     def _on_local_map(self, message: OccupancyGrid) -> None:
         stamp_ns = messages.stamp_ns(message.header.stamp)
-        self._process(self._buffer.add_local_map(stamp_ns, messages.patch_from(message)))
+        self._process(self._buffer.add_local_map(stamp_ns, messages.grid_from_msg(message)))
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         stamp_ns = messages.stamp_ns(message.header.stamp)
-        self._process(self._buffer.add_pose(stamp_ns, messages.pose_from(message.pose.pose)))
+        self._process(self._buffer.add_pose(stamp_ns, messages.pose_from_msg(message.pose.pose)))
 
     def _on_scan(self, message: LaserScan) -> None:
-        scan = self._mount.scan(message)
+        scan = self._laser_transform.to_scan(message)
         if scan.is_blind:
             return  # ignored: a blind scan observes nothing
         self._watchdog.add_scan(self._now_s())
@@ -149,10 +149,10 @@ class ExplorerNode(LiveNode):
 
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:
-            path = self._save_directory.inside(request.path)
+            path = self._save_directory.resolve(request.path)
             return self._strategies.save(path, self._mission.strategy)
 
-        return answer(response, save)
+        return fill_response(response, save)
 
     # Outputs.
 
@@ -161,7 +161,7 @@ class ExplorerNode(LiveNode):
         if observation is None or not self._goals.active:
             return
         was_exploring = self._mission.state == MissionState.EXPLORING
-        with self.health.timed('explorer'):
+        with self.diagnostics.time_step('explorer'):
             action = self._mission.step(observation)
         if was_exploring:
             stamp_ns = observation.scan.stamp_ns

@@ -26,9 +26,9 @@ from thinmap_ros.core.topology.graph import TopologicalMap as Topology
 from thinmap_ros.files import occupancy_maps
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.ros import messages, node_main, parameters, qos
-from thinmap_ros.ros.laser_transform import LaserMount
-from thinmap_ros.ros.lifecycle_node import LiveNode
-from thinmap_ros.ros.subscription import listen
+from thinmap_ros.ros.laser_transform import LaserTransform
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.subscription import subscribe_guarded
 
 _WARN_PERIOD_S = 5.0
 _CONTROL_PERIOD_S = 0.1
@@ -46,7 +46,7 @@ _STATES = {
 }
 
 
-class GlobalLocalizerNode(LiveNode):
+class GlobalLocalizerNode(ThinmapNode):
     """/scan, /odom, /map and /topology in.
 
     /initialpose, /localization_samples and /localization_status out. Service localize_globally.
@@ -57,38 +57,38 @@ class GlobalLocalizerNode(LiveNode):
 
     def __init__(self) -> None:
         super().__init__('global_localizer')
-        self._config = parameters.declare(self, GlobalLocalizationConfig)
+        self._config = parameters.declare_config(self, GlobalLocalizationConfig)
         self._seed = int(
-            parameters.declare_value(self, 'seed', 0, 'decides where samples are drawn')
+            parameters.declare_parameter(self, 'seed', 0, 'decides where samples are drawn')
         )
-        self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
-        automatic = parameters.declare_value(
+        self._map_frame = parameters.declare_parameter(self, 'map_frame', 'map', 'frame of the map')
+        automatic = parameters.declare_parameter(
             self,
             'automatic',
             False,
             'begin at once, and again when the localizer has been lost for lost_s',
         )
-        lost_s = parameters.declare_value(
+        lost_s = parameters.declare_parameter(
             self, 'lost_s', 3.0, 'how long the localizer must have been lost, s'
         )
         self._active = bool(
-            parameters.declare_value(
+            parameters.declare_parameter(
                 self,
                 'active',
                 False,
                 'drive, while it looks, to where the places in question differ most',
             )
         )
-        speed = parameters.declare_value(
+        speed = parameters.declare_parameter(
             self, 'active_speed_m_s', 0.3, 'how fast it then drives, m/s'
         )
         path = str(
-            parameters.declare_value(
+            parameters.declare_parameter(
                 self, 'map', '', 'map_server YAML file; empty: from the topics'
             )
         )
-        self._mount = LaserMount(self)
-        parameters.check_unknown(self)
+        self._laser_transform = LaserTransform(self)
+        parameters.reject_unknown(self)
         self._automatic = bool(automatic)
         self._lost_ns = round(1e9 * float(lost_s))
         self._patch: GridPatch | None = occupancy_maps.read_map(Path(path)) if path else None
@@ -102,23 +102,23 @@ class GlobalLocalizerNode(LiveNode):
             body_radius_m=radius + _BODY_M,
         )
         warm_up.global_localizer()
-        self.begin_anew()
+        self.reset_state()
         self._pose = self.create_publisher(PoseWithCovarianceStamped, 'initialpose', qos.STREAM)
         self._samples = self.create_publisher(PoseArray, 'localization_samples', qos.LATCHED)
         self._status = self.create_publisher(LocalizationStatus, 'localization_status', qos.LATCHED)
         if not path:
-            listen(self, OccupancyGrid, 'map', self._on_map, qos.LATCHED)
-            listen(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
-        listen(self, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
-        listen(self, Odometry, 'odom', self._on_odometry, qos.STREAM)
-        listen(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
+            subscribe_guarded(self, OccupancyGrid, 'map', self._on_map, qos.LATCHED)
+            subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
+        subscribe_guarded(self, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
+        subscribe_guarded(self, Odometry, 'odom', self._on_odometry, qos.STREAM)
+        subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
         self.create_service(LocalizeGlobally, 'localize_globally', self._on_request)
-        self.every(1.0, self._say_what_is_missing)
+        self.create_active_timer(1.0, self._report_missing_inputs)
         if self._active:
             self._cmd_vel = self.create_publisher(Twist, 'cmd_vel', qos.STREAM)
-            self.every(_CONTROL_PERIOD_S, self._drive)
+            self.create_active_timer(_CONTROL_PERIOD_S, self._drive)
 
-    def begin_anew(self) -> None:
+    def reset_state(self) -> None:
         """Forget where the robot may be."""
         self._finder: GlobalLocalization | None = None
         self._wanted = self._automatic
@@ -133,7 +133,7 @@ class GlobalLocalizerNode(LiveNode):
         self._drives = False
         self._shown_ns = -_SHOWN_NS
 
-    def stand_still(self) -> None:
+    def stop(self) -> None:
         """Stop the robot, if it is this node that drives it."""
         if self._drives:
             self._cmd_vel.publish(messages.twist_msg(0.0, 0.0))
@@ -141,14 +141,14 @@ class GlobalLocalizerNode(LiveNode):
 
     def close(self) -> None:
         """Stop the robot: the last thing the node does."""
-        self.stand_still()
+        self.stop()
         super().close()
 
     def _on_map(self, message: OccupancyGrid) -> None:
-        self._patch = messages.patch_from(message)
+        self._patch = messages.grid_from_msg(message)
 
     def _on_topology(self, message: TopologicalMap) -> None:
-        self._topology = messages.topology_from(message)
+        self._topology = messages.topology_from_msg(message)
 
     def _on_slam_status(self, message: SlamStatus) -> None:
         """A robot that was carried off: the localizer finds nothing where it thinks that it is."""
@@ -179,22 +179,22 @@ class GlobalLocalizerNode(LiveNode):
     def _on_odometry(self, message: Odometry) -> None:
         self._heard.add('odom')
         stamp_ns = messages.stamp_ns(message.header.stamp)
-        self._T_odom_base = messages.pose_from(message.pose.pose)
+        self._T_odom_base = messages.pose_from_msg(message.pose.pose)
         self._odometry_ns = stamp_ns
-        self._take(self._pairing.add_odometry(stamp_ns, self._T_odom_base))
+        self._process(self._pairing.add_odometry(stamp_ns, self._T_odom_base))
 
     def _on_scan(self, message: LaserScan) -> None:
-        scan = self._mount.scan(message)
+        scan = self._laser_transform.to_scan(message)
         self._heard.add('scan')
         # Where the laser is blind, nobody sees where the robot drives.
         self._scan = None if scan.is_blind else scan
-        self._take(self._pairing.add_scan(scan))
+        self._process(self._pairing.add_scan(scan))
 
-    def _take(self, ready: list[tuple[Scan, Array]]) -> None:
+    def _process(self, ready: list[tuple[Scan, Array]]) -> None:
         for scan, T_odom_base in ready:
-            if self._wanted and self._make_finder():
+            if self._wanted and self._create_global_localizer():
                 assert self._finder is not None
-                with self.health.timed('global localization'):
+                with self.diagnostics.time_step('global localization'):
                     result = self._finder.step(scan, T_odom_base)
                 if self._search is not None:
                     self._search.take(result, T_odom_base)
@@ -213,16 +213,16 @@ class GlobalLocalizerNode(LiveNode):
             or T_odom_base is None
             or not heard
         ):
-            self.stand_still()
+            self.stop()
             return
         command = self._search.step(T_odom_base, scan, _CONTROL_PERIOD_S)
         if command.state == 'idle':
-            self.stand_still()
+            self.stop()
             return
         self._drives = True
         self._cmd_vel.publish(messages.twist_msg(command.v, command.w))
 
-    def _make_finder(self) -> bool:
+    def _create_global_localizer(self) -> bool:
         """Whether there is all that a search needs; a map that cannot be used is said in words."""
         if self._finder is None and self._patch is not None and self._topology is not None:
             try:
@@ -232,7 +232,7 @@ class GlobalLocalizerNode(LiveNode):
                 if self._active:
                     self._search = ActiveSearch(self._finder.places, self._config, self._driving)
             except InputError as error:
-                self._say(LocalizationStatus.WAITING, str(error))
+                self._publish_state(LocalizationStatus.WAITING, str(error))
         return self._finder is not None
 
     def _missing(self) -> str:
@@ -245,14 +245,14 @@ class GlobalLocalizerNode(LiveNode):
         missing += [name for name in ('odom', 'scan') if name not in self._heard]
         return ', '.join(missing)
 
-    def _say_what_is_missing(self) -> None:
+    def _report_missing_inputs(self) -> None:
         missing = self._missing()
         if not self._wanted:
-            self._say(LocalizationStatus.IDLE, 'not asked')
+            self._publish_state(LocalizationStatus.IDLE, 'not asked')
         elif missing:
-            self._say(LocalizationStatus.WAITING, f'waits for {missing}')
+            self._publish_state(LocalizationStatus.WAITING, f'waits for {missing}')
 
-    def _say(self, state: int, reason: str) -> None:
+    def _publish_state(self, state: int, reason: str) -> None:
         header = messages.header(self._map_frame, self.get_clock().now().nanoseconds)
         self._status.publish(LocalizationStatus(header=header, state=state, reason=reason))
         if state == LocalizationStatus.WAITING:
@@ -285,7 +285,7 @@ class GlobalLocalizerNode(LiveNode):
             self._finder = None
             self._search = None
             self._found_ns = ns
-            self.stand_still()
+            self.stop()
 
     def _show_samples(self, ns: int) -> None:
         """Publish the samples, now and then.

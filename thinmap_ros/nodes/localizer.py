@@ -23,7 +23,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import LastPose, ScanPairing
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
+from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.core.slam.localizers import (
     AnyLocalizer,
     line_features,
@@ -36,11 +36,11 @@ from thinmap_ros.kernels import warm_up
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import State
 from thinmap_ros.ros.diagnostics import ERROR, OK
-from thinmap_ros.ros.laser_transform import LaserMount
-from thinmap_ros.ros.lifecycle_node import LiveNode
-from thinmap_ros.ros.save_folder import SaveFolder
-from thinmap_ros.ros.services import answer
-from thinmap_ros.ros.subscription import listen
+from thinmap_ros.ros.laser_transform import LaserTransform
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.save_directory import SaveDirectory
+from thinmap_ros.ros.services import fill_response
+from thinmap_ros.ros.subscription import subscribe_guarded
 
 _MAP_WAIT_S = 3.0  # after a restart; the navigator drives on for so long without a new pose
 _HEALTH = {
@@ -50,7 +50,7 @@ _HEALTH = {
 }
 
 
-class LocalizerNode(LiveNode):
+class LocalizerNode(ThinmapNode):
     """/scan and /odom in; /pose, map -> odom on /tf, /line_features, /slam_status out.
 
     /trajectory after a loop.
@@ -61,25 +61,27 @@ class LocalizerNode(LiveNode):
 
     def __init__(self) -> None:
         super().__init__('localizer', recovers=True)
-        self._config = parameters.declare(self, ScanLocalizerConfig)
-        self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
-        self._odom_frame = parameters.declare_value(
+        self._config = parameters.declare_config(self, LocalizerConfig)
+        self._map_frame = parameters.declare_parameter(self, 'map_frame', 'map', 'frame of the map')
+        self._odom_frame = parameters.declare_parameter(
             self, 'odom_frame', 'odom', 'frame of the odometry'
         )
-        self._mount = LaserMount(self)
+        self._laser_transform = LaserTransform(self)
         self._session = parameters.declare_session(self)
-        self._saves = SaveFolder(self)
-        parameters.check_unknown(self)
+        self._save_directory = SaveDirectory(self)
+        parameters.reject_unknown(self)
         warm_up.localizer()
         self._map_topic: Subscription | None = None
         # Of a localizer that was killed: its last pose, the map, and the newest scan, that waits
         # for it.
-        self._resumed: LastPose | None = None
-        self._latched: GridPatch | None = None
-        self.begin_anew()
-        self.keep(lambda: None if self._last is None else self._last.state(), self._take_up)
-        self.offer_pause()
-        self.health.sole_publisher_of('pose')
+        self._restored_pose: LastPose | None = None
+        self._latched_map: GridPatch | None = None
+        self.reset_state()
+        self.enable_checkpoint(
+            lambda: None if self._last is None else self._last.state(), self._restore_checkpoint
+        )
+        self.create_pause_service()
+        self.diagnostics.check_sole_publisher('pose')
         self._pose = self.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
         self._tf = self.create_publisher(TFMessage, '/tf', qos.STREAM)
         self._features = self.create_publisher(LineFeatureArray, 'line_features', qos.LATCHED)
@@ -87,61 +89,63 @@ class LocalizerNode(LiveNode):
         self._trajectory = self.create_publisher(Path, 'trajectory', qos.LATCHED)
         # Before the scans: of messages that wait together, the executor takes the graph of the last
         # scan first.
-        listen(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
-        listen(self, Odometry, 'odom', self._on_odometry, qos.STREAM)
-        listen(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
-        listen(self, PoseWithCovarianceStamped, 'initialpose', self._on_initial_pose, qos.STREAM)
+        subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
+        subscribe_guarded(self, Odometry, 'odom', self._on_odometry, qos.STREAM)
+        subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
+        subscribe_guarded(
+            self, PoseWithCovarianceStamped, 'initialpose', self._on_initial_pose, qos.STREAM
+        )
         self.create_service(SaveMap, 'save_features', self._on_save)
         self.create_service(LoadMap, 'load_features', self._on_load)
 
-    def begin_anew(self) -> None:
+    def reset_state(self) -> None:
         """Forget all features, or go back to the session that the node was started with.
 
         The robot is at its start.
         """
-        self._localizer = self._made(self._config)
+        self._localizer = self._create_localizer(self._config)
         self._pairing = ScanPairing()
         self._last: LastPose | None = None
         self._topology: Graph | None = None
-        self._resumed = self._latched = None
-        self._newest: list[tuple[Scan, Array]] = []
-        self._waits_since = monotonic()
+        self._restored_pose = self._latched_map = None
+        self._pending_scan: list[tuple[Scan, Array]] = []
+        self._waiting_since = monotonic()
 
-    def _take_up(self, left: State) -> None:
+    def _restore_checkpoint(self, left: State) -> None:
         """Go on from the last pose of a killed localizer. Raises InputError where it is none."""
-        self._resumed = LastPose.from_state(left)
-        self._listen_for_the_map()
+        self._restored_pose = LastPose.from_state(left)
+        self._subscribe_map_once()
 
-    def _made(self, config: ScanLocalizerConfig) -> AnyLocalizer:
+    def _create_localizer(self, config: LocalizerConfig) -> AnyLocalizer:
         """A localizer that begins at its start, in the map of the session if there is one."""
         loaded = sessions.load_features(self._session, config) if self._session else None
         return loaded or localizer_class(config)(config)
 
-    def _at(self, T_map_base: Array) -> ScanLocalizerConfig:
+    def _config_at(self, T_map_base: Array) -> LocalizerConfig:
         """The configuration of a robot that starts at a pose (3,)."""
         x, y, yaw = T_map_base.tolist()
-        return replace(self._config, start_x_m=x, start_y_m=y, start_yaw_rad=yaw)
+        return replace(self._config, initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
 
     def _on_odometry(self, message: Odometry) -> None:
         stamp_ns = messages.stamp_ns(message.header.stamp)
-        ready = self._pairing.add_odometry(stamp_ns, messages.pose_from(message.pose.pose))
-        self._take(ready)
+        ready = self._pairing.add_odometry(stamp_ns, messages.pose_from_msg(message.pose.pose))
+        self._process(ready)
 
     def _on_scan(self, message: LaserScan) -> None:
-        self._take(self._pairing.add_scan(self._mount.scan(message)))
+        self._process(self._pairing.add_scan(self._laser_transform.to_scan(message)))
 
     def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
         self._localizer.set_pose(
-            messages.pose_from(message.pose.pose), messages.covariance_from(message)
+            messages.pose_from_msg(message.pose.pose), messages.covariance_from_msg(message)
         )
 
     def _on_topology(self, message: TopologicalMap) -> None:
-        self._topology = messages.topology_from(message)
+        self._topology = messages.topology_from_msg(message)
         set_topology(self._localizer, self._topology)
 
-    def _take(self, ready: list[tuple[Scan, Array]]) -> None:
-        if self._resumed is not None:
-            ready = self._resume(self._resumed, ready)
+    def _process(self, ready: list[tuple[Scan, Array]]) -> None:
+        if self._restored_pose is not None:
+            ready = self._resume(self._restored_pose, ready)
         for scan, T_odom_base in ready:
             started = perf_counter()
             estimate = self._localizer.step(scan, T_odom_base)
@@ -149,24 +153,30 @@ class LocalizerNode(LiveNode):
             self._publish(scan, estimate, step_ms)
             if not estimate.lost:
                 self._last = LastPose(scan.stamp_ns, estimate.T_map_odom, T_odom_base)
-        self.health.dropped_in_all('scans without odometry at their time', self._pairing.dropped)
-        self.health.dropped_in_all('scans or odometry that make no sense', self._localizer.refused)
+        self.diagnostics.set_drop_total(
+            'scans without odometry at their time', self._pairing.dropped
+        )
+        self.diagnostics.set_drop_total(
+            'scans or odometry that make no sense', self._localizer.refused
+        )
 
-    def _listen_for_the_map(self) -> None:
+    def _subscribe_map_once(self) -> None:
         """Hear the map that was drawn before this localizer was killed, once."""
 
         def take(message: OccupancyGrid) -> None:
-            if self._resumed is None:
+            if self._restored_pose is None:
                 return  # it was told to begin anew
             try:
-                self._latched = messages.patch_from(message)
+                self._latched_map = messages.grid_from_msg(message)
             except InputError as error:
                 self.get_logger().warning(f'map: {error}')
             if self.is_active:
-                self._take([])
+                self._process([])
 
         self._map_topic = self.create_subscription(OccupancyGrid, 'map', take, qos.LATCHED)
-        self.every(_MAP_WAIT_S, lambda: self._take([]), Clock(clock_type=ClockType.STEADY_TIME))
+        self.create_active_timer(
+            _MAP_WAIT_S, lambda: self._process([]), Clock(clock_type=ClockType.STEADY_TIME)
+        )
 
     def _resume(self, last: LastPose, ready: list[tuple[Scan, Array]]) -> list[tuple[Scan, Array]]:
         """Begin where the robot is now, in the map; returns the scan to go on with, or none yet.
@@ -174,45 +184,49 @@ class LocalizerNode(LiveNode):
         Where the odometry has begun anew, too, the robot is at its start. Where there is no map, it
         begins with what it sees where odometry says that it is.
         """
-        self._newest = ready[-1:] or self._newest
-        if not self._newest:
-            self._waits_since = monotonic()
+        self._pending_scan = ready[-1:] or self._pending_scan
+        if not self._pending_scan:
+            self._waiting_since = monotonic()
             return []
-        scan, T_odom_base = self._newest[0]
+        scan, T_odom_base = self._pending_scan[0]
         leads = last.leads_to(scan.stamp_ns, T_odom_base)
-        waited_s = monotonic() - self._waits_since
-        if leads and self._latched is None and waited_s < _MAP_WAIT_S:
+        waited_s = monotonic() - self._waiting_since
+        if leads and self._latched_map is None and waited_s < _MAP_WAIT_S:
             return []
         if not leads:
             self.get_logger().warning('the odometry has begun anew as well: beginning at the start')
-        elif self._latched is None:
+        elif self._latched_map is None:
             self.get_logger().warning(
                 f'no map came for {waited_s:.0f} s: what is drawn now may not fit what was before'
             )
-            self._localizer = self._made(self._at(se2.compose(last.T_map_odom, T_odom_base)))
+            self._localizer = self._create_localizer(
+                self._config_at(se2.compose(last.T_map_odom, T_odom_base))
+            )
         else:
             kind = localizer_class(self._config)
-            self._localizer = kind.resumed(self._latched, last, T_odom_base, self._config)
+            self._localizer = kind.from_occupancy_map(
+                self._latched_map, last, T_odom_base, self._config
+            )
         if self._topology is not None:
             set_topology(self._localizer, self._topology)
-        self._resumed = self._latched = None
+        self._restored_pose = self._latched_map = None
         self.destroy_subscription(self._map_topic)
-        return self._newest
+        return self._pending_scan
 
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:
-            path = self._saves.inside(request.path)
+            path = self._save_directory.resolve(request.path)
             return f'saved {sessions.save_features(path, self._localizer)}'
 
-        return answer(response, save)
+        return fill_response(response, save)
 
     def _on_load(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:
-        return answer(response, lambda: self._load(request.path))
+        return fill_response(response, lambda: self._load(request.path))
 
     def _load(self, path: str) -> str:
         """Take over the features of a session; without any, those that there are stay."""
-        config = self._at(self._localizer.pose)
-        loaded = sessions.load_features(self._saves.inside(path), config)
+        config = self._config_at(self._localizer.pose)
+        loaded = sessions.load_features(self._save_directory.resolve(path), config)
         if loaded is None:
             return 'no features are saved: the localizer keeps its own'
         self._localizer = loaded
@@ -223,11 +237,11 @@ class LocalizerNode(LiveNode):
 
     def _publish(self, scan: Scan, estimate: Estimate, step_ms: float) -> None:
         ns = scan.stamp_ns
-        self.health.took('localizer', step_ms)
+        self.diagnostics.record_step_time('localizer', step_ms)
         state = _state_of(scan, estimate)
-        self.health.state(*_HEALTH[state])
+        self.diagnostics.set_state(*_HEALTH[state])
         if estimate.correction is not None:
-            self._tell_trajectory(ns)
+            self._publish_trajectory(ns)
         pose = messages.pose_with_covariance_msg(
             estimate.T_map_base, estimate.covariance, self._map_frame, ns
         )
@@ -253,12 +267,12 @@ class LocalizerNode(LiveNode):
             )
         )
 
-    def _tell_trajectory(self, ns: int) -> None:
+    def _publish_trajectory(self, ns: int) -> None:
         """Say where the kept scans were made, now that a loop is closed.
 
         Before the first pose that follows from it.
         """
-        stamps, poses = self._localizer.past()
+        stamps, poses = self._localizer.keyframe_trajectory()
         self._trajectory.publish(
             messages.trajectory_msg(stamps.tolist(), poses, self._map_frame, ns)
         )

@@ -15,8 +15,8 @@ from thinmap_msgs.msg import EndNodeArray, LineFeatureArray, TopologicalMap
 from thinmap_ros.core import validation
 from thinmap_ros.core.topology.graph import NodeKind
 from thinmap_ros.ros import messages, node_main, parameters, qos
-from thinmap_ros.ros.lifecycle_node import LiveNode
-from thinmap_ros.ros.subscription import listen
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.subscription import subscribe_guarded
 from thinmap_ros.view import palette
 
 _EDGE_M = 0.04
@@ -32,27 +32,29 @@ _REMOTE = '#999999'
 _TEXT = '#000000'
 
 
-class MarkersNode(LiveNode):
+class MarkersNode(ThinmapNode):
     """/topology, /end_nodes, /line_features in; as markers on /topology_markers, ... out."""
 
     def __init__(self) -> None:
         super().__init__('markers')
-        parameters.check_unknown(self)
+        parameters.reject_unknown(self)
         self._show(TopologicalMap, 'topology', topology)
         self._show(EndNodeArray, 'end_nodes', end_nodes)
         self._show(LineFeatureArray, 'line_features', line_features)
 
     def _show(self, kind: type, topic: str, drawn: Callable[[Any], MarkerArray]) -> None:
         publisher = self.create_publisher(MarkerArray, f'{topic}_markers', qos.LATCHED)
-        listen(self, kind, topic, lambda message: publisher.publish(drawn(message)), qos.LATCHED)
+        subscribe_guarded(
+            self, kind, topic, lambda message: publisher.publish(drawn(message)), qos.LATCHED
+        )
 
 
 def topology(message: TopologicalMap) -> MarkerArray:
     """Edges as lines along their paths, nodes as spheres coloured by kind.
 
-    Raises InputError as `topology_from`.
+    Raises InputError as `topology_from_msg`.
     """
-    graph = messages.topology_from(message)
+    graph = messages.topology_from_msg(message)
     edges = _marker(message.header, 'edges', Marker.LINE_LIST, _EDGE_M, palette.EDGE)
     for edge in graph.edges.values():
         points = [_point(float(x), float(y), _EDGE_Z) for x, y in edge.path]
@@ -72,8 +74,8 @@ def end_nodes(message: EndNodeArray) -> MarkerArray:
     """
     markers: list[Marker] = []
     for node in message.end_nodes:
-        validation.within(f'end node {node.node_id}', (node.position.x, node.position.y))
-        validation.within(
+        validation.require_bounded(f'end node {node.node_id}', (node.position.x, node.position.y))
+        validation.require_bounded(
             f'probability of end node {node.node_id}', (node.position_probability,), 1.0
         )
         ball = _marker(
@@ -102,7 +104,9 @@ def line_features(message: LineFeatureArray) -> MarkerArray:
     lines = _marker(message.header, 'lines', Marker.LINE_LIST, _LINE_M, palette.ESTIMATE)
     for feature in message.features:
         ends = (feature.start, feature.end)
-        validation.within(f'line {feature.id}', [c for end in ends for c in (end.x, end.y)])
+        validation.require_bounded(
+            f'line {feature.id}', [c for end in ends for c in (end.x, end.y)]
+        )
         lines.points += [_point(end.x, end.y, _LINE_Z) for end in ends]
         lines.colors += 2 * [_colour(palette.ESTIMATE if feature.in_local_area else _REMOTE)]
     return _shown([lines])

@@ -17,9 +17,9 @@ from thinmap_ros.kernels import warm_up
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.action_server import Outcome, SingleGoalServer
 from thinmap_ros.ros.diagnostics import OK, WARN
-from thinmap_ros.ros.laser_transform import LaserMount
-from thinmap_ros.ros.lifecycle_node import LiveNode
-from thinmap_ros.ros.subscription import listen
+from thinmap_ros.ros.laser_transform import LaserTransform
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.subscription import subscribe_guarded
 
 _WARN_PERIOD_S = 5.0
 _CONTROL_PERIOD_S = 0.1
@@ -28,30 +28,30 @@ _SILENCE_NS = 400_000_000  # with the control period: a stop within half a secon
 _SILENCES_NS = {'laser': _SILENCE_NS, 'odometry': _SILENCE_NS, 'localizer': 3_000_000_000}
 
 
-class NavigatorNode(LiveNode):
+class NavigatorNode(ThinmapNode):
     """/pose, /odom, /scan and the maps in; /cmd_vel and /plan out; action navigate_to_pose."""
 
     def __init__(self) -> None:
         super().__init__('navigator')
-        self._config = parameters.declare(self, NavigatorConfig, self._on_config)
-        self._map_frame = parameters.declare_value(self, 'map_frame', 'map', 'frame of the map')
-        self._mount = LaserMount(self)
-        parameters.check_unknown(self)
+        self._config = parameters.declare_config(self, NavigatorConfig, self._on_config)
+        self._map_frame = parameters.declare_parameter(self, 'map_frame', 'map', 'frame of the map')
+        self._laser_transform = LaserTransform(self)
+        parameters.reject_unknown(self)
         warm_up.navigator()
-        self.begin_anew()
+        self.reset_state()
         self._cmd_vel = self.create_publisher(Twist, 'cmd_vel', qos.STREAM)
         self._plan = self.create_publisher(Path, 'plan', qos.LATCHED)
-        listen(self, Odometry, 'odom', self._on_odometry, qos.STREAM)
-        listen(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
-        listen(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
-        listen(self, OccupancyGrid, 'map', self._on_map, qos.LATCHED)
-        listen(self, OccupancyGrid, 'local_map', self._on_window, qos.LATCHED)
+        subscribe_guarded(self, Odometry, 'odom', self._on_odometry, qos.STREAM)
+        subscribe_guarded(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
+        subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
+        subscribe_guarded(self, OccupancyGrid, 'map', self._on_map, qos.LATCHED)
+        subscribe_guarded(self, OccupancyGrid, 'local_map', self._on_window, qos.LATCHED)
         self._goals = SingleGoalServer(
             self, NavigateToPose, 'navigate_to_pose', self._on_goal, self._on_cancel, _preempted
         )
-        self.every(_CONTROL_PERIOD_S, self._control)
+        self.create_active_timer(_CONTROL_PERIOD_S, self._control)
 
-    def begin_anew(self) -> None:
+    def reset_state(self) -> None:
         """Forget the map and where the robot is."""
         self._navigator = Navigator(self._config)
         self._map = MapMirror()
@@ -72,7 +72,7 @@ class NavigatorNode(LiveNode):
         if self._goals.active:
             self._navigator.set_goal(*self._goal)
 
-    def stand_still(self) -> None:
+    def stop(self) -> None:
         """End the goal; the robot stops."""
         self._end(Outcome.ABORTED, 'the navigator was stopped or begins anew')
 
@@ -82,34 +82,34 @@ class NavigatorNode(LiveNode):
         super().close()
 
     def _on_odometry(self, message: Odometry) -> None:
-        self._T_odom_base = messages.pose_from(message.pose.pose)
-        self._note('odometry')
+        self._T_odom_base = messages.pose_from_msg(message.pose.pose)
+        self._record_input('odometry')
         self._odometry.add(messages.stamp_ns(message.header.stamp), self._T_odom_base)
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         T_odom_base = self._odometry.at(messages.stamp_ns(message.header.stamp))
         if T_odom_base is None:
             return
-        T_map_base = messages.pose_from(message.pose.pose)
-        self._note('localizer')
+        T_map_base = messages.pose_from_msg(message.pose.pose)
+        self._record_input('localizer')
         self._T_map_odom = se2.compose(T_map_base, se2.invert(T_odom_base))
 
     def _on_scan(self, message: LaserScan) -> None:
-        scan = self._mount.scan(message)
+        scan = self._laser_transform.to_scan(message)
         self._is_blind = scan.is_blind
         if not scan.is_blind:
             self._scan = scan
-            self._note('laser')
+            self._record_input('laser')
 
     def _on_map(self, message: OccupancyGrid) -> None:
-        self._map.replace(messages.patch_from(message))
+        self._map.replace(messages.grid_from_msg(message))
 
     def _on_window(self, message: OccupancyGrid) -> None:
-        self._map.paste(messages.patch_from(message))
+        self._map.paste(messages.grid_from_msg(message))
 
     def _on_goal(self, request: NavigateToPose.Goal) -> None:
         try:
-            goal = messages.pose_from(request.pose.pose)
+            goal = messages.pose_from_msg(request.pose.pose)
         except InputError as error:
             self._end(Outcome.ABORTED, f'goal: {error}')
             return
@@ -136,26 +136,26 @@ class NavigatorNode(LiveNode):
             return
         command = self._command()
         if command is None:
-            self._tell('waiting')
+            self._publish_feedback('waiting')
             return
         self._cmd_vel.publish(messages.twist_msg(command.v, command.w))
-        self._show_path()
+        self._publish_plan()
         if command.state == 'reached':
             self._end(Outcome.SUCCEEDED, 'goal reached')
         elif command.state == 'failed':
             self._end(Outcome.ABORTED, command.reason)
         else:
-            self._tell(command.state)
+            self._publish_feedback(command.state)
 
     def _command(self) -> Command | None:
         """What the navigator says now; a stop while the laser is silent.
 
         None before everything is known.
         """
-        if fault := self._fault():
+        if fault := self._stop_reason():
             reason = f'{fault}: standing still'
             self.get_logger().warning(reason, throttle_duration_sec=_WARN_PERIOD_S)
-            self.health.state(WARN, reason)
+            self.diagnostics.set_state(WARN, reason)
             self._navigator.halt()
             return Command(0.0, 0.0, 'blocked', reason)
         if (
@@ -169,12 +169,12 @@ class NavigatorNode(LiveNode):
                 throttle_duration_sec=_WARN_PERIOD_S,
             )
             return None
-        self.health.state(OK, 'driving')
+        self.diagnostics.set_state(OK, 'driving')
         T_map_base = se2.compose(self._T_map_odom, self._T_odom_base)
-        with self.health.timed('navigator'):
+        with self.diagnostics.time_step('navigator'):
             return self._navigator.step(T_map_base, self._map.patch, self._scan, _CONTROL_PERIOD_S)
 
-    def _fault(self) -> str:
+    def _stop_reason(self) -> str:
         """Why driving on would be driving blind; '' where all is well."""
         if self._is_blind:
             return 'laser blind (too few valid beams)'
@@ -191,17 +191,17 @@ class NavigatorNode(LiveNode):
                 return f'{who} silent'
         return ''
 
-    def _note(self, who: str) -> None:
+    def _record_input(self, who: str) -> None:
         self._heard_ns[who] = self.get_clock().now().nanoseconds
 
-    def _show_path(self) -> None:
+    def _publish_plan(self) -> None:
         path = self._navigator.path
         if path is not None and path is not self._shown_path:
             self._shown_path = path
             ns = self.get_clock().now().nanoseconds
             self._plan.publish(messages.path_msg(np.asarray(path), self._map_frame, ns))
 
-    def _tell(self, state: str) -> None:
+    def _publish_feedback(self, state: str) -> None:
         feedback = NavigateToPose.Feedback()
         feedback.state = state
         feedback.distance_remaining_m = self._navigator.distance_remaining_m
@@ -209,7 +209,7 @@ class NavigatorNode(LiveNode):
 
     def _end(self, outcome: Outcome, reason: str) -> None:
         self._navigator.cancel()
-        self.health.state(OK, reason)
+        self.diagnostics.set_state(OK, reason)
         self._cmd_vel.publish(messages.twist_msg(0.0, 0.0))
         self._goals.finish(
             outcome, NavigateToPose.Result(success=outcome is Outcome.SUCCEEDED, reason=reason)

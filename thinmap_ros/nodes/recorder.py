@@ -15,10 +15,10 @@ from thinmap_ros.files import package_data
 from thinmap_ros.logs import qos
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.ros import node_main, parameters
-from thinmap_ros.ros.diagnostics import Health
+from thinmap_ros.ros.diagnostics import NodeDiagnostics
 from thinmap_ros.ros.messages import message_class
 
-_LOOK_AROUND_S = 0.25
+_DISCOVERY_PERIOD_S = 0.25
 _FLUSH_S = 0.5
 _DEPTH = 1000
 
@@ -39,8 +39,8 @@ class RecorderNode(Node):
 
     def __init__(self) -> None:
         super().__init__('recorder')
-        self._path = Path(parameters.declare(self, RecorderConfig).bag)
-        parameters.check_unknown(self)
+        self._path = Path(parameters.declare_config(self, RecorderConfig).bag)
+        parameters.reject_unknown(self)
         if self._path.exists():
             raise InputError(f'{self._path}: exists already: expected the name of a new bag')
         try:
@@ -50,10 +50,10 @@ class RecorderNode(Node):
         self._seen: set[str] = {'/rosout', '/parameter_events'}
         self._early: list[tuple[str, str, bytes]] = []
         self._written = 0
-        self._health = Health(self)
+        self._diagnostics = NodeDiagnostics(self)
         # Not in the robot's time, which may stand still until everybody listens.
         wall = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(_LOOK_AROUND_S, self._look_around, clock=wall)
+        self.create_timer(_DISCOVERY_PERIOD_S, self._discover_topics, clock=wall)
         self.create_timer(_FLUSH_S, lambda: self._guarded(self._writer.flush), clock=wall)
 
     def close(self) -> None:
@@ -64,7 +64,7 @@ class RecorderNode(Node):
             self._writer.close()
         self.get_logger().info(f'{self._path}: {self._written} messages')
 
-    def _look_around(self) -> None:
+    def _discover_topics(self) -> None:
         for topic, types in self.get_topic_names_and_types():
             # What an action says under way is repeated on topics of its own.
             if (
@@ -89,16 +89,16 @@ class RecorderNode(Node):
             self.get_logger().warning(f'{topic} is not recorded: {error}')
             return
         self.create_subscription(
-            kind, topic, self._takes(topic, type_name), _wanted(reliable, latched), raw=True
+            kind, topic, self._callback(topic, type_name), _wanted(reliable, latched), raw=True
         )
 
-    def _takes(self, topic: str, type_name: str) -> Callable[[bytes], None]:
-        def take(data: bytes) -> None:
-            self._guarded(lambda: self._take(topic, type_name, data))
+    def _callback(self, topic: str, type_name: str) -> Callable[[bytes], None]:
+        def process(data: bytes) -> None:
+            self._guarded(lambda: self._process(topic, type_name, data))
 
-        return take
+        return process
 
-    def _take(self, topic: str, type_name: str, data: bytes) -> None:
+    def _process(self, topic: str, type_name: str, data: bytes) -> None:
         ns = self.get_clock().now().nanoseconds
         if ns == 0 and len(self._early) < _DEPTH:
             # Time has not begun: players must not think that so much of it passed before the first
@@ -111,10 +111,10 @@ class RecorderNode(Node):
         self._write(topic, type_name, data, ns)
 
     def _write(self, topic: str, type_name: str, data: bytes, ns: int) -> None:
-        with self._health.timed('writing'):
+        with self._diagnostics.time_step('writing'):
             self._writer.write(topic, type_name, ns, data)
         self._written += 1
-        self._health.tell('messages written', self._written)
+        self._diagnostics.set_value('messages written', self._written)
 
     def _guarded(self, work: Callable[[], None]) -> None:
         try:

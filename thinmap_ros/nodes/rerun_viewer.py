@@ -22,8 +22,8 @@ from thinmap_msgs.msg import (
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.ros import node_main, parameters, qos
-from thinmap_ros.ros.diagnostics import Health
-from thinmap_ros.ros.laser_transform import LaserMount
+from thinmap_ros.ros.diagnostics import NodeDiagnostics
+from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.view.message_view import Feed
 from thinmap_ros.view.null_view import NullView
 from thinmap_ros.view.rerun_view import View
@@ -59,16 +59,16 @@ class RerunViewerNode(Node):
 
     def __init__(self) -> None:
         super().__init__('rerun_viewer')
-        config = parameters.declare(self, RerunViewerConfig)
-        mount = LaserMount(self)
-        parameters.check_unknown(self)
+        config = parameters.declare_config(self, RerunViewerConfig)
+        mount = LaserTransform(self)
+        parameters.reject_unknown(self)
         self._view = self._open(config)
         self._feed = Feed(self._view, mount.pose, self.get_namespace())
-        self._health = Health(self)
+        self._diagnostics = NodeDiagnostics(self)
         for topic, (kind, profile) in _TOPICS.items():
             # Those that are not of this robot alone have an absolute name.
             name = f'/{topic}' if topic == 'diagnostics' else topic
-            self.create_subscription(kind, name, self._takes(topic), profile)
+            self.create_subscription(kind, name, self._callback(topic), profile)
 
     def close(self) -> None:
         """Finish the recording."""
@@ -80,16 +80,16 @@ class RerunViewerNode(Node):
         self.get_logger().warning('neither recording nor spawn is set: nothing is shown')
         return NullView()
 
-    def _takes(self, topic: str) -> Callable[[Any], None]:
-        def take(message: Any) -> None:
-            self._health.heard(topic)
+    def _callback(self, topic: str) -> Callable[[Any], None]:
+        def process(message: Any) -> None:
+            self._diagnostics.message_received(topic)
             try:
                 self._feed.take(topic, message)
             except InputError as error:
-                self._health.refused(topic, str(error))
+                self._diagnostics.message_rejected(topic, str(error))
                 self.get_logger().warning(f'{topic}: {error}', throttle_duration_sec=_WARN_PERIOD_S)
 
-        return take
+        return process
 
 
 def main() -> None:

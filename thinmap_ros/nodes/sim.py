@@ -1,6 +1,6 @@
 """A simulated robot: /cmd_vel in; /scan, /odom, /tf, /clock and the true pose out.
 
-~/carry puts it elsewhere.
+~/set_pose puts it elsewhere.
 """
 
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.ros import messages, node_main, parameters, qos
-from thinmap_ros.ros.diagnostics import OK, WARN, Health
+from thinmap_ros.ros.diagnostics import OK, WARN, NodeDiagnostics
 from thinmap_ros.ros.lockstep import NONE, PATIENCE_S, PATIENCE_WORDS, TOPICS, Lockstep
 from thinmap_ros.sim.laser import Lms200Config
 from thinmap_ros.sim.robot import PRESETS
@@ -60,9 +60,9 @@ class SimNode(Node):
 
     def __init__(self) -> None:
         super().__init__('sim')
-        self._config = parameters.declare(self, SimConfig)
-        laser = parameters.declare(self, Lms200Config)
-        parameters.check_unknown(self)
+        self._config = parameters.declare_config(self, SimConfig)
+        laser = parameters.declare_config(self, Lms200Config)
+        parameters.reject_unknown(self)
         world = World.from_patch(*read_world(package_data.world_path(self._config.world)))
         start = _start(self._config.start, world)
         self._sim = Simulation(world, start, PRESETS[self._config.robot], laser, self._config.seed)
@@ -74,7 +74,7 @@ class SimNode(Node):
         self._repeated_at = 0.0
         self._running = False
         self._told_collisions = -1
-        self._health = Health(self)
+        self._diagnostics = NodeDiagnostics(self)
         self._make_topics()
         self._publish_mount()
         wall = Clock(clock_type=ClockType.STEADY_TIME)
@@ -89,42 +89,46 @@ class SimNode(Node):
         self._tf = self.create_publisher(TFMessage, '/tf', qos.STREAM)
         self._tf_static = self.create_publisher(TFMessage, '/tf_static', qos.STATIC_TRANSFORMS)
         self.create_subscription(Twist, 'cmd_vel', self._on_command, qos.STREAM)
-        self.create_subscription(PoseStamped, '~/carry', self._on_carry, qos.STREAM)
+        self.create_subscription(PoseStamped, '~/set_pose', self._on_teleport, qos.STREAM)
 
     def _on_command(self, message: Twist) -> None:
-        self._health.heard('cmd_vel')
+        self._diagnostics.message_received('cmd_vel')
         command = (message.linear.x, message.angular.z)
         if not np.isfinite(command).all():
-            self._health.refused('cmd_vel', f'command {command}: expected finite numbers')
+            self._diagnostics.message_rejected(
+                'cmd_vel', f'command {command}: expected finite numbers'
+            )
             return
         self._command = command
         self._command_ns = self._sim.stamp_ns
 
-    def _on_carry(self, message: PoseStamped) -> None:
+    def _on_teleport(self, message: PoseStamped) -> None:
         """Somebody lifts the robot up and puts it down at a pose in the world.
 
         Its wheels know nothing of it.
         """
-        self._health.heard('~/carry')
+        self._diagnostics.message_received('~/set_pose')
         try:
-            self._sim.carry(messages.pose_from(message.pose))
+            self._sim.carry(messages.pose_from_msg(message.pose))
         except InputError as error:
-            self._health.refused('~/carry', str(error))
+            self._diagnostics.message_rejected('~/set_pose', str(error))
 
     def _tick(self) -> None:
         if not self._running:
             if self.count_subscribers('scan') < self._config.hold_for_subscribers:
-                self._health.state(WARN, 'time stands still: too few nodes listen to the scans')
+                self._diagnostics.set_state(
+                    WARN, 'time stands still: too few nodes listen to the scans'
+                )
                 return
             self._running = True
-            self._health.state(OK, 'running')
+            self._diagnostics.set_state(OK, 'running')
             self._publish(self._sim.sense())
             return
-        if self._lockstep.waits and self._waits():
+        if self._lockstep.is_waiting and self._waits():
             return
         # As a robot's own controller does: without a fresh command it stops.
         fresh = self._sim.stamp_ns - self._command_ns <= _COMMAND_TIMEOUT_NS
-        with self._health.timed('simulation'):
+        with self._diagnostics.time_step('simulation'):
             moment = self._sim.step(*(self._command if fresh else (0.0, 0.0)))
         self._publish(moment)
 
@@ -134,7 +138,7 @@ class SimNode(Node):
         The first one is repeated until somebody answers.
         """
         if self._sim.stamp_ns > 0:
-            return not self._lockstep.give_up()
+            return not self._lockstep.timed_out()
         if monotonic() - self._repeated_at > _REPEAT_S and self._last_scan is not None:
             self._repeated_at = monotonic()
             self._publish_clock(0)
@@ -158,7 +162,7 @@ class SimNode(Node):
         if moment.scan is not None:
             self._last_scan = messages.scan_msg(moment.scan, 'laser', self._scan_time_s)
             self._scan.publish(self._last_scan)
-            self._lockstep.sent(moment.stamp_ns)
+            self._lockstep.scan_published(moment.stamp_ns)
             self._repeated_at = monotonic()
 
     def _publish_clock(self, ns: int) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 
-from thinmap_ros.ros.lifecycle_node import LiveNode
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
 
 
 class Outcome(Enum):
@@ -30,7 +30,7 @@ class SingleGoalServer:
 
     def __init__(
         self,
-        node: LiveNode,
+        node: ThinmapNode,
         action: Any,
         name: str,
         on_goal: Callable[[Any], None],

@@ -14,14 +14,14 @@ from rclpy.node import Node
 
 from thinmap_ros.core.errors import InputError, reason_of
 from thinmap_ros.core.private_folder import private_folder, temporary_folder
-from thinmap_ros.files.atomic import parts_of, written_aside
-from thinmap_ros.files.npz import opened, read_arrays
+from thinmap_ros.files.atomic import atomic_write, partial_files
+from thinmap_ros.files.npz import open_regular_file, read_arrays
 
 State = dict[str, NDArray[Any]]
 _FOLDER = 'THINMAP_STATE_DIR'
 
 
-class Recovery:
+class Checkpoint:
     """The file of one node: of its name, on its ROS domain.
 
     It lies where nothing survives a restart of the machine, and is removed when the node ends in
@@ -37,18 +37,20 @@ class Recovery:
         if limit_s <= 0.0:
             return
         try:
-            self._path = state_folder() / f'{os.environ.get("ROS_DOMAIN_ID", "0")}.{name}.npz'
+            self._path = (
+                checkpoint_directory() / f'{os.environ.get("ROS_DOMAIN_ID", "0")}.{name}.npz'
+            )
         except InputError as error:
             node.get_logger().warning(f'{error}: killed, the node would begin anew')
 
-    def left(self) -> State | None:
+    def load(self) -> State | None:
         """What a killed node left, if not long ago; None where nothing is, or it is broken."""
         if self._path is None:
             return None
-        for part in parts_of(self._path):
+        for part in partial_files(self._path):
             part.unlink(missing_ok=True)
         try:
-            with opened(self._path, os.O_NOFOLLOW) as stream:
+            with open_regular_file(self._path, os.O_NOFOLLOW) as stream:
                 status = os.fstat(stream.fileno())
                 if status.st_uid != os.getuid():
                     raise InputError('expected a file of this user')
@@ -61,17 +63,17 @@ class Recovery:
             self._warn(f'{reason_of(error)}: beginning anew')
             return None
 
-    def keep(self, state: State) -> None:
+    def save(self, state: State) -> None:
         """Keep a state; where the disk does not take it, the node works on without."""
         if self._path is None or self._limit_s <= 0.0:
             return
         try:
-            with written_aside(self._path) as aside, aside.open('wb') as stream:
+            with atomic_write(self._path) as aside, aside.open('wb') as stream:
                 np.savez(stream, **state)  # type: ignore[arg-type]
         except OSError as error:
             self._warn(f'{error.strerror}: killed now, the node would begin anew')
 
-    def forget(self) -> None:
+    def delete(self) -> None:
         """Leave nothing."""
         if self._path is not None:
             self._path.unlink(missing_ok=True)
@@ -80,7 +82,7 @@ class Recovery:
         self._node.get_logger().warning(f'{self._path}: {what}', throttle_duration_sec=60.0)
 
 
-def state_folder() -> Path:
+def checkpoint_directory() -> Path:
     """The folder of this user alone in which nodes keep their states; made where it is missing.
 
     Raises InputError where it is none: a link, of another user, or open to others.

@@ -41,7 +41,7 @@ class _Topic:
 
 
 @dataclass
-class _Complaint:
+class _Check:
     """What is wrong while its condition finds words for it; logged now and then."""
 
     level: bytes
@@ -59,11 +59,11 @@ class _Complaint:
         return bool(self.words)
 
 
-class Health:
+class NodeDiagnostics:
     """Counts what happens to a node and publishes it, whatever the node's own time does.
 
     A level above OK lasts as long as what causes it: refusals and drops until a second has gone by
-    without any, a `complaint` until its condition is no longer true.
+    without any, a `check` until its condition is no longer true.
     """
 
     def __init__(self, node: Node) -> None:
@@ -77,24 +77,24 @@ class Health:
         self._state = (OK, 'running')
         self._is_paused = False
         self._values: dict[str, str] = {}
-        self._complaints: list[_Complaint] = []
+        self._checks: list[_Check] = []
         self._before: list[Callable[[], None]] = []
         self._told_at = monotonic()
         self._topic = node.create_publisher(DiagnosticArray, '/diagnostics', QoSProfile(depth=10))
         # Not in the robot's time: a clock that stands still is a thing to be told.
         node.create_timer(_PERIOD_S, self._publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
-    def expects(self, topic: str) -> None:
+    def expect_topic(self, topic: str) -> None:
         """Name a topic that the node listens to: it is told also while it is silent."""
         self._topics.setdefault(topic, _Topic())
 
-    def heard(self, topic: str) -> None:
+    def message_received(self, topic: str) -> None:
         """Count a message."""
         entry = self._topics.setdefault(topic, _Topic())
         entry.heard += 1
         entry.last_at = monotonic()
 
-    def refused(self, topic: str, reason: str) -> None:
+    def message_rejected(self, topic: str, reason: str) -> None:
         """Count a message that could not be used, by reason: its words, whatever the numbers."""
         entry = self._topics.setdefault(topic, _Topic())
         kind = _NUMBER.sub('#', reason)
@@ -105,48 +105,48 @@ class Health:
         entry.refused_at = monotonic()
         self._bad += 1
 
-    def dropped(self, cause: str, count: int) -> None:
+    def count_drops(self, cause: str, count: int) -> None:
         """Count messages that were fine and were not used."""
         if count > 0:
             self._drops[cause] += count
             self._dropped_at[cause] = monotonic()
             self._bad += count
 
-    def dropped_in_all(self, cause: str, count: int) -> None:
+    def set_drop_total(self, cause: str, count: int) -> None:
         """Tell a count of drops that somebody else keeps; one that begins anew is counted on."""
         last = self._totals[cause]
         self._totals[cause] = count
-        self.dropped(cause, count - last if count >= last else count)
+        self.count_drops(cause, count - last if count >= last else count)
 
-    def took(self, step: str, milliseconds: float) -> None:
+    def record_step_time(self, step: str, milliseconds: float) -> None:
         """Note how long a step took, ms."""
         self._steps.setdefault(step, deque(maxlen=_STEPS)).append(milliseconds)
 
     @contextmanager
-    def timed(self, step: str) -> Iterator[None]:
+    def time_step(self, step: str) -> Iterator[None]:
         """Note how long a block takes."""
         started = perf_counter()
         yield
-        self.took(step, 1000.0 * (perf_counter() - started))
+        self.record_step_time(step, 1000.0 * (perf_counter() - started))
 
-    def state(self, level: bytes, text: str) -> None:
+    def set_state(self, level: bytes, text: str) -> None:
         """Say what state the node is in."""
         self._state = (level, text)
 
-    def pause(self, is_paused: bool) -> None:
+    def set_paused(self, is_paused: bool) -> None:
         """Say `paused` for as long as that is so, whatever state the node would be in."""
         self._is_paused = is_paused
-        self.tell('paused', is_paused)
+        self.set_value('paused', is_paused)
 
-    def tell(self, key: str, value: object) -> None:
+    def set_value(self, key: str, value: object) -> None:
         """Set a value that is told until another one takes its place."""
         self._values[key] = str(value)
 
-    def complain(self, level: bytes, condition: Callable[[], str]) -> None:
+    def add_check(self, level: bytes, condition: Callable[[], str]) -> None:
         """Look once a second what is wrong: a condition returns words, or '' where all is well."""
-        self._complaints.append(_Complaint(level, condition))
+        self._checks.append(_Check(level, condition))
 
-    def complain_of_silence(self, topic: str, limit_s: float) -> None:
+    def add_timeout_check(self, topic: str, limit_s: float) -> None:
         """Complain while nothing is heard on a topic."""
         name = self._node.resolve_topic_name(topic)
 
@@ -160,13 +160,13 @@ class Health:
             silent_s = monotonic() - entry.last_at
             return f'{topic}: silent for {silent_s:.0f} s' if silent_s > limit_s else ''
 
-        self.complain(WARN, silence)
+        self.add_check(WARN, silence)
 
-    def before_telling(self, work: Callable[[], None]) -> None:
+    def add_update_callback(self, work: Callable[[], None]) -> None:
         """Do something once a second, before it is told how things are."""
         self._before.append(work)
 
-    def sole_publisher_of(self, topic: str) -> None:
+    def check_sole_publisher(self, topic: str) -> None:
         """Complain while somebody else publishes a topic that only one node may publish."""
         name = self._node.resolve_topic_name(topic)
 
@@ -181,7 +181,7 @@ class Health:
                 f'{len(nodes)} nodes publish {name}: {", ".join(sorted(nodes))}: stop all but one'
             )
 
-        self.complain(ERROR, rivals)
+        self.add_check(ERROR, rivals)
 
     def _publish(self) -> None:
         for work in self._before:
@@ -198,9 +198,9 @@ class Health:
 
     def _status(self, now: float) -> DiagnosticStatus:
         level, message = (OK, 'paused') if self._is_paused else self._state
-        complaints = [complaint for complaint in self._complaints if complaint.holds(self._node)]
-        if complaints:
-            worst = max(complaints, key=lambda complaint: complaint.level)
+        checks = [check for check in self._checks if check.holds(self._node)]
+        if checks:
+            worst = max(checks, key=lambda check: check.level)
             level, message = (worst.level, worst.words) if worst.level > level else (level, message)
         elif level == OK and self._bad > self._told_bad:
             level = WARN

@@ -18,7 +18,7 @@ from thinmap_ros.ros import messages, parameters, qos
 _MOST_FRAMES = 1000
 
 
-class LaserMount:
+class LaserTransform:
     """The pose of each laser frame on the robot.
 
     Looked up in the static transforms, as bags are read. A node whose robot publishes none is given
@@ -28,16 +28,16 @@ class LaserMount:
 
     def __init__(self, node: Node) -> None:
         self._base_frame = str(
-            parameters.declare_value(node, 'base_frame', 'base_link', 'frame of the robot')
+            parameters.declare_parameter(node, 'base_frame', 'base_link', 'frame of the robot')
         )
-        given = parameters.declare_value(
+        given = parameters.declare_parameter(
             node,
             'laser_pose',
             '',
             'laser on the robot as "x,y,yaw" (m, m, rad); empty: from /tf_static',
         )
         self._zero_is_no_return = bool(
-            parameters.declare_value(
+            parameters.declare_parameter(
                 node,
                 'zero_is_no_return',
                 False,
@@ -53,7 +53,7 @@ class LaserMount:
                 TFMessage, '/tf_static', self._on_static, qos.STATIC_TRANSFORMS
             )
 
-    def scan(self, message: LaserScan) -> Scan:
+    def to_scan(self, message: LaserScan) -> Scan:
         """Scan of a message, with the pose of its laser.
 
         Raises InputError where that is not known, or the message is no scan.
@@ -65,7 +65,7 @@ class LaserMount:
                 f'"{self._base_frame}" to it; publish one on /tf_static or set the parameter '
                 'laser_pose'
             )
-        scan = messages.scan_from(message, mount.T_base_laser, self._zero_is_no_return)
+        scan = messages.scan_from_msg(message, mount.T_base_laser, self._zero_is_no_return)
         return mount.placed(scan)
 
     def pose(self, frame_id: str) -> Array | None:

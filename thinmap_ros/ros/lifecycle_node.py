@@ -1,4 +1,4 @@
-"""What all nodes left running on a robot share: states, health, pause, reset, time set back."""
+"""What the nodes of a robot share: lifecycle, diagnostics, pause, reset, checkpoint, time jump."""
 
 from collections.abc import Callable
 from time import monotonic
@@ -13,26 +13,26 @@ from std_srvs.srv import SetBool, Trigger
 
 from thinmap_ros.core.errors import ThinmapError, reason_of
 from thinmap_ros.ros import parameters
-from thinmap_ros.ros.checkpoint import Recovery, State
-from thinmap_ros.ros.diagnostics import OK, Health
-from thinmap_ros.ros.services import answer
+from thinmap_ros.ros.checkpoint import Checkpoint, State
+from thinmap_ros.ros.diagnostics import OK, NodeDiagnostics
+from thinmap_ros.ros.services import fill_response
 
-_KEEP_S = 0.5
+_CHECKPOINT_PERIOD_S = 0.5
 # Between two times of keeping, in times that it took.
-_LEAST_PAUSES = 50.0
-_LEAST_PAUSES_NEWS = 10.0
+_CHECKPOINT_DUTY = 50.0
+_CHECKPOINT_DUTY_NOW = 10.0
 RCLError = rclpy_implementation.RCLError
 _SET_BACK = JumpThreshold(
     min_forward=None, min_backward=Duration(seconds=-1.0), on_clock_change=False
 )
 
 
-class LiveNode(LifecycleNode):
+class ThinmapNode(LifecycleNode):
     """A node that walks through ROS's states by itself: unconfigured, inactive, active, finalized.
 
     Everything is set up on construction. Only an active node takes messages, works by its timers
     and takes goals; of a latched topic it takes the last message when it becomes active.
-    `begin_anew` forgets what was learned: on clean-up, by the service ~/reset, and when the clock
+    `reset_state` forgets what was learned: on clean-up, by the service ~/reset, and when the clock
     is set back (a bag or a simulation started again).
     """
 
@@ -40,23 +40,23 @@ class LiveNode(LifecycleNode):
         """Make a node; one that recovers calls `keep` once it is set up."""
         super().__init__(name)
         self._autostart = bool(
-            parameters.declare_value(
+            parameters.declare_parameter(
                 self, 'autostart', True, 'become active at once; false: wait for transitions'
             )
         )
         self._recover_s = parameters.declare_recovery(self) if recovers else 0.0
-        self.health = Health(self)
+        self.diagnostics = NodeDiagnostics(self)
         self.is_active = False
         self.is_paused = False
         self._set_back = False
-        self.set_backs = 0
+        self.time_jumps = 0
         self._before_ns = self._back_ns = 0
-        self._recovery: Recovery | None = None
+        self._checkpoint: Checkpoint | None = None
         self._on_activation: list[Callable[[], None]] = []
         self._jumps = self.get_clock().create_jump_callback(_SET_BACK, post_callback=self._on_jump)
-        self.health.before_telling(self.settle)
+        self.diagnostics.add_update_callback(self.handle_time_jump)
         self.create_service(Trigger, '~/reset', self._on_reset)
-        self._survive_wrong_transitions()
+        self._reject_invalid_transitions()
 
     def start(self) -> None:
         """Become active, unless somebody else is to decide when."""
@@ -64,41 +64,49 @@ class LiveNode(LifecycleNode):
             self.trigger_configure()
             self.trigger_activate()
         else:
-            self.health.state(OK, 'unconfigured')
+            self.diagnostics.set_state(OK, 'unconfigured')
 
-    def begin_anew(self) -> None:
+    def reset_state(self) -> None:
         """Forget what was learned from messages."""
 
-    def stand_still(self) -> None:
+    def stop(self) -> None:
         """End what is under way: the node is deactivated, or begins anew."""
 
-    def offer_pause(self) -> None:
+    def create_pause_service(self) -> None:
         """Offer ~/pause: while it is on, the node takes no new scans."""
         self.create_service(SetBool, '~/pause', self._on_pause)
 
-    def every(self, period_s: float, work: Callable[[], None], clock: Clock | None = None) -> Timer:
+    def create_active_timer(
+        self, period_s: float, work: Callable[[], None], clock: Clock | None = None
+    ) -> Timer:
         """Work by a timer while the node is active."""
 
         def guarded() -> None:
-            self.settle()
+            self.handle_time_jump()
             if self.is_active:
                 work()
 
         return self.create_timer(period_s, guarded, clock=clock)
 
-    def keep(self, state: Callable[[], State | None], resume: Callable[[State], None]) -> None:
+    def enable_checkpoint(
+        self, state: Callable[[], State | None], resume: Callable[[State], None]
+    ) -> None:
         """Keep what a state returns, again and again, for the case that the node is killed.
 
         state: returns None where there is nothing to keep. resume: is called with what a
         predecessor left that was killed a short time ago. Where it raises a ThinmapError, as the
         node was started with other parameters, the node begins anew.
         """
-        self._recovery = Recovery(self, self._recover_s)
+        self._checkpoint = Checkpoint(self, self._recover_s)
         self._state_of = state
-        self._kept_at = monotonic()
-        self._keeping_s = 0.0
-        self.create_timer(_KEEP_S, self._keep, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        left = self._recovery.left()
+        self._checkpoint_time = monotonic()
+        self._checkpoint_duration_s = 0.0
+        self.create_timer(
+            _CHECKPOINT_PERIOD_S,
+            self._save_checkpoint,
+            clock=Clock(clock_type=ClockType.STEADY_TIME),
+        )
+        left = self._checkpoint.load()
         if left is None:
             return
         try:
@@ -112,39 +120,42 @@ class LiveNode(LifecycleNode):
 
     def close(self) -> None:
         """Leave nothing behind: the node ends in order."""
-        if self._recovery is not None:
-            self._recovery.forget()
+        if self._checkpoint is not None:
+            self._checkpoint.delete()
 
-    def keep_news(self) -> bool:
+    def checkpoint_now(self) -> bool:
         """Keep the state before others hear what is new in it; returns whether there was time."""
-        return self._keep(_LEAST_PAUSES_NEWS)
+        return self._save_checkpoint(_CHECKPOINT_DUTY_NOW)
 
-    def _keep(self, least_pauses: float = _LEAST_PAUSES) -> bool:
+    def _save_checkpoint(self, least_pauses: float = _CHECKPOINT_DUTY) -> bool:
         # However large the map: keeping it takes a small share of the time.
         now = monotonic()
-        if self._recovery is None or now - self._kept_at < least_pauses * self._keeping_s:
+        if (
+            self._checkpoint is None
+            or now - self._checkpoint_time < least_pauses * self._checkpoint_duration_s
+        ):
             return False
         state = self._state_of()
         if state is not None:
-            self._recovery.keep(state)
-        self._kept_at = monotonic()
-        self._keeping_s = self._kept_at - now
+            self._checkpoint.save(state)
+        self._checkpoint_time = monotonic()
+        self._checkpoint_duration_s = self._checkpoint_time - now
         return True
 
-    def when_activated(self, work: Callable[[], None]) -> None:
+    def add_activation_callback(self, work: Callable[[], None]) -> None:
         """Have something done each time that the node becomes active."""
         self._on_activation.append(work)
 
-    def settle(self) -> None:
+    def handle_time_jump(self) -> None:
         """Begin anew if the clock was set back: before anything of the new time is taken."""
         if self._set_back:
             self._set_back = False
-            self.set_backs = self.set_backs + 1
+            self.time_jumps = self.time_jumps + 1
             self.get_logger().warning('the clock was set back: beginning anew')
-            self.health.dropped('begun anew: the clock was set back', 1)
+            self.diagnostics.count_drops('begun anew: the clock was set back', 1)
             self._forget()
 
-    def is_of_before(self, stamp_ns: int) -> bool:
+    def is_before_time_jump(self, stamp_ns: int) -> bool:
         """Whether a stamp is one of the last before the clock was set back."""
         return abs(self._before_ns - stamp_ns) < self._back_ns // 4
 
@@ -155,22 +166,22 @@ class LiveNode(LifecycleNode):
         self._before_ns = self.get_clock().now().nanoseconds + self._back_ns
 
     def _forget(self) -> None:
-        self.stand_still()
-        if self._recovery is not None:
-            self._recovery.forget()
-        self.begin_anew()
+        self.stop()
+        if self._checkpoint is not None:
+            self._checkpoint.delete()
+        self.reset_state()
 
     # States.
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Be ready."""
-        self.health.state(OK, 'inactive')
+        self.diagnostics.set_state(OK, 'inactive')
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Take messages from now on."""
         self.is_active = True
-        self.health.state(OK, 'running')
+        self.diagnostics.set_state(OK, 'running')
         for work in self._on_activation:
             work()
         return super().on_activate(state)
@@ -178,24 +189,24 @@ class LiveNode(LifecycleNode):
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Take no messages, and leave nothing moving."""
         self.is_active = False
-        self.stand_still()
-        self.health.state(OK, 'inactive')
+        self.stop()
+        self.diagnostics.set_state(OK, 'inactive')
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Forget everything."""
         self._forget()
-        self.health.state(OK, 'unconfigured')
+        self.diagnostics.set_state(OK, 'unconfigured')
         return super().on_cleanup(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop for good; the process ends with its signal, as always."""
         self.is_active = False
-        self.stand_still()
-        self.health.state(OK, 'finalized')
+        self.stop()
+        self.diagnostics.set_state(OK, 'finalized')
         return super().on_shutdown(state)
 
-    def _survive_wrong_transitions(self) -> None:
+    def _reject_invalid_transitions(self) -> None:
         """Refuse a transition that there is not from a state: rclpy lets it end the node."""
         service = self._service_change_state
         change = service.callback
@@ -219,11 +230,11 @@ class LiveNode(LifecycleNode):
             self._forget()
             return 'begun anew'
 
-        return answer(response, work)
+        return fill_response(response, work)
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self.is_paused = request.data
-        self.health.pause(self.is_paused)
-        return answer(
+        self.diagnostics.set_paused(self.is_paused)
+        return fill_response(
             response, lambda: 'no new scans are taken' if self.is_paused else 'scans are taken'
         )

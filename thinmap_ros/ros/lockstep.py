@@ -32,23 +32,23 @@ class Lockstep:
     What the scan led to.
     """
 
-    def __init__(self, node: Node, topic: str, patience_s: float = PATIENCE_S) -> None:
+    def __init__(self, node: Node, topic: str, timeout_s: float = PATIENCE_S) -> None:
         self._node = node
         self._topic = topic
-        self._patience_s = patience_s
+        self._timeout_s = timeout_s
         self._awaited_ns: int | None = None
         self._since = 0.0
         if topic != NONE:
             node.create_subscription(_TYPES[topic], topic, self._on_message, qos.STREAM)
 
-    def sent(self, stamp_ns: int) -> None:
+    def scan_published(self, stamp_ns: int) -> None:
         """Take note that a scan was published."""
         if self._topic != NONE:
             self._awaited_ns = stamp_ns
             self._since = monotonic()
 
     @property
-    def waits(self) -> bool:
+    def is_waiting(self) -> bool:
         """Whether the answer to the last scan is still to come."""
         return self._awaited_ns is not None
 
@@ -57,9 +57,9 @@ class Lockstep:
         """How long the last scan has been waiting, s of the machine's time."""
         return monotonic() - self._since
 
-    def give_up(self) -> bool:
+    def timed_out(self) -> bool:
         """Whether patience is at an end; then waiting ends as well."""
-        if self.waited_s < self._patience_s:
+        if self.waited_s < self._timeout_s:
             return False
         self._node.get_logger().warning(f'no /{self._topic} for the last scan: going on without it')
         self._awaited_ns = None

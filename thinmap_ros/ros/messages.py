@@ -49,12 +49,14 @@ def message_class(type_name: str) -> Any:
     """
     parts = _TYPE_NAME.fullmatch(type_name)
     if parts is None:
-        raise InputError(f'message type {validation.short(type_name)}: expected PACKAGE/msg/NAME')
+        raise InputError(
+            f'message type {validation.abbreviated(type_name)}: expected PACKAGE/msg/NAME'
+        )
     try:
         return getattr(import_module(f'{parts[1]}.msg'), parts[2])
     except (ImportError, AttributeError) as error:
         raise InputError(
-            f'message type {validation.short(type_name)}: not installed here'
+            f'message type {validation.abbreviated(type_name)}: not installed here'
         ) from error
 
 
@@ -89,7 +91,7 @@ def header(frame_id: str, ns: int) -> Header:
     return Header(frame_id=frame_id, stamp=time_msg(ns))
 
 
-def scan_from(message: LaserScan, T_base_laser: Array, zero_is_no_return: bool = False) -> Scan:
+def scan_from_msg(message: LaserScan, T_base_laser: Array, zero_is_no_return: bool = False) -> Scan:
     """Scan from its message, the laser's pose on the robot and what a range of 0 means for it.
 
     Raises InputError as `Scan.create`, and where it has no beams, too many, or beams at angles that
@@ -99,7 +101,7 @@ def scan_from(message: LaserScan, T_base_laser: Array, zero_is_no_return: bool =
     if not 0 < count <= validation.MOST_BEAMS:
         raise InputError(f'{count} beams: expected 1 to {validation.MOST_BEAMS}')
     last = message.angle_min + message.angle_increment * (count - 1)
-    validation.within(
+    validation.require_bounded(
         'angle of the first or last beam', (message.angle_min, last), validation.LARGEST_ANGLE_RAD
     )
     return Scan.create(
@@ -143,9 +145,9 @@ def quaternion_msg(yaw_rad: float) -> Quaternion:
     return Quaternion(z=math.sin(yaw_rad / 2.0), w=math.cos(yaw_rad / 2.0))
 
 
-def pose_from(message: Pose) -> Array:
+def pose_from_msg(message: Pose) -> Array:
     """Planar pose (3,). Raises InputError where it is nowhere near (1000 km) or no rotation."""
-    validation.within('position', (message.position.x, message.position.y))
+    validation.require_bounded('position', (message.position.x, message.position.y))
     return se2.pose(message.position.x, message.position.y, yaw_of(message.orientation))
 
 
@@ -173,14 +175,14 @@ def pose_with_covariance_msg(
     return message
 
 
-def covariance_from(message: PoseWithCovarianceStamped) -> Array:
+def covariance_from_msg(message: PoseWithCovarianceStamped) -> Array:
     """Covariance (3, 3) over x, y, theta.
 
     Raises InputError where it is none: not finite, or below 0.
     """
     full = np.asarray(message.pose.covariance, dtype=np.float64).reshape(6, 6)
     part = full[np.ix_((0, 1, 5), (0, 1, 5))]
-    validation.within('covariance', part.ravel().tolist())
+    validation.require_bounded('covariance', part.ravel().tolist())
     part = (part + part.T) / 2.0
     if np.linalg.eigvalsh(part).min() < -1e-9:
         raise InputError(f'covariance {part.tolist()}: expected no negative eigenvalue')
@@ -230,10 +232,10 @@ def trajectory_msg(stamps_ns: list[int], poses: Array, frame_id: str, ns: int) -
     return message
 
 
-def trajectory_from(message: Path) -> tuple[NDArray[np.int64], Array]:
+def trajectory_from_msg(message: Path) -> tuple[NDArray[np.int64], Array]:
     """Stamps (N,) and poses (N, 3) of a path. Raises InputError where a pose is none."""
     stamps = np.array([stamp_ns(pose.header.stamp) for pose in message.poses], dtype=np.int64)
-    return stamps, np.array([pose_from(pose.pose) for pose in message.poses]).reshape(-1, 3)
+    return stamps, np.array([pose_from_msg(pose.pose) for pose in message.poses]).reshape(-1, 3)
 
 
 def grid_msg(patch: GridPatch, frame_id: str, ns: int, corrected_ns: int = 0) -> OccupancyGrid:
@@ -249,7 +251,7 @@ def grid_msg(patch: GridPatch, frame_id: str, ns: int, corrected_ns: int = 0) ->
     return message
 
 
-def patch_from(message: OccupancyGrid) -> GridPatch:
+def grid_from_msg(message: OccupancyGrid) -> GridPatch:
     """Patch of a map message.
 
     Raises InputError where size and data do not fit, the map is turned, or its cells or their size
@@ -265,7 +267,7 @@ def patch_from(message: OccupancyGrid) -> GridPatch:
             f'with {len(message.data)} values: expected a value for each cell, '
             f'and cells of {FINEST_M} to {COARSEST_M} m'
         )
-    origin = pose_from(info.origin)
+    origin = pose_from_msg(info.origin)
     if abs(origin[2]) > 1e-6:
         raise InputError(f'map turned by {origin[2]} rad: expected an origin without rotation')
     cells = np.frombuffer(message.data, dtype=np.int8).reshape(info.height, info.width)
@@ -302,7 +304,7 @@ def _edge_msg(edge: Edge) -> TopologicalEdge:
     )
 
 
-def topology_from(message: TopologicalMapMsg) -> TopologicalMap:
+def topology_from_msg(message: TopologicalMapMsg) -> TopologicalMap:
     """Topological map of a message.
 
     Raises InputError where a kind is unknown, an edge leads to no node, a number is given twice, or
@@ -317,14 +319,16 @@ def topology_from(message: TopologicalMapMsg) -> TopologicalMap:
                 f'node {node.id}: kind {node.kind}: '
                 f'expected one of {[int(kind) for kind in NodeKind]}'
             )
-        validation.within(f'node {node.id}', (node.position.x, node.position.y, node.clearance_m))
+        validation.require_bounded(
+            f'node {node.id}', (node.position.x, node.position.y, node.clearance_m)
+        )
     for edge in message.edges:
         if not {edge.node_a, edge.node_b} <= known:
             raise InputError(
                 f'edge {edge.id} from node {edge.node_a} to {edge.node_b}: '
                 'expected nodes of this map'
             )
-        validation.within(
+        validation.require_bounded(
             f'edge {edge.id}',
             (edge.length_m, edge.clearance_m, *(c for p in edge.path for c in (p.x, p.y))),
         )

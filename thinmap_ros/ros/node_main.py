@@ -15,7 +15,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from thinmap_ros.core.errors import ThinmapError, reason_of
-from thinmap_ros.kernels.memory import give_back_pages, release_compiler_pages
+from thinmap_ros.kernels.memory import compiler_memory_releaser, release_compiler_pages
 from thinmap_ros.kernels.progress import report_compilation
 from thinmap_ros.ros import parameters
 
@@ -45,7 +45,7 @@ def run_all(make_nodes: Sequence[Callable[[], Node]]) -> None:
     compilation = report_compilation()
     nodes: list[Node] = []
     try:
-        with parameters.shared_by(len(make_nodes)):
+        with parameters.shared_process(len(make_nodes)):
             nodes.extend(make() for make in make_nodes)
         for node in nodes:
             getattr(node, 'start', lambda: None)()
@@ -88,7 +88,7 @@ def _spin(nodes: list[Node]) -> None:
     for thread in others:
         thread.start()
     try:
-        _spin_one(nodes[0], asked, failures, give_back_pages())
+        _spin_one(nodes[0], asked, failures, compiler_memory_releaser())
     finally:
         asked.set()
         for thread in others:

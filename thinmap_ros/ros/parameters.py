@@ -18,13 +18,23 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from thinmap_ros.core.config import Config
+from thinmap_ros.core.config import Config, parameters_of, with_values
 from thinmap_ros.core.errors import ConfigError
+
+# What describes the robot: one file may give it to all nodes, also to those that do not need it.
+ROBOT = (
+    'robot_radius_m',
+    'laser_pose',
+    'zero_is_no_return',
+    'map_frame',
+    'odom_frame',
+    'base_frame',
+)
 
 AnyConfig = TypeVar('AnyConfig', bound=Config)
 
 
-def declare(
+def declare_config(
     node: Node,
     config: type[AnyConfig],
     changed: Callable[[AnyConfig], None] | None = None,
@@ -37,19 +47,18 @@ def declare(
     with its reason.
     Raises ConfigError where a value is outside its range or of the wrong type.
     """
-    names = {field.name for field in dataclasses.fields(config)}
+    declared = list(parameters_of(config()))
+    names = {name for name, _, _ in declared}
     free = set() if changed is None else names if live is None else set(live)
     values = {}
-    for field in dataclasses.fields(config):
-        descriptor = _descriptor(field, read_only=field.name not in free)
+    for name, field, default in declared:
+        descriptor = _descriptor(field, read_only=name not in free)
         try:
-            values[field.name] = node.declare_parameter(field.name, field.default, descriptor).value
+            values[name] = node.declare_parameter(name, default, descriptor).value
         except Exception as error:
             # rclpy has a class of its own for each way in which a value can be wrong.
-            raise ConfigError(
-                f'parameter {field.name} of node {node.get_name()}: {error}'
-            ) from error
-    current = config(**values)
+            raise ConfigError(f'parameter {name} of node {node.get_name()}: {error}') from error
+    current = with_values(config(), values)
     if changed is not None:
         _Changes(node, current, free, changed)
     return current
@@ -66,13 +75,13 @@ class _Changes(Generic[AnyConfig]):
         self._free = free
         self._changed = changed
         node.add_on_set_parameters_callback(self._check)
-        node.add_post_set_parameters_callback(self._take)
+        node.add_post_set_parameters_callback(self._apply)
 
     def _with(self, given: list[Parameter]) -> AnyConfig:
         values = {
             parameter.name: parameter.value for parameter in given if parameter.name in self._free
         }
-        return dataclasses.replace(self._current, **values)
+        return with_values(self._current, values)
 
     def _check(self, given: list[Parameter]) -> SetParametersResult:
         try:
@@ -81,7 +90,7 @@ class _Changes(Generic[AnyConfig]):
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
-    def _take(self, given: list[Parameter]) -> None:
+    def _apply(self, given: list[Parameter]) -> None:
         new = self._with(given)
         if new != self._current:
             self._current = new
@@ -90,7 +99,7 @@ class _Changes(Generic[AnyConfig]):
             self._changed(new)
 
 
-def declare_value(node: Node, name: str, default: Any, description: str) -> Any:
+def declare_parameter(node: Node, name: str, default: Any, description: str) -> Any:
     """Declare one read-only parameter that belongs to the node itself, and return its value."""
     descriptor = ParameterDescriptor(description=description, read_only=True)
     try:
@@ -102,7 +111,7 @@ def declare_value(node: Node, name: str, default: Any, description: str) -> Any:
 def declare_session(node: Node) -> str:
     """Declare the parameter `session` and return its value."""
     return str(
-        declare_value(
+        declare_parameter(
             node, 'session', '', 'path STEM of a saved session to go on from; empty: begin anew'
         )
     )
@@ -111,7 +120,7 @@ def declare_session(node: Node) -> str:
 def declare_recovery(node: Node) -> float:
     """Declare the parameter `recover_s` and return its value."""
     return float(
-        declare_value(
+        declare_parameter(
             node,
             'recover_s',
             30.0,
@@ -120,14 +129,14 @@ def declare_recovery(node: Node) -> float:
     )
 
 
-def check_unknown(node: Node) -> None:
+def reject_unknown(node: Node) -> None:
     """Raise ConfigError where a parameter was given that the node does not have.
 
-    A typo must not go unseen. Where several nodes share a process, a parameter may be meant for
-    another one: the last of them raises.
+    A typo must not go unseen. Parameters of the robot are accepted by every node. Where several
+    nodes share a process, a parameter may be meant for another one: the last of them raises.
     """
     # rclpy has no public way to see what was given but never declared.
-    given = set(node._parameter_overrides)
+    given = set(node._parameter_overrides).difference(ROBOT)
     known = {name for name in node._parameters if not name.startswith('qos_overrides')}
     shared = _SHARED.get()
     if shared is not None:
@@ -162,7 +171,7 @@ _SHARED: ContextVar[_Shared | None] = ContextVar('shared', default=None)
 
 
 @contextmanager
-def shared_by(count: int) -> Iterator[None]:
+def shared_process(count: int) -> Iterator[None]:
     """Let so many nodes, made inside, share what parameters they are given."""
     token = _SHARED.set(_Shared(count) if count > 1 else None)
     try:

@@ -12,7 +12,7 @@ from thinmap_ros.core.errors import ThinmapError
 _LIMIT_S = 10.0
 
 
-def answer(response: Any, work: Callable[[], str]) -> Any:
+def fill_response(response: Any, work: Callable[[], str]) -> Any:
     """Fill in a response: success and what `work` says that it did, or what kept it from that."""
     try:
         response.message = work()
@@ -23,7 +23,7 @@ def answer(response: Any, work: Callable[[], str]) -> Any:
     return response
 
 
-async def ask(node: Node, client: Client, request: Any) -> Any | None:
+async def call(node: Node, client: Client, request: Any) -> Any | None:
     """Answer of another node's service.
 
     None where nobody offers it, success = false where no answer comes in time.

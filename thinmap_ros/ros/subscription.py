@@ -13,21 +13,21 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import LaserScan
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.ros.lifecycle_node import LiveNode
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
 
 _QUIET_S = 5.0
 _SILENT_S = 3.0
 _LONGEST_GAP_NS = 5_000_000_000  # longer gaps are pauses of the sensor, no losses
 
 
-def listen(
-    node: LiveNode, kind: type, topic: str, take: Callable[[Any], None], profile: QoSProfile
+def subscribe_guarded(
+    node: ThinmapNode, kind: type, topic: str, process: Callable[[Any], None], profile: QoSProfile
 ) -> None:
     """Subscribe to a topic.
 
-    A message that `take` refuses with InputError is dropped with a warning, throttled.
+    A message that `process` refuses with InputError is dropped with a warning, throttled.
     """
-    _Listener(node, kind, topic, take, profile)
+    _Listener(node, kind, topic, process, profile)
 
 
 class _Listener:
@@ -35,39 +35,41 @@ class _Listener:
 
     def __init__(
         self,
-        node: LiveNode,
+        node: ThinmapNode,
         kind: type,
         topic: str,
-        take: Callable[[Any], None],
+        process: Callable[[Any], None],
         profile: QoSProfile,
     ) -> None:
         self._node = node
         self._topic = topic
-        self._take = take
+        self._process = process
         self._is_scan = kind is LaserScan
         self._is_latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
         self._held: Any = None
         self._said_at = -_QUIET_S
         self._last_ns = 0
         self._set_backs = 0
-        self._losses = Losses()
-        node.health.expects(topic)
+        self._losses = MessageLossCounter()
+        node.diagnostics.expect_topic(topic)
         node.create_subscription(kind, topic, self._on_message, profile)
         if self._is_scan:
-            node.health.complain_of_silence(topic, _SILENT_S)
+            node.diagnostics.add_timeout_check(topic, _SILENT_S)
         if self._is_latched:
-            node.when_activated(self._take_held)
+            node.add_activation_callback(self._process_held)
 
     def _on_message(self, message: Any, info: dict[str, Any]) -> None:
         node = self._node
-        node.health.heard(self._topic)
+        node.diagnostics.message_received(self._topic)
         last_ns = self._last_ns
         self._last_ns = _stamp_ns(message)
         if not self._is_latched:
             self._count_losses(info.get('publication_sequence_number'))
-        node.settle()
+        node.handle_time_jump()
         if self._is_left_over(last_ns):
-            node.health.dropped(f'{self._topic}: left over from before the clock was set back', 1)
+            node.diagnostics.count_drops(
+                f'{self._topic}: left over from before the clock was set back', 1
+            )
         elif not node.is_active:
             self._held = message if self._is_latched else None
         elif not (self._is_scan and node.is_paused):
@@ -81,36 +83,38 @@ class _Listener:
         With the first that does not, the stream has arrived in the new time.
         """
         node = self._node
-        if self._set_backs == node.set_backs:
+        if self._set_backs == node.time_jumps:
             return False
-        if node.is_of_before(last_ns) and node.is_of_before(self._last_ns):
+        if node.is_before_time_jump(last_ns) and node.is_before_time_jump(self._last_ns):
             return True
-        self._set_backs = node.set_backs
+        self._set_backs = node.time_jumps
         return False
 
     def _count_losses(self, number: int | None) -> None:
-        lost, missing = self._losses.came(self._last_ns, number)
-        self._node.health.dropped(f'{self._topic}: lost on the way or in a full queue', lost)
+        lost, missing = self._losses.record(self._last_ns, number)
+        self._node.diagnostics.count_drops(
+            f'{self._topic}: lost on the way or in a full queue', lost
+        )
         if self._is_scan:
-            self._node.health.dropped(f'{self._topic}: gaps between the stamps', missing)
+            self._node.diagnostics.count_drops(f'{self._topic}: gaps between the stamps', missing)
 
     def _guarded(self, message: Any) -> None:
         try:
-            self._take(message)
+            self._process(message)
         except InputError as error:
-            self._node.health.refused(self._topic, str(error))
+            self._node.diagnostics.message_rejected(self._topic, str(error))
             if monotonic() - self._said_at >= _QUIET_S:
                 self._said_at = monotonic()
                 self._node.get_logger().warning(f'{self._topic}: {error}')
 
-    def _take_held(self) -> None:
+    def _process_held(self) -> None:
         message = self._held
         self._held = None
         if message is not None:
             self._guarded(message)
 
 
-class Losses:
+class MessageLossCounter:
     """What of a stream was lost on the way, or never sent.
 
     Counts by the numbers that a publisher gives its messages, and by their evenly spaced stamps.
@@ -124,7 +128,7 @@ class Losses:
         self._last_number = 0
         self._steps_ns: deque[int] = deque(maxlen=50)
 
-    def came(self, stamp_ns: int, number: int | None) -> tuple[int, int]:
+    def record(self, stamp_ns: int, number: int | None) -> tuple[int, int]:
         """Take note of a message and of its number, None where the middleware gives none.
 
         Returns how many between it and the last one were lost on the way, and how many more are

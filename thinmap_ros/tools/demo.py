@@ -91,7 +91,7 @@ def explore(arguments: argparse.Namespace, world: Path, start: Array) -> None:
     out: Path = arguments.out
     processes = Processes(out / 'log')
     sim_time = ['-p', 'use_sim_time:=true']
-    pose = [f'-p start_x_m:={start[0]} -p start_y_m:={start[1]} -p start_yaw_rad:={start[2]}']
+    pose = [f'-p initial_x_m:={start[0]} -p initial_y_m:={start[1]} -p initial_yaw_rad:={start[2]}']
     extra = {
         'localizer': ' '.join(pose).split(),
         'navigator': ['-p', f'max_speed_m_s:={arguments.speed}'],

@@ -10,7 +10,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, shown
 from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
+from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.experiments.drives import RECIPES, TRUTH_TOPIC, Source
 from thinmap_ros.files import package_data
 from thinmap_ros.files.atomic import write_text
@@ -102,7 +102,7 @@ def record(path: Path, looks: Iterable[Look], localized: bool) -> int:
 def _pipeline(first: Look, localized: bool) -> tuple[Pipeline, list[Array]]:
     """A pipeline for a drive that begins so, and the list that is to take each scan's true pose."""
     x, y, yaw = (float(number) for number in first.T_world_base)
-    localizer = ScanLocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=yaw)
+    localizer = LocalizerConfig(initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
     config = PipelineConfig(localizer=localizer)
     truth: list[Array] = []
 

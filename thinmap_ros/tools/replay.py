@@ -17,9 +17,9 @@ from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
+from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.core.slam.localizers import line_features
-from thinmap_ros.files.atomic import written_aside
+from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.replaying import replay, write_outputs
 from thinmap_ros.tools import cli
@@ -101,7 +101,7 @@ def _view(arguments: argparse.Namespace) -> Iterator[View | None]:
         return
     with ExitStack() as stack:
         aside = (
-            stack.enter_context(written_aside(arguments.recording)) if arguments.recording else None
+            stack.enter_context(atomic_write(arguments.recording)) if arguments.recording else None
         )
         view = View(aside, arguments.view)
         stack.callback(view.close)
@@ -110,7 +110,7 @@ def _view(arguments: argparse.Namespace) -> Iterator[View | None]:
 
 def _play(arguments: argparse.Namespace, shown: ReplayView | None) -> None:
     config = PipelineConfig(
-        localizer=cli.config_from(arguments, ScanLocalizerConfig),
+        localizer=cli.config_from(arguments, LocalizerConfig),
         grid=cli.config_from(arguments, OccupancyConfig),
     )
     wall = time.perf_counter()
@@ -140,7 +140,7 @@ def main() -> None:
         '--view', action='store_true', help='show it in rerun, until the viewer is closed'
     )
     parser.add_argument('--recording', type=Path, help="file for rerun's recording (.rrd)")
-    cli.add_config(parser, ScanLocalizerConfig, ['slam'])
+    cli.add_config(parser, LocalizerConfig, ['slam'])
     cli.add_config(parser, OccupancyConfig, ['resolution_m', 'no_return_range_m', 'usable_range_m'])
     cli.run(_work, parser)
 

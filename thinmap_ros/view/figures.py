@@ -9,7 +9,7 @@ import numpy as np
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
-from thinmap_ros.files.atomic import written_aside
+from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.view import palette
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def summary_figure(
         )
     axes.set(xlabel='x (m)', ylabel='y (m)', title=title, aspect='equal')
     axes.legend(loc='upper center', bbox_to_anchor=(0.5, -0.07), ncols=4, fontsize=8, frameon=False)
-    with written_aside(path) as aside:
+    with atomic_write(path) as aside:
         figure.savefig(aside, format='png', bbox_inches='tight')
 
 
@@ -146,7 +146,7 @@ def coverage_figure(path: Path, reports: list[dict[str, Any]]) -> None:
         xlabel='distance, of the mean of all strategies', ylabel='coverage (%)', ylim=(0.0, 101.0)
     )
     axes.legend(fontsize=8, frameon=False)
-    with written_aside(path) as aside:
+    with atomic_write(path) as aside:
         figure.savefig(aside, format='png', bbox_inches='tight')
 
 
@@ -154,6 +154,6 @@ def write_small_png(source: Path, target: Path) -> None:
     """Copy a PNG with so few colours that it takes a third of the space."""
     from PIL import Image
 
-    with Image.open(source) as picture, written_aside(target) as aside:
+    with Image.open(source) as picture, atomic_write(target) as aside:
         small = picture.convert('RGB').quantize(_SMALL_COLOURS, dither=Image.Dither.NONE)
         small.save(aside, format='PNG', optimize=True)

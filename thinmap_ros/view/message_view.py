@@ -12,7 +12,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamp_matcher import StampMatcher
-from thinmap_ros.files.atomic import written_aside
+from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.laser_mount import StaticTransforms
@@ -93,7 +93,7 @@ class Feed:
         self._view.pose(ns, T_map_base, covariance)
         sigma_m = float(np.sqrt(max(np.linalg.eigvalsh(covariance[:2, :2])[-1], 0.0)))
         self._view.number(ns, 'error', '2 sigma, cm', 200.0 * sigma_m)
-        self._compare(ns, self._pairs.left(ns, T_map_base))
+        self._compare(ns, self._pairs.add_left(ns, T_map_base))
         if self._T_map_odom is None and self._T_odom_base is not None:
             self._T_map_odom = se2.compose(T_map_base, se2.invert(self._T_odom_base))
 
@@ -106,7 +106,7 @@ class Feed:
     def _on_truth(self, ns: int, message: Any) -> None:
         T_map_base = _pose(message.pose)
         self._view.trail(ns, 'truth', T_map_base)
-        self._compare(ns, self._pairs.right(ns, T_map_base))
+        self._compare(ns, self._pairs.add_right(ns, T_map_base))
 
     def _compare(self, ns: int, pair: tuple[Array, Array] | None) -> None:
         if pair is None:
@@ -181,7 +181,7 @@ def recording_from_bag(bag_path: Path, out_rrd: Path) -> None:
     """
     bag = Bag(bag_path)
     mounts = _static_transforms(bag)
-    with written_aside(out_rrd) as aside:
+    with atomic_write(out_rrd) as aside:
         view = View(aside)
         try:
             _tell(bag, Feed(view, lambda frame: _laser_pose(mounts, frame)))

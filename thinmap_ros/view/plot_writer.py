@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thinmap_ros.files.atomic import written_aside
+from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.view import palette
 from thinmap_ros.view.figures import draw_graph, draw_map
 from thinmap_ros.view.plots import (
@@ -63,7 +63,7 @@ def write_plot(folder: Path, plot: Plot) -> None:
             axes.set_visible(False)
         _add_legend(figure, plot.legend)
         for ending, metadata in (('png', {'Software': None}), ('svg', {'Date': None})):
-            with written_aside(folder / f'{plot.name}.{ending}') as aside:
+            with atomic_write(folder / f'{plot.name}.{ending}') as aside:
                 figure.savefig(aside, format=ending, metadata=metadata)
 
 

@@ -34,7 +34,7 @@ class DenseFilter:
             noise[rows, rows] = R[k]
         self._correct(H, v, noise)
 
-    def tie(self, a, b, R):
+    def merge(self, a, b, R):
         H = np.zeros((2, self.x.size))
         opposed = abs(wrap(float(self.x[4 + 2 * a] - self.x[4 + 2 * b]))) > math.pi / 2.0
         H[:, 3 + 2 * a : 5 + 2 * a] = np.eye(2)

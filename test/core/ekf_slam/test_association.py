@@ -12,7 +12,7 @@ from thinmap_ros.core.ekf_slam.association import AssociationConfig, associate, 
 from thinmap_ros.core.ekf_slam.ekf import EkfSlam
 from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
 from thinmap_ros.core.ekf_slam.feature_map import FeatureConfig, FeatureMap
-from thinmap_ros.core.ekf_slam.features import Feature
+from thinmap_ros.core.ekf_slam.features import FeatureTrack
 from thinmap_ros.core.ekf_slam.line_extraction import LineConfig, Lines, extract_lines
 
 R = np.diag([0.02**2, 0.01**2])
@@ -34,7 +34,9 @@ def known(walls, pose=(0.0, 0.0, 0.0), P=SURE):
     """A filter that knows some walls, and the features beside it."""
     lines = seen_lines(*walls)
     ekf = CompressedEkf(np.array(pose), P)
-    features = FeatureMap(FeatureConfig(sightings=1, gap_m=0.3), local_areas=False)
+    features = FeatureMap(
+        FeatureConfig(min_observations=1), AssociationConfig(max_gap_m=0.3), local_areas=False
+    )
     features.observe(ekf, lines, BLIND)
     return ekf, features
 
@@ -56,9 +58,9 @@ def chosen(walls, seen, gap_m=0.3):
     for line, ends in zip(seen_lines(*walls).z, np.array(walls).reshape(-1, 2, 2), strict=True):
         ekf.add(line, 1e-6 * np.eye(2))
         along = ends @ [-math.sin(line[1]), math.cos(line[1])]
-        features.append(Feature(1, along.min(), along.max(), np.zeros(2)))
+        features.append(FeatureTrack(1, along.min(), along.max(), np.zeros(2)))
     return associate(
-        ekf, features, seen_lines(*seen), np.zeros(2), AssociationConfig(gap_m=gap_m)
+        ekf, features, seen_lines(*seen), np.zeros(2), AssociationConfig(max_gap_m=gap_m)
     ).index.tolist()
 
 
@@ -73,7 +75,7 @@ def test_collinear_walls_of_two_rooms_are_two():
 def test_pieces_of_a_wall_beside_a_door_are_one_feature():
     left = [[2, 1], [2, 3]]
     right = [[2, -3], [2, 0]]
-    gap_m = AssociationConfig().gap_m
+    gap_m = AssociationConfig().max_gap_m
     assert chosen([left], [right], gap_m) == [0]
     assert chosen([left], [[[2.0, -3.0], [2.0, 0.9 - gap_m]]], gap_m) == [-1]
 
@@ -109,7 +111,7 @@ def test_what_could_be_two_walls_is_decided_when_the_others_have_corrected_the_p
     ekf.local.set_pose(np.zeros(3), np.diag([0.1**2, 0.01**2, 0.001**2]))
     off = [truth[:2], truth[:2]]
     seen = seen_lines(np.array(wall) - off, np.array(behind) - off)
-    alone = associate(ekf.local, features._local(ekf), seen, np.zeros(2), FeatureConfig())
+    alone = associate(ekf.local, features._local(ekf), seen, np.zeros(2), AssociationConfig())
     assert ekf.area[alone.index[0]] == 2
     assert alone.ambiguous.tolist() == [True, False]
     features.observe(ekf, seen, BLIND)
@@ -121,47 +123,51 @@ def test_the_two_faces_of_a_thin_wall_are_two_features():
     ekf.local.set_pose(np.array([4.0, 0.0, math.pi]), SURE)
     for _ in range(3):
         features.observe(ekf, seen_lines([[1.95, -2.0], [1.95, 2.0]]), BLIND)
-    faces = sorted(f.r_m for f in features.listed(ekf))
+    faces = sorted(f.r_m for f in features.line_features(ekf))
     assert faces == pytest.approx([2.0, 2.05], abs=0.01)
 
 
 def test_a_feature_enters_after_several_sightings_and_keeps_its_id():
     ekf = CompressedEkf(np.zeros(3), SURE)
-    features = FeatureMap(FeatureConfig(sightings=3), local_areas=False)
+    features = FeatureMap(FeatureConfig(min_observations=3), AssociationConfig(), local_areas=False)
     wall = seen_lines([[2.0, -1.0], [2.0, 1.0]])
     counts = []
     for _ in range(5):
         features.observe(ekf, wall, BLIND)
         counts.append(len(features))
     assert counts == [0, 0, 1, 1, 1]
-    (only,) = features.listed(ekf)
+    (only,) = features.line_features(ekf)
     features.observe(ekf, seen_lines([[2.0, -1.0], [2.0, 2.5]]), BLIND)
-    (grown,) = features.listed(ekf)
+    (grown,) = features.line_features(ekf)
     assert grown.id == only.id
     assert {round(float(p[1]), 1) for p in (grown.start, grown.end)} == {-1.0, 2.5}
 
 
 def test_what_was_seen_once_and_then_no_more_is_forgotten():
     ekf = CompressedEkf(np.zeros(3), SURE)
-    features = FeatureMap(FeatureConfig(sightings=2, patience=3), local_areas=False)
+    features = FeatureMap(
+        FeatureConfig(min_observations=2, candidate_max_misses=3),
+        AssociationConfig(),
+        local_areas=False,
+    )
     passer_by = seen_lines([[1.0, -0.5], [1.0, 0.5]])
     wall = seen_lines([[4.0, -1.0], [4.0, 1.0]])
     features.observe(ekf, passer_by, BLIND)
     for _ in range(5):
         features.observe(ekf, wall, BLIND)
     features.observe(ekf, passer_by, BLIND)
-    assert [round(f.r_m) for f in features.listed(ekf)] == [4]
+    assert [round(f.r_m) for f in features.line_features(ekf)] == [4]
 
 
 def test_two_features_that_turn_out_to_be_one_wall_merge():
     ekf, features = known(
         [[[2.0, -3.0], [2.0, -1.0]], [[2.0, 1.0], [2.0, 3.0]], [[-1.0, 2.0], [1.0, 2.0]]]
     )
-    first = min(f.id for f in features.listed(ekf))
+    first = min(f.id for f in features.line_features(ekf))
     assert len(features) == 3
     features.observe(ekf, seen_lines([[2.0, -1.5], [2.0, 1.5]]), BLIND)
     assert len(features) == 2 == len(ekf)
-    (long,) = [f for f in features.listed(ekf) if f.id == first]
+    (long,) = [f for f in features.line_features(ekf) if f.id == first]
     assert sorted([long.start[1], long.end[1]]) == pytest.approx([-3.0, 3.0], abs=0.02)
 
 
@@ -170,12 +176,12 @@ def test_a_drive_through_a_room_finds_its_walls_once(rng, local_areas):
     """All features are walls, and no wall is there twice."""
     truths = [truth for truth, _ in drive(500, rng, np.array([2.0, 2.0, 0.0]))][::3]
     ekf = CompressedEkf(truths[0], SURE)
-    features = FeatureMap(FeatureConfig(gap_m=0.3), local_areas)
+    features = FeatureMap(FeatureConfig(), AssociationConfig(max_gap_m=0.3), local_areas)
     for truth in truths:
         ekf.local.set_pose(truth, SURE)
         scan = scan_in(ROOM, truth, rng)
         features.observe(ekf, extract_lines(scan, LineConfig()), scan)
-    walls = [wall_of(feature) for feature in features.listed(ekf)]
+    walls = [wall_of(feature) for feature in features.line_features(ekf)]
     assert -1 not in walls
     assert len(walls) >= 7
     inner = (4, 5)  # these have two faces
@@ -199,9 +205,9 @@ def wall_of(feature):
 
 def test_features_follow_the_filter_not_the_robot():
     ekf, features = known([[[2.0, -1.0], [2.0, 1.0]]])
-    before = features.listed(ekf)[0]
+    before = features.line_features(ekf)[0]
     ekf.local.set_pose(se2.pose(1.0, 0.5, 0.3), SURE)
-    after = features.listed(ekf)[0]
+    after = features.line_features(ekf)[0]
     np.testing.assert_array_equal(before.start, after.start)
 
 
@@ -212,11 +218,11 @@ def test_a_door_that_opens_leaves_the_map_and_a_wall_behind_a_person_does_not():
     person = np.array([[1.0, -0.8, 1.0, 0.8], [*far[0], *far[1]]])
     for _ in range(10):
         features.observe(ekf, seen_lines(far), scan_in(person, np.zeros(3)))
-    assert sorted(round(f.r_m) for f in features.listed(ekf)) == [2, 5]
-    for _ in range(FeatureConfig().misses):
+    assert sorted(round(f.r_m) for f in features.line_features(ekf)) == [2, 5]
+    for _ in range(FeatureConfig().max_misses):
         assert len(features) == 2
         features.observe(ekf, seen_lines(far), scan_in(person[1:], np.zeros(3)))
-    left = features.listed(ekf)
+    left = features.line_features(ekf)
     assert [round(f.r_m) for f in left] == [5] == [f.id + 3 for f in left]
     assert len(ekf) == 1
 

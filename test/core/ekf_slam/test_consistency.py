@@ -8,6 +8,7 @@ from scipy.stats import chi2
 from support.slam_room import BLIND
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.ekf_slam.association import AssociationConfig
 from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
 from thinmap_ros.core.ekf_slam.feature_map import FeatureConfig, FeatureMap
 from thinmap_ros.core.ekf_slam.line_extraction import Lines
@@ -52,7 +53,7 @@ def look(rng, truth):
     ends = np.array([se2.transform_points(se2.invert(truth), WALLS[i]) for i in seen])
     ends = ends.reshape(-1, 2, 2)
     lengths = np.hypot(*(ends[:, 1] - ends[:, 0]).T)
-    wall = FEATURES.wall_sigma_m * np.column_stack([np.ones(len(z)), 1.0 / lengths])
+    wall = FEATURES.wall_flatness_m * np.column_stack([np.ones(len(z)), 1.0 / lengths])
     z = z + rng.multivariate_normal([0.0, 0.0], SEEN, len(z)) + wall * rng.normal(size=(len(z), 2))
     return Lines(z, np.tile(SEEN, (len(z), 1, 1)), ends)
 
@@ -62,7 +63,7 @@ def nees_of_a_run(seed, local_areas, looks):
     rng = np.random.default_rng(seed)
     truth = np.array([2.0, 5.0, 0.0])
     ekf = CompressedEkf(truth, 1e-8 * np.eye(3))
-    features = FeatureMap(FEATURES, local_areas)
+    features = FeatureMap(FEATURES, AssociationConfig(), local_areas)
     found = []
     for step in range(looks):
         turning = step % 120 >= 110
@@ -72,7 +73,7 @@ def nees_of_a_run(seed, local_areas, looks):
         measured = increment + rng.multivariate_normal(np.zeros(3), Q)
         ekf.local.predict(se2.compose(ekf.local.pose, measured), measured, Q)
         features.observe(ekf, look(rng, truth), BLIND)
-        ekf.work_off()
+        ekf.flush_step()
         error = ekf.local.pose - truth
         error[2] = se2.wrap(float(error[2]))
         found.append(error @ np.linalg.solve(ekf.local.pose_covariance, error))

@@ -63,7 +63,7 @@ def test_two_features_tied_to_be_one_wall(rng):
     for filter_ in (fast, plain):
         filter_.add(seen, R)
         filter_.add(seen + [0.01, -0.004], R)
-        filter_.tie(4, 5, 1e-4 * np.eye(2))
+        filter_.merge(4, 5, 1e-4 * np.eye(2))
     assert_same(fast, plain)
     v, S, _ = fast.difference(4, 5)
     assert np.abs(v).max() < 0.005
@@ -98,7 +98,7 @@ def test_one_wall_in_two_forms_is_tied_to_itself():
     for filter_ in (fast, plain):
         filter_.add(np.array([0.99, np.pi]), R)
         filter_.add(np.array([1.02, np.pi]), R)
-        filter_.tie(0, 1, 1e-6 * np.eye(2))
+        filter_.merge(0, 1, 1e-6 * np.eye(2))
     assert abs(abs(fast.lines[0, 1] - fast.lines[1, 1]) - np.pi) < 0.01
     assert fast.lines[0, 0] == pytest.approx(-fast.lines[1, 0], abs=1e-3)
     assert_same(fast, plain)

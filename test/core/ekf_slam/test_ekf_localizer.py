@@ -14,7 +14,7 @@ START = se2.pose(2.0, 2.0, 0.0)
 
 
 def at_start(slam='ekf_ti', **options):
-    return EkfLocalizer(EkfConfig(slam=slam, start_x_m=2.0, start_y_m=2.0, **options))
+    return EkfLocalizer(EkfConfig(slam=slam, initial_x_m=2.0, initial_y_m=2.0, **options))
 
 
 def driven(localizer, steps):
@@ -66,7 +66,9 @@ def test_a_state_is_a_map_that_another_day_goes_on_in():
     localizer = at_start()
     driven(localizer, 600)
     state = localizer.state()
-    second = EkfLocalizer.from_state(state, EkfConfig(slam='ekf_ti', start_x_m=2.1, start_y_m=1.9))
+    second = EkfLocalizer.from_state(
+        state, EkfConfig(slam='ekf_ti', initial_x_m=2.1, initial_y_m=1.9)
+    )
     assert {f.id for f in second.features} == {f.id for f in localizer.features}
     errors, _ = driven(second, 100)
     assert np.hypot(*errors[-1, :2]) < 0.1
@@ -77,22 +79,22 @@ def test_a_state_is_a_map_that_another_day_goes_on_in():
 def test_without_mapping_no_feature_comes_grows_or_goes():
     localizer = at_start()
     driven(localizer, 600)
-    config = EkfConfig(slam='ekf_ti', start_x_m=2.0, start_y_m=2.0, mapping=False)
+    config = EkfConfig(slam='ekf_ti', initial_x_m=2.0, initial_y_m=2.0, update_map=False)
     second = EkfLocalizer.from_state(localizer.state(), config)
     before = lengths_of(second)
     errors, _ = driven(second, 100)
     assert lengths_of(second) == pytest.approx(before, abs=1e-9)
     assert np.hypot(*errors[-1, :2]) < 0.1
-    alone = at_start(mapping=False)
+    alone = at_start(update_map=False)
     driven(alone, 100)
     assert alone.features == []
 
 
 def test_it_goes_on_after_a_restart_where_odometry_leads():
     last = LastPose(0, se2.pose(1.0, 2.0, 0.5), se2.pose(1.0, 0.0, 0.0))
-    resumed = EkfLocalizer.resumed(None, last, se2.pose(2.0, 0.0, 0.0))
+    from_occupancy_map = EkfLocalizer.from_occupancy_map(None, last, se2.pose(2.0, 0.0, 0.0))
     expected = se2.compose(last.T_map_odom, se2.pose(2.0, 0.0, 0.0))
-    np.testing.assert_allclose(resumed.pose, expected)
+    np.testing.assert_allclose(from_occupancy_map.pose, expected)
 
 
 def test_input_that_makes_no_sense_is_refused():
@@ -112,7 +114,7 @@ def test_input_that_makes_no_sense_is_refused():
 def test_its_path_is_what_it_said():
     localizer = at_start()
     errors, _ = driven(localizer, 50)
-    assert localizer.corrected_path().shape == errors.shape
-    np.testing.assert_array_equal(localizer.corrected_path()[-1], localizer.pose)
-    stamps, poses = localizer.past()
+    assert localizer.optimized_trajectory().shape == errors.shape
+    np.testing.assert_array_equal(localizer.optimized_trajectory()[-1], localizer.pose)
+    stamps, poses = localizer.keyframe_trajectory()
     assert (stamps.shape, poses.shape) == ((0,), (0, 3))

@@ -52,7 +52,7 @@ class Pair:
         self.whole.update(np.array([self.ids.index(i) for i in ids], dtype=np.int64), z, noise)
 
     def assert_same(self):
-        mean, covariance = self.local.settle()
+        mean, covariance = self.local.flush()
         at = np.concatenate(
             [np.arange(3)] + [3 + 2 * self.ids.index(i) + np.arange(2) for i in self.local.ids]
         )
@@ -81,8 +81,8 @@ def run(pair, rng, steps, area_every, change):
             pair.remove(area[rng.integers(len(area))])
         if step % area_every == area_every - 1:
             number = rng.integers(1, 8)
-            pair.local.enter(list(rng.permutation(pair.local.ids)[:number]))
-        pair.local.work_off()
+            pair.local.set_local_area(list(rng.permutation(pair.local.ids)[:number]))
+        pair.local.flush_step()
 
 
 def test_the_same_estimate_as_the_textbook_over_many_areas(rng):
@@ -106,12 +106,12 @@ def test_more_features_than_a_chunk_of_the_store(rng):
         pair.add(new_line(rng))
     for step in range(60):
         if step % 6 == 0:
-            pair.local.enter(list(rng.permutation(pair.local.ids)[:10]))
+            pair.local.set_local_area(list(rng.permutation(pair.local.ids)[:10]))
         pair.predict(rng.normal(0.0, [0.2, 0.02, 0.1]))
         pair.update(rng, rng.permutation(pair.local.area)[:3])
         pair.add(new_line(rng))
         for _ in range(step % 40):
-            pair.local.work_off()
+            pair.local.flush_step()
     pair.assert_same()
 
 
@@ -129,7 +129,7 @@ def test_what_is_told_of_features_outside_the_area(rng):
     pair = Pair(EkfSlam(np.array([1.0, -2.0, 0.4]), P0))
     run(pair, rng, 60, 10, 30)
     ids = pair.local.ids
-    pair.local.enter(ids[:3])
+    pair.local.set_local_area(ids[:3])
     lines = pair.local.lines()
     covariances = pair.local.line_covariances()
     at = [pair.ids.index(i) for i in ids]
@@ -144,7 +144,7 @@ def test_steps_touch_the_local_area_only(rng):
     pair = Pair(EkfSlam(np.array([1.0, -2.0, 0.4]), P0))
     for _ in range(300):
         pair.add(new_line(rng))
-    pair.local.enter(pair.local.ids[:8])
+    pair.local.set_local_area(pair.local.ids[:8])
     assert pair.local.local.size == 2 * (3 + 2 * 8)
     assert len(pair.local) == 300
 
@@ -158,7 +158,7 @@ def test_some_hundred_features_take_little_memory(rng):
     ekf = CompressedEkf(np.array([1.0, -2.0, 0.4]), P0)
     for feature_id in range(250):
         ekf.add(feature_id, new_line(rng), R)
-    ekf.enter([0, 1])
+    ekf.set_local_area([0, 1])
     assert held_mb() - before < 14.0
 
 

@@ -44,8 +44,8 @@ def test_the_fit_is_the_minimum_that_a_general_solver_finds(rng):
     def residuals(x):
         d = rho * np.cos(phi - x[1]) - x[0]
         off = phi - lines.z[0, 1]
-        along = config.bearing_sigma_rad * rho * np.sin(off)
-        return d / np.sqrt((config.range_sigma_m * np.cos(off)) ** 2 + along**2 + 1e-8)
+        along = config.bearing_noise_rad * rho * np.sin(off)
+        return d / np.sqrt((config.range_noise_m * np.cos(off)) ** 2 + along**2 + 1e-8)
 
     best = least_squares(residuals, [3.9, 0.05], xtol=1e-14, ftol=1e-14, gtol=1e-14)
     np.testing.assert_allclose(lines.z[0], best.x, atol=1e-5)
@@ -56,7 +56,7 @@ def test_the_fit_is_the_minimum_that_a_general_solver_finds(rng):
 
 @pytest.mark.parametrize('mount', [np.zeros(3), np.array([0.5, 0.2, 0.3])])
 def test_the_covariance_is_what_many_scans_show(rng, mount):
-    config = LineConfig(range_sigma_m=0.02, bearing_sigma_rad=0.002)
+    config = LineConfig(range_noise_m=0.02, bearing_noise_rad=0.002)
     pose = np.array([0.3, -0.4, 0.2])
     exact = scan_in(BOX[1:2], pose, T_base_laser=mount)
     hit = exact.hit
@@ -94,7 +94,7 @@ def test_no_lines_on_round_columns_or_in_clutter(rng):
     for _ in range(100):
         assert len(extract_lines(scan_of(rng.uniform(1.0, 6.0, 181)), LineConfig())) == 0
         leaves = 3.0 + np.cumsum(rng.normal(0.0, 0.08, 181))
-        assert len(extract_lines(scan_of(leaves), LineConfig(line_points=12))) <= 1
+        assert len(extract_lines(scan_of(leaves), LineConfig(min_points=12))) <= 1
 
 
 def test_all_lines_of_a_furnished_room_are_walls(rng):
@@ -131,7 +131,7 @@ def test_a_bend_parts_a_wall_and_a_split_by_noise_is_healed(rng):
     bent = np.array([[3.0, -2.0, 3.0, 0.0], [3.0, 0.0, 2.7, 2.0]])
     assert len(extract_lines(scan_in(bent, np.zeros(3), rng), LineConfig())) == 2
     straight = np.array([[3.0, -2.5, 3.0, 2.5]])
-    config = LineConfig(line_split_m=0.025)
+    config = LineConfig(split_distance_m=0.025)
     assert all(
         len(extract_lines(scan_in(straight, np.zeros(3), rng), config)) == 1 for _ in range(50)
     )

@@ -69,9 +69,9 @@ def test_features_of_a_node_that_goes_are_handed_on(area):
 
 
 def test_merged_and_dropped_features(area):
-    area.forget(10, heir=30)
+    area.remove(10, heir=30)
     assert area.nodes_of(30) == [1, 3]
-    area.forget(30)
+    area.remove(30)
     assert area.features_near(np.array([0.0, 0.0, 0.0]), AHEAD) == {20}
     assert area.nodes_of(30) == []
 

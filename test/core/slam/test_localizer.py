@@ -15,7 +15,7 @@ from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import LastPose
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.core.slam.localizer import ScanLocalizer, ScanLocalizerConfig
+from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
 from thinmap_ros.sim.drives import drive as drive_along
 from thinmap_ros.sim.laser import Lms200Config
 from thinmap_ros.sim.robot import PioneerConfig
@@ -23,7 +23,7 @@ from thinmap_ros.sim.simulation import Simulation
 from thinmap_ros.sim.world import World
 
 START = np.array([2.0, 2.0, 0.0])
-AT_START = {'start_x_m': 2.0, 'start_y_m': 2.0}
+AT_START = {'initial_x_m': 2.0, 'initial_y_m': 2.0}
 PERIOD_NS = 200_000_000
 # A place that looks like no part of the room.
 ELSEWHERE = np.array(
@@ -39,7 +39,7 @@ ELSEWHERE = np.array(
 
 
 def at_start(**config):
-    return ScanLocalizer(ScanLocalizerConfig(**{**AT_START, **config}))
+    return Localizer(LocalizerConfig(**{**AT_START, **config}))
 
 
 def driven(steps, seed=3, localizer=None, odometry=lambda odom: odom, **config):
@@ -92,11 +92,11 @@ def test_a_drive_round_the_room_stays_on_its_path(whole_drive):
 
 def test_the_whole_path_is_told_afterwards(whole_drive):
     rows, localizer = whole_drive
-    path = localizer.corrected_path()
+    path = localizer.optimized_trajectory()
     assert path.shape == (len(rows), 3)
     truths = np.array([truth for truth, *_ in rows])
     assert np.sqrt(np.mean(np.square((path - truths)[:, :2]).sum(axis=1))) < 0.06
-    stamps, past = localizer.past()
+    stamps, past = localizer.keyframe_trajectory()
     assert (np.diff(stamps) > 0).all()
     off = (past - truths[stamps // PERIOD_NS])[:, :2]
     assert np.hypot(*off.T).max() < 0.1
@@ -108,7 +108,7 @@ def test_the_whole_path_is_told_afterwards(whole_drive):
 
 def test_the_whole_path_is_within_4_cm(whole_drive):
     rows, localizer = whole_drive
-    off = (localizer.corrected_path() - np.array([truth for truth, *_ in rows]))[:, :2]
+    off = (localizer.optimized_trajectory() - np.array([truth for truth, *_ in rows]))[:, :2]
     assert np.sqrt(np.mean(np.square(off).sum(axis=1))) < 0.04
 
 
@@ -352,7 +352,7 @@ def test_beyond_a_hall_in_which_nothing_is_seen_the_map_goes_on(rng):
     """Walls that come into range far off, some points at a time, are new."""
     # Two rooms, each open towards the hall between them.
     hall = np.vstack([ROOM[[0, 2, 3]], np.delete(ROOM, 3, axis=0) + [18.0, 0.0, 18.0, 0.0]])
-    localizer = at_start(start_x_m=2.0, start_y_m=7.0)
+    localizer = at_start(initial_x_m=2.0, initial_y_m=7.0)
     odom = np.zeros(3)
     for k, x in enumerate(np.arange(2.0, 22.0, 0.1)):
         odom = odom + [0.1 * 1.004, rng.normal(0.0, 1e-4), rng.normal(0.0, 1e-4)]
@@ -389,7 +389,7 @@ def test_a_hall_that_is_wider_than_the_laser_sees_is_mapped_all_the_same(seed):
     across = along((2, 2), (2, 12), (9, 14), (16, 10), (23, 14), (30, 11), (36.5, 12))
     round_it = along((36.5, 12), (36.5, 20), (3, 21), (3, 3))
     back = along((3, 3), (2, 2.5), (2, 12))
-    localizer = at_start(start_yaw_rad=np.pi / 2.0)
+    localizer = at_start(initial_yaw_rad=np.pi / 2.0)
     blind = 0
     lost = 0
     off = []
@@ -446,7 +446,8 @@ def walls_in(localizer):
     """Middles (N, 2) of the cells that are walls, from the localizer's state."""
     state = localizer.state()
     tile, row, col = np.nonzero(
-        state['hits'] > localizer.config.match_wall_share * state['seen'].astype(float)
+        state['hits']
+        > localizer.config.local_map.occupied_min_hit_ratio * state['seen'].astype(float)
     )
     size = state['hits'].shape[1]
     cells = state['tiles'][tile] * size + np.column_stack([row, col])
@@ -473,17 +474,20 @@ def test_a_robot_that_is_carried_off_begins_a_new_map_and_says_so():
     rows, localizer = driven(300)
     before = len(localizer.keyframes)
     there = np.array([1.0, 2.0, 0.5])
-    carried = on(localizer, 60, there, rows[-1][2], rng, ELSEWHERE)
-    lost = [estimate.lost for _, estimate, _ in carried]
+    propagated_covariance = on(localizer, 60, there, rows[-1][2], rng, ELSEWHERE)
+    lost = [estimate.lost for _, estimate, _ in propagated_covariance]
     assert not any(estimate.lost for _, estimate, _ in rows)
     assert any(lost[:45])
     assert lost[-1], 'where the new map lies is not known'
-    assert carried[-1][1].match_quality > 0.9, 'it fits the new map'
-    assert carried[-1][1].covariance[0, 0] > 100.0
+    assert propagated_covariance[-1][1].match_quality > 0.9, 'it fits the new map'
+    assert propagated_covariance[-1][1].covariance[0, 0] > 100.0
     assert len(localizer.keyframes) > before
     # In the new map it goes on as ever.
-    steps = [se2.between(a[0], b[0]) for a, b in pairwise(carried[-20:])]
-    found = [se2.between(a[1].T_map_base, b[1].T_map_base) for a, b in pairwise(carried[-20:])]
+    steps = [se2.between(a[0], b[0]) for a, b in pairwise(propagated_covariance[-20:])]
+    found = [
+        se2.between(a[1].T_map_base, b[1].T_map_base)
+        for a, b in pairwise(propagated_covariance[-20:])
+    ]
     np.testing.assert_allclose(found, steps, atol=0.06)
 
 
@@ -520,7 +524,7 @@ def test_a_robot_that_is_brought_back_knows_its_path():
     rng = np.random.default_rng(8)
     rows, localizer = driven(300)
     on(localizer, 60, np.array([1.0, 2.0, 0.5]), rows[-1][2], rng, ELSEWHERE)
-    path = localizer.corrected_path()
+    path = localizer.optimized_trajectory()
     truths = np.array([truth for truth, *_ in rows])
     assert np.hypot(*(path[:300] - truths)[:, :2].T).max() < 0.1
 
@@ -567,7 +571,7 @@ def test_after_a_reset_everything_is_forgotten():
     rows, localizer = driven(200)
     localizer.reset()
     assert not localizer.keyframes
-    assert localizer.corrected_path().shape == (0, 3)
+    assert localizer.optimized_trajectory().shape == (0, 3)
     estimate = localizer.step(scan_in(ROOM, START), rows[-1][2])
     np.testing.assert_allclose(estimate.T_map_base, START)
 
@@ -576,7 +580,7 @@ def test_a_map_is_taken_over_by_another_localizer(whole_drive):
     """A saved map: the robot is lost in it until it fits, then tracks."""
     _, first = whole_drive
     state = {name: array.copy() for name, array in first.state().items()}
-    second = ScanLocalizer.from_state(state, ScanLocalizerConfig(**AT_START))
+    second = Localizer.from_state(state, LocalizerConfig(**AT_START))
     rows, _ = driven(200, seed=8, localizer=second)
     lost = [estimate.lost for _, estimate, _ in rows]
     assert lost[0]
@@ -586,7 +590,7 @@ def test_a_map_is_taken_over_by_another_localizer(whole_drive):
 
 def test_a_robot_that_is_put_elsewhere_in_a_given_map_goes_on_in_it(whole_drive):
     _, first = whole_drive
-    second = ScanLocalizer.from_state(first.state())
+    second = Localizer.from_state(first.state())
     rng = np.random.default_rng(8)
     elsewhere = np.array([8.0, 8.0, np.pi / 2.0])
     second.set_pose(elsewhere + [0.15, -0.1, 0.05], np.diag([0.04, 0.04, 0.01]))
@@ -612,7 +616,7 @@ def test_the_error_of_a_pose_that_was_set_is_not_taken_for_noise_of_the_odometry
 
 def test_a_robot_that_is_not_where_a_given_map_says_stays_lost(whole_drive):
     _, first = whole_drive
-    second = ScanLocalizer.from_state(first.state(), ScanLocalizerConfig(**AT_START))
+    second = Localizer.from_state(first.state(), LocalizerConfig(**AT_START))
     hits = second.state()['hits'].copy()
     second.step(scan_in(ELSEWHERE, np.array([1.0, 2.0, 0.5])), np.zeros(3))
     rng = np.random.default_rng(1)
@@ -629,7 +633,7 @@ def test_a_robot_that_is_not_where_a_given_map_says_stays_lost(whole_drive):
 def test_without_mapping_the_map_stays_as_it_is(whole_drive):
     _, first = whole_drive
     state = {name: array.copy() for name, array in first.state().items()}
-    second = ScanLocalizer.from_state(state, ScanLocalizerConfig(**AT_START, mapping=False))
+    second = Localizer.from_state(state, LocalizerConfig(**AT_START, update_map=False))
     rows, _ = driven(300, seed=8, localizer=second)
     assert not rows[-1][1].lost
     assert worst(rows[10:]) < 0.08
@@ -644,8 +648,8 @@ def test_without_mapping_the_map_stays_as_it_is(whole_drive):
 def test_a_killed_localizer_goes_on_in_the_occupancy_map(slip):
     """Killed for two metres; the wheels slip meanwhile."""
     rng = np.random.default_rng(0)
-    config = ScanLocalizerConfig(**AT_START)
-    localizer = ScanLocalizer(config)
+    config = LocalizerConfig(**AT_START)
+    localizer = Localizer(config)
     last = None
     rows = []
     grid = OccupancyGrid(OccupancyConfig(resolution_m=0.05))
@@ -660,7 +664,7 @@ def test_a_killed_localizer_goes_on_in_the_occupancy_map(slip):
             if k == 450:
                 began = odom
                 began_slipped = se2.compose(odom, off)
-                localizer = ScanLocalizer.resumed(grid.patch(), last, began_slipped, config)
+                localizer = Localizer.from_occupancy_map(grid.patch(), last, began_slipped, config)
             slipped = se2.compose(began_slipped, se2.between(began, odom))
             rows.append((truth, localizer.step(scan, slipped), odom))
     assert not rows[-1][1].lost
@@ -682,12 +686,12 @@ def test_a_state_that_is_none_is_refused_in_words(whole_drive, name, value):
     if value is not None:
         state[name] = value
     with pytest.raises(InputError, match='expected'):
-        ScanLocalizer.from_state(state)
+        Localizer.from_state(state)
 
 
 def test_a_loop_that_is_closed_while_the_robot_slides_into_the_old_map_is_closed_well():
     """Back at the start, the old walls take the robot over before the loop is closed."""
-    localizer = at_start(start_x_m=3.0, start_y_m=1.2)
+    localizer = at_start(initial_x_m=3.0, initial_y_m=1.2)
     corrections = 0
     away = []
     for scan, odom, truth in drive_round_the_block():
@@ -701,7 +705,7 @@ def test_a_loop_that_is_closed_while_the_robot_slides_into_the_old_map_is_closed
 @pytest.fixture(scope='module')
 def round_the_block():
     """Truth, estimate and odometry at each scan, and the localizer."""
-    localizer = at_start(start_x_m=3.15, start_y_m=1.2)  # where the first scan is made
+    localizer = at_start(initial_x_m=3.15, initial_y_m=1.2)  # where the first scan is made
     rows = []
     for scan, odom, truth in drive_round_the_block():
         rows.append((truth, localizer.step(scan, odom), odom))
@@ -716,7 +720,7 @@ def test_a_loop_is_closed_while_the_robot_drives(round_the_block):
     closed = [k for k, (_, estimate, _) in enumerate(rows) if estimate.correction is not None]
     assert off[: closed[0]].max() > 0.3, 'without drift there is nothing to close'
     assert off[closed[-1] :].max() < 0.25
-    path = localizer.corrected_path()
+    path = localizer.optimized_trajectory()
     assert path.shape == (len(rows), 3)
     corrected = np.hypot(*(path - np.array([truth for truth, *_ in rows]))[:, :2].T)
     assert corrected.max() < 0.8 * off.max()
@@ -745,7 +749,7 @@ def test_the_map_is_rendered_again_the_nearest_part_first(round_the_block):
 
 def test_the_heading_is_held_along_corridors():
     """Until the loop round the block is closed."""
-    localizer = at_start(start_x_m=3.15, start_y_m=1.2)
+    localizer = at_start(initial_x_m=3.15, initial_y_m=1.2)
     off = []
     for scan, odom, truth in drive_round_the_block():
         estimate = localizer.step(scan, odom)
@@ -763,7 +767,7 @@ SMOOTH = np.array([[-1.0, -1.2, 60.0, -1.2], [60.0, 1.2, -1.0, 1.2], [-1.0, 1.2,
 def test_along_a_smooth_corridor_the_wheels_are_believed(step_m):
     """Where no scan tells how far the robot has come, the pattern of its beams does not, either."""
     rng = np.random.default_rng(0)
-    localizer = ScanLocalizer()
+    localizer = Localizer()
     truth = np.zeros(3)
     odom = np.zeros(3)
     for k in range(round(10.0 / step_m)):

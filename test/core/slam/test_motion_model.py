@@ -6,7 +6,7 @@ import pytest
 from thinmap_ros.core.slam.motion_model import MotionConfig, MotionModel
 
 CONFIG = MotionConfig()
-SLIP = np.array([CONFIG.odom_slip_m, CONFIG.odom_slip_m, CONFIG.odom_slip_rad])
+SLIP = np.array([CONFIG.noise_floor_m, CONFIG.noise_floor_m, CONFIG.noise_floor_rad])
 KNOWN = np.diag([1e8, 1e8, 1e8])  # a scan that measures the motion all but exactly
 CALIBRATED = np.zeros((3, 3))
 STEP = np.array([0.1, 0.0, 0.05])
@@ -14,33 +14,33 @@ STEP = np.array([0.1, 0.0, 0.05])
 
 def allowed(increment):
     """Variances (3,) of an odometry increment, as documented."""
-    sigma_m = CONFIG.odom_slip_m + CONFIG.odom_noise * np.hypot(*increment[:2])
-    sigma_rad = CONFIG.odom_slip_rad + CONFIG.odom_noise * abs(increment[2])
+    sigma_m = CONFIG.noise_floor_m + CONFIG.noise_ratio * np.hypot(*increment[:2])
+    sigma_rad = CONFIG.noise_floor_rad + CONFIG.noise_ratio * abs(increment[2])
     return np.square([sigma_m, sigma_m, sigma_rad])
 
 
-def learn(model, truths, odometries, information=KNOWN):
+def update(model, truths, odometries, information=KNOWN):
     """Sigmas (N, 3) that were expected of motions that scans then found."""
     sigmas = []
     for truth, odometry in zip(truths, odometries, strict=True):
-        sigmas.append(np.sqrt(np.diag(model.expect(odometry, CALIBRATED).covariance)))
-        model.learn(truth, information)
+        sigmas.append(np.sqrt(np.diag(model.predict(odometry, CALIBRATED).covariance)))
+        model.update(truth, information)
     return np.array(sigmas)
 
 
 def sigmas_of(model, increment=STEP):
-    return np.sqrt(np.diag(model.expect(increment, CALIBRATED).covariance))
+    return np.sqrt(np.diag(model.predict(increment, CALIBRATED).covariance))
 
 
 def test_the_first_motion_is_as_uncertain_as_the_model_allows():
-    motion = MotionModel(CONFIG).expect(STEP, CALIBRATED)
+    motion = MotionModel(CONFIG).predict(STEP, CALIBRATED)
     np.testing.assert_array_equal(motion.increment, STEP)
     np.testing.assert_allclose(motion.covariance, np.diag(allowed(STEP)))
 
 
 def test_what_the_calibration_leaves_open_is_part_of_the_uncertainty():
     systematic = np.diag([4e-4, 1e-4, 9e-4])
-    motion = MotionModel(CONFIG).expect(STEP, systematic)
+    motion = MotionModel(CONFIG).predict(STEP, systematic)
     np.testing.assert_allclose(motion.covariance, np.diag(allowed(STEP)) + systematic)
 
 
@@ -108,11 +108,11 @@ def test_a_scan_that_only_half_decides_teaches_by_the_square_of_its_share():
     """It halves the motion's error: the match shows half of it, and much of that is the scan's."""
     model = MotionModel(CONFIG)
     variances = allowed(STEP)
-    model.expect(STEP, CALIBRATED)
+    model.predict(STEP, CALIBRATED)
     model._share[:] = 4.0
-    motion = np.diag(model.expect(STEP, CALIBRATED).covariance).copy()
+    motion = np.diag(model.predict(STEP, CALIBRATED).covariance).copy()
     np.testing.assert_allclose(motion, 4.0 * variances)
-    model.learn(STEP, np.diag(1.0 / motion))  # no innovation, and half the weight
+    model.update(STEP, np.diag(1.0 / motion))  # no innovation, and half the weight
     # The first scan counts half, a quarter of that, and takes the excess away.
     np.testing.assert_allclose(model._share, 4.0 * (1.0 - 0.5 * 0.25))
 
@@ -122,10 +122,10 @@ def test_a_clear_error_teaches_though_the_scan_decides_little():
     shares = []
     for off in (0.5, 2.0, 50.0):
         model = MotionModel(CONFIG)
-        motion = np.diag(model.expect(STEP, CALIBRATED).covariance).copy()
-        by_scan = np.diag(1.0 / (9.0 * motion))  # a gain of a tenth
+        motion = np.diag(model.predict(STEP, CALIBRATED).covariance).copy()
+        scan_information = np.diag(1.0 / (9.0 * motion))  # a gain of a tenth
         slip = np.array([off * 3.0 * np.sqrt(motion[0]), 0.0, 0.0])
-        model.learn(STEP + 0.1 * slip, by_scan)
+        model.update(STEP + 0.1 * slip, scan_information)
         shares.append(model._share[0])
     assert shares[0] == 1.0, "within the scan's error"
     assert shares[0] < shares[1] < shares[2]
@@ -136,10 +136,10 @@ def test_a_clear_error_teaches_though_the_scan_decides_little():
 @pytest.mark.parametrize('axis', range(3))
 @pytest.mark.parametrize('sign', [-1.0, 1.0])
 def test_more_than_slip_is_motion(axis, sign):
-    for sigmas, stands in ((2.9, True), (3.1, False)):
+    for sigmas, is_stationary in ((2.9, True), (3.1, False)):
         increment = np.zeros(3)
         increment[axis] = sign * sigmas * SLIP[axis]
-        assert MotionModel(CONFIG).expect(increment, CALIBRATED).stands is stands
+        assert MotionModel(CONFIG).predict(increment, CALIBRATED).is_stationary is is_stationary
 
 
 def test_variances_are_those_of_the_errors(rng):
@@ -160,8 +160,8 @@ def test_a_scan_that_slides_along_a_corridor_is_no_error_of_the_odometry(along, 
     odometry = np.array([0.14, 0.0, 0.0])
     before = sigmas_of(model, odometry)
     for _ in range(60):
-        motion = model.expect(odometry, CALIBRATED)
+        motion = model.predict(odometry, CALIBRATED)
         gain = motion.covariance[0, 0] / (motion.covariance[0, 0] + 1.0 / along)
         slid = odometry - [gain * 0.14, 0.0, 0.0]  # the scan alone says that the robot stands
-        model.learn(slid, information)
+        model.update(slid, information)
     assert (sigmas_of(model, odometry)[0] > 3.0 * before[0]) == is_open

@@ -38,7 +38,7 @@ def test_the_systematic_part_is_learned_and_taken_off(backwards):
     off = []
     for T, told in driven(600, backwards=backwards):
         found, _ = calibration.corrected(told, NOISE)
-        calibration.follow(T, KNOWN)
+        calibration.update(T, KNOWN)
         off.append(se2.between(se2.between(last, T), found))
         last = T
     late = np.mean(off[300:], axis=0)
@@ -51,7 +51,7 @@ def test_what_is_left_to_know_shrinks_with_the_way():
     left = []
     for T, told in driven(300):
         left.append(calibration.corrected(told, NOISE)[1])
-        calibration.follow(T, KNOWN)
+        calibration.update(T, KNOWN)
     assert np.trace(left[-1]) < 0.1 * np.trace(left[0])
     assert np.linalg.eigvalsh(left[-1]).min() > -1e-12
 
@@ -61,7 +61,7 @@ def test_a_slip_is_not_learned():
     known = []
     for k, (T, told) in enumerate(driven(300)):
         calibration.corrected(told + [0.5, 0.0, 0.4] if k == 250 else told, NOISE)
-        calibration.follow(T, KNOWN)
+        calibration.update(T, KNOWN)
         known.append(calibration.known)
     np.testing.assert_allclose(known[-1], known[249], atol=5e-3)
 
@@ -71,8 +71,8 @@ def test_across_an_interruption_nothing_is_compared():
     known = calibration.known
     for k, (T, told) in enumerate(driven(100)):
         calibration.corrected(told, NOISE)
-        calibration.follow(T + [3.0 * k, 0.0, 0.0], KNOWN)
-        calibration.interrupt()
+        calibration.update(T + [3.0 * k, 0.0, 0.0], KNOWN)
+        calibration.reset_segment()
     np.testing.assert_array_equal(calibration.known, known)
 
 
@@ -81,9 +81,9 @@ def test_what_the_map_leaves_open_teaches_nothing():
     calibration = OdometryCalibration()
     for T, told in driven(300):
         calibration.corrected(told, NOISE)
-        calibration.follow(T + [0.2 * T[0], 0.0, 0.0], np.diag([0.0, 1e6, 1e6]))
+        calibration.update(T + [0.2 * T[0], 0.0, 0.0], np.diag([0.0, 1e6, 1e6]))
     alone = OdometryCalibration()
     for T, told in driven(300):
         alone.corrected(told, NOISE)
-        alone.follow(T + [0.2 * T[0], 0.0, 0.0], KNOWN)
+        alone.update(T + [0.2 * T[0], 0.0, 0.0], KNOWN)
     assert abs(calibration.known[0] - 1.0) < 0.2 * abs(alone.known[0] - 1.0)

@@ -6,7 +6,7 @@ from support.slam_room import ROOM, corridor, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.ekf_slam.line_extraction import LineConfig, extract_lines, no_lines
-from thinmap_ros.core.slam.localizer import ScanLocalizer
+from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.slam.wall_compass import WallCompass
 
 PLACES = np.array(
@@ -81,7 +81,7 @@ def test_a_wing_that_stands_askew_is_mapped_as_it_stands(askew_deg, rng):
         [22.9, -1.2, *se2.transform_points(wing, np.array([[0.0, -1.2]]))[0]],
     ]
     walls = np.vstack([walls, corner])
-    localizer = ScanLocalizer()
+    localizer = Localizer()
     odom = np.zeros(3)
     truth = np.zeros(3)
     stamp_ns = 0

@@ -28,7 +28,7 @@ LOCKSTEP_S = 2.0
 # However long a start takes.
 RECOVER_S = 1000.0
 TICK_NS = 100_000_000
-AT_START = {'start_x_m': 2.0, 'start_y_m': 2.0, 'start_yaw_rad': 0.9}
+AT_START = {'initial_x_m': 2.0, 'initial_y_m': 2.0, 'initial_yaw_rad': 0.9}
 MAPPING = ('localizer', 'grid_mapper', 'topology_builder')
 
 
@@ -251,7 +251,7 @@ def test_a_whole_robot_that_was_killed_and_begins_anew_is_not_mixed_with_the_one
     # left.
     place = robot.truth[-1].pose.position
     assert np.hypot(place.x - 2.0, place.y - 2.0) < 0.05
-    patch = messages.patch_from(maps[-1])
+    patch = messages.grid_from_msg(maps[-1])
     behind = patch.frame.cells_of(np.array([[1.0, 1.0]]))[0]
     inside = np.all((behind >= 0) & (behind < patch.shape))
     assert not inside or patch.cells[tuple(behind)] == -1
@@ -413,7 +413,7 @@ def test_a_silent_laser_stops_the_robot_and_it_goes_on(graph):
 def test_a_robot_that_stands_for_minutes_is_as_sure_of_its_pose_as_before(graph):
     """In 600 s the deviation had grown to 0.10 m and 0.06 rad."""
     poses = graph.heard('pose', PoseWithCovarianceStamped)
-    graph.start('localizer', laser_pose='0,0,0', start_x_m=2.0, start_y_m=2.0)
+    graph.start('localizer', laser_pose='0,0,0', initial_x_m=2.0, initial_y_m=2.0)
     scan = graph.node.create_publisher(LaserScan, 'scan', qos.STREAM)
     odometry = graph.node.create_publisher(Odometry, 'odom', qos.STREAM)
     rng = np.random.default_rng(5)
@@ -438,7 +438,7 @@ def test_a_robot_that_stands_for_minutes_is_as_sure_of_its_pose_as_before(graph)
             return poses and messages.stamp_ns(poses[-1].header.stamp) >= wanted
 
         graph.until(is_answered, f'{count} poses')
-        return np.sqrt(np.diag(messages.covariance_from(poses[-1])))
+        return np.sqrt(np.diag(messages.covariance_from_msg(poses[-1])))
 
     answered(here, 5)
     for k in range(20):
@@ -585,6 +585,6 @@ def test_an_exploration_finishes_though_every_node_is_killed_once(graph):
     good = (ExplorationStatus.ALL_RESOLVED, ExplorationStatus.NOTHING_REACHABLE)
     assert result.reason_code in good, result.reason
     assert robot.error_m() < 0.3
-    patch = messages.patch_from(maps[-1])
+    patch = messages.grid_from_msg(maps[-1])
     assert patch.free.sum() * 0.01 > 80.0, 'nearly all of a room of 10 x 10 m'
     assert patch.shape[0] < 115 and patch.shape[1] < 115, 'and nothing double'

@@ -52,7 +52,9 @@ class Robot:
         """How far the newest pose is from the truth at its stamp: m, rad."""
         ns = messages.stamp_ns(self.poses[-1].header.stamp)
         at = min(self.truth, key=lambda message: abs(messages.stamp_ns(message.header.stamp) - ns))
-        off = se2.between(messages.pose_from(at.pose), messages.pose_from(self.poses[-1].pose.pose))
+        off = se2.between(
+            messages.pose_from_msg(at.pose), messages.pose_from_msg(self.poses[-1].pose.pose)
+        )
         return np.hypot(off[0], off[1]), abs(off[2])
 
     def is_right(self, since_s=0.0):
@@ -75,7 +77,9 @@ def test_a_robot_finds_itself_in_a_saved_map_and_maps_on_also_when_it_is_carried
     x, y, yaw = START
     for name in NODES:
         start = (
-            {'start_x_m': x, 'start_y_m': y, 'start_yaw_rad': yaw} if name == 'localizer' else {}
+            {'initial_x_m': x, 'initial_y_m': y, 'initial_yaw_rad': yaw}
+            if name == 'localizer'
+            else {}
         )
         graph.start(name, use_sim_time=True, **start)
     start_sim(graph, START, 2)
@@ -99,7 +103,7 @@ def test_a_robot_finds_itself_in_a_saved_map_and_maps_on_also_when_it_is_carried
     assert robot.is_right(found_s)
 
     lost_s = robot.seconds()
-    commands = graph.node.create_publisher(PoseStamped, 'sim/carry', 10)
+    commands = graph.node.create_publisher(PoseStamped, 'sim/set_pose', 10)
     graph.until(lambda: commands.get_subscription_count(), 'somebody who carries')
     commands.publish(messages.pose_stamped_msg(np.array(THERE), 'world', 0))
     robot.drive_until(lambda: SlamStatus.LOST in robot.states(lost_s), 'that it is lost')

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.ekf_slam.ekf import EkfSlam
-from thinmap_ros.core.ekf_slam.features import Feature, normals_of, sides_of, tangents_of
+from thinmap_ros.core.ekf_slam.features import FeatureTrack, normals_of, sides_of, tangents_of
 from thinmap_ros.core.ekf_slam.line_extraction import Lines
 from thinmap_ros.core.se2 import Array, transform_points, wrap
 
@@ -30,18 +30,23 @@ class AssociationConfig(Config):
     """Parameters of data association."""
 
     gate: float = parameter(
-        5.99, 'largest squared Mahalanobis distance of a match (95 %, 2 dof)', low=0.1, high=50.0
+        5.99,
+        'Largest squared Mahalanobis distance between a line and a feature (2 degrees of freedom: '
+        '95 %). Raise it if features double, lower it if different walls are merged.',
+        low=0.1,
+        high=50.0,
     )
-    gap_m: float = parameter(
+    max_gap_m: float = parameter(
         3.0,
-        'seen part and feature may lie this far apart along the line, m: as at a door',
+        'Largest gap along the line between an observed segment and the feature that it extends '
+        '(m); at least the width of a door. Lower it if collinear walls of different rooms merge.',
         low=0.0,
         high=20.0,
     )
 
 
 @dataclass(frozen=True, eq=False)
-class Choice:
+class Associations:
     """For each line of a scan the index of the feature it fits best, and whether others fit, too.
 
     Both (K,); index: -1 where there is none.
@@ -52,8 +57,12 @@ class Choice:
 
 
 def associate(
-    ekf: EkfSlam, features: list[Feature], lines: Lines, laser_map: Array, config: AssociationConfig
-) -> Choice:
+    ekf: EkfSlam,
+    features: list[FeatureTrack],
+    lines: Lines,
+    laser_map: Array,
+    config: AssociationConfig,
+) -> Associations:
     """Which features the lines of a scan are, each taken by itself.
 
     laser_map (2,): where the scan was seen from. Lines that could be several features are better
@@ -62,9 +71,9 @@ def associate(
     chosen = np.full(len(lines), -1, dtype=np.int64)
     passing = np.zeros(len(lines), dtype=np.int64)
     if not features:
-        return Choice(chosen, passing > 1)
+        return Associations(chosen, passing > 1)
     ends_map = transform_points(ekf.pose, lines.ends.reshape(-1, 2)).reshape(-1, 2, 2)
-    pairs = np.argwhere(meeting(ekf.lines, features, ends_map, laser_map, config.gap_m))
+    pairs = np.argwhere(meeting(ekf.lines, features, ends_map, laser_map, config.max_gap_m))
     best = np.full(len(lines), np.inf)
     for k, index in pairs:
         expected, spread, _ = ekf.innovations(int(index))
@@ -77,11 +86,11 @@ def associate(
         if distance <= best[k]:
             best[k] = distance
             chosen[k] = index
-    return Choice(chosen, passing > 1)
+    return Associations(chosen, passing > 1)
 
 
 def meeting(
-    lines_map: Array, features: list[Feature], ends_map: Array, seen_from: Array, gap_m: float
+    lines_map: Array, features: list[FeatureTrack], ends_map: Array, seen_from: Array, gap_m: float
 ) -> NDArray[np.bool_]:
     """Which segments, by their ends (K, 2, 2), could be part of which features, (K, N).
 
@@ -95,7 +104,7 @@ def meeting(
     low = np.array([f.low for f in features])
     high = np.array([f.high for f in features])
     gaps = np.maximum(low - along.max(axis=1), along.min(axis=1) - high)
-    first_seen_from = np.array([f.seen_from for f in features]).reshape(-1, 2)
+    first_seen_from = np.array([f.first_seen_from for f in features]).reshape(-1, 2)
     facing = sides_of(lines_map, seen_from) == sides_of(lines_map, first_seen_from)
     return np.asarray(
         (offsets <= _NEAR_M) & (rise <= math.sin(_NEAR_RAD)) & (gaps <= gap_m) & facing

@@ -137,7 +137,7 @@ class EkfSlam:
             S[rows, rows] += R[k]
         return self._correct(v, S, HP)
 
-    def tie(self, kept: int, dropped: int, covariance: Array) -> bool:
+    def merge(self, kept: int, dropped: int, covariance: Array) -> bool:
         """Let two features be one wall: their difference is 0 up to a covariance (2, 2).
 
         Returns whether that could be done.

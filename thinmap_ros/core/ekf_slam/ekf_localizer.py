@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2, snapshot
-from thinmap_ros.core.config import parameter
+from thinmap_ros.core.config import Config, parameter, part
 from thinmap_ros.core.ekf_slam import feature_map
+from thinmap_ros.core.ekf_slam.association import AssociationConfig
 from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
 from thinmap_ros.core.ekf_slam.feature_map import FeatureConfig, FeatureMap
 from thinmap_ros.core.ekf_slam.features import LineFeature
@@ -39,25 +40,29 @@ _SLIP_SIGMAS = 3.0  # a motion within so much of the slip is not counted yet
 
 
 @dataclass(frozen=True)
-class EkfConfig(OdometryConfig, LineConfig, FeatureConfig):
+class EkfConfig(Config):
     """Parameters of the filter, and of every localizer."""
 
     slam: str = parameter(
         'scan_matching',
         'scan_matching: scan matching with a pose graph; ekf_ti: EKF-SLAM/TI on odometry and line '
-        'features alone; ekf_full: the same with all features in the state',
+        'features alone; ekf_full: the same with all features in the state.',
         choices=('scan_matching', 'ekf_ti', 'ekf_full'),
     )
-    start_x_m: float = parameter(
-        0.0, 'where the robot starts in the map, m', low=-se2.FARTHEST_M, high=se2.FARTHEST_M
+    initial_x_m: float = parameter(
+        0.0, 'Initial x position in the map (m).', low=-se2.FARTHEST_M, high=se2.FARTHEST_M
     )
-    start_y_m: float = parameter(
-        0.0, 'where the robot starts in the map, m', low=-se2.FARTHEST_M, high=se2.FARTHEST_M
+    initial_y_m: float = parameter(
+        0.0, 'Initial y position in the map (m).', low=-se2.FARTHEST_M, high=se2.FARTHEST_M
     )
-    start_yaw_rad: float = parameter(0.0, 'heading at the start, rad')
-    mapping: bool = parameter(
-        True, 'learn what is seen; false: only find the place in the map that there is'
+    initial_yaw_rad: float = parameter(0.0, 'Initial heading in the map (rad).')
+    update_map: bool = parameter(
+        True, 'true: mapping. false: localization in the loaded map, which does not change.'
     )
+    odometry: OdometryConfig = part(OdometryConfig)
+    lines: LineConfig = part(LineConfig)
+    association: AssociationConfig = part(AssociationConfig)
+    features: FeatureConfig = part(FeatureConfig)
 
 
 class EkfLocalizer:
@@ -75,9 +80,11 @@ class EkfLocalizer:
     def reset(self) -> None:
         """Forget everything: the next scan is the first, at the configured start."""
         config = self.config
-        start = se2.pose(config.start_x_m, config.start_y_m, config.start_yaw_rad)
+        start = se2.pose(config.initial_x_m, config.initial_y_m, config.initial_yaw_rad)
         self._filter = CompressedEkf(start, _START)
-        self._features = FeatureMap(config, local_areas=config.slam == 'ekf_ti')
+        self._features = FeatureMap(
+            config.features, config.association, local_areas=config.slam == 'ekf_ti'
+        )
         self._odometry = OdometryIncrements()
         self._moved: Array = np.zeros(3)  # since the filter's pose
         self._is_observation_due = True
@@ -96,7 +103,7 @@ class EkfLocalizer:
     @property
     def features(self) -> list[LineFeature]:
         """The line features of the map."""
-        return self._features.listed(self._filter)
+        return self._features.line_features(self._filter)
 
     def set_topology(self, topology: TopologicalMap) -> None:
         """Take the topological map by which features are stored."""
@@ -132,7 +139,7 @@ class EkfLocalizer:
         return localizer
 
     @staticmethod
-    def resumed(
+    def from_occupancy_map(
         patch: GridPatch, last: LastPose, T_odom_base: Array, config: EkfConfig | None = None
     ) -> 'EkfLocalizer':
         """EkfLocalizer that goes on at T_odom_base (3,) after its last pose, with new features.
@@ -154,14 +161,14 @@ class EkfLocalizer:
         if not se2.is_finite(scan.T_base_laser):
             self._refused += 1
         elif self._is_observation_due:
-            lines = extract_lines(scan, self.config)
+            lines = extract_lines(scan, self.config.lines)
             observed = len(lines)
             matched, is_valid = self._features.observe(
-                self._filter, lines, scan, learn=self.config.mapping
+                self._filter, lines, scan, learn=self.config.update_map
             )
             self._refused += not is_valid
             self._is_observation_due = False  # the same scan again tells no more
-        self._filter.work_off()
+        self._filter.flush_step()
         self._path.extend(self.pose.tolist())
         return Estimate(
             self.pose,
@@ -173,17 +180,17 @@ class EkfLocalizer:
             len(self._filter.area),
         )
 
-    def corrected_path(self) -> Array:
+    def optimized_trajectory(self) -> Array:
         """Poses (N, 3) of all steps; a filter corrects none of the past."""
         return np.array(self._path, dtype=np.float64).reshape(-1, 3)
 
-    def past(self) -> tuple[NDArray[np.int64], Array]:
+    def keyframe_trajectory(self) -> tuple[NDArray[np.int64], Array]:
         """Stamps (0,) and poses (0, 3): nothing of the past is ever corrected."""
         return np.empty(0, dtype=np.int64), np.empty((0, 3))
 
     def _motion_noise(self, moved: Array) -> Array:
         """Covariance (3, 3) of a motion (3,) by odometry, robot frame before it."""
-        return np.diag(_REPEATED**2 * odometry_variances(moved, self.config))
+        return np.diag(_REPEATED**2 * odometry_variances(moved, self.config.odometry))
 
     def _predict(self, increment: Increment) -> None:
         """Eqs. (10) and (11), once the robot has moved by more than odometry slips.
@@ -197,7 +204,7 @@ class EkfLocalizer:
             self._is_observation_due = True
             return
         self._moved = se2.compose(self._moved, increment.T_before_base)
-        slip = _REPEATED * odometry_slip(self.config)
+        slip = _REPEATED * odometry_slip(self.config.odometry)
         if (np.abs(self._moved) > _SLIP_SIGMAS * slip).any():
             ekf.predict(self.pose, self._moved, self._motion_noise(self._moved))
             self._moved = np.zeros(3)

@@ -78,7 +78,7 @@ class CompressedEkf:
         self._store.free_place(place)
         self.local.remove(index)
 
-    def enter(self, ids: list[int]) -> None:
+    def set_local_area(self, ids: list[int]) -> None:
         """Make these features the local area.
 
         What the steps so far mean for all others is folded in.
@@ -95,20 +95,20 @@ class CompressedEkf:
         self.local = _carrying(self.local.pose, mean, 0.5 * (own + own.T), len(self._cross))
         self.area = list(ids)
 
-    def work_off(self) -> None:
+    def flush_step(self) -> None:
         """Work some rows of what was folded into the store; to be called once a step."""
         self._store.sweep()
 
-    def settle(self) -> tuple[Array, Array]:
+    def flush(self) -> tuple[Array, Array]:
         """Work everything in.
 
         Mean (3 + 2 N,) and covariance of pose and all features, in the order of `ids`.
         """
         area = self.area
-        self.enter(self.ids)
+        self.set_local_area(self.ids)
         mean = self.local.mean
         covariance = self.local.covariance
-        self.enter(area)
+        self.set_local_area(area)
         return mean, covariance
 
     def restore(self, ids: list[int], lines: Array, covariance: Array) -> None:

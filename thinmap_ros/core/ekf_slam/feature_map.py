@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import snapshot
-from thinmap_ros.core.config import parameter
+from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.ekf_slam import local_area
 from thinmap_ros.core.ekf_slam.association import AssociationConfig, associate, mahalanobis, meeting
 from thinmap_ros.core.ekf_slam.ekf import EkfSlam
 from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
-from thinmap_ros.core.ekf_slam.feature_candidates import Candidate, Candidates
+from thinmap_ros.core.ekf_slam.feature_candidates import FeatureCandidate, FeatureCandidates
 from thinmap_ros.core.ekf_slam.features import (
-    Feature,
+    FeatureTrack,
     LineFeature,
     as_seen,
     ends_of,
@@ -55,21 +55,43 @@ FIELDS = {
 
 
 @dataclass(frozen=True)
-class FeatureConfig(AssociationConfig):
+class FeatureConfig(Config):
     """Parameters of the upkeep of features."""
 
-    wall_sigma_m: float = parameter(
-        0.02, 'how far real walls are from straight lines, 1 sigma, m', low=0.0, high=1.0
+    wall_flatness_m: float = parameter(
+        0.02,
+        'Standard deviation of real walls about a straight line (m). Raise it for rough walls: too '
+        'low, and the filter becomes overconfident.',
+        low=0.0,
+        high=1.0,
     )
-    wall_sigma_rad: float = parameter(
-        0.006, 'how far real walls are from straight lines, rad', low=0.0, high=0.5
+    wall_flatness_rad: float = parameter(
+        0.006,
+        'Standard deviation of the direction of real walls (rad). Raise it for rough walls: too '
+        'low, and the filter becomes overconfident.',
+        low=0.0,
+        high=0.5,
     )
-    sightings: int = parameter(4, 'a line enters the map after so many sightings', low=1, high=100)
-    patience: int = parameter(
-        15, 'a candidate not seen for so many looks is dropped', low=1, high=10_000
+    min_observations: int = parameter(
+        4,
+        'Number of observations after which a line becomes a feature. Raise it against features '
+        'on moving objects, lower it to use new walls sooner.',
+        low=1,
+        high=100,
     )
-    misses: int = parameter(
-        5, 'a feature seen through by so many looks in a row leaves the map', low=1, high=1000
+    candidate_max_misses: int = parameter(
+        15,
+        'Number of observations without a match after which a feature candidate is dropped. Raise '
+        'it for walls that are often hidden.',
+        low=1,
+        high=10_000,
+    )
+    max_misses: int = parameter(
+        5,
+        'Number of consecutive observations through a feature after which it is removed. Raise it '
+        'to keep walls longer, lower it to forget doors that have opened.',
+        low=1,
+        high=1000,
     )
 
 
@@ -80,13 +102,21 @@ class FeatureMap:
     without, all.
     """
 
-    def __init__(self, config: FeatureConfig, local_areas: bool) -> None:
+    def __init__(
+        self, config: FeatureConfig, association: AssociationConfig, local_areas: bool
+    ) -> None:
         self.area = LocalArea()
         self._config = config
+        self._association = association
         self._local_areas = local_areas
-        self._wall = np.diag(np.square([config.wall_sigma_m, config.wall_sigma_rad]))
-        self._features: dict[int, Feature] = {}
-        self._candidates = Candidates(config.sightings, config.patience, config.gate, config.gap_m)
+        self._wall = np.diag(np.square([config.wall_flatness_m, config.wall_flatness_rad]))
+        self._features: dict[int, FeatureTrack] = {}
+        self._candidates = FeatureCandidates(
+            config.min_observations,
+            config.candidate_max_misses,
+            association.gate,
+            association.max_gap_m,
+        )
         # Features outside the local area that the robot turned out to see.
         self._called: set[int] = set()
         self._next_id = 1
@@ -99,9 +129,9 @@ class FeatureMap:
 
         Candidates are left out.
         """
-        mean, covariance = ekf.settle()
+        mean, covariance = ekf.flush()
         features = [self._features[i] for i in ekf.ids]
-        spans = [(f.low, f.high, *f.seen_from, f.missed) for f in features]
+        spans = [(f.low, f.high, *f.first_seen_from, f.misses) for f in features]
         return {
             'ids': np.array(ekf.ids, dtype=np.int64),
             'lines': mean[3:].reshape(-1, 2),
@@ -121,12 +151,12 @@ class FeatureMap:
         self.area.restore(state)
         ekf.restore(ids, state['lines'], state['line_covariance'])
         self._features = {
-            i: Feature(i, low, high, np.array([x, y]), int(missed))
+            i: FeatureTrack(i, low, high, np.array([x, y]), int(missed))
             for i, (low, high, x, y, missed) in zip(ids, state['spans'].tolist(), strict=True)
         }
         self._next_id = int(state['next_id'])
 
-    def listed(self, ekf: CompressedEkf) -> list[LineFeature]:
+    def line_features(self, ekf: CompressedEkf) -> list[LineFeature]:
         """The features as others see them."""
         lines = ekf.lines()
         covariances = ekf.line_covariances()
@@ -157,8 +187,8 @@ class FeatureMap:
         unknown = np.flatnonzero(chosen < 0)
         if not learn:
             return len(matched), taken
-        seen = self._grow(ekf, chosen[matched], lines.chosen(matched))
-        ripe = self._candidates.take(ekf.local.pose, lines.chosen(unknown), laser_map)
+        seen = self._grow(ekf, chosen[matched], lines.select(matched))
+        ripe = self._candidates.update(ekf.local.pose, lines.select(unknown), laser_map)
         self._miss(ekf, seen, scan)
         self._merge(ekf, seen)
         new = [i for candidate in ripe for i in self._take_up(ekf, candidate)]
@@ -171,7 +201,7 @@ class FeatureMap:
         By as much at their ends as anywhere: a short piece of wall tells its direction badly.
         """
         lengths = np.hypot(*(lines.ends[:, 1] - lines.ends[:, 0]).T)
-        sigma_m = self._config.wall_sigma_m
+        sigma_m = self._config.wall_flatness_m
         walls = np.zeros((len(lines), 2, 2))
         walls[:, 0, 0] = sigma_m**2
         walls[:, 1, 1] = np.square(sigma_m / np.maximum(lengths, sigma_m))
@@ -185,19 +215,19 @@ class FeatureMap:
         Returns which feature each is (-1: none).
         """
         features = self._local(ekf)
-        choice = associate(ekf.local, features, lines, laser_map, self._config)
+        choice = associate(ekf.local, features, lines, laser_map, self._association)
         chosen = np.where(choice.ambiguous, -1, choice.index)
         taken = _update(ekf.local, chosen, lines)
         left = np.flatnonzero(choice.ambiguous)
         if left.size:
             again = associate(
-                ekf.local, features, lines.chosen(left), laser_map, self._config
+                ekf.local, features, lines.select(left), laser_map, self._association
             ).index
-            taken &= _update(ekf.local, again, lines.chosen(left))
+            taken &= _update(ekf.local, again, lines.select(left))
             chosen[left] = again
         return chosen, taken
 
-    def _local(self, ekf: CompressedEkf) -> list[Feature]:
+    def _local(self, ekf: CompressedEkf) -> list[FeatureTrack]:
         return [self._features[i] for i in ekf.area]
 
     def _choose_area(self, ekf: CompressedEkf, scan: Scan) -> None:
@@ -205,7 +235,7 @@ class FeatureMap:
         half_view = 0.5 * abs(scan.angle_increment_rad) * scan.ranges_m.size
         wanted = self.area.features_near(ekf.local.pose, half_view) | self._called
         if not wanted <= set(ekf.area) or len(ekf.area) > len(wanted) + _SPARE:
-            ekf.enter(sorted(wanted))
+            ekf.set_local_area(sorted(wanted))
             self._called.clear()
 
     def _grow(self, ekf: CompressedEkf, indices: NDArray[np.int64], lines: Lines) -> list[int]:
@@ -213,7 +243,7 @@ class FeatureMap:
         for index, ends in zip(indices, lines.ends, strict=True):
             feature = self._features[ekf.area[index]]
             feature.grow(*interval(ekf.local.lines[index], transform_points(ekf.local.pose, ends)))
-            feature.missed = 0
+            feature.misses = 0
         return [ekf.area[i] for i in np.unique(indices)]
 
     def _miss(self, ekf: CompressedEkf, seen: Iterable[int], scan: Scan) -> None:
@@ -222,8 +252,8 @@ class FeatureMap:
         for feature_id in [
             i for i, gone in zip(ekf.area, through, strict=True) if gone and i not in seen
         ]:
-            self._features[feature_id].missed += 1
-            if self._features[feature_id].missed >= self._config.misses:
+            self._features[feature_id].misses += 1
+            if self._features[feature_id].misses >= self._config.max_misses:
                 self._drop(ekf, feature_id, None)
 
     def _merge(self, ekf: CompressedEkf, seen: Iterable[int]) -> None:
@@ -236,7 +266,7 @@ class FeatureMap:
             dropped = max(feature_id, twin)
             a = ekf.area.index(kept)
             b = ekf.area.index(dropped)
-            if ekf.local.tie(a, b, self._wall):
+            if ekf.local.merge(a, b, self._wall):
                 ends = ends_of(self._features[dropped], ekf.local.lines[b])
                 self._features[kept].grow(*interval(ekf.local.lines[a], ends))
                 self._drop(ekf, dropped, kept)
@@ -250,7 +280,7 @@ class FeatureMap:
         lines = ekf.local.lines
         ends = ends_of(self._features[feature_id], lines[index])
         near = meeting(
-            lines, self._local(ekf), ends[None], self._features[feature_id].seen_from, 0.0
+            lines, self._local(ekf), ends[None], self._features[feature_id].first_seen_from, 0.0
         )[0]
         for other in np.flatnonzero(near):
             if other != index and self._is_one_wall(ekf, index, int(other)):
@@ -261,20 +291,22 @@ class FeatureMap:
         v, S, _ = ekf.local.difference(a, b)
         ends = ends_of(self._features[ekf.area[b]], ekf.local.lines[b])
         apart = np.abs(ends @ normals_of(ekf.local.lines[[a]])[0] - ekf.local.lines[a, 0]).max()
-        return bool(apart <= self._near) and mahalanobis(v, S + self._wall) <= self._config.gate
+        return (
+            bool(apart <= self._near) and mahalanobis(v, S + self._wall) <= self._association.gate
+        )
 
     @property
     def _near(self) -> float:
         """Distance between two lines that may yet be one wall, m."""
-        return 3.0 * self._config.wall_sigma_m
+        return 3.0 * self._config.wall_flatness_m
 
     def _drop(self, ekf: CompressedEkf, feature_id: int, heir: int | None) -> None:
         ekf.remove(ekf.area.index(feature_id))
-        self.area.forget(feature_id, heir)
+        self.area.remove(feature_id, heir)
         self._called.discard(feature_id)
         del self._features[feature_id]
 
-    def _take_up(self, ekf: CompressedEkf, candidate: Candidate) -> list[int]:
+    def _take_up(self, ekf: CompressedEkf, candidate: FeatureCandidate) -> list[int]:
         """Make a line a feature, unless it is one that the map has elsewhere.
 
         Returns the id of the new feature.
@@ -287,10 +319,10 @@ class FeatureMap:
         self._next_id = self._next_id + 1
         index = ekf.add(feature_id, candidate.z, candidate.covariance)
         span = interval(ekf.local.lines[index], ends_of(candidate.span, candidate.line))
-        self._features[feature_id] = Feature(feature_id, *span, candidate.span.seen_from)
+        self._features[feature_id] = FeatureTrack(feature_id, *span, candidate.span.first_seen_from)
         return [feature_id]
 
-    def _covering(self, ekf: CompressedEkf, candidate: Candidate) -> set[int]:
+    def _covering(self, ekf: CompressedEkf, candidate: FeatureCandidate) -> set[int]:
         """Features that cover the candidate's place, though it failed the gate.
 
         Two for one wall help nobody.
@@ -308,7 +340,9 @@ class FeatureMap:
         features = [self._features[i] for i in ids.tolist()]
         ends = np.stack([middle - reach, middle + reach])
         return set(
-            ids[meeting(lines, features, ends[None], candidate.span.seen_from, 0.0)[0]].tolist()
+            ids[
+                meeting(lines, features, ends[None], candidate.span.first_seen_from, 0.0)[0]
+            ].tolist()
         )
 
 

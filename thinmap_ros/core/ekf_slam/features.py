@@ -8,7 +8,7 @@ from thinmap_ros.core.se2 import Array, wrap
 
 
 @dataclass(eq=False)
-class Feature:
+class FeatureTrack:
     """A feature's id, the interval [low, high] (m) seen of its line, and from where at first.
 
     Positions along a line are counted from the foot of the perpendicular from the map's origin, to
@@ -19,8 +19,8 @@ class Feature:
     id: int
     low: float
     high: float
-    seen_from: Array
-    missed: int = 0
+    first_seen_from: Array
+    misses: int = 0
 
     def grow(self, low: float, high: float) -> None:
         """Become as long as to hold another interval of the line, m."""
@@ -86,13 +86,13 @@ def point_on(line: Array, position: float) -> Array:
     return np.asarray(line[0] * normals_of(line[None])[0] + position * tangents_of(line[None])[0])
 
 
-def ends_of(feature: Feature, line: Array) -> Array:
+def ends_of(feature: FeatureTrack, line: Array) -> Array:
     """Ends (2, 2) of a feature on its line (r, alpha), map frame."""
     return np.stack([point_on(line, feature.low), point_on(line, feature.high)])
 
 
 def as_seen(
-    feature: Feature, line: Array, covariance: Array, nodes: list[int], local: bool
+    feature: FeatureTrack, line: Array, covariance: Array, nodes: list[int], local: bool
 ) -> LineFeature:
     """The feature with its line (r, alpha) of the present state, for others: with r >= 0."""
     start, end = ends_of(feature, line)

@@ -37,22 +37,53 @@ _R, _ALPHA, _RR, _RA, _AA, _CHI2, _BOW, _BOW_SIGMA, _LOW, _HIGH = range(10)
 class LineConfig(Config):
     """Parameters of line extraction and the noise of the beams."""
 
-    range_sigma_m: float = parameter(
-        0.015, 'range noise of a beam, 1 sigma, m', low=0.0005, high=0.5
+    range_noise_m: float = parameter(
+        0.015,
+        'Standard deviation of a range (m). Set it to the noise of the laser; too low, and walls '
+        'break into pieces.',
+        low=0.0005,
+        high=0.5,
     )
-    bearing_sigma_rad: float = parameter(
-        0.002, 'bearing noise of a beam, 1 sigma, rad', low=0.0, high=0.1
+    bearing_noise_rad: float = parameter(
+        0.002,
+        'Standard deviation of a bearing (rad). Set it to the noise of the laser.',
+        low=0.0,
+        high=0.1,
     )
-    line_range_m: float = parameter(
-        20.0, 'points farther away make no lines, m', low=1.0, high=200.0
+    max_range_m: float = parameter(
+        20.0,
+        'Points beyond this range are not used for lines (m). Lower it where distant points are '
+        'too sparse to be a wall.',
+        low=1.0,
+        high=200.0,
     )
-    line_split_m: float = parameter(
-        0.05, 'a point this far from the chord splits a line, m', low=0.005, high=1.0
+    split_distance_m: float = parameter(
+        0.05,
+        'Distance of a point from the chord at which a line is split (m). Raise it for a noisy '
+        'laser, lower it to resolve shallow corners.',
+        low=0.005,
+        high=1.0,
     )
-    line_points: int = parameter(8, 'fewest points of a line', low=4, high=1000)
-    line_length_m: float = parameter(0.8, 'shortest line, m', low=0.05, high=10.0)
-    line_bow_m: float = parameter(
-        0.02, 'a bow that rises by more than this is no wall, m', low=0.001, high=1.0
+    min_points: int = parameter(
+        8,
+        'Smallest number of points of a line. Raise it against lines on clutter, lower it for a '
+        'laser with few beams.',
+        low=4,
+        high=1000,
+    )
+    min_length_m: float = parameter(
+        0.8,
+        'Smallest length of a line (m). Raise it against lines on furniture, lower it in narrow '
+        'rooms.',
+        low=0.05,
+        high=10.0,
+    )
+    max_sagitta_m: float = parameter(
+        0.02,
+        'Largest rise of the points over the chord of a line (m). Raise it for rough walls, lower '
+        'it to reject curved surfaces.',
+        low=0.001,
+        high=1.0,
     )
 
 
@@ -70,7 +101,7 @@ class Lines:
     def __len__(self) -> int:
         return len(self.z)
 
-    def chosen(self, which: NDArray[np.int64]) -> 'Lines':
+    def select(self, which: NDArray[np.int64]) -> 'Lines':
         """Those at some indices (M,)."""
         return Lines(self.z[which], self.covariances[which], self.ends[which])
 
@@ -82,21 +113,21 @@ def no_lines() -> Lines:
 
 def extract_lines(scan: Scan, config: LineConfig) -> Lines:
     """Segments of a scan, in the robot frame, in the order of the beams."""
-    beams = np.flatnonzero(scan.hit & (scan.ranges_m < config.line_range_m))
-    if beams.size < config.line_points:
+    beams = np.flatnonzero(scan.hit & (scan.ranges_m < config.max_range_m))
+    if beams.size < config.min_points:
         return no_lines()
-    split_m = max(config.line_split_m, _SPLIT_SIGMAS * config.range_sigma_m)
-    sigmas = np.array([config.range_sigma_m, config.bearing_sigma_rad, split_m])
+    split_m = max(config.split_distance_m, _SPLIT_SIGMAS * config.range_noise_m)
+    sigmas = np.array([config.range_noise_m, config.bearing_noise_rad, split_m])
     ranges = scan.ranges_m[beams]
     angles = scan.angles_rad[beams]
     x = ranges * np.cos(angles)
     y = ranges * np.sin(angles)
     step = abs(scan.angle_increment_rad)
-    fits, count = _extract(x, y, ranges, angles, beams, step, sigmas, config.line_points)
+    fits, count = _extract(x, y, ranges, angles, beams, step, sigmas, config.min_points)
     fits = fits[:count]
     length = fits[:, _HIGH] - fits[:, _LOW]
-    straight = (fits[:, _BOW] < config.line_bow_m) | (fits[:, _BOW] < 3.0 * fits[:, _BOW_SIGMA])
-    good = (length >= config.line_length_m) & (fits[:, _CHI2] < _MOST_CHI2) & straight
+    straight = (fits[:, _BOW] < config.max_sagitta_m) | (fits[:, _BOW] < 3.0 * fits[:, _BOW_SIGMA])
+    good = (length >= config.min_length_m) & (fits[:, _CHI2] < _MOST_CHI2) & straight
     return _in_robot_frame(fits[good], scan.T_base_laser)
 
 

@@ -116,7 +116,7 @@ class LocalArea:
             for feature_id in feature_ids:
                 self._put(feature_id, node)
 
-    def forget(self, feature_id: int, heir: int | None = None) -> None:
+    def remove(self, feature_id: int, heir: int | None = None) -> None:
         """Drop a feature everywhere.
 
         Where it has become another one, heir, that is stored in its place.

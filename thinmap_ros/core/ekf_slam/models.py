@@ -13,31 +13,40 @@ from thinmap_ros.core.se2 import Array, wrap
 class OdometryConfig(Config):
     """Noise of odometry, 1 sigma."""
 
-    odom_noise: float = parameter(
+    noise_ratio: float = parameter(
         0.03,
-        'odometry noise (1 sigma) for each metre or radian of a motion, m or rad, beside the '
-        'systematic error, which is calibrated; it grows by itself where scans find it larger',
+        'Standard deviation of odometry per metre or radian of motion, besides its systematic '
+        'error, which is calibrated. Smallest value; it grows where scans find more. Raise it for '
+        'wheels that slip, lower it for an odometry that is better than that.',
         low=0.001,
         high=2.0,
     )
-    odom_slip_m: float = parameter(
-        0.003, 'error of any odometry increment, in each direction, m', low=1e-5, high=1.0
+    noise_floor_m: float = parameter(
+        0.003,
+        'Smallest standard deviation of the position in an odometry increment (m). Raise it if the '
+        'pose sticks where the robot is pushed, lower it if it drifts at a standstill.',
+        low=1e-5,
+        high=1.0,
     )
-    odom_slip_rad: float = parameter(
-        0.003, 'error of any odometry increment, rad', low=1e-5, high=1.0
+    noise_floor_rad: float = parameter(
+        0.003,
+        'Smallest standard deviation of the heading in an odometry increment (rad). Raise it if '
+        'the heading sticks where the robot is turned, lower it if it drifts at a standstill.',
+        low=1e-5,
+        high=1.0,
     )
 
 
 def odometry_slip(config: OdometryConfig) -> Array:
     """Error (3,), 1 sigma, of any odometry increment."""
-    return np.array([config.odom_slip_m, config.odom_slip_m, config.odom_slip_rad])
+    return np.array([config.noise_floor_m, config.noise_floor_m, config.noise_floor_rad])
 
 
 def odometry_variances(increment: Array, config: OdometryConfig) -> Array:
     """Variances (3,) of an odometry increment (3,), in the robot frame before the motion."""
     way_m = math.hypot(increment[0], increment[1])
     turn = abs(float(increment[2]))
-    sigmas = odometry_slip(config) + config.odom_noise * np.array([way_m, way_m, turn])
+    sigmas = odometry_slip(config) + config.noise_ratio * np.array([way_m, way_m, turn])
     return np.square(sigmas)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.ekf_slam.features import Feature, normals_of, tangents_of
+from thinmap_ros.core.ekf_slam.features import FeatureTrack, normals_of, tangents_of
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, compose
 
@@ -15,7 +15,7 @@ _FLATTEST = 0.17  # least sine of the angle between beam and wall
 
 
 def seen_through(
-    scan: Scan, T_map_base: Array, lines: Array, features: list[Feature]
+    scan: Scan, T_map_base: Array, lines: Array, features: list[FeatureTrack]
 ) -> NDArray[np.bool_]:
     """For each feature with its line (N, 2), whether the scan shows that it is gone, (N,).
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2, snapshot
-from thinmap_ros.core.config import parameter
+from thinmap_ros.core.config import parameter, robot_radius
 from thinmap_ros.core.exploration import end_node_tracker, frontiers
 from thinmap_ros.core.exploration.end_node_tracker import EndNodeTracker, Track, TrackerConfig
 from thinmap_ros.core.exploration.frontiers import NOTHING, OpenBorders
@@ -62,7 +62,7 @@ FIELDS = {
 class SurveyConfig(TrackerConfig):
     """Which borders count, to whom they belong, and from where they are looked at."""
 
-    robot_radius_m: float = parameter(0.25, 'radius of the robot, m', low=0.0, high=5.0)
+    robot_radius_m: float = robot_radius()
     shortest_border_m: float = parameter(
         0.5, 'a shorter border is a missing beam, m', low=0.0, high=5.0
     )

@@ -84,7 +84,7 @@ class MissionGoal:
     def __post_init__(self) -> None:
         limits = (self.budget.time_s, self.budget.distance_m, self.budget.area_m2)
         corners = self.area.reshape(-1).tolist()
-        validation.within('goal: limit or corner of the area', [*limits, *corners])
+        validation.require_bounded('goal: limit or corner of the area', [*limits, *corners])
 
     def masked(self, patch: GridPatch) -> GridPatch:
         """Map in which all outside the area is wall."""

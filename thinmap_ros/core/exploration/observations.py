@@ -44,23 +44,23 @@ class ObservationBuffer:
         """
         self._map.paste(patch)
         self._has_local_map = True
-        match = self._mapped_scan_matcher.right(stamp_ns, True)
+        match = self._mapped_scan_matcher.add_right(stamp_ns, True)
         return None if match is None else self._observation(match[0])
 
     def add_pose(self, stamp_ns: int, T_map_base: Array) -> Observation | None:
         """Add the pose (3,) of a stamp; returns the observation if it is complete now."""
-        return self._add_pair(self._pose_matcher.right(stamp_ns, T_map_base))
+        return self._add_pair(self._pose_matcher.add_right(stamp_ns, T_map_base))
 
     def add_scan(self, scan: Scan) -> Observation | None:
         """Add a scan; returns the observation if it is complete now."""
-        return self._add_pair(self._pose_matcher.left(scan.stamp_ns, scan))
+        return self._add_pair(self._pose_matcher.add_left(scan.stamp_ns, scan))
 
     def _add_pair(self, pair: tuple[Scan, Array] | None) -> Observation | None:
         if pair is None:
             return None
         if not self._has_local_map:
             return self._observation(pair)
-        match = self._mapped_scan_matcher.left(pair[0].stamp_ns, pair)
+        match = self._mapped_scan_matcher.add_left(pair[0].stamp_ns, pair)
         return None if match is None else self._observation(match[0])
 
     def _observation(self, pair: tuple[Scan, Array]) -> Observation | None:

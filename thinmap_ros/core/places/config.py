@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.config import Config, parameter, robot_radius
 
 
 @dataclass(frozen=True)
@@ -14,9 +14,7 @@ class GlobalLocalizationConfig(Config):
     usable_range_m: float = parameter(
         15.0, 'what lies farther is not compared with the map, m', low=1.0, high=100.0
     )
-    robot_radius_m: float = parameter(
-        0.2, 'the robot is not nearer than this to a wall, m', low=0.0, high=5.0
-    )
+    robot_radius_m: float = robot_radius()
     active_window_m: float = parameter(
         10.0,
         'edge of the square round the robot in which nodes are compared, m',

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.config import Config, parameter, robot_radius
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.planning.traversability import disc, nearest_true, reached_from
@@ -35,9 +35,7 @@ _HAIR_M = 1e-6
 class WavefrontConfig(Config):
     """What a path may cross and what it should rather avoid."""
 
-    robot_radius_m: float = parameter(
-        0.25, 'radius of the robot: its centre comes no closer, m', low=0.0, high=5.0
-    )
+    robot_radius_m: float = robot_radius()
     keep_m: float = parameter(
         0.6, 'distance to obstacles from which on they cost nothing, m', low=0.0, high=10.0
     )

@@ -22,41 +22,41 @@ class ActiveMap:
         self._config = config
         self.map = LocalMap(config)
         self.number = 0  # of the submap
-        self.T_learned: Array | None = None  # pose (3,) of the scan that it learned from last
-        self._given: Mapping[str, NDArray[Any]] | None = None
-        self._due: list[int] = []
+        self.T_at_update: Array | None = None  # pose (3,) of the scan that it learned from last
+        self._loaded: Mapping[str, NDArray[Any]] | None = None
+        self._pending: list[int] = []
 
-    def begin_in(self, given: Mapping[str, NDArray[Any]]) -> None:
+    def load(self, given: Mapping[str, NDArray[Any]]) -> None:
         """The map has the cells of a state from the beginning."""
-        self._given = given
+        self._loaded = given
 
     def add_scan(self, points: Array, T_base_laser: Array, T_map_base: Array) -> None:
         """Add surface points (N, 5), robot frame, of a scan at a pose (3,)."""
         self.map.add_scan(points, T_base_laser, T_map_base)
-        self.T_learned = T_map_base
+        self.T_at_update = T_map_base
 
     def moved(self, T_map_base: Array) -> Array | None:
         """The motion (3,) since the map last learned, to a pose (3,); None before the first."""
-        return None if self.T_learned is None else se2.between(self.T_learned, T_map_base)
+        return None if self.T_at_update is None else se2.between(self.T_at_update, T_map_base)
 
-    def begin_submap(self) -> None:
+    def start_submap(self) -> None:
         """Continue in an empty map."""
         self.map = LocalMap(self._config)
-        self._due = []
+        self._pending = []
         self.number += 1
 
     def rerender(self, keyframes: Sequence[Keyframe], T_map_base: Array) -> None:
         """Render the map again from its keyframes, those nearest to a pose (3,) first."""
         self.map = LocalMap(self._config)
-        if self._given is not None:
-            self.map.restore(self._given)
+        if self._loaded is not None:
+            self.map.restore(self._loaded)
         places = np.array([frame.T_map_base for frame in keyframes]).reshape(-1, 3)[:, :2]
         away = np.hypot(*(places - T_map_base[:2]).T)
-        self._due = np.argsort(-away).tolist()
+        self._pending = np.argsort(-away).tolist()
         self.render(keyframes, _AT_ONCE)
 
     def render(self, keyframes: Sequence[Keyframe], count: int = _A_STEP) -> None:
         """Render some of the keyframes that are due."""
-        for _ in range(min(count, len(self._due))):
-            frame = keyframes[self._due.pop()]
+        for _ in range(min(count, len(self._pending))):
+            frame = keyframes[self._pending.pop()]
             self.map.add_scan(frame.points, frame.scan.T_base_laser, frame.T_map_base)

@@ -8,7 +8,7 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.graph.keyframes import carried, inverse, turned
+from thinmap_ros.core.slam.graph.keyframes import inverse, propagated_covariance, rotated_covariance
 from thinmap_ros.core.slam.matching.scan_matcher import Match
 
 CHI2 = 11.34  # 99 % of three degrees of freedom
@@ -49,11 +49,11 @@ class PoseUncertainty:
     """Covariances (3, 3), map frame, of the pose as seen from several places on its path."""
 
     def __init__(self, T_map_base: Array) -> None:
-        self.since_fit = np.zeros((3, 3))  # of the motion since a scan fitted: the matcher's prior
-        self.since_learned = np.zeros((3, 3))  # of the pose since the map grew
-        self.by_motion: Array = np.zeros((3, 3))  # the part of it that the motion leaves
-        self._since_anchor = np.zeros((3, 3))
-        self._at_learning = np.zeros((3, 3))  # of the scan the map learned from, not yet above
+        self.since_match = np.zeros((3, 3))  # motion since the last good match: the next prior
+        self.since_map_update = np.zeros((3, 3))  # pose since the last map update
+        self.motion_part: Array = np.zeros((3, 3))  # of since_map_update, due to the motion
+        self._since_keyframe = np.zeros((3, 3))
+        self._map_update_covariance = np.zeros((3, 3))  # of the last map update, not yet counted
         self._contradiction = Contradiction()
         self._T_moved = T_map_base  # where the robot was when it last moved
 
@@ -61,76 +61,77 @@ class PoseUncertainty:
         """The robot is at a pose (3,) with a covariance (3, 3), however it came there."""
         own = 0.5 * (covariance + covariance.T) + _LEAST_STEP
         self._T_moved = T_map_base
-        self.since_fit = own
-        self.since_learned = own
-        self._since_anchor = np.zeros((3, 3))
-        self._at_learning = np.zeros((3, 3))
+        self.since_match = own
+        self.since_map_update = own
+        self._since_keyframe = np.zeros((3, 3))
+        self._map_update_covariance = np.zeros((3, 3))
         self._contradiction.add_jump(own + UNKNOWN)
 
-    def predict(self, before: Array, prior: Array, Q: Array, stands: bool) -> None:
+    def predict(self, before: Array, prior: Array, Q: Array, is_stationary: bool) -> None:
         """The motion has led from one pose (3,) to another, with covariance Q (3, 3)."""
-        self.since_fit = carried(self.since_fit, prior[:2] - before[:2]) + Q
-        if not stands:
+        self.since_match = propagated_covariance(self.since_match, prior[:2] - before[:2]) + Q
+        if not is_stationary:
             lever = prior[:2] - self._T_moved[:2]
-            self._since_anchor = carried(self._since_anchor, lever)
-            self.since_learned = carried(self.since_learned, lever)
+            self._since_keyframe = propagated_covariance(self._since_keyframe, lever)
+            self.since_map_update = propagated_covariance(self.since_map_update, lever)
 
-    def stands(self, T_map_base: Array, slip: Array) -> bool:
+    def is_stationary(self, T_map_base: Array, slip: Array) -> bool:
         """Whether a pose (3,) is where the robot last moved, but for the slip (3,)."""
         return bool((np.abs(se2.off(T_map_base, self._T_moved)) <= slip).all())
 
-    def coast(self, T_map_base: Array, Q: Array, stands: bool) -> None:
+    def coast(self, T_map_base: Array, Q: Array, is_stationary: bool) -> None:
         """No scan has told the pose: it is where the motion has led."""
-        if not stands:
-            self.since_learned = self.since_learned + Q
+        if not is_stationary:
+            self.since_map_update = self.since_map_update + Q
             self._T_moved = T_map_base
-        self.by_motion = self.since_learned
+        self.motion_part = self.since_map_update
 
-    def update(self, match: Match, prior: Array, Q: Array, fits: bool, stands: bool) -> None:
+    def update(self, match: Match, prior: Array, Q: Array, fits: bool, is_stationary: bool) -> None:
         """A match has told the pose, against a prior (3,); fits: whether it is to be believed."""
-        self._contradiction.add(se2.off(match.T_map_base, prior), self.since_fit)
-        self.since_fit = np.zeros((3, 3)) if fits else match.covariance
-        if stands:
+        self._contradiction.add(se2.off(match.T_map_base, prior), self.since_match)
+        self.since_match = np.zeros((3, 3)) if fits else match.covariance
+        if is_stationary:
             return
-        by_motion = inverse(self.since_learned + Q)
-        self.since_learned = inverse(by_motion + match.by_scan)
-        self.by_motion = self.since_learned @ by_motion @ self.since_learned
+        motion_part = inverse(self.since_map_update + Q)
+        self.since_map_update = inverse(motion_part + match.scan_information)
+        self.motion_part = self.since_map_update @ motion_part @ self.since_map_update
         self._T_moved = match.T_map_base
 
     def is_unexpected(self, match: Match, prior: Array) -> bool:
         """Whether a match contradicts the motion that led to a prior (3,)."""
         off = se2.off(match.T_map_base, prior)
-        return float(off @ np.linalg.solve(self.since_fit, off)) > CHI2
+        return float(off @ np.linalg.solve(self.since_match, off)) > CHI2
 
     def learn(self, share: float) -> None:
         """The map has grown; share: of the scan's error that is new since it last did."""
         by_scan = self.by_scan
-        self._since_anchor = self._since_anchor + self.by_motion + share * by_scan
-        self._at_learning = (1.0 - share) * by_scan
-        self.since_learned = np.zeros((3, 3))
-        self.by_motion = np.zeros((3, 3))
+        self._since_keyframe = self._since_keyframe + self.motion_part + share * by_scan
+        self._map_update_covariance = (1.0 - share) * by_scan
+        self.since_map_update = np.zeros((3, 3))
+        self.motion_part = np.zeros((3, 3))
 
     @property
     def by_scan(self) -> Array:
         """The part (3, 3) of the pose's error since the map grew that comes of the scan."""
-        return self.since_learned - self.by_motion
+        return self.since_map_update - self.motion_part
 
-    def begin_map(self, T_map_base: Array, covariance: Array) -> None:
+    def start_submap(self, T_map_base: Array, covariance: Array) -> None:
         """A new local map begins at a pose (3,), off by a covariance (3, 3) from the old one."""
         self._contradiction.add_jump(covariance)
-        self._since_anchor = self._since_anchor + covariance
-        self.since_fit = np.zeros((3, 3))
+        self._since_keyframe = self._since_keyframe + covariance
+        self.since_match = np.zeros((3, 3))
         self._T_moved = T_map_base
 
     def step_from(self, yaw: float) -> tuple[Array, Array]:
         """Covariance (3, 3) of the step from an anchor with a heading, and what jumps add to it."""
         jump = self._contradiction.covariance
-        return turned(self._since_anchor, -yaw) + _LEAST_STEP, turned(jump, -yaw)
+        step = rotated_covariance(self._since_keyframe, -yaw) + _LEAST_STEP
+        return step, rotated_covariance(jump, -yaw)
 
-    def begin_step(self) -> None:
+    def start_step(self) -> None:
         """The pose is that of a keyframe, from which on uncertainty is counted."""
-        self._since_anchor = np.zeros((3, 3))
-        self._at_learning = np.zeros((3, 3))
+        self._since_keyframe = np.zeros((3, 3))
+        self._map_update_covariance = np.zeros((3, 3))
         self._contradiction = Contradiction()
 
     def move(self, T_map_base: Array) -> None:
@@ -140,7 +141,9 @@ class PoseUncertainty:
     def covariance(self, T_anchor: Array | None, anchor_covariance: Array | None) -> Array:
         """Covariance (3, 3) of the pose in the map, by that of its anchor at (3,), if any."""
         # The pose errs as the scan that the map learned from, until it errs by more.
-        own = self._since_anchor + max(self._at_learning, self.since_learned, key=np.trace)
+        own = self._since_keyframe + max(
+            self._map_update_covariance, self.since_map_update, key=np.trace
+        )
         if T_anchor is not None and anchor_covariance is not None:
-            own = own + carried(anchor_covariance, self._T_moved[:2] - T_anchor[:2])
+            own = own + propagated_covariance(anchor_covariance, self._T_moved[:2] - T_anchor[:2])
         return np.asarray(0.5 * (own + own.T))

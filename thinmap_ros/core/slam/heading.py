@@ -29,7 +29,7 @@ class HeadingCorrection:
         """
         # Narrower than the variance of the pose: where the heading errs by more, the local map errs
         # with it, and a robot that is turned alone does not fit that map any more.
-        self._variance += float(pose.by_motion[2, 2] + _NEW_SHARE * pose.by_scan[2, 2])
+        self._variance += float(pose.motion_part[2, 2] + _NEW_SHARE * pose.by_scan[2, 2])
         self.measured = None
         if not fits:
             return T_map_base

@@ -2,15 +2,15 @@
 
 from thinmap_ros.core.ekf_slam.ekf_localizer import EkfLocalizer
 from thinmap_ros.core.ekf_slam.features import LineFeature
-from thinmap_ros.core.slam.localizer import ScanLocalizer, ScanLocalizerConfig
+from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
 from thinmap_ros.core.topology.graph import TopologicalMap
 
-AnyLocalizer = ScanLocalizer | EkfLocalizer
+AnyLocalizer = Localizer | EkfLocalizer
 
 
-def localizer_class(config: ScanLocalizerConfig) -> type[ScanLocalizer] | type[EkfLocalizer]:
+def localizer_class(config: LocalizerConfig) -> type[Localizer] | type[EkfLocalizer]:
     """The class of the localizer of `config.slam`."""
-    return EkfLocalizer if config.slam.startswith('ekf') else ScanLocalizer
+    return EkfLocalizer if config.slam.startswith('ekf') else Localizer
 
 
 def line_features(localizer: AnyLocalizer) -> list[LineFeature]:

@@ -17,7 +17,8 @@ from thinmap_ros.core.ekf_slam.models import OdometryConfig, odometry_slip, odom
 from thinmap_ros.core.se2 import Array
 
 _MOST_SIGMAS = 3.0
-_DISTINCT = 0.2  # of the information across walls: that much along them is no smooth corridor
+# Ratio of the information along walls to that across them, above which it is no smooth corridor.
+_CORRIDOR_RATIO = 0.2
 _LEAST_SHARE = 1.0  # of the variance that the model allows: good wheels slip, too
 
 
@@ -25,13 +26,17 @@ _LEAST_SHARE = 1.0  # of the variance that the model allows: good wheels slip, t
 class MotionConfig(OdometryConfig):
     """Noise of the motion, 1 sigma, as it is taken to be before the scans have told."""
 
-    noise_memory: float = parameter(
-        20.0, 'scans after which an error of odometry is forgotten', low=1.0, high=1e4
+    noise_window: float = parameter(
+        20.0,
+        'Number of scans over which the odometry noise is estimated. Raise it for a steadier '
+        'estimate, lower it to follow changes of the floor sooner.',
+        low=1.0,
+        high=1e4,
     )
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class MotionPrediction:
     """Increment (3,) and its covariance (3, 3), in the robot frame before it.
 
     stands: whether it is no more than the slip of a robot that stands.
@@ -39,7 +44,7 @@ class Motion:
 
     increment: Array
     covariance: Array
-    stands: bool
+    is_stationary: bool
 
 
 def _distinctness(information: Array) -> Array:
@@ -49,7 +54,7 @@ def _distinctness(information: Array) -> Array:
     moves a robot by there is no error of the odometry.
     """
     own = np.diag(information)[:2]
-    return np.asarray(np.minimum(own / max(_DISTINCT * float(own.max()), 1e-12), 1.0))
+    return np.asarray(np.minimum(own / max(_CORRIDOR_RATIO * float(own.max()), 1e-12), 1.0))
 
 
 class MotionModel:
@@ -62,7 +67,7 @@ class MotionModel:
         self._allowed: Array = np.ones(3)
         self._expected: Array = np.zeros(3)
 
-    def expect(self, increment: Array, systematic: Array) -> Motion:
+    def predict(self, increment: Array, systematic: Array) -> MotionPrediction:
         """Motion since the scan before, by the increment (3,) of the odometry.
 
         systematic (3, 3): covariance of what is left of the odometry's systematic error.
@@ -71,11 +76,12 @@ class MotionModel:
         self._expected = increment
         self._allowed = odometry_variances(increment, config) + np.diag(systematic)
         moves = np.abs(increment) > _MOST_SIGMAS * odometry_slip(config)
-        return Motion(increment, np.diag(self._variances), not moves.any())
+        return MotionPrediction(increment, np.diag(self._variances), not moves.any())
 
-    def learn(self, found: Array, by_scan: Array) -> None:
+    def update(self, found: Array, scan_information: Array) -> None:
         """A scan found the motion (3,) to be that, with information (3, 3), robot frame."""
-        variance = 1.0 / np.maximum(np.diag(by_scan), 1e-12)  # of the motion as the scan tells it
+        # Of the motion as the scan measures it.
+        variance = 1.0 / np.maximum(np.diag(scan_information), 1e-12)
         gain = self._variances / (self._variances + variance)
         innovation = found - self._expected
         innovation[2] = se2.wrap(float(innovation[2]))
@@ -86,9 +92,9 @@ class MotionModel:
         # What is farther off has slipped once, and says no more than this of the noise.
         change = np.minimum(beyond / self._allowed, _MOST_SIGMAS**2 * share) - share
         change *= np.maximum(gain**2, beyond / np.maximum(squared, 1e-12))
-        change[:2] *= np.where(change[:2] > 0.0, _distinctness(by_scan), 1.0)
+        change[:2] *= np.where(change[:2] > 0.0, _distinctness(scan_information), 1.0)
         self._learned += 1
-        rate = max(1.0 / self._config.noise_memory, 1.0 / (1.0 + self._learned))
+        rate = max(1.0 / self._config.noise_window, 1.0 / (1.0 + self._learned))
         self._share[0] += rate * 0.5 * (change[0] + change[1])
         self._share[1] += rate * change[2]
         np.maximum(self._share, _LEAST_SHARE, out=self._share)

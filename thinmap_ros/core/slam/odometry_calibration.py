@@ -42,9 +42,9 @@ class OdometryCalibration:
         self._covariance = np.diag(np.square(_PRIOR_SIGMAS))
         self._begin: Array | None = None
         self._doubt: Array = np.zeros((3, 3))  # of where a span begins, map frame
-        self.interrupt()
+        self.reset_segment()
 
-    def interrupt(self) -> None:
+    def reset_segment(self) -> None:
         """Compare nothing across this moment: the pose was not found but put, moved or lost."""
         self._begin = None
         self._expected = np.zeros(3)
@@ -81,7 +81,7 @@ class OdometryCalibration:
         )
         return found, G @ self._covariance @ G.T
 
-    def follow(self, T_map_base: Array, by_map: Array) -> None:
+    def update(self, T_map_base: Array, by_map: Array) -> None:
         """Hear where the robot was found (3,) after the increments so far, map frame.
 
         by_map (3, 3): with what information. Of this only what the map has said: what the wheels
@@ -97,7 +97,7 @@ class OdometryCalibration:
         if self._begin is not None:
             turn = rotation(float(self._begin[2]))
             self._learn(se2.between(self._begin, T_map_base), turn.T @ (doubt + self._doubt) @ turn)
-        self.interrupt()
+        self.reset_segment()
         self._begin = T_map_base
         self._doubt = doubt
 

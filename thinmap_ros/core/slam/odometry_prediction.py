@@ -9,9 +9,9 @@ from thinmap_ros.core.ekf_slam.models import odometry_variances
 from thinmap_ros.core.odometry import OdometryIncrements
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.graph.keyframes import turned
+from thinmap_ros.core.slam.graph.keyframes import rotated_covariance
 from thinmap_ros.core.slam.matching.scan_matcher import Match
-from thinmap_ros.core.slam.motion_model import Motion, MotionConfig, MotionModel
+from thinmap_ros.core.slam.motion_model import MotionConfig, MotionModel, MotionPrediction
 from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
 
 
@@ -37,7 +37,7 @@ class Prediction:
     T_before: Array
     T_map_base: Array
     covariance: Array
-    motion: Motion
+    motion: MotionPrediction
 
 
 class OdometryPrediction:
@@ -72,7 +72,7 @@ class OdometryPrediction:
         reversal = self._reversal
         self._reversal = Reversal()
         expected = se2.compose(T_before, motion.increment) + reversal.mean
-        covariance = turned(motion.covariance, float(T_before[2])) + reversal.covariance
+        covariance = rotated_covariance(motion.covariance, float(T_before[2])) + reversal.covariance
         return Prediction(T_before, se2.pose(*expected.tolist()), covariance, motion)
 
     def contradict(self, prediction: Prediction, match: Match, accepted: bool) -> None:
@@ -81,27 +81,29 @@ class OdometryPrediction:
         mean = -0.5 * off if accepted else np.zeros(3)
         self._reversal = Reversal(mean, 0.25 * np.outer(off, off))
 
-    def learn(self, prediction: Prediction, match: Match) -> None:
+    def update(self, prediction: Prediction, match: Match) -> None:
         """A match that fits has told where the robot is, and so what odometry was off."""
         if self._begins_known:
-            by_scan = turned(match.by_scan, -float(prediction.T_before[2]))
-            self._model.learn(se2.between(prediction.T_before, match.T_map_base), by_scan)
+            scan_information = rotated_covariance(
+                match.scan_information, -float(prediction.T_before[2])
+            )
+            self._model.update(se2.between(prediction.T_before, match.T_map_base), scan_information)
         self._begins_known = True
-        self._calibration.follow(match.T_map_base, match.by_scan)
+        self._calibration.update(match.T_map_base, match.scan_information)
 
-    def interrupt(self) -> None:
+    def reset_segment(self) -> None:
         """The pose was not found but put, moved or lost: the next motion begins from elsewhere."""
         self._begins_known = False
-        self._calibration.interrupt()
+        self._calibration.reset_segment()
 
-    def _motion(self, scan: Scan, T_odom_base: Array) -> Motion:
+    def _motion(self, scan: Scan, T_odom_base: Array) -> MotionPrediction:
         """The motion since the last scan, robot frame."""
         increment = self._increments.next(scan.stamp_ns, T_odom_base)
         variances = odometry_variances(increment.T_before_base, self._config)[[0, 2]]
         moved, systematic = self._calibration.corrected(increment.T_before_base, variances)
-        motion = self._model.expect(moved, systematic)
+        motion = self._model.predict(moved, systematic)
         if increment.bound_m == 0.0:
             return motion
-        self._calibration.interrupt()
+        self._calibration.reset_segment()
         unknown = np.diag(np.square([increment.bound_m, increment.bound_m, 1.0]))
-        return Motion(motion.increment, motion.covariance + unknown, False)
+        return MotionPrediction(motion.increment, motion.covariance + unknown, False)

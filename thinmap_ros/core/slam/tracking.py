@@ -6,7 +6,7 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.graph.keyframes import carried, turned
+from thinmap_ros.core.slam.graph.keyframes import propagated_covariance, rotated_covariance
 from thinmap_ros.core.slam.matching.scan_matcher import Match
 from thinmap_ros.core.slam.odometry_prediction import Prediction
 
@@ -26,9 +26,9 @@ class DeadReckoning:
         """The same after one more motion."""
         motion = prediction.motion
         after = se2.compose(self.T_map_base, motion.increment)
-        Q = turned(motion.covariance, float(self.T_map_base[2]))
+        Q = rotated_covariance(motion.covariance, float(self.T_map_base[2]))
         lever = after[:2] - self.T_map_base[:2]
-        return DeadReckoning(after, carried(self.covariance, lever) + Q)
+        return DeadReckoning(after, propagated_covariance(self.covariance, lever) + Q)
 
 
 class Tracking:
@@ -38,13 +38,13 @@ class Tracking:
     Source: Page, "Continuous inspection schemes", 1954.
     """
 
-    def __init__(self, lost_evidence: float, least_fit: float, T_map_base: Array) -> None:
+    def __init__(self, lost_threshold: float, least_fit: float, T_map_base: Array) -> None:
         self.evidence = 0.0
-        self.is_unplaced = False  # in a map that was given, or put somewhere by hand
-        self.reckoned = DeadReckoning(T_map_base, np.zeros((3, 3)))
-        self._lost_evidence = lost_evidence
+        self.is_delocalized = False  # in a map that was given, or put somewhere by hand
+        self.dead_reckoned = DeadReckoning(T_map_base, np.zeros((3, 3)))
+        self._lost_evidence = lost_threshold
         self._least_fit = least_fit
-        self._adrift_m = 0.0  # path for which a new local map is not yet part of the map
+        self._provisional_path_m = 0.0  # path for which a new local map is not yet part of the map
 
     @property
     def agrees(self) -> bool:
@@ -54,50 +54,50 @@ class Tracking:
     @property
     def is_lost(self) -> bool:
         """Whether the pose is in no map that others know."""
-        return self._adrift_m > 0.0 or (self.is_unplaced and self.evidence > 0.0)
+        return self._provisional_path_m > 0.0 or (self.is_delocalized and self.evidence > 0.0)
 
     @property
-    def needs_new_map(self) -> bool:
+    def needs_submap(self) -> bool:
         """Whether scans contradict the map for good."""
         return self.evidence > self._lost_evidence
 
-    def judge(self, match: Match | None) -> None:
+    def update(self, match: Match | None) -> None:
         """Update the evidence by a match; None: nothing could be matched, and nothing is told."""
         if match is None:
             return
-        more = match.contradicted - match.fit / FOR_A_SLIP
+        more = match.contradiction_ratio - match.inlier_ratio / FOR_A_SLIP
         self.evidence = max(self.evidence + more, 0.0)
-        if self.is_unplaced:
+        if self.is_delocalized:
             self.evidence = min(self.evidence, self._lost_evidence)
-            self.is_unplaced = self.evidence > 0.0 or match.fit < self._least_fit
+            self.is_delocalized = self.evidence > 0.0 or match.inlier_ratio < self._least_fit
 
-    def note(self, T_map_base: Array, covariance: Array) -> None:
+    def record_pose(self, T_map_base: Array, covariance: Array) -> None:
         """The pose of this scan is (3,): dead reckoning begins there where the map agrees."""
         if self.agrees:
-            self.reckoned = DeadReckoning(T_map_base, covariance)
+            self.dead_reckoned = DeadReckoning(T_map_base, covariance)
 
     def place(self, T_map_base: Array, covariance: Array) -> None:
         """The robot was put at a pose (3,) with covariance (3, 3)."""
-        self.is_unplaced = True
-        self._adrift_m = 0.0
+        self.is_delocalized = True
+        self._provisional_path_m = 0.0
         self.evidence = 0.0
-        self.reckoned = DeadReckoning(T_map_base, covariance)
+        self.dead_reckoned = DeadReckoning(T_map_base, covariance)
 
-    def begin_in_map(self) -> None:
+    def start_delocalized(self) -> None:
         """A map was given, and the robot is somewhere in it."""
-        self.is_unplaced = True
+        self.is_delocalized = True
         self.evidence = _UNPLACED_EVIDENCE
 
-    def begin_submap(self) -> None:
+    def start_submap(self) -> None:
         """Continue in a new local map."""
         self.evidence = 0.0
-        self._adrift_m = _ADRIFT_M
+        self._provisional_path_m = _ADRIFT_M
 
-    def travel(self, path_m: float) -> None:
+    def add_path(self, path_m: float) -> None:
         """The map has grown after a path of this length, m."""
-        self._adrift_m = max(self._adrift_m - path_m, 0.0)
+        self._provisional_path_m = max(self._provisional_path_m - path_m, 0.0)
 
     def join(self, T_map_base: Array) -> None:
         """A loop was closed: the new local map is part of the map, the pose is (3,)."""
-        self._adrift_m = 0.0
-        self.reckoned = DeadReckoning(T_map_base, self.reckoned.covariance)
+        self._provisional_path_m = 0.0
+        self.dead_reckoned = DeadReckoning(T_map_base, self.dead_reckoned.covariance)

@@ -2,14 +2,14 @@
 
 from dataclasses import dataclass
 
-from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.config import Config, parameter, robot_radius
 
 
 @dataclass(frozen=True)
 class TopologyConfig(Config):
     """What counts as free, which branches of the skeleton count, and how local maps are merged."""
 
-    robot_radius_m: float = parameter(0.25, 'radius of the robot, m', low=0.0, high=5.0)
+    robot_radius_m: float = robot_radius()
     gap_m: float = parameter(
         0.2, 'unknown gaps between free cells up to this wide count as free, m', low=0.0, high=2.0
     )

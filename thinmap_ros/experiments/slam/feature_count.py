@@ -114,7 +114,7 @@ def _drive(seed: int, count: int, local: bool) -> tuple[Array, Array]:
         area = areas[step // _AREA_STEPS]
         began = process_time()
         if local and step % _AREA_STEPS == 0:
-            ekf.enter(area)
+            ekf.set_local_area(area)
         _step(ekf, area[: len(noise[step])], noise[step])
         taken.append(1e3 * (process_time() - began))
     return np.array(taken[1:]), ekf.local.pose
@@ -128,7 +128,7 @@ def _step(ekf: CompressedEkf, seen: list[int], noise: Array) -> None:
     indices = np.array([ekf.area.index(number) for number in seen])
     z = np.array([ekf.local.innovations(int(k))[0] for k in indices]) + noise
     ekf.local.update(indices, z, np.tile(_LINE, (len(indices), 1, 1)))
-    ekf.work_off()
+    ekf.flush_step()
 
 
 def _spread(taken: Array) -> list[float]:

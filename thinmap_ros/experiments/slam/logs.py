@@ -147,7 +147,10 @@ def _errors(folder: Path, result: Replay) -> list[float | None]:
         return [None] * 5
     times = np.array(result.stamps_ns) / 1e9
     wheels = read_columns(odometry, [0, 1, 2, 3])
-    paths = [(times, np.array(result.poses)), (times, result.pipeline.localizer.corrected_path())]
+    paths = [
+        (times, np.array(result.poses)),
+        (times, result.pipeline.localizer.optimized_trajectory()),
+    ]
     live, final = (relation_errors(*path, relations, odometry) for path in paths)
     raw = relation_errors(wheels[:, 0], wheels[:, 1:], relations, odometry)
     return [*_means(live), *_means(final), float(raw.metres.mean())]
@@ -161,7 +164,7 @@ def _plot(folder: Path, result: Replay) -> Plot:
     pipeline = result.pipeline
     graph = result.pipeline.topology.map
     patch = pipeline.grid.patch()
-    final = pipeline.localizer.corrected_path()
+    final = pipeline.localizer.optimized_trajectory()
     way = Curve(final[:, :2], 'trajectory', 3, width=1.0)
     rows, cols = patch.shape
     width = min(7.0, 6.0 * cols / rows)

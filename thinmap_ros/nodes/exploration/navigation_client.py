@@ -10,7 +10,7 @@ from thinmap_msgs.action import NavigateToPose
 from thinmap_ros.core.exploration.mission import DriveRequest
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.ros import messages
-from thinmap_ros.ros.lifecycle_node import LiveNode
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
 
 _WARN_PERIOD_S = 5.0
 
@@ -19,7 +19,7 @@ class NavigationClient:
     """Sends goals to the action navigate_to_pose, and reports how the last one ended."""
 
     def __init__(
-        self, node: LiveNode, frame_id: str, on_result: Callable[[bool, str], None]
+        self, node: ThinmapNode, frame_id: str, on_result: Callable[[bool, str], None]
     ) -> None:
         """Make a client; on_result: receives success and reason, of the last goal only."""
         self._node = node

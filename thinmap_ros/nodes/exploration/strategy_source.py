@@ -19,7 +19,7 @@ class StrategySource:
     def __init__(self, node: Node) -> None:
         """Declare the parameters. Raises ConfigError where one is wrong."""
         self._name = str(
-            parameters.declare_value(
+            parameters.declare_parameter(
                 node,
                 'strategy',
                 DEFAULT,
@@ -28,7 +28,7 @@ class StrategySource:
                 'for position_probability and paper only',
             )
         )
-        self._config = parameters.declare(node, ExplorerConfig, self._on_config)
+        self._config = parameters.declare_config(node, ExplorerConfig, self._on_config)
         self._is_outdated = False
 
     def initial(self, session: str) -> Strategy:

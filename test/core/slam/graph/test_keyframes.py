@@ -13,12 +13,12 @@ from thinmap_ros.core.slam.graph.keyframes import (
     Keyframe,
     KeyframeConfig,
     Keyframes,
-    carried,
     covariances_from,
     heading_variance,
     inverse,
+    propagated_covariance,
     turned,
-    unlike,
+    view_difference_m,
     with_heading,
 )
 from thinmap_ros.core.slam.graph.pose_graph import Edge
@@ -39,7 +39,7 @@ def frame(pose, path_m=0.0, stamp_ns=0, covariance=None):
 def along(poses, steps=STEP):
     keyframes = Keyframes(KeyframeConfig())
     for k, pose in enumerate(poses):
-        keyframes.keep(frame(pose, float(k), k), steps)
+        keyframes.add(frame(pose, float(k), k), steps)
     return keyframes
 
 
@@ -65,7 +65,7 @@ def test_before_the_first_there_is_no_anchor():
     keyframes = Keyframes(KeyframeConfig())
     assert keyframes.anchor == -1
     assert keyframes.poses().shape == (0, 3)
-    assert keyframes.alike(np.zeros(3)) is None
+    assert keyframes.most_similar(np.zeros(3)) is None
     stamps, poses = keyframes.path()
     assert stamps.shape == (0,)
     assert poses.shape == (0, 3)
@@ -83,7 +83,7 @@ def test_an_earlier_keyframe_stands_for_one_that_sees_the_same():
     assert stamps.tolist() == [0, 1, 2, 3, 77]
     np.testing.assert_allclose(poses[-1], back.T_map_base)
     # What comes next hangs on it.
-    number = keyframes.keep(frame([1.0, 2.0, 0.0], 10.0), STEP)
+    number = keyframes.add(frame([1.0, 2.0, 0.0], 10.0), STEP)
     assert (keyframes.steps[-1].a, keyframes.steps[-1].b) == (1, number)
 
 
@@ -94,7 +94,7 @@ def test_scans_for_which_a_keyframe_stands_go_where_it_goes():
     moved = keyframes.poses() + [0.5, -0.2, 0.4]
     keyframes.move(moved, [])
     np.testing.assert_allclose(keyframes.path()[1][-1], se2.compose(moved[1], offset))
-    assert keyframes.alike(moved[2]) == 2
+    assert keyframes.most_similar(moved[2]) == 2
 
 
 @pytest.mark.parametrize(
@@ -111,23 +111,23 @@ def test_poses_are_apart_by_way_or_by_turn(T, apart):
     keyframes = Keyframes(KeyframeConfig())
     for start in (np.zeros(3), np.array([3.0, -2.0, 3.1])):
         there = se2.compose(start, np.array(T))
-        assert keyframes.are_apart(start, there) is apart
-        assert keyframes.are_apart(there, start) is apart
+        assert keyframes.differ(start, there) is apart
+        assert keyframes.differ(there, start) is apart
 
 
 def test_the_most_alike_keyframe_is_found():
     keyframes = along([se2.pose(0.3 * k, 0.0, 0.2 * k) for k in range(10)])
     pose = np.array([1.25, 0.05, 0.78])
-    assert keyframes.alike(pose) == min(
-        range(10), key=lambda k: unlike(keyframes.frames[k].T_map_base, pose)
+    assert keyframes.most_similar(pose) == min(
+        range(10), key=lambda k: view_difference_m(keyframes.frames[k].T_map_base, pose)
     )
-    assert keyframes.alike(np.array([50.0, 0.0, 0.0])) is None
-    assert keyframes.alike(np.array([0.3, 0.0, 2.5])) is None
+    assert keyframes.most_similar(np.array([50.0, 0.0, 0.0])) is None
+    assert keyframes.most_similar(np.array([0.3, 0.0, 2.5])) is None
 
 
 def test_unlike_wraps():
-    assert unlike(np.array([0.0, 0.0, 3.1]), np.array([0.0, 0.0, -3.1])) < 0.1
-    assert unlike(np.zeros(3), np.array([3.0, 4.0, 0.5])) == pytest.approx(5.5)
+    assert view_difference_m(np.array([0.0, 0.0, 3.1]), np.array([0.0, 0.0, -3.1])) < 0.1
+    assert view_difference_m(np.zeros(3), np.array([3.0, 4.0, 0.5])) == pytest.approx(5.5)
 
 
 def sampled(chain, covariances, rng, number=20000):
@@ -152,10 +152,10 @@ def test_covariances_along_a_chain_are_those_of_sampling(rng):
     covariances = [random_covariance(rng) for _ in chain]
     poses = [np.zeros(3)]
     keyframes = Keyframes(KeyframeConfig())
-    keyframes.keep(frame(poses[0]), STEP)
+    keyframes.add(frame(poses[0]), STEP)
     for k, (T, covariance) in enumerate(zip(chain, covariances, strict=True)):
         poses.append(se2.compose(poses[-1], T))
-        keyframes.keep(frame(poses[-1], float(k)), covariance)
+        keyframes.add(frame(poses[-1], float(k)), covariance)
     keyframes.move(np.array(poses), [])
     truth = sampled(chain, covariances, rng)
     found = keyframes.frames[-1].covariance
@@ -222,8 +222,8 @@ def test_a_carried_covariance_is_that_of_what_is_bound_to_it(rng):
             samples[:, 2],
         ]
     )
-    np.testing.assert_allclose(carried(covariance, lever), np.cov(ends.T), atol=2e-4)
-    np.testing.assert_array_equal(carried(covariance, np.zeros(2)), covariance)
+    np.testing.assert_allclose(propagated_covariance(covariance, lever), np.cov(ends.T), atol=2e-4)
+    np.testing.assert_array_equal(propagated_covariance(covariance, np.zeros(2)), covariance)
 
 
 def test_covariances_along_the_graph_are_the_same_in_plain_python(rng, monkeypatch):
@@ -268,7 +268,7 @@ def test_measured_headings_bound_the_covariance_along_the_path():
     keyframes = Keyframes(KeyframeConfig())
     for k, pose in enumerate(poses):
         kept = replace(frame(pose, float(k), k), heading=Heading(0.0, 0.005**2))
-        keyframes.keep(kept, STEP)
+        keyframes.add(kept, STEP)
     guided = keyframes.covariances_from(0, poses, [])[-1]
     assert np.sqrt(blind[1, 1]) > 1.0
     assert np.sqrt(guided[1, 1]) < 0.2
@@ -281,7 +281,7 @@ def test_measured_headings_bound_the_covariance_along_the_path():
 def test_measured_headings_are_edges_from_the_first_keyframe():
     keyframes = Keyframes(KeyframeConfig())
     for k, heading in enumerate([None, Heading(0.45, 1e-4), None]):
-        keyframes.keep(replace(frame(se2.pose(k, 0.0, 0.4), float(k), k), heading=heading), STEP)
+        keyframes.add(replace(frame(se2.pose(k, 0.0, 0.4), float(k), k), heading=heading), STEP)
     (edge,) = keyframes.headings
     assert (edge.a, edge.b, edge.robust) == (0, 1, True)
     np.testing.assert_allclose(edge.T_a_b[2], 0.05)

@@ -8,10 +8,17 @@ from support.slam_room import RANGE_MAX_M, ROOM, corridor_ring, scan_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam.graph import loop_closure as module
-from thinmap_ros.core.slam.graph.keyframes import Keyframe, carried, inverse, turned
-from thinmap_ros.core.slam.graph.loop_closure import LoopClosure, LoopConfig
+from thinmap_ros.core.slam.graph.keyframes import (
+    Keyframe,
+    KeyframeConfig,
+    inverse,
+    propagated_covariance,
+    turned,
+)
+from thinmap_ros.core.slam.graph.loop_closure import LoopClosure, LoopClosureConfig
 from thinmap_ros.core.slam.graph.pose_graph import Edge
-from thinmap_ros.core.slam.matching.scan_matcher import FEWEST_POINTS, Matcher
+from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
+from thinmap_ros.core.slam.matching.scan_matcher import FEWEST_POINTS, MatchingConfig
 from thinmap_ros.core.slam.matching.surface import surface_points
 
 SIGMAS = np.array([0.02, 0.02, 0.003])
@@ -22,6 +29,12 @@ RING = corridor_ring()
 CORNERS = [(38.8, 1.2), (38.8, 18.8), (1.2, 18.8), (1.2, 1.2), (20.0, 1.2)]
 
 OTHER_ROOMS = [(-4.0, 16.0), (-4.0, 6.0), (-4.0, -4.0), (6.0, -4.0), (16.0, -4.0)]
+
+
+def loop_closure(**config):
+    return LoopClosure(
+        LoopClosureConfig(**config), KeyframeConfig(), MatchingConfig(), LocalMapConfig()
+    )
 
 
 def round_the_block():
@@ -43,7 +56,7 @@ class Driver:
 
     def __init__(self, walls=RING, seed=6, bias=(0.0, 0.0, 0.0), **config):
         self.rng = np.random.default_rng(seed)
-        self.loops = LoopClosure(LoopConfig(**config), Matcher())
+        self.loops = loop_closure(**config)
         self.walls = walls
         self.bias = np.array(bias)
         self.truths = []
@@ -62,16 +75,18 @@ class Driver:
             before = self.pose
             self.pose = se2.compose(before, step + noise)
             own = turned(STEP, float(before[2]))
-            self.covariance = carried(self.covariance, self.pose[:2] - before[:2]) + own
+            self.covariance = (
+                propagated_covariance(self.covariance, self.pose[:2] - before[:2]) + own
+            )
         self.truths.append(truth)
         self.largest = max(self.largest, float(np.hypot(*(self.pose - truth)[:2])))
         scan = scan_in(self.walls, truth, self.rng, len(self.truths) - 1)
         points = surface_points(scan, RANGE_MAX_M)
         frame = Keyframe(scan, points, self.pose, self.path_m(), self.covariance, 0)
-        if len(points) >= FEWEST_POINTS and self.loops.is_due(self.pose):
+        if len(points) >= FEWEST_POINTS and self.loops.needs_keyframe(self.pose):
             self.loops.add(frame, STEP, NONE)
         for _ in range(works):
-            correction = self.loops.work()
+            correction = self.loops.step()
             if correction is not None:
                 self.corrections.append(correction)
                 anchor = self.loops.keyframes.anchor
@@ -163,13 +178,13 @@ def edge_to(loops, a, b, off, sigma=0.03):
 @pytest.fixture
 def straight():
     """Twelve keyframes out and twelve back beside them, along a hall; nothing is matched."""
-    loops = LoopClosure(LoopConfig(), Matcher())
+    loops = loop_closure()
     poses = [se2.pose(k, 0.0, 0.0) for k in range(12)]
     poses += [se2.pose(11 - k, 1.0, np.pi) for k in range(12)]
     for k, pose in enumerate(poses):
         scan = scan_in(ROOM, pose, stamp_ns=k)
         frame = Keyframe(scan, surface_points(scan, RANGE_MAX_M), pose, float(k), NONE, 0)
-        loops.keyframes.keep(frame, STEP)
+        loops.keyframes.add(frame, STEP)
     return loops
 
 
@@ -204,7 +219,7 @@ def test_matches_that_contradict_each_other_close_nothing(straight, rng):
         off = np.array([3.0 * np.cos(2.0 * k), 3.0 * np.sin(2.0 * k), 0.3 * k])
         straight._requested.append(edge_to(straight, k, 22 - k, off))
     assert len(straight._consistent()) == 1
-    assert straight.work() is None
+    assert straight.step() is None
     assert straight._rounds is None
     assert not straight.edges
 
@@ -237,7 +252,7 @@ def test_a_step_does_one_match_or_one_round(monkeypatch):
         driver.go(truth, works=0)
         for _ in range(4):
             before = sum(counts.values())
-            correction = driver.loops.work()
+            correction = driver.loops.step()
             assert sum(counts.values()) - before <= 1
             if correction is not None:
                 driver.corrections.append(correction)
@@ -246,30 +261,30 @@ def test_a_step_does_one_match_or_one_round(monkeypatch):
     assert counts['rounds'] > 1
     # All is done at some time.
     for _ in range(100):
-        driver.loops.work()
+        driver.loops.step()
     before = dict(counts)
-    assert driver.loops.work() is None
+    assert driver.loops.step() is None
     assert counts == before
 
 
 def test_a_robot_that_stands_about_keeps_one_scan(rng):
-    loops = LoopClosure(LoopConfig(), Matcher())
+    loops = loop_closure()
     kept = 0
     for k in range(50):
         pose = np.array([2.0, 2.0, 0.0]) + rng.normal(0.0, 0.1, 3)
-        if loops.is_due(pose):
+        if loops.needs_keyframe(pose):
             scan = scan_in(ROOM, pose, rng, k)
             loops.add(
                 Keyframe(scan, surface_points(scan, RANGE_MAX_M), pose, 0.0, NONE, 0), STEP, NONE
             )
             kept += 1
-        loops.work()
+        loops.step()
     assert kept == 1
     assert loops.finish().shape == (1, 3)
 
 
 def test_the_path_is_measured_in_straight_lines():
-    loops = LoopClosure(LoopConfig(), Matcher())
+    loops = loop_closure()
     assert loops.path_m(np.array([5.0, 5.0, 0.0])) == 0.0
     for k, x in enumerate((0.0, 1.0, 2.0)):
         pose = se2.pose(2.0 + x, 2.0, 0.0)
@@ -281,14 +296,14 @@ def test_the_path_is_measured_in_straight_lines():
 
 def test_what_has_jumped_is_measured_anew(rng):
     """Scan and motion contradicted each other on the way; the keyframes before see the same."""
-    loops = LoopClosure(LoopConfig(), Matcher())
+    loops = loop_closure()
     truths = np.array([[1.2, 2.0, 0.3], [2.0, 2.0, 0.3], [2.8, 2.0, 0.3]])
     told = truths + [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.3, 0.2, 0.05]]
     for k, jump in enumerate([NONE, NONE, np.diag([0.1, 0.1, 0.01])]):
         scan = scan_in(ROOM[:4] / 2.0, truths[k], rng, k, beams=361)
         points = surface_points(scan, RANGE_MAX_M)
         loops.add(Keyframe(scan, points, told[k], float(k), STEP + jump, 0), STEP, jump)
-        loops.work()
+        loops.step()
     assert [(edge.a, edge.b) for edge in loops.edges] == [(1, 2)]
     T = se2.between(truths[1], truths[2])
     np.testing.assert_allclose(loops.edges[0].T_a_b, T, atol=0.05)
@@ -296,7 +311,7 @@ def test_what_has_jumped_is_measured_anew(rng):
 
 
 def test_the_step_covariance_is_that_of_the_step(rng):
-    loops = LoopClosure(LoopConfig(), Matcher())
+    loops = loop_closure()
     for k, pose in enumerate([np.zeros(3), np.array([1.0, 0.0, 0.2])]):
         scan = scan_in(ROOM, pose + [2.0, 2.0, 0.0], rng, k)
         loops.add(
@@ -308,20 +323,20 @@ def test_the_step_covariance_is_that_of_the_step(rng):
 
 def test_an_edge_to_what_is_seen_again_holds_the_errors_of_step_and_match(rng):
     """From the anchor to an earlier keyframe, by way of a scan that both see; against sampling."""
-    loops = LoopClosure(LoopConfig(), Matcher())
+    loops = loop_closure()
     poses = [se2.pose(2.0, 2.0, 0.3), se2.pose(4.0, 2.0, 2.0), se2.pose(2.3, 2.5, 0.8)]
     frames = []
     for k, pose in enumerate(poses):
         scan = scan_in(ROOM, pose, stamp_ns=k)
         frames.append(Keyframe(scan, surface_points(scan, RANGE_MAX_M), pose, 10.0 * k, NONE, 0))
     for frame in frames[:2]:
-        loops.keyframes.keep(frame, STEP)
+        loops.keyframes.add(frame, STEP)
     by_match = np.diag(np.square([0.02, 0.01, 0.05]))
     by_step = np.diag([4e-4, 1e-4, 4e-4])
     loops._pending = (frames[2], by_step)
     T_j_here = se2.between(poses[0], poses[2])
     T_a_here = se2.between(poses[1], poses[2])
-    loops._agree(Edge(0, 2, T_j_here, inverse(by_match), True))
+    loops._confirm(Edge(0, 2, T_j_here, inverse(by_match), True))
     edge = loops.edges[0]
     assert (edge.a, edge.b) == (1, 0)
     assert loops.keyframes.anchor == 0

@@ -10,14 +10,15 @@ from test_local_map import cells_of, nearest
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam.matching import correlative_search
 from thinmap_ros.core.slam.matching.correlative_search import search
+from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.core.slam.matching.matching_cost import SLIP_SIGMAS, UNSEEN_COST
-from thinmap_ros.core.slam.matching.scan_matcher import Matcher
+from thinmap_ros.core.slam.matching.scan_matcher import Matcher, weighted_points
 
 MATCHER = Matcher()
-CELL_M = MATCHER.config.match_cell_m
-SIGMA_M = MATCHER.config.match_sigma_m
-NOISE = (SIGMA_M, MATCHER.config.match_outlier_m / SIGMA_M)
-FAR = MATCHER.config.match_reach_m / SIGMA_M
+CELL_M = LocalMapConfig().resolution_m
+SIGMA_M = MATCHER.config.noise_m
+NOISE = (SIGMA_M, MATCHER.config.kernel_scale_m / SIGMA_M)
+FAR = LocalMapConfig().max_wall_distance_m / SIGMA_M
 PLENTY = 1_000_000  # nodes
 ROOT_M = 4.0 * CELL_M  # half the size of a root
 
@@ -36,11 +37,11 @@ class Exhaustive:
     def costs(self, scan, poses, prior, information):
         """Costs (P,) of a scan (N, 3) at poses (P, 3), with that of the prior."""
         parts = np.array_split(poses, 1 + len(poses) // 2000)
-        by_scan = np.concatenate([self._of_points(scan, part) for part in parts])
+        scan_information = np.concatenate([self._of_points(scan, part) for part in parts])
         off = poses - prior
         off[:, 2] = se2.wrap(off[:, 2])
         squared = np.einsum('ni,ij,nj->n', off, information, off)
-        return by_scan + cauchy(squared, SLIP_SIGMAS)
+        return scan_information + cauchy(squared, SLIP_SIGMAS)
 
     def _of_points(self, scan, poses):
         c = np.cos(poses[:, 2:])
@@ -80,7 +81,7 @@ class Case:
         self.truth = np.array([*rng.uniform(1.0, 9.0, 2), rng.uniform(-3.0, 3.0)])
         poses = around(self.truth, int(rng.integers(3, 10)), rng)
         self.local_map = map_of(ROOM, poses, rng)
-        scan = MATCHER.weighted(seen_in(ROOM, self.truth, rng), np.zeros(3))[:, :3]
+        scan = weighted_points(seen_in(ROOM, self.truth, rng), np.zeros(3), CELL_M)[:, :3]
         self.scan = np.ascontiguousarray(scan[:: max(1, len(scan) // 45)])
         sigmas = rng.uniform(0.005, 0.04, 3) if slips else rng.uniform(0.05, 0.25, 3)
         self.information = np.linalg.inv(np.diag(sigmas**2))

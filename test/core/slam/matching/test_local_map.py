@@ -15,8 +15,8 @@ from thinmap_ros.core.grid.tiles import TILE
 from thinmap_ros.core.slam.matching import local_map as module
 from thinmap_ros.core.slam.matching.local_map import FIELDS, HERE, LocalMap, LocalMapConfig
 
-CELL_M = LocalMapConfig().match_cell_m
-REACH = round(LocalMapConfig().match_reach_m / CELL_M)
+CELL_M = LocalMapConfig().resolution_m
+REACH = round(LocalMapConfig().max_wall_distance_m / CELL_M)
 BOX = ROOM[6:]
 WITHOUT_BOX = ROOM[:6]
 NOTHING = np.empty((0, 5))
@@ -53,7 +53,7 @@ def cells_of(local_map):
 
 
 def walls_of(cells):
-    return cells['hits'] > LocalMapConfig().match_wall_share * cells['seen']
+    return cells['hits'] > LocalMapConfig().occupied_min_hit_ratio * cells['seen']
 
 
 def told(cells):
@@ -280,7 +280,7 @@ def test_an_empty_state_is_restored():
 
 
 def test_cells_of_another_size_are_refused(rng):
-    other = LocalMap(LocalMapConfig(match_cell_m=0.1))
+    other = LocalMap(LocalMapConfig(resolution_m=0.1))
     add_scan(other, ROOM, AROUND_BOX[0], rng)
     with pytest.raises(InputError, match=r'cells of 0\.1 m.*expected 0\.05 m'):
         LocalMap().restore(other.state())

@@ -8,7 +8,7 @@ from support.slam_room import ROOM, around, map_of, on_wall, seen_in
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam.matching import matching_cost
-from thinmap_ros.core.slam.matching.local_map import HERE, LocalMap, off_wall
+from thinmap_ros.core.slam.matching.local_map import HERE, LocalMap, LocalMapConfig, off_wall
 from thinmap_ros.core.slam.matching.matching_cost import (
     FITS_SIGMAS,
     SLIP_SIGMAS,
@@ -17,22 +17,22 @@ from thinmap_ros.core.slam.matching.matching_cost import (
     evaluate,
     minimize,
 )
-from thinmap_ros.core.slam.matching.scan_matcher import Matcher
+from thinmap_ros.core.slam.matching.scan_matcher import Matcher, weighted_points
 
 TRUTH = np.array([2.0, 2.0, 0.3])
 CORRIDOR = np.array([[-50.0, -1.0, 50.0, -1.0], [50.0, 1.0, -50.0, 1.0]])
 MATCHER = Matcher()
-SIGMA_M = MATCHER.config.match_sigma_m
-WIDTH = MATCHER.config.match_outlier_m / SIGMA_M
+SIGMA_M = MATCHER.config.noise_m
+WIDTH = MATCHER.config.kernel_scale_m / SIGMA_M
 NOISE = (SIGMA_M, WIDTH)
-CELL_M = MATCHER.config.match_cell_m
-FAR = MATCHER.config.match_reach_m / SIGMA_M
+CELL_M = LocalMapConfig().resolution_m
+FAR = LocalMapConfig().max_wall_distance_m / SIGMA_M
 DOUBT = np.diag(np.square([0.1, 0.1, 0.1]))
 AXES = np.eye(3)
 
 
 def weighted(points):
-    return MATCHER.weighted(points, np.zeros(3))
+    return weighted_points(points, np.zeros(3), CELL_M)
 
 
 @pytest.fixture

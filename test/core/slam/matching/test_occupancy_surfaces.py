@@ -9,9 +9,9 @@ from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import LastPose
-from thinmap_ros.core.slam.localizer import ScanLocalizer, ScanLocalizerConfig
+from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
 from thinmap_ros.core.slam.matching.local_map import LocalMap
-from thinmap_ros.core.slam.matching.occupancy_surfaces import wall_points
+from thinmap_ros.core.slam.matching.occupancy_surfaces import occupied_surface_points
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher
 
 START = np.array([2.0, 2.0, 0.0])
@@ -21,7 +21,7 @@ def test_points_lie_on_the_faces_that_are_turned_to_free_cells():
     cells = np.full((9, 9), 100, dtype=np.int8)
     cells[2:7, 3:8] = 0
     cells[:, 8] = -1
-    faces = wall_points(GridPatch(GridFrame(-1.0, 2.0, 0.1), cells))
+    faces = occupied_surface_points(GridPatch(GridFrame(-1.0, 2.0, 0.1), cells))
     right, left, up, down = (face.points for face in faces)
     # The room's walls are at x = -0.7 (left of it) and y = 2.2 and 2.7; on its right nothing is
     # known.
@@ -38,7 +38,7 @@ def test_normals_point_from_the_faces_to_free_cells():
     cells = np.full((9, 9), 100, dtype=np.int8)
     cells[2:7, 3:8] = 0
     patch = GridPatch(GridFrame(-1.0, 2.0, 0.1), cells)
-    faces = wall_points(patch)
+    faces = occupied_surface_points(patch)
     assert len({tuple(face.normal) for face in faces}) == 4
     for points, normal in faces:
         assert len(points) == 10
@@ -55,7 +55,7 @@ def test_faces_of_a_map_hold_a_robot_along_their_normals():
     cells = np.full((60, 80), 100, dtype=np.int8)
     cells[1:-1, 1:-1] = 0
     local_map = LocalMap()
-    for points, normal in wall_points(GridPatch(GridFrame(0.0, 0.0, 0.1), cells)):
+    for points, normal in occupied_surface_points(GridPatch(GridFrame(0.0, 0.0, 0.1), cells)):
         local_map.add_walls(points, normal)
     faces = np.array([[0.08, 0.08], [7.92, 0.08], [7.92, 5.92], [0.08, 5.92]])
     walls = np.hstack([faces, np.roll(faces, -1, axis=0)])
@@ -63,20 +63,20 @@ def test_faces_of_a_map_hold_a_robot_along_their_normals():
     prior = truth + [0.08, -0.06, 0.04]
     doubt = np.diag(np.square([0.1, 0.1, 0.1]))
     found = Matcher().match(seen_in(walls, truth), np.zeros(3), local_map, prior, doubt)
-    assert found.fit > 0.95
+    assert found.inlier_ratio > 0.95
     assert np.hypot(*(found.T_map_base - truth)[:2]) < 0.01
     assert abs(found.T_map_base[2] - truth[2]) < 0.003
 
 
 def test_a_map_without_walls_has_no_points():
     patch = GridPatch(GridFrame(0.0, 0.0, 0.1), np.zeros((5, 5), dtype=np.int8))
-    assert all(len(faces.points) == 0 for faces in wall_points(patch))
+    assert all(len(faces.points) == 0 for faces in occupied_surface_points(patch))
 
 
 def killed(config, seed, resolution, slip):
     """Farthest from the truth before it was killed, and after, m; the last estimate."""
     rng = np.random.default_rng(seed)
-    localizer = ScanLocalizer(config)
+    localizer = Localizer(config)
     last = None
     grid = OccupancyGrid(OccupancyConfig(resolution_m=resolution))
     off = se2.pose(slip[0], 0.0, slip[1])
@@ -94,7 +94,7 @@ def killed(config, seed, resolution, slip):
             begin = odom if k == 450 else begin
             slipped = se2.compose(se2.compose(begin, off), se2.between(begin, odom))
             if k == 450:
-                localizer = ScanLocalizer.resumed(grid.patch(), last, slipped, config)
+                localizer = Localizer.from_occupancy_map(grid.patch(), last, slipped, config)
             estimate = localizer.step(scan, slipped)
             after = max(after, float(np.hypot(*(estimate.T_map_base - truth)[:2])))
     return before, after, estimate
@@ -105,7 +105,7 @@ def killed(config, seed, resolution, slip):
 @pytest.mark.parametrize('slip', [(0.0, 0.0), (0.3, 0.2)])
 def test_a_killed_localizer_does_not_bend_the_map(seed, resolution, slip):
     """Killed for two metres while the wheels slip: then it is as true as its map, and a cell."""
-    config = ScanLocalizerConfig(start_x_m=2.0, start_y_m=2.0)
+    config = LocalizerConfig(initial_x_m=2.0, initial_y_m=2.0)
     before, worst, estimate = killed(config, seed, resolution, slip)
     assert not estimate.lost
     assert worst < before + 0.05

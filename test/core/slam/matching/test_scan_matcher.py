@@ -7,8 +7,8 @@ import pytest
 from support.slam_room import RANGE_MAX_M, ROOM, around, map_of, on_wall, scan_in, seen_in
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.slam.matching.local_map import LocalMap
-from thinmap_ros.core.slam.matching.scan_matcher import Matcher, MatcherConfig
+from thinmap_ros.core.slam.matching.local_map import LocalMap, LocalMapConfig
+from thinmap_ros.core.slam.matching.scan_matcher import Matcher, MatchingConfig, weighted_points
 from thinmap_ros.core.slam.matching.surface import surface_points
 
 TRUTH = np.array([2.0, 2.0, 0.3])
@@ -24,7 +24,7 @@ def match(local_map, points, prior, covariance=DOUBT):
 
 def nearest_minimum(local_map, points, prior, covariance):
     """The match without a search."""
-    scan = MATCHER.weighted(points, LASER)
+    scan = weighted_points(points, LASER, LocalMapConfig().resolution_m)
     information = np.linalg.inv(covariance)
     return MATCHER._refined(scan, local_map, prior, prior, information)
 
@@ -65,8 +65,8 @@ def test_the_pose_is_found_from_a_prior_beside_it(rng, room):
         for turn in np.radians([-5.0, 5.0]):
             shift = 0.1 * np.array([math.cos(direction), math.sin(direction)])
             found = match(room, seen_in(ROOM, TRUTH, rng), TRUTH + [*shift, turn])
-            assert found.fit > 0.9
-            assert found.contradicted < 0.05
+            assert found.inlier_ratio > 0.9
+            assert found.contradiction_ratio < 0.05
             assert found.prior_weight > 0.9
             errors.append(off(found))
     rms = np.sqrt(np.mean(np.square(errors), axis=0))
@@ -81,7 +81,7 @@ def test_the_errors_are_within_the_covariance(rng, room):
         found = match(room, seen_in(ROOM, TRUTH, rng), prior)
         error = off(found)
         sigmas.append(error @ np.linalg.solve(found.covariance, error))
-        assert np.linalg.eigvalsh(found.by_scan).min() > 0.0
+        assert np.linalg.eigvalsh(found.scan_information).min() > 0.0
     assert np.max(sigmas) < 16.3, 'three degrees of freedom, 99.9 %'
 
 
@@ -91,7 +91,7 @@ def test_the_covariance_is_that_of_scan_and_prior_together(rng, room):
     away = off(found, prior)
     squared = away @ np.linalg.solve(DOUBT, away)
     assert found.prior_weight == pytest.approx(1.0 / (1.0 + squared / 100.0))
-    information = found.by_scan + found.prior_weight * np.linalg.inv(DOUBT)
+    information = found.scan_information + found.prior_weight * np.linalg.inv(DOUBT)
     np.testing.assert_allclose(found.covariance @ information, np.eye(3), atol=1e-9)
 
 
@@ -142,7 +142,7 @@ def test_along_a_corridor_the_prior_decides(rng):
         assert abs(found.T_map_base[0] - prior[0]) < 0.03
         assert abs(found.T_map_base[1]) < 0.02
         assert abs(found.T_map_base[2]) < 0.01
-        assert found.by_scan[0, 0] < 0.01 * found.by_scan[1, 1]
+        assert found.scan_information[0, 0] < 0.01 * found.scan_information[1, 1]
         assert found.covariance[0, 0] > 0.3 * DOUBT[0, 0]
         assert found.covariance[1, 1] < 0.02 * DOUBT[1, 1]
 
@@ -156,7 +156,7 @@ def test_a_wide_covariance_is_searched_though_the_nearest_minimum_fits(rng):
     prior = np.array([0.6, 0.0, 0.0])
     covariance = np.diag(np.square([0.3, 0.05, 0.02]))
     alone = nearest_minimum(local_map, points, prior, covariance)
-    assert alone.fit > MATCHER.config.match_least_fit
+    assert alone.inlier_ratio > MATCHER.config.min_inlier_ratio
     assert abs(alone.T_map_base[0]) > 0.3
     assert abs(match(local_map, points, prior, covariance).T_map_base[0]) < 0.03
 
@@ -171,7 +171,7 @@ def test_an_unknown_heading_is_searched_though_the_nearest_minimum_fits(rng):
     prior = np.array([0.0, 0.0, 1.2])
     covariance = np.diag(np.square([0.03, 0.03, 0.6]))
     alone = nearest_minimum(local_map, points, prior, covariance)
-    assert alone.fit > 0.5
+    assert alone.inlier_ratio > 0.5
     assert abs(alone.T_map_base[2]) > 1.0
     assert abs(match(local_map, points, prior, covariance).T_map_base[2]) < 0.02
 
@@ -183,7 +183,7 @@ def test_a_robot_that_sees_no_end_of_a_corridor_goes_on_along_it():
     back = []
     for seed in range(12):
         rng = np.random.default_rng(seed)
-        local_map = LocalMap(MATCHER.config)
+        local_map = LocalMap()
         for x in np.arange(-10.0, 0.1, 1.0):
             pose = np.array([x, 0.0, 0.0])
             local_map.add_scan(surface_points(scan_in(CORRIDOR, pose, rng), 6.0), LASER, pose)
@@ -213,7 +213,7 @@ def test_a_scan_in_one_room_is_not_drawn_to_the_other_face_of_a_wall(rng, away_m
         for across in (-0.08, -0.05, 0.05, 0.08):
             prior = truth + [0.02, across, 0.02]
             found = match(local_map, seen_in(walls, truth, rng), prior)
-            assert found.fit > 0.9
+            assert found.inlier_ratio > 0.9
             errors.append(off(found, truth)[1])
     assert np.abs(errors).max() < 0.02
     assert abs(np.mean(errors[:4])) < 0.01
@@ -233,10 +233,12 @@ def test_in_a_crowd_the_prior_holds(seed, number):
     error = off(crowd)
     assert error @ np.linalg.solve(crowd.covariance, error) < 16.3
     assert np.hypot(*error[:2]) < 0.04
-    assert crowd.fit + crowd.contradicted > 0.9
-    assert crowd.contradicted > 0.1
+    assert crowd.inlier_ratio + crowd.contradiction_ratio > 0.9
+    assert crowd.contradiction_ratio > 0.1
     clean = match(room, seen_in(ROOM, TRUTH, rng), prior, wheels)
-    assert np.trace(crowd.by_scan) < np.trace(clean.by_scan), 'what is hidden says nothing'
+    assert np.trace(crowd.scan_information) < np.trace(clean.scan_information), (
+        'what is hidden says nothing'
+    )
 
 
 def test_a_search_never_makes_a_match_worse():
@@ -249,7 +251,7 @@ def test_a_search_never_makes_a_match_worse():
         prior = TRUTH + rng.normal(0.0, 0.05, 3)
         covariance = np.diag(np.square([0.05, 0.05, 0.05]))
         alone = nearest_minimum(room, points, prior, covariance)
-        searched += alone.fit < MATCHER.config.match_least_fit
+        searched += alone.inlier_ratio < MATCHER.config.min_inlier_ratio
         assert match(room, points, prior, covariance).cost <= alone.cost
     assert searched > 40
 
@@ -258,7 +260,7 @@ def test_two_thirds_of_gross_outliers_do_not_pull(rng, room):
     points = np.vstack([seen_in(ROOM, TRUTH, rng)[::2], clutter(rng, 160)])
     found = match(room, points, TRUTH, np.diag(np.square([0.01, 0.01, 0.01])))
     assert np.hypot(*off(found)[:2]) < 0.02
-    assert found.fit < 0.4
+    assert found.inlier_ratio < 0.4
 
 
 def test_some_outliers_do_not_pull(rng, room):
@@ -272,8 +274,8 @@ def test_some_outliers_do_not_pull(rng, room):
     points = surface_points(blocked, RANGE_MAX_M)
     found = match(room, points, TRUTH + [0.05, -0.03, 0.02])
     assert np.hypot(*off(found)[:2]) < 0.025
-    assert 0.05 < 1.0 - found.fit < 0.6
-    assert found.contradicted > 0.05
+    assert 0.05 < 1.0 - found.inlier_ratio < 0.6
+    assert found.contradiction_ratio > 0.05
 
 
 def test_a_new_wall_as_wide_as_a_door_does_not_pull_the_robot_to_a_known_one(rng):
@@ -284,7 +286,7 @@ def test_a_new_wall_as_wide_as_a_door_does_not_pull_the_robot_to_a_known_one(rng
     found = match(local_map, points, np.zeros(3), np.diag(np.square([0.01, 0.01, 0.05])))
     assert abs(found.T_map_base[1]) < 0.03
     assert abs(found.T_map_base[0]) < 0.01
-    assert found.fit < 0.9
+    assert found.inlier_ratio < 0.9
 
 
 def test_beyond_a_door_the_motion_decides_where_nothing_is_known(rng):
@@ -296,7 +298,7 @@ def test_beyond_a_door_the_motion_decides_where_nothing_is_known(rng):
         truth = np.array([4.1, 5.3, np.pi / 2.0])
         prior = truth + rng.normal(0.0, [0.01, 0.01, 0.01])
         found = match(local_map, seen_in(ROOM, truth, rng), prior, wheels)
-        assert found.fit < 0.8
+        assert found.inlier_ratio < 0.8
         assert np.hypot(*off(found, truth)[:2]) < 0.06
         assert abs(off(found, truth)[2]) < 0.04
 
@@ -304,30 +306,34 @@ def test_beyond_a_door_the_motion_decides_where_nothing_is_known(rng):
 def test_ground_that_is_new_contradicts_nothing(rng, room):
     """Through a door into what nobody has seen; the same amid what was seen does."""
     elsewhere = match(room, seen_in(ROOM, TRUTH, rng), TRUTH + [50.0, 0.0, 0.0])
-    assert elsewhere.contradicted == elsewhere.fit == 0.0
+    assert elsewhere.contradiction_ratio == elsewhere.inlier_ratio == 0.0
     np.testing.assert_allclose(elsewhere.T_map_base, TRUTH + [50.0, 0.0, 0.0])
-    np.testing.assert_allclose(elsewhere.by_scan, 0.0)
+    np.testing.assert_allclose(elsewhere.scan_information, 0.0)
     np.testing.assert_allclose(elsewhere.covariance, DOUBT, atol=1e-12)
     ring = np.linspace(-1.2, 1.2, 60)
     open_ground = on_wall(0.8 * np.column_stack([np.cos(ring), np.sin(ring)]))
     inside = match(room, open_ground, TRUTH, np.diag(np.square([0.01, 0.01, 0.01])))
-    assert inside.contradicted > 0.9
+    assert inside.contradiction_ratio > 0.9
 
 
 def test_a_point_counts_as_much_as_its_spacing():
     points = on_wall(np.column_stack([np.arange(5.0), np.ones(5)]))
     points[:, 4] = [0.01, 0.025, 0.05, 0.3, 2.0]
-    scan = MATCHER.weighted(points, np.array([0.5, 1.0, 0.0]))
+    scan = weighted_points(points, np.array([0.5, 1.0, 0.0]), LocalMapConfig().resolution_m)
     np.testing.assert_array_equal(scan[:, :2], points[:, :2])
     np.testing.assert_allclose(scan[:, 2], [0.2, 0.5, 1.0, 1.0, 1.0])
     np.testing.assert_allclose(scan[:, 3:], [[1.0, 0.0], *[[-1.0, 0.0]] * 4])
-    at_the_laser = MATCHER.weighted(points[:1], np.array([0.0, 1.0, 0.0]))
+    at_the_laser = weighted_points(
+        points[:1], np.array([0.0, 1.0, 0.0]), LocalMapConfig().resolution_m
+    )
     assert np.isfinite(at_the_laser).all()
 
 
 def test_a_scan_of_twice_the_beams_says_no_more_of_what_is_near(room):
     sparse, dense = (
-        match(room, surface_points(scan_in(ROOM, TRUTH, beams=beams), RANGE_MAX_M), TRUTH).by_scan
+        match(
+            room, surface_points(scan_in(ROOM, TRUTH, beams=beams), RANGE_MAX_M), TRUTH
+        ).scan_information
         for beams in (721, 1441)
     )
     np.testing.assert_allclose(np.diag(dense), np.diag(sparse), rtol=0.4)
@@ -378,8 +384,8 @@ def test_wide_headings_are_wrapped(rng):
 def test_another_configuration_is_used(rng, room):
     """Points that are twice as uncertain say a quarter."""
     points = seen_in(ROOM, TRUTH, rng)
-    timid = Matcher(MatcherConfig(match_sigma_m=0.1, match_outlier_m=0.3))
-    less = timid.match(points, LASER, room, TRUTH, DOUBT).by_scan
+    timid = Matcher(MatchingConfig(noise_m=0.1, kernel_scale_m=0.3))
+    less = timid.match(points, LASER, room, TRUTH, DOUBT).scan_information
     np.testing.assert_allclose(
-        np.diag(less), 0.25 * np.diag(match(room, points, TRUTH).by_scan), rtol=0.2
+        np.diag(less), 0.25 * np.diag(match(room, points, TRUTH).scan_information), rtol=0.2
     )

@@ -20,7 +20,7 @@ from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.pose_graph import Edge
-from thinmap_ros.core.slam.graph.trajectory import AnchoredPoses
+from thinmap_ros.core.slam.graph.trajectory import KeyframeTrajectory
 from thinmap_ros.core.slam.wall_compass import Heading
 
 _BUCKET_M = 4.0
@@ -33,10 +33,20 @@ _RADIAN_M = 1.0  # a radian of turn makes two scans as different as so many metr
 class KeyframeConfig(Config):
     """Parameters of keyframes."""
 
-    keyframe_m: float = parameter(
-        0.7, 'a scan is kept after a path of this length, m', low=0.1, high=10.0
+    distance_m: float = parameter(
+        0.7,
+        'Travelled distance after which a scan becomes a keyframe (m). Lower: more loop-closure '
+        'candidates, more memory.',
+        low=0.1,
+        high=10.0,
     )
-    keyframe_rad: float = parameter(0.7, 'or after a turn by this, rad', low=0.1, high=3.2)
+    angle_rad: float = parameter(
+        0.7,
+        'Rotation after which a scan becomes a keyframe (rad). Lower: more loop-closure '
+        'candidates, more memory.',
+        low=0.1,
+        high=3.2,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +75,7 @@ class Keyframes:
         self.frames: list[Keyframe] = []
         self.steps: list[Edge] = []  # to each keyframe but the first, from its anchor
         self._buckets = Buckets(_BUCKET_M)
-        self._path = AnchoredPoses()
+        self._path = KeyframeTrajectory()
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -75,7 +85,7 @@ class Keyframes:
         """Number of the keyframe that the robot was at last; -1 before the first."""
         return self._path.last
 
-    def keep(self, frame: Keyframe, step_covariance: Array) -> int:
+    def add(self, frame: Keyframe, step_covariance: Array) -> int:
         """Make a scan a keyframe; returns its number.
 
         step_covariance (3, 3): of its pose seen from the anchor's, in the frame of the anchor.
@@ -137,32 +147,32 @@ class Keyframes:
         """Stamps (N,) and poses (N, 3) of the scans that are keyframes, or for which one stands."""
         return self._path.stamps_ns, self._path.poses(self.poses())
 
-    def are_apart(self, T_a: Array, T_b: Array) -> bool:
+    def differ(self, T_a: Array, T_b: Array) -> bool:
         """Whether two poses (3,) do not see about the same."""
         x, y, turn = se2.between(T_a, T_b).tolist()
         config = self._config
-        return math.hypot(x, y) >= config.keyframe_m or abs(turn) >= config.keyframe_rad
+        return math.hypot(x, y) >= config.distance_m or abs(turn) >= config.angle_rad
 
     def near(self, T_map_base: Array, reach_m: float) -> list[int]:
         """Keyframes within a reach of a pose (3,), and some that are farther."""
         return self._buckets.near(float(T_map_base[0]), float(T_map_base[1]), reach_m)
 
-    def alike(self, T_map_base: Array) -> int | None:
+    def most_similar(self, T_map_base: Array) -> int | None:
         """The keyframe that sees most nearly the same as one at a pose (3,), or None."""
-        near = self.near(T_map_base, self._config.keyframe_m)
-        near = [k for k in near if not self.are_apart(self.frames[k].T_map_base, T_map_base)]
+        near = self.near(T_map_base, self._config.distance_m)
+        near = [k for k in near if not self.differ(self.frames[k].T_map_base, T_map_base)]
         if not near:
             return None
-        return min(near, key=lambda k: unlike(self.frames[k].T_map_base, T_map_base))
+        return min(near, key=lambda k: view_difference_m(self.frames[k].T_map_base, T_map_base))
 
 
-def unlike(T_a: Array, T_b: Array) -> float:
+def view_difference_m(T_a: Array, T_b: Array) -> float:
     """How differently two poses (3,) see, in m."""
     x, y, turn = se2.between(T_a, T_b).tolist()
     return float(math.hypot(x, y) + _RADIAN_M * abs(turn))
 
 
-def carried(covariance: Array, lever: Array) -> Array:
+def propagated_covariance(covariance: Array, lever: Array) -> Array:
     """Covariance (3, 3) of a pose that is bound to another one of that covariance, map frame.
 
     lever (2,): from the one to the other. Source: Smith, Self and Cheeseman, "Estimating uncertain
@@ -193,7 +203,7 @@ def inverse(matrix: Array) -> Array:
     return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
 
 
-def turned(covariance: Array, theta: float) -> Array:
+def rotated_covariance(covariance: Array, theta: float) -> Array:
     """Covariance (3, 3) of a relative pose, turned from a frame at theta to that of the map."""
     c = math.cos(theta)
     s = math.sin(theta)

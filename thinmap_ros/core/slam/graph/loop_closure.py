@@ -15,21 +15,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.config import parameter
+from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.estimate import Correction
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.keyframes import (
     Keyframe,
     KeyframeConfig,
     Keyframes,
-    carried,
     inverse,
-    turned,
-    unlike,
+    propagated_covariance,
+    rotated_covariance,
+    view_difference_m,
 )
 from thinmap_ros.core.slam.graph.pose_graph import Edge, optimized, rounds
 from thinmap_ros.core.slam.graph.submaps import AGAIN_M, Submaps
-from thinmap_ros.core.slam.matching.scan_matcher import Matcher
+from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
+from thinmap_ros.core.slam.matching.scan_matcher import Matcher, MatchingConfig
 
 _VISITS = 3  # earlier visits with which a keyframe is matched, at most
 _SIGMAS = 3.0
@@ -40,22 +41,44 @@ _RECENT = 8  # matches among which consistent ones are looked for
 
 
 @dataclass(frozen=True)
-class LoopConfig(KeyframeConfig):
+class LoopClosureConfig(Config):
     """Parameters of loop closure."""
 
-    loop_reach_m: float = parameter(
-        2.0, 'places nearer than this, and the uncertainty, are matched, m', low=0.1, high=20.0
+    search_radius_m: float = parameter(
+        2.0,
+        'Radius around the pose, in addition to its uncertainty, within which keyframes of earlier '
+        'visits are matched (m). Raise it if loops are missed, lower it to save time.',
+        low=0.1,
+        high=20.0,
     )
-    loop_fit: float = parameter(
-        0.75, 'share of points that must lie on the walls of an earlier visit', low=0.0, high=1.0
+    min_inlier_ratio: float = parameter(
+        0.75,
+        'Smallest ratio of points on the walls of an earlier visit for a loop-closure candidate. '
+        'Raise it against false loops, lower it where furniture moves.',
+        low=0.0,
+        high=1.0,
     )
-    loop_sigma_m: float = parameter(
-        0.05, 'uncertainty of a match of two visits, 1 sigma, m', low=0.001, high=1.0
+    noise_m: float = parameter(
+        0.05,
+        'Standard deviation of the position in a loop-closure edge (m). Raise it to change the '
+        'path less, lower it to trust loops more.',
+        low=0.001,
+        high=1.0,
     )
-    loop_sigma_rad: float = parameter(
-        0.02, 'uncertainty of a match of two visits, 1 sigma, rad', low=0.001, high=1.0
+    noise_rad: float = parameter(
+        0.02,
+        'Standard deviation of the heading in a loop-closure edge (rad). Raise it to change the '
+        'path less, lower it to trust loops more.',
+        low=0.001,
+        high=1.0,
     )
-    loop_matches: int = parameter(5, 'consistent matches that make a loop', low=1, high=_RECENT)
+    min_consistent_matches: int = parameter(
+        5,
+        'Number of consistent candidates that close a loop. Raise it against false loops, lower it '
+        'to close loops earlier.',
+        low=1,
+        high=_RECENT,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,26 +93,31 @@ class _Job:
 class LoopClosure:
     """The pose graph of the keyframes, and the search for edges that close loops."""
 
-    def __init__(self, config: LoopConfig, matcher: Matcher) -> None:
-        self.keyframes = Keyframes(config)
+    def __init__(
+        self,
+        config: LoopClosureConfig,
+        keyframes: KeyframeConfig,
+        matching: MatchingConfig,
+        local_map: LocalMapConfig,
+    ) -> None:
+        self.keyframes = Keyframes(keyframes)
         self.edges: list[Edge] = []
         self._config = config
         # By how much wheels may have slipped is part of the covariance along the graph.
-        self._matcher = Matcher(replace(matcher.config, slip_m=0.001, slip_rad=0.001))
+        self._matcher = Matcher(replace(matching, wheel_slip_m=0.001, wheel_slip_rad=0.001))
         self._jobs: deque[_Job] = deque()
         self._pending: tuple[Keyframe, Array] | None = None
         self._requested: deque[Edge] = deque(maxlen=_RECENT)
         self._here: Keyframe | None = None  # the last of them, kept or not
         self._is_strained = False  # whether a step, measured again, contradicts the poses
-        self._submaps = Submaps(matcher.config)
+        self._submaps = Submaps(local_map)
         self._rounds: Iterator[Array] | None = None
-        self._before: Array = np.zeros((0, 3))
         self._after: Array = np.zeros((0, 3))
 
-    def is_due(self, T_map_base: Array) -> bool:
+    def needs_keyframe(self, T_map_base: Array) -> bool:
         """Whether a scan at a pose (3,) is to be the next keyframe."""
         last = self._here
-        return last is None or self.keyframes.are_apart(last.T_map_base, T_map_base)
+        return last is None or self.keyframes.differ(last.T_map_base, T_map_base)
 
     def path_m(self, T_map_base: Array) -> float:
         """Length of the path up to a pose (3,), m, in straight lines between keyframes."""
@@ -104,7 +132,7 @@ class LoopClosure:
         jump (3, 3): what comes on top where scans and motion contradicted each other on the way;
         the step is then measured anew, by the keyframes before. The frame is the anchor's.
         """
-        self._settle()
+        self._add_pending()
         self._pending = (frame, step_covariance + jump)
         self._here = frame
         jumped = bool(jump.any()) and len(self.keyframes) > 0
@@ -112,21 +140,21 @@ class LoopClosure:
             anchor = self.keyframes.anchor
             theta = float(self.keyframes.frames[anchor].T_map_base[2])
             self._jobs.append(
-                _Job(anchor, len(self.keyframes), turned(step_covariance + jump, theta))
+                _Job(anchor, len(self.keyframes), rotated_covariance(step_covariance + jump, theta))
             )
         recent = None if jumped else self._recent_alike(frame)
         if recent is not None:
-            self._reuse(recent)
+            self._reuse_keyframe(recent)
             return
         self._jobs.extend(self._earlier_visits(frame))
         if jumped:
-            self._settle()
+            self._add_pending()
         if not self._is_pending_matched():
-            self._settle()
+            self._add_pending()
 
     def _recent_alike(self, frame: Keyframe) -> int | None:
         """A keyframe of this visit that sees about the same."""
-        j = self.keyframes.alike(frame.T_map_base)
+        j = self.keyframes.most_similar(frame.T_map_base)
         if j is None or self.keyframes.frames[j].submap != frame.submap:
             return None
         return j if frame.path_m - self.keyframes.frames[j].path_m < AGAIN_M else None
@@ -145,7 +173,7 @@ class LoopClosure:
         for i, (j, covariance) in enumerate(zip(near, covariances, strict=True)):
             sigma = math.sqrt(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
             if math.dist(frames[j].T_map_base[:2], here.T_map_base[:2]) <= self._reach_m(sigma):
-                ranked.append((unlike(frames[j].T_map_base, here.T_map_base), i))
+                ranked.append((view_difference_m(frames[j].T_map_base, here.T_map_base), i))
         ranked.sort()
         found: list[_Job] = []
         for _, i in ranked:
@@ -156,7 +184,7 @@ class LoopClosure:
 
     def _reach_m(self, sigma: float) -> float:
         """How far places that are matched may lie, where the place is uncertain by sigma, m."""
-        return self._config.loop_reach_m + min(_SIGMAS * sigma, _FARTHEST_M)
+        return self._config.search_radius_m + min(_SIGMAS * sigma, _FARTHEST_M)
 
     def _is_earlier(self, j: int, here: Keyframe) -> bool:
         frame = self.keyframes.frames[j]
@@ -169,23 +197,26 @@ class LoopClosure:
         poses = keyframes.poses()
         anchor = keyframes.anchor
         there = keyframes.covariances_from(anchor, poses, self.edges)
-        step = turned(self._pending[1], float(poses[anchor, 2]))
+        step = rotated_covariance(self._pending[1], float(poses[anchor, 2]))
         lever = here.T_map_base[:2] - poses[anchor, :2]
-        back = [carried(there[j], poses[anchor, :2] - poses[j, :2]) for j in near]
+        back = [propagated_covariance(there[j], poses[anchor, :2] - poses[j, :2]) for j in near]
         drift = [_drift(here.path_m - keyframes.frames[j].path_m) for j in near]
-        return [carried(there, lever) + step + own for there, own in zip(back, drift, strict=True)]
+        return [
+            propagated_covariance(there, lever) + step + own
+            for there, own in zip(back, drift, strict=True)
+        ]
 
-    def work(self) -> Correction | None:
+    def step(self) -> Correction | None:
         """Do one match that is due, or one round of the optimization; to be called once a step."""
         if self._rounds is not None:
             return self._optimize()
         if self._jobs:
             self._match(self._jobs.popleft())
             if not self._is_pending_matched():
-                self._settle()
+                self._add_pending()
             consistent = self._consistent()
-            if len(consistent) >= self._config.loop_matches:
-                self._settle()
+            if len(consistent) >= self._config.min_consistent_matches:
+                self._add_pending()
                 self._requested.clear()
                 self.edges += consistent
                 self._begin_rounds()
@@ -234,8 +265,7 @@ class LoopClosure:
         return k < len(self.keyframes) and self.keyframes.steps[k - 1].a == j
 
     def _begin_rounds(self) -> None:
-        self._before = self.keyframes.poses()
-        self._rounds = rounds(self._before, self._all_edges)
+        self._rounds = rounds(self.keyframes.poses(), self._all_edges)
 
     @property
     def _all_edges(self) -> list[Edge]:
@@ -253,37 +283,37 @@ class LoopClosure:
         else:
             base, submap = self._submaps.around(frames, j, here.path_m)
         config = self._config
-        floor = np.diag(np.square([2.0 * config.loop_sigma_m] * 2 + [2.0 * config.loop_sigma_rad]))
+        floor = np.diag(np.square([2.0 * config.noise_m] * 2 + [2.0 * config.noise_rad]))
         prior = se2.between(base, here.T_map_base)
-        relative = turned(job.covariance, -float(base[2])) + floor
+        relative = rotated_covariance(job.covariance, -float(base[2])) + floor
         match = self._matcher.match(here.points, here.scan.T_base_laser, submap, prior, relative)
-        if match.fit < config.loop_fit:
+        if match.inlier_ratio < config.min_inlier_ratio:
             return
-        own = np.diag(np.square([config.loop_sigma_m] * 2 + [config.loop_sigma_rad]))
-        covariance = inverse(match.by_scan + 1e-3 * np.eye(3)) + own
+        own = np.diag(np.square([config.noise_m] * 2 + [config.noise_rad]))
+        covariance = inverse(match.scan_information + 1e-3 * np.eye(3)) + own
         off = se2.off(match.T_map_base, prior)
         if float(off @ np.linalg.solve(relative + covariance, off)) > _CHI2:
             return
         T_j_base = se2.between(frames[j].T_map_base, base)
-        covariance = turned(covariance, float(T_j_base[2]))
+        covariance = rotated_covariance(covariance, float(T_j_base[2]))
         T_j_k = se2.compose(T_j_base, match.T_map_base)
         edge = Edge(j, k, T_j_k, inverse(covariance), True)
         if is_step:
             self.edges.append(edge)
             self._is_strained |= self._mahalanobis(edge) > _CHI2
         elif self._mahalanobis(edge) < _CHI2:
-            self._agree(edge)
+            self._confirm(edge)
         else:
             self._requested.append(edge)
 
-    def _agree(self, edge: Edge) -> None:
+    def _confirm(self, edge: Edge) -> None:
         """A match says that old and new map agree here."""
         here = self._frame(edge.b)
         self._requested.clear()
         if self._is_strained:
             # The robot has slid onto the old map: the loop is closed, the path up to it is bent.
             self._is_strained = False
-            self._settle()
+            self._add_pending()
             self.edges.append(edge)
             self._begin_rounds()
             return
@@ -291,21 +321,19 @@ class LoopClosure:
         if (
             pending is not None
             and edge.b == len(self.keyframes)
-            and not self.keyframes.are_apart(
-                self.keyframes.frames[edge.a].T_map_base, here.T_map_base
-            )
+            and not self.keyframes.differ(self.keyframes.frames[edge.a].T_map_base, here.T_map_base)
         ):
             anchor = self.keyframes.anchor
             if anchor != edge.a:
                 T_a_here = se2.between(self.keyframes.frames[anchor].T_map_base, here.T_map_base)
                 T_a_j = se2.compose(T_a_here, se2.invert(edge.T_a_b))
-                covariance = turned(inverse(edge.information), float(T_a_j[2]))
+                covariance = rotated_covariance(inverse(edge.information), float(T_a_j[2]))
                 lever = T_a_j[:2] - T_a_here[:2]
-                covariance = carried(covariance + pending[1], lever)
+                covariance = propagated_covariance(covariance + pending[1], lever)
                 self.edges.append(Edge(anchor, edge.a, T_a_j, inverse(covariance), True))
-            self._reuse(edge.a)
+            self._reuse_keyframe(edge.a)
             return
-        self._settle()
+        self._add_pending()
         self.edges.append(edge)
 
     def _mahalanobis(self, edge: Edge) -> float:
@@ -357,14 +385,14 @@ class LoopClosure:
         """Whether matches of the pending keyframe are due."""
         return bool(self._jobs) and self._jobs[-1].k == len(self.keyframes)
 
-    def _settle(self) -> None:
+    def _add_pending(self) -> None:
         """Make the pending keyframe one, if there is one."""
         if self._pending is not None:
             frame, covariance = self._pending
             self._pending = None
-            self.keyframes.keep(frame, covariance)
+            self.keyframes.add(frame, covariance)
 
-    def _reuse(self, j: int) -> None:
+    def _reuse_keyframe(self, j: int) -> None:
         """Have an earlier keyframe stand for the pending one."""
         assert self._pending is not None
         frame, _ = self._pending
@@ -377,7 +405,7 @@ class LoopClosure:
         """Do all matches that are due; poses (N, 3) of the keyframes that agree best with all."""
         while self._jobs:
             self._match(self._jobs.popleft())
-        self._settle()
+        self._add_pending()
         return optimized(self.keyframes.poses(), self._all_edges)
 
 

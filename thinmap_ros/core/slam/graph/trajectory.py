@@ -9,7 +9,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import Array
 
 
-class AnchoredPoses:
+class KeyframeTrajectory:
     """Poses with their stamps, each seen from a keyframe, or from the map where there was none yet.
 
     36 bytes each.

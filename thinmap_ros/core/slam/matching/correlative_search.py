@@ -14,7 +14,7 @@ import numpy as np
 from thinmap_ros.core.grid.tiles import NO_TILE, TILE
 from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.matching.local_map import HERE, Lattice, cell_of, slot_of
+from thinmap_ros.core.slam.matching.local_map import HERE, LocalMapView, cell_of, slot_of
 from thinmap_ros.core.slam.matching.matching_cost import UNSEEN_COST, by_prior, far_cost, loss
 
 _ROOT = 4.0  # half the size of a root node, in cells
@@ -27,7 +27,7 @@ _MASK = TILE - 1
 def _cost(
     scan: Array,
     pose: Array,
-    lattice: Lattice,
+    lattice: LocalMapView,
     sigma: float,
     width: float,
     slack: float,
@@ -85,7 +85,7 @@ def search(
     information: Array,
     half: Array,
     incumbent: Array,
-    lattice: Lattice,
+    lattice: LocalMapView,
     sigma: float,
     width: float,
     most_nodes: int,

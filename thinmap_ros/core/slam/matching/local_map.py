@@ -50,23 +50,43 @@ _FAR_M = 1e4  # walls of an occupancy map are seen from so far in front of them
 class LocalMapConfig(Config):
     """Parameters of the local map."""
 
-    match_cell_m: float = parameter(0.05, 'edge of a cell of the local map, m', low=0.01, high=0.5)
-    match_range_m: float = parameter(30.0, 'farther points are not matched, m', low=1.0, high=200.0)
-    match_reach_m: float = parameter(
+    resolution_m: float = parameter(
+        0.05,
+        'Edge of a cell of the local map (m). Lower: more accurate and more memory.',
+        low=0.01,
+        high=0.5,
+    )
+    max_wall_distance_m: float = parameter(
         0.5,
-        f'a point looks for the nearest wall within, m; at most {TILE - 1} cells',
+        'Largest distance at which a point still finds its wall (m); at most '
+        f'{TILE - 1} cells. Raise for a robot with poor odometry, lower to save time.',
         low=0.05,
         high=2.0,
     )
-    match_wall_share: float = parameter(
+    occupied_min_hit_ratio: float = parameter(
         0.25,
-        'share of hits among the observations of a cell that make it a wall',
+        'Smallest ratio of hits to observations with which a cell is a wall. Raise it where moving '
+        'people leave walls behind, lower it for thin walls and poles.',
         low=0.01,
         high=0.95,
     )
+    update_distance_m: float = parameter(
+        0.2,
+        'Travelled distance after which a scan is added to the local map (m). Lower: a denser map '
+        'and more computing time.',
+        low=0.0,
+        high=5.0,
+    )
+    update_angle_rad: float = parameter(
+        0.2,
+        'Rotation after which a scan is added to the local map (rad). Lower: a denser map and more '
+        'computing time.',
+        low=0.0,
+        high=3.0,
+    )
 
 
-class Lattice(NamedTuple):
+class LocalMapView(NamedTuple):
     """The cells as kernels take them.
 
     pool: tiles of cells, CELL; directory: the slot of each tile, or NO_TILE; first_row, first_col:
@@ -94,22 +114,22 @@ class LocalMap:
         return self.tiles.used == 0
 
     @property
-    def lattice(self) -> Lattice:
+    def lattice(self) -> LocalMapView:
         """The cells as kernels take them, until the map grows."""
         tiles = self.tiles
-        return Lattice(
+        return LocalMapView(
             tiles.pool,
             tiles.directory,
             tiles.first_row * TILE,
             tiles.first_col * TILE,
-            self.config.match_cell_m,
+            self.config.resolution_m,
             self._reach_cells,
         )
 
     @property
     def _reach_cells(self) -> int:
-        """`match_reach_m` in cells; less than a tile: of others, only neighbours are touched."""
-        cells = math.ceil(self.config.match_reach_m / self.config.match_cell_m)
+        """`max_wall_distance_m` in cells; less than a tile, so that only neighbours are read."""
+        cells = math.ceil(self.config.max_wall_distance_m / self.config.resolution_m)
         return min(int(cells), TILE - 1)
 
     def add_scan(self, points: Array, T_base_laser: Array, T_map_base: Array) -> None:
@@ -119,7 +139,7 @@ class LocalMap:
         laser = np.ascontiguousarray(T_base_laser[:2])
         ends_map = se2.transform_points(T_map_base, points[:, :2])
         self._reach(ends_map, se2.transform_points(T_map_base, laser[None])[0])
-        _add(points, laser, T_map_base, self.lattice, self.config.match_wall_share)
+        _add(points, laser, T_map_base, self.lattice, self.config.occupied_min_hit_ratio)
 
     def distances(self, points_map: Array) -> Array:
         """Distances (N,) of points (N, 2) from the walls, m; the reach where none is near."""
@@ -128,7 +148,7 @@ class LocalMap:
     def add_walls(self, points_map: Array, normal: Array) -> None:
         """Add points (N, 2), map frame, of walls with a normal (2,), as of an occupancy map."""
         if len(points_map):
-            cells = np.floor(points_map / self.config.match_cell_m).astype(np.int64)
+            cells = np.floor(points_map / self.config.resolution_m).astype(np.int64)
             _, once = np.unique(cells, axis=0, return_index=True)
             points = np.zeros((len(once), COLUMNS))
             points[:, :2] = points_map[np.sort(once)]
@@ -136,14 +156,14 @@ class LocalMap:
             points[:, 3] = 2.0 * normal[0] * normal[1]
             self._reach(np.ascontiguousarray(points[:, :2]), points[0, :2])
             far = points[:, :2].mean(axis=0) + _FAR_M * normal
-            _hit(points, far, np.zeros(3), self.lattice, self.config.match_wall_share)
+            _hit(points, far, np.zeros(3), self.lattice, self.config.occupied_min_hit_ratio)
 
     def state(self) -> dict[str, NDArray[Any]]:
         """All cells as arrays by name, for `restore`."""
         tiles = self.tiles
         cells = tiles.pool[: tiles.used]
         return {
-            'cell_m': np.array(self.config.match_cell_m),
+            'cell_m': np.array(self.config.resolution_m),
             'tiles': tiles.places(),
             'hits': cells['hits'],
             'seen': cells['seen'],
@@ -158,7 +178,7 @@ class LocalMap:
         Raises InputError where they are of another size, or lie too far apart for one map.
         """
         cell_m = float(state['cell_m'])
-        own = self.config.match_cell_m
+        own = self.config.resolution_m
         snapshot.require(cell_m == own, f'local map: cells of {cell_m} m', f'{own} m')
         places = state['tiles']
         if not len(places):
@@ -178,12 +198,12 @@ class LocalMap:
         cells['sin2'] = state['normals'][..., 1]
         cells['face_x'] = state['faces'][..., 0]
         cells['face_y'] = state['faces'][..., 1]
-        _lead(places * TILE, self.lattice, self.config.match_wall_share)
+        _lead(places * TILE, self.lattice, self.config.occupied_min_hit_ratio)
 
     def _reach(self, points_map: Array, laser_map: Array) -> None:
         """Have all tiles that the beams touch, and those within reach of their ends."""
-        reach = self._reach_cells * self.config.match_cell_m
-        edge_m = TILE * self.config.match_cell_m
+        reach = self._reach_cells * self.config.resolution_m
+        edge_m = TILE * self.config.resolution_m
         both = np.vstack([points_map, laser_map])
         low = np.floor((both.min(axis=0) - reach) / edge_m).astype(np.int64)[::-1]
         high = np.floor((both.max(axis=0) + reach) / edge_m).astype(np.int64)[::-1]
@@ -216,7 +236,7 @@ def cell_of(at: float) -> int:
 
 
 @inlined
-def slot_of(lattice: Lattice, row: int, col: int) -> int:
+def slot_of(lattice: LocalMapView, row: int, col: int) -> int:
     """Slot of the tile with a cell, counted from the first one, or NO_TILE."""
     tile_row = row >> _SHIFT
     tile_col = col >> _SHIFT
@@ -228,7 +248,7 @@ def slot_of(lattice: Lattice, row: int, col: int) -> int:
 
 
 @inlined
-def off_wall(lattice: Lattice, x: float, y: float) -> tuple[bool, bool, float, float, Any]:
+def off_wall(lattice: LocalMapView, x: float, y: float) -> tuple[bool, bool, float, float, Any]:
     """What a point (x, y), in cells, is off its nearest wall.
 
     Returns whether a beam has met or crossed the point's cell, whether a wall is within reach, what
@@ -250,7 +270,7 @@ def off_wall(lattice: Lattice, x: float, y: float) -> tuple[bool, bool, float, f
 
 
 @kernel
-def _distances(points: Array, lattice: Lattice) -> Array:
+def _distances(points: Array, lattice: LocalMapView) -> Array:
     """Distances (N,) of points (N, 2) from the means of their nearest walls, m."""
     found = np.full(len(points), lattice.reach * lattice.cell_m)
     for i in range(len(points)):
@@ -307,7 +327,9 @@ def _observe(cell: Any, hit: int) -> None:
 
 
 @kernel
-def _add(points: Array, laser: Array, T_map_base: Array, lattice: Lattice, share: float) -> None:
+def _add(
+    points: Array, laser: Array, T_map_base: Array, lattice: LocalMapView, share: float
+) -> None:
     """Count what beams went through, then where they ended; update the nearest walls."""
     cos = math.cos(T_map_base[2])
     sin = math.sin(T_map_base[2])
@@ -365,7 +387,9 @@ def _learn_surface(cell: Any, x: float, y: float, normal: tuple[float, float, fl
 
 
 @kernel
-def _hit(points: Array, laser: Array, T_map_base: Array, lattice: Lattice, share: float) -> None:
+def _hit(
+    points: Array, laser: Array, T_map_base: Array, lattice: LocalMapView, share: float
+) -> None:
     """Count the points that beams met."""
     cos = math.cos(T_map_base[2])
     sin = math.sin(T_map_base[2])
@@ -399,7 +423,7 @@ def _hit(points: Array, laser: Array, T_map_base: Array, lattice: Lattice, share
 @kernel
 def _lead(
     corners: NDArray[np.int64],
-    lattice: Lattice,
+    lattice: LocalMapView,
     share: float,
 ) -> None:
     """Have all cells of tiles with first cells (N, 2) know their nearest walls."""
@@ -414,7 +438,7 @@ def _lead(
 
 
 @kernel
-def _appear(lattice: Lattice, row: int, col: int) -> None:
+def _appear(lattice: LocalMapView, row: int, col: int) -> None:
     """A cell has become a wall: those around to which it is the nearest lead there."""
     for down in range(-lattice.reach, lattice.reach + 1):
         for right in range(-lattice.reach, lattice.reach + 1):
@@ -431,7 +455,7 @@ def _appear(lattice: Lattice, row: int, col: int) -> None:
 
 
 @kernel
-def _vanish(lattice: Lattice, gone: list[tuple[int, int]], share: float) -> None:
+def _vanish(lattice: LocalMapView, gone: list[tuple[int, int]], share: float) -> None:
     """Cells are walls no more: those that led there take the nearest wall of their neighbours."""
     led = [(0, 0) for _ in range(0)]
     for row, col in gone:
@@ -456,7 +480,7 @@ def _vanish(lattice: Lattice, gone: list[tuple[int, int]], share: float) -> None
 
 
 @inlined
-def _ask(lattice: Lattice, row: int, col: int) -> bool:
+def _ask(lattice: LocalMapView, row: int, col: int) -> bool:
     """Whether one of its neighbours knows a nearer wall for a cell, which leads there then."""
     changed = False
     cell = lattice.pool[slot_of(lattice, row, col), row & _MASK, col & _MASK]

@@ -14,7 +14,7 @@ import numpy as np
 
 from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.slam.matching.local_map import Lattice, off_wall
+from thinmap_ros.core.slam.matching.local_map import LocalMapView, off_wall
 
 SLIP_SIGMAS = 10.0  # of a prior, beyond which wheels have rather slipped than scans erred
 FITS_SIGMAS = 2.0  # of a point, within which it lies on its wall
@@ -35,7 +35,7 @@ def loss(squared: float, width: float) -> float:
 
 
 @inlined
-def far_cost(lattice: Lattice, sigma: float, width: float) -> float:
+def far_cost(lattice: LocalMapView, sigma: float, width: float) -> float:
     """Cost of a point in the open, out of reach of any wall."""
     off = lattice.reach * lattice.cell_m / sigma
     return loss(off * off, width)
@@ -64,7 +64,7 @@ def _normal_matrix(cos2: float, sin2: float) -> tuple[float, float, float]:
 
 @kernel
 def evaluate(
-    scan: Array, pose: Array, lattice: Lattice, sigma: float, width: float
+    scan: Array, pose: Array, lattice: LocalMapView, sigma: float, width: float
 ) -> tuple[Array, Array, Array]:
     """Normal equations H (3, 3), g (3,) of a scan at a pose (3,), and sums (5,).
 
@@ -135,7 +135,7 @@ def minimize(
     start: Array,
     prior: Array,
     information: Array,
-    lattice: Lattice,
+    lattice: LocalMapView,
     sigma: float,
     width: float,
 ) -> tuple[Array, Array, Array, float]:

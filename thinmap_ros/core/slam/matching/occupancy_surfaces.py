@@ -13,14 +13,14 @@ from thinmap_ros.core.se2 import Array
 _SIDES = ((0, 1), (0, -1), (1, 0), (-1, 0))
 
 
-class Faces(NamedTuple):
+class WallFaces(NamedTuple):
     """Points (N, 2) on walls, m, in order along each, and the normal (2,) of all of them."""
 
     points: Array
     normal: Array
 
 
-def wall_points(patch: GridPatch) -> list[Faces]:
+def occupied_surface_points(patch: GridPatch) -> list[WallFaces]:
     """Points on the faces of a map's occupied cells towards free ones, for each of four sides.
 
     A beam fills the cell that lies surface_depth_m behind what it met. So the surface is on average
@@ -30,7 +30,7 @@ def wall_points(patch: GridPatch) -> list[Faces]:
     return [_faces(patch, row, col, depth_m) for row, col in _SIDES]
 
 
-def _faces(patch: GridPatch, row: int, col: int, depth_m: float) -> Faces:
+def _faces(patch: GridPatch, row: int, col: int, depth_m: float) -> WallFaces:
     """The faces of the occupied cells towards the neighbour at (row, col)."""
     rows, cols = patch.shape
     free = np.zeros((rows, cols), dtype=np.bool_)
@@ -43,7 +43,7 @@ def _faces(patch: GridPatch, row: int, col: int, depth_m: float) -> Faces:
     middles = patch.frame.centres_of(cells) + (0.5 * edge - depth_m) * side
     along = 0.25 * edge * np.abs(side[::-1])
     points = np.stack([middles - along, middles + along], axis=1).reshape(-1, 2)
-    return Faces(points, side)
+    return WallFaces(points, side)
 
 
 def _along(cells: NDArray[np.int64], row: int) -> NDArray[np.int64]:

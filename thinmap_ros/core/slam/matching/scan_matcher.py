@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thinmap_ros.core.config import parameter
+from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.keyframes import inverse
 from thinmap_ros.core.slam.matching.correlative_search import search
-from thinmap_ros.core.slam.matching.local_map import LocalMap, LocalMapConfig
+from thinmap_ros.core.slam.matching.local_map import LocalMap
 from thinmap_ros.core.slam.matching.matching_cost import minimize
 
 FEWEST_POINTS = 10
@@ -26,26 +26,49 @@ _MOST_NODES = 1000
 
 
 @dataclass(frozen=True)
-class MatcherConfig(LocalMapConfig):
+class MatchingConfig(Config):
     """Parameters of scan matching."""
 
-    match_sigma_m: float = parameter(
-        0.05, 'uncertainty of a point on its wall (1 sigma), m', low=0.001, high=1.0
+    max_range_m: float = parameter(
+        30.0,
+        'Points beyond this range are not matched (m). Set it to the usable range of the laser.',
+        low=1.0,
+        high=200.0,
     )
-    match_outlier_m: float = parameter(
-        0.15, 'points this far from the nearest wall count half, m', low=0.001, high=1.0
+    noise_m: float = parameter(
+        0.05,
+        'Standard deviation of a scan point around its wall (m). Raise it for a noisy laser or '
+        'rough walls, lower it to trust scans more than odometry.',
+        low=0.001,
+        high=1.0,
     )
-    match_least_fit: float = parameter(
+    kernel_scale_m: float = parameter(
+        0.15,
+        'Distance from its wall at which a point has half its weight (m). Raise it if the robot '
+        'loses its pose in fast turns, lower it where many points belong to people.',
+        low=0.001,
+        high=1.0,
+    )
+    min_inlier_ratio: float = parameter(
         0.6,
-        'share of the points near walls below which the surroundings are searched',
+        'Ratio of inliers below which poses around the prediction are searched. Raise it to search '
+        'more often, lower it in crowds.',
         low=0.0,
         high=1.0,
     )
-    slip_m: float = parameter(
-        0.2, 'error of the motion where wheels have slipped, m', low=0.001, high=5.0
+    wheel_slip_m: float = parameter(
+        0.2,
+        'Standard deviation of the position after wheels have slipped (m): how far is searched. '
+        'Raise it for slippery floors, lower it to save time.',
+        low=0.001,
+        high=5.0,
     )
-    slip_rad: float = parameter(
-        0.15, 'error of the motion where wheels have slipped, rad', low=0.001, high=3.0
+    wheel_slip_rad: float = parameter(
+        0.15,
+        'Standard deviation of the heading after wheels have slipped (rad): how far is searched. '
+        'Raise it for slippery floors, lower it to save time.',
+        low=0.001,
+        high=3.0,
     )
 
 
@@ -53,16 +76,16 @@ class MatcherConfig(LocalMapConfig):
 class Match:
     """A pose T_map_base (3,) with covariance (3, 3), map frame, of scan and prior together.
 
-    by_scan (3, 3): information of the scan alone; fit: share of the points on walls; contradicted:
-    share that lies where others have seen that nothing is; cost: what was minimized;
+    scan_information (3, 3): of the scan alone; inlier_ratio: of points on walls;
+    contradiction_ratio: of points in cells that others have observed to be free; cost: the minimum;
     prior_weight: of the prior in it, less than 1 where the pose is an outlier to it.
     """
 
     T_map_base: Array
     covariance: Array
-    by_scan: Array
-    fit: float
-    contradicted: float
+    scan_information: Array
+    inlier_ratio: float
+    contradiction_ratio: float
     cost: float
     prior_weight: float
 
@@ -70,8 +93,8 @@ class Match:
 class Matcher:
     """Finds the pose at which a scan fits a local map."""
 
-    def __init__(self, config: MatcherConfig | None = None) -> None:
-        self.config = config or MatcherConfig()
+    def __init__(self, config: MatchingConfig | None = None) -> None:
+        self.config = config or MatchingConfig()
 
     def match(
         self,
@@ -85,16 +108,16 @@ class Matcher:
 
         points (N, 5): surface points, robot frame; T_base_laser (3,): where the laser is.
         """
-        scan = self.weighted(points, T_base_laser)
+        scan = weighted_points(points, T_base_laser, local_map.config.resolution_m)
         information = inverse(covariance)
         match = self._refined(scan, local_map, prior, prior, information)
         reach = _SIGMAS * np.sqrt(np.diag(covariance))
-        fits_badly = match.fit < self.config.match_least_fit
+        fits_badly = match.inlier_ratio < self.config.min_inlier_ratio
         is_wide = max(reach[0], reach[1]) > _BASIN[0] or reach[2] > _BASIN[1]
         if not fits_badly and not is_wide:
             return match
         if fits_badly:  # wheels may have slipped
-            slip = np.array([self.config.slip_m, self.config.slip_m, self.config.slip_rad])
+            slip = np.array([*[self.config.wheel_slip_m] * 2, self.config.wheel_slip_rad])
             reach = _SIGMAS * np.sqrt(np.diag(covariance) + slip**2)
         start = search(
             _thinned(scan),
@@ -109,39 +132,41 @@ class Matcher:
         other = self._refined(scan, local_map, start, prior, information)
         return other if other.cost < match.cost else match
 
-    def weighted(self, points: Array, T_base_laser: Array) -> Array:
-        """A scan as the kernels take it (N, 5): x, y, weight, and the direction to the laser.
-
-        Points nearer to each other than a cell see the same piece of wall, and count once.
-        """
-        weights = np.minimum(points[:, 4] / self.config.match_cell_m, 1.0)
-        back = T_base_laser[:2] - points[:, :2]
-        back /= np.maximum(np.hypot(back[:, 0], back[:, 1]), 1e-6)[:, None]
-        return np.column_stack([points[:, :2], weights, back])
-
     @property
     def _noise(self) -> tuple[float, float]:
         """Standard deviation of a point on its wall, m, and in these the width of the loss."""
         config = self.config
-        return config.match_sigma_m, config.match_outlier_m / config.match_sigma_m
+        return config.noise_m, config.kernel_scale_m / config.noise_m
 
     def _refined(
         self, scan: Array, local_map: LocalMap, start: Array, prior: Array, information: Array
     ) -> Match:
-        pose, by_scan, sums, weight = minimize(
+        pose, scan_information, sums, weight = minimize(
             scan, start, prior, information, local_map.lattice, *self._noise
         )
         cost, total, fitting, in_the_open, _ = sums.tolist()
-        covariance = np.linalg.inv(by_scan + weight * information)
+        covariance = np.linalg.inv(scan_information + weight * information)
         return Match(
             pose,
             np.asarray(covariance),
-            by_scan,
+            scan_information,
             fitting / max(total, 1e-9),
             in_the_open / max(total, 1e-9),
             cost,
             weight,
         )
+
+
+def weighted_points(points: Array, T_base_laser: Array, resolution_m: float) -> Array:
+    """Points of a scan as the kernels need them: x, y, weight, and the direction to the laser.
+
+    points (N, 5): surface points, robot frame. Returns (N, 5). Points closer to each other than a
+    cell observe the same piece of wall, and count once.
+    """
+    weights = np.minimum(points[:, 4] / resolution_m, 1.0)
+    back = T_base_laser[:2] - points[:, :2]
+    back /= np.maximum(np.hypot(back[:, 0], back[:, 1]), 1e-6)[:, None]
+    return np.column_stack([points[:, :2], weights, back])
 
 
 def _thinned(scan: Array) -> Array:

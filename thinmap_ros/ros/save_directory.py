@@ -15,16 +15,16 @@ from thinmap_ros.ros import parameters
 _LONGEST_PATH = 1000
 
 
-class SaveFolder:
+class SaveDirectory:
     """The folder below which the paths of a node's services lie."""
 
     def __init__(self, node: Node) -> None:
         """Declare the parameter `save_folder`; empty: the working directory of the node."""
         description = 'folder below which services save and load; empty: the working directory'
-        given = parameters.declare_value(node, 'save_folder', '', description)
+        given = parameters.declare_parameter(node, 'save_folder', '', description)
         self.path = Path(str(given)).resolve()
 
-    def inside(self, given: str) -> str:
+    def resolve(self, given: str) -> str:
         """Return the absolute path of what a service names below this folder, links resolved.
 
         Raises InputError where it, or a file of the session that it names, is elsewhere.
