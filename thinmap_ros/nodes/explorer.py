@@ -22,7 +22,7 @@ from thinmap_ros.core.exploration.strategy import Decision, EndNode
 from thinmap_ros.core.grid.map_mirror import MapMirror
 from thinmap_ros.core.se2 import Array, wrap
 from thinmap_ros.core.stamp_matcher import StampMatcher
-from thinmap_ros.files import sessions
+from thinmap_ros.files.sessions import EXPLORATION
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.action_server import Outcome, SingleGoalServer
@@ -67,7 +67,7 @@ class ExplorerNode(ThinmapNode):
         """Forget map, graph and what was explored, or go back to the session of the start."""
         # What was learned is kept for the next goal, until an exploration is finished.
         self._learned = (
-            sessions.load_exploration(self._session, self._config) if self._session else None
+            EXPLORATION.load_optional(self._session, self._config) if self._session else None
         )
         self._polygon = np.empty((0, 2))
         self._map = MapMirror()
@@ -171,7 +171,7 @@ class ExplorerNode(ThinmapNode):
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:
             path = self._save_directory.resolve(request.path)
-            return f'saved {sessions.save_exploration(path, self._explorer)}'
+            return f'saved {EXPLORATION.save(path, self._explorer)}'
 
         return fill_response(response, save)
 

@@ -1,13 +1,10 @@
 """The occupancy grid: each scan is added at the pose that the localizer found for it."""
 
-from collections.abc import Callable
-
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid as OccupancyGridMsg
 from nav_msgs.msg import Path
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.client import Client
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.srv import LoadMap, SaveMap
@@ -24,11 +21,11 @@ from thinmap_ros.ros.checkpoint import State
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.save_directory import SaveDirectory
-from thinmap_ros.ros.services import call, fill_response
+from thinmap_ros.ros.services import fill_response
+from thinmap_ros.ros.session_client import SessionClient
 from thinmap_ros.ros.subscription import subscribe_guarded
 
 _LOST_SIGMA_M = 200.0  # a pose that is not known better than this is that of a lost robot
-_NO_BUILDER = 'no graph: there is no topology_builder'
 
 
 class GridMapperNode(ThinmapNode):
@@ -72,13 +69,7 @@ class GridMapperNode(ThinmapNode):
         aside = ReentrantCallbackGroup()
         self.create_service(SaveMap, 'save_map', self._on_save, callback_group=aside)
         self.create_service(LoadMap, 'load_map', self._on_load)
-        self._save_topology = self.create_client(SaveMap, 'save_topology', callback_group=aside)
-        self._save_exploration = self.create_client(
-            SaveMap, 'save_exploration', callback_group=aside
-        )
-        self._save_features = self.create_client(SaveMap, 'save_features', callback_group=aside)
-        self._load_features = self.create_client(LoadMap, 'load_features', callback_group=aside)
-        self._load_topology = self.create_client(LoadMap, 'load_topology', callback_group=aside)
+        self._session_client = SessionClient(self, aside)
         self.create_active_timer(1.0, self._publish_map)
 
     def reset_state(self) -> None:
@@ -179,60 +170,26 @@ class GridMapperNode(ThinmapNode):
         self, request: SaveMap.Request, response: SaveMap.Response
     ) -> SaveMap.Response:
         fill_response(response, lambda: self._save_grid(self._save_directory.resolve(request.path)))
-        if not response.success:
-            return response
-        path = str(sessions.stem_of(self._save_directory.resolve(request.path)))
-        graph = await call(self, self._save_topology, SaveMap.Request(path=path))
-        if graph is None:
-            saved = response.message
-            fill_response(
-                response, lambda: f'{saved}; {_NO_BUILDER}{sessions.set_topology_aside(path)}'
-            )
-        else:
-            response.success = graph.success
-            response.message = f'{response.message}; {graph.message}'
-        await self._save_at(self._save_features, path, sessions.set_features_aside, response)
-        await self._save_at(self._save_exploration, path, sessions.set_exploration_aside, response)
+        if response.success:
+            others = await self._session_client.save(self._save_directory.resolve(request.path))
+            response.success = others.success
+            response.message = f'{response.message}; {others.message}'
         return response
-
-    async def _save_at(
-        self, client: Client, path: str, set_aside: Callable[[str], str], response: SaveMap.Response
-    ) -> None:
-        """Have another node save its part.
-
-        Without that node, what is there of an earlier map must not pass for this one's.
-        """
-        saved = response.message
-        part = await call(self, client, SaveMap.Request(path=path))
-        if part is not None:
-            response.success = response.success and part.success
-            response.message = f'{saved}; {part.message}'
-        elif response.success:
-            fill_response(response, lambda: f'{saved}{set_aside(path)}')
 
     async def _on_load(
         self, request: LoadMap.Request, response: LoadMap.Response
     ) -> LoadMap.Response:
-        """Take over grid and graph, or neither."""
+        """Load grid and graph, or neither."""
         try:
-            inside = self._save_directory.resolve(request.path)
-            grid = sessions.load_grid(inside, self._config, self._save_directory.path)
-            stem = str(sessions.stem_of(inside))
-            path = stem if sessions.has_topology(stem) else ''
+            path = self._save_directory.resolve(request.path)
+            grid = sessions.load_grid(path, self._config, self._save_directory.path)
+            result = await self._session_client.load(path, lambda: self._replace_grid(grid))
         except ThinmapError as error:
             response.success = False
             response.message = str(error)
             return response
-        graph = await call(self, self._load_topology, LoadMap.Request(path=path))
-        response.success = graph is None or graph.success
-        response.message = _NO_BUILDER if graph is None else graph.message
-        if response.success:
-            self._replace_grid(grid)
-            response.message = f'grid taken over; {response.message}'
-            features = await call(self, self._load_features, LoadMap.Request(path=stem))
-            if features is not None:
-                response.success = features.success
-                response.message = f'{response.message}; {features.message}'
+        response.success = result.success
+        response.message = result.message
         return response
 
 

@@ -31,7 +31,7 @@ from thinmap_ros.core.slam.localizers import (
     set_topology,
 )
 from thinmap_ros.core.topology.graph import TopologicalMap as Graph
-from thinmap_ros.files import sessions
+from thinmap_ros.files.sessions import LOCALIZER
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import State
@@ -53,10 +53,10 @@ _HEALTH = {
 class LocalizerNode(ThinmapNode):
     """/scan and /odom in; /pose, map -> odom on /tf, /line_features, /slam_status out.
 
-    /trajectory after a loop.
+    /trajectory after a loop closure.
 
-    Services ~/pause, ~/reset, and save_features and load_features for sessions: lost in the map of
-    one, it waits for /initialpose, or for a scan that fits where it is.
+    Services ~/pause, ~/reset, save_localizer, load_localizer. In the map of a session it is lost
+    until /initialpose arrives or a scan matches at its start pose.
     """
 
     def __init__(self) -> None:
@@ -95,8 +95,8 @@ class LocalizerNode(ThinmapNode):
         subscribe_guarded(
             self, PoseWithCovarianceStamped, 'initialpose', self._on_initial_pose, qos.STREAM
         )
-        self.create_service(SaveMap, 'save_features', self._on_save)
-        self.create_service(LoadMap, 'load_features', self._on_load)
+        self.create_service(SaveMap, 'save_localizer', self._on_save)
+        self.create_service(LoadMap, 'load_localizer', self._on_load)
 
     def reset_state(self) -> None:
         """Forget all features, or go back to the session that the node was started with.
@@ -118,7 +118,7 @@ class LocalizerNode(ThinmapNode):
 
     def _create_localizer(self, config: ScanLocalizerConfig) -> AnyLocalizer:
         """A localizer that begins at its start, in the map of the session if there is one."""
-        loaded = sessions.load_features(self._session, config) if self._session else None
+        loaded = LOCALIZER.load_optional(self._session, config) if self._session else None
         return loaded or localizer_class(config)(config)
 
     def _config_at(self, T_map_base: Array) -> ScanLocalizerConfig:
@@ -214,7 +214,7 @@ class LocalizerNode(ThinmapNode):
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:
             path = self._save_directory.resolve(request.path)
-            return f'saved {sessions.save_features(path, self._localizer)}'
+            return f'saved {LOCALIZER.save(path, self._localizer)}'
 
         return fill_response(response, save)
 
@@ -224,7 +224,7 @@ class LocalizerNode(ThinmapNode):
     def _load(self, path: str) -> str:
         """Take over the features of a session; without any, those that there are stay."""
         config = self._config_at(self._localizer.pose)
-        loaded = sessions.load_features(self._save_directory.resolve(path), config)
+        loaded = LOCALIZER.load_optional(self._save_directory.resolve(path), config)
         if loaded is None:
             return 'no features are saved: the localizer keeps its own'
         self._localizer = loaded

@@ -12,7 +12,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamp_matcher import StampMatcher
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
 from thinmap_ros.core.topology.rebuild import Rebuilding
-from thinmap_ros.files import sessions
+from thinmap_ros.files.sessions import TOPOLOGY, load_topology
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import State
@@ -82,7 +82,7 @@ class TopologyBuilderNode(ThinmapNode):
             self._publish(self.get_clock().now().nanoseconds)
 
     def _load_session(self) -> TopologyBuilder:
-        return sessions.load_topology(self._session, self._config)
+        return load_topology(self._session, self._config)
 
     def _on_window(self, message: OccupancyGrid) -> None:
         stamp_ns = messages.stamp_ns(message.header.stamp)
@@ -146,7 +146,7 @@ class TopologyBuilderNode(ThinmapNode):
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:
             path = self._save_directory.resolve(request.path)
-            return f'saved {sessions.save_topology(path, self._builder)}'
+            return f'saved {TOPOLOGY.save(path, self._builder)}'
 
         return fill_response(response, save)
 
@@ -159,7 +159,7 @@ class TopologyBuilderNode(ThinmapNode):
         if path:
             inside = self._save_directory.resolve(path)
             resolution_m = self._builder.resolution_m
-            loaded = sessions.load_topology(inside, self._config, resolution_m)
+            loaded = load_topology(inside, self._config, resolution_m)
         self._builder = loaded
         self._matcher = StampMatcher()
         self._rebuilding = Rebuilding(from_the_start=not path)

@@ -519,13 +519,13 @@ def test_a_full_disk_leaves_the_old_session_as_it_was(graph, tmp_path):
     def save():
         return graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(stem)))
 
-    parts = ('.topology.npz', '.features.npz')
+    parts = ('.topology.npz', '.slam.npz')
     graph.until(
         lambda: all(part in save().message for part in parts), 'a session with all its parts'
     )
     before = {file.name: file.read_bytes() for file in stem.parent.iterdir()}
     assert sorted(before) == [
-        'room.features.npz',
+        'room.slam.npz',
         'room.grid.npz',
         'room.pgm',
         'room.topology.npz',
