@@ -30,6 +30,7 @@ from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.files import sessions
 from thinmap_ros.files.npz import read_arrays
 from thinmap_ros.files.sessions import load_grid
+from thinmap_ros.files.snapshots import VERSION
 
 
 @pytest.fixture(scope='module')
@@ -106,7 +107,7 @@ MAY_BE_NAN = {'localizer': {'spans'}, 'exploration': {'tracks'}}
 
 def label(kind: str) -> bytes:
     """The member of an archive that says what it holds."""
-    return npy(np.array(f'{kind} {PARTS[kind].version}'))
+    return npy(np.array(f'{kind} {VERSION}'))
 
 
 def saved(folder: Path, kind: str, state: State) -> Path:

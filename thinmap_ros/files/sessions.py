@@ -4,33 +4,30 @@ A session has a path STEM. `PARTS` lists its files, one for each node. Beside ST
 same grid as a map_server map, STEM.pgm and STEM.yaml.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
-
-import numpy as np
-from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError, reason_of, shown
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
 from thinmap_ros.core.slam.localizers import AnyLocalizer, localizer_class
+from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
 from thinmap_ros.files.atomic import atomic_write
-from thinmap_ros.files.npz import open_regular_file, read_arrays
+from thinmap_ros.files.npz import open_regular_file
 from thinmap_ros.files.occupancy_maps import read_map, write_map
+from thinmap_ros.files.snapshots import read_snapshot, write_snapshot
 
-_FORMAT = 'thinmap_format'
 _MAP_ENDING = '.yaml'
 _IMAGE_ENDING = '.pgm'
 _ARCHIVED = '.old'
-State = Mapping[str, NDArray[Any]]
 
 
 class _HasState(Protocol):
-    def state(self) -> dict[str, NDArray[Any]]: ...
+    def state(self) -> State: ...
 
 
 Value = TypeVar('Value', bound=_HasState)
@@ -42,14 +39,13 @@ class SessionPart(Generic[Value, PartConfig]):
     """A file of a session: the state of one node (NumPy archive).
 
     node: its services save_NAME and load_NAME write and read the file. ending: of the file, after
-    STEM. version: of the arrays in it. restore: makes the value from its arrays and a
+    STEM. restore: makes the value from its arrays and a
     configuration; raises InputError where they do not fit.
     """
 
     name: str
     node: str
     ending: str
-    version: int
     restore: Callable[[State, PartConfig | None], Value]
 
     def file(self, path: str) -> Path:
@@ -91,47 +87,30 @@ class SessionPart(Generic[Value, PartConfig]):
 
     def write(self, file: Path, value: Value) -> None:
         """Write a file of any name. Raises OSError."""
-        arrays: dict[str, Any] = {_FORMAT: np.array(self._format), **value.state()}
         with file.open('wb') as stream:
-            np.savez_compressed(stream, **arrays)
+            write_snapshot(stream, self.name, value.state())
 
     def read(self, file: Path, config: PartConfig | None = None) -> Value:
         """Read a file of any name. Raises InputError as `load`."""
         try:
-            return self.restore(self._arrays(file), config)
+            with open_regular_file(file) as stream:
+                state = read_snapshot(stream, self.name)
+            return self.restore(state, config)
+        except OSError as error:
+            raise InputError(f'{file}: {error.strerror or reason_of(error)}') from error
         except InputError as error:
             raise InputError(f'{file}: {error}') from error
-
-    @property
-    def _format(self) -> str:
-        return f'{self.name} {self.version}'
-
-    def _arrays(self, file: Path) -> State:
-        expected = f'expected a saved {self.name}'
-        try:
-            with open_regular_file(file) as stream:
-                arrays = read_arrays(stream)
-        except OSError as error:
-            raise InputError(error.strerror or reason_of(error)) from error
-        except InputError as error:
-            raise InputError(f'{error}: {expected}') from error
-        found = arrays.pop(_FORMAT, np.empty(0))
-        if found.shape or found.dtype.kind != 'U' or str(found) != self._format:
-            raise InputError(f'holds {shown(str(found))}: {expected} ({self._format})')
-        return arrays
 
 
 def _restore_localizer(state: State, config: ScanLocalizerConfig | None) -> AnyLocalizer:
     return localizer_class(config or ScanLocalizerConfig()).from_state(state, config)
 
 
-GRID = SessionPart('grid', 'grid_mapper', '.grid.npz', 1, OccupancyGrid.from_state)
-TOPOLOGY = SessionPart(
-    'topology', 'topology_builder', '.topology.npz', 1, TopologyBuilder.from_state
-)
+GRID = SessionPart('grid', 'grid_mapper', '.grid.npz', OccupancyGrid.from_state)
+TOPOLOGY = SessionPart('topology', 'topology_builder', '.topology.npz', TopologyBuilder.from_state)
 # Line features or local map, by the configured localizer.
-LOCALIZER = SessionPart('localizer', 'localizer', '.slam.npz', 1, _restore_localizer)
-EXPLORATION = SessionPart('exploration', 'explorer', '.exploration.npz', 1, Explorer.from_state)
+LOCALIZER = SessionPart('localizer', 'localizer', '.slam.npz', _restore_localizer)
+EXPLORATION = SessionPart('exploration', 'explorer', '.exploration.npz', Explorer.from_state)
 PARTS: tuple[SessionPart[Any, Any], ...] = (GRID, TOPOLOGY, LOCALIZER, EXPLORATION)
 _FILE_ENDINGS = (*(part.ending for part in PARTS), _MAP_ENDING, _IMAGE_ENDING)
 # Of all files that a session may consist of, or that are archived when it is saved.

@@ -13,11 +13,11 @@ from thinmap_ros.core.errors import ThinmapError
 from thinmap_ros.core.grid.correctable import CorrectableGrid
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, WindowConfig
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.stamp_matcher import StampMatcher
 from thinmap_ros.files import sessions
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.ros import messages, node_main, parameters, qos
-from thinmap_ros.ros.checkpoint import State
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.save_directory import SaveDirectory
@@ -92,7 +92,7 @@ class GridMapperNode(ThinmapNode):
 
     def _resume(self, left: State) -> None:
         """Take over the map of a killed mapper. Raises InputError where it is no such map."""
-        latest_ns, cells = snapshot.check_stamp(left)
+        latest_ns, cells = snapshot.split_stamp(left)
         grid = OccupancyGrid.from_state(cells, self._config)
         self._resumed_ns = self._latest_ns = self._restored_ns = latest_ns
         self._replace_grid(grid)

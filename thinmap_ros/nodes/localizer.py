@@ -30,11 +30,11 @@ from thinmap_ros.core.slam.localizers import (
     localizer_class,
     set_topology,
 )
+from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.topology.graph import TopologicalMap as Graph
 from thinmap_ros.files.sessions import LOCALIZER
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.ros import messages, node_main, parameters, qos
-from thinmap_ros.ros.checkpoint import State
 from thinmap_ros.ros.diagnostics import ERROR, OK
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode

@@ -9,13 +9,13 @@ from thinmap_msgs.srv import LoadMap, SaveMap
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.stamp_matcher import StampMatcher
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
 from thinmap_ros.core.topology.rebuild import Rebuilding
 from thinmap_ros.files.sessions import TOPOLOGY, load_topology
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.ros import messages, node_main, parameters, qos
-from thinmap_ros.ros.checkpoint import State
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import fill_response
@@ -64,7 +64,7 @@ class TopologyBuilderNode(ThinmapNode):
 
     def _resume(self, left: State) -> None:
         """Take over the graph of a builder that was killed. Raises InputError where it is none."""
-        latest_ns, graph = snapshot.check_stamp(left)
+        latest_ns, graph = snapshot.split_stamp(left)
         builder = TopologyBuilder.from_state(graph, self._config)
         builder.skip_ids(_ID_RESERVE)
         self._resumed_ns = self._latest_ns = self._restored_ns = latest_ns
