@@ -202,7 +202,7 @@ def test_sessions_are_loaded_into_running_nodes_or_refused_in_words(graph, tmp_p
     # Any map_server map will do; no graph belongs to it.
     occupancy_maps.write_map(tmp_path / 'map', grid.patch())
     response = load('map.yaml')
-    assert response.success and 'anew' in response.message
+    assert response.success and 'graph reset' in response.message
     graph.until(lambda: not graphs[-1].nodes, 'an empty graph')
     known = messages.grid_from_msg(maps[-1])
     assert np.array_equal(known.occupied, grid.patch().occupied)
