@@ -5,7 +5,6 @@ import os
 import pickle
 import re
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +27,10 @@ from fuzz.saved_states import (
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.odometry import LastPose
 from thinmap_ros.core.topology.builder import TopologyBuilder
+from thinmap_ros.files import sessions
 from thinmap_ros.files.npz import read_arrays
-from thinmap_ros.files.sessions import load_exploration, load_features, load_grid, load_topology
+from thinmap_ros.files.sessions import load_grid
+from thinmap_ros.files.snapshots import VERSION
 
 
 @pytest.fixture(scope='module')
@@ -88,13 +89,7 @@ def test_what_a_killed_localizer_left() -> None:
 
 # Archives.
 
-LOADERS: dict[str, Callable[[str], Any]] = {
-    'topology': load_topology,
-    'exploration': load_exploration,
-    'features': load_features,
-    'grid': load_grid,
-}
-FORMATS = {kind: f'{kind} {2 if kind == "features" else 1}' for kind in LOADERS}
+PARTS = {part.name: part for part in sessions.PARTS}
 # The largest number of whole numbers, or one of 300 digits; -1 in whole numbers, NaN in others.
 LARGE = b'\x7f'
 MINUS_ONE = b'\xff'
@@ -102,18 +97,23 @@ MINUS_ONE = b'\xff'
 MAY_BE_NEGATIVE = {
     'topology': {'low', 'memory'},
     'grid': {'tiles', 'log_odds'},
-    'features': {'tiles'},
+    'localizer': {'tiles'},
     'exploration': set[str](),
 }
 # Counts of a byte each, of which any is possible.
-MAY_BE_ANY = {'features': {'seen'}}
-MAY_BE_NAN = {'features': {'spans'}, 'exploration': {'tracks'}}
+MAY_BE_ANY = {'localizer': {'seen'}}
+MAY_BE_NAN = {'localizer': {'spans'}, 'exploration': {'tracks'}}
+
+
+def label(kind: str) -> bytes:
+    """The member of an archive that says what it holds."""
+    return npy(np.array(f'{kind} {VERSION}'))
 
 
 def saved(folder: Path, kind: str, state: State) -> Path:
     """An archive as files.sessions writes it."""
     members = {name: npy(array) for name, array in state.items()}
-    return archive(folder / f'a.{kind}.npz', thinmap_format=npy(np.array(FORMATS[kind])), **members)
+    return archive(folder / f'a{PARTS[kind].ending}', thinmap_format=label(kind), **members)
 
 
 def overwritten(array: np.ndarray, byte: bytes) -> np.ndarray:
@@ -127,7 +127,7 @@ def test_what_no_field_may_hold_is_refused_by_its_name(
     explored: Explored, tmp_path: Path, kind: str, byte: bytes
 ) -> None:
     state = explored.states[kind]
-    assert LOADERS[kind](str(saved(tmp_path, kind, state))) is not None
+    assert PARTS[kind].load(str(saved(tmp_path, kind, state))) is not None
     bounded = 0
     for name, array in state.items():
         told = re.sub('^(nodes|stand_ins|borders)_', r'\1: ', name)
@@ -138,11 +138,11 @@ def test_what_no_field_may_hold_is_refused_by_its_name(
             continue
         path = saved(tmp_path, kind, state | {name: overwritten(array, byte)})
         with pytest.raises(InputError) as error:
-            LOADERS[kind](str(path))
-        what = 'local map' if kind == 'features' else kind
+            PARTS[kind].load(str(path))
+        what = 'local map' if kind == 'localizer' else kind
         assert str(error.value).startswith(f'{path}: saved {what}: {told}'), name
         bounded += 1
-    assert bounded >= {'grid': 1, 'features': 5}.get(kind, 7)
+    assert bounded >= {'grid': 1, 'localizer': 5}.get(kind, 7)
 
 
 class Evil:
@@ -171,13 +171,12 @@ HEADERS = {
 
 
 @pytest.mark.parametrize('name', HEADERS)
-@pytest.mark.parametrize('load', [load_grid, load_topology, load_features, load_exploration])
-def test_headers_of_arrays(tmp_path: Path, load: Callable[[str], object], name: str) -> None:
-    end = load.__name__.removeprefix('load_')
-    label = npy(np.array(FORMATS[end]))
-    archive(tmp_path / f'a.{end}.npz', thinmap_format=label, frame=HEADERS[name])
-    with pytest.raises(InputError, match=rf'a\.{end}\.npz: .*expected') as error:
-        load(str(tmp_path / 'a'))
+@pytest.mark.parametrize('kind', PARTS)
+def test_headers_of_arrays(tmp_path: Path, kind: str, name: str) -> None:
+    part = PARTS[kind]
+    archive(tmp_path / f'a{part.ending}', thinmap_format=label(kind), frame=HEADERS[name])
+    with pytest.raises(InputError, match=rf'a{re.escape(part.ending)}: .*expected') as error:
+        part.load(str(tmp_path / 'a'))
     assert len(str(error.value)) <= LONGEST and str(error.value).isprintable()
 
 
@@ -187,7 +186,7 @@ def test_nothing_is_unpickled(tmp_path: Path) -> None:
     # As many objects as fill the bytes that are there, for whoever compares the two.
     content += bytes(-len(content) % 8)
     member = with_header(plain((len(content) // 8,), '|O'), content)
-    path = archive(tmp_path / 'a.grid.npz', thinmap_format=npy(np.array('grid 1')), frame=member)
+    path = archive(tmp_path / 'a.grid.npz', thinmap_format=label('grid'), frame=member)
     with pytest.raises(InputError, match='expected a saved grid'):
         load_grid(str(path))
     assert not trap.exists()
@@ -239,7 +238,7 @@ def test_a_member_is_as_large_as_its_header_says(
     members = {name: npy(array) for name, array in explored.states['grid'].items()}
     whole = members['frame']
     members['frame'] = whole[:more] if more < 0 else whole + bytes(more)
-    path = archive(tmp_path / 'a.grid.npz', thinmap_format=npy(np.array('grid 1')), **members)
+    path = archive(tmp_path / 'a.grid.npz', thinmap_format=label('grid'), **members)
     with pytest.raises(InputError, match=rf'expected an array of {24 + more} bytes: expected a'):
         load_grid(str(path))
 

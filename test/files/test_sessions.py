@@ -18,22 +18,14 @@ from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.files.occupancy_maps import write_map
 from thinmap_ros.files.sessions import (
-    has_topology,
-    load_exploration,
-    load_features,
+    EXPLORATION,
+    GRID,
+    LOCALIZER,
+    TOPOLOGY,
     load_grid,
     load_topology,
-    read_grid,
-    read_topology,
-    save_exploration,
-    save_features,
     save_grid,
-    save_topology,
-    set_exploration_aside,
-    set_features_aside,
     stem_of,
-    write_grid,
-    write_topology,
 )
 from thinmap_ros.sim.laser import Lms200, Lms200Config
 from thinmap_ros.sim.world import World
@@ -96,10 +88,10 @@ def test_work_goes_on_as_if_it_had_never_stopped(tmp_path: Path) -> None:
     builder = TopologyBuilder()
     poses = way()
     drive(grid, builder, poses[:120], 0)
-    write_grid(tmp_path / 'a.grid.npz', grid)
-    write_topology(tmp_path / 'a.topology.npz', builder)
-    again = read_grid(tmp_path / 'a.grid.npz')
-    restored = read_topology(tmp_path / 'a.topology.npz')
+    GRID.write(tmp_path / 'a.grid.npz', grid)
+    TOPOLOGY.write(tmp_path / 'a.topology.npz', builder)
+    again = GRID.read(tmp_path / 'a.grid.npz')
+    restored = TOPOLOGY.read(tmp_path / 'a.topology.npz')
     assert len(builder.map.nodes) > 2
     assert_same(builder.map, restored.map)
     drive(grid, builder, poses[120:], 1)
@@ -115,27 +107,27 @@ def test_work_goes_on_as_if_it_had_never_stopped(tmp_path: Path) -> None:
 
 
 def test_nothing_seen_yet(tmp_path: Path) -> None:
-    write_grid(tmp_path / 'a.npz', OccupancyGrid())
-    write_topology(tmp_path / 'b.npz', TopologyBuilder())
-    assert read_grid(tmp_path / 'a.npz').patch().unknown.all()
-    assert not read_topology(tmp_path / 'b.npz').map.nodes
+    GRID.write(tmp_path / 'a.npz', OccupancyGrid())
+    TOPOLOGY.write(tmp_path / 'b.npz', TopologyBuilder())
+    assert GRID.read(tmp_path / 'a.npz').patch().unknown.all()
+    assert not TOPOLOGY.read(tmp_path / 'b.npz').map.nodes
 
 
 def test_what_does_not_fit_is_said(tmp_path: Path) -> None:
     grid = OccupancyGrid()
     builder = TopologyBuilder()
     drive(grid, builder, way()[:5], 0)
-    write_grid(tmp_path / 'a.npz', grid)
-    write_topology(tmp_path / 'b.npz', builder)
+    GRID.write(tmp_path / 'a.npz', grid)
+    TOPOLOGY.write(tmp_path / 'b.npz', builder)
     for path in (tmp_path / 'b.npz', tmp_path / 'no.npz'):
         with pytest.raises(InputError, match='npz'):
-            read_grid(path)
+            GRID.read(path)
     with pytest.raises(InputError, match='expected a saved topology'):
-        read_topology(tmp_path / 'a.npz')
+        TOPOLOGY.read(tmp_path / 'a.npz')
     with pytest.raises(InputError, match='resolution'):
-        read_grid(tmp_path / 'a.npz', OccupancyConfig(resolution_m=0.05))
+        GRID.read(tmp_path / 'a.npz', OccupancyConfig(resolution_m=0.05))
     with pytest.raises(InputError, match='memory_m'):
-        read_topology(tmp_path / 'b.npz', TopologyConfig(memory_m=20.0))
+        TOPOLOGY.read(tmp_path / 'b.npz', TopologyConfig(memory_m=20.0))
 
 
 @pytest.mark.parametrize('end', ['', '.grid.npz', '.topology.npz', '.yaml', '.pgm'])
@@ -144,13 +136,13 @@ def test_a_session_is_named_by_its_stem_or_one_of_its_files(tmp_path: Path, end:
     builder = TopologyBuilder()
     drive(grid, builder, way()[:5], 0)
     path = str(tmp_path / 'v1.2' / 'room.one') + end
-    assert not has_topology(path)
+    assert not TOPOLOGY.exists(path)
     save_grid(path, grid)
-    save_topology(path, builder)
+    TOPOLOGY.save(path, builder)
     assert {file.name for file in (tmp_path / 'v1.2').iterdir()} == {
         f'room.one{each}' for each in ('.grid.npz', '.topology.npz', '.yaml', '.pgm')
     }
-    assert has_topology(path)
+    assert TOPOLOGY.exists(path)
     assert np.array_equal(load_grid(path).state()['log_odds'], grid.state()['log_odds'])
     assert_same(load_topology(path, None, 0.1).map, builder.map)
     with pytest.raises(
@@ -232,11 +224,11 @@ def test_a_correction_before_the_first_window() -> None:
 def test_what_an_exploration_learned_is_the_same_after_a_start(tmp_path):
     explorer = Explorer()
     stem = str(tmp_path / 'room')
-    assert load_exploration(stem) is None
+    assert EXPLORATION.load_optional(stem) is None
     explorer.surveyor.follow({7: (1.0, 2.0), 9: (3.0, 2.5)})
     explorer.surveyor.tracker.tracks[9].probability = 0.8
-    save_exploration(stem, explorer)
-    again = load_exploration(stem)
+    EXPLORATION.save(stem, explorer)
+    again = EXPLORATION.load_optional(stem)
     assert again is not None
     assert {i: (t.x, t.y, t.probability) for i, t in again.surveyor.tracker.tracks.items()} == {
         7: (1.0, 2.0, 0.5),
@@ -244,28 +236,28 @@ def test_what_an_exploration_learned_is_the_same_after_a_start(tmp_path):
     }
     (tmp_path / 'room.exploration.npz').write_bytes(b'no archive')
     with pytest.raises(InputError, match=r'room\.exploration\.npz'):
-        load_exploration(stem)
-    assert 'room.exploration.npz.old' in set_exploration_aside(stem)
-    assert load_exploration(stem) is None
+        EXPLORATION.load_optional(stem)
+    assert 'room.exploration.npz.old' in EXPLORATION.archive(stem)
+    assert EXPLORATION.load_optional(stem) is None
 
 
-def test_features_are_kept_set_aside_or_refused_in_words(tmp_path):
+def test_the_part_of_the_localizer_is_loaded_archived_or_rejected(tmp_path):
     stem = str(tmp_path / 'office')
-    assert load_features(stem) is None
+    assert LOCALIZER.load_optional(stem) is None
     localizer = Localizer()
     world = building()
     laser = Lms200(Lms200Config(), 1)
     for k in range(30):
         T = pose(3.0 + 0.1 * k, 6.0, 0.0)
         localizer.step(laser.scan(world, T, k), T)
-    save_features(stem, localizer)
-    loaded = load_features(stem)
+    LOCALIZER.save(stem, localizer)
+    loaded = LOCALIZER.load_optional(stem)
     assert loaded is not None
     for name, value in localizer.state().items():
         if name != 'points':
             np.testing.assert_array_equal(loaded.state()[name], value)
-    (tmp_path / 'bad.features.npz').write_bytes(b'nothing')
-    with pytest.raises(InputError, match=r'bad\.features\.npz: .*expected'):
-        load_features(str(tmp_path / 'bad'))
-    assert 'office.features.npz.old' in set_features_aside(stem)
-    assert load_features(stem) is None
+    (tmp_path / 'bad.slam.npz').write_bytes(b'nothing')
+    with pytest.raises(InputError, match=r'bad\.slam\.npz: .*expected'):
+        LOCALIZER.load_optional(str(tmp_path / 'bad'))
+    assert 'office.slam.npz.old' in LOCALIZER.archive(stem)
+    assert LOCALIZER.load_optional(stem) is None

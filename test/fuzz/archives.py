@@ -3,7 +3,6 @@
 import io
 import os
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +19,7 @@ from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.ros.checkpoint import Checkpoint
 
-_LOADERS: dict[str, Callable[[str], Any]] = {
-    'topology': sessions.load_topology,
-    'exploration': sessions.load_exploration,
-    'features': sessions.load_features,
-    'grid': sessions.load_grid,
-}
+_PARTS = {part.name: part for part in sessions.PARTS}
 
 
 def read_damaged_bag(shared: dict[str, bytes], rng: np.random.Generator, folder: Path) -> None:
@@ -101,9 +95,12 @@ def _members(path: Path) -> dict[str, bytes]:
 def explored_archives(folder: Path) -> tuple[Explored, dict[str, dict[str, bytes]]]:
     found = Explored()
     for kind, state in found.states.items():
-        named: dict[str, Any] = {'thinmap_format': np.array(f'{kind} 1'), **state}
-        np.savez_compressed(folder / f'a.{kind}.npz', **named)
-    return found, {kind: _members(folder / f'a.{kind}.npz') for kind in KINDS}
+        named: dict[str, Any] = {
+            'thinmap_format': np.array(f'{kind} {_PARTS[kind].version}'),
+            **state,
+        }
+        np.savez_compressed(folder / f'a{_PARTS[kind].ending}', **named)
+    return found, {kind: _members(folder / f'a{_PARTS[kind].ending}') for kind in KINDS}
 
 
 def load_damaged_archive(
@@ -113,8 +110,8 @@ def load_damaged_archive(
     content = _packed(rng, shared[1][kind])
     if rng.random() < 0.3:
         content = damaged_bytes(rng, content)
-    (folder / f'a.{kind}.npz').write_bytes(content)
-    loaded = tried(lambda: _LOADERS[kind](str(folder / 'a')))
+    (folder / f'a{_PARTS[kind].ending}').write_bytes(content)
+    loaded = tried(lambda: _PARTS[kind].load(str(folder / 'a')))
     if loaded is not None:
         check_state(shared[0], kind, loaded.state(), 'as it was loaded')
 

@@ -23,7 +23,7 @@ State = dict[str, np.ndarray]
 Work = Callable[[Any, Any], object]
 LONGEST = 500
 STEPS = 4
-KINDS = ('topology', 'exploration', 'features', 'grid')
+KINDS = ('topology', 'exploration', 'localizer', 'grid')
 
 
 class Explored:
@@ -46,7 +46,7 @@ class Explored:
         self.states: dict[str, State] = {
             'topology': pipeline.topology.state(),
             'exploration': self.loop.strategy.state(),  # type: ignore[attr-defined]
-            'features': pipeline.localizer.state(),
+            'localizer': pipeline.localizer.state(),
             'grid': pipeline.grid.state(),
         }
 
@@ -71,7 +71,7 @@ class Explored:
         patch = pipeline.grid.patch()
         return lambda scan, T: explorer.step(pipeline.topology.map, patch, scan, T)
 
-    def _use_features(self, state: State) -> Work:
+    def _use_localizer(self, state: State) -> Work:
         localizer = Localizer.from_state(state, self.loop.pipeline.localizer.config)
         localizer.set_pose(self.scans[-STEPS][1], 1e-4 * np.eye(3))
         return localizer.step
@@ -130,7 +130,7 @@ def check(explored: Explored, kind: str, state: State, what: str) -> bool:
         assert len(str(error)) <= LONGEST and str(error).isprintable(), (what, str(error))
         # What no array tells is whether the windows that come will lie on the saved lattice.
         beside = kind == 'topology' and str(error).startswith('window')
-        beside |= kind in ('grid', 'features') and str(error).startswith('map ')
+        beside |= kind in ('grid', 'localizer') and str(error).startswith('map ')
         assert str(error).startswith('saved') or beside, (what, str(error))
         return True
     return False

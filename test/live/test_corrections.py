@@ -52,7 +52,12 @@ class Mapping:
     def start(self):
         doctor = Doctor(self.graph)
         self.graph.start('grid_mapper', laser_pose='0,0,0', recover_s=1000.0, resolution_m=0.03)
-        keys = ['scan: speakers', 'pose: speakers', 'trajectory: speakers', 'local_map: listeners']
+        keys = [
+            'scan: publishers',
+            'pose: publishers',
+            'trajectory: publishers',
+            'local_map: subscribers',
+        ]
         self.graph.until(
             lambda: (
                 all(doctor.number('grid_mapper', key) for key in keys)

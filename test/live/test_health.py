@@ -65,16 +65,18 @@ def test_nodes_tell_rates_step_times_and_silence(graph):
             lambda n=node, s=step: 'median' in doctor.value(n, f'{s}: step time'),
             f'step times of {node}',
         )
-    graph.until(lambda: doctor.number('topology_builder', 'pose: heard') > 0, 'poses are counted')
-    graph.until(lambda: doctor.number('localizer', 'scan: heard') > 5, 'more than five scans')
-    graph.until(lambda: doctor.number('localizer', 'scan: speakers') == 1, 'the simulation')
-    graph.until(lambda: doctor.number('localizer', 'pose: listeners') == 2, 'mapper and builder')
+    graph.until(
+        lambda: doctor.number('topology_builder', 'pose: received') > 0, 'poses are counted'
+    )
+    graph.until(lambda: doctor.number('localizer', 'scan: received') > 5, 'more than five scans')
+    graph.until(lambda: doctor.number('localizer', 'scan: publishers') == 1, 'the simulation')
+    graph.until(lambda: doctor.number('localizer', 'pose: subscribers') == 2, 'mapper and builder')
     graph.stop('sim')
     graph.until(lambda: 'scan: silent for' in doctor.status('localizer').message, 'silence is told')
     assert doctor.level('localizer') == DiagnosticStatus.WARN
     assert 's ago' in doctor.value('localizer', 'scan: last')
     assert 'silent for' in graph.log('thinmap')
-    assert doctor.number('localizer', 'scan: heard') > 5
+    assert doctor.number('localizer', 'scan: received') > 5
 
 
 def test_two_localizers_on_one_graph_are_detected_and_reported(graph):
@@ -110,16 +112,16 @@ def test_what_is_over_is_not_told_first(ros_domain, monkeypatch):
         now[0] += 1.0
         told.message_rejected('scan', '0 beams: expected 1 to 200000')
         message = told._status(now[0]).message
-        assert message.startswith('4 messages refused or dropped: scan: 0 beams')
+        assert message.startswith('4 messages rejected or dropped: scan: 0 beams')
         assert 'odom: pose nan' in message and 'without odometry' in message
         told._publish()
         now[0] += 10.5
         told.count_drops('scan: gaps between the stamps', 1)
         message = told._status(now[0]).message
-        assert message == '1 messages refused or dropped: scan: gaps between the stamps'
+        assert message == '1 messages rejected or dropped: scan: gaps between the stamps'
         # How often it happened is told for good.
         values = {pair.key: pair.value for pair in told._status(now[0]).values}
-        assert values['odom: refused'] == '1'
+        assert values['odom: rejected'] == '1'
     finally:
         node.destroy_node()
         rclpy.shutdown()
@@ -167,13 +169,13 @@ def test_a_node_that_becomes_active_has_what_was_latched(graph):
     empty = OccupancyGrid()
     empty.info.resolution = -1.0
     maps.publish(empty)
-    graph.until(lambda: doctor.number('explorer', 'local_map: heard') == 1.0, 'the latched map')
-    assert doctor.number('explorer', 'local_map: refused') == 0.0
+    graph.until(lambda: doctor.number('explorer', 'local_map: received') == 1.0, 'the latched map')
+    assert doctor.number('explorer', 'local_map: rejected') == 0.0
     for transition in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
         request = ChangeState.Request(transition=Transition(id=transition))
         assert graph.call(ChangeState, '/explorer/change_state', request).success
     graph.until(
-        lambda: doctor.number('explorer', 'local_map: refused') == 1.0, 'it is taken, and refused'
+        lambda: doctor.number('explorer', 'local_map: rejected') == 1.0, 'it is taken, and refused'
     )
     assert not graphs and poses
 
@@ -197,9 +199,9 @@ def test_pause_and_reset(graph):
     assert 'tracking' not in said_of_a_paused_one()
 
     def some_scans():
-        heard = doctor.number('localizer', 'scan: heard')
+        heard = doctor.number('localizer', 'scan: received')
         graph.until(
-            lambda: doctor.number('localizer', 'scan: heard') > heard + 10,
+            lambda: doctor.number('localizer', 'scan: received') > heard + 10,
             'scans that are not taken',
         )
 

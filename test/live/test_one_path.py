@@ -32,27 +32,27 @@ from thinmap_ros.tools.carmen_to_bag import convert
 pytestmark = pytest.mark.live
 # The test listens to the poses as well, the player to the local graph.
 CONNECTIONS = {
-    'bag_player': {'scan: listeners': 2, 'odom: listeners': 1, 'local_topology: speakers': 1},
+    'bag_player': {'scan: subscribers': 2, 'odom: subscribers': 1, 'local_topology: publishers': 1},
     'localizer': {
-        'scan: speakers': 1,
-        'odom: speakers': 1,
-        'topology: speakers': 1,
-        'pose: listeners': 3,
+        'scan: publishers': 1,
+        'odom: publishers': 1,
+        'topology: publishers': 1,
+        'pose: subscribers': 3,
     },
     'grid_mapper': {
-        'scan: speakers': 1,
-        'pose: speakers': 1,
-        'trajectory: speakers': 1,
-        'local_map: listeners': 1,
-        'map: listeners': 1,
+        'scan: publishers': 1,
+        'pose: publishers': 1,
+        'trajectory: publishers': 1,
+        'local_map: subscribers': 1,
+        'map: subscribers': 1,
     },
     'topology_builder': {
-        'local_map: speakers': 1,
-        'map: speakers': 1,
-        'pose: speakers': 1,
-        'trajectory: speakers': 1,
-        'topology: listeners': 1,
-        'local_topology: listeners': 1,
+        'local_map: publishers': 1,
+        'map: publishers': 1,
+        'pose: publishers': 1,
+        'trajectory: publishers': 1,
+        'topology: subscribers': 1,
+        'local_topology: subscribers': 1,
     },
 }
 

@@ -134,7 +134,7 @@ def room_of(resolution=0.1):
 def save(stem, grid, builder=None):
     sessions.save_grid(str(stem), grid)
     if builder is not None:
-        sessions.save_topology(str(stem), builder)
+        sessions.TOPOLOGY.save(str(stem), builder)
 
 
 def write_bad_sessions(folder, grid, builder):
@@ -166,9 +166,9 @@ def test_sessions_are_loaded_into_running_nodes_or_refused_in_words(graph, tmp_p
     response = graph.call(
         LoadMap, 'load_map', LoadMap.Request(path=str(tmp_path / 'room.grid.npz'))
     )
-    assert response.success and 'no topology_builder' in response.message
+    assert response.success and 'topology_builder is not running' in response.message
     response = graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(tmp_path / 'alone')))
-    assert response.success and 'no topology_builder' in response.message
+    assert response.success and 'topology_builder is not running' in response.message
     assert not (tmp_path / 'alone.topology.npz').exists()
     # The graph of an earlier grid must not be loaded with the new one.
     response = graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(tmp_path / 'room')))
@@ -184,7 +184,8 @@ def test_sessions_are_loaded_into_running_nodes_or_refused_in_words(graph, tmp_p
         return graph.call(LoadMap, 'load_map', LoadMap.Request(path=path))
 
     graph.until(
-        lambda: 'no topology_builder' not in load('room').message, 'the mapper sees the builder'
+        lambda: 'topology_builder is not running' not in load('room').message,
+        'the mapper sees the builder',
     )
     graph.until(lambda: maps and graphs and graphs[-1].nodes, 'map and graph, published at once')
     expected = places(messages.topology_msg(builder.map, 'map', 0))
@@ -201,7 +202,7 @@ def test_sessions_are_loaded_into_running_nodes_or_refused_in_words(graph, tmp_p
     # Any map_server map will do; no graph belongs to it.
     occupancy_maps.write_map(tmp_path / 'map', grid.patch())
     response = load('map.yaml')
-    assert response.success and 'anew' in response.message
+    assert response.success and 'graph reset' in response.message
     graph.until(lambda: not graphs[-1].nodes, 'an empty graph')
     known = messages.grid_from_msg(maps[-1])
     assert np.array_equal(known.occupied, grid.patch().occupied)
@@ -246,8 +247,8 @@ def test_services_touch_nothing_outside_of_their_folder(graph, tmp_path):
     calls = [
         (kind, name)
         for kind, names in (
-            (SaveMap, ('save_map', 'save_topology', 'save_features', 'save_exploration')),
-            (LoadMap, ('load_map', 'load_topology', 'load_features')),
+            (SaveMap, ('save_map', 'save_topology', 'save_localizer', 'save_exploration')),
+            (LoadMap, ('load_map', 'load_topology', 'load_localizer')),
         )
         for name in names
     ]

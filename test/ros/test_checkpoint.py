@@ -168,7 +168,7 @@ def test_broken_states_and_unfinished_files(folder: Path) -> None:
     unfinished = folder / '.7.robot.mapper.npz.0123456789abcdef.part'
     unfinished.write_bytes(b'half')
     assert Checkpoint(node, 30.0).load() is None
-    assert 'beginning anew' in node.said[-1] and not unfinished.exists()
+    assert 'starting without a checkpoint' in node.said[-1] and not unfinished.exists()
 
 
 def test_a_file_beside_has_a_name_that_cannot_be_guessed(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A bag onto the graph, with /clock: what robots heard, for the nodes of today."""
+"""Plays a bag and publishes /clock."""
 
 import contextlib
 from collections import Counter
@@ -56,11 +56,27 @@ class BagPlayerConfig(Config):
     lockstep_patience_s: float = parameter(PATIENCE_S, PATIENCE_WORDS, low=0.1, high=3600.0)
 
 
-class BagPlayerNode(Node):
-    """Publishes the bytes of a bag in its rhythm and as offered, counts them, ends with the bag.
+class _ClockPublisher:
+    """Publishes /clock: with each message, and at least every 20 ms while time is due."""
 
-    Services: ~/pause (true: stand still, false: go on), ~/step (while it stands still: up to and
-    with the next scan).
+    def __init__(self, node: Node) -> None:
+        self._topic = node.create_publisher(ClockMsg, '/clock', qos.STREAM)
+        self._last_s = 0.0
+
+    def publish(self, ns: int) -> None:
+        self._topic.publish(ClockMsg(clock=messages.time_msg(ns)))
+
+    def publish_if_due(self, ns: int, now_s: float) -> None:
+        if now_s - self._last_s > _CLOCK_PERIOD_S:
+            self._last_s = now_s
+            self.publish(ns)
+
+
+class BagPlayerNode(Node):
+    """Publishes the messages of a bag at their rate and with their quality of service.
+
+    Ends with the bag. Services: ~/pause (true: pause, false: continue), ~/step (while paused: up to
+    and including the next scan).
     """
 
     def __init__(self) -> None:
@@ -75,16 +91,16 @@ class BagPlayerNode(Node):
         if self._bag.advice:
             self.get_logger().warning(self._bag.advice)
         self._publishers_by_topic: dict[str, Publisher] = {}
-        self._clock_topic = self.create_publisher(ClockMsg, '/clock', qos.STREAM)
+        self._clock_publisher = _ClockPublisher(self)
         for topic in self._chosen():
             self._offer(topic)
         topics = set(self._publishers_by_topic)
         self._playback = Playback(self._bag, topics, self._config.start_offset_s, self._config.loop)
         for message in self._playback.known_before:
             self._publishers_by_topic[message.topic].publish(message.data)
-        self._begins_at: float | None = None
+        self._start_s: float | None = None
         self._paused = self._config.start_paused
-        self._ticked_at = self._clock_at = 0.0
+        self._last_tick_s = 0.0
         self._lockstep = Lockstep(self, self._config.lockstep, self._config.lockstep_patience_s)
         self._sent: Counter[str] = Counter()
         self._diagnostics = NodeDiagnostics(self)
@@ -95,7 +111,7 @@ class BagPlayerNode(Node):
         self.create_timer(_TICK_S, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def close(self) -> None:
-        """See the last messages through to those who listen, and say what was done."""
+        """Wait until the last messages are acknowledged, and log how many were sent."""
         for publisher in self._publishers_by_topic.values():
             publisher.wait_for_all_acked(_ACKNOWLEDGE)
         counts = sorted(self._sent.items())
@@ -110,13 +126,13 @@ class BagPlayerNode(Node):
         if unknown := asked - set(self._bag.topics):
             has = validation.listed(sorted(self._bag.topics))
             raise InputError(f'{self._config.bag}: no topic {sorted(unknown)[0]}; it has {has}')
-        # A recorded clock would run against the player's own.
+        # A recorded clock would contradict the player's own.
         return sorted((asked or set(self._bag.topics)) - {'/clock'})
 
     def _offer(self, topic: str) -> None:
-        """Make the publisher of a topic.
+        """Create the publisher of a topic.
 
-        What is not installed here is left out, unless it was asked for by name.
+        A type that is not installed is skipped, unless its topic was chosen by name.
         """
         name = f'/{self._config.prefix.strip("/")}{topic}' if self._config.prefix else topic
         profile = qos.as_recorded(topic, self._bag.offers.get(topic, []))
@@ -129,7 +145,7 @@ class BagPlayerNode(Node):
                 raise InputError(f'{validation.abbreviated(topic)}: {reason}') from error
             self.get_logger().warning(f'{validation.abbreviated(topic)} is not played: {reason}')
 
-    def _has_listeners(self) -> bool:
+    def _has_subscribers(self) -> bool:
         scans = [t for t in self._publishers_by_topic if self._bag.topics[t] == _SCAN]
         counts = [
             self._publishers_by_topic[t].get_subscription_count()
@@ -139,20 +155,18 @@ class BagPlayerNode(Node):
         return all(n >= enough for n in counts) if scans else any(n >= enough for n in counts)
 
     def _tick(self) -> None:
-        now = monotonic()
-        passed_s = now - self._ticked_at
-        self._ticked_at = now
-        if self._begins_at is None:
-            # Who listens to scans finds the other topics a moment later.
-            self._begins_at = now + _SETTLE_S if self._has_listeners() else None
-        if self._begins_at is None or now < self._begins_at:
+        now_s = monotonic()
+        passed_s = now_s - self._last_tick_s
+        self._last_tick_s = now_s
+        if self._start_s is None:
+            # A node that subscribes to the scans discovers the other topics a moment later.
+            self._start_s = now_s + _SETTLE_S if self._has_subscribers() else None
+        if self._start_s is None or now_s < self._start_s:
             return
-        # Time that was waited does not count: what follows keeps its rhythm.
+        # Time spent waiting does not count: the messages keep their intervals.
         if not self._paused and (not self._lockstep.is_waiting or self._lockstep.timed_out()):
             self._play(passed_s)
-        if now - self._clock_at > _CLOCK_PERIOD_S:
-            self._clock_at = now
-            self._publish_clock(self._playback.clock_ns)
+        self._clock_publisher.publish_if_due(self._playback.clock_ns, now_s)
         self.finished = self._playback.finished and not self._lockstep.is_waiting
 
     def _play(self, passed_s: float) -> None:
@@ -161,26 +175,23 @@ class BagPlayerNode(Node):
             self._send(message)
 
     def _send(self, message: RawMessage) -> None:
-        self._publish_clock(message.log_ns)
+        self._clock_publisher.publish(message.log_ns)
         self._publishers_by_topic[message.topic].publish(message.data)
         self._sent[message.topic] += 1
         if is_scan(message) and self._config.lockstep != NONE:
-            with contextlib.suppress(InputError):  # a broken scan leads to nothing
+            with contextlib.suppress(InputError):  # nothing is published for an invalid scan
                 self._lockstep.scan_published(
                     messages.stamp_ns(self._bag.decode(message).header.stamp)
                 )
 
     def _publish_diagnostics(self) -> None:
-        waits = self._begins_at is None
-        words = 'waiting for subscribers' if waits else 'paused' if self._paused else 'playing'
-        self._diagnostics.set_state(WARN if waits else OK, words)
+        is_waiting = self._start_s is None
+        text = 'waiting for subscribers' if is_waiting else 'paused' if self._paused else 'playing'
+        self._diagnostics.set_state(WARN if is_waiting else OK, text)
         self._diagnostics.set_value('bag time', self._where())
         self._diagnostics.set_value('rounds', self._playback.laps)
         for topic, count in self._sent.items():
             self._diagnostics.set_value(f'{topic}: sent', count)
-
-    def _publish_clock(self, ns: int) -> None:
-        self._clock_topic.publish(ClockMsg(clock=messages.time_msg(ns)))
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._paused = request.data

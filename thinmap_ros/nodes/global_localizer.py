@@ -1,9 +1,14 @@
-"""Where is a robot switched on anywhere? Asked by service or by itself, until one place is left."""
+"""Global localization: finds the pose of a robot anywhere in the map, on request or when lost."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped, Twist
 from nav_msgs.msg import OccupancyGrid, Odometry
+from rclpy.clock import Clock
+from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.msg import LocalizationStatus, SlamStatus, TopologicalMap
@@ -32,11 +37,11 @@ from thinmap_ros.ros.subscription import subscribe_guarded
 
 _WARN_PERIOD_S = 5.0
 _CONTROL_PERIOD_S = 0.1
-_SILENCE_NS = 400_000_000
-_SHOWN_NS = 1_000_000_000
-# Wider than the robot: where it plans to go, and what stops it
-_PLANNED_M = 0.05
-_BODY_M = 0.04
+_TIMEOUT_NS = 400_000_000
+_SAMPLES_PERIOD_NS = 1_000_000_000
+# Margins added to the radius of the robot: for paths, and for stops in front of obstacles.
+_PATH_MARGIN_M = 0.05
+_STOP_MARGIN_M = 0.04
 _STATES = {
     State.WAITING: LocalizationStatus.WAITING,
     State.SEARCHING: LocalizationStatus.SEARCHING,
@@ -46,67 +51,209 @@ _STATES = {
 }
 
 
+@dataclass(frozen=True)
+class _Settings:
+    """Parameters of the node.
+
+    automatic: search at once, and again when the localizer has been lost for lost_ns. active: drive
+    while searching. map_file: '' for the map of the topics.
+    """
+
+    search: GlobalLocalizationConfig
+    seed: int
+    map_frame: str
+    automatic: bool
+    lost_ns: int
+    active: bool
+    driving: NavigatorConfig
+    map_file: str
+
+    @staticmethod
+    def declare(node: Node) -> '_Settings':
+        def declare(name: str, default: object, description: str) -> Any:
+            return parameters.declare_parameter(node, name, default, description)
+
+        search = parameters.declare_config(node, GlobalLocalizationConfig)
+        seed = int(declare('seed', 0, 'decides where samples are drawn'))
+        map_frame = str(declare('map_frame', 'map', 'frame of the map'))
+        automatic = 'begin at once, and again when the localizer has been lost for lost_s'
+        is_automatic = bool(declare('automatic', False, automatic))
+        lost_s = float(declare('lost_s', 3.0, 'how long the localizer must have been lost, s'))
+        active = 'drive, while it looks, to where the places in question differ most'
+        is_active = bool(declare('active', False, active))
+        speed_m_s = float(declare('active_speed_m_s', 0.3, 'how fast it then drives, m/s'))
+        map_file = str(declare('map', '', 'map_server YAML file; empty: from the topics'))
+        driving = NavigatorConfig(
+            max_speed_m_s=speed_m_s,
+            robot_radius_m=search.robot_radius_m + _PATH_MARGIN_M,
+            body_radius_m=search.robot_radius_m + _STOP_MARGIN_M,
+        )
+        lost_ns = round(1e9 * lost_s)
+        return _Settings(
+            search, seed, map_frame, is_automatic, lost_ns, is_active, driving, map_file
+        )
+
+
+class _LostDetector:
+    """Detects that the localizer has been lost for some time of its own stamps."""
+
+    def __init__(self, limit_ns: int) -> None:
+        self._limit_ns = limit_ns
+        self._lost_since_ns: int | None = None
+        self._valid_after_ns = -1
+
+    def update(self, stamp_ns: int, is_lost: bool) -> bool:
+        """Add a state of the localizer; returns whether it has been lost for the limit."""
+        if not is_lost or stamp_ns <= self._valid_after_ns:
+            self._lost_since_ns = None
+        elif self._lost_since_ns is None:
+            self._lost_since_ns = stamp_ns
+        else:
+            return stamp_ns - self._lost_since_ns >= self._limit_ns
+        return False
+
+    def restart(self) -> None:
+        """Start to measure again."""
+        self._lost_since_ns = None
+
+    def ignore_until(self, stamp_ns: int) -> None:
+        """Ignore the states up to a pose that the localizer had not received yet."""
+        self._valid_after_ns = stamp_ns
+
+
+class _SearchDriver:
+    """Drives the robot to where the pose candidates can be told apart best.
+
+    search: None while there is nothing to search.
+    """
+
+    def __init__(self, clock: Clock, publish: Callable[[Twist], object]) -> None:
+        self.search: ActiveSearch | None = None
+        self._clock = clock
+        self._publish = publish
+        self._is_driving = False
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget scan, odometry and search."""
+        self.search = None
+        self._scan: Scan | None = None
+        self._T_odom_base: Array | None = None
+        self._odometry_ns = 0
+
+    def add_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
+        self._T_odom_base = T_odom_base
+        self._odometry_ns = stamp_ns
+
+    def add_scan(self, scan: Scan) -> None:
+        """Add a scan; while the laser is blind, the robot does not drive."""
+        self._scan = None if scan.is_blind else scan
+
+    def add_result(self, result: Result, T_odom_base: Array) -> None:
+        """Add the result of a step of the localization at an odometry pose (3,)."""
+        if self.search is not None:
+            self.search.take(result, T_odom_base)
+
+    def step(self) -> None:
+        """Publish the next command, or stop while inputs are missing or too old."""
+        if self.search is None or self._scan is None or self._T_odom_base is None:
+            self.stop()
+            return
+        if not self._is_recent(self._scan.stamp_ns):
+            self.stop()
+            return
+        command = self.search.step(self._T_odom_base, self._scan, _CONTROL_PERIOD_S)
+        if command.state == 'idle':
+            self.stop()
+            return
+        self._is_driving = True
+        self._publish(messages.twist_msg(command.v, command.w))
+
+    def stop(self) -> None:
+        """Stop the robot, if it was driven."""
+        if self._is_driving:
+            self._publish(messages.twist_msg(0.0, 0.0))
+        self._is_driving = False
+
+    def _is_recent(self, scan_ns: int) -> bool:
+        odometry_age_ns = int(self._clock.now().nanoseconds) - self._odometry_ns
+        return max(abs(self._odometry_ns - scan_ns), odometry_age_ns) <= _TIMEOUT_NS
+
+
+class _LocalizationPublishers:
+    """Publishes the status of the search, its samples, and the pose that was found."""
+
+    def __init__(self, node: Node, map_frame: str) -> None:
+        self._node = node
+        self._frame = map_frame
+        self._pose = node.create_publisher(PoseWithCovarianceStamped, 'initialpose', qos.STREAM)
+        self._samples = node.create_publisher(PoseArray, 'localization_samples', qos.LATCHED)
+        self._status = node.create_publisher(LocalizationStatus, 'localization_status', qos.LATCHED)
+        self._samples_ns = -_SAMPLES_PERIOD_NS
+
+    def publish_state(self, state: int, reason: str) -> None:
+        """Publish a state without candidates, at the present time."""
+        header = messages.header(self._frame, self._node.get_clock().now().nanoseconds)
+        self._publish_status(LocalizationStatus(header=header, state=state, reason=reason))
+
+    def publish_result(self, stamp_ns: int, result: Result) -> None:
+        """Publish a result at a scan's stamp, with its pose if it has one."""
+        self._publish_status(
+            LocalizationStatus(
+                header=messages.header(self._frame, stamp_ns),
+                state=_STATES[result.state],
+                reason=result.reason,
+                hypotheses=[messages.pose_msg(found.T_map_base) for found in result.hypotheses],
+                weights=[found.weight for found in result.hypotheses],
+                explained=[found.explained for found in result.hypotheses],
+            )
+        )
+        if result.pose is not None:
+            pose = result.pose
+            self._pose.publish(
+                messages.pose_with_covariance_msg(
+                    pose.T_map_base, pose.covariance, self._frame, stamp_ns
+                )
+            )
+            self._node.get_logger().info(f'localized: {result.reason}')
+
+    def publish_samples(self, stamp_ns: int, samples: Array) -> None:
+        """Publish the samples (N, 3), at most once a second: it takes longer than a step."""
+        if not 0 <= stamp_ns - self._samples_ns < _SAMPLES_PERIOD_NS:
+            self._samples_ns = stamp_ns
+            poses = [messages.pose_msg(T) for T in samples]
+            header = messages.header(self._frame, stamp_ns)
+            self._samples.publish(PoseArray(header=header, poses=poses))
+
+    def _publish_status(self, status: LocalizationStatus) -> None:
+        self._status.publish(status)
+        if status.state == LocalizationStatus.WAITING:
+            self._node.get_logger().warning(status.reason, throttle_duration_sec=_WARN_PERIOD_S)
+
+
 class GlobalLocalizerNode(ThinmapNode):
     """/scan, /odom, /map and /topology in.
 
     /initialpose, /localization_samples and /localization_status out. Service localize_globally.
-    The map is taken as it is when the search begins; once the robot is sure, its pose is said once,
-    and the node rests until it is asked again. Where it is `active`, it drives meanwhile: /cmd_vel
-    out.
+    The search uses the map as it is at its start. Once the pose is certain, it is published once,
+    and the node waits for the next request. With `active` it drives meanwhile: /cmd_vel out.
     """
 
     def __init__(self) -> None:
         super().__init__('global_localizer')
-        self._config = parameters.declare_config(self, GlobalLocalizationConfig)
-        self._seed = int(
-            parameters.declare_parameter(self, 'seed', 0, 'decides where samples are drawn')
-        )
-        self._map_frame = parameters.declare_parameter(self, 'map_frame', 'map', 'frame of the map')
-        automatic = parameters.declare_parameter(
-            self,
-            'automatic',
-            False,
-            'begin at once, and again when the localizer has been lost for lost_s',
-        )
-        lost_s = parameters.declare_parameter(
-            self, 'lost_s', 3.0, 'how long the localizer must have been lost, s'
-        )
-        self._active = bool(
-            parameters.declare_parameter(
-                self,
-                'active',
-                False,
-                'drive, while it looks, to where the places in question differ most',
-            )
-        )
-        speed = parameters.declare_parameter(
-            self, 'active_speed_m_s', 0.3, 'how fast it then drives, m/s'
-        )
-        path = str(
-            parameters.declare_parameter(
-                self, 'map', '', 'map_server YAML file; empty: from the topics'
-            )
-        )
+        self._settings = _Settings.declare(self)
         self._laser_transform = LaserTransform(self)
         parameters.reject_unknown(self)
-        self._automatic = bool(automatic)
-        self._lost_ns = round(1e9 * float(lost_s))
-        self._patch: GridPatch | None = occupancy_maps.read_map(Path(path)) if path else None
-        self._topology: Topology | None = (
-            build(self._patch, None, TopologyConfig()) if self._patch else None
-        )
-        radius = self._config.robot_radius_m
-        self._driving = NavigatorConfig(
-            max_speed_m_s=float(speed),
-            robot_radius_m=radius + _PLANNED_M,
-            body_radius_m=radius + _BODY_M,
-        )
+        self._patch: GridPatch | None = None
+        self._topology: Topology | None = None
+        if self._settings.map_file:
+            self._patch = occupancy_maps.read_map(Path(self._settings.map_file))
+            self._topology = build(self._patch, None, TopologyConfig())
         warm_up.global_localizer()
+        self._output = _LocalizationPublishers(self, self._settings.map_frame)
+        self._driver = self._create_driver()
         self.reset_state()
-        self._pose = self.create_publisher(PoseWithCovarianceStamped, 'initialpose', qos.STREAM)
-        self._samples = self.create_publisher(PoseArray, 'localization_samples', qos.LATCHED)
-        self._status = self.create_publisher(LocalizationStatus, 'localization_status', qos.LATCHED)
-        if not path:
+        if not self._settings.map_file:
             subscribe_guarded(self, OccupancyGrid, 'map', self._on_map, qos.LATCHED)
             subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
         subscribe_guarded(self, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
@@ -114,30 +261,26 @@ class GlobalLocalizerNode(ThinmapNode):
         subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
         self.create_service(LocalizeGlobally, 'localize_globally', self._on_request)
         self.create_active_timer(1.0, self._report_missing_inputs)
-        if self._active:
-            self._cmd_vel = self.create_publisher(Twist, 'cmd_vel', qos.STREAM)
-            self.create_active_timer(_CONTROL_PERIOD_S, self._drive)
+
+    def _create_driver(self) -> _SearchDriver:
+        if not self._settings.active:
+            return _SearchDriver(self.get_clock(), lambda command: None)
+        cmd_vel = self.create_publisher(Twist, 'cmd_vel', qos.STREAM)
+        self.create_active_timer(_CONTROL_PERIOD_S, lambda: self._driver.step())
+        return _SearchDriver(self.get_clock(), cmd_vel.publish)
 
     def reset_state(self) -> None:
-        """Forget where the robot may be."""
-        self._finder: GlobalLocalization | None = None
-        self._wanted = self._automatic
-        self._lost_since_ns: int | None = None
-        self._found_ns = -1  # what the localizer said before it heard the pose says nothing
+        """Discard the search and all inputs but the map."""
+        self._localization: GlobalLocalization | None = None
+        self._is_requested = self._settings.automatic
+        self._lost = _LostDetector(self._settings.lost_ns)
         self._pairing = ScanPairing()
-        self._heard: set[str] = set()
-        self._search: ActiveSearch | None = None
-        self._T_odom_base: Array | None = None
-        self._scan: Scan | None = None
-        self._odometry_ns = 0
-        self._drives = False
-        self._shown_ns = -_SHOWN_NS
+        self._received: set[str] = set()
+        self._driver.reset()
 
     def stop(self) -> None:
         """Stop the robot, if it is this node that drives it."""
-        if self._drives:
-            self._cmd_vel.publish(messages.twist_msg(0.0, 0.0))
-        self._drives = False
+        self._driver.stop()
 
     def close(self) -> None:
         """Stop the robot: the last thing the node does."""
@@ -151,153 +294,96 @@ class GlobalLocalizerNode(ThinmapNode):
         self._topology = messages.topology_from_msg(message)
 
     def _on_slam_status(self, message: SlamStatus) -> None:
-        """A robot that was carried off: the localizer finds nothing where it thinks that it is."""
-        stamp_ns = messages.stamp_ns(message.header.stamp)
-        if message.state != SlamStatus.LOST or self._wanted or stamp_ns <= self._found_ns:
-            self._lost_since_ns = None
-        elif self._lost_since_ns is None:
-            self._lost_since_ns = stamp_ns
-        elif self._automatic and stamp_ns - self._lost_since_ns >= self._lost_ns:
-            self.get_logger().info('the localizer is lost: looking all over the map')
-            self._begin(clear=True)
+        """Start when the localizer reports LOST (kidnapped robot)."""
+        is_lost = message.state == SlamStatus.LOST and not self._is_requested
+        is_kidnapped = self._lost.update(messages.stamp_ns(message.header.stamp), is_lost)
+        if is_kidnapped and self._settings.automatic:
+            self.get_logger().info('the localizer is lost: searching the whole map')
+            self._start(clear=True)
 
     def _on_request(
         self, request: LocalizeGlobally.Request, response: LocalizeGlobally.Response
     ) -> LocalizeGlobally.Response:
-        self._begin(request.clear)
+        self._start(request.clear)
         missing = self._missing()
         response.accepted = True
-        response.message = f'waits for {missing}' if missing else 'looking all over the map'
+        response.message = f'waits for {missing}' if missing else 'searching the whole map'
         return response
 
-    def _begin(self, clear: bool) -> None:
-        self._wanted = True
-        self._lost_since_ns = None
+    def _start(self, clear: bool) -> None:
+        self._is_requested = True
+        self._lost.restart()
         if clear:
-            self._finder = self._search = None
+            self._discard_search()
+
+    def _discard_search(self) -> None:
+        self._localization = None
+        self._driver.search = None
 
     def _on_odometry(self, message: Odometry) -> None:
-        self._heard.add('odom')
+        self._received.add('odom')
         stamp_ns = messages.stamp_ns(message.header.stamp)
-        self._T_odom_base = messages.pose_from_msg(message.pose.pose)
-        self._odometry_ns = stamp_ns
-        self._process(self._pairing.add_odometry(stamp_ns, self._T_odom_base))
+        T_odom_base = messages.pose_from_msg(message.pose.pose)
+        self._driver.add_odometry(stamp_ns, T_odom_base)
+        self._process(self._pairing.add_odometry(stamp_ns, T_odom_base))
 
     def _on_scan(self, message: LaserScan) -> None:
         scan = self._laser_transform.to_scan(message)
-        self._heard.add('scan')
-        # Where the laser is blind, nobody sees where the robot drives.
-        self._scan = None if scan.is_blind else scan
+        self._received.add('scan')
+        self._driver.add_scan(scan)
         self._process(self._pairing.add_scan(scan))
 
     def _process(self, ready: list[tuple[Scan, Array]]) -> None:
         for scan, T_odom_base in ready:
-            if self._wanted and self._create_global_localizer():
-                assert self._finder is not None
+            localization = self._create_localization() if self._is_requested else None
+            if localization is not None:
                 with self.diagnostics.time_step('global localization'):
-                    result = self._finder.step(scan, T_odom_base)
-                if self._search is not None:
-                    self._search.take(result, T_odom_base)
-                self._publish(scan.stamp_ns, result)
+                    result = localization.step(scan, T_odom_base)
+                self._driver.add_result(result, T_odom_base)
+                self._output.publish_samples(scan.stamp_ns, localization.samples)
+                self._output.publish_result(scan.stamp_ns, result)
+                if result.pose is not None:
+                    self._finish(scan.stamp_ns)
 
-    def _drive(self) -> None:
-        """Drive on while the robot is looked for and what it sees and has driven is heard of."""
-        scan = self._scan
-        T_odom_base = self._T_odom_base
-        heard = scan is not None and abs(self._odometry_ns - scan.stamp_ns) <= _SILENCE_NS
-        heard = heard and self.get_clock().now().nanoseconds - self._odometry_ns <= _SILENCE_NS
-        if (
-            not self._wanted
-            or self._search is None
-            or scan is None
-            or T_odom_base is None
-            or not heard
-        ):
-            self.stop()
-            return
-        command = self._search.step(T_odom_base, scan, _CONTROL_PERIOD_S)
-        if command.state == 'idle':
-            self.stop()
-            return
-        self._drives = True
-        self._cmd_vel.publish(messages.twist_msg(command.v, command.w))
+    def _finish(self, stamp_ns: int) -> None:
+        """The pose is found: wait for the next request."""
+        self._is_requested = False
+        self._lost.ignore_until(stamp_ns)
+        self._discard_search()
+        self.stop()
 
-    def _create_global_localizer(self) -> bool:
-        """Whether there is all that a search needs; a map that cannot be used is said in words."""
-        if self._finder is None and self._patch is not None and self._topology is not None:
-            try:
-                self._finder = GlobalLocalization(
-                    self._patch, self._topology, self._config, self._seed
-                )
-                if self._active:
-                    self._search = ActiveSearch(self._finder.places, self._config, self._driving)
-            except InputError as error:
-                self._publish_state(LocalizationStatus.WAITING, str(error))
-        return self._finder is not None
+    def _create_localization(self) -> GlobalLocalization | None:
+        """The search under way, or a new one; None while the map is missing or unusable."""
+        if self._localization is not None or self._patch is None or self._topology is None:
+            return self._localization
+        settings = self._settings
+        try:
+            localization = GlobalLocalization(
+                self._patch, self._topology, settings.search, settings.seed
+            )
+        except InputError as error:
+            self._output.publish_state(LocalizationStatus.WAITING, str(error))
+            return None
+        self._localization = localization
+        if settings.active:
+            self._driver.search = ActiveSearch(
+                localization.places, settings.search, settings.driving
+            )
+        return localization
 
     def _missing(self) -> str:
-        """What is not there yet, in words; empty where nothing is missing."""
-        missing = [
-            name
-            for name, value in (('map', self._patch), ('topology', self._topology))
-            if value is None
-        ]
-        missing += [name for name in ('odom', 'scan') if name not in self._heard]
+        """Names of the missing inputs; '' for none."""
+        maps = {'map': self._patch, 'topology': self._topology}
+        missing = [name for name, value in maps.items() if value is None]
+        missing += [name for name in ('odom', 'scan') if name not in self._received]
         return ', '.join(missing)
 
     def _report_missing_inputs(self) -> None:
         missing = self._missing()
-        if not self._wanted:
-            self._publish_state(LocalizationStatus.IDLE, 'not asked')
+        if not self._is_requested:
+            self._output.publish_state(LocalizationStatus.IDLE, 'no request')
         elif missing:
-            self._publish_state(LocalizationStatus.WAITING, f'waits for {missing}')
-
-    def _publish_state(self, state: int, reason: str) -> None:
-        header = messages.header(self._map_frame, self.get_clock().now().nanoseconds)
-        self._status.publish(LocalizationStatus(header=header, state=state, reason=reason))
-        if state == LocalizationStatus.WAITING:
-            self.get_logger().warning(reason, throttle_duration_sec=_WARN_PERIOD_S)
-
-    def _publish(self, ns: int, result: Result) -> None:
-        header = messages.header(self._map_frame, ns)
-        self._show_samples(ns)
-        self._status.publish(
-            LocalizationStatus(
-                header=header,
-                state=_STATES[result.state],
-                reason=result.reason,
-                hypotheses=[messages.pose_msg(found.T_map_base) for found in result.hypotheses],
-                weights=[found.weight for found in result.hypotheses],
-                explained=[found.explained for found in result.hypotheses],
-            )
-        )
-        if result.state == State.WAITING:
-            self.get_logger().warning(result.reason, throttle_duration_sec=_WARN_PERIOD_S)
-        if result.pose is not None:
-            found = result.pose
-            self._pose.publish(
-                messages.pose_with_covariance_msg(
-                    found.T_map_base, found.covariance, self._map_frame, ns
-                )
-            )
-            self.get_logger().info(f'localized: {result.reason}')
-            self._wanted = False
-            self._finder = None
-            self._search = None
-            self._found_ns = ns
-            self.stop()
-
-    def _show_samples(self, ns: int) -> None:
-        """Publish the samples, now and then.
-
-        They are thousands of small objects, which take longer than a step.
-        """
-        if self._finder is not None and not 0 <= ns - self._shown_ns < _SHOWN_NS:
-            self._shown_ns = ns
-            poses = [messages.pose_msg(T) for T in self._finder.samples]
-            self._samples.publish(
-                PoseArray(header=messages.header(self._map_frame, ns), poses=poses)
-            )
+            self._output.publish_state(LocalizationStatus.WAITING, f'waits for {missing}')
 
 
 def main() -> None:

@@ -1,13 +1,13 @@
 """The occupancy grid: each scan is added at the pose that the localizer found for it."""
 
-from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid as OccupancyGridMsg
 from nav_msgs.msg import Path
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.client import Client
+from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.srv import LoadMap, SaveMap
@@ -15,20 +15,62 @@ from thinmap_ros.core import snapshot
 from thinmap_ros.core.errors import ThinmapError
 from thinmap_ros.core.grid.correctable import CorrectableGrid
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, WindowConfig
+from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.stamp_matcher import StampMatcher
 from thinmap_ros.files import sessions
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.ros import messages, node_main, parameters, qos
-from thinmap_ros.ros.checkpoint import State
+from thinmap_ros.ros.checkpoint import StateStamp
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.save_directory import SaveDirectory
-from thinmap_ros.ros.services import call, fill_response
+from thinmap_ros.ros.services import fill_response
+from thinmap_ros.ros.session_client import SessionClient
 from thinmap_ros.ros.subscription import subscribe_guarded
 
-_LOST_SIGMA_M = 200.0  # a pose that is not known better than this is that of a lost robot
-_NO_BUILDER = 'no graph: there is no topology_builder'
+_LOST_SIGMA_M = 200.0  # the localizer publishes a larger standard deviation while it is lost
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """Parameters of the node; mapping: whether scans change the map."""
+
+    grid: OccupancyConfig
+    window_m: float
+    mapping: bool
+
+    @staticmethod
+    def declare(node: Node) -> '_Settings':
+        return _Settings(
+            grid=parameters.declare_config(node, OccupancyConfig),
+            window_m=parameters.declare_config(node, WindowConfig).window_m,
+            mapping=bool(
+                parameters.declare_parameter(
+                    node,
+                    'update_map',
+                    True,
+                    'true: mapping. false: the map is published and does not change.',
+                )
+            ),
+        )
+
+
+class _MapPublishers:
+    """Publishes the map and the local maps."""
+
+    def __init__(self, node: Node) -> None:
+        self._frame = parameters.declare_parameter(node, 'map_frame', 'map', 'frame of the map')
+        self._map = node.create_publisher(OccupancyGridMsg, 'map', qos.LATCHED)
+        self._local_map = node.create_publisher(OccupancyGridMsg, 'local_map', qos.LATCHED)
+
+    def publish_map(self, grid: CorrectableGrid, stamp_ns: int) -> None:
+        patch = grid.shown.patch()
+        self._map.publish(messages.grid_msg(patch, self._frame, stamp_ns, grid.corrected_ns))
+
+    def publish_local_map(self, window: GridPatch, stamp_ns: int, corrected_ns: int) -> None:
+        self._local_map.publish(messages.grid_msg(window, self._frame, stamp_ns, corrected_ns))
 
 
 class GridMapperNode(ThinmapNode):
@@ -43,74 +85,55 @@ class GridMapperNode(ThinmapNode):
 
     def __init__(self) -> None:
         super().__init__('grid_mapper', recovers=True)
-        self._config = parameters.declare_config(self, OccupancyConfig)
-        self._window_m = parameters.declare_config(self, WindowConfig).window_m
-        self._mapping = parameters.declare_parameter(
-            self,
-            'update_map',
-            True,
-            'true: mapping. false: the map is published and does not change.',
-        )
-        self._map_frame = parameters.declare_parameter(self, 'map_frame', 'map', 'frame of the map')
+        self._settings = _Settings.declare(self)
+        self._output = _MapPublishers(self)
         self._laser_transform = LaserTransform(self)
         self._session = parameters.declare_session(self)
         self._save_directory = SaveDirectory(self)
         parameters.reject_unknown(self)
         warm_up.grid_mapper()
-        self._latest_ns: int | None = None
-        self._map = self.create_publisher(OccupancyGridMsg, 'map', qos.LATCHED)
-        self._local_map = self.create_publisher(OccupancyGridMsg, 'local_map', qos.LATCHED)
-        self._resumed_ns: int | None = None
-        self._restored_ns = 0
+        self._stamp = StateStamp()
         self.reset_state()
-        self.enable_checkpoint(self._state, self._resume)
+        self.enable_checkpoint(self._state, self._restore)
         self.create_pause_service()
         self.diagnostics.check_sole_publisher('map')
-        # First: of messages that wait together it is taken before the poses that follow from it.
+        # First: of messages that wait together, it is processed before the poses that follow it.
         subscribe_guarded(self, Path, 'trajectory', self._on_trajectory, qos.LATCHED)
         subscribe_guarded(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
         subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
-        # Mapping goes on while a map is saved, and waits while one is loaded: nothing gets into the
-        # wrong graph.
-        aside = ReentrantCallbackGroup()
-        self.create_service(SaveMap, 'save_map', self._on_save, callback_group=aside)
+        # Mapping continues while a map is saved, and waits while one is loaded: no window of the
+        # old map reaches the new graph.
+        reentrant = ReentrantCallbackGroup()
+        self._session_client = SessionClient(self, reentrant)
+        self.create_service(SaveMap, 'save_map', self._on_save, callback_group=reentrant)
         self.create_service(LoadMap, 'load_map', self._on_load)
-        self._save_topology = self.create_client(SaveMap, 'save_topology', callback_group=aside)
-        self._save_exploration = self.create_client(
-            SaveMap, 'save_exploration', callback_group=aside
-        )
-        self._save_features = self.create_client(SaveMap, 'save_features', callback_group=aside)
-        self._load_features = self.create_client(LoadMap, 'load_features', callback_group=aside)
-        self._load_topology = self.create_client(LoadMap, 'load_topology', callback_group=aside)
         self.create_active_timer(1.0, self._publish_map)
 
     def reset_state(self) -> None:
-        """Forget the map, or go back to the session that the node was started with."""
+        """Discard the map, or return to the session that the node was started with."""
         self._matcher: StampMatcher[LaserScan, tuple[Array, bool]] = StampMatcher()
-        known = self._session or self._latest_ns is not None
-        self._latest_ns = None
+        has_map = self._session or self._stamp.latest_ns is not None
+        self._stamp.latest_ns = None
         if self._session:
-            self._grid = CorrectableGrid(self._load_session(), keeps_scans=False)
+            grid = sessions.load_grid(self._session, self._settings.grid)
+            self._grid = CorrectableGrid(grid, keeps_scans=False)
         else:
-            self._grid = CorrectableGrid(OccupancyGrid(self._config))
-        if known:
-            self._latest_ns = self.get_clock().now().nanoseconds
+            self._grid = CorrectableGrid(OccupancyGrid(self._settings.grid))
+        if has_map:
+            self._stamp.latest_ns = self.get_clock().now().nanoseconds
             self._publish_map()
 
     def _state(self) -> State | None:
-        if self._latest_ns is None:
+        if self._stamp.latest_ns is None:
             return None
-        return {**self._grid.shown.state(), 'latest_ns': np.array(self._latest_ns)}
+        return {**self._grid.shown.state(), 'latest_ns': np.array(self._stamp.latest_ns)}
 
-    def _resume(self, left: State) -> None:
-        """Take over the map of a killed mapper. Raises InputError where it is no such map."""
-        latest_ns, cells = snapshot.check_stamp(left)
-        grid = OccupancyGrid.from_state(cells, self._config)
-        self._resumed_ns = self._latest_ns = self._restored_ns = latest_ns
+    def _restore(self, state: State) -> None:
+        """Continue with the map of a killed mapper. Raises InputError where it is no such map."""
+        latest_ns, cells = snapshot.split_stamp(state)
+        grid = OccupancyGrid.from_state(cells, self._settings.grid)
+        self._stamp.restore(latest_ns)
         self._replace_grid(grid)
-
-    def _load_session(self) -> OccupancyGrid:
-        return sessions.load_grid(self._session, self._config)
 
     def _on_scan(self, message: LaserScan) -> None:
         self._add_scan(self._matcher.add_left(messages.stamp_ns(message.header.stamp), message))
@@ -128,52 +151,44 @@ class GridMapperNode(ThinmapNode):
             return
         message, (T_map_base, is_known) = pair
         scan = self._laser_transform.to_scan(message)
-        if self._resumed_ns is not None and scan.stamp_ns < self._resumed_ns:
-            self.reset_state()  # the robot has begun anew as well
-        self._resumed_ns = None
+        if self._stamp.is_restarted_by(scan.stamp_ns):
+            self.reset_state()
         with self.diagnostics.time_step('map update'):
-            is_mapped = self._mapping and is_known
+            is_mapped = self._settings.mapping and is_known
             moved = self._grid.update(scan if is_mapped else None, T_map_base)
-            window = self._grid.shown.window(T_map_base[0], T_map_base[1], self._window_m)
-        self._latest_ns = scan.stamp_ns
+            x, y, _ = T_map_base
+            window = self._grid.shown.window(x, y, self._settings.window_m)
+        self._stamp.latest_ns = scan.stamp_ns
         if moved is not None:
             self._publish_map()  # before the windows of the corrected map
-        self._local_map.publish(
-            messages.grid_msg(window, self._map_frame, scan.stamp_ns, self._grid.corrected_ns)
-        )
+        self._output.publish_local_map(window, scan.stamp_ns, self._grid.corrected_ns)
 
     def _publish_map(self) -> None:
-        if self._latest_ns is not None:
-            patch = self._grid.shown.patch()
-            corrected_ns = self._grid.corrected_ns
-            self._map.publish(
-                messages.grid_msg(patch, self._map_frame, self._latest_ns, corrected_ns)
-            )
+        if self._stamp.latest_ns is not None:
+            self._output.publish_map(self._grid, self._stamp.latest_ns)
 
     def _on_trajectory(self, message: Path) -> None:
-        """A loop was closed: correct where the scans of the map were made."""
+        """A loop was closed: correct the poses at which the scans of the map were made."""
         corrected_ns = messages.stamp_ns(message.header.stamp)
-        if self._latest_ns is None or corrected_ns <= self._restored_ns:
-            # Latched, and older than the map: that has undergone it, or is a new one.
+        if not self._stamp.is_corrected_by(corrected_ns):
+            # A latched trajectory from before this map, which follows it or is a new one.
             self._grid.corrected_ns = corrected_ns
             return
         with self.diagnostics.time_step('map correction'):
             stamps_ns, poses = messages.trajectory_from_msg(message)
-            is_followed = self._grid.correct(stamps_ns, poses, since_ns=corrected_ns)
-        if not is_followed:
-            self.get_logger().warning(
-                'a loop is closed, but the map was loaded, not drawn here: it stays as it was'
-            )
+            is_corrected = self._grid.correct(stamps_ns, poses, since_ns=corrected_ns)
+        if not is_corrected:
+            self.get_logger().warning('loop closed, but a loaded map is not corrected')
             self._publish_map()
 
     def _replace_grid(self, grid: OccupancyGrid) -> None:
         corrected_ns = self._grid.corrected_ns
         self._grid = CorrectableGrid(grid, keeps_scans=False, corrected_ns=corrected_ns)
-        self._latest_ns = self._latest_ns or self.get_clock().now().nanoseconds
+        self._stamp.latest_ns = self._stamp.latest_ns or self.get_clock().now().nanoseconds
         self._publish_map()
 
     def _save_grid(self, path: str) -> str:
-        """Save the map, after all of it has undergone the newest correction."""
+        """Save the map, after all of it follows the newest correction."""
         if self._grid.finish() is not None:
             self._publish_map()
         return f'saved {sessions.save_grid(path, self._grid.shown)}'
@@ -182,60 +197,26 @@ class GridMapperNode(ThinmapNode):
         self, request: SaveMap.Request, response: SaveMap.Response
     ) -> SaveMap.Response:
         fill_response(response, lambda: self._save_grid(self._save_directory.resolve(request.path)))
-        if not response.success:
-            return response
-        path = str(sessions.stem_of(self._save_directory.resolve(request.path)))
-        graph = await call(self, self._save_topology, SaveMap.Request(path=path))
-        if graph is None:
-            saved = response.message
-            fill_response(
-                response, lambda: f'{saved}; {_NO_BUILDER}{sessions.set_topology_aside(path)}'
-            )
-        else:
-            response.success = graph.success
-            response.message = f'{response.message}; {graph.message}'
-        await self._save_at(self._save_features, path, sessions.set_features_aside, response)
-        await self._save_at(self._save_exploration, path, sessions.set_exploration_aside, response)
+        if response.success:
+            others = await self._session_client.save(self._save_directory.resolve(request.path))
+            response.success = others.success
+            response.message = f'{response.message}; {others.message}'
         return response
-
-    async def _save_at(
-        self, client: Client, path: str, set_aside: Callable[[str], str], response: SaveMap.Response
-    ) -> None:
-        """Have another node save its part.
-
-        Without that node, what is there of an earlier map must not pass for this one's.
-        """
-        saved = response.message
-        part = await call(self, client, SaveMap.Request(path=path))
-        if part is not None:
-            response.success = response.success and part.success
-            response.message = f'{saved}; {part.message}'
-        elif response.success:
-            fill_response(response, lambda: f'{saved}{set_aside(path)}')
 
     async def _on_load(
         self, request: LoadMap.Request, response: LoadMap.Response
     ) -> LoadMap.Response:
-        """Take over grid and graph, or neither."""
+        """Load grid and graph, or neither."""
         try:
-            inside = self._save_directory.resolve(request.path)
-            grid = sessions.load_grid(inside, self._config, self._save_directory.path)
-            stem = str(sessions.stem_of(inside))
-            path = stem if sessions.has_topology(stem) else ''
+            path = self._save_directory.resolve(request.path)
+            grid = sessions.load_grid(path, self._settings.grid, self._save_directory.path)
+            result = await self._session_client.load(path, lambda: self._replace_grid(grid))
         except ThinmapError as error:
             response.success = False
             response.message = str(error)
             return response
-        graph = await call(self, self._load_topology, LoadMap.Request(path=path))
-        response.success = graph is None or graph.success
-        response.message = _NO_BUILDER if graph is None else graph.message
-        if response.success:
-            self._replace_grid(grid)
-            response.message = f'grid taken over; {response.message}'
-            features = await call(self, self._load_features, LoadMap.Request(path=stem))
-            if features is not None:
-                response.success = features.success
-                response.message = f'{response.message}; {features.message}'
+        response.success = result.success
+        response.message = result.message
         return response
 
 

@@ -1,7 +1,4 @@
-"""Where the robot is.
-
-Each scan, with the odometry at its stamp, through one step of the localizer.
-"""
+"""The pose of the robot: each scan, with the odometry at its stamp, is a step of the localizer."""
 
 from dataclasses import replace
 from time import monotonic, perf_counter
@@ -9,6 +6,7 @@ from time import monotonic, perf_counter
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
@@ -30,11 +28,11 @@ from thinmap_ros.core.slam.localizers import (
     localizer_class,
     set_topology,
 )
+from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.topology.graph import TopologicalMap as Graph
-from thinmap_ros.files import sessions
+from thinmap_ros.files.sessions import LOCALIZER
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.ros import messages, node_main, parameters, qos
-from thinmap_ros.ros.checkpoint import State
 from thinmap_ros.ros.diagnostics import ERROR, OK
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
@@ -42,87 +40,152 @@ from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import fill_response
 from thinmap_ros.ros.subscription import subscribe_guarded
 
-_MAP_WAIT_S = 3.0  # after a restart; the navigator drives on for so long without a new pose
+_MAP_WAIT_S = 3.0  # after a restart; the navigator drives for so long without a new pose
 _HEALTH = {
     SlamStatus.TRACKING: (OK, 'tracking'),
-    SlamStatus.LOST: (ERROR, 'lost: scans do not fit the map'),
-    SlamStatus.BLIND: (ERROR, 'laser blind (too few valid beams): odometry alone'),
+    SlamStatus.LOST: (ERROR, 'lost: scans contradict the map'),
+    SlamStatus.BLIND: (ERROR, 'laser blind (too few valid beams): dead reckoning'),
 }
+
+
+class _PosePublishers:
+    """Publishes poses with their transform, status, line features, and corrected trajectories."""
+
+    def __init__(self, node: Node) -> None:
+        def frame(name: str, of: str) -> str:
+            return str(parameters.declare_parameter(node, f'{name}_frame', name, f'frame of {of}'))
+
+        self._map_frame = frame('map', 'the map')
+        self._odom_frame = frame('odom', 'the odometry')
+        self._pose = node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
+        self._tf = node.create_publisher(TFMessage, '/tf', qos.STREAM)
+        self._features = node.create_publisher(LineFeatureArray, 'line_features', qos.LATCHED)
+        self._status = node.create_publisher(SlamStatus, 'slam_status', qos.STREAM)
+        self._trajectory = node.create_publisher(Path, 'trajectory', qos.LATCHED)
+
+    def publish_estimate(
+        self, stamp_ns: int, estimate: Estimate, localizer: AnyLocalizer, status: SlamStatus
+    ) -> None:
+        """Publish an estimate; status: with its state and step time, the rest is filled in."""
+        frame = self._map_frame
+        self._pose.publish(
+            messages.pose_with_covariance_msg(
+                estimate.T_map_base, estimate.covariance, frame, stamp_ns
+            )
+        )
+        transform = messages.transform_msg(estimate.T_map_odom, frame, self._odom_frame, stamp_ns)
+        self._tf.publish(TFMessage(transforms=[transform]))
+        header = messages.header(frame, stamp_ns)
+        features = [_feature_msg(feature) for feature in line_features(localizer)]
+        self._features.publish(LineFeatureArray(header=header, features=features))
+        status.header = header
+        status.features = len(features)
+        status.local_features = estimate.n_local
+        status.observed = estimate.observed
+        status.matched = estimate.matched
+        status.refused = localizer.refused
+        status.match_quality = estimate.match_quality
+        self._status.publish(status)
+
+    def publish_trajectory(self, stamp_ns: int, stamps_ns: list[int], poses: Array) -> None:
+        """Publish the corrected poses (N, 3) of the keyframes, with their stamps."""
+        self._trajectory.publish(
+            messages.trajectory_msg(stamps_ns, poses, self._map_frame, stamp_ns)
+        )
+
+
+class _Relocation:
+    """What a localizer that was killed and restarted waits for: a scan, and the map of before.
+
+    last: the pose in its checkpoint. map: None until it is received by `subscription`.
+    """
+
+    def __init__(self, last: LastPose) -> None:
+        self.last = last
+        self.map: GridPatch | None = None
+        self._pending: tuple[Scan, Array] | None = None
+        self._waiting_since_s = monotonic()
+        self.subscription: Subscription | None = None
+
+    @property
+    def waited_s(self) -> float:
+        """How long a scan has been waiting for the map, s."""
+        return monotonic() - self._waiting_since_s
+
+    def is_continuous_with(self, scan: Scan, T_odom_base: Array) -> bool:
+        """Whether the odometry at a scan can continue that of the checkpoint."""
+        return self.last.leads_to(scan.stamp_ns, T_odom_base)
+
+    def next_scan(self, ready: list[tuple[Scan, Array]]) -> tuple[Scan, Array] | None:
+        """The newest scan with its odometry, once the map need not be waited for any longer."""
+        if ready:
+            self._pending = ready[-1]
+        if self._pending is None:
+            self._waiting_since_s = monotonic()
+            return None
+        is_early = self.map is None and self.waited_s < _MAP_WAIT_S
+        return None if is_early and self.is_continuous_with(*self._pending) else self._pending
 
 
 class LocalizerNode(ThinmapNode):
     """/scan and /odom in; /pose, map -> odom on /tf, /line_features, /slam_status out.
 
-    /trajectory after a loop.
+    /trajectory after a loop closure.
 
-    Services ~/pause, ~/reset, and save_features and load_features for sessions: lost in the map of
-    one, it waits for /initialpose, or for a scan that fits where it is.
+    Services ~/pause, ~/reset, save_localizer, load_localizer. In the map of a session it is lost
+    until /initialpose arrives or a scan matches at its start pose.
     """
 
     def __init__(self) -> None:
         super().__init__('localizer', recovers=True)
         self._config = parameters.declare_config(self, LocalizerConfig)
-        self._map_frame = parameters.declare_parameter(self, 'map_frame', 'map', 'frame of the map')
-        self._odom_frame = parameters.declare_parameter(
-            self, 'odom_frame', 'odom', 'frame of the odometry'
-        )
+        self._output = _PosePublishers(self)
         self._laser_transform = LaserTransform(self)
         self._session = parameters.declare_session(self)
         self._save_directory = SaveDirectory(self)
         parameters.reject_unknown(self)
         warm_up.localizer()
-        self._map_topic: Subscription | None = None
-        # Of a localizer that was killed: its last pose, the map, and the newest scan, that waits
-        # for it.
-        self._restored_pose: LastPose | None = None
-        self._latched_map: GridPatch | None = None
         self.reset_state()
-        self.enable_checkpoint(
-            lambda: None if self._last is None else self._last.state(), self._restore_checkpoint
-        )
+        self.enable_checkpoint(self._state, self._restore)
         self.create_pause_service()
         self.diagnostics.check_sole_publisher('pose')
-        self._pose = self.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
-        self._tf = self.create_publisher(TFMessage, '/tf', qos.STREAM)
-        self._features = self.create_publisher(LineFeatureArray, 'line_features', qos.LATCHED)
-        self._status = self.create_publisher(SlamStatus, 'slam_status', qos.STREAM)
-        self._trajectory = self.create_publisher(Path, 'trajectory', qos.LATCHED)
-        # Before the scans: of messages that wait together, the executor takes the graph of the last
-        # scan first.
+        # Before the scans: of messages that wait together, the executor processes the graph of the
+        # last scan first.
         subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
         subscribe_guarded(self, Odometry, 'odom', self._on_odometry, qos.STREAM)
         subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
         subscribe_guarded(
             self, PoseWithCovarianceStamped, 'initialpose', self._on_initial_pose, qos.STREAM
         )
-        self.create_service(SaveMap, 'save_features', self._on_save)
-        self.create_service(LoadMap, 'load_features', self._on_load)
+        self.create_service(SaveMap, 'save_localizer', self._on_save)
+        self.create_service(LoadMap, 'load_localizer', self._on_load)
 
     def reset_state(self) -> None:
-        """Forget all features, or go back to the session that the node was started with.
+        """Discard the map, or return to the session that the node was started with.
 
-        The robot is at its start.
+        The robot is at the start pose.
         """
         self._localizer = self._create_localizer(self._config)
         self._pairing = ScanPairing()
         self._last: LastPose | None = None
         self._topology: Graph | None = None
-        self._restored_pose = self._latched_map = None
-        self._pending_scan: list[tuple[Scan, Array]] = []
-        self._waiting_since = monotonic()
+        self._relocation: _Relocation | None = None
 
-    def _restore_checkpoint(self, left: State) -> None:
-        """Go on from the last pose of a killed localizer. Raises InputError where it is none."""
-        self._restored_pose = LastPose.from_state(left)
-        self._subscribe_map_once()
+    def _state(self) -> State | None:
+        return None if self._last is None else self._last.state()
+
+    def _restore(self, state: State) -> None:
+        """Continue at the last pose of a killed localizer. Raises InputError where it is none."""
+        self._relocation = _Relocation(LastPose.from_state(state))
+        self._subscribe_map_once(self._relocation)
 
     def _create_localizer(self, config: LocalizerConfig) -> AnyLocalizer:
-        """A localizer that begins at its start, in the map of the session if there is one."""
-        loaded = sessions.load_features(self._session, config) if self._session else None
+        """A localizer at the start pose, in the map of the session if there is one."""
+        loaded = LOCALIZER.load_optional(self._session, config) if self._session else None
         return loaded or localizer_class(config)(config)
 
     def _config_at(self, T_map_base: Array) -> LocalizerConfig:
-        """The configuration of a robot that starts at a pose (3,)."""
+        """The configuration with a start pose (3,)."""
         x, y, yaw = T_map_base.tolist()
         return replace(self._config, initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
 
@@ -144,8 +207,8 @@ class LocalizerNode(ThinmapNode):
         set_topology(self._localizer, self._topology)
 
     def _process(self, ready: list[tuple[Scan, Array]]) -> None:
-        if self._restored_pose is not None:
-            ready = self._resume(self._restored_pose, ready)
+        if self._relocation is not None:
+            ready = self._relocate(self._relocation, ready)
         for scan, T_odom_base in ready:
             started = perf_counter()
             estimate = self._localizer.step(scan, T_odom_base)
@@ -153,70 +216,67 @@ class LocalizerNode(ThinmapNode):
             self._publish(scan, estimate, step_ms)
             if not estimate.lost:
                 self._last = LastPose(scan.stamp_ns, estimate.T_map_odom, T_odom_base)
-        self.diagnostics.set_drop_total(
-            'scans without odometry at their time', self._pairing.dropped
-        )
-        self.diagnostics.set_drop_total(
-            'scans or odometry that make no sense', self._localizer.refused
-        )
+        diagnostics = self.diagnostics
+        diagnostics.set_drop_total('scans without odometry at their time', self._pairing.dropped)
+        diagnostics.set_drop_total('invalid scans or odometry', self._localizer.refused)
 
-    def _subscribe_map_once(self) -> None:
-        """Hear the map that was drawn before this localizer was killed, once."""
+    def _subscribe_map_once(self, relocation: _Relocation) -> None:
+        """Subscribe once to the map that was built before the crash."""
 
-        def take(message: OccupancyGrid) -> None:
-            if self._restored_pose is None:
-                return  # it was told to begin anew
+        def on_map(message: OccupancyGrid) -> None:
+            if self._relocation is not relocation:
+                return
             try:
-                self._latched_map = messages.grid_from_msg(message)
+                relocation.map = messages.grid_from_msg(message)
             except InputError as error:
                 self.get_logger().warning(f'map: {error}')
             if self.is_active:
                 self._process([])
 
-        self._map_topic = self.create_subscription(OccupancyGrid, 'map', take, qos.LATCHED)
+        relocation.subscription = self.create_subscription(
+            OccupancyGrid, 'map', on_map, qos.LATCHED
+        )
         self.create_active_timer(
             _MAP_WAIT_S, lambda: self._process([]), Clock(clock_type=ClockType.STEADY_TIME)
         )
 
-    def _resume(self, last: LastPose, ready: list[tuple[Scan, Array]]) -> list[tuple[Scan, Array]]:
-        """Begin where the robot is now, in the map; returns the scan to go on with, or none yet.
+    def _relocate(
+        self, relocation: _Relocation, ready: list[tuple[Scan, Array]]
+    ) -> list[tuple[Scan, Array]]:
+        """Start at the present pose in the map; returns the scan to continue with, or none yet.
 
-        Where the odometry has begun anew, too, the robot is at its start. Where there is no map, it
-        begins with what it sees where odometry says that it is.
+        Where the odometry was reset, too, the robot is at the start pose. Without a map, the
+        localizer starts a new one at the pose of the odometry.
         """
-        self._pending_scan = ready[-1:] or self._pending_scan
-        if not self._pending_scan:
-            self._waiting_since = monotonic()
+        pending = relocation.next_scan(ready)
+        if pending is None:
             return []
-        scan, T_odom_base = self._pending_scan[0]
-        leads = last.leads_to(scan.stamp_ns, T_odom_base)
-        waited_s = monotonic() - self._waiting_since
-        if leads and self._latched_map is None and waited_s < _MAP_WAIT_S:
-            return []
-        if not leads:
-            self.get_logger().warning('the odometry has begun anew as well: beginning at the start')
-        elif self._latched_map is None:
+        last = relocation.last
+        _, T_odom_base = pending
+        if not relocation.is_continuous_with(*pending):
+            self.get_logger().warning('odometry was reset: starting at the initial pose')
+        elif relocation.map is None:
             self.get_logger().warning(
-                f'no map came for {waited_s:.0f} s: what is drawn now may not fit what was before'
+                f'no map received for {relocation.waited_s:.0f} s: '
+                'the new map may not align with the earlier one'
             )
-            self._localizer = self._create_localizer(
-                self._config_at(se2.compose(last.T_map_odom, T_odom_base))
-            )
+            T_map_base = se2.compose(last.T_map_odom, T_odom_base)
+            self._localizer = self._create_localizer(self._config_at(T_map_base))
         else:
             kind = localizer_class(self._config)
             self._localizer = kind.from_occupancy_map(
-                self._latched_map, last, T_odom_base, self._config
+                relocation.map, last, T_odom_base, self._config
             )
         if self._topology is not None:
             set_topology(self._localizer, self._topology)
-        self._restored_pose = self._latched_map = None
-        self.destroy_subscription(self._map_topic)
-        return self._pending_scan
+        self.destroy_subscription(relocation.subscription)
+        self._relocation = None
+        return [pending]
 
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:
             path = self._save_directory.resolve(request.path)
-            return f'saved {sessions.save_features(path, self._localizer)}'
+            return f'saved {LOCALIZER.save(path, self._localizer)}'
 
         return fill_response(response, save)
 
@@ -224,63 +284,32 @@ class LocalizerNode(ThinmapNode):
         return fill_response(response, lambda: self._load(request.path))
 
     def _load(self, path: str) -> str:
-        """Take over the features of a session; without any, those that there are stay."""
+        """Replace the map by that of a session; without one, the localizer keeps its own."""
         config = self._config_at(self._localizer.pose)
-        loaded = sessions.load_features(self._save_directory.resolve(path), config)
+        loaded = LOCALIZER.load_optional(self._save_directory.resolve(path), config)
         if loaded is None:
-            return 'no features are saved: the localizer keeps its own'
+            return 'the session has no map of the localizer: it keeps its own'
         self._localizer = loaded
         if self._topology is not None:
             set_topology(loaded, self._topology)
         features = line_features(loaded)
-        return f'{len(features)} line features' if features else 'the local map'
+        return f'{len(features)} line features loaded' if features else 'local map loaded'
 
     def _publish(self, scan: Scan, estimate: Estimate, step_ms: float) -> None:
-        ns = scan.stamp_ns
-        self.diagnostics.record_step_time('localizer', step_ms)
         state = _state_of(scan, estimate)
+        self.diagnostics.record_step_time('localizer', step_ms)
         self.diagnostics.set_state(*_HEALTH[state])
         if estimate.correction is not None:
-            self._publish_trajectory(ns)
-        pose = messages.pose_with_covariance_msg(
-            estimate.T_map_base, estimate.covariance, self._map_frame, ns
-        )
-        self._pose.publish(pose)
-        transform = messages.transform_msg(
-            estimate.T_map_odom, self._map_frame, self._odom_frame, ns
-        )
-        self._tf.publish(TFMessage(transforms=[transform]))
-        header = messages.header(self._map_frame, ns)
-        features = [_feature_msg(feature) for feature in line_features(self._localizer)]
-        self._features.publish(LineFeatureArray(header=header, features=features))
-        self._status.publish(
-            SlamStatus(
-                header=header,
-                state=state,
-                features=len(features),
-                local_features=estimate.n_local,
-                observed=estimate.observed,
-                matched=estimate.matched,
-                refused=self._localizer.refused,
-                match_quality=estimate.match_quality,
-                step_time_ms=step_ms,
-            )
-        )
-
-    def _publish_trajectory(self, ns: int) -> None:
-        """Say where the kept scans were made, now that a loop is closed.
-
-        Before the first pose that follows from it.
-        """
-        stamps, poses = self._localizer.keyframe_trajectory()
-        self._trajectory.publish(
-            messages.trajectory_msg(stamps.tolist(), poses, self._map_frame, ns)
-        )
-        self.get_logger().info(f'a loop is closed: {len(poses)} poses of the past are corrected')
+            # Before the first pose that follows from it.
+            stamps, poses = self._localizer.keyframe_trajectory()
+            self._output.publish_trajectory(scan.stamp_ns, stamps.tolist(), poses)
+            self.get_logger().info(f'loop closed: {len(poses)} keyframe poses corrected')
+        status = SlamStatus(state=state, step_time_ms=step_ms)
+        self._output.publish_estimate(scan.stamp_ns, estimate, self._localizer, status)
 
 
 def _state_of(scan: Scan, estimate: Estimate) -> int:
-    """State of a SlamStatus. Of a robot that sees nothing it is not known whether it is lost."""
+    """State of a SlamStatus; without valid beams it is unknown whether the robot is lost."""
     if scan.is_blind:
         return int(SlamStatus.BLIND)
     return int(SlamStatus.LOST if estimate.lost else SlamStatus.TRACKING)

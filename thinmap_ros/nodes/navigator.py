@@ -1,8 +1,9 @@
-"""Driving: goals in, velocity commands out, along wavefront paths on the map."""
+"""Navigation: goals in, velocity commands out, along wavefront paths on the map."""
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
+from rclpy.clock import Clock
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.action import NavigateToPose
@@ -23,9 +24,68 @@ from thinmap_ros.ros.subscription import subscribe_guarded
 
 _WARN_PERIOD_S = 5.0
 _CONTROL_PERIOD_S = 0.1
-_SILENCE_NS = 400_000_000  # with the control period: a stop within half a second
+_TIMEOUT_NS = 400_000_000  # with the control period: a stop within half a second
 # Without a new pose the last correction of the odometry holds for a while.
-_SILENCES_NS = {'laser': _SILENCE_NS, 'odometry': _SILENCE_NS, 'localizer': 3_000_000_000}
+_TIMEOUTS_NS = {'laser': _TIMEOUT_NS, 'odometry': _TIMEOUT_NS, 'localizer': 3_000_000_000}
+
+
+class _RobotState:
+    """Pose and view of the robot, by the last scan, odometry and pose received.
+
+    scan: the last one that is not blind.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self.scan: Scan | None = None
+        self._clock = clock
+        self._is_blind = False
+        self._odometry = OdometryBuffer()
+        self._T_map_odom: Array | None = None
+        self._T_odom_base: Array | None = None
+        self._received_ns: dict[str, int] = {}
+
+    def add_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
+        self._T_odom_base = T_odom_base
+        self._record_time('odometry')
+        self._odometry.add(stamp_ns, T_odom_base)
+
+    def add_pose(self, stamp_ns: int, T_map_base: Array) -> None:
+        T_odom_base = self._odometry.at(stamp_ns)
+        if T_odom_base is not None:
+            self._record_time('localizer')
+            self._T_map_odom = se2.compose(T_map_base, se2.invert(T_odom_base))
+
+    def add_scan(self, scan: Scan) -> None:
+        self._is_blind = scan.is_blind
+        if not scan.is_blind:
+            self.scan = scan
+            self._record_time('laser')
+
+    def pose(self) -> Array | None:
+        """T_map_base (3,) now; None before a pose and odometry are received."""
+        if self._T_map_odom is None or self._T_odom_base is None:
+            return None
+        return se2.compose(self._T_map_odom, self._T_odom_base)
+
+    def stop_reason(self) -> str:
+        """Why the robot must not drive on; '' for no reason."""
+        if self._is_blind:
+            return 'laser blind (too few valid beams)'
+        if self._scan_age_ns() > _TIMEOUT_NS:
+            return 'laser silent'
+        now_ns = self._clock.now().nanoseconds
+        for source, limit_ns in _TIMEOUTS_NS.items():
+            if now_ns - self._received_ns.get(source, now_ns) > limit_ns:
+                return f'{source} silent'
+        return ''
+
+    def _scan_age_ns(self) -> int:
+        """Time from the last scan to the last odometry, by their stamps; 0 without both."""
+        latest_ns = self._odometry.latest_stamp_ns
+        return 0 if self.scan is None or latest_ns is None else latest_ns - self.scan.stamp_ns
+
+    def _record_time(self, source: str) -> None:
+        self._received_ns[source] = self._clock.now().nanoseconds
 
 
 class NavigatorNode(ThinmapNode):
@@ -52,21 +112,16 @@ class NavigatorNode(ThinmapNode):
         self.create_active_timer(_CONTROL_PERIOD_S, self._control)
 
     def reset_state(self) -> None:
-        """Forget the map and where the robot is."""
+        """Discard the map and the pose of the robot."""
         self._navigator = Navigator(self._config)
         self._map = MapMirror()
-        self._odometry = OdometryBuffer()
-        self._T_map_odom: Array | None = None
-        self._T_odom_base: Array | None = None
-        self._scan: Scan | None = None
-        self._is_blind = False
-        self._heard_ns: dict[str, int] = {}
-        self._shown_path: Array | None = None
+        self._robot = _RobotState(self.get_clock())
+        self._published_path: Array | None = None
         self._goal: tuple[float, float, float | None] = (0.0, 0.0, None)
-        self._cancel_asked = False
+        self._is_canceled = False
 
     def _on_config(self, config: NavigatorConfig) -> None:
-        """Drive on with other parameters: to the same goal, on a new path."""
+        """Continue with other parameters: to the same goal, on a new path."""
         self._config = config
         self._navigator = Navigator(config)
         if self._goals.active:
@@ -74,7 +129,7 @@ class NavigatorNode(ThinmapNode):
 
     def stop(self) -> None:
         """End the goal; the robot stops."""
-        self._end(Outcome.ABORTED, 'the navigator was stopped or begins anew')
+        self._end(Outcome.ABORTED, 'navigator deactivated or reset')
 
     def close(self) -> None:
         """Stop the robot: the last thing the node does."""
@@ -82,24 +137,15 @@ class NavigatorNode(ThinmapNode):
         super().close()
 
     def _on_odometry(self, message: Odometry) -> None:
-        self._T_odom_base = messages.pose_from_msg(message.pose.pose)
-        self._record_input('odometry')
-        self._odometry.add(messages.stamp_ns(message.header.stamp), self._T_odom_base)
+        T_odom_base = messages.pose_from_msg(message.pose.pose)
+        self._robot.add_odometry(messages.stamp_ns(message.header.stamp), T_odom_base)
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
-        T_odom_base = self._odometry.at(messages.stamp_ns(message.header.stamp))
-        if T_odom_base is None:
-            return
         T_map_base = messages.pose_from_msg(message.pose.pose)
-        self._record_input('localizer')
-        self._T_map_odom = se2.compose(T_map_base, se2.invert(T_odom_base))
+        self._robot.add_pose(messages.stamp_ns(message.header.stamp), T_map_base)
 
     def _on_scan(self, message: LaserScan) -> None:
-        scan = self._laser_transform.to_scan(message)
-        self._is_blind = scan.is_blind
-        if not scan.is_blind:
-            self._scan = scan
-            self._record_input('laser')
+        self._robot.add_scan(self._laser_transform.to_scan(message))
 
     def _on_map(self, message: OccupancyGrid) -> None:
         self._map.replace(messages.grid_from_msg(message))
@@ -117,7 +163,7 @@ class NavigatorNode(ThinmapNode):
             reason = f'goal in frame "{request.pose.header.frame_id}": expected "{self._map_frame}"'
             self._end(Outcome.ABORTED, reason)
             return
-        self._cancel_asked = False
+        self._is_canceled = False
         self._goal = (
             float(goal[0]),
             float(goal[1]),
@@ -126,12 +172,12 @@ class NavigatorNode(ThinmapNode):
         self._navigator.set_goal(*self._goal)
 
     def _on_cancel(self) -> None:
-        self._cancel_asked = True
+        self._is_canceled = True
 
     def _control(self) -> None:
         if not self._goals.active:
             return
-        if self._cancel_asked:
+        if self._is_canceled:
             self._end(Outcome.CANCELED, 'cancelled')
             return
         command = self._command()
@@ -148,56 +194,33 @@ class NavigatorNode(ThinmapNode):
             self._publish_feedback(command.state)
 
     def _command(self) -> Command | None:
-        """What the navigator says now; a stop while the laser is silent.
+        """The command of the navigator; a stop while the laser is silent.
 
-        None before everything is known.
+        None before all inputs are received.
         """
-        if fault := self._stop_reason():
+        if fault := self._robot.stop_reason():
             reason = f'{fault}: standing still'
             self.get_logger().warning(reason, throttle_duration_sec=_WARN_PERIOD_S)
             self.diagnostics.set_state(WARN, reason)
             self._navigator.halt()
             return Command(0.0, 0.0, 'blocked', reason)
-        if (
-            self._map.patch is None
-            or self._scan is None
-            or self._T_map_odom is None
-            or self._T_odom_base is None
-        ):
+        patch = self._map.patch
+        scan = self._robot.scan
+        T_map_base = self._robot.pose()
+        if patch is None or scan is None or T_map_base is None:
             self.get_logger().warning(
                 'goal waits: no map, scan, pose or odometry yet',
                 throttle_duration_sec=_WARN_PERIOD_S,
             )
             return None
         self.diagnostics.set_state(OK, 'driving')
-        T_map_base = se2.compose(self._T_map_odom, self._T_odom_base)
         with self.diagnostics.time_step('navigator'):
-            return self._navigator.step(T_map_base, self._map.patch, self._scan, _CONTROL_PERIOD_S)
-
-    def _stop_reason(self) -> str:
-        """Why driving on would be driving blind; '' where all is well."""
-        if self._is_blind:
-            return 'laser blind (too few valid beams)'
-        latest = self._odometry.latest_stamp_ns
-        if (
-            latest is not None
-            and self._scan is not None
-            and latest - self._scan.stamp_ns > _SILENCE_NS
-        ):
-            return 'laser silent'
-        now_ns = self.get_clock().now().nanoseconds
-        for who, limit_ns in _SILENCES_NS.items():
-            if now_ns - self._heard_ns.get(who, now_ns) > limit_ns:
-                return f'{who} silent'
-        return ''
-
-    def _record_input(self, who: str) -> None:
-        self._heard_ns[who] = self.get_clock().now().nanoseconds
+            return self._navigator.step(T_map_base, patch, scan, _CONTROL_PERIOD_S)
 
     def _publish_plan(self) -> None:
         path = self._navigator.path
-        if path is not None and path is not self._shown_path:
-            self._shown_path = path
+        if path is not None and path is not self._published_path:
+            self._published_path = path
             ns = self.get_clock().now().nanoseconds
             self._plan.publish(messages.path_msg(np.asarray(path), self._map_frame, ns))
 

@@ -1,6 +1,6 @@
 """A simulated robot: /cmd_vel in; /scan, /odom, /tf, /clock and the true pose out.
 
-~/set_pose puts it elsewhere.
+~/set_pose teleports it.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.diagnostics import OK, WARN, NodeDiagnostics
 from thinmap_ros.ros.lockstep import NONE, PATIENCE_S, PATIENCE_WORDS, TOPICS, Lockstep
 from thinmap_ros.sim.laser import Lms200Config
-from thinmap_ros.sim.robot import PRESETS
+from thinmap_ros.sim.robot import PRESETS, Pioneer
 from thinmap_ros.sim.simulation import STEP_NS, Moment, Simulation
 from thinmap_ros.sim.world import World
 
@@ -55,6 +55,76 @@ class SimConfig(Config):
     publish_tf: bool = parameter(True, 'publish odom -> base_link and base_link -> laser')
 
 
+class _SimPublishers:
+    """Publishes what the simulated robot senses, the time, and the ground truth."""
+
+    def __init__(self, node: Node, scan_time_s: float, publish_tf: bool) -> None:
+        """scan_time_s: time between two scans. publish_tf: also publish the transforms."""
+        self._scan_time_s = scan_time_s
+        self._clock = node.create_publisher(ClockMsg, '/clock', qos.STREAM)
+        self._scan = node.create_publisher(LaserScan, 'scan', qos.STREAM)
+        self._odom = node.create_publisher(Odometry, 'odom', qos.STREAM)
+        self._truth = node.create_publisher(PoseStamped, 'ground_truth', qos.STREAM)
+        self._collisions = node.create_publisher(UInt32, 'collisions', qos.LATCHED)
+        self._tf = node.create_publisher(TFMessage, '/tf', qos.STREAM)
+        self._tf_static = node.create_publisher(TFMessage, '/tf_static', qos.STATIC_TRANSFORMS)
+        self._publish_tf = publish_tf
+        self._last_collisions = -1
+        self._last_scan: LaserScan | None = None
+
+    def publish_laser_pose(self, T_base_laser: Array) -> None:
+        if self._publish_tf:
+            transform = messages.transform_msg(T_base_laser, 'base_link', 'laser', 0)
+            self._tf_static.publish(TFMessage(transforms=[transform]))
+
+    def publish(self, moment: Moment, robot: Pioneer) -> None:
+        """Publish a moment; the scan, if there is one, comes last."""
+        ns = moment.stamp_ns
+        self._publish_clock(ns)
+        self._publish_odometry(moment, robot)
+        if self._publish_tf:
+            transform = messages.transform_msg(moment.T_odom_base, 'odom', 'base_link', ns)
+            self._tf.publish(TFMessage(transforms=[transform]))
+        self._truth.publish(messages.pose_stamped_msg(robot.T_world_base, 'world', ns))
+        if robot.collisions != self._last_collisions:
+            self._last_collisions = robot.collisions
+            self._collisions.publish(UInt32(data=robot.collisions))
+        if moment.scan is not None:
+            self._last_scan = messages.scan_msg(moment.scan, 'laser', self._scan_time_s)
+            self._scan.publish(self._last_scan)
+
+    def repeat_scan(self, moment: Moment, robot: Pioneer) -> None:
+        """Publish the last scan again, with time and odometry of a moment."""
+        if self._last_scan is not None:
+            self._publish_clock(moment.stamp_ns)
+            self._scan.publish(self._last_scan)
+            self._publish_odometry(moment, robot)
+
+    def _publish_clock(self, ns: int) -> None:
+        self._clock.publish(ClockMsg(clock=messages.time_msg(ns)))
+
+    def _publish_odometry(self, moment: Moment, robot: Pioneer) -> None:
+        velocity = (robot.v, robot.w)
+        frames = ('odom', 'base_link')
+        self._odom.publish(
+            messages.odometry_msg(moment.T_odom_base, velocity, frames, moment.stamp_ns)
+        )
+
+
+@dataclass(frozen=True)
+class _VelocityCommand:
+    """A velocity command, m/s and rad/s, with the time at which it was received."""
+
+    v: float = 0.0
+    w: float = 0.0
+    received_ns: int = 0
+
+    def at(self, now_ns: int) -> tuple[float, float]:
+        """The velocity at a time; as a robot's controller, it stops without a recent command."""
+        is_recent = now_ns - self.received_ns <= _COMMAND_TIMEOUT_NS
+        return (self.v, self.w) if is_recent else (0.0, 0.0)
+
+
 class SimNode(Node):
     """Steps the simulation in the rhythm of the wall clock, `rate` times as fast."""
 
@@ -66,47 +136,29 @@ class SimNode(Node):
         world = World.from_patch(*read_world(package_data.world_path(self._config.world)))
         start = _start(self._config.start, world)
         self._sim = Simulation(world, start, PRESETS[self._config.robot], laser, self._config.seed)
-        self._scan_time_s = 1.0 / laser.rate_hz
-        self._command = (0.0, 0.0)
-        self._command_ns = 0
+        self._output = _SimPublishers(self, 1.0 / laser.rate_hz, self._config.publish_tf)
+        self._command = _VelocityCommand()
         self._lockstep = Lockstep(self, self._config.lockstep, self._config.lockstep_patience_s)
-        self._last_scan: LaserScan | None = None
-        self._repeated_at = 0.0
         self._running = False
-        self._told_collisions = -1
+        self._repeated_s = 0.0
         self._diagnostics = NodeDiagnostics(self)
-        self._make_topics()
-        self._publish_mount()
-        wall = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(STEP_NS / 1e9 / self._config.rate, self._tick, clock=wall)
-
-    def _make_topics(self) -> None:
-        self._clock_topic = self.create_publisher(ClockMsg, '/clock', qos.STREAM)
-        self._scan = self.create_publisher(LaserScan, 'scan', qos.STREAM)
-        self._odom = self.create_publisher(Odometry, 'odom', qos.STREAM)
-        self._truth = self.create_publisher(PoseStamped, 'ground_truth', qos.STREAM)
-        self._collisions = self.create_publisher(UInt32, 'collisions', qos.LATCHED)
-        self._tf = self.create_publisher(TFMessage, '/tf', qos.STREAM)
-        self._tf_static = self.create_publisher(TFMessage, '/tf_static', qos.STATIC_TRANSFORMS)
         self.create_subscription(Twist, 'cmd_vel', self._on_command, qos.STREAM)
         self.create_subscription(PoseStamped, '~/set_pose', self._on_teleport, qos.STREAM)
+        self._output.publish_laser_pose(self._sim.laser.T_base_laser)
+        wall = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(STEP_NS / 1e9 / self._config.rate, self._tick, clock=wall)
 
     def _on_command(self, message: Twist) -> None:
         self._diagnostics.message_received('cmd_vel')
         command = (message.linear.x, message.angular.z)
         if not np.isfinite(command).all():
-            self._diagnostics.message_rejected(
-                'cmd_vel', f'command {command}: expected finite numbers'
-            )
+            reason = f'command {command}: expected finite numbers'
+            self._diagnostics.message_rejected('cmd_vel', reason)
             return
-        self._command = command
-        self._command_ns = self._sim.stamp_ns
+        self._command = _VelocityCommand(*command, self._sim.stamp_ns)
 
     def _on_teleport(self, message: PoseStamped) -> None:
-        """Somebody lifts the robot up and puts it down at a pose in the world.
-
-        Its wheels know nothing of it.
-        """
+        """Teleport the robot, for kidnapping tests: the odometry does not change."""
         self._diagnostics.message_received('~/set_pose')
         try:
             self._sim.carry(messages.pose_from_msg(message.pose))
@@ -116,69 +168,35 @@ class SimNode(Node):
     def _tick(self) -> None:
         if not self._running:
             if self.count_subscribers('scan') < self._config.hold_for_subscribers:
-                self._diagnostics.set_state(
-                    WARN, 'time stands still: too few nodes listen to the scans'
-                )
+                self._diagnostics.set_state(WARN, 'on hold: too few subscribers of the scans')
                 return
             self._running = True
             self._diagnostics.set_state(OK, 'running')
             self._publish(self._sim.sense())
             return
-        if self._lockstep.is_waiting and self._waits():
+        if self._lockstep.is_waiting and self._is_on_hold():
             return
-        # As a robot's own controller does: without a fresh command it stops.
-        fresh = self._sim.stamp_ns - self._command_ns <= _COMMAND_TIMEOUT_NS
         with self._diagnostics.time_step('simulation'):
-            moment = self._sim.step(*(self._command if fresh else (0.0, 0.0)))
+            moment = self._sim.step(*self._command.at(self._sim.stamp_ns))
         self._publish(moment)
 
-    def _waits(self) -> bool:
-        """Whether time has to stand still for the last scan.
+    def _is_on_hold(self) -> bool:
+        """Whether the simulation has to wait for the result of the last scan.
 
-        The first one is repeated until somebody answers.
+        The first scan is repeated until there is a result.
         """
         if self._sim.stamp_ns > 0:
             return not self._lockstep.timed_out()
-        if monotonic() - self._repeated_at > _REPEAT_S and self._last_scan is not None:
-            self._repeated_at = monotonic()
-            self._publish_clock(0)
-            self._scan.publish(self._last_scan)
-            self._odom.publish(self._odometry(self._sim.sense()))
+        if monotonic() - self._repeated_s > _REPEAT_S:
+            self._repeated_s = monotonic()
+            self._output.repeat_scan(self._sim.sense(), self._sim.robot)
         return True
 
     def _publish(self, moment: Moment) -> None:
-        self._publish_clock(moment.stamp_ns)
-        self._odom.publish(self._odometry(moment))
-        if self._config.publish_tf:
-            transform = messages.transform_msg(
-                moment.T_odom_base, 'odom', 'base_link', moment.stamp_ns
-            )
-            self._tf.publish(TFMessage(transforms=[transform]))
-        truth = messages.pose_stamped_msg(self._sim.robot.T_world_base, 'world', moment.stamp_ns)
-        self._truth.publish(truth)
-        if self._sim.robot.collisions != self._told_collisions:
-            self._told_collisions = self._sim.robot.collisions
-            self._collisions.publish(UInt32(data=self._told_collisions))
+        self._output.publish(moment, self._sim.robot)
         if moment.scan is not None:
-            self._last_scan = messages.scan_msg(moment.scan, 'laser', self._scan_time_s)
-            self._scan.publish(self._last_scan)
             self._lockstep.scan_published(moment.stamp_ns)
-            self._repeated_at = monotonic()
-
-    def _publish_clock(self, ns: int) -> None:
-        self._clock_topic.publish(ClockMsg(clock=messages.time_msg(ns)))
-
-    def _odometry(self, moment: Moment) -> Odometry:
-        velocity = (self._sim.robot.v, self._sim.robot.w)
-        return messages.odometry_msg(
-            moment.T_odom_base, velocity, ('odom', 'base_link'), moment.stamp_ns
-        )
-
-    def _publish_mount(self) -> None:
-        if self._config.publish_tf:
-            T_base_laser = self._sim.laser.T_base_laser
-            transform = messages.transform_msg(T_base_laser, 'base_link', 'laser', 0)
-            self._tf_static.publish(TFMessage(transforms=[transform]))
+            self._repeated_s = monotonic()
 
 
 def _start(text: str, world: World) -> Array:

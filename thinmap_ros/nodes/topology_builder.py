@@ -3,25 +3,45 @@
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid, Path
+from rclpy.node import Node
 
-from thinmap_msgs.msg import TopologicalMap
+from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
 from thinmap_msgs.srv import LoadMap, SaveMap
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.snapshot import State
 from thinmap_ros.core.stamp_matcher import StampMatcher
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
+from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.core.topology.rebuild import Rebuilding
-from thinmap_ros.files import sessions
+from thinmap_ros.files.sessions import TOPOLOGY, load_topology
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.ros import messages, node_main, parameters, qos
-from thinmap_ros.ros.checkpoint import State
+from thinmap_ros.ros.checkpoint import StateStamp
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import fill_response
 from thinmap_ros.ros.subscription import subscribe_guarded
 
-_ID_RESERVE = 1000  # ids that a builder may have given after its state was kept last
+_ID_RESERVE = 1000  # ids that a builder may have assigned after its last checkpoint
+
+
+class _TopologyPublishers:
+    """Publishes the topological map, and the part of it near the robot."""
+
+    def __init__(self, node: Node) -> None:
+        self._frame = parameters.declare_parameter(node, 'map_frame', 'map', 'frame of the map')
+        self._local = node.create_publisher(TopologicalMapMsg, 'local_topology', qos.LATCHED)
+        self._global = node.create_publisher(TopologicalMapMsg, 'topology', qos.LATCHED)
+        self.has_published = False
+
+    def publish_map(self, topology: TopologicalMap, stamp_ns: int) -> None:
+        self.has_published = True
+        self._global.publish(messages.topology_msg(topology, self._frame, stamp_ns))
+
+    def publish_local_map(self, topology: TopologicalMap, stamp_ns: int) -> None:
+        self._local.publish(messages.topology_msg(topology, self._frame, stamp_ns))
 
 
 class TopologyBuilderNode(ThinmapNode):
@@ -35,15 +55,11 @@ class TopologyBuilderNode(ThinmapNode):
     def __init__(self) -> None:
         super().__init__('topology_builder', recovers=True)
         self._config = parameters.declare_config(self, TopologyConfig)
-        self._map_frame = parameters.declare_parameter(self, 'map_frame', 'map', 'frame of the map')
+        self._output = _TopologyPublishers(self)
         self._session = parameters.declare_session(self)
         self._save_directory = SaveDirectory(self)
         parameters.reject_unknown(self)
         warm_up.topology_builder()
-        self._has_published = False
-        self._newest_saved_id = 0
-        self._local = self.create_publisher(TopologicalMap, 'local_topology', qos.LATCHED)
-        self._global = self.create_publisher(TopologicalMap, 'topology', qos.LATCHED)
         subscribe_guarded(self, Path, 'trajectory', self._on_trajectory, qos.LATCHED)
         subscribe_guarded(self, OccupancyGrid, 'map', self._on_map, qos.LATCHED)
         subscribe_guarded(self, OccupancyGrid, 'local_map', self._on_window, qos.STREAM)
@@ -51,38 +67,36 @@ class TopologyBuilderNode(ThinmapNode):
         self.create_service(SaveMap, 'save_topology', self._on_save)
         self.create_service(LoadMap, 'load_topology', self._on_load)
         self.diagnostics.check_sole_publisher('topology')
-        self._latest_ns: int | None = None
-        self._resumed_ns: int | None = None
-        self._restored_ns = 0
+        self._stamp = StateStamp()
         self.reset_state()
-        self.enable_checkpoint(self._state, self._resume)
+        self.enable_checkpoint(self._state, self._restore)
 
     def _state(self) -> State | None:
-        if self._latest_ns is None:
+        if self._stamp.latest_ns is None:
             return None
-        return {**self._builder.state(), 'latest_ns': np.array(self._latest_ns)}
+        return {**self._builder.state(), 'latest_ns': np.array(self._stamp.latest_ns)}
 
-    def _resume(self, left: State) -> None:
-        """Take over the graph of a builder that was killed. Raises InputError where it is none."""
-        latest_ns, graph = snapshot.check_stamp(left)
+    def _restore(self, state: State) -> None:
+        """Continue with the graph of a killed builder. Raises InputError where it is no graph."""
+        latest_ns, graph = snapshot.split_stamp(state)
         builder = TopologyBuilder.from_state(graph, self._config)
         builder.skip_ids(_ID_RESERVE)
-        self._resumed_ns = self._latest_ns = self._restored_ns = latest_ns
+        self._stamp.restore(latest_ns)
         self._builder = builder
         self._rebuilding = Rebuilding(from_the_start=False)
         self._publish(latest_ns)
 
     def reset_state(self) -> None:
-        """Forget the graph, or go back to the session that the node was started with."""
+        """Discard the graph, or return to the session that the node was started with."""
         self._matcher: StampMatcher[GridPatch, Array] = StampMatcher()
         self._newest_saved_id = 0
         self._rebuilding = Rebuilding(from_the_start=not self._session)
-        self._builder = self._load_session() if self._session else TopologyBuilder(self._config)
-        if self._session or self._has_published:
+        if self._session:
+            self._builder = load_topology(self._session, self._config)
+        else:
+            self._builder = TopologyBuilder(self._config)
+        if self._session or self._output.has_published:
             self._publish(self.get_clock().now().nanoseconds)
-
-    def _load_session(self) -> TopologyBuilder:
-        return sessions.load_topology(self._session, self._config)
 
     def _on_window(self, message: OccupancyGrid) -> None:
         stamp_ns = messages.stamp_ns(message.header.stamp)
@@ -96,30 +110,25 @@ class TopologyBuilderNode(ThinmapNode):
         self._process(stamp_ns, pair)
 
     def _process(self, stamp_ns: int, pair: tuple[GridPatch, Array] | None) -> None:
-        self.diagnostics.set_drop_total(
-            'local maps and poses without a partner', self._matcher.dropped
-        )
+        dropped = self._matcher.dropped
+        self.diagnostics.set_drop_total('local maps and poses without a partner', dropped)
         if pair is None:
             return
-        if self._resumed_ns is not None and stamp_ns < self._resumed_ns:
-            self.reset_state()  # the robot has begun anew as well
-        self._resumed_ns = None
-        self._latest_ns = stamp_ns
+        if self._stamp.is_restarted_by(stamp_ns):
+            self.reset_state()
+        self._stamp.latest_ns = stamp_ns
         window, T_map_base = pair
         with self.diagnostics.time_step('graph update'):
             changed = self._rebuilding.accepts_window() and self._builder.update(window, T_map_base)
         self._rebuilding.add_pose(stamp_ns, T_map_base)
         if changed:
             self._publish(stamp_ns)
-        # The local map comes last: who hears it knows that all of this scan is said.
-        self._local.publish(
-            messages.topology_msg(self._builder.local_map(), self._map_frame, stamp_ns)
-        )
+        # The local map comes last: a subscriber that receives it has all results of this scan.
+        self._output.publish_local_map(self._builder.local_map(), stamp_ns)
 
     def _on_trajectory(self, message: Path) -> None:
         corrected_ns = messages.stamp_ns(message.header.stamp)
-        # A latched one may be of before the graph that was taken over, which then has undergone it.
-        if self._latest_ns is not None and corrected_ns > self._restored_ns:
+        if self._stamp.is_corrected_by(corrected_ns):
             self._rebuilding.correct(corrected_ns, *messages.trajectory_from_msg(message))
 
     def _on_map(self, message: OccupancyGrid) -> None:
@@ -130,15 +139,11 @@ class TopologyBuilderNode(ThinmapNode):
         self._publish(messages.stamp_ns(message.header.stamp))
 
     def _publish(self, stamp_ns: int) -> None:
-        self._has_published = True
         self._checkpoint_new_ids()
-        self._global.publish(messages.topology_msg(self._builder.map, self._map_frame, stamp_ns))
+        self._output.publish_map(self._builder.map, stamp_ns)
 
     def _checkpoint_new_ids(self) -> None:
-        """Whoever hears of a node may rely on its id.
-
-        It is kept first, and not only when the next time has come.
-        """
+        """Save a checkpoint before new ids are published: other nodes may rely on them."""
         newest = max(self._builder.map.nodes, default=0)
         if newest != self._newest_saved_id and self.checkpoint_now():
             self._newest_saved_id = newest
@@ -146,7 +151,7 @@ class TopologyBuilderNode(ThinmapNode):
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:
             path = self._save_directory.resolve(request.path)
-            return f'saved {sessions.save_topology(path, self._builder)}'
+            return f'saved {TOPOLOGY.save(path, self._builder)}'
 
         return fill_response(response, save)
 
@@ -154,17 +159,17 @@ class TopologyBuilderNode(ThinmapNode):
         return fill_response(response, lambda: self._load(request.path))
 
     def _load(self, path: str) -> str:
-        """Take over what was saved; what is on its way from before is forgotten."""
+        """Replace the graph by a saved one; windows that were made before are discarded."""
         loaded = TopologyBuilder(self._config)
         if path:
             inside = self._save_directory.resolve(path)
             resolution_m = self._builder.resolution_m
-            loaded = sessions.load_topology(inside, self._config, resolution_m)
+            loaded = load_topology(inside, self._config, resolution_m)
         self._builder = loaded
         self._matcher = StampMatcher()
         self._rebuilding = Rebuilding(from_the_start=not path)
         self._publish(self.get_clock().now().nanoseconds)
-        return f'graph of {len(loaded.map.nodes)} nodes' if path else 'the graph begins anew'
+        return f'graph of {len(loaded.map.nodes)} nodes' if path else 'graph reset'
 
 
 def main() -> None:

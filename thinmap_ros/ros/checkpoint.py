@@ -1,50 +1,51 @@
-"""What a node leaves for itself in case it is killed.
-
-One that is started again soon goes on from there.
-"""
+"""Checkpoints: a node that was killed and is restarted soon continues from its last one."""
 
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from rclpy.node import Node
 
 from thinmap_ros.core.errors import InputError, reason_of
 from thinmap_ros.core.private_folder import private_folder, temporary_folder
+from thinmap_ros.core.snapshot import State
 from thinmap_ros.files.atomic import atomic_write, partial_files
-from thinmap_ros.files.npz import open_regular_file, read_arrays
+from thinmap_ros.files.npz import open_regular_file
+from thinmap_ros.files.snapshots import read_snapshot, write_snapshot
 
-State = dict[str, NDArray[Any]]
 _FOLDER = 'THINMAP_STATE_DIR'
+_KIND = 'checkpoint'
+# Least time between two checkpoints, in durations of the last one: however large the state, saving
+# it takes a small share of the time. Of checkpoints that must not wait:
+_INTERVAL_FACTOR = 50.0
+_URGENT_INTERVAL_FACTOR = 10.0
 
 
 class Checkpoint:
-    """The file of one node: of its name, on its ROS domain.
+    """The checkpoint file of one node: of its name, on its ROS domain.
 
-    It lies where nothing survives a restart of the machine, and is removed when the node ends in
-    order: what is found there was left by a node that was killed. The folder belongs to this user
-    alone and is no link; else nothing is kept, and a warning says so.
+    It is in a directory that does not survive a restart of the machine, and is deleted when the
+    node ends in order: a file found there was written by a node that was killed. The directory
+    belongs to this user alone and is no link; otherwise no checkpoint is saved, with a warning.
     """
 
     def __init__(self, node: Node, limit_s: float) -> None:
+        """limit_s: age up to which a checkpoint is loaded, s; 0: no checkpoints."""
         self._limit_s = limit_s
         self._node = node
         name = node.get_fully_qualified_name().strip('/').replace('/', '.')
+        file_name = f'{os.environ.get("ROS_DOMAIN_ID", "0")}.{name}.npz'
         self._path: Path | None = None
         if limit_s <= 0.0:
             return
         try:
-            self._path = (
-                checkpoint_directory() / f'{os.environ.get("ROS_DOMAIN_ID", "0")}.{name}.npz'
-            )
+            self._path = checkpoint_directory() / file_name
         except InputError as error:
-            node.get_logger().warning(f'{error}: killed, the node would begin anew')
+            node.get_logger().warning(f'{error}: no checkpoint is saved')
 
     def load(self) -> State | None:
-        """What a killed node left, if not long ago; None where nothing is, or it is broken."""
+        """State of a killed node; None where there is none, or it is too old or broken."""
         if self._path is None:
             return None
         for part in partial_files(self._path):
@@ -56,25 +57,25 @@ class Checkpoint:
                     raise InputError('expected a file of this user')
                 if time.time() - status.st_mtime > self._limit_s:
                     return None
-                return read_arrays(stream)
+                return read_snapshot(stream, _KIND)
         except FileNotFoundError:
             return None
         except (OSError, InputError) as error:
-            self._warn(f'{reason_of(error)}: beginning anew')
+            self._warn(f'{reason_of(error)}: starting without a checkpoint')
             return None
 
     def save(self, state: State) -> None:
-        """Keep a state; where the disk does not take it, the node works on without."""
-        if self._path is None or self._limit_s <= 0.0:
+        """Save a state; a disk that does not accept it leads to a warning."""
+        if self._path is None:
             return
         try:
             with atomic_write(self._path) as aside, aside.open('wb') as stream:
-                np.savez(stream, **state)  # type: ignore[arg-type]
+                write_snapshot(stream, _KIND, state, compress=False)
         except OSError as error:
-            self._warn(f'{error.strerror}: killed now, the node would begin anew')
+            self._warn(f'{error.strerror}: checkpoint not saved')
 
     def delete(self) -> None:
-        """Leave nothing."""
+        """Delete the file."""
         if self._path is not None:
             self._path.unlink(missing_ok=True)
 
@@ -82,10 +83,66 @@ class Checkpoint:
         self._node.get_logger().warning(f'{self._path}: {what}', throttle_duration_sec=60.0)
 
 
-def checkpoint_directory() -> Path:
-    """The folder of this user alone in which nodes keep their states; made where it is missing.
+class PeriodicCheckpoint:
+    """A checkpoint that is saved again and again, in a small share of the node's time."""
 
-    Raises InputError where it is none: a link, of another user, or open to others.
+    def __init__(self, file: Checkpoint, state: Callable[[], State | None]) -> None:
+        """state: returns what to save; None: nothing."""
+        self._file = file
+        self._state = state
+        self._saved_at_s = time.monotonic()
+        self._duration_s = 0.0
+
+    def save(self, is_urgent: bool = False) -> bool:
+        """Save the state, unless the last checkpoint is too recent; returns whether it was due."""
+        now_s = time.monotonic()
+        factor = _URGENT_INTERVAL_FACTOR if is_urgent else _INTERVAL_FACTOR
+        if now_s - self._saved_at_s < factor * self._duration_s:
+            return False
+        state = self._state()
+        if state is not None:
+            self._file.save(state)
+        self._saved_at_s = time.monotonic()
+        self._duration_s = self._saved_at_s - now_s
+        return True
+
+    def delete(self) -> None:
+        """Delete the file."""
+        self._file.delete()
+
+
+class StateStamp:
+    """Stamp of the newest scan in the state of a node, and of the checkpoint that it started from.
+
+    latest_ns: None before the first scan.
+    """
+
+    def __init__(self) -> None:
+        self.latest_ns: int | None = None
+        self._checkpoint_ns = 0
+        self._is_first_scan = False
+
+    def restore(self, stamp_ns: int) -> None:
+        """The state is that of a checkpoint."""
+        self.latest_ns = stamp_ns
+        self._checkpoint_ns = stamp_ns
+        self._is_first_scan = True
+
+    def is_restarted_by(self, stamp_ns: int) -> bool:
+        """Whether a scan, the first after the checkpoint, is older: the robot was restarted too."""
+        is_first = self._is_first_scan
+        self._is_first_scan = False
+        return is_first and stamp_ns < self._checkpoint_ns
+
+    def is_corrected_by(self, corrected_ns: int) -> bool:
+        """Whether a trajectory is newer than the checkpoint; the state follows older ones."""
+        return self.latest_ns is not None and corrected_ns > self._checkpoint_ns
+
+
+def checkpoint_directory() -> Path:
+    """The directory of this user alone in which nodes save checkpoints; created where missing.
+
+    Raises InputError where it is a link, of another user, or open to others.
     """
     chosen = os.environ.get(_FOLDER)
     runtime = os.environ.get('XDG_RUNTIME_DIR')

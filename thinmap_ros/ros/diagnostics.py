@@ -1,4 +1,4 @@
-"""What a node tells on /diagnostics once a second: rates, refusals, drops, step times, state."""
+"""Diagnostics of a node on /diagnostics once a second: rates, drops, step times, state."""
 
 import math
 import re
@@ -15,11 +15,11 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 _PERIOD_S = 1.0
-_QUIET_S = 10.0
-_RECENT_S = 10.0  # what was refused or dropped longer ago is over
+_LOG_PERIOD_S = 10.0
+_RECENT_S = 10.0  # older rejections and drops are not reported as reasons
 _STEPS = 200
-_OF_EVERY_NODE = ('/parameter_events', '/rosout', '/diagnostics', '/clock')
-# So many kinds of refusal are told apart on a topic: a broken sensor must not fill the memory.
+_TOPICS_OF_EVERY_NODE = ('/parameter_events', '/rosout', '/diagnostics', '/clock')
+# Reasons counted apart on a topic: a broken sensor must not fill the memory.
 _REASONS = 8
 _NUMBER = re.compile(r'-?\b(\d+\.?\d*(e[+-]?\d+)?|inf|nan)\b')
 OK = DiagnosticStatus.OK
@@ -29,145 +29,245 @@ ERROR = DiagnosticStatus.ERROR
 
 @dataclass
 class _Topic:
-    """What came on a topic."""
+    """Messages of a topic; times are of the monotonic clock, s."""
 
-    heard: int = 0
-    told: int = 0
-    last_at: float | None = None
-    since: float = field(default_factory=monotonic)
-    refused: Counter[str] = field(default_factory=Counter)
-    last_refusal: str = ''
-    refused_at: float = -math.inf
+    received: int = 0
+    published: int = 0  # value of `received` in the last diagnostics
+    last_s: float | None = None
+    since_s: float = field(default_factory=monotonic)
+    rejected: Counter[str] = field(default_factory=Counter)
+    last_reason: str = ''
+    rejected_s: float = -math.inf
+
+    def reject(self, reason: str) -> None:
+        """Count a rejection by its reason, whatever the numbers in it."""
+        kind = _NUMBER.sub('#', reason)
+        if kind not in self.rejected and len(self.rejected) >= _REASONS:
+            kind = 'other reasons'
+        self.rejected[kind] += 1
+        self.last_reason = reason
+        self.rejected_s = monotonic()
+
+    def values(self, now_s: float, period_s: float) -> dict[str, str]:
+        """Values by the key after the name of the topic."""
+        last = 'never' if self.last_s is None else f'{now_s - self.last_s:.1f} s ago'
+        values = {
+            'received': str(self.received),
+            'rate': f'{(self.received - self.published) / period_s:.1f} Hz',
+            'last': last,
+            'rejected': str(self.rejected.total()),
+        }
+        return values | {f'rejected: {why}': str(count) for why, count in self.rejected.items()}
+
+
+@dataclass
+class _Drops:
+    """Messages dropped for one cause; total: of a counter that is kept elsewhere."""
+
+    count: int = 0
+    total: int = 0
+    last_s: float = -math.inf
+
+
+class MessageStatistics:
+    """Counts the messages of each topic that a node received, rejected and dropped."""
+
+    def __init__(self) -> None:
+        self._topics: dict[str, _Topic] = {}
+        self._drops: dict[str, _Drops] = {}
+        self._faults = 0
+        self._published_faults = 0
+        self._published_s = monotonic()
+
+    def topic(self, name: str) -> _Topic:
+        """The counters of a topic; created where missing."""
+        return self._topics.setdefault(name, _Topic())
+
+    def receive(self, name: str) -> None:
+        """Count a message."""
+        topic = self.topic(name)
+        topic.received += 1
+        topic.last_s = monotonic()
+
+    def reject(self, name: str, reason: str) -> None:
+        """Count a message that could not be used."""
+        self.topic(name).reject(reason)
+        self._faults += 1
+
+    def drop(self, cause: str, count: int) -> None:
+        """Count valid messages that were not used."""
+        if count > 0:
+            drops = self._drops.setdefault(cause, _Drops())
+            drops.count += count
+            drops.last_s = monotonic()
+            self._faults += count
+
+    def set_drop_total(self, cause: str, total: int) -> None:
+        """Count the drops since the last total; a smaller one is of a counter that was reset."""
+        drops = self._drops.setdefault(cause, _Drops())
+        last = drops.total
+        drops.total = total
+        self.drop(cause, total - last if total >= last else total)
+
+    def new_faults(self) -> str:
+        """Rejections and drops since the last diagnostics, in words; '' for none."""
+        count = self._faults - self._published_faults
+        return f'{count} messages rejected or dropped: {self._recent_reasons()}' if count else ''
+
+    def values(self, now_s: float) -> dict[str, str]:
+        """All counts, in a fixed order."""
+        period_s = now_s - self._published_s
+        values = {
+            f'{name}: {key}': value
+            for name, topic in self._topics.items()
+            for key, value in topic.values(now_s, period_s).items()
+        }
+        dropped = {cause: drops.count for cause, drops in self._drops.items() if drops.count}
+        return values | {f'dropped: {cause}': str(count) for cause, count in dropped.items()}
+
+    def mark_published(self, now_s: float) -> None:
+        """Rates and new faults are counted from now on."""
+        self._published_s = now_s
+        self._published_faults = self._faults
+        for topic in self._topics.values():
+            topic.published = topic.received
+
+    def _recent_reasons(self) -> str:
+        reasons = [(t.rejected_s, f'{name}: {t.last_reason}') for name, t in self._topics.items()]
+        reasons += [(drops.last_s, cause) for cause, drops in self._drops.items()]
+        recent = [reason for reason in reasons if monotonic() - reason[0] <= _RECENT_S]
+        return '; '.join(text for _, text in sorted(recent, reverse=True))
+
+
+class StepTimes:
+    """Durations of the last steps of each kind, ms."""
+
+    def __init__(self) -> None:
+        self._times_ms: dict[str, deque[float]] = {}
+
+    def add(self, step: str, milliseconds: float) -> None:
+        """Add the duration of a step, ms."""
+        self._times_ms.setdefault(step, deque(maxlen=_STEPS)).append(milliseconds)
+
+    def values(self) -> dict[str, str]:
+        """Median, 95th percentile and maximum."""
+        values = {}
+        for step, times in self._times_ms.items():
+            median, p95 = np.percentile(times, [50.0, 95.0])
+            text = f'median {median:.1f} ms, p95 {p95:.1f} ms, max {max(times):.1f} ms'
+            values[f'{step}: step time'] = text
+        return values
 
 
 @dataclass
 class _Check:
-    """What is wrong while its condition finds words for it; logged now and then."""
+    """A condition that returns what is wrong, '' for nothing; logged now and then."""
 
     level: bytes
     condition: Callable[[], str]
-    words: str = ''
-    logged_at: float = -_QUIET_S
+    fault: str = ''
+    logged_s: float = -_LOG_PERIOD_S
 
-    def holds(self, node: Node) -> bool:
-        self.words = self.condition()
-        if not self.words:
-            self.logged_at = -_QUIET_S  # what comes back is news
-        elif monotonic() - self.logged_at > _QUIET_S:
-            self.logged_at = monotonic()
-            node.get_logger().warning(self.words)
-        return bool(self.words)
+    def fails(self, node: Node) -> bool:
+        self.fault = self.condition()
+        if not self.fault:
+            self.logged_s = -_LOG_PERIOD_S  # a fault that returns is logged at once
+        elif monotonic() - self.logged_s > _LOG_PERIOD_S:
+            self.logged_s = monotonic()
+            node.get_logger().warning(self.fault)
+        return bool(self.fault)
 
 
 class NodeDiagnostics:
-    """Counts what happens to a node and publishes it, whatever the node's own time does.
+    """Publishes the state of a node once a second of the machine, whatever the node's clock does.
 
-    A level above OK lasts as long as what causes it: refusals and drops until a second has gone by
-    without any, a `check` until its condition is no longer true.
+    A level above OK lasts as long as its cause: rejections and drops until a second without any, a
+    check until its condition returns ''.
     """
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        self._topics: dict[str, _Topic] = {}
-        self._steps: dict[str, deque[float]] = {}
-        self._drops: Counter[str] = Counter()
-        self._dropped_at: dict[str, float] = {}
-        self._totals: Counter[str] = Counter()
-        self._bad = self._told_bad = 0
+        self._messages = MessageStatistics()
+        self._step_times = StepTimes()
         self._state = (OK, 'running')
         self._is_paused = False
         self._values: dict[str, str] = {}
         self._checks: list[_Check] = []
-        self._before: list[Callable[[], None]] = []
-        self._told_at = monotonic()
+        self._update_callbacks: list[Callable[[], None]] = []
         self._topic = node.create_publisher(DiagnosticArray, '/diagnostics', QoSProfile(depth=10))
-        # Not in the robot's time: a clock that stands still is a thing to be told.
+        # Not in the node's time: a clock that stands still is reported, too.
         node.create_timer(_PERIOD_S, self._publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def expect_topic(self, topic: str) -> None:
-        """Name a topic that the node listens to: it is told also while it is silent."""
-        self._topics.setdefault(topic, _Topic())
+        """Report a subscribed topic before its first message."""
+        self._messages.topic(topic)
 
     def message_received(self, topic: str) -> None:
         """Count a message."""
-        entry = self._topics.setdefault(topic, _Topic())
-        entry.heard += 1
-        entry.last_at = monotonic()
+        self._messages.receive(topic)
 
     def message_rejected(self, topic: str, reason: str) -> None:
-        """Count a message that could not be used, by reason: its words, whatever the numbers."""
-        entry = self._topics.setdefault(topic, _Topic())
-        kind = _NUMBER.sub('#', reason)
-        if kind not in entry.refused and len(entry.refused) >= _REASONS:
-            kind = 'other reasons'
-        entry.refused[kind] += 1
-        entry.last_refusal = reason
-        entry.refused_at = monotonic()
-        self._bad += 1
+        """Count a message that could not be used, by reason."""
+        self._messages.reject(topic, reason)
 
     def count_drops(self, cause: str, count: int) -> None:
-        """Count messages that were fine and were not used."""
-        if count > 0:
-            self._drops[cause] += count
-            self._dropped_at[cause] = monotonic()
-            self._bad += count
+        """Count valid messages that were not used."""
+        self._messages.drop(cause, count)
 
-    def set_drop_total(self, cause: str, count: int) -> None:
-        """Tell a count of drops that somebody else keeps; one that begins anew is counted on."""
-        last = self._totals[cause]
-        self._totals[cause] = count
-        self.count_drops(cause, count - last if count >= last else count)
+    def set_drop_total(self, cause: str, total: int) -> None:
+        """Report a count of drops that is kept elsewhere; one that was reset is added."""
+        self._messages.set_drop_total(cause, total)
 
     def record_step_time(self, step: str, milliseconds: float) -> None:
-        """Note how long a step took, ms."""
-        self._steps.setdefault(step, deque(maxlen=_STEPS)).append(milliseconds)
+        """Record the duration of a step, ms."""
+        self._step_times.add(step, milliseconds)
 
     @contextmanager
     def time_step(self, step: str) -> Iterator[None]:
-        """Note how long a block takes."""
+        """Record the duration of a block."""
         started = perf_counter()
         yield
         self.record_step_time(step, 1000.0 * (perf_counter() - started))
 
     def set_state(self, level: bytes, text: str) -> None:
-        """Say what state the node is in."""
+        """Set level and message that are published while no check fails."""
         self._state = (level, text)
 
     def set_paused(self, is_paused: bool) -> None:
-        """Say `paused` for as long as that is so, whatever state the node would be in."""
+        """Publish `paused` instead of the state while that is so."""
         self._is_paused = is_paused
         self.set_value('paused', is_paused)
 
     def set_value(self, key: str, value: object) -> None:
-        """Set a value that is told until another one takes its place."""
+        """Set a value; it is published until it is replaced."""
         self._values[key] = str(value)
 
     def add_check(self, level: bytes, condition: Callable[[], str]) -> None:
-        """Look once a second what is wrong: a condition returns words, or '' where all is well."""
+        """Check a condition once a second: it returns what is wrong, '' for nothing."""
         self._checks.append(_Check(level, condition))
 
     def add_timeout_check(self, topic: str, limit_s: float) -> None:
-        """Complain while nothing is heard on a topic."""
+        """Warn while a topic is silent for longer than a limit, s."""
         name = self._node.resolve_topic_name(topic)
 
         def silence() -> str:
-            entry = self._topics[topic]
-            if entry.last_at is None:
-                if monotonic() - entry.since < limit_s:
-                    return ''  # nodes have just begun to find each other
+            counters = self._messages.topic(topic)
+            if counters.last_s is None:
+                if monotonic() - counters.since_s < limit_s:
+                    return ''  # discovery of other nodes may not be complete
                 count = self._node.count_publishers(name)
-                return f'{topic}: nothing heard yet: {count} publish {name}'
-            silent_s = monotonic() - entry.last_at
+                return f'{topic}: no message yet: {count} publishers of {name}'
+            silent_s = monotonic() - counters.last_s
             return f'{topic}: silent for {silent_s:.0f} s' if silent_s > limit_s else ''
 
         self.add_check(WARN, silence)
 
     def add_update_callback(self, work: Callable[[], None]) -> None:
-        """Do something once a second, before it is told how things are."""
-        self._before.append(work)
+        """Call `work` once a second, before the diagnostics are published."""
+        self._update_callbacks.append(work)
 
     def check_sole_publisher(self, topic: str) -> None:
-        """Complain while somebody else publishes a topic that only one node may publish."""
+        """Report an error while another node publishes a topic of this node."""
         name = self._node.resolve_topic_name(topic)
 
         def rivals() -> str:
@@ -184,75 +284,47 @@ class NodeDiagnostics:
         self.add_check(ERROR, rivals)
 
     def _publish(self) -> None:
-        for work in self._before:
+        for work in self._update_callbacks:
             work()
-        now = monotonic()
-        status = self._status(now)
-        array = DiagnosticArray(status=[status])
+        now_s = monotonic()
+        array = DiagnosticArray(status=[self._status(now_s)])
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._topic.publish(array)
-        self._told_at = now
-        self._told_bad = self._bad
-        for entry in self._topics.values():
-            entry.told = entry.heard
+        self._messages.mark_published(now_s)
 
-    def _status(self, now: float) -> DiagnosticStatus:
-        level, message = (OK, 'paused') if self._is_paused else self._state
-        checks = [check for check in self._checks if check.holds(self._node)]
-        if checks:
-            worst = max(checks, key=lambda check: check.level)
-            level, message = (worst.level, worst.words) if worst.level > level else (level, message)
-        elif level == OK and self._bad > self._told_bad:
-            level = WARN
-            message = f'{self._bad - self._told_bad} messages refused or dropped: {self._why()}'
+    def _status(self, now_s: float) -> DiagnosticStatus:
+        level, message = self._level_and_message()
+        values = self._values | self._connections() | self._messages.values(now_s)
+        values |= self._step_times.values()
         name = self._node.get_fully_qualified_name()
-        pairs = [KeyValue(key=key, value=value) for key, value in self._told(now).items()]
         return DiagnosticStatus(
-            level=level, name=f'{name.lstrip("/")}: thinmap', message=message, values=pairs
+            level=level,
+            name=f'{name.lstrip("/")}: thinmap',
+            message=message,
+            values=[KeyValue(key=key, value=value) for key, value in values.items()],
         )
 
-    def _why(self) -> str:
-        """Reasons of the last refusals and drops, the newest first; what is over is not told."""
-        reasons = [
-            (e.refused_at, f'{topic}: {e.last_refusal}') for topic, e in self._topics.items()
-        ]
-        reasons += [(at, cause) for cause, at in self._dropped_at.items()]
-        recent = [reason for reason in reasons if monotonic() - reason[0] <= _RECENT_S]
-        return '; '.join(text for _, text in sorted(recent, reverse=True))
+    def _level_and_message(self) -> tuple[bytes, str]:
+        level, message = (OK, 'paused') if self._is_paused else self._state
+        failed = [check for check in self._checks if check.fails(self._node)]
+        if failed:
+            worst = max(failed, key=lambda check: check.level)
+            return (worst.level, worst.fault) if worst.level > level else (level, message)
+        faults = self._messages.new_faults()
+        return (WARN, faults) if faults and level == OK else (level, message)
 
     def _connections(self) -> dict[str, str]:
-        """How many have been found that hear what the node says, or say what it hears.
+        """Number of subscribers of each published topic, and of publishers of each subscribed one.
 
-        Others may see both of two endpoints a while before these see each other.
+        Other nodes may discover both endpoints before these discover each other.
         """
         found = {}
         for publisher in list(self._node.publishers):
-            if publisher.topic_name not in _OF_EVERY_NODE:
+            if publisher.topic_name not in _TOPICS_OF_EVERY_NODE:
                 name = publisher.topic_name.lstrip('/')
-                found[f'{name}: listeners'] = str(publisher.get_subscription_count())
+                found[f'{name}: subscribers'] = str(publisher.get_subscription_count())
         for subscription in list(self._node.subscriptions):
-            if subscription.topic_name not in _OF_EVERY_NODE:
+            if subscription.topic_name not in _TOPICS_OF_EVERY_NODE:
                 name = subscription.topic_name.lstrip('/')
-                found[f'{name}: speakers'] = str(subscription.get_publisher_count())
+                found[f'{name}: publishers'] = str(subscription.get_publisher_count())
         return found
-
-    def _told(self, now: float) -> dict[str, str]:
-        """All values, in an order that stays."""
-        told = dict(self._values)
-        told.update(self._connections())
-        for topic, entry in self._topics.items():
-            told[f'{topic}: heard'] = str(entry.heard)
-            told[f'{topic}: rate'] = f'{(entry.heard - entry.told) / (now - self._told_at):.1f} Hz'
-            age = 'never' if entry.last_at is None else f'{now - entry.last_at:.1f} s ago'
-            told[f'{topic}: last'] = age
-            told[f'{topic}: refused'] = str(entry.refused.total())
-            for reason, count in entry.refused.items():
-                told[f'{topic}: refused: {reason}'] = str(count)
-        for cause, count in self._drops.items():
-            told[f'dropped: {cause}'] = str(count)
-        for step, times in self._steps.items():
-            middle, most = np.percentile(times, [50.0, 95.0])
-            told[f'{step}: step time'] = (
-                f'median {middle:.1f} ms, p95 {most:.1f} ms, max {max(times):.1f} ms'
-            )
-        return told

@@ -67,9 +67,7 @@ class _Listener:
             self._count_losses(info.get('publication_sequence_number'))
         node.handle_time_jump()
         if self._is_left_over(last_ns):
-            node.diagnostics.count_drops(
-                f'{self._topic}: left over from before the clock was set back', 1
-            )
+            node.diagnostics.count_drops(f'{self._topic}: from before the clock jumped back', 1)
         elif not node.is_active:
             self._held = message if self._is_latched else None
         elif not (self._is_scan and node.is_paused):
@@ -83,17 +81,17 @@ class _Listener:
         With the first that does not, the stream has arrived in the new time.
         """
         node = self._node
-        if self._set_backs == node.time_jumps:
+        if self._set_backs == node.time_jumps.count:
             return False
-        if node.is_before_time_jump(last_ns) and node.is_before_time_jump(self._last_ns):
+        if node.time_jumps.is_before(last_ns) and node.time_jumps.is_before(self._last_ns):
             return True
-        self._set_backs = node.time_jumps
+        self._set_backs = node.time_jumps.count
         return False
 
     def _count_losses(self, number: int | None) -> None:
         lost, missing = self._losses.record(self._last_ns, number)
         self._node.diagnostics.count_drops(
-            f'{self._topic}: lost on the way or in a full queue', lost
+            f'{self._topic}: lost in transport or in a full queue', lost
         )
         if self._is_scan:
             self._node.diagnostics.count_drops(f'{self._topic}: gaps between the stamps', missing)

@@ -19,7 +19,7 @@ def allowed(increment):
     return np.square([sigma_m, sigma_m, sigma_rad])
 
 
-def update(model, truths, odometries, information=KNOWN):
+def learn(model, truths, odometries, information=KNOWN):
     """Sigmas (N, 3) that were expected of motions that scans then found."""
     sigmas = []
     for truth, odometry in zip(truths, odometries, strict=True):

@@ -19,6 +19,7 @@ from thinmap_msgs.msg import ExplorationStatus, TopologicalMap
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
+from thinmap_ros.files.snapshots import write_snapshot
 from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live
@@ -152,7 +153,7 @@ def test_mapping_goes_on_after_each_node_was_killed(graph):
         kill(graph, name)
         maps.clear(), robot.poses.clear(), graphs.clear()
         start_one(graph, name)
-        graph.until(lambda n=name: 'goes on from what it had' in graph.log(n), 'it remembers')
+        graph.until(lambda n=name: 'restored the state' in graph.log(n), 'it remembers')
         # On a curve: where it had come up to a wall meanwhile, it turns away from it.
         robot.drive(0.15, v=0.15, w=0.6)
         graph.until(lambda: maps and len(robot.poses) > 5, 'mapping goes on')
@@ -192,14 +193,14 @@ def test_a_killed_localizer_goes_on_in_the_map_and_does_not_bend_it(graph):
     # count.
     graph.processes['sim'].send_signal(signal.SIGSTOP)
     start_one(graph, 'localizer')
-    graph.until(lambda: 'goes on from what it had' in graph.log('localizer'), 'it remembers')
-    graph.until(lambda: doctor.number('localizer', 'map: speakers') == 1, 'it finds the mapper')
+    graph.until(lambda: 'restored the state' in graph.log('localizer'), 'it remembers')
+    graph.until(lambda: doctor.number('localizer', 'map: publishers') == 1, 'it finds the mapper')
     graph.processes['sim'].send_signal(signal.SIGCONT)
     robot.drive(0.7, w=0.3)
     graph.until(lambda: len(robot.poses) > 5, 'it goes on')
     robot.drive(1.0, w=-0.3)
     robot.settle()
-    assert 'no map came' not in graph.log('localizer')
+    assert 'no map received' not in graph.log('localizer')
     assert robot.error_m() < 0.06
 
 
@@ -218,14 +219,16 @@ def test_a_killed_node_that_is_started_otherwise_begins_anew_and_says_why(graph)
         kill(graph, name)
         maps.clear()
         graph.start(name, use_sim_time=True, recover_s=RECOVER_S, **values)
-        graph.until(lambda n=name: 'begins anew' in graph.log(n), 'it says so')
+        graph.until(lambda n=name: 'starting empty' in graph.log(n), 'it says so')
         assert said in graph.log(name), graph.log(name)
     kill(graph, 'localizer')
     (kept,) = state.glob('*.localizer.npz')
-    np.savez(kept, stamp_ns=np.array(1), T_map_odom=np.zeros(4), T_odom_base=np.zeros(3))
+    wrong = {'stamp_ns': np.array(1), 'T_map_odom': np.zeros(4), 'T_odom_base': np.zeros(3)}
+    with kept.open('wb') as stream:
+        write_snapshot(stream, 'checkpoint', wrong)
     start_one(graph, 'localizer')
     graph.until(lambda: 'T_map_odom: (4,)' in graph.log('localizer'), 'it says so')
-    assert 'was killed, but what it had is refused' in graph.log('localizer')
+    assert 'checkpoint rejected' in graph.log('localizer')
     graph.until(lambda: maps and maps[-1].info.resolution < 0.06, 'a map with the new cells')
     for name in MAPPING:
         assert graph.stop(name) == 0
@@ -244,8 +247,8 @@ def test_a_whole_robot_that_was_killed_and_begins_anew_is_not_mixed_with_the_one
     robot.poses.clear(), robot.truth.clear(), maps.clear()
     start_together(graph, *MAPPING)
     graph.until(lambda: len(robot.poses) > 10 and len(maps) > 2, 'mapping anew')
-    assert graph.log('thinmap').count('goes on from what it had') == 3
-    assert 'odometry has begun anew' in graph.log('thinmap')
+    assert graph.log('thinmap').count('restored the state') == 3
+    assert 'odometry was reset' in graph.log('thinmap')
     assert robot.error_m() < 0.1
     # The robot stands where it began: it sees what one sees from there, and nothing of the drive is
     # left.
@@ -271,7 +274,7 @@ def test_time_set_back_begins_everything_anew(graph):
     graph.start(
         'sim', start=START, hold_for_subscribers=4, rate=4.0, lockstep='local_topology', seed=3
     )
-    notices = [f'[{name}]: the clock was set back' for name in names]
+    notices = [f'[{name}]: clock jumped back' for name in names]
     graph.until(
         lambda: all(notice in graph.log('thinmap') for notice in notices), 'all of them notice'
     )
@@ -310,7 +313,7 @@ def test_what_waited_while_the_clock_was_set_back_does_not_begin_the_new_map(gra
     now[0] = 1.0
     set_back = Clock(clock=messages.time_msg(10**9))
     graph.until(
-        lambda: clock.publish(set_back) or 'the clock was set back' in graph.log('localizer'),
+        lambda: clock.publish(set_back) or 'clock jumped back' in graph.log('localizer'),
         'it notices',
     )
     said = 0
@@ -319,7 +322,7 @@ def test_what_waited_while_the_clock_was_set_back_does_not_begin_the_new_map(gra
         nonlocal said
         said += 1
         say(last + 0.1 * said, 4.0)
-        cause = 'dropped: scan: left over from before the clock was set back'
+        cause = 'dropped: scan: from before the clock jumped back'
         return doctor.number('localizer', cause) > 0
 
     graph.until(left_over, 'it is counted')
@@ -487,7 +490,7 @@ def test_a_burst_of_scans_leaves_no_queue_and_what_is_lost_is_counted(graph):
         graph.until(lambda: messages.stamp_ns(poses[-1].header.stamp) == now[0], 'the last pose')
         so_far = doctor.times('localizer')
         graph.until(lambda: doctor.times('localizer') >= so_far + 2, 'diagnostics')
-        keys = ('scan: heard', 'dropped: scan: lost on the way or in a full queue')
+        keys = ('scan: received', 'dropped: scan: lost in transport or in a full queue')
         return [doctor.number('localizer', key) for key in keys]
 
     graph.until(steadily, 'poses at 40 Hz')
@@ -519,13 +522,13 @@ def test_a_full_disk_leaves_the_old_session_as_it_was(graph, tmp_path):
     def save():
         return graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(stem)))
 
-    parts = ('.topology.npz', '.features.npz')
+    parts = ('.topology.npz', '.slam.npz')
     graph.until(
         lambda: all(part in save().message for part in parts), 'a session with all its parts'
     )
     before = {file.name: file.read_bytes() for file in stem.parent.iterdir()}
     assert sorted(before) == [
-        'room.features.npz',
+        'room.slam.npz',
         'room.grid.npz',
         'room.pgm',
         'room.topology.npz',

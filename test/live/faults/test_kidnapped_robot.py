@@ -85,7 +85,7 @@ def test_a_robot_finds_itself_in_a_saved_map_and_maps_on_also_when_it_is_carried
     start_sim(graph, START, 2)
     robot.drive_until(lambda: robot.seconds() > 30.0, 'a map of the room')
     saved = graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(stem)))
-    assert saved.success and '.features.npz' in saved.message, saved.message
+    assert saved.success and '.slam.npz' in saved.message, saved.message
     assert [graph.stop(name) for name in ('sim', *NODES)] == [0] * 4
     graph.hear_out()
     heard = robot.truth, robot.poses, robot.status, robot.maps

@@ -26,7 +26,7 @@ SCAN_PERIOD_NS = 200_000_000
 # subscription, and the scans that wait for their odometry.
 QUEUE = qos.SENSOR.depth
 WAITING = 20
-DROPS = ('scan: lost on the way or in a full queue', 'scans without odometry at their time')
+DROPS = ('scan: lost in transport or in a full queue', 'scans without odometry at their time')
 
 
 def stamps(heard):

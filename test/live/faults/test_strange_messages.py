@@ -172,9 +172,9 @@ def test_a_node_lives_through_them_publishes_no_nan_and_counts_what_it_refused(g
     set_to_work(graph, name)
     expected = say(graph, name, publishers, count)
     graph.until(lambda: counted(doctor, name, expected) == [], f'counts {expected}')
-    assert all(doctor.number(name, f'{topic}: heard') >= 0.7 * count for topic in expected)
-    assert doctor.value(name, 'scan: refused') == '' or any(
-        'refused: ' in p.key for p in doctor.status(name).values
+    assert all(doctor.number(name, f'{topic}: received') >= 0.7 * count for topic in expected)
+    assert doctor.value(name, 'scan: rejected') == '' or any(
+        'rejected: ' in p.key for p in doctor.status(name).values
     )
     for topic, said in heard.items():
         assert all(math.isfinite(number) for message in said for number in numbers(message)), topic
@@ -226,7 +226,7 @@ def counted(doctor, name, expected):
     return [
         t
         for t, n in expected.items()
-        if doctor.number(name, f'{t}: refused') < 0.7 * n and t not in LATER[name]
+        if doctor.number(name, f'{t}: rejected') < 0.7 * n and t not in LATER[name]
     ]
 
 

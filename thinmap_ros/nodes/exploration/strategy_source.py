@@ -39,7 +39,7 @@ class StrategySource:
         self._is_outdated = False
         restored = None
         if session and self._name == DEFAULT:
-            restored = sessions.load_exploration(session, self._config)
+            restored = sessions.EXPLORATION.load_optional(session, self._config)
         return restored or self._new()
 
     def next(self, last: Mission, goal: MissionGoal) -> Strategy:
@@ -54,9 +54,10 @@ class StrategySource:
         Raises OSError where writing fails.
         """
         if isinstance(strategy, Explorer):
-            return f'saved {sessions.save_exploration(path, strategy)}'
-        aside = sessions.set_exploration_aside(path)
-        return f'strategy {self._name} has nothing to save{aside}'
+            return f'saved {sessions.EXPLORATION.save(path, strategy)}'
+        archived = sessions.EXPLORATION.archive(path)
+        nothing = f'strategy {self._name} has nothing to save'
+        return f'{nothing}; {archived}' if archived else nothing
 
     def _new(self) -> Strategy:
         self._is_outdated = False

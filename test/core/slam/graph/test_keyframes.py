@@ -17,7 +17,7 @@ from thinmap_ros.core.slam.graph.keyframes import (
     heading_variance,
     inverse,
     propagated_covariance,
-    turned,
+    rotated_covariance,
     view_difference_m,
     with_heading,
 )
@@ -205,8 +205,10 @@ def test_a_turned_covariance_is_that_of_turned_samples(rng):
     c = math.cos(theta)
     s = math.sin(theta)
     samples[:, :2] = samples[:, :2] @ np.array([[c, s], [-s, c]])
-    np.testing.assert_allclose(turned(covariance, theta), np.cov(samples.T), atol=3e-5)
-    np.testing.assert_allclose(turned(turned(covariance, theta), -theta), covariance, atol=1e-12)
+    np.testing.assert_allclose(rotated_covariance(covariance, theta), np.cov(samples.T), atol=3e-5)
+    np.testing.assert_allclose(
+        rotated_covariance(rotated_covariance(covariance, theta), -theta), covariance, atol=1e-12
+    )
 
 
 def test_a_carried_covariance_is_that_of_what_is_bound_to_it(rng):

@@ -13,7 +13,7 @@ from thinmap_ros.core.slam.graph.keyframes import (
     KeyframeConfig,
     inverse,
     propagated_covariance,
-    turned,
+    rotated_covariance,
 )
 from thinmap_ros.core.slam.graph.loop_closure import LoopClosure, LoopClosureConfig
 from thinmap_ros.core.slam.graph.pose_graph import Edge
@@ -74,7 +74,7 @@ class Driver:
             noise = self.rng.normal(0.0, SIGMAS) + np.hypot(step[0], step[1]) * self.bias
             before = self.pose
             self.pose = se2.compose(before, step + noise)
-            own = turned(STEP, float(before[2]))
+            own = rotated_covariance(STEP, float(before[2]))
             self.covariance = (
                 propagated_covariance(self.covariance, self.pose[:2] - before[:2]) + own
             )

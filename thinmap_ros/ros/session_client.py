@@ -1,0 +1,92 @@
+"""A session saved and loaded across nodes: each node saves and loads its own part."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from rclpy.callback_groups import CallbackGroup
+from rclpy.client import Client
+from rclpy.node import Node
+
+from thinmap_msgs.srv import LoadMap, SaveMap
+from thinmap_ros.core.errors import ThinmapError
+from thinmap_ros.files.sessions import EXPLORATION, LOCALIZER, TOPOLOGY, SessionPart, stem_of
+from thinmap_ros.ros.services import call
+
+Part = SessionPart[Any, Any]
+_SAVED: tuple[Part, ...] = (TOPOLOGY, LOCALIZER, EXPLORATION)
+_LOADED: tuple[Part, ...] = (TOPOLOGY, LOCALIZER)
+
+
+@dataclass(frozen=True)
+class PartResult:
+    """What became of one part of a session, or of all: success, and a message for the user."""
+
+    success: bool
+    message: str
+
+
+class SessionClient:
+    """Asks the nodes that share a session with `node` to save or load their parts."""
+
+    def __init__(self, node: Node, callback_group: CallbackGroup) -> None:
+        """Create the clients; callback_group: one that a waiting callback does not block."""
+
+        def client(kind: Any, verb: str, part: Part) -> Client:
+            return node.create_client(kind, f'{verb}_{part.name}', callback_group=callback_group)
+
+        self._node = node
+        self._save = {part.name: client(SaveMap, 'save', part) for part in _SAVED}
+        self._load = {part.name: client(LoadMap, 'load', part) for part in _LOADED}
+
+    async def save(self, path: str) -> PartResult:
+        """Save the parts of all other nodes.
+
+        The part of a node that is not running is archived, as it belongs to an earlier session,
+        unless saving has failed before.
+        """
+        stem = str(stem_of(path))
+        result = PartResult(True, '')
+        for part in _SAVED:
+            result = _joined(result, await self._save_part(part, stem, archives=result.success))
+        return result
+
+    async def load(self, path: str, load_grid: Callable[[], None]) -> PartResult:
+        """Load graph, grid and localizer; `load_grid` is called when the graph was accepted.
+
+        A session without a graph clears the graph of the builder.
+        Raises InputError where the path names no session.
+        """
+        stem = str(stem_of(path))
+        graph = await self._load_part(TOPOLOGY, stem if TOPOLOGY.exists(stem) else '')
+        if not graph.success:
+            return graph
+        load_grid()
+        maps = _joined(PartResult(True, 'grid loaded'), graph)
+        return _joined(maps, await self._load_part(LOCALIZER, stem))
+
+    async def _save_part(self, part: Part, stem: str, archives: bool) -> PartResult:
+        answer = await call(self._node, self._save[part.name], SaveMap.Request(path=stem))
+        if answer is not None:
+            return PartResult(answer.success, answer.message)
+        try:
+            archived = part.archive(stem) if archives else ''
+        except (ThinmapError, OSError) as error:
+            return PartResult(False, str(error))
+        absent = _absent(part)
+        return PartResult(True, f'{absent}: {archived}' if archived else absent)
+
+    async def _load_part(self, part: Part, stem: str) -> PartResult:
+        answer = await call(self._node, self._load[part.name], LoadMap.Request(path=stem))
+        if answer is None:
+            return PartResult(True, _absent(part))
+        return PartResult(answer.success, answer.message)
+
+
+def _absent(part: Part) -> str:
+    return f'{part.node} is not running'
+
+
+def _joined(a: PartResult, b: PartResult) -> PartResult:
+    message = '; '.join(message for message in (a.message, b.message) if message)
+    return PartResult(a.success and b.success, message)
