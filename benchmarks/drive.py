@@ -13,7 +13,7 @@ from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.se2 import Array, pose, wrap
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig, build
 from thinmap_ros.core.topology.graph import Node, TopologicalMap
-from thinmap_ros.sim.laser import Lms200, Lms200Config
+from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 from thinmap_ros.sim.world import World
 
 WINDOW_M = WindowConfig().window_m
@@ -40,7 +40,7 @@ class Drive:
         self.grid = OccupancyGrid(OccupancyConfig())
         self.builder = TopologyBuilder(topology)
         self.ledger = Ledger()
-        self._laser = Lms200(Lms200Config(), seed)
+        self._laser = LaserScanner(LaserScannerConfig(), seed)
 
     def step(self, T: Array, stamp_ns: int = 0) -> None:
         """One scan at a pose (3,) through grid and builder."""
@@ -79,7 +79,7 @@ def tour(world: World, start: Array, radius_m: float, goals: int, seed: int) -> 
     cells = np.where(world.occupied != 0, np.int8(100), np.int8(0))
     patch = GridPatch(world.frame, cells)
     config = WavefrontConfig(robot_radius_m=radius_m + 0.05)
-    standing = world.frame.centres_of(np.argwhere(world.wall_distance_m > radius_m + 0.1))
+    standing = world.frame.centres_of(np.argwhere(world.distance_to_wall_m > radius_m + 0.1))
     poses = [start]
     been = [start[:2]]
     unseen = np.full(len(standing), np.inf)

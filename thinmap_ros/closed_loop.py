@@ -17,8 +17,8 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
-from thinmap_ros.sim.coverage import Coverable
-from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.coverage import ObservableCells
+from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import STEP_NS, Moment, Simulation
 from thinmap_ros.sim.world import World
@@ -44,7 +44,7 @@ class RunLog:
 
 
 @dataclass(frozen=True)
-class Ending:
+class ExplorationOutcome:
     """How an exploration ended; finished: whether the strategy ended it."""
 
     finished: bool
@@ -91,12 +91,14 @@ class ClosedLoop:
         self._T_map_odom = np.zeros(3)
         self._command = (0.0, 0.0)
 
-    def run(self, goal: Coverable, limit_s: float, show: Callable[[float, float], None]) -> Ending:
+    def run(
+        self, goal: ObservableCells, limit_s: float, show: Callable[[float, float], None]
+    ) -> ExplorationOutcome:
         """Explore until the strategy is finished or the time is up.
 
         `show` receives time (s) and coverage every few scans.
         """
-        moment = self.simulation.sense()
+        moment = self.simulation.read_sensors()
         steps = 0
         while moment.stamp_ns < limit_s * 1e9:
             if moment.scan is not None:
@@ -117,7 +119,7 @@ class ClosedLoop:
             if self.decision is not None and finished
             else f'time limit of {limit_s:.0f} s'
         )
-        return Ending(finished, reason, self.simulation.robot.collisions)
+        return ExplorationOutcome(finished, reason, self.simulation.robot.collisions)
 
     @property
     def is_finished(self) -> bool:
@@ -190,9 +192,9 @@ class ClosedLoop:
         if command.state in ('failed', 'reached'):
             self._goal = None
 
-    def _measure(self, goal: Coverable) -> tuple[float, float]:
+    def _measure(self, goal: ObservableCells) -> tuple[float, float]:
         seconds = self.simulation.stamp_ns / 1e9
-        self.log.coverage.append((seconds, goal.share_known(self.pipeline.grid.patch())))
+        self.log.coverage.append((seconds, goal.coverage(self.pipeline.grid.patch())))
         return self.log.coverage[-1]
 
 
@@ -217,7 +219,7 @@ class Options:
     speed_m_s: float = 0.2
     localization: str = 'truth'
     robot: str = '2dx'
-    laser: Lms200Config = field(default_factory=Lms200Config)
+    laser: LaserScannerConfig = field(default_factory=LaserScannerConfig)
     time_limit_s: float = 20_000.0
     kidnap_at_s: float | None = None
 

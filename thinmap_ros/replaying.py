@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.estimate import Estimate
-from thinmap_ros.core.odometry import ScanPairing
+from thinmap_ros.core.odometry import ScanOdometrySynchronizer
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizers import line_features
@@ -53,7 +53,7 @@ def replay(
     Raises InputError where the log has nothing to play.
     """
     result = Replay(Pipeline(config))
-    pairing = ScanPairing()
+    pairing = ScanOdometrySynchronizer()
     tidy_up = compiler_memory_releaser()
     for event in tqdm(log.events(), unit=' events', disable=not show_progress):
         if isinstance(event, OdometryEvent):
@@ -64,7 +64,7 @@ def replay(
             step = result.pipeline.step(scan, T_odom_base)
             result.stamps_ns.append(scan.stamp_ns)
             result.poses.append(step.estimate.T_map_base)
-            result.local_features.append(step.estimate.n_local)
+            result.local_features.append(step.estimate.n_local_features)
             if watcher is not None:
                 watcher.step(scan, T_odom_base, step.estimate, result.pipeline)
         tidy_up()

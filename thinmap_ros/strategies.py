@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import partial
 from importlib import import_module
 
-from thinmap_ros.core.errors import ConfigError, reason_of, shown
+from thinmap_ros.core.errors import ConfigError, one_line_reason, shown
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
 from thinmap_ros.core.exploration.strategy import Strategy
 
@@ -36,7 +36,7 @@ def make_strategy(name: str, config: ExplorerConfig | None = None) -> Strategy:
     try:
         strategy = factory()
     except Exception as error:  # whatever the factory of a user raises
-        raise _refused(name, f'its factory fails: {reason_of(error)}') from error
+        raise _refused(name, f'its factory fails: {one_line_reason(error)}') from error
     if isinstance(strategy, type) or not isinstance(strategy, Strategy):
         found = f'its factory returns a {type(strategy).__name__}'
         raise _refused(name, f'{found}, not a strategy with step and target_failed')
@@ -60,7 +60,7 @@ def _imported(name: str, module: str, attribute: str) -> Callable[[], object]:
     try:
         factory = getattr(import_module(module), attribute)
     except Exception as error:  # whatever the module of a user raises
-        raise _refused(name, reason_of(error)) from error
+        raise _refused(name, one_line_reason(error)) from error
     if not callable(factory):
         raise _refused(name, f'it is a {type(factory).__name__}, not a factory')
     return factory  # type: ignore[no-any-return]

@@ -26,7 +26,7 @@ from thinmap_ros.evaluation.parallel_jobs import (
     add_run_options,
     complaint,
     read_report,
-    run_missing,
+    run_pending,
 )
 from thinmap_ros.files.atomic import read_text, write_text
 from thinmap_ros.tools import cli
@@ -123,7 +123,7 @@ def _run_cases(
     logs = arguments.shared / 'data' / 'logs'
     degrade = arguments.shared / 'tools' / 'degrade_log.py'
     tasks = [Task(case, logs, degrade, arguments.out / 'logs', options) for case in cases]
-    return run_missing(
+    return run_pending(
         measure,
         tasks,
         lambda task: report_file(arguments.out, task.name),

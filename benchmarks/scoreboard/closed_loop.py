@@ -24,17 +24,17 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.machine import forget_peak, peak_mb
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
-from thinmap_ros.sim.coverage import Coverable, coverable
-from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.coverage import ObservableCells, coverable
+from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import Simulation
 from thinmap_ros.sim.world import World
 from thinmap_ros.strategies import DEFAULT, make_strategy
 
 LASERS = {
-    'lms200': Lms200Config(),
-    'turtlebot3': Lms200Config(beams=360, field_of_view_deg=360.0, range_max_m=3.5),
-    'rplidar_a1': Lms200Config(beams=360, field_of_view_deg=360.0, range_max_m=12.0),
+    'lms200': LaserScannerConfig(),
+    'turtlebot3': LaserScannerConfig(beams=360, field_of_view_deg=360.0, range_max_m=3.5),
+    'rplidar_a1': LaserScannerConfig(beams=360, field_of_view_deg=360.0, range_max_m=12.0),
 }
 RECORDED_S = 1200.0  # of a recorded drive: 6,000 scans
 _DRAWN = Path(__file__).resolve().parents[2] / 'worlds'
@@ -45,7 +45,7 @@ _RECORDED_SEED = 0
 _LIMIT_S = 3000.0
 _LIMITS_S = {LARGEST: 1200.0}
 # What is cut short is not asked for its coverage, which takes long to prepare on a large floor.
-_NOTHING = Coverable(np.zeros((0, 0), dtype=np.bool_), GridFrame(0.0, 0.0, 0.1))
+_NOTHING = ObservableCells(np.zeros((0, 0), dtype=np.bool_), GridFrame(0.0, 0.0, 0.1))
 
 
 def record_drive(world: str, worlds: Path, path: Path, limit_s: float = RECORDED_S) -> Numbers:
@@ -124,7 +124,7 @@ def world_of(name: str, worlds: Path) -> tuple[World, Array]:
 
 
 def _pipeline_config(
-    laser: Lms200Config, options: Numbers | None = None, start: Array | None = None
+    laser: LaserScannerConfig, options: Numbers | None = None, start: Array | None = None
 ) -> PipelineConfig:
     """As `explore_world` has it: a beam that met nothing has seen as far as this laser can."""
     return PipelineConfig(

@@ -12,9 +12,9 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.files.atomic import atomic_write
-from thinmap_ros.sim.drives import Look
-from thinmap_ros.sim.laser import Lms200Config
-from thinmap_ros.sim.robot import PioneerConfig, WheelOdometry
+from thinmap_ros.sim.drives import DriveSample
+from thinmap_ros.sim.laser import LaserScannerConfig
+from thinmap_ros.sim.robot import RobotConfig, WheelOdometry
 from thinmap_ros.sim.simulation import STEP_NS, Moment, Simulation, odometry_seed
 from thinmap_ros.sim.world import World
 
@@ -37,7 +37,7 @@ class Recording:
     fan: Array
     T_base_laser: Array
 
-    def replay(self, robot: PioneerConfig, seed: int) -> Iterator[Look]:
+    def replay(self, robot: RobotConfig, seed: int) -> Iterator[DriveSample]:
         """Yield each scan with its true pose and the odometry of a simulation with this seed."""
         odometry = WheelOdometry(robot, odometry_seed(seed))
         driven = 0
@@ -46,7 +46,7 @@ class Recording:
                 odometry.add_step(distance_m, turn_rad)
             driven = stamp_ns // STEP_NS
             scan = Scan.create(stamp_ns, self.ranges_m[k], *self.fan.tolist(), self.T_base_laser)
-            yield Look(scan, odometry.T_odom_base, self.T_world_base[k])
+            yield DriveSample(scan, odometry.T_odom_base, self.T_world_base[k])
 
     def write(self, path: Path) -> None:
         """Write the recording as an .npz file, whole or not at all."""
@@ -67,16 +67,16 @@ class RecordedSimulation(Simulation):
     """A simulation that keeps its scans, the true poses at them, and the motion of each step."""
 
     def __init__(
-        self, world: World, start: Array, robot: PioneerConfig, laser: Lms200Config, seed: int
+        self, world: World, start: Array, robot: RobotConfig, laser: LaserScannerConfig, seed: int
     ) -> None:
         super().__init__(world, start, robot, laser, seed)
         self._scans: list[Scan] = []
         self._poses: list[Array] = []
         self._steps: list[tuple[float, float]] = []
 
-    def sense(self) -> Moment:
+    def read_sensors(self) -> Moment:
         """Return what the sensors measure now, and keep a scan with its true pose."""
-        moment = super().sense()
+        moment = super().read_sensors()
         if moment.scan is not None:
             self._scans.append(moment.scan)
             self._poses.append(self.robot.T_world_base)

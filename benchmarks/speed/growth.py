@@ -17,8 +17,8 @@ from thinmap_ros.evaluation.outcome import Row, at_most
 from thinmap_ros.files.package_data import world_path
 from thinmap_ros.files.worlds import read_tour, read_world
 from thinmap_ros.pipeline import PipelineConfig
-from thinmap_ros.sim.drives import Look, drive, ways_along
-from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.drives import DriveSample, drive, tour_paths
+from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import Simulation
 from thinmap_ros.sim.world import World
@@ -93,7 +93,7 @@ def _ratios(where: str, mark: _Mark, first: _Mark) -> Iterator[Row]:
     yield at_most('  the same, mean', float(now.mean() / then.mean()), 1.2)
 
 
-def _drive(looks: Iterator[Look], marks_m: list[float]) -> Iterator[_Mark]:
+def _drive(looks: Iterator[DriveSample], marks_m: list[float]) -> Iterator[_Mark]:
     """Marks after these lengths of the drive."""
     pipeline: CpuTimedPipeline | None = None
     way_m = 0.0
@@ -131,13 +131,13 @@ def _drive(looks: Iterator[Look], marks_m: list[float]) -> Iterator[_Mark]:
                 return
 
 
-def _looks() -> tuple[Iterator[Look], float]:
+def _looks() -> tuple[Iterator[DriveSample], float]:
     """The tour of the warehouse, again and again, and its length, m."""
     path = world_path('warehouse')
     world = World.from_patch(*read_world(path))
     tour = read_tour(path)
     robot = PRESETS[_ROBOT]
-    simulation = Simulation(world, world.start, robot, Lms200Config(range_max_m=_RANGE_M), 0)
-    ways = list(ways_along(world, tour, robot.radius_m))  # closed: it begins where it ends
+    simulation = Simulation(world, world.start, robot, LaserScannerConfig(range_max_m=_RANGE_M), 0)
+    ways = list(tour_paths(world, tour, robot.radius_m))  # closed: it begins where it ends
     lap_m = float(sum(np.hypot(*np.diff(way, axis=0).T).sum() for way in ways))
     return drive(simulation, islice(cycle(ways), 20 * len(ways)), _SPEED_M_S), lap_m

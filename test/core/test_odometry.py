@@ -7,7 +7,7 @@ import pytest
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.odometry import OdometryBuffer, ScanPairing
+from thinmap_ros.core.odometry import OdometryBuffer, ScanOdometrySynchronizer
 from thinmap_ros.core.scan import Scan
 
 SECOND = 1_000_000_000
@@ -60,7 +60,7 @@ def test_nan_is_refused():
 
 
 def test_a_scan_waits_for_odometry_as_new_as_itself():
-    pairing = ScanPairing()
+    pairing = ScanOdometrySynchronizer()
     assert pairing.add_odometry(0, se2.pose(0, 0, 0)) == []
     assert pairing.add_scan(scan_at(SECOND)) == []
     ((scan, T_odom_base),) = pairing.add_odometry(2 * SECOND, se2.pose(2, 0, 0))
@@ -69,7 +69,7 @@ def test_a_scan_waits_for_odometry_as_new_as_itself():
 
 
 def test_scans_older_than_all_odometry_and_too_many_waiting_are_dropped_and_counted():
-    pairing = ScanPairing(capacity=2)
+    pairing = ScanOdometrySynchronizer(capacity=2)
     pairing.add_odometry(10 * SECOND, se2.pose(0, 0, 0))
     assert pairing.add_scan(scan_at(9 * SECOND)) == []
     for stamp in (11, 12, 13):

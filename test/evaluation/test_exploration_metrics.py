@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from thinmap_ros.closed_loop import Ending
+from thinmap_ros.closed_loop import ExplorationOutcome
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID
 from thinmap_ros.evaluation.exploration_metrics import (
-    FEWEST_SIGHTINGS,
+    MIN_OBSERVATIONS,
     EndNodeCensus,
     TargetLog,
     exploration_report,
@@ -40,7 +40,7 @@ def test_two_at_once_are_two_places_however_near():
 def test_what_did_not_last_is_not_counted():
     blink = (1, 5.0, 5.0)
     stay = (2, 0.0, 0.0)
-    decisions = [[blink, stay]] * (FEWEST_SIGHTINGS - 1) + [[stay]]
+    decisions = [[blink, stay]] * (MIN_OBSERVATIONS - 1) + [[stay]]
     assert census_of(*decisions).seen == 1
 
 
@@ -57,7 +57,7 @@ def report_of(coverage, census=None):
     times = np.arange(0.0, 10.1, 0.5)
     poses = np.column_stack([0.5 * times, 0.0 * times, 0.1 * times])
     return exploration_report(
-        Ending(True, 'done', 0),
+        ExplorationOutcome(True, 'done', 0),
         times,
         poses,
         poses + (0.0, 0.03, 0.0),

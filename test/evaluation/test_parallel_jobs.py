@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.evaluation.parallel_jobs import Failure, complaint, read_report, run_missing
+from thinmap_ros.evaluation.parallel_jobs import Failure, complaint, read_report, run_pending
 
 LONG = """
 import argparse, os, time
@@ -61,7 +61,7 @@ def is_alive(pid):
 
 
 def run(folder, jobs, where=ONE_CORE):
-    return run_missing(add, jobs, lambda job: folder / f'{job.name}.json', where, quiet=True)
+    return run_pending(add, jobs, lambda job: folder / f'{job.name}.json', where, quiet=True)
 
 
 @pytest.mark.parametrize('processes', [1, 2])

@@ -25,7 +25,7 @@ from fuzz.saved_states import (
 )
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.odometry import LastPose
+from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.files import sessions
 from thinmap_ros.files.npz import read_arrays
@@ -77,12 +77,14 @@ def test_a_chain_that_leaps_is_not_taken_for_one(explored: Explored) -> None:
 
 
 def test_what_a_killed_localizer_left() -> None:
-    whole = LastPose(10**18, np.array([1.0, 2.0, 0.5]), np.array([0.1, 0.2, 0.3])).state()
-    assert LastPose.from_state(whole).stamp_ns == 10**18
+    whole = OdometryAnchor(10**18, np.array([1.0, 2.0, 0.5]), np.array([0.1, 0.2, 0.3])).state()
+    assert OdometryAnchor.from_state(whole).stamp_ns == 10**18
     for name, array in whole.items():
         for _, other in replaced(array):
             try:
-                LastPose.from_state(whole | {name: other}).leads_to(10**18, np.zeros(3))
+                OdometryAnchor.from_state(whole | {name: other}).is_continuous_with(
+                    10**18, np.zeros(3)
+                )
             except InputError as error:
                 assert len(str(error)) <= LONGEST
 

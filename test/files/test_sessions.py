@@ -27,7 +27,7 @@ from thinmap_ros.files.sessions import (
     save_grid,
     stem_of,
 )
-from thinmap_ros.sim.laser import Lms200, Lms200Config
+from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 from thinmap_ros.sim.world import World
 
 
@@ -62,7 +62,7 @@ def way() -> list[Array]:
 
 
 def drive(grid: OccupancyGrid, builder: TopologyBuilder, poses: list[Array], seed: int) -> None:
-    laser = Lms200(Lms200Config(), seed)
+    laser = LaserScanner(LaserScannerConfig(), seed)
     world = building()
     for k, T in enumerate(poses):
         grid.update(laser.scan(world, T, k), T)
@@ -190,7 +190,7 @@ def test_a_corrected_past_moves_the_nodes_and_they_keep_their_ids() -> None:
     corrected = OccupancyGrid()
     builder = TopologyBuilder()
     straight = TopologyBuilder()
-    laser = Lms200(Lms200Config(), 0)
+    laser = LaserScanner(LaserScannerConfig(), 0)
     for k, (T, wrong) in enumerate(zip(poses, believed, strict=True)):
         scan = laser.scan(world, T, k)
         drifted.update(scan, wrong)
@@ -246,7 +246,7 @@ def test_the_part_of_the_localizer_is_loaded_archived_or_rejected(tmp_path):
     assert LOCALIZER.load_optional(stem) is None
     localizer = Localizer()
     world = building()
-    laser = Lms200(Lms200Config(), 1)
+    laser = LaserScanner(LaserScannerConfig(), 1)
     for k in range(30):
         T = pose(3.0 + 0.1 * k, 6.0, 0.0)
         localizer.step(laser.scan(world, T, k), T)

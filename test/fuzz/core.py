@@ -95,7 +95,7 @@ def map_and_graph(shared: None, rng: np.random.Generator, folder: Path) -> None:
         if scan is None:
             continue
         T = drive.pose()
-        if tried(lambda s=scan, p=T: [grid.update(s, p)]) is None or not se2.is_on_earth(T):
+        if tried(lambda s=scan, p=T: [grid.update(s, p)]) is None or not se2.is_bounded_pose(T):
             continue
         window = grid.window(T[0], T[1], 16.0)
         sound_patch(window)

@@ -17,7 +17,7 @@ from thinmap_ros.core.se2 import pose
 from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.files import occupancy_maps, sessions
 from thinmap_ros.ros import messages, qos
-from thinmap_ros.sim.laser import Lms200, Lms200Config
+from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 from thinmap_ros.sim.world import World
 
 pytestmark = pytest.mark.live
@@ -123,7 +123,7 @@ def room_of(resolution=0.1):
     grid = OccupancyGrid(OccupancyConfig(resolution_m=resolution))
     builder = TopologyBuilder()
     world = World('room', occupied, OccupancyGrid().frame, pose(2.0, 2.0, 0.0))
-    laser = Lms200(Lms200Config(), 1)
+    laser = LaserScanner(LaserScannerConfig(), 1)
     for k in range(12):
         T = pose(2.0 + 0.1 * k, 3.0, 0.4 * k)
         grid.update(laser.scan(world, T, k), T)

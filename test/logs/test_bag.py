@@ -428,4 +428,4 @@ def test_files_of_a_bag_are_read_as_they_were_numbered(tmp_path: Path) -> None:
             writer.write('/scan', SCAN, k, Maker(writer).scan(k, RANGES))
     bag = Bag(folder)
     assert [message.log_ns for message in bag.messages()] == list(range(12))
-    assert 'metadata.yaml' in bag.advice and 'bag_repair' in bag.advice
+    assert 'metadata.yaml' in bag.repair_hint and 'bag_repair' in bag.repair_hint

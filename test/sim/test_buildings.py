@@ -10,16 +10,16 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.sim.buildings import BuildingConfig, building
 from thinmap_ros.sim.floor_plan import Kind, floor_plan
-from thinmap_ros.sim.laser import Lms200, Lms200Config
-from thinmap_ros.sim.moving_obstacles import Leaves, Moving, People
-from thinmap_ros.sim.robot import PioneerConfig
+from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
+from thinmap_ros.sim.moving_obstacles import Doors, MovingObstacles, Pedestrians
+from thinmap_ros.sim.robot import RobotConfig
 from thinmap_ros.sim.surfaces import inside_of
 from thinmap_ros.sim.world import World
 
 SEEDS = range(24)
-EXACT = Lms200Config(noise_m=0.0, rounding_m=0.0, mixed_pixels=0.0)
-NOBODY = People(np.zeros((0, 4, 2)), np.zeros(0), np.zeros((0, 4)))
-NO_DOOR = Leaves(
+EXACT = LaserScannerConfig(noise_m=0.0, rounding_m=0.0, mixed_pixels=0.0)
+NOBODY = Pedestrians(np.zeros((0, 4, 2)), np.zeros(0), np.zeros((0, 4)))
+NO_DOOR = Doors(
     np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros((0, 1)), np.zeros((0, 1), bool)
 )
 
@@ -33,8 +33,8 @@ def plain(seed, **given):
 def test_a_robot_gets_into_every_part(seed):
     made = plain(seed, area_m2=600.0 + 100.0 * seed)
     world = made.world
-    inside = inside_of(replace(world, occupied=(world.wall_distance_m < 0.3).astype(np.uint8)))
-    assert world.is_clear(*world.start[:2], PioneerConfig().radius_m)
+    inside = inside_of(replace(world, occupied=(world.distance_to_wall_m < 0.3).astype(np.uint8)))
+    assert world.is_clear(*world.start[:2], RobotConfig().radius_m)
     for wing in made.wings:
         for part in wing.plan.parts:
             middle = np.array([[0.5 * (part.x0 + part.x1), 0.5 * (part.y0 + part.y1)]])
@@ -92,7 +92,7 @@ def test_oblique_wings_are_among_them():
 def test_the_largest():
     made = building(1, BuildingConfig(area_m2=100_000.0))
     assert made.area_m2 > 50_000.0
-    assert made.world.is_clear(*made.world.start[:2], PioneerConfig().radius_m)
+    assert made.world.is_clear(*made.world.start[:2], RobotConfig().radius_m)
 
 
 @pytest.mark.parametrize('area_m2', [math.nan, 0.0, 100.0, 1e6])
@@ -112,7 +112,7 @@ def walled(glass, moving=None):
 
 def ahead(world, seconds=0.0):
     """What the beam straight ahead reads, looking along x from (1, 2)."""
-    scan = Lms200(EXACT, 0).scan(world, np.array([1.0, 2.0, 0.0]), round(1e9 * seconds))
+    scan = LaserScanner(EXACT, 0).scan(world, np.array([1.0, 2.0, 0.0]), round(1e9 * seconds))
     return scan.ranges_m[90]
 
 
@@ -124,14 +124,14 @@ def test_glass_returns_nothing_and_is_solid():
 
 def test_people_are_seen_where_they_are_then_and_step_aside():
     points = np.array([[[2.0, 2.0], [2.0, 3.9], [2.0, 3.9], [2.0, 2.0]]])
-    people = People(points, np.array([1.0]), np.full((1, 4), 10.0))
-    world = walled(False, Moving(people, NO_DOOR))
+    people = Pedestrians(points, np.array([1.0]), np.full((1, 4), 10.0))
+    world = walled(False, MovingObstacles(people, NO_DOOR))
     assert ahead(world, 5.0) == pytest.approx(0.8)
     assert people.places(11.0)[0] == pytest.approx((2.0, 3.0))
     assert ahead(world, 20.0) == pytest.approx(2.0)
     assert ahead(world, 43.8 + 5.0) == pytest.approx(0.8)  # round again
-    beside = People(points - (0.6, 0.0), np.array([1.0]), np.full((1, 4), 10.0))
-    assert ahead(walled(False, Moving(beside, NO_DOOR)), 5.0) == pytest.approx(2.0)
+    beside = Pedestrians(points - (0.6, 0.0), np.array([1.0]), np.full((1, 4), 10.0))
+    assert ahead(walled(False, MovingObstacles(beside, NO_DOOR)), 5.0) == pytest.approx(2.0)
 
 
 def test_people_walk_evenly_from_point_to_point():
@@ -141,7 +141,7 @@ def test_people_walk_evenly_from_point_to_point():
     points[3, 2] = points[3, 1]
     pauses = rng.exponential(8.0, (6, 4))
     pauses[4] = 0.0
-    people = People(points, speeds, pauses)
+    people = Pedestrians(points, speeds, pauses)
     for seconds in (0.0, *rng.uniform(0.0, 500.0, 200)):
         for i, place in enumerate(people.places(seconds)):
             times = [0.0]
@@ -161,7 +161,7 @@ def test_doors_swing_and_are_held_open_for_a_robot():
     ends = np.array([[2.0, 2.5]])
     open_rad = np.array([[1.0, -0.5, 1.0]])
     is_shut = np.array([[False, False, True]])
-    leaves = Leaves(hinges, ends, np.array([10.0]), open_rad, is_shut)
+    leaves = Doors(hinges, ends, np.array([10.0]), open_rad, is_shut)
     far = np.array([-6.0, 2.0])
     near = np.array([1.0, 2.0])
 
@@ -174,10 +174,10 @@ def test_doors_swing_and_are_held_open_for_a_robot():
         seen = [angle(first + seconds, far) for seconds in (0.0, 9.9, 10.0, 20.0, 29.9)]
         assert seen == pytest.approx([1.0, 1.0, -0.5, 0.0, 0.0])
     assert [angle(seconds, near) for seconds in (10.0, 20.0)] == pytest.approx([-0.5, 1.0])
-    blocked = Leaves(hinges, ends, np.array([np.inf]), np.ones((1, 2)), np.array([[True, False]]))
-    world = walled(False, Moving(NOBODY, blocked))
+    blocked = Doors(hinges, ends, np.array([np.inf]), np.ones((1, 2)), np.array([[True, False]]))
+    world = walled(False, MovingObstacles(NOBODY, blocked))
     for seconds in (0.0, 1e4):
-        scan = Lms200(EXACT, 0).scan(world, np.array([-1.5, 2.0, 0.0]), round(1e9 * seconds))
+        scan = LaserScanner(EXACT, 0).scan(world, np.array([-1.5, 2.0, 0.0]), round(1e9 * seconds))
         assert scan.ranges_m[90] == pytest.approx(3.5)
 
 

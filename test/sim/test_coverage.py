@@ -38,7 +38,7 @@ def reference(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Free cells surely and perhaps seen: fine rays from reachable cells, then one to spare."""
     solid = world.occupied != 0
-    standing = world.wall_distance_m > radius_m
+    standing = world.distance_to_wall_m > radius_m
     reached = np.zeros_like(standing)
     todo = deque([start_cell])
     while todo:
@@ -122,14 +122,14 @@ def test_share_known() -> None:
     world = walled(40, 50)
     found = coverable(world, np.array([2.0, 2.0, 0.0]), 0.2, 8.0)
     everything = GridPatch(GridFrame(-5.0, -5.0, 0.1), np.zeros((200, 200), dtype=np.int8))
-    assert found.share_known(everything) == 1.0
+    assert found.coverage(everything) == 1.0
     nothing = GridPatch(everything.frame, np.full((200, 200), UNKNOWN, dtype=np.int8))
-    assert found.share_known(nothing) == 0.0
+    assert found.coverage(nothing) == 0.0
     half = nothing.cells.copy()
     half[:, : 50 + 25] = 0  # x < 2.5
-    assert found.share_known(GridPatch(everything.frame, half)) == pytest.approx(24 / 48)
+    assert found.coverage(GridPatch(everything.frame, half)) == pytest.approx(24 / 48)
     small = GridPatch(GridFrame(0.1, 0.1, 0.1), np.zeros((19, 48), dtype=np.int8))
-    assert found.share_known(small) == pytest.approx(19 / 38)
+    assert found.coverage(small) == pytest.approx(19 / 38)
 
 
 def test_share_known_of_a_map_in_a_frame_of_its_own() -> None:
@@ -138,8 +138,8 @@ def test_share_known_of_a_map_in_a_frame_of_its_own() -> None:
     T_world_map = np.array([2.0, 2.0, np.pi / 2])
     # x from -2 to 0 in the map is y from 0 to 2 in the world.
     lower = GridPatch(GridFrame(-2.0, -3.0, 0.1), np.zeros((60, 20), dtype=np.int8))
-    assert found.share_known(lower, T_world_map) == pytest.approx(19 / 38, abs=0.03)
-    assert found.share_known(lower, T_world_map) == found.share_known(
+    assert found.coverage(lower, T_world_map) == pytest.approx(19 / 38, abs=0.03)
+    assert found.coverage(lower, T_world_map) == found.coverage(
         lower, T_world_map + se2.pose(0, 0, 0)
     )
 

@@ -16,7 +16,7 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.view import rerun_sinks
-from thinmap_ros.view.message_view import Feed, recording_from_bag
+from thinmap_ros.view.message_view import MessageView, recording_from_bag
 from thinmap_ros.view.null_view import NullView
 from thinmap_ros.view.rerun_view import View
 
@@ -275,7 +275,7 @@ def test_feed_refuses_what_makes_no_sense():
         nodes = (type('N', (), {'id': 1, 'kind': 9}),)
 
     with pytest.raises(InputError):
-        Feed(NullView(), lambda frame: None).take('topology', Message)
+        MessageView(NullView(), lambda frame: None).take('topology', Message)
 
 
 class Diary(NullView):
@@ -302,7 +302,7 @@ def stamped(**values):
 
 def test_step_times_are_those_of_the_robot_that_is_shown():
     diary = Diary()
-    feed = Feed(diary, lambda frame: None, '/robot2')
+    feed = MessageView(diary, lambda frame: None, '/robot2')
     pair = plain(key='graph update: step time', value='median 12.5 ms, p95 20.0 ms, max 31.0 ms')
     rate = plain(key='scan: rate', value='5.0 Hz')
     names = (
@@ -318,7 +318,7 @@ def test_step_times_are_those_of_the_robot_that_is_shown():
 
 def test_local_area_is_where_its_features_are_stored():
     diary = Diary()
-    feed = Feed(diary, lambda frame: None)
+    feed = MessageView(diary, lambda frame: None)
     nodes = [
         plain(id=i, kind=0, position=plain(x=1.0 * i, y=0.0), clearance_m=0.5) for i in (1, 2, 3)
     ]

@@ -23,7 +23,7 @@ from thinmap_ros.core.exploration.strategy import (
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import axis_setup
 from thinmap_ros.core.jit import kernel
-from thinmap_ros.core.planning.graph_search import costs_from
+from thinmap_ros.core.planning.graph_search import path_lengths_to_nodes
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
@@ -50,7 +50,7 @@ class _Progress:
     waited_ns: int = 0
 
 
-class _Patience:
+class _ProgressTimeout:
     """Gives up what comes no nearer while it is driven to, also if others came between."""
 
     def __init__(self, timeout_s: float) -> None:
@@ -188,7 +188,7 @@ class ExploreLite(FrontierExplorer):
 
     def __init__(self) -> None:
         super().__init__()
-        self._patience = _Patience(self.progress_timeout_s)
+        self._patience = _ProgressTimeout(self.progress_timeout_s)
 
     def step(
         self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
@@ -269,8 +269,10 @@ class VisitAllEndNodes(NearestFrontier):
 
     def __init__(self) -> None:
         super().__init__()
-        self.map = FrontierMap(goes_back=True)  # the graph has led it where the others do not go
-        self._patience = _Patience(self.progress_timeout_s)
+        self.map = FrontierMap(
+            allow_backtracking=True
+        )  # the graph has led it where the others do not go
+        self._patience = _ProgressTimeout(self.progress_timeout_s)
         self._visited: list[tuple[float, float]] = []
         self._end_node: Array | None = None  # the goal (3,) there
 
@@ -314,7 +316,7 @@ class VisitAllEndNodes(NearestFrontier):
         left = {node.id: node for node in ends if not self._was_visited(node.x, node.y)}
         if not left:
             return None
-        costs = costs_from(topology, float(T_map_base[0]), float(T_map_base[1]))
+        costs = path_lengths_to_nodes(topology, float(T_map_base[0]), float(T_map_base[1]))
         followed = {i: node for i, node in left.items() if self._is_followed(node.x, node.y)}
         best = min((followed or left).values(), key=lambda node: costs.get(node.id, math.inf))
         way_m = costs.get(best.id, math.inf)

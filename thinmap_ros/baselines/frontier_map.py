@@ -13,9 +13,13 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.field_of_view import box_of_scan, directions_of_view
 from thinmap_ros.core.exploration.frontiers import OpenBorders
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.grid_search import coarse, ways_from
-from thinmap_ros.core.planning.recent_path import Trail
-from thinmap_ros.core.planning.traversability import let_out, reached_from, standing_places
+from thinmap_ros.core.planning.grid_search import coarse, path_lengths_from
+from thinmap_ros.core.planning.recent_path import RecentPath
+from thinmap_ros.core.planning.traversability import (
+    escape_cells,
+    reachable_cells,
+    traversable_cells,
+)
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
@@ -54,10 +58,10 @@ class FrontierMap:
     Those that were looked at closely and stayed do not count any more.
     """
 
-    def __init__(self, goes_back: bool = False) -> None:
+    def __init__(self, allow_backtracking: bool = False) -> None:
         """goes_back: it can go back where it came, also where the map looks too narrow."""
         self.borders = OpenBorders(SHORTEST_M)
-        self._trail = Trail() if goes_back else None
+        self._trail = RecentPath() if allow_backtracking else None
         self.patch: GridPatch | None = None
         self._ways: Mask = np.zeros((0, 0), dtype=np.bool_)
 
@@ -80,7 +84,7 @@ class FrontierMap:
         frame = self.borders.frame
         cells, numbers, _ = self.borders.stretches()
         xy = (float(T_map_base[0]), float(T_map_base[1]))
-        standing = standing_places(self.borders.free, RADIUS_M, frame.resolution)
+        standing = traversable_cells(self.borders.free, RADIUS_M, frame.resolution)
         reach = self._reach_from(standing, xy)
         if len(cells) == 0:
             return []
@@ -106,17 +110,19 @@ class FrontierMap:
         if not (0 <= row < free.shape[0] and 0 <= col < free.shape[1]):
             return np.zeros_like(standing)
         if self._trail is None:
-            ways = let_out(standing, free, frame, xy, _ESCAPE_M)
-            return reached_from(ways, (row, col)) & standing
+            ways = escape_cells(standing, free, frame, xy, _ESCAPE_M)
+            return reachable_cells(ways, (row, col)) & standing
         trail = self._trail.cells(frame, free.shape)
-        return reached_from(let_out(standing, free, frame, xy, _ESCAPE_M, trail), (row, col))
+        return reachable_cells(
+            escape_cells(standing, free, frame, xy, _ESCAPE_M, trail), (row, col)
+        )
 
     def ways(self, xy: Array, places: Array) -> Array:
         """Length, m, of the ways from a point (2,) to places (N, 2) that `find` has found, (N,)."""
         frame = self.borders.frame
         cells = frame.cells_of(np.vstack([xy[None], places])) // _COARSE
         start = (int(cells[0, 0]), int(cells[0, 1]))
-        return ways_from(self._ways, start, cells[1:]) * frame.resolution * _COARSE
+        return path_lengths_from(self._ways, start, cells[1:]) * frame.resolution * _COARSE
 
     def _middle(self, cells: Cells) -> Array:
         cell = cells[np.square(cells - cells.mean(axis=0)).sum(axis=1).argmin()]

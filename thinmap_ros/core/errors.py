@@ -26,7 +26,7 @@ def shown(value: object) -> str:
     return one_line(_QUOTE.repr(value))
 
 
-def reason_of(error: BaseException) -> str:
+def one_line_reason(error: BaseException) -> str:
     """What another library's error says, on one line of at most 200 characters; else its type."""
     # A KeyError holds the key that was missing: one of a million digits cannot even be converted.
     said = shown(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)

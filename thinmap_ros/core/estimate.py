@@ -38,7 +38,7 @@ class Estimate:
     observed: int = 0
     matched: int = 0
     n_features: int = 0
-    n_local: int = 0
-    match_quality: float = 0.0
+    n_local_features: int = 0
+    inlier_ratio: float = 0.0
     lost: bool = False
     correction: Correction | None = None

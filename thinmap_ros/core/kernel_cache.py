@@ -21,7 +21,7 @@ from typing import Any
 import numba
 from numba.core import caching
 
-from thinmap_ros.core.errors import InputError, reason_of
+from thinmap_ros.core.errors import InputError, one_line_reason
 from thinmap_ros.core.private_folder import private_folder, temporary_folder
 
 PACKAGE = Path(__file__).resolve().parents[1]
@@ -46,7 +46,7 @@ def folder() -> Path | None:
         try:
             return make()
         except (OSError, InputError, RuntimeError) as error:
-            refusals.append(reason_of(error))
+            refusals.append(one_line_reason(error))
     warnings.warn(
         'kernels are compiled at each start, as there is nowhere to keep them: set '
         f'NUMBA_CACHE_DIR to a folder that can be written to ({"; ".join(refusals)})',

@@ -14,7 +14,7 @@ from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.snapshot import FAR_M, LARGEST_COUNT, Field
+from thinmap_ros.core.snapshot import MAX_COORDINATE_M, MAX_COUNT, Field
 
 
 class OdometryBuffer:
@@ -40,11 +40,11 @@ class OdometryBuffer:
 
         Raises InputError where the pose is not finite, or nowhere on earth.
         """
-        if not se2.is_on_earth(T_odom_base):
+        if not se2.is_bounded_pose(T_odom_base):
             pose = ', '.join(f'{value:g}' for value in T_odom_base.tolist())
             raise InputError(
                 f'odometry at {stamp_ns} ns: pose {pose}: expected finite numbers, at most '
-                f'{se2.FARTHEST_M:g} m'
+                f'{se2.MAX_COORDINATE_M:g} m'
             )
         if self._stamps and stamp_ns < self._stamps[-1] - self._span_ns:
             self._stamps = []
@@ -86,14 +86,14 @@ _STEP_BACK_NS = 1_000_000_000
 _LONGEST_GAP_NS = 120_000_000_000
 _JUMP_M = 0.5  # where odometry says more than this and that speed, it was set anew
 FIELDS = {
-    'stamp_ns': Field(np.int64, (), 0, LARGEST_COUNT),
-    'T_map_odom': Field(np.float64, (3,), -FAR_M, FAR_M),
-    'T_odom_base': Field(np.float64, (3,), -FAR_M, FAR_M),
+    'stamp_ns': Field(np.int64, (), 0, MAX_COUNT),
+    'T_map_odom': Field(np.float64, (3,), -MAX_COORDINATE_M, MAX_COORDINATE_M),
+    'T_odom_base': Field(np.float64, (3,), -MAX_COORDINATE_M, MAX_COORDINATE_M),
 }
 
 
 @dataclass(frozen=True, eq=False)
-class LastPose:
+class OdometryAnchor:
     """Where odometry lay in the map, T_map_odom (3,), when it said T_odom_base (3,) at stamp_ns."""
 
     stamp_ns: int
@@ -109,12 +109,12 @@ class LastPose:
         }
 
     @staticmethod
-    def from_state(state: Mapping[str, NDArray[Any]]) -> 'LastPose':
+    def from_state(state: Mapping[str, NDArray[Any]]) -> 'OdometryAnchor':
         """Return the pose of a `state`. Raises InputError where it is none."""
         own = snapshot.check(state, FIELDS, 'pose')
-        return LastPose(int(own['stamp_ns']), own['T_map_odom'], own['T_odom_base'])
+        return OdometryAnchor(int(own['stamp_ns']), own['T_map_odom'], own['T_odom_base'])
 
-    def leads_to(self, stamp_ns: int, T_odom_base: Array) -> bool:
+    def is_continuous_with(self, stamp_ns: int, T_odom_base: Array) -> bool:
         """Whether a later odometry pose can be of the same drive.
 
         It is not before, not long after, not too far away.
@@ -125,7 +125,7 @@ class LastPose:
 
 
 @dataclass(frozen=True, eq=False)
-class Increment:
+class OdometryIncrement:
     """What odometry tells of the motion since the scan before.
 
     T_before_base (3,), in so many seconds. bound_m: 0, or where odometry was set anew and tells
@@ -134,7 +134,7 @@ class Increment:
 
     T_before_base: Array
     seconds: float
-    bound_m: float
+    discontinuity_m: float
 
 
 class OdometryIncrements:
@@ -149,26 +149,26 @@ class OdometryIncrements:
         self._is_begun = False
         self.stamp_ns: int | None = None  # of the last scan
 
-    def next(self, stamp_ns: int, T_odom_base: Array) -> Increment:
+    def next(self, stamp_ns: int, T_odom_base: Array) -> OdometryIncrement:
         """The motion up to an odometry pose (3,) at a stamp; none up to the first."""
         seconds = 0.0 if self.stamp_ns is None else (stamp_ns - self.stamp_ns) / 1e9
         self.stamp_ns = stamp_ns
         if not se2.is_finite(T_odom_base):
             self.refused += 1
-            return Increment(np.zeros(3), seconds, 0.0)
+            return OdometryIncrement(np.zeros(3), seconds, 0.0)
         before = self.T_odom_base if self._is_begun else T_odom_base
         self._is_begun = True
         self.T_odom_base = np.array(T_odom_base, dtype=np.float64)
         # Text logs, bags and messages differ by less, and are to lead to the same.
         moved = np.round(se2.between(before, self.T_odom_base), 9)
-        bound_m = _JUMP_M + _FASTEST_M_S * max(seconds, 1.0)
-        if math.hypot(moved[0], moved[1]) <= bound_m:
-            return Increment(moved, seconds, 0.0)
+        discontinuity_m = _JUMP_M + _FASTEST_M_S * max(seconds, 1.0)
+        if math.hypot(moved[0], moved[1]) <= discontinuity_m:
+            return OdometryIncrement(moved, seconds, 0.0)
         self.refused += 1
-        return Increment(np.zeros(3), seconds, bound_m)
+        return OdometryIncrement(np.zeros(3), seconds, discontinuity_m)
 
 
-class ScanPairing:
+class ScanOdometrySynchronizer:
     """Brings each scan together with the odometry pose at its stamp, in the order of the scans.
 
     A scan waits until odometry as new as itself has come. Used live and in replay alike, so that

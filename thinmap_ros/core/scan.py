@@ -11,9 +11,9 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
 
 # Of a laser with fewer beams than this that say anything, nobody can tell what is in front of it.
-SEEING_SHARE = 0.1
+MIN_VALID_BEAM_RATIO = 0.1
 # No laser is mounted farther from the middle of its robot.
-FARTHEST_MOUNT_M = 100.0
+MAX_MOUNT_OFFSET_M = 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,11 +77,13 @@ class Scan:
         T_base_laser = (
             np.zeros(3) if T_base_laser is None else np.asarray(T_base_laser, dtype=np.float64)
         )
-        if not (se2.is_finite(T_base_laser) and np.abs(T_base_laser[:2]).max() <= FARTHEST_MOUNT_M):
+        if not (
+            se2.is_finite(T_base_laser) and np.abs(T_base_laser[:2]).max() <= MAX_MOUNT_OFFSET_M
+        ):
             mount = ', '.join(f'{value:g}' for value in T_base_laser.tolist())
             raise InputError(
                 f'scan at {stamp_ns} ns: laser mounted at {mount}: '
-                f'expected finite numbers, at most {FARTHEST_MOUNT_M:g} m'
+                f'expected finite numbers, at most {MAX_MOUNT_OFFSET_M:g} m'
             )
         return Scan(int(stamp_ns), ranges, first, step, low, high, T_base_laser, zero_is_no_return)
 
@@ -106,7 +108,7 @@ class Scan:
         return self.ranges_m >= self.range_max_m
 
     @cached_property
-    def too_near(self) -> NDArray[np.bool_]:
+    def below_range_min(self) -> NDArray[np.bool_]:
         """Beams that met something nearer than can be measured: -inf (REP 117), (N,)."""
         return np.isneginf(self.ranges_m)
 
@@ -117,13 +119,13 @@ class Scan:
         With zero_is_no_return a range of 0 is valid: the laser works, and nothing is near. It is
         not `no_return` all the same: a dark thing gives 0 as well, so no cell of a map is freed.
         """
-        valid = self.hit | self.no_return | self.too_near
+        valid = self.hit | self.no_return | self.below_range_min
         return valid | (self.ranges_m == 0.0) if self.zero_is_no_return else valid
 
     @cached_property
     def is_blind(self) -> bool:
         """Whether so few beams are valid that the laser may as well be covered or broken."""
-        return int(np.count_nonzero(self.valid)) < SEEING_SHARE * self.ranges_m.size
+        return int(np.count_nonzero(self.valid)) < MIN_VALID_BEAM_RATIO * self.ranges_m.size
 
     def points_laser(self) -> Array:
         """End points of the beams that met something, laser frame, (M, 2)."""

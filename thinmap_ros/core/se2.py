@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 # No robot gets farther from where its map began. Beyond 1e15 m a coordinate cannot even tell cells
 # apart, and what is computed from it lies outside of every array.
-FARTHEST_M = 1e6
+MAX_COORDINATE_M = 1e6
 
 
 @overload
@@ -73,9 +73,9 @@ def interpolate(T_a: Array, T_b: Array, share: float) -> Array:
     return pose(x, y, T_a[2] + share * wrap(float(T_b[2] - T_a[2])))
 
 
-def is_on_earth(T: Array) -> bool:
+def is_bounded_pose(T: Array) -> bool:
     """Whether a pose (3,) is finite and no farther than FARTHEST_M from the origin of its frame."""
-    return is_finite(T) and abs(T[0]) <= FARTHEST_M and abs(T[1]) <= FARTHEST_M
+    return is_finite(T) and abs(T[0]) <= MAX_COORDINATE_M and abs(T[1]) <= MAX_COORDINATE_M
 
 
 def is_finite(T: Array) -> bool:

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from thinmap_ros.core.errors import InputError, shown
-from thinmap_ros.core.se2 import FARTHEST_M
+from thinmap_ros.core.se2 import MAX_COORDINATE_M
 
 State = Mapping[str, NDArray[Any]]
-FAR_M = FARTHEST_M
-FAR_CELLS = 1_000_000_000  # the same in the smallest cells
-LARGEST_ID = 2**31 - 1
-LARGEST_COUNT = 2**62
+MAX_COORDINATE_M = MAX_COORDINATE_M
+MAX_CELL_INDEX = 1_000_000_000  # the same in the smallest cells
+MAX_ID = 2**31 - 1
+MAX_COUNT = 2**62
 _SIZE = re.compile(r'(\d*)([a-z]+)')
 
 
@@ -43,7 +43,7 @@ class Field:
 Fields = Mapping[str, Field]
 
 
-STAMPED: Fields = {'latest_ns': Field(np.int64, (), 0, LARGEST_COUNT)}
+STAMPED: Fields = {'latest_ns': Field(np.int64, (), 0, MAX_COUNT)}
 
 
 def check(state: State, fields: Fields, what: str) -> dict[str, NDArray[Any]]:

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 
-FARTHEST_M = se2.FARTHEST_M
-LARGEST_ANGLE_RAD = 4.0 * np.pi
-MOST_BEAMS = 200_000
-LONGEST_LIST = 200
+MAX_COORDINATE_M = se2.MAX_COORDINATE_M
+MAX_ANGLE_RAD = 4.0 * np.pi
+MAX_BEAMS = 200_000
+MAX_LIST_LENGTH = 200
 
 
-def require_bounded(what: str, values: Iterable[float], limit: float = FARTHEST_M) -> None:
+def require_bounded(what: str, values: Iterable[float], limit: float = MAX_COORDINATE_M) -> None:
     """Raise InputError, naming what, unless all values are finite and at most `limit` in size."""
     for value in values:
         if not abs(value) <= limit:
@@ -37,7 +37,7 @@ def listed(names: Sequence[str]) -> str:
     """
     told = [abbreviated(name) for name in names]
     lengths = accumulate(len(name) + 2 for name in told)
-    count = max(1, sum(length <= LONGEST_LIST for length in lengths))
+    count = max(1, sum(length <= MAX_LIST_LENGTH for length in lengths))
     more = f' and {len(told) - count} more' if len(told) > count else ''
     return ', '.join(told[:count]) + more or 'nothing'
 

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from thinmap_ros.closed_loop import Ending
+from thinmap_ros.closed_loop import ExplorationOutcome
 from thinmap_ros.core.exploration.position_probability import NEAR_M
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID
 from thinmap_ros.core.se2 import Array
 
 MILESTONES = (0.90, 0.95, 0.98, 0.99)
 SAME_PLACE_M = 1.0
-FEWEST_SIGHTINGS = 5
+MIN_OBSERVATIONS = 5
 
 
 @dataclass(eq=False)
@@ -49,12 +49,12 @@ class EndNodeCensus:
     @property
     def seen(self) -> int:
         """Places where an end node lasted."""
-        return sum(place.sightings >= FEWEST_SIGHTINGS for place in self._places)
+        return sum(place.sightings >= MIN_OBSERVATIONS for place in self._places)
 
     @property
     def visited(self) -> int:
         """Those of them to which the robot came near."""
-        return sum(place.visited and place.sightings >= FEWEST_SIGHTINGS for place in self._places)
+        return sum(place.visited and place.sightings >= MIN_OBSERVATIONS for place in self._places)
 
     def take(self, end_nodes: Iterable[tuple[int, float, float]], T_map_base: Array) -> None:
         """Count the end nodes (id, x, y in m) known at a pose (3,).
@@ -104,7 +104,7 @@ class TargetLog:
 
 
 def exploration_report(
-    ending: Ending,
+    ending: ExplorationOutcome,
     times_s: Array,
     true_poses: Array,
     estimated_poses: Array,

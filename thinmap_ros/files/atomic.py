@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from glob import escape
 from pathlib import Path
 
-from thinmap_ros.core.errors import InputError, reason_of
+from thinmap_ros.core.errors import InputError, one_line_reason
 
 _MOST_TEXT_BYTES = 1 << 30
 _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -31,7 +31,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
     except OSError as error:
         if error.filename is not None and error.filename != str(aside):
             raise
-        raise OSError(error.errno, error.strerror or reason_of(error), str(path)) from error
+        raise OSError(error.errno, error.strerror or one_line_reason(error), str(path)) from error
     finally:
         aside.unlink(missing_ok=True)
 

@@ -21,7 +21,7 @@ import numpy as np
 import yaml
 
 from thinmap_ros.core import validation
-from thinmap_ros.core.errors import InputError, reason_of, shown
+from thinmap_ros.core.errors import InputError, one_line_reason, shown
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.files.atomic import read_text, write_text
@@ -220,7 +220,7 @@ def read_geojson(path: Path) -> TopologicalMap:
     try:
         features = json.loads(text, parse_int=_whole)['features']
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(f'{path}: {reason_of(error)}: {expected}') from error
+        raise InputError(f'{path}: {one_line_reason(error)}: {expected}') from error
     if not isinstance(features, list):
         raise InputError(f'{path}: features: {shown(features)}: {expected}')
     topology = TopologicalMap()
@@ -232,7 +232,7 @@ def read_geojson(path: Path) -> TopologicalMap:
             else:
                 lines.append((i, feature))
         except _BAD_FEATURE as error:
-            reason = reason_of(error)
+            reason = one_line_reason(error)
             expected = 'expected a node (point with id, kind)'
             raise InputError(f'{path}: features[{i}]: {reason}: {expected}') from error
     for i, feature in lines:
@@ -240,7 +240,7 @@ def read_geojson(path: Path) -> TopologicalMap:
             if feature['properties']['id'] == feature['properties']['metadata']['edge']:
                 topology.put_edge(_edge(feature))
         except _BAD_FEATURE as error:
-            reason = reason_of(error)
+            reason = one_line_reason(error)
             expected = 'expected an edge (line with ids, length)'
             raise InputError(f'{path}: features[{i}]: {reason}: {expected}') from error
     return topology
@@ -289,7 +289,7 @@ def _rounded(points: Array) -> list[list[float]]:
 
 def _number(value: Any) -> float:
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not is_number or not abs(value) <= validation.FARTHEST_M:
+    if not is_number or not abs(value) <= validation.MAX_COORDINATE_M:
         raise ValueError(f'{shown(value)} is no finite number of m')
     return float(value)
 

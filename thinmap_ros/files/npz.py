@@ -17,9 +17,9 @@ from typing import IO, Any
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from thinmap_ros.core.errors import InputError, ThinmapError, reason_of, shown
+from thinmap_ros.core.errors import InputError, ThinmapError, one_line_reason, shown
 
-MOST_BYTES = 512 << 20
+MAX_BYTES = 512 << 20
 _MOST_ARRAYS = 64
 _ENDING = '.npy'
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
@@ -56,7 +56,7 @@ def read_arrays(stream: IO[bytes]) -> dict[str, NDArray[Any]]:
     except (
         Exception
     ) as error:  # zlib and NumPy raise whatever a broken file makes them stumble over
-        raise InputError(reason_of(error)) from error
+        raise InputError(one_line_reason(error)) from error
 
 
 def _check_sizes(members: list[zipfile.ZipInfo]) -> None:
@@ -65,8 +65,8 @@ def _check_sizes(members: list[zipfile.ZipInfo]) -> None:
         expected = f'expected at most {_MOST_ARRAYS}, each once'
         raise InputError(f'{len(members)} arrays of {len(names)} names: {expected}')
     size = sum(member.file_size for member in members)
-    if size > MOST_BYTES:
-        raise InputError(f'{size} bytes unpacked: expected at most {MOST_BYTES}')
+    if size > MAX_BYTES:
+        raise InputError(f'{size} bytes unpacked: expected at most {MAX_BYTES}')
     for member in members:
         if not member.filename.endswith(_ENDING) or member.compress_type not in _METHODS:
             raise InputError(f'{shown(member.filename)}: expected an array, stored or deflated')

@@ -13,10 +13,10 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from thinmap_ros.core.errors import InputError, reason_of, shown
+from thinmap_ros.core.errors import InputError, one_line_reason, shown
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, UNKNOWN, GridPatch
-from thinmap_ros.core.se2 import FARTHEST_M
+from thinmap_ros.core.se2 import MAX_COORDINATE_M
 from thinmap_ros.files.atomic import atomic_write, write_text
 from thinmap_ros.files.yaml import read_mapping
 
@@ -116,7 +116,7 @@ def _is_negated(path: Path, content: dict[str, Any]) -> bool:
 def _origin(path: Path, content: dict[str, Any]) -> list[float]:
     value = content.get('origin')
     numbers = value if isinstance(value, list) else []
-    fit = all(isinstance(v, int | float) and abs(v) <= FARTHEST_M for v in numbers)
+    fit = all(isinstance(v, int | float) and abs(v) <= MAX_COORDINATE_M for v in numbers)
     if len(numbers) != 3 or not fit:
         raise InputError(f'{path}: origin: {shown(value)}: expected [x, y, yaw] in m, m, rad')
     if numbers[2] != 0:
@@ -175,7 +175,7 @@ def _cells(path: Path, image: Path, shades: _Shades) -> NDArray[np.int8]:
     except (
         Exception
     ) as error:  # Pillow's readers raise whatever a broken image makes them stumble over
-        reason = reason_of(error)
+        reason = one_line_reason(error)
         raise InputError(f'{image}: {reason}: expected an image that {path} names') from error
 
 

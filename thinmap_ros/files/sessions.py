@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
-from thinmap_ros.core.errors import InputError, reason_of, shown
+from thinmap_ros.core.errors import InputError, one_line_reason, shown
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.slam.localizer import LocalizerConfig
@@ -97,7 +97,7 @@ class SessionPart(Generic[Value, PartConfig]):
                 state = read_snapshot(stream, self.name)
             return self.restore(state, config)
         except OSError as error:
-            raise InputError(f'{file}: {error.strerror or reason_of(error)}') from error
+            raise InputError(f'{file}: {error.strerror or one_line_reason(error)}') from error
         except InputError as error:
             raise InputError(f'{file}: {error}') from error
 

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError, shown
-from thinmap_ros.core.grid.frame import FINEST_M, GridFrame
+from thinmap_ros.core.grid.frame import MIN_RESOLUTION_M, GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.se2 import FARTHEST_M, Array, pose
+from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array, pose
 from thinmap_ros.files.occupancy_maps import read_map
 from thinmap_ros.files.yaml import read_mapping
 
@@ -64,8 +64,8 @@ def _numbers(path: Path, content: dict[str, Any], key: str, count: int) -> list[
 
 def _resolution(path: Path, content: dict[str, Any]) -> float:
     (resolution,) = _numbers(path, content, 'resolution', 1)
-    if not FINEST_M <= resolution <= 1.0:
-        raise InputError(f'{path}: resolution: {resolution}: expected {FINEST_M} to 1 m')
+    if not MIN_RESOLUTION_M <= resolution <= 1.0:
+        raise InputError(f'{path}: resolution: {resolution}: expected {MIN_RESOLUTION_M} to 1 m')
     return resolution
 
 
@@ -132,8 +132,8 @@ def _lattice(path: Path, points: Array, resolution: float) -> tuple[GridFrame, t
     Its lines go through the origin, as a map's do.
     """
     farthest = float(np.abs(points).max())
-    if farthest > FARTHEST_M:
-        expected = f'expected at most {FARTHEST_M:g} m; is a point far off?'
+    if farthest > MAX_COORDINATE_M:
+        expected = f'expected at most {MAX_COORDINATE_M:g} m; is a point far off?'
         raise InputError(f'{path}: point at {farthest:g} m: {expected}')
     low = np.floor((points.min(axis=0) - _MARGIN_M) / resolution)
     cols, rows = np.ceil((points.max(axis=0) + _MARGIN_M) / resolution) - low

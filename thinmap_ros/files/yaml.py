@@ -11,10 +11,10 @@ from typing import Any
 
 import yaml
 
-from thinmap_ros.core.errors import InputError, reason_of, shown
+from thinmap_ros.core.errors import InputError, one_line_reason, shown
 from thinmap_ros.files.atomic import read_text
 
-MOST_BYTES = 4 << 20
+MAX_BYTES = 4 << 20
 _MOST_NODES = 100_000
 _MOST_LEVELS = 20
 _LONGEST_NUMBER = 100
@@ -28,26 +28,26 @@ def load_yaml(path: Path) -> object:
     Raises InputError naming the file where it is no YAML, or beyond the limits.
     """
     try:
-        return parse_yaml(read_text(path, MOST_BYTES))
+        return parse_yaml(read_text(path, MAX_BYTES))
     except _YamlError as error:
         raise InputError(f'{path}: {error}') from error
 
 
 def parse_yaml(text: str) -> object:
     """Parse a YAML text, as `load_yaml`. Raises InputError as it does."""
-    if len(text) > MOST_BYTES:
-        raise _YamlError(f'{len(text)} characters: expected at most {MOST_BYTES}')
+    if len(text) > MAX_BYTES:
+        raise _YamlError(f'{len(text)} characters: expected at most {MAX_BYTES}')
     try:
         return yaml.load(text, Loader=_BoundedLoader)
     except (yaml.YAMLError, ValueError, OverflowError) as error:
         # ValueError, OverflowError: a date such as 2001-99-99, or 1e999 minutes.
-        raise _YamlError(reason_of(error)) from error
+        raise _YamlError(one_line_reason(error)) from error
 
 
 def read_mapping(path: Path, expected: str) -> dict[str, Any]:
     """Read keys and values. Raises InputError naming the file and what it expects."""
     try:
-        content = parse_yaml(read_text(path, MOST_BYTES))
+        content = parse_yaml(read_text(path, MAX_BYTES))
     except _YamlError as error:
         raise InputError(f'{path}: {error}: expected {expected}') from error
     if not isinstance(content, dict):

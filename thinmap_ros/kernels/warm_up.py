@@ -13,7 +13,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
 from thinmap_ros.core.grid.raytrace import cast_rays
-from thinmap_ros.core.odometry import LastPose
+from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
@@ -40,7 +40,7 @@ def localizer() -> None:
     # A scan that fits nowhere is searched for; a map that was saved or drawn is taken up.
     rehearsed.step(_odd_scan(), T_map_base)
     Localizer.from_state(rehearsed.state())
-    Localizer.from_occupancy_map(_room(), LastPose(0, T_map_base, T_map_base), T_map_base)
+    Localizer.from_occupancy_map(_room(), OdometryAnchor(0, T_map_base, T_map_base), T_map_base)
     # As soon as a place is seen again, covariances along the graph are asked for.
     covariances_from(0, np.zeros((2, 3)), [Edge(0, 1, np.zeros(3), np.eye(3), False)], np.ones(2))
 

@@ -14,10 +14,17 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.logs import decode
-from thinmap_ros.logs.bag_directory import bag_files, without_compression
+from thinmap_ros.logs.bag_directory import bag_files, decompressed_files
 from thinmap_ros.logs.laser_mount import Mount, StaticTransforms, rotation_matrix
-from thinmap_ros.logs.log import Event, OdometryEvent, ScanEvent, Skipped, is_mcap, refuse_foreign
-from thinmap_ros.logs.mcap_records import LARGEST_CHUNK, DamagedError, unpacked
+from thinmap_ros.logs.log import (
+    Event,
+    OdometryEvent,
+    ScanEvent,
+    SkippedRecords,
+    is_mcap,
+    refuse_foreign,
+)
+from thinmap_ros.logs.mcap_records import MAX_CHUNK_BYTES, DamagedError, decompress
 from thinmap_ros.logs.storage import RawMessage, Storage, storage_of
 
 _SCAN = 'sensor_msgs/msg/LaserScan'
@@ -49,7 +56,7 @@ class Bag:
         self._files = bag_files(path)
         self._unreadable = 0
         try:
-            for file, unpacked_into in without_compression(self._files.files):
+            for file, unpacked_into in decompressed_files(self._files.files):
                 self._unpacked.append(unpacked_into)
                 self._add(storage_of(file))
         except OSError as error:
@@ -59,7 +66,7 @@ class Bag:
             raise InputError(f'{path}: {self.damage}: no whole message: {expected}')
 
     @property
-    def cut_off(self) -> bool:
+    def is_truncated(self) -> bool:
         """Whether the bag is read only as far as it is whole, which may show late."""
         return bool(self.damage)
 
@@ -74,7 +81,7 @@ class Bag:
         return '; '.join(words[:_MOST_TOLD])
 
     @property
-    def advice(self) -> str:
+    def repair_hint(self) -> str:
         """What is not whole and what to do about it, in one line; empty where all is whole."""
         if not self.damage:
             return ''
@@ -91,7 +98,7 @@ class Bag:
                     yield message
                     continue
                 try:
-                    data = unpacked('zstd', message.data, LARGEST_CHUNK)
+                    data = decompress('zstd', message.data, MAX_CHUNK_BYTES)
                 except DamagedError:
                     self._unreadable += 1
                     continue
@@ -136,7 +143,7 @@ class BagLog:
     odometry_topic: str = ''
     T_base_laser: Array | None = None
     base_frame: str = 'base_link'
-    skipped: Skipped = field(default_factory=Skipped)
+    skipped: SkippedRecords = field(default_factory=SkippedRecords)
 
     def events(self) -> Iterator[Event]:
         """Odometry and scans in the order of the log.
@@ -145,7 +152,7 @@ class BagLog:
         or nothing says where the laser sits. A message that cannot be used is skipped and counted.
         """
         bag = Bag(self.path)
-        self.skipped = Skipped()
+        self.skipped = SkippedRecords()
         try:
             yield from self._events(bag)
         except InputError as error:
@@ -171,8 +178,8 @@ class BagLog:
             else:
                 yield value
             used[message.topic] += 1
-        if bag.advice:
-            self.skipped.add_foremost(bag.advice)
+        if bag.repair_hint:
+            self.skipped.add_first(bag.repair_hint)
         for topic, count in used.items():
             if count == 0:
                 first = f': {self.skipped.first}' if self.skipped.first else ''
@@ -244,9 +251,9 @@ def _odometry(message: Any) -> OdometryEvent:
 def _scan(message: Any) -> Scan:
     if len(message.ranges) == 0:
         raise InputError('a scan without ranges')
-    if len(message.ranges) > validation.MOST_BEAMS:
+    if len(message.ranges) > validation.MAX_BEAMS:
         raise InputError(
-            f'a scan of {len(message.ranges)} ranges: expected at most {validation.MOST_BEAMS}'
+            f'a scan of {len(message.ranges)} ranges: expected at most {validation.MAX_BEAMS}'
         )
     with np.errstate(invalid='ignore'):  # a NaN stays one, however it is made
         return Scan.create(

@@ -8,11 +8,11 @@ from typing import Any
 
 import zstandard
 
-from thinmap_ros.core.errors import InputError, reason_of
+from thinmap_ros.core.errors import InputError, one_line_reason
 from thinmap_ros.files.atomic import read_text
-from thinmap_ros.files.yaml import MOST_BYTES, parse_yaml
+from thinmap_ros.files.yaml import MAX_BYTES, parse_yaml
 
-LARGEST_FILE = 32 * 2**30
+MAX_FILE_BYTES = 32 * 2**30
 """Bytes that a file of a bag compressed file by file may expand to."""
 _PIECE = 2**20
 
@@ -43,7 +43,7 @@ def bag_files(path: Path) -> BagFiles:
     try:
         return _listed(path, _information(metadata))
     except (InputError, KeyError, TypeError, ValueError, AttributeError) as error:
-        reason = f'{metadata}: {reason_of(error).removeprefix(f"{metadata}: ")}'
+        reason = f'{metadata}: {one_line_reason(error).removeprefix(f"{metadata}: ")}'
     if found:
         return BagFiles(found, without_metadata=reason)
     if any(path.glob('*.db3')):
@@ -66,7 +66,7 @@ def _number(file: Path) -> tuple[int, str]:
 
 def _information(metadata: Path) -> Any:
     """Raises InputError, KeyError or TypeError where there is none, or beyond YAML's limits."""
-    content: Any = parse_yaml(read_text(metadata, MOST_BYTES))
+    content: Any = parse_yaml(read_text(metadata, MAX_BYTES))
     return content['rosbag2_bagfile_information']
 
 
@@ -82,7 +82,7 @@ def _listed(folder: Path, information: Any) -> BagFiles:
     return BagFiles(files, compressed_messages=mode == 'message')
 
 
-def without_compression(
+def decompressed_files(
     files: list[Path],
 ) -> Iterator[tuple[Path, TemporaryDirectory[str] | None]]:
     """Each file as it is, or, where its name ends in .zstd, unpacked into a temporary folder.
@@ -104,8 +104,8 @@ def _unpack(file: Path, target: Path) -> None:
         with file.open('rb') as packed, target.open('wb') as out:
             reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
             while piece := reader.read(_PIECE):
-                if out.tell() + len(piece) > LARGEST_FILE:
-                    raise InputError(f'{file}: more than {LARGEST_FILE} bytes unpacked')
+                if out.tell() + len(piece) > MAX_FILE_BYTES:
+                    raise InputError(f'{file}: more than {MAX_FILE_BYTES} bytes unpacked')
                 out.write(piece)
     except zstandard.ZstdError as error:
         raise InputError(f'{file}: no zstd file: {str(error)[:120]}') from error

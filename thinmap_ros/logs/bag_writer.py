@@ -107,7 +107,7 @@ class BagWriter:
 
 
 @contextmanager
-def written_as_bag(path: Path) -> Iterator[Path]:
+def temporary_bag(path: Path) -> Iterator[Path]:
     """Give an empty folder, whose content becomes the bag `path` when the block ends well.
 
     Its content: NAME.mcap and metadata.yaml.

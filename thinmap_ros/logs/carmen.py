@@ -20,11 +20,18 @@ from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError, shown
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.logs.log import Event, OdometryEvent, ScanEvent, Skipped, is_mcap, refuse_foreign
+from thinmap_ros.logs.log import (
+    Event,
+    OdometryEvent,
+    ScanEvent,
+    SkippedRecords,
+    is_mcap,
+    refuse_foreign,
+)
 
 _SECOND_NS = 1_000_000_000
 _LATEST_S = 2**31
-LONGEST_LINE = 4 * 2**20
+MAX_LINE_LENGTH = 4 * 2**20
 """Bytes of a line, unpacked. A scan of 1,000 beams takes 7,000."""
 
 
@@ -57,7 +64,7 @@ class CarmenLog:
 
     path: Path
     options: LaserOptions = field(default_factory=LaserOptions)
-    skipped: Skipped = field(default_factory=Skipped)
+    skipped: SkippedRecords = field(default_factory=SkippedRecords)
     _T_base_laser: Array | None = field(default=None, init=False)
 
     def events(self) -> Iterator[Event]:
@@ -66,7 +73,7 @@ class CarmenLog:
         That odometry has the scan's stamp. Raises InputError where there is no such file, it is no
         text, or it has no scan.
         """
-        self.skipped = Skipped()
+        self.skipped = SkippedRecords()
         self._T_base_laser = None
         scans = 0
         for number, line in self._lines():
@@ -93,11 +100,11 @@ class CarmenLog:
         try:
             with _open(self.path) as stream:
                 # One byte more than the limit: of a longer line no more is ever read.
-                lines = iter(lambda: stream.readline(LONGEST_LINE + 1), b'')
+                lines = iter(lambda: stream.readline(MAX_LINE_LENGTH + 1), b'')
                 for number, line in enumerate(lines, start=1):
-                    if len(line) > LONGEST_LINE:
+                    if len(line) > MAX_LINE_LENGTH:
                         raise InputError(
-                            f'{self.path}:{number}: a line of more than {LONGEST_LINE} bytes: '
+                            f'{self.path}:{number}: a line of more than {MAX_LINE_LENGTH} bytes: '
                             'expected a CARMEN log'
                         )
                     if b'\0' in line:

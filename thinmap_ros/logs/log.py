@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.odometry import ScanPairing
+from thinmap_ros.core.odometry import ScanOdometrySynchronizer
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.logs.mcap_records import MAGIC as _MCAP
@@ -37,7 +37,7 @@ Event = OdometryEvent | ScanEvent
 
 
 @dataclass
-class Skipped:
+class SkippedRecords:
     """What could not be used: how often, and the first case."""
 
     count: int = 0
@@ -48,7 +48,7 @@ class Skipped:
         self.count += 1
         self.first = self.first or where
 
-    def add_foremost(self, where: str) -> None:
+    def add_first(self, where: str) -> None:
         """Count one more, which is named before what came first."""
         self.count += 1
         self.first = where
@@ -57,7 +57,7 @@ class Skipped:
 class Log(Protocol):
     """A log file or bag."""
 
-    skipped: Skipped
+    skipped: SkippedRecords
 
     def events(self) -> Iterator[Event]:
         """Odometry and scans in the order of the file."""
@@ -94,7 +94,7 @@ def paired_scans(log: Log) -> Iterator[tuple[Scan, Array]]:
     A scan without odometry around its stamp is left out. Raises InputError where the log cannot be
     read.
     """
-    pairing = ScanPairing()
+    pairing = ScanOdometrySynchronizer()
     for event in log.events():
         if isinstance(event, OdometryEvent):
             yield from pairing.add_odometry(event.stamp_ns, event.T_odom_base)

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.logs.mcap_records import (
     HEAD,
-    LARGEST_CHUNK,
     MAGIC,
+    MAX_CHUNK_BYTES,
     DamagedError,
     Definition,
     Records,
@@ -34,7 +34,7 @@ from thinmap_ros.logs.mcap_records import (
     records_of,
 )
 
-LARGEST_DEFINITIONS = 64 * 2**20
+MAX_DEFINITIONS_BYTES = 64 * 2**20
 """Bytes of all schemas and channels of a file."""
 _LARGEST_SUMMARY = 64 * 2**20
 _MOST_HELD = 512 * 2**20
@@ -49,14 +49,14 @@ _PRIVATE = 0x80
 class Damage:
     """What of a file is not whole: by the byte where it begins, what was found there."""
 
-    cut_off: bool = False
+    is_truncated: bool = False
     parts: dict[int, str] = field(default_factory=dict)
 
     def __bool__(self) -> bool:
-        return self.cut_off or bool(self.parts)
+        return self.is_truncated or bool(self.parts)
 
     def __str__(self) -> str:
-        words = ['cut off'] if self.cut_off else []
+        words = ['cut off'] if self.is_truncated else []
         if self.parts:
             at, reason = next(iter(self.parts.items()))
             n = len(self.parts)
@@ -83,9 +83,9 @@ class Definitions:
         builder = RecordBuilder()
         record.write(builder)
         self._bytes += builder.count
-        if self._bytes > LARGEST_DEFINITIONS:
+        if self._bytes > MAX_DEFINITIONS_BYTES:
             raise InputError(
-                f'{self.path}: schemas and channels: expected at most {LARGEST_DEFINITIONS} bytes'
+                f'{self.path}: schemas and channels: expected at most {MAX_DEFINITIONS_BYTES} bytes'
             )
 
     def of(self, channel_id: int) -> tuple[Schema, Channel] | None:
@@ -96,7 +96,7 @@ class Definitions:
 
 
 @dataclass(frozen=True)
-class Block:
+class ChunkSpan:
     """A chunk, or a stretch of records outside of chunks: from byte `start` to `end` of the file.
 
     whole: it was not cut off; first_ns: log time of its earliest message; channel_ids: those that
@@ -116,7 +116,7 @@ class Summary:
     """What a file that was closed says of itself at its end."""
 
     definitions: list[Definition]
-    blocks: list[Block]
+    blocks: list[ChunkSpan]
 
 
 class McapFile:
@@ -211,7 +211,7 @@ class _LogOrder:
                 self._held -= len(records.data)
 
 
-def whole_records(path: Path, damage: Damage) -> Iterator[Definition | Message]:
+def intact_records(path: Path, damage: Damage) -> Iterator[Definition | Message]:
     """Whole schemas, channels and messages in file order; what is not whole is noted in `damage`.
 
     Raises InputError where the file does not begin as MCAP files do.
@@ -223,7 +223,7 @@ def whole_records(path: Path, damage: Damage) -> Iterator[Definition | Message]:
         yield from records.messages()
 
 
-def _walk(path: Path, summary: Summary, damage: Damage) -> Iterator[tuple[Block, Records]]:
+def _walk(path: Path, summary: Summary, damage: Damage) -> Iterator[tuple[ChunkSpan, Records]]:
     """Blocks and their records in file order; what is not whole is noted in `damage`.
 
     Where records no longer follow each other, it goes on at the next chunk of the summary.
@@ -245,7 +245,7 @@ def _walk(path: Path, summary: Summary, damage: Damage) -> Iterator[tuple[Block,
             yield replace(block, first_ns=records.first_ns, channel_ids=channel_ids), records
 
 
-def _blocks(stream: BinaryIO, size: int, chunks: list[int], damage: Damage) -> Iterator[Block]:
+def _blocks(stream: BinaryIO, size: int, chunks: list[int], damage: Damage) -> Iterator[ChunkSpan]:
     """Blocks of a file of `size` bytes; `chunks`: where its summary says that chunks begin.
 
     What a recorder has added since is left alone.
@@ -257,39 +257,41 @@ def _blocks(stream: BinaryIO, size: int, chunks: list[int], damage: Damage) -> I
         head = stream.read(HEAD.size) if at + HEAD.size <= size else b''
         code, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
         end = at + HEAD.size + length
-        plain = code in _PLAIN and end <= size and length <= LARGEST_CHUNK
+        plain = code in _PLAIN and end <= size and length <= MAX_CHUNK_BYTES
         if stretch < at and (not plain or end - stretch > _STRETCH):
-            yield Block(stretch, at, is_chunk=False)
+            yield ChunkSpan(stretch, at, is_chunk=False)
             stretch = at
         if (code, length) in ((Opcode.DATA_END, 4), (Opcode.FOOTER, _FOOTER.size)):
             stream.seek(size - len(MAGIC))
-            damage.cut_off = stream.read() != MAGIC  # the messages are whole, the summary is not
+            damage.is_truncated = (
+                stream.read() != MAGIC
+            )  # the messages are whole, the summary is not
             return
         if code == Opcode.CHUNK:
-            yield Block(at, min(end, size), is_chunk=True, whole=end <= size)
+            yield ChunkSpan(at, min(end, size), is_chunk=True, whole=end <= size)
         if end <= size and (0 < code <= _LAST_OPCODE or code >= _PRIVATE):
             if code in _PLAIN and not plain:
-                damage.parts[at] = f'record of {length} bytes: expected at most {LARGEST_CHUNK}'
+                damage.parts[at] = f'record of {length} bytes: expected at most {MAX_CHUNK_BYTES}'
             at = end
             stretch = stretch if plain else at
             continue
         following = bisect_right(chunks, at)
         if following == len(chunks):
-            damage.cut_off = True
+            damage.is_truncated = True
             return
         damage.parts.setdefault(at, 'no record')
         at = chunks[following]
         stretch = at
 
 
-def _load(stream: BinaryIO, block: Block) -> Records:
+def _load(stream: BinaryIO, block: ChunkSpan) -> Records:
     """Records of a block. Raises DamagedError."""
     stream.seek(block.start)
     if not block.is_chunk:
         return records_of(stream.read(block.end - block.start))
     length = block.end - block.start - HEAD.size
-    if length > LARGEST_CHUNK:
-        raise DamagedError(f'chunk of {length} bytes: expected at most {LARGEST_CHUNK}')
+    if length > MAX_CHUNK_BYTES:
+        raise DamagedError(f'chunk of {length} bytes: expected at most {MAX_CHUNK_BYTES}')
     head = stream.read(HEAD.size)
     if block.whole and head != HEAD.pack(Opcode.CHUNK, length):
         raise DamagedError(f'no chunk of {length} bytes')
@@ -335,7 +337,7 @@ def _parsed_summary(content: bytes, data_end: int) -> Summary:
     return summary
 
 
-def _indexed(record: bytes, data_end: int) -> Block:
+def _indexed(record: bytes, data_end: int) -> ChunkSpan:
     index = ChunkIndex.read(ReadDataStream(BytesIO(record)))
     end = index.chunk_start_offset + index.chunk_length
     if not len(MAGIC) <= index.chunk_start_offset <= end - HEAD.size <= data_end - HEAD.size:
@@ -343,4 +345,6 @@ def _indexed(record: bytes, data_end: int) -> Block:
     # Writers may leave out which channels a chunk has messages of.
     channel_ids = frozenset(index.message_index_offsets) or None
     first_ns = index.message_start_time
-    return Block(index.chunk_start_offset, end, True, first_ns=first_ns, channel_ids=channel_ids)
+    return ChunkSpan(
+        index.chunk_start_offset, end, True, first_ns=first_ns, channel_ids=channel_ids
+    )

@@ -21,7 +21,7 @@ from mcap.records import Channel, Message, Schema
 from numpy.typing import NDArray
 
 MAGIC = b'\x89MCAP0\r\n'
-LARGEST_CHUNK = 256 * 2**20
+MAX_CHUNK_BYTES = 256 * 2**20
 """Bytes of a chunk, uncompressed, and of a message. Recorders close a chunk at 1 to 4 MB."""
 LATEST_NS = 2**31 * 1_000_000_000
 """Log times end here, in 2038, as the seconds of ROS's messages do."""
@@ -92,7 +92,7 @@ def chunk_records(content: bytes, whole: bool) -> Records:
         raise DamagedError(f'{len(packed)} bytes compressed: expected {length}')
     # The length of the whole record may be what is damaged.
     complete = len(packed) == length
-    data = unpacked(compression, packed, size, complete)
+    data = decompress(compression, packed, size, complete)
     if complete and len(data) != size:
         raise DamagedError(f'{len(data)} bytes uncompressed: expected {size}')
     if complete and checksum and zlib.crc32(data) != checksum:
@@ -100,14 +100,14 @@ def chunk_records(content: bytes, whole: bool) -> Records:
     return records_of(data, complete)
 
 
-def unpacked(compression: str, data: bytes, size: int, whole: bool = True) -> bytes:
+def decompress(compression: str, data: bytes, size: int, whole: bool = True) -> bytes:
     """Uncompressed bytes; of data that was cut off (not `whole`) what comes out before the cut.
 
     size: what the file claims, bytes; no more is ever unpacked. Raises DamagedError where it is
     more than LARGEST_CHUNK, or the data expand to more than it.
     """
-    if size > LARGEST_CHUNK:
-        raise DamagedError(f'{size} bytes uncompressed: expected at most {LARGEST_CHUNK}')
+    if size > MAX_CHUNK_BYTES:
+        raise DamagedError(f'{size} bytes uncompressed: expected at most {MAX_CHUNK_BYTES}')
     if compression == '':
         return data
     if compression not in ('lz4', 'zstd'):

@@ -12,13 +12,13 @@ from rosbags.rosbag2.metadata import dump_qos_v9
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.files.atomic import write_text
 from thinmap_ros.logs import qos
-from thinmap_ros.logs.mcap_reader import Damage, Definitions, whole_records
-from thinmap_ros.logs.mcap_records import LARGEST_CHUNK, DamagedError, unpacked
+from thinmap_ros.logs.mcap_reader import Damage, Definitions, intact_records
+from thinmap_ros.logs.mcap_records import MAX_CHUNK_BYTES, DamagedError, decompress
 from thinmap_ros.logs.storage import own_typestore
 
 
 @dataclass
-class Salvage:
+class RepairReport:
     """What was found: messages by topic, damage by file, messages that cannot be unpacked."""
 
     counts: dict[str, int] = field(default_factory=dict)
@@ -39,14 +39,14 @@ class Salvage:
         return next((str(damage) for damage in self.damage.values() if damage), '')
 
 
-def repair(files: list[Path], folder: Path, compressed_messages: bool = False) -> Salvage:
+def repair(files: list[Path], folder: Path, compressed_messages: bool = False) -> RepairReport:
     """Write what is whole in MCAP files into folder/NAME.mcap and folder/metadata.yaml.
 
     NAME is the folder's.
     compressed_messages: each message is compressed on its own; it is written unpacked.
     Raises InputError where a file is no MCAP file, or no whole message is left.
     """
-    found = Salvage()
+    found = RepairReport()
     channels: dict[str, Channel] = {}
     schemas: dict[str, Schema] = {}
     with (folder / f'{folder.name}.mcap').open('wb') as stream:
@@ -70,7 +70,7 @@ class _Copy:
     """Copies messages; the same topic of several files becomes one channel."""
 
     writer: Writer
-    found: Salvage
+    found: RepairReport
     channels: dict[str, Channel]
     schemas: dict[str, Schema]
     compressed_messages: bool = False
@@ -80,7 +80,7 @@ class _Copy:
     def add_file(self, file: Path) -> None:
         definitions = Definitions(file)
         damage = self.found.damage.setdefault(file, Damage())
-        for record in whole_records(file, damage):
+        for record in intact_records(file, damage):
             if not isinstance(record, Message):
                 definitions.add(record)
             elif (known := definitions.of(record.channel_id)) is not None:
@@ -92,7 +92,7 @@ class _Copy:
     def _uncompressed(self, message: Message) -> Message:
         if not self.compressed_messages:
             return message
-        return replace(message, data=unpacked('zstd', message.data, LARGEST_CHUNK))
+        return replace(message, data=decompress('zstd', message.data, MAX_CHUNK_BYTES))
 
     def _write(self, schema: Schema, channel: Channel, message: Message) -> None:
         if schema.name not in self._schema_ids:
@@ -131,7 +131,7 @@ def _hash(schema: Schema) -> str:
         return ''
 
 
-def _span(found: Salvage) -> dict[str, Any]:
+def _span(found: RepairReport) -> dict[str, Any]:
     first_ns = found.first_ns or 0
     return {
         'duration': {'nanoseconds': found.last_ns - first_ns},
@@ -141,7 +141,7 @@ def _span(found: Salvage) -> dict[str, Any]:
 
 
 def _metadata(
-    name: str, found: Salvage, channels: dict[str, Channel], schemas: dict[str, Schema]
+    name: str, found: RepairReport, channels: dict[str, Channel], schemas: dict[str, Schema]
 ) -> dict[str, Any]:
     """Content of rosbag2's metadata.yaml."""
     topics = [

@@ -19,7 +19,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.logs import qos
 from thinmap_ros.logs.mcap_reader import Damage, McapFile
 
-LARGEST_SCHEMA = 2**20
+MAX_SCHEMA_BYTES = 2**20
 """Bytes of the definition of a message type with all that it is made of."""
 _IDL_SEPARATOR = '=' * 80 + '\n'
 
@@ -121,7 +121,7 @@ class SqliteStorage:
                 for connection, log_ns, data in reader.messages(chosen) if chosen else ():
                     yield RawMessage(connection.topic, connection.msgtype, log_ns, bytes(data))
         except Exception:  # as above: what came before it counts
-            self.damage.cut_off = True
+            self.damage.is_truncated = True
 
     def _reader(self) -> AnyReader:
         return AnyReader([self._path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
@@ -153,8 +153,8 @@ def typestore_of(schema: Schema) -> Typestore:
 
 def own_typestore(schema: Schema) -> Typestore:
     """Types of one schema. Raises what rosbags' parser raises, and ValueError if too large."""
-    if len(schema.data) > LARGEST_SCHEMA:
-        raise ValueError(f'definition of {len(schema.data)} bytes: expected {LARGEST_SCHEMA}')
+    if len(schema.data) > MAX_SCHEMA_BYTES:
+        raise ValueError(f'definition of {len(schema.data)} bytes: expected {MAX_SCHEMA_BYTES}')
     return _parsed(schema.name, schema.encoding, schema.data.decode())
 
 

@@ -88,8 +88,8 @@ class BagPlayerNode(Node):
         if not self._config.bag:
             raise ConfigError("bag = '': expected a rosbag2 folder or an MCAP file")
         self._bag = Bag(Path(self._config.bag))
-        if self._bag.advice:
-            self.get_logger().warning(self._bag.advice)
+        if self._bag.repair_hint:
+            self.get_logger().warning(self._bag.repair_hint)
         self._publishers_by_topic: dict[str, Publisher] = {}
         self._clock_publisher = _ClockPublisher(self)
         for topic in self._chosen():

@@ -87,7 +87,7 @@ class DemoMonitorNode(Node):
         future.result().get_result_async().add_done_callback(self._on_result)
 
     def _on_map(self, message: OccupancyGrid) -> None:
-        self._coverage = self._coverable.share_known(messages.grid_from_msg(message))
+        self._coverage = self._coverable.coverage(messages.grid_from_msg(message))
 
     def _on_feedback(self, message: Explore.Impl.FeedbackMessage) -> None:
         self._show(message.feedback.status)

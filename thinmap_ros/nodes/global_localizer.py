@@ -16,7 +16,7 @@ from thinmap_msgs.srv import LocalizeGlobally
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.active_localization import ActiveSearch
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.odometry import ScanPairing
+from thinmap_ros.core.odometry import ScanOdometrySynchronizer
 from thinmap_ros.core.places.global_localizer import (
     GlobalLocalization,
     GlobalLocalizationConfig,
@@ -274,7 +274,7 @@ class GlobalLocalizerNode(ThinmapNode):
         self._localization: GlobalLocalization | None = None
         self._is_requested = self._settings.automatic
         self._lost = _LostDetector(self._settings.lost_ns)
-        self._pairing = ScanPairing()
+        self._pairing = ScanOdometrySynchronizer()
         self._received: set[str] = set()
         self._driver.reset()
 

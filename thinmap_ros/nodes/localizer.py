@@ -18,7 +18,7 @@ from thinmap_ros.core.ekf_slam.features import LineFeature as Feature
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.odometry import LastPose, ScanPairing
+from thinmap_ros.core.odometry import OdometryAnchor, ScanOdometrySynchronizer
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import LocalizerConfig
@@ -80,11 +80,11 @@ class _PosePublishers:
         self._features.publish(LineFeatureArray(header=header, features=features))
         status.header = header
         status.features = len(features)
-        status.local_features = estimate.n_local
+        status.local_features = estimate.n_local_features
         status.observed = estimate.observed
         status.matched = estimate.matched
         status.refused = localizer.refused
-        status.match_quality = estimate.match_quality
+        status.match_quality = estimate.inlier_ratio
         self._status.publish(status)
 
     def publish_trajectory(self, stamp_ns: int, stamps_ns: list[int], poses: Array) -> None:
@@ -100,7 +100,7 @@ class _Relocation:
     last: the pose in its checkpoint. map: None until it is received by `subscription`.
     """
 
-    def __init__(self, last: LastPose) -> None:
+    def __init__(self, last: OdometryAnchor) -> None:
         self.last = last
         self.map: GridPatch | None = None
         self._pending: tuple[Scan, Array] | None = None
@@ -114,7 +114,7 @@ class _Relocation:
 
     def is_continuous_with(self, scan: Scan, T_odom_base: Array) -> bool:
         """Whether the odometry at a scan can continue that of the checkpoint."""
-        return self.last.leads_to(scan.stamp_ns, T_odom_base)
+        return self.last.is_continuous_with(scan.stamp_ns, T_odom_base)
 
     def next_scan(self, ready: list[tuple[Scan, Array]]) -> tuple[Scan, Array] | None:
         """The newest scan with its odometry, once the map need not be waited for any longer."""
@@ -166,8 +166,8 @@ class LocalizerNode(ThinmapNode):
         The robot is at the start pose.
         """
         self._localizer = self._create_localizer(self._config)
-        self._pairing = ScanPairing()
-        self._last: LastPose | None = None
+        self._pairing = ScanOdometrySynchronizer()
+        self._last: OdometryAnchor | None = None
         self._topology: Graph | None = None
         self._relocation: _Relocation | None = None
 
@@ -176,7 +176,7 @@ class LocalizerNode(ThinmapNode):
 
     def _restore(self, state: State) -> None:
         """Continue at the last pose of a killed localizer. Raises InputError where it is none."""
-        self._relocation = _Relocation(LastPose.from_state(state))
+        self._relocation = _Relocation(OdometryAnchor.from_state(state))
         self._subscribe_map_once(self._relocation)
 
     def _create_localizer(self, config: LocalizerConfig) -> AnyLocalizer:
@@ -215,7 +215,7 @@ class LocalizerNode(ThinmapNode):
             step_ms = 1000.0 * (perf_counter() - started)
             self._publish(scan, estimate, step_ms)
             if not estimate.lost:
-                self._last = LastPose(scan.stamp_ns, estimate.T_map_odom, T_odom_base)
+                self._last = OdometryAnchor(scan.stamp_ns, estimate.T_map_odom, T_odom_base)
         diagnostics = self.diagnostics
         diagnostics.set_drop_total('scans without odometry at their time', self._pairing.dropped)
         diagnostics.set_drop_total('invalid scans or odometry', self._localizer.refused)

@@ -202,7 +202,7 @@ class NavigatorNode(ThinmapNode):
             reason = f'{fault}: standing still'
             self.get_logger().warning(reason, throttle_duration_sec=_WARN_PERIOD_S)
             self.diagnostics.set_state(WARN, reason)
-            self._navigator.halt()
+            self._navigator.reset_velocity()
             return Command(0.0, 0.0, 'blocked', reason)
         patch = self._map.patch
         scan = self._robot.scan

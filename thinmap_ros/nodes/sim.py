@@ -25,8 +25,8 @@ from thinmap_ros.files.worlds import read_world
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.diagnostics import OK, WARN, NodeDiagnostics
 from thinmap_ros.ros.lockstep import NONE, PATIENCE_S, PATIENCE_WORDS, TOPICS, Lockstep
-from thinmap_ros.sim.laser import Lms200Config
-from thinmap_ros.sim.robot import PRESETS, Pioneer
+from thinmap_ros.sim.laser import LaserScannerConfig
+from thinmap_ros.sim.robot import PRESETS, DifferentialDriveRobot
 from thinmap_ros.sim.simulation import STEP_NS, Moment, Simulation
 from thinmap_ros.sim.world import World
 
@@ -77,7 +77,7 @@ class _SimPublishers:
             transform = messages.transform_msg(T_base_laser, 'base_link', 'laser', 0)
             self._tf_static.publish(TFMessage(transforms=[transform]))
 
-    def publish(self, moment: Moment, robot: Pioneer) -> None:
+    def publish(self, moment: Moment, robot: DifferentialDriveRobot) -> None:
         """Publish a moment; the scan, if there is one, comes last."""
         ns = moment.stamp_ns
         self._publish_clock(ns)
@@ -93,7 +93,7 @@ class _SimPublishers:
             self._last_scan = messages.scan_msg(moment.scan, 'laser', self._scan_time_s)
             self._scan.publish(self._last_scan)
 
-    def repeat_scan(self, moment: Moment, robot: Pioneer) -> None:
+    def repeat_scan(self, moment: Moment, robot: DifferentialDriveRobot) -> None:
         """Publish the last scan again, with time and odometry of a moment."""
         if self._last_scan is not None:
             self._publish_clock(moment.stamp_ns)
@@ -103,7 +103,7 @@ class _SimPublishers:
     def _publish_clock(self, ns: int) -> None:
         self._clock.publish(ClockMsg(clock=messages.time_msg(ns)))
 
-    def _publish_odometry(self, moment: Moment, robot: Pioneer) -> None:
+    def _publish_odometry(self, moment: Moment, robot: DifferentialDriveRobot) -> None:
         velocity = (robot.v, robot.w)
         frames = ('odom', 'base_link')
         self._odom.publish(
@@ -131,7 +131,7 @@ class SimNode(Node):
     def __init__(self) -> None:
         super().__init__('sim')
         self._config = parameters.declare_config(self, SimConfig)
-        laser = parameters.declare_config(self, Lms200Config)
+        laser = parameters.declare_config(self, LaserScannerConfig)
         parameters.reject_unknown(self)
         world = World.from_patch(*read_world(package_data.world_path(self._config.world)))
         start = _start(self._config.start, world)
@@ -172,7 +172,7 @@ class SimNode(Node):
                 return
             self._running = True
             self._diagnostics.set_state(OK, 'running')
-            self._publish(self._sim.sense())
+            self._publish(self._sim.read_sensors())
             return
         if self._lockstep.is_waiting and self._is_on_hold():
             return
@@ -189,7 +189,7 @@ class SimNode(Node):
             return not self._lockstep.timed_out()
         if monotonic() - self._repeated_s > _REPEAT_S:
             self._repeated_s = monotonic()
-            self._output.repeat_scan(self._sim.sense(), self._sim.robot)
+            self._output.repeat_scan(self._sim.read_sensors(), self._sim.robot)
         return True
 
     def _publish(self, moment: Moment) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rclpy.node import Node
 
-from thinmap_ros.core.errors import InputError, reason_of
+from thinmap_ros.core.errors import InputError, one_line_reason
 from thinmap_ros.core.private_folder import private_folder, temporary_folder
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.files.atomic import atomic_write, partial_files
@@ -61,7 +61,7 @@ class Checkpoint:
         except FileNotFoundError:
             return None
         except (OSError, InputError) as error:
-            self._warn(f'{reason_of(error)}: starting without a checkpoint')
+            self._warn(f'{one_line_reason(error)}: starting without a checkpoint')
             return None
 
     def save(self, state: State) -> None:

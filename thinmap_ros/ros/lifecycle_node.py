@@ -10,7 +10,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.timer import Timer
 from std_srvs.srv import SetBool, Trigger
 
-from thinmap_ros.core.errors import ThinmapError, reason_of
+from thinmap_ros.core.errors import ThinmapError, one_line_reason
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.ros import parameters
 from thinmap_ros.ros.checkpoint import Checkpoint, PeriodicCheckpoint
@@ -136,7 +136,9 @@ class ThinmapNode(LifecycleNode):
         try:
             restore(saved)
         except ThinmapError as error:
-            self.get_logger().warning(f'checkpoint rejected: {reason_of(error)}: starting empty')
+            self.get_logger().warning(
+                f'checkpoint rejected: {one_line_reason(error)}: starting empty'
+            )
             self._reset()
         else:
             self.get_logger().warning('restored the state of a killed node; ~/reset discards it')

@@ -31,7 +31,7 @@ from thinmap_msgs.msg import TopologicalEdge, TopologicalNode
 from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
 from thinmap_ros.core import se2, validation
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import COARSEST_M, FINEST_M, GridFrame
+from thinmap_ros.core.grid.frame import MAX_RESOLUTION_M, MIN_RESOLUTION_M, GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -98,11 +98,11 @@ def scan_from_msg(message: LaserScan, T_base_laser: Array, zero_is_no_return: bo
     there are not.
     """
     count = len(message.ranges)
-    if not 0 < count <= validation.MOST_BEAMS:
-        raise InputError(f'{count} beams: expected 1 to {validation.MOST_BEAMS}')
+    if not 0 < count <= validation.MAX_BEAMS:
+        raise InputError(f'{count} beams: expected 1 to {validation.MAX_BEAMS}')
     last = message.angle_min + message.angle_increment * (count - 1)
     validation.require_bounded(
-        'angle of the first or last beam', (message.angle_min, last), validation.LARGEST_ANGLE_RAD
+        'angle of the first or last beam', (message.angle_min, last), validation.MAX_ANGLE_RAD
     )
     return Scan.create(
         stamp_ns(message.header.stamp),
@@ -261,11 +261,11 @@ def grid_from_msg(message: OccupancyGrid) -> GridPatch:
     # The message carries a float32; 0.1 has to be the same 0.1 on both sides.
     resolution = round(float(info.resolution), 6)
     size_fits = len(message.data) == info.width * info.height
-    if not size_fits or not FINEST_M <= resolution <= COARSEST_M:
+    if not size_fits or not MIN_RESOLUTION_M <= resolution <= MAX_RESOLUTION_M:
         raise InputError(
             f'map of {info.width} x {info.height} cells of {resolution} m '
             f'with {len(message.data)} values: expected a value for each cell, '
-            f'and cells of {FINEST_M} to {COARSEST_M} m'
+            f'and cells of {MIN_RESOLUTION_M} to {MAX_RESOLUTION_M} m'
         )
     origin = pose_from_msg(info.origin)
     if abs(origin[2]) > 1e-6:

@@ -14,11 +14,11 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.sim.floor_plan import WALL_M, FloorPlan, Kind, Opening, Part, floor_plan
-from thinmap_ros.sim.moving_obstacles import Leaves, Moving, People
+from thinmap_ros.sim.moving_obstacles import Doors, MovingObstacles, Pedestrians
 from thinmap_ros.sim.world import World
 
 DEVELOPMENT_SEEDS = range(1000)  # others are for judging
-LARGEST_M2 = 100_000.0
+MAX_AREA_M2 = 100_000.0
 _SMALLEST_M2 = 150.0
 _FINE_M = 0.05
 _COARSE_M = 0.1
@@ -103,7 +103,7 @@ def _chosen(asked: BuildingConfig, rng: np.random.Generator) -> BuildingConfig:
     """All that was left to chance; drawn always, so that one choice leaves the others alone."""
     area = math.exp(rng.uniform(math.log(300.0), math.log(12_000.0)))
     if rng.random() < 0.1:
-        area = math.exp(rng.uniform(math.log(12_000.0), math.log(LARGEST_M2)))
+        area = math.exp(rng.uniform(math.log(12_000.0), math.log(MAX_AREA_M2)))
     drawn = {
         'area_m2': area,
         'hall_share': float(rng.choice([0.0, 0.2, 0.6])),
@@ -115,8 +115,8 @@ def _chosen(asked: BuildingConfig, rng: np.random.Generator) -> BuildingConfig:
     }
     given = {name: value for name, value in vars(asked).items() if value is not None}
     chosen = BuildingConfig(**{**drawn, **given})
-    if not _SMALLEST_M2 <= float(chosen.area_m2 or 0.0) <= LARGEST_M2:
-        expected = f'expected {_SMALLEST_M2:g} to {LARGEST_M2:g} m2'
+    if not _SMALLEST_M2 <= float(chosen.area_m2 or 0.0) <= MAX_AREA_M2:
+        expected = f'expected {_SMALLEST_M2:g} to {MAX_AREA_M2:g} m2'
         raise InputError(f'building: area_m2: {chosen.area_m2}: {expected}')
     return chosen
 
@@ -361,15 +361,17 @@ def _start(
             return se2.pose(T[0], T[1], rng.uniform(-math.pi, math.pi))
 
 
-def _moving(wings: list[Wing], config: BuildingConfig, rng: np.random.Generator) -> Moving | None:
+def _moving(
+    wings: list[Wing], config: BuildingConfig, rng: np.random.Generator
+) -> MovingObstacles | None:
     people = _people(wings, config, rng)
     leaves = _leaves(wings, config.moving_doors or 0.0, rng)
     if not len(people.points) and not len(leaves.hinges):
         return None
-    return Moving(people, leaves)
+    return MovingObstacles(people, leaves)
 
 
-def _people(wings: list[Wing], config: BuildingConfig, rng: np.random.Generator) -> People:
+def _people(wings: list[Wing], config: BuildingConfig, rng: np.random.Generator) -> Pedestrians:
     """Walkers, each in a part of his own: to and fro, with pauses."""
     count = rng.poisson((config.people_per_1000_m2 or 0.0) * (config.area_m2 or 0.0) / 1000.0)
     points = np.zeros((count, 4, 2))
@@ -380,10 +382,10 @@ def _people(wings: list[Wing], config: BuildingConfig, rng: np.random.Generator)
         x = rng.uniform(part.x0 + 0.4, part.x1 - 0.4, 4)
         y = rng.uniform(part.y0 + 0.4, part.y1 - 0.4, 4)
         points[i] = se2.transform_points(wing.T_world_wing, np.column_stack([x, y]))
-    return People(points, rng.uniform(0.5, 1.4, count), rng.exponential(8.0, (count, 4)))
+    return Pedestrians(points, rng.uniform(0.5, 1.4, count), rng.exponential(8.0, (count, 4)))
 
 
-def _leaves(wings: list[Wing], moving: float, rng: np.random.Generator) -> Leaves:
+def _leaves(wings: list[Wing], moving: float, rng: np.random.Generator) -> Doors:
     """A leaf for most doors; a share of them moves."""
     hinges = []
     ends = []
@@ -401,4 +403,4 @@ def _leaves(wings: list[Wing], moving: float, rng: np.random.Generator) -> Leave
     chance = np.random.default_rng(int(rng.integers(2**31)))
     open_rad = side[:, None] * chance.uniform(*_AJAR_RAD, (count, _PERIODS))
     is_shut = moves[:, None] & (chance.random((count, _PERIODS)) < _SHUT_SHARE)
-    return Leaves(together, np.concatenate(ends), period_s, open_rad, is_shut)
+    return Doors(together, np.concatenate(ends), period_s, open_rad, is_shut)

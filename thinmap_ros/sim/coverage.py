@@ -26,7 +26,7 @@ _ALIGNED = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Coverable:
+class ObservableCells:
     """Free cells (H, W) bool, 10 cm wide in the world frame, that could be seen."""
 
     cells: NDArray[np.bool_]
@@ -37,7 +37,7 @@ class Coverable:
         """Area of all of them."""
         return float(self.cells.sum()) * self.frame.resolution**2
 
-    def share_known(self, patch: GridPatch, T_world_map: Array | None = None) -> float:
+    def coverage(self, patch: GridPatch, T_world_map: Array | None = None) -> float:
         """Coverage: the share of these cells at whose centres the map is free.
 
         T_world_map (3,): where the map's frame lies in the world; None: they are the same.
@@ -74,7 +74,7 @@ class Coverable:
         return self.frame.centres_of(np.argwhere(self.cells))
 
 
-def coverable(world: World, start: Array, radius_m: float, range_m: float) -> Coverable:
+def coverable(world: World, start: Array, radius_m: float, range_m: float) -> ObservableCells:
     """All that a robot of a radius could come to see, all around up to a range, from a start (3,).
 
     Every place in the world's own cells where the robot can stand is taken; none is left out for
@@ -96,14 +96,14 @@ def coverable(world: World, start: Array, radius_m: float, range_m: float) -> Co
     seen = _look_around(world.occupied, reached, places, angles, range_m / world.frame.resolution)
     coverable_cells = np.zeros(tuple(last + 1), dtype=np.bool_)
     coverable_cells[cells[:, 0], cells[:, 1]] = seen
-    return Coverable(coverable_cells, frame)
+    return ObservableCells(coverable_cells, frame)
 
 
 def _reachable_from(world: World, start: Array, radius_m: float) -> NDArray[np.bool_]:
     """Cells (H, W) at whose centres the robot can stand, connected with the one it starts in."""
     from scipy import ndimage
 
-    standing = world.wall_distance_m > radius_m
+    standing = world.distance_to_wall_m > radius_m
     row, col = world.frame.cells_of(start[None, :2])[0]
     rows, cols = standing.shape
     if not (0 <= row < rows and 0 <= col < cols and standing[row, col]):

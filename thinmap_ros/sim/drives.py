@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.path_follower import Follower, FollowerConfig
+from thinmap_ros.core.planning.path_follower import PathFollower, PathFollowerConfig
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, pose
-from thinmap_ros.sim.laser import Lms200Config
-from thinmap_ros.sim.robot import PioneerConfig
+from thinmap_ros.sim.laser import LaserScannerConfig
+from thinmap_ros.sim.robot import RobotConfig
 from thinmap_ros.sim.simulation import STEP_NS, Simulation
 from thinmap_ros.sim.world import World
 
@@ -28,7 +28,7 @@ _RANDOM_SPEED_M_S = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class DriveSample:
     """What the robot has at a scan: scan, odometry pose (3,), and where it truly is (3,)."""
 
     scan: Scan
@@ -36,15 +36,15 @@ class Look:
     T_world_base: Array
 
 
-def drive(simulation: Simulation, ways: Iterable[Array], speed_m_s: float) -> Iterator[Look]:
+def drive(simulation: Simulation, ways: Iterable[Array], speed_m_s: float) -> Iterator[DriveSample]:
     """Look after look of a robot that follows ways (K, 2), m, world frame, one after the other.
 
     A way that takes much too long is given up for the next.
     """
-    follower = Follower(FollowerConfig(max_speed_m_s=speed_m_s))
-    moment = simulation.sense()
+    follower = PathFollower(PathFollowerConfig(max_speed_m_s=speed_m_s))
+    moment = simulation.read_sensors()
     if moment.scan is not None:
-        yield Look(moment.scan, moment.T_odom_base, simulation.robot.T_world_base)
+        yield DriveSample(moment.scan, moment.T_odom_base, simulation.robot.T_world_base)
     for way in ways:
         length_m = float(np.hypot(*np.diff(way, axis=0).T).sum())
         for _ in range(round(1e9 / STEP_NS * (_LEAST_S + _PATIENCE * length_m / speed_m_s))):
@@ -53,7 +53,7 @@ def drive(simulation: Simulation, ways: Iterable[Array], speed_m_s: float) -> It
                 break
             moment = simulation.step(*follower.command(T, way, STEP_NS / 1e9))
             if moment.scan is not None:
-                yield Look(moment.scan, moment.T_odom_base, simulation.robot.T_world_base)
+                yield DriveSample(moment.scan, moment.T_odom_base, simulation.robot.T_world_base)
 
 
 def patch_of(world: World) -> GridPatch:
@@ -61,7 +61,7 @@ def patch_of(world: World) -> GridPatch:
     return GridPatch(world.frame, np.where(world.occupied != 0, np.int8(100), np.int8(0)))
 
 
-def ways_along(world: World, places: Array, radius_m: float) -> Iterator[Array]:
+def tour_paths(world: World, places: Array, radius_m: float) -> Iterator[Array]:
     """Ways (K, 2) from a world's start to places (N, 2), one by one, straight where there is room.
 
     Raises InputError where a place cannot be reached.
@@ -93,14 +93,14 @@ def _is_clear(world: World, way: Array, radius_m: float) -> bool:
     cells = world.frame.cells_of(way)
     if (cells < 0).any() or (cells >= world.occupied.shape).any():
         return False
-    return bool((world.wall_distance_m[cells[:, 0], cells[:, 1]] > radius_m).all())
+    return bool((world.distance_to_wall_m[cells[:, 0], cells[:, 1]] > radius_m).all())
 
 
 def random_start(
     world: World, rng: np.random.Generator, within: NDArray[np.bool_] | None = None
 ) -> Array:
     """A pose (3,) at which the robot fits, anywhere in the world or in some of its cells (H, W)."""
-    room = world.wall_distance_m > PioneerConfig().radius_m + MARGIN_M
+    room = world.distance_to_wall_m > RobotConfig().radius_m + MARGIN_M
     cells = np.argwhere(room if within is None else room & within)
     at = world.frame.centres_of(cells[rng.integers(len(cells))][None])[0]
     return pose(float(at[0]), float(at[1]), float(rng.uniform(-np.pi, np.pi)))
@@ -111,13 +111,13 @@ def random_drive(
     start: Array,
     seed: int,
     within: NDArray[np.bool_] | None = None,
-    laser: Lms200Config | None = None,
-) -> Iterator[Look]:
+    laser: LaserScannerConfig | None = None,
+) -> Iterator[DriveSample]:
     """Look after look of a robot that drives from a start to random places, one by one, endlessly.
 
     within (H, W): cells of the world in which these places lie; all, where it is not given.
     """
-    simulation = Simulation(world, start, PioneerConfig(), laser or Lms200Config(), seed)
+    simulation = Simulation(world, start, RobotConfig(), laser or LaserScannerConfig(), seed)
     return drive(
         simulation, _random_ways(simulation, np.random.default_rng(seed), within), _RANDOM_SPEED_M_S
     )
@@ -129,7 +129,7 @@ def _random_ways(
     """Paths (K, 2) from where the robot is to random places that can be reached."""
     world = simulation.world
     patch = patch_of(world)
-    config = WavefrontConfig(robot_radius_m=PioneerConfig().radius_m + MARGIN_M)
+    config = WavefrontConfig(robot_radius_m=RobotConfig().radius_m + MARGIN_M)
     while True:
         T = simulation.robot.T_world_base
         goal = random_start(world, rng, within)

@@ -20,7 +20,7 @@ _INTO_CELL = 1e-6
 
 
 @dataclass(frozen=True)
-class Lms200Config(Config):
+class LaserScannerConfig(Config):
     """A planar laser scanner; the defaults are those of an LMS200 in its 8 m mode."""
 
     beams: int = parameter(181, 'beams of a scan', low=2, high=10_000)
@@ -41,10 +41,10 @@ class Lms200Config(Config):
     mount_x_m: float = parameter(0.0, 'laser ahead of the robot centre, m', low=-2.0, high=2.0)
 
 
-class Lms200:
+class LaserScanner:
     """Makes scans of a world; what no beam meets within the range reads +inf (REP 117)."""
 
-    def __init__(self, config: Lms200Config, seed: int) -> None:
+    def __init__(self, config: LaserScannerConfig, seed: int) -> None:
         self.config = config
         self.T_base_laser = np.array([config.mount_x_m, 0.0, 0.0])
         full_circle = config.field_of_view_deg >= 360.0

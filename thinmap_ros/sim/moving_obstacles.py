@@ -14,7 +14,7 @@ _ROBOT_NEAR_M = 3.0  # doors are held open for it
 
 
 @dataclass(frozen=True, eq=False)
-class People:
+class Pedestrians:
     """Walkers, each of whom goes round his points for ever, and stands at each for a while.
 
     points (N, K, 2), m, world frame; speeds (N,), m/s; pauses (N, K), s.
@@ -53,7 +53,7 @@ class People:
 
 
 @dataclass(frozen=True, eq=False)
-class Leaves:
+class Doors:
     """Leaves of doors, each in its frame: hinges (N, 2), m; ends (N, 2) of the shut leaf, m.
 
     Each stands otherwise after every period_s (N,), inf for one that stays as it is: in the k-th
@@ -85,11 +85,11 @@ class Leaves:
 
 
 @dataclass(frozen=True, eq=False)
-class Moving:
+class MovingObstacles:
     """All that moves in a world."""
 
-    people: People
-    leaves: Leaves
+    people: Pedestrians
+    leaves: Doors
 
     def ranges(self, seconds: float, T_world_laser: Array, angles: Array, reach_m: float) -> Array:
         """How far beams (N,) at angles in the world go until they meet one of them; inf: none."""

@@ -14,7 +14,7 @@ _AWAY_M = 0.05
 
 
 @dataclass(frozen=True)
-class PioneerConfig(Config):
+class RobotConfig(Config):
     """A robot's body, limits, and the errors of its wheel odometry."""
 
     radius_m: float = parameter(
@@ -48,8 +48,8 @@ class PioneerConfig(Config):
 
 # The 3-AT is larger and skid-steered: its wheels slip whenever it turns.
 PRESETS = {
-    '2dx': PioneerConfig(),
-    '3at': PioneerConfig(
+    '2dx': RobotConfig(),
+    '3at': RobotConfig(
         radius_m=0.32,
         max_speed_m_s=0.8,
         max_turn_rad_s=2.4,
@@ -63,7 +63,7 @@ PRESETS = {
 class WheelOdometry:
     """Odometry T_odom_base (3,) from zero that drifts by its seed, over exact steps of a robot."""
 
-    def __init__(self, config: PioneerConfig, seed: int) -> None:
+    def __init__(self, config: RobotConfig, seed: int) -> None:
         self.config = config
         self.T_odom_base = np.zeros(3)
         self._rng = np.random.default_rng(seed)
@@ -90,10 +90,10 @@ class WheelOdometry:
 
 
 @dataclass(eq=False)
-class Pioneer:
+class DifferentialDriveRobot:
     """A robot at T_world_base (3,), odometry T_odom_base (3,) from zero that drifts by its seed."""
 
-    config: PioneerConfig
+    config: RobotConfig
     world: World
     T_world_base: Array
     seed: int

@@ -7,8 +7,8 @@ import numpy as np
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.sim.laser import Lms200, Lms200Config
-from thinmap_ros.sim.robot import Pioneer, PioneerConfig
+from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
+from thinmap_ros.sim.robot import DifferentialDriveRobot, RobotConfig
 from thinmap_ros.sim.world import World
 
 STEP_NS = 50_000_000
@@ -36,12 +36,12 @@ class Simulation:
     """
 
     def __init__(
-        self, world: World, start: Array, robot: PioneerConfig, laser: Lms200Config, seed: int
+        self, world: World, start: Array, robot: RobotConfig, laser: LaserScannerConfig, seed: int
     ) -> None:
         _check_fits(world, start, robot)
         self.world = world
-        self.robot = Pioneer(robot, world, start, odometry_seed(seed))
-        self.laser = Lms200(laser, _seeds(seed)[1])
+        self.robot = DifferentialDriveRobot(robot, world, start, odometry_seed(seed))
+        self.laser = LaserScanner(laser, _seeds(seed)[1])
         self._scan_period_ns = round(1e9 / laser.rate_hz)
         self._next_scan_ns = 0
         self.stamp_ns = 0
@@ -56,7 +56,7 @@ class Simulation:
         self.robot.v = 0.0
         self.robot.w = 0.0
 
-    def sense(self) -> Moment:
+    def read_sensors(self) -> Moment:
         """Return what the sensors tell now; a scan that is due is given once."""
         scan = None
         if self.stamp_ns >= self._next_scan_ns:
@@ -68,7 +68,7 @@ class Simulation:
         """Drive for one step with a commanded speed (m/s) and turn rate (rad/s)."""
         self.robot.step(v, w, STEP_NS / 1e9)
         self.stamp_ns += STEP_NS
-        return self.sense()
+        return self.read_sensors()
 
 
 def odometry_seed(seed: int) -> int:
@@ -81,7 +81,7 @@ def _seeds(seed: int) -> list[int]:
     return [int(word) for word in np.random.SeedSequence(seed).generate_state(2)]
 
 
-def _check_fits(world: World, T_world_base: Array, robot: PioneerConfig) -> None:
+def _check_fits(world: World, T_world_base: Array, robot: RobotConfig) -> None:
     if not world.is_clear(float(T_world_base[0]), float(T_world_base[1]), robot.radius_m):
         raise InputError(
             f'{world.name}: start {T_world_base[:2].tolist()}: expected a place where a robot of '

@@ -11,7 +11,7 @@ from thinmap_ros.core.grid.distance import distance_cells
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.sim.moving_obstacles import Moving
+from thinmap_ros.sim.moving_obstacles import MovingObstacles
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class World:
     frame: GridFrame
     start: Array
     glass: NDArray[np.bool_] | None = None
-    moving: Moving | None = None
+    moving: MovingObstacles | None = None
 
     @staticmethod
     def from_patch(name: str, patch: GridPatch, start: Array) -> 'World':
@@ -35,7 +35,7 @@ class World:
         return World(name, (~patch.free).astype(np.uint8), patch.frame, start)
 
     @cached_property
-    def wall_distance_m(self) -> Array:
+    def distance_to_wall_m(self) -> Array:
         """Distance of each cell's centre to the border of the nearest solid cell, m, (H, W).
 
         Up to 0.2 cells too long where that cell lies diagonally.
@@ -54,7 +54,7 @@ class World:
             return False
         # The point lies up to 0.71 cells off the centre, and the distance there is up to 0.2 cells
         # too long.
-        spare = (float(self.wall_distance_m[row, col]) - radius_m) / frame.resolution
+        spare = (float(self.distance_to_wall_m[row, col]) - radius_m) / frame.resolution
         if abs(spare) > 1.0:
             return spare > 0.0
         return self._squared_gap(x, y, row, col, radius_m) > radius_m**2

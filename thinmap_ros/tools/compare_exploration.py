@@ -20,7 +20,7 @@ from thinmap_ros.evaluation.parallel_jobs import (
     add_run_options,
     complaint,
     read_report,
-    run_missing,
+    run_pending,
 )
 from thinmap_ros.evaluation.strategy_comparison import markdown
 from thinmap_ros.files import package_data
@@ -92,7 +92,7 @@ def _report_file(out: Path, job: Job) -> Path:
 
 def _work(arguments: argparse.Namespace) -> None:
     jobs = _jobs(arguments)
-    failures = run_missing(
+    failures = run_pending(
         run_job, jobs, lambda job: _report_file(arguments.out, job), arguments, arguments.quiet
     )
     if failures:

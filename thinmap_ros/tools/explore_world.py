@@ -17,7 +17,7 @@ from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.files import graphs, occupancy_maps, package_data, trajectories
 from thinmap_ros.files.atomic import write_text
 from thinmap_ros.files.worlds import read_world
-from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
 from thinmap_ros.strategies import DEFAULT, NAMES
@@ -71,7 +71,7 @@ def options_from(arguments: argparse.Namespace, strategy: str) -> Options:
         speed_m_s=arguments.speed,
         localization=arguments.localization,
         robot=arguments.robot,
-        laser=cli.config_from(arguments, Lms200Config),
+        laser=cli.config_from(arguments, LaserScannerConfig),
         time_limit_s=arguments.time_limit,
         kidnap_at_s=arguments.kidnap_at,
     )
@@ -90,7 +90,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         '--kidnap-at', type=float, help='carry the robot off after so many simulated s (with slam)'
     )
     parser.add_argument('--quiet', action='store_true', help='no progress bar')
-    cli.add_config(parser, Lms200Config, ['beams', 'field_of_view_deg', 'range_max_m'])
+    cli.add_config(parser, LaserScannerConfig, ['beams', 'field_of_view_deg', 'range_max_m'])
 
 
 def _work(arguments: argparse.Namespace) -> None:

@@ -17,7 +17,7 @@ from thinmap_ros.files.atomic import write_text
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.logs.encode import BagObjects
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
-from thinmap_ros.sim.drives import Look
+from thinmap_ros.sim.drives import DriveSample
 from thinmap_ros.tools import cli
 
 _MAP_EVERY = 300  # scans: a minute
@@ -45,7 +45,7 @@ class _Recording:
         self._log_ns = max(stamp_ns, self._log_ns + 1)
         self._writer.write(topic, _TYPES[topic], self._log_ns, message)
 
-    def mount(self, look: Look) -> None:
+    def mount(self, look: DriveSample) -> None:
         """Where the laser sits."""
         ns = look.scan.stamp_ns
         made = self._objects
@@ -53,7 +53,7 @@ class _Recording:
             '/tf_static', ns, made.transform(ns, ('base_link', 'laser'), look.scan.T_base_laser)
         )
 
-    def sensed(self, look: Look) -> None:
+    def sensed(self, look: DriveSample) -> None:
         """What the robot had at a scan, and where it truly was."""
         ns = look.scan.stamp_ns
         made = self._objects
@@ -74,7 +74,7 @@ class _Recording:
         self._write('/topology', ns, self._objects.topology(ns, pipeline.topology.map))
 
 
-def record(path: Path, looks: Iterable[Look], localized: bool) -> int:
+def record(path: Path, looks: Iterable[DriveSample], localized: bool) -> int:
     """Write the bag of a drive; returns the number of scans.
 
     localized: by the localizer, else by ground truth.
@@ -99,7 +99,7 @@ def record(path: Path, looks: Iterable[Look], localized: bool) -> int:
     return scans
 
 
-def _pipeline(first: Look, localized: bool) -> tuple[Pipeline, list[Array]]:
+def _pipeline(first: DriveSample, localized: bool) -> tuple[Pipeline, list[Array]]:
     """A pipeline for a drive that begins so, and the list that is to take each scan's true pose."""
     x, y, yaw = (float(number) for number in first.T_world_base)
     localizer = LocalizerConfig(initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)

@@ -57,7 +57,7 @@ class ReplayView:
         view.number(ns, 'error', '2 sigma, cm', 200.0 * sigma_m)
         for curve, count in (
             ('features', estimate.n_features),
-            ('local features', estimate.n_local),
+            ('local features', estimate.n_local_features),
             ('matched lines', estimate.matched),
         ):
             view.number(ns, 'count', curve, float(count))

@@ -24,7 +24,7 @@ _MEDIAN = re.compile(r'median (\d+\.\d+) ms')
 _STEPS = {'map update', 'graph update', 'explorer', 'global localization'}
 
 
-class Feed:
+class MessageView:
     """Takes messages by topic and tells a view what they mean.
 
     laser_pose gives T_base_laser (3,) of a laser's frame, or None as long as it is not known: its
@@ -184,12 +184,12 @@ def recording_from_bag(bag_path: Path, out_rrd: Path) -> None:
     with atomic_write(out_rrd) as aside:
         view = View(aside)
         try:
-            _tell(bag, Feed(view, lambda frame: _laser_pose(mounts, frame)))
+            _tell(bag, MessageView(view, lambda frame: _laser_pose(mounts, frame)))
         finally:
             view.close()
 
 
-def _tell(bag: Bag, feed: Feed) -> None:
+def _tell(bag: Bag, feed: MessageView) -> None:
     for raw in bag.messages({f'/{topic}' for topic in feed.topics}):
         try:
             feed.take(raw.topic.removeprefix('/'), bag.decode(raw))

@@ -21,7 +21,7 @@ from thinmap_ros.view.plots import (
     Panel,
     Plot,
     Raster,
-    Robots,
+    RobotMarkers,
     Segments,
     Words,
 )
@@ -187,8 +187,8 @@ def _(layer: Words, axes: 'Axes') -> None:
         )
 
 
-@_draw.register(Robots)
-def _(layer: Robots, axes: 'Axes') -> None:
+@_draw.register(RobotMarkers)
+def _(layer: RobotMarkers, axes: 'Axes') -> None:
     from matplotlib.patches import Circle
 
     for k, (x, y, theta) in enumerate(layer.poses):

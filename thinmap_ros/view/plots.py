@@ -67,7 +67,7 @@ class Words:
 
 
 @dataclass(frozen=True, eq=False)
-class Robots:
+class RobotMarkers:
     """A disc with a heading for each pose (N, 3)."""
 
     poses: Array
@@ -103,7 +103,7 @@ class Raster:
     limits: tuple[float, float] | None = None
 
 
-Layer = Curve | Band | Bars | Segments | Words | Robots | MapLayer | GraphLayer | Raster
+Layer = Curve | Band | Bars | Segments | Words | RobotMarkers | MapLayer | GraphLayer | Raster
 
 
 @dataclass(frozen=True, eq=False)

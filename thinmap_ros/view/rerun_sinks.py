@@ -41,7 +41,7 @@ def library() -> Any:
     return rerun
 
 
-class Streams:
+class RecordingSinks:
     """What is logged goes to all that were opened, at the time that was set last. Close it."""
 
     def __init__(self) -> None:

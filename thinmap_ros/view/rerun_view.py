@@ -14,7 +14,7 @@ from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
 from thinmap_ros.view import palette, rerun_blueprint
 from thinmap_ros.view.null_view import NullView
 from thinmap_ros.view.palette import rgb
-from thinmap_ros.view.rerun_sinks import Streams, library
+from thinmap_ros.view.rerun_sinks import RecordingSinks, library
 
 # What is large is drawn at most so often, and a trail grows by steps of so much: a recording grows
 # slowly.
@@ -68,7 +68,7 @@ class View(NullView):
         for the viewer.
         """
         self._rr = library()
-        self._streams = Streams()
+        self._streams = RecordingSinks()
         self._drawn_ns: dict[str, int] = {}
         self._waiting: dict[str, tuple[int, Callable[[], None]]] = {}
         self._trail_ends: dict[str, Array] = {}
@@ -106,7 +106,7 @@ class View(NullView):
             self._log('map/grid', image)
 
         self._patch = patch
-        self._now_and_then('grid', ns, draw)
+        self._throttled('grid', ns, draw)
         if rerun_blueprint.size_m(patch) > _OUTGROWN * self._framed_m:
             self._frame(patch)
 
@@ -165,7 +165,7 @@ class View(NullView):
             self._log('map/skeleton', strips)
             self._log('map/nodes', self._rr.Points3D(places, colors=shades, radii=[self._px(4.0)]))
 
-        self._now_and_then('topology', ns, draw)
+        self._throttled('topology', ns, draw)
 
     def end_nodes(self, ns: int, places: Array, probabilities: Array) -> None:
         """Show end nodes (N, 2) with their position probabilities (N,), at most once a second."""
@@ -181,7 +181,7 @@ class View(NullView):
             )
             self._log('map/end_nodes', points)
 
-        self._now_and_then('end_nodes', ns, draw)
+        self._throttled('end_nodes', ns, draw)
 
     def lines(self, ns: int, segments: Array, local: NDArray[np.bool_]) -> None:
         """Show line features by their ends (N, 2, 2), at most once a second.
@@ -195,7 +195,7 @@ class View(NullView):
             widths = [self._px(2.5 if near else 1.5) for near in local]
             self._log('map/lines', self._rr.LineStrips3D(strips, colors=shades, radii=widths))
 
-        self._now_and_then('lines', ns, draw)
+        self._throttled('lines', ns, draw)
 
     def local_area(self, ns: int, places: Array) -> None:
         """Show the nodes (N, 2) of the local area, at most once a second."""
@@ -207,7 +207,7 @@ class View(NullView):
                 'map/local_area', self._rr.Points3D(points, colors=[colour], radii=[self._px(9.0)])
             )
 
-        self._now_and_then('local_area', ns, draw)
+        self._throttled('local_area', ns, draw)
 
     def samples(self, ns: int, places: Array) -> None:
         """Show where the samples (N, 2) of global localization are, at most once a second."""
@@ -219,7 +219,7 @@ class View(NullView):
                 self._rr.Points3D(points, colors=[rgb(_SAMPLE)], radii=[self._px(1.2)]),
             )
 
-        self._now_and_then('samples', ns, draw)
+        self._throttled('samples', ns, draw)
 
     def plan(self, ns: int, points: Array) -> None:
         """Show the path (N, 2) that the robot follows, at most once a second."""
@@ -231,7 +231,7 @@ class View(NullView):
                 self._rr.LineStrips3D(strips, colors=[rgb(_PLAN)], radii=[self._px(2.0)]),
             )
 
-        self._now_and_then('plan', ns, draw)
+        self._throttled('plan', ns, draw)
 
     def target(self, ns: int, place: Array | None) -> None:
         """Show where the robot is going, (2,), or that it has no target."""
@@ -297,7 +297,7 @@ class View(NullView):
         """A radius in pixels: to be seen in a room and in a hall."""
         return self._rr.Radius.ui_points(pixels)
 
-    def _now_and_then(self, name: str, ns: int, draw: Callable[[], None]) -> None:
+    def _throttled(self, name: str, ns: int, draw: Callable[[], None]) -> None:
         """Draw now, or, where this was drawn a moment ago, let the newest wait for its turn."""
         self._waiting[name] = (ns, draw)
         drawn = self._drawn_ns.get(name)

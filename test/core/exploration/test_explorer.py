@@ -19,7 +19,7 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.sim.coverage import coverable
-from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import Simulation
 from thinmap_ros.sim.world import World
@@ -48,7 +48,7 @@ class Run:
     def __init__(self, world, config=None, seed=1, fails=None, start=START):
         self.world = world
         self.fails = fails or (lambda decision: False)
-        self.simulation = Simulation(world, start, PRESETS['2dx'], Lms200Config(), seed)
+        self.simulation = Simulation(world, start, PRESETS['2dx'], LaserScannerConfig(), seed)
         self.grid = OccupancyGrid()
         self.topology = TopologyBuilder()
         self.explorer = Explorer(config)
@@ -76,7 +76,7 @@ class Run:
         return decision
 
     def go(self, seconds=300.0):
-        moment = self.simulation.sense()
+        moment = self.simulation.read_sensors()
         while moment.stamp_ns < seconds * 1e9:
             if moment.scan is not None and self.look(moment.scan).finished:
                 break
@@ -95,7 +95,7 @@ class Run:
         return self.decisions[-1]
 
     def coverage(self):
-        return coverable(self.world, START, 0.22, 8.0).share_known(self.grid.patch())
+        return coverable(self.world, START, 0.22, 8.0).coverage(self.grid.patch())
 
 
 @cache
@@ -280,7 +280,7 @@ def test_the_successor_of_a_target_may_lie_farther_off_than_all_that_is_toured()
 
 def test_a_graph_that_is_there_before_the_map_does_not_end_the_exploration():
     run = Run(two_rooms())
-    run.look(run.simulation.sense().scan)
+    run.look(run.simulation.read_sensors().scan)
     for _ in range(5):
         run.look(run.simulation.step(0.0, 0.0).scan or run.scan)
     assert run.topology.map.nodes

@@ -12,7 +12,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.grid import rerendering
 from thinmap_ros.core.grid.correctable import CorrectableGrid
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, log_odds
-from thinmap_ros.core.grid.rerendering import KeptScan, Rerendering
+from thinmap_ros.core.grid.rerendering import Rerendering, StoredScan
 from thinmap_ros.core.grid.tiles import TILE
 from thinmap_ros.core.scan import Scan
 
@@ -182,7 +182,7 @@ def test_a_slice_does_a_bounded_part_of_the_work(monkeypatch):
     done = []
     pop = rerendering._Queue.pop
     monkeypatch.setattr(rerendering._Queue, 'pop', lambda self: done.append(pop(self)) or done[-1])
-    kept = [KeptScan.of(scan, OccupancyConfig()) for scan in SCANS]
+    kept = [StoredScan.of(scan, OccupancyConfig()) for scan in SCANS]
     work = Rerendering(OccupancyGrid(), kept * 2, np.tile(TRUE, (2, 1)), TRUE[0])
     shown = OccupancyGrid()
     slices = []
@@ -220,7 +220,7 @@ def test_a_scan_touches_no_tile_beyond_those_that_it_is_thought_to(seed):
     T = se2.pose(*rng.uniform(-50.0, 50.0, 2), rng.uniform(-3.0, 3.0))
     grid = OccupancyGrid(config)
     grid.update(scan, T)
-    extent = KeptScan.of(scan, config).extent
+    extent = StoredScan.of(scan, config).extent
     low, high = rerendering._tile_boxes([extent], T[None], grid.frame)[0]
     touched = grid.tiles()
     assert (touched >= low).all() and (touched <= high).all()

@@ -104,7 +104,7 @@ def test_the_pool_is_not_copied_and_takes_memory_where_it_is_written():
     tiles.reach(0, 0, 0, 5000)
     pool = tiles.pool
     before = resident_bytes()
-    tiles.ensure(line_of_tiles(0, 4000))
+    tiles.allocate(line_of_tiles(0, 4000))
     assert tiles.pool is pool
     tile_bytes = pool[0].nbytes
     assert resident_bytes() - before < 200 * tile_bytes

@@ -18,10 +18,10 @@ from thinmap_ros.core.planning.navigator import _touches
 from thinmap_ros.core.planning.obstacle_points import _arc, _clear_steps, _points_around
 from thinmap_ros.core.planning.path_follower import _point_ahead, length_from, nearest_point
 from thinmap_ros.core.planning.traversability import (
-    are_near,
-    reached_from,
-    renew_standing,
-    standing_places,
+    near_true_cell,
+    reachable_cells,
+    traversable_cells,
+    update_traversable_cells,
 )
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, cost_of_cells
 from thinmap_ros.core.scan import Scan
@@ -133,7 +133,7 @@ def test_hair_by_hair_a_disc_that_is_too_near_comes_no_nearer():
 def test_standing_places_are_renewed_where_something_changed(seed):
     rng = np.random.default_rng(seed)
     free = rng.random((60, 70)) < 0.97
-    standing = standing_places(free, 0.25, 0.1)
+    standing = traversable_cells(free, 0.25, 0.1)
     for _ in range(10):
         top = int(rng.integers(0, 55))
         left = int(rng.integers(0, 65))
@@ -142,8 +142,8 @@ def test_standing_places_are_renewed_where_something_changed(seed):
         part = (top, left, bottom, right)
         where = (slice(part[0], part[2]), slice(part[1], part[3]))
         free[where] = rng.random(free[where].shape) < 0.97
-        renew_standing(standing, free, part, 0.25, 0.1)
-        assert (standing == standing_places(free, 0.25, 0.1)).all()
+        update_traversable_cells(standing, free, part, 0.25, 0.1)
+        assert (standing == traversable_cells(free, 0.25, 0.1)).all()
 
 
 @pytest.mark.parametrize('seed', SEEDS)
@@ -188,8 +188,8 @@ def test_what_is_joined(seed):
     room = ~mask
     parts, _ = ndimage.label(room)
     start = tuple(int(v) for v in np.argwhere(room)[0])
-    assert (reached_from(room, start) == (parts == parts[start])).all()
-    assert not reached_from(room, tuple(int(v) for v in cells[0])).any()
+    assert (reachable_cells(room, start) == (parts == parts[start])).all()
+    assert not reachable_cells(room, tuple(int(v) for v in cells[0])).any()
 
 
 @pytest.mark.parametrize('seed', SEEDS)
@@ -215,7 +215,7 @@ def test_which_cells_are_near_a_true_one(seed):
     reach = rng.uniform(0.0, 6.0)
     places = np.argwhere(mask)
     expected = [(np.square(places - cell).sum(axis=1) <= reach * reach).any() for cell in cells]
-    assert (are_near(mask, cells, reach) == expected).all()
+    assert (near_true_cell(mask, cells, reach) == expected).all()
 
 
 @pytest.mark.parametrize('seed', SEEDS)

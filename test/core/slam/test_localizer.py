@@ -13,12 +13,12 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.odometry import LastPose
+from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
 from thinmap_ros.sim.drives import drive as drive_along
-from thinmap_ros.sim.laser import Lms200Config
-from thinmap_ros.sim.robot import PioneerConfig
+from thinmap_ros.sim.laser import LaserScannerConfig
+from thinmap_ros.sim.robot import RobotConfig
 from thinmap_ros.sim.simulation import Simulation
 from thinmap_ros.sim.world import World
 
@@ -147,7 +147,7 @@ def test_the_estimate_is_told_in_a_consistent_way(whole_drive):
         )
         np.testing.assert_array_equal(estimate.covariance, estimate.covariance.T)
         assert np.linalg.eigvalsh(estimate.covariance).min() >= -1e-12
-        assert 0.0 <= estimate.match_quality <= 1.0
+        assert 0.0 <= estimate.inlier_ratio <= 1.0
 
 
 def test_the_same_input_gives_the_same_output():
@@ -243,7 +243,7 @@ def test_a_scan_whose_points_are_one_tells_no_pose():
     scan = Scan.create(60 * PERIOD_NS, np.full(16, 2.0), 0.5, 1e-18, 0.05, 8.0)
     estimate = localizer.step(scan, np.zeros(3))
     assert np.isfinite(estimate.T_map_base).all()
-    assert estimate.match_quality == 0.0
+    assert estimate.inlier_ratio == 0.0
     assert localizer.pose[:2] == pytest.approx(before[:2], abs=4.0)
 
 
@@ -292,7 +292,7 @@ def test_a_scan_of_nothing_leaves_the_odometry(value):
     moved = se2.between(before.T_map_base, estimate.T_map_base)
     np.testing.assert_allclose(moved, ahead, atol=0.06)
     assert np.trace(estimate.covariance) > np.trace(before.covariance)
-    assert estimate.match_quality == 0.0
+    assert estimate.inlier_ratio == 0.0
 
 
 def test_without_any_wall_the_odometry_is_followed():
@@ -359,7 +359,7 @@ def test_beyond_a_hall_in_which_nothing_is_seen_the_map_goes_on(rng):
         truth = np.array([x, 7.0, 0.0])
         estimate = localizer.step(scan_in(hall, truth, rng, k * PERIOD_NS, beams=46), odom)
     assert not estimate.lost
-    assert estimate.match_quality > 0.9
+    assert estimate.inlier_ratio > 0.9
     assert abs(estimate.T_map_base - truth).max() < 0.3
 
 
@@ -385,7 +385,7 @@ def test_a_hall_that_is_wider_than_the_laser_sees_is_mapped_all_the_same(seed):
     """Across it by odometry alone, 25 m with bends, then along its walls back to where it began."""
     start = se2.pose(2.0, 2.0, np.pi / 2.0)
     world = World.from_patch('hall', GridPatch(GridFrame(-0.1, -0.1, 0.1), HALL), start)
-    simulation = Simulation(world, start, PioneerConfig(), Lms200Config(), seed)
+    simulation = Simulation(world, start, RobotConfig(), LaserScannerConfig(), seed)
     across = along((2, 2), (2, 12), (9, 14), (16, 10), (23, 14), (30, 11), (36.5, 12))
     round_it = along((36.5, 12), (36.5, 20), (3, 21), (3, 3))
     back = along((3, 3), (2, 2.5), (2, 12))
@@ -479,7 +479,7 @@ def test_a_robot_that_is_carried_off_begins_a_new_map_and_says_so():
     assert not any(estimate.lost for _, estimate, _ in rows)
     assert any(lost[:45])
     assert lost[-1], 'where the new map lies is not known'
-    assert propagated_covariance[-1][1].match_quality > 0.9, 'it fits the new map'
+    assert propagated_covariance[-1][1].inlier_ratio > 0.9, 'it fits the new map'
     assert propagated_covariance[-1][1].covariance[0, 0] > 100.0
     assert len(localizer.keyframes) > before
     # In the new map it goes on as ever.
@@ -659,7 +659,7 @@ def test_a_killed_localizer_goes_on_in_the_occupancy_map(slip):
         if k < 400:
             estimate = localizer.step(scan, odom)
             grid.update(scan, estimate.T_map_base)
-            last = LastPose(scan.stamp_ns, estimate.T_map_odom, odom)
+            last = OdometryAnchor(scan.stamp_ns, estimate.T_map_odom, odom)
         elif k >= 450:
             if k == 450:
                 began = odom

@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
-from thinmap_ros.core.grid.rerendering import KeptScan, Rerendering
-from thinmap_ros.core.grid.scan_history import MovedPoses, PoseHistory
+from thinmap_ros.core.grid.rerendering import Rerendering, StoredScan
+from thinmap_ros.core.grid.scan_history import CorrectedPoses, PoseHistory
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
@@ -25,7 +25,7 @@ class CorrectableGrid:
         """Begin with a grid; without its scans (keeps_scans) it is never corrected."""
         self.shown = grid
         self.corrected_ns = corrected_ns
-        self._history: PoseHistory[KeptScan] | None = PoseHistory() if keeps_scans else None
+        self._history: PoseHistory[StoredScan] | None = PoseHistory() if keeps_scans else None
         self._pending_ns: int | None = None
         self._rerendering: Rerendering | None = None
         self._T_map_base = np.zeros(3)  # pose of the robot
@@ -50,7 +50,7 @@ class CorrectableGrid:
         self._rerendering = None
         return True
 
-    def update(self, scan: Scan | None, T_map_base: Array) -> MovedPoses | None:
+    def update(self, scan: Scan | None, T_map_base: Array) -> CorrectedPoses | None:
         """Continue the re-rendering, then add a scan made at a robot pose (3,).
 
         scan: None where nobody knows where it was made. Returns the moved poses when a
@@ -63,7 +63,7 @@ class CorrectableGrid:
             self._add_scan(scan, T_map_base)
         return moved
 
-    def finish(self) -> MovedPoses | None:
+    def finish(self) -> CorrectedPoses | None:
         """Complete the re-rendering, if one is under way, and return the moved poses."""
         moved = None
         while self.is_rerendering:
@@ -74,12 +74,12 @@ class CorrectableGrid:
         self.shown.update(scan, T_map_base)
         if self._history is None:
             return
-        kept = KeptScan.of(scan, self.shown.config)
+        kept = StoredScan.of(scan, self.shown.config)
         self._history.add(scan.stamp_ns, T_map_base, kept)
         if self._rerendering is not None:
             self._rerendering.add_scan(kept, T_map_base)
 
-    def _render_slice(self) -> MovedPoses | None:
+    def _render_slice(self) -> CorrectedPoses | None:
         if self._history is None or self._pending_ns is None:
             return None
         if self._rerendering is None:

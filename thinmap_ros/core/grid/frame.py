@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.se2 import FARTHEST_M, Array
+from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array
 
-FINEST_M = 0.001
-COARSEST_M = 10.0
+MIN_RESOLUTION_M = 0.001
+MAX_RESOLUTION_M = 10.0
 
 
 @dataclass(frozen=True)
@@ -26,14 +26,14 @@ class GridFrame:
     resolution: float
 
     def __post_init__(self) -> None:
-        if not (abs(self.origin_x) <= FARTHEST_M and abs(self.origin_y) <= FARTHEST_M):
+        if not (abs(self.origin_x) <= MAX_COORDINATE_M and abs(self.origin_y) <= MAX_COORDINATE_M):
             raise InputError(
                 f'map with its origin at {self.origin_x:g}, {self.origin_y:g} m: expected numbers '
-                f'from {-FARTHEST_M:g} to {FARTHEST_M:g}'
+                f'from {-MAX_COORDINATE_M:g} to {MAX_COORDINATE_M:g}'
             )
-        if not FINEST_M <= self.resolution <= COARSEST_M:
+        if not MIN_RESOLUTION_M <= self.resolution <= MAX_RESOLUTION_M:
             raise InputError(
-                f'map of cells of {self.resolution:g} m: expected {FINEST_M:g} to {COARSEST_M:g} m'
+                f'map of cells of {self.resolution:g} m: expected {MIN_RESOLUTION_M:g} to {MAX_RESOLUTION_M:g} m'
             )
 
     def cells_of(self, points: Array) -> NDArray[np.int64]:

@@ -7,7 +7,7 @@ import numpy as np
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
-from thinmap_ros.core.grid.tiles import MOST_CELLS
+from thinmap_ros.core.grid.tiles import MAX_CELLS
 
 
 class MapMirror:
@@ -45,10 +45,10 @@ class MapMirror:
             )
         rows_in_all = max(row + rows, self.patch.shape[0]) - min(row, 0)
         cols_in_all = max(col + cols, self.patch.shape[1]) - min(col, 0)
-        if rows_in_all * cols_in_all > MOST_CELLS:
+        if rows_in_all * cols_in_all > MAX_CELLS:
             raise InputError(
                 f'map window at {window.frame}: a map of {rows_in_all} x {cols_in_all} cells: '
-                f'expected {MOST_CELLS} at most'
+                f'expected {MAX_CELLS} at most'
             )
         before = (max(-row, 0), max(-col, 0))
         after = (max(row + rows - self.patch.shape[0], 0), max(col + cols - self.patch.shape[1], 0))

@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import COARSEST_M, FINEST_M, GridFrame
+from thinmap_ros.core.grid.frame import MAX_RESOLUTION_M, MIN_RESOLUTION_M, GridFrame
 from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
 from thinmap_ros.core.grid.raytrace import fill_segment
-from thinmap_ros.core.grid.rendered_map import Picture
-from thinmap_ros.core.grid.tiles import FARTHEST_TILE, TILE, TileStore
+from thinmap_ros.core.grid.rendered_map import RenderedMap
+from thinmap_ros.core.grid.tiles import MAX_TILE_INDEX, TILE, TileStore
 from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.snapshot import FAR_M, Field
+from thinmap_ros.core.snapshot import MAX_COORDINATE_M, Field
 
 # Log odds are kept as whole thousandths in int16: small, exact to add, and the same on every
 # machine.
@@ -35,8 +35,13 @@ _LONGEST_SURFACE_M = 3.0
 _GRAZED_M = 0.4
 _SURELY_OCCUPIED = 0.9
 FIELDS = {
-    'frame': Field(np.float64, (3,), (-FAR_M, -FAR_M, FINEST_M), (FAR_M, FAR_M, COARSEST_M)),
-    'tiles': Field(np.int64, ('n', 2), -FARTHEST_TILE, FARTHEST_TILE),
+    'frame': Field(
+        np.float64,
+        (3,),
+        (-MAX_COORDINATE_M, -MAX_COORDINATE_M, MIN_RESOLUTION_M),
+        (MAX_COORDINATE_M, MAX_COORDINATE_M, MAX_RESOLUTION_M),
+    ),
+    'tiles': Field(np.int64, ('n', 2), -MAX_TILE_INDEX, MAX_TILE_INDEX),
     'log_odds': Field(np.int16, ('n', TILE, TILE), -_LIMIT, _LIMIT),
 }
 
@@ -117,7 +122,7 @@ class OccupancyGrid:
             )
         self._tiles = TileStore()
         self._percent = _percent_table()
-        self._picture = Picture(self._percent)
+        self._picture = RenderedMap(self._percent)
         self._news: NDArray[np.int16] = np.zeros((0, 0), dtype=np.int16)
         self._fan: tuple[int, float, float] = (0, 0.0, 0.0)
         self._cosines = self._sines = np.empty(0)
@@ -158,7 +163,7 @@ class OccupancyGrid:
         checked = snapshot.check(state, FIELDS, 'grid')
         tiles = checked['tiles']
         odds = checked['log_odds']
-        flat = tiles[:, 0] * (2 * FARTHEST_TILE + 1) + tiles[:, 1]
+        flat = tiles[:, 0] * (2 * MAX_TILE_INDEX + 1) + tiles[:, 1]
         snapshot.require(len(np.unique(flat)) == len(tiles), 'grid: tiles', 'each once')
         origin_x, origin_y, resolution = checked['frame'].tolist()
         grid = OccupancyGrid(config, GridFrame(origin_x, origin_y, resolution))
@@ -179,7 +184,7 @@ class OccupancyGrid:
         if scan.ranges_m.size == 0 or not se2.is_finite(T_map_base):
             return
         T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
-        if not se2.is_on_earth(T_map_laser):
+        if not se2.is_bounded_pose(T_map_laser):
             place = f'{T_map_laser[0]:g}, {T_map_laser[1]:g} m'
             raise InputError(f'scan at {scan.stamp_ns} ns: laser at {place}: too far to be mapped')
         resolution = self.frame.resolution
@@ -226,7 +231,7 @@ class OccupancyGrid:
             tiles.pool, tiles.directory, place, self._news, box, laser, self._steps, self._grazed
         )
         if _apply(tiles.pool, tiles.directory, place, self._news, box, self._steps):
-            tiles.ensure(_tiles_of(self._news, box) + (tile_row, tile_col))
+            tiles.allocate(_tiles_of(self._news, box) + (tile_row, tile_col))
             _apply(tiles.pool, tiles.directory, place, self._news, box, self._steps)
 
     def tiles(self) -> NDArray[np.int64]:

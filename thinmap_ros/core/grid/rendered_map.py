@@ -13,7 +13,7 @@ from thinmap_ros.core.grid.tiles import TileStore
 Bounds = tuple[int, int, int, int]
 
 
-class Picture:
+class RenderedMap:
     """Cells (H, W) int8 of all tiles.
 
     Also which part is out of date, and which rectangle holds all that is known.

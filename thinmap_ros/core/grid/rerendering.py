@@ -22,7 +22,7 @@ _LAST_RING = 1 << 30
 _Cells = NDArray[np.int64]
 
 
-class KeptScan(NamedTuple):
+class StoredScan(NamedTuple):
     """A scan, and the rectangle that its beams lie in.
 
     extent (4,): lowest x and y, highest x and y, robot frame, m.
@@ -32,7 +32,7 @@ class KeptScan(NamedTuple):
     extent: Array
 
     @staticmethod
-    def of(scan: Scan, config: OccupancyConfig) -> 'KeptScan':
+    def of(scan: Scan, config: OccupancyConfig) -> 'StoredScan':
         """A scan as a grid with this configuration renders it."""
         usable = config.usable_range_m
         ranges = np.where(scan.hit, scan.ranges_m, 0.0)
@@ -42,7 +42,7 @@ class KeptScan(NamedTuple):
         bearings = scan.angles_rad + scan.T_base_laser[2]
         x = np.append(reach * np.cos(bearings), 0.0) + scan.T_base_laser[0]
         y = np.append(reach * np.sin(bearings), 0.0) + scan.T_base_laser[1]
-        return KeptScan(scan, np.array([x.min(), y.min(), x.max(), y.max()]))
+        return StoredScan(scan, np.array([x.min(), y.min(), x.max(), y.max()]))
 
 
 class _Task(NamedTuple):
@@ -64,7 +64,7 @@ class _Queue:
     """
 
     def __init__(
-        self, scans: Sequence[KeptScan], poses: Array, rings: _Cells, tile_counts: _Cells
+        self, scans: Sequence[StoredScan], poses: Array, rings: _Cells, tile_counts: _Cells
     ) -> None:
         """Begin with scans at poses (N, 3): nearest ring (N,) and number of tiles (N,) of each."""
         order = np.argsort(rings, kind='stable')
@@ -112,7 +112,7 @@ class Rerendering:
     """
 
     def __init__(
-        self, like: OccupancyGrid, kept: Sequence[KeptScan], poses: Array, T_map_base: Array
+        self, like: OccupancyGrid, kept: Sequence[StoredScan], poses: Array, T_map_base: Array
     ) -> None:
         """Begin with the kept scans at their poses (N, 3).
 
@@ -132,7 +132,7 @@ class Rerendering:
         """Whether all scans are rendered."""
         return len(self._queue) == 0
 
-    def add_scan(self, kept: KeptScan, T_map_base: Array) -> None:
+    def add_scan(self, kept: StoredScan, T_map_base: Array) -> None:
         """Add a scan that came meanwhile, made at a pose (3,) that is right already."""
         self._added.update(kept.scan, T_map_base)
         box = _tile_boxes([kept.extent], T_map_base[None], self.grid.frame)[0]

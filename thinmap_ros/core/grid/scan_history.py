@@ -20,7 +20,7 @@ _FARTHEST_PLACE = 1 << 26  # more than any place on earth is from the origin
 Kept = TypeVar('Kept')
 
 
-class MovedPoses(NamedTuple):
+class CorrectedPoses(NamedTuple):
     """Poses (N, 3) of the kept scans before and after the corrections that a map has undergone."""
 
     before: Array
@@ -95,7 +95,7 @@ class PoseHistory(Generic[Kept]):
         for number, place in zip(kept.tolist(), places.tolist(), strict=True):
             self._at_place.setdefault(place, deque()).append(number)
 
-    def accept_corrections(self) -> MovedPoses:
+    def accept_corrections(self) -> CorrectedPoses:
         """Poses of the kept scans before and after the corrections since the last call.
 
         Those of scans that came after the first of these corrections are given before it as if the
@@ -110,7 +110,7 @@ class PoseHistory(Generic[Kept]):
             before = np.vstack([self._before, later])
         self._before = None
         kept = self._kept_numbers()
-        return MovedPoses(before[kept], after[kept])
+        return CorrectedPoses(before[kept], after[kept])
 
     def _kept_numbers(self) -> NDArray[np.int64]:
         return np.array(list(self._kept), dtype=np.int64)

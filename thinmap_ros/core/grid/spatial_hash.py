@@ -3,7 +3,7 @@
 import math
 
 
-class Buckets:
+class SpatialHash:
     """Which numbers lie in which square of the plane.
 
     What is near costs the same however many lie elsewhere.

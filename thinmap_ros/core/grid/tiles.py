@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import FINEST_M
-from thinmap_ros.core.se2 import FARTHEST_M
+from thinmap_ros.core.grid.frame import MIN_RESOLUTION_M
+from thinmap_ros.core.se2 import MAX_COORDINATE_M
 
 TILE = 64  # cells along the edge of a tile
 NO_TILE = -1
 _MOST_TILES = 1 << 15  # 134 million cells, some 1.1 km in each direction at 0.1 m
-MOST_CELLS = _MOST_TILES * TILE * TILE
-FARTHEST_TILE = int(FARTHEST_M / FINEST_M) // TILE  # of the finest cells
+MAX_CELLS = _MOST_TILES * TILE * TILE
+MAX_TILE_INDEX = int(MAX_COORDINATE_M / MIN_RESOLUTION_M) // TILE  # of the finest cells
 _FEWEST = 64  # tiles that any pool has room for
 # Room beyond what is needed, on a side of the directory that grows: a share of its length, and at
 # least some tiles.
@@ -119,7 +119,7 @@ class TileStore:
         at = places - (self.first_row, self.first_col)
         self.directory[at[:, 0], at[:, 1]] = np.arange(len(at))
 
-    def ensure(self, tiles: NDArray[np.int64]) -> None:
+    def allocate(self, tiles: NDArray[np.int64]) -> None:
         """Make the tiles (N, 2), (row, col) in tile coordinates inside the directory, exist.
 
         Those that did not are stored in the order in which they are given.
@@ -184,7 +184,7 @@ class TileStore:
         ]
         tiles = tiles.reshape(2, -1).T
         self.reach(int(tiles[0, 0]), int(tiles[0, 1]), int(tiles[-1, 0]), int(tiles[-1, 1]))
-        self.ensure(tiles)
+        self.allocate(tiles)
         for tile_row, tile_col, slot in self._tiles_within(row, col, rows, cols):
             top = tile_row * TILE
             left = tile_col * TILE
@@ -211,7 +211,7 @@ class TileStore:
         low_row, low_col = tiles.min(axis=0).tolist()
         high_row, high_col = tiles.max(axis=0).tolist()
         self.reach(low_row, low_col, high_row, high_col)
-        self.ensure(tiles)
+        self.allocate(tiles)
         at = tiles - (self.first_row, self.first_col)
         self.pool[self.directory[at[:, 0], at[:, 1]]] = cells
 

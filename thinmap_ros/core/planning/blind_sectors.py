@@ -18,7 +18,7 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
 # The narrowest thing that must not be driven over unseen: a leg. Sectors are sampled this densely.
-NARROWEST_M = 0.1
+MIN_OBSTACLE_WIDTH_M = 0.1
 _REMEMBERED_SCANS = 32
 # Between two scans that are remembered
 _APART_M = 0.05
@@ -34,7 +34,7 @@ class _Observation(NamedTuple):
     T_map_laser: Array
 
 
-class UnseenSectors:
+class BlindSectors:
     """The sectors of invalid beams in the newest scan, less what the scans just before saw."""
 
     def __init__(self) -> None:
@@ -44,7 +44,7 @@ class UnseenSectors:
     def observe(self, T_map_laser: Array, scan: Scan) -> None:
         """Take a scan made by a laser at a pose (3,), map frame."""
         seen_m = np.where(scan.hit, scan.ranges_m, np.where(scan.valid, np.inf, np.nan))
-        seen_m = np.where(scan.too_near, 0.0, seen_m)
+        seen_m = np.where(scan.below_range_min, 0.0, seen_m)
         newest = _Observation(seen_m, scan.angle_min_rad, scan.angle_increment_rad, T_map_laser)
         if self._newest is not None and self._is_apart(self._newest.T_map_laser):
             self._earlier.append(self._newest)
@@ -99,16 +99,16 @@ def _sector_points(
         if begun < 0:
             continue
         width = (k - begun + 1) * abs(step)
-        ring = NARROWEST_M / width
+        ring = MIN_OBSTACLE_WIDTH_M / width
         while ring <= reach:
-            across = max(1, int(math.ceil(ring * (k - begun) * abs(step) / NARROWEST_M)))
+            across = max(1, int(math.ceil(ring * (k - begun) * abs(step) / MIN_OBSTACLE_WIDTH_M)))
             for j in range(across + 1):
                 beam = start + begun + (k - 1 - begun) * j / across
                 angle = laser[2] + first + step * beam
                 points.append(
                     (laser[0] + ring * math.cos(angle), laser[1] + ring * math.sin(angle))
                 )
-            ring += NARROWEST_M
+            ring += MIN_OBSTACLE_WIDTH_M
         begun = -1
     found = np.empty((len(points), 2))
     for i in range(len(points)):

@@ -23,7 +23,7 @@ class Route:
 
 
 @dataclass(frozen=True)
-class Access:
+class GraphAccess:
     """Where a point joins the graph.
 
     The edge and the index into its path nearest to it, or a lone node.
@@ -67,7 +67,7 @@ def shortest_path(topology: TopologicalMap, start_id: int, goal_id: int) -> Rout
     return None
 
 
-def access(topology: TopologicalMap, x: float, y: float) -> Access | None:
+def access(topology: TopologicalMap, x: float, y: float) -> GraphAccess | None:
     """How a point (m, map frame) joins the graph; None where the map is empty."""
     found = topology.nearest_edge_point(x, y)
     node = topology.nearest_node(x, y)
@@ -75,17 +75,17 @@ def access(topology: TopologicalMap, x: float, y: float) -> Access | None:
         return None
     to_node = ((node.x - x) ** 2 + (node.y - y) ** 2) ** 0.5
     if found is None or to_node < found[2] - 1e-9:
-        return Access(None, 0, to_node, {node.id: to_node})
+        return GraphAccess(None, 0, to_node, {node.id: to_node})
     edge_id, index, approach = found
     edge = topology.edges[edge_id]
     along = _along(edge)
     ends: dict[int, float] = {}
     for node_id, length in ((edge.a, along[index]), (edge.b, along[-1] - along[index])):
         ends[node_id] = min(ends.get(node_id, np.inf), approach + float(length))
-    return Access(edge_id, index, approach, ends)
+    return GraphAccess(edge_id, index, approach, ends)
 
 
-def costs_from(topology: TopologicalMap, x: float, y: float) -> dict[int, float]:
+def path_lengths_to_nodes(topology: TopologicalMap, x: float, y: float) -> dict[int, float]:
     """Length of the shortest way from a point (m, map frame) to every node joined with it, m."""
     start = access(topology, x, y)
     if start is None:
@@ -107,14 +107,14 @@ def costs_from(topology: TopologicalMap, x: float, y: float) -> dict[int, float]
     return costs
 
 
-def costs_to(
+def path_lengths_to_goals(
     topology: TopologicalMap, from_pose: Array, goals: dict[int, Array]
 ) -> dict[int, float]:
     """Length of the shortest way along the graph from a pose to each goal (x, y, ...), if any, m.
 
     A goal has the id of the node that it stands for, if that is in the map.
     """
-    to_nodes = costs_from(topology, float(from_pose[0]), float(from_pose[1]))
+    to_nodes = path_lengths_to_nodes(topology, float(from_pose[0]), float(from_pose[1]))
     costs = {}
     for goal_id, goal in goals.items():
         x = float(goal[0])
@@ -139,7 +139,7 @@ def path_points(topology: TopologicalMap, route: Route) -> Array:
     return np.concatenate(parts)
 
 
-def path_between(
+def route_path(
     topology: TopologicalMap, start_xy: tuple[float, float], goal_xy: tuple[float, float]
 ) -> Array | None:
     """Way (K, 2) along edges between any two points, m, map frame.
@@ -160,7 +160,9 @@ def path_between(
     return np.concatenate([[start_xy], best[1], [goal_xy]])
 
 
-def _ways(topology: TopologicalMap, start: Access, goal: Access) -> Iterator[tuple[float, Array]]:
+def _ways(
+    topology: TopologicalMap, start: GraphAccess, goal: GraphAccess
+) -> Iterator[tuple[float, Array]]:
     """Over each node that the start joins to each that the goal joins.
 
     Also straight along an edge that both lie on.
@@ -181,7 +183,7 @@ def _ways(topology: TopologicalMap, start: Access, goal: Access) -> Iterator[tup
                 yield to_a + route.cost_m + to_b, np.concatenate(parts)
 
 
-def _to_node(topology: TopologicalMap, point: Access, node_id: int) -> Array:
+def _to_node(topology: TopologicalMap, point: GraphAccess, node_id: int) -> Array:
     """Points from where a point joins an edge up to, without, one of the edge's nodes."""
     if point.edge_id is None:
         return np.empty((0, 2))

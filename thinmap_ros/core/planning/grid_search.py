@@ -24,7 +24,7 @@ _BUCKETS = 32
 _FAR = 2**31 - 1
 
 
-def ways_from(allowed: Mask, start: tuple[int, int], goals: Cells) -> Array:
+def path_lengths_from(allowed: Mask, start: tuple[int, int], goals: Cells) -> Array:
     """Length (N,), cells, of the way over allowed cells (H, W) from (row, col) to each goal (N, 2).
 
     inf where there is none, where a goal is not allowed, and from a start beyond the grid. A start
@@ -35,7 +35,7 @@ def ways_from(allowed: Mask, start: tuple[int, int], goals: Cells) -> Array:
     return _cells(steps)
 
 
-def field_from(allowed: Mask, start: tuple[int, int]) -> Array:
+def distance_field_from(allowed: Mask, start: tuple[int, int]) -> Array:
     """Length, in cells, of the way over allowed cells from a start (row, col) to each cell (H, W).
 
     inf where there is none, and everywhere from a start beyond the grid.
@@ -69,7 +69,7 @@ def fine(squares: Mask, factor: int, cells: Mask) -> Mask:
     return result
 
 
-class WayTable:
+class PathLengthTable:
     """Ways between places of a map that grows, on a coarse grid, remembered for a while.
 
     Most places stay. Ways may lead through the unknown, where a step counts unknown_weight times:

@@ -13,14 +13,14 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.config import parameter
 from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, GridPatch
 from thinmap_ros.core.jit import kernel
-from thinmap_ros.core.planning.obstacle_points import SeenPoints
+from thinmap_ros.core.planning.obstacle_points import ObstaclePoints
 from thinmap_ros.core.planning.path_follower import (
-    Follower,
-    FollowerConfig,
+    PathFollower,
+    PathFollowerConfig,
     length_from,
     nearest_point,
 )
-from thinmap_ros.core.planning.recent_path import Trail
+from thinmap_ros.core.planning.recent_path import RecentPath
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -43,7 +43,7 @@ _STANDSTILLS = 5
 
 
 @dataclass(frozen=True)
-class NavigatorConfig(WavefrontConfig, FollowerConfig):
+class NavigatorConfig(WavefrontConfig, PathFollowerConfig):
     """Parameters of planning and following, and when a goal counts as reached or is given up."""
 
     body_radius_m: float = parameter(
@@ -84,9 +84,9 @@ class Navigator:
     def __init__(self, config: NavigatorConfig | None = None) -> None:
         self.config = config or NavigatorConfig()
         self.path: Array | None = None
-        self._follower = Follower(self.config)
-        self._trail = Trail()
-        self._seen = SeenPoints()
+        self._follower = PathFollower(self.config)
+        self._trail = RecentPath()
+        self._seen = ObstaclePoints()
         self._goal: tuple[float, float] | None = None
         self._heading_rad: float | None = None
         self._path_age_s = 0.0
@@ -112,9 +112,9 @@ class Navigator:
         self._standstills = 0
         self._nearest_m = math.inf
 
-    def halt(self) -> None:
+    def reset_velocity(self) -> None:
         """Take note that the robot was stopped by somebody else; it goes on from rest."""
-        self._follower.slowed(0.0, 0.0)
+        self._follower.override_speed(0.0, 0.0)
 
     def cancel(self) -> None:
         """Forget the goal; the next steps bring the robot to rest."""
@@ -226,11 +226,11 @@ class Navigator:
         slowest = before[0] - self.config.max_acceleration_m_s2 * dt_s
         if allowed > max(_CREEP_M_S, slowest):
             # Slower on the same arc.
-            return Command(*self._follower.slowed(allowed, w * allowed / v), 'driving')
+            return Command(*self._follower.override_speed(allowed, w * allowed / v), 'driving')
         squeezed = self._squeezed_speed(T_map_base, min(v, _SQUEEZED_M_S), w / v)
         if squeezed > _CREEP_M_S and slowest <= squeezed:
-            return Command(*self._follower.slowed(squeezed, w * squeezed / v), 'driving')
-        self._follower.slowed(*before)
+            return Command(*self._follower.override_speed(squeezed, w * squeezed / v), 'driving')
+        self._follower.override_speed(*before)
         brakes = slowest > 0.0
         return self._brake(T_map_base, dt_s) if brakes else self._face_obstacle(T_map_base, dt_s)
 
@@ -242,7 +242,7 @@ class Navigator:
         before = self._follower.v
         v, w = self._follower.stop(dt_s)
         if self._safe_speed(T_map_base, before, w * before / v, self.config.body_radius_m) < v:
-            v, w = self._follower.slowed(0.0, 0.0)
+            v, w = self._follower.override_speed(0.0, 0.0)
         return Command(v, w, 'driving')
 
     def _face_obstacle(self, T_map_base: Array, dt_s: float) -> Command:
@@ -256,12 +256,12 @@ class Navigator:
         self._blocked_s += dt_s
         if self._blocked_s > self.config.blocked_s or self._standstills > _STANDSTILLS:
             self.cancel()
-            return Command(*self._follower.slowed(0.0, 0.0), 'failed', reason)
+            return Command(*self._follower.override_speed(0.0, 0.0), 'failed', reason)
         heading = self._heading_of_path(T_map_base)
         if abs(se2.wrap(heading - float(T_map_base[2]))) > _AIM_RAD:
             return Command(*self._follower.turn_to(T_map_base, heading, dt_s), 'driving')
         self._path_age_s = max(self._path_age_s, self.config.replan_s - 0.5)
-        return Command(*self._follower.slowed(0.0, 0.0), 'blocked', reason)
+        return Command(*self._follower.override_speed(0.0, 0.0), 'blocked', reason)
 
     def _heading_of_path(self, T_map_base: Array) -> float:
         assert self.path is not None
@@ -281,7 +281,7 @@ class Navigator:
         """Highest speed up to v at which it still stops before a scan point is within a radius."""
         braking = self.config.max_acceleration_m_s2
         needed = v * self.config.reaction_s + v * v / (2.0 * braking)
-        free_m = self._seen.clear_m(T_map_base, w / v, needed, radius_m)
+        free_m = self._seen.free_arc_length_m(T_map_base, w / v, needed, radius_m)
         late = self.config.reaction_s
         return min(v, braking * (math.sqrt(late * late + 2.0 * free_m / braking) - late))
 

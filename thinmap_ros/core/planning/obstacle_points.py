@@ -6,7 +6,7 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.jit import kernel
-from thinmap_ros.core.planning.blind_sectors import NARROWEST_M, UnseenSectors
+from thinmap_ros.core.planning.blind_sectors import MIN_OBSTACLE_WIDTH_M, BlindSectors
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
@@ -16,7 +16,7 @@ _BESIDE = 2  # beams to either side
 _SAME_M = 0.03  # by how much those that see the same thing differ
 
 
-class SeenPoints:
+class ObstaclePoints:
     """Where the beams of the newest scan ended, and points seen earlier where it does not look.
 
     The latter only as long as they are near.
@@ -29,7 +29,7 @@ class SeenPoints:
     def __init__(self) -> None:
         self.points: Array = np.empty((0, 2))
         self.hidden = False
-        self._unseen = UnseenSectors()
+        self._unseen = BlindSectors()
         self._scan: Scan | None = None
 
     def look(self, T_map_base: Array, scan: Scan | None) -> None:
@@ -44,7 +44,7 @@ class SeenPoints:
         step = scan.angle_increment_rad
         T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
         hits = np.where(scan.hit, scan.ranges_m, np.nan)
-        hits = np.where(scan.too_near, scan.range_min_m, hits)
+        hits = np.where(scan.below_range_min, scan.range_min_m, hits)
         self._unseen.observe(T_map_laser, scan)
         self.points = _points_around(hits, first, step, T_map_laser, self.points, T_map_base)
 
@@ -61,7 +61,7 @@ class SeenPoints:
         """
         return float(_room_along(path, first, length_m, self.points))
 
-    def clear_m(
+    def free_arc_length_m(
         self, T_map_base: Array, curvature: float, length_m: float, radius_m: float
     ) -> float:
         """How far, m, a disc can be moved along an arc from a pose (3,), at most length_m.
@@ -83,7 +83,7 @@ class SeenPoints:
             return points
         # Right at its sides, a robot that begins to move has seen nothing, whatever its laser.
         away = se2.transform_points(se2.invert(T_map_base), points)
-        near = np.hypot(away[:, 0], away[:, 1]) < radius_m + NARROWEST_M
+        near = np.hypot(away[:, 0], away[:, 1]) < radius_m + MIN_OBSTACLE_WIDTH_M
         return np.asarray(points[~(near & (np.abs(away[:, 1]) > away[:, 0]))])
 
 

@@ -22,7 +22,7 @@ _SLOWEST_M_S = 0.1
 
 
 @dataclass(frozen=True)
-class FollowerConfig(Config):
+class PathFollowerConfig(Config):
     """Limits of the drive, and how closely a path is followed."""
 
     max_speed_m_s: float = parameter(0.2, 'speed limit, m/s', low=0.01, high=5.0)
@@ -45,20 +45,20 @@ class FollowerConfig(Config):
     )
 
 
-class Follower:
+class PathFollower:
     """Follows one path after the other.
 
     Remembers the last command, so that the acceleration limits hold.
     """
 
-    def __init__(self, config: FollowerConfig) -> None:
+    def __init__(self, config: PathFollowerConfig) -> None:
         self.config = config
         self.v = 0.0
         self.w = 0.0
         self._turning = False
 
     def command(
-        self, T_map_base: Array, path: Array, dt_s: float, spare_m: float = math.inf
+        self, T_map_base: Array, path: Array, dt_s: float, clearance_margin_m: float = math.inf
     ) -> tuple[float, float]:
         """Speed (m/s) and turn rate (rad/s) for the next dt_s along a path (K, 2) to a stop.
 
@@ -66,7 +66,7 @@ class Follower:
         more closely.
         """
         config = self.config
-        narrow = _SHORTEST_M + _SPARE_FACTOR * max(spare_m, 0.0)
+        narrow = _SHORTEST_M + _SPARE_FACTOR * max(clearance_margin_m, 0.0)
         reach = min(max(config.lookahead_m, config.lookahead_s * self.v), narrow)
         x, y, theta = T_map_base.tolist()
         ahead_x, ahead_y, rest_m = _point_ahead(path, x, y, reach, config.stray_m)
@@ -101,7 +101,7 @@ class Follower:
         v = max(self.v - self.config.max_acceleration_m_s2 * dt_s, 0.0)
         return self._limited(v, self.w * v / self.v if self.v > 0.0 else 0.0, dt_s)
 
-    def slowed(self, v: float, w: float) -> tuple[float, float]:
+    def override_speed(self, v: float, w: float) -> tuple[float, float]:
         """Note that a command was made slower than the limits allow, for something right ahead."""
         self.v = v
         self.w = w

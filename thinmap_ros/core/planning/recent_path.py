@@ -18,7 +18,7 @@ _JUMP_M = 0.5
 _LONGEST = 1300  # points
 
 
-class Trail:
+class RecentPath:
     """The last of the robot's way.
 
     A pose that jumps, as where the map was corrected, begins it anew.

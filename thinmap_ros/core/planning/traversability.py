@@ -16,7 +16,7 @@ Cells = NDArray[np.int64]
 Part = tuple[int, int, int, int]
 
 
-def standing_places(free: Mask, radius_m: float, resolution: float) -> Mask:
+def traversable_cells(free: Mask, radius_m: float, resolution: float) -> Mask:
     """Cells (H, W) in which the centre of a robot of a radius may be.
 
     All that is not free counts as solid.
@@ -24,7 +24,7 @@ def standing_places(free: Mask, radius_m: float, resolution: float) -> Mask:
     return standing_room(column_distance(free), radius_m / resolution)
 
 
-def renew_standing(
+def update_traversable_cells(
     standing: Mask, free: Mask, part: Part, radius_m: float, resolution: float
 ) -> None:
     """Bring standing places (H, W) up to date where free cells have changed within a part.
@@ -38,14 +38,14 @@ def renew_standing(
     right = part[3] + reach
     # As many cells again are read, so that the cut is no wall.
     wide = free[max(top - reach, 0) : bottom + reach, max(left - reach, 0) : right + reach]
-    found = standing_places(np.ascontiguousarray(wide), radius_m, resolution)
+    found = traversable_cells(np.ascontiguousarray(wide), radius_m, resolution)
     row = top - max(top - reach, 0)
     col = left - max(left - reach, 0)
     renewed = standing[top:bottom, left:right]
     renewed[:] = found[row : row + renewed.shape[0], col : col + renewed.shape[1]]
 
 
-def let_out(
+def escape_cells(
     standing: Mask,
     free: Mask,
     frame: GridFrame,
@@ -71,7 +71,7 @@ def let_out(
     return ways
 
 
-def reached_from(allowed: Mask, start: tuple[int, int]) -> Mask:
+def reachable_cells(allowed: Mask, start: tuple[int, int]) -> Mask:
     """Allowed cells (H, W) to which the wave can get from a start (row, col).
 
     It goes over edges of cells, not corners. None from a start beyond the mask.
@@ -94,7 +94,7 @@ def nearest_true(allowed: Mask, cell: tuple[int, int], reach: float) -> tuple[in
 
 
 @kernel
-def are_near(allowed: Mask, cells: NDArray[np.int64], reach: float) -> Mask:
+def near_true_cell(allowed: Mask, cells: NDArray[np.int64], reach: float) -> Mask:
     """Whether a true cell of a mask (H, W) lies within `reach` cells of each cell (N, 2), (N,)."""
     whole = int(math.floor(reach))
     near = np.zeros(cells.shape[0], dtype=np.bool_)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core.config import Config, parameter, robot_radius
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.jit import kernel
-from thinmap_ros.core.planning.traversability import disc, nearest_true, reached_from
+from thinmap_ros.core.planning.traversability import disc, nearest_true, reachable_cells
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.free_space import column_distance, known_free
@@ -93,13 +93,15 @@ def plan(
         back = trail[~occupied[trail[:, 0], trail[:, 1]]]
         cost[back[:, 0], back[:, 1]] = np.minimum(cost[back[:, 0], back[:, 1]], _ESCAPE_COST)
     goal = nearest_true(
-        reached_from(np.isfinite(cost), start), wished, config.goal_slack_m / patch.frame.resolution
+        reachable_cells(np.isfinite(cost), start),
+        wished,
+        config.goal_slack_m / patch.frame.resolution,
     )
     if goal is None:
         return None
     field = navigation_function(cost, goal, start)
     x, y = _in_cells(patch, np.array([start_xy]))[0].tolist()
-    path = descend(field, x, y, *goal) * patch.frame.resolution
+    path = trace_gradient_path(field, x, y, *goal) * patch.frame.resolution
     path += (patch.frame.origin_x, patch.frame.origin_y)
     path[0] = start_xy
     return np.concatenate([path, [goal_xy]]) if goal == wished else path
@@ -137,7 +139,7 @@ def navigation_function(
     return np.asarray(_march(cost, goal[0], goal[1], row, col))
 
 
-def descend(field: Array, x: float, y: float, goal_row: int, goal_col: int) -> Array:
+def trace_gradient_path(field: Array, x: float, y: float, goal_row: int, goal_col: int) -> Array:
     """Path (K, 2) down the slope of a navigation function (H, W), in cells (x, y).
 
     It leads from a point to a cell's centre.

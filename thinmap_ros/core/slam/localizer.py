@@ -20,7 +20,7 @@ from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig
 from thinmap_ros.core.ekf_slam.models import odometry_slip, odometry_variances
 from thinmap_ros.core.estimate import Correction, Estimate
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.odometry import LastPose
+from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.active_map import ActiveMap
@@ -121,7 +121,7 @@ class Localizer:
 
         The next scans settle it; nothing is learned before.
         """
-        if not (se2.is_on_earth(T_map_base) and np.isfinite(covariance).all()):
+        if not (se2.is_bounded_pose(T_map_base) and np.isfinite(covariance).all()):
             self._refused += 1
             return
         self._pose = se2.pose(*T_map_base.tolist())
@@ -155,7 +155,7 @@ class Localizer:
     @staticmethod
     def from_occupancy_map(
         patch: GridPatch,
-        last: LastPose,
+        last: OdometryAnchor,
         T_odom_base: Array,
         config: LocalizerConfig | None = None,
     ) -> 'Localizer':
@@ -352,7 +352,7 @@ class Localizer:
             self._pose,
             covariance,
             se2.compose(self._pose, se2.invert(self._prediction.T_odom_base)),
-            match_quality=0.0 if match is None else match.inlier_ratio,
+            inlier_ratio=0.0 if match is None else match.inlier_ratio,
             lost=self._tracking.is_lost,
             correction=correction,
         )

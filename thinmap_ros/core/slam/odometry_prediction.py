@@ -102,8 +102,8 @@ class OdometryPrediction:
         variances = odometry_variances(increment.T_before_base, self._config)[[0, 2]]
         moved, systematic = self._calibration.corrected(increment.T_before_base, variances)
         motion = self._model.predict(moved, systematic)
-        if increment.bound_m == 0.0:
+        if increment.discontinuity_m == 0.0:
             return motion
         self._calibration.reset_segment()
-        unknown = np.diag(np.square([increment.bound_m, increment.bound_m, 1.0]))
+        unknown = np.diag(np.square([increment.discontinuity_m, increment.discontinuity_m, 1.0]))
         return MotionPrediction(motion.increment, motion.covariance + unknown, False)

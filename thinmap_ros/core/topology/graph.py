@@ -7,7 +7,7 @@ from enum import IntEnum
 import numpy as np
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.spatial_hash import Buckets
+from thinmap_ros.core.grid.spatial_hash import SpatialHash
 from thinmap_ros.core.se2 import Array
 
 # Nodes are listed by squares, in which one is looked for up to so far away.
@@ -83,7 +83,7 @@ class TopologicalMap:
         self.nodes: dict[int, Node] = {}
         self.edges: dict[int, Edge] = {}
         self._edges_at: dict[int, dict[int, None]] = {}
-        self._places = Buckets(_BUCKET_M)
+        self._places = SpatialHash(_BUCKET_M)
         for node in nodes:
             self.put_node(node)
         for edge in edges:

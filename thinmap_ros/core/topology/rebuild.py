@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.grid.scan_history import MovedPoses, PoseHistory
+from thinmap_ros.core.grid.scan_history import CorrectedPoses, PoseHistory
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.builder import TopologyBuilder
 
@@ -75,7 +75,7 @@ class Rebuilding:
         self._awaited = None
         # Of a graph that began elsewhere it is not known from where it was seen: its nodes are
         # searched for where they were.
-        moved = MovedPoses(poses, poses)
+        moved = CorrectedPoses(poses, poses)
         if self._past is not None:
             moved = self._past.accept_corrections()
         grid = OccupancyGrid.from_patch(patch, OccupancyConfig(resolution_m=patch.frame.resolution))

@@ -19,7 +19,7 @@ from thinmap_ros.view.plots import (
     MapLayer,
     Panel,
     Plot,
-    Robots,
+    RobotMarkers,
     Words,
     xy,
 )
@@ -130,7 +130,7 @@ def _panel(moment: Moment, limits: tuple[float, float, float, float]) -> Panel:
     layers: list[Layer] = [
         MapLayer(patch),
         GraphLayer(graph),
-        Robots(T[None]),
+        RobotMarkers(T[None]),
         Words(at[None], ['A'], 11.0),
     ]
     return Panel(layers, f'after {seconds:.0f} s', limits=limits)

@@ -6,7 +6,7 @@ import numpy as np
 
 from thinmap_ros.evaluation import map_errors
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Table
-from thinmap_ros.evaluation.slam_run import run_slam
+from thinmap_ros.evaluation.slam_run import run_drive
 from thinmap_ros.experiments.drives import Source, world_of
 from thinmap_ros.view.plots import Plot
 
@@ -17,8 +17,8 @@ def run(source: Source) -> Outcome:
     """Map the office with EKF-SLAM/TI, and with our localizer."""
     world = world_of('office')
     looks = list(islice(source.looks('office'), _QUICK_SCANS if source.quick else None))
-    done = run_slam(looks)
-    ours = run_slam(looks, 'scan_matching')
+    done = run_drive(looks)
+    ours = run_drive(looks, 'scan_matching')
     error = map_errors.map_error(done.pipeline.grid.patch(), world)
     wheels = np.hypot(*done.errors(done.odometry)[:, :2].T)
     row = map_errors.row('office', error)

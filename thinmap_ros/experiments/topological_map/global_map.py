@@ -12,8 +12,8 @@ from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Rows, Table
 from thinmap_ros.experiments.drives import Source
 from thinmap_ros.experiments.maps import grid_of
-from thinmap_ros.sim.drives import Look
-from thinmap_ros.view.plots import GraphLayer, MapLayer, Panel, Plot, Robots
+from thinmap_ros.sim.drives import DriveSample
+from thinmap_ros.view.plots import GraphLayer, MapLayer, Panel, Plot, RobotMarkers
 
 _WINDOW_M = 16.0
 # The stops near (3 m, 8 m) and (2.3 m, 3 m)
@@ -104,14 +104,14 @@ def _plots(early: list[Panel], whole: OccupancyGrid, final: Panel) -> list[Plot]
     ]
 
 
-def _visit(looks: list[Look], grid: OccupancyGrid, builder: TopologyBuilder) -> None:
+def _visit(looks: list[DriveSample], grid: OccupancyGrid, builder: TopologyBuilder) -> None:
     for look in looks:
         grid.update(look.scan, look.T_world_base)
         x, y, _ = look.T_world_base
         builder.update(grid.window(float(x), float(y), _WINDOW_M), look.T_world_base)
 
 
-def _local_map(looks: list[Look], title: str) -> Panel:
+def _local_map(looks: list[DriveSample], title: str) -> Panel:
     grid = grid_of(looks)
     graph = build(grid.patch(), _start(looks), TopologyConfig())
     x, y = _start(looks)
@@ -121,11 +121,11 @@ def _local_map(looks: list[Look], title: str) -> Panel:
 def _panel(
     grid: OccupancyGrid, graph: TopologicalMap, title: str, robot: Array | None = None
 ) -> Panel:
-    robots = [] if robot is None else [Robots(robot[None], 'sensor')]
+    robots = [] if robot is None else [RobotMarkers(robot[None], 'sensor')]
     return Panel([MapLayer(grid.patch()), GraphLayer(graph), *robots], title)
 
 
-def _start(looks: list[Look]) -> tuple[float, float]:
+def _start(looks: list[DriveSample]) -> tuple[float, float]:
     return float(looks[0].T_world_base[0]), float(looks[0].T_world_base[1])
 
 

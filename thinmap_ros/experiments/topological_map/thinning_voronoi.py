@@ -12,8 +12,8 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Rows, Table
 from thinmap_ros.experiments.drives import Source
 from thinmap_ros.experiments.maps import grid_of, patch_at_rest
-from thinmap_ros.sim.drives import Look
-from thinmap_ros.view.plots import Curve, GraphLayer, MapLayer, Panel, Plot, Robots, xy
+from thinmap_ros.sim.drives import DriveSample
+from thinmap_ros.view.plots import Curve, GraphLayer, MapLayer, Panel, Plot, RobotMarkers, xy
 
 _PRUNE_M = (0.2, 0.4, 0.6, 0.8, 1.0, 1.5, 2.0, 3.0)
 _SHOWN_M = 3.0  # all branches into corners are gone
@@ -97,7 +97,7 @@ def _timed(work: Callable[[], TopologicalMap]) -> tuple[float, TopologicalMap]:
     return min(taken), result
 
 
-def _local_map(looks: list[Look]) -> Plot:
+def _local_map(looks: list[DriveSample]) -> Plot:
     look = looks[0]
     patch = grid_of(looks).patch()
     points = look.scan.points_base()
@@ -110,9 +110,10 @@ def _local_map(looks: list[Look]) -> Plot:
         '(b) the binary map of four such scans, with arcs and nodes by thinning.',
         [
             Panel(
-                [Curve(points, 'range data', 0, '', '.'), Robots(np.zeros((1, 3)), 'laser')], '(a)'
+                [Curve(points, 'range data', 0, '', '.'), RobotMarkers(np.zeros((1, 3)), 'laser')],
+                '(a)',
             ),
-            Panel([MapLayer(patch), GraphLayer(graph), Robots(robot)], '(b)'),
+            Panel([MapLayer(patch), GraphLayer(graph), RobotMarkers(robot)], '(b)'),
         ],
         columns=2,
         panel_inches=(5.0, 4.2),

@@ -8,7 +8,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.odometry import LastPose
+from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
 from thinmap_ros.core.slam.matching.local_map import LocalMap
 from thinmap_ros.core.slam.matching.occupancy_surfaces import occupied_surface_points
@@ -88,7 +88,7 @@ def killed(config, seed, resolution, slip):
         if k < 400:
             estimate = localizer.step(scan, odom)
             grid.update(scan, estimate.T_map_base)
-            last = LastPose(k, estimate.T_map_odom, odom)
+            last = OdometryAnchor(k, estimate.T_map_odom, odom)
             before = max(before, float(np.hypot(*(estimate.T_map_base - truth)[:2])))
         elif k >= 450:
             begin = odom if k == 450 else begin

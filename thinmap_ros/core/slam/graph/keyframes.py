@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.grid.spatial_hash import Buckets
+from thinmap_ros.core.grid.spatial_hash import SpatialHash
 from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -74,7 +74,7 @@ class Keyframes:
         self._config = config
         self.frames: list[Keyframe] = []
         self.steps: list[Edge] = []  # to each keyframe but the first, from its anchor
-        self._buckets = Buckets(_BUCKET_M)
+        self._buckets = SpatialHash(_BUCKET_M)
         self._path = KeyframeTrajectory()
 
     def __len__(self) -> int:
