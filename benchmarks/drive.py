@@ -13,7 +13,7 @@ from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.se2 import Array, pose, wrap
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig, build
 from thinmap_ros.core.topology.graph import Node, TopologicalMap
-from thinmap_ros.sim.laser import Lms200, Lms200Config
+from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 from thinmap_ros.sim.world import World
 
 WINDOW_M = WindowConfig().window_m
@@ -40,14 +40,14 @@ class Drive:
         self.grid = OccupancyGrid(OccupancyConfig())
         self.builder = TopologyBuilder(topology)
         self.ledger = Ledger()
-        self._laser = Lms200(Lms200Config(), seed)
+        self._laser = LaserScanner(LaserScannerConfig(), seed)
 
     def step(self, T: Array, stamp_ns: int = 0) -> None:
         """One scan at a pose (3,) through grid and builder."""
         scan = self._laser.scan(self.world, T, stamp_ns)
         before = dict(self.builder.map.nodes)
         started = time.perf_counter()
-        self.grid.update(scan, T)
+        self.grid.add_scan(scan, T)
         window = self.grid.window(T[0], T[1], WINDOW_M)
         self.builder.update(window, T)
         self.ledger.seconds.append(time.perf_counter() - started)
@@ -79,7 +79,7 @@ def tour(world: World, start: Array, radius_m: float, goals: int, seed: int) -> 
     cells = np.where(world.occupied != 0, np.int8(100), np.int8(0))
     patch = GridPatch(world.frame, cells)
     config = WavefrontConfig(robot_radius_m=radius_m + 0.05)
-    standing = world.frame.centres_of(np.argwhere(world.wall_distance_m > radius_m + 0.1))
+    standing = world.frame.centres_of(np.argwhere(world.distance_to_wall_m > radius_m + 0.1))
     poses = [start]
     been = [start[:2]]
     unseen = np.full(len(standing), np.inf)
@@ -124,4 +124,4 @@ def _along(T: Array, way: Array) -> list[Array]:
 def final_map(drive: Drive, start: Array | None) -> TopologicalMap:
     """The batch map of the grid at the end, of all parts or of that round a start."""
     seed_xy = None if start is None else (float(start[0]), float(start[1]))
-    return build(drive.grid.patch(), seed_xy, drive.builder.config)
+    return build(drive.grid.known_area(), seed_xy, drive.builder.config)

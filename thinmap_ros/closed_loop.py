@@ -25,10 +25,10 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
-from thinmap_ros.sim.coverage import Coverable
-from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.coverage import ObservableCells
+from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
-from thinmap_ros.sim.simulation import STEP_NS, Moment, Simulation
+from thinmap_ros.sim.simulation import STEP_NS, SensorReadings, Simulation
 from thinmap_ros.sim.world import World
 
 _CONTROL_STEPS = 2
@@ -50,7 +50,7 @@ STRATEGIES: dict[str, Callable[[], Strategy]] = {
 
 
 @dataclass(eq=False)
-class Log:
+class RunLog:
     """Scan by scan: stamps, poses (3,) true and estimated; coverage over time."""
 
     stamps_ns: list[int] = field(default_factory=list)
@@ -61,7 +61,7 @@ class Log:
 
 
 @dataclass(frozen=True)
-class Ending:
+class ExplorationOutcome:
     """How an exploration ended.
 
     Whether by itself, why, and how often the robot touched something.
@@ -79,10 +79,10 @@ class Mishap(Protocol):
     def is_lost(self) -> bool:
         """Whether the robot is lost."""
 
-    def takes(self, loop: 'ClosedLoop', scan: Scan, T_odom_base: Array) -> bool:
+    def handle_scan(self, loop: 'ClosedLoop', scan: Scan, T_odom_base: Array) -> bool:
         """Whether a scan is not for the loop."""
 
-    def hear(self, loop: 'ClosedLoop', scan: Scan, estimate: Estimate) -> None:
+    def update(self, loop: 'ClosedLoop', scan: Scan, estimate: Estimate) -> None:
         """Receive the estimate of a scan."""
 
 
@@ -104,7 +104,7 @@ class ClosedLoop:
         self.navigator = navigator
         self.mishap = mishap
         self._watch = watch
-        self.log = Log()
+        self.log = RunLog()
         self.decision: Decision | None = None
         self._patch: GridPatch | None = None
         self._scan: Scan | None = None
@@ -112,16 +112,18 @@ class ClosedLoop:
         self._T_map_odom = np.zeros(3)
         self._command = (0.0, 0.0)
 
-    def run(self, goal: Coverable, limit_s: float, show: Callable[[float, float], None]) -> Ending:
+    def run(
+        self, goal: ObservableCells, limit_s: float, show: Callable[[float, float], None]
+    ) -> ExplorationOutcome:
         """Explore until the strategy is finished or the time is up.
 
         `show` receives time (s) and coverage every few scans.
         """
-        moment = self.simulation.sense()
+        moment = self.simulation.read_sensors()
         steps = 0
         while moment.stamp_ns < limit_s * 1e9:
             if moment.scan is not None:
-                self._take(moment.scan, moment.T_odom_base)
+                self._process_scan(moment.scan, moment.T_odom_base)
                 if len(self.log.poses) % _MEASURE_SCANS == 1:
                     show(*self._measure(goal))
                 if self.is_finished:
@@ -138,7 +140,7 @@ class ClosedLoop:
             if self.decision is not None and finished
             else f'time limit of {limit_s:.0f} s'
         )
-        return Ending(finished, reason, self.simulation.robot.collisions)
+        return ExplorationOutcome(finished, reason, self.simulation.robot.collisions)
 
     @property
     def is_finished(self) -> bool:
@@ -146,28 +148,28 @@ class ClosedLoop:
         lost = self.mishap is not None and self.mishap.is_lost
         return self.decision is not None and self.decision.finished and not lost
 
-    def _take(self, scan: Scan, T_odom_base: Array) -> None:
+    def _process_scan(self, scan: Scan, T_odom_base: Array) -> None:
         """One scan through localization, map and graph to a decision."""
-        if self.mishap is not None and self.mishap.takes(self, scan, T_odom_base):
+        if self.mishap is not None and self.mishap.handle_scan(self, scan, T_odom_base):
             return
         estimate = self.pipeline.step(scan, T_odom_base).estimate
-        self.note(scan, estimate)
+        self.log_poses(scan, estimate)
         if self.mishap is None or not self.mishap.is_lost:
             self.decide(scan, estimate)
 
-    def note(self, scan: Scan, estimate: Estimate) -> None:
+    def log_poses(self, scan: Scan, estimate: Estimate) -> None:
         """Log where the robot is, and where it thinks that it is."""
         self.log.stamps_ns.append(scan.stamp_ns)
         self.log.poses.append(estimate.T_map_base)
         self.log.true_poses.append(self.simulation.robot.T_world_base)
         if self.mishap is not None:
-            self.mishap.hear(self, scan, estimate)
+            self.mishap.update(self, scan, estimate)
 
     def decide(self, scan: Scan, estimate: Estimate) -> None:
         """Say where to go, by the map as it is now."""
         self._scan = scan
         self._T_map_odom = estimate.T_map_odom
-        self._patch = self.pipeline.grid.patch()
+        self._patch = self.pipeline.grid.known_area()
         # The processor's time: what else the machine does is not the strategy's.
         began = time.thread_time()
         self.decision = self.strategy.step(
@@ -184,7 +186,9 @@ class ClosedLoop:
             self._goal = target.goal
             self.navigator.set_goal(*(float(number) for number in target.goal))
 
-    def drive_by(self, pipeline: Pipeline, strategy: Strategy, navigator: Navigator) -> None:
+    def replace_strategy(
+        self, pipeline: Pipeline, strategy: Strategy, navigator: Navigator
+    ) -> None:
         """Have other parts decide where to go from now on."""
         self.navigator.cancel()
         self.pipeline = pipeline
@@ -195,7 +199,7 @@ class ClosedLoop:
         self._goal = None
         self._command = (0.0, 0.0)
 
-    def _control(self, moment: Moment) -> None:
+    def _control(self, moment: SensorReadings) -> None:
         if self._patch is None:
             return
         T_map_base = se2.compose(self._T_map_odom, moment.T_odom_base)
@@ -204,17 +208,17 @@ class ClosedLoop:
         )
         self._command = (command.v, command.w)
         if command.state == 'failed':
-            self.strategy.fail_target(command.reason)
+            self.strategy.target_failed(command.reason)
         if command.state in ('failed', 'reached'):
             self._goal = None
 
-    def _measure(self, goal: Coverable) -> tuple[float, float]:
+    def _measure(self, goal: ObservableCells) -> tuple[float, float]:
         seconds = self.simulation.stamp_ns / 1e9
-        self.log.coverage.append((seconds, goal.share_known(self.pipeline.grid.patch())))
+        self.log.coverage.append((seconds, goal.coverage(self.pipeline.grid.known_area())))
         return self.log.coverage[-1]
 
 
-def true_pose_source(simulation: Simulation) -> Callable[[Scan, Array], Estimate]:
+def ground_truth_poses(simulation: Simulation) -> Callable[[Scan, Array], Estimate]:
     """Takes the localizer's place: the simulator's own pose."""
 
     def locate(scan: Scan, T_odom_base: Array) -> Estimate:
@@ -235,7 +239,7 @@ class Options:
     speed_m_s: float = 0.2
     localization: str = 'truth'
     robot: str = '2dx'
-    laser: Lms200Config = field(default_factory=Lms200Config)
+    laser: LaserScannerConfig = field(default_factory=LaserScannerConfig)
     time_limit_s: float = 20_000.0
     kidnap_at_s: float | None = None
 
@@ -251,7 +255,7 @@ def make_loop(
     simulation = Simulation(world, start, PRESETS[options.robot], options.laser, options.seed)
     x, y, theta = (float(number) for number in start)
     localizer = ScanLocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=theta)
-    source = true_pose_source(simulation) if options.localization == 'truth' else None
+    source = ground_truth_poses(simulation) if options.localization == 'truth' else None
     # A beam that met nothing has seen as far as this laser can.
     grid = OccupancyConfig(no_return_range_m=options.laser.range_max_m)
     pipeline = Pipeline(
@@ -262,5 +266,5 @@ def make_loop(
     return ClosedLoop(simulation, pipeline, strategy, navigator, mishap, watch)
 
 
-def nothing_to_show(seconds: float, coverage: float) -> None:
+def no_progress(seconds: float, coverage: float) -> None:
     """Take the place of a progress bar."""

@@ -9,7 +9,7 @@ from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.grid.correctable import CorrectableGrid
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid, WindowConfig
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.grid.scan_history import MovedPoses
+from thinmap_ros.core.grid.scan_history import CorrectedPoses
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
@@ -32,7 +32,7 @@ class PipelineConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class PipelineResult:
     """What came of one scan: the pose, and the window of the map as it was thinned last."""
 
     estimate: Estimate
@@ -69,20 +69,22 @@ class Pipeline:
         """The map as it is shown; another object after a correction."""
         return self._grid.shown
 
-    def step(self, scan: Scan, T_odom_base: Array) -> Step:
+    def step(self, scan: Scan, T_odom_base: Array) -> PipelineResult:
         """Localize and map one scan with the odometry pose (3,) at its stamp."""
         with self._timed('localizer'):
             estimate = self._locate(scan, T_odom_base)
         with self._timed('grid'):
             if estimate.correction is not None:
-                self.corrections += self._grid.correct(*self.localizer.past(), scan.stamp_ns)
-            moved = self._grid.update(None if estimate.lost else scan, estimate.T_map_base)
+                self.corrections += self._grid.apply_correction(
+                    *self.localizer.past(), scan.stamp_ns
+                )
+            moved = self._grid.update(None if estimate.is_lost else scan, estimate.T_map_base)
         if moved is not None:
             self._rebuild(moved)
         if self._window is None or self._scans % self.config.scans_per_graph == 0:
             self._window = self._thin(estimate.T_map_base)
         self._scans += 1
-        return Step(estimate, self._window)
+        return PipelineResult(estimate, self._window)
 
     def finish(self) -> None:
         """Complete what a correction has left to be done, after the last scan."""
@@ -98,7 +100,7 @@ class Pipeline:
                 set_topology(self.localizer, self.topology.map)
         return window
 
-    def _rebuild(self, moved: MovedPoses) -> None:
+    def _rebuild(self, moved: CorrectedPoses) -> None:
         """Build the graph again: the grid has undergone a correction."""
         with self._timed('rebuild'):
             size = self.config.window.window_m

@@ -11,13 +11,13 @@ from tqdm import tqdm
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.estimate import Estimate
-from thinmap_ros.core.odometry import ScanPairing
+from thinmap_ros.core.odometry import ScanOdometrySynchronizer
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizers import line_features
 from thinmap_ros.files import graphs, occupancy_maps, trajectories
 from thinmap_ros.files.atomic import write_text
-from thinmap_ros.kernels.memory import give_back_pages, release_compiler_pages
+from thinmap_ros.kernels.memory import release_compiler_memory, release_compiler_pages
 from thinmap_ros.logs.log import Log, OdometryEvent
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.view import figures
@@ -41,7 +41,7 @@ class Watcher(Protocol):
     def step(self, scan: Scan, T_odom_base: Array, estimate: Estimate, pipeline: Pipeline) -> None:
         """Receive the result of a scan with the odometry pose (3,) at its stamp."""
 
-    def last(self, ns: int, pipeline: Pipeline) -> None:
+    def finish(self, ns: int, pipeline: Pipeline) -> None:
         """Receive the end of the log, with the stamp of the last scan."""
 
 
@@ -53,8 +53,8 @@ def replay(
     Raises InputError where the log has nothing to play.
     """
     result = Replay(Pipeline(config))
-    pairing = ScanPairing()
-    tidy_up = give_back_pages()
+    pairing = ScanOdometrySynchronizer()
+    tidy_up = release_compiler_memory()
     for event in tqdm(log.events(), unit=' events', disable=not show_progress):
         if isinstance(event, OdometryEvent):
             ready = pairing.add_odometry(event.stamp_ns, event.T_odom_base)
@@ -64,7 +64,7 @@ def replay(
             step = result.pipeline.step(scan, T_odom_base)
             result.stamps_ns.append(scan.stamp_ns)
             result.poses.append(step.estimate.T_map_base)
-            result.local_features.append(step.estimate.n_local)
+            result.local_features.append(step.estimate.n_local_features)
             if watcher is not None:
                 watcher.step(scan, T_odom_base, step.estimate, result.pipeline)
         tidy_up()
@@ -74,7 +74,7 @@ def replay(
     if not result.poses:
         raise InputError(f'no scan with odometry around its stamp; {result.skipped} skipped')
     if watcher is not None:
-        watcher.last(result.stamps_ns[-1], result.pipeline)
+        watcher.finish(result.stamps_ns[-1], result.pipeline)
     return result
 
 
@@ -83,7 +83,7 @@ def write_outputs(
 ) -> dict[str, Any]:
     """Write all files into a folder; seconds: wall and CPU time taken. Returns the report."""
     pipeline = result.pipeline
-    patch = pipeline.grid.patch()
+    patch = pipeline.grid.known_area()
     poses = np.array(result.poses)
     folder.mkdir(parents=True, exist_ok=True)
     trajectories.write_tum(folder / 'trajectory.tum', result.stamps_ns, result.poses)

@@ -27,7 +27,7 @@ def read(path: Path) -> list[Written]:
         return list(csv.DictReader(file))
 
 
-def run_missing(cases: list[Case], path: Path) -> None:
+def run_pending(cases: list[Case], path: Path) -> None:
     """Run the cases that a file does not have yet, and add a line for each."""
     path.parent.mkdir(parents=True, exist_ok=True)
     done = {record['case'] for record in read(path)}
@@ -68,7 +68,7 @@ def main() -> None:
     for row in arguments.rows or ROWS:
         path = arguments.output / f'{row}.csv'
         print(f'-- {row}', flush=True)
-        run_missing(list(islice(ROWS[row](setting), arguments.count)), path)
+        run_pending(list(islice(ROWS[row](setting), arguments.count)), path)
         show(summary(row, read(path)))
 
 

@@ -15,7 +15,7 @@ from thinmap_ros.core.places.global_localizer import GlobalLocalization
 from thinmap_ros.core.se2 import pose
 from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.sim.drives import random_drive, random_start
-from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.world import World
 
 _STEP_SCANS = 3  # a step of the laboratory's experiment: at 0.5 m/s and 5 Hz, up to 0.3 m
@@ -26,14 +26,16 @@ _AT_A_TIME = 5  # drives in a world, before its map makes way for the next one's
 _CARRIED_S = 150.0
 _LIMIT_S = 300.0
 _SHIFT_M = (-12.34, 56.785)
-_FULL = Lms200Config()
+_FULL = LaserScannerConfig()
 LASERS = {
-    '270 deg in 0.5, 20 m': Lms200Config(beams=541, field_of_view_deg=270.0, range_max_m=20.0),
-    '270 deg in 0.25, 30 m, 0.2 m ahead': Lms200Config(
+    '270 deg in 0.5, 20 m': LaserScannerConfig(
+        beams=541, field_of_view_deg=270.0, range_max_m=20.0
+    ),
+    '270 deg in 0.25, 30 m, 0.2 m ahead': LaserScannerConfig(
         beams=1081, field_of_view_deg=270.0, range_max_m=30.0, mount_x_m=0.2
     ),
-    '360 deg in 1, 4 m': Lms200Config(beams=360, field_of_view_deg=360.0, range_max_m=4.0),
-    '240 deg in 0.36, 4 m': Lms200Config(beams=667, field_of_view_deg=240.0, range_max_m=4.0),
+    '360 deg in 1, 4 m': LaserScannerConfig(beams=360, field_of_view_deg=360.0, range_max_m=4.0),
+    '240 deg in 0.36, 4 m': LaserScannerConfig(beams=667, field_of_view_deg=240.0, range_max_m=4.0),
 }
 
 

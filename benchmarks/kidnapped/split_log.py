@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks.kidnapped.trials import Map, Record, fresh, prepared, search
 from thinmap_ros.core import se2
-from thinmap_ros.core.odometry import ScanPairing
+from thinmap_ros.core.odometry import ScanOdometrySynchronizer
 from thinmap_ros.core.places.global_localizer import GlobalLocalization
 from thinmap_ros.core.places.likelihood import Judge
 from thinmap_ros.core.places.observation import observe
@@ -21,7 +21,7 @@ from thinmap_ros.evaluation.trajectory_errors import between_paths
 from thinmap_ros.logs.carmen import CarmenLog
 from thinmap_ros.logs.log import OdometryEvent
 from thinmap_ros.pipeline import Pipeline
-from thinmap_ros.sim.drives import Look
+from thinmap_ros.sim.drives import DriveSample
 
 SCANS = 60
 _STARTS = 100
@@ -36,7 +36,7 @@ _AGREES = 0.8
 class _Halves:
     """Looks of the whole log with poses in the frame of the map of the first half, and that map."""
 
-    looks: list[Look]
+    looks: list[DriveSample]
     half: int
     known: Map
 
@@ -46,7 +46,7 @@ def first_half(log: Path) -> Map:
     return _halves(log).known
 
 
-def looks_from(log: Path, seed: int) -> Iterator[Look]:
+def looks_from(log: Path, seed: int) -> Iterator[DriveSample]:
     """Looks of a log from a random one of its first three quarters on."""
     looks = _halves(log).looks
     yield from looks[int(np.random.default_rng(seed).integers(3 * len(looks) // 4)) :]
@@ -67,7 +67,7 @@ def _finder(log: Path) -> GlobalLocalization:
     return prepared(_halves(log).known, _halves(log).looks[0], seed=1)
 
 
-def _in_map(finder: GlobalLocalization, looks: list[Look]) -> tuple[float, float]:
+def _in_map(finder: GlobalLocalization, looks: list[DriveSample]) -> tuple[float, float]:
     """Of how many beams the map tells, from true poses, and with how many of these it agrees."""
     asked = 0.0
     agreed = 0.0
@@ -95,19 +95,21 @@ def _halves(log: Path) -> _Halves:
     pipeline = Pipeline()
     for scan, T_odom_base in pairs[:half]:
         pipeline.step(scan, T_odom_base)
-    known = Map(pipeline.grid.patch(), copy.deepcopy(pipeline.topology.map))
+    known = Map(pipeline.grid.known_area(), copy.deepcopy(pipeline.topology.map))
     first = pipeline.localizer.corrected_path()
     for scan, T_odom_base in pairs[half:]:
         pipeline.step(scan, T_odom_base)
     whole = pipeline.localizer.corrected_path()
     T_first_whole = between_paths(whole[:half], first)
     poses = [se2.compose(T_first_whole, T) for T in whole]
-    return _Halves([Look(*pair, T) for pair, T in zip(pairs, poses, strict=True)], half, known)
+    return _Halves(
+        [DriveSample(*pair, T) for pair, T in zip(pairs, poses, strict=True)], half, known
+    )
 
 
 def _pairs(log: Path) -> list[tuple[Scan, Array]]:
     """Scans with their odometry poses."""
-    pairing = ScanPairing()
+    pairing = ScanOdometrySynchronizer()
     pairs = []
     for event in CarmenLog(log).events():
         if isinstance(event, OdometryEvent):

@@ -22,8 +22,8 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.experiments.drives import Source
 from thinmap_ros.experiments.maps import grid_of
 from thinmap_ros.files.worlds import read_world
-from thinmap_ros.sim.drives import Look, patch_of, random_drive, random_start
-from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.drives import DriveSample, random_drive, random_start, world_to_grid
+from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.world import World
 
 LAB = Path(__file__).resolve().parents[2] / 'worlds' / 'lab.yaml'
@@ -61,7 +61,7 @@ def lab() -> World:
 @lru_cache(maxsize=1)
 def lab_map() -> Map:
     """Its map, merged from its stops."""
-    patch = grid_of(Source().looks('lab_stops')).patch()
+    patch = grid_of(Source().looks('lab_stops')).known_area()
     return Map(patch, build(patch, LAB_START[:2], TopologyConfig()))
 
 
@@ -73,7 +73,7 @@ def voronoi_lab_map() -> Map:
 
 def shifted_map(world: World, finer: int, shift_m: tuple[float, float]) -> Map:
     """A world itself as a map, in cells so many times finer, in a frame moved by this much."""
-    patch = patch_of(world)
+    patch = world_to_grid(world)
     cells = np.repeat(np.repeat(patch.cells, finer, axis=0), finer, axis=1)
     frame = patch.frame
     origin = (frame.origin_x + shift_m[0], frame.origin_y + shift_m[1])
@@ -81,13 +81,13 @@ def shifted_map(world: World, finer: int, shift_m: tuple[float, float]) -> Map:
     return map_of_patch(GridPatch(shifted, cells))
 
 
-def driven_map(world: World, laser: Lms200Config) -> Map:
+def driven_map(world: World, laser: LaserScannerConfig) -> Map:
     """The map of a long drive with a laser at exact poses, full of what the robot did not see."""
     looks = random_drive(world, random_start(world, np.random.default_rng(99)), 99, laser=laser)
-    return map_of_patch(grid_of(look for look, _ in along(looks, _MAPPED_WAY_M)).patch())
+    return map_of_patch(grid_of(look for look, _ in along(looks, _MAPPED_WAY_M)).known_area())
 
 
-def prepared(known: Map, look: Look, seed: int) -> GlobalLocalization:
+def prepared(known: Map, look: DriveSample, seed: int) -> GlobalLocalization:
     """A search that has looked at its map, and knows the laser by the scan of a look."""
     finder = GlobalLocalization(known.patch, known.topology, seed=seed)
     finder.step(look.scan, look.T_odom_base)
@@ -100,7 +100,7 @@ def fresh(finder: GlobalLocalization) -> GlobalLocalization:
     return copy.deepcopy(finder)
 
 
-def along(looks: Iterable[Look], way_m: float) -> Iterator[tuple[Look, float]]:
+def along(looks: Iterable[DriveSample], way_m: float) -> Iterator[tuple[DriveSample, float]]:
     """Each look, and the way that has been driven up to there, until that is longer than way_m."""
     way = 0.0
     last = None
@@ -120,7 +120,7 @@ def offset(found: Hypothesis, truth: Array) -> tuple[float, float]:
 
 def search(
     finder: GlobalLocalization,
-    looks: Iterable[Look],
+    looks: Iterable[DriveSample],
     way_m: float = np.inf,
     every: int = 1,
     steps: int = 10**9,
@@ -160,7 +160,7 @@ def search(
     return record | {'step_ms': round(1e3 * float(np.median(seconds)), 2)}
 
 
-def watch_twins(finder: GlobalLocalization, looks: Iterable[Look], way_m: float) -> Record:
+def watch_twins(finder: GlobalLocalization, looks: Iterable[DriveSample], way_m: float) -> Record:
     """Counts of steps of a robot that cannot tell places apart.
 
     How often it is sure, and how often the two likeliest places are equally likely.
@@ -180,7 +180,7 @@ def _gap(result: Result) -> float:
     return weights[0] - weights[1]
 
 
-def watch_foreign(finder: GlobalLocalization, looks: Iterable[Look], way_m: float) -> Record:
+def watch_foreign(finder: GlobalLocalization, looks: Iterable[DriveSample], way_m: float) -> Record:
     """After how much way a robot in another building is told so, or sure, and how it ends.
 
     It is looked for on and on, whether it was sure or not.

@@ -23,9 +23,9 @@ from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
 from thinmap_ros.evaluation.parallel_jobs import (
     Failure,
     add_run_options,
-    complaint,
+    failure_summary,
     read_report,
-    run_missing,
+    run_pending,
 )
 from thinmap_ros.files.atomic import read_text, write_text
 from thinmap_ros.tools import cli
@@ -111,7 +111,7 @@ def _run(arguments: argparse.Namespace) -> None:
     write_text(arguments.out / 'scoreboard.md', text)
     print(f'worst tenth, live: {worst_tenth(cases, reports):.3f} m; {arguments.out}/scoreboard.md')
     if failures:
-        raise complaint(failures)
+        raise failure_summary(failures)
     if arguments.write_short:
         write_text(_SHORT, shortened(cases, reports))
 
@@ -122,7 +122,7 @@ def _run_cases(
     logs = arguments.shared / 'data' / 'logs'
     degrade = arguments.shared / 'tools' / 'degrade_log.py'
     tasks = [Task(case, logs, degrade, arguments.out / 'logs', options) for case in cases]
-    return run_missing(
+    return run_pending(
         measure,
         tasks,
         lambda task: report_file(arguments.out, task.name),

@@ -14,8 +14,8 @@ from thinmap_ros.closed_loop import (
     SCANS_PER_GRAPH,
     STRATEGIES,
     ClosedLoop,
-    nothing_to_show,
-    true_pose_source,
+    ground_truth_poses,
+    no_progress,
 )
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
@@ -25,16 +25,16 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.machine import forget_peak, peak_mb
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
-from thinmap_ros.sim.coverage import Coverable, coverable
-from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.coverage import ObservableCells, observable_cells
+from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import Simulation
 from thinmap_ros.sim.world import World
 
 LASERS = {
-    'lms200': Lms200Config(),
-    'turtlebot3': Lms200Config(beams=360, field_of_view_deg=360.0, range_max_m=3.5),
-    'rplidar_a1': Lms200Config(beams=360, field_of_view_deg=360.0, range_max_m=12.0),
+    'lms200': LaserScannerConfig(),
+    'turtlebot3': LaserScannerConfig(beams=360, field_of_view_deg=360.0, range_max_m=3.5),
+    'rplidar_a1': LaserScannerConfig(beams=360, field_of_view_deg=360.0, range_max_m=12.0),
 }
 RECORDED_S = 1200.0  # of a recorded drive: 6,000 scans
 _DRAWN = Path(__file__).resolve().parents[2] / 'worlds'
@@ -45,7 +45,7 @@ _RECORDED_SEED = 0
 _LIMIT_S = 3000.0
 _LIMITS_S = {LARGEST: 1200.0}
 # What is cut short is not asked for its coverage, which takes long to prepare on a large floor.
-_NOTHING = Coverable(np.zeros((0, 0), dtype=np.bool_), GridFrame(0.0, 0.0, 0.1))
+_NOTHING = ObservableCells(np.zeros((0, 0), dtype=np.bool_), GridFrame(0.0, 0.0, 0.1))
 
 
 def record_drive(world: str, worlds: Path, path: Path, limit_s: float = RECORDED_S) -> Numbers:
@@ -53,9 +53,9 @@ def record_drive(world: str, worlds: Path, path: Path, limit_s: float = RECORDED
     place, start = world_of(world, worlds)
     laser = LASERS['lms200']
     simulation = RecordedSimulation(place, start, _ROBOT, laser, _RECORDED_SEED)
-    pipeline = Pipeline(_pipeline_config(laser), true_pose_source(simulation))
+    pipeline = Pipeline(_pipeline_config(laser), ground_truth_poses(simulation))
     loop = _closed_loop(simulation, pipeline)
-    ending = loop.run(_NOTHING, limit_s, nothing_to_show)
+    ending = loop.run(_NOTHING, limit_s, no_progress)
     recording = simulation.recording()
     recording.write(path)
     return {
@@ -87,12 +87,14 @@ def measure_loop(case: LoopCase, worlds: Path, options: Numbers) -> Numbers:
     laser = LASERS[case.laser]
     simulation = Simulation(world, start, _ROBOT, laser, case.seed)
     is_whole = case.world not in _LIMITS_S
-    goal = coverable(world, start, _ROBOT.radius_m, laser.range_max_m) if is_whole else _NOTHING
+    goal = (
+        observable_cells(world, start, _ROBOT.radius_m, laser.range_max_m) if is_whole else _NOTHING
+    )
     rehearse()
     pipeline = PlayedPipeline(_pipeline_config(laser, options, start))
     loop = _closed_loop(simulation, pipeline)
     forget_peak()
-    ending = loop.run(goal, _LIMITS_S.get(case.world, _LIMIT_S), nothing_to_show)
+    ending = loop.run(goal, _LIMITS_S.get(case.world, _LIMIT_S), no_progress)
     played = pipeline.played
     played.final = pipeline.localizer.corrected_path()
     played.peak_mb = peak_mb()
@@ -124,7 +126,7 @@ def world_of(name: str, worlds: Path) -> tuple[World, Array]:
 
 
 def _pipeline_config(
-    laser: Lms200Config, options: Numbers | None = None, start: Array | None = None
+    laser: LaserScannerConfig, options: Numbers | None = None, start: Array | None = None
 ) -> PipelineConfig:
     """As `explore_world` has it: a beam that met nothing has seen as far as this laser can."""
     return PipelineConfig(

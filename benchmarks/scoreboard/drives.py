@@ -10,10 +10,10 @@ from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.se2 import Array, transform_points
-from thinmap_ros.sim.buildings import Building, building
-from thinmap_ros.sim.drives import MARGIN_M, Look, drive, patch_of
-from thinmap_ros.sim.laser import Lms200Config
-from thinmap_ros.sim.robot import PRESETS, PioneerConfig
+from thinmap_ros.sim.buildings import Building, generate_building
+from thinmap_ros.sim.drives import MARGIN_M, DriveSample, drive, world_to_grid
+from thinmap_ros.sim.laser import LaserScannerConfig
+from thinmap_ros.sim.robot import PRESETS, RobotConfig
 from thinmap_ros.sim.simulation import Simulation
 from thinmap_ros.sim.world import World
 
@@ -34,23 +34,23 @@ _ODOMETRY = (
 )
 
 
-def looks(seed: int, robot: str, noise: float) -> Iterator[Look]:
+def looks(seed: int, robot: str, noise: float) -> Iterator[DriveSample]:
     """Look after look of a drive of some 250 m that ends where it began."""
-    made = building(seed)
+    made = generate_building(seed)
     body = noisy(PRESETS[robot], noise)
-    simulation = Simulation(made.world, _start(made, body), body, Lms200Config(), seed)
+    simulation = Simulation(made.world, _start(made, body), body, LaserScannerConfig(), seed)
     return drive(simulation, ways(made, simulation.robot.T_world_base, body, seed), _SPEED_M_S)
 
 
-def noisy(robot: PioneerConfig, noise: float) -> PioneerConfig:
+def noisy(robot: RobotConfig, noise: float) -> RobotConfig:
     """A robot whose odometry errs so many times as much."""
     return replace(robot, **{name: noise * getattr(robot, name) for name in _ODOMETRY})
 
 
-def ways(made: Building, start: Array, robot: PioneerConfig, seed: int) -> Iterator[Array]:
+def ways(made: Building, start: Array, robot: RobotConfig, seed: int) -> Iterator[Array]:
     """Ways (K, 2), m, of a drive, each from where the one before ends."""
     rng = np.random.default_rng(seed)
-    patch = patch_of(made.world)
+    patch = world_to_grid(made.world)
     goals = _goals(made)
     left = np.ones(len(goals), dtype=np.bool_)
     at = start[:2]
@@ -113,11 +113,11 @@ def _way(patch: GridPatch, a: Array, b: Array, radius_m: float) -> Array | None:
     return plan(near, (float(a[0]), float(a[1])), (float(b[0]), float(b[1])), config)
 
 
-def _start(made: Building, robot: PioneerConfig) -> Array:
+def _start(made: Building, robot: RobotConfig) -> Array:
     """The building's start, or the nearest place where a robot of this size fits."""
     world: World = made.world
     if world.is_clear(float(world.start[0]), float(world.start[1]), robot.radius_m + MARGIN_M):
         return world.start
-    room = world.frame.centres_of(np.argwhere(world.wall_distance_m > robot.radius_m + MARGIN_M))
+    room = world.frame.centres_of(np.argwhere(world.distance_to_wall_m > robot.radius_m + MARGIN_M))
     place = room[np.argmin(np.hypot(*(room - world.start[:2]).T))]
     return np.array([place[0], place[1], world.start[2]])

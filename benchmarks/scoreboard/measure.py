@@ -20,7 +20,7 @@ from benchmarks.scoreboard.played import (
 )
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.odometry import ScanPairing
+from thinmap_ros.core.odometry import ScanOdometrySynchronizer
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
@@ -145,7 +145,7 @@ def _degraded(case: LogCase, own: Path, degrade: Path, folder: Path) -> Path:
 
 def _scans(own: Path, laser: str) -> Iterator[tuple[Scan, Array]]:
     """Scans with the odometry at their stamps, in the order of the file."""
-    pairing = ScanPairing()
+    pairing = ScanOdometrySynchronizer()
     for event in CarmenLog(next(own.glob('log.clf*')), laser_of(own, laser)).events():
         if isinstance(event, OdometryEvent):
             yield from pairing.add_odometry(event.stamp_ns, event.T_odom_base)

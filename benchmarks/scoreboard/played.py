@@ -13,7 +13,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.machine import CpuTimedPipeline, resident_mb
 from thinmap_ros.evaluation.trajectory_errors import aligned_rms
 from thinmap_ros.kernels import warm_up
-from thinmap_ros.pipeline import PipelineConfig, Step
+from thinmap_ros.pipeline import PipelineConfig, PipelineResult
 
 Numbers = dict[str, Any]
 _STANDS_M = 0.01
@@ -73,7 +73,7 @@ class PlayedPipeline(CpuTimedPipeline):
         super().__init__(config)
         self.played = Played(before_mb=resident_mb())
 
-    def step(self, scan: Scan, T_odom_base: Array) -> Step:
+    def step(self, scan: Scan, T_odom_base: Array) -> PipelineResult:
         """Add a scan with the odometry pose (3,) at its stamp, and keep the result."""
         stages = self.stage_seconds
         rebuilds = len(stages.get('rebuild', []))
@@ -88,7 +88,7 @@ class PlayedPipeline(CpuTimedPipeline):
         played.stamps_ns.append(scan.stamp_ns)
         played.poses.append(step.estimate.T_map_base)
         played.covariances.append(step.estimate.covariance)
-        played.lost.append(step.estimate.lost)
+        played.lost.append(step.estimate.is_lost)
         return step
 
 

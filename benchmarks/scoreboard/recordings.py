@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.files.atomic import written_aside
-from thinmap_ros.sim.drives import Look
-from thinmap_ros.sim.laser import Lms200Config
-from thinmap_ros.sim.robot import PioneerConfig, WheelOdometry
-from thinmap_ros.sim.simulation import STEP_NS, Moment, Simulation, odometry_seed
+from thinmap_ros.files.atomic import atomic_write
+from thinmap_ros.sim.drives import DriveSample
+from thinmap_ros.sim.laser import LaserScannerConfig
+from thinmap_ros.sim.robot import RobotConfig, WheelOdometry
+from thinmap_ros.sim.simulation import STEP_NS, SensorReadings, Simulation, odometry_seed
 from thinmap_ros.sim.world import World
 
 _STEP_S = STEP_NS / 1e9
@@ -37,7 +37,7 @@ class Recording:
     fan: Array
     T_base_laser: Array
 
-    def replay(self, robot: PioneerConfig, seed: int) -> Iterator[Look]:
+    def replay(self, robot: RobotConfig, seed: int) -> Iterator[DriveSample]:
         """Yield each scan with its true pose and the odometry of a simulation with this seed."""
         odometry = WheelOdometry(robot, odometry_seed(seed))
         driven = 0
@@ -46,11 +46,11 @@ class Recording:
                 odometry.add_step(distance_m, turn_rad)
             driven = stamp_ns // STEP_NS
             scan = Scan.create(stamp_ns, self.ranges_m[k], *self.fan.tolist(), self.T_base_laser)
-            yield Look(scan, odometry.T_odom_base, self.T_world_base[k])
+            yield DriveSample(scan, odometry.T_odom_base, self.T_world_base[k])
 
     def write(self, path: Path) -> None:
         """Write the recording as an .npz file, whole or not at all."""
-        with written_aside(path) as aside, aside.open('wb') as stream:
+        with atomic_write(path) as aside, aside.open('wb') as stream:
             np.savez_compressed(stream, **vars(self))
 
 
@@ -67,22 +67,22 @@ class RecordedSimulation(Simulation):
     """A simulation that keeps its scans, the true poses at them, and the motion of each step."""
 
     def __init__(
-        self, world: World, start: Array, robot: PioneerConfig, laser: Lms200Config, seed: int
+        self, world: World, start: Array, robot: RobotConfig, laser: LaserScannerConfig, seed: int
     ) -> None:
         super().__init__(world, start, robot, laser, seed)
         self._scans: list[Scan] = []
         self._poses: list[Array] = []
         self._steps: list[tuple[float, float]] = []
 
-    def sense(self) -> Moment:
+    def read_sensors(self) -> SensorReadings:
         """Return what the sensors measure now, and keep a scan with its true pose."""
-        moment = super().sense()
+        moment = super().read_sensors()
         if moment.scan is not None:
             self._scans.append(moment.scan)
             self._poses.append(self.robot.T_world_base)
         return moment
 
-    def step(self, v: float, w: float) -> Moment:
+    def step(self, v: float, w: float) -> SensorReadings:
         """Drive for one step, and keep its exact distance and turn."""
         moment = super().step(v, w)
         self._steps.append((self.robot.v * _STEP_S, self.robot.w * _STEP_S))

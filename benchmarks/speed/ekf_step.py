@@ -15,7 +15,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig, EkfLocalizer
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.evaluation.outcome import Row, at_least, at_most
-from thinmap_ros.sim.laser import Lms200, Lms200Config
+from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 from thinmap_ros.sim.world import World
 
 _CELL_M = 0.05
@@ -60,7 +60,7 @@ def _cost(slam: str, numbers: list[int]) -> Iterator[tuple[int, tuple[float, flo
     """
     length = 1.5 * numbers[-1] + 60.0
     world = _floor(length)
-    laser = Lms200(Lms200Config(), 0)
+    laser = LaserScanner(LaserScannerConfig(), 0)
     truth = np.array([1.0, 0.5 * _WIDTH_M, 0.0])
     localizer = EkfLocalizer(
         EkfConfig(slam=slam, gap_m=_GAP_M, start_x_m=truth[0], start_y_m=truth[1])

@@ -17,8 +17,8 @@ from thinmap_ros.evaluation.outcome import Row, at_most
 from thinmap_ros.files.package_data import world_path
 from thinmap_ros.files.worlds import read_tour, read_world
 from thinmap_ros.pipeline import PipelineConfig
-from thinmap_ros.sim.drives import Look, drive, ways_along
-from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.drives import DriveSample, drive, tour_paths
+from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import Simulation
 from thinmap_ros.sim.world import World
@@ -37,7 +37,7 @@ _PARTS = ('localizer', 'grid', 'topology')
 class _Mark:
     """After a way, m: CPU of last scans by part, ms; free area, m2; memory, MB; pose error, m."""
 
-    way_m: float
+    travelled_m: float
     taken_ms: dict[str, Array]
     area_m2: float
     resident_mb: float
@@ -57,10 +57,12 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
         first = first or mark
         if mark is first:
             continue
-        lap = again.index(mark.way_m) + 2 if mark.way_m in again else None
-        where = f'lap {lap}, on the first {_SPAN_M:.0f} m' if lap else f'after {mark.way_m:.0f} m'
+        lap = again.index(mark.travelled_m) + 2 if mark.travelled_m in again else None
+        where = (
+            f'lap {lap}, on the first {_SPAN_M:.0f} m' if lap else f'after {mark.travelled_m:.0f} m'
+        )
         yield from _ratios(where, mark, first)
-        if mark.way_m <= lap_m:
+        if mark.travelled_m <= lap_m:
             new = mark
             grown_kb = 1e3 * (mark.resident_mb - first.resident_mb)
             yield Row(
@@ -68,12 +70,14 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
                 f'{grown_kb / (mark.area_m2 - first.area_m2):.3g} kB',
             )
         elif new is not None:
-            more_mb = (mark.resident_mb - new.resident_mb) / (1e-3 * (mark.way_m - new.way_m))
+            more_mb = (mark.resident_mb - new.resident_mb) / (
+                1e-3 * (mark.travelled_m - new.travelled_m)
+            )
             yield Row('  memory a kilometre on known ground', f'{more_mb:.3g} MB')
 
 
 def _rows(mark: _Mark) -> Iterator[Row]:
-    yield Row(f'after {mark.way_m:.0f} m: free area in the map', f'{mark.area_m2:.0f} m2')
+    yield Row(f'after {mark.travelled_m:.0f} m: free area in the map', f'{mark.area_m2:.0f} m2')
     every = mark.taken_ms['all']
     yield Row('  CPU a scan, median and mean', f'{np.median(every):.3g} and {every.mean():.3g} ms')
     for of, name in ((np.median, 'median'), (np.mean, 'mean')):
@@ -93,7 +97,7 @@ def _ratios(where: str, mark: _Mark, first: _Mark) -> Iterator[Row]:
     yield at_most('  the same, mean', float(now.mean() / then.mean()), 1.2)
 
 
-def _drive(looks: Iterator[Look], marks_m: list[float]) -> Iterator[_Mark]:
+def _drive(looks: Iterator[DriveSample], marks_m: list[float]) -> Iterator[_Mark]:
     """Marks after these lengths of the drive."""
     pipeline: CpuTimedPipeline | None = None
     way_m = 0.0
@@ -118,7 +122,7 @@ def _drive(looks: Iterator[Look], marks_m: list[float]) -> Iterator[_Mark]:
         ways.append(way_m)
         if way_m >= marks_m[0]:
             on_span = np.array(ways) > way_m - _SPAN_M
-            patch = pipeline.grid.patch()
+            patch = pipeline.grid.known_area()
             yield _Mark(
                 marks_m[0],
                 {part: 1e3 * np.array(each)[on_span] for part, each in taken.items()},
@@ -131,13 +135,13 @@ def _drive(looks: Iterator[Look], marks_m: list[float]) -> Iterator[_Mark]:
                 return
 
 
-def _looks() -> tuple[Iterator[Look], float]:
+def _looks() -> tuple[Iterator[DriveSample], float]:
     """The tour of the warehouse, again and again, and its length, m."""
     path = world_path('warehouse')
     world = World.from_patch(*read_world(path))
     tour = read_tour(path)
     robot = PRESETS[_ROBOT]
-    simulation = Simulation(world, world.start, robot, Lms200Config(range_max_m=_RANGE_M), 0)
-    ways = list(ways_along(world, tour, robot.radius_m))  # closed: it begins where it ends
+    simulation = Simulation(world, world.start, robot, LaserScannerConfig(range_max_m=_RANGE_M), 0)
+    ways = list(tour_paths(world, tour, robot.radius_m))  # closed: it begins where it ends
     lap_m = float(sum(np.hypot(*np.diff(way, axis=0).T).sum() for way in ways))
     return drive(simulation, islice(cycle(ways), 20 * len(ways)), _SPEED_M_S), lap_m

@@ -10,7 +10,7 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.machine import best_seconds
 from thinmap_ros.evaluation.outcome import Row, at_least
-from thinmap_ros.sim.laser import Lms200, Lms200Config
+from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 
 _TARGET = 20_000.0
 _SCANS = 200
@@ -19,7 +19,7 @@ _SCANS = 200
 def run(worlds: Path, quick: bool) -> list[Row]:
     """One row: 181 beams, 8 m, 10 cm, a real floor, the robot turning on the spot at ten places."""
     floor = floors(worlds, 'kth/50052748')[0]
-    laser = Lms200(Lms200Config(), 0)
+    laser = LaserScanner(LaserScannerConfig(), 0)
     turns = [
         np.array([*start[:2], start[2] + 0.3 * k])
         for start in floor.starts
@@ -33,4 +33,4 @@ def run(worlds: Path, quick: bool) -> list[Row]:
 
 def _update(grid: OccupancyGrid, scans: list[tuple[Scan, Array]]) -> None:
     for scan, T in scans:
-        grid.update(scan, T)
+        grid.add_scan(scan, T)

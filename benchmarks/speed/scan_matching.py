@@ -20,7 +20,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.matching.local_map import LocalMap
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher
 from thinmap_ros.evaluation.outcome import Row, at_least
-from thinmap_ros.sim.laser import Lms200, Lms200Config
+from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 
 _QUICK = ('kth/50052751',)
 _WORLDS = ('kth/50052751', 'kth/50052748', 'dungeon/d114', 'dungeon/d2555')
@@ -89,7 +89,7 @@ def _cases(worlds: Path, name: str, goals: int) -> Iterator[_Case]:
     """Places along a tour of a floor."""
     floor = floors(worlds, name)[0]
     poses = tour(floor.world, floor.starts[0], 0.25, goals, 0)
-    laser = Lms200(Lms200Config(range_max_m=_RANGE_M), 0)
+    laser = LaserScanner(LaserScannerConfig(range_max_m=_RANGE_M), 0)
     for at in range(_BEFORE * _APART, len(poses), _EVERY):
         around = [poses[at - k * _APART] for k in range(_BEFORE, 0, -1)]
         before = [(laser.scan(floor.world, T, 0), T) for T in around]

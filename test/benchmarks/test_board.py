@@ -34,7 +34,7 @@ def office(tmp_path_factory):
 
 def driven(simulation):
     """All moments of the commands with a scan: scan, odometry, true pose."""
-    moments = [simulation.sense()]
+    moments = [simulation.read_sensors()]
     poses = [simulation.robot.T_world_base]
     for command in COMMANDS:
         moments.append(simulation.step(*command))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.kidnapped.__main__ import read, run_missing
+from benchmarks.kidnapped.__main__ import read, run_pending
 from benchmarks.kidnapped.cases import Case
 from benchmarks.kidnapped.page import page
 from benchmarks.kidnapped.summary import summary
@@ -33,8 +33,8 @@ def test_a_row_is_gone_on_with_and_told_on_the_page(tmp_path: Path) -> None:
     ran: list[str] = []
     outcomes = {'kth/a 0': 'right', 'kth/a 1': 'open', 'kth/b 0': 'wrong'}
     path = tmp_path / 'kth.csv'
-    run_missing(cases(ran, outcomes)[:2], path)
-    run_missing(cases(ran, outcomes), path)
+    run_pending(cases(ran, outcomes)[:2], path)
+    run_pending(cases(ran, outcomes), path)
     assert ran == list(outcomes)
     assert [record['outcome'] for record in read(path)] == list(outcomes.values())
     rows = {row.what: row for row in summary('kth', read(path))}

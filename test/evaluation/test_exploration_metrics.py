@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from thinmap_ros.closed_loop import Ending
+from thinmap_ros.closed_loop import ExplorationOutcome
 from thinmap_ros.core.exploration.strategy import FIRST_STAND_IN_ID
 from thinmap_ros.evaluation.exploration_metrics import (
     FEWEST_SIGHTINGS,
@@ -20,7 +20,7 @@ AFAR = np.array([100.0, 100.0, 0.0])
 def census_of(*decisions, pose=AFAR):
     census = EndNodeCensus()
     for nodes in decisions:
-        census.take(nodes, pose)
+        census.add(nodes, pose)
     return census
 
 
@@ -57,7 +57,7 @@ def report_of(coverage, census=None):
     times = np.arange(0.0, 10.1, 0.5)
     poses = np.column_stack([0.5 * times, 0.0 * times, 0.1 * times])
     return exploration_report(
-        Ending(True, 'done', 0),
+        ExplorationOutcome(True, 'done', 0),
         times,
         poses,
         poses + (0.0, 0.03, 0.0),
@@ -92,5 +92,5 @@ def test_milestones_are_when_a_coverage_was_first_measured_and_none_where_it_nev
 def test_a_target_that_goes_back_to_the_one_before_is_a_reversal(places, changes, reversals):
     log = TargetLog()
     for place in places:
-        log.take(None if place is None else np.array([place, 1.0, 0.0]))
+        log.add(None if place is None else np.array([place, 1.0, 0.0]))
     assert (log.changes, log.reversals) == (changes, reversals)

@@ -16,10 +16,10 @@ import pytest
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.evaluation.outcome import Outcome, Table
 from thinmap_ros.evaluation.pages import read_about, write_markdown, write_page
-from thinmap_ros.evaluation.slam_run import run_slam
+from thinmap_ros.evaluation.slam_run import run_drive
 from thinmap_ros.evaluation.trajectory_errors import relation_errors
 from thinmap_ros.experiments import drives
-from thinmap_ros.experiments.drives import RECIPES, Source, looks_of_bag
+from thinmap_ros.experiments.drives import RECIPES, Source, samples_of_bag
 from thinmap_ros.experiments.exploration.thinning_stages import stages
 from thinmap_ros.experiments.slam import logs, office
 from thinmap_ros.logs.bag import Bag
@@ -125,7 +125,7 @@ def test_a_bag_holds_sensors_truth_and_outputs(office_bag: Path) -> None:
         '/topology',
     }
     live = list(islice(Source().looks('office'), 150))
-    for one, other in zip(live, looks_of_bag(office_bag / 'office.mcap'), strict=True):
+    for one, other in zip(live, samples_of_bag(office_bag / 'office.mcap'), strict=True):
         assert one.scan.stamp_ns == other.scan.stamp_ns
         assert np.allclose(one.scan.ranges_m, other.scan.ranges_m, atol=1e-6)
         assert np.allclose(one.T_odom_base, other.T_odom_base, atol=1e-12)
@@ -133,8 +133,8 @@ def test_a_bag_holds_sensors_truth_and_outputs(office_bag: Path) -> None:
 
 
 def test_from_the_bag_as_from_live(office_bag: Path) -> None:
-    live = run_slam(islice(Source().looks('office'), 150))
-    replayed = run_slam(Source(bags=office_bag).looks('office'))
+    live = run_drive(islice(Source().looks('office'), 150))
+    replayed = run_drive(Source(bags=office_bag).looks('office'))
     assert np.abs(np.array(live.estimate) - np.array(replayed.estimate)).max() < POSE_TOLERANCE_M
     assert live.features == replayed.features
     one, other = (

@@ -20,9 +20,9 @@ from mcap.records import Channel, Chunk, DataEnd, Footer, Header, Message, Schem
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_writer import BagWriter
-from thinmap_ros.logs.carmen import LONGEST_LINE, CarmenLog
-from thinmap_ros.logs.mcap_reader import Damage, whole_records
-from thinmap_ros.logs.mcap_records import LARGEST_CHUNK, DamagedError, records_of, unpacked
+from thinmap_ros.logs.carmen import MAX_LINE_LENGTH, CarmenLog
+from thinmap_ros.logs.mcap_reader import Damage, intact_records
+from thinmap_ros.logs.mcap_records import MAX_CHUNK_BYTES, DamagedError, decompress, records_of
 
 MAGIC = b'\x89MCAP0\r\n'
 EXPANDED = 900 * 2**20
@@ -113,13 +113,13 @@ def test_messages_beside_a_bomb_are_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize('compression', ['lz4', 'zstd'])
 def test_unpacked_is_exact_at_its_bound(compression: str) -> None:
     packed = packed_zeros(compression, 3 * 2**20)
-    assert unpacked(compression, packed, 3 * 2**20) == bytes(3 * 2**20)
+    assert decompress(compression, packed, 3 * 2**20) == bytes(3 * 2**20)
     with pytest.raises(DamagedError, match='more than'):
-        unpacked(compression, packed, 3 * 2**20 - 1)
+        decompress(compression, packed, 3 * 2**20 - 1)
     with pytest.raises(DamagedError, match='at most'):
-        unpacked(compression, packed, LARGEST_CHUNK + 1)
+        decompress(compression, packed, MAX_CHUNK_BYTES + 1)
     half = packed[: len(packed) // 2]
-    assert 0 < len(unpacked(compression, half, 3 * 2**20, whole=False)) < 3 * 2**20
+    assert 0 < len(decompress(compression, half, 3 * 2**20, whole=False)) < 3 * 2**20
 
 
 def test_definitions_without_end_are_refused(tmp_path: Path) -> None:
@@ -194,7 +194,7 @@ def test_offers_that_cannot_be_read_are_left_out(tmp_path: Path, said: str) -> N
     assert Bag(tmp_path / 'bag.mcap').offers == {'/said': []}
     code, line, _ = run('bag_repair', tmp_path / 'bag.mcap', '-o', tmp_path / 'good')
     assert code == 0, line
-    records = whole_records(tmp_path / 'good' / 'good.mcap', Damage())
+    records = intact_records(tmp_path / 'good' / 'good.mcap', Damage())
     channel = next(record for record in records if isinstance(record, Channel))
     assert channel.metadata == {}
 
@@ -211,7 +211,9 @@ def test_a_line_that_never_ends(tmp_path: Path) -> None:
     ):
         code, line, peak_mb = run(str(tool), *arguments)
         assert code == 2
-        assert f'log.clf.gz:2: a line of more than {LONGEST_LINE} bytes' in line and len(line) < 400
+        assert (
+            f'log.clf.gz:2: a line of more than {MAX_LINE_LENGTH} bytes' in line and len(line) < 400
+        )
         assert peak_mb < MOST_MB
     assert not (tmp_path / 'out').exists()
 

@@ -26,7 +26,7 @@ from fuzz.saved_states import (
 )
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.odometry import LastPose
+from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.files.npz import read_arrays
 from thinmap_ros.files.sessions import load_exploration, load_features, load_grid, load_topology
@@ -76,12 +76,14 @@ def test_a_chain_that_leaps_is_not_taken_for_one(explored: Explored) -> None:
 
 
 def test_what_a_killed_localizer_left() -> None:
-    whole = LastPose(10**18, np.array([1.0, 2.0, 0.5]), np.array([0.1, 0.2, 0.3])).state()
-    assert LastPose.from_state(whole).stamp_ns == 10**18
+    whole = OdometryAnchor(10**18, np.array([1.0, 2.0, 0.5]), np.array([0.1, 0.2, 0.3])).state()
+    assert OdometryAnchor.from_state(whole).stamp_ns == 10**18
     for name, array in whole.items():
         for _, other in replaced(array):
             try:
-                LastPose.from_state(whole | {name: other}).leads_to(10**18, np.zeros(3))
+                OdometryAnchor.from_state(whole | {name: other}).is_continuous_with(
+                    10**18, np.zeros(3)
+                )
             except InputError as error:
                 assert len(str(error)) <= LONGEST
 
@@ -203,7 +205,7 @@ def test_archives_that_unpack_to_more_than_any_map(tmp_path: Path) -> None:
         for _ in range(600):
             stream.write(bytes(1 << 20))
     assert path.stat().st_size < 1_000_000
-    with pytest.raises(InputError, match='bytes unpacked: expected at most'):
+    with pytest.raises(InputError, match='bytes decompressed: expected at most'):
         load_grid(str(path))
 
 

@@ -35,7 +35,7 @@ from thinmap_ros.files.sessions import (
     write_grid,
     write_topology,
 )
-from thinmap_ros.sim.laser import Lms200, Lms200Config
+from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 from thinmap_ros.sim.world import World
 
 
@@ -70,10 +70,10 @@ def way() -> list[Array]:
 
 
 def drive(grid: OccupancyGrid, builder: TopologyBuilder, poses: list[Array], seed: int) -> None:
-    laser = Lms200(Lms200Config(), seed)
+    laser = LaserScanner(LaserScannerConfig(), seed)
     world = building()
     for k, T in enumerate(poses):
-        grid.update(laser.scan(world, T, k), T)
+        grid.add_scan(laser.scan(world, T, k), T)
         builder.update(grid.window(T[0], T[1], 10.0), T)
 
 
@@ -105,8 +105,8 @@ def test_work_goes_on_as_if_it_had_never_stopped(tmp_path: Path) -> None:
     drive(grid, builder, poses[120:], 1)
     drive(again, restored, poses[120:], 1)
     assert (
-        np.array_equal(grid.patch().cells, again.patch().cells)
-        and grid.patch().frame == again.patch().frame
+        np.array_equal(grid.known_area().cells, again.known_area().cells)
+        and grid.known_area().frame == again.known_area().frame
     )
     assert_same(builder.map, restored.map)
     for key, array in grid.state().items():
@@ -117,7 +117,7 @@ def test_work_goes_on_as_if_it_had_never_stopped(tmp_path: Path) -> None:
 def test_nothing_seen_yet(tmp_path: Path) -> None:
     write_grid(tmp_path / 'a.npz', OccupancyGrid())
     write_topology(tmp_path / 'b.npz', TopologyBuilder())
-    assert read_grid(tmp_path / 'a.npz').patch().unknown.all()
+    assert read_grid(tmp_path / 'a.npz').known_area().unknown.all()
     assert not read_topology(tmp_path / 'b.npz').map.nodes
 
 
@@ -168,8 +168,12 @@ def test_what_names_no_session(path: str) -> None:
 def test_a_map_is_read_where_there_is_no_saved_grid_and_only_there(tmp_path: Path) -> None:
     grid = OccupancyGrid()
     drive(grid, TopologyBuilder(), way()[:5], 0)
-    write_map(tmp_path / 'a', grid.patch())
-    assert load_grid(str(tmp_path / 'a')).patch().occupied.sum() == grid.patch().occupied.sum() > 50
+    write_map(tmp_path / 'a', grid.known_area())
+    assert (
+        load_grid(str(tmp_path / 'a')).known_area().occupied.sum()
+        == grid.known_area().occupied.sum()
+        > 50
+    )
     with pytest.raises(InputError, match='resolution_m'):
         load_grid(str(tmp_path / 'a.yaml'), OccupancyConfig(resolution_m=0.05))
     with pytest.raises(InputError, match=r'a.grid.npz: No such file'):
@@ -198,11 +202,11 @@ def test_a_corrected_past_moves_the_nodes_and_they_keep_their_ids() -> None:
     corrected = OccupancyGrid()
     builder = TopologyBuilder()
     straight = TopologyBuilder()
-    laser = Lms200(Lms200Config(), 0)
+    laser = LaserScanner(LaserScannerConfig(), 0)
     for k, (T, wrong) in enumerate(zip(poses, believed, strict=True)):
         scan = laser.scan(world, T, k)
-        drifted.update(scan, wrong)
-        corrected.update(scan, T)
+        drifted.add_scan(scan, wrong)
+        corrected.add_scan(scan, T)
         builder.update(drifted.window(wrong[0], wrong[1], 10.0), wrong)
         straight.update(corrected.window(T[0], T[1], 10.0), T)
     before = dict(builder.map.nodes)
@@ -254,7 +258,7 @@ def test_features_are_kept_set_aside_or_refused_in_words(tmp_path):
     assert load_features(stem) is None
     localizer = ScanLocalizer()
     world = building()
-    laser = Lms200(Lms200Config(), 1)
+    laser = LaserScanner(LaserScannerConfig(), 1)
     for k in range(30):
         T = pose(3.0 + 0.1 * k, 6.0, 0.0)
         localizer.step(laser.scan(world, T, k), T)

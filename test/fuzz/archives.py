@@ -14,7 +14,7 @@ from fuzz.damaged_bags import check as check_bag
 from fuzz.damaged_bags import damaged, drive, ended, read_log, whole_bags
 from fuzz.saved_states import KINDS, Explored, State, one_number_replaced, replaced
 from fuzz.saved_states import check as check_state
-from thinmap_ros.core.odometry import LastPose
+from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.files import sessions
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_writer import BagWriter
@@ -146,11 +146,11 @@ def go_on_from_what_was_left(shared: State, rng: np.random.Generator, folder: Pa
     left = recovery.left()
     assert all(text.isprintable() and len(text) < 1000 for text in node.said), node.said
     if left is not None:
-        tried(lambda: LastPose.from_state(left).leads_to(10**18, np.zeros(3)))
+        tried(lambda: OdometryAnchor.from_state(left).is_continuous_with(10**18, np.zeros(3)))
 
 
 def last_pose(folder: Path) -> State:
-    return LastPose(10**18, np.array([1.0, 2.0, 0.5]), np.array([0.1, 0.2, 0.3])).state()
+    return OdometryAnchor(10**18, np.array([1.0, 2.0, 0.5]), np.array([0.1, 0.2, 0.3])).state()
 
 
 SOURCES = (

@@ -155,7 +155,7 @@ def check(path: Path, out: Path) -> str:
         assert read_code == 2
         return 'refused'
     bag = Bag(out)
-    assert not bag.cut_off
+    assert not bag.is_truncated
     messages = list(bag.messages())
     assert said.startswith(f'{out}: {len(messages)} messages on ')
     out.unlink()

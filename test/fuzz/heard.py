@@ -18,7 +18,7 @@ from thinmap_ros.core.slam.localizer import ScanLocalizer, ScanLocalizerConfig
 from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.logs.carmen import LaserOptions
-from thinmap_ros.view.message_view import Feed
+from thinmap_ros.view.message_view import MessageView
 from thinmap_ros.view.null_view import NullView
 
 _COUNT = 10
@@ -57,7 +57,7 @@ def take_messages(shared: None, rng: np.random.Generator, folder: Path) -> None:
 
 def show_messages(shared: None, rng: np.random.Generator, folder: Path) -> None:
     """What the viewer makes of them."""
-    feed = Feed(NullView(), lambda frame: np.zeros(3))
+    feed = MessageView(NullView(), lambda frame: np.zeros(3))
     told = []
     for _ in range(3):
         kind = chosen(rng, _KINDS)
@@ -65,7 +65,7 @@ def show_messages(shared: None, rng: np.random.Generator, folder: Path) -> None:
             told.append(repr(message))
             (folder / 'messages.txt').write_text('\n'.join(told))
             topic = chosen(rng, _TOPICS[kind.__name__])
-            tried(lambda heard=message, where=topic: feed.take(where, heard))
+            tried(lambda heard=message, where=topic: feed.show(where, heard))
 
 
 def set_parameters(shared: None, rng: np.random.Generator, folder: Path) -> None:

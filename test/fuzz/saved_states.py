@@ -15,7 +15,7 @@ from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.slam.localizer import ScanLocalizer
 from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.files.worlds import read_world
-from thinmap_ros.sim.coverage import coverable
+from thinmap_ros.sim.coverage import observable_cells
 from thinmap_ros.sim.world import World
 
 ROOM = Path(__file__).resolve().parents[2] / 'worlds' / 'room_10x10.yaml'
@@ -34,14 +34,14 @@ class Explored:
         world = World(name, patch.occupied.astype(np.uint8), patch.frame, start)
         self.loop: ClosedLoop = make_loop(world, start, Options(localization='slam', speed_m_s=0.4))
         self.scans: list[tuple[Any, Any]] = []
-        note = self.loop.note
+        note = self.loop.log_poses
 
         def noted(scan: Any, estimate: Any) -> None:
             self.scans.append((scan, estimate.T_map_base))
             note(scan, estimate)
 
-        self.loop.note = noted  # type: ignore[method-assign]
-        self.loop.run(coverable(world, start, 0.3, 8.0), 40.0, lambda seconds, share: None)
+        self.loop.log_poses = noted  # type: ignore[method-assign]
+        self.loop.run(observable_cells(world, start, 0.3, 8.0), 40.0, lambda seconds, share: None)
         pipeline = self.loop.pipeline
         self.states: dict[str, State] = {
             'topology': pipeline.topology.state(),
@@ -68,7 +68,7 @@ class Explored:
     def _use_exploration(self, state: State) -> Work:
         explorer = Explorer.from_state(state)
         pipeline = self.loop.pipeline
-        patch = pipeline.grid.patch()
+        patch = pipeline.grid.known_area()
         return lambda scan, T: explorer.step(pipeline.topology.map, patch, scan, T)
 
     def _use_features(self, state: State) -> Work:
@@ -80,9 +80,9 @@ class Explored:
         grid = OccupancyGrid.from_state(state)
 
         def work(scan: Any, T: Any) -> None:
-            grid.update(scan, T)
+            grid.add_scan(scan, T)
             grid.window(T[0], T[1], 8.0)
-            grid.patch()
+            grid.known_area()
 
         return work
 

@@ -65,7 +65,7 @@ def test_a_killed_recorder_loses_no_more_than_what_came_since_the_last_flush(gra
     recorder.wait()
     del graph.processes['recorder']
     found, bag = numbers(tmp_path / 'bag')
-    assert bag.cut_off
+    assert bag.is_truncated
     assert found == list(range(len(found)))
     assert len(found) > 10
     assert sum(1 for _ in bag.messages(set(bag.topics))) >= written
@@ -89,7 +89,7 @@ def test_a_full_disk_ends_the_recording_in_words_and_what_is_written_stays_reada
     assert str(tmp_path / 'bag') in line and 'recording ends here' in line
     assert 'Traceback' not in graph.log('recorder')
     found, bag = numbers(tmp_path / 'bag')
-    assert bag.cut_off
+    assert bag.is_truncated
     assert found == list(range(len(found))) and len(found) >= before > 0
 
 

@@ -80,7 +80,7 @@ class Mapping:
         """The scans before number k were made where they really were."""
         stamps = (np.arange(k) + 1) * SECOND_NS
         ns = (k + 1) * SECOND_NS
-        self.by_hand.correct(stamps, TRUE[:k], ns)
+        self.by_hand.apply_correction(stamps, TRUE[:k], ns)
         self._paths.publish(messages.trajectory_msg(stamps.tolist(), TRUE[:k], 'map', ns))
         return ns
 
@@ -119,8 +119,8 @@ def test_a_map_that_is_saved_meanwhile_has_undergone_the_correction(graph, tmp_p
     assert response.success, response.message
     mapping.by_hand.finish()
     saved = sessions.load_grid(str(tmp_path / 'room'), CONFIG)
-    expected = mapping.by_hand.shown.patch()
-    np.testing.assert_array_equal(saved.patch().cells, expected.cells)
+    expected = mapping.by_hand.shown.known_area()
+    np.testing.assert_array_equal(saved.known_area().cells, expected.cells)
     assert mapping.add(COUNT + 1, TRUE[COUNT + 1]) == corrected_ns
     assert graph.stop('grid_mapper') == 0
 
@@ -144,7 +144,7 @@ def test_a_mapper_that_is_killed_meanwhile_goes_on_with_the_map_that_was_shown(g
     mapping.start()
     graph.until(lambda: mapping.maps, 'the map, at once')
     known = messages.patch_from(mapping.maps[-1])
-    expected = OccupancyGrid.from_state(shown, CONFIG).patch()
+    expected = OccupancyGrid.from_state(shown, CONFIG).known_area()
     np.testing.assert_array_equal(known.cells, expected.cells)
     # What is published before the two have found each other is lost.
     mapping.windows.clear()

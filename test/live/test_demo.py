@@ -78,7 +78,7 @@ def test_the_robot_explores_the_room_and_stops_by_itself(ros_domain, tmp_path):
     assert (out / 'summary.png').stat().st_size > 10_000
     bag = Bag(out / 'bag')
     assert set(bag.topics) >= TOPICS
-    assert not bag.cut_off
+    assert not bag.is_truncated
     assert not nodes_of(out)
 
 

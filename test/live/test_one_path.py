@@ -19,11 +19,11 @@ from thinmap_ros.files import occupancy_maps, package_data, sessions
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.logs.bag import BagLog
 from thinmap_ros.logs.carmen import CarmenLog, LaserOptions
-from thinmap_ros.logs.log import OdometryEvent, ScanEvent, Skipped
+from thinmap_ros.logs.log import OdometryEvent, ScanEvent, SkippedRecords
 from thinmap_ros.pipeline import PipelineConfig
 from thinmap_ros.replaying import replay
 from thinmap_ros.ros import messages, qos
-from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import Simulation
 from thinmap_ros.sim.world import World
@@ -61,12 +61,12 @@ class SimulatedLog:
     """What a robot senses that drives in circles through the room."""
 
     def __init__(self):
-        self.skipped = Skipped()
+        self.skipped = SkippedRecords()
 
     def events(self):
         world = World.from_patch(*read_world(package_data.world_path('room_10x10')))
-        simulation = Simulation(world, world.start, PRESETS['2dx'], Lms200Config(), 5)
-        moment = simulation.sense()
+        simulation = Simulation(world, world.start, PRESETS['2dx'], LaserScannerConfig(), 5)
+        moment = simulation.read_sensors()
         for _ in range(400):
             yield OdometryEvent(moment.stamp_ns, moment.T_odom_base)
             if moment.scan is not None:
@@ -78,7 +78,7 @@ class LoopLog:
     """What a robot senses that comes back to where it began after its map has drifted."""
 
     def __init__(self):
-        self.skipped = Skipped()
+        self.skipped = SkippedRecords()
 
     def events(self):
         for scan, odom, _ in drive_round_the_block():
@@ -89,7 +89,7 @@ class LoopLog:
 def assert_same(one, other):
     assert one.stamps_ns == other.stamps_ns
     assert np.abs(np.array(one.poses) - np.array(other.poses)).max() <= 1e-9
-    patches = one.pipeline.grid.patch(), other.pipeline.grid.patch()
+    patches = one.pipeline.grid.known_area(), other.pipeline.grid.known_area()
     assert np.array_equal(patches[0].cells, patches[1].cells)
 
 
@@ -133,7 +133,7 @@ def assert_live_is_same(graph, bag, expected, tmp_path, **localizer):
     assert np.abs(live - expected.poses).max() <= 1e-9
     response = graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(tmp_path / 'live')))
     assert response.success, response.message
-    occupancy_maps.write_map(tmp_path / 'replayed', expected.pipeline.grid.patch())
+    occupancy_maps.write_map(tmp_path / 'replayed', expected.pipeline.grid.known_area())
     assert (tmp_path / 'live.pgm').read_bytes() == (tmp_path / 'replayed.pgm').read_bytes()
 
 

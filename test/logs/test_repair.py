@@ -25,7 +25,7 @@ from rosbags.typesys import Stores, get_typestore
 from thinmap_ros.logs import qos
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_writer import BagWriter
-from thinmap_ros.logs.mcap_reader import Damage, McapFile, whole_records
+from thinmap_ros.logs.mcap_reader import Damage, McapFile, intact_records
 from thinmap_ros.logs.mcap_records import HEAD, MAGIC
 
 STRING = 'std_msgs/msg/String'
@@ -52,7 +52,7 @@ def text(writer: BagWriter, i: int) -> Any:
 
 def numbers(path: Path) -> list[int]:
     bag = Bag(path)
-    assert not bag.cut_off
+    assert not bag.is_truncated
     return [int(bag.decode(message).data.split()[1]) for message in bag.messages()]
 
 
@@ -68,7 +68,7 @@ def test_what_is_flushed_is_readable_at_once(tmp_path: Path) -> None:
     writer.flush()
     writer.flush()
     bag = Bag(tmp_path / 'bag')
-    assert len(list(bag.messages())) == 5 and bag.cut_off
+    assert len(list(bag.messages())) == 5 and bag.is_truncated
     writer.write('/said', STRING, 2 * 10**9, text(writer, 5))
     writer.close()
     assert numbers(tmp_path / 'bag') == list(range(6))
@@ -191,15 +191,15 @@ def test_a_damaged_chunk_costs_only_itself(tmp_path: Path, compression: Compress
     content[hit.chunk_start_offset + hit.chunk_length - hit.compressed_size // 2] ^= 0x40
     path.write_bytes(content)
     damage = Damage()
-    records = list(whole_records(path, damage))
+    records = list(intact_records(path, damage))
     lost = range(hit.message_start_time, hit.message_end_time + 1)
     assert 0 < len(lost) < 100
     assert [r.log_time for r in records if isinstance(r, Message)] == [
         i for i in range(500) if i not in lost
     ]
-    assert list(damage.parts) == [hit.chunk_start_offset] and not damage.cut_off
+    assert list(damage.parts) == [hit.chunk_start_offset] and not damage.is_truncated
     if compression == CompressionType.NONE:
-        assert damage.parts[hit.chunk_start_offset] == 'checksum that does not fit its bytes'
+        assert damage.parts[hit.chunk_start_offset] == 'wrong checksum'
 
 
 def test_a_damaged_summary_is_not_believed(tmp_path: Path) -> None:
@@ -220,7 +220,7 @@ def test_what_cannot_be_repaired_is_said_in_one_line(tmp_path: Path) -> None:
     (tmp_path / 'empty').mkdir()
     for name, said in (
         ('text.mcap', 'begin with'),
-        ('start.mcap', 'no whole message'),
+        ('start.mcap', 'no intact message'),
         ('empty', 'MCAP files in it'),
     ):
         done = repaired(tmp_path / name)
@@ -247,7 +247,7 @@ def test_behind_a_range_of_zeros_it_goes_on_at_the_next_chunk_of_the_summary(
     assert COUNT - 10 * PER_CHUNK < len(found) < COUNT and {0, COUNT - 1} <= set(found)
     bag = Bag(folder)
     assert [int(bag.decode(m).data.split()[1]) for m in bag.messages()] == found
-    assert bag.cut_off
+    assert bag.is_truncated
 
 
 def test_messages_that_are_compressed_each_on_its_own_are_unpacked(tmp_path: Path) -> None:
@@ -278,7 +278,7 @@ def test_no_damage_makes_it_stumble_or_invent(
     at = 8 + int(share * (len(_WHOLE[0]) - 8))
     damaged = _WHOLE[0][:at] + noise + (b'' if cut else _WHOLE[0][at + len(noise) :])
     (tmp_path / 'damaged.mcap').write_bytes(damaged)
-    records = list(whole_records(tmp_path / 'damaged.mcap', Damage()))
+    records = list(intact_records(tmp_path / 'damaged.mcap', Damage()))
     if not cut and not noise:
         assert sum(isinstance(record, Message) for record in records) == COUNT
     assert len(records) <= COUNT + 10 + len(noise)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.files.atomic import parts_of, written_aside
+from thinmap_ros.files.atomic import atomic_write, partial_files
 from thinmap_ros.ros.checkpoint import Recovery, state_folder
 
 STATE = {'a': np.arange(3), 'b': np.array(2.5)}
@@ -157,7 +157,7 @@ def test_a_file_of_another_user_is_left_alone(
 def test_a_folder_of_another_user(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder.mkdir(mode=0o700)
     monkeypatch.setattr(os, 'getuid', lambda: folder.stat().st_uid + 1)
-    with pytest.raises(InputError, match=r'of user .*: expected a folder of this user'):
+    with pytest.raises(InputError, match=r'owned by user .*: expected a folder of this user'):
         state_folder()
 
 
@@ -175,9 +175,9 @@ def test_a_file_beside_has_a_name_that_cannot_be_guessed(tmp_path: Path) -> None
     path = tmp_path / 'a.[b]'
     names = set()
     for _ in range(3):
-        with written_aside(path) as aside:
+        with atomic_write(path) as aside:
             names.add(aside.name)
             aside.write_text('whole')
-            assert parts_of(path) == [aside]
+            assert partial_files(path) == [aside]
     assert len(names) == 3 and all(str(os.getpid()) not in name.split('.') for name in names)
     assert path.read_text() == 'whole' and list(tmp_path.iterdir()) == [path]

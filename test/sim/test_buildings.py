@@ -8,33 +8,33 @@ import pytest
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.sim.buildings import BuildingConfig, building
-from thinmap_ros.sim.floor_plan import Kind, floor_plan
-from thinmap_ros.sim.laser import Lms200, Lms200Config
-from thinmap_ros.sim.moving_obstacles import Leaves, Moving, People
-from thinmap_ros.sim.robot import PioneerConfig
+from thinmap_ros.sim.buildings import BuildingConfig, generate_building
+from thinmap_ros.sim.floor_plan import Kind, generate_floor_plan
+from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
+from thinmap_ros.sim.moving_obstacles import Doors, MovingObstacles, Pedestrians
+from thinmap_ros.sim.robot import RobotConfig
 from thinmap_ros.sim.surfaces import inside_of
 from thinmap_ros.sim.world import World
 
 SEEDS = range(24)
-EXACT = Lms200Config(noise_m=0.0, rounding_m=0.0, mixed_pixels=0.0)
-NOBODY = People(np.zeros((0, 4, 2)), np.zeros(0), np.zeros((0, 4)))
-NO_DOOR = Leaves(
+EXACT = LaserScannerConfig(noise_m=0.0, rounding_m=0.0, mixed_pixels=0.0)
+NOBODY = Pedestrians(np.zeros((0, 4, 2)), np.zeros(0), np.zeros((0, 4)))
+NO_DOOR = Doors(
     np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros((0, 1)), np.zeros((0, 1), bool)
 )
 
 
 def plain(seed, **given):
     """A building without furniture."""
-    return building(seed, BuildingConfig(clutter=0.0, **given))
+    return generate_building(seed, BuildingConfig(clutter=0.0, **given))
 
 
 @pytest.mark.parametrize('seed', SEEDS)
 def test_a_robot_gets_into_every_part(seed):
     made = plain(seed, area_m2=600.0 + 100.0 * seed)
     world = made.world
-    inside = inside_of(replace(world, occupied=(world.wall_distance_m < 0.3).astype(np.uint8)))
-    assert world.is_clear(*world.start[:2], PioneerConfig().radius_m)
+    inside = inside_of(replace(world, occupied=(world.distance_to_wall_m < 0.3).astype(np.uint8)))
+    assert world.is_clear(*world.start[:2], RobotConfig().radius_m)
     for wing in made.wings:
         for part in wing.plan.parts:
             middle = np.array([[0.5 * (part.x0 + part.x1), 0.5 * (part.y0 + part.y1)]])
@@ -49,7 +49,7 @@ def test_a_robot_gets_into_every_part(seed):
 def test_parts_tile_the_plan():
     for seed in SEEDS:
         rng = np.random.default_rng(seed)
-        plan = floor_plan(*rng.uniform(10.0, 120.0, 2), 0.3, rng)
+        plan = generate_floor_plan(*rng.uniform(10.0, 120.0, 2), 0.3, rng)
         area = sum(part.width * part.depth for part in plan.parts)
         assert area == pytest.approx(plan.width * plan.depth)
         assert min(min(part.width, part.depth) for part in plan.parts) > 1.5
@@ -57,15 +57,15 @@ def test_parts_tile_the_plan():
 
 
 def test_a_seed_says_all_and_another_says_something_else():
-    one = building(5)
-    same = building(5)
-    other = building(6)
+    one = generate_building(5)
+    same = generate_building(5)
+    other = generate_building(6)
     assert np.array_equal(one.world.occupied, same.world.occupied)
     assert one.world.frame == same.world.frame
     assert np.array_equal(one.world.start, same.world.start)
-    places = [made.world.moving.people.places(77.0) for made in (one, same)]
+    places = [made.world.moving.pedestrians.places(77.0) for made in (one, same)]
     assert np.array_equal(*places)
-    leaves = [vars(made.world.moving.leaves) for made in (one, same)]
+    leaves = [vars(made.world.moving.doors) for made in (one, same)]
     assert all(np.array_equal(leaves[0][name], leaves[1][name]) for name in leaves[0])
     assert one.world.occupied.shape != other.world.occupied.shape
 
@@ -75,7 +75,7 @@ def test_what_is_asked_for():
     assert made.area_m2 == pytest.approx(4000.0, rel=0.1)
     assert len(made.wings) == 1
     assert not any(part.kind is Kind.HALL for part in made.wings[0].plan.parts)
-    assert made.world.moving is None or len(made.world.moving.people.points) == 0
+    assert made.world.moving is None or len(made.world.moving.pedestrians.points) == 0
     halls = plain(3, area_m2=4000.0, hall_share=1.0)
     wide = [p for w in halls.wings for p in w.plan.parts if p.kind is Kind.HALL]
     assert any(min(hall.width, hall.depth) > 16.0 for hall in wide)  # wider than 8 m of laser
@@ -90,15 +90,15 @@ def test_oblique_wings_are_among_them():
 
 
 def test_the_largest():
-    made = building(1, BuildingConfig(area_m2=100_000.0))
+    made = generate_building(1, BuildingConfig(area_m2=100_000.0))
     assert made.area_m2 > 50_000.0
-    assert made.world.is_clear(*made.world.start[:2], PioneerConfig().radius_m)
+    assert made.world.is_clear(*made.world.start[:2], RobotConfig().radius_m)
 
 
 @pytest.mark.parametrize('area_m2', [math.nan, 0.0, 100.0, 1e6])
 def test_a_size_that_there_is_not_is_refused(area_m2):
     with pytest.raises(InputError, match=r'area_m2: .*: expected 150 to 100000 m2'):
-        building(0, BuildingConfig(area_m2=area_m2))
+        generate_building(0, BuildingConfig(area_m2=area_m2))
 
 
 def walled(glass, moving=None):
@@ -112,7 +112,7 @@ def walled(glass, moving=None):
 
 def ahead(world, seconds=0.0):
     """What the beam straight ahead reads, looking along x from (1, 2)."""
-    scan = Lms200(EXACT, 0).scan(world, np.array([1.0, 2.0, 0.0]), round(1e9 * seconds))
+    scan = LaserScanner(EXACT, 0).scan(world, np.array([1.0, 2.0, 0.0]), round(1e9 * seconds))
     return scan.ranges_m[90]
 
 
@@ -124,14 +124,14 @@ def test_glass_returns_nothing_and_is_solid():
 
 def test_people_are_seen_where_they_are_then_and_step_aside():
     points = np.array([[[2.0, 2.0], [2.0, 3.9], [2.0, 3.9], [2.0, 2.0]]])
-    people = People(points, np.array([1.0]), np.full((1, 4), 10.0))
-    world = walled(False, Moving(people, NO_DOOR))
+    people = Pedestrians(points, np.array([1.0]), np.full((1, 4), 10.0))
+    world = walled(False, MovingObstacles(people, NO_DOOR))
     assert ahead(world, 5.0) == pytest.approx(0.8)
     assert people.places(11.0)[0] == pytest.approx((2.0, 3.0))
     assert ahead(world, 20.0) == pytest.approx(2.0)
     assert ahead(world, 43.8 + 5.0) == pytest.approx(0.8)  # round again
-    beside = People(points - (0.6, 0.0), np.array([1.0]), np.full((1, 4), 10.0))
-    assert ahead(walled(False, Moving(beside, NO_DOOR)), 5.0) == pytest.approx(2.0)
+    beside = Pedestrians(points - (0.6, 0.0), np.array([1.0]), np.full((1, 4), 10.0))
+    assert ahead(walled(False, MovingObstacles(beside, NO_DOOR)), 5.0) == pytest.approx(2.0)
 
 
 def test_people_walk_evenly_from_point_to_point():
@@ -141,7 +141,7 @@ def test_people_walk_evenly_from_point_to_point():
     points[3, 2] = points[3, 1]
     pauses = rng.exponential(8.0, (6, 4))
     pauses[4] = 0.0
-    people = People(points, speeds, pauses)
+    people = Pedestrians(points, speeds, pauses)
     for seconds in (0.0, *rng.uniform(0.0, 500.0, 200)):
         for i, place in enumerate(people.places(seconds)):
             times = [0.0]
@@ -161,7 +161,7 @@ def test_doors_swing_and_are_held_open_for_a_robot():
     ends = np.array([[2.0, 2.5]])
     open_rad = np.array([[1.0, -0.5, 1.0]])
     is_shut = np.array([[False, False, True]])
-    leaves = Leaves(hinges, ends, np.array([10.0]), open_rad, is_shut)
+    leaves = Doors(hinges, ends, np.array([10.0]), open_rad, is_shut)
     far = np.array([-6.0, 2.0])
     near = np.array([1.0, 2.0])
 
@@ -174,16 +174,16 @@ def test_doors_swing_and_are_held_open_for_a_robot():
         seen = [angle(first + seconds, far) for seconds in (0.0, 9.9, 10.0, 20.0, 29.9)]
         assert seen == pytest.approx([1.0, 1.0, -0.5, 0.0, 0.0])
     assert [angle(seconds, near) for seconds in (10.0, 20.0)] == pytest.approx([-0.5, 1.0])
-    blocked = Leaves(hinges, ends, np.array([np.inf]), np.ones((1, 2)), np.array([[True, False]]))
-    world = walled(False, Moving(NOBODY, blocked))
+    blocked = Doors(hinges, ends, np.array([np.inf]), np.ones((1, 2)), np.array([[True, False]]))
+    world = walled(False, MovingObstacles(NOBODY, blocked))
     for seconds in (0.0, 1e4):
-        scan = Lms200(EXACT, 0).scan(world, np.array([-1.5, 2.0, 0.0]), round(1e9 * seconds))
+        scan = LaserScanner(EXACT, 0).scan(world, np.array([-1.5, 2.0, 0.0]), round(1e9 * seconds))
         assert scan.ranges_m[90] == pytest.approx(3.5)
 
 
 def test_doors_that_move_are_shut_half_of_the_time():
     for share in (0.0, 0.5, 1.0):
-        leaves = plain(3, area_m2=4000.0, moving_doors=share).world.moving.leaves
+        leaves = plain(3, area_m2=4000.0, moving_doors=share).world.moving.doors
         moves = np.isfinite(leaves.period_s)
         assert moves.mean() == pytest.approx(share, abs=0.2)
         assert not leaves.is_shut[~moves].any()

@@ -11,10 +11,10 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import ConfigError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.scan import Scan
-from thinmap_ros.sim.laser import Lms200, Lms200Config
+from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 from thinmap_ros.sim.world import World
 
-EXACT = Lms200Config(noise_m=0.0, mixed_pixels=0.0, rounding_m=0.0)
+EXACT = LaserScannerConfig(noise_m=0.0, mixed_pixels=0.0, rounding_m=0.0)
 
 
 def box(width_m: float = 6.0, height_m: float = 4.0, pillar: bool = False) -> World:
@@ -54,21 +54,21 @@ def analytic(
 @settings(deadline=None, max_examples=60)
 @given(st.floats(0.3, 5.7), st.floats(0.3, 3.7), st.floats(-3.2, 3.2))
 def test_ranges_are_the_geometry(x: float, y: float, theta: float) -> None:
-    scan = Lms200(EXACT, 0).scan(BOX, np.array([x, y, theta]), 5)
+    scan = LaserScanner(EXACT, 0).scan(BOX, np.array([x, y, theta]), 5)
     assert scan.ranges_m.size == 181
     assert scan.stamp_ns == 5
     assert np.allclose(scan.ranges_m, analytic(x, y, theta, scan.angles_rad), atol=2e-6)
 
 
 def test_the_fan_is_that_of_an_lms200() -> None:
-    scan = Lms200(Lms200Config(), 0).scan(BOX, BOX.start, 0)
+    scan = LaserScanner(LaserScannerConfig(), 0).scan(BOX, BOX.start, 0)
     assert np.allclose(np.degrees(scan.angles_rad), np.arange(-90, 91), atol=1e-4)
     assert (scan.range_min_m, scan.range_max_m) == (pytest.approx(0.05), 8.0)
 
 
 def test_beyond_the_range_there_is_no_return() -> None:
     world = box(20.0, 4.0)
-    scan = Lms200(EXACT, 0).scan(world, np.array([1.0, 2.0, 0.0]), 0)
+    scan = LaserScanner(EXACT, 0).scan(world, np.array([1.0, 2.0, 0.0]), 0)
     true = analytic(1.0, 2.0, 0.0, scan.angles_rad, 20.0)
     assert np.array_equal(scan.no_return, true >= 8.0)
     assert scan.no_return.sum() > 10
@@ -80,7 +80,7 @@ def test_beyond_the_range_there_is_no_return() -> None:
     ('beams', 'fov', 'range_m'), [(541, 270.0, 4.0), (360, 360.0, 80.0), (181, 180.0, 8.0)]
 )
 def test_other_lasers(beams: int, fov: float, range_m: float) -> None:
-    config = Lms200Config(
+    config = LaserScannerConfig(
         beams=beams,
         field_of_view_deg=fov,
         range_max_m=range_m,
@@ -88,7 +88,7 @@ def test_other_lasers(beams: int, fov: float, range_m: float) -> None:
         mixed_pixels=0.0,
         rounding_m=0.0,
     )
-    scan = Lms200(config, 0).scan(BOX, np.array([3.0, 1.0, 1.0]), 0)
+    scan = LaserScanner(config, 0).scan(BOX, np.array([3.0, 1.0, 1.0]), 0)
     assert scan.ranges_m.size == beams
     step = fov / beams if fov == 360.0 else fov / (beams - 1)
     assert math.degrees(scan.angle_increment_rad) == pytest.approx(step, rel=1e-5)
@@ -100,9 +100,9 @@ def test_other_lasers(beams: int, fov: float, range_m: float) -> None:
 
 
 def test_the_mount_moves_the_laser() -> None:
-    config = Lms200Config(mount_x_m=0.4, noise_m=0.0, mixed_pixels=0.0, rounding_m=0.0)
+    config = LaserScannerConfig(mount_x_m=0.4, noise_m=0.0, mixed_pixels=0.0, rounding_m=0.0)
     T_world_base = np.array([1.0, 2.0, 0.7])
-    scan = Lms200(config, 0).scan(BOX, T_world_base, 0)
+    scan = LaserScanner(config, 0).scan(BOX, T_world_base, 0)
     points = se2.transform_points(T_world_base, scan.points_base())
     on_wall = np.minimum.reduce(
         [abs(points[:, 0]), abs(points[:, 0] - 6), abs(points[:, 1]), abs(points[:, 1] - 4)]
@@ -112,9 +112,9 @@ def test_the_mount_moves_the_laser() -> None:
 
 
 def test_noise_has_its_sigma_and_ranges_are_whole_millimetres() -> None:
-    laser = Lms200(Lms200Config(noise_m=0.01, mixed_pixels=0.0), 3)
+    laser = LaserScanner(LaserScannerConfig(noise_m=0.01, mixed_pixels=0.0), 3)
     scans = [laser.scan(BOX, np.array([3.0, 2.0, 0.4]), i) for i in range(200)]
-    exact = Lms200(EXACT, 0).scan(BOX, np.array([3.0, 2.0, 0.4]), 0)
+    exact = LaserScanner(EXACT, 0).scan(BOX, np.array([3.0, 2.0, 0.4]), 0)
     errors = np.array([s.ranges_m for s in scans]) - exact.ranges_m
     assert abs(errors.mean()) < 3e-4
     assert errors.std() == pytest.approx(0.01, rel=0.03)
@@ -125,8 +125,8 @@ def test_noise_has_its_sigma_and_ranges_are_whole_millimetres() -> None:
 def test_mixed_pixels_lie_between_the_two_surfaces_and_only_at_edges() -> None:
     world = box(pillar=True)
     pose = np.array([1.0, 2.0, 0.0])
-    exact = Lms200(EXACT, 0).scan(world, pose, 0).ranges_m
-    mixing = Lms200(Lms200Config(noise_m=0.0, rounding_m=0.0, mixed_pixels=1.0), 1)
+    exact = LaserScanner(EXACT, 0).scan(world, pose, 0).ranges_m
+    mixing = LaserScanner(LaserScannerConfig(noise_m=0.0, rounding_m=0.0, mixed_pixels=1.0), 1)
     changed = np.zeros(exact.size, dtype=bool)
     for i in range(50):
         ranges = mixing.scan(world, pose, i).ranges_m
@@ -143,24 +143,24 @@ def test_mixed_pixels_favour_neither_side() -> None:
     """A pillar straight ahead: what its left edge does on average, its right edge does as well."""
     world = box(pillar=True)
     pose = np.array([1.0, 2.0, 0.0])
-    laser = Lms200(Lms200Config(noise_m=0.0, rounding_m=0.0, mixed_pixels=1.0), 1)
+    laser = LaserScanner(LaserScannerConfig(noise_m=0.0, rounding_m=0.0, mixed_pixels=1.0), 1)
     mean = np.mean([laser.scan(world, pose, i).ranges_m for i in range(1000)], axis=0)
-    off = mean - Lms200(EXACT, 0).scan(world, pose, 0).ranges_m
+    off = mean - LaserScanner(EXACT, 0).scan(world, pose, 0).ranges_m
     assert np.abs(off).max() > 0.3
     np.testing.assert_allclose(off, off[::-1], atol=0.1)
 
 
 def test_mixed_pixels_come_as_often_as_said() -> None:
     world = box(pillar=True)
-    laser = Lms200(Lms200Config(noise_m=0.0, rounding_m=0.0, mixed_pixels=0.3), 1)
-    exact = Lms200(EXACT, 0).scan(world, world.start, 0).ranges_m
+    laser = LaserScanner(LaserScannerConfig(noise_m=0.0, rounding_m=0.0, mixed_pixels=0.3), 1)
+    exact = LaserScanner(EXACT, 0).scan(world, world.start, 0).ranges_m
     mixed = [int((laser.scan(world, world.start, i).ranges_m != exact).sum()) for i in range(500)]
     assert np.mean(mixed) == pytest.approx(0.6, abs=0.1)
 
 
 def test_the_seed_decides_the_noise() -> None:
     def ranges(seed: int) -> Scan:
-        return Lms200(Lms200Config(), seed).scan(BOX, BOX.start, 0)
+        return LaserScanner(LaserScannerConfig(), seed).scan(BOX, BOX.start, 0)
 
     assert np.array_equal(ranges(1).ranges_m, ranges(1).ranges_m)
     assert not np.array_equal(ranges(1).ranges_m, ranges(2).ranges_m)
@@ -168,6 +168,6 @@ def test_the_seed_decides_the_noise() -> None:
 
 def test_nonsense_is_refused() -> None:
     with pytest.raises(ConfigError, match='beams'):
-        Lms200Config(beams=1)
+        LaserScannerConfig(beams=1)
     with pytest.raises(ConfigError, match='range_max_m'):
-        Lms200Config(range_max_m=float('nan'))
+        LaserScannerConfig(range_max_m=float('nan'))

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scripts.make_warehouse import warehouse
+from scripts.make_warehouse import warehouse_yaml
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.raytrace import cast_rays
 from thinmap_ros.files.worlds import read_tour, read_world
-from thinmap_ros.sim.drives import drive, ways_along
-from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.drives import drive, tour_paths
+from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import Simulation
 from thinmap_ros.sim.surfaces import surfaces
@@ -91,11 +91,11 @@ def _sees(world: World, place: np.ndarray, face: np.ndarray, resolution: float) 
 def test_the_tour_can_be_driven(name: str) -> None:
     world, tour = load(name)
     robot = PRESETS['2dx']
-    simulation = Simulation(world, world.start, robot, Lms200Config(rate_hz=0.1), 0)
+    simulation = Simulation(world, world.start, robot, LaserScannerConfig(rate_hz=0.1), 0)
     poses = np.array(
         [
             look.T_world_base
-            for look in drive(simulation, ways_along(world, tour, robot.radius_m), 0.5)
+            for look in drive(simulation, tour_paths(world, tour, robot.radius_m), 0.5)
         ]
     )
     assert simulation.robot.collisions == 0
@@ -121,22 +121,22 @@ def test_the_long_tour_takes_twenty_minutes() -> None:
 
 
 def test_the_warehouse_is_what_its_program_writes() -> None:
-    assert (WORLDS / 'warehouse.yaml').read_text(encoding='utf-8') == warehouse()
+    assert (WORLDS / 'warehouse.yaml').read_text(encoding='utf-8') == warehouse_yaml()
 
 
 def test_a_place_that_cannot_be_reached_is_said() -> None:
     world, _ = load('office')
     with pytest.raises(InputError, match=r'office: tour: \[20\.0, 3\.0\]'):
-        list(ways_along(world, np.array([[20.0, 3.0]]), 0.22))
+        list(tour_paths(world, np.array([[20.0, 3.0]]), 0.22))
 
 
 def test_the_same_seed_drives_the_same() -> None:
     world, tour = load('dead_end')
 
     def ranges() -> np.ndarray:
-        simulation = Simulation(world, world.start, PRESETS['2dx'], Lms200Config(), 3)
+        simulation = Simulation(world, world.start, PRESETS['2dx'], LaserScannerConfig(), 3)
         return np.array(
-            [x.scan.ranges_m for x in drive(simulation, ways_along(world, tour[:1], 0.22), 1.0)]
+            [x.scan.ranges_m for x in drive(simulation, tour_paths(world, tour[:1], 0.22), 1.0)]
         )
 
     assert np.array_equal(ranges(), ranges())

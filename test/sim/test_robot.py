@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.sim.robot import PRESETS, Pioneer, PioneerConfig, after_arc
+from thinmap_ros.sim.robot import PRESETS, DifferentialDriveRobot, RobotConfig, after_arc
 from thinmap_ros.sim.world import World
 
-EXACT = PioneerConfig(
+EXACT = RobotConfig(
     scale_sigma=0.0,
     turn_scale_sigma=0.0,
     drift_sigma_rad_m=0.0,
@@ -51,7 +51,7 @@ def test_an_arc_has_no_jump_where_it_becomes_straight(turn: float) -> None:
 
 
 def test_a_full_circle_comes_back() -> None:
-    robot = Pioneer(EXACT, HALL, np.array([1.0, 2.0, 0.3]), 0)
+    robot = DifferentialDriveRobot(EXACT, HALL, np.array([1.0, 2.0, 0.3]), 0)
     robot.v = 0.2
     robot.w = 2 * math.pi / 10
     for _ in range(200):
@@ -63,7 +63,7 @@ def test_a_full_circle_comes_back() -> None:
 @pytest.mark.parametrize('name', ['2dx', '3at'])
 def test_limits_of_speed_and_acceleration(name: str) -> None:
     config = PRESETS[name]
-    robot = Pioneer(config, HALL, np.zeros(3), 0)
+    robot = DifferentialDriveRobot(config, HALL, np.zeros(3), 0)
     previous = (0.0, 0.0)
     for _ in range(100):
         robot.step(9.0, -9.0, 0.05)
@@ -74,7 +74,7 @@ def test_limits_of_speed_and_acceleration(name: str) -> None:
 
 
 def test_it_stops_at_a_wall_and_counts_the_contact_once() -> None:
-    robot = Pioneer(EXACT, HALL, np.array([18.0, 0.0, 0.0]), 0)
+    robot = DifferentialDriveRobot(EXACT, HALL, np.array([18.0, 0.0, 0.0]), 0)
     for _ in range(200):
         robot.step(0.5, 0.0, 0.05)
         assert HALL.is_clear(robot.T_world_base[0], robot.T_world_base[1], EXACT.radius_m)
@@ -91,7 +91,7 @@ def test_it_stops_at_a_wall_and_counts_the_contact_once() -> None:
 
 def test_odometry_is_relative_to_the_start() -> None:
     start = np.array([2.0, -3.0, 2.5])
-    robot = Pioneer(EXACT, HALL, start, 0)
+    robot = DifferentialDriveRobot(EXACT, HALL, start, 0)
     for i in range(300):
         robot.step(0.4, 0.5 * math.sin(i / 20), 0.05)
     assert np.allclose(se2.compose(start, robot.T_odom_base), robot.T_world_base, atol=1e-9)
@@ -102,7 +102,7 @@ def drift(name: str, seed: int) -> tuple[float, float, float]:
 
     And of ten turns on the spot (share).
     """
-    robot = Pioneer(PRESETS[name], hall(90.0), np.zeros(3), seed)
+    robot = DifferentialDriveRobot(PRESETS[name], hall(90.0), np.zeros(3), seed)
     while robot.T_world_base[0] < 20.0:
         robot.step(0.5, 0.0, 0.05)
     heading = float(robot.T_odom_base[2])
@@ -131,7 +131,7 @@ def test_drift_is_that_of_real_wheels_and_worse_when_they_skid() -> None:
 def test_the_seed_decides_everything() -> None:
     runs = []
     for seed in (7, 7, 8):
-        robot = Pioneer(PRESETS['2dx'], HALL, np.zeros(3), seed)
+        robot = DifferentialDriveRobot(PRESETS['2dx'], HALL, np.zeros(3), seed)
         for _ in range(100):
             robot.step(0.2, 0.1, 0.05)
         runs.append(robot.T_odom_base)
@@ -140,7 +140,7 @@ def test_the_seed_decides_everything() -> None:
 
 
 def test_a_robot_that_stands_still_counts_nothing() -> None:
-    robot = Pioneer(PRESETS['3at'], HALL, np.zeros(3), 3)
+    robot = DifferentialDriveRobot(PRESETS['3at'], HALL, np.zeros(3), 3)
     for _ in range(50):
         robot.step(0.0, 0.0, 0.05)
     assert np.array_equal(robot.T_odom_base, np.zeros(3))

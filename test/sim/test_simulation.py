@@ -5,9 +5,9 @@ import pytest
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
-from thinmap_ros.sim.simulation import STEP_NS, Moment, Simulation
+from thinmap_ros.sim.simulation import STEP_NS, SensorReadings, Simulation
 from thinmap_ros.sim.world import World
 
 
@@ -18,11 +18,11 @@ def simulation(seed: int = 1, rate_hz: float = 5.0) -> Simulation:
     cells[:, 0] = 1
     cells[:, -1] = 1
     world = World('box', cells, GridFrame(0.0, 0.0, 0.1), np.array([3.0, 3.0, 0.0]))
-    return Simulation(world, world.start, PRESETS['2dx'], Lms200Config(rate_hz=rate_hz), seed)
+    return Simulation(world, world.start, PRESETS['2dx'], LaserScannerConfig(rate_hz=rate_hz), seed)
 
 
-def drive(sim: Simulation, steps: int) -> list[Moment]:
-    return [sim.sense()] + [sim.step(0.2, 0.3) for _ in range(steps)]
+def drive(sim: Simulation, steps: int) -> list[SensorReadings]:
+    return [sim.read_sensors()] + [sim.step(0.2, 0.3) for _ in range(steps)]
 
 
 def test_time_and_rates_are_exact() -> None:
@@ -40,8 +40,8 @@ def test_a_rate_off_the_steps_is_kept_on_average() -> None:
 
 def test_a_due_scan_is_given_once() -> None:
     sim = simulation()
-    assert sim.sense().scan is not None
-    assert sim.sense().scan is None
+    assert sim.read_sensors().scan is not None
+    assert sim.read_sensors().scan is None
 
 
 def test_same_seed_same_run() -> None:
@@ -57,4 +57,4 @@ def test_same_seed_same_run() -> None:
 def test_a_start_in_a_wall_is_refused(start: list[float]) -> None:
     world = simulation().world
     with pytest.raises(InputError, match='start'):
-        Simulation(world, np.array(start), PRESETS['2dx'], Lms200Config(), 0)
+        Simulation(world, np.array(start), PRESETS['2dx'], LaserScannerConfig(), 0)

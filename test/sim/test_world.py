@@ -129,7 +129,7 @@ def test_passages_of_the_room_are_a_metre_wide() -> None:
     from scipy import ndimage
 
     world = load(ROOM)
-    wide, _ = ndimage.label(world.wall_distance_m > 0.5)
+    wide, _ = ndimage.label(world.distance_to_wall_m > 0.5)
     corners = [(1.5, 1.5), (1.0, 9.0), (9.0, 9.0), (9.0, 1.0), (5.0, 1.0), (1.0, 5.0)]
     places = world.frame.cells_of(np.array(corners))
     assert len(set(wide[places[:, 0], places[:, 1]])) == 1

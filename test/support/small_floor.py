@@ -6,7 +6,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.topology.builder import TopologyConfig, build
-from thinmap_ros.sim.laser import Lms200, Lms200Config
+from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 from thinmap_ros.sim.world import World
 
 CELL_M = 0.1
@@ -49,7 +49,7 @@ def drive(cells, start, moves, seed=0, odometry_at=(5.0, -3.0, 0.7)):
     Moves: (m ahead, rad turned), one a step.
     """
     world = world_of(cells)
-    laser = Lms200(Lms200Config(), seed)
+    laser = LaserScanner(LaserScannerConfig(), seed)
     rng = np.random.default_rng(seed)
     T = se2.pose(*start)
     odometry = se2.pose(*odometry_at)

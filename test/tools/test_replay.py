@@ -278,7 +278,7 @@ class Diary(NullView):
         self.told['grid'] += 1
         self.map_shown = patch
 
-    def number(self, ns, plot, curve, value):
+    def scalar(self, ns, plot, curve, value):
         self.told[plot, curve] += np.isfinite(value)
 
 
@@ -287,7 +287,7 @@ def test_a_view_is_told_each_scan_and_the_map_as_it_is_in_the_end(log):
     result = replay(CarmenLog(log, LaserOptions()), PipelineConfig(), watcher=ReplayView(diary))
     assert len(result.poses) == diary.told['pose'] == diary.told['scan'] == 30
     assert diary.told['grid'] == 7, 'once a second of the log, and at its end'
-    assert np.array_equal(diary.map_shown.cells, result.pipeline.grid.patch().cells)
+    assert np.array_equal(diary.map_shown.cells, result.pipeline.grid.known_area().cells)
     for curve in (
         ('step', 'localizer'),
         ('step', 'map update'),

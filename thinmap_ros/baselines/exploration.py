@@ -18,7 +18,7 @@ from thinmap_ros.core.exploration.strategy import Decision, EndNode, FinishCode
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import axis_setup
 from thinmap_ros.core.jit import kernel
-from thinmap_ros.core.planning.graph_search import costs_from
+from thinmap_ros.core.planning.graph_search import path_lengths_to_nodes
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
@@ -45,7 +45,7 @@ class _Progress:
     waited_ns: int = 0
 
 
-class _Patience:
+class _ProgressTimeout:
     """Gives up what comes no nearer while it is driven to, also if others came between."""
 
     def __init__(self, timeout_s: float) -> None:
@@ -54,7 +54,7 @@ class _Patience:
         self._driven: _Progress | None = None
         self._stamp_ns = 0
 
-    def is_over(self, place: Array, way_m: float, stamp_ns: int) -> bool:
+    def has_expired(self, place: Array, way_m: float, stamp_ns: int) -> bool:
         """Count the time that has gone by on the way (m) to a place (2,) since it was nearest."""
         same = (p for p in self._watched if math.dist(p.place, place) <= _SAME_PLACE_M)
         progress = next(same, None)
@@ -94,7 +94,7 @@ class FrontierExplorer(ABC):
     ) -> Decision:
         """Say where to go; see core/exploration/strategy.Strategy."""
         self.map.update(patch, scan, T_map_base)
-        self._give_up_what_was_looked_at(T_map_base)
+        self._drop_unchanged_target(T_map_base)
         if self._is_due(scan.stamp_ns):
             self._survey_ns = scan.stamp_ns
             self._frame = self.map.borders.frame
@@ -104,10 +104,12 @@ class FrontierExplorer(ABC):
             topology, self.target, self._number, self._nothing_left >= _LOOKS, bool(self._failures)
         )
 
-    def fail_target(self, reason: str) -> None:
+    def target_failed(self, reason: str) -> None:
         """Remember where a target could not be reached."""
         if self.target is not None:
-            self._failures.append((float(self.target.place[0]), float(self.target.place[1])))
+            self._failures.append(
+                (float(self.target.viewpoint[0]), float(self.target.viewpoint[1]))
+            )
         self.target = None
 
     def _is_due(self, stamp_ns: int) -> bool:
@@ -126,19 +128,21 @@ class FrontierExplorer(ABC):
         self.target = None
         if left:
             best = left[int(np.argmin(self.costs(left, T_map_base)))]
-            if before is None or math.dist(before.middle, best.middle) > _SAME_PLACE_M:
+            if before is None or math.dist(before.centroid, best.centroid) > _SAME_PLACE_M:
                 self._number += 1
-            near = before is not None and math.dist(before.place, best.place) < _AT_GOAL_M
+            near = before is not None and math.dist(before.viewpoint, best.viewpoint) < _AT_GOAL_M
             # A goal that hardly moved stays where it is: the robot would otherwise set out anew
             # once a second.
             if near and before:
-                best = Frontier(best.cells, best.middle, before.place, best.way_m)
+                best = Frontier(best.cells, best.centroid, before.viewpoint, best.path_length_m)
             self.target = best
 
     def _tries(self, frontier: Frontier) -> int:
-        return sum(math.dist(frontier.place, place) <= _SAME_PLACE_M for place in self._failures)
+        return sum(
+            math.dist(frontier.viewpoint, place) <= _SAME_PLACE_M for place in self._failures
+        )
 
-    def _give_up_what_was_looked_at(self, T_map_base: Array) -> None:
+    def _drop_unchanged_target(self, T_map_base: Array) -> None:
         """What stays unknown although the robot stands there and looks has nothing more to show."""
         if self.target is None or self._frame != self.map.borders.frame:
             return
@@ -164,7 +168,7 @@ class NearestFrontier(FrontierExplorer):
 
     def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
         """Way to each."""
-        return np.array([f.way_m for f in frontiers])
+        return np.array([f.path_length_m for f in frontiers])
 
 
 class ExploreLite(FrontierExplorer):
@@ -183,7 +187,7 @@ class ExploreLite(FrontierExplorer):
 
     def __init__(self) -> None:
         super().__init__()
-        self._patience = _Patience(self.progress_timeout_s)
+        self._progress_timeout = _ProgressTimeout(self.progress_timeout_s)
 
     def step(
         self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
@@ -191,8 +195,10 @@ class ExploreLite(FrontierExplorer):
         """As the others; a target without progress has failed."""
         decision = super().step(topology, patch, scan, T_map_base)
         target = self.target
-        if target is not None and self._patience.is_over(target.place, target.way_m, scan.stamp_ns):
-            self.fail_target('no progress')
+        if target is not None and self._progress_timeout.has_expired(
+            target.viewpoint, target.path_length_m, scan.stamp_ns
+        ):
+            self.target_failed('no progress')
         return decision
 
     def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
@@ -221,10 +227,10 @@ class InformationGain(FrontierExplorer):
         """Less the discounted gain."""
         assert self.map.patch is not None
         frame = self.map.borders.frame
-        cells = frame.cells_of(np.array([f.place for f in frontiers]))
+        cells = frame.cells_of(np.array([f.viewpoint for f in frontiers]))
         areas = _unknown_in_sight(self.map.patch.cells, cells, self.range_m / frame.resolution)
         return -(areas + 1.0) * np.exp(
-            -self.discount_per_m * np.array([f.way_m for f in frontiers])
+            -self.discount_per_m * np.array([f.path_length_m for f in frontiers])
         )
 
 
@@ -239,11 +245,11 @@ class DistanceAdvantage(FrontierExplorer):
 
     def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
         """Less the advantage."""
-        ways = np.array([f.way_m for f in frontiers])
-        places = np.array([f.place for f in frontiers])
+        ways = np.array([f.path_length_m for f in frontiers])
+        places = np.array([f.viewpoint for f in frontiers])
         if len(frontiers) < 2:
             return ways
-        between = np.array([self.map.ways(place, places) for place in places])
+        between = np.array([self.map.path_lengths_from(place, places) for place in places])
         between = np.where(np.isfinite(between), between, 0.0)
         return np.asarray(ways - between.sum(axis=0) / (len(frontiers) - 1))
 
@@ -264,8 +270,10 @@ class VisitAllEndNodes(NearestFrontier):
 
     def __init__(self) -> None:
         super().__init__()
-        self.map = FrontierMap(goes_back=True)  # the graph has led it where the others do not go
-        self._patience = _Patience(self.progress_timeout_s)
+        self.map = FrontierMap(
+            allow_backtracking=True
+        )  # the graph has led it where the others do not go
+        self._progress_timeout = _ProgressTimeout(self.progress_timeout_s)
         self._visited: list[tuple[float, float]] = []
         self._end_node: Array | None = None  # the goal (3,) there
 
@@ -283,14 +291,14 @@ class VisitAllEndNodes(NearestFrontier):
             self._number += 1
             self._end_node = goal
         decision = _decision(topology, self._end_node, self._number, False, False)
-        if self._patience.is_over(goal[:2], way_m, scan.stamp_ns):
-            self.fail_target('no progress')
+        if self._progress_timeout.has_expired(goal[:2], way_m, scan.stamp_ns):
+            self.target_failed('no progress')
         return decision
 
-    def fail_target(self, reason: str) -> None:
+    def target_failed(self, reason: str) -> None:
         """An end node that cannot be reached counts as visited."""
         if self._end_node is None:
-            super().fail_target(reason)
+            super().target_failed(reason)
         else:
             self._visited.append((float(self._end_node[0]), float(self._end_node[1])))
             self._end_node = None
@@ -309,7 +317,7 @@ class VisitAllEndNodes(NearestFrontier):
         left = {node.id: node for node in ends if not self._was_visited(node.x, node.y)}
         if not left:
             return None
-        costs = costs_from(topology, float(T_map_base[0]), float(T_map_base[1]))
+        costs = path_lengths_to_nodes(topology, float(T_map_base[0]), float(T_map_base[1]))
         followed = {i: node for i, node in left.items() if self._is_followed(node.x, node.y)}
         best = min((followed or left).values(), key=lambda node: costs.get(node.id, math.inf))
         way_m = costs.get(best.id, math.inf)

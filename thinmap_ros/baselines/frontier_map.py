@@ -13,9 +13,13 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.field_of_view import box_of_scan, directions_of_view
 from thinmap_ros.core.exploration.frontiers import OpenBorders
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.grid_search import coarse, ways_from
-from thinmap_ros.core.planning.recent_path import Trail
-from thinmap_ros.core.planning.traversability import let_out, reached_from, standing_places
+from thinmap_ros.core.planning.grid_search import downsample_mask, path_lengths_from
+from thinmap_ros.core.planning.recent_path import RecentPath
+from thinmap_ros.core.planning.traversability import (
+    escape_cells,
+    reachable_cells,
+    traversable_cells,
+)
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
@@ -37,15 +41,15 @@ class Frontier:
     """
 
     cells: Cells
-    middle: Array
-    place: Array
-    way_m: float
+    centroid: Array
+    viewpoint: Array
+    path_length_m: float
 
     @property
     def goal(self) -> Array:
         """The place, with the heading from there to the middle, (3,)."""
-        dx, dy = self.middle - self.place
-        return se2.pose(self.place[0], self.place[1], math.atan2(dy, dx))
+        dx, dy = self.centroid - self.viewpoint
+        return se2.pose(self.viewpoint[0], self.viewpoint[1], math.atan2(dy, dx))
 
 
 class FrontierMap:
@@ -54,19 +58,19 @@ class FrontierMap:
     Those that were looked at closely and stayed do not count any more.
     """
 
-    def __init__(self, goes_back: bool = False) -> None:
-        """goes_back: it can go back where it came, also where the map looks too narrow."""
+    def __init__(self, allow_backtracking: bool = False) -> None:
+        """allow_backtracking: it can go back where it came, also where the map looks too narrow."""
         self.borders = OpenBorders(SHORTEST_M)
-        self._trail = Trail() if goes_back else None
+        self._recent_path = RecentPath() if allow_backtracking else None
         self.patch: GridPatch | None = None
-        self._ways: Mask = np.zeros((0, 0), dtype=np.bool_)
+        self._reachable: Mask = np.zeros((0, 0), dtype=np.bool_)
 
     def update(self, patch: GridPatch, scan: Scan, T_map_base: Array) -> None:
         """Take in the map after a scan made at a pose (3,)."""
         self.patch = patch
         xy = (float(T_map_base[0]), float(T_map_base[1]))
-        if self._trail is not None:
-            self._trail.add(T_map_base)
+        if self._recent_path is not None:
+            self._recent_path.add_pose(T_map_base)
         self.borders.update(patch, box_of_scan(scan, T_map_base))
         self.borders.examine(xy, _CLOSE_LOOK_M, directions_of_view(scan, T_map_base))
 
@@ -80,20 +84,22 @@ class FrontierMap:
         frame = self.borders.frame
         cells, numbers, _ = self.borders.stretches()
         xy = (float(T_map_base[0]), float(T_map_base[1]))
-        standing = standing_places(self.borders.free, RADIUS_M, frame.resolution)
+        standing = traversable_cells(self.borders.free, RADIUS_M, frame.resolution)
         reach = self._reach_from(standing, xy)
         if len(cells) == 0:
             return []
         reached = reach & standing
-        self._ways = coarse(reach, _COARSE)
+        self._reachable = downsample_mask(reach, _COARSE)
         stretches = [cells[numbers == number] for number in np.unique(numbers)]
         places = [
             self.borders.place_to_look(stretch, reached, _REACH_M, xy) for stretch in stretches
         ]
         found = [(s, p) for s, p in zip(stretches, places, strict=True) if p is not None]
-        ways = self.ways(np.array(T_map_base[:2]), np.array([p for _, p in found]).reshape(-1, 2))
+        ways = self.path_lengths_from(
+            np.array(T_map_base[:2]), np.array([p for _, p in found]).reshape(-1, 2)
+        )
         return [
-            Frontier(s, self._middle(s), p, float(way))
+            Frontier(s, self._centroid(s), p, float(way))
             for (s, p), way in zip(found, ways, strict=True)
             if math.isfinite(way)
         ]
@@ -105,19 +111,21 @@ class FrontierMap:
         row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
         if not (0 <= row < free.shape[0] and 0 <= col < free.shape[1]):
             return np.zeros_like(standing)
-        if self._trail is None:
-            ways = let_out(standing, free, frame, xy, _ESCAPE_M)
-            return reached_from(ways, (row, col)) & standing
-        trail = self._trail.cells(frame, free.shape)
-        return reached_from(let_out(standing, free, frame, xy, _ESCAPE_M, trail), (row, col))
+        if self._recent_path is None:
+            ways = escape_cells(standing, free, frame, xy, _ESCAPE_M)
+            return reachable_cells(ways, (row, col)) & standing
+        trail = self._recent_path.cells(frame, free.shape)
+        return reachable_cells(
+            escape_cells(standing, free, frame, xy, _ESCAPE_M, trail), (row, col)
+        )
 
-    def ways(self, xy: Array, places: Array) -> Array:
+    def path_lengths_from(self, xy: Array, places: Array) -> Array:
         """Length, m, of the ways from a point (2,) to places (N, 2) that `find` has found, (N,)."""
         frame = self.borders.frame
         cells = frame.cells_of(np.vstack([xy[None], places])) // _COARSE
         start = (int(cells[0, 0]), int(cells[0, 1]))
-        return ways_from(self._ways, start, cells[1:]) * frame.resolution * _COARSE
+        return path_lengths_from(self._reachable, start, cells[1:]) * frame.resolution * _COARSE
 
-    def _middle(self, cells: Cells) -> Array:
+    def _centroid(self, cells: Cells) -> Array:
         cell = cells[np.square(cells - cells.mean(axis=0)).sum(axis=1).argmin()]
         return np.asarray(self.borders.frame.centres_of(cell[None])[0])

@@ -1,4 +1,4 @@
-"""Two streams that speak of the same scans, brought together by stamp."""
+"""Exact-time synchronizer of two topics."""
 
 from collections import OrderedDict
 from typing import Generic, TypeVar
@@ -8,9 +8,9 @@ Right = TypeVar('Right')
 
 
 class StampMatcher(Generic[Left, Right]):
-    """Pairs the messages of two topics that carry exactly the same stamp, whichever comes first.
+    """Pairs the messages of two topics that carry exactly the same stamp, in any order.
 
-    What finds no partner within `capacity` later messages is dropped, and counted.
+    A message without a partner within `capacity` later messages is dropped and counted.
     """
 
     def __init__(self, capacity: int = 50) -> None:
@@ -19,8 +19,8 @@ class StampMatcher(Generic[Left, Right]):
         self._capacity = capacity
         self.dropped = 0
 
-    def left(self, stamp_ns: int, value: Left) -> tuple[Left, Right] | None:
-        """Take a message of the first topic; returns the pair if it is complete now."""
+    def add_left(self, stamp_ns: int, value: Left) -> tuple[Left, Right] | None:
+        """Add a message of the first topic; returns the pair if it is complete now."""
         partner = self._rights.pop(stamp_ns, None)
         if partner is not None:
             return value, partner
@@ -30,8 +30,8 @@ class StampMatcher(Generic[Left, Right]):
             self.dropped += 1
         return None
 
-    def right(self, stamp_ns: int, value: Right) -> tuple[Left, Right] | None:
-        """Take a message of the second topic; returns the pair if it is complete now."""
+    def add_right(self, stamp_ns: int, value: Right) -> tuple[Left, Right] | None:
+        """Add a message of the second topic; returns the pair if it is complete now."""
         partner = self._lefts.pop(stamp_ns, None)
         if partner is not None:
             return partner, value

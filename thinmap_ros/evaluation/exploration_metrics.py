@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from thinmap_ros.closed_loop import Ending
+from thinmap_ros.closed_loop import ExplorationOutcome
 from thinmap_ros.core.exploration.position_probability import NEAR_M
 from thinmap_ros.core.exploration.strategy import FIRST_STAND_IN_ID
 from thinmap_ros.core.se2 import Array
@@ -30,7 +30,7 @@ class _Place:
     node_id: int
     x: float
     y: float
-    sightings: int = 0
+    observations: int = 0
     visited: bool = False
 
 
@@ -49,14 +49,16 @@ class EndNodeCensus:
     @property
     def seen(self) -> int:
         """Places where an end node lasted."""
-        return sum(place.sightings >= FEWEST_SIGHTINGS for place in self._places)
+        return sum(place.observations >= FEWEST_SIGHTINGS for place in self._places)
 
     @property
     def visited(self) -> int:
         """Those of them to which the robot came near."""
-        return sum(place.visited and place.sightings >= FEWEST_SIGHTINGS for place in self._places)
+        return sum(
+            place.visited and place.observations >= FEWEST_SIGHTINGS for place in self._places
+        )
 
-    def take(self, end_nodes: Iterable[tuple[int, float, float]], T_map_base: Array) -> None:
+    def add(self, end_nodes: Iterable[tuple[int, float, float]], T_map_base: Array) -> None:
         """Count the end nodes (id, x, y in m) known at a pose (3,).
 
         Nearer than 0.5 m is a visit (equation (2)).
@@ -69,7 +71,7 @@ class EndNodeCensus:
             place.node_id = node_id
             place.x = x
             place.y = y
-            place.sightings += 1
+            place.observations += 1
             place.visited |= math.dist((x, y), T_map_base[:2]) < NEAR_M
 
     def _continued(self, idle: list[_Place], x: float, y: float) -> _Place:
@@ -88,7 +90,7 @@ class TargetLog:
         self.changes = self.reversals = 0
         self._last: list[tuple[float, float]] = []
 
-    def take(self, goal: Array | None) -> None:
+    def add(self, goal: Array | None) -> None:
         """Take the goal (x, y, ...), m, of a decision.
 
         One less than SAME_PLACE_M from the last is the same.
@@ -104,7 +106,7 @@ class TargetLog:
 
 
 def exploration_report(
-    ending: Ending,
+    ending: ExplorationOutcome,
     times_s: Array,
     true_poses: Array,
     estimated_poses: Array,

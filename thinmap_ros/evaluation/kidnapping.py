@@ -38,7 +38,7 @@ class Kidnapping:
         self._detected_s: float | None = None
         self._found_s: float | None = None
         self._off: Array | None = None
-        self._way_m = 0.0
+        self._travelled_m = 0.0
         self._own: tuple[Pipeline, Strategy, Navigator] | None = None
         self._finder: GlobalLocalization | None = None
 
@@ -56,7 +56,7 @@ class Kidnapping:
             'kidnapped_at_s': self._carried_s,
             'detected_after_s': after(self._carried_s, self._detected_s),
             'found_after_s': after(self._detected_s, self._found_s),
-            'found_after_m': None if self._found_s is None else round(self._way_m, 3),
+            'found_after_m': None if self._found_s is None else round(self._travelled_m, 3),
             'found_error_m': None if off is None else round(math.hypot(off[0], off[1]), 3),
             'found_right': right,
         }
@@ -66,36 +66,36 @@ class Kidnapping:
         """Whether the robot looks for where it is."""
         return self._finder is not None
 
-    def takes(self, loop: ClosedLoop, scan: Scan, T_odom_base: Array) -> bool:
+    def handle_scan(self, loop: ClosedLoop, scan: Scan, T_odom_base: Array) -> bool:
         """Whether a scan, of before the robot was carried or of a lost one, is not for the loop."""
         if self._carried_s is None and scan.stamp_ns >= 1e9 * self._at_s:
-            self._carry(loop, scan.stamp_ns / 1e9)
+            self._kidnap(loop, scan.stamp_ns / 1e9)
             return True
         if self._finder is None:
             return False
         self._search(loop, self._finder, scan, T_odom_base)
         return True
 
-    def hear(self, loop: ClosedLoop, scan: Scan, estimate: Estimate) -> None:
+    def update(self, loop: ClosedLoop, scan: Scan, estimate: Estimate) -> None:
         """Begin to search once the robot is lost."""
         if (
-            estimate.lost
+            estimate.is_lost
             and self._finder is None
             and self._carried_s is not None
             and self._found_s is None
         ):
             self._detected_s = scan.stamp_ns / 1e9
             self._finder = GlobalLocalization(
-                loop.pipeline.grid.patch(), loop.pipeline.topology.map, seed=self._seed
+                loop.pipeline.grid.known_area(), loop.pipeline.topology.map, seed=self._seed
             )
             self._own = loop.pipeline, loop.strategy, loop.navigator
-            loop.drive_by(Pipeline(), NearestFrontier(), Navigator(loop.navigator.config))
+            loop.replace_strategy(Pipeline(), NearestFrontier(), Navigator(loop.navigator.config))
 
-    def _carry(self, loop: ClosedLoop, seconds: float) -> None:
+    def _kidnap(self, loop: ClosedLoop, seconds: float) -> None:
         """Put the robot on some place that it has mapped, far from where it is."""
         world = loop.simulation.world
         robot = loop.simulation.robot
-        patch = loop.pipeline.grid.patch()
+        patch = loop.pipeline.grid.known_area()
         at = patch.frame.centres_of(np.argwhere(patch.free))
         at = at[np.hypot(*(at - robot.T_world_base[:2]).T) >= _FAR_M]
         fits = [world.is_clear(x, y, robot.config.radius_m + _MARGIN_M) for x, y in at.tolist()]
@@ -106,7 +106,9 @@ class Kidnapping:
             )
         rng = np.random.default_rng(self._seed)
         x, y = rng.choice(at[fits])
-        loop.simulation.carry(se2.pose(float(x), float(y), float(rng.uniform(-math.pi, math.pi))))
+        loop.simulation.teleport(
+            se2.pose(float(x), float(y), float(rng.uniform(-math.pi, math.pi)))
+        )
         self._carried_s = seconds
 
     def _search(
@@ -117,15 +119,15 @@ class Kidnapping:
         localizer = self._own[0].localizer
         T_world_base = loop.simulation.robot.T_world_base
         estimate = self._own[0].step(scan, T_odom_base).estimate
-        self._way_m += float(np.hypot(*(T_world_base - loop.log.true_poses[-1])[:2]))
-        loop.note(scan, estimate)
+        self._travelled_m += float(np.hypot(*(T_world_base - loop.log.true_poses[-1])[:2]))
+        loop.log_poses(scan, estimate)
         found = finder.step(scan, T_odom_base).pose
         if found is not None:
             localizer.set_pose(found.T_map_base, found.covariance)
-        if found is not None or not estimate.lost:
+        if found is not None or not estimate.is_lost:
             self._found_s = scan.stamp_ns / 1e9
             self._off = se2.between(T_world_base, localizer.pose)
             self._finder = None
-            loop.drive_by(*self._own)
+            loop.replace_strategy(*self._own)
         else:
             loop.decide(scan, loop.pipeline.step(scan, T_odom_base).estimate)

@@ -17,7 +17,7 @@ from typing import Any, Protocol, TypeVar
 
 from tqdm import tqdm
 
-from thinmap_ros.core.errors import InputError, ThinmapError, reason_of
+from thinmap_ros.core.errors import InputError, ThinmapError, one_line_reason
 from thinmap_ros.evaluation.processes import end_with_parent
 from thinmap_ros.files.atomic import read_text, write_text
 
@@ -53,7 +53,7 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run_missing(
+def run_pending(
     work: Callable[[AnyJob], Report],
     jobs: Sequence[AnyJob],
     file_of: Callable[[AnyJob], Path],
@@ -90,7 +90,7 @@ def read_report(path: Path, options: Any) -> Report:
     return report
 
 
-def complaint(failures: dict[str, Failure]) -> InputError:
+def failure_summary(failures: dict[str, Failure]) -> InputError:
     """One error for all jobs that failed, each with its name and reason."""
     reasons = [f'{name}: {failure.reason}' for name, failure in sorted(failures.items())]
     return InputError(f'{len(failures)} failed: {"; ".join(reasons)}')
@@ -172,10 +172,10 @@ def _attempted(work: Callable[[AnyJob], Report], job: AnyJob) -> Report | Failur
     try:
         return work(job)
     except (ThinmapError, OSError) as error:
-        return Failure(reason_of(error))
+        return Failure(one_line_reason(error))
     except Exception as error:
         return Failure(_named(error), traceback.format_exc())
 
 
 def _named(error: Exception) -> str:
-    return f'{type(error).__name__}: {reason_of(error)}'
+    return f'{type(error).__name__}: {one_line_reason(error)}'

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from thinmap_ros.closed_loop import Ending
+from thinmap_ros.closed_loop import ExplorationOutcome
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import GridPatch
@@ -20,7 +20,7 @@ from thinmap_ros.files.atomic import write_text
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag import Bag
-from thinmap_ros.sim.coverage import Coverable, coverable
+from thinmap_ros.sim.coverage import ObservableCells, observable_cells
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
 from thinmap_ros.view import figures, rerun_sinks
@@ -90,7 +90,7 @@ def write(out: Path, world_file: Path, robot: str, result: dict[str, Any]) -> di
     recording = read(out / 'bag')
     world = World.from_patch(*read_world(world_file))
     start = next(iter(recording.true.values()))
-    seen = coverable(world, start, PRESETS[robot].radius_m, recording.range_max_m)
+    seen = observable_cells(world, start, PRESETS[robot].radius_m, recording.range_max_m)
     report = _report(recording, seen, result)
     patch = recording.maps[-1][1]
     occupancy_maps.write_map(out / 'map', patch)
@@ -114,7 +114,7 @@ def write(out: Path, world_file: Path, robot: str, result: dict[str, Any]) -> di
     return report
 
 
-def _report(recording: Recording, seen: Coverable, result: dict[str, Any]) -> dict[str, Any]:
+def _report(recording: Recording, seen: ObservableCells, result: dict[str, Any]) -> dict[str, Any]:
     start_ns = int(result['start_ns'])
     end_ns = int(result['end_ns'])
     stamps = [ns for ns in recording.true if start_ns <= ns <= end_ns and ns in recording.estimated]
@@ -122,9 +122,11 @@ def _report(recording: Recording, seen: Coverable, result: dict[str, Any]) -> di
     estimated = np.array([recording.estimated[ns] for ns in stamps])
     times = (np.array(stamps) - start_ns) / 1e9
     coverage = np.array(
-        [((ns - start_ns) / 1e9, seen.share_known(patch)) for ns, patch in recording.maps]
+        [((ns - start_ns) / 1e9, seen.coverage(patch)) for ns, patch in recording.maps]
     )
-    ending = Ending(bool(result['finished']), str(result['reason']), recording.collisions)
+    ending = ExplorationOutcome(
+        bool(result['finished']), str(result['reason']), recording.collisions
+    )
     report = exploration_report(ending, times, true, estimated, coverage, _census(recording))
     # Heading as well: a live run is judged by its poses, not by places alone.
     turned = se2.wrap(np.asarray(estimated[:, 2] - true[:, 2]))
@@ -136,5 +138,5 @@ def _census(recording: Recording) -> EndNodeCensus:
     census = EndNodeCensus()
     for ns, nodes in recording.end_nodes:
         if ns in recording.estimated:
-            census.take(nodes, recording.estimated[ns])
+            census.add(nodes, recording.estimated[ns])
     return census

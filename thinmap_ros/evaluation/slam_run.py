@@ -9,10 +9,10 @@ import numpy as np
 from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
-from thinmap_ros.pipeline import Pipeline, PipelineConfig, Step
-from thinmap_ros.sim.drives import Look
+from thinmap_ros.pipeline import Pipeline, PipelineConfig, PipelineResult
+from thinmap_ros.sim.drives import DriveSample
 
-Watch = Callable[[int, Look, Pipeline, Step], None]
+Watch = Callable[[int, DriveSample, Pipeline, PipelineResult], None]
 
 
 @dataclass(eq=False)
@@ -48,12 +48,14 @@ class Run:
         return f'{off.mean():.1f} cm (mean), {off.max():.1f} cm (most)'
 
     @property
-    def way_m(self) -> float:
+    def path_length_m(self) -> float:
         """Length of the true path, m."""
         return float(np.hypot(*np.diff(np.array(self.truth)[:, :2], axis=0).T).sum())
 
 
-def run_slam(looks: Iterable[Look], slam: str = 'ekf_ti', watch: Watch | None = None) -> Run:
+def run_drive(
+    looks: Iterable[DriveSample], slam: str = 'ekf_ti', watch: Watch | None = None
+) -> Run:
     """Run a drive; the map's frame is the world's.
 
     slam: ekf_ti and ekf_full are the paper's filter, ti is ours. watch is called after each scan
@@ -77,8 +79,8 @@ def run_slam(looks: Iterable[Look], slam: str = 'ekf_ti', watch: Watch | None = 
         run.estimate.append(step.estimate.T_map_base)
         run.sigmas.append(np.sqrt(np.diag(step.estimate.covariance)))
         run.features.append(step.estimate.n_features)
-        run.local.append(step.estimate.n_local)
-        run.matched.append(step.estimate.matched)
+        run.local.append(step.estimate.n_local_features)
+        run.matched.append(step.estimate.matched_lines)
         if watch is not None:
             watch(k, look, run.pipeline, step)
     assert run is not None, 'a drive has at least one scan'

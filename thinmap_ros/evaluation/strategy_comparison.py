@@ -38,7 +38,7 @@ def markdown(reports: list[Report]) -> str:
     return '\n'.join(lines) + '\n'
 
 
-def saved(
+def relative_saving(
     ours: dict[tuple[str, int], Report], others: dict[tuple[str, int], Report], key: str
 ) -> Array:
     """Ours / other - 1 of a quantity for each world and start that both have, (N,)."""
@@ -74,7 +74,7 @@ def _spread(runs: list[Report], key: str) -> str:
 def _paired(
     name: str, ours: dict[tuple[str, int], Report], others: dict[tuple[str, int], Report]
 ) -> str:
-    shares = {key: saved(ours, others, key) for key in ('distance', 'time', 'turned_rad')}
+    shares = {key: relative_saving(ours, others, key) for key in ('distance', 'time', 'turned_rad')}
     cells = []
     for values in shares.values():
         half = (

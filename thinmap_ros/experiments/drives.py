@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from thinmap_ros.closed_loop import Options, make_loop, nothing_to_show
+from thinmap_ros.closed_loop import Options, make_loop, no_progress
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.strategy import Decision, Strategy
@@ -19,9 +19,9 @@ from thinmap_ros.files.worlds import read_tour, read_world
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag import Bag, BagLog
 from thinmap_ros.logs.log import OdometryEvent
-from thinmap_ros.sim.coverage import coverable
-from thinmap_ros.sim.drives import Look, drive, random_drive, ways_along
-from thinmap_ros.sim.laser import Lms200, Lms200Config
+from thinmap_ros.sim.coverage import observable_cells
+from thinmap_ros.sim.drives import DriveSample, drive, random_drive, tour_paths
+from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import Simulation
 from thinmap_ros.sim.world import World
@@ -55,31 +55,31 @@ class Recipe:
     world: str
     robot: str
     how: str
-    looks: Callable[['Recipe', int], Iterator[Look]]
+    looks: Callable[['Recipe', int], Iterator[DriveSample]]
     localized: bool = False
 
 
-def _tour(recipe: Recipe, seed: int) -> Iterator[Look]:
+def _tour(recipe: Recipe, seed: int) -> Iterator[DriveSample]:
     world = world_of(recipe.world)
     robot = PRESETS[recipe.robot]
-    simulation = Simulation(world, world.start, robot, Lms200Config(), seed)
-    return drive(simulation, ways_along(world, tour_of(recipe.world), robot.radius_m), SPEED_M_S)
+    simulation = Simulation(world, world.start, robot, LaserScannerConfig(), seed)
+    return drive(simulation, tour_paths(world, tour_of(recipe.world), robot.radius_m), SPEED_M_S)
 
 
-def _stops(recipe: Recipe, seed: int) -> Iterator[Look]:
+def _stops(recipe: Recipe, seed: int) -> Iterator[DriveSample]:
     """Put down by hand at each stop, looking two ways: the papers' robot had no odometry either."""
     world = world_of(recipe.world)
-    laser = Lms200(Lms200Config(), seed)
+    laser = LaserScanner(LaserScannerConfig(), seed)
     stamp_ns = 0
     for x, y in tour_of(recipe.world):
         for heading in (0.0, np.pi):
             for _ in range(_LOOKS_AT_A_STOP):
                 T = se2.pose(float(x), float(y), heading)
-                yield Look(laser.scan(world, T, stamp_ns), T, T)
+                yield DriveSample(laser.scan(world, T, stamp_ns), T, T)
                 stamp_ns += 200_000_000
 
 
-def _lost(recipe: Recipe, seed: int) -> Iterator[Look]:
+def _lost(recipe: Recipe, seed: int) -> Iterator[DriveSample]:
     """From the paper's place to random ones, for as long as the localization lasts."""
     world = world_of(recipe.world)
     looks = random_drive(world, world.start, seed)
@@ -92,29 +92,33 @@ class _Watched:
     def __init__(self, strategy: Strategy, simulation: Simulation) -> None:
         self._strategy = strategy
         self._simulation = simulation
-        self.looks: list[Look] = []
+        self.looks: list[DriveSample] = []
 
     def step(
         self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
     ) -> Decision:
         self.looks.append(
-            Look(scan, self._simulation.robot.T_odom_base, self._simulation.robot.T_world_base)
+            DriveSample(
+                scan, self._simulation.robot.T_odom_base, self._simulation.robot.T_world_base
+            )
         )
         return self._strategy.step(topology, patch, scan, T_map_base)
 
-    def fail_target(self, reason: str) -> None:
-        self._strategy.fail_target(reason)
+    def target_failed(self, reason: str) -> None:
+        self._strategy.target_failed(reason)
 
 
-def _exploration(recipe: Recipe, seed: int) -> Iterator[Look]:
+def _exploration(recipe: Recipe, seed: int) -> Iterator[DriveSample]:
     world = world_of(recipe.world)
     loop = make_loop(
         world, world.start, Options(seed=seed, robot=recipe.robot, speed_m_s=SPEED_M_S)
     )
     watched = _Watched(loop.strategy, loop.simulation)
     loop.strategy = watched
-    goal = coverable(world, world.start, PRESETS[recipe.robot].radius_m, Lms200Config().range_max_m)
-    loop.run(goal, _EXPLORE_LIMIT_S, nothing_to_show)
+    goal = observable_cells(
+        world, world.start, PRESETS[recipe.robot].radius_m, LaserScannerConfig().range_max_m
+    )
+    loop.run(goal, _EXPLORE_LIMIT_S, no_progress)
     return iter(watched.looks)
 
 
@@ -153,15 +157,15 @@ class Source:
     bags: Path | None = None
     quick: bool = False
 
-    def looks(self, name: str) -> Iterator[Look]:
+    def looks(self, name: str) -> Iterator[DriveSample]:
         """A drive by its name in RECIPES."""
         if self.bags is None:
             recipe = RECIPES[name]
             return recipe.looks(recipe, self.seed)
-        return looks_of_bag(self.bags / f'{name}.mcap')
+        return samples_of_bag(self.bags / f'{name}.mcap')
 
 
-def looks_of_bag(path: Path) -> Iterator[Look]:
+def samples_of_bag(path: Path) -> Iterator[DriveSample]:
     """The drive that a bag holds.
 
     Raises InputError where a scan has no odometry or ground truth of its stamp.
@@ -181,4 +185,4 @@ def looks_of_bag(path: Path) -> Iterator[Look]:
             raise InputError(
                 f'{path}: scan at {stamp_ns} ns: expected /odom and {TRUTH_TOPIC} of the same stamp'
             )
-        yield Look(event.scan, T_odom_base[stamp_ns], truth[stamp_ns])
+        yield DriveSample(event.scan, T_odom_base[stamp_ns], truth[stamp_ns])

@@ -8,18 +8,18 @@ from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.experiments.drives import world_of
-from thinmap_ros.sim.drives import Look
+from thinmap_ros.sim.drives import DriveSample
 from thinmap_ros.sim.surfaces import inside_of
 from thinmap_ros.sim.world import World
 
 CELL_M = 0.1
 
 
-def grid_of(looks: Iterable[Look]) -> OccupancyGrid:
+def grid_of(looks: Iterable[DriveSample]) -> OccupancyGrid:
     """Grid of scans at their true poses."""
     grid = OccupancyGrid()
     for look in looks:
-        grid.update(look.scan, look.T_world_base)
+        grid.add_scan(look.scan, look.T_world_base)
     return grid
 
 

@@ -1,4 +1,4 @@
-"""Files that are whole or not there (written aside, then renamed), and texts read up to a limit."""
+"""Atomic writing of files (temporary file, then rename), and reading of texts up to a limit."""
 
 import os
 import secrets
@@ -7,20 +7,18 @@ from contextlib import contextmanager
 from glob import escape
 from pathlib import Path
 
-from thinmap_ros.core.errors import InputError, reason_of
+from thinmap_ros.core.errors import InputError, one_line_reason
 
 _MOST_TEXT_BYTES = 1 << 30
 _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 @contextmanager
-def written_aside(path: Path) -> Iterator[Path]:
-    """Give a path to write to.
+def atomic_write(path: Path) -> Iterator[Path]:
+    """Yield a temporary path to write to; it replaces `path` when the block succeeds.
 
-    It takes the place of `path` when the block ends well and vanishes when not.
-
-    Its name cannot be guessed and the file is new: nobody can have put a link there beforehand.
-    Raises OSError, with the name of the file, where the disk does not take it.
+    If the block fails, the temporary file is deleted. Its name cannot be guessed and the file is
+    new: no link can be planted there. Raises OSError with the name of `path` on write errors.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     aside = path.with_name(f'.{path.name}.{secrets.token_hex(8)}.part')
@@ -31,24 +29,24 @@ def written_aside(path: Path) -> Iterator[Path]:
     except OSError as error:
         if error.filename is not None and error.filename != str(aside):
             raise
-        raise OSError(error.errno, error.strerror or reason_of(error), str(path)) from error
+        raise OSError(error.errno, error.strerror or one_line_reason(error), str(path)) from error
     finally:
         aside.unlink(missing_ok=True)
 
 
-def parts_of(path: Path) -> list[Path]:
-    """Unfinished files beside a file: those of a `written_aside` that was killed meanwhile."""
+def partial_files(path: Path) -> list[Path]:
+    """Partial files beside a file, left by an `atomic_write` that was killed."""
     return sorted(path.parent.glob(f'.{escape(path.name)}.*.part'))
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file, whole or not at all."""
-    with written_aside(path) as aside:
+    """Write a text file atomically."""
+    with atomic_write(path) as aside:
         aside.write_text(text, encoding='utf-8')
 
 
 def read_text(path: Path, most_bytes: int = _MOST_TEXT_BYTES) -> str:
-    """Read a text file. Raises InputError where it is missing, no text, or above most_bytes."""
+    """Read a text file. Raises InputError if it is missing, not text, or above most_bytes."""
     try:
         with path.open('rb') as stream:
             content = stream.read(most_bytes + 1)

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.errors import InputError, reason_of, shown
+from thinmap_ros.core.errors import InputError, one_line_reason, quoted
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
 from thinmap_ros.core.slam.localizers import AnyLocalizer, localizer_class
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
-from thinmap_ros.files.atomic import written_aside
-from thinmap_ros.files.npz import opened, read_arrays
+from thinmap_ros.files.atomic import atomic_write
+from thinmap_ros.files.npz import open_regular_file, read_arrays
 from thinmap_ros.files.occupancy_maps import read_map, write_map
 
 _FORMAT = 'thinmap_format'
@@ -48,7 +48,7 @@ def stem_of(path: str) -> Path:
         path = path.removesuffix(end)
     if not Path(path).name or '\0' in path:
         expected = 'expected the path of a session, without the endings of its files'
-        raise InputError(f'{shown(path)}: {expected}')
+        raise InputError(f'{quoted(path)}: {expected}')
     return Path(path).absolute()
 
 
@@ -59,9 +59,9 @@ def save_grid(path: str, grid: OccupancyGrid) -> str:
     """
     stem = stem_of(path)
     # All files are written before any takes its name: a full disk leaves the old session as it was.
-    with written_aside(_named(stem, _GRID_END)) as aside:
+    with atomic_write(_named(stem, _GRID_END)) as aside:
         _write_to(aside, _GRID, grid.state())
-        write_map(stem, grid.patch())
+        write_map(stem, grid.known_area())
     return f'{stem}.pgm, {_MAP_END} and {_GRID_END}'
 
 
@@ -234,7 +234,7 @@ def _is_there(path: Path) -> bool:
 
 
 def _write(path: Path, what: str, arrays: Mapping[str, NDArray[Any]]) -> None:
-    with written_aside(path) as aside:
+    with atomic_write(path) as aside:
         _write_to(aside, what, arrays)
 
 
@@ -247,13 +247,13 @@ def _write_to(path: Path, what: str, arrays: Mapping[str, NDArray[Any]]) -> None
 def _read(path: Path, what: str) -> dict[str, NDArray[Any]]:
     expected = f'expected a saved {what.split()[0]}'
     try:
-        with opened(path) as stream:
+        with open_regular_file(path) as stream:
             arrays = read_arrays(stream)
     except OSError as error:
-        raise InputError(error.strerror or reason_of(error)) from error
+        raise InputError(error.strerror or one_line_reason(error)) from error
     except InputError as error:
         raise InputError(f'{error}: {expected}') from error
     found = arrays.pop(_FORMAT, np.empty(0))
     if found.shape or found.dtype.kind != 'U' or str(found) != what:
-        raise InputError(f'holds {shown(str(found))}: {expected} ({what})')
+        raise InputError(f'holds {quoted(str(found))}: {expected} ({what})')
     return arrays

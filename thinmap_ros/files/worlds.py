@@ -1,4 +1,4 @@
-"""World files: walls drawn in a YAML file, or any map_server map."""
+"""World files: walls in a YAML file, or a map_server map."""
 
 import math
 from itertools import pairwise
@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.errors import InputError, shown
-from thinmap_ros.core.grid.frame import FINEST_M, GridFrame
+from thinmap_ros.core.errors import InputError, quoted
+from thinmap_ros.core.grid.frame import MIN_RESOLUTION_M, GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.se2 import FARTHEST_M, Array, pose
+from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array, pose
 from thinmap_ros.files.occupancy_maps import read_map
 from thinmap_ros.files.yaml import read_mapping
 
@@ -24,20 +24,19 @@ _SOLID = 100
 
 
 def read_world(path: Path) -> tuple[str, GridPatch, Array]:
-    """Name, map and start (3,), NaN: none given, of a YAML file.
+    """Name, map and start (3,) (NaN: none) of a YAML file.
 
     The file is a world (walls, solids, tour) or a map_server map (image).
-    Raises InputError naming the file, the key, the value and what was expected.
+    Raises InputError with file, key, value and expectation.
     """
     content = read_mapping(path, 'a world (walls, start) or a map (image, resolution, origin)')
     return _of_map(path, content) if 'image' in content else _of_drawing(path, content)
 
 
 def read_tour(path: Path) -> Array:
-    """Places (N, 2), m, that a world names for a tour; may be none.
+    """Tour of a world: places (N, 2), m, in the order of visits from the start; may be empty.
 
-    They are to be visited in this order and from the start on.
-    Raises InputError naming the file, the value and what was expected.
+    Raises InputError with file, value and expectation.
     """
     content = read_mapping(path, 'a world (walls, start) or a map (image, resolution, origin)')
     return _points(path, 'tour', content['tour'], 1) if 'tour' in content else np.empty((0, 2))
@@ -58,14 +57,14 @@ def _numbers(path: Path, content: dict[str, Any], key: str, count: int) -> list[
         numbers = []
     if len(numbers) != count or not all(math.isfinite(v) for v in numbers):
         expected = f'expected {count} finite number{"s" if count > 1 else ""}'
-        raise InputError(f'{path}: {key}: {shown(value)}: {expected}')
+        raise InputError(f'{path}: {key}: {quoted(value)}: {expected}')
     return numbers
 
 
 def _resolution(path: Path, content: dict[str, Any]) -> float:
     (resolution,) = _numbers(path, content, 'resolution', 1)
-    if not FINEST_M <= resolution <= 1.0:
-        raise InputError(f'{path}: resolution: {resolution}: expected {FINEST_M} to 1 m')
+    if not MIN_RESOLUTION_M <= resolution <= 1.0:
+        raise InputError(f'{path}: resolution: {resolution}: expected {MIN_RESOLUTION_M} to 1 m')
     return resolution
 
 
@@ -73,7 +72,7 @@ def _polylines(path: Path, content: dict[str, Any], key: str, fewest: int) -> li
     drawn = content.get(key, [])
     if not isinstance(drawn, list):
         expected = 'expected a list of lists of points [x, y]'
-        raise InputError(f'{path}: {key}: {shown(drawn)}: {expected}')
+        raise InputError(f'{path}: {key}: {quoted(drawn)}: {expected}')
     return [_points(path, f'{key}[{i}]', points, fewest) for i, points in enumerate(drawn)]
 
 
@@ -89,7 +88,7 @@ def _points(path: Path, what: str, drawn: object, fewest: int) -> Array:
         or not np.isfinite(points).all()
     ):
         expected = f'expected at least {fewest} points [x, y]'
-        raise InputError(f'{path}: {what}: {shown(drawn)}: {expected}')
+        raise InputError(f'{path}: {what}: {quoted(drawn)}: {expected}')
     return points
 
 
@@ -97,10 +96,10 @@ def _of_drawing(path: Path, content: dict[str, Any]) -> tuple[str, GridPatch, Ar
     known = {'name', 'resolution', 'wall_thickness', 'start', 'tour', 'walls', 'solids'}
     if unknown := set(content) - known:
         expected = ', '.join(sorted(known))
-        raise InputError(f'{path}: unknown key {shown(min(unknown))}: expected {expected}')
+        raise InputError(f'{path}: unknown key {quoted(min(unknown))}: expected {expected}')
     resolution = _resolution(path, content)
     (thickness,) = _numbers(path, content, 'wall_thickness', 1)
-    # Thinner walls let rays slip through between cells that touch at a corner only.
+    # Rays pass through thinner walls, between cells that touch only at a corner.
     if not 2.0 * resolution <= thickness <= 10.0:
         raise InputError(
             f'{path}: wall_thickness: {thickness}: '
@@ -122,37 +121,31 @@ def _name(path: Path, content: dict[str, Any]) -> str:
     name = content.get('name', path.stem)
     if not isinstance(name, str | int | float) or len(str(name)) > _LONGEST_NAME:
         expected = f'expected a name of at most {_LONGEST_NAME} characters'
-        raise InputError(f'{path}: name: {shown(name)}: {expected}')
+        raise InputError(f'{path}: name: {quoted(name)}: {expected}')
     return str(name)
 
 
 def _lattice(path: Path, points: Array, resolution: float) -> tuple[GridFrame, tuple[int, int]]:
-    """Frame and shape of a grid with room for all points.
-
-    Its lines go through the origin, as a map's do.
-    """
+    """Frame and shape of a grid that contains all points; its lines pass through the origin."""
     farthest = float(np.abs(points).max())
-    if farthest > FARTHEST_M:
-        expected = f'expected at most {FARTHEST_M:g} m; is a point far off?'
+    if farthest > MAX_COORDINATE_M:
+        expected = f'expected at most {MAX_COORDINATE_M:g} m; is a point wrong?'
         raise InputError(f'{path}: point at {farthest:g} m: {expected}')
     low = np.floor((points.min(axis=0) - _MARGIN_M) / resolution)
     cols, rows = np.ceil((points.max(axis=0) + _MARGIN_M) / resolution) - low
     if not rows * cols <= _MOST_CELLS:
         raise InputError(
             f'{path}: {rows:.0f} x {cols:.0f} cells: expected at most {_MOST_CELLS}; '
-            'is a point far off?'
+            'is a point wrong?'
         )
     frame = GridFrame(float(low[0]) * resolution, float(low[1]) * resolution, resolution)
     return frame, (int(rows), int(cols))
 
 
 def _fill(cells: NDArray[np.int8], frame: GridFrame, polygon: Array) -> None:
-    """Make the cells solid whose centres lie in a polygon (N, 2).
-
-    A ray from such a centre crosses it an odd number of times.
-    """
-    # A border that runs through centres would otherwise fall to either side by rounding: walls 4 to
-    # 6 cells wide.
+    """Set the cells whose centres lie in a polygon (N, 2) to occupied, by the even-odd rule."""
+    # Without the offset, edges through cell centres are rounded to either side: walls of 4 to 6
+    # cells.
     polygon = polygon - _NUDGE_M
     low = np.maximum(frame.cells_of(polygon.min(axis=0))[0], 0)
     high = frame.cells_of(polygon.max(axis=0))[0] + 1
@@ -168,10 +161,7 @@ def _fill(cells: NDArray[np.int8], frame: GridFrame, polygon: Array) -> None:
 
 
 def _slab(a: Array, b: Array, thickness: float) -> Array:
-    """Corners (4, 2) of a wall from a to b.
-
-    It is longer by half its thickness at both ends so that corners close.
-    """
+    """Corners (4, 2) of a wall from a to b, extended by half its thickness to close corners."""
     length = float(np.hypot(*(b - a)))
     along = (b - a) / length if length > 0.0 else np.array([1.0, 0.0])
     across = np.array([-along[1], along[0]]) * thickness / 2.0

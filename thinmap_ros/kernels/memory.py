@@ -11,7 +11,7 @@ _RELEASE_S = 3.0
 _RELEASE_BYTES = 4e6
 
 
-def give_back_pages() -> Callable[[], None]:
+def release_compiler_memory() -> Callable[[], None]:
     """Kernels that only a real message calls for bring the compiler back.
 
     What gives its pages back, now and then.

@@ -13,7 +13,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
 from thinmap_ros.core.grid.raytrace import cast_rays
-from thinmap_ros.core.odometry import LastPose
+from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
@@ -40,7 +40,7 @@ def localizer() -> None:
     # A scan that fits nowhere is searched for; a map that was saved or drawn is taken up.
     rehearsed.step(_odd_scan(), T_map_base)
     ScanLocalizer.from_state(rehearsed.state())
-    ScanLocalizer.resumed(_room(), LastPose(0, T_map_base, T_map_base), T_map_base)
+    ScanLocalizer.resumed(_room(), OdometryAnchor(0, T_map_base, T_map_base), T_map_base)
     # As soon as a place is seen again, covariances along the graph are asked for.
     covariances_from(0, np.zeros((2, 3)), [Edge(0, 1, np.zeros(3), np.eye(3), False)], np.ones(2))
 
@@ -51,9 +51,9 @@ def grid_mapper() -> None:
 
     rehearsed = OccupancyGrid()
     for scan, T_map_base in _drive():
-        rehearsed.update(scan, T_map_base)
+        rehearsed.add_scan(scan, T_map_base)
         rehearsed.window(T_map_base[0], T_map_base[1], WindowConfig().window_m)
-    rehearsed.patch()
+    rehearsed.known_area()
 
 
 def topology_builder() -> None:
@@ -64,7 +64,7 @@ def topology_builder() -> None:
     grid = OccupancyGrid()
     rehearsed = TopologyBuilder()
     for scan, T_map_base in _drive():
-        grid.update(scan, T_map_base)
+        grid.add_scan(scan, T_map_base)
         rehearsed.update(
             grid.window(T_map_base[0], T_map_base[1], WindowConfig().window_m), T_map_base
         )

@@ -1,7 +1,7 @@
-"""MCAP files, whole, cut off or damaged: their whole messages in log order or in file order.
+"""Reads MCAP files, also truncated or damaged ones: intact messages in log order or file order.
 
 The `mcap` package has no recovery (`mcap recover` is a program written in Go), and neither it nor
-rosbags bounds what a compressed chunk expands to; of `mcap` the records are used.
+rosbags limits the decompressed size of a chunk. Only the record types of `mcap` are used.
 """
 
 import heapq
@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.logs.mcap_records import (
     HEAD,
-    LARGEST_CHUNK,
     MAGIC,
+    MAX_CHUNK_BYTES,
     DamagedError,
     Definition,
     Records,
@@ -34,8 +34,8 @@ from thinmap_ros.logs.mcap_records import (
     records_of,
 )
 
-LARGEST_DEFINITIONS = 64 * 2**20
-"""Bytes of all schemas and channels of a file."""
+MAX_DEFINITIONS_BYTES = 64 * 2**20
+"""Maximum bytes of all schemas and channels of a file."""
 _LARGEST_SUMMARY = 64 * 2**20
 _MOST_HELD = 512 * 2**20
 _STRETCH = 2**20
@@ -47,16 +47,16 @@ _PRIVATE = 0x80
 
 @dataclass
 class Damage:
-    """What of a file is not whole: by the byte where it begins, what was found there."""
+    """Damaged parts of a file: description by first byte."""
 
-    cut_off: bool = False
+    is_truncated: bool = False
     parts: dict[int, str] = field(default_factory=dict)
 
     def __bool__(self) -> bool:
-        return self.cut_off or bool(self.parts)
+        return self.is_truncated or bool(self.parts)
 
     def __str__(self) -> str:
-        words = ['cut off'] if self.cut_off else []
+        words = ['cut off'] if self.is_truncated else []
         if self.parts:
             at, reason = next(iter(self.parts.items()))
             n = len(self.parts)
@@ -67,7 +67,7 @@ class Damage:
 
 @dataclass
 class Definitions:
-    """Schemas and channels by their ids; of two with the same id the later one counts."""
+    """Schemas and channels by id; the later one of equal ids counts."""
 
     path: Path
     schemas: dict[int, Schema] = field(default_factory=dict)
@@ -75,7 +75,7 @@ class Definitions:
     _bytes: int = 0
 
     def add(self, record: Definition) -> None:
-        """Add a schema or channel. Raises InputError where they get too large altogether."""
+        """Add a schema or channel. Raises InputError if their total size is too large."""
         known: dict[int, Any] = self.schemas if isinstance(record, Schema) else self.channels
         if record == known.get(record.id):
             return
@@ -83,24 +83,24 @@ class Definitions:
         builder = RecordBuilder()
         record.write(builder)
         self._bytes += builder.count
-        if self._bytes > LARGEST_DEFINITIONS:
+        if self._bytes > MAX_DEFINITIONS_BYTES:
             raise InputError(
-                f'{self.path}: schemas and channels: expected at most {LARGEST_DEFINITIONS} bytes'
+                f'{self.path}: schemas and channels: expected at most {MAX_DEFINITIONS_BYTES} bytes'
             )
 
     def of(self, channel_id: int) -> tuple[Schema, Channel] | None:
-        """Channel and its schema; None where one of them is not known."""
+        """Channel and its schema; None if one of them is unknown."""
         channel = self.channels.get(channel_id)
         schema = None if channel is None else self.schemas.get(channel.schema_id)
         return None if channel is None or schema is None else (schema, channel)
 
 
 @dataclass(frozen=True)
-class Block:
-    """A chunk, or a stretch of records outside of chunks: from byte `start` to `end` of the file.
+class ChunkSpan:
+    """A chunk, or a range of records outside of chunks: bytes `start` to `end` of the file.
 
-    whole: it was not cut off; first_ns: log time of its earliest message; channel_ids: those that
-    it has messages of, None where that is not known.
+    whole: it is not truncated; first_ns: log time of its earliest message; channel_ids: channels of
+    its messages, None if unknown.
     """
 
     start: int
@@ -113,21 +113,21 @@ class Block:
 
 @dataclass(frozen=True)
 class Summary:
-    """What a file that was closed says of itself at its end."""
+    """Summary section of a file that was closed properly."""
 
     definitions: list[Definition]
-    blocks: list[Block]
+    blocks: list[ChunkSpan]
 
 
 class McapFile:
-    """An MCAP file opened for reading in log order: by its summary, or without one by a first pass.
+    """An MCAP file opened for reading in log order, by its summary, or by a first pass without one.
 
-    damage: what is not whole, which may show late where there is a summary; has_messages: whether
+    damage: damaged parts; with a summary, some are found only while reading. has_messages: whether
     there are any.
     """
 
     def __init__(self, path: Path) -> None:
-        """Raises InputError where it is no MCAP file, OSError where there is none."""
+        """Raises InputError if it is no MCAP file, OSError if it is missing."""
         self.path = path
         self.damage = Damage()
         self.definitions = Definitions(path)
@@ -172,9 +172,9 @@ class McapFile:
 
 
 class _LogOrder:
-    """Merges the messages of blocks by log time.
+    """Merges the messages of chunks by log time.
 
-    It holds about _MOST_HELD bytes at most: beyond that, messages come out of order.
+    It buffers about _MOST_HELD bytes at most: beyond that, messages are out of order.
     """
 
     def __init__(self, channel_ids: frozenset[int]) -> None:
@@ -185,7 +185,7 @@ class _LogOrder:
         self._number = 0
 
     def add(self, records: Records) -> None:
-        """Add the records of a block."""
+        """Add the records of a chunk."""
         wanted = np.flatnonzero(np.isin(records.channel_ids, self._wanted))
         order = wanted[np.argsort(records.log_ns[wanted], kind='stable')]
         if order.size:
@@ -195,7 +195,7 @@ class _LogOrder:
             heapq.heappush(self._heap, (int(records.log_ns[order[0]]), self._number, 0))
 
     def before(self, log_ns: int | None) -> Iterator[Message]:
-        """Messages before a log time, or all that are left."""
+        """Messages before a log time, or all remaining ones."""
         while self._heap:
             if not (log_ns is None or self._heap[0][0] < log_ns or self._held > _MOST_HELD):
                 return
@@ -211,10 +211,10 @@ class _LogOrder:
                 self._held -= len(records.data)
 
 
-def whole_records(path: Path, damage: Damage) -> Iterator[Definition | Message]:
-    """Whole schemas, channels and messages in file order; what is not whole is noted in `damage`.
+def intact_records(path: Path, damage: Damage) -> Iterator[Definition | Message]:
+    """Intact schemas, channels and messages in file order; damaged parts are added to `damage`.
 
-    Raises InputError where the file does not begin as MCAP files do.
+    Raises InputError if the file does not begin with the magic bytes of MCAP.
     """
     summary = summary_of(path)
     yield from summary.definitions
@@ -223,11 +223,11 @@ def whole_records(path: Path, damage: Damage) -> Iterator[Definition | Message]:
         yield from records.messages()
 
 
-def _walk(path: Path, summary: Summary, damage: Damage) -> Iterator[tuple[Block, Records]]:
-    """Blocks and their records in file order; what is not whole is noted in `damage`.
+def _walk(path: Path, summary: Summary, damage: Damage) -> Iterator[tuple[ChunkSpan, Records]]:
+    """Chunk spans and their records in file order; damaged parts are added to `damage`.
 
-    Where records no longer follow each other, it goes on at the next chunk of the summary.
-    Raises InputError where the file does not begin as MCAP files do.
+    After a damaged part, reading continues at the next chunk of the summary. Raises InputError if
+    the file does not begin with the magic bytes of MCAP.
     """
     with path.open('rb') as stream:
         if stream.read(len(MAGIC)) != MAGIC:
@@ -245,10 +245,10 @@ def _walk(path: Path, summary: Summary, damage: Damage) -> Iterator[tuple[Block,
             yield replace(block, first_ns=records.first_ns, channel_ids=channel_ids), records
 
 
-def _blocks(stream: BinaryIO, size: int, chunks: list[int], damage: Damage) -> Iterator[Block]:
-    """Blocks of a file of `size` bytes; `chunks`: where its summary says that chunks begin.
+def _blocks(stream: BinaryIO, size: int, chunks: list[int], damage: Damage) -> Iterator[ChunkSpan]:
+    """Chunk spans of a file of `size` bytes; `chunks`: first bytes of chunks by the summary.
 
-    What a recorder has added since is left alone.
+    Data that a recorder has appended since are ignored.
     """
     at = len(MAGIC)
     stretch = at
@@ -257,39 +257,41 @@ def _blocks(stream: BinaryIO, size: int, chunks: list[int], damage: Damage) -> I
         head = stream.read(HEAD.size) if at + HEAD.size <= size else b''
         code, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
         end = at + HEAD.size + length
-        plain = code in _PLAIN and end <= size and length <= LARGEST_CHUNK
+        plain = code in _PLAIN and end <= size and length <= MAX_CHUNK_BYTES
         if stretch < at and (not plain or end - stretch > _STRETCH):
-            yield Block(stretch, at, is_chunk=False)
+            yield ChunkSpan(stretch, at, is_chunk=False)
             stretch = at
         if (code, length) in ((Opcode.DATA_END, 4), (Opcode.FOOTER, _FOOTER.size)):
             stream.seek(size - len(MAGIC))
-            damage.cut_off = stream.read() != MAGIC  # the messages are whole, the summary is not
+            damage.is_truncated = (
+                stream.read() != MAGIC
+            )  # the messages are intact, the summary is not
             return
         if code == Opcode.CHUNK:
-            yield Block(at, min(end, size), is_chunk=True, whole=end <= size)
+            yield ChunkSpan(at, min(end, size), is_chunk=True, whole=end <= size)
         if end <= size and (0 < code <= _LAST_OPCODE or code >= _PRIVATE):
             if code in _PLAIN and not plain:
-                damage.parts[at] = f'record of {length} bytes: expected at most {LARGEST_CHUNK}'
+                damage.parts[at] = f'record of {length} bytes: expected at most {MAX_CHUNK_BYTES}'
             at = end
             stretch = stretch if plain else at
             continue
         following = bisect_right(chunks, at)
         if following == len(chunks):
-            damage.cut_off = True
+            damage.is_truncated = True
             return
         damage.parts.setdefault(at, 'no record')
         at = chunks[following]
         stretch = at
 
 
-def _load(stream: BinaryIO, block: Block) -> Records:
-    """Records of a block. Raises DamagedError."""
+def _load(stream: BinaryIO, block: ChunkSpan) -> Records:
+    """Records of a chunk span. Raises DamagedError."""
     stream.seek(block.start)
     if not block.is_chunk:
         return records_of(stream.read(block.end - block.start))
     length = block.end - block.start - HEAD.size
-    if length > LARGEST_CHUNK:
-        raise DamagedError(f'chunk of {length} bytes: expected at most {LARGEST_CHUNK}')
+    if length > MAX_CHUNK_BYTES:
+        raise DamagedError(f'chunk of {length} bytes: expected at most {MAX_CHUNK_BYTES}')
     head = stream.read(HEAD.size)
     if block.whole and head != HEAD.pack(Opcode.CHUNK, length):
         raise DamagedError(f'no chunk of {length} bytes')
@@ -297,7 +299,7 @@ def _load(stream: BinaryIO, block: Block) -> Records:
 
 
 def summary_of(path: Path) -> Summary:
-    """Summary at the end of a file, empty where it was cut off or its summary cannot be read."""
+    """Summary at the end of a file; empty if it is truncated or the summary is unreadable."""
     size = path.stat().st_size
     with path.open('rb') as stream:
         footer_at = size - len(MAGIC) - HEAD.size - _FOOTER.size
@@ -310,7 +312,7 @@ def summary_of(path: Path) -> Summary:
             return Summary([], [])
         stream.seek(start)
         content = stream.read(footer_at - start)
-    # The checksum covers the footer up to itself.
+    # The checksum covers the footer up to the checksum field.
     if checksum and zlib.crc32(content + footer[: HEAD.size + _FOOTER.size - 4]) != checksum:
         return Summary([], [])
     try:
@@ -335,12 +337,14 @@ def _parsed_summary(content: bytes, data_end: int) -> Summary:
     return summary
 
 
-def _indexed(record: bytes, data_end: int) -> Block:
+def _indexed(record: bytes, data_end: int) -> ChunkSpan:
     index = ChunkIndex.read(ReadDataStream(BytesIO(record)))
     end = index.chunk_start_offset + index.chunk_length
     if not len(MAGIC) <= index.chunk_start_offset <= end - HEAD.size <= data_end - HEAD.size:
         raise DamagedError(f'chunk at byte {index.chunk_start_offset}')
-    # Writers may leave out which channels a chunk has messages of.
+    # Writers may omit the channels of a chunk.
     channel_ids = frozenset(index.message_index_offsets) or None
     first_ns = index.message_start_time
-    return Block(index.chunk_start_offset, end, True, first_ns=first_ns, channel_ids=channel_ids)
+    return ChunkSpan(
+        index.chunk_start_offset, end, True, first_ns=first_ns, channel_ids=channel_ids
+    )

@@ -70,8 +70,8 @@ class BagPlayerNode(Node):
         if not self._config.bag:
             raise ConfigError("bag = '': expected a rosbag2 folder or an MCAP file")
         self._bag = Bag(Path(self._config.bag))
-        if self._bag.advice:
-            self.get_logger().warning(self._bag.advice)
+        if self._bag.repair_hint:
+            self.get_logger().warning(self._bag.repair_hint)
         self._publishers_by_topic: dict[str, Publisher] = {}
         self._clock_topic = self.create_publisher(ClockMsg, '/clock', qos.STREAM)
         for topic in self._chosen():
@@ -106,7 +106,7 @@ class BagPlayerNode(Node):
     def _chosen(self) -> list[str]:
         asked = {topic.strip() for topic in self._config.topics.split(',') if topic.strip()}
         if unknown := asked - set(self._bag.topics):
-            has = validation.listed(sorted(self._bag.topics))
+            has = validation.quoted_names(sorted(self._bag.topics))
             raise InputError(f'{self._config.bag}: no topic {sorted(unknown)[0]}; it has {has}')
         # A recorded clock would run against the player's own.
         return sorted((asked or set(self._bag.topics)) - {'/clock'})
@@ -124,8 +124,8 @@ class BagPlayerNode(Node):
         except (InputError, NameValidationException) as error:
             reason = ' '.join(str(error).split())[:200]
             if self._config.topics:
-                raise InputError(f'{validation.short(topic)}: {reason}') from error
-            self.get_logger().warning(f'{validation.short(topic)} is not played: {reason}')
+                raise InputError(f'{validation.quoted_name(topic)}: {reason}') from error
+            self.get_logger().warning(f'{validation.quoted_name(topic)} is not played: {reason}')
 
     def _has_listeners(self) -> bool:
         scans = [t for t in self._publishers_by_topic if self._bag.topics[t] == _SCAN]
@@ -155,7 +155,7 @@ class BagPlayerNode(Node):
 
     def _play(self, passed_s: float) -> None:
         self._playback.advance(1e9 * passed_s * self._config.rate)
-        while not self._lockstep.waits and (message := self._playback.due()) is not None:
+        while not self._lockstep.waits and (message := self._playback.pop_due()) is not None:
             self._send(message)
 
     def _send(self, message: RawMessage) -> None:

@@ -110,7 +110,7 @@ class ExplorerNode(LiveNode):
         limits = (goal.time_limit_s, goal.distance_limit_m, goal.area_limit_m2)
         try:
             corners = [c for p in goal.area.points for c in (p.x, p.y)]
-            validation.within('goal: limit or corner of the area', [*limits, *corners])
+            validation.require_bounded('goal: limit or corner of the area', [*limits, *corners])
         except InputError as error:
             self._begin(Explore.Goal())
             self._end(ExplorationStatus.CANCELLED, str(error))
@@ -147,17 +147,17 @@ class ExplorerNode(LiveNode):
     def _on_window(self, message: OccupancyGrid) -> None:
         self._map.paste(messages.patch_from(message))
         self._hears_windows = True
-        self._look(self._looks.right(messages.stamp_ns(message.header.stamp), True))
+        self._look(self._looks.add_right(messages.stamp_ns(message.header.stamp), True))
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         T_map_base = messages.pose_from(message.pose.pose)
-        self._take(self._matcher.right(messages.stamp_ns(message.header.stamp), T_map_base))
+        self._take(self._matcher.add_right(messages.stamp_ns(message.header.stamp), T_map_base))
 
     def _on_scan(self, message: LaserScan) -> None:
         if self._mount.scan(message).is_blind:
             return  # as good as silent: what lies in its field of view was not looked at
         self._heard_at = self._now()
-        self._take(self._matcher.left(messages.stamp_ns(message.header.stamp), message))
+        self._take(self._matcher.add_left(messages.stamp_ns(message.header.stamp), message))
 
     def _on_slam_status(self, message: SlamStatus) -> None:
         # Silence is none of it: a localizer that is started again goes on from where it was.
@@ -185,7 +185,7 @@ class ExplorerNode(LiveNode):
             return
         # What a scan shows is in its window, which may come much later: a look at an older map
         # shows nothing new.
-        self._look(self._looks.left(messages.stamp_ns(pair[0].header.stamp), pair))
+        self._look(self._looks.add_left(messages.stamp_ns(pair[0].header.stamp), pair))
 
     def _look(self, complete: tuple[tuple[LaserScan, Array], bool] | None) -> None:
         """Go on with a scan, made at a pose, that is in the map now."""
@@ -333,7 +333,7 @@ class ExplorerNode(LiveNode):
             else:
                 self._drive_to(goal)
         elif not result.success:
-            self._explorer.fail_target(result.reason)
+            self._explorer.target_failed(result.reason)
 
     # What is told.
 

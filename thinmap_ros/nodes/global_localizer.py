@@ -11,7 +11,7 @@ from thinmap_msgs.srv import LocalizeGlobally
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.active_localization import ActiveSearch
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.odometry import ScanPairing
+from thinmap_ros.core.odometry import ScanOdometrySynchronizer
 from thinmap_ros.core.places.global_localizer import (
     GlobalLocalization,
     GlobalLocalizationConfig,
@@ -124,7 +124,7 @@ class GlobalLocalizerNode(LiveNode):
         self._wanted = self._automatic
         self._lost_since_ns: int | None = None
         self._found_ns = -1  # what the localizer said before it heard the pose says nothing
-        self._pairing = ScanPairing()
+        self._pairing = ScanOdometrySynchronizer()
         self._heard: set[str] = set()
         self._search: ActiveSearch | None = None
         self._T_odom_base: Array | None = None

@@ -101,7 +101,7 @@ class GridMapperNode(LiveNode):
 
     def _resume(self, left: State) -> None:
         """Take over the map of a killed mapper. Raises InputError where it is no such map."""
-        latest_ns, cells = snapshot.check_stamp(left)
+        latest_ns, cells = snapshot.split_stamp(left)
         grid = OccupancyGrid.from_state(cells, self._config)
         self._resumed_ns = self._latest_ns = self._taken_over_ns = latest_ns
         self._replace_map(grid)
@@ -110,13 +110,13 @@ class GridMapperNode(LiveNode):
         return sessions.load_grid(self._session, self._config)
 
     def _on_scan(self, message: LaserScan) -> None:
-        self._add_scan(self._matcher.left(messages.stamp_ns(message.header.stamp), message))
+        self._add_scan(self._matcher.add_left(messages.stamp_ns(message.header.stamp), message))
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         is_known = bool(messages.covariance_from(message)[0, 0] < _LOST_SIGMA_M**2)
         T_map_base = messages.pose_from(message.pose.pose)
         self._add_scan(
-            self._matcher.right(messages.stamp_ns(message.header.stamp), (T_map_base, is_known))
+            self._matcher.add_right(messages.stamp_ns(message.header.stamp), (T_map_base, is_known))
         )
 
     def _add_scan(self, pair: tuple[LaserScan, tuple[Array, bool]] | None) -> None:
@@ -141,7 +141,7 @@ class GridMapperNode(LiveNode):
 
     def _publish_map(self) -> None:
         if self._latest_ns is not None:
-            patch = self._grid.shown.patch()
+            patch = self._grid.shown.known_area()
             corrected_ns = self._grid.corrected_ns
             self._map.publish(
                 messages.grid_msg(patch, self._map_frame, self._latest_ns, corrected_ns)
@@ -156,7 +156,7 @@ class GridMapperNode(LiveNode):
             return
         with self.health.timed('map correction'):
             stamps_ns, poses = messages.trajectory_from(message)
-            is_followed = self._grid.correct(stamps_ns, poses, since_ns=corrected_ns)
+            is_followed = self._grid.apply_correction(stamps_ns, poses, since_ns=corrected_ns)
         if not is_followed:
             self.get_logger().warning(
                 'a loop is closed, but the map was loaded, not drawn here: it stays as it was'

@@ -20,7 +20,7 @@ from thinmap_ros.core.ekf_slam.features import LineFeature as Feature
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.odometry import LastPose, ScanPairing
+from thinmap_ros.core.odometry import OdometryAnchor, ScanOdometrySynchronizer
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
@@ -74,7 +74,7 @@ class LocalizerNode(LiveNode):
         self._map_topic: Subscription | None = None
         # Of a localizer that was killed: its last pose, the map, and the newest scan, that waits
         # for it.
-        self._resumed: LastPose | None = None
+        self._resumed: OdometryAnchor | None = None
         self._latched: GridPatch | None = None
         self.begin_anew()
         self.keep(lambda: None if self._last is None else self._last.state(), self._take_up)
@@ -100,8 +100,8 @@ class LocalizerNode(LiveNode):
         The robot is at its start.
         """
         self._localizer = self._made(self._config)
-        self._pairing = ScanPairing()
-        self._last: LastPose | None = None
+        self._pairing = ScanOdometrySynchronizer()
+        self._last: OdometryAnchor | None = None
         self._topology: Graph | None = None
         self._resumed = self._latched = None
         self._newest: list[tuple[Scan, Array]] = []
@@ -109,7 +109,7 @@ class LocalizerNode(LiveNode):
 
     def _take_up(self, left: State) -> None:
         """Go on from the last pose of a killed localizer. Raises InputError where it is none."""
-        self._resumed = LastPose.from_state(left)
+        self._resumed = OdometryAnchor.from_state(left)
         self._listen_for_the_map()
 
     def _made(self, config: ScanLocalizerConfig) -> AnyLocalizer:
@@ -147,8 +147,8 @@ class LocalizerNode(LiveNode):
             estimate = self._localizer.step(scan, T_odom_base)
             step_ms = 1000.0 * (perf_counter() - started)
             self._publish(scan, estimate, step_ms)
-            if not estimate.lost:
-                self._last = LastPose(scan.stamp_ns, estimate.T_map_odom, T_odom_base)
+            if not estimate.is_lost:
+                self._last = OdometryAnchor(scan.stamp_ns, estimate.T_map_odom, T_odom_base)
         self.health.dropped_in_all('scans without odometry at their time', self._pairing.dropped)
         self.health.dropped_in_all('scans or odometry that make no sense', self._localizer.refused)
 
@@ -168,7 +168,9 @@ class LocalizerNode(LiveNode):
         self._map_topic = self.create_subscription(OccupancyGrid, 'map', take, qos.LATCHED)
         self.every(_MAP_WAIT_S, lambda: self._take([]), Clock(clock_type=ClockType.STEADY_TIME))
 
-    def _resume(self, last: LastPose, ready: list[tuple[Scan, Array]]) -> list[tuple[Scan, Array]]:
+    def _resume(
+        self, last: OdometryAnchor, ready: list[tuple[Scan, Array]]
+    ) -> list[tuple[Scan, Array]]:
         """Begin where the robot is now, in the map; returns the scan to go on with, or none yet.
 
         Where the odometry has begun anew, too, the robot is at its start. Where there is no map, it
@@ -179,7 +181,7 @@ class LocalizerNode(LiveNode):
             self._waits_since = monotonic()
             return []
         scan, T_odom_base = self._newest[0]
-        leads = last.leads_to(scan.stamp_ns, T_odom_base)
+        leads = last.is_continuous_with(scan.stamp_ns, T_odom_base)
         waited_s = monotonic() - self._waits_since
         if leads and self._latched is None and waited_s < _MAP_WAIT_S:
             return []
@@ -244,11 +246,11 @@ class LocalizerNode(LiveNode):
                 header=header,
                 state=state,
                 features=len(features),
-                local_features=estimate.n_local,
-                observed=estimate.observed,
-                matched=estimate.matched,
+                local_features=estimate.n_local_features,
+                observed=estimate.observed_lines,
+                matched=estimate.matched_lines,
                 refused=self._localizer.refused,
-                match_quality=estimate.match_quality,
+                match_quality=estimate.inlier_ratio,
                 step_time_ms=step_ms,
             )
         )
@@ -269,7 +271,7 @@ def _state_of(scan: Scan, estimate: Estimate) -> int:
     """State of a SlamStatus. Of a robot that sees nothing it is not known whether it is lost."""
     if scan.is_blind:
         return int(SlamStatus.BLIND)
-    return int(SlamStatus.LOST if estimate.lost else SlamStatus.TRACKING)
+    return int(SlamStatus.LOST if estimate.is_lost else SlamStatus.TRACKING)
 
 
 def _feature_msg(feature: Feature) -> LineFeature:

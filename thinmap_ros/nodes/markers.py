@@ -72,8 +72,8 @@ def end_nodes(message: EndNodeArray) -> MarkerArray:
     """
     markers: list[Marker] = []
     for node in message.end_nodes:
-        validation.within(f'end node {node.node_id}', (node.position.x, node.position.y))
-        validation.within(
+        validation.require_bounded(f'end node {node.node_id}', (node.position.x, node.position.y))
+        validation.require_bounded(
             f'probability of end node {node.node_id}', (node.position_probability,), 1.0
         )
         ball = _marker(
@@ -102,7 +102,9 @@ def line_features(message: LineFeatureArray) -> MarkerArray:
     lines = _marker(message.header, 'lines', Marker.LINE_LIST, _LINE_M, palette.ESTIMATE)
     for feature in message.features:
         ends = (feature.start, feature.end)
-        validation.within(f'line {feature.id}', [c for end in ends for c in (end.x, end.y)])
+        validation.require_bounded(
+            f'line {feature.id}', [c for end in ends for c in (end.x, end.y)]
+        )
         lines.points += [_point(end.x, end.y, _LINE_Z) for end in ends]
         lines.colors += 2 * [_colour(palette.ESTIMATE if feature.in_local_area else _REMOTE)]
     return _shown([lines])

@@ -87,7 +87,7 @@ class NavigatorNode(LiveNode):
         self._odometry.add(messages.stamp_ns(message.header.stamp), self._T_odom_base)
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
-        T_odom_base = self._odometry.at(messages.stamp_ns(message.header.stamp))
+        T_odom_base = self._odometry.interpolate(messages.stamp_ns(message.header.stamp))
         if T_odom_base is None:
             return
         T_map_base = messages.pose_from(message.pose.pose)
@@ -156,7 +156,7 @@ class NavigatorNode(LiveNode):
             reason = f'{fault}: standing still'
             self.get_logger().warning(reason, throttle_duration_sec=_WARN_PERIOD_S)
             self.health.state(WARN, reason)
-            self._navigator.halt()
+            self._navigator.reset_velocity()
             return Command(0.0, 0.0, 'blocked', reason)
         if (
             self._map.patch is None

@@ -24,7 +24,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.ros import node_main, parameters, qos
 from thinmap_ros.ros.diagnostics import Health
 from thinmap_ros.ros.laser_transform import LaserMount
-from thinmap_ros.view.message_view import Feed
+from thinmap_ros.view.message_view import MessageView
 from thinmap_ros.view.null_view import NullView
 from thinmap_ros.view.rerun_view import View
 
@@ -63,7 +63,7 @@ class RerunViewerNode(Node):
         mount = LaserMount(self)
         parameters.check_unknown(self)
         self._view = self._open(config)
-        self._feed = Feed(self._view, mount.pose, self.get_namespace())
+        self._feed = MessageView(self._view, mount.pose, self.get_namespace())
         self._health = Health(self)
         for topic, (kind, profile) in _TOPICS.items():
             # Those that are not of this robot alone have an absolute name.
@@ -84,7 +84,7 @@ class RerunViewerNode(Node):
         def take(message: Any) -> None:
             self._health.heard(topic)
             try:
-                self._feed.take(topic, message)
+                self._feed.show(topic, message)
             except InputError as error:
                 self._health.refused(topic, str(error))
                 self.get_logger().warning(f'{topic}: {error}', throttle_duration_sec=_WARN_PERIOD_S)

@@ -18,16 +18,16 @@ from tf2_msgs.msg import TFMessage
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.errors import ConfigError, InputError, shown
+from thinmap_ros.core.errors import ConfigError, InputError, quoted
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.diagnostics import OK, WARN, Health
 from thinmap_ros.ros.lockstep import NONE, PATIENCE_S, PATIENCE_WORDS, TOPICS, Lockstep
-from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
-from thinmap_ros.sim.simulation import STEP_NS, Moment, Simulation
+from thinmap_ros.sim.simulation import STEP_NS, SensorReadings, Simulation
 from thinmap_ros.sim.world import World
 
 _COMMAND_TIMEOUT_NS = 500_000_000
@@ -61,7 +61,7 @@ class SimNode(Node):
     def __init__(self) -> None:
         super().__init__('sim')
         self._config = parameters.declare(self, SimConfig)
-        laser = parameters.declare(self, Lms200Config)
+        laser = parameters.declare(self, LaserScannerConfig)
         parameters.check_unknown(self)
         world = World.from_patch(*read_world(package_data.world_path(self._config.world)))
         start = _start(self._config.start, world)
@@ -107,7 +107,7 @@ class SimNode(Node):
         """
         self._health.heard('~/carry')
         try:
-            self._sim.carry(messages.pose_from(message.pose))
+            self._sim.teleport(messages.pose_from(message.pose))
         except InputError as error:
             self._health.refused('~/carry', str(error))
 
@@ -118,7 +118,7 @@ class SimNode(Node):
                 return
             self._running = True
             self._health.state(OK, 'running')
-            self._publish(self._sim.sense())
+            self._publish(self._sim.read_sensors())
             return
         if self._lockstep.waits and self._waits():
             return
@@ -139,10 +139,10 @@ class SimNode(Node):
             self._repeated_at = monotonic()
             self._publish_clock(0)
             self._scan.publish(self._last_scan)
-            self._odom.publish(self._odometry(self._sim.sense()))
+            self._odom.publish(self._odometry(self._sim.read_sensors()))
         return True
 
-    def _publish(self, moment: Moment) -> None:
+    def _publish(self, moment: SensorReadings) -> None:
         self._publish_clock(moment.stamp_ns)
         self._odom.publish(self._odometry(moment))
         if self._config.publish_tf:
@@ -164,7 +164,7 @@ class SimNode(Node):
     def _publish_clock(self, ns: int) -> None:
         self._clock_topic.publish(ClockMsg(clock=messages.time_msg(ns)))
 
-    def _odometry(self, moment: Moment) -> Odometry:
+    def _odometry(self, moment: SensorReadings) -> Odometry:
         velocity = (self._sim.robot.v, self._sim.robot.w)
         return messages.odometry_msg(
             moment.T_odom_base, velocity, ('odom', 'base_link'), moment.stamp_ns
@@ -185,7 +185,7 @@ def _start(text: str, world: World) -> Array:
     try:
         x, y, theta = (float(part) for part in text.split(','))
     except ValueError as error:
-        raise ConfigError(f'start = {shown(text)}: expected "x,y,theta" in m, m, rad') from error
+        raise ConfigError(f'start = {quoted(text)}: expected "x,y,theta" in m, m, rad') from error
     return se2.pose(x, y, theta)
 
 

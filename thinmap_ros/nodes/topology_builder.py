@@ -64,7 +64,7 @@ class TopologyBuilderNode(LiveNode):
 
     def _resume(self, left: State) -> None:
         """Take over the graph of a builder that was killed. Raises InputError where it is none."""
-        latest_ns, graph = snapshot.check_stamp(left)
+        latest_ns, graph = snapshot.split_stamp(left)
         builder = TopologyBuilder.from_state(graph, self._config)
         builder.skip_ids(_UNTOLD_IDS)
         self._resumed_ns = self._latest_ns = self._taken_over_ns = latest_ns
@@ -88,11 +88,11 @@ class TopologyBuilderNode(LiveNode):
         stamp_ns = messages.stamp_ns(message.header.stamp)
         patch = messages.patch_from(message)
         self._rebuilding.window(patch, messages.stamp_ns(message.info.map_load_time))
-        self._take(stamp_ns, self._matcher.left(stamp_ns, patch))
+        self._take(stamp_ns, self._matcher.add_left(stamp_ns, patch))
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         stamp_ns = messages.stamp_ns(message.header.stamp)
-        pair = self._matcher.right(stamp_ns, messages.pose_from(message.pose.pose))
+        pair = self._matcher.add_right(stamp_ns, messages.pose_from(message.pose.pose))
         self._take(stamp_ns, pair)
 
     def _take(self, stamp_ns: int, pair: tuple[GridPatch, Array] | None) -> None:

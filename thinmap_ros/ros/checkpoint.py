@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
 
-from thinmap_ros.core.errors import InputError, reason_of
+from thinmap_ros.core.errors import InputError, one_line_reason
 from thinmap_ros.core.private_folder import private_folder, temporary_folder
-from thinmap_ros.files.atomic import parts_of, written_aside
-from thinmap_ros.files.npz import opened, read_arrays
+from thinmap_ros.files.atomic import atomic_write, partial_files
+from thinmap_ros.files.npz import open_regular_file, read_arrays
 
 State = dict[str, NDArray[Any]]
 _FOLDER = 'THINMAP_STATE_DIR'
@@ -45,10 +45,10 @@ class Recovery:
         """What a killed node left, if not long ago; None where nothing is, or it is broken."""
         if self._path is None:
             return None
-        for part in parts_of(self._path):
+        for part in partial_files(self._path):
             part.unlink(missing_ok=True)
         try:
-            with opened(self._path, os.O_NOFOLLOW) as stream:
+            with open_regular_file(self._path, os.O_NOFOLLOW) as stream:
                 status = os.fstat(stream.fileno())
                 if status.st_uid != os.getuid():
                     raise InputError('expected a file of this user')
@@ -58,7 +58,7 @@ class Recovery:
         except FileNotFoundError:
             return None
         except (OSError, InputError) as error:
-            self._warn(f'{reason_of(error)}: beginning anew')
+            self._warn(f'{one_line_reason(error)}: beginning anew')
             return None
 
     def keep(self, state: State) -> None:
@@ -66,7 +66,7 @@ class Recovery:
         if self._path is None or self._limit_s <= 0.0:
             return
         try:
-            with written_aside(self._path) as aside, aside.open('wb') as stream:
+            with atomic_write(self._path) as aside, aside.open('wb') as stream:
                 np.savez(stream, **state)  # type: ignore[arg-type]
         except OSError as error:
             self._warn(f'{error.strerror}: killed now, the node would begin anew')

@@ -11,7 +11,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.timer import Timer
 from std_srvs.srv import SetBool, Trigger
 
-from thinmap_ros.core.errors import ThinmapError, reason_of
+from thinmap_ros.core.errors import ThinmapError, one_line_reason
 from thinmap_ros.ros import parameters
 from thinmap_ros.ros.checkpoint import Recovery, State
 from thinmap_ros.ros.diagnostics import OK, Health
@@ -104,7 +104,7 @@ class LiveNode(LifecycleNode):
         try:
             resume(left)
         except ThinmapError as error:
-            refused = f'what it had is refused: {reason_of(error)}'
+            refused = f'what it had is refused: {one_line_reason(error)}'
             self.get_logger().warning(f'was killed, but {refused}: begins anew')
             self._forget()
         else:

@@ -31,7 +31,7 @@ from thinmap_msgs.msg import TopologicalEdge, TopologicalNode
 from thinmap_msgs.msg import TopologicalMap as TopologicalMapMsg
 from thinmap_ros.core import se2, validation
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import COARSEST_M, FINEST_M, GridFrame
+from thinmap_ros.core.grid.frame import MAX_RESOLUTION_M, MIN_RESOLUTION_M, GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
@@ -49,12 +49,14 @@ def message_class(type_name: str) -> Any:
     """
     parts = _TYPE_NAME.fullmatch(type_name)
     if parts is None:
-        raise InputError(f'message type {validation.short(type_name)}: expected PACKAGE/msg/NAME')
+        raise InputError(
+            f'message type {validation.quoted_name(type_name)}: expected PACKAGE/msg/NAME'
+        )
     try:
         return getattr(import_module(f'{parts[1]}.msg'), parts[2])
     except (ImportError, AttributeError) as error:
         raise InputError(
-            f'message type {validation.short(type_name)}: not installed here'
+            f'message type {validation.quoted_name(type_name)}: not installed here'
         ) from error
 
 
@@ -96,11 +98,11 @@ def scan_from(message: LaserScan, T_base_laser: Array, zero_is_no_return: bool =
     there are not.
     """
     count = len(message.ranges)
-    if not 0 < count <= validation.MOST_BEAMS:
-        raise InputError(f'{count} beams: expected 1 to {validation.MOST_BEAMS}')
+    if not 0 < count <= validation.MAX_BEAMS:
+        raise InputError(f'{count} beams: expected 1 to {validation.MAX_BEAMS}')
     last = message.angle_min + message.angle_increment * (count - 1)
-    validation.within(
-        'angle of the first or last beam', (message.angle_min, last), validation.LARGEST_ANGLE_RAD
+    validation.require_bounded(
+        'angle of the first or last beam', (message.angle_min, last), validation.MAX_ANGLE_RAD
     )
     return Scan.create(
         stamp_ns(message.header.stamp),
@@ -145,7 +147,7 @@ def quaternion_msg(yaw_rad: float) -> Quaternion:
 
 def pose_from(message: Pose) -> Array:
     """Planar pose (3,). Raises InputError where it is nowhere near (1000 km) or no rotation."""
-    validation.within('position', (message.position.x, message.position.y))
+    validation.require_bounded('position', (message.position.x, message.position.y))
     return se2.pose(message.position.x, message.position.y, yaw_of(message.orientation))
 
 
@@ -180,7 +182,7 @@ def covariance_from(message: PoseWithCovarianceStamped) -> Array:
     """
     full = np.asarray(message.pose.covariance, dtype=np.float64).reshape(6, 6)
     part = full[np.ix_((0, 1, 5), (0, 1, 5))]
-    validation.within('covariance', part.ravel().tolist())
+    validation.require_bounded('covariance', part.ravel().tolist())
     part = (part + part.T) / 2.0
     if np.linalg.eigvalsh(part).min() < -1e-9:
         raise InputError(f'covariance {part.tolist()}: expected no negative eigenvalue')
@@ -259,17 +261,17 @@ def patch_from(message: OccupancyGrid) -> GridPatch:
     # The message carries a float32; 0.1 has to be the same 0.1 on both sides.
     resolution = round(float(info.resolution), 6)
     size_fits = len(message.data) == info.width * info.height
-    if not size_fits or not FINEST_M <= resolution <= COARSEST_M:
+    if not size_fits or not MIN_RESOLUTION_M <= resolution <= MAX_RESOLUTION_M:
         raise InputError(
             f'map of {info.width} x {info.height} cells of {resolution} m '
             f'with {len(message.data)} values: expected a value for each cell, '
-            f'and cells of {FINEST_M} to {COARSEST_M} m'
+            f'and cells of {MIN_RESOLUTION_M} to {MAX_RESOLUTION_M} m'
         )
     origin = pose_from(info.origin)
     if abs(origin[2]) > 1e-6:
         raise InputError(f'map turned by {origin[2]} rad: expected an origin without rotation')
     cells = np.frombuffer(message.data, dtype=np.int8).reshape(info.height, info.width)
-    validation.cells_in_range(cells)
+    validation.require_occupancy(cells)
     return GridPatch(GridFrame(float(origin[0]), float(origin[1]), resolution), cells)
 
 
@@ -308,8 +310,8 @@ def topology_from(message: TopologicalMapMsg) -> TopologicalMap:
     Raises InputError where a kind is unknown, an edge leads to no node, a number is given twice, or
     one is no number.
     """
-    validation.unique('nodes', [n.id for n in message.nodes])
-    validation.unique('edges', [e.id for e in message.edges])
+    validation.require_unique('nodes', [n.id for n in message.nodes])
+    validation.require_unique('edges', [e.id for e in message.edges])
     known = {n.id for n in message.nodes}
     for node in message.nodes:
         if node.kind not in list(NodeKind):
@@ -317,14 +319,16 @@ def topology_from(message: TopologicalMapMsg) -> TopologicalMap:
                 f'node {node.id}: kind {node.kind}: '
                 f'expected one of {[int(kind) for kind in NodeKind]}'
             )
-        validation.within(f'node {node.id}', (node.position.x, node.position.y, node.clearance_m))
+        validation.require_bounded(
+            f'node {node.id}', (node.position.x, node.position.y, node.clearance_m)
+        )
     for edge in message.edges:
         if not {edge.node_a, edge.node_b} <= known:
             raise InputError(
                 f'edge {edge.id} from node {edge.node_a} to {edge.node_b}: '
                 'expected nodes of this map'
             )
-        validation.within(
+        validation.require_bounded(
             f'edge {edge.id}',
             (edge.length_m, edge.clearance_m, *(c for p in edge.path for c in (p.x, p.y))),
         )

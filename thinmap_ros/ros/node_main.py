@@ -14,8 +14,8 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from thinmap_ros.core.errors import ThinmapError, reason_of
-from thinmap_ros.kernels.memory import give_back_pages, release_compiler_pages
+from thinmap_ros.core.errors import ThinmapError, one_line_reason
+from thinmap_ros.kernels.memory import release_compiler_memory, release_compiler_pages
 from thinmap_ros.kernels.progress import report_compilation
 from thinmap_ros.ros import parameters
 
@@ -72,7 +72,7 @@ def _init() -> None:
     try:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     except rclpy_implementation.RCLError as error:
-        print(f'error: arguments after --ros-args: {reason_of(error)}', file=sys.stderr)
+        print(f'error: arguments after --ros-args: {one_line_reason(error)}', file=sys.stderr)
         sys.exit(2)
 
 
@@ -88,7 +88,7 @@ def _spin(nodes: list[Node]) -> None:
     for thread in others:
         thread.start()
     try:
-        _spin_one(nodes[0], asked, failures, give_back_pages())
+        _spin_one(nodes[0], asked, failures, release_compiler_memory())
     finally:
         asked.set()
         for thread in others:

@@ -1,7 +1,6 @@
-"""How much of what could be seen is known.
+"""Coverage: share of the observable cells that are known as free.
 
-Coverage is the share of the free cells that a sensor of a range could see, by line of sight, from
-some place that a robot of a radius can reach from its start, that the map holds as free.
+A cell is observable if it is in range and line of sight of a position that the robot can reach.
 """
 
 import math
@@ -26,8 +25,8 @@ _ALIGNED = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Coverable:
-    """Free cells (H, W) bool, 10 cm wide in the world frame, that could be seen."""
+class ObservableCells:
+    """Observable free cells (H, W) bool, 10 cm wide, world frame."""
 
     cells: NDArray[np.bool_]
     frame: GridFrame
@@ -37,10 +36,10 @@ class Coverable:
         """Area of all of them."""
         return float(self.cells.sum()) * self.frame.resolution**2
 
-    def share_known(self, patch: GridPatch, T_world_map: Array | None = None) -> float:
-        """Coverage: the share of these cells at whose centres the map is free.
+    def coverage(self, patch: GridPatch, T_world_map: Array | None = None) -> float:
+        """Share of these cells at whose centres the map is free.
 
-        T_world_map (3,): where the map's frame lies in the world; None: they are the same.
+        T_world_map (3,): pose of the map frame in the world; None: identity.
         """
         centres = self._centres
         if len(centres) == 0:
@@ -56,7 +55,7 @@ class Coverable:
         return float(patch.free[at[inside, 0], at[inside, 1]].sum()) / len(centres)
 
     def _offset_of(self, frame: GridFrame) -> tuple[int, int] | None:
-        """Where a frame's first cell lies among these, (row, col), if it is on the same lattice."""
+        """Offset (row, col) of a frame from these cells, if it is on the same lattice."""
         if frame.resolution != self.frame.resolution:
             return None
         offset = (frame.as_array() - self.frame.as_array())[1::-1] / frame.resolution
@@ -74,17 +73,18 @@ class Coverable:
         return self.frame.centres_of(np.argwhere(self.cells))
 
 
-def coverable(world: World, start: Array, radius_m: float, range_m: float) -> Coverable:
-    """All that a robot of a radius could come to see, all around up to a range, from a start (3,).
+def observable_cells(
+    world: World, start: Array, radius_m: float, range_m: float
+) -> ObservableCells:
+    """Cells that a robot of a radius can observe, with a range and 360 degrees, from a start (3,).
 
-    Every place in the world's own cells where the robot can stand is taken; none is left out for
-    speed. Sight goes both ways, so each free cell looks around for such a place and stops at the
-    first: most stand on one. Rays are 5 cm apart at the full range: a gap narrower than that, that
-    far away, may be missed.
-    Raises InputError where the robot does not fit at its start.
+    All reachable positions count, at the resolution of the world. Visibility is symmetric: each
+    free cell casts rays until it meets a reachable position. Rays are 5 cm apart at the full range,
+    so that narrower gaps at this distance may be missed.
+    Raises InputError if the robot does not fit at its start.
     """
     reached = _reachable_from(world, start, radius_m)
-    # The lattice of maps: its lines go through the world's origin.
+    # The lattice of maps: its lines pass through the origin of the world.
     low = np.floor(np.array([world.frame.origin_x, world.frame.origin_y]) / CELL_M + 1e-6) * CELL_M
     frame = GridFrame(float(low[0]), float(low[1]), CELL_M)
     rows, cols = world.occupied.shape
@@ -96,14 +96,14 @@ def coverable(world: World, start: Array, radius_m: float, range_m: float) -> Co
     seen = _look_around(world.occupied, reached, places, angles, range_m / world.frame.resolution)
     coverable_cells = np.zeros(tuple(last + 1), dtype=np.bool_)
     coverable_cells[cells[:, 0], cells[:, 1]] = seen
-    return Coverable(coverable_cells, frame)
+    return ObservableCells(coverable_cells, frame)
 
 
 def _reachable_from(world: World, start: Array, radius_m: float) -> NDArray[np.bool_]:
-    """Cells (H, W) at whose centres the robot can stand, connected with the one it starts in."""
+    """Cells (H, W) that the centre of the robot can reach from its start."""
     from scipy import ndimage
 
-    standing = world.wall_distance_m > radius_m
+    standing = world.distance_to_wall_m > radius_m
     row, col = world.frame.cells_of(start[None, :2])[0]
     rows, cols = standing.shape
     if not (0 <= row < rows and 0 <= col < cols and standing[row, col]):
@@ -115,7 +115,7 @@ def _reachable_from(world: World, start: Array, radius_m: float) -> NDArray[np.b
 
 
 def _without_solids(world: World, frame: GridFrame, shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Cells without anything solid in them, (H, W)."""
+    """Cells without obstacles, (H, W)."""
     solid = frame.cells_of(world.frame.centres_of(np.argwhere(world.occupied)))
     free = np.ones(shape, dtype=np.bool_)
     free[solid[:, 0], solid[:, 1]] = False
@@ -130,7 +130,7 @@ def _look_around(
     angles: Array,
     max_cells: float,
 ) -> NDArray[np.bool_]:
-    """Whether rays from each place (N, 2; x, y in cells) meet a wanted cell before a solid one."""
+    """Whether rays from each place (N, 2; x, y in cells) meet a wanted cell before an obstacle."""
     rows, cols = solid.shape
     found = np.zeros(len(places), dtype=np.bool_)
     for i in range(len(places)):

@@ -1,4 +1,4 @@
-"""A robot with a laser in a world, in fixed steps of simulated time."""
+"""Simulation of a robot with a laser in a world, in fixed time steps."""
 
 from dataclasses import dataclass
 
@@ -7,19 +7,16 @@ import numpy as np
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.sim.laser import Lms200, Lms200Config
-from thinmap_ros.sim.robot import Pioneer, PioneerConfig
+from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
+from thinmap_ros.sim.robot import DifferentialDriveRobot, RobotConfig
 from thinmap_ros.sim.world import World
 
 STEP_NS = 50_000_000
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
-    """What the robot's sensors tell after a step.
-
-    Odometry at stamp_ns, and a scan where one is due.
-    """
+class SensorReadings:
+    """Sensor readings after a step: odometry at stamp_ns, and a scan if one is due."""
 
     stamp_ns: int
     T_odom_base: Array
@@ -27,48 +24,48 @@ class Moment:
 
 
 class Simulation:
-    """Steps of 50 ms: odometry at 20 Hz, and a scan whenever the laser's period is over.
+    """Steps of 50 ms: odometry at 20 Hz, and scans at the rate of the laser.
 
-    The seed decides all noise.
+    The seed determines all noise.
 
-    start (3,): where the robot stands in the world; its odometry begins at zero there. Raises
-    InputError where it does not fit.
+    start (3,): initial pose of the robot in the world; its odometry is zero there. Raises
+    InputError if it does not fit.
     """
 
     def __init__(
-        self, world: World, start: Array, robot: PioneerConfig, laser: Lms200Config, seed: int
+        self, world: World, start: Array, robot: RobotConfig, laser: LaserScannerConfig, seed: int
     ) -> None:
         _check_fits(world, start, robot)
         self.world = world
-        self.robot = Pioneer(robot, world, start, odometry_seed(seed))
-        self.laser = Lms200(laser, _seeds(seed)[1])
+        self.robot = DifferentialDriveRobot(robot, world, start, odometry_seed(seed))
+        self.laser = LaserScanner(laser, _seeds(seed)[1])
         self._scan_period_ns = round(1e9 / laser.rate_hz)
         self._next_scan_ns = 0
         self.stamp_ns = 0
 
-    def carry(self, T_world_base: Array) -> None:
-        """Carry the robot to a pose (3,): its wheels do not turn.
+    def teleport(self, T_world_base: Array) -> None:
+        """Teleport the robot to a pose (3,); its odometry does not change.
 
-        Raises InputError where it does not fit.
+        Raises InputError if it does not fit.
         """
         _check_fits(self.world, T_world_base, self.robot.config)
         self.robot.T_world_base = np.array(T_world_base, dtype=np.float64)
         self.robot.v = 0.0
         self.robot.w = 0.0
 
-    def sense(self) -> Moment:
-        """Return what the sensors tell now; a scan that is due is given once."""
+    def read_sensors(self) -> SensorReadings:
+        """Return the present sensor readings; each scan is returned once."""
         scan = None
         if self.stamp_ns >= self._next_scan_ns:
             scan = self.laser.scan(self.world, self.robot.T_world_base, self.stamp_ns)
             self._next_scan_ns += self._scan_period_ns
-        return Moment(self.stamp_ns, self.robot.T_odom_base, scan)
+        return SensorReadings(self.stamp_ns, self.robot.T_odom_base, scan)
 
-    def step(self, v: float, w: float) -> Moment:
+    def step(self, v: float, w: float) -> SensorReadings:
         """Drive for one step with a commanded speed (m/s) and turn rate (rad/s)."""
         self.robot.step(v, w, STEP_NS / 1e9)
         self.stamp_ns += STEP_NS
-        return self.sense()
+        return self.read_sensors()
 
 
 def odometry_seed(seed: int) -> int:
@@ -81,7 +78,7 @@ def _seeds(seed: int) -> list[int]:
     return [int(word) for word in np.random.SeedSequence(seed).generate_state(2)]
 
 
-def _check_fits(world: World, T_world_base: Array, robot: PioneerConfig) -> None:
+def _check_fits(world: World, T_world_base: Array, robot: RobotConfig) -> None:
     if not world.is_clear(float(T_world_base[0]), float(T_world_base[1]), robot.radius_m):
         raise InputError(
             f'{world.name}: start {T_world_base[:2].tolist()}: expected a place where a robot of '

@@ -5,9 +5,9 @@ from pathlib import Path
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.logs.bag_directory import bag_files, mcap_files_in
-from thinmap_ros.logs.bag_writer import written_as_bag
+from thinmap_ros.logs.bag_writer import temporary_bag
 from thinmap_ros.logs.log import is_mcap, refuse_foreign
-from thinmap_ros.logs.repair import Salvage, repair
+from thinmap_ros.logs.repair import RepairReport, repair
 from thinmap_ros.tools import cli
 
 
@@ -31,14 +31,14 @@ def _has_compressed_messages(bag: Path) -> bool:
         return False
 
 
-def told(found: Salvage) -> str:
+def describe_repair(found: RepairReport) -> str:
     """Say in one line what was found."""
     parts = [f'{sum(found.counts.values())} messages on {len(found.counts)} topics']
     if found.first_ns is not None:
         parts[0] += f', {(found.last_ns - found.first_ns) / 1e9:.1f} s'
     parts.extend(f'{file.name}: {damage}' for file, damage in found.damage.items() if damage)
     if found.unreadable:
-        parts.append(f'{found.unreadable} messages that cannot be unpacked')
+        parts.append(f'{found.unreadable} messages that cannot be decompressed')
     return '; '.join(parts)
 
 
@@ -48,9 +48,9 @@ def _work(arguments: argparse.Namespace) -> None:
     files = files_of(bag)
     if out.resolve() == bag.resolve():
         raise InputError(f'{out}: expected another name than that of the bag itself')
-    with written_as_bag(out) as folder:
+    with temporary_bag(out) as folder:
         found = repair(files, folder, _has_compressed_messages(bag))
-    print(f'{out}: {told(found)}')
+    print(f'{out}: {describe_repair(found)}')
 
 
 def main() -> None:

@@ -18,9 +18,9 @@ from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.evaluation.parallel_jobs import (
     Report,
     add_run_options,
-    complaint,
+    failure_summary,
     read_report,
-    run_missing,
+    run_pending,
 )
 from thinmap_ros.evaluation.strategy_comparison import markdown
 from thinmap_ros.files.atomic import read_text, write_text
@@ -90,11 +90,11 @@ def _report_file(out: Path, job: Job) -> Path:
 
 def _work(arguments: argparse.Namespace) -> None:
     jobs = _jobs(arguments)
-    failures = run_missing(
+    failures = run_pending(
         run_job, jobs, lambda job: _report_file(arguments.out, job), arguments, arguments.quiet
     )
     if failures:
-        raise complaint(failures)
+        raise failure_summary(failures)
     reports = [read_report(_report_file(arguments.out, job), asdict(job.options)) for job in jobs]
     table = markdown(reports)
     write_text(arguments.out / 'table.md', table)

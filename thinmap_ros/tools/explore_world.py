@@ -17,7 +17,7 @@ from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.files import graphs, occupancy_maps, trajectories
 from thinmap_ros.files.atomic import write_text
 from thinmap_ros.files.worlds import read_world
-from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
 from thinmap_ros.tools import cli
@@ -28,7 +28,7 @@ def write_outputs(loop: ClosedLoop, report: dict[str, Any], folder: Path) -> Non
     """Write all files into a folder."""
     log = loop.log
     pipeline = loop.pipeline
-    patch = pipeline.grid.patch()
+    patch = pipeline.grid.known_area()
     topology = pipeline.topology.map
     folder.mkdir(parents=True, exist_ok=True)
     trajectories.write_tum(folder / 'trajectory.tum', log.stamps_ns, log.poses)
@@ -68,7 +68,7 @@ def options_from(arguments: argparse.Namespace, strategy: str) -> Options:
         speed_m_s=arguments.speed,
         localization=arguments.localization,
         robot=arguments.robot,
-        laser=cli.config_from(arguments, Lms200Config),
+        laser=cli.config_from(arguments, LaserScannerConfig),
         time_limit_s=arguments.time_limit,
         kidnap_at_s=arguments.kidnap_at,
     )
@@ -87,7 +87,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         '--kidnap-at', type=float, help='carry the robot off after so many simulated s (with slam)'
     )
     parser.add_argument('--quiet', action='store_true', help='no progress bar')
-    cli.add_config(parser, Lms200Config, ['beams', 'field_of_view_deg', 'range_max_m'])
+    cli.add_config(parser, LaserScannerConfig, ['beams', 'field_of_view_deg', 'range_max_m'])
 
 
 def _work(arguments: argparse.Namespace) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.errors import InputError, shown
+from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
@@ -17,7 +17,7 @@ from thinmap_ros.files.atomic import write_text
 from thinmap_ros.logs.bag_writer import BagWriter
 from thinmap_ros.logs.encode import BagObjects
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
-from thinmap_ros.sim.drives import Look
+from thinmap_ros.sim.drives import DriveSample
 from thinmap_ros.tools import cli
 
 _MAP_EVERY = 300  # scans: a minute
@@ -33,7 +33,7 @@ _TYPES = {
 }
 
 
-class _Recording:
+class _BagRecorder:
     """A bag that is written to, its messages of one stamp a nanosecond apart in the log."""
 
     def __init__(self, writer: BagWriter) -> None:
@@ -45,7 +45,7 @@ class _Recording:
         self._log_ns = max(stamp_ns, self._log_ns + 1)
         self._writer.write(topic, _TYPES[topic], self._log_ns, message)
 
-    def mount(self, look: Look) -> None:
+    def write_laser_mount(self, look: DriveSample) -> None:
         """Where the laser sits."""
         ns = look.scan.stamp_ns
         made = self._objects
@@ -53,7 +53,7 @@ class _Recording:
             '/tf_static', ns, made.transform(ns, ('base_link', 'laser'), look.scan.T_base_laser)
         )
 
-    def sensed(self, look: Look) -> None:
+    def write_sensors(self, look: DriveSample) -> None:
         """What the robot had at a scan, and where it truly was."""
         ns = look.scan.stamp_ns
         made = self._objects
@@ -62,19 +62,19 @@ class _Recording:
         self._write('/tf', ns, made.transform(ns, ('odom', 'base_link'), look.T_odom_base))
         self._write('/scan', ns, made.scan(look.scan))
 
-    def found(self, ns: int, estimate: Estimate) -> None:
+    def write_estimate(self, ns: int, estimate: Estimate) -> None:
         """What the localizer made of it."""
         made = self._objects
         self._write('/pose', ns, made.estimate(ns, estimate.T_map_base, estimate.covariance))
         self._write('/tf', ns, made.transform(ns, ('map', 'odom'), estimate.T_map_odom))
 
-    def mapped(self, ns: int, pipeline: Pipeline) -> None:
+    def write_maps(self, ns: int, pipeline: Pipeline) -> None:
         """Map and graph as they are."""
-        self._write('/map', ns, self._objects.grid(ns, pipeline.grid.patch()))
+        self._write('/map', ns, self._objects.grid(ns, pipeline.grid.known_area()))
         self._write('/topology', ns, self._objects.topology(ns, pipeline.topology.map))
 
 
-def record(path: Path, looks: Iterable[Look], localized: bool) -> int:
+def record(path: Path, looks: Iterable[DriveSample], localized: bool) -> int:
     """Write the bag of a drive; returns the number of scans.
 
     localized: by the localizer, else by ground truth.
@@ -83,23 +83,25 @@ def record(path: Path, looks: Iterable[Look], localized: bool) -> int:
     scans = 0
     pipeline = None
     with BagWriter(path, definitions=definitions, compressed=True) as writer:
-        recording = _Recording(writer)
+        recording = _BagRecorder(writer)
         for look in looks:
             if pipeline is None:
                 pipeline, truth = _pipeline(look, localized)
-                recording.mount(look)
+                recording.write_laser_mount(look)
             truth[:] = [look.T_world_base]
-            recording.sensed(look)
-            recording.found(look.scan.stamp_ns, pipeline.step(look.scan, look.T_odom_base).estimate)
+            recording.write_sensors(look)
+            recording.write_estimate(
+                look.scan.stamp_ns, pipeline.step(look.scan, look.T_odom_base).estimate
+            )
             scans += 1
             if scans % _MAP_EVERY == 0:
-                recording.mapped(look.scan.stamp_ns, pipeline)
+                recording.write_maps(look.scan.stamp_ns, pipeline)
         if pipeline is not None and scans % _MAP_EVERY:
-            recording.mapped(look.scan.stamp_ns, pipeline)
+            recording.write_maps(look.scan.stamp_ns, pipeline)
     return scans
 
 
-def _pipeline(first: Look, localized: bool) -> tuple[Pipeline, list[Array]]:
+def _pipeline(first: DriveSample, localized: bool) -> tuple[Pipeline, list[Array]]:
     """A pipeline for a drive that begins so, and the list that is to take each scan's true pose."""
     x, y, yaw = (float(number) for number in first.T_world_base)
     localizer = ScanLocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=yaw)
@@ -128,7 +130,7 @@ def _about(name: str, seed: int, scans: int, seconds: float, localized: bool) ->
 
 def _work(arguments: argparse.Namespace) -> None:
     if unknown := set(arguments.names) - set(RECIPES):
-        raise InputError(f'drive {shown(min(unknown))}: expected some of {", ".join(RECIPES)}')
+        raise InputError(f'drive {quoted(min(unknown))}: expected some of {", ".join(RECIPES)}')
     for name in arguments.names or RECIPES:
         path = arguments.out / f'{name}.mcap'
         looks = list(Source(arguments.seed).looks(name))

@@ -19,7 +19,7 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import ScanLocalizerConfig
 from thinmap_ros.core.slam.localizers import line_features
-from thinmap_ros.files.atomic import written_aside
+from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.replaying import replay, write_outputs
 from thinmap_ros.tools import cli
@@ -52,28 +52,28 @@ class ReplayView:
         if self._T_map_odom is None:
             self._T_map_odom = estimate.T_map_odom
         # Odometry as if it had been all there is since the first pose.
-        view.trail(ns, 'odometry', se2.compose(self._T_map_odom, T_odom_base))
+        view.trajectory(ns, 'odometry', se2.compose(self._T_map_odom, T_odom_base))
         sigma_m = float(np.sqrt(max(np.linalg.eigvalsh(estimate.covariance[:2, :2])[-1], 0.0)))
-        view.number(ns, 'error', '2 sigma, cm', 200.0 * sigma_m)
+        view.scalar(ns, 'error', '2 sigma, cm', 200.0 * sigma_m)
         for curve, count in (
             ('features', estimate.n_features),
-            ('local features', estimate.n_local),
-            ('matched lines', estimate.matched),
+            ('local features', estimate.n_local_features),
+            ('matched lines', estimate.matched_lines),
         ):
-            view.number(ns, 'count', curve, float(count))
+            view.scalar(ns, 'count', curve, float(count))
         for stage, curve in _STAGES.items():
-            view.number(ns, 'step', curve, 1000.0 * pipeline.stage_seconds[stage][-1])
+            view.scalar(ns, 'step', curve, 1000.0 * pipeline.stage_seconds[stage][-1])
         if self._drawn_ns is None or abs(ns - self._drawn_ns) >= _PERIOD_NS:
-            self.last(ns, pipeline)
+            self.finish(ns, pipeline)
 
-    def last(self, ns: int, pipeline: Pipeline) -> None:
+    def finish(self, ns: int, pipeline: Pipeline) -> None:
         """Show map, graph and features as they are now."""
         self._drawn_ns = ns
         view = self._view
         topology = pipeline.topology.map
-        view.grid(ns, pipeline.grid.patch())
+        view.grid(ns, pipeline.grid.known_area())
         view.topology(ns, topology)
-        view.number(ns, 'count', 'nodes', float(len(topology.nodes)))
+        view.scalar(ns, 'count', 'nodes', float(len(topology.nodes)))
         features = line_features(pipeline.localizer)
         ends = np.array([[feature.start, feature.end] for feature in features]).reshape(-1, 2, 2)
         view.lines(ns, ends, np.array([feature.local for feature in features], dtype=bool))
@@ -101,7 +101,7 @@ def _view(arguments: argparse.Namespace) -> Iterator[View | None]:
         return
     with ExitStack() as stack:
         aside = (
-            stack.enter_context(written_aside(arguments.recording)) if arguments.recording else None
+            stack.enter_context(atomic_write(arguments.recording)) if arguments.recording else None
         )
         view = View(aside, arguments.view)
         stack.callback(view.close)

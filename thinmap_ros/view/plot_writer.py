@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thinmap_ros.files.atomic import written_aside
+from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.view import palette
 from thinmap_ros.view.figures import draw_graph, draw_map
 from thinmap_ros.view.plots import (
@@ -21,9 +21,9 @@ from thinmap_ros.view.plots import (
     Panel,
     Plot,
     Raster,
-    Robots,
+    RobotMarkers,
     Segments,
-    Words,
+    TextLabels,
 )
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 # Dots and margin, in inches
 _DPI = 110
 _PAD = 0.1
-_MANY = 2000  # points: more make an SVG needlessly large
+_MANY = 2000  # maximum number of points, to limit the size of an SVG
 # Text stays text in an SVG, and its ids do not change from run to run.
 _SETTINGS: Any = {
     'svg.fonttype': 'none',
@@ -63,7 +63,7 @@ def write_plot(folder: Path, plot: Plot) -> None:
             axes.set_visible(False)
         _add_legend(figure, plot.legend)
         for ending, metadata in (('png', {'Software': None}), ('svg', {'Date': None})):
-            with written_aside(folder / f'{plot.name}.{ending}') as aside:
+            with atomic_write(folder / f'{plot.name}.{ending}') as aside:
                 figure.savefig(aside, format=ending, metadata=metadata)
 
 
@@ -167,8 +167,8 @@ def _(layer: Segments, axes: 'Axes') -> None:
     axes.autoscale_view()
 
 
-@_draw.register(Words)
-def _(layer: Words, axes: 'Axes') -> None:
+@_draw.register(TextLabels)
+def _(layer: TextLabels, axes: 'Axes') -> None:
     for at, word in zip(layer.at, layer.words, strict=True):
         axes.annotate(
             word,
@@ -187,8 +187,8 @@ def _(layer: Words, axes: 'Axes') -> None:
         )
 
 
-@_draw.register(Robots)
-def _(layer: Robots, axes: 'Axes') -> None:
+@_draw.register(RobotMarkers)
+def _(layer: RobotMarkers, axes: 'Axes') -> None:
     from matplotlib.patches import Circle
 
     for k, (x, y, theta) in enumerate(layer.poses):

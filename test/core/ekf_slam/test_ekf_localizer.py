@@ -7,7 +7,7 @@ from support.slam_room import ROOM, drive, scan_in
 from thinmap_ros.core import se2
 from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig, EkfLocalizer
 from thinmap_ros.core.errors import ConfigError, InputError
-from thinmap_ros.core.odometry import LastPose
+from thinmap_ros.core.odometry import OdometryAnchor
 
 PERIOD_NS = 200_000_000
 START = se2.pose(2.0, 2.0, 0.0)
@@ -89,7 +89,7 @@ def test_without_mapping_no_feature_comes_grows_or_goes():
 
 
 def test_it_goes_on_after_a_restart_where_odometry_leads():
-    last = LastPose(0, se2.pose(1.0, 2.0, 0.5), se2.pose(1.0, 0.0, 0.0))
+    last = OdometryAnchor(0, se2.pose(1.0, 2.0, 0.5), se2.pose(1.0, 0.0, 0.0))
     resumed = EkfLocalizer.resumed(None, last, se2.pose(2.0, 0.0, 0.0))
     expected = se2.compose(last.T_map_odom, se2.pose(2.0, 0.0, 0.0))
     np.testing.assert_allclose(resumed.pose, expected)

@@ -17,8 +17,8 @@ from thinmap_ros.core.places.global_localizer import GlobalLocalization, Hypothe
 from thinmap_ros.core.places.place_database import FREE, Places
 from thinmap_ros.core.planning.navigator import NavigatorConfig
 from thinmap_ros.sim.drives import random_drive
-from thinmap_ros.sim.laser import Lms200, Lms200Config
-from thinmap_ros.sim.robot import PioneerConfig
+from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
+from thinmap_ros.sim.robot import RobotConfig
 from thinmap_ros.sim.simulation import STEP_NS, Simulation
 
 # Two rooms that are the same, and the corridor at their doors, which goes on to one side.
@@ -46,11 +46,11 @@ def seconds_driven_by_itself(finder, start, seed):
     """Time until it is sure, and the way to there; it never touches a wall."""
     finder.restart()
     simulation = Simulation(
-        world_of(TWINS), se2.pose(*start), PioneerConfig(), Lms200Config(), seed
+        world_of(TWINS), se2.pose(*start), RobotConfig(), LaserScannerConfig(), seed
     )
     # As those that roam.
     search = ActiveSearch(finder.places, finder.config, NavigatorConfig(max_speed_m_s=0.5))
-    moment = simulation.sense()
+    moment = simulation.read_sensors()
     scan = None
     for k in itertools.count():
         if moment.scan is not None:
@@ -131,7 +131,7 @@ def test_where_nothing_tells_places_apart_the_robot_goes_on_and_stands_when_all_
         Result(State.AMBIGUOUS, '', tuple(Hypothesis(T, np.eye(3), 0.5, 1.0) for T in starts)),
         np.zeros(3),
     )
-    scan = Lms200(Lms200Config(), 0).scan(world_of(shut), starts[0], 0)
+    scan = LaserScanner(LaserScannerConfig(), 0).scan(world_of(shut), starts[0], 0)
     command = search.step(np.zeros(3), scan, 0.1)
     assert (command.v, command.w, command.state) == (0.0, 0.0, 'idle')
 

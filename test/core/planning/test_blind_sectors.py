@@ -7,10 +7,10 @@ import pytest
 from test_navigator import Ride, room
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.planning.blind_sectors import UnseenSectors
+from thinmap_ros.core.planning.blind_sectors import BlindSectors
 from thinmap_ros.core.scan import Scan
 
-NARROWEST_M = 0.1
+MIN_OBSTACLE_WIDTH_M = 0.1
 
 
 def scan_with(invalid, beams=181, first=-math.pi / 2, step=math.pi / 180, value=np.nan):
@@ -20,8 +20,8 @@ def scan_with(invalid, beams=181, first=-math.pi / 2, step=math.pi / 180, value=
 
 
 def unseen_points(scan, pose=(0.0, 0.0, 0.0), reach_m=2.0):
-    sectors = UnseenSectors()
-    sectors.observe(np.array(pose), scan)
+    sectors = BlindSectors()
+    sectors.add_scan(np.array(pose), scan)
     return sectors.points(reach_m, 0.5)
 
 
@@ -39,13 +39,13 @@ def test_points_fill_a_sector_from_where_something_can_hide(first, count, pose, 
     assert bearings.min() == pytest.approx(first - 90.0, abs=1e-3)
     assert bearings.max() == pytest.approx(first + count - 1 - 90.0, abs=1e-3)
     nearest = np.hypot(*(points - np.array(pose[:2])).T).min()
-    assert nearest == pytest.approx(NARROWEST_M / math.radians(count + 1), rel=1e-4)
+    assert nearest == pytest.approx(MIN_OBSTACLE_WIDTH_M / math.radians(count + 1), rel=1e-4)
     # Dense enough that no disc of a robot fits in between.
     for metres in (nearest, 1.0, 1.9):
         for degrees in np.linspace(first, first + count - 1, 7) - 90.0:
             angle = pose[2] + math.radians(degrees)
             place = np.array(pose[:2]) + metres * np.array([math.cos(angle), math.sin(angle)])
-            assert np.hypot(*(points - place).T).min() <= 1.01 * NARROWEST_M
+            assert np.hypot(*(points - place).T).min() <= 1.01 * MIN_OBSTACLE_WIDTH_M
 
 
 def test_single_beams_hide_nothing_that_is_near():
@@ -63,14 +63,16 @@ def test_all_round_the_last_beam_is_beside_the_first(clockwise):
     scan = scan_with(np.r_[350:360, 0:10], 360, 0.0, step)
     points = unseen_points(scan)
     assert np.abs(bearings_deg(points)).max() <= 10.001
-    assert np.hypot(*points.T).min() == pytest.approx(NARROWEST_M / math.radians(21), rel=1e-4)
+    assert np.hypot(*points.T).min() == pytest.approx(
+        MIN_OBSTACLE_WIDTH_M / math.radians(21), rel=1e-4
+    )
 
 
 def test_what_was_seen_from_where_the_robot_just_was_is_seen():
-    sectors = UnseenSectors()
+    sectors = BlindSectors()
     dead = scan_with(slice(130, 181))
     for step in range(40):
-        sectors.observe(np.array([0.05 * step, 0.0, 0.0]), dead)
+        sectors.add_scan(np.array([0.05 * step, 0.0, 0.0]), dead)
     here = np.array([0.05 * 39, 0.0])
     bare = unseen_points(dead, (here[0], 0.0, 0.0))
     left = sectors.points(2.0, 0.5)
@@ -131,7 +133,9 @@ def test_where_a_leg_can_hide_a_little_ahead_it_drives_no_faster_than_it_can_sto
     ride = spoiled(Ride(room(), (1.0, 3.0, 0.0)), with_beams(80, 101, np.nan))
     ride.go((3.0, 3.0))
     fastest = max(v for v, _ in ride.commands)
-    assert fastest * ride.navigator.config.reaction_s < NARROWEST_M / math.radians(22) - 0.24
+    assert (
+        fastest * ride.navigator.config.reaction_s < MIN_OBSTACLE_WIDTH_M / math.radians(22) - 0.24
+    )
 
 
 @pytest.mark.parametrize('first, end', [(0, 40), (150, 181), (60, 63)])
@@ -158,7 +162,7 @@ def test_something_nearer_than_can_be_measured_is_an_obstacle():
     ride = spoiled(Ride(room(), (1.0, 3.0, 0.0)), with_beams(85, 96, -np.inf))
     last = ride.go((6.0, 3.0))[-1]
     assert last.state == 'failed'
-    assert 'stands in the way' in last.reason
+    assert 'blocks the path' in last.reason
     assert ride.pose[0] == pytest.approx(1.0)
     behind = spoiled(Ride(room(), (1.0, 3.0, 0.0)), with_beams(0, 5, -np.inf))
     assert behind.go((6.0, 3.0))[-1].state == 'reached', "beside the robot it is in nobody's way"

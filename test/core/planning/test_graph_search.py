@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 
 from thinmap_ros.core.planning.graph_search import (
     access,
-    costs_from,
-    path_between,
+    path_lengths_to_nodes,
     path_points,
+    route_path,
     shortest_path,
 )
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
@@ -78,18 +78,18 @@ def test_costs_equal_floyd_and_warshall_s(count, seed):
 
 
 def test_between_any_points_the_way_joins_the_edges_where_they_are_nearest():
-    path = path_between(square(), (1.0, -0.5), (1.0, 3.2))
+    path = route_path(square(), (1.0, -0.5), (1.0, 3.2))
     np.testing.assert_allclose(path[[0, -1]], [[1.0, -0.5], [1.0, 3.2]])
     assert np.hypot(*np.diff(path, axis=0).T).sum() == pytest.approx(0.5 + 3.0 + 3.0 + 3.0 + 0.2)
 
 
 def test_between_two_points_of_one_edge_the_way_stays_on_it():
-    path = path_between(square(), (3.5, 0.1), (1.5, 0.1))
+    path = route_path(square(), (3.5, 0.1), (1.5, 0.1))
     assert np.hypot(*np.diff(path, axis=0).T).sum() == pytest.approx(2.2)
 
 
 def test_costs_from_a_point_reach_what_is_joined():
-    costs = costs_from(square(), 1.0, 0.25)
+    costs = path_lengths_to_nodes(square(), 1.0, 0.25)
     assert costs == pytest.approx({1: 1.25, 2: 3.25, 3: 6.25, 4: 10.25})
 
 
@@ -98,15 +98,15 @@ def test_a_loop_is_left_the_shorter_way():
     topology = TopologicalMap([node(1, 0, 0)], [edge(2, 1, 1, ring)])
     assert access(topology, 1.0, 1.0).to_node_m == pytest.approx({1: 2.0})
     assert np.hypot(
-        *np.diff(path_between(topology, (1.0, 1.0), (1.0, 0.0)), axis=0).T
+        *np.diff(route_path(topology, (1.0, 1.0), (1.0, 0.0)), axis=0).T
     ).sum() == pytest.approx(3.0)
 
 
 def test_a_map_without_edges_and_an_empty_one():
     lone = TopologicalMap([node(7, 1.0, 1.0)])
-    assert costs_from(lone, 1.0, 3.0) == {7: 2.0}
+    assert path_lengths_to_nodes(lone, 1.0, 3.0) == {7: 2.0}
     np.testing.assert_allclose(
-        path_between(lone, (1.0, 3.0), (0.0, 1.0))[[0, -1]], [[1.0, 3.0], [0.0, 1.0]]
+        route_path(lone, (1.0, 3.0), (0.0, 1.0))[[0, -1]], [[1.0, 3.0], [0.0, 1.0]]
     )
-    assert costs_from(TopologicalMap(), 0.0, 0.0) == {}
-    assert path_between(TopologicalMap(), (0.0, 0.0), (1.0, 1.0)) is None
+    assert path_lengths_to_nodes(TopologicalMap(), 0.0, 0.0) == {}
+    assert route_path(TopologicalMap(), (0.0, 0.0), (1.0, 1.0)) is None

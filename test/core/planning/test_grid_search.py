@@ -7,8 +7,13 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.planning.grid_search import WayTable, coarse, field_from, ways_from
-from thinmap_ros.core.planning.traversability import reached_from
+from thinmap_ros.core.planning.grid_search import (
+    PathLengthTable,
+    distance_field_from,
+    downsample_mask,
+    path_lengths_from,
+)
+from thinmap_ros.core.planning.traversability import reachable_cells
 
 
 def dijkstra(allowed, start):
@@ -37,7 +42,7 @@ def test_ways_are_those_of_dijkstra(seed):
     allowed[20, 20] = True
     goals = np.argwhere(np.ones_like(allowed))
     expected = dijkstra(allowed, (20, 20))
-    found = ways_from(allowed, (20, 20), goals)
+    found = path_lengths_from(allowed, (20, 20), goals)
     assert found.tolist() == [expected.get((r, c), math.inf) / 5 for r, c in goals.tolist()]
 
 
@@ -45,10 +50,13 @@ def test_few_goals_give_what_all_give_and_places_outside_cannot_be_reached():
     allowed = np.random.default_rng(9).random((30, 30)) < 0.8
     allowed[3, 3] = True
     everywhere = np.argwhere(np.ones_like(allowed))
-    whole = ways_from(allowed, (3, 3), everywhere)
+    whole = path_lengths_from(allowed, (3, 3), everywhere)
     for i in (0, 77, 450, 899):
-        assert ways_from(allowed, (3, 3), everywhere[[i]])[0] == whole[i]
-    assert ways_from(allowed, (3, 3), np.array([[-1, 3], [3, 30]])).tolist() == [math.inf, math.inf]
+        assert path_lengths_from(allowed, (3, 3), everywhere[[i]])[0] == whole[i]
+    assert path_lengths_from(allowed, (3, 3), np.array([[-1, 3], [3, 30]])).tolist() == [
+        math.inf,
+        math.inf,
+    ]
 
 
 @pytest.mark.parametrize(
@@ -57,14 +65,14 @@ def test_few_goals_give_what_all_give_and_places_outside_cannot_be_reached():
 def test_from_beyond_the_grid_nothing_can_be_reached(start):
     allowed = np.ones((30, 30), dtype=np.bool_)
     everywhere = np.argwhere(allowed)
-    assert np.isinf(field_from(allowed, start)).all()
-    assert np.isinf(ways_from(allowed, start, everywhere)).all()
-    assert not reached_from(allowed, start).any()
+    assert np.isinf(distance_field_from(allowed, start)).all()
+    assert np.isinf(path_lengths_from(allowed, start, everywhere)).all()
+    assert not reachable_cells(allowed, start).any()
 
 
 def test_ways_are_at_most_a_twelfth_longer_than_straight_ones():
     goals = np.argwhere(np.ones((60, 60), dtype=np.bool_))[1:]
-    ratio = ways_from(np.ones((60, 60), dtype=np.bool_), (0, 0), goals) / np.hypot(*goals.T)
+    ratio = path_lengths_from(np.ones((60, 60), dtype=np.bool_), (0, 0), goals) / np.hypot(*goals.T)
     assert ratio.min() > 0.98
     assert ratio.max() < 1.0 + 1.0 / 12.0
 
@@ -72,11 +80,11 @@ def test_ways_are_at_most_a_twelfth_longer_than_straight_ones():
 def test_a_coarse_square_is_set_where_any_of_its_cells_is():
     mask = np.zeros((5, 7), dtype=np.bool_)
     mask[4, 6] = mask[1, 2] = True
-    assert np.argwhere(coarse(mask, 2)).tolist() == [[0, 1], [2, 3]]
+    assert np.argwhere(downsample_mask(mask, 2)).tolist() == [[0, 1], [2, 3]]
 
 
 def test_a_table_of_ways_stays_true_while_the_map_grows_to_all_sides():
-    table = WayTable(0.2, 1e9, 2)
+    table = PathLengthTable(0.2, 1e9, 2)
     frame = GridFrame(0.3, -0.5, 0.1)
     allowed = np.ones((60, 80), dtype=np.bool_)
     allowed[28:33, :70] = False
@@ -86,14 +94,14 @@ def test_a_table_of_ways_stays_true_while_the_map_grows_to_all_sides():
     assert first[0, 1] > 12.0
     grown = np.pad(allowed, ((3, 5), (7, 2)))
     nothing = np.zeros_like(grown)
-    moved = frame.shifted(-3, -7)
-    fresh = WayTable(0.2, 1e9, 2).update(grown, nothing, moved, places, 0)
+    moved = frame.with_origin_at(-3, -7)
+    fresh = PathLengthTable(0.2, 1e9, 2).update(grown, nothing, moved, places, 0)
     assert np.allclose(table.update(grown, nothing, moved, places, 5), first)
     assert np.abs(fresh - first).max() < 0.7
 
 
 def test_a_way_is_found_anew_once_it_is_old():
-    table = WayTable(0.2, 10.0, 2)
+    table = PathLengthTable(0.2, 10.0, 2)
     allowed = np.ones((60, 60), dtype=np.bool_)
     frame = GridFrame(0.0, 0.0, 0.1)
     allowed[28:33, 4:] = False
@@ -113,10 +121,12 @@ def test_a_way_through_the_unknown_is_longer_than_it_is():
     places = np.array([[1.0, 3.0], [5.0, 3.0]])
     frame = GridFrame(0.0, 0.0, 0.1)
     assert (
-        WayTable(0.2, 10.0, 2).update(allowed, np.zeros_like(allowed), frame, places, 0)[0, 1]
+        PathLengthTable(0.2, 10.0, 2).update(allowed, np.zeros_like(allowed), frame, places, 0)[
+            0, 1
+        ]
         == math.inf
     )
-    assert WayTable(0.2, 10.0, 2).update(allowed, ~allowed, frame, places, 0)[
+    assert PathLengthTable(0.2, 10.0, 2).update(allowed, ~allowed, frame, places, 0)[
         0, 1
     ] == pytest.approx(4.4)
 
@@ -124,7 +134,7 @@ def test_a_way_through_the_unknown_is_longer_than_it_is():
 def test_the_field_of_ways_holds_the_way_to_each_cell():
     allowed = np.random.default_rng(9).random((30, 30)) < 0.8
     everywhere = np.argwhere(np.ones_like(allowed))
-    field = field_from(allowed, (3, 3))
-    expected = ways_from(allowed, (3, 3), everywhere)
+    field = distance_field_from(allowed, (3, 3))
+    expected = path_lengths_from(allowed, (3, 3), everywhere)
     expected[3 * 30 + 3] = 0.0
     assert (field.ravel() == expected).all()

@@ -13,15 +13,15 @@ from thinmap_ros.core.exploration.stretches import without_scraps
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
-from thinmap_ros.core.planning.grid_search import coarse, fine
+from thinmap_ros.core.planning.grid_search import downsample_mask, upsample_mask
 from thinmap_ros.core.planning.navigator import _touches
 from thinmap_ros.core.planning.obstacle_points import _arc, _clear_steps, _points_around
 from thinmap_ros.core.planning.path_follower import _point_ahead, length_from, nearest_point
 from thinmap_ros.core.planning.traversability import (
-    are_near,
-    reached_from,
-    renew_standing,
-    standing_places,
+    near_true_cell,
+    reachable_cells,
+    traversable_cells,
+    update_traversable_cells,
 )
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, cost_of_cells
 from thinmap_ros.core.scan import Scan
@@ -133,7 +133,7 @@ def test_hair_by_hair_a_disc_that_is_too_near_comes_no_nearer():
 def test_standing_places_are_renewed_where_something_changed(seed):
     rng = np.random.default_rng(seed)
     free = rng.random((60, 70)) < 0.97
-    standing = standing_places(free, 0.25, 0.1)
+    standing = traversable_cells(free, 0.25, 0.1)
     for _ in range(10):
         top = int(rng.integers(0, 55))
         left = int(rng.integers(0, 65))
@@ -142,8 +142,8 @@ def test_standing_places_are_renewed_where_something_changed(seed):
         part = (top, left, bottom, right)
         where = (slice(part[0], part[2]), slice(part[1], part[3]))
         free[where] = rng.random(free[where].shape) < 0.97
-        renew_standing(standing, free, part, 0.25, 0.1)
-        assert (standing == standing_places(free, 0.25, 0.1)).all()
+        update_traversable_cells(standing, free, part, 0.25, 0.1)
+        assert (standing == traversable_cells(free, 0.25, 0.1)).all()
 
 
 @pytest.mark.parametrize('seed', SEEDS)
@@ -188,8 +188,8 @@ def test_what_is_joined(seed):
     room = ~mask
     parts, _ = ndimage.label(room)
     start = tuple(int(v) for v in np.argwhere(room)[0])
-    assert (reached_from(room, start) == (parts == parts[start])).all()
-    assert not reached_from(room, tuple(int(v) for v in cells[0])).any()
+    assert (reachable_cells(room, start) == (parts == parts[start])).all()
+    assert not reachable_cells(room, tuple(int(v) for v in cells[0])).any()
 
 
 @pytest.mark.parametrize('seed', SEEDS)
@@ -200,11 +200,11 @@ def test_squares_of_cells_and_back(seed):
     padded = np.pad(cells, [(0, -size % factor) for size in cells.shape])
     shape = (padded.shape[0] // factor, factor, padded.shape[1] // factor, factor)
     expected = padded.reshape(shape).any(axis=(1, 3))
-    assert (coarse(cells, factor) == expected).all()
+    assert (downsample_mask(cells, factor) == expected).all()
     chosen = rng.random(expected.shape) < 0.5
     rows, cols = cells.shape
     spread = np.repeat(np.repeat(chosen, factor, axis=0), factor, axis=1)[:rows, :cols]
-    assert (fine(chosen, factor, cells) == (cells & spread)).all()
+    assert (upsample_mask(chosen, factor, cells) == (cells & spread)).all()
 
 
 @pytest.mark.parametrize('seed', SEEDS)
@@ -215,7 +215,7 @@ def test_which_cells_are_near_a_true_one(seed):
     reach = rng.uniform(0.0, 6.0)
     places = np.argwhere(mask)
     expected = [(np.square(places - cell).sum(axis=1) <= reach * reach).any() for cell in cells]
-    assert (are_near(mask, cells, reach) == expected).all()
+    assert (near_true_cell(mask, cells, reach) == expected).all()
 
 
 @pytest.mark.parametrize('seed', SEEDS)

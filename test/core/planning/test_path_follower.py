@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.planning.path_follower import Follower, FollowerConfig
+from thinmap_ros.core.planning.path_follower import PathFollower, PathFollowerConfig
 
 DT = 0.1
 
 
 def drive(path, start, config=None, seconds=60.0):
     """Exact unicycle driven by the follower: poses and commands."""
-    follower = Follower(config or FollowerConfig())
+    follower = PathFollower(config or PathFollowerConfig())
     pose = np.array(start, dtype=np.float64)
     poses = []
     commands = []
@@ -48,7 +48,7 @@ def test_it_arrives_and_stays_near_the_path_round_sharp_corners():
 
 @pytest.mark.parametrize('speed', [0.2, 0.5])
 def test_commands_keep_all_limits(speed):
-    config = FollowerConfig(max_speed_m_s=speed)
+    config = PathFollowerConfig(max_speed_m_s=speed)
     _, commands = drive(CORNERS, (0.0, 0.0, 2.5), config)
     v, w = commands.T
     assert (v >= 0.0).all()
@@ -68,16 +68,16 @@ def test_it_turns_on_the_spot_towards_a_path_that_begins_behind():
 
 def test_it_slows_down_to_stop_at_the_end():
     poses, commands = drive(
-        dense([(0.0, 0.0), (3.0, 0.0)]), (0.0, 0.0, 0.0), FollowerConfig(max_speed_m_s=0.5)
+        dense([(0.0, 0.0), (3.0, 0.0)]), (0.0, 0.0, 0.0), PathFollowerConfig(max_speed_m_s=0.5)
     )
     assert commands[:, 0].max() == pytest.approx(0.5)
     # The speed that can be braked to rest on the last 0.1 m.
-    assert commands[-1, 0] < math.sqrt(2.0 * FollowerConfig().max_acceleration_m_s2 * 0.1)
+    assert commands[-1, 0] < math.sqrt(2.0 * PathFollowerConfig().max_acceleration_m_s2 * 0.1)
     assert poses[-1][0] <= 3.03
 
 
 def test_turning_to_a_heading_ends_there():
-    follower = Follower(FollowerConfig())
+    follower = PathFollower(PathFollowerConfig())
     heading = 0.0
     for _ in range(100):
         v, w = follower.turn_to(np.array([0.0, 0.0, heading]), 2.0, DT)
@@ -87,14 +87,14 @@ def test_turning_to_a_heading_ends_there():
 
 
 def test_a_path_of_one_point():
-    v, w = Follower(FollowerConfig()).command(np.zeros(3), np.array([[0.0, 0.0]]), DT)
+    v, w = PathFollower(PathFollowerConfig()).command(np.zeros(3), np.array([[0.0, 0.0]]), DT)
     assert (v, w) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize('how', ['stop', 'turn'])
 def test_it_comes_to_rest_on_the_arc_that_it_drives_before_it_turns(how):
-    follower = Follower(FollowerConfig(max_speed_m_s=0.5))
-    follower.slowed(0.5, 0.6)
+    follower = PathFollower(PathFollowerConfig(max_speed_m_s=0.5))
+    follower.override_speed(0.5, 0.6)
     turned = False
     for _ in range(40):
         before = follower.v

@@ -10,7 +10,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
-from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import Simulation
 from thinmap_ros.sim.world import World
@@ -42,7 +42,7 @@ def rove(seed, speed, knows_pillars, seconds=40.0):
     """
     rng = np.random.default_rng(seed)
     world = pillars(rng)
-    robot = Simulation(world, start_in(world, rng), PRESETS['2dx'], Lms200Config(), seed)
+    robot = Simulation(world, start_in(world, rng), PRESETS['2dx'], LaserScannerConfig(), seed)
     known = (
         world.occupied
         if knows_pillars
@@ -50,7 +50,7 @@ def rove(seed, speed, knows_pillars, seconds=40.0):
     )
     patch = GridPatch(FRAME, np.where(known, 100, 0).astype(np.int8))
     navigator = Navigator(NavigatorConfig(max_speed_m_s=speed))
-    moment = robot.sense()
+    moment = robot.read_sensors()
     scan = None
     until = 0.0
     way_m = 0.0

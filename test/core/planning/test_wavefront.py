@@ -12,9 +12,9 @@ from thinmap_ros.core.planning.traversability import nearest_true
 from thinmap_ros.core.planning.wavefront import (
     WavefrontConfig,
     cost_of_cells,
-    descend,
     navigation_function,
     plan,
+    trace_gradient_path,
 )
 
 PLAIN = WavefrontConfig(robot_radius_m=0.25, keep_weight=0.0)
@@ -90,7 +90,7 @@ def test_a_path_goes_down_over_open_cells_to_the_goal_and_never_jumps(rows, cols
     field = navigation_function(cost, goal)
     if np.isinf(field[start]):
         return
-    path = descend(field, start[1] + 0.5, start[0] + 0.5, *goal)
+    path = trace_gradient_path(field, start[1] + 0.5, start[0] + 0.5, *goal)
     cells = np.floor(path[:, ::-1]).astype(int)
     heights = field[cells[:, 0], cells[:, 1]]
     assert np.isfinite(heights).all()

@@ -24,7 +24,7 @@ from thinmap_ros.core.ekf_slam.line_extraction import LineConfig, extract_lines
 from thinmap_ros.core.ekf_slam.models import OdometryConfig, odometry_slip, odometry_variances
 from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.odometry import Increment, LastPose, OdometryIncrements
+from thinmap_ros.core.odometry import OdometryAnchor, OdometryIncrement, OdometryIncrements
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
@@ -49,10 +49,16 @@ class EkfConfig(OdometryConfig, LineConfig, FeatureConfig):
         choices=('scan_matching', 'ekf_ti', 'ekf_full'),
     )
     start_x_m: float = parameter(
-        0.0, 'where the robot starts in the map, m', low=-se2.FARTHEST_M, high=se2.FARTHEST_M
+        0.0,
+        'where the robot starts in the map, m',
+        low=-se2.MAX_COORDINATE_M,
+        high=se2.MAX_COORDINATE_M,
     )
     start_y_m: float = parameter(
-        0.0, 'where the robot starts in the map, m', low=-se2.FARTHEST_M, high=se2.FARTHEST_M
+        0.0,
+        'where the robot starts in the map, m',
+        low=-se2.MAX_COORDINATE_M,
+        high=se2.MAX_COORDINATE_M,
     )
     start_yaw_rad: float = parameter(0.0, 'heading at the start, rad')
     mapping: bool = parameter(
@@ -86,7 +92,7 @@ class EkfLocalizer:
     @property
     def refused(self) -> int:
         """Scans, odometry poses and poses from outside that made no sense."""
-        return self._refused + self._odometry.refused
+        return self._refused + self._odometry.rejected
 
     @property
     def pose(self) -> Array:
@@ -104,7 +110,7 @@ class EkfLocalizer:
 
     def set_pose(self, T_map_base: Array, covariance: Array) -> None:
         """Put the robot at a pose (3,) with covariance (3, 3) in the map that it has."""
-        if not (se2.is_on_earth(T_map_base) and np.isfinite(covariance).all()):
+        if not (se2.is_bounded_pose(T_map_base) and np.isfinite(covariance).all()):
             self._refused += 1
             return
         self._filter.local.set_pose(T_map_base, covariance + _START)
@@ -126,14 +132,14 @@ class EkfLocalizer:
         own = {name: array for name, array in state.items() if name in feature_map.FIELDS}
         localizer = EkfLocalizer(config)
         localizer._features.restore(
-            localizer._filter, snapshot.check(own, feature_map.FIELDS, 'features')
+            localizer._filter, snapshot.validate(own, feature_map.FIELDS, 'features')
         )
         localizer.set_pose(localizer.pose, _IN_SESSION)
         return localizer
 
     @staticmethod
     def resumed(
-        patch: GridPatch, last: LastPose, T_odom_base: Array, config: EkfConfig | None = None
+        patch: GridPatch, last: OdometryAnchor, T_odom_base: Array, config: EkfConfig | None = None
     ) -> 'EkfLocalizer':
         """EkfLocalizer that goes on at T_odom_base (3,) after its last pose, with new features.
 
@@ -148,7 +154,7 @@ class EkfLocalizer:
 
     def step(self, scan: Scan, T_odom_base: Array) -> Estimate:
         """Take in a scan with the odometry pose (3,) at its stamp."""
-        self._predict(self._odometry.next(scan.stamp_ns, T_odom_base))
+        self._predict(self._odometry.add(scan.stamp_ns, T_odom_base))
         observed = 0
         matched = 0
         if not se2.is_finite(scan.T_base_laser):
@@ -185,14 +191,16 @@ class EkfLocalizer:
         """Covariance (3, 3) of a motion (3,) by odometry, robot frame before it."""
         return np.diag(_REPEATED**2 * odometry_variances(moved, self.config))
 
-    def _predict(self, increment: Increment) -> None:
+    def _predict(self, increment: OdometryIncrement) -> None:
         """Eqs. (10) and (11), once the robot has moved by more than odometry slips.
 
         So a robot that stands grows no surer and no less sure, however many scans it takes.
         """
         ekf = self._filter.local
-        if increment.bound_m > 0.0:
-            unknown = np.diag(np.square([increment.bound_m, increment.bound_m, 1.0]))
+        if increment.discontinuity_m > 0.0:
+            unknown = np.diag(
+                np.square([increment.discontinuity_m, increment.discontinuity_m, 1.0])
+            )
             ekf.predict(ekf.pose, np.zeros(3), unknown)
             self._is_observation_due = True
             return

@@ -34,22 +34,36 @@ from thinmap_ros.core.ekf_slam.local_area import LocalArea
 from thinmap_ros.core.ekf_slam.visibility import seen_through
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, transform_points
-from thinmap_ros.core.snapshot import FAR_M, LARGEST_COUNT, LARGEST_ID, Field
+from thinmap_ros.core.snapshot import MAX_COORDINATE_M, MAX_COUNT, MAX_ID, Field
 
 _SPARE = 8  # features that the local area may hold beyond those it should
 _ROUNDING = 1e-6  # of the largest variance, by which a covariance may fail to be one
 FIELDS = {
-    'ids': Field(np.int64, ('n',), 1, LARGEST_ID),
-    'lines': Field(np.float64, ('n', 2), (-FAR_M, -4.0 * np.pi), (FAR_M, 4.0 * np.pi)),
-    'line_covariance': Field(np.float64, ('2n', '2n'), -FAR_M, FAR_M),
+    'ids': Field(np.int64, ('n',), 1, MAX_ID),
+    'lines': Field(
+        np.float64, ('n', 2), (-MAX_COORDINATE_M, -4.0 * np.pi), (MAX_COORDINATE_M, 4.0 * np.pi)
+    ),
+    'line_covariance': Field(np.float64, ('2n', '2n'), -MAX_COORDINATE_M, MAX_COORDINATE_M),
     # low and high end along the line, x and y of where it was first seen from, missed
     'spans': Field(
         np.float64,
         ('n', 5),
-        (-2.0 * FAR_M, -2.0 * FAR_M, -FAR_M, -FAR_M, 0.0),
-        (2.0 * FAR_M, 2.0 * FAR_M, FAR_M, FAR_M, float(LARGEST_COUNT)),
+        (
+            -2.0 * MAX_COORDINATE_M,
+            -2.0 * MAX_COORDINATE_M,
+            -MAX_COORDINATE_M,
+            -MAX_COORDINATE_M,
+            0.0,
+        ),
+        (
+            2.0 * MAX_COORDINATE_M,
+            2.0 * MAX_COORDINATE_M,
+            MAX_COORDINATE_M,
+            MAX_COORDINATE_M,
+            float(MAX_COUNT),
+        ),
     ),
-    'next_id': Field(np.int64, (), 1, LARGEST_ID),
+    'next_id': Field(np.int64, (), 1, MAX_ID),
     **local_area.FIELDS,
 }
 

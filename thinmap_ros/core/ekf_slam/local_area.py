@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.se2 import Array, wrap
-from thinmap_ros.core.snapshot import FAR_M, LARGEST_ID, Field
+from thinmap_ros.core.snapshot import MAX_COORDINATE_M, MAX_ID, Field
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 
 _LISTED_M = 12.0  # nodes are noted up to here, unless none is near
@@ -23,9 +23,9 @@ _REACH_M = 8.0  # nodes along edges matter up to here, and the first one of ever
 _BESIDE_M = 2.0  # what lies this near is not behind the robot
 _TURN_M_RAD = 0.5  # way that the robot could have gone while it turns by a radian
 FIELDS = {
-    'stored_at': Field(np.int64, ('s', 2), 1, LARGEST_ID),
-    'node_ids': Field(np.int64, ('a',), 1, LARGEST_ID),
-    'node_places': Field(np.float64, ('a', 2), -FAR_M, FAR_M),
+    'stored_at': Field(np.int64, ('s', 2), 1, MAX_ID),
+    'node_ids': Field(np.int64, ('a',), 1, MAX_ID),
+    'node_places': Field(np.float64, ('a', 2), -MAX_COORDINATE_M, MAX_COORDINATE_M),
 }
 _TRAIL_M = 3.0  # where no topology is known, the robot's own way is one, with nodes this far apart
 

@@ -26,16 +26,20 @@ from thinmap_ros.core.exploration.frontiers import NOTHING, OpenBorders
 from thinmap_ros.core.exploration.strategy import FIRST_STAND_IN_ID, EndNode
 from thinmap_ros.core.exploration.stretches import middle_one, without_scraps
 from thinmap_ros.core.exploration.viewpoints import SQUARE
-from thinmap_ros.core.planning.grid_search import coarse, field_from, fine
-from thinmap_ros.core.planning.recent_path import Trail
+from thinmap_ros.core.planning.grid_search import (
+    distance_field_from,
+    downsample_mask,
+    upsample_mask,
+)
+from thinmap_ros.core.planning.recent_path import RecentPath
 from thinmap_ros.core.planning.traversability import (
-    are_near,
-    let_out,
-    renew_standing,
-    standing_places,
+    escape_cells,
+    near_true_cell,
+    traversable_cells,
+    update_traversable_cells,
 )
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.snapshot import FAR_M, LARGEST_ID, Field, Fields
+from thinmap_ros.core.snapshot import MAX_COORDINATE_M, MAX_ID, Field, Fields
 
 Cells = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -52,9 +56,14 @@ _PARTS: dict[str, Fields] = {
 }
 FIELDS = {
     # id, x, y of end nodes that were visited without success
-    'visited': Field(np.float64, ('v', 3), (1, -FAR_M, -FAR_M), (LARGEST_ID, FAR_M, FAR_M)),
-    'look_closer': Field(np.float64, ('c', 2), -FAR_M, FAR_M),
-    'next_stand_in': Field(np.int64, (), FIRST_STAND_IN_ID, LARGEST_ID),
+    'visited': Field(
+        np.float64,
+        ('v', 3),
+        (1, -MAX_COORDINATE_M, -MAX_COORDINATE_M),
+        (MAX_ID, MAX_COORDINATE_M, MAX_COORDINATE_M),
+    ),
+    'look_closer': Field(np.float64, ('c', 2), -MAX_COORDINATE_M, MAX_COORDINATE_M),
+    'next_stand_in': Field(np.int64, (), FIRST_STAND_IN_ID, MAX_ID),
 }
 
 
@@ -117,7 +126,7 @@ class Surveyor:
         self.borders = OpenBorders(config.shortest_border_m)
         self.tracker = EndNodeTracker(config)
         self.stand_ins = EndNodeTracker(config)
-        self.trail = Trail()
+        self.trail = RecentPath()
         self.frame = self.borders.frame
         self.reached = self.maybe = self._standing = self.borders.mask
         self.ways: Array = np.zeros((0, 0))
@@ -148,7 +157,7 @@ class Surveyor:
         parts = {name: _part(state, name, fields) for name, fields in _PARTS.items()}
         prefixes = tuple(f'{name}_' for name in _PARTS)
         rest = {key: array for key, array in state.items() if not key.startswith(prefixes)}
-        own = snapshot.check(rest, FIELDS, 'exploration')
+        own = snapshot.validate(rest, FIELDS, 'exploration')
         ids = own['visited'][:, 0]
         snapshot.require(bool((ids == np.floor(ids)).all()), 'exploration: visited', 'whole ids')
         next_id = int(own['next_stand_in'])
@@ -256,10 +265,12 @@ class Surveyor:
         standing = self._standing
         xy = (float(T_map_base[0]), float(T_map_base[1]))
         trail = self.trail.cells(self.frame, free.shape)
-        ways = let_out(standing, free, self.frame, xy, _ESCAPE_M, trail)
+        ways = escape_cells(standing, free, self.frame, xy, _ESCAPE_M, trail)
         row, col = (int(v) for v in self.frame.cells_of(T_map_base[None, :2])[0])
-        self.ways = field_from(coarse(ways, SQUARE), (row // SQUARE, col // SQUARE))
-        self.reached = fine(np.isfinite(self.ways), SQUARE, standing)
+        self.ways = distance_field_from(
+            downsample_mask(ways, SQUARE), (row // SQUARE, col // SQUARE)
+        )
+        self.reached = upsample_mask(np.isfinite(self.ways), SQUARE, standing)
 
     def _renew_standing(self) -> None:
         """Where the robot can stand, and where it could.
@@ -273,11 +284,11 @@ class Surveyor:
         borders.changed = NOTHING
         self.frame = borders.frame
         if part is None:
-            self._standing = standing_places(borders.free, radius, resolution)
-            self.maybe = standing_places(borders.passable, radius, resolution)
+            self._standing = traversable_cells(borders.free, radius, resolution)
+            self.maybe = traversable_cells(borders.passable, radius, resolution)
         elif part != NOTHING:
-            renew_standing(self._standing, borders.free, part, radius, resolution)
-            renew_standing(self.maybe, borders.passable, part, radius, resolution)
+            update_traversable_cells(self._standing, borders.free, part, radius, resolution)
+            update_traversable_cells(self.maybe, borders.passable, part, radius, resolution)
 
     def _owners(self, cells: Cells) -> Cells:
         """Id of the end node to which each border cell belongs, or -1.
@@ -291,7 +302,7 @@ class Surveyor:
         if ids.size == 0 or len(cells) == 0:
             return np.full(len(cells), -1, dtype=np.int64)
         nodes = self.frame.cells_of(np.array([_place(self.tracker.tracks[int(i)]) for i in ids]))
-        within = are_near(self.reached, nodes, _NEAR_VISIT_M / self.frame.resolution)
+        within = near_true_cell(self.reached, nodes, _NEAR_VISIT_M / self.frame.resolution)
         ids = ids[within]
         nodes = nodes[within]
         index = self.borders.owners(cells, nodes, self.config.attach_m)
@@ -424,7 +435,7 @@ def _part(state: Mapping[str, NDArray[Any]], name: str, fields: Fields) -> dict[
         for key, array in state.items()
         if key.startswith(f'{name}_')
     }
-    return snapshot.check(own, fields, f'exploration: {name}')
+    return snapshot.validate(own, fields, f'exploration: {name}')
 
 
 def _place(track: Track) -> Place:

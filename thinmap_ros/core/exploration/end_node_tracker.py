@@ -44,25 +44,45 @@ from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.snapshot import FAR_M, LARGEST_COUNT, LARGEST_ID, Field
+from thinmap_ros.core.snapshot import MAX_COORDINATE_M, MAX_COUNT, MAX_ID, Field
 
 Cells = NDArray[np.int64]
 PRIOR = 0.5
 _NEUTRAL = 0.5
 _SEEN = slice(5, 7)  # of a row of 'tracks': from where the node was last seen, NaN if it was not
 FIELDS = {
-    'ids': Field(np.int64, ('n',), 1, LARGEST_ID),
+    'ids': Field(np.int64, ('n',), 1, MAX_ID),
     # x, y, x and y where the evidence began, probability, x and y of where it was seen from, closed
     'tracks': Field(
         np.float64,
         ('n', 8),
-        (-FAR_M, -FAR_M, -FAR_M, -FAR_M, 0.0, -FAR_M, -FAR_M, 0.0),
-        (FAR_M, FAR_M, FAR_M, FAR_M, 1.0, FAR_M, FAR_M, 1.0),
+        (
+            -MAX_COORDINATE_M,
+            -MAX_COORDINATE_M,
+            -MAX_COORDINATE_M,
+            -MAX_COORDINATE_M,
+            0.0,
+            -MAX_COORDINATE_M,
+            -MAX_COORDINATE_M,
+            0.0,
+        ),
+        (
+            MAX_COORDINATE_M,
+            MAX_COORDINATE_M,
+            MAX_COORDINATE_M,
+            MAX_COORDINATE_M,
+            1.0,
+            MAX_COORDINATE_M,
+            MAX_COORDINATE_M,
+            1.0,
+        ),
         nan=True,
     ),
-    'look_counts': Field(np.int64, ('n',), 0, LARGEST_COUNT),
+    'look_counts': Field(np.int64, ('n',), 0, MAX_COUNT),
     # distance and bearing of each look, node after node
-    'looks': Field(np.float64, ('k', 2), (0.0, -2.0 * math.pi), (2.0 * FAR_M, 2.0 * math.pi)),
+    'looks': Field(
+        np.float64, ('k', 2), (0.0, -2.0 * math.pi), (2.0 * MAX_COORDINATE_M, 2.0 * math.pi)
+    ),
 }
 
 

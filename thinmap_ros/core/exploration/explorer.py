@@ -35,8 +35,8 @@ from thinmap_ros.core.exploration.field_of_view import box_of_scan, directions_o
 from thinmap_ros.core.exploration.strategy import Decision, verdict
 from thinmap_ros.core.exploration.tour import tours_by_first
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.graph_search import costs_to
-from thinmap_ros.core.planning.grid_search import WayTable
+from thinmap_ros.core.planning.graph_search import path_lengths_to_goals
+from thinmap_ros.core.planning.grid_search import PathLengthTable
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.snapshot import Field
@@ -129,7 +129,7 @@ class Explorer:
         self.config = config or ExplorerConfig()
         self.surveyor = Surveyor(self.config)
         self._failures = Failures(self.config.retry_s)
-        self._ways = WayTable(_COARSE_M, _FORGET_S, _UNKNOWN_WEIGHT)
+        self._ways = PathLengthTable(_COARSE_M, _FORGET_S, _UNKNOWN_WEIGHT)
         self._memory = _Memory()
         self._stamp_ns = 0
         self._began_ns = 2**63
@@ -156,7 +156,7 @@ class Explorer:
         """
         explorer = Explorer(config)
         own = {key: array for key, array in state.items() if key in FIELDS}
-        checked = snapshot.check(own, FIELDS, 'exploration')
+        checked = snapshot.validate(own, FIELDS, 'exploration')
         explorer.surveyor.restore({key: state[key] for key in state if key not in FIELDS})
         explorer._memory.first_choice_made = bool(checked['first_choice_made'])
         return explorer
@@ -173,7 +173,7 @@ class Explorer:
         self._began_ns = min(self._began_ns, self._stamp_ns)
         surveyor = self.surveyor
         borders = self.surveyor.borders
-        surveyor.trail.add(T_map_base)
+        surveyor.trail.add_pose(T_map_base)
         xy = (float(T_map_base[0]), float(T_map_base[1]))
         borders.update(patch, box_of_scan(scan, T_map_base))
         borders.examine(xy, self.config.close_look_m, directions_of_view(scan, T_map_base))
@@ -188,7 +188,7 @@ class Explorer:
         target = self._choose(topology, worth, T_map_base)
         return self._decision(target, worth, candidates)
 
-    def fail_target(self, reason: str) -> None:
+    def target_failed(self, reason: str) -> None:
         """Hear that the present target could not be reached; it is put aside for a while."""
         target = self._memory.target
         track = None if target is None else self.surveyor.track(target)
@@ -320,7 +320,7 @@ class Explorer:
         }
         if self.config.mode == 'open_border':
             return self._tours(worth, turn_cost, T_map_base)
-        ways = costs_to(topology, T_map_base, {i: c.goal for i, c in worth.items()})
+        ways = path_lengths_to_goals(topology, T_map_base, {i: c.goal for i, c in worth.items()})
         straight = {i: math.dist(c.goal[:2], T_map_base[:2]) for i, c in worth.items()}
         return {i: turn_cost[i] + ways.get(i, _DETOUR * straight[i]) for i in worth}
 

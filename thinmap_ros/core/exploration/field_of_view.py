@@ -35,7 +35,7 @@ def box_of_scan(scan: Scan, T_map_base: Array) -> Array:
     """Lower left and upper right corner (2, 2), m, of what a scan at (3,) can have changed."""
     T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
     # Some drivers say that their laser's range has no end.
-    limits = (scan.range_min_m, min(scan.range_max_m, se2.FARTHEST_M))
+    limits = (scan.range_min_m, min(scan.range_max_m, se2.MAX_COORDINATE_M))
     return np.asarray(
         _box(scan.ranges_m, limits, scan.angle_min_rad, scan.angle_increment_rad, T_map_laser)
     )

@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.exploration.viewpoints import place_at, place_for, shows_enough
-from thinmap_ros.core.grid.frame import COARSEST_M, FINEST_M, GridFrame
+from thinmap_ros.core.grid.frame import MAX_RESOLUTION_M, MIN_RESOLUTION_M, GridFrame
 from thinmap_ros.core.grid.patch import FREE_AT_MOST, OCCUPIED_AT_LEAST, GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.planning.traversability import Part
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.core.snapshot import FAR_M, Field
+from thinmap_ros.core.snapshot import MAX_COORDINATE_M, Field
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.free_space import known_free, true_cells
 
@@ -37,7 +37,12 @@ _MARGIN = 3
 NOTHING = (0, 0, 0, 0)
 _MOST_CELLS = 1 << 28  # of a map with the room to grow
 FIELDS = {
-    'frame': Field(np.float64, (3,), (-FAR_M, -FAR_M, FINEST_M), (FAR_M, FAR_M, COARSEST_M)),
+    'frame': Field(
+        np.float64,
+        (3,),
+        (-MAX_COORDINATE_M, -MAX_COORDINATE_M, MIN_RESOLUTION_M),
+        (MAX_COORDINATE_M, MAX_COORDINATE_M, MAX_RESOLUTION_M),
+    ),
     'looks': Field(np.uint8, ('rows', 'cols'), 0, _LOOKS),
 }
 
@@ -260,7 +265,7 @@ class OpenBorders:
             self.passable = np.pad(self.passable, more, constant_values=True)
             self.mask = np.pad(self.mask, more)
             self._looks = np.pad(self._looks, more)
-            self.frame = self.frame.shifted(-more[0][0], -more[1][0])
+            self.frame = self.frame.with_origin_at(-more[0][0], -more[1][0])
             self.changed = None
             row = row + more[0][0]
             col = col + more[1][0]

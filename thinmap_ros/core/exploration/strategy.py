@@ -68,7 +68,7 @@ class Strategy(Protocol):
     ) -> Decision:
         """Say where to go, from the graph, the whole map and a scan made at a pose (3,)."""
 
-    def fail_target(self, reason: str) -> None:
+    def target_failed(self, reason: str) -> None:
         """Hear that the present target could not be reached."""
 
 

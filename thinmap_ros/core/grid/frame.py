@@ -1,4 +1,4 @@
-"""Where the cells of a grid lie in the world."""
+"""Transform between world points and the cells of a grid."""
 
 from dataclasses import dataclass
 
@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.se2 import FARTHEST_M, Array
+from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array
 
-FINEST_M = 0.001
-COARSEST_M = 10.0
+MIN_RESOLUTION_M = 0.001
+MAX_RESOLUTION_M = 10.0
 
 
 @dataclass(frozen=True)
@@ -17,8 +17,8 @@ class GridFrame:
     """A lattice of square cells: world point <-> cell (row, col).
 
     origin_x, origin_y: lower left corner of cell (0, 0), m; resolution: edge of a cell, m. Row 0
-    has the lowest y, as in nav_msgs/OccupancyGrid. Raises InputError where it is no place on earth
-    (FARTHEST_M), or cells are finer than FINEST_M or coarser than COARSEST_M.
+    has the lowest y, as in nav_msgs/OccupancyGrid. Raises InputError if the origin is beyond
+    MAX_COORDINATE_M, or the resolution is not between MIN_RESOLUTION_M and MAX_RESOLUTION_M.
     """
 
     origin_x: float
@@ -26,14 +26,15 @@ class GridFrame:
     resolution: float
 
     def __post_init__(self) -> None:
-        if not (abs(self.origin_x) <= FARTHEST_M and abs(self.origin_y) <= FARTHEST_M):
+        if not (abs(self.origin_x) <= MAX_COORDINATE_M and abs(self.origin_y) <= MAX_COORDINATE_M):
             raise InputError(
                 f'map with its origin at {self.origin_x:g}, {self.origin_y:g} m: expected numbers '
-                f'from {-FARTHEST_M:g} to {FARTHEST_M:g}'
+                f'from {-MAX_COORDINATE_M:g} to {MAX_COORDINATE_M:g}'
             )
-        if not FINEST_M <= self.resolution <= COARSEST_M:
+        if not MIN_RESOLUTION_M <= self.resolution <= MAX_RESOLUTION_M:
             raise InputError(
-                f'map of cells of {self.resolution:g} m: expected {FINEST_M:g} to {COARSEST_M:g} m'
+                f'map of cells of {self.resolution:g} m: expected {MIN_RESOLUTION_M:g} to '
+                f'{MAX_RESOLUTION_M:g} m'
             )
 
     def cells_of(self, points: Array) -> NDArray[np.int64]:
@@ -48,7 +49,7 @@ class GridFrame:
         centres[:, 1] = (cells[:, 0] + 0.5) * self.resolution + self.origin_y
         return centres
 
-    def shifted(self, rows: int, cols: int) -> 'GridFrame':
+    def with_origin_at(self, rows: int, cols: int) -> 'GridFrame':
         """The same lattice with cell (rows, cols) as its new cell (0, 0)."""
         x = self.origin_x + cols * self.resolution
         y = self.origin_y + rows * self.resolution

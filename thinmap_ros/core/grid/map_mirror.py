@@ -1,13 +1,10 @@
-"""A map put together from published patches.
-
-It is what a node knows of a grid that another node keeps.
-"""
+"""Local copy of the grid of another node, assembled from published patches."""
 
 import numpy as np
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
-from thinmap_ros.core.grid.tiles import MOST_CELLS
+from thinmap_ros.core.grid.tiles import MAX_CELLS
 
 
 class MapMirror:
@@ -20,15 +17,13 @@ class MapMirror:
         self.patch: GridPatch | None = None
 
     def replace(self, whole: GridPatch) -> None:
-        """Take a whole map; whatever was held before is forgotten."""
+        """Replace the copy by a whole map."""
         self.patch = whole
 
     def paste(self, window: GridPatch) -> GridPatch:
-        """Lay a window over what is held, growing it where the window stands out.
+        """Paste a window into the copy, enlarging it if necessary; returns the result.
 
-        Returns the result.
-        Raises InputError where the window's cells do not lie on the lattice of the map, or far from
-        it.
+        Raises InputError if the window is not aligned with the cells of the map, or far from it.
         """
         if self.patch is None:
             self.patch = window
@@ -45,10 +40,10 @@ class MapMirror:
             )
         rows_in_all = max(row + rows, self.patch.shape[0]) - min(row, 0)
         cols_in_all = max(col + cols, self.patch.shape[1]) - min(col, 0)
-        if rows_in_all * cols_in_all > MOST_CELLS:
+        if rows_in_all * cols_in_all > MAX_CELLS:
             raise InputError(
                 f'map window at {window.frame}: a map of {rows_in_all} x {cols_in_all} cells: '
-                f'expected {MOST_CELLS} at most'
+                f'expected {MAX_CELLS} at most'
             )
         before = (max(-row, 0), max(-col, 0))
         after = (max(row + rows - self.patch.shape[0], 0), max(col + cols - self.patch.shape[1], 0))
@@ -60,7 +55,7 @@ class MapMirror:
         row = row + before[0]
         col = col + before[1]
         cells[row : row + rows, col : col + cols] = window.cells
-        self.patch = GridPatch(self.patch.frame.shifted(-before[0], -before[1]), cells)
+        self.patch = GridPatch(self.patch.frame.with_origin_at(-before[0], -before[1]), cells)
         return self.patch
 
 

@@ -1,7 +1,4 @@
-"""The whole of a grid as people and planners see it, in percent.
-
-It is worked out anew only where the grid has changed.
-"""
+"""Occupancy of a whole grid in percent, updated only where the grid has changed."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,29 +10,23 @@ from thinmap_ros.core.grid.tiles import TileStore
 Bounds = tuple[int, int, int, int]
 
 
-class Picture:
-    """Cells (H, W) int8 of all tiles.
-
-    Also which part is out of date, and which rectangle holds all that is known.
-    """
+class RenderedMap:
+    """Cells (H, W) int8 of all tiles, with the outdated part and the bounds of the known cells."""
 
     def __init__(self, percent: NDArray[np.int8]) -> None:
-        """Begin with nothing; percent (2 L + 1,): what to show for log odds from -L to L."""
+        """Start empty; percent (2 L + 1,): occupancy in percent for log odds from -L to L."""
         self._percent = percent
         self._cells: NDArray[np.int8] = np.empty((0, 0), dtype=np.int8)
         self._bounds: Bounds = (0, 0, 0, 0)
         self._known: Bounds | None = None
         self._stale: Bounds | None = None
 
-    def touch(self, row: int, col: int, end_row: int, end_col: int) -> None:
-        """Note that cells [row, end_row) x [col, end_col) may have changed."""
+    def mark_dirty(self, row: int, col: int, end_row: int, end_col: int) -> None:
+        """Mark cells [row, end_row) x [col, end_col) as outdated."""
         self._stale = _union(self._stale, (row, col, end_row, end_col))
 
-    def draw(self, tiles: TileStore, frame: GridFrame) -> GridPatch:
-        """The smallest rectangle that holds all that is known, as a copy.
-
-        One unknown cell where nothing is.
-        """
+    def render(self, tiles: TileStore, frame: GridFrame) -> GridPatch:
+        """Copy of the bounding rectangle of the known cells; one unknown cell if there are none."""
         self._fit(tiles)
         if self._stale is not None:
             self._refresh(tiles, *_common(self._stale, self._bounds))
@@ -45,10 +36,10 @@ class Picture:
         row, col, end_row, end_col = self._known
         top, left = self._bounds[:2]
         shown = self._cells[row - top : end_row - top, col - left : end_col - left]
-        return GridPatch(frame.shifted(row, col), shown.copy())
+        return GridPatch(frame.with_origin_at(row, col), shown.copy())
 
     def _fit(self, tiles: TileStore) -> None:
-        """Lay the cells anew when tiles have come outside of them."""
+        """Enlarge the cells if tiles have been added outside of them."""
         bounds = tiles.bounds()
         if bounds is None or bounds == self._bounds:
             return
@@ -71,7 +62,7 @@ class Picture:
         rows = np.flatnonzero(known.any(axis=1))
         cols = np.flatnonzero(known.any(axis=0))
         if rows.size:
-            # What is known once stays so: the rectangle only grows.
+            # Known cells stay known: the rectangle only grows.
             found = (
                 row + int(rows[0]),
                 col + int(cols[0]),

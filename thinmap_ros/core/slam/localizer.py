@@ -20,7 +20,7 @@ from thinmap_ros.core.ekf_slam.ekf_localizer import EkfConfig
 from thinmap_ros.core.ekf_slam.models import odometry_slip, odometry_variances
 from thinmap_ros.core.estimate import Correction, Estimate
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.odometry import LastPose
+from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.active_map import ActiveMap
@@ -104,7 +104,7 @@ class ScanLocalizer:
 
         The next scans settle it; nothing is learned before.
         """
-        if not (se2.is_on_earth(T_map_base) and np.isfinite(covariance).all()):
+        if not (se2.is_bounded_pose(T_map_base) and np.isfinite(covariance).all()):
             self._refused += 1
             return
         self._pose = se2.pose(*T_map_base.tolist())
@@ -125,7 +125,7 @@ class ScanLocalizer:
 
         It is lost until scans fit there. Raises InputError where it is no such state.
         """
-        checked = snapshot.check(state, local_map.FIELDS, 'local map')
+        checked = snapshot.validate(state, local_map.FIELDS, 'local map')
         possible = bool((checked['hits'] <= checked['seen']).all())
         snapshot.require(
             possible, 'local map: hits: more than seen', 'no more hits than observations'
@@ -138,7 +138,7 @@ class ScanLocalizer:
     @staticmethod
     def resumed(
         patch: GridPatch,
-        last: LastPose,
+        last: OdometryAnchor,
         T_odom_base: Array,
         config: ScanLocalizerConfig | None = None,
     ) -> 'ScanLocalizer':
@@ -303,10 +303,10 @@ class ScanLocalizer:
         """A loop was closed: pose and local map go where the keyframes have gone."""
         anchor = self._loops.keyframes.anchor
         self._prediction.interrupt()
-        self._pose = correction.moved(anchor, self._pose)
+        self._pose = correction.applied_to(anchor, self._pose)
         self._map.T_learned = self._pose
         self._uncertainty.move(self._pose)
-        self._tracking.join(correction.moved(anchor, self._tracking.reckoned.T_map_base))
+        self._tracking.join(correction.applied_to(anchor, self._tracking.reckoned.T_map_base))
         self._map.rerender(self.keyframes, self._pose)
 
     def _note(self, scan: Scan) -> None:
@@ -331,7 +331,7 @@ class ScanLocalizer:
             self._pose,
             covariance,
             se2.compose(self._pose, se2.invert(self._prediction.T_odom_base)),
-            match_quality=0.0 if match is None else match.fit,
-            lost=self._tracking.is_lost,
+            inlier_ratio=0.0 if match is None else match.fit,
+            is_lost=self._tracking.is_lost,
             correction=correction,
         )

@@ -54,7 +54,7 @@ class OdometryPrediction:
     @property
     def refused(self) -> int:
         """Odometry poses that made no sense."""
-        return self._increments.refused
+        return self._increments.rejected
 
     @property
     def stamp_ns(self) -> int | None:
@@ -77,7 +77,7 @@ class OdometryPrediction:
 
     def contradict(self, prediction: Prediction, match: Match, accepted: bool) -> None:
         """A match was unexpected: the next motion may take the contradiction back."""
-        off = se2.off(match.T_map_base, prediction.T_map_base)
+        off = se2.pose_difference(match.T_map_base, prediction.T_map_base)
         mean = -0.5 * off if accepted else np.zeros(3)
         self._reversal = Reversal(mean, 0.25 * np.outer(off, off))
 
@@ -96,12 +96,12 @@ class OdometryPrediction:
 
     def _motion(self, scan: Scan, T_odom_base: Array) -> Motion:
         """The motion since the last scan, robot frame."""
-        increment = self._increments.next(scan.stamp_ns, T_odom_base)
+        increment = self._increments.add(scan.stamp_ns, T_odom_base)
         variances = odometry_variances(increment.T_before_base, self._config)[[0, 2]]
         moved, systematic = self._calibration.corrected(increment.T_before_base, variances)
         motion = self._model.expect(moved, systematic)
-        if increment.bound_m == 0.0:
+        if increment.discontinuity_m == 0.0:
             return motion
         self._calibration.interrupt()
-        unknown = np.diag(np.square([increment.bound_m, increment.bound_m, 1.0]))
+        unknown = np.diag(np.square([increment.discontinuity_m, increment.discontinuity_m, 1.0]))
         return Motion(motion.increment, motion.covariance + unknown, False)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.jit import kernel
-from thinmap_ros.core.snapshot import FAR_CELLS, LARGEST_COUNT, Field
+from thinmap_ros.core.snapshot import MAX_CELL_INDEX, MAX_COUNT, Field
 from thinmap_ros.core.topology.net import Net, chains_of
 from thinmap_ros.core.topology.skeleton_graph import Chain, Spot, Web
 
@@ -23,16 +23,19 @@ FIELDS = {
     'spots': Field(
         np.int64,
         ('n', 4),
-        (1, -FAR_CELLS, -FAR_CELLS, 0),
-        (LARGEST_COUNT, FAR_CELLS, FAR_CELLS, _LARGEST_SQUARED),
+        (1, -MAX_CELL_INDEX, -MAX_CELL_INDEX, 0),
+        (MAX_COUNT, MAX_CELL_INDEX, MAX_CELL_INDEX, _LARGEST_SQUARED),
     ),
     # number, spot a, spot b, how many cells
-    'chains': Field(np.int64, ('m', 4), 1, LARGEST_COUNT),
+    'chains': Field(np.int64, ('m', 4), 1, MAX_COUNT),
     # row, col, squared clearance, chain after chain
     'cells': Field(
-        np.int64, ('k', 3), (-FAR_CELLS, -FAR_CELLS, 0), (FAR_CELLS, FAR_CELLS, _LARGEST_SQUARED)
+        np.int64,
+        ('k', 3),
+        (-MAX_CELL_INDEX, -MAX_CELL_INDEX, 0),
+        (MAX_CELL_INDEX, MAX_CELL_INDEX, _LARGEST_SQUARED),
     ),
-    'next': Field(np.int64, (1,), 0, LARGEST_COUNT),
+    'next': Field(np.int64, (1,), 0, MAX_COUNT),
 }
 
 

@@ -12,7 +12,7 @@ from thinmap_ros.core.grid.components import label, reachable
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.se2 import Array, invert, transform_points
-from thinmap_ros.core.snapshot import LARGEST_COUNT, Field
+from thinmap_ros.core.snapshot import MAX_COUNT, Field
 from thinmap_ros.core.topology import atlas, identity, surroundings
 from thinmap_ros.core.topology.atlas import Atlas, Box
 from thinmap_ros.core.topology.config import TopologyConfig
@@ -49,7 +49,7 @@ _STRIDE_M = 1.0  # between poses at which the map is built anew
 _PAD = 6  # cells round what changed that are drawn anew with it
 _APART = 16  # cells between changes that are drawn anew each for itself
 FIELDS = {
-    'taken': Field(np.int64, (), 0, LARGEST_COUNT),
+    'taken': Field(np.int64, (), 0, MAX_COUNT),
     **surroundings.FIELDS,
     **atlas.FIELDS,
     **identity.FIELDS,
@@ -117,7 +117,9 @@ class TopologyBuilder:
         )
         dissolve_all(shown, np.ones(len(shown.spots), dtype=np.bool_))
         return map_of(
-            web_of_net(shown), around.lattice.shifted(around.near.row, around.near.col), self.config
+            web_of_net(shown),
+            around.lattice.with_origin_at(around.near.row, around.near.col),
+            self.config,
         )
 
     def rebuild(
@@ -169,7 +171,7 @@ class TopologyBuilder:
         builder = TopologyBuilder(config)
         if not state:
             return builder
-        checked = snapshot.check(state, FIELDS, 'topology')
+        checked = snapshot.validate(state, FIELDS, 'topology')
         builder._surroundings = Surroundings.from_state(checked, builder.config)
         builder._atlas = Atlas.from_state(checked)
         builder._taken = int(checked['taken'])

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.jit import kernel
-from thinmap_ros.core.snapshot import FAR_CELLS, LARGEST_COUNT, LARGEST_ID, Field
+from thinmap_ros.core.snapshot import MAX_CELL_INDEX, MAX_COUNT, MAX_ID, Field
 from thinmap_ros.core.topology.atlas import Atlas
 from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.corners import corner_indices
@@ -26,10 +26,10 @@ Cells = NDArray[np.int64]
 Place = tuple[int, int]  # spot, -1; or chain, index of a corner
 FIELDS = {
     # number of a spot and -1, or number of a chain and index of a corner; id of its node
-    'places': Field(np.int64, ('p', 3), (1, -1, 1), (LARGEST_COUNT, FAR_CELLS, LARGEST_ID)),
+    'places': Field(np.int64, ('p', 3), (1, -1, 1), (MAX_COUNT, MAX_CELL_INDEX, MAX_ID)),
     # number of a chain, id of an edge along it
-    'edges': Field(np.int64, ('e', 2), 1, (LARGEST_COUNT, LARGEST_ID)),
-    'next_id': Field(np.int64, (1,), 1, LARGEST_ID),
+    'edges': Field(np.int64, ('e', 2), 1, (MAX_COUNT, MAX_ID)),
+    'next_id': Field(np.int64, (1,), 1, MAX_ID),
 }
 OldEdges = dict[tuple[int, int], list[Edge]]  # by the ids of their nodes, the lower one first
 

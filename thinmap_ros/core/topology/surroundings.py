@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import snapshot
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.core.grid.frame import COARSEST_M, FINEST_M, GridFrame
+from thinmap_ros.core.grid.frame import MAX_RESOLUTION_M, MIN_RESOLUTION_M, GridFrame
 from thinmap_ros.core.grid.patch import FREE_AT_MOST, OCCUPIED_AT_LEAST, UNKNOWN, GridPatch
 from thinmap_ros.core.jit import kernel
-from thinmap_ros.core.snapshot import FAR_CELLS, FAR_M, Field
+from thinmap_ros.core.snapshot import MAX_CELL_INDEX, MAX_COORDINATE_M, Field
 from thinmap_ros.core.topology.atlas import Box
 from thinmap_ros.core.topology.config import TopologyConfig
 
@@ -27,9 +27,14 @@ _NEVER = np.int8(-2)  # never in a window, or forgotten
 _BLOCK = 3  # painting looks first at blocks of 2**3 cells
 FIELDS = {
     'memory': Field(np.int8, ('s', 's'), int(_NEVER), int(OCCUPIED)),
-    'low': Field(np.int64, (2,), -FAR_CELLS, FAR_CELLS),
-    'lattice': Field(np.float64, (3,), (-FAR_M, -FAR_M, FINEST_M), (FAR_M, FAR_M, COARSEST_M)),
-    'reach': Field(np.int64, (), 0, FAR_CELLS),
+    'low': Field(np.int64, (2,), -MAX_CELL_INDEX, MAX_CELL_INDEX),
+    'lattice': Field(
+        np.float64,
+        (3,),
+        (-MAX_COORDINATE_M, -MAX_COORDINATE_M, MIN_RESOLUTION_M),
+        (MAX_COORDINATE_M, MAX_COORDINATE_M, MAX_RESOLUTION_M),
+    ),
+    'reach': Field(np.int64, (), 0, MAX_CELL_INDEX),
 }
 _OFF_LATTICE = 1e-3  # of a cell: windows that lie worse than this do not belong to the same grid
 
@@ -154,7 +159,7 @@ class Surroundings:
         cells = self._cells.copy()
         painted = _paint(cells, (skeleton - (self.box.row, self.box.col))[::2], squared[::2])
         cells[cells == _NEVER] = UNKNOWN
-        return GridPatch(self.lattice.shifted(self.box.row, self.box.col), cells), painted
+        return GridPatch(self.lattice.with_origin_at(self.box.row, self.box.col), cells), painted
 
     def _place_of(self, frame: GridFrame) -> tuple[int, int]:
         if frame.resolution != self.lattice.resolution:

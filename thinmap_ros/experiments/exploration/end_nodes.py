@@ -19,8 +19,8 @@ from thinmap_ros.view.plots import (
     MapLayer,
     Panel,
     Plot,
-    Robots,
-    Words,
+    RobotMarkers,
+    TextLabels,
     xy,
 )
 
@@ -102,7 +102,7 @@ def _follow(source: Source, name: str) -> tuple[list[Moment], list[list[float]]]
         T = look.T_world_base
         way += 0.0 if last is None else math.dist(T[:2], last[:2])
         last = T
-        grid.update(look.scan, T)
+        grid.add_scan(look.scan, T)
         builder.update(grid.window(float(T[0]), float(T[1]), _WINDOW_M), T)
         places = np.array(
             [n.position for n in builder.map.nodes.values() if n.kind == NodeKind.END]
@@ -113,7 +113,7 @@ def _follow(source: Source, name: str) -> tuple[list[Moment], list[list[float]]]
             seconds = look.scan.stamp_ns / 1e9
             track.append([seconds, float(at[0]), float(at[1]), way])
             if k % 5 == 0:
-                moments.append((seconds, T, grid.patch(), builder.map.copy(), at))
+                moments.append((seconds, T, grid.known_area(), builder.map.copy(), at))
     return moments, track
 
 
@@ -130,8 +130,8 @@ def _panel(moment: Moment, limits: tuple[float, float, float, float]) -> Panel:
     layers: list[Layer] = [
         MapLayer(patch),
         GraphLayer(graph),
-        Robots(T[None]),
-        Words(at[None], ['A'], 11.0),
+        RobotMarkers(T[None]),
+        TextLabels(at[None], ['A'], 11.0),
     ]
     return Panel(layers, f'after {seconds:.0f} s', limits=limits)
 

@@ -15,11 +15,20 @@ from thinmap_ros.evaluation.exploration_metrics import EndNodeCensus
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Rows, Table
 from thinmap_ros.experiments.drives import Source, world_of
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
-from thinmap_ros.sim.coverage import coverable
-from thinmap_ros.sim.drives import Look
-from thinmap_ros.sim.laser import Lms200Config
+from thinmap_ros.sim.coverage import observable_cells
+from thinmap_ros.sim.drives import DriveSample
+from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
-from thinmap_ros.view.plots import Curve, GraphLayer, Layer, MapLayer, Panel, Plot, Robots, Words
+from thinmap_ros.view.plots import (
+    Curve,
+    GraphLayer,
+    Layer,
+    MapLayer,
+    Panel,
+    Plot,
+    RobotMarkers,
+    TextLabels,
+)
 
 _MOMENTS = (0.05, 0.2, 0.4, 0.6, 0.8, 1.0)
 _PAPER_S = 120.0
@@ -41,9 +50,11 @@ class _Moment:
 def run(source: Source) -> Outcome:
     """Decide anew what was decided on the drive, from the same scans; look at what was known."""
     world = world_of('room_10x10')
-    moments, census = _relive(list(source.looks('room_10x10')))
-    goal = coverable(world, world.start, PRESETS['2dx'].radius_m, Lms200Config().range_max_m)
-    coverage = [(m.seconds, goal.share_known(m.patch)) for m in moments]
+    moments, census = _replay_exploration(list(source.looks('room_10x10')))
+    goal = observable_cells(
+        world, world.start, PRESETS['2dx'].radius_m, LaserScannerConfig().range_max_m
+    )
+    coverage = [(m.seconds, goal.coverage(m.patch)) for m in moments]
     last = moments[-1]
     poses = np.array([moment.T_map_base for moment in moments])
     way_m = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
@@ -104,7 +115,7 @@ _COLUMNS = [
 ]
 
 
-def _relive(looks: list[Look]) -> tuple[list[_Moment], EndNodeCensus]:
+def _replay_exploration(looks: list[DriveSample]) -> tuple[list[_Moment], EndNodeCensus]:
     """Once a second, and at the end, what is known."""
 
     def here(scan: object, T_odom_base: Array) -> Estimate:
@@ -117,10 +128,10 @@ def _relive(looks: list[Look]) -> tuple[list[_Moment], EndNodeCensus]:
     for k, look in enumerate(looks):
         truth = look.T_world_base
         pipeline.step(look.scan, look.T_odom_base)
-        patch = pipeline.grid.patch()
+        patch = pipeline.grid.known_area()
         graph = pipeline.topology.map
         decision = explorer.step(graph, patch, look.scan, truth)
-        census.take([(n.node_id, n.x, n.y) for n in decision.end_nodes], truth)
+        census.add([(n.node_id, n.x, n.y) for n in decision.end_nodes], truth)
         if k % 5 == 0 or k == len(looks) - 1:
             moments.append(_Moment(look.scan.stamp_ns / 1e9, truth, patch, graph.copy(), decision))
     return moments, census
@@ -161,5 +172,5 @@ def _panel(moment: _Moment, path: Array) -> Panel:
         Curve(path[:, :2], 'path', 5),
         *goal,
     ]
-    layers += [Robots(moment.T_map_base[None]), Words(at, words)]
+    layers += [RobotMarkers(moment.T_map_base[None]), TextLabels(at, words)]
     return Panel(layers, f'after {moment.seconds:.0f} s', limits=_LIMITS)

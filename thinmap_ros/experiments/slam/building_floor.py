@@ -11,10 +11,10 @@ from thinmap_ros.core.slam.localizers import line_features
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.evaluation import map_errors
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Rows, Table
-from thinmap_ros.evaluation.slam_run import Run, run_slam
+from thinmap_ros.evaluation.slam_run import Run, run_drive
 from thinmap_ros.experiments.drives import Source, world_of
-from thinmap_ros.pipeline import Pipeline, Step
-from thinmap_ros.sim.drives import Look
+from thinmap_ros.pipeline import Pipeline, PipelineResult
+from thinmap_ros.sim.drives import DriveSample
 from thinmap_ros.view.plots import (
     Band,
     Curve,
@@ -23,7 +23,7 @@ from thinmap_ros.view.plots import (
     MapLayer,
     Panel,
     Plot,
-    Robots,
+    RobotMarkers,
     Segments,
     xy,
 )
@@ -45,9 +45,9 @@ class _Glance:
         self.number = number
         self.patch: GridPatch | None = None
 
-    def __call__(self, k: int, look: Look, pipeline: Pipeline, step: Step) -> None:
+    def __call__(self, k: int, look: DriveSample, pipeline: Pipeline, step: PipelineResult) -> None:
         if k == self.number:
-            self.patch = pipeline.grid.patch()
+            self.patch = pipeline.grid.known_area()
             self.graph = pipeline.topology.map.copy()
             self.features = line_features(pipeline.localizer)
             self.pose = step.estimate.T_map_base
@@ -58,10 +58,10 @@ def run(source: Source) -> Outcome:
     world = world_of('floor_40x10')
     looks = list(islice(source.looks('floor_40x10'), _QUICK_SCANS if source.quick else None))
     glance = _Glance(round(_LOCAL_AT * len(looks)))
-    ti = run_slam(looks, 'ekf_ti', glance)
-    full = run_slam(looks, 'ekf_full')
-    ours = run_slam(looks, 'scan_matching')
-    error = map_errors.map_error(ti.pipeline.grid.patch(), world)
+    ti = run_drive(looks, 'ekf_ti', glance)
+    full = run_drive(looks, 'ekf_full')
+    ours = run_drive(looks, 'scan_matching')
+    error = map_errors.map_error(ti.pipeline.grid.known_area(), world)
     apart = np.hypot(*(np.array(ti.estimate) - np.array(full.estimate))[:, :2].T)
     used = float(np.median(ti.local))
     known = ti.features[-1]
@@ -69,8 +69,8 @@ def run(source: Source) -> Outcome:
         'A building floor with 33 lines',
         'SLAM paper, sections 4 and 5.1, Fig. 7, 8, 11 and 12',
         'The floor of 40 x 10 m: a Pioneer 3-AT with an LMS200 drives its tour at 0.2 m/s '
-        f'({ti.way_m:.0f} m). The same scans go through the conventional filter (all features) '
-        'and through EKF-SLAM/TI (local areas), each on odometry and lines alone.',
+        f'({ti.path_length_m:.0f} m). The same scans go through the conventional filter '
+        '(all features) and through EKF-SLAM/TI (local areas), each on odometry and lines alone.',
         [
             Table('map', map_errors.COLUMNS, [map_errors.row('floor_40x10', error)]),
             Table('path', _PATH, _path_rows(ti, full)),
@@ -221,7 +221,7 @@ def _local_area(glance: _Glance) -> Plot:
         GraphLayer(nodes, 9.0),
         Segments(_ends(glance.features, False), 'other features', 5, 2.0),
         Segments(_ends(glance.features, True), 'features of the local area', 1, 4.0),
-        Robots(glance.pose[None], radius_m=0.32),
+        RobotMarkers(glance.pose[None], radius_m=0.32),
     ]
     caption = (
         'Paper 3, Fig. 7 and 8: the local area: nodes near the robot (large: those at which its '
@@ -241,7 +241,7 @@ def _paths(ti: Run, full: Run) -> Plot:
             Segments(_ends(features, True), 'features used at the end', 1, 4.0),
             Curve(odometry[:, :2], 'odometry alone', 6, '-', width=1.0),
             Curve(estimate[:, :2], 'estimated path', 0, '--', width=1.6),
-            Robots(estimate[-1:], radius_m=0.32),
+            RobotMarkers(estimate[-1:], radius_m=0.32),
         ]
         title = f'{name}: {sum(f.local for f in features)} of {len(features)} features used'
         panels.append(Panel(layers, title, limits=_LIMITS))

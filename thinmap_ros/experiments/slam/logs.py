@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from thinmap_ros.core.errors import ConfigError, InputError, reason_of
+from thinmap_ros.core.errors import ConfigError, InputError, one_line_reason
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Table
 from thinmap_ros.evaluation.trajectory_errors import RelationErrors, read_columns, relation_errors
 from thinmap_ros.files.yaml import read_mapping
@@ -136,7 +136,7 @@ def laser_of(folder: Path, log: str) -> LaserOptions:
     try:
         return LaserOptions(**options)
     except (TypeError, ConfigError) as error:
-        raise InputError(f'{path}: {reason_of(error)}') from error
+        raise InputError(f'{path}: {one_line_reason(error)}') from error
 
 
 def _errors(folder: Path, result: Replay) -> list[float | None]:
@@ -160,7 +160,7 @@ def _means(errors: RelationErrors) -> tuple[float, float]:
 def _plot(folder: Path, result: Replay) -> Plot:
     pipeline = result.pipeline
     graph = result.pipeline.topology.map
-    patch = pipeline.grid.patch()
+    patch = pipeline.grid.known_area()
     final = pipeline.localizer.corrected_path()
     way = Curve(final[:, :2], 'trajectory', 3, width=1.0)
     rows, cols = patch.shape

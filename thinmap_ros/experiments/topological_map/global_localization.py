@@ -11,8 +11,8 @@ from thinmap_ros.core.topology.builder import TopologyConfig, build
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Rows, Table
 from thinmap_ros.experiments.drives import LOST_STEP_SCANS, Source
 from thinmap_ros.experiments.maps import grid_of
-from thinmap_ros.sim.drives import Look
-from thinmap_ros.view.plots import Curve, MapLayer, Panel, Plot, Robots, xy
+from thinmap_ros.sim.drives import DriveSample
+from thinmap_ros.view.plots import Curve, MapLayer, Panel, Plot, RobotMarkers, xy
 
 _SHOWN = (0, 2, 7, 11)  # steps of the paper's pictures; 0: before the first
 _STEPS = 11
@@ -25,7 +25,7 @@ _RIGHT_RAD = np.radians(10.0)
 
 def run(source: Source) -> Outcome:
     """Localize on one drive with many seeds of the samples; the first one is drawn."""
-    patch = grid_of(source.looks('lab_stops')).patch()
+    patch = grid_of(source.looks('lab_stops')).known_area()
     topology = build(patch, (2.0, 2.0), TopologyConfig())
     looks = list(islice(source.looks('lab_lost'), 0, None, LOST_STEP_SCANS))
     rows: Rows = []
@@ -83,7 +83,7 @@ def _candidates(result: Result) -> int:
     return sum(hypothesis.weight >= _LIKELY for hypothesis in result.hypotheses)
 
 
-def _error(result: Result, look: Look) -> tuple[float | None, float | None]:
+def _error(result: Result, look: DriveSample) -> tuple[float | None, float | None]:
     """How far the likeliest place is off, m and degrees."""
     if not result.hypotheses:
         return None, None
@@ -91,7 +91,7 @@ def _error(result: Result, look: Look) -> tuple[float | None, float | None]:
     return float(np.hypot(off[0], off[1])), float(np.degrees(abs(wrap(float(off[2])))))
 
 
-def _is_right(result: Result, look: Look) -> bool:
+def _is_right(result: Result, look: DriveSample) -> bool:
     metres, degrees = _error(result, look)
     return (
         metres is not None
@@ -101,9 +101,9 @@ def _is_right(result: Result, look: Look) -> bool:
     )
 
 
-def _panel(patch: GridPatch, samples: Array, look: Look | None, step: int) -> Panel:
+def _panel(patch: GridPatch, samples: Array, look: DriveSample | None, step: int) -> Panel:
     title = f'after {step} steps' if step else f'at the start: {len(samples)} samples'
-    robot = [] if look is None else [Robots(look.T_world_base[None])]
+    robot = [] if look is None else [RobotMarkers(look.T_world_base[None])]
     return Panel(
         [MapLayer(patch), Curve(samples[:, :2], 'samples', 1, '', '.', size=1.5), *robot], title
     )

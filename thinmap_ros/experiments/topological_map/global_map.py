@@ -12,8 +12,8 @@ from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Rows, Table
 from thinmap_ros.experiments.drives import Source
 from thinmap_ros.experiments.maps import grid_of
-from thinmap_ros.sim.drives import Look
-from thinmap_ros.view.plots import GraphLayer, MapLayer, Panel, Plot, Robots
+from thinmap_ros.sim.drives import DriveSample
+from thinmap_ros.view.plots import GraphLayer, MapLayer, Panel, Plot, RobotMarkers
 
 _WINDOW_M = 16.0
 # The stops near (3 m, 8 m) and (2.3 m, 3 m)
@@ -44,7 +44,7 @@ def run(source: Source) -> Outcome:
         for stop, name in ((_FIRST, 'local map 1'), (_SECOND, 'local map 2'))
     ]
     whole = grid_of(look for stop in stops for look in stop)
-    batch = build(whole.patch(), _start(stops[0]), TopologyConfig())
+    batch = build(whole.known_area(), _start(stops[0]), TopologyConfig())
     share = _agreement(states[-1], batch)
     back = _agreement(batch, states[-1])
     gone = _redundant(states[1], states[-1])
@@ -98,22 +98,22 @@ def _plots(early: list[Panel], whole: OccupancyGrid, final: Panel) -> list[Plot]
             'fig6_9',
             'Paper 1, Fig. 6 and 9: the global grid map (above; only for better understanding) '
             'and the final global topological map.',
-            [Panel([MapLayer(whole.patch())]), final],
+            [Panel([MapLayer(whole.known_area())]), final],
             panel_inches=(9.0, 4.6),
         ),
     ]
 
 
-def _visit(looks: list[Look], grid: OccupancyGrid, builder: TopologyBuilder) -> None:
+def _visit(looks: list[DriveSample], grid: OccupancyGrid, builder: TopologyBuilder) -> None:
     for look in looks:
-        grid.update(look.scan, look.T_world_base)
+        grid.add_scan(look.scan, look.T_world_base)
         x, y, _ = look.T_world_base
         builder.update(grid.window(float(x), float(y), _WINDOW_M), look.T_world_base)
 
 
-def _local_map(looks: list[Look], title: str) -> Panel:
+def _local_map(looks: list[DriveSample], title: str) -> Panel:
     grid = grid_of(looks)
-    graph = build(grid.patch(), _start(looks), TopologyConfig())
+    graph = build(grid.known_area(), _start(looks), TopologyConfig())
     x, y = _start(looks)
     return _panel(grid, graph, f'{title}, sensor at ({x:g} m, {y:g} m)', looks[0].T_world_base)
 
@@ -121,11 +121,11 @@ def _local_map(looks: list[Look], title: str) -> Panel:
 def _panel(
     grid: OccupancyGrid, graph: TopologicalMap, title: str, robot: Array | None = None
 ) -> Panel:
-    robots = [] if robot is None else [Robots(robot[None], 'sensor')]
-    return Panel([MapLayer(grid.patch()), GraphLayer(graph), *robots], title)
+    robots = [] if robot is None else [RobotMarkers(robot[None], 'sensor')]
+    return Panel([MapLayer(grid.known_area()), GraphLayer(graph), *robots], title)
 
 
-def _start(looks: list[Look]) -> tuple[float, float]:
+def _start(looks: list[DriveSample]) -> tuple[float, float]:
     return float(looks[0].T_world_base[0]), float(looks[0].T_world_base[1])
 
 

@@ -12,8 +12,8 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Rows, Table
 from thinmap_ros.experiments.drives import Source
 from thinmap_ros.experiments.maps import grid_of, patch_at_rest
-from thinmap_ros.sim.drives import Look
-from thinmap_ros.view.plots import Curve, GraphLayer, MapLayer, Panel, Plot, Robots, xy
+from thinmap_ros.sim.drives import DriveSample
+from thinmap_ros.view.plots import Curve, GraphLayer, MapLayer, Panel, Plot, RobotMarkers, xy
 
 _PRUNE_M = (0.2, 0.4, 0.6, 0.8, 1.0, 1.5, 2.0, 3.0)
 _SHOWN_M = 3.0  # all branches into corners are gone
@@ -27,7 +27,7 @@ _MORE_NODES = 4
 def run(source: Source) -> Outcome:
     """Compare by pruning distance: nodes and edges (always the same), and times."""
     looks = list(source.looks('lab_stops'))
-    maps = {'lab': grid_of(looks).patch()}
+    maps = {'lab': grid_of(looks).known_area()}
     maps |= {name: patch_at_rest(name) for name in _WORLDS[: 1 if source.quick else None]}
     counts: Rows = []
     times: Rows = []
@@ -97,9 +97,9 @@ def _timed(work: Callable[[], TopologicalMap]) -> tuple[float, TopologicalMap]:
     return min(taken), result
 
 
-def _local_map(looks: list[Look]) -> Plot:
+def _local_map(looks: list[DriveSample]) -> Plot:
     look = looks[0]
-    patch = grid_of(looks).patch()
+    patch = grid_of(looks).known_area()
     points = look.scan.points_base()
     xy = (float(look.T_world_base[0]), float(look.T_world_base[1]))
     graph = build(patch, xy, TopologyConfig())
@@ -110,9 +110,10 @@ def _local_map(looks: list[Look]) -> Plot:
         '(b) the binary map of four such scans, with arcs and nodes by thinning.',
         [
             Panel(
-                [Curve(points, 'range data', 0, '', '.'), Robots(np.zeros((1, 3)), 'laser')], '(a)'
+                [Curve(points, 'range data', 0, '', '.'), RobotMarkers(np.zeros((1, 3)), 'laser')],
+                '(a)',
             ),
-            Panel([MapLayer(patch), GraphLayer(graph), Robots(robot)], '(b)'),
+            Panel([MapLayer(patch), GraphLayer(graph), RobotMarkers(robot)], '(b)'),
         ],
         columns=2,
         panel_inches=(5.0, 4.2),

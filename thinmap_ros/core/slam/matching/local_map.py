@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core import se2, snapshot
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.grid.tiles import FARTHEST_TILE, NO_TILE, TILE, TileStore
+from thinmap_ros.core.grid.tiles import MAX_TILE_INDEX, NO_TILE, TILE, TileStore
 from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.matching.surface import COLUMNS
@@ -144,7 +144,7 @@ class LocalMap:
         cells = tiles.pool[: tiles.used]
         return {
             'cell_m': np.array(self.config.match_cell_m),
-            'tiles': tiles.places(),
+            'tiles': tiles.tile_coordinates(),
             'hits': cells['hits'],
             'seen': cells['seen'],
             'means': np.stack([cells['x'], cells['y']], axis=-1),
@@ -167,8 +167,8 @@ class LocalMap:
         snapshot.require(once, 'features: tiles: one twice', 'each tile once')
         low = places.min(axis=0)
         high = places.max(axis=0)
-        self.tiles.reach(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
-        self.tiles.ensure(places)
+        self.tiles.grow_to(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+        self.tiles.allocate(places)
         cells = self.tiles.pool[: len(places)]
         cells['hits'] = np.minimum(state['hits'], state['seen'])
         cells['seen'] = state['seen']
@@ -187,7 +187,7 @@ class LocalMap:
         both = np.vstack([points_map, laser_map])
         low = np.floor((both.min(axis=0) - reach) / edge_m).astype(np.int64)[::-1]
         high = np.floor((both.max(axis=0) + reach) / edge_m).astype(np.int64)[::-1]
-        self.tiles.reach(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+        self.tiles.grow_to(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
         touched = _touched(points_map, laser_map, low, high, edge_m, reach)
         first = (low[0] - self.tiles.first_row, low[1] - self.tiles.first_col)
         rows, cols = touched.shape
@@ -195,12 +195,12 @@ class LocalMap:
             self.tiles.directory[first[0] : first[0] + rows, first[1] : first[1] + cols] == NO_TILE
         )
         if missing.any():
-            self.tiles.ensure(np.argwhere(missing) + low)
+            self.tiles.allocate(np.argwhere(missing) + low)
 
 
 FIELDS = {
     'cell_m': Field(np.float64, (), 1e-3, 10.0),
-    'tiles': Field(np.int64, ('t', 2), -FARTHEST_TILE, FARTHEST_TILE),
+    'tiles': Field(np.int64, ('t', 2), -MAX_TILE_INDEX, MAX_TILE_INDEX),
     'hits': Field(np.uint8, ('t', TILE, TILE), 0, 255),
     'seen': Field(np.uint8, ('t', TILE, TILE), 0, 255),
     'means': Field(np.float32, ('t', TILE, TILE, 2), 0.0, 1.0),
