@@ -33,7 +33,7 @@ from thinmap_ros.sim.world import World
 
 _CONTROL_STEPS = 2
 _MEASURE_SCANS = 5
-# At the survey's pace; thinning costs more than all else together.
+# At the period of candidate search; thinning costs more than all other stages.
 SCANS_PER_GRAPH = 5
 Watch = Callable[[Decision, Array], None]
 """Receives each decision, and the estimated pose (3,) at which it was made."""
@@ -62,10 +62,7 @@ class RunLog:
 
 @dataclass(frozen=True)
 class ExplorationOutcome:
-    """How an exploration ended.
-
-    Whether by itself, why, and how often the robot touched something.
-    """
+    """Outcome of an exploration: whether it finished, why it ended, and number of collisions."""
 
     finished: bool
     reason: str
@@ -80,7 +77,7 @@ class Mishap(Protocol):
         """Whether the robot is lost."""
 
     def handle_scan(self, loop: 'ClosedLoop', scan: Scan, T_odom_base: Array) -> bool:
-        """Whether a scan is not for the loop."""
+        """Process a scan; returns whether the loop must ignore it."""
 
     def update(self, loop: 'ClosedLoop', scan: Scan, estimate: Estimate) -> None:
         """Receive the estimate of a scan."""
@@ -144,12 +141,12 @@ class ClosedLoop:
 
     @property
     def is_finished(self) -> bool:
-        """Whether the strategy has nothing left to do; a lost robot has."""
+        """Whether the strategy is finished and the robot is not lost."""
         lost = self.mishap is not None and self.mishap.is_lost
         return self.decision is not None and self.decision.finished and not lost
 
     def _process_scan(self, scan: Scan, T_odom_base: Array) -> None:
-        """One scan through localization, map and graph to a decision."""
+        """Process a scan: localization, map, graph and decision."""
         if self.mishap is not None and self.mishap.handle_scan(self, scan, T_odom_base):
             return
         estimate = self.pipeline.step(scan, T_odom_base).estimate
@@ -158,7 +155,7 @@ class ClosedLoop:
             self.decide(scan, estimate)
 
     def log_poses(self, scan: Scan, estimate: Estimate) -> None:
-        """Log where the robot is, and where it thinks that it is."""
+        """Log the true and the estimated pose."""
         self.log.stamps_ns.append(scan.stamp_ns)
         self.log.poses.append(estimate.T_map_base)
         self.log.true_poses.append(self.simulation.robot.T_world_base)
@@ -166,11 +163,11 @@ class ClosedLoop:
             self.mishap.update(self, scan, estimate)
 
     def decide(self, scan: Scan, estimate: Estimate) -> None:
-        """Say where to go, by the map as it is now."""
+        """Choose a target in the present map."""
         self._scan = scan
         self._T_map_odom = estimate.T_map_odom
         self._patch = self.pipeline.grid.known_area()
-        # The processor's time: what else the machine does is not the strategy's.
+        # CPU time of this thread: other load does not count.
         began = time.thread_time()
         self.decision = self.strategy.step(
             self.pipeline.topology.map, self._patch, scan, estimate.T_map_base
@@ -189,7 +186,7 @@ class ClosedLoop:
     def replace_strategy(
         self, pipeline: Pipeline, strategy: Strategy, navigator: Navigator
     ) -> None:
-        """Have other parts decide where to go from now on."""
+        """Replace pipeline, strategy and navigator."""
         self.navigator.cancel()
         self.pipeline = pipeline
         self.strategy = strategy
@@ -219,7 +216,7 @@ class ClosedLoop:
 
 
 def ground_truth_poses(simulation: Simulation) -> Callable[[Scan, Array], Estimate]:
-    """Takes the localizer's place: the simulator's own pose."""
+    """Pose source that replaces the localizer by the true pose of the simulator."""
 
     def locate(scan: Scan, T_odom_base: Array) -> Estimate:
         T_map_base = simulation.robot.T_world_base
@@ -232,7 +229,7 @@ def ground_truth_poses(simulation: Simulation) -> Callable[[Scan, Array], Estima
 
 @dataclass(frozen=True)
 class Options:
-    """What an exploration is run with, beside world and start."""
+    """Options of an exploration, beside world and start."""
 
     strategy: str = 'position_probability'
     seed: int = 0
@@ -251,12 +248,12 @@ def make_loop(
     mishap: Mishap | None = None,
     watch: Watch | None = None,
 ) -> ClosedLoop:
-    """All parts as the options want them; what befalls the robot, and who watches, are given."""
+    """Build a closed loop from options, with an optional mishap and watcher."""
     simulation = Simulation(world, start, PRESETS[options.robot], options.laser, options.seed)
     x, y, theta = (float(number) for number in start)
     localizer = ScanLocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=theta)
     source = ground_truth_poses(simulation) if options.localization == 'truth' else None
-    # A beam that met nothing has seen as far as this laser can.
+    # A beam without return clears cells up to the range of the laser.
     grid = OccupancyConfig(no_return_range_m=options.laser.range_max_m)
     pipeline = Pipeline(
         PipelineConfig(localizer=localizer, grid=grid, scans_per_graph=SCANS_PER_GRAPH), source
@@ -267,4 +264,4 @@ def make_loop(
 
 
 def no_progress(seconds: float, coverage: float) -> None:
-    """Take the place of a progress bar."""
+    """Show no progress bar."""

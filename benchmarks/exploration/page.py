@@ -39,7 +39,7 @@ then looked into, for more way in most worlds, where there are no such doorways.
 
 
 def page(reports: list[Report]) -> str:
-    """Text of the page: a section for each kind of world and way in which it was explored."""
+    """Text of the page: a section for each kind of world and options of the exploration."""
     sections: dict[tuple[str, str], list[Report]] = defaultdict(list)
     for report in reports:
         sections[report['world'].split('-')[0], _conditions(report['options'])].append(report)

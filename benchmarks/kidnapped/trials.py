@@ -101,7 +101,7 @@ def fresh(finder: GlobalLocalization) -> GlobalLocalization:
 
 
 def along(looks: Iterable[DriveSample], way_m: float) -> Iterator[tuple[DriveSample, float]]:
-    """Each look, and the way that has been driven up to there, until that is longer than way_m."""
+    """Each sample and the distance travelled so far, up to way_m."""
     way = 0.0
     last = None
     for look in looks:
@@ -181,9 +181,9 @@ def _gap(result: Result) -> float:
 
 
 def watch_foreign(finder: GlobalLocalization, looks: Iterable[DriveSample], way_m: float) -> Record:
-    """After how much way a robot in another building is told so, or sure, and how it ends.
+    """Record of a robot in a building that is not in the map: distances until the result.
 
-    It is looked for on and on, whether it was sure or not.
+    The search continues after a result.
     """
     record: Record = {'said_m': '', 'sure_m': '', 'last': ''}
     for look, way in along(looks, way_m):

@@ -72,7 +72,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--write-short',
         action='store_true',
-        help='write short.txt anew from the complete run in DIR (what is missing is run first)',
+        help='rewrite short.txt from the complete run in DIR (missing cases are run first)',
     )
     parser.add_argument('--quiet', action='store_true', help='no bar of progress')
     parser.add_argument(

@@ -48,7 +48,7 @@ def noisy(robot: RobotConfig, noise: float) -> RobotConfig:
 
 
 def ways(made: Building, start: Array, robot: RobotConfig, seed: int) -> Iterator[Array]:
-    """Ways (K, 2), m, of a drive, each from where the one before ends."""
+    """Paths (K, 2), m, of a drive; each starts at the end of the previous one."""
     rng = np.random.default_rng(seed)
     patch = world_to_grid(made.world)
     goals = _goals(made)
@@ -99,7 +99,7 @@ def _middles(low: float, high: float) -> Array:
 
 
 def _way(patch: GridPatch, a: Array, b: Array, radius_m: float) -> Array | None:
-    """A way from a to b in the part of the map round both, or None."""
+    """A path from a to b in the part of the map around both, or None."""
     frame = patch.frame
     ends = np.stack([a, b])
     low = frame.cells_of(ends.min(axis=0)[None] - _DETOUR_M)[0].clip(0)

@@ -35,7 +35,7 @@ _PARTS = ('localizer', 'grid', 'topology')
 
 @dataclass(frozen=True, eq=False)
 class _Mark:
-    """After a way, m: CPU of last scans by part, ms; free area, m2; memory, MB; pose error, m."""
+    """Measurements at a distance, m: CPU by part, ms; area, m2; memory, MB; pose error, m."""
 
     travelled_m: float
     taken_ms: dict[str, Array]
@@ -48,7 +48,7 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
     """Rows at some lengths of the drive, as they come."""
     deque(_drive(islice(_looks()[0], _WARM_UP), [math.inf]), maxlen=0)  # compiles
     looks, lap_m = _looks()
-    # Where the first stretch has been driven once more.
+    # A further drive along the first part.
     again = [lap * lap_m + _MARKS_M[0] for lap in range(1, 4)]
     first: _Mark | None = None
     new: _Mark | None = None  # the last one of the first lap

@@ -17,7 +17,7 @@ _SCANS = 200
 
 
 def run(worlds: Path, quick: bool) -> list[Row]:
-    """One row: 181 beams, 8 m, 10 cm, a real floor, the robot turning on the spot at ten places."""
+    """One row: 181 beams, 8 m, 10 cm, a real floor, rotation in place at ten places."""
     floor = floors(worlds, 'kth/50052748')[0]
     laser = LaserScanner(LaserScannerConfig(), 0)
     turns = [

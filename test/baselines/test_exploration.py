@@ -126,7 +126,7 @@ def test_a_target_that_fails_is_left_for_later_and_the_end_says_so() -> None:
             tried.append(round(decision.target.x))
             strategy.target_failed('no way')
     assert decision.finished
-    assert decision.reason == 'what is left cannot be reached'
+    assert decision.reason == 'remaining targets are unreachable'
     assert tried[0] != tried[1]
     assert len(tried) >= 3 * len(set(tried))
 

@@ -1,8 +1,7 @@
-"""Exploration as others do it: which frontier, or which end node, next.
+"""Baseline exploration strategies: which frontier, or which end node, is visited next.
 
-All of them run on the same map, drive by the same navigator, choose anew once a second and as soon
-as what they drive to is seen, and stop when nothing is left to choose from. What differs is the
-choice.
+All of them use the same map and navigator. They choose once a second, and as soon as the target has
+been observed, and stop when no target is left. They differ in the choice only.
 """
 
 import math
@@ -35,10 +34,7 @@ _PROGRESS_M = 0.1
 
 @dataclass(eq=False)
 class _Progress:
-    """How near a place was while it was driven to, and for how long it has been no nearer.
-
-    nearest_m: by the way there.
-    """
+    """Progress towards a place: the shortest remaining path, and the time since then."""
 
     place: tuple[float, float]
     nearest_m: float
@@ -46,7 +42,7 @@ class _Progress:
 
 
 class _ProgressTimeout:
-    """Gives up what comes no nearer while it is driven to, also if others came between."""
+    """Detects targets without progress while the robot drives to them."""
 
     def __init__(self, timeout_s: float) -> None:
         self._timeout_ns = 1e9 * timeout_s
@@ -55,7 +51,7 @@ class _ProgressTimeout:
         self._stamp_ns = 0
 
     def has_expired(self, place: Array, way_m: float, stamp_ns: int) -> bool:
-        """Count the time that has gone by on the way (m) to a place (2,) since it was nearest."""
+        """Add driving time towards a place (2,) at a remaining path length, m."""
         same = (p for p in self._watched if math.dist(p.place, place) <= _SAME_PLACE_M)
         progress = next(same, None)
         if progress is None:
@@ -75,7 +71,7 @@ class _ProgressTimeout:
 
 
 class FrontierExplorer(ABC):
-    """Drives to one frontier after the other until none is left that can be reached."""
+    """Visits frontiers until no reachable one is left."""
 
     def __init__(self) -> None:
         self.map = FrontierMap()
@@ -87,12 +83,12 @@ class FrontierExplorer(ABC):
 
     @abstractmethod
     def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
-        """Cost of each frontier, (N,), from a pose (3,): the cheapest is next."""
+        """Cost of each frontier, (N,), from a pose (3,); the cheapest one is next."""
 
     def step(
         self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
     ) -> Decision:
-        """Say where to go; see core/exploration/strategy.Strategy."""
+        """Choose a target; see core/exploration/strategy.Strategy."""
         self.map.update(patch, scan, T_map_base)
         self._drop_unchanged_target(T_map_base)
         if self._is_due(scan.stamp_ns):
@@ -105,7 +101,7 @@ class FrontierExplorer(ABC):
         )
 
     def target_failed(self, reason: str) -> None:
-        """Remember where a target could not be reached."""
+        """Store the position of a target that could not be reached."""
         if self.target is not None:
             self._failures.append(
                 (float(self.target.viewpoint[0]), float(self.target.viewpoint[1]))
@@ -131,8 +127,7 @@ class FrontierExplorer(ABC):
             if before is None or math.dist(before.centroid, best.centroid) > _SAME_PLACE_M:
                 self._number += 1
             near = before is not None and math.dist(before.viewpoint, best.viewpoint) < _AT_GOAL_M
-            # A goal that hardly moved stays where it is: the robot would otherwise set out anew
-            # once a second.
+            # A goal that hardly moved is kept: the robot would otherwise replan every second.
             if near and before:
                 best = Frontier(best.cells, best.centroid, before.viewpoint, best.path_length_m)
             self.target = best
@@ -143,7 +138,7 @@ class FrontierExplorer(ABC):
         )
 
     def _drop_unchanged_target(self, T_map_base: Array) -> None:
-        """What stays unknown although the robot stands there and looks has nothing more to show."""
+        """Drop a target that stays unknown although the robot is at its viewpoint."""
         if self.target is None or self._frame != self.map.borders.frame:
             return
         goal = self.target.goal
@@ -159,15 +154,15 @@ class FrontierExplorer(ABC):
 
 
 class NearestFrontier(FrontierExplorer):
-    """The frontier with the shortest way over the grid.
+    """The frontier with the shortest path on the grid.
 
     Source: Yamauchi, "A frontier-based approach for autonomous exploration", 1997; Holz et al.,
-    "Evaluating the efficiency of frontier-based exploration strategies", 2010 (choosing anew when
+    "Evaluating the efficiency of frontier-based exploration strategies", 2010 (a new choice when
     the frontier is gone).
     """
 
     def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
-        """Way to each."""
+        """Path length to each frontier."""
         return np.array([f.path_length_m for f in frontiers])
 
 
@@ -175,9 +170,9 @@ class ExploreLite(FrontierExplorer):
     """explore_lite's cost: potential_scale * straight distance - gain_scale * size.
 
     Both are scaled by the cell size. Scales as in its launch file; size in cells, distance that of
-    the nearest frontier cell, m; it drives to the frontier's middle. A goal that has come no nearer
-    while it was driven to for progress_timeout_s is given up; here also if others were driven to in
-    between, as the package would go to and fro between two of them for ever.
+    the nearest frontier cell, m; the target is the centroid of the frontier. A goal without
+    progress for progress_timeout_s is blacklisted; here also after an interruption, because the
+    package would oscillate between two goals for ever.
     Source: Hörner, "Map-merging for multi-robot system", 2016, package explore_lite.
     """
 
@@ -192,7 +187,7 @@ class ExploreLite(FrontierExplorer):
     def step(
         self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
     ) -> Decision:
-        """As the others; a target without progress has failed."""
+        """Choose a target; a target without progress has failed."""
         decision = super().step(topology, patch, scan, T_map_base)
         target = self.target
         if target is not None and self._progress_timeout.has_expired(
@@ -202,7 +197,7 @@ class ExploreLite(FrontierExplorer):
         return decision
 
     def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
-        """Distance against size."""
+        """Weighted distance minus weighted size."""
         frame = self.map.borders.frame
         nearest = [
             np.hypot(*(frame.centres_of(f.cells) - T_map_base[:2]).T).min() for f in frontiers
@@ -214,7 +209,7 @@ class ExploreLite(FrontierExplorer):
 
 
 class InformationGain(FrontierExplorer):
-    """The greatest area to be seen from a place, discounted by the way there: A exp(-lambda L).
+    """The largest area visible from a place, discounted by the path length: A exp(-lambda L).
 
     Source: Gonzalez-Banos and Latombe, "Navigation strategies for exploring indoor environments",
     2002.
@@ -224,7 +219,7 @@ class InformationGain(FrontierExplorer):
     range_m = 8.0
 
     def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
-        """Less the discounted gain."""
+        """Negative discounted gain."""
         assert self.map.patch is not None
         frame = self.map.borders.frame
         cells = frame.cells_of(np.array([f.viewpoint for f in frontiers]))
@@ -235,16 +230,14 @@ class InformationGain(FrontierExplorer):
 
 
 class DistanceAdvantage(FrontierExplorer):
-    """The frontier for which now is the best time.
+    """The frontier with the largest distance advantage: near the robot, far from other frontiers.
 
-    It is near to the robot, and far from where the robot would be otherwise.
-
-    Cost: the way from the robot less the mean way from the other frontiers, from which it would
-    have to be come back to later.
+    Cost: path length from the robot minus the mean path length from the other frontiers, from which
+    the robot would have to return later.
     """
 
     def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
-        """Less the advantage."""
+        """Negative advantage."""
         ways = np.array([f.path_length_m for f in frontiers])
         places = np.array([f.viewpoint for f in frontiers])
         if len(frontiers) < 2:
@@ -255,14 +248,11 @@ class DistanceAdvantage(FrontierExplorer):
 
 
 class VisitAllEndNodes(NearestFrontier):
-    """The nearest end node that was not visited yet, by A* on the graph, until all were.
+    """The nearest end node that was not visited yet, by A* on the graph, as on a GVG.
 
-    This is exploration along a GVG.
-
-    An edge is followed to its end: another one is chosen when the robot is there, when there is no
-    end any more, or when it has come no nearer for progress_timeout_s: in wide halls ends come and
-    go as more is seen. Frontiers that no end node leads to are visited at the end, the nearest
-    first.
+    The robot follows an edge to its end. It chooses another one when it has arrived, when the end
+    node disappears, or without progress for progress_timeout_s: in wide halls end nodes appear and
+    disappear as the map grows. Frontiers without an end node are visited at the end, nearest first.
     Source: Choset and Nagatani, "Topological simultaneous localization and mapping (SLAM)", 2001.
     """
 
@@ -272,7 +262,7 @@ class VisitAllEndNodes(NearestFrontier):
         super().__init__()
         self.map = FrontierMap(
             allow_backtracking=True
-        )  # the graph has led it where the others do not go
+        )  # the graph may lead through narrow passages
         self._progress_timeout = _ProgressTimeout(self.progress_timeout_s)
         self._visited: list[tuple[float, float]] = []
         self._end_node: Array | None = None  # the goal (3,) there
@@ -280,7 +270,7 @@ class VisitAllEndNodes(NearestFrontier):
     def step(
         self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
     ) -> Decision:
-        """End nodes first; what frontiers there are is looked after meanwhile."""
+        """Choose an end node, or a frontier if none is left."""
         found = self._next_end_node(topology, T_map_base)
         if found is None:
             self._end_node = None
@@ -296,7 +286,7 @@ class VisitAllEndNodes(NearestFrontier):
         return decision
 
     def target_failed(self, reason: str) -> None:
-        """An end node that cannot be reached counts as visited."""
+        """Mark an unreachable end node as visited."""
         if self._end_node is None:
             super().target_failed(reason)
         else:
@@ -306,7 +296,7 @@ class VisitAllEndNodes(NearestFrontier):
     def _next_end_node(
         self, topology: TopologicalMap, T_map_base: Array
     ) -> tuple[Array, float] | None:
-        """Goal (3,) at the end node that is next, and the way there, m; None without one."""
+        """Goal (3,) at the next end node, and the path length to it, m; None without one."""
         ends = [node for node in topology.nodes.values() if node.kind == NodeKind.END]
         self._visited += [
             (node.x, node.y)
@@ -327,7 +317,7 @@ class VisitAllEndNodes(NearestFrontier):
         return se2.pose(best.x, best.y, heading), way_m
 
     def _is_followed(self, x: float, y: float) -> bool:
-        """Whether the end node at a place is the one driven to, which moves as more is seen."""
+        """Whether the end node at a place is the present target, which moves as the map grows."""
         return self._end_node is not None and math.dist((x, y), self._end_node[:2]) < _SAME_PLACE_M
 
     def _was_visited(self, x: float, y: float) -> bool:
@@ -349,10 +339,7 @@ def _decision(
     finished: bool,
     failures: bool,
 ) -> Decision:
-    """What is common to all.
-
-    The graph's end nodes are told of, though nobody asked for their probability.
-    """
+    """Decision with the end nodes of the graph, with a probability of 0.5 each."""
     nodes = [
         _end_node(node.id, se2.pose(node.x, node.y, 0.0), False)
         for node in topology.nodes.values()
@@ -361,10 +348,10 @@ def _decision(
     goal = target.goal if isinstance(target, Frontier) else target
     chosen = None if goal is None else _end_node(-number, goal, True)
     code = FinishCode.NONE
-    reason = 'something is left'
+    reason = 'targets remain'
     if finished:
         code = FinishCode.NOTHING_REACHABLE if failures else FinishCode.ALL_RESOLVED
-        reason = 'what is left cannot be reached' if failures else 'nothing is left'
+        reason = 'remaining targets are unreachable' if failures else 'no target is left'
     return Decision(chosen, finished, reason, code, nodes, [], 0.0, 0.0)
 
 

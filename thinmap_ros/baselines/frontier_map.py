@@ -1,7 +1,4 @@
-"""What all frontier based exploration shares.
-
-Stretches of frontier, where to look at them from, how far that is.
-"""
+"""Frontiers for the baseline strategies: clusters, viewpoints and path lengths."""
 
 import math
 from dataclasses import dataclass
@@ -35,9 +32,9 @@ _COARSE = 2
 
 @dataclass(frozen=True, eq=False)
 class Frontier:
-    """A stretch of frontier: its cells (N, 2), its middle and the place to look at it from (2,), m.
+    """A frontier cluster: its cells (N, 2), centroid (2,) and viewpoint (2,), m.
 
-    way_m: length of the way from the robot to that place.
+    path_length_m: length of the path from the robot to the viewpoint.
     """
 
     cells: Cells
@@ -47,26 +44,23 @@ class Frontier:
 
     @property
     def goal(self) -> Array:
-        """The place, with the heading from there to the middle, (3,)."""
+        """The viewpoint, facing the centroid, (3,)."""
         dx, dy = self.centroid - self.viewpoint
         return se2.pose(self.viewpoint[0], self.viewpoint[1], math.atan2(dy, dx))
 
 
 class FrontierMap:
-    """The frontiers of the map as it grows.
-
-    Those that were looked at closely and stayed do not count any more.
-    """
+    """The frontiers of a growing map, without those that persist after close observation."""
 
     def __init__(self, allow_backtracking: bool = False) -> None:
-        """allow_backtracking: it can go back where it came, also where the map looks too narrow."""
+        """allow_backtracking: the recent path counts as traversable, however narrow it appears."""
         self.borders = OpenBorders(SHORTEST_M)
         self._recent_path = RecentPath() if allow_backtracking else None
         self.patch: GridPatch | None = None
         self._reachable: Mask = np.zeros((0, 0), dtype=np.bool_)
 
     def update(self, patch: GridPatch, scan: Scan, T_map_base: Array) -> None:
-        """Take in the map after a scan made at a pose (3,)."""
+        """Update the frontiers after a scan made at a pose (3,)."""
         self.patch = patch
         xy = (float(T_map_base[0]), float(T_map_base[1]))
         if self._recent_path is not None:
@@ -75,12 +69,12 @@ class FrontierMap:
         self.borders.examine(xy, _CLOSE_LOOK_M, directions_of_view(scan, T_map_base))
 
     def is_open(self, frontier: Frontier) -> bool:
-        """Whether enough of a frontier, found on this very patch's frame, is left."""
+        """Whether enough of a frontier remains; its cells must be of the present frame."""
         left = np.count_nonzero(self.borders.mask[frontier.cells[:, 0], frontier.cells[:, 1]])
         return bool(left * self.borders.frame.resolution >= SHORTEST_M - 1e-6)
 
     def find(self, T_map_base: Array) -> list[Frontier]:
-        """All frontiers that can be looked at from where the robot can get to from a pose (3,)."""
+        """All frontiers with a viewpoint that is reachable from a pose (3,)."""
         frame = self.borders.frame
         cells, numbers, _ = self.borders.stretches()
         xy = (float(T_map_base[0]), float(T_map_base[1]))
@@ -105,7 +99,7 @@ class FrontierMap:
         ]
 
     def _reach_from(self, standing: Mask, xy: tuple[float, float]) -> Mask:
-        """Cells (H, W) to which the robot can get from a point (m)."""
+        """Cells (H, W) that are reachable from a point (m)."""
         free = self.borders.free
         frame = self.borders.frame
         row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
@@ -120,7 +114,7 @@ class FrontierMap:
         )
 
     def path_lengths_from(self, xy: Array, places: Array) -> Array:
-        """Length, m, of the ways from a point (2,) to places (N, 2) that `find` has found, (N,)."""
+        """Path lengths, m, from a point (2,) to viewpoints (N, 2) of `find`, (N,)."""
         frame = self.borders.frame
         cells = frame.cells_of(np.vstack([xy[None], places])) // _COARSE
         start = (int(cells[0, 0]), int(cells[0, 1]))

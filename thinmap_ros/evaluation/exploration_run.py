@@ -1,4 +1,4 @@
-"""One exploration of a simulated world, and the report on it."""
+"""Exploration of a simulated world, with a report."""
 
 import time
 from collections.abc import Callable

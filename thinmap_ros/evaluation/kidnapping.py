@@ -1,4 +1,4 @@
-"""A robot carried off while it explores: if it notices, and how soon it knows where it is again."""
+"""Kidnaps the robot during exploration, and measures detection and recovery."""
 
 import math
 from typing import Any
@@ -24,11 +24,10 @@ _RIGHT_RAD = math.radians(10.0)
 
 
 class Kidnapping:
-    """What befalls a closed loop whose robot is carried, once, to a random place of its map.
+    """Teleports the robot of a closed loop once to a random place of its map.
 
-    When its localizer is lost, samples all over the map find it again. Until then it explores what
-    is around it, as a robot that has just been switched on, for itself: nothing of that gets into
-    the map.
+    When its localizer is lost, global localization starts. Meanwhile the robot explores its
+    surroundings with a separate pipeline and map.
     """
 
     def __init__(self, at_s: float, seed: int) -> None:
@@ -43,7 +42,7 @@ class Kidnapping:
         self._finder: GlobalLocalization | None = None
 
     def report(self) -> dict[str, Any]:
-        """What became of it, for the report: times in s, None for what has not happened."""
+        """Results for the report: times in s, None for events that did not happen."""
 
         def after(since: float | None, until: float | None) -> float | None:
             return None if since is None or until is None else round(until - since, 3)
@@ -63,11 +62,11 @@ class Kidnapping:
 
     @property
     def is_lost(self) -> bool:
-        """Whether the robot looks for where it is."""
+        """Whether global localization is running."""
         return self._finder is not None
 
     def handle_scan(self, loop: ClosedLoop, scan: Scan, T_odom_base: Array) -> bool:
-        """Whether a scan, of before the robot was carried or of a lost one, is not for the loop."""
+        """Process a scan; returns whether the loop must ignore it."""
         if self._carried_s is None and scan.stamp_ns >= 1e9 * self._at_s:
             self._kidnap(loop, scan.stamp_ns / 1e9)
             return True
@@ -77,7 +76,7 @@ class Kidnapping:
         return True
 
     def update(self, loop: ClosedLoop, scan: Scan, estimate: Estimate) -> None:
-        """Begin to search once the robot is lost."""
+        """Start global localization when the robot is lost."""
         if (
             estimate.is_lost
             and self._finder is None
@@ -92,7 +91,7 @@ class Kidnapping:
             loop.replace_strategy(Pipeline(), NearestFrontier(), Navigator(loop.navigator.config))
 
     def _kidnap(self, loop: ClosedLoop, seconds: float) -> None:
-        """Put the robot on some place that it has mapped, far from where it is."""
+        """Teleport the robot to a random mapped place far from its position."""
         world = loop.simulation.world
         robot = loop.simulation.robot
         patch = loop.pipeline.grid.known_area()
@@ -101,7 +100,7 @@ class Kidnapping:
         fits = [world.is_clear(x, y, robot.config.radius_m + _MARGIN_M) for x, y in at.tolist()]
         if not any(fits):
             raise InputError(
-                f'--kidnap-at={self._at_s:g}: nothing {_FAR_M:g} m off is known: '
+                f'--kidnap-at={self._at_s:g}: no mapped place is {_FAR_M:g} m away: '
                 'expected a later time'
             )
         rng = np.random.default_rng(self._seed)
@@ -114,7 +113,7 @@ class Kidnapping:
     def _search(
         self, loop: ClosedLoop, finder: GlobalLocalization, scan: Scan, T_odom_base: Array
     ) -> None:
-        """One scan of a lost robot, for all of its localizers."""
+        """Process a scan of a lost robot, with all of its localizers."""
         assert self._own is not None
         localizer = self._own[0].localizer
         T_world_base = loop.simulation.robot.T_world_base

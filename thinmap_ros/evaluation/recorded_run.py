@@ -1,4 +1,4 @@
-"""What a run of the live graph leaves behind, read back from its bag."""
+"""Results of a run of the live graph, from its bag."""
 
 import json
 import sys
@@ -52,7 +52,7 @@ class Recording:
 
 
 def read(path: Path) -> Recording:
-    """Read what counts from a bag of a run. Raises InputError where a topic is missing."""
+    """Read the outputs from the bag of a run. Raises InputError if a topic is missing."""
     bag = Bag(path)
     recording = Recording()
     for raw in bag.messages(_TOPICS):
@@ -128,7 +128,7 @@ def _report(recording: Recording, seen: ObservableCells, result: dict[str, Any])
         bool(result['finished']), str(result['reason']), recording.collisions
     )
     report = exploration_report(ending, times, true, estimated, coverage, _census(recording))
-    # Heading as well: a live run is judged by its poses, not by places alone.
+    # Also the heading: a live run is evaluated by its poses.
     turned = se2.wrap(np.asarray(estimated[:, 2] - true[:, 2]))
     report['heading_rmse_deg'] = round(float(np.degrees(np.sqrt(np.mean(turned**2)))), 4)
     return report

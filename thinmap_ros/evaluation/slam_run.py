@@ -1,4 +1,4 @@
-"""One drive through localizer, grid and topology, and how far off it was."""
+"""Runs a drive through localizer, grid and topology, and computes its errors."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -17,9 +17,9 @@ Watch = Callable[[int, DriveSample, Pipeline, PipelineResult], None]
 
 @dataclass(eq=False)
 class Run:
-    """What came of each scan: seconds (N,); poses (N, 3) true, by odometry and estimated.
+    """Results of each scan: seconds (N,); poses (N, 3) true, by odometry and estimated.
 
-    1 sigma (N, 3); features.
+    Also 1 sigma (N, 3), and numbers of features.
     """
 
     pipeline: Pipeline
@@ -34,16 +34,16 @@ class Run:
     step_ms: list[float] = field(default_factory=list)
 
     def errors(self, poses: list[Array] | None = None) -> Array:
-        """How far poses (N, 3), or the estimates, are off.
+        """Errors of poses (N, 3), or of the estimates.
 
-        Along and across the true heading, m, and in it, rad.
+        Along and across the true heading, m, and in heading, rad.
         """
         found = self.estimate if poses is None else poses
         return np.array([se2.between(T, other) for T, other in zip(self.truth, found, strict=True)])
 
     @property
     def position_error(self) -> str:
-        """How far positions are off, in words."""
+        """Position errors as text."""
         off = 100.0 * np.hypot(*self.errors()[:, :2].T)
         return f'{off.mean():.1f} cm (mean), {off.max():.1f} cm (most)'
 
@@ -56,7 +56,7 @@ class Run:
 def run_drive(
     looks: Iterable[DriveSample], slam: str = 'ekf_ti', watch: Watch | None = None
 ) -> Run:
-    """Run a drive; the map's frame is the world's.
+    """Run a drive in the world frame.
 
     slam: ekf_ti and ekf_full are the paper's filter, ti is ours. watch is called after each scan
     with its number.

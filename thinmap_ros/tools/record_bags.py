@@ -1,4 +1,4 @@
-"""Record the experiments' drives: sensors, ground truth, outputs, each a bag with a text on it."""
+"""Records the drives of the experiments: a bag with sensors, ground truth and outputs for each."""
 
 import argparse
 from collections.abc import Iterable
@@ -34,7 +34,7 @@ _TYPES = {
 
 
 class _BagRecorder:
-    """A bag that is written to, its messages of one stamp a nanosecond apart in the log."""
+    """Writes a bag; messages with equal stamps are a nanosecond apart in log time."""
 
     def __init__(self, writer: BagWriter) -> None:
         self._writer = writer
@@ -46,7 +46,7 @@ class _BagRecorder:
         self._writer.write(topic, _TYPES[topic], self._log_ns, message)
 
     def write_laser_mount(self, look: DriveSample) -> None:
-        """Where the laser sits."""
+        """Write the pose of the laser."""
         ns = look.scan.stamp_ns
         made = self._objects
         self._write(
@@ -54,7 +54,7 @@ class _BagRecorder:
         )
 
     def write_sensors(self, look: DriveSample) -> None:
-        """What the robot had at a scan, and where it truly was."""
+        """Write scan, odometry and true pose of a sample."""
         ns = look.scan.stamp_ns
         made = self._objects
         self._write(TRUTH_TOPIC, ns, made.pose(ns, 'map', look.T_world_base))
@@ -63,13 +63,13 @@ class _BagRecorder:
         self._write('/scan', ns, made.scan(look.scan))
 
     def write_estimate(self, ns: int, estimate: Estimate) -> None:
-        """What the localizer made of it."""
+        """Write the estimate of the localizer."""
         made = self._objects
         self._write('/pose', ns, made.estimate(ns, estimate.T_map_base, estimate.covariance))
         self._write('/tf', ns, made.transform(ns, ('map', 'odom'), estimate.T_map_odom))
 
     def write_maps(self, ns: int, pipeline: Pipeline) -> None:
-        """Map and graph as they are."""
+        """Write the present map and graph."""
         self._write('/map', ns, self._objects.grid(ns, pipeline.grid.known_area()))
         self._write('/topology', ns, self._objects.topology(ns, pipeline.topology.map))
 
@@ -102,7 +102,7 @@ def record(path: Path, looks: Iterable[DriveSample], localized: bool) -> int:
 
 
 def _pipeline(first: DriveSample, localized: bool) -> tuple[Pipeline, list[Array]]:
-    """A pipeline for a drive that begins so, and the list that is to take each scan's true pose."""
+    """A pipeline for a drive from this sample, and the list for the true pose of each scan."""
     x, y, yaw = (float(number) for number in first.T_world_base)
     localizer = ScanLocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=yaw)
     config = PipelineConfig(localizer=localizer)

@@ -1,7 +1,4 @@
-"""A log or bag through localizer, grid and topology, as fast as it goes.
-
-Trajectory, map, graph, report and picture.
-"""
+"""Replays a log or bag through localizer, grid and topology, as fast as possible."""
 
 import argparse
 import sys
@@ -26,32 +23,29 @@ from thinmap_ros.tools import cli
 from thinmap_ros.view.null_view import NullView
 from thinmap_ros.view.rerun_view import View
 
-# What is large is put together once a second, as a view does not draw it more often.
+# Large data are converted once a second: a view does not draw them more often.
 _PERIOD_NS = 1_000_000_000
 _STAGES = {'localizer': 'localizer', 'grid': 'map update', 'topology': 'graph update'}
 
 
 class ReplayView:
-    """Tells a view what a pipeline makes of each scan: the same picture as of the live nodes.
-
-    At the end `last` shows the map and graph again.
-    """
+    """Shows the results of a pipeline in a view, as of live nodes; `finish` shows the final map."""
 
     def __init__(self, view: NullView) -> None:
-        """Begin with nothing shown."""
+        """Start with an empty view."""
         self._view = view
         self._T_map_odom: Array | None = None
         self._drawn_ns: int | None = None
 
     def step(self, scan: Scan, T_odom_base: Array, estimate: Estimate, pipeline: Pipeline) -> None:
-        """Show what came of a scan with the odometry pose (3,) at its stamp."""
+        """Show the result of a scan with the odometry pose (3,) at its stamp."""
         ns = scan.stamp_ns
         view = self._view
         view.pose(ns, estimate.T_map_base, estimate.covariance)
         view.scan(ns, scan)
         if self._T_map_odom is None:
             self._T_map_odom = estimate.T_map_odom
-        # Odometry as if it had been all there is since the first pose.
+        # Dead reckoning from the first pose.
         view.trajectory(ns, 'odometry', se2.compose(self._T_map_odom, T_odom_base))
         sigma_m = float(np.sqrt(max(np.linalg.eigvalsh(estimate.covariance[:2, :2])[-1], 0.0)))
         view.scalar(ns, 'error', '2 sigma, cm', 200.0 * sigma_m)
@@ -92,10 +86,7 @@ def _work(arguments: argparse.Namespace) -> None:
 
 @contextmanager
 def _view(arguments: argparse.Namespace) -> Iterator[View | None]:
-    """What is asked for of viewer and recording.
-
-    Of a log that cannot be replayed there is no recording.
-    """
+    """The requested viewer and recording. The recording is deleted if the replay fails."""
     if not (arguments.view or arguments.recording):
         yield None
         return

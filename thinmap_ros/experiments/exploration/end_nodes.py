@@ -55,7 +55,11 @@ def run(source: Source) -> Outcome:
         moved = np.hypot(*(line[:, 1:3] - line[0, 1:3]).T)
         curves.append(Curve(xy(line[:, 3], moved), name.replace('_', ' '), k, ('-', '--')[k]))
     panel = Panel(
-        curves, '', 'way of the robot (m)', 'node A from where it was first (m)', plan=False
+        curves,
+        '',
+        'travelled distance (m)',
+        'distance of node A from its first position (m)',
+        plan=False,
     )
     caption = 'Paper 2, to Fig. 5 and 6: how far node A has moved.'
     plots.append(Plot('movement', caption, [panel], panel_inches=(6.5, 3.6), legend='inside'))
@@ -90,7 +94,7 @@ Moment = tuple[float, Array, GridPatch, TopologicalMap, Array]
 
 
 def _follow(source: Source, name: str) -> tuple[list[Moment], list[list[float]]]:
-    """State once a second (time, pose, map, graph, node A), and A at each scan: time, x, y, way."""
+    """State once a second (time, pose, map, graph, node A); A by scan: time, x, y, path."""
     builder = TopologyBuilder(TopologyConfig())
     grid = OccupancyGrid()
     moments: list[Moment] = []
@@ -141,7 +145,7 @@ def _moved(track: Array) -> float:
 
 
 def _rest(track: Array) -> float:
-    """Way of the robot at which node A had come, to stay, to where it is in the end, m."""
+    """Travelled distance at which node A reached its final position, m."""
     off = np.hypot(*(track[:, 1:3] - track[-1, 1:3]).T) > _RESTS_M
     moving = np.flatnonzero(off)
     return float(track[moving[-1], 3]) if moving.size else 0.0

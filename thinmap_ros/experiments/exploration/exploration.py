@@ -38,7 +38,7 @@ _FULL = 0.99
 
 @dataclass(frozen=True, eq=False)
 class _Moment:
-    """What was known at a scan."""
+    """State of map and graph at a scan."""
 
     seconds: float
     T_map_base: Array
@@ -48,7 +48,7 @@ class _Moment:
 
 
 def run(source: Source) -> Outcome:
-    """Decide anew what was decided on the drive, from the same scans; look at what was known."""
+    """Replay the decisions of the drive from the same scans, and show the map at six moments."""
     world = world_of('room_10x10')
     moments, census = _replay_exploration(list(source.looks('room_10x10')))
     goal = observable_cells(
@@ -116,7 +116,7 @@ _COLUMNS = [
 
 
 def _replay_exploration(looks: list[DriveSample]) -> tuple[list[_Moment], EndNodeCensus]:
-    """Once a second, and at the end, what is known."""
+    """State of map and graph once a second, and at the end."""
 
     def here(scan: object, T_odom_base: Array) -> Estimate:
         return Estimate(truth, np.zeros((3, 3)), np.zeros(3))

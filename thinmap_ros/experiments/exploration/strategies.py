@@ -148,7 +148,7 @@ def _summary(name: str, runs: dict[str, dict[tuple[str, int], Report]]) -> list[
 
 
 def _complete(runs: dict[tuple[str, int], Report]) -> dict[tuple[str, int], Report]:
-    """Runs that saw nearly all: what stops much too soon is no shorter way."""
+    """Runs with nearly complete coverage: a run that stops early is not more efficient."""
     return {key: report for key, report in runs.items() if report['coverage'] >= _COMPLETE}
 
 

@@ -39,7 +39,7 @@ _LIMITS = (-1.0, 41.0, -2.0, 12.0)  # the odometry alone goes far beyond
 
 
 class _Glance:
-    """What the robot knew at one scan."""
+    """Estimate and map at one scan."""
 
     def __init__(self, number: int) -> None:
         self.number = number
@@ -104,7 +104,7 @@ def _comparisons(ti: Run, full: Run, apart: Array, used: float, known: int) -> l
             str(_LINES),
             str(known),
             abs(known - _LINES) <= 0.1 * _LINES,
-            remark='the world has 33 surfaces of at least 0.8 m; those that go on behind a door '
+            remark='the world has 33 surfaces of at least 0.8 m; those that continue behind a door '
             'are one feature',
         ),
         Comparison(

@@ -28,8 +28,8 @@ _LASERS = {
         'max_range_m': 25.0,
     },
 }
-# What others are said to reach on the Intel log: errors of translation in m, live and after all
-# corrections; CPU ms a scan; MB. Single runs of the programs with their defaults, Cartographer
+# Published results on the Intel log: errors of translation in m, live and after all corrections;
+# CPU ms per scan; MB. Single runs of the programs with their defaults, Cartographer
 # tuned; the last three as published in 2009.
 _OTHERS: list[tuple[str, float | None, float, float | None, float | None]] = [
     ('IRIS LaMa slam2d', 0.036, 0.033, 0.17, 13.0),

@@ -213,7 +213,7 @@ def _comparisons(ti: Run, full: Run, ours: Run, turned: Array) -> list[Compariso
             str(_LINES),
             str(known),
             abs(known - _LINES) <= 0.1 * _LINES,
-            remark='the world has 88 surfaces of at least 0.8 m; those that go on behind a door '
+            remark='the world has 88 surfaces of at least 0.8 m; those that continue behind a door '
             'are one feature',
         ),
         Comparison(

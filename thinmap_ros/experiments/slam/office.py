@@ -49,7 +49,7 @@ def run(source: Source) -> Outcome:
             Comparison(
                 'pose',
                 '',
-                f'off by {done.position_error}; wheels alone {wheels[-1]:.2f} m at the end',
+                f'off by {done.position_error}; dead reckoning {wheels[-1]:.2f} m at the end',
                 remark=f'scan matching (`slam: scan_matching`): {ours.position_error}',
             ),
         ],
