@@ -89,24 +89,24 @@ def tour(world: World, start: Array, radius_m: float, goals: int, seed: int) -> 
             if unseen.max() < 1.0:
                 break
             goal = standing[int(np.argmax(unseen + rng.uniform(0.0, 2.0, len(unseen))))]
-            way = plan(patch, (poses[-1][0], poses[-1][1]), (goal[0], goal[1]), config)
-            if way is not None:
+            path = plan(patch, (poses[-1][0], poses[-1][1]), (goal[0], goal[1]), config)
+            if path is not None:
                 break
             unseen[np.hypot(*(standing - goal).T) < 1.0] = 0.0
         else:
             break
-        if unseen.max() < 1.0 or way is None:
+        if unseen.max() < 1.0 or path is None:
             break
-        been = list(way[::10])
-        poses += _along(poses[-1], way)
+        been = list(path[::10])
+        poses += _along(poses[-1], path)
     return poses
 
 
-def _along(T: Array, way: Array) -> list[Array]:
+def _along(T: Array, path: Array) -> list[Array]:
     """Poses every _STEP_M along a path, after a rotation in place."""
-    travelled = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))))
+    travelled = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))))
     marks = np.arange(_STEP_M, travelled[-1], _STEP_M)
-    points = np.column_stack([np.interp(marks, travelled, way[:, axis]) for axis in (0, 1)])
+    points = np.column_stack([np.interp(marks, travelled, path[:, axis]) for axis in (0, 1)])
     poses = []
     last = T
     for point in points:

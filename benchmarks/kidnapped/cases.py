@@ -257,9 +257,9 @@ def foreign_log(setting: Setting) -> Iterator[Case]:
 
 def _log_elsewhere(setting: Setting, name: str) -> Record:
     known = _map_of(setting.worlds, name)
-    looks = split_log.looks_from(setting.log, sum(map(ord, name)))
+    samples = split_log.samples_from(setting.log, sum(map(ord, name)))
     return trials.watch_foreign(
-        GlobalLocalization(known.patch, known.topology, seed=1), looks, _FOREIGN_WAY_M
+        GlobalLocalization(known.patch, known.topology, seed=1), samples, _FOREIGN_WAY_M
     )
 
 

@@ -76,8 +76,8 @@ def measure_drive(
     recording: Recording = read_recording(recordings / f'{flat(case.world)}.npz')
     truth = recording.T_world_base
     config = config_of(options, truth[0])
-    looks = recording.replay(_ROBOT, case.odometry_seed)
-    pairs = ((look.scan, look.T_odom_base) for look in looks)
+    samples = recording.replay(_ROBOT, case.odometry_seed)
+    pairs = ((sample.scan, sample.T_odom_base) for sample in samples)
     return simulated_numbers(play(pairs, config, scans_per_graph), truth)
 
 

@@ -46,13 +46,13 @@ class _Mark:
 
 def run(worlds: Path, quick: bool) -> Iterator[Row]:
     """Rows at some lengths of the drive, as they come."""
-    deque(_drive(islice(_looks()[0], _WARM_UP), [math.inf]), maxlen=0)  # compiles
-    looks, lap_m = _looks()
+    deque(_drive(islice(_samples()[0], _WARM_UP), [math.inf]), maxlen=0)  # compiles
+    samples, lap_m = _samples()
     # A further drive along the first part.
     again = [lap * lap_m + _MARKS_M[0] for lap in range(1, 4)]
     first: _Mark | None = None
     new: _Mark | None = None  # the last one of the first lap
-    for mark in _drive(looks, sorted(_MARKS_QUICK_M if quick else {*_MARKS_M, *again})):
+    for mark in _drive(samples, sorted(_MARKS_QUICK_M if quick else {*_MARKS_M, *again})):
         yield from _rows(mark)
         first = first or mark
         if mark is first:
@@ -97,45 +97,45 @@ def _ratios(where: str, mark: _Mark, first: _Mark) -> Iterator[Row]:
     yield at_most('  the same, mean', float(now.mean() / then.mean()), 1.2)
 
 
-def _drive(looks: Iterator[DriveSample], marks_m: list[float]) -> Iterator[_Mark]:
+def _drive(samples: Iterator[DriveSample], marks_m: list[float]) -> Iterator[_Mark]:
     """Marks after these lengths of the drive."""
     pipeline: CpuTimedPipeline | None = None
-    way_m = 0.0
+    travelled_m = 0.0
     last = None
     ways = []
     taken: dict[str, list[float]] = {part: [] for part in ('all', *_PARTS)}
-    for look in looks:
+    for sample in samples:
         if pipeline is None:
-            x, y, yaw = look.T_world_base.tolist()
+            x, y, yaw = sample.T_world_base.tolist()
             pipeline = CpuTimedPipeline(
                 PipelineConfig(
                     localizer=ScanLocalizerConfig(start_x_m=x, start_y_m=y, start_yaw_rad=yaw)
                 )
             )
-        way_m += 0.0 if last is None else float(np.hypot(*(look.T_world_base - last)[:2]))
-        last = look.T_world_base
+        travelled_m += 0.0 if last is None else float(np.hypot(*(sample.T_world_base - last)[:2]))
+        last = sample.T_world_base
         began = time.process_time()
-        T_map_base = pipeline.step(look.scan, look.T_odom_base).estimate.T_map_base
+        T_map_base = pipeline.step(sample.scan, sample.T_odom_base).estimate.T_map_base
         taken['all'].append(time.process_time() - began)
         for part in _PARTS:
             taken[part].append(pipeline.stage_seconds[part][-1])
-        ways.append(way_m)
-        if way_m >= marks_m[0]:
-            on_span = np.array(ways) > way_m - _SPAN_M
+        ways.append(travelled_m)
+        if travelled_m >= marks_m[0]:
+            on_span = np.array(ways) > travelled_m - _SPAN_M
             patch = pipeline.grid.known_area()
             yield _Mark(
                 marks_m[0],
                 {part: 1e3 * np.array(each)[on_span] for part, each in taken.items()},
                 float(patch.free.sum()) * patch.frame.resolution**2,
                 resident_mb(),
-                float(np.hypot(*(T_map_base - look.T_world_base)[:2])),
+                float(np.hypot(*(T_map_base - sample.T_world_base)[:2])),
             )
             marks_m = marks_m[1:]
             if not marks_m:
                 return
 
 
-def _looks() -> tuple[Iterator[DriveSample], float]:
+def _samples() -> tuple[Iterator[DriveSample], float]:
     """The tour of the warehouse, again and again, and its length, m."""
     path = world_path('warehouse')
     world = World.from_patch(*read_world(path))

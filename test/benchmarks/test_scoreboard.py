@@ -333,7 +333,7 @@ def test_a_drive_ends_where_it_began_and_its_noise_is_what_is_asked_for():
     assert robot.radius_m == PRESETS['3at'].radius_m
     made = generate_building(11)
     start = drives._start(made, robot)
-    paths = list(drives.ways(made, start, robot, 11))
+    paths = list(drives.paths(made, start, robot, 11))
     assert len(paths) > 1
     np.testing.assert_allclose(paths[-1][-1], start[:2], atol=0.2)
 

@@ -1,4 +1,4 @@
-"""Kernels are kept where there is room for them, and compiled anew when what they hold changed."""
+"""Kernels are cached in a writable folder, and recompiled when their code or constants change."""
 
 import os
 import shutil

@@ -8,7 +8,7 @@ import pytest
 from thinmap_ros.closed_loop import ExplorationOutcome
 from thinmap_ros.core.exploration.strategy import FIRST_STAND_IN_ID
 from thinmap_ros.evaluation.exploration_metrics import (
-    FEWEST_SIGHTINGS,
+    MIN_OBSERVATIONS,
     EndNodeCensus,
     TargetLog,
     exploration_report,
@@ -40,7 +40,7 @@ def test_two_at_once_are_two_places_however_near():
 def test_what_did_not_last_is_not_counted():
     blink = (1, 5.0, 5.0)
     stay = (2, 0.0, 0.0)
-    decisions = [[blink, stay]] * (FEWEST_SIGHTINGS - 1) + [[stay]]
+    decisions = [[blink, stay]] * (MIN_OBSERVATIONS - 1) + [[stay]]
     assert census_of(*decisions).seen == 1
 
 

@@ -1,4 +1,4 @@
-"""Jobs in processes of their own: what fails is told by name, and nothing else ends with it."""
+"""Jobs in separate processes: failed ones are reported by name, the others continue."""
 
 import argparse
 import json

@@ -186,7 +186,7 @@ def test_headers_of_arrays(tmp_path: Path, load: Callable[[str], object], name: 
 def test_nothing_is_unpickled(tmp_path: Path) -> None:
     trap = tmp_path / 'sprung'
     content = pickle.dumps(np.array([Evil(str(trap))], dtype=object), protocol=2)
-    # As many objects as fill the bytes that are there, for whoever compares the two.
+    # As many objects as fill these bytes, to match the declared size.
     content += bytes(-len(content) % 8)
     member = with_header(plain((len(content) // 8,), '|O'), content)
     path = archive(tmp_path / 'a.grid.npz', thinmap_format=npy(np.array('grid 1')), frame=member)

@@ -1,4 +1,4 @@
-"""Saved sessions: work goes on as if it had never stopped."""
+"""Saved sessions: a restored state continues as if there had been no interruption."""
 
 import math
 from itertools import pairwise

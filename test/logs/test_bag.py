@@ -1,4 +1,4 @@
-"""Bags: what is written is read back; that one is broken or lacks something is said in one line."""
+"""Bags: written data are read back; damage and missing data are reported in one line."""
 
 import math
 import struct

@@ -94,8 +94,8 @@ def test_the_tour_can_be_driven(name: str) -> None:
     simulation = Simulation(world, world.start, robot, LaserScannerConfig(rate_hz=0.1), 0)
     poses = np.array(
         [
-            look.T_world_base
-            for look in drive(simulation, tour_paths(world, tour, robot.radius_m), 0.5)
+            sample.T_world_base
+            for sample in drive(simulation, tour_paths(world, tour, robot.radius_m), 0.5)
         ]
     )
     assert simulation.robot.collisions == 0

@@ -226,7 +226,7 @@ def test_stamps_that_jump_back_do_no_harm(tmp_path):
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / 'out' / 'report.json').read_text())
     assert report['scans'] + report['skipped'] == 40
-    # As in the file: a robot's clock is set back now and then, and its log goes on.
+    # As in the file: a robot's clock is set back now and then, and its log continues.
     assert report['scans'] >= 38
     poses = np.loadtxt(tmp_path / 'out' / 'trajectory.tum')
     assert np.isfinite(poses).all()

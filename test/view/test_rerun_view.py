@@ -1,4 +1,4 @@
-"""What a view is told stands in the .rrd file; read back with rerun's own reader."""
+"""Data shown in a view are in the .rrd file, read back with rerun's own reader."""
 
 import subprocess
 import sys

@@ -50,15 +50,15 @@ class _ProgressTimeout:
         self._driven: _Progress | None = None
         self._stamp_ns = 0
 
-    def has_expired(self, place: Array, way_m: float, stamp_ns: int) -> bool:
+    def has_expired(self, place: Array, length_m: float, stamp_ns: int) -> bool:
         """Add driving time towards a place (2,) at a remaining path length, m."""
         same = (p for p in self._watched if math.dist(p.place, place) <= _SAME_PLACE_M)
         progress = next(same, None)
         if progress is None:
-            progress = _Progress((float(place[0]), float(place[1])), way_m)
+            progress = _Progress((float(place[0]), float(place[1])), length_m)
             self._watched.append(progress)
-        if way_m < progress.nearest_m - _PROGRESS_M:
-            progress.nearest_m = way_m
+        if length_m < progress.nearest_m - _PROGRESS_M:
+            progress.nearest_m = length_m
             progress.waited_ns = 0
         if self._driven is progress:
             progress.waited_ns += max(stamp_ns - self._stamp_ns, 0)
@@ -238,13 +238,13 @@ class DistanceAdvantage(FrontierExplorer):
 
     def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
         """Negative advantage."""
-        ways = np.array([f.path_length_m for f in frontiers])
+        lengths = np.array([f.path_length_m for f in frontiers])
         places = np.array([f.viewpoint for f in frontiers])
         if len(frontiers) < 2:
-            return ways
+            return lengths
         between = np.array([self.map.path_lengths_from(place, places) for place in places])
         between = np.where(np.isfinite(between), between, 0.0)
-        return np.asarray(ways - between.sum(axis=0) / (len(frontiers) - 1))
+        return np.asarray(lengths - between.sum(axis=0) / (len(frontiers) - 1))
 
 
 class VisitAllEndNodes(NearestFrontier):
@@ -275,13 +275,13 @@ class VisitAllEndNodes(NearestFrontier):
         if found is None:
             self._end_node = None
             return super().step(topology, patch, scan, T_map_base)
-        goal, way_m = found
+        goal, length_m = found
         self.map.update(patch, scan, T_map_base)
         if self._end_node is None or not _is_near(self._end_node, goal):
             self._number += 1
             self._end_node = goal
         decision = _decision(topology, self._end_node, self._number, False, False)
-        if self._progress_timeout.has_expired(goal[:2], way_m, scan.stamp_ns):
+        if self._progress_timeout.has_expired(goal[:2], length_m, scan.stamp_ns):
             self.target_failed('no progress')
         return decision
 
@@ -310,11 +310,11 @@ class VisitAllEndNodes(NearestFrontier):
         costs = path_lengths_to_nodes(topology, float(T_map_base[0]), float(T_map_base[1]))
         followed = {i: node for i, node in left.items() if self._is_followed(node.x, node.y)}
         best = min((followed or left).values(), key=lambda node: costs.get(node.id, math.inf))
-        way_m = costs.get(best.id, math.inf)
-        if not math.isfinite(way_m):
+        length_m = costs.get(best.id, math.inf)
+        if not math.isfinite(length_m):
             return None
         heading = math.atan2(best.y - T_map_base[1], best.x - T_map_base[0])
-        return se2.pose(best.x, best.y, heading), way_m
+        return se2.pose(best.x, best.y, heading), length_m
 
     def _is_followed(self, x: float, y: float) -> bool:
         """Whether the end node at a place is the present target, which moves as the map grows."""

@@ -55,7 +55,7 @@ class OdometryBuffer:
             return
         self._stamps.insert(index, stamp_ns)
         self._poses.insert(index, T_odom_base)
-        self._forget()
+        self._drop_old()
 
     def interpolate(self, stamp_ns: int) -> Array | None:
         """Pose at a stamp.
@@ -74,16 +74,16 @@ class OdometryBuffer:
         share = (stamp_ns - before) / (after - before)
         return se2.interpolate(self._poses[index - 1], self._poses[index], share)
 
-    def _forget(self) -> None:
+    def _drop_old(self) -> None:
         first = bisect_left(self._stamps, self._stamps[-1] - self._span_ns)
         # In blocks, so that a long buffer is not shifted at every sample.
         if first > 256:
             del self._stamps[:first], self._poses[:first]
 
 
-_FASTEST_M_S = 3.0
+_MAX_SPEED_M_S = 3.0
 _STEP_BACK_NS = 1_000_000_000
-_LONGEST_GAP_NS = 120_000_000_000
+_MAX_GAP_NS = 120_000_000_000
 _JUMP_M = 0.5  # a larger increment than this plus that speed is a discontinuity
 FIELDS = {
     'stamp_ns': Field(np.int64, (), 0, MAX_COUNT),
@@ -121,7 +121,7 @@ class OdometryAnchor:
         """
         gap_ns = stamp_ns - self.stamp_ns
         moved = math.dist(self.T_odom_base[:2], T_odom_base[:2])
-        return 0 <= gap_ns <= _LONGEST_GAP_NS and moved <= _JUMP_M + _FASTEST_M_S * gap_ns / 1e9
+        return 0 <= gap_ns <= _MAX_GAP_NS and moved <= _JUMP_M + _MAX_SPEED_M_S * gap_ns / 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +161,7 @@ class OdometryIncrements:
         self.T_odom_base = np.array(T_odom_base, dtype=np.float64)
         # Rounded, so that text logs, bags and messages give identical results.
         moved = np.round(se2.between(before, self.T_odom_base), 9)
-        discontinuity_m = _JUMP_M + _FASTEST_M_S * max(seconds, 1.0)
+        discontinuity_m = _JUMP_M + _MAX_SPEED_M_S * max(seconds, 1.0)
         if math.hypot(moved[0], moved[1]) <= discontinuity_m:
             return OdometryIncrement(moved, seconds, 0.0)
         self.rejected += 1

@@ -60,14 +60,14 @@ class EndNodeCensus:
         alive = {place.node_id: place for place in self._places if place.node_id in nodes}
         idle = [place for place in self._places if place.node_id not in nodes]
         for node_id, (x, y) in nodes.items():
-            place = alive.get(node_id) or self._continued(idle, x, y)
+            place = alive.get(node_id) or self._matching_place(idle, x, y)
             place.node_id = node_id
             place.x = x
             place.y = y
             place.observations += 1
             place.visited |= math.dist((x, y), T_map_base[:2]) < NEAR_M
 
-    def _continued(self, idle: list[_Place], x: float, y: float) -> _Place:
+    def _matching_place(self, idle: list[_Place], x: float, y: float) -> _Place:
         near = min(idle, key=lambda place: math.dist((x, y), (place.x, place.y)), default=None)
         if near is not None and math.dist((x, y), (near.x, near.y)) <= SAME_PLACE_M:
             idle.remove(near)

@@ -115,12 +115,12 @@ def completeness(
         from_source = paths.lengths_from(source)
         from_target = paths.lengths_from(target)
         first, last = (_nearest(lengths, at_nodes) for lengths in (from_source, from_target))
-        ways = (
+        lengths = (
             from_source[at_nodes[first], None]
             + between[np.ix_(first, last)]
             + from_target[at_nodes[last]]
         )
-        length = float(ways.min(initial=np.inf))
+        length = float(lengths.min(initial=np.inf))
         if math.isfinite(length):
             found.append(length)
             best.append(float(from_source[target]))

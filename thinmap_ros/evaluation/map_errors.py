@@ -11,7 +11,7 @@ from thinmap_ros.sim.surfaces import surfaces
 from thinmap_ros.sim.world import World
 from thinmap_ros.view.plots import MapLayer, Panel, Raster, Segments
 
-_SHORTEST_M = 0.2
+_MIN_LENGTH_M = 0.2
 _SPACING_M = 0.05
 _FOUND_M = 0.2
 _SHOWN_M = 0.3
@@ -45,7 +45,7 @@ def map_error(patch: GridPatch, world: World) -> MapError:
     at = world.frame.cells_of(patch.frame.centres_of(cells))
     at = np.clip(at, 0, np.array(world.occupied.shape) - 1)
     off_m[cells[:, 0], cells[:, 1]] = to_solid_m[at[:, 0], at[:, 1]]
-    points = _points_on(surfaces(world, _SHORTEST_M))
+    points = _points_on(surfaces(world, _MIN_LENGTH_M))
     to_cell_m = ndimage.distance_transform_edt(np.pad(~patch.occupied, 1, constant_values=True))[
         1:-1, 1:-1
     ]

@@ -54,7 +54,7 @@ class Run:
 
 
 def run_drive(
-    looks: Iterable[DriveSample], slam: str = 'ekf_ti', watch: Watch | None = None
+    samples: Iterable[DriveSample], slam: str = 'ekf_ti', watch: Watch | None = None
 ) -> Run:
     """Run a drive in the world frame.
 
@@ -62,19 +62,19 @@ def run_drive(
     with its number.
     """
     run: Run | None = None
-    for k, look in enumerate(looks):
+    for k, sample in enumerate(samples):
         if run is None:
-            x, y, yaw = (float(v) for v in look.T_world_base)
+            x, y, yaw = (float(v) for v in sample.T_world_base)
             config = ScanLocalizerConfig(slam=slam, start_x_m=x, start_y_m=y, start_yaw_rad=yaw)
             run = Run(Pipeline(PipelineConfig(localizer=config)))
-            start = look
+            start = sample
         began = process_time()
-        step = run.pipeline.step(look.scan, look.T_odom_base)
+        step = run.pipeline.step(sample.scan, sample.T_odom_base)
         run.step_ms.append(1e3 * (process_time() - began))
-        run.seconds.append(look.scan.stamp_ns / 1e9)
-        run.truth.append(look.T_world_base)
+        run.seconds.append(sample.scan.stamp_ns / 1e9)
+        run.truth.append(sample.T_world_base)
         run.odometry.append(
-            se2.compose(start.T_world_base, se2.between(start.T_odom_base, look.T_odom_base))
+            se2.compose(start.T_world_base, se2.between(start.T_odom_base, sample.T_odom_base))
         )
         run.estimate.append(step.estimate.T_map_base)
         run.sigmas.append(np.sqrt(np.diag(step.estimate.covariance)))
@@ -82,6 +82,6 @@ def run_drive(
         run.local.append(step.estimate.n_local_features)
         run.matched.append(step.estimate.matched_lines)
         if watch is not None:
-            watch(k, look, run.pipeline, step)
+            watch(k, sample, run.pipeline, step)
     assert run is not None, 'a drive has at least one scan'
     return run

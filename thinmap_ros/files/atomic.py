@@ -9,7 +9,7 @@ from pathlib import Path
 
 from thinmap_ros.core.errors import InputError, one_line_reason
 
-_MOST_TEXT_BYTES = 1 << 30
+_MAX_TEXT_BYTES = 1 << 30
 _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
@@ -45,15 +45,15 @@ def write_text(path: Path, text: str) -> None:
         aside.write_text(text, encoding='utf-8')
 
 
-def read_text(path: Path, most_bytes: int = _MOST_TEXT_BYTES) -> str:
-    """Read a text file. Raises InputError if it is missing, not text, or above most_bytes."""
+def read_text(path: Path, max_bytes: int = _MAX_TEXT_BYTES) -> str:
+    """Read a text file. Raises InputError if it is missing, not text, or above max_bytes."""
     try:
         with path.open('rb') as stream:
-            content = stream.read(most_bytes + 1)
+            content = stream.read(max_bytes + 1)
     except (OSError, ValueError) as error:  # ValueError: a name with a zero byte
         raise InputError(f'{path}: {getattr(error, "strerror", None) or error}') from error
-    if len(content) > most_bytes:
-        raise InputError(f'{path}: expected at most {most_bytes} bytes')
+    if len(content) > max_bytes:
+        raise InputError(f'{path}: expected at most {max_bytes} bytes')
     try:
         return content.decode('utf-8').replace('\r\n', '\n')
     except UnicodeDecodeError as error:

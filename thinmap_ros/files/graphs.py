@@ -24,9 +24,9 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.files.atomic import read_text, write_text
 
-_LARGEST_ID = 2**32 - 1
-_MOST_BYTES = 256 << 20
-_MOST_DIGITS = 100
+_MAX_ID = 2**32 - 1
+_MAX_BYTES = 256 << 20
+_MAX_DIGITS = 100
 _BAD_FEATURE = (KeyError, TypeError, ValueError, InputError)
 _ARRIVED_M = 0.3  # distance at which topological_navigation counts a node as reached
 _UPRIGHT = {'w': 1.0, 'x': 0.0, 'y': 0.0, 'z': 0.0}
@@ -60,8 +60,8 @@ def write_geojson(path: Path, topology: TopologicalMap, frame_id: str = 'map') -
     Raises InputError if an id is too large for an unsigned int.
     """
     highest = max([0, *topology.nodes, *topology.edges])
-    if highest + max([0, *topology.edges]) > _LARGEST_ID:
-        raise InputError(f'{path}: id {highest}: expected ids whose sum stays below {_LARGEST_ID}')
+    if highest + max([0, *topology.edges]) > _MAX_ID:
+        raise InputError(f'{path}: id {highest}: expected ids whose sum stays below {_MAX_ID}')
     features = [_node_feature(node, frame_id) for node in topology.nodes.values()]
     for edge in topology.edges.values():
         features.append(_edge_feature(edge, edge.id, edge.a))
@@ -105,11 +105,11 @@ def write_graphml(path: Path, topology: TopologicalMap) -> None:
     for edge in topology.edges.values():
         ends = {'id': str(edge.id), 'source': str(edge.a), 'target': str(edge.b)}
         at = ElementTree.SubElement(graph, 'edge', ends)
-        way = ' '.join(f'{x} {y}' for x, y in _rounded(edge.path))
+        path_text = ' '.join(f'{x} {y}' for x, y in _rounded(edge.path))
         values = {
             'length': round(edge.length_m, 3),
             'clearance': round(edge.clearance_m, 3),
-            'path': way,
+            'path': path_text,
         }
         _put_data(at, 'edge', values)
     ElementTree.indent(root)
@@ -212,9 +212,9 @@ def read_geojson(path: Path) -> TopologicalMap:
     Raises InputError naming the file and the feature.
     """
     expected = 'expected a GeoJSON collection of features'
-    text = read_text(path, _MOST_BYTES)
+    text = read_text(path, _MAX_BYTES)
     try:
-        features = json.loads(text, parse_int=_whole)['features']
+        features = json.loads(text, parse_int=_integer)['features']
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f'{path}: {one_line_reason(error)}: {expected}') from error
     if not isinstance(features, list):
@@ -242,10 +242,10 @@ def read_geojson(path: Path) -> TopologicalMap:
     return topology
 
 
-def _whole(digits: str) -> int:
+def _integer(digits: str) -> int:
     """Parse an integer of a JSON text; no valid number has hundreds of digits."""
-    if len(digits) > _MOST_DIGITS:
-        raise ValueError(f'a number of {len(digits)} digits: expected at most {_MOST_DIGITS}')
+    if len(digits) > _MAX_DIGITS:
+        raise ValueError(f'a number of {len(digits)} digits: expected at most {_MAX_DIGITS}')
     return int(digits)
 
 
@@ -291,8 +291,8 @@ def _number(value: Any) -> float:
 
 
 def _id(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 < value <= _LARGEST_ID:
-        raise ValueError(f'id {quoted(value)} is no integer from 1 to {_LARGEST_ID}')
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 < value <= _MAX_ID:
+        raise ValueError(f'id {quoted(value)} is no integer from 1 to {_MAX_ID}')
     return value
 
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from thinmap_ros.core.errors import InputError, ThinmapError, one_line_reason, quoted
 
 MAX_BYTES = 512 << 20
-_MOST_ARRAYS = 64
+_MAX_ARRAYS = 64
 _ENDING = '.npy'
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _READERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
@@ -59,8 +59,8 @@ def read_arrays(stream: IO[bytes]) -> dict[str, NDArray[Any]]:
 
 def _check_sizes(members: list[zipfile.ZipInfo]) -> None:
     names = {member.filename for member in members}
-    if len(members) > _MOST_ARRAYS or len(names) < len(members):
-        expected = f'expected at most {_MOST_ARRAYS}, each once'
+    if len(members) > _MAX_ARRAYS or len(names) < len(members):
+        expected = f'expected at most {_MAX_ARRAYS}, each once'
         raise InputError(f'{len(members)} arrays of {len(names)} names: {expected}')
     size = sum(member.file_size for member in members)
     if size > MAX_BYTES:

@@ -17,8 +17,8 @@ from thinmap_ros.files.yaml import read_mapping
 
 _MARGIN_M = 0.2
 _NUDGE_M = 1e-9
-_MOST_CELLS = 100_000_000
-_LONGEST_NAME = 200
+_MAX_CELLS = 100_000_000
+_MAX_NAME_LENGTH = 200
 _FREE = 0
 _SOLID = 100
 
@@ -30,7 +30,7 @@ def read_world(path: Path) -> tuple[str, GridPatch, Array]:
     Raises InputError with file, key, value and expectation.
     """
     content = read_mapping(path, 'a world (walls, start) or a map (image, resolution, origin)')
-    return _of_map(path, content) if 'image' in content else _of_drawing(path, content)
+    return _from_map(path, content) if 'image' in content else _from_drawing(path, content)
 
 
 def read_tour(path: Path) -> Array:
@@ -42,7 +42,7 @@ def read_tour(path: Path) -> Array:
     return _points(path, 'tour', content['tour'], 1) if 'tour' in content else np.empty((0, 2))
 
 
-def _of_map(path: Path, content: dict[str, Any]) -> tuple[str, GridPatch, Array]:
+def _from_map(path: Path, content: dict[str, Any]) -> tuple[str, GridPatch, Array]:
     start = np.array([np.nan, np.nan, 0.0])
     if 'start' in content:
         start = pose(*_numbers(path, content, 'start', 3))
@@ -92,7 +92,7 @@ def _points(path: Path, what: str, drawn: object, fewest: int) -> Array:
     return points
 
 
-def _of_drawing(path: Path, content: dict[str, Any]) -> tuple[str, GridPatch, Array]:
+def _from_drawing(path: Path, content: dict[str, Any]) -> tuple[str, GridPatch, Array]:
     known = {'name', 'resolution', 'wall_thickness', 'start', 'tour', 'walls', 'solids'}
     if unknown := set(content) - known:
         expected = ', '.join(sorted(known))
@@ -107,10 +107,10 @@ def _of_drawing(path: Path, content: dict[str, Any]) -> tuple[str, GridPatch, Ar
         )
     walls = _polylines(path, content, 'walls', 2)
     polygons = _polylines(path, content, 'solids', 3)
-    polygons += [_slab(a, b, thickness) for wall in walls for a, b in pairwise(wall)]
+    polygons += [_wall_polygon(a, b, thickness) for wall in walls for a, b in pairwise(wall)]
     if not polygons:
         raise InputError(f'{path}: walls: expected at least one wall or solid')
-    frame, shape = _lattice(path, np.concatenate(polygons), resolution)
+    frame, shape = _frame_of(path, np.concatenate(polygons), resolution)
     cells = np.full(shape, _FREE, dtype=np.int8)
     for polygon in polygons:
         _fill(cells, frame, polygon)
@@ -119,13 +119,13 @@ def _of_drawing(path: Path, content: dict[str, Any]) -> tuple[str, GridPatch, Ar
 
 def _name(path: Path, content: dict[str, Any]) -> str:
     name = content.get('name', path.stem)
-    if not isinstance(name, str | int | float) or len(str(name)) > _LONGEST_NAME:
-        expected = f'expected a name of at most {_LONGEST_NAME} characters'
+    if not isinstance(name, str | int | float) or len(str(name)) > _MAX_NAME_LENGTH:
+        expected = f'expected a name of at most {_MAX_NAME_LENGTH} characters'
         raise InputError(f'{path}: name: {quoted(name)}: {expected}')
     return str(name)
 
 
-def _lattice(path: Path, points: Array, resolution: float) -> tuple[GridFrame, tuple[int, int]]:
+def _frame_of(path: Path, points: Array, resolution: float) -> tuple[GridFrame, tuple[int, int]]:
     """Frame and shape of a grid that contains all points; its lines pass through the origin."""
     farthest = float(np.abs(points).max())
     if farthest > MAX_COORDINATE_M:
@@ -133,9 +133,9 @@ def _lattice(path: Path, points: Array, resolution: float) -> tuple[GridFrame, t
         raise InputError(f'{path}: point at {farthest:g} m: {expected}')
     low = np.floor((points.min(axis=0) - _MARGIN_M) / resolution)
     cols, rows = np.ceil((points.max(axis=0) + _MARGIN_M) / resolution) - low
-    if not rows * cols <= _MOST_CELLS:
+    if not rows * cols <= _MAX_CELLS:
         raise InputError(
-            f'{path}: {rows:.0f} x {cols:.0f} cells: expected at most {_MOST_CELLS}; '
+            f'{path}: {rows:.0f} x {cols:.0f} cells: expected at most {_MAX_CELLS}; '
             'is a point wrong?'
         )
     frame = GridFrame(float(low[0]) * resolution, float(low[1]) * resolution, resolution)
@@ -160,7 +160,7 @@ def _fill(cells: NDArray[np.int8], frame: GridFrame, polygon: Array) -> None:
     cells[low[0] : high[0], low[1] : high[1]][inside] = _SOLID
 
 
-def _slab(a: Array, b: Array, thickness: float) -> Array:
+def _wall_polygon(a: Array, b: Array, thickness: float) -> Array:
     """Corners (4, 2) of a wall from a to b, extended by half its thickness to close corners."""
     length = float(np.hypot(*(b - a)))
     along = (b - a) / length if length > 0.0 else np.array([1.0, 0.0])

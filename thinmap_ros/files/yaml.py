@@ -14,9 +14,9 @@ from thinmap_ros.core.errors import InputError, one_line_reason, quoted
 from thinmap_ros.files.atomic import read_text
 
 MAX_BYTES = 4 << 20
-_MOST_NODES = 100_000
-_MOST_LEVELS = 20
-_LONGEST_NUMBER = 100
+_MAX_NODES = 100_000
+_MAX_LEVELS = 20
+_MAX_NUMBER_LENGTH = 100
 _MERGE_TAG = 'tag:yaml.org,2002:merge'
 _NUMBER_TAGS = ('tag:yaml.org,2002:int', 'tag:yaml.org,2002:float')
 
@@ -72,32 +72,32 @@ class _BoundedLoader(yaml.SafeLoader):
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         """Compose the next node. Raises _YamlError beyond the limits, or at an alias."""
         event = self.peek_event()
-        self._refuse_repetition(event)
+        self._reject_aliases(event)
         self._nodes += 1
         self._level += 1
-        if self._nodes > _MOST_NODES:
-            expected = f'expected at most {_MOST_NODES} values, lists and mappings'
+        if self._nodes > _MAX_NODES:
+            expected = f'expected at most {_MAX_NODES} values, lists and mappings'
             raise _YamlError(f'{_at(event)}: {expected}')
-        if self._level > _MOST_LEVELS:
-            raise _YamlError(f'{_at(event)}: expected at most {_MOST_LEVELS} levels')
+        if self._level > _MAX_LEVELS:
+            raise _YamlError(f'{_at(event)}: expected at most {_MAX_LEVELS} levels')
         node = super().compose_node(parent, index)
         self._level -= 1
-        self._refuse_long_number(node, event)
+        self._reject_long_number(node, event)
         return node
 
-    def _refuse_repetition(self, event: yaml.Event) -> None:
+    def _reject_aliases(self, event: yaml.Event) -> None:
         name = getattr(event, 'anchor', None)
         if name is not None:
             expected = 'expected no anchors and aliases (& and *)'
             raise _YamlError(f'{_at(event)}: {quoted(name)}: {expected}')
 
-    def _refuse_long_number(self, node: yaml.Node | None, event: yaml.Event) -> None:
+    def _reject_long_number(self, node: yaml.Node | None, event: yaml.Event) -> None:
         if not isinstance(node, yaml.ScalarNode):
             return
         if node.tag == _MERGE_TAG:
             raise _YamlError(f'{_at(event)}: <<: expected no merge keys')
-        if node.tag in _NUMBER_TAGS and len(node.value) > _LONGEST_NUMBER:
-            expected = f'expected at most {_LONGEST_NUMBER}'
+        if node.tag in _NUMBER_TAGS and len(node.value) > _MAX_NUMBER_LENGTH:
+            expected = f'expected at most {_MAX_NUMBER_LENGTH}'
             size = len(node.value)
             raise _YamlError(f'{_at(event)}: a number of {size} characters: {expected}')
 

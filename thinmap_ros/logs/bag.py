@@ -30,7 +30,7 @@ from thinmap_ros.logs.storage import RawMessage, Storage, storage_of
 _SCAN = 'sensor_msgs/msg/LaserScan'
 _ODOMETRY = 'nav_msgs/msg/Odometry'
 _TF = 'tf2_msgs/msg/TFMessage'
-_MOST_TOLD = 8
+_MAX_WARNINGS = 8
 
 
 class Bag:
@@ -78,7 +78,7 @@ class Bag:
             words.append(self._files.without_metadata)
         if self._unreadable:
             words.append(f'{self._unreadable} messages that cannot be decompressed')
-        return '; '.join(words[:_MOST_TOLD])
+        return '; '.join(words[:_MAX_WARNINGS])
 
     @property
     def repair_hint(self) -> str:

@@ -59,7 +59,7 @@ class BagWriter:
         try:
             self.close()
             if kind is None and self._folder != self._path:
-                _take_name(self._folder, self._path)
+                _rename(self._folder, self._path)
         finally:
             if self._folder != self._path or kind is not None:
                 _remove(self._folder)
@@ -118,7 +118,7 @@ def temporary_bag(path: Path) -> Iterator[Path]:
     folder.mkdir(parents=True)
     try:
         yield folder
-        _take_name(folder, path)
+        _rename(folder, path)
     finally:
         _remove(folder)
 
@@ -127,7 +127,7 @@ def _aside(path: Path) -> Path:
     return path.with_name(f'.{path.name}.{os.getpid()}.part')
 
 
-def _take_name(folder: Path, path: Path) -> None:
+def _rename(folder: Path, path: Path) -> None:
     (file,) = folder.glob('*.mcap')
     if path.suffix == '.mcap':
         file.replace(path)

@@ -112,14 +112,17 @@ class CarmenLog:
                             f'{self.path}:{number}: a zero byte: expected a text file (CARMEN log)'
                         )
                     text = line.decode('utf-8', errors='replace')
-                    yield number, text if text.endswith('\n') else self._whole_words(number, text)
+                    yield (
+                        number,
+                        text if text.endswith('\n') else self._complete_words(number, text),
+                    )
         except (OSError, EOFError, zlib.error) as error:
             if isinstance(error, EOFError | gzip.BadGzipFile | zlib.error):
                 self.skipped.add(f'{self.path}: {error}')
                 return
             raise InputError(f'{self.path}: {error.strerror or error}') from error
 
-    def _whole_words(self, number: int, text: str) -> str:
+    def _complete_words(self, number: int, text: str) -> str:
         """Return a truncated line without its last word, which may be part of a number."""
         whole = text.rstrip().rpartition(' ')[0]
         if text.strip() and not whole:

@@ -11,7 +11,7 @@ from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
-_LARGEST_TILT_DEG = 15.0
+_MAX_TILT_DEG = 15.0
 
 
 def rotation_matrix(q: Any) -> Array:
@@ -75,8 +75,8 @@ class StaticTransforms:
             f'transform to {quoted(message.child_frame_id)}', translation.tolist()
         )
         rotation = rotation_matrix(message.transform.rotation)
-        self._parents[_plain(message.child_frame_id)] = (
-            _plain(message.header.frame_id),
+        self._parents[_without_slash(message.child_frame_id)] = (
+            _without_slash(message.header.frame_id),
             rotation,
             translation,
         )
@@ -88,10 +88,10 @@ class StaticTransforms:
         """
         rotation = np.eye(3)
         translation = np.zeros(3)
-        frame = _plain(laser_frame)
+        frame = _without_slash(laser_frame)
         for _ in range(len(self._parents) + 1):
-            if frame == _plain(base_frame):
-                return _laid_down(laser_frame, rotation, translation)
+            if frame == _without_slash(base_frame):
+                return _projected(laser_frame, rotation, translation)
             if frame not in self._parents:
                 return None
             frame, turned, moved = self._parents[frame]
@@ -100,16 +100,16 @@ class StaticTransforms:
         return None  # a cycle of frames
 
 
-def _laid_down(frame: str, rotation: Array, translation: Array) -> Mount:
+def _projected(frame: str, rotation: Array, translation: Array) -> Mount:
     up = float(rotation[2, 2])
-    if abs(up) < math.cos(math.radians(_LARGEST_TILT_DEG)):
+    if abs(up) < math.cos(math.radians(_MAX_TILT_DEG)):
         tilt = math.degrees(math.acos(min(abs(up), 1.0)))
-        expected = f'expected at most {_LARGEST_TILT_DEG:.0f}'
+        expected = f'expected at most {_MAX_TILT_DEG:.0f}'
         raise InputError(f'laser {quoted(frame)} is tilted by {tilt:.0f} deg: {expected}')
     yaw = math.atan2(rotation[1, 0], rotation[0, 0])
     return Mount(se2.pose(float(translation[0]), float(translation[1]), yaw), up < 0.0)
 
 
-def _plain(frame: str) -> str:
+def _without_slash(frame: str) -> str:
     """Frame name without the leading slash of ROS 1."""
     return frame.lstrip('/')

@@ -36,8 +36,8 @@ from thinmap_ros.logs.mcap_records import (
 
 MAX_DEFINITIONS_BYTES = 64 * 2**20
 """Maximum bytes of all schemas and channels of a file."""
-_LARGEST_SUMMARY = 64 * 2**20
-_MOST_HELD = 512 * 2**20
+_MAX_SUMMARY_BYTES = 64 * 2**20
+_MAX_BUFFERED_BYTES = 512 * 2**20
 _STRETCH = 2**20
 _FOOTER = struct.Struct('<QQI')
 _PLAIN = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
@@ -134,14 +134,14 @@ class McapFile:
         summary = summary_of(path)
         for record in summary.definitions:
             self.definitions.add(record)
-        self._blocks = summary.blocks if self.definitions.channels else []
-        if not self._blocks:
+        self._chunk_spans = summary.blocks if self.definitions.channels else []
+        if not self._chunk_spans:
             for block, records in _walk(path, summary, self.damage):
                 for record in records.definitions:
                     self.definitions.add(record)
                 if records.log_ns.size:
-                    self._blocks.append(block)
-        self.has_messages = bool(self._blocks)
+                    self._chunk_spans.append(block)
+        self.has_messages = bool(self._chunk_spans)
 
     def messages(self, topics: set[str] | None = None) -> Iterator[tuple[Schema, Channel, Message]]:
         """Messages of the given topics, or of all, in the order of the log."""
@@ -156,7 +156,9 @@ class McapFile:
 
     def _in_log_order(self, channel_ids: frozenset[int]) -> Iterator[Message]:
         queue = _LogOrder(channel_ids)
-        blocks = [b for b in self._blocks if b.channel_ids is None or b.channel_ids & channel_ids]
+        blocks = [
+            b for b in self._chunk_spans if b.channel_ids is None or b.channel_ids & channel_ids
+        ]
         with self.path.open('rb') as stream:
             for block in sorted(blocks, key=lambda b: b.first_ns):
                 yield from queue.before(block.first_ns)
@@ -197,7 +199,9 @@ class _LogOrder:
     def before(self, log_ns: int | None) -> Iterator[Message]:
         """Messages before a log time, or all remaining ones."""
         while self._heap:
-            if not (log_ns is None or self._heap[0][0] < log_ns or self._held > _MOST_HELD):
+            if not (
+                log_ns is None or self._heap[0][0] < log_ns or self._held > _MAX_BUFFERED_BYTES
+            ):
                 return
             _, number, place = self._heap[0]
             records, order = self._loaded[number]
@@ -233,7 +237,7 @@ def _walk(path: Path, summary: Summary, damage: Damage) -> Iterator[tuple[ChunkS
         if stream.read(len(MAGIC)) != MAGIC:
             raise InputError(f'{path}: no MCAP file: expected it to begin with {MAGIC!r}')
         chunks = sorted(block.start for block in summary.blocks)
-        for block in _blocks(stream, path.stat().st_size, chunks, damage):
+        for block in _chunk_spans(stream, path.stat().st_size, chunks, damage):
             try:
                 records = _load(stream, block)
             except DamagedError as error:
@@ -245,7 +249,9 @@ def _walk(path: Path, summary: Summary, damage: Damage) -> Iterator[tuple[ChunkS
             yield replace(block, first_ns=records.first_ns, channel_ids=channel_ids), records
 
 
-def _blocks(stream: BinaryIO, size: int, chunks: list[int], damage: Damage) -> Iterator[ChunkSpan]:
+def _chunk_spans(
+    stream: BinaryIO, size: int, chunks: list[int], damage: Damage
+) -> Iterator[ChunkSpan]:
     """Chunk spans of a file of `size` bytes; `chunks`: first bytes of chunks by the summary.
 
     Data that a recorder has appended since are ignored.
@@ -308,7 +314,7 @@ def summary_of(path: Path) -> Summary:
         if footer_at < 0 or footer[: HEAD.size] != HEAD.pack(Opcode.FOOTER, _FOOTER.size):
             return Summary([], [])
         start, _, checksum = _FOOTER.unpack_from(footer, HEAD.size)
-        if not len(MAGIC) <= start <= footer_at or footer_at - start > _LARGEST_SUMMARY:
+        if not len(MAGIC) <= start <= footer_at or footer_at - start > _MAX_SUMMARY_BYTES:
             return Summary([], [])
         stream.seek(start)
         content = stream.read(footer_at - start)

@@ -31,7 +31,7 @@ _CHUNK = struct.Struct('<QQQI')
 _MESSAGE = struct.Struct('<HIQQ')
 _IN_CHUNK = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 _PRIVATE = 0x80
-_MOST_DEFINITIONS = 2**16
+_MAX_DEFINITIONS = 2**16
 _PIECE = 2**20
 _SLICE = 2**16
 
@@ -161,7 +161,7 @@ def records_of(data: bytes, whole: bool = True) -> Records:
         found.add(code, data, start, length)
         at = start + length
     if at < len(data) and (whole or not is_record):
-        found.leave_out_last(f'no record at byte {at} of {len(data)}')
+        found.drop_last(f'no record at byte {at} of {len(data)}')
     return Records(
         data,
         found.definitions,
@@ -191,10 +191,10 @@ class _Found:
                 self.definitions.append(definition(code, data[start : start + length]))
         except DamagedError as error:
             self.damaged = self.damaged or str(error)
-        if len(self.definitions) > _MOST_DEFINITIONS:
-            raise DamagedError(f'more than {_MOST_DEFINITIONS} schemas and channels')
+        if len(self.definitions) > _MAX_DEFINITIONS:
+            raise DamagedError(f'more than {_MAX_DEFINITIONS} schemas and channels')
 
-    def leave_out_last(self, reason: str) -> None:
+    def drop_last(self, reason: str) -> None:
         """Omit the last message."""
         self.damaged = self.damaged or reason
         for values in (self.log_ns, self.channel_ids, self.offsets):

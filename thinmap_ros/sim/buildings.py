@@ -26,7 +26,7 @@ from thinmap_ros.sim.world import World
 
 DEVELOPMENT_SEEDS = range(1000)  # others are for evaluation
 MAX_AREA_M2 = 100_000.0
-_SMALLEST_M2 = 150.0
+_MIN_AREA_M2 = 150.0
 _FINE_M = 0.05
 _COARSE_M = 0.1
 _COARSE_FROM_M2 = 20_000.0
@@ -94,10 +94,10 @@ def generate_building(seed: int, config: BuildingConfig | None = None) -> Buildi
     """
     asked = config or BuildingConfig()
     rng = np.random.default_rng(seed)
-    chosen = _chosen(asked, rng)
+    chosen = _random_config(asked, rng)
     wings, links = _wings(chosen, rng)
-    frame, occupied = _painted(wings, links, chosen, rng)
-    moving = _moving(wings, chosen, rng)
+    frame, occupied = _rasterized(wings, links, chosen, rng)
+    moving = _moving_obstacles(wings, chosen, rng)
     name = f'building_{seed}'
     glass = occupied == _GLASS
     start = _start(wings[0], frame, occupied, rng)
@@ -106,7 +106,7 @@ def generate_building(seed: int, config: BuildingConfig | None = None) -> Buildi
     return Building(world, wings)
 
 
-def _chosen(asked: BuildingConfig, rng: np.random.Generator) -> BuildingConfig:
+def _random_config(asked: BuildingConfig, rng: np.random.Generator) -> BuildingConfig:
     """Draw all random properties; always all of them, so that each is independent of the others."""
     area = math.exp(rng.uniform(math.log(300.0), math.log(12_000.0)))
     if rng.random() < 0.1:
@@ -122,8 +122,8 @@ def _chosen(asked: BuildingConfig, rng: np.random.Generator) -> BuildingConfig:
     }
     given = {name: value for name, value in vars(asked).items() if value is not None}
     chosen = BuildingConfig(**{**drawn, **given})
-    if not _SMALLEST_M2 <= float(chosen.area_m2 or 0.0) <= MAX_AREA_M2:
-        expected = f'expected {_SMALLEST_M2:g} to {MAX_AREA_M2:g} m2'
+    if not _MIN_AREA_M2 <= float(chosen.area_m2 or 0.0) <= MAX_AREA_M2:
+        expected = f'expected {_MIN_AREA_M2:g} to {MAX_AREA_M2:g} m2'
         raise InputError(f'building: area_m2: {chosen.area_m2}: {expected}')
     return chosen
 
@@ -213,7 +213,7 @@ def _overlap(a: Wing, b: Wing) -> bool:
     return True
 
 
-def _painted(
+def _rasterized(
     wings: list[Wing], links: list[_Link], config: BuildingConfig, rng: np.random.Generator
 ) -> tuple[GridFrame, NDArray[np.uint8]]:
     """Cells of the world: 0 free, else obstacle or glass."""
@@ -370,17 +370,19 @@ def _start(
             return se2.pose(T[0], T[1], rng.uniform(-math.pi, math.pi))
 
 
-def _moving(
+def _moving_obstacles(
     wings: list[Wing], config: BuildingConfig, rng: np.random.Generator
 ) -> MovingObstacles | None:
-    people = _people(wings, config, rng)
-    leaves = _leaves(wings, config.moving_doors or 0.0, rng)
-    if not len(people.points) and not len(leaves.hinges):
+    pedestrians = _pedestrians(wings, config, rng)
+    doors = _doors(wings, config.moving_doors or 0.0, rng)
+    if not len(pedestrians.points) and not len(doors.hinges):
         return None
-    return MovingObstacles(people, leaves)
+    return MovingObstacles(pedestrians, doors)
 
 
-def _people(wings: list[Wing], config: BuildingConfig, rng: np.random.Generator) -> Pedestrians:
+def _pedestrians(
+    wings: list[Wing], config: BuildingConfig, rng: np.random.Generator
+) -> Pedestrians:
     """Pedestrians, each in its own part of the floor: back and forth, with pauses."""
     count = rng.poisson((config.people_per_1000_m2 or 0.0) * (config.area_m2 or 0.0) / 1000.0)
     points = np.zeros((count, 4, 2))
@@ -394,7 +396,7 @@ def _people(wings: list[Wing], config: BuildingConfig, rng: np.random.Generator)
     return Pedestrians(points, rng.uniform(0.5, 1.4, count), rng.exponential(8.0, (count, 4)))
 
 
-def _leaves(wings: list[Wing], moving: float, rng: np.random.Generator) -> Doors:
+def _doors(wings: list[Wing], moving: float, rng: np.random.Generator) -> Doors:
     """Door leaves for most doors; a share of them moves."""
     hinges = []
     ends = []

@@ -93,7 +93,9 @@ def observable_cells(
     origin = (world.frame.origin_x, world.frame.origin_y)
     places = (frame.centres_of(cells) - origin) / world.frame.resolution
     angles = np.arange(0.0, 2.0 * math.pi, _RAY_SPACING_M / max(range_m, 1.0))
-    seen = _look_around(world.occupied, reached, places, angles, range_m / world.frame.resolution)
+    seen = _sees_reachable(
+        world.occupied, reached, places, angles, range_m / world.frame.resolution
+    )
     coverable_cells = np.zeros(tuple(last + 1), dtype=np.bool_)
     coverable_cells[cells[:, 0], cells[:, 1]] = seen
     return ObservableCells(coverable_cells, frame)
@@ -123,7 +125,7 @@ def _without_solids(world: World, frame: GridFrame, shape: tuple[int, int]) -> N
 
 
 @kernel
-def _look_around(
+def _sees_reachable(
     solid: NDArray[np.uint8],
     wanted: NDArray[np.bool_],
     places: Array,

@@ -22,7 +22,7 @@ MARGIN_M = 0.1  # minimum distance of planned paths from obstacles
 _ARRIVED_M = 0.3
 _SPACING_M = 0.05
 _PATIENCE = 5.0  # times the duration at full speed
-_LEAST_S = 60.0
+_MIN_TIMEOUT_S = 60.0
 _NEAREST_GOAL_M = 2.0
 _RANDOM_SPEED_M_S = 0.5
 
@@ -36,7 +36,9 @@ class DriveSample:
     T_world_base: Array
 
 
-def drive(simulation: Simulation, ways: Iterable[Array], speed_m_s: float) -> Iterator[DriveSample]:
+def drive(
+    simulation: Simulation, paths: Iterable[Array], speed_m_s: float
+) -> Iterator[DriveSample]:
     """Yield the samples of a drive along paths (K, 2), m, world frame, one after the other.
 
     A path that takes much too long is aborted.
@@ -45,13 +47,13 @@ def drive(simulation: Simulation, ways: Iterable[Array], speed_m_s: float) -> It
     moment = simulation.read_sensors()
     if moment.scan is not None:
         yield DriveSample(moment.scan, moment.T_odom_base, simulation.robot.T_world_base)
-    for way in ways:
-        length_m = float(np.hypot(*np.diff(way, axis=0).T).sum())
-        for _ in range(round(1e9 / STEP_NS * (_LEAST_S + _PATIENCE * length_m / speed_m_s))):
+    for path in paths:
+        length_m = float(np.hypot(*np.diff(path, axis=0).T).sum())
+        for _ in range(round(1e9 / STEP_NS * (_MIN_TIMEOUT_S + _PATIENCE * length_m / speed_m_s))):
             T = simulation.robot.T_world_base
-            if np.hypot(*(way[-1] - T[:2])) < _ARRIVED_M:
+            if np.hypot(*(path[-1] - T[:2])) < _ARRIVED_M:
                 break
-            moment = simulation.step(*follower.command(T, way, STEP_NS / 1e9))
+            moment = simulation.step(*follower.command(T, path, STEP_NS / 1e9))
             if moment.scan is not None:
                 yield DriveSample(moment.scan, moment.T_odom_base, simulation.robot.T_world_base)
 
@@ -70,8 +72,8 @@ def tour_paths(world: World, places: Array, radius_m: float) -> Iterator[Array]:
     patch = world_to_grid(world)
     at = world.start[:2]
     for place in places:
-        way = _straight(at, place)
-        if not _is_clear(world, way, reach.robot_radius_m):
+        path = _straight(at, place)
+        if not _is_clear(world, path, reach.robot_radius_m):
             planned = plan(
                 patch, (float(at[0]), float(at[1])), (float(place[0]), float(place[1])), reach
             )
@@ -79,8 +81,8 @@ def tour_paths(world: World, places: Array, radius_m: float) -> Iterator[Array]:
                 raise InputError(
                     f'{world.name}: tour: {place.tolist()}: no path from {at.tolist()}'
                 )
-            way = planned
-        yield way
+            path = planned
+        yield path
         at = place
 
 
@@ -90,9 +92,9 @@ def _straight(a: Array, b: Array) -> Array:
     return np.asarray(a + np.linspace(0.0, 1.0, count)[:, None] * (b - a))
 
 
-def _is_clear(world: World, way: Array, radius_m: float) -> bool:
+def _is_clear(world: World, path: Array, radius_m: float) -> bool:
     """Whether a disc can move along points (K, 2) without collision."""
-    cells = world.frame.cells_of(way)
+    cells = world.frame.cells_of(path)
     if (cells < 0).any() or (cells >= world.occupied.shape).any():
         return False
     return bool((world.distance_to_wall_m[cells[:, 0], cells[:, 1]] > radius_m).all())
@@ -121,11 +123,13 @@ def random_drive(
     """
     simulation = Simulation(world, start, RobotConfig(), laser or LaserScannerConfig(), seed)
     return drive(
-        simulation, _random_ways(simulation, np.random.default_rng(seed), within), _RANDOM_SPEED_M_S
+        simulation,
+        _random_paths(simulation, np.random.default_rng(seed), within),
+        _RANDOM_SPEED_M_S,
     )
 
 
-def _random_ways(
+def _random_paths(
     simulation: Simulation, rng: np.random.Generator, within: NDArray[np.bool_] | None
 ) -> Iterator[Array]:
     """Paths (K, 2) from the robot to random reachable places."""
@@ -137,6 +141,6 @@ def _random_ways(
         goal = random_start(world, rng, within)
         if np.hypot(*(goal[:2] - T[:2])) < _NEAREST_GOAL_M:
             continue
-        way = plan(patch, (float(T[0]), float(T[1])), (float(goal[0]), float(goal[1])), config)
-        if way is not None:
-            yield way
+        path = plan(patch, (float(T[0]), float(T[1])), (float(goal[0]), float(goal[1])), config)
+        if path is not None:
+            yield path

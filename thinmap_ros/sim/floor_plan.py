@@ -11,7 +11,7 @@ WALL_M = 0.15
 _CORRIDOR_M = (1.6, 3.0)
 _ROOM_WIDTH_M = (2.6, 8.0)
 _ROW_M = 5.5  # a block that is no deeper has one row of rooms, and
-_LONGEST_ROW_M = 30.0  # where it is longer is cut across
+_MAX_ROW_M = 30.0  # where it is longer is cut across
 _SPINE_M = 18.0  # one that is no deeper has a corridor along its middle
 _HALL_M = (12.0, 45.0)  # shortest and longest side of what may become a hall
 _DOOR_M = (0.85, 1.05)
@@ -89,7 +89,7 @@ def generate_floor_plan(
 
     hall_share: probability that a large enough block is a hall. All parts are connected.
     """
-    parts = _cut(FloorPart(Kind.ROOM, 0.0, 0.0, width, depth), hall_share, rng)
+    parts = _split_block(FloorPart(Kind.ROOM, 0.0, 0.0, width, depth), hall_share, rng)
     shared = _shared_walls(parts)
     passages = [wall for wall in shared if _is_open(parts[wall.a], parts[wall.b])]
     closed = [wall for wall in shared if not _is_open(parts[wall.a], parts[wall.b])]
@@ -100,13 +100,13 @@ def generate_floor_plan(
     return FloorPlan(width, depth, parts, doors, inner, closed)
 
 
-def _cut(block: FloorPart, hall_share: float, rng: np.random.Generator) -> list[FloorPart]:
+def _split_block(block: FloorPart, hall_share: float, rng: np.random.Generator) -> list[FloorPart]:
     """Cut a block into corridors and rows of rooms."""
     short, long = sorted((block.width, block.depth))
     if short >= _HALL_M[0] and long <= _HALL_M[1] and rng.random() < hall_share:
-        return [_as(Kind.HALL, block)]
+        return [_with_kind(Kind.HALL, block)]
     along_x = block.width >= block.depth
-    if short <= _ROW_M and long <= _LONGEST_ROW_M:
+    if short <= _ROW_M and long <= _MAX_ROW_M:
         return _rooms(block, along_x, rng)
     # A corridor along a block that is as deep as two rows of rooms, else across it.
     spine = short <= _SPINE_M
@@ -114,12 +114,12 @@ def _cut(block: FloorPart, hall_share: float, rng: np.random.Generator) -> list[
     length = block.width if across_x else block.depth
     corridor = rng.uniform(*_CORRIDOR_M)
     at = rng.uniform(0.35, 0.65) * (length - corridor)
-    first, middle, last = _sliced(block, across_x, [at, at + corridor])
+    first, middle, last = _split(block, across_x, [at, at + corridor])
     if spine:
         sides = [_rooms(side, along_x, rng) for side in (first, last)]
     else:
-        sides = [_cut(side, hall_share, rng) for side in (first, last)]
-    return [*sides[0], _as(Kind.CORRIDOR, middle), *sides[1]]
+        sides = [_split_block(side, hall_share, rng) for side in (first, last)]
+    return [*sides[0], _with_kind(Kind.CORRIDOR, middle), *sides[1]]
 
 
 def _rooms(row: FloorPart, along_x: bool, rng: np.random.Generator) -> list[FloorPart]:
@@ -128,10 +128,10 @@ def _rooms(row: FloorPart, along_x: bool, rng: np.random.Generator) -> list[Floo
     marks = [rng.uniform(*_ROOM_WIDTH_M)]
     while marks[-1] < length - _ROOM_WIDTH_M[0]:
         marks.append(marks[-1] + rng.uniform(*_ROOM_WIDTH_M))
-    return _sliced(row, along_x, [mark for mark in marks if mark < length - _ROOM_WIDTH_M[0]])
+    return _split(row, along_x, [mark for mark in marks if mark < length - _ROOM_WIDTH_M[0]])
 
 
-def _sliced(part: FloorPart, along_x: bool, marks: list[float]) -> list[FloorPart]:
+def _split(part: FloorPart, along_x: bool, marks: list[float]) -> list[FloorPart]:
     """Pieces of a part, cut across one of its axes at distances from its lower side."""
     low = part.x0 if along_x else part.y0
     high = part.x1 if along_x else part.y1
@@ -144,7 +144,7 @@ def _sliced(part: FloorPart, along_x: bool, marks: list[float]) -> list[FloorPar
     return pieces
 
 
-def _as(kind: Kind, part: FloorPart) -> FloorPart:
+def _with_kind(kind: Kind, part: FloorPart) -> FloorPart:
     return FloorPart(kind, part.x0, part.y0, part.x1, part.y1)
 
 

@@ -45,22 +45,22 @@ class _BagRecorder:
         self._log_ns = max(stamp_ns, self._log_ns + 1)
         self._writer.write(topic, _TYPES[topic], self._log_ns, message)
 
-    def write_laser_mount(self, look: DriveSample) -> None:
+    def write_laser_mount(self, sample: DriveSample) -> None:
         """Write the pose of the laser."""
-        ns = look.scan.stamp_ns
+        ns = sample.scan.stamp_ns
         made = self._objects
         self._write(
-            '/tf_static', ns, made.transform(ns, ('base_link', 'laser'), look.scan.T_base_laser)
+            '/tf_static', ns, made.transform(ns, ('base_link', 'laser'), sample.scan.T_base_laser)
         )
 
-    def write_sensors(self, look: DriveSample) -> None:
+    def write_sensors(self, sample: DriveSample) -> None:
         """Write scan, odometry and true pose of a sample."""
-        ns = look.scan.stamp_ns
+        ns = sample.scan.stamp_ns
         made = self._objects
-        self._write(TRUTH_TOPIC, ns, made.pose(ns, 'map', look.T_world_base))
-        self._write('/odom', ns, made.odometry(ns, look.T_odom_base))
-        self._write('/tf', ns, made.transform(ns, ('odom', 'base_link'), look.T_odom_base))
-        self._write('/scan', ns, made.scan(look.scan))
+        self._write(TRUTH_TOPIC, ns, made.pose(ns, 'map', sample.T_world_base))
+        self._write('/odom', ns, made.odometry(ns, sample.T_odom_base))
+        self._write('/tf', ns, made.transform(ns, ('odom', 'base_link'), sample.T_odom_base))
+        self._write('/scan', ns, made.scan(sample.scan))
 
     def write_estimate(self, ns: int, estimate: Estimate) -> None:
         """Write the estimate of the localizer."""
@@ -74,7 +74,7 @@ class _BagRecorder:
         self._write('/topology', ns, self._objects.topology(ns, pipeline.topology.map))
 
 
-def record(path: Path, looks: Iterable[DriveSample], localized: bool) -> int:
+def record(path: Path, samples: Iterable[DriveSample], localized: bool) -> int:
     """Write the bag of a drive; returns the number of scans.
 
     localized: by the localizer, else by ground truth.
@@ -84,20 +84,20 @@ def record(path: Path, looks: Iterable[DriveSample], localized: bool) -> int:
     pipeline = None
     with BagWriter(path, definitions=definitions, compressed=True) as writer:
         recording = _BagRecorder(writer)
-        for look in looks:
+        for sample in samples:
             if pipeline is None:
-                pipeline, truth = _pipeline(look, localized)
-                recording.write_laser_mount(look)
-            truth[:] = [look.T_world_base]
-            recording.write_sensors(look)
+                pipeline, truth = _pipeline(sample, localized)
+                recording.write_laser_mount(sample)
+            truth[:] = [sample.T_world_base]
+            recording.write_sensors(sample)
             recording.write_estimate(
-                look.scan.stamp_ns, pipeline.step(look.scan, look.T_odom_base).estimate
+                sample.scan.stamp_ns, pipeline.step(sample.scan, sample.T_odom_base).estimate
             )
             scans += 1
             if scans % _MAP_EVERY == 0:
-                recording.write_maps(look.scan.stamp_ns, pipeline)
+                recording.write_maps(sample.scan.stamp_ns, pipeline)
         if pipeline is not None and scans % _MAP_EVERY:
-            recording.write_maps(look.scan.stamp_ns, pipeline)
+            recording.write_maps(sample.scan.stamp_ns, pipeline)
     return scans
 
 
@@ -133,10 +133,10 @@ def _work(arguments: argparse.Namespace) -> None:
         raise InputError(f'drive {quoted(min(unknown))}: expected some of {", ".join(RECIPES)}')
     for name in arguments.names or RECIPES:
         path = arguments.out / f'{name}.mcap'
-        looks = list(Source(arguments.seed).looks(name))
+        samples = list(Source(arguments.seed).samples(name))
         localized = RECIPES[name].localized
-        scans = record(path, looks, localized)
-        seconds = (looks[-1].scan.stamp_ns - looks[0].scan.stamp_ns) / 1e9
+        scans = record(path, samples, localized)
+        seconds = (samples[-1].scan.stamp_ns - samples[0].scan.stamp_ns) / 1e9
         write_text(
             arguments.out / f'{name}.txt', _about(name, arguments.seed, scans, seconds, localized)
         )

@@ -1,4 +1,4 @@
-"""What lies nowhere on earth is refused before anything is written: no kernel ever sees it."""
+"""Coordinates beyond the bounds are rejected before anything is written: no kernel gets them."""
 
 import numpy as np
 import pytest

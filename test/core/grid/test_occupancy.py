@@ -295,7 +295,7 @@ def test_all_cells_are_those_of_the_plain_grid_bit_for_bit(seed, config):
     grid = OccupancyGrid(config)
     plain = PlainGrid(config)
     for scan, T in drive_through_clutter(seed):
-        # The way back, too: into columns and rows that are negative.
+        # The opposite direction, too: into negative rows and columns.
         for at in (T, np.array([-T[0], -T[1], T[2] + math.pi])):
             grid.add_scan(scan, at)
             plain.update(scan, at)

@@ -87,7 +87,7 @@ def test_places_are_those_after_a_correction():
 
 
 def test_poses_before_the_corrections_are_those_of_the_first_since_they_were_accepted():
-    """What comes after a correction is told before it as if the robot had gone on without it."""
+    """Poses after a correction are given before it as if there had been no correction."""
     history = filled(POSES[:6], range(6))
     history.apply_correction(np.array([0]), POSES[[0]] + [0.0, 1.0, 0.0], since_ns=6)
     for k in (6, 7):

@@ -1,4 +1,4 @@
-"""Sectors of invalid beams: what may stand in them, and what a robot that cannot see does."""
+"""Blind sectors: possible obstacles in them, and the behaviour of a robot with a blind laser."""
 
 import math
 
@@ -77,7 +77,7 @@ def test_what_was_seen_from_where_the_robot_just_was_is_seen():
     bare = unseen_points(dead, (here[0], 0.0, 0.0))
     left = sectors.points(2.0, 0.5)
     assert 0 < len(left) < len(bare)
-    # What lies beside the robot was ahead of it; what is farther out never was.
+    # The space beside the robot was ahead of it; the space farther out never was.
     beside = here + np.array([0.0, 0.25])
     assert np.hypot(*(bare - beside).T).min() < 0.1 < np.hypot(*(left - beside).T).min()
     # Of what was seen farther back than it may remember, it knows nothing.

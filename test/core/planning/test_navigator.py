@@ -237,7 +237,7 @@ def test_it_remembers_what_is_beside_it_where_the_laser_does_not_look():
     # Turned away from it: it is still there; looked at again and gone: it is forgotten.
     assert np.allclose(look((2.0, 3.0, 2.5), np.full(181, np.inf), 1), [[2.5, 3.0]], atol=1e-6)
     assert len(look((2.0, 3.0, 0.5), np.full(181, np.inf), 2)) == 0
-    # What is left behind is forgotten too.
+    # Distant points are dropped, too.
     look((2.0, 3.0, 0.0), ahead, 3)
     assert len(look((3.6, 3.0, 0.0), np.full(181, np.inf), 4)) == 0
 

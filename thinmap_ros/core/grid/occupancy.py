@@ -29,7 +29,7 @@ _TILE_BITS = TILE.bit_length() - 1
 # Three neighbouring beams hit one surface if the middle range differs by less than this from the
 # range that the others predict, m.
 _FLAT_M = 0.06
-_LONGEST_SURFACE_M = 3.0
+_MAX_SURFACE_GAP_M = 3.0
 # A beam that passes through this length of occupied cells grazes the face of a wall, m.
 _GRAZED_M = 0.4
 _SURELY_OCCUPIED = 0.9
@@ -325,7 +325,7 @@ def _is_flat(ranges: Array, hit: NDArray[np.bool_], usable: float, bend: float, 
     if max(before, between, after) >= usable:
         return False
     flat: bool = abs(between - bend * before * after / (before + after)) < _FLAT_M
-    return flat and abs(after - before) < _LONGEST_SURFACE_M
+    return flat and abs(after - before) < _MAX_SURFACE_GAP_M
 
 
 @kernel
@@ -429,7 +429,7 @@ def _odds_at(pool: NDArray[np.int16], directory: NDArray[np.int32], row: int, co
 
 
 @inlined
-def _run_of(
+def _occupied_run(
     pool: NDArray[np.int16],
     directory: NDArray[np.int32],
     row: int,
@@ -459,7 +459,7 @@ def _run_of(
 
 
 @inlined
-def _holds(increments: NDArray[np.int16], odds: NDArray[np.int16], sure: int) -> bool:
+def _has_occupied(increments: NDArray[np.int16], odds: NDArray[np.int16], sure: int) -> bool:
     """Whether beams passed a surely occupied cell of a strip of TILE cells."""
     found = 0
     for k in range(TILE):
@@ -494,11 +494,11 @@ def _keep_grazed_walls(
                 continue
             added = increments[row, first : first + TILE]
             odds = pool[slot, row & (TILE - 1)]
-            if _holds(added, odds, sure):
+            if _has_occupied(added, odds, sure):
                 for k in range(TILE):
                     if added[k] < 0 and odds[k] >= sure:
                         away = (first + k + 0.5 - laser[0], row + 0.5 - laser[1])
-                        run = _run_of(
+                        run = _occupied_run(
                             pool, directory, top + row, left + first + k, away, sure, grazed
                         )
                         added[k] = 0 if run >= grazed else added[k]

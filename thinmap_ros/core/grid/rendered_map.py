@@ -27,9 +27,9 @@ class RenderedMap:
 
     def render(self, tiles: TileStore, frame: GridFrame) -> GridPatch:
         """Copy of the bounding rectangle of the known cells; one unknown cell if there are none."""
-        self._fit(tiles)
+        self._enlarge(tiles)
         if self._stale is not None:
-            self._refresh(tiles, *_common(self._stale, self._bounds))
+            self._refresh(tiles, *_intersection(self._stale, self._bounds))
             self._stale = None
         if self._known is None:
             return GridPatch(frame, np.full((1, 1), UNKNOWN, dtype=np.int8))
@@ -38,7 +38,7 @@ class RenderedMap:
         shown = self._cells[row - top : end_row - top, col - left : end_col - left]
         return GridPatch(frame.with_origin_at(row, col), shown.copy())
 
-    def _fit(self, tiles: TileStore) -> None:
+    def _enlarge(self, tiles: TileStore) -> None:
         """Enlarge the cells if tiles have been added outside of them."""
         bounds = tiles.bounds()
         if bounds is None or bounds == self._bounds:
@@ -76,5 +76,5 @@ def _union(a: Bounds | None, b: Bounds) -> Bounds:
     return b if a is None else (min(a[0], b[0]), min(a[1], b[1]), max(a[2], b[2]), max(a[3], b[3]))
 
 
-def _common(a: Bounds, b: Bounds) -> Bounds:
+def _intersection(a: Bounds, b: Bounds) -> Bounds:
     return max(a[0], b[0]), max(a[1], b[1]), min(a[2], b[2]), min(a[3], b[3])

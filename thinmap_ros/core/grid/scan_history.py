@@ -16,7 +16,7 @@ _APART_RAD = 0.25
 _PLACE_M = 1.0  # edge of a place
 _DIRECTIONS = 8  # robot headings that are distinguished at each place
 _PER_PLACE = 4  # scans kept of each place and direction: about one visit
-_FARTHEST_PLACE = 1 << 26  # more places than lie within MAX_COORDINATE_M
+_MAX_PLACE = 1 << 26  # more places than lie within MAX_COORDINATE_M
 Kept = TypeVar('Kept')
 
 
@@ -123,7 +123,7 @@ def _places_of(poses: Array) -> NDArray[np.int64]:
     """Number (N,) of the place and direction of each pose (N, 3)."""
     turn = np.floor(poses[:, 2] % (2.0 * math.pi) / (2.0 * math.pi) * _DIRECTIONS)
     x, y = np.floor(poses[:, :2] / _PLACE_M).astype(np.int64).T
-    places: NDArray[np.int64] = (x * _FARTHEST_PLACE + y) * _DIRECTIONS + turn.astype(np.int64)
+    places: NDArray[np.int64] = (x * _MAX_PLACE + y) * _DIRECTIONS + turn.astype(np.int64)
     return places
 
 

@@ -13,14 +13,14 @@ from thinmap_ros.core.se2 import MAX_COORDINATE_M
 
 TILE = 64  # cells along the edge of a tile
 NO_TILE = -1
-_MOST_TILES = 1 << 15  # 134 million cells, some 1.1 km in each direction at 0.1 m
-MAX_CELLS = _MOST_TILES * TILE * TILE
+_MAX_TILES = 1 << 15  # 134 million cells, some 1.1 km in each direction at 0.1 m
+MAX_CELLS = _MAX_TILES * TILE * TILE
 MAX_TILE_INDEX = int(MAX_COORDINATE_M / MIN_RESOLUTION_M) // TILE  # of the finest cells
-_FEWEST = 64  # minimum capacity of a pool, tiles
+_MIN_POOL_TILES = 64  # minimum capacity of a pool, tiles
 # Room beyond what is needed, on a side of the directory that grows: a share of its length, and at
 # least some tiles.
 _ROOM_SHARE = 0.25
-_LEAST_ROOM = 4
+_MIN_ROOM = 4
 
 
 class _Span(NamedTuple):
@@ -45,7 +45,7 @@ class _Span(NamedTuple):
     def grown_to(self, other: '_Span') -> '_Span':
         """A span that holds this one and another, with room to spare on each side that grew."""
         first, end = self.covering(other)
-        room = max(_LEAST_ROOM, int(_ROOM_SHARE * (end - first)))
+        room = max(_MIN_ROOM, int(_ROOM_SHARE * (end - first)))
         return _Span(
             first - room if first < self.first else first, end + room if end > self.end else end
         )
@@ -65,7 +65,7 @@ class TileStore:
 
     def __init__(self, dtype: DTypeLike = np.int16, per_cell: tuple[int, ...] = ()) -> None:
         self.directory: NDArray[np.int32] = np.full((1, 1), NO_TILE, dtype=np.int32)
-        self.pool: NDArray[Any] = _empty_pool((TILE, TILE, *per_cell), dtype, _FEWEST)
+        self.pool: NDArray[Any] = _empty_pool((TILE, TILE, *per_cell), dtype, _MIN_POOL_TILES)
         self.first_row = 0
         self.first_col = 0
         self.used = 0
@@ -83,15 +83,15 @@ class TileStore:
             return
         taller = height.grown_to(rows)
         wider = width.grown_to(cols)
-        if taller.length * wider.length > _MOST_TILES:
+        if taller.length * wider.length > _MAX_TILES:
             # Unused spare room is given up.
             used_height, used_width = self._used_spans()
             taller = used_height.covering(rows)
             wider = used_width.covering(cols)
-        if taller.length * wider.length > _MOST_TILES:
+        if taller.length * wider.length > _MAX_TILES:
             size = f'{taller.length} x {wider.length}'
-            raise InputError(f'map of {size} tiles: expected {_MOST_TILES} at most')
-        self._lay_out(taller, wider)
+            raise InputError(f'map of {size} tiles: expected {_MAX_TILES} at most')
+        self._rebuild_directory(taller, wider)
 
     def _spans(self) -> tuple['_Span', '_Span']:
         """Rows and columns of tiles of the directory."""
@@ -109,7 +109,7 @@ class TileStore:
         high_row, high_col = places.max(axis=0).tolist()
         return _Span(low_row, high_row + 1), _Span(low_col, high_col + 1)
 
-    def _lay_out(self, height: '_Span', width: '_Span') -> None:
+    def _rebuild_directory(self, height: '_Span', width: '_Span') -> None:
         """Rebuild the directory with these rows and columns, which include all existing tiles."""
         places = self.tile_coordinates()
         self.directory = np.full((height.length, width.length), NO_TILE, dtype=np.int32)
@@ -242,5 +242,5 @@ def _empty_pool(tile: tuple[int, ...], dtype: DTypeLike, least: int) -> NDArray[
     """
     if resource.getrlimit(resource.RLIMIT_AS)[0] == resource.RLIM_INFINITY:
         with suppress(MemoryError):
-            return np.zeros((_MOST_TILES, *tile), dtype=dtype)
+            return np.zeros((_MAX_TILES, *tile), dtype=dtype)
     return np.zeros((least, *tile), dtype=dtype)

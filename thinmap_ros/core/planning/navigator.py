@@ -128,8 +128,8 @@ class Navigator:
         if self._goal is None:
             return Command(*self._follower.stop(dt_s), 'idle')
         if self._has_arrived(T_map_base):
-            return self._arrive(T_map_base, dt_s)
-        if self._must_plan(T_map_base, patch, dt_s):
+            return self._finish_goal(T_map_base, dt_s)
+        if self._needs_plan(T_map_base, patch, dt_s):
             reason = self._plan(T_map_base, patch)
             if reason:
                 return self._wait(reason, dt_s)
@@ -142,7 +142,7 @@ class Navigator:
         away_m = min(math.dist(end, T_map_base[:2]) for end in ends)
         return away_m <= self.config.goal_tolerance_m
 
-    def _arrive(self, T_map_base: Array, dt_s: float) -> Command:
+    def _finish_goal(self, T_map_base: Array, dt_s: float) -> Command:
         self._remaining_m = 0.0
         if self._heading_rad is not None:
             error = se2.wrap(self._heading_rad - float(T_map_base[2]))
@@ -152,7 +152,7 @@ class Navigator:
         self.cancel()
         return Command(*self._follower.stop(dt_s), 'reached')
 
-    def _must_plan(self, T_map_base: Array, patch: GridPatch, dt_s: float) -> bool:
+    def _needs_plan(self, T_map_base: Array, patch: GridPatch, dt_s: float) -> bool:
         changed = patch is not self._patch
         self._patch = patch
         self._path_age_s += dt_s
@@ -171,7 +171,7 @@ class Navigator:
         ahead = self.path[first : first + max(1, int(2.0 * _CHECK_AHEAD_M / frame.resolution))]
         at = (frame.origin_x, frame.origin_y, frame.resolution)
         radius = self.config.robot_radius_m / frame.resolution - 1e-6
-        return _touches(patch.cells, at, ahead, radius)
+        return _collides(patch.cells, at, ahead, radius)
 
     def _plan(self, T_map_base: Array, patch: GridPatch) -> str:
         """Replan; returns why there is no path, or an empty text.
@@ -279,7 +279,7 @@ class Navigator:
 
 
 @kernel
-def _touches(
+def _collides(
     cells: NDArray[np.int8], frame: tuple[float, float, float], path: Array, radius: float
 ) -> bool:
     """Whether an occupied cell of a map (H, W) is within a radius, cells, of a path (K, 2), m.

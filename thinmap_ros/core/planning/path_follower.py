@@ -14,9 +14,9 @@ from thinmap_ros.core.se2 import Array, wrap
 
 # In narrow passages: minimum lookahead, its growth with the clearance margin, and a speed that is
 # always allowed.
-_SHORTEST_M = 0.1
+_MIN_LOOKAHEAD_M = 0.1
 _SPARE_FACTOR = 2.0
-_SLOWEST_M_S = 0.1
+_MIN_SPEED_M_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class PathFollower:
         follows the path more closely.
         """
         config = self.config
-        narrow = _SHORTEST_M + _SPARE_FACTOR * max(clearance_margin_m, 0.0)
+        narrow = _MIN_LOOKAHEAD_M + _SPARE_FACTOR * max(clearance_margin_m, 0.0)
         reach = min(max(config.lookahead_m, config.lookahead_s * self.v), narrow)
         x, y, theta = T_map_base.tolist()
         ahead_x, ahead_y, rest_m = _point_ahead(path, x, y, reach, config.stray_m)
@@ -72,9 +72,9 @@ class PathFollower:
         least = 0.3 * config.turn_in_place_rad if self._turning else config.turn_in_place_rad
         self._turning = abs(error) > least
         if self._turning:
-            return self._limited(0.0, self._turn_for(error, dt_s), dt_s)
+            return self._limited(0.0, self._turn_rate(error, dt_s), dt_s)
         v = min(config.max_speed_m_s, math.sqrt(2.0 * config.max_acceleration_m_s2 * rest_m))
-        v = min(v, max(narrow / max(config.lookahead_s, 1e-9), _SLOWEST_M_S))
+        v = min(v, max(narrow / max(config.lookahead_s, 1e-9), _MIN_SPEED_M_S))
         curvature = 2.0 * math.sin(error) / max(math.hypot(dx, dy), 0.05)
         if abs(curvature) * v > config.max_turn_rad_s:
             v = config.max_turn_rad_s / abs(curvature)
@@ -85,7 +85,7 @@ class PathFollower:
         if self.v > 0.0:
             return self.stop(dt_s)
         error = wrap(heading_rad - float(T_map_base[2]))
-        return self._limited(0.0, self._turn_for(error, dt_s), dt_s)
+        return self._limited(0.0, self._turn_rate(error, dt_s), dt_s)
 
     def stop(self, dt_s: float) -> tuple[float, float]:
         """Speed and turn rate for the next dt_s: brake on the present arc, within the limits.
@@ -102,7 +102,7 @@ class PathFollower:
         self.w = w
         return v, w
 
-    def _turn_for(self, error: float, dt_s: float) -> float:
+    def _turn_rate(self, error: float, dt_s: float) -> float:
         """Highest turn rate from which the robot can stop at the desired heading."""
         braking = math.sqrt(2.0 * 0.7 * self.config.max_turn_acceleration_rad_s2 * abs(error))
         return math.copysign(min(braking, self.config.max_turn_rad_s, abs(error) / dt_s), error)
@@ -110,12 +110,12 @@ class PathFollower:
     def _limited(self, v: float, w: float, dt_s: float) -> tuple[float, float]:
         config = self.config
         w = min(max(w, -config.max_turn_rad_s), config.max_turn_rad_s)
-        self.v = max(_towards(self.v, v, config.max_acceleration_m_s2 * dt_s), 0.0)
-        self.w = _towards(self.w, w, config.max_turn_acceleration_rad_s2 * dt_s)
+        self.v = max(_limited_change(self.v, v, config.max_acceleration_m_s2 * dt_s), 0.0)
+        self.w = _limited_change(self.w, w, config.max_turn_acceleration_rad_s2 * dt_s)
         return self.v, self.w
 
 
-def _towards(value: float, goal: float, change: float) -> float:
+def _limited_change(value: float, goal: float, change: float) -> float:
     return min(max(goal, value - change), value + change)
 
 
@@ -159,13 +159,13 @@ def _point_ahead(
         last += 1
         along += math.hypot(path[last, 0] - path[last - 1, 0], path[last, 1] - path[last - 1, 1])
     allowed = stray_m + math.hypot(path[first, 0] - x, path[first, 1] - y)
-    while last > first + 1 and _stray(path, first, last, x, y) > allowed:
+    while last > first + 1 and _max_deviation(path, first, last, x, y) > allowed:
         last -= 1
     return path[last, 0], path[last, 1], left_m
 
 
 @kernel
-def _stray(path: Array, first: int, last: int, x: float, y: float) -> float:
+def _max_deviation(path: Array, first: int, last: int, x: float, y: float) -> float:
     """Largest distance, m, of path points first to last from the line from (x, y) to the last."""
     dx = path[last, 0] - x
     dy = path[last, 1] - y

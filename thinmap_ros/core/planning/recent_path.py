@@ -15,7 +15,7 @@ from thinmap_ros.core.se2 import Array
 
 _STEP_M = 0.03
 _JUMP_M = 0.5
-_LONGEST = 1300  # points
+_MAX_POINTS = 1300  # points
 
 
 class RecentPath:
@@ -23,7 +23,7 @@ class RecentPath:
 
     def __init__(self) -> None:
         # Twice the capacity: points are moved to the front only when the array is full.
-        self._points = np.empty((2 * _LONGEST, 2))
+        self._points = np.empty((2 * _MAX_POINTS, 2))
         self._begin = self._end = 0
 
     def add_pose(self, T_map_base: Array) -> None:
@@ -42,21 +42,23 @@ class RecentPath:
         if self._end == self._begin:
             return np.empty((0, 2), dtype=np.int64)
         return np.asarray(
-            _joined(frame.cells_of(self._points[self._begin : self._end]), shape[0], shape[1])
+            _connected_cells(
+                frame.cells_of(self._points[self._begin : self._end]), shape[0], shape[1]
+            )
         )
 
     def _append(self, here: tuple[float, float]) -> None:
         if self._end == len(self._points):
-            self._points[: _LONGEST - 1] = self._points[self._end - _LONGEST + 1 :]
+            self._points[: _MAX_POINTS - 1] = self._points[self._end - _MAX_POINTS + 1 :]
             self._begin = 0
-            self._end = _LONGEST - 1
+            self._end = _MAX_POINTS - 1
         self._points[self._end] = here
         self._end += 1
-        self._begin = max(self._begin, self._end - _LONGEST)
+        self._begin = max(self._begin, self._end - _MAX_POINTS)
 
 
 @kernel
-def _joined(cells: NDArray[np.int64], rows: int, cols: int) -> NDArray[np.int64]:
+def _connected_cells(cells: NDArray[np.int64], rows: int, cols: int) -> NDArray[np.int64]:
     """Cells (N, 2) and the cells between them, first along the column, then along the row.
 
     Cells outside the map are omitted.

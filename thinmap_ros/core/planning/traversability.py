@@ -55,16 +55,16 @@ def escape_cells(
     A robot closer to obstacles than its radius may cross free cells up to escape_distance_m away.
     trail: cells (N, 2) of its recent path; it may return over those that are free.
     """
-    ways = standing.copy()
+    allowed = standing.copy()
     if trail is not None:
-        ways[trail[:, 0], trail[:, 1]] |= free[trail[:, 0], trail[:, 1]]
+        allowed[trail[:, 0], trail[:, 1]] |= free[trail[:, 0], trail[:, 1]]
     row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
     if not (0 <= row < free.shape[0] and 0 <= col < free.shape[1]) or standing[row, col]:
-        return ways
-    part, within = disc(ways, (row, col), escape_distance_m / frame.resolution)
-    ways[part] |= within & free[part]
-    ways[row, col] = True
-    return ways
+        return allowed
+    part, within = disc(allowed, (row, col), escape_distance_m / frame.resolution)
+    allowed[part] |= within & free[part]
+    allowed[row, col] = True
+    return allowed
 
 
 def reachable_cells(allowed: Mask, start: tuple[int, int]) -> Mask:

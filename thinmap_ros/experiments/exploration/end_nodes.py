@@ -100,13 +100,13 @@ def _follow(source: Source, name: str) -> tuple[list[Moment], list[list[float]]]
     moments: list[Moment] = []
     track: list[list[float]] = []
     at = _AHEAD
-    way = 0.0
+    travelled_m = 0.0
     last = None
-    for k, look in enumerate(source.looks(name)):
-        T = look.T_world_base
-        way += 0.0 if last is None else math.dist(T[:2], last[:2])
+    for k, sample in enumerate(source.samples(name)):
+        T = sample.T_world_base
+        travelled_m += 0.0 if last is None else math.dist(T[:2], last[:2])
         last = T
-        grid.add_scan(look.scan, T)
+        grid.add_scan(sample.scan, T)
         builder.update(grid.window(float(T[0]), float(T[1]), _WINDOW_M), T)
         places = np.array(
             [n.position for n in builder.map.nodes.values() if n.kind == NodeKind.END]
@@ -114,8 +114,8 @@ def _follow(source: Source, name: str) -> tuple[list[Moment], list[list[float]]]
         away = np.hypot(*(places - at).T)
         if away.min(initial=np.inf) <= _JUMP_M:
             at = places[int(away.argmin())]
-            seconds = look.scan.stamp_ns / 1e9
-            track.append([seconds, float(at[0]), float(at[1]), way])
+            seconds = sample.scan.stamp_ns / 1e9
+            track.append([seconds, float(at[0]), float(at[1]), travelled_m])
             if k % 5 == 0:
                 moments.append((seconds, T, grid.known_area(), builder.map.copy(), at))
     return moments, track

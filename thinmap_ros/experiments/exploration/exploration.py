@@ -50,7 +50,7 @@ class _Moment:
 def run(source: Source) -> Outcome:
     """Replay the decisions of the drive from the same scans, and show the map at six moments."""
     world = world_of('room_10x10')
-    moments, census = _replay_exploration(list(source.looks('room_10x10')))
+    moments, census = _replay_exploration(list(source.samples('room_10x10')))
     goal = observable_cells(
         world, world.start, PRESETS['2dx'].radius_m, LaserScannerConfig().range_max_m
     )
@@ -115,7 +115,7 @@ _COLUMNS = [
 ]
 
 
-def _replay_exploration(looks: list[DriveSample]) -> tuple[list[_Moment], EndNodeCensus]:
+def _replay_exploration(samples: list[DriveSample]) -> tuple[list[_Moment], EndNodeCensus]:
     """State of map and graph once a second, and at the end."""
 
     def here(scan: object, T_odom_base: Array) -> Estimate:
@@ -125,15 +125,17 @@ def _replay_exploration(looks: list[DriveSample]) -> tuple[list[_Moment], EndNod
     explorer = Explorer()
     census = EndNodeCensus()
     moments = []
-    for k, look in enumerate(looks):
-        truth = look.T_world_base
-        pipeline.step(look.scan, look.T_odom_base)
+    for k, sample in enumerate(samples):
+        truth = sample.T_world_base
+        pipeline.step(sample.scan, sample.T_odom_base)
         patch = pipeline.grid.known_area()
         graph = pipeline.topology.map
-        decision = explorer.step(graph, patch, look.scan, truth)
+        decision = explorer.step(graph, patch, sample.scan, truth)
         census.add([(n.node_id, n.x, n.y) for n in decision.end_nodes], truth)
-        if k % 5 == 0 or k == len(looks) - 1:
-            moments.append(_Moment(look.scan.stamp_ns / 1e9, truth, patch, graph.copy(), decision))
+        if k % 5 == 0 or k == len(samples) - 1:
+            moments.append(
+                _Moment(sample.scan.stamp_ns / 1e9, truth, patch, graph.copy(), decision)
+            )
     return moments, census
 
 

@@ -45,7 +45,9 @@ class _Glance:
         self.number = number
         self.patch: GridPatch | None = None
 
-    def __call__(self, k: int, look: DriveSample, pipeline: Pipeline, step: PipelineResult) -> None:
+    def __call__(
+        self, k: int, sample: DriveSample, pipeline: Pipeline, step: PipelineResult
+    ) -> None:
         if k == self.number:
             self.patch = pipeline.grid.known_area()
             self.graph = pipeline.topology.map.copy()
@@ -56,11 +58,11 @@ class _Glance:
 def run(source: Source) -> Outcome:
     """Drive the floor once; both filters, and our localizer, see the same scans."""
     world = world_of('floor_40x10')
-    looks = list(islice(source.looks('floor_40x10'), _QUICK_SCANS if source.quick else None))
-    glance = _Glance(round(_LOCAL_AT * len(looks)))
-    ti = run_drive(looks, 'ekf_ti', glance)
-    full = run_drive(looks, 'ekf_full')
-    ours = run_drive(looks, 'scan_matching')
+    samples = list(islice(source.samples('floor_40x10'), _QUICK_SCANS if source.quick else None))
+    glance = _Glance(round(_LOCAL_AT * len(samples)))
+    ti = run_drive(samples, 'ekf_ti', glance)
+    full = run_drive(samples, 'ekf_full')
+    ours = run_drive(samples, 'scan_matching')
     error = map_errors.map_error(ti.pipeline.grid.known_area(), world)
     apart = np.hypot(*(np.array(ti.estimate) - np.array(full.estimate))[:, :2].T)
     used = float(np.median(ti.local))

@@ -162,14 +162,14 @@ def _plot(folder: Path, result: Replay) -> Plot:
     graph = result.pipeline.topology.map
     patch = pipeline.grid.known_area()
     final = pipeline.localizer.corrected_path()
-    way = Curve(final[:, :2], 'trajectory', 3, width=1.0)
+    trajectory = Curve(final[:, :2], 'trajectory', 3, width=1.0)
     rows, cols = patch.shape
     width = min(7.0, 6.0 * cols / rows)
     return Plot(
         folder.name,
         f'{folder.name}: map and trajectory; topological map.',
         [
-            Panel([MapLayer(patch), way], 'map and trajectory'),
+            Panel([MapLayer(patch), trajectory], 'map and trajectory'),
             Panel([MapLayer(patch), GraphLayer(graph, 3.0)], f'{len(graph.nodes)} nodes'),
         ],
         columns=2,

@@ -43,7 +43,9 @@ class _Marks:
         self.near: list[Panel] = []
         self._passed: list[tuple[str, Array]] = []
 
-    def __call__(self, k: int, look: DriveSample, pipeline: Pipeline, step: PipelineResult) -> None:
+    def __call__(
+        self, k: int, sample: DriveSample, pipeline: Pipeline, step: PipelineResult
+    ) -> None:
         if k not in self._at:
             return
         T = step.estimate.T_map_base
@@ -53,7 +55,7 @@ class _Marks:
         robot = RobotMarkers(T[None], radius_m=0.32)
         words = TextLabels(np.array(places), names, 11.0)
         title = (
-            f'{self._at[k]}: after {look.scan.stamp_ns / 6e10:.1f} min, '
+            f'{self._at[k]}: after {sample.scan.stamp_ns / 6e10:.1f} min, '
             f'{step.estimate.n_features} features'
         )
         self.wide.append(
@@ -77,11 +79,11 @@ def _box(T: Array) -> tuple[float, float, float, float]:
 def run(source: Source) -> Outcome:
     """Drive the floor once, both filters and our localizer on the same scans."""
     world = world_of('floor_70x10')
-    looks = list(islice(source.looks('floor_70x10'), _QUICK_SCANS if source.quick else None))
-    marks = _Marks(len(looks))
-    ti = run_drive(looks, 'ekf_ti', marks)
-    full = run_drive(looks, 'ekf_full')
-    ours = run_drive(looks, 'scan_matching')
+    samples = list(islice(source.samples('floor_70x10'), _QUICK_SCANS if source.quick else None))
+    marks = _Marks(len(samples))
+    ti = run_drive(samples, 'ekf_ti', marks)
+    full = run_drive(samples, 'ekf_full')
+    ours = run_drive(samples, 'scan_matching')
     error = map_errors.map_error(ti.pipeline.grid.known_area(), world)
     off = np.hypot(*ti.errors()[:, :2].T)
     turned = np.degrees(np.abs(ti.errors()[:, 2]))

@@ -16,9 +16,9 @@ _QUICK_SCANS = 150
 def run(source: Source) -> Outcome:
     """Map the office with EKF-SLAM/TI, and with our localizer."""
     world = world_of('office')
-    looks = list(islice(source.looks('office'), _QUICK_SCANS if source.quick else None))
-    done = run_drive(looks)
-    ours = run_drive(looks, 'scan_matching')
+    samples = list(islice(source.samples('office'), _QUICK_SCANS if source.quick else None))
+    done = run_drive(samples)
+    ours = run_drive(samples, 'scan_matching')
     error = map_errors.map_error(done.pipeline.grid.known_area(), world)
     wheels = np.hypot(*done.errors(done.odometry)[:, :2].T)
     row = map_errors.row('office', error)
