@@ -1,4 +1,4 @@
-"""A drive through a world with exact poses: what grid and topological map become on the way."""
+"""A drive through a world with true poses, with the grid and topological map on the way."""
 
 import math
 import time
@@ -25,7 +25,7 @@ _IN_VIEW_M = 3.0
 
 @dataclass
 class Ledger:
-    """What was seen on the way: seconds of each cycle, how many nodes in view kept their ids."""
+    """Statistics of a drive: seconds of each cycle, and how many visible nodes kept their ids."""
 
     seconds: list[float] = field(default_factory=list)
     kept: int = 0
@@ -43,11 +43,11 @@ class Drive:
         self._laser = LaserScanner(LaserScannerConfig(), seed)
 
     def step(self, T: Array, stamp_ns: int = 0) -> None:
-        """One scan at a pose (3,) through grid and builder."""
+        """Process one scan at a pose (3,) in grid and builder."""
         scan = self._laser.scan(self.world, T, stamp_ns)
         before = dict(self.builder.map.nodes)
         started = time.perf_counter()
-        self.grid.update(scan, T)
+        self.grid.add_scan(scan, T)
         window = self.grid.window(T[0], T[1], WINDOW_M)
         self.builder.update(window, T)
         self.ledger.seconds.append(time.perf_counter() - started)
@@ -59,7 +59,7 @@ class Drive:
             self.step(T)
 
     def _compare(self, before: dict[int, Node], T: Array) -> None:
-        """Count nodes in view whose place still has a node, and how many of them kept their id."""
+        """Count visible nodes whose place still has a node, and how many of them kept their id."""
         after = self.builder.map.nodes
         places = np.array([node.position for node in after.values()]).reshape(-1, 2)
         for number, node in before.items():
@@ -71,9 +71,9 @@ class Drive:
 
 
 def tour(world: World, start: Array, radius_m: float, goals: int, seed: int) -> list[Array]:
-    """Poses (3,) of a drive, again and again to the world's place farthest from where it has been.
+    """Poses (3,) of a drive, repeatedly to the place of the world farthest from the driven path.
 
-    The ways are the wavefront planner's on the world itself: 0.6 m from walls where there is room.
+    Paths are planned by the wavefront planner on the world: 0.6 m from walls where possible.
     """
     rng = np.random.default_rng(seed)
     cells = np.where(world.occupied != 0, np.int8(100), np.int8(0))
@@ -89,24 +89,24 @@ def tour(world: World, start: Array, radius_m: float, goals: int, seed: int) -> 
             if unseen.max() < 1.0:
                 break
             goal = standing[int(np.argmax(unseen + rng.uniform(0.0, 2.0, len(unseen))))]
-            way = plan(patch, (poses[-1][0], poses[-1][1]), (goal[0], goal[1]), config)
-            if way is not None:
+            path = plan(patch, (poses[-1][0], poses[-1][1]), (goal[0], goal[1]), config)
+            if path is not None:
                 break
             unseen[np.hypot(*(standing - goal).T) < 1.0] = 0.0
         else:
             break
-        if unseen.max() < 1.0 or way is None:
+        if unseen.max() < 1.0 or path is None:
             break
-        been = list(way[::10])
-        poses += _along(poses[-1], way)
+        been = list(path[::10])
+        poses += _along(poses[-1], path)
     return poses
 
 
-def _along(T: Array, way: Array) -> list[Array]:
-    """Poses every _STEP_M along a way, turning on the spot before it."""
-    travelled = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))))
+def _along(T: Array, path: Array) -> list[Array]:
+    """Poses every _STEP_M along a path, after a rotation in place."""
+    travelled = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))))
     marks = np.arange(_STEP_M, travelled[-1], _STEP_M)
-    points = np.column_stack([np.interp(marks, travelled, way[:, axis]) for axis in (0, 1)])
+    points = np.column_stack([np.interp(marks, travelled, path[:, axis]) for axis in (0, 1)])
     poses = []
     last = T
     for point in points:
@@ -122,6 +122,6 @@ def _along(T: Array, way: Array) -> list[Array]:
 
 
 def final_map(drive: Drive, start: Array | None) -> TopologicalMap:
-    """The batch map of the grid at the end, of all parts or of that round a start."""
+    """The batch map of the final grid, of all components or of that of a start."""
     seed_xy = None if start is None else (float(start[0]), float(start[1]))
-    return build(drive.grid.patch(), seed_xy, drive.builder.config)
+    return build(drive.grid.known_area(), seed_xy, drive.builder.config)

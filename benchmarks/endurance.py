@@ -2,8 +2,8 @@
 
 Usage: scripts/endurance [--minutes M] -o DIR. Time waits for the nodes, so that it goes as fast as
 the machine can. Writes DIR/endurance.csv, a line for every few seconds of simulated time: memory of
-each node, its step time, processor time of all nodes, scans without a pose. Ends with a verdict:
-what grew from the second quarter of the drive to the last one, and what was lost.
+each node, its step time, CPU time of all nodes, scans without a pose. Ends with a verdict: growth
+from the second quarter of the drive to the last one, and lost scans.
 """
 
 import argparse
@@ -42,14 +42,14 @@ _SCAN_S = 0.2
 _FLAT = 1.05
 _STOP_S = 10.0
 _START_S = 120.0
-_LAG = 5  # scans whose pose may still be under way at the end
+_LAG = 5  # scans whose pose may not have arrived at the end
 _DEPTH = 1000
-_FEWEST_SAMPLES = 4  # a quarter of them is looked at
+_FEWEST_SAMPLES = 4  # a quarter of them is evaluated
 
 
 @dataclass
 class Samples:
-    """What was seen of the nodes: rows of the CSV file."""
+    """Measurements of the nodes: rows of the CSV file."""
 
     columns: list[str]
     rows: list[list[float]] = field(default_factory=list)
@@ -70,7 +70,7 @@ class Samples:
 
 
 class Driver:
-    """A client of the nodes: has the world explored, then sends the robot from place to place."""
+    """A client of the nodes: explores the world, then sends the robot to random places."""
 
     def __init__(self, world: World, seed: int) -> None:
         import rclpy
@@ -105,7 +105,7 @@ class Driver:
         self._node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, deep)
 
     def spin(self) -> None:
-        """Hear what there is, and send the robot on if it stands."""
+        """Process received messages, and send the next goal if the robot is idle."""
         self._rclpy.spin_once(self._node, timeout_sec=0.02)
         client = self._explore if self.explores else self._navigate
         if not self._busy and self.poses and client.server_is_ready():
@@ -113,11 +113,11 @@ class Driver:
             client.send_goal_async(self._next_goal()).add_done_callback(self._on_taken)
 
     def lost(self) -> int:
-        """Scans without a pose since the first one that was heard: before that nobody listened."""
+        """Scans without a pose since the first received one."""
         return max(round((self.simulated_s - self.first_s) / _SCAN_S) + 1 - self.poses, 0)
 
     def close(self) -> None:
-        """Listen no more."""
+        """Destroy the client."""
         self._node.destroy_node()
         self._rclpy.shutdown()
 
@@ -182,9 +182,9 @@ def start_all(world: str, at: np.ndarray, rate: float, seed: int) -> dict[str, p
 def measure(
     driver: Driver, nodes: dict[str, psutil.Popen], arguments: argparse.Namespace, path: Path
 ) -> Samples:
-    """Drive for so long, and write down how the nodes are.
+    """Drive for a duration, and record measurements of the nodes.
 
-    Raises ThinmapError where a node ends, or nothing comes.
+    Raises ThinmapError if a node exits, or no pose arrives.
     """
     columns = [
         'simulated_s',
@@ -214,7 +214,7 @@ def measure(
 
 
 def sample(driver: Driver, nodes: dict[str, psutil.Popen], wall_s: float) -> list[float]:
-    """A row: each node's own memory, MB; median step times, ms; processor time of all nodes, s."""
+    """A row: private memory of each node, MB; median step times, ms; CPU time of all nodes, s."""
     memory = [nodes[name].memory_full_info().uss / 1e6 for name in _NODES]
     times = [nodes[name].cpu_times() for name in _NODES]
     steps = [driver.step_ms.get(name, np.nan) for name in _STEPS]
@@ -224,7 +224,7 @@ def sample(driver: Driver, nodes: dict[str, psutil.Popen], wall_s: float) -> lis
 
 
 def verdict(samples: Samples, driver: Driver) -> bool:
-    """Say what grew and what was lost; returns whether all is flat and nothing lost."""
+    """Print growth and losses; returns whether nothing grew and no scan was lost."""
     memory = {name: samples.growth(f'{name}_mb') for name in _NODES}
     steps = {name: samples.growth(f'{name}_ms') for name in _STEPS}
     for what, found in (('memory', memory), ('step time', steps)):
@@ -247,7 +247,7 @@ def verdict(samples: Samples, driver: Driver) -> bool:
 
 
 def stop(nodes: dict[str, psutil.Popen]) -> None:
-    """End all nodes; those that do not end by themselves are killed."""
+    """Stop all nodes; those that do not exit are killed."""
     for process in nodes.values():
         with suppress(psutil.NoSuchProcess):
             process.send_signal(signal.SIGTERM)

@@ -21,7 +21,7 @@ def main(log: str, folder: Path) -> None:
         positions.append(estimate.T_map_base[:2])
     slam.finish()
     folder.mkdir(parents=True, exist_ok=True)
-    write_map(folder / 'map', slam.grid.patch())
+    write_map(folder / 'map', slam.grid.known_area())
     write_graph(folder / 'route.geojson', slam.topology.map)
     steps_m = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     print(f'{len(positions)} scans, {steps_m.sum():.1f} m, {len(slam.topology.map.nodes)} nodes')

@@ -27,7 +27,7 @@ wall_thickness: 0.20
 """
 
 
-def warehouse() -> str:
+def warehouse_yaml() -> str:
     """Text of the world file."""
     rng = np.random.default_rng(_SEED)
     solids = []
@@ -69,4 +69,4 @@ def _tour() -> list[tuple[float, float]]:
 
 
 if __name__ == '__main__':
-    print(warehouse(), end='')
+    print(warehouse_yaml(), end='')

@@ -20,7 +20,7 @@ from thinmap_ros.pipeline import Pipeline, PipelineConfig
 from thinmap_ros.sim.coverage import ObservableCells
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
-from thinmap_ros.sim.simulation import STEP_NS, Moment, Simulation
+from thinmap_ros.sim.simulation import STEP_NS, SensorReadings, Simulation
 from thinmap_ros.sim.world import World
 from thinmap_ros.strategies import DEFAULT, make_strategy
 
@@ -123,7 +123,7 @@ class ClosedLoop:
 
     @property
     def is_finished(self) -> bool:
-        """Whether the strategy has nothing left to do; a lost robot has."""
+        """Whether the strategy is finished and the robot is not lost."""
         lost = self.mishap is not None and self.mishap.is_lost
         return self.decision is not None and self.decision.finished and not lost
 
@@ -148,7 +148,7 @@ class ClosedLoop:
         """Have the strategy decide where to drive, by the present map."""
         self._T_map_odom = estimate.T_map_odom
         observation = Observation(
-            self.pipeline.topology.map, self.pipeline.grid.patch(), scan, estimate.T_map_base
+            self.pipeline.topology.map, self.pipeline.grid.known_area(), scan, estimate.T_map_base
         )
         self._observation = observation
         # Processor time of this thread: other processes do not count.
@@ -178,7 +178,7 @@ class ClosedLoop:
         self._goal = None
         self._command = (0.0, 0.0)
 
-    def _control(self, moment: Moment) -> None:
+    def _control(self, moment: SensorReadings) -> None:
         observation = self._observation
         if observation is None:
             return
@@ -194,7 +194,7 @@ class ClosedLoop:
 
     def _measure(self, goal: ObservableCells) -> tuple[float, float]:
         seconds = self.simulation.stamp_ns / 1e9
-        self.log.coverage.append((seconds, goal.coverage(self.pipeline.grid.patch())))
+        self.log.coverage.append((seconds, goal.coverage(self.pipeline.grid.known_area())))
         return self.log.coverage[-1]
 
 

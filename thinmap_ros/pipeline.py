@@ -1,4 +1,4 @@
-"""The nodes' wiring without ROS: scan and odometry in, pose, grid and topology out."""
+"""Pipeline without ROS: from scan and odometry to pose, grid and topology."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -21,7 +21,7 @@ from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
 class PipelineConfig:
     """Parameters of all stages.
 
-    scans_per_graph: the graph is brought up to date with every so many scans.
+    scans_per_graph: number of scans between updates of the graph.
     """
 
     localizer: LocalizerConfig = field(default_factory=LocalizerConfig)
@@ -33,19 +33,16 @@ class PipelineConfig:
 
 @dataclass(frozen=True, eq=False)
 class PipelineResult:
-    """What came of one scan: the pose, and the window of the map as it was thinned last."""
+    """Result of one scan: the estimate, and the window of the map that was thinned last."""
 
     estimate: Estimate
     window: GridPatch
 
 
 class Pipeline:
-    """Localizer, grid and topology, one after the other, for every scan.
+    """Localizer, grid and topology, for every scan, as in three live nodes.
 
-    What the live graph does in three nodes.
-
-    `pose_source` takes the place of the localizer where poses are known from elsewhere (a
-    simulator's truth).
+    `pose_source` replaces the localizer if poses are known (true poses of a simulator).
     """
 
     def __init__(
@@ -55,7 +52,7 @@ class Pipeline:
     ) -> None:
         self.config = config or PipelineConfig()
         self.localizer = localizer_class(self.config.localizer)(self.config.localizer)
-        # Poses that are known from elsewhere are never corrected.
+        # Known poses are never corrected.
         self._grid = CorrectableGrid(OccupancyGrid(self.config.grid), not pose_source)
         self.corrections = 0
         self.topology = TopologyBuilder(self.config.topology)
@@ -66,7 +63,7 @@ class Pipeline:
 
     @property
     def grid(self) -> OccupancyGrid:
-        """The map as it is shown; another object after a correction."""
+        """The published map; another object after a correction."""
         return self._grid.shown
 
     def step(self, scan: Scan, T_odom_base: Array) -> PipelineResult:
@@ -75,10 +72,10 @@ class Pipeline:
             estimate = self._locate(scan, T_odom_base)
         with self._timed('grid'):
             if estimate.correction is not None:
-                self.corrections += self._grid.correct(
+                self.corrections += self._grid.apply_correction(
                     *self.localizer.keyframe_trajectory(), scan.stamp_ns
                 )
-            moved = self._grid.update(None if estimate.lost else scan, estimate.T_map_base)
+            moved = self._grid.update(None if estimate.is_lost else scan, estimate.T_map_base)
         if moved is not None:
             self._rebuild(moved)
         if self._window is None or self._scans % self.config.scans_per_graph == 0:
@@ -87,13 +84,13 @@ class Pipeline:
         return PipelineResult(estimate, self._window)
 
     def finish(self) -> None:
-        """Complete what a correction has left to be done, after the last scan."""
+        """Complete a pending correction after the last scan."""
         moved = self._grid.finish()
         if moved is not None:
             self._rebuild(moved)
 
     def _thin(self, T_map_base: Array) -> GridPatch:
-        """Bring the graph up to date, but not from a map of which a part is not corrected yet."""
+        """Update the graph, unless the map is only partly corrected."""
         with self._timed('topology'):
             window = self.grid.window(T_map_base[0], T_map_base[1], self.config.window.window_m)
             if not self._grid.is_rerendering and self.topology.update(window, T_map_base):
@@ -101,7 +98,7 @@ class Pipeline:
         return window
 
     def _rebuild(self, moved: CorrectedPoses) -> None:
-        """Build the graph again: the grid has undergone a correction."""
+        """Rebuild the graph after a correction of the grid."""
         with self._timed('rebuild'):
             size = self.config.window.window_m
             self.topology.rebuild(lambda x, y: self.grid.window(x, y, size), *moved)

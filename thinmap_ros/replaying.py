@@ -25,7 +25,7 @@ from thinmap_ros.view import figures
 
 @dataclass(eq=False)
 class Replay:
-    """What came of a log: the pipeline at its end, and the pose (3,) of every scan."""
+    """Result of a replay: the pipeline at the end, and the pose (3,) of every scan."""
 
     pipeline: Pipeline
     stamps_ns: list[int] = field(default_factory=list)
@@ -41,17 +41,14 @@ class Watcher(Protocol):
     def step(self, scan: Scan, T_odom_base: Array, estimate: Estimate, pipeline: Pipeline) -> None:
         """Receive the result of a scan with the odometry pose (3,) at its stamp."""
 
-    def last(self, ns: int, pipeline: Pipeline) -> None:
+    def finish(self, ns: int, pipeline: Pipeline) -> None:
         """Receive the end of the log, with the stamp of the last scan."""
 
 
 def replay(
     log: Log, config: PipelineConfig, show_progress: bool = False, watcher: Watcher | None = None
 ) -> Replay:
-    """Play a log through the pipeline, watched or not.
-
-    Raises InputError where the log has nothing to play.
-    """
+    """Replay a log through the pipeline. Raises InputError if it has no scan with odometry."""
     result = Replay(Pipeline(config))
     pairing = ScanOdometrySynchronizer()
     tidy_up = compiler_memory_releaser()
@@ -74,7 +71,7 @@ def replay(
     if not result.poses:
         raise InputError(f'no scan with odometry around its stamp; {result.skipped} skipped')
     if watcher is not None:
-        watcher.last(result.stamps_ns[-1], result.pipeline)
+        watcher.finish(result.stamps_ns[-1], result.pipeline)
     return result
 
 
@@ -83,7 +80,7 @@ def write_outputs(
 ) -> dict[str, Any]:
     """Write all files into a folder; seconds: wall and CPU time taken. Returns the report."""
     pipeline = result.pipeline
-    patch = pipeline.grid.patch()
+    patch = pipeline.grid.known_area()
     poses = np.array(result.poses)
     folder.mkdir(parents=True, exist_ok=True)
     trajectories.write_tum(folder / 'trajectory.tum', result.stamps_ns, result.poses)
@@ -91,7 +88,7 @@ def write_outputs(
     trajectories.write_tum(folder / 'trajectory_final.tum', result.stamps_ns, final)
     occupancy_maps.write_map(folder / 'map', patch)
     graphs.write_geojson(folder / 'topology.geojson', pipeline.topology.map)
-    release_compiler_pages()  # before matplotlib comes on top of them
+    release_compiler_pages()  # before matplotlib is loaded
     figures.summary_figure(folder / 'summary.png', patch, pipeline.topology.map, poses, title=title)
     report = _report(result, poses, seconds)
     write_text(folder / 'report.json', json.dumps(report, indent=2) + '\n')
@@ -111,7 +108,7 @@ def _report(result: Replay, poses: Array, seconds: tuple[float, float]) -> dict[
         'peak_mb': round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
         'loops_closed': result.pipeline.corrections,
         'rebuild_ms': round(1000.0 * float(rebuilds.max(initial=0.0)), 1),
-        'ms_per_scan': {name: _spread(1000.0 * taken) for name, taken in stages.items()},
+        'ms_per_scan': {name: _spread(1000.0 * seconds) for name, seconds in stages.items()},
         'features': len(line_features(result.pipeline.localizer)),
         'features_local_median': float(np.median(result.local_features)),
         'refused': result.pipeline.localizer.refused,

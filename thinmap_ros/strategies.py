@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import partial
 from importlib import import_module
 
-from thinmap_ros.core.errors import ConfigError, one_line_reason, shown
+from thinmap_ros.core.errors import ConfigError, one_line_reason, quoted
 from thinmap_ros.core.exploration.explorer import Explorer, ExplorerConfig
 from thinmap_ros.core.exploration.strategy import Strategy
 
@@ -52,7 +52,7 @@ def _factory(name: str, config: ExplorerConfig) -> Callable[[], object]:
         return _imported(name, 'thinmap_ros.baselines.exploration', _BASELINES[name])
     module, colon, attribute = name.partition(':')
     if not (module and colon and attribute):
-        raise ConfigError(f'strategy = {shown(name)}: {_EXPECTED}')
+        raise ConfigError(f'strategy = {quoted(name)}: {_EXPECTED}')
     return _imported(name, module, attribute)
 
 
@@ -67,4 +67,4 @@ def _imported(name: str, module: str, attribute: str) -> Callable[[], object]:
 
 
 def _refused(name: str, problem: str) -> ConfigError:
-    return ConfigError(f'strategy = {shown(name)}: {problem}: {_EXPECTED}')
+    return ConfigError(f'strategy = {quoted(name)}: {problem}: {_EXPECTED}')

@@ -9,7 +9,7 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
-from thinmap_ros.evaluation.strategy_comparison import OURS, markdown, saved
+from thinmap_ros.evaluation.strategy_comparison import OURS, markdown, relative_saving
 
 Report = dict[str, Any]
 _PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'exploration.md'
@@ -39,7 +39,7 @@ then looked into, for more way in most worlds, where there are no such doorways.
 
 
 def page(reports: list[Report]) -> str:
-    """Text of the page: a section for each kind of world and way in which it was explored."""
+    """Text of the page: a section for each kind of world and options of the exploration."""
     sections: dict[tuple[str, str], list[Report]] = defaultdict(list)
     for report in reports:
         sections[report['world'].split('-')[0], _conditions(report['options'])].append(report)
@@ -86,7 +86,7 @@ def _verdicts(reports: list[Report]) -> list[str]:
             f'After {_NEARLY_ALL:.1%} were seen, {OURS} drove {rest:.1%} of its way (mean).'
         )
     for name, theirs in sorted(by_strategy.items()):
-        longer = saved(ours, theirs, 'distance')
+        longer = relative_saving(ours, theirs, 'distance')
         if (longer > 0.0).any():
             lines.append(
                 f'{name} drove less in {int((longer > 0.0).sum())} of {len(longer)} pairs; '

@@ -68,7 +68,7 @@ def lab(_: Setting) -> Iterator[Case]:
 
 
 def voronoi(_: Setting) -> Iterator[Case]:
-    """The first of these once more with the nodes of a Voronoi diagram in the map."""
+    """The first of these again, with the nodes of a Voronoi diagram in the map."""
     for seed in range(500):
         yield Case(f'{seed}', partial(_in_lab, seed, 15, 'voronoi'))
 
@@ -225,7 +225,7 @@ def _map_of(folder: Path, name: str) -> Map:
 
 
 def kidnapped(setting: Setting) -> Iterator[Case]:
-    """Robots carried off after 150 s of exploring with SLAM at 0.5 m/s, elsewhere on the map."""
+    """Robots kidnapped after 150 s of exploration with SLAM at 0.5 m/s, elsewhere on the map."""
     for number, floor in enumerate(floors(setting.worlds)):
         yield Case(floor.name, partial(_carried_off, setting.worlds, floor.name, number))
 
@@ -257,9 +257,9 @@ def foreign_log(setting: Setting) -> Iterator[Case]:
 
 def _log_elsewhere(setting: Setting, name: str) -> Record:
     known = _map_of(setting.worlds, name)
-    looks = split_log.looks_from(setting.log, sum(map(ord, name)))
+    samples = split_log.samples_from(setting.log, sum(map(ord, name)))
     return trials.watch_foreign(
-        GlobalLocalization(known.patch, known.topology, seed=1), looks, _FOREIGN_WAY_M
+        GlobalLocalization(known.patch, known.topology, seed=1), samples, _FOREIGN_WAY_M
     )
 
 

@@ -15,7 +15,7 @@ _HEAD = """\
 
 Made by `python -m benchmarks.kidnapped.page DIR` of the files that
 `python -m benchmarks.kidnapped -o DIR` left; with `--count` the first so many of each row. A robot
-is right that is sure within 0.3 m (0.5 m in the log, and when carried off) and 10 degrees of where
+is right that is sure within 0.3 m (0.5 m in the log, and when kidnapped) and 10 degrees of where
 it is; unless told otherwise it has a laser of 181 beams over 180 degrees that reaches 8 m, drives
 at 0.5 m/s to random places, and has 40 m of way. Times are of the processor, on a machine that did
 other things as well. Times of a step's parts and what a map takes in memory are in
@@ -33,7 +33,7 @@ _ABOUT = {
     'foreign': 'Robots in other buildings than that of the map; 20 m of way',
     'foreign_log': 'A real robot (Intel) in the maps of other buildings, and robots of these in '
     'its map; 20 m of way',
-    'kidnapped': 'Carried off while exploring with SLAM',
+    'kidnapped': 'Kidnapped while exploring with SLAM',
     'halves': 'A real log (Intel) in halves: map of the first, robot switched on in the second. '
     'In the map is a place of which the map shows 70 of 100 beams, and agrees with 80 of 100 of '
     'these',

@@ -36,7 +36,7 @@ _AGREES = 0.8
 class _Halves:
     """Looks of the whole log with poses in the frame of the map of the first half, and that map."""
 
-    looks: list[DriveSample]
+    samples: list[DriveSample]
     half: int
     known: Map
 
@@ -46,37 +46,37 @@ def first_half(log: Path) -> Map:
     return _halves(log).known
 
 
-def looks_from(log: Path, seed: int) -> Iterator[DriveSample]:
+def samples_from(log: Path, seed: int) -> Iterator[DriveSample]:
     """Looks of a log from a random one of its first three quarters on."""
-    looks = _halves(log).looks
-    yield from looks[int(np.random.default_rng(seed).integers(3 * len(looks) // 4)) :]
+    samples = _halves(log).samples
+    yield from samples[int(np.random.default_rng(seed).integers(3 * len(samples) // 4)) :]
 
 
 def in_second_half(log: Path, number: int) -> Record:
     """A robot switched on at one of 100 stamps of the second half, with the map of the first."""
     halves = _halves(log)
-    begin = int(np.linspace(halves.half, len(halves.looks) - SCANS - 1, _STARTS)[number])
-    looks = halves.looks[begin : begin + SCANS]
-    shown, agrees = _in_map(_finder(log), looks)
-    record = search(fresh(_finder(log)), looks, steps=SCANS, right_m=_RIGHT_M)
+    begin = int(np.linspace(halves.half, len(halves.samples) - SCANS - 1, _STARTS)[number])
+    samples = halves.samples[begin : begin + SCANS]
+    shown, agrees = _in_map(_finder(log), samples)
+    record = search(fresh(_finder(log)), samples, steps=SCANS, right_m=_RIGHT_M)
     return record | {'shown': round(shown, 3), 'agrees': round(agrees, 3)}
 
 
 @lru_cache(maxsize=1)
 def _finder(log: Path) -> GlobalLocalization:
-    return prepared(_halves(log).known, _halves(log).looks[0], seed=1)
+    return prepared(_halves(log).known, _halves(log).samples[0], seed=1)
 
 
-def _in_map(finder: GlobalLocalization, looks: list[DriveSample]) -> tuple[float, float]:
+def _in_map(finder: GlobalLocalization, samples: list[DriveSample]) -> tuple[float, float]:
     """Of how many beams the map tells, from true poses, and with how many of these it agrees."""
     asked = 0.0
     agreed = 0.0
     beams = 0
-    model = calibrate(finder.places, looks[0].scan, finder.config, np.random.default_rng(0))
+    model = calibrate(finder.places, samples[0].scan, finder.config, np.random.default_rng(0))
     judge = Judge(finder.places, finder.config, model)
-    for look in looks[: SCANS // 2 : _EVERY // 2]:
-        seen = observe(look.scan, finder.places.frame.resolution, finder.config)
-        counts, silent = judge.explained(judge.refined(look.T_world_base[None], seen), seen)
+    for sample in samples[: SCANS // 2 : _EVERY // 2]:
+        seen = observe(sample.scan, finder.places.frame.resolution, finder.config)
+        counts, silent = judge.explained(judge.refined(sample.T_world_base[None], seen), seen)
         beams += len(seen.ranges_m)
         asked += len(seen.ranges_m) - float(silent[0])
         agreed += float(counts[0])
@@ -95,7 +95,7 @@ def _halves(log: Path) -> _Halves:
     pipeline = Pipeline()
     for scan, T_odom_base in pairs[:half]:
         pipeline.step(scan, T_odom_base)
-    known = Map(pipeline.grid.patch(), copy.deepcopy(pipeline.topology.map))
+    known = Map(pipeline.grid.known_area(), copy.deepcopy(pipeline.topology.map))
     first = pipeline.localizer.optimized_trajectory()
     for scan, T_odom_base in pairs[half:]:
         pipeline.step(scan, T_odom_base)

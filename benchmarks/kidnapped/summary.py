@@ -98,7 +98,7 @@ def _kidnapped(records: list[Written]) -> Iterator[Row]:
     ]
     found = [record for record in records if record['found_after_s']]
     right = sum(record['found_right'] == 'True' for record in found)
-    yield Row('robots carried off', f'{count}')
+    yield Row('kidnapped robots', f'{count}')
     yield at_least(
         'noticed within 5 s, of 100', percent(sum(s <= _NOTICED_S for s in noticed), count), 95.0
     )

@@ -22,7 +22,7 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.experiments.drives import Source
 from thinmap_ros.experiments.maps import grid_of
 from thinmap_ros.files.worlds import read_world
-from thinmap_ros.sim.drives import DriveSample, patch_of, random_drive, random_start
+from thinmap_ros.sim.drives import DriveSample, random_drive, random_start, world_to_grid
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.world import World
 
@@ -61,7 +61,7 @@ def lab() -> World:
 @lru_cache(maxsize=1)
 def lab_map() -> Map:
     """Its map, merged from its stops."""
-    patch = grid_of(Source().looks('lab_stops')).patch()
+    patch = grid_of(Source().samples('lab_stops')).known_area()
     return Map(patch, build(patch, LAB_START[:2], TopologyConfig()))
 
 
@@ -73,7 +73,7 @@ def voronoi_lab_map() -> Map:
 
 def shifted_map(world: World, finer: int, shift_m: tuple[float, float]) -> Map:
     """A world itself as a map, in cells so many times finer, in a frame moved by this much."""
-    patch = patch_of(world)
+    patch = world_to_grid(world)
     cells = np.repeat(np.repeat(patch.cells, finer, axis=0), finer, axis=1)
     frame = patch.frame
     origin = (frame.origin_x + shift_m[0], frame.origin_y + shift_m[1])
@@ -83,14 +83,14 @@ def shifted_map(world: World, finer: int, shift_m: tuple[float, float]) -> Map:
 
 def driven_map(world: World, laser: LaserScannerConfig) -> Map:
     """The map of a long drive with a laser at exact poses, full of what the robot did not see."""
-    looks = random_drive(world, random_start(world, np.random.default_rng(99)), 99, laser=laser)
-    return map_of_patch(grid_of(look for look, _ in along(looks, _MAPPED_WAY_M)).patch())
+    samples = random_drive(world, random_start(world, np.random.default_rng(99)), 99, laser=laser)
+    return map_of_patch(grid_of(sample for sample, _ in along(samples, _MAPPED_WAY_M)).known_area())
 
 
-def prepared(known: Map, look: DriveSample, seed: int) -> GlobalLocalization:
-    """A search that has looked at its map, and knows the laser by the scan of a look."""
+def prepared(known: Map, sample: DriveSample, seed: int) -> GlobalLocalization:
+    """A localizer with its map prepared, and the laser known from the scan of a sample."""
     finder = GlobalLocalization(known.patch, known.topology, seed=seed)
-    finder.step(look.scan, look.T_odom_base)
+    finder.step(sample.scan, sample.T_odom_base)
     finder.restart()
     return finder
 
@@ -100,15 +100,15 @@ def fresh(finder: GlobalLocalization) -> GlobalLocalization:
     return copy.deepcopy(finder)
 
 
-def along(looks: Iterable[DriveSample], way_m: float) -> Iterator[tuple[DriveSample, float]]:
-    """Each look, and the way that has been driven up to there, until that is longer than way_m."""
+def along(samples: Iterable[DriveSample], limit_m: float) -> Iterator[tuple[DriveSample, float]]:
+    """Each sample and the distance travelled so far, up to limit_m."""
     way = 0.0
     last = None
-    for look in looks:
-        way += 0.0 if last is None else float(np.hypot(*(look.T_world_base - last)[:2]))
-        last = look.T_world_base
-        yield look, way
-        if way > way_m:
+    for sample in samples:
+        way += 0.0 if last is None else float(np.hypot(*(sample.T_world_base - last)[:2]))
+        last = sample.T_world_base
+        yield sample, way
+        if way > limit_m:
             return
 
 
@@ -120,8 +120,8 @@ def offset(found: Hypothesis, truth: Array) -> tuple[float, float]:
 
 def search(
     finder: GlobalLocalization,
-    looks: Iterable[DriveSample],
-    way_m: float = np.inf,
+    samples: Iterable[DriveSample],
+    limit_m: float = np.inf,
     every: int = 1,
     steps: int = 10**9,
     right_m: float = 0.3,
@@ -135,12 +135,12 @@ def search(
     count = 0
     result = None
     driven_m = 0.0
-    for k, (look, way) in enumerate(along(looks, way_m)):
+    for k, (sample, way) in enumerate(along(samples, limit_m)):
         if k % every:
             continue
         driven_m = way
         began = time.process_time()
-        result = finder.step(look.scan, look.T_odom_base)
+        result = finder.step(sample.scan, sample.T_odom_base)
         seconds.append(time.process_time() - began)
         count += 1
         if result.pose is not None or count == steps:
@@ -153,19 +153,23 @@ def search(
         'off_deg': '',
     }
     if result is not None and result.pose is not None:
-        off_m, off_rad = offset(result.pose, look.T_world_base + (*shift_m, 0.0))
+        off_m, off_rad = offset(result.pose, sample.T_world_base + (*shift_m, 0.0))
         good = off_m <= right_m and off_rad <= _RIGHT_RAD
         off = {'off_m': round(off_m, 3), 'off_deg': round(float(np.degrees(off_rad)), 2)}
         record |= {'outcome': 'right' if good else 'wrong', **off}
     return record | {'step_ms': round(1e3 * float(np.median(seconds)), 2)}
 
 
-def watch_twins(finder: GlobalLocalization, looks: Iterable[DriveSample], way_m: float) -> Record:
+def watch_twins(
+    finder: GlobalLocalization, samples: Iterable[DriveSample], limit_m: float
+) -> Record:
     """Counts of steps of a robot that cannot tell places apart.
 
     How often it is sure, and how often the two likeliest places are equally likely.
     """
-    results = [finder.step(look.scan, look.T_odom_base) for look, _ in along(looks, way_m)]
+    results = [
+        finder.step(sample.scan, sample.T_odom_base) for sample, _ in along(samples, limit_m)
+    ]
     return {
         'steps': len(results),
         'sure': sum(result.state == State.LOCALIZED for result in results),
@@ -180,14 +184,16 @@ def _gap(result: Result) -> float:
     return weights[0] - weights[1]
 
 
-def watch_foreign(finder: GlobalLocalization, looks: Iterable[DriveSample], way_m: float) -> Record:
-    """After how much way a robot in another building is told so, or sure, and how it ends.
+def watch_foreign(
+    finder: GlobalLocalization, samples: Iterable[DriveSample], limit_m: float
+) -> Record:
+    """Record of a robot in a building that is not in the map: distances until the result.
 
-    It is looked for on and on, whether it was sure or not.
+    The search continues after a result.
     """
     record: Record = {'said_m': '', 'sure_m': '', 'last': ''}
-    for look, way in along(looks, way_m):
-        state = finder.step(look.scan, look.T_odom_base).state
+    for sample, way in along(samples, limit_m):
+        state = finder.step(sample.scan, sample.T_odom_base).state
         for key, wanted in (('said_m', State.NOT_IN_MAP), ('sure_m', State.LOCALIZED)):
             if state == wanted and record[key] == '':
                 record[key] = round(way, 2)

@@ -24,7 +24,7 @@ from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.evaluation.parallel_jobs import (
     Failure,
     add_run_options,
-    complaint,
+    failure_summary,
     read_report,
     run_pending,
 )
@@ -73,7 +73,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--write-short',
         action='store_true',
-        help='write short.txt anew from the complete run in DIR (what is missing is run first)',
+        help='rewrite short.txt from the complete run in DIR (missing cases are run first)',
     )
     parser.add_argument('--quiet', action='store_true', help='no bar of progress')
     parser.add_argument(
@@ -112,7 +112,7 @@ def _run(arguments: argparse.Namespace) -> None:
     write_text(arguments.out / 'scoreboard.md', text)
     print(f'worst tenth, live: {worst_tenth(cases, reports):.3f} m; {arguments.out}/scoreboard.md')
     if failures:
-        raise complaint(failures)
+        raise failure_summary(failures)
     if arguments.write_short:
         write_text(_SHORT, shortened(cases, reports))
 

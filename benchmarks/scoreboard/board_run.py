@@ -17,7 +17,7 @@ from benchmarks.scoreboard.page import case_tables
 from benchmarks.scoreboard.played import Numbers
 from benchmarks.scoreboard.reports import report_file, report_of, reports_there
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.evaluation.parallel_jobs import Failure, complaint, read_report, run_pending
+from thinmap_ros.evaluation.parallel_jobs import Failure, failure_summary, read_report, run_pending
 from thinmap_ros.files.atomic import write_text
 
 FOLDER = 'board'  # of the results; a case of the complete scoreboard may have the same name
@@ -91,7 +91,7 @@ def run_board(arguments: argparse.Namespace, options: Numbers) -> None:
     write_text(arguments.out / 'cases.md', '# Cases of the board\n\n' + tables)
     print(f'{table}\n{arguments.out}/board.md')
     if failures:
-        raise complaint(failures)
+        raise failure_summary(failures)
 
 
 def measure_on_board(task: BoardTask) -> Numbers:

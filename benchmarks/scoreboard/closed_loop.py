@@ -24,7 +24,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.machine import forget_peak, peak_mb
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
-from thinmap_ros.sim.coverage import ObservableCells, coverable
+from thinmap_ros.sim.coverage import ObservableCells, observable_cells
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import Simulation
@@ -76,8 +76,8 @@ def measure_drive(
     recording: Recording = read_recording(recordings / f'{flat(case.world)}.npz')
     truth = recording.T_world_base
     config = config_of(options, truth[0])
-    looks = recording.replay(_ROBOT, case.odometry_seed)
-    pairs = ((look.scan, look.T_odom_base) for look in looks)
+    samples = recording.replay(_ROBOT, case.odometry_seed)
+    pairs = ((sample.scan, sample.T_odom_base) for sample in samples)
     return simulated_numbers(play(pairs, config, scans_per_graph), truth)
 
 
@@ -87,7 +87,9 @@ def measure_loop(case: LoopCase, worlds: Path, options: Numbers) -> Numbers:
     laser = LASERS[case.laser]
     simulation = Simulation(world, start, _ROBOT, laser, case.seed)
     is_whole = case.world not in _LIMITS_S
-    goal = coverable(world, start, _ROBOT.radius_m, laser.range_max_m) if is_whole else _NOTHING
+    goal = (
+        observable_cells(world, start, _ROBOT.radius_m, laser.range_max_m) if is_whole else _NOTHING
+    )
     rehearse()
     pipeline = PlayedPipeline(_pipeline_config(laser, options, start))
     loop = _closed_loop(simulation, pipeline)

@@ -10,8 +10,8 @@ from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.se2 import Array, transform_points
-from thinmap_ros.sim.buildings import Building, building
-from thinmap_ros.sim.drives import MARGIN_M, DriveSample, drive, patch_of
+from thinmap_ros.sim.buildings import Building, generate_building
+from thinmap_ros.sim.drives import MARGIN_M, DriveSample, drive, world_to_grid
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS, RobotConfig
 from thinmap_ros.sim.simulation import Simulation
@@ -20,7 +20,7 @@ from thinmap_ros.sim.world import World
 _SPEED_M_S = 0.7
 _LENGTH_M = 250.0
 _NEAR_M = 40.0  # a part that is so near may be the next
-_DETOUR_M = 25.0  # ways may lead so far round
+_DETOUR_M = 25.0  # maximum detour of paths
 _CHOICES = 5  # the next is one of so many nearest that were not visited
 _MOST_GOALS = 60
 _PIECE_M = 16.0  # of a hall: what a laser of 8 m sees from its middle
@@ -34,12 +34,12 @@ _ODOMETRY = (
 )
 
 
-def looks(seed: int, robot: str, noise: float) -> Iterator[DriveSample]:
-    """Look after look of a drive of some 250 m that ends where it began."""
-    made = building(seed)
+def samples(seed: int, robot: str, noise: float) -> Iterator[DriveSample]:
+    """Yield the samples of a drive of some 250 m that ends at its start."""
+    made = generate_building(seed)
     body = noisy(PRESETS[robot], noise)
     simulation = Simulation(made.world, _start(made, body), body, LaserScannerConfig(), seed)
-    return drive(simulation, ways(made, simulation.robot.T_world_base, body, seed), _SPEED_M_S)
+    return drive(simulation, paths(made, simulation.robot.T_world_base, body, seed), _SPEED_M_S)
 
 
 def noisy(robot: RobotConfig, noise: float) -> RobotConfig:
@@ -47,10 +47,10 @@ def noisy(robot: RobotConfig, noise: float) -> RobotConfig:
     return replace(robot, **{name: noise * getattr(robot, name) for name in _ODOMETRY})
 
 
-def ways(made: Building, start: Array, robot: RobotConfig, seed: int) -> Iterator[Array]:
-    """Ways (K, 2), m, of a drive, each from where the one before ends."""
+def paths(made: Building, start: Array, robot: RobotConfig, seed: int) -> Iterator[Array]:
+    """Paths (K, 2), m, of a drive; each starts at the end of the previous one."""
     rng = np.random.default_rng(seed)
-    patch = patch_of(made.world)
+    patch = world_to_grid(made.world)
     goals = _goals(made)
     left = np.ones(len(goals), dtype=np.bool_)
     at = start[:2]
@@ -64,15 +64,15 @@ def ways(made: Building, start: Array, robot: RobotConfig, seed: int) -> Iterato
             break
         chosen = int(rng.choice(nearest))
         left[chosen] = False
-        way = _way(patch, at, goals[chosen], robot.radius_m)
-        if way is not None:
-            driven.append(way)
-            at = way[-1]
-            length_m += float(np.hypot(*np.diff(way, axis=0).T).sum())
-            yield way
+        path = _path(patch, at, goals[chosen], robot.radius_m)
+        if path is not None:
+            driven.append(path)
+            at = path[-1]
+            length_m += float(np.hypot(*np.diff(path, axis=0).T).sum())
+            yield path
     # Home the way it came, but for the detours: known ground, and a loop where there is one.
-    for way in reversed(driven):
-        back = _way(patch, at, way[0], robot.radius_m)
+    for path in reversed(driven):
+        back = _path(patch, at, path[0], robot.radius_m)
         if back is not None:
             at = back[-1]
             yield back
@@ -98,8 +98,8 @@ def _middles(low: float, high: float) -> Array:
     return np.asarray(0.5 * (ends[1:] + ends[:-1]))
 
 
-def _way(patch: GridPatch, a: Array, b: Array, radius_m: float) -> Array | None:
-    """A way from a to b in the part of the map round both, or None."""
+def _path(patch: GridPatch, a: Array, b: Array, radius_m: float) -> Array | None:
+    """A path from a to b in the part of the map around both, or None."""
     frame = patch.frame
     ends = np.stack([a, b])
     low = frame.cells_of(ends.min(axis=0)[None] - _DETOUR_M)[0].clip(0)

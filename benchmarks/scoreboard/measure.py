@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.scoreboard.cases import EXACT_S, BuildingCase, Case, LogCase
-from benchmarks.scoreboard.drives import looks
+from benchmarks.scoreboard.drives import samples
 from benchmarks.scoreboard.played import (
     Numbers,
     Played,
@@ -177,10 +177,10 @@ def _disturbed(pairs: Iterator[tuple[Scan, Array]], run: int) -> Iterator[tuple[
 
 def measure_building(case: BuildingCase, options: Numbers, scans_per_graph: int = 1) -> Numbers:
     """Numbers of a drive through a generated building; scans_per_graph: as of the pipeline."""
-    drive = list(looks(case.seed, case.robot, case.noise))
-    truth = np.array([look.T_world_base for look in drive])
+    drive = list(samples(case.seed, case.robot, case.noise))
+    truth = np.array([sample.T_world_base for sample in drive])
     config = config_of(options, truth[0])
-    pairs = ((look.scan, look.T_odom_base) for look in drive)
+    pairs = ((sample.scan, sample.T_odom_base) for sample in drive)
     return simulated_numbers(play(_disturbed(pairs, case.run), config, scans_per_graph), truth)
 
 

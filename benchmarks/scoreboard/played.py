@@ -88,7 +88,7 @@ class PlayedPipeline(CpuTimedPipeline):
         played.stamps_ns.append(scan.stamp_ns)
         played.poses.append(step.estimate.T_map_base)
         played.covariances.append(step.estimate.covariance)
-        played.lost.append(step.estimate.lost)
+        played.lost.append(step.estimate.is_lost)
         return step
 
 

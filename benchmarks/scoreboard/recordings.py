@@ -15,7 +15,7 @@ from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.sim.drives import DriveSample
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import RobotConfig, WheelOdometry
-from thinmap_ros.sim.simulation import STEP_NS, Moment, Simulation, odometry_seed
+from thinmap_ros.sim.simulation import STEP_NS, SensorReadings, Simulation, odometry_seed
 from thinmap_ros.sim.world import World
 
 _STEP_S = STEP_NS / 1e9
@@ -74,7 +74,7 @@ class RecordedSimulation(Simulation):
         self._poses: list[Array] = []
         self._steps: list[tuple[float, float]] = []
 
-    def read_sensors(self) -> Moment:
+    def read_sensors(self) -> SensorReadings:
         """Return what the sensors measure now, and keep a scan with its true pose."""
         moment = super().read_sensors()
         if moment.scan is not None:
@@ -82,7 +82,7 @@ class RecordedSimulation(Simulation):
             self._poses.append(self.robot.T_world_base)
         return moment
 
-    def step(self, v: float, w: float) -> Moment:
+    def step(self, v: float, w: float) -> SensorReadings:
         """Drive for one step, and keep its exact distance and turn."""
         moment = super().step(v, w)
         self._steps.append((self.robot.v * _STEP_S, self.robot.w * _STEP_S))

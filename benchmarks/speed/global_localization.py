@@ -29,7 +29,7 @@ def _step_times(folder: Path, quick: bool) -> Iterator[Row]:
     """5,000 samples against 10 observed nodes and a scan's beams, in maps of few and many nodes."""
     floor = floors(folder, 'kth/50052749')[0]
     patch = shifted_map(floor.world, 1, (0.0, 0.0)).patch
-    look = next(random_drive(floor.world, floor.starts[0], 0))
+    drive_sample = next(random_drive(floor.world, floor.starts[0], 0))
     rng = np.random.default_rng(0)
     for count, limit in ((30, 2.0), (120, 3.0), (2000, 5.0)):
         config = GlobalLocalizationConfig()
@@ -38,7 +38,7 @@ def _step_times(folder: Path, quick: bool) -> Iterator[Row]:
         places = Places.of(patch, TopologicalMap(nodes), config)
         judge = Judge(places, config, NodeModel(np.full(3, 0.5), np.full(3, 0.4), np.full(3, 20.0)))
         seen = replace(
-            observe(look.scan, patch.frame.resolution, config),
+            observe(drive_sample.scan, patch.frame.resolution, config),
             nodes=rng.normal(0.0, 2.0, (10, 2)),
             node_kinds=np.ones(10, dtype=np.int64),
         )

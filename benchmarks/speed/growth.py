@@ -35,9 +35,9 @@ _PARTS = ('localizer', 'grid', 'topology')
 
 @dataclass(frozen=True, eq=False)
 class _Mark:
-    """After a way, m: CPU of last scans by part, ms; free area, m2; memory, MB; pose error, m."""
+    """Measurements at a distance, m: CPU by part, ms; area, m2; memory, MB; pose error, m."""
 
-    way_m: float
+    travelled_m: float
     taken_ms: dict[str, Array]
     area_m2: float
     resident_mb: float
@@ -46,21 +46,23 @@ class _Mark:
 
 def run(worlds: Path, quick: bool) -> Iterator[Row]:
     """Rows at some lengths of the drive, as they come."""
-    deque(_drive(islice(_looks()[0], _WARM_UP), [math.inf]), maxlen=0)  # compiles
-    looks, lap_m = _looks()
-    # Where the first stretch has been driven once more.
+    deque(_drive(islice(_samples()[0], _WARM_UP), [math.inf]), maxlen=0)  # compiles
+    samples, lap_m = _samples()
+    # A further drive along the first part.
     again = [lap * lap_m + _MARKS_M[0] for lap in range(1, 4)]
     first: _Mark | None = None
     new: _Mark | None = None  # the last one of the first lap
-    for mark in _drive(looks, sorted(_MARKS_QUICK_M if quick else {*_MARKS_M, *again})):
+    for mark in _drive(samples, sorted(_MARKS_QUICK_M if quick else {*_MARKS_M, *again})):
         yield from _rows(mark)
         first = first or mark
         if mark is first:
             continue
-        lap = again.index(mark.way_m) + 2 if mark.way_m in again else None
-        where = f'lap {lap}, on the first {_SPAN_M:.0f} m' if lap else f'after {mark.way_m:.0f} m'
+        lap = again.index(mark.travelled_m) + 2 if mark.travelled_m in again else None
+        where = (
+            f'lap {lap}, on the first {_SPAN_M:.0f} m' if lap else f'after {mark.travelled_m:.0f} m'
+        )
         yield from _ratios(where, mark, first)
-        if mark.way_m <= lap_m:
+        if mark.travelled_m <= lap_m:
             new = mark
             grown_kb = 1e3 * (mark.resident_mb - first.resident_mb)
             yield Row(
@@ -68,12 +70,14 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
                 f'{grown_kb / (mark.area_m2 - first.area_m2):.3g} kB',
             )
         elif new is not None:
-            more_mb = (mark.resident_mb - new.resident_mb) / (1e-3 * (mark.way_m - new.way_m))
+            more_mb = (mark.resident_mb - new.resident_mb) / (
+                1e-3 * (mark.travelled_m - new.travelled_m)
+            )
             yield Row('  memory a kilometre on known ground', f'{more_mb:.3g} MB')
 
 
 def _rows(mark: _Mark) -> Iterator[Row]:
-    yield Row(f'after {mark.way_m:.0f} m: free area in the map', f'{mark.area_m2:.0f} m2')
+    yield Row(f'after {mark.travelled_m:.0f} m: free area in the map', f'{mark.area_m2:.0f} m2')
     every = mark.taken_ms['all']
     yield Row('  CPU a scan, median and mean', f'{np.median(every):.3g} and {every.mean():.3g} ms')
     for of, name in ((np.median, 'median'), (np.mean, 'mean')):
@@ -93,45 +97,45 @@ def _ratios(where: str, mark: _Mark, first: _Mark) -> Iterator[Row]:
     yield at_most('  the same, mean', float(now.mean() / then.mean()), 1.2)
 
 
-def _drive(looks: Iterator[DriveSample], marks_m: list[float]) -> Iterator[_Mark]:
+def _drive(samples: Iterator[DriveSample], marks_m: list[float]) -> Iterator[_Mark]:
     """Marks after these lengths of the drive."""
     pipeline: CpuTimedPipeline | None = None
-    way_m = 0.0
+    travelled_m = 0.0
     last = None
     ways = []
     taken: dict[str, list[float]] = {part: [] for part in ('all', *_PARTS)}
-    for look in looks:
+    for sample in samples:
         if pipeline is None:
-            x, y, yaw = look.T_world_base.tolist()
+            x, y, yaw = sample.T_world_base.tolist()
             pipeline = CpuTimedPipeline(
                 PipelineConfig(
                     localizer=LocalizerConfig(initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
                 )
             )
-        way_m += 0.0 if last is None else float(np.hypot(*(look.T_world_base - last)[:2]))
-        last = look.T_world_base
+        travelled_m += 0.0 if last is None else float(np.hypot(*(sample.T_world_base - last)[:2]))
+        last = sample.T_world_base
         began = time.process_time()
-        T_map_base = pipeline.step(look.scan, look.T_odom_base).estimate.T_map_base
+        T_map_base = pipeline.step(sample.scan, sample.T_odom_base).estimate.T_map_base
         taken['all'].append(time.process_time() - began)
         for part in _PARTS:
             taken[part].append(pipeline.stage_seconds[part][-1])
-        ways.append(way_m)
-        if way_m >= marks_m[0]:
-            on_span = np.array(ways) > way_m - _SPAN_M
-            patch = pipeline.grid.patch()
+        ways.append(travelled_m)
+        if travelled_m >= marks_m[0]:
+            on_span = np.array(ways) > travelled_m - _SPAN_M
+            patch = pipeline.grid.known_area()
             yield _Mark(
                 marks_m[0],
                 {part: 1e3 * np.array(each)[on_span] for part, each in taken.items()},
                 float(patch.free.sum()) * patch.frame.resolution**2,
                 resident_mb(),
-                float(np.hypot(*(T_map_base - look.T_world_base)[:2])),
+                float(np.hypot(*(T_map_base - sample.T_world_base)[:2])),
             )
             marks_m = marks_m[1:]
             if not marks_m:
                 return
 
 
-def _looks() -> tuple[Iterator[DriveSample], float]:
+def _samples() -> tuple[Iterator[DriveSample], float]:
     """The tour of the warehouse, again and again, and its length, m."""
     path = world_path('warehouse')
     world = World.from_patch(*read_world(path))

@@ -17,7 +17,7 @@ _SCANS = 200
 
 
 def run(worlds: Path, quick: bool) -> list[Row]:
-    """One row: 181 beams, 8 m, 10 cm, a real floor, the robot turning on the spot at ten places."""
+    """One row: 181 beams, 8 m, 10 cm, a real floor, rotation in place at ten places."""
     floor = floors(worlds, 'kth/50052748')[0]
     laser = LaserScanner(LaserScannerConfig(), 0)
     turns = [
@@ -33,4 +33,4 @@ def run(worlds: Path, quick: bool) -> list[Row]:
 
 def _update(grid: OccupancyGrid, scans: list[tuple[Scan, Array]]) -> None:
     for scan, T in scans:
-        grid.update(scan, T)
+        grid.add_scan(scan, T)

@@ -15,8 +15,8 @@ Made by `python -m benchmarks.speed.page out/benchmarks` of the files that
 of one core; a load far above the number of cores says that the machine was busy with other things,
 and that all times are much too long.
 
-How well the localizer does on real logs, on degraded ones and in generated buildings is told by
-another program: `python -m benchmarks.scoreboard -o DIR` (`--short`: two minutes of its worst
+Another program measures the localizer on real logs, on degraded ones and in generated buildings:
+`python -m benchmarks.scoreboard -o DIR` (`--short`: two minutes of its worst
 cases) leaves its page in `DIR/scoreboard.md`. A complete run: [scoreboard.md](scoreboard.md).
 Where small causes have large effects, as where a loop is found a scan later, one run tells little:
 `--runs 8` runs each case eight times, all but the first with odometry disturbed by less than wheels
@@ -47,8 +47,8 @@ _ABOUT = {
     'localization': 'Global localization from 5,000 samples.',
     'planning': 'The wavefront planner.',
     'matching': 'A scan against ten others round its place: the scan matcher of the localizer, and '
-    'that of OpenKarto (package karto-scanmatcher, where it is installed), which makes its map '
-    'anew for each match.',
+    'that of OpenKarto (package karto-scanmatcher, where it is installed), which '
+    'renders its map again for each match.',
     'slam': "A step of the paper's filter by the number of features in the map: with those of the "
     'local area in the state (ti), with all of them (full).',
     'growth': 'Localizer, grid and graph together on a long drive through the warehouse of '

@@ -50,7 +50,7 @@ Maker = Callable[[list[tuple[Scan, Array]], tuple[float, float]], Match]
 
 
 def run(worlds: Path, quick: bool) -> Iterator[Row]:
-    """Rows for each matcher, for priors that are near and for those that are far off."""
+    """Rows for each matcher, for good and for bad priors."""
     cases = [
         case
         for name in (_QUICK if quick else _WORLDS)
@@ -73,7 +73,7 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
             right = float(((off_m <= _RIGHT_M) & (off_deg <= _RIGHT_DEG)).mean())
             yield Row(f'  {name}: CPU of a match, median', f'{np.median(match_ms):.3g} ms')
             yield Row(
-                f'  {name}: the same with {_BEFORE} scans taken in before',
+                f'  {name}: the same with {_BEFORE} scans added before',
                 f'{np.median(drawn_ms):.3g} ms',
             )
             yield Row(
@@ -99,7 +99,7 @@ def _cases(worlds: Path, name: str, goals: int) -> Iterator[_Case]:
 def _measure(
     maker: Maker, cases: list[_Case], errors: tuple[float, float]
 ) -> tuple[Array, Array, Array]:
-    """CPU of each match without and with drawing its map, ms, and how far it is off, (N, 3)."""
+    """CPU time of each match without and with rendering of its map, ms, and errors, (N, 3)."""
     rng = np.random.default_rng(0)
     taken = []
     off = []
@@ -121,7 +121,7 @@ def _measure(
 def _ours(before: list[tuple[Scan, Array]], errors: tuple[float, float]) -> Match:
     """The matcher of this project, told how good the prior is."""
     matcher = Matcher()
-    local_map = LocalMap(matcher.config)
+    local_map = LocalMap()
     for scan, T in before:
         local_map.add_scan(scan.points_base(), scan.T_base_laser, T)
     sigmas = np.array([errors[0], errors[0], np.radians(errors[1])]) / np.sqrt(3.0)

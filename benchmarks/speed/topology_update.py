@@ -51,7 +51,7 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
                 drive.ledger.kept / max(drive.ledger.asked, 1),
                 0.99,
             ),
-            at_least('  drivable edges', drivable_share(drive.grid.patch(), graph, 0.25), 1.0),
+            at_least('  drivable edges', drivable_share(drive.grid.known_area(), graph, 0.25), 1.0),
         ]
 
 

@@ -79,7 +79,7 @@ POSE = np.array([4.0, 4.0, 0.0])
 def choice(strategy: FrontierExplorer) -> np.ndarray:
     frontiers = after_a_look(strategy, corridor(), POSE)
     assert len(frontiers) >= 2
-    return np.asarray(frontiers[int(np.argmin(strategy.costs(frontiers, POSE)))].middle)
+    return np.asarray(frontiers[int(np.argmin(strategy.costs(frontiers, POSE)))].centroid)
 
 
 def test_the_nearest_frontier_is_the_one_at_the_near_end() -> None:
@@ -91,7 +91,7 @@ def test_explore_lite_and_information_gain_go_for_more_where_it_is_not_much_fart
     lite = ExploreLite()
     frontiers = after_a_look(lite, corridor(), near_the_middle)
     sizes = np.array([len(frontier.cells) for frontier in frontiers])
-    equal = np.array([frontier.way_m for frontier in frontiers])
+    equal = np.array([frontier.path_length_m for frontier in frontiers])
     costs = lite.costs(frontiers, near_the_middle)
     assert costs[sizes.argmax()] < costs[sizes.argmin()] + 0.3 * np.ptp(equal)
     gain = InformationGain()
@@ -103,7 +103,7 @@ def test_explore_lite_and_information_gain_go_for_more_where_it_is_not_much_fart
 def test_the_advantage_of_a_frontier_grows_with_the_way_back_to_it() -> None:
     strategy = DistanceAdvantage()
     frontiers = after_a_look(strategy, corridor(), POSE)
-    ways = np.array([frontier.way_m for frontier in frontiers])
+    ways = np.array([frontier.path_length_m for frontier in frontiers])
     costs = strategy.costs(frontiers, POSE)
     assert (costs < ways).all()
     nearest_end = int(ways.argmin())
@@ -127,7 +127,7 @@ def test_a_target_that_fails_is_left_for_later_and_the_end_says_so() -> None:
             tried.append(round(decision.target.x))
             strategy.target_failed('no way')
     assert decision.finished
-    assert decision.reason == 'what is left cannot be reached'
+    assert decision.reason == 'remaining targets are unreachable'
     assert tried[0] != tried[1]
     assert len(tried) >= 3 * len(set(tried))
 
@@ -206,7 +206,7 @@ def test_who_drives_along_the_graph_goes_back_where_it_came_through() -> None:
         for pose in passage:
             after_a_look(strategy, cells, pose)
         middles[type(strategy)] = [
-            frontier.middle[0] for frontier in after_a_look(strategy, cells, far)
+            frontier.centroid[0] for frontier in after_a_look(strategy, cells, far)
         ]
     assert min(middles[NearestFrontier]) > 6.2
     assert min(middles[VisitAllEndNodes]) < 1.0

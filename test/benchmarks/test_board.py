@@ -20,7 +20,7 @@ from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import Simulation
 
-# Turns, a wall that is run into, a way back.
+# Turns, a collision with a wall, and a return.
 COMMANDS = [(0.3, 0.4)] * 60 + [(0.8, 0.0)] * 200 + [(0.0, -1.0)] * 40 + [(-0.3, 0.1)] * 60
 
 
@@ -53,20 +53,20 @@ def test_a_replay_has_the_odometry_of_a_live_simulation_with_its_seed(office, ro
     live = driven(Simulation(world, start, PRESETS[robot], LASERS['lms200'], seed))
     replayed = list(recorded.recording().replay(PRESETS[robot], seed))
     assert len(live) == len(replayed) > 80
-    for look, scan, (_, T_odom_base, T_world_base) in zip(replayed, scans, live, strict=True):
-        np.testing.assert_array_equal(look.T_odom_base, T_odom_base)
-        np.testing.assert_array_equal(look.T_world_base, T_world_base)
-        np.testing.assert_array_equal(look.scan.ranges_m, scan.ranges_m)
-        assert look.scan.stamp_ns == scan.stamp_ns
-        assert look.scan.angle_increment_rad == scan.angle_increment_rad
+    for sample, scan, (_, T_odom_base, T_world_base) in zip(replayed, scans, live, strict=True):
+        np.testing.assert_array_equal(sample.T_odom_base, T_odom_base)
+        np.testing.assert_array_equal(sample.T_world_base, T_world_base)
+        np.testing.assert_array_equal(sample.scan.ranges_m, scan.ranges_m)
+        assert sample.scan.stamp_ns == scan.stamp_ns
+        assert sample.scan.angle_increment_rad == scan.angle_increment_rad
 
 
 def test_a_recording_is_the_exploration_by_the_true_pose(office):
     world, start, path, numbers = office
-    looks = list(read_recording(path).replay(PRESETS['2dx'], 0))
-    assert numbers['scans'] == len(looks)
+    samples = list(read_recording(path).replay(PRESETS['2dx'], 0))
+    assert numbers['scans'] == len(samples)
     loop, _ = explore(world, start, Options(speed_m_s=0.5, time_limit_s=20.0))
-    truth = [look.T_world_base for look in looks]
+    truth = [sample.T_world_base for sample in samples]
     np.testing.assert_array_equal(truth[: len(loop.log.true_poses)], loop.log.true_poses)
     assert numbers['distance_m'] > 3.0
 

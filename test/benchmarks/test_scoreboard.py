@@ -29,7 +29,7 @@ from benchmarks.scoreboard.played import Played, consistency
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import ConfigError
 from thinmap_ros.evaluation.trajectory_errors import aligned_rms
-from thinmap_ros.sim.buildings import DEVELOPMENT_SEEDS, BuildingConfig, building
+from thinmap_ros.sim.buildings import DEVELOPMENT_SEEDS, BuildingConfig, generate_building
 from thinmap_ros.sim.robot import PRESETS
 
 COSTS = {
@@ -317,7 +317,7 @@ def test_it_goes_on_where_it_was_and_one_that_fails_stops_no_other(tmp_path, cap
 
 def test_a_drive_in_a_small_building(tmp_path, monkeypatch):
     small = BuildingConfig(area_m2=200.0, wings=1, clutter=0.0, people_per_1000_m2=0.0)
-    monkeypatch.setattr(drives, 'building', lambda seed: building(seed, small))
+    monkeypatch.setattr(drives, 'building', lambda seed: generate_building(seed, small))
     monkeypatch.setattr(drives, '_LENGTH_M', 12.0)
     case = BuildingCase(3, '2dx', 3.0)
     report = measure(Task(case, tmp_path, tmp_path, tmp_path, {'slam': 'ekf_ti'}))
@@ -337,9 +337,9 @@ def test_a_drive_ends_where_it_began_and_its_noise_is_what_is_asked_for():
     robot = drives.noisy(PRESETS['3at'], 3.0)
     assert robot.turn_noise == 3.0 * PRESETS['3at'].turn_noise
     assert robot.radius_m == PRESETS['3at'].radius_m
-    made = building(11)
+    made = generate_building(11)
     start = drives._start(made, robot)
-    paths = list(drives.ways(made, start, robot, 11))
+    paths = list(drives.paths(made, start, robot, 11))
     assert len(paths) > 1
     np.testing.assert_allclose(paths[-1][-1], start[:2], atol=0.2)
 

@@ -1,4 +1,4 @@
-"""Kernels are kept where there is room for them, and compiled anew when what they hold changed."""
+"""Kernels are cached in a writable folder, and recompiled when their code or constants change."""
 
 import os
 import shutil
@@ -94,7 +94,7 @@ def test_the_first_run_says_that_it_compiles_and_later_ones_need_not(install: In
     first, last = said.splitlines()
     assert first == 'thinmap: compiling kernels, once (1 of 1)'
     assert last.startswith('thinmap: kernels compiled in ')
-    assert last.endswith(f'kept in {folder}')
+    assert last.endswith(f'cached in {folder}')
     assert install.run() == (['6.0', folder], '')
 
 

@@ -26,21 +26,21 @@ def filled(*stamps):
 
 def test_a_pose_on_a_sample_is_that_sample_and_between_two_is_interpolated():
     buffer = filled(0, SECOND)
-    assert buffer.at(SECOND)[0] == 1.0
-    assert buffer.at(SECOND // 4)[0] == pytest.approx(0.25)
+    assert buffer.interpolate(SECOND)[0] == 1.0
+    assert buffer.interpolate(SECOND // 4)[0] == pytest.approx(0.25)
 
 
 def test_outside_of_what_is_known_there_is_no_pose():
     buffer = filled(SECOND, 2 * SECOND)
-    assert buffer.at(SECOND - 1) is None
-    assert buffer.at(2 * SECOND + 1) is None
-    assert OdometryBuffer().at(0) is None
+    assert buffer.interpolate(SECOND - 1) is None
+    assert buffer.interpolate(2 * SECOND + 1) is None
+    assert OdometryBuffer().interpolate(0) is None
 
 
 def test_a_late_sample_takes_its_place():
     buffer = filled(0, 2 * SECOND, SECOND)
     assert buffer.latest_stamp_ns == 2 * SECOND
-    assert buffer.at(3 * SECOND // 2)[0] == pytest.approx(1.5)
+    assert buffer.interpolate(3 * SECOND // 2)[0] == pytest.approx(1.5)
 
 
 def test_a_clock_set_back_starts_anew():
@@ -50,8 +50,8 @@ def test_a_clock_set_back_starts_anew():
 
 def test_old_samples_are_forgotten():
     buffer = filled(*(i * SECOND // 100 for i in range(5000)))
-    assert buffer.at(0) is None
-    assert buffer.at(49 * SECOND)[0] == pytest.approx(49.0)
+    assert buffer.interpolate(0) is None
+    assert buffer.interpolate(49 * SECOND)[0] == pytest.approx(49.0)
 
 
 def test_nan_is_refused():

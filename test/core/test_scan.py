@@ -76,7 +76,7 @@ def one_range(value, **options):
         (np.inf, 'no_return'),
         (8.0, 'no_return'),
         (81.83, 'no_return'),
-        (-np.inf, 'too_near'),
+        (-np.inf, 'below_range_min'),
         (np.nan, ''),
         (0.0, ''),
         (-1.0, ''),
@@ -85,7 +85,7 @@ def one_range(value, **options):
 )
 def test_a_range_says_one_thing_or_nothing(value, name):
     scan = one_range(value)
-    said = [key for key in ('hit', 'no_return', 'too_near') if getattr(scan, key).all()]
+    said = [key for key in ('hit', 'no_return', 'below_range_min') if getattr(scan, key).all()]
     assert said == ([name] if name else [])
     assert scan.valid.all() == bool(name)
     assert scan.is_blind == (not name)

@@ -20,7 +20,7 @@ AFAR = np.array([100.0, 100.0, 0.0])
 def census_of(*decisions, pose=AFAR):
     census = EndNodeCensus()
     for nodes in decisions:
-        census.take(nodes, pose)
+        census.add(nodes, pose)
     return census
 
 
@@ -92,5 +92,5 @@ def test_milestones_are_when_a_coverage_was_first_measured_and_none_where_it_nev
 def test_a_target_that_goes_back_to_the_one_before_is_a_reversal(places, changes, reversals):
     log = TargetLog()
     for place in places:
-        log.take(None if place is None else np.array([place, 1.0, 0.0]))
+        log.add(None if place is None else np.array([place, 1.0, 0.0]))
     assert (log.changes, log.reversals) == (changes, reversals)

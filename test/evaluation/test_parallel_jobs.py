@@ -1,4 +1,4 @@
-"""Jobs in processes of their own: what fails is told by name, and nothing else ends with it."""
+"""Jobs in separate processes: failed ones are reported by name, the others continue."""
 
 import argparse
 import json
@@ -13,13 +13,13 @@ from pathlib import Path
 import pytest
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.evaluation.parallel_jobs import Failure, complaint, read_report, run_pending
+from thinmap_ros.evaluation.parallel_jobs import Failure, failure_summary, read_report, run_pending
 
 LONG = """
 import argparse, os, time
 from dataclasses import dataclass
 from pathlib import Path
-from thinmap_ros.evaluation.parallel_jobs import run_missing
+from thinmap_ros.evaluation.parallel_jobs import run_pending
 
 @dataclass(frozen=True)
 class Rest:
@@ -31,7 +31,7 @@ def rest(job):
 
 if __name__ == '__main__':
     where = argparse.Namespace(processes=1, scheduler='')
-    run_missing(rest, [Rest('a')], lambda job: Path(job.name), where, quiet=True)
+    run_pending(rest, [Rest('a')], lambda job: Path(job.name), where, quiet=True)
 """
 ONE_CORE = argparse.Namespace(processes=1, scheduler='')
 
@@ -81,7 +81,7 @@ def test_one_that_fails_is_named_and_the_others_run(
     assert failures['wrong'].reason.startswith('TypeError: ')
     assert 'in add' in failures['wrong'].trace
     assert 'wrong: TypeError' in capsys.readouterr().err
-    assert str(complaint(failures)).startswith('3 failed: killed: its process ended')
+    assert str(failure_summary(failures)).startswith('3 failed: killed: its process ended')
     reports = [json.loads((tmp_path / f'{name}.json').read_text()) for name in 'ab']
     assert [report['sum'] for report in reports] == [3.0, 4.0]
     assert len({report['process'] for report in reports} | {os.getpid()}) == 3

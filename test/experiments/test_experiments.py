@@ -107,7 +107,8 @@ def test_the_plain_stages_end_where_nothing_changes() -> None:
 def office_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp('bags')
     assert (
-        record(folder / 'office.mcap', islice(Source().looks('office'), 150), localized=True) == 150
+        record(folder / 'office.mcap', islice(Source().samples('office'), 150), localized=True)
+        == 150
     )
     return folder
 
@@ -124,7 +125,7 @@ def test_a_bag_holds_sensors_truth_and_outputs(office_bag: Path) -> None:
         '/map',
         '/topology',
     }
-    live = list(islice(Source().looks('office'), 150))
+    live = list(islice(Source().samples('office'), 150))
     for one, other in zip(live, samples_of_bag(office_bag / 'office.mcap'), strict=True):
         assert one.scan.stamp_ns == other.scan.stamp_ns
         assert np.allclose(one.scan.ranges_m, other.scan.ranges_m, atol=1e-6)
@@ -133,8 +134,8 @@ def test_a_bag_holds_sensors_truth_and_outputs(office_bag: Path) -> None:
 
 
 def test_from_the_bag_as_from_live(office_bag: Path) -> None:
-    live = run_drive(islice(Source().looks('office'), 150))
-    replayed = run_drive(Source(bags=office_bag).looks('office'))
+    live = run_drive(islice(Source().samples('office'), 150))
+    replayed = run_drive(Source(bags=office_bag).samples('office'))
     assert np.abs(np.array(live.estimate) - np.array(replayed.estimate)).max() < POSE_TOLERANCE_M
     assert live.features == replayed.features
     one, other = (
@@ -146,13 +147,13 @@ def test_from_the_bag_as_from_live(office_bag: Path) -> None:
 
 def test_a_bag_without_truth_is_refused(tmp_path: Path, office_bag: Path) -> None:
     with pytest.raises(InputError, match='no such file'):
-        list(Source(bags=tmp_path).looks('office'))
+        list(Source(bags=tmp_path).samples('office'))
 
 
 def test_every_drive_begins_where_its_world_says() -> None:
     for name, recipe in RECIPES.items():
         if name not in ('lab_stops', 'room_10x10'):
-            first = next(Source().looks(name))
+            first = next(Source().samples(name))
             assert first.T_world_base == pytest.approx(drives.world_of(recipe.world).start)
 
 
@@ -179,13 +180,13 @@ def test_relation_errors_of_a_known_path(tmp_path: Path) -> None:
 
 def test_logs_of_the_users_own(tmp_path: Path) -> None:
     (tmp_path / 'logs' / 'mine').mkdir(parents=True)
-    looks = islice(Source().looks('dead_end'), 60)
+    samples = islice(Source().samples('dead_end'), 60)
     lines = []
-    for look in looks:
-        ranges = ' '.join(f'{r if np.isfinite(r) else 81.0:.3f}' for r in look.scan.ranges_m)
-        x, y, theta = look.T_odom_base
+    for sample in samples:
+        ranges = ' '.join(f'{r if np.isfinite(r) else 81.0:.3f}' for r in sample.scan.ranges_m)
+        x, y, theta = sample.T_odom_base
         pose = f'{x:.6f} {y:.6f} {theta:.6f}'
-        t = look.scan.stamp_ns / 1e9
+        t = sample.scan.stamp_ns / 1e9
         lines.append(f'FLASER 181 {ranges} {pose} {pose} {t:.6f} host {t:.6f}\n')
     (tmp_path / 'logs' / 'mine' / 'log.clf').write_text(''.join(lines))
     (tmp_path / 'logs' / 'mine' / 'odom.txt').write_text('0 0 0 0\n20 0 0 0\n')

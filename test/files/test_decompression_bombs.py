@@ -13,7 +13,7 @@ import pytest
 import yaml
 from PIL import Image
 
-from thinmap_ros.core.errors import InputError, shown
+from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.files.graphs import read_geojson
 from thinmap_ros.files.occupancy_maps import read_map
 from thinmap_ros.files.worlds import read_tour, read_world
@@ -156,7 +156,7 @@ def test_a_kind_of_a_million_letters_in_geojson(tmp_path: Path) -> None:
     ids=range(8),
 )
 def test_whatever_is_quoted_is_short_and_on_one_line(value: object) -> None:
-    text = shown(value)
+    text = quoted(value)
     assert 0 < len(text) <= 200 and text.isprintable()
 
 

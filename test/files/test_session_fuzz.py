@@ -185,7 +185,7 @@ def test_headers_of_arrays(tmp_path: Path, kind: str, name: str) -> None:
 def test_nothing_is_unpickled(tmp_path: Path) -> None:
     trap = tmp_path / 'sprung'
     content = pickle.dumps(np.array([Evil(str(trap))], dtype=object), protocol=2)
-    # As many objects as fill the bytes that are there, for whoever compares the two.
+    # As many objects as fill these bytes, to match the declared size.
     content += bytes(-len(content) % 8)
     member = with_header(plain((len(content) // 8,), '|O'), content)
     path = archive(tmp_path / 'a.grid.npz', thinmap_format=label('grid'), frame=member)
@@ -204,7 +204,7 @@ def test_archives_that_unpack_to_more_than_any_map(tmp_path: Path) -> None:
         for _ in range(600):
             stream.write(bytes(1 << 20))
     assert path.stat().st_size < 1_000_000
-    with pytest.raises(InputError, match='bytes unpacked: expected at most'):
+    with pytest.raises(InputError, match='bytes decompressed: expected at most'):
         load_grid(str(path))
 
 

@@ -1,4 +1,4 @@
-"""Saved sessions: work goes on as if it had never stopped."""
+"""Saved sessions: a restored state continues as if there had been no interruption."""
 
 import math
 from itertools import pairwise
@@ -65,7 +65,7 @@ def drive(grid: OccupancyGrid, builder: TopologyBuilder, poses: list[Array], see
     laser = LaserScanner(LaserScannerConfig(), seed)
     world = building()
     for k, T in enumerate(poses):
-        grid.update(laser.scan(world, T, k), T)
+        grid.add_scan(laser.scan(world, T, k), T)
         builder.update(grid.window(T[0], T[1], 10.0), T)
 
 
@@ -97,8 +97,8 @@ def test_work_goes_on_as_if_it_had_never_stopped(tmp_path: Path) -> None:
     drive(grid, builder, poses[120:], 1)
     drive(again, restored, poses[120:], 1)
     assert (
-        np.array_equal(grid.patch().cells, again.patch().cells)
-        and grid.patch().frame == again.patch().frame
+        np.array_equal(grid.known_area().cells, again.known_area().cells)
+        and grid.known_area().frame == again.known_area().frame
     )
     assert_same(builder.map, restored.map)
     for key, array in grid.state().items():
@@ -160,8 +160,12 @@ def test_what_names_no_session(path: str) -> None:
 def test_a_map_is_read_where_there_is_no_saved_grid_and_only_there(tmp_path: Path) -> None:
     grid = OccupancyGrid()
     drive(grid, TopologyBuilder(), way()[:5], 0)
-    write_map(tmp_path / 'a', grid.patch())
-    assert load_grid(str(tmp_path / 'a')).patch().occupied.sum() == grid.patch().occupied.sum() > 50
+    write_map(tmp_path / 'a', grid.known_area())
+    assert (
+        load_grid(str(tmp_path / 'a')).known_area().occupied.sum()
+        == grid.known_area().occupied.sum()
+        > 50
+    )
     with pytest.raises(InputError, match='resolution_m'):
         load_grid(str(tmp_path / 'a.yaml'), OccupancyConfig(resolution_m=0.05))
     with pytest.raises(InputError, match=r'a.grid.npz: No such file'):
@@ -193,8 +197,8 @@ def test_a_corrected_past_moves_the_nodes_and_they_keep_their_ids() -> None:
     laser = LaserScanner(LaserScannerConfig(), 0)
     for k, (T, wrong) in enumerate(zip(poses, believed, strict=True)):
         scan = laser.scan(world, T, k)
-        drifted.update(scan, wrong)
-        corrected.update(scan, T)
+        drifted.add_scan(scan, wrong)
+        corrected.add_scan(scan, T)
         builder.update(drifted.window(wrong[0], wrong[1], 10.0), wrong)
         straight.update(corrected.window(T[0], T[1], 10.0), T)
     before = dict(builder.map.nodes)

@@ -95,7 +95,7 @@ def map_and_graph(shared: None, rng: np.random.Generator, folder: Path) -> None:
         if scan is None:
             continue
         T = drive.pose()
-        if tried(lambda s=scan, p=T: [grid.update(s, p)]) is None or not se2.is_bounded_pose(T):
+        if tried(lambda s=scan, p=T: [grid.add_scan(s, p)]) is None or not se2.is_bounded_pose(T):
             continue
         window = grid.window(T[0], T[1], 16.0)
         sound_patch(window)
@@ -103,12 +103,12 @@ def map_and_graph(shared: None, rng: np.random.Generator, folder: Path) -> None:
             continue
         sound_graph(builder.map)
         sound_graph(builder.local_map())
-        patch = grid.patch()
+        patch = grid.known_area()
         if patch.cells.size < 4_000_000:
             decision = tried(lambda s=scan, p=T, m=patch: explorer.step(builder.map, m, s, p))
             if decision is not None and decision.target is not None:
                 finite(decision.target.goal)
-    sound_patch(grid.patch())
+    sound_patch(grid.known_area())
 
 
 def localize(shared: None, rng: np.random.Generator, folder: Path) -> None:
@@ -138,9 +138,9 @@ def known_room(folder: Path) -> tuple[GridPatch, Any]:
     builder = TopologyBuilder()
     for k in range(40):
         T = se2.pose(1.5 + 0.18 * k, 1.5, 0.4 * k)
-        grid.update(scan_in(ROOM, T, stamp_ns=k * _PERIOD_NS), T)
+        grid.add_scan(scan_in(ROOM, T, stamp_ns=k * _PERIOD_NS), T)
         builder.update(grid.window(T[0], T[1], 16.0), T)
-    return grid.patch(), builder.map
+    return grid.known_area(), builder.map
 
 
 def localize_globally(

@@ -65,7 +65,7 @@ def show_messages(shared: None, rng: np.random.Generator, folder: Path) -> None:
             told.append(repr(message))
             (folder / 'messages.txt').write_text('\n'.join(told))
             topic = chosen(rng, _TOPICS[kind.__name__])
-            tried(lambda heard=message, where=topic: feed.take(where, heard))
+            tried(lambda heard=message, where=topic: feed.show(where, heard))
 
 
 def set_parameters(shared: None, rng: np.random.Generator, folder: Path) -> None:

@@ -15,7 +15,7 @@ from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.slam.localizer import Localizer
 from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.files.worlds import read_world
-from thinmap_ros.sim.coverage import coverable
+from thinmap_ros.sim.coverage import observable_cells
 from thinmap_ros.sim.world import World
 
 ROOM = Path(__file__).resolve().parents[2] / 'worlds' / 'room_10x10.yaml'
@@ -41,7 +41,7 @@ class Explored:
             log_poses(scan, estimate)
 
         self.loop.log_poses = noted  # type: ignore[method-assign]
-        self.loop.run(coverable(world, start, 0.3, 8.0), 40.0, lambda seconds, share: None)
+        self.loop.run(observable_cells(world, start, 0.3, 8.0), 40.0, lambda seconds, share: None)
         pipeline = self.loop.pipeline
         self.states: dict[str, State] = {
             'topology': pipeline.topology.state(),
@@ -68,7 +68,7 @@ class Explored:
     def _use_exploration(self, state: State) -> Work:
         explorer = Explorer.from_state(state)
         pipeline = self.loop.pipeline
-        patch = pipeline.grid.patch()
+        patch = pipeline.grid.known_area()
         return lambda scan, T: explorer.step(pipeline.topology.map, patch, scan, T)
 
     def _use_localizer(self, state: State) -> Work:
@@ -80,9 +80,9 @@ class Explored:
         grid = OccupancyGrid.from_state(state)
 
         def work(scan: Any, T: Any) -> None:
-            grid.update(scan, T)
+            grid.add_scan(scan, T)
             grid.window(T[0], T[1], 8.0)
-            grid.patch()
+            grid.known_area()
 
         return work
 

@@ -85,7 +85,7 @@ class Mapping:
         """The scans before number k were made where they really were."""
         stamps = (np.arange(k) + 1) * SECOND_NS
         ns = (k + 1) * SECOND_NS
-        self.by_hand.correct(stamps, TRUE[:k], ns)
+        self.by_hand.apply_correction(stamps, TRUE[:k], ns)
         self._paths.publish(messages.trajectory_msg(stamps.tolist(), TRUE[:k], 'map', ns))
         return ns
 
@@ -124,8 +124,8 @@ def test_a_map_that_is_saved_meanwhile_has_undergone_the_correction(graph, tmp_p
     assert response.success, response.message
     mapping.by_hand.finish()
     saved = sessions.load_grid(str(tmp_path / 'room'), CONFIG)
-    expected = mapping.by_hand.shown.patch()
-    np.testing.assert_array_equal(saved.patch().cells, expected.cells)
+    expected = mapping.by_hand.shown.known_area()
+    np.testing.assert_array_equal(saved.known_area().cells, expected.cells)
     assert mapping.add(COUNT + 1, TRUE[COUNT + 1]) == corrected_ns
     assert graph.stop('grid_mapper') == 0
 

@@ -89,7 +89,7 @@ class LoopLog:
 def assert_same(one, other):
     assert one.stamps_ns == other.stamps_ns
     assert np.abs(np.array(one.poses) - np.array(other.poses)).max() <= 1e-9
-    patches = one.pipeline.grid.patch(), other.pipeline.grid.patch()
+    patches = one.pipeline.grid.known_area(), other.pipeline.grid.known_area()
     assert np.array_equal(patches[0].cells, patches[1].cells)
 
 
@@ -133,7 +133,7 @@ def assert_live_is_same(graph, bag, expected, tmp_path, **localizer):
     assert np.abs(live - expected.poses).max() <= 1e-9
     response = graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(tmp_path / 'live')))
     assert response.success, response.message
-    occupancy_maps.write_map(tmp_path / 'replayed', expected.pipeline.grid.patch())
+    occupancy_maps.write_map(tmp_path / 'replayed', expected.pipeline.grid.known_area())
     assert (tmp_path / 'live.pgm').read_bytes() == (tmp_path / 'replayed.pgm').read_bytes()
 
 

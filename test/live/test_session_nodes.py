@@ -91,7 +91,7 @@ def test_ids_and_cells_are_the_same_tomorrow_and_mapping_goes_on(graph, tmp_path
     graph.hear_out()
     before = places(graphs[-1])
     edges = {edge.id for edge in graphs[-1].edges}
-    known = sessions.load_grid(str(stem)).patch()
+    known = sessions.load_grid(str(stem)).known_area()
     assert len(before) > 3
     maps.clear(), graphs.clear(), local.clear()
     for name in MAPPERS:
@@ -126,7 +126,7 @@ def room_of(resolution=0.1):
     laser = LaserScanner(LaserScannerConfig(), 1)
     for k in range(12):
         T = pose(2.0 + 0.1 * k, 3.0, 0.4 * k)
-        grid.update(laser.scan(world, T, k), T)
+        grid.add_scan(laser.scan(world, T, k), T)
         builder.update(grid.window(T[0], T[1], 10.0), T)
     return grid, builder
 
@@ -144,7 +144,7 @@ def write_bad_sessions(folder, grid, builder):
     save(folder / 'half', grid, builder)
     (folder / 'cut.grid.npz').write_bytes((folder / 'cut.grid.npz').read_bytes()[:-200])
     (folder / 'half.topology.npz').write_bytes((folder / 'half.topology.npz').read_bytes()[:300])
-    occupancy_maps.write_map(folder / 'fine_map', room_of(0.05)[0].patch())
+    occupancy_maps.write_map(folder / 'fine_map', room_of(0.05)[0].known_area())
     save(folder / 'mixed', grid, room_of(0.05)[1])
     return {
         'fine': 'expected 0.1 m',
@@ -200,12 +200,12 @@ def test_sessions_are_loaded_into_running_nodes_or_refused_in_words(graph, tmp_p
     assert np.array_equal(again.state()['log_odds'], grid.state()['log_odds'])
     assert sessions.load_topology(str(tmp_path / 'again')).map.nodes == builder.map.nodes
     # Any map_server map will do; no graph belongs to it.
-    occupancy_maps.write_map(tmp_path / 'map', grid.patch())
+    occupancy_maps.write_map(tmp_path / 'map', grid.known_area())
     response = load('map.yaml')
     assert response.success and 'graph reset' in response.message
     graph.until(lambda: not graphs[-1].nodes, 'an empty graph')
     known = messages.grid_from_msg(maps[-1])
-    assert np.array_equal(known.occupied, grid.patch().occupied)
+    assert np.array_equal(known.occupied, grid.known_area().occupied)
     for name in MAPPERS:
         assert graph.stop(name) == 0
 
@@ -221,7 +221,7 @@ def test_services_touch_nothing_outside_of_their_folder(graph, tmp_path):
     outside = tmp_path / 'outside'
     folder.mkdir(), outside.mkdir()
     save(outside / 'room', *room_of())
-    occupancy_maps.write_map(outside / 'drawn', room_of()[0].patch())
+    occupancy_maps.write_map(outside / 'drawn', room_of()[0].known_area())
     (folder / 'link').symlink_to(outside)
     (folder / 'circle').symlink_to(folder / 'circle')
     for end in ('.grid.npz', '.topology.npz'):

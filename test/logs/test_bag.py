@@ -1,4 +1,4 @@
-"""Bags: what is written is read back; that one is broken or lacks something is said in one line."""
+"""Bags: written data are read back; damage and missing data are reported in one line."""
 
 import math
 import struct
@@ -233,7 +233,7 @@ def test_a_tilted_laser_is_refused(tmp_path: Path) -> None:
 )
 def test_without_a_mount_nothing_is_assumed(tmp_path: Path, links: Any) -> None:
     path = mounted(tmp_path, *links)
-    with pytest.raises(InputError, match=r'tf_static does not say where "laser" is on "base_link"'):
+    with pytest.raises(InputError, match=r'tf_static has no transform from "laser" to "base_link"'):
         read(path)
     given = np.array([0.78, 0.0, 0.0])
     assert np.array_equal(scans(read(path, T_base_laser=given))[0].T_base_laser, given)
@@ -245,7 +245,7 @@ def test_topics_are_chosen_or_asked_for(tmp_path: Path) -> None:
         writer.write('/rear/scan', SCAN, 5, make.scan(5, [4.0] * 5))
 
     path = write(tmp_path / 'bag', fill)
-    with pytest.raises(InputError, match=r'name one of /rear/scan, /scan$'):
+    with pytest.raises(InputError, match=r'choose one of /rear/scan, /scan$'):
         read(path)
     assert len(scans(read(path, scan_topic='/rear/scan'))) == 1
     with pytest.raises(InputError, match=r'no laser scans .*front.*it has /odom'):
@@ -271,7 +271,7 @@ def with_empty_scans(writer: BagWriter, make: Maker) -> None:
     [
         (without_odometry, 'no odometry .*it has /scan .sensor_msgs/msg/LaserScan'),
         (without_scans, 'no laser scans .*it has /odom'),
-        (with_empty_scans, '/scan: no message that can be used.*without ranges'),
+        (with_empty_scans, '/scan: no usable message.*without ranges'),
         (lambda w, m: None, 'no laser scans'),
     ],
 )
@@ -383,7 +383,7 @@ def test_what_a_bag_names_is_quoted_in_short(tmp_path: Path) -> None:
 
     path = write(tmp_path / 'bag.mcap', fill)
     with pytest.raises(
-        InputError, match=r'name one of /robot_0/x+\.\.\., .* and 29\d more$'
+        InputError, match=r'choose one of /robot_0/x+\.\.\., .* and 29\d more$'
     ) as error:
         read(path)
     assert len(str(error.value)) < 400

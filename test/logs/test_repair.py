@@ -199,7 +199,7 @@ def test_a_damaged_chunk_costs_only_itself(tmp_path: Path, compression: Compress
     ]
     assert list(damage.parts) == [hit.chunk_start_offset] and not damage.is_truncated
     if compression == CompressionType.NONE:
-        assert damage.parts[hit.chunk_start_offset] == 'checksum that does not fit its bytes'
+        assert damage.parts[hit.chunk_start_offset] == 'wrong checksum'
 
 
 def test_a_damaged_summary_is_not_believed(tmp_path: Path) -> None:
@@ -220,7 +220,7 @@ def test_what_cannot_be_repaired_is_said_in_one_line(tmp_path: Path) -> None:
     (tmp_path / 'empty').mkdir()
     for name, said in (
         ('text.mcap', 'begin with'),
-        ('start.mcap', 'no whole message'),
+        ('start.mcap', 'no intact message'),
         ('empty', 'MCAP files in it'),
     ):
         done = repaired(tmp_path / name)

@@ -8,8 +8,8 @@ import pytest
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.sim.buildings import BuildingConfig, building
-from thinmap_ros.sim.floor_plan import Kind, floor_plan
+from thinmap_ros.sim.buildings import BuildingConfig, generate_building
+from thinmap_ros.sim.floor_plan import Kind, generate_floor_plan
 from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 from thinmap_ros.sim.moving_obstacles import Doors, MovingObstacles, Pedestrians
 from thinmap_ros.sim.robot import RobotConfig
@@ -26,7 +26,7 @@ NO_DOOR = Doors(
 
 def plain(seed, **given):
     """A building without furniture."""
-    return building(seed, BuildingConfig(clutter=0.0, **given))
+    return generate_building(seed, BuildingConfig(clutter=0.0, **given))
 
 
 @pytest.mark.parametrize('seed', SEEDS)
@@ -49,7 +49,7 @@ def test_a_robot_gets_into_every_part(seed):
 def test_parts_tile_the_plan():
     for seed in SEEDS:
         rng = np.random.default_rng(seed)
-        plan = floor_plan(*rng.uniform(10.0, 120.0, 2), 0.3, rng)
+        plan = generate_floor_plan(*rng.uniform(10.0, 120.0, 2), 0.3, rng)
         area = sum(part.width * part.depth for part in plan.parts)
         assert area == pytest.approx(plan.width * plan.depth)
         assert min(min(part.width, part.depth) for part in plan.parts) > 1.5
@@ -57,15 +57,15 @@ def test_parts_tile_the_plan():
 
 
 def test_a_seed_says_all_and_another_says_something_else():
-    one = building(5)
-    same = building(5)
-    other = building(6)
+    one = generate_building(5)
+    same = generate_building(5)
+    other = generate_building(6)
     assert np.array_equal(one.world.occupied, same.world.occupied)
     assert one.world.frame == same.world.frame
     assert np.array_equal(one.world.start, same.world.start)
-    places = [made.world.moving.people.places(77.0) for made in (one, same)]
+    places = [made.world.moving.pedestrians.places(77.0) for made in (one, same)]
     assert np.array_equal(*places)
-    leaves = [vars(made.world.moving.leaves) for made in (one, same)]
+    leaves = [vars(made.world.moving.doors) for made in (one, same)]
     assert all(np.array_equal(leaves[0][name], leaves[1][name]) for name in leaves[0])
     assert one.world.occupied.shape != other.world.occupied.shape
 
@@ -75,7 +75,7 @@ def test_what_is_asked_for():
     assert made.area_m2 == pytest.approx(4000.0, rel=0.1)
     assert len(made.wings) == 1
     assert not any(part.kind is Kind.HALL for part in made.wings[0].plan.parts)
-    assert made.world.moving is None or len(made.world.moving.people.points) == 0
+    assert made.world.moving is None or len(made.world.moving.pedestrians.points) == 0
     halls = plain(3, area_m2=4000.0, hall_share=1.0)
     wide = [p for w in halls.wings for p in w.plan.parts if p.kind is Kind.HALL]
     assert any(min(hall.width, hall.depth) > 16.0 for hall in wide)  # wider than 8 m of laser
@@ -90,7 +90,7 @@ def test_oblique_wings_are_among_them():
 
 
 def test_the_largest():
-    made = building(1, BuildingConfig(area_m2=100_000.0))
+    made = generate_building(1, BuildingConfig(area_m2=100_000.0))
     assert made.area_m2 > 50_000.0
     assert made.world.is_clear(*made.world.start[:2], RobotConfig().radius_m)
 
@@ -98,7 +98,7 @@ def test_the_largest():
 @pytest.mark.parametrize('area_m2', [math.nan, 0.0, 100.0, 1e6])
 def test_a_size_that_there_is_not_is_refused(area_m2):
     with pytest.raises(InputError, match=r'area_m2: .*: expected 150 to 100000 m2'):
-        building(0, BuildingConfig(area_m2=area_m2))
+        generate_building(0, BuildingConfig(area_m2=area_m2))
 
 
 def walled(glass, moving=None):
@@ -183,7 +183,7 @@ def test_doors_swing_and_are_held_open_for_a_robot():
 
 def test_doors_that_move_are_shut_half_of_the_time():
     for share in (0.0, 0.5, 1.0):
-        leaves = plain(3, area_m2=4000.0, moving_doors=share).world.moving.leaves
+        leaves = plain(3, area_m2=4000.0, moving_doors=share).world.moving.doors
         moves = np.isfinite(leaves.period_s)
         assert moves.mean() == pytest.approx(share, abs=0.2)
         assert not leaves.is_shut[~moves].any()

@@ -9,7 +9,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import UNKNOWN, GridPatch
-from thinmap_ros.sim.coverage import coverable
+from thinmap_ros.sim.coverage import observable_cells
 from thinmap_ros.sim.world import World
 
 
@@ -65,7 +65,7 @@ def reference(
 def test_it_is_the_definition(seed: int) -> None:
     world = walled(50, 60, seed=seed)
     start = np.array([3.05, 2.55, 0.0])
-    ours = coverable(world, start, 0.25, 3.0).cells
+    ours = observable_cells(world, start, 0.25, 3.0).cells
     seen, perhaps = reference(world, (25, 30), 0.25, 3.0)
     assert not (ours & ~perhaps).any()
     # Centre to centre, a line may slip through where two solid cells touch at a corner; no ray of
@@ -79,12 +79,12 @@ def test_a_closet_that_the_robot_cannot_enter_is_seen_through_its_door() -> None
     world = walled(40, 40)
     world.occupied[20, :] = 1
     world.occupied[20, 18:21] = 0  # 0.3 m wide
-    inside = coverable(world, np.array([1.95, 1.0, 0.0]), 0.25, 8.0)
+    inside = observable_cells(world, np.array([1.95, 1.0, 0.0]), 0.25, 8.0)
     assert inside.cells[1:20, 1:39].all()
     assert inside.cells[21:39, 19].all()
     assert not inside.cells[21, 2]
     world.occupied[20, 18:21] = 1
-    assert not coverable(world, np.array([1.95, 1.0, 0.0]), 0.25, 8.0).cells[21:].any()
+    assert not observable_cells(world, np.array([1.95, 1.0, 0.0]), 0.25, 8.0).cells[21:].any()
 
 
 def test_range_counts() -> None:
@@ -92,7 +92,7 @@ def test_range_counts() -> None:
     world.occupied[1:6, 30:99] = 1  # the rest is a slit of 0.3 m
     world.occupied[8, 30:99] = 1
     short, long = (
-        coverable(world, np.array([1.0, 0.5, 0.0]), 0.2, r).cells[6:8].any(axis=0)
+        observable_cells(world, np.array([1.0, 0.5, 0.0]), 0.2, r).cells[6:8].any(axis=0)
         for r in (2.0, 5.0)
     )
     reached = 28
@@ -108,7 +108,7 @@ def test_the_lattice_is_that_of_maps() -> None:
     fine[10:290, 10:15] = 1
     fine[10:290, 285:290] = 1
     world = World('fine', fine, GridFrame(-0.26, -0.26, 0.02), np.zeros(3))
-    found = coverable(world, np.array([1.0, 1.0, 0.0]), 0.2, 8.0)
+    found = observable_cells(world, np.array([1.0, 1.0, 0.0]), 0.2, 8.0)
     np.testing.assert_allclose(found.frame.as_array(), [-0.3, -0.3, 0.1])
     # Inner walls at 0.04 and 5.44: whole cells without wall from 0.1 to 5.4.
     assert found.area_m2 == pytest.approx(5.3**2)
@@ -120,7 +120,7 @@ def patch_of(cells: np.ndarray, frame: GridFrame, free: np.ndarray) -> GridPatch
 
 def test_share_known() -> None:
     world = walled(40, 50)
-    found = coverable(world, np.array([2.0, 2.0, 0.0]), 0.2, 8.0)
+    found = observable_cells(world, np.array([2.0, 2.0, 0.0]), 0.2, 8.0)
     everything = GridPatch(GridFrame(-5.0, -5.0, 0.1), np.zeros((200, 200), dtype=np.int8))
     assert found.coverage(everything) == 1.0
     nothing = GridPatch(everything.frame, np.full((200, 200), UNKNOWN, dtype=np.int8))
@@ -134,7 +134,7 @@ def test_share_known() -> None:
 
 def test_share_known_of_a_map_in_a_frame_of_its_own() -> None:
     world = walled(40, 50)
-    found = coverable(world, np.array([2.0, 2.0, 0.0]), 0.2, 8.0)
+    found = observable_cells(world, np.array([2.0, 2.0, 0.0]), 0.2, 8.0)
     T_world_map = np.array([2.0, 2.0, np.pi / 2])
     # x from -2 to 0 in the map is y from 0 to 2 in the world.
     lower = GridPatch(GridFrame(-2.0, -3.0, 0.1), np.zeros((60, 20), dtype=np.int8))
@@ -146,4 +146,4 @@ def test_share_known_of_a_map_in_a_frame_of_its_own() -> None:
 
 def test_a_start_where_the_robot_does_not_fit() -> None:
     with pytest.raises(InputError, match='does not fit'):
-        coverable(walled(20, 20), np.array([0.2, 1.0, 0.0]), 0.25, 8.0)
+        observable_cells(walled(20, 20), np.array([0.2, 1.0, 0.0]), 0.25, 8.0)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scripts.make_warehouse import warehouse
+from scripts.make_warehouse import warehouse_yaml
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.raytrace import cast_rays
 from thinmap_ros.files.worlds import read_tour, read_world
@@ -94,8 +94,8 @@ def test_the_tour_can_be_driven(name: str) -> None:
     simulation = Simulation(world, world.start, robot, LaserScannerConfig(rate_hz=0.1), 0)
     poses = np.array(
         [
-            look.T_world_base
-            for look in drive(simulation, tour_paths(world, tour, robot.radius_m), 0.5)
+            sample.T_world_base
+            for sample in drive(simulation, tour_paths(world, tour, robot.radius_m), 0.5)
         ]
     )
     assert simulation.robot.collisions == 0
@@ -121,7 +121,7 @@ def test_the_long_tour_takes_twenty_minutes() -> None:
 
 
 def test_the_warehouse_is_what_its_program_writes() -> None:
-    assert (WORLDS / 'warehouse.yaml').read_text(encoding='utf-8') == warehouse()
+    assert (WORLDS / 'warehouse.yaml').read_text(encoding='utf-8') == warehouse_yaml()
 
 
 def test_a_place_that_cannot_be_reached_is_said() -> None:

@@ -100,7 +100,7 @@ def test_odometry_is_relative_to_the_start() -> None:
 def drift(name: str, seed: int) -> tuple[float, float, float]:
     """Odometry errors over 20 m: of distance (share), of heading (rad).
 
-    And of ten turns on the spot (share).
+    And of ten rotations in place (share).
     """
     robot = DifferentialDriveRobot(PRESETS[name], hall(90.0), np.zeros(3), seed)
     while robot.T_world_base[0] < 20.0:

@@ -7,7 +7,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
-from thinmap_ros.sim.simulation import STEP_NS, Moment, Simulation
+from thinmap_ros.sim.simulation import STEP_NS, SensorReadings, Simulation
 from thinmap_ros.sim.world import World
 
 
@@ -21,7 +21,7 @@ def simulation(seed: int = 1, rate_hz: float = 5.0) -> Simulation:
     return Simulation(world, world.start, PRESETS['2dx'], LaserScannerConfig(rate_hz=rate_hz), seed)
 
 
-def drive(sim: Simulation, steps: int) -> list[Moment]:
+def drive(sim: Simulation, steps: int) -> list[SensorReadings]:
     return [sim.read_sensors()] + [sim.step(0.2, 0.3) for _ in range(steps)]
 
 

@@ -1,4 +1,4 @@
-"""Worlds: what is drawn is what is solid, and what cannot be drawn is said in one line."""
+"""Worlds: drawn obstacles are occupied, and errors are reported in one line."""
 
 from pathlib import Path
 

@@ -11,7 +11,7 @@ import yaml
 from support.timeouts import PROGRAM_S
 
 from benchmarks.exploration.page import page
-from thinmap_ros.evaluation.strategy_comparison import markdown, saved
+from thinmap_ros.evaluation.strategy_comparison import markdown, relative_saving
 
 ROOT = Path(__file__).resolve().parents[2]
 WORLD = {
@@ -45,7 +45,7 @@ def test_savings_are_paired_by_world_and_start() -> None:
     ours = {('a', 0): report('x', 'a', 0, 50.0), ('a', 1): report('x', 'a', 1, 90.0)}
     ours['b', 0] = report('x', 'b', 0, 1.0)
     others = {('a', 0): report('y', 'a', 0, 100.0), ('a', 1): report('y', 'a', 1, 100.0)}
-    assert saved(ours, others, 'distance').tolist() == pytest.approx([-0.5, -0.1])
+    assert relative_saving(ours, others, 'distance').tolist() == pytest.approx([-0.5, -0.1])
 
 
 def test_the_table_has_a_row_for_each_strategy_and_says_what_ours_saves() -> None:

@@ -226,7 +226,7 @@ def test_stamps_that_jump_back_do_no_harm(tmp_path):
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / 'out' / 'report.json').read_text())
     assert report['scans'] + report['skipped'] == 40
-    # As in the file: a robot's clock is set back now and then, and its log goes on.
+    # As in the file: a robot's clock is set back now and then, and its log continues.
     assert report['scans'] >= 38
     poses = np.loadtxt(tmp_path / 'out' / 'trajectory.tum')
     assert np.isfinite(poses).all()
@@ -278,7 +278,7 @@ class Diary(NullView):
         self.told['grid'] += 1
         self.map_shown = patch
 
-    def number(self, ns, plot, curve, value):
+    def scalar(self, ns, plot, curve, value):
         self.told[plot, curve] += np.isfinite(value)
 
 
@@ -287,7 +287,7 @@ def test_a_view_is_told_each_scan_and_the_map_as_it_is_in_the_end(log):
     result = replay(CarmenLog(log, LaserOptions()), PipelineConfig(), watcher=ReplayView(diary))
     assert len(result.poses) == diary.told['pose'] == diary.told['scan'] == 30
     assert diary.told['grid'] == 7, 'once a second of the log, and at its end'
-    assert np.array_equal(diary.map_shown.cells, result.pipeline.grid.patch().cells)
+    assert np.array_equal(diary.map_shown.cells, result.pipeline.grid.known_area().cells)
     for curve in (
         ('step', 'localizer'),
         ('step', 'map update'),

@@ -1,4 +1,4 @@
-"""What a view is told stands in the .rrd file; read back with rerun's own reader."""
+"""Data shown in a view are in the .rrd file, read back with rerun's own reader."""
 
 import subprocess
 import sys
@@ -128,11 +128,11 @@ def test_graph_target_lines_and_numbers(tmp_path):
         np.array([True, False]),
     )
     view.local_area(START, np.array([[1.0, 0.0]]))
-    view.samples(START, np.array([[4.0, 5.0], [6.0, 7.0]]))
+    view.particles(START, np.array([[4.0, 5.0], [6.0, 7.0]]))
     view.plan(START, np.array([[0.0, 0.0], [1.0, 0.0]]))
     for i, place in enumerate([np.array([1.0, 2.0]), np.array([1.0, 2.0]), None, None]):
         view.target(START + i * S, place)
-    view.number(START + S, 'step', 'localizer', 4.5)
+    view.scalar(START + S, 'step', 'localizer', 4.5)
     view.close()
     rows, _ = read_back(tmp_path / 'a.rrd')
     colours = rows['/map/nodes'][0][1]['Points3D:colors']
@@ -190,7 +190,7 @@ def test_viewer_is_sent_what_the_file_holds_and_ends_with_the_view(tmp_path, mon
     view = View(tmp_path / 'a.rrd', spawn=True)
     viewer = view._streams.viewer
     for i in range(10):
-        view.number(START + i * S, 'progress', 'coverage, %', 10.0 * i)
+        view.scalar(START + i * S, 'progress', 'coverage, %', 10.0 * i)
     assert viewer.poll() is None
     view.close()
     assert viewer.poll() is not None
@@ -275,7 +275,7 @@ def test_feed_refuses_what_makes_no_sense():
         nodes = (type('N', (), {'id': 1, 'kind': 9}),)
 
     with pytest.raises(InputError):
-        MessageView(NullView(), lambda frame: None).take('topology', Message)
+        MessageView(NullView(), lambda frame: None).show('topology', Message)
 
 
 class Diary(NullView):
@@ -285,7 +285,7 @@ class Diary(NullView):
         self.numbers = []
         self.near = None
 
-    def number(self, ns, plot, curve, value):
+    def scalar(self, ns, plot, curve, value):
         self.numbers.append((plot, curve, value))
 
     def local_area(self, ns, places):
@@ -310,7 +310,7 @@ def test_step_times_are_those_of_the_robot_that_is_shown():
         'robot2/topology_builder: thinmap',
         'robot2/x/topology_builder: thinmap',
     )
-    feed.take(
+    feed.show(
         'diagnostics', stamped(status=[plain(name=name, values=[rate, pair]) for name in names])
     )
     assert diary.numbers == [('step', 'graph update', 12.5)]
@@ -322,11 +322,11 @@ def test_local_area_is_where_its_features_are_stored():
     nodes = [
         plain(id=i, kind=0, position=plain(x=1.0 * i, y=0.0), clearance_m=0.5) for i in (1, 2, 3)
     ]
-    feed.take('topology', stamped(nodes=nodes, edges=[]))
+    feed.show('topology', stamped(nodes=nodes, edges=[]))
     point = plain(x=0.0, y=0.0)
     kept = [([1, 7], True), ([2], True), ([3], False)]  # node 7 is gone
     features = [
         plain(start=point, end=point, node_ids=ids, in_local_area=local) for ids, local in kept
     ]
-    feed.take('line_features', stamped(features=features))
+    feed.show('line_features', stamped(features=features))
     assert diary.near == [[1.0, 0.0], [2.0, 0.0]]

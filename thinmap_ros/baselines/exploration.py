@@ -1,8 +1,7 @@
-"""Exploration as others do it: which frontier, or which end node, next.
+"""Baseline exploration strategies: which frontier, or which end node, is visited next.
 
-All of them run on the same map, drive by the same navigator, choose anew once a second and as soon
-as what they drive to is seen, and stop when nothing is left to choose from. What differs is the
-choice.
+All of them use the same map and navigator. They choose once a second, and as soon as the target has
+been observed, and stop when no target is left. They differ in the choice only.
 """
 
 import math
@@ -40,10 +39,7 @@ _PROGRESS_M = 0.1
 
 @dataclass(eq=False)
 class _Progress:
-    """How near a place was while it was driven to, and for how long it has been no nearer.
-
-    nearest_m: by the way there.
-    """
+    """Progress towards a place: the shortest remaining path, and the time since then."""
 
     place: tuple[float, float]
     nearest_m: float
@@ -51,7 +47,7 @@ class _Progress:
 
 
 class _ProgressTimeout:
-    """Gives up what comes no nearer while it is driven to, also if others came between."""
+    """Detects targets without progress while the robot drives to them."""
 
     def __init__(self, timeout_s: float) -> None:
         self._timeout_ns = 1e9 * timeout_s
@@ -59,15 +55,15 @@ class _ProgressTimeout:
         self._driven: _Progress | None = None
         self._stamp_ns = 0
 
-    def is_over(self, place: Array, way_m: float, stamp_ns: int) -> bool:
-        """Count the time that has gone by on the way (m) to a place (2,) since it was nearest."""
+    def has_expired(self, place: Array, length_m: float, stamp_ns: int) -> bool:
+        """Add driving time towards a place (2,) at a remaining path length, m."""
         same = (p for p in self._watched if math.dist(p.place, place) <= _SAME_PLACE_M)
         progress = next(same, None)
         if progress is None:
-            progress = _Progress((float(place[0]), float(place[1])), way_m)
+            progress = _Progress((float(place[0]), float(place[1])), length_m)
             self._watched.append(progress)
-        if way_m < progress.nearest_m - _PROGRESS_M:
-            progress.nearest_m = way_m
+        if length_m < progress.nearest_m - _PROGRESS_M:
+            progress.nearest_m = length_m
             progress.waited_ns = 0
         if self._driven is progress:
             progress.waited_ns += max(stamp_ns - self._stamp_ns, 0)
@@ -80,7 +76,7 @@ class _ProgressTimeout:
 
 
 class FrontierExplorer(ABC):
-    """Drives to one frontier after the other until none is left that can be reached."""
+    """Visits frontiers until no reachable one is left."""
 
     def __init__(self) -> None:
         self.map = FrontierMap()
@@ -92,14 +88,14 @@ class FrontierExplorer(ABC):
 
     @abstractmethod
     def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
-        """Cost of each frontier, (N,), from a pose (3,): the cheapest is next."""
+        """Cost of each frontier, (N,), from a pose (3,); the cheapest one is next."""
 
     def step(
         self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
     ) -> Decision:
-        """Say where to go; see core/exploration/strategy.Strategy."""
+        """Choose a target; see core/exploration/strategy.Strategy."""
         self.map.update(patch, scan, T_map_base)
-        self._give_up_what_was_looked_at(T_map_base)
+        self._drop_unchanged_target(T_map_base)
         if self._is_due(scan.stamp_ns):
             self._survey_ns = scan.stamp_ns
             self._frame = self.map.borders.frame
@@ -110,9 +106,11 @@ class FrontierExplorer(ABC):
         )
 
     def target_failed(self, reason: str) -> None:
-        """Remember where a target could not be reached."""
+        """Store the position of a target that could not be reached."""
         if self.target is not None:
-            self._failures.append((float(self.target.place[0]), float(self.target.place[1])))
+            self._failures.append(
+                (float(self.target.viewpoint[0]), float(self.target.viewpoint[1]))
+            )
         self.target = None
 
     def _is_due(self, stamp_ns: int) -> bool:
@@ -131,20 +129,21 @@ class FrontierExplorer(ABC):
         self.target = None
         if left:
             best = left[int(np.argmin(self.costs(left, T_map_base)))]
-            if before is None or math.dist(before.middle, best.middle) > _SAME_PLACE_M:
+            if before is None or math.dist(before.centroid, best.centroid) > _SAME_PLACE_M:
                 self._number += 1
-            near = before is not None and math.dist(before.place, best.place) < _AT_GOAL_M
-            # A goal that hardly moved stays where it is: the robot would otherwise set out anew
-            # once a second.
+            near = before is not None and math.dist(before.viewpoint, best.viewpoint) < _AT_GOAL_M
+            # A goal that hardly moved is kept: the robot would otherwise replan every second.
             if near and before:
-                best = Frontier(best.cells, best.middle, before.place, best.way_m)
+                best = Frontier(best.cells, best.centroid, before.viewpoint, best.path_length_m)
             self.target = best
 
     def _tries(self, frontier: Frontier) -> int:
-        return sum(math.dist(frontier.place, place) <= _SAME_PLACE_M for place in self._failures)
+        return sum(
+            math.dist(frontier.viewpoint, place) <= _SAME_PLACE_M for place in self._failures
+        )
 
-    def _give_up_what_was_looked_at(self, T_map_base: Array) -> None:
-        """What stays unknown although the robot stands there and looks has nothing more to show."""
+    def _drop_unchanged_target(self, T_map_base: Array) -> None:
+        """Drop a target that stays unknown although the robot is at its viewpoint."""
         if self.target is None or self._frame != self.map.borders.frame:
             return
         goal = self.target.goal
@@ -160,25 +159,25 @@ class FrontierExplorer(ABC):
 
 
 class NearestFrontier(FrontierExplorer):
-    """The frontier with the shortest way over the grid.
+    """The frontier with the shortest path on the grid.
 
     Source: Yamauchi, "A frontier-based approach for autonomous exploration", 1997; Holz et al.,
-    "Evaluating the efficiency of frontier-based exploration strategies", 2010 (choosing anew when
+    "Evaluating the efficiency of frontier-based exploration strategies", 2010 (a new choice when
     the frontier is gone).
     """
 
     def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
-        """Way to each."""
-        return np.array([f.way_m for f in frontiers])
+        """Path length to each frontier."""
+        return np.array([f.path_length_m for f in frontiers])
 
 
 class ExploreLite(FrontierExplorer):
     """explore_lite's cost: potential_scale * straight distance - gain_scale * size.
 
     Both are scaled by the cell size. Scales as in its launch file; size in cells, distance that of
-    the nearest frontier cell, m; it drives to the frontier's middle. A goal that has come no nearer
-    while it was driven to for progress_timeout_s is given up; here also if others were driven to in
-    between, as the package would go to and fro between two of them for ever.
+    the nearest frontier cell, m; the target is the centroid of the frontier. A goal without
+    progress for progress_timeout_s is blacklisted; here also after an interruption, because the
+    package would oscillate between two goals for ever.
     Source: Hörner, "Map-merging for multi-robot system", 2016, package explore_lite.
     """
 
@@ -188,20 +187,22 @@ class ExploreLite(FrontierExplorer):
 
     def __init__(self) -> None:
         super().__init__()
-        self._patience = _ProgressTimeout(self.progress_timeout_s)
+        self._progress_timeout = _ProgressTimeout(self.progress_timeout_s)
 
     def step(
         self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
     ) -> Decision:
-        """As the others; a target without progress has failed."""
+        """Choose a target; a target without progress has failed."""
         decision = super().step(topology, patch, scan, T_map_base)
         target = self.target
-        if target is not None and self._patience.is_over(target.place, target.way_m, scan.stamp_ns):
+        if target is not None and self._progress_timeout.has_expired(
+            target.viewpoint, target.path_length_m, scan.stamp_ns
+        ):
             self.target_failed('no progress')
         return decision
 
     def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
-        """Distance against size."""
+        """Weighted distance minus weighted size."""
         frame = self.map.borders.frame
         nearest = [
             np.hypot(*(frame.centres_of(f.cells) - T_map_base[:2]).T).min() for f in frontiers
@@ -213,7 +214,7 @@ class ExploreLite(FrontierExplorer):
 
 
 class InformationGain(FrontierExplorer):
-    """The greatest area to be seen from a place, discounted by the way there: A exp(-lambda L).
+    """The largest area visible from a place, discounted by the path length: A exp(-lambda L).
 
     Source: Gonzalez-Banos and Latombe, "Navigation strategies for exploring indoor environments",
     2002.
@@ -223,45 +224,40 @@ class InformationGain(FrontierExplorer):
     range_m = 8.0
 
     def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
-        """Less the discounted gain."""
+        """Negative discounted gain."""
         assert self.map.patch is not None
         frame = self.map.borders.frame
-        cells = frame.cells_of(np.array([f.place for f in frontiers]))
+        cells = frame.cells_of(np.array([f.viewpoint for f in frontiers]))
         areas = _unknown_in_sight(self.map.patch.cells, cells, self.range_m / frame.resolution)
         return -(areas + 1.0) * np.exp(
-            -self.discount_per_m * np.array([f.way_m for f in frontiers])
+            -self.discount_per_m * np.array([f.path_length_m for f in frontiers])
         )
 
 
 class DistanceAdvantage(FrontierExplorer):
-    """The frontier for which now is the best time.
+    """The frontier with the largest distance advantage: near the robot, far from other frontiers.
 
-    It is near to the robot, and far from where the robot would be otherwise.
-
-    Cost: the way from the robot less the mean way from the other frontiers, from which it would
-    have to be come back to later.
+    Cost: path length from the robot minus the mean path length from the other frontiers, from which
+    the robot would have to return later.
     """
 
     def costs(self, frontiers: list[Frontier], T_map_base: Array) -> Array:
-        """Less the advantage."""
-        ways = np.array([f.way_m for f in frontiers])
-        places = np.array([f.place for f in frontiers])
+        """Negative advantage."""
+        lengths = np.array([f.path_length_m for f in frontiers])
+        places = np.array([f.viewpoint for f in frontiers])
         if len(frontiers) < 2:
-            return ways
-        between = np.array([self.map.ways(place, places) for place in places])
+            return lengths
+        between = np.array([self.map.path_lengths_from(place, places) for place in places])
         between = np.where(np.isfinite(between), between, 0.0)
-        return np.asarray(ways - between.sum(axis=0) / (len(frontiers) - 1))
+        return np.asarray(lengths - between.sum(axis=0) / (len(frontiers) - 1))
 
 
 class VisitAllEndNodes(NearestFrontier):
-    """The nearest end node that was not visited yet, by A* on the graph, until all were.
+    """The nearest end node that was not visited yet, by A* on the graph, as on a GVG.
 
-    This is exploration along a GVG.
-
-    An edge is followed to its end: another one is chosen when the robot is there, when there is no
-    end any more, or when it has come no nearer for progress_timeout_s: in wide halls ends come and
-    go as more is seen. Frontiers that no end node leads to are visited at the end, the nearest
-    first.
+    The robot follows an edge to its end. It chooses another one when it has arrived, when the end
+    node disappears, or without progress for progress_timeout_s: in wide halls end nodes appear and
+    disappear as the map grows. Frontiers without an end node are visited at the end, nearest first.
     Source: Choset and Nagatani, "Topological simultaneous localization and mapping (SLAM)", 2001.
     """
 
@@ -271,31 +267,31 @@ class VisitAllEndNodes(NearestFrontier):
         super().__init__()
         self.map = FrontierMap(
             allow_backtracking=True
-        )  # the graph has led it where the others do not go
-        self._patience = _ProgressTimeout(self.progress_timeout_s)
+        )  # the graph may lead through narrow passages
+        self._progress_timeout = _ProgressTimeout(self.progress_timeout_s)
         self._visited: list[tuple[float, float]] = []
         self._end_node: Array | None = None  # the goal (3,) there
 
     def step(
         self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
     ) -> Decision:
-        """End nodes first; what frontiers there are is looked after meanwhile."""
+        """Choose an end node, or a frontier if none is left."""
         found = self._next_end_node(topology, T_map_base)
         if found is None:
             self._end_node = None
             return super().step(topology, patch, scan, T_map_base)
-        goal, way_m = found
+        goal, length_m = found
         self.map.update(patch, scan, T_map_base)
         if self._end_node is None or not _is_near(self._end_node, goal):
             self._number += 1
             self._end_node = goal
         decision = _decision(topology, self._end_node, self._number, False, False)
-        if self._patience.is_over(goal[:2], way_m, scan.stamp_ns):
+        if self._progress_timeout.has_expired(goal[:2], length_m, scan.stamp_ns):
             self.target_failed('no progress')
         return decision
 
     def target_failed(self, reason: str) -> None:
-        """An end node that cannot be reached counts as visited."""
+        """Mark an unreachable end node as visited."""
         if self._end_node is None:
             super().target_failed(reason)
         else:
@@ -305,7 +301,7 @@ class VisitAllEndNodes(NearestFrontier):
     def _next_end_node(
         self, topology: TopologicalMap, T_map_base: Array
     ) -> tuple[Array, float] | None:
-        """Goal (3,) at the end node that is next, and the way there, m; None without one."""
+        """Goal (3,) at the next end node, and the path length to it, m; None without one."""
         ends = [node for node in topology.nodes.values() if node.kind == NodeKind.END]
         self._visited += [
             (node.x, node.y)
@@ -319,14 +315,14 @@ class VisitAllEndNodes(NearestFrontier):
         costs = path_lengths_to_nodes(topology, float(T_map_base[0]), float(T_map_base[1]))
         followed = {i: node for i, node in left.items() if self._is_followed(node.x, node.y)}
         best = min((followed or left).values(), key=lambda node: costs.get(node.id, math.inf))
-        way_m = costs.get(best.id, math.inf)
-        if not math.isfinite(way_m):
+        length_m = costs.get(best.id, math.inf)
+        if not math.isfinite(length_m):
             return None
         heading = math.atan2(best.y - T_map_base[1], best.x - T_map_base[0])
-        return se2.pose(best.x, best.y, heading), way_m
+        return se2.pose(best.x, best.y, heading), length_m
 
     def _is_followed(self, x: float, y: float) -> bool:
-        """Whether the end node at a place is the one driven to, which moves as more is seen."""
+        """Whether the end node at a place is the present target, which moves as the map grows."""
         return self._end_node is not None and math.dist((x, y), self._end_node[:2]) < _SAME_PLACE_M
 
     def _was_visited(self, x: float, y: float) -> bool:
@@ -348,10 +344,7 @@ def _decision(
     finished: bool,
     failures: bool,
 ) -> Decision:
-    """What is common to all.
-
-    The graph's end nodes are told of, though nobody asked for their probability.
-    """
+    """Decision with the end nodes of the graph, with a probability of 0.5 each."""
     nodes = [
         _end_node(node.id, se2.pose(node.x, node.y, 0.0), False)
         for node in topology.nodes.values()
@@ -360,10 +353,10 @@ def _decision(
     goal = target.goal if isinstance(target, Frontier) else target
     chosen = None if goal is None else _end_node(FIRST_FRONTIER_ID + number, goal, True)
     code = FinishCode.NONE
-    reason = 'something is left'
+    reason = 'targets remain'
     if finished:
         code = FinishCode.NOTHING_REACHABLE if failures else FinishCode.ALL_RESOLVED
-        reason = 'what is left cannot be reached' if failures else 'nothing is left'
+        reason = 'remaining targets are unreachable' if failures else 'no target is left'
     return Decision(chosen, finished, reason, code, nodes, [], 0.0, 0.0)
 
 

@@ -1,7 +1,4 @@
-"""What all frontier based exploration shares.
-
-Stretches of frontier, where to look at them from, how far that is.
-"""
+"""Frontiers for the baseline strategies: clusters, viewpoints and path lengths."""
 
 import math
 from dataclasses import dataclass
@@ -13,7 +10,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.exploration.field_of_view import box_of_scan, directions_of_view
 from thinmap_ros.core.exploration.frontiers import OpenBorders
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.core.planning.grid_search import coarse, path_lengths_from
+from thinmap_ros.core.planning.grid_search import downsample_mask, path_lengths_from
 from thinmap_ros.core.planning.recent_path import RecentPath
 from thinmap_ros.core.planning.traversability import (
     escape_cells,
@@ -35,52 +32,49 @@ _COARSE = 2
 
 @dataclass(frozen=True, eq=False)
 class Frontier:
-    """A stretch of frontier: its cells (N, 2), its middle and the place to look at it from (2,), m.
+    """A frontier cluster: its cells (N, 2), centroid (2,) and viewpoint (2,), m.
 
-    way_m: length of the way from the robot to that place.
+    path_length_m: length of the path from the robot to the viewpoint.
     """
 
     cells: Cells
-    middle: Array
-    place: Array
-    way_m: float
+    centroid: Array
+    viewpoint: Array
+    path_length_m: float
 
     @property
     def goal(self) -> Array:
-        """The place, with the heading from there to the middle, (3,)."""
-        dx, dy = self.middle - self.place
-        return se2.pose(self.place[0], self.place[1], math.atan2(dy, dx))
+        """The viewpoint, facing the centroid, (3,)."""
+        dx, dy = self.centroid - self.viewpoint
+        return se2.pose(self.viewpoint[0], self.viewpoint[1], math.atan2(dy, dx))
 
 
 class FrontierMap:
-    """The frontiers of the map as it grows.
-
-    Those that were looked at closely and stayed do not count any more.
-    """
+    """The frontiers of a growing map, without those that persist after close observation."""
 
     def __init__(self, allow_backtracking: bool = False) -> None:
-        """goes_back: it can go back where it came, also where the map looks too narrow."""
+        """allow_backtracking: the recent path counts as traversable, however narrow it appears."""
         self.borders = OpenBorders(SHORTEST_M)
-        self._trail = RecentPath() if allow_backtracking else None
+        self._recent_path = RecentPath() if allow_backtracking else None
         self.patch: GridPatch | None = None
-        self._ways: Mask = np.zeros((0, 0), dtype=np.bool_)
+        self._reachable: Mask = np.zeros((0, 0), dtype=np.bool_)
 
     def update(self, patch: GridPatch, scan: Scan, T_map_base: Array) -> None:
-        """Take in the map after a scan made at a pose (3,)."""
+        """Update the frontiers after a scan made at a pose (3,)."""
         self.patch = patch
         xy = (float(T_map_base[0]), float(T_map_base[1]))
-        if self._trail is not None:
-            self._trail.add(T_map_base)
+        if self._recent_path is not None:
+            self._recent_path.add_pose(T_map_base)
         self.borders.update(patch, box_of_scan(scan, T_map_base))
         self.borders.examine(xy, _CLOSE_LOOK_M, directions_of_view(scan, T_map_base))
 
     def is_open(self, frontier: Frontier) -> bool:
-        """Whether enough of a frontier, found on this very patch's frame, is left."""
+        """Whether enough of a frontier remains; its cells must be of the present frame."""
         left = np.count_nonzero(self.borders.mask[frontier.cells[:, 0], frontier.cells[:, 1]])
         return bool(left * self.borders.frame.resolution >= SHORTEST_M - 1e-6)
 
     def find(self, T_map_base: Array) -> list[Frontier]:
-        """All frontiers that can be looked at from where the robot can get to from a pose (3,)."""
+        """All frontiers with a viewpoint that is reachable from a pose (3,)."""
         frame = self.borders.frame
         cells, numbers, _ = self.borders.stretches()
         xy = (float(T_map_base[0]), float(T_map_base[1]))
@@ -89,41 +83,43 @@ class FrontierMap:
         if len(cells) == 0:
             return []
         reached = reach & standing
-        self._ways = coarse(reach, _COARSE)
+        self._reachable = downsample_mask(reach, _COARSE)
         stretches = [cells[numbers == number] for number in np.unique(numbers)]
         places = [
             self.borders.place_to_look(stretch, reached, _REACH_M, xy) for stretch in stretches
         ]
         found = [(s, p) for s, p in zip(stretches, places, strict=True) if p is not None]
-        ways = self.ways(np.array(T_map_base[:2]), np.array([p for _, p in found]).reshape(-1, 2))
+        ways = self.path_lengths_from(
+            np.array(T_map_base[:2]), np.array([p for _, p in found]).reshape(-1, 2)
+        )
         return [
-            Frontier(s, self._middle(s), p, float(way))
+            Frontier(s, self._centroid(s), p, float(way))
             for (s, p), way in zip(found, ways, strict=True)
             if math.isfinite(way)
         ]
 
     def _reach_from(self, standing: Mask, xy: tuple[float, float]) -> Mask:
-        """Cells (H, W) to which the robot can get from a point (m)."""
+        """Cells (H, W) that are reachable from a point (m)."""
         free = self.borders.free
         frame = self.borders.frame
         row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
         if not (0 <= row < free.shape[0] and 0 <= col < free.shape[1]):
             return np.zeros_like(standing)
-        if self._trail is None:
+        if self._recent_path is None:
             ways = escape_cells(standing, free, frame, xy, _ESCAPE_M)
             return reachable_cells(ways, (row, col)) & standing
-        trail = self._trail.cells(frame, free.shape)
+        trail = self._recent_path.cells(frame, free.shape)
         return reachable_cells(
             escape_cells(standing, free, frame, xy, _ESCAPE_M, trail), (row, col)
         )
 
-    def ways(self, xy: Array, places: Array) -> Array:
-        """Length, m, of the ways from a point (2,) to places (N, 2) that `find` has found, (N,)."""
+    def path_lengths_from(self, xy: Array, places: Array) -> Array:
+        """Path lengths, m, from a point (2,) to viewpoints (N, 2) of `find`, (N,)."""
         frame = self.borders.frame
         cells = frame.cells_of(np.vstack([xy[None], places])) // _COARSE
         start = (int(cells[0, 0]), int(cells[0, 1]))
-        return path_lengths_from(self._ways, start, cells[1:]) * frame.resolution * _COARSE
+        return path_lengths_from(self._reachable, start, cells[1:]) * frame.resolution * _COARSE
 
-    def _middle(self, cells: Cells) -> Array:
+    def _centroid(self, cells: Cells) -> Array:
         cell = cells[np.square(cells - cells.mean(axis=0)).sum(axis=1).argmin()]
         return np.asarray(self.borders.frame.centres_of(cell[None])[0])

@@ -1,6 +1,4 @@
-"""The Voronoi topology that the papers compare thinning with.
-
-It is made of points as far from two obstacle cells as from each other.
+"""Topological map from the Voronoi diagram, which the papers compare with thinning.
 
 Source: topological map paper sections 1 and 4 (hierarchical map building); Zwynsvoorde et al.,
 "Incremental topological modeling using local Voronoi-like graphs", 2000.
@@ -24,7 +22,7 @@ Numbers = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class VoronoiConfig(Config):
-    """Which parts of the diagram make the graph."""
+    """Parameters of the selection of vertices and ridges."""
 
     robot_radius_m: float = robot_radius()
     prune_m: float = parameter(
@@ -35,10 +33,10 @@ class VoronoiConfig(Config):
 def build_voronoi(patch: GridPatch, config: VoronoiConfig | None = None) -> TopologicalMap:
     """Topological map (m, map frame) from the Voronoi diagram of the cells that bound free space.
 
-    A ridge of the diagram counts where both its ends lie on free cells, at least robot_radius_m
-    from the centres that they belong to. Of what is left, dead ends up to prune_m long are dropped,
-    shortest first, until there are none; then nodes stand where one or three and more ridges meet,
-    and one in each ring that has none. Clearances are distances to the nearest obstacle centre.
+    A ridge of the diagram is used if both its ends lie on free cells, at least robot_radius_m from
+    their obstacle centres. Dead ends up to prune_m long are removed, shortest first, until there
+    are none. Nodes are the ends of one, or of three and more ridges, and one point of each ring
+    without nodes. Clearances are distances to the nearest obstacle centre.
     """
     config = config or VoronoiConfig()
     solid = ~patch.free
@@ -66,7 +64,7 @@ def build_voronoi(patch: GridPatch, config: VoronoiConfig | None = None) -> Topo
 
 
 def _beside(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Cells (H, W) that have a true one beside them, over an edge or a corner."""
+    """Cells (H, W) with a true cell among their eight neighbours."""
     near: NDArray[np.bool_] = ndimage.binary_dilation(cells, np.ones((3, 3), dtype=np.bool_))
     return near
 
@@ -83,7 +81,7 @@ def _degrees(ridges: Numbers, count: int) -> Numbers:
 
 
 def _chains(ridges: Numbers, count: int) -> list[list[int]]:
-    """Vertices along each chain of ridges between vertices with one or over two, rings last."""
+    """Vertices of each chain of ridges between vertices of degree one or above two; rings last."""
     ends = np.concatenate([ridges, ridges[:, ::-1]])
     ends = ends[np.argsort(ends[:, 0], kind='stable')]
     starts = np.searchsorted(ends[:, 0], np.arange(count + 1))
@@ -117,7 +115,7 @@ def _length(vertices: Array, chain: list[int]) -> float:
 
 
 def _pruned(vertices: Array, ridges: Numbers, prune_m: float) -> Numbers:
-    """Ridges (M, 2) without dead ends up to prune_m long.
+    """Remove dead ends up to prune_m long from ridges (M, 2).
 
     A part that is nothing else keeps its longest one.
     """
@@ -135,8 +133,7 @@ def _pruned(vertices: Array, ridges: Numbers, prune_m: float) -> Numbers:
         touched: set[int] = set()
         for _, chain in sorted(short):
             base = chain[0] if degree[chain[0]] != 1 else chain[-1]
-            # One dead end a junction and round: dropping one may make the others part of something
-            # longer.
+            # One dead end per junction and iteration: its removal may extend the other chains.
             if base not in touched:
                 touched.add(base)
                 gone |= {(min(a, b), max(a, b)) for a, b in pairwise(chain)}

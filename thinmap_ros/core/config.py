@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
-from thinmap_ros.core.errors import ConfigError, shown
+from thinmap_ros.core.errors import ConfigError, quoted
 
 
 def parameter(
@@ -21,7 +21,7 @@ def parameter(
     high: float | None = None,
     choices: Sequence[str] | None = None,
 ) -> Any:
-    """Declare a field of a Config: its default, what it means (with unit), and its allowed values.
+    """Declare a field of a Config: default, description (with unit) and allowed values.
 
     low, high: inclusive bounds of a number; choices: the allowed strings.
     """
@@ -48,7 +48,7 @@ def part(config: type['Config']) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Base of every configuration: values are checked once, on construction.
+    """Base of every configuration; values are validated on construction.
 
     Raises ConfigError naming the parameter, its value and what was expected.
     """
@@ -113,21 +113,21 @@ def _check(field: 'dataclasses.Field[Any]', value: Any) -> None:
     low, high, choices = (field.metadata[key] for key in ('low', 'high', 'choices'))
     if not _same_type(value, field.default):
         expected = type(field.default).__name__
-        raise ConfigError(f'{field.name} = {shown(value)}: expected a {expected}')
+        raise ConfigError(f'{field.name} = {quoted(value)}: expected a {expected}')
     if choices is not None and value not in choices:
-        raise ConfigError(f'{field.name} = {shown(value)}: expected one of {", ".join(choices)}')
+        raise ConfigError(f'{field.name} = {quoted(value)}: expected one of {", ".join(choices)}')
     if isinstance(value, bool) or not isinstance(value, int | float):
         return
     if not _is_finite(value):
-        raise ConfigError(f'{field.name} = {shown(value)}: expected a finite number')
+        raise ConfigError(f'{field.name} = {quoted(value)}: expected a finite number')
     if (low is not None and value < low) or (high is not None and value > high):
-        raise ConfigError(f'{field.name} = {shown(value)}: expected {_interval(low, high)}')
+        raise ConfigError(f'{field.name} = {quoted(value)}: expected {_interval(low, high)}')
 
 
 def _is_finite(value: float) -> bool:
     try:
         return math.isfinite(value)
-    except OverflowError:  # a whole number beyond all that can be calculated with
+    except OverflowError:  # an integer too large for float
         return False
 
 

@@ -1,9 +1,9 @@
-"""What can go wrong at the doors of thinmap, each in one line, and how values are quoted."""
+"""Errors that thinmap reports to its user, and how their messages quote values."""
 
 import reprlib
 
-_LONGEST_QUOTE = 200
-_LARGEST_WHOLE = 10**30
+_MAX_QUOTE_LENGTH = 200
+_MAX_INTEGER = 10**30
 
 
 class ThinmapError(Exception):
@@ -21,27 +21,27 @@ class ConfigError(ThinmapError):
     """A parameter outside its range: the message names it, the value, and what was expected."""
 
 
-def shown(value: object) -> str:
-    """A value from outside as an error quotes it: `repr`, on one line, at most 200 characters."""
+def quoted(value: object) -> str:
+    """Quote a foreign value in an error message: its `repr`, one line, at most 200 characters."""
     return one_line(_QUOTE.repr(value))
 
 
 def one_line_reason(error: BaseException) -> str:
-    """What another library's error says, on one line of at most 200 characters; else its type."""
-    # A KeyError holds the key that was missing: one of a million digits cannot even be converted.
-    said = shown(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
-    return one_line(said) or type(error).__name__
+    """Message of another library's error, one line of at most 200 characters; else its type."""
+    # A KeyError holds the missing key. An integer of a million digits cannot even be converted.
+    text = quoted(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
+    return one_line(text) or type(error).__name__
 
 
 def one_line(text: str) -> str:
     """Text without line breaks and shortened in its middle to at most 200 characters."""
-    # Both ends are enough; splitting all of a long text into words takes as long as reading it.
-    if len(text) > 4 * _LONGEST_QUOTE:
-        text = text[: 2 * _LONGEST_QUOTE] + text[-2 * _LONGEST_QUOTE :]
+    # Both ends are enough: splitting a long text into words takes as long as reading it.
+    if len(text) > 4 * _MAX_QUOTE_LENGTH:
+        text = text[: 2 * _MAX_QUOTE_LENGTH] + text[-2 * _MAX_QUOTE_LENGTH :]
     line = ' '.join(text.split())
     line = ''.join(c if c.isprintable() else '?' for c in line)
-    half = (_LONGEST_QUOTE - 3) // 2
-    return line if len(line) <= _LONGEST_QUOTE else f'{line[:half]}...{line[-half:]}'
+    half = (_MAX_QUOTE_LENGTH - 3) // 2
+    return line if len(line) <= _MAX_QUOTE_LENGTH else f'{line[:half]}...{line[-half:]}'
 
 
 class _Quote(reprlib.Repr):
@@ -49,11 +49,11 @@ class _Quote(reprlib.Repr):
 
     def __init__(self) -> None:
         super().__init__()
-        self.maxstring = self.maxother = _LONGEST_QUOTE
+        self.maxstring = self.maxother = _MAX_QUOTE_LENGTH
         self.maxlevel = 3
 
     def repr_int(self, x: int, level: int) -> str:
-        if abs(x) <= _LARGEST_WHOLE:
+        if abs(x) <= _MAX_INTEGER:
             return repr(x)
         return f'a whole number of {x.bit_length()} bits'
 

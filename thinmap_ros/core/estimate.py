@@ -1,4 +1,4 @@
-"""What a localizer says after a scan."""
+"""Result of one localizer step."""
 
 from dataclasses import dataclass
 
@@ -13,32 +13,32 @@ class Correction:
     before: Array
     after: Array
 
-    def moved(self, k: int, T: Array) -> Array:
-        """Where a pose (3,) that was found from keyframe k is now."""
+    def applied_to(self, k: int, T: Array) -> Array:
+        """Corrected pose (3,) of a pose T (3,) that was estimated relative to keyframe k."""
         return se2.compose(self.after[k], se2.between(self.before[k], T))
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What a step found.
+    """Estimated pose after a scan.
 
-    T_map_base (3,) with covariance (3, 3), T_map_odom (3,), and how it was found.
+    T_map_base (3,) with covariance (3, 3); T_map_odom (3,).
 
-    observed, matched: lines of this scan, and those found among the features (both 0 where the
-    robot stands still and the scan has nothing new to say); n_features, n_local: features in the
-    map, and in the local area; match_quality: share of the scan's points on known ground that fit
-    the map. lost: it could be anywhere, as the covariance says.
-    correction: where a loop was closed in this step, what it did to the keyframes; T_map_base is
-    then the corrected pose.
+    observed_lines, matched_lines: lines of this scan, and how many of them match features (both 0
+    while the robot stands still). n_features, n_local_features: features in the map, and in the
+    local area. inlier_ratio: share of the scan points in known space that fit the map.
+    is_lost: the pose is unknown; the covariance is accordingly large.
+    correction: keyframe poses before and after, if this step closed a loop; T_map_base is then the
+    corrected pose.
     """
 
     T_map_base: Array
     covariance: Array
     T_map_odom: Array
-    observed: int = 0
-    matched: int = 0
+    observed_lines: int = 0
+    matched_lines: int = 0
     n_features: int = 0
     n_local_features: int = 0
     inlier_ratio: float = 0.0
-    lost: bool = False
+    is_lost: bool = False
     correction: Correction | None = None

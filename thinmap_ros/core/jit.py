@@ -1,4 +1,4 @@
-"""The one way in which hot loops are compiled."""
+"""Compilation of hot loops with numba."""
 
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
@@ -8,19 +8,19 @@ import numba
 from thinmap_ros.core import kernel_cache
 
 Function = TypeVar('Function', bound=Callable[..., Any])
-# Those of all modules that were imported.
+# Kernels of all imported modules.
 KERNELS: list[Any] = []
 
 
 def kernel(function: Function) -> Function:
-    """Compile a hot loop with numba: kept on disk, and without holding Python's global lock."""
+    """Compile a hot loop with numba: cached on disk, run without the global interpreter lock."""
     compiled = _compiled(function)
     KERNELS.append(compiled)
     return compiled
 
 
 def inlined(function: Function) -> Function:
-    """Compile a small step that is shared by several kernels and inlined into each of them."""
+    """Compile a small function that is inlined into each kernel that calls it."""
     return _compiled(function, inline='always')
 
 

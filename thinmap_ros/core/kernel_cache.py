@@ -1,10 +1,10 @@
-"""Where compiled kernels are kept, and when they are compiled anew.
+"""Cache of compiled kernels: its folder, and when a kernel is recompiled.
 
-numba keeps a kernel beside its module, or in the home folder, and compiles it anew when that module
-changes. That is not enough here: an install may be read-only and a service have no home, where
-numba refuses to compile at all; and a kernel holds code and constants of the modules that it
-imports. So this package's kernels are kept in one folder (`folder`), each with a fingerprint of its
-module and all modules of this package that it depends on (`fingerprint`).
+numba caches a kernel beside its module, or in the home folder, and recompiles it when that module
+changes. That is not enough here. An install may be read-only and a service may have no home: numba
+then refuses to compile at all. A kernel also contains code and constants of the modules that it
+imports. This package therefore keeps its kernels in one folder (`folder`), each with a fingerprint
+of its module and of all modules of this package that it depends on (`fingerprint`).
 """
 
 import hashlib
@@ -34,11 +34,11 @@ _IMPORT = re.compile(
 
 @cache
 def folder() -> Path | None:
-    """The folder for kernels, or None, with a warning, where there is none to write to.
+    """The cache folder; None, with a warning, if no folder is writable.
 
-    The first that can be written to of: NUMBA_CACHE_DIR, where it is set; beside the package; the
-    user's cache folder; a private one among the temporary files. What an administrator compiled
-    beside a package that this user may not write to is taken over.
+    The first writable one of: NUMBA_CACHE_DIR, if set; beside the package; the user's cache folder;
+    a private folder among the temporary files. Kernels that an administrator compiled beside a
+    read-only package are copied from there.
     """
     refusals = []
     named = [_named] if numba.config.CACHE_DIR else []
@@ -48,8 +48,8 @@ def folder() -> Path | None:
         except (OSError, InputError, RuntimeError) as error:
             refusals.append(one_line_reason(error))
     warnings.warn(
-        'kernels are compiled at each start, as there is nowhere to keep them: set '
-        f'NUMBA_CACHE_DIR to a folder that can be written to ({"; ".join(refusals)})',
+        'kernels are compiled at each start, because no cache folder is writable: set '
+        f'NUMBA_CACHE_DIR to a writable folder ({"; ".join(refusals)})',
         RuntimeWarning,
         stacklevel=2,
     )
@@ -58,7 +58,7 @@ def folder() -> Path | None:
 
 @cache
 def fingerprint(path: Path) -> str:
-    """One word for the contents of a module and of all of this package that it depends on."""
+    """Hash of a module and of all modules of this package that it depends on."""
     known: set[Path] = set()
     waiting = [path]
     while waiting:
@@ -73,7 +73,7 @@ def fingerprint(path: Path) -> str:
 
 
 class KernelLocator:
-    """What numba asks where a function of this package is kept: it takes any class that answers."""
+    """Tells numba where the functions of this package are cached (numba's locator interface)."""
 
     def __init__(self, function: Callable[..., Any], path: Path, cache_folder: Path) -> None:
         self._py_file = str(path)
@@ -82,7 +82,7 @@ class KernelLocator:
 
     @classmethod
     def from_function(cls, function: Callable[..., Any], py_file: str) -> 'KernelLocator | None':
-        """Locator of a function, or None where it is not of this package: others have theirs."""
+        """Locator of a function; None for functions of other packages."""
         path = Path(py_file).resolve()
         cache_folder = folder()
         if PACKAGE not in path.parents or cache_folder is None:
@@ -90,27 +90,27 @@ class KernelLocator:
         return cls(function, path, cache_folder)
 
     def ensure_cache_path(self) -> None:
-        """Make the folder."""
+        """Create the folder."""
         self._folder.mkdir(parents=True, exist_ok=True)
 
     def get_cache_path(self) -> str:
-        """Folder of the module's kernels."""
+        """Folder of the kernels of the module."""
         return str(self._folder)
 
     def get_source_stamp(self) -> str:
-        """What a kernel that was kept has to agree with."""
+        """Fingerprint that a cached kernel must have."""
         return fingerprint(Path(self._py_file))
 
     def get_disambiguator(self) -> str:
-        """Tell functions of one name apart."""
+        """Distinguish functions of the same name."""
         return str(self._line)
 
 
 class _KernelIndex(caching.IndexDataCacheFile):
-    """The kernels of a function by the types of their arguments."""
+    """Index of a function's kernels by the types of their arguments."""
 
     def _load_index(self) -> dict[Any, str]:
-        """Read the index; empty where it names types of modules that have been moved or renamed."""
+        """Read the index; empty if it names types of modules that were moved or renamed."""
         try:
             index: dict[Any, str] = super()._load_index()
         except (ImportError, AttributeError):
@@ -140,7 +140,7 @@ def _temporary() -> Path:
 
 
 def _seeded(base: Path) -> Path:
-    """A folder of its own for each install, which begins with what lies beside the package."""
+    """Cache folder of this install; it starts with a copy of the kernels beside the package."""
     given = BESIDE_PACKAGE.stat().st_mtime_ns if BESIDE_PACKAGE.is_dir() else 0
     word = hashlib.sha256(f'{PACKAGE} {given}'.encode()).hexdigest()[:16]
     chosen = base / 'thinmap' / f'kernels-{word}'
@@ -158,7 +158,7 @@ def _seeded(base: Path) -> Path:
 
 
 def _writable(chosen: Path) -> Path:
-    """Return the folder, made where it is missing; raises OSError where it takes no file."""
+    """Return the folder, created if missing. Raises OSError if no file can be written there."""
     chosen.mkdir(parents=True, exist_ok=True)
     tempfile.TemporaryFile(dir=chosen).close()
     return chosen

@@ -1,4 +1,4 @@
-"""A folder that belongs to this user alone: for what no other user may read, or put there."""
+"""Folders that only this user can read and write."""
 
 import os
 import stat
@@ -12,9 +12,9 @@ _OF_OTHERS = 0o077
 
 
 def private_folder(folder: Path) -> Path:
-    """Return the folder, made where it is missing.
+    """Return the folder, created if missing.
 
-    Raises InputError where it is a link, of another user, or open to others.
+    Raises InputError if it is a link, belongs to another user, or is accessible to others.
     """
     try:
         folder.mkdir(mode=_MODE, parents=True, exist_ok=True)
@@ -24,7 +24,7 @@ def private_folder(folder: Path) -> Path:
     if not stat.S_ISDIR(status.st_mode):
         raise InputError(f'{folder}: expected a folder, not a link or a file')
     if status.st_uid != os.getuid():
-        raise InputError(f'{folder}: of user {status.st_uid}: expected a folder of this user')
+        raise InputError(f'{folder}: owned by user {status.st_uid}: expected a folder of this user')
     if status.st_mode & _OF_OTHERS:
         mode = stat.S_IMODE(status.st_mode)
         raise InputError(f'{folder}: mode {mode:o}: expected {_MODE:o}, closed to other users')
@@ -32,5 +32,5 @@ def private_folder(folder: Path) -> Path:
 
 
 def temporary_folder() -> Path:
-    """Path of thinmap's folder of this user among the temporary files; it may not be there yet."""
+    """Path of this user's folder among the temporary files; it may not exist yet."""
     return Path(tempfile.gettempdir()) / f'thinmap-{os.getuid()}'

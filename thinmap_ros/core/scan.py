@@ -10,22 +10,22 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array
 
-# Of a laser with fewer beams than this that say anything, nobody can tell what is in front of it.
+# With a smaller share of valid beams, the space in front of the laser is unobserved.
 MIN_VALID_BEAM_RATIO = 0.1
-# No laser is mounted farther from the middle of its robot.
+# Maximum distance of a laser from the centre of its robot.
 MAX_MOUNT_OFFSET_M = 100.0
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """Ranges of one scan and where the laser sat on the robot when it was taken.
+    """Ranges of one scan, and the pose of the laser on the robot.
 
     stamp_ns: time of the scan; ranges_m (N,): raw, may hold inf, NaN and nonsense; beam i points to
     angle_min_rad + i * angle_increment_rad in the laser frame (a negative increment is a clockwise
     laser); T_base_laser (3,): the laser's pose on the robot; zero_is_no_return: whether this
-    laser's driver publishes 0 for a beam that met nothing. Make one with `Scan.create`.
+    laser's driver publishes 0 for a beam without return. Use `Scan.create` to make one.
 
-    What a range says: `hit`, `no_return`, `too_near`, or nothing (`valid` is False).
+    Each range is one of `hit`, `no_return`, `below_range_min`, or invalid (`valid` is False).
     Source: REP 117, with range_max as a finite value for "no return", which many drivers publish.
     """
 
@@ -53,9 +53,8 @@ class Scan:
 
         Text log, bag and live agree bit for bit.
 
-        Raises InputError where the geometry is no geometry: NaN angles, beams without an angle
-        between them, an empty or negative range interval, a mount that is not finite or farther
-        than FARTHEST_MOUNT_M.
+        Raises InputError if the geometry is invalid: NaN angles, an increment of 0, an empty or
+        negative range interval, a laser pose that is not finite or beyond MAX_MOUNT_OFFSET_M.
         """
         ranges = np.asarray(ranges_m, dtype=np.float32).astype(np.float64)
         first, step, low, high = (
@@ -95,7 +94,7 @@ class Scan:
 
     @cached_property
     def hit(self) -> NDArray[np.bool_]:
-        """Beams that met something: range_min <= range < range_max, (N,)."""
+        """Beams that hit an obstacle: range_min <= range < range_max, (N,)."""
         return (
             (self.ranges_m >= self.range_min_m)
             & (self.ranges_m < self.range_max_m)
@@ -104,35 +103,35 @@ class Scan:
 
     @cached_property
     def no_return(self) -> NDArray[np.bool_]:
-        """Beams that met nothing within the range: range >= range_max or +inf (REP 117), (N,)."""
+        """Beams without an obstacle in range: range >= range_max or +inf (REP 117), (N,)."""
         return self.ranges_m >= self.range_max_m
 
     @cached_property
     def below_range_min(self) -> NDArray[np.bool_]:
-        """Beams that met something nearer than can be measured: -inf (REP 117), (N,)."""
+        """Beams that hit an obstacle closer than range_min: -inf (REP 117), (N,)."""
         return np.isneginf(self.ranges_m)
 
     @cached_property
     def valid(self) -> NDArray[np.bool_]:
-        """Beams that say something, (N,). The others (NaN, 0, below range_min) may hide anything.
+        """Valid beams, (N,). Obstacles may hide behind the others (NaN, 0, below range_min).
 
         With zero_is_no_return a range of 0 is valid: the laser works, and nothing is near. It is
-        not `no_return` all the same: a dark thing gives 0 as well, so no cell of a map is freed.
+        still not `no_return`: a dark surface gives 0 as well, so the beam clears no cells.
         """
         valid = self.hit | self.no_return | self.below_range_min
         return valid | (self.ranges_m == 0.0) if self.zero_is_no_return else valid
 
     @cached_property
     def is_blind(self) -> bool:
-        """Whether so few beams are valid that the laser may as well be covered or broken."""
+        """Whether so few beams are valid that the laser must be covered or broken."""
         return int(np.count_nonzero(self.valid)) < MIN_VALID_BEAM_RATIO * self.ranges_m.size
 
     def points_laser(self) -> Array:
-        """End points of the beams that met something, laser frame, (M, 2)."""
+        """End points of the hits, laser frame, (M, 2)."""
         ranges = self.ranges_m[self.hit]
         angles = self.angles_rad[self.hit]
         return np.column_stack([ranges * np.cos(angles), ranges * np.sin(angles)])
 
     def points_base(self) -> Array:
-        """End points of the beams that met something, robot frame, (M, 2)."""
+        """End points of the hits, robot frame, (M, 2)."""
         return se2.transform_points(self.T_base_laser, self.points_laser())

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# No robot gets farther from where its map began. Beyond 1e15 m a coordinate cannot even tell cells
-# apart, and what is computed from it lies outside of every array.
+# Larger coordinates are errors. Beyond 1e15 m, float64 cannot even resolve cells, and computed
+# indices lie outside of every array.
 MAX_COORDINATE_M = 1e6
 
 
@@ -21,7 +21,7 @@ def wrap(angle: float) -> float: ...
 @overload
 def wrap(angle: Array) -> Array: ...
 def wrap(angle: float | Array) -> float | Array:
-    """Angle(s) brought into (-pi, pi], rad."""
+    """Angle(s) wrapped to (-pi, pi], rad."""
     if isinstance(angle, np.ndarray):
         return np.pi - np.mod(np.pi - angle, 2.0 * np.pi)
     return math.pi - (math.pi - angle) % (2.0 * math.pi)
@@ -54,8 +54,8 @@ def between(T_a_b: Array, T_a_c: Array) -> Array:
     return compose(invert(T_a_b), T_a_c)
 
 
-def off(T: Array, T_expected: Array) -> Array:
-    """How far a pose is from where it was expected, (3,): x, y and heading, the latter wrapped."""
+def pose_difference(T: Array, T_expected: Array) -> Array:
+    """Difference T - T_expected in x, y and heading (wrapped), (3,)."""
     x, y, theta = (T - T_expected).tolist()
     return np.array([x, y, wrap(theta)])
 
@@ -68,13 +68,13 @@ def transform_points(T_a_b: Array, points_b: Array) -> Array:
 
 
 def interpolate(T_a: Array, T_b: Array, share: float) -> Array:
-    """Pose on the straight way from T_a (share 0) to T_b (share 1), turned the shorter way."""
+    """Pose on the straight line from T_a (share 0) to T_b (share 1); the shorter rotation."""
     x, y = T_a[:2] + share * (T_b[:2] - T_a[:2])
     return pose(x, y, T_a[2] + share * wrap(float(T_b[2] - T_a[2])))
 
 
 def is_bounded_pose(T: Array) -> bool:
-    """Whether a pose (3,) is finite and no farther than FARTHEST_M from the origin of its frame."""
+    """Whether a pose (3,) is finite, with |x| and |y| at most MAX_COORDINATE_M."""
     return is_finite(T) and abs(T[0]) <= MAX_COORDINATE_M and abs(T[1]) <= MAX_COORDINATE_M
 
 

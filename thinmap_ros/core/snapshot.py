@@ -1,7 +1,7 @@
-"""What a saved state has to look like: arrays by name, checked before any of them is used.
+"""Schema and validation of saved states: arrays by name, validated before use.
 
-Each class with a state declares its fields beside it. `check` looks at names, types, shapes and
-ranges; what arrays say about each other is checked by the class, with the helpers here.
+Each class with a state declares its fields. `validate` checks names, types, shapes and ranges. The
+class itself checks relations between arrays, with the helpers below.
 """
 
 import math
@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from thinmap_ros.core.errors import InputError, shown
-from thinmap_ros.core.se2 import MAX_COORDINATE_M
+from thinmap_ros.core import se2
+from thinmap_ros.core.errors import InputError, quoted
 
 State = Mapping[str, NDArray[Any]]
-MAX_COORDINATE_M = MAX_COORDINATE_M
-MAX_CELL_INDEX = 1_000_000_000  # the same in the smallest cells
+MAX_COORDINATE_M = se2.MAX_COORDINATE_M
+MAX_CELL_INDEX = 1_000_000_000  # MAX_COORDINATE_M in the smallest cells
 MAX_ID = 2**31 - 1
 MAX_COUNT = 2**62
 _SIZE = re.compile(r'(\d*)([a-z]+)')
@@ -26,11 +26,12 @@ _SIZE = re.compile(r'(\d*)([a-z]+)')
 
 @dataclass(frozen=True)
 class Field:
-    """What an array of a state has to be.
+    """Declaration of an array of a state.
 
-    dtype: its type, or one that converts to it without loss. shape: a number, or the name of a size
-    that several arrays share ('n'; '2n' is twice as much), for each axis. low, high: inclusive
-    bounds, for all or one for each index of the last axis. nan: whether it may hold NaN.
+    dtype: its type; types that convert to it without loss are accepted. shape: for each axis a
+    number, or the name of a size that several arrays share ('n'; '2n' is twice as much). low, high:
+    inclusive bounds, one for all elements or one for each index of the last axis. nan: whether NaN
+    is allowed.
     """
 
     dtype: DTypeLike
@@ -46,14 +47,14 @@ Fields = Mapping[str, Field]
 STAMPED: Fields = {'latest_ns': Field(np.int64, (), 0, MAX_COUNT)}
 
 
-def check(state: State, fields: Fields, what: str) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a state in their declared types; what: of what it is, for the error.
+def validate(state: State, fields: Fields, what: str) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a state in their declared types; `what` names it in errors.
 
-    Raises InputError where a name is missing or unknown, or an array is not what its field says.
+    Raises InputError if a name is missing or unknown, or an array does not fit its field.
     """
     for name in state:
         if name not in fields:
-            raise InputError(f'saved {what}: {shown(name)}: expected {", ".join(fields)} only')
+            raise InputError(f'saved {what}: {quoted(name)}: expected {", ".join(fields)} only')
     sizes: dict[str, int] = {}
     checked = {}
     for name, field in fields.items():
@@ -64,23 +65,23 @@ def check(state: State, fields: Fields, what: str) -> dict[str, NDArray[Any]]:
 
 
 def split_stamp(state: State) -> tuple[int, dict[str, NDArray[Any]]]:
-    """Return the stamp, ns, of a state that a node kept ('latest_ns'), and the rest of its arrays.
+    """Split the state of a node into its stamp ('latest_ns', ns) and the other arrays.
 
-    Raises InputError where there is no stamp.
+    Raises InputError if there is no stamp.
     """
     own = {name: array for name, array in state.items() if name in STAMPED}
-    stamp_ns = int(check(own, STAMPED, 'state')['latest_ns'])
+    stamp_ns = int(validate(own, STAMPED, 'state')['latest_ns'])
     return stamp_ns, {name: array for name, array in state.items() if name not in STAMPED}
 
 
 def require(is_so: bool, what: str, expected: str) -> None:
-    """Raise InputError, saying what was found and what was expected, unless it is so."""
+    """Raise InputError with what was found and what was expected, unless is_so."""
     if not is_so:
         raise InputError(f'saved {what}: expected {expected}')
 
 
 def require_unique(ids: NDArray[np.int64], what: str) -> None:
-    """Raise InputError where one of the ids (N,) occurs twice."""
+    """Raise InputError if one of the ids (N,) occurs twice."""
     values, counts = np.unique(ids, return_counts=True)
     twice = values[counts > 1]
     if twice.size:
@@ -88,12 +89,10 @@ def require_unique(ids: NDArray[np.int64], what: str) -> None:
 
 
 def require_known(ids: NDArray[np.int64], known: NDArray[np.int64], what: str) -> None:
-    """Raise InputError where one of the ids (N,) is none of those that are known (M,)."""
+    """Raise InputError if one of the ids (N,) is not among the known ones (M,)."""
     unknown = ids[~np.isin(ids, known)]
     if unknown.size:
-        raise InputError(
-            f'saved {what}: {unknown[0]}: expected one of the {len(known)} that are there'
-        )
+        raise InputError(f'saved {what}: {unknown[0]}: expected one of the {len(known)} known ids')
 
 
 def _checked(array: NDArray[Any], field: Field, sizes: dict[str, int], what: str) -> NDArray[Any]:
@@ -101,7 +100,7 @@ def _checked(array: NDArray[Any], field: Field, sizes: dict[str, int], what: str
     shape = ', '.join(str(size) for size in field.shape)
     expected = f'expected {dtype} ({shape})'
     if array.dtype.kind not in 'biuf' or not np.can_cast(array.dtype, dtype, 'safe'):
-        raise InputError(f'{what}: {shown(str(array.dtype))}: {expected}')
+        raise InputError(f'{what}: {quoted(str(array.dtype))}: {expected}')
     if array.ndim != len(field.shape):
         raise InputError(f'{what}: of {array.ndim} dimensions: {expected}')
     for size, declared in zip(array.shape, field.shape, strict=True):
@@ -113,7 +112,7 @@ def _checked(array: NDArray[Any], field: Field, sizes: dict[str, int], what: str
 
 
 def _fits(size: int, declared: int | str, sizes: dict[str, int]) -> bool:
-    """Whether an axis has its declared size; a new name stands for this size from now on."""
+    """Whether an axis has its declared size. A new size name is bound to this size."""
     if isinstance(declared, int):
         return size == declared
     match = _SIZE.fullmatch(declared)
@@ -125,7 +124,7 @@ def _fits(size: int, declared: int | str, sizes: dict[str, int]) -> bool:
 
 
 def _check_range(array: NDArray[Any], field: Field, what: str) -> None:
-    # Written so that NaN, which is in no range, is refused as well.
+    # Written so that NaN, which is in no range, is rejected as well.
     wrong = ~((array >= np.asarray(field.low)) & (array <= np.asarray(field.high)))
     if field.nan:
         wrong &= ~np.isnan(array)

@@ -1,4 +1,4 @@
-"""Two streams that speak of the same scans, brought together by stamp."""
+"""Exact-time synchronizer of two topics."""
 
 from collections import OrderedDict
 from typing import Generic, TypeVar
@@ -8,9 +8,9 @@ Right = TypeVar('Right')
 
 
 class StampMatcher(Generic[Left, Right]):
-    """Pairs the messages of two topics that carry exactly the same stamp, whichever comes first.
+    """Pairs the messages of two topics that carry exactly the same stamp, in any order.
 
-    What finds no partner within `capacity` later messages is dropped, and counted.
+    A message without a partner within `capacity` later messages is dropped and counted.
     """
 
     def __init__(self, capacity: int = 50) -> None:

@@ -1,4 +1,4 @@
-"""What a message may say at most: beyond that it is a mistake, whoever made it."""
+"""Bounds on the contents of messages and files."""
 
 from collections.abc import Iterable, Sequence
 from itertools import accumulate
@@ -16,33 +16,30 @@ MAX_LIST_LENGTH = 200
 
 
 def require_bounded(what: str, values: Iterable[float], limit: float = MAX_COORDINATE_M) -> None:
-    """Raise InputError, naming what, unless all values are finite and at most `limit` in size."""
+    """Raise InputError unless all values are finite and at most `limit` in magnitude."""
     for value in values:
         if not abs(value) <= limit:
             raise InputError(f'{what}: {value}: expected a number from {-limit:g} to {limit:g}')
 
 
-def abbreviated(text: str, longest: int = 80) -> str:
-    """A topic, type or frame of a file as part of a message.
+def quoted_name(text: str, longest: int = 80) -> str:
+    """Shorten a topic, type or frame of a file for an error message.
 
-    One line of printable characters, unquoted, short.
+    One line of printable characters, without quotation marks.
     """
     return repr(text if len(text) <= longest else text[:longest] + '...')[1:-1]
 
 
-def listed(names: Sequence[str]) -> str:
-    """Names of a file as part of a message.
-
-    The first of them, in short, and how many more there are.
-    """
-    told = [abbreviated(name) for name in names]
-    lengths = accumulate(len(name) + 2 for name in told)
+def quoted_names(names: Sequence[str]) -> str:
+    """List names of a file for an error message: the first ones, and the number of the others."""
+    shown = [quoted_name(name) for name in names]
+    lengths = accumulate(len(name) + 2 for name in shown)
     count = max(1, sum(length <= MAX_LIST_LENGTH for length in lengths))
-    more = f' and {len(told) - count} more' if len(told) > count else ''
-    return ', '.join(told[:count]) + more or 'nothing'
+    more = f' and {len(shown) - count} more' if len(shown) > count else ''
+    return ', '.join(shown[:count]) + more or 'nothing'
 
 
-def cells_in_range(cells: NDArray[np.int8]) -> None:
+def require_occupancy(cells: NDArray[np.int8]) -> None:
     """Raise InputError unless all cells are -1 (unknown) or 0 to 100 %."""
     if cells.size and (cells.min() < -1 or cells.max() > 100):
         raise InputError(
@@ -50,8 +47,8 @@ def cells_in_range(cells: NDArray[np.int8]) -> None:
         )
 
 
-def unique(what: str, ids: list[int]) -> None:
-    """Raise InputError where a number is given twice."""
+def require_unique(what: str, ids: list[int]) -> None:
+    """Raise InputError if an id occurs twice."""
     if len(set(ids)) < len(ids):
         raise InputError(
             f'{what}: {len(ids)} of them with {len(set(ids))} ids: expected an id for each'

@@ -1,1 +1,1 @@
-"""What judges a run: errors, metrics, reports, and runs side by side."""
+"""Evaluation of runs: errors, metrics, reports and comparisons."""

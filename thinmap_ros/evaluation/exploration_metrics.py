@@ -1,7 +1,4 @@
-"""The numbers that sum up an exploration, from plain arrays.
-
-The same for the simulator and for the live graph.
-"""
+"""Metrics of an exploration, from plain arrays, for the simulator and for the live graph."""
 
 import math
 from collections.abc import Iterable
@@ -22,25 +19,21 @@ MIN_OBSERVATIONS = 5
 
 @dataclass(eq=False)
 class _Place:
-    """A place where an end node was.
-
-    Where it is or was last (m), under which id, how often seen, whether come near.
-    """
+    """Place of an end node: latest id and position (m), number of observations, and visits."""
 
     node_id: int
     x: float
     y: float
-    sightings: int = 0
+    observations: int = 0
     visited: bool = False
 
 
 class EndNodeCensus:
-    """At how many places there were end nodes, and to how many of them the robot came near.
+    """Counts the places of end nodes, and those that the robot visited.
 
-    An end node wanders as the map grows, and may come and go under new ids: one that appears within
-    SAME_PLACE_M of where another one was last, and is no more, continues that one. One that did not
-    last for FEWEST_SIGHTINGS decisions is not counted, and neither are what stands in for borders
-    that no end node sees.
+    End nodes move as the map grows, and may reappear with new ids: a new one within SAME_PLACE_M of
+    the last position of a vanished one continues it. End nodes that existed for fewer than
+    MIN_OBSERVATIONS decisions are not counted, and neither are frontier candidates.
     """
 
     def __init__(self) -> None:
@@ -48,31 +41,33 @@ class EndNodeCensus:
 
     @property
     def seen(self) -> int:
-        """Places where an end node lasted."""
-        return sum(place.sightings >= MIN_OBSERVATIONS for place in self._places)
+        """Number of places with a persistent end node."""
+        return sum(place.observations >= MIN_OBSERVATIONS for place in self._places)
 
     @property
     def visited(self) -> int:
-        """Those of them to which the robot came near."""
-        return sum(place.visited and place.sightings >= MIN_OBSERVATIONS for place in self._places)
+        """Number of these places that were visited."""
+        return sum(
+            place.visited and place.observations >= MIN_OBSERVATIONS for place in self._places
+        )
 
-    def take(self, end_nodes: Iterable[tuple[int, float, float]], T_map_base: Array) -> None:
-        """Count the end nodes (id, x, y in m) known at a pose (3,).
+    def add(self, end_nodes: Iterable[tuple[int, float, float]], T_map_base: Array) -> None:
+        """Add the end nodes (id, x, y in m) of a decision at a pose (3,).
 
-        Nearer than 0.5 m is a visit (equation (2)).
+        A visit is a distance below 0.5 m (equation (2)).
         """
         nodes = {node_id: (x, y) for node_id, x, y in end_nodes if node_id < FIRST_FRONTIER_ID}
         alive = {place.node_id: place for place in self._places if place.node_id in nodes}
         idle = [place for place in self._places if place.node_id not in nodes]
         for node_id, (x, y) in nodes.items():
-            place = alive.get(node_id) or self._continued(idle, x, y)
+            place = alive.get(node_id) or self._matching_place(idle, x, y)
             place.node_id = node_id
             place.x = x
             place.y = y
-            place.sightings += 1
+            place.observations += 1
             place.visited |= math.dist((x, y), T_map_base[:2]) < NEAR_M
 
-    def _continued(self, idle: list[_Place], x: float, y: float) -> _Place:
+    def _matching_place(self, idle: list[_Place], x: float, y: float) -> _Place:
         near = min(idle, key=lambda place: math.dist((x, y), (place.x, place.y)), default=None)
         if near is not None and math.dist((x, y), (near.x, near.y)) <= SAME_PLACE_M:
             idle.remove(near)
@@ -82,16 +77,16 @@ class EndNodeCensus:
 
 
 class TargetLog:
-    """How often the target changed, and how often it went back to the one before: oscillation."""
+    """Counts target changes, and returns to the target before the last (oscillation)."""
 
     def __init__(self) -> None:
         self.changes = self.reversals = 0
         self._last: list[tuple[float, float]] = []
 
-    def take(self, goal: Array | None) -> None:
-        """Take the goal (x, y, ...), m, of a decision.
+    def add(self, goal: Array | None) -> None:
+        """Add the goal (x, y, ...), m, of a decision.
 
-        One less than SAME_PLACE_M from the last is the same.
+        A goal within SAME_PLACE_M of the last one is the same.
         """
         if goal is None:
             return
@@ -113,10 +108,10 @@ def exploration_report(
 ) -> dict[str, Any]:
     """Report of an exploration, ready for JSON.
 
-    times_s (N,): from the start on; true_poses, estimated_poses (N, 3): at these times, in the same
-    frame; coverage (M, 2): time in s and coverage, 0 to 1, whenever it was measured. distance and
-    the times and distances at which a coverage was first measured are of the true path, in m and s;
-    None where it was not reached. curve: time, distance and coverage whenever it was measured.
+    times_s (N,): since the start; true_poses, estimated_poses (N, 3): at these times, in the same
+    frame; coverage (M, 2): time in s and coverage, 0 to 1, of each measurement. `distance`, and the
+    times and distances of the first measurement of a coverage, refer to the true path, in m and s;
+    None if it was not reached. `curve`: time, distance and coverage of each measurement.
     """
     steps = np.hypot(*np.diff(true_poses[:, :2], axis=0).T)
     along = np.concatenate([[0.0], np.cumsum(steps)])

@@ -1,4 +1,4 @@
-"""One exploration of a simulated world, and the report on it."""
+"""Exploration of a simulated world, with a report."""
 
 import time
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from thinmap_ros.core.exploration.strategy import Decision
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.exploration_metrics import EndNodeCensus, TargetLog, exploration_report
 from thinmap_ros.evaluation.kidnapping import Kidnapping
-from thinmap_ros.sim.coverage import coverable
+from thinmap_ros.sim.coverage import observable_cells
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
 
@@ -28,14 +28,16 @@ def explore(
     targets = TargetLog()
 
     def watch(decision: Decision, T_map_base: Array) -> None:
-        census.take([(n.node_id, n.x, n.y) for n in decision.end_nodes], T_map_base)
-        targets.take(None if decision.target is None else decision.target.goal)
+        census.add([(n.node_id, n.x, n.y) for n in decision.end_nodes], T_map_base)
+        targets.add(None if decision.target is None else decision.target.goal)
 
     kidnapping = (
         None if options.kidnap_at_s is None else Kidnapping(options.kidnap_at_s, options.seed)
     )
     loop = make_loop(world, start, options, kidnapping, watch)
-    goal = coverable(world, start, PRESETS[options.robot].radius_m, options.laser.range_max_m)
+    goal = observable_cells(
+        world, start, PRESETS[options.robot].radius_m, options.laser.range_max_m
+    )
     began = time.perf_counter()
     cpu_began = time.process_time()
     ending = loop.run(goal, options.time_limit_s, show)

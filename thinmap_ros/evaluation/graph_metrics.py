@@ -1,4 +1,4 @@
-"""How good a topological map is: drivable, complete, like another one, with ids that stay."""
+"""Metrics of topological maps: drivable edges, completeness, agreement."""
 
 import math
 from typing import Any
@@ -14,23 +14,23 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
 
 Mask = NDArray[np.bool_]
-_SAMPLE_CELLS = 0.1  # how finely straight lines are looked at
-_ATTACH = 8  # nodes that a place off the graph may go to first
+_SAMPLE_CELLS = 0.1  # sampling step of straight lines
+_ATTACH = 8  # nearest nodes to which a cell is connected
 
 
 def loop_count(graph: TopologicalMap) -> int:
-    """Independent rings in a graph."""
+    """Number of independent cycles of a graph."""
     return len(graph.edges) - len(graph.nodes) + len(graph.components())
 
 
 def clearance_m(patch: GridPatch) -> Array:
-    """Distance (H, W) of cells to the nearest occupied one, by centres, m; outside is occupied."""
+    """Distance (H, W) from the nearest occupied cell, centres, m; cells outside are occupied."""
     distance = ndimage.distance_transform_edt(np.pad(~patch.occupied, 1))[1:-1, 1:-1]
     return np.asarray(distance * patch.frame.resolution)
 
 
 def drivable_share(patch: GridPatch, graph: TopologicalMap, radius_m: float) -> float:
-    """Share of edges whose straight line, every tenth of a cell, keeps a radius from obstacles."""
+    """Share of edges with a straight line at least a radius from obstacles (0.1 cell steps)."""
     clearance = clearance_m(patch)
     good = 0
     for edge in graph.edges.values():
@@ -45,7 +45,7 @@ def drivable_share(patch: GridPatch, graph: TopologicalMap, radius_m: float) -> 
 
 
 def agreement(one: TopologicalMap, other: TopologicalMap, reach_m: float) -> tuple[float, float]:
-    """Share of the nodes of each map that have a node of the other within reach."""
+    """Share of the nodes of each map with a node of the other map within reach."""
     if not one.nodes or not other.nodes:
         return (float(not other.nodes), float(not one.nodes))
     first, second = (
@@ -57,7 +57,7 @@ def agreement(one: TopologicalMap, other: TopologicalMap, reach_m: float) -> tup
 
 
 class GridPaths:
-    """Shortest ways over the cells on which a robot can stand, eight neighbours to a cell."""
+    """Shortest paths over traversable cells, with 8-connectivity."""
 
     def __init__(self, standing: Mask) -> None:
         self.numbers = np.full(standing.shape, -1)
@@ -67,7 +67,7 @@ class GridPaths:
         self.parts = ndimage.label(standing, np.ones((3, 3)))[0][standing]
 
     def lengths_from(self, number: int) -> Array:
-        """Shortest way, in cells, from one cell to every other, inf where there is none."""
+        """Shortest path length, in cells, from one cell to every other; inf if there is none."""
         lengths: Array = csgraph.dijkstra(self._links, directed=False, indices=[number])[0]
         return lengths
 
@@ -93,11 +93,11 @@ class GridPaths:
 def completeness(
     patch: GridPatch, graph: TopologicalMap, radius_m: float, pairs: int, seed: int
 ) -> tuple[float, float]:
-    """Share of reachable random pairs of cells joined by a graph, mean length against the best.
+    """Share of reachable random pairs of cells that a graph connects, and relative path length.
 
-    From a cell the robot goes over the grid to one of the nearest nodes (the way counts), then
-    along straight lines between nodes. The best way is the shortest one over cells with the same
-    clearance. Means are over all pairs that are joined.
+    A path leads from a cell over the grid to one of the nearest nodes, then along straight lines
+    between nodes. Its length is relative to the shortest path over cells with the same clearance.
+    The mean is over all connected pairs.
     """
     paths = GridPaths(clearance_m(patch) >= radius_m - 1e-9)
     rng = np.random.default_rng(seed)
@@ -115,12 +115,12 @@ def completeness(
         from_source = paths.lengths_from(source)
         from_target = paths.lengths_from(target)
         first, last = (_nearest(lengths, at_nodes) for lengths in (from_source, from_target))
-        ways = (
+        lengths = (
             from_source[at_nodes[first], None]
             + between[np.ix_(first, last)]
             + from_target[at_nodes[last]]
         )
-        length = float(ways.min(initial=np.inf))
+        length = float(lengths.min(initial=np.inf))
         if math.isfinite(length):
             found.append(length)
             best.append(float(from_source[target]))
@@ -128,7 +128,7 @@ def completeness(
 
 
 def _nearest(lengths: Array, at_nodes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Indices of the nodes that are nearest over the grid."""
+    """Indices of the nearest nodes, by path length on the grid."""
     distance = np.where(at_nodes >= 0, lengths[at_nodes], np.inf)
     nearest = np.argsort(distance, kind='stable')[:_ATTACH]
     return nearest[np.isfinite(distance[nearest])]
@@ -137,7 +137,7 @@ def _nearest(lengths: Array, at_nodes: NDArray[np.int64]) -> NDArray[np.int64]:
 def _straight_lines(
     graph: TopologicalMap, order: list[int], resolution: float
 ) -> sparse.csr_matrix:
-    """Lengths, in cells, of straight lines between joined nodes; the shorter of parallel edges."""
+    """Lengths, in cells, of straight lines between connected nodes."""
     index = {node: k for k, node in enumerate(order)}
     lines: dict[tuple[int, int], float] = {}
     for edge in graph.edges.values():

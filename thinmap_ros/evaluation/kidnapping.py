@@ -1,4 +1,4 @@
-"""A robot carried off while it explores: if it notices, and how soon it knows where it is again."""
+"""Kidnaps the robot during exploration, and measures detection and recovery."""
 
 import math
 from typing import Any
@@ -24,11 +24,10 @@ _RIGHT_RAD = math.radians(10.0)
 
 
 class Kidnapping:
-    """What befalls a closed loop whose robot is carried, once, to a random place of its map.
+    """Teleports the robot of a closed loop once to a random place of its map.
 
-    When its localizer is lost, samples all over the map find it again. Until then it explores what
-    is around it, as a robot that has just been switched on, for itself: nothing of that gets into
-    the map.
+    When its localizer is lost, global localization starts. Meanwhile the robot explores its
+    surroundings with a separate pipeline and map.
     """
 
     def __init__(self, at_s: float, seed: int) -> None:
@@ -38,12 +37,12 @@ class Kidnapping:
         self._detected_s: float | None = None
         self._found_s: float | None = None
         self._off: Array | None = None
-        self._way_m = 0.0
+        self._travelled_m = 0.0
         self._own: tuple[Pipeline, Strategy, Navigator] | None = None
         self._finder: GlobalLocalization | None = None
 
     def report(self) -> dict[str, Any]:
-        """What became of it, for the report: times in s, None for what has not happened."""
+        """Results for the report: times in s, None for events that did not happen."""
 
         def after(since: float | None, until: float | None) -> float | None:
             return None if since is None or until is None else round(until - since, 3)
@@ -56,20 +55,20 @@ class Kidnapping:
             'kidnapped_at_s': self._carried_s,
             'detected_after_s': after(self._carried_s, self._detected_s),
             'found_after_s': after(self._detected_s, self._found_s),
-            'found_after_m': None if self._found_s is None else round(self._way_m, 3),
+            'found_after_m': None if self._found_s is None else round(self._travelled_m, 3),
             'found_error_m': None if off is None else round(math.hypot(off[0], off[1]), 3),
             'found_right': right,
         }
 
     @property
     def is_lost(self) -> bool:
-        """Whether the robot looks for where it is."""
+        """Whether global localization is running."""
         return self._finder is not None
 
     def intercepts(self, loop: ClosedLoop, scan: Scan, T_odom_base: Array) -> bool:
         """Whether a scan, of before the robot was carried or of a lost one, is not for the loop."""
         if self._carried_s is None and scan.stamp_ns >= 1e9 * self._at_s:
-            self._carry(loop, scan.stamp_ns / 1e9)
+            self._kidnap(loop, scan.stamp_ns / 1e9)
             return True
         if self._finder is None:
             return False
@@ -79,50 +78,52 @@ class Kidnapping:
     def add_estimate(self, loop: ClosedLoop, scan: Scan, estimate: Estimate) -> None:
         """Begin to search once the robot is lost."""
         if (
-            estimate.lost
+            estimate.is_lost
             and self._finder is None
             and self._carried_s is not None
             and self._found_s is None
         ):
             self._detected_s = scan.stamp_ns / 1e9
             self._finder = GlobalLocalization(
-                loop.pipeline.grid.patch(), loop.pipeline.topology.map, seed=self._seed
+                loop.pipeline.grid.known_area(), loop.pipeline.topology.map, seed=self._seed
             )
             self._own = loop.pipeline, loop.strategy, loop.navigator
             loop.replace_strategy(Pipeline(), NearestFrontier(), Navigator(loop.navigator.config))
 
-    def _carry(self, loop: ClosedLoop, seconds: float) -> None:
-        """Put the robot on some place that it has mapped, far from where it is."""
+    def _kidnap(self, loop: ClosedLoop, seconds: float) -> None:
+        """Teleport the robot to a random mapped place far from its position."""
         world = loop.simulation.world
         robot = loop.simulation.robot
-        patch = loop.pipeline.grid.patch()
+        patch = loop.pipeline.grid.known_area()
         at = patch.frame.centres_of(np.argwhere(patch.free))
         at = at[np.hypot(*(at - robot.T_world_base[:2]).T) >= _FAR_M]
         fits = [world.is_clear(x, y, robot.config.radius_m + _MARGIN_M) for x, y in at.tolist()]
         if not any(fits):
             raise InputError(
-                f'--kidnap-at={self._at_s:g}: nothing {_FAR_M:g} m off is known: '
+                f'--kidnap-at={self._at_s:g}: no mapped place is {_FAR_M:g} m away: '
                 'expected a later time'
             )
         rng = np.random.default_rng(self._seed)
         x, y = rng.choice(at[fits])
-        loop.simulation.carry(se2.pose(float(x), float(y), float(rng.uniform(-math.pi, math.pi))))
+        loop.simulation.teleport(
+            se2.pose(float(x), float(y), float(rng.uniform(-math.pi, math.pi)))
+        )
         self._carried_s = seconds
 
     def _search(
         self, loop: ClosedLoop, finder: GlobalLocalization, scan: Scan, T_odom_base: Array
     ) -> None:
-        """One scan of a lost robot, for all of its localizers."""
+        """Process a scan of a lost robot, with all of its localizers."""
         assert self._own is not None
         localizer = self._own[0].localizer
         T_world_base = loop.simulation.robot.T_world_base
         estimate = self._own[0].step(scan, T_odom_base).estimate
-        self._way_m += float(np.hypot(*(T_world_base - loop.log.true_poses[-1])[:2]))
+        self._travelled_m += float(np.hypot(*(T_world_base - loop.log.true_poses[-1])[:2]))
         loop.log_poses(scan, estimate)
         found = finder.step(scan, T_odom_base).pose
         if found is not None:
             localizer.set_pose(found.T_map_base, found.covariance)
-        if found is not None or not estimate.lost:
+        if found is not None or not estimate.is_lost:
             self._found_s = scan.stamp_ns / 1e9
             self._off = se2.between(T_world_base, localizer.pose)
             self._finder = None

@@ -1,6 +1,6 @@
-"""What the benchmarks ran on, and what they took of it: time and memory.
+"""Machine of the benchmarks, and their time and memory.
 
-Times can be compared: the best of several alternating runs, or the processor time of one run.
+Times are comparable: the best of several alternating runs, or the CPU time of one run.
 """
 
 import os
@@ -30,7 +30,7 @@ def machine() -> Iterator[Row]:
 
 
 class CpuTimedPipeline(Pipeline):
-    """A pipeline whose stages are timed in processor time: a busy machine changes it little."""
+    """A pipeline that measures its stages in CPU time, which depends little on other load."""
 
     @contextmanager
     def _timed(self, stage: str) -> Iterator[None]:
@@ -40,9 +40,9 @@ class CpuTimedPipeline(Pipeline):
 
 
 def best_seconds(works: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
-    """Shortest time of each work over some rounds.
+    """Shortest time of each function over some rounds.
 
-    All take turns, so that a busy machine is busy for all.
+    All functions alternate, so that other load affects all of them.
     """
     for work in works.values():
         work()  # compile, fill caches
@@ -56,10 +56,7 @@ def best_seconds(works: dict[str, Callable[[], object]], rounds: int) -> dict[st
 
 
 def median_seconds(work: Callable[[], object], rounds: int) -> float:
-    """Median processor time of a function over some rounds.
-
-    A busy machine changes it little.
-    """
+    """Median CPU time of a function over some rounds, which depends little on other load."""
     work()  # compile, fill caches
     taken = []
     for _ in range(rounds):
@@ -76,12 +73,12 @@ def resident_mb() -> float:
 
 
 def peak_mb() -> float:
-    """Highest resident memory since the process began or `forget_peak`, MB."""
-    # Not ru_maxrss: after a fork that is at least what the parent had.
+    """Highest resident memory since the start of the process or `forget_peak`, MB."""
+    # Not ru_maxrss: after a fork it includes the memory of the parent.
     status = Path('/proc/self/status').read_text()
     return int(status.split('VmHWM:')[1].split()[0]) * 1024 / 1e6
 
 
 def forget_peak() -> None:
-    """From now on the peak is that of what follows."""
+    """Reset the peak of resident memory."""
     Path('/proc/self/clear_refs').write_text('5')

@@ -1,4 +1,4 @@
-"""How far a map is off what it shows."""
+"""Errors of a map against its world."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from thinmap_ros.sim.surfaces import surfaces
 from thinmap_ros.sim.world import World
 from thinmap_ros.view.plots import MapLayer, Panel, Raster, Segments
 
-_SHORTEST_M = 0.2
+_MIN_LENGTH_M = 0.2
 _SPACING_M = 0.05
 _FOUND_M = 0.2
 _SHOWN_M = 0.3
@@ -19,9 +19,9 @@ _SHOWN_M = 0.3
 
 @dataclass(frozen=True, eq=False)
 class MapError:
-    """Distance of each occupied cell's centre to what is solid, m, (H, W), NaN elsewhere.
+    """Distance of each occupied cell centre from the nearest obstacle, m, (H, W), NaN elsewhere.
 
-    Share of surfaces found.
+    found: share of surfaces found.
     """
 
     off_m: Array
@@ -37,7 +37,7 @@ class MapError:
 def map_error(patch: GridPatch, world: World) -> MapError:
     """Compare a map with its world, in the same frame.
 
-    A surface is found where a cell within 0.2 m is occupied.
+    A surface point is found if a cell within 0.2 m is occupied.
     """
     off_m = np.full(patch.shape, np.nan)
     cells = np.argwhere(patch.occupied)
@@ -45,7 +45,7 @@ def map_error(patch: GridPatch, world: World) -> MapError:
     at = world.frame.cells_of(patch.frame.centres_of(cells))
     at = np.clip(at, 0, np.array(world.occupied.shape) - 1)
     off_m[cells[:, 0], cells[:, 1]] = to_solid_m[at[:, 0], at[:, 1]]
-    points = _points_on(surfaces(world, _SHORTEST_M))
+    points = _points_on(surfaces(world, _MIN_LENGTH_M))
     to_cell_m = ndimage.distance_transform_edt(np.pad(~patch.occupied, 1, constant_values=True))[
         1:-1, 1:-1
     ]
@@ -56,7 +56,7 @@ def map_error(patch: GridPatch, world: World) -> MapError:
 
 
 def panels(error: MapError, world: World) -> list[Panel]:
-    """The world as it is, the map, and how far the map is off."""
+    """Panels of the world, the map and the error of the map."""
     lines = surfaces(world, 0.1)
     corners = lines.reshape(-1, 2)
     (left, bottom) = corners.min(axis=0) - 0.5
@@ -66,14 +66,14 @@ def panels(error: MapError, world: World) -> list[Panel]:
     return [
         Panel([Segments(lines)], '(a) the world (CAD data)', limits=limits),
         Panel([MapLayer(error.patch)], '(b) grid map', limits=limits),
-        Panel([raster], '(c) distance of occupied cells to what is solid', limits=limits),
+        Panel([raster], '(c) distance of occupied cells from obstacles', limits=limits),
     ]
 
 
 def row(name: str, error: MapError) -> list[object]:
-    """Name, occupied cells, and how far they are off: mean, 95 of 100, share within a cell.
+    """Name, occupied cells, mean error, 95th percentile, share within a cell.
 
-    Share of surfaces found.
+    Also the share of surfaces found.
     """
     off = error.cells_off_m
     within = float((off <= error.patch.frame.resolution).mean())

@@ -1,4 +1,4 @@
-"""What came out: of an experiment its tables and figures, of a benchmark its rows and targets."""
+"""Results: tables and figures of an experiment, rows and targets of a benchmark."""
 
 import csv
 import io
@@ -17,7 +17,7 @@ Rows = list[list[Any]]
 class Table:
     """Rows under columns (with units in their names).
 
-    timed: holds times, so it is not the same from run to run.
+    timed: contains times, which differ from run to run.
     """
 
     name: str
@@ -36,9 +36,9 @@ class Table:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What the paper reports beside what came out here.
+    """A result of a paper and ours.
 
-    Met: whether that is as good, None: there is no number.
+    met: whether ours is as good; None: there is no number.
     """
 
     what: str
@@ -51,7 +51,7 @@ class Comparison:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """All that came of one experiment. source: paper and figures; how: what was done."""
+    """Results of one experiment. source: paper and figures; how: procedure."""
 
     title: str
     source: str
@@ -63,7 +63,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Row:
-    """One measurement; good: whether the value is as it should be, None without a target."""
+    """One measurement; good: whether the target is met, None without a target."""
 
     what: str
     value: str
@@ -72,14 +72,14 @@ class Row:
 
 
 def at_most(what: str, value: float, limit: float, unit: str = '') -> Row:
-    """Row of a value that should not be above a limit."""
+    """Row of a value with an upper limit."""
     return Row(
         what, f'{value:.3g} {unit}'.strip(), f'at most {limit:g} {unit}'.strip(), value <= limit
     )
 
 
 def at_least(what: str, value: float, limit: float, unit: str = '') -> Row:
-    """Row of a value that should not be below a limit."""
+    """Row of a value with a lower limit."""
     return Row(
         what, f'{value:.4g} {unit}'.strip(), f'at least {limit:g} {unit}'.strip(), value >= limit
     )
@@ -90,7 +90,7 @@ VERDICTS = {True: 'ok', False: 'MISSED', None: ''}
 
 
 def show(rows: Iterable[Row], path: Path | None = None) -> None:
-    """Print rows, each as soon as it is there, and write them to a CSV file where one is wished."""
+    """Print each row as soon as it is available, and optionally write them to a CSV file."""
     with ExitStack() as stack:
         writer = None
         if path is not None:

@@ -1,4 +1,4 @@
-"""Pages of experiments' results, in HTML and Markdown, made of the files in their folders alone."""
+"""Pages of experiment results in HTML and Markdown, from the files in their folders."""
 
 import json
 from html import escape
@@ -20,7 +20,7 @@ _VERDICTS = {True: 'yes', False: 'no', None: ''}
 
 
 def read_about(out: Path, name: str) -> About:
-    """What the folder of an experiment tells of it."""
+    """Description of an experiment, from its folder."""
     about: About = json.loads(read_text(out / name / 'about.json'))
     return about
 

@@ -1,4 +1,4 @@
-"""Many jobs, a process each, on the cores of this machine or on a Dask cluster; resumable."""
+"""Runs jobs in separate processes, on local cores or a Dask cluster; resumable."""
 
 import argparse
 import json
@@ -25,11 +25,11 @@ Report = dict[str, Any]
 
 
 class Job(Protocol):
-    """What a report is made of; it goes to another process as a pickle."""
+    """Input of a run; pickled for another process."""
 
     @property
     def name(self) -> str:
-        """What messages call it."""
+        """Name in messages."""
 
 
 AnyJob = TypeVar('AnyJob', bound=Job)
@@ -37,7 +37,7 @@ AnyJob = TypeVar('AnyJob', bound=Job)
 
 @dataclass(frozen=True)
 class Failure:
-    """A job without a report: why, in one line, and the traceback where the program is to blame."""
+    """A failed job: reason in one line, and the traceback of program errors."""
 
     reason: str
     trace: str = ''
@@ -60,10 +60,10 @@ def run_pending(
     arguments: argparse.Namespace,
     quiet: bool = False,
 ) -> dict[str, Failure]:
-    """Run each job whose file is not there yet; its report is written as soon as it is there.
+    """Run each job without a report file, and write its report when it is finished.
 
-    work: a function of a module, since other processes import it. arguments: those of
-    `add_run_options`. Returns the jobs that failed, by name; the others run all the same.
+    work: a function of a module, because other processes import it. arguments: those of
+    `add_run_options`. Returns the failed jobs, by name; the others run nevertheless.
     """
     missing = [job for job in jobs if not file_of(job).exists()]
     done = len(jobs) - len(missing)
@@ -80,18 +80,15 @@ def run_pending(
 
 
 def read_report(path: Path, options: Any) -> Report:
-    """Report of a finished job; its entry `options` has to be these.
-
-    Raises InputError where it is not.
-    """
+    """Report of a finished job. Raises InputError if its entry `options` differs from options."""
     report: Report = json.loads(read_text(path))
     if report.get('options') != options:
         raise InputError(f'{path}: of a run with other options: expected another folder for these')
     return report
 
 
-def complaint(failures: dict[str, Failure]) -> InputError:
-    """One error for all jobs that failed, each with its name and reason."""
+def failure_summary(failures: dict[str, Failure]) -> InputError:
+    """One error for all failed jobs, each with its name and reason."""
     reasons = [f'{name}: {failure.reason}' for name, failure in sorted(failures.items())]
     return InputError(f'{len(failures)} failed: {"; ".join(reasons)}')
 
@@ -107,7 +104,7 @@ def _outcomes(
 def _on_cores(
     work: Callable[[AnyJob], Report], jobs: Sequence[AnyJob], processes: int
 ) -> Iterator[tuple[AnyJob, Report | Failure]]:
-    # No pool: one process that the system kills would end all of a pool's jobs. And the peak memory
+    # No pool: one process that the system kills would end all jobs of a pool. Also, the peak memory
     # of a process is that of its job.
     waiting = list(reversed(jobs))
     running: dict[Connection, tuple[AnyJob, SpawnProcess]] = {}

@@ -1,4 +1,4 @@
-"""Processes that end with the one that started them."""
+"""Child processes that end with their parent."""
 
 import ctypes
 import signal
@@ -7,5 +7,5 @@ _DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG
 
 
 def end_with_parent() -> None:
-    """Have this process get SIGTERM when its parent ends, however that ends (Linux)."""
+    """Send SIGTERM to this process when its parent ends (Linux)."""
     ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGTERM)

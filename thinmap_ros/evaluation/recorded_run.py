@@ -1,4 +1,4 @@
-"""What a run of the live graph leaves behind, read back from its bag."""
+"""Results of a run of the live graph, from its bag."""
 
 import json
 import sys
@@ -20,7 +20,7 @@ from thinmap_ros.files.atomic import write_text
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag import Bag
-from thinmap_ros.sim.coverage import ObservableCells, coverable
+from thinmap_ros.sim.coverage import ObservableCells, observable_cells
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
 from thinmap_ros.view import figures, rerun_sinks
@@ -52,7 +52,7 @@ class Recording:
 
 
 def read(path: Path) -> Recording:
-    """Read what counts from a bag of a run. Raises InputError where a topic is missing."""
+    """Read the outputs from the bag of a run. Raises InputError if a topic is missing."""
     bag = Bag(path)
     recording = Recording()
     for raw in bag.messages(_TOPICS):
@@ -90,7 +90,7 @@ def write(out: Path, world_file: Path, robot: str, result: dict[str, Any]) -> di
     recording = read(out / 'bag')
     world = World.from_patch(*read_world(world_file))
     start = next(iter(recording.true.values()))
-    seen = coverable(world, start, PRESETS[robot].radius_m, recording.range_max_m)
+    seen = observable_cells(world, start, PRESETS[robot].radius_m, recording.range_max_m)
     report = _report(recording, seen, result)
     patch = recording.maps[-1][1]
     occupancy_maps.write_map(out / 'map', patch)
@@ -128,7 +128,7 @@ def _report(recording: Recording, seen: ObservableCells, result: dict[str, Any])
         bool(result['finished']), str(result['reason']), recording.collisions
     )
     report = exploration_report(ending, times, true, estimated, coverage, _census(recording))
-    # Heading as well: a live run is judged by its poses, not by places alone.
+    # Also the heading: a live run is evaluated by its poses.
     turned = se2.wrap(np.asarray(estimated[:, 2] - true[:, 2]))
     report['heading_rmse_deg'] = round(float(np.degrees(np.sqrt(np.mean(turned**2)))), 4)
     return report
@@ -138,5 +138,5 @@ def _census(recording: Recording) -> EndNodeCensus:
     census = EndNodeCensus()
     for ns, nodes in recording.end_nodes:
         if ns in recording.estimated:
-            census.take(nodes, recording.estimated[ns])
+            census.add(nodes, recording.estimated[ns])
     return census

@@ -13,7 +13,7 @@ _NORMAL_95 = 1.96
 
 
 def markdown(reports: list[Report]) -> str:
-    """Tables of means (and spread over runs) by strategy, and of what ours saves, run by run."""
+    """Tables of means (and spread over runs) by strategy, and of paired relative savings."""
     by_strategy: dict[str, dict[tuple[str, int], Report]] = defaultdict(dict)
     for report in reports:
         by_strategy[report['strategy']][report['world'], report['start_number']] = report
@@ -38,10 +38,10 @@ def markdown(reports: list[Report]) -> str:
     return '\n'.join(lines) + '\n'
 
 
-def saved(
+def relative_saving(
     ours: dict[tuple[str, int], Report], others: dict[tuple[str, int], Report], key: str
 ) -> Array:
-    """Ours / other - 1 of a quantity for each world and start that both have, (N,)."""
+    """Ours / other - 1 of a quantity, for each world and start of both, (N,)."""
     common = sorted(ours.keys() & others.keys())
     return np.array([ours[pair][key] / others[pair][key] - 1.0 for pair in common])
 
@@ -74,7 +74,7 @@ def _spread(runs: list[Report], key: str) -> str:
 def _paired(
     name: str, ours: dict[tuple[str, int], Report], others: dict[tuple[str, int], Report]
 ) -> str:
-    shares = {key: saved(ours, others, key) for key in ('distance', 'time', 'turned_rad')}
+    shares = {key: relative_saving(ours, others, key) for key in ('distance', 'time', 'turned_rad')}
     cells = []
     for values in shares.values():
         half = (

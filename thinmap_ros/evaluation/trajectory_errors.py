@@ -1,4 +1,4 @@
-"""The error of a trajectory: by known relations between its poses, or laid onto the true one."""
+"""Trajectory errors: by known relations between poses, or after alignment with the truth."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,12 +10,12 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array, wrap
 from thinmap_ros.files.atomic import read_text
 
-# A pose this near to a stamp is the one of that stamp; else it is moved along the odometry.
+# A pose this close to a stamp is used as it is; others are extrapolated by odometry.
 _NEAR_S = 0.1
 
 
 def between_paths(path: Array, onto: Array) -> Array:
-    """Rigid motion (3,) that lays a path (N, 3) onto another: least squares of the positions."""
+    """Rigid motion (3,) that aligns a path (N, 3) with another, by least squares of positions."""
     middle = path[:, :2].mean(axis=0)
     onto_middle = onto[:, :2].mean(axis=0)
     a = path[:, :2] - middle
@@ -27,9 +27,8 @@ def between_paths(path: Array, onto: Array) -> Array:
 
 
 def aligned_rms(path: Array, truth: Array) -> float:
-    """Rms error of the positions of a path (N, 3), m, after the rigid motion that suits it best.
+    """Absolute trajectory error: rms error of positions (N, 3), m, after rigid alignment.
 
-    The absolute trajectory error, after the whole map was rotated and shifted.
     Source: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", 2012.
     """
     aligned = se2.transform_points(between_paths(path, truth), path[:, :2])
@@ -38,7 +37,7 @@ def aligned_rms(path: Array, truth: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class RelationErrors:
-    """Errors of the relations that could be judged: m and degrees, (N,) each."""
+    """Errors of the evaluated relations: m and degrees, (N,) each."""
 
     metres: Array
     degrees: Array
@@ -47,7 +46,7 @@ class RelationErrors:
 def read_columns(path: Path, columns: list[int]) -> Array:
     """Some columns (N, len(columns)) of a text of numbers.
 
-    Raises InputError where a line has no such numbers.
+    Raises InputError if a line lacks these numbers.
     """
     rows = []
     for number, line in enumerate(read_text(path).splitlines(), 1):
@@ -68,8 +67,8 @@ def relation_errors(
     """Errors of poses (N, 3) at times (N,), s, by a file of relations `t1 t2 x y z roll pitch yaw`.
 
     For each relation, the difference of the true motion between two stamps and the estimated one.
-    odometry: a file of `t x y theta`, along which a pose is moved to a stamp from which it is
-    farther than near_s.
+    odometry: a file of `t x y theta`; it extrapolates poses that are farther than near_s from a
+    stamp.
     Source: Kuemmerle et al., "On measuring the accuracy of SLAM algorithms", 2009.
     """
     known = read_columns(relations, [0, 1, 2, 3, 7])

@@ -19,7 +19,7 @@ from thinmap_ros.files.worlds import read_tour, read_world
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag import Bag, BagLog
 from thinmap_ros.logs.log import OdometryEvent
-from thinmap_ros.sim.coverage import coverable
+from thinmap_ros.sim.coverage import observable_cells
 from thinmap_ros.sim.drives import DriveSample, drive, random_drive, tour_paths
 from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
@@ -31,7 +31,7 @@ SPEED_M_S = 0.2  # of all three papers
 LOST_STEPS = 15
 LOST_STEP_SCANS = 3
 TRUTH_TOPIC = '/ground_truth'
-_LOOKS_AT_A_STOP = 4
+_SCANS_PER_STOP = 4
 _EXPLORE_LIMIT_S = 1000.0
 
 
@@ -55,7 +55,7 @@ class Recipe:
     world: str
     robot: str
     how: str
-    looks: Callable[['Recipe', int], Iterator[DriveSample]]
+    samples: Callable[['Recipe', int], Iterator[DriveSample]]
     localized: bool = False
 
 
@@ -73,7 +73,7 @@ def _stops(recipe: Recipe, seed: int) -> Iterator[DriveSample]:
     stamp_ns = 0
     for x, y in tour_of(recipe.world):
         for heading in (0.0, np.pi):
-            for _ in range(_LOOKS_AT_A_STOP):
+            for _ in range(_SCANS_PER_STOP):
                 T = se2.pose(float(x), float(y), heading)
                 yield DriveSample(laser.scan(world, T, stamp_ns), T, T)
                 stamp_ns += 200_000_000
@@ -82,8 +82,8 @@ def _stops(recipe: Recipe, seed: int) -> Iterator[DriveSample]:
 def _lost(recipe: Recipe, seed: int) -> Iterator[DriveSample]:
     """From the paper's place to random ones, for as long as the localization lasts."""
     world = world_of(recipe.world)
-    looks = random_drive(world, world.start, seed)
-    return (next(looks) for _ in range(1 + LOST_STEPS * LOST_STEP_SCANS))
+    samples = random_drive(world, world.start, seed)
+    return (next(samples) for _ in range(1 + LOST_STEPS * LOST_STEP_SCANS))
 
 
 class _Watched:
@@ -92,12 +92,12 @@ class _Watched:
     def __init__(self, strategy: Strategy, simulation: Simulation) -> None:
         self._strategy = strategy
         self._simulation = simulation
-        self.looks: list[DriveSample] = []
+        self.samples: list[DriveSample] = []
 
     def step(
         self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
     ) -> Decision:
-        self.looks.append(
+        self.samples.append(
             DriveSample(
                 scan, self._simulation.robot.T_odom_base, self._simulation.robot.T_world_base
             )
@@ -115,11 +115,11 @@ def _exploration(recipe: Recipe, seed: int) -> Iterator[DriveSample]:
     )
     watched = _Watched(loop.strategy, loop.simulation)
     loop.strategy = watched
-    goal = coverable(
+    goal = observable_cells(
         world, world.start, PRESETS[recipe.robot].radius_m, LaserScannerConfig().range_max_m
     )
     loop.run(goal, _EXPLORE_LIMIT_S, no_progress)
-    return iter(watched.looks)
+    return iter(watched.samples)
 
 
 RECIPES = {
@@ -157,11 +157,11 @@ class Source:
     bags: Path | None = None
     quick: bool = False
 
-    def looks(self, name: str) -> Iterator[DriveSample]:
+    def samples(self, name: str) -> Iterator[DriveSample]:
         """A drive by its name in RECIPES."""
         if self.bags is None:
             recipe = RECIPES[name]
-            return recipe.looks(recipe, self.seed)
+            return recipe.samples(recipe, self.seed)
         return samples_of_bag(self.bags / f'{name}.mcap')
 
 

@@ -15,11 +15,11 @@ from thinmap_ros.sim.world import World
 CELL_M = 0.1
 
 
-def grid_of(looks: Iterable[DriveSample]) -> OccupancyGrid:
+def grid_of(samples: Iterable[DriveSample]) -> OccupancyGrid:
     """Grid of scans at their true poses."""
     grid = OccupancyGrid()
-    for look in looks:
-        grid.update(look.scan, look.T_world_base)
+    for sample in samples:
+        grid.add_scan(sample.scan, sample.T_world_base)
     return grid
 
 

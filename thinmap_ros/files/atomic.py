@@ -1,4 +1,4 @@
-"""Files that are whole or not there (written aside, then renamed), and texts read up to a limit."""
+"""Atomic writing of files (temporary file, then rename), and reading of texts up to a limit."""
 
 import os
 import secrets
@@ -9,18 +9,16 @@ from pathlib import Path
 
 from thinmap_ros.core.errors import InputError, one_line_reason
 
-_MOST_TEXT_BYTES = 1 << 30
+_MAX_TEXT_BYTES = 1 << 30
 _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """Give a path to write to.
+    """Yield a temporary path to write to; it replaces `path` when the block succeeds.
 
-    It takes the place of `path` when the block ends well and vanishes when not.
-
-    Its name cannot be guessed and the file is new: nobody can have put a link there beforehand.
-    Raises OSError, with the name of the file, where the disk does not take it.
+    If the block fails, the temporary file is deleted. Its name cannot be guessed and the file is
+    new: no link can be planted there. Raises OSError with the name of `path` on write errors.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     aside = path.with_name(f'.{path.name}.{secrets.token_hex(8)}.part')
@@ -42,20 +40,20 @@ def partial_files(path: Path) -> list[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file, whole or not at all."""
+    """Write a text file atomically."""
     with atomic_write(path) as aside:
         aside.write_text(text, encoding='utf-8')
 
 
-def read_text(path: Path, most_bytes: int = _MOST_TEXT_BYTES) -> str:
-    """Read a text file. Raises InputError where it is missing, no text, or above most_bytes."""
+def read_text(path: Path, max_bytes: int = _MAX_TEXT_BYTES) -> str:
+    """Read a text file. Raises InputError if it is missing, not text, or above max_bytes."""
     try:
         with path.open('rb') as stream:
-            content = stream.read(most_bytes + 1)
+            content = stream.read(max_bytes + 1)
     except (OSError, ValueError) as error:  # ValueError: a name with a zero byte
         raise InputError(f'{path}: {getattr(error, "strerror", None) or error}') from error
-    if len(content) > most_bytes:
-        raise InputError(f'{path}: expected at most {most_bytes} bytes')
+    if len(content) > max_bytes:
+        raise InputError(f'{path}: expected at most {max_bytes} bytes')
     try:
         return content.decode('utf-8').replace('\r\n', '\n')
     except UnicodeDecodeError as error:

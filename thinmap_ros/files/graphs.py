@@ -1,11 +1,9 @@
-"""Topological maps as route graphs.
+"""Topological maps as files: GeoJSON for Nav2's route server, GraphML, tmap2.
 
-GeoJSON for Nav2's route server, GraphML, tmap2 for topological_navigation.
-
-GeoJSON: nodes are points, edges are lines along the cells that they were found in (the route server
-itself drives straight from node to node). Edges are directed there, so each of ours is written in
-both directions; ids are unsigned and unique over nodes and edges; metadata are flat and without
-nulls, on which its reader would throw. Lengths and clearances are in m everywhere.
+GeoJSON: nodes are points, edges are lines along their cells (the route server itself drives
+straight from node to node). Its edges are directed, so each edge is written in both directions. Ids
+are unsigned and unique over nodes and edges. Metadata are flat and without nulls, because the
+reader throws on them. Lengths and clearances are in m everywhere.
 """
 
 import json
@@ -21,32 +19,32 @@ import numpy as np
 import yaml
 
 from thinmap_ros.core import validation
-from thinmap_ros.core.errors import InputError, one_line_reason, shown
+from thinmap_ros.core.errors import InputError, one_line_reason, quoted
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.files.atomic import read_text, write_text
 
-_LARGEST_ID = 2**32 - 1
-_MOST_BYTES = 256 << 20
-_MOST_DIGITS = 100
+_MAX_ID = 2**32 - 1
+_MAX_BYTES = 256 << 20
+_MAX_DIGITS = 100
 _BAD_FEATURE = (KeyError, TypeError, ValueError, InputError)
 _ARRIVED_M = 0.3  # distance at which topological_navigation counts a node as reached
 _UPRIGHT = {'w': 1.0, 'x': 0.0, 'y': 0.0, 'z': 0.0}
-_SIDES = 8  # of the polygon round a node, within which the robot counts as being there
+_SIDES = 8  # of the polygon around a node in which the robot counts as arrived
 
 
 def write_graph(path: Path, topology: TopologicalMap) -> None:
-    """Write a topological map in the format that the file's name asks for, whole or not at all.
+    """Write a topological map atomically, in the format given by the file name extension.
 
-    Raises InputError where the name has no such ending, or the format cannot hold the map.
+    Raises InputError if the extension is unknown, or the format cannot hold the map.
     """
     writer_of(path)(path, topology)
 
 
 def writer_of(path: Path) -> Callable[[Path, TopologicalMap], None]:
-    """What writes the format that a file's name asks for.
+    """Writer of the format given by a file name extension.
 
-    Raises InputError where the name has no known ending.
+    Raises InputError if the extension is unknown.
     """
     for ending, writer in _WRITERS.items():
         if path.name.endswith(ending) and path.name != ending:
@@ -55,15 +53,15 @@ def writer_of(path: Path) -> Callable[[Path, TopologicalMap], None]:
 
 
 def write_geojson(path: Path, topology: TopologicalMap, frame_id: str = 'map') -> None:
-    """Write a topological map, whole or not at all.
+    """Write a topological map atomically.
 
-    The way back along an edge has an id above all others.
+    The reverse direction of an edge gets an id above all others.
 
-    Raises InputError where an id is too large for an unsigned int.
+    Raises InputError if an id is too large for an unsigned int.
     """
     highest = max([0, *topology.nodes, *topology.edges])
-    if highest + max([0, *topology.edges]) > _LARGEST_ID:
-        raise InputError(f'{path}: id {highest}: expected ids whose sum stays below {_LARGEST_ID}')
+    if highest + max([0, *topology.edges]) > _MAX_ID:
+        raise InputError(f'{path}: id {highest}: expected ids whose sum stays below {_MAX_ID}')
     features = [_node_feature(node, frame_id) for node in topology.nodes.values()]
     for edge in topology.edges.values():
         features.append(_edge_feature(edge, edge.id, edge.a))
@@ -73,11 +71,10 @@ def write_geojson(path: Path, topology: TopologicalMap, frame_id: str = 'map') -
 
 
 def write_graphml(path: Path, topology: TopologicalMap) -> None:
-    """Write an undirected GraphML graph: x, y, kind and clearance of nodes.
+    """Write an undirected GraphML graph.
 
-    Length, clearance and path of edges.
-
-    A path is a list of points in one string: "x y x y ...".
+    Nodes have x, y, kind and clearance; edges have length, clearance and path. A path is a list of
+    points in one string: "x y x y ...".
     """
     root = ElementTree.Element('graphml', xmlns='http://graphml.graphdrawing.org/xmlns')
     keys = {'node': ('x', 'y', 'kind', 'clearance'), 'edge': ('length', 'clearance', 'path')}
@@ -108,11 +105,11 @@ def write_graphml(path: Path, topology: TopologicalMap) -> None:
     for edge in topology.edges.values():
         ends = {'id': str(edge.id), 'source': str(edge.a), 'target': str(edge.b)}
         at = ElementTree.SubElement(graph, 'edge', ends)
-        way = ' '.join(f'{x} {y}' for x, y in _rounded(edge.path))
+        path_text = ' '.join(f'{x} {y}' for x, y in _rounded(edge.path))
         values = {
             'length': round(edge.length_m, 3),
             'clearance': round(edge.clearance_m, 3),
-            'path': way,
+            'path': path_text,
         }
         _put_data(at, 'edge', values)
     ElementTree.indent(root)
@@ -127,9 +124,8 @@ def _put_data(element: ElementTree.Element, owner: str, values: dict[str, Any]) 
 def write_tmap2(path: Path, topology: TopologicalMap, frame_id: str = 'map') -> None:
     """Write a map for topological_navigation (LCAS).
 
-    Waypoints named NODE<id>, edges both ways to be driven by Nav2.
-
-    A robot counts as being at a node within its clearance.
+    Waypoints are named NODE<id>; edges lead in both directions, with Nav2 as action. A robot is at
+    a node within the clearance of the node.
     """
     name = path.name.split('.')[0]
     edges: dict[int, list[dict[str, Any]]] = {node: [] for node in topology.nodes}
@@ -158,7 +154,7 @@ def write_tmap2(path: Path, topology: TopologicalMap, frame_id: str = 'map') -> 
 
 
 class _WithoutAliases(yaml.SafeDumper):
-    """Writes what occurs twice twice, as people expect of a map file."""
+    """Writes repeated objects in full, without YAML aliases."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
@@ -216,13 +212,13 @@ def read_geojson(path: Path) -> TopologicalMap:
     Raises InputError naming the file and the feature.
     """
     expected = 'expected a GeoJSON collection of features'
-    text = read_text(path, _MOST_BYTES)
+    text = read_text(path, _MAX_BYTES)
     try:
-        features = json.loads(text, parse_int=_whole)['features']
+        features = json.loads(text, parse_int=_integer)['features']
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f'{path}: {one_line_reason(error)}: {expected}') from error
     if not isinstance(features, list):
-        raise InputError(f'{path}: features: {shown(features)}: {expected}')
+        raise InputError(f'{path}: features: {quoted(features)}: {expected}')
     topology = TopologicalMap()
     lines: list[tuple[int, dict[str, Any]]] = []
     for i, feature in enumerate(features):
@@ -246,10 +242,10 @@ def read_geojson(path: Path) -> TopologicalMap:
     return topology
 
 
-def _whole(digits: str) -> int:
-    """A whole number of a JSON text; no id and no coordinate has hundreds of digits."""
-    if len(digits) > _MOST_DIGITS:
-        raise ValueError(f'a number of {len(digits)} digits: expected at most {_MOST_DIGITS}')
+def _integer(digits: str) -> int:
+    """Parse an integer of a JSON text; no valid number has hundreds of digits."""
+    if len(digits) > _MAX_DIGITS:
+        raise ValueError(f'a number of {len(digits)} digits: expected at most {_MAX_DIGITS}')
     return int(digits)
 
 
@@ -268,7 +264,7 @@ def _edge_feature(edge: Edge, feature_id: int, start: int) -> dict[str, Any]:
         'length': round(float(edge.length_m), 3),
         'clearance': round(float(edge.clearance_m), 3),
     }
-    # A loop begins and ends at one node: its way back is told by its id.
+    # A loop starts and ends at one node: only the id distinguishes its directions.
     path = edge.path if feature_id == edge.id else edge.path[::-1]
     return {
         'type': 'Feature',
@@ -283,20 +279,20 @@ def _edge_feature(edge: Edge, feature_id: int, start: int) -> dict[str, Any]:
 
 
 def _rounded(points: Array) -> list[list[float]]:
-    """Points (N, 2) to a tenth of a millimetre."""
+    """Points (N, 2), rounded to a tenth of a millimetre."""
     return [[round(float(x), 4), round(float(y), 4)] for x, y in points]
 
 
 def _number(value: Any) -> float:
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if not is_number or not abs(value) <= validation.MAX_COORDINATE_M:
-        raise ValueError(f'{shown(value)} is no finite number of m')
+        raise ValueError(f'{quoted(value)} is no finite number of m')
     return float(value)
 
 
 def _id(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 < value <= _LARGEST_ID:
-        raise ValueError(f'id {shown(value)} is no whole number from 1 to {_LARGEST_ID}')
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 < value <= _MAX_ID:
+        raise ValueError(f'id {quoted(value)} is no integer from 1 to {_MAX_ID}')
     return value
 
 

@@ -1,8 +1,8 @@
-"""NumPy archives (.npz) from outside: no array is read before it is known how large it will be.
+"""Reads NumPy archives (.npz) of any origin: the size of each array is checked before it is read.
 
-An archive's members are compressed a thousandfold at best, and the header of an array may say any
-size. So sizes are added up first, and what a header says is compared with what its member holds.
-The limits are above the largest map that thinmap builds: 512 MiB in all, 64 arrays.
+Members may be compressed a thousandfold, and the header of an array may declare any size. Sizes are
+therefore summed first, and each declared size is compared with that of its member. The limits are
+above the largest map of thinmap: 512 MiB in total, 64 arrays.
 """
 
 import math
@@ -17,10 +17,10 @@ from typing import IO, Any
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from thinmap_ros.core.errors import InputError, ThinmapError, one_line_reason, shown
+from thinmap_ros.core.errors import InputError, ThinmapError, one_line_reason, quoted
 
 MAX_BYTES = 512 << 20
-_MOST_ARRAYS = 64
+_MAX_ARRAYS = 64
 _ENDING = '.npy'
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _READERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
@@ -31,7 +31,7 @@ _READ_ONLY = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK
 def open_regular_file(path: Path, flags: int = 0) -> Iterator[IO[bytes]]:
     """Open a regular file to be read; flags: more of them for os.open, such as O_NOFOLLOW.
 
-    Raises InputError where it is another kind of file (a pipe would block), OSError as open.
+    Raises InputError if it is no regular file (a pipe would block), OSError as open.
     """
     number = os.open(path, _READ_ONLY | flags)
     with os.fdopen(number, 'rb') as stream:
@@ -43,7 +43,7 @@ def open_regular_file(path: Path, flags: int = 0) -> Iterator[IO[bytes]]:
 def read_arrays(stream: IO[bytes]) -> dict[str, NDArray[Any]]:
     """Read all arrays of an archive, by name.
 
-    Raises InputError where it is no archive of plain arrays (no pickled objects), or beyond the
+    Raises InputError if it is no archive of plain arrays (no pickled objects), or exceeds the
     limits; OSError as the stream.
     """
     try:
@@ -53,23 +53,21 @@ def read_arrays(stream: IO[bytes]) -> dict[str, NDArray[Any]]:
             return {_name_of(member): _read(archive, member) for member in members}
     except (OSError, ThinmapError):
         raise
-    except (
-        Exception
-    ) as error:  # zlib and NumPy raise whatever a broken file makes them stumble over
+    except Exception as error:  # zlib and NumPy raise many types for corrupt files
         raise InputError(one_line_reason(error)) from error
 
 
 def _check_sizes(members: list[zipfile.ZipInfo]) -> None:
     names = {member.filename for member in members}
-    if len(members) > _MOST_ARRAYS or len(names) < len(members):
-        expected = f'expected at most {_MOST_ARRAYS}, each once'
+    if len(members) > _MAX_ARRAYS or len(names) < len(members):
+        expected = f'expected at most {_MAX_ARRAYS}, each once'
         raise InputError(f'{len(members)} arrays of {len(names)} names: {expected}')
     size = sum(member.file_size for member in members)
     if size > MAX_BYTES:
-        raise InputError(f'{size} bytes unpacked: expected at most {MAX_BYTES}')
+        raise InputError(f'{size} bytes decompressed: expected at most {MAX_BYTES}')
     for member in members:
         if not member.filename.endswith(_ENDING) or member.compress_type not in _METHODS:
-            raise InputError(f'{shown(member.filename)}: expected an array, stored or deflated')
+            raise InputError(f'{quoted(member.filename)}: expected an array, stored or deflated')
 
 
 def _name_of(member: zipfile.ZipInfo) -> str:
@@ -85,13 +83,13 @@ def _read(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
 
 
 def _check_header(stream: IO[bytes], member: zipfile.ZipInfo) -> None:
-    """Raise InputError unless a member is as large as its header says."""
+    """Raise InputError unless the size of a member is that of its header."""
     version = npy.read_magic(stream)
     if version not in _READERS:
-        raise InputError(f'{shown(member.filename)}: version {version}: expected 1.0 or 2.0')
+        raise InputError(f'{quoted(member.filename)}: version {version}: expected 1.0 or 2.0')
     shape, _, dtype = _READERS[version](stream)
     declared = math.prod(shape) * dtype.itemsize
-    there = member.file_size - stream.tell()
-    if min(shape, default=0) < 0 or dtype.itemsize == 0 or declared != there:
-        found = f'{shown(shape)} of {shown(str(dtype))}'
-        raise InputError(f'{shown(member.filename)}: {found}: expected an array of {there} bytes')
+    actual = member.file_size - stream.tell()
+    if min(shape, default=0) < 0 or dtype.itemsize == 0 or declared != actual:
+        found = f'{quoted(shape)} of {quoted(str(dtype))}'
+        raise InputError(f'{quoted(member.filename)}: {found}: expected an array of {actual} bytes')

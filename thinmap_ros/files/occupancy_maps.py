@@ -1,7 +1,7 @@
-"""map_server maps: an image and a YAML file <-> a patch of cells.
+"""Reads and writes map_server maps: an image and a YAML file.
 
 Images are PGM (or another netpbm format), PNG, BMP or JPEG, of at most 8192 x 8192 pixels: a square
-of 400 m at 0.05 m a cell. The size in an image's header is checked before any pixel is decoded.
+of 400 m at 0.05 m a cell. The size in the image header is checked before pixels are decoded.
 """
 
 import warnings
@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from thinmap_ros.core.errors import InputError, one_line_reason, shown
+from thinmap_ros.core.errors import InputError, one_line_reason, quoted
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, UNKNOWN, GridPatch
 from thinmap_ros.core.se2 import MAX_COORDINATE_M
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 _GREY_FREE = 254
 _GREY_UNKNOWN = 205
 _GREY_OCCUPIED = 0
-_MOST_PIXELS = 8192 * 8192
-_LONGEST_NAME = 200
-# Only these: the readers of others run programs, or decode before they know the size.
+_MAX_PIXELS = 8192 * 8192
+_MAX_NAME_LENGTH = 200
+# Readers of other formats run programs, or decode before they check the size.
 _FORMATS = ('PPM', 'PNG', 'BMP', 'JPEG')
 _GREYS_8 = 1 << 8
 _GREYS_16 = 1 << 16
@@ -37,7 +37,7 @@ _GREYS_16 = 1 << 16
 
 def write_map(stem: Path, patch: GridPatch) -> Path:
     """Write STEM.pgm and STEM.yaml (trinary mode); returns the path of the YAML file."""
-    from PIL import Image  # here: most nodes that could write or read a map never do
+    from PIL import Image  # imported here: most processes never write or read a map
 
     grey = np.full(patch.shape, _GREY_UNKNOWN, dtype=np.uint8)
     grey[patch.free] = _GREY_FREE
@@ -46,8 +46,7 @@ def write_map(stem: Path, patch: GridPatch) -> Path:
     description = stem.with_name(stem.name + '.yaml')
     with atomic_write(image) as aside:
         Image.fromarray(grey[::-1]).save(aside, format='PPM')
-        # The image takes its name last: where there is no room for both, the old map stays as it
-        # was.
+        # The image is renamed last: if the disk is full, the old map remains unchanged.
         write_text(description, yaml.safe_dump(_description(image.name, patch), sort_keys=False))
     return description
 
@@ -61,8 +60,7 @@ def _description(image: str, patch: GridPatch) -> dict[str, Any]:
         'origin': [round(frame.origin_x, 6), round(frame.origin_y, 6), 0.0],
         'negate': 0,
         'occupied_thresh': OCCUPIED_AT_LEAST / 100,
-        # Below the darkness of the grey for unknown (50/255): with 0.25, readers would take it for
-        # free.
+        # Below the darkness of unknown cells (50/255): with 0.25, readers would read them as free.
         'free_thresh': 0.196,
     }
 
@@ -70,8 +68,8 @@ def _description(image: str, patch: GridPatch) -> dict[str, Any]:
 def read_map(path: Path, folder: Path | None = None) -> GridPatch:
     """Read a map from its YAML file; trinary and scale modes.
 
-    folder: where given, the image has to lie below it. Raises InputError naming the file, the key,
-    its value and what was expected.
+    folder: if given, the image must be inside of it. Raises InputError with file, key, value and
+    expectation.
     """
     content = read_mapping(path, 'a map_server YAML file')
     image = _image_of(path, content, folder)
@@ -84,11 +82,11 @@ def read_map(path: Path, folder: Path | None = None) -> GridPatch:
 
 def _image_of(path: Path, content: dict[str, Any], folder: Path | None) -> Path:
     name = content.get('image')
-    if not isinstance(name, str) or not name.isprintable() or len(name) > _LONGEST_NAME:
-        raise InputError(f'{path}: image: {shown(name)}: expected the name of an image')
+    if not isinstance(name, str) or not name.isprintable() or len(name) > _MAX_NAME_LENGTH:
+        raise InputError(f'{path}: image: {quoted(name)}: expected the name of an image')
     image = path.parent / name
     if folder is not None and not image.resolve().is_relative_to(folder):
-        raise InputError(f'{path}: image: {shown(name)}: expected a file below {folder}')
+        raise InputError(f'{path}: image: {quoted(name)}: expected a file below {folder}')
     return image
 
 
@@ -102,14 +100,14 @@ def _number(
 ) -> float:
     value = content.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-        raise InputError(f'{path}: {key}: {shown(value)}: expected a number from {low} to {high}')
+        raise InputError(f'{path}: {key}: {quoted(value)}: expected a number from {low} to {high}')
     return float(value)
 
 
 def _is_negated(path: Path, content: dict[str, Any]) -> bool:
     value = content.get('negate', 0)
     if value not in (0, 1):  # false and true count as such
-        raise InputError(f'{path}: negate: {shown(value)}: expected 0 or 1')
+        raise InputError(f'{path}: negate: {quoted(value)}: expected 0 or 1')
     return bool(value)
 
 
@@ -118,7 +116,7 @@ def _origin(path: Path, content: dict[str, Any]) -> list[float]:
     numbers = value if isinstance(value, list) else []
     fit = all(isinstance(v, int | float) and abs(v) <= MAX_COORDINATE_M for v in numbers)
     if len(numbers) != 3 or not fit:
-        raise InputError(f'{path}: origin: {shown(value)}: expected [x, y, yaw] in m, m, rad')
+        raise InputError(f'{path}: origin: {quoted(value)}: expected [x, y, yaw] in m, m, rad')
     if numbers[2] != 0:
         raise InputError(f'{path}: origin: yaw {numbers[2]}: expected 0; turned maps are not read')
     return [float(v) for v in numbers]
@@ -126,7 +124,7 @@ def _origin(path: Path, content: dict[str, Any]) -> list[float]:
 
 @dataclass(frozen=True)
 class _Shades:
-    """Which shade stands for which cell."""
+    """Thresholds for the conversion of grey values to cells."""
 
     occupied: float
     free: float
@@ -139,14 +137,14 @@ class _Shades:
         free = _number(path, content, 'free_thresh', 0.0, 1.0, default=0.25)
         mode = content.get('mode', 'trinary')
         if mode not in ('trinary', 'scale'):
-            raise InputError(f'{path}: mode: {shown(mode)}: expected trinary or scale')
+            raise InputError(f'{path}: mode: {quoted(mode)}: expected trinary or scale')
         if not free < occupied:
             expected = f'expected less than occupied_thresh ({occupied})'
             raise InputError(f'{path}: free_thresh: {free}: {expected}')
         return _Shades(occupied, free, mode == 'scale', _is_negated(path, content))
 
     def table(self, greys: int) -> NDArray[np.int8]:
-        """The cell for each grey from 0 to greys - 1."""
+        """Cell value of each grey value from 0 to greys - 1."""
         shade = np.arange(greys) / (greys - 1)
         darkness = shade if self.negate else 1.0 - shade
         cells = np.full(greys, UNKNOWN, dtype=np.int8)
@@ -159,22 +157,20 @@ class _Shades:
 
 
 def _cells(path: Path, image: Path, shades: _Shades) -> NDArray[np.int8]:
-    """Cells (H, W) of an image, first row on top; unknown where it is transparent."""
+    """Cells (H, W) of an image, top row first; transparent pixels are unknown."""
     from PIL import Image
 
     try:
-        # Above its own, larger limit Pillow warns on stderr; here, that is an error like others.
+        # Above its own, larger limit Pillow only warns: here this is an error.
         with warnings.catch_warnings():
             warnings.simplefilter('error', Image.DecompressionBombWarning)
             with Image.open(image, formats=_FORMATS) as opened:
                 width, height = opened.size
-                if width * height > _MOST_PIXELS:
-                    raise ValueError(f'{width} x {height} pixels: expected at most {_MOST_PIXELS}')
+                if width * height > _MAX_PIXELS:
+                    raise ValueError(f'{width} x {height} pixels: expected at most {_MAX_PIXELS}')
                 opened.load()
                 return _cells_of(opened, shades)
-    except (
-        Exception
-    ) as error:  # Pillow's readers raise whatever a broken image makes them stumble over
+    except Exception as error:  # Pillow raises many types for corrupt images
         reason = one_line_reason(error)
         raise InputError(f'{image}: {reason}: expected an image that {path} names') from error
 

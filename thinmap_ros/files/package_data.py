@@ -8,15 +8,15 @@ from collections.abc import Iterator
 from importlib import resources, util
 from pathlib import Path
 
-from thinmap_ros.core.errors import InputError, shown
+from thinmap_ros.core.errors import InputError, quoted
 
 _PACKAGE = 'thinmap_ros'
 
 
 def world_path(name: str) -> Path:
-    """A world's file: a path as it is, or the name of one of the package's worlds.
+    """Path of a world: an existing file, or the name of an installed world.
 
-    Raises InputError where there is neither, naming the worlds that there are.
+    Raises InputError, with the names of the installed worlds, if there is neither.
     """
     path = Path(name)
     if path.is_file():
@@ -25,13 +25,13 @@ def world_path(name: str) -> Path:
     if name in worlds:
         return worlds[name]
     installed = ', '.join(sorted(worlds)) or 'none installed'
-    raise InputError(f'world {shown(name)}: expected a file, or one of {installed}')
+    raise InputError(f'world {quoted(name)}: expected a file, or one of {installed}')
 
 
 def message_definitions(package: str) -> dict[str, str]:
     """Texts of a package's message definitions by full name, for bags.
 
-    Empty where the package is not there.
+    Empty if the package is not available.
     """
     for folder in _folders(package, 'msg'):
         files = sorted(folder.glob('*.msg'))

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
-from thinmap_ros.core.errors import InputError, one_line_reason, shown
+from thinmap_ros.core.errors import InputError, one_line_reason, quoted
 from thinmap_ros.core.exploration.explorer import Explorer
 from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.slam.localizer import LocalizerConfig
@@ -126,7 +126,7 @@ def stem_of(path: str) -> Path:
         path = path.removesuffix(ending)
     if not Path(path).name or '\0' in path:
         expected = 'expected the path of a session, without the endings of its files'
-        raise InputError(f'{shown(path)}: {expected}')
+        raise InputError(f'{quoted(path)}: {expected}')
     return Path(path).absolute()
 
 
@@ -136,7 +136,7 @@ def save_grid(path: str, grid: OccupancyGrid) -> str:
     # No file takes its name before all are written: a full disk leaves the old session unchanged.
     with atomic_write(GRID.file(path)) as aside:
         GRID.write(aside, grid)
-        write_map(stem, grid.patch())
+        write_map(stem, grid.known_area())
     return f'{stem}.pgm, {_MAP_ENDING} and {GRID.ending}'
 
 

@@ -9,7 +9,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.errors import InputError, shown
+from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.snapshot import State
 from thinmap_ros.files.npz import read_arrays
 
@@ -36,7 +36,7 @@ def read_snapshot(stream: IO[bytes], kind: str) -> dict[str, NDArray[Any]]:
         raise InputError(f'{error}: {expected}') from error
     label = arrays.pop(_LABEL, np.empty(0))
     if label.shape or label.dtype.kind != 'U' or str(label) != _label(kind):
-        raise InputError(f'holds {shown(str(label))}: {expected} ({_label(kind)})')
+        raise InputError(f'holds {quoted(str(label))}: {expected} ({_label(kind)})')
     return arrays
 
 

@@ -1,4 +1,4 @@
-"""Trajectories as TUM text: `t x y z qx qy qz qw`, seconds and metres."""
+"""Trajectories in TUM format: `t x y z qx qy qz qw`, seconds and metres."""
 
 import math
 from collections.abc import Sequence
@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.errors import InputError, shown
+from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.files.atomic import read_text, write_text
 
 
 def write_tum(path: Path, stamps_ns: Sequence[int], poses: Sequence[Array]) -> None:
-    """Write one line a pose (3,); stamps are exact to the nanosecond."""
+    """Write one line per pose (3,); stamps are exact to the nanosecond."""
     lines = []
     for ns, (x, y, theta) in zip(stamps_ns, poses, strict=True):
         half = theta / 2.0
@@ -37,10 +37,10 @@ def read_tum(path: Path) -> tuple[list[int], Array]:
             stamp_ns = int(seconds) * 1_000_000_000 + int(f'{nano:0<9.9}')
             x, y, _, _, _, qz, qw = (float(v) for v in fields[1:])
         except ValueError as error:
-            quoted = shown(line[:60])
-            raise InputError(f'{path}:{number}: {quoted}: expected t x y z qx qy qz qw') from error
+            text = quoted(line[:60])
+            raise InputError(f'{path}:{number}: {text}: expected t x y z qx qy qz qw') from error
         if not all(map(math.isfinite, (x, y, qz, qw))):
-            raise InputError(f'{path}:{number}: {shown(line[:60])}: expected finite numbers')
+            raise InputError(f'{path}:{number}: {quoted(line[:60])}: expected finite numbers')
         stamps.append(stamp_ns)
         poses.append(se2.pose(x, y, 2.0 * math.atan2(qz, qw)))
     return stamps, np.array(poses).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""World files: walls drawn in a YAML file, or any map_server map."""
+"""World files: walls in a YAML file, or a map_server map."""
 
 import math
 from itertools import pairwise
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thinmap_ros.core.errors import InputError, shown
+from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.grid.frame import MIN_RESOLUTION_M, GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array, pose
@@ -17,33 +17,32 @@ from thinmap_ros.files.yaml import read_mapping
 
 _MARGIN_M = 0.2
 _NUDGE_M = 1e-9
-_MOST_CELLS = 100_000_000
-_LONGEST_NAME = 200
+_MAX_CELLS = 100_000_000
+_MAX_NAME_LENGTH = 200
 _FREE = 0
 _SOLID = 100
 
 
 def read_world(path: Path) -> tuple[str, GridPatch, Array]:
-    """Name, map and start (3,), NaN: none given, of a YAML file.
+    """Name, map and start (3,) (NaN: none) of a YAML file.
 
     The file is a world (walls, solids, tour) or a map_server map (image).
-    Raises InputError naming the file, the key, the value and what was expected.
+    Raises InputError with file, key, value and expectation.
     """
     content = read_mapping(path, 'a world (walls, start) or a map (image, resolution, origin)')
-    return _of_map(path, content) if 'image' in content else _of_drawing(path, content)
+    return _from_map(path, content) if 'image' in content else _from_drawing(path, content)
 
 
 def read_tour(path: Path) -> Array:
-    """Places (N, 2), m, that a world names for a tour; may be none.
+    """Tour of a world: places (N, 2), m, in the order of visits from the start; may be empty.
 
-    They are to be visited in this order and from the start on.
-    Raises InputError naming the file, the value and what was expected.
+    Raises InputError with file, value and expectation.
     """
     content = read_mapping(path, 'a world (walls, start) or a map (image, resolution, origin)')
     return _points(path, 'tour', content['tour'], 1) if 'tour' in content else np.empty((0, 2))
 
 
-def _of_map(path: Path, content: dict[str, Any]) -> tuple[str, GridPatch, Array]:
+def _from_map(path: Path, content: dict[str, Any]) -> tuple[str, GridPatch, Array]:
     start = np.array([np.nan, np.nan, 0.0])
     if 'start' in content:
         start = pose(*_numbers(path, content, 'start', 3))
@@ -58,7 +57,7 @@ def _numbers(path: Path, content: dict[str, Any], key: str, count: int) -> list[
         numbers = []
     if len(numbers) != count or not all(math.isfinite(v) for v in numbers):
         expected = f'expected {count} finite number{"s" if count > 1 else ""}'
-        raise InputError(f'{path}: {key}: {shown(value)}: {expected}')
+        raise InputError(f'{path}: {key}: {quoted(value)}: {expected}')
     return numbers
 
 
@@ -73,7 +72,7 @@ def _polylines(path: Path, content: dict[str, Any], key: str, fewest: int) -> li
     drawn = content.get(key, [])
     if not isinstance(drawn, list):
         expected = 'expected a list of lists of points [x, y]'
-        raise InputError(f'{path}: {key}: {shown(drawn)}: {expected}')
+        raise InputError(f'{path}: {key}: {quoted(drawn)}: {expected}')
     return [_points(path, f'{key}[{i}]', points, fewest) for i, points in enumerate(drawn)]
 
 
@@ -89,18 +88,18 @@ def _points(path: Path, what: str, drawn: object, fewest: int) -> Array:
         or not np.isfinite(points).all()
     ):
         expected = f'expected at least {fewest} points [x, y]'
-        raise InputError(f'{path}: {what}: {shown(drawn)}: {expected}')
+        raise InputError(f'{path}: {what}: {quoted(drawn)}: {expected}')
     return points
 
 
-def _of_drawing(path: Path, content: dict[str, Any]) -> tuple[str, GridPatch, Array]:
+def _from_drawing(path: Path, content: dict[str, Any]) -> tuple[str, GridPatch, Array]:
     known = {'name', 'resolution', 'wall_thickness', 'start', 'tour', 'walls', 'solids'}
     if unknown := set(content) - known:
         expected = ', '.join(sorted(known))
-        raise InputError(f'{path}: unknown key {shown(min(unknown))}: expected {expected}')
+        raise InputError(f'{path}: unknown key {quoted(min(unknown))}: expected {expected}')
     resolution = _resolution(path, content)
     (thickness,) = _numbers(path, content, 'wall_thickness', 1)
-    # Thinner walls let rays slip through between cells that touch at a corner only.
+    # Rays pass through thinner walls, between cells that touch only at a corner.
     if not 2.0 * resolution <= thickness <= 10.0:
         raise InputError(
             f'{path}: wall_thickness: {thickness}: '
@@ -108,10 +107,10 @@ def _of_drawing(path: Path, content: dict[str, Any]) -> tuple[str, GridPatch, Ar
         )
     walls = _polylines(path, content, 'walls', 2)
     polygons = _polylines(path, content, 'solids', 3)
-    polygons += [_slab(a, b, thickness) for wall in walls for a, b in pairwise(wall)]
+    polygons += [_wall_polygon(a, b, thickness) for wall in walls for a, b in pairwise(wall)]
     if not polygons:
         raise InputError(f'{path}: walls: expected at least one wall or solid')
-    frame, shape = _lattice(path, np.concatenate(polygons), resolution)
+    frame, shape = _frame_of(path, np.concatenate(polygons), resolution)
     cells = np.full(shape, _FREE, dtype=np.int8)
     for polygon in polygons:
         _fill(cells, frame, polygon)
@@ -120,39 +119,33 @@ def _of_drawing(path: Path, content: dict[str, Any]) -> tuple[str, GridPatch, Ar
 
 def _name(path: Path, content: dict[str, Any]) -> str:
     name = content.get('name', path.stem)
-    if not isinstance(name, str | int | float) or len(str(name)) > _LONGEST_NAME:
-        expected = f'expected a name of at most {_LONGEST_NAME} characters'
-        raise InputError(f'{path}: name: {shown(name)}: {expected}')
+    if not isinstance(name, str | int | float) or len(str(name)) > _MAX_NAME_LENGTH:
+        expected = f'expected a name of at most {_MAX_NAME_LENGTH} characters'
+        raise InputError(f'{path}: name: {quoted(name)}: {expected}')
     return str(name)
 
 
-def _lattice(path: Path, points: Array, resolution: float) -> tuple[GridFrame, tuple[int, int]]:
-    """Frame and shape of a grid with room for all points.
-
-    Its lines go through the origin, as a map's do.
-    """
+def _frame_of(path: Path, points: Array, resolution: float) -> tuple[GridFrame, tuple[int, int]]:
+    """Frame and shape of a grid that contains all points; its lines pass through the origin."""
     farthest = float(np.abs(points).max())
     if farthest > MAX_COORDINATE_M:
-        expected = f'expected at most {MAX_COORDINATE_M:g} m; is a point far off?'
+        expected = f'expected at most {MAX_COORDINATE_M:g} m; is a point wrong?'
         raise InputError(f'{path}: point at {farthest:g} m: {expected}')
     low = np.floor((points.min(axis=0) - _MARGIN_M) / resolution)
     cols, rows = np.ceil((points.max(axis=0) + _MARGIN_M) / resolution) - low
-    if not rows * cols <= _MOST_CELLS:
+    if not rows * cols <= _MAX_CELLS:
         raise InputError(
-            f'{path}: {rows:.0f} x {cols:.0f} cells: expected at most {_MOST_CELLS}; '
-            'is a point far off?'
+            f'{path}: {rows:.0f} x {cols:.0f} cells: expected at most {_MAX_CELLS}; '
+            'is a point wrong?'
         )
     frame = GridFrame(float(low[0]) * resolution, float(low[1]) * resolution, resolution)
     return frame, (int(rows), int(cols))
 
 
 def _fill(cells: NDArray[np.int8], frame: GridFrame, polygon: Array) -> None:
-    """Make the cells solid whose centres lie in a polygon (N, 2).
-
-    A ray from such a centre crosses it an odd number of times.
-    """
-    # A border that runs through centres would otherwise fall to either side by rounding: walls 4 to
-    # 6 cells wide.
+    """Set the cells whose centres lie in a polygon (N, 2) to occupied, by the even-odd rule."""
+    # Without the offset, edges through cell centres are rounded to either side: walls of 4 to 6
+    # cells.
     polygon = polygon - _NUDGE_M
     low = np.maximum(frame.cells_of(polygon.min(axis=0))[0], 0)
     high = frame.cells_of(polygon.max(axis=0))[0] + 1
@@ -167,11 +160,8 @@ def _fill(cells: NDArray[np.int8], frame: GridFrame, polygon: Array) -> None:
     cells[low[0] : high[0], low[1] : high[1]][inside] = _SOLID
 
 
-def _slab(a: Array, b: Array, thickness: float) -> Array:
-    """Corners (4, 2) of a wall from a to b.
-
-    It is longer by half its thickness at both ends so that corners close.
-    """
+def _wall_polygon(a: Array, b: Array, thickness: float) -> Array:
+    """Corners (4, 2) of a wall from a to b, extended by half its thickness to close corners."""
     length = float(np.hypot(*(b - a)))
     along = (b - a) / length if length > 0.0 else np.array([1.0, 0.0])
     across = np.array([-along[1], along[0]]) * thickness / 2.0

@@ -1,9 +1,8 @@
-"""YAML from outside, read within limits that are checked before any object is constructed.
+"""Reads YAML of any origin, within limits that are checked before objects are constructed.
 
-A file of a few hundred bytes can describe billions of members by repeating one part again and again
-(anchors and aliases, merge keys). No file of this project needs that, so it is refused. The limits
-are far above any drawn world: 4 MiB, 100,000 nodes (values, lists and mappings), 20 levels, numbers
-of 100 characters.
+A file of a few hundred bytes can describe billions of members by repetition (anchors and aliases,
+merge keys). No file of this project needs them, so they are rejected. The limits are far above any
+world: 4 MiB, 100,000 nodes (values, lists and mappings), 20 levels, numbers of 100 characters.
 """
 
 from pathlib import Path
@@ -11,21 +10,21 @@ from typing import Any
 
 import yaml
 
-from thinmap_ros.core.errors import InputError, one_line_reason, shown
+from thinmap_ros.core.errors import InputError, one_line_reason, quoted
 from thinmap_ros.files.atomic import read_text
 
 MAX_BYTES = 4 << 20
-_MOST_NODES = 100_000
-_MOST_LEVELS = 20
-_LONGEST_NUMBER = 100
+_MAX_NODES = 100_000
+_MAX_LEVELS = 20
+_MAX_NUMBER_LENGTH = 100
 _MERGE_TAG = 'tag:yaml.org,2002:merge'
 _NUMBER_TAGS = ('tag:yaml.org,2002:int', 'tag:yaml.org,2002:float')
 
 
 def load_yaml(path: Path) -> object:
-    """Read what a YAML file holds: mappings, lists, texts, numbers, truth values, dates or nothing.
+    """Read a YAML file: mappings, lists, texts, numbers, booleans, dates or nothing.
 
-    Raises InputError naming the file where it is no YAML, or beyond the limits.
+    Raises InputError with the file name if it is no YAML, or exceeds the limits.
     """
     try:
         return parse_yaml(read_text(path, MAX_BYTES))
@@ -45,7 +44,7 @@ def parse_yaml(text: str) -> object:
 
 
 def read_mapping(path: Path, expected: str) -> dict[str, Any]:
-    """Read keys and values. Raises InputError naming the file and what it expects."""
+    """Read a mapping. Raises InputError with the file name and the expectation."""
     try:
         content = parse_yaml(read_text(path, MAX_BYTES))
     except _YamlError as error:
@@ -54,16 +53,16 @@ def read_mapping(path: Path, expected: str) -> dict[str, Any]:
         raise InputError(f'{path}: expected {expected}')
     for key in content:
         if not isinstance(key, str):
-            raise InputError(f'{path}: key {shown(key)}: expected a name; {expected}')
+            raise InputError(f'{path}: key {quoted(key)}: expected a name; {expected}')
     return content
 
 
 class _YamlError(InputError):
-    """What is wrong with a YAML text, without the name of its file."""
+    """Error in a YAML text, without the file name."""
 
 
 class _BoundedLoader(yaml.SafeLoader):
-    """Counts the nodes as they are parsed; objects are constructed after the last of them."""
+    """Counts nodes while parsing; objects are constructed after the last one."""
 
     def __init__(self, stream: str) -> None:
         super().__init__(stream)
@@ -71,39 +70,39 @@ class _BoundedLoader(yaml.SafeLoader):
         self._level = 0
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """Compose the next node, unless it is one too many or repeats another one."""
+        """Compose the next node. Raises _YamlError beyond the limits, or at an alias."""
         event = self.peek_event()
-        self._refuse_repetition(event)
+        self._reject_aliases(event)
         self._nodes += 1
         self._level += 1
-        if self._nodes > _MOST_NODES:
-            expected = f'expected at most {_MOST_NODES} values, lists and mappings'
+        if self._nodes > _MAX_NODES:
+            expected = f'expected at most {_MAX_NODES} values, lists and mappings'
             raise _YamlError(f'{_at(event)}: {expected}')
-        if self._level > _MOST_LEVELS:
-            raise _YamlError(f'{_at(event)}: expected at most {_MOST_LEVELS} levels')
+        if self._level > _MAX_LEVELS:
+            raise _YamlError(f'{_at(event)}: expected at most {_MAX_LEVELS} levels')
         node = super().compose_node(parent, index)
         self._level -= 1
-        self._refuse_long_number(node, event)
+        self._reject_long_number(node, event)
         return node
 
-    def _refuse_repetition(self, event: yaml.Event) -> None:
+    def _reject_aliases(self, event: yaml.Event) -> None:
         name = getattr(event, 'anchor', None)
         if name is not None:
             expected = 'expected no anchors and aliases (& and *)'
-            raise _YamlError(f'{_at(event)}: {shown(name)}: {expected}')
+            raise _YamlError(f'{_at(event)}: {quoted(name)}: {expected}')
 
-    def _refuse_long_number(self, node: yaml.Node | None, event: yaml.Event) -> None:
+    def _reject_long_number(self, node: yaml.Node | None, event: yaml.Event) -> None:
         if not isinstance(node, yaml.ScalarNode):
             return
         if node.tag == _MERGE_TAG:
             raise _YamlError(f'{_at(event)}: <<: expected no merge keys')
-        if node.tag in _NUMBER_TAGS and len(node.value) > _LONGEST_NUMBER:
-            expected = f'expected at most {_LONGEST_NUMBER}'
+        if node.tag in _NUMBER_TAGS and len(node.value) > _MAX_NUMBER_LENGTH:
+            expected = f'expected at most {_MAX_NUMBER_LENGTH}'
             size = len(node.value)
             raise _YamlError(f'{_at(event)}: a number of {size} characters: {expected}')
 
 
 def _at(event: yaml.Event) -> str:
-    """Where an event begins, for people, who count from 1."""
+    """Line and column of an event, from 1."""
     mark = event.start_mark
     return 'somewhere' if mark is None else f'line {mark.line + 1}, column {mark.column + 1}'

@@ -1,4 +1,4 @@
-"""Memory pages that a process holds without need."""
+"""Releases memory pages of the kernel compiler."""
 
 import ctypes
 import gc
@@ -14,7 +14,7 @@ _RELEASE_BYTES = 4e6
 def compiler_memory_releaser() -> Callable[[], None]:
     """Kernels that only a real message calls for bring the compiler back.
 
-    What gives its pages back, now and then.
+    Kernels that are loaded later, with the first message, load the compiler again.
     """
     looked_at = monotonic()
     least = _shared_bytes()
@@ -31,18 +31,17 @@ def compiler_memory_releaser() -> Callable[[], None]:
 
 
 def _shared_bytes() -> int:
-    """Memory that the process has from files, as libraries are; 0 where there is no /proc."""
+    """File-backed memory of the process, such as libraries; 0 without /proc."""
     statm = Path('/proc/self/statm')
     return int(statm.read_text().split()[2]) * mmap.PAGESIZE if statm.exists() else 0
 
 
 def release_compiler_pages() -> None:
-    """Give back the memory pages of the kernels' compiler.
+    """Release the memory pages of the kernel compiler.
 
-    Its library, some 100 MB, is idle once they are loaded.
-
-    Only mappings without a page of the process's own are dropped: the system reads them again from
-    the library's file whenever they are needed. Where there is no /proc, nothing happens.
+    Its library, some 100 MB, is idle once all kernels are loaded. Only unmodified mappings are
+    released: the system reads them again from the library when needed. Without /proc, nothing
+    happens.
     """
     gc.collect()
     smaps = Path('/proc/self/smaps')
@@ -56,7 +55,7 @@ def release_compiler_pages() -> None:
 
 
 def _clean_mappings(smaps: str, name: str) -> Iterator[tuple[int, int]]:
-    """Address ranges of the mappings of a file of which no page was changed."""
+    """Address ranges of the unmodified mappings of a file."""
     header = ''
     for line in smaps.splitlines():
         key = line.split(maxsplit=1)[0]

@@ -1,8 +1,8 @@
-"""A rehearsal of each algorithm in a small room, so that no real step compiles or loads a kernel.
+"""Warm-up of each algorithm in a small room, so that kernels are loaded before the first step.
 
-A node rehearses before it listens: on a robot the first seconds would otherwise be spent standing
-still, and in a simulation that runs faster than real time many more. Each rehearsal imports what it
-needs, so that a node does not carry the compiled code of the others.
+A node warms up before it subscribes: otherwise a robot loses its first seconds, and a simulation
+faster than real time many more. Each warm-up imports its own modules only, so that a node does not
+load the kernels of others.
 """
 
 from collections.abc import Iterator
@@ -29,7 +29,7 @@ _TURN_RAD = 0.11
 
 
 def localizer() -> None:
-    """Rehearse localization."""
+    """Warm up localization."""
     from thinmap_ros.core.slam.graph.keyframes import covariances_from
     from thinmap_ros.core.slam.graph.pose_graph import Edge
     from thinmap_ros.core.slam.localizer import Localizer
@@ -37,7 +37,7 @@ def localizer() -> None:
     rehearsed = Localizer()
     for scan, T_map_base in _drive():
         rehearsed.step(scan, T_map_base)
-    # A scan that fits nowhere is searched for; a map that was saved or drawn is taken up.
+    # Also the search for a scan without a match, and the start from a loaded map.
     rehearsed.step(_odd_scan(), T_map_base)
     Localizer.from_state(rehearsed.state())
     Localizer.from_occupancy_map(_room(), OdometryAnchor(0, T_map_base, T_map_base), T_map_base)
@@ -46,25 +46,25 @@ def localizer() -> None:
 
 
 def grid_mapper() -> None:
-    """Rehearse the map update and its windows."""
+    """Warm up the map update and its windows."""
     from thinmap_ros.core.grid.occupancy import OccupancyGrid, WindowConfig
 
     rehearsed = OccupancyGrid()
     for scan, T_map_base in _drive():
-        rehearsed.update(scan, T_map_base)
+        rehearsed.add_scan(scan, T_map_base)
         rehearsed.window(T_map_base[0], T_map_base[1], WindowConfig().window_m)
-    rehearsed.patch()
+    rehearsed.known_area()
 
 
 def topology_builder() -> None:
-    """Rehearse thinning and the merging of local maps."""
+    """Warm up thinning and the merging of local maps."""
     from thinmap_ros.core.grid.occupancy import OccupancyGrid, WindowConfig
     from thinmap_ros.core.topology.builder import TopologyBuilder
 
     grid = OccupancyGrid()
     rehearsed = TopologyBuilder()
     for scan, T_map_base in _drive():
-        grid.update(scan, T_map_base)
+        grid.add_scan(scan, T_map_base)
         rehearsed.update(
             grid.window(T_map_base[0], T_map_base[1], WindowConfig().window_m), T_map_base
         )
@@ -72,7 +72,7 @@ def topology_builder() -> None:
 
 
 def explorer() -> None:
-    """Rehearse the choice of an end node in a room of which a part is unknown."""
+    """Warm up the choice of an end node, in a partly unknown room."""
     from thinmap_ros.core.exploration.explorer import Explorer
     from thinmap_ros.core.topology.builder import TopologyConfig, build
 
@@ -84,7 +84,7 @@ def explorer() -> None:
 
 
 def navigator() -> None:
-    """Rehearse planning and driving."""
+    """Warm up planning and driving."""
     from thinmap_ros.core.planning.navigator import Navigator
 
     patch = _room()
@@ -95,7 +95,7 @@ def navigator() -> None:
 
 
 def global_localizer() -> None:
-    """Rehearse the search for a lost robot."""
+    """Warm up global localization."""
     from thinmap_ros.core.places.global_localizer import GlobalLocalization
     from thinmap_ros.core.topology.builder import TopologyConfig, build
 
@@ -106,7 +106,7 @@ def global_localizer() -> None:
 
 
 def _room() -> GridPatch:
-    """A room with a pillar, and a passage into the unknown."""
+    """A room with a pillar, and a passage to unknown space."""
     cells = np.zeros((_ROOM_CELLS, _ROOM_CELLS), dtype=np.int8)
     cells[[0, -1]] = 100
     cells[:, [0, -1]] = 100
@@ -117,7 +117,7 @@ def _room() -> GridPatch:
 
 
 def _odd_scan() -> Scan:
-    """A scan of beams of many lengths, which is of no room."""
+    """A scan of random ranges, which fits no room."""
     step = np.radians(180.0 / (_BEAMS - 1))
     ranges = 1.0 + np.arange(_BEAMS) * 0.37 % 3.0
     stamp_ns = round(1e9 * _PERIOD_S * _SCANS)

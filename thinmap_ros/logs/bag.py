@@ -1,4 +1,4 @@
-"""rosbag2 folders and MCAP files: read as scans and odometry, and read raw."""
+"""rosbag2 folders and MCAP files: raw messages, and scans with odometry."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -30,17 +30,17 @@ from thinmap_ros.logs.storage import RawMessage, Storage, storage_of
 _SCAN = 'sensor_msgs/msg/LaserScan'
 _ODOMETRY = 'nav_msgs/msg/Odometry'
 _TF = 'tf2_msgs/msg/TFMessage'
-_MOST_TOLD = 8
+_MAX_WARNINGS = 8
 
 
 class Bag:
     """A bag opened for reading.
 
-    `topics` and their types, `offers` and the QoS of their publishers.
+    `topics`: their types; `offers`: QoS of their publishers.
     """
 
     def __init__(self, path: Path) -> None:
-        """Open a bag. Raises InputError naming the file where it is none or nothing is whole."""
+        """Open a bag. Raises InputError with the file name if it has no intact message."""
         if not path.exists():
             raise InputError(
                 f'{path}: no such file or folder: expected a rosbag2 folder or an MCAP file'
@@ -63,35 +63,33 @@ class Bag:
             raise InputError(f'{path}: {error.strerror or error}') from error
         if self.damage and not any(storage.has_messages for storage in self._storages):
             expected = 'expected a rosbag2 folder or an MCAP file'
-            raise InputError(f'{path}: {self.damage}: no whole message: {expected}')
+            raise InputError(f'{path}: {self.damage}: no intact message: {expected}')
 
     @property
     def is_truncated(self) -> bool:
-        """Whether the bag is read only as far as it is whole, which may show late."""
+        """Whether the bag is truncated: only its intact part is read. May become True late."""
         return bool(self.damage)
 
     @property
     def damage(self) -> str:
-        """What of the bag is not whole, in one line; empty where all of it is."""
+        """Description of the damage, in one line; empty if the bag is intact."""
         words = [str(storage.damage) for storage in self._storages if storage.damage]
         if self._files.without_metadata:
             words.append(self._files.without_metadata)
         if self._unreadable:
-            words.append(f'{self._unreadable} messages that cannot be unpacked')
-        return '; '.join(words[:_MOST_TOLD])
+            words.append(f'{self._unreadable} messages that cannot be decompressed')
+        return '; '.join(words[:_MAX_WARNINGS])
 
     @property
     def repair_hint(self) -> str:
-        """What is not whole and what to do about it, in one line; empty where all is whole."""
+        """Damage and how to repair it, in one line; empty if the bag is intact."""
         if not self.damage:
             return ''
-        read = 'read as far as it is whole'
-        return (
-            f'{self.path}: {self.damage}: {read}; `bag_repair {self.path}` makes a whole bag of it'
-        )
+        read = 'only the intact part is read'
+        return f'{self.path}: {self.damage}: {read}; `bag_repair {self.path}` writes a repaired bag'
 
     def messages(self, topics: set[str] | None = None) -> Iterator[RawMessage]:
-        """Whole messages of the given topics, or of all, in log order."""
+        """Intact messages of the given topics, or of all, in log order."""
         for storage in self._storages:
             for message in storage.messages(topics):
                 if not self._files.compressed_messages:
@@ -105,37 +103,34 @@ class Bag:
                 yield RawMessage(message.topic, message.type_name, message.log_ns, data)
 
     def decode(self, message: RawMessage) -> Any:
-        """Message object of a raw message.
-
-        Raises InputError where its bytes do not fit its type.
-        """
+        """Decode a raw message. Raises InputError if its bytes do not fit its type."""
         holders = (s for s in self._storages if s.topics.get(message.topic) == message.type_name)
         storage = next(holders, self._storages[0])
         try:
             return storage.typestore(message.type_name).deserialize_cdr(
                 message.data, message.type_name
             )
-        except (
-            Exception
-        ) as error:  # any error of the deserializer means the same: these bytes are no such message
+        except Exception as error:  # the deserializer raises many types
             reason = ' '.join(str(error).split())[:120] or type(error).__name__
-            where = f'{self.path}: {validation.abbreviated(message.topic)}'
+            where = f'{self.path}: {validation.quoted_name(message.topic)}'
             raise InputError(
-                f'{where}: no {validation.abbreviated(message.type_name)}: {reason}'
+                f'{where}: no {validation.quoted_name(message.type_name)}: {reason}'
             ) from error
 
     def _add(self, storage: Storage) -> None:
         self._storages.append(storage)
         self.topics |= storage.topics
         for topic, offers in storage.offers.items():
-            self.offers.setdefault(topic, offers)  # each file of a bag says the same of its topics
+            self.offers.setdefault(
+                topic, offers
+            )  # the files of a bag repeat the entries of their topics
 
 
 @dataclass
 class BagLog:
-    """A bag as scans and odometry. Empty topic names: the only topic of that type.
+    """Scans and odometry of a bag. Empty topic name: the only topic of that type.
 
-    T_base_laser (3,): the laser on the robot; None: from /tf_static.
+    T_base_laser (3,): pose of the laser on the robot; None: from /tf_static.
     """
 
     path: Path
@@ -146,10 +141,10 @@ class BagLog:
     skipped: SkippedRecords = field(default_factory=SkippedRecords)
 
     def events(self) -> Iterator[Event]:
-        """Odometry and scans in the order of the log.
+        """Odometry and scans in the order of the log. Unusable messages are skipped and counted.
 
-        Raises InputError where the bag has no scans or no odometry (naming the topics that it has),
-        or nothing says where the laser sits. A message that cannot be used is skipped and counted.
+        Raises InputError if the bag has no scans or no odometry (with the list of its topics), or
+        if the laser pose is unknown.
         """
         bag = Bag(self.path)
         self.skipped = SkippedRecords()
@@ -157,7 +152,7 @@ class BagLog:
             yield from self._events(bag)
         except InputError as error:
             if bag.damage and bag.damage not in str(error):
-                raise InputError(f'{error}; the bag is not whole: {bag.damage}') from error
+                raise InputError(f'{error}; the bag is damaged: {bag.damage}') from error
             raise
 
     def _events(self, bag: Bag) -> Iterator[Event]:
@@ -174,7 +169,7 @@ class BagLog:
             frame, value = event
             if isinstance(value, Scan):
                 mounts[frame] = mounts.get(frame) or self._mount(frame, transforms)
-                yield ScanEvent(mounts[frame].placed(value))
+                yield ScanEvent(mounts[frame].apply(value))
             else:
                 yield value
             used[message.topic] += 1
@@ -183,16 +178,16 @@ class BagLog:
         for topic, count in used.items():
             if count == 0:
                 first = f': {self.skipped.first}' if self.skipped.first else ''
-                name = validation.abbreviated(topic)
+                name = validation.quoted_name(topic)
                 raise InputError(f'{self.path}: {name}: no message that can be used{first}')
 
     def _event(self, bag: Bag, message: RawMessage) -> tuple[str, OdometryEvent | Scan] | None:
-        """Frame and value of a message; None, counted, where it is unusable."""
+        """Frame and value of a message; None, and counted, if it is unusable."""
         try:
             decoded = bag.decode(message)
             value = _odometry(decoded) if message.type_name == _ODOMETRY else _scan(decoded)
         except InputError as error:
-            where = f'{self.path}: {validation.abbreviated(message.topic)}: '
+            where = f'{self.path}: {validation.quoted_name(message.topic)}: '
             self.skipped.add(where + str(error).removeprefix(where))
             return None
         return decoded.header.frame_id, value
@@ -204,12 +199,12 @@ class BagLog:
         if not wanted and len(found) == 1:
             return found[0]
         if not found or wanted:
-            has = validation.listed(
+            has = validation.quoted_names(
                 [f'{topic} ({name})' for topic, name in sorted(bag.topics.items())]
             )
             raise InputError(f'{self.path}: no {what} ({wanted or type_name}); it has {has}')
-        names = validation.listed(found)
-        raise InputError(f'{self.path}: {what} on several topics, name one of {names}')
+        names = validation.quoted_names(found)
+        raise InputError(f'{self.path}: {what} on several topics: choose one of {names}')
 
     def _static_transforms(self, bag: Bag) -> StaticTransforms:
         transforms = StaticTransforms()
@@ -219,7 +214,7 @@ class BagLog:
                 for transform in bag.decode(message).transforms:
                     transforms.add(transform)
             except InputError as error:
-                where = f'{self.path}: {validation.abbreviated(message.topic)}: '
+                where = f'{self.path}: {validation.quoted_name(message.topic)}: '
                 self.skipped.add(where + str(error).removeprefix(where))
         return transforms
 
@@ -227,21 +222,21 @@ class BagLog:
         if self.T_base_laser is not None:
             return Mount(self.T_base_laser, upside_down=False)
         try:
-            mount = transforms.mount(frame, self.base_frame)
+            mount = transforms.laser_mount(frame, self.base_frame)
         except InputError as error:
             raise InputError(f'{self.path}: /tf_static: {error}') from error
         if mount is None:
-            known = validation.listed(transforms.frames)
-            where = f'where "{validation.abbreviated(frame)}" is on "{self.base_frame}"'
+            known = validation.quoted_names(transforms.frames)
+            where = f'where "{validation.quoted_name(frame)}" is on "{self.base_frame}"'
             raise InputError(
-                f'{self.path}: /tf_static does not say {where} (it has {known}): '
+                f'{self.path}: /tf_static has no transform {where} (it has {known}): '
                 'give --base-frame, or --offset-m for a laser straight ahead'
             )
         return mount
 
 
 def _odometry(message: Any) -> OdometryEvent:
-    rotation_matrix(message.pose.pose.orientation)  # raises where it is none
+    rotation_matrix(message.pose.pose.orientation)  # raises InputError if it is invalid
     T_odom_base = decode.pose(message.pose.pose)
     if not se2.is_finite(T_odom_base):
         raise InputError(f'pose {T_odom_base.tolist()}: expected finite numbers')
@@ -250,12 +245,12 @@ def _odometry(message: Any) -> OdometryEvent:
 
 def _scan(message: Any) -> Scan:
     if len(message.ranges) == 0:
-        raise InputError('a scan without ranges')
+        raise InputError('scan without ranges')
     if len(message.ranges) > validation.MAX_BEAMS:
         raise InputError(
-            f'a scan of {len(message.ranges)} ranges: expected at most {validation.MAX_BEAMS}'
+            f'scan of {len(message.ranges)} ranges: expected at most {validation.MAX_BEAMS}'
         )
-    with np.errstate(invalid='ignore'):  # a NaN stays one, however it is made
+    with np.errstate(invalid='ignore'):  # NaN is kept, whatever its bits
         return Scan.create(
             decode.stamp_ns(message),
             message.ranges,

@@ -1,4 +1,4 @@
-"""Folders of rosbag2: which files make the bag, and how they are compressed (metadata.yaml)."""
+"""rosbag2 folders: their files, and how these are compressed (metadata.yaml)."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from thinmap_ros.files.atomic import read_text
 from thinmap_ros.files.yaml import MAX_BYTES, parse_yaml
 
 MAX_FILE_BYTES = 32 * 2**30
-"""Bytes that a file of a bag compressed file by file may expand to."""
+"""Maximum decompressed size of a file of a bag with file compression."""
 _PIECE = 2**20
 
 
@@ -21,8 +21,8 @@ _PIECE = 2**20
 class BagFiles:
     """The files of a bag in the order of recording.
 
-    compressed_messages: each message is compressed on its own; without_metadata: why metadata.yaml
-    was not used, empty where it was.
+    compressed_messages: whether messages are compressed individually; without_metadata: why
+    metadata.yaml was not used, empty if it was.
     """
 
     files: list[Path]
@@ -31,10 +31,10 @@ class BagFiles:
 
 
 def bag_files(path: Path) -> BagFiles:
-    """Files of a bag: the one that is given, or those of a folder.
+    """Files of a bag: the given file, or those of a folder.
 
-    MCAP files are found without metadata.yaml, too, or where it cannot be read. Raises InputError
-    where there are no files.
+    MCAP files are found even if metadata.yaml is missing or unreadable. Raises InputError if there
+    are no files.
     """
     if not path.is_dir():
         return BagFiles([path])
@@ -59,19 +59,19 @@ def mcap_files_in(folder: Path) -> list[Path]:
 
 
 def _number(file: Path) -> tuple[int, str]:
-    """rosbag2 numbers the files of a bag: name_0, name_1, ... name_10."""
+    """Number of a file of a bag: rosbag2 names them name_0, name_1, ... name_10."""
     number = file.stem.rpartition('_')[2]
     return (int(number) if number.isdecimal() and len(number) < 10 else -1, file.name)
 
 
 def _information(metadata: Path) -> Any:
-    """Raises InputError, KeyError or TypeError where there is none, or beyond YAML's limits."""
+    """Raises InputError, KeyError or TypeError if it is missing, or exceeds the YAML limits."""
     content: Any = parse_yaml(read_text(metadata, MAX_BYTES))
     return content['rosbag2_bagfile_information']
 
 
 def _listed(folder: Path, information: Any) -> BagFiles:
-    """Raises KeyError, TypeError, ValueError or AttributeError where the information is none."""
+    """Raises KeyError, TypeError, ValueError or AttributeError if the information is invalid."""
     files = [folder / PurePath(name).name for name in information['relative_file_paths']]
     missing = [file.name for file in files if not file.is_file()]
     if missing or not files:
@@ -85,9 +85,9 @@ def _listed(folder: Path, information: Any) -> BagFiles:
 def decompressed_files(
     files: list[Path],
 ) -> Iterator[tuple[Path, TemporaryDirectory[str] | None]]:
-    """Each file as it is, or, where its name ends in .zstd, unpacked into a temporary folder.
+    """The files; those ending in .zstd are decompressed into a temporary folder.
 
-    Raises InputError where a file is none, or expands to more than LARGEST_FILE.
+    Raises InputError if a file is invalid, or expands to more than MAX_FILE_BYTES.
     """
     for file in files:
         if file.suffix != '.zstd':
@@ -105,7 +105,7 @@ def _unpack(file: Path, target: Path) -> None:
             reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
             while piece := reader.read(_PIECE):
                 if out.tell() + len(piece) > MAX_FILE_BYTES:
-                    raise InputError(f'{file}: more than {MAX_FILE_BYTES} bytes unpacked')
+                    raise InputError(f'{file}: more than {MAX_FILE_BYTES} bytes decompressed')
                 out.write(piece)
     except zstandard.ZstdError as error:
         raise InputError(f'{file}: no zstd file: {str(error)[:120]}') from error

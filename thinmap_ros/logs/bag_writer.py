@@ -1,4 +1,4 @@
-"""Writes rosbag2 folders and MCAP files: whole at the end, or to the last second if killed."""
+"""Writes rosbag2 folders and MCAP files, atomically or live."""
 
 import os
 import shutil
@@ -19,13 +19,12 @@ from thinmap_ros.logs.qos import recorded
 
 
 class BagWriter:
-    """Writes a rosbag2 folder with an MCAP file, or, where the path ends in .mcap, that file alone.
+    """Writes a rosbag2 folder with an MCAP file, or only that file if the path ends in .mcap.
 
-    As a context it writes aside and takes the name when the block ends well, so that no
-    half-written bag passes for a good one. `live` writes under the name from the start: what a
-    recorder wants, whose work is never "done", and which calls `flush` as often as it is willing to
-    lose what came since. `compressed`: with zstd, chunk by chunk. An older bag of that name gives
-    way. Raises InputError where the path is something else.
+    As a context manager it writes to a temporary path and renames it when the block succeeds, so
+    that no partial bag is mistaken for a complete one. `live` writes under the final name from the
+    start, for recorders: messages since the last `flush` may be lost. `compressed`: with zstd, by
+    chunk. An older bag of that name is replaced. Raises InputError if the path is something else.
     """
 
     def __init__(
@@ -38,7 +37,7 @@ class BagWriter:
         self._path = path
         self._folder = path if live else _aside(path)
         self.typestore: Typestore = get_typestore(Stores.ROS2_JAZZY)
-        self.learn(definitions or {})
+        self.add_definitions(definitions or {})
         self._connections: dict[str, Connection] = {}
         _check_replaceable(path)
         _remove(self._folder)
@@ -60,13 +59,13 @@ class BagWriter:
         try:
             self.close()
             if kind is None and self._folder != self._path:
-                _take_name(self._folder, self._path)
+                _rename(self._folder, self._path)
         finally:
             if self._folder != self._path or kind is not None:
                 _remove(self._folder)
 
-    def learn(self, definitions: dict[str, str]) -> None:
-        """Take in message definitions, texts by full name, for types that do not come with ROS."""
+    def add_definitions(self, definitions: dict[str, str]) -> None:
+        """Add message definitions, texts by full name, for types outside of ROS."""
         for name, text in definitions.items():
             if name not in self.typestore.types:
                 self.typestore.register(get_types_from_msg(text, name))
@@ -82,9 +81,9 @@ class BagWriter:
         self._writer.write(self._connections[topic], log_ns, message)
 
     def add_topic(self, topic: str, type_name: str, offers: Sequence[Qos]) -> None:
-        """Name a topic before its first message, with what its publishers offer.
+        """Add a topic before its first message, with the QoS of its publishers.
 
-        Raises InputError where the definition of its type is not known.
+        Raises InputError if the definition of its type is unknown.
         """
         try:
             self._connections[topic] = self._writer.add_connection(
@@ -94,7 +93,7 @@ class BagWriter:
             raise InputError(f'{topic}: {" ".join(str(error).split())}') from error
 
     def flush(self) -> None:
-        """Close the chunk being filled and hand all to the disk: no sudden end can take it back."""
+        """Close the current chunk and sync it to disk, so that it survives a crash."""
         storage = cast(McapWriter, self._writer.storage)
         if storage.chunk.msgs:
             storage.close_chunk()
@@ -108,10 +107,10 @@ class BagWriter:
 
 @contextmanager
 def temporary_bag(path: Path) -> Iterator[Path]:
-    """Give an empty folder, whose content becomes the bag `path` when the block ends well.
+    """Yield an empty folder, whose content becomes the bag `path` when the block succeeds.
 
-    Its content: NAME.mcap and metadata.yaml.
-    An older bag of that name gives way. Raises InputError where the path is something else.
+    Its content: NAME.mcap and metadata.yaml. An older bag of that name is replaced. Raises
+    InputError if the path is something else.
     """
     _check_replaceable(path)
     folder = _aside(path)
@@ -119,7 +118,7 @@ def temporary_bag(path: Path) -> Iterator[Path]:
     folder.mkdir(parents=True)
     try:
         yield folder
-        _take_name(folder, path)
+        _rename(folder, path)
     finally:
         _remove(folder)
 
@@ -128,12 +127,12 @@ def _aside(path: Path) -> Path:
     return path.with_name(f'.{path.name}.{os.getpid()}.part')
 
 
-def _take_name(folder: Path, path: Path) -> None:
+def _rename(folder: Path, path: Path) -> None:
     (file,) = folder.glob('*.mcap')
     if path.suffix == '.mcap':
         file.replace(path)
         return
-    # The file inside carries the folder's name, and the metadata carry the file's.
+    # The file has the name of the folder, and the metadata have that of the file.
     name = file.name.replace(folder.name, path.name)
     metadata = folder / 'metadata.yaml'
     metadata.write_text(metadata.read_text().replace(file.name, name))
@@ -143,7 +142,7 @@ def _take_name(folder: Path, path: Path) -> None:
 
 
 def _check_replaceable(path: Path) -> None:
-    """Refuse to write where something else is than a bag: it would be lost."""
+    """Raise InputError if the path exists and is no bag: it would be overwritten."""
     if path.is_dir() and path.suffix != '.mcap':
         others = [
             file.name

@@ -1,8 +1,8 @@
 """CARMEN logs: FLASER, ROBOTLASER1 and ODOM lines, plain or gzip.
 
-Lines are played in the order of the file; their stamps are the robot's own and step back now and
-then. A line that cannot be read is skipped and counted, because logs are cut off and glued
-together; a file without any scan is an error.
+Lines are played in the order of the file; their stamps are those of the robot and step back now and
+then. Invalid lines are skipped and counted, because some logs are truncated or concatenated. A file
+without scans is an error.
 """
 
 import gzip
@@ -17,7 +17,7 @@ import numpy as np
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.errors import InputError, shown
+from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.logs.log import (
@@ -32,14 +32,14 @@ from thinmap_ros.logs.log import (
 _SECOND_NS = 1_000_000_000
 _LATEST_S = 2**31
 MAX_LINE_LENGTH = 4 * 2**20
-"""Bytes of a line, unpacked. A scan of 1,000 beams takes 7,000."""
+"""Maximum bytes of a line, decompressed. A scan of 1,000 beams takes 7,000."""
 
 
 @dataclass(frozen=True)
 class LaserOptions(Config):
-    """What a FLASER line does not say of its laser.
+    """Properties of the laser that FLASER lines do not contain.
 
-    ROBOTLASER1 lines say it: an offset given here comes before.
+    ROBOTLASER1 lines contain them; an offset given here takes precedence.
     """
 
     start_angle_deg: float = parameter(
@@ -60,7 +60,7 @@ class LaserOptions(Config):
 
 @dataclass
 class CarmenLog:
-    """A CARMEN log file. `events()` plays it in file order; `skipped` says what was passed over."""
+    """A CARMEN log file. `events()` plays it in file order; `skipped` counts invalid lines."""
 
     path: Path
     options: LaserOptions = field(default_factory=LaserOptions)
@@ -68,10 +68,10 @@ class CarmenLog:
     _T_base_laser: Array | None = field(default=None, init=False)
 
     def events(self) -> Iterator[Event]:
-        """Odometry and scans in file order; a scan line's odometry comes right before its scan.
+        """Odometry and scans in file order; the odometry of a scan line precedes its scan.
 
-        That odometry has the scan's stamp. Raises InputError where there is no such file, it is no
-        text, or it has no scan.
+        That odometry has the stamp of the scan. Raises InputError if the file is missing, is not
+        text, or has no scan.
         """
         self.skipped = SkippedRecords()
         self._T_base_laser = None
@@ -90,7 +90,7 @@ class CarmenLog:
             scans += any(isinstance(event, ScanEvent) for event in events)
             yield from events
         if scans == 0:
-            reason = f'; first line passed over: {self.skipped.first}' if self.skipped.first else ''
+            reason = f'; first skipped line: {self.skipped.first}' if self.skipped.first else ''
             raise InputError(f'{self.path}: no scan: expected FLASER or ROBOTLASER1 lines{reason}')
 
     def _lines(self) -> Iterator[tuple[int, str]]:
@@ -99,7 +99,7 @@ class CarmenLog:
             raise InputError(f'{self.path}: an MCAP file, which is a bag: expected a CARMEN log')
         try:
             with _open(self.path) as stream:
-                # One byte more than the limit: of a longer line no more is ever read.
+                # One byte more than the limit: no more of a longer line is ever read.
                 lines = iter(lambda: stream.readline(MAX_LINE_LENGTH + 1), b'')
                 for number, line in enumerate(lines, start=1):
                     if len(line) > MAX_LINE_LENGTH:
@@ -112,18 +112,21 @@ class CarmenLog:
                             f'{self.path}:{number}: a zero byte: expected a text file (CARMEN log)'
                         )
                     text = line.decode('utf-8', errors='replace')
-                    yield number, text if text.endswith('\n') else self._whole_words(number, text)
+                    yield (
+                        number,
+                        text if text.endswith('\n') else self._complete_words(number, text),
+                    )
         except (OSError, EOFError, zlib.error) as error:
             if isinstance(error, EOFError | gzip.BadGzipFile | zlib.error):
                 self.skipped.add(f'{self.path}: {error}')
                 return
             raise InputError(f'{self.path}: {error.strerror or error}') from error
 
-    def _whole_words(self, number: int, text: str) -> str:
-        """Return a line that was cut off without its last word, which may be half a number."""
+    def _complete_words(self, number: int, text: str) -> str:
+        """Return a truncated line without its last word, which may be part of a number."""
         whole = text.rstrip().rpartition(' ')[0]
         if text.strip() and not whole:
-            self.skipped.add(f'{self.path}:{number}: {shown(text.strip()[:20])}: a line cut off')
+            self.skipped.add(f'{self.path}:{number}: {quoted(text.strip()[:20])}: truncated line')
         return whole
 
     def _parse(self, line: str) -> list[Event]:
@@ -152,7 +155,7 @@ class CarmenLog:
         return [OdometryEvent(scan.stamp_ns, _pose(rest[3:6])), ScanEvent(scan)]
 
     def _robotlaser(self, words: list[str]) -> list[Event]:
-        """Events of a line of these words.
+        """Events of a line with these words.
 
         ROBOTLASER1 type start fov step max_range accuracy mode n range...
         m remission... lx ly lt x y t ...
@@ -172,8 +175,8 @@ class CarmenLog:
         T_odom_laser = _pose(rest[0:3])
         T_odom_base = _pose(rest[3:6])
         if self._T_base_laser is None:
-            # A mount is rigid: the first line's stands for all, without the last digits that
-            # rounding made up.
+            # The laser is mounted rigidly: the offset of the first line is used for all, without
+            # its rounding errors.
             self._T_base_laser = np.round(se2.between(T_odom_base, T_odom_laser), 3)
         mount = self._offset() if self.options.offset_m else self._T_base_laser
         limit = min(max_range, self.options.max_range_m)
@@ -194,17 +197,17 @@ class CarmenLog:
         if not ranges:
             raise ValueError('no range: expected one or more')
         values = np.array(ranges, dtype=np.float64)
-        with np.errstate(over='ignore'):  # a range beyond float32 is a "no return" as inf is
+        with np.errstate(over='ignore'):  # a range beyond float32 is a "no return", as inf
             return Scan.create(
                 stamp_ns, values, *fan, self.options.range_min_m, limit, T_base_laser
             )
 
 
 def _check_length(words: list[str], count: int, expected: str) -> None:
-    """Refuse a line whose words do not come out even; a host and logger's stamp may follow."""
+    """Raise ValueError if the number of words is wrong; host and logger stamp may follow."""
     if not count <= len(words) <= count + 2:
         raise ValueError(
-            f'{len(words)} words where {count} to {count + 2} belong: expected {expected}'
+            f'{len(words)} words instead of {count} to {count + 2}: expected {expected}'
         )
 
 
@@ -220,7 +223,7 @@ def _stamp(word: str) -> int:
     if not (
         seconds.isdigit() and (fraction == '' or fraction.isdigit()) and int(seconds) < _LATEST_S
     ):
-        raise ValueError(f'stamp {shown(word)}: expected seconds from 0 to {_LATEST_S}')
+        raise ValueError(f'stamp {quoted(word)}: expected seconds from 0 to {_LATEST_S}')
     return int(seconds) * _SECOND_NS + int(f'{fraction:0<9.9}')
 
 

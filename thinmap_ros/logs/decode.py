@@ -1,4 +1,4 @@
-"""Messages as a bag gives them (rosbags' own classes, with the fields of ROS's) -> core values."""
+"""Conversion of messages of a bag (rosbags' classes, with the fields of ROS) to core values."""
 
 import math
 from typing import Any

@@ -1,4 +1,4 @@
-"""Core values -> message objects for a bag, made without ROS."""
+"""Conversion of core values to message objects for a bag, without ROS."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ _SECOND_NS = 1_000_000_000
 
 
 class BagObjects:
-    """Makes message objects of a typestore's types."""
+    """Makes message objects of the types of a typestore."""
 
     def __init__(self, types: dict[str, Any]) -> None:
         self._types = types

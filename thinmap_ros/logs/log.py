@@ -1,4 +1,4 @@
-"""What a log or bag holds for us, in the order in which it was written, and how its file begins."""
+"""Events of a log or bag, in the order of writing, and detection of file formats."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -38,18 +38,18 @@ Event = OdometryEvent | ScanEvent
 
 @dataclass
 class SkippedRecords:
-    """What could not be used: how often, and the first case."""
+    """Number of unusable records, and the first one."""
 
     count: int = 0
     first: str = ''
 
     def add(self, where: str) -> None:
-        """Count one more."""
+        """Count a record."""
         self.count += 1
         self.first = self.first or where
 
     def add_first(self, where: str) -> None:
-        """Count one more, which is named before what came first."""
+        """Count a record and report it as the first one."""
         self.count += 1
         self.first = where
 
@@ -103,7 +103,7 @@ def paired_scans(log: Log) -> Iterator[tuple[Scan, Array]]:
 
 
 def refuse_foreign(path: Path) -> None:
-    """Raise InputError, with the command that converts it, at a ROS 1 bag or a bare SQLite file."""
+    """Raise InputError, with a command for conversion, for a ROS 1 bag or a bare SQLite file."""
     begin = _begin(path)
     convert = f'rosbags-convert --src {path} --dst {path.stem} --dst-storage mcap'
     if begin.startswith(_ROS1):
@@ -120,12 +120,12 @@ def refuse_foreign(path: Path) -> None:
 
 
 def is_mcap(path: Path) -> bool:
-    """Whether a file begins as MCAP files do, whatever its name is."""
+    """Whether a file begins with the magic bytes of MCAP."""
     return _begin(path).startswith(_MCAP)
 
 
 def _begin(path: Path) -> bytes:
-    """First bytes; none of what is no file or cannot be read: whoever opens it says so."""
+    """First bytes of a file; empty if it cannot be read: opening it reports the error."""
     try:
         with path.open('rb') as stream:
             return stream.read(16)

@@ -1,7 +1,7 @@
-"""MCAP files, whole, cut off or damaged: their whole messages in log order or in file order.
+"""Reads MCAP files, also truncated or damaged ones: intact messages in log order or file order.
 
 The `mcap` package has no recovery (`mcap recover` is a program written in Go), and neither it nor
-rosbags bounds what a compressed chunk expands to; of `mcap` the records are used.
+rosbags limits the decompressed size of a chunk. Only the record types of `mcap` are used.
 """
 
 import heapq
@@ -35,9 +35,9 @@ from thinmap_ros.logs.mcap_records import (
 )
 
 MAX_DEFINITIONS_BYTES = 64 * 2**20
-"""Bytes of all schemas and channels of a file."""
-_LARGEST_SUMMARY = 64 * 2**20
-_MOST_HELD = 512 * 2**20
+"""Maximum bytes of all schemas and channels of a file."""
+_MAX_SUMMARY_BYTES = 64 * 2**20
+_MAX_BUFFERED_BYTES = 512 * 2**20
 _STRETCH = 2**20
 _FOOTER = struct.Struct('<QQI')
 _PLAIN = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
@@ -47,7 +47,7 @@ _PRIVATE = 0x80
 
 @dataclass
 class Damage:
-    """What of a file is not whole: by the byte where it begins, what was found there."""
+    """Damaged parts of a file: description by first byte."""
 
     is_truncated: bool = False
     parts: dict[int, str] = field(default_factory=dict)
@@ -67,7 +67,7 @@ class Damage:
 
 @dataclass
 class Definitions:
-    """Schemas and channels by their ids; of two with the same id the later one counts."""
+    """Schemas and channels by id; the later one of equal ids counts."""
 
     path: Path
     schemas: dict[int, Schema] = field(default_factory=dict)
@@ -75,7 +75,7 @@ class Definitions:
     _bytes: int = 0
 
     def add(self, record: Definition) -> None:
-        """Add a schema or channel. Raises InputError where they get too large altogether."""
+        """Add a schema or channel. Raises InputError if their total size is too large."""
         known: dict[int, Any] = self.schemas if isinstance(record, Schema) else self.channels
         if record == known.get(record.id):
             return
@@ -89,7 +89,7 @@ class Definitions:
             )
 
     def of(self, channel_id: int) -> tuple[Schema, Channel] | None:
-        """Channel and its schema; None where one of them is not known."""
+        """Channel and its schema; None if one of them is unknown."""
         channel = self.channels.get(channel_id)
         schema = None if channel is None else self.schemas.get(channel.schema_id)
         return None if channel is None or schema is None else (schema, channel)
@@ -97,10 +97,10 @@ class Definitions:
 
 @dataclass(frozen=True)
 class ChunkSpan:
-    """A chunk, or a stretch of records outside of chunks: from byte `start` to `end` of the file.
+    """A chunk, or a range of records outside of chunks: bytes `start` to `end` of the file.
 
-    whole: it was not cut off; first_ns: log time of its earliest message; channel_ids: those that
-    it has messages of, None where that is not known.
+    whole: it is not truncated; first_ns: log time of its earliest message; channel_ids: channels of
+    its messages, None if unknown.
     """
 
     start: int
@@ -113,35 +113,35 @@ class ChunkSpan:
 
 @dataclass(frozen=True)
 class Summary:
-    """What a file that was closed says of itself at its end."""
+    """Summary section of a file that was closed properly."""
 
     definitions: list[Definition]
     blocks: list[ChunkSpan]
 
 
 class McapFile:
-    """An MCAP file opened for reading in log order: by its summary, or without one by a first pass.
+    """An MCAP file opened for reading in log order, by its summary, or by a first pass without one.
 
-    damage: what is not whole, which may show late where there is a summary; has_messages: whether
+    damage: damaged parts; with a summary, some are found only while reading. has_messages: whether
     there are any.
     """
 
     def __init__(self, path: Path) -> None:
-        """Raises InputError where it is no MCAP file, OSError where there is none."""
+        """Raises InputError if it is no MCAP file, OSError if it is missing."""
         self.path = path
         self.damage = Damage()
         self.definitions = Definitions(path)
         summary = summary_of(path)
         for record in summary.definitions:
             self.definitions.add(record)
-        self._blocks = summary.blocks if self.definitions.channels else []
-        if not self._blocks:
+        self._chunk_spans = summary.blocks if self.definitions.channels else []
+        if not self._chunk_spans:
             for block, records in _walk(path, summary, self.damage):
                 for record in records.definitions:
                     self.definitions.add(record)
                 if records.log_ns.size:
-                    self._blocks.append(block)
-        self.has_messages = bool(self._blocks)
+                    self._chunk_spans.append(block)
+        self.has_messages = bool(self._chunk_spans)
 
     def messages(self, topics: set[str] | None = None) -> Iterator[tuple[Schema, Channel, Message]]:
         """Messages of the given topics, or of all, in the order of the log."""
@@ -156,7 +156,9 @@ class McapFile:
 
     def _in_log_order(self, channel_ids: frozenset[int]) -> Iterator[Message]:
         queue = _LogOrder(channel_ids)
-        blocks = [b for b in self._blocks if b.channel_ids is None or b.channel_ids & channel_ids]
+        blocks = [
+            b for b in self._chunk_spans if b.channel_ids is None or b.channel_ids & channel_ids
+        ]
         with self.path.open('rb') as stream:
             for block in sorted(blocks, key=lambda b: b.first_ns):
                 yield from queue.before(block.first_ns)
@@ -172,9 +174,9 @@ class McapFile:
 
 
 class _LogOrder:
-    """Merges the messages of blocks by log time.
+    """Merges the messages of chunks by log time.
 
-    It holds about _MOST_HELD bytes at most: beyond that, messages come out of order.
+    It buffers about _MOST_HELD bytes at most: beyond that, messages are out of order.
     """
 
     def __init__(self, channel_ids: frozenset[int]) -> None:
@@ -185,7 +187,7 @@ class _LogOrder:
         self._number = 0
 
     def add(self, records: Records) -> None:
-        """Add the records of a block."""
+        """Add the records of a chunk."""
         wanted = np.flatnonzero(np.isin(records.channel_ids, self._wanted))
         order = wanted[np.argsort(records.log_ns[wanted], kind='stable')]
         if order.size:
@@ -195,9 +197,11 @@ class _LogOrder:
             heapq.heappush(self._heap, (int(records.log_ns[order[0]]), self._number, 0))
 
     def before(self, log_ns: int | None) -> Iterator[Message]:
-        """Messages before a log time, or all that are left."""
+        """Messages before a log time, or all remaining ones."""
         while self._heap:
-            if not (log_ns is None or self._heap[0][0] < log_ns or self._held > _MOST_HELD):
+            if not (
+                log_ns is None or self._heap[0][0] < log_ns or self._held > _MAX_BUFFERED_BYTES
+            ):
                 return
             _, number, place = self._heap[0]
             records, order = self._loaded[number]
@@ -212,9 +216,9 @@ class _LogOrder:
 
 
 def intact_records(path: Path, damage: Damage) -> Iterator[Definition | Message]:
-    """Whole schemas, channels and messages in file order; what is not whole is noted in `damage`.
+    """Intact schemas, channels and messages in file order; damaged parts are added to `damage`.
 
-    Raises InputError where the file does not begin as MCAP files do.
+    Raises InputError if the file does not begin with the magic bytes of MCAP.
     """
     summary = summary_of(path)
     yield from summary.definitions
@@ -224,16 +228,16 @@ def intact_records(path: Path, damage: Damage) -> Iterator[Definition | Message]
 
 
 def _walk(path: Path, summary: Summary, damage: Damage) -> Iterator[tuple[ChunkSpan, Records]]:
-    """Blocks and their records in file order; what is not whole is noted in `damage`.
+    """Chunk spans and their records in file order; damaged parts are added to `damage`.
 
-    Where records no longer follow each other, it goes on at the next chunk of the summary.
-    Raises InputError where the file does not begin as MCAP files do.
+    After a damaged part, reading continues at the next chunk of the summary. Raises InputError if
+    the file does not begin with the magic bytes of MCAP.
     """
     with path.open('rb') as stream:
         if stream.read(len(MAGIC)) != MAGIC:
             raise InputError(f'{path}: no MCAP file: expected it to begin with {MAGIC!r}')
         chunks = sorted(block.start for block in summary.blocks)
-        for block in _blocks(stream, path.stat().st_size, chunks, damage):
+        for block in _chunk_spans(stream, path.stat().st_size, chunks, damage):
             try:
                 records = _load(stream, block)
             except DamagedError as error:
@@ -245,10 +249,12 @@ def _walk(path: Path, summary: Summary, damage: Damage) -> Iterator[tuple[ChunkS
             yield replace(block, first_ns=records.first_ns, channel_ids=channel_ids), records
 
 
-def _blocks(stream: BinaryIO, size: int, chunks: list[int], damage: Damage) -> Iterator[ChunkSpan]:
-    """Blocks of a file of `size` bytes; `chunks`: where its summary says that chunks begin.
+def _chunk_spans(
+    stream: BinaryIO, size: int, chunks: list[int], damage: Damage
+) -> Iterator[ChunkSpan]:
+    """Chunk spans of a file of `size` bytes; `chunks`: first bytes of chunks by the summary.
 
-    What a recorder has added since is left alone.
+    Data that a recorder has appended since are ignored.
     """
     at = len(MAGIC)
     stretch = at
@@ -265,7 +271,7 @@ def _blocks(stream: BinaryIO, size: int, chunks: list[int], damage: Damage) -> I
             stream.seek(size - len(MAGIC))
             damage.is_truncated = (
                 stream.read() != MAGIC
-            )  # the messages are whole, the summary is not
+            )  # the messages are intact, the summary is not
             return
         if code == Opcode.CHUNK:
             yield ChunkSpan(at, min(end, size), is_chunk=True, whole=end <= size)
@@ -285,7 +291,7 @@ def _blocks(stream: BinaryIO, size: int, chunks: list[int], damage: Damage) -> I
 
 
 def _load(stream: BinaryIO, block: ChunkSpan) -> Records:
-    """Records of a block. Raises DamagedError."""
+    """Records of a chunk span. Raises DamagedError."""
     stream.seek(block.start)
     if not block.is_chunk:
         return records_of(stream.read(block.end - block.start))
@@ -299,7 +305,7 @@ def _load(stream: BinaryIO, block: ChunkSpan) -> Records:
 
 
 def summary_of(path: Path) -> Summary:
-    """Summary at the end of a file, empty where it was cut off or its summary cannot be read."""
+    """Summary at the end of a file; empty if it is truncated or the summary is unreadable."""
     size = path.stat().st_size
     with path.open('rb') as stream:
         footer_at = size - len(MAGIC) - HEAD.size - _FOOTER.size
@@ -308,11 +314,11 @@ def summary_of(path: Path) -> Summary:
         if footer_at < 0 or footer[: HEAD.size] != HEAD.pack(Opcode.FOOTER, _FOOTER.size):
             return Summary([], [])
         start, _, checksum = _FOOTER.unpack_from(footer, HEAD.size)
-        if not len(MAGIC) <= start <= footer_at or footer_at - start > _LARGEST_SUMMARY:
+        if not len(MAGIC) <= start <= footer_at or footer_at - start > _MAX_SUMMARY_BYTES:
             return Summary([], [])
         stream.seek(start)
         content = stream.read(footer_at - start)
-    # The checksum covers the footer up to itself.
+    # The checksum covers the footer up to the checksum field.
     if checksum and zlib.crc32(content + footer[: HEAD.size + _FOOTER.size - 4]) != checksum:
         return Summary([], [])
     try:
@@ -342,7 +348,7 @@ def _indexed(record: bytes, data_end: int) -> ChunkSpan:
     end = index.chunk_start_offset + index.chunk_length
     if not len(MAGIC) <= index.chunk_start_offset <= end - HEAD.size <= data_end - HEAD.size:
         raise DamagedError(f'chunk at byte {index.chunk_start_offset}')
-    # Writers may leave out which channels a chunk has messages of.
+    # Writers may omit the channels of a chunk.
     channel_ids = frozenset(index.message_index_offsets) or None
     first_ns = index.message_start_time
     return ChunkSpan(

@@ -1,4 +1,4 @@
-"""Records of MCAP files within limits: memory is taken for what is there, not for what is claimed.
+"""Records of MCAP files, within limits: declared sizes are checked before memory is allocated.
 
 Source: https://mcap.dev/spec.
 """
@@ -22,16 +22,16 @@ from numpy.typing import NDArray
 
 MAGIC = b'\x89MCAP0\r\n'
 MAX_CHUNK_BYTES = 256 * 2**20
-"""Bytes of a chunk, uncompressed, and of a message. Recorders close a chunk at 1 to 4 MB."""
+"""Maximum bytes of a chunk (uncompressed) and of a message. Recorders use chunks of 1 to 4 MB."""
 LATEST_NS = 2**31 * 1_000_000_000
-"""Log times end here, in 2038, as the seconds of ROS's messages do."""
+"""Upper limit of log times, in 2038, as of the seconds in ROS messages."""
 
 HEAD = struct.Struct('<BQ')
 _CHUNK = struct.Struct('<QQQI')
 _MESSAGE = struct.Struct('<HIQQ')
 _IN_CHUNK = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 _PRIVATE = 0x80
-_MOST_DEFINITIONS = 2**16
+_MAX_DEFINITIONS = 2**16
 _PIECE = 2**20
 _SLICE = 2**16
 
@@ -39,15 +39,15 @@ Definition = Schema | Channel
 
 
 class DamagedError(Exception):
-    """Bytes that are not what their place in the file says: what was found, what was expected."""
+    """Damaged bytes: what was found, and what was expected."""
 
 
 @dataclass(frozen=True, eq=False)
 class Records:
-    """The records of a chunk, or of a stretch of the file without chunks.
+    """The records of a chunk, or of a range of the file without chunks.
 
     definitions: schemas and channels; log_ns (N,), channel_ids (N,), offsets (N,): the messages in
-    file order, offsets into `data`; damaged: why records were left out, empty where none were.
+    file order, with offsets into `data`; damaged: why records were omitted, else empty.
     """
 
     data: bytes
@@ -59,11 +59,11 @@ class Records:
 
     @property
     def first_ns(self) -> int:
-        """Log time of the earliest message, 0 where there is none."""
+        """Log time of the earliest message; 0 if there are none."""
         return int(self.log_ns.min()) if self.log_ns.size else 0
 
     def message(self, index: int) -> Message:
-        """Message by its place in `offsets`."""
+        """Message by its index in `offsets`."""
         at = int(self.offsets[index])
         (_, length) = HEAD.unpack_from(self.data, at - HEAD.size)
         channel_id, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(self.data, at)
@@ -76,9 +76,9 @@ class Records:
 
 
 def chunk_records(content: bytes, whole: bool) -> Records:
-    """Records of a chunk record's content; if it was cut off (not `whole`), those before the cut.
+    """Records in the content of a chunk; if it is truncated (not `whole`), those before the end.
 
-    Raises DamagedError where it has been changed or is larger than LARGEST_CHUNK.
+    Raises DamagedError if it is corrupt or larger than MAX_CHUNK_BYTES.
     """
     try:
         _, _, size, checksum = _CHUNK.unpack_from(content)
@@ -86,25 +86,25 @@ def chunk_records(content: bytes, whole: bool) -> Records:
         compression = content[_CHUNK.size + 4 : _CHUNK.size + 4 + n].decode('ascii')
         (length,) = struct.unpack_from('<Q', content, _CHUNK.size + 4 + n)
     except (struct.error, ValueError) as error:
-        raise DamagedError(f'no head of a chunk: {_short(error)}') from error
+        raise DamagedError(f'no chunk header: {_short(error)}') from error
     packed = content[_CHUNK.size + 12 + n : _CHUNK.size + 12 + n + length]
     if whole and len(packed) < length:
         raise DamagedError(f'{len(packed)} bytes compressed: expected {length}')
-    # The length of the whole record may be what is damaged.
+    # The length of the record itself may be damaged.
     complete = len(packed) == length
     data = decompress(compression, packed, size, complete)
     if complete and len(data) != size:
         raise DamagedError(f'{len(data)} bytes uncompressed: expected {size}')
     if complete and checksum and zlib.crc32(data) != checksum:
-        raise DamagedError('checksum that does not fit its bytes')
+        raise DamagedError('wrong checksum')
     return records_of(data, complete)
 
 
 def decompress(compression: str, data: bytes, size: int, whole: bool = True) -> bytes:
-    """Uncompressed bytes; of data that was cut off (not `whole`) what comes out before the cut.
+    """Uncompressed bytes; of truncated data (not `whole`), those before the end.
 
-    size: what the file claims, bytes; no more is ever unpacked. Raises DamagedError where it is
-    more than LARGEST_CHUNK, or the data expand to more than it.
+    size: declared bytes; no more is ever decompressed. Raises DamagedError if it exceeds
+    MAX_CHUNK_BYTES, or the data expand to more than declared.
     """
     if size > MAX_CHUNK_BYTES:
         raise DamagedError(f'{size} bytes uncompressed: expected at most {MAX_CHUNK_BYTES}')
@@ -118,7 +118,7 @@ def decompress(compression: str, data: bytes, size: int, whole: bool = True) -> 
         for piece in pieces:
             result += piece
             if len(result) > size:
-                raise DamagedError(f'more than the {size} bytes uncompressed that it claims')
+                raise DamagedError(f'more than the declared {size} bytes uncompressed')
     except (RuntimeError, zstandard.ZstdError) as error:
         if whole:
             raise DamagedError(f'{compression}: {_short(error)}') from error
@@ -143,11 +143,11 @@ def _lz4_pieces(data: bytes) -> Iterator[bytes]:
 
 
 def records_of(data: bytes, whole: bool = True) -> Records:
-    """Records that lie one after the other in `data`, up to its end or to bytes that are no record.
+    """Consecutive records in `data`, up to its end or to bytes that are no record.
 
-    The message before such bytes is left out, too: most likely its own length is wrong. Of data
-    that was cut off (not `whole`) an incomplete last record is expected. Raises DamagedError at
-    too many definitions.
+    The message before such bytes is omitted, too: most likely its length is wrong. In truncated
+    data (not `whole`) an incomplete last record is expected. Raises DamagedError if there are too
+    many definitions.
     """
     found = _Found([], array('Q'), array('H'), array('Q'))
     at = 0
@@ -161,7 +161,7 @@ def records_of(data: bytes, whole: bool = True) -> Records:
         found.add(code, data, start, length)
         at = start + length
     if at < len(data) and (whole or not is_record):
-        found.leave_out_last(f'no record at byte {at} of {len(data)}')
+        found.drop_last(f'no record at byte {at} of {len(data)}')
     return Records(
         data,
         found.definitions,
@@ -174,7 +174,7 @@ def records_of(data: bytes, whole: bool = True) -> Records:
 
 @dataclass
 class _Found:
-    """Collects the records of some bytes; 18 bytes a message, however many a chunk has."""
+    """Collects the records of some bytes, in 18 bytes per message."""
 
     definitions: list[Definition]
     log_ns: 'array[int]'
@@ -183,7 +183,7 @@ class _Found:
     damaged: str = ''
 
     def add(self, code: int, data: bytes, start: int, length: int) -> None:
-        """Add a record by where its content lies, or note why it is none."""
+        """Add a record by the position of its content, or store why it is invalid."""
         try:
             if code == Opcode.MESSAGE:
                 self._add_message(data, start, length)
@@ -191,11 +191,11 @@ class _Found:
                 self.definitions.append(definition(code, data[start : start + length]))
         except DamagedError as error:
             self.damaged = self.damaged or str(error)
-        if len(self.definitions) > _MOST_DEFINITIONS:
-            raise DamagedError(f'more than {_MOST_DEFINITIONS} schemas and channels')
+        if len(self.definitions) > _MAX_DEFINITIONS:
+            raise DamagedError(f'more than {_MAX_DEFINITIONS} schemas and channels')
 
-    def leave_out_last(self, reason: str) -> None:
-        """Leave the last message out."""
+    def drop_last(self, reason: str) -> None:
+        """Omit the last message."""
         self.damaged = self.damaged or reason
         for values in (self.log_ns, self.channel_ids, self.offsets):
             del values[-1:]
@@ -212,7 +212,7 @@ class _Found:
 
 
 def definition(code: int, content: bytes) -> Definition:
-    """Schema or channel from its record's content. Raises DamagedError where it is none."""
+    """Schema or channel from the content of its record. Raises DamagedError if it is invalid."""
     stream = ReadDataStream(BytesIO(content))
     builder = RecordBuilder()
     try:
@@ -220,7 +220,7 @@ def definition(code: int, content: bytes) -> Definition:
         record.write(builder)
     except (McapError, struct.error, ValueError) as error:
         raise DamagedError(f'{Opcode(code).name.lower()}: {_short(error)}') from error
-    # mcap reads what is there of a string that claims to be longer.
+    # mcap accepts strings whose declared length exceeds the data.
     if not content.startswith(builder.end()[HEAD.size :]):
         raise DamagedError(
             f'{Opcode(code).name.lower()}: lengths that do not fit its {len(content)} bytes'

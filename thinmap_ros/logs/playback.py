@@ -1,7 +1,4 @@
-"""Which messages of a bag are due, in a time that is told.
-
-It runs, stands still, goes by steps, or begins again.
-"""
+"""Messages of a bag that are due, for a clock that runs, pauses, steps or loops."""
 
 from collections.abc import Iterator
 
@@ -14,20 +11,20 @@ _SCAN = 'sensor_msgs/msg/LaserScan'
 
 
 def is_scan(message: RawMessage) -> bool:
-    """Whether a message is a laser scan: what steps and lockstep go by."""
+    """Whether a message is a laser scan, the unit of steps and lockstep."""
     return message.type_name == _SCAN
 
 
 class Playback:
-    """Goes through chosen topics of a bag from an offset on.
+    """Plays selected topics of a bag from an offset.
 
-    What is latched is known from the start: `known_before` holds the last message before the offset
-    of each such topic, and all static transforms of the bag, as where the sensors sit is known
-    before anything is sensed.
+    Latched messages are available from the start: `known_before` holds the last message of each
+    such topic before the offset, and all static transforms of the bag, because sensor poses are
+    needed before the first measurement.
     """
 
     def __init__(self, bag: Bag, topics: set[str], start_offset_s: float, loop: bool) -> None:
-        """Read up to the offset. Raises InputError where the bag ends before it."""
+        """Read up to the offset. Raises InputError if the bag ends before it."""
         self._bag = bag
         self._topics = topics
         self._loop = loop
@@ -41,29 +38,26 @@ class Playback:
 
     @property
     def finished(self) -> bool:
-        """Whether nothing is left."""
+        """Whether all messages have been played."""
         return self._next is None
 
     @property
     def clock_ns(self) -> int:
-        """Time of the bag, ns: what was played, and never past a message that is still to come."""
+        """Time of the bag, ns, never beyond the next message."""
         return self.played_ns if self._next is None else min(self.played_ns, self._next.log_ns)
 
     def advance(self, ns: float) -> None:
-        """Let time of the bag pass, ns."""
+        """Advance the time of the bag, ns."""
         self.played_ns += int(ns)
 
-    def due(self) -> RawMessage | None:
-        """Next message whose time has come; None where there is none yet.
-
-        After the last one a loop begins again.
-        """
+    def pop_due(self) -> RawMessage | None:
+        """Next message that is due, or None. A loop restarts after the last message."""
         if self._next is None or self._next.log_ns > self.played_ns:
             return None
         return self._take()
 
     def step(self) -> list[RawMessage]:
-        """Messages up to and with the next scan; in a bag without scans the next message."""
+        """Messages up to and including the next scan; without scans, the next message."""
         has_scans = any(self._bag.topics[topic] == _SCAN for topic in self._topics)
         taken: list[RawMessage] = []
         while self._next is not None:

@@ -1,7 +1,4 @@
-"""Qualities of service as bags hold them.
-
-Written with each topic, so that players offer what was offered.
-"""
+"""QoS profiles in bags, stored with each topic so that players can offer the same."""
 
 from typing import Any
 
@@ -26,7 +23,7 @@ _DEEPEST_QUEUE = 100_000
 
 
 def of_channel(channel: Channel) -> list[Qos]:
-    """QoS that the publishers of a channel offered; empty where it says none that can be read."""
+    """QoS of the publishers of a channel; empty if missing or unreadable."""
     text = channel.metadata.get(KEY, '')
     try:
         content: Any = parse_yaml(text) if text else []
@@ -39,7 +36,7 @@ def of_channel(channel: Channel) -> list[Qos]:
 
 
 def recorded(depth: int, reliable: bool, latched: bool) -> Qos:
-    """What is written of a topic: depth, whether it is reliable, whether it is transient local."""
+    """Stored QoS of a topic: depth, reliability, durability."""
     return Qos(
         history=QosHistory.KEEP_LAST,
         depth=depth,
@@ -54,11 +51,9 @@ def recorded(depth: int, reliable: bool, latched: bool) -> Qos:
 
 
 def is_latched(topic: str, offers: list[Qos]) -> bool:
-    """Whether who comes late is to hear the last message of a topic.
+    """Whether late subscribers receive the last message of a topic: all publishers offered it.
 
-    All its publishers offered that.
-
-    Converted bags say nothing about static transforms, which are always latched.
+    Converted bags have no QoS of static transforms, which are always latched.
     """
     if not offers:
         return topic.endswith('tf_static')
@@ -66,13 +61,10 @@ def is_latched(topic: str, offers: list[Qos]) -> bool:
 
 
 def is_reliable(offers: list[Qos]) -> bool:
-    """Whether a topic is to be offered as reliable: so it is where nothing else was recorded."""
+    """Whether to offer a topic as reliable; the default if no QoS was recorded."""
     return all(offer.reliability is not QosReliability.BEST_EFFORT for offer in offers)
 
 
 def depth(offers: list[Qos]) -> int:
-    """How many messages of a topic its publishers kept, all together.
-
-    The graph does not always tell.
-    """
+    """Total queue depth of the publishers of a topic; the graph does not always report it."""
     return sum(max(offer.depth, 1) for offer in offers)

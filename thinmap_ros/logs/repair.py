@@ -1,4 +1,4 @@
-"""MCAP files cut off or damaged: every record that is whole, and a new file made of them."""
+"""Repairs truncated or damaged MCAP files: copies every intact record to a new file."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,7 +19,7 @@ from thinmap_ros.logs.storage import own_typestore
 
 @dataclass
 class RepairReport:
-    """What was found: messages by topic, damage by file, messages that cannot be unpacked."""
+    """Messages by topic, damage by file, and number of messages that cannot be decompressed."""
 
     counts: dict[str, int] = field(default_factory=dict)
     first_ns: int | None = None
@@ -28,23 +28,23 @@ class RepairReport:
     unreadable: int = 0
 
     def count(self, topic: str, log_ns: int) -> None:
-        """Count one message."""
+        """Count a message."""
         self.counts[topic] = self.counts.get(topic, 0) + 1
         self.first_ns = log_ns if self.first_ns is None else min(self.first_ns, log_ns)
         self.last_ns = max(self.last_ns, log_ns)
 
     @property
     def reason(self) -> str:
-        """What is not whole, in one line, by the first such file; empty where all of them are."""
+        """Damage of the first damaged file, in one line; empty if all files are intact."""
         return next((str(damage) for damage in self.damage.values() if damage), '')
 
 
 def repair(files: list[Path], folder: Path, compressed_messages: bool = False) -> RepairReport:
-    """Write what is whole in MCAP files into folder/NAME.mcap and folder/metadata.yaml.
+    """Write the intact records of MCAP files to folder/NAME.mcap and folder/metadata.yaml.
 
-    NAME is the folder's.
-    compressed_messages: each message is compressed on its own; it is written unpacked.
-    Raises InputError where a file is no MCAP file, or no whole message is left.
+    NAME is that of the folder.
+    compressed_messages: messages are compressed individually; they are written decompressed.
+    Raises InputError if a file is no MCAP file, or no message is intact.
     """
     found = RepairReport()
     channels: dict[str, Channel] = {}
@@ -58,7 +58,7 @@ def repair(files: list[Path], folder: Path, compressed_messages: bool = False) -
         writer.finish()
     if not found.counts:
         reason = f': {found.reason}' if found.reason else ''
-        raise InputError(f'{files[0]}: no whole message is left in it{reason}')
+        raise InputError(f'{files[0]}: no intact message{reason}')
     write_text(
         folder / 'metadata.yaml', yaml.safe_dump(_metadata(folder.name, found, channels, schemas))
     )
@@ -67,7 +67,7 @@ def repair(files: list[Path], folder: Path, compressed_messages: bool = False) -
 
 @dataclass
 class _Copy:
-    """Copies messages; the same topic of several files becomes one channel."""
+    """Copies messages; equal topics of several files are merged into one channel."""
 
     writer: Writer
     found: RepairReport
@@ -101,7 +101,7 @@ class _Copy:
             )
         if channel.topic not in self._channel_ids:
             if not qos.of_channel(channel):
-                # What cannot be read would keep players from the whole bag.
+                # Players refuse a bag with messages that cannot be decompressed.
                 kept = {key: value for key, value in channel.metadata.items() if key != qos.KEY}
                 channel = replace(channel, metadata=kept)
             self._channel_ids[channel.topic] = self.writer.register_channel(
@@ -123,11 +123,11 @@ class _Copy:
 
 
 def _hash(schema: Schema) -> str:
-    """Hash of a message type as ROS computes it; empty where its definition cannot be read."""
+    """ROS type hash of a message type; empty if its definition is unreadable."""
     try:
         return own_typestore(schema).hash_rihs01(schema.name)
     except Exception:
-        # rosbags' parser and hasher raise whatever a broken definition makes them stumble over.
+        # rosbags raises many types for invalid definitions.
         return ''
 
 

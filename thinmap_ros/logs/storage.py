@@ -1,6 +1,6 @@
 """Storage of a bag: MCAP files, read within limits, and SQLite files, read by rosbags.
 
-Also the message types that a file carries along.
+Also the message types that a file defines.
 """
 
 from collections.abc import Iterator
@@ -20,13 +20,13 @@ from thinmap_ros.logs import qos
 from thinmap_ros.logs.mcap_reader import Damage, McapFile
 
 MAX_SCHEMA_BYTES = 2**20
-"""Bytes of the definition of a message type with all that it is made of."""
+"""Maximum bytes of the definition of a message type, including its parts."""
 _IDL_SEPARATOR = '=' * 80 + '\n'
 
 
 @dataclass(frozen=True)
 class RawMessage:
-    """A message as it lies in a bag: topic, type, log time, CDR bytes."""
+    """A serialized message: topic, type, log time, CDR bytes."""
 
     topic: str
     type_name: str
@@ -43,20 +43,20 @@ class Storage(Protocol):
 
     @property
     def has_messages(self) -> bool:
-        """Whether there are messages in it."""
+        """Whether it has messages."""
         ...
 
     def typestore(self, type_name: str) -> Typestore:
-        """Types to decode messages of a type with."""
+        """Typestore for decoding messages of a type."""
         ...
 
     def messages(self, topics: set[str] | None) -> Iterator[RawMessage]:
-        """Whole messages of the given topics, or of all, in log order."""
+        """Intact messages of the given topics, or of all, in log order."""
         ...
 
 
 class McapStorage:
-    """An MCAP file, whole, cut off or damaged."""
+    """An MCAP file, possibly truncated or damaged."""
 
     def __init__(self, path: Path) -> None:
         self._file = McapFile(path)
@@ -74,7 +74,7 @@ class McapStorage:
                 self._schemas[known[0].name] = known[0]
 
     def typestore(self, type_name: str) -> Typestore:
-        """Types as the file defines them; ROS 2 Jazzy's where it does not."""
+        """Types that the file defines; otherwise those of ROS 2 Jazzy."""
         if type_name not in self._typestores:
             self._typestores[type_name] = typestore_of(self._schemas[type_name])
         return self._typestores[type_name]
@@ -91,7 +91,7 @@ class SqliteStorage:
     has_messages = True
 
     def __init__(self, path: Path) -> None:
-        """Raises InputError where it cannot be opened."""
+        """Raises InputError if it cannot be opened."""
         self._path = path
         self.damage = Damage()
         self.topics: dict[str, str] = {}
@@ -105,7 +105,7 @@ class SqliteStorage:
                             connection.ext.offered_qos_profiles
                         )
                 self._typestore = reader.typestore
-        except Exception as error:  # rosbags' readers raise whatever they stumble over
+        except Exception as error:  # rosbags raises many types for corrupt files
             reason = ' '.join(str(error).split())[:200] or type(error).__name__
             raise InputError(f'{path}: {reason}') from error
 
@@ -120,7 +120,7 @@ class SqliteStorage:
                 chosen = [c for c in reader.connections if topics is None or c.topic in topics]
                 for connection, log_ns, data in reader.messages(chosen) if chosen else ():
                     yield RawMessage(connection.topic, connection.msgtype, log_ns, bytes(data))
-        except Exception:  # as above: what came before it counts
+        except Exception:  # as above; earlier messages are kept
             self.damage.is_truncated = True
 
     def _reader(self) -> AnyReader:
@@ -128,21 +128,21 @@ class SqliteStorage:
 
 
 def storage_of(path: Path) -> Storage:
-    """Open a file of a bag. Raises InputError where it is none."""
+    """Open a file of a bag. Raises InputError if it is invalid."""
     return SqliteStorage(path) if path.suffix == '.db3' else McapStorage(path)
 
 
 def typestore_of(schema: Schema) -> Typestore:
-    """Types to decode messages of a schema with: its own, or ROS 2 Jazzy's where these do not do.
+    """Typestore for messages of a schema: its own types, or those of ROS 2 Jazzy.
 
-    That is where a definition cannot be read, lacks a type that it is made of, or lacks fields of a
-    type that Jazzy knows.
+    The latter if a definition is unreadable, lacks a nested type, or lacks fields of a type of
+    Jazzy.
     """
     known = get_typestore(Stores.ROS2_JAZZY)
     try:
         own = own_typestore(schema)
-        own.hash_rihs01(schema.name)  # raises where a type is missing
-    except Exception:  # rosbags' parser raises whatever a broken definition makes it stumble over
+        own.hash_rihs01(schema.name)  # raises if a type is missing
+    except Exception:  # rosbags raises many types for invalid definitions
         return known
     for name in own.fielddefs.keys() & known.fielddefs.keys():
         fields = own.fielddefs[name][1]
@@ -152,7 +152,7 @@ def typestore_of(schema: Schema) -> Typestore:
 
 
 def own_typestore(schema: Schema) -> Typestore:
-    """Types of one schema. Raises what rosbags' parser raises, and ValueError if too large."""
+    """Types of one schema. Raises errors of rosbags' parser, and ValueError if too large."""
     if len(schema.data) > MAX_SCHEMA_BYTES:
         raise ValueError(f'definition of {len(schema.data)} bytes: expected {MAX_SCHEMA_BYTES}')
     return _parsed(schema.name, schema.encoding, schema.data.decode())
@@ -164,7 +164,7 @@ def _parsed(name: str, encoding: str, text: str) -> Typestore:
     if 'idl' not in encoding:
         typestore.register(get_types_from_msg(text, name))
         return typestore
-    # rosbag2 puts the files that a type needs one behind the other, each below its name.
+    # rosbag2 concatenates the definitions that a type needs, each below its name.
     parts = [part.partition('\n')[2] for part in text.split(_IDL_SEPARATOR)[1:]]
     for part in parts or [text]:
         types = get_types_from_idl(part)

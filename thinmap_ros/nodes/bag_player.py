@@ -124,7 +124,7 @@ class BagPlayerNode(Node):
     def _chosen(self) -> list[str]:
         asked = {topic.strip() for topic in self._config.topics.split(',') if topic.strip()}
         if unknown := asked - set(self._bag.topics):
-            has = validation.listed(sorted(self._bag.topics))
+            has = validation.quoted_names(sorted(self._bag.topics))
             raise InputError(f'{self._config.bag}: no topic {sorted(unknown)[0]}; it has {has}')
         # A recorded clock would contradict the player's own.
         return sorted((asked or set(self._bag.topics)) - {'/clock'})
@@ -142,8 +142,8 @@ class BagPlayerNode(Node):
         except (InputError, NameValidationException) as error:
             reason = ' '.join(str(error).split())[:200]
             if self._config.topics:
-                raise InputError(f'{validation.abbreviated(topic)}: {reason}') from error
-            self.get_logger().warning(f'{validation.abbreviated(topic)} is not played: {reason}')
+                raise InputError(f'{validation.quoted_name(topic)}: {reason}') from error
+            self.get_logger().warning(f'{validation.quoted_name(topic)} is not played: {reason}')
 
     def _has_subscribers(self) -> bool:
         scans = [t for t in self._publishers_by_topic if self._bag.topics[t] == _SCAN]
@@ -171,7 +171,7 @@ class BagPlayerNode(Node):
 
     def _play(self, passed_s: float) -> None:
         self._playback.advance(1e9 * passed_s * self._config.rate)
-        while not self._lockstep.is_waiting and (message := self._playback.due()) is not None:
+        while not self._lockstep.is_waiting and (message := self._playback.pop_due()) is not None:
             self._send(message)
 
     def _send(self, message: RawMessage) -> None:

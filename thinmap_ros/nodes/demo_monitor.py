@@ -20,7 +20,7 @@ from thinmap_ros.files import package_data
 from thinmap_ros.files.atomic import write_text
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.ros import messages, node_main, parameters, qos
-from thinmap_ros.sim.coverage import coverable
+from thinmap_ros.sim.coverage import observable_cells
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
 
@@ -52,7 +52,7 @@ class DemoMonitorNode(Node):
         parameters.reject_unknown(self)
         world = World.from_patch(*read_world(package_data.world_path(self._config.world)))
         radius = PRESETS[self._config.robot].radius_m
-        self._coverable = coverable(world, world.start, radius, self._config.range_max_m)
+        self._coverable = observable_cells(world, world.start, radius, self._config.range_max_m)
         self._coverage = 0.0
         self._sent: Any = None
         self._sent_at = 0.0

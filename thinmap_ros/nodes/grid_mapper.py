@@ -66,7 +66,7 @@ class _MapPublishers:
         self._local_map = node.create_publisher(OccupancyGridMsg, 'local_map', qos.LATCHED)
 
     def publish_map(self, grid: CorrectableGrid, stamp_ns: int) -> None:
-        patch = grid.shown.patch()
+        patch = grid.shown.known_area()
         self._map.publish(messages.grid_msg(patch, self._frame, stamp_ns, grid.corrected_ns))
 
     def publish_local_map(self, window: GridPatch, stamp_ns: int, corrected_ns: int) -> None:
@@ -176,7 +176,7 @@ class GridMapperNode(ThinmapNode):
             return
         with self.diagnostics.time_step('map correction'):
             stamps_ns, poses = messages.trajectory_from_msg(message)
-            is_corrected = self._grid.correct(stamps_ns, poses, since_ns=corrected_ns)
+            is_corrected = self._grid.apply_correction(stamps_ns, poses, since_ns=corrected_ns)
         if not is_corrected:
             self.get_logger().warning('loop closed, but a loaded map is not corrected')
             self._publish_map()

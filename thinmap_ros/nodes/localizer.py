@@ -81,8 +81,8 @@ class _PosePublishers:
         status.header = header
         status.features = len(features)
         status.local_features = estimate.n_local_features
-        status.observed = estimate.observed
-        status.matched = estimate.matched
+        status.observed = estimate.observed_lines
+        status.matched = estimate.matched_lines
         status.refused = localizer.refused
         status.match_quality = estimate.inlier_ratio
         self._status.publish(status)
@@ -214,7 +214,7 @@ class LocalizerNode(ThinmapNode):
             estimate = self._localizer.step(scan, T_odom_base)
             step_ms = 1000.0 * (perf_counter() - started)
             self._publish(scan, estimate, step_ms)
-            if not estimate.lost:
+            if not estimate.is_lost:
                 self._last = OdometryAnchor(scan.stamp_ns, estimate.T_map_odom, T_odom_base)
         diagnostics = self.diagnostics
         diagnostics.set_drop_total('scans without odometry at their time', self._pairing.dropped)
@@ -312,7 +312,7 @@ def _state_of(scan: Scan, estimate: Estimate) -> int:
     """State of a SlamStatus; without valid beams it is unknown whether the robot is lost."""
     if scan.is_blind:
         return int(SlamStatus.BLIND)
-    return int(SlamStatus.LOST if estimate.lost else SlamStatus.TRACKING)
+    return int(SlamStatus.LOST if estimate.is_lost else SlamStatus.TRACKING)
 
 
 def _feature_msg(feature: Feature) -> LineFeature:

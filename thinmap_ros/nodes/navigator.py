@@ -50,7 +50,7 @@ class _RobotState:
         self._odometry.add(stamp_ns, T_odom_base)
 
     def add_pose(self, stamp_ns: int, T_map_base: Array) -> None:
-        T_odom_base = self._odometry.at(stamp_ns)
+        T_odom_base = self._odometry.interpolate(stamp_ns)
         if T_odom_base is not None:
             self._record_time('localizer')
             self._T_map_odom = se2.compose(T_map_base, se2.invert(T_odom_base))

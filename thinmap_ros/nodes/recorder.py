@@ -81,7 +81,9 @@ class RecorderNode(Node):
         latched = all(offer.durability == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers)
         try:
             kind = message_class(type_name)
-            self._writer.learn(package_data.message_definitions(type_name.partition('/')[0]))
+            self._writer.add_definitions(
+                package_data.message_definitions(type_name.partition('/')[0])
+            )
             self._writer.add_topic(
                 topic, type_name, [qos.recorded(o.depth, reliable, latched) for o in offers]
             )

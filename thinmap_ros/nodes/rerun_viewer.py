@@ -84,7 +84,7 @@ class RerunViewerNode(Node):
         def process(message: Any) -> None:
             self._diagnostics.message_received(topic)
             try:
-                self._feed.take(topic, message)
+                self._feed.show(topic, message)
             except InputError as error:
                 self._diagnostics.message_rejected(topic, str(error))
                 self.get_logger().warning(f'{topic}: {error}', throttle_duration_sec=_WARN_PERIOD_S)

@@ -18,7 +18,7 @@ from tf2_msgs.msg import TFMessage
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
-from thinmap_ros.core.errors import ConfigError, InputError, shown
+from thinmap_ros.core.errors import ConfigError, InputError, quoted
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
@@ -27,7 +27,7 @@ from thinmap_ros.ros.diagnostics import OK, WARN, NodeDiagnostics
 from thinmap_ros.ros.lockstep import NONE, PATIENCE_S, PATIENCE_WORDS, TOPICS, Lockstep
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS, DifferentialDriveRobot
-from thinmap_ros.sim.simulation import STEP_NS, Moment, Simulation
+from thinmap_ros.sim.simulation import STEP_NS, SensorReadings, Simulation
 from thinmap_ros.sim.world import World
 
 _COMMAND_TIMEOUT_NS = 500_000_000
@@ -77,7 +77,7 @@ class _SimPublishers:
             transform = messages.transform_msg(T_base_laser, 'base_link', 'laser', 0)
             self._tf_static.publish(TFMessage(transforms=[transform]))
 
-    def publish(self, moment: Moment, robot: DifferentialDriveRobot) -> None:
+    def publish(self, moment: SensorReadings, robot: DifferentialDriveRobot) -> None:
         """Publish a moment; the scan, if there is one, comes last."""
         ns = moment.stamp_ns
         self._publish_clock(ns)
@@ -93,7 +93,7 @@ class _SimPublishers:
             self._last_scan = messages.scan_msg(moment.scan, 'laser', self._scan_time_s)
             self._scan.publish(self._last_scan)
 
-    def repeat_scan(self, moment: Moment, robot: DifferentialDriveRobot) -> None:
+    def repeat_scan(self, moment: SensorReadings, robot: DifferentialDriveRobot) -> None:
         """Publish the last scan again, with time and odometry of a moment."""
         if self._last_scan is not None:
             self._publish_clock(moment.stamp_ns)
@@ -103,7 +103,7 @@ class _SimPublishers:
     def _publish_clock(self, ns: int) -> None:
         self._clock.publish(ClockMsg(clock=messages.time_msg(ns)))
 
-    def _publish_odometry(self, moment: Moment, robot: DifferentialDriveRobot) -> None:
+    def _publish_odometry(self, moment: SensorReadings, robot: DifferentialDriveRobot) -> None:
         velocity = (robot.v, robot.w)
         frames = ('odom', 'base_link')
         self._odom.publish(
@@ -161,7 +161,7 @@ class SimNode(Node):
         """Teleport the robot, for kidnapping tests: the odometry does not change."""
         self._diagnostics.message_received('~/set_pose')
         try:
-            self._sim.carry(messages.pose_from_msg(message.pose))
+            self._sim.teleport(messages.pose_from_msg(message.pose))
         except InputError as error:
             self._diagnostics.message_rejected('~/set_pose', str(error))
 
@@ -192,7 +192,7 @@ class SimNode(Node):
             self._output.repeat_scan(self._sim.read_sensors(), self._sim.robot)
         return True
 
-    def _publish(self, moment: Moment) -> None:
+    def _publish(self, moment: SensorReadings) -> None:
         self._output.publish(moment, self._sim.robot)
         if moment.scan is not None:
             self._lockstep.scan_published(moment.stamp_ns)
@@ -207,7 +207,7 @@ def _start(text: str, world: World) -> Array:
     try:
         x, y, theta = (float(part) for part in text.split(','))
     except ValueError as error:
-        raise ConfigError(f'start = {shown(text)}: expected "x,y,theta" in m, m, rad') from error
+        raise ConfigError(f'start = {quoted(text)}: expected "x,y,theta" in m, m, rad') from error
     return se2.pose(x, y, theta)
 
 

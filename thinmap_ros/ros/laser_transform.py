@@ -9,7 +9,7 @@ from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.errors import ConfigError, InputError, shown
+from thinmap_ros.core.errors import ConfigError, InputError, quoted
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.logs.laser_mount import Mount, StaticTransforms
@@ -61,12 +61,12 @@ class LaserTransform:
         mount = self._mount(message.header.frame_id)
         if mount is None:
             raise InputError(
-                f'scan in frame {shown(message.header.frame_id)}: no static transform from '
+                f'scan in frame {quoted(message.header.frame_id)}: no static transform from '
                 f'"{self._base_frame}" to it; publish one on /tf_static or set the parameter '
                 'laser_pose'
             )
         scan = messages.scan_from_msg(message, mount.T_base_laser, self._zero_is_no_return)
-        return mount.placed(scan)
+        return mount.apply(scan)
 
     def pose(self, frame_id: str) -> Array | None:
         """T_base_laser (3,) of a laser frame, or None as long as it is not known."""
@@ -77,7 +77,7 @@ class LaserTransform:
         if self._fixed is not None:
             return self._fixed
         if frame_id not in self._mounts:
-            found = self._transforms.mount(frame_id, self._base_frame)
+            found = self._transforms.laser_mount(frame_id, self._base_frame)
             if found is None:
                 return None
             self._mounts[frame_id] = found
@@ -100,5 +100,5 @@ def _parse_pose(text: str) -> Array:
     except ValueError:
         T = np.full(3, np.nan)
     if not se2.is_finite(T):
-        raise ConfigError(f'laser_pose = {shown(text)}: expected "x,y,yaw" in m, m, rad')
+        raise ConfigError(f'laser_pose = {quoted(text)}: expected "x,y,yaw" in m, m, rad')
     return T

@@ -50,13 +50,13 @@ def message_class(type_name: str) -> Any:
     parts = _TYPE_NAME.fullmatch(type_name)
     if parts is None:
         raise InputError(
-            f'message type {validation.abbreviated(type_name)}: expected PACKAGE/msg/NAME'
+            f'message type {validation.quoted_name(type_name)}: expected PACKAGE/msg/NAME'
         )
     try:
         return getattr(import_module(f'{parts[1]}.msg'), parts[2])
     except (ImportError, AttributeError) as error:
         raise InputError(
-            f'message type {validation.abbreviated(type_name)}: not installed here'
+            f'message type {validation.quoted_name(type_name)}: not installed here'
         ) from error
 
 
@@ -271,7 +271,7 @@ def grid_from_msg(message: OccupancyGrid) -> GridPatch:
     if abs(origin[2]) > 1e-6:
         raise InputError(f'map turned by {origin[2]} rad: expected an origin without rotation')
     cells = np.frombuffer(message.data, dtype=np.int8).reshape(info.height, info.width)
-    validation.cells_in_range(cells)
+    validation.require_occupancy(cells)
     return GridPatch(GridFrame(float(origin[0]), float(origin[1]), resolution), cells)
 
 
@@ -310,8 +310,8 @@ def topology_from_msg(message: TopologicalMapMsg) -> TopologicalMap:
     Raises InputError where a kind is unknown, an edge leads to no node, a number is given twice, or
     one is no number.
     """
-    validation.unique('nodes', [n.id for n in message.nodes])
-    validation.unique('edges', [e.id for e in message.edges])
+    validation.require_unique('nodes', [n.id for n in message.nodes])
+    validation.require_unique('edges', [e.id for e in message.edges])
     known = {n.id for n in message.nodes}
     for node in message.nodes:
         if node.kind not in list(NodeKind):

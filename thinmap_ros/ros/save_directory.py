@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rclpy.node import Node
 
-from thinmap_ros.core.errors import InputError, shown
+from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.files.sessions import ENDINGS, stem_of
 from thinmap_ros.ros import parameters
 
@@ -31,15 +31,15 @@ class SaveDirectory:
         """
         expected = f'expected a file below {self.path}'
         if not given.isprintable() or len(given) > _LONGEST_PATH:
-            raise InputError(f'path {shown(given)}: {expected}')
+            raise InputError(f'path {quoted(given)}: {expected}')
         stem_of(given)  # a path that names no session is refused as such
         try:
             resolved = (self.path / given).resolve()
             stem = stem_of(str(resolved))
             files = [stem.with_name(stem.name + ending).resolve() for ending in ENDINGS]
         except (OSError, RuntimeError) as error:  # RuntimeError: links that lead in a circle
-            raise InputError(f'path {shown(given)}: {error}: {expected}') from error
+            raise InputError(f'path {quoted(given)}: {error}: {expected}') from error
         for file in (resolved, *files):
             if not file.is_relative_to(self.path) or file == self.path:
-                raise InputError(f'path {shown(given)}: {expected}')
+                raise InputError(f'path {quoted(given)}: {expected}')
         return str(resolved)

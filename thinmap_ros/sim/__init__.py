@@ -1,1 +1,1 @@
-"""A world, a robot and a laser, stepped by hand: no ROS, seeded, as fast as the machine goes."""
+"""Simulator: world, robot and laser in fixed time steps, without ROS, reproducible by seed."""

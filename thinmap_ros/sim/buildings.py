@@ -1,6 +1,6 @@
-"""Buildings made by chance, from one seed each: rooms, corridors, halls, oblique wings, clutter.
+"""Random buildings, each from a seed: rooms, corridors, halls, oblique wings, clutter.
 
-Unlike drawn worlds they are as many as one likes: what was developed on some is judged on others.
+Any number of them can be generated: development and evaluation use different seeds.
 """
 
 import math
@@ -13,13 +13,20 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.se2 import Array
-from thinmap_ros.sim.floor_plan import WALL_M, FloorPlan, Kind, Opening, Part, floor_plan
+from thinmap_ros.sim.floor_plan import (
+    WALL_M,
+    FloorPart,
+    FloorPlan,
+    Kind,
+    Opening,
+    generate_floor_plan,
+)
 from thinmap_ros.sim.moving_obstacles import Doors, MovingObstacles, Pedestrians
 from thinmap_ros.sim.world import World
 
-DEVELOPMENT_SEEDS = range(1000)  # others are for judging
+DEVELOPMENT_SEEDS = range(1000)  # others are for evaluation
 MAX_AREA_M2 = 100_000.0
-_SMALLEST_M2 = 150.0
+_MIN_AREA_M2 = 150.0
 _FINE_M = 0.05
 _COARSE_M = 0.1
 _COARSE_FROM_M2 = 20_000.0
@@ -27,19 +34,19 @@ _MARGIN_M = 1.0
 _SOLID = 1
 _GLASS = 2
 _ROWS_AT_ONCE = 256
-_LINK_M = (1.8, 3.0)  # width of what joins two wings
+_LINK_M = (1.8, 3.0)  # width of the passage between two wings
 _GAP_M = (2.0, 6.0)
 _TRIES = 40
 _START_CLEAR_M = 0.45
-_KEEP_FREE_M = 1.0  # no furniture nearer to a door
+_KEEP_FREE_M = 1.0  # minimum distance of furniture from a door
 _AJAR_RAD = (0.6, 1.9)
-_SHUT_SHARE = 0.5  # of the time, where a door moves
-_PERIODS = 64  # of a door, before they come round again
+_SHUT_SHARE = 0.5  # share of the time
+_PERIODS = 64  # of a door, before they repeat
 
 
 @dataclass(frozen=True)
 class BuildingConfig:
-    """How a building is: shares between 0 and 1, areas in m2. None: by chance, from the seed."""
+    """Properties of a building: shares from 0 to 1, areas in m2. None: random, from the seed."""
 
     area_m2: float | None = None
     hall_share: float | None = None
@@ -60,7 +67,7 @@ class Wing:
 
 @dataclass(frozen=True)
 class Building:
-    """A world, what moves in it, and what it was made of."""
+    """A generated world and its properties."""
 
     world: World
     wings: list[Wing]
@@ -80,17 +87,17 @@ class _Link:
     width: float
 
 
-def building(seed: int, config: BuildingConfig | None = None) -> Building:
-    """Building of a seed; the same seed gives the same building on every machine.
+def generate_building(seed: int, config: BuildingConfig | None = None) -> Building:
+    """Generate the building of a seed; it is the same on every machine.
 
-    Raises InputError where the area is out of range.
+    Raises InputError if the area is out of range.
     """
     asked = config or BuildingConfig()
     rng = np.random.default_rng(seed)
-    chosen = _chosen(asked, rng)
+    chosen = _random_config(asked, rng)
     wings, links = _wings(chosen, rng)
-    frame, occupied = _painted(wings, links, chosen, rng)
-    moving = _moving(wings, chosen, rng)
+    frame, occupied = _rasterized(wings, links, chosen, rng)
+    moving = _moving_obstacles(wings, chosen, rng)
     name = f'building_{seed}'
     glass = occupied == _GLASS
     start = _start(wings[0], frame, occupied, rng)
@@ -99,8 +106,8 @@ def building(seed: int, config: BuildingConfig | None = None) -> Building:
     return Building(world, wings)
 
 
-def _chosen(asked: BuildingConfig, rng: np.random.Generator) -> BuildingConfig:
-    """All that was left to chance; drawn always, so that one choice leaves the others alone."""
+def _random_config(asked: BuildingConfig, rng: np.random.Generator) -> BuildingConfig:
+    """Draw all random properties; always all of them, so that each is independent of the others."""
     area = math.exp(rng.uniform(math.log(300.0), math.log(12_000.0)))
     if rng.random() < 0.1:
         area = math.exp(rng.uniform(math.log(12_000.0), math.log(MAX_AREA_M2)))
@@ -115,14 +122,14 @@ def _chosen(asked: BuildingConfig, rng: np.random.Generator) -> BuildingConfig:
     }
     given = {name: value for name, value in vars(asked).items() if value is not None}
     chosen = BuildingConfig(**{**drawn, **given})
-    if not _SMALLEST_M2 <= float(chosen.area_m2 or 0.0) <= MAX_AREA_M2:
-        expected = f'expected {_SMALLEST_M2:g} to {MAX_AREA_M2:g} m2'
+    if not _MIN_AREA_M2 <= float(chosen.area_m2 or 0.0) <= MAX_AREA_M2:
+        expected = f'expected {_MIN_AREA_M2:g} to {MAX_AREA_M2:g} m2'
         raise InputError(f'building: area_m2: {chosen.area_m2}: {expected}')
     return chosen
 
 
 def _wings(config: BuildingConfig, rng: np.random.Generator) -> tuple[list[Wing], list[_Link]]:
-    """The main wing at the origin, and others joined to it obliquely, as far as there is room."""
+    """The main wing at the origin, and oblique wings attached to it where they fit."""
     count = config.wings or 1
     share = 1.0 if count == 1 else 0.6
     area = config.area_m2 or 0.0
@@ -142,11 +149,11 @@ def _wings(config: BuildingConfig, rng: np.random.Generator) -> tuple[list[Wing]
 def _plan(area_m2: float, config: BuildingConfig, rng: np.random.Generator) -> FloorPlan:
     ratio = rng.uniform(1.0, 3.0)
     depth = math.sqrt(area_m2 / ratio)
-    return floor_plan(ratio * depth, depth, config.hall_share or 0.0, rng)
+    return generate_floor_plan(ratio * depth, depth, config.hall_share or 0.0, rng)
 
 
 def _joined(wing: Wing, plan: FloorPlan, rng: np.random.Generator) -> tuple[Wing, _Link] | None:
-    """A wing of a plan, askew behind one of the exits of another wing; None where there is none."""
+    """A wing of a plan, at an angle behind an exit of another wing; None if it does not fit."""
     exits = _exits(wing.plan)
     entries = _exits(plan)
     if not exits or not entries:
@@ -157,7 +164,7 @@ def _joined(wing: Wing, plan: FloorPlan, rng: np.random.Generator) -> tuple[Wing
     oblique = float(rng.choice([0.0, *rng.uniform(-0.9, 0.9, 2)]))
     T_exit = se2.compose(wing.T_world_wing, way_out)
     gap = rng.uniform(*_GAP_M) + 0.5 * width * abs(math.tan(oblique))
-    # The entry looks back at the exit, turned by the angle between the wings.
+    # The entry faces the exit, rotated by the angle between the wings.
     T_entry = se2.compose(T_exit, se2.pose(gap, 0.0, math.pi + oblique))
     T_world_wing = se2.compose(T_entry, se2.invert(way_in))
     inside = 0.5 * width + 1.0
@@ -167,7 +174,7 @@ def _joined(wing: Wing, plan: FloorPlan, rng: np.random.Generator) -> tuple[Wing
 
 
 def _exits(plan: FloorPlan) -> list[Array]:
-    """Poses (3,) in the plan at its rim, looking out, where a corridor or a hall ends."""
+    """Poses (3,) at the outer wall of a plan, facing outwards, at corridors and halls."""
     found = []
     for part in plan.parts:
         if part.kind is Kind.ROOM:
@@ -194,7 +201,7 @@ def _corners(wing: Wing, margin_m: float) -> Array:
 
 
 def _overlap(a: Wing, b: Wing) -> bool:
-    """Whether two wings come nearer than half a metre: no axis separates their rectangles."""
+    """Whether two wings are closer than half a metre, by the separating axis theorem."""
     first = _corners(a, 0.25)
     second = _corners(b, 0.25)
     for corners in (first, second):
@@ -206,10 +213,10 @@ def _overlap(a: Wing, b: Wing) -> bool:
     return True
 
 
-def _painted(
+def _rasterized(
     wings: list[Wing], links: list[_Link], config: BuildingConfig, rng: np.random.Generator
 ) -> tuple[GridFrame, NDArray[np.uint8]]:
-    """The cells of the world: 0 free, else solid or glass."""
+    """Cells of the world: 0 free, else obstacle or glass."""
     cell = _COARSE_M if (config.area_m2 or 0.0) >= _COARSE_FROM_M2 else _FINE_M
     corners = np.concatenate([_corners(wing, _MARGIN_M) for wing in wings])
     low = np.floor(corners.min(axis=0) / cell)
@@ -243,7 +250,7 @@ def _interior(
 
 
 def _thick(opening: Opening, half: float) -> tuple[float, float, float, float]:
-    """The box of an opening as deep as the wall it is in."""
+    """Box of an opening, as deep as its wall."""
     along_x = abs(opening.x1 - opening.x0) > abs(opening.y1 - opening.y0)
     dx = 0.0 if along_x else half
     dy = half if along_x else 0.0
@@ -253,7 +260,7 @@ def _thick(opening: Opening, half: float) -> tuple[float, float, float, float]:
 def _fill(
     cells: NDArray[np.uint8], cell: float, box: tuple[float, float, float, float], value: int
 ) -> None:
-    """Give a value to the cells whose centres lie in a box (x0, y0, x1, y1), m."""
+    """Set the cells whose centres lie in a box (x0, y0, x1, y1), m."""
     col, row, end_col, end_row = (max(math.ceil(edge / cell - 0.5), 0) for edge in box)
     cells[row:end_row, col:end_col] = value
 
@@ -265,7 +272,7 @@ def _furnish(
     clutter: float,
     rng: np.random.Generator,
 ) -> None:
-    """Cupboards along walls, tables and legs of chairs; pillars in halls."""
+    """Add cupboards along walls, tables and chair legs, and pillars in halls."""
     doors = np.array([(0.5 * (d.x0 + d.x1), 0.5 * (d.y0 + d.y1)) for d in plan.doors])
     for part in plan.parts:
         if part.kind is Kind.HALL and rng.random() < 0.5:
@@ -281,7 +288,9 @@ def _furnish(
             _box(cells, cell, at, size, turn, part)
 
 
-def _pillars(cells: NDArray[np.uint8], cell: float, hall: Part, rng: np.random.Generator) -> None:
+def _pillars(
+    cells: NDArray[np.uint8], cell: float, hall: FloorPart, rng: np.random.Generator
+) -> None:
     spacing = rng.uniform(4.0, 8.0)
     side = np.full(2, rng.uniform(0.3, 0.8))
     for x in np.arange(hall.x0 + spacing, hall.x1 - 1.5, spacing):
@@ -290,9 +299,9 @@ def _pillars(cells: NDArray[np.uint8], cell: float, hall: Part, rng: np.random.G
 
 
 def _box(
-    cells: NDArray[np.uint8], cell: float, at: Array, size: Array, turn: float, part: Part
+    cells: NDArray[np.uint8], cell: float, at: Array, size: Array, turn: float, part: FloorPart
 ) -> None:
-    """A solid box (2,), m, at a place of a part, turned, as far as it lies inside that part."""
+    """Draw a rotated box (2,), m, clipped to a part of the floor."""
     reach = 0.5 * float(np.hypot(*size)) + cell
     low = np.maximum(at - reach, (part.x0, part.y0))
     high = np.minimum(at + reach, (part.x1, part.y1))
@@ -312,7 +321,7 @@ def _box(
 def _paste(
     occupied: NDArray[np.uint8], frame: GridFrame, wing: Wing, inside: NDArray[np.uint8]
 ) -> None:
-    """Copy the cells of a wing to where it lies in the world, some rows at a time."""
+    """Copy the cells of a wing into the world, some rows at a time."""
     cell = frame.resolution
     corners = frame.cells_of(_corners(wing, 0.0))
     first = np.maximum(corners.min(axis=0) - 1, 0)
@@ -329,7 +338,7 @@ def _paste(
 
 
 def _carve(occupied: NDArray[np.uint8], frame: GridFrame, link: _Link) -> None:
-    """Make a passage free."""
+    """Clear the cells of a passage."""
     reach = 0.5 * link.width
     ends = np.stack([link.a, link.b])
     first = frame.cells_of(ends.min(axis=0)[None] - reach)[0]
@@ -348,7 +357,7 @@ def _carve(occupied: NDArray[np.uint8], frame: GridFrame, link: _Link) -> None:
 def _start(
     wing: Wing, frame: GridFrame, occupied: NDArray[np.uint8], rng: np.random.Generator
 ) -> Array:
-    """A pose (3,) in a corridor or hall of a wing, or in a room where there is neither."""
+    """A pose (3,) in a corridor or hall of a wing, or in a room if there is neither."""
     parts = [part for part in wing.plan.parts if part.kind is not Kind.ROOM] or wing.plan.parts
     reach = math.ceil(_START_CLEAR_M / frame.resolution)
     while True:
@@ -361,18 +370,20 @@ def _start(
             return se2.pose(T[0], T[1], rng.uniform(-math.pi, math.pi))
 
 
-def _moving(
+def _moving_obstacles(
     wings: list[Wing], config: BuildingConfig, rng: np.random.Generator
 ) -> MovingObstacles | None:
-    people = _people(wings, config, rng)
-    leaves = _leaves(wings, config.moving_doors or 0.0, rng)
-    if not len(people.points) and not len(leaves.hinges):
+    pedestrians = _pedestrians(wings, config, rng)
+    doors = _doors(wings, config.moving_doors or 0.0, rng)
+    if not len(pedestrians.points) and not len(doors.hinges):
         return None
-    return MovingObstacles(people, leaves)
+    return MovingObstacles(pedestrians, doors)
 
 
-def _people(wings: list[Wing], config: BuildingConfig, rng: np.random.Generator) -> Pedestrians:
-    """Walkers, each in a part of his own: to and fro, with pauses."""
+def _pedestrians(
+    wings: list[Wing], config: BuildingConfig, rng: np.random.Generator
+) -> Pedestrians:
+    """Pedestrians, each in its own part of the floor: back and forth, with pauses."""
     count = rng.poisson((config.people_per_1000_m2 or 0.0) * (config.area_m2 or 0.0) / 1000.0)
     points = np.zeros((count, 4, 2))
     parts = [(wing, part) for wing in wings for part in wing.plan.parts]
@@ -385,8 +396,8 @@ def _people(wings: list[Wing], config: BuildingConfig, rng: np.random.Generator)
     return Pedestrians(points, rng.uniform(0.5, 1.4, count), rng.exponential(8.0, (count, 4)))
 
 
-def _leaves(wings: list[Wing], moving: float, rng: np.random.Generator) -> Doors:
-    """A leaf for most doors; a share of them moves."""
+def _doors(wings: list[Wing], moving: float, rng: np.random.Generator) -> Doors:
+    """Door leaves for most doors; a share of them moves."""
     hinges = []
     ends = []
     for wing in wings:
@@ -399,7 +410,7 @@ def _leaves(wings: list[Wing], moving: float, rng: np.random.Generator) -> Doors
     moves = rng.random(count) < moving
     side = rng.choice([-1.0, 1.0], count)
     period_s = np.where(moves, rng.uniform(20.0, 300.0, count), np.inf)
-    # One of its own: however much it is asked for, what is drawn elsewhere stays the same.
+    # A separate generator, so that other random choices do not depend on it.
     chance = np.random.default_rng(int(rng.integers(2**31)))
     open_rad = side[:, None] * chance.uniform(*_AJAR_RAD, (count, _PERIODS))
     is_shut = moves[:, None] & (chance.random((count, _PERIODS)) < _SHUT_SHARE)

@@ -1,7 +1,6 @@
-"""How much of what could be seen is known.
+"""Coverage: share of the observable cells that are known as free.
 
-Coverage is the share of the free cells that a sensor of a range could see, by line of sight, from
-some place that a robot of a radius can reach from its start, that the map holds as free.
+A cell is observable if it is in range and line of sight of a position that the robot can reach.
 """
 
 import math
@@ -27,7 +26,7 @@ _ALIGNED = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class ObservableCells:
-    """Free cells (H, W) bool, 10 cm wide in the world frame, that could be seen."""
+    """Observable free cells (H, W) bool, 10 cm wide, world frame."""
 
     cells: NDArray[np.bool_]
     frame: GridFrame
@@ -38,9 +37,9 @@ class ObservableCells:
         return float(self.cells.sum()) * self.frame.resolution**2
 
     def coverage(self, patch: GridPatch, T_world_map: Array | None = None) -> float:
-        """Coverage: the share of these cells at whose centres the map is free.
+        """Share of these cells at whose centres the map is free.
 
-        T_world_map (3,): where the map's frame lies in the world; None: they are the same.
+        T_world_map (3,): pose of the map frame in the world; None: identity.
         """
         centres = self._centres
         if len(centres) == 0:
@@ -56,7 +55,7 @@ class ObservableCells:
         return float(patch.free[at[inside, 0], at[inside, 1]].sum()) / len(centres)
 
     def _offset_of(self, frame: GridFrame) -> tuple[int, int] | None:
-        """Where a frame's first cell lies among these, (row, col), if it is on the same lattice."""
+        """Offset (row, col) of a frame from these cells, if it is on the same lattice."""
         if frame.resolution != self.frame.resolution:
             return None
         offset = (frame.as_array() - self.frame.as_array())[1::-1] / frame.resolution
@@ -74,17 +73,18 @@ class ObservableCells:
         return self.frame.centres_of(np.argwhere(self.cells))
 
 
-def coverable(world: World, start: Array, radius_m: float, range_m: float) -> ObservableCells:
-    """All that a robot of a radius could come to see, all around up to a range, from a start (3,).
+def observable_cells(
+    world: World, start: Array, radius_m: float, range_m: float
+) -> ObservableCells:
+    """Cells that a robot of a radius can observe, with a range and 360 degrees, from a start (3,).
 
-    Every place in the world's own cells where the robot can stand is taken; none is left out for
-    speed. Sight goes both ways, so each free cell looks around for such a place and stops at the
-    first: most stand on one. Rays are 5 cm apart at the full range: a gap narrower than that, that
-    far away, may be missed.
-    Raises InputError where the robot does not fit at its start.
+    All reachable positions count, at the resolution of the world. Visibility is symmetric: each
+    free cell casts rays until it meets a reachable position. Rays are 5 cm apart at the full range,
+    so that narrower gaps at this distance may be missed.
+    Raises InputError if the robot does not fit at its start.
     """
     reached = _reachable_from(world, start, radius_m)
-    # The lattice of maps: its lines go through the world's origin.
+    # The lattice of maps: its lines pass through the origin of the world.
     low = np.floor(np.array([world.frame.origin_x, world.frame.origin_y]) / CELL_M + 1e-6) * CELL_M
     frame = GridFrame(float(low[0]), float(low[1]), CELL_M)
     rows, cols = world.occupied.shape
@@ -93,14 +93,16 @@ def coverable(world: World, start: Array, radius_m: float, range_m: float) -> Ob
     origin = (world.frame.origin_x, world.frame.origin_y)
     places = (frame.centres_of(cells) - origin) / world.frame.resolution
     angles = np.arange(0.0, 2.0 * math.pi, _RAY_SPACING_M / max(range_m, 1.0))
-    seen = _look_around(world.occupied, reached, places, angles, range_m / world.frame.resolution)
+    seen = _sees_reachable(
+        world.occupied, reached, places, angles, range_m / world.frame.resolution
+    )
     coverable_cells = np.zeros(tuple(last + 1), dtype=np.bool_)
     coverable_cells[cells[:, 0], cells[:, 1]] = seen
     return ObservableCells(coverable_cells, frame)
 
 
 def _reachable_from(world: World, start: Array, radius_m: float) -> NDArray[np.bool_]:
-    """Cells (H, W) at whose centres the robot can stand, connected with the one it starts in."""
+    """Cells (H, W) that the centre of the robot can reach from its start."""
     from scipy import ndimage
 
     standing = world.distance_to_wall_m > radius_m
@@ -115,7 +117,7 @@ def _reachable_from(world: World, start: Array, radius_m: float) -> NDArray[np.b
 
 
 def _without_solids(world: World, frame: GridFrame, shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Cells without anything solid in them, (H, W)."""
+    """Cells without obstacles, (H, W)."""
     solid = frame.cells_of(world.frame.centres_of(np.argwhere(world.occupied)))
     free = np.ones(shape, dtype=np.bool_)
     free[solid[:, 0], solid[:, 1]] = False
@@ -123,14 +125,14 @@ def _without_solids(world: World, frame: GridFrame, shape: tuple[int, int]) -> N
 
 
 @kernel
-def _look_around(
+def _sees_reachable(
     solid: NDArray[np.uint8],
     wanted: NDArray[np.bool_],
     places: Array,
     angles: Array,
     max_cells: float,
 ) -> NDArray[np.bool_]:
-    """Whether rays from each place (N, 2; x, y in cells) meet a wanted cell before a solid one."""
+    """Whether rays from each place (N, 2; x, y in cells) meet a wanted cell before an obstacle."""
     rows, cols = solid.shape
     found = np.zeros(len(places), dtype=np.bool_)
     for i in range(len(places)):

@@ -1,4 +1,4 @@
-"""Drives of a simulated robot, on given or random ways: scan, odometry and truth, from one seed."""
+"""Drives of a simulated robot on given or random paths: scans, odometry and ground truth."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -18,79 +18,83 @@ from thinmap_ros.sim.robot import RobotConfig
 from thinmap_ros.sim.simulation import STEP_NS, Simulation
 from thinmap_ros.sim.world import World
 
-MARGIN_M = 0.1  # between the body and what is solid, where ways are planned
+MARGIN_M = 0.1  # minimum distance of planned paths from obstacles
 _ARRIVED_M = 0.3
 _SPACING_M = 0.05
-_PATIENCE = 5.0  # times what a way takes at full speed
-_LEAST_S = 60.0
+_PATIENCE = 5.0  # times the duration at full speed
+_MIN_TIMEOUT_S = 60.0
 _NEAREST_GOAL_M = 2.0
 _RANDOM_SPEED_M_S = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class DriveSample:
-    """What the robot has at a scan: scan, odometry pose (3,), and where it truly is (3,)."""
+    """Sample of a drive: scan, odometry pose (3,) and true pose (3,)."""
 
     scan: Scan
     T_odom_base: Array
     T_world_base: Array
 
 
-def drive(simulation: Simulation, ways: Iterable[Array], speed_m_s: float) -> Iterator[DriveSample]:
-    """Look after look of a robot that follows ways (K, 2), m, world frame, one after the other.
+def drive(
+    simulation: Simulation, paths: Iterable[Array], speed_m_s: float
+) -> Iterator[DriveSample]:
+    """Yield the samples of a drive along paths (K, 2), m, world frame, one after the other.
 
-    A way that takes much too long is given up for the next.
+    A path that takes much too long is aborted.
     """
     follower = PathFollower(PathFollowerConfig(max_speed_m_s=speed_m_s))
     moment = simulation.read_sensors()
     if moment.scan is not None:
         yield DriveSample(moment.scan, moment.T_odom_base, simulation.robot.T_world_base)
-    for way in ways:
-        length_m = float(np.hypot(*np.diff(way, axis=0).T).sum())
-        for _ in range(round(1e9 / STEP_NS * (_LEAST_S + _PATIENCE * length_m / speed_m_s))):
+    for path in paths:
+        length_m = float(np.hypot(*np.diff(path, axis=0).T).sum())
+        for _ in range(round(1e9 / STEP_NS * (_MIN_TIMEOUT_S + _PATIENCE * length_m / speed_m_s))):
             T = simulation.robot.T_world_base
-            if np.hypot(*(way[-1] - T[:2])) < _ARRIVED_M:
+            if np.hypot(*(path[-1] - T[:2])) < _ARRIVED_M:
                 break
-            moment = simulation.step(*follower.command(T, way, STEP_NS / 1e9))
+            moment = simulation.step(*follower.command(T, path, STEP_NS / 1e9))
             if moment.scan is not None:
                 yield DriveSample(moment.scan, moment.T_odom_base, simulation.robot.T_world_base)
 
 
-def patch_of(world: World) -> GridPatch:
-    """The map that a world is itself."""
+def world_to_grid(world: World) -> GridPatch:
+    """Complete map of a world."""
     return GridPatch(world.frame, np.where(world.occupied != 0, np.int8(100), np.int8(0)))
 
 
 def tour_paths(world: World, places: Array, radius_m: float) -> Iterator[Array]:
-    """Ways (K, 2) from a world's start to places (N, 2), one by one, straight where there is room.
+    """Paths (K, 2) from the start of a world to places (N, 2), in order, straight where possible.
 
-    Raises InputError where a place cannot be reached.
+    Raises InputError if a place is unreachable.
     """
     reach = WavefrontConfig(robot_radius_m=radius_m + MARGIN_M)
-    patch = patch_of(world)
+    patch = world_to_grid(world)
     at = world.start[:2]
     for place in places:
-        way = _straight(at, place)
-        if not _is_clear(world, way, reach.robot_radius_m):
+        path = _straight(at, place)
+        if not _is_clear(world, path, reach.robot_radius_m):
             planned = plan(
                 patch, (float(at[0]), float(at[1])), (float(place[0]), float(place[1])), reach
             )
             if planned is None:
-                raise InputError(f'{world.name}: tour: {place.tolist()}: no way from {at.tolist()}')
-            way = planned
-        yield way
+                raise InputError(
+                    f'{world.name}: tour: {place.tolist()}: no path from {at.tolist()}'
+                )
+            path = planned
+        yield path
         at = place
 
 
 def _straight(a: Array, b: Array) -> Array:
-    """Points (K, 2) from one place to another, as dense as those that the planner gives."""
+    """Points (K, 2) of a straight line, as dense as those of the planner."""
     count = 2 + math.ceil(float(np.hypot(*(b - a))) / _SPACING_M)
     return np.asarray(a + np.linspace(0.0, 1.0, count)[:, None] * (b - a))
 
 
-def _is_clear(world: World, way: Array, radius_m: float) -> bool:
-    """Whether a disc can go along points (K, 2)."""
-    cells = world.frame.cells_of(way)
+def _is_clear(world: World, path: Array, radius_m: float) -> bool:
+    """Whether a disc can move along points (K, 2) without collision."""
+    cells = world.frame.cells_of(path)
     if (cells < 0).any() or (cells >= world.occupied.shape).any():
         return False
     return bool((world.distance_to_wall_m[cells[:, 0], cells[:, 1]] > radius_m).all())
@@ -99,7 +103,7 @@ def _is_clear(world: World, way: Array, radius_m: float) -> bool:
 def random_start(
     world: World, rng: np.random.Generator, within: NDArray[np.bool_] | None = None
 ) -> Array:
-    """A pose (3,) at which the robot fits, anywhere in the world or in some of its cells (H, W)."""
+    """A random collision-free pose (3,), anywhere in the world or in some of its cells (H, W)."""
     room = world.distance_to_wall_m > RobotConfig().radius_m + MARGIN_M
     cells = np.argwhere(room if within is None else room & within)
     at = world.frame.centres_of(cells[rng.integers(len(cells))][None])[0]
@@ -113,28 +117,30 @@ def random_drive(
     within: NDArray[np.bool_] | None = None,
     laser: LaserScannerConfig | None = None,
 ) -> Iterator[DriveSample]:
-    """Look after look of a robot that drives from a start to random places, one by one, endlessly.
+    """Yield the samples of an endless drive from a start to random places.
 
-    within (H, W): cells of the world in which these places lie; all, where it is not given.
+    within (H, W): cells of the world for these places; None: all.
     """
     simulation = Simulation(world, start, RobotConfig(), laser or LaserScannerConfig(), seed)
     return drive(
-        simulation, _random_ways(simulation, np.random.default_rng(seed), within), _RANDOM_SPEED_M_S
+        simulation,
+        _random_paths(simulation, np.random.default_rng(seed), within),
+        _RANDOM_SPEED_M_S,
     )
 
 
-def _random_ways(
+def _random_paths(
     simulation: Simulation, rng: np.random.Generator, within: NDArray[np.bool_] | None
 ) -> Iterator[Array]:
-    """Paths (K, 2) from where the robot is to random places that can be reached."""
+    """Paths (K, 2) from the robot to random reachable places."""
     world = simulation.world
-    patch = patch_of(world)
+    patch = world_to_grid(world)
     config = WavefrontConfig(robot_radius_m=RobotConfig().radius_m + MARGIN_M)
     while True:
         T = simulation.robot.T_world_base
         goal = random_start(world, rng, within)
         if np.hypot(*(goal[:2] - T[:2])) < _NEAREST_GOAL_M:
             continue
-        way = plan(patch, (float(T[0]), float(T[1])), (float(goal[0]), float(goal[1])), config)
-        if way is not None:
-            yield way
+        path = plan(patch, (float(T[0]), float(T[1])), (float(goal[0]), float(goal[1])), config)
+        if path is not None:
+            yield path

@@ -1,4 +1,4 @@
-"""Floor plans made by chance: rectangles that are rooms, corridors and halls, and openings."""
+"""Random floor plans: rooms, corridors and halls, which are rectangles, and openings."""
 
 import math
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ WALL_M = 0.15
 _CORRIDOR_M = (1.6, 3.0)
 _ROOM_WIDTH_M = (2.6, 8.0)
 _ROW_M = 5.5  # a block that is no deeper has one row of rooms, and
-_LONGEST_ROW_M = 30.0  # where it is longer is cut across
+_MAX_ROW_M = 30.0  # where it is longer is cut across
 _SPINE_M = 18.0  # one that is no deeper has a corridor along its middle
 _HALL_M = (12.0, 45.0)  # shortest and longest side of what may become a hall
 _DOOR_M = (0.85, 1.05)
@@ -21,7 +21,7 @@ _TOUCHING_M = 1e-6
 
 
 class Kind(Enum):
-    """What a part of a floor is."""
+    """Kind of a part of a floor."""
 
     ROOM = 'room'
     CORRIDOR = 'corridor'
@@ -29,8 +29,8 @@ class Kind(Enum):
 
 
 @dataclass(frozen=True)
-class Part:
-    """A rectangle of the floor from middle of wall to middle of wall, m."""
+class FloorPart:
+    """A rectangle of the floor, between the centre lines of its walls, m."""
 
     kind: Kind
     x0: float
@@ -70,26 +70,26 @@ class Opening:
 class FloorPlan:
     """Parts that tile a rectangle of width x depth, m, from (0, 0) on.
 
-    doors: openings of the width of a door; passages: where corridors and halls go over into each
-    other; walls: what is left between two parts, where a pane of glass may be.
+    doors: openings of the width of a door; passages: openings between corridors and halls; walls:
+    the remaining walls between two parts, which may have glass.
     """
 
     width: float
     depth: float
-    parts: list[Part]
+    parts: list[FloorPart]
     doors: list[Opening]
     passages: list[Opening]
     walls: list[Opening]
 
 
-def floor_plan(
+def generate_floor_plan(
     width: float, depth: float, hall_share: float, rng: np.random.Generator
 ) -> FloorPlan:
     """Plan of one wing.
 
-    hall_share: how often a block that is large enough is a hall. Every part can be reached.
+    hall_share: probability that a large enough block is a hall. All parts are connected.
     """
-    parts = _cut(Part(Kind.ROOM, 0.0, 0.0, width, depth), hall_share, rng)
+    parts = _split_block(FloorPart(Kind.ROOM, 0.0, 0.0, width, depth), hall_share, rng)
     shared = _shared_walls(parts)
     passages = [wall for wall in shared if _is_open(parts[wall.a], parts[wall.b])]
     closed = [wall for wall in shared if not _is_open(parts[wall.a], parts[wall.b])]
@@ -100,13 +100,13 @@ def floor_plan(
     return FloorPlan(width, depth, parts, doors, inner, closed)
 
 
-def _cut(block: Part, hall_share: float, rng: np.random.Generator) -> list[Part]:
-    """Corridors through a block, as long as it is too deep for rooms, and what is between."""
+def _split_block(block: FloorPart, hall_share: float, rng: np.random.Generator) -> list[FloorPart]:
+    """Cut a block into corridors and rows of rooms."""
     short, long = sorted((block.width, block.depth))
     if short >= _HALL_M[0] and long <= _HALL_M[1] and rng.random() < hall_share:
-        return [_as(Kind.HALL, block)]
+        return [_with_kind(Kind.HALL, block)]
     along_x = block.width >= block.depth
-    if short <= _ROW_M and long <= _LONGEST_ROW_M:
+    if short <= _ROW_M and long <= _MAX_ROW_M:
         return _rooms(block, along_x, rng)
     # A corridor along a block that is as deep as two rows of rooms, else across it.
     spine = short <= _SPINE_M
@@ -114,46 +114,46 @@ def _cut(block: Part, hall_share: float, rng: np.random.Generator) -> list[Part]
     length = block.width if across_x else block.depth
     corridor = rng.uniform(*_CORRIDOR_M)
     at = rng.uniform(0.35, 0.65) * (length - corridor)
-    first, middle, last = _sliced(block, across_x, [at, at + corridor])
+    first, middle, last = _split(block, across_x, [at, at + corridor])
     if spine:
         sides = [_rooms(side, along_x, rng) for side in (first, last)]
     else:
-        sides = [_cut(side, hall_share, rng) for side in (first, last)]
-    return [*sides[0], _as(Kind.CORRIDOR, middle), *sides[1]]
+        sides = [_split_block(side, hall_share, rng) for side in (first, last)]
+    return [*sides[0], _with_kind(Kind.CORRIDOR, middle), *sides[1]]
 
 
-def _rooms(row: Part, along_x: bool, rng: np.random.Generator) -> list[Part]:
+def _rooms(row: FloorPart, along_x: bool, rng: np.random.Generator) -> list[FloorPart]:
     """A row of rooms."""
     length = row.width if along_x else row.depth
     marks = [rng.uniform(*_ROOM_WIDTH_M)]
     while marks[-1] < length - _ROOM_WIDTH_M[0]:
         marks.append(marks[-1] + rng.uniform(*_ROOM_WIDTH_M))
-    return _sliced(row, along_x, [mark for mark in marks if mark < length - _ROOM_WIDTH_M[0]])
+    return _split(row, along_x, [mark for mark in marks if mark < length - _ROOM_WIDTH_M[0]])
 
 
-def _sliced(part: Part, along_x: bool, marks: list[float]) -> list[Part]:
+def _split(part: FloorPart, along_x: bool, marks: list[float]) -> list[FloorPart]:
     """Pieces of a part, cut across one of its axes at distances from its lower side."""
     low = part.x0 if along_x else part.y0
     high = part.x1 if along_x else part.y1
     pieces = []
     for a, b in pairwise([low, *(low + mark for mark in marks), high]):
         if along_x:
-            pieces.append(Part(part.kind, a, part.y0, b, part.y1))
+            pieces.append(FloorPart(part.kind, a, part.y0, b, part.y1))
         else:
-            pieces.append(Part(part.kind, part.x0, a, part.x1, b))
+            pieces.append(FloorPart(part.kind, part.x0, a, part.x1, b))
     return pieces
 
 
-def _as(kind: Kind, part: Part) -> Part:
-    return Part(kind, part.x0, part.y0, part.x1, part.y1)
+def _with_kind(kind: Kind, part: FloorPart) -> FloorPart:
+    return FloorPart(kind, part.x0, part.y0, part.x1, part.y1)
 
 
-def _is_open(a: Part, b: Part) -> bool:
+def _is_open(a: FloorPart, b: FloorPart) -> bool:
     return a.kind is Kind.CORRIDOR and b.kind is Kind.CORRIDOR
 
 
-def _shared_walls(parts: list[Part]) -> list[Opening]:
-    """Where two parts lie beside each other, all along their common side."""
+def _shared_walls(parts: list[FloorPart]) -> list[Opening]:
+    """Walls between adjacent parts, along their whole common side."""
     boxes = np.array([(p.x0, p.y0, p.x1, p.y1) for p in parts])
     found = []
     for i, part in enumerate(parts):
@@ -174,9 +174,9 @@ def _wide_enough(walls: list[Opening]) -> list[Opening]:
 
 
 def _with_doors(
-    parts: list[Part], passages: list[Opening], walls: list[Opening], rng: np.random.Generator
+    parts: list[FloorPart], passages: list[Opening], walls: list[Opening], rng: np.random.Generator
 ) -> list[Opening]:
-    """Walls that get a door: so many that all is connected, corridors first, and some more."""
+    """Choose walls for doors: those that connect all parts, corridors first, and some more."""
     group = list(range(len(parts)))
 
     def root(i: int) -> int:
@@ -188,7 +188,7 @@ def _with_doors(
     for passage in passages:
         group[root(passage.a)] = root(passage.b)
     order = rng.permutation(len(walls)).tolist()
-    # A room has its door on a corridor where it has one.
+    # A room beside a corridor has its door there.
     order = sorted(order, key=lambda k: not _leads_to_corridor(parts, walls[k]))
     chosen = []
     for k in order:
@@ -201,12 +201,12 @@ def _with_doors(
     return chosen
 
 
-def _leads_to_corridor(parts: list[Part], wall: Opening) -> bool:
+def _leads_to_corridor(parts: list[FloorPart], wall: Opening) -> bool:
     return Kind.CORRIDOR in (parts[wall.a].kind, parts[wall.b].kind)
 
 
-def _door(wall: Opening, parts: list[Part], rng: np.random.Generator) -> Opening:
-    """A door somewhere in a wall; one to a hall may be wide."""
+def _door(wall: Opening, parts: list[FloorPart], rng: np.random.Generator) -> Opening:
+    """A door at a random position in a wall; doors of halls may be wide."""
     is_hall = Kind.HALL in (parts[wall.a].kind, parts[wall.b].kind)
     wide = is_hall and wall.length > _WIDE_DOOR_M[1] + 2.0 * _JAMB_M and rng.random() < 0.6
     width = rng.uniform(*(_WIDE_DOOR_M if wide else _DOOR_M))

@@ -1,4 +1,4 @@
-"""A SICK LMS200: 181 beams over 180 degrees, with range noise and mixed pixels."""
+"""Simulated planar laser scanner, with range noise and mixed pixels."""
 
 import math
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.sim.world import World
 
-# Neighbouring beams on a wall seen at this angle are no depth edge.
+# Neighbouring beams on a wall at this angle of incidence are no depth edge.
 _FLATTEST_RAD = math.radians(10.0)
 _INTO_CELL = 1e-6
 
@@ -42,7 +42,7 @@ class LaserScannerConfig(Config):
 
 
 class LaserScanner:
-    """Makes scans of a world; what no beam meets within the range reads +inf (REP 117)."""
+    """Simulates scans of a world; a beam without a hit in range is +inf (REP 117)."""
 
     def __init__(self, config: LaserScannerConfig, seed: int) -> None:
         self.config = config
@@ -87,10 +87,10 @@ class LaserScanner:
         return np.minimum(ranges, nearer)
 
     def _mix(self, ranges: Array) -> Array:
-        """Mixed pixels: at a depth edge a beam's spot is on both surfaces, the range in between.
+        """Add mixed pixels: at a depth edge a beam covers both surfaces, with a range in between.
 
-        Of the two beams beside an edge it is the one or the other: were it always the same one, the
-        pixels of a left and a right wall would be off to the same side.
+        A random one of the two beams beside an edge is affected: with always the same one, the
+        points of left and right walls would be shifted to the same side.
         """
         edges = _edges(ranges, self.config.edge_m, self._increment / math.sin(_FLATTEST_RAD))
         mixed = edges[self._rng.random(ranges.size - 1)[edges] < self.config.mixed_pixels]
@@ -106,7 +106,7 @@ class LaserScanner:
 def _meets(
     special: NDArray[np.bool_], x: float, y: float, angles: Array, cells: Array
 ) -> NDArray[np.bool_]:
-    """Whether beams from (x, y) that end after so many cells (N,) end in a special cell."""
+    """Whether beams from (x, y) with lengths (N,), cells, end in a special cell."""
     inside = np.where(np.isfinite(cells), cells, 0.0) + _INTO_CELL
     cols = np.floor(x + inside * np.cos(angles)).astype(np.int64)
     rows = np.floor(y + inside * np.sin(angles)).astype(np.int64)
@@ -120,7 +120,7 @@ def _meets(
 
 @kernel
 def _edges(ranges: Array, edge_m: float, along_a_wall: float) -> NDArray[np.int64]:
-    """Beams whose range differs from the next by more than edge_m and than along_a_wall a metre."""
+    """Beams at depth edges: the next range differs by more than edge_m and along_a_wall."""
     found = np.empty(ranges.size, dtype=np.int64)
     count = 0
     for i in range(ranges.size - 1):

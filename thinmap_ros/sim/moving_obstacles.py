@@ -1,4 +1,4 @@
-"""What moves in a world beside the robot: people who walk about, and the leaves of doors."""
+"""Moving obstacles of a world: pedestrians and doors."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 from thinmap_ros.core.se2 import Array
 
 _PERSON_M = 0.2  # radius
-_PERSONAL_SPACE_M = 0.7  # people step aside for a robot
+_PERSONAL_SPACE_M = 0.7  # pedestrians avoid the robot
 _ROBOT_NEAR_M = 3.0  # doors are held open for it
 
 
 @dataclass(frozen=True, eq=False)
 class Pedestrians:
-    """Walkers, each of whom goes round his points for ever, and stands at each for a while.
+    """Pedestrians; each walks in a loop along its points and pauses at each of them.
 
     points (N, K, 2), m, world frame; speeds (N,), m/s; pauses (N, K), s.
     """
@@ -26,7 +26,7 @@ class Pedestrians:
 
     @cached_property
     def _times(self) -> Array:
-        """When each arrives at and leaves each of his points, (N, 2 K + 1), s, from 0."""
+        """Times at which each arrives at and leaves each of its points, (N, 2 K + 1), s."""
         legs = np.hypot(*np.moveaxis(np.roll(self.points, -1, axis=1) - self.points, 2, 0))
         spans = np.stack([self.pauses, legs / self.speeds[:, None]], axis=2)
         ends = np.cumsum(spans.reshape(len(self.points), 2 * self.points.shape[1]), axis=1)
@@ -34,12 +34,12 @@ class Pedestrians:
 
     @cached_property
     def _stations(self) -> Array:
-        """Where each is at these times, (N, 2 K + 1, 2)."""
+        """Positions at these times, (N, 2 K + 1, 2)."""
         twice = np.repeat(self.points, 2, axis=1)
         return np.concatenate([twice, self.points[:, :1]], axis=1)
 
     def places(self, seconds: float) -> Array:
-        """Where all are (N, 2) at a time."""
+        """Positions (N, 2) at a time."""
         now = seconds % self._times[:, -1]
         who = np.arange(len(now))
         span = (self._times[:, 1:-1] <= now[:, None]).sum(axis=1)
@@ -54,10 +54,10 @@ class Pedestrians:
 
 @dataclass(frozen=True, eq=False)
 class Doors:
-    """Leaves of doors, each in its frame: hinges (N, 2), m; ends (N, 2) of the shut leaf, m.
+    """Door leaves: hinges (N, 2), m; ends (N, 2) of the closed leaf, m.
 
-    Each stands otherwise after every period_s (N,), inf for one that stays as it is: in the k-th
-    of K periods, which come round again, open by open_rad (N, K), or shut where is_shut (N, K).
+    Each changes its angle after every period_s (N,) (inf: never). In the k-th of K periods, which
+    repeat, it is open by open_rad (N, K), or closed where is_shut (N, K).
     """
 
     hinges: Array
@@ -67,7 +67,7 @@ class Doors:
     is_shut: NDArray[np.bool_]
 
     def segments(self, seconds: float, robot: Array, reach_m: float) -> Array:
-        """Leaves (M, 4) near a robot (x, y): from the hinge to where the leaf ends now, m."""
+        """Leaves (M, 4) near a robot (x, y): from the hinge to the present end, m."""
         away = np.hypot(*(self.hinges - robot).T)
         near = np.flatnonzero(away < reach_m)
         angles = self._angles(near, seconds, away[near] < _ROBOT_NEAR_M)
@@ -78,7 +78,7 @@ class Doors:
         return np.column_stack([self.hinges[near], self.hinges[near] + ends])
 
     def _angles(self, doors: NDArray[np.int64], seconds: float, held: NDArray[np.bool_]) -> Array:
-        """Opening angles of some, rad; what is held is not shut."""
+        """Opening angles of some doors, rad; doors held open do not close."""
         period = (seconds // self.period_s[doors]).astype(np.int64) % self.open_rad.shape[1]
         shut = self.is_shut[doors, period] & ~held
         return np.where(shut, 0.0, self.open_rad[doors, period])
@@ -86,28 +86,28 @@ class Doors:
 
 @dataclass(frozen=True, eq=False)
 class MovingObstacles:
-    """All that moves in a world."""
+    """All moving obstacles of a world."""
 
-    people: Pedestrians
-    leaves: Doors
+    pedestrians: Pedestrians
+    doors: Doors
 
     def ranges(self, seconds: float, T_world_laser: Array, angles: Array, reach_m: float) -> Array:
-        """How far beams (N,) at angles in the world go until they meet one of them; inf: none."""
+        """Distance, m, at which beams (N,) at world angles hit one of them; inf: none."""
         laser = T_world_laser[:2]
-        places = self.people.places(seconds)
+        places = self.pedestrians.places(seconds)
         away = np.hypot(*(places - laser).T)
         places = places[(away > _PERSONAL_SPACE_M) & (away < reach_m + _PERSON_M)]
         beams = np.column_stack([np.cos(angles), np.sin(angles)])
         nearest = np.full(len(angles), np.inf)
         for place in places:
             np.minimum(nearest, _to_disc(place - laser, beams), out=nearest)
-        for leaf in self.leaves.segments(seconds, laser, reach_m + 3.0):
+        for leaf in self.doors.segments(seconds, laser, reach_m + 3.0):
             np.minimum(nearest, _to_segment(leaf[:2] - laser, leaf[2:] - laser, beams), out=nearest)
         return nearest
 
 
 def _to_disc(centre: Array, beams: Array) -> Array:
-    """Distance along unit vectors (N, 2) to a disc of a person's size, inf where they miss it."""
+    """Distance along unit vectors (N, 2) to the disc of a pedestrian; inf if they miss it."""
     along = beams @ centre
     across = beams[:, 0] * centre[1] - beams[:, 1] * centre[0]
     hits = (along > 0.0) & (np.abs(across) < _PERSON_M)
@@ -116,7 +116,7 @@ def _to_disc(centre: Array, beams: Array) -> Array:
 
 
 def _to_segment(a: Array, b: Array, beams: Array) -> Array:
-    """Distance along unit vectors (N, 2) to a segment from a to b, inf where they miss it."""
+    """Distance along unit vectors (N, 2) to a segment from a to b; inf if they miss it."""
     side = b - a
     turned = beams[:, 0] * side[1] - beams[:, 1] * side[0]
     safe = np.where(turned == 0.0, 1.0, turned)

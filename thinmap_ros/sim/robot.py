@@ -1,4 +1,4 @@
-"""A Pioneer with two driven wheels: exact motion, limits, contact with walls, drifting odometry."""
+"""Differential-drive robot: exact motion, limits, contact with walls, odometry drift."""
 
 import math
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ _AWAY_M = 0.05
 
 @dataclass(frozen=True)
 class RobotConfig(Config):
-    """A robot's body, limits, and the errors of its wheel odometry."""
+    """Body and limits of a robot, and the errors of its wheel odometry."""
 
     radius_m: float = parameter(
         0.22, 'radius of the disc that holds the body, m', low=0.01, high=2.0
@@ -61,7 +61,7 @@ PRESETS = {
 
 
 class WheelOdometry:
-    """Odometry T_odom_base (3,) from zero that drifts by its seed, over exact steps of a robot."""
+    """Odometry T_odom_base (3,) from zero, with random drift, from exact steps of a robot."""
 
     def __init__(self, config: RobotConfig, seed: int) -> None:
         self.config = config
@@ -72,13 +72,13 @@ class WheelOdometry:
         self._drift_rad_m = self._rng.normal(0.0, config.drift_sigma_rad_m)
 
     def add_step(self, distance_m: float, turn_rad: float) -> Array:
-        """Return the odometry pose (3,) after a step of an exact distance and turn."""
-        distance, turn = self._measured(distance_m, turn_rad)
+        """Add a step with an exact distance and rotation; returns the odometry pose (3,)."""
+        distance, turn = self._with_odometry_noise(distance_m, turn_rad)
         self.T_odom_base = after_arc(self.T_odom_base, distance, turn)
         return self.T_odom_base
 
-    def _measured(self, distance: float, turn: float) -> tuple[float, float]:
-        """Return distance (m) and turn (rad) as the wheels count them."""
+    def _with_odometry_noise(self, distance: float, turn: float) -> tuple[float, float]:
+        """Distance (m) and rotation (rad) with odometry errors."""
         metres = abs(distance)
         radians = abs(turn)
         noise = self._rng.normal(size=2).tolist()
@@ -91,7 +91,7 @@ class WheelOdometry:
 
 @dataclass(eq=False)
 class DifferentialDriveRobot:
-    """A robot at T_world_base (3,), odometry T_odom_base (3,) from zero that drifts by its seed."""
+    """A robot at T_world_base (3,), with odometry T_odom_base (3,) from zero that drifts."""
 
     config: RobotConfig
     world: World
@@ -109,8 +109,8 @@ class DifferentialDriveRobot:
     def step(self, v: float, w: float, dt_s: float) -> None:
         """Drive for dt_s towards a commanded speed v (m/s) and turn rate w (rad/s), within limits.
 
-        A robot that would touch a wall stays where it is and can still turn. A contact counts once,
-        until the robot has come away from the wall.
+        A robot that would touch a wall does not move, but can rotate. A contact counts once, until
+        the robot has left the wall.
         """
         self.v = _towards(
             self.v, v, self.config.max_speed_m_s, self.config.max_acceleration_m_s2 * dt_s
@@ -126,7 +126,7 @@ class DifferentialDriveRobot:
             self.v = 0.0
             moved = after_arc(self.T_world_base, 0.0, self.w * dt_s)
         self.T_world_base = moved
-        # One that goes on pushing creeps up to the wall and is stopped again: the same contact.
+        # A robot that keeps pushing approaches the wall again: still the same contact.
         self.touching = not clear or (
             self.touching
             and not self.world.is_clear(moved[0], moved[1], self.config.radius_m + _AWAY_M)
@@ -135,7 +135,7 @@ class DifferentialDriveRobot:
 
 
 def after_arc(T: Array, distance: float, turn: float) -> Array:
-    """Pose (3,) after a circular arc of a length (m) from a pose (3,), with a turn (rad)."""
+    """Pose (3,) after a circular arc of a length (m) and rotation (rad) from a pose (3,)."""
     half = turn / 2.0
     chord = distance if half == 0.0 else distance * math.sin(half) / half
     dx = chord * math.cos(half)

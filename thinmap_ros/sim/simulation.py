@@ -1,4 +1,4 @@
-"""A robot with a laser in a world, in fixed steps of simulated time."""
+"""Simulation of a robot with a laser in a world, in fixed time steps."""
 
 from dataclasses import dataclass
 
@@ -15,11 +15,8 @@ STEP_NS = 50_000_000
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
-    """What the robot's sensors tell after a step.
-
-    Odometry at stamp_ns, and a scan where one is due.
-    """
+class SensorReadings:
+    """Sensor readings after a step: odometry at stamp_ns, and a scan if one is due."""
 
     stamp_ns: int
     T_odom_base: Array
@@ -27,12 +24,12 @@ class Moment:
 
 
 class Simulation:
-    """Steps of 50 ms: odometry at 20 Hz, and a scan whenever the laser's period is over.
+    """Steps of 50 ms: odometry at 20 Hz, and scans at the rate of the laser.
 
-    The seed decides all noise.
+    The seed determines all noise.
 
-    start (3,): where the robot stands in the world; its odometry begins at zero there. Raises
-    InputError where it does not fit.
+    start (3,): initial pose of the robot in the world; its odometry is zero there. Raises
+    InputError if it does not fit.
     """
 
     def __init__(
@@ -46,25 +43,25 @@ class Simulation:
         self._next_scan_ns = 0
         self.stamp_ns = 0
 
-    def carry(self, T_world_base: Array) -> None:
-        """Carry the robot to a pose (3,): its wheels do not turn.
+    def teleport(self, T_world_base: Array) -> None:
+        """Teleport the robot to a pose (3,); its odometry does not change.
 
-        Raises InputError where it does not fit.
+        Raises InputError if it does not fit.
         """
         _check_fits(self.world, T_world_base, self.robot.config)
         self.robot.T_world_base = np.array(T_world_base, dtype=np.float64)
         self.robot.v = 0.0
         self.robot.w = 0.0
 
-    def read_sensors(self) -> Moment:
-        """Return what the sensors tell now; a scan that is due is given once."""
+    def read_sensors(self) -> SensorReadings:
+        """Return the present sensor readings; each scan is returned once."""
         scan = None
         if self.stamp_ns >= self._next_scan_ns:
             scan = self.laser.scan(self.world, self.robot.T_world_base, self.stamp_ns)
             self._next_scan_ns += self._scan_period_ns
-        return Moment(self.stamp_ns, self.robot.T_odom_base, scan)
+        return SensorReadings(self.stamp_ns, self.robot.T_odom_base, scan)
 
-    def step(self, v: float, w: float) -> Moment:
+    def step(self, v: float, w: float) -> SensorReadings:
         """Drive for one step with a commanded speed (m/s) and turn rate (rad/s)."""
         self.robot.step(v, w, STEP_NS / 1e9)
         self.stamp_ns += STEP_NS

@@ -1,4 +1,4 @@
-"""The straight surfaces of a world: what a laser in it can see as lines."""
+"""Straight surfaces of a world, which a laser observes as lines."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,13 +10,10 @@ from thinmap_ros.sim.world import World
 
 
 def surfaces(world: World, shortest_m: float) -> Array:
-    """Faces of what is solid, parallel to an axis, that bound the free space round the start.
+    """Axis-parallel obstacle faces that bound the free space around the start: ends (N, 4), m.
 
-    Ends (N, 4), m.
-
-    Each is as long as it goes on straight, at least shortest_m; the two sides of a thin wall are
-    two. Columns: x and y of one end, x and y of the other. Slanting surfaces fall into steps, and
-    are left out with these.
+    Each is at least shortest_m long; the two sides of a thin wall are two faces. Columns: x and y
+    of one end, x and y of the other. Oblique surfaces consist of short steps and are omitted.
     """
     free = world.occupied == 0
     inside = inside_of(world)
@@ -30,7 +27,7 @@ def surfaces(world: World, shortest_m: float) -> Array:
 
 
 def inside_of(world: World) -> NDArray[np.bool_]:
-    """Free cells (H, W) that are joined to the start."""
+    """Free cells (H, W) that are connected with the start."""
     return reachable(world.occupied == 0, world.frame.cells_of(world.start[None, :2]))
 
 
@@ -41,10 +38,7 @@ def _rows_of_faces(
     shortest_m: float,
     side: int,
 ) -> Array:
-    """Faces along rows, (N, 4).
-
-    Free cells inside that have a solid one beside them, a row below (-1) or above (1).
-    """
+    """Faces along rows, (N, 4): free cells with an obstacle one row below (-1) or above (1)."""
     faces = np.zeros((inside.shape[0], inside.shape[1] + 2), dtype=np.int8)
     beyond = np.ones_like(free)
     beyond[max(-side, 0) : len(free) - max(side, 0)] = free[

@@ -1,4 +1,4 @@
-"""Worlds: what is solid in them, and where a robot may start."""
+"""Worlds: obstacles, and the start of a robot."""
 
 import math
 from dataclasses import dataclass
@@ -16,10 +16,10 @@ from thinmap_ros.sim.moving_obstacles import MovingObstacles
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """What is solid: `occupied` (H, W) uint8 on a lattice in the world frame.
+    """Obstacles: `occupied` (H, W) uint8 on a lattice in the world frame.
 
-    Where a robot may start (3,); where a laser gets no return from what is solid, `glass` (H, W);
-    and what moves.
+    start (3,): initial pose of a robot; `glass` (H, W): obstacles without laser returns; `moving`:
+    moving obstacles.
     """
 
     name: str
@@ -31,19 +31,19 @@ class World:
 
     @staticmethod
     def from_patch(name: str, patch: GridPatch, start: Array) -> 'World':
-        """World of a map: what is not free there is solid. start (3,): NaN where none is known."""
+        """World of a map; cells that are not free are obstacles. start (3,): NaN if unknown."""
         return World(name, (~patch.free).astype(np.uint8), patch.frame, start)
 
     @cached_property
     def distance_to_wall_m(self) -> Array:
-        """Distance of each cell's centre to the border of the nearest solid cell, m, (H, W).
+        """Distance of each cell centre from the edge of the nearest obstacle cell, m, (H, W).
 
-        Up to 0.2 cells too long where that cell lies diagonally.
+        Up to 0.2 cells too long in diagonal directions.
         """
         return (distance_cells(self.occupied != 0) - 0.5) * self.frame.resolution
 
     def is_clear(self, x: float, y: float, radius_m: float) -> bool:
-        """Whether a disc whose centre lies within the world touches no solid cell; exact."""
+        """Whether a disc with its centre in the world touches no obstacle cell; exact."""
         if not (math.isfinite(x) and math.isfinite(y)):
             return False
         frame = self.frame
@@ -52,7 +52,7 @@ class World:
         col = math.floor((x - frame.origin_x) / frame.resolution)
         if not (0 <= row < rows and 0 <= col < cols):
             return False
-        # The point lies up to 0.71 cells off the centre, and the distance there is up to 0.2 cells
+        # The point is up to 0.71 cells from the centre, and the distance there is up to 0.2 cells
         # too long.
         spare = (float(self.distance_to_wall_m[row, col]) - radius_m) / frame.resolution
         if abs(spare) > 1.0:
@@ -60,9 +60,9 @@ class World:
         return self._squared_gap(x, y, row, col, radius_m) > radius_m**2
 
     def _squared_gap(self, x: float, y: float, row: int, col: int, reach_m: float) -> float:
-        """Squared distance, m^2, from a point to the nearest solid cell within reach.
+        """Squared distance, m^2, from a point to the nearest obstacle cell within reach.
 
-        Inf where there is none.
+        inf if there is none.
         """
         reach = math.ceil(reach_m / self.frame.resolution) + 1
         first = np.maximum([row - reach, col - reach], 0)

@@ -1,4 +1,4 @@
-"""A bag that was cut off or damaged (MCAP) into a whole one, with all that can be read of it."""
+"""Repairs a truncated or damaged bag (MCAP): writes a new bag of all intact messages."""
 
 import argparse
 from pathlib import Path
@@ -12,9 +12,9 @@ from thinmap_ros.tools import cli
 
 
 def files_of(bag: Path) -> list[Path]:
-    """Return the MCAP files of a bag, in the order in which they were recorded.
+    """Return the MCAP files of a bag, in the order of recording.
 
-    Raises InputError where it has none.
+    Raises InputError if it has none.
     """
     refuse_foreign(bag)
     files = mcap_files_in(bag) if bag.is_dir() else [bag]
@@ -24,21 +24,21 @@ def files_of(bag: Path) -> list[Path]:
 
 
 def _has_compressed_messages(bag: Path) -> bool:
-    """Whether metadata.yaml says that each message is compressed on its own; none without it."""
+    """Whether messages are compressed individually, by metadata.yaml; False without it."""
     try:
         return bag_files(bag).compressed_messages
     except InputError:
         return False
 
 
-def told(found: RepairReport) -> str:
-    """Say in one line what was found."""
+def describe_repair(found: RepairReport) -> str:
+    """Describe the repair in one line."""
     parts = [f'{sum(found.counts.values())} messages on {len(found.counts)} topics']
     if found.first_ns is not None:
         parts[0] += f', {(found.last_ns - found.first_ns) / 1e9:.1f} s'
     parts.extend(f'{file.name}: {damage}' for file, damage in found.damage.items() if damage)
     if found.unreadable:
-        parts.append(f'{found.unreadable} messages that cannot be unpacked')
+        parts.append(f'{found.unreadable} messages that cannot be decompressed')
     return '; '.join(parts)
 
 
@@ -50,7 +50,7 @@ def _work(arguments: argparse.Namespace) -> None:
         raise InputError(f'{out}: expected another name than that of the bag itself')
     with temporary_bag(out) as folder:
         found = repair(files, folder, _has_compressed_messages(bag))
-    print(f'{out}: {told(found)}')
+    print(f'{out}: {describe_repair(found)}')
 
 
 def main() -> None:

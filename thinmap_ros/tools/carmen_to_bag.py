@@ -1,4 +1,4 @@
-"""A CARMEN log becomes a bag: scan, odom, tf and tf_static."""
+"""Converts a CARMEN log to a bag: scan, odom, tf and tf_static."""
 
 import argparse
 from pathlib import Path
@@ -13,9 +13,9 @@ from thinmap_ros.tools import cli
 def convert(log: CarmenLog, bag: Path) -> int:
     """Write a bag of a log; returns the number of scans.
 
-    Header stamps are the log's own, also where they step back. The bag's log time never does: it
-    follows the largest stamp so far, a nanosecond a message, so that playing it keeps the order of
-    the file.
+    Header stamps are those of the log, even if they step back. The log time of the bag is
+    monotonic: the largest stamp so far plus a nanosecond per message, so that playback keeps the
+    order of the file.
     """
     scans = 0
     with BagWriter(bag) as writer:

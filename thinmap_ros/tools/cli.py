@@ -1,4 +1,4 @@
-"""What every command line program does alike: arguments, errors in one line, exit codes."""
+"""Common parts of command line programs: arguments, errors in one line, exit codes."""
 
 import argparse
 import sys
@@ -19,12 +19,12 @@ from thinmap_ros.logs.log import Log
 BAD_INPUT = 2
 INTERRUPTED = 130
 AnyConfig = TypeVar('AnyConfig', bound=Config)
-# A parser or a group of its options: argparse's own name for what both are.
+# argparse's base class of parsers and groups of options.
 Options = argparse._ActionsContainer
 
 
 def run(work: Callable[[argparse.Namespace], None], parser: argparse.ArgumentParser) -> None:
-    """Parse the arguments, do the work, and end.
+    """Parse the arguments, run the work, and exit.
 
     0, 2 after one line on what is wrong, or 130 on Ctrl-C. The program has the name by which the
     command `thinmap` calls it, if it does.
@@ -46,12 +46,9 @@ def run(work: Callable[[argparse.Namespace], None], parser: argparse.ArgumentPar
 
 
 def add_config(parser: Options, config: type[Config], names: list[str] | None = None) -> None:
-    """Add an option for each field of a config (or those named).
+    """Add an option for each field of a config (or the named ones), with its description.
 
-    Its default and description are the config's.
-
-    What is not given on the command line is not among the arguments: `config_from` leaves it to the
-    config.
+    Options that are not given are not among the arguments: `config_from` uses the defaults.
     """
     for field in fields(config):
         if (names is None or field.name in names) and isinstance(field.default, int | float | str):
@@ -65,28 +62,23 @@ def add_config(parser: Options, config: type[Config], names: list[str] | None = 
 
 
 def config_from(arguments: argparse.Namespace, config: type[AnyConfig]) -> AnyConfig:
-    """Config of what was given on the command line.
-
-    Raises ConfigError where a value is out of range.
-    """
+    """Config from the command line. Raises ConfigError if a value is out of range."""
     names = [field.name for field in fields(config)]
     return config(**{name: getattr(arguments, name) for name in names if hasattr(arguments, name)})
 
 
 def add_log_options(parser: argparse.ArgumentParser) -> None:
-    """Add the log itself and what says where its laser sits and which topics to read."""
+    """Add the log, and options for its laser pose and topics."""
     parser.add_argument(
         'log', type=Path, help='CARMEN log (plain or gzip), rosbag2 folder, or MCAP file'
     )
-    carmen = parser.add_argument_group(
-        'laser of a CARMEN log', 'Bags say this themselves, but for --offset-m.'
-    )
+    carmen = parser.add_argument_group('laser of a CARMEN log', 'Only --offset-m applies to bags.')
     add_config(carmen, LaserOptions)
     parser.add_argument(
-        '--scan-topic', default='', help='bag: topic of the scans, where there are several'
+        '--scan-topic', default='', help='bag: topic of the scans, if there are several'
     )
     parser.add_argument(
-        '--odom-topic', default='', help='bag: topic of the odometry, where there are several'
+        '--odom-topic', default='', help='bag: topic of the odometry, if there are several'
     )
     parser.add_argument(
         '--base-frame', default='base_link', help="bag: the robot's frame (default base_link)"

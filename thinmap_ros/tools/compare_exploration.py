@@ -1,6 +1,6 @@
 """Run strategies x worlds x starts, on all cores or a Dask cluster: one table, plots of coverage.
 
-What is finished is kept: started again with the same folder, only what is missing is run.
+Results are kept: with the same folder, only missing runs are started.
 """
 
 import argparse
@@ -18,7 +18,7 @@ from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.evaluation.parallel_jobs import (
     Report,
     add_run_options,
-    complaint,
+    failure_summary,
     read_report,
     run_pending,
 )
@@ -35,7 +35,7 @@ from thinmap_ros.view import figures
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """One run: a world, which of its starts that is, and what it is explored with."""
+    """One run: world, number of the start, and options of the exploration."""
 
     world: World
     start: Array
@@ -44,12 +44,12 @@ class Job:
 
     @property
     def name(self) -> str:
-        """The folder of its result."""
+        """Folder of the result."""
         return f'{self.world.name}/{self.number}/{self.options.strategy}'
 
 
 def run_job(job: Job) -> Report:
-    """Explore, in its own process, here or on another machine, which needs no file of this one."""
+    """Explore in a separate process, here or on another machine, without files of this one."""
     _, report = explore(job.world, job.start, job.options)
     return report | {'start_number': job.number, 'seed': job.options.seed}
 
@@ -70,7 +70,7 @@ def _jobs(arguments: argparse.Namespace) -> list[Job]:
 
 
 def _starts(path: Path, world: World, count: int) -> list[Array]:
-    """The first starts of a world: of worlds.json in the folder above its own, else its own one."""
+    """First starts of a world, of worlds.json in the parent folder, or else of the world file."""
     listing = path.resolve().parent.parent / 'worlds.json'
     key = f'{path.resolve().parent.name}/{path.stem}'
     if listing.exists():
@@ -82,7 +82,7 @@ def _starts(path: Path, world: World, count: int) -> list[Array]:
                 f'{listing}: {key}: expected starts as lists of x, y, theta'
             ) from error
     if not np.isfinite(world.start).all():
-        raise InputError(f'{path}: the world names no start, and there is no {listing}')
+        raise InputError(f'{path}: the world has no start, and there is no {listing}')
     return [world.start]
 
 
@@ -96,7 +96,7 @@ def _work(arguments: argparse.Namespace) -> None:
         run_job, jobs, lambda job: _report_file(arguments.out, job), arguments, arguments.quiet
     )
     if failures:
-        raise complaint(failures)
+        raise failure_summary(failures)
     reports = [read_report(_report_file(arguments.out, job), asdict(job.options)) for job in jobs]
     table = markdown(reports)
     write_text(arguments.out / 'table.md', table)

@@ -1,4 +1,4 @@
-"""A simulated robot explores a room through the live ROS 2 graph: every node its own process."""
+"""Demo: a simulated robot explores a room with the live ROS 2 graph, a process per node."""
 
 import argparse
 import contextlib
@@ -23,26 +23,23 @@ from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.tools import cli
 from thinmap_ros.tools.ros_check import require_ros
 
-# Nodes end at once, but not on a machine that is busy; a recorder that is killed leaves half a bag.
+# On a busy machine nodes need time to exit; a killed recorder leaves a truncated bag.
 _PATIENCE_S = 20.0
 _NODES = ('localizer', 'grid_mapper', 'topology_builder', 'explorer', 'navigator', 'recorder')
-# These listen to /scan: time stands still until all of them do.
+# Subscribers of /scan: simulated time waits for all of them.
 _SCAN_LISTENERS = 5
 _SLEEP_S = 0.05
 
 
 @dataclass(eq=False)
 class Processes:
-    """Processes that live and end together.
-
-    Each in a group of its own, with its output in a file.
-    """
+    """Processes that end together, each in its own process group, with its output in a file."""
 
     folder: Path
     running: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
 
     def start(self, name: str, arguments: list[str], quiet: bool = True) -> None:
-        """Start a node; its output goes to NAME.log, or, unless quiet, to where ours goes."""
+        """Start a node; its output goes to NAME.log, or, unless quiet, to our output."""
         command = [sys.executable, '-m', f'thinmap_ros.nodes.{name}', '--ros-args', *arguments]
         self.folder.mkdir(parents=True, exist_ok=True)
         with (self.folder / f'{name}.log').open('wb') as log:
@@ -62,8 +59,8 @@ class Processes:
         )
 
     def stop(self) -> None:
-        """SIGTERM to every group, and SIGKILL to those that are still there a little later."""
-        # Unlike SIGINT it ends a process without a word that is still importing.
+        """Send SIGTERM to every group, and SIGKILL to those that still run a little later."""
+        # Unlike SIGINT it ends importing processes without a traceback.
         self._signal(signal.SIGTERM)
         until = time.monotonic() + _PATIENCE_S
         while time.monotonic() < until and any(p.poll() is None for p in self.running.values()):
@@ -84,10 +81,7 @@ def _raise_interrupt(number: int, frame: object) -> None:
 
 
 def explore(arguments: argparse.Namespace, world: Path, start: Array) -> None:
-    """Run the graph until the exploration has ended.
-
-    Raises ThinmapError where a node ends before.
-    """
+    """Run the graph until the exploration has ended. Raises ThinmapError if a node exits early."""
     out: Path = arguments.out
     processes = Processes(out / 'log')
     sim_time = ['-p', 'use_sim_time:=true']
@@ -135,10 +129,7 @@ def _wait(processes: Processes) -> None:
 
 
 def _prepare(out: Path) -> None:
-    """An empty place for the results of this run.
-
-    What an earlier run left there goes, and nothing else.
-    """
+    """Prepare the folder for the results: delete those of an earlier run, and nothing else."""
     out.mkdir(parents=True, exist_ok=True)
     if (out / 'bag').exists():
         for file in (out / 'bag').iterdir():
@@ -149,10 +140,7 @@ def _prepare(out: Path) -> None:
 
 
 def _choose_domain() -> None:
-    """A domain of its own, unless the user has set one.
-
-    Two demos at once do not hear each other.
-    """
+    """Choose a separate ROS domain, unless the user has set one, to isolate simultaneous demos."""
     if 'ROS_DOMAIN_ID' not in os.environ:
         os.environ['ROS_DOMAIN_ID'] = str(random.SystemRandom().randrange(1, 102))
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')

@@ -1,4 +1,4 @@
-"""The papers' experiments: figures and tables, the paper's numbers beside ours, a page for all."""
+"""Runs the papers' experiments: figures, tables, comparison with the papers, and a page."""
 
 import argparse
 import json
@@ -32,7 +32,7 @@ from thinmap_ros.files.atomic import write_text
 from thinmap_ros.tools import cli
 from thinmap_ros.view.plot_writer import write_plot
 
-# In the order of the papers; the longest are begun first.
+# In the order of the papers; the longest are started first.
 EXPERIMENTS: dict[str, Callable[[Source], Outcome]] = {
     'thinning_voronoi': thinning_voronoi.run,
     'global_map': global_map.run,
@@ -48,16 +48,16 @@ EXPERIMENTS: dict[str, Callable[[Source], Outcome]] = {
     'feature_count': feature_count.run,
     'long_floor': long_floor.run,
 }
-# Need logs, or results: not among all
+# These need logs, or results: not part of `all`
 LOGS = 'logs'
 PAGE = 'page'
 _LONGEST = ('strategies', 'feature_count', 'long_floor', 'convergence')
 
 
 def run_one(name: str, source: Source, out: Path) -> float:
-    """Run an experiment and write all of it into the folder out/NAME.
+    """Run an experiment and write its results to the folder out/NAME.
 
-    Returns the seconds it took.
+    Returns its duration, s.
     """
     began = time.perf_counter()
     write_outcome(EXPERIMENTS[name](source), out / name)
@@ -65,7 +65,7 @@ def run_one(name: str, source: Source, out: Path) -> float:
 
 
 def write_outcome(outcome: Outcome, folder: Path) -> None:
-    """Write tables (CSV), figures (PNG, SVG) and what the page needs to know of them."""
+    """Write tables (CSV), figures (PNG, SVG) and their descriptions for the page."""
     for table in outcome.tables:
         write_text(folder / f'{table.name}.csv', table.csv())
     for plot in outcome.plots:

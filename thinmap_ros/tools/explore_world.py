@@ -1,4 +1,4 @@
-"""Explore a simulated world, no ROS, faster than real time: map, graph, path, picture, report."""
+"""Explores a simulated world without ROS, faster than real time."""
 
 import argparse
 import json
@@ -31,7 +31,7 @@ def write_outputs(loop: ClosedLoop, report: dict[str, Any], folder: Path) -> Non
     """Write all files into a folder."""
     log = loop.log
     pipeline = loop.pipeline
-    patch = pipeline.grid.patch()
+    patch = pipeline.grid.known_area()
     topology = pipeline.topology.map
     folder.mkdir(parents=True, exist_ok=True)
     trajectories.write_tum(folder / 'trajectory.tum', log.stamps_ns, log.poses)
@@ -51,7 +51,7 @@ def _start(world: World, given: str | None) -> Array:
     if given is None:
         if not np.isfinite(world.start).all():
             raise InputError(
-                f'{world.name}: the world names no start: give one with --start=X,Y,THETA'
+                f'{world.name}: the world has no start: give one with --start=X,Y,THETA'
             )
         return world.start
     try:
@@ -78,16 +78,16 @@ def options_from(arguments: argparse.Namespace, strategy: str) -> Options:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that every run in a simulated world has."""
+    """Add the common options of runs in a simulated world."""
     parser.add_argument('--seed', type=int, default=0, help='decides all noise (default 0)')
     parser.add_argument('--speed', type=float, default=0.2, help='speed limit, m/s (default 0.2)')
     parser.add_argument('--localization', default='truth', choices=('truth', 'slam'))
     parser.add_argument('--robot', default='2dx', choices=sorted(PRESETS))
     parser.add_argument(
-        '--time-limit', type=float, default=20_000.0, help='simulated time to give up at, s'
+        '--time-limit', type=float, default=20_000.0, help='limit of simulated time, s'
     )
     parser.add_argument(
-        '--kidnap-at', type=float, help='carry the robot off after so many simulated s (with slam)'
+        '--kidnap-at', type=float, help='kidnap the robot at this simulated time, s (with slam)'
     )
     parser.add_argument('--quiet', action='store_true', help='no progress bar')
     cli.add_config(parser, LaserScannerConfig, ['beams', 'field_of_view_deg', 'range_max_m'])
@@ -98,7 +98,7 @@ def _work(arguments: argparse.Namespace) -> None:
     options = options_from(arguments, arguments.strategy)
     if options.kidnap_at_s is not None and options.localization == 'truth':
         raise InputError(
-            '--kidnap-at: a robot that knows the truth is never lost: expected --localization=slam'
+            '--kidnap-at: expected --localization=slam, because true poses are never lost'
         )
     with tqdm(
         total=100, unit='%', disable=arguments.quiet, bar_format='{l_bar}{bar}| {postfix}'

@@ -1,4 +1,4 @@
-"""A map_server map becomes a route graph: places, and passages that a robot can drive straight."""
+"""Converts a map_server map to a route graph."""
 
 import argparse
 import math
@@ -29,7 +29,7 @@ def _start(given: str | None) -> tuple[float, float] | None:
 
 
 def _config(arguments: argparse.Namespace) -> TopologyConfig:
-    """Robot and pruning as the arguments want them: a greater clearance is a wider robot."""
+    """Configuration from the arguments: a greater clearance is a wider robot."""
     radius = arguments.robot_radius if arguments.min_clearance is None else arguments.min_clearance
     if radius < arguments.robot_radius:
         raise InputError(
@@ -40,7 +40,7 @@ def _config(arguments: argparse.Namespace) -> TopologyConfig:
 
 
 def _work(arguments: argparse.Namespace) -> None:
-    graphs.writer_of(arguments.out)  # a wrong name is reported before any work
+    graphs.writer_of(arguments.out)  # report a wrong name before the work
     if arguments.picture is not None and arguments.picture.suffix != '.png':
         raise InputError(f'{arguments.picture}: expected a name that ends in .png')
     start = _start(arguments.start)

@@ -1,4 +1,4 @@
-"""Record the experiments' drives: sensors, ground truth, outputs, each a bag with a text on it."""
+"""Records the drives of the experiments: a bag with sensors, ground truth and outputs for each."""
 
 import argparse
 from collections.abc import Iterable
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.errors import InputError, shown
+from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.estimate import Estimate
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import LocalizerConfig
@@ -33,8 +33,8 @@ _TYPES = {
 }
 
 
-class _Recording:
-    """A bag that is written to, its messages of one stamp a nanosecond apart in the log."""
+class _BagRecorder:
+    """Writes a bag; messages with equal stamps are a nanosecond apart in log time."""
 
     def __init__(self, writer: BagWriter) -> None:
         self._writer = writer
@@ -45,36 +45,36 @@ class _Recording:
         self._log_ns = max(stamp_ns, self._log_ns + 1)
         self._writer.write(topic, _TYPES[topic], self._log_ns, message)
 
-    def mount(self, look: DriveSample) -> None:
-        """Where the laser sits."""
-        ns = look.scan.stamp_ns
+    def write_laser_mount(self, sample: DriveSample) -> None:
+        """Write the pose of the laser."""
+        ns = sample.scan.stamp_ns
         made = self._objects
         self._write(
-            '/tf_static', ns, made.transform(ns, ('base_link', 'laser'), look.scan.T_base_laser)
+            '/tf_static', ns, made.transform(ns, ('base_link', 'laser'), sample.scan.T_base_laser)
         )
 
-    def sensed(self, look: DriveSample) -> None:
-        """What the robot had at a scan, and where it truly was."""
-        ns = look.scan.stamp_ns
+    def write_sensors(self, sample: DriveSample) -> None:
+        """Write scan, odometry and true pose of a sample."""
+        ns = sample.scan.stamp_ns
         made = self._objects
-        self._write(TRUTH_TOPIC, ns, made.pose(ns, 'map', look.T_world_base))
-        self._write('/odom', ns, made.odometry(ns, look.T_odom_base))
-        self._write('/tf', ns, made.transform(ns, ('odom', 'base_link'), look.T_odom_base))
-        self._write('/scan', ns, made.scan(look.scan))
+        self._write(TRUTH_TOPIC, ns, made.pose(ns, 'map', sample.T_world_base))
+        self._write('/odom', ns, made.odometry(ns, sample.T_odom_base))
+        self._write('/tf', ns, made.transform(ns, ('odom', 'base_link'), sample.T_odom_base))
+        self._write('/scan', ns, made.scan(sample.scan))
 
-    def found(self, ns: int, estimate: Estimate) -> None:
-        """What the localizer made of it."""
+    def write_estimate(self, ns: int, estimate: Estimate) -> None:
+        """Write the estimate of the localizer."""
         made = self._objects
         self._write('/pose', ns, made.estimate(ns, estimate.T_map_base, estimate.covariance))
         self._write('/tf', ns, made.transform(ns, ('map', 'odom'), estimate.T_map_odom))
 
-    def mapped(self, ns: int, pipeline: Pipeline) -> None:
-        """Map and graph as they are."""
-        self._write('/map', ns, self._objects.grid(ns, pipeline.grid.patch()))
+    def write_maps(self, ns: int, pipeline: Pipeline) -> None:
+        """Write the present map and graph."""
+        self._write('/map', ns, self._objects.grid(ns, pipeline.grid.known_area()))
         self._write('/topology', ns, self._objects.topology(ns, pipeline.topology.map))
 
 
-def record(path: Path, looks: Iterable[DriveSample], localized: bool) -> int:
+def record(path: Path, samples: Iterable[DriveSample], localized: bool) -> int:
     """Write the bag of a drive; returns the number of scans.
 
     localized: by the localizer, else by ground truth.
@@ -83,24 +83,26 @@ def record(path: Path, looks: Iterable[DriveSample], localized: bool) -> int:
     scans = 0
     pipeline = None
     with BagWriter(path, definitions=definitions, compressed=True) as writer:
-        recording = _Recording(writer)
-        for look in looks:
+        recording = _BagRecorder(writer)
+        for sample in samples:
             if pipeline is None:
-                pipeline, truth = _pipeline(look, localized)
-                recording.mount(look)
-            truth[:] = [look.T_world_base]
-            recording.sensed(look)
-            recording.found(look.scan.stamp_ns, pipeline.step(look.scan, look.T_odom_base).estimate)
+                pipeline, truth = _pipeline(sample, localized)
+                recording.write_laser_mount(sample)
+            truth[:] = [sample.T_world_base]
+            recording.write_sensors(sample)
+            recording.write_estimate(
+                sample.scan.stamp_ns, pipeline.step(sample.scan, sample.T_odom_base).estimate
+            )
             scans += 1
             if scans % _MAP_EVERY == 0:
-                recording.mapped(look.scan.stamp_ns, pipeline)
+                recording.write_maps(sample.scan.stamp_ns, pipeline)
         if pipeline is not None and scans % _MAP_EVERY:
-            recording.mapped(look.scan.stamp_ns, pipeline)
+            recording.write_maps(sample.scan.stamp_ns, pipeline)
     return scans
 
 
 def _pipeline(first: DriveSample, localized: bool) -> tuple[Pipeline, list[Array]]:
-    """A pipeline for a drive that begins so, and the list that is to take each scan's true pose."""
+    """A pipeline for a drive from this sample, and the list for the true pose of each scan."""
     x, y, yaw = (float(number) for number in first.T_world_base)
     localizer = LocalizerConfig(initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
     config = PipelineConfig(localizer=localizer)
@@ -128,13 +130,13 @@ def _about(name: str, seed: int, scans: int, seconds: float, localized: bool) ->
 
 def _work(arguments: argparse.Namespace) -> None:
     if unknown := set(arguments.names) - set(RECIPES):
-        raise InputError(f'drive {shown(min(unknown))}: expected some of {", ".join(RECIPES)}')
+        raise InputError(f'drive {quoted(min(unknown))}: expected some of {", ".join(RECIPES)}')
     for name in arguments.names or RECIPES:
         path = arguments.out / f'{name}.mcap'
-        looks = list(Source(arguments.seed).looks(name))
+        samples = list(Source(arguments.seed).samples(name))
         localized = RECIPES[name].localized
-        scans = record(path, looks, localized)
-        seconds = (looks[-1].scan.stamp_ns - looks[0].scan.stamp_ns) / 1e9
+        scans = record(path, samples, localized)
+        seconds = (samples[-1].scan.stamp_ns - samples[0].scan.stamp_ns) / 1e9
         write_text(
             arguments.out / f'{name}.txt', _about(name, arguments.seed, scans, seconds, localized)
         )

@@ -1,7 +1,4 @@
-"""A log or bag through localizer, grid and topology, as fast as it goes.
-
-Trajectory, map, graph, report and picture.
-"""
+"""Replays a log or bag through localizer, grid and topology, as fast as possible."""
 
 import argparse
 import sys
@@ -26,54 +23,51 @@ from thinmap_ros.tools import cli
 from thinmap_ros.view.null_view import NullView
 from thinmap_ros.view.rerun_view import View
 
-# What is large is put together once a second, as a view does not draw it more often.
+# Large data are converted once a second: a view does not draw them more often.
 _PERIOD_NS = 1_000_000_000
 _STAGES = {'localizer': 'localizer', 'grid': 'map update', 'topology': 'graph update'}
 
 
 class ReplayView:
-    """Tells a view what a pipeline makes of each scan: the same picture as of the live nodes.
-
-    At the end `last` shows the map and graph again.
-    """
+    """Shows the results of a pipeline in a view, as of live nodes; `finish` shows the final map."""
 
     def __init__(self, view: NullView) -> None:
-        """Begin with nothing shown."""
+        """Start with an empty view."""
         self._view = view
         self._T_map_odom: Array | None = None
         self._drawn_ns: int | None = None
 
     def step(self, scan: Scan, T_odom_base: Array, estimate: Estimate, pipeline: Pipeline) -> None:
-        """Show what came of a scan with the odometry pose (3,) at its stamp."""
+        """Show the result of a scan with the odometry pose (3,) at its stamp."""
         ns = scan.stamp_ns
         view = self._view
         view.pose(ns, estimate.T_map_base, estimate.covariance)
         view.scan(ns, scan)
         if self._T_map_odom is None:
             self._T_map_odom = estimate.T_map_odom
-        # Odometry as if it had been all there is since the first pose.
-        view.trail(ns, 'odometry', se2.compose(self._T_map_odom, T_odom_base))
+        # Dead reckoning from the first pose.
+        view.trajectory(ns, 'odometry', se2.compose(self._T_map_odom, T_odom_base))
         sigma_m = float(np.sqrt(max(np.linalg.eigvalsh(estimate.covariance[:2, :2])[-1], 0.0)))
-        view.number(ns, 'error', '2 sigma, cm', 200.0 * sigma_m)
+        view.scalar(ns, 'error', '2 sigma, cm', 200.0 * sigma_m)
         for curve, count in (
             ('features', estimate.n_features),
             ('local features', estimate.n_local_features),
-            ('matched lines', estimate.matched),
+            ('matched lines', estimate.matched_lines),
         ):
-            view.number(ns, 'count', curve, float(count))
+            view.scalar(ns, 'count', curve, float(count))
         for stage, curve in _STAGES.items():
-            view.number(ns, 'step', curve, 1000.0 * pipeline.stage_seconds[stage][-1])
+            view.scalar(ns, 'step', curve, 1000.0 * pipeline.stage_seconds[stage][-1])
         if self._drawn_ns is None or abs(ns - self._drawn_ns) >= _PERIOD_NS:
-            self.last(ns, pipeline)
+            self.finish(ns, pipeline)
 
-    def last(self, ns: int, pipeline: Pipeline) -> None:
+    def finish(self, ns: int, pipeline: Pipeline) -> None:
         """Show map, graph and features as they are now."""
         self._drawn_ns = ns
         view = self._view
         topology = pipeline.topology.map
-        view.grid(ns, pipeline.grid.patch())
+        view.grid(ns, pipeline.grid.known_area())
         view.topology(ns, topology)
-        view.number(ns, 'count', 'nodes', float(len(topology.nodes)))
+        view.scalar(ns, 'count', 'nodes', float(len(topology.nodes)))
         features = line_features(pipeline.localizer)
         ends = np.array([[feature.start, feature.end] for feature in features]).reshape(-1, 2, 2)
         view.lines(ns, ends, np.array([feature.local for feature in features], dtype=bool))
@@ -92,10 +86,7 @@ def _work(arguments: argparse.Namespace) -> None:
 
 @contextmanager
 def _view(arguments: argparse.Namespace) -> Iterator[View | None]:
-    """What is asked for of viewer and recording.
-
-    Of a log that cannot be replayed there is no recording.
-    """
+    """The requested viewer and recording. The recording is deleted if the replay fails."""
     if not (arguments.view or arguments.recording):
         yield None
         return

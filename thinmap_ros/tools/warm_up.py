@@ -1,4 +1,4 @@
-"""Compiles all kernels and keeps them, so that no program has to wait for that at its start."""
+"""Compiles all kernels and caches them, so that programs start without compilation."""
 
 import argparse
 
@@ -27,15 +27,15 @@ def main() -> None:
 
 
 def work(arguments: argparse.Namespace) -> None:
-    """Rehearse every algorithm, and an exploration in the simulator."""
+    """Run every algorithm once, and an exploration in the simulator."""
     for rehearse in _REHEARSALS:
         rehearse()
     world = World.from_patch(*read_world(package_data.world_path('office')))
-    # What is needed only where there are several places to go to is reached by a whole exploration.
+    # A complete exploration reaches the kernels that need several targets.
     explore(world, world.start, Options(localization='slam'))
     kept = kernel_cache.folder()
     print(
-        f'all kernels are compiled, and kept in {kept}' if kept else 'there is no folder for them'
+        f'all kernels are compiled, and cached in {kept}' if kept else 'there is no folder for them'
     )
 
 

@@ -1,1 +1,1 @@
-"""What people look at: figures, and rerun."""
+"""Visualization: figures and rerun."""

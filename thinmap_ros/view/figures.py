@@ -1,4 +1,4 @@
-"""Pictures of maps, and pictures made small."""
+"""Figures of maps, and size reduction of PNG files."""
 
 from collections import defaultdict
 from pathlib import Path
@@ -15,9 +15,9 @@ from thinmap_ros.view import palette
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_GREY = 204  # of 255: cells that nobody has seen
+_GREY = 204  # of 255: unknown cells
 _SMALL_COLOURS = 64
-# Each kind of node has a shape of its own as well as a colour.
+# Each kind of node has its own shape and colour.
 _MARKERS = {NodeKind.END: 'o', NodeKind.BRANCH: 's', NodeKind.CORNER: '^'}
 
 
@@ -84,12 +84,12 @@ def draw_map(axes: 'Axes', patch: GridPatch) -> None:
     rows, cols = patch.shape
     x = patch.frame.origin_x + patch.frame.resolution * np.arange(cols + 1)
     y = patch.frame.origin_y + patch.frame.resolution * np.arange(rows + 1)
-    # Not by imshow: that takes some 90 bytes for each pixel of the picture.
+    # Not by imshow: it takes some 90 bytes per pixel.
     axes.pcolormesh(x, y, shade, antialiased=False, rasterized=True)
 
 
 def draw_graph(axes: 'Axes', topology: TopologicalMap, size: float = 5.0) -> None:
-    """Draw the paths of the edges and the nodes by kind, markers so many points wide."""
+    """Draw the paths of the edges and the nodes by kind, with markers of a size in points."""
     for i, edge in enumerate(topology.edges.values()):
         label = 'skeleton' if i == 0 else None
         axes.plot(
@@ -151,7 +151,7 @@ def coverage_figure(path: Path, reports: list[dict[str, Any]]) -> None:
 
 
 def write_small_png(source: Path, target: Path) -> None:
-    """Copy a PNG with so few colours that it takes a third of the space."""
+    """Copy a PNG with a reduced palette: a third of the size."""
     from PIL import Image
 
     with Image.open(source) as picture, atomic_write(target) as aside:

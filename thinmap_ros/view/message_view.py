@@ -1,4 +1,4 @@
-"""Messages, live or from a bag, told to a view."""
+"""Shows messages, live or from a bag, in a view."""
 
 import re
 from collections.abc import Callable
@@ -25,11 +25,11 @@ _STEPS = {'map update', 'graph update', 'explorer', 'global localization'}
 
 
 class MessageView:
-    """Takes messages by topic and tells a view what they mean.
+    """Shows messages by topic in a view.
 
-    laser_pose gives T_base_laser (3,) of a laser's frame, or None as long as it is not known: its
-    scans are not shown.
-    namespace: of the nodes whose step times are shown, as /diagnostics are of all robots.
+    laser_pose returns T_base_laser (3,) of a laser frame, or None while it is unknown: scans of
+    this laser are not shown.
+    namespace: of the nodes whose step times are shown; /diagnostics contains those of all robots.
     """
 
     def __init__(
@@ -60,17 +60,14 @@ class MessageView:
 
     @property
     def topics(self) -> set[str]:
-        """Topics that can be taken, relative names."""
+        """Relative names of the supported topics."""
         return set(self._takers)
 
-    def take(self, topic: str, message: Any) -> None:
-        """Tell the view of a message (ROS's class or rosbags').
-
-        Raises InputError where it makes no sense.
-        """
+    def show(self, topic: str, message: Any) -> None:
+        """Show a message (of ROS's class or rosbags'). Raises InputError if it is invalid."""
         try:
             self._takers[topic](decode.stamp_ns(message), message)
-        except ValueError as error:  # a kind of node that there is not, cells that are no rectangle
+        except ValueError as error:  # unknown node kinds, cells that form no rectangle
             raise InputError(' '.join(str(error).split())) from error
 
     def _on_map(self, ns: int, message: Any) -> None:
@@ -92,37 +89,37 @@ class MessageView:
             raise InputError('covariance: expected finite numbers')
         self._view.pose(ns, T_map_base, covariance)
         sigma_m = float(np.sqrt(max(np.linalg.eigvalsh(covariance[:2, :2])[-1], 0.0)))
-        self._view.number(ns, 'error', '2 sigma, cm', 200.0 * sigma_m)
+        self._view.scalar(ns, 'error', '2 sigma, cm', 200.0 * sigma_m)
         self._compare(ns, self._pairs.add_left(ns, T_map_base))
         if self._T_map_odom is None and self._T_odom_base is not None:
             self._T_map_odom = se2.compose(T_map_base, se2.invert(self._T_odom_base))
 
     def _on_odometry(self, ns: int, message: Any) -> None:
-        """Odometry as if it had been all there is since the first pose."""
+        """Trajectory of dead reckoning from the first pose."""
         self._T_odom_base = _pose(message.pose.pose)
         if self._T_map_odom is not None:
-            self._view.trail(ns, 'odometry', se2.compose(self._T_map_odom, self._T_odom_base))
+            self._view.trajectory(ns, 'odometry', se2.compose(self._T_map_odom, self._T_odom_base))
 
     def _on_truth(self, ns: int, message: Any) -> None:
         T_map_base = _pose(message.pose)
-        self._view.trail(ns, 'truth', T_map_base)
+        self._view.trajectory(ns, 'truth', T_map_base)
         self._compare(ns, self._pairs.add_right(ns, T_map_base))
 
     def _compare(self, ns: int, pair: tuple[Array, Array] | None) -> None:
         if pair is None:
             return
         difference = pair[0] - pair[1]
-        self._view.number(
+        self._view.scalar(
             ns, 'error', 'position, cm', 100.0 * float(np.hypot(difference[0], difference[1]))
         )
         heading = abs(float(np.degrees(se2.wrap(float(difference[2])))))
-        self._view.number(ns, 'error', 'heading, deg', heading)
+        self._view.scalar(ns, 'error', 'heading, deg', heading)
 
     def _on_topology(self, ns: int, message: Any) -> None:
         topology = decode.topology(message)
         self._places = {node.id: node.position for node in topology.nodes.values()}
         self._view.topology(ns, topology)
-        self._view.number(ns, 'count', 'nodes', len(topology.nodes))
+        self._view.scalar(ns, 'count', 'nodes', len(topology.nodes))
 
     def _on_end_nodes(self, ns: int, message: Any) -> None:
         places = np.array([[n.position.x, n.position.y] for n in message.end_nodes]).reshape(-1, 2)
@@ -140,7 +137,7 @@ class MessageView:
 
     def _on_samples(self, ns: int, message: Any) -> None:
         places = [[pose.position.x, pose.position.y] for pose in message.poses]
-        self._view.samples(ns, np.array(places, dtype=np.float64).reshape(-1, 2))
+        self._view.particles(ns, np.array(places, dtype=np.float64).reshape(-1, 2))
 
     def _on_plan(self, ns: int, message: Any) -> None:
         points = [[p.pose.position.x, p.pose.position.y] for p in message.poses]
@@ -149,20 +146,20 @@ class MessageView:
     def _on_exploration(self, ns: int, message: Any) -> None:
         place = message.target_position
         self._view.target(ns, np.array([place.x, place.y]) if message.has_target else None)
-        self._view.number(ns, 'progress', 'coverage, %', 100.0 * float(message.coverage_estimate))
-        self._view.number(ns, 'progress', 'distance, m', float(message.distance_m))
-        self._view.number(ns, 'count', 'end nodes left', float(message.end_nodes_left))
+        self._view.scalar(ns, 'progress', 'coverage, %', 100.0 * float(message.coverage_estimate))
+        self._view.scalar(ns, 'progress', 'distance, m', float(message.distance_m))
+        self._view.scalar(ns, 'count', 'end nodes left', float(message.end_nodes_left))
 
     def _on_slam(self, ns: int, message: Any) -> None:
-        self._view.number(ns, 'step', 'localizer', float(message.step_time_ms))
-        self._view.number(ns, 'count', 'features', float(message.features))
-        self._view.number(ns, 'count', 'local features', float(message.local_features))
-        self._view.number(ns, 'count', 'matched lines', float(message.matched))
+        self._view.scalar(ns, 'step', 'localizer', float(message.step_time_ms))
+        self._view.scalar(ns, 'count', 'features', float(message.features))
+        self._view.scalar(ns, 'count', 'local features', float(message.local_features))
+        self._view.scalar(ns, 'count', 'matched lines', float(message.matched))
 
     def _on_diagnostics(self, ns: int, message: Any) -> None:
-        """Step times of the nodes that publish none of their own."""
+        """Step times of nodes, from /diagnostics."""
         if ns <= 0:
-            return  # told before there was any time
+            return  # published before the first step
         for status in message.status:
             if status.name.rpartition(': ')[0].rpartition('/')[0] != self._namespace:
                 continue
@@ -170,14 +167,13 @@ class MessageView:
                 step, _, key = pair.key.rpartition(': ')
                 median = _MEDIAN.match(pair.value)
                 if key == 'step time' and median and step in _STEPS:
-                    self._view.number(ns, 'step', step, float(median[1]))
+                    self._view.scalar(ns, 'step', step, float(median[1]))
 
 
 def recording_from_bag(bag_path: Path, out_rrd: Path) -> None:
-    """Write the .rrd of a bag of a run, whole or not at all.
+    """Write the .rrd recording of the bag of a run, atomically.
 
-    Messages that make no sense are left out. Raises InputError where rerun is missing or the bag is
-    none.
+    Invalid messages are omitted. Raises InputError if rerun is missing or the bag is invalid.
     """
     bag = Bag(bag_path)
     mounts = _static_transforms(bag)
@@ -192,7 +188,7 @@ def recording_from_bag(bag_path: Path, out_rrd: Path) -> None:
 def _tell(bag: Bag, feed: MessageView) -> None:
     for raw in bag.messages({f'/{topic}' for topic in feed.topics}):
         try:
-            feed.take(raw.topic.removeprefix('/'), bag.decode(raw))
+            feed.show(raw.topic.removeprefix('/'), bag.decode(raw))
         except InputError:
             continue
 
@@ -206,7 +202,7 @@ def _static_transforms(bag: Bag) -> StaticTransforms:
 
 
 def _laser_pose(transforms: StaticTransforms, frame: str) -> Array | None:
-    mount = transforms.mount(frame, 'base_link')
+    mount = transforms.laser_mount(frame, 'base_link')
     return None if mount is None else mount.T_base_laser
 
 

@@ -1,4 +1,4 @@
-"""What can be told to a view, whoever shows it."""
+"""The interface of views, and a view that shows nothing."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,25 +10,25 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 
 
 class NullView:
-    """What a view is told, shown to nobody.
+    """A view that shows nothing, and the interface of all views.
 
-    Each call gives the stamp in ns; poses (3,) and points are in the map frame, m and rad.
+    Stamps are in ns; poses (3,) and points are in the map frame, m and rad.
     """
 
     def grid(self, ns: int, patch: GridPatch) -> None:
         """Show the map."""
 
     def scan(self, ns: int, scan: Scan) -> None:
-        """Show a scan where the robot is; it replaces the one before."""
+        """Show a scan at the pose of the robot; it replaces the previous scan."""
 
     def pose(self, ns: int, T_map_base: Array, covariance: Array) -> None:
-        """Show the robot with its covariance (3, 3) over x, y, theta.
+        """Show the robot pose with its covariance (3, 3) over x, y, theta.
 
-        Its way becomes the trail `estimate`.
+        The poses form the trajectory `estimate`.
         """
 
-    def trail(self, ns: int, name: str, T_map_base: Array) -> None:
-        """Lengthen the trail of this name: `estimate`, `truth` or `odometry`."""
+    def trajectory(self, ns: int, name: str, T_map_base: Array) -> None:
+        """Extend a trajectory: `estimate`, `truth` or `odometry`."""
 
     def topology(self, ns: int, topology: TopologicalMap) -> None:
         """Show the skeleton, and the nodes coloured by kind."""
@@ -42,20 +42,20 @@ class NullView:
     def local_area(self, ns: int, places: Array) -> None:
         """Show the nodes (N, 2) of the local area."""
 
-    def samples(self, ns: int, places: Array) -> None:
-        """Show where the samples (N, 2) of global localization are."""
+    def particles(self, ns: int, places: Array) -> None:
+        """Show the particles (N, 2) of global localization."""
 
     def plan(self, ns: int, points: Array) -> None:
         """Show the path (N, 2) that the robot follows."""
 
     def target(self, ns: int, place: Array | None) -> None:
-        """Show where the robot is going, (2,), or that it has no target."""
+        """Show the target (2,) of the robot, or remove it."""
 
-    def number(self, ns: int, plot: str, curve: str, value: float) -> None:
-        """Continue a curve of a plot (`error`, `progress`, `count`, `step`)."""
+    def scalar(self, ns: int, plot: str, curve: str, value: float) -> None:
+        """Add a value to a curve of a plot (`error`, `progress`, `count`, `step`)."""
 
     def wait_until_closed(self) -> None:
-        """Show all that was told until whoever looks at it has seen enough."""
+        """Wait until the user closes the viewer."""
 
     def close(self) -> None:
-        """Finish what is shown or written."""
+        """Finish the recording."""

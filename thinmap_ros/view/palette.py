@@ -1,4 +1,4 @@
-"""Colours of pictures and views: Okabe and Ito's, told apart by everyone."""
+"""Colours of figures and views: the colour-blind safe palette of Okabe and Ito."""
 
 from thinmap_ros.core.topology.graph import NodeKind
 
@@ -7,7 +7,7 @@ EDGE = '#009E73'
 ESTIMATE = '#CC79A7'
 TRUTH = '#56B4E9'
 
-# For curves, in the order in which they are told apart best.
+# For curves, in the order of best contrast.
 PALETTE = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '#555555')
 
 

@@ -23,7 +23,7 @@ from thinmap_ros.view.plots import (
     Raster,
     RobotMarkers,
     Segments,
-    Words,
+    TextLabels,
 )
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 # Dots and margin, in inches
 _DPI = 110
 _PAD = 0.1
-_MANY = 2000  # points: more make an SVG needlessly large
+_MANY = 2000  # maximum number of points, to limit the size of an SVG
 # Text stays text in an SVG, and its ids do not change from run to run.
 _SETTINGS: Any = {
     'svg.fonttype': 'none',
@@ -167,8 +167,8 @@ def _(layer: Segments, axes: 'Axes') -> None:
     axes.autoscale_view()
 
 
-@_draw.register(Words)
-def _(layer: Words, axes: 'Axes') -> None:
+@_draw.register(TextLabels)
+def _(layer: TextLabels, axes: 'Axes') -> None:
     for at, word in zip(layer.at, layer.words, strict=True):
         axes.annotate(
             word,

@@ -1,4 +1,4 @@
-"""What a figure shows, as plain data: panels of layers. `plot_writer` draws them."""
+"""Contents of figures as plain data: panels of layers. `plot_writer` draws them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,9 +13,9 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """A line through points (N, 2), or markers alone where the style is empty.
+    """A line through points (N, 2), or only markers if the style is empty.
 
-    Colour: a number in the palette.
+    Colour: index in the palette.
     """
 
     points: Array
@@ -40,7 +40,7 @@ class Band:
 
 @dataclass(frozen=True, eq=False)
 class Bars:
-    """A bar for each name, with its value (N,) written on it."""
+    """A bar for each name, labelled with its value (N,)."""
 
     names: Sequence[str]
     values: Array
@@ -58,8 +58,8 @@ class Segments:
 
 
 @dataclass(frozen=True, eq=False)
-class Words:
-    """A word at each of some points (N, 2)."""
+class TextLabels:
+    """A label at each of some points (N, 2)."""
 
     at: Array
     words: Sequence[str]
@@ -103,7 +103,7 @@ class Raster:
     limits: tuple[float, float] | None = None
 
 
-Layer = Curve | Band | Bars | Segments | Words | RobotMarkers | MapLayer | GraphLayer | Raster
+Layer = Curve | Band | Bars | Segments | TextLabels | RobotMarkers | MapLayer | GraphLayer | Raster
 
 
 @dataclass(frozen=True, eq=False)

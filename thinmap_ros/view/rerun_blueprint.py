@@ -1,4 +1,4 @@
-"""How rerun lays a view out: the map large, curves beside it, what the colours mean below them."""
+"""Layout of a view in rerun: the map, curves beside it, and a legend below them."""
 
 import math
 from typing import Any
@@ -9,8 +9,8 @@ from thinmap_ros.view.rerun_sinks import TIMELINE
 
 UNKNOWN_GREY = 205
 _ASPECT = 1.3  # width over height of the map's part of the window, or less
-_HALF_VIEW = math.radians(55.0) / 2.0  # rerun's eye sees so far up and down
-_TILT = 0.25  # so much of its height the eye stands south of what it looks at
+_HALF_VIEW = math.radians(55.0) / 2.0  # vertical field of view of rerun's camera
+_TILT = 0.25  # horizontal offset of the camera to the south, as a share of its height
 _MARGIN = 1.15
 _WIDTHS = (5, 2)
 _HEIGHTS = (3, 3, 3, 3, 3)
@@ -32,7 +32,7 @@ _PLOTS = {
 
 
 def entity(plot: str, curve: str) -> str:
-    """Where a curve is logged."""
+    """Entity path of a curve."""
     return f'plots/{plot}/{curve.replace(",", "").replace("%", "percent").replace(" ", "_")}'
 
 
@@ -48,10 +48,7 @@ def style(rr: Any) -> dict[str, Any]:
 
 
 def blueprint(rr: Any, patch: GridPatch, trails: list[str]) -> Any:
-    """Layout in which the whole of a map is in view.
-
-    Trails (entities) are shown from their beginning.
-    """
+    """Layout in which the whole map is in view; trajectories (entities) are shown in full."""
     rrb = rr.blueprint
     past = {
         'start': rrb.TimeRangeBoundary.infinite(),
@@ -77,20 +74,20 @@ def blueprint(rr: Any, patch: GridPatch, trails: list[str]) -> Any:
     legend = rrb.TextDocumentView(origin='legend', name='colours')
     beside = rrb.Vertical(*curves, legend, row_shares=_HEIGHTS)
     layout = rrb.Horizontal(scene, beside, column_shares=_WIDTHS)
-    # At the newest: a live view goes along, and a file opens at what came of it.
+    # At the newest time: a live view follows, and a file opens at its end.
     time = rrb.TimePanel(state='collapsed', play_state='following')
     panels = rrb.BlueprintPanel(state='hidden'), rrb.SelectionPanel(state='hidden'), time
     return rrb.Blueprint(layout, *panels)
 
 
 def size_m(patch: GridPatch) -> float:
-    """What of a map decides how far away the eye has to be."""
+    """Size of a map that determines the distance of the camera."""
     rows, cols = patch.shape
     return patch.frame.resolution * max(rows, cols / _ASPECT)
 
 
 def _eye(rrb: Any, patch: GridPatch) -> Any:
-    """A little south of straight above."""
+    """Camera position, slightly south of the zenith."""
     rows, cols = patch.shape
     frame = patch.frame
     x = frame.origin_x + frame.resolution * cols / 2.0

@@ -1,4 +1,4 @@
-"""Where a view's recording goes: a file, a viewer that is started for it, or both.
+"""Sinks of a rerun recording: a file, a viewer that is started for it, or both.
 
 rerun is the extra `viewer`.
 """
@@ -19,7 +19,7 @@ from thinmap_ros.core.errors import InputError
 
 APPLICATION = 'thinmap'
 TIMELINE = 'time'
-# Beyond this a viewer forgets the oldest.
+# Memory limit of a viewer; beyond it, the oldest data are dropped.
 _MEMORY_LIMIT = '1GB'
 _SERVER_MEMORY_LIMIT = '256MB'
 _LOCALHOST = '127.0.0.1'
@@ -27,12 +27,12 @@ _FLUSH_S = 0.8
 
 
 def is_installed() -> bool:
-    """Whether the extra `viewer` is there."""
+    """Whether the extra `viewer` is installed."""
     return importlib.util.find_spec('rerun') is not None
 
 
 def library() -> Any:
-    """The library. Raises InputError, which says what to install, where it is missing."""
+    """The rerun library. Raises InputError with installation advice if it is missing."""
     try:
         import rerun
         import rerun.blueprint
@@ -42,19 +42,18 @@ def library() -> Any:
 
 
 class RecordingSinks:
-    """What is logged goes to all that were opened, at the time that was set last. Close it."""
+    """Logs data to all open sinks, at the time that was set last. Must be closed."""
 
     def __init__(self) -> None:
         self._rr = library()
         self.viewer: subprocess.Popen[bytes] | None = None
-        # A stream of its own for each: a viewer that hangs must not keep the file from being
-        # finished.
+        # A separate stream for each sink: a viewer that hangs must not block the file.
         self._files: list[tuple[Path, Any]] = []
         self._shown: list[Any] = []
         self._first_ns: int | None = None
 
     def open_file(self, path: Path) -> None:
-        """Write to a file. Raises InputError where it cannot be written."""
+        """Write to a file. Raises InputError if it cannot be written."""
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._files.append((path, self._new_stream(self._rr.FileSink(str(path)))))
@@ -62,9 +61,9 @@ class RecordingSinks:
             raise InputError(f'{path}: rerun: {" ".join(str(error).split())}') from error
 
     def open_viewer(self) -> None:
-        """Start a viewer of our own, which listens to this machine only and ends with us.
+        """Start a viewer that accepts local connections only and ends with this process.
 
-        Raises InputError where there is no screen, or no viewer.
+        Raises InputError if there is no display, or no viewer.
         """
         if sys.platform == 'linux' and not (
             os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY')
@@ -97,7 +96,7 @@ class RecordingSinks:
         )
 
     def at(self, ns: int) -> None:
-        """Set the time of what is logged next; the first one is 0."""
+        """Set the time of subsequent logs, relative to the first one."""
         if self._first_ns is None:
             self._first_ns = ns
         for stream in self._all():
@@ -109,20 +108,20 @@ class RecordingSinks:
             stream.log(entity, value, static=static)
 
     def send_blueprint(self, blueprint: Any) -> None:
-        """Say how to show it."""
+        """Send the layout."""
         for stream in self._all():
             stream.send_blueprint(blueprint)
 
     def close(self) -> None:
         """Finish the file and end the viewer.
 
-        Raises InputError where the file could not be written to its end.
+        Raises InputError if the file could not be completed.
         """
         try:
             for path, stream in self._files:
                 _finish(path, stream)
         finally:
-            # After the file: a viewer that was closed makes its stream wait for it.
+            # After the file: the stream of a closed viewer blocks.
             for shown in self._shown:
                 with contextlib.suppress(InputError):
                     _finish(Path(), shown)
@@ -135,7 +134,7 @@ class RecordingSinks:
 
     def _new_stream(self, sink: Any) -> Any:
         stream = self._rr.RecordingStream(APPLICATION, recording_id=uuid.uuid4())
-        # A recording says when things were, not when they were drawn.
+        # A recording has the time of the data, not of logging.
         stream.set_log_time_enabled(False)
         stream.set_log_tick_enabled(False)
         stream.set_sinks(sink)
@@ -143,14 +142,14 @@ class RecordingSinks:
 
 
 def viewer_program() -> str:
-    """The viewer that came with the library, which need not be on the PATH."""
+    """Viewer program of the library, which need not be on the PATH."""
     spec = importlib.util.find_spec('rerun_cli')
     program = Path(spec.origin).with_name('rerun') if spec is not None and spec.origin else None
     return str(program) if program is not None and program.exists() else 'rerun'
 
 
 def _free_port() -> int:
-    """A port of its own for each viewer: two runs at once do not draw into each other's picture."""
+    """A free port for each viewer, so that simultaneous runs do not share one."""
     with socket.socket() as probe:
         probe.bind((_LOCALHOST, 0))
         return int(probe.getsockname()[1])

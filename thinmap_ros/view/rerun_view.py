@@ -1,4 +1,4 @@
-"""Core values shown in rerun, live or in an .rrd file."""
+"""Shows core values in rerun, live or in an .rrd file."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -16,14 +16,14 @@ from thinmap_ros.view.null_view import NullView
 from thinmap_ros.view.palette import rgb
 from thinmap_ros.view.rerun_sinks import RecordingSinks, library
 
-# What is large is drawn at most so often, and a trail grows by steps of so much: a recording grows
-# slowly.
+# Minimum period of large entities, and minimum step of trajectories: they limit the size of a
+# recording.
 _PERIOD_NS = 1_000_000_000
 _TRAIL_STEP_M = 0.05
-_OUTGROWN = 1.4  # a map so much larger than what was in view is brought into view
+_OUTGROWN = 1.4  # the camera moves when the map has grown by this factor
 _OUTLINE = 33
 _SIGMA2_95 = 5.991  # chi-square, 95 %, 2 degrees of freedom
-# The wedge in which the robot looks in 95 of 100 cases
+# Wedge of the 95 % confidence interval of the heading
 _HEADING_M = 1.0
 _HEADING_SIGMAS = 1.96
 _ODOMETRY = '#777777'
@@ -34,9 +34,9 @@ _SAMPLE = '#7B3FA0'
 _LOCAL_LINE = '#0072B2'
 _LINE = '#8FBEDB'
 _LOCAL_NODE = '#0072B2'
-_STAYS = (125, 125, 125)  # an end node of which is sure that it will stay
+_STAYS = (125, 125, 125)  # an end node with position probability 1
 _TRAILS = {'estimate': palette.ESTIMATE, 'truth': palette.TRUTH, 'odometry': _ODOMETRY}
-# Heights above the map, so that what matters more covers what matters less, m.
+# Heights above the map, m, in the order of importance.
 _Z = {
     'skeleton': 0.02,
     'lines': 0.03,
@@ -57,14 +57,14 @@ _Z = {
 class View(NullView):
     """A recording in rerun: to a file, to a viewer that it opens, or to both. Close it.
 
-    Memory is bounded: what is large is logged at most once a second, a scan replaces the one
-    before, a trail is made of steps, and the viewer has a limit beyond which it forgets the oldest.
+    Memory is bounded: large entities are logged at most once a second, a scan replaces the previous
+    one, a trajectory consists of steps, and the viewer drops the oldest data beyond a limit.
     """
 
     def __init__(self, recording: Path | None = None, spawn: bool = False) -> None:
         """Begin a recording.
 
-        Raises InputError where rerun is missing, the file cannot be written, or there is no screen
+        Raises InputError if rerun is missing, the file cannot be written, or there is no display
         for the viewer.
         """
         self._rr = library()
@@ -84,7 +84,7 @@ class View(NullView):
     def grid(self, ns: int, patch: GridPatch) -> None:
         """Show the map, at most once a second.
 
-        Where it has outgrown what is in view, the eye moves away.
+        The camera moves back when the map has outgrown the view.
         """
 
         def draw() -> None:
@@ -95,9 +95,9 @@ class View(NullView):
                 width=cols, height=rows, color_model='L', channel_datatype='U8'
             )
             origin = [frame.origin_x, frame.origin_y, 0.0]
-            # An image's first row is its upper one.
+            # The first row of an image is the top.
             data = np.ascontiguousarray(_shade(patch)[::-1]).tobytes()
-            # Else a shade passes for a measurement, in all colours.
+            # Otherwise grey values are shown with a colour map.
             grey = rr.components.Colormap.Grayscale
             size = frame.resolution
             image = rr.GridMap(
@@ -111,7 +111,7 @@ class View(NullView):
             self._frame(patch)
 
     def scan(self, ns: int, scan: Scan) -> None:
-        """Show a scan where the robot is; it replaces the one before."""
+        """Show a scan at the pose of the robot; it replaces the previous scan."""
         self._at(ns)
         points = self._rr.Points3D(
             _lifted(scan.points_base(), 0.0), colors=[rgb(_SCAN)], radii=[self._px(1.8)]
@@ -119,9 +119,9 @@ class View(NullView):
         self._log('map/robot/scan', points)
 
     def pose(self, ns: int, T_map_base: Array, covariance: Array) -> None:
-        """Show the robot with its covariance (3, 3) over x, y, theta.
+        """Show the robot pose with its covariance (3, 3) over x, y, theta.
 
-        Its way becomes the trail `estimate`.
+        The poses form the trajectory `estimate`.
         """
         rr = self._rr
         self._at(ns)
@@ -137,10 +137,10 @@ class View(NullView):
             'map/covariance',
             rr.LineStrips3D(strips, colors=[rgb(palette.ESTIMATE)], radii=[self._px(1.0)]),
         )
-        self.trail(ns, 'estimate', T_map_base)
+        self.trajectory(ns, 'estimate', T_map_base)
 
-    def trail(self, ns: int, name: str, T_map_base: Array) -> None:
-        """Lengthen the trail of this name: `estimate`, `truth` or `odometry`."""
+    def trajectory(self, ns: int, name: str, T_map_base: Array) -> None:
+        """Extend a trajectory: `estimate`, `truth` or `odometry`."""
         here = np.array(T_map_base[:2])
         before = self._trail_ends.setdefault(name, here)
         if np.hypot(*(here - before)) < _TRAIL_STEP_M:
@@ -209,8 +209,8 @@ class View(NullView):
 
         self._throttled('local_area', ns, draw)
 
-    def samples(self, ns: int, places: Array) -> None:
-        """Show where the samples (N, 2) of global localization are, at most once a second."""
+    def particles(self, ns: int, places: Array) -> None:
+        """Show the particles (N, 2) of global localization, at most once a second."""
 
         def draw() -> None:
             points = _lifted(places, _Z['samples'])
@@ -234,7 +234,7 @@ class View(NullView):
         self._throttled('plan', ns, draw)
 
     def target(self, ns: int, place: Array | None) -> None:
-        """Show where the robot is going, (2,), or that it has no target."""
+        """Show the target (2,) of the robot, or remove it."""
         places = np.zeros((0, 2)) if place is None else place.reshape(1, 2)
         if np.array_equal(places, self._target):
             return
@@ -245,22 +245,22 @@ class View(NullView):
         )
         self._log('map/target', points)
 
-    def number(self, ns: int, plot: str, curve: str, value: float) -> None:
-        """Continue a curve of a plot (`error`, `progress`, `count`, `step`)."""
+    def scalar(self, ns: int, plot: str, curve: str, value: float) -> None:
+        """Add a value to a curve of a plot (`error`, `progress`, `count`, `step`)."""
         self._at(ns)
         self._log(rerun_blueprint.entity(plot, curve), self._rr.Scalars([value]))
 
     def wait_until_closed(self) -> None:
-        """Show all that was told, and wait until the viewer that was opened is closed."""
+        """Show all pending data, and wait until the viewer is closed."""
         self._finish_drawing()
         if self._streams.viewer is not None:
             self._streams.viewer.wait()
 
     def close(self) -> None:
-        """Draw what still waits, finish the file, and end the viewer.
+        """Log all pending data, finish the file, and end the viewer.
 
         The file then opens with the whole map in view.
-        Raises InputError where the file could not be written to its end.
+        Raises InputError if the file could not be completed.
         """
         self._finish_drawing()
         self._streams.close()
@@ -287,18 +287,18 @@ class View(NullView):
             self._log(entity, style, static=True)
 
     def _frame(self, patch: GridPatch) -> None:
-        """Bring the whole of a map into view."""
+        """Move the camera so that the whole map is in view."""
         self._framed_m = rerun_blueprint.size_m(patch)
         self._streams.send_blueprint(
             rerun_blueprint.blueprint(self._rr, patch, [f'map/{name}' for name in _TRAILS])
         )
 
     def _px(self, pixels: float) -> Any:
-        """A radius in pixels: to be seen in a room and in a hall."""
+        """A radius in pixels, visible at any map size."""
         return self._rr.Radius.ui_points(pixels)
 
     def _throttled(self, name: str, ns: int, draw: Callable[[], None]) -> None:
-        """Draw now, or, where this was drawn a moment ago, let the newest wait for its turn."""
+        """Draw at most once a period; otherwise the newest value waits."""
         self._waiting[name] = (ns, draw)
         drawn = self._drawn_ns.get(name)
         if drawn is None or abs(ns - drawn) >= _PERIOD_NS:
@@ -318,13 +318,13 @@ class View(NullView):
 
 
 def _shade(patch: GridPatch) -> NDArray[np.uint8]:
-    """Grey of each cell (H, W): the likelier free, the lighter."""
+    """Grey value of each cell (H, W): lighter if more likely free."""
     grey = np.round(2.55 * (100.0 - np.clip(patch.cells, 0, 100)))
     return np.where(patch.cells == UNKNOWN, rerun_blueprint.UNKNOWN_GREY, grey).astype(np.uint8)
 
 
 def _faded(colour: str, share: float) -> list[int]:
-    """A colour, the closer to grey the larger the share, 0 to 1."""
+    """A colour, mixed with grey by a share, 0 to 1."""
     return [
         round((1.0 - share) * c + share * grey) for c, grey in zip(rgb(colour), _STAYS, strict=True)
     ]
@@ -336,7 +336,7 @@ def _lifted(points: Array, z: float) -> NDArray[np.float32]:
 
 
 def _ellipse(centre: Array, covariance: Array) -> Array:
-    """Outline (N, 2) within which a place with this covariance (2, 2) lies in 95 of 100 cases."""
+    """Outline (N, 2) of the 95 % confidence ellipse of a covariance (2, 2)."""
     values, vectors = np.linalg.eigh(covariance)
     angles = np.linspace(0.0, 2.0 * np.pi, _OUTLINE)
     axes = vectors * np.sqrt(_SIGMA2_95 * np.maximum(values, 0.0))
@@ -344,7 +344,7 @@ def _ellipse(centre: Array, covariance: Array) -> Array:
 
 
 def _wedge(T_map_base: Array, variance: float) -> Array:
-    """Outline (3, 2) of where the robot looks, given the variance of its heading."""
+    """Outline (3, 2) of the 95 % confidence wedge of the heading, given its variance."""
     x, y, theta = T_map_base.tolist()
     spread = min(_HEADING_SIGMAS * np.sqrt(max(variance, 0.0)), np.pi)
     ends = [

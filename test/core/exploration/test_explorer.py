@@ -18,7 +18,7 @@ from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.core.topology.graph import TopologicalMap
-from thinmap_ros.sim.coverage import coverable
+from thinmap_ros.sim.coverage import observable_cells
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import Simulation
@@ -59,9 +59,9 @@ class Run:
 
     def look(self, scan):
         pose = self.simulation.robot.T_world_base
-        self.grid.update(scan, pose)
+        self.grid.add_scan(scan, pose)
         self.topology.update(self.grid.window(pose[0], pose[1], 10.0), pose)
-        decision = self.explorer.step(self.topology.map, self.grid.patch(), scan, pose)
+        decision = self.explorer.step(self.topology.map, self.grid.known_area(), scan, pose)
         self.decisions.append(decision)
         self.poses.append(pose)
         self.scan = scan
@@ -81,7 +81,7 @@ class Run:
             if moment.scan is not None and self.look(moment.scan).finished:
                 break
             command = self.navigator.step(
-                self.simulation.robot.T_world_base, self.grid.patch(), self.scan, 0.05
+                self.simulation.robot.T_world_base, self.grid.known_area(), self.scan, 0.05
             )
             if command.state == 'failed':
                 self.explorer.target_failed(command.reason)
@@ -95,7 +95,7 @@ class Run:
         return self.decisions[-1]
 
     def coverage(self):
-        return coverable(self.world, START, 0.22, 8.0).coverage(self.grid.patch())
+        return observable_cells(self.world, START, 0.22, 8.0).coverage(self.grid.known_area())
 
 
 @cache
@@ -221,7 +221,7 @@ def test_an_exploration_goes_on_from_its_state_as_if_it_had_not_been_interrupted
     finished = run.explorer.state()
     late = Explorer.from_state(finished)
     for _ in range(3):
-        decision = late.step(run.topology.map, run.grid.patch(), run.scan, run.poses[-1])
+        decision = late.step(run.topology.map, run.grid.known_area(), run.scan, run.poses[-1])
     assert decision.finished, 'what was examined in vain stays examined'
 
 
@@ -284,9 +284,11 @@ def test_a_graph_that_is_there_before_the_map_does_not_end_the_exploration():
     for _ in range(5):
         run.look(run.simulation.step(0.0, 0.0).scan or run.scan)
     assert run.topology.map.nodes
-    unknown = GridPatch(run.grid.patch().frame, np.full(run.grid.patch().shape, -1, dtype=np.int8))
+    unknown = GridPatch(
+        run.grid.known_area().frame, np.full(run.grid.known_area().shape, -1, dtype=np.int8)
+    )
     late = Explorer()
     for _ in range(20):
         decision = late.step(run.topology.map, unknown, run.scan, START)
         assert not decision.finished and decision.target is None
-    assert late.step(run.topology.map, run.grid.patch(), run.scan, START).known_area_m2 > 0.0
+    assert late.step(run.topology.map, run.grid.known_area(), run.scan, START).known_area_m2 > 0.0

@@ -112,7 +112,7 @@ def test_a_map_that_grows_on_all_sides_keeps_what_was_exhausted():
     gone = np.argwhere(borders.mask)[:10]
     borders.exhaust(gone, (1.95, 0.15))
     grown = np.pad(half_known(), ((5, 3), (4, 6)), constant_values=-1)
-    borders.update(patch_of(grown, FRAME.shifted(-5, -4)), HERE)
+    borders.update(patch_of(grown, FRAME.with_origin_at(-5, -4)), HERE)
     moved = gone + np.round((FRAME.as_array() - borders.frame.as_array())[1::-1] / 0.1).astype(int)
     assert not borders.mask[moved[:, 0], moved[:, 1]].any()
     assert borders.mask.sum() == 18

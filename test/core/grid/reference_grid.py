@@ -1,4 +1,4 @@
-"""The occupancy grid once more, slow and obvious.
+"""Reference implementation of the occupancy grid, slow and obvious.
 
 A dictionary of cells, and one beam after the other.
 """
@@ -43,7 +43,7 @@ class PlainGrid:
         return round(1000.0 * log_odds(probability))
 
     def update(self, scan, T_map_base):
-        """Take in a scan made at a robot pose T_map_base (3,)."""
+        """Add a scan made at a robot pose T_map_base (3,)."""
         T = se2.compose(T_map_base, scan.T_base_laser)
         self.laser = (T[0] / self.config.resolution_m, T[1] / self.config.resolution_m)
         ends = [self.end_of(scan, i, T[2]) for i in range(scan.ranges_m.size)]

@@ -1,4 +1,4 @@
-"""What lies nowhere on earth is refused before anything is written: no kernel ever sees it."""
+"""Coordinates beyond the bounds are rejected before anything is written: no kernel gets them."""
 
 import numpy as np
 import pytest
@@ -25,10 +25,10 @@ class Guarded:
     """The sheet on which a scan is drawn, in the middle of memory of which all is known."""
 
     def __init__(self, grid):
-        grid.update(SEEN, np.zeros(3))
-        rows, cols = grid._news.shape
+        grid.add_scan(SEEN, np.zeros(3))
+        rows, cols = grid._increments.shape
         self.memory = np.zeros((3 * rows, cols), dtype=np.int16)
-        grid._news = self.memory[rows : 2 * rows]
+        grid._increments = self.memory[rows : 2 * rows]
         self.around = (self.memory[:rows], self.memory[2 * rows :])
 
     def is_untouched(self):
@@ -40,23 +40,23 @@ class Guarded:
 def test_a_pose_far_away_is_refused_before_anything_is_drawn(far, axis):
     grid = OccupancyGrid()
     guard = Guarded(grid)
-    before = grid.patch()
+    before = grid.known_area()
     pose = np.zeros(3)
     pose[axis] = far
     with pytest.raises(InputError, match='too far'):
-        grid.update(SEEN, pose)
+        grid.add_scan(SEEN, pose)
     assert guard.is_untouched()
-    assert not grid._news.any(), 'nothing is left over for the next scan'
-    np.testing.assert_array_equal(grid.patch().cells, before.cells)
+    assert not grid._increments.any(), 'nothing is left over for the next scan'
+    np.testing.assert_array_equal(grid.known_area().cells, before.cells)
 
 
 def test_a_map_that_would_get_too_large_keeps_nothing_of_the_scan():
     grid = OccupancyGrid()
-    grid.update(SEEN, np.zeros(3))
+    grid.add_scan(SEEN, np.zeros(3))
     before = grid.state()
     with pytest.raises(InputError, match='tiles'):
-        grid.update(SEEN, np.array([5e4, 5e4, 0.0]))
-    assert not grid._news.any()
+        grid.add_scan(SEEN, np.array([5e4, 5e4, 0.0]))
+    assert not grid._increments.any()
     np.testing.assert_array_equal(grid.state()['log_odds'], before['log_odds'])
 
 

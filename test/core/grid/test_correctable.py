@@ -66,7 +66,7 @@ class Drive:
         self.moved = []
 
     def correct(self, stamps, poses, since_ns, T_map_base):
-        self.map.correct(stamps, poses, since_ns)
+        self.map.apply_correction(stamps, poses, since_ns)
         if self.in_one_go:
             self.note(self.map.update(None, T_map_base) or self.map.finish())
 
@@ -101,8 +101,8 @@ def test_in_the_end_slices_give_what_rendering_in_one_go_gives(seed, times):
     at_once = run(seed, times, True)
     assert len(at_once.moved) == len(times) and 1 <= len(sliced.moved) <= len(times)
     assert sliced.map.corrected_ns == at_once.map.corrected_ns == max(times)
-    one = sliced.map.shown.patch()
-    other = at_once.map.shown.patch()
+    one = sliced.map.shown.known_area()
+    other = at_once.map.shown.known_area()
     assert one.frame == other.frame
     np.testing.assert_array_equal(one.cells, other.cells)
 
@@ -137,7 +137,7 @@ def test_each_tile_shows_the_old_rendering_until_its_new_one_is_complete_near_on
     old = tiles_of(grid.shown)
     stamps = np.arange(250)
     for each in (grid, whole):
-        each.correct(stamps, TRUE[:250], 250)
+        each.apply_correction(stamps, TRUE[:250], 250)
     whole.update(None, TRUE[250])
     whole.finish()
     new = tiles_of(whole.shown)
@@ -164,14 +164,14 @@ def test_each_tile_shows_the_old_rendering_until_its_new_one_is_complete_near_on
 @pytest.mark.usefixtures('small_slices')
 def test_new_scans_are_shown_at_once_and_stay_shown():
     grid = drifted_map(120)
-    grid.correct(np.arange(120), TRUE[:120], 120)
+    grid.apply_correction(np.arange(120), TRUE[:120], 120)
     news = OccupancyGrid()
     k = 120
     while grid.is_rerendering:
         grid.update(SCANS[k], TRUE[k])
-        news.update(SCANS[k], TRUE[k])
-        for row, col in np.argwhere(news.patch().cells >= 0)[::7].tolist():
-            x, y = news.patch().frame.centres_of(np.array([[row, col]]))[0]
+        news.add_scan(SCANS[k], TRUE[k])
+        for row, col in np.argwhere(news.known_area().cells >= 0)[::7].tolist():
+            x, y = news.known_area().frame.centres_of(np.array([[row, col]]))[0]
             assert grid.shown.window(x, y, 0.1).cells[0, 0] >= 0, (x, y)
         k += 1
     assert k > 150
@@ -198,7 +198,7 @@ def test_a_slice_does_a_bounded_part_of_the_work(monkeypatch):
 def test_however_large_its_scans_a_rerendering_goes_faster_than_scans_come(monkeypatch):
     monkeypatch.setattr(rerendering, '_TILES_PER_SLICE', 0)
     grid = drifted_map(40)
-    grid.correct(np.arange(40), TRUE[:40], 40)
+    grid.apply_correction(np.arange(40), TRUE[:40], 40)
     for k in range(40, 90):
         grid.update(SCANS[k], TRUE[k])
     assert not grid.is_rerendering
@@ -219,7 +219,7 @@ def test_a_scan_touches_no_tile_beyond_those_that_it_is_thought_to(seed):
     scan = Scan.create(0, ranges, rng.uniform(-3.0, 3.0), 0.02, 0.1, 8.0, mount)
     T = se2.pose(*rng.uniform(-50.0, 50.0, 2), rng.uniform(-3.0, 3.0))
     grid = OccupancyGrid(config)
-    grid.update(scan, T)
+    grid.add_scan(scan, T)
     extent = StoredScan.of(scan, config).extent
     low, high = rerendering._tile_boxes([extent], T[None], grid.frame)[0]
     touched = grid.tiles()
@@ -235,20 +235,20 @@ def test_what_is_rendered_again_at_the_same_poses_is_what_was_there():
     for k, T in enumerate(poses):
         grid.update(SCANS[k], T)
     before = grid.shown
-    grid.correct(np.arange(12), np.array(poses), 12)
+    grid.apply_correction(np.arange(12), np.array(poses), 12)
     assert grid.update(None, poses[-1]) is None and grid.shown is before
     assert grid.update(None, poses[-1]) is not None and grid.shown is not before
-    np.testing.assert_array_equal(grid.shown.patch().cells, before.patch().cells)
+    np.testing.assert_array_equal(grid.shown.known_area().cells, before.known_area().cells)
 
 
 def test_a_grid_whose_scans_are_not_known_stays_as_it_is():
     grid = CorrectableGrid(OccupancyGrid(), keeps_scans=False)
     grid.update(SCANS[0], TRUE[0])
-    before = grid.shown.patch()
-    assert not grid.correct(np.array([0]), TRUE[[5]], 1)
+    before = grid.shown.known_area()
+    assert not grid.apply_correction(np.array([0]), TRUE[[5]], 1)
     assert not grid.is_rerendering and grid.corrected_ns == 1
     assert grid.update(None, TRUE[0]) is None
-    np.testing.assert_array_equal(grid.shown.patch().cells, before.cells)
+    np.testing.assert_array_equal(grid.shown.known_area().cells, before.cells)
 
 
 def test_tiles_hold_the_sum_of_grids_within_the_limits():
@@ -256,9 +256,9 @@ def test_tiles_hold_the_sum_of_grids_within_the_limits():
     other = OccupancyGrid()
     total = OccupancyGrid()
     for k in range(6):
-        one.update(SCANS[0], TRUE[0])
+        one.add_scan(SCANS[0], TRUE[0])
         if k % 2:
-            other.update(SCANS[20], TRUE[20])
+            other.add_scan(SCANS[20], TRUE[20])
     places = np.unique(np.vstack([one.tiles(), other.tiles()]), axis=0)
     total.set_tiles(places, one, other)
     single = tiles_of(one)

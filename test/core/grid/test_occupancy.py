@@ -58,9 +58,9 @@ def test_one_scan_marks_what_a_finely_sampled_reference_marks(seed):
     T = np.array([*rng.uniform(-3, 3, 2), rng.uniform(-3, 3)])
     config = OccupancyConfig()
     grid = OccupancyGrid(config)
-    grid.update(scan, T)
+    grid.add_scan(scan, T)
     passed, hit = reference(scan, T, config)
-    patch = grid.patch()
+    patch = grid.known_area()
     offset = np.round([patch.frame.origin_y / 0.1, patch.frame.origin_x / 0.1]).astype(int)
     found_hit = {tuple((c + offset).tolist()) for c in np.argwhere(patch.cells >= 65)}
     found_passed = {
@@ -76,11 +76,11 @@ def test_each_cell_counts_once_a_scan_and_is_clamped():
     config = OccupancyConfig()
     grid = OccupancyGrid(config)
     wall = scan_of(np.full(181, 1.0))
-    grid.update(wall, pose(0.05, 0.05, 0))
+    grid.add_scan(wall, pose(0.05, 0.05, 0))
     once = 100 / (1 + math.exp(-log_odds(config.p_free)))
     assert percent(grid, 0.25, 0.05) == round(once)
     for _ in range(50):
-        grid.update(wall, pose(0.05, 0.05, 0))
+        grid.add_scan(wall, pose(0.05, 0.05, 0))
     assert percent(grid, 0.25, 0.05) == round(100 * config.p_lowest)
     assert percent(grid, 1.05, 0.05) == round(100 * config.p_highest)
 
@@ -88,15 +88,15 @@ def test_each_cell_counts_once_a_scan_and_is_clamped():
 def test_a_wall_that_went_away_is_unlearned():
     grid = OccupancyGrid()
     for _ in range(100):
-        grid.update(scan_of(np.full(181, 1.0)), pose(0.05, 0.05, 0))
+        grid.add_scan(scan_of(np.full(181, 1.0)), pose(0.05, 0.05, 0))
     for _ in range(12):
-        grid.update(scan_of(np.full(181, 2.0)), pose(0.05, 0.05, 0))
+        grid.add_scan(scan_of(np.full(181, 2.0)), pose(0.05, 0.05, 0))
     assert grid.window(1.05, 0.05, 0.1).free.all()
 
 
 def test_nothing_is_said_of_what_lies_beyond_a_hit():
     grid = OccupancyGrid()
-    grid.update(scan_of(np.full(181, 1.0)), pose(0.05, 0.05, 0))
+    grid.add_scan(scan_of(np.full(181, 1.0)), pose(0.05, 0.05, 0))
     assert percent(grid, 1.35, 0.05) == -1
     assert percent(grid, -0.55, 0.05) == -1
 
@@ -104,17 +104,17 @@ def test_nothing_is_said_of_what_lies_beyond_a_hit():
 @pytest.mark.parametrize('value', [np.nan, 0.0, -1.0, 0.05, -np.inf])
 def test_invalid_beams_change_nothing(value):
     grid = OccupancyGrid()
-    grid.update(scan_of(np.full(181, value)), pose(0, 0, 0))
-    assert grid.patch().unknown.all()
+    grid.add_scan(scan_of(np.full(181, value)), pose(0, 0, 0))
+    assert grid.known_area().unknown.all()
 
 
 @pytest.mark.parametrize('place', [(0.0, 0.0), (9.0, 0.0), (-9.0, 0.0), (0.0, 9.0), (300.0, -9.0)])
 def test_a_scan_that_shows_nothing_leaves_the_picture_as_it_was(place):
     grid = OccupancyGrid()
-    grid.update(scan_of(np.full(181, 3.0)), pose(0.0, 0.0, 0.3))
-    before = grid.patch()
-    grid.update(scan_of(np.full(181, np.nan)), pose(*place, 0.3))
-    after = grid.patch()
+    grid.add_scan(scan_of(np.full(181, 3.0)), pose(0.0, 0.0, 0.3))
+    before = grid.known_area()
+    grid.add_scan(scan_of(np.full(181, np.nan)), pose(*place, 0.3))
+    after = grid.known_area()
     assert after.frame == before.frame
     assert np.array_equal(after.cells, before.cells)
 
@@ -122,24 +122,24 @@ def test_a_scan_that_shows_nothing_leaves_the_picture_as_it_was(place):
 def test_a_beam_without_return_frees_up_to_the_configured_range():
     grid = OccupancyGrid(OccupancyConfig(no_return_range_m=3.0))
     for _ in range(2):
-        grid.update(scan_of(np.full(181, np.inf)), pose(0.05, 0.05, 0))
+        grid.add_scan(scan_of(np.full(181, np.inf)), pose(0.05, 0.05, 0))
     assert grid.window(2.85, 0.05, 0.1).free.all()
     assert percent(grid, 3.25, 0.05) == -1
-    assert not grid.patch().occupied.any()
+    assert not grid.known_area().occupied.any()
 
 
 def test_a_hit_beyond_the_usable_range_frees_the_way_and_marks_no_wall():
     grid = OccupancyGrid(OccupancyConfig(usable_range_m=3.0))
     for _ in range(2):
-        grid.update(scan_of(np.full(181, 5.0)), pose(0.05, 0.05, 0))
+        grid.add_scan(scan_of(np.full(181, 5.0)), pose(0.05, 0.05, 0))
     assert grid.window(2.85, 0.05, 0.1).free.all()
-    assert not grid.patch().occupied.any()
+    assert not grid.known_area().occupied.any()
 
 
 def test_the_map_grows_in_any_direction_in_memory_proportional_to_what_was_seen():
     grid = OccupancyGrid()
     for x, y in [(0, 0), (500, 0), (-300, 400), (0, -900)]:
-        grid.update(scan_of(np.full(181, 1.0)), pose(x + 0.05, y + 0.05, 0))
+        grid.add_scan(scan_of(np.full(181, 1.0)), pose(x + 0.05, y + 0.05, 0))
         assert percent(grid, x + 1.05, y + 0.05) == 80
     assert grid._tiles.used <= 16
     assert percent(grid, 1.05, 0.05) == 80
@@ -151,13 +151,13 @@ def test_a_pose_that_is_not_finite_changes_nothing(axis, value):
     grid = OccupancyGrid()
     T = np.zeros(3)
     T[axis] = value
-    grid.update(scan_of(np.full(181, 1.0)), T)
-    assert grid.patch().unknown.all()
+    grid.add_scan(scan_of(np.full(181, 1.0)), T)
+    assert grid.known_area().unknown.all()
 
 
 def test_a_window_is_aligned_with_the_map_and_unknown_where_nothing_is():
     grid = OccupancyGrid()
-    grid.update(scan_of(np.full(181, 1.0)), pose(0.05, 0.05, 0))
+    grid.add_scan(scan_of(np.full(181, 1.0)), pose(0.05, 0.05, 0))
     window = grid.window(0.32, -0.17, 10.0)
     assert window.shape == (100, 100)
     assert window.frame.origin_x / 0.1 == pytest.approx(round(window.frame.origin_x / 0.1))
@@ -167,15 +167,15 @@ def test_a_window_is_aligned_with_the_map_and_unknown_where_nothing_is():
 def test_a_saved_map_goes_on_where_it_was():
     grid = OccupancyGrid()
     for _ in range(3):
-        grid.update(scan_of(np.full(181, 1.0)), pose(0.05, 0.05, 0))
-    again = OccupancyGrid.from_patch(grid.patch())
-    np.testing.assert_array_equal(again.patch().cells, grid.patch().cells)
-    again.update(scan_of(np.full(181, 2.0)), pose(0.05, 0.05, 0))
+        grid.add_scan(scan_of(np.full(181, 1.0)), pose(0.05, 0.05, 0))
+    again = OccupancyGrid.from_patch(grid.known_area())
+    np.testing.assert_array_equal(again.known_area().cells, grid.known_area().cells)
+    again.add_scan(scan_of(np.full(181, 2.0)), pose(0.05, 0.05, 0))
     assert percent(again, 2.05, 0.05) == 80
 
 
 def test_a_map_of_another_resolution_is_refused():
-    patch = OccupancyGrid(OccupancyConfig(resolution_m=0.05)).patch()
+    patch = OccupancyGrid(OccupancyConfig(resolution_m=0.05)).known_area()
     with pytest.raises(InputError, match='resolution'):
         OccupancyGrid.from_patch(GridPatch(patch.frame, patch.cells))
 
@@ -187,7 +187,7 @@ def test_beams_that_graze_a_wall_do_not_erase_it():
     for x in np.arange(-6.0, 0.0, 0.05):
         with np.errstate(divide='ignore'):
             ranges = np.where(np.sin(angles) > 0.0, (1.03 - 0.4) / np.sin(angles), np.inf)
-        grid.update(scan_of(np.where(ranges < 8.0, ranges, np.inf)), pose(x, 0.4, 0))
+        grid.add_scan(scan_of(np.where(ranges < 8.0, ranges, np.inf)), pose(x, 0.4, 0))
     row = grid.window(0.0, 1.05, 8.0)
     wall = row.cells[row.frame.cells_of(np.array([[0.0, 1.05]]))[0][0]]
     columns = row.frame.cells_of(np.array([[-3.5, 1.05], [2.0, 1.05]]))[:, 1]
@@ -202,7 +202,9 @@ def test_a_wall_on_the_border_of_two_cells_leaves_the_one_in_front_free():
         # A wall along x = 2.0, seen with 1 cm of noise.
         with np.errstate(divide='ignore'):
             ranges = 2.0 / np.cos(bearings) + rng.normal(0.0, 0.01, 181)
-        grid.update(scan_of(np.where(np.abs(bearings) < 0.8, ranges, np.nan)), pose(0.0, 0.05, 0.0))
+        grid.add_scan(
+            scan_of(np.where(np.abs(bearings) < 0.8, ranges, np.nan)), pose(0.0, 0.05, 0.0)
+        )
     beside = [percent(grid, 1.95, y) for y in np.arange(-1.45, 1.5, 0.1)]
     behind = [percent(grid, 2.05, y) for y in np.arange(-1.45, 1.5, 0.1)]
     assert max(beside) <= 25
@@ -224,24 +226,24 @@ def seen_from(x, y, heading, wall_y, solid=True):
 def test_looking_along_a_wall_does_not_erase_it(y):
     grid = OccupancyGrid()
     for _ in range(20):
-        grid.update(seen_from(1.5, 0.5, math.pi / 2, 2.0), pose(1.5, 0.5, math.pi / 2))
+        grid.add_scan(seen_from(1.5, 0.5, math.pi / 2, 2.0), pose(1.5, 0.5, math.pi / 2))
     wall = np.column_stack([np.arange(0.25, 2.3, 0.1), np.full(21, 1.95)])
-    before = grid.patch()
+    before = grid.known_area()
     assert before.occupied[tuple(before.frame.cells_of(wall).T)].all()
     for heading in np.radians(np.linspace(170.0, 190.0, 60)):
-        grid.update(seen_from(5.3, y, heading, 2.0), pose(5.3, y, heading))
-    after = grid.patch()
+        grid.add_scan(seen_from(5.3, y, heading, 2.0), pose(5.3, y, heading))
+    after = grid.known_area()
     assert after.occupied[tuple(after.frame.cells_of(wall).T)].mean() > 0.9
 
 
 def test_a_long_wall_that_went_away_is_unlearned_by_beams_that_cross_it():
     grid = OccupancyGrid()
     for _ in range(20):
-        grid.update(seen_from(1.5, 0.5, math.pi / 2, 2.0), pose(1.5, 0.5, math.pi / 2))
+        grid.add_scan(seen_from(1.5, 0.5, math.pi / 2, 2.0), pose(1.5, 0.5, math.pi / 2))
     for x in np.linspace(0.5, 2.5, 30):
-        grid.update(seen_from(x, 0.5, math.pi / 2, 2.0, solid=False), pose(x, 0.5, math.pi / 2))
+        grid.add_scan(seen_from(x, 0.5, math.pi / 2, 2.0, solid=False), pose(x, 0.5, math.pi / 2))
     wall = np.column_stack([np.arange(0.25, 2.3, 0.1), np.full(21, 1.95)])
-    patch = grid.patch()
+    patch = grid.known_area()
     assert patch.free[tuple(patch.frame.cells_of(wall).T)].all()
 
 
@@ -293,12 +295,12 @@ def test_all_cells_are_those_of_the_plain_grid_bit_for_bit(seed, config):
     grid = OccupancyGrid(config)
     plain = PlainGrid(config)
     for scan, T in drive_through_clutter(seed):
-        # The way back, too: into columns and rows that are negative.
+        # The opposite direction, too: into negative rows and columns.
         for at in (T, np.array([-T[0], -T[1], T[2] + math.pi])):
-            grid.update(scan, at)
+            grid.add_scan(scan, at)
             plain.update(scan, at)
     assert known_cells(grid) == plain.odds
-    assert not grid._news.any()
+    assert not grid._increments.any()
 
 
 @pytest.mark.parametrize('seed', range(3))
@@ -307,9 +309,9 @@ def test_the_whole_map_is_the_same_however_often_it_was_looked_at(seed):
     watched = OccupancyGrid()
     for _ in range(12):
         scan = scan_of(rng.uniform(0.5, 9.0, 181))
-        watched.update(scan, pose(*rng.uniform(-15.0, 15.0, 2), rng.uniform(-3.0, 3.0)))
-        seen = watched.patch()
-        fresh = OccupancyGrid.from_state(watched.state()).patch()
+        watched.add_scan(scan, pose(*rng.uniform(-15.0, 15.0, 2), rng.uniform(-3.0, 3.0)))
+        seen = watched.known_area()
+        fresh = OccupancyGrid.from_state(watched.state()).known_area()
         assert seen.frame == fresh.frame
         assert np.array_equal(seen.cells, fresh.cells)
         known = seen.cells != -1

@@ -12,7 +12,7 @@ POSES = np.array([se2.pose(0.3 * k, 0.0, 0.0) for k in range(12)])
 def filled(poses, stamps):
     history = PoseHistory()
     for T, stamp in zip(poses, stamps, strict=True):
-        history.add(stamp, T, stamp)
+        history.add_pose(stamp, T, stamp)
     return history
 
 
@@ -23,7 +23,7 @@ def test_scans_move_with_the_last_named_one_before_them():
     """
     history = filled(POSES, range(100, 112))
     moved = np.array([POSES[4] + [0.0, 1.0, 0.0], POSES[8] + [0.0, 0.0, 0.5]])
-    history.correct(np.array([104, 108]), moved, since_ns=112)
+    history.apply_correction(np.array([104, 108]), moved, since_ns=112)
     after = history.kept_poses()
     np.testing.assert_allclose(after[:8], POSES[:8] + [0.0, 1.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(after[8], moved[1], atol=1e-12)
@@ -34,7 +34,7 @@ def test_scans_move_with_the_last_named_one_before_them():
 
 def test_scans_whose_poses_are_right_already_stay():
     history = filled(POSES, range(12))
-    history.correct(np.array([0, 5]), POSES[[0, 5]] + [0.0, 0.0, 1.0], since_ns=9)
+    history.apply_correction(np.array([0, 5]), POSES[[0, 5]] + [0.0, 0.0, 1.0], since_ns=9)
     np.testing.assert_array_equal(history.kept_poses()[9:], POSES[9:])
     assert not np.allclose(history.kept_poses()[8], POSES[8])
 
@@ -42,9 +42,9 @@ def test_scans_whose_poses_are_right_already_stay():
 def test_unknown_stamps_and_stamps_that_step_back_are_borne():
     stamps = [0, 1, 2, 3, 2, 4, 5, 6, 7, 8, 9, 10]
     history = filled(POSES, stamps)
-    history.correct(np.array([77]), POSES[:1] + 5.0, since_ns=100)
+    history.apply_correction(np.array([77]), POSES[:1] + 5.0, since_ns=100)
     np.testing.assert_array_equal(history.kept_poses(), POSES)
-    history.correct(np.array([-3, 2]), POSES[[0, 4]] + [1.0, 0.0, 0.0], since_ns=100)
+    history.apply_correction(np.array([-3, 2]), POSES[[0, 4]] + [1.0, 0.0, 0.0], since_ns=100)
     np.testing.assert_allclose(history.kept_poses(), POSES + [1.0, 0.0, 0.0], atol=1e-12)
 
 
@@ -53,8 +53,8 @@ def test_named_scans_may_come_in_any_order():
     other = filled(POSES, range(12))
     stamps = np.array([7, 2, 10])
     moved = POSES[stamps] + [[0.0, 1.0, 0.1], [0.5, 0.0, 0.0], [0.0, 0.0, -0.3]]
-    history.correct(stamps, moved, since_ns=12)
-    other.correct(stamps[[1, 0, 2]], moved[[1, 0, 2]], since_ns=12)
+    history.apply_correction(stamps, moved, since_ns=12)
+    other.apply_correction(stamps[[1, 0, 2]], moved[[1, 0, 2]], since_ns=12)
     np.testing.assert_array_equal(history.kept_poses(), other.kept_poses())
     np.testing.assert_allclose(history.kept_poses()[stamps], moved, atol=1e-12)
 
@@ -78,22 +78,22 @@ def test_places_are_those_after_a_correction():
     there = np.array([se2.pose(0.01 + k, 0.1, 0.1) for k in range(8)])
     away = there + [0.0, 50.0, 0.0]
     history = filled(np.concatenate([there] * 4 + [away] * 4), range(64))
-    history.correct(np.array([0, 32]), there[[0, 0]], since_ns=64)
+    history.apply_correction(np.array([0, 32]), there[[0, 0]], since_ns=64)
     assert history.kept() == list(range(64))
     for k, T in enumerate(there):
-        history.add(64 + k, T, 64 + k)
+        history.add_pose(64 + k, T, 64 + k)
     assert len(history.kept()) == 32
     assert min(history.kept()) == 40
 
 
 def test_poses_before_the_corrections_are_those_of_the_first_since_they_were_accepted():
-    """What comes after a correction is told before it as if the robot had gone on without it."""
+    """Poses after a correction are given before it as if there had been no correction."""
     history = filled(POSES[:6], range(6))
-    history.correct(np.array([0]), POSES[[0]] + [0.0, 1.0, 0.0], since_ns=6)
+    history.apply_correction(np.array([0]), POSES[[0]] + [0.0, 1.0, 0.0], since_ns=6)
     for k in (6, 7):
-        history.add(k, POSES[k] + [0.0, 1.0, 0.0], k)
-    history.correct(np.array([0]), POSES[[0]] + [0.0, 3.0, 0.0], since_ns=8)
-    history.add(8, POSES[8] + [0.0, 3.0, 0.0], 8)
+        history.add_pose(k, POSES[k] + [0.0, 1.0, 0.0], k)
+    history.apply_correction(np.array([0]), POSES[[0]] + [0.0, 3.0, 0.0], since_ns=8)
+    history.add_pose(8, POSES[8] + [0.0, 3.0, 0.0], 8)
     moved = history.accept_corrections()
     np.testing.assert_allclose(moved.before, POSES[:9], atol=1e-12)
     np.testing.assert_allclose(moved.after, POSES[:9] + [0.0, 3.0, 0.0], atol=1e-12)
@@ -105,6 +105,8 @@ def test_poses_before_the_corrections_are_those_of_the_first_since_they_were_acc
 def test_a_correction_that_names_no_scan_changes_nothing(stamps):
     for poses in (POSES, POSES[:0]):
         history = filled(poses, range(len(poses)))
-        history.correct(np.array(stamps, dtype=np.int64), POSES[: len(stamps)] + 1.0, since_ns=99)
+        history.apply_correction(
+            np.array(stamps, dtype=np.int64), POSES[: len(stamps)] + 1.0, since_ns=99
+        )
         np.testing.assert_array_equal(history.kept_poses(), poses)
         np.testing.assert_array_equal(history.accept_corrections().before, poses)

@@ -1,4 +1,4 @@
-"""Sectors of invalid beams: what may stand in them, and what a robot that cannot see does."""
+"""Blind sectors: possible obstacles in them, and the behaviour of a robot with a blind laser."""
 
 import math
 
@@ -21,7 +21,7 @@ def scan_with(invalid, beams=181, first=-math.pi / 2, step=math.pi / 180, value=
 
 def unseen_points(scan, pose=(0.0, 0.0, 0.0), reach_m=2.0):
     sectors = BlindSectors()
-    sectors.observe(np.array(pose), scan)
+    sectors.add_scan(np.array(pose), scan)
     return sectors.points(reach_m, 0.5)
 
 
@@ -72,12 +72,12 @@ def test_what_was_seen_from_where_the_robot_just_was_is_seen():
     sectors = BlindSectors()
     dead = scan_with(slice(130, 181))
     for step in range(40):
-        sectors.observe(np.array([0.05 * step, 0.0, 0.0]), dead)
+        sectors.add_scan(np.array([0.05 * step, 0.0, 0.0]), dead)
     here = np.array([0.05 * 39, 0.0])
     bare = unseen_points(dead, (here[0], 0.0, 0.0))
     left = sectors.points(2.0, 0.5)
     assert 0 < len(left) < len(bare)
-    # What lies beside the robot was ahead of it; what is farther out never was.
+    # The space beside the robot was ahead of it; the space farther out never was.
     beside = here + np.array([0.0, 0.25])
     assert np.hypot(*(bare - beside).T).min() < 0.1 < np.hypot(*(left - beside).T).min()
     # Of what was seen farther back than it may remember, it knows nothing.
@@ -162,7 +162,7 @@ def test_something_nearer_than_can_be_measured_is_an_obstacle():
     ride = spoiled(Ride(room(), (1.0, 3.0, 0.0)), with_beams(85, 96, -np.inf))
     last = ride.go((6.0, 3.0))[-1]
     assert last.state == 'failed'
-    assert 'stands in the way' in last.reason
+    assert 'blocks the path' in last.reason
     assert ride.pose[0] == pytest.approx(1.0)
     behind = spoiled(Ride(room(), (1.0, 3.0, 0.0)), with_beams(0, 5, -np.inf))
     assert behind.go((6.0, 3.0))[-1].state == 'reached', "beside the robot it is in nobody's way"

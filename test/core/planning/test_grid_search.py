@@ -9,8 +9,8 @@ import pytest
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.planning.grid_search import (
     PathLengthTable,
-    coarse,
     distance_field_from,
+    downsample_mask,
     path_lengths_from,
 )
 from thinmap_ros.core.planning.traversability import reachable_cells
@@ -80,7 +80,7 @@ def test_ways_are_at_most_a_twelfth_longer_than_straight_ones():
 def test_a_coarse_square_is_set_where_any_of_its_cells_is():
     mask = np.zeros((5, 7), dtype=np.bool_)
     mask[4, 6] = mask[1, 2] = True
-    assert np.argwhere(coarse(mask, 2)).tolist() == [[0, 1], [2, 3]]
+    assert np.argwhere(downsample_mask(mask, 2)).tolist() == [[0, 1], [2, 3]]
 
 
 def test_a_table_of_ways_stays_true_while_the_map_grows_to_all_sides():
@@ -94,7 +94,7 @@ def test_a_table_of_ways_stays_true_while_the_map_grows_to_all_sides():
     assert first[0, 1] > 12.0
     grown = np.pad(allowed, ((3, 5), (7, 2)))
     nothing = np.zeros_like(grown)
-    moved = frame.shifted(-3, -7)
+    moved = frame.with_origin_at(-3, -7)
     fresh = PathLengthTable(0.2, 1e9, 2).update(grown, nothing, moved, places, 0)
     assert np.allclose(table.update(grown, nothing, moved, places, 5), first)
     assert np.abs(fresh - first).max() < 0.7

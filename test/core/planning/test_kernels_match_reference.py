@@ -13,8 +13,8 @@ from thinmap_ros.core.exploration.stretches import without_scraps
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.grid.raytrace import line_is_clear
-from thinmap_ros.core.planning.grid_search import coarse, fine
-from thinmap_ros.core.planning.navigator import _touches
+from thinmap_ros.core.planning.grid_search import downsample_mask, upsample_mask
+from thinmap_ros.core.planning.navigator import _collides
 from thinmap_ros.core.planning.obstacle_points import _arc, _clear_steps, _points_around
 from thinmap_ros.core.planning.path_follower import _point_ahead, length_from, nearest_point
 from thinmap_ros.core.planning.traversability import (
@@ -81,7 +81,7 @@ def test_whether_something_has_come_near_a_path(seed):
     path = np.clip(np.cumsum(rng.integers(-1, 2, (30, 2)), axis=0) + 25, 0, 49)
     away = ndimage.distance_transform_edt(cells < 65)[path[:, 0], path[:, 1]].min()
     at = (-1.0, 2.0, 0.1)
-    assert _touches(cells, at, GridFrame(*at).centres_of(path), 2.5) == (away < 2.5)
+    assert _collides(cells, at, GridFrame(*at).centres_of(path), 2.5) == (away < 2.5)
 
 
 def plain_smoothed(ranges):
@@ -200,11 +200,11 @@ def test_squares_of_cells_and_back(seed):
     padded = np.pad(cells, [(0, -size % factor) for size in cells.shape])
     shape = (padded.shape[0] // factor, factor, padded.shape[1] // factor, factor)
     expected = padded.reshape(shape).any(axis=(1, 3))
-    assert (coarse(cells, factor) == expected).all()
+    assert (downsample_mask(cells, factor) == expected).all()
     chosen = rng.random(expected.shape) < 0.5
     rows, cols = cells.shape
     spread = np.repeat(np.repeat(chosen, factor, axis=0), factor, axis=1)[:rows, :cols]
-    assert (fine(chosen, factor, cells) == (cells & spread)).all()
+    assert (upsample_mask(chosen, factor, cells) == (cells & spread)).all()
 
 
 @pytest.mark.parametrize('seed', SEEDS)

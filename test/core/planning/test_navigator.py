@@ -161,7 +161,7 @@ def test_where_there_is_no_way_around_it_gives_up_with_a_reason():
     ride = Ride(world, (1.0, 3.0, 0.0), known=room())
     commands = ride.go((7.0, 3.0), 120.0)
     assert commands[-1].state == 'failed'
-    assert 'blocked' in commands[-1].reason or 'stands in the way' in commands[-1].reason
+    assert 'blocked' in commands[-1].reason or 'blocks the path' in commands[-1].reason
     assert any(c.state == 'blocked' for c in commands)
     assert ride.nearest_m > 0.18
 
@@ -229,7 +229,7 @@ def test_it_remembers_what_is_beside_it_where_the_laser_does_not_look():
     def look(pose, ranges, stamp):
         scan = Scan.create(stamp, ranges, -math.pi / 2, math.pi / 180, 0.02, 8.0)
         navigator.step(np.array(pose), patch, scan, DT)
-        return navigator._seen.points
+        return navigator._obstacles.points
 
     ahead = np.full(181, np.inf)
     ahead[90] = 0.5
@@ -237,7 +237,7 @@ def test_it_remembers_what_is_beside_it_where_the_laser_does_not_look():
     # Turned away from it: it is still there; looked at again and gone: it is forgotten.
     assert np.allclose(look((2.0, 3.0, 2.5), np.full(181, np.inf), 1), [[2.5, 3.0]], atol=1e-6)
     assert len(look((2.0, 3.0, 0.5), np.full(181, np.inf), 2)) == 0
-    # What is left behind is forgotten too.
+    # Distant points are dropped, too.
     look((2.0, 3.0, 0.0), ahead, 3)
     assert len(look((3.6, 3.0, 0.0), np.full(181, np.inf), 4)) == 0
 

@@ -17,7 +17,7 @@ def test_its_cells_are_those_that_it_led_over_each_beside_the_one_before(seed):
     trail = RecentPath()
     way = np.cumsum(rng.normal(0.05, 0.1, (200, 2)), axis=0) + (0.0, 4.0)
     for x, y in way:
-        trail.add(np.array([x, y, 0.0]))
+        trail.add_pose(np.array([x, y, 0.0]))
     shape = (150, 60)
     cells = trail.cells(FRAME, shape)
     assert ((cells >= 0) & (cells < shape)).all()
@@ -32,10 +32,10 @@ def test_its_cells_are_those_that_it_led_over_each_beside_the_one_before(seed):
 def test_a_jump_begins_it_anew_and_it_forgets_what_is_long_past():
     trail = RecentPath()
     for x in np.arange(0.0, 99.0, 0.05):
-        trail.add(np.array([x, 3.0, 0.0]))
+        trail.add_pose(np.array([x, 3.0, 0.0]))
     cells = trail.cells(FRAME, (100, 1000))
     assert cells[:, 1].min() > 100
-    trail.add(np.array([3.0, 3.0, 0.0]))
+    trail.add_pose(np.array([3.0, 3.0, 0.0]))
     assert len(trail.cells(FRAME, (100, 1000))) == 1
     assert len(RecentPath().cells(FRAME, (100, 1000))) == 0
 
@@ -45,7 +45,7 @@ def test_of_a_long_way_it_keeps_the_last_points(count):
     trail = RecentPath()
     way = np.arange(count) * 0.05
     for x in way:
-        trail.add(np.array([x, 3.0, 0.0]))
+        trail.add_pose(np.array([x, 3.0, 0.0]))
     columns = FRAME.cells_of(np.stack([way[-1300:], np.full(1300, 3.0)], axis=1))[:, 1]
     kept = np.unique(trail.cells(FRAME, (100, 10_000))[:, 1])
     assert kept.tolist() == np.unique(columns).tolist()
@@ -54,7 +54,7 @@ def test_of_a_long_way_it_keeps_the_last_points(count):
 def test_a_pose_that_is_not_finite_leaves_no_trail():
     trail = RecentPath()
     for x in (np.nan, 0.0, np.inf, 0.1):
-        trail.add(np.array([x, 3.0, 0.0]))
+        trail.add_pose(np.array([x, 3.0, 0.0]))
     cells = trail.cells(FRAME, (100, 1000))
     been = FRAME.cells_of(np.array([[0.0, 3.0], [0.1, 3.0]]))
     assert np.unique(cells, axis=0).tolist() == been.tolist()
@@ -68,7 +68,7 @@ def test_the_way_back_is_open_though_a_speck_makes_it_too_narrow_but_not_through
     cells[33:, 40] = 100
     trail = RecentPath()
     for x in np.arange(2.0, 6.0, 0.05):
-        trail.add(np.array([x, 3.05, 0.0]))
+        trail.add_pose(np.array([x, 3.05, 0.0]))
     frame = GridFrame(0.0, 0.0, 0.1)
     config = WavefrontConfig()
     back = trail.cells(frame, cells.shape)

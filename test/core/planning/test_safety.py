@@ -1,4 +1,4 @@
-"""Whatever it is told, the robot touches nothing.
+"""Whatever the goal, the robot touches nothing.
 
 Real limits and a real laser in rooms full of pillars.
 """

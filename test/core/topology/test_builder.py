@@ -19,11 +19,13 @@ PAD = 200
 def windows(patch, way, size=100):
     """Windows of a finished map at points (N, 2) along a way, and the poses there."""
     cells = np.pad(patch.cells, PAD, constant_values=UNKNOWN)
-    frame = patch.frame.shifted(-PAD, -PAD)
+    frame = patch.frame.with_origin_at(-PAD, -PAD)
     for x, y in way:
         row, col = (frame.cells_of(np.array([[x, y]]))[0] - size // 2).tolist()
         yield (
-            GridPatch(frame.shifted(row, col), cells[row : row + size, col : col + size].copy()),
+            GridPatch(
+                frame.with_origin_at(row, col), cells[row : row + size, col : col + size].copy()
+            ),
             np.array([x, y, 0]),
         )
 
@@ -164,7 +166,7 @@ def test_jumps_and_far_away_windows_do_not_break_the_map():
         sizes.append(sum(len(chain.cells) for chain in builder._atlas.chains.values()))
     assert sizes[-1] <= 2 * sizes[1], 'the web does not grow where nothing is new'
     far = GridPatch(
-        patch.frame.shifted(100_000, -50_000), np.full((100, 100), UNKNOWN, dtype=np.int8)
+        patch.frame.with_origin_at(100_000, -50_000), np.full((100, 100), UNKNOWN, dtype=np.int8)
     )
     builder.update(far, np.array([0.0, 0.0, 0.0]))
 
@@ -209,5 +211,5 @@ def test_drives_through_floors_lead_to_the_map_of_the_whole(shared_data, name):
         shown[row : row + 100, col : col + 100] = window.cells
     # What no window showed, the batch map must not know either.
     assert_like(
-        builder.map, build(GridPatch(patch.frame.shifted(-PAD, -PAD), shown), start, config)
+        builder.map, build(GridPatch(patch.frame.with_origin_at(-PAD, -PAD), shown), start, config)
     )

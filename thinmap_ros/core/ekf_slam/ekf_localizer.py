@@ -99,7 +99,7 @@ class EkfLocalizer:
     @property
     def refused(self) -> int:
         """Scans, odometry poses and poses from outside that made no sense."""
-        return self._refused + self._odometry.refused
+        return self._refused + self._odometry.rejected
 
     @property
     def pose(self) -> Array:
@@ -139,7 +139,7 @@ class EkfLocalizer:
         own = {name: array for name, array in state.items() if name in feature_map.FIELDS}
         localizer = EkfLocalizer(config)
         localizer._features.restore(
-            localizer._filter, snapshot.check(own, feature_map.FIELDS, 'features')
+            localizer._filter, snapshot.validate(own, feature_map.FIELDS, 'features')
         )
         localizer.set_pose(localizer.pose, _IN_SESSION)
         return localizer
@@ -161,7 +161,7 @@ class EkfLocalizer:
 
     def step(self, scan: Scan, T_odom_base: Array) -> Estimate:
         """Take in a scan with the odometry pose (3,) at its stamp."""
-        self._predict(self._odometry.next(scan.stamp_ns, T_odom_base))
+        self._predict(self._odometry.add(scan.stamp_ns, T_odom_base))
         observed = 0
         matched = 0
         if not se2.is_finite(scan.T_base_laser):

@@ -26,7 +26,11 @@ from thinmap_ros.core.exploration.frontiers import NOTHING, OpenBorders
 from thinmap_ros.core.exploration.strategy import FIRST_FRONTIER_ID, EndNode
 from thinmap_ros.core.exploration.stretches import middle_one, without_scraps
 from thinmap_ros.core.exploration.viewpoints import SQUARE
-from thinmap_ros.core.planning.grid_search import coarse, distance_field_from, fine
+from thinmap_ros.core.planning.grid_search import (
+    distance_field_from,
+    downsample_mask,
+    upsample_mask,
+)
 from thinmap_ros.core.planning.recent_path import RecentPath
 from thinmap_ros.core.planning.traversability import (
     escape_cells,
@@ -153,7 +157,7 @@ class Surveyor:
         parts = {name: _part(state, name, fields) for name, fields in _PARTS.items()}
         prefixes = tuple(f'{name}_' for name in _PARTS)
         rest = {key: array for key, array in state.items() if not key.startswith(prefixes)}
-        own = snapshot.check(rest, FIELDS, 'exploration')
+        own = snapshot.validate(rest, FIELDS, 'exploration')
         ids = own['visited'][:, 0]
         snapshot.require(bool((ids == np.floor(ids)).all()), 'exploration: visited', 'whole ids')
         next_id = int(own['next_stand_in'])
@@ -263,8 +267,10 @@ class Surveyor:
         trail = self.trail.cells(self.frame, free.shape)
         ways = escape_cells(standing, free, self.frame, xy, _ESCAPE_M, trail)
         row, col = (int(v) for v in self.frame.cells_of(T_map_base[None, :2])[0])
-        self.ways = distance_field_from(coarse(ways, SQUARE), (row // SQUARE, col // SQUARE))
-        self.reached = fine(np.isfinite(self.ways), SQUARE, standing)
+        self.ways = distance_field_from(
+            downsample_mask(ways, SQUARE), (row // SQUARE, col // SQUARE)
+        )
+        self.reached = upsample_mask(np.isfinite(self.ways), SQUARE, standing)
 
     def _renew_standing(self) -> None:
         """Where the robot can stand, and where it could.
@@ -429,7 +435,7 @@ def _part(state: Mapping[str, NDArray[Any]], name: str, fields: Fields) -> dict[
         for key, array in state.items()
         if key.startswith(f'{name}_')
     }
-    return snapshot.check(own, fields, f'exploration: {name}')
+    return snapshot.validate(own, fields, f'exploration: {name}')
 
 
 def _place(track: Track) -> Place:

@@ -156,7 +156,7 @@ class Explorer:
         """
         explorer = Explorer(config)
         own = {key: array for key, array in state.items() if key in FIELDS}
-        checked = snapshot.check(own, FIELDS, 'exploration')
+        checked = snapshot.validate(own, FIELDS, 'exploration')
         explorer.surveyor.restore({key: state[key] for key in state if key not in FIELDS})
         explorer._memory.first_choice_made = bool(checked['first_choice_made'])
         return explorer
@@ -173,7 +173,7 @@ class Explorer:
         self._began_ns = min(self._began_ns, self._stamp_ns)
         surveyor = self.surveyor
         borders = self.surveyor.borders
-        surveyor.trail.add(T_map_base)
+        surveyor.trail.add_pose(T_map_base)
         xy = (float(T_map_base[0]), float(T_map_base[1]))
         borders.update(patch, box_of_scan(scan, T_map_base))
         borders.examine(xy, self.config.close_look_m, directions_of_view(scan, T_map_base))

@@ -265,7 +265,7 @@ class OpenBorders:
             self.passable = np.pad(self.passable, more, constant_values=True)
             self.mask = np.pad(self.mask, more)
             self._looks = np.pad(self._looks, more)
-            self.frame = self.frame.shifted(-more[0][0], -more[1][0])
+            self.frame = self.frame.with_origin_at(-more[0][0], -more[1][0])
             self.changed = None
             row = row + more[0][0]
             col = col + more[1][0]

@@ -1,6 +1,6 @@
-"""Which cells hang together, over edges and corners.
+"""Connected components of a mask, with 8-connectivity.
 
-Found row by row, from one run of true cells to the next.
+Runs of true cells are joined row by row, with a union-find structure.
 """
 
 import numpy as np
@@ -13,11 +13,10 @@ Mask = NDArray[np.bool_]
 
 
 def label(cells: Mask) -> tuple[NDArray[np.int32], Cells]:
-    """Number of the part (joined over edges and corners) of each true cell, 0 elsewhere.
+    """Label the 8-connected components of a mask (H, W).
 
-    Cells in each part.
-
-    Parts are numbered in the order of their first cells, row after row.
+    Returns the component number of each true cell (0 elsewhere), (H, W), and the number of cells of
+    each component. Components are numbered in the order of their first cells, row by row.
     """
     numbers: NDArray[np.int32]
     numbers, sizes = _label(np.ascontiguousarray(cells))
@@ -25,17 +24,17 @@ def label(cells: Mask) -> tuple[NDArray[np.int32], Cells]:
 
 
 def reachable(cells: Mask, seeds: Cells) -> Mask:
-    """The true cells (H, W) that are joined to one of the seeds (N, 2), over edges and corners."""
+    """True cells (H, W) in the same 8-connected component as one of the seeds (N, 2)."""
     found: Mask = _reachable(np.ascontiguousarray(cells), seeds)
     return found
 
 
 @kernel
 def _runs(cells: Mask) -> tuple[Cells, Cells, Cells, int]:
-    """Runs (R, 3) of true cells as (row, first column, end), row after row, and what they make.
+    """Runs (R, 3) of true cells as (row, first column, end), row by row, and their components.
 
-    Also: which run is the first of each row, (H + 1,); the number of each run's part from 1 on,
-    (R,); how many parts.
+    Also: index of the first run of each row, (H + 1,); component number of each run, from 1,
+    (R,); number of components.
     """
     rows, cols = cells.shape
     runs = np.empty((rows * (cols // 2 + 1), 3), dtype=np.int64)
@@ -83,10 +82,7 @@ def _runs(cells: Mask) -> tuple[Cells, Cells, Cells, int]:
 
 @kernel
 def _root(owner: Cells, k: int) -> int:
-    """The earliest run known to be of the same part.
-
-    The way there is made shorter for the next one who asks.
-    """
+    """Root of a run in the union-find structure, with path compression."""
     while owner[k] != k:
         owner[k] = owner[owner[k]]
         k = owner[k]

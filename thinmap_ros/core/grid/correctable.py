@@ -1,4 +1,4 @@
-"""An occupancy grid that follows the corrections of loop closures."""
+"""Occupancy grid that is corrected after loop closures."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,18 +11,18 @@ from thinmap_ros.core.se2 import Array
 
 
 class CorrectableGrid:
-    """A grid that is re-rendered from kept scans, a slice with each scan, after a correction.
+    """A grid that is re-rendered from stored scans after a correction, one slice per scan.
 
-    `shown` is the map for others to read; it is complete at any time: each tile shows the new
-    rendering as soon as that is complete, and the old one before. `corrected_ns` is the stamp of
-    the newest correction that all of it has undergone.
-    The kept scans take 10 kB a metre of new ground, at most 30 kB a square metre.
+    `shown` is the published map. It is always complete: each tile shows the old rendering until its
+    new one is complete. `corrected_ns` is the stamp of the newest correction that has been
+    applied to the whole map.
+    The stored scans take 10 kB per metre of new ground, at most 30 kB per square metre.
     """
 
     def __init__(
         self, grid: OccupancyGrid, keeps_scans: bool = True, corrected_ns: int = 0
     ) -> None:
-        """Begin with a grid; without its scans (keeps_scans) it is never corrected."""
+        """Start with a grid. If keeps_scans is False, it is never corrected."""
         self.shown = grid
         self.corrected_ns = corrected_ns
         self._history: PoseHistory[StoredScan] | None = PoseHistory() if keeps_scans else None
@@ -32,20 +32,20 @@ class CorrectableGrid:
 
     @property
     def is_rerendering(self) -> bool:
-        """Whether there is a correction that not all of the shown grid has undergone."""
+        """Whether a correction has not yet been applied to the whole grid."""
         return self._pending_ns is not None
 
-    def correct(self, stamps_ns: NDArray[np.int64], poses: Array, since_ns: int) -> bool:
-        """Follow a correction: the scans of these stamps (M,) were made at poses (M, 3).
+    def apply_correction(self, stamps_ns: NDArray[np.int64], poses: Array, since_ns: int) -> bool:
+        """Apply a correction: the scans of these stamps (M,) were made at poses (M, 3).
 
-        since_ns: stamp of the first scan whose pose is right already. A re-rendering that is under
-        way starts again, at the newer poses. Returns False where the scans of the grid are not
-        known: then it stays as it is.
+        since_ns: stamp of the first scan whose pose is already correct. A re-rendering in progress
+        starts again with the newer poses. Returns False, and changes nothing, if the scans of the
+        grid are not stored.
         """
         if self._history is None:
             self.corrected_ns = since_ns
             return False
-        self._history.correct(stamps_ns, poses, since_ns)
+        self._history.apply_correction(stamps_ns, poses, since_ns)
         self._pending_ns = since_ns
         self._rerendering = None
         return True
@@ -53,9 +53,8 @@ class CorrectableGrid:
     def update(self, scan: Scan | None, T_map_base: Array) -> CorrectedPoses | None:
         """Continue the re-rendering, then add a scan made at a robot pose (3,).
 
-        scan: None where nobody knows where it was made. Returns the moved poses when a
-        re-rendering is completed, without that of this scan. Raises InputError as
-        `OccupancyGrid.update` does.
+        scan: None if its pose is unknown. Returns the corrected poses when a re-rendering is
+        complete, without that of this scan. Raises InputError as `OccupancyGrid.add_scan` does.
         """
         self._T_map_base = T_map_base
         moved = self._render_slice()
@@ -64,18 +63,18 @@ class CorrectableGrid:
         return moved
 
     def finish(self) -> CorrectedPoses | None:
-        """Complete the re-rendering, if one is under way, and return the moved poses."""
+        """Complete a re-rendering in progress, and return the corrected poses."""
         moved = None
         while self.is_rerendering:
             moved = self._render_slice()
         return moved
 
     def _add_scan(self, scan: Scan, T_map_base: Array) -> None:
-        self.shown.update(scan, T_map_base)
+        self.shown.add_scan(scan, T_map_base)
         if self._history is None:
             return
         kept = StoredScan.of(scan, self.shown.config)
-        self._history.add(scan.stamp_ns, T_map_base, kept)
+        self._history.add_pose(scan.stamp_ns, T_map_base, kept)
         if self._rerendering is not None:
             self._rerendering.add_scan(kept, T_map_base)
 
@@ -86,7 +85,7 @@ class CorrectableGrid:
             kept = self._history.kept()
             poses = self._history.kept_poses()
             self._rerendering = Rerendering(self.shown, kept, poses, self._T_map_base)
-            # The step in which a loop is closed has enough to do.
+            # The step that closes a loop is already long: rendering starts with the next one.
             return None
         self._rerendering.render_slice(self.shown)
         if not self._rerendering.is_complete:

@@ -5,13 +5,13 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.jit import kernel
 
-FAR = 1.0e6  # squared distance, in cells, where the set is empty
+FAR = 1.0e6  # squared distance in cells if the set is empty
 
 
 def distance_cells(marked: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Distance, in cells between centres, from each cell (H, W) to the nearest marked one.
 
-    1000 where none is.
+    1000 if no cell is marked.
 
     Source: Felzenszwalb and Huttenlocher, "Distance transforms of sampled functions", 2012: the
     lower envelope of parabolas, along columns and then along rows.
@@ -23,7 +23,7 @@ def distance_cells(marked: NDArray[np.bool_]) -> NDArray[np.float64]:
 def _distance(marked: NDArray[np.bool_]) -> NDArray[np.float64]:
     rows, cols = marked.shape
     squared = np.full((rows, cols), FAR)
-    # Along columns the input is 0 or nothing: two sweeps count the steps.
+    # Along columns, two sweeps count the steps from marked cells.
     for col in range(cols):
         steps = 1.0e3
         for row in range(rows):

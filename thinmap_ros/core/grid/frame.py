@@ -1,4 +1,4 @@
-"""Where the cells of a grid lie in the world."""
+"""Transform between world points and the cells of a grid."""
 
 from dataclasses import dataclass
 
@@ -17,8 +17,8 @@ class GridFrame:
     """A lattice of square cells: world point <-> cell (row, col).
 
     origin_x, origin_y: lower left corner of cell (0, 0), m; resolution: edge of a cell, m. Row 0
-    has the lowest y, as in nav_msgs/OccupancyGrid. Raises InputError where it is no place on earth
-    (FARTHEST_M), or cells are finer than FINEST_M or coarser than COARSEST_M.
+    has the lowest y, as in nav_msgs/OccupancyGrid. Raises InputError if the origin is beyond
+    MAX_COORDINATE_M, or the resolution is not between MIN_RESOLUTION_M and MAX_RESOLUTION_M.
     """
 
     origin_x: float
@@ -33,7 +33,8 @@ class GridFrame:
             )
         if not MIN_RESOLUTION_M <= self.resolution <= MAX_RESOLUTION_M:
             raise InputError(
-                f'map of cells of {self.resolution:g} m: expected {MIN_RESOLUTION_M:g} to {MAX_RESOLUTION_M:g} m'
+                f'map of cells of {self.resolution:g} m: expected {MIN_RESOLUTION_M:g} to '
+                f'{MAX_RESOLUTION_M:g} m'
             )
 
     def cells_of(self, points: Array) -> NDArray[np.int64]:
@@ -48,7 +49,7 @@ class GridFrame:
         centres[:, 1] = (cells[:, 0] + 0.5) * self.resolution + self.origin_y
         return centres
 
-    def shifted(self, rows: int, cols: int) -> 'GridFrame':
+    def with_origin_at(self, rows: int, cols: int) -> 'GridFrame':
         """The same lattice with cell (rows, cols) as its new cell (0, 0)."""
         x = self.origin_x + cols * self.resolution
         y = self.origin_y + rows * self.resolution

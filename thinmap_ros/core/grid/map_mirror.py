@@ -1,7 +1,4 @@
-"""A map put together from published patches.
-
-It is what a node knows of a grid that another node keeps.
-"""
+"""Local copy of the grid of another node, assembled from published patches."""
 
 import numpy as np
 
@@ -20,15 +17,13 @@ class MapMirror:
         self.patch: GridPatch | None = None
 
     def replace(self, whole: GridPatch) -> None:
-        """Take a whole map; whatever was held before is forgotten."""
+        """Replace the copy by a whole map."""
         self.patch = whole
 
     def paste(self, window: GridPatch) -> GridPatch:
-        """Lay a window over what is held, growing it where the window stands out.
+        """Paste a window into the copy, enlarging it if necessary; returns the result.
 
-        Returns the result.
-        Raises InputError where the window's cells do not lie on the lattice of the map, or far from
-        it.
+        Raises InputError if the window is not aligned with the cells of the map, or far from it.
         """
         if self.patch is None:
             self.patch = window
@@ -60,7 +55,7 @@ class MapMirror:
         row = row + before[0]
         col = col + before[1]
         cells[row : row + rows, col : col + cols] = window.cells
-        self.patch = GridPatch(self.patch.frame.shifted(-before[0], -before[1]), cells)
+        self.patch = GridPatch(self.patch.frame.with_origin_at(-before[0], -before[1]), cells)
         return self.patch
 
 

@@ -26,12 +26,11 @@ from thinmap_ros.core.snapshot import MAX_COORDINATE_M, Field
 _SCALE = 1000.0
 _LIMIT = 6000
 _TILE_BITS = TILE.bit_length() - 1
-# Three neighbouring beams show one surface if the middle range is this near to what the others
-# foretell, m.
+# Three neighbouring beams hit one surface if the middle range differs by less than this from the
+# range that the others predict, m.
 _FLAT_M = 0.06
-_LONGEST_SURFACE_M = 3.0
-# What a beam passes through is no wall; but where it passes through this much of one, it grazes a
-# face of the wall.
+_MAX_SURFACE_GAP_M = 3.0
+# A beam that passes through this length of occupied cells grazes the face of a wall, m.
 _GRAZED_M = 0.4
 _SURELY_OCCUPIED = 0.9
 FIELDS = {
@@ -95,17 +94,16 @@ class WindowConfig(Config):
 
 
 class OccupancyGrid:
-    """A map of any extent, in tiles that exist only where something was seen.
+    """Occupancy map of any extent, in tiles that exist only where something was observed.
 
-    The inverse sensor model: cells along a beam are free, its end is occupied, nothing is said of
-    what lies beyond. The end is taken surface_depth_m behind the measured surface, where the solid
-    is: with a wall on the border of two cells, noise would otherwise fill the free one in front of
-    it half the time. Each cell is counted once a scan, and a cell in which any beam of the scan
-    ends counts as occupied. Beams that graze a wall pass through the cells in which it stands, long
-    before they end, or without ending there at all. A cell on the line between the ends of
-    neighbouring beams that lie on one surface is therefore never counted as free; nor is a cell
-    that is surely occupied, as are others in line with it along the beam, for 0.4 m: nothing that
-    thick is looked through. What was taken away is still unlearned, by the beams that cross it.
+    The inverse sensor model: cells along a beam are free, its end is occupied, cells beyond are
+    unchanged. The end is taken surface_depth_m behind the measured surface, inside the obstacle:
+    for a wall on the border of two cells, noise would otherwise fill the free cell in front of it
+    half the time. Each cell is counted once per scan, and a cell in which any beam of the scan ends
+    counts as occupied. Beams that graze a wall pass through its cells long before they end. A cell
+    on the line between the ends of neighbouring beams on one surface is therefore never counted as
+    free. Neither is a surely occupied cell in a run of such cells of at least 0.4 m along the beam:
+    a laser does not see through walls. Beams that cross a removed obstacle still clear it.
     Source: topological map paper section 2.1 (binary local map), exploration paper section 2.1
     (Bayes update).
     """
@@ -122,18 +120,18 @@ class OccupancyGrid:
             )
         self._tiles = TileStore()
         self._percent = _percent_table()
-        self._picture = RenderedMap(self._percent)
-        self._news: NDArray[np.int16] = np.zeros((0, 0), dtype=np.int16)
-        self._fan: tuple[int, float, float] = (0, 0.0, 0.0)
+        self._rendered = RenderedMap(self._percent)
+        self._increments: NDArray[np.int16] = np.zeros((0, 0), dtype=np.int16)
+        self._beam_geometry: tuple[int, float, float] = (0, 0.0, 0.0)
         self._cosines = self._sines = np.empty(0)
         self._steps = _steps(self.config)
         self._grazed = max(3, round(_GRAZED_M / self.frame.resolution))
 
     @staticmethod
     def from_patch(patch: GridPatch, config: OccupancyConfig | None = None) -> 'OccupancyGrid':
-        """Grid that goes on from a finished map; its cells keep their places.
+        """Start from a finished map, with the same cells.
 
-        Raises InputError where the map's resolution is not that of the configuration.
+        Raises InputError if the resolution of the map is not that of the configuration.
         """
         grid = OccupancyGrid(config, patch.frame)
         clamped = np.clip(patch.cells / 100.0, grid.config.p_lowest, grid.config.p_highest)
@@ -142,13 +140,10 @@ class OccupancyGrid:
         return grid
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """All that the grid knows, exactly, as arrays by name.
-
-        `from_state` makes the same grid of it.
-        """
+        """The exact state of the grid, as arrays by name; `from_state` restores it."""
         return {
             'frame': self.frame.as_array(),
-            'tiles': self._tiles.places(),
+            'tiles': self._tiles.tile_coordinates(),
             'log_odds': self._tiles.pool[: self._tiles.used].copy(),
         }
 
@@ -156,11 +151,8 @@ class OccupancyGrid:
     def from_state(
         state: Mapping[str, NDArray[Any]], config: OccupancyConfig | None = None
     ) -> 'OccupancyGrid':
-        """Grid that goes on from the `state` of another.
-
-        Raises InputError where it is no such state.
-        """
-        checked = snapshot.check(state, FIELDS, 'grid')
+        """Restore a grid from its `state`. Raises InputError if the state is invalid."""
+        checked = snapshot.validate(state, FIELDS, 'grid')
         tiles = checked['tiles']
         odds = checked['log_odds']
         flat = tiles[:, 0] * (2 * MAX_TILE_INDEX + 1) + tiles[:, 1]
@@ -173,13 +165,13 @@ class OccupancyGrid:
 
     def _write(self, row: int, col: int, odds: NDArray[np.int16]) -> None:
         self._tiles.write(row, col, odds)
-        self._picture.touch(row, col, row + odds.shape[0], col + odds.shape[1])
+        self._rendered.mark_dirty(row, col, row + odds.shape[0], col + odds.shape[1])
 
-    def update(self, scan: Scan, T_map_base: Array) -> None:
-        """Take in a scan made at a robot pose T_map_base (3,).
+    def add_scan(self, scan: Scan, T_map_base: Array) -> None:
+        """Add a scan made at a robot pose T_map_base (3,).
 
-        Raises InputError where the laser is nowhere on earth or the map would get too large; the
-        map is then as it was.
+        Raises InputError, and leaves the map unchanged, if the laser is beyond MAX_COORDINATE_M or
+        the map would become too large.
         """
         if scan.ranges_m.size == 0 or not se2.is_finite(T_map_base):
             return
@@ -197,18 +189,18 @@ class OccupancyGrid:
         tile_row = (math.floor(y) - radius) // TILE
         tile_col = (math.floor(x) - radius) // TILE
         laser = (x - tile_col * TILE, y - tile_row * TILE)
-        # Before anything is drawn: what cannot be merged must not stay on the sheet.
+        # Before drawing: increments that cannot be merged must not remain in the buffer.
         last_row = (math.floor(y) + radius) // TILE
         last_col = (math.floor(x) + radius) // TILE
-        self._tiles.reach(tile_row, tile_col, last_row, last_col)
-        news = self._sheet(radius)
-        self._follow(scan)
+        self._tiles.grow_to(tile_row, tile_col, last_row, last_col)
+        increments = self._empty_increments(radius)
+        self._cache_bearings(scan)
         heading = float(T_map_laser[2])
         bend = 2.0 * math.cos(scan.angle_increment_rad)
         turn = (math.cos(heading), math.sin(heading))
         beams = (scan.ranges_m, scan.hit, scan.no_return, self._cosines, self._sines)
         limits = (usable, without_return, depth, resolution, bend)
-        box = _draw(news, laser, turn, *beams, limits, self._steps)
+        box = _draw(increments, laser, turn, *beams, limits, self._steps)
         self._merge(tile_row, tile_col, box, laser)
 
     def _merge(
@@ -218,28 +210,35 @@ class OccupancyGrid:
         box: tuple[int, int, int, int],
         laser: tuple[float, float],
     ) -> None:
-        """Add the news to the tiles, and make those that do not exist.
+        """Add the increments to the tiles, and allocate missing tiles.
 
-        (tile_row, tile_col): where the news begin.
+        (tile_row, tile_col): first tile of the increments.
         """
         tiles = self._tiles
         row = tile_row * TILE
         col = tile_col * TILE
-        self._picture.touch(row + box[0], col + box[2], row + box[1] + 1, col + box[3] + 1)
+        self._rendered.mark_dirty(row + box[0], col + box[2], row + box[1] + 1, col + box[3] + 1)
         place = (tile_row - tiles.first_row, tile_col - tiles.first_col)
-        _spare(
-            tiles.pool, tiles.directory, place, self._news, box, laser, self._steps, self._grazed
+        _keep_grazed_walls(
+            tiles.pool,
+            tiles.directory,
+            place,
+            self._increments,
+            box,
+            laser,
+            self._steps,
+            self._grazed,
         )
-        if _apply(tiles.pool, tiles.directory, place, self._news, box, self._steps):
-            tiles.allocate(_tiles_of(self._news, box) + (tile_row, tile_col))
-            _apply(tiles.pool, tiles.directory, place, self._news, box, self._steps)
+        if _apply(tiles.pool, tiles.directory, place, self._increments, box, self._steps):
+            tiles.allocate(_tiles_of(self._increments, box) + (tile_row, tile_col))
+            _apply(tiles.pool, tiles.directory, place, self._increments, box, self._steps)
 
     def tiles(self) -> NDArray[np.int64]:
         """Tile coordinates (N, 2) as (row, col) of the tiles that exist."""
-        return self._tiles.places()
+        return self._tiles.tile_coordinates()
 
     def set_tiles(self, tiles: NDArray[np.int64], *grids: 'OccupancyGrid') -> None:
-        """Make tiles (N, 2) hold the sum of what some grids of the same cells hold there."""
+        """Set tiles (N, 2) to the sum of the log odds of some grids with the same frame."""
         if not len(tiles):
             return
         odds = np.zeros((len(tiles), TILE, TILE), dtype=np.int16)
@@ -248,12 +247,12 @@ class OccupancyGrid:
             part = grid._tiles.read_tiles(tiles)
             odds += part
             seen |= part != 0
-        odds[seen & (odds == 0)] = 1  # 0 is kept for cells never seen
+        odds[seen & (odds == 0)] = 1  # 0 means unobserved
         low, high = self._steps[2:4]
         self._tiles.write_tiles(tiles, np.clip(odds, low, high))
         row, col = (tiles.min(axis=0) * TILE).tolist()
         end_row, end_col = ((tiles.max(axis=0) + 1) * TILE).tolist()
-        self._picture.touch(row, col, end_row, end_col)
+        self._rendered.mark_dirty(row, col, end_row, end_col)
 
     def window(self, x: float, y: float, size_m: float) -> GridPatch:
         """Square of size_m around a point, aligned with the cells, copied out of the tiles."""
@@ -261,42 +260,39 @@ class OccupancyGrid:
         row, col = self.frame.cells_of(np.array([[x, y]]))[0] - count // 2
         return self._cut(int(row), int(col), count, count)
 
-    def patch(self) -> GridPatch:
-        """The smallest rectangle that holds all that is known.
-
-        One unknown cell where nothing is.
-        """
-        return self._picture.draw(self._tiles, self.frame)
+    def known_area(self) -> GridPatch:
+        """Bounding rectangle of all known cells; one unknown cell if there are none."""
+        return self._rendered.render(self._tiles, self.frame)
 
     def _cut(self, row: int, col: int, rows: int, cols: int) -> GridPatch:
         odds = self._tiles.read(row, col, rows, cols)
-        return GridPatch(self.frame.shifted(row, col), _shades(odds, self._percent))
+        return GridPatch(self.frame.with_origin_at(row, col), _percentages(odds, self._percent))
 
-    def _sheet(self, radius: int) -> NDArray[np.int16]:
-        """Zeros for what a scan adds, whole tiles that hold `radius` cells around any cell.
+    def _empty_increments(self, radius: int) -> NDArray[np.int16]:
+        """Zeros for the increments of a scan: whole tiles, `radius` cells around any cell.
 
-        The sheet is kept; `_apply` clears it.
-        Its rows are longer than the tiles by one line of the processor's cache: with a power of
-        two, cells above each other would compete for the same few lines.
+        The buffer is reused; `_apply` clears it. Its rows are padded by one cache line: with a
+        power of two, cells above each other would compete for the same cache lines.
         """
         tiles = (2 * radius) // TILE + 2
-        if self._news.shape[0] != tiles * TILE:
-            self._news = np.zeros((tiles * TILE, tiles * TILE + 32), dtype=np.int16)
-        return self._news
+        if self._increments.shape[0] != tiles * TILE:
+            self._increments = np.zeros((tiles * TILE, tiles * TILE + 32), dtype=np.int16)
+        return self._increments
 
-    def _follow(self, scan: Scan) -> None:
-        """Keep the cosines and sines of the beams' bearings for the next scan of the same laser."""
+    def _cache_bearings(self, scan: Scan) -> None:
+        """Cache the cosines and sines of the bearings for scans with the same geometry."""
         fan = (scan.ranges_m.size, scan.angle_min_rad, scan.angle_increment_rad)
-        if fan != self._fan:
-            self._fan = fan
+        if fan != self._beam_geometry:
+            self._beam_geometry = fan
             self._cosines = np.cos(scan.angles_rad)
             self._sines = np.sin(scan.angles_rad)
 
 
 def _steps(config: OccupancyConfig) -> NDArray[np.int16]:
-    """What a cell gains that a beam passed, or in which one ended.
+    """Log-odds increments and limits, (5,).
 
-    Then lowest, highest and sure log odds, (5,) in all.
+    Increment of a miss and of a hit; lowest and highest log odds; log odds of a surely occupied
+    cell.
     """
     free, hit, low, high = (
         round(_SCALE * log_odds(p))
@@ -307,10 +303,7 @@ def _steps(config: OccupancyConfig) -> NDArray[np.int16]:
 
 
 def _percent_table() -> NDArray[np.int8]:
-    """Occupancy in percent for each log odds from -_LIMIT to _LIMIT.
-
-    Exactly 0 is a cell never seen.
-    """
+    """Occupancy in percent for log odds from -_LIMIT to _LIMIT; exactly 0 means unobserved."""
     odds = np.arange(-_LIMIT, _LIMIT + 1) / _SCALE
     table = np.round(100.0 / (1.0 + np.exp(-odds))).astype(np.int8)
     table[_LIMIT] = UNKNOWN
@@ -321,9 +314,8 @@ def _percent_table() -> NDArray[np.int8]:
 def _is_flat(ranges: Array, hit: NDArray[np.bool_], usable: float, bend: float, i: int) -> bool:
     """Whether a beam and those beside it end on one surface.
 
-    On a straight line 1 / range is a sine of the bearing: the two outer ranges foretell the one
-    between, also where the wall is grazed and its points lie almost behind each other. bend: twice
-    the cosine of the angle between beams.
+    On a straight line 1 / range is a sine of the bearing: the two outer ranges predict the middle
+    one, even if the beams graze the wall. bend: twice the cosine of the angle between beams.
     """
     if i < 1 or i > ranges.size - 2 or not (hit[i - 1] and hit[i] and hit[i + 1]):
         return False
@@ -333,12 +325,12 @@ def _is_flat(ranges: Array, hit: NDArray[np.bool_], usable: float, bend: float, 
     if max(before, between, after) >= usable:
         return False
     flat: bool = abs(between - bend * before * after / (before + after)) < _FLAT_M
-    return flat and abs(after - before) < _LONGEST_SURFACE_M
+    return flat and abs(after - before) < _MAX_SURFACE_GAP_M
 
 
 @kernel
 def _draw(
-    news: NDArray[np.int16],
+    increments: NDArray[np.int16],
     laser: tuple[float, float],
     turn: tuple[float, float],
     ranges: Array,
@@ -349,19 +341,19 @@ def _draw(
     limits: tuple[float, float, float, float, float],
     steps: NDArray[np.int16],
 ) -> tuple[int, int, int, int]:
-    """Draw what a scan adds to each cell.
+    """Draw the log-odds increments of a scan.
 
-    What beams passed, over it the surfaces (nothing), over these their ends.
+    First the cells that beams passed, over them the surfaces (0), over these the ends of beams.
 
-    news (H, W): zeros, large enough for every beam; laser: (x, y) in cells from there; turn: cosine
-    and sine of its heading; ranges (m), hit, no_return, cosines, sines (N,): the beams, bearings in
-    the laser's frame; limits: how far beams tell something, and those without return, how far
-    behind its range a beam ends, edge of a cell, all m, and the `bend` of `_is_flat`. Returns first
-    and last row, first and last column of the box that holds all that is drawn.
+    increments (H, W): zeros, large enough for every beam; laser: (x, y) in cells of this array;
+    turn: cosine and sine of its heading; ranges (m), hit, no_return, cosines, sines (N,): beams,
+    with bearings in the laser frame; limits: usable range, range cleared by beams without return,
+    surface depth, edge of a cell, all m, and the `bend` of `_is_flat`. Returns first and last row,
+    first and last column of the bounding box of the drawn cells.
     """
     usable, without_return, depth, resolution, bend = limits
-    cells = news.ravel()
-    width = news.shape[1]
+    cells = increments.ravel()
+    width = increments.shape[1]
     ends = np.empty((ranges.size, 2))
     low_x = laser[0]
     low_y = laser[1]
@@ -381,7 +373,7 @@ def _draw(
             high_x = max(high_x, x)
             high_y = max(high_y, y)
     _draw_ends(cells, width, ends, ranges, hit, usable, bend, steps[1])
-    # One more on each side: a coordinate in fixed point may come to lie just beyond a border.
+    # One more on each side: a fixed-point coordinate may be rounded across a border.
     return int(low_y) - 1, int(high_y) + 1, int(low_x) - 1, int(high_x) + 1
 
 
@@ -396,10 +388,7 @@ def _draw_ends(
     bend: float,
     step: int,
 ) -> None:
-    """Draw what the beams of a scan met over what they passed.
-
-    The surfaces between their ends, then the ends.
-    """
+    """Draw the hits of a scan over the passed cells: surfaces between beam ends, then the ends."""
     flat_before = False
     for i in range(1, ranges.size):
         flat = _is_flat(ranges, hit, usable, bend, i)
@@ -414,8 +403,8 @@ def _draw_ends(
 
 
 @kernel
-def _shades(odds: NDArray[np.int16], percent: NDArray[np.int8]) -> NDArray[np.int8]:
-    """Cells (H, W) of a patch: what the table says of their log odds."""
+def _percentages(odds: NDArray[np.int16], percent: NDArray[np.int8]) -> NDArray[np.int8]:
+    """Occupancy (H, W), in percent, of log odds."""
     cells = np.empty(odds.shape, dtype=np.int8)
     for row in range(odds.shape[0]):
         for col in range(odds.shape[1]):
@@ -425,7 +414,7 @@ def _shades(odds: NDArray[np.int16], percent: NDArray[np.int8]) -> NDArray[np.in
 
 @inlined
 def _odds_at(pool: NDArray[np.int16], directory: NDArray[np.int32], row: int, col: int) -> int:
-    """Log odds of a cell, counted from the directory's first one on; 0 where no tile is."""
+    """Log odds of a cell, relative to the first cell of the directory; 0 if there is no tile."""
     tile_row = row >> _TILE_BITS
     tile_col = col >> _TILE_BITS
     if (
@@ -440,7 +429,7 @@ def _odds_at(pool: NDArray[np.int16], directory: NDArray[np.int32], row: int, co
 
 
 @inlined
-def _run_of(
+def _occupied_run(
     pool: NDArray[np.int16],
     directory: NDArray[np.int32],
     row: int,
@@ -449,9 +438,8 @@ def _run_of(
     sure: int,
     enough: int,
 ) -> int:
-    """How many surely occupied cells lie in line with one along a beam, itself among them.
+    """Length of the run of surely occupied cells through a cell along a beam, up to `enough`.
 
-    They are counted up to `enough`.
     away: (x, y) from the laser to the cell, in cells.
     """
     longest = max(abs(away[0]), abs(away[1]), 1e-9)
@@ -471,29 +459,29 @@ def _run_of(
 
 
 @inlined
-def _holds(news: NDArray[np.int16], odds: NDArray[np.int16], sure: int) -> bool:
-    """Whether beams passed a cell of a strip of TILE that is surely occupied."""
+def _has_occupied(increments: NDArray[np.int16], odds: NDArray[np.int16], sure: int) -> bool:
+    """Whether beams passed a surely occupied cell of a strip of TILE cells."""
     found = 0
     for k in range(TILE):
-        found |= (news[k] < 0) & (odds[k] >= sure)
+        found |= (increments[k] < 0) & (odds[k] >= sure)
     return found != 0
 
 
 @kernel
-def _spare(
+def _keep_grazed_walls(
     pool: NDArray[np.int16],
     directory: NDArray[np.int32],
     place: tuple[int, int],
-    news: NDArray[np.int16],
+    increments: NDArray[np.int16],
     box: tuple[int, int, int, int],
     laser: tuple[float, float],
     steps: NDArray[np.int16],
     grazed: int,
 ) -> None:
-    """Take back what beams only passed but what is surely occupied for `grazed` cells along them.
+    """Reset the increments of passed cells in runs of at least `grazed` surely occupied cells.
 
-    place: (row, col) in the directory of the tile in which the news begin; laser: (x, y) in cells
-    of them.
+    Such beams graze a wall. place: (row, col) in the directory of the first tile of the increments;
+    laser: (x, y) in cells of the increments.
     """
     sure = steps[4]
     top = place[0] * TILE
@@ -504,13 +492,13 @@ def _spare(
             first = tile * TILE
             if slot < 0:
                 continue
-            added = news[row, first : first + TILE]
+            added = increments[row, first : first + TILE]
             odds = pool[slot, row & (TILE - 1)]
-            if _holds(added, odds, sure):
+            if _has_occupied(added, odds, sure):
                 for k in range(TILE):
                     if added[k] < 0 and odds[k] >= sure:
                         away = (first + k + 0.5 - laser[0], row + 0.5 - laser[1])
-                        run = _run_of(
+                        run = _occupied_run(
                             pool, directory, top + row, left + first + k, away, sure, grazed
                         )
                         added[k] = 0 if run >= grazed else added[k]
@@ -521,15 +509,14 @@ def _apply(
     pool: NDArray[np.int16],
     directory: NDArray[np.int32],
     place: tuple[int, int],
-    news: NDArray[np.int16],
+    increments: NDArray[np.int16],
     box: tuple[int, int, int, int],
     steps: NDArray[np.int16],
 ) -> bool:
-    """Add the news to the log odds, clamped, and clear them.
+    """Add the increments to the log odds, clamped, and clear them.
 
-    Returns whether some are left, where no tile is.
-    Strip after strip of a tile, cell after cell without a branch: the compiler makes 16 or more
-    additions one.
+    Returns whether increments remain where tiles are missing. The inner loop has no branches, so
+    that the compiler can vectorize it.
     """
     missing = False
     low = steps[2]
@@ -539,14 +526,13 @@ def _apply(
     for row in range(box[0], box[1] + 1):
         for tile in range(box[2] >> _TILE_BITS, (box[3] >> _TILE_BITS) + 1):
             slot = directory[place[0] + (row >> _TILE_BITS), place[1] + tile]
-            added = news[row, tile * TILE : tile * TILE + TILE]
+            added = increments[row, tile * TILE : tile * TILE + TILE]
             if slot < 0:
                 missing = missing or bool(added.any())
                 continue
             odds = pool[slot, row & (TILE - 1)]
             for k in range(TILE):
-                # 0 is kept for cells never seen: a cell that comes back to even odds stays a
-                # thousandth off.
+                # 0 means unobserved: a cell that returns to even odds gets a thousandth instead.
                 total = np.int16(odds[k] + added[k])
                 total = one if total == none else total
                 total = low if total < low else total
@@ -556,10 +542,10 @@ def _apply(
     return missing
 
 
-def _tiles_of(news: NDArray[np.int16], box: tuple[int, int, int, int]) -> NDArray[np.int64]:
-    """Tiles (N, 2), from that in which the news begin, for which there are news."""
-    rows, cols = np.nonzero(news[: box[1] + 1])
-    width = news.shape[1] // TILE + 1
-    drawn = np.zeros((news.shape[0] // TILE + 1) * width, dtype=np.bool_)
+def _tiles_of(increments: NDArray[np.int16], box: tuple[int, int, int, int]) -> NDArray[np.int64]:
+    """Tiles (N, 2), relative to the first one, that have increments."""
+    rows, cols = np.nonzero(increments[: box[1] + 1])
+    width = increments.shape[1] // TILE + 1
+    drawn = np.zeros((increments.shape[0] // TILE + 1) * width, dtype=np.bool_)
     drawn[rows // TILE * width + cols // TILE] = True
     return np.column_stack(np.divmod(np.flatnonzero(drawn), width))

@@ -21,7 +21,7 @@ class GridPatch:
 
     Row 0 has the lowest y.
 
-    A cell up to 25 % is free, from 65 % occupied; what lies between counts as unknown.
+    A cell up to 25 % is free, from 65 % occupied; values in between count as unknown.
     """
 
     frame: GridFrame

@@ -1,9 +1,9 @@
 """Rays and segments through cells: map update, simulated laser and line of sight.
 
-What may be stopped on its way goes from border to border; what is drawn as a whole goes by columns
-(or rows), which does not wait for one border to know the next. Source: Amanatides and Woo, "A fast
-voxel traversal algorithm for ray tracing", 1987. All numbers are in units of cells: x runs along
-columns, y along rows, and cell (row, col) covers [col, col + 1) x [row, row + 1).
+Rays that may be stopped step from cell border to cell border. Segments that are drawn as a whole
+step by columns (or rows): these steps do not depend on each other. Source: Amanatides and Woo, "A
+fast voxel traversal algorithm for ray tracing", 1987. All numbers are in units of cells: x runs
+along columns, y along rows, and cell (row, col) covers [col, col + 1) x [row, row + 1).
 """
 
 import math

@@ -1,7 +1,4 @@
-"""The whole of a grid as people and planners see it, in percent.
-
-It is worked out anew only where the grid has changed.
-"""
+"""Occupancy of a whole grid in percent, updated only where the grid has changed."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,41 +11,35 @@ Bounds = tuple[int, int, int, int]
 
 
 class RenderedMap:
-    """Cells (H, W) int8 of all tiles.
-
-    Also which part is out of date, and which rectangle holds all that is known.
-    """
+    """Cells (H, W) int8 of all tiles, with the outdated part and the bounds of the known cells."""
 
     def __init__(self, percent: NDArray[np.int8]) -> None:
-        """Begin with nothing; percent (2 L + 1,): what to show for log odds from -L to L."""
+        """Start empty; percent (2 L + 1,): occupancy in percent for log odds from -L to L."""
         self._percent = percent
         self._cells: NDArray[np.int8] = np.empty((0, 0), dtype=np.int8)
         self._bounds: Bounds = (0, 0, 0, 0)
         self._known: Bounds | None = None
         self._stale: Bounds | None = None
 
-    def touch(self, row: int, col: int, end_row: int, end_col: int) -> None:
-        """Note that cells [row, end_row) x [col, end_col) may have changed."""
+    def mark_dirty(self, row: int, col: int, end_row: int, end_col: int) -> None:
+        """Mark cells [row, end_row) x [col, end_col) as outdated."""
         self._stale = _union(self._stale, (row, col, end_row, end_col))
 
-    def draw(self, tiles: TileStore, frame: GridFrame) -> GridPatch:
-        """The smallest rectangle that holds all that is known, as a copy.
-
-        One unknown cell where nothing is.
-        """
-        self._fit(tiles)
+    def render(self, tiles: TileStore, frame: GridFrame) -> GridPatch:
+        """Copy of the bounding rectangle of the known cells; one unknown cell if there are none."""
+        self._enlarge(tiles)
         if self._stale is not None:
-            self._refresh(tiles, *_common(self._stale, self._bounds))
+            self._refresh(tiles, *_intersection(self._stale, self._bounds))
             self._stale = None
         if self._known is None:
             return GridPatch(frame, np.full((1, 1), UNKNOWN, dtype=np.int8))
         row, col, end_row, end_col = self._known
         top, left = self._bounds[:2]
         shown = self._cells[row - top : end_row - top, col - left : end_col - left]
-        return GridPatch(frame.shifted(row, col), shown.copy())
+        return GridPatch(frame.with_origin_at(row, col), shown.copy())
 
-    def _fit(self, tiles: TileStore) -> None:
-        """Lay the cells anew when tiles have come outside of them."""
+    def _enlarge(self, tiles: TileStore) -> None:
+        """Enlarge the cells if tiles have been added outside of them."""
         bounds = tiles.bounds()
         if bounds is None or bounds == self._bounds:
             return
@@ -71,7 +62,7 @@ class RenderedMap:
         rows = np.flatnonzero(known.any(axis=1))
         cols = np.flatnonzero(known.any(axis=0))
         if rows.size:
-            # What is known once stays so: the rectangle only grows.
+            # Known cells stay known: the rectangle only grows.
             found = (
                 row + int(rows[0]),
                 col + int(cols[0]),
@@ -85,5 +76,5 @@ def _union(a: Bounds | None, b: Bounds) -> Bounds:
     return b if a is None else (min(a[0], b[0]), min(a[1], b[1]), max(a[2], b[2]), max(a[3], b[3]))
 
 
-def _common(a: Bounds, b: Bounds) -> Bounds:
+def _intersection(a: Bounds, b: Bounds) -> Bounds:
     return max(a[0], b[0]), max(a[1], b[1]), min(a[2], b[2]), min(a[3], b[3])

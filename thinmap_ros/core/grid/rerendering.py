@@ -1,4 +1,4 @@
-"""A grid re-rendered in slices after a correction, near tiles first."""
+"""Re-renders a grid in slices after a correction, tiles near the robot first."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from thinmap_ros.core.se2 import Array
 
 # Work of a slice, in tiles that scans may touch: 2 to 15 ms on a desktop processor.
 _TILES_PER_SLICE = 512
-# At least, however many tiles they touch: while one scan comes, two are rendered.
+# At least two scans, whatever they touch: while one scan arrives, two are rendered.
 _SCANS_PER_SLICE = 2
 _MARGIN_CELLS = 2  # by which the cells of a scan may lie beyond the ends of its beams
 _LAST_RING = 1 << 30
@@ -23,7 +23,7 @@ _Cells = NDArray[np.int64]
 
 
 class StoredScan(NamedTuple):
-    """A scan, and the rectangle that its beams lie in.
+    """A scan, and the bounding rectangle of its beams.
 
     extent (4,): lowest x and y, highest x and y, robot frame, m.
     """
@@ -33,7 +33,7 @@ class StoredScan(NamedTuple):
 
     @staticmethod
     def of(scan: Scan, config: OccupancyConfig) -> 'StoredScan':
-        """A scan as a grid with this configuration renders it."""
+        """Store a scan, with the extent that a grid of this configuration renders."""
         usable = config.usable_range_m
         ranges = np.where(scan.hit, scan.ranges_m, 0.0)
         reach = np.minimum(ranges + config.surface_depth_m, usable)
@@ -58,15 +58,15 @@ class _Task(NamedTuple):
 
 
 class _Queue:
-    """The scans to be rendered: first those of before the correction, then those that came since.
+    """The scans to be rendered: first those before the correction, then those since.
 
-    The former are kept in arrays: thousands of small objects would call the garbage collector.
+    The former are stored in arrays: thousands of small objects would trigger the garbage collector.
     """
 
     def __init__(
         self, scans: Sequence[StoredScan], poses: Array, rings: _Cells, tile_counts: _Cells
     ) -> None:
-        """Begin with scans at poses (N, 3): nearest ring (N,) and number of tiles (N,) of each."""
+        """Start with scans at poses (N, 3); nearest ring (N,) and number of tiles (N,) of each."""
         order = np.argsort(rings, kind='stable')
         self._scans = [scans[k].scan for k in order.tolist()]
         self._poses = poses[order]
@@ -79,12 +79,12 @@ class _Queue:
         return len(self._scans) - self._next + len(self._since)
 
     def append(self, scan: Scan, T_map_base: Array, tiles: int) -> None:
-        """Add a scan that came since the correction."""
+        """Add a scan that was made since the correction."""
         self._since.append(_Task(_LAST_RING, tiles, scan, T_map_base))
 
     @property
     def first(self) -> _Task:
-        """The scan that is next."""
+        """The next scan."""
         k = self._next
         if k == len(self._scans):
             return self._since[0]
@@ -101,25 +101,24 @@ class _Queue:
 
 
 class Rerendering:
-    """A new rendering of all kept scans at their corrected poses, of which each slice does a part.
+    """Renders all stored scans at their corrected poses, in slices.
 
-    Tiles lie in square rings around that of the robot. Scans are rendered in the order of the
-    nearest ring that they may touch, and in the order in which they came where that is the same. So
-    a ring is complete as soon as the first scan that does not touch it is next, and the tiles near
-    the robot are rendered in the order in which their scans came.
-    Scans that come meanwhile are rendered last. Until then, tiles that are complete are shown with
-    these scans added to them. In the end, `grid` holds what rendering all scans in one go gives.
+    Tiles form square rings around the tile of the robot. Scans are sorted by the nearest ring that
+    they may touch, and within a ring by time. A ring is complete as soon as the next scan does not
+    touch it, and the tiles near the robot are rendered in the order of their scans.
+    Scans that arrive meanwhile are rendered last. Until then, they are added to the completed tiles
+    that are shown. At the end, `grid` equals a rendering of all scans at once.
     """
 
     def __init__(
         self, like: OccupancyGrid, kept: Sequence[StoredScan], poses: Array, T_map_base: Array
     ) -> None:
-        """Begin with the kept scans at their poses (N, 3).
+        """Start with the stored scans at their poses (N, 3).
 
         like: a grid with the same cells and configuration; T_map_base (3,): pose of the robot.
         """
         self.grid = OccupancyGrid(like.config, like.frame)
-        self._added = OccupancyGrid(like.config, like.frame)  # of the scans that came meanwhile
+        self._added = OccupancyGrid(like.config, like.frame)  # scans that arrived meanwhile
         self._robot_tile = like.frame.cells_of(T_map_base[None, :2])[0] // TILE
         self._complete_rings = 0
         boxes = _tile_boxes([each.extent for each in kept], poses, like.frame)
@@ -133,14 +132,14 @@ class Rerendering:
         return len(self._queue) == 0
 
     def add_scan(self, kept: StoredScan, T_map_base: Array) -> None:
-        """Add a scan that came meanwhile, made at a pose (3,) that is right already."""
-        self._added.update(kept.scan, T_map_base)
+        """Add a scan that arrived meanwhile, made at a pose (3,) that is already correct."""
+        self._added.add_scan(kept.scan, T_map_base)
         box = _tile_boxes([kept.extent], T_map_base[None], self.grid.frame)[0]
         tiles = int(np.prod(box[1] - box[0] + 1))
         self._queue.append(kept.scan, T_map_base, tiles)
 
     def render_slice(self, shown: OccupancyGrid) -> None:
-        """Render some scans, and bring a shown grid up to date, unless `grid` is complete now."""
+        """Render some scans, and update the shown grid, unless `grid` is complete now."""
         scans = 0
         tiles = 0
         while self._queue:
@@ -148,7 +147,7 @@ class Rerendering:
             if scans >= _SCANS_PER_SLICE and tiles > _TILES_PER_SLICE:
                 break
             task = self._queue.pop()
-            self.grid.update(task.scan, task.T_map_base)
+            self.grid.add_scan(task.scan, task.T_map_base)
             scans += 1
         if self._queue:
             self._show_complete_rings(shown)
@@ -159,8 +158,8 @@ class Rerendering:
             return
         places = np.unique(np.vstack([shown.tiles(), self.grid.tiles()]), axis=0)
         rings = self._rings(places, places)
-        news = places[(rings >= self._complete_rings) & (rings < complete)]
-        shown.set_tiles(news, self.grid, self._added)
+        completed = places[(rings >= self._complete_rings) & (rings < complete)]
+        shown.set_tiles(completed, self.grid, self._added)
         self._complete_rings = complete
 
     def _rings(self, low: _Cells, high: _Cells) -> _Cells:

@@ -1,4 +1,4 @@
-"""The poses of all scans, corrected after loop closures, and the scans kept to render maps from."""
+"""Stored poses and scans, for re-rendering the grid after a loop closure."""
 
 import math
 from array import array
@@ -14,39 +14,39 @@ from thinmap_ros.core.se2 import Array
 _APART_M = 0.25
 _APART_RAD = 0.25
 _PLACE_M = 1.0  # edge of a place
-_DIRECTIONS = 8  # of the robot, that are told apart there
+_DIRECTIONS = 8  # robot headings that are distinguished at each place
 _PER_PLACE = 4  # scans kept of each place and direction: about one visit
-_FARTHEST_PLACE = 1 << 26  # more than any place on earth is from the origin
+_MAX_PLACE = 1 << 26  # more places than lie within MAX_COORDINATE_M
 Kept = TypeVar('Kept')
 
 
 class CorrectedPoses(NamedTuple):
-    """Poses (N, 3) of the kept scans before and after the corrections that a map has undergone."""
+    """Poses (N, 3) of the stored scans before and after the corrections of a map."""
 
     before: Array
     after: Array
 
 
 class PoseHistory(Generic[Kept]):
-    """The pose of every scan, and what is kept of some of them.
+    """The pose of every scan, and stored data of some scans.
 
-    Of the scans that lie 0.25 m or 0.25 rad apart, the newest four of each place and direction are
-    kept: their number grows with the area that was seen, not with time. A correction gives the
-    poses of some scans, by their stamps. Every other scan moves with the last of these before it,
-    in the order in which the scans were added: stamps of real robots step back now and then.
+    Of the scans that are 0.25 m or 0.25 rad apart, the newest four of each place and direction are
+    stored: their number grows with the area, not with time. A correction gives the poses of some
+    scans, by their stamps. Every other scan moves with the last of these before it, in the order in
+    which the scans were added: stamps of real robots step back now and then.
     """
 
     def __init__(self) -> None:
         self._stamps = array('q')
         self._poses = array('d')
         self._last_apart = -1
-        self._kept: dict[int, Kept] = {}  # by the number of scans that came before
+        self._kept: dict[int, Kept] = {}  # by the index of the scan
         self._at_place: dict[int, deque[int]] = {}
-        # All poses as they were before the first correction that no map has undergone yet.
+        # All poses before the first correction that has not been accepted yet.
         self._before: Array | None = None
 
-    def add(self, stamp_ns: int, T_map_base: Array, kept: Kept) -> None:
-        """Add the pose (3,) of a scan, and what is to be kept of the scan, if any scan is."""
+    def add_pose(self, stamp_ns: int, T_map_base: Array, kept: Kept) -> None:
+        """Add the pose (3,) of a scan; `kept` is stored if the scan is far enough from others."""
         number = len(self._stamps)
         self._stamps.append(stamp_ns)
         self._poses.extend(T_map_base.tolist())
@@ -63,18 +63,18 @@ class PoseHistory(Generic[Kept]):
             del self._kept[at_place.popleft()]
 
     def kept(self) -> list[Kept]:
-        """What is kept, in the order in which it was added."""
+        """The stored data, in the order in which it was added."""
         return list(self._kept.values())
 
     def kept_poses(self) -> Array:
-        """Poses (N, 3) of the kept scans, as they are known now."""
+        """Current poses (N, 3) of the stored scans."""
         return self._all_poses()[self._kept_numbers()]
 
-    def correct(self, stamps_ns: NDArray[np.int64], poses: Array, since_ns: int) -> None:
+    def apply_correction(self, stamps_ns: NDArray[np.int64], poses: Array, since_ns: int) -> None:
         """Correct all poses: the scans of these stamps (M,) were made at poses (M, 3).
 
-        since_ns: stamp of the first scan whose pose is right already, whether it was added yet or
-        not. Stamps of no scan are ignored.
+        since_ns: stamp of the first scan whose pose is already correct, whether it was added yet or
+        not. Unknown stamps are ignored.
         """
         stamps = np.array(self._stamps, dtype=np.int64)
         right_already = np.flatnonzero(stamps == since_ns)
@@ -88,7 +88,7 @@ class PoseHistory(Generic[Kept]):
         anchors = np.maximum(np.searchsorted(numbers, np.arange(count), side='right') - 1, 0)
         after = _moved_along(before, before[numbers][anchors], poses[named][anchors])
         np.frombuffer(self._poses)[: 3 * count] = after.ravel()
-        # Places with too many scans now lose the oldest ones when more come.
+        # Places that have too many scans now lose the oldest ones when more arrive.
         kept = self._kept_numbers()
         self._at_place = {}
         places = _places_of(self._all_poses()[kept])
@@ -96,10 +96,10 @@ class PoseHistory(Generic[Kept]):
             self._at_place.setdefault(place, deque()).append(number)
 
     def accept_corrections(self) -> CorrectedPoses:
-        """Poses of the kept scans before and after the corrections since the last call.
+        """Poses of the stored scans before and after the corrections since the last call.
 
-        Those of scans that came after the first of these corrections are given before it as if the
-        robot had gone on without it.
+        For scans added after the first of these corrections, the pose before is the one that they
+        would have without it.
         """
         after = self._all_poses()
         before = after
@@ -123,16 +123,16 @@ def _places_of(poses: Array) -> NDArray[np.int64]:
     """Number (N,) of the place and direction of each pose (N, 3)."""
     turn = np.floor(poses[:, 2] % (2.0 * math.pi) / (2.0 * math.pi) * _DIRECTIONS)
     x, y = np.floor(poses[:, :2] / _PLACE_M).astype(np.int64).T
-    places: NDArray[np.int64] = (x * _FARTHEST_PLACE + y) * _DIRECTIONS + turn.astype(np.int64)
+    places: NDArray[np.int64] = (x * _MAX_PLACE + y) * _DIRECTIONS + turn.astype(np.int64)
     return places
 
 
 def _numbers_of(
     wanted: NDArray[np.int64], stamps: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Indices of the wanted stamps (M,) among all (N,), ascending, and which of them each is.
+    """Indices of the wanted stamps (M,) among all (N,), ascending, and their positions in wanted.
 
-    Of equal stamps the last is found; what is not found is left out.
+    Of equal stamps the last is found. Unknown stamps are left out.
     """
     order = np.argsort(stamps, kind='stable')
     at = np.searchsorted(stamps[order], wanted, side='right') - 1
@@ -144,7 +144,7 @@ def _numbers_of(
 
 
 def _moved_along(poses: Array, before: Array, after: Array) -> Array:
-    """Poses (N, 3), each moved as another that went from `before` to `after`, (N, 3) or (1, 3)."""
+    """Poses (N, 3), each moved rigidly with another from `before` to `after`, (N, 3) or (1, 3)."""
     turn = after[:, 2] - before[:, 2]
     c = np.cos(turn)
     s = np.sin(turn)

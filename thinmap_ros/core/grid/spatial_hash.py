@@ -1,12 +1,12 @@
-"""Places by number, found again near a point without looking at all of them."""
+"""Spatial hash: finds the points near a point, by number."""
 
 import math
 
 
 class SpatialHash:
-    """Which numbers lie in which square of the plane.
+    """Numbers by square of the plane.
 
-    What is near costs the same however many lie elsewhere.
+    The time of a query does not depend on the number of points elsewhere.
     """
 
     def __init__(self, edge_m: float) -> None:
@@ -14,32 +14,32 @@ class SpatialHash:
         self._numbers: dict[tuple[int, int], set[int]] = {}
         self._bucket_of: dict[int, tuple[int, int]] = {}
 
-    def put(self, number: int, x: float, y: float) -> None:
+    def insert(self, number: int, x: float, y: float) -> None:
         """Add a number at a point, or move it there, m.
 
-        Near to a point that is not finite is nothing.
+        A point that is not finite removes the number.
         """
         if not (math.isfinite(x) and math.isfinite(y)):
-            self.drop(number)
+            self.remove(number)
             return
         bucket = (math.floor(x / self._edge_m), math.floor(y / self._edge_m))
         if self._bucket_of.get(number) != bucket:
-            self.drop(number)
+            self.remove(number)
             self._bucket_of[number] = bucket
             self._numbers.setdefault(bucket, set()).add(number)
 
-    def drop(self, number: int) -> None:
-        """Forget a number, if it is known."""
+    def remove(self, number: int) -> None:
+        """Remove a number, if present."""
         bucket = self._bucket_of.pop(number, None)
         if bucket is not None:
             self._numbers[bucket].discard(number)
             if not self._numbers[bucket]:
                 del self._numbers[bucket]
 
-    def near(self, x: float, y: float, reach_m: float) -> list[int]:
-        """All numbers within a reach of a point, m, in order.
+    def query_radius(self, x: float, y: float, reach_m: float) -> list[int]:
+        """All numbers within reach_m of a point, m, sorted.
 
-        Some that are farther off may be among them.
+        Some more distant ones may be among them.
         """
         if not (math.isfinite(x) and math.isfinite(y)):
             return []

@@ -1,4 +1,4 @@
-"""Tiles: storage for maps growing in any direction, in memory proportional to what was touched."""
+"""Tile storage for maps that grow in any direction; memory is proportional to the area touched."""
 
 import resource
 from contextlib import suppress
@@ -13,14 +13,14 @@ from thinmap_ros.core.se2 import MAX_COORDINATE_M
 
 TILE = 64  # cells along the edge of a tile
 NO_TILE = -1
-_MOST_TILES = 1 << 15  # 134 million cells, some 1.1 km in each direction at 0.1 m
-MAX_CELLS = _MOST_TILES * TILE * TILE
+_MAX_TILES = 1 << 15  # 134 million cells, some 1.1 km in each direction at 0.1 m
+MAX_CELLS = _MAX_TILES * TILE * TILE
 MAX_TILE_INDEX = int(MAX_COORDINATE_M / MIN_RESOLUTION_M) // TILE  # of the finest cells
-_FEWEST = 64  # tiles that any pool has room for
+_MIN_POOL_TILES = 64  # minimum capacity of a pool, tiles
 # Room beyond what is needed, on a side of the directory that grows: a share of its length, and at
 # least some tiles.
 _ROOM_SHARE = 0.25
-_LEAST_ROOM = 4
+_MIN_ROOM = 4
 
 
 class _Span(NamedTuple):
@@ -45,7 +45,7 @@ class _Span(NamedTuple):
     def grown_to(self, other: '_Span') -> '_Span':
         """A span that holds this one and another, with room to spare on each side that grew."""
         first, end = self.covering(other)
-        room = max(_LEAST_ROOM, int(_ROOM_SHARE * (end - first)))
+        room = max(_MIN_ROOM, int(_ROOM_SHARE * (end - first)))
         return _Span(
             first - room if first < self.first else first, end + room if end > self.end else end
         )
@@ -57,25 +57,24 @@ class TileStore:
     A cell is a number of the given type, or an array of them of shape per_cell; it begins as 0.
     `directory` (R, C) int32 says for each tile of a bounding rectangle which slot of `pool`
     (N, TILE, TILE, *per_cell) holds it, or NO_TILE; `first_row`, `first_col`: tile coordinates of
-    directory[0, 0]. When the map grows, the directory, one number a tile, is copied into a larger
-    one. The pool is not copied: it is as long as that of the largest map, and the system gives it
-    memory page by page, when it is first written to. Only where so much address space is not to be
-    had, the pool is copied into one that is longer by half.
+    directory[0, 0]. When the map grows, the directory (one number a tile) is copied into a larger
+    one. The pool is not copied: it has the address space of the largest map, and the operating
+    system allocates its pages on first write. If that much address space is not available, the pool
+    is copied into one that is longer by half.
     """
 
     def __init__(self, dtype: DTypeLike = np.int16, per_cell: tuple[int, ...] = ()) -> None:
         self.directory: NDArray[np.int32] = np.full((1, 1), NO_TILE, dtype=np.int32)
-        self.pool: NDArray[Any] = _empty_pool((TILE, TILE, *per_cell), dtype, _FEWEST)
+        self.pool: NDArray[Any] = _empty_pool((TILE, TILE, *per_cell), dtype, _MIN_POOL_TILES)
         self.first_row = 0
         self.first_col = 0
         self.used = 0
 
-    def reach(self, row_a: int, col_a: int, row_b: int, col_b: int) -> None:
+    def grow_to(self, row_a: int, col_a: int, row_b: int, col_b: int) -> None:
         """Extend the directory to the tiles from (row_a, col_a) to (row_b, col_b), inclusive.
 
-        A side that grows gets room to spare, the others do not: a long building is not wide.
-        Raises InputError where the directory would become larger than that of any building: a pose
-        is wrong then.
+        A side that grows gets spare room, the others do not: a long building is not wide.
+        Raises InputError if the directory would exceed that of any building: then a pose is wrong.
         """
         rows = _Span(row_a, row_b + 1)
         cols = _Span(col_a, col_b + 1)
@@ -84,15 +83,15 @@ class TileStore:
             return
         taller = height.grown_to(rows)
         wider = width.grown_to(cols)
-        if taller.length * wider.length > _MOST_TILES:
-            # Room that was never used is given up.
+        if taller.length * wider.length > _MAX_TILES:
+            # Unused spare room is given up.
             used_height, used_width = self._used_spans()
             taller = used_height.covering(rows)
             wider = used_width.covering(cols)
-        if taller.length * wider.length > _MOST_TILES:
+        if taller.length * wider.length > _MAX_TILES:
             size = f'{taller.length} x {wider.length}'
-            raise InputError(f'map of {size} tiles: expected {_MOST_TILES} at most')
-        self._lay_out(taller, wider)
+            raise InputError(f'map of {size} tiles: expected {_MAX_TILES} at most')
+        self._rebuild_directory(taller, wider)
 
     def _spans(self) -> tuple['_Span', '_Span']:
         """Rows and columns of tiles of the directory."""
@@ -103,16 +102,16 @@ class TileStore:
 
     def _used_spans(self) -> tuple['_Span', '_Span']:
         """Rows and columns of the tiles that exist; those of the directory if there are none."""
-        places = self.places()
+        places = self.tile_coordinates()
         if not len(places):
             return self._spans()
         low_row, low_col = places.min(axis=0).tolist()
         high_row, high_col = places.max(axis=0).tolist()
         return _Span(low_row, high_row + 1), _Span(low_col, high_col + 1)
 
-    def _lay_out(self, height: '_Span', width: '_Span') -> None:
-        """Give the directory these rows and columns of tiles, all that exist among them."""
-        places = self.places()
+    def _rebuild_directory(self, height: '_Span', width: '_Span') -> None:
+        """Rebuild the directory with these rows and columns, which include all existing tiles."""
+        places = self.tile_coordinates()
         self.directory = np.full((height.length, width.length), NO_TILE, dtype=np.int32)
         self.first_row = height.first
         self.first_col = width.first
@@ -120,9 +119,9 @@ class TileStore:
         self.directory[at[:, 0], at[:, 1]] = np.arange(len(at))
 
     def allocate(self, tiles: NDArray[np.int64]) -> None:
-        """Make the tiles (N, 2), (row, col) in tile coordinates inside the directory, exist.
+        """Allocate the tiles (N, 2), (row, col) in tile coordinates inside the directory.
 
-        Those that did not are stored in the order in which they are given.
+        New ones are stored in the given order; existing ones are unchanged.
         """
         at = tiles - (self.first_row, self.first_col)
         missing = at[self.directory[at[:, 0], at[:, 1]] == NO_TILE]
@@ -138,10 +137,10 @@ class TileStore:
         self.used = used
 
     def __getstate__(self) -> dict[str, Any]:
-        """What copies and pickles hold: not the unused room, which would become memory in them."""
+        """State for copies and pickles, without the unused part of the pool."""
         return {**self.__dict__, 'pool': self.pool[: self.used].copy()}
 
-    def places(self) -> NDArray[np.int64]:
+    def tile_coordinates(self) -> NDArray[np.int64]:
         """Tile coordinates (N, 2) as (row, col) of the tiles in the order of their slots."""
         found = np.argwhere(self.directory != NO_TILE)
         order = np.argsort(self.directory[found[:, 0], found[:, 1]])
@@ -183,7 +182,7 @@ class TileStore:
             row // TILE : (row + rows - 1) // TILE + 1, col // TILE : (col + cols - 1) // TILE + 1
         ]
         tiles = tiles.reshape(2, -1).T
-        self.reach(int(tiles[0, 0]), int(tiles[0, 1]), int(tiles[-1, 0]), int(tiles[-1, 1]))
+        self.grow_to(int(tiles[0, 0]), int(tiles[0, 1]), int(tiles[-1, 0]), int(tiles[-1, 1]))
         self.allocate(tiles)
         for tile_row, tile_col, slot in self._tiles_within(row, col, rows, cols):
             top = tile_row * TILE
@@ -210,7 +209,7 @@ class TileStore:
         """Set the tiles (N, 2), (row, col) in tile coordinates, to cells (N, TILE, TILE, ...)."""
         low_row, low_col = tiles.min(axis=0).tolist()
         high_row, high_col = tiles.max(axis=0).tolist()
-        self.reach(low_row, low_col, high_row, high_col)
+        self.grow_to(low_row, low_col, high_row, high_col)
         self.allocate(tiles)
         at = tiles - (self.first_row, self.first_col)
         self.pool[self.directory[at[:, 0], at[:, 1]]] = cells
@@ -236,11 +235,12 @@ class TileStore:
 
 
 def _empty_pool(tile: tuple[int, ...], dtype: DTypeLike, least: int) -> NDArray[Any]:
-    """Zeros (N, *tile) with room for the largest map, or for at least so many tiles.
+    """Zeros (N, *tile) with room for the largest map.
 
-    The latter where the address space of the process is limited, or the system refuses that much.
+    If the address space of the process is limited, or the system refuses that much: room for
+    `least` tiles.
     """
     if resource.getrlimit(resource.RLIMIT_AS)[0] == resource.RLIM_INFINITY:
         with suppress(MemoryError):
-            return np.zeros((_MOST_TILES, *tile), dtype=dtype)
+            return np.zeros((_MAX_TILES, *tile), dtype=dtype)
     return np.zeros((least, *tile), dtype=dtype)

@@ -81,7 +81,7 @@ def observed_nodes(
             no_return_range_m=half,
         )
     )
-    grid.update(scan, np.zeros(3))
+    grid.add_scan(scan, np.zeros(3))
     window = grid.window(0.0, 0.0, config.active_window_m)
     topology = build(window, (0.0, 0.0), TopologyConfig(robot_radius_m=config.robot_radius_m))
     nodes = np.array([node.position for node in topology.nodes.values()]).reshape(-1, 2)

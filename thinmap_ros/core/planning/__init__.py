@@ -1,4 +1,1 @@
-"""Ways through the known.
-
-Along edges of the topological map, over the cells of the grid, and how to drive them.
-"""
+"""Path planning on grid and graph, and path following."""

@@ -1,8 +1,8 @@
-"""Where the laser does not see though it looks there: behind invalid beams something may stand.
+"""Blind sectors: invalid beams behind which an obstacle may stand.
 
-Between two valid beams an angle D apart, a thing of width w cannot hide nearer than w / D. What
-lies farther out in a sector of invalid beams is unseen, until an earlier scan has seen it from a
-place that the robot has just left.
+Between two valid beams an angle D apart, an obstacle of width w cannot hide closer than w / D. The
+space beyond that in a sector of invalid beams is unobserved, unless a recent scan, made near by,
+has observed it.
 """
 
 import math
@@ -17,16 +17,16 @@ from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
-# The narrowest thing that must not be driven over unseen: a leg. Sectors are sampled this densely.
+# Width of the smallest relevant obstacle: a leg. Sectors are sampled at this spacing.
 MIN_OBSTACLE_WIDTH_M = 0.1
 _REMEMBERED_SCANS = 32
-# Between two scans that are remembered
+# Minimum motion between two stored scans
 _APART_M = 0.05
 _APART_RAD = 0.1
 
 
 class _Observation(NamedTuple):
-    """Ranges (N,) that a scan saw, m (NaN: not at all), and from where, (3,), map frame."""
+    """Observed ranges (N,), m (NaN: invalid), of a scan, and the laser pose (3,), map frame."""
 
     seen_m: Array
     first_rad: float
@@ -35,14 +35,14 @@ class _Observation(NamedTuple):
 
 
 class BlindSectors:
-    """The sectors of invalid beams in the newest scan, less what the scans just before saw."""
+    """Sectors of invalid beams in the newest scan, less the space that recent scans observed."""
 
     def __init__(self) -> None:
         self._newest: _Observation | None = None
         self._earlier: deque[_Observation] = deque(maxlen=_REMEMBERED_SCANS)
 
-    def observe(self, T_map_laser: Array, scan: Scan) -> None:
-        """Take a scan made by a laser at a pose (3,), map frame."""
+    def add_scan(self, T_map_laser: Array, scan: Scan) -> None:
+        """Add a scan made by a laser at a pose (3,), map frame."""
         seen_m = np.where(scan.hit, scan.ranges_m, np.where(scan.valid, np.inf, np.nan))
         seen_m = np.where(scan.below_range_min, 0.0, seen_m)
         newest = _Observation(seen_m, scan.angle_min_rad, scan.angle_increment_rad, T_map_laser)
@@ -57,9 +57,9 @@ class BlindSectors:
         return math.hypot(moved[0], moved[1]) > _APART_M or abs(float(moved[2])) > _APART_RAD
 
     def points(self, reach_m: float, remembered_m: float) -> Array:
-        """Points (K, 2), map frame, in what is unseen up to reach_m from the laser.
+        """Points (K, 2), map frame, in unobserved space up to reach_m from the laser.
 
-        remembered_m: how far the robot may have come from where an earlier scan saw a point.
+        remembered_m: earlier scans count if they were made within this distance.
         """
         if self._newest is None:
             return np.empty((0, 2))
@@ -80,13 +80,13 @@ class BlindSectors:
 def _sector_points(
     invalid: NDArray[np.bool_], first: float, step: float, laser: Array, reach: float
 ) -> Array:
-    """Points (K, 2) to a reach in the sectors of invalid beams (N,), from where something can hide.
+    """Points (K, 2) in the sectors of invalid beams (N,), up to a reach, where obstacles can hide.
 
-    first, step: bearing of the first beam and from one to the next, rad; laser (3,): its pose.
+    first, step: bearing of the first beam and increment, rad; laser (3,): its pose.
     """
     count = invalid.size
     points = [(0.0, 0.0) for _ in range(0)]
-    # Where the beams go all round, the last one is beside the first.
+    # In a full circle, the last beam is beside the first.
     is_circle = count * abs(step) > 2.0 * math.pi - 0.5 * abs(step)
     start = 0
     while is_circle and start < count and invalid[start]:
@@ -120,10 +120,10 @@ def _sector_points(
 def _is_seen(
     points: Array, seen: Array, first: float, step: float, laser: Array
 ) -> NDArray[np.bool_]:
-    """Whether beams of a scan went past points (K, 2): (K,).
+    """Whether beams of a scan passed points (K, 2): (K,).
 
-    seen (N,): how far each beam saw, m, NaN: not at all; first, step: their bearings, rad; laser
-    (3,): pose of the laser.
+    seen (N,): observed range of each beam, m, NaN: invalid; first, step: bearing of the first beam
+    and increment, rad; laser (3,): pose of the laser.
     """
     result = np.zeros(points.shape[0], dtype=np.bool_)
     turn = 2.0 * math.pi

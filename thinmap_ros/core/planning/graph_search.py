@@ -1,4 +1,4 @@
-"""A* over the topological map, from any point to any point.
+"""A* on the topological map, between any two points.
 
 Source: topological map paper section 3.2: the length of the edges is the cost of a path.
 """
@@ -15,7 +15,7 @@ from thinmap_ros.core.topology.graph import Edge, TopologicalMap
 
 @dataclass(frozen=True)
 class Route:
-    """A way along edges: the nodes in order, the edges between them, and its whole length in m."""
+    """A path along edges: the nodes in order, the edges between them, and its length in m."""
 
     node_ids: tuple[int, ...]
     edge_ids: tuple[int, ...]
@@ -24,11 +24,10 @@ class Route:
 
 @dataclass(frozen=True)
 class GraphAccess:
-    """Where a point joins the graph.
+    """Where a point connects to the graph: the nearest edge and index into its path, or a node.
 
-    The edge and the index into its path nearest to it, or a lone node.
-    approach_m: straight distance from the point to there; to_node_m: from the point, over there, to
-    the nodes.
+    approach_m: straight distance from the point to the graph; to_node_m: distance from the point,
+    by this connection, to each node.
     """
 
     edge_id: int | None
@@ -38,10 +37,10 @@ class GraphAccess:
 
 
 def shortest_path(topology: TopologicalMap, start_id: int, goal_id: int) -> Route | None:
-    """Shortest way from node to node by A*; None where the map joins them by no edges.
+    """Shortest route between two nodes, by A*; None if no edges connect them.
 
-    The straight distance to the goal never exceeds the way along edges, as long as edges are as
-    long as their paths.
+    The heuristic is the straight distance to the goal. It is admissible because no edge is shorter
+    than the distance between its nodes.
     """
     goal = topology.nodes[goal_id]
     reached_by: dict[int, tuple[int, int]] = {}
@@ -68,7 +67,7 @@ def shortest_path(topology: TopologicalMap, start_id: int, goal_id: int) -> Rout
 
 
 def access(topology: TopologicalMap, x: float, y: float) -> GraphAccess | None:
-    """How a point (m, map frame) joins the graph; None where the map is empty."""
+    """How a point (m, map frame) connects to the graph; None if the map is empty."""
     found = topology.nearest_edge_point(x, y)
     node = topology.nearest_node(x, y)
     if node is None:
@@ -86,7 +85,7 @@ def access(topology: TopologicalMap, x: float, y: float) -> GraphAccess | None:
 
 
 def path_lengths_to_nodes(topology: TopologicalMap, x: float, y: float) -> dict[int, float]:
-    """Length of the shortest way from a point (m, map frame) to every node joined with it, m."""
+    """Length of the shortest path from a point (m, map frame) to every reachable node, m."""
     start = access(topology, x, y)
     if start is None:
         return {}
@@ -110,9 +109,9 @@ def path_lengths_to_nodes(topology: TopologicalMap, x: float, y: float) -> dict[
 def path_lengths_to_goals(
     topology: TopologicalMap, from_pose: Array, goals: dict[int, Array]
 ) -> dict[int, float]:
-    """Length of the shortest way along the graph from a pose to each goal (x, y, ...), if any, m.
+    """Length of the shortest path on the graph from a pose to each reachable goal (x, y, ...), m.
 
-    A goal has the id of the node that it stands for, if that is in the map.
+    The id of a goal is that of its node, if the map has this node.
     """
     to_nodes = path_lengths_to_nodes(topology, float(from_pose[0]), float(from_pose[1]))
     costs = {}
@@ -121,17 +120,14 @@ def path_lengths_to_goals(
         y = float(goal[1])
         joins = None if goal_id in topology.nodes else access(topology, x, y)
         ends = {goal_id: 0.0} if joins is None else joins.to_node_m
-        ways = [to_nodes[i] + rest for i, rest in ends.items() if i in to_nodes]
-        if ways:
-            costs[goal_id] = min(ways)
+        lengths = [to_nodes[i] + rest for i, rest in ends.items() if i in to_nodes]
+        if lengths:
+            costs[goal_id] = min(lengths)
     return costs
 
 
 def path_points(topology: TopologicalMap, route: Route) -> Array:
-    """Points (K, 2) of a route from its first node to its last, m, map frame.
-
-    Where edges meet, each point once.
-    """
+    """Points (K, 2) of a route from its first to its last node, m, map frame, no duplicates."""
     first = topology.nodes[route.node_ids[0]]
     parts = [np.array([[first.x, first.y]])]
     for node_id, edge_id in zip(route.node_ids, route.edge_ids, strict=False):
@@ -142,30 +138,30 @@ def path_points(topology: TopologicalMap, route: Route) -> Array:
 def route_path(
     topology: TopologicalMap, start_xy: tuple[float, float], goal_xy: tuple[float, float]
 ) -> Array | None:
-    """Way (K, 2) along edges between any two points, m, map frame.
+    """Path (K, 2) along edges between any two points, m, map frame.
 
-    From each straight to the nearest edge.
-    None where the map is empty or does not join them.
+    It leads straight from each point to the nearest edge. None if the map is empty or does not
+    connect the points.
     """
     start = access(topology, *start_xy)
     goal = access(topology, *goal_xy)
     if start is None or goal is None:
         return None
     best: tuple[float, Array] | None = None
-    for cost, middle in _ways(topology, start, goal):
+    for cost, points in _candidate_paths(topology, start, goal):
         if best is None or cost < best[0]:
-            best = (cost, middle)
+            best = (cost, points)
     if best is None:
         return None
     return np.concatenate([[start_xy], best[1], [goal_xy]])
 
 
-def _ways(
+def _candidate_paths(
     topology: TopologicalMap, start: GraphAccess, goal: GraphAccess
 ) -> Iterator[tuple[float, Array]]:
-    """Over each node that the start joins to each that the goal joins.
+    """Length and points of a path for each pair of nodes at the start and the goal.
 
-    Also straight along an edge that both lie on.
+    Also the path along a common edge.
     """
     if start.edge_id is not None and start.edge_id == goal.edge_id:
         edge = topology.edges[start.edge_id]
@@ -184,7 +180,7 @@ def _ways(
 
 
 def _to_node(topology: TopologicalMap, point: GraphAccess, node_id: int) -> Array:
-    """Points from where a point joins an edge up to, without, one of the edge's nodes."""
+    """Path points from a connection on an edge to one of its nodes, without the node."""
     if point.edge_id is None:
         return np.empty((0, 2))
     edge = topology.edges[point.edge_id]
@@ -204,7 +200,7 @@ def _leaving(edge: Edge, node_id: int) -> Array:
 
 
 def _along(edge: Edge) -> Array:
-    """Length along the path from its beginning to each of its points."""
+    """Length of the path from its start to each of its points."""
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(edge.path, axis=0).T))])
 
 

@@ -1,10 +1,8 @@
-"""How far it is over the grid from one place to many.
+"""Lengths of shortest paths on the grid from one cell to many.
 
-Lengths of ways only, fast enough to ask all the time.
-
-Chamfer steps of 5 and 7 (a fifth of a cell) in a circular bucket queue; ways are at most 8 % longer
-than the straight line. Source: Dial, "Algorithm 360: shortest-path forest with topological
-ordering", 1969; Borgefors, "Distance transformations in digital images", 1986.
+Dijkstra with chamfer steps of 5 and 7 (a fifth of a cell) and a circular bucket queue; lengths are
+at most 8 % above the straight line. Source: Dial, "Algorithm 360: shortest-path forest with
+topological ordering", 1969; Borgefors, "Distance transformations in digital images", 1986.
 """
 
 import numpy as np
@@ -17,7 +15,7 @@ from thinmap_ros.core.se2 import Array
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.int64]
 Key = tuple[int, int]
-# Buckets for steps of up to four times the diagonal one.
+# Enough buckets for steps of up to four times the diagonal one.
 _STRAIGHT = 5
 _DIAGONAL = 7
 _BUCKETS = 32
@@ -25,36 +23,38 @@ _FAR = 2**31 - 1
 
 
 def path_lengths_from(allowed: Mask, start: tuple[int, int], goals: Cells) -> Array:
-    """Length (N,), cells, of the way over allowed cells (H, W) from (row, col) to each goal (N, 2).
+    """Path length (N,), cells, over allowed cells (H, W) from (row, col) to each goal (N, 2).
 
-    inf where there is none, where a goal is not allowed, and from a start beyond the grid. A start
-    that is not allowed may be left all the same.
+    inf if there is no path, if the goal is not allowed, or if the start is outside the grid. The
+    start itself need not be allowed.
     """
     weights = np.ascontiguousarray(allowed, dtype=np.uint8)
-    steps = _ways_from(weights, start[0], start[1], np.ascontiguousarray(goals, dtype=np.int64))
+    steps = _path_lengths_from(
+        weights, start[0], start[1], np.ascontiguousarray(goals, dtype=np.int64)
+    )
     return _cells(steps)
 
 
 def distance_field_from(allowed: Mask, start: tuple[int, int]) -> Array:
-    """Length, in cells, of the way over allowed cells from a start (row, col) to each cell (H, W).
+    """Path length, cells, over allowed cells from a start (row, col) to each cell (H, W).
 
-    inf where there is none, and everywhere from a start beyond the grid.
+    inf if there is no path, or if the start is outside the grid.
     """
     nothing = np.zeros((allowed.shape[0] + 2, allowed.shape[1] + 2), dtype=np.bool_)
     return _cells(_field(allowed.astype(np.uint8), start[0], start[1], nothing, -1)[1:-1, 1:-1])
 
 
-def coarse(allowed: Mask, factor: int) -> Mask:
-    """Squares of factor x factor cells of a mask (H, W) in which any is set.
+def downsample_mask(allowed: Mask, factor: int) -> Mask:
+    """Squares of factor x factor cells of a mask (H, W) with at least one true cell.
 
     Their shape is (ceil(H / factor), ceil(W / factor)).
     """
-    return np.asarray(_coarse(allowed, factor, 0, 0))
+    return np.asarray(_downsample(allowed, factor, 0, 0))
 
 
 @kernel
-def fine(squares: Mask, factor: int, cells: Mask) -> Mask:
-    """Those cells of a mask (H, W) that lie in a true square of factor x factor cells."""
+def upsample_mask(squares: Mask, factor: int, cells: Mask) -> Mask:
+    """Cells of a mask (H, W) that lie in a true square of factor x factor cells."""
     rows, cols = cells.shape
     result = np.zeros((rows, cols), dtype=np.bool_)
     line = np.zeros(squares.shape[1] * factor, dtype=np.bool_)
@@ -62,7 +62,7 @@ def fine(squares: Mask, factor: int, cells: Mask) -> Mask:
         for square in range(squares.shape[1]):
             for k in range(factor):
                 line[square * factor + k] = squares[square_row, square]
-        # All rows of a square with one line, many cells at a time.
+        # One line for all rows of a square: vectorized over columns.
         for row in range(square_row * factor, min((square_row + 1) * factor, rows)):
             for col in range(cols):
                 result[row, col] = cells[row, col] & line[col]
@@ -70,10 +70,10 @@ def fine(squares: Mask, factor: int, cells: Mask) -> Mask:
 
 
 class PathLengthTable:
-    """Ways between places of a map that grows, on a coarse grid, remembered for a while.
+    """Path lengths between places of a growing map, on a coarse grid, cached for some time.
 
-    Most places stay. Ways may lead through the unknown, where a step counts unknown_weight times:
-    two places may well be joined there.
+    Most places do not move. Paths may cross unknown space, where each step counts unknown_weight
+    times: an unobserved connection is possible.
     """
 
     def __init__(self, cell_m: float, forget_s: float, unknown_weight: int) -> None:
@@ -85,13 +85,12 @@ class PathLengthTable:
     def update(
         self, allowed: Mask, unknown: Mask, frame: GridFrame, places: Array, stamp_ns: int
     ) -> Array:
-        """Lengths (N, N), m, of ways between places (N, 2), m, over allowed cells (H, W).
+        """Path lengths (N, N), m, between places (N, 2), m, over allowed cells (H, W).
 
-        frame: of the cells; unknown (H, W): cells that may turn out to be allowed. inf where there
-        is no way.
+        frame: of the cells; unknown (H, W): cells that may be traversable. inf if there is no path.
         """
         factor = max(1, round(self._cell_m / frame.resolution))
-        # Squares on a lattice that stays when the frame grows.
+        # The lattice of squares does not move when the frame grows.
         shift = [
             round(origin / frame.resolution) % factor for origin in (frame.origin_y, frame.origin_x)
         ]
@@ -103,7 +102,7 @@ class PathLengthTable:
         )
         keys = [(int(row), int(col)) for row, col in cells + first]
         known = self._still_known(keys, stamp_ns)
-        # From new places to all others, not from all others to each of them.
+        # One search from each new place to all others, not from all others to each new one.
         for i in sorted(
             range(len(keys)), key=lambda i: sum(_pair(keys[i], key) in known for key in keys)
         ):
@@ -115,10 +114,10 @@ class PathLengthTable:
                 if weights is None:
                     weights = self._weights(allowed, unknown, factor, shift)
                 goals = np.ascontiguousarray(cells[missing])
-                steps = _ways_from(weights, int(cells[i, 0]), int(cells[i, 1]), goals)
-                ways = (_cells(steps) * frame.resolution * factor).tolist()
-                for j, way in zip(missing, ways, strict=True):
-                    known[_pair(key, keys[j])] = (stamp_ns, way)
+                steps = _path_lengths_from(weights, int(cells[i, 0]), int(cells[i, 1]), goals)
+                lengths = (_cells(steps) * frame.resolution * factor).tolist()
+                for j, length in zip(missing, lengths, strict=True):
+                    known[_pair(key, keys[j])] = (stamp_ns, length)
         self._known = known
         below = [
             [0.0 if a == b else known[_pair(a, b)][1] for b in keys[:i]] for i, a in enumerate(keys)
@@ -128,19 +127,16 @@ class PathLengthTable:
     def _weights(
         self, allowed: Mask, unknown: Mask, factor: int, shift: list[int]
     ) -> NDArray[np.uint8]:
-        """What a step costs in each square; 0: no way."""
-        maybe = _coarse(unknown, factor, shift[0], shift[1])
+        """Cost of a step in each square; 0: not traversable."""
+        maybe = _downsample(unknown, factor, shift[0], shift[1])
         weights = self._unknown_weight * maybe.astype(np.uint8)
-        weights[_coarse(allowed, factor, shift[0], shift[1])] = 1
+        weights[_downsample(allowed, factor, shift[0], shift[1])] = 1
         return weights
 
     def _still_known(
         self, keys: list[Key], stamp_ns: int
     ) -> dict[tuple[Key, Key], tuple[int, float]]:
-        """The ways that are known between these places, and not too old.
-
-        All others are forgotten.
-        """
+        """Cached path lengths between these places that are not too old."""
         since = stamp_ns - self._forget_ns
         pairs = (_pair(a, b) for i, a in enumerate(keys) for b in keys[:i])
         found = ((pair, self._known.get(pair)) for pair in pairs)
@@ -165,11 +161,8 @@ def _cells(steps: NDArray[np.int32]) -> Array:
 
 
 @kernel
-def _coarse(allowed: Mask, factor: int, shift_row: int, shift_col: int) -> Mask:
-    """Squares in which any cell is set.
-
-    The first cell is (shift_row, shift_col) within its square.
-    """
+def _downsample(allowed: Mask, factor: int, shift_row: int, shift_col: int) -> Mask:
+    """Squares with a true cell; the first cell is (shift_row, shift_col) in its square."""
     rows, cols = allowed.shape
     height = -(-(rows + shift_row) // factor)
     width = -(-(cols + shift_col) // factor)
@@ -180,7 +173,7 @@ def _coarse(allowed: Mask, factor: int, shift_row: int, shift_col: int) -> Mask:
         top = max(square * factor - shift_row, 0)
         bottom = min((square + 1) * factor - shift_row, rows)
         for row in range(top, bottom):
-            # All rows of a square into one, many cells at a time; then its columns.
+            # All rows of a square into one line (vectorized), then its columns.
             cells = allowed[row].view(np.uint8)
             part = line[shift_col : shift_col + cols]
             for col in range(cols):
@@ -192,7 +185,7 @@ def _coarse(allowed: Mask, factor: int, shift_row: int, shift_col: int) -> Mask:
 
 
 @kernel
-def _ways_from(
+def _path_lengths_from(
     weights: NDArray[np.uint8], start_row: int, start_col: int, goals: Cells
 ) -> NDArray[np.int32]:
     rows, cols = weights.shape
@@ -228,16 +221,16 @@ def _ways_from(
 def _field(
     weights: NDArray[np.uint8], start_row: int, start_col: int, wanted: Mask, left: int
 ) -> NDArray[np.int32]:
-    """Steps to each cell, in a frame one cell wider all round, until all `left` wanted are reached.
+    """Steps to each cell, padded by one cell, until all `left` wanted cells are reached.
 
-    wanted (H + 2, W + 2): cells to be reached; those that have been are cleared.
+    wanted (H + 2, W + 2): cells to reach; reached ones are cleared.
     """
     rows, cols = wanted.shape
     field = np.full((rows, cols), _FAR, dtype=np.int32)
-    # A robot may be believed where there is no map; what is beyond these arrays is not theirs.
+    # The estimated pose may lie outside the map: never index outside the arrays.
     if not (0 <= start_row < rows - 2 and 0 <= start_col < cols - 2):
         return field
-    # A border that cannot be entered saves all questions about the rim.
+    # A blocked margin of one cell makes bounds checks unnecessary.
     framed = np.zeros((rows, cols), dtype=np.uint8)
     framed[1:-1, 1:-1] = weights
     weight = framed.ravel()

@@ -1,7 +1,4 @@
-"""Goal in, velocity commands out.
-
-It plans by wavefront, follows, replans, and stops in front of what the laser sees.
-"""
+"""Navigator: plans a path to a goal, follows it, replans, and stops in front of obstacles."""
 
 import math
 from dataclasses import dataclass
@@ -29,22 +26,22 @@ _CHECK_AHEAD_M = 4.0
 _NARROW_AHEAD_M = 0.6
 _CREEP_M_S = 0.02
 _ROUNDING_M_S = 1e-9
-# Where nothing else is left, points may come so much nearer than the body's radius, but only so
-# slowly.
-_SQUEEZED_M = 0.01
-_SQUEEZED_M_S = 0.1
+# In a passage hardly wider than the robot, obstacles may come closer than body_radius_m by this
+# distance, at most at this speed.
+_NARROW_MARGIN_M = 0.01
+_NARROW_M_S = 0.1
 _AIM_RAD = 0.1
-_OBSTACLE = 'something stands in the way'
-_HIDDEN = 'the laser does not see the way: a sector of invalid beams'
-_POINTS_M = 2.5  # so near, the laser's points count beside the map
-# A goal that does not get this much nearer between so many standstills is given up.
+_OBSTACLE = 'an obstacle blocks the path'
+_HIDDEN = 'the laser does not see the path: sector of invalid beams'
+_POINTS_M = 2.5  # scan points within this distance are obstacles, beside those of the map
+# A goal is aborted after _STANDSTILLS standstills without this much progress, m.
 _PROGRESS_M = 0.5
 _STANDSTILLS = 5
 
 
 @dataclass(frozen=True)
 class NavigatorConfig(WavefrontConfig, PathFollowerConfig):
-    """Parameters of planning and following, and when a goal counts as reached or is given up."""
+    """Parameters of planning and following, and when a goal is reached or aborted."""
 
     body_radius_m: float = parameter(
         0.24, 'nothing that the laser sees may come this near, m', low=0.0, high=5.0
@@ -57,7 +54,7 @@ class NavigatorConfig(WavefrontConfig, PathFollowerConfig):
         0.15, 'a heading this near is reached, rad', low=0.01, high=3.2
     )
     replan_s: float = parameter(
-        5.0, 'a path is planned anew after this time, s', low=0.1, high=1000.0
+        5.0, 'time after which the path is replanned, s', low=0.1, high=1000.0
     )
     blocked_s: float = parameter(
         8.0, 'a goal is given up after this time at a standstill, s', low=0.1, high=1000.0
@@ -66,10 +63,9 @@ class NavigatorConfig(WavefrontConfig, PathFollowerConfig):
 
 @dataclass(frozen=True)
 class Command:
-    """What to do until the next step: speed v (m/s), turn rate w (rad/s), and how the goal stands.
+    """Command until the next step: speed v (m/s), turn rate w (rad/s), and state of the goal.
 
-    state: 'idle', 'driving', 'blocked', 'reached' or 'failed'; reason: why blocked or failed, in
-    words.
+    state: 'idle', 'driving', 'blocked', 'reached' or 'failed'; reason: text, if blocked or failed.
     """
 
     v: float
@@ -79,14 +75,14 @@ class Command:
 
 
 class Navigator:
-    """Drives to one goal at a time; a new goal takes the place of the old one without a stop."""
+    """Drives to one goal at a time; a new goal replaces the old one without a stop."""
 
     def __init__(self, config: NavigatorConfig | None = None) -> None:
         self.config = config or NavigatorConfig()
         self.path: Array | None = None
         self._follower = PathFollower(self.config)
-        self._trail = RecentPath()
-        self._seen = ObstaclePoints()
+        self._recent_path = RecentPath()
+        self._obstacles = ObstaclePoints()
         self._goal: tuple[float, float] | None = None
         self._heading_rad: float | None = None
         self._path_age_s = 0.0
@@ -98,11 +94,11 @@ class Navigator:
 
     @property
     def distance_remaining_m(self) -> float:
-        """Length of the path still to be driven, m; 0 without a path."""
+        """Remaining length of the path, m; 0 without a path."""
         return self._remaining_m
 
     def set_goal(self, x: float, y: float, theta: float | None = None) -> None:
-        """Take a goal in the map frame, m; with a heading (rad) only where that matters."""
+        """Set a goal in the map frame, m, with an optional heading, rad."""
         self._goal = (x, y)
         self._heading_rad = theta
         self.path = None
@@ -113,40 +109,40 @@ class Navigator:
         self._nearest_m = math.inf
 
     def reset_velocity(self) -> None:
-        """Take note that the robot was stopped by somebody else; it goes on from rest."""
+        """Reset the commanded velocity: the robot was stopped from outside."""
         self._follower.override_speed(0.0, 0.0)
 
     def cancel(self) -> None:
-        """Forget the goal; the next steps bring the robot to rest."""
+        """Cancel the goal; the next steps bring the robot to rest."""
         self._goal = None
         self.path = None
         self._remaining_m = 0.0
 
     def step(self, T_map_base: Array, patch: GridPatch, scan: Scan | None, dt_s: float) -> Command:
-        """Command for the next dt_s from the pose (3,), the map as known now, and the newest scan.
+        """Command for the next dt_s from the pose (3,), the current map and the newest scan.
 
-        The same scan may be given again while the robot moves on.
+        The same scan may be given again while the robot moves.
         """
-        self._seen.look(T_map_base, scan)
-        self._trail.add(T_map_base)
+        self._obstacles.add_scan(T_map_base, scan)
+        self._recent_path.add_pose(T_map_base)
         if self._goal is None:
             return Command(*self._follower.stop(dt_s), 'idle')
-        if self._is_there(T_map_base):
-            return self._arrive(T_map_base, dt_s)
-        if self._must_plan(T_map_base, patch, dt_s):
+        if self._has_arrived(T_map_base):
+            return self._finish_goal(T_map_base, dt_s)
+        if self._needs_plan(T_map_base, patch, dt_s):
             reason = self._plan(T_map_base, patch)
             if reason:
                 return self._wait(reason, dt_s)
         return self._drive(T_map_base, dt_s)
 
-    def _is_there(self, T_map_base: Array) -> bool:
-        """Whether the robot is at its goal, or where the path ends that leads as near as may be."""
+    def _has_arrived(self, T_map_base: Array) -> bool:
+        """Whether the robot is at its goal, or at the end of its path."""
         assert self._goal is not None
         ends = [self._goal] if self.path is None else [self._goal, self.path[-1]]
         away_m = min(math.dist(end, T_map_base[:2]) for end in ends)
         return away_m <= self.config.goal_tolerance_m
 
-    def _arrive(self, T_map_base: Array, dt_s: float) -> Command:
+    def _finish_goal(self, T_map_base: Array, dt_s: float) -> Command:
         self._remaining_m = 0.0
         if self._heading_rad is not None:
             error = se2.wrap(self._heading_rad - float(T_map_base[2]))
@@ -156,7 +152,7 @@ class Navigator:
         self.cancel()
         return Command(*self._follower.stop(dt_s), 'reached')
 
-    def _must_plan(self, T_map_base: Array, patch: GridPatch, dt_s: float) -> bool:
+    def _needs_plan(self, T_map_base: Array, patch: GridPatch, dt_s: float) -> bool:
         changed = patch is not self._patch
         self._patch = patch
         self._path_age_s += dt_s
@@ -169,23 +165,25 @@ class Navigator:
         return bool(strayed or (changed and self._is_blocked(nearest, patch)))
 
     def _is_blocked(self, first: int, patch: GridPatch) -> bool:
-        """Whether an obstacle has come nearer to the path's next metres than the robot's radius."""
+        """Whether an obstacle is closer to the next metres of the path than the robot radius."""
         assert self.path is not None
         frame = patch.frame
         ahead = self.path[first : first + max(1, int(2.0 * _CHECK_AHEAD_M / frame.resolution))]
         at = (frame.origin_x, frame.origin_y, frame.resolution)
         radius = self.config.robot_radius_m / frame.resolution - 1e-6
-        return _touches(patch.cells, at, ahead, radius)
+        return _collides(patch.cells, at, ahead, radius)
 
     def _plan(self, T_map_base: Array, patch: GridPatch) -> str:
-        """Plan anew; returns why there is no path, or nothing.
+        """Replan; returns why there is no path, or an empty text.
 
-        In front of an obstacle its points count, too.
+        While the robot is blocked, scan points count as obstacles, too.
         """
         assert self._goal is not None
-        points = self._seen.within(T_map_base, _POINTS_M) if self._blocked_s > 0.0 else None
+        points = (
+            self._obstacles.query_radius(T_map_base, _POINTS_M) if self._blocked_s > 0.0 else None
+        )
         start = float(T_map_base[0]), float(T_map_base[1])
-        trail = self._trail.cells(patch.frame, patch.shape)
+        trail = self._recent_path.cells(patch.frame, patch.shape)
         path = plan(patch, start, self._goal, self.config, points, self.config.body_radius_m, trail)
         first = self.path is None
         self._path_age_s = 0.0
@@ -193,13 +191,13 @@ class Navigator:
             self.path = None
             where = f'({self._goal[0]:.2f}, {self._goal[1]:.2f})'
             never = first and self._blocked_s == 0.0
-            return f'no way to {where}' if never else f'the way to {where} is blocked'
+            return f'no path to {where}' if never else f'the path to {where} is blocked'
         self.path = path
         return ''
 
     def _wait(self, reason: str, dt_s: float) -> Command:
-        """Stand still; give the goal up where there never was a way, or after blocked_s."""
-        never = reason.startswith('no way')
+        """Stop; abort the goal if there was never a path, or after blocked_s."""
+        never = reason.startswith('no path')
         self._blocked_s += dt_s
         self._remaining_m = 0.0
         if never or self._blocked_s > self.config.blocked_s:
@@ -215,7 +213,7 @@ class Navigator:
             self._standstills = 0
             self._nearest_m = self._remaining_m
         before = (self._follower.v, self._follower.w)
-        room = self._seen.room_along(self.path, nearest, _NARROW_AHEAD_M)
+        room = self._obstacles.clearance_along(self.path, nearest, _NARROW_AHEAD_M)
         v, w = self._follower.command(T_map_base, self.path, dt_s, room - self.config.body_radius_m)
         if v <= 0.0:
             return Command(v, w, 'driving')
@@ -225,9 +223,9 @@ class Navigator:
             return Command(v, w, 'driving')
         slowest = before[0] - self.config.max_acceleration_m_s2 * dt_s
         if allowed > max(_CREEP_M_S, slowest):
-            # Slower on the same arc.
+            # Drive slower on the same arc.
             return Command(*self._follower.override_speed(allowed, w * allowed / v), 'driving')
-        squeezed = self._squeezed_speed(T_map_base, min(v, _SQUEEZED_M_S), w / v)
+        squeezed = self._narrow_passage_speed(T_map_base, min(v, _NARROW_M_S), w / v)
         if squeezed > _CREEP_M_S and slowest <= squeezed:
             return Command(*self._follower.override_speed(squeezed, w * squeezed / v), 'driving')
         self._follower.override_speed(*before)
@@ -235,10 +233,7 @@ class Navigator:
         return self._brake(T_map_base, dt_s) if brakes else self._face_obstacle(T_map_base, dt_s)
 
     def _brake(self, T_map_base: Array, dt_s: float) -> Command:
-        """Come to rest on the arc on which the robot is.
-
-        At once where something has come into its way there too.
-        """
+        """Brake on the present arc; stop at once if an obstacle has come into it."""
         before = self._follower.v
         v, w = self._follower.stop(dt_s)
         if self._safe_speed(T_map_base, before, w * before / v, self.config.body_radius_m) < v:
@@ -246,12 +241,9 @@ class Navigator:
         return Command(v, w, 'driving')
 
     def _face_obstacle(self, T_map_base: Array, dt_s: float) -> Command:
-        """Right in front of something.
-
-        Turn along the path if that helps, else plan around it, else give up.
-        """
+        """Act in front of an obstacle: rotate towards the path, else replan, else abort."""
         assert self.path is not None
-        reason = _HIDDEN if self._seen.hidden else _OBSTACLE
+        reason = _HIDDEN if self._obstacles.is_hidden else _OBSTACLE
         self._standstills += self._blocked_s == 0.0
         self._blocked_s += dt_s
         if self._blocked_s > self.config.blocked_s or self._standstills > _STANDSTILLS:
@@ -269,28 +261,28 @@ class Navigator:
         ahead = self.path[min(nearest + 3, len(self.path) - 1)]
         return math.atan2(ahead[1] - T_map_base[1], ahead[0] - T_map_base[0])
 
-    def _squeezed_speed(self, T_map_base: Array, v: float, curvature: float) -> float:
-        """Highest speed up to v through a passage that is hardly wider than the robot.
+    def _narrow_passage_speed(self, T_map_base: Array, v: float, curvature: float) -> float:
+        """Highest speed up to v through a passage hardly wider than the robot.
 
-        Noise takes up the margin.
+        There the noise of the ranges exceeds the margin.
         """
-        radius_m = max(self.config.body_radius_m - _SQUEEZED_M, 0.0)
+        radius_m = max(self.config.body_radius_m - _NARROW_MARGIN_M, 0.0)
         return self._safe_speed(T_map_base, v, v * curvature, radius_m)
 
     def _safe_speed(self, T_map_base: Array, v: float, w: float, radius_m: float) -> float:
-        """Highest speed up to v at which it still stops before a scan point is within a radius."""
+        """Highest speed up to v at which the robot stops before a point comes within radius_m."""
         braking = self.config.max_acceleration_m_s2
         needed = v * self.config.reaction_s + v * v / (2.0 * braking)
-        free_m = self._seen.free_arc_length_m(T_map_base, w / v, needed, radius_m)
+        free_m = self._obstacles.free_arc_length_m(T_map_base, w / v, needed, radius_m)
         late = self.config.reaction_s
         return min(v, braking * (math.sqrt(late * late + 2.0 * free_m / braking) - late))
 
 
 @kernel
-def _touches(
+def _collides(
     cells: NDArray[np.int8], frame: tuple[float, float, float], path: Array, radius: float
 ) -> bool:
-    """Whether an occupied cell of a map (H, W) is nearer than a radius, cells, to a path (K, 2), m.
+    """Whether an occupied cell of a map (H, W) is within a radius, cells, of a path (K, 2), m.
 
     frame: origin x, origin y and resolution of the map, m.
     """

@@ -1,4 +1,4 @@
-"""What the laser sees round the robot, as points, and how far a disc can be moved among them."""
+"""Obstacles around the robot as points, and the free path length of a disc among them."""
 
 import math
 
@@ -12,31 +12,26 @@ from thinmap_ros.core.se2 import Array
 
 _REMEMBERED_M = 1.0
 _SWEEP_STEP_M = 0.03
-_BESIDE = 2  # beams to either side
-_SAME_M = 0.03  # by how much those that see the same thing differ
+_NEIGHBOURS = 2  # beams on either side
+_SAME_M = 0.03  # maximum difference of ranges of the same obstacle
 
 
 class ObstaclePoints:
-    """Where the beams of the newest scan ended, and points seen earlier where it does not look.
+    """Hits of the newest scan, and earlier hits near the robot outside its field of view.
 
-    The latter only as long as they are near.
-
-    A laser that looks ahead only does not see the corner any more round which the robot is turning.
-    points (N, 2): in the map frame, m; they keep the place where they were first seen.
-    hidden: whether it was an unseen sector, not a point, that came first in the last `clear_m`.
+    A laser that looks ahead does not see the corner around which the robot is turning.
+    points (N, 2): map frame, m; they stay where they were first observed.
+    is_hidden: whether a blind sector, not a point, limited the last `free_arc_length_m`.
     """
 
     def __init__(self) -> None:
         self.points: Array = np.empty((0, 2))
-        self.hidden = False
-        self._unseen = BlindSectors()
+        self.is_hidden = False
+        self._blind_sectors = BlindSectors()
         self._scan: Scan | None = None
 
-    def look(self, T_map_base: Array, scan: Scan | None) -> None:
-        """Take a scan made at a pose (3,).
-
-        The one taken last may be given again while the robot moves on.
-        """
+    def add_scan(self, T_map_base: Array, scan: Scan | None) -> None:
+        """Add a scan made at a pose (3,). The newest one may be given again."""
         if scan is None or scan is self._scan:
             return
         self._scan = scan
@@ -45,53 +40,53 @@ class ObstaclePoints:
         T_map_laser = se2.compose(T_map_base, scan.T_base_laser)
         hits = np.where(scan.hit, scan.ranges_m, np.nan)
         hits = np.where(scan.below_range_min, scan.range_min_m, hits)
-        self._unseen.observe(T_map_laser, scan)
+        self._blind_sectors.add_scan(T_map_laser, scan)
         self.points = _points_around(hits, first, step, T_map_laser, self.points, T_map_base)
 
-    def within(self, T_map_base: Array, reach_m: float) -> Array:
-        """Points (M, 2), m, nearer than reach_m to a pose (3,)."""
+    def query_radius(self, T_map_base: Array, reach_m: float) -> Array:
+        """Points (M, 2), m, within reach_m of a pose (3,)."""
         return np.asarray(
             self.points[np.square(self.points - T_map_base[:2]).sum(axis=1) < reach_m**2]
         )
 
-    def room_along(self, path: Array, first: int, length_m: float) -> float:
-        """How near points are to a path (K, 2) from its point `first` on for some length, m.
+    def clearance_along(self, path: Array, first: int, length_m: float) -> float:
+        """Distance, m, of points from a path (K, 2), from its point `first` for length_m.
 
-        Without points: inf.
+        inf without points.
         """
-        return float(_room_along(path, first, length_m, self.points))
+        return float(_clearance_along(path, first, length_m, self.points))
 
     def free_arc_length_m(
         self, T_map_base: Array, curvature: float, length_m: float, radius_m: float
     ) -> float:
-        """How far, m, a disc can be moved along an arc from a pose (3,), at most length_m.
+        """Free length, m, of an arc from a pose (3,) for a disc, at most length_m.
 
-        It touches nothing on that way, and nothing of what it sweeps is unseen.
+        Along it the disc touches no point and sweeps no unobserved space.
         """
         count = math.ceil(length_m / _SWEEP_STEP_M)
         clear = _clear_steps_on_arc(T_map_base, curvature, length_m, count, self.points, radius_m)
-        unseen = self._unseen_ahead(T_map_base, length_m, radius_m)
+        unseen = self._blind_points_ahead(T_map_base, length_m, radius_m)
         seen = _clear_steps_on_arc(T_map_base, curvature, length_m, count, unseen, radius_m)
-        self.hidden = seen < clear
+        self.is_hidden = seen < clear
         return float(length_m * min(clear, seen) / max(count, 1))
 
-    def _unseen_ahead(self, T_map_base: Array, length_m: float, radius_m: float) -> Array:
-        """Points (K, 2), map frame, in what is unseen and may be swept by a disc at a pose (3,)."""
-        # What lies beside the robot now was in front of it one diameter ago.
-        points = self._unseen.points(2.0 * radius_m + length_m, 2.0 * radius_m)
+    def _blind_points_ahead(self, T_map_base: Array, length_m: float, radius_m: float) -> Array:
+        """Points (K, 2), map frame, in unobserved space that a disc at a pose (3,) may sweep."""
+        # The space beside the robot was in front of it one diameter ago.
+        points = self._blind_sectors.points(2.0 * radius_m + length_m, 2.0 * radius_m)
         if not len(points):
             return points
-        # Right at its sides, a robot that begins to move has seen nothing, whatever its laser.
+        # Directly beside a robot that starts to move, no laser has observed anything yet.
         away = se2.transform_points(se2.invert(T_map_base), points)
         near = np.hypot(away[:, 0], away[:, 1]) < radius_m + MIN_OBSTACLE_WIDTH_M
         return np.asarray(points[~(near & (np.abs(away[:, 1]) > away[:, 0]))])
 
 
 @kernel
-def _room_along(path: Array, first: int, length_m: float, points: Array) -> float:
-    """How near points (N, 2) are to a path (K, 2) from its point `first` on for some length, m.
+def _clearance_along(path: Array, first: int, length_m: float, points: Array) -> float:
+    """Distance, m, of points (N, 2) from a path (K, 2), from its point `first` for length_m.
 
-    Without points: inf.
+    inf without points.
     """
     nearest = np.inf
     along = 0.0
@@ -109,7 +104,7 @@ def _room_along(path: Array, first: int, length_m: float, points: Array) -> floa
 
 @kernel
 def _arc(start: Array, curvature: float, length_m: float, count: int) -> Array:
-    """Points (count + 1, 2), evenly spaced, of an arc that begins at a pose (3,), m."""
+    """Evenly spaced points (count + 1, 2) of an arc that starts at a pose (3,), m."""
     points = np.empty((count + 1, 2))
     for k in range(count + 1):
         length = length_m * k / max(count, 1)
@@ -122,11 +117,9 @@ def _arc(start: Array, curvature: float, length_m: float, count: int) -> Array:
 
 @kernel
 def _clear_steps(centres: Array, points: Array, radius: float) -> int:
-    """Index of the last centre (K, 2) to which a disc can be moved, one after the other.
+    """Index of the last centre (K, 2) that a disc reaches without touching points (N, 2).
 
-    It touches none of the points (N, 2) on its way.
-
-    A point that is too near to the first centre already only forbids to come still nearer.
+    A point that is already too close to the first centre only forbids approaching it further.
     """
     clear: int = centres.shape[0]
     for i in range(points.shape[0]):
@@ -142,7 +135,7 @@ def _clear_steps(centres: Array, points: Array, radius: float) -> int:
 def _clear_steps_on_arc(
     start: Array, curvature: float, length_m: float, count: int, points: Array, radius: float
 ) -> int:
-    """How many of `count` steps along an arc a disc can be moved without touching points.
+    """Number of steps, of `count` along an arc, that a disc can move without touching points.
 
     See `_arc` and `_clear_steps`.
     """
@@ -151,14 +144,14 @@ def _clear_steps_on_arc(
 
 @kernel
 def _smoothed(ranges: Array, i: int) -> float:
-    """A range of a scan (NaN: none), m: the mean of the beams beside it that differ by noise only.
+    """Smoothed range, m: mean of the neighbouring beams that differ by noise only (NaN: none).
 
-    The nearest of many noisy points is nearer than the wall: without this, passages would seem
-    narrower than they are.
+    The nearest of many noisy points is closer than the wall: without smoothing, passages appear too
+    narrow.
     """
     total = 0.0
     count = 0
-    for k in range(max(i - _BESIDE, 0), min(i + _BESIDE + 1, ranges.size)):
+    for k in range(max(i - _NEIGHBOURS, 0), min(i + _NEIGHBOURS + 1, ranges.size)):
         if abs(ranges[k] - ranges[i]) < _SAME_M:
             total += ranges[k]
             count += 1
@@ -169,10 +162,9 @@ def _smoothed(ranges: Array, i: int) -> float:
 def _points_around(
     ranges: Array, first: float, step: float, laser: Array, earlier: Array, robot: Array
 ) -> Array:
-    """Where the beams of a scan ended (NaN: nowhere), and what counts of the points seen before.
+    """Hits of a scan (NaN: none), and the earlier points (N, 2) that remain valid.
 
-    Of those (N, 2), the ones near to the robot's pose (3,) that lie beside the scan's field of
-    view. All in the map frame, m.
+    Those are near the robot pose (3,) and outside the field of view. All in the map frame, m.
     """
     points = np.empty((ranges.size + earlier.shape[0], 2))
     count = 0

@@ -1,6 +1,4 @@
-"""Path -> speed and turn rate for a differential drive.
-
-It is pure pursuit, with turns on the spot where the path bends hard.
+"""Pure-pursuit path follower for a differential drive, with rotation in place at sharp bends.
 
 Source: Coulter, "Implementation of the pure pursuit path tracking algorithm", 1992.
 """
@@ -14,11 +12,11 @@ from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.se2 import Array, wrap
 
-# Where it is narrow: the shortest look ahead, how it grows with the room to spare, and a speed that
-# is always allowed.
-_SHORTEST_M = 0.1
+# In narrow passages: minimum lookahead, its growth with the clearance margin, and a speed that is
+# always allowed.
+_MIN_LOOKAHEAD_M = 0.1
 _SPARE_FACTOR = 2.0
-_SLOWEST_M_S = 0.1
+_MIN_SPEED_M_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -41,15 +39,12 @@ class PathFollowerConfig(Config):
         0.05, 'corners of the path are cut by no more than this, m', low=0.0, high=1.0
     )
     turn_in_place_rad: float = parameter(
-        0.9, 'heading error from which on the robot turns on the spot, rad', low=0.1, high=3.0
+        0.9, 'heading error above which the robot rotates in place, rad', low=0.1, high=3.0
     )
 
 
 class PathFollower:
-    """Follows one path after the other.
-
-    Remembers the last command, so that the acceleration limits hold.
-    """
+    """Follows paths; stores the last command, so that acceleration limits hold."""
 
     def __init__(self, config: PathFollowerConfig) -> None:
         self.config = config
@@ -60,67 +55,67 @@ class PathFollower:
     def command(
         self, T_map_base: Array, path: Array, dt_s: float, clearance_margin_m: float = math.inf
     ) -> tuple[float, float]:
-        """Speed (m/s) and turn rate (rad/s) for the next dt_s along a path (K, 2) to a stop.
+        """Speed (m/s) and turn rate (rad/s) for the next dt_s along a path (K, 2), to its end.
 
-        spare_m: room to either side of the path; where there is little, the robot keeps to it the
-        more closely.
+        clearance_margin_m: free space on either side of the path; where it is small, the robot
+        follows the path more closely.
         """
         config = self.config
-        narrow = _SHORTEST_M + _SPARE_FACTOR * max(clearance_margin_m, 0.0)
+        narrow = _MIN_LOOKAHEAD_M + _SPARE_FACTOR * max(clearance_margin_m, 0.0)
         reach = min(max(config.lookahead_m, config.lookahead_s * self.v), narrow)
         x, y, theta = T_map_base.tolist()
         ahead_x, ahead_y, rest_m = _point_ahead(path, x, y, reach, config.stray_m)
         dx = ahead_x - x
         dy = ahead_y - y
         error = wrap(math.atan2(dy, dx) - theta) if dx or dy else 0.0
-        # Once turning, on until the path is nearly straight ahead: no flickering at the limit.
+        # Hysteresis: once turning, the robot turns until the path is nearly straight ahead.
         least = 0.3 * config.turn_in_place_rad if self._turning else config.turn_in_place_rad
         self._turning = abs(error) > least
         if self._turning:
-            return self._limited(0.0, self._turn_for(error, dt_s), dt_s)
+            return self._limited(0.0, self._turn_rate(error, dt_s), dt_s)
         v = min(config.max_speed_m_s, math.sqrt(2.0 * config.max_acceleration_m_s2 * rest_m))
-        v = min(v, max(narrow / max(config.lookahead_s, 1e-9), _SLOWEST_M_S))
+        v = min(v, max(narrow / max(config.lookahead_s, 1e-9), _MIN_SPEED_M_S))
         curvature = 2.0 * math.sin(error) / max(math.hypot(dx, dy), 0.05)
         if abs(curvature) * v > config.max_turn_rad_s:
             v = config.max_turn_rad_s / abs(curvature)
         return self._limited(v, v * curvature, dt_s)
 
     def turn_to(self, T_map_base: Array, heading_rad: float, dt_s: float) -> tuple[float, float]:
-        """Speed and turn rate for the next dt_s to stop, then turn to a heading, map frame."""
+        """Speed and turn rate for the next dt_s: stop, then turn to a heading, map frame."""
         if self.v > 0.0:
             return self.stop(dt_s)
         error = wrap(heading_rad - float(T_map_base[2]))
-        return self._limited(0.0, self._turn_for(error, dt_s), dt_s)
+        return self._limited(0.0, self._turn_rate(error, dt_s), dt_s)
 
     def stop(self, dt_s: float) -> tuple[float, float]:
-        """Speed and turn rate for the next dt_s to come to rest on the arc that is being driven.
+        """Speed and turn rate for the next dt_s: brake on the present arc, within the limits.
 
-        It does so within the limits. That arc was looked at when it was entered, up to where the
-        robot would stand; any other may end in a wall.
+        This arc was checked for obstacles up to the stopping point when it was entered; any other
+        may end in a wall.
         """
         v = max(self.v - self.config.max_acceleration_m_s2 * dt_s, 0.0)
         return self._limited(v, self.w * v / self.v if self.v > 0.0 else 0.0, dt_s)
 
     def override_speed(self, v: float, w: float) -> tuple[float, float]:
-        """Note that a command was made slower than the limits allow, for something right ahead."""
+        """Override the command with a slower one, beyond the limits, in front of an obstacle."""
         self.v = v
         self.w = w
         return v, w
 
-    def _turn_for(self, error: float, dt_s: float) -> float:
-        """Turn rate that can still be braked to rest at the wished heading."""
+    def _turn_rate(self, error: float, dt_s: float) -> float:
+        """Highest turn rate from which the robot can stop at the desired heading."""
         braking = math.sqrt(2.0 * 0.7 * self.config.max_turn_acceleration_rad_s2 * abs(error))
         return math.copysign(min(braking, self.config.max_turn_rad_s, abs(error) / dt_s), error)
 
     def _limited(self, v: float, w: float, dt_s: float) -> tuple[float, float]:
         config = self.config
         w = min(max(w, -config.max_turn_rad_s), config.max_turn_rad_s)
-        self.v = max(_towards(self.v, v, config.max_acceleration_m_s2 * dt_s), 0.0)
-        self.w = _towards(self.w, w, config.max_turn_acceleration_rad_s2 * dt_s)
+        self.v = max(_limited_change(self.v, v, config.max_acceleration_m_s2 * dt_s), 0.0)
+        self.w = _limited_change(self.w, w, config.max_turn_acceleration_rad_s2 * dt_s)
         return self.v, self.w
 
 
-def _towards(value: float, goal: float, change: float) -> float:
+def _limited_change(value: float, goal: float, change: float) -> float:
     return min(max(goal, value - change), value + change)
 
 
@@ -150,10 +145,10 @@ def length_from(path: Array, first: int) -> float:
 def _point_ahead(
     path: Array, x: float, y: float, reach_m: float, stray_m: float
 ) -> tuple[float, float, float]:
-    """Point of a path (K, 2) to steer for from (x, y), and the length left from the nearest one, m.
+    """Target point on a path (K, 2) from (x, y), and the remaining length of the path, m.
 
-    It lies up to reach_m on along the path, and less far where the straight way to it would leave
-    the path by more than stray_m: corners are not cut.
+    It lies up to reach_m ahead on the path, or less if the straight line to it would leave the path
+    by more than stray_m: corners are not cut.
     """
     first = nearest_point(path, x, y)
     end = path.shape[0] - 1
@@ -164,13 +159,13 @@ def _point_ahead(
         last += 1
         along += math.hypot(path[last, 0] - path[last - 1, 0], path[last, 1] - path[last - 1, 1])
     allowed = stray_m + math.hypot(path[first, 0] - x, path[first, 1] - y)
-    while last > first + 1 and _stray(path, first, last, x, y) > allowed:
+    while last > first + 1 and _max_deviation(path, first, last, x, y) > allowed:
         last -= 1
     return path[last, 0], path[last, 1], left_m
 
 
 @kernel
-def _stray(path: Array, first: int, last: int, x: float, y: float) -> float:
+def _max_deviation(path: Array, first: int, last: int, x: float, y: float) -> float:
     """Largest distance, m, of path points first to last from the line from (x, y) to the last."""
     dx = path[last, 0] - x
     dy = path[last, 1] - y

@@ -1,6 +1,6 @@
-"""Where the robot has been of late.
+"""Recent path of the robot.
 
-It can go back there, even where a speck in the map makes a passage too narrow.
+The robot can return along it, even if noise in the map makes a passage appear too narrow.
 """
 
 import math
@@ -15,22 +15,19 @@ from thinmap_ros.core.se2 import Array
 
 _STEP_M = 0.03
 _JUMP_M = 0.5
-_LONGEST = 1300  # points
+_MAX_POINTS = 1300  # points
 
 
 class RecentPath:
-    """The last of the robot's way.
-
-    A pose that jumps, as where the map was corrected, begins it anew.
-    """
+    """The last metres of the robot's path; reset when the pose jumps, as after a correction."""
 
     def __init__(self) -> None:
-        # Twice the room: moved to the front only when it is full.
-        self._points = np.empty((2 * _LONGEST, 2))
+        # Twice the capacity: points are moved to the front only when the array is full.
+        self._points = np.empty((2 * _MAX_POINTS, 2))
         self._begin = self._end = 0
 
-    def add(self, T_map_base: Array) -> None:
-        """Hear where the robot is, (3,); what is not finite is passed over."""
+    def add_pose(self, T_map_base: Array) -> None:
+        """Add a pose of the robot, (3,); poses that are not finite are ignored."""
         if not se2.is_finite(T_map_base):
             return
         here = float(T_map_base[0]), float(T_map_base[1])
@@ -41,28 +38,30 @@ class RecentPath:
             self._append(here)
 
     def cells(self, frame: GridFrame, shape: tuple[int, ...]) -> NDArray[np.int64]:
-        """Cells (N, 2) of a map (H, W) over which it led, each joined to the next by an edge."""
+        """Cells (N, 2) of a map (H, W) on the path; consecutive cells share an edge."""
         if self._end == self._begin:
             return np.empty((0, 2), dtype=np.int64)
         return np.asarray(
-            _joined(frame.cells_of(self._points[self._begin : self._end]), shape[0], shape[1])
+            _connected_cells(
+                frame.cells_of(self._points[self._begin : self._end]), shape[0], shape[1]
+            )
         )
 
     def _append(self, here: tuple[float, float]) -> None:
         if self._end == len(self._points):
-            self._points[: _LONGEST - 1] = self._points[self._end - _LONGEST + 1 :]
+            self._points[: _MAX_POINTS - 1] = self._points[self._end - _MAX_POINTS + 1 :]
             self._begin = 0
-            self._end = _LONGEST - 1
+            self._end = _MAX_POINTS - 1
         self._points[self._end] = here
         self._end += 1
-        self._begin = max(self._begin, self._end - _LONGEST)
+        self._begin = max(self._begin, self._end - _MAX_POINTS)
 
 
 @kernel
-def _joined(cells: NDArray[np.int64], rows: int, cols: int) -> NDArray[np.int64]:
-    """Cells (N, 2) and those between them, first along the column, then along the row.
+def _connected_cells(cells: NDArray[np.int64], rows: int, cols: int) -> NDArray[np.int64]:
+    """Cells (N, 2) and the cells between them, first along the column, then along the row.
 
-    Those outside the map are left out.
+    Cells outside the map are omitted.
     """
     count = cells.shape[0]
     for k in range(1, cells.shape[0]):

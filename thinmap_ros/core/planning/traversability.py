@@ -1,4 +1,4 @@
-"""Where a robot can stand, and to which of these places it can get."""
+"""Traversable and reachable cells."""
 
 import math
 from typing import Any
@@ -19,7 +19,7 @@ Part = tuple[int, int, int, int]
 def traversable_cells(free: Mask, radius_m: float, resolution: float) -> Mask:
     """Cells (H, W) in which the centre of a robot of a radius may be.
 
-    All that is not free counts as solid.
+    All cells that are not free count as obstacles.
     """
     return standing_room(column_distance(free), radius_m / resolution)
 
@@ -27,16 +27,13 @@ def traversable_cells(free: Mask, radius_m: float, resolution: float) -> Mask:
 def update_traversable_cells(
     standing: Mask, free: Mask, part: Part, radius_m: float, resolution: float
 ) -> None:
-    """Bring standing places (H, W) up to date where free cells have changed within a part.
-
-    See `standing_places`.
-    """
+    """Update traversable cells (H, W), in place, where free cells have changed within a part."""
     reach = math.ceil(radius_m / resolution) + 1
     top = max(part[0] - reach, 0)
     left = max(part[1] - reach, 0)
     bottom = part[2] + reach
     right = part[3] + reach
-    # As many cells again are read, so that the cut is no wall.
+    # A margin is read as well, so that the edge of the part does not act as a wall.
     wide = free[max(top - reach, 0) : bottom + reach, max(left - reach, 0) : right + reach]
     found = traversable_cells(np.ascontiguousarray(wide), radius_m, resolution)
     row = top - max(top - reach, 0)
@@ -50,37 +47,36 @@ def escape_cells(
     free: Mask,
     frame: GridFrame,
     xy: tuple[float, float],
-    escape_m: float,
+    escape_distance_m: float,
     trail: Cells | None = None,
 ) -> Mask:
-    """Cells (H, W) over which a robot that is at a point (m) may go.
+    """Traversable cells (H, W) for a robot at a point (m), including an escape from a collision.
 
-    These are its standing places, but where it stands too near to something it is let out over free
-    cells up to escape_m away, as a path would. trail: cells (N, 2) over which it came; over those
-    that are free it can go back.
+    A robot closer to obstacles than its radius may cross free cells up to escape_distance_m away.
+    trail: cells (N, 2) of its recent path; it may return over those that are free.
     """
-    ways = standing.copy()
+    allowed = standing.copy()
     if trail is not None:
-        ways[trail[:, 0], trail[:, 1]] |= free[trail[:, 0], trail[:, 1]]
+        allowed[trail[:, 0], trail[:, 1]] |= free[trail[:, 0], trail[:, 1]]
     row, col = (int(v) for v in frame.cells_of(np.array([xy]))[0])
     if not (0 <= row < free.shape[0] and 0 <= col < free.shape[1]) or standing[row, col]:
-        return ways
-    part, within = disc(ways, (row, col), escape_m / frame.resolution)
-    ways[part] |= within & free[part]
-    ways[row, col] = True
-    return ways
+        return allowed
+    part, within = disc(allowed, (row, col), escape_distance_m / frame.resolution)
+    allowed[part] |= within & free[part]
+    allowed[row, col] = True
+    return allowed
 
 
 def reachable_cells(allowed: Mask, start: tuple[int, int]) -> Mask:
-    """Allowed cells (H, W) to which the wave can get from a start (row, col).
+    """Allowed cells (H, W) that are reachable from a start (row, col), with 4-connectivity.
 
-    It goes over edges of cells, not corners. None from a start beyond the mask.
+    No cells if the start is outside the mask.
     """
-    return np.asarray(_reached_from(allowed, start[0], start[1]))
+    return np.asarray(_reachable_cells(allowed, start[0], start[1]))
 
 
 def nearest_true(allowed: Mask, cell: tuple[int, int], reach: float) -> tuple[int, int] | None:
-    """The true cell nearest to one that lies anywhere, if there is one within `reach` cells."""
+    """The true cell nearest to a cell, or None if there is none within `reach` cells."""
     whole = math.floor(reach)
     top = max(cell[0] - whole, 0)
     left = max(cell[1] - whole, 0)
@@ -110,7 +106,7 @@ def near_true_cell(allowed: Mask, cells: NDArray[np.int64], reach: float) -> Mas
 def disc(
     of: NDArray[Any], centre: tuple[int, int], reach: float
 ) -> tuple[tuple[slice, slice], Mask]:
-    """The part of an array (H, W) round a cell, and which of its cells lie within reach."""
+    """The part of an array (H, W) around a cell, and the mask of its cells within reach."""
     whole = math.ceil(reach)
     rows = slice(max(centre[0] - whole, 0), min(centre[0] + whole + 1, of.shape[0]))
     cols = slice(max(centre[1] - whole, 0), min(centre[1] + whole + 1, of.shape[1]))
@@ -119,10 +115,10 @@ def disc(
 
 
 @kernel
-def _reached_from(allowed: Mask, start_row: int, start_col: int) -> Mask:
+def _reachable_cells(allowed: Mask, start_row: int, start_col: int) -> Mask:
     rows = allowed.shape[0]
     cols = allowed.shape[1] + 2
-    # An empty border saves the wave all questions about the rim.
+    # A blocked margin of one cell makes bounds checks unnecessary.
     left = np.zeros((rows + 2, cols), dtype=np.bool_)
     left[1:-1, 1:-1] = allowed
     found = np.zeros((rows + 2, cols), dtype=np.bool_)

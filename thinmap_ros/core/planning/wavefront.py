@@ -1,9 +1,9 @@
-"""The gradient method: the cheapest way from every cell to the goal, and the path down its slope.
+"""Wavefront planner (gradient method): navigation function and gradient descent.
 
 F(P) = sum I(p_i) + sum A(p_i, p_i+1): the intrinsic cost I falls from `keep_weight` at the closest
 allowed distance to an obstacle to zero at `keep_m`, the adjacency cost A is the distance moved. The
-wave is carried on from cell to cell by solving |grad F| = 1 + I, so that ways in all directions are
-measured alike, not only along rows, columns and diagonals.
+wave propagates from cell to cell by solving |grad F| = 1 + I, so that the cost of a path does not
+depend on its direction.
 Source: topological map paper section 3.2; Konolige, "A gradient method for realtime robot control",
 2000; Sethian, "A fast marching level set method for monotonically advancing fronts", 1996.
 """
@@ -33,7 +33,7 @@ _HAIR_M = 1e-6
 
 @dataclass(frozen=True)
 class WavefrontConfig(Config):
-    """What a path may cross and what it should rather avoid."""
+    """Parameters of the costs of cells."""
 
     robot_radius_m: float = robot_radius()
     keep_m: float = parameter(
@@ -52,7 +52,10 @@ class WavefrontConfig(Config):
         0.3, 'a goal too near to an obstacle may move this far, m', low=0.0, high=5.0
     )
     escape_m: float = parameter(
-        0.6, 'a start too near to an obstacle is let out this far, m', low=0.0, high=5.0
+        0.6,
+        'distance within which a start in collision may cross inflated cells, m',
+        low=0.0,
+        high=5.0,
     )
 
 
@@ -65,13 +68,12 @@ def plan(
     body_radius_m: float = 0.0,
     trail: NDArray[np.int64] | None = None,
 ) -> Array | None:
-    """Path (K, 2) from start to goal, m, map frame, points about half a cell apart; None: no way.
+    """Path (K, 2) from start to goal, m, map frame, points half a cell apart; None: no path.
 
-    The path ends at the goal, or at the allowed cell nearest to it within goal_slack_m. It keeps a
-    body's radius away from points (N, 2) that the map need not know. They are taken as exact: in
-    cells, a wall whose points fall into the cell before it, as noise has it, would be a cell
-    thicker, and many a passage too narrow. trail: cells (N, 2) over which the robot came; unless
-    something stands there now, it may go back over them, however narrow it looks.
+    The path ends at the goal, or at the nearest allowed cell within goal_slack_m. It stays
+    body_radius_m away from obstacle points (N, 2), which the map need not contain. Points are not
+    rounded to cells: noise would make walls one cell thicker, and passages too narrow. trail: cells
+    (N, 2) of the recent path; the robot may return over them unless they are occupied now.
     """
     cells = patch.frame.cells_of(np.array([start_xy, goal_xy]))
     if not patch.contains(np.array([start_xy, goal_xy])).all():
@@ -83,12 +85,18 @@ def plan(
         at = patch.frame.cells_of(points)
         occupied[at[:, 0], at[:, 1]] = True
         cell_m = patch.frame.resolution
-        keep = config.keep_m / cell_m
-        _keep_away(cost, _in_cells(patch, points), body_radius_m / cell_m, keep, config.keep_weight)
+        inflation_radius = config.keep_m / cell_m
+        _inflate_points(
+            cost,
+            _in_cells(patch, points),
+            body_radius_m / cell_m,
+            inflation_radius,
+            config.keep_weight,
+        )
     start = (int(cells[0, 0]), int(cells[0, 1]))
     wished = (int(cells[1, 0]), int(cells[1, 1]))
     if not math.isfinite(cost[start]):
-        _let_out(cost, occupied, start, config.escape_m / patch.frame.resolution)
+        _open_escape_cells(cost, occupied, start, config.escape_m / patch.frame.resolution)
     if trail is not None:
         back = trail[~occupied[trail[:, 0], trail[:, 1]]]
         cost[back[:, 0], back[:, 1]] = np.minimum(cost[back[:, 0], back[:, 1]], _ESCAPE_COST)
@@ -108,10 +116,7 @@ def plan(
 
 
 def cost_of_cells(patch: GridPatch, config: WavefrontConfig) -> Array:
-    """Cost of moving one unit of distance in each cell (H, W): 1 + I.
-
-    Inf where the robot's centre may not be.
-    """
+    """Cost per unit of distance in each cell (H, W): 1 + I; inf if the robot would collide."""
     resolution = patch.frame.resolution
     free = known_free(patch, _TOPOLOGY)
     passable = free if config.unknown == 'forbidden' else ~patch.occupied
@@ -130,21 +135,21 @@ def cost_of_cells(patch: GridPatch, config: WavefrontConfig) -> Array:
 def navigation_function(
     cost: Array, goal: tuple[int, int], start: tuple[int, int] | None = None
 ) -> Array:
-    """Cheapest cost F, in cells, from each cell (H, W) to the goal (row, col); inf: no way.
+    """Minimum cost F, in cells, from each cell (H, W) to the goal (row, col); inf: no path.
 
-    With a start (row, col), the wave stops a little after it has got there, and cells farther off
-    stay inf.
+    With a start (row, col), the wave stops shortly after it has reached the start, and more distant
+    cells remain inf.
     """
     row, col = (-1, -1) if start is None else start
     return np.asarray(_march(cost, goal[0], goal[1], row, col))
 
 
 def trace_gradient_path(field: Array, x: float, y: float, goal_row: int, goal_col: int) -> Array:
-    """Path (K, 2) down the slope of a navigation function (H, W), in cells (x, y).
+    """Path (K, 2) by gradient descent on a navigation function (H, W), in cells (x, y).
 
-    It leads from a point to a cell's centre.
+    It leads from a point to the centre of the goal cell.
     """
-    return np.asarray(_descend(field, x, y, goal_row, goal_col))
+    return np.asarray(_trace_gradient_path(field, x, y, goal_row, goal_col))
 
 
 def _in_cells(patch: GridPatch, points: Array) -> Array:
@@ -152,11 +157,10 @@ def _in_cells(patch: GridPatch, points: Array) -> Array:
     return np.asarray((points - (frame.origin_x, frame.origin_y)) / frame.resolution)
 
 
-def _let_out(cost: Array, occupied: Mask, start: tuple[int, int], reach: float) -> None:
-    """Open the forbidden cells around a start, at a high cost.
+def _open_escape_cells(cost: Array, occupied: Mask, start: tuple[int, int], reach: float) -> None:
+    """Allow the inflated cells around a start, at a high cost, so that the robot can escape.
 
-    A robot that stands there has to get away somehow. Cells that are occupied stay closed, but for
-    the robot's own cell: where the robot is, nothing else can be.
+    Occupied cells stay forbidden, except the cell of the robot itself.
     """
     where, within = disc(cost, start, reach)
     part = cost[where]
@@ -165,13 +169,15 @@ def _let_out(cost: Array, occupied: Mask, start: tuple[int, int], reach: float) 
 
 
 @kernel
-def _keep_away(cost: Array, points: Array, radius: float, keep: float, weight: float) -> None:
-    """Raise the cost of cells (H, W) by how near their centres are to points (N, 2), in cells.
+def _inflate_points(
+    cost: Array, points: Array, radius: float, inflation_radius: float, weight: float
+) -> None:
+    """Inflate points (N, 2), in cells: raise the cost of the cells (H, W) near them.
 
-    As by the map, cells nearer than a radius are closed; from `keep` on a point costs nothing.
+    Cells within `radius` are forbidden; the cost falls to zero at `inflation_radius`.
     """
-    reach = int(math.ceil(max(radius, keep))) + 1
-    spread = max(keep - radius, 1e-6)
+    reach = int(math.ceil(max(radius, inflation_radius))) + 1
+    spread = max(inflation_radius - radius, 1e-6)
     for i in range(points.shape[0]):
         x = points[i, 0] - 0.5
         y = points[i, 1] - 0.5
@@ -180,21 +186,21 @@ def _keep_away(cost: Array, points: Array, radius: float, keep: float, weight: f
         for r in range(max(row - reach, 0), min(row + reach + 1, cost.shape[0])):
             for c in range(max(col - reach, 0), min(col + reach + 1, cost.shape[1])):
                 away = math.hypot(r - y, c - x)
-                nearness = max(keep - away, 0.0) / spread
+                nearness = max(inflation_radius - away, 0.0) / spread
                 near_cost = 1.0 + weight * nearness * nearness
                 cost[r, c] = np.inf if away < radius else max(cost[r, c], near_cost)
 
 
 @kernel
 def _look_up(distance: NDArray[np.int16], reach: int, table: Array) -> Array:
-    """table[squared distance in cells to the nearest solid cell] for each cell (H, W).
+    """table[squared distance in cells to the nearest obstacle cell] for each cell (H, W).
 
-    Outside all is solid. distance: from `column_distance`. What is farther than `reach` cells in a
-    row or column counts as reach + 1 there.
+    Cells outside the array are obstacles. distance: from `column_distance`. Distances beyond
+    `reach` cells along a row or column count as reach + 1.
     """
     rows, cols = distance.shape
     result = np.empty((rows, cols))
-    # Columns of solid on both sides, in a row of the processor's smallest numbers.
+    # Obstacle columns on both sides; int16, so that the loops vectorize.
     line = np.zeros(cols + 2 * reach, dtype=np.int16)
     most = np.int16(reach + 1)
     squared = np.empty(cols, dtype=np.int16)
@@ -205,7 +211,7 @@ def _look_up(distance: NDArray[np.int16], reach: int, table: Array) -> Array:
         squared[:] = line[reach : reach + cols]
         for k in range(1, reach + 1):
             step = np.int16(k * k)
-            # Slices whose indices all count from 0: the compiler makes sixteen comparisons one.
+            # Slices that are indexed from 0: the compiler vectorizes the comparisons.
             left = line[reach - k : reach - k + cols]
             right = line[reach + k : reach + k + cols]
             for col in range(cols):
@@ -232,7 +238,7 @@ def _push(keys: Array, cells: NDArray[np.int64], count: int, key: float, cell: i
 
 @kernel
 def _drop_first(keys: Array, cells: NDArray[np.int64], count: int) -> None:
-    """Take the smallest key out of a binary heap of `count` entries."""
+    """Remove the smallest key from a binary heap of `count` entries."""
     key = keys[count - 1]
     cell = cells[count - 1]
     place = 0
@@ -272,7 +278,7 @@ def _march(cost: Array, goal_row: int, goal_col: int, start_row: int, start_col:
             continue
         done[row, col] = True
         if row == start_row and col == start_col:
-            # A few cells more, so that the slope at the start is that of the finished field.
+            # Some cells more, so that the gradient at the start is that of the complete field.
             stop = field[row, col] + 3.0 * cost[row, col]
         for side in range(4):
             r = row + (side == 0) - (side == 1)
@@ -304,7 +310,7 @@ def _march(cost: Array, goal_row: int, goal_col: int, start_row: int, start_col:
 
 @kernel
 def _slope(field: Array, row: int, col: int, out: Array) -> bool:
-    """Downhill direction (x, y) in a cell from its lower neighbours; False where there is none."""
+    """Downhill direction (x, y) in a cell from its lower neighbours; False if there is none."""
     rows, cols = field.shape
     here = field[row, col]
     out[0] = 0.0
@@ -329,7 +335,7 @@ def _slope(field: Array, row: int, col: int, out: Array) -> bool:
 
 @kernel
 def _lowest_around(field: Array, row: int, col: int) -> tuple[int, int]:
-    """The lowest of the eight neighbours; over a corner only where both cells beside are open."""
+    """The lowest of the eight neighbours; diagonal only if both adjacent cells are allowed."""
     rows, cols = field.shape
     best_row = row
     best_col = col
@@ -346,12 +352,12 @@ def _lowest_around(field: Array, row: int, col: int) -> tuple[int, int]:
 
 
 @kernel
-def _descend(field: Array, x: float, y: float, goal_row: int, goal_col: int) -> Array:
-    """Half a cell at a time along the slope, blended over the four nearest cells.
+def _trace_gradient_path(field: Array, x: float, y: float, goal_row: int, goal_col: int) -> Array:
+    """Gradient descent in steps of half a cell, with bilinear interpolation of the gradient.
 
-    Every cell entered lies lower than the one left; where the slope would not lead to one (beside
-    walls, and wherever it has led nowhere for some steps), the path goes to the centre of the
-    lowest neighbour.
+    Each new cell is lower than the previous one. Where the gradient does not lead to a lower cell
+    (beside walls, or after several steps in one cell), the path goes to the centre of the lowest
+    neighbour.
     """
     rows, cols = field.shape
     path = np.empty((8 * field.size + 8, 2))

@@ -77,7 +77,7 @@ class PoseUncertainty:
 
     def is_stationary(self, T_map_base: Array, slip: Array) -> bool:
         """Whether a pose (3,) is where the robot last moved, but for the slip (3,)."""
-        return bool((np.abs(se2.off(T_map_base, self._T_moved)) <= slip).all())
+        return bool((np.abs(se2.pose_difference(T_map_base, self._T_moved)) <= slip).all())
 
     def coast(self, T_map_base: Array, Q: Array, is_stationary: bool) -> None:
         """No scan has told the pose: it is where the motion has led."""
@@ -88,7 +88,7 @@ class PoseUncertainty:
 
     def update(self, match: Match, prior: Array, Q: Array, fits: bool, is_stationary: bool) -> None:
         """A match has told the pose, against a prior (3,); fits: whether it is to be believed."""
-        self._contradiction.add(se2.off(match.T_map_base, prior), self.since_match)
+        self._contradiction.add(se2.pose_difference(match.T_map_base, prior), self.since_match)
         self.since_match = np.zeros((3, 3)) if fits else match.covariance
         if is_stationary:
             return
@@ -99,7 +99,7 @@ class PoseUncertainty:
 
     def is_unexpected(self, match: Match, prior: Array) -> bool:
         """Whether a match contradicts the motion that led to a prior (3,)."""
-        off = se2.off(match.T_map_base, prior)
+        off = se2.pose_difference(match.T_map_base, prior)
         return float(off @ np.linalg.solve(self.since_match, off)) > CHI2
 
     def learn(self, share: float) -> None:

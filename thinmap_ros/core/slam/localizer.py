@@ -142,7 +142,7 @@ class Localizer:
 
         It is lost until scans fit there. Raises InputError where it is no such state.
         """
-        checked = snapshot.check(state, local_map.FIELDS, 'local map')
+        checked = snapshot.validate(state, local_map.FIELDS, 'local map')
         possible = bool((checked['hits'] <= checked['seen']).all())
         snapshot.require(
             possible, 'local map: hits: more than seen', 'no more hits than observations'
@@ -324,10 +324,10 @@ class Localizer:
         """A loop was closed: pose and local map go where the keyframes have gone."""
         anchor = self._loops.keyframes.anchor
         self._prediction.reset_segment()
-        self._pose = correction.moved(anchor, self._pose)
+        self._pose = correction.applied_to(anchor, self._pose)
         self._map.T_at_update = self._pose
         self._uncertainty.move(self._pose)
-        self._tracking.join(correction.moved(anchor, self._tracking.dead_reckoned.T_map_base))
+        self._tracking.join(correction.applied_to(anchor, self._tracking.dead_reckoned.T_map_base))
         self._map.rerender(self.keyframes, self._pose)
 
     def _record_pose(self, scan: Scan) -> None:
@@ -353,6 +353,6 @@ class Localizer:
             covariance,
             se2.compose(self._pose, se2.invert(self._prediction.T_odom_base)),
             inlier_ratio=0.0 if match is None else match.inlier_ratio,
-            lost=self._tracking.is_lost,
+            is_lost=self._tracking.is_lost,
             correction=correction,
         )

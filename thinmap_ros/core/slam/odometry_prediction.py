@@ -54,7 +54,7 @@ class OdometryPrediction:
     @property
     def refused(self) -> int:
         """Odometry poses that made no sense."""
-        return self._increments.refused
+        return self._increments.rejected
 
     @property
     def stamp_ns(self) -> int | None:
@@ -77,7 +77,7 @@ class OdometryPrediction:
 
     def contradict(self, prediction: Prediction, match: Match, accepted: bool) -> None:
         """A match was unexpected: the next motion may take the contradiction back."""
-        off = se2.off(match.T_map_base, prediction.T_map_base)
+        off = se2.pose_difference(match.T_map_base, prediction.T_map_base)
         mean = -0.5 * off if accepted else np.zeros(3)
         self._reversal = Reversal(mean, 0.25 * np.outer(off, off))
 
@@ -98,7 +98,7 @@ class OdometryPrediction:
 
     def _motion(self, scan: Scan, T_odom_base: Array) -> MotionPrediction:
         """The motion since the last scan, robot frame."""
-        increment = self._increments.next(scan.stamp_ns, T_odom_base)
+        increment = self._increments.add(scan.stamp_ns, T_odom_base)
         variances = odometry_variances(increment.T_before_base, self._config)[[0, 2]]
         moved, systematic = self._calibration.corrected(increment.T_before_base, variances)
         motion = self._model.predict(moved, systematic)

@@ -117,7 +117,9 @@ class TopologyBuilder:
         )
         dissolve_all(shown, np.ones(len(shown.spots), dtype=np.bool_))
         return map_of(
-            web_of_net(shown), around.lattice.shifted(around.near.row, around.near.col), self.config
+            web_of_net(shown),
+            around.lattice.with_origin_at(around.near.row, around.near.col),
+            self.config,
         )
 
     def rebuild(
@@ -169,7 +171,7 @@ class TopologyBuilder:
         builder = TopologyBuilder(config)
         if not state:
             return builder
-        checked = snapshot.check(state, FIELDS, 'topology')
+        checked = snapshot.validate(state, FIELDS, 'topology')
         builder._surroundings = Surroundings.from_state(checked, builder.config)
         builder._atlas = Atlas.from_state(checked)
         builder._taken = int(checked['taken'])

@@ -102,7 +102,7 @@ class TopologicalMap:
             raise InputError(f'node id {node.id}: expected a positive number that no edge has')
         self.nodes[node.id] = node
         self._edges_at.setdefault(node.id, {})
-        self._places.put(node.id, node.x, node.y)
+        self._places.insert(node.id, node.x, node.y)
 
     def put_edge(self, edge: Edge) -> None:
         """Add an edge, or replace the one with its id.
@@ -133,7 +133,7 @@ class TopologicalMap:
         for edge_id in list(self._edges_at[node_id]):
             self.drop_edge(edge_id)
         del self.nodes[node_id], self._edges_at[node_id]
-        self._places.drop(node_id)
+        self._places.remove(node_id)
 
     def edges_at(self, node_id: int) -> list[Edge]:
         """Edges that begin or end at a node; a loop counts once."""
@@ -165,7 +165,7 @@ class TopologicalMap:
 
         Some that are farther off may be among them.
         """
-        return [self.nodes[i] for i in self._places.near(x, y, reach_m)]
+        return [self.nodes[i] for i in self._places.query_radius(x, y, reach_m)]
 
     def nearest_edge_point(self, x: float, y: float) -> tuple[int, int, float] | None:
         """Edge id, index into its path, and distance in m, of the path point nearest to a point.

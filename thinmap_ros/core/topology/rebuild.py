@@ -53,12 +53,12 @@ class Rebuilding:
     def add_pose(self, stamp_ns: int, T_map_base: Array) -> None:
         """Add the pose (3,) of a scan."""
         if self._past is not None:
-            self._past.add(stamp_ns, T_map_base, None)
+            self._past.add_pose(stamp_ns, T_map_base, None)
 
     def correct(self, corrected_ns: int, stamps_ns: NDArray[np.int64], poses: Array) -> None:
         """Follow a correction: the scans of these stamps (M,) were made at poses (M, 3)."""
         if self._past is not None:
-            self._past.correct(stamps_ns, poses, since_ns=corrected_ns)
+            self._past.apply_correction(stamps_ns, poses, since_ns=corrected_ns)
         self._awaited = (corrected_ns, poses)
         self._waited = 0
         self._stale_ns = self._window_ns if self._window_ns != corrected_ns else None

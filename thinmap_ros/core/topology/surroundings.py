@@ -159,7 +159,7 @@ class Surroundings:
         cells = self._cells.copy()
         painted = _paint(cells, (skeleton - (self.box.row, self.box.col))[::2], squared[::2])
         cells[cells == _NEVER] = UNKNOWN
-        return GridPatch(self.lattice.shifted(self.box.row, self.box.col), cells), painted
+        return GridPatch(self.lattice.with_origin_at(self.box.row, self.box.col), cells), painted
 
     def _place_of(self, frame: GridFrame) -> tuple[int, int]:
         if frame.resolution != self.lattice.resolution:

@@ -20,7 +20,7 @@ from thinmap_ros.view.plots import (
     Panel,
     Plot,
     RobotMarkers,
-    Words,
+    TextLabels,
     xy,
 )
 
@@ -55,7 +55,11 @@ def run(source: Source) -> Outcome:
         moved = np.hypot(*(line[:, 1:3] - line[0, 1:3]).T)
         curves.append(Curve(xy(line[:, 3], moved), name.replace('_', ' '), k, ('-', '--')[k]))
     panel = Panel(
-        curves, '', 'way of the robot (m)', 'node A from where it was first (m)', plan=False
+        curves,
+        '',
+        'travelled distance (m)',
+        'distance of node A from its first position (m)',
+        plan=False,
     )
     caption = 'Paper 2, to Fig. 5 and 6: how far node A has moved.'
     plots.append(Plot('movement', caption, [panel], panel_inches=(6.5, 3.6), legend='inside'))
@@ -90,19 +94,19 @@ Moment = tuple[float, Array, GridPatch, TopologicalMap, Array]
 
 
 def _follow(source: Source, name: str) -> tuple[list[Moment], list[list[float]]]:
-    """State once a second (time, pose, map, graph, node A), and A at each scan: time, x, y, way."""
+    """State once a second (time, pose, map, graph, node A); A by scan: time, x, y, path."""
     builder = TopologyBuilder(TopologyConfig())
     grid = OccupancyGrid()
     moments: list[Moment] = []
     track: list[list[float]] = []
     at = _AHEAD
-    way = 0.0
+    travelled_m = 0.0
     last = None
-    for k, look in enumerate(source.looks(name)):
-        T = look.T_world_base
-        way += 0.0 if last is None else math.dist(T[:2], last[:2])
+    for k, sample in enumerate(source.samples(name)):
+        T = sample.T_world_base
+        travelled_m += 0.0 if last is None else math.dist(T[:2], last[:2])
         last = T
-        grid.update(look.scan, T)
+        grid.add_scan(sample.scan, T)
         builder.update(grid.window(float(T[0]), float(T[1]), _WINDOW_M), T)
         places = np.array(
             [n.position for n in builder.map.nodes.values() if n.kind == NodeKind.END]
@@ -110,10 +114,10 @@ def _follow(source: Source, name: str) -> tuple[list[Moment], list[list[float]]]
         away = np.hypot(*(places - at).T)
         if away.min(initial=np.inf) <= _JUMP_M:
             at = places[int(away.argmin())]
-            seconds = look.scan.stamp_ns / 1e9
-            track.append([seconds, float(at[0]), float(at[1]), way])
+            seconds = sample.scan.stamp_ns / 1e9
+            track.append([seconds, float(at[0]), float(at[1]), travelled_m])
             if k % 5 == 0:
-                moments.append((seconds, T, grid.patch(), builder.map.copy(), at))
+                moments.append((seconds, T, grid.known_area(), builder.map.copy(), at))
     return moments, track
 
 
@@ -131,7 +135,7 @@ def _panel(moment: Moment, limits: tuple[float, float, float, float]) -> Panel:
         MapLayer(patch),
         GraphLayer(graph),
         RobotMarkers(T[None]),
-        Words(at[None], ['A'], 11.0),
+        TextLabels(at[None], ['A'], 11.0),
     ]
     return Panel(layers, f'after {seconds:.0f} s', limits=limits)
 
@@ -141,7 +145,7 @@ def _moved(track: Array) -> float:
 
 
 def _rest(track: Array) -> float:
-    """Way of the robot at which node A had come, to stay, to where it is in the end, m."""
+    """Travelled distance at which node A reached its final position, m."""
     off = np.hypot(*(track[:, 1:3] - track[-1, 1:3]).T) > _RESTS_M
     moving = np.flatnonzero(off)
     return float(track[moving[-1], 3]) if moving.size else 0.0

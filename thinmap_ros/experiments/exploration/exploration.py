@@ -15,7 +15,7 @@ from thinmap_ros.evaluation.exploration_metrics import EndNodeCensus
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Rows, Table
 from thinmap_ros.experiments.drives import Source, world_of
 from thinmap_ros.pipeline import Pipeline, PipelineConfig
-from thinmap_ros.sim.coverage import coverable
+from thinmap_ros.sim.coverage import observable_cells
 from thinmap_ros.sim.drives import DriveSample
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
@@ -27,7 +27,7 @@ from thinmap_ros.view.plots import (
     Panel,
     Plot,
     RobotMarkers,
-    Words,
+    TextLabels,
 )
 
 _MOMENTS = (0.05, 0.2, 0.4, 0.6, 0.8, 1.0)
@@ -38,7 +38,7 @@ _FULL = 0.99
 
 @dataclass(frozen=True, eq=False)
 class _Moment:
-    """What was known at a scan."""
+    """State of map and graph at a scan."""
 
     seconds: float
     T_map_base: Array
@@ -48,10 +48,12 @@ class _Moment:
 
 
 def run(source: Source) -> Outcome:
-    """Decide anew what was decided on the drive, from the same scans; look at what was known."""
+    """Replay the decisions of the drive from the same scans, and show the map at six moments."""
     world = world_of('room_10x10')
-    moments, census = _replay_exploration(list(source.looks('room_10x10')))
-    goal = coverable(world, world.start, PRESETS['2dx'].radius_m, LaserScannerConfig().range_max_m)
+    moments, census = _replay_exploration(list(source.samples('room_10x10')))
+    goal = observable_cells(
+        world, world.start, PRESETS['2dx'].radius_m, LaserScannerConfig().range_max_m
+    )
     coverage = [(m.seconds, goal.coverage(m.patch)) for m in moments]
     last = moments[-1]
     poses = np.array([moment.T_map_base for moment in moments])
@@ -113,8 +115,8 @@ _COLUMNS = [
 ]
 
 
-def _replay_exploration(looks: list[DriveSample]) -> tuple[list[_Moment], EndNodeCensus]:
-    """Once a second, and at the end, what is known."""
+def _replay_exploration(samples: list[DriveSample]) -> tuple[list[_Moment], EndNodeCensus]:
+    """State of map and graph once a second, and at the end."""
 
     def here(scan: object, T_odom_base: Array) -> Estimate:
         return Estimate(truth, np.zeros((3, 3)), np.zeros(3))
@@ -123,15 +125,17 @@ def _replay_exploration(looks: list[DriveSample]) -> tuple[list[_Moment], EndNod
     explorer = Explorer()
     census = EndNodeCensus()
     moments = []
-    for k, look in enumerate(looks):
-        truth = look.T_world_base
-        pipeline.step(look.scan, look.T_odom_base)
-        patch = pipeline.grid.patch()
+    for k, sample in enumerate(samples):
+        truth = sample.T_world_base
+        pipeline.step(sample.scan, sample.T_odom_base)
+        patch = pipeline.grid.known_area()
         graph = pipeline.topology.map
-        decision = explorer.step(graph, patch, look.scan, truth)
-        census.take([(n.node_id, n.x, n.y) for n in decision.end_nodes], truth)
-        if k % 5 == 0 or k == len(looks) - 1:
-            moments.append(_Moment(look.scan.stamp_ns / 1e9, truth, patch, graph.copy(), decision))
+        decision = explorer.step(graph, patch, sample.scan, truth)
+        census.add([(n.node_id, n.x, n.y) for n in decision.end_nodes], truth)
+        if k % 5 == 0 or k == len(samples) - 1:
+            moments.append(
+                _Moment(sample.scan.stamp_ns / 1e9, truth, patch, graph.copy(), decision)
+            )
     return moments, census
 
 
@@ -170,5 +174,5 @@ def _panel(moment: _Moment, path: Array) -> Panel:
         Curve(path[:, :2], 'path', 5),
         *goal,
     ]
-    layers += [RobotMarkers(moment.T_map_base[None]), Words(at, words)]
+    layers += [RobotMarkers(moment.T_map_base[None]), TextLabels(at, words)]
     return Panel(layers, f'after {moment.seconds:.0f} s', limits=_LIMITS)

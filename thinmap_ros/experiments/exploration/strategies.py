@@ -5,7 +5,7 @@ import numpy as np
 from thinmap_ros.closed_loop import Options
 from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Rows, Table
-from thinmap_ros.evaluation.strategy_comparison import OURS, Report, saved
+from thinmap_ros.evaluation.strategy_comparison import OURS, Report, relative_saving
 from thinmap_ros.experiments.drives import Source, world_of
 from thinmap_ros.sim.drives import random_start
 from thinmap_ros.sim.world import World
@@ -130,7 +130,7 @@ def _row(report: Report) -> list[object]:
 
 def _summary(name: str, runs: dict[str, dict[tuple[str, int], Report]]) -> list[object]:
     mine = list(runs[name].values())
-    shares = saved(runs[OURS], _complete(runs[name]), 'distance')
+    shares = relative_saving(runs[OURS], _complete(runs[name]), 'distance')
     some = len(shares) > 1
     distance, time = (
         float(np.mean([report[key] for report in mine])) for key in ('distance', 'time')
@@ -148,13 +148,13 @@ def _summary(name: str, runs: dict[str, dict[tuple[str, int], Report]]) -> list[
 
 
 def _complete(runs: dict[tuple[str, int], Report]) -> dict[tuple[str, int], Report]:
-    """Runs that saw nearly all: what stops much too soon is no shorter way."""
+    """Runs with nearly complete coverage: a run that stops early is not more efficient."""
     return {key: report for key, report in runs.items() if report['coverage'] >= _COMPLETE}
 
 
 def _comparison(other: str, runs: dict[str, dict[tuple[str, int], Report]]) -> Comparison:
     complete = _complete(runs[other])
-    shares = {key: saved(runs[OURS], complete, key) for key in ('distance', 'time')}
+    shares = {key: relative_saving(runs[OURS], complete, key) for key in ('distance', 'time')}
     shorter = shares['distance']
     if not len(shorter):
         return Comparison(

@@ -51,7 +51,7 @@ def run(source: Source) -> Outcome:
             Plot(
                 'fig2',
                 'Paper 2, Fig. 2: environment, selection of free space, '
-                'and thinning stage by stage (dark: what is left).',
+                'and thinning stage by stage (dark: remaining cells).',
                 panels,
                 columns=3,
                 panel_inches=(3.6, 3.6),

@@ -39,15 +39,17 @@ _LIMITS = (-1.0, 41.0, -2.0, 12.0)  # the odometry alone goes far beyond
 
 
 class _Glance:
-    """What the robot knew at one scan."""
+    """Estimate and map at one scan."""
 
     def __init__(self, number: int) -> None:
         self.number = number
         self.patch: GridPatch | None = None
 
-    def __call__(self, k: int, look: DriveSample, pipeline: Pipeline, step: PipelineResult) -> None:
+    def __call__(
+        self, k: int, sample: DriveSample, pipeline: Pipeline, step: PipelineResult
+    ) -> None:
         if k == self.number:
-            self.patch = pipeline.grid.patch()
+            self.patch = pipeline.grid.known_area()
             self.graph = pipeline.topology.map.copy()
             self.features = line_features(pipeline.localizer)
             self.pose = step.estimate.T_map_base
@@ -56,12 +58,12 @@ class _Glance:
 def run(source: Source) -> Outcome:
     """Drive the floor once; both filters, and our localizer, see the same scans."""
     world = world_of('floor_40x10')
-    looks = list(islice(source.looks('floor_40x10'), _QUICK_SCANS if source.quick else None))
-    glance = _Glance(round(_LOCAL_AT * len(looks)))
-    ti = run_drive(looks, 'ekf_ti', glance)
-    full = run_drive(looks, 'ekf_full')
-    ours = run_drive(looks, 'scan_matching')
-    error = map_errors.map_error(ti.pipeline.grid.patch(), world)
+    samples = list(islice(source.samples('floor_40x10'), _QUICK_SCANS if source.quick else None))
+    glance = _Glance(round(_LOCAL_AT * len(samples)))
+    ti = run_drive(samples, 'ekf_ti', glance)
+    full = run_drive(samples, 'ekf_full')
+    ours = run_drive(samples, 'scan_matching')
+    error = map_errors.map_error(ti.pipeline.grid.known_area(), world)
     apart = np.hypot(*(np.array(ti.estimate) - np.array(full.estimate))[:, :2].T)
     used = float(np.median(ti.local))
     known = ti.features[-1]
@@ -69,8 +71,8 @@ def run(source: Source) -> Outcome:
         'A building floor with 33 lines',
         'SLAM paper, sections 4 and 5.1, Fig. 7, 8, 11 and 12',
         'The floor of 40 x 10 m: a Pioneer 3-AT with an LMS200 drives its tour at 0.2 m/s '
-        f'({ti.way_m:.0f} m). The same scans go through the conventional filter (all features) '
-        'and through EKF-SLAM/TI (local areas), each on odometry and lines alone.',
+        f'({ti.path_length_m:.0f} m). The same scans go through the conventional filter '
+        '(all features) and through EKF-SLAM/TI (local areas), each on odometry and lines alone.',
         [
             Table('map', map_errors.COLUMNS, [map_errors.row('floor_40x10', error)]),
             Table('path', _PATH, _path_rows(ti, full)),
@@ -104,7 +106,7 @@ def _comparisons(ti: Run, full: Run, apart: Array, used: float, known: int) -> l
             str(_LINES),
             str(known),
             abs(known - _LINES) <= 0.1 * _LINES,
-            remark='the world has 33 surfaces of at least 0.8 m; those that go on behind a door '
+            remark='the world has 33 surfaces of at least 0.8 m; those that continue behind a door '
             'are one feature',
         ),
         Comparison(

@@ -28,8 +28,8 @@ _LASERS = {
         'max_range_m': 25.0,
     },
 }
-# What others are said to reach on the Intel log: errors of translation in m, live and after all
-# corrections; CPU ms a scan; MB. Single runs of the programs with their defaults, Cartographer
+# Published results on the Intel log: errors of translation in m, live and after all corrections;
+# CPU ms per scan; MB. Single runs of the programs with their defaults, Cartographer
 # tuned; the last three as published in 2009.
 _OTHERS: list[tuple[str, float | None, float, float | None, float | None]] = [
     ('IRIS LaMa slam2d', 0.036, 0.033, 0.17, 13.0),
@@ -163,16 +163,16 @@ def _means(errors: RelationErrors) -> tuple[float, float]:
 def _plot(folder: Path, result: Replay) -> Plot:
     pipeline = result.pipeline
     graph = result.pipeline.topology.map
-    patch = pipeline.grid.patch()
+    patch = pipeline.grid.known_area()
     final = pipeline.localizer.optimized_trajectory()
-    way = Curve(final[:, :2], 'trajectory', 3, width=1.0)
+    trajectory = Curve(final[:, :2], 'trajectory', 3, width=1.0)
     rows, cols = patch.shape
     width = min(7.0, 6.0 * cols / rows)
     return Plot(
         folder.name,
         f'{folder.name}: map and trajectory; topological map.',
         [
-            Panel([MapLayer(patch), way], 'map and trajectory'),
+            Panel([MapLayer(patch), trajectory], 'map and trajectory'),
             Panel([MapLayer(patch), GraphLayer(graph, 3.0)], f'{len(graph.nodes)} nodes'),
         ],
         columns=2,

@@ -11,7 +11,16 @@ from thinmap_ros.evaluation.slam_run import Run, run_drive
 from thinmap_ros.experiments.drives import Source, world_of
 from thinmap_ros.pipeline import Pipeline, PipelineResult
 from thinmap_ros.sim.drives import DriveSample
-from thinmap_ros.view.plots import Curve, GraphLayer, MapLayer, Panel, Plot, RobotMarkers, Words, xy
+from thinmap_ros.view.plots import (
+    Curve,
+    GraphLayer,
+    MapLayer,
+    Panel,
+    Plot,
+    RobotMarkers,
+    TextLabels,
+    xy,
+)
 
 _QUICK_SCANS = 150
 _MARKS = 'ABCDE'
@@ -34,7 +43,9 @@ class _Marks:
         self.near: list[Panel] = []
         self._passed: list[tuple[str, Array]] = []
 
-    def __call__(self, k: int, look: DriveSample, pipeline: Pipeline, step: PipelineResult) -> None:
+    def __call__(
+        self, k: int, sample: DriveSample, pipeline: Pipeline, step: PipelineResult
+    ) -> None:
         if k not in self._at:
             return
         T = step.estimate.T_map_base
@@ -42,14 +53,14 @@ class _Marks:
         names, places = zip(*self._passed, strict=True)
         graph = pipeline.topology.map.copy()
         robot = RobotMarkers(T[None], radius_m=0.32)
-        words = Words(np.array(places), names, 11.0)
+        words = TextLabels(np.array(places), names, 11.0)
         title = (
-            f'{self._at[k]}: after {look.scan.stamp_ns / 6e10:.1f} min, '
+            f'{self._at[k]}: after {sample.scan.stamp_ns / 6e10:.1f} min, '
             f'{step.estimate.n_features} features'
         )
         self.wide.append(
             Panel(
-                [MapLayer(pipeline.grid.patch()), robot, words],
+                [MapLayer(pipeline.grid.known_area()), robot, words],
                 title,
                 limits=(-1.0, 71.0, -0.5, 10.5),
             )
@@ -68,19 +79,19 @@ def _box(T: Array) -> tuple[float, float, float, float]:
 def run(source: Source) -> Outcome:
     """Drive the floor once, both filters and our localizer on the same scans."""
     world = world_of('floor_70x10')
-    looks = list(islice(source.looks('floor_70x10'), _QUICK_SCANS if source.quick else None))
-    marks = _Marks(len(looks))
-    ti = run_drive(looks, 'ekf_ti', marks)
-    full = run_drive(looks, 'ekf_full')
-    ours = run_drive(looks, 'scan_matching')
-    error = map_errors.map_error(ti.pipeline.grid.patch(), world)
+    samples = list(islice(source.samples('floor_70x10'), _QUICK_SCANS if source.quick else None))
+    marks = _Marks(len(samples))
+    ti = run_drive(samples, 'ekf_ti', marks)
+    full = run_drive(samples, 'ekf_full')
+    ours = run_drive(samples, 'scan_matching')
+    error = map_errors.map_error(ti.pipeline.grid.known_area(), world)
     off = np.hypot(*ti.errors()[:, :2].T)
     turned = np.degrees(np.abs(ti.errors()[:, 2]))
     return Outcome(
         'A floor of 70 x 10 m over twenty minutes',
         'SLAM paper, section 5.2, Fig. 14',
         'A Pioneer 3-AT with an LMS200 drives the tour of the floor with its 88 lines at 0.2 m/s: '
-        f'{ti.way_m:.0f} m in {ti.seconds[-1] / 60.0:.0f} minutes.',
+        f'{ti.path_length_m:.0f} m in {ti.seconds[-1] / 60.0:.0f} minutes.',
         [
             Table('path', _PATH, _rows(ti)),
             Table('map', map_errors.COLUMNS, [map_errors.row('floor_70x10', error)]),
@@ -204,7 +215,7 @@ def _comparisons(ti: Run, full: Run, ours: Run, turned: Array) -> list[Compariso
             str(_LINES),
             str(known),
             abs(known - _LINES) <= 0.1 * _LINES,
-            remark='the world has 88 surfaces of at least 0.8 m; those that go on behind a door '
+            remark='the world has 88 surfaces of at least 0.8 m; those that continue behind a door '
             'are one feature',
         ),
         Comparison(

@@ -16,17 +16,17 @@ _QUICK_SCANS = 150
 def run(source: Source) -> Outcome:
     """Map the office with EKF-SLAM/TI, and with our localizer."""
     world = world_of('office')
-    looks = list(islice(source.looks('office'), _QUICK_SCANS if source.quick else None))
-    done = run_drive(looks)
-    ours = run_drive(looks, 'scan_matching')
-    error = map_errors.map_error(done.pipeline.grid.patch(), world)
+    samples = list(islice(source.samples('office'), _QUICK_SCANS if source.quick else None))
+    done = run_drive(samples)
+    ours = run_drive(samples, 'scan_matching')
+    error = map_errors.map_error(done.pipeline.grid.known_area(), world)
     wheels = np.hypot(*done.errors(done.odometry)[:, :2].T)
     row = map_errors.row('office', error)
     return Outcome(
         'The map of an office',
         'SLAM paper, section 5.1, Fig. 10',
         'The office of 9.5 x 7.5 m with furniture; a Pioneer 3-AT with an LMS200 drives its tour '
-        f'at 0.2 m/s ({done.way_m:.0f} m). Cells of 0.1 m.',
+        f'at 0.2 m/s ({done.path_length_m:.0f} m). Cells of 0.1 m.',
         [Table('map', map_errors.COLUMNS, [row])],
         [
             Plot(
@@ -49,7 +49,7 @@ def run(source: Source) -> Outcome:
             Comparison(
                 'pose',
                 '',
-                f'off by {done.position_error}; wheels alone {wheels[-1]:.2f} m at the end',
+                f'off by {done.position_error}; dead reckoning {wheels[-1]:.2f} m at the end',
                 remark=f'scan matching (`slam: scan_matching`): {ours.position_error}',
             ),
         ],

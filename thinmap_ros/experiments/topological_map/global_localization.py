@@ -25,9 +25,9 @@ _RIGHT_RAD = np.radians(10.0)
 
 def run(source: Source) -> Outcome:
     """Localize on one drive with many seeds of the samples; the first one is drawn."""
-    patch = grid_of(source.looks('lab_stops')).patch()
+    patch = grid_of(source.samples('lab_stops')).known_area()
     topology = build(patch, (2.0, 2.0), TopologyConfig())
-    looks = list(islice(source.looks('lab_lost'), 0, None, LOST_STEP_SCANS))
+    drive_samples = list(islice(source.samples('lab_lost'), 0, None, LOST_STEP_SCANS))
     rows: Rows = []
     steps: Rows = []
     panels = []
@@ -37,15 +37,15 @@ def run(source: Source) -> Outcome:
         if seed == source.seed:
             panels.append(_panel(patch, finder.samples, None, 0))
         first = None
-        for step, look in enumerate(looks, 1):
-            result = finder.step(look.scan, look.T_odom_base)
+        for step, sample in enumerate(drive_samples, 1):
+            result = finder.step(sample.scan, sample.T_odom_base)
             state = State(result.state).name.lower()
-            rows.append([seed, step, _candidates(result), state, *_error(result, look)])
+            rows.append([seed, step, _candidates(result), state, *_error(result, sample)])
             if first is None and result.pose is not None:
                 first = step
-                steps.append([seed, step, *_error(result, look), _is_right(result, look)])
+                steps.append([seed, step, *_error(result, sample), _is_right(result, sample)])
             if seed == source.seed and step in _SHOWN:
-                panels.append(_panel(patch, finder.samples, look, step))
+                panels.append(_panel(patch, finder.samples, sample, step))
     taken = np.array([row[1] for row in steps])
     right = sum(bool(row[4]) for row in steps)
     worst = float(np.max([row[2] for row in steps]))
@@ -60,7 +60,7 @@ def run(source: Source) -> Outcome:
             Table('steps', ['seed', 'step', 'candidates', 'state', 'error_m', 'error_deg'], rows),
             Table('convergence', ['seed', 'steps', 'error_m', 'error_deg', 'right'], steps),
         ],
-        [_samples(panels), _curve(rows, len(looks))],
+        [_samples(panels), _curve(rows, len(drive_samples))],
         [
             Comparison(
                 'one position left',
@@ -83,16 +83,16 @@ def _candidates(result: Result) -> int:
     return sum(hypothesis.weight >= _LIKELY for hypothesis in result.hypotheses)
 
 
-def _error(result: Result, look: DriveSample) -> tuple[float | None, float | None]:
+def _error(result: Result, sample: DriveSample) -> tuple[float | None, float | None]:
     """How far the likeliest place is off, m and degrees."""
     if not result.hypotheses:
         return None, None
-    off = result.hypotheses[0].T_map_base - look.T_world_base
+    off = result.hypotheses[0].T_map_base - sample.T_world_base
     return float(np.hypot(off[0], off[1])), float(np.degrees(abs(wrap(float(off[2])))))
 
 
-def _is_right(result: Result, look: DriveSample) -> bool:
-    metres, degrees = _error(result, look)
+def _is_right(result: Result, sample: DriveSample) -> bool:
+    metres, degrees = _error(result, sample)
     return (
         metres is not None
         and degrees is not None
@@ -101,9 +101,9 @@ def _is_right(result: Result, look: DriveSample) -> bool:
     )
 
 
-def _panel(patch: GridPatch, samples: Array, look: DriveSample | None, step: int) -> Panel:
+def _panel(patch: GridPatch, samples: Array, sample: DriveSample | None, step: int) -> Panel:
     title = f'after {step} steps' if step else f'at the start: {len(samples)} samples'
-    robot = [] if look is None else [RobotMarkers(look.T_world_base[None])]
+    robot = [] if sample is None else [RobotMarkers(sample.T_world_base[None])]
     return Panel(
         [MapLayer(patch), Curve(samples[:, :2], 'samples', 1, '', '.', size=1.5), *robot], title
     )

@@ -24,8 +24,8 @@ _SAME_M = 0.5
 
 def run(source: Source) -> Outcome:
     """Merge stop by stop; the global grid is only used to judge the result."""
-    by_place = groupby(source.looks('lab_stops'), lambda look: tuple(look.T_world_base[:2]))
-    stops = [list(looks) for _, looks in by_place]
+    by_place = groupby(source.samples('lab_stops'), lambda sample: tuple(sample.T_world_base[:2]))
+    stops = [list(samples) for _, samples in by_place]
     order = [_FIRST, _SECOND, *(k for k in range(len(stops)) if k not in (_FIRST, _SECOND))]
     builder = TopologyBuilder(TopologyConfig())
     grid = OccupancyGrid()
@@ -43,8 +43,8 @@ def run(source: Source) -> Outcome:
         _local_map(stops[stop], name)
         for stop, name in ((_FIRST, 'local map 1'), (_SECOND, 'local map 2'))
     ]
-    whole = grid_of(look for stop in stops for look in stop)
-    batch = build(whole.patch(), _start(stops[0]), TopologyConfig())
+    whole = grid_of(sample for stop in stops for sample in stop)
+    batch = build(whole.known_area(), _start(stops[0]), TopologyConfig())
     share = _agreement(states[-1], batch)
     back = _agreement(batch, states[-1])
     gone = _redundant(states[1], states[-1])
@@ -98,35 +98,35 @@ def _plots(early: list[Panel], whole: OccupancyGrid, final: Panel) -> list[Plot]
             'fig6_9',
             'Paper 1, Fig. 6 and 9: the global grid map (above; only for better understanding) '
             'and the final global topological map.',
-            [Panel([MapLayer(whole.patch())]), final],
+            [Panel([MapLayer(whole.known_area())]), final],
             panel_inches=(9.0, 4.6),
         ),
     ]
 
 
-def _visit(looks: list[DriveSample], grid: OccupancyGrid, builder: TopologyBuilder) -> None:
-    for look in looks:
-        grid.update(look.scan, look.T_world_base)
-        x, y, _ = look.T_world_base
-        builder.update(grid.window(float(x), float(y), _WINDOW_M), look.T_world_base)
+def _visit(samples: list[DriveSample], grid: OccupancyGrid, builder: TopologyBuilder) -> None:
+    for sample in samples:
+        grid.add_scan(sample.scan, sample.T_world_base)
+        x, y, _ = sample.T_world_base
+        builder.update(grid.window(float(x), float(y), _WINDOW_M), sample.T_world_base)
 
 
-def _local_map(looks: list[DriveSample], title: str) -> Panel:
-    grid = grid_of(looks)
-    graph = build(grid.patch(), _start(looks), TopologyConfig())
-    x, y = _start(looks)
-    return _panel(grid, graph, f'{title}, sensor at ({x:g} m, {y:g} m)', looks[0].T_world_base)
+def _local_map(samples: list[DriveSample], title: str) -> Panel:
+    grid = grid_of(samples)
+    graph = build(grid.known_area(), _start(samples), TopologyConfig())
+    x, y = _start(samples)
+    return _panel(grid, graph, f'{title}, sensor at ({x:g} m, {y:g} m)', samples[0].T_world_base)
 
 
 def _panel(
     grid: OccupancyGrid, graph: TopologicalMap, title: str, robot: Array | None = None
 ) -> Panel:
     robots = [] if robot is None else [RobotMarkers(robot[None], 'sensor')]
-    return Panel([MapLayer(grid.patch()), GraphLayer(graph), *robots], title)
+    return Panel([MapLayer(grid.known_area()), GraphLayer(graph), *robots], title)
 
 
-def _start(looks: list[DriveSample]) -> tuple[float, float]:
-    return float(looks[0].T_world_base[0]), float(looks[0].T_world_base[1])
+def _start(samples: list[DriveSample]) -> tuple[float, float]:
+    return float(samples[0].T_world_base[0]), float(samples[0].T_world_base[1])
 
 
 def _agreement(one: TopologicalMap, other: TopologicalMap) -> float:

@@ -18,7 +18,7 @@ from thinmap_ros.view.plots import Curve, GraphLayer, MapLayer, Panel, Plot, Rob
 _PRUNE_M = (0.2, 0.4, 0.6, 0.8, 1.0, 1.5, 2.0, 3.0)
 _SHOWN_M = 3.0  # all branches into corners are gone
 _WORLDS = ('room_10x10', 'office', 'floor_40x10')
-_STOP = 16  # the first look of the third stop, (3 m, 8.3 m, 0 deg): the paper's Fig. 3 and 7(a)
+_STOP = 16  # the first scan of the third stop, (3 m, 8.3 m, 0 deg): the paper's Fig. 3 and 7(a)
 _TOLD_M = (0.6, 1.5, 3.0)
 _LOOKS = 4
 _MORE_NODES = 4
@@ -26,8 +26,8 @@ _MORE_NODES = 4
 
 def run(source: Source) -> Outcome:
     """Compare by pruning distance: nodes and edges (always the same), and times."""
-    looks = list(source.looks('lab_stops'))
-    maps = {'lab': grid_of(looks).patch()}
+    samples = list(source.samples('lab_stops'))
+    maps = {'lab': grid_of(samples).known_area()}
     maps |= {name: patch_at_rest(name) for name in _WORLDS[: 1 if source.quick else None]}
     counts: Rows = []
     times: Rows = []
@@ -57,7 +57,7 @@ def run(source: Source) -> Outcome:
             Table('nodes', columns, counts),
             Table('times', ['map', 'prune_m', 'thinning_ms', 'voronoi_ms'], times, timed=True),
         ],
-        [_local_map(looks[_STOP : _STOP + _LOOKS]), _both(maps['lab']), _curves(counts, times)],
+        [_local_map(samples[_STOP : _STOP + _LOOKS]), _both(maps['lab']), _curves(counts, times)],
         [
             Comparison(
                 'computing',
@@ -97,13 +97,13 @@ def _timed(work: Callable[[], TopologicalMap]) -> tuple[float, TopologicalMap]:
     return min(taken), result
 
 
-def _local_map(looks: list[DriveSample]) -> Plot:
-    look = looks[0]
-    patch = grid_of(looks).patch()
-    points = look.scan.points_base()
-    xy = (float(look.T_world_base[0]), float(look.T_world_base[1]))
+def _local_map(samples: list[DriveSample]) -> Plot:
+    sample = samples[0]
+    patch = grid_of(samples).known_area()
+    points = sample.scan.points_base()
+    xy = (float(sample.T_world_base[0]), float(sample.T_world_base[1]))
     graph = build(patch, xy, TopologyConfig())
-    robot = np.array([look.T_world_base])
+    robot = np.array([sample.T_world_base])
     return Plot(
         'fig3',
         'Paper 1, Fig. 3: (a) range data of one scan, laser at the origin; '

@@ -25,7 +25,7 @@ _COSTS = {
 
 def run(source: Source) -> Outcome:
     """Plan from the start to each stop, with and without intrinsic cost."""
-    patch = grid_of(source.looks('lab_stops')).patch()
+    patch = grid_of(source.samples('lab_stops')).known_area()
     goals = [(float(x), float(y)) for x, y in tour_of('lab')]
     clearance_m = ndimage.distance_transform_edt(patch.free) * patch.frame.resolution
     rows = []

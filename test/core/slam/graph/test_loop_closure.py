@@ -90,7 +90,7 @@ class Driver:
             if correction is not None:
                 self.corrections.append(correction)
                 anchor = self.loops.keyframes.anchor
-                self.pose = correction.moved(anchor, self.pose)
+                self.pose = correction.applied_to(anchor, self.pose)
                 self.covariance = self.loops.keyframes.frames[anchor].covariance
 
     def path_m(self):
@@ -256,7 +256,7 @@ def test_a_step_does_one_match_or_one_round(monkeypatch):
             assert sum(counts.values()) - before <= 1
             if correction is not None:
                 driver.corrections.append(correction)
-                driver.pose = correction.moved(driver.loops.keyframes.anchor, driver.pose)
+                driver.pose = correction.applied_to(driver.loops.keyframes.anchor, driver.pose)
     assert driver.corrections
     assert counts['rounds'] > 1
     # All is done at some time.

@@ -257,7 +257,7 @@ def test_a_state_is_restored(rng):
         add_scan(local_map, ROOM, pose - [8.0, 20.0, 0.0], rng)
         add_scan(local_map, ROOM, pose, rng)
     state = local_map.state()
-    again.restore(snapshot.check(state, FIELDS, 'local map'))
+    again.restore(snapshot.validate(state, FIELDS, 'local map'))
     assert set(state) == set(FIELDS)
     for name, array in state.items():
         assert np.any(array), name

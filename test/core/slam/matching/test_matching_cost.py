@@ -297,7 +297,7 @@ def test_the_prior_pulls_as_its_cost_falls(rng):
         pose = prior + scale * np.array([*rng.normal(0.0, 0.1, 2), 0.1])
         pose[2] = se2.wrap(float(pose[2]))
         pull, weight, cost = by_prior(pose, prior, information)
-        off = se2.off(pose, prior)
+        off = se2.pose_difference(pose, prior)
         squared = off @ information @ off
         assert cost == pytest.approx(cauchy(squared, SLIP_SIGMAS))
         assert weight == pytest.approx(1.0 / (1.0 + squared / SLIP_SIGMAS**2))

@@ -87,14 +87,14 @@ def killed(config, seed, resolution, slip):
         scan = scan_in(ROOM, truth, rng, k)
         if k < 400:
             estimate = localizer.step(scan, odom)
-            grid.update(scan, estimate.T_map_base)
+            grid.add_scan(scan, estimate.T_map_base)
             last = OdometryAnchor(k, estimate.T_map_odom, odom)
             before = max(before, float(np.hypot(*(estimate.T_map_base - truth)[:2])))
         elif k >= 450:
             begin = odom if k == 450 else begin
             slipped = se2.compose(se2.compose(begin, off), se2.between(begin, odom))
             if k == 450:
-                localizer = Localizer.from_occupancy_map(grid.patch(), last, slipped, config)
+                localizer = Localizer.from_occupancy_map(grid.known_area(), last, slipped, config)
             estimate = localizer.step(scan, slipped)
             after = max(after, float(np.hypot(*(estimate.T_map_base - truth)[:2])))
     return before, after, estimate
@@ -107,6 +107,6 @@ def test_a_killed_localizer_does_not_bend_the_map(seed, resolution, slip):
     """Killed for two metres while the wheels slip: then it is as true as its map, and a cell."""
     config = LocalizerConfig(initial_x_m=2.0, initial_y_m=2.0)
     before, worst, estimate = killed(config, seed, resolution, slip)
-    assert not estimate.lost
+    assert not estimate.is_lost
     assert worst < before + 0.05
     assert worst < 0.1

@@ -30,7 +30,7 @@ def nearest_minimum(local_map, points, prior, covariance):
 
 
 def off(match_, truth=TRUTH):
-    return se2.off(match_.T_map_base, truth)
+    return se2.pose_difference(match_.T_map_base, truth)
 
 
 def clutter(rng, number):

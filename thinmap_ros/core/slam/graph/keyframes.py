@@ -96,7 +96,7 @@ class Keyframes:
             T = se2.between(self.frames[anchor].T_map_base, frame.T_map_base)
             self.steps.append(Edge(anchor, number, T, inverse(step_covariance), False))
         self.frames.append(frame)
-        self._buckets.put(number, float(frame.T_map_base[0]), float(frame.T_map_base[1]))
+        self._buckets.insert(number, float(frame.T_map_base[0]), float(frame.T_map_base[1]))
         self._path.add(frame.scan.stamp_ns, number, np.zeros(3))
         return number
 
@@ -141,7 +141,7 @@ class Keyframes:
             self.frames[number] = replace(
                 self.frames[number], T_map_base=T, covariance=covariances[number]
             )
-            self._buckets.put(number, float(T[0]), float(T[1]))
+            self._buckets.insert(number, float(T[0]), float(T[1]))
 
     def path(self) -> tuple[NDArray[np.int64], Array]:
         """Stamps (N,) and poses (N, 3) of the scans that are keyframes, or for which one stands."""
@@ -155,7 +155,7 @@ class Keyframes:
 
     def near(self, T_map_base: Array, reach_m: float) -> list[int]:
         """Keyframes within a reach of a pose (3,), and some that are farther."""
-        return self._buckets.near(float(T_map_base[0]), float(T_map_base[1]), reach_m)
+        return self._buckets.query_radius(float(T_map_base[0]), float(T_map_base[1]), reach_m)
 
     def most_similar(self, T_map_base: Array) -> int | None:
         """The keyframe that sees most nearly the same as one at a pose (3,), or None."""

@@ -291,7 +291,7 @@ class LoopClosure:
             return
         own = np.diag(np.square([config.noise_m] * 2 + [config.noise_rad]))
         covariance = inverse(match.scan_information + 1e-3 * np.eye(3)) + own
-        off = se2.off(match.T_map_base, prior)
+        off = se2.pose_difference(match.T_map_base, prior)
         if float(off @ np.linalg.solve(relative + covariance, off)) > _CHI2:
             return
         T_j_base = se2.between(frames[j].T_map_base, base)
@@ -371,7 +371,7 @@ class LoopClosure:
         T_b_b = se2.between(frames[one.b].T_map_base, frames[other.b].T_map_base)
         there = se2.compose(one.T_a_b, T_b_b)
         back = se2.compose(T_a_a, other.T_a_b)
-        off = se2.off(there, back)
+        off = se2.pose_difference(there, back)
         covariance = inverse(one.information) + inverse(other.information)
         covariance[2, 2] += 1e-6
         return float(off @ np.linalg.solve(covariance, off)) < _CHI2

@@ -164,7 +164,7 @@ class LocalMap:
         cells = tiles.pool[: tiles.used]
         return {
             'cell_m': np.array(self.config.resolution_m),
-            'tiles': tiles.places(),
+            'tiles': tiles.tile_coordinates(),
             'hits': cells['hits'],
             'seen': cells['seen'],
             'means': np.stack([cells['x'], cells['y']], axis=-1),
@@ -187,7 +187,7 @@ class LocalMap:
         snapshot.require(once, 'features: tiles: one twice', 'each tile once')
         low = places.min(axis=0)
         high = places.max(axis=0)
-        self.tiles.reach(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+        self.tiles.grow_to(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
         self.tiles.allocate(places)
         cells = self.tiles.pool[: len(places)]
         cells['hits'] = np.minimum(state['hits'], state['seen'])
@@ -207,7 +207,7 @@ class LocalMap:
         both = np.vstack([points_map, laser_map])
         low = np.floor((both.min(axis=0) - reach) / edge_m).astype(np.int64)[::-1]
         high = np.floor((both.max(axis=0) + reach) / edge_m).astype(np.int64)[::-1]
-        self.tiles.reach(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+        self.tiles.grow_to(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
         touched = _touched(points_map, laser_map, low, high, edge_m, reach)
         first = (low[0] - self.tiles.first_row, low[1] - self.tiles.first_col)
         rows, cols = touched.shape
