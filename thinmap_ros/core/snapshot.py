@@ -64,7 +64,7 @@ def check(state: State, fields: Fields, what: str) -> dict[str, NDArray[Any]]:
 
 
 def split_stamp(state: State) -> tuple[int, dict[str, NDArray[Any]]]:
-    """Return the stamp, ns, of a state that a node kept ('latest_ns'), and the rest of its arrays.
+    """Return the stamp, ns, of a node's checkpoint ('latest_ns'), and the rest of its arrays.
 
     Raises InputError where there is no stamp.
     """

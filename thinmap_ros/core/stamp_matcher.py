@@ -1,4 +1,4 @@
-"""Two streams that speak of the same scans, brought together by stamp."""
+"""Pairs the messages of two streams by stamp."""
 
 from collections import OrderedDict
 from typing import Generic, TypeVar
@@ -8,9 +8,9 @@ Right = TypeVar('Right')
 
 
 class StampMatcher(Generic[Left, Right]):
-    """Pairs the messages of two topics that carry exactly the same stamp, whichever comes first.
+    """Pairs the messages of two topics with exactly the same stamp, in any order of arrival.
 
-    What finds no partner within `capacity` later messages is dropped, and counted.
+    dropped: messages without a partner among the `capacity` later ones.
     """
 
     def __init__(self, capacity: int = 50) -> None:
@@ -20,7 +20,7 @@ class StampMatcher(Generic[Left, Right]):
         self.dropped = 0
 
     def add_left(self, stamp_ns: int, value: Left) -> tuple[Left, Right] | None:
-        """Take a message of the first topic; returns the pair if it is complete now."""
+        """Add a message of the first topic; returns its pair if that is complete."""
         partner = self._rights.pop(stamp_ns, None)
         if partner is not None:
             return value, partner
@@ -31,7 +31,7 @@ class StampMatcher(Generic[Left, Right]):
         return None
 
     def add_right(self, stamp_ns: int, value: Right) -> tuple[Left, Right] | None:
-        """Take a message of the second topic; returns the pair if it is complete now."""
+        """Add a message of the second topic; returns its pair if that is complete."""
         partner = self._lefts.pop(stamp_ns, None)
         if partner is not None:
             return partner, value

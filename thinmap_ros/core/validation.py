@@ -1,4 +1,4 @@
-"""What a message may say at most: beyond that it is a mistake, whoever made it."""
+"""Limits of the values of messages and files: beyond them they are errors."""
 
 from collections.abc import Iterable, Sequence
 from itertools import accumulate
@@ -16,30 +16,24 @@ LONGEST_LIST = 200
 
 
 def require_bounded(what: str, values: Iterable[float], limit: float = FARTHEST_M) -> None:
-    """Raise InputError, naming what, unless all values are finite and at most `limit` in size."""
+    """Raise InputError, naming `what`, unless all values are finite and at most `limit` in size."""
     for value in values:
         if not abs(value) <= limit:
             raise InputError(f'{what}: {value}: expected a number from {-limit:g} to {limit:g}')
 
 
 def abbreviated(text: str, longest: int = 80) -> str:
-    """A topic, type or frame of a file as part of a message.
-
-    One line of printable characters, unquoted, short.
-    """
+    """A name from a file for an error message: printable, on one line, of limited length."""
     return repr(text if len(text) <= longest else text[:longest] + '...')[1:-1]
 
 
 def listed(names: Sequence[str]) -> str:
-    """Names of a file as part of a message.
-
-    The first of them, in short, and how many more there are.
-    """
-    told = [abbreviated(name) for name in names]
-    lengths = accumulate(len(name) + 2 for name in told)
+    """Names from a file for an error message: the first ones, and how many more there are."""
+    shown = [abbreviated(name) for name in names]
+    lengths = accumulate(len(name) + 2 for name in shown)
     count = max(1, sum(length <= LONGEST_LIST for length in lengths))
-    more = f' and {len(told) - count} more' if len(told) > count else ''
-    return ', '.join(told[:count]) + more or 'nothing'
+    more = f' and {len(shown) - count} more' if len(shown) > count else ''
+    return ', '.join(shown[:count]) + more or 'nothing'
 
 
 def cells_in_range(cells: NDArray[np.int8]) -> None:
@@ -51,7 +45,7 @@ def cells_in_range(cells: NDArray[np.int8]) -> None:
 
 
 def unique(what: str, ids: list[int]) -> None:
-    """Raise InputError where a number is given twice."""
+    """Raise InputError where an id occurs twice."""
     if len(set(ids)) < len(ids):
         raise InputError(
             f'{what}: {len(ids)} of them with {len(set(ids))} ids: expected an id for each'

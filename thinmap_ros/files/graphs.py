@@ -57,7 +57,7 @@ def writer_of(path: Path) -> Callable[[Path, TopologicalMap], None]:
 def write_geojson(path: Path, topology: TopologicalMap, frame_id: str = 'map') -> None:
     """Write a topological map, whole or not at all.
 
-    The way back along an edge has an id above all others.
+    The reverse of an edge has an id above all others.
 
     Raises InputError where an id is too large for an unsigned int.
     """
@@ -268,7 +268,7 @@ def _edge_feature(edge: Edge, feature_id: int, start: int) -> dict[str, Any]:
         'length': round(float(edge.length_m), 3),
         'clearance': round(float(edge.clearance_m), 3),
     }
-    # A loop begins and ends at one node: its way back is told by its id.
+    # A loop starts and ends at one node: its reverse is recognized by its id.
     path = edge.path if feature_id == edge.id else edge.path[::-1]
     return {
         'type': 'Feature',

@@ -133,14 +133,14 @@ def _lattice(path: Path, points: Array, resolution: float) -> tuple[GridFrame, t
     """
     farthest = float(np.abs(points).max())
     if farthest > FARTHEST_M:
-        expected = f'expected at most {FARTHEST_M:g} m; is a point far off?'
+        expected = f'expected at most {FARTHEST_M:g} m; is a point too distant?'
         raise InputError(f'{path}: point at {farthest:g} m: {expected}')
     low = np.floor((points.min(axis=0) - _MARGIN_M) / resolution)
     cols, rows = np.ceil((points.max(axis=0) + _MARGIN_M) / resolution) - low
     if not rows * cols <= _MOST_CELLS:
         raise InputError(
             f'{path}: {rows:.0f} x {cols:.0f} cells: expected at most {_MOST_CELLS}; '
-            'is a point far off?'
+            'is a point too distant?'
         )
     frame = GridFrame(float(low[0]) * resolution, float(low[1]) * resolution, resolution)
     return frame, (int(rows), int(cols))
@@ -151,8 +151,8 @@ def _fill(cells: NDArray[np.int8], frame: GridFrame, polygon: Array) -> None:
 
     A ray from such a centre crosses it an odd number of times.
     """
-    # A border that runs through centres would otherwise fall to either side by rounding: walls 4 to
-    # 6 cells wide.
+    # Rounding would otherwise decide about cells whose centres lie on the boundary: walls 4 to 6
+    # cells wide.
     polygon = polygon - _NUDGE_M
     low = np.maximum(frame.cells_of(polygon.min(axis=0))[0], 0)
     high = frame.cells_of(polygon.max(axis=0))[0] + 1

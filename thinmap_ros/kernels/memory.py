@@ -12,9 +12,9 @@ _RELEASE_BYTES = 4e6
 
 
 def compiler_memory_releaser() -> Callable[[], None]:
-    """Kernels that only a real message calls for bring the compiler back.
+    """A function to be called often; it releases the pages of the compiler every few seconds.
 
-    What gives its pages back, now and then.
+    Kernels that are first needed for a message load the compiler again.
     """
     looked_at = monotonic()
     least = _shared_bytes()
