@@ -20,7 +20,7 @@ class StampMatcher(Generic[Left, Right]):
         self.dropped = 0
 
     def add_left(self, stamp_ns: int, value: Left) -> tuple[Left, Right] | None:
-        """Take a message of the first topic; returns the pair if it is complete now."""
+        """Add a message of the first topic; returns its pair if that is complete."""
         partner = self._rights.pop(stamp_ns, None)
         if partner is not None:
             return value, partner
@@ -31,7 +31,7 @@ class StampMatcher(Generic[Left, Right]):
         return None
 
     def add_right(self, stamp_ns: int, value: Right) -> tuple[Left, Right] | None:
-        """Take a message of the second topic; returns the pair if it is complete now."""
+        """Add a message of the second topic; returns its pair if that is complete."""
         partner = self._lefts.pop(stamp_ns, None)
         if partner is not None:
             return partner, value

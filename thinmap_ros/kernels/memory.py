@@ -12,7 +12,7 @@ _RELEASE_BYTES = 4e6
 
 
 def compiler_memory_releaser() -> Callable[[], None]:
-    """Kernels that only a real message calls for bring the compiler back.
+    """A function to be called often; it releases the pages of the compiler every few seconds.
 
     Kernels that are loaded later, with the first message, load the compiler again.
     """

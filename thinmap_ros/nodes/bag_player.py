@@ -22,7 +22,7 @@ from thinmap_ros.logs.playback import Playback, is_scan
 from thinmap_ros.logs.storage import RawMessage
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.diagnostics import OK, WARN, NodeDiagnostics
-from thinmap_ros.ros.lockstep import NONE, PATIENCE_S, PATIENCE_WORDS, TOPICS, Lockstep
+from thinmap_ros.ros.lockstep import NONE, TIMEOUT_DESCRIPTION, TIMEOUT_S, TOPICS, Lockstep
 from thinmap_ros.ros.messages import message_class
 from thinmap_ros.ros.services import fill_response
 
@@ -51,9 +51,11 @@ class BagPlayerConfig(Config):
         high=100,
     )
     lockstep: str = parameter(
-        NONE, 'wait for what each scan leads to: nothing is lost at high rates', choices=TOPICS
+        NONE,
+        'wait for this result of each scan, so that none is lost at high rates',
+        choices=TOPICS,
     )
-    lockstep_patience_s: float = parameter(PATIENCE_S, PATIENCE_WORDS, low=0.1, high=3600.0)
+    lockstep_patience_s: float = parameter(TIMEOUT_S, TIMEOUT_DESCRIPTION, low=0.1, high=3600.0)
 
 
 class _ClockPublisher:

@@ -1,4 +1,4 @@
-"""Asks for an exploration, shows how it goes in one progress bar, and writes down how it ended."""
+"""Requests an exploration, shows its progress in a bar, and writes its result to a file."""
 
 import json
 from dataclasses import dataclass
@@ -24,10 +24,10 @@ from thinmap_ros.sim.coverage import observable_cells
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.world import World
 
-_LOOK_PERIOD_S = 0.5
-# After so long an answer passes for lost: an explorer that has just found us may be unable to give
-# one.
-_ASK_AGAIN_S = 10.0
+_PERIOD_S = 0.5
+# Without an answer for this time, the goal is sent again: an explorer that has just been discovered
+# may be unable to answer.
+_RESEND_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -64,16 +64,16 @@ class DemoMonitorNode(Node):
         self._bar.set_description_str('waiting for the nodes')
         self._explore = ActionClient(self, Explore, 'explore')
         self.create_subscription(OccupancyGrid, 'map', self._on_map, qos.LATCHED)
-        self.create_timer(_LOOK_PERIOD_S, self._ask, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.create_timer(_PERIOD_S, self._send_goal, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def close(self) -> None:
-        """End the bar, so that what is printed next begins on a line of its own."""
+        """End the bar, so that the next output starts on a new line."""
         self._bar.close()
 
-    def _ask(self) -> None:
+    def _send_goal(self) -> None:
         if self._accepted or not self._explore.server_is_ready():
             return
-        if self._sent is not None and monotonic() - self._sent_at < _ASK_AGAIN_S:
+        if self._sent is not None and monotonic() - self._sent_at < _RESEND_S:
             return
         goal = Explore.Goal(time_limit_s=self._config.time_limit_s)
         self._sent_at = monotonic()
@@ -82,7 +82,7 @@ class DemoMonitorNode(Node):
 
     def _on_accepted(self, future: Future) -> None:
         if future is not self._sent:
-            return  # a newer goal has taken its place
+            return  # replaced by a newer goal
         self._accepted = True
         future.result().get_result_async().add_done_callback(self._on_result)
 
@@ -93,9 +93,9 @@ class DemoMonitorNode(Node):
         self._show(message.feedback.status)
 
     def _show(self, status: ExplorationStatus) -> None:
-        place = status.target_position
+        position = status.target_position
         target = (
-            f'to the end node at {place.x:.1f}, {place.y:.1f}'
+            f'to the end node at {position.x:.1f}, {position.y:.1f}'
             if status.has_target
             else 'looking around'
         )

@@ -1,7 +1,4 @@
-"""Graph, end nodes and line features as markers, for RViz and Foxglove.
-
-These do not know thinmap's messages.
-"""
+"""Graph, end nodes and line features as markers, for RViz and Foxglove."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -68,9 +65,9 @@ def topology(message: TopologicalMap) -> MarkerArray:
 
 
 def end_nodes(message: EndNodeArray) -> MarkerArray:
-    """End nodes as spheres, the paler the less sure, the target's larger, with their probability.
+    """End nodes as spheres with their probability: more opaque if larger; the target is larger.
 
-    Raises InputError where a place or probability is no number.
+    Raises InputError where a position or probability is out of range.
     """
     markers: list[Marker] = []
     for node in message.end_nodes:
@@ -99,7 +96,7 @@ def end_nodes(message: EndNodeArray) -> MarkerArray:
 def line_features(message: LineFeatureArray) -> MarkerArray:
     """Line features, those of the local area in another colour.
 
-    Raises InputError where an end is no number.
+    Raises InputError where an end point is out of range.
     """
     lines = _marker(message.header, 'lines', Marker.LINE_LIST, _LINE_M, palette.ESTIMATE)
     for feature in message.features:
@@ -113,7 +110,7 @@ def line_features(message: LineFeatureArray) -> MarkerArray:
 
 
 def _shown(markers: list[Marker]) -> MarkerArray:
-    """Markers in place of all shown before; lists without points are left out: RViz complains."""
+    """Markers that replace all shown before, without empty lists, which RViz rejects."""
     lists = (Marker.LINE_LIST, Marker.SPHERE_LIST)
     return MarkerArray(
         markers=[
@@ -137,7 +134,7 @@ def _point(x: float, y: float, z: float) -> Point:
 
 
 def _colour(web: str) -> ColorRGBA:
-    """Colour of a web colour, #rrggbb."""
+    """Message of a web colour, #rrggbb."""
     r, g, b = bytes.fromhex(web[1:])
     return ColorRGBA(r=r / 255.0, g=g / 255.0, b=b / 255.0, a=1.0)
 

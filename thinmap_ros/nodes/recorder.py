@@ -1,4 +1,4 @@
-"""Everything that is said on the graph, into an MCAP bag."""
+"""Records all topics into an MCAP bag."""
 
 import contextlib
 from collections.abc import Callable
@@ -31,10 +31,10 @@ class RecorderConfig(Config):
 
 
 class RecorderNode(Node):
-    """Subscribes to each topic as soon as somebody publishes it, and writes the bytes as they come.
+    """Subscribes to each topic as soon as it has a publisher, and writes its serialized messages.
 
-    What has come is on the disk within half a second, whatever ends the robot. Where the disk takes
-    no more, the node says so and ends.
+    A message is on the disk within half a second, whatever ends the robot. When the disk is full,
+    the node ends with an error.
     """
 
     def __init__(self) -> None:
@@ -51,13 +51,13 @@ class RecorderNode(Node):
         self._early: list[tuple[str, str, bytes]] = []
         self._written = 0
         self._diagnostics = NodeDiagnostics(self)
-        # Not in the robot's time, which may stand still until everybody listens.
+        # Not in the robot's time, which may stand still until all subscribers are there.
         wall = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_DISCOVERY_PERIOD_S, self._discover_topics, clock=wall)
         self.create_timer(_FLUSH_S, lambda: self._guarded(self._writer.flush), clock=wall)
 
     def close(self) -> None:
-        """Finish the bag; what a full disk leaves is readable, and `bag_repair` makes it whole."""
+        """Finish the bag; one cut off by a full disk is readable, and `bag_repair` completes it."""
         with contextlib.suppress(OSError):
             for message in self._early:
                 self._write(*message, self.get_clock().now().nanoseconds)
@@ -66,7 +66,7 @@ class RecorderNode(Node):
 
     def _discover_topics(self) -> None:
         for topic, types in self.get_topic_names_and_types():
-            # What an action says under way is repeated on topics of its own.
+            # Feedback and status of an action are also published on topics of their own.
             if (
                 '/_action/' not in topic
                 and topic not in self._seen
@@ -91,7 +91,7 @@ class RecorderNode(Node):
             self.get_logger().warning(f'{topic} is not recorded: {error}')
             return
         self.create_subscription(
-            kind, topic, self._callback(topic, type_name), _wanted(reliable, latched), raw=True
+            kind, topic, self._callback(topic, type_name), _common_qos(reliable, latched), raw=True
         )
 
     def _callback(self, topic: str, type_name: str) -> Callable[[bytes], None]:
@@ -103,8 +103,7 @@ class RecorderNode(Node):
     def _process(self, topic: str, type_name: str, data: bytes) -> None:
         ns = self.get_clock().now().nanoseconds
         if ns == 0 and len(self._early) < _DEPTH:
-            # Time has not begun: players must not think that so much of it passed before the first
-            # scan.
+            # Time has not begun: these messages get the first time, so that a player does not wait.
             self._early.append((topic, type_name, data))
             return
         for message in self._early:
@@ -127,8 +126,8 @@ class RecorderNode(Node):
             ) from error
 
 
-def _wanted(reliable: bool, latched: bool) -> QoSProfile:
-    """What every publisher of a topic offers at least, so that all of them are heard."""
+def _common_qos(reliable: bool, latched: bool) -> QoSProfile:
+    """The quality of service that all publishers of a topic offer."""
     return QoSProfile(
         depth=_DEPTH,
         history=HistoryPolicy.KEEP_LAST,

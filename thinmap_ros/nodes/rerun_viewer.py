@@ -1,4 +1,4 @@
-"""All that the graph says about map and robot, shown in rerun and written to an .rrd file."""
+"""Shows map and robot in rerun, and writes them to an .rrd file."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -66,7 +66,7 @@ class RerunViewerNode(Node):
         self._feed = MessageView(self._view, mount.pose, self.get_namespace())
         self._diagnostics = NodeDiagnostics(self)
         for topic, (kind, profile) in _TOPICS.items():
-            # Those that are not of this robot alone have an absolute name.
+            # A topic that all robots share has an absolute name.
             name = f'/{topic}' if topic == 'diagnostics' else topic
             self.create_subscription(kind, name, self._callback(topic), profile)
 

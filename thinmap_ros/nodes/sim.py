@@ -24,7 +24,7 @@ from thinmap_ros.files import package_data
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.diagnostics import OK, WARN, NodeDiagnostics
-from thinmap_ros.ros.lockstep import NONE, PATIENCE_S, PATIENCE_WORDS, TOPICS, Lockstep
+from thinmap_ros.ros.lockstep import NONE, TIMEOUT_DESCRIPTION, TIMEOUT_S, TOPICS, Lockstep
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS, DifferentialDriveRobot
 from thinmap_ros.sim.simulation import STEP_NS, SensorReadings, Simulation
@@ -46,11 +46,13 @@ class SimConfig(Config):
     seed: int = parameter(0, 'decides all noise', low=0, high=2**31 - 1)
     rate: float = parameter(1.0, 'simulated seconds a second', low=0.01, high=1000.0)
     lockstep: str = parameter(
-        NONE, 'wait for what each scan leads to: nothing is lost at high rates', choices=TOPICS
+        NONE,
+        'wait for this result of each scan, so that none is lost at high rates',
+        choices=TOPICS,
     )
-    lockstep_patience_s: float = parameter(PATIENCE_S, PATIENCE_WORDS, low=0.1, high=3600.0)
+    lockstep_patience_s: float = parameter(TIMEOUT_S, TIMEOUT_DESCRIPTION, low=0.1, high=3600.0)
     hold_for_subscribers: int = parameter(
-        0, 'time stands still until /scan has so many subscribers', low=0, high=100
+        0, 'wait at the start until /scan has this number of subscribers', low=0, high=100
     )
     publish_tf: bool = parameter(True, 'publish odom -> base_link and base_link -> laser')
 

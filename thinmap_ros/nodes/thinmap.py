@@ -19,12 +19,12 @@ There are also: {', '.join(_OTHERS)}.
 A parameter goes to every node that has it; -p localizer:slam:=off goes to one."""
 
 
-def makers(names: list[str]) -> list[Callable[[], Node]]:
-    """What makes the nodes of these modules of this package, one each."""
+def node_factories(names: list[str]) -> list[Callable[[], Node]]:
+    """Functions that create the nodes of these modules, one each."""
 
     def make(name: str) -> Node:
-        # Imported here: a node that is not asked for costs nothing. All of them before the first
-        # is made: the kernels of all are counted then.
+        # Imported here: a node that is not chosen costs nothing. All are imported before the first
+        # is created, so that the kernels of all are counted.
         modules = {each: import_module(f'thinmap_ros.nodes.{each}') for each in names}
         return getattr(modules[name], f'{name.title().replace("_", "")}Node')()
 
@@ -46,7 +46,7 @@ def main() -> None:
             file=sys.stderr,
         )
         sys.exit(2)
-    node_main.run_all(makers(names))
+    node_main.run_all(node_factories(names))
 
 
 if __name__ == '__main__':

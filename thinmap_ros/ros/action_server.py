@@ -1,4 +1,4 @@
-"""An action server with one goal at a time, driven by callbacks: nothing waits inside of it."""
+"""An action server with one goal at a time, driven by callbacks without blocking."""
 
 from collections.abc import Callable
 from enum import Enum
@@ -19,13 +19,13 @@ class Outcome(Enum):
 
 
 class SingleGoalServer:
-    """Takes a goal, lets the node work on it in its own callbacks, answers once `finish` is called.
+    """Accepts a goal, and returns its result when the node calls `finish`.
 
-    Goals are taken while the node is active. A new goal takes the place of the old one, which is
-    aborted with what `preempted` returns. rclpy runs a goal in a coroutine, and one that waits
-    keeps the executor busy all the time; here the goal's coroutine is started only when its result
-    is there. `on_cancel` only hears that the goal is to be ended: it calls `finish` later, from
-    another callback, when the goal's state has changed.
+    Goals are accepted while the node is active. A new goal preempts the old one, which is aborted
+    with the result of `preempted`. rclpy runs a goal in a coroutine, and one that waits keeps the
+    executor busy; here the coroutine starts when the result is known. `on_cancel` records the
+    request: the node calls `finish` later, from another callback, when the goal's state has
+    changed.
     """
 
     def __init__(
@@ -56,16 +56,16 @@ class SingleGoalServer:
 
     @property
     def active(self) -> bool:
-        """Whether a goal is being worked on."""
+        """Whether there is a goal."""
         return self._handle is not None
 
     def feedback(self, message: Any) -> None:
-        """Publish feedback on the goal; nothing where there is none."""
+        """Publish feedback on the goal, if there is one."""
         if self._handle is not None:
             self._handle.publish_feedback(message)
 
     def finish(self, outcome: Outcome, result: Any) -> None:
-        """End the goal with a result; nothing where there is none."""
+        """End the goal, if there is one, with a result."""
         handle = self._handle
         self._handle = None
         if handle is not None:

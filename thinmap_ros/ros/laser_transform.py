@@ -1,7 +1,4 @@
-"""Where the laser sits on the robot.
-
-From /tf_static, or from a parameter where the user chose so.
-"""
+"""The pose of the laser on the robot, from /tf_static or from a parameter."""
 
 import numpy as np
 from rclpy.node import Node
@@ -15,15 +12,14 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.logs.laser_mount import Mount, StaticTransforms
 from thinmap_ros.ros import messages, parameters, qos
 
-_MOST_FRAMES = 1000
+_MAX_FRAMES = 1000
 
 
 class LaserTransform:
     """The pose of each laser frame on the robot.
 
-    Looked up in the static transforms, as bags are read. A node whose robot publishes none is given
-    the parameter `laser_pose` [x m, y m, yaw rad]; it then holds for every frame. Nothing is ever
-    assumed.
+    It is looked up in the static transforms, as for bags. For a robot that does not publish them,
+    the parameter `laser_pose` [x m, y m, yaw rad] is used for every frame. There is no default.
     """
 
     def __init__(self, node: Node) -> None:
@@ -41,8 +37,8 @@ class LaserTransform:
                 node,
                 'zero_is_no_return',
                 False,
-                'a range of 0 means that nothing was met (LDS of the TurtleBot 3); false: that the '
-                'beam is invalid',
+                'a range of 0 is a beam without return (LDS of the TurtleBot 3); false: an '
+                'invalid beam',
             )
         )
         self._fixed = Mount(_parse_pose(str(given)), upside_down=False) if given else None
@@ -56,7 +52,7 @@ class LaserTransform:
     def to_scan(self, message: LaserScan) -> Scan:
         """Scan of a message, with the pose of its laser.
 
-        Raises InputError where that is not known, or the message is no scan.
+        Raises InputError where the pose is unknown or the message is no scan.
         """
         mount = self._mount(message.header.frame_id)
         if mount is None:
@@ -69,7 +65,7 @@ class LaserTransform:
         return mount.apply(scan)
 
     def pose(self, frame_id: str) -> Array | None:
-        """T_base_laser (3,) of a laser frame, or None as long as it is not known."""
+        """T_base_laser (3,) of a laser frame; None until it is known."""
         mount = self._mount(frame_id)
         return None if mount is None else mount.T_base_laser
 
@@ -87,10 +83,10 @@ class LaserTransform:
         self._mounts.clear()
         for transform in message.transforms:
             try:
-                if len(self._transforms.frames) < _MOST_FRAMES:
+                if len(self._transforms.frames) < _MAX_FRAMES:
                     self._transforms.add(transform)
             except InputError:
-                continue  # a transform that is none tells nothing: its frame stays unknown
+                continue  # the frame of an invalid transform stays unknown
 
 
 def _parse_pose(text: str) -> Array:

@@ -1,7 +1,4 @@
-"""Time that waits for the nodes.
-
-With it a log or a simulation can run at any rate, and no scan is lost.
-"""
+"""Lockstep: a player or simulation waits for the result of each scan, so that none is lost."""
 
 from time import monotonic
 from typing import Any
@@ -21,18 +18,15 @@ _TYPES: dict[str, Any] = {
     'localization_status': LocalizationStatus,
 }
 TOPICS = (NONE, *_TYPES)
-# Long: a machine that is busy, or compiles, is not one on which a scan leads to nothing.
-PATIENCE_S = 10.0
-PATIENCE_WORDS = 'in lockstep, go on without an answer after so long, s of the machine'
+# Long: a busy machine, or one that compiles kernels, still publishes a result.
+TIMEOUT_S = 10.0
+TIMEOUT_DESCRIPTION = 'in lockstep, continue without a result after this time, s of the machine'
 
 
 class Lockstep:
-    """Waits, after each scan, for the message of a topic that carries the scan's stamp.
+    """Waits, after each scan, for its result: the message of a topic with the stamp of the scan."""
 
-    What the scan led to.
-    """
-
-    def __init__(self, node: Node, topic: str, timeout_s: float = PATIENCE_S) -> None:
+    def __init__(self, node: Node, topic: str, timeout_s: float = TIMEOUT_S) -> None:
         self._node = node
         self._topic = topic
         self._timeout_s = timeout_s
@@ -42,26 +36,28 @@ class Lockstep:
             node.create_subscription(_TYPES[topic], topic, self._on_message, qos.STREAM)
 
     def scan_published(self, stamp_ns: int) -> None:
-        """Take note that a scan was published."""
+        """Wait for the result of a scan that was published."""
         if self._topic != NONE:
             self._awaited_ns = stamp_ns
             self._since = monotonic()
 
     @property
     def is_waiting(self) -> bool:
-        """Whether the answer to the last scan is still to come."""
+        """Whether the result of the last scan is missing."""
         return self._awaited_ns is not None
 
     @property
     def waited_s(self) -> float:
-        """How long the last scan has been waiting, s of the machine's time."""
+        """Time since the last scan was published, s of the machine."""
         return monotonic() - self._since
 
     def timed_out(self) -> bool:
-        """Whether patience is at an end; then waiting ends as well."""
+        """Whether the result has been missing for too long; waiting then ends."""
         if self.waited_s < self._timeout_s:
             return False
-        self._node.get_logger().warning(f'no /{self._topic} for the last scan: going on without it')
+        self._node.get_logger().warning(
+            f'no /{self._topic} for the last scan: continuing without it'
+        )
         self._awaited_ns = None
         return True
 

@@ -1,7 +1,4 @@
-"""ROS messages <-> core values; nothing else knows the layout of a message.
-
-Also message classes by name.
-"""
+"""Conversion between ROS messages and core values; message classes by name."""
 
 import math
 import re
@@ -38,7 +35,7 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 
 SECOND_NS = 1_000_000_000
-# Nothing else is imported because a bag or a publisher names it.
+# A bag or a publisher cannot name anything else to import.
 _TYPE_NAME = re.compile(r'([a-z]\w*)/msg/([A-Z]\w*)', re.ASCII)
 
 
@@ -61,7 +58,7 @@ def message_class(type_name: str) -> Any:
 
 
 def stamp_ns(stamp: Time) -> int:
-    """Time message as whole nanoseconds. Raises InputError where it is no time."""
+    """Time message as whole nanoseconds. Raises InputError where it is invalid."""
     if stamp.sec < 0 or stamp.nanosec >= SECOND_NS:
         raise InputError(
             f'stamp {stamp.sec} s, {stamp.nanosec} ns: '
@@ -92,10 +89,9 @@ def header(frame_id: str, ns: int) -> Header:
 
 
 def scan_from_msg(message: LaserScan, T_base_laser: Array, zero_is_no_return: bool = False) -> Scan:
-    """Scan from its message, the laser's pose on the robot and what a range of 0 means for it.
+    """Scan of a message; T_base_laser (3,), zero_is_no_return: what a range of 0 means.
 
-    Raises InputError as `Scan.create`, and where it has no beams, too many, or beams at angles that
-    there are not.
+    Raises InputError as `Scan.create`, and where it has no beams, too many, or impossible angles.
     """
     count = len(message.ranges)
     if not 0 < count <= validation.MAX_BEAMS:
@@ -133,7 +129,7 @@ def scan_msg(scan: Scan, frame_id: str, scan_time_s: float) -> LaserScan:
 
 
 def yaw_of(q: Quaternion) -> float:
-    """Heading of a rotation, rad. Raises InputError where it is no rotation (norm not 1)."""
+    """Yaw of a quaternion, rad. Raises InputError where its norm is not 1."""
     norm = math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
     if not abs(norm - 1.0) < 0.01:
         raise InputError(f'quaternion ({q.x}, {q.y}, {q.z}, {q.w}): expected norm 1, not {norm}')
@@ -141,12 +137,12 @@ def yaw_of(q: Quaternion) -> float:
 
 
 def quaternion_msg(yaw_rad: float) -> Quaternion:
-    """Rotation about z."""
+    """Quaternion of a rotation about z."""
     return Quaternion(z=math.sin(yaw_rad / 2.0), w=math.cos(yaw_rad / 2.0))
 
 
 def pose_from_msg(message: Pose) -> Array:
-    """Planar pose (3,). Raises InputError where it is nowhere near (1000 km) or no rotation."""
+    """Planar pose (3,). Raises InputError where it is beyond 1000 km or no rotation."""
     validation.require_bounded('position', (message.position.x, message.position.y))
     return se2.pose(message.position.x, message.position.y, yaw_of(message.orientation))
 
@@ -178,7 +174,7 @@ def pose_with_covariance_msg(
 def covariance_from_msg(message: PoseWithCovarianceStamped) -> Array:
     """Covariance (3, 3) over x, y, theta.
 
-    Raises InputError where it is none: not finite, or below 0.
+    Raises InputError where it is not finite or has a negative eigenvalue.
     """
     full = np.asarray(message.pose.covariance, dtype=np.float64).reshape(6, 6)
     part = full[np.ix_((0, 1, 5), (0, 1, 5))]
@@ -225,7 +221,7 @@ def path_msg(points: Array, frame_id: str, ns: int) -> Path:
 
 
 def trajectory_msg(stamps_ns: list[int], poses: Array, frame_id: str, ns: int) -> Path:
-    """Path of poses (N, 3), each with a stamp of its own."""
+    """Path of poses (N, 3) with their stamps."""
     message = path_msg(poses, frame_id, ns)
     for pose, stamp in zip(message.poses, stamps_ns, strict=True):
         pose.header.stamp = time_msg(stamp)
@@ -233,13 +229,13 @@ def trajectory_msg(stamps_ns: list[int], poses: Array, frame_id: str, ns: int) -
 
 
 def trajectory_from_msg(message: Path) -> tuple[NDArray[np.int64], Array]:
-    """Stamps (N,) and poses (N, 3) of a path. Raises InputError where a pose is none."""
+    """Stamps (N,) and poses (N, 3) of a path. Raises InputError where a pose is invalid."""
     stamps = np.array([stamp_ns(pose.header.stamp) for pose in message.poses], dtype=np.int64)
     return stamps, np.array([pose_from_msg(pose.pose) for pose in message.poses]).reshape(-1, 3)
 
 
 def grid_msg(patch: GridPatch, frame_id: str, ns: int, corrected_ns: int = 0) -> OccupancyGrid:
-    """Map message; corrected_ns: stamp of the newest trajectory that its grid has undergone."""
+    """Map message; corrected_ns: stamp of the newest trajectory that its grid follows."""
     message = OccupancyGrid(header=header(frame_id, ns))
     message.info.map_load_time = time_msg(corrected_ns)
     message.info.resolution = patch.frame.resolution
@@ -254,11 +250,11 @@ def grid_msg(patch: GridPatch, frame_id: str, ns: int, corrected_ns: int = 0) ->
 def grid_from_msg(message: OccupancyGrid) -> GridPatch:
     """Patch of a map message.
 
-    Raises InputError where size and data do not fit, the map is turned, or its cells or their size
-    make no sense.
+    Raises InputError where size and data disagree, the map is rotated, or its cells or resolution
+    are out of range.
     """
     info = message.info
-    # The message carries a float32; 0.1 has to be the same 0.1 on both sides.
+    # The message holds a float32: 0.1 must be the same number on both sides.
     resolution = round(float(info.resolution), 6)
     size_fits = len(message.data) == info.width * info.height
     if not size_fits or not MIN_RESOLUTION_M <= resolution <= MAX_RESOLUTION_M:
@@ -269,7 +265,7 @@ def grid_from_msg(message: OccupancyGrid) -> GridPatch:
         )
     origin = pose_from_msg(info.origin)
     if abs(origin[2]) > 1e-6:
-        raise InputError(f'map turned by {origin[2]} rad: expected an origin without rotation')
+        raise InputError(f'map rotated by {origin[2]} rad: expected an origin without rotation')
     cells = np.frombuffer(message.data, dtype=np.int8).reshape(info.height, info.width)
     validation.require_occupancy(cells)
     return GridPatch(GridFrame(float(origin[0]), float(origin[1]), resolution), cells)
@@ -307,8 +303,8 @@ def _edge_msg(edge: Edge) -> TopologicalEdge:
 def topology_from_msg(message: TopologicalMapMsg) -> TopologicalMap:
     """Topological map of a message.
 
-    Raises InputError where a kind is unknown, an edge leads to no node, a number is given twice, or
-    one is no number.
+    Raises InputError where a kind is unknown, an edge has no node, an id occurs twice, or a number
+    is not finite.
     """
     validation.require_unique('nodes', [n.id for n in message.nodes])
     validation.require_unique('edges', [e.id for e in message.edges])
@@ -333,7 +329,7 @@ def topology_from_msg(message: TopologicalMapMsg) -> TopologicalMap:
             (edge.length_m, edge.clearance_m, *(c for p in edge.path for c in (p.x, p.y))),
         )
         if not edge.path:
-            raise InputError(f'edge {edge.id}: a path without points')
+            raise InputError(f'edge {edge.id}: empty path: expected points')
     nodes = [
         Node(n.id, NodeKind(n.kind), n.position.x, n.position.y, float(n.clearance_m))
         for n in message.nodes

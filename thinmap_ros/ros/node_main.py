@@ -1,4 +1,4 @@
-"""How a process of one node or several starts, spins and ends."""
+"""Start, spin and end of a process of one node or several."""
 
 import gc
 import os
@@ -23,22 +23,20 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def run(make_node: Callable[[], Node]) -> None:
-    """Make a node and spin it until SIGINT or SIGTERM.
+    """Create a node and spin it until SIGINT or SIGTERM.
 
-    The process ends with 0, or 2 on a refused start.
+    The process ends with 0, or with 2 where the start fails with a ThinmapError.
 
-    A node may have a method `start()`, called once it is made, and a method `close()`: it is called
+    A node may have a method `start()`, called after its creation, and a method `close()`, called
     last, whatever ended the node.
     """
     run_all([make_node])
 
 
 def run_all(make_nodes: Sequence[Callable[[], Node]]) -> None:
-    """Make several nodes and spin them in one process, each in a thread of its own.
+    """Create several nodes and spin them in one process, each in a thread of its own.
 
-    The first to end ends all.
-
-    Parameters that are given to all of them need to be known to one of them.
+    The first that ends, ends all. A parameter that is given to all needs to be known to one.
     """
     _init()
     _on_signals(_leave)
@@ -51,7 +49,7 @@ def run_all(make_nodes: Sequence[Callable[[], Node]]) -> None:
             getattr(node, 'start', lambda: None)()
         compilation.end()
         release_compiler_pages()
-        # What the start has made stays. With it, a full collection takes longer than any scan.
+        # Objects of the start stay. With them, a full collection takes longer than a scan.
         gc.freeze()
         _spin(nodes)
     except ExternalShutdownException:
@@ -60,7 +58,7 @@ def run_all(make_nodes: Sequence[Callable[[], Node]]) -> None:
         print(f'error: {error}', file=sys.stderr)
         sys.exit(2)
     finally:
-        _on_signals(signal.SIG_IGN)  # ending is short: a second signal must not cut it off
+        _on_signals(signal.SIG_IGN)  # a second signal must not interrupt the end, which is short
         for node in reversed(nodes):
             getattr(node, 'close', lambda: None)()
             node.destroy_node()
@@ -68,7 +66,7 @@ def run_all(make_nodes: Sequence[Callable[[], Node]]) -> None:
 
 
 def _init() -> None:
-    """Take the arguments after --ros-args; ends with 2 and a line where they are wrong."""
+    """Parse the arguments after --ros-args; ends with 2 and an error line where they are wrong."""
     try:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     except rclpy_implementation.RCLError as error:
@@ -77,20 +75,19 @@ def _init() -> None:
 
 
 def _spin(nodes: list[Node]) -> None:
-    asked = threading.Event()
-    # Only noted: an exception raised just anywhere comes out of compiled code as another error, or
-    # gets lost in it.
-    _on_signals(lambda number, frame: asked.set())
+    stop_event = threading.Event()
+    # Only recorded: an exception raised in compiled code is replaced by another one, or lost.
+    _on_signals(lambda number, frame: stop_event.set())
     failures: list[BaseException] = []
     others = [
-        threading.Thread(target=_spin_one, args=(node, asked, failures)) for node in nodes[1:]
+        threading.Thread(target=_spin_one, args=(node, stop_event, failures)) for node in nodes[1:]
     ]
     for thread in others:
         thread.start()
     try:
-        _spin_one(nodes[0], asked, failures, compiler_memory_releaser())
+        _spin_one(nodes[0], stop_event, failures, compiler_memory_releaser())
     finally:
-        asked.set()
+        stop_event.set()
         for thread in others:
             thread.join()
     if failures:
@@ -99,21 +96,21 @@ def _spin(nodes: list[Node]) -> None:
 
 def _spin_one(
     node: Node,
-    asked: threading.Event,
+    stop_event: threading.Event,
     failures: list[BaseException],
-    each_time: Callable[[], None] = lambda: None,
+    after_each_call: Callable[[], None] = lambda: None,
 ) -> None:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     try:
-        while rclpy.ok() and not asked.is_set() and not getattr(node, 'finished', False):
-            # A bounded wait: Python sees signals only between calls.
+        while rclpy.ok() and not stop_event.is_set() and not getattr(node, 'finished', False):
+            # A bounded wait: Python handles signals only between calls.
             executor.spin_once(timeout_sec=0.25)
-            each_time()
-    except Exception as error:  # kept for the main thread, which says what it was
+            after_each_call()
+    except Exception as error:  # raised by the main thread
         failures.append(error)
     finally:
-        asked.set()
+        stop_event.set()
 
 
 def _on_signals(handler: Any) -> None:
@@ -122,5 +119,5 @@ def _on_signals(handler: Any) -> None:
 
 
 def _leave(number: int, frame: object) -> None:
-    """End at once: a node that does not listen yet has nothing to finish."""
+    """End at once: a node that does not spin yet has nothing to finish."""
     os._exit(0)

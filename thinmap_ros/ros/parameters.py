@@ -1,7 +1,4 @@
-"""Config dataclasses of core <-> declared ROS parameters.
-
-One home for each default, seen from ROS.
-"""
+"""Declaration of ROS parameters from the Config dataclasses of core, which hold the defaults."""
 
 import dataclasses
 from collections.abc import Callable, Collection, Iterator
@@ -42,9 +39,9 @@ def declare_config(
 ) -> AnyConfig:
     """Declare each field of a config as a parameter of the node; return the config as it was set.
 
-    All are read-only, but where `changed` is given: then those named in `live` (None: all) can be
-    set at run time, and `changed` gets the new config. A setting that the config refuses is refused
-    with its reason.
+    Parameters are read-only without `changed`. With it, those named in `live` (None: all) can be
+    set at run time, and `changed` is called with the new config. A value that the config rejects is
+    rejected with its reason.
     Raises ConfigError where a value is outside its range or of the wrong type.
     """
     declared = list(parameters_of(config()))
@@ -65,7 +62,7 @@ def declare_config(
 
 
 class _Changes(Generic[AnyConfig]):
-    """Takes new values of a config at run time: all that are set together, or none."""
+    """Changes a config at run time: all values that are set together, or none."""
 
     def __init__(
         self, node: Node, current: AnyConfig, free: set[str], changed: Callable[[AnyConfig], None]
@@ -94,13 +91,13 @@ class _Changes(Generic[AnyConfig]):
         new = self._with(given)
         if new != self._current:
             self._current = new
-            told = ', '.join(f'{p.name} = {p.value}' for p in given if p.name in self._free)
-            self._node.get_logger().info(f'changed: {told}')
+            changes = ', '.join(f'{p.name} = {p.value}' for p in given if p.name in self._free)
+            self._node.get_logger().info(f'changed: {changes}')
             self._changed(new)
 
 
 def declare_parameter(node: Node, name: str, default: Any, description: str) -> Any:
-    """Declare one read-only parameter that belongs to the node itself, and return its value."""
+    """Declare a read-only parameter of the node, and return its value."""
     descriptor = ParameterDescriptor(description=description, read_only=True)
     try:
         return node.declare_parameter(name, default, descriptor).value
@@ -112,7 +109,10 @@ def declare_session(node: Node) -> str:
     """Declare the parameter `session` and return its value."""
     return str(
         declare_parameter(
-            node, 'session', '', 'path STEM of a saved session to go on from; empty: begin anew'
+            node,
+            'session',
+            '',
+            'path STEM of a saved session to continue; empty: start with an empty map',
         )
     )
 
@@ -124,13 +124,13 @@ def declare_recovery(node: Node) -> float:
             node,
             'recover_s',
             30.0,
-            'killed and started again within so many s, go on from there; 0: never',
+            'continue from the checkpoint of a killed node up to this age, s; 0: never',
         )
     )
 
 
 def reject_unknown(node: Node) -> None:
-    """Raise ConfigError where a parameter was given that the node does not have.
+    """Raise ConfigError where a parameter was given that the node does not have: a typo.
 
     A typo must not go unseen. Parameters of the robot are accepted by every node. Where several
     nodes share a process, a parameter may be meant for another one: the last of them raises.
@@ -159,7 +159,7 @@ def reject_unknown(node: Node) -> None:
 
 @dataclasses.dataclass
 class _Shared:
-    """What nodes that share a process were given and know, together."""
+    """Parameters that the nodes of one process were given, and those that they declared."""
 
     count: int
     names: list[str] = dataclasses.field(default_factory=list)
@@ -172,7 +172,7 @@ _SHARED: ContextVar[_Shared | None] = ContextVar('shared', default=None)
 
 @contextmanager
 def shared_process(count: int) -> Iterator[None]:
-    """Let so many nodes, made inside, share what parameters they are given."""
+    """Let `count` nodes that are created inside share the parameters that they are given."""
     token = _SHARED.set(_Shared(count) if count > 1 else None)
     try:
         yield

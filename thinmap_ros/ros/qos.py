@@ -1,4 +1,4 @@
-"""Qualities of service of the topics, by what they carry."""
+"""Quality of service of the topics, by kind of data."""
 
 from rclpy.qos import (
     DurabilityPolicy,
@@ -30,9 +30,9 @@ STATIC_TRANSFORMS = QoSProfile(
 
 
 def as_recorded(topic: str, offers: list[Qos]) -> QoSProfile:
-    """What to offer when a topic of a bag is played: what was offered when it was recorded."""
+    """Quality of service of a topic of a bag when it is played: as it was recorded."""
     latched = is_latched(topic, offers)
-    # Each part of the tree of static transforms came from somebody else; all of them are kept.
+    # Static transforms have many publishers; a late subscriber needs all of them.
     least = (
         STATIC_TRANSFORMS.depth if topic.endswith('tf_static') else 1 if latched else STREAM.depth
     )

@@ -1,7 +1,7 @@
-"""Where services may read and write: below one folder that the operator chose, wherever links lead.
+"""Directory in which services may read and write, symbolic links resolved.
 
-Whoever can call a service can name a path in it. What the operator names when starting a node (the
-parameters `session` and `map`) is not confined.
+Any caller of a service can name a path. Paths that the operator gives when starting a node (the
+parameters `session` and `map`) are not confined.
 """
 
 from pathlib import Path
@@ -12,11 +12,11 @@ from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.files.sessions import ENDINGS, stem_of
 from thinmap_ros.ros import parameters
 
-_LONGEST_PATH = 1000
+_MAX_PATH_LENGTH = 1000
 
 
 class SaveDirectory:
-    """The folder below which the paths of a node's services lie."""
+    """The directory that contains the paths of a node's services."""
 
     def __init__(self, node: Node) -> None:
         """Declare the parameter `save_folder`; empty: the working directory of the node."""
@@ -25,14 +25,14 @@ class SaveDirectory:
         self.path = Path(str(given)).resolve()
 
     def resolve(self, given: str) -> str:
-        """Return the absolute path of what a service names below this folder, links resolved.
+        """Absolute path of a session that a service names, links resolved.
 
-        Raises InputError where it, or a file of the session that it names, is elsewhere.
+        Raises InputError where it, or a file of the session, is outside of this directory.
         """
         expected = f'expected a file below {self.path}'
-        if not given.isprintable() or len(given) > _LONGEST_PATH:
+        if not given.isprintable() or len(given) > _MAX_PATH_LENGTH:
             raise InputError(f'path {quoted(given)}: {expected}')
-        stem_of(given)  # a path that names no session is refused as such
+        stem_of(given)  # raises for a path that names no session
         try:
             resolved = (self.path / given).resolve()
             stem = stem_of(str(resolved))

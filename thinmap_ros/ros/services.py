@@ -1,4 +1,4 @@
-"""Services that answer with success and a message, and how one node asks another for them."""
+"""Services with the response `success` and `message`: filled in by a node, called by another."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,11 +9,11 @@ from rclpy.node import Node
 
 from thinmap_ros.core.errors import ThinmapError
 
-_LIMIT_S = 10.0
+_TIMEOUT_S = 10.0
 
 
 def fill_response(response: Any, work: Callable[[], str]) -> Any:
-    """Fill in a response: success and what `work` says that it did, or what kept it from that."""
+    """Fill in a response: the message that `work` returns, or the error that it raises."""
     try:
         response.message = work()
         response.success = True
@@ -24,19 +24,18 @@ def fill_response(response: Any, work: Callable[[], str]) -> Any:
 
 
 async def call(node: Node, client: Client, request: Any) -> Any | None:
-    """Answer of another node's service.
+    """Response of another node's service, for callbacks that are coroutines.
 
-    None where nobody offers it, success = false where no answer comes in time.
-
-    For callbacks that are coroutines. The client needs a callback group that the one who waits does
-    not keep busy. The time is that of the machine: a simulated one may stand still.
+    None where no node offers it; success = false where there is no answer in time. The callback
+    group of the client must not be blocked by the waiting callback. The timeout is in time of the
+    machine, as simulated time may stand still.
     """
     if not client.service_is_ready():
         return None
     future = client.call_async(request)
     wall = Clock(clock_type=ClockType.STEADY_TIME)
     timer = node.create_timer(
-        _LIMIT_S, future.cancel, callback_group=client.callback_group, clock=wall
+        _TIMEOUT_S, future.cancel, callback_group=client.callback_group, clock=wall
     )
     await future
     node.destroy_timer(timer)
@@ -44,5 +43,5 @@ async def call(node: Node, client: Client, request: Any) -> Any | None:
         return future.result()
     client.remove_pending_request(future)
     return client.srv_type.Response(
-        message=f'{client.srv_name}: no answer within {_LIMIT_S:.0f} s', success=False
+        message=f'{client.srv_name}: no answer within {_TIMEOUT_S:.0f} s', success=False
     )

@@ -1,7 +1,6 @@
-"""How nodes listen.
+"""Guarded subscriptions: messages are processed while the node is active.
 
-Only while active, and what a message says wrongly is counted and said, and the node goes on.
-What of a stream did not come is counted too.
+Invalid messages are counted, logged and dropped; messages lost on the way are counted.
 """
 
 from collections import deque
@@ -15,9 +14,9 @@ from sensor_msgs.msg import LaserScan
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 
-_QUIET_S = 5.0
-_SILENT_S = 3.0
-_LONGEST_GAP_NS = 5_000_000_000  # longer gaps are pauses of the sensor, no losses
+_LOG_PERIOD_S = 5.0
+_TIMEOUT_S = 3.0
+_MAX_GAP_NS = 5_000_000_000  # longer gaps are pauses of the sensor, no losses
 
 
 def subscribe_guarded(
@@ -25,13 +24,13 @@ def subscribe_guarded(
 ) -> None:
     """Subscribe to a topic.
 
-    A message that `process` refuses with InputError is dropped with a warning, throttled.
+    A message for which `process` raises InputError is dropped with a throttled warning.
     """
-    _Listener(node, kind, topic, process, profile)
+    _GuardedSubscription(node, kind, topic, process, profile)
 
 
-class _Listener:
-    """A subscription, and what is to be known of it."""
+class _GuardedSubscription:
+    """A subscription with the state that its checks need."""
 
     def __init__(
         self,
@@ -46,17 +45,17 @@ class _Listener:
         self._process = process
         self._is_scan = kind is LaserScan
         self._is_latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
-        self._held: Any = None
-        self._said_at = -_QUIET_S
+        self._latched_message: Any = None
+        self._logged_s = -_LOG_PERIOD_S
         self._last_ns = 0
-        self._set_backs = 0
+        self._time_jumps = 0
         self._losses = MessageLossCounter()
         node.diagnostics.expect_topic(topic)
         node.create_subscription(kind, topic, self._on_message, profile)
         if self._is_scan:
-            node.diagnostics.add_timeout_check(topic, _SILENT_S)
+            node.diagnostics.add_timeout_check(topic, _TIMEOUT_S)
         if self._is_latched:
-            node.add_activation_callback(self._process_held)
+            node.add_activation_callback(self._process_latched)
 
     def _on_message(self, message: Any, info: dict[str, Any]) -> None:
         node = self._node
@@ -66,26 +65,24 @@ class _Listener:
         if not self._is_latched:
             self._count_losses(info.get('publication_sequence_number'))
         node.handle_time_jump()
-        if self._is_left_over(last_ns):
+        if self._is_outdated(last_ns):
             node.diagnostics.count_drops(f'{self._topic}: from before the clock jumped back', 1)
         elif not node.is_active:
-            self._held = message if self._is_latched else None
+            self._latched_message = message if self._is_latched else None
         elif not (self._is_scan and node.is_paused):
             self._guarded(message)
 
-    def _is_left_over(self, last_ns: int) -> bool:
-        """Whether a message has waited here since before the clock was set back.
+    def _is_outdated(self, last_ns: int) -> bool:
+        """Whether a message was queued before the clock jumped back: it continues that stream.
 
-        It goes on where the stream was then.
-
-        With the first that does not, the stream has arrived in the new time.
+        The first one that does not continue it starts the stream of the new time.
         """
         node = self._node
-        if self._set_backs == node.time_jumps.count:
+        if self._time_jumps == node.time_jumps.count:
             return False
         if node.time_jumps.is_before(last_ns) and node.time_jumps.is_before(self._last_ns):
             return True
-        self._set_backs = node.time_jumps.count
+        self._time_jumps = node.time_jumps.count
         return False
 
     def _count_losses(self, number: int | None) -> None:
@@ -101,24 +98,22 @@ class _Listener:
             self._process(message)
         except InputError as error:
             self._node.diagnostics.message_rejected(self._topic, str(error))
-            if monotonic() - self._said_at >= _QUIET_S:
-                self._said_at = monotonic()
+            if monotonic() - self._logged_s >= _LOG_PERIOD_S:
+                self._logged_s = monotonic()
                 self._node.get_logger().warning(f'{self._topic}: {error}')
 
-    def _process_held(self) -> None:
-        message = self._held
-        self._held = None
+    def _process_latched(self) -> None:
+        message = self._latched_message
+        self._latched_message = None
         if message is not None:
             self._guarded(message)
 
 
 class MessageLossCounter:
-    """What of a stream was lost on the way, or never sent.
+    """Counts the messages of a stream that were lost in transport or never sent.
 
-    Counts by the numbers that a publisher gives its messages, and by their evenly spaced stamps.
-
-    Either alone is not enough: numbers of two publishers are mixed up, and a sensor that was silent
-    has lost nothing.
+    It compares the sequence numbers of the publisher with the evenly spaced stamps. Either alone is
+    not enough: two publishers have independent numbers, and a silent sensor has lost nothing.
     """
 
     def __init__(self) -> None:
@@ -127,10 +122,10 @@ class MessageLossCounter:
         self._steps_ns: deque[int] = deque(maxlen=50)
 
     def record(self, stamp_ns: int, number: int | None) -> tuple[int, int]:
-        """Take note of a message and of its number, None where the middleware gives none.
+        """Record a message with its sequence number (None: the middleware has none).
 
-        Returns how many between it and the last one were lost on the way, and how many more are
-        missing: never sent, or without numbers nobody knows.
+        Returns how many messages between it and the last one were lost in transport, and how many
+        more are missing: never sent, or lost without sequence numbers.
         """
         step_ns = stamp_ns - self._last_ns
         self._last_ns = stamp_ns
@@ -141,9 +136,9 @@ class MessageLossCounter:
         spaces = round(step_ns / min(self._steps_ns, default=step_ns)) - 1
         self._steps_ns.append(step_ns)
         lost = min(max(skipped, 0), max(spaces, 0))
-        return lost, spaces - lost if spaces > 0 and step_ns < _LONGEST_GAP_NS else 0
+        return lost, spaces - lost if spaces > 0 and step_ns < _MAX_GAP_NS else 0
 
 
 def _stamp_ns(message: Any) -> int:
-    """Stamp of a message as it says it, however strange."""
+    """Stamp of a message, unchecked."""
     return int(1_000_000_000 * message.header.stamp.sec + message.header.stamp.nanosec)
