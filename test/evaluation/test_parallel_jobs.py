@@ -98,6 +98,7 @@ def test_what_is_finished_is_not_run_again(tmp_path: Path) -> None:
         read_report(tmp_path / 'b.json', [3.0])
 
 
+@pytest.mark.programs
 def test_a_cluster_tells_what_fails_as_well(tmp_path: Path) -> None:
     distributed = pytest.importorskip('distributed')
     jobs = [Sum('a', (1.0,)), Sum('refused', ())]
@@ -110,6 +111,7 @@ def test_a_cluster_tells_what_fails_as_well(tmp_path: Path) -> None:
     assert read_report(tmp_path / 'a.json', [1.0])['sum'] == 1.0
 
 
+@pytest.mark.programs
 @pytest.mark.parametrize('end', [signal.SIGTERM, signal.SIGKILL])
 def test_a_job_ends_with_the_program_that_runs_it(tmp_path: Path, end: signal.Signals) -> None:
     program = tmp_path / 'long.py'

@@ -76,6 +76,7 @@ def packed_zeros(compression: str, size: int) -> bytes:
     return b''.join([*(stream.compress(piece) for _ in range(size // 2**20)), stream.flush()])
 
 
+@pytest.mark.programs
 @pytest.mark.parametrize('claimed', [2**20, EXPANDED, 2**62])
 @pytest.mark.parametrize('compression', ['lz4', 'zstd'])
 @pytest.mark.parametrize('tool', ['bag_repair', 'replay'])
@@ -181,6 +182,7 @@ def test_metadata_that_grow_in_memory_are_not_read(tmp_path: Path, said: str) ->
     assert len(str(error.value)) < 400
 
 
+@pytest.mark.programs
 @pytest.mark.usefixtures('in_short')
 @pytest.mark.parametrize('said', YAML_BOMBS)
 def test_offers_that_cannot_be_read_are_left_out(tmp_path: Path, said: str) -> None:
@@ -199,6 +201,7 @@ def test_offers_that_cannot_be_read_are_left_out(tmp_path: Path, said: str) -> N
     assert channel.metadata == {}
 
 
+@pytest.mark.programs
 def test_a_line_that_never_ends(tmp_path: Path) -> None:
     path = tmp_path / 'log.clf.gz'
     with gzip.open(path, 'wb', compresslevel=1) as out:

@@ -59,6 +59,7 @@ def run(folder: Path, program: str, *arguments: str) -> subprocess.CompletedProc
     return subprocess.run(command, capture_output=True, text=True, cwd=folder)
 
 
+@pytest.mark.programs
 @pytest.mark.parametrize('program', PROGRAMS)
 @pytest.mark.parametrize('name', ['old.bag', 'old.mcap', 'old.log'])
 def test_a_ros1_bag_is_named_with_the_command_that_converts_it(
@@ -73,6 +74,7 @@ def test_a_ros1_bag_is_named_with_the_command_that_converts_it(
     assert not (tmp_path / 'out').exists()
 
 
+@pytest.mark.programs
 def test_the_command_makes_a_bag_that_is_read(tmp_path: Path) -> None:
     ros1_bag(tmp_path / 'old.bag')
     with pytest.raises(InputError, match='a ROS 1 bag') as error:
@@ -88,6 +90,7 @@ def test_the_command_makes_a_bag_that_is_read(tmp_path: Path) -> None:
     assert not hasattr(scan.header, 'seq'), 'its bytes are not those of a ROS 2 message'
 
 
+@pytest.mark.programs
 @pytest.mark.parametrize('program', PROGRAMS)
 @pytest.mark.parametrize('name', ['bag_0.db3', 'bag_0.mcap'])
 def test_a_bare_sqlite_file_is_named_with_what_it_lacks(
@@ -101,6 +104,7 @@ def test_a_bare_sqlite_file_is_named_with_what_it_lacks(
     assert 'ros2 bag reindex' in line and 'rosbags-convert --src' in line
 
 
+@pytest.mark.programs
 def test_a_folder_of_sqlite_files_without_metadata(tmp_path: Path) -> None:
     (tmp_path / 'bag').mkdir()
     sqlite_file(tmp_path / 'bag' / 'bag_0.db3')
@@ -110,6 +114,7 @@ def test_a_folder_of_sqlite_files_without_metadata(tmp_path: Path) -> None:
     assert done.returncode == 2 and 'MCAP' in done.stderr
 
 
+@pytest.mark.programs
 def test_an_mcap_file_is_no_carmen_log_and_read_under_any_name(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'a.mcap') as writer:
         writer.write('/said', 'std_msgs/msg/String', 5, b'\0\1\0\0\1\0\0\0\0')

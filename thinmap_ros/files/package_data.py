@@ -1,11 +1,16 @@
-"""Files that come with the package."""
+"""Files that come with the package: worlds, and texts of message definitions.
 
-import contextlib
+They lie in the package where pip installed it, beside it in the source tree, and in the share
+folders of ROS where colcon installed it; they are looked for in this order.
+"""
+
+from collections.abc import Iterator
+from importlib import resources, util
 from pathlib import Path
 
-from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
-
 from thinmap_ros.core.errors import InputError, shown
+
+_PACKAGE = 'thinmap_ros'
 
 
 def world_path(name: str) -> Path:
@@ -28,18 +33,39 @@ def message_definitions(package: str) -> dict[str, str]:
 
     Empty where the package is not there.
     """
-    folder = (
-        Path(__file__).parents[2] / package / 'msg'
-    )  # from the source tree: not installed, or no ROS sourced
-    with contextlib.suppress(PackageNotFoundError, OSError):
-        folder = Path(get_package_share_directory(package)) / 'msg'
-    return {f'{package}/msg/{file.stem}': file.read_text() for file in sorted(folder.glob('*.msg'))}
+    for folder in _folders(package, 'msg'):
+        files = sorted(folder.glob('*.msg'))
+        if files:
+            return {f'{package}/msg/{file.stem}': file.read_text() for file in files}
+    return {}
 
 
 def _worlds() -> dict[str, Path]:
-    folders = [Path(__file__).parents[2] / 'worlds']
-    with contextlib.suppress(
-        PackageNotFoundError, OSError
-    ):  # from the source tree: not installed, or no ROS sourced
-        folders.append(Path(get_package_share_directory('thinmap_ros')) / 'worlds')
-    return {file.stem: file for folder in folders for file in folder.glob('*.yaml')}
+    """Worlds by name."""
+    worlds: dict[str, Path] = {}
+    for folder in _folders(_PACKAGE, 'worlds'):
+        for file in folder.glob('*.yaml'):
+            worlds.setdefault(file.stem, file)
+    return worlds
+
+
+def _folders(package: str, name: str) -> Iterator[Path]:
+    """Where a folder of a package's data may be, the best place first."""
+    yield Path(str(resources.files(_PACKAGE))) / 'data' / package / name
+    source = Path(__file__).parents[2]
+    yield source / name if package == _PACKAGE else source / package / name
+    share = _share(package)
+    if share is not None:
+        yield share / name
+
+
+def _share(package: str) -> Path | None:
+    """Share folder of an installed ROS package; None without ROS or without the package."""
+    if util.find_spec('ament_index_python') is None:
+        return None
+    from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
+
+    try:
+        return Path(get_package_share_directory(package))
+    except (PackageNotFoundError, OSError):  # OSError: no ROS is sourced
+        return None

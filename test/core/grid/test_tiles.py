@@ -129,6 +129,7 @@ assert (tiles.pool[:2000, 7, 7] == np.arange(2000)).all()
 """
 
 
+@pytest.mark.programs
 def test_where_the_address_space_is_limited_the_pool_grows_by_copies():
     """Room for the largest map would be 1 GB of this type: four times what there is."""
     done = subprocess.run([sys.executable, '-c', LIMITED], capture_output=True, text=True)

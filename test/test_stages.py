@@ -1,0 +1,25 @@
+"""scripts/test: its stages by name, and every test in one of them."""
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.mark.programs
+def test_a_wrong_stage_is_one_line_and_exit_code_2() -> None:
+    command = [str(ROOT / 'scripts' / 'test'), 'units']
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stdout == ''
+    assert done.stderr.startswith('scripts/test: units: expected')
+    assert done.stderr.endswith('a stage: lint unit without-ros live bounds\n')
+    assert done.stderr.count('\n') == 1
+
+
+def test_every_test_is_in_one_stage(request: pytest.FixtureRequest) -> None:
+    for item in request.session.items:
+        marks = {mark.name for mark in item.iter_markers()}
+        assert not {'programs', 'live'} <= marks, item.nodeid
