@@ -6,7 +6,7 @@ no result are listed in test/mutants/equivalent.tsv with their reasons, and are 
 
 import argparse
 import csv
-import random
+import hashlib
 import shutil
 import sys
 import time
@@ -63,8 +63,15 @@ def chosen(arguments: argparse.Namespace) -> list[Mutation]:
     for folder in arguments.folders:
         for file in sorted((arguments.root / folder).rglob('*.py')):
             found += mutations(file.relative_to(arguments.root), file.read_bytes())
-    random.Random(arguments.seed).shuffle(found)
+    # By texts, not by places: most of the choice stays the same when other code changes.
+    ranks = {mutation: _rank(arguments, mutation) for mutation in found}
+    found.sort(key=lambda mutation: (ranks[mutation], mutation))
     return [m for m in found[: arguments.count] if _is_wanted(m, arguments)]
+
+
+def _rank(arguments: argparse.Namespace, mutation: Mutation) -> bytes:
+    words = repr((arguments.seed, *change_of(arguments.root, mutation)))
+    return hashlib.sha256(words.encode()).digest()
 
 
 def _is_wanted(mutation: Mutation, arguments: argparse.Namespace) -> bool:

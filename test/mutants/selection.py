@@ -1,6 +1,7 @@
 """Which tests belong to a module: that of its name first, then those that import it."""
 
 import ast
+import itertools
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,22 +28,30 @@ class Selection:
         """Test files of a module, relative to the root, the nearest first."""
         inside = module.relative_to(self._root)
         mirrored = Path('test', *inside.parts[1:-1], f'test_{inside.name}')
-        near = [mirrored] if (self._root / mirrored).exists() else []
-        for files in self._by_distance(module):
-            tests = sorted(files, key=lambda file: (file.parent != mirrored.parent, file))
-            near += [file for file in tests if file not in near]
-            if len(near) >= MOST_FILES:
-                break
-        return near[:MOST_FILES]
+        distances = self._distances(module)
+        if (self._root / mirrored).exists():
+            distances[mirrored] = 0
 
-    def _by_distance(self, module: Path) -> Iterator[list[Path]]:
-        """Tests that import a module; those that import what imports it; and so on."""
+        def key(test: Path) -> tuple[bool, int, Path]:
+            is_near = distances[test] <= 1 or test.parent == mirrored.parent
+            return not is_near, distances[test], test
+
+        return sorted(distances, key=key)[:MOST_FILES]
+
+    def _distances(self, module: Path) -> dict[Path, int]:
+        """Tests that import a module, 1; that import what imports it, 2; and so on."""
+        distances: dict[Path, int] = {}
         known = {module}
         border = {module}
-        while border:
+        for distance in itertools.count(1):
             border = {importer for file in border for importer in self._importers[file]} - known
+            if not border:
+                break
             known |= border
-            yield [file.relative_to(self._root) for file in border if self._is_test(file)]
+            for file in border:
+                if self._is_test(file):
+                    distances[file.relative_to(self._root)] = distance
+        return distances
 
     def _is_test(self, file: Path) -> bool:
         if not file.is_relative_to(self._tests) or not file.name.startswith('test_'):
