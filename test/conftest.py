@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import pytest
@@ -50,14 +51,15 @@ def without_ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def started_programs(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A test that starts a program says so: unit tests are those that start none."""
+    """A test that starts a process says so: unit tests are those that start none."""
     if any(request.node.get_closest_marker(name) for name in ('programs', 'live')):
         return
 
     def refuse(*_: object, **__: object) -> None:
-        pytest.fail('starts a program: mark it with programs or live')
+        pytest.fail('starts a process: mark it with programs or live')
 
     monkeypatch.setattr(subprocess.Popen, '__init__', refuse)
+    monkeypatch.setattr(BaseProcess, 'start', refuse)
 
 
 @pytest.fixture(scope='session')

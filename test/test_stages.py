@@ -1,5 +1,6 @@
 """scripts/test: its stages by name, and every test in one of them."""
 
+import ast
 import subprocess
 from pathlib import Path
 
@@ -23,3 +24,11 @@ def test_every_test_is_in_one_stage(request: pytest.FixtureRequest) -> None:
     for item in request.session.items:
         marks = {mark.name for mark in item.iter_markers()}
         assert not {'programs', 'live'} <= marks, item.nodeid
+
+
+def test_what_test_modules_share_is_in_support() -> None:
+    tests = {path.stem: path for path in (ROOT / 'test').rglob('test_*.py')}
+    for path in tests.values():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                assert node.module.split('.')[-1] not in tests, f'{path}: {node.module}'

@@ -64,6 +64,7 @@ def run(folder, jobs, where=ONE_CORE):
     return run_missing(add, jobs, lambda job: folder / f'{job.name}.json', where, quiet=True)
 
 
+@pytest.mark.programs
 @pytest.mark.parametrize('processes', [1, 2])
 def test_one_that_fails_is_named_and_the_others_run(
     tmp_path: Path, processes: int, capsys: pytest.CaptureFixture[str]
@@ -88,6 +89,7 @@ def test_one_that_fails_is_named_and_the_others_run(
     assert sorted(path.stem for path in tmp_path.iterdir()) == ['a', 'b']
 
 
+@pytest.mark.programs
 def test_what_is_finished_is_not_run_again(tmp_path: Path) -> None:
     jobs = [Sum('a', (1.0,)), Sum('b', (2.0,))]
     (tmp_path / 'a.json').write_text(json.dumps({'options': [1.0], 'sum': 77.0}))
