@@ -99,7 +99,7 @@ class Driver:
         self.poses = 0
         self.first_s = 0.0
         self.simulated_s = 0.0
-        self.step_ms = {}
+        self.step_ms: dict[str, float] = {}
         deep = QoSProfile(depth=_DEPTH)
         self._node.create_subscription(PoseWithCovarianceStamped, 'pose', self._on_pose, deep)
         self._node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, deep)

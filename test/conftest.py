@@ -5,10 +5,12 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+from support.hidden_library import hide_ros
 from support.ros_domains import free_domain
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -36,6 +38,28 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     is_worker = hasattr(session.config, 'workerinput')
     if not is_worker and not session.config.option.collectonly and 'THINMAP_ENV' not in os.environ:
         subprocess.run([sys.executable, '-m', 'thinmap_ros.tools.warm_up'], cwd=ROOT, check=True)
+
+
+@pytest.fixture(scope='session', autouse=True)
+def without_ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """In the stage without ROS: ROS is hidden from all programs that the tests start."""
+    with pytest.MonkeyPatch.context() as patch:
+        if 'THINMAP_WITHOUT_ROS' in os.environ:
+            hide_ros(tmp_path_factory.mktemp('without_ros'), patch)
+        yield
+
+
+@pytest.fixture(autouse=True)
+def started_programs(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A test that starts a process says so: unit tests are those that start none."""
+    if any(request.node.get_closest_marker(name) for name in ('programs', 'live')):
+        return
+
+    def refuse(*_: object, **__: object) -> None:
+        pytest.fail('starts a process: mark it with programs or live')
+
+    monkeypatch.setattr(subprocess.Popen, '__init__', refuse)
+    monkeypatch.setattr(BaseProcess, 'start', refuse)
 
 
 @pytest.fixture(scope='session')

@@ -106,6 +106,7 @@ def test_every_room_is_known():
     assert rooms <= set(ROOMS) | {'__init__'}
 
 
+@pytest.mark.programs
 def test_core_imports_with_everything_else_blocked():
     modules = [
         'thinmap_ros.' + '.'.join(p.relative_to(PACKAGE).with_suffix('').parts)

@@ -196,6 +196,7 @@ def test_files_for_users_are_installed(folder):
     )
 
 
+@pytest.mark.programs
 @pytest.mark.parametrize('name', TOOLS)
 def test_every_tool_has_help(name):
     command = [sys.executable, '-m', f'thinmap_ros.tools.{name}', '--help']

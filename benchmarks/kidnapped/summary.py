@@ -132,7 +132,9 @@ def _usual(records: list[Written]) -> Iterator[Row]:
     yield from outcomes(records, 97.0, 0.5)
 
 
-_SUMMARIES: dict[str, Callable[[list[Written]], Iterator[Row]]] = {
+_Summary = Callable[[list[Written]], Iterator[Row]]
+_WORLDS = ('kth', 'dungeon', 'lasers', 'fine', 'driven')
+_SUMMARIES: dict[str, _Summary] = {
     'paper': lambda records: outcomes(records, 100.0, 0.0),
     'lab': lambda records: outcomes(records, 99.0, 0.0, 6.0),
     'voronoi': lambda records: outcomes(records, 99.0, 0.0, 6.0),
@@ -141,4 +143,5 @@ _SUMMARIES: dict[str, Callable[[list[Written]], Iterator[Row]]] = {
     'foreign_log': _foreign,
     'kidnapped': _kidnapped,
     'halves': _halves,
-} | dict.fromkeys(('kth', 'dungeon', 'lasers', 'fine', 'driven'), _usual)
+    **dict.fromkeys(_WORLDS, _usual),
+}

@@ -62,8 +62,10 @@ def measure(task: Task) -> Numbers:
     case = task.case
     if isinstance(case, LogCase):
         numbers = measure_log(case, task)
-    else:
+    elif isinstance(case, BuildingCase):
         numbers = measure_building(case, task.options)
+    else:
+        raise TypeError(f'{task.name}: neither a log nor a building')
     taken = {'cpu_s': time.process_time() - began}
     return {'name': task.name, 'options': task.options, **taken, **numbers}
 

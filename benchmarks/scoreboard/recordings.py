@@ -40,12 +40,13 @@ class Recording:
     def replay(self, robot: RobotConfig, seed: int) -> Iterator[DriveSample]:
         """Yield each scan with its true pose and the odometry of a simulation with this seed."""
         odometry = WheelOdometry(robot, odometry_seed(seed))
+        fan: tuple[float, float, float, float] = tuple(self.fan.tolist())
         driven = 0
         for k, stamp_ns in enumerate(self.stamps_ns.tolist()):
             for distance_m, turn_rad in self.steps[driven : stamp_ns // STEP_NS].tolist():
                 odometry.add_step(distance_m, turn_rad)
             driven = stamp_ns // STEP_NS
-            scan = Scan.create(stamp_ns, self.ranges_m[k], *self.fan.tolist(), self.T_base_laser)
+            scan = Scan.create(stamp_ns, self.ranges_m[k], *fan, self.T_base_laser)
             yield DriveSample(scan, odometry.T_odom_base, self.T_world_base[k])
 
     def write(self, path: Path) -> None:

@@ -1,6 +1,7 @@
 """map_to_graph on real floors: time, number of nodes, drivable, complete."""
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 from benchmarks.worlds import floors
@@ -30,7 +31,7 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
         if floor.name in _SECONDS:
             seconds = best_seconds({'work': work}, 5)['work']
             yield at_most('  map to graph', seconds, _SECONDS[floor.name], 's')
-            voronoi = best_seconds({'work': lambda patch=patch: build_voronoi(patch)}, 1)['work']
+            voronoi = best_seconds({'work': partial(build_voronoi, patch)}, 1)['work']
             yield at_least('  times faster than a Voronoi graph (SciPy)', voronoi / seconds, 1.0)
         if floor.name == 'kth/50052751':
             yield at_most('  nodes', len(graph.nodes), _MOST_NODES)

@@ -1,6 +1,7 @@
 """Thinning against scikit-image, OpenCV, a mask's copy and a distance transform, in one run."""
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -41,16 +42,16 @@ def run(worlds: Path, quick: bool) -> Iterator[Row]:
         grey = free.astype(np.uint8)
         fast = best_seconds(
             {
-                'thin': lambda free=free: thin(free),
-                'copy': lambda free=free: free.copy(),
-                'distance': lambda grey=grey: cv2.distanceTransform(grey, cv2.DIST_L2, 5),
+                'thin': partial(thin, free),
+                'copy': free.copy,
+                'distance': partial(cv2.distanceTransform, grey, cv2.DIST_L2, 5),
             },
             rounds=30 if side <= 1000 else 5,
         )
         slow = best_seconds(
             {
-                'skimage': lambda free=free: skeletonize(free),
-                'opencv': lambda free=free: padded_opencv(free),
+                'skimage': partial(skeletonize, free),
+                'opencv': partial(padded_opencv, free),
             },
             rounds=3 if side <= 1000 else 1,
         )

@@ -201,6 +201,7 @@ def small_board(monkeypatch, tmp_path):
     return tmp_path / 'out'
 
 
+@pytest.mark.programs
 def test_a_small_board_goes_on_where_it_was(small_board, capsys):
     words = ['-o', small_board, '--processes', 1, '--quiet']
     assert called(*words, '--only', 'drive_*_1') == 0
@@ -239,6 +240,7 @@ def test_a_small_board_goes_on_where_it_was(small_board, capsys):
     assert '## Against another run (2 of 2 cases)' in (small_board / 'other/cases.md').read_text()
 
 
+@pytest.mark.programs
 def test_what_the_board_cannot_do_is_one_line(small_board, monkeypatch, capsys):
     words = ['-o', small_board, '--processes', 1, '--quiet']
     for option in (['--short'], ['--runs', 2], ['--write-short']):

@@ -277,6 +277,7 @@ def write_log(folder, scans):
     (folder / 'log.clf').write_text(''.join(lines))
 
 
+@pytest.mark.programs
 def test_it_goes_on_where_it_was_and_one_that_fails_stops_no_other(tmp_path, capsys):
     logs = tmp_path / 'shared' / 'data' / 'logs'
     write_log(logs / 'try_1', 0)
@@ -344,6 +345,7 @@ def test_a_drive_ends_where_it_began_and_its_noise_is_what_is_asked_for():
     np.testing.assert_allclose(paths[-1][-1], start[:2], atol=0.2)
 
 
+@pytest.mark.programs
 def test_a_piece_of_a_real_log_and_the_same_made_worse(shared_data, tmp_path):
     there = shared_data / 'logs' / 'aces'
     own = tmp_path / 'shared' / 'data' / 'logs' / 'aces'

@@ -20,6 +20,7 @@ beyond(memory[:4], 4)
 """
 
 
+@pytest.mark.programs
 @pytest.mark.parametrize('checked', [False, True])
 def test_bounds_are_checked_where_that_is_asked_for(tmp_path, checked):
     """scripts/test runs all tests of core once so: this says that such a run can find something."""

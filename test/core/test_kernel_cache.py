@@ -10,6 +10,7 @@ import pytest
 
 from thinmap_ros.core import kernel_cache
 
+pytestmark = pytest.mark.programs
 CONSTANT = 'GAIN = {gain}\n'
 MODULE = """
 from thinmap_ros.core.constant import GAIN

@@ -18,9 +18,9 @@ from typing import Any
 import psutil
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from logs.test_log import ros1_bag
+from support.carmen_log import carmen_lines
+from support.ros1_bag import ros1_bag
 from support.timeouts import PATIENCE_S
-from tools.test_replay import carmen_lines
 
 from docs import commands
 from thinmap_ros.files import occupancy_maps, package_data

@@ -11,7 +11,7 @@ import pytest
 import rclpy
 from rclpy.action import get_action_server_names_and_types_by_node
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
-from test_config_files import NEEDED, NODES, OF_EVERY_NODE, OWN_WORDS, ROOT, default_of, node_class
+from support.node_list import NEEDED, NODES, OF_EVERY_NODE, OWN_WORDS, ROOT, default_of, node_class
 
 from thinmap_ros.logs.bag_writer import BagWriter
 

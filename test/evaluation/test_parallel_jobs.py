@@ -64,6 +64,7 @@ def run(folder, jobs, where=ONE_CORE):
     return run_pending(add, jobs, lambda job: folder / f'{job.name}.json', where, quiet=True)
 
 
+@pytest.mark.programs
 @pytest.mark.parametrize('processes', [1, 2])
 def test_one_that_fails_is_named_and_the_others_run(
     tmp_path: Path, processes: int, capsys: pytest.CaptureFixture[str]
@@ -88,6 +89,7 @@ def test_one_that_fails_is_named_and_the_others_run(
     assert sorted(path.stem for path in tmp_path.iterdir()) == ['a', 'b']
 
 
+@pytest.mark.programs
 def test_what_is_finished_is_not_run_again(tmp_path: Path) -> None:
     jobs = [Sum('a', (1.0,)), Sum('b', (2.0,))]
     (tmp_path / 'a.json').write_text(json.dumps({'options': [1.0], 'sum': 77.0}))
@@ -98,6 +100,7 @@ def test_what_is_finished_is_not_run_again(tmp_path: Path) -> None:
         read_report(tmp_path / 'b.json', [3.0])
 
 
+@pytest.mark.programs
 def test_a_cluster_tells_what_fails_as_well(tmp_path: Path) -> None:
     distributed = pytest.importorskip('distributed')
     jobs = [Sum('a', (1.0,)), Sum('refused', ())]
@@ -110,6 +113,7 @@ def test_a_cluster_tells_what_fails_as_well(tmp_path: Path) -> None:
     assert read_report(tmp_path / 'a.json', [1.0])['sum'] == 1.0
 
 
+@pytest.mark.programs
 @pytest.mark.parametrize('end', [signal.SIGTERM, signal.SIGKILL])
 def test_a_job_ends_with_the_program_that_runs_it(tmp_path: Path, end: signal.Signals) -> None:
     program = tmp_path / 'long.py'

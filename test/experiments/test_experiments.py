@@ -45,6 +45,7 @@ def outcome_of(name: str) -> Outcome:
     return _DONE[name]
 
 
+@pytest.mark.programs
 @pytest.mark.parametrize('name', EXPERIMENTS)
 def test_an_experiment_writes_what_it_promises(name: str, tmp_path: Path) -> None:
     outcome = outcome_of(name)

@@ -214,6 +214,7 @@ BIG_HEADERS = {
 }
 
 
+@pytest.mark.programs
 @pytest.mark.parametrize('size', [8_200, 23_000])
 def test_a_png_of_more_pixels_than_any_map_has(tmp_path: Path, size: int) -> None:
     path = tmp_path / 'm.yaml'
@@ -224,6 +225,7 @@ def test_a_png_of_more_pixels_than_any_map_has(tmp_path: Path, size: int) -> Non
     assert megabytes < 50.0 and 'pixels' in said and len(said) <= LONGEST
 
 
+@pytest.mark.programs
 def test_the_largest_map_takes_a_few_bytes_a_pixel(tmp_path: Path) -> None:
     path = tmp_path / 'm.yaml'
     path.write_text(yaml.safe_dump(MAP))
@@ -233,6 +235,7 @@ def test_the_largest_map_takes_a_few_bytes_a_pixel(tmp_path: Path) -> None:
     assert megabytes < 8 * 64.0
 
 
+@pytest.mark.programs
 @pytest.mark.parametrize('kind', ['zTXt', 'iTXt', 'iCCP'])
 def test_bombs_beside_the_pixels(tmp_path: Path, kind: str) -> None:
     packed = zlib.compress(bytes(200_000_000), 9)

@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
-from thinmap_ros.files.graphs import read_geojson, write_geojson
+from thinmap_ros.files.graphs import read_geojson, write_geojson, write_graphml, write_tmap2
 
 
 def edge(edge_id: int, a: int, b: int, *points: tuple[float, float]) -> Edge:
@@ -61,6 +62,72 @@ def test_it_is_what_the_route_server_reads(tmp_path: Path) -> None:
             ways.add((f['properties']['metadata']['edge'], start, end))
     assert {(2, 1, 3), (2, 3, 1), (4, 3, 1), (4, 1, 3), (9, 1, 7), (9, 7, 1), (5, 7, 7)} == ways
     assert nodes[3]['properties']['metadata'] == {'kind': 'end', 'clearance': 0.4}
+
+
+def small() -> TopologicalMap:
+    nodes = [Node(1, NodeKind.BRANCH, 0.0, 0.5, 1.0), Node(3, NodeKind.END, 2.0, 0.5, 0.4)]
+    return TopologicalMap(nodes, [edge(2, 1, 3, (0.0, 0.5), (2.0, 0.5))])
+
+
+def test_it_is_what_topological_navigation_reads(tmp_path: Path) -> None:
+    write_tmap2(tmp_path / 'g.tmap2.yaml', small(), 'floor')
+    content = yaml.safe_load((tmp_path / 'g.tmap2.yaml').read_text())
+    upright = {'x': 0.0, 'y': 0.0, 'z': 0.0, 'w': 1.0}
+    assert content['transformation'] == {
+        'child': 'topo_map',
+        'parent': 'floor',
+        'rotation': upright,
+        'translation': {'x': 0.0, 'y': 0.0, 'z': 0.0},
+    }
+    assert content['metric_map'] == content['name'] == content['pointset'] == 'g'
+    first, second = content['nodes']
+    assert first['meta'] == {'map': 'g', 'node': 'NODE1', 'pointset': 'g'}
+    node = first['node']
+    verts = np.array([[vert['x'], vert['y']] for vert in node.pop('verts')])
+    np.testing.assert_allclose(np.hypot(*verts.T), 1.0, atol=2e-3)
+    np.testing.assert_allclose(verts.mean(axis=0), 0.0, atol=1e-3)
+    (only,) = node.pop('edges')
+    assert node == {
+        'name': 'NODE1',
+        'parent_frame': 'floor',
+        'pose': {'position': {'x': 0.0, 'y': 0.5, 'z': 0.0}, 'orientation': upright},
+        'localise_by_topic': '',
+        'properties': {
+            'xy_goal_tolerance': 0.3,
+            'yaw_goal_tolerance': 6.2832,
+            'kind': 'branch',
+            'clearance': 1.0,
+        },
+        'restrictions_planning': 'True',
+        'restrictions_runtime': 'True',
+    }
+    assert only == {
+        'edge_id': 'NODE1_NODE3',
+        'node': 'NODE3',
+        'action': 'navigate_to_pose',
+        'action_type': 'geometry_msgs/PoseStamped',
+        'goal': {
+            'target_pose': {'header': {'frame_id': '$node.parent_frame'}, 'pose': '$node.pose'}
+        },
+        'config': [],
+        'fail_policy': 'fail',
+        'fluid_navigation': True,
+        'recovery_behaviours_config': '',
+        'restrictions_planning': 'True',
+        'restrictions_runtime': 'True',
+        'properties': {'length': 2.0, 'clearance': 0.35},
+    }
+    assert [back['node'] for back in second['node']['edges']] == ['NODE1']
+
+
+def test_graphml_holds_positions_kinds_and_paths(tmp_path: Path) -> None:
+    write_graphml(tmp_path / 'g.graphml', small())
+    text = (tmp_path / 'g.graphml').read_text()
+    assert '<data key="node_y">0.5</data>' in text
+    assert '<data key="node_kind">end</data>' in text
+    assert '<data key="edge_length">2.0</data>' in text
+    assert '<data key="edge_clearance">0.35</data>' in text
+    assert '<data key="edge_path">0.0 0.5 2.0 0.5</data>' in text
 
 
 def test_round_trip(tmp_path: Path) -> None:

@@ -97,6 +97,8 @@ def test_scale_mode_and_transparency(tmp_path: Path) -> None:
         described(tmp_path, ramp, mode='scale', free_thresh=0.1, occupied_thresh=0.9)
     ).cells[0]
     assert cells[0] == 0 and cells[-1] == 100
+    # As map_server: 1 + 98 times the share between the thresholds.
+    assert cells[[8, 15]].tolist() == [1 + 45, 1 + 95]
     assert np.all(np.diff(cells) >= 0) and len(set(cells.tolist())) > 10
     rgba = np.zeros((1, 2, 4), dtype=np.uint8)
     rgba[0, 0, 3] = 255

@@ -148,6 +148,7 @@ def test_a_planted_fault_is_found_again_by_its_seed(
     assert list((tmp_path / '8').glob('carmen-*/why.txt'))
 
 
+@pytest.mark.live
 def test_ctrl_c_ends_it_with_a_summary(tmp_path: Path) -> None:
     places = [ROOT / 'test', ROOT]
     environment = os.environ | {

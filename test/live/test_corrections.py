@@ -8,8 +8,8 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid as OccupancyGridMsg
 from nav_msgs.msg import Path
 from sensor_msgs.msg import LaserScan
+from support.doctor import Doctor
 from support.slam_room import corridor_ring, scan_in
-from test_health import Doctor
 
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.core import se2

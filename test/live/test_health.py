@@ -2,7 +2,7 @@
 
 import pytest
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
@@ -10,6 +10,7 @@ from nav_msgs.msg import OccupancyGrid
 from rclpy.action import ActionClient
 from sensor_msgs.msg import LaserScan
 from std_srvs.srv import SetBool, Trigger
+from support.doctor import Doctor
 
 from thinmap_msgs.action import NavigateToPose
 from thinmap_msgs.msg import TopologicalMap
@@ -19,31 +20,6 @@ pytestmark = pytest.mark.live
 AT_START = {'initial_x_m': 2.0, 'initial_y_m': 2.0, 'initial_yaw_rad': 0.0}
 START = '2.0,2.0,0.0'
 MAPPING = ('localizer', 'grid_mapper', 'topology_builder')
-
-
-class Doctor:
-    """What the nodes last said of themselves, by node."""
-
-    def __init__(self, graph):
-        self.heard = graph.heard('/diagnostics', DiagnosticArray)
-
-    def status(self, node):
-        found = [s for array in self.heard for s in array.status if s.name == f'{node}: thinmap']
-        return found[-1] if found else DiagnosticStatus(level=DiagnosticStatus.STALE)
-
-    def times(self, node):
-        """How often a node has said how it is."""
-        return sum(s.name == f'{node}: thinmap' for array in self.heard for s in array.status)
-
-    def value(self, node, key):
-        return {pair.key: pair.value for pair in self.status(node).values}.get(key, '')
-
-    def number(self, node, key):
-        text = self.value(node, key)
-        return float(text.split()[0]) if text else 0.0
-
-    def level(self, node):
-        return self.status(node).level
 
 
 def test_nodes_tell_rates_step_times_and_silence(graph):

@@ -9,9 +9,9 @@ import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Path
 from std_srvs.srv import SetBool
+from support.doctor import Doctor
 from support.slam_room import drive_round_the_block
 from support.timeouts import PATIENCE_S
-from test_health import Doctor
 
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.core.slam.localizer import LocalizerConfig

@@ -335,8 +335,9 @@ def test_programs_packages_and_fields_need_no_graph():
 
 
 def test_help_names_what_there_is():
+    text = output('-h')
     for word in ('action', 'lifecycle', 'node', 'param', 'pkg', 'run', 'service', 'topic'):
-        assert f'\n  {word} ' in output('-h')
+        assert f'\n  {word} ' in text
     assert '\n  echo ' in output('topic', '-h')
     assert '--field' in output('topic', 'echo', '-h')
     assert 'program' in output('run', '-h')

@@ -9,10 +9,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
-from rosbags.rosbag1 import Writer
-from rosbags.typesys import Stores, get_typestore
+from support.ros1_bag import ros1_bag
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.logs.bag import Bag
@@ -23,29 +21,6 @@ PROGRAMS = {
     'carmen_to_bag': ['out'],
     'bag_repair': ['-o', 'out'],
 }
-
-
-def ros1_bag(path: Path) -> None:
-    """A bag of one scan, with a header as ROS 1 has it."""
-    typestore = get_typestore(Stores.ROS1_NOETIC)
-    types = typestore.types
-    time = types['builtin_interfaces/msg/Time'](sec=1, nanosec=0)
-    header = types['std_msgs/msg/Header'](seq=7, stamp=time, frame_id='laser')
-    scan = types['sensor_msgs/msg/LaserScan'](
-        header=header,
-        angle_min=-1.0,
-        angle_max=1.0,
-        angle_increment=0.5,
-        time_increment=0.0,
-        scan_time=0.0,
-        range_min=0.1,
-        range_max=8.0,
-        ranges=np.full(5, 2.0, dtype=np.float32),
-        intensities=np.zeros(0, dtype=np.float32),
-    )
-    with Writer(path) as writer:
-        connection = writer.add_connection('/scan', scan.__msgtype__, typestore=typestore)
-        writer.write(connection, 10**9, typestore.serialize_ros1(scan, scan.__msgtype__))
 
 
 def sqlite_file(path: Path) -> None:
@@ -59,6 +34,7 @@ def run(folder: Path, program: str, *arguments: str) -> subprocess.CompletedProc
     return subprocess.run(command, capture_output=True, text=True, cwd=folder)
 
 
+@pytest.mark.programs
 @pytest.mark.parametrize('program', PROGRAMS)
 @pytest.mark.parametrize('name', ['old.bag', 'old.mcap', 'old.log'])
 def test_a_ros1_bag_is_named_with_the_command_that_converts_it(
@@ -73,6 +49,7 @@ def test_a_ros1_bag_is_named_with_the_command_that_converts_it(
     assert not (tmp_path / 'out').exists()
 
 
+@pytest.mark.programs
 def test_the_command_makes_a_bag_that_is_read(tmp_path: Path) -> None:
     ros1_bag(tmp_path / 'old.bag')
     with pytest.raises(InputError, match='a ROS 1 bag') as error:
@@ -88,6 +65,7 @@ def test_the_command_makes_a_bag_that_is_read(tmp_path: Path) -> None:
     assert not hasattr(scan.header, 'seq'), 'its bytes are not those of a ROS 2 message'
 
 
+@pytest.mark.programs
 @pytest.mark.parametrize('program', PROGRAMS)
 @pytest.mark.parametrize('name', ['bag_0.db3', 'bag_0.mcap'])
 def test_a_bare_sqlite_file_is_named_with_what_it_lacks(
@@ -101,6 +79,7 @@ def test_a_bare_sqlite_file_is_named_with_what_it_lacks(
     assert 'ros2 bag reindex' in line and 'rosbags-convert --src' in line
 
 
+@pytest.mark.programs
 def test_a_folder_of_sqlite_files_without_metadata(tmp_path: Path) -> None:
     (tmp_path / 'bag').mkdir()
     sqlite_file(tmp_path / 'bag' / 'bag_0.db3')
@@ -110,6 +89,7 @@ def test_a_folder_of_sqlite_files_without_metadata(tmp_path: Path) -> None:
     assert done.returncode == 2 and 'MCAP' in done.stderr
 
 
+@pytest.mark.programs
 def test_an_mcap_file_is_no_carmen_log_and_read_under_any_name(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'a.mcap') as writer:
         writer.write('/said', 'std_msgs/msg/String', 5, b'\0\1\0\0\1\0\0\0\0')

@@ -108,6 +108,7 @@ def test_a_file_may_grow_while_it_is_read(tmp_path: Path) -> None:
         assert list(read.messages()) == list(wanted.messages()) and read.damage == wanted.damage
 
 
+@pytest.mark.programs
 def test_a_cut_off_bag_gets_index_metadata_and_its_qualities_back(tmp_path: Path) -> None:
     whole = (write(tmp_path / 'bag') / 'bag.mcap').read_bytes()
     (tmp_path / 'cut').mkdir()
@@ -150,6 +151,7 @@ def cut_file(tmp_path: Path, compression: CompressionType) -> Path:
     return tmp_path / 'cut.mcap'
 
 
+@pytest.mark.programs
 @pytest.mark.parametrize('compression', list(CompressionType))
 def test_of_a_chunk_that_was_cut_off_the_part_before_the_cut_is_kept(
     tmp_path: Path, compression: CompressionType
@@ -214,6 +216,7 @@ def test_a_damaged_summary_is_not_believed(tmp_path: Path) -> None:
     assert {channel.topic for _, channel, _ in file.messages()} == {'/said'}
 
 
+@pytest.mark.programs
 def test_what_cannot_be_repaired_is_said_in_one_line(tmp_path: Path) -> None:
     (tmp_path / 'text.mcap').write_bytes(b'dear all')
     (tmp_path / 'start.mcap').write_bytes(b'\x89MCAP0\r\n\x01')
@@ -233,6 +236,7 @@ def test_what_cannot_be_repaired_is_said_in_one_line(tmp_path: Path) -> None:
     assert not list(tmp_path.glob('.*.part'))
 
 
+@pytest.mark.programs
 def test_behind_a_range_of_zeros_it_goes_on_at_the_next_chunk_of_the_summary(
     tmp_path: Path,
 ) -> None:
@@ -250,6 +254,7 @@ def test_behind_a_range_of_zeros_it_goes_on_at_the_next_chunk_of_the_summary(
     assert bag.is_truncated
 
 
+@pytest.mark.programs
 def test_messages_that_are_compressed_each_on_its_own_are_unpacked(tmp_path: Path) -> None:
     writer = RosbagWriter(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP)
     writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)

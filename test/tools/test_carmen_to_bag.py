@@ -102,6 +102,7 @@ def run(*arguments: object) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.programs
 def test_the_program(tmp_path: Path) -> None:
     log = log_of(tmp_path, [flaser('5.0', 1), 'FLASER broken\n', flaser('6.0', 2)])
     done = run(log.path, tmp_path / 'bag', '--offset-m', 0.3)
@@ -114,6 +115,7 @@ def test_the_program(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.programs
 @pytest.mark.parametrize(
     ('content', 'options', 'said'),
     [

@@ -104,6 +104,7 @@ def world(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.programs
 def test_it_runs_all_writes_all_and_goes_on_where_it_was(world: Path, tmp_path: Path) -> None:
     out = tmp_path / 'out'
     words = [
@@ -136,12 +137,14 @@ def test_it_runs_all_writes_all_and_goes_on_where_it_was(world: Path, tmp_path: 
     assert 'other options' in faster.stderr
 
 
+@pytest.mark.programs
 def test_a_world_without_start_is_told_in_one_line(world: Path, tmp_path: Path) -> None:
     result = compare(str(tmp_path / 'nowhere.yaml'), '-o', str(tmp_path / 'out'))
     assert result.returncode == 2
     assert result.stderr.count('\n') == 1
 
 
+@pytest.mark.programs
 def test_a_cluster_gives_what_one_machine_gives(world: Path, tmp_path: Path) -> None:
     distributed = pytest.importorskip('distributed')
     words = [str(world), '--strategies', 'nearest_frontier']

@@ -54,6 +54,7 @@ def world(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.programs
 def test_a_room_is_explored_and_everything_written(world: Path, tmp_path: Path) -> None:
     out = tmp_path / 'out'
     result = explore(
@@ -74,6 +75,7 @@ def test_a_room_is_explored_and_everything_written(world: Path, tmp_path: Path) 
         assert (out / name).stat().st_size > 0
 
 
+@pytest.mark.programs
 def test_a_map_without_a_start_can_be_explored_from_a_given_one(
     world: Path, tmp_path: Path
 ) -> None:
@@ -86,6 +88,7 @@ def test_a_map_without_a_start_can_be_explored_from_a_given_one(
     assert json.loads((tmp_path / 'two' / 'report.json').read_text())['coverage'] >= 0.99
 
 
+@pytest.mark.programs
 @pytest.mark.parametrize(
     ('words', 'said'),
     [

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
+from support.carmen_log import BEAMS, carmen_lines
 from support.hidden_library import hide
 from support.timeouts import PATIENCE_S
 
@@ -26,7 +27,6 @@ from thinmap_ros.view.null_view import NullView
 
 TRAJECTORIES = {'trajectory.tum', 'trajectory_final.tum'}
 FILES = TRAJECTORIES | {'map.pgm', 'map.yaml', 'topology.geojson', 'summary.png', 'report.json'}
-BEAMS = 181
 needs_rerun = pytest.mark.skipif(
     not rerun_sinks.is_installed(),
     reason='needs rerun, which is not installed (the extra "viewer")',
@@ -38,28 +38,6 @@ def run(*arguments):
     return subprocess.run(command, capture_output=True, text=True)
 
 
-def box_ranges(x, theta, half=3.0):
-    """What a laser sees in a square room around the origin."""
-    angles = theta + np.radians(np.arange(BEAMS) - 90.0)
-    to_x = (np.sign(np.cos(angles)) * half - x) / np.cos(angles)
-    to_y = half / np.abs(np.sin(angles) + 1e-12)
-    return np.minimum(np.abs(to_x), to_y)
-
-
-def carmen_lines(scans=30, beams=BEAMS, start_s=0.0):
-    lines = ['# a robot that drives along x through a square room']
-    for k in range(scans):
-        x = 0.03 * k
-        stamp = start_s + 0.2 * k
-        readings = ' '.join(f'{r:.3f}' for r in box_ranges(x, 0.0)[:beams])
-        tail = f'{x:.4f} 0 0 {x:.4f} 0 0 {stamp:.3f} robot {stamp:.3f}'
-        lines += [
-            f'ODOM {x:.4f} 0 0 0.15 0 0 {stamp:.3f} robot {stamp:.3f}',
-            f'FLASER {beams} {readings} {tail}',
-        ]
-    return lines
-
-
 @pytest.fixture
 def log(tmp_path):
     path = tmp_path / 'log.clf'
@@ -67,6 +45,7 @@ def log(tmp_path):
     return path
 
 
+@pytest.mark.programs
 @pytest.mark.parametrize('form', ['plain', 'gzip', 'bag', 'mcap'])
 def test_files_and_figures(log, tmp_path, form):
     if form == 'gzip':
@@ -93,6 +72,7 @@ def test_files_and_figures(log, tmp_path, form):
     assert patch.occupied[wall[0], wall[1] - 1 : wall[1] + 2].any()
 
 
+@pytest.mark.programs
 @pytest.mark.parametrize('slam', ['scan_matching', 'ekf_ti', 'ekf_full'])
 def test_each_localizer_replays_it(tmp_path, slam):
     log = tmp_path / 'log.clf'
@@ -106,6 +86,7 @@ def test_each_localizer_replays_it(tmp_path, slam):
     assert np.abs(trajectory[:, 1] - 0.03 * np.arange(60)).max() < 0.05
 
 
+@pytest.mark.programs
 def test_the_localizer_is_the_scan_matcher_unless_it_is_told(log, tmp_path):
     for name, options in (
         ('default', []),
@@ -119,6 +100,7 @@ def test_the_localizer_is_the_scan_matcher_unless_it_is_told(log, tmp_path):
     assert default == scans != by_filter
 
 
+@pytest.mark.programs
 @pytest.mark.parametrize('share', [0.5, 0.97])
 def test_a_cut_off_bag_is_replayed_as_far_as_bag_repair_reads_it(log, tmp_path, share):
     convert(CarmenLog(log, LaserOptions()), tmp_path / 'bag.mcap')
@@ -173,6 +155,7 @@ BAD = {
 }
 
 
+@pytest.mark.programs
 @pytest.mark.parametrize('case', BAD)
 def test_what_cannot_be_replayed_is_said_in_one_line(tmp_path, case):
     make, words = BAD[case]
@@ -186,6 +169,7 @@ def test_what_cannot_be_replayed_is_said_in_one_line(tmp_path, case):
     assert not (tmp_path / 'out').exists(), 'nothing is written of a log that could not be replayed'
 
 
+@pytest.mark.programs
 def test_bag_without_odometry_names_its_topics(tmp_path):
     bag_without_odometry(tmp_path / 'bag')
     done = run(tmp_path / 'bag', '-o', tmp_path / 'out')
@@ -194,6 +178,7 @@ def test_bag_without_odometry_names_its_topics(tmp_path):
     assert 'Traceback' not in done.stderr
 
 
+@pytest.mark.programs
 def test_bad_lines_are_counted_and_the_first_is_named(tmp_path):
     lines = carmen_lines()
     lines[10] = lines[10][: len(lines[10]) // 2]  # cut in the middle
@@ -208,6 +193,7 @@ def test_bad_lines_are_counted_and_the_first_is_named(tmp_path):
     assert '2 skipped' in done.stdout and 'some.log:11: ' in done.stdout
 
 
+@pytest.mark.programs
 def test_beam_counts_may_change(tmp_path):
     path = tmp_path / 'some.log'
     path.write_text('\n'.join(carmen_lines(10) + carmen_lines(10, beams=91, start_s=2.0)))
@@ -218,6 +204,7 @@ def test_beam_counts_may_change(tmp_path):
     assert report['scans'] >= 10
 
 
+@pytest.mark.programs
 def test_stamps_that_jump_back_do_no_harm(tmp_path):
     path = tmp_path / 'some.log'
     lines = carmen_lines()
@@ -233,6 +220,7 @@ def test_stamps_that_jump_back_do_no_harm(tmp_path):
     assert np.abs(poses[:, 1]).max() < 1.0
 
 
+@pytest.mark.programs
 @pytest.mark.parametrize(
     'arguments', [['--slam', 'magic'], ['--resolution-m', '0'], ['--offset-m', 'nan'], []]
 )
@@ -243,12 +231,14 @@ def test_wrong_options_end_with_two(log, tmp_path, arguments):
     assert 'Traceback' not in done.stderr and done.stderr.strip()
 
 
+@pytest.mark.programs
 def test_unwritable_place_is_said(log):
     done = run(log, '-o', '/proc/nowhere')
     assert done.returncode == 2
     assert '/proc/nowhere' in done.stderr and 'Traceback' not in done.stderr
 
 
+@pytest.mark.programs
 @pytest.mark.slow
 def test_real_office_log(shared_data, tmp_path):
     log = shared_data / 'logs' / 'mrpt_office' / 'log.clf'
@@ -297,6 +287,7 @@ def test_a_view_is_told_each_scan_and_the_map_as_it_is_in_the_end(log):
         assert diary.told[curve] == 30
 
 
+@pytest.mark.programs
 @pytest.mark.parametrize('option', ['--view', '--recording=run.rrd'])
 def test_without_rerun_a_view_is_refused_in_one_line(
     log, tmp_path, tmp_path_factory, monkeypatch, option
@@ -308,6 +299,7 @@ def test_without_rerun_a_view_is_refused_in_one_line(
     assert not (tmp_path / 'out').exists()
 
 
+@pytest.mark.programs
 @needs_rerun
 def test_without_a_screen_a_view_is_refused_in_one_line(log, tmp_path, monkeypatch):
     monkeypatch.delenv('DISPLAY', raising=False)
@@ -325,6 +317,7 @@ def rows_of(path, entity):
     return sum(chunk.num_rows for chunk in RrdReader(path).stream() if chunk.entity_path == entity)
 
 
+@pytest.mark.programs
 @needs_rerun
 def test_a_recording_holds_the_whole_replay_or_is_not_written(log, tmp_path):
     done = run(log, '-o', tmp_path / 'out', '--quiet', '--recording', tmp_path / 'run.rrd')

@@ -244,6 +244,7 @@ def test_no_bag_leaves_no_recording(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.programs
 def test_without_rerun_a_view_says_what_to_install():
     code = """
 import sys

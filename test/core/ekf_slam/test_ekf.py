@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from reference_filter import DenseFilter
 
-from thinmap_ros.core.ekf_slam.ekf import EkfSlam
+from thinmap_ros.core.ekf_slam.ekf import EkfSlam, line_difference
 from thinmap_ros.core.ekf_slam.models import observe_line
 from thinmap_ros.core.se2 import compose
 
@@ -102,6 +102,14 @@ def test_one_wall_in_two_forms_is_tied_to_itself():
     assert abs(abs(fast.lines[0, 1] - fast.lines[1, 1]) - np.pi) < 0.01
     assert fast.lines[0, 0] == pytest.approx(-fast.lines[1, 0], abs=1e-3)
     assert_same(fast, plain)
+
+
+@pytest.mark.parametrize(('turned', 'signs'), [(1.5, [1.0, 1.0]), (1.6, [-1.0, 1.0])])
+def test_a_line_is_compared_with_the_form_that_is_nearer_in_angle(turned, signs):
+    v, found = line_difference(np.array([2.0, 0.3 + turned]), np.array([1.5, 0.3]))
+    np.testing.assert_array_equal(found, signs)
+    expected = [0.5, turned] if signs[0] > 0.0 else [3.5, turned - np.pi]
+    np.testing.assert_allclose(v, expected)
 
 
 def test_a_pose_that_is_set_has_nothing_to_do_with_the_features(rng):

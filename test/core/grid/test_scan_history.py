@@ -64,6 +64,12 @@ def test_a_robot_that_stands_still_is_kept_once():
     assert history.kept() == [0]
 
 
+@pytest.mark.parametrize('step', [(0.3, 0.0, 0.0), (0.0, 0.3, 0.0), (0.0, 0.0, 0.3)])
+def test_a_robot_that_moves_in_any_way_is_kept_at_each_pose(step):
+    poses = np.outer(np.arange(5), step)
+    assert filled(poses, range(5)).kept() == [0, 1, 2, 3, 4]
+
+
 def test_of_a_place_that_is_seen_again_and_again_the_newest_scans_are_kept():
     laps = 30
     history = filled(np.tile(POSES, (laps, 1)), range(12 * laps))

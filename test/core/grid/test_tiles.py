@@ -129,6 +129,7 @@ assert (tiles.pool[:2000, 7, 7] == np.arange(2000)).all()
 """
 
 
+@pytest.mark.programs
 def test_where_the_address_space_is_limited_the_pool_grows_by_copies():
     """A pool for the largest map would take 1 GB: four times the available memory."""
     done = subprocess.run([sys.executable, '-c', LIMITED], capture_output=True, text=True)

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from test_navigator import Ride, room
+from support.ride import Ride, room
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.planning.blind_sectors import BlindSectors

@@ -12,8 +12,8 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
 from nav_msgs.msg import Odometry
 from rclpy.action import ActionClient
 from sensor_msgs.msg import LaserScan
-from test_faults import empty_hall
-from test_health import Doctor
+from support.doctor import Doctor
+from support.halls import empty_hall
 
 from thinmap_msgs.action import Explore, NavigateToPose
 from thinmap_msgs.msg import SlamStatus

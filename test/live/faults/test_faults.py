@@ -11,25 +11,22 @@ from nav_msgs.msg import OccupancyGrid, Odometry
 from rclpy.action import ActionClient
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
+from support.doctor import Doctor
+from support.halls import AT_START, START, empty_hall
 from support.slam_room import ROOM, scan_in
-from test_health import Doctor
 
 from thinmap_msgs.action import Explore, NavigateToPose
 from thinmap_msgs.msg import ExplorationStatus, TopologicalMap
 from thinmap_msgs.srv import SaveMap
-from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.files.snapshots import write_snapshot
 from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live
-START = '2.0,2.0,0.9'
 # While a node is dead, no scan leads to anything.
 LOCKSTEP_S = 2.0
 # However long a start takes.
 RECOVER_S = 1000.0
 TICK_NS = 100_000_000
-AT_START = {'initial_x_m': 2.0, 'initial_y_m': 2.0, 'initial_yaw_rad': 0.9}
 MAPPING = ('localizer', 'grid_mapper', 'topology_builder')
 
 
@@ -334,12 +331,6 @@ def test_what_waited_while_the_clock_was_set_back_does_not_begin_the_new_map(gra
     assert all(
         np.hypot(pose.pose.pose.position.x, pose.pose.pose.position.y) < 0.05 for pose in poses
     )
-
-
-def empty_hall():
-    """Map of 12 x 12 m around the origin in which all is free."""
-    cells = np.zeros((120, 120), dtype=np.int8)
-    return messages.grid_msg(GridPatch(GridFrame(-6.0, -6.0, 0.1), cells), 'map', 0)
 
 
 def scan_of_nothing_near(ns):

@@ -11,7 +11,7 @@ import signal
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from sensor_msgs.msg import LaserScan
-from test_health import Doctor
+from support.doctor import Doctor
 
 from thinmap_msgs.msg import TopologicalMap
 from thinmap_ros.ros import messages, qos

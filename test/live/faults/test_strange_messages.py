@@ -14,7 +14,7 @@ from lifecycle_msgs.srv import GetState
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from rclpy.action import ActionClient
 from sensor_msgs.msg import LaserScan
-from test_health import Doctor
+from support.doctor import Doctor
 from tf2_msgs.msg import TFMessage
 
 from thinmap_msgs.action import Explore, NavigateToPose

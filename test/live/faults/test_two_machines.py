@@ -16,8 +16,8 @@ import time
 from pathlib import Path
 
 import pytest
+from support.halls import AT_START, START
 from support.timeouts import PATIENCE_S
-from test_faults import AT_START, START
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.logs.bag import Bag

@@ -46,6 +46,7 @@ def test_it_holds_the_keyframes_around_one(frames):
     assert_holds(Submaps(CONFIG).around(frames, 10, 29.0), frames, 10, range(6, 15))
     assert_holds(Submaps(CONFIG).around(frames, 8, 29.0), frames, 10, range(6, 15))
     assert_holds(Submaps(CONFIG).around(frames, 0, 29.0), frames, 2, range(7))
+    assert_holds(Submaps(CONFIG).around(frames[:10], 9, 9.0), frames, 9, range(5, 10))
 
 
 def test_it_holds_nothing_of_the_visit_that_is_matched_with_it(frames):

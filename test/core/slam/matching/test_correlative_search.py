@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 import pytest
+from support.local_map_cells import cells_of, nearest
 from support.slam_room import ROOM, around, map_of, seen_in
-from test_local_map import cells_of, nearest
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam.matching import correlative_search

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.ndimage import distance_transform_edt
+from support.local_map_cells import CELL_M, REACH, cells_of, nearest, walls_of
 from support.slam_room import ROOM, map_of, on_wall, seen_in
 
 from thinmap_ros.core import se2, snapshot
@@ -15,8 +15,6 @@ from thinmap_ros.core.grid.tiles import TILE
 from thinmap_ros.core.slam.matching import local_map as module
 from thinmap_ros.core.slam.matching.local_map import FIELDS, HERE, LocalMap, LocalMapConfig
 
-CELL_M = LocalMapConfig().resolution_m
-REACH = round(LocalMapConfig().max_wall_distance_m / CELL_M)
 BOX = ROOM[6:]
 WITHOUT_BOX = ROOM[:6]
 NOTHING = np.empty((0, 5))
@@ -46,16 +44,6 @@ def random_pose(rng):
     return np.array([*rng.uniform(1.0, 9.0, 2), rng.uniform(-np.pi, np.pi)])
 
 
-def cells_of(local_map):
-    """All cells (R, C) of the rectangle of tiles, and the first row and column."""
-    top, left, end_row, end_col = local_map.tiles.bounds()
-    return local_map.tiles.read(top, left, end_row - top, end_col - left), top, left
-
-
-def walls_of(cells):
-    return cells['hits'] > LocalMapConfig().occupied_min_hit_ratio * cells['seen']
-
-
 def told(cells):
     """Distance of each cell from the wall that it leads to, in cells; inf where it leads to none.
 
@@ -67,12 +55,6 @@ def told(cells):
     rows, cols = np.nonzero(leads)
     assert walls_of(cells)[rows + down[leads], cols + right[leads]].all()
     return np.where(leads, np.hypot(down, right), np.inf)
-
-
-def nearest(cells):
-    """The plain reference: distance of each cell from the nearest wall, inf beyond the reach."""
-    away = distance_transform_edt(~walls_of(cells))
-    return np.where(away <= REACH, away, np.inf)
 
 
 def test_each_cell_knows_its_nearest_wall(rng):

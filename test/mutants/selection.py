@@ -1,0 +1,76 @@
+"""Which tests belong to a module: that of its name first, then those that import it."""
+
+import ast
+import itertools
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+# Tests that start programs take too long here, and check other things.
+_LEFT_OUT = {'live', 'docs', 'fuzz', 'tools', 'ros', 'benchmarks', 'experiments', 'mutants'}
+# So many test files for a mutant; the nearest come first.
+MOST_FILES = 6
+
+
+class Selection:
+    """Imports of a package and of its tests, read from the source."""
+
+    def __init__(self, root: Path, package: str) -> None:
+        self._root = root
+        self._tests = root / 'test'
+        self._importers: dict[Path, set[Path]] = defaultdict(set)
+        sources = [*(root / package).rglob('*.py'), *self._tests.rglob('*.py')]
+        for source in sources:
+            for imported in self._imported(source):
+                self._importers[imported].add(source)
+
+    def tests_of(self, module: Path) -> list[Path]:
+        """Test files of a module, relative to the root, the nearest first."""
+        inside = module.relative_to(self._root)
+        mirrored = Path('test', *inside.parts[1:-1], f'test_{inside.name}')
+        distances = self._distances(module)
+        if (self._root / mirrored).exists():
+            distances[mirrored] = 0
+
+        def key(test: Path) -> tuple[bool, int, Path]:
+            is_near = distances[test] <= 1 or test.parent == mirrored.parent
+            return not is_near, distances[test], test
+
+        return sorted(distances, key=key)[:MOST_FILES]
+
+    def _distances(self, module: Path) -> dict[Path, int]:
+        """Tests that import a module, 1; that import what imports it, 2; and so on."""
+        distances: dict[Path, int] = {}
+        known = {module}
+        border = {module}
+        for distance in itertools.count(1):
+            border = {importer for file in border for importer in self._importers[file]} - known
+            if not border:
+                break
+            known |= border
+            for file in border:
+                if self._is_test(file):
+                    distances[file.relative_to(self._root)] = distance
+        return distances
+
+    def _is_test(self, file: Path) -> bool:
+        if not file.is_relative_to(self._tests) or not file.name.startswith('test_'):
+            return False
+        return not _LEFT_OUT & set(file.relative_to(self._tests).parts)
+
+    def _imported(self, source: Path) -> Iterator[Path]:
+        for node in ast.walk(ast.parse(source.read_bytes())):
+            if isinstance(node, ast.Import):
+                for alias in node.names:
+                    yield from self._files(alias.name)
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                yield from self._files(node.module)
+                for alias in node.names:
+                    yield from self._files(f'{node.module}.{alias.name}')
+
+    def _files(self, dotted: str) -> Iterator[Path]:
+        """File of a module of the package, or of a helper of the tests."""
+        for base in (self._root, self._tests):
+            path = base.joinpath(*dotted.split('.')).with_suffix('.py')
+            if path.exists():
+                yield path

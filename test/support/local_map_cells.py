@@ -1,0 +1,26 @@
+"""Cells of a local map, and the distances that they should hold."""
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
+
+CELL_M = LocalMapConfig().resolution_m
+
+REACH = round(LocalMapConfig().max_wall_distance_m / CELL_M)
+
+
+def cells_of(local_map):
+    """All cells (R, C) of the rectangle of tiles, and the first row and column."""
+    top, left, end_row, end_col = local_map.tiles.bounds()
+    return local_map.tiles.read(top, left, end_row - top, end_col - left), top, left
+
+
+def walls_of(cells):
+    return cells['hits'] > LocalMapConfig().occupied_min_hit_ratio * cells['seen']
+
+
+def nearest(cells):
+    """The plain reference: distance of each cell from the nearest wall, inf beyond the reach."""
+    away = distance_transform_edt(~walls_of(cells))
+    return np.where(away <= REACH, away, np.inf)

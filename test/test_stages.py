@@ -1,0 +1,34 @@
+"""scripts/test: its stages by name, and every test in one of them."""
+
+import ast
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.mark.programs
+def test_a_wrong_stage_is_one_line_and_exit_code_2() -> None:
+    command = [str(ROOT / 'scripts' / 'test'), 'units']
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stdout == ''
+    assert done.stderr.startswith('scripts/test: units: expected')
+    assert done.stderr.endswith('a stage: lint unit without-ros live bounds\n')
+    assert done.stderr.count('\n') == 1
+
+
+def test_every_test_is_in_one_stage(request: pytest.FixtureRequest) -> None:
+    for item in request.session.items:
+        marks = {mark.name for mark in item.iter_markers()}
+        assert not {'programs', 'live'} <= marks, item.nodeid
+
+
+def test_what_test_modules_share_is_in_support() -> None:
+    tests = {path.stem: path for path in (ROOT / 'test').rglob('test_*.py')}
+    for path in tests.values():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                assert node.module.split('.')[-1] not in tests, f'{path}: {node.module}'
