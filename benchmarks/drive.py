@@ -16,7 +16,7 @@ from thinmap_ros.core.topology.graph import Node, TopologicalMap
 from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 from thinmap_ros.sim.world import World
 
-WINDOW_M = WindowConfig().window_m
+WINDOW_M = WindowConfig().local_map_size_m
 _STEP_M = 0.1  # between scans: half a metre a second at 5 Hz
 _TURN_RAD = 0.3
 _TRIES = 40

@@ -174,7 +174,7 @@ def start_all(world: str, at: np.ndarray, rate: float, seed: int) -> dict[str, p
     found['sim'] = start(
         'sim',
         f'world:={world} {place} rate:={rate} seed:={seed} '
-        'lockstep:=local_topology hold_for_subscribers:=4',
+        'lockstep:=local_topology wait_for_subscribers:=4',
     )
     return found
 

@@ -237,7 +237,7 @@ def make_loop(
     localizer = LocalizerConfig(initial_x_m=x, initial_y_m=y, initial_yaw_rad=theta)
     source = ground_truth_poses(simulation) if options.localization == 'truth' else None
     # A beam without return has observed free space up to the laser's range.
-    grid = OccupancyConfig(no_return_range_m=options.laser.range_max_m)
+    grid = OccupancyConfig(no_return_clear_range_m=options.laser.range_max_m)
     pipeline = Pipeline(
         PipelineConfig(localizer=localizer, grid=grid, scans_per_graph=SCANS_PER_GRAPH), source
     )

@@ -92,7 +92,9 @@ class Pipeline:
     def _thin(self, T_map_base: Array) -> GridPatch:
         """Update the graph, unless the map is only partly corrected."""
         with self._timed('topology'):
-            window = self.grid.window(T_map_base[0], T_map_base[1], self.config.window.window_m)
+            window = self.grid.window(
+                T_map_base[0], T_map_base[1], self.config.window.local_map_size_m
+            )
             if not self._grid.is_rerendering and self.topology.update(window, T_map_base):
                 set_topology(self.localizer, self.topology.map)
         return window
@@ -100,7 +102,7 @@ class Pipeline:
     def _rebuild(self, moved: CorrectedPoses) -> None:
         """Rebuild the graph after a correction of the grid."""
         with self._timed('rebuild'):
-            size = self.config.window.window_m
+            size = self.config.window.local_map_size_m
             self.topology.rebuild(lambda x, y: self.grid.window(x, y, size), *moved)
             set_topology(self.localizer, self.topology.map)
 

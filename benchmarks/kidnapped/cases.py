@@ -32,7 +32,7 @@ LASERS = {
         beams=541, field_of_view_deg=270.0, range_max_m=20.0
     ),
     '270 deg in 0.25, 30 m, 0.2 m ahead': LaserScannerConfig(
-        beams=1081, field_of_view_deg=270.0, range_max_m=30.0, mount_x_m=0.2
+        beams=1081, field_of_view_deg=270.0, range_max_m=30.0, laser_x_m=0.2
     ),
     '360 deg in 1, 4 m': LaserScannerConfig(beams=360, field_of_view_deg=360.0, range_max_m=4.0),
     '240 deg in 0.36, 4 m': LaserScannerConfig(beams=667, field_of_view_deg=240.0, range_max_m=4.0),

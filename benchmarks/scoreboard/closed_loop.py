@@ -131,7 +131,7 @@ def _pipeline_config(
     """As `explore_world` has it: a beam that met nothing has seen as far as this laser can."""
     return PipelineConfig(
         localizer=config_of(options or {}, start),
-        grid=OccupancyConfig(no_return_range_m=laser.range_max_m),
+        grid=OccupancyConfig(no_return_clear_range_m=laser.range_max_m),
         scans_per_graph=SCANS_PER_GRAPH,
     )
 

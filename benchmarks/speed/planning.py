@@ -78,8 +78,8 @@ def _try(floor: Floor, patch: GridPatch, rng: np.random.Generator, tally: _Tally
     at = tuple(patch.frame.cells_of(start[None, :2])[0])
     expected = parts[at] > 0 and parts[tuple(cell)] == parts[at]
     # Beside what can be reached, a goal moves a little: neither answer is wrong there.
-    low = np.maximum(cell - math.ceil(config.goal_slack_m / resolution), 0)
-    slack = config.goal_slack_m / resolution
+    low = np.maximum(cell - math.ceil(config.goal_search_radius_m / resolution), 0)
+    slack = config.goal_search_radius_m / resolution
     near = parts[low[0] : cell[0] + math.ceil(slack) + 1, low[1] : cell[1] + math.ceil(slack) + 1]
     if parts[at] == 0 or (not expected and (near == parts[at]).any()):
         return

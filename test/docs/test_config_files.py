@@ -117,7 +117,7 @@ def test_unknown_key_of_a_file_is_an_error(declared, tmp_path):
     (tmp_path / 'given.yaml').write_text(
         yaml.safe_dump({'/**': {'ros__parameters': {'windwo_m': 3.0}}})
     )
-    with pytest.raises(ConfigError, match=r'no parameter windwo_m; it has: .*window_m'):
+    with pytest.raises(ConfigError, match=r'no parameter windwo_m; it has: .*local_map_size_m'):
         declared('grid_mapper', '--params-file', str(tmp_path / 'given.yaml'))
 
 
@@ -179,6 +179,6 @@ def test_presets_fit_together():
             for name in ('sim', 'grid_mapper', 'localizer')
         )
         assert localizer['matching.max_range_m'] <= sim['range_max_m']
-        assert grid['usable_range_m'] <= sim['range_max_m']
-        reach_m = max(grid['no_return_range_m'], min(grid['usable_range_m'], 4.0))
-        assert grid['window_m'] >= 2.0 * reach_m
+        assert grid['max_range_m'] <= sim['range_max_m']
+        reach_m = max(grid['no_return_clear_range_m'], min(grid['max_range_m'], 4.0))
+        assert grid['local_map_size_m'] >= 2.0 * reach_m

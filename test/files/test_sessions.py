@@ -126,8 +126,8 @@ def test_what_does_not_fit_is_said(tmp_path: Path) -> None:
         TOPOLOGY.read(tmp_path / 'a.npz')
     with pytest.raises(InputError, match='resolution'):
         GRID.read(tmp_path / 'a.npz', OccupancyConfig(resolution_m=0.05))
-    with pytest.raises(InputError, match='memory_m'):
-        TOPOLOGY.read(tmp_path / 'b.npz', TopologyConfig(memory_m=20.0))
+    with pytest.raises(InputError, match='window_memory_m'):
+        TOPOLOGY.read(tmp_path / 'b.npz', TopologyConfig(window_memory_m=20.0))
 
 
 @pytest.mark.parametrize('end', ['', '.grid.npz', '.topology.npz', '.yaml', '.pgm'])

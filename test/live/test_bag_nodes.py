@@ -213,7 +213,7 @@ def test_a_loop_begins_again_with_the_clock(graph, bag):
         rate=50.0,
         wait_for_subscribers=2,
         lockstep='pose',
-        lockstep_patience_s=PATIENCE_S,
+        lockstep_timeout_s=PATIENCE_S,
     )
     graph.until(answers.get_subscription_count, 'a player that hears answers')
 

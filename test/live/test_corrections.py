@@ -51,7 +51,9 @@ class Mapping:
 
     def start(self):
         doctor = Doctor(self.graph)
-        self.graph.start('grid_mapper', laser_pose='0,0,0', recover_s=1000.0, resolution_m=0.03)
+        self.graph.start(
+            'grid_mapper', laser_pose='0,0,0', recovery_timeout_s=1000.0, resolution_m=0.03
+        )
         keys = [
             'scan: publishers',
             'pose: publishers',

@@ -184,7 +184,7 @@ def test_it_goes_on_after_a_cancelled_goal_and_after_a_new_start(graph, robot, t
     before = robot.evidence()
     stem = tmp_path / 'room'
     assert graph.call(SaveMap, 'save_exploration', SaveMap.Request(path=str(stem))).success
-    for session in ({}, {'session': str(stem)}):
+    for session in ({}, {'session_path': str(stem)}):
         if session:
             assert graph.stop('explorer') == 0, graph.log('explorer')
             graph.start('explorer', laser_pose='0,0,0', use_sim_time=True, **session)

@@ -65,7 +65,7 @@ def test_a_robot_that_drives_about_finds_itself_when_asked(graph, map_file):
     poses = graph.heard('initialpose', PoseWithCovarianceStamped)
     samples = graph.heard('localization_samples', PoseArray, qos.LATCHED)
     truth = graph.heard('ground_truth', PoseStamped)
-    graph.start('global_localizer', map=str(map_file), use_sim_time=True)
+    graph.start('global_localizer', map_path=str(map_file), use_sim_time=True)
     commands = graph.node.create_publisher(Twist, 'cmd_vel', 10)
     graph.start('sim', start=','.join(map(str, START)), rate=3.0)
     graph.until(lambda: status and truth, 'status and the robot')
@@ -105,7 +105,7 @@ def test_a_robot_that_drives_about_finds_itself_when_asked(graph, map_file):
 
 def test_it_says_what_is_missing_and_waits(graph):
     status = graph.heard('localization_status', LocalizationStatus, qos.LATCHED)
-    graph.start('global_localizer', automatic=True, laser_pose='0.0,0.0,0.0')
+    graph.start('global_localizer', start_automatically=True, laser_pose='0.0,0.0,0.0')
     graph.until(lambda: status and status[-1].state == LocalizationStatus.WAITING, 'waiting')
     assert status[-1].reason == 'waits for map, topology, odom, scan'
     graph.until(lambda: 'waits for map' in graph.log('global_localizer'), 'a warning in words')
@@ -119,7 +119,11 @@ def test_a_robot_that_may_drive_finds_itself_alone_and_stops(graph, tmp_path):
     truth = graph.heard('ground_truth', PoseStamped)
     commands = graph.heard('cmd_vel', Twist)
     graph.start(
-        'global_localizer', map=str(map_file), automatic=True, active=True, use_sim_time=True
+        'global_localizer',
+        map_path=str(map_file),
+        start_automatically=True,
+        drive=True,
+        use_sim_time=True,
     )
     graph.start('sim', world=str(tmp_path / 'twins.yaml'), rate=4.0, lockstep='localization_status')
     graph.until(lambda: poses and truth and commands, 'a pose, the true one and commands')
@@ -152,7 +156,7 @@ def test_what_is_wrong_with_the_input_is_said_in_words_and_no_pose_comes_of_it(g
             ('scan', LaserScan, qos.SENSOR),
         )
     }
-    graph.start('global_localizer', automatic=True, laser_pose='0.0,0.0,0.0')
+    graph.start('global_localizer', start_automatically=True, laser_pose='0.0,0.0,0.0')
     good = occupancy_maps.read_map(map_file)
     topology = build(good, None, TopologyConfig())
     seconds = itertools.count(1)
@@ -202,7 +206,7 @@ def test_what_is_wrong_with_the_input_is_said_in_words_and_no_pose_comes_of_it(g
 
 
 def test_a_map_that_cannot_be_read_ends_the_start_in_words(graph, tmp_path):
-    process = graph.start('global_localizer', map=str(tmp_path / 'nowhere.yaml'))
+    process = graph.start('global_localizer', map_path=str(tmp_path / 'nowhere.yaml'))
     assert graph.ended(process) == 2
     graph.processes.clear()
     assert 'nowhere.yaml' in graph.log('global_localizer')

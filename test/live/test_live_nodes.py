@@ -72,7 +72,7 @@ def test_a_scan_becomes_a_pose_a_map_and_a_graph(graph, tmp_path):
     graph.start('localizer', use_sim_time=True, **AT_START)
     graph.start('grid_mapper', use_sim_time=True)
     graph.start('topology_builder', use_sim_time=True)
-    graph.start('sim', start=START, rate=4.0, lockstep='local_topology', hold_for_subscribers=3)
+    graph.start('sim', start=START, rate=4.0, lockstep='local_topology', wait_for_subscribers=3)
     graph.until(
         lambda: len(local_maps) > 8 and poses and status and scans and ('map', 'odom') in links(),
         'local maps, poses, status, scans and the frame of the odometry',
@@ -189,7 +189,7 @@ def test_the_navigator_drives_to_a_goal_and_refuses_one_in_a_wall(graph):
         start=START,
         rate=8.0,
         lockstep='local_topology',
-        hold_for_subscribers=3,
+        wait_for_subscribers=3,
     )
     maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
     graph.until(lambda: maps and is_free(maps[-1], 3.0, 2.0), 'a map that knows the goal')

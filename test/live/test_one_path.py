@@ -118,7 +118,7 @@ def assert_live_is_same(graph, bag, expected, tmp_path, **localizer):
         rate=1000.0,
         start_paused=True,
         lockstep='local_topology',
-        lockstep_patience_s=PATIENCE_S,
+        lockstep_timeout_s=PATIENCE_S,
         wait_for_subscribers=2,
     )
     wanted = {f'{n}: {t}': c for n, topics in CONNECTIONS.items() for t, c in topics.items()}

@@ -45,7 +45,7 @@ def test_one_process_locates_maps_and_drives(graph):
         start='2.0,2.0,0.0',
         rate=8.0,
         lockstep='local_topology',
-        hold_for_subscribers=3,
+        wait_for_subscribers=3,
     )
     graph.until(
         lambda: maps and free_at(maps[-1], 3.0, 2.0) and graphs and graphs[-1].nodes,
@@ -91,7 +91,7 @@ def start_robot(graph, name, start, seed):
         initial_x_m=float(x),
         initial_y_m=float(y),
         initial_yaw_rad=0.0,
-        hold_for_subscribers=2,
+        wait_for_subscribers=2,
         rate=2.0,
         arguments=('sim', 'localizer', 'grid_mapper', 'topology_builder'),
     )

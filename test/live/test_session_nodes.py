@@ -50,7 +50,7 @@ def drive(graph, x, y, yaw, metres):
         start=f'{x},{y},{yaw}',
         rate=4.0,
         lockstep='local_topology',
-        hold_for_subscribers=2,
+        wait_for_subscribers=2,
     )
     commands = graph.node.create_publisher(Twist, 'cmd_vel', 10)
     forward = Twist()
@@ -95,7 +95,7 @@ def test_ids_and_cells_are_the_same_tomorrow_and_mapping_goes_on(graph, tmp_path
     assert len(before) > 3
     maps.clear(), graphs.clear(), local.clear()
     for name in MAPPERS:
-        graph.start(name, use_sim_time=True, session=str(stem))
+        graph.start(name, use_sim_time=True, session_path=str(stem))
     graph.until(lambda: maps and graphs, 'the saved map and graph, without a scan')
     assert not local
     assert places(graphs[-1]) == before and {edge.id for edge in graphs[-1].edges} == edges
@@ -229,7 +229,11 @@ def test_services_touch_nothing_outside_of_their_folder(graph, tmp_path):
     described = (outside / 'drawn.yaml').read_text()
     (folder / 'seen.yaml').write_text(described.replace('drawn.pgm', '../outside/drawn.pgm'))
     for name in ('grid_mapper', 'topology_builder', 'localizer', 'explorer'):
-        graph.start(name, save_folder='maps', **({} if name == 'explorer' else {'recover_s': 0.0}))
+        graph.start(
+            name,
+            save_directory='maps',
+            **({} if name == 'explorer' else {'recovery_timeout_s': 0.0}),
+        )
     before = files_below(tmp_path)
     wrong = [
         str(outside / 'room'),
@@ -273,7 +277,7 @@ def test_services_touch_nothing_outside_of_their_folder(graph, tmp_path):
     # What the operator names at the start is not confined.
     assert graph.stop('grid_mapper') == 0
     maps = graph.heard('map', OccupancyGridMsg, qos.LATCHED)
-    graph.start('grid_mapper', save_folder='maps', session=str(outside / 'room'))
+    graph.start('grid_mapper', save_directory='maps', session_path=str(outside / 'room'))
     graph.until(lambda: maps and max(maps[-1].data) > 50, 'the session from elsewhere')
 
 
@@ -287,7 +291,7 @@ def test_a_session_of_nonsense_leaves_the_running_map_as_it_was(graph, tmp_path)
     np.savez(tmp_path / 'bad.topology.npz', **arrays)
     maps, graphs, _ = heard_maps(graph)
     for name in MAPPERS:
-        graph.start(name, session=str(tmp_path / 'room'))
+        graph.start(name, session_path=str(tmp_path / 'room'))
     graph.until(lambda: maps and graphs, 'map and graph')
     before = places(graphs[-1])
 
@@ -331,7 +335,7 @@ def test_a_builder_that_does_not_answer_is_said_and_the_mapper_goes_on(graph, tm
 
 @pytest.mark.parametrize('name', MAPPERS)
 def test_a_session_that_is_not_there_ends_the_start_with_one_clear_line(graph, name):
-    process = graph.start(name, session='/nowhere/room')
+    process = graph.start(name, session_path='/nowhere/room')
     assert graph.ended(process) == 2
     lines = graph.log(name).strip().splitlines()
     assert '/nowhere/room' in lines[-1] and 'Traceback' not in graph.log(name)

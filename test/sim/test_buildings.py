@@ -17,7 +17,7 @@ from thinmap_ros.sim.surfaces import inside_of
 from thinmap_ros.sim.world import World
 
 SEEDS = range(24)
-EXACT = LaserScannerConfig(noise_m=0.0, rounding_m=0.0, mixed_pixels=0.0)
+EXACT = LaserScannerConfig(range_noise_m=0.0, range_resolution_m=0.0, mixed_pixel_ratio=0.0)
 NOBODY = Pedestrians(np.zeros((0, 4, 2)), np.zeros(0), np.zeros((0, 4)))
 NO_DOOR = Doors(
     np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros((0, 1)), np.zeros((0, 1), bool)

@@ -14,7 +14,7 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 from thinmap_ros.sim.world import World
 
-EXACT = LaserScannerConfig(noise_m=0.0, mixed_pixels=0.0, rounding_m=0.0)
+EXACT = LaserScannerConfig(range_noise_m=0.0, mixed_pixel_ratio=0.0, range_resolution_m=0.0)
 
 
 def box(width_m: float = 6.0, height_m: float = 4.0, pillar: bool = False) -> World:
@@ -84,9 +84,9 @@ def test_other_lasers(beams: int, fov: float, range_m: float) -> None:
         beams=beams,
         field_of_view_deg=fov,
         range_max_m=range_m,
-        noise_m=0.0,
-        mixed_pixels=0.0,
-        rounding_m=0.0,
+        range_noise_m=0.0,
+        mixed_pixel_ratio=0.0,
+        range_resolution_m=0.0,
     )
     scan = LaserScanner(config, 0).scan(BOX, np.array([3.0, 1.0, 1.0]), 0)
     assert scan.ranges_m.size == beams
@@ -100,7 +100,9 @@ def test_other_lasers(beams: int, fov: float, range_m: float) -> None:
 
 
 def test_the_mount_moves_the_laser() -> None:
-    config = LaserScannerConfig(mount_x_m=0.4, noise_m=0.0, mixed_pixels=0.0, rounding_m=0.0)
+    config = LaserScannerConfig(
+        laser_x_m=0.4, range_noise_m=0.0, mixed_pixel_ratio=0.0, range_resolution_m=0.0
+    )
     T_world_base = np.array([1.0, 2.0, 0.7])
     scan = LaserScanner(config, 0).scan(BOX, T_world_base, 0)
     points = se2.transform_points(T_world_base, scan.points_base())
@@ -112,7 +114,7 @@ def test_the_mount_moves_the_laser() -> None:
 
 
 def test_noise_has_its_sigma_and_ranges_are_whole_millimetres() -> None:
-    laser = LaserScanner(LaserScannerConfig(noise_m=0.01, mixed_pixels=0.0), 3)
+    laser = LaserScanner(LaserScannerConfig(range_noise_m=0.01, mixed_pixel_ratio=0.0), 3)
     scans = [laser.scan(BOX, np.array([3.0, 2.0, 0.4]), i) for i in range(200)]
     exact = LaserScanner(EXACT, 0).scan(BOX, np.array([3.0, 2.0, 0.4]), 0)
     errors = np.array([s.ranges_m for s in scans]) - exact.ranges_m
@@ -126,7 +128,9 @@ def test_mixed_pixels_lie_between_the_two_surfaces_and_only_at_edges() -> None:
     world = box(pillar=True)
     pose = np.array([1.0, 2.0, 0.0])
     exact = LaserScanner(EXACT, 0).scan(world, pose, 0).ranges_m
-    mixing = LaserScanner(LaserScannerConfig(noise_m=0.0, rounding_m=0.0, mixed_pixels=1.0), 1)
+    mixing = LaserScanner(
+        LaserScannerConfig(range_noise_m=0.0, range_resolution_m=0.0, mixed_pixel_ratio=1.0), 1
+    )
     changed = np.zeros(exact.size, dtype=bool)
     for i in range(50):
         ranges = mixing.scan(world, pose, i).ranges_m
@@ -143,7 +147,9 @@ def test_mixed_pixels_favour_neither_side() -> None:
     """A pillar straight ahead: what its left edge does on average, its right edge does as well."""
     world = box(pillar=True)
     pose = np.array([1.0, 2.0, 0.0])
-    laser = LaserScanner(LaserScannerConfig(noise_m=0.0, rounding_m=0.0, mixed_pixels=1.0), 1)
+    laser = LaserScanner(
+        LaserScannerConfig(range_noise_m=0.0, range_resolution_m=0.0, mixed_pixel_ratio=1.0), 1
+    )
     mean = np.mean([laser.scan(world, pose, i).ranges_m for i in range(1000)], axis=0)
     off = mean - LaserScanner(EXACT, 0).scan(world, pose, 0).ranges_m
     assert np.abs(off).max() > 0.3
@@ -152,7 +158,9 @@ def test_mixed_pixels_favour_neither_side() -> None:
 
 def test_mixed_pixels_come_as_often_as_said() -> None:
     world = box(pillar=True)
-    laser = LaserScanner(LaserScannerConfig(noise_m=0.0, rounding_m=0.0, mixed_pixels=0.3), 1)
+    laser = LaserScanner(
+        LaserScannerConfig(range_noise_m=0.0, range_resolution_m=0.0, mixed_pixel_ratio=0.3), 1
+    )
     exact = LaserScanner(EXACT, 0).scan(world, world.start, 0).ranges_m
     mixed = [int((laser.scan(world, world.start, i).ranges_m != exact).sum()) for i in range(500)]
     assert np.mean(mixed) == pytest.approx(0.6, abs=0.1)

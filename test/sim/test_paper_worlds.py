@@ -91,7 +91,7 @@ def _sees(world: World, place: np.ndarray, face: np.ndarray, resolution: float) 
 def test_the_tour_can_be_driven(name: str) -> None:
     world, tour = load(name)
     robot = PRESETS['2dx']
-    simulation = Simulation(world, world.start, robot, LaserScannerConfig(rate_hz=0.1), 0)
+    simulation = Simulation(world, world.start, robot, LaserScannerConfig(scan_rate_hz=0.1), 0)
     poses = np.array(
         [
             sample.T_world_base

@@ -68,9 +68,9 @@ def test_limits_of_speed_and_acceleration(name: str) -> None:
     for _ in range(100):
         robot.step(9.0, -9.0, 0.05)
         assert abs(robot.v - previous[0]) <= config.max_acceleration_m_s2 * 0.05 + 1e-12
-        assert abs(robot.w - previous[1]) <= config.max_turn_acceleration_rad_s2 * 0.05 + 1e-12
+        assert abs(robot.w - previous[1]) <= config.max_angular_acceleration_rad_s2 * 0.05 + 1e-12
         previous = (robot.v, robot.w)
-    assert previous == (config.max_speed_m_s, -config.max_turn_rad_s)
+    assert previous == (config.max_speed_m_s, -config.max_angular_speed_rad_s)
 
 
 def test_it_stops_at_a_wall_and_counts_the_contact_once() -> None:

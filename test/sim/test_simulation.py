@@ -18,7 +18,9 @@ def simulation(seed: int = 1, rate_hz: float = 5.0) -> Simulation:
     cells[:, 0] = 1
     cells[:, -1] = 1
     world = World('box', cells, GridFrame(0.0, 0.0, 0.1), np.array([3.0, 3.0, 0.0]))
-    return Simulation(world, world.start, PRESETS['2dx'], LaserScannerConfig(rate_hz=rate_hz), seed)
+    return Simulation(
+        world, world.start, PRESETS['2dx'], LaserScannerConfig(scan_rate_hz=rate_hz), seed
+    )
 
 
 def drive(sim: Simulation, steps: int) -> list[SensorReadings]:

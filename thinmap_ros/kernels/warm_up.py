@@ -52,7 +52,7 @@ def grid_mapper() -> None:
     rehearsed = OccupancyGrid()
     for scan, T_map_base in _drive():
         rehearsed.add_scan(scan, T_map_base)
-        rehearsed.window(T_map_base[0], T_map_base[1], WindowConfig().window_m)
+        rehearsed.window(T_map_base[0], T_map_base[1], WindowConfig().local_map_size_m)
     rehearsed.known_area()
 
 
@@ -66,7 +66,7 @@ def topology_builder() -> None:
     for scan, T_map_base in _drive():
         grid.add_scan(scan, T_map_base)
         rehearsed.update(
-            grid.window(T_map_base[0], T_map_base[1], WindowConfig().window_m), T_map_base
+            grid.window(T_map_base[0], T_map_base[1], WindowConfig().local_map_size_m), T_map_base
         )
         rehearsed.local_map()
 

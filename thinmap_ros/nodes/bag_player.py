@@ -37,25 +37,29 @@ _SCAN = 'sensor_msgs/msg/LaserScan'
 class BagPlayerConfig(Config):
     """Parameters of the player."""
 
-    bag: str = parameter('', 'rosbag2 folder or MCAP file')
-    topics: str = parameter('', 'topics to play, separated by commas; empty: all')
-    prefix: str = parameter('', 'put before each topic: robot1 makes /scan /robot1/scan')
-    rate: float = parameter(1.0, 'bag seconds a second', low=0.01, high=1000.0)
-    start_offset_s: float = parameter(0.0, 'begin so far into the bag, s', low=0.0)
-    loop: bool = parameter(False, 'begin again at the end')
-    start_paused: bool = parameter(False, 'wait for ~/pause or ~/step')
+    bag: str = parameter('', 'rosbag2 folder or MCAP file.')
+    topics: str = parameter('', 'Topics to play, separated by commas. Empty: all.')
+    prefix: str = parameter('', 'Prefix of each topic: robot1 makes /scan /robot1/scan.')
+    rate: float = parameter(1.0, 'Seconds of the bag per second.', low=0.01, high=1000.0)
+    start_offset_s: float = parameter(
+        0.0, 'Time into the bag at which playback starts (s).', low=0.0
+    )
+    loop: bool = parameter(False, 'Start again at the end of the bag.')
+    start_paused: bool = parameter(False, 'Start paused, until ~/pause or ~/step.')
     wait_for_subscribers: int = parameter(
         1,
-        'begin when every scan topic (or, without one, any topic) has so many subscribers',
+        'Playback starts when every scan topic (or, without one, any topic) has this many '
+        'subscribers.',
         low=0,
         high=100,
     )
     lockstep: str = parameter(
         NONE,
-        'wait for this result of each scan, so that none is lost at high rates',
+        'Topic whose message for each scan is awaited, so that nothing is lost at high rates. '
+        'none: time never waits.',
         choices=TOPICS,
     )
-    lockstep_patience_s: float = parameter(TIMEOUT_S, TIMEOUT_DESCRIPTION, low=0.1, high=3600.0)
+    lockstep_timeout_s: float = parameter(TIMEOUT_S, TIMEOUT_DESCRIPTION, low=0.1, high=3600.0)
 
 
 class _ClockPublisher:
@@ -103,7 +107,7 @@ class BagPlayerNode(Node):
         self._start_s: float | None = None
         self._paused = self._config.start_paused
         self._last_tick_s = 0.0
-        self._lockstep = Lockstep(self, self._config.lockstep, self._config.lockstep_patience_s)
+        self._lockstep = Lockstep(self, self._config.lockstep, self._config.lockstep_timeout_s)
         self._sent: Counter[str] = Counter()
         self._diagnostics = NodeDiagnostics(self)
         self._diagnostics.add_update_callback(self._publish_diagnostics)

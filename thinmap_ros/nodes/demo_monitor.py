@@ -34,13 +34,13 @@ _RESEND_S = 10.0
 class DemoMonitorConfig(Config):
     """Parameters of the monitor."""
 
-    world: str = parameter('room_10x10', 'world whose coverage is shown')
-    robot: str = parameter('2dx', 'which Pioneer', choices=tuple(PRESETS))
-    range_max_m: float = parameter(8.0, "the laser's range, m", low=0.1, high=200.0)
+    world: str = parameter('room_10x10', 'World whose coverage is shown.')
+    robot: str = parameter('2dx', 'Preset of the robot.', choices=tuple(PRESETS))
+    range_max_m: float = parameter(8.0, 'Range of the laser (m).', low=0.1, high=200.0)
     time_limit_s: float = parameter(
-        0.0, 'simulated time after which the exploration ends; 0: none, s', low=0.0
+        0.0, 'Simulated time after which the exploration ends (s). 0: none.', low=0.0
     )
-    result: str = parameter('', 'JSON file for the result')
+    result: str = parameter('', 'JSON file for the result. Empty: none.')
 
 
 class DemoMonitorNode(Node):

@@ -47,7 +47,7 @@ class ExplorerNode(ThinmapNode):
     def __init__(self) -> None:
         super().__init__('explorer')
         self._strategies = StrategySource(self)
-        self._map_frame = parameters.declare_parameter(self, 'map_frame', 'map', 'frame of the map')
+        self._map_frame = parameters.declare_map_frame(self)
         self._laser_transform = LaserTransform(self)
         self._session = parameters.declare_session(self)
         self._save_directory = SaveDirectory(self)

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped, Twist
 from nav_msgs.msg import OccupancyGrid, Odometry
@@ -13,6 +12,7 @@ from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.msg import LocalizationStatus, SlamStatus, TopologicalMap
 from thinmap_msgs.srv import LocalizeGlobally
+from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.active_localization import ActiveSearch
 from thinmap_ros.core.grid.patch import GridPatch
@@ -52,46 +52,47 @@ _STATES = {
 
 
 @dataclass(frozen=True)
-class _Settings:
-    """Parameters of the node.
+class GlobalLocalizerConfig(Config):
+    """Parameters of the node besides those of the search."""
 
-    automatic: search at once, and again when the localizer has been lost for lost_ns. active: drive
-    while searching. map_file: '' for the map of the topics.
-    """
+    seed: int = parameter(0, 'Seed of the samples.')
+    start_automatically: bool = parameter(
+        False, 'Start at once, and when the localizer has reported LOST for lost_timeout_s.'
+    )
+    lost_timeout_s: float = parameter(
+        3.0,
+        'Time for which the localizer must report LOST (s). Raise it if the localizer recovers by '
+        'itself.',
+        low=0.0,
+    )
+    drive: bool = parameter(
+        False, 'Drive towards disambiguating viewpoints while localizing. Publishes cmd_vel.'
+    )
+    drive_speed_m_s: float = parameter(0.3, 'Speed of that drive (m/s).', low=0.01, high=5.0)
+    map_path: str = parameter(
+        '', 'map_server YAML file. Empty: map and topology are taken from their topics.'
+    )
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """Parameters of the search, the node, and of driving while searching."""
 
     search: GlobalLocalizationConfig
-    seed: int
+    node: GlobalLocalizerConfig
     map_frame: str
-    automatic: bool
-    lost_ns: int
-    active: bool
     driving: NavigatorConfig
-    map_file: str
 
     @staticmethod
     def declare(node: Node) -> '_Settings':
-        def declare(name: str, default: object, description: str) -> Any:
-            return parameters.declare_parameter(node, name, default, description)
-
         search = parameters.declare_config(node, GlobalLocalizationConfig)
-        seed = int(declare('seed', 0, 'decides where samples are drawn'))
-        map_frame = str(declare('map_frame', 'map', 'frame of the map'))
-        automatic = 'begin at once, and again when the localizer has been lost for lost_s'
-        is_automatic = bool(declare('automatic', False, automatic))
-        lost_s = float(declare('lost_s', 3.0, 'how long the localizer must have been lost, s'))
-        active = 'drive, while it looks, to where the places in question differ most'
-        is_active = bool(declare('active', False, active))
-        speed_m_s = float(declare('active_speed_m_s', 0.3, 'how fast it then drives, m/s'))
-        map_file = str(declare('map', '', 'map_server YAML file; empty: from the topics'))
+        own = parameters.declare_config(node, GlobalLocalizerConfig)
         driving = NavigatorConfig(
-            max_speed_m_s=speed_m_s,
+            max_speed_m_s=own.drive_speed_m_s,
             robot_radius_m=search.robot_radius_m + _PATH_MARGIN_M,
-            body_radius_m=search.robot_radius_m + _STOP_MARGIN_M,
+            stop_radius_m=search.robot_radius_m + _STOP_MARGIN_M,
         )
-        lost_ns = round(1e9 * lost_s)
-        return _Settings(
-            search, seed, map_frame, is_automatic, lost_ns, is_active, driving, map_file
-        )
+        return _Settings(search, own, parameters.declare_map_frame(node), driving)
 
 
 class _LostDetector:
@@ -246,14 +247,14 @@ class GlobalLocalizerNode(ThinmapNode):
         parameters.reject_unknown(self)
         self._patch: GridPatch | None = None
         self._topology: Topology | None = None
-        if self._settings.map_file:
-            self._patch = occupancy_maps.read_map(Path(self._settings.map_file))
+        if self._settings.node.map_path:
+            self._patch = occupancy_maps.read_map(Path(self._settings.node.map_path))
             self._topology = build(self._patch, None, TopologyConfig())
         warm_up.global_localizer()
         self._output = _LocalizationPublishers(self, self._settings.map_frame)
         self._driver = self._create_driver()
         self.reset_state()
-        if not self._settings.map_file:
+        if not self._settings.node.map_path:
             subscribe_guarded(self, OccupancyGrid, 'map', self._on_map, qos.LATCHED)
             subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
         subscribe_guarded(self, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
@@ -263,7 +264,7 @@ class GlobalLocalizerNode(ThinmapNode):
         self.create_active_timer(1.0, self._report_missing_inputs)
 
     def _create_driver(self) -> _SearchDriver:
-        if not self._settings.active:
+        if not self._settings.node.drive:
             return _SearchDriver(self.get_clock(), lambda command: None)
         cmd_vel = self.create_publisher(Twist, 'cmd_vel', qos.STREAM)
         self.create_active_timer(_CONTROL_PERIOD_S, lambda: self._driver.step())
@@ -272,8 +273,8 @@ class GlobalLocalizerNode(ThinmapNode):
     def reset_state(self) -> None:
         """Discard the search and all inputs but the map."""
         self._localization: GlobalLocalization | None = None
-        self._is_requested = self._settings.automatic
-        self._lost = _LostDetector(self._settings.lost_ns)
+        self._is_requested = self._settings.node.start_automatically
+        self._lost = _LostDetector(round(1e9 * self._settings.node.lost_timeout_s))
         self._pairing = ScanOdometrySynchronizer()
         self._received: set[str] = set()
         self._driver.reset()
@@ -297,7 +298,7 @@ class GlobalLocalizerNode(ThinmapNode):
         """Start when the localizer reports LOST (kidnapped robot)."""
         is_lost = message.state == SlamStatus.LOST and not self._is_requested
         is_kidnapped = self._lost.update(messages.stamp_ns(message.header.stamp), is_lost)
-        if is_kidnapped and self._settings.automatic:
+        if is_kidnapped and self._settings.node.start_automatically:
             self.get_logger().info('the localizer is lost: searching the whole map')
             self._start(clear=True)
 
@@ -359,13 +360,13 @@ class GlobalLocalizerNode(ThinmapNode):
         settings = self._settings
         try:
             localization = GlobalLocalization(
-                self._patch, self._topology, settings.search, settings.seed
+                self._patch, self._topology, settings.search, settings.node.seed
             )
         except InputError as error:
             self._output.publish_state(LocalizationStatus.WAITING, str(error))
             return None
         self._localization = localization
-        if settings.active:
+        if settings.node.drive:
             self._driver.search = ActiveSearch(
                 localization.places, settings.search, settings.driving
             )

@@ -38,14 +38,14 @@ class _Settings:
     """Parameters of the node; mapping: whether scans change the map."""
 
     grid: OccupancyConfig
-    window_m: float
+    local_map_size_m: float
     mapping: bool
 
     @staticmethod
     def declare(node: Node) -> '_Settings':
         return _Settings(
             grid=parameters.declare_config(node, OccupancyConfig),
-            window_m=parameters.declare_config(node, WindowConfig).window_m,
+            local_map_size_m=parameters.declare_config(node, WindowConfig).local_map_size_m,
             mapping=bool(
                 parameters.declare_parameter(
                     node,
@@ -61,7 +61,7 @@ class _MapPublishers:
     """Publishes the map and the local maps."""
 
     def __init__(self, node: Node) -> None:
-        self._frame = parameters.declare_parameter(node, 'map_frame', 'map', 'frame of the map')
+        self._frame = parameters.declare_map_frame(node)
         self._map = node.create_publisher(OccupancyGridMsg, 'map', qos.LATCHED)
         self._local_map = node.create_publisher(OccupancyGridMsg, 'local_map', qos.LATCHED)
 
@@ -157,7 +157,7 @@ class GridMapperNode(ThinmapNode):
             is_mapped = self._settings.mapping and is_known
             moved = self._grid.update(scan if is_mapped else None, T_map_base)
             x, y, _ = T_map_base
-            window = self._grid.shown.window(x, y, self._settings.window_m)
+            window = self._grid.shown.window(x, y, self._settings.local_map_size_m)
         self._stamp.latest_ns = scan.stamp_ns
         if moved is not None:
             self._publish_map()  # before the windows of the corrected map

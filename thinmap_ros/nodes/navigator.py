@@ -94,7 +94,7 @@ class NavigatorNode(ThinmapNode):
     def __init__(self) -> None:
         super().__init__('navigator')
         self._config = parameters.declare_config(self, NavigatorConfig, self._on_config)
-        self._map_frame = parameters.declare_parameter(self, 'map_frame', 'map', 'frame of the map')
+        self._map_frame = parameters.declare_map_frame(self)
         self._laser_transform = LaserTransform(self)
         parameters.reject_unknown(self)
         warm_up.navigator()

@@ -27,7 +27,7 @@ _DEPTH = 1000
 class RecorderConfig(Config):
     """Parameters of the recorder."""
 
-    bag: str = parameter('bag', 'rosbag2 folder to write; it must not exist yet')
+    bag: str = parameter('bag', 'rosbag2 folder to write. It must not exist yet.')
 
 
 class RecorderNode(Node):

@@ -50,8 +50,8 @@ _TOPICS = {
 class RerunViewerConfig(Config):
     """Parameters of the viewer."""
 
-    recording: str = parameter('', 'file to write (.rrd); empty: none')
-    spawn: bool = parameter(True, 'open the viewer')
+    recording: str = parameter('', 'Recording to write (.rrd). Empty: none.')
+    spawn: bool = parameter(True, 'Open the viewer.')
 
 
 class RerunViewerNode(Node):

@@ -39,22 +39,23 @@ class SimConfig(Config):
     """Parameters of the simulation."""
 
     world: str = parameter(
-        'room_10x10', 'world or map YAML file, or the name of a world of the package'
+        'room_10x10', 'World or map YAML file, or the name of a world of the package.'
     )
-    robot: str = parameter('2dx', 'which Pioneer', choices=tuple(PRESETS))
-    start: str = parameter('', 'start as "x,y,theta" (m, m, rad); empty: the one of the world')
-    seed: int = parameter(0, 'decides all noise', low=0, high=2**31 - 1)
-    rate: float = parameter(1.0, 'simulated seconds a second', low=0.01, high=1000.0)
+    robot: str = parameter('2dx', 'Preset of the robot.', choices=tuple(PRESETS))
+    start: str = parameter('', 'Start as "x,y,theta" (m, m, rad). Empty: the start of the world.')
+    seed: int = parameter(0, 'Seed of all noise.', low=0, high=2**31 - 1)
+    real_time_factor: float = parameter(1.0, 'Simulated seconds per second.', low=0.01, high=1000.0)
     lockstep: str = parameter(
         NONE,
-        'wait for this result of each scan, so that none is lost at high rates',
+        'Topic whose message for each scan is awaited, so that nothing is lost at high rates. '
+        'none: time never waits.',
         choices=TOPICS,
     )
-    lockstep_patience_s: float = parameter(TIMEOUT_S, TIMEOUT_DESCRIPTION, low=0.1, high=3600.0)
-    hold_for_subscribers: int = parameter(
-        0, 'wait at the start until /scan has this number of subscribers', low=0, high=100
+    lockstep_timeout_s: float = parameter(TIMEOUT_S, TIMEOUT_DESCRIPTION, low=0.1, high=3600.0)
+    wait_for_subscribers: int = parameter(
+        0, 'Time stands still until scan has this many subscribers.', low=0, high=100
     )
-    publish_tf: bool = parameter(True, 'publish odom -> base_link and base_link -> laser')
+    publish_tf: bool = parameter(True, 'Publish odom -> base_link and base_link -> laser.')
 
 
 class _SimPublishers:
@@ -138,9 +139,9 @@ class SimNode(Node):
         world = World.from_patch(*read_world(package_data.world_path(self._config.world)))
         start = _start(self._config.start, world)
         self._sim = Simulation(world, start, PRESETS[self._config.robot], laser, self._config.seed)
-        self._output = _SimPublishers(self, 1.0 / laser.rate_hz, self._config.publish_tf)
+        self._output = _SimPublishers(self, 1.0 / laser.scan_rate_hz, self._config.publish_tf)
         self._command = _VelocityCommand()
-        self._lockstep = Lockstep(self, self._config.lockstep, self._config.lockstep_patience_s)
+        self._lockstep = Lockstep(self, self._config.lockstep, self._config.lockstep_timeout_s)
         self._running = False
         self._repeated_s = 0.0
         self._diagnostics = NodeDiagnostics(self)
@@ -148,7 +149,7 @@ class SimNode(Node):
         self.create_subscription(PoseStamped, '~/set_pose', self._on_teleport, qos.STREAM)
         self._output.publish_laser_pose(self._sim.laser.T_base_laser)
         wall = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(STEP_NS / 1e9 / self._config.rate, self._tick, clock=wall)
+        self.create_timer(STEP_NS / 1e9 / self._config.real_time_factor, self._tick, clock=wall)
 
     def _on_command(self, message: Twist) -> None:
         self._diagnostics.message_received('cmd_vel')
@@ -169,7 +170,7 @@ class SimNode(Node):
 
     def _tick(self) -> None:
         if not self._running:
-            if self.count_subscribers('scan') < self._config.hold_for_subscribers:
+            if self.count_subscribers('scan') < self._config.wait_for_subscribers:
                 self._diagnostics.set_state(WARN, 'on hold: too few subscribers of the scans')
                 return
             self._running = True

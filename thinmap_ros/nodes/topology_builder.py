@@ -31,7 +31,7 @@ class _TopologyPublishers:
     """Publishes the topological map, and the part of it near the robot."""
 
     def __init__(self, node: Node) -> None:
-        self._frame = parameters.declare_parameter(node, 'map_frame', 'map', 'frame of the map')
+        self._frame = parameters.declare_map_frame(node)
         self._local = node.create_publisher(TopologicalMapMsg, 'local_topology', qos.LATCHED)
         self._global = node.create_publisher(TopologicalMapMsg, 'topology', qos.LATCHED)
         self.has_published = False

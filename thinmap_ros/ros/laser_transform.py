@@ -24,21 +24,23 @@ class LaserTransform:
 
     def __init__(self, node: Node) -> None:
         self._base_frame = str(
-            parameters.declare_parameter(node, 'base_frame', 'base_link', 'frame of the robot')
+            parameters.declare_parameter(
+                node, 'base_frame', 'base_link', 'Frame of the robot (REP 105).'
+            )
         )
         given = parameters.declare_parameter(
             node,
             'laser_pose',
             '',
-            'laser on the robot as "x,y,yaw" (m, m, rad); empty: from /tf_static',
+            'Pose of the laser on the robot as "x,y,yaw" (m, m, rad). Empty: from /tf_static.',
         )
         self._zero_is_no_return = bool(
             parameters.declare_parameter(
                 node,
                 'zero_is_no_return',
                 False,
-                'a range of 0 is a beam without return (LDS of the TurtleBot 3); false: an '
-                'invalid beam',
+                'A range of 0 means no return, as for the LDS of the TurtleBot 3. false: the beam '
+                'is invalid.',
             )
         )
         self._fixed = Mount(_parse_pose(str(given)), upside_down=False) if given else None

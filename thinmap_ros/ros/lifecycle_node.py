@@ -70,10 +70,10 @@ class ThinmapNode(LifecycleNode):
         super().__init__(name)
         self._autostart = bool(
             parameters.declare_parameter(
-                self, 'autostart', True, 'become active at once; false: wait for transitions'
+                self, 'autostart', True, 'Become active at once. false: wait for transitions.'
             )
         )
-        self._recover_s = parameters.declare_recovery(self) if recovers else 0.0
+        self._recovery_timeout_s = parameters.declare_recovery(self) if recovers else 0.0
         self.diagnostics = NodeDiagnostics(self)
         self.is_active = False
         self.is_paused = False
@@ -120,10 +120,10 @@ class ThinmapNode(LifecycleNode):
         """Restore the checkpoint of a killed predecessor, and save one periodically from now on.
 
         state: returns what to save; None: nothing. restore: is called with the state of a node that
-        was killed less than `recover_s` ago. Where it raises a ThinmapError, as for a node that was
-        started with other parameters, the node starts empty.
+        was killed less than `recovery_timeout_s` ago. Where it raises a ThinmapError, as for a node
+        that was started with other parameters, the node starts empty.
         """
-        file = Checkpoint(self, self._recover_s)
+        file = Checkpoint(self, self._recovery_timeout_s)
         self._checkpoint = PeriodicCheckpoint(file, state)
         self.create_timer(
             _CHECKPOINT_PERIOD_S,

@@ -105,26 +105,32 @@ def declare_parameter(node: Node, name: str, default: Any, description: str) -> 
         raise ConfigError(f'parameter {name} of node {node.get_name()}: {error}') from error
 
 
+def declare_map_frame(node: Node) -> str:
+    """Declare the parameter `map_frame` and return its value."""
+    return str(declare_parameter(node, 'map_frame', 'map', 'Frame of the map (REP 105).'))
+
+
 def declare_session(node: Node) -> str:
-    """Declare the parameter `session` and return its value."""
+    """Declare the parameter `session_path` and return its value."""
     return str(
         declare_parameter(
             node,
-            'session',
+            'session_path',
             '',
-            'path STEM of a saved session to continue; empty: start with an empty map',
+            'Path stem of the saved session to start from. Empty: start with an empty map.',
         )
     )
 
 
 def declare_recovery(node: Node) -> float:
-    """Declare the parameter `recover_s` and return its value."""
+    """Declare the parameter `recovery_timeout_s` and return its value."""
     return float(
         declare_parameter(
             node,
-            'recover_s',
+            'recovery_timeout_s',
             30.0,
-            'continue from the checkpoint of a killed node up to this age, s; 0: never',
+            'Maximum age of a checkpoint that a restarted node resumes from (s). 0 disables '
+            'recovery. Raise it where nodes restart slowly.',
         )
     )
 
@@ -132,7 +138,7 @@ def declare_recovery(node: Node) -> float:
 def reject_unknown(node: Node) -> None:
     """Raise ConfigError where a parameter was given that the node does not have: a typo.
 
-    A typo must not go unseen. Parameters of the robot are accepted by every node. Where several
+    Parameters of the robot are accepted by every node. Where several
     nodes share a process, a parameter may be meant for another one: the last of them raises.
     """
     # rclpy has no public way to see what was given but never declared.

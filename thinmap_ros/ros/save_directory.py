@@ -19,9 +19,11 @@ class SaveDirectory:
     """The directory that contains the paths of a node's services."""
 
     def __init__(self, node: Node) -> None:
-        """Declare the parameter `save_folder`; empty: the working directory of the node."""
-        description = 'folder below which services save and load; empty: the working directory'
-        given = parameters.declare_parameter(node, 'save_folder', '', description)
+        """Declare the parameter `save_directory`; empty: the working directory of the node."""
+        description = (
+            'Directory that save and load services are confined to. Empty: the working directory.'
+        )
+        given = parameters.declare_parameter(node, 'save_directory', '', description)
         self.path = Path(str(given)).resolve()
 
     def resolve(self, given: str) -> str:

@@ -23,22 +23,27 @@ _INTO_CELL = 1e-6
 class LaserScannerConfig(Config):
     """A planar laser scanner; the defaults are those of an LMS200 in its 8 m mode."""
 
-    beams: int = parameter(181, 'beams of a scan', low=2, high=10_000)
+    beams: int = parameter(181, 'Number of beams of a scan.', low=2, high=10_000)
     field_of_view_deg: float = parameter(
-        180.0, 'angle between first and last beam, degrees', low=0.0, high=360.0
+        180.0, 'Angle between the first and the last beam (deg).', low=0.0, high=360.0
     )
-    range_min_m: float = parameter(0.05, 'nearest range, m', low=0.0, high=10.0)
-    range_max_m: float = parameter(8.0, 'farthest range, m', low=0.1, high=200.0)
-    rate_hz: float = parameter(5.0, 'scans a second', low=0.1, high=20.0)
-    noise_m: float = parameter(0.01, 'range noise, 1 sigma, m', low=0.0, high=1.0)
-    rounding_m: float = parameter(0.001, 'ranges are whole multiples of this, m', low=0.0, high=0.1)
-    mixed_pixels: float = parameter(
-        0.3, 'share of depth edges that give a range in between', low=0.0, high=1.0
+    range_min_m: float = parameter(0.05, 'Smallest range (m).', low=0.0, high=10.0)
+    range_max_m: float = parameter(8.0, 'Largest range (m).', low=0.1, high=200.0)
+    scan_rate_hz: float = parameter(5.0, 'Scans per second.', low=0.1, high=20.0)
+    range_noise_m: float = parameter(0.01, 'Standard deviation of a range (m).', low=0.0, high=1.0)
+    range_resolution_m: float = parameter(0.001, 'Resolution of a range (m).', low=0.0, high=0.1)
+    mixed_pixel_ratio: float = parameter(
+        0.3, 'Ratio of depth edges with a range in between (mixed pixel).', low=0.0, high=1.0
     )
-    edge_m: float = parameter(
-        0.3, 'neighbouring beams that differ by more make a depth edge, m', low=0.01, high=10.0
+    mixed_pixel_edge_m: float = parameter(
+        0.3,
+        'Range difference of neighbouring beams that makes a depth edge (m).',
+        low=0.01,
+        high=10.0,
     )
-    mount_x_m: float = parameter(0.0, 'laser ahead of the robot centre, m', low=-2.0, high=2.0)
+    laser_x_m: float = parameter(
+        0.0, 'Position of the laser ahead of the robot centre (m).', low=-2.0, high=2.0
+    )
 
 
 class LaserScanner:
@@ -46,7 +51,7 @@ class LaserScanner:
 
     def __init__(self, config: LaserScannerConfig, seed: int) -> None:
         self.config = config
-        self.T_base_laser = np.array([config.mount_x_m, 0.0, 0.0])
+        self.T_base_laser = np.array([config.laser_x_m, 0.0, 0.0])
         full_circle = config.field_of_view_deg >= 360.0
         intervals = config.beams if full_circle else config.beams - 1
         self._increment = math.radians(config.field_of_view_deg) / intervals
@@ -57,9 +62,11 @@ class LaserScanner:
     def scan(self, world: World, T_world_base: Array, stamp_ns: int) -> Scan:
         """Scan from a robot pose (3,) in the world."""
         exact = self._exact(world, se2.compose(T_world_base, self.T_base_laser), stamp_ns)
-        ranges = self._mix(exact) + self._rng.normal(0.0, self.config.noise_m, exact.size)
-        if self.config.rounding_m > 0.0:
-            ranges = np.round(ranges / self.config.rounding_m) * self.config.rounding_m
+        ranges = self._mix(exact) + self._rng.normal(0.0, self.config.range_noise_m, exact.size)
+        if self.config.range_resolution_m > 0.0:
+            ranges = (
+                np.round(ranges / self.config.range_resolution_m) * self.config.range_resolution_m
+            )
         ranges[~(ranges < self.config.range_max_m)] = np.inf
         return Scan.create(
             stamp_ns,
@@ -92,8 +99,10 @@ class LaserScanner:
         A random one of the two beams beside an edge is affected: with always the same one, the
         points of left and right walls would be shifted to the same side.
         """
-        edges = _edges(ranges, self.config.edge_m, self._increment / math.sin(_FLATTEST_RAD))
-        mixed = edges[self._rng.random(ranges.size - 1)[edges] < self.config.mixed_pixels]
+        edges = _edges(
+            ranges, self.config.mixed_pixel_edge_m, self._increment / math.sin(_FLATTEST_RAD)
+        )
+        mixed = edges[self._rng.random(ranges.size - 1)[edges] < self.config.mixed_pixel_ratio]
         share = self._rng.random(mixed.size)
         side = self._rng.integers(0, 2, mixed.size)
         nearer = np.minimum(ranges[mixed], ranges[mixed + 1])

@@ -21,9 +21,9 @@ class RobotConfig(Config):
         0.22, 'radius of the disc that holds the body, m', low=0.01, high=2.0
     )
     max_speed_m_s: float = parameter(1.6, 'speed limit, m/s', low=0.01, high=5.0)
-    max_turn_rad_s: float = parameter(3.0, 'turn rate limit, rad/s', low=0.01, high=10.0)
+    max_angular_speed_rad_s: float = parameter(3.0, 'turn rate limit, rad/s', low=0.01, high=10.0)
     max_acceleration_m_s2: float = parameter(0.5, 'acceleration limit, m/s^2', low=0.01, high=10.0)
-    max_turn_acceleration_rad_s2: float = parameter(
+    max_angular_acceleration_rad_s2: float = parameter(
         3.0, 'turn acceleration limit, rad/s^2', low=0.01, high=20.0
     )
     scale_sigma: float = parameter(
@@ -52,7 +52,7 @@ PRESETS = {
     '3at': RobotConfig(
         radius_m=0.32,
         max_speed_m_s=0.8,
-        max_turn_rad_s=2.4,
+        max_angular_speed_rad_s=2.4,
         turn_scale_sigma=0.08,
         turn_noise=0.06,
         drift_sigma_rad_m=0.02,
@@ -116,7 +116,10 @@ class DifferentialDriveRobot:
             self.v, v, self.config.max_speed_m_s, self.config.max_acceleration_m_s2 * dt_s
         )
         self.w = _towards(
-            self.w, w, self.config.max_turn_rad_s, self.config.max_turn_acceleration_rad_s2 * dt_s
+            self.w,
+            w,
+            self.config.max_angular_speed_rad_s,
+            self.config.max_angular_acceleration_rad_s2 * dt_s,
         )
         moved = after_arc(self.T_world_base, self.v * dt_s, self.w * dt_s)
         x, y, _ = moved.tolist()

@@ -39,7 +39,7 @@ class Simulation:
         self.world = world
         self.robot = DifferentialDriveRobot(robot, world, start, odometry_seed(seed))
         self.laser = LaserScanner(laser, _seeds(seed)[1])
-        self._scan_period_ns = round(1e9 / laser.rate_hz)
+        self._scan_period_ns = round(1e9 / laser.scan_rate_hz)
         self._next_scan_ns = 0
         self.stamp_ns = 0
 

@@ -99,7 +99,7 @@ def explore(arguments: argparse.Namespace, world: Path, start: Array) -> None:
             '-p',
             'lockstep:=local_topology',
             '-p',
-            f'hold_for_subscribers:={_SCAN_LISTENERS}',
+            f'wait_for_subscribers:={_SCAN_LISTENERS}',
         ]
         clock = ['-p', f'rate:={arguments.rate}', '-p', f'seed:={arguments.seed}']
         where = ['-p', f'start:={start[0]},{start[1]},{start[2]}']

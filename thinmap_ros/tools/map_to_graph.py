@@ -36,7 +36,7 @@ def _config(arguments: argparse.Namespace) -> TopologyConfig:
             f'--min-clearance {radius}: '
             f'expected at least the robot radius ({arguments.robot_radius} m)'
         )
-    return TopologyConfig(robot_radius_m=radius, spur_m=arguments.prune)
+    return TopologyConfig(robot_radius_m=radius, min_branch_length_m=arguments.prune)
 
 
 def _work(arguments: argparse.Namespace) -> None:
@@ -76,10 +76,11 @@ def main() -> None:
     parser.add_argument('--robot-radius', type=float, default=radius, help=f'm (default {radius})')
     clearance_help = 'how far nodes and edges stay from obstacles, m (default: the robot radius)'
     parser.add_argument('--min-clearance', type=float, help=clearance_help)
-    prune_help = (
-        f'a branch must bring the robot farther than this to count, m (default {_DEFAULTS.spur_m})'
+    default = _DEFAULTS.min_branch_length_m
+    prune_help = f'shorter branches of the skeleton are pruned, m (default {default})'
+    parser.add_argument(
+        '--prune', type=float, default=_DEFAULTS.min_branch_length_m, help=prune_help
     )
-    parser.add_argument('--prune', type=float, default=_DEFAULTS.spur_m, help=prune_help)
     parser.add_argument(
         '--start', help='X,Y in m: only what a robot can reach from there (default: all parts)'
     )

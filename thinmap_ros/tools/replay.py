@@ -132,7 +132,9 @@ def main() -> None:
     )
     parser.add_argument('--recording', type=Path, help="file for rerun's recording (.rrd)")
     cli.add_config(parser, LocalizerConfig, ['slam'])
-    cli.add_config(parser, OccupancyConfig, ['resolution_m', 'no_return_range_m', 'usable_range_m'])
+    cli.add_config(
+        parser, OccupancyConfig, ['resolution_m', 'no_return_clear_range_m', 'max_range_m']
+    )
     cli.run(_work, parser)
 
 

@@ -126,7 +126,7 @@ def test_what_vanishes_is_forgotten():
 
 
 def test_an_open_border_keeps_a_node_in_doubt_however_often_it_is_seen():
-    nodes = tracker('open_border')
+    nodes = tracker('frontier')
     nodes.follow({1: (5.0, 5.0)})
     for bearing in np.radians(np.arange(0.0, 180.0, 15.0)):
         look(nodes, (5.0 - math.cos(bearing), 5.0 - math.sin(bearing), float(bearing)), {1})
@@ -135,7 +135,7 @@ def test_an_open_border_keeps_a_node_in_doubt_however_often_it_is_seen():
 
 
 def test_a_closed_border_settles_a_node_and_an_opened_one_is_as_doubtful_as_at_first():
-    nodes = tracker('open_border')
+    nodes = tracker('frontier')
     nodes.follow({1: (9.0, 9.0)})
     look(nodes, (1.0, 1.0, math.pi))
     settled = nodes.tracks[1].probability

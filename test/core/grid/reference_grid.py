@@ -61,16 +61,16 @@ class PlainGrid:
         }
         spared = {cell for cell in passed - hit if self.is_grazed(cell)}
         for cell in hit:
-            self.add(cell, self.thousandths(self.config.p_occupied))
+            self.add(cell, self.thousandths(self.config.p_hit))
         for cell in passed - hit - surface - spared:
-            self.add(cell, self.thousandths(self.config.p_free))
+            self.add(cell, self.thousandths(self.config.p_miss))
 
     def is_hit(self, scan, i):
         """Whether a beam ended in something near enough."""
         return (
             0 <= i < scan.ranges_m.size
             and scan.hit[i]
-            and scan.ranges_m[i] < self.config.usable_range_m
+            and scan.ranges_m[i] < self.config.max_range_m
         )
 
     def end_of(self, scan, i, heading):
@@ -78,11 +78,11 @@ class PlainGrid:
         config = self.config
         length = 0.0
         if self.is_hit(scan, i):
-            length = min(scan.ranges_m[i] + config.surface_depth_m, config.usable_range_m)
+            length = min(scan.ranges_m[i] + config.surface_thickness_m, config.max_range_m)
         elif scan.hit[i]:
-            length = config.usable_range_m
+            length = config.max_range_m
         elif scan.no_return[i]:
-            length = min(config.no_return_range_m, scan.range_max_m, config.usable_range_m)
+            length = min(config.no_return_clear_range_m, scan.range_max_m, config.max_range_m)
         angle = heading + scan.angles_rad[i]
         reach = length / config.resolution_m
         return (
@@ -102,7 +102,7 @@ class PlainGrid:
     def is_grazed(self, cell):
         """Whether a cell is surely occupied, as are others in line with it along the beam."""
         config = self.config
-        sure = min(self.thousandths(SURELY_OCCUPIED), self.thousandths(config.p_highest))
+        sure = min(self.thousandths(SURELY_OCCUPIED), self.thousandths(config.p_max))
         if self.odds.get(cell, 0) < sure:
             return False
         away = np.array([cell[0] + 0.5 - self.laser[1], cell[1] + 0.5 - self.laser[0]])
@@ -125,6 +125,6 @@ class PlainGrid:
 
         Even odds stay a thousandth off, because 0 is a cell never seen.
         """
-        low = self.thousandths(self.config.p_lowest)
-        high = self.thousandths(self.config.p_highest)
+        low = self.thousandths(self.config.p_min)
+        high = self.thousandths(self.config.p_max)
         self.odds[cell] = min(max((self.odds.get(cell, 0) + step) or 1, low), high)

@@ -209,9 +209,9 @@ def test_a_scan_touches_no_tile_beyond_those_that_it_is_thought_to(seed):
     rng = np.random.default_rng(seed)
     config = OccupancyConfig(
         resolution_m=float(rng.choice([0.02, 0.05, 0.1])),
-        usable_range_m=float(rng.uniform(2.0, 9.0)),
-        no_return_range_m=float(rng.uniform(0.0, 9.0)),
-        surface_depth_m=float(rng.uniform(0.0, 0.5)),
+        max_range_m=float(rng.uniform(2.0, 9.0)),
+        no_return_clear_range_m=float(rng.uniform(0.0, 9.0)),
+        surface_thickness_m=float(rng.uniform(0.0, 0.5)),
     )
     ranges = rng.uniform(0.0, rng.uniform(1.0, 8.0), 90)
     ranges[rng.random(90) < 0.3] = np.inf
@@ -224,7 +224,7 @@ def test_a_scan_touches_no_tile_beyond_those_that_it_is_thought_to(seed):
     low, high = rerendering._tile_boxes([extent], T[None], grid.frame)[0]
     touched = grid.tiles()
     assert (touched >= low).all() and (touched <= high).all()
-    longest = 2.0 * max(config.usable_range_m, 1.0) / config.resolution_m / TILE
+    longest = 2.0 * max(config.max_range_m, 1.0) / config.resolution_m / TILE
     assert (high - low <= 1.5 * longest + 3).all()
 
 
@@ -265,7 +265,7 @@ def test_tiles_hold_the_sum_of_grids_within_the_limits():
     added = tiles_of(other)
     both = tiles_of(total)
     nothing = np.zeros((TILE, TILE), dtype=np.int16)
-    low, high = (round(1000 * log_odds(p)) for p in (one.config.p_lowest, one.config.p_highest))
+    low, high = (round(1000 * log_odds(p)) for p in (one.config.p_min, one.config.p_max))
     for place in map(tuple, places.tolist()):
         a = single.get(place, nothing)
         b = added.get(place, nothing)

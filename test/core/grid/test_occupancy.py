@@ -36,15 +36,17 @@ def reference(scan, T, config):
     """Cells passed and hit by fine sampling of beams: slow, obvious, blind only at cell corners."""
     passed = set()
     hit = set()
-    ranges = np.where(scan.hit, scan.ranges_m + config.surface_depth_m, scan.ranges_m)
+    ranges = np.where(scan.hit, scan.ranges_m + config.surface_thickness_m, scan.ranges_m)
     for r, angle in zip(ranges, scan.angles_rad + T[2], strict=True):
-        reach = min(r, config.usable_range_m) if r < scan.range_max_m else config.no_return_range_m
+        reach = (
+            min(r, config.max_range_m) if r < scan.range_max_m else config.no_return_clear_range_m
+        )
         along = np.arange(0.0, reach, 0.002)
         cells = np.floor(
             np.column_stack([T[1] + along * math.sin(angle), T[0] + along * math.cos(angle)]) / 0.1
         )
         passed |= {tuple(c) for c in cells.astype(int).tolist()}
-        if r < min(scan.range_max_m, config.usable_range_m):
+        if r < min(scan.range_max_m, config.max_range_m):
             row = math.floor((T[1] + r * math.sin(angle)) / 0.1)
             col = math.floor((T[0] + r * math.cos(angle)) / 0.1)
             hit.add((row, col))
@@ -77,12 +79,12 @@ def test_each_cell_counts_once_a_scan_and_is_clamped():
     grid = OccupancyGrid(config)
     wall = scan_of(np.full(181, 1.0))
     grid.add_scan(wall, pose(0.05, 0.05, 0))
-    once = 100 / (1 + math.exp(-log_odds(config.p_free)))
+    once = 100 / (1 + math.exp(-log_odds(config.p_miss)))
     assert percent(grid, 0.25, 0.05) == round(once)
     for _ in range(50):
         grid.add_scan(wall, pose(0.05, 0.05, 0))
-    assert percent(grid, 0.25, 0.05) == round(100 * config.p_lowest)
-    assert percent(grid, 1.05, 0.05) == round(100 * config.p_highest)
+    assert percent(grid, 0.25, 0.05) == round(100 * config.p_min)
+    assert percent(grid, 1.05, 0.05) == round(100 * config.p_max)
 
 
 def test_a_wall_that_went_away_is_unlearned():
@@ -120,7 +122,7 @@ def test_a_scan_that_shows_nothing_leaves_the_picture_as_it_was(place):
 
 
 def test_a_beam_without_return_frees_up_to_the_configured_range():
-    grid = OccupancyGrid(OccupancyConfig(no_return_range_m=3.0))
+    grid = OccupancyGrid(OccupancyConfig(no_return_clear_range_m=3.0))
     for _ in range(2):
         grid.add_scan(scan_of(np.full(181, np.inf)), pose(0.05, 0.05, 0))
     assert grid.window(2.85, 0.05, 0.1).free.all()
@@ -129,7 +131,7 @@ def test_a_beam_without_return_frees_up_to_the_configured_range():
 
 
 def test_a_hit_beyond_the_usable_range_frees_the_way_and_marks_no_wall():
-    grid = OccupancyGrid(OccupancyConfig(usable_range_m=3.0))
+    grid = OccupancyGrid(OccupancyConfig(max_range_m=3.0))
     for _ in range(2):
         grid.add_scan(scan_of(np.full(181, 5.0)), pose(0.05, 0.05, 0))
     assert grid.window(2.85, 0.05, 0.1).free.all()
@@ -287,8 +289,13 @@ def known_cells(grid):
     ('seed', 'config'),
     [
         (0, OccupancyConfig()),
-        (1, OccupancyConfig(resolution_m=0.05, no_return_range_m=2.0, surface_depth_m=0.0)),
-        (2, OccupancyConfig(resolution_m=0.25, usable_range_m=3.0)),
+        (
+            1,
+            OccupancyConfig(
+                resolution_m=0.05, no_return_clear_range_m=2.0, surface_thickness_m=0.0
+            ),
+        ),
+        (2, OccupancyConfig(resolution_m=0.25, max_range_m=3.0)),
     ],
 )
 def test_all_cells_are_those_of_the_plain_grid_bit_for_bit(seed, config):

@@ -78,7 +78,7 @@ def test_nodes_in_sight_of_a_block_are_those_of_the_map_that_nothing_hides(place
             == (row // places.block_cells, col // places.block_cells)
         ).all(1)
         lead = places.standing[own][0]
-        reach = CONFIG.active_window_m / 2.0 / CELL_M + places.block_cells
+        reach = CONFIG.node_window_m / 2.0 / CELL_M + places.block_cells
         expected = [
             node
             for node, cell in zip(places.nodes, cells, strict=True)

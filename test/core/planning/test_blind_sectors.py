@@ -134,7 +134,8 @@ def test_where_a_leg_can_hide_a_little_ahead_it_drives_no_faster_than_it_can_sto
     ride.go((3.0, 3.0))
     fastest = max(v for v, _ in ride.commands)
     assert (
-        fastest * ride.navigator.config.reaction_s < MIN_OBSTACLE_WIDTH_M / math.radians(22) - 0.24
+        fastest * ride.navigator.config.reaction_time_s
+        < MIN_OBSTACLE_WIDTH_M / math.radians(22) - 0.24
     )
 
 

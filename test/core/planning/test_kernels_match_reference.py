@@ -33,13 +33,13 @@ def wandering(rng, count=40):
     return np.cumsum(rng.normal(0.03, 0.05, (count, 2)), axis=0)
 
 
-def plain_point_ahead(path, xy, reach_m, stray_m):
+def plain_point_ahead(path, xy, reach_m, max_corner_cut_m):
     nearest = int(np.square(path - xy).sum(axis=1).argmin())
     rest = path[nearest:]
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(rest, axis=0).T))])
     left_m = max(float(along[-1]), float(np.hypot(*(rest[-1] - xy))))
     last = min(int(np.searchsorted(along, reach_m)), len(rest) - 1)
-    allowed = stray_m + float(np.hypot(*(rest[0] - xy)))
+    allowed = max_corner_cut_m + float(np.hypot(*(rest[0] - xy)))
     while last > 1:
         dx, dy = rest[last] - xy
         off = np.abs((rest[:last, 0] - xy[0]) * dy - (rest[:last, 1] - xy[1]) * dx).max()
@@ -169,9 +169,13 @@ def test_the_cost_of_cells_falls_with_the_distance_to_what_is_not_free(seed):
         GridPatch(GridFrame(0.0, 0.0, 0.1), np.where(free, 0, 100).astype(np.int8)), config
     )
     away_m = 0.1 * ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1]
-    nearness = np.clip((config.keep_m - away_m) / (config.keep_m - config.robot_radius_m), 0.0, 1.0)
+    nearness = np.clip(
+        (config.inflation_radius_m - away_m) / (config.inflation_radius_m - config.robot_radius_m),
+        0.0,
+        1.0,
+    )
     expected = np.where(
-        away_m >= config.robot_radius_m - 1e-6, 1.0 + config.keep_weight * nearness**2, np.inf
+        away_m >= config.robot_radius_m - 1e-6, 1.0 + config.inflation_cost * nearness**2, np.inf
     )
     assert cost == pytest.approx(expected)
 

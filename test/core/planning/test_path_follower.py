@@ -53,10 +53,10 @@ def test_commands_keep_all_limits(speed):
     v, w = commands.T
     assert (v >= 0.0).all()
     assert v.max() <= speed + 1e-9
-    assert np.abs(w).max() <= config.max_turn_rad_s + 1e-9
+    assert np.abs(w).max() <= config.max_angular_speed_rad_s + 1e-9
     steps = np.abs(np.diff(commands, axis=0, prepend=[[0.0, 0.0]]))
     assert steps[:, 0].max() <= config.max_acceleration_m_s2 * DT + 1e-9
-    assert steps[:, 1].max() <= config.max_turn_acceleration_rad_s2 * DT + 1e-9
+    assert steps[:, 1].max() <= config.max_angular_acceleration_rad_s2 * DT + 1e-9
 
 
 def test_it_turns_on_the_spot_towards_a_path_that_begins_behind():

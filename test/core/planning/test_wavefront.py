@@ -17,7 +17,7 @@ from thinmap_ros.core.planning.wavefront import (
     trace_gradient_path,
 )
 
-PLAIN = WavefrontConfig(robot_radius_m=0.25, keep_weight=0.0)
+PLAIN = WavefrontConfig(robot_radius_m=0.25, inflation_cost=0.0)
 
 
 def patch_of(drawing):
@@ -144,8 +144,8 @@ def test_no_point_of_a_path_is_nearer_to_an_obstacle_than_the_radius():
 
 def test_where_there_is_room_a_path_keeps_off_the_walls():
     cells = room(40, 100)
-    near = WavefrontConfig(keep_weight=0.0)
-    far = WavefrontConfig(keep_m=1.0, keep_weight=5.0)
+    near = WavefrontConfig(inflation_cost=0.0)
+    far = WavefrontConfig(inflation_radius_m=1.0, inflation_cost=5.0)
     start = (0.5, 0.5)
     goal = (9.5, 0.5)
     middle = [np.median(plan(patch(cells), start, goal, config)[:, 1]) for config in (near, far)]
@@ -165,15 +165,15 @@ def test_unknown_space_is_forbidden_or_costly_as_configured():
     cells = room(60, 60)
     cells[30, :] = cells[31, :] = cells[32, :] = -1
     goals = ((2.0, 1.0), (2.0, 5.0))
-    assert plan(patch(cells), *goals, WavefrontConfig(unknown='forbidden')) is None
-    assert plan(patch(cells), *goals, WavefrontConfig(unknown='costly')) is not None
+    assert plan(patch(cells), *goals, WavefrontConfig(allow_unknown=False)) is None
+    assert plan(patch(cells), *goals, WavefrontConfig(allow_unknown=True)) is not None
 
 
 def test_costly_unknown_space_is_avoided_where_there_is_another_way():
     cells = room(60, 100)
     cells[25:35, :70] = -1
     path = plan(
-        patch(cells), (2.0, 1.0), (2.0, 5.0), WavefrontConfig(unknown='costly', unknown_weight=20.0)
+        patch(cells), (2.0, 1.0), (2.0, 5.0), WavefrontConfig(allow_unknown=True, unknown_cost=20.0)
     )
     assert path[:, 0].max() > 7.0
 
@@ -189,7 +189,10 @@ def test_a_goal_too_near_to_a_wall_moves_a_little_and_no_more():
     cells = room(60, 60)
     path = plan(patch(cells), (3.0, 3.0), (3.05, 0.15), PLAIN)
     assert 0.2 <= path[-1, 1] <= 0.45
-    assert plan(patch(cells), (3.0, 3.0), (3.05, 0.15), WavefrontConfig(goal_slack_m=0.05)) is None
+    assert (
+        plan(patch(cells), (3.0, 3.0), (3.05, 0.15), WavefrontConfig(goal_search_radius_m=0.05))
+        is None
+    )
 
 
 @pytest.mark.parametrize('goal', [(50.0, 3.0), (-4.0, 3.0)])
@@ -205,7 +208,7 @@ def test_the_map_s_own_origin_counts():
 
 
 def test_intrinsic_cost_falls_to_nothing_at_the_stated_distance():
-    config = WavefrontConfig(robot_radius_m=0.25, keep_m=0.8, keep_weight=3.0)
+    config = WavefrontConfig(robot_radius_m=0.25, inflation_radius_m=0.8, inflation_cost=3.0)
     cost = cost_of_cells(patch(room(60, 60)), config)
     column = cost[:30, 30]
     assert np.isinf(column[:3]).all()

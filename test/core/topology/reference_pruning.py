@@ -109,7 +109,7 @@ def drop_spurs(web, spots, promising, limits):
             math.sqrt(web.spots[spot].squared) - limits.radius for spot in (tip, base)
         )
         adds = path_length(chain.cells) + tip_room - base_room
-        seen = adds <= limits.spur_ratio * base_room and not promising(web.spots[tip])
+        seen = adds <= limits.min_branch_ratio * base_room and not promising(web.spots[tip])
         if adds <= limits.spur or seen:
             gone.append((number, tip, base))
         elif not gone and adds_nothing(web, number, base, limits.radius):

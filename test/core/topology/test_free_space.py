@@ -63,7 +63,7 @@ def test_unknown_specks_between_beams_are_closed_but_no_larger_hole():
     cells[20, 20] = cells[40:42, 30] = -1
     cells[30:34, 44:48] = -1
     cells[10, 10] = 100
-    free = known_free(patch_of(cells), TopologyConfig(gap_m=0.2))
+    free = known_free(patch_of(cells), TopologyConfig(max_unknown_gap_m=0.2))
     assert free[20, 20] and free[40:42, 30].all()
     assert not free[31:33, 45:47].any()
     assert not free[10, 10], 'an occupied cell is never noise'
@@ -93,7 +93,7 @@ def test_only_what_the_robot_can_reach():
 
 def test_seed_beside_the_free_space_finds_it_within_reach():
     patch = drawn('####', '#..#', '#..#', '####')
-    config = TopologyConfig(seed_reach_m=0.5)
+    config = TopologyConfig(seed_search_radius_m=0.5)
     assert select_free_space(patch, (0.9, 2.0), config).any()
     assert not select_free_space(patch, (0.2, 2.0), config).any()
     assert not select_free_space(patch, (-50.0, 2.0), config).any()

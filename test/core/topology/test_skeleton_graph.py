@@ -14,7 +14,7 @@ from thinmap_ros.core.topology.skeleton import net_along, simplified
 from thinmap_ros.core.topology.skeleton_graph import Chain, Spot, Web, extent
 from thinmap_ros.core.topology.thinning import thin
 
-LIMITS = Limits(radius=2.5, spur=6.0, spur_ratio=0.5, join=4.0)
+LIMITS = Limits(radius=2.5, spur=6.0, min_branch_ratio=0.5, join=4.0)
 ROOMY = 36
 EVERYWHERE = Outlook(np.ones((0, 0), dtype=bool), 0, 0)
 

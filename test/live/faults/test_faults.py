@@ -37,33 +37,35 @@ def start_mapping(graph, rate=4.0, lockstep='local_topology'):
         'sim',
         remap=graph.paced() if lockstep == 'local_topology' else (),
         start=START,
-        hold_for_subscribers=2,
+        wait_for_subscribers=2,
         rate=rate,
         lockstep=lockstep,
-        lockstep_patience_s=LOCKSTEP_S,
+        lockstep_timeout_s=LOCKSTEP_S,
     )
 
 
 def start_together(graph, *names, **simulation):
     """The same in one process, as it is left running on a robot."""
-    graph.start('thinmap', arguments=names, use_sim_time=True, recover_s=RECOVER_S, **AT_START)
+    graph.start(
+        'thinmap', arguments=names, use_sim_time=True, recovery_timeout_s=RECOVER_S, **AT_START
+    )
     graph.start(
         'sim',
         remap=graph.paced(),
         start=START,
-        hold_for_subscribers=len({*names} - {'topology_builder'}),
+        wait_for_subscribers=len({*names} - {'topology_builder'}),
         rate=4.0,
         lockstep='local_topology',
-        lockstep_patience_s=LOCKSTEP_S,
+        lockstep_timeout_s=LOCKSTEP_S,
         **simulation,
     )
 
 
 def start_one(graph, name):
     own = {
-        'localizer': {**AT_START, 'recover_s': RECOVER_S},
-        'grid_mapper': {'recover_s': RECOVER_S},
-        'topology_builder': {'recover_s': RECOVER_S},
+        'localizer': {**AT_START, 'recovery_timeout_s': RECOVER_S},
+        'grid_mapper': {'recovery_timeout_s': RECOVER_S},
+        'topology_builder': {'recovery_timeout_s': RECOVER_S},
     }
     graph.start(name, use_sim_time=True, **own.get(name, {}))
 
@@ -210,12 +212,12 @@ def test_a_killed_node_that_is_started_otherwise_begins_anew_and_says_why(graph)
     graph.until(lambda: len(list(state.glob('[!.]*.npz'))) == 3, 'all is kept')
     changed = {
         'grid_mapper': ({'resolution_m': 0.05}, 'expected 0.05 m (resolution_m)'),
-        'topology_builder': ({'memory_m': 20.0}, '(memory_m, context_m)'),
+        'topology_builder': ({'window_memory_m': 20.0}, '(window_memory_m, update_context_m)'),
     }
     for name, (values, said) in changed.items():
         kill(graph, name)
         maps.clear()
-        graph.start(name, use_sim_time=True, recover_s=RECOVER_S, **values)
+        graph.start(name, use_sim_time=True, recovery_timeout_s=RECOVER_S, **values)
         graph.until(lambda n=name: 'starting empty' in graph.log(n), 'it says so')
         assert said in graph.log(name), graph.log(name)
     kill(graph, 'localizer')
@@ -269,7 +271,7 @@ def test_time_set_back_begins_everything_anew(graph):
     graph.hear_out()
     robot.poses.clear(), robot.truth.clear(), maps.clear()
     graph.start(
-        'sim', start=START, hold_for_subscribers=4, rate=4.0, lockstep='local_topology', seed=3
+        'sim', start=START, wait_for_subscribers=4, rate=4.0, lockstep='local_topology', seed=3
     )
     notices = [f'[{name}]: clock jumped back' for name in names]
     graph.until(

@@ -65,7 +65,7 @@ class Robot:
 def start_sim(graph, at, subscribers):
     text = ','.join(map(str, at))
     graph.start(
-        'sim', start=text, rate=6.0, lockstep='local_topology', hold_for_subscribers=subscribers
+        'sim', start=text, rate=6.0, lockstep='local_topology', wait_for_subscribers=subscribers
     )
 
 
@@ -93,8 +93,8 @@ def test_a_robot_finds_itself_in_a_saved_map_and_maps_on_also_when_it_is_carried
         messages_of_then.clear()
 
     for name in NODES:
-        graph.start(name, use_sim_time=True, session=str(stem))
-    graph.start('global_localizer', use_sim_time=True, automatic=True)
+        graph.start(name, use_sim_time=True, session_path=str(stem))
+    graph.start('global_localizer', use_sim_time=True, start_automatically=True)
     start_sim(graph, ELSEWHERE, 3)
     robot.drive_until(robot.is_right, 'the place where it was switched on')
     assert robot.states()[0] == SlamStatus.LOST

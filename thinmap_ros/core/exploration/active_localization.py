@@ -79,7 +79,7 @@ class ActiveSearch:
         self, places: Places, config: GlobalLocalizationConfig, driving: NavigatorConfig
     ) -> None:
         self._places = places
-        self._range_m = config.usable_range_m
+        self._range_m = config.max_range_m
         self._driving = driving
         self._navigator = Navigator(driving)
         self._view: Viewpoint | None = None
@@ -257,7 +257,7 @@ def _in_reach(
     resolution = patch.frame.resolution
     xy = (float(T_odom_base[0]), float(T_odom_base[1]))
     standing = traversable_cells(patch.free, driving.robot_radius_m, resolution)
-    ways = escape_cells(standing, patch.free, patch.frame, xy, driving.escape_m)
+    ways = escape_cells(standing, patch.free, patch.frame, xy, driving.start_escape_distance_m)
     middle = patch.shape[0] // 2, patch.shape[1] // 2
     metres = navigation_function(np.where(ways, 1.0, np.inf), middle) * resolution
     near_by = np.argwhere(standing & (metres >= _NEAREST_M) & np.isfinite(metres))

@@ -24,8 +24,8 @@ class _Failure:
 class Failures:
     """What failed at about which place (x, y), m: ids of nodes come and go, places stay."""
 
-    def __init__(self, retry_s: float) -> None:
-        self._retry_ns = retry_s * 1e9
+    def __init__(self, blacklist_timeout_s: float) -> None:
+        self._retry_ns = blacklist_timeout_s * 1e9
         self._failures: list[_Failure] = []
 
     def add(self, place: Place, stamp_ns: int) -> None:

@@ -72,14 +72,26 @@ class SurveyConfig(TrackerConfig):
     """Which borders count, to whom they belong, and from where they are looked at."""
 
     robot_radius_m: float = robot_radius()
-    shortest_border_m: float = parameter(
-        0.5, 'a shorter border is a missing beam, m', low=0.0, high=5.0
+    min_frontier_size_m: float = parameter(
+        0.5,
+        'Shorter frontiers are ignored (m). Raise it for shorter paths, lower it for higher '
+        'coverage.',
+        low=0.0,
+        high=5.0,
     )
-    attach_m: float = parameter(
-        3.0, 'a border belongs to an end node in sight within this, m', low=0.1, high=50.0
+    frontier_assignment_radius_m: float = parameter(
+        3.0,
+        'A frontier belongs to the nearest visible end node within this distance (m). Raise it in '
+        'halls.',
+        low=0.1,
+        high=50.0,
     )
     view_depth_m: float = parameter(
-        2.0, 'a look at a border is to show this much behind it, m', low=0.1, high=20.0
+        2.0,
+        'Depth behind a frontier that a viewpoint must be able to see (m). Raise it to drive '
+        'closer to the middle of openings.',
+        low=0.1,
+        high=20.0,
     )
 
 
@@ -123,7 +135,7 @@ class Surveyor:
 
     def __init__(self, config: SurveyConfig) -> None:
         self.config = config
-        self.borders = OpenBorders(config.shortest_border_m)
+        self.borders = OpenBorders(config.min_frontier_size_m)
         self.tracker = EndNodeTracker(config)
         self.stand_ins = EndNodeTracker(config)
         self.trail = RecentPath()
@@ -168,7 +180,7 @@ class Surveyor:
         tracker = EndNodeTracker.from_state(parts['nodes'], self.config)
         self.stand_ins = EndNodeTracker.from_state(parts['stand_ins'], self.config)
         self.tracker = tracker
-        self.borders = OpenBorders.from_state(parts['borders'], self.config.shortest_border_m)
+        self.borders = OpenBorders.from_state(parts['borders'], self.config.min_frontier_size_m)
         visited = {int(row[0]): (float(row[1]), float(row[2])) for row in own['visited']}
         closer = [(float(x), float(y)) for x, y in own['look_closer']]
         self._memory = _Memory(visited, closer, next_id)
@@ -189,7 +201,8 @@ class Surveyor:
             i: place
             for i, place in visited.items()
             if i in self.tracker.tracks
-            and math.dist(place, _place(self.tracker.tracks[i])) <= self.config.moved_m
+            and math.dist(place, _place(self.tracker.tracks[i]))
+            <= self.config.node_reset_distance_m
         }
         return renamed
 
@@ -223,7 +236,7 @@ class Surveyor:
             return candidate
         cells = candidate.cells[still]
         length_m = len(cells) * self.borders.frame.resolution
-        long_enough = length_m >= self.config.shortest_border_m - 1e-6
+        long_enough = length_m >= self.config.min_frontier_size_m - 1e-6
         if not (long_enough or self.config.mode == 'paper'):
             return None
         return Candidate(candidate.track, cells, candidate.goal)
@@ -240,7 +253,7 @@ class Surveyor:
         middle = self.border_of(candidate)
         if (
             len(candidate.cells)
-            and self.config.mode == 'open_border'
+            and self.config.mode == 'frontier'
             and not self._is_to_be_looked_at_closer(middle)
         ):
             memory.look_closer.append(middle)
@@ -305,7 +318,7 @@ class Surveyor:
         within = near_true_cell(self.reached, nodes, _NEAR_VISIT_M / self.frame.resolution)
         ids = ids[within]
         nodes = nodes[within]
-        index = self.borders.owners(cells, nodes, self.config.attach_m)
+        index = self.borders.owners(cells, nodes, self.config.frontier_assignment_radius_m)
         return np.where(index < 0, -1, ids[index]) if ids.size else index
 
     def _without_scraps(self, owners: Cells, numbers: Cells) -> Cells:
@@ -314,7 +327,7 @@ class Surveyor:
         Such a scrap goes to whoever holds most of the stretch: it would be a target that is none at
         the next scan.
         """
-        fewest = round(self.config.shortest_border_m / self.borders.frame.resolution)
+        fewest = round(self.config.min_frontier_size_m / self.borders.frame.resolution)
         return without_scraps(owners, numbers, fewest)
 
     def _stand_in(
@@ -322,7 +335,7 @@ class Surveyor:
     ) -> list[Candidate]:
         """One candidate for each stretch of border left over that can be seen from somewhere."""
         found: list[tuple[Cells, Array]] = []
-        if len(cells) and self.config.mode == 'open_border':
+        if len(cells) and self.config.mode == 'frontier':
             for number in np.unique(numbers):
                 stretch = cells[numbers == number]
                 place = self._place_for(stretch, T_map_base, range_m)
@@ -342,7 +355,9 @@ class Surveyor:
         if place is not None:
             return place
         xy = (float(T_map_base[0]), float(T_map_base[1]))
-        return self.borders.place_to_look(stretch, self.reached, self.config.attach_m, xy)
+        return self.borders.place_to_look(
+            stretch, self.reached, self.config.frontier_assignment_radius_m, xy
+        )
 
     def _far_place_for(self, cells: Cells, range_m: float) -> Array | None:
         if self.config.mode == 'paper' or self._is_to_be_looked_at_closer(self._middle(cells)):

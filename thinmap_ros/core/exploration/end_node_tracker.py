@@ -3,8 +3,8 @@
 What the paper leaves open, and how it is settled here:
 
 - *Independent evidence.* A look at a node counts only if, since the last look that counted, the
-  robot has moved `look_move_m` or the bearing to the node has turned by `look_turn_deg`. A robot
-  that stands still learns nothing new.
+  robot has moved `observation_distance_m` or the bearing to the node has turned by
+  `observation_angle_deg`. A robot that stands still learns nothing new.
 - *Which looks.* The node lies in the laser's field of view and range, and all cells between are
   free.
 - *Moved nodes.* A node that is farther than `moved_m` from where its evidence began loses all of
@@ -13,10 +13,10 @@ What the paper leaves open, and how it is settled here:
   over the evidence of one that vanished at the same scan within `moved_m`; so a merged node keeps
   that of the nearest one.
 - *Rim of the range, and of the known.* A skeleton also ends where only knowledge ends. In mode
-  `open_border`, a node with unknown space at its neighbourhood's border (see `frontiers`) is not
-  made more reliable by any look (R is at most 0.5), and one without any cannot move any more: that
-  counts as one look of reliability `closed_reliability`. In mode `paper` the looks are all there
-  is.
+  `frontier`, a node with unknown space at its neighbourhood's border (see `frontiers`) is not made
+  more reliable by any look (R is at most 0.5), and one without any cannot move any more: that
+  counts as one look of reliability `closed_node_reliability`. In mode `paper` the looks are all
+  there is.
 """
 
 import itertools
@@ -91,19 +91,38 @@ class TrackerConfig(Config):
     """Which looks count, and what becomes of a node's evidence."""
 
     mode: str = parameter(
-        'open_border', 'what a node is judged by', choices=('open_border', 'paper')
+        'frontier',
+        'frontier: end nodes are judged by the frontiers at them. paper: by viewing distance and '
+        'angle alone, as printed.',
+        choices=('frontier', 'paper'),
     )
-    look_move_m: float = parameter(
-        0.5, 'a look counts after the robot has moved this far, m', low=0.0, high=10.0
+    observation_distance_m: float = parameter(
+        0.5,
+        'Motion of the robot after which an end node counts as observed again (m). Lower: '
+        'probabilities change faster.',
+        low=0.0,
+        high=10.0,
     )
-    look_turn_deg: float = parameter(
-        15.0, 'or the bearing to the node has turned this far, deg', low=0.0, high=180.0
+    observation_angle_deg: float = parameter(
+        15.0,
+        'Change of the bearing after which an end node counts as observed again (deg). Lower: '
+        'probabilities change faster.',
+        low=0.0,
+        high=180.0,
     )
-    moved_m: float = parameter(
-        0.4, 'a node that moved farther loses its evidence, m', low=0.0, high=10.0
+    node_reset_distance_m: float = parameter(
+        0.4,
+        'An end node that moves farther than this loses its evidence (m). Raise it for a noisy '
+        'map.',
+        low=0.0,
+        high=10.0,
     )
-    closed_reliability: float = parameter(
-        0.95, 'reliability of a node without unknown space around', low=0.5, high=0.999
+    closed_node_reliability: float = parameter(
+        0.95,
+        'Reliability of an end node without a frontier. Lower it to visit closed end nodes as '
+        'well.',
+        low=0.5,
+        high=0.999,
     )
 
 
@@ -177,7 +196,7 @@ class EndNodeTracker:
                     track.node_id = node_id
             track.x = x
             track.y = y
-            if math.dist((x, y), track.began_at) > self.config.moved_m:
+            if math.dist((x, y), track.began_at) > self.config.node_reset_distance_m:
                 track.forget()
             tracks[node_id] = track
         self.tracks = tracks
@@ -208,7 +227,7 @@ class EndNodeTracker:
         for track in itertools.compress(self.tracks.values(), seen):
             if self._is_news(track, T_map_laser):
                 self._count(track, T_map_laser, track.node_id in open_ids)
-        if self.config.mode == 'open_border':
+        if self.config.mode == 'frontier':
             for track in self.tracks.values():
                 self._judge_border(track, track.node_id in open_ids)
 
@@ -261,17 +280,17 @@ class EndNodeTracker:
         near = min(
             lost.values(), key=lambda track: math.dist((x, y), (track.x, track.y)), default=None
         )
-        if near is None or math.dist((x, y), (near.x, near.y)) > self.config.moved_m:
+        if near is None or math.dist((x, y), (near.x, near.y)) > self.config.node_reset_distance_m:
             return None
         return lost.pop(near.node_id)
 
     def _is_news(self, track: Track, T_map_laser: Array) -> bool:
         if track.last_seen_from is None:
             return True
-        if math.dist(track.last_seen_from, T_map_laser[:2]) >= self.config.look_move_m:
+        if math.dist(track.last_seen_from, T_map_laser[:2]) >= self.config.observation_distance_m:
             return True
         turned = se2.wrap(_bearing(track, T_map_laser) - track.bearings_rad[-1])
-        return abs(turned) >= math.radians(self.config.look_turn_deg)
+        return abs(turned) >= math.radians(self.config.observation_angle_deg)
 
     def _count(self, track: Track, T_map_laser: Array, is_open: bool) -> None:
         """Equations (1) to (10) for one look."""
@@ -280,7 +299,7 @@ class EndNodeTracker:
         track.bearings_rad.append(_bearing(track, T_map_laser))
         track.angle_span_deg = angle_difference(np.array(track.bearings_rad))
         value = reliability(nearest_distance(np.array(track.distances_m)), track.angle_span_deg)
-        if self.config.mode == 'open_border' and is_open:
+        if self.config.mode == 'frontier' and is_open:
             value = min(value, _NEUTRAL)
         track.probability = bayes_update(track.probability, value)
 
@@ -292,7 +311,7 @@ class EndNodeTracker:
             # What far looks said against the node is settled by the map: nothing is left that could
             # move it.
             before = max(track.probability, PRIOR)
-            track.probability = bayes_update(before, self.config.closed_reliability)
+            track.probability = bayes_update(before, self.config.closed_node_reliability)
         track.closed = not is_open
 
 

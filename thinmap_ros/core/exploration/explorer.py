@@ -61,39 +61,86 @@ FIELDS = {'first_choice_made': Field(np.bool_)}
 class ExplorerConfig(SurveyConfig):
     """What is worth a visit, and how steady a choice is."""
 
-    threshold: float = parameter(
-        0.9, 'an end node as probable as this needs no visit', low=0.5, high=0.999
+    probability_threshold: float = parameter(
+        0.9,
+        'An end node with at least this position probability is not visited. Raise it for higher '
+        'coverage, lower it for shorter paths.',
+        low=0.5,
+        high=0.999,
     )
-    small_border_m: float = parameter(
-        1.5, 'behind a shorter border not much is expected, m', low=0.0, high=50.0
+    small_frontier_m: float = parameter(
+        1.5,
+        'Frontiers up to this length are assumed to hide little (m). Raise it to leave more of '
+        'them for later.',
+        low=0.0,
+        high=50.0,
     )
-    wait_weight: float = parameter(
-        0.5, 'cost of a metre until a target is reached, m', low=0.0, high=10.0
+    waiting_cost: float = parameter(
+        0.5,
+        'Tour cost per metre for which a frontier stays unvisited. Raise it to finish near '
+        'frontiers first.',
+        low=0.0,
+        high=10.0,
     )
-    small_wait_weight: float = parameter(
-        2.0, 'the same, for one with a small border', low=0.0, high=10.0
+    small_frontier_waiting_cost: float = parameter(
+        2.0,
+        'Tour cost per metre for which a small frontier stays unvisited. Raise it to finish small '
+        'ones in passing.',
+        low=0.0,
+        high=10.0,
     )
-    wait_m: float = parameter(
-        15.0, 'a target farther off than this along the tour waits no more, m', low=0.0, high=1e3
+    waiting_horizon_m: float = parameter(
+        15.0,
+        'Tour length beyond which waiting costs nothing more (m). Lower: greedier.',
+        low=0.0,
+        high=1e3,
     )
-    close_look_m: float = parameter(
-        2.0, 'unknown in plain sight this near stays unknown, m', low=0.0, high=50.0
+    exhaustion_range_m: float = parameter(
+        2.0,
+        'A frontier observed from nearer than this without change is exhausted (m). Lower it if '
+        'openings are given up too soon.',
+        low=0.0,
+        high=50.0,
     )
     turn_cost_m_rad: float = parameter(
-        0.2, 'path length that a turn by one radian costs, m', low=0.0, high=10.0
+        0.2,
+        'Path length that a turn by one radian is worth (m/rad). Raise it for a robot that turns '
+        'slowly.',
+        low=0.0,
+        high=10.0,
     )
-    switch_share: float = parameter(0.1, 'and this share of it', low=0.0, high=1.0)
-    switch_m: float = parameter(
-        2.0, 'another target must save this much of the way, m', low=0.0, high=100.0
+    switch_margin_ratio: float = parameter(
+        0.1,
+        'Smallest saving for which the target is changed, relative to its cost. Raise it if the '
+        'robot oscillates.',
+        low=0.0,
+        high=1.0,
     )
-    retry_s: float = parameter(
-        60.0, 'a target that failed is tried again after this time, s', low=0.0, high=1e5
+    switch_margin_m: float = parameter(
+        2.0,
+        'Smallest saving for which the target is changed (m). Raise it if the robot oscillates.',
+        low=0.0,
+        high=100.0,
     )
-    survey_s: float = parameter(
-        1.0, 'borders are assigned anew after this time, s', low=0.0, high=60.0
+    blacklist_timeout_s: float = parameter(
+        60.0,
+        'Time after which an unreachable target is tried again (s). Lower it where people block '
+        'doors.',
+        low=0.0,
+        high=1e5,
     )
-    behind_m: float = parameter(
-        2.0, 'depth of unknown space expected behind a border, m', low=0.0, high=50.0
+    candidate_period_s: float = parameter(
+        1.0,
+        'Period at which frontiers are assigned and candidates are found (s). Raise it to save '
+        'time.',
+        low=0.0,
+        high=60.0,
+    )
+    expected_depth_m: float = parameter(
+        2.0,
+        'Depth of unknown space that is assumed behind a frontier in coverage_estimate (m).',
+        low=0.0,
+        high=50.0,
     )
 
 
@@ -128,7 +175,7 @@ class Explorer:
     def __init__(self, config: ExplorerConfig | None = None) -> None:
         self.config = config or ExplorerConfig()
         self.surveyor = Surveyor(self.config)
-        self._failures = Failures(self.config.retry_s)
+        self._failures = Failures(self.config.blacklist_timeout_s)
         self._ways = PathLengthTable(_COARSE_M, _FORGET_S, _UNKNOWN_WEIGHT)
         self._memory = _Memory()
         self._stamp_ns = 0
@@ -176,13 +223,15 @@ class Explorer:
         surveyor.trail.add_pose(T_map_base)
         xy = (float(T_map_base[0]), float(T_map_base[1]))
         borders.update(patch, box_of_scan(scan, T_map_base))
-        borders.examine(xy, self.config.close_look_m, directions_of_view(scan, T_map_base))
+        borders.examine(xy, self.config.exhaustion_range_m, directions_of_view(scan, T_map_base))
         candidates = self._candidates(topology, T_map_base, scan.range_max_m)
         open_ids = {c.track.node_id for c in candidates}
         for tracker in (surveyor.tracker, surveyor.stand_ins):
             tracker.look(scan, T_map_base, borders.free, borders.frame, open_ids)
         worth = {
-            c.track.node_id: c for c in candidates if c.track.probability < self.config.threshold
+            c.track.node_id: c
+            for c in candidates
+            if c.track.probability < self.config.probability_threshold
         }
         self._give_up_what_was_examined(worth, T_map_base)
         target = self._choose(topology, worth, T_map_base)
@@ -212,7 +261,7 @@ class Explorer:
         renamed = surveyor.follow(ends)
         memory.target = renamed.get(memory.target or 0, memory.target)
         same = last.revision == borders.revision and last.ends == ends
-        recent = same or self._stamp_ns - last.stamp_ns < self.config.survey_s * 1e9
+        recent = same or self._stamp_ns - last.stamp_ns < self.config.candidate_period_s * 1e9
         if surveyor.frame == borders.frame and recent:
             left = last.candidates
             if not same:
@@ -276,7 +325,7 @@ class Explorer:
 
         Plans change with every scan, and whoever turns back gains nothing.
         """
-        return max(self.config.switch_m, self.config.switch_share * cost)
+        return max(self.config.switch_margin_m, self.config.switch_margin_ratio * cost)
 
     def _go_for(self, chosen: Candidate, T_map_base: Array) -> int:
         """Make a candidate the target.
@@ -318,7 +367,7 @@ class Explorer:
             i: self.config.turn_cost_m_rad * _first_turn(T_map_base, c.goal)
             for i, c in worth.items()
         }
-        if self.config.mode == 'open_border':
+        if self.config.mode == 'frontier':
             return self._tours(worth, turn_cost, T_map_base)
         ways = path_lengths_to_goals(topology, T_map_base, {i: c.goal for i, c in worth.items()})
         straight = {i: math.dist(c.goal[:2], T_map_base[:2]) for i, c in worth.items()}
@@ -352,9 +401,9 @@ class Explorer:
         between = np.maximum(np.where(np.isfinite(table), table, _DETOUR * straight), straight)
         first = np.array([near[i] + turn_cost[i] for i in ids])
         lengths = np.array([len(worth[i].cells) * surveyor.frame.resolution for i in ids])
-        small = lengths < self.config.small_border_m
-        weights = np.where(small, self.config.small_wait_weight, self.config.wait_weight)
-        costs = tours_by_first(first, between, weights, self.config.wait_m)
+        small = lengths < self.config.small_frontier_m
+        weights = np.where(small, self.config.small_frontier_waiting_cost, self.config.waiting_cost)
+        costs = tours_by_first(first, between, weights, self.config.waiting_horizon_m)
         return dict(zip(ids, costs.tolist(), strict=True))
 
     # What is told.
@@ -376,7 +425,9 @@ class Explorer:
         finished = self._memory.nothing_left >= _LOOKS
         code, reason = finish_reason(finished, unreachable, len(worth))
         known = surveyor.borders.known_cells * resolution**2
-        expected = sum(len(c.cells) for c in worth.values()) * resolution * self.config.behind_m
+        expected = (
+            sum(len(c.cells) for c in worth.values()) * resolution * self.config.expected_depth_m
+        )
         chosen = next((e for e in end_nodes if e.is_target), None)
         estimate = known / (known + expected) if known > 0.0 else 0.0
         return Decision(chosen, finished, reason, code, end_nodes, unreachable, estimate, known)

@@ -18,19 +18,24 @@ Places = NDArray[np.int64]
 _ROUNDS = 10
 
 
-def tours_by_first(from_start: Array, between: Array, wait_weights: Array, wait_m: float) -> Array:
+def tours_by_first(
+    from_start: Array, between: Array, wait_weights: Array, waiting_horizon_m: float
+) -> Array:
     """Cost of a good open tour through all N places for each of them that could come first, (N,).
 
     The cost is the tour's length, and for each place its weight times the way until it is reached,
-    at most wait_m: what lies near is better done now, since what comes to light on the way may
-    change the tour. from_start (N,): way from the robot to each place; between (N, N): ways between
-    them, symmetric; all finite; wait_weights (N,).
+    at most waiting_horizon_m: what lies near is better done now, since what comes to light on the
+    way may change the tour. from_start (N,): way from the robot to each place; between (N, N): ways
+    between them, symmetric; all finite; wait_weights (N,).
     """
     from_start = np.ascontiguousarray(from_start)
     between = np.ascontiguousarray(between)
     count = from_start.size
     return np.array(
-        [_best_tour(from_start, between, first, wait_weights, wait_m) for first in range(count)]
+        [
+            _best_tour(from_start, between, first, wait_weights, waiting_horizon_m)
+            for first in range(count)
+        ]
     )
 
 

@@ -49,28 +49,56 @@ FIELDS = {
 class OccupancyConfig(Config):
     """Parameters of the grid and of the laser's inverse sensor model."""
 
-    resolution_m: float = parameter(0.10, 'edge of a cell, m', low=0.01, high=1.0)
-    p_free: float = parameter(
-        0.35, 'probability of occupied after a beam passed through', low=0.01, high=0.49
+    resolution_m: float = parameter(
+        0.10,
+        'Edge of a cell of the grid (m). Lower: finer walls, more memory and computing time.',
+        low=0.01,
+        high=1.0,
     )
-    p_occupied: float = parameter(
-        0.80, 'probability of occupied after a beam ended there', low=0.51, high=0.99
+    p_miss: float = parameter(
+        0.35,
+        'Occupancy probability of a cell that a beam passed through. Lower: moved objects vanish '
+        'sooner, thin walls as well.',
+        low=0.01,
+        high=0.49,
     )
-    p_lowest: float = parameter(
-        0.05, 'clamp: no cell gets surer of being free', low=0.003, high=0.4
+    p_hit: float = parameter(
+        0.80,
+        'Occupancy probability of the cell in which a beam ended. Higher: objects appear sooner, '
+        'noise as well.',
+        low=0.51,
+        high=0.99,
     )
-    p_highest: float = parameter(
-        0.97, 'clamp: no cell gets surer of being occupied', low=0.6, high=0.997
+    p_min: float = parameter(
+        0.05,
+        'Lower clamp of the occupancy probability. Lower: free cells change more slowly.',
+        low=0.003,
+        high=0.4,
     )
-    usable_range_m: float = parameter(
-        30.0, 'farther hits only free the way up to here, m', low=0.5, high=200.0
+    p_max: float = parameter(
+        0.97,
+        'Upper clamp of the occupancy probability. Higher: occupied cells change more slowly.',
+        low=0.6,
+        high=0.997,
     )
-    no_return_range_m: float = parameter(
-        8.0, 'a beam without return frees up to here (0: nothing), m', low=0.0, high=200.0
+    max_range_m: float = parameter(
+        30.0,
+        'Longer ranges clear cells up to here and mark no obstacle (m). Set it to the usable '
+        'range of the laser.',
+        low=0.5,
+        high=200.0,
     )
-    surface_depth_m: float = parameter(
+    no_return_clear_range_m: float = parameter(
+        8.0,
+        'Range up to which a beam without return clears cells (m). 0: it clears nothing, as for '
+        'lasers that do not see dark or glass walls.',
+        low=0.0,
+        high=200.0,
+    )
+    surface_thickness_m: float = parameter(
         0.03,
-        'what a beam met fills the cell this far behind the measured surface, m',
+        'Depth behind the measured surface that is marked occupied (m). Raise it if walls that '
+        'lie on the border of two cells break up.',
         low=0.0,
         high=0.5,
     )
@@ -85,9 +113,10 @@ def log_odds(probability: float) -> float:
 class WindowConfig(Config):
     """The part of the map around the robot that a scan changes."""
 
-    window_m: float = parameter(
+    local_map_size_m: float = parameter(
         16.0,
-        'edge of the local map around the robot, m: best twice what the laser reaches',
+        'Side length of local_map, centred on the robot (m). Set it to twice the range of the '
+        'laser; lower: less computing time.',
         low=2.0,
         high=100.0,
     )
@@ -97,7 +126,7 @@ class OccupancyGrid:
     """Occupancy map of any extent, in tiles that exist only where something was observed.
 
     The inverse sensor model: cells along a beam are free, its end is occupied, cells beyond are
-    unchanged. The end is taken surface_depth_m behind the measured surface, inside the obstacle:
+    unchanged. The end is surface_thickness_m behind the measured surface, inside the obstacle:
     for a wall on the border of two cells, noise would otherwise fill the free cell in front of it
     half the time. Each cell is counted once per scan, and a cell in which any beam of the scan ends
     counts as occupied. Beams that graze a wall pass through its cells long before they end. A cell
@@ -134,7 +163,7 @@ class OccupancyGrid:
         Raises InputError if the resolution of the map is not that of the configuration.
         """
         grid = OccupancyGrid(config, patch.frame)
-        clamped = np.clip(patch.cells / 100.0, grid.config.p_lowest, grid.config.p_highest)
+        clamped = np.clip(patch.cells / 100.0, grid.config.p_min, grid.config.p_max)
         odds = np.round(_SCALE * np.log(clamped / (1.0 - clamped))).astype(np.int16)
         grid._write(0, 0, np.where(patch.cells == UNKNOWN, 0, odds).astype(np.int16))
         return grid
@@ -180,11 +209,11 @@ class OccupancyGrid:
             place = f'{T_map_laser[0]:g}, {T_map_laser[1]:g} m'
             raise InputError(f'scan at {scan.stamp_ns} ns: laser at {place}: too far to be mapped')
         resolution = self.frame.resolution
-        usable = self.config.usable_range_m
-        depth = self.config.surface_depth_m
+        usable = self.config.max_range_m
+        depth = self.config.surface_thickness_m
         x = (float(T_map_laser[0]) - self.frame.origin_x) / resolution
         y = (float(T_map_laser[1]) - self.frame.origin_y) / resolution
-        without_return = min(self.config.no_return_range_m, scan.range_max_m, usable)
+        without_return = min(self.config.no_return_clear_range_m, scan.range_max_m, usable)
         radius = math.ceil(min(usable, scan.range_max_m + depth) / resolution) + 2
         tile_row = (math.floor(y) - radius) // TILE
         tile_col = (math.floor(x) - radius) // TILE
@@ -296,7 +325,7 @@ def _steps(config: OccupancyConfig) -> NDArray[np.int16]:
     """
     free, hit, low, high = (
         round(_SCALE * log_odds(p))
-        for p in (config.p_free, config.p_occupied, config.p_lowest, config.p_highest)
+        for p in (config.p_miss, config.p_hit, config.p_min, config.p_max)
     )
     sure = min(round(_SCALE * log_odds(_SURELY_OCCUPIED)), high)
     return np.array([free, hit, low, high, sure], dtype=np.int16)

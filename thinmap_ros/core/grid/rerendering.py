@@ -34,10 +34,10 @@ class StoredScan(NamedTuple):
     @staticmethod
     def of(scan: Scan, config: OccupancyConfig) -> 'StoredScan':
         """Store a scan, with the extent that a grid of this configuration renders."""
-        usable = config.usable_range_m
+        usable = config.max_range_m
         ranges = np.where(scan.hit, scan.ranges_m, 0.0)
-        reach = np.minimum(ranges + config.surface_depth_m, usable)
-        without_return = min(config.no_return_range_m, scan.range_max_m, usable)
+        reach = np.minimum(ranges + config.surface_thickness_m, usable)
+        without_return = min(config.no_return_clear_range_m, scan.range_max_m, usable)
         reach = np.where(scan.no_return, without_return, reach)
         bearings = scan.angles_rad + scan.T_base_laser[2]
         x = np.append(reach * np.cos(bearings), 0.0) + scan.T_base_laser[0]

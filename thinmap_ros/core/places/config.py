@@ -9,69 +9,115 @@ from thinmap_ros.core.config import Config, parameter, robot_radius
 class GlobalLocalizationConfig(Config):
     """How many samples, how often looked at, what counts as explained, when the robot is sure."""
 
-    samples: int = parameter(5000, 'samples of the pose', low=100, high=100_000)
-    beams: int = parameter(60, 'beams of a scan that are compared with the map', low=8, high=1000)
-    usable_range_m: float = parameter(
-        15.0, 'what lies farther is not compared with the map, m', low=1.0, high=100.0
+    samples: int = parameter(
+        5000,
+        'Number of samples of the pose. Raise it for large maps, lower it to save time.',
+        low=100,
+        high=100_000,
+    )
+    max_beams: int = parameter(
+        60,
+        'Number of beams of a scan that are compared with the map. Raise it for similar rooms, '
+        'lower it to save time.',
+        low=8,
+        high=1000,
+    )
+    max_range_m: float = parameter(
+        15.0,
+        'Longer ranges are not compared with the map (m). Set it to the usable range of the laser.',
+        low=1.0,
+        high=100.0,
     )
     robot_radius_m: float = robot_radius()
-    active_window_m: float = parameter(
+    node_window_m: float = parameter(
         10.0,
-        'edge of the square round the robot in which nodes are compared, m',
+        'Side length of the window in which observed nodes are compared (m). Set it to the range '
+        'of the laser.',
         low=2.0,
         high=50.0,
     )
     range_noise_m: float = parameter(
-        0.02, 'range noise of the laser, 1 sigma, m', low=0.001, high=1.0
+        0.02, 'Standard deviation of a range (m). Raise it for a noisy laser.', low=0.001, high=1.0
     )
-    pose_noise_m: float = parameter(
+    map_noise_m: float = parameter(
         0.05,
-        'what map and pose of a hypothesis are off where all is well, 1 sigma, m',
+        'Standard deviation of the position of a correct hypothesis in the map (m). Raise it for '
+        'a map with errors.',
         low=0.001,
         high=1.0,
     )
     heading_noise_rad: float = parameter(
         0.01,
-        'what the heading of a hypothesis is off where all is well, 1 sigma, rad',
+        'Standard deviation of the heading of a correct hypothesis (rad). Raise it for a map with '
+        'errors.',
         low=0.0,
         high=0.2,
     )
-    odometry_noise: float = parameter(
-        0.05, 'odometry error a metre, and a radian, of motion', low=0.0, high=1.0
+    odometry_noise_ratio: float = parameter(
+        0.05,
+        'Standard deviation of odometry per metre or radian of motion. Raise it for wheels that '
+        'slip.',
+        low=0.0,
+        high=1.0,
     )
-    look_m: float = parameter(0.1, 'the robot looks again after so much way, m', low=0.01, high=5.0)
-    look_rad: float = parameter(0.1, 'or after so much turning, rad', low=0.01, high=3.0)
-    odometry_jump_m: float = parameter(
+    update_distance_m: float = parameter(
+        0.1,
+        'Travelled distance between updates (m). Lower: sooner localized, more computing time.',
+        low=0.01,
+        high=5.0,
+    )
+    update_angle_rad: float = parameter(
+        0.1,
+        'Rotation between updates (rad). Lower: sooner localized, more computing time.',
+        low=0.01,
+        high=3.0,
+    )
+    odometry_discontinuity_m: float = parameter(
         1.5,
-        'odometry that moves more than this between two scans has jumped, m',
+        'A larger odometry increment between two scans restarts the search (m). Raise it for fast '
+        'robots with slow scanners.',
         low=0.1,
         high=100.0,
     )
-    sure_share: float = parameter(
-        0.99, 'weight of the one hypothesis of a robot that is sure', low=0.6, high=1.0
+    accept_weight: float = parameter(
+        0.99,
+        'Smallest weight of the hypothesis that is accepted. Raise it against false localization, '
+        'lower it to be localized sooner.',
+        low=0.6,
+        high=1.0,
     )
-    sure_looks: int = parameter(
+    accept_updates: int = parameter(
         3,
-        'looks in a row at which all must speak for one place before it is sure',
+        'Consecutive updates with one hypothesis before it is accepted. Raise it against false '
+        'localization, lower it to be localized sooner.',
         low=1,
         high=1000,
     )
-    least_explained: float = parameter(
+    min_inlier_ratio: float = parameter(
         0.8,
-        'a place that explains less than this share of what a right one would '
-        'is not taken for the right one',
+        'Smallest inlier ratio of an accepted hypothesis, relative to the expected one. Lower it '
+        'where furniture has moved, raise it against false localization.',
         low=0.3,
         high=1.0,
     )
-    sure_sigma_m: float = parameter(
-        0.15, 'its place must be known to this, 1 sigma, m', low=0.01, high=5.0
+    accept_sigma_m: float = parameter(
+        0.15,
+        'Largest standard deviation of the position of an accepted hypothesis (m). Raise it to be '
+        'localized sooner.',
+        low=0.01,
+        high=5.0,
     )
-    sure_sigma_rad: float = parameter(
-        0.07, 'its heading must be known to this, 1 sigma, rad', low=0.005, high=1.0
+    accept_sigma_rad: float = parameter(
+        0.07,
+        'Largest standard deviation of the heading of an accepted hypothesis (rad). Raise it to '
+        'be localized sooner.',
+        low=0.005,
+        high=1.0,
     )
-    foreign_way_m: float = parameter(
+    not_in_map_distance_m: float = parameter(
         2.0,
-        'so much way must have been looked at to say that a map is of another place, m',
+        'Travelled distance without a hypothesis after which NOT_IN_MAP is reported (m). Raise it '
+        'for places that have changed much.',
         low=0.0,
         high=100.0,
     )

@@ -36,7 +36,7 @@ def usual_share(
         scan = made_up_scan(places, T, like)
         noisy = scan.ranges_m + rng.normal(0.0, config.range_noise_m, scan.ranges_m.size)
         seen = observed_beams(replace(scan, ranges_m=noisy), config)
-        noise = (config.pose_noise_m, config.pose_noise_m, config.heading_noise_rad)
+        noise = (config.map_noise_m, config.map_noise_m, config.heading_noise_rad)
         off = rng.normal(size=3) * noise
         explained, silent = judge.explained((T + off)[None], seen)
         counts += float(explained[0])

@@ -185,7 +185,7 @@ class GlobalLocalization:
         if self._T_step is None:
             return False
         motion = se2.between(self._T_step, T_odom_base)
-        far = math.hypot(motion[0], motion[1]) > self.config.odometry_jump_m
+        far = math.hypot(motion[0], motion[1]) > self.config.odometry_discontinuity_m
         return far or abs(float(motion[2])) > _JUMP_RAD
 
     def _novelty(self, T_odom_base: Array) -> float:
@@ -198,7 +198,7 @@ class GlobalLocalization:
         motion = se2.between(self._T_look, T_odom_base)
         way = math.hypot(motion[0], motion[1])
         turn = abs(float(motion[2]))
-        if way < self.config.look_m and turn < self.config.look_rad:
+        if way < self.config.update_distance_m and turn < self.config.update_angle_rad:
             return 0.0
         return min(1.0, way / _NEW_WAY_M + turn / _NEW_TURN_RAD)
 
@@ -257,7 +257,7 @@ class GlobalLocalization:
         way = math.hypot(motion[0], motion[1])
         turn = abs(float(motion[2]))
         self._way_m += way
-        noise = self.config.odometry_noise
+        noise = self.config.odometry_noise_ratio
         spread = (noise * way + _STANDING_NOISE[0], noise * (way + turn) + _STANDING_NOISE[1])
         self._known.move(motion, spread, self._rng)
         self._drawn = moved(self._drawn, motion)
@@ -272,7 +272,7 @@ class GlobalLocalization:
         if len(found):
             poses = np.concatenate([self._known.poses, found])
             counts, silent = judged_before(
-                judge, self._views, poses, T_odom_base, self.config.odometry_noise
+                judge, self._views, poses, T_odom_base, self.config.odometry_noise_ratio
             )
             new = slice(len(self._known), None)
             missed = np.zeros(len(poses))
@@ -298,7 +298,7 @@ class GlobalLocalization:
 
     def _explains_badly(self) -> bool:
         """Whether no hypothesis explains enough to be sure of."""
-        return float(self._fits.max(initial=0.0)) < self.config.least_explained
+        return float(self._fits.max(initial=0.0)) < self.config.min_inlier_ratio
 
     @property
     def _fits(self) -> Array:
@@ -325,7 +325,7 @@ class GlobalLocalization:
         the more places of this map have looked alike, the more; a place in a map of another
         building may look alike for a while.
         """
-        if self._convinced < self.config.sure_looks:
+        if self._convinced < self.config.accept_updates:
             return False
         best = self._known.best()
         age = float(self._known.ages[best])
@@ -348,16 +348,16 @@ class GlobalLocalization:
         variance = float(np.linalg.eigvalsh(known.covariances[best][:2, :2])[-1])
         sigma_m = math.sqrt(max(variance, 0.0))
         return (
-            float(known.weights[best]) >= config.sure_share
-            and float(self._fits[best]) >= config.least_explained
-            and sigma_m <= config.sure_sigma_m
-            and math.sqrt(max(float(known.covariances[best][2, 2]), 0.0)) <= config.sure_sigma_rad
+            float(known.weights[best]) >= config.accept_weight
+            and float(self._fits[best]) >= config.min_inlier_ratio
+            and sigma_m <= config.accept_sigma_m
+            and math.sqrt(max(float(known.covariances[best][2, 2]), 0.0)) <= config.accept_sigma_rad
         )
 
     def _lasting(self) -> NDArray[np.bool_]:
         """Hypotheses (H,) that explain enough, and for some time where much has been seen."""
         known = self._known
-        enough = self._fits >= self.config.least_explained
+        enough = self._fits >= self.config.min_inlier_ratio
         if self._overview < _MANY_LOOKS:
             return enough
         least_age = min(_LASTING_SHARE * self._overview, _LASTING_LOOKS)
@@ -383,8 +383,8 @@ class GlobalLocalization:
         if self.is_sure:
             reason = f'one place explains {best.explained:.0%} of what was seen'
             return Result(State.LOCALIZED, reason, hypotheses)
-        if self._way_m >= self.config.foreign_way_m and not self._lasting().any():
-            share = self.config.least_explained * self._usual
+        if self._way_m >= self.config.not_in_map_distance_m and not self._lasting().any():
+            share = self.config.min_inlier_ratio * self._usual
             reason = f'no place explains {share:.0%} of what was seen for long'
             return Result(State.NOT_IN_MAP, reason, hypotheses)
         likely = int((weights > 0.05 * weights.max()).sum())

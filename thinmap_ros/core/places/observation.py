@@ -51,9 +51,11 @@ def observe(scan: Scan, resolution_m: float, config: GlobalLocalizationConfig) -
 def observed_beams(scan: Scan, config: GlobalLocalizationConfig) -> Observation:
     """Observation of a scan without its nodes: beams alone."""
     usable = np.flatnonzero(scan.hit | scan.no_return)
-    if usable.size > config.beams:
-        usable = usable[np.linspace(0.0, usable.size - 1.0, config.beams).round().astype(np.int64)]
-    farthest = min(scan.range_max_m, config.usable_range_m)
+    if usable.size > config.max_beams:
+        usable = usable[
+            np.linspace(0.0, usable.size - 1.0, config.max_beams).round().astype(np.int64)
+        ]
+    farthest = min(scan.range_max_m, config.max_range_m)
     met = scan.hit[usable] & (scan.ranges_m[usable] < farthest)
     ranges = np.where(met, scan.ranges_m[usable], farthest)
     bearings = scan.angles_rad[usable]
@@ -71,18 +73,18 @@ def observed_nodes(
 
     Source: topological map paper section 2.1; the active window is a square round the robot.
     """
-    half = config.active_window_m / 2.0
+    half = config.node_window_m / 2.0
     grid = OccupancyGrid(
         OccupancyConfig(
             resolution_m=resolution_m,
-            p_free=_P_FREE,
-            p_occupied=_P_OCCUPIED,
-            usable_range_m=max(half, 0.5),
-            no_return_range_m=half,
+            p_miss=_P_FREE,
+            p_hit=_P_OCCUPIED,
+            max_range_m=max(half, 0.5),
+            no_return_clear_range_m=half,
         )
     )
     grid.add_scan(scan, np.zeros(3))
-    window = grid.window(0.0, 0.0, config.active_window_m)
+    window = grid.window(0.0, 0.0, config.node_window_m)
     topology = build(window, (0.0, 0.0), TopologyConfig(robot_radius_m=config.robot_radius_m))
     nodes = np.array([node.position for node in topology.nodes.values()]).reshape(-1, 2)
     return nodes, np.array([int(node.kind) for node in topology.nodes.values()], dtype=np.int64)

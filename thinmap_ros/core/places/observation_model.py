@@ -54,7 +54,7 @@ def calibrate(
         for kind, distance in zip(kinds.tolist(), nearest.tolist(), strict=True):
             distances[kind].append(distance)
     chance = _chance(places)
-    window = _VIEW_SHARE * config.active_window_m**2
+    window = _VIEW_SHARE * config.node_window_m**2
     found = np.zeros(len(NodeKind))
     spread = np.full(len(NodeKind), places.frame.resolution)
     for kind in NodeKind:

@@ -227,7 +227,7 @@ def _sights(
     )
     blocks.ravel()[numbers] = np.arange(len(numbers), dtype=np.int32)
     cells = frame.cells_of(nodes)
-    reach = config.active_window_m / 2.0 / frame.resolution + block_cells
+    reach = config.node_window_m / 2.0 / frame.resolution + block_cells
     first, in_sight = _list_sights(states == FREE, standing[leads].astype(np.int64), cells, reach)
     # Coordinates, not numbers of nodes: samples look at these lists in no order, and each look is
     # one short run of whole numbers, which the compiler compares several at a time.

@@ -93,7 +93,11 @@ def distinct_indices(poses: Array, apart_m: float, apart_rad: float, most: int) 
 
 
 def judged_before(
-    judge: Judge, views: list[KeyView], poses: Array, T_odom_base: Array, odometry_noise: float
+    judge: Judge,
+    views: list[KeyView],
+    poses: Array,
+    T_odom_base: Array,
+    odometry_noise_ratio: float,
 ) -> tuple[Array, Array]:
     """How many beams of earlier views (V) the map explains from poses (N, 3) held now.
 
@@ -107,7 +111,7 @@ def judged_before(
         view = views[k]
         # From view to view: what odometry is off does not add up.
         back = se2.between(at, view.T_odom_base)
-        drift = _drift(back, odometry_noise)
+        drift = _drift(back, odometry_noise_ratio)
         now = judge.refined(moved(now, back), view.seen, np.broadcast_to(drift, (len(now), 3, 3)))
         at = view.T_odom_base
         counts[k], silent[k] = judge.explained(now, view.seen)

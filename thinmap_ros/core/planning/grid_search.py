@@ -72,14 +72,14 @@ def upsample_mask(squares: Mask, factor: int, cells: Mask) -> Mask:
 class PathLengthTable:
     """Path lengths between places of a growing map, on a coarse grid, cached for some time.
 
-    Most places do not move. Paths may cross unknown space, where each step counts unknown_weight
+    Most places do not move. Paths may cross unknown space, where each step counts unknown_cost
     times: an unobserved connection is possible.
     """
 
-    def __init__(self, cell_m: float, forget_s: float, unknown_weight: int) -> None:
+    def __init__(self, cell_m: float, forget_s: float, unknown_cost: int) -> None:
         self._cell_m = cell_m
         self._forget_ns = forget_s * 1e9
-        self._unknown_weight = unknown_weight
+        self._unknown_weight = unknown_cost
         self._known: dict[tuple[Key, Key], tuple[int, float]] = {}
 
     def update(

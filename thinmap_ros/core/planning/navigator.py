@@ -43,21 +43,41 @@ _STANDSTILLS = 5
 class NavigatorConfig(WavefrontConfig, PathFollowerConfig):
     """Parameters of planning and following, and when a goal is reached or aborted."""
 
-    body_radius_m: float = parameter(
-        0.24, 'nothing that the laser sees may come this near, m', low=0.0, high=5.0
+    stop_radius_m: float = parameter(
+        0.24,
+        'The robot stops before a scan point comes closer than this to its centre (m). At most '
+        'robot_radius_m.',
+        low=0.0,
+        high=5.0,
     )
-    reaction_s: float = parameter(
-        0.3, 'time from a measurement until the robot brakes, s', low=0.0, high=5.0
+    reaction_time_s: float = parameter(
+        0.3,
+        'Time from a measurement until the robot brakes (s). Raise it for slow drivers or '
+        'networks.',
+        low=0.0,
+        high=5.0,
     )
-    goal_tolerance_m: float = parameter(0.15, 'a goal this near is reached, m', low=0.01, high=5.0)
-    heading_tolerance_rad: float = parameter(
-        0.15, 'a heading this near is reached, rad', low=0.01, high=3.2
+    xy_goal_tolerance_m: float = parameter(
+        0.15,
+        'Distance at which a goal is reached (m). Raise it if the robot searches for its goal.',
+        low=0.01,
+        high=5.0,
     )
-    replan_s: float = parameter(
-        5.0, 'time after which the path is replanned, s', low=0.1, high=1000.0
+    yaw_goal_tolerance_rad: float = parameter(
+        0.15,
+        'Heading error at which a goal is reached (rad). Raise it if the robot oscillates at its '
+        'goal.',
+        low=0.01,
+        high=3.2,
     )
-    blocked_s: float = parameter(
-        8.0, 'a goal is given up after this time at a standstill, s', low=0.1, high=1000.0
+    replan_period_s: float = parameter(
+        5.0, 'Period of replanning (s). Lower it among moving obstacles.', low=0.1, high=1000.0
+    )
+    blocked_timeout_s: float = parameter(
+        8.0,
+        'Time at standstill after which the goal is aborted (s). Raise it where people step aside.',
+        low=0.1,
+        high=1000.0,
     )
 
 
@@ -140,13 +160,13 @@ class Navigator:
         assert self._goal is not None
         ends = [self._goal] if self.path is None else [self._goal, self.path[-1]]
         away_m = min(math.dist(end, T_map_base[:2]) for end in ends)
-        return away_m <= self.config.goal_tolerance_m
+        return away_m <= self.config.xy_goal_tolerance_m
 
     def _finish_goal(self, T_map_base: Array, dt_s: float) -> Command:
         self._remaining_m = 0.0
         if self._heading_rad is not None:
             error = se2.wrap(self._heading_rad - float(T_map_base[2]))
-            if abs(error) > self.config.heading_tolerance_rad:
+            if abs(error) > self.config.yaw_goal_tolerance_rad:
                 v, w = self._follower.turn_to(T_map_base, self._heading_rad, dt_s)
                 return Command(v, w, 'driving')
         self.cancel()
@@ -156,12 +176,12 @@ class Navigator:
         changed = patch is not self._patch
         self._patch = patch
         self._path_age_s += dt_s
-        if self.path is None or self._path_age_s >= self.config.replan_s:
+        if self.path is None or self._path_age_s >= self.config.replan_period_s:
             return True
         x = float(T_map_base[0])
         y = float(T_map_base[1])
         nearest = nearest_point(self.path, x, y)
-        strayed = math.dist(self.path[nearest], (x, y)) > 2.0 * self.config.lookahead_m
+        strayed = math.dist(self.path[nearest], (x, y)) > 2.0 * self.config.lookahead_distance_m
         return bool(strayed or (changed and self._is_blocked(nearest, patch)))
 
     def _is_blocked(self, first: int, patch: GridPatch) -> bool:
@@ -184,7 +204,7 @@ class Navigator:
         )
         start = float(T_map_base[0]), float(T_map_base[1])
         trail = self._recent_path.cells(patch.frame, patch.shape)
-        path = plan(patch, start, self._goal, self.config, points, self.config.body_radius_m, trail)
+        path = plan(patch, start, self._goal, self.config, points, self.config.stop_radius_m, trail)
         first = self.path is None
         self._path_age_s = 0.0
         if path is None:
@@ -196,11 +216,11 @@ class Navigator:
         return ''
 
     def _wait(self, reason: str, dt_s: float) -> Command:
-        """Stop; abort the goal if there was never a path, or after blocked_s."""
+        """Stop; abort the goal if there was never a path, or after blocked_timeout_s."""
         never = reason.startswith('no path')
         self._blocked_s += dt_s
         self._remaining_m = 0.0
-        if never or self._blocked_s > self.config.blocked_s:
+        if never or self._blocked_s > self.config.blocked_timeout_s:
             self.cancel()
             return Command(*self._follower.stop(dt_s), 'failed', reason)
         return Command(*self._follower.stop(dt_s), 'blocked', reason)
@@ -214,10 +234,10 @@ class Navigator:
             self._nearest_m = self._remaining_m
         before = (self._follower.v, self._follower.w)
         room = self._obstacles.clearance_along(self.path, nearest, _NARROW_AHEAD_M)
-        v, w = self._follower.command(T_map_base, self.path, dt_s, room - self.config.body_radius_m)
+        v, w = self._follower.command(T_map_base, self.path, dt_s, room - self.config.stop_radius_m)
         if v <= 0.0:
             return Command(v, w, 'driving')
-        allowed = self._safe_speed(T_map_base, v, w, self.config.body_radius_m)
+        allowed = self._safe_speed(T_map_base, v, w, self.config.stop_radius_m)
         if allowed >= v - _ROUNDING_M_S:
             self._blocked_s = 0.0
             return Command(v, w, 'driving')
@@ -236,7 +256,7 @@ class Navigator:
         """Brake on the present arc; stop at once if an obstacle has come into it."""
         before = self._follower.v
         v, w = self._follower.stop(dt_s)
-        if self._safe_speed(T_map_base, before, w * before / v, self.config.body_radius_m) < v:
+        if self._safe_speed(T_map_base, before, w * before / v, self.config.stop_radius_m) < v:
             v, w = self._follower.override_speed(0.0, 0.0)
         return Command(v, w, 'driving')
 
@@ -246,13 +266,13 @@ class Navigator:
         reason = _HIDDEN if self._obstacles.is_hidden else _OBSTACLE
         self._standstills += self._blocked_s == 0.0
         self._blocked_s += dt_s
-        if self._blocked_s > self.config.blocked_s or self._standstills > _STANDSTILLS:
+        if self._blocked_s > self.config.blocked_timeout_s or self._standstills > _STANDSTILLS:
             self.cancel()
             return Command(*self._follower.override_speed(0.0, 0.0), 'failed', reason)
         heading = self._heading_of_path(T_map_base)
         if abs(se2.wrap(heading - float(T_map_base[2]))) > _AIM_RAD:
             return Command(*self._follower.turn_to(T_map_base, heading, dt_s), 'driving')
-        self._path_age_s = max(self._path_age_s, self.config.replan_s - 0.5)
+        self._path_age_s = max(self._path_age_s, self.config.replan_period_s - 0.5)
         return Command(*self._follower.override_speed(0.0, 0.0), 'blocked', reason)
 
     def _heading_of_path(self, T_map_base: Array) -> float:
@@ -266,15 +286,15 @@ class Navigator:
 
         There the noise of the ranges exceeds the margin.
         """
-        radius_m = max(self.config.body_radius_m - _NARROW_MARGIN_M, 0.0)
+        radius_m = max(self.config.stop_radius_m - _NARROW_MARGIN_M, 0.0)
         return self._safe_speed(T_map_base, v, v * curvature, radius_m)
 
     def _safe_speed(self, T_map_base: Array, v: float, w: float, radius_m: float) -> float:
         """Highest speed up to v at which the robot stops before a point comes within radius_m."""
         braking = self.config.max_acceleration_m_s2
-        needed = v * self.config.reaction_s + v * v / (2.0 * braking)
+        needed = v * self.config.reaction_time_s + v * v / (2.0 * braking)
         free_m = self._obstacles.free_arc_length_m(T_map_base, w / v, needed, radius_m)
-        late = self.config.reaction_s
+        late = self.config.reaction_time_s
         return min(v, braking * (math.sqrt(late * late + 2.0 * free_m / braking) - late))
 
 

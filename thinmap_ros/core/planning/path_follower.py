@@ -23,23 +23,43 @@ _MIN_SPEED_M_S = 0.1
 class PathFollowerConfig(Config):
     """Limits of the drive, and how closely a path is followed."""
 
-    max_speed_m_s: float = parameter(0.2, 'speed limit, m/s', low=0.01, high=5.0)
-    max_turn_rad_s: float = parameter(1.0, 'turn rate limit, rad/s', low=0.05, high=10.0)
-    max_acceleration_m_s2: float = parameter(0.4, 'acceleration limit, m/s^2', low=0.01, high=10.0)
-    max_turn_acceleration_rad_s2: float = parameter(
-        2.5, 'turn acceleration limit, rad/s^2', low=0.05, high=20.0
+    max_speed_m_s: float = parameter(0.2, 'Maximum speed (m/s).', low=0.01, high=5.0)
+    max_angular_speed_rad_s: float = parameter(
+        1.0, 'Maximum angular speed (rad/s).', low=0.05, high=10.0
     )
-    lookahead_m: float = parameter(
-        0.35, 'distance of the point on the path that is steered for, m', low=0.05, high=5.0
+    max_acceleration_m_s2: float = parameter(
+        0.4,
+        'Maximum acceleration (m/s^2). Lower: smoother, longer stopping distances.',
+        low=0.01,
+        high=10.0,
     )
-    lookahead_s: float = parameter(
-        0.8, 'time ahead of the point that is steered for, s', low=0.0, high=10.0
+    max_angular_acceleration_rad_s2: float = parameter(
+        2.5, 'Maximum angular acceleration (rad/s^2). Lower: smoother turns.', low=0.05, high=20.0
     )
-    stray_m: float = parameter(
-        0.05, 'corners of the path are cut by no more than this, m', low=0.0, high=1.0
+    lookahead_distance_m: float = parameter(
+        0.35,
+        'Smallest lookahead distance of the pure-pursuit controller (m). Raise it if the robot '
+        'oscillates about the path, lower it to follow more closely.',
+        low=0.05,
+        high=5.0,
     )
-    turn_in_place_rad: float = parameter(
-        0.9, 'heading error above which the robot rotates in place, rad', low=0.1, high=3.0
+    lookahead_time_s: float = parameter(
+        0.8,
+        'Lookahead distance per speed (s). Raise it if a fast robot oscillates about the path.',
+        low=0.0,
+        high=10.0,
+    )
+    max_corner_cut_m: float = parameter(
+        0.05,
+        'Largest distance between the driven arc and the path (m). Lower it in narrow passages.',
+        low=0.0,
+        high=1.0,
+    )
+    rotate_to_heading_angle_rad: float = parameter(
+        0.9,
+        'Heading error above which the robot rotates in place (rad). Raise it to drive more arcs.',
+        low=0.1,
+        high=3.0,
     )
 
 
@@ -62,22 +82,26 @@ class PathFollower:
         """
         config = self.config
         narrow = _MIN_LOOKAHEAD_M + _SPARE_FACTOR * max(clearance_margin_m, 0.0)
-        reach = min(max(config.lookahead_m, config.lookahead_s * self.v), narrow)
+        reach = min(max(config.lookahead_distance_m, config.lookahead_time_s * self.v), narrow)
         x, y, theta = T_map_base.tolist()
-        ahead_x, ahead_y, rest_m = _point_ahead(path, x, y, reach, config.stray_m)
+        ahead_x, ahead_y, rest_m = _point_ahead(path, x, y, reach, config.max_corner_cut_m)
         dx = ahead_x - x
         dy = ahead_y - y
         error = wrap(math.atan2(dy, dx) - theta) if dx or dy else 0.0
         # Hysteresis: once turning, the robot turns until the path is nearly straight ahead.
-        least = 0.3 * config.turn_in_place_rad if self._turning else config.turn_in_place_rad
+        least = (
+            0.3 * config.rotate_to_heading_angle_rad
+            if self._turning
+            else config.rotate_to_heading_angle_rad
+        )
         self._turning = abs(error) > least
         if self._turning:
             return self._limited(0.0, self._turn_rate(error, dt_s), dt_s)
         v = min(config.max_speed_m_s, math.sqrt(2.0 * config.max_acceleration_m_s2 * rest_m))
-        v = min(v, max(narrow / max(config.lookahead_s, 1e-9), _MIN_SPEED_M_S))
+        v = min(v, max(narrow / max(config.lookahead_time_s, 1e-9), _MIN_SPEED_M_S))
         curvature = 2.0 * math.sin(error) / max(math.hypot(dx, dy), 0.05)
-        if abs(curvature) * v > config.max_turn_rad_s:
-            v = config.max_turn_rad_s / abs(curvature)
+        if abs(curvature) * v > config.max_angular_speed_rad_s:
+            v = config.max_angular_speed_rad_s / abs(curvature)
         return self._limited(v, v * curvature, dt_s)
 
     def turn_to(self, T_map_base: Array, heading_rad: float, dt_s: float) -> tuple[float, float]:
@@ -104,14 +128,16 @@ class PathFollower:
 
     def _turn_rate(self, error: float, dt_s: float) -> float:
         """Highest turn rate from which the robot can stop at the desired heading."""
-        braking = math.sqrt(2.0 * 0.7 * self.config.max_turn_acceleration_rad_s2 * abs(error))
-        return math.copysign(min(braking, self.config.max_turn_rad_s, abs(error) / dt_s), error)
+        braking = math.sqrt(2.0 * 0.7 * self.config.max_angular_acceleration_rad_s2 * abs(error))
+        return math.copysign(
+            min(braking, self.config.max_angular_speed_rad_s, abs(error) / dt_s), error
+        )
 
     def _limited(self, v: float, w: float, dt_s: float) -> tuple[float, float]:
         config = self.config
-        w = min(max(w, -config.max_turn_rad_s), config.max_turn_rad_s)
+        w = min(max(w, -config.max_angular_speed_rad_s), config.max_angular_speed_rad_s)
         self.v = max(_limited_change(self.v, v, config.max_acceleration_m_s2 * dt_s), 0.0)
-        self.w = _limited_change(self.w, w, config.max_turn_acceleration_rad_s2 * dt_s)
+        self.w = _limited_change(self.w, w, config.max_angular_acceleration_rad_s2 * dt_s)
         return self.v, self.w
 
 
@@ -143,12 +169,12 @@ def length_from(path: Array, first: int) -> float:
 
 @kernel
 def _point_ahead(
-    path: Array, x: float, y: float, reach_m: float, stray_m: float
+    path: Array, x: float, y: float, reach_m: float, max_corner_cut_m: float
 ) -> tuple[float, float, float]:
     """Target point on a path (K, 2) from (x, y), and the remaining length of the path, m.
 
     It lies up to reach_m ahead on the path, or less if the straight line to it would leave the path
-    by more than stray_m: corners are not cut.
+    by more than max_corner_cut_m: corners are not cut.
     """
     first = nearest_point(path, x, y)
     end = path.shape[0] - 1
@@ -158,7 +184,7 @@ def _point_ahead(
     while last < end and along < reach_m:
         last += 1
         along += math.hypot(path[last, 0] - path[last - 1, 0], path[last, 1] - path[last - 1, 1])
-    allowed = stray_m + math.hypot(path[first, 0] - x, path[first, 1] - y)
+    allowed = max_corner_cut_m + math.hypot(path[first, 0] - x, path[first, 1] - y)
     while last > first + 1 and _max_deviation(path, first, last, x, y) > allowed:
         last -= 1
     return path[last, 0], path[last, 1], left_m

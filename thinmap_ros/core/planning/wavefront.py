@@ -1,9 +1,9 @@
 """Wavefront planner (gradient method): navigation function and gradient descent.
 
-F(P) = sum I(p_i) + sum A(p_i, p_i+1): the intrinsic cost I falls from `keep_weight` at the closest
-allowed distance to an obstacle to zero at `keep_m`, the adjacency cost A is the distance moved. The
-wave propagates from cell to cell by solving |grad F| = 1 + I, so that the cost of a path does not
-depend on its direction.
+F(P) = sum I(p_i) + sum A(p_i, p_i+1): the intrinsic cost I falls from `inflation_cost` at the
+closest allowed distance to an obstacle to zero at `inflation_radius_m`, the adjacency cost A is the
+distance moved. The wave propagates from cell to cell by solving |grad F| = 1 + I, so that the cost
+of a path does not depend on its direction.
 Source: topological map paper section 3.2; Konolige, "A gradient method for realtime robot control",
 2000; Sethian, "A fast marching level set method for monotonically advancing fronts", 1996.
 """
@@ -36,24 +36,40 @@ class WavefrontConfig(Config):
     """Parameters of the costs of cells."""
 
     robot_radius_m: float = robot_radius()
-    keep_m: float = parameter(
-        0.6, 'distance to obstacles from which on they cost nothing, m', low=0.0, high=10.0
-    )
-    keep_weight: float = parameter(
-        2.0, 'cost of a metre right beside an obstacle, in metres', low=0.0, high=100.0
-    )
-    unknown: str = parameter(
-        'forbidden', 'unknown space in a path', choices=('forbidden', 'costly')
-    )
-    unknown_weight: float = parameter(
-        3.0, 'cost of a metre of unknown space, in metres', low=0.0, high=1000.0
-    )
-    goal_slack_m: float = parameter(
-        0.3, 'a goal too near to an obstacle may move this far, m', low=0.0, high=5.0
-    )
-    escape_m: float = parameter(
+    inflation_radius_m: float = parameter(
         0.6,
-        'distance within which a start in collision may cross inflated cells, m',
+        'Distance from obstacles below which cells cost more (m). Raise it to keep to the middle '
+        'of rooms, lower it to cut corners.',
+        low=0.0,
+        high=10.0,
+    )
+    inflation_cost: float = parameter(
+        2.0,
+        'Additional cost per metre next to an obstacle. Raise it to keep away from obstacles, '
+        'lower it for shorter paths.',
+        low=0.0,
+        high=100.0,
+    )
+    allow_unknown: bool = parameter(
+        False, 'Whether paths may cross unknown space, as for the planners of Nav2.'
+    )
+    unknown_cost: float = parameter(
+        3.0,
+        'Cost per metre of unknown space, where it is allowed. Raise it to drive through unknown '
+        'space only where there is no other path.',
+        low=0.0,
+        high=1000.0,
+    )
+    goal_search_radius_m: float = parameter(
+        0.3,
+        'A goal in collision is moved by at most this distance (m). 0: such a goal fails.',
+        low=0.0,
+        high=5.0,
+    )
+    start_escape_distance_m: float = parameter(
+        0.6,
+        'A start in collision may leave inflated cells within this distance (m). Raise it if the '
+        'robot gets stuck beside obstacles.',
         low=0.0,
         high=5.0,
     )
@@ -65,13 +81,13 @@ def plan(
     goal_xy: tuple[float, float],
     config: WavefrontConfig,
     points: Array | None = None,
-    body_radius_m: float = 0.0,
+    stop_radius_m: float = 0.0,
     trail: NDArray[np.int64] | None = None,
 ) -> Array | None:
     """Path (K, 2) from start to goal, m, map frame, points half a cell apart; None: no path.
 
-    The path ends at the goal, or at the nearest allowed cell within goal_slack_m. It stays
-    body_radius_m away from obstacle points (N, 2), which the map need not contain. Points are not
+    The path ends at the goal, or at the nearest allowed cell within goal_search_radius_m. It stays
+    stop_radius_m away from obstacle points (N, 2), which the map need not contain. Points are not
     rounded to cells: noise would make walls one cell thicker, and passages too narrow. trail: cells
     (N, 2) of the recent path; the robot may return over them unless they are occupied now.
     """
@@ -85,25 +101,27 @@ def plan(
         at = patch.frame.cells_of(points)
         occupied[at[:, 0], at[:, 1]] = True
         cell_m = patch.frame.resolution
-        inflation_radius = config.keep_m / cell_m
+        inflation_radius = config.inflation_radius_m / cell_m
         _inflate_points(
             cost,
             _in_cells(patch, points),
-            body_radius_m / cell_m,
+            stop_radius_m / cell_m,
             inflation_radius,
-            config.keep_weight,
+            config.inflation_cost,
         )
     start = (int(cells[0, 0]), int(cells[0, 1]))
     wished = (int(cells[1, 0]), int(cells[1, 1]))
     if not math.isfinite(cost[start]):
-        _open_escape_cells(cost, occupied, start, config.escape_m / patch.frame.resolution)
+        _open_escape_cells(
+            cost, occupied, start, config.start_escape_distance_m / patch.frame.resolution
+        )
     if trail is not None:
         back = trail[~occupied[trail[:, 0], trail[:, 1]]]
         cost[back[:, 0], back[:, 1]] = np.minimum(cost[back[:, 0], back[:, 1]], _ESCAPE_COST)
     goal = nearest_true(
         reachable_cells(np.isfinite(cost), start),
         wished,
-        config.goal_slack_m / patch.frame.resolution,
+        config.goal_search_radius_m / patch.frame.resolution,
     )
     if goal is None:
         return None
@@ -119,16 +137,16 @@ def cost_of_cells(patch: GridPatch, config: WavefrontConfig) -> Array:
     """Cost per unit of distance in each cell (H, W): 1 + I; inf if the robot would collide."""
     resolution = patch.frame.resolution
     free = known_free(patch, _TOPOLOGY)
-    passable = free if config.unknown == 'forbidden' else ~patch.occupied
-    reach = max(math.ceil(max(config.keep_m, config.robot_radius_m) / resolution), 1)
+    passable = ~patch.occupied if config.allow_unknown else free
+    reach = max(math.ceil(max(config.inflation_radius_m, config.robot_radius_m) / resolution), 1)
     distance_m = np.sqrt(np.arange(2 * (reach + 1) ** 2 + 1)) * resolution
-    spread = max(config.keep_m - config.robot_radius_m, 1e-6)
-    nearness = np.clip((config.keep_m - distance_m) / spread, 0.0, 1.0)
+    spread = max(config.inflation_radius_m - config.robot_radius_m, 1e-6)
+    nearness = np.clip((config.inflation_radius_m - distance_m) / spread, 0.0, 1.0)
     allowed = distance_m >= config.robot_radius_m - _HAIR_M
-    table = np.where(allowed, 1.0 + config.keep_weight * nearness * nearness, np.inf)
+    table = np.where(allowed, 1.0 + config.inflation_cost * nearness * nearness, np.inf)
     cost = _look_up(column_distance(passable), reach, table)
-    if config.unknown == 'costly':
-        cost += np.where(free, 0.0, config.unknown_weight)
+    if config.allow_unknown:
+        cost += np.where(free, 0.0, config.unknown_cost)
     return cost
 
 

@@ -106,7 +106,7 @@ class TopologyBuilder:
         return self._registry.refresh(self._atlas)
 
     def local_map(self) -> TopologicalMap:
-        """The map of what is near in the newest window, near_m wide, not merged; ids from 1."""
+        """Map of the newest window near the robot, update_window_m wide, not merged; ids from 1."""
         view = self._view
         around = self._surroundings
         if view is None or around is None:
@@ -327,7 +327,7 @@ class _View:
         self.distance = distance = column_distance(known)
         room = standing_room(distance, config.robot_radius_m / patch.frame.resolution)
         seeds = known_skeleton[0] - (around.box.row, around.box.col)
-        seed = nearest_cell(room, patch, robot_xy, config.seed_reach_m)
+        seed = nearest_cell(room, patch, robot_xy, config.seed_search_radius_m)
         self.robot: Cells = np.empty((0, 2), dtype=np.int64) if seed is None else seed[None]
         self.free = reachable(room, np.concatenate((seeds, self.robot)))
         self.measure: Measure = lambda cells: squared_clearance(distance, cells)

@@ -10,42 +10,73 @@ class TopologyConfig(Config):
     """What counts as free, which branches of the skeleton count, and how local maps are merged."""
 
     robot_radius_m: float = robot_radius()
-    gap_m: float = parameter(
-        0.2, 'unknown gaps between free cells up to this wide count as free, m', low=0.0, high=2.0
+    max_unknown_gap_m: float = parameter(
+        0.2,
+        'Unknown gaps between free cells up to this width count as free (m). Raise it for a laser '
+        'with few beams, lower it to keep small unknown regions.',
+        low=0.0,
+        high=2.0,
     )
-    seed_reach_m: float = parameter(
-        1.5, 'how far from the robot its free space may begin, m', low=0.0, high=20.0
+    seed_search_radius_m: float = parameter(
+        1.5,
+        'Largest distance from the robot to the free space that is thinned (m). Raise it if the '
+        'graph stays empty where the robot starts beside obstacles.',
+        low=0.0,
+        high=20.0,
     )
-    spur_m: float = parameter(
-        0.6, 'a branch must bring the robot farther than this to count, m', low=0.0, high=10.0
+    min_branch_length_m: float = parameter(
+        0.6,
+        'Shorter branches of the skeleton are pruned (m). Raise it for fewer end nodes, lower it '
+        'to keep niches.',
+        low=0.0,
+        high=10.0,
     )
-    spur_ratio: float = parameter(
+    min_branch_ratio: float = parameter(
         0.5,
-        'a branch to a known wall must also bring it farther than this share of the free radius',
+        'Smallest length of a branch towards a known wall, relative to the clearance at its base. '
+        'Raise it for fewer end nodes in corners.',
         low=0.0,
         high=5.0,
     )
-    join_m: float = parameter(
-        0.4, 'branch nodes closer than this along the skeleton are one, m', low=0.0, high=5.0
+    branch_merge_distance_m: float = parameter(
+        0.4,
+        'Branch nodes closer than this along the skeleton are merged (m). Raise it for fewer '
+        'nodes at wide junctions.',
+        low=0.0,
+        high=5.0,
     )
-    near_m: float = parameter(
+    update_window_m: float = parameter(
         10.0,
-        'edge of the square round the robot that is thinned at every scan, m',
+        'Side length of the window that is thinned at every scan (m). Raise it for a long-range '
+        'laser, lower it to save time.',
         low=2.0,
         high=50.0,
     )
-    context_m: float = parameter(
-        6.0, 'width of what is thinned with it all round, m', low=0.0, high=50.0
-    )
-    memory_m: float = parameter(
-        50.0, 'how far round a window past ones are remembered, m', low=0.0, high=200.0
-    )
-    margin_m: float = parameter(
-        2.0,
-        'how far from places known before, but out of sight, the old skeleton stays, m',
+    update_context_m: float = parameter(
+        6.0,
+        'Width of the margin that is thinned with the window (m). Raise it if the graph differs '
+        'from that of the whole map, lower it to save time.',
         low=0.0,
         high=50.0,
     )
-    same_place_m: float = parameter(
-        0.5, 'a node that moved up to this far keeps its id, m', low=0.0, high=10.0
+    window_memory_m: float = parameter(
+        50.0,
+        'Distance up to which earlier windows are remembered (m). Raise it for large halls, lower '
+        'it to save memory.',
+        low=0.0,
+        high=200.0,
+    )
+    skeleton_keep_margin_m: float = parameter(
+        2.0,
+        'Distance outside the visible area up to which the previous skeleton is kept (m). Raise '
+        'it if nodes at the border of the view flicker.',
+        low=0.0,
+        high=50.0,
+    )
+    node_match_radius_m: float = parameter(
+        0.5,
+        'A node that moved less than this keeps its id (m). Raise it if ids change while the map '
+        'grows.',
+        low=0.0,
+        high=10.0,
     )

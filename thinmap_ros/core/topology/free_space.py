@@ -27,7 +27,7 @@ def select_free_space(
     unknown cells up to gap_m long between two free cells of a row or column are taken for free:
     specks between beams. Occupied cells count however few they are: a lone one is a pillar until
     the grid takes it back. Cells are joined over edges and corners. seed_xy: x, y in m in the map
-    frame; where it is not on such a cell, the nearest one within seed_reach_m; none: an empty
+    frame; where it is not on such a cell, the nearest one within seed_search_radius_m; none: empty
     selection. Without seed: every part that is larger than the robot itself.
     Source: exploration paper section 2.1, "selection of free space"; rules beyond the papers are
     stated above.
@@ -36,14 +36,14 @@ def select_free_space(
     standing = standing_room(column_distance(known_free(patch, config)), radius)
     if seed_xy is None:
         return without_specks(standing, math.pi * radius**2)
-    seed = nearest_cell(standing, patch, seed_xy, config.seed_reach_m)
+    seed = nearest_cell(standing, patch, seed_xy, config.seed_search_radius_m)
     return reachable(standing, np.empty((0, 2), dtype=np.int64) if seed is None else seed[None])
 
 
 def known_free(patch: GridPatch, config: TopologyConfig) -> Mask:
     """Free cells (H, W), with unknown gaps up to gap_m between them closed."""
     states = patch.free.astype(np.uint8) + 2 * patch.unknown.astype(np.uint8)
-    gap = int(config.gap_m / patch.frame.resolution + 1e-6)
+    gap = int(config.max_unknown_gap_m / patch.frame.resolution + 1e-6)
     return _close_gaps(states, gap)
 
 

@@ -118,9 +118,9 @@ class Registry:
     def refresh(self, atlas: Atlas) -> bool:
         """Follow the changes of the atlas since the last call; returns whether there were any.
 
-        A new node takes over the id of one that is gone and lay within same_place_m: nearest pairs
-        first, and one of another kind counts as farther away unless it was in the same cell. An
-        edge between two nodes keeps its id.
+        A new node takes over the id of one that is gone and lay within node_match_radius_m: nearest
+        pairs first, and one of another kind counts as farther away unless it was in the same cell.
+        An edge between two nodes keeps its id.
         """
         spots, chains = atlas.take_changes()
         changed = bool(spots or chains)
@@ -200,7 +200,7 @@ class Registry:
         fresh_kinds, old_kinds = (np.array([n.kind for n in nodes]) for nodes in (fresh, old))
         kinds = fresh_kinds[:, None] != old_kinds
         distance = np.hypot(*np.moveaxis(new_xy[:, None] - old_xy, 2, 0))
-        limit = self._config.same_place_m
+        limit = self._config.node_match_radius_m
         moved = distance > 0.1 * self._lattice.resolution
         cost = distance + (_OTHER_KIND * limit) * (kinds & moved)
         pairs = np.argwhere(distance <= limit)

@@ -38,14 +38,16 @@ class Limits(NamedTuple):
 
     radius: float
     spur: float
-    spur_ratio: float
+    min_branch_ratio: float
     join: float
 
     @staticmethod
     def of(config: TopologyConfig, resolution: float) -> 'Limits':
         """Limits on a grid of some m a cell."""
-        lengths = config.robot_radius_m / resolution, config.spur_m / resolution
-        return Limits(*lengths, config.spur_ratio, config.join_m / resolution)
+        lengths = config.robot_radius_m / resolution, config.min_branch_length_m / resolution
+        return Limits(
+            *lengths, config.min_branch_ratio, config.branch_merge_distance_m / resolution
+        )
 
 
 class Outlook(NamedTuple):
@@ -94,11 +96,12 @@ def drop_spurs(net: Net, chosen: Mask, outlook: Outlook, limits: Limits) -> bool
 
     A spur is a chain with one free end. What it adds to the place where it begins is the length by
     which the space round its tip reaches beyond the space round its base: length + room(tip) -
-    room(base), room being clearance less robot radius. Up to spur_m that is noise; and where the
-    tip looks at known walls only, up to spur_ratio of the base's room too (a right-angled corner of
-    a room adds 0.41 of it). So is one that lies in the room round other chains from its base
-    altogether: what is left where an old piece of skeleton runs beside a new one. All spurs of a
-    round go together, so that the two corners at the end of a corridor leave its middle as the end.
+    room(base), room being clearance less robot radius. Up to min_branch_length_m that is noise; and
+    where the tip looks at known walls only, up to min_branch_ratio of the base's room too (a
+    right-angled corner of a room adds 0.41 of it). So is one that lies in the room round other
+    chains from its base altogether: what is left where an old piece of skeleton runs beside a new
+    one. All spurs of a round go together, so that the two corners at the end of a corridor leave
+    its middle as the end.
     """
     gone = np.empty(chain_count(net), dtype=np.int64)
     tips = np.empty(gone.size, dtype=np.int64)
@@ -147,7 +150,7 @@ def _adds_little(
     adds = length_of(net, number) + tip_room - base_room
     if adds <= limits.spur:
         return True
-    return adds <= limits.spur_ratio * base_room and not _looks_out(outlook, net.spots[tip])
+    return adds <= limits.min_branch_ratio * base_room and not _looks_out(outlook, net.spots[tip])
 
 
 @kernel

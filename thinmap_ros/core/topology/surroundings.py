@@ -40,14 +40,14 @@ _OFF_LATTICE = 1e-3  # of a cell: windows that lie worse than this do not belong
 
 
 class Surroundings:
-    """What the windows of the last places showed, within memory_m round the newest one.
+    """What the windows of the last places showed, within window_memory_m round the newest one.
 
     Bounded, whatever the map.
 
     Thinning near the rim of a window differs from thinning the whole map. With what lies round the
-    window at hand, context_m wide, the skeleton goes on over its rim as it would in a map of the
-    whole. The cells are kept in a square array whose indices wrap round, so that nothing is moved
-    when the robot moves.
+    window at hand, update_context_m wide, the skeleton goes on over its rim as it would in a map of
+    the whole. The cells are kept in a square array whose indices wrap round, so that nothing is
+    moved when the robot moves.
 
     `near` is the near part of the window, `inner` that part or all of it, whichever is to be
     thinned now, and `box` the same with its context.
@@ -57,9 +57,9 @@ class Surroundings:
         """Begin on the cells of a lattice, for windows of at most so many rows and columns."""
         resolution = lattice.resolution
         self.lattice = lattice
-        self._margin = round(config.context_m / resolution)
-        self._near = round(config.near_m / resolution)
-        self._depth = round(config.margin_m / resolution)
+        self._margin = round(config.update_context_m / resolution)
+        self._near = round(config.update_window_m / resolution)
+        self._depth = round(config.skeleton_keep_margin_m / resolution)
         self._reach = _reach(config, resolution)
         self._size = max(window) + 2 * self._reach
         self._memory: States = np.full((self._size, self._size), _NEVER, dtype=np.int8)
@@ -107,7 +107,7 @@ class Surroundings:
         reach = int(state['reach'])
         lattice = GridFrame(*state['lattice'].tolist())
         wanted = _reach(config, lattice.resolution)
-        expected = f'{wanted} (memory_m, context_m)'
+        expected = f'{wanted} (window_memory_m, update_context_m)'
         snapshot.require(reach == wanted, f'surroundings {reach} cells wide', expected)
         window = memory.shape[0] - 2 * reach
         snapshot.require(window > 0, f'surroundings {memory.shape}', f'more than {2 * reach} cells')
@@ -178,7 +178,9 @@ class Surroundings:
 
 def _reach(config: TopologyConfig, resolution: float) -> int:
     """How far round a window is remembered, in cells."""
-    return max(round(config.memory_m / resolution), round(config.context_m / resolution))
+    return max(
+        round(config.window_memory_m / resolution), round(config.update_context_m / resolution)
+    )
 
 
 def _wrapped(first: int, count: int, size: int) -> list[tuple[slice, slice]]:

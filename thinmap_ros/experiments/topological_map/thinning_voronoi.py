@@ -82,7 +82,7 @@ def run(source: Source) -> Outcome:
 
 
 def _methods(patch: GridPatch, prune_m: float) -> Iterator[Callable[[], TopologicalMap]]:
-    config = TopologyConfig(spur_m=prune_m, spur_ratio=0.0)
+    config = TopologyConfig(min_branch_length_m=prune_m, min_branch_ratio=0.0)
     yield lambda: build(patch, None, config)
     yield lambda: build_voronoi(patch, VoronoiConfig(prune_m=prune_m))
 

@@ -19,7 +19,7 @@ from thinmap_ros.view.plots import Curve, MapLayer, Panel, Plot, Raster
 _START = (2.0, 2.0)
 _COSTS = {
     'intrinsic and adjacency': WavefrontConfig(),
-    'adjacency alone': WavefrontConfig(keep_weight=0.0),
+    'adjacency alone': WavefrontConfig(inflation_cost=0.0),
 }
 
 

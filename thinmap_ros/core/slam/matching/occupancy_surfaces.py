@@ -23,10 +23,10 @@ class WallFaces(NamedTuple):
 def occupied_surface_points(patch: GridPatch) -> list[WallFaces]:
     """Points on the faces of a map's occupied cells towards free ones, for each of four sides.
 
-    A beam fills the cell that lies surface_depth_m behind what it met. So the surface is on average
-    half a cell, less that depth, behind the face of the cell.
+    A beam fills the cell that lies surface_thickness_m behind what it met. So the surface is on
+    average half a cell, less that depth, behind the face of the cell.
     """
-    depth_m = max(0.5 * patch.frame.resolution - OccupancyConfig().surface_depth_m, 0.0)
+    depth_m = max(0.5 * patch.frame.resolution - OccupancyConfig().surface_thickness_m, 0.0)
     return [_faces(patch, row, col, depth_m) for row, col in _SIDES]
 
 
