@@ -111,7 +111,7 @@ def _report(result: Replay, poses: Array, seconds: tuple[float, float]) -> dict[
         'ms_per_scan': {name: _spread(1000.0 * seconds) for name, seconds in stages.items()},
         'features': len(line_features(result.pipeline.localizer)),
         'features_local_median': float(np.median(result.local_features)),
-        'refused': result.pipeline.localizer.refused,
+        'rejected': result.pipeline.localizer.rejected,
         'distance': round(float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum()), 3),
         'nodes': len(result.pipeline.topology.map.nodes),
         'edges': len(result.pipeline.topology.map.edges),

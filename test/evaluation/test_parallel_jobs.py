@@ -45,7 +45,7 @@ class Sum:
 
 
 def add(job):
-    if job.name == 'refused':
+    if job.name == 'rejected':
         raise InputError('refused: no numbers')
     if job.name == 'killed':
         os.kill(os.getpid(), signal.SIGKILL)
@@ -71,13 +71,13 @@ def test_one_that_fails_is_named_and_the_others_run(
 ) -> None:
     jobs = [
         Sum('a', (1.0, 2.0)),
-        Sum('refused', ()),
+        Sum('rejected', ()),
         Sum('killed', ()),
         Sum('wrong', ('x',)),
         Sum('b', (4.0,)),
     ]
     failures = run(tmp_path, jobs, argparse.Namespace(processes=processes, scheduler=''))
-    assert failures['refused'] == Failure('refused: no numbers')
+    assert failures['rejected'] == Failure('refused: no numbers')
     assert failures['killed'].reason == 'its process ended with exit code -9'
     assert failures['wrong'].reason.startswith('TypeError: ')
     assert 'in add' in failures['wrong'].trace
@@ -103,13 +103,13 @@ def test_what_is_finished_is_not_run_again(tmp_path: Path) -> None:
 @pytest.mark.programs
 def test_a_cluster_tells_what_fails_as_well(tmp_path: Path) -> None:
     distributed = pytest.importorskip('distributed')
-    jobs = [Sum('a', (1.0,)), Sum('refused', ())]
+    jobs = [Sum('a', (1.0,)), Sum('rejected', ())]
     with distributed.LocalCluster(
         n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
     ) as cluster:
         where = argparse.Namespace(processes=1, scheduler=cluster.scheduler_address)
         failures = run(tmp_path, jobs, where)
-    assert failures == {'refused': Failure('refused: no numbers')}
+    assert failures == {'rejected': Failure('refused: no numbers')}
     assert read_report(tmp_path / 'a.json', [1.0])['sum'] == 1.0
 
 

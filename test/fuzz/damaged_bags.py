@@ -153,7 +153,7 @@ def check(path: Path, out: Path) -> str:
     if code == 2:
         assert not out.exists()
         assert read_code == 2
-        return 'refused'
+        return 'rejected'
     bag = Bag(out)
     assert not bag.is_truncated
     messages = list(bag.messages())

@@ -50,7 +50,7 @@ class TwoAttempts:
         target = EndNode(7, goal[0], goal[1], 0.5, 0.0, 0.0, 1.0, 0.0, 1.0, True, goal)
         if self.attempts < 2:
             return Decision(target, False, 'one left', FinishCode.NONE, [target], [], 0.5, 1.0)
-        code = FinishCode.NOTHING_REACHABLE
+        code = FinishCode.UNREACHABLE
         return Decision(None, True, 'two attempts failed', code, [target], [7], 0.5, 1.0)
 
     def target_failed(self, reason):
@@ -126,7 +126,7 @@ class Robot:
     def evidence(self):
         """Probability and number of counted looks' closest distance by end node."""
         return {
-            n.node_id: (n.position_probability, n.smallest_distance_m)
+            n.node_id: (n.position_probability, n.min_distance_m)
             for n in self.end_nodes[-1].end_nodes
         }
 
@@ -147,17 +147,17 @@ def robot(graph):
 
 def test_it_says_why_it_ended(robot):
     assert robot.explores(area_limit_m2=1.0) == (
-        ExplorationStatus.BUDGET,
+        ExplorationStatus.BUDGET_EXHAUSTED,
         GoalStatus.STATUS_SUCCEEDED,
     )
     robot.is_tracked = False
     assert robot.explores() == (ExplorationStatus.LOCALIZATION_LOST, GoalStatus.STATUS_ABORTED)
     robot.is_tracked = True
     robot.hears_scans = False
-    assert robot.explores() == (ExplorationStatus.SENSOR_SILENT, GoalStatus.STATUS_ABORTED)
+    assert robot.explores() == (ExplorationStatus.SENSOR_TIMEOUT, GoalStatus.STATUS_ABORTED)
     robot.hears_scans = True
     robot.refuses_to_drive()
-    assert robot.explores() == (ExplorationStatus.NOTHING_REACHABLE, GoalStatus.STATUS_SUCCEEDED)
+    assert robot.explores() == (ExplorationStatus.UNREACHABLE, GoalStatus.STATUS_SUCCEEDED)
     robot.knows(60)
     assert robot.explores() == (ExplorationStatus.ALL_RESOLVED, GoalStatus.STATUS_SUCCEEDED)
 
@@ -189,7 +189,7 @@ def test_it_goes_on_after_a_cancelled_goal_and_after_a_new_start(graph, robot, t
             assert graph.stop('explorer') == 0, graph.log('explorer')
             graph.start('explorer', laser_pose='0,0,0', use_sim_time=True, **session)
         robot.end_nodes.clear()
-        assert robot.explores(area_limit_m2=1.0)[0] == ExplorationStatus.BUDGET
+        assert robot.explores(area_limit_m2=1.0)[0] == ExplorationStatus.BUDGET_EXHAUSTED
         graph.until(lambda: robot.end_nodes, 'what was looked at last')
         # The robot has not moved: there is no new evidence, and what there was has been kept.
         assert robot.evidence() == before
@@ -207,7 +207,7 @@ def test_a_users_own_strategy_explores(graph):
     )
     ended = graph.act(Explore, 'explore', Explore.Goal())
     assert ended.status == GoalStatus.STATUS_SUCCEEDED
-    assert ended.result.status.reason_code == ExplorationStatus.NOTHING_REACHABLE
+    assert ended.result.status.reason_code == ExplorationStatus.UNREACHABLE
     assert ended.result.status.reason == 'two attempts failed'
     assert list(robot.evidence()) == [7]
     saved = graph.call(SaveMap, 'save_exploration', SaveMap.Request(path='room'))
@@ -220,7 +220,7 @@ def test_a_baseline_explores(graph):
     robot = Robot(graph)
     robot.refuses_to_drive()
     graph.start('explorer', laser_pose='0,0,0', use_sim_time=True, strategy='nearest_frontier')
-    assert robot.explores() == (ExplorationStatus.NOTHING_REACHABLE, GoalStatus.STATUS_SUCCEEDED)
+    assert robot.explores() == (ExplorationStatus.UNREACHABLE, GoalStatus.STATUS_SUCCEEDED)
     robot.knows(60)
     assert robot.explores() == (ExplorationStatus.ALL_RESOLVED, GoalStatus.STATUS_SUCCEEDED)
     assert graph.stop('explorer') == 0, graph.log('explorer')
@@ -249,5 +249,5 @@ def test_a_return_begins_when_there_is_a_navigator_at_last(graph, robot):
     robot.refuses_to_drive()
     ended = accepted.get_result_async()
     graph.until(ended.done, 'the end')
-    assert ended.result().result.status.reason_code == ExplorationStatus.BUDGET
+    assert ended.result().result.status.reason_code == ExplorationStatus.BUDGET_EXHAUSTED
     assert ended.result().result.status.reason.endswith('; not home: the wheels are chained')

@@ -70,8 +70,10 @@ def test_a_robot_that_drives_about_finds_itself_when_asked(graph, map_file):
     graph.start('sim', start=','.join(map(str, START)), rate=3.0)
     graph.until(lambda: status and truth, 'status and the robot')
     assert status[-1].state == LocalizationStatus.IDLE
-    answer = graph.call(LocalizeGlobally, 'localize_globally', LocalizeGlobally.Request(clear=True))
-    assert answer.accepted, answer.message
+    answer = graph.call(
+        LocalizeGlobally, 'localize_globally', LocalizeGlobally.Request(discard_hypotheses=True)
+    )
+    assert answer.success, answer.message
     ahead = Twist()
     ahead.linear.x = 0.25
     ahead.angular.z = 0.35

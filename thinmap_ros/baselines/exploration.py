@@ -355,7 +355,7 @@ def _decision(
     code = FinishCode.NONE
     reason = 'targets remain'
     if finished:
-        code = FinishCode.NOTHING_REACHABLE if failures else FinishCode.ALL_RESOLVED
+        code = FinishCode.UNREACHABLE if failures else FinishCode.ALL_RESOLVED
         reason = 'remaining targets are unreachable' if failures else 'no target is left'
     return Decision(chosen, finished, reason, code, nodes, [], 0.0, 0.0)
 

@@ -103,7 +103,7 @@ class DemoMonitorNode(Node):
             target if status.state == ExplorationStatus.EXPLORING else status.reason
         )
         self._bar.set_postfix_str(
-            f'{status.distance_m:.1f} m, {messages.seconds(status.time):.0f} s'
+            f'{status.distance_m:.1f} m, {messages.seconds(status.elapsed):.0f} s'
         )
         self._bar.n = 100.0 * self._coverage
         self._bar.refresh()
@@ -115,9 +115,9 @@ class DemoMonitorNode(Node):
             end_ns = messages.stamp_ns(status.header.stamp)
             content = {
                 'finished': status.reason_code
-                in (ExplorationStatus.ALL_RESOLVED, ExplorationStatus.NOTHING_REACHABLE),
+                in (ExplorationStatus.ALL_RESOLVED, ExplorationStatus.UNREACHABLE),
                 'reason': status.reason,
-                'start_ns': end_ns - round(1e9 * messages.seconds(status.time)),
+                'start_ns': end_ns - round(1e9 * messages.seconds(status.elapsed)),
                 'end_ns': end_ns,
             }
             write_text(Path(self._config.result), json.dumps(content) + '\n')

@@ -206,7 +206,7 @@ class _LocalizationPublishers:
                 reason=result.reason,
                 hypotheses=[messages.pose_msg(found.T_map_base) for found in result.hypotheses],
                 weights=[found.weight for found in result.hypotheses],
-                explained=[found.explained for found in result.hypotheses],
+                inlier_ratios=[found.explained for found in result.hypotheses],
             )
         )
         if result.pose is not None:
@@ -305,9 +305,9 @@ class GlobalLocalizerNode(ThinmapNode):
     def _on_request(
         self, request: LocalizeGlobally.Request, response: LocalizeGlobally.Response
     ) -> LocalizeGlobally.Response:
-        self._start(request.clear)
+        self._start(request.discard_hypotheses)
         missing = self._missing()
-        response.accepted = True
+        response.success = True
         response.message = f'waits for {missing}' if missing else 'searching the whole map'
         return response
 

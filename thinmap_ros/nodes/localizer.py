@@ -83,8 +83,8 @@ class _PosePublishers:
         status.local_features = estimate.n_local_features
         status.observed = estimate.observed_lines
         status.matched = estimate.matched_lines
-        status.refused = localizer.refused
-        status.match_quality = estimate.inlier_ratio
+        status.rejected = localizer.rejected
+        status.inlier_ratio = estimate.inlier_ratio
         self._status.publish(status)
 
     def publish_trajectory(self, stamp_ns: int, stamps_ns: list[int], poses: Array) -> None:
@@ -218,7 +218,7 @@ class LocalizerNode(ThinmapNode):
                 self._last = OdometryAnchor(scan.stamp_ns, estimate.T_map_odom, T_odom_base)
         diagnostics = self.diagnostics
         diagnostics.set_drop_total('scans without odometry at their time', self._pairing.dropped)
-        diagnostics.set_drop_total('invalid scans or odometry', self._localizer.refused)
+        diagnostics.set_drop_total('invalid scans or odometry', self._localizer.rejected)
 
     def _subscribe_map_once(self, relocation: _Relocation) -> None:
         """Subscribe once to the map that was built before the crash."""

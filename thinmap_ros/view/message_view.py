@@ -148,7 +148,7 @@ class MessageView:
         self._view.target(ns, np.array([place.x, place.y]) if message.has_target else None)
         self._view.scalar(ns, 'progress', 'coverage, %', 100.0 * float(message.coverage_estimate))
         self._view.scalar(ns, 'progress', 'distance, m', float(message.distance_m))
-        self._view.scalar(ns, 'count', 'end nodes left', float(message.end_nodes_left))
+        self._view.scalar(ns, 'count', 'end nodes left', float(message.end_nodes_remaining))
 
     def _on_slam(self, ns: int, message: Any) -> None:
         self._view.scalar(ns, 'step', 'localizer', float(message.step_time_ms))

@@ -105,7 +105,7 @@ def test_input_that_makes_no_sense_is_refused():
     scan = scan_in(ROOM, pose, None, PERIOD_NS * 50)
     localizer.step(scan, np.array([np.inf, 0.0, 0.0]))
     localizer.step(scan, localizer._odometry.T_odom_base + [500.0, 0.0, 0.0])
-    assert localizer.refused == 3
+    assert localizer.rejected == 3
     np.testing.assert_allclose(localizer.pose, pose, atol=0.3)
     with pytest.raises(ConfigError, match='ekf_full'):
         EkfConfig(slam='full')

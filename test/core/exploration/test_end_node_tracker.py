@@ -33,7 +33,7 @@ def test_first_look_is_equations_1_to_10():
     nodes.follow({1: (5.0, 2.0)})
     look(nodes, (2.0, 2.0, 0.0))
     track = nodes.tracks[1]
-    assert track.smallest_distance_m == pytest.approx(3.0)
+    assert track.min_distance_m == pytest.approx(3.0)
     assert track.probability == pytest.approx(bayes_update(PRIOR, distance_index(3.0)))
 
 
@@ -55,7 +55,7 @@ def test_looks_from_all_round_make_a_node_reliable_from_afar():
     for bearing in np.radians(np.arange(0.0, 120.0, 20.0)):
         look(nodes, (5.0 - 4.0 * math.cos(bearing), 5.0 - 4.0 * math.sin(bearing), float(bearing)))
     assert nodes.tracks[1].angle_index == 1.0
-    assert nodes.tracks[1].smallest_distance_m == pytest.approx(4.0)
+    assert nodes.tracks[1].min_distance_m == pytest.approx(4.0)
     assert nodes.tracks[1].probability > 0.9
 
 
@@ -84,7 +84,7 @@ def test_a_node_that_moves_a_little_keeps_its_evidence_and_one_that_moves_on_los
     # Step by step as well: what counts is the way from where the evidence began.
     nodes.follow({1: (5.6, 2.0)})
     assert nodes.tracks[1].probability == PRIOR
-    assert nodes.tracks[1].smallest_distance_m == math.inf
+    assert nodes.tracks[1].min_distance_m == math.inf
 
 
 def test_a_new_id_nearby_takes_over_the_evidence_and_is_told():
@@ -102,9 +102,9 @@ def test_of_two_that_merge_the_nearer_one_lives_on():
     nodes = tracker()
     nodes.follow({1: (5.0, 2.0), 2: (5.5, 2.0)})
     look(nodes, (2.0, 2.0, 0.0))
-    nearer = nodes.tracks[2].smallest_distance_m
+    nearer = nodes.tracks[2].min_distance_m
     assert nodes.follow({3: (5.4, 2.0)}) == {2: 3}
-    assert nodes.tracks[3].smallest_distance_m == nearer
+    assert nodes.tracks[3].min_distance_m == nearer
 
 
 def test_a_track_is_inherited_once_and_a_far_one_not_at_all():

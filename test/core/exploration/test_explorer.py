@@ -195,7 +195,7 @@ def test_a_target_that_cannot_be_reached_is_put_aside_tried_again_and_named_at_t
 
     run = Run(two_rooms(), fails=refuse).go(60.0)
     assert run.last.finished
-    assert run.last.code == FinishCode.NOTHING_REACHABLE
+    assert run.last.code == FinishCode.UNREACHABLE
     assert run.last.unreachable
     assert max(refused.count(node_id) for node_id in run.last.unreachable) >= 2
     assert not np.hypot(*(np.array(run.poses)[:, :2] - START[:2]).T).any()

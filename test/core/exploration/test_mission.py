@@ -164,13 +164,13 @@ def test_each_budget_ends_a_mission_as_a_success(limit, now_s, words):
     strategy.area_m2 = 30.0
     mission.step(at(2.0))
     end = mission.check(now_s, True)
-    assert end == Finish(FinishCode.BUDGET, words)
+    assert end == Finish(FinishCode.BUDGET_EXHAUSTED, words)
     assert end.is_success
     assert mission.elapsed_s(now_s) == now_s - 100.0
 
 
 def returning_mission():
-    strategy = Scripted(code=FinishCode.NOTHING_REACHABLE)
+    strategy = Scripted(code=FinishCode.UNREACHABLE)
     mission = mission_of(strategy, return_to_start=True, budget=Budget(time_s=1.0))
     mission.odometer.add_pose(pose(1.0, 2.0, 0.5))
     action = mission.step(at(3.0))
@@ -186,7 +186,7 @@ def test_a_mission_returns_to_its_start_and_ends_with_the_reason_why_exploring_e
     assert mission.odometer.distance_m > 3.0
     # Budgets do not keep the robot from returning.
     assert mission.check(2.0, True) is None
-    assert mission.drive_ended(True, '') == Finish(FinishCode.NOTHING_REACHABLE, 'words')
+    assert mission.drive_ended(True, '') == Finish(FinishCode.UNREACHABLE, 'words')
     assert mission.state == MissionState.FINISHED
 
 
@@ -195,7 +195,7 @@ def test_the_return_is_tried_three_times():
     assert isinstance(mission.drive_ended(False, 'no path'), DriveTo)
     assert isinstance(mission.drive_ended(False, 'no path'), DriveTo)
     end = mission.drive_ended(False, 'a closed door')
-    assert end == Finish(FinishCode.NOTHING_REACHABLE, 'words; not home: a closed door')
+    assert end == Finish(FinishCode.UNREACHABLE, 'words; not home: a closed door')
     assert not mission.strategy.failures
 
 
@@ -210,7 +210,7 @@ def test_a_navigator_that_lost_the_goal_is_sent_to_the_start_again():
 
 def test_a_budget_that_ends_before_the_first_pose_returns_nowhere():
     mission = mission_of(Scripted(), budget=Budget(time_s=1.0), return_to_start=True)
-    assert mission.check(1.0, False) == Finish(FinishCode.BUDGET, 'time limit of 1 s')
+    assert mission.check(1.0, False) == Finish(FinishCode.BUDGET_EXHAUSTED, 'time limit of 1 s')
 
 
 def test_scans_that_stay_away_end_a_mission():
@@ -220,7 +220,7 @@ def test_scans_that_stay_away_end_a_mission():
     watchdog.add_scan(150.0)
     assert mission.check(210.0, True) is None
     end = mission.check(210.1, True)
-    assert end == Finish(FinishCode.SENSOR_SILENT, 'no scan that shows anything for 60 s')
+    assert end == Finish(FinishCode.SENSOR_TIMEOUT, 'no scan that shows anything for 60 s')
     assert not end.is_success
 
 
@@ -274,7 +274,7 @@ def test_the_strategy_sees_walls_outside_the_area():
 
 
 def test_only_an_interrupted_mission_of_the_same_area_is_resumed():
-    for code in (FinishCode.NONE, FinishCode.ALL_RESOLVED, FinishCode.NOTHING_REACHABLE):
+    for code in (FinishCode.NONE, FinishCode.ALL_RESOLVED, FinishCode.UNREACHABLE):
         mission = mission_of(Scripted(code=code), area=SQUARE)
         mission.step(at(2.0, 2.0))
         assert mission.is_resumed_by(MissionGoal(area=SQUARE)) == (code == FinishCode.NONE)

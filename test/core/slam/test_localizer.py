@@ -87,7 +87,7 @@ def test_a_drive_round_the_room_stays_on_its_path(whole_drive):
     odometry = np.array([se2.between(truth, se2.compose(START, odom)) for truth, _, odom in rows])
     assert np.hypot(*odometry[-1, :2]) > 0.3
     assert not any(estimate.is_lost for _, estimate, _ in rows)
-    assert localizer.refused == 0
+    assert localizer.rejected == 0
 
 
 def test_the_whole_path_is_told_afterwards(whole_drive):
@@ -265,7 +265,7 @@ def test_nonsense_of_the_odometry_is_refused_and_counted(odom):
     truth, before, last = rows[-1]
     scan = scan_in(ROOM, truth, rng, 60 * PERIOD_NS)
     estimate = localizer.step(scan, np.array(odom))
-    assert localizer.refused == 1
+    assert localizer.rejected == 1
     assert np.abs(se2.between(before.T_map_base, estimate.T_map_base)).max() < 0.04
     assert np.isfinite(estimate.covariance).all()
     assert np.isfinite(estimate.T_map_odom).all()
@@ -277,7 +277,7 @@ def test_nonsense_of_the_odometry_is_refused_and_counted(odom):
 def test_a_first_odometry_that_is_not_finite_is_refused():
     localizer = at_start()
     estimate = localizer.step(scan_in(ROOM, START), np.full(3, np.nan))
-    assert localizer.refused == 1
+    assert localizer.rejected == 1
     np.testing.assert_allclose(estimate.T_map_base, START)
     assert np.isfinite(estimate.T_map_odom).all()
 
@@ -552,7 +552,7 @@ def test_a_pose_that_is_none_is_refused(pose, covariance):
     _, localizer = driven(20)
     before = localizer.pose
     localizer.set_pose(np.array(pose), covariance)
-    assert localizer.refused == 1
+    assert localizer.rejected == 1
     np.testing.assert_array_equal(localizer.pose, before)
 
 

@@ -578,7 +578,7 @@ def test_an_exploration_finishes_though_every_node_is_killed_once(graph):
             ended = ask()
     graph.until(ended.done, 'the exploration ends', 600.0)
     result = ended.result().result.status
-    good = (ExplorationStatus.ALL_RESOLVED, ExplorationStatus.NOTHING_REACHABLE)
+    good = (ExplorationStatus.ALL_RESOLVED, ExplorationStatus.UNREACHABLE)
     assert result.reason_code in good, result.reason
     assert robot.error_m() < 0.3
     patch = messages.grid_from_msg(maps[-1])

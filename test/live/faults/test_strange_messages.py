@@ -56,7 +56,7 @@ def test_a_map_that_is_turned_is_refused_and_no_other(sign):
 
 
 @pytest.mark.parametrize(
-    ('sec', 'nanosec', 'refused'),
+    ('sec', 'nanosec', 'rejected'),
     [(0, 0, False), (-1, 0, True), (1, 10**9 - 1, False), (1, 10**9, True), (1, 2**32 - 1, True)],
 )
 def test_stamps(sec, nanosec, refused):

@@ -74,13 +74,13 @@ class EkfConfig(Config):
 class EkfLocalizer:
     """The filter behind the interface of a localizer.
 
-    Input that is not finite is refused and counted in `refused`: the robot is then taken to be
+    Input that is not finite is rejected and counted in `rejected`: the robot is then taken to be
     where it was.
     """
 
     def __init__(self, config: EkfConfig | None = None) -> None:
         self.config = config or EkfConfig(slam='ekf_ti')
-        self._refused = 0
+        self._rejected = 0
         self.reset()
 
     def reset(self) -> None:
@@ -97,9 +97,9 @@ class EkfLocalizer:
         self._path = array('d')
 
     @property
-    def refused(self) -> int:
+    def rejected(self) -> int:
         """Scans, odometry poses and poses from outside that made no sense."""
-        return self._refused + self._odometry.rejected
+        return self._rejected + self._odometry.rejected
 
     @property
     def pose(self) -> Array:
@@ -118,7 +118,7 @@ class EkfLocalizer:
     def set_pose(self, T_map_base: Array, covariance: Array) -> None:
         """Put the robot at a pose (3,) with covariance (3, 3) in the map that it has."""
         if not (se2.is_bounded_pose(T_map_base) and np.isfinite(covariance).all()):
-            self._refused += 1
+            self._rejected += 1
             return
         self._filter.local.set_pose(T_map_base, covariance + _START)
         self._moved = np.zeros(3)
@@ -165,14 +165,14 @@ class EkfLocalizer:
         observed = 0
         matched = 0
         if not se2.is_finite(scan.T_base_laser):
-            self._refused += 1
+            self._rejected += 1
         elif self._is_observation_due:
             lines = extract_lines(scan, self.config.lines)
             observed = len(lines)
             matched, is_valid = self._features.observe(
                 self._filter, lines, scan, learn=self.config.update_map
             )
-            self._refused += not is_valid
+            self._rejected += not is_valid
             self._is_observation_due = False  # the same scan again tells no more
         self._filter.flush_step()
         self._path.extend(self.pose.tolist())

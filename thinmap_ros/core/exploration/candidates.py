@@ -435,7 +435,7 @@ def end_node_of(
         probability=track.probability,
         distance_index=track.distance_index,
         angle_index=track.angle_index,
-        smallest_distance_m=track.smallest_distance_m,
+        min_distance_m=track.min_distance_m,
         angle_span_deg=track.angle_span_deg,
         frontier_length_m=0.0 if candidate is None else len(candidate.cells) * resolution,
         is_target=target_goal is not None,

@@ -146,14 +146,14 @@ class Track:
     closed: bool = False
 
     @property
-    def smallest_distance_m(self) -> float:
+    def min_distance_m(self) -> float:
         """Nearest place of the looks that counted, m; inf before the first."""
         return min(self.distances_m, default=math.inf)
 
     @property
     def distance_index(self) -> float:
         """D of equation (1); 0 before the first look."""
-        return distance_index(self.smallest_distance_m) if self.distances_m else 0.0
+        return distance_index(self.min_distance_m) if self.distances_m else 0.0
 
     @property
     def angle_index(self) -> float:

@@ -27,7 +27,7 @@ _NAVIGATOR_TIMEOUT_S = 3.0
 _SAME_GOAL_M = 0.1
 _SAME_GOAL_RAD = 0.2
 _MAX_RETURN_FAILURES = 3
-_EXPLORED = (FinishCode.ALL_RESOLVED, FinishCode.NOTHING_REACHABLE)
+_EXPLORED = (FinishCode.ALL_RESOLVED, FinishCode.UNREACHABLE)
 
 
 @dataclass(eq=False)
@@ -115,7 +115,7 @@ class Finish(NamedTuple):
     @property
     def is_success(self) -> bool:
         """Whether the mission ended as planned."""
-        return self.code in (*_EXPLORED, FinishCode.BUDGET)
+        return self.code in (*_EXPLORED, FinishCode.BUDGET_EXHAUSTED)
 
 
 Action = DriveTo | Finish | None
@@ -169,7 +169,7 @@ class InputWatchdog:
         """Reason to give up: no scans, or no pose, for too long."""
         if now_s - self.last_scan_s > _SCAN_TIMEOUT_S:
             reason = f'no scan that shows anything for {_SCAN_TIMEOUT_S:.0f} s'
-            return Finish(FinishCode.SENSOR_SILENT, reason)
+            return Finish(FinishCode.SENSOR_TIMEOUT, reason)
         if self.is_lost and now_s - self.last_tracking_s > _LOST_TIMEOUT_S:
             reason = f'the pose has been lost for {_LOST_TIMEOUT_S:.0f} s'
             return Finish(FinishCode.LOCALIZATION_LOST, reason)
@@ -244,7 +244,7 @@ class Mission:
             self.elapsed_s(now_s), self.odometer.distance_m, known_area_m2
         )
         if exhausted and self.state == MissionState.EXPLORING:
-            return self._finish_exploring(Finish(FinishCode.BUDGET, exhausted))
+            return self._finish_exploring(Finish(FinishCode.BUDGET_EXHAUSTED, exhausted))
         return None
 
     def drive_ended(self, success: bool, reason: str) -> Action:

@@ -16,16 +16,16 @@ FIRST_FRONTIER_ID = 2_000_000_000
 class FinishCode(IntEnum):
     """Why an exploration ended, as in thinmap_msgs/ExplorationStatus.
 
-    A strategy ends it with ALL_RESOLVED or NOTHING_REACHABLE, a mission with any of the others.
+    A strategy ends it with ALL_RESOLVED or UNREACHABLE, a mission with any of the others.
     """
 
     NONE = 0
     ALL_RESOLVED = 1
-    BUDGET = 2
+    BUDGET_EXHAUSTED = 2
     CANCELLED = 3
-    NOTHING_REACHABLE = 4
+    UNREACHABLE = 4
     LOCALIZATION_LOST = 5
-    SENSOR_SILENT = 6
+    SENSOR_TIMEOUT = 6
 
 
 class EndNode(NamedTuple):
@@ -42,7 +42,7 @@ class EndNode(NamedTuple):
     probability: float
     distance_index: float
     angle_index: float
-    smallest_distance_m: float
+    min_distance_m: float
     angle_span_deg: float
     frontier_length_m: float
     is_target: bool
@@ -88,6 +88,6 @@ def finish_reason(finished: bool, unreachable: list[int], left: int) -> tuple[Fi
     if not unreachable:
         return FinishCode.ALL_RESOLVED, 'all end nodes resolved'
     return (
-        FinishCode.NOTHING_REACHABLE,
+        FinishCode.UNREACHABLE,
         f'{len(unreachable)} end nodes left, none of them reachable',
     )

@@ -75,14 +75,14 @@ class LocalizerConfig(EkfConfig):
 class Localizer:
     """Scan matching with a local map, keyframes and loop closure.
 
-    Input that is not finite is refused and counted in `refused`: the robot is then taken to be
+    Input that is not finite is rejected and counted in `rejected`: the robot is then taken to be
     where it was.
     """
 
     def __init__(self, config: LocalizerConfig | None = None) -> None:
         self.config = config or LocalizerConfig()
         self._matcher = Matcher(self.config.matching)
-        self._refused = 0
+        self._rejected = 0
         self.reset()
 
     def reset(self) -> None:
@@ -102,9 +102,9 @@ class Localizer:
         self._path = KeyframeTrajectory()
 
     @property
-    def refused(self) -> int:
+    def rejected(self) -> int:
         """Odometry poses and poses from outside that made no sense."""
-        return self._refused + self._prediction.refused
+        return self._rejected + self._prediction.rejected
 
     @property
     def pose(self) -> Array:
@@ -122,7 +122,7 @@ class Localizer:
         The next scans settle it; nothing is learned before.
         """
         if not (se2.is_bounded_pose(T_map_base) and np.isfinite(covariance).all()):
-            self._refused += 1
+            self._rejected += 1
             return
         self._pose = se2.pose(*T_map_base.tolist())
         self._uncertainty.place(self._pose, covariance)

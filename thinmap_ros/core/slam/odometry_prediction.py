@@ -52,7 +52,7 @@ class OdometryPrediction:
         self._begins_known = False  # whether a match told where the next motion begins
 
     @property
-    def refused(self) -> int:
+    def rejected(self) -> int:
         """Odometry poses that made no sense."""
         return self._increments.rejected
 

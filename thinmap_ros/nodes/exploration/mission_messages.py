@@ -37,7 +37,7 @@ def status_msg(mission: Mission, frame_id: str, now_ns: int) -> ExplorationStatu
         reason_code=int(mission.end.code),
         reason=mission.end.reason,
         distance_m=mission.odometer.distance_m,
-        time=messages.duration_msg(mission.elapsed_s(now_ns / 1e9)),
+        elapsed=messages.duration_msg(mission.elapsed_s(now_ns / 1e9)),
     )
     decision = mission.decision
     if decision is None:
@@ -45,23 +45,23 @@ def status_msg(mission: Mission, frame_id: str, now_ns: int) -> ExplorationStatu
     status.coverage_estimate = decision.coverage_estimate
     status.known_area_m2 = decision.known_area_m2
     status.reason = status.reason or decision.reason
-    status.end_nodes_left = sum(node.frontier_length_m > 0.0 for node in decision.end_nodes)
+    status.end_nodes_remaining = sum(node.frontier_length_m > 0.0 for node in decision.end_nodes)
     if decision.target is not None:
         status.has_target = True
-        status.target = decision.target.node_id
+        status.target_id = decision.target.node_id
         status.target_position = Point(x=decision.target.x, y=decision.target.y)
     return status
 
 
 def _end_node_msg(node: EndNode) -> EndNodeMsg:
-    is_observed = math.isfinite(node.smallest_distance_m)
+    is_observed = math.isfinite(node.min_distance_m)
     return EndNodeMsg(
         node_id=node.node_id,
         position=Point(x=node.x, y=node.y),
         position_probability=node.probability,
         distance_index=node.distance_index,
         angle_index=node.angle_index,
-        smallest_distance_m=node.smallest_distance_m if is_observed else 0.0,
+        min_distance_m=node.min_distance_m if is_observed else 0.0,
         angle_span_deg=node.angle_span_deg,
         is_target=node.is_target,
     )
