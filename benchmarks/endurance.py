@@ -173,7 +173,7 @@ def start_all(world: str, at: np.ndarray, rate: float, seed: int) -> dict[str, p
     place = f'start:={at[0]},{at[1]},{at[2]}'
     found['sim'] = start(
         'sim',
-        f'world:={world} {place} rate:={rate} seed:={seed} '
+        f'world:={world} {place} real_time_factor:={rate} seed:={seed} '
         'lockstep:=local_topology wait_for_subscribers:=4',
     )
     return found

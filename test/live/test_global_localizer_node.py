@@ -67,7 +67,7 @@ def test_a_robot_that_drives_about_finds_itself_when_asked(graph, map_file):
     truth = graph.heard('ground_truth', PoseStamped)
     graph.start('global_localizer', map_path=str(map_file), use_sim_time=True)
     commands = graph.node.create_publisher(Twist, 'cmd_vel', 10)
-    graph.start('sim', start=','.join(map(str, START)), rate=3.0)
+    graph.start('sim', start=','.join(map(str, START)), real_time_factor=3.0)
     graph.until(lambda: status and truth, 'status and the robot')
     assert status[-1].state == LocalizationStatus.IDLE
     answer = graph.call(
@@ -127,7 +127,12 @@ def test_a_robot_that_may_drive_finds_itself_alone_and_stops(graph, tmp_path):
         drive=True,
         use_sim_time=True,
     )
-    graph.start('sim', world=str(tmp_path / 'twins.yaml'), rate=4.0, lockstep='localization_status')
+    graph.start(
+        'sim',
+        world=str(tmp_path / 'twins.yaml'),
+        real_time_factor=4.0,
+        lockstep='localization_status',
+    )
     graph.until(lambda: poses and truth and commands, 'a pose, the true one and commands')
     ns = messages.stamp_ns(poses[-1].header.stamp)
     graph.until(lambda: messages.stamp_ns(truth[-1].header.stamp) >= ns, 'where it was then')

@@ -107,7 +107,7 @@ def test_a_localizer_walks_through_its_states(graph):
     poses = graph.heard('pose', PoseWithCovarianceStamped)
     scans = graph.heard('scan', LaserScan, qos.SENSOR)
     graph.start('localizer', use_sim_time=True, autostart=False, **AT_START)
-    graph.start('sim', start=START, wait_for_subscribers=2, rate=2.0)
+    graph.start('sim', start=START, wait_for_subscribers=2, real_time_factor=2.0)
 
     def state():
         return graph.call(GetState, '/localizer/get_state', GetState.Request()).current_state.id
@@ -162,7 +162,7 @@ def test_pause_and_reset(graph):
     maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
     graphs = graph.heard('topology', TopologicalMap, qos.LATCHED)
     graph.start('thinmap', arguments=MAPPING, use_sim_time=True, **AT_START)
-    graph.start('sim', start=START, wait_for_subscribers=2, rate=4.0)
+    graph.start('sim', start=START, wait_for_subscribers=2, real_time_factor=4.0)
     graph.until(lambda: maps and graphs and graphs[-1].nodes, 'map and graph')
     assert graph.call(SetBool, '/localizer/pause', SetBool.Request(data=True)).success
 

@@ -33,7 +33,7 @@ def test_the_simulated_robot_drives_as_told_and_stops_without_commands(graph):
     odometry = graph.heard('odom', Odometry)
     clock = graph.heard('/clock', Clock)
     frames = graph.heard('/tf', TFMessage)
-    graph.start('sim', start=START, rate=4.0)
+    graph.start('sim', start=START, real_time_factor=4.0)
     graph.until(
         lambda: len(scans) > 3 and odometry and clock and frames, 'scans, odometry, time and frames'
     )
@@ -72,7 +72,9 @@ def test_a_scan_becomes_a_pose_a_map_and_a_graph(graph, tmp_path):
     graph.start('localizer', use_sim_time=True, **AT_START)
     graph.start('grid_mapper', use_sim_time=True)
     graph.start('topology_builder', use_sim_time=True)
-    graph.start('sim', start=START, rate=4.0, lockstep='local_topology', wait_for_subscribers=3)
+    graph.start(
+        'sim', start=START, real_time_factor=4.0, lockstep='local_topology', wait_for_subscribers=3
+    )
     graph.until(
         lambda: len(local_maps) > 8 and poses and status and scans and ('map', 'odom') in links(),
         'local maps, poses, status, scans and the frame of the odometry',
@@ -187,7 +189,7 @@ def test_the_navigator_drives_to_a_goal_and_refuses_one_in_a_wall(graph):
         'sim',
         remap=graph.paced(),
         start=START,
-        rate=8.0,
+        real_time_factor=8.0,
         lockstep='local_topology',
         wait_for_subscribers=3,
     )
@@ -212,7 +214,7 @@ def test_the_navigator_drives_to_a_goal_and_refuses_one_in_a_wall(graph):
 def test_what_is_recorded_is_played_again(graph, tmp_path):
     scans = graph.heard('scan', LaserScan)
     graph.start('recorder', bag=str(tmp_path / 'bag'))
-    graph.start('sim', start=START, rate=8.0)
+    graph.start('sim', start=START, real_time_factor=8.0)
     recorded = ('/tf', '/tf_static', '/odom', '/clock')
     graph.until(
         lambda: all(graph.node.count_subscribers(topic) for topic in recorded),

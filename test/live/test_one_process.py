@@ -43,7 +43,7 @@ def test_one_process_locates_maps_and_drives(graph):
         'sim',
         remap=graph.paced(),
         start='2.0,2.0,0.0',
-        rate=8.0,
+        real_time_factor=8.0,
         lockstep='local_topology',
         wait_for_subscribers=3,
     )
@@ -92,7 +92,7 @@ def start_robot(graph, name, start, seed):
         initial_y_m=float(y),
         initial_yaw_rad=0.0,
         wait_for_subscribers=2,
-        rate=2.0,
+        real_time_factor=2.0,
         arguments=('sim', 'localizer', 'grid_mapper', 'topology_builder'),
     )
 

@@ -48,7 +48,7 @@ def drive(graph, x, y, yaw, metres):
         'sim',
         remap=graph.paced(),
         start=f'{x},{y},{yaw}',
-        rate=4.0,
+        real_time_factor=4.0,
         lockstep='local_topology',
         wait_for_subscribers=2,
     )

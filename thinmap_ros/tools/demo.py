@@ -101,7 +101,7 @@ def explore(arguments: argparse.Namespace, world: Path, start: Array) -> None:
             '-p',
             f'wait_for_subscribers:={_SCAN_LISTENERS}',
         ]
-        clock = ['-p', f'rate:={arguments.rate}', '-p', f'seed:={arguments.seed}']
+        clock = ['-p', f'real_time_factor:={arguments.rate}', '-p', f'seed:={arguments.seed}']
         where = ['-p', f'start:={start[0]},{start[1]},{start[2]}']
         processes.start('sim', common + lockstep + clock + where)
         limit = [

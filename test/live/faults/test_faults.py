@@ -38,7 +38,7 @@ def start_mapping(graph, rate=4.0, lockstep='local_topology'):
         remap=graph.paced() if lockstep == 'local_topology' else (),
         start=START,
         wait_for_subscribers=2,
-        rate=rate,
+        real_time_factor=rate,
         lockstep=lockstep,
         lockstep_timeout_s=LOCKSTEP_S,
     )
@@ -54,7 +54,7 @@ def start_together(graph, *names, **simulation):
         remap=graph.paced(),
         start=START,
         wait_for_subscribers=len({*names} - {'topology_builder'}),
-        rate=4.0,
+        real_time_factor=4.0,
         lockstep='local_topology',
         lockstep_timeout_s=LOCKSTEP_S,
         **simulation,
@@ -271,7 +271,12 @@ def test_time_set_back_begins_everything_anew(graph):
     graph.hear_out()
     robot.poses.clear(), robot.truth.clear(), maps.clear()
     graph.start(
-        'sim', start=START, wait_for_subscribers=4, rate=4.0, lockstep='local_topology', seed=3
+        'sim',
+        start=START,
+        wait_for_subscribers=4,
+        real_time_factor=4.0,
+        lockstep='local_topology',
+        seed=3,
     )
     notices = [f'[{name}]: clock jumped back' for name in names]
     graph.until(

@@ -65,7 +65,11 @@ class Robot:
 def start_sim(graph, at, subscribers):
     text = ','.join(map(str, at))
     graph.start(
-        'sim', start=text, rate=6.0, lockstep='local_topology', wait_for_subscribers=subscribers
+        'sim',
+        start=text,
+        real_time_factor=6.0,
+        lockstep='local_topology',
+        wait_for_subscribers=subscribers,
     )
 
 

@@ -189,7 +189,12 @@ def test_a_robot_here_and_its_map_there_outlive_a_cable_that_is_pulled(machines,
     machines.start(0, 'recorder', bag=str(bag), use_sim_time=True)
     start_mapping(machines, 1)
     machines.start(
-        0, 'sim', start=START, rate=4.0, lockstep='local_topology', wait_for_subscribers=3
+        0,
+        'sim',
+        start=START,
+        real_time_factor=4.0,
+        lockstep='local_topology',
+        wait_for_subscribers=3,
     )
     wait(machines, lambda: recorded(bag, '/local_topology') > 10, 'the graph comes over')
     machines.unplugged(3.0)
@@ -210,7 +215,12 @@ def test_an_exploration_over_the_cable_finishes_though_it_is_pulled_for_five_sec
     for name in ('navigator', 'explorer'):
         machines.start(0, name, use_sim_time=True)
     machines.start(
-        0, 'sim', start=START, rate=5.0, lockstep='local_topology', wait_for_subscribers=4
+        0,
+        'sim',
+        start=START,
+        real_time_factor=5.0,
+        lockstep='local_topology',
+        wait_for_subscribers=4,
     )
     monitor = machines.start(0, 'demo_monitor', use_sim_time=True, result=str(result))
     time.sleep(30.0)
