@@ -50,7 +50,7 @@ def robot(tmp_path_factory):
             start='2.0,2.0,0.0',
             initial_x_m=2.0,
             initial_y_m=2.0,
-            rate=1.0,
+            real_time_factor=1.0,
         )
         graph.until(lambda: maps, 'a map')
         yield graph
