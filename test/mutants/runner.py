@@ -16,7 +16,9 @@ from mutants.mutations import Mutation
 from mutants.selection import Selection
 
 _MOST_MEMORY = 8 * 2**30  # bytes: a mutant may ask for any
-_NO_TESTS = 5  # pytest's exit code
+# Exit codes of pytest: no test was found; tests failed, without naming one; wrong usage.
+_NO_TESTS = 5
+_NO_RESULT = (1, 4)
 _FAILED = re.compile(r'^(?:FAILED|ERROR) (\S+)', re.MULTILINE)
 
 
@@ -72,6 +74,8 @@ class Workshop:
         if code in (0, _NO_TESTS):
             return Result(mutation, Fate.SURVIVED)
         failed = _FAILED.search(output)
+        if failed is None and code in _NO_RESULT:
+            raise SystemExit(f'mutants: pytest ended with {code}: {output.strip()[-300:]}')
         return Result(mutation, Fate.KILLED, failed[1] if failed else '')
 
     def failures_without_mutant(self, tests: list[str], limit_s: float) -> list[str]:

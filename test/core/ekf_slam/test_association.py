@@ -50,7 +50,7 @@ def test_the_gate_lets_95_of_100_true_matches_pass(rng):
     assert mahalanobis(v, S) == pytest.approx(v @ np.linalg.solve(S, v))
     assert mahalanobis(v, -S) == math.inf
     assert mahalanobis(v, np.zeros((2, 2))) == math.inf
-    assert mahalanobis(v, np.ones((2, 2))) == math.inf
+    assert mahalanobis(np.ones(2), np.ones((2, 2))) == math.inf
 
 
 def chosen(walls, seen, gap_m=0.3):

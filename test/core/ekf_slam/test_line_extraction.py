@@ -8,6 +8,7 @@ from scipy.optimize import least_squares
 from support.slam_room import ROOM, scan_in
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.ekf_slam import line_extraction
 from thinmap_ros.core.ekf_slam.line_extraction import LineConfig, extract_lines
 from thinmap_ros.core.scan import Scan
 
@@ -83,6 +84,19 @@ def test_the_covariance_is_what_many_scans_show(rng, mount):
     np.testing.assert_allclose(np.diag(shown), np.diag(said), rtol=0.25)
     correlations = [C[0, 1] / math.sqrt(C[0, 0] * C[1, 1]) for C in (shown, said)]
     assert correlations[0] == pytest.approx(correlations[1], abs=0.15)
+
+
+def test_trimming_ends_where_too_few_points_are_left():
+    """Points that are all far from any one line: each trim takes one off an end."""
+    count = 12
+    x = np.linspace(-1.0, 1.0, count)
+    y = 2.0 + np.where(np.arange(count) % 2, 0.5, -0.5)
+    sigmas = np.array([0.01, 0.001, 0.05])
+    arguments = (x, y, np.hypot(x, y), np.arctan2(y, x))
+    for fewest in (3, 6):
+        a, b = line_extraction._fit_trimmed(*arguments, 0, count, sigmas, fewest, np.empty(10))
+        assert 0 < a <= count - fewest + 1
+        assert b - a == fewest - 1
 
 
 def test_no_lines_on_round_columns_or_in_clutter(rng):

@@ -359,6 +359,15 @@ def test_walls_at_the_rim_of_a_tile_are_known_in_the_next(corner):
     np.testing.assert_allclose(local_map.distances(points + outwards), expected, atol=0.015)
 
 
+def test_only_tiles_along_the_beams_and_around_the_walls_take_memory():
+    local_map = LocalMap()
+    add(local_map, np.array([[30.0, 30.0]]))
+    top, left, end_row, end_col = local_map.tiles.bounds()
+    along = (end_row - top) // TILE
+    assert along == (end_col - left) // TILE > 5
+    assert along <= local_map.tiles.used < along**2 / 2
+
+
 def test_a_scan_is_put_where_the_robot_is():
     T_base_laser = np.array([0.2, -0.1, 0.3])
     pose = np.array([3.0, 2.0, 1.0])
