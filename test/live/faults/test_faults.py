@@ -526,9 +526,9 @@ def test_a_full_disk_leaves_the_old_session_as_it_was(graph, tmp_path):
     )
     before = {file.name: file.read_bytes() for file in stem.parent.iterdir()}
     assert sorted(before) == [
-        'room.slam.npz',
         'room.grid.npz',
         'room.pgm',
+        'room.slam.npz',
         'room.topology.npz',
         'room.yaml',
     ]
