@@ -13,6 +13,7 @@ from thinmap_ros.core.exploration.observations import Observation
 from thinmap_ros.core.exploration.strategy import Decision, Strategy
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
+from thinmap_ros.core.planning.path_follower import PathFollowerConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.localizer import LocalizerConfig
@@ -241,7 +242,9 @@ def make_loop(
     pipeline = Pipeline(
         PipelineConfig(localizer=localizer, grid=grid, scans_per_graph=SCANS_PER_GRAPH), source
     )
-    navigator = Navigator(NavigatorConfig(max_speed_m_s=options.speed_m_s))
+    navigator = Navigator(
+        NavigatorConfig(controller=PathFollowerConfig(max_speed_m_s=options.speed_m_s))
+    )
     strategy = make_strategy(options.strategy)
     return ClosedLoop(simulation, pipeline, strategy, navigator, mishap, watch)
 

@@ -20,6 +20,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyConfig
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
+from thinmap_ros.core.planning.path_follower import PathFollowerConfig
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.evaluation.machine import forget_peak, peak_mb
 from thinmap_ros.files.worlds import read_world
@@ -137,7 +138,7 @@ def _pipeline_config(
 
 
 def _closed_loop(simulation: Simulation, pipeline: Pipeline) -> ClosedLoop:
-    navigator = Navigator(NavigatorConfig(max_speed_m_s=_SPEED_M_S))
+    navigator = Navigator(NavigatorConfig(controller=PathFollowerConfig(max_speed_m_s=_SPEED_M_S)))
     return ClosedLoop(simulation, pipeline, make_strategy(DEFAULT), navigator)
 
 

@@ -5,7 +5,14 @@ from dataclasses import dataclass
 
 import pytest
 
-from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.config import (
+    Config,
+    parameter,
+    parameters_of,
+    part,
+    robot_radius,
+    with_values,
+)
 from thinmap_ros.core.errors import ConfigError
 
 
@@ -48,3 +55,36 @@ def test_a_wrong_value_is_named(wrong):
 def test_a_number_beyond_all_floats_is_none(name):
     with pytest.raises(ConfigError, match=f'{name} = a whole number of 1329 bits: expected a fin'):
         Sample(**{name: 10**400})
+
+
+@dataclass(frozen=True)
+class Inner(Config):
+    robot_radius_m: float = robot_radius()
+    size_m: float = parameter(1.0, 'size, m', low=0.0, high=2.0)
+
+
+@dataclass(frozen=True)
+class Outer(Config):
+    speed: float = parameter(0.2, 'speed, m/s', low=0.0, high=2.0)
+    inner: Inner = part(Inner)
+
+
+def test_parameters_of_a_part_have_its_name_but_not_those_of_the_robot():
+    found = {name: value for name, _, value in parameters_of(Outer())}
+    assert found == {'speed': 0.2, 'robot_radius_m': 0.25, 'inner.size_m': 1.0}
+
+
+def test_values_are_given_by_full_names():
+    config = with_values(Outer(), {'inner.size_m': 0.5, 'robot_radius_m': 0.3, 'speed': 1.0})
+    assert config == Outer(speed=1.0, inner=Inner(robot_radius_m=0.3, size_m=0.5))
+
+
+@pytest.mark.parametrize('name', ['size_m', 'inner', 'inner.speed', 'inner.robot_radius_m'])
+def test_a_name_that_there_is_not_is_an_error_that_lists_those_that_there_are(name):
+    with pytest.raises(ConfigError, match=f'no parameter {name}: expected one of speed, robot_ra'):
+        with_values(Outer(), {name: 1.0})
+
+
+def test_a_wrong_value_of_a_part_is_named_in_full():
+    with pytest.raises(ConfigError, match=r'inner\.size_m = 3.0: expected 0.0 to 2.0'):
+        with_values(Outer(), {'inner.size_m': 3.0})

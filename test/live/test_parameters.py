@@ -30,19 +30,16 @@ def current(graph, node, *names):
 
 def test_the_navigator_changes_its_speed_and_refuses_what_makes_no_sense(graph):
     graph.start('navigator')
-    assert change(graph, 'navigator', max_speed_m_s=0.5, max_angular_speed_rad_s=0.7).successful
-    assert current(graph, 'navigator', 'max_speed_m_s', 'max_angular_speed_rad_s') == [0.5, 0.7]
-    graph.until(
-        lambda: (
-            'changed: max_speed_m_s = 0.5, max_angular_speed_rad_s = 0.7' in graph.log('navigator')
-        ),
-        'it is said',
-    )
+    names = ('controller.max_speed_m_s', 'controller.max_angular_speed_rad_s')
+    speed, turn = names
+    assert change(graph, 'navigator', **{speed: 0.5, turn: 0.7}).successful
+    assert current(graph, 'navigator', *names) == [0.5, 0.7]
+    graph.until(lambda: f'changed: {speed} = 0.5, {turn} = 0.7' in graph.log('navigator'), 'it')
     # All or none, with a reason; NaN is within no range.
     for wrong in (-1.0, 1e9, float('nan'), float('inf')):
-        result = change(graph, 'navigator', max_angular_speed_rad_s=0.9, max_speed_m_s=wrong)
+        result = change(graph, 'navigator', **{turn: 0.9, speed: wrong})
         assert not result.successful and 'max_speed_m_s' in result.reason, result
-    assert current(graph, 'navigator', 'max_speed_m_s', 'max_angular_speed_rad_s') == [0.5, 0.7]
+    assert current(graph, 'navigator', *names) == [0.5, 0.7]
     request = SetParametersAtomically.Request(
         parameters=[Parameter(name='map_frame', value=value(1.0))]
     )

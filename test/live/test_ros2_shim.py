@@ -202,13 +202,15 @@ def test_a_service_is_called(robot):
 
 def test_parameters_are_read_and_set(robot):
     names = output('param', 'list', '/navigator', *WAIT).splitlines()
-    assert '  max_speed_m_s' in names and names == sorted(names)
-    before = output('param', 'get', '--hide-type', 'navigator', 'max_speed_m_s', *WAIT).strip()
-    value = ('/navigator', 'max_speed_m_s')
+    assert '  controller.max_speed_m_s' in names and names == sorted(names)
+    before = output(
+        'param', 'get', '--hide-type', 'navigator', 'controller.max_speed_m_s', *WAIT
+    ).strip()
+    value = ('/navigator', 'controller.max_speed_m_s')
     assert output('param', 'set', *value, '0.15', *WAIT) == 'Set parameter successful\n'
     assert output('param', 'get', *value, *WAIT) == 'Double value is: 0.15\n'
     dumped = yaml.safe_load(output('param', 'dump', '/navigator', *WAIT))
-    assert dumped['/navigator']['ros__parameters']['max_speed_m_s'] == 0.15
+    assert dumped['/navigator']['ros__parameters']['controller']['max_speed_m_s'] == 0.15
     refused = run('param', 'set', *value, '-0.2', *WAIT)
     assert refused.returncode == 0 and not refused.stdout
     assert refused.stderr.startswith('Setting parameter failed: ')
@@ -218,7 +220,7 @@ def test_parameters_are_read_and_set(robot):
     # The test's own node does not answer while the test waits: that is said, and the rest listed.
     everywhere = set()
     end = time.monotonic() + PATIENCE_S
-    while not {'/navigator:', '/sim:', '  max_speed_m_s', '  lockstep'} <= everywhere:
+    while not {'/navigator:', '/sim:', '  controller.max_speed_m_s', '  lockstep'} <= everywhere:
         assert time.monotonic() < end, everywhere
         done = run('param', 'list', '--spin-time', '5')
         assert done.returncode == 0

@@ -24,6 +24,8 @@ from thinmap_ros.core.places.global_localizer import (
     State,
 )
 from thinmap_ros.core.planning.navigator import NavigatorConfig
+from thinmap_ros.core.planning.path_follower import PathFollowerConfig
+from thinmap_ros.core.planning.wavefront import WavefrontConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.builder import TopologyConfig, build
@@ -88,8 +90,8 @@ class _Settings:
         search = parameters.declare_config(node, GlobalLocalizationConfig)
         own = parameters.declare_config(node, GlobalLocalizerConfig)
         driving = NavigatorConfig(
-            max_speed_m_s=own.drive_speed_m_s,
-            robot_radius_m=search.robot_radius_m + _PATH_MARGIN_M,
+            planner=WavefrontConfig(robot_radius_m=search.robot_radius_m + _PATH_MARGIN_M),
+            controller=PathFollowerConfig(max_speed_m_s=own.drive_speed_m_s),
             stop_radius_m=search.robot_radius_m + _STOP_MARGIN_M,
         )
         return _Settings(search, own, parameters.declare_map_frame(node), driving)

@@ -88,7 +88,7 @@ def explore(arguments: argparse.Namespace, world: Path, start: Array) -> None:
     pose = [f'-p initial_x_m:={start[0]} -p initial_y_m:={start[1]} -p initial_yaw_rad:={start[2]}']
     extra = {
         'localizer': ' '.join(pose).split(),
-        'navigator': ['-p', f'max_speed_m_s:={arguments.speed}'],
+        'navigator': ['-p', f'controller.max_speed_m_s:={arguments.speed}'],
         'recorder': ['-p', f'bag:={out / "bag"}'],
     }
     common = ['-p', f'world:={world}', '-p', f'robot:={arguments.robot}']

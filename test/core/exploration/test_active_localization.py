@@ -16,6 +16,8 @@ from thinmap_ros.core.places.config import GlobalLocalizationConfig
 from thinmap_ros.core.places.global_localizer import GlobalLocalization, Hypothesis, Result, State
 from thinmap_ros.core.places.place_database import FREE, Places
 from thinmap_ros.core.planning.navigator import NavigatorConfig
+from thinmap_ros.core.planning.path_follower import PathFollowerConfig
+from thinmap_ros.core.planning.wavefront import WavefrontConfig
 from thinmap_ros.sim.drives import random_drive
 from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 from thinmap_ros.sim.robot import RobotConfig
@@ -49,7 +51,11 @@ def seconds_driven_by_itself(finder, start, seed):
         world_of(TWINS), se2.pose(*start), RobotConfig(), LaserScannerConfig(), seed
     )
     # As those that roam.
-    search = ActiveSearch(finder.places, finder.config, NavigatorConfig(max_speed_m_s=0.5))
+    search = ActiveSearch(
+        finder.places,
+        finder.config,
+        NavigatorConfig(controller=PathFollowerConfig(max_speed_m_s=0.5)),
+    )
     moment = simulation.read_sensors()
     scan = None
     for k in itertools.count():
@@ -93,7 +99,7 @@ def test_the_viewpoint_is_where_the_views_differ_and_in_reach_for_all_places(fin
     odometry = se2.pose(4.0, -1.0, 0.4)  # wherever it is, it is the same place
     starts_there = np.array([se2.compose(T, se2.invert(odometry)) for T in starts])
     half = np.array([0.5, 0.5])
-    view = best_viewpoint(finder.places, odometry, starts_there, half, 15.0, NavigatorConfig())
+    view = best_viewpoint(finder.places, odometry, starts_there, half, 15.0, WavefrontConfig())
     assert view.gain > 0.5
     for T in starts_there:
         x, y = se2.transform_points(T, view.T_odom_view[None, :2])[0]
@@ -140,14 +146,14 @@ def test_what_is_beside_a_place_by_little_neither_closes_its_way_nor_is_told_apa
     starts = in_both_rooms(*STARTS[0])
     beside = np.array([se2.compose(T, se2.pose(0.4, 0.2, 0.1)) for T in starts])
     weights = np.array([0.3, 0.3, 0.2, 0.2])
-    one = best_viewpoint(finder.places, np.zeros(3), starts, weights[:2], 15.0, NavigatorConfig())
+    one = best_viewpoint(finder.places, np.zeros(3), starts, weights[:2], 15.0, WavefrontConfig())
     four = best_viewpoint(
         finder.places,
         np.zeros(3),
         np.concatenate([starts, beside]),
         weights,
         15.0,
-        NavigatorConfig(),
+        WavefrontConfig(),
     )
     assert np.array_equal(one.T_odom_view, four.T_odom_view)
 
@@ -158,7 +164,7 @@ def test_where_all_but_the_own_place_has_been_looked_from_a_turn_there_is_new(fi
     seen = everywhere()
     seen = np.concatenate([seen[np.hypot(seen[:, 0], seen[:, 1]) > 0.85], np.zeros((1, 3))])
     view = best_viewpoint(
-        finder.places, np.zeros(3), starts, np.array([0.5, 0.5]), 15.0, NavigatorConfig(), seen
+        finder.places, np.zeros(3), starts, np.array([0.5, 0.5]), 15.0, WavefrontConfig(), seen
     )
     assert view.gain > 0.0
     assert np.hypot(*view.T_odom_view[:2]) < 0.6

@@ -15,6 +15,7 @@ from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.occupancy import OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
+from thinmap_ros.core.planning.path_follower import PathFollowerConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.topology.builder import TopologyBuilder
 from thinmap_ros.core.topology.graph import TopologicalMap
@@ -52,7 +53,9 @@ class Run:
         self.grid = OccupancyGrid()
         self.topology = TopologyBuilder()
         self.explorer = Explorer(config)
-        self.navigator = Navigator(NavigatorConfig(max_speed_m_s=0.5))
+        self.navigator = Navigator(
+            NavigatorConfig(controller=PathFollowerConfig(max_speed_m_s=0.5))
+        )
         self.decisions: list[Decision] = []
         self.poses: list[np.ndarray] = []
         self.scan = self.goal = None

@@ -9,6 +9,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
+from thinmap_ros.core.planning.path_follower import PathFollowerConfig
 from thinmap_ros.core.scan import Scan
 
 
@@ -52,7 +53,12 @@ def test_a_goal_too_near_to_a_wall_is_reached_as_near_to_it_as_the_robot_may_sta
 def test_it_stops_in_front_of_what_only_the_laser_knows_and_goes_around_it():
     world = room()
     world[5:25, 40] = 100
-    ride = Ride(world, (1.0, 1.0, 0.0), known=room(), config=NavigatorConfig(max_speed_m_s=0.5))
+    ride = Ride(
+        world,
+        (1.0, 1.0, 0.0),
+        known=room(),
+        config=NavigatorConfig(controller=PathFollowerConfig(max_speed_m_s=0.5)),
+    )
     assert ride.go((7.0, 1.5), 120.0)[-1].state == 'reached'
     assert ride.nearest_m > 0.18
 
@@ -86,7 +92,7 @@ def rides_to_and_fro(ride, seconds):
 
 @pytest.mark.parametrize('seed', range(4))
 def test_a_noisy_laser_makes_no_passage_too_narrow_and_none_wide_enough(seed):
-    config = NavigatorConfig(max_speed_m_s=0.5)
+    config = NavigatorConfig(controller=PathFollowerConfig(max_speed_m_s=0.5))
     wide = Ride(gap_of(5), (1.0, 3.05, 0.0), config=config, noise=np.random.default_rng(seed))
     crossings, nearest = rides_to_and_fro(wide, 120.0)
     assert crossings >= 4
@@ -141,7 +147,7 @@ def test_a_new_goal_takes_the_place_of_the_old_one_and_cancel_brings_it_to_rest(
 
 def test_speed_is_kept_low_enough_to_stop_before_what_stands_ahead():
     """A wall at every distance: told to drive on, it never has more speed than it can brake."""
-    config = NavigatorConfig(max_speed_m_s=0.5)
+    config = NavigatorConfig(controller=PathFollowerConfig(max_speed_m_s=0.5))
     known = room()
     for gap in (0.3, 0.4, 0.6, 1.0):
         world = room()

@@ -10,6 +10,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.navigator import Navigator, NavigatorConfig
+from thinmap_ros.core.planning.path_follower import PathFollowerConfig
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import Simulation
@@ -49,7 +50,7 @@ def rove(seed, speed, knows_pillars, seconds=40.0):
         else np.pad(np.zeros((68, 68), dtype=np.uint8), 1, constant_values=1)
     )
     patch = GridPatch(FRAME, np.where(known, 100, 0).astype(np.int8))
-    navigator = Navigator(NavigatorConfig(max_speed_m_s=speed))
+    navigator = Navigator(NavigatorConfig(controller=PathFollowerConfig(max_speed_m_s=speed)))
     moment = robot.read_sensors()
     scan = None
     until = 0.0

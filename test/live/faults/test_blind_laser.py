@@ -50,7 +50,9 @@ def test_a_blind_laser_stops_an_exploration_which_goes_on_when_it_sees_again(gra
     doctor = Doctor(graph)
     relay = Relay(graph)
     start = {'initial_x_m': 2.0, 'initial_y_m': 2.0, 'initial_yaw_rad': 0.9}
-    graph.start('thinmap', arguments=NODES, use_sim_time=True, max_speed_m_s=0.5, **start)
+    graph.start(
+        'thinmap', arguments=NODES, use_sim_time=True, **{'controller.max_speed_m_s': 0.5}, **start
+    )
     graph.start('sim', start='2.0,2.0,0.9', remap=('scan:=raw_scan',), wait_for_subscribers=1)
     client = ActionClient(graph.node, Explore, 'explore')
     graph.send_goal(client, Explore.Goal())

@@ -134,7 +134,7 @@ class ActiveSearch:
                 self._starts,
                 self._weights,
                 self._range_m,
-                self._driving,
+                self._driving.planner,
                 self._looked,
             )
         if self._view is None:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.config import parameter
+from thinmap_ros.core.config import Config, parameter, part
 from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, GridPatch
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.planning.obstacle_points import ObstaclePoints
@@ -40,9 +40,11 @@ _STANDSTILLS = 5
 
 
 @dataclass(frozen=True)
-class NavigatorConfig(WavefrontConfig, PathFollowerConfig):
+class NavigatorConfig(Config):
     """Parameters of planning and following, and when a goal is reached or aborted."""
 
+    planner: WavefrontConfig = part(WavefrontConfig)
+    controller: PathFollowerConfig = part(PathFollowerConfig)
     stop_radius_m: float = parameter(
         0.24,
         'The robot stops before a scan point comes closer than this to its centre (m). At most '
@@ -94,39 +96,45 @@ class Command:
     reason: str = ''
 
 
+@dataclass(eq=False)
+class _Progress:
+    """Progress towards a goal: age of the path, time at standstill, remaining path length.
+
+    standstills: number of them without progress; nearest_m: smallest remaining length.
+    """
+
+    path_age_s: float = 0.0
+    blocked_s: float = 0.0
+    remaining_m: float = 0.0
+    standstills: int = 0
+    nearest_m: float = math.inf
+
+
 class Navigator:
     """Drives to one goal at a time; a new goal replaces the old one without a stop."""
 
     def __init__(self, config: NavigatorConfig | None = None) -> None:
         self.config = config or NavigatorConfig()
         self.path: Array | None = None
-        self._follower = PathFollower(self.config)
+        self._follower = PathFollower(self.config.controller)
         self._recent_path = RecentPath()
         self._obstacles = ObstaclePoints()
         self._goal: tuple[float, float] | None = None
         self._heading_rad: float | None = None
-        self._path_age_s = 0.0
-        self._blocked_s = 0.0
-        self._remaining_m = 0.0
-        self._standstills = 0
-        self._nearest_m = math.inf
+        self._progress = _Progress()
         self._patch: GridPatch | None = None
 
     @property
     def distance_remaining_m(self) -> float:
         """Remaining length of the path, m; 0 without a path."""
-        return self._remaining_m
+        return self._progress.remaining_m
 
     def set_goal(self, x: float, y: float, theta: float | None = None) -> None:
         """Set a goal in the map frame, m, with an optional heading, rad."""
         self._goal = (x, y)
         self._heading_rad = theta
         self.path = None
-        self._path_age_s = 0.0
-        self._blocked_s = 0.0
-        self._remaining_m = 0.0
-        self._standstills = 0
-        self._nearest_m = math.inf
+        self._progress = _Progress()
 
     def reset_velocity(self) -> None:
         """Reset the commanded velocity: the robot was stopped from outside."""
@@ -136,7 +144,7 @@ class Navigator:
         """Cancel the goal; the next steps bring the robot to rest."""
         self._goal = None
         self.path = None
-        self._remaining_m = 0.0
+        self._progress.remaining_m = 0.0
 
     def step(self, T_map_base: Array, patch: GridPatch, scan: Scan | None, dt_s: float) -> Command:
         """Command for the next dt_s from the pose (3,), the current map and the newest scan.
@@ -163,7 +171,7 @@ class Navigator:
         return away_m <= self.config.xy_goal_tolerance_m
 
     def _finish_goal(self, T_map_base: Array, dt_s: float) -> Command:
-        self._remaining_m = 0.0
+        self._progress.remaining_m = 0.0
         if self._heading_rad is not None:
             error = se2.wrap(self._heading_rad - float(T_map_base[2]))
             if abs(error) > self.config.yaw_goal_tolerance_rad:
@@ -175,13 +183,16 @@ class Navigator:
     def _needs_plan(self, T_map_base: Array, patch: GridPatch, dt_s: float) -> bool:
         changed = patch is not self._patch
         self._patch = patch
-        self._path_age_s += dt_s
-        if self.path is None or self._path_age_s >= self.config.replan_period_s:
+        self._progress.path_age_s += dt_s
+        if self.path is None or self._progress.path_age_s >= self.config.replan_period_s:
             return True
         x = float(T_map_base[0])
         y = float(T_map_base[1])
         nearest = nearest_point(self.path, x, y)
-        strayed = math.dist(self.path[nearest], (x, y)) > 2.0 * self.config.lookahead_distance_m
+        strayed = (
+            math.dist(self.path[nearest], (x, y))
+            > 2.0 * self.config.controller.lookahead_distance_m
+        )
         return bool(strayed or (changed and self._is_blocked(nearest, patch)))
 
     def _is_blocked(self, first: int, patch: GridPatch) -> bool:
@@ -190,7 +201,7 @@ class Navigator:
         frame = patch.frame
         ahead = self.path[first : first + max(1, int(2.0 * _CHECK_AHEAD_M / frame.resolution))]
         at = (frame.origin_x, frame.origin_y, frame.resolution)
-        radius = self.config.robot_radius_m / frame.resolution - 1e-6
+        radius = self.config.planner.robot_radius_m / frame.resolution - 1e-6
         return _collides(patch.cells, at, ahead, radius)
 
     def _plan(self, T_map_base: Array, patch: GridPatch) -> str:
@@ -200,17 +211,21 @@ class Navigator:
         """
         assert self._goal is not None
         points = (
-            self._obstacles.query_radius(T_map_base, _POINTS_M) if self._blocked_s > 0.0 else None
+            self._obstacles.query_radius(T_map_base, _POINTS_M)
+            if self._progress.blocked_s > 0.0
+            else None
         )
         start = float(T_map_base[0]), float(T_map_base[1])
         trail = self._recent_path.cells(patch.frame, patch.shape)
-        path = plan(patch, start, self._goal, self.config, points, self.config.stop_radius_m, trail)
+        path = plan(
+            patch, start, self._goal, self.config.planner, points, self.config.stop_radius_m, trail
+        )
         first = self.path is None
-        self._path_age_s = 0.0
+        self._progress.path_age_s = 0.0
         if path is None:
             self.path = None
             where = f'({self._goal[0]:.2f}, {self._goal[1]:.2f})'
-            never = first and self._blocked_s == 0.0
+            never = first and self._progress.blocked_s == 0.0
             return f'no path to {where}' if never else f'the path to {where} is blocked'
         self.path = path
         return ''
@@ -218,9 +233,9 @@ class Navigator:
     def _wait(self, reason: str, dt_s: float) -> Command:
         """Stop; abort the goal if there was never a path, or after blocked_timeout_s."""
         never = reason.startswith('no path')
-        self._blocked_s += dt_s
-        self._remaining_m = 0.0
-        if never or self._blocked_s > self.config.blocked_timeout_s:
+        self._progress.blocked_s += dt_s
+        self._progress.remaining_m = 0.0
+        if never or self._progress.blocked_s > self.config.blocked_timeout_s:
             self.cancel()
             return Command(*self._follower.stop(dt_s), 'failed', reason)
         return Command(*self._follower.stop(dt_s), 'blocked', reason)
@@ -228,10 +243,10 @@ class Navigator:
     def _drive(self, T_map_base: Array, dt_s: float) -> Command:
         assert self.path is not None
         nearest = nearest_point(self.path, float(T_map_base[0]), float(T_map_base[1]))
-        self._remaining_m = length_from(self.path, nearest)
-        if self._remaining_m < self._nearest_m - _PROGRESS_M:
-            self._standstills = 0
-            self._nearest_m = self._remaining_m
+        self._progress.remaining_m = length_from(self.path, nearest)
+        if self._progress.remaining_m < self._progress.nearest_m - _PROGRESS_M:
+            self._progress.standstills = 0
+            self._progress.nearest_m = self._progress.remaining_m
         before = (self._follower.v, self._follower.w)
         room = self._obstacles.clearance_along(self.path, nearest, _NARROW_AHEAD_M)
         v, w = self._follower.command(T_map_base, self.path, dt_s, room - self.config.stop_radius_m)
@@ -239,9 +254,9 @@ class Navigator:
             return Command(v, w, 'driving')
         allowed = self._safe_speed(T_map_base, v, w, self.config.stop_radius_m)
         if allowed >= v - _ROUNDING_M_S:
-            self._blocked_s = 0.0
+            self._progress.blocked_s = 0.0
             return Command(v, w, 'driving')
-        slowest = before[0] - self.config.max_acceleration_m_s2 * dt_s
+        slowest = before[0] - self.config.controller.max_acceleration_m_s2 * dt_s
         if allowed > max(_CREEP_M_S, slowest):
             # Drive slower on the same arc.
             return Command(*self._follower.override_speed(allowed, w * allowed / v), 'driving')
@@ -264,15 +279,20 @@ class Navigator:
         """Act in front of an obstacle: rotate towards the path, else replan, else abort."""
         assert self.path is not None
         reason = _HIDDEN if self._obstacles.is_hidden else _OBSTACLE
-        self._standstills += self._blocked_s == 0.0
-        self._blocked_s += dt_s
-        if self._blocked_s > self.config.blocked_timeout_s or self._standstills > _STANDSTILLS:
+        self._progress.standstills += self._progress.blocked_s == 0.0
+        self._progress.blocked_s += dt_s
+        if (
+            self._progress.blocked_s > self.config.blocked_timeout_s
+            or self._progress.standstills > _STANDSTILLS
+        ):
             self.cancel()
             return Command(*self._follower.override_speed(0.0, 0.0), 'failed', reason)
         heading = self._heading_of_path(T_map_base)
         if abs(se2.wrap(heading - float(T_map_base[2]))) > _AIM_RAD:
             return Command(*self._follower.turn_to(T_map_base, heading, dt_s), 'driving')
-        self._path_age_s = max(self._path_age_s, self.config.replan_period_s - 0.5)
+        self._progress.path_age_s = max(
+            self._progress.path_age_s, self.config.replan_period_s - 0.5
+        )
         return Command(*self._follower.override_speed(0.0, 0.0), 'blocked', reason)
 
     def _heading_of_path(self, T_map_base: Array) -> float:
@@ -291,7 +311,7 @@ class Navigator:
 
     def _safe_speed(self, T_map_base: Array, v: float, w: float, radius_m: float) -> float:
         """Highest speed up to v at which the robot stops before a point comes within radius_m."""
-        braking = self.config.max_acceleration_m_s2
+        braking = self.config.controller.max_acceleration_m_s2
         needed = v * self.config.reaction_time_s + v * v / (2.0 * braking)
         free_m = self._obstacles.free_arc_length_m(T_map_base, w / v, needed, radius_m)
         late = self.config.reaction_time_s
