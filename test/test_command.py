@@ -15,6 +15,8 @@ from thinmap_ros import __main__ as command
 from thinmap_ros import __version__
 from thinmap_ros.core.kernel_cache import BESIDE_PACKAGE
 
+pytestmark = pytest.mark.programs
+
 ROOT = Path(__file__).resolve().parents[1]
 TOOLS = ROOT / 'thinmap_ros' / 'tools'
 OF_A_WHEEL = ['setup.py', 'setup.cfg', 'pyproject.toml', 'thinmap_ros', 'worlds', 'config']

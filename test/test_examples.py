@@ -12,6 +12,8 @@ from support.hidden_library import hide_ros
 import thinmap_ros
 from docs import commands
 
+pytestmark = pytest.mark.programs
+
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = sorted((ROOT / 'examples').glob('*.py'))
 MOST_LINES = 40

@@ -11,6 +11,8 @@ from support.hidden_library import hide_ros
 
 import thinmap_ros
 
+pytestmark = pytest.mark.programs
+
 ROOT = Path(__file__).resolve().parents[1]
 
 

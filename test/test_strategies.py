@@ -38,13 +38,13 @@ def test_each_name_makes_a_new_strategy_each_time(name):
 
 
 def test_the_config_is_of_the_own_strategies():
-    config = ExplorerConfig(threshold=0.8)
+    config = ExplorerConfig(probability_threshold=0.8)
     first = make_strategy(DEFAULT, config)
     paper = make_strategy('paper', config)
     assert isinstance(first, Explorer)
     assert isinstance(paper, Explorer)
     assert first.config == config
-    assert (paper.config.mode, paper.config.threshold) == ('paper', 0.8)
+    assert (paper.config.mode, paper.config.probability_threshold) == ('paper', 0.8)
     assert isinstance(make_strategy('nearest_frontier', config), NearestFrontier)
 
 

@@ -318,7 +318,7 @@ def test_it_goes_on_where_it_was_and_one_that_fails_stops_no_other(tmp_path, cap
 
 def test_a_drive_in_a_small_building(tmp_path, monkeypatch):
     small = BuildingConfig(area_m2=200.0, wings=1, clutter=0.0, people_per_1000_m2=0.0)
-    monkeypatch.setattr(drives, 'building', lambda seed: generate_building(seed, small))
+    monkeypatch.setattr(drives, 'generate_building', lambda seed: generate_building(seed, small))
     monkeypatch.setattr(drives, '_LENGTH_M', 12.0)
     case = BuildingCase(3, '2dx', 3.0)
     report = measure(Task(case, tmp_path, tmp_path, tmp_path, {'slam': 'ekf_ti'}))

@@ -179,6 +179,7 @@ def test_relation_errors_of_a_known_path(tmp_path: Path) -> None:
     assert errors.degrees == pytest.approx([0.0, np.degrees(0.1), 0.0])
 
 
+@pytest.mark.programs
 def test_logs_of_the_users_own(tmp_path: Path) -> None:
     (tmp_path / 'logs' / 'mine').mkdir(parents=True)
     samples = islice(Source().samples('dead_end'), 60)

@@ -58,7 +58,7 @@ def test_options_say_what_flaser_does_not(tmp_path: Path) -> None:
         start_angle_deg=-110.0,
         step_deg=2.0,
         offset_m=0.16,
-        max_range_m=2.0,
+        range_max_m=2.0,
     )[1]
     assert isinstance(event, ScanEvent)
     assert np.degrees(event.scan.angles_rad) == pytest.approx([-110, -108, -106], abs=1e-4)

@@ -157,7 +157,7 @@ def test_a_file_of_another_user_is_left_alone(
 def test_a_folder_of_another_user(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder.mkdir(mode=0o700)
     monkeypatch.setattr(os, 'getuid', lambda: folder.stat().st_uid + 1)
-    with pytest.raises(InputError, match=r'of user .*: expected a folder of this user'):
+    with pytest.raises(InputError, match=r'owned by user .*: expected a folder of this user'):
         checkpoint_directory()
 
 

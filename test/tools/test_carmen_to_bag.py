@@ -58,7 +58,7 @@ def test_the_bag_says_what_the_log_says(tmp_path: Path) -> None:
         flaser('976052857.837530', 3, 7.5),
         odom('976052856.900000', 1.6, 0.0),
     ]
-    log = log_of(tmp_path, lines, offset_m=0.16, max_range_m=25.0)
+    log = log_of(tmp_path, lines, offset_m=0.16, range_max_m=25.0)
     assert convert(log, tmp_path / 'bag') == 3
     assert_same(list(log.events()), list(BagLog(tmp_path / 'bag').events()))
 
@@ -80,7 +80,7 @@ def test_log_time_keeps_the_order_of_the_file(tmp_path: Path) -> None:
         ('sena', {'offset_m': 0.78}),
         (
             'mrpt_office',
-            {'start_angle_deg': -110.0, 'step_deg': 0.352, 'offset_m': 0.16, 'max_range_m': 25.0},
+            {'start_angle_deg': -110.0, 'step_deg': 0.352, 'offset_m': 0.16, 'range_max_m': 25.0},
         ),
         ('intel_sparse', {}),
     ],
@@ -124,7 +124,7 @@ def test_the_program(tmp_path: Path) -> None:
         ('ODOM 1 2 3 0 0 0 1.0 h 1\n', (), 'no scan'),
         ('FLASER 180 1.0 2.0', (), 'no scan'),
         ('x', ('--offset-m', '99'), 'offset_m'),
-        ('x', ('--max-range-m', 'nan'), 'max_range_m'),
+        ('x', ('--range-max-m', 'nan'), 'range_max_m'),
     ],
 )
 def test_bad_input_is_one_line_and_leaves_nothing(

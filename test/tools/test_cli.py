@@ -59,14 +59,14 @@ def parse(*words: str) -> argparse.Namespace:
 def test_an_option_that_is_not_given_is_the_configs() -> None:
     assert cli.config_from(parse('a.clf'), LaserOptions) == LaserOptions()
     given = cli.config_from(
-        parse('a.clf', '--max-range-m', '25', '--start-angle-deg=-110'), LaserOptions
+        parse('a.clf', '--range-max-m', '25', '--start-angle-deg=-110'), LaserOptions
     )
-    assert given == LaserOptions(max_range_m=25.0, start_angle_deg=-110.0)
+    assert given == LaserOptions(range_max_m=25.0, start_angle_deg=-110.0)
 
 
 def test_a_value_out_of_range_is_an_error() -> None:
-    with pytest.raises(ConfigError, match='max_range_m'):
-        cli.config_from(parse('a.clf', '--max-range-m', '-1'), LaserOptions)
+    with pytest.raises(ConfigError, match='range_max_m'):
+        cli.config_from(parse('a.clf', '--range-max-m', '-1'), LaserOptions)
 
 
 def test_logs_and_bags_are_told_apart(tmp_path: Path) -> None:

@@ -243,7 +243,7 @@ def test_unwritable_place_is_said(log):
 def test_real_office_log(shared_data, tmp_path):
     log = shared_data / 'logs' / 'mrpt_office' / 'log.clf'
     angles = ['--start-angle-deg', '-110.0', '--step-deg', '0.352']
-    options = [*angles, '--offset-m', '0.16', '--max-range-m', '24.9']
+    options = [*angles, '--offset-m', '0.16', '--range-max-m', '24.9']
     done = run(log, '-o', tmp_path / 'out', '--quiet', *options)
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / 'out' / 'report.json').read_text())
@@ -364,6 +364,7 @@ def closed_when(mark, condition):
 
 
 @needs_rerun
+@pytest.mark.programs
 def test_the_viewer_shows_the_replay_until_it_is_closed(log, tmp_path, monkeypatch, capsys):
     # The real program, told to write down what it receives where it would open a window; closed
     # when the results are there and it has shown all of it.

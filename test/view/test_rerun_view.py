@@ -176,6 +176,7 @@ def test_viewer_without_a_screen_is_refused(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.programs
 @needs_rerun
 def test_viewer_is_sent_what_the_file_holds_and_ends_with_the_view(tmp_path, monkeypatch):
     # The real program, told to write down what it receives where it would open a window.

@@ -66,7 +66,7 @@ class Kidnapping:
         return self._finder is not None
 
     def intercepts(self, loop: ClosedLoop, scan: Scan, T_odom_base: Array) -> bool:
-        """Whether a scan, of before the robot was carried or of a lost one, is not for the loop."""
+        """Whether the loop must ignore a scan: before the robot is placed, or while it is lost."""
         if self._carried_s is None and scan.stamp_ns >= 1e9 * self._at_s:
             self._kidnap(loop, scan.stamp_ns / 1e9)
             return True
@@ -76,7 +76,7 @@ class Kidnapping:
         return True
 
     def add_estimate(self, loop: ClosedLoop, scan: Scan, estimate: Estimate) -> None:
-        """Begin to search once the robot is lost."""
+        """Start global localization when the robot is lost."""
         if (
             estimate.is_lost
             and self._finder is None

@@ -35,7 +35,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 
 def partial_files(path: Path) -> list[Path]:
-    """Unfinished files beside a file: those of an `atomic_write` that was killed meanwhile."""
+    """Partial files beside a file, left by an `atomic_write` that was killed."""
     return sorted(path.parent.glob(f'.{escape(path.name)}.*.part'))
 
 

@@ -29,7 +29,7 @@ _READ_ONLY = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK
 
 @contextmanager
 def open_regular_file(path: Path, flags: int = 0) -> Iterator[IO[bytes]]:
-    """Open a regular file to be read; flags: more of them for os.open, such as O_NOFOLLOW.
+    """Open a regular file for reading; flags: additional ones for os.open, such as O_NOFOLLOW.
 
     Raises InputError if it is no regular file (a pipe would block), OSError as open.
     """

@@ -12,7 +12,7 @@ _RELEASE_BYTES = 4e6
 
 
 def compiler_memory_releaser() -> Callable[[], None]:
-    """A function to be called often; it releases the pages of the compiler every few seconds.
+    """Return a function that releases the pages of the compiler, to be called repeatedly.
 
     Kernels that are loaded later, with the first message, load the compiler again.
     """

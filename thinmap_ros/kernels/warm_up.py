@@ -41,7 +41,7 @@ def localizer() -> None:
     rehearsed.step(_odd_scan(), T_map_base)
     Localizer.from_state(rehearsed.state())
     Localizer.from_occupancy_map(_room(), OdometryAnchor(0, T_map_base, T_map_base), T_map_base)
-    # As soon as a place is seen again, covariances along the graph are asked for.
+    # A revisit needs covariances along the graph.
     covariances_from(0, np.zeros((2, 3)), [Edge(0, 1, np.zeros(3), np.eye(3), False)], np.ones(2))
 
 

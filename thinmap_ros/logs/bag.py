@@ -179,7 +179,7 @@ class BagLog:
             if count == 0:
                 first = f': {self.skipped.first}' if self.skipped.first else ''
                 name = validation.quoted_name(topic)
-                raise InputError(f'{self.path}: {name}: no message that can be used{first}')
+                raise InputError(f'{self.path}: {name}: no usable message{first}')
 
     def _event(self, bag: Bag, message: RawMessage) -> tuple[str, OdometryEvent | Scan] | None:
         """Frame and value of a message; None, and counted, if it is unusable."""
@@ -227,7 +227,7 @@ class BagLog:
             raise InputError(f'{self.path}: /tf_static: {error}') from error
         if mount is None:
             known = validation.quoted_names(transforms.frames)
-            where = f'where "{validation.quoted_name(frame)}" is on "{self.base_frame}"'
+            where = f'from "{validation.quoted_name(frame)}" to "{self.base_frame}"'
             raise InputError(
                 f'{self.path}: /tf_static has no transform {where} (it has {known}): '
                 'give --base-frame, or --offset-m for a laser straight ahead'

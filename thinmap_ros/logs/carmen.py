@@ -53,7 +53,7 @@ class LaserOptions(Config):
     )
     offset_m: float = parameter(0.0, 'laser ahead of the robot centre, m', low=-5.0, high=5.0)
     range_min_m: float = parameter(0.02, 'nearest valid range, m', low=0.0, high=10.0)
-    max_range_m: float = parameter(
+    range_max_m: float = parameter(
         80.0, 'ranges from here on are "no return", m', low=0.1, high=1000.0
     )
 
@@ -150,7 +150,7 @@ class CarmenLog:
         step = self.options.step_deg or (1.0 if count == 180 else 180.0 / max(count - 1, 1))
         fan = (math.radians(self.options.start_angle_deg), math.radians(step))
         scan = self._scan(
-            _stamp(rest[6]), words[2 : 2 + count], fan, self.options.max_range_m, self._offset()
+            _stamp(rest[6]), words[2 : 2 + count], fan, self.options.range_max_m, self._offset()
         )
         return [OdometryEvent(scan.stamp_ns, _pose(rest[3:6])), ScanEvent(scan)]
 
@@ -179,7 +179,7 @@ class CarmenLog:
             # its rounding errors.
             self._T_base_laser = np.round(se2.between(T_odom_base, T_odom_laser), 3)
         mount = self._offset() if self.options.offset_m else self._T_base_laser
-        limit = min(max_range, self.options.max_range_m)
+        limit = min(max_range, self.options.range_max_m)
         scan = self._scan(_stamp(rest[11]), words[9 : 9 + count], (start, step), limit, mount)
         return [OdometryEvent(scan.stamp_ns, T_odom_base), ScanEvent(scan)]
 

@@ -123,13 +123,15 @@ def test_where_nothing_tells_places_apart_the_robot_goes_on_and_stands_when_all_
     starts = in_both_rooms(*STARTS[0])
     half = np.array([0.5, 0.5])
     driving = NavigatorConfig()
-    view = best_viewpoint(places, np.zeros(3), starts, half, 15.0, driving)
+    view = best_viewpoint(places, np.zeros(3), starts, half, 15.0, driving.planner)
     assert view.gain == 0.0
     assert np.hypot(*view.T_odom_view[:2]) > 2.0
     seen = everywhere()
-    assert best_viewpoint(places, np.zeros(3), starts, half, 15.0, driving, seen) is None
+    assert best_viewpoint(places, np.zeros(3), starts, half, 15.0, driving.planner, seen) is None
     ahead = seen[np.abs(se2.wrap(seen[:, 2])) < 1.5]
-    assert best_viewpoint(places, np.zeros(3), starts, half, 15.0, driving, ahead) is not None
+    assert (
+        best_viewpoint(places, np.zeros(3), starts, half, 15.0, driving.planner, ahead) is not None
+    )
     search = ActiveSearch(places, CONFIG, driving)
     for T in seen:
         search.take(Result(State.AMBIGUOUS, '', ()), T)

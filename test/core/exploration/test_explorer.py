@@ -121,7 +121,7 @@ def test_at_the_end_every_end_node_is_reliable_and_none_has_a_border():
     assert nodes
     assert (
         min(node.probability for node in nodes if node.node_id < FIRST_FRONTIER_ID)
-        >= ExplorerConfig().threshold
+        >= ExplorerConfig().probability_threshold
     )
     assert all(node.frontier_length_m == 0.0 for node in nodes)
 
