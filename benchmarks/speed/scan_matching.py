@@ -19,6 +19,7 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.matching.local_map import LocalMap
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher
+from thinmap_ros.core.slam.matching.surface import surface_points
 from thinmap_ros.evaluation.outcome import Row, at_least
 from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 
@@ -123,12 +124,12 @@ def _ours(before: list[tuple[Scan, Array]], errors: tuple[float, float]) -> Matc
     matcher = Matcher()
     local_map = LocalMap()
     for scan, T in before:
-        local_map.add_scan(scan.points_base(), scan.T_base_laser, T)
+        local_map.add_scan(surface_points(scan, _RANGE_M), scan.T_base_laser, T)
     sigmas = np.array([errors[0], errors[0], np.radians(errors[1])]) / np.sqrt(3.0)
     covariance = np.diag(np.square(sigmas))
     return lambda scan, prior: (
         matcher.match(
-            scan.points_base(), scan.T_base_laser, local_map, prior, covariance
+            surface_points(scan, _RANGE_M), scan.T_base_laser, local_map, prior, covariance
         ).T_map_base
     )
 
