@@ -53,7 +53,7 @@ def _laser_options(rng: np.random.Generator) -> LaserOptions | None:
     if rng.random() < 0.3:
         values['step_deg'] = float(rng.uniform(-12.0, 12.0))
         values['range_min_m'] = float(rng.uniform(-1.0, 11.0))
-        values['max_range_m'] = float(rng.uniform(0.0, 100.0))
+        values['range_max_m'] = float(rng.uniform(0.0, 100.0))
     options: LaserOptions | None = tried(lambda: LaserOptions(**values))
     return options
 

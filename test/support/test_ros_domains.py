@@ -26,6 +26,7 @@ def test_no_domain_is_given_twice_and_all_can_be_had_again():
             assert len(taken) == 20 and taken <= set(ros_domains.DOMAINS)
 
 
+@pytest.mark.programs
 def test_a_domain_that_another_process_has_is_left_alone(monkeypatch):
     with ros_domains.free_domain() as domain:
         pass
@@ -59,6 +60,7 @@ def test_a_domain_on_which_a_node_listens_is_left_alone(monkeypatch):
             pass
 
 
+@pytest.mark.live
 def test_nodes_are_seen_where_they_listen(ros_domain):
     """The ports are where the middleware really has them."""
     node = subprocess.Popen(

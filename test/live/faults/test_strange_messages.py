@@ -31,7 +31,7 @@ from thinmap_ros.ros import messages, qos
 pytestmark = pytest.mark.live
 
 
-def is_refused(message):
+def is_rejected(message):
     try:
         CHECKS[type(message)](message)
     except InputError as error:
@@ -42,28 +42,28 @@ def is_refused(message):
 
 @pytest.mark.parametrize('kind', CHECKS)
 def test_conversions_give_sound_values_or_refuse_in_one_line(kind):
-    refused = Counter(is_refused(message) for message in made(kind, 800))
+    rejected = Counter(is_rejected(message) for message in made(kind, 800))
     # Both happen, and often.
-    assert refused[True] > 80 and refused[False] > 80
+    assert rejected[True] > 80 and rejected[False] > 80
 
 
 @pytest.mark.parametrize('sign', [1.0, -1.0])
-def test_a_map_that_is_turned_is_refused_and_no_other(sign):
-    good = next(message for message in made(OccupancyGrid, 40) if not is_refused(message))
-    for turned, refused in ((0.0, False), (0.01, True), (1.5, True)):
+def test_a_map_that_is_turned_is_rejected_and_no_other(sign):
+    good = next(message for message in made(OccupancyGrid, 40) if not is_rejected(message))
+    for turned, rejected in ((0.0, False), (0.01, True), (1.5, True)):
         good.info.origin.orientation = messages.quaternion_msg(sign * turned)
-        assert is_refused(good) == refused
+        assert is_rejected(good) == rejected
 
 
 @pytest.mark.parametrize(
     ('sec', 'nanosec', 'rejected'),
     [(0, 0, False), (-1, 0, True), (1, 10**9 - 1, False), (1, 10**9, True), (1, 2**32 - 1, True)],
 )
-def test_stamps(sec, nanosec, refused):
-    good = next(message for message in made(Odometry, 40) if not is_refused(message))
+def test_stamps(sec, nanosec, rejected):
+    good = next(message for message in made(Odometry, 40) if not is_rejected(message))
     good.header.stamp.sec = sec
     good.header.stamp.nanosec = nanosec
-    assert is_refused(good) == refused
+    assert is_rejected(good) == rejected
 
 
 SPOKEN = {
@@ -140,21 +140,21 @@ def set_to_work(graph, name):
 def say(graph, name, publishers, count):
     """Publish so many strange messages on each topic, stamp by stamp, as fast as they are taken.
 
-    A node that answers has taken what came before. Returns how many of each must be refused.
+    A node that answers has taken what came before. Returns how many of each must be rejected.
     """
     columns = {topic: made(kind, count) for topic, (kind, _) in publishers.items()}
     for row in range(count):
         for topic, (_, publisher) in publishers.items():
             publisher.publish(columns[topic][row])
         graph.call(GetState, f'/{name}/get_state', GetState.Request())
-    return {topic: sum(map(is_refused, column)) for topic, column in columns.items()}
+    return {topic: sum(map(is_rejected, column)) for topic, column in columns.items()}
 
 
 @pytest.mark.parametrize('name', LISTENERS)
 @pytest.mark.parametrize(
     'count', [100, pytest.param(10_000, marks=[pytest.mark.slow, pytest.mark.timeout(1800)])]
 )
-def test_a_node_lives_through_them_publishes_no_nan_and_counts_what_it_refused(graph, name, count):
+def test_a_node_lives_through_them_publishes_no_nan_and_counts_what_it_rejected(graph, name, count):
     heard = {
         topic: graph.heard(topic, kind)
         for topic, kind in SPOKEN.items()
@@ -232,7 +232,7 @@ def counted(doctor, name, expected):
 
 def good(kind, ns):
     """A message of a kind that nobody can refuse."""
-    found = next(m for m in made(kind, 40) if not is_refused(m) and is_plain(m))
+    found = next(m for m in made(kind, 40) if not is_rejected(m) and is_plain(m))
     found.header.stamp = messages.time_msg(ns)
     return found
 
