@@ -5,6 +5,7 @@ THINMAP_WRITE_CONFIG=1 writes the files anew from what is declared.
 
 import json
 import os
+import re
 import textwrap
 
 import pytest
@@ -142,6 +143,20 @@ def test_robot_file_is_accepted_by_every_node_and_has_its_defaults(declared):
         assert own == {key: values[key] for key in own}
         seen |= set(own)
     assert seen == set(values)
+
+
+def test_the_readme_names_parameters_that_there_are():
+    rows = re.findall(r'^\| `(\w+)` \|.*\|.*\| (.*) \|$', (ROOT / 'README.md').read_text(), re.M)
+    named = [
+        (node, parameter)
+        for node, cell in rows
+        if node in NODES
+        for parameter in re.findall(r'`([\w.]+)`', re.sub(r'\(.*?\)', '', cell))
+    ]
+    assert len(named) > 20
+    for node, parameter in named:
+        text = (ROOT / 'config' / f'{node}.yaml').read_text()
+        assert parameter in flat(yaml.safe_load(text)['/**']['ros__parameters']), (node, parameter)
 
 
 PRESETS = sorted((ROOT / 'config' / 'sensors').glob('*'))
