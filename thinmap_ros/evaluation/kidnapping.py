@@ -1,6 +1,7 @@
 """Kidnaps the robot during exploration, and measures detection and recovery."""
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,10 +18,22 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.pipeline import Pipeline
 
-_MARGIN_M = 0.1
-_FAR_M = 3.0
-_RIGHT_M = 0.5
-_RIGHT_RAD = math.radians(10.0)
+
+@dataclass(frozen=True)
+class _Criteria:
+    """Where a robot is put, and which pose is right.
+
+    far_m: distance from its place, or more. margin_m: between robot and walls. right_m, right_rad:
+    largest errors of a right pose.
+    """
+
+    far_m: float
+    margin_m: float
+    right_m: float
+    right_rad: float
+
+
+_CRITERIA = _Criteria(far_m=3.0, margin_m=0.1, right_m=0.5, right_rad=math.radians(10.0))
 
 
 class Kidnapping:
@@ -50,7 +63,8 @@ class Kidnapping:
         off = self._off
         right: bool | None = None
         if off is not None:
-            right = bool(math.hypot(off[0], off[1]) <= _RIGHT_M and abs(off[2]) <= _RIGHT_RAD)
+            is_near = math.hypot(off[0], off[1]) <= _CRITERIA.right_m
+            right = bool(is_near and abs(off[2]) <= _CRITERIA.right_rad)
         return {
             'kidnapped_at_s': self._carried_s,
             'detected_after_s': after(self._carried_s, self._detected_s),
@@ -96,11 +110,12 @@ class Kidnapping:
         robot = loop.simulation.robot
         patch = loop.pipeline.grid.known_area()
         at = patch.frame.centres_of(np.argwhere(patch.free))
-        at = at[np.hypot(*(at - robot.T_world_base[:2]).T) >= _FAR_M]
-        fits = [world.is_clear(x, y, robot.config.radius_m + _MARGIN_M) for x, y in at.tolist()]
+        at = at[np.hypot(*(at - robot.T_world_base[:2]).T) >= _CRITERIA.far_m]
+        clearance_m = robot.config.radius_m + _CRITERIA.margin_m
+        fits = [world.is_clear(x, y, clearance_m) for x, y in at.tolist()]
         if not any(fits):
             raise InputError(
-                f'--kidnap-at={self._at_s:g}: no mapped place is {_FAR_M:g} m away: '
+                f'--kidnap-at={self._at_s:g}: no mapped place is {_CRITERIA.far_m:g} m away: '
                 'expected a later time'
             )
         rng = np.random.default_rng(self._seed)

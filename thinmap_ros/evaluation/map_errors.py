@@ -11,10 +11,22 @@ from thinmap_ros.sim.surfaces import surfaces
 from thinmap_ros.sim.world import World
 from thinmap_ros.view.plots import MapLayer, Panel, Raster, Segments
 
-_MIN_LENGTH_M = 0.2
-_SPACING_M = 0.05
-_FOUND_M = 0.2
-_SHOWN_M = 0.3
+
+@dataclass(frozen=True)
+class _Distances:
+    """How surfaces are compared with occupied cells, m.
+
+    min_length: of a surface. spacing: of the points on it. found: largest distance of a point that
+    is found from an occupied cell. shown: largest error in the colour scale of the picture.
+    """
+
+    min_length: float
+    spacing: float
+    found: float
+    shown: float
+
+
+_METRES = _Distances(min_length=0.2, spacing=0.05, found=0.2, shown=0.3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,13 +57,13 @@ def map_error(patch: GridPatch, world: World) -> MapError:
     at = world.frame.cells_of(patch.frame.centres_of(cells))
     at = np.clip(at, 0, np.array(world.occupied.shape) - 1)
     off_m[cells[:, 0], cells[:, 1]] = to_solid_m[at[:, 0], at[:, 1]]
-    points = _points_on(surfaces(world, _MIN_LENGTH_M))
+    points = _points_on(surfaces(world, _METRES.min_length))
     to_cell_m = ndimage.distance_transform_edt(np.pad(~patch.occupied, 1, constant_values=True))[
         1:-1, 1:-1
     ]
     inside = patch.contains(points)
     there = patch.frame.cells_of(points[inside])
-    near = to_cell_m[there[:, 0], there[:, 1]] * patch.frame.resolution <= _FOUND_M
+    near = to_cell_m[there[:, 0], there[:, 1]] * patch.frame.resolution <= _METRES.found
     return MapError(off_m, patch, float(near.sum() / len(points)))
 
 
@@ -62,7 +74,7 @@ def panels(error: MapError, world: World) -> list[Panel]:
     (left, bottom) = corners.min(axis=0) - 0.5
     (right, top) = corners.max(axis=0) + 0.5
     limits = (left, right, bottom, top)
-    raster = Raster(error.off_m, error.patch.frame, 'cell off by (m)', (0.0, _SHOWN_M))
+    raster = Raster(error.off_m, error.patch.frame, 'cell off by (m)', (0.0, _METRES.shown))
     return [
         Panel([Segments(lines)], '(a) the world (CAD data)', limits=limits),
         Panel([MapLayer(error.patch)], '(b) grid map', limits=limits),
@@ -94,6 +106,6 @@ def _points_on(lines: Array) -> Array:
     """Points (N, 2) along segments (M, 4)."""
     parts = []
     for line in lines:
-        count = max(2, round(float(np.hypot(*(line[2:] - line[:2]))) / _SPACING_M))
+        count = max(2, round(float(np.hypot(*(line[2:] - line[:2]))) / _METRES.spacing))
         parts.append(line[:2] + np.linspace(0.0, 1.0, count)[:, None] * (line[2:] - line[:2]))
     return np.concatenate(parts)

@@ -46,6 +46,11 @@ def relative_saving(
     return np.array([ours[pair][key] / others[pair][key] - 1.0 for pair in common])
 
 
+def half_interval_95(values: Array) -> float:
+    """Half the width of the 95 % confidence interval of the mean of two or more values (N,)."""
+    return float(_NORMAL_95 * values.std(ddof=1) / np.sqrt(len(values)))
+
+
 def _row(name: str, runs: list[Report]) -> str:
     coverage = [run['coverage'] for run in runs]
     speed = sum(run['time'] for run in runs) / max(sum(run['cpu_s'] for run in runs), 1e-9)
@@ -77,11 +82,7 @@ def _paired(
     shares = {key: relative_saving(ours, others, key) for key in ('distance', 'time', 'turned_rad')}
     cells = []
     for values in shares.values():
-        half = (
-            f' ± {_NORMAL_95 * values.std(ddof=1) / np.sqrt(len(values)):.1%}'
-            if len(values) > 1
-            else ''
-        )
+        half = f' ± {half_interval_95(values):.1%}' if len(values) > 1 else ''
         cells.append(f'{values.mean():+.1%}{half}' if len(values) else '')
     distances = shares['distance']
     return (

@@ -26,13 +26,31 @@ from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import Simulation
 from thinmap_ros.sim.world import World
 
-SPEED_M_S = 0.2  # of all three papers
-# A step of global localization: at 0.5 m/s and 5 Hz, up to 0.3 m.
-LOST_STEPS = 15
-LOST_STEP_SCANS = 3
 TRUTH_TOPIC = '/ground_truth'
-_SCANS_PER_STOP = 4
-_EXPLORE_LIMIT_S = 1000.0
+
+
+@dataclass(frozen=True)
+class _Setup:
+    """Speed and length of the simulated drives.
+
+    speed_m_s: of all three papers. scans_per_stop: in each direction. lost_steps: of a lost robot.
+    scans_per_lost_step: at 0.5 m/s and 5 Hz, up to 0.3 m.
+    """
+
+    speed_m_s: float
+    scans_per_stop: int
+    lost_steps: int
+    scans_per_lost_step: int
+    exploration_limit_s: float
+
+
+SETUP = _Setup(
+    speed_m_s=0.2,
+    scans_per_stop=4,
+    lost_steps=15,
+    scans_per_lost_step=3,
+    exploration_limit_s=1000.0,
+)
 
 
 def world_of(name: str) -> World:
@@ -63,7 +81,8 @@ def _tour(recipe: Recipe, seed: int) -> Iterator[DriveSample]:
     world = world_of(recipe.world)
     robot = PRESETS[recipe.robot]
     simulation = Simulation(world, world.start, robot, LaserScannerConfig(), seed)
-    return drive(simulation, tour_paths(world, tour_of(recipe.world), robot.radius_m), SPEED_M_S)
+    paths = tour_paths(world, tour_of(recipe.world), robot.radius_m)
+    return drive(simulation, paths, SETUP.speed_m_s)
 
 
 def _stops(recipe: Recipe, seed: int) -> Iterator[DriveSample]:
@@ -73,7 +92,7 @@ def _stops(recipe: Recipe, seed: int) -> Iterator[DriveSample]:
     stamp_ns = 0
     for x, y in tour_of(recipe.world):
         for heading in (0.0, np.pi):
-            for _ in range(_SCANS_PER_STOP):
+            for _ in range(SETUP.scans_per_stop):
                 T = se2.pose(float(x), float(y), heading)
                 yield DriveSample(laser.scan(world, T, stamp_ns), T, T)
                 stamp_ns += 200_000_000
@@ -83,7 +102,7 @@ def _lost(recipe: Recipe, seed: int) -> Iterator[DriveSample]:
     """From the paper's place to random ones, for as long as the localization lasts."""
     world = world_of(recipe.world)
     samples = random_drive(world, world.start, seed)
-    return (next(samples) for _ in range(1 + LOST_STEPS * LOST_STEP_SCANS))
+    return (next(samples) for _ in range(1 + SETUP.lost_steps * SETUP.scans_per_lost_step))
 
 
 class _Watched:
@@ -111,14 +130,14 @@ class _Watched:
 def _exploration(recipe: Recipe, seed: int) -> Iterator[DriveSample]:
     world = world_of(recipe.world)
     loop = make_loop(
-        world, world.start, Options(seed=seed, robot=recipe.robot, speed_m_s=SPEED_M_S)
+        world, world.start, Options(seed=seed, robot=recipe.robot, speed_m_s=SETUP.speed_m_s)
     )
     watched = _Watched(loop.strategy, loop.simulation)
     loop.strategy = watched
     goal = observable_cells(
         world, world.start, PRESETS[recipe.robot].radius_m, LaserScannerConfig().range_max_m
     )
-    loop.run(goal, _EXPLORE_LIMIT_S, no_progress)
+    loop.run(goal, SETUP.exploration_limit_s, no_progress)
     return iter(watched.samples)
 
 

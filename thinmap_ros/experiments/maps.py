@@ -5,14 +5,14 @@ from collections.abc import Iterable
 import numpy as np
 
 from thinmap_ros.core.grid.frame import GridFrame
-from thinmap_ros.core.grid.occupancy import OccupancyGrid
+from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.experiments.drives import world_of
 from thinmap_ros.sim.drives import DriveSample
 from thinmap_ros.sim.surfaces import inside_of
 from thinmap_ros.sim.world import World
 
-CELL_M = 0.1
+CELL_M = OccupancyConfig().resolution_m
 
 
 def grid_of(samples: Iterable[DriveSample]) -> OccupancyGrid:

@@ -6,6 +6,7 @@ load the kernels of others.
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,15 +18,52 @@ from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
-_CELL_M = 0.1
-_RANGE_M = 8.0
-_BEAMS = 181
-_ROOM_CELLS = 80
-_PASSAGE = slice(30, 50)
-_SCANS = 12
-_PERIOD_S = 0.2
-_STEP_M = 0.12
-_TURN_RAD = 0.11
+
+@dataclass(frozen=True)
+class _Rehearsal:
+    """The room and the drive through it.
+
+    room_cells: side of the room. passage: rows of the passage to unknown space. range_m, beams: of
+    the laser, which sees 180 degrees. scans: number, one each period_s. step_m, turn_rad: motion
+    between two scans.
+    """
+
+    cell_m: float
+    room_cells: int
+    passage: slice
+    range_m: float
+    beams: int
+    scans: int
+    period_s: float
+    step_m: float
+    turn_rad: float
+
+    @property
+    def beam_angles(self) -> Array:
+        """Angles of the beams in the laser frame, rad (N,)."""
+        return self.beam_step_rad * np.arange(self.beams, dtype=np.float64) - np.pi / 2.0
+
+    @property
+    def beam_step_rad(self) -> float:
+        """Angle between two beams, rad."""
+        return float(np.radians(180.0 / (self.beams - 1)))
+
+    def stamp_ns(self, number: int) -> int:
+        """Stamp of a scan."""
+        return round(1e9 * self.period_s * number)
+
+
+_REHEARSAL = _Rehearsal(
+    cell_m=0.1,
+    room_cells=80,
+    passage=slice(30, 50),
+    range_m=8.0,
+    beams=181,
+    scans=12,
+    period_s=0.2,
+    step_m=0.12,
+    turn_rad=0.11,
+)
 
 
 def localizer() -> None:
@@ -91,7 +129,7 @@ def navigator() -> None:
     rehearsed = Navigator()
     rehearsed.set_goal(4.0, 3.0, 0.0)
     for scan, T_map_base in _drive():
-        rehearsed.step(T_map_base, patch, scan, _PERIOD_S)
+        rehearsed.step(T_map_base, patch, scan, _REHEARSAL.period_s)
 
 
 def global_localizer() -> None:
@@ -107,34 +145,41 @@ def global_localizer() -> None:
 
 def _room() -> GridPatch:
     """A room with a pillar, and a passage to unknown space."""
-    cells = np.zeros((_ROOM_CELLS, _ROOM_CELLS), dtype=np.int8)
+    cells = np.zeros((_REHEARSAL.room_cells, _REHEARSAL.room_cells), dtype=np.int8)
     cells[[0, -1]] = 100
     cells[:, [0, -1]] = 100
     cells[40:46, 40:46] = 100
-    cells[_PASSAGE, -1] = 0
+    cells[_REHEARSAL.passage, -1] = 0
     cells[:, -20:-1] = UNKNOWN
-    return GridPatch(GridFrame(0.0, 0.0, _CELL_M), cells)
+    return GridPatch(GridFrame(0.0, 0.0, _REHEARSAL.cell_m), cells)
 
 
 def _odd_scan() -> Scan:
     """A scan of random ranges, which fits no room."""
-    step = np.radians(180.0 / (_BEAMS - 1))
-    ranges = 1.0 + np.arange(_BEAMS) * 0.37 % 3.0
-    stamp_ns = round(1e9 * _PERIOD_S * _SCANS)
-    return Scan.create(stamp_ns, ranges, -np.pi / 2.0, float(step), 0.05, _RANGE_M)
+    beams = np.arange(_REHEARSAL.beams, dtype=np.float64)
+    return _scan(_REHEARSAL.scans, 1.0 + beams * 0.37 % 3.0)
 
 
 def _drive() -> Iterator[tuple[Scan, Array]]:
     """Scans along an arc through the room, each with its pose (3,)."""
     occupied = _room().occupied.astype(np.uint8)
-    step = np.radians(180.0 / (_BEAMS - 1))
-    angles = step * np.arange(_BEAMS) - np.pi / 2.0
+    cell_m = _REHEARSAL.cell_m
+    step = se2.pose(_REHEARSAL.step_m, 0.0, _REHEARSAL.turn_rad)
     T_map_base = se2.pose(2.0, 2.0, 0.3)
-    for k in range(_SCANS):
-        x, y = T_map_base[:2] / _CELL_M
-        ranges = _CELL_M * cast_rays(occupied, x, y, angles + T_map_base[2], _RANGE_M / _CELL_M)
-        scan = Scan.create(
-            round(1e9 * _PERIOD_S * k), ranges, float(angles[0]), float(step), 0.05, _RANGE_M
-        )
-        yield scan, T_map_base
-        T_map_base = se2.compose(T_map_base, se2.pose(_STEP_M, 0.0, _TURN_RAD))
+    for k in range(_REHEARSAL.scans):
+        x, y = T_map_base[:2] / cell_m
+        angles = _REHEARSAL.beam_angles + T_map_base[2]
+        ranges = cell_m * cast_rays(occupied, x, y, angles, _REHEARSAL.range_m / cell_m)
+        yield _scan(k, ranges), T_map_base
+        T_map_base = se2.compose(T_map_base, step)
+
+
+def _scan(number: int, ranges: Array) -> Scan:
+    return Scan.create(
+        _REHEARSAL.stamp_ns(number),
+        ranges,
+        -np.pi / 2.0,
+        _REHEARSAL.beam_step_rad,
+        0.05,
+        _REHEARSAL.range_m,
+    )

@@ -26,11 +26,25 @@ from thinmap_ros.ros.lockstep import NONE, TIMEOUT_DESCRIPTION, TIMEOUT_S, TOPIC
 from thinmap_ros.ros.messages import message_class
 from thinmap_ros.ros.services import fill_response
 
-_TICK_S = 0.002
-_CLOCK_PERIOD_S = 0.02
-_ACKNOWLEDGE = Duration(seconds=1.0)
-_SETTLE_S = 0.5
 _SCAN = 'sensor_msgs/msg/LaserScan'
+
+
+@dataclass(frozen=True)
+class _Times:
+    """Periods and delays of the player, s.
+
+    tick: between two looks for messages that are due. clock: between two messages on /clock, at
+    most. settle: from the subscription to the scans to the first message. acknowledge: wait for
+    the acknowledgement of the last messages, at most.
+    """
+
+    tick: float
+    clock: float
+    settle: float
+    acknowledge: float
+
+
+_SECONDS = _Times(tick=0.002, clock=0.02, settle=0.5, acknowledge=1.0)
 
 
 @dataclass(frozen=True)
@@ -73,7 +87,7 @@ class _ClockPublisher:
         self._topic.publish(ClockMsg(clock=messages.time_msg(ns)))
 
     def publish_if_due(self, ns: int, now_s: float) -> None:
-        if now_s - self._last_s > _CLOCK_PERIOD_S:
+        if now_s - self._last_s > _SECONDS.clock:
             self._last_s = now_s
             self.publish(ns)
 
@@ -114,12 +128,12 @@ class BagPlayerNode(Node):
         self.finished = False
         self.create_service(SetBool, '~/pause', self._on_pause)
         self.create_service(Trigger, '~/step', self._on_step)
-        self.create_timer(_TICK_S, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.create_timer(_SECONDS.tick, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def close(self) -> None:
         """Wait until the last messages are acknowledged, and log how many were sent."""
         for publisher in self._publishers_by_topic.values():
-            publisher.wait_for_all_acked(_ACKNOWLEDGE)
+            publisher.wait_for_all_acked(Duration(seconds=_SECONDS.acknowledge))
         counts = sorted(self._sent.items())
         parts = ', '.join(f'{topic} {count}' for topic, count in counts) or 'nothing'
         self.get_logger().info(f'{self._config.bag}: {self._sent.total()} messages sent: {parts}')
@@ -166,7 +180,7 @@ class BagPlayerNode(Node):
         self._last_tick_s = now_s
         if self._start_s is None:
             # A node that subscribes to the scans discovers the other topics a moment later.
-            self._start_s = now_s + _SETTLE_S if self._has_subscribers() else None
+            self._start_s = now_s + _SECONDS.settle if self._has_subscribers() else None
         if self._start_s is None or now_s < self._start_s:
             return
         # Time spent waiting does not count: the messages keep their intervals.

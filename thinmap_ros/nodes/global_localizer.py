@@ -23,7 +23,11 @@ from thinmap_ros.core.places.global_localizer import (
     Result,
     State,
 )
-from thinmap_ros.core.planning.navigator import NavigatorConfig
+from thinmap_ros.core.planning.navigator import (
+    CONTROL_PERIOD_S,
+    SENSOR_TIMEOUT_NS,
+    NavigatorConfig,
+)
 from thinmap_ros.core.planning.path_follower import PathFollowerConfig
 from thinmap_ros.core.planning.wavefront import WavefrontConfig
 from thinmap_ros.core.scan import Scan
@@ -35,11 +39,8 @@ from thinmap_ros.kernels import warm_up
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.subscription import subscribe_guarded
+from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
 
-_WARN_PERIOD_S = 5.0
-_CONTROL_PERIOD_S = 0.1
-_TIMEOUT_NS = 400_000_000
 _SAMPLES_PERIOD_NS = 1_000_000_000
 # Margins added to the radius of the robot: for paths, and for stops in front of obstacles.
 _PATH_MARGIN_M = 0.05
@@ -165,7 +166,7 @@ class _SearchDriver:
         if not self._is_recent(self._scan.stamp_ns):
             self.stop()
             return
-        command = self.search.step(self._T_odom_base, self._scan, _CONTROL_PERIOD_S)
+        command = self.search.step(self._T_odom_base, self._scan, CONTROL_PERIOD_S)
         if command.state == 'idle':
             self.stop()
             return
@@ -180,7 +181,7 @@ class _SearchDriver:
 
     def _is_recent(self, scan_ns: int) -> bool:
         odometry_age_ns = int(self._clock.now().nanoseconds) - self._odometry_ns
-        return max(abs(self._odometry_ns - scan_ns), odometry_age_ns) <= _TIMEOUT_NS
+        return max(abs(self._odometry_ns - scan_ns), odometry_age_ns) <= SENSOR_TIMEOUT_NS
 
 
 class _LocalizationPublishers:
@@ -231,7 +232,7 @@ class _LocalizationPublishers:
     def _publish_status(self, status: LocalizationStatus) -> None:
         self._status.publish(status)
         if status.state == LocalizationStatus.WAITING:
-            self._node.get_logger().warning(status.reason, throttle_duration_sec=_WARN_PERIOD_S)
+            self._node.get_logger().warning(status.reason, throttle_duration_sec=WARN_PERIOD_S)
 
 
 class GlobalLocalizerNode(ThinmapNode):
@@ -269,7 +270,7 @@ class GlobalLocalizerNode(ThinmapNode):
         if not self._settings.node.drive:
             return _SearchDriver(self.get_clock(), lambda command: None)
         cmd_vel = self.create_publisher(Twist, 'cmd_vel', qos.STREAM)
-        self.create_active_timer(_CONTROL_PERIOD_S, lambda: self._driver.step())
+        self.create_active_timer(CONTROL_PERIOD_S, lambda: self._driver.step())
         return _SearchDriver(self.get_clock(), cmd_vel.publish)
 
     def reset_state(self) -> None:

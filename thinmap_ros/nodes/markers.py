@@ -1,6 +1,7 @@
 """Graph, end nodes and line features as markers, for RViz and Foxglove."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -16,17 +17,23 @@ from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import subscribe_guarded
 from thinmap_ros.view import palette
 
-_EDGE_M = 0.04
-_NODE_M = 0.2
-_LINE_M = 0.06
-_TEXT_M = 0.3
-_EDGE_Z = 0.02
-_NODE_Z = 0.05
-_LINE_Z = 0.04
-_TEXT_Z = 0.4
 _END = palette.NODES[NodeKind.END]
 _REMOTE = '#999999'
-_TEXT = '#000000'
+_TEXT_COLOUR = '#000000'
+
+
+@dataclass(frozen=True)
+class _Style:
+    """Size of a kind of marker, and its height above the map."""
+
+    size_m: float
+    z_m: float
+
+
+_EDGE = _Style(size_m=0.04, z_m=0.02)
+_LINE = _Style(size_m=0.06, z_m=0.04)
+_NODE = _Style(size_m=0.2, z_m=0.05)
+_TEXT = _Style(size_m=0.3, z_m=0.4)
 
 
 class MarkersNode(ThinmapNode):
@@ -52,14 +59,14 @@ def topology(message: TopologicalMap) -> MarkerArray:
     Raises InputError as `topology_from_msg`.
     """
     graph = messages.topology_from_msg(message)
-    edges = _marker(message.header, 'edges', Marker.LINE_LIST, _EDGE_M, palette.EDGE)
+    edges = _marker(message.header, 'edges', Marker.LINE_LIST, _EDGE.size_m, palette.EDGE)
     for edge in graph.edges.values():
-        points = [_point(float(x), float(y), _EDGE_Z) for x, y in edge.path]
+        points = [_point(float(x), float(y), _EDGE.z_m) for x, y in edge.path]
         for start, end in pairwise(points):
             edges.points += [start, end]
-    nodes = _marker(message.header, 'nodes', Marker.SPHERE_LIST, _NODE_M, palette.EDGE)
+    nodes = _marker(message.header, 'nodes', Marker.SPHERE_LIST, _NODE.size_m, palette.EDGE)
     for node in graph.nodes.values():
-        nodes.points.append(_point(node.x, node.y, _NODE_Z))
+        nodes.points.append(_point(node.x, node.y, _NODE.z_m))
         nodes.colors.append(_colour(palette.NODES[node.kind]))
     return _shown([edges, nodes])
 
@@ -79,16 +86,18 @@ def end_nodes(message: EndNodeArray) -> MarkerArray:
             message.header,
             'end_nodes',
             Marker.SPHERE,
-            _NODE_M * (2.0 if node.is_target else 1.2),
+            _NODE.size_m * (2.0 if node.is_target else 1.2),
             _END,
         )
         ball.id = len(markers)
         ball.color.a = 0.3 + 0.7 * node.position_probability
-        ball.pose.position = _point(node.position.x, node.position.y, _NODE_Z)
-        text = _marker(message.header, 'probabilities', Marker.TEXT_VIEW_FACING, _TEXT_M, _TEXT)
+        ball.pose.position = _point(node.position.x, node.position.y, _NODE.z_m)
+        text = _marker(
+            message.header, 'probabilities', Marker.TEXT_VIEW_FACING, _TEXT.size_m, _TEXT_COLOUR
+        )
         text.id = len(markers)
         text.text = f'{node.position_probability:.2f}'
-        text.pose.position = _point(node.position.x, node.position.y, _TEXT_Z)
+        text.pose.position = _point(node.position.x, node.position.y, _TEXT.z_m)
         markers += [ball, text]
     return _shown(markers)
 
@@ -98,13 +107,13 @@ def line_features(message: LineFeatureArray) -> MarkerArray:
 
     Raises InputError where an end point is out of range.
     """
-    lines = _marker(message.header, 'lines', Marker.LINE_LIST, _LINE_M, palette.ESTIMATE)
+    lines = _marker(message.header, 'lines', Marker.LINE_LIST, _LINE.size_m, palette.ESTIMATE)
     for feature in message.features:
         ends = (feature.start, feature.end)
         validation.require_bounded(
             f'line {feature.id}', [c for end in ends for c in (end.x, end.y)]
         )
-        lines.points += [_point(end.x, end.y, _LINE_Z) for end in ends]
+        lines.points += [_point(end.x, end.y, _LINE.z_m) for end in ends]
         lines.colors += 2 * [_colour(palette.ESTIMATE if feature.in_local_area else _REMOTE)]
     return _shown([lines])
 

@@ -11,7 +11,13 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.map_mirror import MapMirror
 from thinmap_ros.core.odometry import OdometryBuffer
-from thinmap_ros.core.planning.navigator import Command, Navigator, NavigatorConfig
+from thinmap_ros.core.planning.navigator import (
+    CONTROL_PERIOD_S,
+    SENSOR_TIMEOUT_NS,
+    Command,
+    Navigator,
+    NavigatorConfig,
+)
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.kernels import warm_up
@@ -20,13 +26,14 @@ from thinmap_ros.ros.action_server import Outcome, SingleGoalServer
 from thinmap_ros.ros.diagnostics import OK, WARN
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.subscription import subscribe_guarded
+from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
 
-_WARN_PERIOD_S = 5.0
-_CONTROL_PERIOD_S = 0.1
-_TIMEOUT_NS = 400_000_000  # with the control period: a stop within half a second
 # Without a new pose the last correction of the odometry holds for a while.
-_TIMEOUTS_NS = {'laser': _TIMEOUT_NS, 'odometry': _TIMEOUT_NS, 'localizer': 3_000_000_000}
+_TIMEOUTS_NS = {
+    'laser': SENSOR_TIMEOUT_NS,
+    'odometry': SENSOR_TIMEOUT_NS,
+    'localizer': 3_000_000_000,
+}
 
 
 class _RobotState:
@@ -71,7 +78,7 @@ class _RobotState:
         """Why the robot must not drive on; '' for no reason."""
         if self._is_blind:
             return 'laser blind (too few valid beams)'
-        if self._scan_age_ns() > _TIMEOUT_NS:
+        if self._scan_age_ns() > SENSOR_TIMEOUT_NS:
             return 'laser silent'
         now_ns = self._clock.now().nanoseconds
         for source, limit_ns in _TIMEOUTS_NS.items():
@@ -109,7 +116,7 @@ class NavigatorNode(ThinmapNode):
         self._goals = SingleGoalServer(
             self, NavigateToPose, 'navigate_to_pose', self._on_goal, self._on_cancel, _preempted
         )
-        self.create_active_timer(_CONTROL_PERIOD_S, self._control)
+        self.create_active_timer(CONTROL_PERIOD_S, self._control)
 
     def reset_state(self) -> None:
         """Discard the map and the pose of the robot."""
@@ -200,7 +207,7 @@ class NavigatorNode(ThinmapNode):
         """
         if fault := self._robot.stop_reason():
             reason = f'{fault}: standing still'
-            self.get_logger().warning(reason, throttle_duration_sec=_WARN_PERIOD_S)
+            self.get_logger().warning(reason, throttle_duration_sec=WARN_PERIOD_S)
             self.diagnostics.set_state(WARN, reason)
             self._navigator.reset_velocity()
             return Command(0.0, 0.0, 'blocked', reason)
@@ -210,12 +217,12 @@ class NavigatorNode(ThinmapNode):
         if patch is None or scan is None or T_map_base is None:
             self.get_logger().warning(
                 'goal waits: no map, scan, pose or odometry yet',
-                throttle_duration_sec=_WARN_PERIOD_S,
+                throttle_duration_sec=WARN_PERIOD_S,
             )
             return None
         self.diagnostics.set_state(OK, 'driving')
         with self.diagnostics.time_step('navigator'):
-            return self._navigator.step(T_map_base, patch, scan, _CONTROL_PERIOD_S)
+            return self._navigator.step(T_map_base, patch, scan, CONTROL_PERIOD_S)
 
     def _publish_plan(self) -> None:
         path = self._navigator.path

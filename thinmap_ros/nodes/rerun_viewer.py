@@ -24,11 +24,11 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.ros import node_main, parameters, qos
 from thinmap_ros.ros.diagnostics import NodeDiagnostics
 from thinmap_ros.ros.laser_transform import LaserTransform
+from thinmap_ros.ros.subscription import WARN_PERIOD_S
 from thinmap_ros.view.message_view import MessageView
 from thinmap_ros.view.null_view import NullView
 from thinmap_ros.view.rerun_view import View
 
-_WARN_PERIOD_S = 5.0
 _TOPICS = {
     'map': (OccupancyGrid, qos.LATCHED),
     'scan': (LaserScan, qos.SENSOR),
@@ -87,7 +87,7 @@ class RerunViewerNode(Node):
                 self._feed.show(topic, message)
             except InputError as error:
                 self._diagnostics.message_rejected(topic, str(error))
-                self.get_logger().warning(f'{topic}: {error}', throttle_duration_sec=_WARN_PERIOD_S)
+                self.get_logger().warning(f'{topic}: {error}', throttle_duration_sec=WARN_PERIOD_S)
 
         return process
 

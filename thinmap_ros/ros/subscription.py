@@ -14,7 +14,7 @@ from sensor_msgs.msg import LaserScan
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 
-_LOG_PERIOD_S = 5.0
+WARN_PERIOD_S = 5.0  # between two warnings of the same kind
 _TIMEOUT_S = 3.0
 _MAX_GAP_NS = 5_000_000_000  # longer gaps are pauses of the sensor, no losses
 
@@ -46,7 +46,7 @@ class _GuardedSubscription:
         self._is_scan = kind is LaserScan
         self._is_latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
         self._latched_message: Any = None
-        self._logged_s = -_LOG_PERIOD_S
+        self._logged_s = -WARN_PERIOD_S
         self._last_ns = 0
         self._time_jumps = 0
         self._losses = MessageLossCounter()
@@ -98,7 +98,7 @@ class _GuardedSubscription:
             self._process(message)
         except InputError as error:
             self._node.diagnostics.message_rejected(self._topic, str(error))
-            if monotonic() - self._logged_s >= _LOG_PERIOD_S:
+            if monotonic() - self._logged_s >= WARN_PERIOD_S:
                 self._logged_s = monotonic()
                 self._node.get_logger().warning(f'{self._topic}: {error}')
 

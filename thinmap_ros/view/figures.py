@@ -15,6 +15,7 @@ from thinmap_ros.view import palette
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+DPI = 110
 _GREY = 204  # of 255: unknown cells
 _SMALL_COLOURS = 64
 # Each kind of node has its own shape and colour.
@@ -36,7 +37,7 @@ def summary_figure(
     height, width = (count * patch.frame.resolution for count in patch.shape)
     scale = 9.0 / max(height, width)
     figure = Figure(
-        figsize=(width * scale + 1.2, height * scale + 1.6), dpi=110, layout='constrained'
+        figsize=(width * scale + 1.2, height * scale + 1.6), dpi=DPI, layout='constrained'
     )
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
@@ -137,7 +138,7 @@ def coverage_figure(path: Path, reports: list[dict[str, Any]]) -> None:
         unit = max(float(np.mean(lengths[report['world'], report['start_number']])), 1e-9)
         _, along, coverage = np.array(report['curve']).T
         curves[report['strategy']].append(np.interp(shares * unit, along, coverage))
-    figure = Figure(figsize=(8.0, 5.0), dpi=110, layout='constrained')
+    figure = Figure(figsize=(8.0, 5.0), dpi=DPI, layout='constrained')
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     for strategy, runs in sorted(curves.items()):

@@ -11,7 +11,7 @@ import numpy as np
 
 from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.view import palette
-from thinmap_ros.view.figures import draw_graph, draw_map
+from thinmap_ros.view.figures import DPI, draw_graph, draw_map
 from thinmap_ros.view.plots import (
     Band,
     Bars,
@@ -30,9 +30,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Dots and margin, in inches
-_DPI = 110
-_PAD = 0.1
+_PAD = 0.1  # inches
 _MANY = 2000  # maximum number of points, to limit the size of an SVG
 # Text stays text in an SVG, and its ids do not change from run to run.
 _SETTINGS: Any = {
@@ -52,7 +50,7 @@ def write_plot(folder: Path, plot: Plot) -> None:
     rows = -(-len(plot.panels) // plot.columns)
     width, height = plot.panel_inches
     with matplotlib.rc_context(_SETTINGS):
-        figure = Figure(figsize=(width * plot.columns, height * rows + 0.3), dpi=_DPI)
+        figure = Figure(figsize=(width * plot.columns, height * rows + 0.3), dpi=DPI)
         figure.set_layout_engine('constrained', h_pad=_PAD, w_pad=_PAD)
         FigureCanvasAgg(figure)
         for axes, panel in zip(

@@ -1,6 +1,7 @@
 """Layout of a view in rerun: the map, curves beside it, and a legend below them."""
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 from thinmap_ros.core.grid.patch import GridPatch
@@ -8,12 +9,7 @@ from thinmap_ros.view import palette
 from thinmap_ros.view.rerun_sinks import TIMELINE
 
 UNKNOWN_GREY = 205
-_ASPECT = 1.3  # width over height of the map's part of the window, or less
-_HALF_VIEW = math.radians(55.0) / 2.0  # vertical field of view of rerun's camera
-_TILT = 0.25  # horizontal offset of the camera to the south, as a share of its height
-_MARGIN = 1.15
-_WIDTHS = (5, 2)
-_HEIGHTS = (3, 3, 3, 3, 3)
+_WIDTHS = (5, 2)  # of the map and of what stands beside it
 LEGEND = """**orange** end node, with its position probability; **grey** it will stay ·
 **dark blue** branch · **amber** corner · **green** skeleton ·
 **blue** features of the local area, its nodes ringed;
@@ -29,6 +25,24 @@ _PLOTS = {
         ('localizer', 'map update', 'graph update', 'explorer', 'global localization'),
     ),
 }
+
+
+@dataclass(frozen=True)
+class _Camera:
+    """The camera above the map.
+
+    aspect: width over height of the map's part of the window, or less. half_view_rad: half of the
+    vertical field of view of rerun's camera. tilt: horizontal offset to the south, as a share of
+    the height. margin: size of the picture over that of the map.
+    """
+
+    aspect: float
+    half_view_rad: float
+    tilt: float
+    margin: float
+
+
+_CAMERA = _Camera(aspect=1.3, half_view_rad=math.radians(27.5), tilt=0.25, margin=1.15)
 
 
 def entity(plot: str, curve: str) -> str:
@@ -72,7 +86,7 @@ def blueprint(rr: Any, patch: GridPatch, trails: list[str]) -> Any:
         for plot, (name, _) in _PLOTS.items()
     ]
     legend = rrb.TextDocumentView(origin='legend', name='colours')
-    beside = rrb.Vertical(*curves, legend, row_shares=_HEIGHTS)
+    beside = rrb.Vertical(*curves, legend)
     layout = rrb.Horizontal(scene, beside, column_shares=_WIDTHS)
     # At the newest time: a live view follows, and a file opens at its end.
     time = rrb.TimePanel(state='collapsed', play_state='following')
@@ -83,7 +97,7 @@ def blueprint(rr: Any, patch: GridPatch, trails: list[str]) -> Any:
 def size_m(patch: GridPatch) -> float:
     """Size of a map that determines the distance of the camera."""
     rows, cols = patch.shape
-    return patch.frame.resolution * max(rows, cols / _ASPECT)
+    return patch.frame.resolution * max(rows, cols / _CAMERA.aspect)
 
 
 def _eye(rrb: Any, patch: GridPatch) -> Any:
@@ -92,7 +106,9 @@ def _eye(rrb: Any, patch: GridPatch) -> Any:
     frame = patch.frame
     x = frame.origin_x + frame.resolution * cols / 2.0
     y = frame.origin_y + frame.resolution * rows / 2.0
-    height = _MARGIN * size_m(patch) / (2.0 * math.tan(_HALF_VIEW))
+    height = _CAMERA.margin * size_m(patch) / (2.0 * math.tan(_CAMERA.half_view_rad))
     return rrb.EyeControls3D(
-        position=(x, y - _TILT * height, height), look_target=(x, y, 0.0), eye_up=(0.0, 0.0, 1.0)
+        position=(x, y - _CAMERA.tilt * height, height),
+        look_target=(x, y, 0.0),
+        eye_up=(0.0, 0.0, 1.0),
     )

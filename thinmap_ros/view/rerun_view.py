@@ -1,6 +1,7 @@
 """Shows core values in rerun, live or in an .rrd file."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +17,6 @@ from thinmap_ros.view.null_view import NullView
 from thinmap_ros.view.palette import rgb
 from thinmap_ros.view.rerun_sinks import RecordingSinks, library
 
-# Minimum period of large entities, and minimum step of trajectories: they limit the size of a
-# recording.
-_PERIOD_NS = 1_000_000_000
-_TRAIL_STEP_M = 0.05
-_OUTGROWN = 1.4  # the camera moves when the map has grown by this factor
-_OUTLINE = 33
-_SIGMA2_95 = 5.991  # chi-square, 95 %, 2 degrees of freedom
-# Wedge of the 95 % confidence interval of the heading
-_HEADING_M = 1.0
-_HEADING_SIGMAS = 1.96
 _ODOMETRY = '#777777'
 _SCAN = '#CC0000'
 _PLAN = '#F0E442'
@@ -34,7 +25,7 @@ _SAMPLE = '#7B3FA0'
 _LOCAL_LINE = '#0072B2'
 _LINE = '#8FBEDB'
 _LOCAL_NODE = '#0072B2'
-_STAYS = (125, 125, 125)  # an end node with position probability 1
+_STAYS = '#7D7D7D'  # an end node with position probability 1
 _TRAILS = {'estimate': palette.ESTIMATE, 'truth': palette.TRUTH, 'odometry': _ODOMETRY}
 # Heights above the map, m, in the order of importance.
 _Z = {
@@ -52,6 +43,37 @@ _Z = {
     'covariance': 0.11,
     'robot': 0.12,
 }
+
+
+@dataclass(frozen=True)
+class _Thresholds:
+    """When something is drawn; they limit the size of a recording.
+
+    period_ns: between two values of a large entity. trail_step_m: between two points of a
+    trajectory. growth: factor by which the map has grown when the camera moves.
+    """
+
+    period_ns: int
+    trail_step_m: float
+    growth: float
+
+
+@dataclass(frozen=True)
+class _Confidence:
+    """Outlines of the 95 % confidence regions of the position and of the heading.
+
+    chi_square: with 2 degrees of freedom. points: of the ellipse. sigmas: half the angle of the
+    wedge. wedge_m: its length.
+    """
+
+    chi_square: float
+    points: int
+    sigmas: float
+    wedge_m: float
+
+
+_DRAWN = _Thresholds(period_ns=1_000_000_000, trail_step_m=0.05, growth=1.4)
+_CONFIDENCE = _Confidence(chi_square=5.991, points=33, sigmas=1.96, wedge_m=1.0)
 
 
 class View(NullView):
@@ -107,7 +129,7 @@ class View(NullView):
 
         self._patch = patch
         self._throttled('grid', ns, draw)
-        if rerun_blueprint.size_m(patch) > _OUTGROWN * self._framed_m:
+        if rerun_blueprint.size_m(patch) > _DRAWN.growth * self._framed_m:
             self._frame(patch)
 
     def scan(self, ns: int, scan: Scan) -> None:
@@ -143,7 +165,7 @@ class View(NullView):
         """Extend a trajectory: `estimate`, `truth` or `odometry`."""
         here = np.array(T_map_base[:2])
         before = self._trail_ends.setdefault(name, here)
-        if np.hypot(*(here - before)) < _TRAIL_STEP_M:
+        if np.hypot(*(here - before)) < _DRAWN.trail_step_m:
             return
         self._trail_ends[name] = here
         self._at(ns)
@@ -301,7 +323,7 @@ class View(NullView):
         """Draw at most once a period; otherwise the newest value waits."""
         self._waiting[name] = (ns, draw)
         drawn = self._drawn_ns.get(name)
-        if drawn is None or abs(ns - drawn) >= _PERIOD_NS:
+        if drawn is None or abs(ns - drawn) >= _DRAWN.period_ns:
             self._draw(name)
 
     def _draw(self, name: str) -> None:
@@ -326,7 +348,8 @@ def _shade(patch: GridPatch) -> NDArray[np.uint8]:
 def _faded(colour: str, share: float) -> list[int]:
     """A colour, mixed with grey by a share, 0 to 1."""
     return [
-        round((1.0 - share) * c + share * grey) for c, grey in zip(rgb(colour), _STAYS, strict=True)
+        round((1.0 - share) * c + share * grey)
+        for c, grey in zip(rgb(colour), rgb(_STAYS), strict=True)
     ]
 
 
@@ -338,17 +361,17 @@ def _lifted(points: Array, z: float) -> NDArray[np.float32]:
 def _ellipse(centre: Array, covariance: Array) -> Array:
     """Outline (N, 2) of the 95 % confidence ellipse of a covariance (2, 2)."""
     values, vectors = np.linalg.eigh(covariance)
-    angles = np.linspace(0.0, 2.0 * np.pi, _OUTLINE)
-    axes = vectors * np.sqrt(_SIGMA2_95 * np.maximum(values, 0.0))
+    angles = np.linspace(0.0, 2.0 * np.pi, _CONFIDENCE.points)
+    axes = vectors * np.sqrt(_CONFIDENCE.chi_square * np.maximum(values, 0.0))
     return np.asarray(centre + np.column_stack([np.cos(angles), np.sin(angles)]) @ axes.T)
 
 
 def _wedge(T_map_base: Array, variance: float) -> Array:
     """Outline (3, 2) of the 95 % confidence wedge of the heading, given its variance."""
     x, y, theta = T_map_base.tolist()
-    spread = min(_HEADING_SIGMAS * np.sqrt(max(variance, 0.0)), np.pi)
+    spread = min(_CONFIDENCE.sigmas * np.sqrt(max(variance, 0.0)), np.pi)
     ends = [
-        (x + _HEADING_M * np.cos(theta + s), y + _HEADING_M * np.sin(theta + s))
+        (x + _CONFIDENCE.wedge_m * np.cos(theta + s), y + _CONFIDENCE.wedge_m * np.sin(theta + s))
         for s in (-spread, spread)
     ]
     return np.array([ends[0], (x, y), ends[1]])

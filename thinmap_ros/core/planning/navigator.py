@@ -22,6 +22,9 @@ from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
+# Of the nodes that drive the robot: a stop within half a second after the last scan or odometry.
+CONTROL_PERIOD_S = 0.1
+SENSOR_TIMEOUT_NS = 400_000_000
 _CHECK_AHEAD_M = 4.0
 _NARROW_AHEAD_M = 0.6
 _CREEP_M_S = 0.02

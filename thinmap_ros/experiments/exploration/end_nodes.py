@@ -1,10 +1,11 @@
 """Paper 2, Fig. 5 and 6: an end node moves until its surroundings are explored."""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
-from thinmap_ros.core.grid.occupancy import OccupancyGrid
+from thinmap_ros.core.grid.occupancy import OccupancyGrid, WindowConfig
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
@@ -24,13 +25,26 @@ from thinmap_ros.view.plots import (
     xy,
 )
 
-_WINDOW_M = 16.0
 _FIGURES = {'dead_end': 'Fig. 5', 'joined_hallways': 'Fig. 6'}
-_MOMENTS = (0.0, 0.6, 1.0)  # of the time until the node rests, or of the drive
-_AHEAD = np.array([0.0, 9.0])  # node A: the one nearest to the bend
-_JUMP_M = 3.0  # A is the end node nearest to where it was, if it is this near
-_RESTS_M = 0.2
-_MARGIN_M = 0.4
+
+
+@dataclass(frozen=True)
+class _Setup:
+    """Node A and the pictures.
+
+    shown: moments of the pictures, as shares of the drive. bend: x and y, m; A is at first the end
+    node nearest to it. jump_m: A continues as the nearest end node up to this distance.
+    rest_m: A rests within this distance of its final position. margin_m: around the world.
+    """
+
+    shown: tuple[float, ...]
+    bend: tuple[float, float]
+    jump_m: float
+    rest_m: float
+    margin_m: float
+
+
+_SETUP = _Setup(shown=(0.0, 0.6, 1.0), bend=(0.0, 9.0), jump_m=3.0, rest_m=0.2, margin_m=0.4)
 
 
 def run(source: Source) -> Outcome:
@@ -45,7 +59,7 @@ def run(source: Source) -> Outcome:
         line = np.array(track)
         ends[name] = (line, _rest(line))
         last = len(moments) - 1
-        shown = [moments[round(share * last)] for share in _MOMENTS]
+        shown = [moments[round(share * last)] for share in _SETUP.shown]
         caption = (
             f'Paper 2, {figure}: the topological map while the robot drives up the hallway; '
             'A is the end node that is followed.'
@@ -99,20 +113,21 @@ def _follow(source: Source, name: str) -> tuple[list[Moment], list[list[float]]]
     grid = OccupancyGrid()
     moments: list[Moment] = []
     track: list[list[float]] = []
-    at = _AHEAD
+    at = np.array(_SETUP.bend)
     travelled_m = 0.0
+    window_m = WindowConfig().local_map_size_m
     last = None
     for k, sample in enumerate(source.samples(name)):
         T = sample.T_world_base
         travelled_m += 0.0 if last is None else math.dist(T[:2], last[:2])
         last = T
         grid.add_scan(sample.scan, T)
-        builder.update(grid.window(float(T[0]), float(T[1]), _WINDOW_M), T)
+        builder.update(grid.window(float(T[0]), float(T[1]), window_m), T)
         places = np.array(
             [n.position for n in builder.map.nodes.values() if n.kind == NodeKind.END]
         ).reshape(-1, 2)
         away = np.hypot(*(places - at).T)
-        if away.min(initial=np.inf) <= _JUMP_M:
+        if away.min(initial=np.inf) <= _SETUP.jump_m:
             at = places[int(away.argmin())]
             seconds = sample.scan.stamp_ns / 1e9
             track.append([seconds, float(at[0]), float(at[1]), travelled_m])
@@ -123,9 +138,9 @@ def _follow(source: Source, name: str) -> tuple[list[Moment], list[list[float]]]
 
 def _limits(name: str) -> tuple[float, float, float, float]:
     """Bounds of a world, x, x, y, y, with some margin, m."""
-    corners = surfaces(world_of(name), _MARGIN_M).reshape(-1, 2)
-    (left, bottom) = corners.min(axis=0) - _MARGIN_M
-    (right, top) = corners.max(axis=0) + _MARGIN_M
+    corners = surfaces(world_of(name), _SETUP.margin_m).reshape(-1, 2)
+    (left, bottom) = corners.min(axis=0) - _SETUP.margin_m
+    (right, top) = corners.max(axis=0) + _SETUP.margin_m
     return float(left), float(right), float(bottom), float(top)
 
 
@@ -146,6 +161,6 @@ def _moved(track: Array) -> float:
 
 def _rest(track: Array) -> float:
     """Travelled distance at which node A reached its final position, m."""
-    off = np.hypot(*(track[:, 1:3] - track[-1, 1:3]).T) > _RESTS_M
+    off = np.hypot(*(track[:, 1:3] - track[-1, 1:3]).T) > _SETUP.rest_m
     moving = np.flatnonzero(off)
     return float(track[moving[-1], 3]) if moving.size else 0.0

@@ -30,10 +30,27 @@ from thinmap_ros.view.plots import (
     TextLabels,
 )
 
-_MOMENTS = (0.05, 0.2, 0.4, 0.6, 0.8, 1.0)
-_PAPER_S = 120.0
-_LIMITS = (-0.3, 10.6, -0.3, 10.3)
-_FULL = 0.99
+
+@dataclass(frozen=True)
+class _Setup:
+    """Pictures, and what counts as success.
+
+    shown: moments of the pictures, as shares of the time. limits: of a picture, x, x, y, y, m.
+    paper_s: time of the paper for the room. entire: coverage of an entire environment.
+    """
+
+    shown: tuple[float, ...]
+    limits: tuple[float, float, float, float]
+    paper_s: float
+    entire: float
+
+
+_SETUP = _Setup(
+    shown=(0.05, 0.2, 0.4, 0.6, 0.8, 1.0),
+    limits=(-0.3, 10.6, -0.3, 10.3),
+    paper_s=120.0,
+    entire=0.99,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +75,7 @@ def run(source: Source) -> Outcome:
     last = moments[-1]
     poses = np.array([moment.T_map_base for moment in moments])
     way_m = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
-    shown = [moments[round(share * (len(moments) - 1))] for share in _MOMENTS]
+    shown = [moments[round(share * (len(moments) - 1))] for share in _SETUP.shown]
     unvisited = census.seen - census.visited
     return Outcome(
         'Exploration by position probability',
@@ -82,15 +99,15 @@ def run(source: Source) -> Outcome:
         [
             Comparison(
                 'time for the room',
-                f'under {_PAPER_S:.0f} s',
+                f'under {_SETUP.paper_s:.0f} s',
                 f'{last.seconds:.0f} s, {way_m:.1f} m',
-                last.seconds < _PAPER_S,
+                last.seconds < _SETUP.paper_s,
             ),
             Comparison(
                 'explored',
                 'the entire environment',
                 f'{coverage[-1][1]:.1%}',
-                coverage[-1][1] >= _FULL,
+                coverage[-1][1] >= _SETUP.entire,
             ),
             Comparison(
                 'end nodes that were never visited',
@@ -175,4 +192,4 @@ def _panel(moment: _Moment, path: Array) -> Panel:
         *goal,
     ]
     layers += [RobotMarkers(moment.T_map_base[None]), TextLabels(at, words)]
-    return Panel(layers, f'after {moment.seconds:.0f} s', limits=_LIMITS)
+    return Panel(layers, f'after {moment.seconds:.0f} s', limits=_SETUP.limits)

@@ -8,10 +8,9 @@ from thinmap_ros.core.topology.builder import TopologyConfig, build
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Rows, Table
 from thinmap_ros.experiments.drives import Source
-from thinmap_ros.experiments.maps import patch_at_rest
+from thinmap_ros.experiments.maps import CELL_M, patch_at_rest
 from thinmap_ros.view.plots import GraphLayer, MapLayer, Panel, Plot, Segments
 
-_CELL_M = 0.1
 # Free boxes, m: x, y, end x, end y.
 _SHAPES = {
     '(a) end nodes': [(0.5, 2.0, 5.5, 3.2)],
@@ -81,9 +80,9 @@ def run(source: Source) -> Outcome:
 def _patch(boxes: list[tuple[float, float, float, float]]) -> GridPatch:
     cells = np.full((46, 60), 100, dtype=np.int8)
     for box in boxes:
-        x, y, end_x, end_y = (round(v / _CELL_M) for v in box)
+        x, y, end_x, end_y = (round(v / CELL_M) for v in box)
         cells[y:end_y, x:end_x] = 0
-    return GridPatch(GridFrame(0.0, 0.0, _CELL_M), cells)
+    return GridPatch(GridFrame(0.0, 0.0, CELL_M), cells)
 
 
 def _counts(graph: TopologicalMap) -> tuple[int, int, int]:

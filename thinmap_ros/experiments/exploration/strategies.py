@@ -1,11 +1,18 @@
 """Paper 2's claim: exploration by position probability is shorter than by the other schemes."""
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from thinmap_ros.closed_loop import Options
 from thinmap_ros.evaluation.exploration_run import explore
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Rows, Table
-from thinmap_ros.evaluation.strategy_comparison import OURS, Report, relative_saving
+from thinmap_ros.evaluation.strategy_comparison import (
+    OURS,
+    Report,
+    half_interval_95,
+    relative_saving,
+)
 from thinmap_ros.experiments.drives import Source, world_of
 from thinmap_ros.sim.drives import random_start
 from thinmap_ros.sim.world import World
@@ -20,21 +27,36 @@ _STRATEGIES = (
     'explore_lite',
     'information_gain',
 )
-_SEEDS = 6
-_LIMIT_S = 3000.0
-_QUICK_S = 10.0
-_FULL = 0.99
-_COMPLETE = 0.95
 _NEARLY = '0.98'
-_NORMAL_95 = 1.96
+
+
+@dataclass(frozen=True)
+class _Setup:
+    """Size of the comparison, and what counts as success.
+
+    worlds: how many of _WORLDS. starts: random ones in each world. limit_s: time limit of a run.
+    complete: coverage of runs whose lengths are compared. entire: coverage of an entire
+    environment.
+    """
+
+    worlds: int
+    starts: int
+    limit_s: float
+    complete: float
+    entire: float
+
+
+_FULL = _Setup(worlds=len(_WORLDS), starts=6, limit_s=3000.0, complete=0.95, entire=0.99)
+_QUICK = replace(_FULL, worlds=1, starts=2, limit_s=10.0)
 
 
 def run(source: Source) -> Outcome:
     """Explore from random starts with each strategy."""
+    setup = _QUICK if source.quick else _FULL
     reports = [
         report
-        for world in _WORLDS[: 1 if source.quick else None]
-        for report in _reports(source, world)
+        for world in _WORLDS[: setup.worlds]
+        for report in _reports(source.seed, setup, world)
     ]
     runs = {name: {_key(r): r for r in reports if r['strategy'] == name} for name in _STRATEGIES}
     summary = [_summary(name, runs) for name in _STRATEGIES]
@@ -46,7 +68,7 @@ def run(source: Source) -> Outcome:
             'coverage, the least of all runs',
             'the entire environment',
             f'{_least(runs[OURS]):.1%}',
-            _least(runs[OURS]) >= _FULL,
+            _least(runs[OURS]) >= setup.entire,
         ),
         Comparison(
             'end nodes visited, of those seen',
@@ -59,8 +81,8 @@ def run(source: Source) -> Outcome:
     return Outcome(
         'Position probability against other strategies',
         'Exploration paper, sections 3.2 and 5: what it claims without a figure',
-        f'{", ".join(_WORLDS)} from {_SEEDS} random starts each, at most 0.2 m/s, exact poses, '
-        'the same starts and noise for all. '
+        f'{", ".join(_WORLDS)} from {_FULL.starts} random starts each, at most 0.2 m/s, '
+        'exact poses, the same starts and noise for all. '
         '`paper` is the scheme with nothing but what the paper says; '
         '`position_probability` is ours.',
         [
@@ -98,14 +120,13 @@ _SUMMARY = [
 ]
 
 
-def _reports(source: Source, name: str) -> list[Report]:
+def _reports(seed: int, setup: _Setup, name: str) -> list[Report]:
     world = world_of(name)
     reports = []
-    for k in range(2 if source.quick else _SEEDS):
-        start = random_start(world, np.random.default_rng([source.seed, k]))
+    for k in range(setup.starts):
+        start = random_start(world, np.random.default_rng([seed, k]))
         for strategy in _STRATEGIES:
-            limit_s = _QUICK_S if source.quick else _LIMIT_S
-            options = Options(strategy=strategy, seed=source.seed + k, time_limit_s=limit_s)
+            options = Options(strategy=strategy, seed=seed + k, time_limit_s=setup.limit_s)
             _, report = explore(_at(world, start), start, options)
             reports.append(report | {'start_number': k})
     return reports
@@ -143,13 +164,13 @@ def _summary(name: str, runs: dict[str, dict[tuple[str, int], Report]]) -> list[
         distance,
         time,
         float(-shares.mean()) if some else None,
-        float(_NORMAL_95 * shares.std(ddof=1) / np.sqrt(len(shares))) if some else None,
+        half_interval_95(shares) if some else None,
     ]
 
 
 def _complete(runs: dict[tuple[str, int], Report]) -> dict[tuple[str, int], Report]:
     """Runs with nearly complete coverage: a run that stops early is not more efficient."""
-    return {key: report for key, report in runs.items() if report['coverage'] >= _COMPLETE}
+    return {key: report for key, report in runs.items() if report['coverage'] >= _FULL.complete}
 
 
 def _comparison(other: str, runs: dict[str, dict[tuple[str, int], Report]]) -> Comparison:

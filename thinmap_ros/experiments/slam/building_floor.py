@@ -1,5 +1,6 @@
 """Paper 3, Fig. 7, 8, 11, 12: a building floor by both filters; features used; error bounds."""
 
+from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
@@ -15,6 +16,7 @@ from thinmap_ros.evaluation.slam_run import Run, run_drive
 from thinmap_ros.experiments.drives import Source, world_of
 from thinmap_ros.pipeline import Pipeline, PipelineResult
 from thinmap_ros.sim.drives import DriveSample
+from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.view.plots import (
     Band,
     Curve,
@@ -28,14 +30,37 @@ from thinmap_ros.view.plots import (
     xy,
 )
 
-_QUICK_SCANS = 200
-_LOCAL_AT = 0.45  # of the drive: Fig. 7 and 8
-_LINES = 33
-_PAPER_USED = 7
-_PAPER_ALL = 25
-_EVERY = 5
-_SIGMAS = 3.0
-_LIMITS = (-1.0, 41.0, -2.0, 12.0)  # the odometry alone goes far beyond
+
+@dataclass(frozen=True)
+class _Setup:
+    """The drive, its tables and figures, and what the paper reports.
+
+    quick_scans: length of a short drive. local_area_at: moment of Fig. 7 and 8, as a share of the
+    drive. row_scans: scans for each row of the tables. sigmas: width of the error bounds.
+    limits: of a picture, x, x, y, y, m; the odometry alone goes far beyond. paper_lines, paper_all,
+    paper_used: features of the floor, of the conventional filter, of an update with local areas.
+    """
+
+    quick_scans: int
+    local_area_at: float
+    row_scans: int
+    sigmas: float
+    limits: tuple[float, float, float, float]
+    paper_lines: int
+    paper_all: int
+    paper_used: int
+
+
+_SETUP = _Setup(
+    quick_scans=200,
+    local_area_at=0.45,
+    row_scans=5,
+    sigmas=3.0,
+    limits=(-1.0, 41.0, -2.0, 12.0),
+    paper_lines=33,
+    paper_all=25,
+    paper_used=7,
+)
 
 
 class _Glance:
@@ -58,8 +83,9 @@ class _Glance:
 def run(source: Source) -> Outcome:
     """Drive the floor once; both filters, and our localizer, see the same scans."""
     world = world_of('floor_40x10')
-    samples = list(islice(source.samples('floor_40x10'), _QUICK_SCANS if source.quick else None))
-    glance = _Glance(round(_LOCAL_AT * len(samples)))
+    length = _SETUP.quick_scans if source.quick else None
+    samples = list(islice(source.samples('floor_40x10'), length))
+    glance = _Glance(round(_SETUP.local_area_at * len(samples)))
     ti = run_drive(samples, 'ekf_ti', glance)
     full = run_drive(samples, 'ekf_full')
     ours = run_drive(samples, 'scan_matching')
@@ -103,15 +129,15 @@ def _comparisons(ti: Run, full: Run, apart: Array, used: float, known: int) -> l
     return [
         Comparison(
             'line features extracted',
-            str(_LINES),
+            str(_SETUP.paper_lines),
             str(known),
-            abs(known - _LINES) <= 0.1 * _LINES,
+            abs(known - _SETUP.paper_lines) <= 0.1 * _SETUP.paper_lines,
             remark='the world has 33 surfaces of at least 0.8 m; those that continue behind a door '
             'are one feature',
         ),
         Comparison(
             'features used for an update',
-            f'{_PAPER_USED} instead of more than {_PAPER_ALL}',
+            f'{_SETUP.paper_used} instead of more than {_SETUP.paper_all}',
             f'{used:.0f} (median; most {max(ti.local)}) instead of {full.local[-1]}',
             used <= 0.5 * full.local[-1],
         ),
@@ -161,7 +187,7 @@ def _inside(done: Run) -> list[float]:
     """Shares of the scans with errors within three sigma, for x, y and heading."""
     return [
         float(share)
-        for share in (np.abs(_errors(done)) <= _SIGMAS * np.array(done.sigmas)).mean(axis=0)
+        for share in (np.abs(_errors(done)) <= _SETUP.sigmas * np.array(done.sigmas)).mean(axis=0)
     ]
 
 
@@ -200,7 +226,7 @@ def _path_rows(ti: Run, full: Run) -> list[list[float]]:
             ti.features[k],
             ti.local[k],
         ]
-        for k in range(0, len(ti.seconds), _EVERY)
+        for k in range(0, len(ti.seconds), _SETUP.row_scans)
     ]
 
 
@@ -223,7 +249,7 @@ def _local_area(glance: _Glance) -> Plot:
         GraphLayer(nodes, 9.0),
         Segments(_ends(glance.features, False), 'other features', 5, 2.0),
         Segments(_ends(glance.features, True), 'features of the local area', 1, 4.0),
-        RobotMarkers(glance.pose[None], radius_m=0.32),
+        RobotMarkers(glance.pose[None], radius_m=PRESETS['3at'].radius_m),
     ]
     caption = (
         'Paper 3, Fig. 7 and 8: the local area: nodes near the robot (large: those at which its '
@@ -243,10 +269,10 @@ def _paths(ti: Run, full: Run) -> Plot:
             Segments(_ends(features, True), 'features used at the end', 1, 4.0),
             Curve(odometry[:, :2], 'odometry alone', 6, '-', width=1.0),
             Curve(estimate[:, :2], 'estimated path', 0, '--', width=1.6),
-            RobotMarkers(estimate[-1:], radius_m=0.32),
+            RobotMarkers(estimate[-1:], radius_m=PRESETS['3at'].radius_m),
         ]
         title = f'{name}: {sum(f.local for f in features)} of {len(features)} features used'
-        panels.append(Panel(layers, title, limits=_LIMITS))
+        panels.append(Panel(layers, title, limits=_SETUP.limits))
     caption = (
         'Paper 3, Fig. 12: paths and line features by both filters; '
         'thick: the features used at the last pose.'
@@ -257,7 +283,7 @@ def _paths(ti: Run, full: Run) -> Plot:
 def _bounds(done: Run) -> Plot:
     seconds = np.array(done.seconds)
     errors = _errors(done)
-    bounds = _SIGMAS * np.array(done.sigmas)
+    bounds = _SETUP.sigmas * np.array(done.sigmas)
     panels = []
     rows = (('x', 'cm', 100.0), ('y', 'cm', 100.0), ('heading', 'deg', 180.0 / np.pi))
     for k, (name, unit, scale) in enumerate(rows):

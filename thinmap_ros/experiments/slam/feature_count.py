@@ -1,5 +1,7 @@
 """Paper 3, Fig. 13: time of a filter's step against the number of features."""
 
+from dataclasses import dataclass
+from functools import cached_property
 from time import process_time
 
 import numpy as np
@@ -12,18 +14,58 @@ from thinmap_ros.view.plots import Curve, Panel, Plot
 
 _COUNTS = (25, 50, 88, 200, 400, 800, 1500, 3000)
 _COUNTS_QUICK = (25, 88)
-# Features of a local area, and of them those that a step sees
-_LOCAL = 12
-_SEEN = 7
-# A metre at 0.2 m/s and 5 Hz
-_STEPS = 100
-_AREA_STEPS = 25
-_ONE_STEP = np.array([0.04, 0.0, 0.0])  # 0.2 m/s at 5 Hz
-_MOTION = np.diag([1e-6, 1e-6, 1e-6])
-_LINE = np.diag([1e-4, 1e-5])
-_SAME = 1e-6
-_FLAT = 1.5
-_HALF_WAY = 800
+
+
+@dataclass(frozen=True)
+class _Setup:
+    """The steps that are timed, and what counts as constant and as the same.
+
+    local: features of a local area. seen: those of them that a step sees. steps: of each filter.
+    area_steps: steps in a local area, a metre. step_m: length of a step, 0.2 m/s at 5 Hz.
+    motion_variance: of a step in x, y and heading, m^2 and rad^2. line_variances: of a line in
+    distance and direction, m^2 and rad^2. flat_ratio: largest ratio of step times that are nearly
+    constant, from the first count to flat_until. same: largest difference of poses, m and rad.
+    """
+
+    local: int
+    seen: int
+    steps: int
+    area_steps: int
+    step_m: float
+    motion_variance: float
+    line_variances: tuple[float, float]
+    flat_ratio: float
+    flat_until: int
+    same: float
+
+    @cached_property
+    def step(self) -> Array:
+        """A step straight ahead (3,)."""
+        return np.array([self.step_m, 0.0, 0.0])
+
+    @cached_property
+    def motion_covariance(self) -> Array:
+        """Covariance of a step (3, 3)."""
+        return self.motion_variance * np.eye(3)
+
+    @cached_property
+    def line_covariance(self) -> Array:
+        """Covariance of a line (2, 2)."""
+        return np.diag(self.line_variances)
+
+
+_SETUP = _Setup(
+    local=12,
+    seen=7,
+    steps=100,
+    area_steps=25,
+    step_m=0.04,
+    motion_variance=1e-6,
+    line_variances=(1e-4, 1e-5),
+    flat_ratio=1.5,
+    flat_until=800,
+    same=1e-6,
+)
 
 
 def run(source: Source) -> Outcome:
@@ -38,14 +80,14 @@ def run(source: Source) -> Outcome:
         same.append([count, float(np.abs(local_pose - full_pose).max())])
     first = times[0]
     last = times[-1]
-    half = next((row for row in times if row[0] >= _HALF_WAY), last)
+    half = next((row for row in times if row[0] >= _SETUP.flat_until), last)
     apart = max(row[1] for row in same)
     return Outcome(
         'Time of a step against the number of features',
         'SLAM paper, section 5.2, Fig. 13',
-        f'Maps of {counts[0]} to {counts[-1]} lines. A step predicts and corrects by {_SEEN} lines '
-        f'that are seen; a local area has {_LOCAL} features, and after every {_AREA_STEPS} steps, '
-        'or a metre, the robot is in another one. '
+        f'Maps of {counts[0]} to {counts[-1]} lines. A step predicts and corrects by '
+        f'{_SETUP.seen} lines that are seen; a local area has {_SETUP.local} features, '
+        f'and after every {_SETUP.area_steps} steps, or a metre, the robot is in another one. '
         'The conventional filter takes the same steps with all features. '
         'CPU time of the filter alone: what a whole scan costs is on the benchmark page.',
         [
@@ -59,7 +101,7 @@ def run(source: Source) -> Outcome:
                 'nearly constant, 30-40 ms in all',
                 f'{first[1]:.2f} ms with {first[0]}, '
                 f'{last[1]:.2f} ms with {last[0]} features (medians)',
-                bool(half[1] <= _FLAT * first[1]),
+                bool(half[1] <= _SETUP.flat_ratio * first[1]),
                 timed=True,
                 remark=f'{half[1] / first[1]:.2f} times as much with {half[0]} '
                 f'as with {first[0]} features, '
@@ -79,7 +121,7 @@ def run(source: Source) -> Outcome:
                 'both estimate the same',
                 'almost identical',
                 f'pose at most {apart:.1e} (m, rad) apart',
-                apart < _SAME,
+                apart < _SETUP.same,
                 remark='the compressed form loses nothing; the paper drops the rest',
             ),
         ],
@@ -103,17 +145,18 @@ def _drive(seed: int, count: int, local: bool) -> tuple[Array, Array]:
     ekf = CompressedEkf(np.zeros(3), np.diag([1e-4, 1e-4, 1e-4]))
     lines = np.column_stack([rng.uniform(1.0, 40.0, count), rng.uniform(-np.pi, np.pi, count)])
     for number, line in enumerate(lines):
-        ekf.add(number, line, _LINE)
+        ekf.add(number, line, _SETUP.line_covariance)
     areas = [
-        rng.choice(count, min(_LOCAL, count), replace=False).tolist()
-        for _ in range(_STEPS // _AREA_STEPS)
+        rng.choice(count, min(_SETUP.local, count), replace=False).tolist()
+        for _ in range(_SETUP.steps // _SETUP.area_steps)
     ]
-    noise = rng.normal(0.0, 1.0, (_STEPS, min(_SEEN, count), 2)) * np.sqrt(np.diag(_LINE))
+    size = (_SETUP.steps, min(_SETUP.seen, count), 2)
+    noise = rng.normal(0.0, 1.0, size) * np.sqrt(_SETUP.line_variances)
     taken = []
-    for step in range(_STEPS):
-        area = areas[step // _AREA_STEPS]
+    for step in range(_SETUP.steps):
+        area = areas[step // _SETUP.area_steps]
         began = process_time()
-        if local and step % _AREA_STEPS == 0:
+        if local and step % _SETUP.area_steps == 0:
             ekf.set_local_area(area)
         _step(ekf, area[: len(noise[step])], noise[step])
         taken.append(1e3 * (process_time() - began))
@@ -123,11 +166,11 @@ def _drive(seed: int, count: int, local: bool) -> tuple[Array, Array]:
 def _step(ekf: CompressedEkf, seen: list[int], noise: Array) -> None:
     """Predict, and correct by the features that are seen."""
     pose = ekf.local.pose
-    ahead = pose + [_ONE_STEP[0] * np.cos(pose[2]), _ONE_STEP[0] * np.sin(pose[2]), 0.0]
-    ekf.local.predict(ahead, _ONE_STEP, _MOTION)
+    ahead = pose + [_SETUP.step_m * np.cos(pose[2]), _SETUP.step_m * np.sin(pose[2]), 0.0]
+    ekf.local.predict(ahead, _SETUP.step, _SETUP.motion_covariance)
     indices = np.array([ekf.area.index(number) for number in seen])
     z = np.array([ekf.local.innovations(int(k))[0] for k in indices]) + noise
-    ekf.local.update(indices, z, np.tile(_LINE, (len(indices), 1, 1)))
+    ekf.local.update(indices, z, np.tile(_SETUP.line_covariance, (len(indices), 1, 1)))
     ekf.flush_step()
 
 

@@ -1,5 +1,6 @@
 """Paper 3, Fig. 14: a floor of 70 x 10 m over twenty minutes, at marked places."""
 
+from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
@@ -11,6 +12,7 @@ from thinmap_ros.evaluation.slam_run import Run, run_drive
 from thinmap_ros.experiments.drives import Source, world_of
 from thinmap_ros.pipeline import Pipeline, PipelineResult
 from thinmap_ros.sim.drives import DriveSample
+from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.view.plots import (
     Curve,
     GraphLayer,
@@ -22,14 +24,38 @@ from thinmap_ros.view.plots import (
     xy,
 )
 
-_QUICK_SCANS = 150
 _MARKS = 'ABCDE'
-_WINDOW_M = 10.0
-_LINES = 88
-_PAPER_M = 0.20
-_PAPER_DEG = 5.0
-_PAPER_MS = 40.0
-_EVERY = 10
+
+
+@dataclass(frozen=True)
+class _Setup:
+    """The drive, its tables and figures, and what the paper reports.
+
+    quick_scans: length of a short drive. row_scans: scans for each row of the table.
+    window_m: side of a local map. limits: of a picture of the floor, x, x, y, y, m.
+    paper_lines: features of the floor. paper_error_m, paper_error_deg, paper_step_ms: the largest.
+    """
+
+    quick_scans: int
+    row_scans: int
+    window_m: float
+    limits: tuple[float, float, float, float]
+    paper_lines: int
+    paper_error_m: float
+    paper_error_deg: float
+    paper_step_ms: float
+
+
+_SETUP = _Setup(
+    quick_scans=150,
+    row_scans=10,
+    window_m=10.0,
+    limits=(-1.0, 71.0, -0.5, 10.5),
+    paper_lines=88,
+    paper_error_m=0.20,
+    paper_error_deg=5.0,
+    paper_step_ms=40.0,
+)
 
 
 class _Marks:
@@ -52,7 +78,7 @@ class _Marks:
         self._passed.append((self._at[k], T[:2]))
         names, places = zip(*self._passed, strict=True)
         graph = pipeline.topology.map.copy()
-        robot = RobotMarkers(T[None], radius_m=0.32)
+        robot = RobotMarkers(T[None], radius_m=PRESETS['3at'].radius_m)
         words = TextLabels(np.array(places), names, 11.0)
         title = (
             f'{self._at[k]}: after {sample.scan.stamp_ns / 6e10:.1f} min, '
@@ -62,24 +88,25 @@ class _Marks:
             Panel(
                 [MapLayer(pipeline.grid.known_area()), robot, words],
                 title,
-                limits=(-1.0, 71.0, -0.5, 10.5),
+                limits=_SETUP.limits,
             )
         )
-        window = pipeline.grid.window(float(T[0]), float(T[1]), _WINDOW_M)
+        window = pipeline.grid.window(float(T[0]), float(T[1]), _SETUP.window_m)
         self.near.append(
             Panel([MapLayer(window), GraphLayer(graph), robot], self._at[k], limits=_box(T))
         )
 
 
 def _box(T: Array) -> tuple[float, float, float, float]:
-    half = _WINDOW_M / 2.0
+    half = _SETUP.window_m / 2.0
     return float(T[0]) - half, float(T[0]) + half, float(T[1]) - half, float(T[1]) + half
 
 
 def run(source: Source) -> Outcome:
     """Drive the floor once, both filters and our localizer on the same scans."""
     world = world_of('floor_70x10')
-    samples = list(islice(source.samples('floor_70x10'), _QUICK_SCANS if source.quick else None))
+    length = _SETUP.quick_scans if source.quick else None
+    samples = list(islice(source.samples('floor_70x10'), length))
     marks = _Marks(len(samples))
     ti = run_drive(samples, 'ekf_ti', marks)
     full = run_drive(samples, 'ekf_full')
@@ -154,7 +181,7 @@ def _rows(done: Run) -> list[list[float]]:
             done.features[k],
             done.local[k],
         ]
-        for k in range(0, len(done.seconds), _EVERY)
+        for k in range(0, len(done.seconds), _SETUP.row_scans)
     ]
 
 
@@ -212,9 +239,9 @@ def _comparisons(ti: Run, full: Run, ours: Run, turned: Array) -> list[Compariso
     return [
         Comparison(
             'features extracted',
-            str(_LINES),
+            str(_SETUP.paper_lines),
             str(known),
-            abs(known - _LINES) <= 0.1 * _LINES,
+            abs(known - _SETUP.paper_lines) <= 0.1 * _SETUP.paper_lines,
             remark='the world has 88 surfaces of at least 0.8 m; those that continue behind a door '
             'are one feature',
         ),
@@ -222,20 +249,20 @@ def _comparisons(ti: Run, full: Run, ours: Run, turned: Array) -> list[Compariso
             'error of the position',
             'about 20 cm',
             ti.position_error,
-            bool(np.hypot(*ti.errors()[:, :2].T).max() <= _PAPER_M),
+            bool(np.hypot(*ti.errors()[:, :2].T).max() <= _SETUP.paper_error_m),
             remark=f'scan matching (`slam: scan_matching`): {ours.position_error}',
         ),
         Comparison(
             'error of the heading',
             'about 5 deg',
             f'{turned.mean():.2f} deg (mean), {turned.max():.2f} deg (most)',
-            bool(turned.max() <= _PAPER_DEG),
+            bool(turned.max() <= _SETUP.paper_error_deg),
         ),
         Comparison(
             'a step',
             '30-40 ms, on a machine of 2006',
             f'{medians[0]:.1f} ms (median), {slowest:.1f} ms (99 of 100)',
-            slowest <= _PAPER_MS,
+            slowest <= _SETUP.paper_step_ms,
             timed=True,
         ),
         Comparison(

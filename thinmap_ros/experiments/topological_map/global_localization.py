@@ -1,5 +1,6 @@
 """Paper 1, Fig. 10 and 11: 5,000 samples of a lost robot come together at one place."""
 
+from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
@@ -9,29 +10,51 @@ from thinmap_ros.core.places.global_localizer import GlobalLocalization, Result,
 from thinmap_ros.core.se2 import Array, wrap
 from thinmap_ros.core.topology.builder import TopologyConfig, build
 from thinmap_ros.evaluation.outcome import Comparison, Outcome, Rows, Table
-from thinmap_ros.experiments.drives import LOST_STEP_SCANS, Source
+from thinmap_ros.experiments.drives import SETUP, Source
 from thinmap_ros.experiments.maps import grid_of
 from thinmap_ros.sim.drives import DriveSample
 from thinmap_ros.view.plots import Curve, MapLayer, Panel, Plot, RobotMarkers, xy
 
-_SHOWN = (0, 2, 7, 11)  # steps of the paper's pictures; 0: before the first
-_STEPS = 11
-_SEEDS = 20
-_SEEDS_QUICK = 2
-_LIKELY = 0.01  # weight from which on a hypothesis is a candidate
-_RIGHT_M = 0.3
-_RIGHT_RAD = np.radians(10.0)
+
+@dataclass(frozen=True)
+class _Setup:
+    """Runs and pictures, what the paper reports, and what counts as success.
+
+    shown: steps of the paper's pictures; 0: before the first. seeds, quick_seeds: runs.
+    paper_steps: until one position is left. candidate_weight: of a candidate, or more.
+    right_m, right_deg: largest errors of a right position.
+    """
+
+    shown: tuple[int, ...]
+    seeds: int
+    quick_seeds: int
+    paper_steps: int
+    candidate_weight: float
+    right_m: float
+    right_deg: float
+
+
+_SETUP = _Setup(
+    shown=(0, 2, 7, 11),
+    seeds=20,
+    quick_seeds=2,
+    paper_steps=11,
+    candidate_weight=0.01,
+    right_m=0.3,
+    right_deg=10.0,
+)
 
 
 def run(source: Source) -> Outcome:
     """Localize on one drive with many seeds of the samples; the first one is drawn."""
     patch = grid_of(source.samples('lab_stops')).known_area()
     topology = build(patch, (2.0, 2.0), TopologyConfig())
-    drive_samples = list(islice(source.samples('lab_lost'), 0, None, LOST_STEP_SCANS))
+    drive_samples = list(islice(source.samples('lab_lost'), 0, None, SETUP.scans_per_lost_step))
     rows: Rows = []
     steps: Rows = []
     panels = []
-    seeds = range(source.seed, source.seed + (_SEEDS_QUICK if source.quick else _SEEDS))
+    runs = _SETUP.quick_seeds if source.quick else _SETUP.seeds
+    seeds = range(source.seed, source.seed + runs)
     for seed in seeds:
         finder = GlobalLocalization(patch, topology, seed=seed)
         if seed == source.seed:
@@ -43,8 +66,8 @@ def run(source: Source) -> Outcome:
             rows.append([seed, step, _candidates(result), state, *_error(result, sample)])
             if first is None and result.pose is not None:
                 first = step
-                steps.append([seed, step, *_error(result, sample), _is_right(result, sample)])
-            if seed == source.seed and step in _SHOWN:
+                steps.append([seed, step, *_error(result, sample), int(_is_right(result, sample))])
+            if seed == source.seed and step in _SETUP.shown:
                 panels.append(_panel(patch, finder.samples, sample, step))
     taken = np.array([row[1] for row in steps])
     right = sum(bool(row[4]) for row in steps)
@@ -54,7 +77,7 @@ def run(source: Source) -> Outcome:
         'Topological map paper, sections 3.1 and 4.2, Fig. 10 and 11',
         'The robot is switched on at (2 m, 2 m, 270 deg) of the laboratory, moves on continuously, '
         'and knows only the map of the twelve stops. '
-        f'A step is {0.2 * LOST_STEP_SCANS:g} s, up to 0.3 m. '
+        f'A step is {0.2 * SETUP.scans_per_lost_step:g} s, up to 0.3 m. '
         f'The same drive is localized with {len(seeds)} seeds of the samples.',
         [
             Table('steps', ['seed', 'step', 'candidates', 'state', 'error_m', 'error_deg'], rows),
@@ -64,10 +87,10 @@ def run(source: Source) -> Outcome:
         [
             Comparison(
                 'one position left',
-                f'after {_STEPS} steps',
+                f'after {_SETUP.paper_steps} steps',
                 f'after {np.median(taken):.0f} (median), {taken.max()} (most) steps '
                 f'in {len(taken)} of {len(seeds)} runs',
-                len(taken) == len(seeds) and int(taken.max()) <= _STEPS,
+                len(taken) == len(seeds) and int(taken.max()) <= _SETUP.paper_steps,
             ),
             Comparison(
                 'it is the right one',
@@ -80,7 +103,7 @@ def run(source: Source) -> Outcome:
 
 
 def _candidates(result: Result) -> int:
-    return sum(hypothesis.weight >= _LIKELY for hypothesis in result.hypotheses)
+    return sum(hypothesis.weight >= _SETUP.candidate_weight for hypothesis in result.hypotheses)
 
 
 def _error(result: Result, sample: DriveSample) -> tuple[float | None, float | None]:
@@ -96,8 +119,8 @@ def _is_right(result: Result, sample: DriveSample) -> bool:
     return (
         metres is not None
         and degrees is not None
-        and metres <= _RIGHT_M
-        and degrees <= np.degrees(_RIGHT_RAD)
+        and metres <= _SETUP.right_m
+        and degrees <= _SETUP.right_deg
     )
 
 

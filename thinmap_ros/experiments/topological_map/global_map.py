@@ -5,7 +5,7 @@ from itertools import groupby
 import numpy as np
 from scipy.spatial import cKDTree
 
-from thinmap_ros.core.grid.occupancy import OccupancyGrid
+from thinmap_ros.core.grid.occupancy import OccupancyGrid, WindowConfig
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig, build
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
@@ -15,18 +15,16 @@ from thinmap_ros.experiments.maps import grid_of
 from thinmap_ros.sim.drives import DriveSample
 from thinmap_ros.view.plots import GraphLayer, MapLayer, Panel, Plot, RobotMarkers
 
-_WINDOW_M = 16.0
 # The stops near (3 m, 8 m) and (2.3 m, 3 m)
-_FIRST = 2
-_SECOND = 1
-_SAME_M = 0.5
+_FIRST_STOPS = (2, 1)
+_SAME_M = 0.5  # largest distance of nodes of two maps that agree
 
 
 def run(source: Source) -> Outcome:
     """Merge stop by stop; the global grid is only used to judge the result."""
     by_place = groupby(source.samples('lab_stops'), lambda sample: tuple(sample.T_world_base[:2]))
     stops = [list(samples) for _, samples in by_place]
-    order = [_FIRST, _SECOND, *(k for k in range(len(stops)) if k not in (_FIRST, _SECOND))]
+    order = [*_FIRST_STOPS, *(k for k in range(len(stops)) if k not in _FIRST_STOPS)]
     builder = TopologyBuilder(TopologyConfig())
     grid = OccupancyGrid()
     growth = []
@@ -40,8 +38,8 @@ def run(source: Source) -> Outcome:
         if number == 2:
             panels.append(_panel(grid, states[-1], 'merged from both'))
     locals_ = [
-        _local_map(stops[stop], name)
-        for stop, name in ((_FIRST, 'local map 1'), (_SECOND, 'local map 2'))
+        _local_map(stops[stop], f'local map {number}')
+        for number, stop in enumerate(_FIRST_STOPS, 1)
     ]
     whole = grid_of(sample for stop in stops for sample in stop)
     batch = build(whole.known_area(), _start(stops[0]), TopologyConfig())
@@ -105,10 +103,11 @@ def _plots(early: list[Panel], whole: OccupancyGrid, final: Panel) -> list[Plot]
 
 
 def _visit(samples: list[DriveSample], grid: OccupancyGrid, builder: TopologyBuilder) -> None:
+    window_m = WindowConfig().local_map_size_m
     for sample in samples:
         grid.add_scan(sample.scan, sample.T_world_base)
         x, y, _ = sample.T_world_base
-        builder.update(grid.window(float(x), float(y), _WINDOW_M), sample.T_world_base)
+        builder.update(grid.window(float(x), float(y), window_m), sample.T_world_base)
 
 
 def _local_map(samples: list[DriveSample], title: str) -> Panel:

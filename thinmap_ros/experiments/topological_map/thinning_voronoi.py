@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,13 +16,32 @@ from thinmap_ros.experiments.maps import grid_of, patch_at_rest
 from thinmap_ros.sim.drives import DriveSample
 from thinmap_ros.view.plots import Curve, GraphLayer, MapLayer, Panel, Plot, RobotMarkers, xy
 
-_PRUNE_M = (0.2, 0.4, 0.6, 0.8, 1.0, 1.5, 2.0, 3.0)
-_SHOWN_M = 3.0  # all branches into corners are gone
 _WORLDS = ('room_10x10', 'office', 'floor_40x10')
-_STOP = 16  # the first scan of the third stop, (3 m, 8.3 m, 0 deg): the paper's Fig. 3 and 7(a)
-_TOLD_M = (0.6, 1.5, 3.0)
-_LOOKS = 4
-_MORE_NODES = 4
+
+
+@dataclass(frozen=True)
+class _Setup:
+    """Pruning distances, the scans of Fig. 3, and what the paper reports.
+
+    prune_m: all that are compared; told_m: those of the summary; shown_m: that of Fig. 4, at which
+    all branches into corners are gone. scans: of the third stop, (3 m, 8.3 m, 0 deg), as in the
+    paper's Fig. 3 and 7(a). paper_more_nodes: nodes of thinning beyond those of Voronoi.
+    """
+
+    prune_m: tuple[float, ...]
+    told_m: tuple[float, ...]
+    shown_m: float
+    scans: slice
+    paper_more_nodes: int
+
+
+_SETUP = _Setup(
+    prune_m=(0.2, 0.4, 0.6, 0.8, 1.0, 1.5, 2.0, 3.0),
+    told_m=(0.6, 1.5, 3.0),
+    shown_m=3.0,
+    scans=slice(16, 20),
+    paper_more_nodes=4,
+)
 
 
 def run(source: Source) -> Outcome:
@@ -32,7 +52,7 @@ def run(source: Source) -> Outcome:
     counts: Rows = []
     times: Rows = []
     for name, patch in maps.items():
-        for prune_m in _PRUNE_M:
+        for prune_m in _SETUP.prune_m:
             (thin_s, thinned), (voronoi_s, voronoi) = map(_timed, _methods(patch, prune_m))
             sizes = [len(thinned.nodes), len(voronoi.nodes), len(thinned.edges), len(voronoi.edges)]
             counts.append([name, prune_m, *sizes])
@@ -57,7 +77,7 @@ def run(source: Source) -> Outcome:
             Table('nodes', columns, counts),
             Table('times', ['map', 'prune_m', 'thinning_ms', 'voronoi_ms'], times, timed=True),
         ],
-        [_local_map(samples[_STOP : _STOP + _LOOKS]), _both(maps['lab']), _curves(counts, times)],
+        [_local_map(samples[_SETUP.scans]), _both(maps['lab']), _curves(counts, times)],
         [
             Comparison(
                 'computing',
@@ -68,12 +88,12 @@ def run(source: Source) -> Outcome:
             ),
             Comparison(
                 'nodes of thinning beyond those of Voronoi, in the laboratory',
-                f'{_MORE_NODES} in its example',
+                f'{_SETUP.paper_more_nodes} in its example',
                 ', '.join(
                     f'{more[prune_m]:+d} with dead ends up to {prune_m:g} m dropped'
-                    for prune_m in _TOLD_M
+                    for prune_m in _SETUP.told_m
                 ),
-                max(more.values()) >= _MORE_NODES,
+                max(more.values()) >= _SETUP.paper_more_nodes,
                 remark='A Voronoi diagram grows a branch into each corner; '
                 'without these thinning has more nodes, by its corner nodes.',
             ),
@@ -121,11 +141,11 @@ def _local_map(samples: list[DriveSample]) -> Plot:
 
 
 def _both(patch: GridPatch) -> Plot:
-    thinned, voronoi = (work() for work in _methods(patch, _SHOWN_M))
+    thinned, voronoi = (work() for work in _methods(patch, _SETUP.shown_m))
     return Plot(
         'fig4',
         'Paper 1, Fig. 4: the laboratory by Voronoi diagram (left) and by thinning (right), '
-        f'dead ends up to {_SHOWN_M} m dropped in both.',
+        f'dead ends up to {_SETUP.shown_m} m dropped in both.',
         [
             Panel([MapLayer(patch), GraphLayer(voronoi)], f'Voronoi: {len(voronoi.nodes)} nodes'),
             Panel([MapLayer(patch), GraphLayer(thinned)], f'thinning: {len(thinned.nodes)} nodes'),

@@ -11,8 +11,7 @@ from thinmap_ros.core.exploration.mission import DriveRequest
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.ros import messages
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-
-_WARN_PERIOD_S = 5.0
+from thinmap_ros.ros.subscription import WARN_PERIOD_S
 
 
 class NavigationClient:
@@ -39,14 +38,14 @@ class NavigationClient:
         logger = self._node.get_logger()
         if self._request is not None and self._request.is_silent(self._now_s()):
             logger.warning(
-                'the navigator is silent: asking again', throttle_duration_sec=_WARN_PERIOD_S
+                'the navigator is silent: asking again', throttle_duration_sec=WARN_PERIOD_S
             )
             self._request = None
             self._handle = None
         if self._request is not None and self._request.is_same(goal):
             return
         if not self._client.server_is_ready():
-            logger.warning('no navigator yet', throttle_duration_sec=_WARN_PERIOD_S)
+            logger.warning('no navigator yet', throttle_duration_sec=WARN_PERIOD_S)
             return
         self._send(DriveRequest(goal, self._now_s()))
 
