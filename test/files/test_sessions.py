@@ -83,7 +83,7 @@ def assert_same(one: TopologicalMap, other: TopologicalMap) -> None:
         assert np.array_equal(edge.path, twin.path)
 
 
-def test_work_goes_on_as_if_it_had_never_stopped(tmp_path: Path) -> None:
+def test_work_continues_as_without_interruption(tmp_path: Path) -> None:
     grid = OccupancyGrid()
     builder = TopologyBuilder()
     poses = way()
@@ -113,7 +113,7 @@ def test_nothing_seen_yet(tmp_path: Path) -> None:
     assert not TOPOLOGY.read(tmp_path / 'b.npz').map.nodes
 
 
-def test_what_does_not_fit_is_said(tmp_path: Path) -> None:
+def test_inconsistent_states_are_reported(tmp_path: Path) -> None:
     grid = OccupancyGrid()
     builder = TopologyBuilder()
     drive(grid, builder, way()[:5], 0)
@@ -186,7 +186,7 @@ def test_a_grid_of_nonsense_is_refused(wrong: dict[str, Array]) -> None:
 
 
 def test_a_corrected_past_moves_the_nodes_and_they_keep_their_ids() -> None:
-    """The robot's heading was wrong by a little more with each metre; then a loop was closed."""
+    """A heading error that grows with the path, then a loop closure."""
     world = building()
     poses = way()
     believed = [pose(T[0] + 0.004 * k, T[1] + 0.002 * k, T[2]) for k, T in enumerate(poses)]
@@ -211,7 +211,7 @@ def test_a_corrected_past_moves_the_nodes_and_they_keep_their_ids() -> None:
     assert len(after.edges) - len(after.nodes) == len(wanted.edges) - len(wanted.nodes)
     kept = before.keys() & after.nodes.keys()
     assert len(kept) >= len(after.nodes) / 2
-    # Where a place of the wrong map is no more, its node's number is not given to another place.
+    # Ids of nodes that a correction has removed are not reused.
     shift = [np.hypot(*(after.nodes[k].position - before[k].position)) for k in kept]
     assert max(shift) <= 2.0
     builder.update(corrected.window(poses[-1][0], poses[-1][1], 10.0), poses[-1])

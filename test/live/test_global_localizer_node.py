@@ -1,4 +1,4 @@
-"""The node that finds a lost robot, as a process on a live graph."""
+"""The global localizer as a process on a live graph."""
 
 import itertools
 
@@ -24,8 +24,8 @@ pytestmark = pytest.mark.live
 START = (2.0, 2.0, 0.0)
 
 
-# Two rooms that are the same, so that a turn tells nothing, and the corridor at their doors, which
-# goes on to one side.
+# Two identical rooms, which a rotation in place cannot distinguish, and the corridor at their
+# doors, which continues to one side.
 TWINS = """
 name: twins
 resolution: 0.02
@@ -98,14 +98,16 @@ def test_a_robot_that_drives_about_finds_itself_when_asked(graph, map_file):
         np.isfinite([p.position.x, p.position.y, p.orientation.z]).all()
         for p in samples[-1].poses[:100]
     )
-    graph.until(lambda: status[-1].state == LocalizationStatus.IDLE, 'rest, once the pose is said')
+    graph.until(
+        lambda: status[-1].state == LocalizationStatus.IDLE, 'idle after the pose is published'
+    )
     said = [message for message in status if message.state == LocalizationStatus.LOCALIZED]
     assert len(said) == len(poses) == 1
     assert said[0].weights[0] > 0.9
     assert graph.stop('global_localizer') == 0, graph.log('global_localizer')
 
 
-def test_it_says_what_is_missing_and_waits(graph):
+def test_it_reports_missing_inputs_and_waits(graph):
     status = graph.heard('localization_status', LocalizationStatus, qos.LATCHED)
     graph.start('global_localizer', start_automatically=True, laser_pose='0.0,0.0,0.0')
     graph.until(lambda: status and status[-1].state == LocalizationStatus.WAITING, 'waiting')
@@ -150,7 +152,7 @@ def scan_msg(ns, ranges):
     return messages.scan_msg(scan, 'laser', 0.1)
 
 
-def test_what_is_wrong_with_the_input_is_said_in_words_and_no_pose_comes_of_it(graph, map_file):
+def test_invalid_input_is_reported_and_gives_no_pose(graph, map_file):
     status = graph.heard('localization_status', LocalizationStatus, qos.LATCHED)
     poses = graph.heard('initialpose', PoseWithCovarianceStamped)
     samples = graph.heard('localization_samples', PoseArray, qos.LATCHED)

@@ -1,4 +1,4 @@
-"""Parameters of running nodes: set where that makes sense, and refused with a reason where not."""
+"""Parameters of running nodes: changes are accepted, or rejected with a reason."""
 
 import subprocess
 import sys
@@ -74,7 +74,7 @@ def test_arguments_that_ros_cannot_read_end_the_start_with_a_line(arguments, sai
     command = [sys.executable, '-m', 'thinmap_ros.nodes.navigator', '--ros-args', *arguments]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2
-    line = done.stderr.splitlines()[-1]  # before it one of rcl's log
+    line = done.stderr.splitlines()[-1]  # after one of rcl's log
     assert 'Traceback' not in done.stderr
     assert line.startswith('error: arguments after --ros-args: ')
     assert said in line

@@ -1,4 +1,4 @@
-"""replay as a program: its files, its figures, and one line for whatever cannot be replayed."""
+"""The program replay: its files, its figures, and errors of one line."""
 
 import gzip
 import json
@@ -87,7 +87,7 @@ def test_each_localizer_replays_it(tmp_path, slam):
 
 
 @pytest.mark.programs
-def test_the_localizer_is_the_scan_matcher_unless_it_is_told(log, tmp_path):
+def test_the_localizer_is_the_scan_matcher_by_default(log, tmp_path):
     for name, options in (
         ('default', []),
         ('scans', ['--slam', 'scan_matching']),
@@ -106,7 +106,7 @@ def test_a_cut_off_bag_is_replayed_as_far_as_bag_repair_reads_it(log, tmp_path, 
     convert(CarmenLog(log, LaserOptions()), tmp_path / 'bag.mcap')
     whole = (tmp_path / 'bag.mcap').read_bytes()
     cut = tmp_path / 'cut.mcap'
-    cut.write_bytes(whole[: int(share * len(whole))])  # one chunk, and the summary
+    cut.write_bytes(whole[: int(share * len(whole))])  # one chunk and the summary
     good = tmp_path / 'good.mcap'
     repair = [sys.executable, '-m', 'thinmap_ros.tools.bag_repair', cut, '-o', good]
     assert subprocess.run(repair).returncode == 0
@@ -157,7 +157,7 @@ BAD = {
 
 @pytest.mark.programs
 @pytest.mark.parametrize('case', BAD)
-def test_what_cannot_be_replayed_is_said_in_one_line(tmp_path, case):
+def test_what_cannot_be_replayed_is_reported_in_one_line(tmp_path, case):
     make, words = BAD[case]
     path = tmp_path / 'some.log'
     make(path)
@@ -213,7 +213,7 @@ def test_stamps_that_jump_back_do_no_harm(tmp_path):
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / 'out' / 'report.json').read_text())
     assert report['scans'] + report['skipped'] == 40
-    # As in the file: a robot's clock is set back now and then, and its log continues.
+    # As in real logs: a robot's clock is sometimes set back, and its log continues.
     assert report['scans'] >= 38
     poses = np.loadtxt(tmp_path / 'out' / 'trajectory.tum')
     assert np.isfinite(poses).all()
@@ -232,7 +232,7 @@ def test_wrong_options_end_with_two(log, tmp_path, arguments):
 
 
 @pytest.mark.programs
-def test_unwritable_place_is_said(log):
+def test_an_unwritable_path_is_reported(log):
     done = run(log, '-o', '/proc/nowhere')
     assert done.returncode == 2
     assert '/proc/nowhere' in done.stderr and 'Traceback' not in done.stderr
@@ -252,7 +252,7 @@ def test_real_office_log(shared_data, tmp_path):
 
 
 class Diary(NullView):
-    """What a view was told: how often of what, and the last map."""
+    """A view that counts its calls by kind, and stores the last map."""
 
     def __init__(self):
         self.told = Counter()
@@ -272,7 +272,7 @@ class Diary(NullView):
         self.told[plot, curve] += np.isfinite(value)
 
 
-def test_a_view_is_told_each_scan_and_the_map_as_it_is_in_the_end(log):
+def test_a_view_receives_each_scan_and_the_final_map(log):
     diary = Diary()
     result = replay(CarmenLog(log, LaserOptions()), PipelineConfig(), watcher=ReplayView(diary))
     assert len(result.poses) == diary.told['pose'] == diary.told['scan'] == 30
@@ -343,7 +343,7 @@ def rows_received(path, entity):
 
 @contextmanager
 def closed_when(mark, condition):
-    """Write a mark when a condition holds, or when it never does."""
+    """Write a mark when a condition holds, or after a timeout."""
     ended = threading.Event()
 
     def watch():
@@ -366,7 +366,7 @@ def closed_when(mark, condition):
 @needs_rerun
 @pytest.mark.programs
 def test_the_viewer_shows_the_replay_until_it_is_closed(log, tmp_path, monkeypatch, capsys):
-    # The real program, told to write down what it receives where it would open a window; closed
+    # The real program, which writes a file of what it receives instead of opening a window; closed
     # when the results are there and it has shown all of it.
     received, stand_in, seen = (tmp_path / name for name in ('received.rrd', 'viewer', 'seen'))
     report = tmp_path / 'out' / 'report.json'

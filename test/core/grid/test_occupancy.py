@@ -1,4 +1,4 @@
-"""The grid's Bayes update: against a plain reference, and what it must never do."""
+"""The grid's Bayes update, compared with a reference, and its invariants."""
 
 import math
 
@@ -33,7 +33,7 @@ def percent(grid, x, y):
 
 
 def reference(scan, T, config):
-    """Cells passed and hit by fine sampling of beams: slow, obvious, blind only at cell corners."""
+    """Cells traversed and hit, by fine sampling of beams: inexact only at cell corners."""
     passed = set()
     hit = set()
     ranges = np.where(scan.hit, scan.ranges_m + config.surface_thickness_m, scan.ranges_m)
@@ -69,7 +69,7 @@ def test_one_scan_marks_what_a_finely_sampled_reference_marks(seed):
         tuple((c + offset).tolist()) for c in np.argwhere((patch.cells >= 0) & (patch.cells < 65))
     }
     assert found_hit == hit
-    # A beam cuts the corner of a cell by less than the reference's step now and then, and some
+    # A beam may cut the corner of a cell by less than the reference's step, and some
     # neighbours of these random ranges look like a surface.
     assert len(found_passed ^ passed) <= 0.02 * len(passed)
 
@@ -96,7 +96,7 @@ def test_a_wall_that_went_away_is_unlearned():
     assert grid.window(1.05, 0.05, 0.1).free.all()
 
 
-def test_nothing_is_said_of_what_lies_beyond_a_hit():
+def test_cells_beyond_a_hit_are_not_updated():
     grid = OccupancyGrid()
     grid.add_scan(scan_of(np.full(181, 1.0)), pose(0.05, 0.05, 0))
     assert percent(grid, 1.35, 0.05) == -1
@@ -130,7 +130,7 @@ def test_a_beam_without_return_frees_up_to_the_configured_range():
     assert not grid.known_area().occupied.any()
 
 
-def test_a_hit_beyond_the_usable_range_frees_the_way_and_marks_no_wall():
+def test_a_hit_beyond_the_usable_range_frees_cells_and_marks_no_wall():
     grid = OccupancyGrid(OccupancyConfig(max_range_m=3.0))
     for _ in range(2):
         grid.add_scan(scan_of(np.full(181, 5.0)), pose(0.05, 0.05, 0))
@@ -166,7 +166,7 @@ def test_a_window_is_aligned_with_the_map_and_unknown_where_nothing_is():
     assert grid.window(1000.0, 0.0, 1.0).unknown.all()
 
 
-def test_a_saved_map_goes_on_where_it_was():
+def test_a_saved_map_is_resumed():
     grid = OccupancyGrid()
     for _ in range(3):
         grid.add_scan(scan_of(np.full(181, 1.0)), pose(0.05, 0.05, 0))
@@ -183,7 +183,7 @@ def test_a_map_of_another_resolution_is_refused():
 
 
 def test_beams_that_graze_a_wall_do_not_erase_it():
-    """A wall along y = 1.03, in the middle of its cells, passed at a distance again and again."""
+    """A wall along y = 1.03, at the centre of its cells, passed repeatedly at a distance."""
     grid = OccupancyGrid()
     angles = -math.pi / 2 + STEP * np.arange(181)
     for x in np.arange(-6.0, 0.0, 0.05):
@@ -196,12 +196,12 @@ def test_beams_that_graze_a_wall_do_not_erase_it():
     assert (wall[columns[0] : columns[1]] >= 65).all()
 
 
-def test_a_wall_on_the_border_of_two_cells_leaves_the_one_in_front_free():
+def test_a_wall_on_the_boundary_of_two_cells_leaves_the_one_in_front_free():
     grid = OccupancyGrid()
     rng = np.random.default_rng(4)
     bearings = np.radians(np.arange(-90.0, 91.0))
     for _ in range(30):
-        # A wall along x = 2.0, seen with 1 cm of noise.
+        # A wall along x = 2.0, observed with 1 cm of noise.
         with np.errstate(divide='ignore'):
             ranges = 2.0 / np.cos(bearings) + rng.normal(0.0, 0.01, 181)
         grid.add_scan(
@@ -214,7 +214,7 @@ def test_a_wall_on_the_border_of_two_cells_leaves_the_one_in_front_free():
 
 
 def seen_from(x, y, heading, wall_y, solid=True):
-    """Scan of a wall from (0, wall_y) to (2.4, wall_y), 0.1 m thick, before one at x = -1."""
+    """Scan of a wall from (0, wall_y) to (2.4, wall_y), 0.1 m thick, in front of one at x = -1."""
     world = np.zeros((500, 500), dtype=np.uint8)
     world[:, 75:80] = 1
     if solid:
@@ -250,7 +250,7 @@ def test_a_long_wall_that_went_away_is_unlearned_by_beams_that_cross_it():
 
 
 def drive_through_clutter(seed, scans=25):
-    """Scans on a curve among posts and walls, some beams lost, spoilt or without return."""
+    """Scans on a curve among posts and walls; some beams are invalid or without return."""
     rng = np.random.default_rng(seed)
     world = np.zeros((600, 600), dtype=np.uint8)
     world[[0, -1]] = 1
@@ -272,7 +272,7 @@ def drive_through_clutter(seed, scans=25):
 
 
 def known_cells(grid):
-    """Log odds by (row, col) of all the cells that a grid has seen."""
+    """Log odds by (row, col) of all observed cells of a grid."""
     state = grid.state()
     cells = [
         (tile, *at)
