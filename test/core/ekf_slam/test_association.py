@@ -172,6 +172,12 @@ def test_two_features_that_turn_out_to_be_one_wall_merge():
     assert sorted([long.start[1], long.end[1]]) == pytest.approx([-3.0, 3.0], abs=0.02)
 
 
+def test_a_line_askew_on_a_known_wall_fails_the_gate_and_is_no_second_feature():
+    ekf, features = known([[[3.0, -1.0], [3.0, 3.0]]])
+    features.observe(ekf, seen_lines([[3.09, 0.2], [2.91, 1.8]]), BLIND)
+    assert len(features) == 1
+
+
 @pytest.mark.parametrize('local_areas', [False, True])
 def test_a_drive_through_a_room_finds_its_walls_once(rng, local_areas):
     """All features are walls, and no wall is there twice."""
