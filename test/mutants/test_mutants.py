@@ -118,6 +118,7 @@ def test_a_seed_chooses_the_same_mutants(project) -> None:
         ('a: tuple[1] = b', []),
         ("raise E(f'{a + 1}')", []),
         ('"Text."', []),
+        ('for a, b in zip(c, d, strict=True): e(a)', ['for a, b in zip(c, d, strict=True): pass']),
         ('T = TypeVar("T", bound=a + 1)', []),
     ],
 )
