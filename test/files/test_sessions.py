@@ -109,7 +109,7 @@ def test_work_goes_on_as_if_it_had_never_stopped(tmp_path: Path) -> None:
 def test_nothing_seen_yet(tmp_path: Path) -> None:
     GRID.write(tmp_path / 'a.npz', OccupancyGrid())
     TOPOLOGY.write(tmp_path / 'b.npz', TopologyBuilder())
-    assert GRID.read(tmp_path / 'a.npz').patch().unknown.all()
+    assert GRID.read(tmp_path / 'a.npz').known_area().unknown.all()
     assert not TOPOLOGY.read(tmp_path / 'b.npz').map.nodes
 
 
