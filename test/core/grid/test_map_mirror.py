@@ -46,3 +46,12 @@ def test_a_window_off_the_lattice_is_refused(other):
     mirror.replace(patch(0.0, 0.0, 0))
     with pytest.raises(InputError, match='lattice'):
         mirror.paste(other)
+
+
+@pytest.mark.parametrize(('x', 'y'), [(0.01, 0.0), (0.0, 0.01)])
+def test_a_window_may_be_less_than_a_hundredth_of_a_cell_off_the_lattice(x, y):
+    mirror = MapMirror()
+    mirror.replace(patch(0.0, 0.0, 0, resolution=1.0))
+    assert mirror.paste(patch(0.99 * x, 0.99 * y, 0, resolution=1.0)).shape == (4, 4)
+    with pytest.raises(InputError, match='lattice'):
+        mirror.paste(patch(x, y, 0, resolution=1.0))
