@@ -227,7 +227,7 @@ class BagLog:
             raise InputError(f'{self.path}: /tf_static: {error}') from error
         if mount is None:
             known = validation.quoted_names(transforms.frames)
-            where = f'where "{validation.quoted_name(frame)}" is on "{self.base_frame}"'
+            where = f'from "{validation.quoted_name(frame)}" to "{self.base_frame}"'
             raise InputError(
                 f'{self.path}: /tf_static has no transform {where} (it has {known}): '
                 'give --base-frame, or --offset-m for a laser straight ahead'
