@@ -179,7 +179,7 @@ class BagLog:
             if count == 0:
                 first = f': {self.skipped.first}' if self.skipped.first else ''
                 name = validation.quoted_name(topic)
-                raise InputError(f'{self.path}: {name}: no message that can be used{first}')
+                raise InputError(f'{self.path}: {name}: no usable message{first}')
 
     def _event(self, bag: Bag, message: RawMessage) -> tuple[str, OdometryEvent | Scan] | None:
         """Frame and value of a message; None, and counted, if it is unusable."""
