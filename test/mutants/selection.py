@@ -10,6 +10,8 @@ from pathlib import Path
 _LEFT_OUT = {'live', 'docs', 'fuzz', 'tools', 'ros', 'benchmarks', 'experiments', 'mutants'}
 # So many test files for a mutant; the nearest come first.
 MOST_FILES = 6
+# Compares defaults and ranges of parameters with those of the documentation.
+_PARAMETERS = Path('test/docs/test_node_reference.py')
 
 
 class Selection:
@@ -42,7 +44,11 @@ class Selection:
             is_near = distances[test] <= 1 or test.parent == mirrored.parent
             return not is_near, distances[test], self._n_imported[test], test
 
-        return sorted(distances, key=key)[:MOST_FILES]
+        nearest = sorted(distances, key=key)[:MOST_FILES]
+        has_parameters = b'= parameter(' in module.read_bytes()
+        if has_parameters and (self._root / _PARAMETERS).exists():
+            nearest.append(_PARAMETERS)
+        return nearest
 
     def _distances(self, module: Path) -> dict[Path, int]:
         """Tests that import a module, 1; that import what imports it, 2; and so on."""
