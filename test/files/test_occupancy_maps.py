@@ -84,6 +84,14 @@ def test_thresholds_of_a_trinary_map(tmp_path: Path) -> None:
     assert patch.frame == GridFrame(-1.5, 2.25, 0.05)
 
 
+def test_a_darkness_equal_to_a_threshold_is_unknown(tmp_path: Path) -> None:
+    grey = np.array([[50, 51, 52, 203, 204, 205]], dtype=np.uint8)
+    patch = read_map(
+        described(tmp_path, grey, negate=1, free_thresh=51 / 255, occupied_thresh=204 / 255)
+    )
+    assert patch.cells[0].tolist() == [0, -1, -1, -1, -1, 100]
+
+
 @pytest.mark.parametrize('negate', [1, True])
 def test_negate(tmp_path: Path, negate: object) -> None:
     grey = np.array([[0, 255]], dtype=np.uint8)

@@ -151,7 +151,7 @@ def test_a_mapper_that_is_killed_meanwhile_resumes_with_the_published_map(graph)
     mapping.start()
     graph.until(lambda: mapping.maps, 'the map, at once')
     known = messages.grid_from_msg(mapping.maps[-1])
-    expected = OccupancyGrid.from_state(shown, CONFIG).patch()
+    expected = OccupancyGrid.from_state(shown, CONFIG).known_area()
     np.testing.assert_array_equal(known.cells, expected.cells)
     # Messages published before discovery are lost.
     mapping.windows.clear()

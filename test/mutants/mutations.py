@@ -98,7 +98,7 @@ class _Finder:
         yield from self._below(ast.parse(self._source))
 
     def _below(self, node: ast.AST) -> Iterator[Mutation]:
-        if isinstance(node, _SKIPPED) or _is_skipped_call(node):
+        if isinstance(node, _SKIPPED) or _is_strict(node) or _is_skipped_call(node):
             return
         yield from self._of(node)
         for child in _children(node):
@@ -182,6 +182,11 @@ def _children(node: ast.AST) -> Iterator[ast.AST]:
         for child in value if isinstance(value, list) else [value]:
             if isinstance(child, ast.AST):
                 yield child
+
+
+def _is_strict(node: ast.AST) -> bool:
+    """Whether this is the `strict=True` of a zip: an assertion."""
+    return isinstance(node, ast.keyword) and node.arg == 'strict'
 
 
 def _is_skipped_call(node: ast.AST) -> bool:

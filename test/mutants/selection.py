@@ -10,6 +10,8 @@ from pathlib import Path
 _LEFT_OUT = {'live', 'docs', 'fuzz', 'tools', 'ros', 'benchmarks', 'experiments', 'mutants'}
 # Largest number of test files for a mutant; the nearest come first.
 MOST_FILES = 6
+# Compares defaults and ranges of parameters with those of the documentation.
+_PARAMETERS = Path('test/docs/test_node_reference.py')
 
 
 class Selection:
@@ -19,24 +21,34 @@ class Selection:
         self._root = root
         self._tests = root / 'test'
         self._importers: dict[Path, set[Path]] = defaultdict(set)
+        self._n_imported: dict[Path, int] = {}
         sources = [*(root / package).rglob('*.py'), *self._tests.rglob('*.py')]
         for source in sources:
-            for imported in self._imported(source):
+            found = set(self._imported(source))
+            self._n_imported[source.relative_to(root)] = len(found)
+            for imported in found:
                 self._importers[imported].add(source)
 
     def tests_of(self, module: Path) -> list[Path]:
-        """Test files of a module, relative to the root, the nearest first."""
+        """Test files of a module, relative to the root, the nearest first.
+
+        Of two equally near ones, that which imports less: it is about this module, and quicker.
+        """
         inside = module.relative_to(self._root)
         mirrored = Path('test', *inside.parts[1:-1], f'test_{inside.name}')
         distances = self._distances(module)
         if (self._root / mirrored).exists():
             distances[mirrored] = 0
 
-        def key(test: Path) -> tuple[bool, int, Path]:
+        def key(test: Path) -> tuple[bool, int, int, Path]:
             is_near = distances[test] <= 1 or test.parent == mirrored.parent
-            return not is_near, distances[test], test
+            return not is_near, distances[test], self._n_imported[test], test
 
-        return sorted(distances, key=key)[:MOST_FILES]
+        nearest = sorted(distances, key=key)[:MOST_FILES]
+        has_parameters = b'= parameter(' in module.read_bytes()
+        if has_parameters and (self._root / _PARAMETERS).exists():
+            nearest.append(_PARAMETERS)
+        return nearest
 
     def _distances(self, module: Path) -> dict[Path, int]:
         """Tests that import a module, 1; that import what imports it, 2; and so on."""

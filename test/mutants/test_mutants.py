@@ -7,6 +7,7 @@ import pytest
 
 from mutants.__main__ import EQUIVALENT, ROOT, chosen, equivalent_changes, main, parsed
 from mutants.mutations import mutations
+from mutants.selection import Selection
 
 MODULE = """
 LIMIT: int = 4
@@ -101,6 +102,31 @@ def test_a_seed_chooses_the_same_mutants(project) -> None:
     assert not of('--skip', 'package/core')
 
 
+def added(project: Path, name: str, text: str) -> Path:
+    (project / name).parent.mkdir(exist_ok=True)
+    (project / name).write_text(text)
+    return Path(name)
+
+
+@pytest.mark.programs
+def test_of_equally_near_tests_those_that_import_less_come_first(project) -> None:
+    added(project, 'package/core/other.py', '')
+    more = added(project, 'test/core/test_a.py', 'from package.core import bounds, other\n')
+    less = added(project, 'test/core/test_b.py', 'from package.core import bounds\n')
+    mirrored = Path('test/core/test_bounds.py')
+    found = Selection(project, 'package').tests_of(project / 'package/core/bounds.py')
+    assert found == [mirrored, less, more]
+
+
+@pytest.mark.programs
+def test_the_test_of_the_documented_parameters_belongs_to_modules_with_parameters(project) -> None:
+    reference = added(project, 'test/docs/test_node_reference.py', '')
+    module = project / 'package/core/bounds.py'
+    assert reference not in Selection(project, 'package').tests_of(module)
+    module.write_text(MODULE + 'share: float = parameter(0.5)\n')
+    assert Selection(project, 'package').tests_of(module)[-1] == reference
+
+
 @pytest.mark.parametrize(
     ('source', 'expected'),
     [
@@ -118,6 +144,7 @@ def test_a_seed_chooses_the_same_mutants(project) -> None:
         ('a: tuple[1] = b', []),
         ("raise E(f'{a + 1}')", []),
         ('"Text."', []),
+        ('for a, b in zip(c, d, strict=True): e(a)', ['for a, b in zip(c, d, strict=True): pass']),
         ('T = TypeVar("T", bound=a + 1)', []),
     ],
 )

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.files import worlds
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.world import World
 
@@ -159,6 +160,17 @@ def test_errors_are_reported(tmp_path: Path, change: dict[str, object], said: st
         box(tmp_path, **change)
     assert str(tmp_path / 'w.yaml') in str(error.value)
     assert '\n' not in str(error.value)
+
+
+def test_a_world_may_have_as_many_cells_as_the_limit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    size = box(tmp_path).occupied.size
+    monkeypatch.setattr(worlds, '_MAX_CELLS', size)
+    assert box(tmp_path).occupied.size == size
+    monkeypatch.setattr(worlds, '_MAX_CELLS', size - 1)
+    with pytest.raises(InputError, match=f'expected at most {size - 1}'):
+        box(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -160,6 +160,18 @@ def test_what_was_seen_once_and_then_no_more_is_forgotten():
     assert [round(f.r_m) for f in features.line_features(ekf)] == [4]
 
 
+@pytest.mark.parametrize(('misses', 'found'), [(3, [1, 4]), (4, [4])])
+def test_a_candidate_is_dropped_after_more_misses_than_configured(misses, found):
+    ekf = CompressedEkf(np.zeros(3), SURE)
+    config = FeatureConfig(min_observations=2, candidate_max_misses=3)
+    features = FeatureMap(config, AssociationConfig(), local_areas=False)
+    seldom_seen = seen_lines([[1.0, -0.5], [1.0, 0.5]])
+    wall = seen_lines([[4.0, -1.0], [4.0, 1.0]])
+    for lines in (seldom_seen, *[wall] * misses, seldom_seen):
+        features.observe(ekf, lines, BLIND)
+    assert sorted(round(f.r_m) for f in features.line_features(ekf)) == found
+
+
 def test_two_features_that_turn_out_to_be_one_wall_merge():
     ekf, features = known(
         [[[2.0, -3.0], [2.0, -1.0]], [[2.0, 1.0], [2.0, 3.0]], [[-1.0, 2.0], [1.0, 2.0]]]
@@ -170,6 +182,12 @@ def test_two_features_that_turn_out_to_be_one_wall_merge():
     assert len(features) == 2 == len(ekf)
     (long,) = [f for f in features.line_features(ekf) if f.id == first]
     assert sorted([long.start[1], long.end[1]]) == pytest.approx([-3.0, 3.0], abs=0.02)
+
+
+def test_a_line_askew_on_a_known_wall_fails_the_gate_and_is_no_second_feature():
+    ekf, features = known([[[3.0, -1.0], [3.0, 3.0]]])
+    features.observe(ekf, seen_lines([[3.09, 0.2], [2.91, 1.8]]), BLIND)
+    assert len(features) == 1
 
 
 @pytest.mark.parametrize('local_areas', [False, True])

@@ -7,7 +7,7 @@ import pytest
 from reference_filter import DenseFilter
 
 from thinmap_ros.core.ekf_slam.ekf import EkfSlam
-from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf
+from thinmap_ros.core.ekf_slam.ekf_ti import CompressedEkf, _Store
 from thinmap_ros.core.ekf_slam.models import observe_line
 from thinmap_ros.core.se2 import compose
 
@@ -152,6 +152,23 @@ def test_steps_touch_the_local_area_only(rng):
 @pytest.mark.skipif(
     not STATUS.exists(), reason='says what a process holds only where there is a /proc'
 )
+def test_a_fold_of_some_hundred_features_is_worked_in_over_some_hundred_steps(rng):
+    store = _Store()
+    for _ in range(500):
+        store.take_place()
+    at = np.arange(1000)
+    W = np.zeros((3, store.width))
+    W[:, :1000] = rng.normal(0.0, 0.1, (3, 1000))
+    store.subtract(W)
+    _, up_to_date = store.read(at)
+    steps = 0
+    while len(store._waiting) + len(store._sweeping) > 0:
+        store.sweep()
+        steps += 1
+    assert 250 < steps < 450
+    np.testing.assert_allclose(store._P[:1000, :1000], up_to_date[:, :1000], atol=1e-12)
+
+
 def test_some_hundred_features_take_little_memory(rng):
     """Their covariance is 2 MB; the reserved memory of the store must not be used."""
     before = held_mb()

@@ -32,9 +32,26 @@ def test_the_first_window_is_the_map_and_a_new_map_replaces_all():
     assert mirror.patch.shape == (2, 2)
 
 
+@pytest.mark.parametrize(('x', 'y'), [(0.0, 5.0), (5.0, 0.0), (0.0, -5.0), (-5.0, 0.0)])
+def test_a_window_far_off_in_one_direction_is_refused(x, y):
+    mirror = MapMirror()
+    mirror.replace(patch(0.0, 0.0, 0))
+    with pytest.raises(InputError, match='expected it on or beside the map'):
+        mirror.paste(patch(x, y, 0))
+
+
 @pytest.mark.parametrize('other', [patch(0.05, 0.0, 0), patch(0.0, 0.0, 0, resolution=0.2)])
 def test_a_window_off_the_lattice_is_refused(other):
     mirror = MapMirror()
     mirror.replace(patch(0.0, 0.0, 0))
     with pytest.raises(InputError, match='lattice'):
         mirror.paste(other)
+
+
+@pytest.mark.parametrize(('x', 'y'), [(0.01, 0.0), (0.0, 0.01)])
+def test_a_window_may_be_less_than_a_hundredth_of_a_cell_off_the_lattice(x, y):
+    mirror = MapMirror()
+    mirror.replace(patch(0.0, 0.0, 0, resolution=1.0))
+    assert mirror.paste(patch(0.99 * x, 0.99 * y, 0, resolution=1.0)).shape == (4, 4)
+    with pytest.raises(InputError, match='lattice'):
+        mirror.paste(patch(x, y, 0, resolution=1.0))

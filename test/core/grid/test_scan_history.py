@@ -79,6 +79,12 @@ def test_of_a_place_that_is_seen_again_and_again_the_newest_scans_are_kept():
     assert kept == sorted(kept)
 
 
+def test_a_robot_that_turns_on_the_spot_keeps_four_scans_of_each_of_eight_directions():
+    turning = np.array([se2.pose(0.5, 0.5, 0.3 * k) for k in range(200)])
+    kept = filled(turning, range(200)).kept()
+    assert len(kept) == 4 * 8
+
+
 def test_places_are_those_after_a_correction():
     """Two halves of a path are corrected onto each other: the newest scans are kept."""
     there = np.array([se2.pose(0.01 + k, 0.1, 0.1) for k in range(8)])

@@ -76,6 +76,21 @@ def test_it_slows_down_to_stop_at_the_end():
     assert poses[-1][0] <= 3.03
 
 
+@pytest.mark.parametrize(
+    ('lookahead_time_s', 'margin_m', 'expected'),
+    [(0.8, 0.05, 0.25), (0.4, 0.05, 0.5), (0.4, 0.1, 0.75), (2.0, 0.0, 0.1)],
+)
+def test_in_a_narrow_passage_the_speed_is_the_shorter_lookahead_over_its_time(
+    lookahead_time_s, margin_m, expected
+):
+    config = PathFollowerConfig(max_speed_m_s=2.0, lookahead_time_s=lookahead_time_s)
+    follower = PathFollower(config)
+    path = dense([(0.0, 0.0), (20.0, 0.0)])
+    for _ in range(30):
+        v, w = follower.command(np.zeros(3), path, DT, margin_m)
+    assert (v, w) == pytest.approx((expected, 0.0))
+
+
 def test_turning_to_a_heading_ends_there():
     follower = PathFollower(PathFollowerConfig())
     heading = 0.0

@@ -688,6 +688,14 @@ def test_a_state_that_is_none_is_refused_in_words(whole_drive, name, value):
         Localizer.from_state(state)
 
 
+def test_a_state_with_more_hits_than_observations_in_one_cell_is_refused(whole_drive):
+    state = whole_drive[1].state()
+    hits = state['hits'].copy()
+    hits.flat[0] = state['seen'].flat[0] + 1
+    with pytest.raises(InputError, match='hits: more than seen'):
+        Localizer.from_state({**state, 'hits': hits})
+
+
 def test_a_loop_that_is_closed_while_the_robot_slides_into_the_old_map_is_closed_well():
     """At the start the pose slides onto the old walls before the loop is closed."""
     localizer = at_start(initial_x_m=3.0, initial_y_m=1.2)

@@ -56,6 +56,22 @@ def test_the_residual_covariance_shrinks_with_the_path():
     assert np.linalg.eigvalsh(left[-1]).min() > -1e-12
 
 
+@pytest.mark.parametrize('increment', [(0.3, 0.1, 0.4), (0.2, -0.15, -0.8), (-0.4, 0.2, 0.3)])
+def test_the_residual_covariance_is_that_of_numeric_differences(increment):
+    known = np.array([1.1, 0.05, 0.9, 0.2])
+
+    def corrected(offset):
+        calibration = OdometryCalibration()
+        calibration.known = known + offset
+        return calibration.corrected(np.array(increment), NOISE)
+
+    step = 1e-6
+    differences = [corrected(d)[0] - corrected(-d)[0] for d in step * np.eye(4)]
+    J = np.array(differences).T / (2.0 * step)
+    P = OdometryCalibration()._covariance
+    np.testing.assert_allclose(corrected(np.zeros(4))[1], J @ P @ J.T, rtol=1e-6, atol=1e-12)
+
+
 def test_a_single_slip_does_not_change_the_calibration():
     calibration = OdometryCalibration()
     known = []

@@ -185,9 +185,10 @@ class EkfSlam:
         self.count -= 1
 
     def _correct(self, v: Array, S: Array, HP: Array) -> bool:
-        """Eqs. (6)-(9): x += K v and P -= K (H P).
+        """Update with the innovation v (M,), its covariance S (M, M), and H P (M, size).
 
-        v (M,): the innovation, S (M, M): its covariance, HP (M, size).
+        Kalman gain K = P H' S^-1, eqs. (8) and (9); state x += K v, eq. (6); covariance
+        P -= K H P, eq. (7).
         """
         taken = bool(_correct(0.5 * (S + S.T), HP, v, self._x, self._P))
         if taken:

@@ -310,6 +310,18 @@ def test_a_step_with_a_jump_is_measured_again(rng):
     assert np.hypot(*(loops.finish()[2] - truths[2])[:2]) < 0.1
 
 
+def test_what_has_jumped_is_as_uncertain_as_step_and_jump_together():
+    loops = loop_closure()
+    for k, jump in enumerate([NONE, np.diag([0.09, 0.01, 0.02])]):
+        pose = se2.pose(2.0, 2.0 + k, 0.5 * np.pi)
+        scan = scan_in(ROOM, pose, stamp_ns=k)
+        points = surface_points(scan, RANGE_MAX_M)
+        loops.add(Keyframe(scan, points, pose, float(k), NONE, 0), STEP, jump)
+    (job,) = loops._jobs
+    # In the map frame: along the robot's way is y.
+    np.testing.assert_allclose(job.covariance, STEP + np.diag([0.01, 0.09, 0.02]), atol=1e-12)
+
+
 def test_the_step_covariance_is_that_of_the_step(rng):
     loops = loop_closure()
     for k, pose in enumerate([np.zeros(3), np.array([1.0, 0.0, 0.2])]):
