@@ -94,7 +94,8 @@ def draw(path: Path) -> None:
     for (a, b), count in sorted(without_implied(edges).items()):
         if a in place and b in place:
             style = {'arrowstyle': '->', 'lw': 0.4 + 0.5 * math.log2(1 + count), 'color': '#7a8794'}
-            (x_a, y_a), (x_b, y_b) = place[a], place[b]
+            x_a, y_a = place[a]
+            x_b, y_b = place[b]
             ends = ((x_b, y_b + 0.19), (x_a, y_a - 0.19))
             axes.annotate('', *ends, arrowprops=style | {'shrinkA': 0, 'shrinkB': 0})
     for room, (x, y) in place.items():

@@ -47,12 +47,12 @@ def described(name, value, descriptor, indent):
     text = OWN_WORDS.get(name, descriptor.description)
     limits = [*descriptor.floating_point_range, *descriptor.integer_range]
     if limits:
-        text += f'; {limits[0].from_value:g} to {limits[0].to_value:g}'
+        text += f' Range: {limits[0].from_value:g} to {limits[0].to_value:g}.'
     if descriptor.additional_constraints:
-        text += f'; {descriptor.additional_constraints}'
+        text += f' {descriptor.additional_constraints.capitalize()}.'
     assert text, f'{name} has no description'
     if not descriptor.read_only and name not in OWN_WORDS:
-        text += '; can be changed at run time'
+        text += ' Can be changed at run time.'
     comment = f'{indent}# '
     lines = textwrap.wrap(text, 112, initial_indent=comment, subsequent_indent=comment)
     return [*lines, indent + yaml.safe_dump({name.split('.')[-1]: value}).strip()]

@@ -68,7 +68,7 @@ class ExplorerNode(ThinmapNode):
     def stop(self) -> None:
         """End the exploration."""
         if self._goals.active:
-            self._execute(self._mission.cancel('the explorer was stopped or begins anew'))
+            self._execute(self._mission.cancel('the explorer was stopped or reset'))
 
     def _make_topics(self) -> None:
         self._end_nodes = self.create_publisher(EndNodeArray, 'end_nodes', qos.LATCHED)

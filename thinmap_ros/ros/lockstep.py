@@ -20,7 +20,7 @@ _TYPES: dict[str, Any] = {
 TOPICS = (NONE, *_TYPES)
 # Long: a busy machine, or one that compiles kernels, still publishes a result.
 TIMEOUT_S = 10.0
-TIMEOUT_DESCRIPTION = 'in lockstep, continue without a result after this time, s of the machine'
+TIMEOUT_DESCRIPTION = 'Time after which lockstep continues without a result (s, machine time).'
 
 
 class Lockstep:

@@ -53,7 +53,7 @@ def declare_config(
         try:
             values[name] = node.declare_parameter(name, default, descriptor).value
         except Exception as error:
-            # rclpy has a class of its own for each way in which a value can be wrong.
+            # rclpy has an exception class for each kind of wrong value.
             raise ConfigError(f'parameter {name} of node {node.get_name()}: {error}') from error
     current = with_values(config(), values)
     if changed is not None:

@@ -98,7 +98,7 @@ class OccupancyConfig(Config):
     surface_thickness_m: float = parameter(
         0.03,
         'Depth behind the measured surface that is marked occupied (m). Raise it if walls that '
-        'lie on the border of two cells break up.',
+        'lie between two cells break up.',
         low=0.0,
         high=0.5,
     )

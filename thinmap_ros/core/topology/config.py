@@ -69,7 +69,7 @@ class TopologyConfig(Config):
     skeleton_keep_margin_m: float = parameter(
         2.0,
         'Distance outside the visible area up to which the previous skeleton is kept (m). Raise '
-        'it if nodes at the border of the view flicker.',
+        'it if nodes at the edge of the view flicker.',
         low=0.0,
         high=50.0,
     )
