@@ -9,7 +9,7 @@ from thinmap_ros.view import palette
 from thinmap_ros.view.rerun_sinks import TIMELINE
 
 UNKNOWN_GREY = 205
-_WIDTHS = (5, 2)  # of the map and of the panels beside it
+_WIDTHS = (5, 2)  # of the map, and of curves and legend
 LEGEND = """**orange** end node, with its position probability; **grey** it will stay ·
 **dark blue** branch · **amber** corner · **green** skeleton ·
 **blue** features of the local area, its nodes ringed;
