@@ -1,4 +1,4 @@
-"""The local map that scans are matched with, rendered again from keyframes after a correction."""
+"""The local map for scan matching, re-rendered from the keyframes after a loop closure."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,22 +12,22 @@ from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.matching.local_map import LocalMap, LocalMapConfig
 
 _AT_ONCE = 20  # keyframes rendered at once after a correction
-_A_STEP = 2  # and in each step after it
+_A_STEP = 2  # keyframes rendered in each later step
 
 
 class ActiveMap:
-    """A local map, what it was given to begin with, and the keyframes that it still lacks."""
+    """The current local map, its loaded cells, and the keyframes that are not yet rendered."""
 
     def __init__(self, config: LocalMapConfig) -> None:
         self._config = config
         self.map = LocalMap(config)
         self.number = 0  # of the submap
-        self.T_at_update: Array | None = None  # pose (3,) of the scan that it learned from last
+        self.T_at_update: Array | None = None  # pose (3,) of the last scan that was added
         self._loaded: Mapping[str, NDArray[Any]] | None = None
         self._pending: list[int] = []
 
     def load(self, given: Mapping[str, NDArray[Any]]) -> None:
-        """The map has the cells of a state from the beginning."""
+        """Set the cells of a `LocalMap.state` with which every re-rendered map starts."""
         self._loaded = given
 
     def add_scan(self, points: Array, T_base_laser: Array, T_map_base: Array) -> None:
@@ -36,7 +36,7 @@ class ActiveMap:
         self.T_at_update = T_map_base
 
     def moved(self, T_map_base: Array) -> Array | None:
-        """The motion (3,) since the map last learned, to a pose (3,); None before the first."""
+        """Motion (3,) from the last map update to a pose (3,); None before the first update."""
         return None if self.T_at_update is None else se2.between(self.T_at_update, T_map_base)
 
     def start_submap(self) -> None:
@@ -46,7 +46,7 @@ class ActiveMap:
         self.number += 1
 
     def rerender(self, keyframes: Sequence[Keyframe], T_map_base: Array) -> None:
-        """Render the map again from its keyframes, those nearest to a pose (3,) first."""
+        """Re-render the map from the keyframes, those nearest to a pose (3,) first."""
         self.map = LocalMap(self._config)
         if self._loaded is not None:
             self.map.restore(self._loaded)
@@ -56,7 +56,7 @@ class ActiveMap:
         self.render(keyframes, _AT_ONCE)
 
     def render(self, keyframes: Sequence[Keyframe], count: int = _A_STEP) -> None:
-        """Render some of the keyframes that are due."""
+        """Render up to `count` of the pending keyframes."""
         for _ in range(min(count, len(self._pending))):
             frame = keyframes[self._pending.pop()]
             self.map.add_scan(frame.points, frame.scan.T_base_laser, frame.T_map_base)

@@ -1,7 +1,7 @@
-"""How uncertain the pose is: since scans last fitted, since the map last grew, since the anchor.
+"""Covariance of the pose since the last match, the last map update, and the anchor keyframe.
 
-A scan measures the pose in the local map. The map errs where it grew, by as much as the scan that
-it learned from: that adds up along the path, and only loop closure takes it back.
+A match measures the pose relative to the local map. A scan that is added to the map adds its own
+pose error to it. These errors accumulate along the path until a loop closure corrects them.
 """
 
 import numpy as np
@@ -12,12 +12,12 @@ from thinmap_ros.core.slam.graph.keyframes import inverse, propagated_covariance
 from thinmap_ros.core.slam.matching.scan_matcher import Match
 
 CHI2 = 11.34  # 99 % of three degrees of freedom
-UNKNOWN = np.diag(np.square([300.0, 300.0, np.pi]))  # of a pose that could be anywhere
-_LEAST_STEP = np.diag(np.square([2e-3, 2e-3, 5e-4]))  # of a step between keyframes, at least
+UNKNOWN = np.diag(np.square([300.0, 300.0, np.pi]))  # covariance of an unknown pose
+_LEAST_STEP = np.diag(np.square([2e-3, 2e-3, 5e-4]))  # smallest covariance between keyframes
 
 
 class Contradiction:
-    """What scans have moved the pose by, against the motion, since the anchor."""
+    """Sum of the innovations of matches since the anchor: pose changes that are no motion."""
 
     def __init__(self) -> None:
         self._moved: Array = np.zeros(3)
@@ -25,19 +25,20 @@ class Contradiction:
         self._known: Array = np.zeros((3, 3))
 
     def add(self, off: Array, expected: Array) -> None:
-        """Add what a match is off (3,) its prior, and the covariance (3, 3) expected of that."""
+        """Add the innovation (3,) of a match, and the prior covariance (3, 3) of it."""
         self._moved = self._moved + off
         self._expected = self._expected + expected
 
     def add_jump(self, covariance: Array) -> None:
-        """Add a step that is known to be uncertain by a covariance (3, 3)."""
+        """Add the covariance (3, 3) of a known discontinuity."""
         self._known = self._known + covariance
 
     @property
     def covariance(self) -> Array:
-        """Covariance (3, 3) that the step from the anchor has on top, 0 where nothing disagrees.
+        """Covariance (3, 3) to add to the step from the anchor; 0 if the innovations are noise.
 
-        Scans that pull a robot back to what was mapped before, a little each time, are no motion.
+        Many small innovations in one direction pull the pose onto an earlier map; they are no
+        motion of the robot.
         """
         expected = self._expected + _LEAST_STEP
         if float(self._moved @ np.linalg.solve(expected, self._moved)) < CHI2:
@@ -46,19 +47,19 @@ class Contradiction:
 
 
 class PoseUncertainty:
-    """Covariances (3, 3), map frame, of the pose as seen from several places on its path."""
+    """Covariances (3, 3), map frame, of the pose relative to several earlier poses."""
 
     def __init__(self, T_map_base: Array) -> None:
         self.since_match = np.zeros((3, 3))  # motion since the last good match: the next prior
         self.since_map_update = np.zeros((3, 3))  # pose since the last map update
-        self.motion_part: Array = np.zeros((3, 3))  # of since_map_update, due to the motion
+        self.motion_part: Array = np.zeros((3, 3))  # share of since_map_update from the motion
         self._since_keyframe = np.zeros((3, 3))
-        self._map_update_covariance = np.zeros((3, 3))  # of the last map update, not yet counted
+        self._map_update_covariance = np.zeros((3, 3))  # last update, not in _since_keyframe
         self._contradiction = Contradiction()
-        self._T_moved = T_map_base  # where the robot was when it last moved
+        self._T_moved = T_map_base  # pose after the last motion
 
     def place(self, T_map_base: Array, covariance: Array) -> None:
-        """The robot is at a pose (3,) with a covariance (3, 3), however it came there."""
+        """Set the pose (3,) and its covariance (3, 3), without any motion."""
         own = 0.5 * (covariance + covariance.T) + _LEAST_STEP
         self._T_moved = T_map_base
         self.since_match = own
@@ -68,7 +69,7 @@ class PoseUncertainty:
         self._contradiction.add_jump(own + UNKNOWN)
 
     def predict(self, before: Array, prior: Array, Q: Array, is_stationary: bool) -> None:
-        """The motion has led from one pose (3,) to another, with covariance Q (3, 3)."""
+        """Propagate by a motion from a pose (3,) to the prior (3,), with covariance Q (3, 3)."""
         self.since_match = propagated_covariance(self.since_match, prior[:2] - before[:2]) + Q
         if not is_stationary:
             lever = prior[:2] - self._T_moved[:2]
@@ -76,18 +77,18 @@ class PoseUncertainty:
             self.since_map_update = propagated_covariance(self.since_map_update, lever)
 
     def is_stationary(self, T_map_base: Array, slip: Array) -> bool:
-        """Whether a pose (3,) is where the robot last moved, but for the slip (3,)."""
+        """Whether a pose (3,) differs from the last moved one by at most the slip (3,)."""
         return bool((np.abs(se2.pose_difference(T_map_base, self._T_moved)) <= slip).all())
 
     def coast(self, T_map_base: Array, Q: Array, is_stationary: bool) -> None:
-        """No scan has told the pose: it is where the motion has led."""
+        """Use the predicted pose (3,) of this step, without a match."""
         if not is_stationary:
             self.since_map_update = self.since_map_update + Q
             self._T_moved = T_map_base
         self.motion_part = self.since_map_update
 
     def update(self, match: Match, prior: Array, Q: Array, fits: bool, is_stationary: bool) -> None:
-        """A match has told the pose, against a prior (3,); fits: whether it is to be believed."""
+        """Update by a match with a prior (3,); fits: whether enough points are inliers."""
         self._contradiction.add(se2.pose_difference(match.T_map_base, prior), self.since_match)
         self.since_match = np.zeros((3, 3)) if fits else match.covariance
         if is_stationary:
@@ -98,12 +99,12 @@ class PoseUncertainty:
         self._T_moved = match.T_map_base
 
     def is_unexpected(self, match: Match, prior: Array) -> bool:
-        """Whether a match contradicts the motion that led to a prior (3,)."""
+        """Whether the innovation of a match from its prior (3,) exceeds the 99 % gate."""
         off = se2.pose_difference(match.T_map_base, prior)
         return float(off @ np.linalg.solve(self.since_match, off)) > CHI2
 
     def learn(self, share: float) -> None:
-        """The map has grown; share: of the scan's error that is new since it last did."""
+        """Account for a map update; share: of the scan's error that is independent of the last."""
         by_scan = self.by_scan
         self._since_keyframe = self._since_keyframe + self.motion_part + share * by_scan
         self._map_update_covariance = (1.0 - share) * by_scan
@@ -112,35 +113,38 @@ class PoseUncertainty:
 
     @property
     def by_scan(self) -> Array:
-        """The part (3, 3) of the pose's error since the map grew that comes of the scan."""
+        """Share (3, 3) of `since_map_update` that is due to the scan."""
         return self.since_map_update - self.motion_part
 
     def start_submap(self, T_map_base: Array, covariance: Array) -> None:
-        """A new local map begins at a pose (3,), off by a covariance (3, 3) from the old one."""
+        """Start a submap at a pose (3,), with covariance (3, 3) relative to the previous one."""
         self._contradiction.add_jump(covariance)
         self._since_keyframe = self._since_keyframe + covariance
         self.since_match = np.zeros((3, 3))
         self._T_moved = T_map_base
 
     def step_from(self, yaw: float) -> tuple[Array, Array]:
-        """Covariance (3, 3) of the step from an anchor with a heading, and what jumps add to it."""
+        """Covariance (3, 3) of the step from an anchor with heading yaw, and of its jumps (3, 3).
+
+        Both in the frame of the anchor.
+        """
         jump = self._contradiction.covariance
         step = rotated_covariance(self._since_keyframe, -yaw) + _LEAST_STEP
         return step, rotated_covariance(jump, -yaw)
 
     def start_step(self) -> None:
-        """The pose is that of a keyframe, from which on uncertainty is counted."""
+        """Make the current pose the anchor: its step covariance restarts at 0."""
         self._since_keyframe = np.zeros((3, 3))
         self._map_update_covariance = np.zeros((3, 3))
         self._contradiction = Contradiction()
 
     def move(self, T_map_base: Array) -> None:
-        """The pose was corrected to (3,), and all that it is seen from with it."""
+        """Set the corrected pose (3,); covariances relative to earlier poses do not change."""
         self._T_moved = T_map_base
 
     def covariance(self, T_anchor: Array | None, anchor_covariance: Array | None) -> Array:
-        """Covariance (3, 3) of the pose in the map, by that of its anchor at (3,), if any."""
-        # The pose errs as the scan that the map learned from, until it errs by more.
+        """Covariance (3, 3) of the pose, map frame, given the anchor's pose (3,) and covariance."""
+        # A match cannot be more accurate than the scan that was last added to the map.
         own = self._since_keyframe + max(
             self._map_update_covariance, self.since_map_update, key=np.trace
         )

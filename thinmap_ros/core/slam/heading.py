@@ -1,4 +1,4 @@
-"""The heading by the main directions of the building's walls: new walls are rendered straight."""
+"""Manhattan-world heading correction of the scans that are added to the local map."""
 
 from thinmap_ros.core import se2
 from thinmap_ros.core.ekf_slam.line_extraction import LineConfig, extract_lines
@@ -7,28 +7,29 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.covariance import PoseUncertainty
 from thinmap_ros.core.slam.wall_compass import Heading, WallCompass
 
-_NEW_SHARE = 0.2  # of the error of a match, from one update of the map to the next
+_NEW_SHARE = 0.2  # share of a match's error that is independent of the previous map update
 _LEAST_VARIANCE = 5e-4**2
 
 
 class HeadingCorrection:
-    """Corrects the heading of scans that the map learns from."""
+    """Corrects the heading of scans before they are added to the map."""
 
     def __init__(self, config: LineConfig) -> None:
         self._config = config
         self._compass = WallCompass()
-        self._variance = _LEAST_VARIANCE  # of the heading since the walls' direction told it
-        self.measured: Heading | None = None  # of the scan that was corrected last
+        self._variance = _LEAST_VARIANCE  # of the heading since its last measurement
+        self.measured: Heading | None = None  # measured heading of the last scan
 
     def correct(
         self, scan: Scan, T_map_base: Array, pose: PoseUncertainty, path_m: float, fits: bool
     ) -> Array:
-        """Pose (3,) with the heading that walls tell, or as it was where nothing fits.
+        """Pose (3,) with the heading corrected by the wall directions, if they give one.
 
-        path_m: length of the path so far, m: the compass trusts the beginning of the map most.
+        path_m: length of the path so far (m); walls near the start of the path weigh most.
+        fits: whether scans agree with the map; otherwise the pose is unchanged.
         """
-        # Narrower than the variance of the pose: where the heading errs by more, the local map errs
-        # with it, and a robot that is turned alone does not fit that map any more.
+        # The gate is narrower than the variance of the pose: a larger heading error is also in the
+        # local map, and a scan that is corrected alone would no longer fit this map.
         self._variance += float(pose.motion_part[2, 2] + _NEW_SHARE * pose.by_scan[2, 2])
         self.measured = None
         if not fits:

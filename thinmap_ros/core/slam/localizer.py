@@ -1,9 +1,9 @@
 """The localizer: one step for each scan, live and offline.
 
-A scan is matched with the local map from where the calibrated odometry expects it. The local map
-grows where the robot moves; keyframes and loop closure keep the whole consistent. A robot whose
-scans contradict the map goes on in a new local map, which hangs on the old one by a step as
-uncertain as it is.
+Calibrated odometry predicts the pose, and scan-to-map matching corrects it. The scan is added to
+the local map when the robot has moved far enough. Keyframes and loop closure keep the map globally
+consistent. If scans contradict the local map, a new one is started. A dead-reckoned edge with the
+accumulated covariance connects the two.
 """
 
 import math
@@ -50,7 +50,7 @@ from thinmap_ros.core.slam.odometry_prediction import OdometryPrediction, Predic
 from thinmap_ros.core.slam.tracking import FOR_A_SLIP, Tracking
 
 _SIGMAS = 3.0
-_VIEW_M = 1.0  # after a path of this length a match errs by other points than before
+_VIEW_M = 1.0  # path length after which the errors of two matches are independent
 
 
 @dataclass(frozen=True)
@@ -75,8 +75,7 @@ class LocalizerConfig(EkfConfig):
 class Localizer:
     """Scan matching with a local map, keyframes and loop closure.
 
-    Input that is not finite is rejected and counted in `rejected`: the robot is then taken to be
-    where it was.
+    Input that is not finite is counted in `rejected`; a rejected odometry pose means no motion.
     """
 
     def __init__(self, config: LocalizerConfig | None = None) -> None:
@@ -86,7 +85,7 @@ class Localizer:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: the next scan is the first, at the configured start."""
+        """Discard map, path and pose; the next scan starts at the configured initial pose."""
         config = self.config
         self._pose = se2.pose(config.initial_x_m, config.initial_y_m, config.initial_yaw_rad)
         self._prediction = OdometryPrediction(config.odometry)
@@ -103,23 +102,23 @@ class Localizer:
 
     @property
     def rejected(self) -> int:
-        """Odometry poses and poses from outside that made no sense."""
+        """Number of odometry poses and `set_pose` calls with invalid values."""
         return self._rejected + self._prediction.rejected
 
     @property
     def pose(self) -> Array:
-        """Where the robot is, T_map_base (3,)."""
+        """Current pose T_map_base (3,), a copy."""
         return self._pose.copy()
 
     @property
     def keyframes(self) -> list[Keyframe]:
-        """The scans that were kept, at their poses as they are known now."""
+        """The keyframes, at their optimized poses."""
         return self._loops.keyframes.frames
 
     def set_pose(self, T_map_base: Array, covariance: Array) -> None:
-        """Put the robot at a pose (3,) with covariance (3, 3) in the map that it has.
+        """Set the pose (3,) with covariance (3, 3) in the current map.
 
-        The next scans settle it; nothing is learned before.
+        The map is not updated until scans confirm the pose.
         """
         if not (se2.is_bounded_pose(T_map_base) and np.isfinite(covariance).all()):
             self._rejected += 1
@@ -131,21 +130,21 @@ class Localizer:
         self._map.rerender(self.keyframes, self._pose)
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """The local map as arrays by name, for `from_state`; not where the robot is."""
+        """The local map as arrays by name, for `from_state`; without the pose."""
         return self._map.map.state()
 
     @staticmethod
     def from_state(
         state: Mapping[str, NDArray[Any]], config: LocalizerConfig | None = None
     ) -> 'Localizer':
-        """Localizer in the map of another one's `state`, at the configured start.
+        """Localizer in the local map of a saved `state`, at the configured initial pose.
 
-        It is lost until scans fit there. Raises InputError where it is no such state.
+        It is delocalized until scans fit. Raises InputError if the state is invalid.
         """
         checked = snapshot.validate(state, local_map.FIELDS, 'local map')
         possible = bool((checked['hits'] <= checked['seen']).all())
         snapshot.require(
-            possible, 'local map: hits: more than seen', 'no more hits than observations'
+            possible, 'local map: hits: more than observations', 'no more hits than observations'
         )
         localizer = Localizer(config)
         localizer._map.map.restore(checked)
@@ -159,10 +158,10 @@ class Localizer:
         T_odom_base: Array,
         config: LocalizerConfig | None = None,
     ) -> 'Localizer':
-        """Localizer that goes on in an occupancy map, at T_odom_base (3,) after its last pose.
+        """Localizer that resumes in an occupancy map, after the odometry motion since `last`.
 
-        The pose is known to the noise of the odometry since then, and to a cell of the map (at a
-        metre, for the heading).
+        T_odom_base (3,): odometry pose now. The standard deviation of the pose is the odometry
+        noise since `last` plus one cell of the map (in rad, too, for the heading).
         """
         localizer = Localizer(config)
         for faces in occupied_surface_points(patch):
@@ -179,7 +178,10 @@ class Localizer:
         return localizer
 
     def step(self, scan: Scan, T_odom_base: Array) -> Estimate:
-        """Locate a scan with the odometry pose (3,) at its stamp, and learn from it."""
+        """Estimate the pose of a scan, given the odometry pose (3,) at its stamp; update the map.
+
+        One step: predict, match, update the pose, update the map, close loops.
+        """
         prediction = self._prediction.predict(scan, T_odom_base, self._pose)
         is_stationary = self._is_stationary(prediction)
         self._uncertainty.predict(
@@ -201,49 +203,49 @@ class Localizer:
         return self._estimate(match, correction)
 
     def optimized_trajectory(self) -> Array:
-        """Poses (N, 3) of all steps since the beginning, as they look after all corrections."""
+        """Poses (N, 3) of all steps since the start, after all corrections."""
         return self._path.poses(self._loops.finish())
 
     def keyframe_trajectory(self) -> tuple[NDArray[np.int64], Array]:
-        """Stamps (N,) and poses (N, 3), as known now, of scans along the whole path.
+        """Stamps (N,) in ns and optimized poses (N, 3) of the keyframe scans along the path.
 
-        All others go with those before.
+        Each other scan keeps its pose relative to the keyframe before it.
         """
         return self._loops.keyframes.path()
 
     def _start_delocalized(self, given: Mapping[str, NDArray[Any]]) -> None:
-        """The local map was given: the robot is lost in it until scans fit."""
+        """Start in a loaded local map: delocalized until scans fit."""
         self._map.load(given)
         self._tracking.start_delocalized()
         self._uncertainty.since_match = self._slip_covariance()
 
     def _slip_covariance(self) -> Array:
-        """Covariance (3, 3) of a pose after wheels have slipped as far as they ever do."""
+        """Covariance (3, 3) of a pose after the largest expected wheel slip."""
         config = self.config.matching
         slip = np.array([*[config.wheel_slip_m] * 2, config.wheel_slip_rad])
         return np.diag(np.square(_SIGMAS * slip))
 
     def _is_stationary(self, prediction: Prediction) -> bool:
-        """Whether the robot has not moved by more than odometry errs by."""
+        """Whether the robot has moved by no more than the odometry noise."""
         slip = _SIGMAS * odometry_slip(self.config.odometry)
         is_still = self._uncertainty.is_stationary(prediction.T_map_base, slip)
         return prediction.motion.is_stationary and is_still
 
     def _match(self, scan: Scan, points: Array, prior: Array) -> Match | None:
-        """The match of a scan with the local map; None where there is nothing to match."""
+        """Match a scan with the local map; None if scan or map have too little structure."""
         if len(points) < FEWEST_POINTS or self._map.map.is_empty:
             return None
         if np.ptp(points[:, :2], axis=0).max() < self.config.local_map.resolution_m:
-            return None  # all in one place: they tell no pose
+            return None  # all points in one cell do not determine a pose
         covariance = self._uncertainty.since_match
         return self._matcher.match(points, scan.T_base_laser, self._map.map, prior, covariance)
 
     def _update(self, match: Match | None, prediction: Prediction, is_stationary: bool) -> None:
-        """The pose by a match, or by the motion where there is none that can be believed."""
+        """Set the pose to that of an accepted match, or else to the predicted one."""
         prior = prediction.T_map_base
         is_unexpected = match is not None and self._uncertainty.is_unexpected(match, prior)
         accepted = match is not None and not (is_unexpected and self._is_rejected(match))
-        # Of a robot that was put somewhere: where it was before says nothing.
+        # After set_pose an innovation is due to the given pose, and not to the odometry.
         if match is not None and is_unexpected and not self._tracking.is_delocalized:
             self._prediction.contradict(prediction, match, accepted)
         if match is None or not accepted:
@@ -257,14 +259,14 @@ class Localizer:
         self._uncertainty.update(match, prior, prediction.covariance, fits, is_stationary)
 
     def _is_rejected(self, match: Match) -> bool:
-        """Whether many points contradict the map, so that a match may be chance."""
+        """Whether an unexpected match is rejected: many of its points contradict the map."""
         return (
             match.inlier_ratio < FOR_A_SLIP * match.contradiction_ratio
             and not self._tracking.is_delocalized
         )
 
     def _update_map(self, scan: Scan, points: Array) -> None:
-        """Extend the map by the scan, if the robot has moved since it last grew."""
+        """Add the scan to the map if the robot has moved far enough since the last update."""
         config = self.config.local_map
         moved = self._map.moved(self._pose)
         first = moved is None
@@ -277,14 +279,14 @@ class Localizer:
             self._start_submap()
         self._correct_heading(scan)
         self._map.add_scan(points, scan.T_base_laser, self._pose)
-        # What the motion leaves is new with every step; what the scan leaves is much the same error
-        # as in the step before, as long as the same walls are seen.
+        # Motion errors are independent in each step. The error of a match is correlated with that
+        # of the previous match as long as the same walls are observed.
         self._uncertainty.learn(min(1.0, path_m / _VIEW_M + turn))
         if len(points) >= FEWEST_POINTS and self._loops.needs_keyframe(self._pose):
             self._add_keyframe(scan, points)
 
     def _correct_heading(self, scan: Scan) -> None:
-        """Correct the heading by the directions of walls, where scans agree with the map."""
+        """Correct the heading by the wall directions if scans agree with the map."""
         path_m = self._loops.path_m(self._pose)
         agrees = self._tracking.agrees
         self._pose = self._heading.correct(scan, self._pose, self._uncertainty, path_m, agrees)
@@ -298,7 +300,7 @@ class Localizer:
         yaw = 0.0 if anchor < 0 else float(self.keyframes[anchor].T_map_base[2])
         step, jump = self._uncertainty.step_from(yaw)
         path_m = loops.path_m(self._pose)
-        # In a new local map the robot may be turned by any angle, also by a right one.
+        # In a new submap the heading is unknown, also by multiples of 90 degrees.
         heading = None if self._tracking.is_lost else self._heading.measured
         variance = heading_variance(heading, self._pose)
         covariance = with_heading(self._covariance(), variance)
@@ -307,10 +309,10 @@ class Localizer:
         self._uncertainty.start_step()
 
     def _start_submap(self) -> None:
-        """Go on in a new local map: where the robot is in the old one is not known any more.
+        """Start a new local map at the dead-reckoned pose.
 
-        The new one lies where the motion has led since a scan agreed with the old one: the matches
-        since then were with what contradicts them, as in a crowd.
+        Dead reckoning starts at the last scan that agreed with the old map: later matches, as in a
+        crowd, are not reliable.
         """
         dead_reckoned = self._tracking.dead_reckoned
         self._pose = dead_reckoned.T_map_base
@@ -321,7 +323,7 @@ class Localizer:
         self._tracking.start_submap()
 
     def _apply(self, correction: Correction) -> None:
-        """A loop was closed: pose and local map go where the keyframes have gone."""
+        """Apply a loop closure to the pose, and re-render the local map."""
         anchor = self._loops.keyframes.anchor
         self._prediction.reset_segment()
         self._pose = correction.applied_to(anchor, self._pose)
@@ -331,7 +333,7 @@ class Localizer:
         self._map.rerender(self.keyframes, self._pose)
 
     def _record_pose(self, scan: Scan) -> None:
-        """Keep the pose of the step, as seen from the anchor."""
+        """Store the pose of this step relative to the anchor keyframe."""
         anchor = self._loops.keyframes.anchor
         T_anchor = np.zeros(3) if anchor < 0 else self.keyframes[anchor].T_map_base
         self._path.add(scan.stamp_ns, anchor, se2.between(T_anchor, self._pose))

@@ -1,4 +1,4 @@
-"""The localizers, and which of them a configuration asks for."""
+"""The available localizers, and their selection by configuration."""
 
 from thinmap_ros.core.ekf_slam.ekf_localizer import EkfLocalizer
 from thinmap_ros.core.ekf_slam.features import LineFeature
@@ -9,16 +9,16 @@ AnyLocalizer = Localizer | EkfLocalizer
 
 
 def localizer_class(config: LocalizerConfig) -> type[Localizer] | type[EkfLocalizer]:
-    """The class of the localizer of `config.slam`."""
+    """Class of the localizer that `config.slam` selects."""
     return EkfLocalizer if config.slam.startswith('ekf') else Localizer
 
 
 def line_features(localizer: AnyLocalizer) -> list[LineFeature]:
-    """The line features of a localizer; scan matching has none."""
+    """Line features of a localizer; empty for scan matching."""
     return localizer.features if isinstance(localizer, EkfLocalizer) else []
 
 
 def set_topology(localizer: AnyLocalizer, topology: TopologicalMap) -> None:
-    """Set the topological map by which a localizer stores its features."""
+    """Set the topological map with which an EKF localizer selects its local area."""
     if isinstance(localizer, EkfLocalizer):
         localizer.set_topology(topology)

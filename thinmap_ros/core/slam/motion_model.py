@@ -1,8 +1,7 @@
 """The motion that odometry predicts from one scan to the next, and how uncertain it is.
 
-How far odometry was off what the scans found is remembered, for translation and rotation, and
-scales the noise that its model allows: an odometry that slips, lags or does not turn at all counts
-less, without any rule for it.
+The innovations of scan matching scale the noise of the odometry model, separately for translation
+and rotation. So an odometry that slips, lags or lacks rotation gets a larger covariance.
 Source: Mehra, "On the identification of variances and adaptive Kalman filtering", 1970;
 Siegwart and Nourbakhsh, "Introduction to autonomous mobile robots", for the odometry's noise.
 """
@@ -17,14 +16,14 @@ from thinmap_ros.core.ekf_slam.models import OdometryConfig, odometry_slip, odom
 from thinmap_ros.core.se2 import Array
 
 _MOST_SIGMAS = 3.0
-# Ratio of the information along walls to that across them, above which it is no smooth corridor.
+# Ratio of the information along a corridor to that across it. Below it the corridor is smooth.
 _CORRIDOR_RATIO = 0.2
-_LEAST_SHARE = 1.0  # of the variance that the model allows: good wheels slip, too
+_LEAST_SHARE = 1.0  # smallest scale of the modelled variance: good wheels slip, too
 
 
 @dataclass(frozen=True)
 class MotionConfig(OdometryConfig):
-    """Noise of the motion, 1 sigma, as it is taken to be before the scans have told."""
+    """Parameters of the odometry noise, and of its adaptation to scan matching."""
 
     noise_window: float = parameter(
         20.0,
@@ -39,7 +38,7 @@ class MotionConfig(OdometryConfig):
 class MotionPrediction:
     """Increment (3,) and its covariance (3, 3), in the robot frame before it.
 
-    stands: whether it is no more than the slip of a robot that stands.
+    is_stationary: whether the increment is within the noise floor of the odometry.
     """
 
     increment: Array
@@ -48,29 +47,29 @@ class MotionPrediction:
 
 
 def _distinctness(information: Array) -> Array:
-    """How far a scan is to be believed on each coordinate of the position (2,): 0 to 1.
+    """Weight (2,), 0 to 1, of a scan's innovation in x and y, by its information (3, 3).
 
-    Along a smooth corridor it tells little, and errs by more than its information claims: what it
-    moves a robot by there is no error of the odometry.
+    Along a smooth corridor the information of a match is overconfident, and its innovation is no
+    error of the odometry.
     """
     own = np.diag(information)[:2]
     return np.asarray(np.minimum(own / max(_CORRIDOR_RATIO * float(own.max()), 1e-12), 1.0))
 
 
 class MotionModel:
-    """Predicts the motion between two scans, and learns its noise from where they were matched."""
+    """Predicts the motion between two scans, and adapts its noise to the innovations of matches."""
 
     def __init__(self, config: MotionConfig) -> None:
         self._config = config
-        self._share: Array = np.ones(2)  # of the allowed variances, of translation and rotation
-        self._learned = 0  # motions that scans have told
+        self._share: Array = np.ones(2)  # scale of the variances of translation and rotation
+        self._learned = 0  # number of updates
         self._allowed: Array = np.ones(3)
         self._expected: Array = np.zeros(3)
 
     def predict(self, increment: Array, systematic: Array) -> MotionPrediction:
-        """Motion since the scan before, by the increment (3,) of the odometry.
+        """Predict the motion since the previous scan by the odometry increment (3,).
 
-        systematic (3, 3): covariance of what is left of the odometry's systematic error.
+        systematic (3, 3): covariance of the residual systematic error of the odometry.
         """
         config = self._config
         self._expected = increment
@@ -79,17 +78,17 @@ class MotionModel:
         return MotionPrediction(increment, np.diag(self._variances), not moves.any())
 
     def update(self, found: Array, scan_information: Array) -> None:
-        """A scan found the motion (3,) to be that, with information (3, 3), robot frame."""
-        # Of the motion as the scan measures it.
+        """Adapt the noise to a matched motion (3,); information (3, 3) of the scan, robot frame."""
+        # Variance of the motion as the scan measures it.
         variance = 1.0 / np.maximum(np.diag(scan_information), 1e-12)
         gain = self._variances / (self._variances + variance)
         innovation = found - self._expected
         innovation[2] = se2.wrap(float(innovation[2]))
-        # The match has moved the pose by that share of what the scan alone says.
+        # The match is a posterior: it has moved the pose by `gain` times the scan's innovation.
         squared = np.square(innovation / gain)
-        beyond = np.maximum(squared - variance, 0.0)  # what the scan's own error does not explain
+        beyond = np.maximum(squared - variance, 0.0)  # not explained by the noise of the scan
         share = self._share[[0, 0, 1]]
-        # What is farther off has slipped once, and says no more than this of the noise.
+        # A larger innovation is an outlier, such as a single slip: its effect is limited.
         change = np.minimum(beyond / self._allowed, _MOST_SIGMAS**2 * share) - share
         change *= np.maximum(gain**2, beyond / np.maximum(squared, 1e-12))
         change[:2] *= np.where(change[:2] > 0.0, _distinctness(scan_information), 1.0)

@@ -1,4 +1,4 @@
-"""Where odometry leads the robot from scan to scan, and how uncertain that is."""
+"""Pose prediction by calibrated odometry from scan to scan, with its covariance."""
 
 from dataclasses import dataclass, field
 
@@ -17,10 +17,10 @@ from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
 
 @dataclass(frozen=True, eq=False)
 class Reversal:
-    """What the next motion takes back of one that contradicted its scan, map frame.
+    """Expected reversal of an odometry error by the next increment, map frame.
 
-    mean (3,), covariance (3, 3). A reading of the odometry that was wrong is put right by the next
-    one, what wheels have slipped is not; one is as likely as the other.
+    mean (3,), covariance (3, 3). The next reading reverses a wrong reading of the odometry, but
+    not wheel slip. Both are assumed to be equally likely.
     """
 
     mean: Array = field(default_factory=lambda: np.zeros(3))
@@ -29,9 +29,9 @@ class Reversal:
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Pose T_map_base (3,) that the motion leads to, and its covariance (3, 3), map frame.
+    """Predicted pose T_map_base (3,), and covariance (3, 3) of its motion, map frame.
 
-    motion: the increment in the robot frame; T_before (3,): where it began.
+    motion: the increment in the robot frame; T_before (3,): pose before the motion, map frame.
     """
 
     T_before: Array
@@ -41,7 +41,7 @@ class Prediction:
 
 
 class OdometryPrediction:
-    """Predicts the pose of each scan by odometry, and learns the errors of the odometry."""
+    """Predicts the pose of each scan by odometry, and estimates the errors of the odometry."""
 
     def __init__(self, config: MotionConfig) -> None:
         self._config = config
@@ -49,11 +49,11 @@ class OdometryPrediction:
         self._calibration = OdometryCalibration()
         self._model = MotionModel(config)
         self._reversal = Reversal()
-        self._begins_known = False  # whether a match told where the next motion begins
+        self._begins_known = False  # whether the next motion starts at a matched pose
 
     @property
     def rejected(self) -> int:
-        """Odometry poses that made no sense."""
+        """Number of odometry poses with invalid values."""
         return self._increments.rejected
 
     @property
@@ -67,7 +67,7 @@ class OdometryPrediction:
         return self._increments.T_odom_base
 
     def predict(self, scan: Scan, T_odom_base: Array, T_before: Array) -> Prediction:
-        """The pose of a scan with an odometry pose (3,), from where the robot was before (3,)."""
+        """Predict the pose of a scan by its odometry pose (3,) and the previous pose (3,)."""
         motion = self._motion(scan, T_odom_base)
         reversal = self._reversal
         self._reversal = Reversal()
@@ -76,13 +76,13 @@ class OdometryPrediction:
         return Prediction(T_before, se2.pose(*expected.tolist()), covariance, motion)
 
     def contradict(self, prediction: Prediction, match: Match, accepted: bool) -> None:
-        """A match was unexpected: the next motion may take the contradiction back."""
+        """Expect that the next increment may reverse the innovation of an unexpected match."""
         off = se2.pose_difference(match.T_map_base, prediction.T_map_base)
         mean = -0.5 * off if accepted else np.zeros(3)
         self._reversal = Reversal(mean, 0.25 * np.outer(off, off))
 
     def update(self, prediction: Prediction, match: Match) -> None:
-        """A match that fits has told where the robot is, and so what odometry was off."""
+        """Update the odometry noise and calibration by a match with enough inliers."""
         if self._begins_known:
             scan_information = rotated_covariance(
                 match.scan_information, -float(prediction.T_before[2])
@@ -92,12 +92,12 @@ class OdometryPrediction:
         self._calibration.update(match.T_map_base, match.scan_information)
 
     def reset_segment(self) -> None:
-        """The pose was not found but put, moved or lost: the next motion begins from elsewhere."""
+        """Stop comparing odometry with matches across a pose that was set, corrected or lost."""
         self._begins_known = False
         self._calibration.reset_segment()
 
     def _motion(self, scan: Scan, T_odom_base: Array) -> MotionPrediction:
-        """The motion since the last scan, robot frame."""
+        """Motion since the last scan, robot frame; wide after an odometry discontinuity."""
         increment = self._increments.add(scan.stamp_ns, T_odom_base)
         variances = odometry_variances(increment.T_before_base, self._config)[[0, 2]]
         moved, systematic = self._calibration.corrected(increment.T_before_base, variances)

@@ -1,4 +1,4 @@
-"""Whether scans agree with the map: tracking, lost in a new local map, or not yet placed in one."""
+"""Tracking state: scans agree with the map, the robot is lost, or it is delocalized."""
 
 from dataclasses import dataclass
 
@@ -10,20 +10,20 @@ from thinmap_ros.core.slam.graph.keyframes import propagated_covariance, rotated
 from thinmap_ros.core.slam.matching.scan_matcher import Match
 from thinmap_ros.core.slam.odometry_prediction import Prediction
 
-FOR_A_SLIP = 3.0  # points that fit, for one that contradicts, where scan and motion disagree
-_ADRIFT_M = 10.0  # path in a new local map after which it is part of the map for good
-_UNPLACED_EVIDENCE = 0.5  # of a robot that has been put into a map: a scan or two that fit
+FOR_A_SLIP = 3.0  # inliers for each contradicting point, for a match to override the odometry
+_ADRIFT_M = 10.0  # path length after which a new local map is no longer provisional
+_UNPLACED_EVIDENCE = 0.5  # initial evidence in a loaded map: one or two fitting scans remove it
 
 
 @dataclass(frozen=True, eq=False)
 class DeadReckoning:
-    """Where the motion alone leads since a scan agreed with the map: pose (3,), cov. (3, 3)."""
+    """Dead-reckoned pose (3,) and covariance (3, 3) since the last scan that agreed, map frame."""
 
     T_map_base: Array
     covariance: Array
 
     def moved(self, prediction: Prediction) -> 'DeadReckoning':
-        """The same after one more motion."""
+        """The dead-reckoned pose after the motion of a prediction."""
         motion = prediction.motion
         after = se2.compose(self.T_map_base, motion.increment)
         Q = rotated_covariance(motion.covariance, float(self.T_map_base[2]))
@@ -32,37 +32,37 @@ class DeadReckoning:
 
 
 class Tracking:
-    """Evidence against the map.
+    """Detects by a CUSUM test that scans contradict the map.
 
-    A cumulative sum of the share of points that contradict the map, less a third of those that fit.
-    Source: Page, "Continuous inspection schemes", 1954.
+    The evidence sums up the contradiction ratio less a third of the inlier ratio, and is never
+    negative. Source: Page, "Continuous inspection schemes", 1954.
     """
 
     def __init__(self, lost_threshold: float, least_fit: float, T_map_base: Array) -> None:
         self.evidence = 0.0
-        self.is_delocalized = False  # in a map that was given, or put somewhere by hand
+        self.is_delocalized = False  # in a loaded map, or after set_pose, until scans fit
         self.dead_reckoned = DeadReckoning(T_map_base, np.zeros((3, 3)))
         self._lost_evidence = lost_threshold
         self._least_fit = least_fit
-        self._provisional_path_m = 0.0  # path for which a new local map is not yet part of the map
+        self._provisional_path_m = 0.0  # remaining path for which a new local map is provisional
 
     @property
     def agrees(self) -> bool:
-        """Whether nothing speaks against the map."""
+        """Whether there is no evidence against the map."""
         return self.evidence == 0.0
 
     @property
     def is_lost(self) -> bool:
-        """Whether the pose is in no map that others know."""
+        """Whether the pose is not known in the published map."""
         return self._provisional_path_m > 0.0 or (self.is_delocalized and self.evidence > 0.0)
 
     @property
     def needs_submap(self) -> bool:
-        """Whether scans contradict the map for good."""
+        """Whether the evidence exceeds the threshold for a new submap."""
         return self.evidence > self._lost_evidence
 
     def update(self, match: Match | None) -> None:
-        """Update the evidence by a match; None: nothing could be matched, and nothing is told."""
+        """Update the evidence by a match; None (no match was possible) leaves it unchanged."""
         if match is None:
             return
         more = match.contradiction_ratio - match.inlier_ratio / FOR_A_SLIP
@@ -72,32 +72,32 @@ class Tracking:
             self.is_delocalized = self.evidence > 0.0 or match.inlier_ratio < self._least_fit
 
     def record_pose(self, T_map_base: Array, covariance: Array) -> None:
-        """The pose of this scan is (3,): dead reckoning begins there where the map agrees."""
+        """Restart dead reckoning at the pose (3,) of this scan if the scan agrees with the map."""
         if self.agrees:
             self.dead_reckoned = DeadReckoning(T_map_base, covariance)
 
     def place(self, T_map_base: Array, covariance: Array) -> None:
-        """The robot was put at a pose (3,) with covariance (3, 3)."""
+        """Set the pose (3,) with covariance (3, 3); the robot is delocalized until scans fit."""
         self.is_delocalized = True
         self._provisional_path_m = 0.0
         self.evidence = 0.0
         self.dead_reckoned = DeadReckoning(T_map_base, covariance)
 
     def start_delocalized(self) -> None:
-        """A map was given, and the robot is somewhere in it."""
+        """Start in a loaded map, at an unconfirmed pose."""
         self.is_delocalized = True
         self.evidence = _UNPLACED_EVIDENCE
 
     def start_submap(self) -> None:
-        """Continue in a new local map."""
+        """Start a new, provisional local map."""
         self.evidence = 0.0
         self._provisional_path_m = _ADRIFT_M
 
     def add_path(self, path_m: float) -> None:
-        """The map has grown after a path of this length, m."""
+        """Add a path of this length (m), after which a scan was added to the map."""
         self._provisional_path_m = max(self._provisional_path_m - path_m, 0.0)
 
     def join(self, T_map_base: Array) -> None:
-        """A loop was closed: the new local map is part of the map, the pose is (3,)."""
+        """Apply a loop closure: the local map is not provisional any more, the pose is (3,)."""
         self._provisional_path_m = 0.0
         self.dead_reckoned = DeadReckoning(T_map_base, self.dead_reckoned.covariance)

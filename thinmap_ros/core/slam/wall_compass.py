@@ -1,10 +1,9 @@
-"""Heading by the walls: those of most buildings stand parallel or square to each other.
+"""Manhattan-world heading prior: most walls are parallel or perpendicular to each other.
 
-Where a robot comes round a corner into a hall, a scan may show nothing that the map knows: the
-wheels alone then say how it is turned, and all that is drawn from there on is turned with it. What
-was learned of the walls so far tells better: how many metres of them were seen in which direction,
-modulo a right angle. Only where most stand in one it is believed, and walls that stand otherwise
-say nothing.
+Behind a corner a scan may have no overlap with the map. Then only odometry predicts the heading,
+and its error rotates everything that is mapped from there on. A histogram of wall lengths by
+direction, modulo a right angle, measures the heading better. It is used only if most walls share
+one direction; walls in other directions are ignored.
 Source: Coughlan and Yuille, "Manhattan world: compass direction from a single image by Bayesian
 inference", 1999.
 """
@@ -19,19 +18,19 @@ from thinmap_ros.core.se2 import Array
 
 _QUARTER = 0.5 * math.pi
 _BINS = 180  # of half a degree
-_NEAR_BINS = 3  # to either side of the fullest: walls of its direction
+_NEAR_BINS = 3  # bins to either side of the peak that belong to its direction
 _AROUND = np.arange(-_NEAR_BINS, _NEAR_BINS + 1)
 _BESIDE = (np.arange(_BINS)[:, None] + [-1, 0, 1]) % _BINS  # each bin with its neighbours
-_LEAST_M = 60.0  # of wall, scan by scan, before a direction is believed
-_MOST = 0.7  # share of them that stands in it
-# The heading is surest where the map begins: after so much way a wall weighs half as much, and in
-# the end this much.
+_LEAST_M = 60.0  # smallest length of wall, summed over scans, for a main direction
+_MOST = 0.7  # smallest share of the walls in the main direction
+# The heading is most accurate at the start of the map: after this path length the weight of a wall
+# is a half; it never falls below the smallest weight.
 _FADES_M = 20.0
 _LEAST_WEIGHT = 0.02
-_ASKEW_RAD = 0.003  # by which walls are built askew, 1 sigma
+_ASKEW_RAD = 0.003  # standard deviation of real walls from the main direction
 _GATE_SIGMAS = 3.0
 _WIDEST_RAD = 0.35
-_SHORTEST_M = 1.5  # of wall in a scan that tells a heading
+_SHORTEST_M = 1.5  # smallest length of wall in a scan for a measured heading
 
 
 class Heading(NamedTuple):
@@ -42,25 +41,25 @@ class Heading(NamedTuple):
 
 
 class WallCompass:
-    """Metres of wall by direction in the map, and what the walls of a scan say of the heading."""
+    """Histogram of wall lengths by direction in the map; measures the heading of a scan."""
 
     def __init__(self) -> None:
-        # By direction: metres of wall, weighted, and these times where in the bin the walls stand
-        # on an average.
+        # For each bin: weighted length of the walls (m), and its product with the mean position of
+        # their directions in the bin (0 to 1).
         self._metres = np.zeros(_BINS)
         self._places = np.zeros(_BINS)
 
-    def learn(self, lines: Lines, yaw: float, way_m: float) -> None:
-        """Take in the walls of a scan made with a heading, rad, so far along the way, m."""
+    def learn(self, lines: Lines, yaw: float, path_m: float) -> None:
+        """Add the walls of a scan with heading yaw (rad), after a path of a length (m)."""
         at = (lines.z[:, 1] + yaw) % _QUARTER / _QUARTER * _BINS
         bins = at.astype(np.int64)
-        weights = _lengths(lines) * max(1.0 / (1.0 + (way_m / _FADES_M) ** 2), _LEAST_WEIGHT)
+        weights = _lengths(lines) * max(1.0 / (1.0 + (path_m / _FADES_M) ** 2), _LEAST_WEIGHT)
         np.add.at(self._metres, bins % _BINS, weights)
         np.add.at(self._places, bins % _BINS, weights * (at - bins))
 
     @property
     def direction(self) -> float | None:
-        """That of most walls, rad, from 0 to a right angle; None where there is none."""
+        """Main direction of the walls, rad, from 0 to a right angle; None if there is none."""
         total = float(self._metres.sum())
         if total < _LEAST_M:
             return None
@@ -73,9 +72,9 @@ class WallCompass:
         return float((fullest + mean) * _QUARTER / _BINS) % _QUARTER
 
     def read(self, lines: Lines, yaw: float, variance: float) -> Heading | None:
-        """The heading, near one (rad) known to a variance, at which the lines stand as walls do.
+        """Measure the heading of a scan by its lines, given a prior yaw (rad) and its variance.
 
-        None where the building has no such direction, or these lines do not tell it.
+        None if the building has no main direction, or too few lines are inliers to it.
         """
         direction = self.direction
         lengths = _lengths(lines)

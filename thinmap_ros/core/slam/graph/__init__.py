@@ -1,1 +1,1 @@
-"""The pose graph: keyframes, loop closures, and the poses that agree best with them."""
+"""The pose graph: keyframes, loop closure and optimization."""

@@ -1,7 +1,7 @@
-"""Keyframes: scans that are kept along the path, and what their poses are known to.
+"""Keyframes: stored scans along the path, with their poses and covariances.
 
-Where the robot comes back to what it has mapped before, and both agree, an earlier keyframe is
-reused: their number follows the area, not the time.
+If the robot returns to a mapped area and both visits agree, an earlier keyframe is reused. So the
+number of keyframes grows with the area, not with time.
 Source: Johannsson, Kaess, Fallon and Leonard, "Temporally scalable visual SLAM using a reduced pose
 graph", 2013.
 """
@@ -24,9 +24,9 @@ from thinmap_ros.core.slam.graph.trajectory import KeyframeTrajectory
 from thinmap_ros.core.slam.wall_compass import Heading
 
 _BUCKET_M = 4.0
-# Of the direction of the walls in the map, which its first scans tell, as seen from the start.
+# Variance of the main wall direction relative to the first keyframe.
 _MAP_VARIANCE = 0.005**2
-_RADIAN_M = 1.0  # a radian of turn makes two scans as different as so many metres
+_RADIAN_M = 1.0  # distance that changes the view of a scan as much as a rotation by a radian
 
 
 @dataclass(frozen=True)
@@ -51,11 +51,10 @@ class KeyframeConfig(Config):
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    """A scan that is kept, its surface points (N, 5), robot frame, and its pose (3,).
+    """A stored scan, its surface points (N, 5), robot frame, and its pose T_map_base (3,).
 
-    path_m: length of the path when the robot was there last; covariance (3, 3): of the pose, map
-    frame; submap: number of the local map that it is part of; heading: in the map, by the walls'
-    directions, where they tell it.
+    path_m: length of the path at the last visit; covariance (3, 3): of the pose, map frame;
+    submap: number of its local map; heading: measured by wall directions, map frame, or None.
     """
 
     scan: Scan
@@ -68,12 +67,12 @@ class Keyframe:
 
 
 class Keyframes:
-    """The keyframes, the steps between them, and the path that is told by them."""
+    """The keyframes, the edges between consecutive ones, and the trajectory relative to them."""
 
     def __init__(self, config: KeyframeConfig) -> None:
         self._config = config
         self.frames: list[Keyframe] = []
-        self.steps: list[Edge] = []  # to each keyframe but the first, from its anchor
+        self.steps: list[Edge] = []  # from its anchor to each keyframe but the first
         self._buckets = SpatialHash(_BUCKET_M)
         self._path = KeyframeTrajectory()
 
@@ -82,13 +81,13 @@ class Keyframes:
 
     @property
     def anchor(self) -> int:
-        """Number of the keyframe that the robot was at last; -1 before the first."""
+        """Number of the last added or reused keyframe; -1 before the first."""
         return self._path.last
 
     def add(self, frame: Keyframe, step_covariance: Array) -> int:
-        """Make a scan a keyframe; returns its number.
+        """Add a keyframe with an edge from the anchor; returns its number.
 
-        step_covariance (3, 3): of its pose seen from the anchor's, in the frame of the anchor.
+        step_covariance (3, 3): of its pose relative to the anchor, in the frame of the anchor.
         """
         number = len(self.frames)
         if number:
@@ -101,7 +100,7 @@ class Keyframes:
         return number
 
     def reuse(self, number: int, frame: Keyframe) -> None:
-        """Have an earlier keyframe stand for a scan that sees about the same."""
+        """Reuse an earlier keyframe with nearly the same view (reduced pose graph)."""
         earlier = self.frames[number]
         self.frames[number] = replace(earlier, path_m=frame.path_m)
         offset = se2.between(earlier.T_map_base, frame.T_map_base)
@@ -109,7 +108,7 @@ class Keyframes:
 
     @property
     def headings(self) -> list[Edge]:
-        """Measured headings, as edges from the first keyframe, which has that of the map."""
+        """Measured headings as edges from the first keyframe, whose heading defines the map's."""
         return [
             _heading_edge(number, frame.heading, float(self.frames[0].T_map_base[2]))
             for number, frame in enumerate(self.frames)
@@ -117,9 +116,9 @@ class Keyframes:
         ]
 
     def covariances_from(self, root: int, poses: Array, edges: list[Edge]) -> Array:
-        """Covariance (N, 3, 3) of each pose (N, 3) as seen from one of them, map frame.
+        """Covariance (N, 3, 3) of each pose (N, 3) relative to pose `root`, map frame.
 
-        edges: what ties keyframes besides the steps.
+        edges: edges of the graph besides the steps.
         """
         variances = np.array(
             [
@@ -135,7 +134,7 @@ class Keyframes:
         return np.array([frame.T_map_base for frame in self.frames]).reshape(-1, 3)
 
     def move(self, poses: Array, edges: list[Edge]) -> None:
-        """The first (N,) keyframes are at poses (N, 3); `edges` tie them besides the steps."""
+        """Set the poses (N, 3) of the first N keyframes; `edges`: besides the steps."""
         covariances = self.covariances_from(0, poses, edges)
         for number, T in enumerate(poses):
             self.frames[number] = replace(
@@ -144,21 +143,21 @@ class Keyframes:
             self._buckets.insert(number, float(T[0]), float(T[1]))
 
     def path(self) -> tuple[NDArray[np.int64], Array]:
-        """Stamps (N,) and poses (N, 3) of the scans that are keyframes, or for which one stands."""
+        """Stamps (N,) in ns and poses (N, 3) of all keyframe scans, with those that reused one."""
         return self._path.stamps_ns, self._path.poses(self.poses())
 
     def differ(self, T_a: Array, T_b: Array) -> bool:
-        """Whether two poses (3,) do not see about the same."""
+        """Whether the views of two poses (3,) differ by a keyframe distance or angle."""
         x, y, turn = se2.between(T_a, T_b).tolist()
         config = self._config
         return math.hypot(x, y) >= config.distance_m or abs(turn) >= config.angle_rad
 
     def near(self, T_map_base: Array, reach_m: float) -> list[int]:
-        """Keyframes within a reach of a pose (3,), and some that are farther."""
+        """Keyframes within a radius (m) of a pose (3,), and some that are farther."""
         return self._buckets.query_radius(float(T_map_base[0]), float(T_map_base[1]), reach_m)
 
     def most_similar(self, T_map_base: Array) -> int | None:
-        """The keyframe that sees most nearly the same as one at a pose (3,), or None."""
+        """Keyframe with the view most similar to that at a pose (3,); None if all differ."""
         near = self.near(T_map_base, self._config.distance_m)
         near = [k for k in near if not self.differ(self.frames[k].T_map_base, T_map_base)]
         if not near:
@@ -167,23 +166,23 @@ class Keyframes:
 
 
 def view_difference_m(T_a: Array, T_b: Array) -> float:
-    """How differently two poses (3,) see, in m."""
+    """Difference of the views of two poses (3,): distance plus weighted rotation, m."""
     x, y, turn = se2.between(T_a, T_b).tolist()
     return float(math.hypot(x, y) + _RADIAN_M * abs(turn))
 
 
 def propagated_covariance(covariance: Array, lever: Array) -> Array:
-    """Covariance (3, 3) of a pose that is bound to another one of that covariance, map frame.
+    """Covariance (3, 3) of a pose at a fixed offset from a pose of that covariance, map frame.
 
-    lever (2,): from the one to the other. Source: Smith, Self and Cheeseman, "Estimating uncertain
-    spatial relationships in robotics", 1990, compounding.
+    lever (2,): offset, m. Source: Smith, Self and Cheeseman, "Estimating uncertain spatial
+    relationships in robotics", 1990, compounding.
     """
     F = np.array([[1.0, 0.0, -lever[1]], [0.0, 1.0, lever[0]], [0.0, 0.0, 1.0]])
     return np.asarray(F @ covariance @ F.T)
 
 
 def heading_variance(heading: Heading | None, T_map_base: Array) -> float:
-    """Variance of the heading of a pose (3,) by a measured one, from which it may differ."""
+    """Variance of the heading of a pose (3,) by a measurement, plus their squared difference."""
     if heading is None:
         return math.inf
     off = float(se2.wrap(heading.yaw - float(T_map_base[2])))
@@ -191,7 +190,7 @@ def heading_variance(heading: Heading | None, T_map_base: Array) -> float:
 
 
 def with_heading(covariance: Array, variance: float) -> Array:
-    """Covariance (3, 3) of a pose of which the heading is known to a variance by other means."""
+    """Covariance (3, 3) of a pose after an independent heading measurement of a variance."""
     if not math.isfinite(variance):
         return covariance
     gain = covariance[:, 2] / (covariance[2, 2] + variance)
@@ -199,12 +198,12 @@ def with_heading(covariance: Array, variance: float) -> Array:
 
 
 def inverse(matrix: Array) -> Array:
-    """Information (3, 3) of a covariance, and the other way round."""
+    """Information (3, 3) of a covariance, and vice versa."""
     return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
 
 
 def rotated_covariance(covariance: Array, theta: float) -> Array:
-    """Covariance (3, 3) of a relative pose, turned from a frame at theta to that of the map."""
+    """Covariance (3, 3) of a relative pose, rotated by theta into the map frame."""
     c = math.cos(theta)
     s = math.sin(theta)
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -218,12 +217,11 @@ def _heading_edge(number: int, heading: Heading, first: float) -> Edge:
 
 
 def covariances_from(root: int, poses: Array, edges: list[Edge], heading_variances: Array) -> Array:
-    """Covariance (N, 3, 3) of each pose (N, 3) as seen from one of them, map frame.
+    """Covariance (N, 3, 3) of each pose (N, 3) relative to pose `root`, map frame.
 
-    Along the chain of edges that leaves it the least: an upper bound, as if there were no other
-    chain. Poses that no chain leads to are as uncertain as can be; edges to others are left out.
-    heading_variances (N,): of the heading of each, as seen from the root, where it was measured;
-    infinite elsewhere.
+    Along the chain of edges with the smallest variance: an upper bound, because other chains are
+    ignored. It is infinite for poses that are not connected. Edges to poses beyond N are ignored.
+    heading_variances (N,): of measured headings relative to the root; infinite without one.
     """
     edges = [edge for edge in edges if edge.b < len(poses)]
     a = np.array([edge.a for edge in edges], dtype=np.int64)
@@ -246,7 +244,7 @@ def covariances_from(root: int, poses: Array, edges: list[Edge], heading_varianc
 
 @inlined
 def _carry(covariance: Array, x: float, y: float) -> Array:
-    """`carried` by a lever (x, y)."""
+    """`propagated_covariance` with a lever (x, y)."""
     F = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
     carried_there: Array = F @ covariance @ F.T
     return carried_there
@@ -265,8 +263,8 @@ def _covariances(
 ) -> Array:
     """Dijkstra's algorithm, by the variance of the position.
 
-    Ties of pose k are order[first[k]] to order[first[k + 1]]; from M on they are those edges the
-    other way.
+    The M edges at pose k have the numbers order[first[k]] to order[first[k + 1]]. A number n >= M
+    is edge n - M in reverse direction.
     """
     found = np.full((len(poses), 3, 3), np.inf)
     best = np.full(len(poses), np.inf)
@@ -286,7 +284,7 @@ def _covariances(
                 continue
             x = poses[other, 0] - poses[k, 0]
             y = poses[other, 1] - poses[k, 1]
-            # Against its direction the edge's error in heading acts at the far end.
+            # In reverse direction the heading error of the edge acts at its other end.
             step = own[edge] if tie < len(a) else _carry(own[edge], x, y)
             new = _carry(found[k], x, y) + step
             gain = new[:, 2] / (new[2, 2] + heading_variances[other])

@@ -1,8 +1,8 @@
-"""Loop closure: the robot is back where it has been, by another way.
+"""Loop closure: matches keyframes with earlier visits and optimizes the pose graph.
 
-A new keyframe is matched with what earlier visits saw where it may be, as the covariance along the
-path says. Several matches that are consistent with each other make a loop; then the pose graph is
-optimized, one round a step.
+A new keyframe is matched with submaps of earlier visits within its covariance along the graph.
+Several mutually consistent matches close a loop. Then the pose graph is optimized, one iteration
+per step.
 Source: Mangelson et al., "Pairwise consistent measurement set maximization for robust multi-robot
 map merging", 2018.
 """
@@ -32,12 +32,12 @@ from thinmap_ros.core.slam.graph.submaps import AGAIN_M, Submaps
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher, MatchingConfig
 
-_VISITS = 3  # earlier visits with which a keyframe is matched, at most
+_VISITS = 3  # largest number of earlier visits with which a keyframe is matched
 _SIGMAS = 3.0
-_DRIFT = 0.005  # of the path: errors that repeat from step to step, which steps take to be chance
-_FARTHEST_M = 8.0  # of the uncertainty that is searched: places beyond need recognition
+_DRIFT = 0.005  # of the path: systematic errors, which the independent steps do not contain
+_FARTHEST_M = 8.0  # largest uncertainty that is searched: beyond it, place recognition is needed
 _CHI2 = 11.34  # 99 % of three degrees of freedom
-_RECENT = 8  # matches among which consistent ones are looked for
+_RECENT = 8  # recent candidates among which consistent ones are searched
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class LoopClosureConfig(Config):
 
 @dataclass(frozen=True, eq=False)
 class _Job:
-    """Keyframe k is to be matched with keyframe j; its covariance (3, 3) as seen from there."""
+    """Match keyframe k with keyframe j; covariance (3, 3) of k relative to j, map frame."""
 
     j: int
     k: int
@@ -91,7 +91,7 @@ class _Job:
 
 
 class LoopClosure:
-    """The pose graph of the keyframes, and the search for edges that close loops."""
+    """The pose graph of the keyframes, and the search for loop-closure edges."""
 
     def __init__(
         self,
@@ -103,34 +103,34 @@ class LoopClosure:
         self.keyframes = Keyframes(keyframes)
         self.edges: list[Edge] = []
         self._config = config
-        # By how much wheels may have slipped is part of the covariance along the graph.
+        # No wheel slip here: the covariance along the graph contains it.
         self._matcher = Matcher(replace(matching, wheel_slip_m=0.001, wheel_slip_rad=0.001))
         self._jobs: deque[_Job] = deque()
         self._pending: tuple[Keyframe, Array] | None = None
         self._requested: deque[Edge] = deque(maxlen=_RECENT)
-        self._here: Keyframe | None = None  # the last of them, kept or not
-        self._is_strained = False  # whether a step, measured again, contradicts the poses
+        self._here: Keyframe | None = None  # the last keyframe scan, added or not
+        self._is_strained = False  # whether a re-measured step contradicts the poses
         self._submaps = Submaps(local_map)
         self._rounds: Iterator[Array] | None = None
         self._after: Array = np.zeros((0, 3))
 
     def needs_keyframe(self, T_map_base: Array) -> bool:
-        """Whether a scan at a pose (3,) is to be the next keyframe."""
+        """Whether a scan at a pose (3,) becomes the next keyframe."""
         last = self._here
         return last is None or self.keyframes.differ(last.T_map_base, T_map_base)
 
     def path_m(self, T_map_base: Array) -> float:
-        """Length of the path up to a pose (3,), m, in straight lines between keyframes."""
+        """Length of the path up to a pose (3,), m, along straight lines between keyframes."""
         last = self._here
         if last is None:
             return 0.0
         return last.path_m + math.dist(last.T_map_base[:2], T_map_base[:2])
 
     def add(self, frame: Keyframe, step_covariance: Array, jump: Array) -> None:
-        """Take in a keyframe that is due, with the covariance (3, 3) of the step from the anchor.
+        """Add a keyframe, with the covariance (3, 3) of the step from the anchor, anchor frame.
 
-        jump (3, 3): what comes on top where scans and motion contradicted each other on the way;
-        the step is then measured anew, by the keyframes before. The frame is the anchor's.
+        jump (3, 3): additional covariance if scans and motion contradicted each other on the step.
+        The step is then measured again, by a match with the submap of the keyframes before it.
         """
         self._add_pending()
         self._pending = (frame, step_covariance + jump)
@@ -153,18 +153,18 @@ class LoopClosure:
             self._add_pending()
 
     def _recent_alike(self, frame: Keyframe) -> int | None:
-        """A keyframe of this visit that sees about the same."""
+        """Keyframe of the current visit with nearly the same view, or None."""
         j = self.keyframes.most_similar(frame.T_map_base)
         if j is None or self.keyframes.frames[j].submap != frame.submap:
             return None
         return j if frame.path_m - self.keyframes.frames[j].path_m < AGAIN_M else None
 
     def _earlier_visits(self, here: Keyframe) -> list[_Job]:
-        """The keyframe most like this one of each earlier visit, likest first."""
+        """Jobs for the most similar keyframe of each earlier visit, the most similar first."""
         frames = self.keyframes.frames
         spread = math.sqrt(float(np.linalg.eigvalsh(here.covariance[:2, :2])[-1]))
         near = self.keyframes.near(here.T_map_base, self._reach_m(spread))
-        due = {job.j for job in self._jobs if job.k == len(frames)}  # the step, measured again
+        due = {job.j for job in self._jobs if job.k == len(frames)}  # the step to be re-measured
         near = [j for j in near if self._is_earlier(j, here) and j not in due]
         if not near:
             return []
@@ -183,7 +183,7 @@ class LoopClosure:
         return found[:_VISITS]
 
     def _reach_m(self, sigma: float) -> float:
-        """How far places that are matched may lie, where the place is uncertain by sigma, m."""
+        """Radius (m) in which keyframes are matched, for a position of uncertainty sigma, m."""
         return self._config.search_radius_m + min(_SIGMAS * sigma, _FARTHEST_M)
 
     def _is_earlier(self, j: int, here: Keyframe) -> bool:
@@ -191,7 +191,7 @@ class LoopClosure:
         return frame.path_m <= here.path_m - AGAIN_M or frame.submap != here.submap
 
     def _as_seen_from(self, near: list[int], here: Keyframe) -> list[Array]:
-        """Covariance (3, 3), map frame, of the pending keyframe as seen from each of some."""
+        """Covariance (3, 3), map frame, of the pending keyframe relative to each keyframe."""
         assert self._pending is not None
         keyframes = self.keyframes
         poses = keyframes.poses()
@@ -207,7 +207,10 @@ class LoopClosure:
         ]
 
     def step(self) -> Correction | None:
-        """Do one match that is due, or one round of the optimization; to be called once a step."""
+        """Do one pending match, or one iteration of the optimization; called once per scan.
+
+        Returns the correction of the keyframes when an optimization has finished.
+        """
         if self._rounds is not None:
             return self._optimize()
         if self._jobs:
@@ -230,7 +233,7 @@ class LoopClosure:
             return None
         self._rounds = None
         poses = self._after
-        # Keyframes that were added meanwhile go with their anchors.
+        # Keyframes that were added during the optimization move with their anchors.
         for step in self.keyframes.steps[len(poses) - 1 :]:
             poses = np.vstack([poses, se2.compose(poses[step.a], step.T_a_b)])
         before = self.keyframes.poses()
@@ -247,9 +250,10 @@ class LoopClosure:
         return Correction(before, poses)
 
     def _measure_jumps(self) -> None:
-        """Optimize again where a step that was taken meanwhile led to another map of the place.
+        """Re-measure steps with a jump, and optimize again if one contradicts the poses.
 
-        The scans that closed the loop lie in the new map, those after such a step in the old one.
+        After such a step, scans are matched with the old map of the place. The scans that closed
+        the loop are part of the new map.
         """
         last = len(self.keyframes)
         jumps = [job for job in self._jobs if job.k < last and self._is_step(job.j, job.k)]
@@ -272,7 +276,7 @@ class LoopClosure:
         return self.keyframes.steps + self.edges + self.keyframes.headings
 
     def _match(self, job: _Job) -> None:
-        """Match keyframe k, or the pending one, with the submap around j."""
+        """Match keyframe k, or the pending one, with the submap around j; add the edge."""
         j = job.j
         k = job.k
         here = self._frame(k)
@@ -307,11 +311,11 @@ class LoopClosure:
             self._requested.append(edge)
 
     def _confirm(self, edge: Edge) -> None:
-        """A match says that old and new map agree here."""
+        """Record that the maps of both visits agree here: reuse the keyframe, or add the edge."""
         here = self._frame(edge.b)
         self._requested.clear()
         if self._is_strained:
-            # The robot has slid onto the old map: the loop is closed, the path up to it is bent.
+            # The pose has slid onto the old map, which bent the path: the loop is closed.
             self._is_strained = False
             self._add_pending()
             self.edges.append(edge)
@@ -337,14 +341,14 @@ class LoopClosure:
         self.edges.append(edge)
 
     def _mahalanobis(self, edge: Edge) -> float:
-        """Squared distance of an edge from the poses as they are, by its own covariance."""
+        """Squared Mahalanobis distance of an edge from the current poses, by its information."""
         T = se2.between(self.keyframes.frames[edge.a].T_map_base, self._frame(edge.b).T_map_base)
         off = edge.T_a_b - T
         off[2] = se2.wrap(float(off[2]))
         return float(off @ edge.information @ off)
 
     def _consistent(self) -> list[Edge]:
-        """The largest set of recent matches that ask for the same correction."""
+        """Largest set of recent candidates that agree on the same correction (greedy)."""
         edges = [edge for edge in self._requested if edge.b < len(self.keyframes)]
         if not edges:
             return []
@@ -363,7 +367,7 @@ class LoopClosure:
         return [edges[i] for i in best] if len({edges[i].b for i in best}) == len(best) else []
 
     def _are_consistent(self, one: Edge, other: Edge) -> bool:
-        """Whether the loop over two matches, back along the path, closes within its covariance."""
+        """Whether the loop over two matches and the path between them closes within the gate."""
         if one.b == other.b:
             return False
         frames = self.keyframes.frames
@@ -382,18 +386,18 @@ class LoopClosure:
         return self._pending[0]
 
     def _is_pending_matched(self) -> bool:
-        """Whether matches of the pending keyframe are due."""
+        """Whether there are pending matches of the pending keyframe."""
         return bool(self._jobs) and self._jobs[-1].k == len(self.keyframes)
 
     def _add_pending(self) -> None:
-        """Make the pending keyframe one, if there is one."""
+        """Add the pending keyframe to the graph, if there is one."""
         if self._pending is not None:
             frame, covariance = self._pending
             self._pending = None
             self.keyframes.add(frame, covariance)
 
     def _reuse_keyframe(self, j: int) -> None:
-        """Have an earlier keyframe stand for the pending one."""
+        """Reuse an earlier keyframe instead of the pending one."""
         assert self._pending is not None
         frame, _ = self._pending
         self._pending = None
@@ -402,7 +406,7 @@ class LoopClosure:
         self.keyframes.reuse(j, frame)
 
     def finish(self) -> Array:
-        """Do all matches that are due; poses (N, 3) of the keyframes that agree best with all."""
+        """Do all pending matches; returns the optimized poses (N, 3) of the keyframes."""
         while self._jobs:
             self._match(self._jobs.popleft())
         self._add_pending()
@@ -410,7 +414,7 @@ class LoopClosure:
 
 
 def _drift(path_m: float) -> Array:
-    """Covariance (3, 3) of errors that repeat, accumulated along a path, m."""
+    """Covariance (3, 3) of systematic errors, accumulated along a path, m."""
     return np.diag(np.square([_DRIFT * path_m, _DRIFT * path_m, 0.0]))
 
 

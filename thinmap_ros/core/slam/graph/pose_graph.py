@@ -1,9 +1,9 @@
-"""Edges of the pose graph, and the poses that agree best with them.
+"""Edges of the pose graph, and its optimization.
 
 Source: Grisetti, Kuemmerle, Stachniss and Burgard, "A tutorial on graph-based SLAM", 2010.
-Edges that may be wrong are held down by the loss of Geman and McClure, which is narrowed round by
-round, so that true loops have time to close: Yang et al., "Graduated non-convexity for robust
-spatial perception", 2020.
+Edges that may be outliers have the robust loss of Geman and McClure. Its width decreases in each
+iteration, so that true loops with a large error close first: Yang et al., "Graduated non-convexity
+for robust spatial perception", 2020.
 """
 
 from collections import deque
@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 from thinmap_ros.core.se2 import Array, wrap
 
 _ROUNDS = 30
-_SETTLED = 1e-5  # m and rad
-_LARGE = 16.0  # a squared error, in sigmas, that costs an edge three quarters of its weight
-_NARROWING = 2.0
+_SETTLED = 1e-5  # m and rad: a smaller step ends the optimization
+_LARGE = 16.0  # squared error, in sigmas, at which a robust edge has a quarter of its weight
+_NARROWING = 2.0  # factor by which the width of the loss decreases in each iteration
 
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """Pose b seen from pose a, T_a_b (3,), with its information (3, 3), frame of a.
+    """Relative pose T_a_b (3,) of keyframe b in a, with its information (3, 3), frame of a.
 
-    robust: whether it may be all wrong.
+    robust: whether it may be an outlier.
     """
 
     a: int
@@ -36,12 +36,12 @@ class Edge:
 
 
 def optimized(poses: Array, edges: list[Edge]) -> Array:
-    """Poses (N, 3) moved to agree with edges; the first stays."""
+    """Optimize poses (N, 3); the first is fixed."""
     return deque(rounds(poses, edges), maxlen=1)[0]
 
 
 def rounds(poses: Array, edges: list[Edge]) -> Iterator[Array]:
-    """Poses (N, 3) after each round of Gauss-Newton, so that a caller can do one at a time."""
+    """Yield the poses (N, 3) after each Gauss-Newton iteration; the first pose is fixed."""
     poses = poses.copy()
     if len(poses) < 2 or not edges:
         yield poses
@@ -73,7 +73,7 @@ class _Edges:
 
 
 def _linearise(poses: Array, edges: _Edges) -> tuple[Array, Array, Array]:
-    """Error (M, 3) of each edge, in the frame of its pose a, and Jacobians (M, 3, 3) by a and b."""
+    """Error (M, 3) of each edge, frame of a, and its Jacobians (M, 3, 3) w.r.t. a and b."""
     a = poses[edges.a]
     b = poses[edges.b]
     c = np.cos(a[:, 2])
@@ -97,9 +97,9 @@ def _linearise(poses: Array, edges: _Edges) -> tuple[Array, Array, Array]:
 def _step(edges: _Edges, e: Array, by_a: Array, by_b: Array, W: Array) -> Array:
     """Gauss-Newton step (N - 1, 3) of all poses but the first.
 
-    From errors, Jacobians and weights (M, 3, 3).
+    e (M, 3), by_a, by_b (M, 3, 3): errors and Jacobians; W (M, 3, 3): weights.
     """
-    # Here, not above: a live localizer never comes here, and these libraries take 18 MB.
+    # Imported here: without a loop closure they are not needed, and they take 18 MB.
     from scipy.sparse import coo_matrix
     from scipy.sparse.linalg import spsolve
 

@@ -1,4 +1,4 @@
-"""Local maps of pieces of the path, with which the scan of a later visit is matched."""
+"""Submaps around keyframes, with which the scans of later visits are matched."""
 
 import math
 from collections import OrderedDict
@@ -9,27 +9,28 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.matching.local_map import LocalMap, LocalMapConfig
 
-AGAIN_M = 8.0  # a path of this length lies between leaving a place and coming back
-_AROUND = 4  # keyframes to either side that make a submap
-_STRIDE = 4  # keyframes that share one: building it takes longer than the match
-_KEPT = 3  # submaps: as many visits as a keyframe is matched with
+AGAIN_M = 8.0  # smallest path length between two visits of a place
+_AROUND = 4  # keyframes to either side of the centre of a submap
+_STRIDE = 4  # keyframes that share a submap: building it takes longer than a match
+_KEPT = 3  # cached submaps: as many as the visits with which a keyframe is matched
 
 
 class Submaps:
-    """Submaps around keyframes; the last are kept, as robots follow an earlier path for a while."""
+    """Cache of submaps around keyframes; consecutive keyframes often match the same submap."""
 
     def __init__(self, config: LocalMapConfig) -> None:
         self._config = config
         self._kept: OrderedDict[tuple[int, int], tuple[Array, LocalMap]] = OrderedDict()
 
     def clear(self) -> None:
-        """Drop all submaps: the keyframes have moved."""
+        """Drop all submaps, after keyframes have moved."""
         self._kept.clear()
 
     def around(self, frames: Sequence[Keyframe], j: int, path_m: float) -> tuple[Array, LocalMap]:
-        """Pose (3,) of a submap around keyframe j, and the map in the frame of that pose.
+        """Pose (3,) of a submap around keyframe j, and the map in the frame of this pose.
 
-        Of the keyframes after j, it holds those of earlier visits than that at path_m, m.
+        path_m: length of the path now; keyframes after j that belong to the current visit are not
+        part of the submap.
         """
         centre = min(j - j % _STRIDE + _STRIDE // 2, len(frames) - 1)
         key = (centre, frames[j].submap)
@@ -41,7 +42,7 @@ class Submaps:
         return self._kept[key]
 
     def before(self, frames: Sequence[Keyframe], j: int) -> tuple[Array, LocalMap]:
-        """Pose (3,) of a submap of keyframe j and those before it, and the map in its frame."""
+        """Pose (3,) of a submap of keyframe j and of those before it, and the map in its frame."""
         return self._built(frames, j, j, -math.inf)
 
     def _built(

@@ -1,4 +1,4 @@
-"""Poses told by keyframes: when these are corrected, all that was seen from them goes along."""
+"""Trajectory relative to keyframes, so that corrections of keyframes move all poses."""
 
 from array import array
 
@@ -10,9 +10,9 @@ from thinmap_ros.core.se2 import Array
 
 
 class KeyframeTrajectory:
-    """Poses with their stamps, each seen from a keyframe, or from the map where there was none yet.
+    """Stamped poses, each relative to a keyframe, or to the map before the first keyframe.
 
-    36 bytes each.
+    Needs 36 bytes per pose.
     """
 
     def __init__(self) -> None:
@@ -21,24 +21,24 @@ class KeyframeTrajectory:
         self._from_anchor = array('d')
 
     def add(self, stamp_ns: int, anchor: int, T_anchor_base: Array) -> None:
-        """Add a pose (3,) as seen from a keyframe; anchor -1: from the map."""
+        """Add a pose (3,) relative to a keyframe; anchor -1: relative to the map."""
         self._stamps.append(stamp_ns)
         self._anchors.append(anchor)
         self._from_anchor.extend(T_anchor_base.tolist())
 
     @property
     def last(self) -> int:
-        """The keyframe of the last pose; -1 without one."""
+        """Keyframe of the last pose; -1 without one."""
         return self._anchors[-1] if self._anchors else -1
 
     @property
     def stamps_ns(self) -> NDArray[np.int64]:
-        """Stamps (N,)."""
+        """Stamps (N,), ns."""
         return np.array(self._stamps, dtype=np.int64)
 
     def poses(self, keyframes: Array) -> Array:
-        """Poses (N, 3) in the map, where the keyframes are at (M, 3)."""
-        # The row after the last keyframe is the map's own origin, which number -1 finds.
+        """Poses (N, 3), map frame, given the poses (M, 3) of the keyframes."""
+        # The last row is the origin of the map: index -1 selects it.
         anchors = np.vstack([keyframes.reshape(-1, 3), np.zeros(3)])[
             np.array(self._anchors, dtype=np.int64)
         ]

@@ -1,9 +1,9 @@
-"""Branch and bound over the poses within the uncertainty of a prior.
+"""Global pose search by branch and bound within the uncertainty of a prior.
 
 Source: Olson, "Real-time correlative scan matching", 2009; Hess et al., "Real-time loop closure in
-2D LIDAR SLAM", 2016, for branch and bound. The bound of a node is read off the distance to the
-nearest wall, which no motion changes by more than its length; a point out of reach of any wall is
-taken to stay so.
+2D LIDAR SLAM", 2016, for branch and bound. The lower bound of a node follows from the distances to
+the nearest walls: a displacement changes a distance by at most its length. A point out of reach of
+any wall is assumed to stay out of reach.
 """
 
 import heapq
@@ -18,8 +18,8 @@ from thinmap_ros.core.slam.matching.local_map import HERE, LocalMapView, cell_of
 from thinmap_ros.core.slam.matching.matching_cost import UNSEEN_COST, by_prior, far_cost, loss
 
 _ROOT = 4.0  # half the size of a root node, in cells
-_LEVELS = 2  # of nodes below
-_DIAGONAL = 1.4  # of what a translation within a node moves a point by
+_LEVELS = 2  # levels of nodes below the root
+_DIAGONAL = 1.4  # largest translation within a node, per half of its size
 _MASK = TILE - 1
 
 
@@ -33,9 +33,10 @@ def _cost(
     slack: float,
     most: float,
 ) -> float:
-    """Cost of a scan at a pose (3,), where points may be nearer to walls by a slack, in cells.
+    """Cost of a scan at a pose (3,), with wall distances reduced by a slack, in cells.
 
-    scan (N, 4): x, y, weight, and by how many slacks a point moves. Ends where it exceeds `most`.
+    scan (N, 4): x, y, weight, and the factor of the slack. Returns early when the cost exceeds
+    `most`.
     """
     scale = lattice.cell_m / sigma
     far = far_cost(lattice, sigma, width)
@@ -69,9 +70,9 @@ def _cost(
 
 @inlined
 def _least_by_prior(middle: Array, half: Array, prior: Array, information: Array) -> float:
-    """Cost of the prior at the point of a node that is nearest to it along each axis.
+    """Lower bound of the prior's cost in a node: at the point nearest to the prior on each axis.
 
-    middle, half (3,): of the node, as seen from the prior.
+    middle, half (3,): centre of the node relative to the prior, and half of its size.
     """
     nearest = np.sign(middle) * np.maximum(np.abs(middle) - half, 0.0)
     _, _, cost = by_prior(prior + nearest, prior, information)
@@ -90,10 +91,10 @@ def search(
     width: float,
     most_nodes: int,
 ) -> Array:
-    """The pose (3,) around a prior (3,) with the lowest cost, or the incumbent.
+    """Pose (3,) of lowest cost around a prior (3,), or the incumbent (3,) if none is lower.
 
-    scan (N, 3): x, y, weight; half (3,): half the size of what is searched, m, m, rad, rounded to
-    whole roots; information (3, 3) of the prior.
+    scan (N, 3): x, y, weight; half (3,): half of the search window, m, m, rad, rounded to whole
+    root nodes; information (3, 3) of the prior; sigma, width: as in `evaluate`.
     """
     away = np.sqrt(scan[:, 0] ** 2 + scan[:, 1] ** 2)
     radius = max(np.median(away), 1.0)

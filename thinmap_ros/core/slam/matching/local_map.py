@@ -1,9 +1,9 @@
-"""The local map that scans are matched with: cells with hits, and the way to the nearest wall.
+"""Local map for scan matching: hit counts, and the offset to the nearest wall for each cell.
 
-A cell counts how often a beam ended in it and how often one was seen through it or in it, and keeps
-the mean of its hits, which lies much nearer to the surface than the middle of the cell. A cell is a
-wall where enough of its observations are hits. Each cell near a wall knows the nearest one, so that
-the distance from any point to the walls is looked up, not searched.
+A cell counts its hits (beams that end in it) and its observations (hits, and beams through it). It
+stores the mean of its hits, which is much nearer to the surface than the centre of the cell. A cell
+is a wall if enough of its observations are hits. Each cell near a wall stores the offset to the
+nearest one, so that distances to walls are looked up, not searched.
 Source: Konolige et al., "Efficient sparse pose adjustment for 2D mapping", 2010, for the counts;
 Lau, Sprunk and Burgard, "Efficient grid-based spatial representations for robot navigation in
 dynamic environments", 2013, for distances that follow a changing map.
@@ -29,21 +29,21 @@ CELL = np.dtype(
     [
         ('hits', np.uint8),
         ('seen', np.uint8),
-        ('to_row', np.uint8),  # the nearest wall, in cells from here, + HERE; 0: none within reach
+        ('to_row', np.uint8),  # offset to the nearest wall, cells, + HERE; 0: none within reach
         ('to_col', np.uint8),
-        ('x', np.float32),  # mean of the hits, in cells from the corner of this one
+        ('x', np.float32),  # mean of the hits, in cells from the corner of this cell
         ('y', np.float32),
-        ('cos2', np.float32),  # mean of the double angle of the surface's normal
+        ('cos2', np.float32),  # mean of the double angle of the surface normal
         ('sin2', np.float32),
-        ('face_x', np.float32),  # mean of the normal towards the laser: 0 where both sides were hit
+        ('face_x', np.float32),  # mean of the normal towards the laser; 0 if hit from both sides
         ('face_y', np.float32),
     ]
 )
-HERE = 100
+HERE = 100  # stored value of an offset of 0
 _SHIFT = TILE.bit_length() - 1
 _MASK = TILE - 1
 _MOST_SEEN = 255
-_FAR_M = 1e4  # walls of an occupancy map are seen from so far in front of them
+_FAR_M = 1e4  # distance from which the walls of an occupancy map are taken to be observed
 
 
 @dataclass(frozen=True)
@@ -87,10 +87,10 @@ class LocalMapConfig(Config):
 
 
 class LocalMapView(NamedTuple):
-    """The cells as kernels take them.
+    """View of the cells for kernels, valid until the map grows.
 
-    pool: tiles of cells, CELL; directory: the slot of each tile, or NO_TILE; first_row, first_col:
-    its first cell; reach: in cells.
+    pool: tiles of cells, dtype CELL; directory: the slot of each tile, or NO_TILE; first_row,
+    first_col: first cell of the directory; reach: largest distance to a wall, in cells.
     """
 
     pool: NDArray[Any]
@@ -102,7 +102,7 @@ class LocalMapView(NamedTuple):
 
 
 class LocalMap:
-    """Cells that grow in any direction, in tiles, in the frame of the map."""
+    """Grid of cells in tiles, map frame, that grows in any direction."""
 
     def __init__(self, config: LocalMapConfig | None = None) -> None:
         self.config = config or LocalMapConfig()
@@ -110,12 +110,12 @@ class LocalMap:
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing was added yet."""
+        """Whether no scan or wall was added yet."""
         return self.tiles.used == 0
 
     @property
     def lattice(self) -> LocalMapView:
-        """The cells as kernels take them, until the map grows."""
+        """View of the cells for kernels, valid until the map grows."""
         tiles = self.tiles
         return LocalMapView(
             tiles.pool,
@@ -128,7 +128,7 @@ class LocalMap:
 
     @property
     def _reach_cells(self) -> int:
-        """`max_wall_distance_m` in cells; less than a tile, so that only neighbours are read."""
+        """`max_wall_distance_m` in cells; below a tile, so that only adjacent tiles are read."""
         cells = math.ceil(self.config.max_wall_distance_m / self.config.resolution_m)
         return min(int(cells), TILE - 1)
 
@@ -142,11 +142,11 @@ class LocalMap:
         _add(points, laser, T_map_base, self.lattice, self.config.occupied_min_hit_ratio)
 
     def distances(self, points_map: Array) -> Array:
-        """Distances (N,) of points (N, 2) from the walls, m; the reach where none is near."""
+        """Distances (N,) of points (N, 2), map frame, from walls, m; at most the reach."""
         return _distances(points_map, self.lattice)
 
     def add_walls(self, points_map: Array, normal: Array) -> None:
-        """Add points (N, 2), map frame, of walls with a normal (2,), as of an occupancy map."""
+        """Add points (N, 2), map frame, on walls of an occupancy map with a normal (2,)."""
         if len(points_map):
             cells = np.floor(points_map / self.config.resolution_m).astype(np.int64)
             _, once = np.unique(cells, axis=0, return_index=True)
@@ -173,9 +173,9 @@ class LocalMap:
         }
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Take over the cells of a `state`, checked by FIELDS, into a map that is empty.
+        """Restore the cells of a `state`, checked by FIELDS, into an empty map.
 
-        Raises InputError where they are of another size, or lie too far apart for one map.
+        Raises InputError if the cell size differs, or if the tiles are too far apart for one map.
         """
         cell_m = float(state['cell_m'])
         own = self.config.resolution_m
@@ -184,7 +184,7 @@ class LocalMap:
         if not len(places):
             return
         once = len(np.unique(places, axis=0)) == len(places)
-        snapshot.require(once, 'features: tiles: one twice', 'each tile once')
+        snapshot.require(once, 'local map: tiles: duplicate', 'each tile once')
         low = places.min(axis=0)
         high = places.max(axis=0)
         self.tiles.grow_to(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
@@ -201,7 +201,7 @@ class LocalMap:
         _lead(places * TILE, self.lattice, self.config.occupied_min_hit_ratio)
 
     def _reach(self, points_map: Array, laser_map: Array) -> None:
-        """Have all tiles that the beams touch, and those within reach of their ends."""
+        """Allocate all tiles that the beams touch, and those within reach of their ends."""
         reach = self._reach_cells * self.config.resolution_m
         edge_m = TILE * self.config.resolution_m
         both = np.vstack([points_map, laser_map])
@@ -231,13 +231,13 @@ FIELDS = {
 
 @inlined
 def cell_of(at: float) -> int:
-    """Row or column of the cell at a place, in cells."""
+    """Row or column of the cell at a coordinate, in cells."""
     return int(math.floor(at))
 
 
 @inlined
 def slot_of(lattice: LocalMapView, row: int, col: int) -> int:
-    """Slot of the tile with a cell, counted from the first one, or NO_TILE."""
+    """Slot of the tile with a cell (row and column relative to the first cell), or NO_TILE."""
     tile_row = row >> _SHIFT
     tile_col = col >> _SHIFT
     if tile_row < 0 or tile_col < 0:
@@ -249,10 +249,10 @@ def slot_of(lattice: LocalMapView, row: int, col: int) -> int:
 
 @inlined
 def off_wall(lattice: LocalMapView, x: float, y: float) -> tuple[bool, bool, float, float, Any]:
-    """What a point (x, y), in cells, is off its nearest wall.
+    """Offset of a point (x, y), in cells, from its nearest wall.
 
-    Returns whether a beam has met or crossed the point's cell, whether a wall is within reach, what
-    the point is off the mean of the wall's hits (2), in cells, and the wall's cell.
+    Returns whether the point's cell was observed, whether a wall is within reach, the offset (2)
+    from the mean of the wall's hits, in cells, and the cell of the wall.
     """
     row = cell_of(y)
     col = cell_of(x)
@@ -318,7 +318,7 @@ def _is_wall(cell: Any, share: float) -> bool:
 
 @inlined
 def _observe(cell: Any, hit: int) -> None:
-    """Count an observation; what is old counts less and less."""
+    """Count an observation; the weight of old ones decays once the counter is full."""
     if cell['seen'] == _MOST_SEEN:
         cell['seen'] //= 2
         cell['hits'] //= 2
@@ -330,7 +330,7 @@ def _observe(cell: Any, hit: int) -> None:
 def _add(
     points: Array, laser: Array, T_map_base: Array, lattice: LocalMapView, share: float
 ) -> None:
-    """Count what beams went through, then where they ended; update the nearest walls."""
+    """Count the cells that beams traverse, then those where they end; update nearest walls."""
     cos = math.cos(T_map_base[2])
     sin = math.sin(T_map_base[2])
     x0 = (T_map_base[0] + cos * laser[0] - sin * laser[1]) / lattice.cell_m - lattice.first_col
@@ -354,7 +354,7 @@ def _add(
             x = x + step_x
             y = y + step_y
             slot = slot_of(lattice, row, col)
-            # A beam that grazes a wall says nothing against the cells beside its end.
+            # Near its end a beam that grazes a wall traverses cells of this wall.
             if slot == NO_TILE or (abs(row - end_row) <= 1 and abs(col - end_col) <= 1):
                 continue
             cell = lattice.pool[slot, row & _MASK, col & _MASK]
@@ -371,8 +371,8 @@ def _add(
 def _learn_surface(cell: Any, x: float, y: float, normal: tuple[float, float, float]) -> None:
     """Update the means of a cell by a hit at (x, y), in cells from its corner.
 
-    normal: cosine and sine of the double angle of the surface's normal, and how far the laser is to
-    the side that half of that angle points to, positive or negative.
+    normal: cosine and sine of the double angle of the surface normal, and the signed distance of
+    the laser along the normal at half of this angle.
     """
     gain = np.float32(1.0 / cell['hits'])
     cos2, sin2, side = normal
@@ -390,7 +390,7 @@ def _learn_surface(cell: Any, x: float, y: float, normal: tuple[float, float, fl
 def _hit(
     points: Array, laser: Array, T_map_base: Array, lattice: LocalMapView, share: float
 ) -> None:
-    """Count the points that beams met."""
+    """Count hits, and update nearest walls where cells become walls."""
     cos = math.cos(T_map_base[2])
     sin = math.sin(T_map_base[2])
     cos2 = math.cos(2.0 * T_map_base[2])
@@ -426,7 +426,7 @@ def _lead(
     lattice: LocalMapView,
     share: float,
 ) -> None:
-    """Have all cells of tiles with first cells (N, 2) know their nearest walls."""
+    """Compute the nearest-wall offsets of whole tiles, given their first cells (N, 2)."""
     for i in range(len(corners)):
         top = corners[i, 0] - lattice.first_row
         left = corners[i, 1] - lattice.first_col
@@ -439,7 +439,7 @@ def _lead(
 
 @kernel
 def _appear(lattice: LocalMapView, row: int, col: int) -> None:
-    """A cell has become a wall: those around to which it is the nearest lead there."""
+    """Add a wall: cells to which it is the nearest one refer to it."""
     for down in range(-lattice.reach, lattice.reach + 1):
         for right in range(-lattice.reach, lattice.reach + 1):
             squared = down * down + right * right
@@ -456,7 +456,7 @@ def _appear(lattice: LocalMapView, row: int, col: int) -> None:
 
 @kernel
 def _vanish(lattice: LocalMapView, gone: list[tuple[int, int]], share: float) -> None:
-    """Cells are walls no more: those that led there take the nearest wall of their neighbours."""
+    """Remove walls, and propagate other nearest walls into the cells that referred to them."""
     led = [(0, 0) for _ in range(0)]
     for row, col in gone:
         slot = slot_of(lattice, row, col)
@@ -481,7 +481,7 @@ def _vanish(lattice: LocalMapView, gone: list[tuple[int, int]], share: float) ->
 
 @inlined
 def _ask(lattice: LocalMapView, row: int, col: int) -> bool:
-    """Whether one of its neighbours knows a nearer wall for a cell, which leads there then."""
+    """Adopt the nearest wall of a neighbour cell if it is nearer; returns whether it was."""
     changed = False
     cell = lattice.pool[slot_of(lattice, row, col), row & _MASK, col & _MASK]
     for i in range(-1, 2):

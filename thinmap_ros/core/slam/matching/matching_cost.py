@@ -1,8 +1,8 @@
-"""The sum that a match minimizes: what points are off their walls, and the motion.
+"""Cost function of scan matching: point-to-wall distances and the motion prior.
 
-A point is off a wall by what it is off along the wall's normal: a smooth wall says nothing of the
-position along it. Where the normals of a cell's hits differ, as in a corner, both directions count.
-The same matrix leads to the minimum and tells how well it is known.
+The distance of a point is measured along the wall's normal: a smooth wall has no information along
+itself. If the normals of a cell's hits differ, as in a corner, both directions have information.
+The Gauss-Newton matrix of the minimum is also the information of the match.
 Source: Censi, "An ICP variant using a point-to-line metric", 2008, for the metric; Kohlbrecher et
 al., "A flexible and scalable SLAM system with full 3D motion estimation", 2011, for the match with
 a map.
@@ -16,15 +16,15 @@ from thinmap_ros.core.jit import inlined, kernel
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.matching.local_map import LocalMapView, off_wall
 
-SLIP_SIGMAS = 10.0  # of a prior, beyond which wheels have rather slipped than scans erred
-FITS_SIGMAS = 2.0  # of a point, within which it lies on its wall
-_OFF_SIGMAS = 3.0  # and beyond which it does not
-_HALF_WALL = 5.0  # to either side of the hits of a cell its wall goes on so many cells
-UNSEEN_COST = 0.5  # of a point where nobody has looked yet, for one in the open
-_YOUNG_HITS = 1.0  # a wall that was hit so often weighs half: who walks by is seen once
-_BEHIND = -0.1  # cosine to a wall's normal from which on a beam comes from behind
+SLIP_SIGMAS = 10.0  # scale of the prior's loss: beyond it, wheel slip is more likely than an error
+FITS_SIGMAS = 2.0  # largest distance of an inlier from its wall
+_OFF_SIGMAS = 3.0  # smallest distance of a point that contradicts the map
+_HALF_WALL = 5.0  # extent of a wall to either side of a cell's hits, in cells
+UNSEEN_COST = 0.5  # cost of a point in an unobserved cell, as a share of one in free space
+_YOUNG_HITS = 1.0  # hits at which a wall has half its weight: moving people are hit once
+_BEHIND = -0.1  # cosine to a wall's normal below which a beam comes from behind the wall
 _ROUNDS = 20
-_SETTLED = 1e-4  # m and rad: a step that is smaller is the last
+_SETTLED = 1e-4  # m and rad: a smaller step ends the minimization
 _LARGEST_DAMPING = 1e2
 
 
@@ -36,14 +36,14 @@ def loss(squared: float, width: float) -> float:
 
 @inlined
 def far_cost(lattice: LocalMapView, sigma: float, width: float) -> float:
-    """Cost of a point in the open, out of reach of any wall."""
+    """Cost of a point in free space, out of reach of any wall."""
     off = lattice.reach * lattice.cell_m / sigma
     return loss(off * off, width)
 
 
 @inlined
 def by_prior(pose: Array, prior: Array, information: Array) -> tuple[Array, float, float]:
-    """Pull (3,), weight and cost of a prior (3,) with information (3, 3) at a pose (3,)."""
+    """Gradient (3,), weight and cost at a pose (3,) of a prior (3,) with information (3, 3)."""
     off = pose - prior
     off[2] = math.atan2(math.sin(off[2]), math.cos(off[2]))
     pull = information @ off
@@ -54,7 +54,7 @@ def by_prior(pose: Array, prior: Array, information: Array) -> tuple[Array, floa
 
 @inlined
 def _normal_matrix(cos2: float, sin2: float) -> tuple[float, float, float]:
-    """Information (xx, xy, yy) of a wall on a point: 1 along its normal, less along the wall."""
+    """Relative information (xx, xy, yy) of a wall: 1 along its normal, less along the wall."""
     length = math.sqrt(cos2 * cos2 + sin2 * sin2)
     along = ((1.0 - length) / (1.0 + length)) ** 2
     mean = 0.5 * (1.0 + along)
@@ -68,9 +68,9 @@ def evaluate(
 ) -> tuple[Array, Array, Array]:
     """Normal equations H (3, 3), g (3,) of a scan at a pose (3,), and sums (5,).
 
-    scan (N, 5): x, y, weight, and the direction back to the laser; sigma: of a point on its wall,
-    m; width: of the loss, in sigmas. Sums: cost, and weights of all points, of those on their
-    walls, of those in the open, and the cost that young walls leave out.
+    scan (N, 5): x, y, weight, and the direction to the laser; sigma: noise of a point around its
+    wall, m; width: of the loss, in sigmas. Sums: cost; weights of all points, of inliers, and of
+    points that contradict the map; cost that walls with few hits leave out.
     """
     H = np.zeros((3, 3))
     g = np.zeros(3)
@@ -95,7 +95,7 @@ def evaluate(
         to_x = cos * scan[i, 3] - sin * scan[i, 4]
         to_y = sin * scan[i, 3] + cos * scan[i, 4]
         if wall['face_x'] * to_x + wall['face_y'] * to_y < _BEHIND:
-            sums[0] += weight * far * UNSEEN_COST  # the other face is another wall
+            sums[0] += weight * far * UNSEEN_COST  # the other face is a separate wall
             continue
         w = weight * wall['hits'] / (wall['hits'] + _YOUNG_HITS)
         xx, xy, yy = _normal_matrix(wall['cos2'], wall['sin2'])
@@ -139,10 +139,11 @@ def minimize(
     sigma: float,
     width: float,
 ) -> tuple[Array, Array, Array, float]:
-    """The nearest minimum to a start (3,), by Levenberg and Marquardt's method.
+    """Nearest minimum to a start (3,), by the Levenberg-Marquardt method.
 
-    Returns the pose (3,), the information (3, 3) of the scan there, the sums of `evaluate` with the
-    prior's cost, and the weight of the prior.
+    prior (3,), information (3, 3): of the motion; sigma, width: as in `evaluate`. Returns the pose
+    (3,), the information (3, 3) of the scan alone, the sums of `evaluate` with the cost of the
+    prior, and the weight of the prior.
     """
     pose = start.copy()
     damping = 1e-4

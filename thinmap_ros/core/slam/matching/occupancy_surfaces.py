@@ -1,4 +1,4 @@
-"""Points on the walls of an occupancy map, for scans to be matched with."""
+"""Surface points on the walls of an occupancy map, for scan matching."""
 
 from typing import NamedTuple
 
@@ -14,16 +14,16 @@ _SIDES = ((0, 1), (0, -1), (1, 0), (-1, 0))
 
 
 class WallFaces(NamedTuple):
-    """Points (N, 2) on walls, m, in order along each, and the normal (2,) of all of them."""
+    """Points (N, 2) on walls, m, map frame, in order along each wall, and their normal (2,)."""
 
     points: Array
     normal: Array
 
 
 def occupied_surface_points(patch: GridPatch) -> list[WallFaces]:
-    """Points on the faces of a map's occupied cells towards free ones, for each of four sides.
+    """Points on the faces between occupied and free cells, for each of the four directions.
 
-    A beam fills the cell that lies surface_thickness_m behind what it met. So the surface is on
+    A beam occupies the cell that is surface_thickness_m behind its end. So the surface is on
     average half a cell, less that depth, behind the face of the cell.
     """
     depth_m = max(0.5 * patch.frame.resolution - OccupancyConfig().surface_thickness_m, 0.0)
@@ -31,7 +31,7 @@ def occupied_surface_points(patch: GridPatch) -> list[WallFaces]:
 
 
 def _faces(patch: GridPatch, row: int, col: int, depth_m: float) -> WallFaces:
-    """The faces of the occupied cells towards the neighbour at (row, col)."""
+    """Faces of the occupied cells towards a free neighbour at the offset (row, col)."""
     rows, cols = patch.shape
     free = np.zeros((rows, cols), dtype=np.bool_)
     here = (slice(max(-row, 0), rows - max(row, 0)), slice(max(-col, 0), cols - max(col, 0)))
@@ -47,10 +47,7 @@ def _faces(patch: GridPatch, row: int, col: int, depth_m: float) -> WallFaces:
 
 
 def _along(cells: NDArray[np.int64], row: int) -> NDArray[np.int64]:
-    """Cells (N, 2) in the order of the walls that their faces make.
-
-    Along rows, or along columns.
-    """
+    """Cells (N, 2) in order along the walls: along rows if row is not 0, or else along columns."""
     order = (
         np.lexsort((cells[:, 1], cells[:, 0])) if row else np.lexsort((cells[:, 0], cells[:, 1]))
     )

@@ -1,9 +1,9 @@
-"""A scan against the local map: the pose that walls and motion together make most likely.
+"""Scan-to-map matching: maximum a posteriori pose given point-to-wall distances and a motion prior.
 
-One sum holds a robust loss of what each point is off the nearest wall, and the motion that is
-expected, with its covariance. Its minimum near the prior is refined (`matching_cost.py`). Where the
-scan fits badly there, or the prior is wider than a wall attracts, the poses within three sigmas of
-the prior are searched (`correlative_search.py`); the lower sum wins.
+The cost is a robust loss of the distance of each point to its nearest wall, plus that of the prior.
+Its minimum near the prior is refined (`matching_cost.py`). If few points are inliers there, or if
+the prior is wider than the basin of convergence, the poses within three sigmas of the prior are
+searched (`correlative_search.py`). The lower cost is used.
 """
 
 from dataclasses import dataclass
@@ -18,9 +18,9 @@ from thinmap_ros.core.slam.matching.local_map import LocalMap
 from thinmap_ros.core.slam.matching.matching_cost import minimize
 
 FEWEST_POINTS = 10
-_SIGMAS = 3.0  # of a prior, within which poses are searched
-_BASIN = (0.3, 0.15)  # m, rad: three sigmas of a prior within which the nearest minimum is the one
-_WIDEST = (3.0, 3.0, 1.5)  # m, m, rad: half of what is searched, at most
+_SIGMAS = 3.0  # of the prior, within which poses are searched
+_BASIN = (0.3, 0.15)  # m, rad: basin of convergence, compared with three sigmas of the prior
+_WIDEST = (3.0, 3.0, 1.5)  # m, m, rad: half of the largest search window
 _SEARCHED_POINTS = 90
 _MOST_NODES = 1000
 
@@ -74,11 +74,11 @@ class MatchingConfig(Config):
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """A pose T_map_base (3,) with covariance (3, 3), map frame, of scan and prior together.
+    """Posterior pose T_map_base (3,) with covariance (3, 3), map frame, of scan and prior.
 
     scan_information (3, 3): of the scan alone; inlier_ratio: of points on walls;
-    contradiction_ratio: of points in cells that others have observed to be free; cost: the minimum;
-    prior_weight: of the prior in it, less than 1 where the pose is an outlier to it.
+    contradiction_ratio: of points in cells observed to be free; cost: the minimum; prior_weight:
+    robust weight of the prior, below 1 if the pose is an outlier to it.
     """
 
     T_map_base: Array
@@ -91,7 +91,7 @@ class Match:
 
 
 class Matcher:
-    """Finds the pose at which a scan fits a local map."""
+    """Matches scans with a local map."""
 
     def __init__(self, config: MatchingConfig | None = None) -> None:
         self.config = config or MatchingConfig()
@@ -104,9 +104,9 @@ class Matcher:
         prior: Array,
         covariance: Array,
     ) -> Match:
-        """Pose near a prior (3,) with covariance (3, 3), map frame, that a scan fits best.
+        """Match a scan with a local map, given a prior (3,) with covariance (3, 3), map frame.
 
-        points (N, 5): surface points, robot frame; T_base_laser (3,): where the laser is.
+        points (N, 5): surface points, robot frame; T_base_laser (3,): pose of the laser.
         """
         scan = weighted_points(points, T_base_laser, local_map.config.resolution_m)
         information = inverse(covariance)
@@ -134,7 +134,7 @@ class Matcher:
 
     @property
     def _noise(self) -> tuple[float, float]:
-        """Standard deviation of a point on its wall, m, and in these the width of the loss."""
+        """Standard deviation of a point around its wall, m, and the width of the loss, sigmas."""
         config = self.config
         return config.noise_m, config.kernel_scale_m / config.noise_m
 
@@ -158,10 +158,10 @@ class Matcher:
 
 
 def weighted_points(points: Array, T_base_laser: Array, resolution_m: float) -> Array:
-    """Points of a scan as the kernels need them: x, y, weight, and the direction to the laser.
+    """Points (N, 5) of a scan for the kernels: x, y, weight, and unit direction (2) to the laser.
 
-    points (N, 5): surface points, robot frame. Returns (N, 5). Points closer to each other than a
-    cell observe the same piece of wall, and count once.
+    points (N, 5): surface points, robot frame. Points closer together than one cell are redundant
+    and share their weight.
     """
     weights = np.minimum(points[:, 4] / resolution_m, 1.0)
     back = T_base_laser[:2] - points[:, :2]
@@ -170,7 +170,7 @@ def weighted_points(points: Array, T_base_laser: Array, resolution_m: float) -> 
 
 
 def _thinned(scan: Array) -> Array:
-    """Some of the points of a scan (N, 3), with the weight of all."""
+    """Subsample of a scan (M, 3) with the total weight of all its points."""
     sparse = np.ascontiguousarray(scan[:: max(1, len(scan) // _SEARCHED_POINTS), :3])
     sparse[:, 2] *= len(scan) / len(sparse)
     return sparse

@@ -1,8 +1,8 @@
-"""The surface that each point of a scan lies on, by its neighbours in the scan.
+"""Surface points of a scan: normals and spacing, estimated from neighbouring beams.
 
-Only neighbouring beams on one surface tell a normal: the last beam of one wall and the first of the
-next are neighbours in the scan and not in space. A point without a neighbour on its surface is left
-out: where a beam meets something by chance is no feature of the building, and moves with the robot.
+Only neighbouring beams on the same surface determine a normal: the last beam of one wall and the
+first of the next are neighbours in the scan, but not in space. A point without a neighbour on its
+surface is left out, because the position of a single hit changes with the robot's.
 """
 
 import math
@@ -15,17 +15,17 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
 COLUMNS = 5  # of surface points: x, y, double angle of the normal (cosine, sine), spacing
-WINDOW_M = 0.15  # neighbours that are nearer are on one surface and tell its normal
-_RANGE_NOISE_M = 0.02  # 1 sigma: points that scatter by no more lie on a plane
-_ALIGNED = 0.8  # squared cosine between two steps along one surface
-_ALIKE = 9.0  # squared ratio of their lengths, at most
+WINDOW_M = 0.15  # nearer neighbours are on the same surface and determine its normal
+_RANGE_NOISE_M = 0.02  # 1 sigma: points with no more scatter lie on a plane
+_ALIGNED = 0.8  # smallest squared cosine between two steps along one surface
+_ALIKE = 9.0  # largest squared ratio of their lengths
 
 
 def surface_points(scan: Scan, range_m: float) -> Array:
-    """Points (N, 5) of a scan within a range, m, robot frame, in the order of the beams.
+    """Surface points (N, 5) of a scan within a range (m), robot frame, in the order of the beams.
 
-    Columns: x, y, cosine and sine of twice the angle of the surface's normal, shortened where the
-    neighbours scatter by more than the noise of a range, and the spacing of the points, m.
+    Columns: x, y; cosine and sine of twice the angle of the surface normal, shortened if the
+    neighbours scatter by more than the range noise; spacing of the points, m.
     """
     near = scan.ranges_m[scan.hit] < range_m
     points = np.ascontiguousarray(scan.points_base()[near])
@@ -34,7 +34,7 @@ def surface_points(scan: Scan, range_m: float) -> Array:
 
 @inlined
 def _are_aligned(ax: float, ay: float, bx: float, by: float) -> bool:
-    """Whether two steps along a scan lead the same way, and are alike in length."""
+    """Whether two steps along a scan have similar directions and lengths."""
     a = ax * ax + ay * ay
     b = bx * bx + by * by
     dot = ax * bx + ay * by
@@ -43,7 +43,7 @@ def _are_aligned(ax: float, ay: float, bx: float, by: float) -> bool:
 
 @kernel
 def _links(points: Array, beams: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Whether each point (N + 1,) lies on one surface with the point before it."""
+    """Whether each point (N + 1,) lies on the same surface as its predecessor."""
     n = len(points)
     linked = np.zeros(n + 1, dtype=np.bool_)
     for k in range(1, n):
@@ -62,7 +62,7 @@ def _links(points: Array, beams: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 @kernel
 def _surface(points: Array, beams: NDArray[np.int64]) -> Array:
-    """Surface points of the points (N, 2) of some beams (N,): those that have a neighbour."""
+    """Surface points (M, 5) of the points (N, 2) of beams (N,) that have a neighbour."""
     linked = _links(points, beams)
     found = np.empty((len(points), COLUMNS))
     used = 0
