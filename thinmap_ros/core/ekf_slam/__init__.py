@@ -1,1 +1,1 @@
-"""The third paper: EKF-SLAM on line features of the local area, picked by topology."""
+"""EKF-SLAM/TI (third paper): EKF-SLAM on line features of a topological local area."""

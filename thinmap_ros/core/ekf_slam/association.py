@@ -1,10 +1,10 @@
-"""Which line of the scan is which feature of the map.
+"""Data association: nearest neighbour of each line of a scan among the features.
 
-Source: EKF-SLAM/TI paper eq. (13), with the sign of the gate as it must be: v' S^-1 v <= 5.99, two
-degrees of freedom, 95 %. Infinite lines agree where walls of different rooms are collinear, so what
-was seen of them has to meet as well; and the two faces of a thin wall are two features, each seen
-from its own side. Lines that could be several features are decided after the others have corrected
-the pose, so that the scan is taken as a whole (the idea of Neira and Tardos, "Data association in
+Source: EKF-SLAM/TI paper eq. (13), with the sign of the gate corrected: v' S^-1 v <= 5.99, two
+degrees of freedom, 95 %. Collinear walls of different rooms are on one infinite line, so the
+observed segments have to overlap or be near, too. The two faces of a thin wall are two features,
+each observed from its own side. Ambiguous lines are associated after the others have updated the
+pose, so that the scan is considered jointly (the idea of Neira and Tardos, "Data association in
 stochastic mapping using the joint compatibility test", 2001).
 """
 
@@ -20,7 +20,7 @@ from thinmap_ros.core.ekf_slam.features import FeatureTrack, normals_of, sides_o
 from thinmap_ros.core.ekf_slam.line_extraction import Lines
 from thinmap_ros.core.se2 import Array, transform_points, wrap
 
-# Only pairs nearer than this are put to the statistical test at all.
+# Only pairs nearer than this are tested by their Mahalanobis distance.
 _NEAR_M = 0.5
 _NEAR_RAD = math.radians(15.0)
 
@@ -47,9 +47,9 @@ class AssociationConfig(Config):
 
 @dataclass(frozen=True, eq=False)
 class Associations:
-    """For each line of a scan the index of the feature it fits best, and whether others fit, too.
+    """Nearest feature of each line of a scan, and whether several features pass the gate.
 
-    Both (K,); index: -1 where there is none.
+    Both (K,); index: -1 if no feature passes the gate.
     """
 
     index: NDArray[np.int64]
@@ -63,10 +63,10 @@ def associate(
     laser_map: Array,
     config: AssociationConfig,
 ) -> Associations:
-    """Which features the lines of a scan are, each taken by itself.
+    """Associate each line of a scan with its nearest feature, independently of other lines.
 
-    laser_map (2,): where the scan was seen from. Lines that could be several features are better
-    asked again when the others have corrected the pose.
+    laser_map (2,): position of the laser, map frame. Ambiguous lines should be associated again
+    after the others have updated the pose.
     """
     chosen = np.full(len(lines), -1, dtype=np.int64)
     passing = np.zeros(len(lines), dtype=np.int64)
@@ -92,10 +92,10 @@ def associate(
 def meeting(
     lines_map: Array, features: list[FeatureTrack], ends_map: Array, seen_from: Array, gap_m: float
 ) -> NDArray[np.bool_]:
-    """Which segments, by their ends (K, 2, 2), could be part of which features, (K, N).
+    """Whether segments with ends (K, 2, 2), map frame, may be part of features, (K, N).
 
-    Direction and offset roughly agree, the intervals along the line lie at most gap_m apart, and
-    the place (2,) from which the segments were seen is on the feature's side.
+    Direction and offset agree roughly, the intervals along the line are at most gap_m apart, and
+    the laser, at seen_from (2,), is on the side from which the feature was first observed.
     """
     offsets = np.abs(ends_map.mean(axis=1) @ normals_of(lines_map).T - lines_map[:, 0])
     chords = ends_map[:, 1] - ends_map[:, 0]
@@ -112,9 +112,9 @@ def meeting(
 
 
 def mahalanobis(v: Array, S: Array) -> float:
-    """Squared Mahalanobis distance v' S^-1 v of a (2,) and a (2, 2).
+    """Squared Mahalanobis distance v' S^-1 v, v (2,), S (2, 2).
 
-    Inf where S is not positive.
+    Infinite if S is not positive definite.
     """
     determinant = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
     if not (determinant > 0.0 and S[0, 0] > 0.0):

@@ -15,15 +15,14 @@ from thinmap_ros.core.se2 import Array, wrap
 
 
 class EkfSlam:
-    """The filter. Features are addressed by their place in the state, 0 to count - 1.
+    """The filter. Features are addressed by their index in the state, 0 to count - 1.
 
-    Between pose and features the state may hold `carried` numbers that no observation sees and no
-    motion moves; whoever wants to know what the updates did to other quantities lets them stand for
-    these (see ekf_ti).
+    Between pose and features the state may hold `carried` numbers, which no observation or motion
+    model depends on. Updates change them only by their correlations: see ekf_ti for their use.
     """
 
     def __init__(self, T_map_base: Array, covariance: Array, carried: int = 0) -> None:
-        self.first = 3 + carried  # where the features begin
+        self.first = 3 + carried  # index of the first feature's r
         self._x: Array = np.zeros(self.first + 2 * 32)
         self._P: Array = np.zeros((self._x.size, self._x.size))
         self.count = 0
@@ -31,7 +30,7 @@ class EkfSlam:
 
     @property
     def size(self) -> int:
-        """Numbers in the state."""
+        """Dimension of the state."""
         return self.first + 2 * self.count
 
     @property
@@ -60,7 +59,7 @@ class EkfSlam:
         return self._x[: self.size].copy()
 
     def place(self, index: int) -> slice:
-        """Where a feature stands in the state."""
+        """Indices of a feature in the state."""
         return slice(self.first + 2 * index, self.first + 2 * index + 2)
 
     def line_covariances(self) -> Array:
@@ -69,9 +68,9 @@ class EkfSlam:
         return np.asarray(self._P[at[:, :, None], at[:, None, :]])
 
     def set_state(self, mean: Array, covariance: Array) -> None:
-        """Take a whole state (size,) with its covariance.
+        """Set the whole state (size,) and its covariance (size, size).
 
-        What follows pose and carried numbers are features.
+        All numbers after the pose and the carried ones are features.
         """
         n = mean.size
         self._reserve(n)
@@ -80,7 +79,7 @@ class EkfSlam:
         self._P[:n, :n] = covariance
 
     def set_pose(self, T_map_base: Array, covariance: Array) -> None:
-        """Put the robot at a pose (3,) with covariance (3, 3), independent of the features."""
+        """Set the pose (3,) with covariance (3, 3), uncorrelated with the features."""
         n = self.size
         self._x[:3] = T_map_base
         self._x[2] = wrap(float(T_map_base[2]))
@@ -110,10 +109,11 @@ class EkfSlam:
         return expected, H @ self._P[np.ix_(at, at)] @ H.T, H
 
     def update(self, indices: NDArray[np.int64], z: Array, R: Array) -> bool:
-        """Correct by features (M,) seen as lines z (M, 2) of covariances R (M, 2, 2), eqs. (6)-(9).
+        """Update by observations z (M, 2) of features (M,) with covariances R (M, 2, 2).
 
-        Returns False, and changes nothing, where the numbers do not make an update. H has five
-        nonzero columns a line, so H P takes these rows only.
+        Returns False, and changes nothing, if the innovation covariance is not positive definite.
+        H has five nonzero columns per line, so H P needs these rows of P only.
+        Source: eqs. (6)-(9).
         """
         if len(indices) == 0:
             return True
@@ -138,9 +138,9 @@ class EkfSlam:
         return self._correct(v, S, HP)
 
     def merge(self, kept: int, dropped: int, covariance: Array) -> bool:
-        """Let two features be one wall: their difference is 0 up to a covariance (2, 2).
+        """Constrain two features to be equal, with covariance (2, 2).
 
-        Returns whether that could be done.
+        Returns whether the update was possible.
         """
         n = self.size
         a = self.place(kept)
@@ -149,9 +149,9 @@ class EkfSlam:
         return self._correct(-v, S + covariance, self._P[a, :n] - signs[:, None] * self._P[b, :n])
 
     def difference(self, a: int, b: int) -> tuple[Array, Array, Array]:
-        """Line a less line b, (2,), its covariance (2, 2), and signs (2,) of b's r and alpha in it.
+        """Line a minus line b, (2,), its covariance (2, 2), and the signs (2,) of b's r and alpha.
 
-        (r, alpha) and (-r, alpha + pi) are one line; b is taken in the form that is nearer to a.
+        (r, alpha) and (-r, alpha + pi) are the same line; the form of b nearer to a is used.
         """
         at_a = self.place(a)
         at_b = self.place(b)
@@ -161,7 +161,10 @@ class EkfSlam:
         return v, S, signs
 
     def add(self, seen: Array, covariance: Array) -> int:
-        """Take up a line seen as (r, alpha) as a new feature; returns its index."""
+        """Add an observed line (r, alpha), robot frame, as a feature; returns its index.
+
+        covariance (2, 2): of the observation.
+        """
         n = self.size
         self._reserve(n + 2)
         line, by_pose, by_seen = place_line(self._x[:3], seen)
@@ -174,7 +177,7 @@ class EkfSlam:
         return self.count - 1
 
     def remove(self, index: int) -> None:
-        """Drop a feature; those behind it move up by one."""
+        """Remove a feature; the indices of those behind it decrease by one."""
         keep = np.delete(np.arange(self.size), np.r_[self.place(index)])
         n = keep.size
         self._x[:n] = self._x[keep]
@@ -204,9 +207,9 @@ class EkfSlam:
         self._P = P
 
     def _normalise(self) -> None:
-        """Angles into (-pi, pi].
+        """Wrap angles into (-pi, pi].
 
-        An r below zero stays: turning the line round would turn its ends with it.
+        A negative r is kept: reversing the line would also exchange the ends of its interval.
         """
         self._x[2] = wrap(float(self._x[2]))
         self.lines[:, 1] = wrap(self.lines[:, 1])
@@ -217,7 +220,7 @@ def _difference(seen: Array, expected: Array) -> Array:
 
 
 def line_difference(a: Array, b: Array) -> tuple[Array, Array]:
-    """Line a (r, alpha) less line b, in the nearer form of b, and signs (2,) of b's r and alpha."""
+    """Line a (r, alpha) minus the nearer form of line b, and the signs (2,) of b's r and alpha."""
     v = _difference(a, b)
     if abs(v[1]) <= 0.5 * math.pi:
         return v, np.ones(2)
@@ -226,10 +229,10 @@ def line_difference(a: Array, b: Array) -> tuple[Array, Array]:
 
 @kernel
 def _correct(S: Array, HP: Array, v: Array, x: Array, P: Array) -> bool:
-    """Correct x and P in place; returns False, with x and P untouched, where S is not positive.
+    """Update x and P in place; returns False without a change if S is not positive definite.
 
     With S = L L', W = L^-1 H P and w = L^-1 v the gain need not be formed: K v = W' w, and
-    K (H P) = W' W, which is symmetric to the last bit. S, HP and v are used up.
+    K (H P) = W' W, which is exactly symmetric. S, HP and v are overwritten.
     """
     m, n = HP.shape
     for j in range(m):

@@ -1,9 +1,9 @@
-"""EKF-SLAM/TI, the paper's filter alone: odometry predicts, line features correct.
+"""EKF-SLAM/TI, the filter of the paper alone: odometry predicts, line features correct.
 
 Source: EKF-SLAM/TI paper sections 2 to 4. The state holds the pose and the features of the local
-area, which the topological map picks (`ekf_ti`), or all features (`ekf_full`); both estimate the
-same. There is no scan matching and no pose graph: what the filter once believed of a line stays,
-and a robot that was carried off is not noticed.
+area, which the topological map selects (`ekf_ti`), or all features (`ekf_full`). Both have the same
+estimate. There is no scan matching and no pose graph: associations are never revised, and a
+kidnapped robot is not detected.
 """
 
 from array import array
@@ -30,13 +30,12 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import TopologicalMap
 
-_START = np.diag(np.square([1e-4, 1e-4, 1e-4]))  # the map begins where the robot stands
-_IN_SESSION = np.diag(np.square([0.3, 0.3, 0.15]))  # of a start in the map of another day
-# The systematic errors of odometry repeat from step to step, and this filter does not calibrate
-# them. It takes errors to be independent: these have to be so many times larger to add up to as
-# much.
+_START = np.diag(np.square([1e-4, 1e-4, 1e-4]))  # of the initial pose, which defines the map frame
+_IN_SESSION = np.diag(np.square([0.3, 0.3, 0.15]))  # of the initial pose in a loaded map
+# The filter assumes independent odometry errors and does not calibrate the systematic ones. This
+# factor of the standard deviation makes up for their accumulation.
 _REPEATED = 5.0
-_SLIP_SIGMAS = 3.0  # a motion within so much of the slip is not counted yet
+_SLIP_SIGMAS = 3.0  # a motion within so many sigmas of the noise floor is not predicted yet
 
 
 @dataclass(frozen=True)
@@ -72,10 +71,9 @@ class EkfConfig(Config):
 
 
 class EkfLocalizer:
-    """The filter behind the interface of a localizer.
+    """EKF-SLAM with the interface of a localizer.
 
-    Input that is not finite is rejected and counted in `rejected`: the robot is then taken to be
-    where it was.
+    Input that is not finite is counted in `rejected`; a rejected odometry pose means no motion.
     """
 
     def __init__(self, config: EkfConfig | None = None) -> None:
@@ -84,7 +82,7 @@ class EkfLocalizer:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: the next scan is the first, at the configured start."""
+        """Discard map, path and pose; the next scan starts at the configured initial pose."""
         config = self.config
         start = se2.pose(config.initial_x_m, config.initial_y_m, config.initial_yaw_rad)
         self._filter = CompressedEkf(start, _START)
@@ -92,18 +90,18 @@ class EkfLocalizer:
             config.features, config.association, local_areas=config.slam == 'ekf_ti'
         )
         self._odometry = OdometryIncrements()
-        self._moved: Array = np.zeros(3)  # since the filter's pose
+        self._moved: Array = np.zeros(3)  # motion that the filter has not predicted yet
         self._is_observation_due = True
         self._path = array('d')
 
     @property
     def rejected(self) -> int:
-        """Scans, odometry poses and poses from outside that made no sense."""
+        """Number of scans, odometry poses and `set_pose` calls with invalid values."""
         return self._rejected + self._odometry.rejected
 
     @property
     def pose(self) -> Array:
-        """Where the robot is, T_map_base (3,)."""
+        """Current pose T_map_base (3,)."""
         return se2.compose(self._filter.local.pose, self._moved)
 
     @property
@@ -112,11 +110,11 @@ class EkfLocalizer:
         return self._features.line_features(self._filter)
 
     def set_topology(self, topology: TopologicalMap) -> None:
-        """Take the topological map by which features are stored."""
+        """Set the topological map that selects the local area."""
         self._features.area.set_topology(topology)
 
     def set_pose(self, T_map_base: Array, covariance: Array) -> None:
-        """Put the robot at a pose (3,) with covariance (3, 3) in the map that it has."""
+        """Set the pose (3,) with covariance (3, 3) in the current map."""
         if not (se2.is_bounded_pose(T_map_base) and np.isfinite(covariance).all()):
             self._rejected += 1
             return
@@ -125,16 +123,16 @@ class EkfLocalizer:
         self._is_observation_due = True
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """The features as arrays by name, for `from_state`; not where the robot is."""
+        """The features as arrays by name, for `from_state`; without the pose."""
         return self._features.state(self._filter)
 
     @staticmethod
     def from_state(
         state: Mapping[str, NDArray[Any]], config: EkfConfig | None = None
     ) -> 'EkfLocalizer':
-        """EkfLocalizer with the features of another localizer's `state`, at the configured start.
+        """EkfLocalizer with the features of a saved `state`, at the configured initial pose.
 
-        Raises InputError where it is no such state.
+        Raises InputError if the state is invalid.
         """
         own = {name: array for name, array in state.items() if name in feature_map.FIELDS}
         localizer = EkfLocalizer(config)
@@ -148,9 +146,9 @@ class EkfLocalizer:
     def from_occupancy_map(
         patch: GridPatch, last: OdometryAnchor, T_odom_base: Array, config: EkfConfig | None = None
     ) -> 'EkfLocalizer':
-        """EkfLocalizer that goes on at T_odom_base (3,) after its last pose, with new features.
+        """EkfLocalizer that resumes at the last pose plus the odometry motion, without features.
 
-        The occupancy map is of no use to it.
+        T_odom_base (3,): odometry pose now. The occupancy map is not used.
         """
         localizer = EkfLocalizer(config)
         moved = se2.between(last.T_odom_base, T_odom_base)
@@ -160,7 +158,10 @@ class EkfLocalizer:
         return localizer
 
     def step(self, scan: Scan, T_odom_base: Array) -> Estimate:
-        """Take in a scan with the odometry pose (3,) at its stamp."""
+        """Estimate the pose of a scan, given the odometry pose (3,) at its stamp; update the map.
+
+        One step: predict, extract lines, update.
+        """
         self._predict(self._odometry.add(scan.stamp_ns, T_odom_base))
         observed = 0
         matched = 0
@@ -173,7 +174,7 @@ class EkfLocalizer:
                 self._filter, lines, scan, learn=self.config.update_map
             )
             self._rejected += not is_valid
-            self._is_observation_due = False  # the same scan again tells no more
+            self._is_observation_due = False  # a scan from the same pose is not independent
         self._filter.flush_step()
         self._path.extend(self.pose.tolist())
         return Estimate(
@@ -187,21 +188,21 @@ class EkfLocalizer:
         )
 
     def optimized_trajectory(self) -> Array:
-        """Poses (N, 3) of all steps; a filter corrects none of the past."""
+        """Poses (N, 3) of all steps; the filter does not correct earlier ones."""
         return np.array(self._path, dtype=np.float64).reshape(-1, 3)
 
     def keyframe_trajectory(self) -> tuple[NDArray[np.int64], Array]:
-        """Stamps (0,) and poses (0, 3): nothing of the past is ever corrected."""
+        """Stamps (0,) and poses (0, 3): the filter does not correct earlier poses."""
         return np.empty(0, dtype=np.int64), np.empty((0, 3))
 
     def _motion_noise(self, moved: Array) -> Array:
-        """Covariance (3, 3) of a motion (3,) by odometry, robot frame before it."""
+        """Covariance (3, 3) of an odometry motion (3,), robot frame before the motion."""
         return np.diag(_REPEATED**2 * odometry_variances(moved, self.config.odometry))
 
     def _predict(self, increment: OdometryIncrement) -> None:
-        """Eqs. (10) and (11), once the robot has moved by more than odometry slips.
+        """Predict by eqs. (10) and (11) once the motion exceeds the odometry noise floor.
 
-        So a robot that stands grows no surer and no less sure, however many scans it takes.
+        So the covariance of a stationary robot does not change.
         """
         ekf = self._filter.local
         if increment.discontinuity_m > 0.0:

@@ -1,21 +1,21 @@
 """EKF-SLAM/TI: the conventional filter's estimate at a cost independent of the feature count.
 
-Steps touch the pose and the features of a local area, A. What they would do to all other features,
-B, is gathered in a few numbers and worked in when the area changes. Source: EKF-SLAM/TI paper
+Each step updates the pose and the features of a local area, A. Its effect on all other features, B,
+is accumulated in a few numbers, and applied when the area changes. Source: EKF-SLAM/TI paper
 section 4 for the area; the compressed filter after Guivant and Nebot, "Optimization of the
 simultaneous localization and map-building algorithm for real-time implementation", 2001 (the
 paper's reference [4]).
 
-With the covariances at the time when the area was entered, P_AB and P_BB, there is a matrix C and a
-vector c so that now x_B = x_B + P_BA c and P_BB = P_BB + P_BA C P_AB, and each number a of A has
-the cross terms P_aB = Phi_a P_AB. That is just what happens to a vector e with mean 0, covariance 0
-and cov(A, e) = I on entering (B moves as P_BA e), whose mean c, covariance C and cross terms Phi
-the filter itself keeps up when e is carried in its state. So there is no second set of equations:
-the local filter is the conventional one with e carried along.
+Let P_AB and P_BB be the covariances when the area was set. Then after any number of steps there is
+a vector c and a matrix C with x_B = x_B + P_BA c and P_BB = P_BB + P_BA C P_AB, and each number a
+of A has the cross covariance P_aB = Phi_a P_AB. A vector e with mean 0, covariance 0 and
+cov(A, e) = I at that time evolves in the same way (B changes as P_BA e): its mean is c, its
+covariance C, and its cross covariance Phi. So the local filter is the conventional filter with e
+as part of its state, without a second set of equations.
 
-Folding P_BA C P_AB into P_BB costs the square of the number of features. C is negative, so the term
-is -W' W with few rows; reading only what a new area needs and working off W a few rows at each step
-keeps every step short.
+Adding P_BA C P_AB to P_BB costs the square of the number of features. C is negative semidefinite,
+so the term is -W' W with few rows. Only the rows of a new area are updated at once. The others
+follow a few at a time, so that the time of each step is bounded.
 """
 
 import math
@@ -28,29 +28,29 @@ from numpy.typing import NDArray
 from thinmap_ros.core.ekf_slam.ekf import EkfSlam
 from thinmap_ros.core.se2 import Array, wrap
 
-_ROOM = 8200  # numbers by which the store grows; memory is taken up only where it is written
-_CHUNK = 256  # numbers by which what is computed with grows
-_SWEEP_STEPS = 384  # in so many steps a fold is worked in
-_BLOCK = 64  # rows that are worth a look at W
-_ROUNDING = 1e-15  # eigenvalues this much smaller than the largest are nothing but rounding
+_ROOM = 8200  # numbers by which the store grows; memory is used only where it is written
+_CHUNK = 256  # numbers by which the used width of the store grows
+_SWEEP_STEPS = 384  # steps in which -W' W is added to the whole store
+_BLOCK = 64  # smallest number of rows to update at once
+_ROUNDING = 1e-15  # relative size of an eigenvalue below which it is rounding error
 
 
 class CompressedEkf:
-    """Pose and all features; `local` is the filter of pose and the features of the area.
+    """Pose and all features; `local` is the filter of the pose and the features of the area.
 
-    Features are known by ids of the caller's choice. `area` lists those of the local filter, in its
-    order; change the number of its features only by `add` and `remove` of this class. As long as
-    `enter` is never called, all features are in the area, and this is the conventional filter.
+    The caller chooses the ids of features. `area` lists those of the local filter, in its order;
+    change their number only by `add` and `remove` of this class. Until `set_local_area` is called,
+    all features are in the area, and this is the conventional filter.
     """
 
     def __init__(self, T_map_base: Array, covariance: Array) -> None:
         self.local = EkfSlam(T_map_base, covariance)
         self.area: list[int] = []
         self._store = _Store()
-        # P_AB on entering the area, (carried numbers, store's width);
+        # P_AB when the area was set, (carried numbers, store's width);
         # the columns of the area itself are 0.
         self._cross: Array = np.zeros((0, self._store.width))
-        # By id, which pair of the store's numbers is the feature's.
+        # By feature id, the index of its pair of numbers in the store.
         self._places: dict[int, int] = {}
 
     def __len__(self) -> int:
@@ -58,13 +58,13 @@ class CompressedEkf:
 
     @property
     def ids(self) -> list[int]:
-        """All features."""
+        """Ids of all features."""
         return list(self._places)
 
     def add(self, feature_id: int, seen: Array, covariance: Array) -> int:
-        """Take up a line seen as (r, alpha) as a new feature of the area.
+        """Add an observed line (r, alpha), robot frame, as a feature of the area.
 
-        Returns its index in the local filter.
+        covariance (2, 2): of the observation. Returns the feature's index in the local filter.
         """
         self._places[feature_id] = self._store.take_place()
         if self._cross.shape[1] < self._store.width:
@@ -73,16 +73,13 @@ class CompressedEkf:
         return self.local.add(seen, covariance)
 
     def remove(self, index: int) -> None:
-        """Drop a feature of the area, by its index in the local filter."""
+        """Remove a feature of the area, by its index in the local filter."""
         place = self._places.pop(self.area.pop(index))
         self._store.free_place(place)
         self.local.remove(index)
 
     def set_local_area(self, ids: list[int]) -> None:
-        """Make these features the local area.
-
-        What the steps so far mean for all others is folded in.
-        """
+        """Make these features the local area, and apply the steps so far to all others."""
         pose_cross = self._fold()
         at = self._numbers(ids)
         mean, rows = self._store.read(at)
@@ -96,13 +93,13 @@ class CompressedEkf:
         self.area = list(ids)
 
     def flush_step(self) -> None:
-        """Work some rows of what was folded into the store; to be called once a step."""
+        """Update some rows of the store; to be called once per step."""
         self._store.sweep()
 
     def flush(self) -> tuple[Array, Array]:
-        """Work everything in.
+        """Apply all steps to all features.
 
-        Mean (3 + 2 N,) and covariance of pose and all features, in the order of `ids`.
+        Returns mean (3 + 2 N,) and covariance of pose and all features, in the order of `ids`.
         """
         area = self.area
         self.set_local_area(self.ids)
@@ -112,9 +109,9 @@ class CompressedEkf:
         return mean, covariance
 
     def restore(self, ids: list[int], lines: Array, covariance: Array) -> None:
-        """Take up features with lines (N, 2) and covariance (2 N, 2 N), into a filter without any.
+        """Restore features with lines (N, 2) and covariance (2 N, 2 N) into an empty filter.
 
-        The pose has nothing to do with them. All are in the area until another one is entered.
+        They are uncorrelated with the pose. All are in the area until `set_local_area` is called.
         """
         for feature_id in ids:
             self._places[feature_id] = self._store.take_place()
@@ -127,37 +124,31 @@ class CompressedEkf:
         self.area = list(ids)
 
     def lines(self) -> dict[int, Array]:
-        """Line (r, alpha) of every feature.
-
-        Of those outside the area, as of when the area was entered.
-        """
+        """Line (r, alpha) of every feature; outside the area as of when the area was set."""
         found = {i: self._store.mean[2 * p : 2 * p + 2] for i, p in self._places.items()}
         found.update(zip(self.area, self.local.lines, strict=True))
         return found
 
     def line_array(self) -> tuple[NDArray[np.int64], Array]:
-        """Ids (N,) and lines (N, 2) of all features, in the order of `ids`, as `lines` has them."""
+        """Ids (N,) and lines (N, 2) of all features, as `lines`, in the order of `ids`."""
         lines = self._store.mean[: self._store.width].reshape(-1, 2).copy()  # by place
         lines[[self._places[i] for i in self.area]] = self.local.lines
         ids = np.fromiter(self._places, dtype=np.int64, count=len(self))
         return ids, lines[np.fromiter(self._places.values(), dtype=np.int64, count=len(self))]
 
     def line_covariances(self) -> dict[int, Array]:
-        """Covariance (2, 2) of every feature's line.
-
-        Of those outside the area, as of when the area was entered.
-        """
+        """Covariance (2, 2) of every line; outside the area as of when the area was set."""
         found = dict(zip(self.ids, self._store.blocks(list(self._places.values())), strict=True))
         found.update(zip(self.area, self.local.line_covariances(), strict=True))
         return found
 
     def _numbers(self, ids: list[int]) -> NDArray[np.int64]:
-        """Where the lines of features stand in the store, (2 len(ids),)."""
+        """Indices (2 len(ids),) of the lines of features in the store."""
         places = np.array([self._places[i] for i in ids], dtype=np.int64)
         return np.asarray((2 * places[:, None] + np.arange(2)).ravel())
 
     def _fold(self) -> Array:
-        """Bring the store up to date; returns cov(pose, each number of the store), (3, width)."""
+        """Update the store by all steps; returns cov(pose, numbers of the store), (3, width)."""
         mean = self.local.mean
         P = self.local.covariance
         first = self.local.first
@@ -176,9 +167,9 @@ class CompressedEkf:
 
 
 def _carrying(pose: Array, lines: Array, covariance: Array, carried: int) -> EkfSlam:
-    """A filter of pose (3,) and lines (2 L,) with their covariance, and e between them.
+    """Filter of pose (3,) and lines (2 L,) with their covariance, and with cov(A, e) = I.
 
-    It has cov(A, e) = I.
+    carried: dimension of e.
     """
     local = EkfSlam(pose, covariance[:3, :3], carried)
     at = np.r_[0:3, 3 + carried : 3 + carried + lines.size]
@@ -194,12 +185,11 @@ def _carrying(pose: Array, lines: Array, covariance: Array, carried: int) -> Ekf
 
 
 class _Store:
-    """Mean and covariance of all features as of the last fold.
+    """Mean and covariance of all features as of the last change of the area.
 
-    To the covariance a few terms -W' W are still to be added. These are worked off in sweeps over
-    rows and columns, from the first to the last. A sweep takes what is there when it begins; what
-    comes meanwhile waits for the next. Rows and columns that are written are up to date, so the
-    terms are zero there from then on.
+    Some terms -W' W are not yet added to the covariance. Sweeps add them to rows and columns, from
+    the first to the last. A sweep processes the terms that exist when it starts; later terms wait
+    for the next sweep. Rows and columns that are written are up to date, so W is 0 there.
     """
 
     def __init__(self) -> None:
@@ -210,11 +200,11 @@ class _Store:
         self._free: list[int] = []
         self._sweeping: Array = np.zeros((0, self.width))
         self._waiting: Array = np.zeros((0, self.width))
-        self._row = 0  # rows and columns before this have been swept
-        self._due = 0.0  # numbers that should have been swept by now beyond that
+        self._row = 0  # number of rows and columns that the sweep has updated
+        self._due = 0.0  # numbers that the sweep is behind schedule
 
     def take_place(self) -> int:
-        """A place for a feature: its numbers are 2 place and 2 place + 1."""
+        """Allocate a place for a feature: its numbers are 2 place and 2 place + 1."""
         if self._free:
             return self._free.pop()
         self._used += 1
@@ -230,11 +220,11 @@ class _Store:
         return self._used - 1
 
     def free_place(self, place: int) -> None:
-        """Give a place back."""
+        """Release a place."""
         self._free.append(place)
 
     def taken_but(self, at: NDArray[np.int64]) -> NDArray[np.int64]:
-        """All numbers of places that are taken, in order, but some."""
+        """Numbers of all allocated places except those at `at`, in order."""
         taken = np.zeros(self.width, dtype=np.bool_)
         taken[: 2 * self._used] = True
         taken[at] = False
@@ -247,7 +237,7 @@ class _Store:
         self.mean[1 : self.width : 2] = wrap(self.mean[1 : self.width : 2])
 
     def read(self, at: NDArray[np.int64]) -> tuple[Array, Array]:
-        """Mean and rows of the covariance (len(at), width) at some numbers, up to date."""
+        """Current mean (M,) and rows (M, width) of the covariance at numbers `at` (M,)."""
         rows = self._P[at, : self.width]
         late = at >= self._row
         row = self._row
@@ -256,7 +246,7 @@ class _Store:
         return self.mean[at], rows
 
     def write(self, at: NDArray[np.int64], mean: Array, rows: Array) -> None:
-        """Set mean and rows, and with them columns, of the covariance at some numbers."""
+        """Set mean (M,), and rows (M, width) and columns of the covariance, at numbers (M,)."""
         self.mean[at] = mean
         self._P[at, : self.width] = rows
         self._P[: self.width, at] = rows.T
@@ -264,7 +254,7 @@ class _Store:
         self._waiting[:, at] = 0.0
 
     def blocks(self, places: list[int]) -> Array:
-        """Covariances (N, 2, 2) of the features at some places, up to date."""
+        """Current covariances (N, 2, 2) of the features at some places."""
         at = 2 * np.array(places, dtype=np.int64)[:, None] + np.arange(2)
         found = self._P[at[:, :, None], at[:, None, :]]
         swept = np.where(at[:, 0] >= self._row, 1.0, 0.0)[:, None, None]
@@ -274,17 +264,17 @@ class _Store:
         )
 
     def subtract(self, W: Array) -> None:
-        """Take W' W off the covariance, in time; W (R, width)."""
+        """Subtract W' W from the covariance in later sweeps; W (R, width)."""
         self._waiting = np.vstack([self._waiting, W])
 
     def sweep(self) -> None:
-        """Work some rows, and with them columns, off."""
+        """Update some rows, and their columns, of the covariance."""
         if len(self._sweeping) == 0:
             self._sweeping, self._waiting, self._row = self._waiting, self._sweeping, 0
         if len(self._sweeping) == 0:
             return
-        # Rows grow shorter to the diagonal, so a step's share is one of the triangle; shares are
-        # saved up for a block.
+        # Only the triangle is computed, so rows become shorter; a step's share is one of its area.
+        # Shares accumulate until they are enough for a block.
         end = 2 * self._used
         a = self._row
         self._due += 0.5 * end * end / _SWEEP_STEPS
@@ -301,17 +291,16 @@ class _Store:
 
 
 def _zeros(size: int) -> Array:
-    """Zeros (size, size) that take up memory only where they are written.
+    """Zeros (size, size) that use memory only where they are written.
 
-    Not by numpy: that asks for large pages, of which each line of the few numbers in use would take
-    up its share.
+    numpy would use huge pages, and each row with a few numbers in use would occupy a whole page.
     """
     pages = mmap.mmap(-1, 8 * size * size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-    with suppress(AttributeError, OSError):  # where there are no large pages
+    with suppress(AttributeError, OSError):  # no huge pages on this system
         pages.madvise(mmap.MADV_NOHUGEPAGE)
     return np.frombuffer(pages, dtype=np.float64).reshape(size, size)
 
 
 def widened(rows: Array, width: int) -> Array:
-    """Rows (R, W) with zeros added up to a width."""
+    """Rows (R, W), padded with zeros to a width."""
     return np.pad(rows, ((0, 0), (0, width - rows.shape[1])))

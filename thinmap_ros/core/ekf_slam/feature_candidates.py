@@ -1,7 +1,4 @@
-"""Lines that are not yet features.
-
-Only what is seen several times, at the same place, becomes one.
-"""
+"""Feature candidates: a line becomes a feature after several observations at one place."""
 
 from dataclasses import dataclass
 
@@ -17,9 +14,9 @@ from thinmap_ros.core.se2 import Array, transform_points
 
 @dataclass(eq=False)
 class FeatureCandidate:
-    """A line (r, alpha) and what was seen of it, in the map.
+    """A line (r, alpha), map frame, and its observed interval.
 
-    The last look as it was seen, z (2,) with covariance.
+    z (2,) with covariance (2, 2): the last observation, robot frame.
     """
 
     line: Array
@@ -31,12 +28,13 @@ class FeatureCandidate:
 
 
 class FeatureCandidates:
-    """The lines that have been seen too seldom so far."""
+    """The lines with too few observations to be features."""
 
     def __init__(self, min_observations: int, max_misses: int, gate: float, gap_m: float) -> None:
-        """min_observations: after so many a line is ripe.
+        """Create an empty set.
 
-        max_misses: observations without it after which it is dropped.
+        min_observations: number after which a line becomes a feature; max_misses: observations
+        without a match after which a candidate is dropped; gate, gap_m: as in `associate`.
         """
         self._min_observations = min_observations
         self._max_misses = max_misses
@@ -46,9 +44,9 @@ class FeatureCandidates:
         self._observations = 0
 
     def update(self, pose: Array, lines: Lines, laser_map: Array) -> list[FeatureCandidate]:
-        """Take in lines of a scan from a pose (3,), with the laser at a place (2,).
+        """Update by the lines of a scan at a pose (3,), with the laser at laser_map (2,).
 
-        Returns those that are ripe now.
+        Returns the candidates that have become features.
         """
         self._observations += 1
         seen = [
@@ -63,9 +61,9 @@ class FeatureCandidates:
     def _take(
         self, pose: Array, z: Array, covariance: Array, ends_map: Array, laser_map: Array
     ) -> FeatureCandidate:
-        """The candidate that a seen line continues, brought up to date, or a new one."""
+        """Update the candidate that an observed line matches, or add a new one."""
         line, _, by_seen = place_line(pose, z)
-        # Two looks at one line differ by the noise of both; the robot hardly moved in between.
+        # Two observations of a line differ by the noise of both; the robot has hardly moved.
         S = 2.0 * by_seen @ covariance @ by_seen.T
         for candidate in self._meeting(ends_map, laser_map):
             v, signs = line_difference(line, candidate.line)

@@ -1,10 +1,8 @@
-"""The line features of the map and their care.
+"""Management of the line features: they are added, extended, merged and removed.
 
-How one enters, grows, is found to be another one, and leaves.
-
-Source: EKF-SLAM/TI paper sections 2 and 4. The paper does not say when a feature enters or leaves;
-here it enters after several sightings from different places, because what was only clutter would
-stay in the state for ever, and leaves when several looks went through where it should be.
+Source: EKF-SLAM/TI paper sections 2 and 4. The paper does not define when features are added or
+removed. Here a feature is added after several observations, so that clutter does not enter the
+state, and removed after several consecutive scans saw through it.
 """
 
 from collections.abc import Iterable, Mapping
@@ -36,15 +34,15 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, transform_points
 from thinmap_ros.core.snapshot import MAX_COORDINATE_M, MAX_COUNT, MAX_ID, Field
 
-_SPARE = 8  # features that the local area may hold beyond those it should
-_ROUNDING = 1e-6  # of the largest variance, by which a covariance may fail to be one
+_SPARE = 8  # additional features that may stay in the local area
+_ROUNDING = 1e-6  # relative rounding error that is accepted in a covariance
 FIELDS = {
     'ids': Field(np.int64, ('n',), 1, MAX_ID),
     'lines': Field(
         np.float64, ('n', 2), (-MAX_COORDINATE_M, -4.0 * np.pi), (MAX_COORDINATE_M, 4.0 * np.pi)
     ),
     'line_covariance': Field(np.float64, ('2n', '2n'), -MAX_COORDINATE_M, MAX_COORDINATE_M),
-    # low and high end along the line, x and y of where it was first seen from, missed
+    # low and high end along the line, x and y of first_seen_from, misses
     'spans': Field(
         np.float64,
         ('n', 5),
@@ -70,7 +68,7 @@ FIELDS = {
 
 @dataclass(frozen=True)
 class FeatureConfig(Config):
-    """Parameters of the upkeep of features."""
+    """Parameters of feature management."""
 
     wall_flatness_m: float = parameter(
         0.02,
@@ -110,10 +108,10 @@ class FeatureConfig(Config):
 
 
 class FeatureMap:
-    """All features by id, those in the filter's local area, and lines that may become features.
+    """All features by id, the local area of the filter, and the feature candidates.
 
-    With local areas (EKF-SLAM/TI) association and update take the features of the local area;
-    without, all.
+    With local areas (EKF-SLAM/TI) association and update use the features of the local area;
+    without, they use all.
     """
 
     def __init__(
@@ -131,7 +129,7 @@ class FeatureMap:
             association.gate,
             association.max_gap_m,
         )
-        # Features outside the local area that the robot turned out to see.
+        # Features outside the local area that were observed, to be added to it.
         self._called: set[int] = set()
         self._next_id = 1
 
@@ -139,10 +137,7 @@ class FeatureMap:
         return len(self._features)
 
     def state(self, ekf: CompressedEkf) -> dict[str, NDArray[Any]]:
-        """All features as arrays by name, with the covariance of their lines.
-
-        Candidates are left out.
-        """
+        """All features as arrays by name, with the covariance of their lines; no candidates."""
         mean, covariance = ekf.flush()
         features = [self._features[i] for i in ekf.ids]
         spans = [(f.low, f.high, *f.first_seen_from, f.misses) for f in features]
@@ -156,9 +151,9 @@ class FeatureMap:
         }
 
     def restore(self, ekf: CompressedEkf, state: Mapping[str, NDArray[Any]]) -> None:
-        """Take up the `state` of another map, into an empty one and its filter.
+        """Restore a saved `state` into an empty map and its filter.
 
-        state: checked by FIELDS. Raises InputError where its arrays contradict each other.
+        state: checked by FIELDS. Raises InputError if its arrays are inconsistent.
         """
         _check_references(state)
         ids = state['ids'].tolist()
@@ -171,7 +166,7 @@ class FeatureMap:
         self._next_id = int(state['next_id'])
 
     def line_features(self, ekf: CompressedEkf) -> list[LineFeature]:
-        """The features as others see them."""
+        """All features, with their current lines."""
         lines = ekf.lines()
         covariances = ekf.line_covariances()
         local = set(ekf.area)
@@ -187,10 +182,10 @@ class FeatureMap:
         scan: Scan,
         learn: bool = True,
     ) -> tuple[int, bool]:
-        """Associate and correct the filter by the lines of a scan, then look after the features.
+        """Associate the lines of a scan, update the filter, and manage the features.
 
-        learn: whether features may grow, come and go.
-        Returns how many were matched, and whether the filter took the update.
+        learn: whether features may be added, extended, merged and removed.
+        Returns the number of matched lines, and whether the filter update was possible.
         """
         if self._local_areas:
             self._choose_area(ekf, scan)
@@ -210,9 +205,9 @@ class FeatureMap:
         return len(matched), taken
 
     def _walls(self, lines: Lines) -> Array:
-        """Covariances (K, 2, 2) of lines as real walls are off straight ones.
+        """Covariances (K, 2, 2) of lines due to the flatness of real walls.
 
-        By as much at their ends as anywhere: a short piece of wall tells its direction badly.
+        The error at the ends is the same as elsewhere, so a short line has an uncertain direction.
         """
         lengths = np.hypot(*(lines.ends[:, 1] - lines.ends[:, 0]).T)
         sigma_m = self._config.wall_flatness_m
@@ -224,9 +219,9 @@ class FeatureMap:
     def _correct(
         self, ekf: CompressedEkf, lines: Lines, laser_map: Array
     ) -> tuple[NDArray[np.int64], bool]:
-        """Update by the lines that can only be one feature, then by the others.
+        """Update by the unambiguous lines, then by the others.
 
-        Returns which feature each is (-1: none).
+        Returns the index of the feature of each line (-1: none), and whether both were possible.
         """
         features = self._local(ekf)
         choice = associate(ekf.local, features, lines, laser_map, self._association)
@@ -245,7 +240,7 @@ class FeatureMap:
         return [self._features[i] for i in ekf.area]
 
     def _choose_area(self, ekf: CompressedEkf, scan: Scan) -> None:
-        """Have the filter enter the robot's area when it lacks some of it or holds much else."""
+        """Set the filter's area if features are missing, or if it holds too many others."""
         half_view = 0.5 * abs(scan.angle_increment_rad) * scan.ranges_m.size
         wanted = self.area.features_near(ekf.local.pose, half_view) | self._called
         if not wanted <= set(ekf.area) or len(ekf.area) > len(wanted) + _SPARE:
@@ -253,7 +248,7 @@ class FeatureMap:
             self._called.clear()
 
     def _grow(self, ekf: CompressedEkf, indices: NDArray[np.int64], lines: Lines) -> list[int]:
-        """Features become as long as what was seen of them; returns the ids of these."""
+        """Extend features by the observed segments; returns their ids."""
         for index, ends in zip(indices, lines.ends, strict=True):
             feature = self._features[ekf.area[index]]
             feature.grow(*interval(ekf.local.lines[index], transform_points(ekf.local.pose, ends)))
@@ -261,7 +256,7 @@ class FeatureMap:
         return [ekf.area[i] for i in np.unique(indices)]
 
     def _miss(self, ekf: CompressedEkf, seen: Iterable[int], scan: Scan) -> None:
-        """Features that the scan went through, time and again, leave."""
+        """Count the features that the scan saw through; remove those with too many misses."""
         through = seen_through(scan, ekf.local.pose, ekf.local.lines, self._local(ekf))
         for feature_id in [
             i for i, gone in zip(ekf.area, through, strict=True) if gone and i not in seen
@@ -271,7 +266,7 @@ class FeatureMap:
                 self._drop(ekf, feature_id, None)
 
     def _merge(self, ekf: CompressedEkf, seen: Iterable[int]) -> None:
-        """Of the features just seen, those found to be another one are tied to it, and go."""
+        """Merge observed features that are the same wall as another feature."""
         for feature_id in seen:
             twin = self._twin(ekf, feature_id) if feature_id in self._features else None
             if twin is None:
@@ -286,9 +281,9 @@ class FeatureMap:
                 self._drop(ekf, dropped, kept)
 
     def _twin(self, ekf: CompressedEkf, feature_id: int) -> int | None:
-        """Another feature that passes for the same wall.
+        """Another feature that is the same wall, or None.
 
-        It meets this one, and their difference passes the gate.
+        Their intervals overlap, and their difference passes the gate.
         """
         index = ekf.area.index(feature_id)
         lines = ekf.local.lines
@@ -311,7 +306,7 @@ class FeatureMap:
 
     @property
     def _near(self) -> float:
-        """Distance between two lines that may yet be one wall, m."""
+        """Largest distance between two lines that may be one wall, m."""
         return 3.0 * self._config.wall_flatness_m
 
     def _drop(self, ekf: CompressedEkf, feature_id: int, heir: int | None) -> None:
@@ -321,9 +316,9 @@ class FeatureMap:
         del self._features[feature_id]
 
     def _take_up(self, ekf: CompressedEkf, candidate: FeatureCandidate) -> list[int]:
-        """Make a line a feature, unless it is one that the map has elsewhere.
+        """Add a candidate as a feature, unless existing features cover it.
 
-        Returns the id of the new feature.
+        Returns the id of the new feature, or an empty list.
         """
         known = self._covering(ekf, candidate)
         if known:
@@ -337,9 +332,9 @@ class FeatureMap:
         return [feature_id]
 
     def _covering(self, ekf: CompressedEkf, candidate: FeatureCandidate) -> set[int]:
-        """Features that cover the candidate's place, though it failed the gate.
+        """Ids of features that cover the candidate although it failed their gate.
 
-        Two for one wall help nobody.
+        Prevents duplicate features of one wall.
         """
         if not self._features:
             return set()
@@ -348,7 +343,7 @@ class FeatureMap:
         middle = 0.5 * (start + end)
         reach = 0.25 * (end - start)
         near = np.abs(normals_of(lines) @ middle - lines[:, 0]) <= self._near
-        # The few on whose lines it lies, of all that the map has.
+        # Only features whose lines are near the candidate.
         ids = ids[near]
         lines = lines[near]
         features = [self._features[i] for i in ids.tolist()]
@@ -361,7 +356,7 @@ class FeatureMap:
 
 
 def _check_references(state: Mapping[str, NDArray[Any]]) -> None:
-    """Raise InputError unless ids are unique and known, spans in order, and P a covariance."""
+    """Raise InputError unless ids are unique and known, spans ordered, and P is a covariance."""
     ids = state['ids']
     spans = state['spans']
     snapshot.require_unique(ids, 'features: id')
@@ -377,12 +372,12 @@ def _check_references(state: Mapping[str, NDArray[Any]]) -> None:
 
 
 def _is_covariance(P: Array) -> bool:
-    """Whether a matrix (N, N) is symmetric and, but for rounding, positive semidefinite."""
+    """Whether a matrix (N, N) is symmetric and positive semidefinite up to rounding."""
     rounding = _ROUNDING * float(np.abs(P).max(initial=0.0))
     if np.abs(P - P.T).max(initial=0.0) > rounding:
         return False
     try:
-        # A smallest variance that is no more than rounding error keeps it definite.
+        # The added variance, of the size of rounding errors, makes a semidefinite matrix definite.
         np.linalg.cholesky(P + (rounding + 1e-12) * np.eye(len(P)))
     except np.linalg.LinAlgError:
         return False

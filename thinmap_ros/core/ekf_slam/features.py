@@ -1,4 +1,4 @@
-"""What is kept of a line feature beside the filter's state, and where it lies along its line."""
+"""Data of line features besides the filter state, and geometry along their lines."""
 
 from dataclasses import dataclass
 
@@ -9,11 +9,11 @@ from thinmap_ros.core.se2 import Array, wrap
 
 @dataclass(eq=False)
 class FeatureTrack:
-    """A feature's id, the interval [low, high] (m) seen of its line, and from where at first.
+    """A feature's id, and the observed interval [low, high] (m) of its line.
 
-    Positions along a line are counted from the foot of the perpendicular from the map's origin, to
-    its left. seen_from (2,): in the map frame, m. missed counts the looks in a row that should have
-    met the feature and did not.
+    Positions along a line are relative to the foot of the perpendicular from the map's origin,
+    positive to the left of the normal. first_seen_from (2,): position of the laser at the first
+    observation, map frame, m. misses: number of consecutive scans that saw through the feature.
     """
 
     id: int
@@ -23,17 +23,17 @@ class FeatureTrack:
     misses: int = 0
 
     def grow(self, low: float, high: float) -> None:
-        """Become as long as to hold another interval of the line, m."""
+        """Extend the interval to include another one, m."""
         self.low = min(self.low, low)
         self.high = max(self.high, high)
 
 
 @dataclass(frozen=True, eq=False)
 class LineFeature:
-    """A feature as others see it.
+    """A feature for display and storage.
 
-    id; r >= 0 and alpha with their covariance (2, 2); its ends (2,) each, m, map frame; nodes: ids
-    of the topological nodes at which it is stored; local: whether it is in the local area now.
+    r_m >= 0 and alpha_rad with their covariance (2, 2); start, end (2,): m, map frame; nodes: ids
+    of the topological nodes at which it is stored; local: whether it is in the local area.
     """
 
     id: int
@@ -52,15 +52,12 @@ def normals_of(lines: Array) -> Array:
 
 
 def tangents_of(lines: Array) -> Array:
-    """Directions (N, 2) in which positions along lines (N, 2) grow.
-
-    Their normals turned to the left.
-    """
+    """Unit tangents (N, 2) of lines (N, 2): their normals rotated by 90 degrees to the left."""
     return _paired(-np.sin(lines[:, 1]), np.cos(lines[:, 1]))
 
 
 def _paired(x: Array, y: Array) -> Array:
-    """(N, 2) of x (N,) and y (N,): asked for so often that np.column_stack would be felt."""
+    """(N, 2) of x (N,) and y (N,); np.column_stack is too slow for such frequent calls."""
     pairs = np.empty((x.size, 2))
     pairs[:, 0] = x
     pairs[:, 1] = y
@@ -68,21 +65,21 @@ def _paired(x: Array, y: Array) -> Array:
 
 
 def sides_of(lines: Array, points: Array) -> Array:
-    """Side of each line (N, 2) on which its point (N, 2), or one point (2,), lies.
+    """Side (N,) of lines (N, 2) on which points (N, 2), or one point (2,), are.
 
-    1 the origin's, -1 beyond.
+    1: the side of the origin; -1: the other side.
     """
     return np.where(lines[:, 0] - (normals_of(lines) * points).sum(axis=1) >= 0.0, 1.0, -1.0)
 
 
 def interval(line: Array, points: Array) -> tuple[float, float]:
-    """Where along a line (r, alpha) points (M, 2) lie: lowest and highest position."""
+    """Lowest and highest position of points (M, 2) along a line (r, alpha), m."""
     along = points @ tangents_of(line[None])[0]
     return float(along.min()), float(along.max())
 
 
 def point_on(line: Array, position: float) -> Array:
-    """Point (2,) at a position along a line (r, alpha)."""
+    """Point (2,) at a position (m) along a line (r, alpha)."""
     return np.asarray(line[0] * normals_of(line[None])[0] + position * tangents_of(line[None])[0])
 
 
@@ -94,7 +91,7 @@ def ends_of(feature: FeatureTrack, line: Array) -> Array:
 def as_seen(
     feature: FeatureTrack, line: Array, covariance: Array, nodes: list[int], local: bool
 ) -> LineFeature:
-    """The feature with its line (r, alpha) of the present state, for others: with r >= 0."""
+    """LineFeature of a feature with its current line (r, alpha), converted to r >= 0."""
     start, end = ends_of(feature, line)
     if line[0] < 0.0:
         signs = np.array([-1.0, 1.0])

@@ -1,12 +1,10 @@
-"""Line segments of a scan.
+"""Line extraction from a scan: split and merge, with a weighted least-squares fit.
 
-Split where the beams jump or bend, merged where they go on, fitted by least squares.
-
-A run of beams ends where two neighbours lie farther apart than on a wall seen at the flattest
-usable angle. It is split at the point farthest from the chord of its ends while that is farther
-than noise can be (iterative end point fit); neighbouring parts that fit one line are merged again.
-What is then left has to pass for a wall: enough points, long enough, residuals that the noise of
-the beams explains, and no bow (round columns make short chords).
+A run of beams ends if two neighbours are farther apart than on a wall at the smallest usable angle
+of incidence. A run is split at the point farthest from the chord of its ends while this distance
+exceeds the noise (iterative end point fit). Adjacent parts that fit one line are merged again. A
+segment is accepted if it has enough points, is long enough, has residuals within the noise, and has
+no curvature (round columns make short chords).
 Source: EKF-SLAM/TI paper section 4 (least-squares lines, reference [9] there); the breakpoints
 after Borges and Aldon, "Line extraction in 2D range images", 2004; the fit minimises
 sum w (rho cos(phi - alpha) - r)^2.
@@ -23,12 +21,12 @@ from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, transform_points, wrap
 
-_FLATTEST_RAD = math.radians(10.0)  # walls are joined down to this angle between wall and beam
-_WIDEST_GAP_M = 0.6  # narrower than a door
-_MOST_MISSING = 2  # beams without return inside a wall
+_FLATTEST_RAD = math.radians(10.0)  # smallest usable angle between wall and beam
+_WIDEST_GAP_M = 0.6  # largest gap in a wall: narrower than a door
+_MOST_MISSING = 2  # largest number of adjacent beams without return inside a wall
 _MOST_CHI2 = 3.0  # per degree of freedom: rough walls pass, clutter does not
 _SPLIT_SIGMAS = 4.0
-_TRIM_SIGMAS = 3.0  # end points farther off than this are mixed pixels or the next wall's
+_TRIM_SIGMAS = 3.0  # end points with a larger distance are mixed pixels or on the next wall
 # Columns of a fit.
 _R, _ALPHA, _RR, _RA, _AA, _CHI2, _BOW, _BOW_SIGMA, _LOW, _HIGH = range(10)
 
@@ -89,9 +87,9 @@ class LineConfig(Config):
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """Segments of a scan, robot frame.
+    """Line segments of a scan, robot frame.
 
-    z (K, 2) as (r, alpha), r >= 0, covariances (K, 2, 2), end points (K, 2, 2).
+    z (K, 2) as (r, alpha), r >= 0; covariances (K, 2, 2); ends (K, 2, 2), m.
     """
 
     z: Array
@@ -102,17 +100,17 @@ class Lines:
         return len(self.z)
 
     def select(self, which: NDArray[np.int64]) -> 'Lines':
-        """Those at some indices (M,)."""
+        """The lines at some indices (M,)."""
         return Lines(self.z[which], self.covariances[which], self.ends[which])
 
 
 def no_lines() -> Lines:
-    """What an empty scan shows."""
+    """Lines of an empty scan: none."""
     return Lines(np.empty((0, 2)), np.empty((0, 2, 2)), np.empty((0, 2, 2)))
 
 
 def extract_lines(scan: Scan, config: LineConfig) -> Lines:
-    """Segments of a scan, in the robot frame, in the order of the beams."""
+    """Extract the line segments of a scan, robot frame, in the order of the beams."""
     beams = np.flatnonzero(scan.hit & (scan.ranges_m < config.max_range_m))
     if beams.size < config.min_points:
         return no_lines()
@@ -132,10 +130,7 @@ def extract_lines(scan: Scan, config: LineConfig) -> Lines:
 
 
 def _in_robot_frame(fits: Array, T_base_laser: Array) -> Lines:
-    """Lines of the laser frame seen from the robot.
-
-    Turned by the mount, r longer by the mount's part along n.
-    """
+    """Transform fitted lines from the laser frame to the robot frame."""
     r = fits[:, _R]
     alpha = fits[:, _ALPHA]
     normals = np.column_stack([np.cos(alpha), np.sin(alpha)])
@@ -169,9 +164,9 @@ def _extract(
     sigmas: Array,
     fewest: int,
 ) -> tuple[Array, int]:
-    """Fits of all segments in the first rows, and how many these are.
+    """Fits (N, 10) of all segments, in the first rows, and their number.
 
-    sigmas: range noise m, bearing noise rad, split distance m.
+    sigmas (3,): range noise m, bearing noise rad, split distance m.
     """
     fits = np.empty((ranges.size, 10))
     fit = np.empty(10)
@@ -208,7 +203,7 @@ def _extract(
 def _apart(
     x: Array, y: Array, ranges: Array, beams: NDArray[np.int64], step: float, sigma: float, i: int
 ) -> bool:
-    """Whether point i lies too far from the point before it to be on the same wall."""
+    """Whether point i is too far from point i - 1 to be on the same wall."""
     turn = (beams[i] - beams[i - 1]) * step
     if beams[i] - beams[i - 1] > 1 + _MOST_MISSING or turn >= 0.9 * _FLATTEST_RAD:
         return True
@@ -229,9 +224,9 @@ def _split(
     parts: NDArray[np.int64],
     stack: NDArray[np.int64],
 ) -> int:
-    """Break a run [first, end) of points into parts that stay near their chords.
+    """Split a run [first, end) of points into parts that are near their chords.
 
-    Returns how many.
+    Returns the number of parts.
     """
     count = 0
     depth = 1
@@ -276,7 +271,7 @@ def _fit_trimmed(
     fewest: int,
     fit: Array,
 ) -> tuple[int, int]:
-    """Fit points [a, b) without end points that the line does not explain; returns what is left."""
+    """Fit points [a, b) without end points that are outliers; returns the remaining [a, b)."""
     for _ in range(4):
         _fit(x, y, ranges, angles, a, b, sigmas, fit)
         start = a
@@ -292,7 +287,7 @@ def _fit_trimmed(
 
 @kernel
 def _variance(rho: float, off: float, sigmas: Array) -> float:
-    """Variance of a point across a line whose normal it sees at an angle off."""
+    """Variance of a point across a line, at an angle `off` between its beam and the normal."""
     across = sigmas[0] * math.cos(off)
     along = sigmas[1] * rho * math.sin(off)
     return float(across * across + along * along + 1e-8)
@@ -311,11 +306,10 @@ def _off(
 def _fit(
     x: Array, y: Array, ranges: Array, angles: Array, a: int, b: int, sigmas: Array, fit: Array
 ) -> None:
-    """Weighted total least squares through points [a, b), its covariance, and how well it fits.
+    """Weighted total least squares through points [a, b), with covariance, chi2 and bow.
 
-    The covariance is (J' W J)^-1, J the derivative of each point's distance by (r, alpha): the
-    normal equations of the fit itself. The bow is the parabola across the line that the distances
-    still contain.
+    The covariance is (J' W J)^-1, with J the derivative of each point's distance with respect to
+    (r, alpha). The bow is the parabolic component of the residuals.
     """
     chord = math.atan2(y[b - 1] - y[a], x[b - 1] - x[a])
     alpha = chord - 0.5 * math.pi
@@ -366,8 +360,8 @@ def _fit(
         low = min(low, t)
         high = max(high, t)
     spread = max(spread, 1e-12)
-    # The mean's offset and the direction are independent; turning about the mean shifts r by foot
-    # times the turn.
+    # The errors of the mean and of the direction are independent. A rotation about the mean changes
+    # r by foot times the angle.
     fit[_R] = r
     fit[_ALPHA] = alpha
     fit[_AA] = 1.0 / spread
@@ -392,7 +386,7 @@ def _bow(
     middle: float,
     spread: float,
 ) -> tuple[float, float]:
-    """Rise of the bow that the points make over half the line's length, and its sigma.
+    """Rise of the parabola of the residuals over half of the line, m, and its sigma.
 
     middle, spread: mean and variance of the positions t along the line.
     """

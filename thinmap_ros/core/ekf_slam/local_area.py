@@ -1,7 +1,7 @@
-"""Topological information: which features matter where the robot is.
+"""Local area: selection of the features near the robot by the topological map.
 
-Features are stored at the nodes near which they were seen. The local area of a robot are the
-features of its node and of the nodes that edges join to it, but for those that it cannot see.
+Features are stored at the nodes near which they were observed. The local area consists of the
+features at the robot's node and at the nodes connected to it, except those out of view.
 Source: EKF-SLAM/TI paper section 4, Fig. 6-8.
 """
 
@@ -17,23 +17,23 @@ from thinmap_ros.core.se2 import Array, wrap
 from thinmap_ros.core.snapshot import MAX_COORDINATE_M, MAX_ID, Field
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 
-_LISTED_M = 12.0  # nodes are noted up to here, unless none is near
-_AS_NEAR_M = 1.0  # nodes farther than the nearest by no more than this are about as near
-_REACH_M = 8.0  # nodes along edges matter up to here, and the first one of every edge
-_BESIDE_M = 2.0  # what lies this near is not behind the robot
-_TURN_M_RAD = 0.5  # way that the robot could have gone while it turns by a radian
+_LISTED_M = 12.0  # radius in which nodes are listed, unless none is near
+_AS_NEAR_M = 1.0  # tolerance within which nodes are as near as the nearest
+_REACH_M = 8.0  # largest path length to a node, except to the first one on each edge
+_BESIDE_M = 2.0  # nodes nearer than this are never behind the robot
+_TURN_M_RAD = 0.5  # distance that costs as much as a rotation by a radian
 FIELDS = {
     'stored_at': Field(np.int64, ('s', 2), 1, MAX_ID),
     'node_ids': Field(np.int64, ('a',), 1, MAX_ID),
     'node_places': Field(np.float64, ('a', 2), -MAX_COORDINATE_M, MAX_COORDINATE_M),
 }
-_TRAIL_M = 3.0  # where no topology is known, the robot's own way is one, with nodes this far apart
+_TRAIL_M = 3.0  # distance between nodes along the robot's path, until a topology is set
 
 
 class LocalArea:
-    """Features by the topological nodes near which they were seen.
+    """Features by the topological nodes near which they were observed.
 
-    Until `set_topology` has given it nodes, nodes are laid along the robot's way.
+    Until `set_topology` is called with nodes, nodes are placed along the robot's path.
     """
 
     def __init__(self) -> None:
@@ -41,21 +41,19 @@ class LocalArea:
         self._trail: _Trail | None = _Trail(self._topology)
         self._features_at: dict[int, set[int]] = {}
         self._nodes_of: dict[int, set[int]] = {}
-        # Ids and places of the nodes that could be nearest,
-        # as they were when the robot was at a place (2,).
+        # Ids and positions of the nodes that could be nearest, and the position (2,) of the robot
+        # when they were listed.
         self._ids: list[int] = []
         self._places: Array = np.empty((0, 2))
         self._listed_at: Array = np.full(2, np.inf)
-        # Where the nodes with features were when they were last listed, and the map of then.
+        # Positions of the nodes with features when they were last listed, and their map.
         self._place_of: dict[int, Array] = {}
         self._listed: TopologicalMap | None = None
 
     def set_topology(self, topology: TopologicalMap) -> None:
-        """Take the topological map in use from now on.
+        """Set the topological map: a newer version of the same map, or the same object, changed.
 
-        It is a newer state of the same map, or the map itself, changed.
-
-        Either way features at nodes that are no more are handed on when nodes are listed next.
+        Features at removed nodes move to other nodes when nodes are next listed.
         """
         if not topology.nodes:
             return
@@ -69,7 +67,7 @@ class LocalArea:
             self._listed_at = np.full(2, np.inf)
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """Features by node (K, 2) as (feature, node), and these nodes with their places."""
+        """Stored features (K, 2) as (feature, node), and the ids and positions of the nodes."""
         nodes = self._topology.nodes
         stored = [(f, n) for f, at in self._nodes_of.items() for n in sorted(at) if n in nodes]
         ids = sorted({n for _, n in stored})
@@ -80,9 +78,9 @@ class LocalArea:
         }
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Take up the `state` of another area; once a topology is set, it replaces these nodes.
+        """Restore a saved `state`; its nodes are used until a topology is set.
 
-        state: checked by FIELDS. Raises InputError where features are stored at unknown nodes.
+        state: checked by FIELDS. Raises InputError if features are stored at unknown nodes.
         """
         snapshot.require_unique(state['node_ids'], 'features: node')
         used = state['stored_at'][:, 1]
@@ -108,7 +106,7 @@ class LocalArea:
         return sorted(self._nodes_of.get(feature_id, ()))
 
     def store(self, T_map_base: Array, feature_ids: list[int]) -> None:
-        """Store features that were seen from a pose (3,) at its node."""
+        """Store features that were observed from a pose (3,) at its nearest node."""
         if self._trail is not None and self._trail.follow(T_map_base):
             self._list_nodes(T_map_base)
         node = self._node_at(T_map_base)
@@ -117,10 +115,7 @@ class LocalArea:
                 self._put(feature_id, node)
 
     def remove(self, feature_id: int, heir: int | None = None) -> None:
-        """Drop a feature everywhere.
-
-        Where it has become another one, heir, that is stored in its place.
-        """
+        """Remove a feature; if it was merged into another one, heir, store that instead."""
         for node_id in self._nodes_of.pop(feature_id, set()):
             self._features_at[node_id].discard(feature_id)
             if heir is not None:
@@ -129,7 +124,7 @@ class LocalArea:
     def features_near(self, T_map_base: Array, half_view_rad: float) -> set[int]:
         """Features of the local area at a pose (3,).
 
-        half_view_rad: how far to either side the laser sees.
+        half_view_rad: half of the laser's field of view.
         """
         here = self._node_at(T_map_base)
         if here is None:
@@ -142,26 +137,24 @@ class LocalArea:
         return found
 
     def _along_edges(self, here: int) -> list[int]:
-        """Nodes that edges join to one, and those farther on within reach along edges."""
-        ways = {here: 0.0}
+        """Nodes connected to a node: its neighbours, and others within reach along edges."""
+        lengths = {here: 0.0}
         open_ids = [here]
         while open_ids:
-            node_id = min(open_ids, key=ways.__getitem__)
+            node_id = min(open_ids, key=lengths.__getitem__)
             open_ids.remove(node_id)
             for edge in self._topology.edges_at(node_id):
-                way = ways[node_id] + edge.length_m
-                if node_id != here and way > _REACH_M:
+                length = lengths[node_id] + edge.length_m
+                if node_id != here and length > _REACH_M:
                     continue
-                if edge.other(node_id) not in ways:
-                    open_ids.append(edge.other(node_id))
-                ways[edge.other(node_id)] = min(way, ways.get(edge.other(node_id), way))
-        return [i for i in ways if i != here]
+                other = edge.other(node_id)
+                if other not in lengths:
+                    open_ids.append(other)
+                lengths[other] = min(length, lengths.get(other, length))
+        return [i for i in lengths if i != here]
 
     def _node_at(self, T_map_base: Array) -> int | None:
-        """The nearest node.
-
-        Of those about as near, the one that the robot reaches sooner as it is headed.
-        """
+        """Nearest node; among nodes about as near, the one with the smallest bearing."""
         if math.dist(T_map_base[:2], self._listed_at) > _AS_NEAR_M:
             self._list_nodes(T_map_base)
         distances = np.hypot(*(self._places - T_map_base[:2]).T)
@@ -178,15 +171,15 @@ class LocalArea:
         return best
 
     def _list_nodes(self, T_map_base: Array) -> None:
-        """Note the nodes around anew.
+        """List the nodes near a pose (3,).
 
-        Once a metre, and only as far as it takes, whatever the size of the building.
+        Called once per metre; its time does not depend on the size of the map if nodes are near.
         """
         topology = self._topology
         (x, y) = T_map_base[:2].tolist()
         near = topology.nodes_near(x, y, _LISTED_M)
-        # After the next metre the nearest node may be one more away, and those about as near
-        # another one.
+        # After the next metre the nearest node may be a metre farther away, and nodes about as near
+        # another metre.
         nearest = min((math.hypot(n.x - x, n.y - y) for n in near), default=math.inf)
         sure = nearest + 2.0 * _AS_NEAR_M + _AS_NEAR_M
         if sure > _LISTED_M:
@@ -200,16 +193,16 @@ class LocalArea:
         self._hand_over(sorted(gone))
 
     def _note_places(self, nodes: list[Node]) -> None:
-        """Note where nodes with features are.
+        """Store the positions of nodes with features.
 
-        Of a map that is changed in place, those far off stay where they were.
+        In a map that is changed in place, distant nodes do not move.
         """
         self._place_of.update(
             (node.id, node.position) for node in nodes if node.id in self._features_at
         )
 
     def _hand_over(self, gone: list[int]) -> None:
-        """Features of nodes that are no more go to the nodes nearest to where those were."""
+        """Move the features of removed nodes to the nodes nearest to their former positions."""
         features = {node_id: self._features_at.pop(node_id) for node_id in gone}
         for node_id, left in features.items():
             for feature_id in left:
@@ -229,10 +222,7 @@ class LocalArea:
 
 
 class _Trail:
-    """Nodes along the robot's way, in a map that is given.
-
-    Coming back to one, the robot is there again.
-    """
+    """Places nodes along the robot's path in a topological map; returning to one reuses it."""
 
     def __init__(self, topology: TopologicalMap) -> None:
         self._map = topology
@@ -240,7 +230,7 @@ class _Trail:
         self._next_id = 1
 
     def follow(self, T_map_base: Array) -> bool:
-        """Take in where the robot is now, (3,); whether nodes or edges came of it."""
+        """Update by the robot's pose (3,); returns whether nodes or edges were added."""
         x = float(T_map_base[0])
         y = float(T_map_base[1])
         node = self._map.nearest_node(x, y)
@@ -262,7 +252,7 @@ class _Trail:
 
 
 def _from_robot(T_map_base: Array, place: Array) -> tuple[float, float]:
-    """Bearing (rad, robot frame) and distance of a place (2,)."""
+    """Bearing (rad, robot frame) and distance (m) of a position (2,), map frame."""
     dx = float(place[0] - T_map_base[0])
     dy = float(place[1] - T_map_base[1])
     return wrap(math.atan2(dy, dx) - float(T_map_base[2])), math.hypot(dx, dy)

@@ -1,4 +1,4 @@
-"""Motion of a differential drive and observation of a line, with their Jacobians."""
+"""Motion model of a differential drive and observation model of a line, with Jacobians."""
 
 import math
 from dataclasses import dataclass
@@ -38,20 +38,20 @@ class OdometryConfig(Config):
 
 
 def odometry_slip(config: OdometryConfig) -> Array:
-    """Error (3,), 1 sigma, of any odometry increment."""
+    """Smallest error (3,), 1 sigma, of an odometry increment."""
     return np.array([config.noise_floor_m, config.noise_floor_m, config.noise_floor_rad])
 
 
 def odometry_variances(increment: Array, config: OdometryConfig) -> Array:
     """Variances (3,) of an odometry increment (3,), in the robot frame before the motion."""
-    way_m = math.hypot(increment[0], increment[1])
+    length_m = math.hypot(increment[0], increment[1])
     turn = abs(float(increment[2]))
-    sigmas = odometry_slip(config) + config.noise_ratio * np.array([way_m, way_m, turn])
+    sigmas = odometry_slip(config) + config.noise_ratio * np.array([length_m, length_m, turn])
     return np.square(sigmas)
 
 
 def rotation(theta: float) -> Array:
-    """(3, 3): turns increments, and by R C R' covariances, from the robot frame to theta's."""
+    """Matrix R (3, 3) that rotates increments by theta, and covariances C by R C R'."""
     c = math.cos(theta)
     s = math.sin(theta)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -69,13 +69,14 @@ def motion_jacobians(T_map_base: Array, increment: Array) -> tuple[Array, Array]
 
 
 def observe_line(T_map_base: Array, line: Array) -> tuple[Array, Array, Array]:
-    """A map line (r, alpha) as the robot sees it.
+    """Predicted observation (2,) of a map line (r, alpha), robot frame.
 
-    Prediction (2,), Jacobians by pose (2, 3) and by line (2, 2).
+    Also returns its Jacobians w.r.t. the pose (2, 3) and the line (2, 2).
 
-    Source: EKF-SLAM/TI paper eq. (3), lost in the text; with x cos(alpha) + y sin(alpha) = r it is
+    Source: EKF-SLAM/TI paper eq. (3), which is illegible in the text. For a line
+    x cos(alpha) + y sin(alpha) = r it is
     r^R = r - (x cos(alpha) + y sin(alpha)), alpha^R = alpha - theta,
-    and where r^R < 0: -r^R, alpha^R + pi.
+    and if r^R < 0: -r^R, alpha^R + pi.
     """
     x, y, theta = (float(v) for v in T_map_base)
     r = float(line[0])
@@ -95,11 +96,11 @@ def observe_line(T_map_base: Array, line: Array) -> tuple[Array, Array, Array]:
 
 
 def place_line(T_map_base: Array, seen: Array) -> tuple[Array, Array, Array]:
-    """A line (r, alpha) seen by the robot, in the map.
+    """Line (2,), map frame, of an observed line (r, alpha), robot frame.
 
-    Line (2,), Jacobians by pose (2, 3) and by what was seen (2, 2).
+    Also returns its Jacobians w.r.t. the pose (2, 3) and the observation (2, 2).
 
-    The inverse of `observe_line`; r >= 0 in the map as well.
+    The inverse of `observe_line`; r >= 0 in the map, too.
     """
     x, y, theta = (float(v) for v in T_map_base)
     alpha = float(seen[1]) + theta

@@ -1,4 +1,4 @@
-"""Features that should be seen and are not: a door that has opened, a box that was carried off."""
+"""Detection of removed features, such as an opened door, by beams that pass through them."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,20 +7,20 @@ from thinmap_ros.core.ekf_slam.features import FeatureTrack, normals_of, tangent
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array, compose
 
-_BEYOND_M = 0.3  # a beam that ends this far behind a wall went through where the wall should be
-_END_M = 0.15  # nothing is expected of the ends of a feature
+_BEYOND_M = 0.3  # a beam that ends this far behind a feature has passed through it
+_END_M = 0.15  # margin at the ends of a feature where beams are ignored
 _FEWEST_BEAMS = 8
-_SHARE = 0.7  # of the beams that come as far as the feature
-_FLATTEST = 0.17  # least sine of the angle between beam and wall
+_SHARE = 0.7  # smallest share of passing beams among those that reach the feature
+_FLATTEST = 0.17  # smallest sine of the angle between beam and wall
 
 
 def seen_through(
     scan: Scan, T_map_base: Array, lines: Array, features: list[FeatureTrack]
 ) -> NDArray[np.bool_]:
-    """For each feature with its line (N, 2), whether the scan shows that it is gone, (N,).
+    """Whether the scan passes through each feature with its line (N, 2), map frame; (N,).
 
-    Most of the beams that should have met it, and enough of them, end well behind it. Beams that
-    return nothing tell nothing: glass and black walls do that as well.
+    Most of the beams that should hit the feature, and enough of them, end well behind it. Beams
+    without return are ignored: glass and black walls cause them, too.
     """
     if not features:
         return np.zeros(0, dtype=np.bool_)
