@@ -1,4 +1,4 @@
-"""EKF-SLAM written out with whole matrices, slow and plain, to hold the fast filters against."""
+"""Reference EKF-SLAM with dense matrices, to test the fast filters."""
 
 import math
 
@@ -9,7 +9,7 @@ from thinmap_ros.core.se2 import compose, wrap
 
 
 class DenseFilter:
-    """x (3 + 2 N,), P: pose and lines; each step is the textbook's formula over the whole state."""
+    """State x (3 + 2 N,) and P: pose and lines; textbook formulas over the whole state."""
 
     def __init__(self, pose, covariance):
         self.x = np.array(pose, dtype=float)

@@ -1,4 +1,4 @@
-"""Which line is which feature, and what becomes a feature at all."""
+"""Data association of lines and features, and the creation of features."""
 
 import math
 
@@ -31,7 +31,7 @@ def seen_lines(*walls):
 
 
 def known(walls, pose=(0.0, 0.0, 0.0), P=SURE):
-    """A filter that knows some walls, and the features beside it."""
+    """A filter with some walls as features, and their tracks."""
     lines = seen_lines(*walls)
     ekf = CompressedEkf(np.array(pose), P)
     features = FeatureMap(
@@ -82,7 +82,7 @@ def test_pieces_of_a_wall_beside_a_door_are_one_feature():
 
 
 def test_a_short_piece_of_wall_tells_its_direction_by_its_length():
-    """4 m of a wall seen 20 mrad askew turn the pose more than twice as much as 0.5 m do."""
+    """4 m of a wall, observed at 20 mrad, rotate the pose over twice as much as 0.5 m."""
     turned = []
     for length_m in (0.5, 4.0):
         ekf, features = known([[[2.0, -4.0], [2.0, 4.0]]])
@@ -103,7 +103,7 @@ def test_a_line_fits_only_where_the_gate_says_so():
 
 
 def test_what_could_be_two_walls_is_decided_when_the_others_have_corrected_the_pose():
-    """A cupboard 12 cm before a wall: taken by itself, the line fits the wrong one better."""
+    """A cupboard 12 cm in front of a wall: alone, its line is nearer to the wrong feature."""
     wall = [[2.12, -1.0], [2.12, 1.0]]
     cupboard = [[2.0, -1.0], [2.0, 1.0]]
     behind = [[-3.0, -1.0], [-3.0, 1.0]]
@@ -174,7 +174,7 @@ def test_two_features_that_turn_out_to_be_one_wall_merge():
 
 @pytest.mark.parametrize('local_areas', [False, True])
 def test_a_drive_through_a_room_finds_its_walls_once(rng, local_areas):
-    """All features are walls, and no wall is there twice."""
+    """All features are walls, without duplicates."""
     truths = [truth for truth, _ in drive(500, rng, np.array([2.0, 2.0, 0.0]))][::3]
     ekf = CompressedEkf(truths[0], SURE)
     features = FeatureMap(FeatureConfig(), AssociationConfig(max_gap_m=0.3), local_areas)
@@ -185,7 +185,7 @@ def test_a_drive_through_a_room_finds_its_walls_once(rng, local_areas):
     walls = [wall_of(feature) for feature in features.line_features(ekf)]
     assert -1 not in walls
     assert len(walls) >= 7
-    inner = (4, 5)  # these have two faces
+    inner = (4, 5)  # walls with two faces
     assert all(walls.count(w) <= (2 if w in inner else 1) for w in walls)
 
 

@@ -1,4 +1,4 @@
-"""Consistency: pose errors are as large as the filter says, step by step, over many runs."""
+"""Consistency: pose errors match the filter's covariance over many runs (NEES)."""
 
 import math
 
@@ -15,7 +15,7 @@ from thinmap_ros.core.ekf_slam.line_extraction import Lines
 from thinmap_ros.core.ekf_slam.models import observe_line
 
 FEATURES = FeatureConfig()
-# What wheels leave open after scan matching: of a step ahead, and of one of a turn.
+# Noise of a step forward and of a rotation.
 AHEAD = np.diag(np.square([0.011, 0.003, 0.006]))
 TURN = np.diag(np.square([0.002, 0.002, 0.017]))
 SEEN = np.diag([0.01**2, 0.005**2])
@@ -41,9 +41,9 @@ TRUE_LINES = np.column_stack(
 
 
 def look(rng, truth):
-    """Noisy lines of the walls whose middle is in range and ahead."""
+    """Noisy lines of the walls whose centre is in range and ahead."""
     middles = WALLS.mean(axis=1)
-    # Of long walls, the part beside the robot.
+    # The part of long walls near the robot.
     middles[:2, 0] = truth[0]
     off = se2.transform_points(se2.invert(truth), middles)
     seen = np.flatnonzero((np.hypot(*off.T) < RANGE_M) & (off[:, 0] > -0.5))
@@ -59,7 +59,7 @@ def look(rng, truth):
 
 
 def nees_of_a_run(seed, local_areas, looks):
-    """Squared error of the pose, in sigmas, at each look of a drive up and down the corridor."""
+    """NEES of the pose at each observation of a drive up and down the corridor."""
     rng = np.random.default_rng(seed)
     truth = np.array([2.0, 5.0, 0.0])
     ekf = CompressedEkf(truth, 1e-8 * np.eye(3))

@@ -1,4 +1,4 @@
-"""The conventional filter: the same numbers as the textbook's formulas, and always a covariance."""
+"""The conventional filter: equal to the textbook formulas, with a valid covariance."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def both(rng, features):
 
 
 def look(rng, filter_, indices):
-    """Noisy observations of some features, as the filter expects them."""
+    """Observations of some features: predictions with noise."""
     expected = np.array([observe_line(filter_.pose, filter_.lines[i])[0] for i in indices]).reshape(
         -1, 2
     )
@@ -91,7 +91,7 @@ def test_more_looks_make_no_line_less_sure(rng):
 
 
 def test_one_wall_in_two_forms_is_tied_to_itself():
-    """A wall through the origin may be noted as (r, alpha) or as (-r, alpha + pi)."""
+    """A wall through the origin may be represented as (r, alpha) or (-r, alpha + pi)."""
     pose = np.array([1.0, 0.0, 0.0])
     fast = EkfSlam(pose, P0)
     plain = DenseFilter(pose, P0)

@@ -1,4 +1,4 @@
-"""The paper's filter alone behind the interface of a localizer: odometry and line features."""
+"""EKF-SLAM with the interface of a localizer: odometry and line features."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def at_start(slam='ekf_ti', **options):
 
 
 def driven(localizer, steps):
-    """Errors (N, 3) of a drive through the room on worn wheels, and the last estimate."""
+    """Errors (N, 3) of a drive with systematic odometry errors, and the last estimate."""
     rng = np.random.default_rng(3)
     errors = []
     estimate = None

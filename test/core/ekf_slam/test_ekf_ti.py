@@ -1,4 +1,4 @@
-"""EKF-SLAM/TI against the conventional filter: same associations, same estimate to rounding."""
+"""EKF-SLAM/TI against the conventional filter: the same estimate up to rounding errors."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ R = np.array([[4e-4, 1e-5], [1e-5, 1e-4]])
 
 
 class Pair:
-    """Both filters, driven alike; features by id."""
+    """Both filters with the same input; features by id."""
 
     def __init__(self, reference):
         self.whole = reference
@@ -68,7 +68,7 @@ def new_line(rng):
 
 
 def run(pair, rng, steps, area_every, change):
-    """A robot goes from area to area and sees what is there, at times something new or gone."""
+    """A robot drives through several areas; features are observed, added and removed."""
     for _ in range(20):
         pair.add(new_line(rng))
     for step in range(steps):
@@ -100,7 +100,7 @@ def test_the_same_estimate_as_the_full_filter_over_a_thousand_steps(rng, area_ev
 
 
 def test_more_features_than_a_chunk_of_the_store(rng):
-    """Sweeps over several areas under way at once, and a store that grows under them."""
+    """Pending sweeps of several areas, while the store grows."""
     pair = Pair(EkfSlam(np.array([1.0, -2.0, 0.4]), P0))
     for _ in range(200):
         pair.add(new_line(rng))
@@ -125,7 +125,7 @@ def test_a_pose_set_anew_is_set_for_all_features(rng):
 
 
 def test_what_is_told_of_features_outside_the_area(rng):
-    """Lines and covariances of the others are those at the time when the area was entered."""
+    """Lines and covariances outside the area are those of the time when it was set."""
     pair = Pair(EkfSlam(np.array([1.0, -2.0, 0.4]), P0))
     run(pair, rng, 60, 10, 30)
     ids = pair.local.ids
@@ -140,7 +140,7 @@ def test_what_is_told_of_features_outside_the_area(rng):
 
 
 def test_steps_touch_the_local_area_only(rng):
-    """The stepped filter holds pose, area and as many numbers again, whatever the map holds."""
+    """The local filter has a state of pose, area and as many carried numbers, for any map size."""
     pair = Pair(EkfSlam(np.array([1.0, -2.0, 0.4]), P0))
     for _ in range(300):
         pair.add(new_line(rng))
@@ -153,7 +153,7 @@ def test_steps_touch_the_local_area_only(rng):
     not STATUS.exists(), reason='says what a process holds only where there is a /proc'
 )
 def test_some_hundred_features_take_little_memory(rng):
-    """Their covariance is 2 MB; the store has room for far more, which must not count."""
+    """Their covariance is 2 MB; the reserved memory of the store must not be used."""
     before = held_mb()
     ekf = CompressedEkf(np.array([1.0, -2.0, 0.4]), P0)
     for feature_id in range(250):
@@ -163,7 +163,7 @@ def test_some_hundred_features_take_little_memory(rng):
 
 
 def held_mb():
-    """What this process has written to, MB."""
+    """Private memory of this process, MB."""
     return next(
         int(line.split()[1]) / 1e3 for line in STATUS.read_text().splitlines() if 'RssAnon' in line
     )

@@ -1,4 +1,4 @@
-"""Lines of a scan: where the walls are, how sure, and none where there is no wall."""
+"""Line extraction: accuracy, covariance, and no false lines."""
 
 import math
 
@@ -65,7 +65,7 @@ def test_the_covariance_is_what_many_scans_show(rng, mount):
     found = []
     claimed = []
     for _ in range(400):
-        # Bearing noise moves the range on the wall at hand: rho = d / cos(phi - alpha).
+        # Bearing noise changes the range on this wall: rho = d / cos(phi - alpha).
         off = exact.angles_rad[hit] + normal
         measured = (
             exact.ranges_m[hit] * np.cos(off) / np.cos(off + rng.normal(0.0, 0.002, off.size))
@@ -87,7 +87,7 @@ def test_the_covariance_is_what_many_scans_show(rng, mount):
 
 
 def test_trimming_ends_where_too_few_points_are_left():
-    """Points that are all far from any one line: each trim takes one off an end."""
+    """Points far from any common line: each iteration trims an end point."""
     count = 12
     x = np.linspace(-1.0, 1.0, count)
     y = 2.0 + np.where(np.arange(count) % 2, 0.5, -0.5)

@@ -1,4 +1,4 @@
-"""Which features are local: stored at nodes, those at the robot's node and ahead of it."""
+"""Local area: features stored at the robot's node and at nodes ahead."""
 
 import math
 from itertools import pairwise
@@ -23,7 +23,7 @@ def corridor(*xs):
 
 
 def stored(area, *xs):
-    """Feature 10 i seen at the i-th place, counted from 1."""
+    """Feature 10 i, observed at the i-th position, i from 1."""
     for i, x in enumerate(xs):
         area.store(np.array([x, 0.0, 0.0]), [10 * (i + 1)])
 
@@ -84,7 +84,7 @@ def test_without_a_topology_the_robot_s_own_way_is_one():
     places = sorted(0.05 * i - 0.5 for i in near)
     assert 8.0 <= places[0] <= 11.0
     assert 12.0 <= places[-1] <= 10.0 + 11.0
-    # Known topology takes over what the trail's nodes held.
+    # A topology adopts the features of the path's nodes.
     area.set_topology(corridor(0.0, 10.0, 20.0))
     assert area.features_near(np.array([10.0, 0.0, 0.0]), math.pi) == {
         10 * (i + 1) for i in range(len(xs))

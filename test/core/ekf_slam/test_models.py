@@ -1,6 +1,6 @@
-"""Motion and observation: known answers and Jacobians.
+"""Motion and observation models: known results and Jacobians.
 
-Every Jacobian is held against numeric differences of functions written anew.
+Every Jacobian is compared with numeric differences of independent implementations.
 """
 
 import cmath
@@ -25,7 +25,7 @@ increments = st.tuples(*[st.floats(-1.0, 1.0)] * 2, st.floats(-1.0, 1.0)).map(np
 
 
 def numeric(function, x, angles):
-    """Central differences; the listed outputs are angles."""
+    """Central differences; `angles` lists the outputs that are angles."""
     columns = []
     for i in range(len(x)):
         step = np.zeros(len(x))
@@ -44,7 +44,7 @@ def moved(pose, increment):
 
 
 def seen(pose, line):
-    """Foot of the perpendicular from the robot on the line, in the robot's frame, in polar form."""
+    """Foot of the perpendicular from the robot to the line, robot frame, polar coordinates."""
     on_line = line[0] * cmath.exp(1j * line[1])
     normal = cmath.exp(1j * line[1])
     robot = complex(pose[0], pose[1])
@@ -63,7 +63,7 @@ def test_motion_jacobians(pose, increment):
 @given(poses, lines)
 def test_observation_and_its_jacobians(pose, line):
     expected, by_pose, by_line = observe_line(pose, line)
-    if expected[0] < 0.01:  # seen from on the line itself the direction of the foot is undefined
+    if expected[0] < 0.01:  # on the line itself the direction of the foot is undefined
         return
     reference = seen(pose, line)
     assert expected[0] == pytest.approx(reference[0], abs=1e-9)

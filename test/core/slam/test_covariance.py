@@ -1,4 +1,4 @@
-"""How uncertain the pose is: what a robot that was put somewhere else adds to a step."""
+"""Pose uncertainty: covariance of a step during which the pose was set."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""The scan localizer in a simulated room, and what it does with input that is wrong."""
+"""The localizer in a simulated room, and with invalid input."""
 
 from copy import deepcopy
 from dataclasses import replace
@@ -25,7 +25,7 @@ from thinmap_ros.sim.world import World
 START = np.array([2.0, 2.0, 0.0])
 AT_START = {'initial_x_m': 2.0, 'initial_y_m': 2.0}
 PERIOD_NS = 200_000_000
-# A place that looks like no part of the room.
+# A scan that is unlike any part of the room.
 ELSEWHERE = np.array(
     [
         [0.0, 0.0, 3.0, 0.6],
@@ -43,7 +43,7 @@ def at_start(**config):
 
 
 def driven(steps, seed=3, localizer=None, odometry=lambda odom: odom, **config):
-    """Truth, estimate and odometry at each scan of a drive, and the localizer."""
+    """True pose, estimate and odometry at each scan of a drive, and the localizer."""
     rng = np.random.default_rng(seed)
     localizer = localizer or at_start(**config)
     rows = []
@@ -62,7 +62,7 @@ def worst(rows):
 
 
 def on(localizer, steps, truth, odom, rng, segments=ROOM, turn=0.1):
-    """Further rows of a robot that turns and goes a little where it is."""
+    """More rows, of a robot that turns and moves a little near its position."""
     rows = []
     for _ in range(steps):
         step = se2.pose(0.02, 0.0, turn)
@@ -100,7 +100,7 @@ def test_the_whole_path_is_told_afterwards(whole_drive):
     assert (np.diff(stamps) > 0).all()
     off = (past - truths[stamps // PERIOD_NS])[:, :2]
     assert np.hypot(*off.T).max() < 0.1
-    # The robot is back where it was: far fewer keyframes than the path would hold.
+    # The robot returns to mapped places: far fewer keyframes than the path length would give.
     assert 10 < len(localizer.keyframes) < len(stamps)
     for frame in localizer.keyframes:
         assert np.hypot(*(truths[:, :2] - frame.T_map_base[:2]).T).min() < 0.1
@@ -121,7 +121,7 @@ def test_a_pose_that_is_set_is_within_5_cm():
 
 
 def test_drives_are_as_true_as_their_first_scans():
-    """Whatever the noise was: on average over drives."""
+    """On average over drives with different noise."""
     rms = []
     for seed in range(6):
         rows, _ = driven(300, seed=seed)
@@ -135,7 +135,7 @@ def test_errors_are_within_the_covariance(whole_drive):
     off = np.array([se2.pose_difference(estimate.T_map_base, truth) for truth, estimate, _ in rows])
     sigmas = np.sqrt(np.array([np.diag(estimate.covariance) for _, estimate, _ in rows]))
     within = np.abs(off) <= 3.0 * sigmas + 1e-12
-    # From a path of a metre on: the first map is only as true as the first scans.
+    # After the first metre: the initial map is only as accurate as the first scans.
     assert within[40:].mean(axis=0).min() > 0.97
     assert (sigmas[40:, :2] < 0.5).all(), 'nor does it say that it could be anywhere'
 
@@ -193,7 +193,7 @@ def test_standing_still_adds_no_uncertainty(trembling):
 
 
 def straight(localizer, poses, rng, first=0):
-    """Estimates on the way through poses (N, 3), with a true odometry."""
+    """Estimates at poses (N, 3), with exact odometry."""
     return [
         localizer.step(scan_in(ROOM, T, rng, (first + k) * PERIOD_NS), T - START)
         for k, T in enumerate(poses)
@@ -215,7 +215,7 @@ def test_driving_adds_uncertainty_whichever_scans_were_lost(seed):
     localizer = at_start()
 
     def sigmas(metres, count):
-        """Deviations (3,) after so many scans at a place ahead, half of which get lost."""
+        """Errors (3,) after some scans at a pose ahead, half of which are dropped."""
         pose = START + [metres, 0.0, 0.0]
         for k in range(count):
             scan = scan_in(ROOM, pose, rng, k * PERIOD_NS)
@@ -301,14 +301,14 @@ def test_without_any_wall_the_odometry_is_followed():
     for _ in range(40):
         odom = se2.compose(odom, se2.pose(0.1, 0.0, 0.02))
         estimate = localizer.step(BLIND, odom)
-    # The first scan is where the robot starts.
+    # The first scan is at the initial pose.
     moved = se2.between(se2.pose(0.1, 0.0, 0.02), odom)
     np.testing.assert_allclose(estimate.T_map_base, se2.compose(START, moved), atol=1e-6)
     assert np.linalg.eigvalsh(estimate.covariance)[-1] > 1e-3
 
 
 def test_wheels_that_slip_are_caught_by_the_walls():
-    """Jumps of 0.3 m or 10 degrees in the odometry, now and then."""
+    """Occasional odometry discontinuities of 0.3 m or 10 degrees."""
     rng = np.random.default_rng(4)
     localizer = at_start()
     most = 0.0
@@ -337,7 +337,7 @@ def test_odometry_that_is_stuck_for_two_seconds_is_made_up_by_the_walls():
 
 
 def test_a_robot_that_turns_fast_is_not_lost():
-    """By 23 degrees from one scan to the next."""
+    """A rotation of 23 degrees between two scans."""
     rng = np.random.default_rng(0)
     localizer = at_start()
     for k in range(40):
@@ -349,7 +349,7 @@ def test_a_robot_that_turns_fast_is_not_lost():
 
 
 def test_beyond_a_hall_in_which_nothing_is_seen_the_map_goes_on(rng):
-    """Walls that come into range far off, some points at a time, are new."""
+    """Distant walls that come into range point by point do not contradict the map."""
     # Two rooms, each open towards the hall between them.
     hall = np.vstack([ROOM[[0, 2, 3]], np.delete(ROOM, 3, axis=0) + [18.0, 0.0, 18.0, 0.0]])
     localizer = at_start(initial_x_m=2.0, initial_y_m=7.0)
@@ -371,7 +371,7 @@ HALL[60:64, -12:] = 100
 
 
 def along(*corners):
-    """Points (K, 2) every 5 cm along straight lines from corner to corner, m."""
+    """Points (K, 2), m, every 5 cm along straight lines between corners."""
     legs = [
         np.linspace(a, b, int(np.hypot(*np.subtract(b, a)) / 0.05) + 1)
         for a, b in pairwise(corners)
@@ -382,7 +382,7 @@ def along(*corners):
 @pytest.mark.xfail(strict=True, reason='no return of any beam for 20 m: 1.3 m off beyond the hall')
 @pytest.mark.parametrize('seed', range(3))
 def test_a_hall_that_is_wider_than_the_laser_sees_is_mapped_all_the_same(seed):
-    """Across it by odometry alone, 25 m with bends, then along its walls back to where it began."""
+    """25 m with bends by odometry alone, then along the walls back to the start."""
     start = se2.pose(2.0, 2.0, np.pi / 2.0)
     world = World.from_patch('hall', GridPatch(GridFrame(-0.1, -0.1, 0.1), HALL), start)
     simulation = Simulation(world, start, RobotConfig(), LaserScannerConfig(), seed)
@@ -403,17 +403,17 @@ def test_a_hall_that_is_wider_than_the_laser_sees_is_mapped_all_the_same(seed):
         off.append(np.hypot(error[0], error[1]))
         turned.append(abs(error[2]) if sees else 0.0)
     assert blind > 200
-    # Beyond the hall its walls tell how the robot is turned.
+    # At the far side of the hall its walls measure the heading.
     assert max(turned[len(turned) // 3 :]) < 0.03
     assert lost < 30, 'walls that are new are a map to hold on to'
     assert np.mean(off[-20:]) < 0.5 * max(off), 'what was known before puts it right'
 
 
 def test_without_odometry_the_velocity_carries_on():
-    """Wheels that tell nothing, for the whole drive: a laser in the hand."""
+    """No odometry for the whole drive: a hand-held laser."""
     rows, _ = driven(400, odometry=np.zeros_like)
     assert not any(estimate.is_lost for _, estimate, _ in rows)
-    # Until the wheels are known for what they are the map begins to grow in the wrong place.
+    # Until the odometry noise has adapted, the map starts at a wrong place.
     assert worst(rows) < 0.5
     steps = np.array(
         [
@@ -425,7 +425,7 @@ def test_without_odometry_the_velocity_carries_on():
 
 
 def legs_round(at, i):
-    """Walls of three people who walk round a place."""
+    """Walls (N, 4) of three people who walk around a position."""
     legs = []
     for k in range(3):
         x, y = at + 1.5 * np.array([np.cos(0.05 * i + 2.0 * k), np.sin(0.05 * i + 2.0 * k)])
@@ -443,7 +443,7 @@ def from_walls(points):
 
 
 def walls_in(localizer):
-    """Middles (N, 2) of the cells that are walls, from the localizer's state."""
+    """Centres (N, 2) of the wall cells in the localizer's state."""
     state = localizer.state()
     tile, row, col = np.nonzero(
         state['hits']
@@ -465,7 +465,7 @@ def test_people_who_walk_through_do_not_become_walls():
     assert most < 0.1
     assert not estimate.is_lost
     walls = walls_in(localizer)
-    # Of some thousand hits on them, what nobody has looked through since.
+    # Of some thousand hits on them, those that no later beam has traversed.
     assert np.mean(from_walls(walls) > 0.2) < 0.15
 
 
@@ -482,14 +482,14 @@ def test_a_robot_that_is_carried_off_begins_a_new_map_and_says_so():
     assert carried[-1][1].inlier_ratio > 0.9, 'it fits the new map'
     assert carried[-1][1].covariance[0, 0] > 100.0
     assert len(localizer.keyframes) > before
-    # In the new map it goes on as ever.
+    # In the new submap it continues normally.
     steps = [se2.between(a[0], b[0]) for a, b in pairwise(carried[-20:])]
     found = [se2.between(a[1].T_map_base, b[1].T_map_base) for a, b in pairwise(carried[-20:])]
     np.testing.assert_allclose(found, steps, atol=0.06)
 
 
 def crowd(at, rng):
-    """The room, and people who crowd round a place, at other places in each scan."""
+    """The room, and a crowd around a position that moves between scans."""
     angles = rng.uniform(-np.pi, np.pi, 30)
     outward = np.column_stack([np.cos(angles), np.sin(angles)])
     middles = at + rng.uniform(0.6, 1.6, 30)[:, None] * outward
@@ -499,7 +499,7 @@ def crowd(at, rng):
 
 @pytest.mark.parametrize('seed', range(8))
 def test_a_crowd_does_not_move_a_robot_whose_wheels_know_better(seed):
-    """It is lost, and its new map lies where the wheels have led."""
+    """It is lost, and its new submap starts at the dead-reckoned pose."""
     rng = np.random.default_rng(seed)
     rows, localizer = driven(150, seed=seed)
     rows = on(localizer, 10, rows[-1][0], rows[-1][2], rng)
@@ -517,7 +517,7 @@ def test_a_crowd_does_not_move_a_robot_whose_wheels_know_better(seed):
 
 
 def test_a_robot_that_is_brought_back_knows_its_path():
-    """Old keyframes stay where they were."""
+    """Earlier keyframes do not move."""
     rng = np.random.default_rng(8)
     rows, localizer = driven(300)
     on(localizer, 60, np.array([1.0, 2.0, 0.5]), rows[-1][2], rng, ELSEWHERE)
@@ -574,7 +574,7 @@ def test_after_a_reset_everything_is_forgotten():
 
 
 def test_a_map_is_taken_over_by_another_localizer(whole_drive):
-    """A saved map: the robot is lost in it until it fits, then tracks."""
+    """In a saved map the robot is delocalized until scans fit, then it tracks."""
     _, first = whole_drive
     state = {name: array.copy() for name, array in first.state().items()}
     second = Localizer.from_state(state, LocalizerConfig(**AT_START))
@@ -620,7 +620,7 @@ def test_a_robot_that_is_not_where_a_given_map_says_stays_lost(whole_drive):
     rows = on(second, 20, np.array([1.0, 2.0, 0.5]), np.zeros(3), rng, ELSEWHERE, turn=0.3)
     assert all(estimate.is_lost for _, estimate, _ in rows)
     np.testing.assert_array_equal(second.state()['hits'], hits)
-    # Put where it is, it is not.
+    # After set_pose with the true pose it is not lost.
     second.set_pose(START, np.diag([0.01, 0.01, 0.01]))
     rows = on(second, 10, START, rows[-1][2], rng)
     assert not rows[-1][1].is_lost
@@ -643,7 +643,7 @@ def test_without_mapping_the_map_stays_as_it_is(whole_drive):
 
 @pytest.mark.parametrize('slip', [(0.0, 0.0), (0.3, 0.2)])
 def test_a_killed_localizer_goes_on_in_the_occupancy_map(slip):
-    """Killed for two metres; the wheels slip meanwhile."""
+    """Two metres without a localizer, while the wheels slip."""
     rng = np.random.default_rng(0)
     config = LocalizerConfig(**AT_START)
     localizer = Localizer(config)
@@ -689,7 +689,7 @@ def test_a_state_that_is_none_is_refused_in_words(whole_drive, name, value):
 
 
 def test_a_loop_that_is_closed_while_the_robot_slides_into_the_old_map_is_closed_well():
-    """Back at the start, the old walls take the robot over before the loop is closed."""
+    """At the start the pose slides onto the old walls before the loop is closed."""
     localizer = at_start(initial_x_m=3.0, initial_y_m=1.2)
     corrections = 0
     away = []
@@ -703,8 +703,8 @@ def test_a_loop_that_is_closed_while_the_robot_slides_into_the_old_map_is_closed
 
 @pytest.fixture(scope='module')
 def round_the_block():
-    """Truth, estimate and odometry at each scan, and the localizer."""
-    localizer = at_start(initial_x_m=3.15, initial_y_m=1.2)  # where the first scan is made
+    """True pose, estimate and odometry at each scan, and the localizer."""
+    localizer = at_start(initial_x_m=3.15, initial_y_m=1.2)  # pose of the first scan
     rows = []
     for scan, odom, truth in drive_round_the_block():
         rows.append((truth, localizer.step(scan, odom), odom))
@@ -713,7 +713,7 @@ def round_the_block():
 
 @pytest.mark.xfail(strict=True, reason='the far side of the ring keeps most of its error')
 def test_a_loop_is_closed_while_the_robot_drives(round_the_block):
-    """Round the block the map has drifted, as wheels wear; back where it began it is put right."""
+    """The map drifts round the block by systematic errors; the loop closure corrects it."""
     rows, localizer = round_the_block
     off = np.hypot(*errors_of(rows)[:, :2].T)
     closed = [k for k, (_, estimate, _) in enumerate(rows) if estimate.correction is not None]
@@ -727,14 +727,14 @@ def test_a_loop_is_closed_while_the_robot_drives(round_the_block):
 
 
 def test_the_map_is_rendered_again_the_nearest_part_first(round_the_block):
-    """As after a loop: where the robot is there is a map at once, and in the end all of it."""
+    """As after a loop closure: the map near the robot is rendered at once, the rest later."""
     rows, localizer = round_the_block
     localizer = deepcopy(localizer)
     walls = walls_in(localizer)
     near = np.hypot(*(walls - localizer.pose[:2]).T) < 6.0
 
     def known():
-        """Which of the walls that were there before are there again."""
+        """Which of the former walls are rendered again."""
         return localizer._map.map.distances(walls) < 0.1
 
     localizer.set_pose(localizer.pose, 1e-4 * np.eye(3))
@@ -747,7 +747,7 @@ def test_the_map_is_rendered_again_the_nearest_part_first(round_the_block):
 
 
 def test_the_heading_is_held_along_corridors():
-    """Until the loop round the block is closed."""
+    """Drive until the loop round the block is closed."""
     localizer = at_start(initial_x_m=3.15, initial_y_m=1.2)
     off = []
     for scan, odom, truth in drive_round_the_block():
@@ -764,7 +764,7 @@ SMOOTH = np.array([[-1.0, -1.2, 60.0, -1.2], [60.0, 1.2, -1.0, 1.2], [-1.0, 1.2,
 
 @pytest.mark.parametrize('step_m', [0.01, 0.02, 0.04, 0.1, 0.2])
 def test_along_a_smooth_corridor_the_wheels_are_believed(step_m):
-    """Where no scan tells how far the robot has come, the pattern of its beams does not, either."""
+    """Without information along the corridor, the pattern of the beams gives none, either."""
     rng = np.random.default_rng(0)
     localizer = Localizer()
     truth = np.zeros(3)

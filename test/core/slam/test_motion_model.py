@@ -1,4 +1,4 @@
-"""The motion model: how much the odometry is trusted, as the scans have found it to be off."""
+"""The motion model: adaptation of the odometry noise to the innovations of scan matching."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from thinmap_ros.core.slam.motion_model import MotionConfig, MotionModel
 
 CONFIG = MotionConfig()
 SLIP = np.array([CONFIG.noise_floor_m, CONFIG.noise_floor_m, CONFIG.noise_floor_rad])
-KNOWN = np.diag([1e8, 1e8, 1e8])  # a scan that measures the motion all but exactly
+KNOWN = np.diag([1e8, 1e8, 1e8])  # information of a nearly exact match
 CALIBRATED = np.zeros((3, 3))
 STEP = np.array([0.1, 0.0, 0.05])
 
@@ -20,7 +20,7 @@ def allowed(increment):
 
 
 def learn(model, truths, odometries, information=KNOWN):
-    """Sigmas (N, 3) that were expected of motions that scans then found."""
+    """Predicted sigmas (N, 3) of motions before each update."""
     sigmas = []
     for truth, odometry in zip(truths, odometries, strict=True):
         sigmas.append(np.sqrt(np.diag(model.predict(odometry, CALIBRATED).covariance)))
@@ -98,14 +98,14 @@ def test_slips_beyond_three_sigmas_all_count_the_same():
 
 
 def test_a_scan_that_measures_nothing_teaches_nothing():
-    """As along a corridor: the match gives back what was expected."""
+    """As along a corridor: the match returns the prediction."""
     model = MotionModel(CONFIG)
     learn(model, [STEP] * 50, [STEP] * 50, np.zeros((3, 3)))
     np.testing.assert_allclose(sigmas_of(model), np.sqrt(allowed(STEP)))
 
 
 def test_a_scan_that_only_half_decides_teaches_by_the_square_of_its_share():
-    """It halves the motion's error: the match shows half of it, and much of that is the scan's."""
+    """A match with half the weight shows half of the motion error, with noise of the scan."""
     model = MotionModel(CONFIG)
     variances = allowed(STEP)
     model.predict(STEP, CALIBRATED)
@@ -113,12 +113,12 @@ def test_a_scan_that_only_half_decides_teaches_by_the_square_of_its_share():
     motion = np.diag(model.predict(STEP, CALIBRATED).covariance).copy()
     np.testing.assert_allclose(motion, 4.0 * variances)
     model.update(STEP, np.diag(1.0 / motion))  # no innovation, and half the weight
-    # The first scan counts half, a quarter of that, and takes the excess away.
+    # The first update has a rate of a half, times a quarter, and removes the excess.
     np.testing.assert_allclose(model._share, 4.0 * (1.0 - 0.5 * 0.25))
 
 
 def test_a_clear_error_teaches_though_the_scan_decides_little():
-    """What lies far beyond the scan's own error is the odometry's, whatever the weights are."""
+    """An innovation far beyond the scan's noise is an odometry error, for any weights."""
     shares = []
     for off in (0.5, 2.0, 50.0):
         model = MotionModel(CONFIG)
@@ -129,7 +129,7 @@ def test_a_clear_error_teaches_though_the_scan_decides_little():
         shares.append(model._share[0])
     assert shares[0] == 1.0, "within the scan's error"
     assert shares[0] < shares[1] < shares[2]
-    # 0.5 of the first scan, half for one of two axes, up to the most of nine shares, less one.
+    # Rate 0.5 of the first update, half for one of two axes, limited to nine shares, minus one.
     assert shares[2] == pytest.approx(1.0 + 0.25 * 8.0 - 0.25 * 0.01, rel=0.01)
 
 
@@ -143,7 +143,7 @@ def test_more_than_slip_is_motion(axis, sign):
 
 
 def test_variances_are_those_of_the_errors(rng):
-    """An odometry three times as bad as it is taken to be, over many steps."""
+    """Odometry with three times the modelled noise, over many steps."""
     truths = np.tile(STEP, (600, 1)) + rng.normal(0.0, 0.02, (600, 3))
     errors = 3.0 * rng.normal(0.0, 1.0, (600, 3)) * np.sqrt(allowed(STEP))
     sigmas = learn(MotionModel(CONFIG), truths, truths + errors)
@@ -154,7 +154,7 @@ def test_variances_are_those_of_the_errors(rng):
 
 @pytest.mark.parametrize(('along', 'is_open'), [(3e4, True), (500.0, False)])
 def test_a_scan_that_slides_along_a_corridor_is_no_error_of_the_odometry(along, is_open):
-    """A corridor looks the same everywhere: scans that say so, again and again, are all wrong."""
+    """In a smooth corridor the matches of a moving robot do not move: all are wrong."""
     information = np.diag([along, 3e4, 1e5])
     model = MotionModel(CONFIG)
     odometry = np.array([0.14, 0.0, 0.0])
@@ -162,6 +162,6 @@ def test_a_scan_that_slides_along_a_corridor_is_no_error_of_the_odometry(along, 
     for _ in range(60):
         motion = model.predict(odometry, CALIBRATED)
         gain = motion.covariance[0, 0] / (motion.covariance[0, 0] + 1.0 / along)
-        slid = odometry - [gain * 0.14, 0.0, 0.0]  # the scan alone says that the robot stands
+        slid = odometry - [gain * 0.14, 0.0, 0.0]  # the scan alone measures no motion
         model.update(slid, information)
     assert (sigmas_of(model, odometry)[0] > 3.0 * before[0]) == is_open

@@ -1,4 +1,4 @@
-"""What odometry errs by all the time is learned, what it errs by once is not."""
+"""Systematic odometry errors are calibrated; single errors are ignored."""
 
 import numpy as np
 import pytest
@@ -6,18 +6,18 @@ import pytest
 from thinmap_ros.core import se2
 from thinmap_ros.core.slam.odometry_calibration import OdometryCalibration
 
-# A metre is told as 1.04 m and 0.03 rad too much of turn, a radian is told as 1.05, the laser sits
-# 1.5 deg askew.
+# Odometry measures a metre as 1.04 m with 0.03 rad of rotation, and a radian as 1.05 rad. The laser
+# is mounted 1.5 deg askew.
 SCALE = 1.04
 DRIFT = 0.03
 TURN_SCALE = 1.05
 ASKEW = 0.026
-NOISE = np.full(2, 2.5e-7)  # of a step's wheels
-KNOWN = np.diag([1e6, 1e6, 1e6])  # what the map says of where it ends
+NOISE = np.full(2, 2.5e-7)  # variances of a step
+KNOWN = np.diag([1e6, 1e6, 1e6])  # information of a match at the end of a span
 
 
 def driven(steps, seed=0, backwards=False):
-    """Poses, and increments that wheels with these errors and a little noise tell."""
+    """True poses, and odometry increments with these errors and small noise."""
     rng = np.random.default_rng(seed)
     T = np.zeros(3)
     for k in range(steps):
@@ -77,7 +77,7 @@ def test_across_an_interruption_nothing_is_compared():
 
 
 def test_what_the_map_leaves_open_teaches_nothing():
-    """Along a corridor a scan is found where the wheels put it."""
+    """Along a corridor the match equals the odometry prediction."""
     calibration = OdometryCalibration()
     for T, told in driven(300):
         calibration.corrected(told, NOISE)

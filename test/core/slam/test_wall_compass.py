@@ -1,4 +1,4 @@
-"""What the walls say of the heading, where they stand square, and where they do not."""
+"""Heading measured by wall directions, in Manhattan worlds and elsewhere."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def lines_at(place, rng, walls=ROOM):
 
 
 def learned(rng, walls=ROOM, turned=TURNED, looks=20):
-    """What was learned on a round in a map that is turned against the walls."""
+    """Compass after a round in a map that is rotated against the walls."""
     compass = WallCompass()
     for k in range(looks):
         place = PLACES[k % len(PLACES)] + [0.0, 0.0, 0.2 * k]
@@ -61,7 +61,7 @@ def test_where_most_walls_are_not_square_there_is_no_direction(rng):
 
 
 def test_what_was_seen_where_the_map_began_counts_most(rng):
-    """Later walls are drawn with what the heading has drifted by then."""
+    """Later walls contain the heading drift up to then."""
     compass = learned(rng)
     for k in range(60):
         place = PLACES[k % len(PLACES)]
@@ -71,7 +71,7 @@ def test_what_was_seen_where_the_map_began_counts_most(rng):
 
 @pytest.mark.parametrize('askew_deg', [0.0, 4.0, 20.0])
 def test_a_wing_that_stands_askew_is_mapped_as_it_stands(askew_deg, rng):
-    """A corridor, and round its corner another one, at a right angle or not."""
+    """A corridor and another one behind its corner, at a right angle or not."""
     wing = se2.pose(21.2, 1.2, np.pi / 2.0 + np.radians(askew_deg))
     walls = np.vstack(
         [corridor(20.0), se2.transform_points(wing, corridor(14.0).reshape(-1, 2)).reshape(-1, 4)]

@@ -1,4 +1,4 @@
-"""Keyframes: what stands for what, and what their poses are known to."""
+"""Keyframes: their reuse, and the covariances of their poses."""
 
 import math
 from dataclasses import replace
@@ -26,7 +26,7 @@ from thinmap_ros.core.slam.matching.surface import surface_points
 from thinmap_ros.core.slam.wall_compass import Heading
 
 STEP = np.diag(np.square([0.02, 0.01, 0.01]))
-MAP = 0.005**2  # variance of the direction of the map's walls
+MAP = 0.005**2  # variance of the main wall direction of the map
 
 
 def frame(pose, path_m=0.0, stamp_ns=0, covariance=None):
@@ -82,7 +82,7 @@ def test_an_earlier_keyframe_stands_for_one_that_sees_the_same():
     stamps, poses = keyframes.path()
     assert stamps.tolist() == [0, 1, 2, 3, 77]
     np.testing.assert_allclose(poses[-1], back.T_map_base)
-    # What comes next hangs on it.
+    # The next edge starts at the reused keyframe.
     number = keyframes.add(frame([1.0, 2.0, 0.0], 10.0), STEP)
     assert (keyframes.steps[-1].a, keyframes.steps[-1].b) == (1, number)
 
@@ -167,7 +167,7 @@ def test_covariances_along_a_chain_are_those_of_sampling(rng):
 
 
 def test_an_edge_that_closes_a_loop_leaves_less_uncertainty():
-    """The shortest chain counts: back at the start it is that of the loop."""
+    """The chain of smallest variance counts: at the start this is the loop edge."""
     angles = np.linspace(0.0, 2.0 * np.pi, 20, endpoint=False)
     poses = np.column_stack([3 * np.cos(angles), 3 * np.sin(angles), se2.wrap(angles + np.pi / 2)])
     keyframes = along(poses)
@@ -179,13 +179,13 @@ def test_an_edge_that_closes_a_loop_leaves_less_uncertainty():
     assert closed[19] == pytest.approx(alone[1], rel=0.3)
     assert np.argmax(closed) in (9, 10, 11)
     assert all(b <= a + 1e-12 for a, b in zip(alone, closed, strict=True))
-    # Edges to keyframes that are not yet among those that were optimized are left out.
+    # Edges to keyframes that are not part of the optimization are ignored.
     keyframes.move(poses[:10], [loop])
     assert np.trace(keyframes.frames[9].covariance[:2, :2]) == pytest.approx(alone[9])
 
 
 def test_a_loop_measured_the_other_way_is_turned_round(rng):
-    """A pose from which the first one was measured, 3 m away: its heading counts by the way."""
+    """An edge in reverse direction, 3 m long: its heading error acts over this distance."""
     poses = np.array([[0.0, 0.0, 0.4], [3.0, 0.5, 1.3]])
     T = se2.between(poses[1], poses[0])
     covariance = np.diag(np.square([0.02, 0.01, 0.05]))
@@ -264,7 +264,7 @@ def test_a_pose_off_its_measured_heading_is_as_uncertain_as_that():
 
 
 def test_measured_headings_bound_the_covariance_along_the_path():
-    """Without them the lateral error of a straight path grows with its length to 3/2."""
+    """Without them the lateral error of a straight path grows with its length to the power 3/2."""
     poses = np.array([se2.pose(k, 0.0, 0.0) for k in range(40)])
     blind = along(poses).covariances_from(0, poses, [])[-1]
     keyframes = Keyframes(KeyframeConfig())

@@ -1,4 +1,4 @@
-"""Loops: a ring is closed by what earlier visits saw, and by nothing else."""
+"""Loop closure: a ring is closed by matches with earlier visits, and by nothing else."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ from thinmap_ros.core.slam.matching.surface import surface_points
 SIGMAS = np.array([0.02, 0.02, 0.003])
 STEP = np.diag(np.square(SIGMAS))
 NONE = np.zeros((3, 3))
-DRIFT = (0.005, 0.0, 0.0008)  # a metre: once round it is 2.5 sigmas of what the steps claim
+DRIFT = (0.005, 0.0, 0.0008)  # per metre: 2.5 sigmas of the steps' covariance after a lap
 RING = corridor_ring()
 CORNERS = [(38.8, 1.2), (38.8, 18.8), (1.2, 18.8), (1.2, 1.2), (20.0, 1.2)]
 
@@ -38,7 +38,7 @@ def loop_closure(**config):
 
 
 def round_the_block():
-    """True poses of a way once round the corridor and on, every 0.75 m or 0.5 rad."""
+    """True poses of a path of more than a lap of the corridor, every 0.75 m or 0.5 rad."""
     pose = np.array([3.0, 1.2, 0.0])
     yield pose
     for goal in CORNERS:
@@ -66,7 +66,7 @@ class Driver:
         self.covariance = NONE
 
     def go(self, truth, works=1):
-        """Be at the next true pose; returns what was corrected."""
+        """Move to the next true pose; returns the correction, if any."""
         if self.pose is None:
             self.pose = truth
         else:
@@ -97,7 +97,7 @@ class Driver:
         return self.loops.path_m(self.pose)
 
     def errors(self, poses=None):
-        """Distance (N,) of keyframes from where they truly were."""
+        """Distances (N,) of keyframes from their true positions, m."""
         frames = self.loops.keyframes.frames
         truths = np.array([self.truths[frame.scan.stamp_ns] for frame in frames])
         poses = self.loops.keyframes.poses() if poses is None else poses
@@ -128,7 +128,7 @@ def test_a_correction_tells_where_the_keyframes_were_and_are(ring):
     np.testing.assert_array_equal(first.before[0], first.after[0])
     moved = np.hypot(*(first.after - first.before)[:, :2].T)
     assert moved.max() > 0.3
-    # The farther from the start, the more there was to correct: no jumps along the path.
+    # The correction grows along the path, without jumps.
     assert np.abs(np.diff(moved)).max() < 0.2
 
 
@@ -141,7 +141,7 @@ def test_a_closed_loop_leaves_less_uncertainty(ring):
 
 
 def test_a_closed_ring_reuses_its_keyframes(ring):
-    """The second time along the first side nothing new has to be kept, once it fits."""
+    """On the second lap keyframes of the first side are reused once they match."""
     number = len(ring.loops.keyframes)
     stamps, poses = ring.loops.keyframes.path()
     assert len(stamps) > number
@@ -157,7 +157,7 @@ def test_a_little_drift_is_not_made_worse():
 
 
 def test_where_an_earlier_visit_saw_other_walls_nothing_is_closed():
-    """Another building stands there now: no match fits, and no edge comes of it."""
+    """In another building no match is accepted, and no edge is added."""
     driver = Driver(bias=DRIFT)
     way = list(round_the_block())
     for k, truth in enumerate(way):
@@ -169,7 +169,7 @@ def test_where_an_earlier_visit_saw_other_walls_nothing_is_closed():
 
 
 def edge_to(loops, a, b, off, sigma=0.03):
-    """A match of keyframes a and b that is that far (3,) from where they are."""
+    """Edge between keyframes a and b, at an offset (3,) from their current relative pose."""
     frames = loops.keyframes.frames
     T = se2.between(frames[a].T_map_base, frames[b].T_map_base) + off
     return Edge(a, b, T, np.eye(3) / sigma**2, True)
@@ -177,7 +177,7 @@ def edge_to(loops, a, b, off, sigma=0.03):
 
 @pytest.fixture
 def straight():
-    """Twelve keyframes out and twelve back beside them, along a hall; nothing is matched."""
+    """Twelve keyframes along a hall and twelve back beside them; without any match."""
     loops = loop_closure()
     poses = [se2.pose(k, 0.0, 0.0) for k in range(12)]
     poses += [se2.pose(11 - k, 1.0, np.pi) for k in range(12)]
@@ -189,7 +189,7 @@ def straight():
 
 
 def same_correction(loops, number):
-    """Matches that all say that the way back lies half a metre farther north."""
+    """Candidates that all request to move the way back half a metre to the north."""
     edges = []
     for k in range(number):
         a = k
@@ -231,7 +231,7 @@ def test_matches_of_one_keyframe_do_not_confirm_each_other(straight):
 
 
 def test_a_step_does_one_match_or_one_round(monkeypatch):
-    """However much is due."""
+    """The number of pending matches does not matter."""
     driver = Driver(bias=DRIFT)
     counts = {'matches': 0, 'rounds': 0}
     match = LoopClosure._match
@@ -259,7 +259,7 @@ def test_a_step_does_one_match_or_one_round(monkeypatch):
                 driver.pose = correction.applied_to(driver.loops.keyframes.anchor, driver.pose)
     assert driver.corrections
     assert counts['rounds'] > 1
-    # All is done at some time.
+    # All pending work is done after enough steps.
     for _ in range(100):
         driver.loops.step()
     before = dict(counts)
@@ -295,7 +295,7 @@ def test_the_path_is_measured_in_straight_lines():
 
 
 def test_what_has_jumped_is_measured_anew(rng):
-    """Scan and motion contradicted each other on the way; the keyframes before see the same."""
+    """Scan and motion contradicted each other on a step; earlier keyframes have the same view."""
     loops = loop_closure()
     truths = np.array([[1.2, 2.0, 0.3], [2.0, 2.0, 0.3], [2.8, 2.0, 0.3]])
     told = truths + [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.3, 0.2, 0.05]]
@@ -322,7 +322,7 @@ def test_the_step_covariance_is_that_of_the_step(rng):
 
 
 def test_an_edge_to_what_is_seen_again_holds_the_errors_of_step_and_match(rng):
-    """From the anchor to an earlier keyframe, by way of a scan that both see; against sampling."""
+    """Edge from the anchor to an earlier keyframe through a scan that both match; by sampling."""
     loops = loop_closure()
     poses = [se2.pose(2.0, 2.0, 0.3), se2.pose(4.0, 2.0, 2.0), se2.pose(2.3, 2.5, 0.8)]
     frames = []

@@ -1,4 +1,4 @@
-"""The pose graph: the poses that agree best with edges, some of which are wrong."""
+"""Pose graph optimization, with and without outlier edges."""
 
 from itertools import pairwise
 
@@ -14,7 +14,7 @@ CORRELATED = np.array([[400.0, 150.0, -80.0], [150.0, 300.0, 60.0], [-80.0, 60.0
 
 
 def ring(rng, number=24, noise=0.01):
-    """True poses round a circle, estimates by noisy steps, and the steps."""
+    """True poses on a circle, dead-reckoned estimates by noisy steps, and the steps."""
     angles = np.linspace(0.0, 2.0 * np.pi, number, endpoint=False)
     truth = np.column_stack(
         [5.0 * np.cos(angles), 5.0 * np.sin(angles), se2.wrap(angles + np.pi / 2.0)]
@@ -36,7 +36,7 @@ def worst(poses, truth):
 
 
 def test_two_measurements_of_one_step_meet_by_their_information():
-    """A graph of two poses: the mean, weighted."""
+    """A graph of two poses: the result is the weighted mean."""
     poses = np.array([[1.0, 2.0, 0.5], [0.0, 0.0, 0.0]])
     once = np.array([1.0, 0.0, 0.0])
     twice = np.array([1.4, 0.4, 0.2])
@@ -46,7 +46,7 @@ def test_two_measurements_of_one_step_meet_by_their_information():
 
 
 def test_a_gap_along_a_line_is_shared_by_the_steps():
-    """Four steps of 1 m, and a loop that measures 4.5 m: each takes its share of the gap."""
+    """Four steps of 1 m, and a loop that measures 4.5 m: each takes a share of the error."""
     poses = np.column_stack([np.arange(5.0), np.zeros(5), np.zeros(5)])
     steps = [Edge(i, i + 1, np.array([1.0, 0.0, 0.0]), np.eye(3), False) for i in range(4)]
     whole = Edge(0, 4, np.array([4.5, 0.0, 0.0]), np.eye(3), False)
@@ -115,7 +115,7 @@ def test_a_closed_loop_spreads_the_drift(rng):
 
 
 def test_a_large_gap_is_closed_by_true_loops(rng):
-    """Many sigmas off at first, as a false one would be: the loss has to start wide."""
+    """A true loop with an initial error of many sigmas: the loss has to start wide."""
     truth, _, steps = ring(rng)
     bent = [truth[0]]
     for edge in steps:
@@ -133,7 +133,7 @@ def test_a_false_edge_is_held_down(rng):
     false = loop(truth, 4, 15, off=(6.0, -3.0, 1.0))
     without = optimized(poses, [*steps, *right])
     assert worst(optimized(poses, [*steps, *right, false]), without) < 0.1
-    # Were it trusted, it would bend everything.
+    # If it had its full weight, it would bend the whole path.
     trusted = Edge(false.a, false.b, false.T_a_b, false.information, False)
     assert worst(optimized(poses, [*steps, *right, trusted]), without) > 1.0
 

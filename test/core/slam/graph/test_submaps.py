@@ -1,4 +1,4 @@
-"""Submaps of earlier visits: what they hold, and when they are built again."""
+"""Submaps of earlier visits: their keyframes, and when they are rebuilt."""
 
 from dataclasses import replace
 

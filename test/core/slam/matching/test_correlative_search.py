@@ -1,4 +1,4 @@
-"""Branch and bound: against trying every pose of its finest lattice."""
+"""Branch and bound, compared with exhaustive search over its finest lattice."""
 
 import math
 
@@ -28,7 +28,7 @@ def cauchy(squared, width):
 
 
 class Exhaustive:
-    """The plain reference: cost of poses by the nearest wall of each cell, found by brute force."""
+    """Reference: cost of poses by the nearest wall of each cell, by brute force."""
 
     def __init__(self, local_map):
         self.cells, self.top, self.left = cells_of(local_map)
@@ -74,7 +74,7 @@ def leaves(scan, prior, half):
 
 
 class Case:
-    """A scan in a map of the room, and a prior beside its true pose."""
+    """A scan in a map of the room, and a prior near its true pose."""
 
     def __init__(self, seed, slips=False):
         rng = np.random.default_rng(seed)
@@ -99,7 +99,7 @@ class Case:
 
 
 def exact(cases, most_nodes):
-    """Which of some cases end at the least cost of all leaves and the incumbent; the gaps (N,)."""
+    """Gaps (N,) between the found cost and the lowest one of all leaves and the incumbent."""
     gaps = []
     better = 0
     for case in cases:
@@ -116,14 +116,14 @@ def exact(cases, most_nodes):
 
 @pytest.mark.parametrize('most_nodes', [PLENTY, 1000])
 def test_the_search_finds_the_least_of_its_lattice(most_nodes):
-    """In nearly all cases: points out of reach of walls are taken to stay so."""
+    """In nearly all cases: points out of reach of walls are assumed to stay out of reach."""
     found, gaps = exact([Case(seed) for seed in range(60)], most_nodes)
     assert found.mean() >= 0.95
     assert gaps.max() < 30.0
 
 
 def test_where_wheels_have_slipped_the_search_finds_nearly_the_least():
-    """Far from a sharp prior, whose cost differs much within a node and is taken at its middle."""
+    """Far from a narrow prior, whose cost varies much within a node."""
     found, gaps = exact([Case(seed, slips=True) for seed in range(60)], 1000)
     assert found.mean() >= 0.95
     assert gaps.max() < 20.0
@@ -145,7 +145,7 @@ def test_the_search_never_returns_worse_than_the_incumbent(rng):
 
 
 def test_a_prior_at_half_a_turn_is_searched_on_both_sides():
-    """A heading may be any of those that are a turn apart."""
+    """A heading may be given modulo a full turn."""
     case = Case(7)
     turned = Case(7)
     turned.prior = case.prior + [0.0, 0.0, 2.0 * math.pi]
@@ -155,7 +155,7 @@ def test_a_prior_at_half_a_turn_is_searched_on_both_sides():
 
 @pytest.mark.parametrize('most_nodes', [0, 8, 40])
 def test_no_more_nodes_are_tried_than_allowed(monkeypatch, most_nodes):
-    """Besides the roots, and the last one's children."""
+    """Except the root nodes and the children of the last node."""
     tried = []
     cost = correlative_search._cost
 
@@ -186,7 +186,7 @@ def test_the_search_is_what_it_is_in_plain_python():
 
 
 def test_the_cost_is_that_of_the_reference_and_its_bound_is_lower(rng):
-    """What a motion within a node changes, where all points are within reach of walls."""
+    """Change of the cost within a node if all points are within reach of walls."""
     violations = 0
     compared = 0
     for seed in range(20):

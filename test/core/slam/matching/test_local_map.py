@@ -1,4 +1,4 @@
-"""The local map: its counts, its means, its distances, and how it follows walls that vanish."""
+"""The local map: counts, means, distances, and removed walls."""
 
 import math
 
@@ -18,7 +18,7 @@ from thinmap_ros.core.slam.matching.local_map import FIELDS, HERE, LocalMap, Loc
 BOX = ROOM[6:]
 WITHOUT_BOX = ROOM[:6]
 NOTHING = np.empty((0, 5))
-# In sight of the box from all sides.
+# The box is visible from all sides.
 AROUND_BOX = [
     np.array([x, y, math.atan2(2.5 - y, 7.5 - x)])
     for x, y in [(5.0, 1.0), (6.0, 4.0), (9.2, 4.0), (9.0, 1.0), (7.4, 4.2), (5.2, 2.6)]
@@ -45,9 +45,9 @@ def random_pose(rng):
 
 
 def told(cells):
-    """Distance of each cell from the wall that it leads to, in cells; inf where it leads to none.
+    """Distance of each cell from the wall that it refers to, in cells; inf without one.
 
-    Every cell that is led to has to be a wall.
+    Checks that each cell that is referred to is a wall.
     """
     down = cells['to_row'].astype(int) - HERE
     right = cells['to_col'].astype(int) - HERE
@@ -68,7 +68,7 @@ def test_each_cell_knows_its_nearest_wall(rng):
 
 
 def test_walls_that_vanish_are_forgotten(rng):
-    """A box is taken away; what was nearest to it is nearest to something else, or to nothing."""
+    """A box is removed; its nearest cells refer to other walls, or to none."""
     local_map = LocalMap()
     for pose in AROUND_BOX:
         add_scan(local_map, ROOM, pose, rng)
@@ -82,7 +82,7 @@ def test_walls_that_vanish_are_forgotten(rng):
     np.testing.assert_array_equal(local_map.distances(faces), CELL_M * REACH)
 
 
-# Few cells, crowded: walls come and go beside each other.
+# Few cells, so that adjacent walls appear and vanish.
 @settings(max_examples=60)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_distances_follow_walls_that_come_and_go(seed):
@@ -96,14 +96,14 @@ def test_distances_follow_walls_that_come_and_go(seed):
     found = told(cells)
     np.testing.assert_array_equal(np.isfinite(found), np.isfinite(truth))
     near = np.isfinite(truth)
-    # What a neighbour tells may be a little farther than the nearest wall, rarely.
+    # A propagated wall may rarely be slightly farther than the nearest one.
     assert (found[near] >= truth[near]).all()
     assert (found[near] - truth[near]).max(initial=0.0) < 0.3
     assert np.mean(found[near] != truth[near]) < 0.01
 
 
 def test_a_cell_keeps_the_mean_of_its_hits(rng):
-    """Of their places, of their normals, and of the side that they were seen from."""
+    """Means of the hits, of their normals, and of the side from which they were observed."""
     points = np.array([2.0, -1.0]) + rng.uniform(0.0, CELL_M, (40, 2)) * 0.999
     angles = rng.normal(0.3, 0.2, 40)
     T_base_laser = np.array([0.1, 0.2, 0.0])
@@ -122,7 +122,7 @@ def test_a_cell_keeps_the_mean_of_its_hits(rng):
 
 @pytest.mark.parametrize('heading', [0.0, 0.7, 2.0, -1.6, 3.1])
 def test_normals_and_faces_are_turned_with_the_robot(heading):
-    """A wall 2 m before a robot that has turned, with its laser in front: it faces the laser."""
+    """A wall 2 m in front of a turned robot with an offset laser: its normal faces the laser."""
     pose = np.array([1.0, -2.0, heading])
     points = on_wall(np.column_stack([np.full(21, 2.0), np.linspace(-0.5, 0.5, 21)]), 0.0)
     local_map = LocalMap()
@@ -147,7 +147,7 @@ def test_a_wall_that_is_hit_from_both_sides_has_no_face():
 
 
 def test_the_faces_of_a_thin_wall_are_kept_apart():
-    """A wall of 10 cm between two rooms: each face looks into the room that it was seen from."""
+    """A wall of 10 cm between two rooms: each face points into the room of its observer."""
     wall = np.array([[-4.0, 0.02, 4.0, 0.02], [4.0, 0.12, -4.0, 0.12]])
     local_map = map_of(wall[:1], [np.array([x, -2.0, math.pi / 2.0]) for x in (-1.0, 0.0, 1.0)])
     for x in (-1.0, 0.0, 1.0):
@@ -161,7 +161,7 @@ def test_the_faces_of_a_thin_wall_are_kept_apart():
 
 
 def test_hits_and_looks_through_are_counted():
-    """A beam says nothing of the cells beside its end, that it may graze."""
+    """A beam does not count as an observation of cells near its end, which it may graze."""
     local_map = LocalMap()
     add(local_map, np.array([[0.525, 0.025]]), (0.025, 0.025), 0.0)
     cells, top, left = cells_of(local_map)
@@ -190,7 +190,7 @@ def test_counts_forget_and_do_not_run_over():
 
 
 def test_a_cell_is_a_wall_while_enough_of_its_observations_are_hits():
-    """One hit, and three beams that pass: at a quarter it is none."""
+    """One hit and three traversing beams: a hit ratio of a quarter is no wall."""
     local_map = LocalMap()
     point = np.array([[1.025, 0.025]])
     add(local_map, point, (0.025, 0.025), 0.0)
@@ -206,7 +206,7 @@ def test_a_cell_is_a_wall_while_enough_of_its_observations_are_hits():
 
 @pytest.mark.parametrize('wall_m', [1.003, 1.013, 1.025, 1.041])
 def test_distances_from_a_wall_are_finer_than_a_cell(wall_m):
-    """To the mean of the hits of the nearest cell, which lies on the wall within half a cell."""
+    """To the mean of the hits of the nearest cell, which is on the wall within half a cell."""
     along = np.arange(-2.0, 2.0, 0.01) + 0.005
     local_map = LocalMap()
     add(local_map, np.column_stack([along, np.full(len(along), wall_m)]))
@@ -244,11 +244,11 @@ def test_a_state_is_restored(rng):
     for name, array in state.items():
         assert np.any(array), name
         np.testing.assert_array_equal(again.state()[name], array)
-    # Of walls that are equally near it may be another one that a cell leads to.
+    # A cell may refer to any of several equally near walls.
     for each in (local_map, again):
         cells, *_ = cells_of(each)
         np.testing.assert_array_equal(told(cells), nearest(cells))
-    # Both go on alike.
+    # Both continue identically.
     for each in (local_map, again):
         add_scan(each, ROOM, np.array([4.0, 7.0, 0.5]))
     for name, array in local_map.state().items():
@@ -281,7 +281,7 @@ def test_a_tile_that_is_there_twice_is_refused(rng):
 
 @pytest.mark.parametrize('normal', [(0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0)])
 def test_walls_of_an_occupancy_map_are_added(normal):
-    """Each cell once, however many points lie in it, and nothing is seen through."""
+    """One hit per cell, for any number of points in it, and no traversed cells."""
     normal = np.array(normal)
     along = np.abs(normal[::-1])
     points = np.arange(0.0, 3.0, 0.01)[:, None] * along + 2.02 * np.abs(normal)
@@ -345,7 +345,7 @@ def test_far_from_all_tiles_there_is_no_wall(rng):
 
 @pytest.mark.parametrize('corner', [(0, 0), (-1, -1), (3, -2)])
 def test_walls_at_the_rim_of_a_tile_are_known_in_the_next(corner):
-    """One point in each corner cell of a tile, looked at from its middle."""
+    """One point in each corner cell of a tile, observed from its centre."""
     edge_m = TILE * CELL_M
     low = edge_m * np.array(corner)
     inside = np.array([[0.02, 0.02], [0.02, -0.02], [-0.02, 0.02], [-0.02, -0.02]])
@@ -387,7 +387,7 @@ def test_a_scan_is_put_where_the_robot_is():
 
 
 def test_kernels_are_what_they_are_in_plain_python(rng, monkeypatch):
-    """The box comes and goes."""
+    """The box appears and vanishes."""
     compiled = LocalMap()
     plain = LocalMap()
     scans = [

@@ -1,4 +1,4 @@
-"""The sum that a match minimizes: against a plain reference and numeric differences."""
+"""Matching cost, compared with a reference and with numeric differences."""
 
 import math
 
@@ -57,7 +57,7 @@ def cell_at(local_map, row, col):
 
 
 def assigned(local_map, scan, pose):
-    """Of each point: whether its cell was seen, and the mean and cell of its wall, or None."""
+    """For each point: whether its cell was observed, and the mean and cell of its wall, or None."""
     found = []
     for x, y in se2.transform_points(pose, np.ascontiguousarray(scan[:, :2])):
         row = math.floor(y / CELL_M)
@@ -75,7 +75,7 @@ def assigned(local_map, scan, pose):
 
 
 def metric_of(wall):
-    """Matrix (2, 2): 1 along the normal, and along the wall the less, the surer the normal is."""
+    """Matrix (2, 2): 1 along the normal, less along the wall for a more certain normal."""
     double = np.array([wall['cos2'], wall['sin2']], dtype=float)
     sure = np.hypot(*double)
     angle = 0.5 * math.atan2(double[1], double[0])
@@ -92,8 +92,8 @@ def is_behind(point, pose, wall):
     return back @ [wall['face_x'], wall['face_y']] < -0.1
 
 
-HALF_WALL_M = 0.25  # a wall goes on so far to either side of its hits
-OFF_SIGMAS = 3.0  # a point that is farther off its wall contradicts it, where a beam went through
+HALF_WALL_M = 0.25  # extent of a wall to either side of its hits
+OFF_SIGMAS = 3.0  # a point at a larger distance contradicts an observed cell
 
 
 def reference(local_map, scan, pose):
@@ -134,7 +134,7 @@ def is_same_wall(one, other):
 
 
 def are_alike(local_map, scan, poses):
-    """Whether each point has the same wall, and is on the same side of it, at all poses."""
+    """Whether each point has the same wall and is on the same side of it at all poses."""
     first, *rest = [assigned(local_map, scan, pose) for pose in poses]
     for pose, other in zip(poses[1:], rest, strict=True):
         for point, (seen, mean, wall), (seen_2, mean_2, wall_2) in zip(
@@ -150,7 +150,7 @@ def are_alike(local_map, scan, poses):
 
 
 def strange_scan(rng, number=60):
-    """Points anywhere, seen from anywhere: on walls, before and behind them, and far out."""
+    """Random points and viewpoints: on walls, in front of and behind them, and far outside."""
     directions = rng.uniform(-math.pi, math.pi, number)
     return np.column_stack(
         [
@@ -176,7 +176,7 @@ def test_the_sums_are_those_of_the_reference(rng, room, scan):
 
 
 def test_the_gradient_is_that_of_numeric_differences(rng, room, scan):
-    """With the wall of each point held: away from where another one is the nearest."""
+    """With a fixed wall for each point: not where the nearest wall changes."""
     step = 1e-6
     compared = 0
     for k in range(24):
@@ -208,7 +208,7 @@ def test_the_matrix_is_symmetric_and_positive_semidefinite(rng, room, scan):
 @pytest.mark.parametrize('wall_m', [1.003, 1.013, 1.025, 1.041])
 @pytest.mark.parametrize('angle', [0.0, 0.7, 2.0])
 def test_a_point_is_off_a_wall_along_its_normal_alone(wall_m, angle):
-    """Finer than a cell, and however far it lies from the hits along the wall."""
+    """Below the cell size, at any distance along the wall from its hits."""
     turn = np.array([0.0, 0.0, angle])
     along = np.arange(-2.0, 2.0, 0.005) + 0.0025
     hits = np.column_stack([along, np.full(len(along), wall_m)])
@@ -219,7 +219,7 @@ def test_a_point_is_off_a_wall_along_its_normal_alone(wall_m, angle):
             scan = np.array([[x, wall_m - away, 1.0, 0.0, -1.0]])
             H, g, sums = evaluate(scan, turn, local_map.lattice, *NOISE)
             share = 1.0 - sums[4] / (UNSEEN_COST * cauchy(FAR**2, WIDTH))
-            # Of hits on a slanted wall those of one cell do not lie in a line with its middle.
+            # On a slanted wall the mean of a cell's hits is not at its centre.
             assert sums[0] == pytest.approx(
                 share * cauchy((away / SIGMA_M) ** 2, WIDTH), rel=1e-3, abs=1e-6
             )
@@ -247,7 +247,7 @@ def test_along_a_smooth_corridor_there_is_no_information(rng, angle):
 
 
 def test_in_a_corner_both_directions_count():
-    """Where normals differ within a cell, its hits hold a point in both directions."""
+    """If normals differ within a cell, both directions have information."""
     local_map = LocalMap()
     hit = np.array([[1.02, 1.02]])
     scan = np.array([[1.08, 1.06, 1.0, -math.sqrt(0.5), -math.sqrt(0.5)]])
@@ -274,7 +274,7 @@ def test_a_wall_that_was_hit_once_draws_half_as_much():
 
 
 def test_the_other_face_of_a_wall_draws_nothing():
-    """A beam that comes from behind has met another surface: as good as none that is known."""
+    """A beam from behind has hit another surface, which counts as unobserved."""
     local_map = LocalMap()
     local_map.add_scan(on_wall(np.array([[1.02, 0.02]]), 0.0), np.zeros(3), np.zeros(3))
     far = cauchy(FAR**2, WIDTH)
@@ -286,7 +286,7 @@ def test_the_other_face_of_a_wall_draws_nothing():
         if not draws:
             np.testing.assert_allclose(sums, [0.7 * far * UNSEEN_COST, 0.7, 0.0, 0.0, 0.0])
     turned = np.array([0.0, 0.0, math.pi])
-    scan = np.array([[-1.08, -0.02, 0.7, -1.0, 0.0]])  # at the same place, from behind
+    scan = np.array([[-1.08, -0.02, 0.7, -1.0, 0.0]])  # the same point, from behind
     assert not evaluate(scan, turned, local_map.lattice, *NOISE)[1].any()
 
 
@@ -311,18 +311,18 @@ def test_the_prior_pulls_as_its_cost_falls(rng):
 
 
 def cost_at(local_map, scan, pose, prior, information):
-    """What walls and prior cost together, without and with what young walls leave out."""
+    """Total cost of walls and prior, without and with the share that walls with few hits omit."""
     _, _, sums = evaluate(scan, pose, local_map.lattice, *NOISE)
     cost = sums[0] + by_prior(pose, prior, information)[2]
     return cost, cost + sums[4]
 
 
 def test_a_minimum_is_one(rng, room, scan):
-    """No higher than where it began, and what is told of it is what is there."""
+    """The cost does not exceed that of the start, and the returned sums are those of the result."""
     information = np.linalg.inv(DOUBT)
     settled = 0
     for k in range(60):
-        if k == 30:  # points that change their walls at every step, of which some lead uphill
+        if k == 30:  # points that change their walls at every step, some with a higher cost
             scan = strange_scan(rng)
         start = TRUTH + rng.normal(0.0, 0.1, 3)
         given = start.copy()
@@ -342,7 +342,7 @@ def test_a_minimum_is_one(rng, room, scan):
 
 
 def test_from_a_prior_far_off_the_walls_decide(rng, room, scan):
-    """It keeps its information, but weighs little: wheels have slipped."""
+    """A distant prior has a small weight: the wheels have slipped."""
     sharp = np.linalg.inv(np.diag(np.square([0.005, 0.005, 0.005])))
     prior = TRUTH + [0.0, 0.4, 0.0]
     pose, _, _, weight = minimize(scan, TRUTH, prior, sharp, room.lattice, *NOISE)
@@ -353,7 +353,7 @@ def test_from_a_prior_far_off_the_walls_decide(rng, room, scan):
 
 
 def test_headings_of_minima_are_wrapped(rng):
-    """From a start beside half a turn, and with a prior on its other side."""
+    """With a start near a half turn, and a prior on the other side of it."""
     truth = np.array([2.0, 2.0, math.pi - 0.01])
     room = map_of(ROOM, around(truth, 15, rng), rng)
     scan = weighted(seen_in(ROOM, truth, rng))
@@ -376,7 +376,7 @@ def test_kernels_are_what_they_are_in_plain_python(rng, room, scan, monkeypatch)
     evaluated = evaluate(thin, pose, room.lattice, *NOISE)
     arguments = (thin, pose, prior, information, room.lattice, *NOISE)
     minimized = minimize(*arguments)
-    # A compiled function cannot hand a cell to plain Python.
+    # A compiled function cannot return a cell to Python.
     monkeypatch.setattr(matching_cost, 'off_wall', off_wall.py_func)
     for compiled, plain in zip(
         evaluated, evaluate.py_func(thin, pose, room.lattice, *NOISE), strict=True

@@ -1,4 +1,4 @@
-"""A localizer that goes on in an occupancy map: what was drawn stays where it is."""
+"""A localizer that resumes in an occupancy map: the map does not shift."""
 
 import numpy as np
 import pytest
@@ -51,7 +51,7 @@ def test_normals_point_from_the_faces_to_free_cells():
 
 
 def test_faces_of_a_map_hold_a_robot_along_their_normals():
-    """What the local map makes of them: a scan inside finds its place between them."""
+    """A scan matches the local map that is made of them."""
     cells = np.full((60, 80), 100, dtype=np.int8)
     cells[1:-1, 1:-1] = 0
     local_map = LocalMap()
@@ -74,7 +74,7 @@ def test_a_map_without_walls_has_no_points():
 
 
 def killed(config, seed, resolution, slip):
-    """Farthest from the truth before it was killed, and after, m; the last estimate."""
+    """Largest errors before the crash and after it, m; the last estimate."""
     rng = np.random.default_rng(seed)
     localizer = Localizer(config)
     last = None
@@ -104,7 +104,7 @@ def killed(config, seed, resolution, slip):
 @pytest.mark.parametrize('seed', range(3))
 @pytest.mark.parametrize('slip', [(0.0, 0.0), (0.3, 0.2)])
 def test_a_killed_localizer_does_not_bend_the_map(seed, resolution, slip):
-    """Killed for two metres while the wheels slip: then it is as true as its map, and a cell."""
+    """After two metres of slip without a localizer the error is that of the map plus a cell."""
     config = LocalizerConfig(initial_x_m=2.0, initial_y_m=2.0)
     before, worst, estimate = killed(config, seed, resolution, slip)
     assert not estimate.is_lost

@@ -1,4 +1,4 @@
-"""Scans against the local map: the true pose, honest where walls leave a direction open."""
+"""Scan-to-map matching: accuracy, and covariance in directions without walls."""
 
 import math
 
@@ -23,7 +23,7 @@ def match(local_map, points, prior, covariance=DOUBT):
 
 
 def nearest_minimum(local_map, points, prior, covariance):
-    """The match without a search."""
+    """The match without a global search."""
     scan = weighted_points(points, LASER, LocalMapConfig().resolution_m)
     information = np.linalg.inv(covariance)
     return MATCHER._refined(scan, local_map, prior, prior, information)
@@ -34,13 +34,13 @@ def off(match_, truth=TRUTH):
 
 
 def clutter(rng, number):
-    """Surface points (N, 5) anywhere around, with normals in any direction."""
+    """Random surface points (N, 5), with normals in any direction."""
     points = np.column_stack([rng.uniform(0.3, 2.0, number), rng.uniform(-2.0, 2.0, number)])
     return np.vstack([on_wall(point[None], rng.uniform(0.0, math.pi)) for point in points])
 
 
 def people(pose, number, rng):
-    """Walls (N, 4) of as many octagons of 40 cm around a pose, 0.8 to 2 m before it."""
+    """Walls (N, 4) of octagonal columns of 40 cm, 0.8 to 2 m in front of a pose."""
     away = rng.uniform(0.8, 2.0, number)
     bearing = rng.uniform(-1.5, 1.5, number) + pose[2]
     middles = pose[:2] + away[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
@@ -59,7 +59,7 @@ def room(rng):
 
 
 def test_the_pose_is_found_from_a_prior_beside_it(rng, room):
-    """From 10 cm and 5 degrees off, in every direction."""
+    """With a prior error of 10 cm and 5 degrees in every direction."""
     errors = []
     for direction in np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False):
         for turn in np.radians([-5.0, 5.0]):
@@ -96,7 +96,7 @@ def test_the_covariance_is_that_of_scan_and_prior_together(rng, room):
 
 
 def test_a_prior_far_off_is_searched_for(rng, room):
-    """Half a metre and twenty degrees: refinement alone ends elsewhere, the search finds it."""
+    """Half a metre and twenty degrees: only the search finds the pose."""
     missed = 0
     found = 0
     wide = np.diag(np.square([0.3, 0.3, 0.2]))
@@ -113,7 +113,7 @@ def test_a_prior_far_off_is_searched_for(rng, room):
 
 
 def test_where_wheels_have_slipped_the_surroundings_are_searched(rng):
-    """Though the motion says that the pose is known: the scan fits badly there."""
+    """Although the prior is narrow: the inlier ratio is low at it."""
     truth = np.array([4.0, 2.5, 0.5])
     room = map_of(ROOM, around(truth, 15, rng), rng)
     sharp = np.diag(np.square([0.01, 0.01, 0.01]))
@@ -134,7 +134,7 @@ def test_where_wheels_have_slipped_the_surroundings_are_searched(rng):
 
 
 def test_along_a_corridor_the_prior_decides(rng):
-    """A smooth wall says nothing of where along it the robot is."""
+    """A smooth wall has no information along itself."""
     for _ in range(12):
         local_map = in_corridor(rng)
         prior = np.array([rng.choice([-0.1, 0.1]), 0.06, 0.02])
@@ -148,7 +148,7 @@ def test_along_a_corridor_the_prior_decides(rng):
 
 
 def test_a_wide_covariance_is_searched_though_the_nearest_minimum_fits(rng):
-    """A corridor, on whose walls nearly all points lie anywhere along it, and a door in its end."""
+    """A smooth corridor, with a door at its end."""
     walls = np.vstack([CORRIDOR, [[4.0, -1.0, 4.0, -0.2]]])
     truth = np.zeros(3)
     local_map = map_of(walls, around(truth, 10, rng), rng)
@@ -162,7 +162,7 @@ def test_a_wide_covariance_is_searched_though_the_nearest_minimum_fits(rng):
 
 
 def test_an_unknown_heading_is_searched_though_the_nearest_minimum_fits(rng):
-    """A square room, that looks nearly the same after a quarter turn, but for a piece of wall."""
+    """A square room with near rotational symmetry, except for a piece of wall."""
     corners = 3.0 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     walls = np.vstack([np.hstack([corners, np.roll(corners, -1, axis=0)]), [[1.0, 1.0, 1.2, 1.0]]])
     truth = np.zeros(3)
@@ -177,7 +177,7 @@ def test_an_unknown_heading_is_searched_though_the_nearest_minimum_fits(rng):
 
 
 def test_a_robot_that_sees_no_end_of_a_corridor_goes_on_along_it():
-    """Where it was before, all that it sees is known; where it is now, some of it is not."""
+    """The previous pose explains all points; at the current pose some are in unobserved cells."""
     truth = np.array([1.0, 0.0, 0.0])
     covariance = np.diag(np.square([0.12, 0.12, 0.02]))
     back = []
@@ -190,14 +190,14 @@ def test_a_robot_that_sees_no_end_of_a_corridor_goes_on_along_it():
         points = surface_points(scan_in(CORRIDOR, truth, rng), 6.0)
         found = match(local_map, points, truth, covariance)
         back.append(truth[0] - found.T_map_base[0])
-    # No more than the prior's own sigma: where nothing is known along the corridor, it decides.
+    # At most the prior's sigma: without information along the corridor, the prior decides.
     assert np.sqrt(np.mean(np.square(back))) < 0.12
     assert np.median(np.abs(back)) < 0.05
 
 
 @pytest.mark.parametrize('away_m', [0.3, 0.6, 1.5])
 def test_a_scan_in_one_room_is_not_drawn_to_the_other_face_of_a_wall(rng, away_m):
-    """A thin wall of 10 cm, seen from both rooms; where either face ends up decides nothing."""
+    """A wall of 10 cm, observed from both rooms: each face is a separate surface."""
     south = [-4.0, 0.0, 4.0, 0.0]
     north = [4.0, 0.1, -4.0, 0.1]
     sides = np.array([[-2.0, -3.0, -2.0, 0.0], [2.5, 3.0, 2.5, 0.1]])
@@ -223,7 +223,7 @@ def test_a_scan_in_one_room_is_not_drawn_to_the_other_face_of_a_wall(rng, away_m
 @pytest.mark.parametrize('seed', range(4))
 @pytest.mark.parametrize('number', [5, 10, 20])
 def test_in_a_crowd_the_prior_holds(seed, number):
-    """People before the robot hide the walls: what seems to fit does not outweigh the wheels."""
+    """People in front of the robot hide the walls: chance inliers do not override odometry."""
     rng = np.random.default_rng(seed)
     room = map_of(ROOM, around(TRUTH, 15, rng), rng)
     wheels = np.diag(np.square([0.01, 0.01, 0.01]))
@@ -242,7 +242,7 @@ def test_in_a_crowd_the_prior_holds(seed, number):
 
 
 def test_a_search_never_makes_a_match_worse():
-    """It tries some of the points alone, and may take a pose for better than it is."""
+    """The search uses a subsample, and may underestimate a cost."""
     searched = 0
     for seed in range(60):
         rng = np.random.default_rng(seed)
@@ -264,7 +264,7 @@ def test_two_thirds_of_gross_outliers_do_not_pull(rng, room):
 
 
 def test_some_outliers_do_not_pull(rng, room):
-    """A third of the scan is somebody who stands before a wall."""
+    """A third of the scan is on a person in front of a wall."""
     scan = scan_in(ROOM, TRUTH, rng)
     ranges = scan.ranges_m.copy()
     ranges[: len(ranges) // 3] = 0.8
@@ -279,7 +279,7 @@ def test_some_outliers_do_not_pull(rng, room):
 
 
 def test_a_new_wall_as_wide_as_a_door_does_not_pull_the_robot_to_a_known_one(rng):
-    """A foot before the known wall, which it would fit: somebody has shut a door."""
+    """A closed door 0.3 m in front of a known wall, to which it could be matched."""
     local_map = in_corridor(rng)
     door = np.array([[0.3, 0.7, 1.2, 0.7]])
     points = seen_in(np.vstack([CORRIDOR, door]), np.zeros(3), rng)
@@ -290,7 +290,7 @@ def test_a_new_wall_as_wide_as_a_door_does_not_pull_the_robot_to_a_known_one(rng
 
 
 def test_beyond_a_door_the_motion_decides_where_nothing_is_known(rng):
-    """A room that nobody has seen, from its door."""
+    """An unobserved room, seen from its door."""
     south = [np.array([x, y, 0.5]) for x in (1.5, 4.0, 6.0) for y in (1.5, 3.0)]
     local_map = map_of(ROOM, south, rng)
     wheels = np.diag(np.square([0.02, 0.02, 0.02]))
@@ -304,7 +304,7 @@ def test_beyond_a_door_the_motion_decides_where_nothing_is_known(rng):
 
 
 def test_ground_that_is_new_contradicts_nothing(rng, room):
-    """Through a door into what nobody has seen; the same amid what was seen does."""
+    """Points in unobserved space behind a door do not contradict; in free space they do."""
     elsewhere = match(room, seen_in(ROOM, TRUTH, rng), TRUTH + [50.0, 0.0, 0.0])
     assert elsewhere.contradiction_ratio == elsewhere.inlier_ratio == 0.0
     np.testing.assert_allclose(elsewhere.T_map_base, TRUTH + [50.0, 0.0, 0.0])
@@ -355,7 +355,7 @@ def test_the_same_input_gives_the_same_output_and_stays_as_it_is(rng, room):
 
 
 def test_a_thin_wall_is_matched_by_the_face_that_is_seen(rng):
-    """From the far side of a wall 10 cm thick the near face must not draw the scan through it."""
+    """A scan must not be matched with the other face of a wall of 10 cm."""
     faces = np.array(
         [[2.0, -3.0, 2.0, 3.0], [2.1, -3.0, 2.1, 3.0], [0.0, -3.0, 5.0, -3.0], [0.0, 3.0, 5.0, 3.0]]
     )
@@ -369,7 +369,7 @@ def test_a_thin_wall_is_matched_by_the_face_that_is_seen(rng):
 
 
 def test_wide_headings_are_wrapped(rng):
-    """Priors beside half a turn."""
+    """Priors near a half turn."""
     truth = np.array([2.0, 2.0, math.pi - 0.01])
     local_map = map_of(ROOM, around(truth, 15, rng), rng)
     points = seen_in(ROOM, truth, rng)
@@ -382,7 +382,7 @@ def test_wide_headings_are_wrapped(rng):
 
 
 def test_another_configuration_is_used(rng, room):
-    """Points that are twice as uncertain say a quarter."""
+    """Points with twice the noise have a quarter of the information."""
     points = seen_in(ROOM, TRUTH, rng)
     timid = Matcher(MatchingConfig(noise_m=0.1, kernel_scale_m=0.3))
     less = timid.match(points, LASER, room, TRUTH, DOUBT).scan_information

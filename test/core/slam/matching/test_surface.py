@@ -1,4 +1,4 @@
-"""Surface points: normals from neighbours on one surface, and no surface where there is none."""
+"""Surface points: normals from neighbours on one surface, and no false surfaces."""
 
 import math
 
@@ -13,7 +13,7 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.slam.matching import surface
 from thinmap_ros.core.slam.matching.surface import WINDOW_M, surface_points
 
-RANGE_NOISE_M = 0.02  # as documented: neighbours that scatter by no more lie on a plane
+RANGE_NOISE_M = 0.02  # as documented: neighbours with no more scatter lie on a plane
 
 
 def normals_of(points):
@@ -26,7 +26,7 @@ def sureness_of(points):
 
 
 def off_normal(points, angle):
-    """Degrees (N,) between the normals and an angle, without regard to their sign."""
+    """Angles (N,) between the normals and a direction, degrees, without sign."""
     off = normals_of(points) - angle
     return np.degrees(np.abs((off + 0.5 * np.pi) % np.pi - 0.5 * np.pi))
 
@@ -35,7 +35,7 @@ def off_normal(points, angle):
 
 
 def are_linked(points, beams):
-    """Whether each point (N,) is on one surface with the one before it."""
+    """Whether each point (N,) is on the same surface as its predecessor."""
     linked = np.zeros(len(points), dtype=bool)
     steps = {
         k: points[k] - points[k - 1] for k in range(1, len(points)) if beams[k] == beams[k - 1] + 1
@@ -54,7 +54,7 @@ def are_linked(points, beams):
 
 
 def neighbours_of(i, points, linked):
-    """Those on either side as far as they are linked, up to the first beyond the window."""
+    """Linked neighbours on either side, up to the first one beyond the window."""
     found = []
     for side in (-1, 1):
         k = i
@@ -84,7 +84,7 @@ def reference(points, beams):
 
 
 def polyline(rng, number):
-    """Points of walls that turn, jump and come close, and their beams, some of which are gone."""
+    """Points on walls with bends, jumps and varying distance; some beams are missing."""
     turns = np.where(rng.random(number) < 0.15, rng.uniform(-2.0, 2.0, number), 0.0)
     lengths = rng.choice([0.02, 0.05, 0.12, 0.3, 1.5], number, p=[0.3, 0.3, 0.2, 0.15, 0.05])
     headings = np.cumsum(turns)
@@ -126,7 +126,7 @@ def test_kernels_are_what_they_are_in_plain_python(rng):
 @pytest.mark.parametrize('incidence', np.radians([0.0, 20.0, 40.0, 60.0, 70.0]))
 @pytest.mark.parametrize('away_m', [1.0, 3.0])
 def test_normals_of_a_flat_wall_at_all_incidences(rng, incidence, away_m):
-    """At 1 cm noise and half a degree between beams; the middle beam meets the wall aslant."""
+    """At 1 cm noise and half a degree between beams; the middle beam is oblique to the wall."""
     normal = np.array([math.cos(incidence), math.sin(incidence)])
     along = np.array([-normal[1], normal[0]])
     middle = np.array([away_m, 0.0])
@@ -148,7 +148,7 @@ def test_normals_of_a_flat_wall_at_all_incidences(rng, incidence, away_m):
 
 
 def test_normals_without_noise_are_exact_on_a_turned_robot():
-    """In the frame of the robot, however the laser is mounted."""
+    """In the robot frame, for any mount of the laser."""
     wall = np.array([[3.0, -20.0, 3.0, 20.0]])
     for mount in ([0.0, 0.0, 0.0], [0.2, -0.1, 0.4]):
         for heading in (0.0, 0.5, -0.7):
@@ -162,7 +162,7 @@ def test_normals_without_noise_are_exact_on_a_turned_robot():
 
 
 def test_a_jump_between_two_walls_is_no_surface():
-    """A wall ends before another one, each with its own normals up to the last beam."""
+    """A wall ends in front of another one; both have their own normals up to the last beam."""
     walls = np.array([[2.0, 2.0, 2.0, 0.0], [3.0, 0.4, 3.4, -3.0]])
     points = seen_in(walls, np.zeros(3))
     near = points[:, 0] < 2.5
@@ -174,7 +174,7 @@ def test_a_jump_between_two_walls_is_no_surface():
 
 
 def test_a_beam_that_met_nothing_parts_its_neighbours():
-    """Two pieces of wall 20 cm apart and collinear; the beam through the gap does not return."""
+    """Two collinear walls, 20 cm apart; the beam through the gap has no return."""
     points = np.column_stack([np.ones(6), 0.2 * np.arange(6)])
     beams = np.arange(6)
     assert surface._links(points, beams)[1:6].all()
@@ -186,7 +186,7 @@ CORRIDOR = np.array([[-50.0, -1.0, 50.0, -1.0], [50.0, 1.0, -50.0, 1.0]])
 
 
 def in_corridor(rng, beams, edges=False):
-    """Surface points, and how far their normals are off those of the walls, degrees."""
+    """Surface points, and the errors of their normals, degrees."""
     pose = np.array([0.0, rng.uniform(-0.3, 0.3), rng.uniform(-0.3, 0.3)])
     if edges:
         scan = scan_in(CORRIDOR, pose, rng, beams=beams)
@@ -202,7 +202,7 @@ def in_corridor(rng, beams, edges=False):
 
 @pytest.mark.parametrize('beams', [61, 181, 721])
 def test_across_a_corridor_there_is_no_surface(rng, beams):
-    """The last beams of both walls at the laser's limit of 8 m are neighbours in the scan alone."""
+    """The last beams of both walls, at the range limit of 8 m, are neighbours in the scan only."""
     far = 0
     for _ in range(50):
         points, off = in_corridor(rng, beams)
@@ -213,13 +213,13 @@ def test_across_a_corridor_there_is_no_surface(rng, beams):
 
 
 def test_few_ranges_in_between_make_a_surface_across_a_corridor(rng):
-    """A third of all beams that meet a wall far from their neighbours end before it or behind."""
+    """A third of the beams at range jumps end between the two surfaces (mixed pixels)."""
     off = np.concatenate([in_corridor(rng, 181, edges=True)[1] for _ in range(200)])
     assert 0.0 < np.mean(off > 20.0) < 0.002
 
 
 def test_points_that_are_left_out_part_the_scan_too():
-    """Beyond the range that is asked for nothing is left, and nothing is linked through it."""
+    """Points beyond the range are dropped, and do not link others."""
     walls = np.array([[-50.0, -1.0, 50.0, -1.0], [50.0, 1.0, -50.0, 1.0], [7.0, -1.0, 7.0, 1.0]])
     scan = scan_in(walls, np.zeros(3), beams=61)
     points = surface_points(scan, 5.0)
@@ -230,13 +230,13 @@ def test_points_that_are_left_out_part_the_scan_too():
 
 
 def test_lone_points_are_dropped():
-    """A thin post before a wall, met by one beam, and the edges that are a range in between."""
+    """A thin post in front of a wall, hit by one beam, and mixed pixels at its edges."""
     wall = [4.0, -8.0, 4.0, 8.0]
     post = [2.0, -0.005, 2.0, 0.005]
     points = seen_in(np.array([wall, post]), np.zeros(3))
     assert points[:, 0].min() > 3.9
     assert len(points) > 100
-    both = np.array([wall, [2.0, -0.05, 2.0, 0.05]])  # a thick one is met by three
+    both = np.array([wall, [2.0, -0.05, 2.0, 0.05]])  # a thick one is hit by three
     assert np.count_nonzero(seen_in(both, np.zeros(3))[:, 0] < 3.0) == 3
 
 
@@ -249,7 +249,7 @@ def test_a_corner_is_less_sure_than_a_wall():
 
 
 def test_what_scatters_has_no_sure_normal(rng):
-    """A bush: ranges that differ by far more than their noise, from beam to beam."""
+    """A bush: ranges of adjacent beams differ by much more than their noise."""
     points = np.column_stack([2.0 + rng.normal(0.0, 0.05, 300), 0.01 * np.arange(300)])
     found = surface._surface(points, np.arange(300))
     assert len(found) > 280
@@ -285,13 +285,13 @@ def test_a_clockwise_laser_sees_the_same(rng):
 @settings(max_examples=150)
 @given(data=st.data(), number=st.integers(0, 40))
 def test_any_points_of_any_beams_have_a_surface(data, number):
-    """Also where some lie in one place or on one line; what comes in is not changed."""
+    """Also for coincident or collinear points; the input is not changed."""
     coordinates = st.sampled_from([-0.1, 0.0, 0.05, 0.1, 0.1000001, 2.0]) | st.floats(-30.0, 30.0)
     flat = data.draw(st.lists(coordinates, min_size=2 * number, max_size=2 * number))
     gaps = data.draw(st.lists(st.integers(1, 3), min_size=number, max_size=number))
     points = np.array(flat, dtype=float).reshape(-1, 2)
     beams = np.cumsum(gaps, dtype=np.int64)
-    # No laser has two adjacent beams that end in the very same place.
+    # No laser has two adjacent beams with identical end points.
     assume(np.hypot(*np.diff(points, axis=0).T).min(initial=1.0) > 1e-9)
     given_points = points.copy()
     given_beams = beams.copy()
