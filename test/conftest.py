@@ -1,4 +1,4 @@
-"""What all tests share."""
+"""Fixtures and options of all tests."""
 
 import os
 import signal
@@ -19,13 +19,12 @@ SHARED = next(
     ROOT.parent / 'shared',
 )
 
-# How long an example takes says more about the machine than about the code; the same examples every
-# time.
+# No deadline: the time of an example depends on the machine. The same examples in every run.
 settings.register_profile('thinmap', deadline=None, derandomize=True)
 settings.load_profile('thinmap')
 
-# A shell's job in the background is born deaf to Ctrl-C, and so would be the programs that tests
-# start and interrupt.
+# A background job of a shell ignores SIGINT, and so would the programs that tests start and
+# interrupt.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -33,7 +32,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Compile the kernels before any test: `colcon test` in a workspace that was just built.
 
-    Within the tests it would take the time of those that come first. scripts/env has done it.
+    Otherwise the first tests would include the compilation. scripts/env compiles them, too.
     """
     is_worker = hasattr(session.config, 'workerinput')
     if not is_worker and not session.config.option.collectonly and 'THINMAP_ENV' not in os.environ:
@@ -51,7 +50,7 @@ def without_ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def started_programs(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A test that starts a process says so: unit tests are those that start none."""
+    """Tests that start a process are marked: unit tests start none."""
     if any(request.node.get_closest_marker(name) for name in ('programs', 'live')):
         return
 
@@ -72,8 +71,8 @@ def shared_data() -> Path:
 
 @pytest.fixture
 def ros_domain(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[int]:
-    """A ROS domain that no other process of this machine's tests uses, for what a test starts."""
-    # What killed nodes leave concerns no other test.
+    """A ROS domain that no other test process on this machine uses."""
+    # Checkpoints of killed nodes must not affect other tests.
     monkeypatch.setenv('THINMAP_STATE_DIR', str(tmp_path / 'state'))
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     with free_domain() as domain:

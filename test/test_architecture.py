@@ -1,4 +1,4 @@
-"""Which module may import what: the doors of docs/architecture.md, read from the source."""
+"""Allowed imports between packages, as in docs/architecture.md, and limits of the code style."""
 
 import ast
 import subprocess
@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / 'thinmap_ros'
-# What each room may import from the others; core's ground floor is 'core' and 'core.grid'.
+# Allowed imports of each package; the base layers of core are 'core' and 'core.grid'.
 CORE = {'core', 'core.grid'}
 TOPOLOGY = CORE | {'core.topology'}
 ROOMS = {
@@ -62,7 +62,7 @@ SOURCES = sorted(PACKAGE.rglob('*.py'))
 
 
 def room_of(module):
-    """Room of a dotted module below thinmap_ros."""
+    """Package of a dotted module below thinmap_ros."""
     parts = module.split('.')
     if parts[0] == 'core' and len(parts) > 1 and (PACKAGE / 'core' / parts[1]).is_dir():
         return f'core.{parts[1]}'
@@ -75,7 +75,7 @@ def imports(tree):
             yield from (name.name for name in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, 'relative import'
-            # `from package import module` is an import of the module where there is one.
+            # `from package import module` is an import of the module if it exists.
             for name in node.names:
                 path = PACKAGE.parent.joinpath(*node.module.split('.'), name.name)
                 is_module = path.is_dir() or path.with_suffix('.py').exists()

@@ -97,7 +97,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     target = tmp_path_factory.mktemp('installed')
     pip = [sys.executable, '-m', 'pip', 'install', '--quiet', '--no-deps', '--no-index']
     pip += ['--no-build-isolation', '--disable-pip-version-check', '--target', str(target)]
-    # In pip's own environment: no package of the source tree hides the one that is built.
+    # In pip's isolated environment: no package of the source tree hides the installed one.
     environment = {k: v for k, v in os.environ.items() if k != 'PYTHONPATH'}
     done = subprocess.run(
         [*pip, str(source)], capture_output=True, text=True, env=environment, cwd=target

@@ -1,4 +1,4 @@
-"""Each example runs as its docstring says, without ROS, and uses public names only."""
+"""Each example runs as in its docstring, without ROS, and uses public names only."""
 
 import ast
 import re

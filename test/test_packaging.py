@@ -1,4 +1,4 @@
-"""The package as colcon, rosdep and `ros2 run` see it."""
+"""The package for colcon, rosdep and `ros2 run`."""
 
 import ast
 import subprocess
@@ -20,7 +20,7 @@ PROGRAMS = sorted(path.stem for path in MODULES if 'def main(' in path.read_text
 TOOLS = sorted(
     path.stem for path in (PACKAGE / 'tools').glob('*.py') if 'ArgumentParser(' in path.read_text()
 )
-# rosdep keys of what is imported or installed under another name.
+# rosdep keys of packages that are imported or installed under another name.
 KEYS = {
     'PIL': 'python3-pil',
     'pillow': 'python3-pil',
@@ -28,12 +28,12 @@ KEYS = {
     'pyyaml': 'python3-yaml',
     'rosbags': 'python3-rosbags-pip',
     'mcap': 'python3-mcap-pip',
-    'lz4': 'python3-mcap-pip',  # comes with mcap, as zstandard
+    'lz4': 'python3-mcap-pip',  # a dependency of mcap, as zstandard
     'zstandard': 'python3-mcap-pip',
     'cv2': 'python3-opencv',
     'opencv-contrib-python-headless': 'python3-opencv',
     'scikit-image': 'python3-skimage',
-    'pytest-xdist': None,  # there is none; it only runs tests side by side
+    'pytest-xdist': None,  # no key; it only runs tests in parallel
 }
 # Keys of rosdistro's rosdep/python.yaml, read in its commit 662921b on 2026-11-22; of two that were
 # added or widened to Ubuntu 24.04 later: its pull requests 37795 (rosbags) and 36477 (numba).
@@ -83,7 +83,7 @@ LOCKS = {
 }
 # Optional, and named in setup.py as extras.
 EXTRAS = {'rerun', 'dask', 'distributed'}
-# What builds and what checks the code: it runs without.
+# Tools for building and checking the code, not needed at run time.
 BUILDERS = {'colcon-common-extensions', 'catkin-pkg', 'setuptools'}
 CHECKERS = {'ruff', 'mypy', 'types-pyyaml', 'types-tqdm', 'scipy-stubs'}
 
@@ -98,7 +98,7 @@ CHECKERS = {'ruff', 'mypy', 'types-pyyaml', 'types-tqdm', 'scipy-stubs'}
 def test_every_import_has_its_key_in_package_xml(folder, tags):
     wanted = set()
     own = {'thinmap_ros'} | {path.stem for path in (ROOT / 'test').rglob('*.py')}
-    # A test names a helper in another folder of the tests by both.
+    # A test names a helper in another test folder by both parts.
     own |= {path.name for path in (ROOT / 'test').iterdir() if path.is_dir()}
     own |= {'benchmarks', 'fuzz', 'scripts'} if folder == 'test' else set()
     for path in (ROOT / folder).rglob('*.py'):
@@ -128,19 +128,19 @@ def test_rosdep_knows_every_key():
 
 
 def names_in(path):
-    """Names of requirements, as the index of packages spells them, and their pinned versions."""
+    """Names of requirements, as spelled by the package index, and their pinned versions."""
     lines = [line.partition('#')[0].strip() for line in path.read_text().splitlines()]
     pairs = [line.partition('==') for line in lines if line]
     return {name.lower().replace('_', '-'): pinned for name, _, pinned in pairs}
 
 
 def bare(requirements):
-    """Names without their bounds."""
+    """Names without version bounds."""
     return {name.partition('>')[0].partition('<')[0] for name in requirements}
 
 
 def asked_in_setup_py():
-    """What thinmap needs, and its extras."""
+    """Requirements of thinmap, and its extras."""
     tree = ast.parse((ROOT / 'setup.py').read_text())
     given = {node.arg: node.value for node in ast.walk(tree) if isinstance(node, ast.keyword)}
     return [ast.literal_eval(given[name]) for name in ('install_requires', 'extras_require')]

@@ -1,4 +1,4 @@
-"""All strategies ours is compared with: each finishes a small world, and chooses as it says."""
+"""Baseline strategies: each finishes a small world, and chooses targets as documented."""
 
 import math
 
@@ -57,7 +57,7 @@ def test_the_literal_scheme_sets_out_and_stops_by_itself() -> None:
 
 
 def after_a_look(strategy: FrontierExplorer, cells: np.ndarray, pose: np.ndarray) -> list[Frontier]:
-    """Frontiers of a map as the strategy sees them from a pose."""
+    """Frontiers of a map as the strategy finds them from a pose."""
     scan = Scan.create(0, np.full(181, np.nan), -math.pi / 2, math.pi / 180, 0.05, 8.0)
     strategy.map.update(GridPatch(GridFrame(0.0, 0.0, 0.1), cells.astype(np.int8)), scan, pose)
     return strategy.map.find(pose)
@@ -149,9 +149,9 @@ def test_an_edge_is_followed_to_its_end_though_another_end_comes_nearer() -> Non
         return target.x
 
     assert goes_to(7.9, 2.0) == 2.0
-    # More is seen, and the end recedes: the other one is nearer now.
+    # The frontier recedes: the other one is nearer now.
     assert [goes_to(7.9, x) for x in (1.8, 1.5, 1.3)] == pytest.approx([1.8, 1.5, 1.3], abs=0.35)
-    # It was there.
+    # The robot has reached it.
     assert goes_to(1.2, 1.2) == 14.0
 
 
@@ -161,7 +161,7 @@ def test_explore_lite_gives_up_what_comes_no_nearer_also_if_it_goes_to_and_fro()
     places = []
     failed = []
     for second in range(120):
-        # Now one is cheaper, then the other one, as where the map grows at its rims.
+        # The cheaper target alternates, as when frontiers move.
         pose = np.array([7.0 if second % 2 else 9.0, 4.0, 0.0])
         scan = Scan.create(
             second * 10**9, np.full(181, np.nan), -math.pi / 2, math.pi / 180, 0.05, 8.0
@@ -175,7 +175,7 @@ def test_explore_lite_gives_up_what_comes_no_nearer_also_if_it_goes_to_and_fro()
 
 
 def test_an_end_node_that_comes_no_nearer_counts_as_visited() -> None:
-    """A robot that does not get there, as if the end in a wide hall went wherever it goes."""
+    """A robot that never reaches its target, as if the frontier receded in a wide hall."""
     strategy = VisitAllEndNodes()
     patch = GridPatch(GridFrame(0.0, 0.0, 0.1), corridor().astype(np.int8))
     nodes = [Node(k + 1, NodeKind.END, x, 4.0, 1.0) for k, x in enumerate((2.0, 14.0))]
@@ -195,7 +195,7 @@ def test_an_end_node_that_comes_no_nearer_counts_as_visited() -> None:
 
 
 def test_who_drives_along_the_graph_goes_back_where_it_came_through() -> None:
-    """A passage of two cells: too narrow on the map for the others, once it is behind."""
+    """A passage of two cells: too narrow for the other strategies once it is passed."""
     cells = corridor()
     cells[:, 60:62] = 100
     cells[39:41, 60:62] = 0

@@ -1,4 +1,4 @@
-"""The Voronoi topology of plain shapes."""
+"""The Voronoi topology of simple shapes."""
 
 import numpy as np
 import pytest

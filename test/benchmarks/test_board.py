@@ -1,4 +1,4 @@
-"""The board of the scoreboard: replays of recorded drives, its table, and small real runs."""
+"""The board of the scoreboard: replay of recorded drives, its table, and small real runs."""
 
 import json
 import sys
@@ -33,7 +33,7 @@ def office(tmp_path_factory):
 
 
 def driven(simulation):
-    """All moments of the commands with a scan: scan, odometry, true pose."""
+    """Scan, odometry and true pose at all steps of the commands with a scan."""
     moments = [simulation.read_sensors()]
     poses = [simulation.robot.T_world_base]
     for command in COMMANDS:
@@ -184,7 +184,7 @@ def test_loops_logs_and_buildings_are_judged():
 
 
 def called(*words):
-    """Call the program in this process; exit code."""
+    """Run the program in this process; returns the exit code."""
     with patch.object(sys, 'argv', ['scoreboard', '--board', *map(str, words)]):
         try:
             program.main()
@@ -228,7 +228,7 @@ def test_a_small_board_goes_on_where_it_was(small_board, capsys):
     cases = (small_board / 'cases.md').read_text()
     assert '| drive_office.odometry_1 |' in cases
     assert '| loop_office.turtlebot3_1 |' in cases
-    # Other options need another folder, but not other recordings; two folders are compared.
+    # Other options need another folder with the same recordings; two folders are compared.
     assert called(*words, '--set', 'slam=ekf_ti') == 2
     assert 'other options' in capsys.readouterr().err
     other = ['-o', small_board / 'other', '--recordings', small_board / 'drives']

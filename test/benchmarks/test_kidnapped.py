@@ -1,6 +1,6 @@
-"""Lost robots by the hundred.
+"""Benchmark of kidnapped robots.
 
-What is in the files is not run again, and the page is made of them.
+Existing results are not computed again, and the page is made from them.
 """
 
 from pathlib import Path

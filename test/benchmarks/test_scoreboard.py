@@ -1,4 +1,4 @@
-"""The scoreboard: its page and comparisons, what it runs again, and small real runs."""
+"""The scoreboard: its page, comparisons, resuming, and small real runs."""
 
 import argparse
 import json
@@ -58,7 +58,7 @@ def of_log(case, path):
 
 
 def straight(sideways_m):
-    """Path of 11 poses along x, from the third one on so far to the side."""
+    """Path of 11 poses along x, with an offset to the side from the third one on."""
     return [[float(k), float(k), sideways_m * (k > 2), 0.0] for k in range(11)]
 
 
@@ -72,7 +72,7 @@ def test_a_degraded_log_without_relations_is_judged_by_the_undegraded_one(report
     found = errors(CASES, reports)
     assert found[0] == 0.0
     assert found[1] == pytest.approx(0.5 * math.sqrt(8 / 11))
-    assert errors(CASES[1:], reports[1:])[0] == MOST_M  # nothing to judge it by
+    assert errors(CASES[1:], reports[1:])[0] == MOST_M  # no ground truth
 
 
 def test_the_worst_tenth_is_one_number_and_named(reports):
@@ -155,7 +155,7 @@ def test_all_that_was_asked_for_is_a_case(tmp_path):
     assert {f'aces.{version}' for version in DEGRADED} | {*names} <= logs.keys()
     for name in ('intel', 'sena', 'mrpt_office'):
         assert {f'{name}.every_2', f'{name}.every_5', f'{name}.rate_1hz'} <= logs.keys()
-    # Poses are moved to the stamps of relations wherever these are meant to be exact.
+    # Poses are interpolated at the stamps of relations if these are exact.
     assert {name for name, case in logs.items() if case.exact_s < 0.1} == {
         name for name in logs if name.startswith('intel_raw') or name == 'intel.rate_1hz'
     }
@@ -257,7 +257,7 @@ def test_the_page_tells_mean_and_worst_of_several_runs(reports):
 
 
 def called(*words):
-    """Call the program in this process; exit code."""
+    """Run the program in this process; returns the exit code."""
     with patch.object(sys, 'argv', ['scoreboard', *map(str, words)]):
         try:
             program.main()
@@ -267,7 +267,7 @@ def called(*words):
 
 
 def write_log(folder, scans):
-    """A log of a robot that stands in a room of 6 x 6 m."""
+    """A log of a stationary robot in a room of 6 x 6 m."""
     angles = np.radians(np.arange(-90.0, 90.0))
     ranges = 3.0 / np.maximum(np.abs(np.cos(angles)), np.abs(np.sin(angles)))
     beams = ' '.join(f'{each:.3f}' for each in ranges)
@@ -290,7 +290,7 @@ def test_it_goes_on_where_it_was_and_one_that_fails_stops_no_other(tmp_path, cap
     text = (out / 'scoreboard.md').read_text()
     assert '| try_1 | | failed: ' in text
     assert '| try_2 | 8 | 0.000 (ours) |' in text
-    # What is there is not run again; what failed is.
+    # Existing results are not computed again; failed ones are.
     file = out / 'results' / 'try_2.json'
     file.write_text(json.dumps(json.loads(file.read_text()) | {'scans': 12345}))
     write_log(logs / 'try_1', 6)
@@ -299,7 +299,7 @@ def test_it_goes_on_where_it_was_and_one_that_fails_stops_no_other(tmp_path, cap
     assert '| try_1 | 6 |' in text
     assert '| try_2 | 12345 |' in text
     assert 'worst tenth, live: 0.000 m' in capsys.readouterr().out
-    # Nor is what was run otherwise taken for it.
+    # Results of other options are not used.
     assert called(*words, '--set', 'slam=ekf_ti') == 2
     assert 'other options' in capsys.readouterr().err
     assert called(*words, '--against', out) == 0

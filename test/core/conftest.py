@@ -1,4 +1,4 @@
-"""The random numbers of each test."""
+"""Random generator with a fixed seed for each test."""
 
 import numpy as np
 import pytest

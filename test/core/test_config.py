@@ -1,4 +1,4 @@
-"""Values are checked where a configuration is made."""
+"""Configurations check their values."""
 
 import math
 from dataclasses import dataclass

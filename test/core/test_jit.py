@@ -1,4 +1,4 @@
-"""Kernels are compiled without bounds checks, and with them where that is asked for."""
+"""Kernels are compiled without bounds checks, or with them on request."""
 
 import os
 import subprocess
@@ -23,7 +23,7 @@ beyond(memory[:4], 4)
 @pytest.mark.programs
 @pytest.mark.parametrize('checked', [False, True])
 def test_bounds_are_checked_where_that_is_asked_for(tmp_path, checked):
-    """scripts/test runs all tests of core once so: this says that such a run can find something."""
+    """scripts/test runs all tests of core once like this: such a run finds errors."""
     (tmp_path / 'outside.py').write_text(MODULE)
     environment = {**os.environ, 'NUMBA_BOUNDSCHECK': str(int(checked))}
     environment['NUMBA_CACHE_DIR'] = str(tmp_path / 'cache')

@@ -49,7 +49,7 @@ report.end()
 
 
 class Install:
-    """A copy of the package with a kernel of its own, in a folder, and programs run with it."""
+    """A copy of the package in a folder, with an additional kernel, and programs that use it."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -62,15 +62,15 @@ class Install:
         self.set_gain(2.0)
 
     def set_gain(self, gain: float) -> None:
-        """Change a constant of another module than the kernel's."""
+        """Change a constant in another module than that of the kernel."""
         (self.package / 'core' / 'constant.py').write_text(CONSTANT.format(gain=gain))
 
     def close_to_writing(self) -> None:
-        """Leave no room beside the package, for root neither."""
+        """Make the folder of the package unwritable, also for root."""
         (self.package / '__pycache__').touch()
 
     def run(self, **variables: str) -> tuple[list[str], str]:
-        """What the program prints: value and folder; and what it says on stderr."""
+        """Output of the program: value and folder; and its stderr."""
         environment = {**os.environ, 'PYTHONPATH': str(self.folder), 'PYTHONDONTWRITEBYTECODE': '1'}
         for name in ('NUMBA_CACHE_DIR', 'XDG_CACHE_HOME', 'HOME'):
             environment.pop(name, None)
@@ -100,7 +100,7 @@ def test_the_first_run_says_that_it_compiles_and_later_ones_need_not(install: In
 
 
 def test_a_kernel_follows_what_it_imports(install: Install) -> None:
-    """Numba itself looks at the kernel's own module alone, and would say 6.0 for ever."""
+    """Numba's own cache only checks the module of the kernel, and would return 6.0 forever."""
     install.run()
     install.set_gain(5.0)
     (value, _), said = install.run()
@@ -109,7 +109,7 @@ def test_a_kernel_follows_what_it_imports(install: Install) -> None:
 
 
 def test_a_kernel_whose_types_have_moved_is_compiled_again(install: Install) -> None:
-    """As when a module of an earlier version has another name in this one."""
+    """As when a module was renamed since an earlier version."""
     core = install.package / 'core'
     (core / 'pair.py').write_text(PAIR)
     (core / 'amplifier.py').write_text(MODULE_OF_PAIRS)
@@ -148,7 +148,7 @@ def test_without_a_home_they_are_kept_among_the_temporary_files(install: Install
 
 
 def test_kernels_are_not_kept_where_others_may_write(install: Install) -> None:
-    """They are code."""
+    """Cache files contain code."""
     install.close_to_writing()
     private = install.folder / f'thinmap-{os.getuid()}'
     private.mkdir()

@@ -1,4 +1,4 @@
-"""Odometry at the stamp of a scan, whatever order things come in."""
+"""Odometry at the stamp of a scan, for any order of arrival."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Which beams say what."""
+"""Classification of beams."""
 
 import math
 
@@ -92,7 +92,7 @@ def test_a_range_says_one_thing_or_nothing(value, name):
 
 
 def test_a_driver_that_publishes_zero_for_no_return_says_so():
-    """The LDS of the TurtleBot 3; zero frees nothing all the same."""
+    """The LDS of the TurtleBot 3; a range of zero still frees no cells."""
     scan = one_range(0.0, zero_is_no_return=True)
     assert scan.valid.all()
     assert not scan.is_blind

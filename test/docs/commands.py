@@ -1,6 +1,6 @@
 """Command lines in the documentation.
 
-A command is each line of a block of code, and each span of code in the text that begins like one.
+Each line of a code block is a command, and so is each code span in the text that starts like one.
 A block fenced as Python is no command: `python_blocks` gives it.
 `<!-- not run -->` on the line before a block or paragraph, or in front of a span, marks it.
 """
@@ -21,7 +21,7 @@ _CODE_INDENT = 4
 
 @dataclass(frozen=True)
 class Command:
-    """One command as it stands, where it stands, and whether it is marked as not run."""
+    """One command, its position in the document, and whether it is marked as not run."""
 
     document: str
     section: str
@@ -50,7 +50,7 @@ def commands(path: Path) -> list[Command]:
 
 
 def marks(path: Path) -> int:
-    """How many marks a document has."""
+    """Number of marks in a document."""
     return path.read_text().count(MARK)
 
 

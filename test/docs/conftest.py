@@ -1,3 +1,3 @@
-"""What the tests of documents share with the live ones."""
+"""Fixtures that the tests of documents share with the live tests."""
 
 from support.live_graph import graph as graph

@@ -1,6 +1,6 @@
-"""config/*.yaml says for people what the nodes declare: every parameter, its default, its meaning.
+"""config/*.yaml contain every parameter that the nodes declare, its default and its description.
 
-THINMAP_WRITE_CONFIG=1 writes the files anew from what is declared.
+THINMAP_WRITE_CONFIG=1 rewrites the files from the declarations.
 """
 
 import json
@@ -19,7 +19,7 @@ from thinmap_ros.ros import parameters
 
 @pytest.fixture
 def declared(ros_domain, tmp_path, monkeypatch):
-    """Value and descriptor of a node's parameters, by name, as it starts with some arguments."""
+    """Value and descriptor of a node's parameters by name, when started with some arguments."""
     monkeypatch.chdir(tmp_path)
     BagWriter(tmp_path / 'some_bag', live=True).close()
 
@@ -97,7 +97,7 @@ def test_config_file_says_what_the_node_declares(declared, name):
     if 'THINMAP_WRITE_CONFIG' in os.environ:
         path.write_text(text)
     assert path.read_text() == text, (
-        f'{path.name}: see the top of {__file__} for how to write it anew'
+        f'{path.name}: see the top of {__file__} for how to regenerate it'
     )
 
 
@@ -105,7 +105,7 @@ def test_config_file_says_what_the_node_declares(declared, name):
 def test_node_takes_its_config_file(declared, tmp_path, name):
     content = yaml.safe_load((ROOT / 'config' / f'{name}.yaml').read_text())
     values = content['/**']['ros__parameters']
-    # A value that is no default proves that the file is read at all.
+    # A value that is not the default proves that the file is read.
     values['use_sim_time'] = True
     values |= NEEDED.get(name, {})
     (tmp_path / 'given.yaml').write_text(yaml.safe_dump({'/**': {'ros__parameters': values}}))
@@ -127,7 +127,7 @@ def test_there_is_a_file_for_each_node_and_no_other():
 
 
 def test_robot_file_is_accepted_by_every_node_and_has_its_defaults(declared):
-    """One file describes the robot to all nodes."""
+    """One file describes the robot for all nodes."""
     path = ROOT / 'config' / 'robot.yaml'
     values = yaml.safe_load(path.read_text())['/**']['ros__parameters']
     assert sorted(values) == sorted(parameters.ROBOT)

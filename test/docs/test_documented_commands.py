@@ -1,4 +1,4 @@
-"""Every command line of README.md and docs/tutorials.md runs as it stands there.
+"""Every command line of README.md and docs/tutorials.md runs as documented.
 
 The commands of a section are given to bash one after the other, in a shell as `source scripts/env`
 makes it, in a folder where the files have the names that the text uses. A section that is new has
@@ -58,25 +58,25 @@ NOT_RUN = {
 }
 MOST_MARKS = 6
 
-# Too long for every run: these ask for help only, so that script, program and options are there.
+# Too long for every run: only their help is run, to check script, program and options.
 HELP_ONLY = {
     'scripts/demo': 'test/live/test_demo.py runs the demo to its end',
     'scripts/endurance': 'hours; scripts/endurance --minutes 10 is for releases',
     'scripts/experiments/all.sh': 'test/experiments/test_experiments.py runs each experiment',
 }
-# Shortened by what the same lines of the documents say.
+# Shortened by options that the same lines of the documents name.
 SHORTER = {
     'scripts/test': 'scripts/test test/core/topology/test_thinning.py',
     'scripts/experiments/exploration.sh': 'scripts/experiments/exploration.sh --from-bag bags',
 }
 
-# Said by commands that end with 0 all the same.
+# Errors of commands whose exit code is 0 all the same.
 FAILED = ('Traceback', 'success=False', 'Setting parameter failed', 'Transitioning failed')
 
 
 @dataclass(frozen=True)
 class Section:
-    """What runs beside the commands of a section: nodes, with their parameters."""
+    """Nodes that run beside the commands of a section, with their parameters."""
 
     beside: dict[str, dict[str, Any]] = field(default_factory=dict)
 
@@ -115,7 +115,7 @@ def nodes_of_package() -> set[str]:
 
 
 def told_by(text: str) -> list[str]:
-    """Names under which the nodes of a command tell on /diagnostics how they are."""
+    """Names under which the nodes of a command publish on /diagnostics."""
     words = text.split('--ros-args')[0].split('#')[0].removesuffix('&').split()
     program = words[3]
     names = words[4:] or FIVE if program == 'thinmap' else [program]
@@ -125,7 +125,7 @@ def told_by(text: str) -> list[str]:
 
 
 def kind_of(text: str) -> str:
-    """What a command does in the end: goes on for ever (and how it is ended), or ends by itself."""
+    """How a command ends: by itself, or by a signal."""
     run = re.match(r'ros2 run thinmap_ros (\w+)', text)
     if run and (run[1] in nodes_of_package() or 'start_paused:=true' in text):
         return 'node'
@@ -135,12 +135,12 @@ def kind_of(text: str) -> str:
 
 
 class Line:
-    """A command of the documents, in a bash of its own, as in a terminal of its own."""
+    """A command of the documents, in its own bash, as in a separate terminal."""
 
     def __init__(self, text: str, number: int, folder: Path, environment: dict[str, str]) -> None:
         self.text = text
         self._log = folder / f'line{number}.txt'
-        # Jobs in the background have a group of their own, and hear Ctrl-C, as in a terminal.
+        # Background jobs have their own process group and receive SIGINT, as in a terminal.
         script = f'set -m\n{text}\nstatus=$?\n[ -z "$!" ] || wait $! || exit\nexit $status'
         with self._log.open('wb') as log:
             self.process = subprocess.Popen(
@@ -171,7 +171,7 @@ class Line:
             return []
 
     def end(self, code: int) -> None:
-        """Check the exit code, now or soon."""
+        """Wait for the end, and check the exit code."""
         self.process.wait(timeout=PATIENCE_S)
         assert self.process.returncode == code, f'{self.text}\n{self.said()}'
         for bad in FAILED:
@@ -228,7 +228,7 @@ def _write_scripts(folder: Path) -> None:
 
 
 def shortened(text: str) -> str:
-    """Command as it is run here: most as they stand."""
+    """Command as it is run here: most are unchanged."""
     bare = text.split('#')[0].strip()
     if bare in HELP_ONLY:
         return f'{bare} --help'
@@ -255,7 +255,7 @@ def run_section(graph: Any, lines: list[str], place: Path, environment: dict[str
 
 
 def _follow(graph: Any, line: Line, health: list[DiagnosticArray]) -> None:
-    """Wait until a command has done what it is for."""
+    """Wait until a command has had its effect."""
     kind = kind_of(line.text)
     if kind == 'node':
         names = set(told_by(line.text))

@@ -1,6 +1,6 @@
-"""docs/nodes.md says what a node listens to, says, offers and can be told, as the node declares it.
+"""docs/nodes.md lists each node's subscriptions, publishers, services and parameters as declared.
 
-THINMAP_WRITE_CONFIG=1 writes the page anew.
+THINMAP_WRITE_CONFIG=1 rewrites the page.
 """
 
 import inspect
@@ -16,7 +16,7 @@ from support.node_list import NEEDED, NODES, OF_EVERY_NODE, OWN_WORDS, ROOT, def
 from thinmap_ros.logs.bag_writer import BagWriter
 
 PAGE = ROOT / 'docs' / 'nodes.md'
-# What rclpy and its lifecycle give to every node.
+# Topics of rclpy and of its lifecycle, which every node has.
 COMMON = ('/parameter_events', '/rosout', '/clock', '/diagnostics', 'transition_event')
 HEAD = """# Nodes
 
@@ -104,7 +104,7 @@ def parameters(node, name):
 def section(name, node):
     lines = [f'## {name}', '', inspect.getmodule(type(node)).__doc__.strip(), '']
     lines += [' '.join(inspect.cleandoc(type(node).__doc__).split()), '']
-    for what, entities in (('Listens to', node.subscriptions), ('Says', node.publishers)):
+    for what, entities in (('Subscribes to', node.subscriptions), ('Publishes', node.publishers)):
         if rows := topics(entities, name):
             lines += [f'| {what} | type | quality, depth |', '|---|---|---|', *rows, '']
     for what, found in (('Services', services(node, name)), ('Actions', actions(node))):
@@ -135,7 +135,7 @@ def message_texts():
     return lines
 
 
-def test_the_page_says_what_the_nodes_declare(declared):
+def test_the_page_lists_what_the_nodes_declare(declared):
     lines = [HEAD]
     for name in NODES:
         node = declared(name)
@@ -146,6 +146,6 @@ def test_the_page_says_what_the_nodes_declare(declared):
     if 'THINMAP_WRITE_CONFIG' in os.environ:
         PAGE.write_text(text)
     assert PAGE.read_text() == text, (
-        f'{PAGE.name}: see the top of {__file__} for how to write it anew'
+        f'{PAGE.name}: see the top of {__file__} for how to regenerate it'
     )
     assert files('thinmap_ros').joinpath('nodes', 'thinmap.py').is_file()

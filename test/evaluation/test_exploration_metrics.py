@@ -1,4 +1,4 @@
-"""The census of end nodes, and the numbers that sum up an exploration."""
+"""The census of end nodes, and the summary metrics of an exploration."""
 
 import json
 

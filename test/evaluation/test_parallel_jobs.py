@@ -38,7 +38,7 @@ ONE_CORE = argparse.Namespace(processes=1, scheduler='')
 
 @dataclass(frozen=True)
 class Sum:
-    """Numbers to add up."""
+    """Numbers to be summed."""
 
     name: str
     numbers: tuple[float, ...]
@@ -53,7 +53,7 @@ def add(job):
 
 
 def is_alive(pid):
-    """Whether a process runs: one that has ended and waits to be collected does not."""
+    """Whether a process runs; a zombie does not."""
     try:
         return Path(f'/proc/{pid}/stat').read_text().rsplit(')', 1)[1].split()[0] != 'Z'
     except FileNotFoundError:

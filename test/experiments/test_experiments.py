@@ -1,6 +1,6 @@
-"""The experiments in their quick form.
+"""The experiments with option --quick.
 
-They write what they promise, always the same, and from a bag as from live.
+Their output is complete and reproducible, and the same from a bag as from live data.
 """
 
 import csv
@@ -28,13 +28,13 @@ from thinmap_ros.tools.record_bags import record
 
 ROOT = Path(__file__).resolve().parents[2]
 QUICK = Source(quick=True)
-# Bag and live differ by what float32 ranges and quaternions round off.
+# Bag and live differ by the rounding of float32 ranges and quaternions.
 POSE_TOLERANCE_M = 1e-3
 _DONE: dict[str, Outcome] = {}
 
 
 def called(*arguments: str) -> None:
-    """Call the program in this process."""
+    """Run the program in this process."""
     with patch.object(sys, 'argv', ['experiment', *arguments]):
         main()
 

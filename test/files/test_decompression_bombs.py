@@ -1,4 +1,4 @@
-"""Small files that describe something huge: refused within a moment, in one short line."""
+"""Small files that expand to huge data: rejected at once, with an error of one line."""
 
 import json
 import struct
@@ -25,7 +25,7 @@ LONGEST = 500  # characters: a path, two values and what was expected
 
 
 def nested(levels: int, repeated: str) -> str:
-    """Lists of nine times the list before, as aliases."""
+    """Lists of nine aliases of the previous list each."""
     lines = [f'a0: &a0 [{repeated}]']
     for i in range(1, levels):
         lines.append(f'a{i}: &a{i} [{", ".join(9 * [f"*a{i - 1}"])}]')
@@ -73,7 +73,7 @@ def test_yaml_bombs(tmp_path: Path, name: str, read: object) -> None:
         assert len(str(error)) <= LONGEST and '\n' not in str(error)
     else:
         assert read is read_tour, 'a tour is no more than a part of a world, which may have none'
-    # A moment's work on a slow machine, too: before, some of these took minutes.
+    # Fast on a slow machine, too: without limits some of these took minutes.
     assert time.process_time() - begun < 10.0
 
 
@@ -165,7 +165,7 @@ def chunk(kind: bytes, data: bytes) -> bytes:
 
 
 def png(width: int, height: int, *extra: bytes) -> bytes:
-    """A PNG of one colour, 1 bit a pixel, compressed as far as it goes."""
+    """A PNG of one colour, 1 bit per pixel, with the highest compression."""
     row = b'\0' + (width + 7) // 8 * b'\xff'
     packer = zlib.compressobj(9)
     rows = b''.join(packer.compress(row) for _ in range(height)) + packer.flush()
@@ -176,7 +176,7 @@ def png(width: int, height: int, *extra: bytes) -> bytes:
 
 
 def peak_mb(path: Path) -> tuple[float, str]:
-    """Peak memory of reading a map, MB above that of a small one, and its shape or the error."""
+    """Peak memory of reading a map, in MB above that of a small one, and its shape or error."""
     code = """
 import sys
 from pathlib import Path

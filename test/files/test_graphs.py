@@ -1,4 +1,4 @@
-"""Route graphs: what Nav2's reader asks for, and that nothing is lost on the way."""
+"""Route graphs: the format of Nav2's reader, and lossless round trips."""
 
 import json
 from pathlib import Path

@@ -1,6 +1,6 @@
 """map_server files.
 
-What we write others read as we meant it, and what others write we read as they do.
+Compatible with other readers and writers of the format.
 """
 
 from pathlib import Path

@@ -1,6 +1,6 @@
-"""What is read is bounded.
+"""Limits of reading files.
 
-A small file that expands or nests without end is refused in one line and little memory.
+A small file that expands or nests without bounds is rejected in one line, with little memory.
 """
 
 import functools
@@ -41,7 +41,7 @@ finally:
 
 
 def run(tool: str, *arguments: Path | str) -> tuple[int, str, int]:
-    """Exit code, last line of complaint, and peak memory, MB, of a program."""
+    """Exit code, last line of stderr, and peak memory (MB) of a program."""
     command = [sys.executable, '-c', RUNNER, f'thinmap_ros.tools.{tool}', *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert 'Traceback' not in done.stderr, done.stderr[-2000:]
@@ -50,7 +50,7 @@ def run(tool: str, *arguments: Path | str) -> tuple[int, str, int]:
 
 
 def bomb(path: Path, compression: str, packed: bytes, claimed: int) -> Path:
-    """An MCAP file of one chunk that claims to expand to so many bytes."""
+    """An MCAP file of one chunk with a declared size in bytes."""
     builder = RecordBuilder()
     Header('ros2', 'test').write(builder)
     Schema(id=1, name='std_msgs/msg/String', encoding='ros2msg', data=b'string data').write(builder)
@@ -64,7 +64,7 @@ def bomb(path: Path, compression: str, packed: bytes, claimed: int) -> Path:
 
 @functools.cache
 def packed_zeros(compression: str, size: int) -> bytes:
-    """So many zeros, compressed piece by piece."""
+    """A number of zeros, compressed in pieces."""
     piece = bytes(2**20)
     if compression == 'lz4':
         packer = lz4.frame.LZ4FrameCompressor()
@@ -134,7 +134,7 @@ def _schema_parts() -> tuple[bytes, bytes]:
 
 
 def schema_record(number: int) -> bytes:
-    """An empty schema with a number; RecordBuilder takes ten times as long."""
+    """An empty schema with an id; RecordBuilder would take ten times as long."""
     before, after = _schema_parts()
     return before + number.to_bytes(2, 'little') + after
 
@@ -153,7 +153,7 @@ def test_definitions_without_end_are_refused(tmp_path: Path) -> None:
 
 
 def laughs() -> str:
-    """A document of some hundred characters that stands for 10^9 values."""
+    """A document of some hundred characters that expands to 10^9 values."""
     lines = ['a0: &a0 [x, x, x, x, x, x, x, x, x, x]']
     for k in range(1, 10):
         names = ', '.join([f'*a{k - 1}'] * 10)
@@ -163,7 +163,7 @@ def laughs() -> str:
 
 @pytest.fixture
 def in_short() -> Iterator[None]:
-    """No more than a moment of work; what others do on the machine meanwhile does not count."""
+    """A limit of CPU time, so that other processes on the machine do not count."""
     begun = time.process_time()
     yield
     assert time.process_time() - begun < 20.0
@@ -185,7 +185,7 @@ def test_metadata_that_grow_in_memory_are_not_read(tmp_path: Path, said: str) ->
     writer.__exit__(None, None, None)
     (tmp_path / 'bag' / 'metadata.yaml').write_text(YAML_BOMBS[said]())
     bag = Bag(tmp_path / 'bag')
-    # The bag itself is whole, and is read without it.
+    # The bag itself is complete, and is read without the metadata.
     assert set(bag.topics) == {'/said'}
     assert re.search(f'metadata.yaml.*{said}', bag.damage)
     assert len(bag.damage) < 400

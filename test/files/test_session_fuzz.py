@@ -1,4 +1,4 @@
-"""Saved states with one array replaced: refused in one line, or as good as the saved one."""
+"""Saved states with one array replaced: rejected in one line, or valid."""
 
 import json
 import os
@@ -92,34 +92,34 @@ def test_what_a_killed_localizer_left() -> None:
 # Archives.
 
 PARTS = {part.name: part for part in sessions.PARTS}
-# The largest number of whole numbers, or one of 300 digits; -1 in whole numbers, NaN in others.
+# The largest integer, or a number of 300 digits; -1 for integers, NaN for others.
 LARGE = b'\x7f'
 MINUS_ONE = b'\xff'
-# Where -1 is a number like others, and where NaN stands for "not known".
+# Arrays in which -1 is valid, and arrays in which NaN means "not known".
 MAY_BE_NEGATIVE = {
     'topology': {'low', 'memory'},
     'grid': {'tiles', 'log_odds'},
     'localizer': {'tiles'},
     'exploration': set[str](),
 }
-# Counts of a byte each, of which any is possible.
+# Counts of a byte each, for which any value is valid.
 MAY_BE_ANY = {'localizer': {'seen'}}
 MAY_BE_NAN = {'localizer': {'spans'}, 'exploration': {'tracks'}}
 
 
 def label(kind: str) -> bytes:
-    """The member of an archive that says what it holds."""
+    """The member of an archive that describes its contents."""
     return npy(np.array(f'{kind} {VERSION}'))
 
 
 def saved(folder: Path, kind: str, state: State) -> Path:
-    """An archive as files.sessions writes it."""
+    """An archive in the format of files.sessions."""
     members = {name: npy(array) for name, array in state.items()}
     return archive(folder / f'a{PARTS[kind].ending}', thinmap_format=label(kind), **members)
 
 
 def overwritten(array: np.ndarray, byte: bytes) -> np.ndarray:
-    """An array of the same type and shape with every byte the same."""
+    """An array of the same type and shape with equal bytes."""
     return np.frombuffer(byte * array.nbytes, dtype=array.dtype).reshape(array.shape)
 
 
@@ -148,7 +148,7 @@ def test_what_no_field_may_hold_is_refused_by_its_name(
 
 
 class Evil:
-    """An object that does something when it is unpickled."""
+    """An object with a side effect when it is unpickled."""
 
     def __init__(self, path: str) -> None:
         self.path = path
@@ -185,7 +185,7 @@ def test_headers_of_arrays(tmp_path: Path, kind: str, name: str) -> None:
 def test_nothing_is_unpickled(tmp_path: Path) -> None:
     trap = tmp_path / 'sprung'
     content = pickle.dumps(np.array([Evil(str(trap))], dtype=object), protocol=2)
-    # As many objects as fill these bytes, to match the declared size.
+    # As many objects as match the declared size in bytes.
     content += bytes(-len(content) % 8)
     member = with_header(plain((len(content) // 8,), '|O'), content)
     path = archive(tmp_path / 'a.grid.npz', thinmap_format=label('grid'), frame=member)

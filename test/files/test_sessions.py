@@ -186,7 +186,7 @@ def test_a_grid_of_nonsense_is_refused(wrong: dict[str, Array]) -> None:
 
 
 def test_a_corrected_past_moves_the_nodes_and_they_keep_their_ids() -> None:
-    """The robot's heading was wrong by a little more with each metre; then a loop was closed."""
+    """A heading error that grows with the path, then a loop closure."""
     world = building()
     poses = way()
     believed = [pose(T[0] + 0.004 * k, T[1] + 0.002 * k, T[2]) for k, T in enumerate(poses)]
@@ -211,7 +211,7 @@ def test_a_corrected_past_moves_the_nodes_and_they_keep_their_ids() -> None:
     assert len(after.edges) - len(after.nodes) == len(wanted.edges) - len(wanted.nodes)
     kept = before.keys() & after.nodes.keys()
     assert len(kept) >= len(after.nodes) / 2
-    # Where a place of the wrong map is no more, its node's number is not given to another place.
+    # Ids of nodes that a correction has removed are not reused.
     shift = [np.hypot(*(after.nodes[k].position - before[k].position)) for k in kept]
     assert max(shift) <= 2.0
     builder.update(corrected.window(poses[-1][0], poses[-1][1], 10.0), poses[-1])

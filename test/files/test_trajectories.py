@@ -1,4 +1,4 @@
-"""TUM trajectories: stamps to the nanosecond, poses to what six digits hold."""
+"""TUM trajectories: stamps to the nanosecond, poses to six digits."""
 
 import math
 from pathlib import Path

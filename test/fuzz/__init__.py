@@ -1,1 +1,1 @@
-"""Cases that nobody thought of: see scripts/fuzz."""
+"""Fuzz tests: see scripts/fuzz."""

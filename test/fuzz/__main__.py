@@ -1,4 +1,4 @@
-"""Try cases that nobody thought of on all that reads from outside, and on the core."""
+"""Fuzz tests of all readers of external data, and of the core."""
 
 import argparse
 import os
@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def parsed(words: list[str] | None) -> argparse.Namespace:
-    """What the command line says."""
+    """Options of the command line."""
     parser = argparse.ArgumentParser(prog='fuzz', description=__doc__)
     parser.add_argument('--minutes', type=float, default=10.0, help='how long (default 10)')
     parser.add_argument('--seed', type=int, help='repeats the cases of one run')
@@ -34,7 +34,7 @@ def parsed(words: list[str] | None) -> argparse.Namespace:
 
 
 def summary(outcome: Outcome, out: Path) -> str:
-    """What was tried, and what has failed."""
+    """Report of the tested cases and the failures."""
     lines = [f'{name}: {count} cases' for name, count in sorted(outcome.tried.items())]
     alike: dict[tuple[str, str], list[int]] = {}
     for source, number, why in outcome.failures:
@@ -50,14 +50,14 @@ def summary(outcome: Outcome, out: Path) -> str:
 
 
 def main(words: list[str] | None = None) -> int:
-    """Run; the exit code is 1 where a case has failed."""
+    """Run; the exit code is 1 if a case has failed."""
     arguments = parsed(words)
     seed = arguments.seed
     if seed is None:
         seed = random.SystemRandom().randrange(10**9)
-    # Once more heard where a shell's job in the background is born deaf to it.
+    # Enables SIGINT, which a background job of a shell ignores.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    # The run itself takes it from here on, to end with a summary.
+    # From here on the runner handles it, to end with a summary.
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     warnings.simplefilter('ignore')
     print(f'seed {seed}', flush=True)

@@ -1,4 +1,4 @@
-"""Bags, saved sessions and what killed nodes left, with damages."""
+"""Damaged bags, saved sessions and checkpoints."""
 
 import io
 import os
@@ -33,7 +33,7 @@ def drive_messages(folder: Path) -> list[Any]:
 
 
 def read_strange_bodies(shared: list[Any], rng: np.random.Generator, folder: Path) -> None:
-    """A whole bag, some messages of which are no messages."""
+    """An undamaged bag with some invalid messages."""
     with BagWriter(folder / 'bag.mcap') as writer:
         for message in shared:
             data = bytes(message.data)
@@ -54,7 +54,7 @@ def explored(folder: Path) -> Explored:
 
 
 def _changed(rng: np.random.Generator, whole: State) -> tuple[str, State]:
-    """A state with up to two of its numbers, then up to two of its arrays replaced."""
+    """A state with up to two numbers and up to two arrays replaced."""
     state = whole
     told = []
     for _ in range(int(rng.integers(0, 3))):
@@ -77,7 +77,7 @@ def use_changed_state(shared: Explored, rng: np.random.Generator, folder: Path) 
 
 
 def _packed(rng: np.random.Generator, members: dict[str, bytes]) -> bytes:
-    """An archive of members, one of them damaged: the archive itself says that all is well."""
+    """An archive with one damaged member; the archive itself is valid."""
     name = chosen(rng, sorted(members))
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, 'w', zipfile.ZIP_DEFLATED, compresslevel=1) as archive:

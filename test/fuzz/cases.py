@@ -1,4 +1,4 @@
-"""What a case is, and what all of them have to keep to."""
+"""The interface of fuzz cases, and common checks."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,9 +21,9 @@ WORDS = ('', 'null', 'true', '[]', '{}', '~', '\u5730\u56f3', 'a' * 5_000, '../x
 class Source:
     """Cases of one kind.
 
-    prepare(folder) makes once what all of them share; run(shared, rng, folder) makes a case below
-    the folder and tries it. It raises what is wrong: an exception that thinmap raises for its user
-    is not.
+    prepare(folder) makes their shared data once; run(shared, rng, folder) makes a case below
+    the folder and tests it. It raises an exception on failure; a ThinmapError for the user is no
+    failure.
     """
 
     name: str
@@ -36,7 +36,7 @@ def nothing(folder: Path) -> None:
 
 
 def tried(work: Callable[[], Any]) -> Any:
-    """What the work returns, or None where it is refused as a user is to be told."""
+    """Result of a call, or None if it is rejected with a proper error message."""
     try:
         return work()
     except ThinmapError as error:
@@ -54,19 +54,19 @@ def finite(*values: Any) -> None:
 
 
 def chosen(rng: np.random.Generator, things: Any) -> Any:
-    """One of the things, whatever they are."""
+    """A random choice."""
     return things[int(rng.integers(len(things)))]
 
 
 def damaged_text(rng: np.random.Generator, text: str) -> str:
-    """A text with up to four words or lines of it changed, left out, repeated, or exchanged."""
+    """A text with up to four words or lines changed, removed, repeated or swapped."""
     for _ in range(int(rng.integers(0, 5))):
         text = chosen(rng, _DAMAGES)(rng, text)
     return text
 
 
 def damaged_bytes(rng: np.random.Generator, content: bytes) -> bytes:
-    """A file with up to three of its bytes changed, its end cut off, or a part put in again."""
+    """A file with up to three bytes changed, truncated, or with a part inserted again."""
     data = bytearray(content)
     if not data or rng.random() < 0.3:
         return bytes(data)
@@ -90,7 +90,7 @@ def _strange(rng: np.random.Generator) -> str:
 
 
 def _word(rng: np.random.Generator, text: str) -> str:
-    """Another word in the place of one."""
+    """A replacement for a word."""
     ends = [i for i, c in enumerate(text) if c in ' \n,[]{}:'] or [0]
     k = int(rng.integers(len(ends)))
     end = ends[k + 1] if k + 1 < len(ends) else len(text)

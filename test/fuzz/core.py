@@ -1,4 +1,4 @@
-"""The core with scans, poses, maps and graphs at random: what comes out has to make sense."""
+"""Fuzz tests of the core with random scans, poses, maps and graphs: results must be valid."""
 
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ _STRANGE = (0.0, -0.0, 1e-300, 1e-9, 1.0, -1.0, 50.0, 1e6, -1e9, 1e300, np.nan, 
 
 
 class Drive:
-    """A robot in a room, which is thrown about, and whose laser and wheels fail now and then."""
+    """A robot in a room with kidnapping, and with occasional failures of laser and odometry."""
 
     def __init__(self, rng: np.random.Generator, folder: Path) -> None:
         self._rng = rng
@@ -38,7 +38,7 @@ class Drive:
         self._k = 0
 
     def move(self) -> None:
-        """Go on by a step; seldom leap, or say what is no pose."""
+        """Make a step; rarely with a discontinuity or an invalid pose."""
         rng = self._rng
         step = se2.pose(float(rng.uniform(0.0, 0.2)), 0.0, float(rng.normal(0.0, 0.2)))
         self.T = se2.compose(self.T, step)
@@ -50,7 +50,7 @@ class Drive:
         self._k += 1
 
     def scan(self) -> Scan | None:
-        """A scan from where the robot is, often with faults; None where it was refused."""
+        """A scan from the robot's pose, often with faults; None if it was rejected."""
         rng = self._rng
         good = scan_in(ROOM, self.T, stamp_ns=self._k * _PERIOD_NS)
         ranges = good.ranges_m.copy()
@@ -71,11 +71,11 @@ class Drive:
         return made
 
     def tell(self, *words: Any) -> None:
-        """Write down what comes next, to be found where that fails."""
+        """Store the next input, to be found after a failure."""
         print(*words, file=self._diary, flush=True)
 
     def pose(self) -> Array:
-        """Where the robot is; now and then somewhere else on or beyond the earth."""
+        """The robot's pose; occasionally a random or out-of-range one."""
         if self._rng.random() > 0.05:
             return self.T
         size = float(chosen(self._rng, (1.0, 1e3, 1e5, 1e7, 1e300, np.inf, np.nan)))

@@ -1,4 +1,4 @@
-"""Bags of all makers, and the same with damages."""
+"""Bags of all writers, undamaged and damaged."""
 
 import argparse
 import io
@@ -42,7 +42,7 @@ def drive(path: Path, scans: int = SCANS) -> Path:
 
 
 def rewritten(source: Path, target: Path, **options: Any) -> Path:
-    """The same messages as another writer puts them, with the QoS of each topic."""
+    """The same messages by another writer, with the QoS of each topic."""
     with source.open('rb') as stream, target.open('wb') as out:
         writer = Writer(out, chunk_size=20_000, **options)
         writer.start(profile='ros2')
@@ -84,20 +84,20 @@ MAKERS: dict[str, Callable[[Path, Path], Path]] = {
 
 
 def whole_bags(folder: Path) -> dict[str, bytes]:
-    """One drive as each maker writes it."""
+    """One drive in the format of each writer."""
     source = drive(folder / 'drive.mcap')
     files = {name: make(source, folder / f'{name}.mcap') for name, make in MAKERS.items()}
     return {name: file.read_bytes() for name, file in files.items()}
 
 
 def damaged(whole: bytes, rng: np.random.Generator) -> bytes:
-    """A copy with bits flipped, an end cut off, a range zeroed, or a block put in once more."""
+    """A copy with flipped bits, truncated, with a zeroed range, or with a repeated block."""
     content = bytearray(whole)
     kind = rng.choice(['flip', 'flip', 'flip', 'cut', 'zero', 'repeat'])
     at = int(rng.integers(8, len(content)))
     length = int(rng.integers(1, max(2, len(content) // int(rng.choice([2, 20, 500])))))
     if kind == 'flip':
-        # Many of the bits where the file says how it is made: at both ends.
+        # Many of the flipped bits are in the headers and indices at both ends.
         near = rng.choice([len(content), 3000])
         for _ in range(int(rng.integers(1, 9))):
             place = int(rng.integers(8, min(near, len(content))))
@@ -113,7 +113,7 @@ def damaged(whole: bytes, rng: np.random.Generator) -> bytes:
 
 
 def ended(main: Callable[[], None], *arguments: str) -> tuple[int, str, str]:
-    """Exit code and output of a program; an exception that would be a traceback is raised."""
+    """Exit code and output of a program; raises exceptions that would be a traceback."""
     said = io.StringIO()
     complained = io.StringIO()
     before = sys.argv
@@ -130,7 +130,7 @@ def ended(main: Callable[[], None], *arguments: str) -> tuple[int, str, str]:
 
 
 def read_log() -> None:
-    """Read a log to its end by the way that replay opens it."""
+    """Read a whole log in the same manner as replay."""
     parser = argparse.ArgumentParser()
     cli.add_log_options(parser)
 

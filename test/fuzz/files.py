@@ -1,4 +1,4 @@
-"""Files of all kinds with damages: logs, maps, worlds, graphs, trajectories."""
+"""Damaged files of all kinds: logs, maps, worlds, graphs, trajectories."""
 
 import gzip
 import io
@@ -24,7 +24,7 @@ _LARGEST_WORLD = 4_000
 
 
 def write(rng: np.random.Generator, path: Path, text: str) -> Path:
-    """A text with damages, and now and then damaged again as bytes."""
+    """A damaged text, sometimes damaged again as bytes."""
     content = damaged_text(rng, text).encode('utf-8', 'surrogatepass')
     path.write_bytes(damaged_bytes(rng, content) if rng.random() < 0.3 else content)
     return path
@@ -93,7 +93,7 @@ def _image(rng: np.random.Generator) -> tuple[str, bytes]:
 
 
 def strange_value(rng: np.random.Generator) -> Any:
-    """A value as YAML may hold it."""
+    """A random YAML value."""
     return chosen(
         rng,
         (
@@ -116,7 +116,7 @@ def strange_value(rng: np.random.Generator) -> Any:
 
 
 def described_map(rng: np.random.Generator, folder: Path) -> Path:
-    """A map_server map with damages to its description or its image."""
+    """A map_server map with a damaged description or image."""
     kind, image = _image(rng)
     (folder / f'm.{kind}').write_bytes(damaged_bytes(rng, image))
     content: dict[str, Any] = {
@@ -142,7 +142,7 @@ def described_map(rng: np.random.Generator, folder: Path) -> Path:
 
 
 def sound_patch(patch: GridPatch) -> None:
-    """Raise AssertionError unless a map makes sense."""
+    """Raise AssertionError unless a map is valid."""
     finite(patch.frame.as_array())
     assert patch.frame.resolution > 0.0
     assert patch.cells.ndim == 2
@@ -196,7 +196,7 @@ def graph_text(folder: Path) -> str:
 
 
 def sound_graph(graph: TopologicalMap) -> None:
-    """Raise AssertionError unless a graph makes sense."""
+    """Raise AssertionError unless a graph is valid."""
     for node in graph.nodes.values():
         finite([node.x, node.y, node.clearance_m])
     for edge in graph.edges.values():

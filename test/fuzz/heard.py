@@ -1,4 +1,4 @@
-"""Messages and parameters that make no sense, where nodes take them in."""
+"""Invalid messages and parameters, at the conversions of the nodes."""
 
 import dataclasses
 from pathlib import Path
@@ -56,7 +56,7 @@ def take_messages(shared: None, rng: np.random.Generator, folder: Path) -> None:
 
 
 def show_messages(shared: None, rng: np.random.Generator, folder: Path) -> None:
-    """What the viewer makes of them."""
+    """Conversions of the viewer."""
     feed = MessageView(NullView(), lambda frame: np.zeros(3))
     told = []
     for _ in range(3):

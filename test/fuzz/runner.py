@@ -1,4 +1,4 @@
-"""Cases one after the other, each in a process that may hang or die, until the time is over."""
+"""Runs cases in processes that may hang or die, until the time is over."""
 
 import faulthandler
 import os
@@ -31,7 +31,7 @@ _KEPT_OF_A_KIND = 20
 
 @dataclass
 class Outcome:
-    """How many cases of each source were tried, and which of them failed: (source, number, why)."""
+    """Number of tested cases by source, and the failures (source, number, reason)."""
 
     seed: int
     tried: Counter[str] = field(default_factory=Counter)
@@ -40,15 +40,15 @@ class Outcome:
 
 
 def rng_of(seed: int, source: str, number: int) -> np.random.Generator:
-    """Randomness of one case: it depends on nothing that was tried before."""
+    """Random generator of one case, independent of earlier cases."""
     return np.random.default_rng([seed, zlib.crc32(source.encode()), number])
 
 
 class Runner:
-    """Tries cases of all sources in turn, a batch at a time, and keeps those that fail.
+    """Tests cases of all sources in turn, in batches, and stores those that fail.
 
-    Each batch runs in a child process with a limit of memory. A case that takes more CPU time than
-    limit_s is ended with its process, and so is one that has not ended after net_s by the clock.
+    Each batch runs in a child process with limited memory. A case that needs more than limit_s of
+    CPU time or net_s of wall time is ended with its process.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class Runner:
         self.outcome = Outcome(seed)
         self._sources = sources
         self._out = out / str(seed)
-        # Another run of the same seed may go on beside.
+        # Another run with the same seed may be active.
         self._work = self._out / f'work-{os.getpid()}'
         self._failed = self._out / f'failed-{os.getpid()}'
         self._limit_s = limit_s
@@ -71,7 +71,7 @@ class Runner:
         self._spent = Counter[str]()
 
     def run(self, end_s: float, most: int, first: int = 0) -> Outcome:
-        """Try until time.monotonic() is end_s, or `most` cases of each source from number first."""
+        """Test until time.monotonic() is end_s, or `most` cases of each source from `first` on."""
         following = {source.name: first for source in self._sources}
         try:
             signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
@@ -79,9 +79,9 @@ class Runner:
                 left = [s for s in self._sources if following[s.name] < first + most]
                 if not left:
                     break
-                # The one that has had the least time so far.
+                # The source with the least time so far.
                 source = min(left, key=lambda s: self._spent[s.name])
-                # What all cases share may take longer than many of them: it does not count.
+                # The time for shared data does not count.
                 self._prepare(source)
                 began = time.monotonic()
                 stop = min(following[source.name] + _BATCH, first + most)
@@ -102,12 +102,12 @@ class Runner:
             self._shared[source.name] = source.prepare(folder)
 
     def _batch(self, source: Source, numbers: range, end_s: float) -> int:
-        """Try cases until one ends its process; the number to go on with."""
+        """Test cases until one ends its process; returns the number of the next case."""
         read, write = os.pipe()
-        # What is waiting to be written would be written twice.
+        # Buffered output would be written twice.
         sys.stdout.flush()
         sys.stderr.flush()
-        # Ctrl-C amidst a fork may be lost in what libraries do there.
+        # SIGINT during a fork may be lost in fork handlers of libraries.
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         child = os.fork()
         if child == 0:
@@ -120,7 +120,7 @@ class Runner:
             os.close(read)
 
     def _watch(self, source: Source, numbers: range, child: int, pipe: int) -> int:
-        """Follow what a child says: a byte when a case has gone well, another when it has not."""
+        """Read the child's pipe: one byte per case, for success or failure."""
         number = numbers.start
         ended = ''
         try:
@@ -161,7 +161,7 @@ class Runner:
         print(f'{source.name} {number}: {why}', file=sys.stderr)
 
     def _keep(self, source: Source, number: int) -> str:
-        """Keep the files of a failed case; returns why it failed, in a line."""
+        """Store the files of a failed case; returns the reason in one line."""
         kept = self._out / f'{source.name}-{number}'
         waiting = self._failed / str(number)
         made = waiting if waiting.exists() else self._work
@@ -173,7 +173,7 @@ class Runner:
         return lines[-1] if lines else 'no reason'
 
     def _child(self, source: Source, numbers: range, end_s: float, pipe: int) -> None:
-        """Try cases, and end the process."""
+        """Test cases, and end the process."""
         try:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
             signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
@@ -190,18 +190,18 @@ class Runner:
     def _tried(self, source: Source, number: int) -> bool:
         shutil.rmtree(self._work, ignore_errors=True)
         self._work.mkdir(parents=True)
-        # What was going on when the process died.
+        # State of the process when it died.
         died = (self._work / 'died.txt').open('w')
         faulthandler.enable(died)
-        # It ends the process when the time is over, also amidst a kernel that never comes back to
-        # the interpreter, and says before where that was.
+        # It prints the stack and ends the process after the time limit, also within a kernel that
+        # never returns to the interpreter.
         faulthandler.register(signal.SIGPROF, died, chain=True)
         signal.setitimer(signal.ITIMER_PROF, self._limit_s)
         rng = rng_of(self.outcome.seed, source.name, number)
         try:
             source.run(self._shared[source.name], rng, self._work)
         except Exception:
-            # The folder is taken over at once: the next case has one of its own.
+            # The folder is moved at once: the next case has its own.
             (self._work / 'why.txt').write_text(traceback.format_exc())
             self._failed.mkdir(exist_ok=True)
             self._work.rename(self._failed / str(number))
@@ -215,7 +215,7 @@ class Runner:
 
 
 def _limit_memory() -> None:
-    """Let this process take up so much more than it has."""
+    """Limit the memory of this process to this amount above its current use."""
     pages = int(Path('/proc/self/statm').read_text().split()[0])
     limit = pages * resource.getpagesize() + MEMORY_BYTES
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))

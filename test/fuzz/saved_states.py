@@ -1,4 +1,4 @@
-"""What a robot that explores a room saves, and what may stand in its archives instead."""
+"""Saved states of a robot that explores a room, and replacements for their arrays."""
 
 import io
 import zipfile
@@ -27,7 +27,7 @@ KINDS = ('topology', 'exploration', 'localizer', 'grid')
 
 
 class Explored:
-    """A room that a robot is exploring, and what each part of it knows."""
+    """A robot that explores a room, and the states of its parts."""
 
     def __init__(self) -> None:
         name, patch, start = read_world(ROOM)
@@ -51,7 +51,7 @@ class Explored:
         }
 
     def use(self, kind: str, state: State) -> None:
-        """Make what a state is of, and let it do its work for some scans."""
+        """Restore an object from a state, and run it for some scans."""
         work = getattr(self, f'_use_{kind}')(state)
         for scan, T_map_base in self.scans[-STEPS:]:
             work(scan, T_map_base)
@@ -88,7 +88,7 @@ class Explored:
 
 
 def replaced(array: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    """What may stand in an archive in the place of an array."""
+    """Replacement for an array in an archive."""
     yield 'complex', array.astype(np.complex128)
     yield 'text', array.astype(str)
     yield 'objects', array.astype(object)
@@ -123,12 +123,12 @@ def replaced(array: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def check(explored: Explored, kind: str, state: State, what: str) -> bool:
-    """Whether a state is refused, with a good reason; any other exception is a failure."""
+    """Whether a state is rejected with a proper reason; any other exception is a failure."""
     try:
         explored.use(kind, state)
     except InputError as error:
         assert len(str(error)) <= LONGEST and str(error).isprintable(), (what, str(error))
-        # What no array tells is whether the windows that come will lie on the saved lattice.
+        # No array determines whether later windows will be aligned with the saved lattice.
         beside = kind == 'topology' and str(error).startswith('window')
         beside |= kind in ('grid', 'localizer') and str(error).startswith('map ')
         assert str(error).startswith('saved') or beside, (what, str(error))
@@ -137,7 +137,7 @@ def check(explored: Explored, kind: str, state: State, what: str) -> bool:
 
 
 def one_number_replaced(whole: State, rng: np.random.Generator) -> tuple[str, State]:
-    """A state with one number of one array replaced, and which."""
+    """A state with one number of one array replaced, and the name of the array."""
     state = {name: array.copy() for name, array in whole.items()}
     name = str(rng.choice([name for name, array in whole.items() if array.size]))
     flat = state[name].reshape(-1)

@@ -1,6 +1,6 @@
-"""Messages that are nearly right, and wrong in up to three places.
+"""Nearly valid messages, with up to three errors.
 
-What broken drivers and strange nodes send.
+As published by faulty drivers and nodes.
 """
 
 import math
@@ -271,9 +271,9 @@ CHECKS = {
 
 
 def made(kind, count, seed=None):
-    """So many messages of a kind, the same ones every time for a seed.
+    """A number of messages of a type, reproducible by a seed.
 
-    Stamps go on by a tenth of a second.
+    Stamps increase by 0.1 s.
     """
     messages = []
 
@@ -292,7 +292,7 @@ def made(kind, count, seed=None):
 
     make = make if seed is None else hypothesis.seed(seed)(make)
     make()
-    # Hypothesis ends early where it has seen all that there is: then the same once more.
+    # Hypothesis ends early when it has exhausted all examples: then they are repeated.
     while len(messages) < count:
         make()
     return messages[:count]

@@ -1,4 +1,4 @@
-"""scripts/fuzz finds what is wrong, keeps it, goes on, and does the same again."""
+"""scripts/fuzz finds failures, stores them, continues, and is reproducible."""
 
 import os
 import signal
@@ -24,7 +24,7 @@ LINE = 'FLASER 3 1.00 2.50 3.00 0 0 0 0.5 -0.25 1.5 976052857.337530 host 0.1\n'
 
 
 def fails(shared: None, rng: np.random.Generator, folder: Path) -> None:
-    """Writes a number; every third case is wrong."""
+    """Writes a number; every third case fails."""
     number = int(rng.integers(300))
     (folder / 'number').write_text(str(number))
     if number % 3 == 0:
@@ -70,7 +70,7 @@ def waits(shared: None, rng: np.random.Generator, folder: Path) -> None:
 
 
 def burns(shared: None, rng: np.random.Generator, folder: Path) -> None:
-    # As in a kernel: no signal reaches Python before its end.
+    # As in a kernel: Python handles no signal before its end.
     sum(repeat(0))
 
 
@@ -164,7 +164,7 @@ def test_ctrl_c_ends_it_with_a_summary(tmp_path: Path) -> None:
     )
     assert process.stdout is not None
     seed = process.stdout.readline().split()[1]
-    # It is heard from here on, whatever it is doing.
+    # From here on SIGINT is handled at any time.
     os.killpg(process.pid, signal.SIGINT)
     said = process.communicate(timeout=120.0)[0]
     assert process.returncode == 0

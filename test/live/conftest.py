@@ -1,3 +1,3 @@
-"""What all live tests share."""
+"""Fixtures of all live tests."""
 
 from support.live_graph import graph as graph

@@ -1,4 +1,4 @@
-"""Recorder and player on a live graph: what a sudden end leaves, and how a bag is played."""
+"""Recorder and player on a live graph: bags after a sudden end, and playback."""
 
 import resource
 import signal
@@ -27,9 +27,9 @@ BEST_EFFORT = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 def talks(graph, topic, size=100):
-    """Says a number on a topic, the next one at each call; returns how many were said."""
+    """Publishes increasing numbers on a topic; each call returns the count."""
     publisher = graph.node.create_publisher(String, topic, qos.STREAM)
-    graph.until(publisher.get_subscription_count, f'somebody who listens to {topic}')
+    graph.until(publisher.get_subscription_count, f'a subscriber of {topic}')
     said = count()
 
     def talk():
@@ -46,9 +46,9 @@ def numbers(path):
 
 
 def on_disk(graph, talk, doctor, least):
-    """Talk until the recorder has written so many messages and had time to put them on the disk.
+    """Publish until the recorder has written a number of messages and flushed them to disk.
 
-    It flushes twice for each time that it tells how it is. Returns how many must be there.
+    It flushes twice per diagnostics message. Returns the number of expected messages.
     """
     graph.until(lambda: talk() and doctor.number('recorder', 'messages written') > least, 'some')
     written = doctor.number('recorder', 'messages written')
@@ -80,7 +80,7 @@ def test_a_full_disk_ends_the_recording_in_words_and_what_is_written_stays_reada
     on_disk(graph, talk, doctor, 20)
     size = (tmp_path / 'bag' / 'bag.mcap').stat().st_size
     before = len(numbers(tmp_path / 'bag')[0])
-    # Nothing fills a disk as surely as a limit on how long files may get.
+    # A limit of the file size is a reliable substitute for a full disk.
     resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (size + 3000, size + 3000))
     del graph.processes['recorder']
     graph.until(lambda: talk() and recorder.poll() is not None, 'the recorder gives up')
@@ -95,7 +95,7 @@ def test_a_full_disk_ends_the_recording_in_words_and_what_is_written_stays_reada
 
 @pytest.fixture
 def bag(tmp_path):
-    """Ten scans, ten words and two signs that are latched, one a second; the words best effort."""
+    """Ten scans, ten best-effort words and two latched signs, one per second."""
     writer = BagWriter(tmp_path / 'bag', live=True)
     make = writer.typestore.types
     writer.add_topic('/robot/scan', SCAN, [recorded(5, True, False)])
@@ -182,7 +182,7 @@ def test_a_bag_is_paused_stepped_and_begun_in_its_middle(graph, bag):
 
     graph.until(lambda: signs, 'what was latched before the offset')
     assert signs[0].data == '1' and not scans
-    # It has found those who listen to the scans as well.
+    # It has discovered the subscribers of the scans, too.
     graph.until(lambda: doctor.status('bag_player').message == 'paused', 'the player')
     for taken in (1, 2, 3):
         response = step()
@@ -196,7 +196,7 @@ def test_a_bag_is_paused_stepped_and_begun_in_its_middle(graph, bag):
     assert graph.call(SetBool, '/bag_player/pause', SetBool.Request(data=False)).success
     response = step()
     assert not response.success and 'not paused' in response.message
-    graph.until(lambda: len(scans) > 3, 'it goes on')
+    graph.until(lambda: len(scans) > 3, 'it continues')
     ticks = [messages.stamp_ns(tick.clock) for tick in clock]
     assert ticks == sorted(ticks) and len(set(ticks)) > 5
     assert graph.stop('bag_player') == 0
@@ -205,7 +205,7 @@ def test_a_bag_is_paused_stepped_and_begun_in_its_middle(graph, bag):
 def test_a_loop_begins_again_with_the_clock(graph, bag):
     clock = graph.heard('/clock', Clock)
     answers = graph.node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
-    # Each scan is answered: a player that did not wait would overrun a test that is held up.
+    # Each scan is acknowledged: otherwise the player could overrun a slow test.
     graph.start(
         'bag_player',
         bag=str(bag),
@@ -227,7 +227,7 @@ def test_a_loop_begins_again_with_the_clock(graph, bag):
         ticks = [messages.stamp_ns(tick.clock) for tick in clock]
         return [b for a, b in pairwise(ticks) if b < a]
 
-    # Scans and clock do not come at the same moment.
+    # Scans and clock do not arrive at the same time.
     graph.until(
         lambda: len(scans) > 25 and len(set_back()) == (len(scans) - 1) // 10,
         'two rounds and a half',

@@ -1,4 +1,4 @@
-"""A live map that is re-rendered after a correction, and saved or killed meanwhile."""
+"""A live map that is re-rendered after a correction, with a save or a crash meanwhile."""
 
 import signal
 
@@ -32,12 +32,12 @@ def scan_of(k):
 
 
 def named_by(message):
-    """Stamp of the correction that a map has undergone."""
+    """Stamp of the correction that a map contains."""
     return messages.stamp_ns(message.info.map_load_time)
 
 
 class Mapping:
-    """A grid_mapper, which is told scans, poses and corrections, and the same done by hand."""
+    """A grid_mapper with scans, poses and corrections, and a reference grid with the same input."""
 
     def __init__(self, graph):
         self.graph = graph
@@ -69,7 +69,7 @@ class Mapping:
         )
 
     def add(self, k, T_map_base):
-        """Add scan number k; returns the stamp of the correction that its local map names."""
+        """Add scan number k; returns the stamp of the correction in its local map."""
         self.by_hand.update(scan_of(k), T_map_base)
         self.windows.clear()
         self.publish(k, T_map_base)
@@ -84,7 +84,7 @@ class Mapping:
         self._poses.publish(pose)
 
     def correct(self, k):
-        """The scans before number k were made where they really were."""
+        """Correct the poses of the scans before number k to the true ones."""
         stamps = (np.arange(k) + 1) * SECOND_NS
         ns = (k + 1) * SECOND_NS
         self.by_hand.apply_correction(stamps, TRUE[:k], ns)
@@ -92,7 +92,7 @@ class Mapping:
         return ns
 
     def drive_and_correct(self):
-        """Until a re-rendering is under way; returns its stamp."""
+        """Wait until re-rendering is in progress; returns its stamp."""
         for k in range(COUNT):
             assert self.add(k, DRIFTED[k]) == 0
         corrected_ns = self.correct(COUNT)
@@ -153,7 +153,7 @@ def test_a_mapper_that_is_killed_meanwhile_goes_on_with_the_map_that_was_shown(g
     known = messages.grid_from_msg(mapping.maps[-1])
     expected = OccupancyGrid.from_state(shown, CONFIG).patch()
     np.testing.assert_array_equal(known.cells, expected.cells)
-    # What is published before the two have found each other is lost.
+    # Messages published before discovery are lost.
     mapping.windows.clear()
     graph.until(
         lambda: (

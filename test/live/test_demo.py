@@ -1,4 +1,4 @@
-"""The demo as a user runs it: the whole live graph, faster than real time."""
+"""The demo as documented: the whole live graph, faster than real time."""
 
 import json
 import signal
@@ -50,7 +50,7 @@ def demo(out, *arguments):
 def nodes_of(out):
     """Processes of a demo.
 
-    Each has the results' folder in its arguments, or is a child of one that has.
+    Each has the folder of results in its arguments, or is a child of such a process.
     """
     found = []
     for process in psutil.process_iter(['cmdline']):

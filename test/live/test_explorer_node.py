@@ -1,6 +1,6 @@
 """The explorer as a process on a live graph.
 
-All reasons for which an exploration ends, how it is resumed, and with which strategies.
+The reasons for the end of an exploration, resuming, and strategies.
 """
 
 import math
@@ -34,9 +34,9 @@ pytestmark = pytest.mark.live
 AT = pose(2.0, 2.0, 0.0)
 ANGLES = np.radians(np.arange(-90.0, 91.0))
 PERIOD_NS = 200_000_000
-# Ten times as fast as a robot's; the explorer goes by the robot's time.
+# Ten times real time; the explorer uses the simulated time.
 SPEAK_S = 0.02
-# A strategy of a user's own: one target, and it is finished once that has failed twice.
+# A user-defined strategy: one target, finished after two failures.
 OWN_STRATEGY = """
 import numpy as np
 from thinmap_ros.core.exploration.strategy import Decision, EndNode, FinishCode
@@ -59,7 +59,7 @@ class TwoAttempts:
 
 
 def room(known_cols):
-    """A walled room of 6 x 4 m, known up to a column."""
+    """A closed room of 6 x 4 m, known up to a column."""
     cells = np.zeros((40, 60), dtype=np.int8)
     cells[[0, -1]] = 100
     cells[:, [0, -1]] = 100
@@ -68,7 +68,7 @@ def room(known_cols):
 
 
 class Robot:
-    """Says what the other nodes of a robot would say that stands in a room."""
+    """Publishes the messages of the other nodes, for a stationary robot in a room."""
 
     def __init__(self, graph):
         self.graph = graph
@@ -88,7 +88,7 @@ class Robot:
     def refuses_to_drive(self):
         """From now on, goals fail.
 
-        Before, there is no navigator at all, and the explorer waits for it.
+        Until this call there is no navigator, and the explorer waits for it.
         """
 
         def refuse(handle):
@@ -119,12 +119,12 @@ class Robot:
         )
 
     def explores(self, **goal):
-        """Status with which an exploration ends, and whether it succeeded."""
+        """Final status of an exploration, and whether it succeeded."""
         ended = self.graph.act(Explore, 'explore', Explore.Goal(**goal))
         return ended.result.status.reason_code, ended.status
 
     def evidence(self):
-        """Probability and number of counted looks' closest distance by end node."""
+        """Probability and closest distance of counted observations by end node."""
         return {
             n.node_id: (n.position_probability, n.min_distance_m)
             for n in self.end_nodes[-1].end_nodes
@@ -166,8 +166,8 @@ def test_it_goes_on_after_a_cancelled_goal_and_after_a_new_start(graph, robot, t
     client = ActionClient(graph.node, Explore, 'explore')
     accepted = graph.send_goal(client, Explore.Goal())
     graph.until(lambda: robot.end_nodes and any(robot.evidence().values()), 'end nodes')
-    # Nodes are looked at one after the other, and borders once a second: until nothing new comes
-    # for 30 looks.
+    # Nodes are observed in turn, and frontiers once per second: until nothing changes for 30
+    # observations.
     seen = [(robot.evidence(), len(robot.end_nodes))]
 
     def is_settled():
@@ -191,7 +191,7 @@ def test_it_goes_on_after_a_cancelled_goal_and_after_a_new_start(graph, robot, t
         robot.end_nodes.clear()
         assert robot.explores(area_limit_m2=1.0)[0] == ExplorationStatus.BUDGET_EXHAUSTED
         graph.until(lambda: robot.end_nodes, 'what was looked at last')
-        # The robot has not moved: there is no new evidence, and what there was has been kept.
+        # The robot has not moved: there is no new evidence, and the old one is kept.
         assert robot.evidence() == before
 
 

@@ -1,4 +1,4 @@
-"""The node that finds a lost robot, as a process on a live graph."""
+"""The global localizer as a process on a live graph."""
 
 import itertools
 
@@ -24,8 +24,8 @@ pytestmark = pytest.mark.live
 START = (2.0, 2.0, 0.0)
 
 
-# Two rooms that are the same, so that a turn tells nothing, and the corridor at their doors, which
-# goes on to one side.
+# Two identical rooms, which a rotation in place cannot distinguish, and the corridor at their
+# doors, which continues to one side.
 TWINS = """
 name: twins
 resolution: 0.02
@@ -98,7 +98,9 @@ def test_a_robot_that_drives_about_finds_itself_when_asked(graph, map_file):
         np.isfinite([p.position.x, p.position.y, p.orientation.z]).all()
         for p in samples[-1].poses[:100]
     )
-    graph.until(lambda: status[-1].state == LocalizationStatus.IDLE, 'rest, once the pose is said')
+    graph.until(
+        lambda: status[-1].state == LocalizationStatus.IDLE, 'idle after the pose is published'
+    )
     said = [message for message in status if message.state == LocalizationStatus.LOCALIZED]
     assert len(said) == len(poses) == 1
     assert said[0].weights[0] > 0.9

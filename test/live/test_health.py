@@ -1,4 +1,4 @@
-"""/diagnostics of the nodes, their states, and the services that every node has."""
+"""/diagnostics of the nodes, their states, and the common services of all nodes."""
 
 import pytest
 import rclpy
@@ -48,7 +48,9 @@ def test_nodes_tell_rates_step_times_and_silence(graph):
     graph.until(lambda: doctor.number('localizer', 'scan: publishers') == 1, 'the simulation')
     graph.until(lambda: doctor.number('localizer', 'pose: subscribers') == 2, 'mapper and builder')
     graph.stop('sim')
-    graph.until(lambda: 'scan: silent for' in doctor.status('localizer').message, 'silence is told')
+    graph.until(
+        lambda: 'scan: silent for' in doctor.status('localizer').message, 'silence is reported'
+    )
     assert doctor.level('localizer') == DiagnosticStatus.WARN
     assert 's ago' in doctor.value('localizer', 'scan: last')
     assert 'silent for' in graph.log('thinmap')
@@ -76,7 +78,7 @@ def test_two_localizers_on_one_graph_are_detected_and_reported(graph):
 
 
 def test_what_is_over_is_not_told_first(ros_domain, monkeypatch):
-    """A refusal of long ago was the first thing told whenever anything else was dropped."""
+    """An old rejection must not be reported first when something else is dropped."""
     now = [100.0]
     monkeypatch.setattr(diagnostics, 'monotonic', lambda: now[0])
     rclpy.init(domain_id=ros_domain)
@@ -95,7 +97,7 @@ def test_what_is_over_is_not_told_first(ros_domain, monkeypatch):
         told.count_drops('scan: gaps between the stamps', 1)
         message = told._status(now[0]).message
         assert message == '1 messages rejected or dropped: scan: gaps between the stamps'
-        # How often it happened is told for good.
+        # The count is reported permanently.
         values = {pair.key: pair.value for pair in told._status(now[0]).values}
         assert values['odom: rejected'] == '1'
     finally:
@@ -170,7 +172,7 @@ def test_pause_and_reset(graph):
         statuses = [s for array in doctor.heard for s in array.status if 'localizer' in s.name]
         return [s.message for s in statuses if KeyValue(key='paused', value='True') in s.values]
 
-    # On a busy machine it may have scans to tell of that were lost before.
+    # On a busy machine it may report scans that were lost before.
     graph.until(lambda: 'paused' in said_of_a_paused_one(), 'it is told')
     assert 'tracking' not in said_of_a_paused_one()
 
@@ -181,7 +183,7 @@ def test_pause_and_reset(graph):
             'scans that are not taken',
         )
 
-    some_scans()  # poses of before may still be on their way
+    some_scans()  # earlier poses may still be in transit
     poses.clear()
     some_scans()
     assert not poses

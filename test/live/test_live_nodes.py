@@ -1,4 +1,4 @@
-"""Each node as a process on a live graph: what it says, how it starts and how it ends."""
+"""Each node as a process on a live graph: its topics, start and end."""
 
 import signal
 
@@ -79,15 +79,15 @@ def test_a_scan_becomes_a_pose_a_map_and_a_graph(graph, tmp_path):
         lambda: len(local_maps) > 8 and poses and status and scans and ('map', 'odom') in links(),
         'local maps, poses, status, scans and the frame of the odometry',
     )
-    # Not set against the scans heard here: sensor data may be lost on the way to one listener and
-    # not to another.
+    # Not compared with the scans received here: best-effort messages may be lost for one subscriber
+    # and not for another.
     assert not np.mod(np.array(stamps(poses)) - stamps(scans)[0], SCAN_PERIOD_NS).any()
     assert poses[-1].header.frame_id == 'map'
     assert (
         np.hypot(poses[-1].pose.pose.position.x - 2.0, poses[-1].pose.pose.position.y - 2.0) < 0.05
     )
     assert status[-1].state == SlamStatus.TRACKING
-    # Who comes later still gets map and graph: both are transient local.
+    # Late subscribers still receive map and graph: both are transient local.
     maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
     graphs = graph.heard('topology', TopologicalMap, qos.LATCHED)
     graph.until(lambda: maps and graphs and graphs[-1].nodes, 'map and topology')
@@ -184,7 +184,7 @@ def test_the_navigator_drives_to_a_goal_and_refuses_one_in_a_wall(graph):
     truth = graph.heard('ground_truth', PoseStamped)
     for name in ('localizer', 'grid_mapper', 'topology_builder', 'navigator'):
         graph.start(name, use_sim_time=True, **(AT_START if name == 'localizer' else {}))
-    # Paced: else the result could be heard before the true poses of the way.
+    # Paced: otherwise the result could arrive before the true poses of the path.
     graph.start(
         'sim',
         remap=graph.paced(),
@@ -229,7 +229,7 @@ def test_what_is_recorded_is_played_again(graph, tmp_path):
     assert {'/scan', *recorded} <= set(bag.topics)
     assert len(kept) > 20
     scans.clear()
-    # The player waits for the test to hear each scan, as it keeps no more than it was told to.
+    # The player waits for the test to receive each scan, as its queue is limited.
     heard_it = graph.node.create_publisher(TopologicalMap, 'local_topology', qos.STREAM)
     graph.node.create_subscription(
         LaserScan, 'scan', lambda scan: heard_it.publish(TopologicalMap(header=scan.header)), 10
@@ -241,7 +241,7 @@ def test_what_is_recorded_is_played_again(graph, tmp_path):
         lambda: player.poll() == 0 and len(scans) == len(kept), 'as many scans as were recorded'
     )
     assert stamps(scans) == [messages.stamp_ns(bag.decode(raw).header.stamp) for raw in kept]
-    # A bag is never written over.
+    # A bag is never overwritten.
     again = graph.start('recorder', bag=str(tmp_path / 'bag'))
     assert graph.ended(again) == 2
     assert 'exists already' in graph.log('recorder')

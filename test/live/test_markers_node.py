@@ -1,4 +1,4 @@
-"""Markers for RViz and Foxglove: what they show is what the messages say."""
+"""Markers for RViz and Foxglove: they show the contents of the messages."""
 
 import math
 

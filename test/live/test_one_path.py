@@ -30,7 +30,7 @@ from thinmap_ros.sim.world import World
 from thinmap_ros.tools.carmen_to_bag import convert
 
 pytestmark = pytest.mark.live
-# The test listens to the poses as well, the player to the local graph.
+# The test subscribes to the poses, too, and the player to the local graph.
 CONNECTIONS = {
     'bag_player': {'scan: subscribers': 2, 'odom: subscribers': 1, 'local_topology: publishers': 1},
     'localizer': {
@@ -58,7 +58,7 @@ CONNECTIONS = {
 
 
 class SimulatedLog:
-    """What a robot senses that drives in circles through the room."""
+    """Scans and odometry of a robot that drives in circles through the room."""
 
     def __init__(self):
         self.skipped = SkippedRecords()
@@ -75,7 +75,7 @@ class SimulatedLog:
 
 
 class LoopLog:
-    """What a robot senses that comes back to where it began after its map has drifted."""
+    """Scans and odometry of a robot that returns to its start after its map has drifted."""
 
     def __init__(self):
         self.skipped = SkippedRecords()
@@ -94,10 +94,10 @@ def assert_same(one, other):
 
 
 def connections(doctor):
-    """How many have found each other, of those that lead from a scan to what the player awaits.
+    """Number of discovered connections on the path from a scan to the player's acknowledgement.
 
-    Nodes find each other one by one, and what is said to one that is not yet found is lost. A
-    localizer that finds the graph late steps without it meanwhile.
+    Nodes discover each other one by one, and messages to undiscovered ones are lost. A localizer
+    that discovers the graph late works without it until then.
     """
     return {
         f'{node}: {topic}': doctor.number(node, topic)
@@ -170,7 +170,7 @@ def test_a_closed_loop_corrects_the_live_map_as_it_does_the_replayed_one(graph, 
     for number, node in live.nodes.items():
         other = offline.nodes[number]
         assert node.kind == other.kind
-        # The origin of the live grid has gone through a message, and is rounded otherwise.
+        # The origin of the live grid is rounded in its message.
         assert (node.x, node.y) == pytest.approx((other.x, other.y), abs=1e-9)
     assert live.edges.keys() == offline.edges.keys()
 

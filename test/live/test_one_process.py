@@ -1,6 +1,6 @@
 """All nodes in one process, and two robots on one graph.
 
-Each does what it does in a process of its own.
+Each node behaves as in its own process.
 """
 
 import signal
@@ -38,7 +38,7 @@ def test_one_process_locates_maps_and_drives(graph):
     health = graph.heard('/diagnostics', DiagnosticArray)
     start = {'initial_x_m': 2.0, 'initial_y_m': 2.0, 'use_sim_time': True}
     process = graph.start('thinmap', **start)
-    # Paced: else the result could be heard before the true poses of the way.
+    # Paced: otherwise the result could arrive before the true poses of the path.
     graph.start(
         'sim',
         remap=graph.paced(),
@@ -70,7 +70,7 @@ def test_one_process_locates_maps_and_drives(graph):
         }
 
     graph.until(lambda: well() >= set(FIVE), 'each says that it is well')
-    # The kernels' compiler and the libraries are there once, not five times.
+    # The kernels' compiler and the libraries are loaded once, not five times.
     assert psutil.Process(process.pid).memory_info().rss < 400e6
     assert graph.stop('thinmap', signal.SIGTERM) == 0, graph.log('thinmap')
 
@@ -79,7 +79,7 @@ ROBOT = ('/tf:=tf', '/tf_static:=tf_static', '/clock:=clock')
 
 
 def start_robot(graph, name, start, seed):
-    """A robot all by itself in a namespace, simulation included."""
+    """A robot with its simulation in a namespace."""
     x, y, _ = start.split(',')
     graph.start(
         'thinmap',

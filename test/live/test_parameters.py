@@ -1,4 +1,4 @@
-"""Parameters of running nodes: set where that makes sense, and refused with a reason where not."""
+"""Parameters of running nodes: changes are accepted, or rejected with a reason."""
 
 import subprocess
 import sys
@@ -34,8 +34,10 @@ def test_the_navigator_changes_its_speed_and_refuses_what_makes_no_sense(graph):
     speed, turn = names
     assert change(graph, 'navigator', **{speed: 0.5, turn: 0.7}).successful
     assert current(graph, 'navigator', *names) == [0.5, 0.7]
-    graph.until(lambda: f'changed: {speed} = 0.5, {turn} = 0.7' in graph.log('navigator'), 'it')
-    # All or none, with a reason; NaN is within no range.
+    graph.until(
+        lambda: f'changed: {speed} = 0.5, {turn} = 0.7' in graph.log('navigator'), 'a report'
+    )
+    # All or none, with a reason; NaN is in no range.
     for wrong in (-1.0, 1e9, float('nan'), float('inf')):
         result = change(graph, 'navigator', **{turn: 0.9, speed: wrong})
         assert not result.successful and 'max_speed_m_s' in result.reason, result
@@ -74,7 +76,7 @@ def test_arguments_that_ros_cannot_read_end_the_start_with_a_line(arguments, sai
     command = [sys.executable, '-m', 'thinmap_ros.nodes.navigator', '--ros-args', *arguments]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2
-    line = done.stderr.splitlines()[-1]  # before it one of rcl's log
+    line = done.stderr.splitlines()[-1]  # after one of rcl's log
     assert 'Traceback' not in done.stderr
     assert line.startswith('error: arguments after --ros-args: ')
     assert said in line

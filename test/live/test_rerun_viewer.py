@@ -1,4 +1,4 @@
-"""The viewer as a process: it writes what it hears, and ends well."""
+"""The viewer as a process: it writes the received messages, and ends cleanly."""
 
 from pathlib import Path
 

@@ -1,6 +1,6 @@
 """The small `ros2` for machines without ROS, each verb on a live graph.
 
-What a list shows is found when the middleware finds it: lists are asked again until it is there.
+Lists depend on discovery by the middleware: they are repeated until an entry is found.
 """
 
 import os
@@ -35,7 +35,7 @@ NODES = [name.lstrip('/') for name in FIVE]
 
 @pytest.fixture(scope='module')
 def robot(tmp_path_factory):
-    """A simulated robot whose nodes run; each test leaves them as it found them."""
+    """Running nodes of a simulated robot; tests do not change them."""
     with pytest.MonkeyPatch.context() as patch, free_domain() as domain:
         folder = tmp_path_factory.mktemp('robot')
         patch.setenv('THINMAP_STATE_DIR', str(folder / 'state'))
@@ -84,7 +84,7 @@ def output(*words):
 
 
 def listed(wanted, *words):
-    """Lines of a list, when what is wanted is among them."""
+    """Lines of a list, once the wanted ones are among them."""
     end = time.monotonic() + PATIENCE_S
     while True:
         lines = output(*words).splitlines()
@@ -103,7 +103,7 @@ def test_lists_show_what_there_is(robot):
     listed(['/save_map', '/localizer/get_state'], 'service', 'list')
     actions = ['/explore [thinmap_msgs/action/Explore]']
     listed(actions, 'action', 'list', '-t')
-    # Each command finds the graph anew, and on a busy machine not all of it at once.
+    # Each command discovers the graph itself, and on a busy machine only a part of it at first.
     robot.until(lambda: int(output('action', 'list', '-c')) > 0, 'actions to count')
     states = listed(['/localizer', '/explorer'], 'lifecycle', 'nodes')
     assert '/sim' not in states
@@ -217,7 +217,7 @@ def test_parameters_are_read_and_set(robot):
     assert 'max_speed_m_s' in refused.stderr and len(refused.stderr.splitlines()) == 1
     assert output('param', 'get', *value, *WAIT) == 'Double value is: 0.15\n'
     output('param', 'set', *value, before, *WAIT)
-    # The test's own node does not answer while the test waits: that is said, and the rest listed.
+    # The test's own node does not respond while the test waits: this is reported, the rest listed.
     everywhere = set()
     end = time.monotonic() + PATIENCE_S
     while not {'/navigator:', '/sim:', '  controller.max_speed_m_s', '  lockstep'} <= everywhere:

@@ -1,6 +1,6 @@
 """Sessions on a live graph.
 
-What was saved is there again after a new start, and mapping goes on from it.
+Saved sessions are restored after a restart, and mapping continues.
 """
 
 import numpy as np
@@ -25,7 +25,7 @@ MAPPERS = ('grid_mapper', 'topology_builder')
 
 
 def places(topology):
-    """Kind and place by id."""
+    """Kind and position by id."""
     return {n.id: (n.kind, n.position.x, n.position.y) for n in topology.nodes}
 
 
@@ -38,9 +38,9 @@ def heard_maps(graph):
 
 
 def drive(graph, x, y, yaw, metres):
-    """Nodes of a robot that stands at a place, driven until it has made its way.
+    """Nodes of a robot that has driven along a path and stands still.
 
-    Then the robot alone is stopped.
+    Then only the robot is stopped.
     """
     truth = graph.heard('ground_truth', PoseStamped)
     graph.start('localizer', use_sim_time=True, initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
@@ -79,7 +79,7 @@ def test_ids_and_cells_are_the_same_tomorrow_and_mapping_goes_on(graph, tmp_path
     def save_all():
         return graph.call(SaveMap, 'save_map', SaveMap.Request(path=str(stem)))
 
-    # The mapper may not know at once that the localizer has gone, and asks it for its part.
+    # The mapper may not have detected the end of the localizer yet, and asks it for its part.
     graph.until(lambda: 'no answer' not in save_all().message, 'an answer of all that are there')
     response = save_all()
     assert response.success, response.message
@@ -101,8 +101,7 @@ def test_ids_and_cells_are_the_same_tomorrow_and_mapping_goes_on(graph, tmp_path
     assert places(graphs[-1]) == before and {edge.id for edge in graphs[-1].edges} == edges
     assert np.array_equal(messages.grid_from_msg(maps[-1]).cells, known.cells)
     drive(graph, *T.tolist(), 0.3)
-    # Mapping has gone on from there: more is known, what stayed has its number, and no number is
-    # given twice.
+    # Mapping has continued: more is known, remaining nodes have their ids, and no id is used twice.
     assert (messages.grid_from_msg(maps[-1]).cells >= 0).sum() >= (known.cells >= 0).sum()
     after = places(graphs[-1])
     stayed = [
@@ -115,7 +114,7 @@ def test_ids_and_cells_are_the_same_tomorrow_and_mapping_goes_on(graph, tmp_path
 
 
 def room_of(resolution=0.1):
-    """Grid and graph of a room of 6 x 6 m as seen from its middle."""
+    """Grid and graph of a room of 6 x 6 m as observed from its centre."""
     occupied = np.zeros((60, 60), dtype=np.uint8)
     occupied[[0, -1]] = 1
     occupied[:, [0, -1]] = 1
@@ -138,7 +137,7 @@ def save(stem, grid, builder=None):
 
 
 def write_bad_sessions(folder, grid, builder):
-    """Sessions that cannot be loaded: what is to be said of each, by its name."""
+    """Sessions that cannot be loaded, with the expected error of each by its name."""
     save(folder / 'fine', *room_of(0.05))
     save(folder / 'cut', grid, builder)
     save(folder / 'half', grid, builder)
@@ -211,7 +210,7 @@ def test_sessions_are_loaded_into_running_nodes_or_refused_in_words(graph, tmp_p
 
 
 def files_below(folder):
-    """Each file below a folder with its content, but for the logs of nodes and what they keep."""
+    """Contents of all files below a folder, except logs and checkpoints of nodes."""
     files = [p for p in folder.rglob('*') if p.is_file() and p.suffix != '.log']
     return {p: p.read_bytes() for p in files if 'state' not in p.parts}
 
@@ -274,7 +273,7 @@ def test_services_touch_nothing_outside_of_their_folder(graph, tmp_path):
     absolute = str(folder / 'new' / 'room.yaml')
     response = graph.call(LoadMap, 'load_map', LoadMap.Request(path=absolute))
     assert response.success, response.message
-    # What the operator names at the start is not confined.
+    # Paths given at the start are not confined.
     assert graph.stop('grid_mapper') == 0
     maps = graph.heard('map', OccupancyGridMsg, qos.LATCHED)
     graph.start('grid_mapper', save_directory='maps', session_path=str(outside / 'room'))
@@ -317,7 +316,7 @@ def test_a_builder_that_does_not_answer_is_said_and_the_mapper_goes_on(graph, tm
         SaveMap, 'save_topology', never, callback_group=ReentrantCallbackGroup()
     )
     graph.start('grid_mapper')
-    # Asked before the two have found each other, the mapper sees no builder.
+    # Before discovery the mapper finds no builder.
     answers = []
 
     def save_again():

@@ -1,4 +1,4 @@
-"""Bags: written data are read back; damage and missing data are reported in one line."""
+"""Bags: round trips; damage and missing data are reported in one line."""
 
 import math
 import struct
@@ -325,7 +325,7 @@ def test_a_cut_mcap_is_read_as_far_as_it_is_whole(tmp_path: Path) -> None:
     count = len(scans(list(log.events())))
     assert 2_000 < count < 7_000
     assert 'cut off' in log.skipped.first
-    folder = tmp_path / 'killed'  # as a recorder leaves it: no metadata
+    folder = tmp_path / 'killed'  # as a killed recorder leaves it: no metadata
     folder.mkdir()
     cut.rename(folder / 'killed_0.mcap')
     assert len(scans(read(folder))) == count
@@ -403,7 +403,7 @@ def test_a_scan_of_too_many_beams_is_skipped(tmp_path: Path) -> None:
 
 
 def test_definitions_are_those_of_the_bag(tmp_path: Path) -> None:
-    """A ROS 1 bag that was converted without new types keeps the `seq` of its headers."""
+    """A ROS 1 bag that was converted without new types still has `seq` in its headers."""
     definition = 'Header header\nfloat32 x\n' + '=' * 80 + '\nMSG: std_msgs/Header\n'
     definition += 'uint32 seq\ntime stamp\nstring frame_id\n'
     with (tmp_path / 'bag.mcap').open('wb') as out:

@@ -1,4 +1,4 @@
-"""CARMEN logs: what each line means, and that no file whatever brings a traceback."""
+"""CARMEN logs: the meaning of each line, and no traceback for any file."""
 
 import gzip
 import math
@@ -169,7 +169,7 @@ def test_nan_ranges_are_neither_hit_nor_no_return(tmp_path: Path) -> None:
         (b'FLASER 3 1.0', 'no scan.*log.clf:1'),
         (b'\x89PNG\r\n\x00\x00', 'zero byte'),
         (b'hello\nworld\n', 'no scan'),
-        # Without the time of day, which would be in the name of the test.
+        # Without the time of day, which would become part of the test name.
         (gzip.compress(FLASER.encode(), mtime=0)[:-12], 'no scan'),
         (b'\x1f\x8bnonsense', 'no scan'),
     ],
@@ -200,9 +200,9 @@ def test_no_file_and_a_folder(tmp_path: Path) -> None:
 
 
 def _is_read_or_refused(path: Path) -> bool:
-    """Whether a log gives events, or ends in one line that says why not.
+    """Whether a log gives events, or an InputError of one line.
 
-    Anything else is raised.
+    Other exceptions are raised.
     """
     try:
         return all(

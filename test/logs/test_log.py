@@ -1,6 +1,6 @@
-"""Logs in formats that are not read.
+"""Logs in unsupported formats.
 
-Every program that opens a log says what they are and how to convert them.
+Every program that opens a log names the format and how to convert it.
 """
 
 import shlex

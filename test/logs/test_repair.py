@@ -1,6 +1,6 @@
-"""bag_repair keeps all that is whole of a cut or damaged file; the result is an ordinary bag.
+"""bag_repair keeps all intact data of a truncated or damaged file; the result is a valid bag.
 
-Whatever happened to a bag, no program ends in a traceback.
+No damage causes a traceback in any program.
 """
 
 import os
@@ -34,7 +34,7 @@ PER_CHUNK = 10
 
 
 def write(path: Path, count: int = COUNT) -> Path:
-    """A bag of numbered messages, a chunk for every ten."""
+    """A bag of numbered messages, ten per chunk."""
     writer = BagWriter(path, live=True)
     writer.add_topic('/said', STRING, [qos.recorded(7, False, False)])
     writer.add_topic('/map', STRING, [qos.recorded(1, True, True)])
@@ -75,7 +75,7 @@ def test_what_is_flushed_is_readable_at_once(tmp_path: Path) -> None:
 
 
 def record_ends(content: bytes) -> list[int]:
-    """Where the records of a whole file end, and the file."""
+    """Ends of the records of an undamaged file, and the file."""
     ends = [len(MAGIC)]
     while ends[-1] < len(content) - len(MAGIC):
         _, length = HEAD.unpack_from(content, ends[-1])
@@ -88,7 +88,7 @@ def test_a_file_may_grow_while_it_is_read(tmp_path: Path) -> None:
     ends = record_ends(whole)
 
     class Growing(type(tmp_path)):  # type: ignore[misc]
-        """A file that a recorder adds a record to whenever its size has just been looked at."""
+        """A file to which a recorder adds a record after each query of its size."""
 
         def stat(self, *, follow_symlinks: bool = True) -> os.stat_result:
             found: os.stat_result = super().stat(follow_symlinks=follow_symlinks)
@@ -118,7 +118,7 @@ def test_a_cut_off_bag_gets_index_metadata_and_its_qualities_back(tmp_path: Path
     assert 'cut off' in done.stdout and 'on 2 topics' in done.stdout
     good = tmp_path / 'cut_repaired'
     found = numbers(good)
-    # The file's middle is behind the middle of its messages: summary and index come last.
+    # Half of the file has more than half of the messages: summary and index are at its end.
     assert found == list(range(len(found))) and COUNT / 2 - PER_CHUNK <= len(found) < COUNT
     assert f'{len(found)} messages' in done.stdout
     metadata = yaml.safe_load((good / 'metadata.yaml').read_text())['rosbag2_bagfile_information']
@@ -133,7 +133,7 @@ def test_a_cut_off_bag_gets_index_metadata_and_its_qualities_back(tmp_path: Path
 
 
 def cut_file(tmp_path: Path, compression: CompressionType) -> Path:
-    """One chunk of many messages, cut in its middle."""
+    """One chunk of many messages, truncated in its middle."""
     with (tmp_path / 'one.mcap').open('wb') as stream:
         writer = Writer(stream, chunk_size=10**9, compression=compression)
         writer.start(profile='ros2')
@@ -167,7 +167,7 @@ def test_of_a_chunk_that_was_cut_off_the_part_before_the_cut_is_kept(
 
 
 def chunked_file(path: Path, compression: CompressionType) -> list[ChunkIndex]:
-    """A file of 500 numbered messages; where its chunks lie."""
+    """A file of 500 numbered messages, and the offsets of its chunks."""
     with path.open('wb') as stream:
         writer = Writer(stream, chunk_size=2000, compression=compression)
         writer.start(profile='ros2')
@@ -189,7 +189,7 @@ def test_a_damaged_chunk_costs_only_itself(tmp_path: Path, compression: Compress
     chunks = chunked_file(path, compression)
     hit = chunks[len(chunks) // 3]
     content = bytearray(path.read_bytes())
-    # In the middle of what the chunk holds: uncompressed, its checksum alone tells.
+    # In the data of the chunk: if it is uncompressed, only its checksum shows the damage.
     content[hit.chunk_start_offset + hit.chunk_length - hit.compressed_size // 2] ^= 0x40
     path.write_bytes(content)
     damage = Damage()
@@ -208,7 +208,7 @@ def test_a_damaged_summary_is_not_believed(tmp_path: Path) -> None:
     path = tmp_path / 'bag.mcap'
     chunked_file(path, CompressionType.NONE)
     content = bytearray(path.read_bytes())
-    # The last mention of the topic is the summary's.
+    # The last occurrence of the topic is in the summary.
     at = content.rindex(b'/said')
     content[at : at + 5] = b'/sald'
     path.write_bytes(content)

@@ -1,1 +1,1 @@
-"""Changes of the code that a test should find: see scripts/mutants."""
+"""Mutation tests: see scripts/mutants."""

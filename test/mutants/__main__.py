@@ -1,4 +1,4 @@
-"""Change the code in one place at a time, and see whether a test fails.
+"""Mutation testing: change the code in one place at a time, and run its tests.
 
 Survivors, which no test has found, are listed with file, line, and both texts. Mutants that change
 no result are listed in test/mutants/equivalent.tsv with their reasons, and are not counted.
@@ -27,7 +27,7 @@ Change = tuple[str, str, str]
 
 
 def parsed(words: list[str] | None) -> argparse.Namespace:
-    """What the command line says."""
+    """Options of the command line."""
     parser = argparse.ArgumentParser(prog='mutants', description=__doc__)
     parser.add_argument('--count', type=int, default=COUNT, help=f'mutants (default {COUNT})')
     parser.add_argument('--seed', type=int, default=SEED, help=f'of the choice (default {SEED})')
@@ -63,7 +63,7 @@ def chosen(arguments: argparse.Namespace) -> list[Mutation]:
     for folder in arguments.folders:
         for file in sorted((arguments.root / folder).rglob('*.py')):
             found += mutations(file.relative_to(arguments.root), file.read_bytes())
-    # By texts, not by places: most of the choice stays the same when other code changes.
+    # By texts, not by positions: most of the choice is stable when other code changes.
     ranks = {mutation: _rank(arguments, mutation) for mutation in found}
     found.sort(key=lambda mutation: (ranks[mutation], mutation))
     return [m for m in found[: arguments.count] if _is_wanted(m, arguments)]
@@ -88,7 +88,7 @@ def described(root: Path, result: Result) -> str:
 
 
 def run(arguments: argparse.Namespace, folder: Path) -> list[Result]:
-    """Try the mutants one after the other, reporting each."""
+    """Test the mutants one by one, with a report of each."""
     reasons = equivalent_changes(arguments.equivalent)
     candidates = chosen(arguments)[arguments.first : arguments.last]
     tried = [m for m in candidates if change_of(arguments.root, m) not in reasons]
@@ -112,7 +112,7 @@ def run(arguments: argparse.Namespace, folder: Path) -> list[Result]:
 
 
 def main(words: list[str] | None = None) -> int:
-    """Run; the exit code is 1 where too many survive."""
+    """Run; the exit code is 1 if too many survive."""
     arguments = parsed(words)
     folder = arguments.root / 'out' / 'mutants'
     shutil.rmtree(folder, ignore_errors=True)

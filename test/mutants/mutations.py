@@ -1,4 +1,4 @@
-"""What may be wrong in a module: each mutation changes one operator, number, name or statement."""
+"""Mutations of a module: each changes one operator, number, name or statement."""
 
 import ast
 from collections.abc import Iterator
@@ -44,7 +44,7 @@ _NAMES = {
     'sin': 'cos',
     'cos': 'sin',
 }
-# Whose contents are words or types: a change there changes no result.
+# Calls whose arguments are texts or types: mutations there change no result.
 _SKIPPED = (ast.Raise, ast.Import, ast.ImportFrom, ast.JoinedStr, ast.Assert)
 _SKIPPED_CALLS = ('warn', 'cast', 'TypeVar', 'NewType')
 
@@ -67,7 +67,7 @@ class Mutation:
         return source.count(b'\n', 0, self.begin) + 1
 
     def before_and_after(self, source: bytes) -> tuple[str, str]:
-        """Its lines without and with the mutation, each in one line."""
+        """Its lines without and with the mutation, each joined into one line."""
         first = source.rfind(b'\n', 0, self.begin) + 1
         last = source.find(b'\n', self.end)
         last = len(source) if last < 0 else last

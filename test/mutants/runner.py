@@ -1,4 +1,4 @@
-"""Mutants of a copy of the project, each with the tests that belong to its module."""
+"""Tests mutants in a copy of the project, each with the tests of its module."""
 
 import contextlib
 import enum
@@ -15,7 +15,7 @@ from pathlib import Path
 from mutants.mutations import Mutation
 from mutants.selection import Selection
 
-_MOST_MEMORY = 8 * 2**30  # bytes: a mutant may ask for any
+_MOST_MEMORY = 8 * 2**30  # bytes: a mutant may allocate any amount
 # Exit codes of pytest: no test was found; tests failed, without naming one; wrong usage.
 _NO_TESTS = 5
 _NO_RESULT = (1, 4)
@@ -23,7 +23,7 @@ _FAILED = re.compile(r'^(?:FAILED|ERROR) (\S+)', re.MULTILINE)
 
 
 class Fate(enum.Enum):
-    """What has become of a mutant."""
+    """Outcome of a mutant."""
 
     KILLED = 'killed'
     TIMED_OUT = 'timed out'
@@ -32,7 +32,7 @@ class Fate(enum.Enum):
 
 @dataclass(frozen=True)
 class Result:
-    """What has become of a mutant, and the test that has found it."""
+    """Outcome of a mutant, and the test that has found it."""
 
     mutation: Mutation
     fate: Fate
@@ -52,13 +52,13 @@ class Workshop:
         if beside_package.is_dir():
             shutil.copytree(beside_package, self._kernels)
         self._kernels.mkdir(exist_ok=True)
-        # By content: a mutant of the same length within a second must not pass for the original.
+        # By content: a mutant of the same size and time must not be taken for the original.
         command = ['-m', 'compileall', '-q', '--invalidation-mode', 'checked-hash', package]
         subprocess.run([sys.executable, *command], cwd=self._copy, check=True)
         self._selection = Selection(self._copy, package)
 
     def run(self, mutation: Mutation, limit_s: float) -> Result:
-        """Try a mutant; its path is relative to the project."""
+        """Test a mutant; its path is relative to the project."""
         module = self._copy / mutation.path
         tests = [str(test) for test in self._selection.tests_of(module)]
         if not tests:
@@ -79,14 +79,14 @@ class Workshop:
         return Result(mutation, Fate.KILLED, failed[1] if failed else '')
 
     def failures_without_mutant(self, tests: list[str], limit_s: float) -> list[str]:
-        """Those of some tests that fail in the copy as it is: what they find is no mutant."""
+        """Tests that fail in the unmodified copy, and so prove nothing."""
         if not tests:
             return []
         _, output = self._pytest(tests, limit_s, '--maxfail=1000000')
         return _FAILED.findall(output)
 
     def _pytest(self, tests: list[str], limit_s: float, *options: str) -> tuple[int | None, str]:
-        """Exit code, None where the time is up, and output."""
+        """Exit code (None after the time limit) and output."""
         command = [sys.executable, '-m', 'pytest', '-x', '-q', '-rfE', '--tb=no', '--no-header']
         command += ['-p', 'no:cacheprovider', '-m', 'not slow and not live', *options, *tests]
         process = subprocess.Popen(
@@ -110,7 +110,7 @@ class Workshop:
         return process.returncode, output
 
     def _environment(self) -> dict[str, str]:
-        """Variables of a run; its kernels begin as those of the project, apart from these."""
+        """Environment of a run; its kernel cache is a copy of the project's."""
         shutil.rmtree(self._kernels_used, ignore_errors=True)
         shutil.copytree(self._kernels, self._kernels_used)
         given = os.environ.get('PYTHONPATH', '').split(os.pathsep)

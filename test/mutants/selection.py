@@ -1,4 +1,4 @@
-"""Which tests belong to a module: that of its name first, then those that import it."""
+"""Tests of a module: that of its name first, then those that import it."""
 
 import ast
 import itertools
@@ -6,9 +6,9 @@ from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
-# Tests that start programs take too long here, and check other things.
+# Tests that start programs take too long, and check other things.
 _LEFT_OUT = {'live', 'docs', 'fuzz', 'tools', 'ros', 'benchmarks', 'experiments', 'mutants'}
-# So many test files for a mutant; the nearest come first.
+# Largest number of test files for a mutant; the nearest come first.
 MOST_FILES = 6
 
 

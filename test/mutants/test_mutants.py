@@ -1,4 +1,4 @@
-"""scripts/mutants finds what the tests of a small package find, and what they miss."""
+"""scripts/mutants reports the killed and the surviving mutants of a small package."""
 
 import subprocess
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What a killed node left: found again, but only where nobody else can have put it."""
+"""Checkpoints of killed nodes: found again, but only in places that no other user can write."""
 
 import os
 import tempfile
@@ -136,7 +136,7 @@ def test_where_nothing_is_chosen_states_lie_where_a_restart_removes_them(
     base = tmp_path / ('there' if runtime == 'there' else 'temporary')
     assert checkpoint_directory() == base / f'thinmap-{os.getuid()}'
     assert checkpoint_directory().stat().st_mode & 0o777 == 0o700
-    # What somebody else put there first is not used, and it is the node that says so.
+    # Files of another user are not used, and the node reports it.
     checkpoint_directory().chmod(0o755)
     node = FakeNode()
     Checkpoint(node, 30.0).save(STATE)

@@ -1,6 +1,6 @@
-"""What of a stream did not come.
+"""Lost messages of a stream.
 
-Told from what was silent, and from what two publishers say in turn.
+Distinguished from pauses, and from two publishers in turn.
 """
 
 from thinmap_ros.ros.subscription import MessageLossCounter
@@ -9,7 +9,7 @@ STEP_NS = 200_000_000
 
 
 def counted(came):
-    """Sums of lost and missing over (time in steps, number) of what came."""
+    """Sums of lost and missing messages over received (time in steps, number)."""
     losses = MessageLossCounter()
     found = [losses.record(10**12 + steps * STEP_NS, number) for steps, number in came]
     return sum(lost for lost, _ in found), sum(missing for _, missing in found)

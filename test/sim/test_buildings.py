@@ -1,4 +1,4 @@
-"""Buildings from seeds: every part can be reached; what is glass, walks or swings does so."""
+"""Buildings from seeds: reachability, glass, moving people and swinging doors."""
 
 import math
 from dataclasses import replace
@@ -111,7 +111,7 @@ def walled(glass, moving=None):
 
 
 def ahead(world, seconds=0.0):
-    """What the beam straight ahead reads, looking along x from (1, 2)."""
+    """Range of the beam straight ahead, along x from (1, 2)."""
     scan = LaserScanner(EXACT, 0).scan(world, np.array([1.0, 2.0, 0.0]), round(1e9 * seconds))
     return scan.ranges_m[90]
 

@@ -1,4 +1,4 @@
-"""Coverage against a slow reference that follows the definition word by word."""
+"""Coverage compared with a slow reference that follows the definition."""
 
 from collections import deque
 
@@ -36,7 +36,7 @@ def walled(
 def reference(
     world: World, start_cell: tuple[int, int], radius_m: float, range_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Free cells surely and perhaps seen: fine rays from reachable cells, then one to spare."""
+    """Free cells certainly and possibly visible: fine rays from reachable cells, then one more."""
     solid = world.occupied != 0
     standing = world.distance_to_wall_m > radius_m
     reached = np.zeros_like(standing)
@@ -68,10 +68,10 @@ def test_it_is_the_definition(seed: int) -> None:
     ours = observable_cells(world, start, 0.25, 3.0).cells
     seen, perhaps = reference(world, (25, 30), 0.25, 3.0)
     assert not (ours & ~perhaps).any()
-    # Centre to centre, a line may slip through where two solid cells touch at a corner; no ray of
+    # Centre to centre, a line may pass between two solid cells that touch at a corner; no ray of
     # ours does.
     assert (seen & ~ours).sum() <= 0.001 * seen.sum()
-    # A cell is seen here when any part of a place's cell is met, there when its centre is.
+    # Here a cell is visible if a ray hits any part of it, there if it hits its centre.
     assert (ours & ~seen).sum() <= 0.02 * seen.sum()
 
 

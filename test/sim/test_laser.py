@@ -1,4 +1,4 @@
-"""The laser: exact in a box whose answer is known, and wrong as real ones are."""
+"""The laser: exact in a box with known ranges, and with the errors of real lasers."""
 
 import math
 
@@ -144,7 +144,7 @@ def test_mixed_pixels_lie_between_the_two_surfaces_and_only_at_edges() -> None:
 
 
 def test_mixed_pixels_favour_neither_side() -> None:
-    """A pillar straight ahead: what its left edge does on average, its right edge does as well."""
+    """A pillar straight ahead: its left and right edges are symmetric on average."""
     world = box(pillar=True)
     pose = np.array([1.0, 2.0, 0.0])
     laser = LaserScanner(

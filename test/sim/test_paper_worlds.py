@@ -1,6 +1,6 @@
 """The papers' worlds.
 
-As large and as full of lines as the papers say, with tours that a robot can drive.
+With the sizes and numbers of lines in the papers, and tours that a robot can drive.
 """
 
 from pathlib import Path
@@ -44,7 +44,7 @@ def test_size_and_lines_are_the_papers(name: str, size: tuple[float, float], lin
     world, _ = load(name)
     found = surfaces(world, SHORTEST_M)
     assert len(found) == lines
-    # The outer walls stand on the size, half their thickness inside and half outside.
+    # The outer walls are centred on the boundary, half their thickness inside.
     span = np.ptp(found.reshape(-1, 2), axis=0)
     assert span == pytest.approx(np.array(size) - 0.1, abs=0.05)
 
@@ -53,7 +53,7 @@ def test_surfaces_of_a_box_in_a_room() -> None:
     cells = np.ones((40, 60), dtype=np.uint8)
     cells[5:35, 5:55] = 0
     cells[15:20, 20:40] = 1
-    cells[0:3, 0:3] = 0  # outside: nobody sees it
+    cells[0:3, 0:3] = 0  # outside: not visible
     world = World('box', cells, load('office')[0].frame, np.zeros(3))
     frame = world.frame
     start = frame.centres_of(np.array([[10, 10]]))[0]
@@ -76,7 +76,7 @@ def test_every_line_is_in_sight_of_the_tour(name: str) -> None:
 
 
 def _sees(world: World, place: np.ndarray, face: np.ndarray, resolution: float) -> bool:
-    """Whether a beam from a place to the middle of a face comes as far as the face."""
+    """Whether a beam from a position to the centre of a face reaches the face."""
     off = 0.5 * (face[:2] + face[2:]) - place
     distance = float(np.hypot(*off))
     if distance > RANGE_M:

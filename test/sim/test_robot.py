@@ -1,4 +1,4 @@
-"""The robot: exact motion, limits, contact, and odometry that drifts as real wheels do."""
+"""The robot: exact motion, limits, contact, and realistic odometry drift."""
 
 import math
 
@@ -98,9 +98,9 @@ def test_odometry_is_relative_to_the_start() -> None:
 
 
 def drift(name: str, seed: int) -> tuple[float, float, float]:
-    """Odometry errors over 20 m: of distance (share), of heading (rad).
+    """Odometry errors over 20 m: of distance (relative), of heading (rad).
 
-    And of ten rotations in place (share).
+    And of ten rotations in place (relative).
     """
     robot = DifferentialDriveRobot(PRESETS[name], hall(90.0), np.zeros(3), seed)
     while robot.T_world_base[0] < 20.0:

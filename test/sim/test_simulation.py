@@ -1,4 +1,4 @@
-"""The simulation: its clock, its sensors' rhythm, and that a seed is all that decides."""
+"""The simulation: its clock, the rates of its sensors, and reproducibility by a seed."""
 
 import numpy as np
 import pytest

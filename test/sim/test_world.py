@@ -1,4 +1,4 @@
-"""Worlds: drawn obstacles are occupied, and errors are reported in one line."""
+"""Worlds: obstacles are occupied, and errors are reported in one line."""
 
 from pathlib import Path
 

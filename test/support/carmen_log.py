@@ -6,7 +6,7 @@ BEAMS = 181
 
 
 def box_ranges(x, theta, half=3.0):
-    """What a laser sees in a square room around the origin."""
+    """Ranges of a laser in a square room around the origin."""
     angles = theta + np.radians(np.arange(BEAMS) - 90.0)
     to_x = (np.sign(np.cos(angles)) * half - x) / np.cos(angles)
     to_y = half / np.abs(np.sin(angles) + 1e-12)

@@ -1,10 +1,10 @@
-"""What the nodes of a live graph say of themselves on /diagnostics."""
+"""Diagnostics of the nodes of a live graph."""
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
 
 class Doctor:
-    """What the nodes last said of themselves, by node."""
+    """Last diagnostics by node."""
 
     def __init__(self, graph):
         self.heard = graph.heard('/diagnostics', DiagnosticArray)
@@ -14,7 +14,7 @@ class Doctor:
         return found[-1] if found else DiagnosticStatus(level=DiagnosticStatus.STALE)
 
     def times(self, node):
-        """How often a node has said how it is."""
+        """Number of diagnostics of a node."""
         return sum(s.name == f'{node}: thinmap' for array in self.heard for s in array.status)
 
     def value(self, node, key):

@@ -1,4 +1,4 @@
-"""Where robots of live tests start, and a map without walls."""
+"""Start poses of live tests, and a map without walls."""
 
 import numpy as np
 
@@ -12,6 +12,6 @@ AT_START = {'initial_x_m': 2.0, 'initial_y_m': 2.0, 'initial_yaw_rad': 0.9}
 
 
 def empty_hall():
-    """Map of 12 x 12 m around the origin in which all is free."""
+    """Free map of 12 x 12 m around the origin."""
     cells = np.zeros((120, 120), dtype=np.int8)
     return messages.grid_msg(GridPatch(GridFrame(-6.0, -6.0, 0.1), cells), 'map', 0)

@@ -1,10 +1,10 @@
-"""Libraries hidden from a test's programs, to see what they say where they are not installed."""
+"""Hides libraries from a test's programs, as if they were not installed."""
 
 from pathlib import Path
 
 import pytest
 
-# Python runs a module of this name when it starts.
+# Python imports a module of this name at its start.
 _START = """
 import sys
 from importlib.machinery import PathFinder
@@ -24,12 +24,12 @@ _ROS = ('rclpy', 'ament_index_python', 'rosidl_parser', 'rcl_interfaces', 'built
 
 
 def hide(library: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hide a library from the Python programs that the test starts from now on."""
+    """Hide a library from Python programs that the test starts later."""
     _write((library,), (), folder, monkeypatch)
 
 
 def hide_ros(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hide ROS 2 and its messages from the Python programs that the test starts from now on."""
+    """Hide ROS 2 and its messages from Python programs that the test starts later."""
     _write(_ROS, ('_msgs',), folder, monkeypatch)
     monkeypatch.delenv('AMENT_PREFIX_PATH', raising=False)
 

@@ -1,4 +1,4 @@
-"""A live ROS graph for a test: node processes on a private domain, and a client beside them."""
+"""A live ROS graph for a test: node processes on a private domain, and a client node."""
 
 import math
 import os
@@ -25,12 +25,12 @@ from thinmap_msgs.msg import TopologicalMap
 from thinmap_ros.ros import qos
 
 _DEPTH = 1000
-# After so long an answer passes for lost.
+# Time after which a response is taken to be lost.
 _ASK_AGAIN_S = 20.0
 
 
 class Graph:
-    """Node processes, and a node of the test's own that listens and asks."""
+    """Node processes, and the test's own node, with subscriptions and clients."""
 
     def __init__(self, domain: int, folder: Path) -> None:
         self.folder = folder
@@ -54,7 +54,7 @@ class Graph:
     ) -> subprocess.Popen[bytes]:
         """Start a node with arguments, ROS's remapping rules and its parameters.
 
-        It is known by its label, or its name.
+        Its key is its label, or its name.
         """
         command = [sys.executable, '-m', f'thinmap_ros.nodes.{name}', *arguments, '--ros-args']
         name = label or name
@@ -64,7 +64,7 @@ class Graph:
             text = f"'{value}'" if isinstance(value, str) else str(value).lower()
             command += ['-p', f'{key}:={text}']
         log = (self.folder / f'{name}.log').open('wb')
-        # Services save and load below the working directory.
+        # Services save and load below the working directory only.
         process = subprocess.Popen(
             command, stdout=log, stderr=subprocess.STDOUT, start_new_session=True, cwd=self.folder
         )
@@ -76,7 +76,7 @@ class Graph:
         return (self.folder / f'{name}.log').read_text()
 
     def heard(self, topic: str, kind: type, profile: QoSProfile = qos.STREAM) -> list[Any]:
-        """List that fills with all messages of a topic as the test spins, however rare that is."""
+        """List of all messages of a topic, filled while the test spins, even if it spins rarely."""
         messages: list[Any] = []
         deep = QoSProfile(
             depth=_DEPTH, reliability=profile.reliability, durability=profile.durability
@@ -90,9 +90,9 @@ class Graph:
         return messages
 
     def paced(self) -> tuple[str, ...]:
-        """Remapping of a simulation in lockstep with the local graph: it waits for the test, too.
+        """Remapping so that a simulation in lockstep with the local graph waits for the test, too.
 
-        Else a test that hears late where the robot is would drive it on, into a wall.
+        Otherwise a test that receives poses late could drive the robot into a wall.
         """
         if self._pacemaker is None:
             heard_too = self.node.create_publisher(TopologicalMap, 'heard_too', qos.STREAM)
@@ -103,7 +103,7 @@ class Graph:
         return ('local_topology:=heard_too',)
 
     def hear_out(self) -> None:
-        """Hear what still waits, until it is quiet: those that have stopped send nothing later."""
+        """Receive queued messages until there are no more: stopped nodes publish nothing later."""
         last_heard = self._heard
         quiet = 0
 
@@ -127,9 +127,9 @@ class Graph:
                 pytest.fail(f'never came: {what}\n{logs}')
 
     def client(self, kind: type, name: str) -> Client:
-        """Client of a service, the same each time: that both sides know each other takes a while.
+        """Client of a service, created once, because discovery takes a while.
 
-        Made before the server, it is known by the time that the server is ready.
+        If it is created before the server, it is discovered when the server is ready.
         """
         if name not in self._clients:
             self._clients[name] = self.node.create_client(kind, name)
@@ -138,19 +138,19 @@ class Graph:
     def call(self, kind: type, name: str, request: Any) -> Any:
         client = self.client(kind, name)
         self.until(client.service_is_ready, f'service {name}')
-        # A server that has just found its client may not be able to answer yet: asked again then.
+        # A server that has just discovered its client may not respond yet: ask again.
         return self._first(lambda: client.call_async(request), f'an answer of {name}')
 
     def send_goal(self, client: ActionClient, goal: Any) -> Any:
-        """Handle of a goal that was taken.
+        """Handle of an accepted goal.
 
-        A node that was killed passes for a server for a while: asked again then.
+        A killed node still counts as a server for a while: then ask again.
         """
         self.until(client.server_is_ready, 'action server')
         return self._first(lambda: client.send_goal_async(goal), 'goal taken')
 
     def _first(self, ask: Callable[[], Any], what: str) -> Any:
-        """The first answer that comes, asking again where none does for a while."""
+        """First response; asks again if there is none for a while."""
         asked: list[Any] = []
         asked_at = -math.inf
 

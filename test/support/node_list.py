@@ -1,4 +1,4 @@
-"""All nodes of the package, and what they declare beside their own parameters."""
+"""All nodes of the package, and the parameters that they have in common."""
 
 import dataclasses
 import importlib
@@ -8,17 +8,17 @@ import rclpy
 
 ROOT = Path(__file__).resolve().parents[2]
 
-# All but the one that runs the others.
+# All except the one that runs the others.
 NODES = sorted(
     path.stem
     for path in (ROOT / 'thinmap_ros' / 'nodes').glob('[a-z]*.py')
     if path.stem != 'thinmap'
 )
 
-# What rclpy declares in every node of its own accord.
+# Parameters that rclpy declares in every node.
 OF_EVERY_NODE = {'start_type_description_service'}
 
-# What a node must be told here that is not its default: a bag that exists; a test opens no window.
+# Parameters that must not have their defaults here: an existing bag, no window.
 NEEDED = {'bag_player': {'bag': 'some_bag'}, 'rerun_viewer': {'spawn': False}}
 
 OWN_WORDS = {'use_sim_time': 'follow /clock instead of the time of the machine'}
@@ -34,7 +34,7 @@ def node_class(name):
 
 
 def default_of(name, key):
-    """Default of a field of the config that a node's own module has."""
+    """Default of a field of the config in a node's module."""
     module = importlib.import_module(f'thinmap_ros.nodes.{name}')
     configs = [
         c

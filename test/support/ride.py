@@ -1,4 +1,4 @@
-"""A robot that drives by the commands of the navigator."""
+"""A simulated robot that follows the commands of the navigator."""
 
 import math
 
@@ -23,7 +23,7 @@ def room(rows=60, cols=80):
 
 
 class Ride:
-    """A robot that does exactly as told, in a world of cells of which its map may know less."""
+    """A robot with exact motion in a world of cells, with a map that may be incomplete."""
 
     def __init__(self, world, start, known=None, config=None, noise=None):
         self.noise = noise

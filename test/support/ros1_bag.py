@@ -1,4 +1,4 @@
-"""A bag as ROS 1 has it."""
+"""A bag with ROS 1 headers."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from rosbags.typesys import Stores, get_typestore
 
 
 def ros1_bag(path: Path) -> None:
-    """A bag of one scan, with a header as ROS 1 has it."""
+    """A bag of one scan, with a ROS 1 header."""
     typestore = get_typestore(Stores.ROS1_NOETIC)
     types = typestore.types
     time = types['builtin_interfaces/msg/Time'](sec=1, nanosec=0)

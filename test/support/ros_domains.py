@@ -1,6 +1,6 @@
-"""ROS domains for tests: each is taken by one test at a time on this machine.
+"""ROS domains for tests: one test at a time uses a domain on this machine.
 
-Nodes of two tests on one domain would hear each other, whoever runs these tests.
+Nodes of two tests on one domain would communicate, also if different users run the tests.
 """
 
 import errno
@@ -10,20 +10,20 @@ import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-# Above, the ports of a domain are such as the system gives to programs that ask for any.
+# Above it, the ports of a domain are in the range of ephemeral ports.
 DOMAINS = range(1, 102)
-# How DDS numbers its ports: of each participant of a domain, where others ask for it.
+# Numbering of DDS ports: discovery port of each participant of a domain.
 _FIRST_PORT = 7410
 _PORTS_A_DOMAIN = 250
 _PORTS_A_PARTICIPANT = 2
 _PARTICIPANTS = 32
-# So that each test takes another, and processes begin at different ones.
+# Each test uses another domain, and processes start at different ones.
 _turns = itertools.count(os.getpid())
 
 
 @contextmanager
 def free_domain() -> Iterator[int]:
-    """A domain that no other test has now, and on which no node of this machine listens."""
+    """A domain that no other test uses, and without nodes on this machine."""
     for _ in DOMAINS:
         domain = DOMAINS[next(_turns) % len(DOMAINS)]
         lock = _lock(domain)
@@ -37,10 +37,10 @@ def free_domain() -> Iterator[int]:
 
 
 def _lock(domain: int) -> socket.socket | None:
-    """Lock of a domain, None where another process has it.
+    """Lock of a domain; None if another process has it.
 
-    A name of the kernel's, and no file: whoever ends in whatever way leaves none, and it reaches as
-    far as the ports of the domain do.
+    An abstract socket, not a file: it vanishes with its process, and has the same network namespace
+    as the ports of the domain.
     """
     lock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:

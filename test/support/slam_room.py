@@ -1,4 +1,4 @@
-"""A small room made of segments, and a robot that drives through it."""
+"""A small room of line segments, and a robot that drives through it."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -31,7 +31,7 @@ ROOM = np.array(
 
 
 def ranges_in(segments: np.ndarray, T_world_laser: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    """Exact range of each ray to the nearest segment, inf where it meets none."""
+    """Exact range of each ray to the nearest segment; inf without one."""
     directions = np.column_stack(
         [np.cos(angles + T_world_laser[2]), np.sin(angles + T_world_laser[2])]
     )
@@ -57,7 +57,7 @@ def scan_in(
     beams: int = 181,
     clockwise: bool = False,
 ) -> Scan:
-    """A 180 degree scan; with rng: 1 cm of noise, a third of depth edges give ranges in between."""
+    """A 180 degree scan; with rng: 1 cm of noise, and mixed pixels at a third of range jumps."""
     mount = np.zeros(3) if T_base_laser is None else T_base_laser
     sign = -1.0 if clockwise else 1.0
     start = -sign * math.pi / 2.0
@@ -79,7 +79,7 @@ def seen_in(
 def on_wall(points: np.ndarray, angle_rad: float = math.pi / 2.0, share: float = 1.0) -> np.ndarray:
     """Surface points (N, 5) at points (N, 2) of a wall whose normal is at an angle.
 
-    share: how sure the normal is. They are so far apart that each of them counts fully.
+    share: certainty of the normal, 0 to 1. Their spacing gives each of them full weight.
     """
     surface = np.ones((len(points), COLUMNS))
     surface[:, :2] = points
@@ -102,7 +102,7 @@ def map_of(
 
 
 def around(pose: np.ndarray, number: int, rng: np.random.Generator) -> list[np.ndarray]:
-    """Poses (3,) beside one: within some 20 cm and 11 degrees."""
+    """Poses (3,) near a pose: within some 20 cm and 11 degrees."""
     return [pose + rng.normal(0.0, [0.2, 0.2, 0.2]) for _ in range(number)]
 
 
@@ -124,7 +124,7 @@ def drive(
     scale: float = 1.03,
     drift_rad_m: float = 0.05,
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Truth (3,) and drifting odometry (3,) of a drive around the room at 0.2 m/s and 5 Hz."""
+    """True pose (3,) and drifting odometry (3,) of a drive round the room at 0.2 m/s and 5 Hz."""
     way = np.array(
         [
             [2.0, 2.0],
@@ -153,11 +153,11 @@ def drive(
         odom = se2.compose(odom, np.array([rolled, 0.0, turned]))
 
 
-BLIND = scan_in(np.array([[1e3, -1.0, 1e3, 1.0]]), np.zeros(3))  # a scan that meets nothing
+BLIND = scan_in(np.array([[1e3, -1.0, 1e3, 1.0]]), np.zeros(3))  # a scan without hits
 
 
 def corridor_ring() -> np.ndarray:
-    """Walls (N, 4) of a corridor of 2.4 m round a block of 35 x 15 m; niches tell sides apart."""
+    """Walls (N, 4) of a corridor of 2.4 m round a block of 35 x 15 m; its sides have niches."""
     outer = np.array([40.0, 20.0])
     inner = 2.4
     corners = [np.array([[0.0, 0.0], [outer[0], 0.0], outer, [0.0, outer[1]], [0.0, 0.0]])]
@@ -191,7 +191,7 @@ def corridor(length_m: float) -> np.ndarray:
 
 
 def drive_round_the_block() -> Iterator[tuple[Scan, np.ndarray, np.ndarray]]:
-    """Scan, odometry, truth of a drive once round the corridor and on; the wheels wear and slip."""
+    """Scan, odometry and true pose of over a lap of the corridor, with worn and slipping wheels."""
     rng = np.random.default_rng(5)
     slips = np.random.default_rng(6)
     walls = corridor_ring()

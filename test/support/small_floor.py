@@ -1,4 +1,4 @@
-"""A small floor for a lost robot: world, map and drives."""
+"""A small floor for global localization: world, map and drives."""
 
 import numpy as np
 
@@ -22,7 +22,7 @@ def floor(*walls, rows=60, cols=90):
     return cells
 
 
-# Nothing in it looks like anything else.
+# Without similar places.
 OFFICE = floor(
     (0, 30, 35, 32),
     (20, 60, 60, 62),
@@ -44,9 +44,9 @@ def world_of(cells):
 
 
 def drive(cells, start, moves, seed=0, odometry_at=(5.0, -3.0, 0.7)):
-    """Scan, odometry pose and true pose from a start on.
+    """Scan, odometry pose and true pose of each step from a start.
 
-    Moves: (m ahead, rad turned), one a step.
+    Moves: (m ahead, rad of rotation), one per step.
     """
     world = world_of(cells)
     laser = LaserScanner(LaserScannerConfig(), seed)
@@ -61,6 +61,6 @@ def drive(cells, start, moves, seed=0, odometry_at=(5.0, -3.0, 0.7)):
         yield laser.scan(world, T, 200_000_000 * k), odometry, T
 
 
-# Round a corner of the office: start and way.
+# Round a corner of the office: start and moves.
 START = (0.8, 3.5, 1.2)
 WAY = [(0.15, 0.0)] * 14 + [(0.0, -0.3)] * 4 + [(0.15, 0.0)] * 12

@@ -1,4 +1,4 @@
-"""ROS domains of tests: no two tests have the same at a time."""
+"""ROS domains of tests: no two tests use the same one at a time."""
 
 import socket
 import subprocess
@@ -62,7 +62,7 @@ def test_a_domain_on_which_a_node_listens_is_left_alone(monkeypatch):
 
 @pytest.mark.live
 def test_nodes_are_seen_where_they_listen(ros_domain):
-    """The ports are where the middleware really has them."""
+    """The ports are those of the middleware."""
     node = subprocess.Popen(
         [sys.executable, '-c', NODE], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )

@@ -1,9 +1,9 @@
-"""A weak link between two network namespaces: every Ethernet frame comes late, and some never.
+"""A weak link between two network namespaces: Ethernet frames are delayed, and some are lost.
 
     weak_link.py PID DEVICE DEVICE LOSS DELAY_S SEED
 
 Makes a TAP device here and one in the namespace of a process, carries frames between them until
-SIGTERM, and then prints how many it carried and how many it lost, as JSON.
+SIGTERM, and then prints the numbers of carried and lost frames as JSON.
 """
 
 import contextlib
@@ -27,7 +27,7 @@ _LARGEST_FRAME = 65_536
 
 
 def tap(name: str) -> int:
-    """Return the descriptor of a new TAP device in the namespace that this process is in now."""
+    """Return the descriptor of a new TAP device in the current network namespace."""
     descriptor = os.open('/dev/net/tun', os.O_RDWR | os.O_NONBLOCK)
     fcntl.ioctl(
         descriptor, _TUNSETIFF, struct.pack('16sH22x', name.encode(), _IFF_TAP | _IFF_NO_PI)
@@ -36,9 +36,9 @@ def tap(name: str) -> int:
 
 
 def enter_network_of(pid: int) -> None:
-    """Go over to the network namespace of a process.
+    """Enter the network namespace of a process.
 
-    Devices that are open stay where they were made.
+    Open devices stay in the namespace in which they were created.
     """
     namespace = os.open(f'/proc/{pid}/ns/net', os.O_RDONLY)
     if ctypes.CDLL(None, use_errno=True).setns(namespace, _CLONE_NEWNET):
@@ -47,7 +47,7 @@ def enter_network_of(pid: int) -> None:
 
 
 class Link:
-    """Frames under way between two devices."""
+    """Frames in transit between two devices."""
 
     def __init__(self, ends: tuple[int, int], loss: float, delay_s: float, seed: int) -> None:
         self._other = {ends[0]: ends[1], ends[1]: ends[0]}

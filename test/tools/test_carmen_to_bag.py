@@ -1,4 +1,4 @@
-"""A log as a bag: reading either gives the same, bit for bit."""
+"""A log converted to a bag: both give identical data."""
 
 import subprocess
 import sys

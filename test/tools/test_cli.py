@@ -1,4 +1,4 @@
-"""What all command line programs do alike."""
+"""Common behaviour of all command line programs."""
 
 import argparse
 from pathlib import Path

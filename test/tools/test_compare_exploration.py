@@ -1,4 +1,4 @@
-"""Strategies x worlds x starts into one table: resumable, paired, and the same on a cluster."""
+"""Table of strategies x worlds x starts: resumable, paired, and the same on a cluster."""
 
 import json
 import os
@@ -123,7 +123,7 @@ def test_it_runs_all_writes_all_and_goes_on_where_it_was(world: Path, tmp_path: 
     assert (out / 'table.md').read_text() in result.stdout
     files = sorted((out / 'runs').rglob('report.json'))
     assert len(files) == 2
-    # What is there is not run again: the table is made of it.
+    # Existing results are not computed again: the table is made from them.
     changed = json.loads(files[0].read_text()) | {'distance': 1234.5}
     files[0].write_text(json.dumps(changed))
     stamp = files[1].stat().st_mtime_ns
@@ -131,7 +131,7 @@ def test_it_runs_all_writes_all_and_goes_on_where_it_was(world: Path, tmp_path: 
     again = compare(*words)
     assert '1234.5' in again.stdout
     assert files[1].stat().st_mtime_ns > stamp
-    # Nor is what was run otherwise taken for it.
+    # Results of other options are not used.
     faster = compare(*words, '--speed', '0.3')
     assert faster.returncode == 2
     assert 'other options' in faster.stderr

@@ -1,6 +1,6 @@
 """The program map_to_graph.
 
-Any map_server map in, a route graph out, or one line on what is wrong.
+From any map_server map to a route graph, or to an error of one line.
 """
 
 import json

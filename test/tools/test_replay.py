@@ -1,4 +1,4 @@
-"""replay as a program: its files, its figures, and one line for whatever cannot be replayed."""
+"""The program replay: its files, its figures, and errors of one line."""
 
 import gzip
 import json
@@ -106,7 +106,7 @@ def test_a_cut_off_bag_is_replayed_as_far_as_bag_repair_reads_it(log, tmp_path, 
     convert(CarmenLog(log, LaserOptions()), tmp_path / 'bag.mcap')
     whole = (tmp_path / 'bag.mcap').read_bytes()
     cut = tmp_path / 'cut.mcap'
-    cut.write_bytes(whole[: int(share * len(whole))])  # one chunk, and the summary
+    cut.write_bytes(whole[: int(share * len(whole))])  # one chunk and the summary
     good = tmp_path / 'good.mcap'
     repair = [sys.executable, '-m', 'thinmap_ros.tools.bag_repair', cut, '-o', good]
     assert subprocess.run(repair).returncode == 0
@@ -213,7 +213,7 @@ def test_stamps_that_jump_back_do_no_harm(tmp_path):
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / 'out' / 'report.json').read_text())
     assert report['scans'] + report['skipped'] == 40
-    # As in the file: a robot's clock is set back now and then, and its log continues.
+    # As in real logs: a robot's clock is sometimes set back, and its log continues.
     assert report['scans'] >= 38
     poses = np.loadtxt(tmp_path / 'out' / 'trajectory.tum')
     assert np.isfinite(poses).all()
@@ -252,7 +252,7 @@ def test_real_office_log(shared_data, tmp_path):
 
 
 class Diary(NullView):
-    """What a view was told: how often of what, and the last map."""
+    """A view that counts its calls by kind, and stores the last map."""
 
     def __init__(self):
         self.told = Counter()
@@ -343,7 +343,7 @@ def rows_received(path, entity):
 
 @contextmanager
 def closed_when(mark, condition):
-    """Write a mark when a condition holds, or when it never does."""
+    """Write a mark when a condition holds, or after a timeout."""
     ended = threading.Event()
 
     def watch():
@@ -366,7 +366,7 @@ def closed_when(mark, condition):
 @needs_rerun
 @pytest.mark.programs
 def test_the_viewer_shows_the_replay_until_it_is_closed(log, tmp_path, monkeypatch, capsys):
-    # The real program, told to write down what it receives where it would open a window; closed
+    # The real program, which writes a file of what it receives instead of opening a window; closed
     # when the results are there and it has shown all of it.
     received, stand_in, seen = (tmp_path / name for name in ('received.rrd', 'viewer', 'seen'))
     report = tmp_path / 'out' / 'report.json'

@@ -1,4 +1,4 @@
-"""Data shown in a view are in the .rrd file, read back with rerun's own reader."""
+"""Data of a view are in the .rrd file, read with rerun's own reader."""
 
 import subprocess
 import sys
@@ -70,7 +70,7 @@ def test_map_lies_where_it_is_and_is_the_right_way_up(tmp_path):
     assert blueprints >= 1
     assert np.ravel(grid['GridMap:translation']).tolist() == [-1.0, 2.0, 0.0]
     assert np.ravel(grid['GridMap:cell_size']) == pytest.approx(0.1)
-    # Grey is drawn as grey, and not in the colours of a measurement.
+    # Grey images are shown in grey, and not with a colour map.
     assert np.ravel(grid['GridMap:colormap']).tolist() == [1]
     # Upper row first; free is white, occupied black, unknown between.
     assert np.ravel(grid['GridMap:data']).tolist() == [127, 255, 255, 255, 0, 205]
@@ -96,7 +96,7 @@ def test_robot_scan_and_trail(tmp_path):
         START, [1.0, 2.0, np.inf], 0.0, np.pi / 2.0, 0.1, 8.0, se2.pose(0.1, 0.0, 0.0)
     )
     view.scan(START, scan)
-    # A robot that stands still, and only then goes: standing leaves no trail.
+    # A robot that first stands still: this adds no points to the trail.
     for i, x in enumerate([0.0, 0.01, 0.0, 0.2, 0.4]):
         view.pose(START + i * S, se2.pose(x, 1.0, 0.5), np.diag([0.04, 0.01, 0.001]))
     view.close()
@@ -179,7 +179,7 @@ def test_viewer_without_a_screen_is_refused(tmp_path, monkeypatch):
 @pytest.mark.programs
 @needs_rerun
 def test_viewer_is_sent_what_the_file_holds_and_ends_with_the_view(tmp_path, monkeypatch):
-    # The real program, told to write down what it receives where it would open a window.
+    # The real program, which writes a file of what it receives instead of opening a window.
     received = tmp_path / 'received.rrd'
     stand_in = tmp_path / 'viewer'
     stand_in.write_text(
@@ -197,7 +197,7 @@ def test_viewer_is_sent_what_the_file_holds_and_ends_with_the_view(tmp_path, mon
     assert viewer.poll() is not None
     rows, _ = read_back(tmp_path / 'a.rrd')
     assert sum(seconds is not None for seconds, _ in rows['/plots/progress/coverage_percent']) == 10
-    # It is ended, not asked to finish its file: what matters is that it was reached.
+    # It is killed without finishing its file: only its connection matters.
     assert received.stat().st_size > 0
 
 
@@ -229,7 +229,7 @@ def test_bag_becomes_a_recording_with_the_error_of_the_pose(tmp_path):
     write_bag(tmp_path / 'bag')
     recording_from_bag(tmp_path / 'bag', tmp_path / 'run.rrd')
     rows, _ = read_back(tmp_path / 'run.rrd')
-    # The pose that is no number is left out, and nothing else is.
+    # Only the pose that is not a number is left out.
     errors = [
         (s, v['Scalars:scalars'][0]) for s, v in rows['/plots/error/position_cm'] if s is not None
     ]
@@ -281,7 +281,7 @@ def test_feed_refuses_what_makes_no_sense():
 
 
 class Diary(NullView):
-    """What a view was told."""
+    """A view that stores its calls."""
 
     def __init__(self):
         self.numbers = []

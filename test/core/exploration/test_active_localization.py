@@ -1,4 +1,4 @@
-"""A lost robot drives to where the places in question differ, sure sooner than one that roams."""
+"""Active localization: drives to where the hypotheses differ, faster than a random drive."""
 
 import itertools
 
@@ -23,7 +23,7 @@ from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 from thinmap_ros.sim.robot import RobotConfig
 from thinmap_ros.sim.simulation import STEP_NS, Simulation
 
-# Two rooms that are the same, and the corridor at their doors, which goes on to one side.
+# Two identical rooms, and the corridor at their doors, which continues to one side.
 _ROOM = ((0, 0, 70, 2), (70, 0, 72, 46), (70, 56, 72, 60), (20, 18, 34, 30), (50, 35, 53, 45))
 TWINS = floor(
     *((r, c + left, e, d + left) for left in (0, 60) for r, c, e, d in _ROOM), rows=86, cols=135
@@ -45,12 +45,12 @@ def is_right(found, T):
 
 
 def seconds_driven_by_itself(finder, start, seed):
-    """Time until it is sure, and the way to there; it never touches a wall."""
+    """Time until localized, and the travelled path; without contact with a wall."""
     finder.restart()
     simulation = Simulation(
         world_of(TWINS), se2.pose(*start), RobotConfig(), LaserScannerConfig(), seed
     )
-    # As those that roam.
+    # As the random drives.
     search = ActiveSearch(
         finder.places,
         finder.config,
@@ -90,13 +90,13 @@ def test_a_robot_that_drives_where_places_differ_is_sure_sooner_than_one_that_ro
 
 
 def in_both_rooms(*start):
-    """The same place in both twin rooms, as T_map_odom of a robot whose odometry is zero there."""
+    """The same pose in both identical rooms, as T_map_odom for an odometry pose of zero."""
     return np.array([se2.pose(*start), se2.pose(start[0] + 6.0, *start[1:])])
 
 
 def test_the_viewpoint_is_where_the_views_differ_and_in_reach_for_all_places(finder):
     starts = in_both_rooms(*STARTS[0])
-    odometry = se2.pose(4.0, -1.0, 0.4)  # wherever it is, it is the same place
+    odometry = se2.pose(4.0, -1.0, 0.4)  # the same pose in either room
     starts_there = np.array([se2.compose(T, se2.invert(odometry)) for T in starts])
     half = np.array([0.5, 0.5])
     view = best_viewpoint(finder.places, odometry, starts_there, half, 15.0, WavefrontConfig())
@@ -105,11 +105,11 @@ def test_the_viewpoint_is_where_the_views_differ_and_in_reach_for_all_places(fin
         x, y = se2.transform_points(T, view.T_odom_view[None, :2])[0]
         row, col = finder.places.frame.cells_of(np.array([[x, y]]))[0]
         assert finder.places.states[row, col] == FREE
-        assert y > 2.0 + 6.0  # near the doors, far from the middle of the rooms
+        assert y > 2.0 + 6.0  # near the doors, far from the centre of the rooms
 
 
 def everywhere(step_m=0.4):
-    """Odometry poses all over a room, with looks to all sides."""
+    """Odometry poses all over a room, with observations to all sides."""
     x, y = np.meshgrid(np.arange(-7.0, 7.0, step_m), np.arange(-9.0, 9.0, step_m))
     turns = np.arange(-3.0, 3.2, 0.7)
     at = np.repeat(np.column_stack([x.ravel(), y.ravel()]), len(turns), axis=0)
@@ -161,7 +161,7 @@ def test_what_is_beside_a_place_by_little_neither_closes_its_way_nor_is_told_apa
 
 
 def test_where_all_but_the_own_place_has_been_looked_from_a_turn_there_is_new(finder):
-    # In front of its room's door, with its back to the corridor, which goes on to one side.
+    # In front of its room's door, facing away from the corridor, which continues to one side.
     starts = np.array([[3.5, 9.9, -np.pi / 2.0], [9.5, 9.9, -np.pi / 2.0]])
     seen = everywhere()
     seen = np.concatenate([seen[np.hypot(seen[:, 0], seen[:, 1]) > 0.85], np.zeros((1, 3))])

@@ -1,4 +1,4 @@
-"""Borders of the known: shared among end nodes, looked at from as far as that shows something."""
+"""Frontier candidates: assignment of frontiers to end nodes, and their viewpoints."""
 
 import math
 
@@ -35,7 +35,7 @@ def corridor():
 
 
 def corner():
-    """A room of 4 x 4 m with a side room to the north, hidden where it lies behind the corner."""
+    """A room of 4 x 4 m with a side room to the north, hidden behind the corner."""
     cells = np.full((90, 90), -1)
     cells[:40, :40] = 0
     cells[[0, 39], :40] = 100
@@ -52,7 +52,7 @@ def test_a_border_at_the_end_of_the_range_is_looked_at_from_a_little_nearer():
     (candidate,) = surveyor_of(corridor()).survey(AT, 8.0)
     assert candidate.track.node_id == FIRST_FRONTIER_ID
     assert len(candidate.cells) == 38
-    # What lies 2 m behind the border at 9 m is in range from 3.5 m on.
+    # Cells 2 m behind the frontier at 9 m are in range from 3.5 m on.
     assert candidate.goal[0] == pytest.approx(11.0 - 7.5, abs=0.5)
     assert abs(candidate.goal[2]) < 0.3
 
@@ -89,7 +89,7 @@ def test_from_where_the_robot_is_to_look_most_of_what_is_hidden_is_in_sight():
 
 
 def open_hall(seen_to_m):
-    """36 x 20 m, all of it seen up to x: the border is as long as the hall is wide."""
+    """36 x 20 m, observed up to x: the frontier is as long as the hall is wide."""
     cells = np.full((200, 360), -1)
     cells[:, : int(10 * seen_to_m)] = 0
     cells[[0, -1]] = 100
@@ -98,7 +98,7 @@ def open_hall(seen_to_m):
 
 
 def test_of_a_border_longer_than_the_laser_reaches_a_part_is_looked_at_from_the_nearest_place():
-    """No place shows most of it; the goal is not right at it, but as far as the range allows."""
+    """No viewpoint shows most of it; the goal is as far from it as the range allows."""
     surveyor = surveyor_of(open_hall(12.0))
     near = se2.pose(2.0, 4.0, 0.0)
     far = se2.pose(2.0, 16.0, 0.0)

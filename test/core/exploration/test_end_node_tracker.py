@@ -1,4 +1,4 @@
-"""The tracker: which looks count, what becomes of nodes that move, appear, merge or vanish."""
+"""End node tracker: counted observations, and nodes that move, appear, merge or vanish."""
 
 import math
 
@@ -81,7 +81,7 @@ def test_a_node_that_moves_a_little_keeps_its_evidence_and_one_that_moves_on_los
     gathered = nodes.tracks[1].probability
     nodes.follow({1: (5.3, 2.0)})
     assert nodes.tracks[1].probability == gathered
-    # Step by step as well: what counts is the way from where the evidence began.
+    # In small steps, too: the displacement since the first evidence counts.
     nodes.follow({1: (5.6, 2.0)})
     assert nodes.tracks[1].probability == PRIOR
     assert nodes.tracks[1].min_distance_m == math.inf

@@ -1,4 +1,4 @@
-"""The explorer in small worlds: it sees all, stops by itself, says why, and does not waver."""
+"""The explorer in small worlds: coverage, termination with a reason, and hysteresis."""
 
 import math
 from dataclasses import replace
@@ -29,7 +29,7 @@ START = np.array([1.0, 1.0, 0.0])
 
 
 def world_of(walls=(), size=(60, 60)):
-    """A walled floor, 0.1 m a cell, with inner walls given as (rows, cols) slices."""
+    """A closed floor with cells of 0.1 m, and inner walls given as (rows, cols) slices."""
     cells = np.zeros(size, dtype=np.uint8)
     cells[[0, -1]] = 1
     cells[:, [0, -1]] = 1
@@ -39,12 +39,12 @@ def world_of(walls=(), size=(60, 60)):
 
 
 def two_rooms():
-    """A door of 1 m joins a room with a second one in which a screen hides a corner."""
+    """A door of 1 m to a second room, in which a screen hides a corner."""
     return world_of([(slice(0, 25), 30), (slice(35, 60), 30), (slice(40, 42), slice(40, 60))])
 
 
 class Run:
-    """An exploration with known poses; fails(decision): which targets the navigator refuses."""
+    """An exploration with known poses; fails(decision): whether navigation to a target fails."""
 
     def __init__(self, world, config=None, seed=1, fails=None, start=START):
         self.world = world
@@ -152,7 +152,7 @@ def test_it_decides_the_same_every_time():
 
 
 def comb(doors=45):
-    """A corridor from which many openings lead into the unknown."""
+    """A corridor with many openings to unknown space."""
     cells = np.full((60, 30 + 20 * doors), -1, dtype=np.int8)
     cells[[9, 50], :] = 100
     cells[10:50, :] = 0
@@ -225,7 +225,7 @@ def test_an_exploration_goes_on_from_its_state_as_if_it_had_not_been_interrupted
     late = Explorer.from_state(finished)
     for _ in range(3):
         decision = late.step(run.topology.map, run.grid.known_area(), run.scan, run.poses[-1])
-    assert decision.finished, 'what was examined in vain stays examined'
+    assert decision.finished, 'a target that was examined without success stays examined'
 
 
 @pytest.mark.parametrize('broken', ['nodes_ids', 'borders_looks', 'visited'])
@@ -242,7 +242,7 @@ def test_the_literal_scheme_stops_by_itself_too():
 
 
 def hall_with_pockets(size=(160, 300)):
-    """A free hall; 30 unknown pockets near the robot, two side by side at its far end (slices)."""
+    """A free hall with 30 unknown patches near the robot and two at the far end (slices)."""
     cells = np.zeros(size, dtype=np.int8)
     cells[[0, -1]] = 100
     cells[:, [0, -1]] = 100

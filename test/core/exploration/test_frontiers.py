@@ -1,6 +1,6 @@
-"""Borders of the known.
+"""Frontiers.
 
-Found anew scan by scan as from scratch, given to end nodes, looked at, exhausted.
+Incremental detection equals detection in the whole map; assignment, observation, exhaustion.
 """
 
 import math
@@ -25,7 +25,7 @@ def patch_of(cells, frame=FRAME):
 
 
 def half_known():
-    """A walled room of 4 x 3 m, known up to x = 2 m: one border, 2.8 m long."""
+    """A walled room of 4 x 3 m, known up to x = 2 m: one frontier, 2.8 m long."""
     cells = np.full((30, 40), -1)
     cells[:, :20] = 0
     cells[[0, -1], :20] = 100
@@ -141,7 +141,7 @@ def test_the_place_to_look_from_can_be_stood_on_and_is_near_the_border():
     assert place is not None
     row, col = FRAME.cells_of(place[None])[0]
     assert allowed[row, col]
-    # Nearly the shortest way from the border; of such places the one nearest to the robot.
+    # Nearly the shortest path from the frontier; among such places the nearest to the robot.
     assert 1.0 < place[0] < 1.65
     assert abs(place[1] - 2.0) < 0.1
     assert borders.place_to_look(found, allowed, 0.1, (1.0, 2.0)) is None

@@ -96,7 +96,7 @@ def test_outside_the_fence_all_is_wall_and_inside_nothing_changes():
 
 
 class Scripted:
-    """A strategy with decisions set by the test; it remembers its inputs."""
+    """A strategy with decisions set by the test; it stores its inputs."""
 
     def __init__(self, goal=None, code=FinishCode.NONE, area_m2=0.0):
         self.goal = goal
@@ -184,7 +184,7 @@ def test_a_mission_returns_to_its_start_and_ends_with_the_reason_why_exploring_e
     mission = returning_mission()
     assert mission.step(at(2.0)) is None
     assert mission.odometer.distance_m > 3.0
-    # Budgets do not keep the robot from returning.
+    # Budgets do not prevent the return.
     assert mission.check(2.0, True) is None
     assert mission.drive_ended(True, '') == Finish(FinishCode.UNREACHABLE, 'words')
     assert mission.state == MissionState.FINISHED
@@ -203,7 +203,7 @@ def test_a_navigator_that_lost_the_goal_is_sent_to_the_start_again():
     mission = returning_mission()
     assert mission.check(1.0, True) is None
     assert isinstance(mission.check(2.0, False), DriveTo)
-    # That counts as no failure.
+    # This is not a failure.
     assert isinstance(mission.drive_ended(False, 'no path'), DriveTo)
     assert isinstance(mission.drive_ended(False, 'no path'), DriveTo)
 

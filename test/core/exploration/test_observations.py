@@ -1,4 +1,4 @@
-"""Observations are complete with scan, pose and map, in whatever order these arrive."""
+"""Observations are complete with scan, pose and map, in any order of arrival."""
 
 import math
 

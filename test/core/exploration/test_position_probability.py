@@ -1,4 +1,4 @@
-"""Equations (1) to (10) of the exploration paper, against hand-worked numbers and their meaning."""
+"""Equations (1) to (10) of the exploration paper, against results by hand, and their meaning."""
 
 import math
 
@@ -27,7 +27,7 @@ def test_distance_index_is_equation_1(r, index):
 
 
 def test_far_looks_speak_against_a_node_since_nothing_clips_the_index():
-    # The paper's Fig. 10 shows 0.44 after one look: D = 0.44 at 5.6 m.
+    # The paper's Fig. 10 shows 0.44 after one observation: D = 0.44 at 5.6 m.
     assert bayes_update(0.5, reliability(4.0 / 0.44 - 3.5, 0.0)) == pytest.approx(0.44)
 
 

@@ -1,4 +1,4 @@
-"""Tours against trying all orders, and what waiting is for."""
+"""Tours compared with all permutations, and deferred targets."""
 
 import itertools
 
@@ -44,7 +44,7 @@ def test_a_place_that_would_have_to_be_come_back_to_comes_first():
 
 
 def test_waiting_makes_near_places_come_first():
-    # Out to a far place and back past a near one is as long as the other way round.
+    # A tour to a distant place and back past a near one is as long as its reverse.
     points = np.array([[1.0, 0.0], [10.0, 0.0], [-8.0, 0.0]])
     between = between_of(points)
     ways = np.abs(points[:, 0])

@@ -1,6 +1,6 @@
-"""Reference implementation of the occupancy grid, slow and obvious.
+"""Reference implementation of the occupancy grid: slow and simple.
 
-A dictionary of cells, and one beam after the other.
+A dictionary of cells; beams are processed one by one.
 """
 
 import math
@@ -19,7 +19,7 @@ SURELY_OCCUPIED = 0.9
 def crossed(start, end):
     """Cells (row, col) of a segment (x, y) to (x, y).
 
-    Those of the middles between its crossings of cell borders.
+    Those at the midpoints between its crossings of cell boundaries.
     """
     shares = [0.0, 1.0]
     for a, b in zip(start, end, strict=True):
@@ -32,18 +32,18 @@ def crossed(start, end):
 
 
 class PlainGrid:
-    """Log odds, in whole thousandths, of the cells (row, col) that were ever seen."""
+    """Log odds, in thousandths, of the observed cells (row, col)."""
 
     def __init__(self, config=None):
         self.config = config or OccupancyConfig()
         self.odds = {}
 
     def thousandths(self, probability):
-        """Log odds as they are kept."""
+        """Log odds as stored."""
         return round(1000.0 * log_odds(probability))
 
     def update(self, scan, T_map_base):
-        """Add a scan made at a robot pose T_map_base (3,)."""
+        """Add a scan at a robot pose T_map_base (3,)."""
         T = se2.compose(T_map_base, scan.T_base_laser)
         self.laser = (T[0] / self.config.resolution_m, T[1] / self.config.resolution_m)
         ends = [self.end_of(scan, i, T[2]) for i in range(scan.ranges_m.size)]
@@ -66,7 +66,7 @@ class PlainGrid:
             self.add(cell, self.thousandths(self.config.p_miss))
 
     def is_hit(self, scan, i):
-        """Whether a beam ended in something near enough."""
+        """Whether a beam has a hit within the usable range."""
         return (
             0 <= i < scan.ranges_m.size
             and scan.hit[i]
@@ -74,7 +74,7 @@ class PlainGrid:
         )
 
     def end_of(self, scan, i, heading):
-        """Where a beam ends (x, y), in cells; None where it says nothing."""
+        """End (x, y) of a beam, in cells; None for an uninformative beam."""
         config = self.config
         length = 0.0
         if self.is_hit(scan, i):
@@ -100,7 +100,7 @@ class PlainGrid:
         return abs(between - foretold) < FLAT_M and abs(after - before) < LONGEST_SURFACE_M
 
     def is_grazed(self, cell):
-        """Whether a cell is surely occupied, as are others in line with it along the beam."""
+        """Whether a cell is certainly occupied, and others in line with it along the beam."""
         config = self.config
         sure = min(self.thousandths(SURELY_OCCUPIED), self.thousandths(config.p_max))
         if self.odds.get(cell, 0) < sure:
@@ -123,7 +123,7 @@ class PlainGrid:
     def add(self, cell, step):
         """Bayes' rule for one cell.
 
-        Even odds stay a thousandth off, because 0 is a cell never seen.
+        Even odds are stored as one thousandth, because 0 is an unobserved cell.
         """
         low = self.thousandths(self.config.p_min)
         high = self.thousandths(self.config.p_max)

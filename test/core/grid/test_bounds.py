@@ -22,7 +22,7 @@ SEEN = scan_of(np.full(61, 20.0))
 
 
 class Guarded:
-    """The sheet on which a scan is drawn, in the middle of memory of which all is known."""
+    """The buffer into which a scan is rendered, between guard areas of known content."""
 
     def __init__(self, grid):
         grid.add_scan(SEEN, np.zeros(3))

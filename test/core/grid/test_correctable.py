@@ -1,4 +1,4 @@
-"""A grid that follows corrections in slices: in the end it is what rendering in one go gives."""
+"""A grid that is re-rendered in slices equals one that is re-rendered at once."""
 
 from itertools import pairwise
 
@@ -22,7 +22,7 @@ APART_M = 0.4
 
 
 def ring_poses():
-    """True poses (N, 3) once round the corridor."""
+    """True poses (N, 3) of a lap of the corridor."""
     poses = []
     for a, b in pairwise(CORNERS):
         heading = np.arctan2(*(b - a)[::-1])
@@ -52,13 +52,13 @@ def drifted(poses, rad_a_step):
 
 
 def correction(rng, count, spread_m):
-    """Stamps (M,) of some of the first scans, and poses (M, 3) somewhere near the true ones."""
+    """Stamps (M,) of some early scans, and poses (M, 3) near the true ones."""
     stamps = np.flatnonzero(rng.random(count) < 0.2)
     return stamps, TRUE[stamps] + rng.normal(0.0, spread_m, (len(stamps), 3)) * [1.0, 1.0, 0.1]
 
 
 class Drive:
-    """The same drive and corrections with a grid that is re-rendered in slices or in one go."""
+    """The same drive and corrections with a grid re-rendered in slices or at once."""
 
     def __init__(self, in_one_go):
         self.map = CorrectableGrid(OccupancyGrid())
@@ -125,7 +125,7 @@ def drifted_map(count):
 
 
 def tiles_of(grid):
-    """Log odds of each tile by its place."""
+    """Log odds of each tile by its coordinates."""
     state = grid.state()
     return dict(zip(map(tuple, state['tiles'].tolist()), state['log_odds'], strict=True))
 
@@ -178,7 +178,7 @@ def test_new_scans_are_shown_at_once_and_stay_shown():
 
 
 def test_a_slice_does_a_bounded_part_of_the_work(monkeypatch):
-    """However long the drive was, a slice renders scans of at most so many tiles."""
+    """A slice renders scans of a bounded number of tiles, for any length of the drive."""
     done = []
     pop = rerendering._Queue.pop
     monkeypatch.setattr(rerendering._Queue, 'pop', lambda self: done.append(pop(self)) or done[-1])
@@ -229,7 +229,7 @@ def test_a_scan_touches_no_tile_beyond_those_that_it_is_thought_to(seed):
 
 
 def test_what_is_rendered_again_at_the_same_poses_is_what_was_there():
-    """All scans touch the tile of the robot: they are rendered in the order in which they came."""
+    """All scans touch the tile of the robot: they are rendered in their original order."""
     grid = CorrectableGrid(OccupancyGrid())
     poses = [se2.pose(3.0 + 0.3 * k, 1.2, 0.0) for k in range(12)]
     for k, T in enumerate(poses):

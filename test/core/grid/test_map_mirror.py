@@ -1,4 +1,4 @@
-"""A map put together from what was published."""
+"""A map assembled from published local maps."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The grid's Bayes update: against a plain reference, and what it must never do."""
+"""The grid's Bayes update, compared with a reference, and its invariants."""
 
 import math
 
@@ -33,7 +33,7 @@ def percent(grid, x, y):
 
 
 def reference(scan, T, config):
-    """Cells passed and hit by fine sampling of beams: slow, obvious, blind only at cell corners."""
+    """Cells traversed and hit, by fine sampling of beams: inexact only at cell corners."""
     passed = set()
     hit = set()
     ranges = np.where(scan.hit, scan.ranges_m + config.surface_thickness_m, scan.ranges_m)
@@ -69,7 +69,7 @@ def test_one_scan_marks_what_a_finely_sampled_reference_marks(seed):
         tuple((c + offset).tolist()) for c in np.argwhere((patch.cells >= 0) & (patch.cells < 65))
     }
     assert found_hit == hit
-    # A beam cuts the corner of a cell by less than the reference's step now and then, and some
+    # A beam may cut the corner of a cell by less than the reference's step, and some
     # neighbours of these random ranges look like a surface.
     assert len(found_passed ^ passed) <= 0.02 * len(passed)
 
@@ -183,7 +183,7 @@ def test_a_map_of_another_resolution_is_refused():
 
 
 def test_beams_that_graze_a_wall_do_not_erase_it():
-    """A wall along y = 1.03, in the middle of its cells, passed at a distance again and again."""
+    """A wall along y = 1.03, at the centre of its cells, passed repeatedly at a distance."""
     grid = OccupancyGrid()
     angles = -math.pi / 2 + STEP * np.arange(181)
     for x in np.arange(-6.0, 0.0, 0.05):
@@ -201,7 +201,7 @@ def test_a_wall_on_the_border_of_two_cells_leaves_the_one_in_front_free():
     rng = np.random.default_rng(4)
     bearings = np.radians(np.arange(-90.0, 91.0))
     for _ in range(30):
-        # A wall along x = 2.0, seen with 1 cm of noise.
+        # A wall along x = 2.0, observed with 1 cm of noise.
         with np.errstate(divide='ignore'):
             ranges = 2.0 / np.cos(bearings) + rng.normal(0.0, 0.01, 181)
         grid.add_scan(
@@ -214,7 +214,7 @@ def test_a_wall_on_the_border_of_two_cells_leaves_the_one_in_front_free():
 
 
 def seen_from(x, y, heading, wall_y, solid=True):
-    """Scan of a wall from (0, wall_y) to (2.4, wall_y), 0.1 m thick, before one at x = -1."""
+    """Scan of a wall from (0, wall_y) to (2.4, wall_y), 0.1 m thick, in front of one at x = -1."""
     world = np.zeros((500, 500), dtype=np.uint8)
     world[:, 75:80] = 1
     if solid:
@@ -250,7 +250,7 @@ def test_a_long_wall_that_went_away_is_unlearned_by_beams_that_cross_it():
 
 
 def drive_through_clutter(seed, scans=25):
-    """Scans on a curve among posts and walls, some beams lost, spoilt or without return."""
+    """Scans on a curve among posts and walls; some beams are invalid or without return."""
     rng = np.random.default_rng(seed)
     world = np.zeros((600, 600), dtype=np.uint8)
     world[[0, -1]] = 1
@@ -272,7 +272,7 @@ def drive_through_clutter(seed, scans=25):
 
 
 def known_cells(grid):
-    """Log odds by (row, col) of all the cells that a grid has seen."""
+    """Log odds by (row, col) of all observed cells of a grid."""
     state = grid.state()
     cells = [
         (tile, *at)

@@ -1,4 +1,4 @@
-"""The traversal against geometry that can be worked out by hand."""
+"""The traversal compared with geometry computed by hand."""
 
 import math
 
@@ -20,7 +20,7 @@ def room(rows=40, cols=60):
 
 
 def distance_to_box(x, y, angle, left, bottom, right, top):
-    """Where a ray from inside a box meets its border: the plain formula."""
+    """Intersection of a ray from inside a box with its boundary, by the plain formula."""
     cos = math.cos(angle)
     sin = math.sin(angle)
     along_x = (right - x) / cos if cos > 0 else (left - x) / cos if cos < 0 else math.inf
@@ -55,7 +55,7 @@ def test_a_line_is_clear_just_where_finely_sampled_points_on_it_are(seed, a, b):
     free = np.random.default_rng(seed).random((20, 20)) > 0.1
     points = np.linspace(np.add(a, 0.5), np.add(b, 0.5), 2003)
     off_lattice = np.abs(points - np.round(points))
-    # On a border a point belongs to no cell for sure; through a corner the line visits one of two
+    # A point on a boundary belongs to either cell; through a corner the line visits one of two
     # cells.
     inside = off_lattice.min(axis=1) > 1e-6
     through_corner = bool((off_lattice.max(axis=1) < 0.01).any())
@@ -84,14 +84,14 @@ def test_a_filled_segment_joins_its_ends_through_the_cells_that_it_crosses(start
     ends = [(math.floor(y), math.floor(x)) for x, y in (start, end)]
     assert filled.issuperset(ends)
     assert len(filled) == np.count_nonzero(sheet)
-    # Cells that differ are cut by so little that rounding decides: the segment passes their
+    # Cells that differ are cut by less than the rounding error: the segment passes their
     # corners.
     for row, col in filled ^ crossed(start, end).union(ends):
         assert distance_to_segment(col, row, start, end) < 1e-6
 
 
 def distance_to_segment(col, row, start, end):
-    """The least distance of a cell's corners from a segment, in cells."""
+    """Smallest distance of a cell's corners from a segment, in cells."""
     corners = np.array(
         [[col, row], [col + 1, row], [col, row + 1], [col + 1, row + 1]], dtype=float
     )

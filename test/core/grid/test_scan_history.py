@@ -1,4 +1,4 @@
-"""Poses of the past, corrected, and which scans are kept."""
+"""Scan history: corrected poses, and the choice of stored scans."""
 
 import numpy as np
 import pytest
@@ -17,9 +17,9 @@ def filled(poses, stamps):
 
 
 def test_scans_move_with_the_last_named_one_before_them():
-    """Scan 4 is moved to the side and scan 8 is turned.
+    """Scan 4 is shifted and scan 8 is rotated.
 
-    Those after each go with it, those before the first as well.
+    Later scans move with each of them, and scans before the first one, too.
     """
     history = filled(POSES, range(100, 112))
     moved = np.array([POSES[4] + [0.0, 1.0, 0.0], POSES[8] + [0.0, 0.0, 0.5]])
@@ -80,7 +80,7 @@ def test_of_a_place_that_is_seen_again_and_again_the_newest_scans_are_kept():
 
 
 def test_places_are_those_after_a_correction():
-    """Two halves of a path turn out to be one: of what is seen there, the newest is kept."""
+    """Two halves of a path are corrected onto each other: the newest scans are kept."""
     there = np.array([se2.pose(0.01 + k, 0.1, 0.1) for k in range(8)])
     away = there + [0.0, 50.0, 0.0]
     history = filled(np.concatenate([there] * 4 + [away] * 4), range(64))
@@ -93,7 +93,7 @@ def test_places_are_those_after_a_correction():
 
 
 def test_poses_before_the_corrections_are_those_of_the_first_since_they_were_accepted():
-    """Poses after a correction are given before it as if there had been no correction."""
+    """Poses after a correction are stored as if there had been no correction."""
     history = filled(POSES[:6], range(6))
     history.apply_correction(np.array([0]), POSES[[0]] + [0.0, 1.0, 0.0], since_ns=6)
     for k in (6, 7):

@@ -1,4 +1,4 @@
-"""Numbers found by place."""
+"""Numbers indexed by position."""
 
 import math
 

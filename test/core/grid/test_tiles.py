@@ -1,4 +1,4 @@
-"""Storage in tiles: it grows with the building, whatever its shape, without long copies."""
+"""Storage in tiles: it grows with the building, for any shape, without long copies."""
 
 import copy
 import mmap

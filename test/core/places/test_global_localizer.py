@@ -1,6 +1,6 @@
-"""A lost robot: found, in doubt, or in another building.
+"""Global localization: localized, ambiguous, or in another building.
 
-And what it says when something is missing.
+And reports of missing inputs.
 """
 
 from dataclasses import replace
@@ -77,7 +77,7 @@ def test_a_floor_that_looks_the_same_when_turned_by_180_degrees_stays_ambiguous(
         first, second = result.hypotheses[:2]
         assert abs(first.weight - second.weight) < 0.1
         assert is_right(first, T) or is_right(second, T)
-        middle = (7.0, 10.0, np.pi)  # twice the middle of the floor
+        middle = (7.0, 10.0, np.pi)  # twice the centre of the floor
         assert is_right(second, np.array(middle) + first.T_map_base * (-1.0, -1.0, 1.0))
 
 
@@ -101,7 +101,7 @@ def test_a_pose_found_is_followed_and_a_robot_carried_off_is_found_again(finder)
     wrong = [
         T for result, T in results[len(before) :] if result.pose and not is_right(result.pose, T)
     ]
-    assert len(wrong) <= 3  # until the first looks there have been taken
+    assert len(wrong) <= 3  # until the first observations there
     assert results[-1][0].state != State.LOCALIZED or is_right(results[-1][0].pose, results[-1][1])
 
 

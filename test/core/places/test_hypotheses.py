@@ -1,4 +1,4 @@
-"""Places where the robot may be: evidence, samples of their own, and what becomes of doubles."""
+"""Pose hypotheses: evidence, their samples, and merging of duplicates."""
 
 import numpy as np
 import pytest

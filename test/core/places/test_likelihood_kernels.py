@@ -1,4 +1,4 @@
-"""The loops over samples against what they say in plain words."""
+"""Likelihood kernels compared with a plain reference."""
 
 import math
 
@@ -113,13 +113,13 @@ def test_node_scores_are_those_of_the_nearest_node_in_sight(places, poses):
             nearest = min((np.hypot(*(node - at)) for node in known), default=np.inf)
             agrees = math.exp(-0.5 * (nearest / sigma) ** 2) if nearest < 5.0 * sigma else 0.0
             expected += math.log(1.0 - q + q * gain * agrees)
-        # Places of nodes and of squared distances are steps of a scale: ten nodes are off by a
+        # Positions of nodes and squared distances are quantized: ten nodes are off by a
         # little each.
         assert score == pytest.approx(expected, abs=0.05)
 
 
 def marched(states, x, y, angle, most):
-    """Way to the first cell that is not free, in small steps."""
+    """Distance to the first cell that is not free, in small steps."""
     for way in np.arange(0.0, most, 0.002):
         row = math.floor(y + way * math.sin(angle))
         col = math.floor(x + way * math.cos(angle))
@@ -158,14 +158,14 @@ def test_the_true_pose_explains_nearly_all_and_one_behind_a_wall_little(places, 
     )
     assert counts[0] >= 0.95 * len(seen.ranges_m)
     assert (counts[1:] < 0.7 * len(seen.ranges_m)).all()
-    assert not silent[:2].any()  # turned, beams end outside the map
+    assert not silent[:2].any()  # rotated, beams end outside the map
 
 
 def test_of_the_unknown_the_map_says_nothing(places, seen):
     states = np.where(places.states == 1, np.uint8(2), places.states)
     near = np.full_like(places.near, 255)
-    # Each beam that met something ends a hair within the unknown: where noise lets it end before,
-    # the map says much.
+    # Each hit is slightly inside unknown space: if noise shortens the range, the
+    # map is informative.
     x, y = (se2.pose(*START)[:2] - origin(places)) / CELL_M
     ways = [free_way(states, x, y, START[2] + bearing, 500.0)[0] for bearing in seen.bearings_rad]
     ranges = np.where(seen.met, (np.array(ways) + 1e-3) * CELL_M, seen.ranges_m)
@@ -240,9 +240,7 @@ def test_distances_to_walls_are_exact_where_they_fit_a_byte(places):
 
 
 def test_of_poses_whose_beams_would_have_to_pass_walls_one_that_explains_them_is_taken():
-    hall = floor(
-        (20, 0, 22, 40), (20, 48, 22, 90), rows=60, cols=90
-    )  # a door through which the robot looks
+    hall = floor((20, 0, 22, 40), (20, 48, 22, 90), rows=60, cols=90)  # a door in the robot's view
     places = Places.of(*map_of(hall), CONFIG)
     scan, _, T = next(drive(hall, (3.4, 2.8, 1.57), []))
     judge = Judge(places, CONFIG, calibrate(places, scan, CONFIG, np.random.default_rng(0)))

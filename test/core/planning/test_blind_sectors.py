@@ -40,7 +40,7 @@ def test_points_fill_a_sector_from_where_something_can_hide(first, count, pose, 
     assert bearings.max() == pytest.approx(first + count - 1 - 90.0, abs=1e-3)
     nearest = np.hypot(*(points - np.array(pose[:2])).T).min()
     assert nearest == pytest.approx(MIN_OBSTACLE_WIDTH_M / math.radians(count + 1), rel=1e-4)
-    # Dense enough that no disc of a robot fits in between.
+    # So dense that the robot's footprint does not fit in between.
     for metres in (nearest, 1.0, 1.9):
         for degrees in np.linspace(first, first + count - 1, 7) - 90.0:
             angle = pose[2] + math.radians(degrees)
@@ -77,15 +77,15 @@ def test_what_was_seen_from_where_the_robot_just_was_is_seen():
     bare = unseen_points(dead, (here[0], 0.0, 0.0))
     left = sectors.points(2.0, 0.5)
     assert 0 < len(left) < len(bare)
-    # The space beside the robot was ahead of it; the space farther out never was.
+    # The space beside the robot was observed ahead of it; the space farther out never was.
     beside = here + np.array([0.0, 0.25])
     assert np.hypot(*(bare - beside).T).min() < 0.1 < np.hypot(*(left - beside).T).min()
-    # Of what was seen farther back than it may remember, it knows nothing.
+    # Observations beyond its memory distance are forgotten.
     assert len(sectors.points(2.0, 0.0)) == len(bare)
 
 
 def spoiled(ride, spoil):
-    """The same ride with a laser that is broken from now on."""
+    """The same ride with a laser that is blind from now on."""
     whole = ride.scan
 
     def scan():
@@ -129,7 +129,7 @@ def test_a_robot_whose_sector_dies_on_the_way_stops(first, end):
 
 
 def test_where_a_leg_can_hide_a_little_ahead_it_drives_no_faster_than_it_can_stop():
-    """20 degrees: a leg cannot hide nearer than 0.26 m, 2 cm ahead of the body."""
+    """20 degrees: a leg in the sector is at least 0.26 m away, 2 cm ahead of the body."""
     ride = spoiled(Ride(room(), (1.0, 3.0, 0.0)), with_beams(80, 101, np.nan))
     ride.go((3.0, 3.0))
     fastest = max(v for v, _ in ride.commands)
@@ -159,7 +159,7 @@ def test_a_hall_without_a_return_is_driven_through():
 
 
 def test_something_nearer_than_can_be_measured_is_an_obstacle():
-    """-inf, REP 117: at range_min, which is inside of what the robot would sweep."""
+    """-inf (REP 117): an obstacle at range_min, inside the swept area of the robot."""
     ride = spoiled(Ride(room(), (1.0, 3.0, 0.0)), with_beams(85, 96, -np.inf))
     last = ride.go((6.0, 3.0))[-1]
     assert last.state == 'failed'

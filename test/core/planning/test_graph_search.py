@@ -25,7 +25,7 @@ def edge(number, a, b, points):
 
 
 def square():
-    """Corners 1 (0, 0), 2 (4, 0), 3 (4, 3), 4 (0, 3); no edge from 4 to 1; 5 lies alone."""
+    """Corners 1 (0, 0), 2 (4, 0), 3 (4, 3), 4 (0, 3); no edge from 4 to 1; 5 is isolated."""
     nodes = [node(1, 0, 0), node(2, 4, 0), node(3, 4, 3), node(4, 0, 3), node(5, 9, 9)]
     corners = {n.id: (n.x, n.y) for n in nodes}
     edges = [

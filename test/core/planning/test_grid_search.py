@@ -1,4 +1,4 @@
-"""Lengths of ways over the grid, against Dijkstra's algorithm as it is in the books."""
+"""Path lengths on the grid, compared with a textbook Dijkstra's algorithm."""
 
 import heapq
 import math

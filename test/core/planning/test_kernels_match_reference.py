@@ -1,4 +1,4 @@
-"""The compiled loops of planning and exploration give what plain code gives."""
+"""The kernels of planning and exploration are equal to reference implementations."""
 
 import math
 
@@ -85,7 +85,7 @@ def test_whether_something_has_come_near_a_path(seed):
 
 
 def plain_smoothed(ranges):
-    """Each known range as the mean of those up to two beams off that differ by less than 3 cm."""
+    """Mean of each valid range with those up to two beams away that differ by less than 3 cm."""
     beside = [ranges[max(i - 2, 0) : i + 3] for i in range(len(ranges))]
     return np.array(
         [

@@ -64,7 +64,7 @@ def test_it_stops_in_front_of_what_only_the_laser_knows_and_goes_around_it():
 
 
 def gap_of(cells):
-    """A room with a wall across, and a gap in it."""
+    """A room divided by a wall with a gap."""
     world = room()
     world[: 30 - cells // 2, 40:43] = 100
     world[30 + cells - cells // 2 :, 40:43] = 100
@@ -72,7 +72,7 @@ def gap_of(cells):
 
 
 def rides_to_and_fro(ride, seconds):
-    """How often a robot crosses to the other side in that time, how near it comes to walls, m."""
+    """Number of crossings to the other side in that time, and the smallest clearance, m."""
     corners = np.argwhere(ride.world == 100)[:, ::-1] * 0.1
     nearest = math.inf
     crossings = 0
@@ -146,7 +146,7 @@ def test_a_new_goal_takes_the_place_of_the_old_one_and_cancel_brings_it_to_rest(
 
 
 def test_speed_is_kept_low_enough_to_stop_before_what_stands_ahead():
-    """A wall at every distance: told to drive on, it never has more speed than it can brake."""
+    """A wall at every distance: the speed always allows braking in front of it."""
     config = NavigatorConfig(controller=PathFollowerConfig(max_speed_m_s=0.5))
     known = room()
     for gap in (0.3, 0.4, 0.6, 1.0):
@@ -182,7 +182,7 @@ def test_it_remembers_what_is_beside_it_where_the_laser_does_not_look():
     ahead = np.full(181, np.inf)
     ahead[90] = 0.5
     assert np.allclose(look((2.0, 3.0, 0.0), ahead, 0), [[2.5, 3.0]], atol=1e-6)
-    # Turned away from it: it is still there; looked at again and gone: it is forgotten.
+    # Out of view, it is remembered; observed as free, it is forgotten.
     assert np.allclose(look((2.0, 3.0, 2.5), np.full(181, np.inf), 1), [[2.5, 3.0]], atol=1e-6)
     assert len(look((2.0, 3.0, 0.5), np.full(181, np.inf), 2)) == 0
     # Distant points are dropped, too.
@@ -198,7 +198,7 @@ def test_the_way_it_came_it_can_go_back_however_narrow_it_looks_now():
     narrow = GridPatch(looks_open.frame, gap_of(2))
     navigator.set_goal(1.0, 3.05)
     assert navigator.step(np.array([7.0, 3.05, math.pi]), narrow, None, DT).state == 'driving'
-    # Nobody has been there who did not come that way.
+    # The robot has not been there.
     other = Navigator()
     other.set_goal(1.0, 3.05)
     assert other.step(np.array([7.0, 3.05, math.pi]), narrow, None, DT).state == 'failed'

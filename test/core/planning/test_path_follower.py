@@ -71,7 +71,7 @@ def test_it_slows_down_to_stop_at_the_end():
         dense([(0.0, 0.0), (3.0, 0.0)]), (0.0, 0.0, 0.0), PathFollowerConfig(max_speed_m_s=0.5)
     )
     assert commands[:, 0].max() == pytest.approx(0.5)
-    # The speed that can be braked to rest on the last 0.1 m.
+    # The speed from which it can brake to rest within the last 0.1 m.
     assert commands[-1, 0] < math.sqrt(2.0 * PathFollowerConfig().max_acceleration_m_s2 * 0.1)
     assert poses[-1][0] <= 3.03
 

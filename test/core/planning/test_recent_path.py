@@ -1,4 +1,4 @@
-"""Where a robot was it can go back: as cells, and for a planner whose map has a speck too many."""
+"""Recent path: traversable cells on it, also for a planner whose map has a false obstacle."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def test_its_cells_are_those_that_it_led_over_each_beside_the_one_before(seed):
     assert ((cells >= 0) & (cells < shape)).all()
     inside = (way[:, 0] < 5.0) & (way[:, 1] < 17.0) & (way[:, 0] > -1.0) & (way[:, 1] > 2.0)
     gone_over = set(map(tuple, FRAME.cells_of(way[inside]).tolist()))
-    # Steps of less than 3 cm may be left out.
+    # Steps of less than 3 cm may be skipped.
     assert len(gone_over - set(map(tuple, cells.tolist()))) <= 0.05 * len(gone_over)
     if inside.all():
         assert (np.abs(np.diff(cells, axis=0)).sum(axis=1) <= 1).all()

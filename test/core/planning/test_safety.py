@@ -1,4 +1,4 @@
-"""Whatever the goal, the robot touches nothing.
+"""The robot has no contact with obstacles, for any goal.
 
 Real limits and a real laser in rooms full of pillars.
 """
@@ -37,9 +37,9 @@ def start_in(world, rng):
 
 
 def rove(seed, speed, knows_pillars, seconds=40.0):
-    """Drive to one random goal after the other, often sent elsewhere on the way.
+    """Drive to random goals, which are often replaced before they are reached.
 
-    Returns contacts and the way made.
+    Returns the number of contacts and the travelled distance.
     """
     rng = np.random.default_rng(seed)
     world = pillars(rng)

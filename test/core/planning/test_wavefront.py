@@ -21,9 +21,9 @@ PLAIN = WavefrontConfig(robot_radius_m=0.25, inflation_cost=0.0)
 
 
 def patch_of(drawing):
-    """Rows from the top down: '.' free, '#' occupied, '?' unknown.
+    """Grid from rows, top down: '.' free, '#' occupied, '?' unknown.
 
-    10 cm a cell, corner at (1, 2).
+    Cells of 10 cm, corner at (1, 2).
     """
     states = {'.': 0, '#': 100, '?': -1}
     cells = np.array([[states[c] for c in row] for row in reversed(drawing)], dtype=np.int8)
@@ -42,7 +42,7 @@ def patch(cells):
 
 
 def reference(cost, goal):
-    """The same upwind equation, cell by cell with Python's heap."""
+    """The same upwind equation, with Python's heap."""
     rows, cols = cost.shape
     field = np.full(cost.shape, np.inf)
     done = set()
@@ -125,8 +125,8 @@ def test_round_a_wall_a_path_is_hardly_longer_than_the_string_pulled_tight():
     cells = room(120, 120)
     cells[40, :80] = 100
     path = plan(patch(cells), (2.0, 2.0), (2.0, 6.0), PLAIN)
-    # Tight round the end of the wall (x = 8.0, y = 4.0 to 4.1), at 0.25 m,
-    # half a cell more for the cells' width.
+    # Close around the end of the wall (x = 8.0, y = 4.0 to 4.1), at 0.25 m,
+    # plus half a cell.
     around = 2.0 * math.hypot(8.2 - 2.0, 2.05)
     assert np.hypot(*np.diff(path, axis=0).T).sum() <= 1.05 * around
 

@@ -1,4 +1,4 @@
-"""Small maps drawn with characters, and real ones, for the tests of the topological map."""
+"""Small maps drawn as text, and real maps, for the tests of the topological map."""
 
 import json
 from pathlib import Path
@@ -24,12 +24,12 @@ def drawn(*lines: str, scale: int = 10) -> GridPatch:
 
 
 def place(col: float, row: float, lines: int, scale: int = 10) -> tuple[float, float]:
-    """World point at the middle of a character, (col, row) counted from the top left one."""
+    """World point at the centre of a character, (col, row) from the top left."""
     return (col + 0.5) * scale * RESOLUTION, (lines - row - 0.5) * scale * RESOLUTION
 
 
 def world(folder: Path, name: str) -> tuple[GridPatch, tuple[float, float]]:
-    """A real floor plan, and a place to start from."""
+    """A real floor plan, and a start position."""
     picture = np.array(Image.open(folder / 'worlds' / f'{name}.png'))[::-1]
     start = json.loads((folder / 'worlds' / 'worlds.json').read_text())[name]['starts'][0]
     return patch_of(np.where(picture > 250, 0, 100)), (start[0], start[1])

@@ -1,4 +1,4 @@
-"""A web simplified once more, slow and obvious: chain objects, one rule after the other."""
+"""Reference simplification of a skeleton graph, slow and simple, with chain objects."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Local maps merged into the global one: like the map of the whole, with ids that stay."""
+"""Merging of local maps into the global one: equal to the batch map, with stable ids."""
 
 import math
 from itertools import pairwise
@@ -17,7 +17,7 @@ PAD = 200
 
 
 def windows(patch, way, size=100):
-    """Windows of a finished map at points (N, 2) along a way, and the poses there."""
+    """Windows of a finished map at points (N, 2) along a path, and the poses there."""
     cells = np.pad(patch.cells, PAD, constant_values=UNKNOWN)
     frame = patch.frame.with_origin_at(-PAD, -PAD)
     for x, y in way:
@@ -75,7 +75,7 @@ def test_a_drive_leads_to_the_map_of_the_whole():
     for window, T in windows(patch, round_trip):
         builder.update(window, T)
     assert_like(builder.map, build(patch, (5.0, 5.0), TopologyConfig()))
-    # Every place is drawn once: what is cut and sewn again does not pile up.
+    # Every place has one chain: repeated cutting and merging makes no duplicates.
     chains = builder._atlas.chains.values()
     cells = np.concatenate([chain.cells for chain in chains])
     assert len(cells) <= 1.1 * len(np.unique(cells, axis=0)) + 20
@@ -148,7 +148,7 @@ def test_a_place_that_changed_is_replaced():
         builder.update(window, T)
     rings = loops(builder.map)
     closed = GridPatch(patch.frame, patch.cells.copy())
-    closed.cells[110:114, 150:170] = 100  # the passage in the middle
+    closed.cells[110:114, 150:170] = 100  # the passage at the centre
     for window, T in windows(closed, legs((5, 5), (16, 5), (16, 9), (16, 5))):
         builder.update(window, T)
     assert loops(builder.map) == rings - 1
@@ -209,7 +209,7 @@ def test_drives_through_floors_lead_to_the_map_of_the_whole(shared_data, name):
             + PAD
         )
         shown[row : row + 100, col : col + 100] = window.cells
-    # What no window showed, the batch map must not know either.
+    # The batch map must not contain more than the windows.
     assert_like(
         builder.map, build(GridPatch(patch.frame.with_origin_at(-PAD, -PAD), shown), start, config)
     )

@@ -1,4 +1,4 @@
-"""A graph that is rebuilt where trajectory, grid and windows come one after the other."""
+"""A graph that is rebuilt after trajectory, grid and windows arrive in turn."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ STAMPS = np.arange(1, 6)
 
 
 def hall(shift_m=0.0):
-    """A hall of 8 x 4 m in the middle of what is unknown, cells of 10 cm."""
+    """A hall of 8 x 4 m in unknown space, cells of 10 cm."""
     cells = np.full((160, 160), UNKNOWN, dtype=np.int8)
     cells[29:72, 20:102] = 100
     cells[30:71, 21:101] = 0

@@ -1,4 +1,4 @@
-"""Known answers for plain shapes, and what must hold on any map."""
+"""Known results for simple shapes, and invariants on any map."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def loops(graph):
 
 
 def assert_sound(patch, graph, free):
-    """Edges run over free cells from node to node, and so do straight lines between their nodes."""
+    """Edges are on free cells from node to node, and so are straight lines between their nodes."""
     assert not set(graph.nodes) & set(graph.edges) and min([*graph.nodes, 1]) >= 1
     for node in graph.nodes.values():
         assert free[tuple(patch.frame.cells_of(node.position)[0])]

@@ -1,4 +1,4 @@
-"""What simplifying a web keeps and what it drops."""
+"""Simplification of a skeleton graph: kept and removed chains."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ EVERYWHERE = Outlook(np.ones((0, 0), dtype=bool), 0, 0)
 
 
 def chain(web, *cells):
-    """Chain along straight pieces between cells, with spots where it begins and ends."""
+    """Chain along straight segments between cells, with vertices at its ends."""
     way = [cells[0]]
     for row, col in cells[1:]:
         while way[-1] != (row, col):
@@ -78,7 +78,7 @@ def test_loops_that_are_cut_and_drawn_together_again_do_not_multiply():
 
 
 def scribble(seed, size=60):
-    """A skeleton with all that is to be simplified, and clearances that do not agree with it."""
+    """A skeleton with all cases of simplification, and inconsistent clearances."""
     rng = np.random.default_rng(seed)
     free = np.ones((size, size), dtype=bool)
     for row, col in rng.integers(0, size, (rng.integers(5, 60), 2)):
@@ -96,7 +96,7 @@ def said(web):
 
 
 def looking(rim, row, col):
-    """What an outlook says of a spot, in plain words."""
+    """Reference for the outlook of a vertex."""
     marked = np.argwhere(rim) + (row, col)
 
     def promising(spot):

@@ -1,6 +1,6 @@
-"""A laser that says nothing, on a live graph.
+"""A blind laser on a live graph.
 
-The robot stops, says why, and goes on when ranges come back.
+The robot stops, reports the reason, and continues when ranges return.
 """
 
 import math
@@ -24,7 +24,7 @@ NODES = ('localizer', 'grid_mapper', 'topology_builder', 'explorer', 'navigator'
 
 
 class Relay:
-    """Between the laser and the nodes: passes the scans on, spoiled where the test wants it."""
+    """Relay between the laser and the nodes, which spoils scans on request."""
 
     def __init__(self, graph):
         self.spoil = None
@@ -71,7 +71,7 @@ def test_a_blind_laser_stops_an_exploration_which_goes_on_when_it_sees_again(gra
         graph.until(lambda: relay.spoiled > 2, 'it has heard of it')
         graph.until(stands, 'it stops')
         commands.clear()
-        graph.until(lambda: len(commands) > 10, 'it goes on saying so')
+        graph.until(lambda: len(commands) > 10, 'further commands')
         assert all(c.linear.x == c.angular.z == 0.0 for c in commands)
         # Half a second at 0.5 m/s, and then a braking distance of 0.5 m/s^2.
         assert np.hypot(*(place() - before)) < 0.5
@@ -80,11 +80,11 @@ def test_a_blind_laser_stops_an_exploration_which_goes_on_when_it_sees_again(gra
         graph.until(lambda: statuses[-1].state == SlamStatus.BLIND, 'the status says so')
         relay.whole()
         graph.until(lambda: statuses[-1].state == SlamStatus.TRACKING, 'it tracks again')
-    graph.until(lambda: commands[-1].linear.x > 0.3, 'it goes on')
+    graph.until(lambda: commands[-1].linear.x > 0.3, 'it drives on')
 
 
 class Robot:
-    """A robot at rest in an empty hall, of which a navigator alone hears, with a goal ahead."""
+    """A stationary robot in an empty hall with a navigator alone, and a goal ahead."""
 
     def __init__(self, graph):
         self.graph = graph
@@ -97,7 +97,7 @@ class Robot:
         self.drive()
 
     def drive(self):
-        """Ask for it anew."""
+        """Send the goal again."""
         goal = NavigateToPose.Goal()
         goal.pose.pose.position.x = 4.0
         goal.pose.pose.orientation.w = 1.0

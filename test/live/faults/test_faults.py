@@ -1,4 +1,4 @@
-"""Faults on a live graph: killed nodes, silence, time set back, bursts, a full disk."""
+"""Faults on a live graph: killed nodes, silent topics, a clock set back, bursts, a full disk."""
 
 import resource
 import signal
@@ -22,9 +22,9 @@ from thinmap_ros.files.snapshots import write_snapshot
 from thinmap_ros.ros import messages, qos
 
 pytestmark = pytest.mark.live
-# While a node is dead, no scan leads to anything.
+# While a node is dead, no scan has a result.
 LOCKSTEP_S = 2.0
-# However long a start takes.
+# Includes the start of the node.
 RECOVER_S = 1000.0
 TICK_NS = 100_000_000
 MAPPING = ('localizer', 'grid_mapper', 'topology_builder')
@@ -45,7 +45,7 @@ def start_mapping(graph, rate=4.0, lockstep='local_topology'):
 
 
 def start_together(graph, *names, **simulation):
-    """The same in one process, as it is left running on a robot."""
+    """The same in one process, as it is run on a robot."""
     graph.start(
         'thinmap', arguments=names, use_sim_time=True, recovery_timeout_s=RECOVER_S, **AT_START
     )
@@ -77,7 +77,7 @@ def kill(graph, name):
 
 
 class Robot:
-    """Where the robot is and where it is believed to be."""
+    """True and estimated poses of the robot."""
 
     def __init__(self, graph):
         self.graph = graph
@@ -86,7 +86,7 @@ class Robot:
         self.commands = graph.node.create_publisher(Twist, 'cmd_vel', 10)
 
     def drive(self, metres, v=0.3, w=0.0):
-        """Drive so far as the crow flies."""
+        """Drive this straight-line distance."""
         self.graph.until(lambda: self.truth, 'true pose')
         start = self.truth[-1].pose.position
         command = messages.twist_msg(v, w)
@@ -99,17 +99,17 @@ class Robot:
         self.graph.until(far_enough, 'the robot makes its way')
 
     def spin(self):
-        """Turn on the spot, for now."""
+        """Rotate in place until the next command."""
         self.commands.publish(messages.twist_msg(0.0, 1.0))
 
     def settle(self):
-        """Stand, and hear where it is."""
+        """Stop, and wait for the pose."""
         self.commands.publish(messages.twist_msg(0.0, 0.0))
         said = len(self.poses) + 5
         self.graph.until(lambda: len(self.poses) > said, 'poses of a robot that stands')
 
     def error_m(self):
-        """How far the last pose is from the truth of its time, as soon as that is heard."""
+        """Error of the last pose, once the true pose of its stamp is received."""
         self.graph.until(self._errors_m, 'a pose, and the true one of its time')
         return self._errors_m()[-1]
 
@@ -121,7 +121,7 @@ class Robot:
 
 
 def kept(graph):
-    """Wait until each node has kept what it knows now: a robot that stands learns nothing."""
+    """Wait until each node has written a checkpoint; a stationary robot adds nothing to the map."""
     since_ns = time.time_ns()
     state = graph.folder / 'state'
 
@@ -153,9 +153,9 @@ def test_mapping_goes_on_after_each_node_was_killed(graph):
         maps.clear(), robot.poses.clear(), graphs.clear()
         start_one(graph, name)
         graph.until(lambda n=name: 'restored the state' in graph.log(n), 'it remembers')
-        # On a curve: where it had come up to a wall meanwhile, it turns away from it.
+        # On a curve, so that it turns away from walls.
         robot.drive(0.15, v=0.15, w=0.6)
-        graph.until(lambda: maps and len(robot.poses) > 5, 'mapping goes on')
+        graph.until(lambda: maps and len(robot.poses) > 5, 'mapping continues')
         assert (np.array(maps[-1].data) >= 0).sum() > 0.9 * known, name
         assert robot.error_m() < 0.15, name
         if name == 'topology_builder':
@@ -173,13 +173,13 @@ def test_mapping_goes_on_after_each_node_was_killed(graph):
 
 
 def test_a_killed_localizer_goes_on_in_the_map_and_does_not_bend_it(graph):
-    """The robot drives on meanwhile; without the map, the error grew from 0.005 to 0.345 m."""
+    """The robot drives on during the restart; without the map the error was up to 0.345 m."""
     robot = Robot(graph)
     doctor = Doctor(graph)
     start_mapping(graph, rate=2.0, lockstep='none')
     graph.until(lambda: robot.poses, 'it maps')
     robot.drive(2.0)
-    # Once round, so that walls are known to all sides.
+    # A full turn, so that walls to all sides are mapped.
     turned = len(robot.truth) + 130
     graph.until(lambda: robot.spin() or len(robot.truth) > turned, 'it looks round')
     robot.settle()
@@ -188,7 +188,7 @@ def test_a_killed_localizer_goes_on_in_the_map_and_does_not_bend_it(graph):
     kill(graph, 'localizer')
     robot.drive(0.5, w=0.4)
     robot.poses.clear(), doctor.heard.clear()
-    # It waits 3 s for the map from the first scan on: how long it takes to find the mapper must not
+    # It waits 3 s for the map from the first scan on: the time to discover the mapper must not
     # count.
     graph.processes['sim'].send_signal(signal.SIGSTOP)
     start_one(graph, 'localizer')
@@ -196,7 +196,7 @@ def test_a_killed_localizer_goes_on_in_the_map_and_does_not_bend_it(graph):
     graph.until(lambda: doctor.number('localizer', 'map: publishers') == 1, 'it finds the mapper')
     graph.processes['sim'].send_signal(signal.SIGCONT)
     robot.drive(0.7, w=0.3)
-    graph.until(lambda: len(robot.poses) > 5, 'it goes on')
+    graph.until(lambda: len(robot.poses) > 5, 'it continues')
     robot.drive(1.0, w=-0.3)
     robot.settle()
     assert 'no map received' not in graph.log('localizer')
@@ -245,11 +245,11 @@ def test_a_whole_robot_that_was_killed_and_begins_anew_is_not_mixed_with_the_one
     graph.hear_out()
     robot.poses.clear(), robot.truth.clear(), maps.clear()
     start_together(graph, *MAPPING)
-    graph.until(lambda: len(robot.poses) > 10 and len(maps) > 2, 'mapping anew')
+    graph.until(lambda: len(robot.poses) > 10 and len(maps) > 2, 'a new map')
     assert graph.log('thinmap').count('restored the state') == 3
     assert 'odometry was reset' in graph.log('thinmap')
     assert robot.error_m() < 0.1
-    # The robot stands where it began: it sees what one sees from there, and nothing of the drive is
+    # The robot is at its start: the map is what it observes from there, and nothing of the drive is
     # left.
     place = robot.truth[-1].pose.position
     assert np.hypot(place.x - 2.0, place.y - 2.0) < 0.05
@@ -286,7 +286,7 @@ def test_time_set_back_begins_everything_anew(graph):
     graph.until(lambda: len(robot.poses) > 10 and robot.truth, 'new poses')
     assert robot.error_m() < 0.1
     graph.until(lambda: len(maps) > 3, 'new maps')
-    # What only the first drive could see is forgotten: the robot, at its start again, stood still.
+    # Each node reports the jump once.
     assert all(graph.log('thinmap').count(notice) == 1 for notice in notices)
     assert graph.stop('thinmap') == 0, graph.log('thinmap')
 
@@ -364,7 +364,7 @@ def test_a_silent_laser_stops_the_robot_and_it_goes_on(graph):
     def speak():
         """A robot in an empty hall, the next 0.1 s after each command.
 
-        Until the first one comes, time goes on by itself.
+        Until the first command, time advances by itself.
         """
         waits = len(commands) == answered[0] if commands else time.monotonic() - said_at[0] < 0.1
         if waits:
@@ -405,14 +405,14 @@ def test_a_silent_laser_stops_the_robot_and_it_goes_on(graph):
         since_ns = now_ns[0]
         graph.until(stands, f'it stops without {who}')
         assert now_ns[0] - since_ns < (limit_s + 0.3) * 1e9
-        # Time stands still meanwhile.
+        # The clock is stopped meanwhile.
         graph.until(lambda w=who: f'{w} silent' in doctor.status('navigator').message, 'it says so')
     silent.clear()
-    graph.until(drives, 'it goes on')
+    graph.until(drives, 'it drives on')
 
 
 def test_a_robot_that_stands_for_minutes_is_as_sure_of_its_pose_as_before(graph):
-    """In 600 s the deviation had grown to 0.10 m and 0.06 rad."""
+    """The standard deviation once grew to 0.10 m and 0.06 rad in 600 s."""
     poses = graph.heard('pose', PoseWithCovarianceStamped)
     graph.start('localizer', laser_pose='0,0,0', initial_x_m=2.0, initial_y_m=2.0)
     scan = graph.node.create_publisher(LaserScan, 'scan', qos.STREAM)
@@ -431,7 +431,7 @@ def test_a_robot_that_stands_for_minutes_is_as_sure_of_its_pose_as_before(graph)
         scan.publish(messages.scan_msg(seen, 'laser', 0.2))
 
     def answered(T_map_base, count):
-        """Say where it is, over and over, until so many of these scans are behind the last pose."""
+        """Publish scans until there is a pose `count` periods later; returns its sigmas."""
         wanted = stamp[0] + count * 200_000_000
 
         def is_answered():
@@ -451,7 +451,7 @@ def test_a_robot_that_stands_for_minutes_is_as_sure_of_its_pose_as_before(graph)
     assert np.abs(after - before).max() < 1e-6
     place = poses[-1].pose.pose.position
     assert np.hypot(place.x - began.x, place.y - began.y) < 0.02, 'it does not wander'
-    # How many scans of the drive were heard, and so how true it is, depends on the machine.
+    # The number of received scans, and so the accuracy, depends on the machine.
     assert np.hypot(place.x - there[0], place.y - there[1]) < 0.04
     assert (answered(there + (0.5, 0.0, 0.0), 1) > after).any(), 'driving adds'
 
@@ -484,7 +484,7 @@ def test_a_burst_of_scans_leaves_no_queue_and_what_is_lost_is_counted(graph):
         return len(poses) > 40
 
     def all_told():
-        """Scans that the localizer says it heard or lost, when it has told of the last one."""
+        """Received and lost scans in the localizer's diagnostics, once the last one is counted."""
         graph.until(lambda: messages.stamp_ns(poses[-1].header.stamp) == now[0], 'the last pose')
         so_far = doctor.times('localizer')
         graph.until(lambda: doctor.times('localizer') >= so_far + 2, 'diagnostics')

@@ -1,6 +1,6 @@
 """A robot in a saved map on a live graph.
 
-Switched on anywhere it finds itself and maps on, and so when carried off.
+It is localized after a start anywhere and after kidnapping, and continues mapping.
 """
 
 import numpy as np
@@ -21,7 +21,7 @@ NODES = ('grid_mapper', 'topology_builder', 'localizer')
 
 
 class Robot:
-    """A robot that drives in circles, and what is heard of it."""
+    """A robot that drives in circles, and its published poses and status."""
 
     def __init__(self, graph):
         self.graph = graph
@@ -49,7 +49,7 @@ class Robot:
         return [s.state for s in self.status if messages.stamp_ns(s.header.stamp) >= since_s * 1e9]
 
     def off(self):
-        """How far the newest pose is from the truth at its stamp: m, rad."""
+        """Error of the newest pose at its stamp: m, rad."""
         ns = messages.stamp_ns(self.poses[-1].header.stamp)
         at = min(self.truth, key=lambda message: abs(messages.stamp_ns(message.header.stamp) - ns))
         off = se2.between(

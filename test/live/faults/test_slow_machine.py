@@ -1,9 +1,9 @@
-"""Nodes that get too little of the processor.
+"""Nodes with too little CPU time.
 
-What they cannot take is dropped and counted, and nothing queues up.
+Messages that they cannot process are dropped and counted, and no queue grows.
 
-A slow machine is made of any other by halting a process again and again, while so many scans come;
-how fast this one is makes no difference.
+Halting a process repeatedly simulates a slow machine, for a number of scans per halt; the speed of
+this machine makes no difference.
 """
 
 import signal
@@ -22,8 +22,8 @@ RATE = 8.0
 SCANS_WHILE_HALTED = 18
 SCANS_IN_ALL = 500
 SCAN_PERIOD_NS = 200_000_000
-# What may wait between the newest scan and the one that a pose is of: the queue of the
-# subscription, and the scans that wait for their odometry.
+# Scans that may wait between the newest one and that of a pose: the queue of the subscription, and
+# the scans that wait for their odometry.
 QUEUE = qos.SENSOR.depth
 WAITING = 20
 DROPS = ('scan: lost in transport or in a full queue', 'scans without odometry at their time')
@@ -35,11 +35,11 @@ def stamps(heard):
 
 @pytest.fixture
 def no_shared_memory(monkeypatch):
-    """Fast DDS without its shared memory, of all participants made from now on.
+    """Disable shared memory of Fast DDS for all participants created from now on.
 
-    Whoever opens the shared memory of a process that has not answered for a second takes it for
-    crashed and makes another one (healthy_check_timeout_ms); a process that was only halted may
-    then go on to listen to the old one, and hear nothing any more. That is not what is asked here.
+    A process that opens the shared memory of one that has not responded for a second assumes a
+    crash and creates another segment (healthy_check_timeout_ms). A process that was only halted may
+    then keep the old segment, and receive nothing any more. This is not the subject of this test.
     """
     monkeypatch.setenv('FASTDDS_BUILTIN_TRANSPORTS', 'UDPv4')
 
@@ -52,7 +52,7 @@ def test_old_scans_are_dropped_and_counted_and_the_delay_does_not_grow(no_shared
     start = {'initial_x_m': 2.0, 'initial_y_m': 2.0, 'initial_yaw_rad': 0.9}
     process = graph.start('thinmap', arguments=MAPPING, use_sim_time=True, **start)
     graph.start('sim', start='2.0,2.0,0.9', wait_for_subscribers=3, real_time_factor=RATE)
-    # The scans are heard by another connection than the poses: it may be made later.
+    # Discovery of the scans' publisher may take longer than that of the poses'.
     graph.until(
         lambda: len(poses) > 20 and graphs and scans, 'poses and graphs, before it becomes slow'
     )
@@ -60,10 +60,10 @@ def test_old_scans_are_dropped_and_counted_and_the_delay_does_not_grow(no_shared
     begun = [len(scans), len(scans)]
 
     def look():
-        """Note how many scans the newest is ahead of a pose, as each pose comes.
+        """Record at each pose by how many scans the newest one is ahead.
 
-        That is more than waits by as many as came since it may have been taken: since the process
-        was set to work the time before.
+        This exceeds the number of waiting scans by those that were published since the process was
+        resumed the time before.
         """
         for ns in stamps(poses[len(behind) :]):
             ahead = (stamps(scans[-1:])[0] - ns) / SCAN_PERIOD_NS
@@ -80,12 +80,12 @@ def test_old_scans_are_dropped_and_counted_and_the_delay_does_not_grow(no_shared
         begun.append(len(scans))
         newest_ns = stamps(scans[-1:])[0]
         process.send_signal(signal.SIGCONT)
-        # Else what waits in the transport, which it empties only while it runs, goes on to wait.
+        # Otherwise messages stay in the transport, which the process empties only while it runs.
         graph.until(lambda ns=newest_ns: look() and max(behind) >= ns, 'a pose of the newest')
     assert max(list(behind.values())[already:]) <= QUEUE + WAITING, 'what waits is bounded'
     assert len(behind) - already < 0.8 * (len(scans) - first), 'or the machine was not slow'
     enough = len(poses) + 20
-    graph.until(lambda: len(poses) > enough and len(graphs) > 20, 'it goes on as before')
+    graph.until(lambda: len(poses) > enough and len(graphs) > 20, 'it continues as before')
     assert graph.stop('sim') == 0
     graph.hear_out()
     sent = {ns for ns in stamps(scans) if ns >= stamps(poses)[0]}

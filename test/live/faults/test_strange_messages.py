@@ -1,6 +1,6 @@
-"""Whatever messages say.
+"""Invalid messages on a live graph.
 
-Conversions give sound values or refuse in one line, and no node dies or publishes NaN.
+Conversions give valid values or an error of one line; no node dies or publishes NaN.
 """
 
 import math
@@ -43,7 +43,7 @@ def is_rejected(message):
 @pytest.mark.parametrize('kind', CHECKS)
 def test_conversions_give_sound_values_or_refuse_in_one_line(kind):
     rejected = Counter(is_rejected(message) for message in made(kind, 800))
-    # Both happen, and often.
+    # Both occur often.
     assert rejected[True] > 80 and rejected[False] > 80
 
 
@@ -104,14 +104,14 @@ LISTENERS = {
         'pose': PoseWithCovarianceStamped,
     },
 }
-LATER = {  # looked into only when the message of another topic has come that belongs to it
+LATER = {  # converted only when the corresponding message of another topic has arrived
     'localizer': (),
     'grid_mapper': ('scan',),
     'topology_builder': (),
     'explorer': ('scan',),
     'navigator': ('pose',),
 }
-ANSWERS = {  # what each node says when it hears good messages
+ANSWERS = {  # topic that each node publishes after valid messages
     'localizer': 'pose',
     'grid_mapper': 'local_map',
     'topology_builder': 'local_topology',
@@ -121,7 +121,7 @@ ANSWERS = {  # what each node says when it hears good messages
 
 
 def set_to_work(graph, name):
-    """Give the nodes that work on goals a goal that they do not reach."""
+    """Send a goal that is not reached to the action servers."""
     if name not in ('explorer', 'navigator'):
         return
     kind, action = (
@@ -138,9 +138,9 @@ def set_to_work(graph, name):
 
 
 def say(graph, name, publishers, count):
-    """Publish so many strange messages on each topic, stamp by stamp, as fast as they are taken.
+    """Publish a number of strange messages on each topic, as fast as they are processed.
 
-    A node that answers has taken what came before. Returns how many of each must be rejected.
+    A response proves that earlier messages were processed. Returns the expected rejections.
     """
     columns = {topic: made(kind, count) for topic, (kind, _) in publishers.items()}
     for row in range(count):
@@ -178,7 +178,7 @@ def test_a_node_lives_through_them_publishes_no_nan_and_counts_what_it_rejected(
     )
     for topic, said in heard.items():
         assert all(math.isfinite(number) for message in said for number in numbers(message)), topic
-    # It still works; fresh stamps, as all that was said before may lie ahead of these.
+    # It still works; with later stamps, as earlier messages may have been ahead of time.
     answers = heard[ANSWERS[name]]
     before = len(answers)
     ns = [3 * 10**12]
@@ -219,9 +219,9 @@ def test_goals_that_are_no_goals_end_with_a_reason(graph):
 
 
 def counted(doctor, name, expected):
-    """Topics of which not enough refusals are counted.
+    """Topics with too few counted rejections.
 
-    Some messages are lost where they come this fast.
+    Some messages are lost at this rate.
     """
     return [
         t
@@ -231,7 +231,7 @@ def counted(doctor, name, expected):
 
 
 def good(kind, ns):
-    """A message of a kind that nobody can refuse."""
+    """A message of a type without invalid values."""
     found = next(m for m in made(kind, 40) if not is_rejected(m) and is_plain(m))
     found.header.stamp = messages.time_msg(ns)
     return found

@@ -1,9 +1,9 @@
 """Two machines: two network namespaces with a virtual Ethernet between them.
 
-Nothing else connects their nodes.
+There is no other connection between their nodes.
 
-Needs a kernel on which an ordinary user may make namespaces (`unshare -rn`) and virtual Ethernets;
-skipped where not.
+Needs a kernel on which an ordinary user may create namespaces (`unshare -rn`) and virtual
+Ethernets; skipped otherwise.
 """
 
 import json
@@ -25,7 +25,7 @@ from thinmap_ros.logs.bag import Bag
 pytestmark = pytest.mark.live
 ADDRESSES = ('10.77.0.1', '10.77.0.2')
 CABLE = ('cable0', 'cable1')
-WEAK = (0.05, 0.05, 7)  # share of the frames that is lost, seconds that each takes one way, seed
+WEAK = (0.05, 0.05, 7)  # share of lost frames, one-way delay in s, seed
 
 
 class Machines:
@@ -80,7 +80,7 @@ class Machines:
             pytest.skip(f'no TAP devices here: {self.link.stderr.read().strip().splitlines()[-1]}')
 
     def frames(self) -> dict[str, int]:
-        """How many frames the weak link carried, and how many it lost; with this it ends."""
+        """End the weak link; returns the numbers of carried and lost frames."""
         assert self.link is not None
         self.link.terminate()
         counts: dict[str, int] = json.loads(self.link.communicate(timeout=PATIENCE_S)[0])
@@ -123,7 +123,7 @@ class Machines:
         for key, value in parameters.items():
             text = f"'{value}'" if isinstance(value, str) else str(value).lower()
             command += ['-p', f'{key}:={text}']
-        # Shared memory would lead past the cable: both namespaces are of one machine, after all.
+        # Shared memory would bypass the link: both namespaces are on one machine.
         environment = {
             **os.environ,
             'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4',
@@ -199,8 +199,8 @@ def test_a_robot_here_and_its_map_there_outlive_a_cable_that_is_pulled(machines,
     wait(machines, lambda: recorded(bag, '/local_topology') > 10, 'the graph comes over')
     machines.unplugged(3.0)
     before = recorded(bag, '/local_topology')
-    wait(machines, lambda: recorded(bag, '/local_topology') > before + 15, 'it goes on')
-    # Scans went one way, maps and graphs the other.
+    wait(machines, lambda: recorded(bag, '/local_topology') > before + 15, 'it continues')
+    # Scans went in one direction, maps and graphs in the other.
     assert machines.received_bytes(1) > 50_000 and machines.received_bytes(0) > 50_000
     assert all(process.poll() is None for process in machines.processes.values()), machines.logs()
 
@@ -239,7 +239,7 @@ def test_an_exploration_in_real_time_over_a_weak_link_finishes_though_it_breaks_
     start_mapping(machines, 1)
     for name in ('navigator', 'explorer'):
         machines.start(0, name, use_sim_time=True)
-    # Nobody waits for an answer: what comes late comes late.
+    # Without lockstep: late messages stay late.
     machines.start(0, 'sim', start=START, wait_for_subscribers=4)
     monitor = machines.start(0, 'demo_monitor', use_sim_time=True, result=str(result))
     time.sleep(30.0)

@@ -189,7 +189,7 @@ def straight():
 
 
 def same_correction(loops, number):
-    """Candidates that all request to move the way back half a metre to the north."""
+    """Candidates that all request to move the return path half a metre to the north."""
     edges = []
     for k in range(number):
         a = k
