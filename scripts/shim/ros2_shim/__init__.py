@@ -1,4 +1,4 @@
-"""A small `ros2` on rclpy: the verbs that a robot with thinmap needs, spoken as the real one does.
+"""A small `ros2` on rclpy: the verbs that thinmap needs, with the output of the real one.
 
-The real one, where there is one, comes first on PATH: this one is then never run.
+If the real one is installed, it precedes this one on PATH, which is then never run.
 """

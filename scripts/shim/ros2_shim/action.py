@@ -34,7 +34,7 @@ def _info_arguments(parser: ArgumentParser) -> None:
     add_graph_arguments(parser)
     parser.add_argument('action_name')
     parser.add_argument('-t', '--show-types', action='store_true', help='types, too')
-    parser.add_argument('-c', '--count', action='store_true', help='only how many')
+    parser.add_argument('-c', '--count', action='store_true', help='only the number')
 
 
 def _info(args: Namespace) -> None:
@@ -66,8 +66,8 @@ def _send_goal_arguments(parser: ArgumentParser) -> None:
     parser.add_argument('action_type', help='as in thinmap_msgs/action/Explore')
     group = parser.add_mutually_exclusive_group()
     group.add_argument('goal', nargs='?', default='{}', help="as in '{time_limit_s: 60.0}'")
-    group.add_argument('--stdin', action='store_true', help='read the goal there')
-    parser.add_argument('-f', '--feedback', action='store_true', help='show what is told meanwhile')
+    group.add_argument('--stdin', action='store_true', help='read the goal from stdin')
+    parser.add_argument('-f', '--feedback', action='store_true', help='show the feedback')
 
 
 def _send_goal(args: Namespace) -> None:
@@ -93,23 +93,23 @@ def _send_goal(args: Namespace) -> None:
 
 
 class _Feedback:
-    """Says what is told meanwhile, once it is said that the goal was taken.
+    """Shows feedback, but not before the acceptance of the goal.
 
-    The answer whether it was, and the feedback, come on ways of their own: either may be first.
+    Acceptance and feedback arrive on separate channels, in any order.
     """
 
     def __init__(self) -> None:
         self._held: list[Any] | None = []
 
     def hear(self, message: Any) -> None:
-        """Say it, or hold it back."""
+        """Show a feedback message, or queue it."""
         if self._held is None:
             say(f'Feedback:\n    {values.to_yaml(message.feedback)}')
         else:
             self._held.append(message)
 
     def release(self) -> None:
-        """Say what was held back, and hold back no more."""
+        """Show queued messages, and later ones at once."""
         held = self._held or []
         self._held = None
         for message in held:
@@ -117,7 +117,7 @@ class _Feedback:
 
 
 def _follow(session: Session, sent: Future, feedback: _Feedback) -> None:
-    """Say what becomes of a goal until it has ended."""
+    """Show the progress of a goal until it ends."""
     handle = session.result(sent)
     if not handle.accepted:
         say('Goal was rejected.')
@@ -130,9 +130,9 @@ def _follow(session: Session, sent: Future, feedback: _Feedback) -> None:
 
 
 def _cancel(session: Session, sent: Future) -> None:
-    """Cancel a goal, also one of which it is not known yet whether it was taken.
+    """Cancel a goal, also one whose acceptance is not known yet.
 
-    Said on standard error where nobody reads the output any more: the robot stops all the same.
+    Reports on standard error if the output is a closed pipe: the robot stops all the same.
     """
     if not session.until(sent.done, _CANCEL_S):
         raise ShimError('Failed to cancel goal: no answer whether it was accepted')
@@ -156,7 +156,7 @@ def _say_somewhere(text: str) -> None:
 
 
 VERBS = {
-    'info': Verb('Which nodes serve and use an action.', _info_arguments, _info),
+    'info': Verb('Servers and clients of an action.', _info_arguments, _info),
     'list': _ACTIONS.list_verb,
     'send_goal': Verb(
         'Send a goal and wait for its end; Ctrl-C cancels it.', _send_goal_arguments, _send_goal

@@ -1,4 +1,4 @@
-"""The command line: which command, which verb, and how all of them end."""
+"""The command line: dispatch to commands and verbs, error messages and exit codes."""
 
 import importlib
 import os
@@ -7,35 +7,35 @@ import sys
 
 from ros2_shim.verbs import Parser, ShimError, Verb
 
-# Each is a module beside this one; it is read only where it is asked for.
+# Each is a module beside this one, imported on demand.
 COMMANDS = {
     'action': 'list actions, send goals',
     'interface': 'show the fields of a type',
     'lifecycle': 'states of lifecycle nodes',
-    'node': 'list nodes, and what they talk about',
+    'node': 'list nodes and their topics, services and actions',
     'param': 'parameters of running nodes',
     'pkg': 'packages and their programs',
     'run': 'run a program of a package',
     'service': 'list and call services',
-    'topic': 'list, hear and publish topics',
+    'topic': 'list topics, show and publish messages',
 }
 SMALL = "thinmap's small ros2 for machines without ROS"
 
 
 def main(words: list[str]) -> int:
-    """Exit code of a command line."""
+    """Run a command line; returns the exit code."""
     try:
         return _command(words)
     except KeyboardInterrupt:
         return int(signal.SIGINT)
     except BrokenPipeError:
-        # Nobody reads any more. Python would complain when it closes its output at the end.
+        # The reader of the pipe has ended. Python would fail when it flushes stdout at its exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except ShimError as failure:
         print(_one_line(failure), file=sys.stderr)
     except RuntimeError as error:
-        # What rclpy and the middleware refuse.
+        # Errors of rclpy and of the middleware.
         print(f'ros2: {_one_line(error)}', file=sys.stderr)
     return 1
 

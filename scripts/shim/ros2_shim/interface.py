@@ -13,7 +13,7 @@ _BASIC = re.compile(r'(bool|byte|char|float(32|64)|u?int(8|16|32|64)|w?string)$'
 
 
 def _definition(name: str) -> list[str]:
-    """Lines of the file in which a type is defined."""
+    """Lines of the definition of a type."""
     parts = name.split('/')
     if len(parts) == 3 and all(parts) and '..' not in parts:
         try:
@@ -28,7 +28,7 @@ def _definition(name: str) -> list[str]:
 
 
 def lines(name: str, depth: int = 0) -> list[str]:
-    """Lines of a type, and below each field of another type the lines of that."""
+    """Lines of a type, and below each field of another type the indented lines of that type."""
     package = name.split('/')[0]
     shown = []
     for line in _definition(name):

@@ -1,4 +1,4 @@
-"""`ros2 lifecycle`: states of nodes that have some."""
+"""`ros2 lifecycle`: states and transitions of lifecycle nodes."""
 
 import sys
 from argparse import ArgumentParser, Namespace
@@ -22,7 +22,7 @@ def _with_states(session: Session, hidden: bool) -> list[str]:
 def _nodes_arguments(parser: ArgumentParser) -> None:
     add_graph_arguments(parser)
     parser.add_argument('-a', '--all', action='store_true', help='hidden ones, too')
-    parser.add_argument('-c', '--count-nodes', action='store_true', help='only how many')
+    parser.add_argument('-c', '--count-nodes', action='store_true', help='only the number')
 
 
 def _nodes(args: Namespace) -> None:
@@ -95,13 +95,13 @@ def _set(args: Namespace) -> None:
     if done:
         say('Transitioning successful')
         return
-    # The real one ends with exit code 0 here, too.
+    # The real command has exit code 0 here, too.
     print('Transitioning failed', file=sys.stderr)
 
 
 VERBS = {
     'get': Verb('State of a lifecycle node, or of all.', _get_arguments, _get),
-    'list': Verb('Transitions that a node can make now.', _list_arguments, _list),
+    'list': Verb('Available transitions of a node.', _list_arguments, _list),
     'nodes': Verb('Names of all lifecycle nodes.', _nodes_arguments, _nodes),
     'set': Verb('Make a transition.', _set_arguments, _set),
 }

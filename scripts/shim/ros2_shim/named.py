@@ -1,4 +1,4 @@
-"""Topics, services and actions all have names and types: the verbs that say which."""
+"""Verbs for the names and types of topics, services and actions."""
 
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable
@@ -15,34 +15,34 @@ Pairs = list[tuple[str, list[str]]]
 
 @dataclass(frozen=True)
 class Named:
-    """What has a name and types: one of it is a `kind`, and pairs(node) are all that there are."""
+    """Entities with names and types; kind: their noun; pairs(node): all names with their types."""
 
     kind: str
     pairs: Callable[[Node], Pairs]
     hides: bool = True
-    """Whether names of ROS's own are left out of lists, unless they are asked for."""
+    """Whether lists omit hidden names by default."""
 
     @property
     def list_verb(self) -> Verb:
-        """Lists names, and types if asked for."""
+        """Verb that lists names, and types on request."""
         return Verb(f'Names of all {self.kind}s.', self._list_arguments, self._list)
 
     @property
     def type_verb(self) -> Verb:
-        """Says the types of one."""
+        """Verb that shows the types of a name."""
         return Verb(f'Type of a {self.kind}.', self.name_arguments, self._type)
 
     def name_arguments(self, parser: ArgumentParser) -> None:
-        """Arguments of a verb about one of a `name`."""
+        """Add the arguments of a verb with a `name`."""
         add_graph_arguments(parser)
         parser.add_argument('name', metavar=f'{self.kind}_name')
 
     def types(self, session: Session, full_name: str) -> list[str]:
-        """Types of what has a name; none where nothing has it."""
+        """Types of a name; empty if it is unknown."""
         return list(dict(self.pairs(session.node)).get(full_name, []))
 
     def known(self, session: Session, name: str) -> str:
-        """Full name of one that is there."""
+        """Full name of an existing entity; raises ShimError if it is not found."""
         full = session.full_name(name, self.kind)
         if not session.found(lambda: self.types(session, full)):
             raise ShimError(f"Unknown {self.kind} '{full}'")
@@ -52,7 +52,7 @@ class Named:
         add_graph_arguments(parser)
         parser.add_argument('-t', '--show-types', action='store_true', help='types, too')
         count = f'--count-{self.kind}s'
-        parser.add_argument('-c', count, action='store_true', dest='count', help='only how many')
+        parser.add_argument('-c', count, action='store_true', dest='count', help='only the number')
         if self.hides:
             parser.add_argument(
                 f'--include-hidden-{self.kind}s',

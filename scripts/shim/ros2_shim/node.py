@@ -18,7 +18,7 @@ from ros2_shim.verbs import Verb, add_graph_arguments, say
 def _list_arguments(parser: ArgumentParser) -> None:
     add_graph_arguments(parser)
     parser.add_argument('-a', '--all', action='store_true', help='hidden ones, too')
-    parser.add_argument('-c', '--count-nodes', action='store_true', help='only how many')
+    parser.add_argument('-c', '--count-nodes', action='store_true', help='only the number')
 
 
 def _list(args: Namespace) -> None:
@@ -66,11 +66,11 @@ def _info(args: Namespace) -> None:
 
 
 def is_hidden(name: str) -> bool:
-    """Tell whether a topic or service is one of ROS's own, not to be listed."""
+    """Whether a topic or service is hidden: internal to ROS."""
     return bool(topic_or_service_is_hidden(name))
 
 
 VERBS = {
-    'info': Verb('What a node hears, says and serves.', _info_arguments, _info),
+    'info': Verb('Topics, services and actions of a node.', _info_arguments, _info),
     'list': Verb('Names of all nodes.', _list_arguments, _list),
 }

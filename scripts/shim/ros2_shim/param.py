@@ -54,7 +54,7 @@ def _list(args: Namespace) -> None:
 
 
 def _list_one(session: Session, node: str) -> None:
-    """Say the names of one of several nodes; one that does not answer keeps none from the rest."""
+    """Show the parameter names of a node; one that does not respond is reported and skipped."""
     try:
         names = _names(session, node)
     except ShimError as error:
@@ -69,7 +69,7 @@ def _get_arguments(parser: ArgumentParser) -> None:
     add_graph_arguments(parser)
     parser.add_argument('node_name')
     parser.add_argument('parameter_name')
-    parser.add_argument('--hide-type', action='store_true', help='the value alone')
+    parser.add_argument('--hide-type', action='store_true', help='only the value')
 
 
 def _get(args: Namespace) -> None:
@@ -100,7 +100,7 @@ def _set(args: Namespace) -> None:
     if result.successful:
         say(f'Set parameter successful{reason}')
         return
-    # The real one ends with exit code 0 here, too.
+    # The real command has exit code 0 here, too.
     print(f'Setting parameter failed{reason}', file=sys.stderr)
 
 
@@ -108,7 +108,7 @@ def _read(text: str) -> ParameterValue:
     try:
         return get_parameter_value(text)
     except (yaml.YAMLError, AssertionError):
-        # What is neither a number nor anything else of YAML's is a text: `[draft`, a date.
+        # Values that are no parameters in YAML are texts: `[draft`, a date.
         return ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=text)
 
 
@@ -144,5 +144,5 @@ VERBS = {
     'dump': Verb('All parameters of a node, as a parameter file.', _dump_arguments, _dump),
     'get': Verb('Value of a parameter.', _get_arguments, _get),
     'list': Verb('Names of the parameters of a node, or of all.', _list_arguments, _list),
-    'set': Verb('Give a parameter another value.', _set_arguments, _set),
+    'set': Verb('Set a parameter.', _set_arguments, _set),
 }

@@ -1,4 +1,4 @@
-"""`ros2 run` and `ros2 pkg`: programs and folders of packages, found as the real command does."""
+"""`ros2 run` and `ros2 pkg`: programs and folders of packages, as in the real command."""
 
 import os
 from argparse import ArgumentParser, Namespace
@@ -15,7 +15,7 @@ from ros2_shim.verbs import Parser, ShimError, Verb, say
 
 
 def prefix(package: str) -> Path:
-    """Folder into which a package is installed."""
+    """Install prefix of a package."""
     try:
         return Path(get_package_prefix(package))
     except (PackageNotFoundError, ValueError):
@@ -29,12 +29,14 @@ def programs(package: str) -> list[Path]:
 
 
 def run(words: list[str]) -> None:
-    """Become the program; returns only after help."""
+    """Replace this process by the program; returns only after showing help."""
     if not words or words[0].startswith('-') or len(words) < 2:
         parser = Parser(prog='ros2 run', description='Run a program of a package.')
         parser.add_argument('package')
         parser.add_argument('program')
-        parser.add_argument('arguments', nargs='*', default=[], help='passed on as they are')
+        parser.add_argument(
+            'arguments', nargs='*', default=[], help='passed to the program unchanged'
+        )
         parser.parse_args(words)
     package = words[0]
     program = words[1]
@@ -47,7 +49,7 @@ def run(words: list[str]) -> None:
 
 def _executables_arguments(parser: ArgumentParser) -> None:
     parser.add_argument('package_name', nargs='?')
-    parser.add_argument('--full-path', action='store_true', help='where each is')
+    parser.add_argument('--full-path', action='store_true', help='show full paths')
 
 
 def _executables(args: Namespace) -> None:
@@ -79,5 +81,5 @@ def _list(args: Namespace) -> None:
 VERBS = {
     'executables': Verb('Programs of a package, or of all.', _executables_arguments, _executables),
     'list': Verb('Names of all packages.', _nothing, _list),
-    'prefix': Verb('Folder that a package is installed in.', _prefix_arguments, _prefix),
+    'prefix': Verb('Install prefix of a package.', _prefix_arguments, _prefix),
 }

@@ -1,4 +1,4 @@
-"""The quality of service with which a topic is heard or published."""
+"""QoS profiles of subscriptions and publishers."""
 
 from argparse import ArgumentParser, Namespace
 from typing import Any
@@ -21,19 +21,19 @@ _QUIET_S = 0.5
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """Options that go before what is chosen."""
+    """Add options that override the chosen profile."""
     parser.add_argument('--qos-reliability', choices=_RELIABILITY)
     parser.add_argument('--qos-durability', choices=_DURABILITY)
     parser.add_argument('--qos-depth', type=positive_int, default=_DEPTH, metavar='N')
 
 
 def to_publish(args: Namespace) -> QoSProfile:
-    """Reliable and volatile, unless the options say something else."""
+    """Profile of a publisher: reliable and volatile, unless the options differ."""
     return _profile(args, ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE)
 
 
 def to_hear(session: Session, topic: str, args: Namespace) -> QoSProfile:
-    """What all publishers of a topic can serve, or what the options say."""
+    """Profile of a subscription: compatible with all publishers, or as in the options."""
     publishers = _publishers(session, topic)
     reliability = ReliabilityPolicy.BEST_EFFORT
     durability = DurabilityPolicy.VOLATILE
@@ -51,7 +51,7 @@ def to_hear(session: Session, topic: str, args: Namespace) -> QoSProfile:
 
 
 def _publishers(session: Session, topic: str) -> list[Any]:
-    """Publishers of a topic, when no more of them are found."""
+    """Publishers of a topic, after discovery has settled."""
     node = session.node
     session.found(lambda: node.count_publishers(topic))
     count = 0

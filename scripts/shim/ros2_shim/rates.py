@@ -1,11 +1,11 @@
-"""How often something is heard."""
+"""Rate of received messages."""
 
 import statistics
 from collections import deque
 
 
 class Rates:
-    """Mean rate and spread over a window of messages, told once a second."""
+    """Mean rate and standard deviation over a window of messages, reported once per second."""
 
     def __init__(self, window: int) -> None:
         self._gaps_s: deque[float] = deque(maxlen=window)
@@ -13,7 +13,7 @@ class Rates:
         self._told_s: float | None = None
 
     def heard(self, now_s: float) -> str | None:
-        """Take a message in; what there is to tell, in two lines."""
+        """Add a message received at a time (s); returns a report of two lines if one is due."""
         if self._last_s is not None:
             self._gaps_s.append(now_s - self._last_s)
         self._last_s = now_s

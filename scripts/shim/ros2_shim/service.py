@@ -18,7 +18,7 @@ def _call_arguments(parser: ArgumentParser) -> None:
     parser.add_argument('service_type', help='as in std_srvs/srv/Trigger')
     group = parser.add_mutually_exclusive_group()
     group.add_argument('values', nargs='?', default='{}', help="as in '{data: true}'")
-    group.add_argument('--stdin', action='store_true', help='read the values there')
+    group.add_argument('--stdin', action='store_true', help='read the values from stdin')
 
 
 def _call(args: Namespace) -> None:

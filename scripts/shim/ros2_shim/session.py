@@ -1,7 +1,7 @@
-"""A node that looks at the graph and asks.
+"""A node that queries the ROS graph.
 
-There is no daemon that knows the graph already: what is named is waited for, and a list is given
-when nothing new has been found for a while.
+There is no daemon with a known graph: named entities are waited for, and lists are complete when
+discovery has found nothing new for a while.
 """
 
 import itertools
@@ -22,18 +22,18 @@ from rclpy.validate_full_topic_name import validate_full_topic_name
 
 from ros2_shim.verbs import SPIN_TIME_S, ShimError
 
-# A spin is short, as Python hears Ctrl-C only after it.
+# A spin is short, as Python handles Ctrl-C only after it.
 _SPIN_S = 0.05
 _LOOK_S = 1.0
-# Where nobody has been found yet.
+# If no other node has been found yet.
 _LOOK_LONGER_S = 2.5
 _QUIET_S = 0.6
-# Time for a server of unknown name to know its client.
+# Time for an unknown server to discover its client.
 _MEET_S = 0.2
 
 
 class Session:
-    """A hidden node, from `with` to its end."""
+    """A hidden node, as a context manager."""
 
     def __init__(self, args: Namespace, name: str = '') -> None:
         self.patience_s: float = getattr(args, 'spin_time', SPIN_TIME_S)
@@ -51,11 +51,11 @@ class Session:
         rclpy.shutdown()
 
     def spin(self, seconds: float = _SPIN_S) -> None:
-        """Do what there is to be done, or wait."""
+        """Process one callback, or wait."""
         rclpy.spin_once(self.node, timeout_sec=seconds)
 
     def until(self, condition: Callable[[], Any], seconds: float | None = None) -> bool:
-        """Spin until a condition holds; without seconds for ever."""
+        """Spin until a condition holds, at most for some seconds; returns whether it holds."""
         end = None if seconds is None else time.monotonic() + seconds
         while not condition():
             if end is not None and time.monotonic() > end:
@@ -64,7 +64,7 @@ class Session:
         return True
 
     def beats(self, period_s: float) -> Iterator[None]:
-        """Spin between beats; the first is at once."""
+        """Yield once per period, and spin in between; the first time at once."""
         begun = time.monotonic()
         for count in itertools.count():
             due = begun + count * period_s
@@ -73,7 +73,7 @@ class Session:
             yield
 
     def found(self, condition: Callable[[], Any]) -> bool:
-        """Wait for something that is named, as long as the options say."""
+        """Wait until a condition holds, up to the time in the options; returns whether it holds."""
         return self.until(condition, self.patience_s)
 
     def settle(self) -> None:
@@ -99,7 +99,7 @@ class Session:
         return names, topics, ends, node.get_service_names_and_types()
 
     def full_name(self, name: str, kind: str = 'topic') -> str:
-        """Name with its namespace; what cannot be a name is a failure."""
+        """Name with its namespace; raises ShimError if it is invalid."""
         try:
             full = expand_topic_name(name, self.node.get_name(), self.node.get_namespace())
             validate_full_topic_name(full, is_service=kind == 'service')
@@ -109,7 +109,7 @@ class Session:
         return str(full)
 
     def node_names(self, hidden: bool = False) -> list[str]:
-        """Full names of all nodes but this one, in order."""
+        """Full names of all nodes except this one, sorted."""
         pairs = self.node.get_node_names_and_namespaces()
         names = [f'{namespace.rstrip("/")}/{name}' for name, namespace in pairs]
         own = f'/{self._name}'
@@ -117,7 +117,7 @@ class Session:
         return sorted(name for name in shown if hidden or '/_' not in name)
 
     def find_node(self, name: str) -> str:
-        """Full name of a node that is there."""
+        """Full name of an existing node; raises ShimError if it is not found."""
         full = absolute(name)
         if not self.found(lambda: full in self.node_names(hidden=True)):
             raise ShimError(f"Node not found: '{full}'")
@@ -135,11 +135,11 @@ class Session:
         return None
 
     def introduce(self, node: str | None) -> None:
-        """Make sure that a node knows the clients made so far.
+        """Wait until a node has discovered the clients created so far.
 
-        A server that does not know its client yet takes the request, and its answer is lost. Ends
-        of a topic or service become known in the order in which they were made: a node that answers
-        to a later client knows the earlier ones. What is asked here may be asked again.
+        A server that has not discovered its client yet processes the request, but its response is
+        lost. Endpoints are discovered in the order of their creation: a node that responds to a
+        later client has discovered the earlier ones. The request here may be repeated safely.
         """
         client = self.node.create_client(GetParameters, f'{node or ""}/get_parameters')
         if node is None or not self.until(client.service_is_ready, _LOOK_S):
@@ -152,7 +152,7 @@ class Session:
                 return
 
     def ask(self, kind: Any, name: str, request: Any) -> Any:
-        """Response of a service of a node that is there."""
+        """Response of a service of an existing node."""
         client = self.node.create_client(kind, name)
         if not self.until(client.service_is_ready, self.patience_s):
             raise ShimError(f"Wait for service timed out: '{name}'")
@@ -163,7 +163,7 @@ class Session:
         return self.result(future)
 
     def result(self, future: Future) -> Any:
-        """Wait for what was asked; an error on the way is a failure."""
+        """Wait for a future and return its result; an exception becomes a ShimError."""
         self.until(future.done)
         error = future.exception()
         if error is not None:

@@ -1,4 +1,4 @@
-"""`ros2 topic`: what there is, and what is said on it."""
+"""`ros2 topic`: topics and their messages."""
 
 import itertools
 import time
@@ -42,7 +42,9 @@ def _not_published(topic: str) -> None:
 
 def _info_arguments(parser: ArgumentParser) -> None:
     _TOPICS.name_arguments(parser)
-    parser.add_argument('-v', '--verbose', action='store_true', help='each end, with its QoS')
+    parser.add_argument(
+        '-v', '--verbose', action='store_true', help='each publisher and subscription, with its QoS'
+    )
 
 
 def _info(args: Namespace) -> None:
@@ -70,10 +72,10 @@ def _echo_arguments(parser: ArgumentParser) -> None:
     parser.add_argument('message_type', nargs='?', help='as in std_msgs/msg/String')
     parser.add_argument('--once', action='store_true', help='the first message only')
     parser.add_argument('--field', metavar='F', help='a part of it, as in pose.pose.position')
-    parser.add_argument('-f', '--full-length', action='store_true', help='cut nothing')
+    parser.add_argument('-f', '--full-length', action='store_true', help='do not truncate')
     parser.add_argument('-l', '--truncate-length', type=positive_int, default=_TRUNCATE)
-    parser.add_argument('--no-arr', action='store_true', help='sequences by their length alone')
-    parser.add_argument('--no-str', action='store_true', help='texts by their length alone')
+    parser.add_argument('--no-arr', action='store_true', help='show only the length of sequences')
+    parser.add_argument('--no-str', action='store_true', help='show only the length of texts')
     parser.add_argument('--flow-style', action='store_true', help='in one line')
     qos.add_arguments(parser)
 
@@ -88,7 +90,7 @@ def _echo(args: Namespace) -> None:
             raise ShimError('Could not determine the type for the passed topic')
         kind = given or _single_type(session, topic)
 
-        def tell(message: Any) -> None:
+        def show(message: Any) -> None:
             nonlocal heard
             if args.once and heard:
                 return
@@ -96,12 +98,12 @@ def _echo(args: Namespace) -> None:
             say(_echoed(_part(message, args.field), args), '---\n')
 
         profile = qos.to_hear(session, topic, args)
-        session.node.create_subscription(kind, topic, tell, profile)
+        session.node.create_subscription(kind, topic, show, profile)
         session.until(lambda: args.once and heard)
 
 
 def _part(message: Any, path: str | None) -> Any:
-    """Value of a field, and its fields, named with dots."""
+    """Value of a field by its path, with dots for nested fields."""
     for field in filter(None, (path or '').split('.')):
         if not hasattr(message, 'get_fields_and_field_types'):
             raise ShimError(f"Invalid field '{path}': what holds '{field}' is not a message")
@@ -144,7 +146,7 @@ def _hz(args: Namespace) -> None:
             if text:
                 say(text)
 
-        # Not decoded: only the time at which it comes is asked for.
+        # Not decoded: only the time of arrival is needed.
         session.node.create_subscription(kind, topic, hear, profile, raw=True)
         session.until(lambda: False)
 
@@ -157,16 +159,20 @@ def _pub_arguments(parser: ArgumentParser) -> None:
     parser.add_argument('message_type', help='as in std_msgs/msg/String')
     parser.add_argument('values', nargs='?', default='{}', help="as in '{data: text}'")
     parser.add_argument('-r', '--rate', type=positive_float, default=1.0, metavar='HZ')
-    parser.add_argument('-p', '--print', type=int, default=1, metavar='N', help='only each N-th')
+    parser.add_argument(
+        '-p', '--print', type=int, default=1, metavar='N', help='print every N-th message only'
+    )
     group = parser.add_mutually_exclusive_group()
     group.add_argument('-1', '--once', action='store_true', help='one message, then end')
-    group.add_argument('-t', '--times', type=positive_int, default=0, help='so many, then end')
+    group.add_argument(
+        '-t', '--times', type=positive_int, default=0, help='number of messages, then end'
+    )
     parser.add_argument(
         '-w',
         '--wait-matching-subscriptions',
         type=int,
         metavar='N',
-        help='wait for so many who hear it (default: 1 with --once and --times, else 0)',
+        help='number of subscriptions to wait for (default: 1 with --once and --times, else 0)',
     )
     parser.add_argument('--keep-alive', type=float, default=0.1, metavar='SECONDS')
     qos.add_arguments(parser)
@@ -197,14 +203,14 @@ def _pub(args: Namespace) -> None:
             if args.print > 0 and count % args.print == 0:
                 say(f'publishing #{count}: {message!r}\n')
             publisher.publish(message)
-        # It reaches the wire before the end.
+        # The last message must be sent before the process ends.
         session.until(lambda: False, args.keep_alive)
 
 
 VERBS = {
     'echo': Verb('Print the messages of a topic.', _echo_arguments, _echo),
-    'hz': Verb('How often a topic is heard.', _hz_arguments, _hz),
-    'info': Verb('Who publishes and who hears a topic.', _info_arguments, _info),
+    'hz': Verb('Rate of the messages of a topic.', _hz_arguments, _hz),
+    'info': Verb('Publishers and subscriptions of a topic.', _info_arguments, _info),
     'list': _TOPICS.list_verb,
     'pub': Verb('Publish messages on a topic.', _pub_arguments, _pub),
     'type': _TOPICS.type_verb,

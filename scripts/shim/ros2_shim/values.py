@@ -1,4 +1,4 @@
-"""Types by their names, and messages from and to YAML."""
+"""Types by name, and conversion of messages from and to YAML."""
 
 import array
 import importlib
@@ -22,7 +22,7 @@ _INTEGERS = ('int', 'uint', 'byte', 'octet', 'char')
 
 
 def type_named(name: str, kind: str) -> Any:
-    """Class of a type: kind is msg, srv or action."""
+    """Class of a type by its name; kind: msg, srv or action."""
     word = {'msg': 'message', 'srv': 'service'}.get(kind, kind)
     parts = name.split('/')
     if len(parts) == 2:
@@ -40,7 +40,7 @@ def type_named(name: str, kind: str) -> Any:
 
 
 def mapping(text: str) -> dict[str, Any]:
-    """Values of fields, by name."""
+    """Parse the values of fields, by name, from YAML."""
     try:
         values = yaml.safe_load(text)
     except yaml.YAMLError as error:
@@ -59,7 +59,7 @@ def mapping(text: str) -> dict[str, Any]:
 def fill(message: Any, values: Any, now: Now | None = None) -> Any:
     """Set fields of a message.
 
-    With a clock, a header may be `auto` and a time `now`.
+    With `now`, a header may be `auto` and a time `now`.
     """
     name = type(message).__name__
     if not isinstance(values, dict):
@@ -112,7 +112,7 @@ def _sequence(present: Any, kind: Any, value: Any, now: Now | None) -> Any:
 
 def _scalar(kind: Any, value: Any) -> Any:
     if not isinstance(kind, BasicType):
-        # YAML reads `name: 5` as a number: a text all the same.
+        # YAML reads `name: 5` as a number: converted to a text.
         if isinstance(value, str | int | float):
             return str(value)
         raise ValueError(value)
@@ -138,7 +138,7 @@ def to_yaml(
     no_str: bool = False,
     flow: bool = False,
 ) -> str:
-    """Text of a message; sequences and texts are cut after `longest` elements."""
+    """YAML text of a message; sequences and texts are truncated after `longest` elements."""
     return yaml.dump(
         plain(message, longest, no_arr, no_str),
         allow_unicode=True,
@@ -151,7 +151,7 @@ def to_yaml(
 def plain(
     message: Any, longest: int | None = None, no_arr: bool = False, no_str: bool = False
 ) -> dict[str, Any]:
-    """Dictionaries, lists, numbers and texts of a message, in the order of its fields."""
+    """Convert a message to dictionaries, lists, numbers and texts, in the order of its fields."""
     result: dict[str, Any] = {}
     for field, kind in zip(message.get_fields_and_field_types(), message.SLOT_TYPES, strict=True):
         value = getattr(message, field)
@@ -182,7 +182,7 @@ def _cut(text: str, longest: int | None) -> str:
 
 
 def _told(kind: AbstractNestedType, value: Any) -> str:
-    """What stands for a sequence that is left out."""
+    """Placeholder of a sequence that is not shown."""
     element = kind.value_type
     if isinstance(element, NamespacedType):
         name = '/'.join(element.namespaced_name())

@@ -1,4 +1,4 @@
-"""What a verb is, how its arguments are read, and how it fails."""
+"""Verbs, their arguments and their errors."""
 
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable
@@ -9,11 +9,11 @@ SPIN_TIME_S = 5.0
 
 
 class ShimError(Exception):
-    """What went wrong, in one line; ends the program with exit code 1."""
+    """Error of one line; ends the program with exit code 1."""
 
 
 class Parser(ArgumentParser):
-    """Reader of arguments that says in one line what is wrong with them."""
+    """Argument parser with errors of one line."""
 
     def error(self, message: str) -> NoReturn:
         """End with exit code 2."""
@@ -22,7 +22,7 @@ class Parser(ArgumentParser):
 
 @dataclass(frozen=True)
 class Verb:
-    """One line of help, the arguments, and what is done with them."""
+    """Help text of one line, arguments, and the function that runs the verb."""
 
     help: str
     arguments: Callable[[ArgumentParser], None]
@@ -30,26 +30,26 @@ class Verb:
 
 
 def say(text: str = '', end: str = '\n') -> None:
-    """Print at once: who reads a pipe must not wait for a full buffer."""
+    """Print and flush: the reader of a pipe must not wait for a full buffer."""
     print(text, end=end, flush=True)
 
 
 def add_graph_arguments(parser: ArgumentParser) -> None:
-    """Options of every verb that looks at the graph."""
+    """Add the options of verbs that query the graph."""
     parser.add_argument(
         '--spin-time',
         type=positive_float,
         default=SPIN_TIME_S,
         metavar='SECONDS',
-        help='how long to look for what is named (default: %(default)s)',
+        help='time limit of discovery (default: %(default)s)',
     )
     parser.add_argument(
-        '--no-daemon', action='store_true', help='there is none: for commands of the real ros2'
+        '--no-daemon', action='store_true', help='no effect: accepted for compatibility'
     )
 
 
 def positive_float(text: str) -> float:
-    """Read a number above zero."""
+    """Parse a positive number."""
     value = float(text)
     if not 0.0 < value < float('inf'):
         raise ValueError(text)
@@ -57,7 +57,7 @@ def positive_float(text: str) -> float:
 
 
 def positive_int(text: str) -> int:
-    """Read a whole number above zero."""
+    """Parse a positive integer."""
     value = int(text)
     if value <= 0:
         raise ValueError(text)
