@@ -100,7 +100,7 @@ def test_explore_lite_and_information_gain_go_for_more_where_it_is_not_much_fart
     assert (values > 0.0).all()
 
 
-def test_the_advantage_of_a_frontier_grows_with_the_way_back_to_it() -> None:
+def test_the_advantage_of_a_frontier_grows_with_the_return_path() -> None:
     strategy = DistanceAdvantage()
     frontiers = after_a_look(strategy, corridor(), POSE)
     ways = np.array([frontier.path_length_m for frontier in frontiers])
@@ -110,7 +110,7 @@ def test_the_advantage_of_a_frontier_grows_with_the_way_back_to_it() -> None:
     assert costs.argmin() == nearest_end
 
 
-def test_a_target_that_fails_is_left_for_later_and_the_end_says_so() -> None:
+def test_a_failed_target_is_deferred_and_reported_at_the_end() -> None:
     strategy = NearestFrontier()
     pose = POSE
     scan = Scan.create(0, np.full(181, np.nan), -math.pi / 2, math.pi / 180, 0.05, 8.0)
@@ -155,7 +155,7 @@ def test_an_edge_is_followed_to_its_end_though_another_end_comes_nearer() -> Non
     assert goes_to(1.2, 1.2) == 14.0
 
 
-def test_explore_lite_gives_up_what_comes_no_nearer_also_if_it_goes_to_and_fro() -> None:
+def test_explore_lite_gives_up_targets_without_progress_also_when_it_oscillates() -> None:
     strategy = ExploreLite()
     patch = GridPatch(GridFrame(0.0, 0.0, 0.1), corridor().astype(np.int8))
     places = []

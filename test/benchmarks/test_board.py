@@ -202,7 +202,7 @@ def small_board(monkeypatch, tmp_path):
 
 
 @pytest.mark.programs
-def test_a_small_board_goes_on_where_it_was(small_board, capsys):
+def test_a_small_board_is_resumed(small_board, capsys):
     words = ['-o', small_board, '--processes', 1, '--quiet']
     assert called(*words, '--only', 'drive_*_1') == 0
     assert '[1 of 2 cases]' in (small_board / 'board.md').read_text()

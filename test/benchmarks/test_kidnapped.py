@@ -29,7 +29,7 @@ def cases(ran: list[str], outcomes: dict[str, str]) -> list[Case]:
     return [Case(name, lambda name=name: run(name)) for name in outcomes]
 
 
-def test_a_row_is_gone_on_with_and_told_on_the_page(tmp_path: Path) -> None:
+def test_a_row_is_resumed_and_shown_on_the_page(tmp_path: Path) -> None:
     ran: list[str] = []
     outcomes = {'kth/a 0': 'right', 'kth/a 1': 'open', 'kth/b 0': 'wrong'}
     path = tmp_path / 'kth.csv'
@@ -49,7 +49,7 @@ def test_a_row_is_gone_on_with_and_told_on_the_page(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ('said', 'sure', 'good'), [('4.2', '', (True, True)), ('', '3.1', (False, False))]
 )
-def test_robots_elsewhere_are_to_be_told_so_and_never_sure(
+def test_robots_in_another_building_are_told_so_and_never_localized(
     said: str, sure: str, good: tuple[bool, bool]
 ) -> None:
     records = [{'case': 'a <- b', 'said_m': said, 'sure_m': sure, 'last': 'NOT_IN_MAP'}]

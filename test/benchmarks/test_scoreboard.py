@@ -244,7 +244,7 @@ def test_a_disturbed_run_has_noise_of_its_own_and_the_first_has_none():
     np.testing.assert_allclose(np.std(off, axis=0), 5e-4, rtol=0.1)
 
 
-def test_the_page_tells_mean_and_worst_of_several_runs(reports):
+def test_the_page_shows_mean_and_worst_of_several_runs(reports):
     cases = repeated([LOGS[0], DRIVES[0]], 2)
     names = ['hall', 'hall.run_1', 'building_000.2dx_x1', 'building_000.2dx_x1.run_1']
     assert [case.name for case in cases] == names
@@ -278,7 +278,7 @@ def write_log(folder, scans):
 
 
 @pytest.mark.programs
-def test_it_goes_on_where_it_was_and_one_that_fails_stops_no_other(tmp_path, capsys):
+def test_it_resumes_and_a_failed_run_stops_no_other(tmp_path, capsys):
     logs = tmp_path / 'shared' / 'data' / 'logs'
     write_log(logs / 'try_1', 0)
     write_log(logs / 'try_2', 8)

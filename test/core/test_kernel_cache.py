@@ -88,7 +88,7 @@ def install(tmp_path: Path) -> Install:
     return Install(tmp_path)
 
 
-def test_the_first_run_says_that_it_compiles_and_later_ones_need_not(install: Install) -> None:
+def test_the_first_run_reports_that_it_compiles_and_later_ones_do_not(install: Install) -> None:
     (value, folder), said = install.run()
     assert value == '6.0'
     assert folder == str(install.package / '__pycache__' / 'kernels')

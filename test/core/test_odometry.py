@@ -43,7 +43,7 @@ def test_a_late_sample_takes_its_place():
     assert buffer.interpolate(3 * SECOND // 2)[0] == pytest.approx(1.5)
 
 
-def test_a_clock_set_back_starts_anew():
+def test_a_clock_set_back_resets_it():
     buffer = filled(100 * SECOND, 5 * SECOND)
     assert buffer.latest_stamp_ns == 5 * SECOND
 

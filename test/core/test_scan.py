@@ -83,7 +83,7 @@ def one_range(value, **options):
         (0.05, ''),
     ],
 )
-def test_a_range_says_one_thing_or_nothing(value, name):
+def test_each_range_is_a_hit_or_free_or_invalid(value, name):
     scan = one_range(value)
     said = [key for key in ('hit', 'no_return', 'below_range_min') if getattr(scan, key).all()]
     assert said == ([name] if name else [])
@@ -91,7 +91,7 @@ def test_a_range_says_one_thing_or_nothing(value, name):
     assert scan.is_blind == (not name)
 
 
-def test_a_driver_that_publishes_zero_for_no_return_says_so():
+def test_zero_may_be_configured_as_no_return():
     """The LDS of the TurtleBot 3; a range of zero still frees no cells."""
     scan = one_range(0.0, zero_is_no_return=True)
     assert scan.valid.all()

@@ -47,6 +47,6 @@ def test_a_step_ahead_of_a_robot_facing_north_goes_north():
     )
 
 
-def test_interpolation_turns_the_shorter_way():
+def test_interpolation_turns_in_the_shorter_direction():
     middle = se2.interpolate(se2.pose(0, 0, 3.0), se2.pose(2, 0, -3.0), 0.5)
     np.testing.assert_allclose(middle, [1.0, 0.0, math.pi])

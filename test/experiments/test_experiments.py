@@ -203,7 +203,7 @@ def test_logs_of_the_users_own(tmp_path: Path) -> None:
     assert (tmp_path / 'out' / 'logs' / 'mine' / 'trajectory.tum').exists()
 
 
-def test_a_laser_file_that_is_wrong_is_said(tmp_path: Path) -> None:
+def test_a_wrong_laser_file_is_reported(tmp_path: Path) -> None:
     (tmp_path / 'laser.yaml').write_text('ofset_m: 0.1\n')
     with pytest.raises(InputError, match=r'laser\.yaml.*ofset_m'):
         logs.laser_of(tmp_path, tmp_path.name)
@@ -219,7 +219,7 @@ def test_a_laser_file_that_is_wrong_is_said(tmp_path: Path) -> None:
         (['page'], 'no results'),
     ],
 )
-def test_what_is_wrong_is_said_in_a_line(
+def test_errors_are_reported_in_one_line(
     arguments: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as end:

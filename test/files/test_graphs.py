@@ -168,7 +168,7 @@ def test_not_a_number_is_never_written(tmp_path: Path) -> None:
         (('geometry',), None, 'features.0'),
     ],
 )
-def test_what_is_wrong_is_said(
+def test_errors_are_reported(
     tmp_path: Path, place: tuple[str, ...], value: object, said: str
 ) -> None:
     features = written(tmp_path)

@@ -131,7 +131,7 @@ def test_other_images(tmp_path: Path) -> None:
         ({'occupied_thresh': 'x'}, 'occupied_thresh'),
     ],
 )
-def test_what_is_wrong_is_said(tmp_path: Path, changes: dict[str, object], said: str) -> None:
+def test_errors_are_reported(tmp_path: Path, changes: dict[str, object], said: str) -> None:
     path = described(tmp_path, np.zeros((2, 2), dtype=np.uint8))
     path.write_text(yaml.safe_dump(YAML | changes))
     with pytest.raises(InputError, match=said) as error:

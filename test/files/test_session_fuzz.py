@@ -66,7 +66,7 @@ def test_single_numbers_replaced(explored: Explored, kind: str, seed: int) -> No
         check(explored, kind, state, what)
 
 
-def test_a_chain_that_leaps_is_not_taken_for_one(explored: Explored) -> None:
+def test_a_chain_with_a_gap_is_rejected(explored: Explored) -> None:
     state = {name: array.copy() for name, array in explored.states['topology'].items()}
     state['cells'][5, 0] = 10**9
     with pytest.raises(InputError, match='cells'):

@@ -83,7 +83,7 @@ def assert_same(one: TopologicalMap, other: TopologicalMap) -> None:
         assert np.array_equal(edge.path, twin.path)
 
 
-def test_work_goes_on_as_if_it_had_never_stopped(tmp_path: Path) -> None:
+def test_work_continues_as_without_interruption(tmp_path: Path) -> None:
     grid = OccupancyGrid()
     builder = TopologyBuilder()
     poses = way()
@@ -113,7 +113,7 @@ def test_nothing_seen_yet(tmp_path: Path) -> None:
     assert not TOPOLOGY.read(tmp_path / 'b.npz').map.nodes
 
 
-def test_what_does_not_fit_is_said(tmp_path: Path) -> None:
+def test_inconsistent_states_are_reported(tmp_path: Path) -> None:
     grid = OccupancyGrid()
     builder = TopologyBuilder()
     drive(grid, builder, way()[:5], 0)

@@ -48,7 +48,7 @@ def test_comments_and_short_fractions(tmp_path: Path) -> None:
     'line',
     ['1 2 3', 'a 0 0 0 0 0 0 1', '1 0 0 0 0 0 0 x', '1 nan 0 0 0 0 0 1', '1e9 0 0 0 0 0 0 1'],
 )
-def test_what_is_wrong_is_said(tmp_path: Path, line: str) -> None:
+def test_errors_are_reported(tmp_path: Path, line: str) -> None:
     (tmp_path / 't.tum').write_text('0 0 0 0 0 0 0 1\n' + line + '\n')
     with pytest.raises(InputError, match=r't\.tum:2: '):
         read_tum(tmp_path / 't.tum')

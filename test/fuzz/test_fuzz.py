@@ -95,7 +95,7 @@ def says_too_much(shared: None, rng: np.random.Generator, folder: Path) -> None:
         (says_too_much, {}, 'not one line'),
     ],
 )
-def test_whatever_a_case_does_the_run_goes_on(
+def test_the_run_continues_whatever_a_case_does(
     tmp_path: Path, run: Callable[..., None], limits: dict[str, float], why: str
 ) -> None:
     runner, kept = tried_once(tmp_path, run, 2, **limits)

@@ -132,7 +132,7 @@ def test_a_map_that_is_saved_meanwhile_has_undergone_the_correction(graph, tmp_p
     assert graph.stop('grid_mapper') == 0
 
 
-def test_a_mapper_that_is_killed_meanwhile_goes_on_with_the_map_that_was_shown(graph):
+def test_a_mapper_that_is_killed_meanwhile_resumes_with_the_published_map(graph):
     mapping = Mapping(graph)
     corrected_ns = mapping.drive_and_correct()
     shown = mapping.by_hand.shown.state()

@@ -145,7 +145,7 @@ def robot(graph):
     return robot
 
 
-def test_it_says_why_it_ended(robot):
+def test_it_reports_why_it_ended(robot):
     assert robot.explores(area_limit_m2=1.0) == (
         ExplorationStatus.BUDGET_EXHAUSTED,
         GoalStatus.STATUS_SUCCEEDED,
@@ -162,7 +162,7 @@ def test_it_says_why_it_ended(robot):
     assert robot.explores() == (ExplorationStatus.ALL_RESOLVED, GoalStatus.STATUS_SUCCEEDED)
 
 
-def test_it_goes_on_after_a_cancelled_goal_and_after_a_new_start(graph, robot, tmp_path):
+def test_it_resumes_after_a_cancelled_goal_and_after_a_restart(graph, robot, tmp_path):
     client = ActionClient(graph.node, Explore, 'explore')
     accepted = graph.send_goal(client, Explore.Goal())
     graph.until(lambda: robot.end_nodes and any(robot.evidence().values()), 'end nodes')

@@ -107,7 +107,7 @@ def test_a_robot_that_drives_about_finds_itself_when_asked(graph, map_file):
     assert graph.stop('global_localizer') == 0, graph.log('global_localizer')
 
 
-def test_it_says_what_is_missing_and_waits(graph):
+def test_it_reports_missing_inputs_and_waits(graph):
     status = graph.heard('localization_status', LocalizationStatus, qos.LATCHED)
     graph.start('global_localizer', start_automatically=True, laser_pose='0.0,0.0,0.0')
     graph.until(lambda: status and status[-1].state == LocalizationStatus.WAITING, 'waiting')
@@ -152,7 +152,7 @@ def scan_msg(ns, ranges):
     return messages.scan_msg(scan, 'laser', 0.1)
 
 
-def test_what_is_wrong_with_the_input_is_said_in_words_and_no_pose_comes_of_it(graph, map_file):
+def test_invalid_input_is_reported_and_gives_no_pose(graph, map_file):
     status = graph.heard('localization_status', LocalizationStatus, qos.LATCHED)
     poses = graph.heard('initialpose', PoseWithCovarianceStamped)
     samples = graph.heard('localization_samples', PoseArray, qos.LATCHED)

@@ -22,7 +22,7 @@ START = '2.0,2.0,0.0'
 MAPPING = ('localizer', 'grid_mapper', 'topology_builder')
 
 
-def test_nodes_tell_rates_step_times_and_silence(graph):
+def test_nodes_report_rates_step_times_and_silence(graph):
     doctor = Doctor(graph)
     graph.start('thinmap', arguments=MAPPING, use_sim_time=True, **AT_START)
     graph.start('sim', start=START, wait_for_subscribers=2)
@@ -77,7 +77,7 @@ def test_two_localizers_on_one_graph_are_detected_and_reported(graph):
     graph.until(lambda: doctor.level('localizer') == DiagnosticStatus.WARN, 'the complaint ends')
 
 
-def test_what_is_over_is_not_told_first(ros_domain, monkeypatch):
+def test_past_errors_are_not_reported_first(ros_domain, monkeypatch):
     """An old rejection must not be reported first when something else is dropped."""
     now = [100.0]
     monkeypatch.setattr(diagnostics, 'monotonic', lambda: now[0])

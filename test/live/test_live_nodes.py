@@ -28,7 +28,7 @@ def stamps(heard):
     return [messages.stamp_ns(message.header.stamp) for message in heard]
 
 
-def test_the_simulated_robot_drives_as_told_and_stops_without_commands(graph):
+def test_the_simulated_robot_follows_commands_and_stops_without_them(graph):
     scans = graph.heard('scan', LaserScan, qos.SENSOR)
     odometry = graph.heard('odom', Odometry)
     clock = graph.heard('/clock', Clock)

@@ -39,7 +39,7 @@ def is_sound(message):
     return all(node.kind == 0 for node in message.nodes)
 
 
-def test_end_nodes_say_how_sure_they_are():
+def test_end_nodes_show_their_probability():
     nodes = [
         EndNode(node_id=i, position_probability=p, is_target=i == 1)
         for i, p in enumerate((0.25, 0.9))

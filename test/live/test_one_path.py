@@ -146,7 +146,7 @@ def test_simulated_log_bag_and_live_graph_agree(graph, tmp_path):
     assert_live_is_same(graph, tmp_path / 'bag', from_log, tmp_path)
 
 
-def test_the_filter_of_the_paper_says_live_what_it_says_replayed(graph, tmp_path):
+def test_the_filter_of_the_paper_gives_the_same_live_and_replayed(graph, tmp_path):
     config = PipelineConfig(localizer=LocalizerConfig(slam='ekf_ti'))
     expected = replay(SimulatedLog(), config)
     assert len(expected.pipeline.localizer.features) > 3

@@ -133,7 +133,7 @@ def run(*arguments):
     return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S)
 
 
-def test_what_cannot_be_run_is_said_in_one_line(ros_domain):
+def test_what_cannot_be_run_is_reported_in_one_line(ros_domain):
     assert 'usage: thinmap' in run('--help').stdout
     done = run('localizer', 'pilot')
     assert done.returncode == 2 and done.stderr.startswith('error: pilot')

@@ -12,7 +12,7 @@ from thinmap_ros.view import rerun_sinks
 pytestmark = pytest.mark.live
 
 
-def test_without_anything_to_show_it_says_so_and_ends_on_a_signal(graph):
+def test_without_data_it_reports_so_and_ends_on_a_signal(graph):
     graph.start('rerun_viewer', spawn=False)
     graph.until(lambda: 'nothing is shown' in graph.log('rerun_viewer'), 'the warning')
     assert graph.stop('rerun_viewer') == 0

@@ -140,7 +140,7 @@ def test_a_message_is_echoed_as_yaml(robot):
     assert done.stderr == "Invalid field 'pose.nix': no 'nix', there is pose, covariance\n"
 
 
-def test_what_was_said_before_is_heard_where_it_was_kept(robot):
+def test_latched_messages_are_received_later(robot):
     text = output('topic', 'echo', '--once', '--no-arr', '/tf_static', *WAIT)
     assert 'transforms: ' in text
     kept = output('topic', 'echo', '--once', '--field', 'info.resolution', '/map', *WAIT)
@@ -295,7 +295,7 @@ def wait_for(condition, what):
         time.sleep(0.01)
 
 
-def test_that_a_goal_was_taken_is_said_before_its_feedback(graph):
+def test_the_acceptance_of_a_goal_is_shown_before_its_feedback(graph):
     serve_feedback_first(graph.node, '/hasty')
     kind = 'thinmap_msgs/action/NavigateToPose'
     goal = start('action', 'send_goal', '--feedback', '/hasty', kind, GO)
@@ -389,14 +389,14 @@ AT_ONCE = ('--spin-time', '0.5')
         (['interface', 'show', 'nowhere/msg/X'], 1, "'nowhere/msg/X', expected PACKAGE/msg/NAME"),
     ],
 )
-def test_what_cannot_be_done_is_said_in_one_line(ros_domain, words, code, said):
+def test_errors_are_reported_in_one_line(ros_domain, words, code, said):
     done = run(*words)
     assert done.returncode == code
     assert said in done.stderr and len(done.stderr.splitlines()) == 1
     assert not done.stdout
 
 
-def test_a_topic_that_never_comes_is_told(ros_domain):
+def test_a_topic_that_is_never_published_is_reported(ros_domain):
     done = run('topic', 'echo', '/nowhere', *AT_ONCE)
     assert done.returncode == 1
     assert done.stdout == 'WARNING: topic [/nowhere] does not appear to be published yet\n'

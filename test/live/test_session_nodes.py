@@ -69,7 +69,7 @@ def drive(graph, x, y, yaw, metres):
     return T
 
 
-def test_ids_and_cells_are_the_same_tomorrow_and_mapping_goes_on(graph, tmp_path):
+def test_ids_and_cells_survive_a_restart_and_mapping_continues(graph, tmp_path):
     maps, graphs, local = heard_maps(graph)
     for name in MAPPERS:
         graph.start(name, use_sim_time=True)
@@ -308,7 +308,7 @@ def test_a_session_of_nonsense_leaves_the_running_map_as_it_was(graph, tmp_path)
         assert graph.stop(name) == 0
 
 
-def test_a_builder_that_does_not_answer_is_said_and_the_mapper_goes_on(graph, tmp_path):
+def test_a_builder_that_does_not_answer_is_reported_and_the_mapper_continues(graph, tmp_path):
     async def never(request, response):
         await Future()
 

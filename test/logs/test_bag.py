@@ -275,7 +275,7 @@ def with_empty_scans(writer: BagWriter, make: Maker) -> None:
         (lambda w, m: None, 'no laser scans'),
     ],
 )
-def test_what_is_missing_is_said(
+def test_missing_data_are_reported(
     tmp_path: Path, fill: Callable[[BagWriter, Maker], None], said: str
 ) -> None:
     path = write(tmp_path / 'bag', fill)

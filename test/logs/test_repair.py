@@ -217,7 +217,7 @@ def test_a_damaged_summary_is_not_believed(tmp_path: Path) -> None:
 
 
 @pytest.mark.programs
-def test_what_cannot_be_repaired_is_said_in_one_line(tmp_path: Path) -> None:
+def test_what_cannot_be_repaired_is_reported_in_one_line(tmp_path: Path) -> None:
     (tmp_path / 'text.mcap').write_bytes(b'dear all')
     (tmp_path / 'start.mcap').write_bytes(b'\x89MCAP0\r\n\x01')
     (tmp_path / 'empty').mkdir()
@@ -237,7 +237,7 @@ def test_what_cannot_be_repaired_is_said_in_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.programs
-def test_behind_a_range_of_zeros_it_goes_on_at_the_next_chunk_of_the_summary(
+def test_behind_a_range_of_zeros_it_continues_at_the_next_chunk_of_the_summary(
     tmp_path: Path,
 ) -> None:
     folder = write(tmp_path / 'bag')

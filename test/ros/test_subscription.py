@@ -27,7 +27,7 @@ def test_what_was_never_sent_is_missing_unless_the_sensor_was_silent():
     assert counted([(0, 1), (1, 2), (4, 3), (7, 5), (107, 6)]) == (1, 2 + 1)
 
 
-def test_without_numbers_the_stamps_tell():
+def test_without_sequence_numbers_losses_follow_from_stamps():
     assert counted([(0, None), (1, None), (4, None), (104, None)]) == (0, 2)
 
 
@@ -35,5 +35,5 @@ def test_two_publishers_in_turn_have_lost_nothing():
     assert counted([(i, 900 + i // 2 if i % 2 else i // 2) for i in range(40)]) == (0, 0)
 
 
-def test_a_publisher_or_a_time_that_begins_anew_has_lost_nothing():
+def test_a_restarted_publisher_or_clock_counts_no_losses():
     assert counted([(0, 500), (1, 501), (2, 1), (3, 2), (-400, 3), (-399, 4)]) == (0, 0)

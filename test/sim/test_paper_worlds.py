@@ -124,7 +124,7 @@ def test_the_warehouse_is_what_its_program_writes() -> None:
     assert (WORLDS / 'warehouse.yaml').read_text(encoding='utf-8') == warehouse_yaml()
 
 
-def test_a_place_that_cannot_be_reached_is_said() -> None:
+def test_an_unreachable_place_is_reported() -> None:
     world, _ = load('office')
     with pytest.raises(InputError, match=r'office: tour: \[20\.0, 3\.0\]'):
         list(tour_paths(world, np.array([[20.0, 3.0]]), 0.22))
@@ -142,7 +142,7 @@ def test_the_same_seed_drives_the_same() -> None:
     assert np.array_equal(ranges(), ranges())
 
 
-def test_a_tour_that_is_none_is_said(tmp_path: Path) -> None:
+def test_an_invalid_tour_is_reported(tmp_path: Path) -> None:
     path = tmp_path / 'w.yaml'
     path.write_text('tour: [[1, 2], [3]]\n')
     with pytest.raises(InputError, match=r'w\.yaml: tour'):

@@ -154,7 +154,7 @@ def test_passages_of_the_room_are_a_metre_wide() -> None:
         ({'colour': 'red'}, 'colour'),
     ],
 )
-def test_what_is_wrong_is_said(tmp_path: Path, change: dict[str, object], said: str) -> None:
+def test_errors_are_reported(tmp_path: Path, change: dict[str, object], said: str) -> None:
     with np.errstate(all='ignore'), pytest.raises(InputError, match=said) as error:
         box(tmp_path, **change)
     assert str(tmp_path / 'w.yaml') in str(error.value)

@@ -49,7 +49,7 @@ def assert_same(ours: list[Event], theirs: list[Event]) -> None:
         assert np.allclose(a.scan.T_base_laser, b.scan.T_base_laser, rtol=0.0, atol=1e-12)
 
 
-def test_the_bag_says_what_the_log_says(tmp_path: Path) -> None:
+def test_the_bag_equals_the_log(tmp_path: Path) -> None:
     lines = [
         odom('976052857.000001', 1.25, -3.1415926),
         flaser('976052857.337530', 1, 3.141592653589793),

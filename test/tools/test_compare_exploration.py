@@ -105,7 +105,7 @@ def world(tmp_path: Path) -> Path:
 
 
 @pytest.mark.programs
-def test_it_runs_all_writes_all_and_goes_on_where_it_was(world: Path, tmp_path: Path) -> None:
+def test_it_runs_all_writes_all_and_resumes(world: Path, tmp_path: Path) -> None:
     out = tmp_path / 'out'
     words = [
         str(world),
@@ -138,7 +138,7 @@ def test_it_runs_all_writes_all_and_goes_on_where_it_was(world: Path, tmp_path: 
 
 
 @pytest.mark.programs
-def test_a_world_without_start_is_told_in_one_line(world: Path, tmp_path: Path) -> None:
+def test_a_world_without_start_is_reported_in_one_line(world: Path, tmp_path: Path) -> None:
     result = compare(str(tmp_path / 'nowhere.yaml'), '-o', str(tmp_path / 'out'))
     assert result.returncode == 2
     assert result.stderr.count('\n') == 1

@@ -101,7 +101,7 @@ def test_a_map_without_a_start_can_be_explored_from_a_given_one(
         (['WORLD', '--kidnap-at', '5'], 'expected --localization=slam'),
     ],
 )
-def test_bad_input_is_told_in_one_line(
+def test_bad_input_is_reported_in_one_line(
     world: Path, tmp_path: Path, words: list[str], said: str
 ) -> None:
     result = explore(

@@ -87,7 +87,7 @@ def test_each_localizer_replays_it(tmp_path, slam):
 
 
 @pytest.mark.programs
-def test_the_localizer_is_the_scan_matcher_unless_it_is_told(log, tmp_path):
+def test_the_localizer_is_the_scan_matcher_by_default(log, tmp_path):
     for name, options in (
         ('default', []),
         ('scans', ['--slam', 'scan_matching']),
@@ -157,7 +157,7 @@ BAD = {
 
 @pytest.mark.programs
 @pytest.mark.parametrize('case', BAD)
-def test_what_cannot_be_replayed_is_said_in_one_line(tmp_path, case):
+def test_what_cannot_be_replayed_is_reported_in_one_line(tmp_path, case):
     make, words = BAD[case]
     path = tmp_path / 'some.log'
     make(path)
@@ -232,7 +232,7 @@ def test_wrong_options_end_with_two(log, tmp_path, arguments):
 
 
 @pytest.mark.programs
-def test_unwritable_place_is_said(log):
+def test_an_unwritable_path_is_reported(log):
     done = run(log, '-o', '/proc/nowhere')
     assert done.returncode == 2
     assert '/proc/nowhere' in done.stderr and 'Traceback' not in done.stderr
@@ -272,7 +272,7 @@ class Diary(NullView):
         self.told[plot, curve] += np.isfinite(value)
 
 
-def test_a_view_is_told_each_scan_and_the_map_as_it_is_in_the_end(log):
+def test_a_view_receives_each_scan_and_the_final_map(log):
     diary = Diary()
     result = replay(CarmenLog(log, LaserOptions()), PipelineConfig(), watcher=ReplayView(diary))
     assert len(result.poses) == diary.told['pose'] == diary.told['scan'] == 30

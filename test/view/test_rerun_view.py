@@ -246,7 +246,7 @@ def test_no_bag_leaves_no_recording(tmp_path):
 
 
 @pytest.mark.programs
-def test_without_rerun_a_view_says_what_to_install():
+def test_without_rerun_a_view_names_what_to_install():
     code = """
 import sys
 sys.modules['rerun'] = None

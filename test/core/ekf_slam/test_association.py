@@ -81,7 +81,7 @@ def test_pieces_of_a_wall_beside_a_door_are_one_feature():
     assert chosen([left], [[[2.0, -3.0], [2.0, 0.9 - gap_m]]], gap_m) == [-1]
 
 
-def test_a_short_piece_of_wall_tells_its_direction_by_its_length():
+def test_the_direction_of_a_short_wall_is_uncertain():
     """4 m of a wall, observed at 20 mrad, rotate the pose over twice as much as 0.5 m."""
     turned = []
     for length_m in (0.5, 4.0):
@@ -95,7 +95,7 @@ def test_a_short_piece_of_wall_tells_its_direction_by_its_length():
     assert turned[0] < 0.5 * turned[1]
 
 
-def test_a_line_fits_only_where_the_gate_says_so():
+def test_only_lines_within_the_gate_are_associated():
     assert chosen([[[2, -1], [2, 1]]], [[[2.03, -1], [2.03, 1]]]) == [0]
     assert chosen([[[2, -1], [2, 1]]], [[[2.2, -1], [2.2, 1]]]) == [-1]
     assert chosen([[[2, -1], [2, 1]]], [[[2.2, -1], [1.8, 1]]]) == [-1]

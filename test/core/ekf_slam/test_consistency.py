@@ -87,7 +87,7 @@ def share_inside(runs, looks, local_areas):
 
 
 @pytest.mark.parametrize('local_areas', [True, False])
-def test_the_errors_are_as_large_as_the_filter_says(local_areas):
+def test_the_errors_match_the_covariance_of_the_filter(local_areas):
     inside, mean = share_inside(8, 120, local_areas)
     assert inside >= 0.85
     assert 2.0 < mean < 4.2

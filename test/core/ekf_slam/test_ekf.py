@@ -57,7 +57,7 @@ def test_the_fast_filter_is_the_textbook_filter(rng):
     assert_same(fast, plain)
 
 
-def test_two_features_tied_to_be_one_wall(rng):
+def test_two_features_merged_into_one_wall(rng):
     fast, plain = both(rng, 4)
     seen = np.array([2.0, 0.3])
     for filter_ in (fast, plain):
@@ -82,7 +82,7 @@ def test_the_covariance_stays_symmetric_and_positive(rng):
     assert np.linalg.eigvalsh(P).min() > -1e-12
 
 
-def test_more_looks_make_no_line_less_sure(rng):
+def test_more_observations_never_increase_the_variance_of_a_line(rng):
     fast, _ = both(rng, 5)
     before = np.linalg.eigvalsh(fast.line_covariances()).max(axis=1)
     indices = np.arange(5)
@@ -90,7 +90,7 @@ def test_more_looks_make_no_line_less_sure(rng):
     assert (np.linalg.eigvalsh(fast.line_covariances()).max(axis=1) <= before + 1e-15).all()
 
 
-def test_one_wall_in_two_forms_is_tied_to_itself():
+def test_one_wall_in_two_forms_is_merged():
     """A wall through the origin may be represented as (r, alpha) or (-r, alpha + pi)."""
     pose = np.array([1.0, 0.0, 0.0])
     fast = EkfSlam(pose, P0)

@@ -34,7 +34,7 @@ def lengths_of(localizer):
 
 
 @pytest.mark.parametrize('slam', ['ekf_ti', 'ekf_full'])
-def test_line_features_hold_the_pose_of_worn_wheels(slam):
+def test_line_features_bound_the_error_of_systematic_odometry_drift(slam):
     errors, estimate = driven(at_start(slam), 600)
     off = np.hypot(*errors[:, :2].T)
     assert off.max() < 0.2
@@ -62,7 +62,7 @@ def test_a_robot_that_stands_grows_neither_surer_nor_less_sure():
     np.testing.assert_allclose(estimate.covariance, before.covariance, rtol=0.3)
 
 
-def test_a_state_is_a_map_that_another_day_goes_on_in():
+def test_a_saved_state_is_resumed_in_another_session():
     localizer = at_start()
     driven(localizer, 600)
     state = localizer.state()
@@ -90,7 +90,7 @@ def test_without_mapping_no_feature_comes_grows_or_goes():
     assert alone.features == []
 
 
-def test_it_goes_on_after_a_restart_where_odometry_leads():
+def test_it_resumes_at_the_odometry_pose_after_a_restart():
     last = OdometryAnchor(0, se2.pose(1.0, 2.0, 0.5), se2.pose(1.0, 0.0, 0.0))
     from_occupancy_map = EkfLocalizer.from_occupancy_map(None, last, se2.pose(2.0, 0.0, 0.0))
     expected = se2.compose(last.T_map_odom, se2.pose(2.0, 0.0, 0.0))
@@ -111,7 +111,7 @@ def test_input_that_makes_no_sense_is_refused():
         EkfConfig(slam='full')
 
 
-def test_its_path_is_what_it_said():
+def test_its_path_equals_its_estimates():
     localizer = at_start()
     errors, _ = driven(localizer, 50)
     assert localizer.optimized_trajectory().shape == errors.shape

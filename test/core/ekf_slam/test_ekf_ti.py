@@ -115,7 +115,7 @@ def test_more_features_than_a_chunk_of_the_store(rng):
     pair.assert_same()
 
 
-def test_a_pose_set_anew_is_set_for_all_features(rng):
+def test_a_pose_that_is_set_is_that_of_the_full_filter(rng):
     pair = Pair(EkfSlam(np.array([1.0, -2.0, 0.4]), P0))
     run(pair, rng, 40, 10, 30)
     for filter_ in (pair.local.local, pair.whole):
@@ -124,7 +124,7 @@ def test_a_pose_set_anew_is_set_for_all_features(rng):
     pair.assert_same()
 
 
-def test_what_is_told_of_features_outside_the_area(rng):
+def test_lines_and_covariances_outside_the_area(rng):
     """Lines and covariances outside the area are those of the time when it was set."""
     pair = Pair(EkfSlam(np.array([1.0, -2.0, 0.4]), P0))
     run(pair, rng, 60, 10, 30)

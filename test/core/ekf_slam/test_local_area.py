@@ -76,7 +76,7 @@ def test_merged_and_dropped_features(area):
     assert area.nodes_of(30) == []
 
 
-def test_without_a_topology_the_robot_s_own_way_is_one():
+def test_without_a_topology_nodes_are_placed_along_the_path():
     area = LocalArea()
     xs = np.arange(0.0, 20.0, 0.5)
     stored(area, *xs)

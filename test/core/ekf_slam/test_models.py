@@ -103,7 +103,7 @@ def test_a_line_passed_by_is_seen_from_its_other_side():
 
 
 @pytest.mark.parametrize('metres, radians', [(0.0, 0.0), (0.5, 0.0), (0.0, -0.4), (-0.3, 0.2)])
-def test_odometry_errs_by_its_slip_and_a_share_of_the_motion(metres, radians):
+def test_odometry_noise_is_a_floor_plus_a_share_of_the_motion(metres, radians):
     config = OdometryConfig(noise_ratio=0.1, noise_floor_m=0.01, noise_floor_rad=0.02)
     sigmas = np.sqrt(odometry_variances(np.array([0.6 * metres, 0.8 * metres, radians]), config))
     along = 0.01 + 0.1 * abs(metres)

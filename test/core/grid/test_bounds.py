@@ -37,7 +37,7 @@ class Guarded:
 
 @pytest.mark.parametrize('far', [1e7, 1e15, 1e18, -1e18, 1e20, 1e300])
 @pytest.mark.parametrize('axis', [0, 1])
-def test_a_pose_far_away_is_refused_before_anything_is_drawn(far, axis):
+def test_a_pose_far_away_is_rejected_before_anything_is_rendered(far, axis):
     grid = OccupancyGrid()
     guard = Guarded(grid)
     before = grid.known_area()

@@ -96,7 +96,7 @@ def test_a_wall_that_went_away_is_unlearned():
     assert grid.window(1.05, 0.05, 0.1).free.all()
 
 
-def test_nothing_is_said_of_what_lies_beyond_a_hit():
+def test_cells_beyond_a_hit_are_not_updated():
     grid = OccupancyGrid()
     grid.add_scan(scan_of(np.full(181, 1.0)), pose(0.05, 0.05, 0))
     assert percent(grid, 1.35, 0.05) == -1
@@ -130,7 +130,7 @@ def test_a_beam_without_return_frees_up_to_the_configured_range():
     assert not grid.known_area().occupied.any()
 
 
-def test_a_hit_beyond_the_usable_range_frees_the_way_and_marks_no_wall():
+def test_a_hit_beyond_the_usable_range_frees_cells_and_marks_no_wall():
     grid = OccupancyGrid(OccupancyConfig(max_range_m=3.0))
     for _ in range(2):
         grid.add_scan(scan_of(np.full(181, 5.0)), pose(0.05, 0.05, 0))
@@ -166,7 +166,7 @@ def test_a_window_is_aligned_with_the_map_and_unknown_where_nothing_is():
     assert grid.window(1000.0, 0.0, 1.0).unknown.all()
 
 
-def test_a_saved_map_goes_on_where_it_was():
+def test_a_saved_map_is_resumed():
     grid = OccupancyGrid()
     for _ in range(3):
         grid.add_scan(scan_of(np.full(181, 1.0)), pose(0.05, 0.05, 0))
@@ -196,7 +196,7 @@ def test_beams_that_graze_a_wall_do_not_erase_it():
     assert (wall[columns[0] : columns[1]] >= 65).all()
 
 
-def test_a_wall_on_the_border_of_two_cells_leaves_the_one_in_front_free():
+def test_a_wall_on_the_boundary_of_two_cells_leaves_the_one_in_front_free():
     grid = OccupancyGrid()
     rng = np.random.default_rng(4)
     bearings = np.radians(np.arange(-90.0, 91.0))

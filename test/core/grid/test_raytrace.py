@@ -29,7 +29,7 @@ def distance_to_box(x, y, angle, left, bottom, right, top):
 
 
 @given(st.floats(1.5, 58.5), st.floats(1.5, 38.5), st.floats(-math.pi, math.pi))
-def test_rays_in_a_room_meet_its_walls_where_geometry_says(x, y, angle):
+def test_rays_in_a_room_hit_its_walls_at_the_exact_ranges(x, y, angle):
     (found,) = cast_rays(room(), x, y, np.array([angle]), 100.0)
     assert math.isclose(
         found, distance_to_box(x, y, angle, 1, 1, 59, 39), rel_tol=1e-9, abs_tol=1e-7

@@ -118,7 +118,7 @@ def test_a_robot_does_not_drive_where_a_sector_is_dead(first, end, value):
 
 
 @pytest.mark.parametrize('first, end', [(90, 181), (60, 121)])
-def test_a_robot_whose_sector_dies_on_the_way_stops(first, end):
+def test_a_robot_stops_if_a_sector_becomes_blind_ahead(first, end):
     ride = Ride(room(), (1.0, 3.0, 0.0))
     ride.navigator.set_goal(6.5, 3.0)
     while ride.pose[0] < 3.0:
@@ -140,7 +140,7 @@ def test_where_a_leg_can_hide_a_little_ahead_it_drives_no_faster_than_it_can_sto
 
 
 @pytest.mark.parametrize('first, end', [(0, 40), (150, 181), (60, 63)])
-def test_a_sector_beside_the_way_does_not_stop_it(first, end):
+def test_a_blind_sector_beside_the_path_does_not_stop_it(first, end):
     ride = spoiled(Ride(room(), (1.0, 3.0, 0.0)), with_beams(first, end, np.nan))
     assert ride.go((6.0, 3.0))[-1].state == 'reached'
 

@@ -77,13 +77,13 @@ def test_costs_equal_floyd_and_warshall_s(count, seed):
         assert (np.inf if route is None else route.cost_m) == pytest.approx(best[a, b])
 
 
-def test_between_any_points_the_way_joins_the_edges_where_they_are_nearest():
+def test_between_any_points_the_path_joins_the_edges_at_the_nearest_points():
     path = route_path(square(), (1.0, -0.5), (1.0, 3.2))
     np.testing.assert_allclose(path[[0, -1]], [[1.0, -0.5], [1.0, 3.2]])
     assert np.hypot(*np.diff(path, axis=0).T).sum() == pytest.approx(0.5 + 3.0 + 3.0 + 3.0 + 0.2)
 
 
-def test_between_two_points_of_one_edge_the_way_stays_on_it():
+def test_between_two_points_of_one_edge_the_path_stays_on_it():
     path = route_path(square(), (3.5, 0.1), (1.5, 0.1))
     assert np.hypot(*np.diff(path, axis=0).T).sum() == pytest.approx(2.2)
 
@@ -93,7 +93,7 @@ def test_costs_from_a_point_reach_what_is_joined():
     assert costs == pytest.approx({1: 1.25, 2: 3.25, 3: 6.25, 4: 10.25})
 
 
-def test_a_loop_is_left_the_shorter_way():
+def test_a_loop_is_left_by_the_shorter_side():
     ring = [(0, 0), (1, 0), (2, 0), (2, 1), (1, 1), (0, 1), (0, 0)]
     topology = TopologicalMap([node(1, 0, 0)], [edge(2, 1, 1, ring)])
     assert access(topology, 1.0, 1.0).to_node_m == pytest.approx({1: 2.0})

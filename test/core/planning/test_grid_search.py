@@ -36,7 +36,7 @@ def dijkstra(allowed, start):
 
 
 @pytest.mark.parametrize('seed', range(5))
-def test_ways_are_those_of_dijkstra(seed):
+def test_paths_are_those_of_dijkstra(seed):
     rng = np.random.default_rng(seed)
     allowed = rng.random((40, 50)) < 0.75
     allowed[20, 20] = True
@@ -70,7 +70,7 @@ def test_from_beyond_the_grid_nothing_can_be_reached(start):
     assert not reachable_cells(allowed, start).any()
 
 
-def test_ways_are_at_most_a_twelfth_longer_than_straight_ones():
+def test_paths_are_at_most_a_twelfth_longer_than_straight_lines():
     goals = np.argwhere(np.ones((60, 60), dtype=np.bool_))[1:]
     ratio = path_lengths_from(np.ones((60, 60), dtype=np.bool_), (0, 0), goals) / np.hypot(*goals.T)
     assert ratio.min() > 0.98
@@ -83,7 +83,7 @@ def test_a_coarse_square_is_set_where_any_of_its_cells_is():
     assert np.argwhere(downsample_mask(mask, 2)).tolist() == [[0, 1], [2, 3]]
 
 
-def test_a_table_of_ways_stays_true_while_the_map_grows_to_all_sides():
+def test_a_path_table_stays_valid_while_the_map_grows_to_all_sides():
     table = PathLengthTable(0.2, 1e9, 2)
     frame = GridFrame(0.3, -0.5, 0.1)
     allowed = np.ones((60, 80), dtype=np.bool_)
@@ -100,7 +100,7 @@ def test_a_table_of_ways_stays_true_while_the_map_grows_to_all_sides():
     assert np.abs(fresh - first).max() < 0.7
 
 
-def test_a_way_is_found_anew_once_it_is_old():
+def test_an_old_path_is_computed_again():
     table = PathLengthTable(0.2, 10.0, 2)
     allowed = np.ones((60, 60), dtype=np.bool_)
     frame = GridFrame(0.0, 0.0, 0.1)
@@ -115,7 +115,7 @@ def test_a_way_is_found_anew_once_it_is_old():
     assert later[0, 1] == pytest.approx(4.0, abs=0.3)
 
 
-def test_a_way_through_the_unknown_is_longer_than_it_is():
+def test_a_path_through_unknown_space_costs_more_than_its_length():
     allowed = np.ones((60, 60), dtype=np.bool_)
     allowed[:, 28:32] = False
     places = np.array([[1.0, 3.0], [5.0, 3.0]])
@@ -131,7 +131,7 @@ def test_a_way_through_the_unknown_is_longer_than_it_is():
     ] == pytest.approx(4.4)
 
 
-def test_the_field_of_ways_holds_the_way_to_each_cell():
+def test_the_path_field_holds_the_path_to_each_cell():
     allowed = np.random.default_rng(9).random((30, 30)) < 0.8
     everywhere = np.argwhere(np.ones_like(allowed))
     field = distance_field_from(allowed, (3, 3))

@@ -50,7 +50,7 @@ def test_a_goal_too_near_to_a_wall_is_reached_as_near_to_it_as_the_robot_may_sta
     assert heading is None or abs(se2.wrap(ride.pose[2] - heading)) < 0.2
 
 
-def test_it_stops_in_front_of_what_only_the_laser_knows_and_goes_around_it():
+def test_it_stops_in_front_of_an_unmapped_obstacle_and_drives_around_it():
     world = room()
     world[5:25, 40] = 100
     ride = Ride(
@@ -103,7 +103,7 @@ def test_a_noisy_laser_makes_no_passage_too_narrow_and_none_wide_enough(seed):
     assert nearest > 0.2
 
 
-def test_where_there_is_no_way_around_it_gives_up_with_a_reason():
+def test_without_a_path_around_it_gives_up_with_a_reason():
     world = room()
     world[:, 40] = 100
     ride = Ride(world, (1.0, 3.0, 0.0), known=room())
@@ -114,7 +114,7 @@ def test_where_there_is_no_way_around_it_gives_up_with_a_reason():
     assert ride.nearest_m > 0.18
 
 
-def test_a_path_that_the_map_shows_to_be_blocked_is_planned_anew():
+def test_a_path_that_is_blocked_in_the_map_is_planned_again():
     world = room()
     ride = Ride(world, (1.0, 3.0, 0.0))
     ride.navigator.set_goal(7.0, 3.0)
@@ -170,7 +170,7 @@ def test_it_sets_out_in_free_space_however_often_it_is_asked(dt_s):
     assert commands[-1].v == pytest.approx(0.2)
 
 
-def test_it_remembers_what_is_beside_it_where_the_laser_does_not_look():
+def test_it_remembers_obstacles_beside_it_outside_of_the_field_of_view():
     navigator = Navigator()
     patch = GridPatch(GridFrame(0.0, 0.0, 0.1), room())
 
@@ -190,7 +190,7 @@ def test_it_remembers_what_is_beside_it_where_the_laser_does_not_look():
     assert len(look((3.6, 3.0, 0.0), np.full(181, np.inf), 4)) == 0
 
 
-def test_the_way_it_came_it_can_go_back_however_narrow_it_looks_now():
+def test_it_can_return_along_its_recent_path_however_narrow():
     navigator = Navigator()
     looks_open = GridPatch(GridFrame(0.0, 0.0, 0.1), room())
     for x in np.arange(1.0, 7.0, 0.05):
@@ -204,7 +204,7 @@ def test_the_way_it_came_it_can_go_back_however_narrow_it_looks_now():
     assert other.step(np.array([7.0, 3.05, math.pi]), narrow, None, DT).state == 'failed'
 
 
-def test_carried_off_its_path_it_plans_anew_at_once():
+def test_displaced_from_its_path_it_plans_again_at_once():
     navigator = Navigator()
     patch = GridPatch(GridFrame(0.0, 0.0, 0.1), room())
     navigator.set_goal(7.0, 1.0)

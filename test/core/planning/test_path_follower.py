@@ -59,7 +59,7 @@ def test_commands_keep_all_limits(speed):
     assert steps[:, 1].max() <= config.max_angular_acceleration_rad_s2 * DT + 1e-9
 
 
-def test_it_turns_on_the_spot_towards_a_path_that_begins_behind():
+def test_it_rotates_in_place_towards_a_path_that_starts_behind():
     poses, commands = drive(dense([(0.0, 0.0), (-2.0, 0.0)]), (0.0, 0.0, 0.0))
     turning = np.abs(poses[:, 2]) < math.pi - 0.9
     assert commands[turning, 0].max() == 0.0

@@ -29,7 +29,7 @@ def test_its_cells_are_those_that_it_led_over_each_beside_the_one_before(seed):
         assert (np.abs(np.diff(cells, axis=0)).sum(axis=1) <= 1).all()
 
 
-def test_a_jump_begins_it_anew_and_it_forgets_what_is_long_past():
+def test_a_discontinuity_resets_it_and_old_points_are_forgotten():
     trail = RecentPath()
     for x in np.arange(0.0, 99.0, 0.05):
         trail.add_pose(np.array([x, 3.0, 0.0]))
@@ -41,7 +41,7 @@ def test_a_jump_begins_it_anew_and_it_forgets_what_is_long_past():
 
 
 @pytest.mark.parametrize('count', [1300, 1301, 2600, 2601, 3899, 3901, 9000])
-def test_of_a_long_way_it_keeps_the_last_points(count):
+def test_of_a_long_path_it_keeps_the_last_points(count):
     trail = RecentPath()
     way = np.arange(count) * 0.05
     for x in way:
@@ -60,7 +60,7 @@ def test_a_pose_that_is_not_finite_leaves_no_trail():
     assert np.unique(cells, axis=0).tolist() == been.tolist()
 
 
-def test_the_way_back_is_open_though_a_speck_makes_it_too_narrow_but_not_through_what_is_there():
+def test_the_recent_path_is_traversable_despite_a_false_obstacle_but_not_a_real_one():
     cells = np.zeros((60, 80), dtype=np.int8)
     cells[[0, -1]] = 100
     cells[:, [0, -1]] = 100

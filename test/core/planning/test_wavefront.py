@@ -99,7 +99,7 @@ def test_a_path_goes_down_over_open_cells_to_the_goal_and_never_jumps(rows, cols
     np.testing.assert_array_equal(path[-1], [goal[1] + 0.5, goal[0] + 0.5])
 
 
-def test_stopping_at_the_start_leaves_the_way_there_as_it_was():
+def test_stopping_at_the_start_does_not_change_the_path():
     rng = np.random.default_rng(5)
     cost = np.where(rng.random((60, 60)) < 0.2, np.inf, 1.0)
     cost[5, 5] = cost[20, 18] = 1.0
@@ -169,7 +169,7 @@ def test_unknown_space_is_forbidden_or_costly_as_configured():
     assert plan(patch(cells), *goals, WavefrontConfig(allow_unknown=True)) is not None
 
 
-def test_costly_unknown_space_is_avoided_where_there_is_another_way():
+def test_costly_unknown_space_is_avoided_if_there_is_another_path():
     cells = room(60, 100)
     cells[25:35, :70] = -1
     path = plan(
@@ -178,7 +178,7 @@ def test_costly_unknown_space_is_avoided_where_there_is_another_way():
     assert path[:, 0].max() > 7.0
 
 
-def test_a_start_too_near_to_a_wall_is_let_out_but_not_through_the_wall():
+def test_a_start_too_near_to_a_wall_escapes_but_not_through_the_wall():
     cells = room(60, 60)
     cells[30, :] = 100
     assert plan(patch(cells), (2.05, 2.85), (2.0, 1.0), PLAIN) is not None

@@ -90,7 +90,7 @@ def test_a_drive_round_the_room_stays_on_its_path(whole_drive):
     assert localizer.rejected == 0
 
 
-def test_the_whole_path_is_told_afterwards(whole_drive):
+def test_the_whole_path_is_available_afterwards(whole_drive):
     rows, localizer = whole_drive
     path = localizer.optimized_trajectory()
     assert path.shape == (len(rows), 3)
@@ -140,7 +140,7 @@ def test_errors_are_within_the_covariance(whole_drive):
     assert (sigmas[40:, :2] < 0.5).all(), 'nor does it say that it could be anywhere'
 
 
-def test_the_estimate_is_told_in_a_consistent_way(whole_drive):
+def test_the_estimate_is_consistent(whole_drive):
     for _, estimate, odom in whole_drive[0]:
         np.testing.assert_allclose(
             se2.compose(estimate.T_map_odom, odom), estimate.T_map_base, atol=1e-9
@@ -237,7 +237,7 @@ def test_a_robot_that_creeps_is_less_sure_of_its_position_with_every_metre():
     assert (sigmas[100, :2] > sigmas[50, :2]).all()
 
 
-def test_a_scan_whose_points_are_one_tells_no_pose():
+def test_a_scan_with_coincident_points_is_not_matched():
     _, localizer = driven(60)
     before = localizer.pose
     scan = Scan.create(60 * PERIOD_NS, np.full(16, 2.0), 0.5, 1e-18, 0.05, 8.0)
@@ -307,7 +307,7 @@ def test_without_any_wall_the_odometry_is_followed():
     assert np.linalg.eigvalsh(estimate.covariance)[-1] > 1e-3
 
 
-def test_wheels_that_slip_are_caught_by_the_walls():
+def test_wheel_slip_is_corrected_by_matching():
     """Occasional odometry discontinuities of 0.3 m or 10 degrees."""
     rng = np.random.default_rng(4)
     localizer = at_start()
@@ -348,7 +348,7 @@ def test_a_robot_that_turns_fast_is_not_lost():
         assert np.abs(se2.between(truth, estimate.T_map_base)).max() < 0.04
 
 
-def test_beyond_a_hall_in_which_nothing_is_seen_the_map_goes_on(rng):
+def test_behind_a_hall_without_returns_the_map_continues(rng):
     """Distant walls that come into range point by point do not contradict the map."""
     # Two rooms, each open towards the hall between them.
     hall = np.vstack([ROOM[[0, 2, 3]], np.delete(ROOM, 3, axis=0) + [18.0, 0.0, 18.0, 0.0]])
@@ -469,7 +469,7 @@ def test_people_who_walk_through_do_not_become_walls():
     assert np.mean(from_walls(walls) > 0.2) < 0.15
 
 
-def test_a_robot_that_is_carried_off_begins_a_new_map_and_says_so():
+def test_kidnapping_starts_a_new_submap_and_reports_lost():
     rng = np.random.default_rng(8)
     rows, localizer = driven(300)
     before = len(localizer.keyframes)
@@ -498,7 +498,7 @@ def crowd(at, rng):
 
 
 @pytest.mark.parametrize('seed', range(8))
-def test_a_crowd_does_not_move_a_robot_whose_wheels_know_better(seed):
+def test_a_crowd_does_not_override_odometry(seed):
     """It is lost, and its new submap starts at the dead-reckoned pose."""
     rng = np.random.default_rng(seed)
     rows, localizer = driven(150, seed=seed)
@@ -516,7 +516,7 @@ def test_a_crowd_does_not_move_a_robot_whose_wheels_know_better(seed):
     assert abs(se2.wrap(off[2])) < 0.02
 
 
-def test_a_robot_that_is_brought_back_knows_its_path():
+def test_a_robot_that_is_brought_back_recovers_its_path():
     """Earlier keyframes do not move."""
     rng = np.random.default_rng(8)
     rows, localizer = driven(300)
@@ -526,7 +526,7 @@ def test_a_robot_that_is_brought_back_knows_its_path():
     assert np.hypot(*(path[:300] - truths)[:, :2].T).max() < 0.1
 
 
-def test_a_pose_that_is_set_is_settled_by_the_walls():
+def test_a_pose_that_is_set_is_refined_by_matching():
     rng = np.random.default_rng(9)
     rows, localizer = driven(300)
     truth, _, odom = rows[-1]
@@ -556,7 +556,7 @@ def test_a_pose_that_is_none_is_refused(pose, covariance):
     np.testing.assert_array_equal(localizer.pose, before)
 
 
-def test_a_robot_that_was_put_somewhere_roughly_draws_nothing_until_a_scan_fits():
+def test_after_set_pose_the_map_is_not_updated_until_a_scan_fits():
     rows, localizer = driven(300)
     localizer.set_pose(rows[-1][0] + [40.0, 0.0, 0.0], np.diag([4.0, 4.0, 0.1]))
     tiles = len(localizer.state()['tiles'])
@@ -585,7 +585,7 @@ def test_a_map_is_taken_over_by_another_localizer(whole_drive):
     assert worst(rows[10:]) < 0.08
 
 
-def test_a_robot_that_is_put_elsewhere_in_a_given_map_goes_on_in_it(whole_drive):
+def test_after_set_pose_in_a_loaded_map_localization_continues(whole_drive):
     _, first = whole_drive
     second = Localizer.from_state(first.state())
     rng = np.random.default_rng(8)
@@ -611,7 +611,7 @@ def test_the_error_of_a_pose_that_was_set_is_not_taken_for_noise_of_the_odometry
     assert (localizer._prediction._model._share < 1.5 * before).all()
 
 
-def test_a_robot_that_is_not_where_a_given_map_says_stays_lost(whole_drive):
+def test_a_robot_outside_of_a_loaded_map_stays_lost(whole_drive):
     _, first = whole_drive
     second = Localizer.from_state(first.state(), LocalizerConfig(**AT_START))
     hits = second.state()['hits'].copy()
@@ -642,7 +642,7 @@ def test_without_mapping_the_map_stays_as_it_is(whole_drive):
 
 
 @pytest.mark.parametrize('slip', [(0.0, 0.0), (0.3, 0.2)])
-def test_a_killed_localizer_goes_on_in_the_occupancy_map(slip):
+def test_a_killed_localizer_resumes_in_the_occupancy_map(slip):
     """Two metres without a localizer, while the wheels slip."""
     rng = np.random.default_rng(0)
     config = LocalizerConfig(**AT_START)
@@ -763,7 +763,7 @@ SMOOTH = np.array([[-1.0, -1.2, 60.0, -1.2], [60.0, 1.2, -1.0, 1.2], [-1.0, 1.2,
 
 
 @pytest.mark.parametrize('step_m', [0.01, 0.02, 0.04, 0.1, 0.2])
-def test_along_a_smooth_corridor_the_wheels_are_believed(step_m):
+def test_along_a_smooth_corridor_odometry_decides(step_m):
     """Without information along the corridor, the pattern of the beams gives none, either."""
     rng = np.random.default_rng(0)
     localizer = Localizer()

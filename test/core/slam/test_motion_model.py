@@ -104,7 +104,7 @@ def test_a_scan_that_measures_nothing_teaches_nothing():
     np.testing.assert_allclose(sigmas_of(model), np.sqrt(allowed(STEP)))
 
 
-def test_a_scan_that_only_half_decides_teaches_by_the_square_of_its_share():
+def test_a_match_with_half_the_weight_updates_by_the_square_of_its_gain():
     """A match with half the weight shows half of the motion error, with noise of the scan."""
     model = MotionModel(CONFIG)
     variances = allowed(STEP)

@@ -32,7 +32,7 @@ def driven(steps, seed=0, backwards=False):
 
 
 @pytest.mark.parametrize('backwards', [False, True])
-def test_the_systematic_part_is_learned_and_taken_off(backwards):
+def test_the_systematic_error_is_estimated_and_removed(backwards):
     calibration = OdometryCalibration()
     last = np.zeros(3)
     off = []
@@ -46,7 +46,7 @@ def test_the_systematic_part_is_learned_and_taken_off(backwards):
     assert abs(np.mean(off[:10], axis=0)[0]) > 3e-3, 'it erred before'
 
 
-def test_what_is_left_to_know_shrinks_with_the_way():
+def test_the_residual_covariance_shrinks_with_the_path():
     calibration = OdometryCalibration()
     left = []
     for T, told in driven(300):
@@ -56,7 +56,7 @@ def test_what_is_left_to_know_shrinks_with_the_way():
     assert np.linalg.eigvalsh(left[-1]).min() > -1e-12
 
 
-def test_a_slip_is_not_learned():
+def test_a_single_slip_does_not_change_the_calibration():
     calibration = OdometryCalibration()
     known = []
     for k, (T, told) in enumerate(driven(300)):

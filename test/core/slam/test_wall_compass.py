@@ -29,12 +29,12 @@ def learned(rng, walls=ROOM, turned=TURNED, looks=20):
 
 
 @pytest.mark.parametrize('turned', [0.0, 0.3, 1.569])
-def test_the_direction_of_the_walls_is_learned(turned, rng):
+def test_the_main_direction_of_the_walls_is_found(turned, rng):
     off = learned(rng, turned=turned).direction - turned
     assert abs((off + np.pi / 4) % (np.pi / 2) - np.pi / 4) < 0.002
 
 
-def test_a_scan_tells_the_heading_that_wheels_have_lost(rng):
+def test_a_scan_corrects_the_heading_drift_of_odometry(rng):
     compass = learned(rng)
     for wrong in (-0.15, -0.02, 0.05, 0.15):
         told = compass.read(lines_at(PLACES[1], rng), PLACES[1, 2] + TURNED + wrong, 0.06**2)
@@ -42,7 +42,7 @@ def test_a_scan_tells_the_heading_that_wheels_have_lost(rng):
         assert 0.0 < told.variance < 0.01**2
 
 
-def test_walls_that_stand_otherwise_say_nothing_of_a_heading_that_is_known(rng):
+def test_walls_in_other_directions_measure_no_heading(rng):
     compass = learned(rng)
     assert compass.read(lines_at(PLACES[1], rng), PLACES[1, 2] + TURNED + 0.05, 0.005**2) is None
     assert compass.read(no_lines(), 0.0, 1.0) is None
@@ -53,7 +53,7 @@ def test_nothing_is_believed_before_enough_was_seen(rng):
     assert learned(rng, looks=1).direction is None
 
 
-def test_where_most_walls_are_not_square_there_is_no_direction(rng):
+def test_walls_of_a_round_room_have_no_main_direction(rng):
     corners = np.array(
         [[5.0 + 4.5 * np.cos(a), 5.0 + 4.5 * np.sin(a)] for a in np.linspace(0, 2 * np.pi, 8)]
     )

@@ -43,7 +43,7 @@ class Relay:
         self.spoiled = 0
 
 
-def test_a_blind_laser_stops_an_exploration_which_goes_on_when_it_sees_again(graph):
+def test_a_blind_laser_pauses_an_exploration_until_ranges_return(graph):
     truth = graph.heard('ground_truth', PoseStamped)
     commands = graph.heard('cmd_vel', Twist)
     statuses = graph.heard('slam_status', SlamStatus)
@@ -161,7 +161,7 @@ def test_a_hall_in_which_nothing_is_near_is_not_blind(graph):
     )
 
 
-def test_a_laser_that_is_blind_from_the_start_is_told(graph):
+def test_a_laser_that_is_blind_from_the_start_is_reported(graph):
     doctor = Doctor(graph)
     graph.start('navigator', laser_pose='0,0,0')
     robot = Robot(graph)

@@ -137,7 +137,7 @@ def places(graph_message):
     return {n.id: (n.position.x, n.position.y) for n in graph_message.nodes}
 
 
-def test_mapping_goes_on_after_each_node_was_killed(graph):
+def test_mapping_continues_after_each_node_was_killed(graph):
     robot = Robot(graph)
     maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
     graphs = graph.heard('topology', TopologicalMap, qos.LATCHED)
@@ -172,7 +172,7 @@ def test_mapping_goes_on_after_each_node_was_killed(graph):
     assert not list((graph.folder / 'state').iterdir()), 'who ends in order leaves nothing'
 
 
-def test_a_killed_localizer_goes_on_in_the_map_and_does_not_bend_it(graph):
+def test_a_killed_localizer_resumes_in_the_map_and_does_not_bend_it(graph):
     """The robot drives on during the restart; without the map the error was up to 0.345 m."""
     robot = Robot(graph)
     doctor = Doctor(graph)
@@ -203,7 +203,7 @@ def test_a_killed_localizer_goes_on_in_the_map_and_does_not_bend_it(graph):
     assert robot.error_m() < 0.06
 
 
-def test_a_killed_node_that_is_started_otherwise_begins_anew_and_says_why(graph):
+def test_a_killed_node_with_other_parameters_is_reset_and_reports_why(graph):
     maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
     local = graph.heard('local_topology', TopologicalMap, qos.LATCHED)
     start_mapping(graph)
@@ -234,7 +234,7 @@ def test_a_killed_node_that_is_started_otherwise_begins_anew_and_says_why(graph)
 
 
 @pytest.mark.slow
-def test_a_whole_robot_that_was_killed_and_begins_anew_is_not_mixed_with_the_one_before(graph):
+def test_a_whole_robot_that_was_killed_and_reset_is_not_mixed_with_earlier_data(graph):
     robot = Robot(graph)
     maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
     start_together(graph, *MAPPING)
@@ -259,7 +259,7 @@ def test_a_whole_robot_that_was_killed_and_begins_anew_is_not_mixed_with_the_one
     assert not inside or patch.cells[tuple(behind)] == -1
 
 
-def test_time_set_back_begins_everything_anew(graph):
+def test_a_clock_set_back_resets_all_nodes(graph):
     robot = Robot(graph)
     maps = graph.heard('map', OccupancyGrid, qos.LATCHED)
     graphs = graph.heard('topology', TopologicalMap, qos.LATCHED)
@@ -347,7 +347,7 @@ def scan_of_nothing_near(ns):
     return message
 
 
-def test_a_silent_laser_stops_the_robot_and_it_goes_on(graph):
+def test_a_silent_laser_stops_the_robot_until_scans_return(graph):
     commands = graph.heard('cmd_vel', Twist)
     doctor = Doctor(graph)
     graph.start('navigator', laser_pose='0,0,0', use_sim_time=True)

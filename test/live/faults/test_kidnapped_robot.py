@@ -73,9 +73,7 @@ def start_sim(graph, at, subscribers):
     )
 
 
-def test_a_robot_finds_itself_in_a_saved_map_and_maps_on_also_when_it_is_carried_off(
-    graph, tmp_path
-):
+def test_a_robot_is_localized_in_a_saved_map_and_after_kidnapping(graph, tmp_path):
     robot = Robot(graph)
     stem = tmp_path / 'room'
     x, y, yaw = START

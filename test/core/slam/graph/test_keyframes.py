@@ -107,7 +107,7 @@ def test_scans_for_which_a_keyframe_stands_go_where_it_goes():
         ((0.0, 0.0, -0.71), True),
     ],
 )
-def test_poses_are_apart_by_way_or_by_turn(T, apart):
+def test_poses_differ_by_distance_or_by_angle(T, apart):
     keyframes = Keyframes(KeyframeConfig())
     for start in (np.zeros(3), np.array([3.0, -2.0, 3.1])):
         there = se2.compose(start, np.array(T))
@@ -115,7 +115,7 @@ def test_poses_are_apart_by_way_or_by_turn(T, apart):
         assert keyframes.differ(there, start) is apart
 
 
-def test_the_most_alike_keyframe_is_found():
+def test_the_most_similar_keyframe_is_found():
     keyframes = along([se2.pose(0.3 * k, 0.0, 0.2 * k) for k in range(10)])
     pose = np.array([1.25, 0.05, 0.78])
     assert keyframes.most_similar(pose) == min(

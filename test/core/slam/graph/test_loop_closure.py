@@ -122,7 +122,7 @@ def test_a_ring_is_closed(ring):
     np.testing.assert_array_equal(after[0], ring.loops.keyframes.poses()[0])
 
 
-def test_a_correction_tells_where_the_keyframes_were_and_are(ring):
+def test_a_correction_contains_old_and_new_keyframe_poses(ring):
     first = ring.corrections[0]
     assert first.before.shape == first.after.shape
     np.testing.assert_array_equal(first.before[0], first.after[0])
@@ -294,7 +294,7 @@ def test_the_path_is_measured_in_straight_lines():
     assert loops.path_m(np.array([4.0, 5.0, 0.0])) == pytest.approx(5.0)
 
 
-def test_what_has_jumped_is_measured_anew(rng):
+def test_a_step_with_a_jump_is_measured_again(rng):
     """Scan and motion contradicted each other on a step; earlier keyframes have the same view."""
     loops = loop_closure()
     truths = np.array([[1.2, 2.0, 0.3], [2.0, 2.0, 0.3], [2.8, 2.0, 0.3]])

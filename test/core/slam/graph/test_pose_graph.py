@@ -53,7 +53,7 @@ def test_a_gap_along_a_line_is_shared_by_the_steps():
     np.testing.assert_allclose(optimized(poses, [*steps, whole])[:, 0], 1.1 * np.arange(5.0))
 
 
-def test_edges_from_a_later_to_an_earlier_pose_say_the_same(rng):
+def test_edges_in_reverse_direction_are_equivalent(rng):
     truth, poses, steps = ring(rng)
     there = optimized(poses, [*steps, Edge(0, 20, se2.between(truth[0], truth[20]), STEP, False)])
     assert worst(there, truth) < worst(poses, truth)

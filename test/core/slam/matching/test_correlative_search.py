@@ -122,7 +122,7 @@ def test_the_search_finds_the_least_of_its_lattice(most_nodes):
     assert gaps.max() < 30.0
 
 
-def test_where_wheels_have_slipped_the_search_finds_nearly_the_least():
+def test_after_wheel_slip_the_search_finds_nearly_the_lowest_cost():
     """Far from a narrow prior, whose cost varies much within a node."""
     found, gaps = exact([Case(seed, slips=True) for seed in range(60)], 1000)
     assert found.mean() >= 0.95

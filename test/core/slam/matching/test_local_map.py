@@ -57,7 +57,7 @@ def told(cells):
     return np.where(leads, np.hypot(down, right), np.inf)
 
 
-def test_each_cell_knows_its_nearest_wall(rng):
+def test_each_cell_refers_to_its_nearest_wall(rng):
     local_map = LocalMap()
     for k in range(12):
         add_scan(local_map, ROOM, random_pose(rng), rng)
@@ -160,7 +160,7 @@ def test_the_faces_of_a_thin_wall_are_kept_apart():
         np.testing.assert_allclose(face_y[hit], face, atol=1e-3)
 
 
-def test_hits_and_looks_through_are_counted():
+def test_hits_and_traversals_are_counted():
     """A beam does not count as an observation of cells near its end, which it may graze."""
     local_map = LocalMap()
     add(local_map, np.array([[0.525, 0.025]]), (0.025, 0.025), 0.0)

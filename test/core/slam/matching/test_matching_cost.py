@@ -259,7 +259,7 @@ def test_in_a_corner_both_directions_count():
         assert (g[1] < -1.0) is np.bool_(rank == 2)
 
 
-def test_a_wall_that_was_hit_once_draws_half_as_much():
+def test_a_wall_with_one_hit_has_half_the_weight():
     scan = np.array([[1.08, 0.02, 1.0, -1.0, 0.0]])
     pulls = []
     for hits in (1, 2, 50):
@@ -273,7 +273,7 @@ def test_a_wall_that_was_hit_once_draws_half_as_much():
     np.testing.assert_allclose(pulls, expected[:, None] / expected[2] * pulls[2], rtol=1e-9)
 
 
-def test_the_other_face_of_a_wall_draws_nothing():
+def test_the_other_face_of_a_wall_has_no_weight():
     """A beam from behind has hit another surface, which counts as unobserved."""
     local_map = LocalMap()
     local_map.add_scan(on_wall(np.array([[1.02, 0.02]]), 0.0), np.zeros(3), np.zeros(3))
@@ -341,7 +341,7 @@ def test_a_minimum_is_one(rng, room, scan):
     assert settled >= 27
 
 
-def test_from_a_prior_far_off_the_walls_decide(rng, room, scan):
+def test_with_a_distant_prior_the_walls_decide(rng, room, scan):
     """A distant prior has a small weight: the wheels have slipped."""
     sharp = np.linalg.inv(np.diag(np.square([0.005, 0.005, 0.005])))
     prior = TRUTH + [0.0, 0.4, 0.0]

@@ -95,7 +95,7 @@ def test_the_covariance_is_that_of_scan_and_prior_together(rng, room):
     np.testing.assert_allclose(found.covariance @ information, np.eye(3), atol=1e-9)
 
 
-def test_a_prior_far_off_is_searched_for(rng, room):
+def test_with_a_distant_prior_poses_are_searched(rng, room):
     """Half a metre and twenty degrees: only the search finds the pose."""
     missed = 0
     found = 0
@@ -112,7 +112,7 @@ def test_a_prior_far_off_is_searched_for(rng, room):
     assert found >= 11
 
 
-def test_where_wheels_have_slipped_the_surroundings_are_searched(rng):
+def test_after_wheel_slip_poses_around_the_prior_are_searched(rng):
     """Although the prior is narrow: the inlier ratio is low at it."""
     truth = np.array([4.0, 2.5, 0.5])
     room = map_of(ROOM, around(truth, 15, rng), rng)
@@ -176,7 +176,7 @@ def test_an_unknown_heading_is_searched_though_the_nearest_minimum_fits(rng):
     assert abs(match(local_map, points, prior, covariance).T_map_base[2]) < 0.02
 
 
-def test_a_robot_that_sees_no_end_of_a_corridor_goes_on_along_it():
+def test_in_a_corridor_without_visible_end_the_prior_decides():
     """The previous pose explains all points; at the current pose some are in unobserved cells."""
     truth = np.array([1.0, 0.0, 0.0])
     covariance = np.diag(np.square([0.12, 0.12, 0.02]))
@@ -196,7 +196,7 @@ def test_a_robot_that_sees_no_end_of_a_corridor_goes_on_along_it():
 
 
 @pytest.mark.parametrize('away_m', [0.3, 0.6, 1.5])
-def test_a_scan_in_one_room_is_not_drawn_to_the_other_face_of_a_wall(rng, away_m):
+def test_a_scan_in_one_room_is_not_matched_with_the_other_face_of_a_wall(rng, away_m):
     """A wall of 10 cm, observed from both rooms: each face is a separate surface."""
     south = [-4.0, 0.0, 4.0, 0.0]
     north = [4.0, 0.1, -4.0, 0.1]
@@ -329,7 +329,7 @@ def test_a_point_counts_as_much_as_its_spacing():
     assert np.isfinite(at_the_laser).all()
 
 
-def test_a_scan_of_twice_the_beams_says_no_more_of_what_is_near(room):
+def test_a_scan_of_twice_the_beams_has_no_more_information_at_close_range(room):
     sparse, dense = (
         match(
             room, surface_points(scan_in(ROOM, TRUTH, beams=beams), RANGE_MAX_M), TRUTH
