@@ -34,8 +34,10 @@ def test_the_navigator_changes_its_speed_and_refuses_what_makes_no_sense(graph):
     speed, turn = names
     assert change(graph, 'navigator', **{speed: 0.5, turn: 0.7}).successful
     assert current(graph, 'navigator', *names) == [0.5, 0.7]
-    graph.until(lambda: f'changed: {speed} = 0.5, {turn} = 0.7' in graph.log('navigator'), 'it')
-    # All or none, with a reason; NaN is within no range.
+    graph.until(
+        lambda: f'changed: {speed} = 0.5, {turn} = 0.7' in graph.log('navigator'), 'a report'
+    )
+    # All or none, with a reason; NaN is in no range.
     for wrong in (-1.0, 1e9, float('nan'), float('inf')):
         result = change(graph, 'navigator', **{turn: 0.9, speed: wrong})
         assert not result.successful and 'max_speed_m_s' in result.reason, result

@@ -184,7 +184,7 @@ class LocalMap:
         if not len(places):
             return
         once = len(np.unique(places, axis=0)) == len(places)
-        snapshot.require(once, 'local map: tiles: duplicate', 'each tile once')
+        snapshot.require(once, 'local map: tiles: one occurs twice', 'each tile once')
         low = places.min(axis=0)
         high = places.max(axis=0)
         self.tiles.grow_to(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
