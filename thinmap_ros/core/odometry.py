@@ -15,6 +15,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.snapshot import MAX_COORDINATE_M, MAX_COUNT, Field
+from thinmap_ros.core.stamps import SECOND_NS
 
 
 class OdometryBuffer:
@@ -82,7 +83,6 @@ class OdometryBuffer:
 
 
 _MAX_SPEED_M_S = 3.0
-_STEP_BACK_NS = 1_000_000_000
 _MAX_GAP_NS = 120_000_000_000
 _JUMP_M = 0.5  # a larger increment than this plus that speed is a discontinuity
 FIELDS = {
@@ -196,8 +196,8 @@ class ScanOdometrySynchronizer:
 
     def add_scan(self, scan: Scan) -> list[tuple[Scan, Array]]:
         """Add a scan; returns the scans that are ready now, each with its T_odom_base (3,)."""
-        # A scan with a stamp far in the future would block all later ones.
-        while self._waiting and self._waiting[-1].stamp_ns > scan.stamp_ns + _STEP_BACK_NS:
+        # A scan with a stamp more than a second ahead would block all later ones.
+        while self._waiting and self._waiting[-1].stamp_ns > scan.stamp_ns + SECOND_NS:
             self._waiting.pop()
             self.dropped += 1
         self._waiting.append(scan)
