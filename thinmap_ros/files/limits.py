@@ -21,6 +21,7 @@ class FileLimits:
     world_cells: int = 100_000_000
     digits: int = 100  # of a number
     name_length: int = 200
+    path_length: int = 1000
 
 
 @dataclass(frozen=True)
@@ -38,5 +39,6 @@ class LogLimits:
     queue_depth: int = 100_000
 
 
+PIECE_BYTES = 1 << 20  # large files are read in pieces
 FILES = FileLimits()
 LOGS = LogLimits()

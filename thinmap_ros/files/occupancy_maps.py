@@ -6,6 +6,7 @@ of 400 m at 0.05 m a cell. The size in the image header is checked before pixels
 
 import warnings
 from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,23 +25,27 @@ from thinmap_ros.files.yaml import read_mapping
 if TYPE_CHECKING:
     from PIL import Image
 
-# Grey values of a trinary map, as map_saver writes them.
-_GREY_FREE = 254
-_GREY_UNKNOWN = 205
-_GREY_OCCUPIED = 0
 # Readers of other formats run programs, or decode before they check the size.
 _FORMATS = ('PPM', 'PNG', 'BMP', 'JPEG')
 _GREYS_8 = 1 << 8
 _GREYS_16 = 1 << 16
 
 
+class _Grey(IntEnum):
+    """Grey values of a trinary map, as map_saver writes them."""
+
+    FREE = 254
+    UNKNOWN = 205
+    OCCUPIED = 0
+
+
 def write_map(stem: Path, patch: GridPatch) -> Path:
     """Write STEM.pgm and STEM.yaml (trinary mode); returns the path of the YAML file."""
     from PIL import Image  # imported here: most processes never write or read a map
 
-    grey = np.full(patch.shape, _GREY_UNKNOWN, dtype=np.uint8)
-    grey[patch.free] = _GREY_FREE
-    grey[patch.occupied] = _GREY_OCCUPIED
+    grey = np.full(patch.shape, _Grey.UNKNOWN, dtype=np.uint8)
+    grey[patch.free] = _Grey.FREE
+    grey[patch.occupied] = _Grey.OCCUPIED
     image = stem.with_name(stem.name + '.pgm')
     description = stem.with_name(stem.name + '.yaml')
     with atomic_write(image) as aside:

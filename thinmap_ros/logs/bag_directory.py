@@ -10,10 +10,8 @@ import zstandard
 
 from thinmap_ros.core.errors import InputError, one_line_reason
 from thinmap_ros.files.atomic import read_text
-from thinmap_ros.files.limits import FILES, LOGS
+from thinmap_ros.files.limits import FILES, LOGS, PIECE_BYTES
 from thinmap_ros.files.yaml import parse_yaml
-
-_PIECE = 2**20
 
 
 @dataclass(frozen=True)
@@ -102,7 +100,7 @@ def _unpack(file: Path, target: Path) -> None:
     try:
         with file.open('rb') as packed, target.open('wb') as out:
             reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
-            while piece := reader.read(_PIECE):
+            while piece := reader.read(PIECE_BYTES):
                 if out.tell() + len(piece) > LOGS.file_bytes:
                     raise InputError(f'{file}: more than {LOGS.file_bytes} bytes decompressed')
                 out.write(piece)

@@ -22,7 +22,7 @@ from mcap.records import Channel, ChunkIndex, Message, Schema
 from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError
-from thinmap_ros.files.limits import LOGS
+from thinmap_ros.files.limits import LOGS, PIECE_BYTES
 from thinmap_ros.logs.mcap_records import (
     FIRST_PRIVATE_OPCODE,
     HEAD,
@@ -35,7 +35,6 @@ from thinmap_ros.logs.mcap_records import (
     records_of,
 )
 
-_STRETCH = 2**20
 _FOOTER = struct.Struct('<QQI')
 _PLAIN = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 _LAST_OPCODE = Opcode.DATA_END
@@ -259,7 +258,7 @@ def _chunk_spans(
         code, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
         end = at + HEAD.size + length
         plain = code in _PLAIN and end <= size and length <= LOGS.chunk_bytes
-        if stretch < at and (not plain or end - stretch > _STRETCH):
+        if stretch < at and (not plain or end - stretch > PIECE_BYTES):
             yield ChunkSpan(stretch, at, is_chunk=False)
             stretch = at
         if (code, length) in ((Opcode.DATA_END, 4), (Opcode.FOOTER, _FOOTER.size)):

@@ -21,7 +21,7 @@ from mcap.records import Channel, Message, Schema
 from numpy.typing import NDArray
 
 from thinmap_ros.core.stamps import LATEST_NS
-from thinmap_ros.files.limits import LOGS
+from thinmap_ros.files.limits import LOGS, PIECE_BYTES
 
 MAGIC = b'\x89MCAP0\r\n'
 FIRST_PRIVATE_OPCODE = 0x80
@@ -30,7 +30,6 @@ HEAD = struct.Struct('<BQ')
 _CHUNK = struct.Struct('<QQQI')
 _MESSAGE = struct.Struct('<HIQQ')
 _IN_CHUNK = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
-_PIECE = 2**20
 _SLICE = 2**16
 
 Definition = Schema | Channel
@@ -125,17 +124,17 @@ def decompress(compression: str, data: bytes, size: int, whole: bool = True) -> 
 
 def _zstd_pieces(data: bytes) -> Iterator[bytes]:
     reader = zstandard.ZstdDecompressor().stream_reader(BytesIO(data), read_across_frames=True)
-    while piece := reader.read(_PIECE):
+    while piece := reader.read(PIECE_BYTES):
         yield piece
 
 
 def _lz4_pieces(data: bytes) -> Iterator[bytes]:
     unpacker: Any = lz4.frame.LZ4FrameDecompressor()
     for at in range(0, len(data), _SLICE):
-        piece = unpacker.decompress(data[at : at + _SLICE], max_length=_PIECE)
+        piece = unpacker.decompress(data[at : at + _SLICE], max_length=PIECE_BYTES)
         yield piece
         while not unpacker.needs_input and not unpacker.eof:
-            yield unpacker.decompress(b'', max_length=_PIECE)
+            yield unpacker.decompress(b'', max_length=PIECE_BYTES)
         if unpacker.eof:
             return
 
