@@ -25,6 +25,7 @@ from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.planning.graph_search import path_lengths_to_nodes
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
 
 
@@ -57,7 +58,7 @@ class _ProgressTimeout:
 
     def __init__(self, config: TargetConfig) -> None:
         self._config = config
-        self._timeout_ns = 1e9 * config.progress_timeout_s
+        self._timeout_ns = SECOND_NS * config.progress_timeout_s
         self._watched: list[_Progress] = []
         self._driven: _Progress | None = None
         self._stamp_ns = 0
@@ -132,7 +133,7 @@ class FrontierExplorer(ABC):
             or self._frame != self.map.borders.frame
             or not self.map.is_open(self.target)
         )
-        return gone or stamp_ns - self._survey_ns >= 1e9 * self.config.choice_period_s
+        return gone or stamp_ns - self._survey_ns >= SECOND_NS * self.config.choice_period_s
 
     def _choose(self, T_map_base: Array) -> None:
         left = [f for f in self.map.find(T_map_base) if self._tries(f) < self.config.max_failures]
