@@ -11,7 +11,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.planning.wavefront import WavefrontConfig, plan
 from thinmap_ros.core.se2 import Array, transform_points
 from thinmap_ros.sim.buildings import Building, generate_building
-from thinmap_ros.sim.drives import MARGIN_M, DriveSample, drive, world_to_grid
+from thinmap_ros.sim.drives import MARGIN_M, DriveConfig, DriveSample, drive, world_to_grid
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS, RobotConfig
 from thinmap_ros.sim.simulation import Simulation
@@ -39,7 +39,8 @@ def samples(seed: int, robot: str, noise: float) -> Iterator[DriveSample]:
     made = generate_building(seed)
     body = noisy(PRESETS[robot], noise)
     simulation = Simulation(made.world, _start(made, body), body, LaserScannerConfig(), seed)
-    return drive(simulation, paths(made, simulation.robot.T_world_base, body, seed), _SPEED_M_S)
+    legs = paths(made, simulation.robot.T_world_base, body, seed)
+    return drive(simulation, legs, DriveConfig(_SPEED_M_S))
 
 
 def noisy(robot: RobotConfig, noise: float) -> RobotConfig:

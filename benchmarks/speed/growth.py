@@ -17,7 +17,7 @@ from thinmap_ros.evaluation.outcome import Row, at_most
 from thinmap_ros.files.package_data import world_path
 from thinmap_ros.files.worlds import read_tour, read_world
 from thinmap_ros.pipeline import PipelineConfig
-from thinmap_ros.sim.drives import DriveSample, drive, tour_paths
+from thinmap_ros.sim.drives import DriveConfig, DriveSample, drive, tour_paths
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import Simulation
@@ -144,4 +144,5 @@ def _samples() -> tuple[Iterator[DriveSample], float]:
     simulation = Simulation(world, world.start, robot, LaserScannerConfig(range_max_m=_RANGE_M), 0)
     ways = list(tour_paths(world, tour, robot.radius_m))  # closed: it begins where it ends
     lap_m = float(sum(np.hypot(*np.diff(way, axis=0).T).sum() for way in ways))
-    return drive(simulation, islice(cycle(ways), 20 * len(ways)), _SPEED_M_S), lap_m
+    laps = islice(cycle(ways), 20 * len(ways))
+    return drive(simulation, laps, DriveConfig(_SPEED_M_S)), lap_m

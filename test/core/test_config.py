@@ -61,6 +61,7 @@ def test_a_number_beyond_all_floats_is_none(name):
 class Inner(Config):
     robot_radius_m: float = robot_radius()
     size_m: float = parameter(1.0, 'size, m', low=0.0, high=2.0)
+    step_m: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,14 @@ class Outer(Config):
 def test_parameters_of_a_part_have_its_name_but_not_those_of_the_robot():
     found = {name: value for name, _, value in parameters_of(Outer())}
     assert found == {'speed': 0.2, 'robot_radius_m': 0.25, 'inner.size_m': 1.0}
+
+
+def test_a_fixed_field_is_no_parameter_but_can_be_set_in_python():
+    fixed = Outer(inner=Inner(step_m=0.2))
+    assert 'inner.step_m' not in [name for name, _, _ in parameters_of(fixed)]
+    assert with_values(fixed, {'inner.size_m': 0.5}).inner == Inner(size_m=0.5, step_m=0.2)
+    with pytest.raises(ConfigError, match=r'no parameter inner\.step_m'):
+        with_values(fixed, {'inner.step_m': 0.3})
 
 
 def test_values_are_given_by_full_names():

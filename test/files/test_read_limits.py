@@ -19,11 +19,12 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import Channel, Chunk, DataEnd, Footer, Header, Message, Schema
 
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.files.limits import LOGS
 from thinmap_ros.logs.bag import Bag
 from thinmap_ros.logs.bag_writer import BagWriter
-from thinmap_ros.logs.carmen import MAX_LINE_LENGTH, CarmenLog
+from thinmap_ros.logs.carmen import CarmenLog
 from thinmap_ros.logs.mcap_reader import Damage, intact_records
-from thinmap_ros.logs.mcap_records import MAX_CHUNK_BYTES, DamagedError, decompress, records_of
+from thinmap_ros.logs.mcap_records import DamagedError, decompress, records_of
 
 MAGIC = b'\x89MCAP0\r\n'
 EXPANDED = 900 * 2**20
@@ -120,7 +121,7 @@ def test_unpacked_is_exact_at_its_bound(compression: str) -> None:
     with pytest.raises(DamagedError, match='more than'):
         decompress(compression, packed, 3 * 2**20 - 1)
     with pytest.raises(DamagedError, match='at most'):
-        decompress(compression, packed, MAX_CHUNK_BYTES + 1)
+        decompress(compression, packed, LOGS.chunk_bytes + 1)
     half = packed[: len(packed) // 2]
     assert 0 < len(decompress(compression, half, 3 * 2**20, whole=False)) < 3 * 2**20
 
@@ -225,7 +226,7 @@ def test_a_line_that_never_ends(tmp_path: Path) -> None:
         code, line, peak_mb = run(str(tool), *arguments)
         assert code == 2
         assert (
-            f'log.clf.gz:2: a line of more than {MAX_LINE_LENGTH} bytes' in line and len(line) < 400
+            f'log.clf.gz:2: a line of more than {LOGS.line_bytes} bytes' in line and len(line) < 400
         )
         assert peak_mb < MOST_MB
     assert not (tmp_path / 'out').exists()

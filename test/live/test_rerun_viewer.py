@@ -6,6 +6,7 @@ import pytest
 from geometry_msgs.msg import PoseStamped
 from support.hidden_library import hide
 
+from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.view import rerun_sinks
 
@@ -30,8 +31,8 @@ def test_recording_can_be_read_after_a_signal(graph, tmp_path):
     truth = graph.node.create_publisher(PoseStamped, 'ground_truth', qos.STREAM)
     graph.until(lambda: truth.get_subscription_count() == 1, 'the viewer listens')
     for i in range(5):
-        truth.publish(messages.pose_stamped_msg([0.2 * i, 0.0, 0.0], 'map', i * messages.SECOND_NS))
-    broken = messages.pose_stamped_msg([float('nan'), 0.0, 0.0], 'map', 5 * messages.SECOND_NS)
+        truth.publish(messages.pose_stamped_msg([0.2 * i, 0.0, 0.0], 'map', i * SECOND_NS))
+    broken = messages.pose_stamped_msg([float('nan'), 0.0, 0.0], 'map', 5 * SECOND_NS)
     truth.publish(broken)
     graph.until(
         lambda: 'ground_truth: pose' in graph.log('rerun_viewer'),

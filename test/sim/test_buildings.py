@@ -9,7 +9,7 @@ import pytest
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.sim.buildings import BuildingConfig, generate_building
-from thinmap_ros.sim.floor_plan import Kind, generate_floor_plan
+from thinmap_ros.sim.floor_plan import FloorPlanConfig, Kind, generate_floor_plan
 from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 from thinmap_ros.sim.moving_obstacles import Doors, MovingObstacles, Pedestrians
 from thinmap_ros.sim.robot import RobotConfig
@@ -49,7 +49,7 @@ def test_a_robot_gets_into_every_part(seed):
 def test_parts_tile_the_plan():
     for seed in SEEDS:
         rng = np.random.default_rng(seed)
-        plan = generate_floor_plan(*rng.uniform(10.0, 120.0, 2), 0.3, rng)
+        plan = generate_floor_plan(*rng.uniform(10.0, 120.0, 2), FloorPlanConfig(0.3), rng)
         area = sum(part.width * part.depth for part in plan.parts)
         assert area == pytest.approx(plan.width * plan.depth)
         assert min(min(part.width, part.depth) for part in plan.parts) > 1.5

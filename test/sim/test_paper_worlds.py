@@ -12,7 +12,7 @@ from scripts.make_warehouse import warehouse_yaml
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.raytrace import cast_rays
 from thinmap_ros.files.worlds import read_tour, read_world
-from thinmap_ros.sim.drives import drive, tour_paths
+from thinmap_ros.sim.drives import DriveConfig, drive, tour_paths
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import Simulation
@@ -95,7 +95,9 @@ def test_the_tour_can_be_driven(name: str) -> None:
     poses = np.array(
         [
             sample.T_world_base
-            for sample in drive(simulation, tour_paths(world, tour, robot.radius_m), 0.5)
+            for sample in drive(
+                simulation, tour_paths(world, tour, robot.radius_m), DriveConfig(0.5)
+            )
         ]
     )
     assert simulation.robot.collisions == 0
@@ -136,7 +138,10 @@ def test_the_same_seed_drives_the_same() -> None:
     def ranges() -> np.ndarray:
         simulation = Simulation(world, world.start, PRESETS['2dx'], LaserScannerConfig(), 3)
         return np.array(
-            [x.scan.ranges_m for x in drive(simulation, tour_paths(world, tour[:1], 0.22), 1.0)]
+            [
+                x.scan.ranges_m
+                for x in drive(simulation, tour_paths(world, tour[:1], 0.22), DriveConfig(1.0))
+            ]
         )
 
     assert np.array_equal(ranges(), ranges())

@@ -25,16 +25,23 @@ from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.planning.graph_search import path_lengths_to_nodes
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.topology.graph import NodeKind, TopologicalMap
 
-_SURVEY_NS = 1_000_000_000
-_AT_GOAL_M = 0.3
-_AT_GOAL_RAD = 0.35
-_LOOKS = 3
-_TRIES = 3
-_SAME_PLACE_M = 1.0
-_VISIT_M = 0.5
-_PROGRESS_M = 0.1
+
+@dataclass(frozen=True)
+class TargetConfig:
+    """When a target is chosen, reached, the same as another, or given up."""
+
+    choice_period_s: float = 1.0
+    goal_tolerance_m: float = 0.3
+    goal_tolerance_rad: float = 0.35
+    same_place_m: float = 1.0
+    visit_radius_m: float = 0.5  # an end node is visited where the robot comes nearer
+    max_looks: int = 3  # scans without change, at the goal or without any target
+    max_failures: int = 3
+    progress_m: float = 0.1
+    progress_timeout_s: float = 30.0  # without this progress
 
 
 @dataclass(eq=False)
@@ -49,20 +56,22 @@ class _Progress:
 class _ProgressTimeout:
     """Detects targets without progress while the robot drives to them."""
 
-    def __init__(self, timeout_s: float) -> None:
-        self._timeout_ns = 1e9 * timeout_s
+    def __init__(self, config: TargetConfig) -> None:
+        self._config = config
+        self._timeout_ns = SECOND_NS * config.progress_timeout_s
         self._watched: list[_Progress] = []
         self._driven: _Progress | None = None
         self._stamp_ns = 0
 
     def has_expired(self, place: Array, length_m: float, stamp_ns: int) -> bool:
         """Add driving time towards a place (2,) at a remaining path length, m."""
-        same = (p for p in self._watched if math.dist(p.place, place) <= _SAME_PLACE_M)
+        same_place_m = self._config.same_place_m
+        same = (p for p in self._watched if math.dist(p.place, place) <= same_place_m)
         progress = next(same, None)
         if progress is None:
             progress = _Progress((float(place[0]), float(place[1])), length_m)
             self._watched.append(progress)
-        if length_m < progress.nearest_m - _PROGRESS_M:
+        if length_m < progress.nearest_m - self._config.progress_m:
             progress.nearest_m = length_m
             progress.waited_ns = 0
         if self._driven is progress:
@@ -78,7 +87,8 @@ class _ProgressTimeout:
 class FrontierExplorer(ABC):
     """Visits frontiers until no reachable one is left."""
 
-    def __init__(self) -> None:
+    def __init__(self, config: TargetConfig | None = None) -> None:
+        self.config = config or TargetConfig()
         self.map = FrontierMap()
         self.target: Frontier | None = None
         self._survey_ns = 0
@@ -102,7 +112,11 @@ class FrontierExplorer(ABC):
             self._choose(T_map_base)
         self._nothing_left = self._nothing_left + 1 if self.target is None else 0
         return _decision(
-            topology, self.target, self._number, self._nothing_left >= _LOOKS, bool(self._failures)
+            topology,
+            self.target,
+            self._number,
+            self._nothing_left >= self.config.max_looks,
+            bool(self._failures),
         )
 
     def target_failed(self, reason: str) -> None:
@@ -119,19 +133,25 @@ class FrontierExplorer(ABC):
             or self._frame != self.map.borders.frame
             or not self.map.is_open(self.target)
         )
-        return gone or stamp_ns - self._survey_ns >= _SURVEY_NS
+        return gone or stamp_ns - self._survey_ns >= SECOND_NS * self.config.choice_period_s
 
     def _choose(self, T_map_base: Array) -> None:
-        left = [f for f in self.map.find(T_map_base) if self._tries(f) < _TRIES]
+        left = [f for f in self.map.find(T_map_base) if self._tries(f) < self.config.max_failures]
         fewest = min((self._tries(f) for f in left), default=0)
         left = [f for f in left if self._tries(f) == fewest]
         before = self.target
         self.target = None
         if left:
             best = left[int(np.argmin(self.costs(left, T_map_base)))]
-            if before is None or math.dist(before.centroid, best.centroid) > _SAME_PLACE_M:
+            if (
+                before is None
+                or math.dist(before.centroid, best.centroid) > self.config.same_place_m
+            ):
                 self._number += 1
-            near = before is not None and math.dist(before.viewpoint, best.viewpoint) < _AT_GOAL_M
+            near = (
+                before is not None
+                and math.dist(before.viewpoint, best.viewpoint) < self.config.goal_tolerance_m
+            )
             # A goal that hardly moved is kept: the robot would otherwise replan every second.
             if near and before:
                 best = Frontier(best.cells, best.centroid, before.viewpoint, best.path_length_m)
@@ -139,7 +159,8 @@ class FrontierExplorer(ABC):
 
     def _tries(self, frontier: Frontier) -> int:
         return sum(
-            math.dist(frontier.viewpoint, place) <= _SAME_PLACE_M for place in self._failures
+            math.dist(frontier.viewpoint, place) <= self.config.same_place_m
+            for place in self._failures
         )
 
     def _drop_unchanged_target(self, T_map_base: Array) -> None:
@@ -147,10 +168,10 @@ class FrontierExplorer(ABC):
         if self.target is None or self._frame != self.map.borders.frame:
             return
         goal = self.target.goal
-        near = math.dist(T_map_base[:2], goal[:2]) <= _AT_GOAL_M
-        looks = near and _turn(T_map_base, goal[2]) <= _AT_GOAL_RAD
+        near = math.dist(T_map_base[:2], goal[:2]) <= self.config.goal_tolerance_m
+        looks = near and _turn(T_map_base, goal[2]) <= self.config.goal_tolerance_rad
         self._at_goal = self._at_goal + 1 if looks else 0
-        if self._at_goal >= _LOOKS:
+        if self._at_goal >= self.config.max_looks:
             self.map.borders.exhaust(
                 self.target.cells, (float(T_map_base[0]), float(T_map_base[1]))
             )
@@ -183,11 +204,10 @@ class ExploreLite(FrontierExplorer):
 
     potential_scale = 3.0
     gain_scale = 1.0
-    progress_timeout_s = 30.0
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._progress_timeout = _ProgressTimeout(self.progress_timeout_s)
+    def __init__(self, config: TargetConfig | None = None) -> None:
+        super().__init__(config)
+        self._progress_timeout = _ProgressTimeout(self.config)
 
     def step(
         self, topology: TopologicalMap, patch: GridPatch, scan: Scan, T_map_base: Array
@@ -261,14 +281,12 @@ class VisitAllEndNodes(NearestFrontier):
     Source: Choset and Nagatani, "Topological simultaneous localization and mapping (SLAM)", 2001.
     """
 
-    progress_timeout_s = 30.0
-
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, config: TargetConfig | None = None) -> None:
+        super().__init__(config)
         self.map = FrontierMap(
             allow_backtracking=True
         )  # the graph may lead through narrow passages
-        self._progress_timeout = _ProgressTimeout(self.progress_timeout_s)
+        self._progress_timeout = _ProgressTimeout(self.config)
         self._visited: list[tuple[float, float]] = []
         self._end_node: Array | None = None  # the goal (3,) there
 
@@ -282,7 +300,7 @@ class VisitAllEndNodes(NearestFrontier):
             return super().step(topology, patch, scan, T_map_base)
         goal, length_m = found
         self.map.update(patch, scan, T_map_base)
-        if self._end_node is None or not _is_near(self._end_node, goal):
+        if not self._is_end_node_at(goal):
             self._number += 1
             self._end_node = goal
         decision = _decision(topology, self._end_node, self._number, False, False)
@@ -306,7 +324,7 @@ class VisitAllEndNodes(NearestFrontier):
         self._visited += [
             (node.x, node.y)
             for node in ends
-            if math.dist((node.x, node.y), T_map_base[:2]) < _VISIT_M
+            if math.dist((node.x, node.y), T_map_base[:2]) < self.config.visit_radius_m
             and not self._was_visited(node.x, node.y)
         ]
         left = {node.id: node for node in ends if not self._was_visited(node.x, node.y)}
@@ -321,16 +339,21 @@ class VisitAllEndNodes(NearestFrontier):
         heading = math.atan2(best.y - T_map_base[1], best.x - T_map_base[0])
         return se2.pose(best.x, best.y, heading), length_m
 
+    def _is_end_node_at(self, goal: Array) -> bool:
+        """Whether the present end node is at a goal (3,)."""
+        if self._end_node is None:
+            return False
+        return math.dist(self._end_node[:2], goal[:2]) < self.config.goal_tolerance_m
+
     def _is_followed(self, x: float, y: float) -> bool:
         """Whether the end node at a place is the present target, which moves as the map grows."""
-        return self._end_node is not None and math.dist((x, y), self._end_node[:2]) < _SAME_PLACE_M
+        return (
+            self._end_node is not None
+            and math.dist((x, y), self._end_node[:2]) < self.config.same_place_m
+        )
 
     def _was_visited(self, x: float, y: float) -> bool:
-        return any(math.dist((x, y), place) < _VISIT_M for place in self._visited)
-
-
-def _is_near(a: Array, b: Array) -> bool:
-    return math.dist(a[:2], b[:2]) < _AT_GOAL_M
+        return any(math.dist((x, y), place) < self.config.visit_radius_m for place in self._visited)
 
 
 def _turn(T_map_base: Array, heading_rad: float) -> float:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
+from thinmap_ros.core.exploration.explorer import ExplorerConfig
 from thinmap_ros.core.exploration.field_of_view import box_of_scan, directions_of_view
 from thinmap_ros.core.exploration.frontiers import OpenBorders
 from thinmap_ros.core.grid.patch import GridPatch
@@ -17,17 +18,16 @@ from thinmap_ros.core.planning.traversability import (
     reachable_cells,
     traversable_cells,
 )
+from thinmap_ros.core.planning.wavefront import WavefrontConfig
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
 Cells = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-RADIUS_M = 0.25
-SHORTEST_M = 0.5
-_REACH_M = 3.0
-_CLOSE_LOOK_M = 2.0
-_ESCAPE_M = 0.6
 _COARSE = 2
+# The same robot and the same frontiers as for the exploration of the paper.
+_EXPLORER = ExplorerConfig()
+_PLANNER = WavefrontConfig()
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class FrontierMap:
 
     def __init__(self, allow_backtracking: bool = False) -> None:
         """allow_backtracking: the recent path counts as traversable, however narrow it appears."""
-        self.borders = OpenBorders(SHORTEST_M)
+        self.borders = OpenBorders(_EXPLORER.min_frontier_size_m)
         self._recent_path = RecentPath() if allow_backtracking else None
         self.patch: GridPatch | None = None
         self._reachable: Mask = np.zeros((0, 0), dtype=np.bool_)
@@ -66,19 +66,19 @@ class FrontierMap:
         if self._recent_path is not None:
             self._recent_path.add_pose(T_map_base)
         self.borders.update(patch, box_of_scan(scan, T_map_base))
-        self.borders.examine(xy, _CLOSE_LOOK_M, directions_of_view(scan, T_map_base))
+        self.borders.examine(xy, _EXPLORER.exhaustion_range_m, directions_of_view(scan, T_map_base))
 
     def is_open(self, frontier: Frontier) -> bool:
         """Whether enough of a frontier remains; its cells must be of the present frame."""
         left = np.count_nonzero(self.borders.mask[frontier.cells[:, 0], frontier.cells[:, 1]])
-        return bool(left * self.borders.frame.resolution >= SHORTEST_M - 1e-6)
+        return bool(left * self.borders.frame.resolution >= _EXPLORER.min_frontier_size_m - 1e-6)
 
     def find(self, T_map_base: Array) -> list[Frontier]:
         """All frontiers with a viewpoint that is reachable from a pose (3,)."""
         frame = self.borders.frame
         cells, numbers, _ = self.borders.stretches()
         xy = (float(T_map_base[0]), float(T_map_base[1]))
-        standing = traversable_cells(self.borders.free, RADIUS_M, frame.resolution)
+        standing = traversable_cells(self.borders.free, _EXPLORER.robot_radius_m, frame.resolution)
         reach = self._reach_from(standing, xy)
         if len(cells) == 0:
             return []
@@ -86,7 +86,8 @@ class FrontierMap:
         self._reachable = downsample_mask(reach, _COARSE)
         stretches = [cells[numbers == number] for number in np.unique(numbers)]
         places = [
-            self.borders.place_to_look(stretch, reached, _REACH_M, xy) for stretch in stretches
+            self.borders.place_to_look(stretch, reached, _EXPLORER.frontier_assignment_radius_m, xy)
+            for stretch in stretches
         ]
         found = [(s, p) for s, p in zip(stretches, places, strict=True) if p is not None]
         ways = self.path_lengths_from(
@@ -106,11 +107,12 @@ class FrontierMap:
         if not (0 <= row < free.shape[0] and 0 <= col < free.shape[1]):
             return np.zeros_like(standing)
         if self._recent_path is None:
-            ways = escape_cells(standing, free, frame, xy, _ESCAPE_M)
+            ways = escape_cells(standing, free, frame, xy, _PLANNER.start_escape_distance_m)
             return reachable_cells(ways, (row, col)) & standing
         trail = self._recent_path.cells(frame, free.shape)
         return reachable_cells(
-            escape_cells(standing, free, frame, xy, _ESCAPE_M, trail), (row, col)
+            escape_cells(standing, free, frame, xy, _PLANNER.start_escape_distance_m, trail),
+            (row, col),
         )
 
     def path_lengths_from(self, xy: Array, places: Array) -> Array:

@@ -2,7 +2,8 @@
 
 A configuration is composed of others (`part`). Seen from ROS and the command line it is flat:
 parameters of a part have its name before theirs, `matching.noise_m`; those that describe the robot
-(`robot_radius`) have one name everywhere.
+(`robot_radius`) have one name everywhere. Fields without `parameter` are fixed: they are set in
+Python only, and are no parameters of nodes.
 """
 
 import dataclasses
@@ -55,8 +56,13 @@ class Config:
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
-            if 'description' in field.metadata:
+            if is_parameter(field):
                 _check(field, getattr(self, field.name))
+
+
+def is_parameter(field: 'dataclasses.Field[Any]') -> bool:
+    """Whether a field was declared by `parameter`, so that users can set it."""
+    return 'description' in field.metadata
 
 
 AnyConfig = TypeVar('AnyConfig', bound=Config)
@@ -69,7 +75,7 @@ def parameters_of(config: Config) -> Iterator[tuple[str, 'dataclasses.Field[Any]
         if isinstance(value, Config):
             for name, inner, own in parameters_of(value):
                 yield name if _is_shared(inner) else f'{field.name}.{name}', inner, own
-        else:
+        elif is_parameter(field):
             yield field.name, field, value
 
 

@@ -2,7 +2,7 @@
 
 import reprlib
 
-_MAX_QUOTE_LENGTH = 200
+MAX_QUOTE_LENGTH = 200
 _MAX_INTEGER = 10**30
 
 
@@ -36,12 +36,12 @@ def one_line_reason(error: BaseException) -> str:
 def one_line(text: str) -> str:
     """Text without line breaks and shortened in its middle to at most 200 characters."""
     # Both ends are enough: splitting a long text into words takes as long as reading it.
-    if len(text) > 4 * _MAX_QUOTE_LENGTH:
-        text = text[: 2 * _MAX_QUOTE_LENGTH] + text[-2 * _MAX_QUOTE_LENGTH :]
+    if len(text) > 4 * MAX_QUOTE_LENGTH:
+        text = text[: 2 * MAX_QUOTE_LENGTH] + text[-2 * MAX_QUOTE_LENGTH :]
     line = ' '.join(text.split())
     line = ''.join(c if c.isprintable() else '?' for c in line)
-    half = (_MAX_QUOTE_LENGTH - 3) // 2
-    return line if len(line) <= _MAX_QUOTE_LENGTH else f'{line[:half]}...{line[-half:]}'
+    half = (MAX_QUOTE_LENGTH - 3) // 2
+    return line if len(line) <= MAX_QUOTE_LENGTH else f'{line[:half]}...{line[-half:]}'
 
 
 class _Quote(reprlib.Repr):
@@ -49,7 +49,7 @@ class _Quote(reprlib.Repr):
 
     def __init__(self) -> None:
         super().__init__()
-        self.maxstring = self.maxother = _MAX_QUOTE_LENGTH
+        self.maxstring = self.maxother = MAX_QUOTE_LENGTH
         self.maxlevel = 3
 
     def repr_int(self, x: int, level: int) -> str:

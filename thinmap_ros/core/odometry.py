@@ -15,6 +15,7 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.snapshot import MAX_COORDINATE_M, MAX_COUNT, Field
+from thinmap_ros.core.stamps import SECOND_NS
 
 
 class OdometryBuffer:
@@ -81,15 +82,27 @@ class OdometryBuffer:
             del self._stamps[:first], self._poses[:first]
 
 
-_MAX_SPEED_M_S = 3.0
-_STEP_BACK_NS = 1_000_000_000
-_MAX_GAP_NS = 120_000_000_000
-_JUMP_M = 0.5  # a larger increment than this plus that speed is a discontinuity
 FIELDS = {
     'stamp_ns': Field(np.int64, (), 0, MAX_COUNT),
     'T_map_odom': Field(np.float64, (3,), -MAX_COORDINATE_M, MAX_COORDINATE_M),
     'T_odom_base': Field(np.float64, (3,), -MAX_COORDINATE_M, MAX_COORDINATE_M),
 }
+
+
+@dataclass(frozen=True)
+class OdometryLimits:
+    """Motion that odometry can report of one drive; a larger one is a discontinuity."""
+
+    jump_m: float = 0.5
+    max_speed_m_s: float = 3.0
+    max_gap_ns: int = 120_000_000_000
+
+    def distance_m(self, seconds: float) -> float:
+        """Largest distance between two samples so many seconds apart, m."""
+        return self.jump_m + self.max_speed_m_s * seconds
+
+
+_LIMITS = OdometryLimits()
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +134,7 @@ class OdometryAnchor:
         """
         gap_ns = stamp_ns - self.stamp_ns
         moved = math.dist(self.T_odom_base[:2], T_odom_base[:2])
-        return 0 <= gap_ns <= _MAX_GAP_NS and moved <= _JUMP_M + _MAX_SPEED_M_S * gap_ns / 1e9
+        return 0 <= gap_ns <= _LIMITS.max_gap_ns and moved <= _LIMITS.distance_m(gap_ns / 1e9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +174,7 @@ class OdometryIncrements:
         self.T_odom_base = np.array(T_odom_base, dtype=np.float64)
         # Rounded, so that text logs, bags and messages give identical results.
         moved = np.round(se2.between(before, self.T_odom_base), 9)
-        discontinuity_m = _JUMP_M + _MAX_SPEED_M_S * max(seconds, 1.0)
+        discontinuity_m = _LIMITS.distance_m(max(seconds, 1.0))
         if math.hypot(moved[0], moved[1]) <= discontinuity_m:
             return OdometryIncrement(moved, seconds, 0.0)
         self.rejected += 1
@@ -196,8 +209,8 @@ class ScanOdometrySynchronizer:
 
     def add_scan(self, scan: Scan) -> list[tuple[Scan, Array]]:
         """Add a scan; returns the scans that are ready now, each with its T_odom_base (3,)."""
-        # A scan with a stamp far in the future would block all later ones.
-        while self._waiting and self._waiting[-1].stamp_ns > scan.stamp_ns + _STEP_BACK_NS:
+        # A scan with a stamp more than a second ahead would block all later ones.
+        while self._waiting and self._waiting[-1].stamp_ns > scan.stamp_ns + SECOND_NS:
             self._waiting.pop()
             self.dropped += 1
         self._waiting.append(scan)

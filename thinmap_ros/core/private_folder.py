@@ -7,8 +7,8 @@ from pathlib import Path
 
 from thinmap_ros.core.errors import InputError
 
-_MODE = 0o700
-_OF_OTHERS = 0o077
+_MODE = stat.S_IRWXU
+_OF_OTHERS = stat.S_IRWXG | stat.S_IRWXO
 
 
 def private_folder(folder: Path) -> Path:

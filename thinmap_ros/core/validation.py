@@ -7,12 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thinmap_ros.core import se2
-from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.errors import MAX_QUOTE_LENGTH, InputError
 
 MAX_COORDINATE_M = se2.MAX_COORDINATE_M
 MAX_ANGLE_RAD = 4.0 * np.pi
 MAX_BEAMS = 200_000
-MAX_LIST_LENGTH = 200
 
 
 def require_bounded(what: str, values: Iterable[float], limit: float = MAX_COORDINATE_M) -> None:
@@ -34,7 +33,7 @@ def quoted_names(names: Sequence[str]) -> str:
     """List names of a file for an error message: the first ones, and the number of the others."""
     shown = [quoted_name(name) for name in names]
     lengths = accumulate(len(name) + 2 for name in shown)
-    count = max(1, sum(length <= MAX_LIST_LENGTH for length in lengths))
+    count = max(1, sum(length <= MAX_QUOTE_LENGTH for length in lengths))
     more = f' and {len(shown) - count} more' if len(shown) > count else ''
     return ', '.join(shown[:count]) + more or 'nothing'
 

@@ -20,7 +20,7 @@ from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag import Bag, BagLog
 from thinmap_ros.logs.log import OdometryEvent
 from thinmap_ros.sim.coverage import observable_cells
-from thinmap_ros.sim.drives import DriveSample, drive, random_drive, tour_paths
+from thinmap_ros.sim.drives import DriveConfig, DriveSample, drive, random_drive, tour_paths
 from thinmap_ros.sim.laser import LaserScanner, LaserScannerConfig
 from thinmap_ros.sim.robot import PRESETS
 from thinmap_ros.sim.simulation import Simulation
@@ -82,7 +82,7 @@ def _tour(recipe: Recipe, seed: int) -> Iterator[DriveSample]:
     robot = PRESETS[recipe.robot]
     simulation = Simulation(world, world.start, robot, LaserScannerConfig(), seed)
     paths = tour_paths(world, tour_of(recipe.world), robot.radius_m)
-    return drive(simulation, paths, SETUP.speed_m_s)
+    return drive(simulation, paths, DriveConfig(SETUP.speed_m_s))
 
 
 def _stops(recipe: Recipe, seed: int) -> Iterator[DriveSample]:

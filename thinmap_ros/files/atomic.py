@@ -8,8 +8,8 @@ from glob import escape
 from pathlib import Path
 
 from thinmap_ros.core.errors import InputError, one_line_reason
+from thinmap_ros.files.limits import FILES
 
-_MAX_TEXT_BYTES = 1 << 30
 _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
@@ -45,7 +45,7 @@ def write_text(path: Path, text: str) -> None:
         aside.write_text(text, encoding='utf-8')
 
 
-def read_text(path: Path, max_bytes: int = _MAX_TEXT_BYTES) -> str:
+def read_text(path: Path, max_bytes: int = FILES.text_bytes) -> str:
     """Read a text file. Raises InputError if it is missing, not text, or above max_bytes."""
     try:
         with path.open('rb') as stream:

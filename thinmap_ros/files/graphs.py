@@ -23,10 +23,9 @@ from thinmap_ros.core.errors import InputError, one_line_reason, quoted
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 from thinmap_ros.files.atomic import read_text, write_text
+from thinmap_ros.files.limits import FILES
 
 _MAX_ID = 2**32 - 1
-_MAX_BYTES = 256 << 20
-_MAX_DIGITS = 100
 _BAD_FEATURE = (KeyError, TypeError, ValueError, InputError)
 _ARRIVED_M = 0.3  # distance at which topological_navigation counts a node as reached
 _UPRIGHT = {'w': 1.0, 'x': 0.0, 'y': 0.0, 'z': 0.0}
@@ -212,7 +211,7 @@ def read_geojson(path: Path) -> TopologicalMap:
     Raises InputError naming the file and the feature.
     """
     expected = 'expected a GeoJSON collection of features'
-    text = read_text(path, _MAX_BYTES)
+    text = read_text(path, FILES.graph_bytes)
     try:
         features = json.loads(text, parse_int=_integer)['features']
     except (ValueError, KeyError, TypeError, RecursionError) as error:
@@ -244,8 +243,8 @@ def read_geojson(path: Path) -> TopologicalMap:
 
 def _integer(digits: str) -> int:
     """Parse an integer of a JSON text; no valid number has hundreds of digits."""
-    if len(digits) > _MAX_DIGITS:
-        raise ValueError(f'a number of {len(digits)} digits: expected at most {_MAX_DIGITS}')
+    if len(digits) > FILES.digits:
+        raise ValueError(f'a number of {len(digits)} digits: expected at most {FILES.digits}')
     return int(digits)
 
 

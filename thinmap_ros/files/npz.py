@@ -18,9 +18,8 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError, ThinmapError, one_line_reason, quoted
+from thinmap_ros.files.limits import FILES
 
-MAX_BYTES = 512 << 20
-_MAX_ARRAYS = 64
 _ENDING = '.npy'
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _READERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
@@ -59,12 +58,12 @@ def read_arrays(stream: IO[bytes]) -> dict[str, NDArray[Any]]:
 
 def _check_sizes(members: list[zipfile.ZipInfo]) -> None:
     names = {member.filename for member in members}
-    if len(members) > _MAX_ARRAYS or len(names) < len(members):
-        expected = f'expected at most {_MAX_ARRAYS}, each once'
+    if len(members) > FILES.npz_arrays or len(names) < len(members):
+        expected = f'expected at most {FILES.npz_arrays}, each once'
         raise InputError(f'{len(members)} arrays of {len(names)} names: {expected}')
     size = sum(member.file_size for member in members)
-    if size > MAX_BYTES:
-        raise InputError(f'{size} bytes decompressed: expected at most {MAX_BYTES}')
+    if size > FILES.npz_bytes:
+        raise InputError(f'{size} bytes decompressed: expected at most {FILES.npz_bytes}')
     for member in members:
         if not member.filename.endswith(_ENDING) or member.compress_type not in _METHODS:
             raise InputError(f'{quoted(member.filename)}: expected an array, stored or deflated')

@@ -6,6 +6,7 @@ of 400 m at 0.05 m a cell. The size in the image header is checked before pixels
 
 import warnings
 from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,30 +19,33 @@ from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import OCCUPIED_AT_LEAST, UNKNOWN, GridPatch
 from thinmap_ros.core.se2 import MAX_COORDINATE_M
 from thinmap_ros.files.atomic import atomic_write, write_text
+from thinmap_ros.files.limits import FILES
 from thinmap_ros.files.yaml import read_mapping
 
 if TYPE_CHECKING:
     from PIL import Image
 
-# Grey values of a trinary map, as map_saver writes them.
-_GREY_FREE = 254
-_GREY_UNKNOWN = 205
-_GREY_OCCUPIED = 0
-_MAX_PIXELS = 8192 * 8192
-_MAX_NAME_LENGTH = 200
 # Readers of other formats run programs, or decode before they check the size.
 _FORMATS = ('PPM', 'PNG', 'BMP', 'JPEG')
 _GREYS_8 = 1 << 8
 _GREYS_16 = 1 << 16
 
 
+class _Grey(IntEnum):
+    """Grey values of a trinary map, as map_saver writes them."""
+
+    FREE = 254
+    UNKNOWN = 205
+    OCCUPIED = 0
+
+
 def write_map(stem: Path, patch: GridPatch) -> Path:
     """Write STEM.pgm and STEM.yaml (trinary mode); returns the path of the YAML file."""
     from PIL import Image  # imported here: most processes never write or read a map
 
-    grey = np.full(patch.shape, _GREY_UNKNOWN, dtype=np.uint8)
-    grey[patch.free] = _GREY_FREE
-    grey[patch.occupied] = _GREY_OCCUPIED
+    grey = np.full(patch.shape, _Grey.UNKNOWN, dtype=np.uint8)
+    grey[patch.free] = _Grey.FREE
+    grey[patch.occupied] = _Grey.OCCUPIED
     image = stem.with_name(stem.name + '.pgm')
     description = stem.with_name(stem.name + '.yaml')
     with atomic_write(image) as aside:
@@ -82,7 +86,7 @@ def read_map(path: Path, folder: Path | None = None) -> GridPatch:
 
 def _image_of(path: Path, content: dict[str, Any], folder: Path | None) -> Path:
     name = content.get('image')
-    if not isinstance(name, str) or not name.isprintable() or len(name) > _MAX_NAME_LENGTH:
+    if not isinstance(name, str) or not name.isprintable() or len(name) > FILES.name_length:
         raise InputError(f'{path}: image: {quoted(name)}: expected the name of an image')
     image = path.parent / name
     if folder is not None and not image.resolve().is_relative_to(folder):
@@ -166,8 +170,10 @@ def _cells(path: Path, image: Path, shades: _Shades) -> NDArray[np.int8]:
             warnings.simplefilter('error', Image.DecompressionBombWarning)
             with Image.open(image, formats=_FORMATS) as opened:
                 width, height = opened.size
-                if width * height > _MAX_PIXELS:
-                    raise ValueError(f'{width} x {height} pixels: expected at most {_MAX_PIXELS}')
+                if width * height > FILES.image_pixels:
+                    raise ValueError(
+                        f'{width} x {height} pixels: expected at most {FILES.image_pixels}'
+                    )
                 opened.load()
                 return _cells_of(opened, shades)
     except Exception as error:  # Pillow raises many types for corrupt images

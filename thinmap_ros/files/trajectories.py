@@ -9,6 +9,7 @@ import numpy as np
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.files.atomic import read_text, write_text
 
 
@@ -18,7 +19,7 @@ def write_tum(path: Path, stamps_ns: Sequence[int], poses: Sequence[Array]) -> N
     for ns, (x, y, theta) in zip(stamps_ns, poses, strict=True):
         half = theta / 2.0
         lines.append(
-            f'{ns // 1_000_000_000}.{ns % 1_000_000_000:09d} {x:.6f} {y:.6f} 0 0 0 '
+            f'{ns // SECOND_NS}.{ns % SECOND_NS:09d} {x:.6f} {y:.6f} 0 0 0 '
             f'{math.sin(half):.9f} {math.cos(half):.9f}\n'
         )
     write_text(path, ''.join(lines))
@@ -34,7 +35,7 @@ def read_tum(path: Path) -> tuple[list[int], Array]:
             continue
         try:
             seconds, _, nano = fields[0].partition('.')
-            stamp_ns = int(seconds) * 1_000_000_000 + int(f'{nano:0<9.9}')
+            stamp_ns = int(seconds) * SECOND_NS + int(f'{nano:0<9.9}')
             x, y, _, _, _, qz, qw = (float(v) for v in fields[1:])
         except ValueError as error:
             text = quoted(line[:60])

@@ -12,13 +12,12 @@ from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.grid.frame import MIN_RESOLUTION_M, GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import MAX_COORDINATE_M, Array, pose
+from thinmap_ros.files.limits import FILES
 from thinmap_ros.files.occupancy_maps import read_map
 from thinmap_ros.files.yaml import read_mapping
 
 _MARGIN_M = 0.2
 _NUDGE_M = 1e-9
-_MAX_CELLS = 100_000_000
-_MAX_NAME_LENGTH = 200
 _FREE = 0
 _SOLID = 100
 
@@ -119,8 +118,8 @@ def _from_drawing(path: Path, content: dict[str, Any]) -> tuple[str, GridPatch, 
 
 def _name(path: Path, content: dict[str, Any]) -> str:
     name = content.get('name', path.stem)
-    if not isinstance(name, str | int | float) or len(str(name)) > _MAX_NAME_LENGTH:
-        expected = f'expected a name of at most {_MAX_NAME_LENGTH} characters'
+    if not isinstance(name, str | int | float) or len(str(name)) > FILES.name_length:
+        expected = f'expected a name of at most {FILES.name_length} characters'
         raise InputError(f'{path}: name: {quoted(name)}: {expected}')
     return str(name)
 
@@ -133,9 +132,9 @@ def _frame_of(path: Path, points: Array, resolution: float) -> tuple[GridFrame, 
         raise InputError(f'{path}: point at {farthest:g} m: {expected}')
     low = np.floor((points.min(axis=0) - _MARGIN_M) / resolution)
     cols, rows = np.ceil((points.max(axis=0) + _MARGIN_M) / resolution) - low
-    if not rows * cols <= _MAX_CELLS:
+    if not rows * cols <= FILES.world_cells:
         raise InputError(
-            f'{path}: {rows:.0f} x {cols:.0f} cells: expected at most {_MAX_CELLS}; '
+            f'{path}: {rows:.0f} x {cols:.0f} cells: expected at most {FILES.world_cells}; '
             'is a point wrong?'
         )
     frame = GridFrame(float(low[0]) * resolution, float(low[1]) * resolution, resolution)

@@ -12,11 +12,8 @@ import yaml
 
 from thinmap_ros.core.errors import InputError, one_line_reason, quoted
 from thinmap_ros.files.atomic import read_text
+from thinmap_ros.files.limits import FILES
 
-MAX_BYTES = 4 << 20
-_MAX_NODES = 100_000
-_MAX_LEVELS = 20
-_MAX_NUMBER_LENGTH = 100
 _MERGE_TAG = 'tag:yaml.org,2002:merge'
 _NUMBER_TAGS = ('tag:yaml.org,2002:int', 'tag:yaml.org,2002:float')
 
@@ -27,15 +24,15 @@ def load_yaml(path: Path) -> object:
     Raises InputError with the file name if it is no YAML, or exceeds the limits.
     """
     try:
-        return parse_yaml(read_text(path, MAX_BYTES))
+        return parse_yaml(read_text(path, FILES.yaml_bytes))
     except _YamlError as error:
         raise InputError(f'{path}: {error}') from error
 
 
 def parse_yaml(text: str) -> object:
     """Parse a YAML text, as `load_yaml`. Raises InputError as it does."""
-    if len(text) > MAX_BYTES:
-        raise _YamlError(f'{len(text)} characters: expected at most {MAX_BYTES}')
+    if len(text) > FILES.yaml_bytes:
+        raise _YamlError(f'{len(text)} characters: expected at most {FILES.yaml_bytes}')
     try:
         return yaml.load(text, Loader=_BoundedLoader)
     except (yaml.YAMLError, ValueError, OverflowError) as error:
@@ -46,7 +43,7 @@ def parse_yaml(text: str) -> object:
 def read_mapping(path: Path, expected: str) -> dict[str, Any]:
     """Read a mapping. Raises InputError with the file name and the expectation."""
     try:
-        content = parse_yaml(read_text(path, MAX_BYTES))
+        content = parse_yaml(read_text(path, FILES.yaml_bytes))
     except _YamlError as error:
         raise InputError(f'{path}: {error}: expected {expected}') from error
     if not isinstance(content, dict):
@@ -75,11 +72,11 @@ class _BoundedLoader(yaml.SafeLoader):
         self._reject_aliases(event)
         self._nodes += 1
         self._level += 1
-        if self._nodes > _MAX_NODES:
-            expected = f'expected at most {_MAX_NODES} values, lists and mappings'
+        if self._nodes > FILES.yaml_nodes:
+            expected = f'expected at most {FILES.yaml_nodes} values, lists and mappings'
             raise _YamlError(f'{_at(event)}: {expected}')
-        if self._level > _MAX_LEVELS:
-            raise _YamlError(f'{_at(event)}: expected at most {_MAX_LEVELS} levels')
+        if self._level > FILES.yaml_levels:
+            raise _YamlError(f'{_at(event)}: expected at most {FILES.yaml_levels} levels')
         node = super().compose_node(parent, index)
         self._level -= 1
         self._reject_long_number(node, event)
@@ -96,8 +93,8 @@ class _BoundedLoader(yaml.SafeLoader):
             return
         if node.tag == _MERGE_TAG:
             raise _YamlError(f'{_at(event)}: <<: expected no merge keys')
-        if node.tag in _NUMBER_TAGS and len(node.value) > _MAX_NUMBER_LENGTH:
-            expected = f'expected at most {_MAX_NUMBER_LENGTH}'
+        if node.tag in _NUMBER_TAGS and len(node.value) > FILES.digits:
+            expected = f'expected at most {FILES.digits}'
             size = len(node.value)
             raise _YamlError(f'{_at(event)}: a number of {size} characters: {expected}')
 

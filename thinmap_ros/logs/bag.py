@@ -13,6 +13,7 @@ from thinmap_ros.core import se2, validation
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.files.limits import LOGS
 from thinmap_ros.logs import decode
 from thinmap_ros.logs.bag_directory import bag_files, decompressed_files
 from thinmap_ros.logs.laser_mount import Mount, StaticTransforms, rotation_matrix
@@ -24,7 +25,7 @@ from thinmap_ros.logs.log import (
     is_mcap,
     refuse_foreign,
 )
-from thinmap_ros.logs.mcap_records import MAX_CHUNK_BYTES, DamagedError, decompress
+from thinmap_ros.logs.mcap_records import DamagedError, decompress
 from thinmap_ros.logs.storage import RawMessage, Storage, storage_of
 
 _SCAN = 'sensor_msgs/msg/LaserScan'
@@ -96,7 +97,7 @@ class Bag:
                     yield message
                     continue
                 try:
-                    data = decompress('zstd', message.data, MAX_CHUNK_BYTES)
+                    data = decompress('zstd', message.data, LOGS.chunk_bytes)
                 except DamagedError:
                     self._unreadable += 1
                     continue

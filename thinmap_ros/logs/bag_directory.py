@@ -10,11 +10,8 @@ import zstandard
 
 from thinmap_ros.core.errors import InputError, one_line_reason
 from thinmap_ros.files.atomic import read_text
-from thinmap_ros.files.yaml import MAX_BYTES, parse_yaml
-
-MAX_FILE_BYTES = 32 * 2**30
-"""Maximum decompressed size of a file of a bag with file compression."""
-_PIECE = 2**20
+from thinmap_ros.files.limits import FILES, LOGS, PIECE_BYTES
+from thinmap_ros.files.yaml import parse_yaml
 
 
 @dataclass(frozen=True)
@@ -66,7 +63,7 @@ def _number(file: Path) -> tuple[int, str]:
 
 def _information(metadata: Path) -> Any:
     """Raises InputError, KeyError or TypeError if it is missing, or exceeds the YAML limits."""
-    content: Any = parse_yaml(read_text(metadata, MAX_BYTES))
+    content: Any = parse_yaml(read_text(metadata, FILES.yaml_bytes))
     return content['rosbag2_bagfile_information']
 
 
@@ -87,7 +84,7 @@ def decompressed_files(
 ) -> Iterator[tuple[Path, TemporaryDirectory[str] | None]]:
     """The files; those ending in .zstd are decompressed into a temporary folder.
 
-    Raises InputError if a file is invalid, or expands to more than MAX_FILE_BYTES.
+    Raises InputError if a file is invalid, or expands to more than LOGS.file_bytes.
     """
     for file in files:
         if file.suffix != '.zstd':
@@ -103,9 +100,9 @@ def _unpack(file: Path, target: Path) -> None:
     try:
         with file.open('rb') as packed, target.open('wb') as out:
             reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
-            while piece := reader.read(_PIECE):
-                if out.tell() + len(piece) > MAX_FILE_BYTES:
-                    raise InputError(f'{file}: more than {MAX_FILE_BYTES} bytes decompressed')
+            while piece := reader.read(PIECE_BYTES):
+                if out.tell() + len(piece) > LOGS.file_bytes:
+                    raise InputError(f'{file}: more than {LOGS.file_bytes} bytes decompressed')
                 out.write(piece)
     except zstandard.ZstdError as error:
         raise InputError(f'{file}: no zstd file: {str(error)[:120]}') from error

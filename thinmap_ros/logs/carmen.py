@@ -20,6 +20,8 @@ from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.stamps import LATEST_S, SECOND_NS
+from thinmap_ros.files.limits import LOGS
 from thinmap_ros.logs.log import (
     Event,
     OdometryEvent,
@@ -28,11 +30,6 @@ from thinmap_ros.logs.log import (
     is_mcap,
     refuse_foreign,
 )
-
-_SECOND_NS = 1_000_000_000
-_LATEST_S = 2**31
-MAX_LINE_LENGTH = 4 * 2**20
-"""Maximum bytes of a line, decompressed. A scan of 1,000 beams takes 7,000."""
 
 
 @dataclass(frozen=True)
@@ -100,11 +97,11 @@ class CarmenLog:
         try:
             with _open(self.path) as stream:
                 # One byte more than the limit: no more of a longer line is ever read.
-                lines = iter(lambda: stream.readline(MAX_LINE_LENGTH + 1), b'')
+                lines = iter(lambda: stream.readline(LOGS.line_bytes + 1), b'')
                 for number, line in enumerate(lines, start=1):
-                    if len(line) > MAX_LINE_LENGTH:
+                    if len(line) > LOGS.line_bytes:
                         raise InputError(
-                            f'{self.path}:{number}: a line of more than {MAX_LINE_LENGTH} bytes: '
+                            f'{self.path}:{number}: a line of more than {LOGS.line_bytes} bytes: '
                             'expected a CARMEN log'
                         )
                     if b'\0' in line:
@@ -221,10 +218,10 @@ def _stamp(word: str) -> int:
     """Seconds as written, exact to the nanosecond."""
     seconds, _, fraction = word.partition('.')
     if not (
-        seconds.isdigit() and (fraction == '' or fraction.isdigit()) and int(seconds) < _LATEST_S
+        seconds.isdigit() and (fraction == '' or fraction.isdigit()) and int(seconds) < LATEST_S
     ):
-        raise ValueError(f'stamp {quoted(word)}: expected seconds from 0 to {_LATEST_S}')
-    return int(seconds) * _SECOND_NS + int(f'{fraction:0<9.9}')
+        raise ValueError(f'stamp {quoted(word)}: expected seconds from 0 to {LATEST_S}')
+    return int(seconds) * SECOND_NS + int(f'{fraction:0<9.9}')
 
 
 def _pose(words: list[str]) -> Array:

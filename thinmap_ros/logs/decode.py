@@ -9,14 +9,13 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
-
-_SECOND_NS = 1_000_000_000
 
 
 def stamp_ns(message: Any) -> int:
     """Stamp of a message's header, ns."""
-    return int(message.header.stamp.sec) * _SECOND_NS + int(message.header.stamp.nanosec)
+    return int(message.header.stamp.sec) * SECOND_NS + int(message.header.stamp.nanosec)
 
 
 def yaw(q: Any) -> float:

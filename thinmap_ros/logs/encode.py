@@ -7,9 +7,8 @@ import numpy as np
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.topology.graph import Edge, Node, TopologicalMap
-
-_SECOND_NS = 1_000_000_000
 
 
 class BagObjects:
@@ -24,7 +23,7 @@ class BagObjects:
     def header(self, frame_id: str, ns: int) -> Any:
         """std_msgs/Header."""
         stamp = self._make(
-            'builtin_interfaces/msg/Time', sec=ns // _SECOND_NS, nanosec=ns % _SECOND_NS
+            'builtin_interfaces/msg/Time', sec=ns // SECOND_NS, nanosec=ns % SECOND_NS
         )
         return self._make('std_msgs/msg/Header', stamp=stamp, frame_id=frame_id)
 

@@ -22,10 +22,11 @@ from mcap.records import Channel, ChunkIndex, Message, Schema
 from numpy.typing import NDArray
 
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.files.limits import LOGS, PIECE_BYTES
 from thinmap_ros.logs.mcap_records import (
+    FIRST_PRIVATE_OPCODE,
     HEAD,
     MAGIC,
-    MAX_CHUNK_BYTES,
     DamagedError,
     Definition,
     Records,
@@ -34,15 +35,9 @@ from thinmap_ros.logs.mcap_records import (
     records_of,
 )
 
-MAX_DEFINITIONS_BYTES = 64 * 2**20
-"""Maximum bytes of all schemas and channels of a file."""
-_MAX_SUMMARY_BYTES = 64 * 2**20
-_MAX_BUFFERED_BYTES = 512 * 2**20
-_STRETCH = 2**20
 _FOOTER = struct.Struct('<QQI')
 _PLAIN = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 _LAST_OPCODE = Opcode.DATA_END
-_PRIVATE = 0x80
 
 
 @dataclass
@@ -83,10 +78,9 @@ class Definitions:
         builder = RecordBuilder()
         record.write(builder)
         self._bytes += builder.count
-        if self._bytes > MAX_DEFINITIONS_BYTES:
-            raise InputError(
-                f'{self.path}: schemas and channels: expected at most {MAX_DEFINITIONS_BYTES} bytes'
-            )
+        if self._bytes > LOGS.definitions_bytes:
+            expected = f'expected at most {LOGS.definitions_bytes} bytes'
+            raise InputError(f'{self.path}: schemas and channels: {expected}')
 
     def of(self, channel_id: int) -> tuple[Schema, Channel] | None:
         """Channel and its schema; None if one of them is unknown."""
@@ -200,7 +194,7 @@ class _LogOrder:
         """Messages before a log time, or all remaining ones."""
         while self._heap:
             if not (
-                log_ns is None or self._heap[0][0] < log_ns or self._held > _MAX_BUFFERED_BYTES
+                log_ns is None or self._heap[0][0] < log_ns or self._held > LOGS.buffered_bytes
             ):
                 return
             _, number, place = self._heap[0]
@@ -263,8 +257,8 @@ def _chunk_spans(
         head = stream.read(HEAD.size) if at + HEAD.size <= size else b''
         code, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
         end = at + HEAD.size + length
-        plain = code in _PLAIN and end <= size and length <= MAX_CHUNK_BYTES
-        if stretch < at and (not plain or end - stretch > _STRETCH):
+        plain = code in _PLAIN and end <= size and length <= LOGS.chunk_bytes
+        if stretch < at and (not plain or end - stretch > PIECE_BYTES):
             yield ChunkSpan(stretch, at, is_chunk=False)
             stretch = at
         if (code, length) in ((Opcode.DATA_END, 4), (Opcode.FOOTER, _FOOTER.size)):
@@ -275,9 +269,9 @@ def _chunk_spans(
             return
         if code == Opcode.CHUNK:
             yield ChunkSpan(at, min(end, size), is_chunk=True, whole=end <= size)
-        if end <= size and (0 < code <= _LAST_OPCODE or code >= _PRIVATE):
+        if end <= size and (0 < code <= _LAST_OPCODE or code >= FIRST_PRIVATE_OPCODE):
             if code in _PLAIN and not plain:
-                damage.parts[at] = f'record of {length} bytes: expected at most {MAX_CHUNK_BYTES}'
+                damage.parts[at] = f'record of {length} bytes: expected at most {LOGS.chunk_bytes}'
             at = end
             stretch = stretch if plain else at
             continue
@@ -296,8 +290,8 @@ def _load(stream: BinaryIO, block: ChunkSpan) -> Records:
     if not block.is_chunk:
         return records_of(stream.read(block.end - block.start))
     length = block.end - block.start - HEAD.size
-    if length > MAX_CHUNK_BYTES:
-        raise DamagedError(f'chunk of {length} bytes: expected at most {MAX_CHUNK_BYTES}')
+    if length > LOGS.chunk_bytes:
+        raise DamagedError(f'chunk of {length} bytes: expected at most {LOGS.chunk_bytes}')
     head = stream.read(HEAD.size)
     if block.whole and head != HEAD.pack(Opcode.CHUNK, length):
         raise DamagedError(f'no chunk of {length} bytes')
@@ -314,7 +308,7 @@ def summary_of(path: Path) -> Summary:
         if footer_at < 0 or footer[: HEAD.size] != HEAD.pack(Opcode.FOOTER, _FOOTER.size):
             return Summary([], [])
         start, _, checksum = _FOOTER.unpack_from(footer, HEAD.size)
-        if not len(MAGIC) <= start <= footer_at or footer_at - start > _MAX_SUMMARY_BYTES:
+        if not len(MAGIC) <= start <= footer_at or footer_at - start > LOGS.summary_bytes:
             return Summary([], [])
         stream.seek(start)
         content = stream.read(footer_at - start)

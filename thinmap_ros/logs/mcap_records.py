@@ -20,19 +20,16 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Message, Schema
 from numpy.typing import NDArray
 
+from thinmap_ros.core.stamps import LATEST_NS
+from thinmap_ros.files.limits import LOGS, PIECE_BYTES
+
 MAGIC = b'\x89MCAP0\r\n'
-MAX_CHUNK_BYTES = 256 * 2**20
-"""Maximum bytes of a chunk (uncompressed) and of a message. Recorders use chunks of 1 to 4 MB."""
-LATEST_NS = 2**31 * 1_000_000_000
-"""Upper limit of log times, in 2038, as of the seconds in ROS messages."""
+FIRST_PRIVATE_OPCODE = 0x80
 
 HEAD = struct.Struct('<BQ')
 _CHUNK = struct.Struct('<QQQI')
 _MESSAGE = struct.Struct('<HIQQ')
 _IN_CHUNK = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
-_PRIVATE = 0x80
-_MAX_DEFINITIONS = 2**16
-_PIECE = 2**20
 _SLICE = 2**16
 
 Definition = Schema | Channel
@@ -78,7 +75,7 @@ class Records:
 def chunk_records(content: bytes, whole: bool) -> Records:
     """Records in the content of a chunk; if it is truncated (not `whole`), those before the end.
 
-    Raises DamagedError if it is corrupt or larger than MAX_CHUNK_BYTES.
+    Raises DamagedError if it is corrupt or larger than LOGS.chunk_bytes.
     """
     try:
         _, _, size, checksum = _CHUNK.unpack_from(content)
@@ -104,10 +101,10 @@ def decompress(compression: str, data: bytes, size: int, whole: bool = True) -> 
     """Uncompressed bytes; of truncated data (not `whole`), those before the end.
 
     size: declared bytes; no more is ever decompressed. Raises DamagedError if it exceeds
-    MAX_CHUNK_BYTES, or the data expand to more than declared.
+    LOGS.chunk_bytes, or the data expand to more than declared.
     """
-    if size > MAX_CHUNK_BYTES:
-        raise DamagedError(f'{size} bytes uncompressed: expected at most {MAX_CHUNK_BYTES}')
+    if size > LOGS.chunk_bytes:
+        raise DamagedError(f'{size} bytes uncompressed: expected at most {LOGS.chunk_bytes}')
     if compression == '':
         return data
     if compression not in ('lz4', 'zstd'):
@@ -127,17 +124,17 @@ def decompress(compression: str, data: bytes, size: int, whole: bool = True) -> 
 
 def _zstd_pieces(data: bytes) -> Iterator[bytes]:
     reader = zstandard.ZstdDecompressor().stream_reader(BytesIO(data), read_across_frames=True)
-    while piece := reader.read(_PIECE):
+    while piece := reader.read(PIECE_BYTES):
         yield piece
 
 
 def _lz4_pieces(data: bytes) -> Iterator[bytes]:
     unpacker: Any = lz4.frame.LZ4FrameDecompressor()
     for at in range(0, len(data), _SLICE):
-        piece = unpacker.decompress(data[at : at + _SLICE], max_length=_PIECE)
+        piece = unpacker.decompress(data[at : at + _SLICE], max_length=PIECE_BYTES)
         yield piece
         while not unpacker.needs_input and not unpacker.eof:
-            yield unpacker.decompress(b'', max_length=_PIECE)
+            yield unpacker.decompress(b'', max_length=PIECE_BYTES)
         if unpacker.eof:
             return
 
@@ -155,7 +152,7 @@ def records_of(data: bytes, whole: bool = True) -> Records:
     while at + HEAD.size <= len(data):
         code, length = HEAD.unpack_from(data, at)
         start = at + HEAD.size
-        is_record = code in _IN_CHUNK or code >= _PRIVATE
+        is_record = code in _IN_CHUNK or code >= FIRST_PRIVATE_OPCODE
         if not is_record or start + length > len(data):
             break
         found.add(code, data, start, length)
@@ -191,8 +188,8 @@ class _Found:
                 self.definitions.append(definition(code, data[start : start + length]))
         except DamagedError as error:
             self.damaged = self.damaged or str(error)
-        if len(self.definitions) > _MAX_DEFINITIONS:
-            raise DamagedError(f'more than {_MAX_DEFINITIONS} schemas and channels')
+        if len(self.definitions) > LOGS.definitions:
+            raise DamagedError(f'more than {LOGS.definitions} schemas and channels')
 
     def drop_last(self, reason: str) -> None:
         """Omit the last message."""

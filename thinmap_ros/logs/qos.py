@@ -14,12 +14,12 @@ from rosbags.interfaces import (
 from rosbags.rosbag2.metadata import parse_qos
 
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.files.limits import LOGS
 from thinmap_ros.files.yaml import parse_yaml
 
 KEY = 'offered_qos_profiles'
 """Key of a channel's metadata in an MCAP file; its value is YAML."""
 _FOREVER = QosTime(2147483647, 4294967295)
-_DEEPEST_QUEUE = 100_000
 
 
 def of_channel(channel: Channel) -> list[Qos]:
@@ -31,7 +31,7 @@ def of_channel(channel: Channel) -> list[Qos]:
         depths = [offer.depth for offer in offers]
     except (InputError, KeyError, TypeError, ValueError, AttributeError):
         return []
-    good = all(isinstance(depth, int) and 0 <= depth < _DEEPEST_QUEUE for depth in depths)
+    good = all(isinstance(depth, int) and 0 <= depth < LOGS.queue_depth for depth in depths)
     return offers if good else []
 
 

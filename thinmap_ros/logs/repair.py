@@ -11,9 +11,10 @@ from rosbags.rosbag2.metadata import dump_qos_v9
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.files.atomic import write_text
+from thinmap_ros.files.limits import LOGS
 from thinmap_ros.logs import qos
 from thinmap_ros.logs.mcap_reader import Damage, Definitions, intact_records
-from thinmap_ros.logs.mcap_records import MAX_CHUNK_BYTES, DamagedError, decompress
+from thinmap_ros.logs.mcap_records import DamagedError, decompress
 from thinmap_ros.logs.storage import own_typestore
 
 
@@ -92,7 +93,7 @@ class _Copy:
     def _uncompressed(self, message: Message) -> Message:
         if not self.compressed_messages:
             return message
-        return replace(message, data=decompress('zstd', message.data, MAX_CHUNK_BYTES))
+        return replace(message, data=decompress('zstd', message.data, LOGS.chunk_bytes))
 
     def _write(self, schema: Schema, channel: Channel, message: Message) -> None:
         if schema.name not in self._schema_ids:

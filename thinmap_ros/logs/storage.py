@@ -16,11 +16,10 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.files.limits import LOGS
 from thinmap_ros.logs import qos
 from thinmap_ros.logs.mcap_reader import Damage, McapFile
 
-MAX_SCHEMA_BYTES = 2**20
-"""Maximum bytes of the definition of a message type, including its parts."""
 _IDL_SEPARATOR = '=' * 80 + '\n'
 
 
@@ -153,8 +152,8 @@ def typestore_of(schema: Schema) -> Typestore:
 
 def own_typestore(schema: Schema) -> Typestore:
     """Types of one schema. Raises errors of rosbags' parser, and ValueError if too large."""
-    if len(schema.data) > MAX_SCHEMA_BYTES:
-        raise ValueError(f'definition of {len(schema.data)} bytes: expected {MAX_SCHEMA_BYTES}')
+    if len(schema.data) > LOGS.schema_bytes:
+        raise ValueError(f'definition of {len(schema.data)} bytes: expected {LOGS.schema_bytes}')
     return _parsed(schema.name, schema.encoding, schema.data.decode())
 
 

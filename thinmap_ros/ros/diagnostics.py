@@ -15,9 +15,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 _PERIOD_S = 1.0
-_LOG_PERIOD_S = 10.0
 _RECENT_S = 10.0  # older rejections and drops are not reported as reasons
-_STEPS = 200
 _TOPICS_OF_EVERY_NODE = ('/parameter_events', '/rosout', '/diagnostics', '/clock')
 # Reasons counted apart on a topic: a broken sensor must not fill the memory.
 _REASONS = 8
@@ -142,12 +140,13 @@ class MessageStatistics:
 class StepTimes:
     """Durations of the last steps of each kind, ms."""
 
-    def __init__(self) -> None:
+    def __init__(self, count: int = 200) -> None:
+        self._count = count
         self._times_ms: dict[str, deque[float]] = {}
 
     def add(self, step: str, milliseconds: float) -> None:
         """Add the duration of a step, ms."""
-        self._times_ms.setdefault(step, deque(maxlen=_STEPS)).append(milliseconds)
+        self._times_ms.setdefault(step, deque(maxlen=self._count)).append(milliseconds)
 
     def values(self) -> dict[str, str]:
         """Median, 95th percentile and maximum."""
@@ -166,13 +165,14 @@ class _Check:
     level: bytes
     condition: Callable[[], str]
     fault: str = ''
-    logged_s: float = -_LOG_PERIOD_S
+    log_period_s: float = 10.0
+    logged_s: float = -math.inf
 
     def fails(self, node: Node) -> bool:
         self.fault = self.condition()
         if not self.fault:
-            self.logged_s = -_LOG_PERIOD_S  # a fault that returns is logged at once
-        elif monotonic() - self.logged_s > _LOG_PERIOD_S:
+            self.logged_s = -math.inf  # a fault that returns is logged at once
+        elif monotonic() - self.logged_s > self.log_period_s:
             self.logged_s = monotonic()
             node.get_logger().warning(self.fault)
         return bool(self.fault)

@@ -32,9 +32,9 @@ from thinmap_ros.core.grid.frame import MAX_RESOLUTION_M, MIN_RESOLUTION_M, Grid
 from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.core.topology.graph import Edge, Node, NodeKind, TopologicalMap
 
-SECOND_NS = 1_000_000_000
 # A bag or a publisher cannot name anything else to import.
 _TYPE_NAME = re.compile(r'([a-z]\w*)/msg/([A-Z]\w*)', re.ASCII)
 

@@ -9,10 +9,9 @@ from pathlib import Path
 from rclpy.node import Node
 
 from thinmap_ros.core.errors import InputError, quoted
+from thinmap_ros.files.limits import FILES
 from thinmap_ros.files.sessions import ENDINGS, stem_of
 from thinmap_ros.ros import parameters
-
-_MAX_PATH_LENGTH = 1000
 
 
 class SaveDirectory:
@@ -32,7 +31,7 @@ class SaveDirectory:
         Raises InputError where it, or a file of the session, is outside of this directory.
         """
         expected = f'expected a file below {self.path}'
-        if not given.isprintable() or len(given) > _MAX_PATH_LENGTH:
+        if not given.isprintable() or len(given) > FILES.path_length:
             raise InputError(f'path {quoted(given)}: {expected}')
         stem_of(given)  # raises for a path that names no session
         try:

@@ -12,6 +12,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import LaserScan
 
 from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 
 WARN_PERIOD_S = 5.0  # between two warnings of the same kind
@@ -141,4 +142,4 @@ class MessageLossCounter:
 
 def _stamp_ns(message: Any) -> int:
     """Stamp of a message, unchecked."""
-    return int(1_000_000_000 * message.header.stamp.sec + message.header.stamp.nanosec)
+    return int(SECOND_NS * message.header.stamp.sec + message.header.stamp.nanosec)

@@ -5,6 +5,7 @@ Any number of them can be generated: development and evaluation use different se
 
 import math
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +15,9 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.sim.floor_plan import (
-    WALL_M,
     FloorPart,
     FloorPlan,
+    FloorPlanConfig,
     Kind,
     Opening,
     generate_floor_plan,
@@ -25,23 +26,37 @@ from thinmap_ros.sim.moving_obstacles import Doors, MovingObstacles, Pedestrians
 from thinmap_ros.sim.world import World
 
 DEVELOPMENT_SEEDS = range(1000)  # others are for evaluation
-MAX_AREA_M2 = 100_000.0
-_MIN_AREA_M2 = 150.0
-_FINE_M = 0.05
-_COARSE_M = 0.1
-_COARSE_FROM_M2 = 20_000.0
-_MARGIN_M = 1.0
-_SOLID = 1
-_GLASS = 2
+_AREA_RANGE_M2 = (150.0, 100_000.0)
 _ROWS_AT_ONCE = 256
-_LINK_M = (1.8, 3.0)  # width of the passage between two wings
-_GAP_M = (2.0, 6.0)
 _TRIES = 40
-_START_CLEAR_M = 0.45
-_KEEP_FREE_M = 1.0  # minimum distance of furniture from a door
-_AJAR_RAD = (0.6, 1.9)
-_SHUT_SHARE = 0.5  # share of the time
-_PERIODS = 64  # of a door, before they repeat
+
+
+class _Cell(IntEnum):
+    """Contents of a cell of a building."""
+
+    FREE = 0
+    SOLID = 1
+    GLASS = 2
+
+
+@dataclass(frozen=True)
+class LayoutConfig:
+    """Sizes that all buildings share; pairs: smallest and largest.
+
+    A door with a leaf has another opening angle after each period, or is closed.
+    """
+
+    fine_cell_m: float = 0.05
+    coarse_cell_m: float = 0.1
+    coarse_from_m2: float = 20_000.0
+    margin_m: float = 1.0  # of solid cells around the wings
+    passage_width_m: tuple[float, float] = (1.8, 3.0)  # between two wings
+    wing_gap_m: tuple[float, float] = (2.0, 6.0)
+    start_clearance_m: float = 0.45
+    furniture_door_gap_m: float = 1.0
+    door_open_rad: tuple[float, float] = (0.6, 1.9)
+    door_closed_share: float = 0.5
+    door_periods: int = 64  # before they repeat
 
 
 @dataclass(frozen=True)
@@ -55,6 +70,7 @@ class BuildingConfig:
     wings: int | None = None
     people_per_1000_m2: float | None = None
     moving_doors: float | None = None
+    layout: LayoutConfig = LayoutConfig()
 
 
 @dataclass(frozen=True)
@@ -99,8 +115,8 @@ def generate_building(seed: int, config: BuildingConfig | None = None) -> Buildi
     frame, occupied = _rasterized(wings, links, chosen, rng)
     moving = _moving_obstacles(wings, chosen, rng)
     name = f'building_{seed}'
-    glass = occupied == _GLASS
-    start = _start(wings[0], frame, occupied, rng)
+    glass = occupied == _Cell.GLASS
+    start = _start(wings[0], frame, occupied, chosen.layout, rng)
     solid = (occupied != 0).astype(np.uint8)
     world = World(name, solid, frame, start, glass if glass.any() else None, moving)
     return Building(world, wings)
@@ -108,9 +124,10 @@ def generate_building(seed: int, config: BuildingConfig | None = None) -> Buildi
 
 def _random_config(asked: BuildingConfig, rng: np.random.Generator) -> BuildingConfig:
     """Draw all random properties; always all of them, so that each is independent of the others."""
+    least, most = _AREA_RANGE_M2
     area = math.exp(rng.uniform(math.log(300.0), math.log(12_000.0)))
     if rng.random() < 0.1:
-        area = math.exp(rng.uniform(math.log(12_000.0), math.log(MAX_AREA_M2)))
+        area = math.exp(rng.uniform(math.log(12_000.0), math.log(most)))
     drawn = {
         'area_m2': area,
         'hall_share': float(rng.choice([0.0, 0.2, 0.6])),
@@ -122,8 +139,8 @@ def _random_config(asked: BuildingConfig, rng: np.random.Generator) -> BuildingC
     }
     given = {name: value for name, value in vars(asked).items() if value is not None}
     chosen = BuildingConfig(**{**drawn, **given})
-    if not _MIN_AREA_M2 <= float(chosen.area_m2 or 0.0) <= MAX_AREA_M2:
-        expected = f'expected {_MIN_AREA_M2:g} to {MAX_AREA_M2:g} m2'
+    if not least <= float(chosen.area_m2 or 0.0) <= most:
+        expected = f'expected {least:g} to {most:g} m2'
         raise InputError(f'building: area_m2: {chosen.area_m2}: {expected}')
     return chosen
 
@@ -138,7 +155,7 @@ def _wings(config: BuildingConfig, rng: np.random.Generator) -> tuple[list[Wing]
     for _ in range(count - 1):
         plan = _plan((1.0 - share) * area / (count - 1), config, rng)
         for _ in range(_TRIES):
-            joined = _joined(wings[int(rng.integers(len(wings)))], plan, rng)
+            joined = _joined(wings[int(rng.integers(len(wings)))], plan, config.layout, rng)
             if joined is not None and not any(_overlap(joined[0], other) for other in wings):
                 wings.append(joined[0])
                 links.append(joined[1])
@@ -149,10 +166,12 @@ def _wings(config: BuildingConfig, rng: np.random.Generator) -> tuple[list[Wing]
 def _plan(area_m2: float, config: BuildingConfig, rng: np.random.Generator) -> FloorPlan:
     ratio = rng.uniform(1.0, 3.0)
     depth = math.sqrt(area_m2 / ratio)
-    return generate_floor_plan(ratio * depth, depth, config.hall_share or 0.0, rng)
+    return generate_floor_plan(ratio * depth, depth, FloorPlanConfig(config.hall_share or 0.0), rng)
 
 
-def _joined(wing: Wing, plan: FloorPlan, rng: np.random.Generator) -> tuple[Wing, _Link] | None:
+def _joined(
+    wing: Wing, plan: FloorPlan, layout: LayoutConfig, rng: np.random.Generator
+) -> tuple[Wing, _Link] | None:
     """A wing of a plan, at an angle behind an exit of another wing; None if it does not fit."""
     exits = _exits(wing.plan)
     entries = _exits(plan)
@@ -160,10 +179,10 @@ def _joined(wing: Wing, plan: FloorPlan, rng: np.random.Generator) -> tuple[Wing
         return None
     way_out = exits[int(rng.integers(len(exits)))]
     way_in = entries[int(rng.integers(len(entries)))]
-    width = rng.uniform(*_LINK_M)
+    width = rng.uniform(*layout.passage_width_m)
     oblique = float(rng.choice([0.0, *rng.uniform(-0.9, 0.9, 2)]))
     T_exit = se2.compose(wing.T_world_wing, way_out)
-    gap = rng.uniform(*_GAP_M) + 0.5 * width * abs(math.tan(oblique))
+    gap = rng.uniform(*layout.wing_gap_m) + 0.5 * width * abs(math.tan(oblique))
     # The entry faces the exit, rotated by the angle between the wings.
     T_entry = se2.compose(T_exit, se2.pose(gap, 0.0, math.pi + oblique))
     T_world_wing = se2.compose(T_entry, se2.invert(way_in))
@@ -217,12 +236,14 @@ def _rasterized(
     wings: list[Wing], links: list[_Link], config: BuildingConfig, rng: np.random.Generator
 ) -> tuple[GridFrame, NDArray[np.uint8]]:
     """Cells of the world: 0 free, else obstacle or glass."""
-    cell = _COARSE_M if (config.area_m2 or 0.0) >= _COARSE_FROM_M2 else _FINE_M
-    corners = np.concatenate([_corners(wing, _MARGIN_M) for wing in wings])
+    layout = config.layout
+    is_coarse = (config.area_m2 or 0.0) >= layout.coarse_from_m2
+    cell = layout.coarse_cell_m if is_coarse else layout.fine_cell_m
+    corners = np.concatenate([_corners(wing, layout.margin_m) for wing in wings])
     low = np.floor(corners.min(axis=0) / cell)
     cols, rows = (np.ceil(corners.max(axis=0) / cell) - low).astype(int)
     frame = GridFrame(float(low[0] * cell), float(low[1] * cell), cell)
-    occupied = np.full((int(rows), int(cols)), _SOLID, dtype=np.uint8)
+    occupied = np.full((int(rows), int(cols)), _Cell.SOLID, dtype=np.uint8)
     for wing in wings:
         _paste(occupied, frame, wing, _interior(wing.plan, cell, config, rng))
     for link in links:
@@ -235,17 +256,17 @@ def _interior(
 ) -> NDArray[np.uint8]:
     """Cells of a plan in its own frame."""
     shape = (math.ceil(plan.depth / cell), math.ceil(plan.width / cell))
-    cells = np.full(shape, _SOLID, dtype=np.uint8)
-    half = 0.5 * WALL_M
+    cells = np.full(shape, _Cell.SOLID, dtype=np.uint8)
+    half = 0.5 * plan.wall_m
     for wall in plan.walls:
         if rng.random() < (config.glass_share or 0.0):
-            _fill(cells, cell, _thick(wall, half), _GLASS)
+            _fill(cells, cell, _thick(wall, half), _Cell.GLASS)
     for part in plan.parts:
         inner = (part.x0 + half, part.y0 + half, part.x1 - half, part.y1 - half)
-        _fill(cells, cell, inner, 0)
+        _fill(cells, cell, inner, _Cell.FREE)
     for opening in (*plan.doors, *plan.passages):
-        _fill(cells, cell, _thick(opening, half + cell), 0)
-    _furnish(cells, cell, plan, config.clutter or 0.0, rng)
+        _fill(cells, cell, _thick(opening, half + cell), _Cell.FREE)
+    _furnish(cells, cell, plan, config, rng)
     return cells
 
 
@@ -258,7 +279,7 @@ def _thick(opening: Opening, half: float) -> tuple[float, float, float, float]:
 
 
 def _fill(
-    cells: NDArray[np.uint8], cell: float, box: tuple[float, float, float, float], value: int
+    cells: NDArray[np.uint8], cell: float, box: tuple[float, float, float, float], value: _Cell
 ) -> None:
     """Set the cells whose centres lie in a box (x0, y0, x1, y1), m."""
     col, row, end_col, end_row = (max(math.ceil(edge / cell - 0.5), 0) for edge in box)
@@ -269,20 +290,21 @@ def _furnish(
     cells: NDArray[np.uint8],
     cell: float,
     plan: FloorPlan,
-    clutter: float,
+    config: BuildingConfig,
     rng: np.random.Generator,
 ) -> None:
     """Add cupboards along walls, tables and chair legs, and pillars in halls."""
+    door_gap_m = config.layout.furniture_door_gap_m
     doors = np.array([(0.5 * (d.x0 + d.x1), 0.5 * (d.y0 + d.y1)) for d in plan.doors])
     for part in plan.parts:
         if part.kind is Kind.HALL and rng.random() < 0.5:
             _pillars(cells, cell, part, rng)
         density = {Kind.ROOM: 0.12, Kind.HALL: 0.02, Kind.CORRIDOR: 0.0}[part.kind]
-        count = rng.poisson(clutter * density * part.width * part.depth)
+        count = rng.poisson((config.clutter or 0.0) * density * part.width * part.depth)
         for _ in range(min(count, 60)):
             at = np.array([rng.uniform(part.x0, part.x1), rng.uniform(part.y0, part.y1)])
             size = rng.choice([0.06, 0.5, 0.9, 1.4]) * rng.uniform(0.7, 1.3, 2)
-            if len(doors) and np.hypot(*(doors - at).T).min() < _KEEP_FREE_M + size.max():
+            if len(doors) and np.hypot(*(doors - at).T).min() < door_gap_m + size.max():
                 continue
             turn = float(rng.choice([0.0, rng.uniform(0.0, math.pi)]))
             _box(cells, cell, at, size, turn, part)
@@ -315,7 +337,7 @@ def _box(
     v = np.abs(-s * beside[0] + c * beside[1])
     inside = (u <= 0.5 * size[0]) & (v <= 0.5 * size[1])
     view = cells[first[1] : last[1], first[0] : last[0]]
-    view[inside[: view.shape[0], : view.shape[1]]] = _SOLID
+    view[inside[: view.shape[0], : view.shape[1]]] = _Cell.SOLID
 
 
 def _paste(
@@ -355,11 +377,15 @@ def _carve(occupied: NDArray[np.uint8], frame: GridFrame, link: _Link) -> None:
 
 
 def _start(
-    wing: Wing, frame: GridFrame, occupied: NDArray[np.uint8], rng: np.random.Generator
+    wing: Wing,
+    frame: GridFrame,
+    occupied: NDArray[np.uint8],
+    layout: LayoutConfig,
+    rng: np.random.Generator,
 ) -> Array:
     """A pose (3,) in a corridor or hall of a wing, or in a room if there is neither."""
     parts = [part for part in wing.plan.parts if part.kind is not Kind.ROOM] or wing.plan.parts
-    reach = math.ceil(_START_CLEAR_M / frame.resolution)
+    reach = math.ceil(layout.start_clearance_m / frame.resolution)
     while True:
         part = parts[int(rng.integers(len(parts)))]
         at = se2.pose(rng.uniform(part.x0, part.x1), rng.uniform(part.y0, part.y1), 0.0)
@@ -374,7 +400,7 @@ def _moving_obstacles(
     wings: list[Wing], config: BuildingConfig, rng: np.random.Generator
 ) -> MovingObstacles | None:
     pedestrians = _pedestrians(wings, config, rng)
-    doors = _doors(wings, config.moving_doors or 0.0, rng)
+    doors = _doors(wings, config, rng)
     if not len(pedestrians.points) and not len(doors.hinges):
         return None
     return MovingObstacles(pedestrians, doors)
@@ -396,7 +422,7 @@ def _pedestrians(
     return Pedestrians(points, rng.uniform(0.5, 1.4, count), rng.exponential(8.0, (count, 4)))
 
 
-def _doors(wings: list[Wing], moving: float, rng: np.random.Generator) -> Doors:
+def _doors(wings: list[Wing], config: BuildingConfig, rng: np.random.Generator) -> Doors:
     """Door leaves for most doors; a share of them moves."""
     hinges = []
     ends = []
@@ -407,11 +433,13 @@ def _doors(wings: list[Wing], moving: float, rng: np.random.Generator) -> Doors:
         ends.append(se2.transform_points(wing.T_world_wing, at[:, 2:]))
     together = np.concatenate(hinges)
     count = len(together)
-    moves = rng.random(count) < moving
+    moves = rng.random(count) < (config.moving_doors or 0.0)
     side = rng.choice([-1.0, 1.0], count)
     period_s = np.where(moves, rng.uniform(20.0, 300.0, count), np.inf)
     # A separate generator, so that other random choices do not depend on it.
     chance = np.random.default_rng(int(rng.integers(2**31)))
-    open_rad = side[:, None] * chance.uniform(*_AJAR_RAD, (count, _PERIODS))
-    is_shut = moves[:, None] & (chance.random((count, _PERIODS)) < _SHUT_SHARE)
+    layout = config.layout
+    shape = (count, layout.door_periods)
+    open_rad = side[:, None] * chance.uniform(*layout.door_open_rad, shape)
+    is_shut = moves[:, None] & (chance.random(shape) < layout.door_closed_share)
     return Doors(together, np.concatenate(ends), period_s, open_rad, is_shut)

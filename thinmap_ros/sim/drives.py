@@ -19,12 +19,18 @@ from thinmap_ros.sim.simulation import STEP_NS, Simulation
 from thinmap_ros.sim.world import World
 
 MARGIN_M = 0.1  # minimum distance of planned paths from obstacles
-_ARRIVED_M = 0.3
 _SPACING_M = 0.05
-_PATIENCE = 5.0  # times the duration at full speed
-_MIN_TIMEOUT_S = 60.0
-_NEAREST_GOAL_M = 2.0
-_RANDOM_SPEED_M_S = 0.5
+
+
+@dataclass(frozen=True)
+class DriveConfig:
+    """Speed of a drive, and when a path has been driven or is aborted."""
+
+    speed_m_s: float = 0.5
+    goal_tolerance_m: float = 0.3
+    min_timeout_s: float = 60.0
+    timeout_factor: float = 5.0  # times the duration at full speed, added to that
+    min_goal_distance_m: float = 2.0  # of a random drive
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,21 +43,22 @@ class DriveSample:
 
 
 def drive(
-    simulation: Simulation, paths: Iterable[Array], speed_m_s: float
+    simulation: Simulation, paths: Iterable[Array], config: DriveConfig
 ) -> Iterator[DriveSample]:
     """Yield the samples of a drive along paths (K, 2), m, world frame, one after the other.
 
     A path that takes much too long is aborted.
     """
-    follower = PathFollower(PathFollowerConfig(max_speed_m_s=speed_m_s))
+    follower = PathFollower(PathFollowerConfig(max_speed_m_s=config.speed_m_s))
     moment = simulation.read_sensors()
     if moment.scan is not None:
         yield DriveSample(moment.scan, moment.T_odom_base, simulation.robot.T_world_base)
     for path in paths:
         length_m = float(np.hypot(*np.diff(path, axis=0).T).sum())
-        for _ in range(round(1e9 / STEP_NS * (_MIN_TIMEOUT_S + _PATIENCE * length_m / speed_m_s))):
+        duration_s = config.timeout_factor * length_m / config.speed_m_s
+        for _ in range(round(1e9 / STEP_NS * (config.min_timeout_s + duration_s))):
             T = simulation.robot.T_world_base
-            if np.hypot(*(path[-1] - T[:2])) < _ARRIVED_M:
+            if np.hypot(*(path[-1] - T[:2])) < config.goal_tolerance_m:
                 break
             moment = simulation.step(*follower.command(T, path, STEP_NS / 1e9))
             if moment.scan is not None:
@@ -122,25 +129,26 @@ def random_drive(
     within (H, W): cells of the world for these places; None: all.
     """
     simulation = Simulation(world, start, RobotConfig(), laser or LaserScannerConfig(), seed)
-    return drive(
-        simulation,
-        _random_paths(simulation, np.random.default_rng(seed), within),
-        _RANDOM_SPEED_M_S,
-    )
+    config = DriveConfig()
+    paths = _random_paths(simulation, np.random.default_rng(seed), within, config)
+    return drive(simulation, paths, config)
 
 
 def _random_paths(
-    simulation: Simulation, rng: np.random.Generator, within: NDArray[np.bool_] | None
+    simulation: Simulation,
+    rng: np.random.Generator,
+    within: NDArray[np.bool_] | None,
+    config: DriveConfig,
 ) -> Iterator[Array]:
     """Paths (K, 2) from the robot to random reachable places."""
     world = simulation.world
     patch = world_to_grid(world)
-    config = WavefrontConfig(robot_radius_m=RobotConfig().radius_m + MARGIN_M)
+    planner = WavefrontConfig(robot_radius_m=RobotConfig().radius_m + MARGIN_M)
     while True:
         T = simulation.robot.T_world_base
         goal = random_start(world, rng, within)
-        if np.hypot(*(goal[:2] - T[:2])) < _NEAREST_GOAL_M:
+        if np.hypot(*(goal[:2] - T[:2])) < config.min_goal_distance_m:
             continue
-        path = plan(patch, (float(T[0]), float(T[1])), (float(goal[0]), float(goal[1])), config)
+        path = plan(patch, (float(T[0]), float(T[1])), (float(goal[0]), float(goal[1])), planner)
         if path is not None:
             yield path

@@ -7,17 +7,27 @@ from itertools import pairwise
 
 import numpy as np
 
-WALL_M = 0.15
-_CORRIDOR_M = (1.6, 3.0)
-_ROOM_WIDTH_M = (2.6, 8.0)
-_ROW_M = 5.5  # a block that is no deeper has one row of rooms, and
-_MAX_ROW_M = 30.0  # where it is longer is cut across
-_SPINE_M = 18.0  # one that is no deeper has a corridor along its middle
-_HALL_M = (12.0, 45.0)  # shortest and longest side of what may become a hall
-_DOOR_M = (0.85, 1.05)
-_WIDE_DOOR_M = (1.6, 2.4)
-_JAMB_M = 0.25  # between an opening and the corner of a room
 _TOUCHING_M = 1e-6
+
+
+@dataclass(frozen=True)
+class FloorPlanConfig:
+    """Sizes of a floor plan, m; pairs: smallest and largest.
+
+    hall_share: probability that a block whose sides are within hall_side_m is a hall.
+    """
+
+    hall_share: float = 0.0
+    hall_side_m: tuple[float, float] = (12.0, 45.0)
+    wall_m: float = 0.15
+    corridor_width_m: tuple[float, float] = (1.6, 3.0)
+    room_width_m: tuple[float, float] = (2.6, 8.0)
+    row_depth_m: float = 5.5  # a block that is no deeper has one row of rooms, and
+    max_row_length_m: float = 30.0  # where it is longer is cut across
+    spine_depth_m: float = 18.0  # one that is no deeper has a corridor along its middle
+    door_width_m: tuple[float, float] = (0.85, 1.05)
+    wide_door_width_m: tuple[float, float] = (1.6, 2.4)
+    jamb_m: float = 0.25  # between an opening and the corner of a room
 
 
 class Kind(Enum):
@@ -68,7 +78,7 @@ class Opening:
 
 @dataclass(frozen=True)
 class FloorPlan:
-    """Parts that tile a rectangle of width x depth, m, from (0, 0) on.
+    """Parts that tile a rectangle of width x depth, m, from (0, 0) on; thickness of all walls.
 
     doors: openings of the width of a door; passages: openings between corridors and halls; walls:
     the remaining walls between two parts, which may have glass.
@@ -76,6 +86,7 @@ class FloorPlan:
 
     width: float
     depth: float
+    wall_m: float
     parts: list[FloorPart]
     doors: list[Opening]
     passages: list[Opening]
@@ -83,52 +94,58 @@ class FloorPlan:
 
 
 def generate_floor_plan(
-    width: float, depth: float, hall_share: float, rng: np.random.Generator
+    width: float, depth: float, config: FloorPlanConfig, rng: np.random.Generator
 ) -> FloorPlan:
-    """Plan of one wing.
-
-    hall_share: probability that a large enough block is a hall. All parts are connected.
-    """
-    parts = _split_block(FloorPart(Kind.ROOM, 0.0, 0.0, width, depth), hall_share, rng)
+    """Plan of one wing of width x depth, m; all parts are connected."""
+    parts = _split_block(FloorPart(Kind.ROOM, 0.0, 0.0, width, depth), config, rng)
     shared = _shared_walls(parts)
     passages = [wall for wall in shared if _is_open(parts[wall.a], parts[wall.b])]
     closed = [wall for wall in shared if not _is_open(parts[wall.a], parts[wall.b])]
+    shortest = config.door_width_m[1] + 2.0 * config.jamb_m
+    wide_enough = [wall for wall in closed if wall.length >= shortest]
     doors = [
-        _door(wall, parts, rng) for wall in _with_doors(parts, passages, _wide_enough(closed), rng)
+        _door(wall, parts, config, rng) for wall in _with_doors(parts, passages, wide_enough, rng)
     ]
-    inner = [_shortened(wall, 0.5 * WALL_M) for wall in passages if wall.length > 2.0 * WALL_M]
-    return FloorPlan(width, depth, parts, doors, inner, closed)
+    wall_m = config.wall_m
+    inner = [_shortened(wall, 0.5 * wall_m) for wall in passages if wall.length > 2.0 * wall_m]
+    return FloorPlan(width, depth, wall_m, parts, doors, inner, closed)
 
 
-def _split_block(block: FloorPart, hall_share: float, rng: np.random.Generator) -> list[FloorPart]:
+def _split_block(
+    block: FloorPart, config: FloorPlanConfig, rng: np.random.Generator
+) -> list[FloorPart]:
     """Cut a block into corridors and rows of rooms."""
     short, long = sorted((block.width, block.depth))
-    if short >= _HALL_M[0] and long <= _HALL_M[1] and rng.random() < hall_share:
+    least, most = config.hall_side_m
+    if short >= least and long <= most and rng.random() < config.hall_share:
         return [_with_kind(Kind.HALL, block)]
     along_x = block.width >= block.depth
-    if short <= _ROW_M and long <= _MAX_ROW_M:
-        return _rooms(block, along_x, rng)
+    if short <= config.row_depth_m and long <= config.max_row_length_m:
+        return _rooms(block, along_x, config, rng)
     # A corridor along a block that is as deep as two rows of rooms, else across it.
-    spine = short <= _SPINE_M
+    spine = short <= config.spine_depth_m
     across_x = along_x != spine
     length = block.width if across_x else block.depth
-    corridor = rng.uniform(*_CORRIDOR_M)
+    corridor = rng.uniform(*config.corridor_width_m)
     at = rng.uniform(0.35, 0.65) * (length - corridor)
     first, middle, last = _split(block, across_x, [at, at + corridor])
     if spine:
-        sides = [_rooms(side, along_x, rng) for side in (first, last)]
+        sides = [_rooms(side, along_x, config, rng) for side in (first, last)]
     else:
-        sides = [_split_block(side, hall_share, rng) for side in (first, last)]
+        sides = [_split_block(side, config, rng) for side in (first, last)]
     return [*sides[0], _with_kind(Kind.CORRIDOR, middle), *sides[1]]
 
 
-def _rooms(row: FloorPart, along_x: bool, rng: np.random.Generator) -> list[FloorPart]:
+def _rooms(
+    row: FloorPart, along_x: bool, config: FloorPlanConfig, rng: np.random.Generator
+) -> list[FloorPart]:
     """A row of rooms."""
+    widths = config.room_width_m
     length = row.width if along_x else row.depth
-    marks = [rng.uniform(*_ROOM_WIDTH_M)]
-    while marks[-1] < length - _ROOM_WIDTH_M[0]:
-        marks.append(marks[-1] + rng.uniform(*_ROOM_WIDTH_M))
-    return _split(row, along_x, [mark for mark in marks if mark < length - _ROOM_WIDTH_M[0]])
+    marks = [rng.uniform(*widths)]
+    while marks[-1] < length - widths[0]:
+        marks.append(marks[-1] + rng.uniform(*widths))
+    return _split(row, along_x, [mark for mark in marks if mark < length - widths[0]])
 
 
 def _split(part: FloorPart, along_x: bool, marks: list[float]) -> list[FloorPart]:
@@ -169,10 +186,6 @@ def _shared_walls(parts: list[FloorPart]) -> list[Opening]:
     return found
 
 
-def _wide_enough(walls: list[Opening]) -> list[Opening]:
-    return [wall for wall in walls if wall.length >= _DOOR_M[1] + 2.0 * _JAMB_M]
-
-
 def _with_doors(
     parts: list[FloorPart], passages: list[Opening], walls: list[Opening], rng: np.random.Generator
 ) -> list[Opening]:
@@ -205,12 +218,16 @@ def _leads_to_corridor(parts: list[FloorPart], wall: Opening) -> bool:
     return Kind.CORRIDOR in (parts[wall.a].kind, parts[wall.b].kind)
 
 
-def _door(wall: Opening, parts: list[FloorPart], rng: np.random.Generator) -> Opening:
+def _door(
+    wall: Opening, parts: list[FloorPart], config: FloorPlanConfig, rng: np.random.Generator
+) -> Opening:
     """A door at a random position in a wall; doors of halls may be wide."""
     is_hall = Kind.HALL in (parts[wall.a].kind, parts[wall.b].kind)
-    wide = is_hall and wall.length > _WIDE_DOOR_M[1] + 2.0 * _JAMB_M and rng.random() < 0.6
-    width = rng.uniform(*(_WIDE_DOOR_M if wide else _DOOR_M))
-    begin = rng.uniform(_JAMB_M, wall.length - _JAMB_M - width)
+    jamb = config.jamb_m
+    fits = wall.length > config.wide_door_width_m[1] + 2.0 * jamb
+    wide = is_hall and fits and rng.random() < 0.6
+    width = rng.uniform(*(config.wide_door_width_m if wide else config.door_width_m))
+    begin = rng.uniform(jamb, wall.length - jamb - width)
     return _stretch(wall, begin, begin + width)
 
 

@@ -14,8 +14,6 @@ from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.sim.world import World
 
-# Neighbouring beams on a wall at this angle of incidence are no depth edge.
-_FLATTEST_RAD = math.radians(10.0)
 _INTO_CELL = 1e-6
 
 
@@ -44,6 +42,7 @@ class LaserScannerConfig(Config):
     laser_x_m: float = parameter(
         0.0, 'Position of the laser ahead of the robot centre (m).', low=-2.0, high=2.0
     )
+    min_incidence_deg: float = 10.0  # beams side by side on a wall at this angle are no depth edge
 
 
 class LaserScanner:
@@ -100,7 +99,9 @@ class LaserScanner:
         points of left and right walls would be shifted to the same side.
         """
         edges = _edges(
-            ranges, self.config.mixed_pixel_edge_m, self._increment / math.sin(_FLATTEST_RAD)
+            ranges,
+            self.config.mixed_pixel_edge_m,
+            self._increment / math.sin(math.radians(self.config.min_incidence_deg)),
         )
         mixed = edges[self._rng.random(ranges.size - 1)[edges] < self.config.mixed_pixel_ratio]
         share = self._rng.random(mixed.size)

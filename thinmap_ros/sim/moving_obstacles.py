@@ -8,10 +8,6 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.se2 import Array
 
-_PERSON_M = 0.2  # radius
-_PERSONAL_SPACE_M = 0.7  # pedestrians avoid the robot
-_ROBOT_NEAR_M = 3.0  # doors are held open for it
-
 
 @dataclass(frozen=True, eq=False)
 class Pedestrians:
@@ -23,6 +19,8 @@ class Pedestrians:
     points: Array
     speeds: Array
     pauses: Array
+    radius_m: float = 0.2
+    personal_space_m: float = 0.7  # they avoid the robot
 
     @cached_property
     def _times(self) -> Array:
@@ -65,12 +63,13 @@ class Doors:
     period_s: Array
     open_rad: Array
     is_shut: NDArray[np.bool_]
+    held_open_m: float = 3.0  # for a robot that is nearer
 
     def segments(self, seconds: float, robot: Array, reach_m: float) -> Array:
         """Leaves (M, 4) near a robot (x, y): from the hinge to the present end, m."""
         away = np.hypot(*(self.hinges - robot).T)
         near = np.flatnonzero(away < reach_m)
-        angles = self._angles(near, seconds, away[near] < _ROBOT_NEAR_M)
+        angles = self._angles(near, seconds, away[near] < self.held_open_m)
         shut = self.ends[near] - self.hinges[near]
         c = np.cos(angles)
         s = np.sin(angles)
@@ -94,24 +93,25 @@ class MovingObstacles:
     def ranges(self, seconds: float, T_world_laser: Array, angles: Array, reach_m: float) -> Array:
         """Distance, m, at which beams (N,) at world angles hit one of them; inf: none."""
         laser = T_world_laser[:2]
-        places = self.pedestrians.places(seconds)
+        people = self.pedestrians
+        places = people.places(seconds)
         away = np.hypot(*(places - laser).T)
-        places = places[(away > _PERSONAL_SPACE_M) & (away < reach_m + _PERSON_M)]
+        places = places[(away > people.personal_space_m) & (away < reach_m + people.radius_m)]
         beams = np.column_stack([np.cos(angles), np.sin(angles)])
         nearest = np.full(len(angles), np.inf)
         for place in places:
-            np.minimum(nearest, _to_disc(place - laser, beams), out=nearest)
+            np.minimum(nearest, _to_disc(place - laser, people.radius_m, beams), out=nearest)
         for leaf in self.doors.segments(seconds, laser, reach_m + 3.0):
             np.minimum(nearest, _to_segment(leaf[:2] - laser, leaf[2:] - laser, beams), out=nearest)
         return nearest
 
 
-def _to_disc(centre: Array, beams: Array) -> Array:
-    """Distance along unit vectors (N, 2) to the disc of a pedestrian; inf if they miss it."""
+def _to_disc(centre: Array, radius_m: float, beams: Array) -> Array:
+    """Distance along unit vectors (N, 2) to a disc; inf if they miss it."""
     along = beams @ centre
     across = beams[:, 0] * centre[1] - beams[:, 1] * centre[0]
-    hits = (along > 0.0) & (np.abs(across) < _PERSON_M)
-    half = np.sqrt(np.maximum(_PERSON_M**2 - across**2, 0.0))
+    hits = (along > 0.0) & (np.abs(across) < radius_m)
+    half = np.sqrt(np.maximum(radius_m**2 - across**2, 0.0))
     return np.where(hits, along - half, np.inf)
 
 

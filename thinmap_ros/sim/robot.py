@@ -10,8 +10,6 @@ from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.sim.world import World
 
-_AWAY_M = 0.05
-
 
 @dataclass(frozen=True)
 class RobotConfig(Config):
@@ -44,6 +42,7 @@ class RobotConfig(Config):
     turn_noise_driving: float = parameter(
         0.01, 'noise of turns per square root of metres (1 sigma), rad', low=0.0
     )
+    contact_margin_m: float = 0.05  # a contact ends where the body is so far from the wall
 
 
 # The 3-AT is larger and skid-steered: its wheels slip whenever it turns.
@@ -132,7 +131,9 @@ class DifferentialDriveRobot:
         # A robot that keeps pushing approaches the wall again: still the same contact.
         self.touching = not clear or (
             self.touching
-            and not self.world.is_clear(moved[0], moved[1], self.config.radius_m + _AWAY_M)
+            and not self.world.is_clear(
+                moved[0], moved[1], self.config.radius_m + self.config.contact_margin_m
+            )
         )
         self.T_odom_base = self._odometry.add_step(self.v * dt_s, self.w * dt_s)
 

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from thinmap_ros.core.config import Config
+from thinmap_ros.core.config import Config, is_parameter
 from thinmap_ros.core.errors import ThinmapError
 from thinmap_ros.kernels.progress import report_compilation
 from thinmap_ros.logs import log
@@ -50,8 +50,8 @@ def add_config(parser: Options, config: type[Config], names: list[str] | None = 
 
     Options that are not given are not among the arguments: `config_from` uses the defaults.
     """
-    for field in fields(config):
-        if (names is None or field.name in names) and isinstance(field.default, int | float | str):
+    for field in filter(is_parameter, fields(config)):
+        if names is None or field.name in names:
             option = '--' + field.name.replace('_', '-')
             help_text = f'{field.metadata["description"]} (default {field.default})'
             kind = type(field.default)

@@ -16,6 +16,7 @@ from thinmap_ros.core.grid.patch import GridPatch
 from thinmap_ros.core.odometry import OdometryAnchor
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.slam.localizer import Localizer, LocalizerConfig
+from thinmap_ros.sim.drives import DriveConfig
 from thinmap_ros.sim.drives import drive as drive_along
 from thinmap_ros.sim.laser import LaserScannerConfig
 from thinmap_ros.sim.robot import RobotConfig
@@ -394,7 +395,7 @@ def test_a_hall_that_is_wider_than_the_laser_sees_is_mapped_all_the_same(seed):
     lost = 0
     off = []
     turned = []
-    for look in drive_along(simulation, [across, round_it, back], 0.5):
+    for look in drive_along(simulation, [across, round_it, back], DriveConfig(0.5)):
         estimate = localizer.step(look.scan, look.T_odom_base)
         sees = np.count_nonzero(look.scan.hit) > 30
         blind += not sees

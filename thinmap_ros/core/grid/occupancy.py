@@ -30,9 +30,6 @@ _TILE_BITS = TILE.bit_length() - 1
 # range that the others predict, m.
 _FLAT_M = 0.06
 _MAX_SURFACE_GAP_M = 3.0
-# A beam that passes through this length of occupied cells grazes the face of a wall, m.
-_GRAZED_M = 0.4
-_SURELY_OCCUPIED = 0.9
 FIELDS = {
     'frame': Field(
         np.float64,
@@ -102,6 +99,9 @@ class OccupancyConfig(Config):
         low=0.0,
         high=0.5,
     )
+    # A beam that passes through this length of occupied cells grazes the face of a wall.
+    grazed_length_m: float = 0.4
+    p_surely_occupied: float = 0.9
 
 
 def log_odds(probability: float) -> float:
@@ -154,7 +154,7 @@ class OccupancyGrid:
         self._beam_geometry: tuple[int, float, float] = (0, 0.0, 0.0)
         self._cosines = self._sines = np.empty(0)
         self._steps = _steps(self.config)
-        self._grazed = max(3, round(_GRAZED_M / self.frame.resolution))
+        self._grazed = max(3, round(self.config.grazed_length_m / self.frame.resolution))
 
     @staticmethod
     def from_patch(patch: GridPatch, config: OccupancyConfig | None = None) -> 'OccupancyGrid':
@@ -327,7 +327,7 @@ def _steps(config: OccupancyConfig) -> NDArray[np.int16]:
         round(_SCALE * log_odds(p))
         for p in (config.p_miss, config.p_hit, config.p_min, config.p_max)
     )
-    sure = min(round(_SCALE * log_odds(_SURELY_OCCUPIED)), high)
+    sure = min(round(_SCALE * log_odds(config.p_surely_occupied)), high)
     return np.array([free, hit, low, high, sure], dtype=np.int16)
 
 

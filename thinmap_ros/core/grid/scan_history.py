@@ -3,6 +3,7 @@
 import math
 from array import array
 from collections import deque
+from dataclasses import dataclass
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -11,13 +12,19 @@ from numpy.typing import NDArray
 from thinmap_ros.core import se2
 from thinmap_ros.core.se2 import Array
 
-_APART_M = 0.25
-_APART_RAD = 0.25
-_PLACE_M = 1.0  # edge of a place
-_DIRECTIONS = 8  # robot headings that are distinguished at each place
-_PER_PLACE = 4  # scans kept of each place and direction: about one visit
 _MAX_PLACE = 1 << 26  # more places than lie within MAX_COORDINATE_M
 Kept = TypeVar('Kept')
+
+
+@dataclass(frozen=True)
+class HistoryConfig:
+    """Which scans are stored: those some distance or angle apart, the newest of each place."""
+
+    apart_m: float = 0.25
+    apart_rad: float = 0.25
+    place_m: float = 1.0  # edge of a place
+    directions: int = 8  # robot headings that are distinguished at each place
+    scans_per_place: int = 4  # and direction: about one visit
 
 
 class CorrectedPoses(NamedTuple):
@@ -36,7 +43,8 @@ class PoseHistory(Generic[Kept]):
     which the scans were added: stamps of real robots step back now and then.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, config: HistoryConfig | None = None) -> None:
+        self._config = config or HistoryConfig()
         self._stamps = array('q')
         self._poses = array('d')
         self._last_apart = -1
@@ -53,13 +61,16 @@ class PoseHistory(Generic[Kept]):
         if self._last_apart >= 0:
             last = np.array(self._poses[3 * self._last_apart : 3 * self._last_apart + 3])
             moved = se2.between(last, T_map_base)
-            if math.hypot(moved[0], moved[1]) < _APART_M and abs(float(moved[2])) < _APART_RAD:
+            is_near = math.hypot(moved[0], moved[1]) < self._config.apart_m
+            if is_near and abs(float(moved[2])) < self._config.apart_rad:
                 return
         self._last_apart = number
         self._kept[number] = kept
-        at_place = self._at_place.setdefault(int(_places_of(T_map_base[None])[0]), deque())
+        at_place = self._at_place.setdefault(
+            int(_places_of(T_map_base[None], self._config)[0]), deque()
+        )
         at_place.append(number)
-        while len(at_place) > _PER_PLACE:
+        while len(at_place) > self._config.scans_per_place:
             del self._kept[at_place.popleft()]
 
     def kept(self) -> list[Kept]:
@@ -91,7 +102,7 @@ class PoseHistory(Generic[Kept]):
         # Places that have too many scans now lose the oldest ones when more arrive.
         kept = self._kept_numbers()
         self._at_place = {}
-        places = _places_of(self._all_poses()[kept])
+        places = _places_of(self._all_poses()[kept], self._config)
         for number, place in zip(kept.tolist(), places.tolist(), strict=True):
             self._at_place.setdefault(place, deque()).append(number)
 
@@ -119,11 +130,11 @@ class PoseHistory(Generic[Kept]):
         return np.array(self._poses).reshape(-1, 3)
 
 
-def _places_of(poses: Array) -> NDArray[np.int64]:
+def _places_of(poses: Array, config: HistoryConfig) -> NDArray[np.int64]:
     """Number (N,) of the place and direction of each pose (N, 3)."""
-    turn = np.floor(poses[:, 2] % (2.0 * math.pi) / (2.0 * math.pi) * _DIRECTIONS)
-    x, y = np.floor(poses[:, :2] / _PLACE_M).astype(np.int64).T
-    places: NDArray[np.int64] = (x * _MAX_PLACE + y) * _DIRECTIONS + turn.astype(np.int64)
+    turn = np.floor(poses[:, 2] % (2.0 * math.pi) / (2.0 * math.pi) * config.directions)
+    x, y = np.floor(poses[:, :2] / config.place_m).astype(np.int64).T
+    places: NDArray[np.int64] = (x * _MAX_PLACE + y) * config.directions + turn.astype(np.int64)
     return places
 
 

@@ -19,10 +19,6 @@ from thinmap_ros.core.se2 import Array
 
 # Width of the smallest relevant obstacle: a leg. Sectors are sampled at this spacing.
 MIN_OBSTACLE_WIDTH_M = 0.1
-_REMEMBERED_SCANS = 32
-# Minimum motion between two stored scans
-_APART_M = 0.05
-_APART_RAD = 0.1
 
 
 class _Observation(NamedTuple):
@@ -37,9 +33,12 @@ class _Observation(NamedTuple):
 class BlindSectors:
     """Sectors of invalid beams in the newest scan, less the space that recent scans observed."""
 
-    def __init__(self) -> None:
+    def __init__(self, scans: int = 32, apart_m: float = 0.05, apart_rad: float = 0.1) -> None:
+        """Remember so many scans, made at least some distance or angle apart."""
+        self._apart_m = apart_m
+        self._apart_rad = apart_rad
         self._newest: _Observation | None = None
-        self._earlier: deque[_Observation] = deque(maxlen=_REMEMBERED_SCANS)
+        self._earlier: deque[_Observation] = deque(maxlen=scans)
 
     def add_scan(self, T_map_laser: Array, scan: Scan) -> None:
         """Add a scan made by a laser at a pose (3,), map frame."""
@@ -54,7 +53,8 @@ class BlindSectors:
         if not self._earlier:
             return True
         moved = se2.between(self._earlier[-1].T_map_laser, T_map_laser)
-        return math.hypot(moved[0], moved[1]) > _APART_M or abs(float(moved[2])) > _APART_RAD
+        has_moved = math.hypot(moved[0], moved[1]) > self._apart_m
+        return has_moved or abs(float(moved[2])) > self._apart_rad
 
     def points(self, reach_m: float, remembered_m: float) -> Array:
         """Points (K, 2), map frame, in unobserved space up to reach_m from the laser.

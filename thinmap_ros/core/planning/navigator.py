@@ -25,21 +25,9 @@ from thinmap_ros.core.se2 import Array
 # Of the nodes that drive the robot: a stop within half a second after the last scan or odometry.
 CONTROL_PERIOD_S = 0.1
 SENSOR_TIMEOUT_NS = 400_000_000
-_CHECK_AHEAD_M = 4.0
-_NARROW_AHEAD_M = 0.6
-_CREEP_M_S = 0.02
 _ROUNDING_M_S = 1e-9
-# In a passage hardly wider than the robot, obstacles may come closer than body_radius_m by this
-# distance, at most at this speed.
-_NARROW_MARGIN_M = 0.01
-_NARROW_M_S = 0.1
-_AIM_RAD = 0.1
 _OBSTACLE = 'an obstacle blocks the path'
 _HIDDEN = 'the laser does not see the path: sector of invalid beams'
-_POINTS_M = 2.5  # scan points within this distance are obstacles, beside those of the map
-# A goal is aborted after _STANDSTILLS standstills without this much progress, m.
-_PROGRESS_M = 0.5
-_STANDSTILLS = 5
 
 
 @dataclass(frozen=True)
@@ -84,6 +72,18 @@ class NavigatorConfig(Config):
         low=0.1,
         high=1000.0,
     )
+    check_ahead_m: float = 4.0  # of the path, for obstacles in a new map
+    scan_obstacle_range_m: float = 2.5  # nearer scan points are obstacles, beside those of the map
+    clearance_ahead_m: float = 0.6  # of the path, whose narrowest place limits the speed
+    creep_speed_m_s: float = 0.02  # the robot stops rather than drive slower
+    # In a passage hardly wider than the robot, obstacles may come closer than stop_radius_m by this
+    # distance, at most at this speed.
+    narrow_margin_m: float = 0.01
+    narrow_speed_m_s: float = 0.1
+    aim_tolerance_rad: float = 0.1  # heading error at which a blocked robot faces its path
+    # A goal is aborted after too many standstills without this much progress.
+    progress_m: float = 0.5
+    max_standstills: int = 5
 
 
 @dataclass(frozen=True)
@@ -202,7 +202,9 @@ class Navigator:
         """Whether an obstacle is closer to the next metres of the path than the robot radius."""
         assert self.path is not None
         frame = patch.frame
-        ahead = self.path[first : first + max(1, int(2.0 * _CHECK_AHEAD_M / frame.resolution))]
+        ahead = self.path[
+            first : first + max(1, int(2.0 * self.config.check_ahead_m / frame.resolution))
+        ]
         at = (frame.origin_x, frame.origin_y, frame.resolution)
         radius = self.config.planner.robot_radius_m / frame.resolution - 1e-6
         return _collides(patch.cells, at, ahead, radius)
@@ -214,7 +216,7 @@ class Navigator:
         """
         assert self._goal is not None
         points = (
-            self._obstacles.query_radius(T_map_base, _POINTS_M)
+            self._obstacles.query_radius(T_map_base, self.config.scan_obstacle_range_m)
             if self._progress.blocked_s > 0.0
             else None
         )
@@ -247,11 +249,11 @@ class Navigator:
         assert self.path is not None
         nearest = nearest_point(self.path, float(T_map_base[0]), float(T_map_base[1]))
         self._progress.remaining_m = length_from(self.path, nearest)
-        if self._progress.remaining_m < self._progress.nearest_m - _PROGRESS_M:
+        if self._progress.remaining_m < self._progress.nearest_m - self.config.progress_m:
             self._progress.standstills = 0
             self._progress.nearest_m = self._progress.remaining_m
         before = (self._follower.v, self._follower.w)
-        room = self._obstacles.clearance_along(self.path, nearest, _NARROW_AHEAD_M)
+        room = self._obstacles.clearance_along(self.path, nearest, self.config.clearance_ahead_m)
         v, w = self._follower.command(T_map_base, self.path, dt_s, room - self.config.stop_radius_m)
         if v <= 0.0:
             return Command(v, w, 'driving')
@@ -260,11 +262,13 @@ class Navigator:
             self._progress.blocked_s = 0.0
             return Command(v, w, 'driving')
         slowest = before[0] - self.config.controller.max_acceleration_m_s2 * dt_s
-        if allowed > max(_CREEP_M_S, slowest):
+        if allowed > max(self.config.creep_speed_m_s, slowest):
             # Drive slower on the same arc.
             return Command(*self._follower.override_speed(allowed, w * allowed / v), 'driving')
-        squeezed = self._narrow_passage_speed(T_map_base, min(v, _NARROW_M_S), w / v)
-        if squeezed > _CREEP_M_S and slowest <= squeezed:
+        squeezed = self._narrow_passage_speed(
+            T_map_base, min(v, self.config.narrow_speed_m_s), w / v
+        )
+        if squeezed > self.config.creep_speed_m_s and slowest <= squeezed:
             return Command(*self._follower.override_speed(squeezed, w * squeezed / v), 'driving')
         self._follower.override_speed(*before)
         brakes = slowest > 0.0
@@ -286,12 +290,12 @@ class Navigator:
         self._progress.blocked_s += dt_s
         if (
             self._progress.blocked_s > self.config.blocked_timeout_s
-            or self._progress.standstills > _STANDSTILLS
+            or self._progress.standstills > self.config.max_standstills
         ):
             self.cancel()
             return Command(*self._follower.override_speed(0.0, 0.0), 'failed', reason)
         heading = self._heading_of_path(T_map_base)
-        if abs(se2.wrap(heading - float(T_map_base[2]))) > _AIM_RAD:
+        if abs(se2.wrap(heading - float(T_map_base[2]))) > self.config.aim_tolerance_rad:
             return Command(*self._follower.turn_to(T_map_base, heading, dt_s), 'driving')
         self._progress.path_age_s = max(
             self._progress.path_age_s, self.config.replan_period_s - 0.5
@@ -309,7 +313,7 @@ class Navigator:
 
         There the noise of the ranges exceeds the margin.
         """
-        radius_m = max(self.config.stop_radius_m - _NARROW_MARGIN_M, 0.0)
+        radius_m = max(self.config.stop_radius_m - self.config.narrow_margin_m, 0.0)
         return self._safe_speed(T_map_base, v, v * curvature, radius_m)
 
     def _safe_speed(self, T_map_base: Array, v: float, w: float, radius_m: float) -> float:

@@ -12,12 +12,6 @@ from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.se2 import Array, wrap
 
-# In narrow passages: minimum lookahead, its growth with the clearance margin, and a speed that is
-# always allowed.
-_MIN_LOOKAHEAD_M = 0.1
-_SPARE_FACTOR = 2.0
-_MIN_SPEED_M_S = 0.1
-
 
 @dataclass(frozen=True)
 class PathFollowerConfig(Config):
@@ -61,6 +55,11 @@ class PathFollowerConfig(Config):
         low=0.1,
         high=3.0,
     )
+    # In narrow passages: minimum lookahead, its growth with the clearance margin, and a speed that
+    # is always allowed.
+    narrow_lookahead_m: float = 0.1
+    lookahead_per_margin: float = 2.0
+    min_narrow_speed_m_s: float = 0.1
 
 
 class PathFollower:
@@ -81,7 +80,9 @@ class PathFollower:
         follows the path more closely.
         """
         config = self.config
-        narrow = _MIN_LOOKAHEAD_M + _SPARE_FACTOR * max(clearance_margin_m, 0.0)
+        narrow = config.narrow_lookahead_m + config.lookahead_per_margin * max(
+            clearance_margin_m, 0.0
+        )
         reach = min(max(config.lookahead_distance_m, config.lookahead_time_s * self.v), narrow)
         x, y, theta = T_map_base.tolist()
         ahead_x, ahead_y, rest_m = _point_ahead(path, x, y, reach, config.max_corner_cut_m)
@@ -98,7 +99,7 @@ class PathFollower:
         if self._turning:
             return self._limited(0.0, self._turn_rate(error, dt_s), dt_s)
         v = min(config.max_speed_m_s, math.sqrt(2.0 * config.max_acceleration_m_s2 * rest_m))
-        v = min(v, max(narrow / max(config.lookahead_time_s, 1e-9), _MIN_SPEED_M_S))
+        v = min(v, max(narrow / max(config.lookahead_time_s, 1e-9), config.min_narrow_speed_m_s))
         curvature = 2.0 * math.sin(error) / max(math.hypot(dx, dy), 0.05)
         if abs(curvature) * v > config.max_angular_speed_rad_s:
             v = config.max_angular_speed_rad_s / abs(curvature)

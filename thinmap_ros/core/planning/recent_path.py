@@ -13,17 +13,17 @@ from thinmap_ros.core.grid.frame import GridFrame
 from thinmap_ros.core.jit import kernel
 from thinmap_ros.core.se2 import Array
 
-_STEP_M = 0.03
-_JUMP_M = 0.5
-_MAX_POINTS = 1300  # points
-
 
 class RecentPath:
     """The last metres of the robot's path; reset when the pose jumps, as after a correction."""
 
-    def __init__(self) -> None:
+    def __init__(self, step_m: float = 0.03, jump_m: float = 0.5, capacity: int = 1300) -> None:
+        """Keep the last points, step_m apart; a longer step than jump_m is a jump."""
+        self._step_m = step_m
+        self._jump_m = jump_m
+        self._capacity = capacity
         # Twice the capacity: points are moved to the front only when the array is full.
-        self._points = np.empty((2 * _MAX_POINTS, 2))
+        self._points = np.empty((2 * capacity, 2))
         self._begin = self._end = 0
 
     def add_pose(self, T_map_base: Array) -> None:
@@ -32,9 +32,9 @@ class RecentPath:
             return
         here = float(T_map_base[0]), float(T_map_base[1])
         away = math.dist(here, self._points[self._end - 1]) if self._end > self._begin else math.inf
-        if away > _JUMP_M:
+        if away > self._jump_m:
             self._begin = self._end = 0
-        if away >= _STEP_M:
+        if away >= self._step_m:
             self._append(here)
 
     def cells(self, frame: GridFrame, shape: tuple[int, ...]) -> NDArray[np.int64]:
@@ -49,12 +49,13 @@ class RecentPath:
 
     def _append(self, here: tuple[float, float]) -> None:
         if self._end == len(self._points):
-            self._points[: _MAX_POINTS - 1] = self._points[self._end - _MAX_POINTS + 1 :]
+            kept = self._capacity - 1
+            self._points[:kept] = self._points[self._end - kept :]
             self._begin = 0
-            self._end = _MAX_POINTS - 1
+            self._end = kept
         self._points[self._end] = here
         self._end += 1
-        self._begin = max(self._begin, self._end - _MAX_POINTS)
+        self._begin = max(self._begin, self._end - self._capacity)
 
 
 @kernel

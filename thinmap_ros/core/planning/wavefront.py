@@ -23,7 +23,6 @@ from thinmap_ros.core.topology.config import TopologyConfig
 from thinmap_ros.core.topology.free_space import column_distance, known_free
 
 Mask = NDArray[np.bool_]
-_ESCAPE_COST = 10.0
 _STEP_CELLS = 0.5
 _TOPOLOGY = TopologyConfig()
 # Distances are whole cells times the resolution:
@@ -73,6 +72,7 @@ class WavefrontConfig(Config):
         low=0.0,
         high=5.0,
     )
+    escape_cost: float = 10.0  # of these cells, and of those of the recent path
 
 
 def plan(
@@ -112,12 +112,10 @@ def plan(
     start = (int(cells[0, 0]), int(cells[0, 1]))
     wished = (int(cells[1, 0]), int(cells[1, 1]))
     if not math.isfinite(cost[start]):
-        _open_escape_cells(
-            cost, occupied, start, config.start_escape_distance_m / patch.frame.resolution
-        )
+        _open_escape_cells(cost, occupied, start, patch.frame.resolution, config)
     if trail is not None:
         back = trail[~occupied[trail[:, 0], trail[:, 1]]]
-        cost[back[:, 0], back[:, 1]] = np.minimum(cost[back[:, 0], back[:, 1]], _ESCAPE_COST)
+        cost[back[:, 0], back[:, 1]] = np.minimum(cost[back[:, 0], back[:, 1]], config.escape_cost)
     goal = nearest_true(
         reachable_cells(np.isfinite(cost), start),
         wished,
@@ -175,15 +173,21 @@ def _in_cells(patch: GridPatch, points: Array) -> Array:
     return np.asarray((points - (frame.origin_x, frame.origin_y)) / frame.resolution)
 
 
-def _open_escape_cells(cost: Array, occupied: Mask, start: tuple[int, int], reach: float) -> None:
+def _open_escape_cells(
+    cost: Array,
+    occupied: Mask,
+    start: tuple[int, int],
+    resolution: float,
+    config: WavefrontConfig,
+) -> None:
     """Allow the inflated cells around a start, at a high cost, so that the robot can escape.
 
     Occupied cells stay forbidden, except the cell of the robot itself.
     """
-    where, within = disc(cost, start, reach)
+    where, within = disc(cost, start, config.start_escape_distance_m / resolution)
     part = cost[where]
-    part[within & ~np.isfinite(part) & ~occupied[where]] = _ESCAPE_COST
-    cost[start] = min(cost[start], _ESCAPE_COST)
+    part[within & ~np.isfinite(part) & ~occupied[where]] = config.escape_cost
+    cost[start] = min(cost[start], config.escape_cost)
 
 
 @kernel

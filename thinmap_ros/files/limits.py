@@ -1,0 +1,44 @@
+"""Limits of what is read from files and logs: a larger one is refused before it fills the memory.
+
+One table for all formats; the readers name the limit in their error messages.
+"""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class FileLimits:
+    """Maps, graphs, worlds, sessions and configuration files. Sizes in bytes."""
+
+    text_bytes: int = 1 << 30
+    yaml_bytes: int = 4 << 20
+    yaml_nodes: int = 100_000  # values, lists and mappings
+    yaml_levels: int = 20
+    graph_bytes: int = 256 << 20
+    npz_bytes: int = 512 << 20  # decompressed
+    npz_arrays: int = 64
+    image_pixels: int = 8192 * 8192
+    world_cells: int = 100_000_000
+    digits: int = 100  # of a number
+    name_length: int = 200
+    path_length: int = 1000
+
+
+@dataclass(frozen=True)
+class LogLimits:
+    """Bags and logs of sensor data. Sizes in bytes."""
+
+    file_bytes: int = 32 << 30  # decompressed
+    line_bytes: int = 4 << 20  # of a text log
+    chunk_bytes: int = 256 << 20  # uncompressed, and any other record
+    summary_bytes: int = 64 << 20
+    definitions_bytes: int = 64 << 20  # schemas and channels, all together
+    definitions: int = 1 << 16
+    schema_bytes: int = 1 << 20
+    buffered_bytes: int = 512 << 20  # messages that wait to be sorted by time
+    queue_depth: int = 100_000
+
+
+PIECE_BYTES = 1 << 20  # large files are read in pieces
+FILES = FileLimits()
+LOGS = LogLimits()
