@@ -68,6 +68,19 @@ def test_features_of_a_node_that_goes_are_handed_on(area):
     assert area.nodes_of(20) == [7]
 
 
+def test_features_of_a_node_that_moved_are_handed_on_where_it_was_last():
+    area = LocalArea()
+    for topology in (corridor(0.0, 4.0, 10.0), corridor(0.0, 8.0, 10.0)):
+        area.set_topology(topology)
+        area.store(np.array([topology.nodes[2].x, 0.0, 0.0]), [20])
+        assert area.nodes_of(20) == [2]
+    without = corridor(0.0, 8.0, 10.0)
+    without.drop_node(2)
+    area.set_topology(without)
+    area.features_near(np.zeros(3), AHEAD)
+    assert area.nodes_of(20) == [3]
+
+
 def test_merged_and_dropped_features(area):
     area.remove(10, heir=30)
     assert area.nodes_of(30) == [1, 3]
