@@ -81,6 +81,17 @@ def test_features_of_a_node_that_moved_are_handed_on_where_it_was_last():
     assert area.nodes_of(20) == [3]
 
 
+def test_features_of_a_node_that_goes_at_once_are_handed_on_where_it_was():
+    area = LocalArea()
+    area.set_topology(corridor(0.0, 4.0, 10.0))
+    area.store(np.array([4.0, 0.0, 0.0]), [20])
+    without = corridor(0.0, 4.0, 10.0)
+    without.drop_node(2)
+    area.set_topology(without)
+    area.features_near(np.array([10.0, 0.0, 0.0]), AHEAD)
+    assert area.nodes_of(20) == [1]
+
+
 def test_merged_and_dropped_features(area):
     area.remove(10, heir=30)
     assert area.nodes_of(30) == [1, 3]
