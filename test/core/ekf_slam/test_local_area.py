@@ -68,6 +68,30 @@ def test_features_of_a_node_that_goes_are_handed_on(area):
     assert area.nodes_of(20) == [7]
 
 
+def test_features_of_a_node_that_moved_are_handed_on_where_it_was_last():
+    area = LocalArea()
+    for topology in (corridor(0.0, 4.0, 10.0), corridor(0.0, 8.0, 10.0)):
+        area.set_topology(topology)
+        area.store(np.array([topology.nodes[2].x, 0.0, 0.0]), [20])
+        assert area.nodes_of(20) == [2]
+    without = corridor(0.0, 8.0, 10.0)
+    without.drop_node(2)
+    area.set_topology(without)
+    area.features_near(np.zeros(3), AHEAD)
+    assert area.nodes_of(20) == [3]
+
+
+def test_features_of_a_node_that_goes_at_once_are_handed_on_where_it_was():
+    area = LocalArea()
+    area.set_topology(corridor(0.0, 4.0, 10.0))
+    area.store(np.array([4.0, 0.0, 0.0]), [20])
+    without = corridor(0.0, 4.0, 10.0)
+    without.drop_node(2)
+    area.set_topology(without)
+    area.features_near(np.array([10.0, 0.0, 0.0]), AHEAD)
+    assert area.nodes_of(20) == [1]
+
+
 def test_merged_and_dropped_features(area):
     area.remove(10, heir=30)
     assert area.nodes_of(30) == [1, 3]
@@ -83,7 +107,8 @@ def test_without_a_topology_nodes_are_placed_along_the_path():
     near = area.features_near(np.array([10.0, 0.0, 0.0]), AHEAD)
     places = sorted(0.05 * i - 0.5 for i in near)
     assert 8.0 <= places[0] <= 11.0
-    assert 12.0 <= places[-1] <= 10.0 + 11.0
+    # The nodes ahead, up to 8 m along edges, and what was seen from 3 m beyond them.
+    assert 16.0 <= places[-1] <= 10.0 + 11.0
     # A topology adopts the features of the path's nodes.
     area.set_topology(corridor(0.0, 10.0, 20.0))
     assert area.features_near(np.array([10.0, 0.0, 0.0]), math.pi) == {
