@@ -57,7 +57,7 @@ def test_what_cannot_change_is_marked_and_refused(graph):
     (descriptor,) = graph.call(
         DescribeParameters, '/grid_mapper/describe_parameters', request
     ).descriptors
-    assert descriptor.read_only and 'edge of a cell' in descriptor.description
+    assert descriptor.read_only and 'Edge of a cell' in descriptor.description
     assert descriptor.floating_point_range[0].to_value == 1.0
     result = change(graph, 'grid_mapper', resolution_m=0.2)
     assert not result.successful and 'read-only' in result.reason
