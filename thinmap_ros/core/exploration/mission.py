@@ -21,12 +21,6 @@ from thinmap_ros.core.se2 import Array, wrap
 _SMALLEST_STEP_M = 0.02
 _WALL = np.int8(100)
 _MIN_CORNERS = 3
-_SCAN_TIMEOUT_S = 60.0
-_LOST_TIMEOUT_S = 10.0
-_NAVIGATOR_TIMEOUT_S = 3.0
-_SAME_GOAL_M = 0.1
-_SAME_GOAL_RAD = 0.2
-_MAX_RETURN_FAILURES = 3
 _EXPLORED = (FinishCode.ALL_RESOLVED, FinishCode.UNREACHABLE)
 
 
@@ -74,12 +68,14 @@ class MissionGoal:
     """What a mission shall do.
 
     area: corners (N, 2) of a polygon in the map frame, m; with fewer than three, everywhere.
+    return_attempts: drives to the start before a return is given up.
     Raises InputError where a limit or a corner is no number, or too large.
     """
 
     budget: Budget = field(default_factory=Budget)
     area: Array = field(default_factory=lambda: np.empty((0, 2)))
     return_to_start: bool = False
+    return_attempts: int = 3
 
     def __post_init__(self) -> None:
         limits = (self.budget.time_s, self.budget.distance_m, self.budget.area_m2)
@@ -124,28 +120,36 @@ Action = DriveTo | Finish | None
 
 @dataclass
 class DriveRequest:
-    """Goal (3,) that the navigator was given, and when it last reported on it, s."""
+    """Goal (3,) that the navigator was given, and when it last reported on it, s.
+
+    timeout_s: after which it is silent; same_m, same_rad: goals nearer than this are the same.
+    """
 
     goal: Array
     last_feedback_s: float
+    timeout_s: float = 3.0
+    same_m: float = 0.1
+    same_rad: float = 0.2
 
     def is_same(self, goal: Array) -> bool:
         """Whether another goal (3,) is so near that it need not be sent."""
-        near = math.dist(goal[:2], self.goal[:2]) <= _SAME_GOAL_M
-        return near and abs(wrap(float(goal[2] - self.goal[2]))) <= _SAME_GOAL_RAD
+        near = math.dist(goal[:2], self.goal[:2]) <= self.same_m
+        return near and abs(wrap(float(goal[2] - self.goal[2]))) <= self.same_rad
 
     def is_silent(self, now_s: float) -> bool:
         """Whether the navigator does not report; it may have been restarted and lost the goal."""
-        return now_s - self.last_feedback_s >= _NAVIGATOR_TIMEOUT_S
+        return now_s - self.last_feedback_s >= self.timeout_s
 
 
 @dataclass
 class InputWatchdog:
-    """When the laser last showed anything and the pose was last tracked, s."""
+    """When the laser last showed anything and the pose was last tracked, s, and the timeouts."""
 
     last_scan_s: float = 0.0
     last_tracking_s: float = 0.0
     is_lost: bool = False
+    scan_timeout_s: float = 60.0
+    lost_timeout_s: float = 10.0
 
     def restart(self, now_s: float) -> None:
         """Start all timeouts."""
@@ -167,11 +171,11 @@ class InputWatchdog:
 
     def failure(self, now_s: float) -> Finish | None:
         """Reason to give up: no scans, or no pose, for too long."""
-        if now_s - self.last_scan_s > _SCAN_TIMEOUT_S:
-            reason = f'no scan that shows anything for {_SCAN_TIMEOUT_S:.0f} s'
+        if now_s - self.last_scan_s > self.scan_timeout_s:
+            reason = f'no scan that shows anything for {self.scan_timeout_s:.0f} s'
             return Finish(FinishCode.SENSOR_TIMEOUT, reason)
-        if self.is_lost and now_s - self.last_tracking_s > _LOST_TIMEOUT_S:
-            reason = f'the pose has been lost for {_LOST_TIMEOUT_S:.0f} s'
+        if self.is_lost and now_s - self.last_tracking_s > self.lost_timeout_s:
+            reason = f'the pose has been lost for {self.lost_timeout_s:.0f} s'
             return Finish(FinishCode.LOCALIZATION_LOST, reason)
         return None
 
@@ -256,7 +260,7 @@ class Mission:
         if success:
             return self._finish(self.end)
         self._return_failures += 1
-        if self._return_failures < _MAX_RETURN_FAILURES:
+        if self._return_failures < self.goal.return_attempts:
             return self._drive_to_start()
         return self._finish(self.end._replace(reason=f'{self.end.reason}; not home: {reason}'))
 

@@ -11,15 +11,14 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.matching.local_map import LocalMap, LocalMapConfig
 
-_AT_ONCE = 20  # keyframes rendered at once after a correction
-_A_STEP = 2  # keyframes rendered in each later step
-
 
 class ActiveMap:
     """The current local map, its loaded cells, and the keyframes that are not yet rendered."""
 
-    def __init__(self, config: LocalMapConfig) -> None:
+    def __init__(self, config: LocalMapConfig, render_first: int = 20) -> None:
+        """render_first: keyframes that are rendered at once after a correction."""
         self._config = config
+        self._render_first = render_first
         self.map = LocalMap(config)
         self.number = 0  # of the submap
         self.T_at_update: Array | None = None  # pose (3,) of the last scan that was added
@@ -53,9 +52,9 @@ class ActiveMap:
         places = np.array([frame.T_map_base for frame in keyframes]).reshape(-1, 3)[:, :2]
         away = np.hypot(*(places - T_map_base[:2]).T)
         self._pending = np.argsort(-away).tolist()
-        self.render(keyframes, _AT_ONCE)
+        self.render(keyframes, self._render_first)
 
-    def render(self, keyframes: Sequence[Keyframe], count: int = _A_STEP) -> None:
+    def render(self, keyframes: Sequence[Keyframe], count: int = 2) -> None:
         """Render up to `count` of the pending keyframes."""
         for _ in range(min(count, len(self._pending))):
             frame = keyframes[self._pending.pop()]

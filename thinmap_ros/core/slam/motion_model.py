@@ -15,15 +15,15 @@ from thinmap_ros.core.config import parameter
 from thinmap_ros.core.ekf_slam.models import OdometryConfig, odometry_slip, odometry_variances
 from thinmap_ros.core.se2 import Array
 
-_MOST_SIGMAS = 3.0
-# Ratio of the information along a corridor to that across it. Below it the corridor is smooth.
-_CORRIDOR_RATIO = 0.2
-_LEAST_SHARE = 1.0  # smallest scale of the modelled variance: good wheels slip, too
-
 
 @dataclass(frozen=True)
 class MotionConfig(OdometryConfig):
-    """Parameters of the odometry noise, and of its adaptation to scan matching."""
+    """Parameters of the odometry noise, and of its adaptation to scan matching.
+
+    Besides the parameters: min_scale of the modelled variance, as good wheels slip, too; a motion
+    within stationary_sigmas of the noise floor is none; below corridor_ratio of the information
+    across a corridor, the information along it is that of a smooth one.
+    """
 
     noise_window: float = parameter(
         20.0,
@@ -32,6 +32,9 @@ class MotionConfig(OdometryConfig):
         low=1.0,
         high=1e4,
     )
+    min_scale: float = 1.0
+    stationary_sigmas: float = 3.0
+    corridor_ratio: float = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,14 +49,14 @@ class MotionPrediction:
     is_stationary: bool
 
 
-def _distinctness(information: Array) -> Array:
+def _distinctness(information: Array, corridor_ratio: float) -> Array:
     """Weight (2,), 0 to 1, of a scan's innovation in x and y, by its information (3, 3).
 
     Along a smooth corridor the information of a match is overconfident, and its innovation is no
     error of the odometry.
     """
     own = np.diag(information)[:2]
-    return np.asarray(np.minimum(own / max(_CORRIDOR_RATIO * float(own.max()), 1e-12), 1.0))
+    return np.asarray(np.minimum(own / max(corridor_ratio * float(own.max()), 1e-12), 1.0))
 
 
 class MotionModel:
@@ -74,7 +77,7 @@ class MotionModel:
         config = self._config
         self._expected = increment
         self._allowed = odometry_variances(increment, config) + np.diag(systematic)
-        moves = np.abs(increment) > _MOST_SIGMAS * odometry_slip(config)
+        moves = np.abs(increment) > config.stationary_sigmas * odometry_slip(config)
         return MotionPrediction(increment, np.diag(self._variances), not moves.any())
 
     def update(self, found: Array, scan_information: Array) -> None:
@@ -89,14 +92,18 @@ class MotionModel:
         beyond = np.maximum(squared - variance, 0.0)  # not explained by the noise of the scan
         share = self._share[[0, 0, 1]]
         # A larger innovation is an outlier, such as a single slip: its effect is limited.
-        change = np.minimum(beyond / self._allowed, _MOST_SIGMAS**2 * share) - share
+        change = (
+            np.minimum(beyond / self._allowed, self._config.stationary_sigmas**2 * share) - share
+        )
         change *= np.maximum(gain**2, beyond / np.maximum(squared, 1e-12))
-        change[:2] *= np.where(change[:2] > 0.0, _distinctness(scan_information), 1.0)
+        change[:2] *= np.where(
+            change[:2] > 0.0, _distinctness(scan_information, self._config.corridor_ratio), 1.0
+        )
         self._learned += 1
         rate = max(1.0 / self._config.noise_window, 1.0 / (1.0 + self._learned))
         self._share[0] += rate * 0.5 * (change[0] + change[1])
         self._share[1] += rate * change[2]
-        np.maximum(self._share, _LEAST_SHARE, out=self._share)
+        np.maximum(self._share, self._config.min_scale, out=self._share)
 
     @property
     def _variances(self) -> Array:

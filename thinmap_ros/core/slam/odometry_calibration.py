@@ -11,6 +11,7 @@ correction of systematic odometry errors in mobile robots", 1996.
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,25 +19,37 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.ekf_slam.models import rotation
 from thinmap_ros.core.se2 import Array
 
-_PRIOR_SIGMAS = (0.02, 0.02, 0.05, 0.02)  # of the parameters, before the first span
-_WANDER_SIGMAS = (0.001, 0.001, 0.001, 0.0002)  # random walk per m or rad: floor and load change
-# Smallest span to compare: so long that the covariance of its two ends is small beside it.
-_SPAN_M = 1.0
-_SPAN_RAD = 1.0
-# Noise of a span, besides that of its ends and of the odometry: errors of matches are correlated.
-_SIGMA_M = 0.02
-_SIGMA_RAD = 0.02
-_LEAST_INFORMATION = (1e-2, 1e-2, 1e-2)  # for directions without information, as in a corridor
-_GATE_SIGMAS = 4.0  # a larger innovation is wheel slip
+
+@dataclass(frozen=True)
+class CalibrationConfig:
+    """Noise of the calibration.
+
+    prior_sigmas: of scale, drift, turn_scale and askew before the first span; walk_sigmas: their
+    random walk per m or rad, as floor and load change. span_m, span_rad: smallest span to compare,
+    so long that the covariance of its two ends is small beside it; noise_m, noise_rad: of a span,
+    besides that of its ends and of the odometry, as errors of matches are correlated;
+    min_information: for directions without information, as in a corridor; gate_sigmas: a larger
+    innovation is wheel slip.
+    """
+
+    prior_sigmas: tuple[float, ...] = (0.02, 0.02, 0.05, 0.02)
+    walk_sigmas: tuple[float, ...] = (0.001, 0.001, 0.001, 0.0002)
+    span_m: float = 1.0
+    span_rad: float = 1.0
+    noise_m: float = 0.02
+    noise_rad: float = 0.02
+    min_information: float = 1e-2
+    gate_sigmas: float = 4.0
 
 
 class OdometryCalibration:
     """Estimates the systematic odometry error from scan matches, and removes it."""
 
-    def __init__(self) -> None:
+    def __init__(self, config: CalibrationConfig | None = None) -> None:
+        self._config = config or CalibrationConfig()
         # Estimated parameters: scale, drift in rad/m, turn_scale, askew in rad.
         self.known = np.array([1.0, 0.0, 1.0, 0.0])
-        self._covariance = np.diag(np.square(_PRIOR_SIGMAS))
+        self._covariance = np.diag(np.square(self._config.prior_sigmas))
         self._begin: Array | None = None
         self._begin_covariance: Array = np.zeros((3, 3))  # of the pose _begin, map frame
         self.reset_segment()
@@ -86,11 +99,13 @@ class OdometryCalibration:
         """
         if (
             self._begin is not None
-            and abs(self._travelled_m) < _SPAN_M
-            and abs(self._turned_rad) < _SPAN_RAD
+            and abs(self._travelled_m) < self._config.span_m
+            and abs(self._turned_rad) < self._config.span_rad
         ):
             return
-        covariance: Array = np.linalg.inv(by_map + np.diag(_LEAST_INFORMATION)).astype(np.float64)
+        covariance: Array = np.linalg.inv(by_map + self._config.min_information * np.eye(3)).astype(
+            np.float64
+        )
         if self._begin is not None:
             R = rotation(float(self._begin[2]))
             found = se2.between(self._begin, T_map_base)
@@ -105,24 +120,28 @@ class OdometryCalibration:
         found (3,), covariance (3, 3): measured end of the span, in the frame of its start.
         """
         moved = abs(self._travelled_m) + abs(self._turned_rad)
-        self._covariance += np.diag(np.square(_WANDER_SIGMAS)) * moved
+        self._covariance += np.diag(np.square(self._config.walk_sigmas)) * moved
         off_turn = float(se2.wrap(float(found[2] - self._expected[2])))
-        variance = _SIGMA_RAD**2 + self._random[1] + float(covariance[2, 2])
+        variance = self._config.noise_rad**2 + self._random[1] + float(covariance[2, 2])
         self._update(off_turn, np.array([0.0, self._travelled_m, self._turned_rad, 0.0]), variance)
         length = math.hypot(self._expected[0], self._expected[1])
-        if length > 0.5 * _SPAN_M:
+        if length > 0.5 * self._config.span_m:
             x, y = self._expected[:2] / length
             dx, dy = found[:2] - self._expected[:2]
             along = np.array([x, y])
             across = np.array([-y, x])
-            variance = _SIGMA_M**2 + self._random[0] + float(along @ covariance[:2, :2] @ along)
+            variance = (
+                self._config.noise_m**2
+                + self._random[0]
+                + float(along @ covariance[:2, :2] @ along)
+            )
             self._update(
                 x * dx + y * dy, np.array([length / self.known[0], 0.0, 0.0, 0.0]), variance
             )
             # The lateral offset contains half of the turn error.
             aside = x * dy - y * dx - 0.5 * length * off_turn
             variance = (
-                _SIGMA_M**2
+                self._config.noise_m**2
                 + 0.25 * length**2 * self._random[1]
                 + float(across @ covariance[:2, :2] @ across)
             )
@@ -135,7 +154,7 @@ class OdometryCalibration:
         """
         along = self._covariance @ H
         variance = float(H @ along) + noise
-        if off * off > _GATE_SIGMAS**2 * variance:
+        if off * off > self._config.gate_sigmas**2 * variance:
             return
         gain = along / variance
         self.known = self.known + gain * off

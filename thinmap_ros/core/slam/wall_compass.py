@@ -9,6 +9,7 @@ inference", 1999.
 """
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -21,16 +22,27 @@ _BINS = 180  # of half a degree
 _NEAR_BINS = 3  # bins to either side of the peak that belong to its direction
 _AROUND = np.arange(-_NEAR_BINS, _NEAR_BINS + 1)
 _BESIDE = (np.arange(_BINS)[:, None] + [-1, 0, 1]) % _BINS  # each bin with its neighbours
-_LEAST_M = 60.0  # smallest length of wall, summed over scans, for a main direction
-_MOST = 0.7  # smallest share of the walls in the main direction
-# The heading is most accurate at the start of the map: after this path length the weight of a wall
-# is a half; it never falls below the smallest weight.
-_FADES_M = 20.0
-_LEAST_WEIGHT = 0.02
-_ASKEW_RAD = 0.003  # standard deviation of real walls from the main direction
-_GATE_SIGMAS = 3.0
-_WIDEST_RAD = 0.35
-_SHORTEST_M = 1.5  # smallest length of wall in a scan for a measured heading
+
+
+@dataclass(frozen=True)
+class WallCompassConfig:
+    """When walls measure the heading.
+
+    min_total_m: smallest length of wall, summed over scans, for a main direction; min_ratio:
+    smallest ratio of the walls in it; min_length_m: smallest length of wall in a scan. The heading
+    is most accurate at the start of the map: after a path of fade_m the weight of a wall is a half,
+    and never below min_weight. wall_sigma_rad: deviation of real walls from the main direction;
+    gate_sigmas, max_offset_rad: largest deviation of an inlier.
+    """
+
+    min_total_m: float = 60.0
+    min_ratio: float = 0.7
+    min_length_m: float = 1.5
+    fade_m: float = 20.0
+    min_weight: float = 0.02
+    wall_sigma_rad: float = 0.003
+    gate_sigmas: float = 3.0
+    max_offset_rad: float = 0.35
 
 
 class Heading(NamedTuple):
@@ -43,7 +55,8 @@ class Heading(NamedTuple):
 class WallCompass:
     """Histogram of wall lengths by direction in the map; measures the heading of a scan."""
 
-    def __init__(self) -> None:
+    def __init__(self, config: WallCompassConfig | None = None) -> None:
+        self._config = config or WallCompassConfig()
         # For each bin: weighted length of the walls (m), and its product with the mean position of
         # their directions in the bin (0 to 1).
         self._metres = np.zeros(_BINS)
@@ -53,7 +66,8 @@ class WallCompass:
         """Add the walls of a scan with heading yaw (rad), after a path of a length (m)."""
         at = (lines.z[:, 1] + yaw) % _QUARTER / _QUARTER * _BINS
         bins = at.astype(np.int64)
-        weights = _lengths(lines) * max(1.0 / (1.0 + (path_m / _FADES_M) ** 2), _LEAST_WEIGHT)
+        fading = 1.0 / (1.0 + (path_m / self._config.fade_m) ** 2)
+        weights = _lengths(lines) * max(fading, self._config.min_weight)
         np.add.at(self._metres, bins % _BINS, weights)
         np.add.at(self._places, bins % _BINS, weights * (at - bins))
 
@@ -61,12 +75,12 @@ class WallCompass:
     def direction(self) -> float | None:
         """Main direction of the walls, rad, from 0 to a right angle; None if there is none."""
         total = float(self._metres.sum())
-        if total < _LEAST_M:
+        if total < self._config.min_total_m:
             return None
         fullest = int(np.argmax(self._metres[_BESIDE].sum(axis=1)))
         near = (fullest + _AROUND) % _BINS
         metres = float(self._metres[near].sum())
-        if metres < _MOST * total:
+        if metres < self._config.min_ratio * total:
             return None
         mean = (self._places[near].sum() + self._metres[near] @ _AROUND) / metres
         return float((fullest + mean) * _QUARTER / _BINS) % _QUARTER
@@ -76,18 +90,19 @@ class WallCompass:
 
         None if the building has no main direction, or too few lines are inliers to it.
         """
+        config = self._config
         direction = self.direction
         lengths = _lengths(lines)
         if direction is None:
             return None
         off = (lines.z[:, 1] + yaw - direction + 0.5 * _QUARTER) % _QUARTER - 0.5 * _QUARTER
-        sigmas = np.sqrt(variance + _ASKEW_RAD**2 + lines.covariances[:, 1, 1])
-        near = np.abs(off) < np.minimum(_GATE_SIGMAS * sigmas, _WIDEST_RAD)
-        if lengths[near].sum() < max(_MOST * lengths.sum(), _SHORTEST_M):
+        sigmas = np.sqrt(variance + config.wall_sigma_rad**2 + lines.covariances[:, 1, 1])
+        near = np.abs(off) < np.minimum(config.gate_sigmas * sigmas, config.max_offset_rad)
+        if lengths[near].sum() < max(config.min_ratio * lengths.sum(), config.min_length_m):
             return None
         weights = lengths[near] / lengths[near].sum()
         seen = float(np.square(weights) @ lines.covariances[near, 1, 1])
-        return Heading(yaw - float(weights @ off[near]), _ASKEW_RAD**2 + seen)
+        return Heading(yaw - float(weights @ off[near]), config.wall_sigma_rad**2 + seen)
 
 
 def _lengths(lines: Lines) -> Array:

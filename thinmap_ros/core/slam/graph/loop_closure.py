@@ -18,6 +18,7 @@ from thinmap_ros.core import se2
 from thinmap_ros.core.config import Config, parameter
 from thinmap_ros.core.estimate import Correction
 from thinmap_ros.core.se2 import Array
+from thinmap_ros.core.slam.covariance import CHI2
 from thinmap_ros.core.slam.graph.keyframes import (
     Keyframe,
     KeyframeConfig,
@@ -32,17 +33,18 @@ from thinmap_ros.core.slam.graph.submaps import AGAIN_M, Submaps
 from thinmap_ros.core.slam.matching.local_map import LocalMapConfig
 from thinmap_ros.core.slam.matching.scan_matcher import Matcher, MatchingConfig
 
-_VISITS = 3  # largest number of earlier visits with which a keyframe is matched
-_SIGMAS = 3.0
-_DRIFT = 0.005  # of the path: systematic errors, which the independent steps do not contain
-_FARTHEST_M = 8.0  # largest uncertainty that is searched: beyond it, place recognition is needed
-_CHI2 = 11.34  # 99 % of three degrees of freedom
 _RECENT = 8  # recent candidates among which consistent ones are searched
 
 
 @dataclass(frozen=True)
 class LoopClosureConfig(Config):
-    """Parameters of loop closure."""
+    """Parameters of loop closure.
+
+    Besides the parameters: a keyframe is matched with at most max_visits earlier visits, within
+    search_sigmas of its uncertainty and max_uncertainty_m, beyond which place recognition is
+    needed; drift_ratio: systematic error as a ratio of the path, which independent steps do not
+    contain.
+    """
 
     search_radius_m: float = parameter(
         2.0,
@@ -79,6 +81,10 @@ class LoopClosureConfig(Config):
         low=1,
         high=_RECENT,
     )
+    max_visits: int = 3
+    search_sigmas: float = 3.0
+    max_uncertainty_m: float = 8.0
+    drift_ratio: float = 0.005
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,11 +186,12 @@ class LoopClosure:
             path_m = frames[near[i]].path_m
             if all(abs(path_m - frames[job.j].path_m) > AGAIN_M for job in found):
                 found.append(_Job(near[i], len(frames), covariances[i]))
-        return found[:_VISITS]
+        return found[: self._config.max_visits]
 
     def _reach_m(self, sigma: float) -> float:
         """Radius (m) in which keyframes are matched, for a position of uncertainty sigma, m."""
-        return self._config.search_radius_m + min(_SIGMAS * sigma, _FARTHEST_M)
+        config = self._config
+        return config.search_radius_m + min(config.search_sigmas * sigma, config.max_uncertainty_m)
 
     def _is_earlier(self, j: int, here: Keyframe) -> bool:
         frame = self.keyframes.frames[j]
@@ -200,7 +207,10 @@ class LoopClosure:
         step = rotated_covariance(self._pending[1], float(poses[anchor, 2]))
         lever = here.T_map_base[:2] - poses[anchor, :2]
         back = [propagated_covariance(there[j], poses[anchor, :2] - poses[j, :2]) for j in near]
-        drift = [_drift(here.path_m - keyframes.frames[j].path_m) for j in near]
+        drift = [
+            _drift(self._config.drift_ratio * (here.path_m - keyframes.frames[j].path_m))
+            for j in near
+        ]
         return [
             propagated_covariance(there, lever) + step + own
             for there, own in zip(back, drift, strict=True)
@@ -261,7 +271,7 @@ class LoopClosure:
             self._jobs.remove(job)
             known = len(self.edges)
             self._match(job)
-            if any(self._mahalanobis(edge) > _CHI2 for edge in self.edges[known:]):
+            if any(self._mahalanobis(edge) > CHI2 for edge in self.edges[known:]):
                 self._begin_rounds()
 
     def _is_step(self, j: int, k: int) -> bool:
@@ -296,7 +306,7 @@ class LoopClosure:
         own = np.diag(np.square([config.noise_m] * 2 + [config.noise_rad]))
         covariance = inverse(match.scan_information + 1e-3 * np.eye(3)) + own
         off = se2.pose_difference(match.T_map_base, prior)
-        if float(off @ np.linalg.solve(relative + covariance, off)) > _CHI2:
+        if float(off @ np.linalg.solve(relative + covariance, off)) > CHI2:
             return
         T_j_base = se2.between(frames[j].T_map_base, base)
         covariance = rotated_covariance(covariance, float(T_j_base[2]))
@@ -304,8 +314,8 @@ class LoopClosure:
         edge = Edge(j, k, T_j_k, inverse(covariance), True)
         if is_step:
             self.edges.append(edge)
-            self._is_strained |= self._mahalanobis(edge) > _CHI2
-        elif self._mahalanobis(edge) < _CHI2:
+            self._is_strained |= self._mahalanobis(edge) > CHI2
+        elif self._mahalanobis(edge) < CHI2:
             self._confirm(edge)
         else:
             self._requested.append(edge)
@@ -378,7 +388,7 @@ class LoopClosure:
         off = se2.pose_difference(there, back)
         covariance = inverse(one.information) + inverse(other.information)
         covariance[2, 2] += 1e-6
-        return float(off @ np.linalg.solve(covariance, off)) < _CHI2
+        return float(off @ np.linalg.solve(covariance, off)) < CHI2
 
     def _frame(self, k: int) -> Keyframe:
         if k < len(self.keyframes) or self._pending is None:
@@ -413,9 +423,9 @@ class LoopClosure:
         return optimized(self.keyframes.poses(), self._all_edges)
 
 
-def _drift(path_m: float) -> Array:
+def _drift(sigma_m: float) -> Array:
     """Covariance (3, 3) of systematic errors, accumulated along a path, m."""
-    return np.diag(np.square([_DRIFT * path_m, _DRIFT * path_m, 0.0]))
+    return np.diag(np.square([sigma_m, sigma_m, 0.0]))
 
 
 def _moved(frame: Keyframe, before: Array, after: Array) -> Keyframe:

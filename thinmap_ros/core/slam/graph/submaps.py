@@ -10,16 +10,22 @@ from thinmap_ros.core.slam.graph.keyframes import Keyframe
 from thinmap_ros.core.slam.matching.local_map import LocalMap, LocalMapConfig
 
 AGAIN_M = 8.0  # smallest path length between two visits of a place
-_AROUND = 4  # keyframes to either side of the centre of a submap
-_STRIDE = 4  # keyframes that share a submap: building it takes longer than a match
-_KEPT = 3  # cached submaps: as many as the visits with which a keyframe is matched
 
 
 class Submaps:
     """Cache of submaps around keyframes; consecutive keyframes often match the same submap."""
 
-    def __init__(self, config: LocalMapConfig) -> None:
+    def __init__(
+        self, config: LocalMapConfig, around: int = 4, stride: int = 4, capacity: int = 3
+    ) -> None:
+        """around: keyframes to either side of the centre of a submap.
+
+        stride: keyframes that share a submap, as building it takes longer than a match.
+        """
         self._config = config
+        self._around = around
+        self._stride = stride
+        self._capacity = capacity
         self._kept: OrderedDict[tuple[int, int], tuple[Array, LocalMap]] = OrderedDict()
 
     def clear(self) -> None:
@@ -32,11 +38,11 @@ class Submaps:
         path_m: length of the path now; keyframes after j that belong to the current visit are not
         part of the submap.
         """
-        centre = min(j - j % _STRIDE + _STRIDE // 2, len(frames) - 1)
+        centre = min(j - j % self._stride + self._stride // 2, len(frames) - 1)
         key = (centre, frames[j].submap)
         if key not in self._kept:
             self._kept[key] = self._built(frames, centre, j, path_m)
-            if len(self._kept) > _KEPT:
+            if len(self._kept) > self._capacity:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(key)
         return self._kept[key]
@@ -50,7 +56,7 @@ class Submaps:
     ) -> tuple[Array, LocalMap]:
         base = frames[centre].T_map_base
         submap = LocalMap(self._config)
-        for i in range(max(0, centre - _AROUND), min(centre + _AROUND + 1, len(frames))):
+        for i in range(max(0, centre - self._around), min(centre + self._around + 1, len(frames))):
             frame = frames[i]
             is_earlier = i <= j or path_m - frame.path_m > AGAIN_M
             if is_earlier and frame.submap == frames[j].submap:

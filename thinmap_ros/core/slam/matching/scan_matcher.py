@@ -18,16 +18,16 @@ from thinmap_ros.core.slam.matching.local_map import LocalMap
 from thinmap_ros.core.slam.matching.matching_cost import minimize
 
 FEWEST_POINTS = 10
-_SIGMAS = 3.0  # of the prior, within which poses are searched
-_BASIN = (0.3, 0.15)  # m, rad: basin of convergence, compared with three sigmas of the prior
-_WIDEST = (3.0, 3.0, 1.5)  # m, m, rad: half of the largest search window
-_SEARCHED_POINTS = 90
-_MOST_NODES = 1000
 
 
 @dataclass(frozen=True)
 class MatchingConfig(Config):
-    """Parameters of scan matching."""
+    """Parameters of scan matching.
+
+    Besides the parameters: poses are searched within search_sigmas of the prior and max_search (m,
+    m, rad) to either side, with search_points points and at most search_nodes nodes; basin (m, rad)
+    of convergence, compared with these sigmas of the prior.
+    """
 
     max_range_m: float = parameter(
         30.0,
@@ -70,6 +70,11 @@ class MatchingConfig(Config):
         low=0.001,
         high=3.0,
     )
+    search_sigmas: float = 3.0
+    max_search: tuple[float, float, float] = (3.0, 3.0, 1.5)
+    search_points: int = 90
+    search_nodes: int = 1000
+    basin: tuple[float, float] = (0.3, 0.15)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,23 +116,24 @@ class Matcher:
         scan = weighted_points(points, T_base_laser, local_map.config.resolution_m)
         information = inverse(covariance)
         match = self._refined(scan, local_map, prior, prior, information)
-        reach = _SIGMAS * np.sqrt(np.diag(covariance))
+        reach = self.config.search_sigmas * np.sqrt(np.diag(covariance))
         fits_badly = match.inlier_ratio < self.config.min_inlier_ratio
-        is_wide = max(reach[0], reach[1]) > _BASIN[0] or reach[2] > _BASIN[1]
+        basin_m, basin_rad = self.config.basin
+        is_wide = max(reach[0], reach[1]) > basin_m or reach[2] > basin_rad
         if not fits_badly and not is_wide:
             return match
         if fits_badly:  # wheels may have slipped
             slip = np.array([*[self.config.wheel_slip_m] * 2, self.config.wheel_slip_rad])
-            reach = _SIGMAS * np.sqrt(np.diag(covariance) + slip**2)
+            reach = self.config.search_sigmas * np.sqrt(np.diag(covariance) + slip**2)
         start = search(
-            _thinned(scan),
+            _thinned(scan, self.config.search_points),
             prior,
             information,
-            np.minimum(reach, _WIDEST),
+            np.minimum(reach, self.config.max_search),
             match.T_map_base,
             local_map.lattice,
             *self._noise,
-            _MOST_NODES,
+            self.config.search_nodes,
         )
         other = self._refined(scan, local_map, start, prior, information)
         return other if other.cost < match.cost else match
@@ -169,8 +175,8 @@ def weighted_points(points: Array, T_base_laser: Array, resolution_m: float) -> 
     return np.column_stack([points[:, :2], weights, back])
 
 
-def _thinned(scan: Array) -> Array:
+def _thinned(scan: Array, count: int) -> Array:
     """Subsample of a scan (M, 3) with the total weight of all its points."""
-    sparse = np.ascontiguousarray(scan[:: max(1, len(scan) // _SEARCHED_POINTS), :3])
+    sparse = np.ascontiguousarray(scan[:: max(1, len(scan) // count), :3])
     sparse[:, 2] *= len(scan) / len(sparse)
     return sparse
