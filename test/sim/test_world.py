@@ -1,5 +1,6 @@
 """Worlds: obstacles are occupied, and errors are reported in one line."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.files import worlds
+from thinmap_ros.files.limits import FILES
 from thinmap_ros.files.worlds import read_world
 from thinmap_ros.sim.world import World
 
@@ -166,9 +168,9 @@ def test_a_world_may_have_as_many_cells_as_the_limit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     size = box(tmp_path).occupied.size
-    monkeypatch.setattr(worlds, '_MAX_CELLS', size)
+    monkeypatch.setattr(worlds, 'FILES', replace(FILES, world_cells=size))
     assert box(tmp_path).occupied.size == size
-    monkeypatch.setattr(worlds, '_MAX_CELLS', size - 1)
+    monkeypatch.setattr(worlds, 'FILES', replace(FILES, world_cells=size - 1))
     with pytest.raises(InputError, match=f'expected at most {size - 1}'):
         box(tmp_path)
 

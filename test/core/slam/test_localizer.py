@@ -693,7 +693,7 @@ def test_a_state_with_more_hits_than_observations_in_one_cell_is_refused(whole_d
     state = whole_drive[1].state()
     hits = state['hits'].copy()
     hits.flat[0] = state['seen'].flat[0] + 1
-    with pytest.raises(InputError, match='hits: more than seen'):
+    with pytest.raises(InputError, match='hits: more than observations'):
         Localizer.from_state({**state, 'hits': hits})
 
 
