@@ -6,9 +6,8 @@ from typing import NamedTuple
 
 from thinmap_ros import __version__
 from thinmap_ros.core.errors import ThinmapError
+from thinmap_ros.tools.cli import BAD_INPUT
 from thinmap_ros.tools.ros_check import require_ros
-
-_BAD_USE = 2
 
 
 class _Program(NamedTuple):
@@ -56,7 +55,7 @@ def _usage() -> str:
 
 def _fail(message: str) -> None:
     print(f'thinmap: error: {message}', file=sys.stderr)
-    sys.exit(_BAD_USE)
+    sys.exit(BAD_INPUT)
 
 
 def _run(name: str, arguments: list[str]) -> None:

@@ -7,11 +7,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from time import monotonic
 
-_RELEASE_S = 3.0
-_RELEASE_BYTES = 4e6
 
-
-def compiler_memory_releaser() -> Callable[[], None]:
+def compiler_memory_releaser(
+    period_s: float = 3.0, threshold_bytes: float = 4e6
+) -> Callable[[], None]:
     """Return a function that releases the pages of the compiler, to be called repeatedly.
 
     Kernels that are loaded later, with the first message, load the compiler again.
@@ -21,8 +20,8 @@ def compiler_memory_releaser() -> Callable[[], None]:
 
     def look() -> None:
         nonlocal looked_at, least
-        if monotonic() - looked_at > _RELEASE_S:
-            if _shared_bytes() > least + _RELEASE_BYTES:
+        if monotonic() - looked_at > period_s:
+            if _shared_bytes() > least + threshold_bytes:
                 release_compiler_pages()
                 least = _shared_bytes()
             looked_at = monotonic()

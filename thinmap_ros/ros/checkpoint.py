@@ -16,10 +16,6 @@ from thinmap_ros.files.snapshots import read_snapshot, write_snapshot
 
 _FOLDER = 'THINMAP_STATE_DIR'
 _KIND = 'checkpoint'
-# Least time between two checkpoints, in durations of the last one: however large the state, saving
-# it takes a small share of the time. Of checkpoints that must not wait:
-_INTERVAL_FACTOR = 50.0
-_URGENT_INTERVAL_FACTOR = 10.0
 
 
 class Checkpoint:
@@ -86,8 +82,21 @@ class Checkpoint:
 class PeriodicCheckpoint:
     """A checkpoint that is saved again and again, in a small share of the node's time."""
 
-    def __init__(self, file: Checkpoint, state: Callable[[], State | None]) -> None:
-        """state: returns what to save; None: nothing."""
+    def __init__(
+        self,
+        file: Checkpoint,
+        state: Callable[[], State | None],
+        interval: float = 50.0,
+        urgent_interval: float = 10.0,
+    ) -> None:
+        """state: returns what to save; None: nothing.
+
+        interval: least time between two checkpoints, in durations of the last one: however large
+        the state, saving it takes a small share of the time. urgent_interval: the same of
+        checkpoints that must not wait.
+        """
+        self._interval = interval
+        self._urgent_interval = urgent_interval
         self._file = file
         self._state = state
         self._saved_at_s = time.monotonic()
@@ -96,7 +105,7 @@ class PeriodicCheckpoint:
     def save(self, is_urgent: bool = False) -> bool:
         """Save the state, unless the last checkpoint is too recent; returns whether it was due."""
         now_s = time.monotonic()
-        factor = _URGENT_INTERVAL_FACTOR if is_urgent else _INTERVAL_FACTOR
+        factor = self._urgent_interval if is_urgent else self._interval
         if now_s - self._saved_at_s < factor * self._duration_s:
             return False
         state = self._state()

@@ -15,10 +15,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 _PERIOD_S = 1.0
-_RECENT_S = 10.0  # older rejections and drops are not reported as reasons
 _TOPICS_OF_EVERY_NODE = ('/parameter_events', '/rosout', '/diagnostics', '/clock')
-# Reasons counted apart on a topic: a broken sensor must not fill the memory.
-_REASONS = 8
 _NUMBER = re.compile(r'-?\b(\d+\.?\d*(e[+-]?\d+)?|inf|nan)\b')
 OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN
@@ -27,7 +24,10 @@ ERROR = DiagnosticStatus.ERROR
 
 @dataclass
 class _Topic:
-    """Messages of a topic; times are of the monotonic clock, s."""
+    """Messages of a topic; times are of the monotonic clock, s.
+
+    max_reasons: that are counted apart, as a broken sensor must not fill the memory.
+    """
 
     received: int = 0
     published: int = 0  # value of `received` in the last diagnostics
@@ -36,11 +36,12 @@ class _Topic:
     rejected: Counter[str] = field(default_factory=Counter)
     last_reason: str = ''
     rejected_s: float = -math.inf
+    max_reasons: int = 8
 
     def reject(self, reason: str) -> None:
         """Count a rejection by its reason, whatever the numbers in it."""
         kind = _NUMBER.sub('#', reason)
-        if kind not in self.rejected and len(self.rejected) >= _REASONS:
+        if kind not in self.rejected and len(self.rejected) >= self.max_reasons:
             kind = 'other reasons'
         self.rejected[kind] += 1
         self.last_reason = reason
@@ -130,10 +131,11 @@ class MessageStatistics:
         for topic in self._topics.values():
             topic.published = topic.received
 
-    def _recent_reasons(self) -> str:
+    def _recent_reasons(self, within_s: float = 10.0) -> str:
+        """Reasons of the last rejections and drops; older ones are not reported."""
         reasons = [(t.rejected_s, f'{name}: {t.last_reason}') for name, t in self._topics.items()]
         reasons += [(drops.last_s, cause) for cause, drops in self._drops.items()]
-        recent = [reason for reason in reasons if monotonic() - reason[0] <= _RECENT_S]
+        recent = [reason for reason in reasons if monotonic() - reason[0] <= within_s]
         return '; '.join(text for _, text in sorted(recent, reverse=True))
 
 

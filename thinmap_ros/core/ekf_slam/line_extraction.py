@@ -25,7 +25,6 @@ _FLATTEST_RAD = math.radians(10.0)  # smallest usable angle between wall and bea
 _WIDEST_GAP_M = 0.6  # largest gap in a wall: narrower than a door
 _MOST_MISSING = 2  # largest number of adjacent beams without return inside a wall
 _MOST_CHI2 = 3.0  # per degree of freedom: rough walls pass, clutter does not
-_SPLIT_SIGMAS = 4.0
 _TRIM_SIGMAS = 3.0  # end points with a larger distance are mixed pixels or on the next wall
 # Columns of a fit.
 _R, _ALPHA, _RR, _RA, _AA, _CHI2, _BOW, _BOW_SIGMA, _LOW, _HIGH = range(10)
@@ -33,7 +32,10 @@ _R, _ALPHA, _RR, _RA, _AA, _CHI2, _BOW, _BOW_SIGMA, _LOW, _HIGH = range(10)
 
 @dataclass(frozen=True)
 class LineConfig(Config):
-    """Parameters of line extraction and the noise of the beams."""
+    """Parameters of line extraction and the noise of the beams.
+
+    split_sigmas: smallest distance of a split, in standard deviations of a range.
+    """
 
     range_noise_m: float = parameter(
         0.015,
@@ -83,6 +85,7 @@ class LineConfig(Config):
         low=0.001,
         high=1.0,
     )
+    split_sigmas: float = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +117,7 @@ def extract_lines(scan: Scan, config: LineConfig) -> Lines:
     beams = np.flatnonzero(scan.hit & (scan.ranges_m < config.max_range_m))
     if beams.size < config.min_points:
         return no_lines()
-    split_m = max(config.split_distance_m, _SPLIT_SIGMAS * config.range_noise_m)
+    split_m = max(config.split_distance_m, config.split_sigmas * config.range_noise_m)
     sigmas = np.array([config.range_noise_m, config.bearing_noise_rad, split_m])
     ranges = scan.ranges_m[beams]
     angles = scan.angles_rad[beams]

@@ -7,17 +7,18 @@ from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.slam.covariance import PoseUncertainty
 from thinmap_ros.core.slam.wall_compass import Heading, WallCompass
 
-_NEW_SHARE = 0.2  # share of a match's error that is independent of the previous map update
-_LEAST_VARIANCE = 5e-4**2
-
 
 class HeadingCorrection:
     """Corrects the heading of scans before they are added to the map."""
 
-    def __init__(self, config: LineConfig) -> None:
+    def __init__(
+        self, config: LineConfig, min_sigma_rad: float = 5e-4, new_ratio: float = 0.2
+    ) -> None:
+        """new_ratio: of a match's error, that is independent of the previous map update."""
+        self._new_ratio = new_ratio
         self._config = config
         self._compass = WallCompass()
-        self._variance = _LEAST_VARIANCE  # of the heading since its last measurement
+        self._variance = min_sigma_rad**2  # of the heading since its last measurement
         self.measured: Heading | None = None  # measured heading of the last scan
 
     def correct(
@@ -30,7 +31,7 @@ class HeadingCorrection:
         """
         # The gate is narrower than the variance of the pose: a larger heading error is also in the
         # local map, and a scan that is corrected alone would no longer fit this map.
-        self._variance += float(pose.motion_part[2, 2] + _NEW_SHARE * pose.by_scan[2, 2])
+        self._variance += float(pose.motion_part[2, 2] + self._new_ratio * pose.by_scan[2, 2])
         self.measured = None
         if not fits:
             return T_map_base

@@ -11,8 +11,6 @@ from thinmap_ros.core.slam.matching.scan_matcher import Match
 from thinmap_ros.core.slam.odometry_prediction import Prediction
 
 FOR_A_SLIP = 3.0  # inliers for each contradicting point, for a match to override the odometry
-_ADRIFT_M = 10.0  # path length after which a new local map is no longer provisional
-_UNPLACED_EVIDENCE = 0.5  # initial evidence in a loaded map: one or two fitting scans remove it
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +36,20 @@ class Tracking:
     negative. Source: Page, "Continuous inspection schemes", 1954.
     """
 
-    def __init__(self, lost_threshold: float, least_fit: float, T_map_base: Array) -> None:
+    def __init__(
+        self,
+        lost_threshold: float,
+        least_fit: float,
+        T_map_base: Array,
+        provisional_m: float = 10.0,
+        loaded_evidence: float = 0.5,
+    ) -> None:
+        """provisional_m: path length for which a new local map is provisional.
+
+        loaded_evidence: initial evidence in a loaded map: one or two fitting scans remove it.
+        """
+        self._provisional_m = provisional_m
+        self._loaded_evidence = loaded_evidence
         self.evidence = 0.0
         self.is_delocalized = False  # in a loaded map, or after set_pose, until scans fit
         self.dead_reckoned = DeadReckoning(T_map_base, np.zeros((3, 3)))
@@ -86,12 +97,12 @@ class Tracking:
     def start_delocalized(self) -> None:
         """Start in a loaded map, at an unconfirmed pose."""
         self.is_delocalized = True
-        self.evidence = _UNPLACED_EVIDENCE
+        self.evidence = self._loaded_evidence
 
     def start_submap(self) -> None:
         """Start a new, provisional local map."""
         self.evidence = 0.0
-        self._provisional_path_m = _ADRIFT_M
+        self._provisional_path_m = self._provisional_m
 
     def add_path(self, path_m: float) -> None:
         """Add a path of this length (m), after which a scan was added to the map."""

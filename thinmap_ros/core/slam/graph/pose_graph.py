@@ -15,10 +15,23 @@ from numpy.typing import NDArray
 
 from thinmap_ros.core.se2 import Array, wrap
 
-_ROUNDS = 30
-_SETTLED = 1e-5  # m and rad: a smaller step ends the optimization
-_LARGE = 16.0  # squared error, in sigmas, at which a robust edge has a quarter of its weight
-_NARROWING = 2.0  # factor by which the width of the loss decreases in each iteration
+
+@dataclass(frozen=True)
+class OptimizerConfig:
+    """Graduated non-convexity of robust edges.
+
+    large: squared error, in sigmas, at which a robust edge has a quarter of its weight; narrowing:
+    factor by which the width of the loss decreases in each iteration; settled: a smaller step (m
+    and rad) ends the optimization, as do max_iterations.
+    """
+
+    large: float = 16.0
+    narrowing: float = 2.0
+    settled: float = 1e-5
+    max_iterations: int = 30
+
+
+_CONFIG = OptimizerConfig()
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,16 +61,16 @@ def rounds(poses: Array, edges: list[Edge]) -> Iterator[Array]:
         return
     arrays = _Edges(edges)
     width: float | None = None
-    for _ in range(_ROUNDS):
+    for _ in range(_CONFIG.max_iterations):
         e, by_a, by_b = _linearise(poses, arrays)
         squared = np.einsum('ki,kij,kj->k', e, arrays.information, e)
-        width = 2.0 * float(squared.max()) if width is None else width / _NARROWING
-        scale = np.where(arrays.robust, (1.0 + squared / max(width, _LARGE)) ** -2, 1.0)
+        width = 2.0 * float(squared.max()) if width is None else width / _CONFIG.narrowing
+        scale = np.where(arrays.robust, (1.0 + squared / max(width, _CONFIG.large)) ** -2, 1.0)
         step = _step(arrays, e, by_a, by_b, scale[:, None, None] * arrays.information)
         poses[1:] += step
         poses[:, 2] = wrap(poses[:, 2])
         yield poses
-        if width <= _LARGE and np.abs(step).max() < _SETTLED:
+        if width <= _CONFIG.large and np.abs(step).max() < _CONFIG.settled:
             break
 
 
