@@ -26,7 +26,6 @@ from thinmap_ros.sim.world import World
 from thinmap_ros.strategies import DEFAULT, make_strategy
 
 _CONTROL_STEPS = 2
-_MEASURE_SCANS = 5
 # As often as the strategy searches frontiers; thinning costs more than all else together.
 SCANS_PER_GRAPH = 5
 Watch = Callable[[Decision, Array], None]
@@ -93,18 +92,22 @@ class ClosedLoop:
         self._command = (0.0, 0.0)
 
     def run(
-        self, goal: ObservableCells, limit_s: float, show: Callable[[float, float], None]
+        self,
+        goal: ObservableCells,
+        limit_s: float,
+        show: Callable[[float, float], None],
+        scans_per_show: int = 5,
     ) -> ExplorationOutcome:
         """Explore until the strategy is finished or the time is up.
 
-        `show` receives time (s) and coverage every few scans.
+        `show` receives time (s) and coverage with every `scans_per_show`-th scan.
         """
         moment = self.simulation.read_sensors()
         steps = 0
         while moment.stamp_ns < limit_s * 1e9:
             if moment.scan is not None:
                 self._process_scan(moment.scan, moment.T_odom_base)
-                if len(self.log.poses) % _MEASURE_SCANS == 1:
+                if len(self.log.poses) % scans_per_show == 1:
                     show(*self._measure(goal))
                 if self.is_finished:
                     break

@@ -10,9 +10,6 @@ from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.se2 import Array, wrap
 from thinmap_ros.files.atomic import read_text
 
-# A pose this close to a stamp is used as it is; others are extrapolated by odometry.
-_NEAR_S = 0.1
-
 
 def between_paths(path: Array, onto: Array) -> Array:
     """Rigid motion (3,) that aligns a path (N, 3) with another, by least squares of positions."""
@@ -62,7 +59,7 @@ def read_columns(path: Path, columns: list[int]) -> Array:
 
 
 def relation_errors(
-    times_s: Array, poses: Array, relations: Path, odometry: Path, near_s: float = _NEAR_S
+    times_s: Array, poses: Array, relations: Path, odometry: Path, near_s: float = 0.1
 ) -> RelationErrors:
     """Errors of poses (N, 3) at times (N,), s, by a file of relations `t1 t2 x y z roll pitch yaw`.
 

@@ -9,17 +9,17 @@ from numba.core import event
 from thinmap_ros.core import jit, kernel_cache
 
 _COMPILATION = 'numba:compile'
-_PAUSE_S = 5.0
 
 
 class CompilationReport(event.Listener):
     """Reports on stderr how many kernels are compiled."""
 
-    def __init__(self) -> None:
+    def __init__(self, period_s: float = 5.0) -> None:
+        self._period_s = period_s
         self._depth = 0
         self._seconds = 0.0
         self._began_at = 0.0
-        self._told_at = -_PAUSE_S
+        self._told_at = -period_s
 
     def on_start(self, event: Any) -> None:
         """Handle the start of a compilation, possibly nested in another one."""
@@ -27,7 +27,7 @@ class CompilationReport(event.Listener):
         if self._depth == 0:
             self._began_at = now
         self._depth += 1
-        if now - self._told_at >= _PAUSE_S:
+        if now - self._told_at >= self._period_s:
             self._told_at = now
             # Kernels that are compiled for further types count once.
             there = sum(1 for kernel in jit.KERNELS if kernel.signatures)
