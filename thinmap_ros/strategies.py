@@ -43,6 +43,11 @@ def make_strategy(name: str, config: ExplorerConfig | None = None) -> Strategy:
     return strategy
 
 
+def check_strategy(name: str) -> None:
+    """Raise ConfigError where there is no strategy of this name, or it cannot be imported."""
+    _factory(name, ExplorerConfig())
+
+
 def _factory(name: str, config: ExplorerConfig) -> Callable[[], object]:
     if name == DEFAULT:
         return partial(Explorer, config)

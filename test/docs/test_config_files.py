@@ -122,6 +122,20 @@ def test_unknown_key_of_a_file_is_an_error(declared, tmp_path):
         declared('grid_mapper', '--params-file', str(tmp_path / 'given.yaml'))
 
 
+@pytest.mark.parametrize(
+    ('name', 'meant'),
+    [
+        ('max_speed_m_s', 'controller.max_speed_m_s'),
+        ('planner.unknown_costs', 'planner.unknown_cost'),
+    ],
+)
+def test_an_unknown_parameter_comes_with_what_was_probably_meant(declared, name, meant):
+    with pytest.raises(
+        ConfigError, match=rf'no parameter {name} \(did you mean {meant}\?\); it has'
+    ):
+        declared('navigator', '-p', f'{name}:=0.5')
+
+
 def test_there_is_a_file_for_each_node_and_no_other():
     files = sorted(path.stem for path in (ROOT / 'config').glob('*.yaml'))
     assert files == sorted([*NODES, 'robot'])

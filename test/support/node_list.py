@@ -21,7 +21,7 @@ OF_EVERY_NODE = {'start_type_description_service'}
 # Parameters that must not have their defaults here: an existing bag, no window.
 NEEDED = {'bag_player': {'bag': 'some_bag'}, 'rerun_viewer': {'spawn': False}}
 
-OWN_WORDS = {'use_sim_time': 'follow /clock instead of the time of the machine'}
+OWN_WORDS = {'use_sim_time': 'Follow /clock instead of the time of the machine.'}
 
 
 def node_class(name):

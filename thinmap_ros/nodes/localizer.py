@@ -52,11 +52,12 @@ class _PosePublishers:
     """Publishes poses with their transform, status, line features, and corrected trajectories."""
 
     def __init__(self, node: Node) -> None:
-        def frame(name: str, of: str) -> str:
-            return str(parameters.declare_parameter(node, f'{name}_frame', name, f'frame of {of}'))
-
-        self._map_frame = frame('map', 'the map')
-        self._odom_frame = frame('odom', 'the odometry')
+        self._map_frame = parameters.declare_map_frame(node)
+        self._odom_frame = str(
+            parameters.declare_parameter(
+                node, 'odom_frame', 'odom', 'Frame of the odometry (REP 105).'
+            )
+        )
         self._pose = node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
         self._tf = node.create_publisher(TFMessage, '/tf', qos.STREAM)
         self._features = node.create_publisher(LineFeatureArray, 'line_features', qos.LATCHED)

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from difflib import get_close_matches
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import (
@@ -157,10 +158,18 @@ def reject_unknown(node: Node) -> None:
     else:
         names = str(node.get_name())
     if unknown := sorted(given - known):
+        wrong = ', '.join(name + _suggestion(name, known) for name in unknown)
         raise ConfigError(
-            f'node {names} has no parameter {", ".join(unknown)}; '
-            f'it has: {", ".join(sorted(known))}'
+            f'node {names} has no parameter {wrong}; it has: {", ".join(sorted(known))}'
         )
+
+
+def _suggestion(name: str, known: set[str]) -> str:
+    """The parameter that was probably meant: in another group, or with a similar name."""
+    last = name.split('.')[-1]
+    same = [other for other in sorted(known) if other.split('.')[-1] == last]
+    likely = same or get_close_matches(name, sorted(known), n=1, cutoff=0.75)
+    return f' (did you mean {", ".join(likely)}?)' if likely else ''
 
 
 @dataclasses.dataclass

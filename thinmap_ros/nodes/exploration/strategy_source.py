@@ -7,7 +7,7 @@ from thinmap_ros.core.exploration.mission import Mission, MissionGoal
 from thinmap_ros.core.exploration.strategy import Strategy
 from thinmap_ros.files import sessions
 from thinmap_ros.ros import parameters
-from thinmap_ros.strategies import DEFAULT, NAMES, make_strategy
+from thinmap_ros.strategies import DEFAULT, NAMES, check_strategy, make_strategy
 
 
 class StrategySource:
@@ -23,11 +23,12 @@ class StrategySource:
                 node,
                 'strategy',
                 DEFAULT,
-                f'exploration strategy: {", ".join(NAMES)}, or your own as package.module:factory, '
-                'where factory() returns a Strategy; parameters of end nodes and frontiers hold '
-                'for position_probability and paper only',
+                f'Exploration strategy: {", ".join(NAMES)}, or your own as package.module:factory, '
+                'where factory() returns a Strategy. Parameters of end nodes and frontiers are '
+                'those of position_probability and paper.',
             )
         )
+        check_strategy(self._name)  # before kernels are compiled
         self._config = parameters.declare_config(node, ExplorerConfig, self._on_config)
         self._is_outdated = False
 
