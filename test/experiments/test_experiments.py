@@ -23,6 +23,7 @@ from thinmap_ros.experiments.drives import RECIPES, Source, samples_of_bag
 from thinmap_ros.experiments.exploration.thinning_stages import stages
 from thinmap_ros.experiments.slam import logs, office
 from thinmap_ros.logs.bag import Bag
+from thinmap_ros.logs.carmen import LaserOptions
 from thinmap_ros.tools.experiment import EXPERIMENTS, main, write_outcome
 from thinmap_ros.tools.record_bags import record
 
@@ -177,6 +178,11 @@ def test_relation_errors_of_a_known_path(tmp_path: Path) -> None:
     errors = relation_errors(times, poses, tmp_path / 'relations', tmp_path / 'odom')
     assert errors.metres == pytest.approx([0.0, 0.5, 0.5], abs=1e-9)
     assert errors.degrees == pytest.approx([0.0, np.degrees(0.1), 0.0])
+
+
+@pytest.mark.parametrize('log', sorted(logs._LASERS))
+def test_lasers_of_known_logs_are_valid(tmp_path: Path, log: str) -> None:
+    assert logs.laser_of(tmp_path, log) != LaserOptions()
 
 
 @pytest.mark.programs

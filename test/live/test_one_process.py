@@ -140,5 +140,9 @@ def test_what_cannot_be_run_is_reported_in_one_line(ros_domain):
     done = run('localizer', 'grid_mapper', '--ros-args', '-p', 'gaet:=1.0')
     assert done.returncode == 2 and 'localizer, grid_mapper has no parameter gaet' in done.stderr
     assert len(done.stderr.splitlines()) == 1
-    done = run('localizer', 'grid_mapper', '--ros-args', '-p', 'gate:=-1.0')
-    assert done.returncode == 2 and 'gate' in done.stderr and 'Traceback' not in done.stderr
+    done = run('localizer', 'grid_mapper', '--ros-args', '-p', 'association.gate:=-1.0')
+    assert (
+        done.returncode == 2
+        and 'association.gate' in done.stderr
+        and 'Traceback' not in done.stderr
+    )

@@ -25,7 +25,7 @@ _LASERS = {
         'offset_m': 0.16,
         'start_angle_deg': -110.0079,
         'step_deg': 0.352025,
-        'max_range_m': 25.0,
+        'range_max_m': 25.0,
     },
 }
 # Published results on the Intel log: errors of translation in m, live and after all corrections;
