@@ -62,7 +62,7 @@ def test_the_residual_covariance_is_that_of_numeric_differences(increment):
 
     def corrected(offset):
         calibration = OdometryCalibration()
-        calibration.known = known + offset
+        calibration.parameters = known + offset
         return calibration.corrected(np.array(increment), NOISE)
 
     step = 1e-6
@@ -78,18 +78,18 @@ def test_a_single_slip_does_not_change_the_calibration():
     for k, (T, told) in enumerate(driven(300)):
         calibration.corrected(told + [0.5, 0.0, 0.4] if k == 250 else told, NOISE)
         calibration.update(T, KNOWN)
-        known.append(calibration.known)
+        known.append(calibration.parameters)
     np.testing.assert_allclose(known[-1], known[249], atol=5e-3)
 
 
 def test_across_an_interruption_nothing_is_compared():
     calibration = OdometryCalibration()
-    known = calibration.known
+    known = calibration.parameters
     for k, (T, told) in enumerate(driven(100)):
         calibration.corrected(told, NOISE)
         calibration.update(T + [3.0 * k, 0.0, 0.0], KNOWN)
         calibration.reset_segment()
-    np.testing.assert_array_equal(calibration.known, known)
+    np.testing.assert_array_equal(calibration.parameters, known)
 
 
 def test_what_the_map_leaves_open_teaches_nothing():
@@ -102,4 +102,4 @@ def test_what_the_map_leaves_open_teaches_nothing():
     for T, told in driven(300):
         alone.corrected(told, NOISE)
         alone.update(T + [0.2 * T[0], 0.0, 0.0], KNOWN)
-    assert abs(calibration.known[0] - 1.0) < 0.2 * abs(alone.known[0] - 1.0)
+    assert abs(calibration.parameters[0] - 1.0) < 0.2 * abs(alone.parameters[0] - 1.0)

@@ -24,7 +24,7 @@ def learned(rng, walls=ROOM, turned=TURNED, looks=20):
     compass = WallCompass()
     for k in range(looks):
         place = PLACES[k % len(PLACES)] + [0.0, 0.0, 0.2 * k]
-        compass.learn(lines_at(place, rng, walls), place[2] + turned, 0.3 * k)
+        compass.add_lines(lines_at(place, rng, walls), place[2] + turned, 0.3 * k)
     return compass
 
 
@@ -65,7 +65,7 @@ def test_what_was_seen_where_the_map_began_counts_most(rng):
     compass = learned(rng)
     for k in range(60):
         place = PLACES[k % len(PLACES)]
-        compass.learn(lines_at(place, rng), place[2] + TURNED + 0.02, 100.0 + k)
+        compass.add_lines(lines_at(place, rng), place[2] + TURNED + 0.02, 100.0 + k)
     assert abs(compass.direction - TURNED) < 0.006
 
 

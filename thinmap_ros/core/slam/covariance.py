@@ -103,16 +103,16 @@ class PoseUncertainty:
         off = se2.pose_difference(match.T_map_base, prior)
         return float(off @ np.linalg.solve(self.since_match, off)) > CHI2
 
-    def learn(self, share: float) -> None:
+    def map_updated(self, share: float) -> None:
         """Account for a map update; share: of the scan's error that is independent of the last."""
-        by_scan = self.by_scan
-        self._since_keyframe = self._since_keyframe + self.motion_part + share * by_scan
-        self._map_update_covariance = (1.0 - share) * by_scan
+        scan_part = self.scan_part
+        self._since_keyframe = self._since_keyframe + self.motion_part + share * scan_part
+        self._map_update_covariance = (1.0 - share) * scan_part
         self.since_map_update = np.zeros((3, 3))
         self.motion_part = np.zeros((3, 3))
 
     @property
-    def by_scan(self) -> Array:
+    def scan_part(self) -> Array:
         """Share (3, 3) of `since_map_update` that is due to the scan."""
         return self.since_map_update - self.motion_part
 

@@ -31,7 +31,7 @@ class HeadingCorrection:
         """
         # The gate is narrower than the variance of the pose: a larger heading error is also in the
         # local map, and a scan that is corrected alone would no longer fit this map.
-        self._variance += float(pose.motion_part[2, 2] + self._new_ratio * pose.by_scan[2, 2])
+        self._variance += float(pose.motion_part[2, 2] + self._new_ratio * pose.scan_part[2, 2])
         self.measured = None
         if not fits:
             return T_map_base
@@ -42,5 +42,5 @@ class HeadingCorrection:
             gain = self._variance / (self._variance + self.measured.variance)
             heading = float(se2.wrap(heading + gain * (self.measured.yaw - heading)))
             self._variance *= 1.0 - gain
-        self._compass.learn(lines, heading, path_m)
+        self._compass.add_lines(lines, heading, path_m)
         return se2.pose(x, y, heading)

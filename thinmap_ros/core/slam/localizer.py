@@ -47,7 +47,7 @@ from thinmap_ros.core.slam.matching.scan_matcher import (
 from thinmap_ros.core.slam.matching.surface import surface_points
 from thinmap_ros.core.slam.motion_model import MotionConfig
 from thinmap_ros.core.slam.odometry_prediction import OdometryPrediction, Prediction
-from thinmap_ros.core.slam.tracking import FOR_A_SLIP, Tracking
+from thinmap_ros.core.slam.tracking import INLIERS_PER_CONTRADICTION, Tracking
 
 _SIGMAS = 3.0
 _VIEW_M = 1.0  # path length after which the errors of two matches are independent
@@ -261,7 +261,7 @@ class Localizer:
     def _is_rejected(self, match: Match) -> bool:
         """Whether an unexpected match is rejected: many of its points contradict the map."""
         return (
-            match.inlier_ratio < FOR_A_SLIP * match.contradiction_ratio
+            match.inlier_ratio < INLIERS_PER_CONTRADICTION * match.contradiction_ratio
             and not self._tracking.is_delocalized
         )
 
@@ -281,7 +281,7 @@ class Localizer:
         self._map.add_scan(points, scan.T_base_laser, self._pose)
         # Motion errors are independent in each step. The error of a match is correlated with that
         # of the previous match as long as the same walls are observed.
-        self._uncertainty.learn(min(1.0, path_m / _VIEW_M + turn))
+        self._uncertainty.map_updated(min(1.0, path_m / _VIEW_M + turn))
         if len(points) >= FEWEST_POINTS and self._loops.needs_keyframe(self._pose):
             self._add_keyframe(scan, points)
 

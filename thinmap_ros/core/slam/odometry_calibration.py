@@ -48,7 +48,7 @@ class OdometryCalibration:
     def __init__(self, config: CalibrationConfig | None = None) -> None:
         self._config = config or CalibrationConfig()
         # Estimated parameters: scale, drift in rad/m, turn_scale, askew in rad.
-        self.known = np.array([1.0, 0.0, 1.0, 0.0])
+        self.parameters = np.array([1.0, 0.0, 1.0, 0.0])
         self._covariance = np.diag(np.square(self._config.prior_sigmas))
         self._begin: Array | None = None
         self._begin_covariance: Array = np.zeros((3, 3))  # of the pose _begin, map frame
@@ -70,7 +70,7 @@ class OdometryCalibration:
         """
         length = _signed_length(increment)
         turned = float(increment[2])
-        scale, drift, turn_scale, askew = self.known
+        scale, drift, turn_scale, askew = self.parameters
         turn = turn_scale * turned + drift * length
         bent = askew + 0.5 * (turn - turned)  # the chord of an arc is rotated by half its turn
         c = scale * math.cos(bent)
@@ -136,7 +136,7 @@ class OdometryCalibration:
                 + float(along @ covariance[:2, :2] @ along)
             )
             self._update(
-                x * dx + y * dy, np.array([length / self.known[0], 0.0, 0.0, 0.0]), variance
+                x * dx + y * dy, np.array([length / self.parameters[0], 0.0, 0.0, 0.0]), variance
             )
             # The lateral offset contains half of the turn error.
             aside = x * dy - y * dx - 0.5 * length * off_turn
@@ -157,7 +157,7 @@ class OdometryCalibration:
         if off * off > self._config.gate_sigmas**2 * variance:
             return
         gain = along / variance
-        self.known = self.known + gain * off
+        self.parameters = self.parameters + gain * off
         self._covariance -= np.outer(gain, along)
 
 

@@ -10,7 +10,9 @@ from thinmap_ros.core.slam.graph.keyframes import propagated_covariance, rotated
 from thinmap_ros.core.slam.matching.scan_matcher import Match
 from thinmap_ros.core.slam.odometry_prediction import Prediction
 
-FOR_A_SLIP = 3.0  # inliers for each contradicting point, for a match to override the odometry
+INLIERS_PER_CONTRADICTION = (
+    3.0  # inliers for each contradicting point, for a match to override the odometry
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +78,7 @@ class Tracking:
         """Update the evidence by a match; None (no match was possible) leaves it unchanged."""
         if match is None:
             return
-        more = match.contradiction_ratio - match.inlier_ratio / FOR_A_SLIP
+        more = match.contradiction_ratio - match.inlier_ratio / INLIERS_PER_CONTRADICTION
         self.evidence = max(self.evidence + more, 0.0)
         if self.is_delocalized:
             self.evidence = min(self.evidence, self._lost_evidence)

@@ -62,7 +62,7 @@ class WallCompass:
         self._metres = np.zeros(_BINS)
         self._places = np.zeros(_BINS)
 
-    def learn(self, lines: Lines, yaw: float, path_m: float) -> None:
+    def add_lines(self, lines: Lines, yaw: float, path_m: float) -> None:
         """Add the walls of a scan with heading yaw (rad), after a path of a length (m)."""
         at = (lines.z[:, 1] + yaw) % _QUARTER / _QUARTER * _BINS
         bins = at.astype(np.int64)
