@@ -10,9 +10,8 @@ from thinmap_ros.core.slam.graph.keyframes import propagated_covariance, rotated
 from thinmap_ros.core.slam.matching.scan_matcher import Match
 from thinmap_ros.core.slam.odometry_prediction import Prediction
 
-INLIERS_PER_CONTRADICTION = (
-    3.0  # inliers for each contradicting point, for a match to override the odometry
-)
+# Inliers for each contradicting point with which a match overrides the odometry.
+INLIERS_PER_CONTRADICTION = 3.0
 
 
 @dataclass(frozen=True, eq=False)
