@@ -26,7 +26,7 @@ from thinmap_ros.sim.world import World
 from thinmap_ros.strategies import DEFAULT, make_strategy
 
 _CONTROL_STEPS = 2
-# As often as the strategy searches frontiers; thinning costs more than all else together.
+# The period of the candidate search; thinning costs more than all other stages.
 SCANS_PER_GRAPH = 5
 Watch = Callable[[Decision, Array], None]
 """Receives each decision, and the estimated pose (3,) at which it was made."""
@@ -141,7 +141,7 @@ class ClosedLoop:
             self.decide(scan, estimate)
 
     def log_poses(self, scan: Scan, estimate: Estimate) -> None:
-        """RunLog where the robot is, and where it thinks that it is."""
+        """Log the true and the estimated pose of a scan."""
         self.log.stamps_ns.append(scan.stamp_ns)
         self.log.poses.append(estimate.T_map_base)
         self.log.true_poses.append(self.simulation.robot.T_world_base)
@@ -149,7 +149,7 @@ class ClosedLoop:
             self.mishap.add_estimate(self, scan, estimate)
 
     def decide(self, scan: Scan, estimate: Estimate) -> None:
-        """Have the strategy decide where to drive, by the present map."""
+        """Choose a target in the present map."""
         self._T_map_odom = estimate.T_map_odom
         observation = Observation(
             self.pipeline.topology.map, self.pipeline.grid.known_area(), scan, estimate.T_map_base
@@ -172,7 +172,7 @@ class ClosedLoop:
     def replace_strategy(
         self, pipeline: Pipeline, strategy: Strategy, navigator: Navigator
     ) -> None:
-        """Use other parts from now on; the robot stops first."""
+        """Replace pipeline, strategy and navigator; the robot stops first."""
         self.navigator.cancel()
         self.pipeline = pipeline
         self.strategy = strategy
@@ -203,7 +203,7 @@ class ClosedLoop:
 
 
 def ground_truth_poses(simulation: Simulation) -> Callable[[Scan, Array], Estimate]:
-    """Replace the localizer by the simulator's true pose."""
+    """Pose source that replaces the localizer by the true pose of the simulator."""
 
     def locate(scan: Scan, T_odom_base: Array) -> Estimate:
         T_map_base = simulation.robot.T_world_base

@@ -193,6 +193,12 @@ def test_it_resumes_after_a_cancelled_goal_and_after_a_restart(graph, robot, tmp
         graph.until(lambda: robot.end_nodes, 'what was looked at last')
         # The robot has not moved: there is no new evidence, and the old one is kept.
         assert robot.evidence() == before
+    # The evidence of one scheme is not that of another.
+    assert graph.stop('explorer') == 0, graph.log('explorer')
+    graph.start('explorer', laser_pose='0,0,0', use_sim_time=True, strategy='paper')
+    answer = graph.call(SaveMap, 'save_exploration', SaveMap.Request(path=str(stem)))
+    assert answer.success and 'paper has nothing to save' in answer.message
+    assert not (tmp_path / 'room.exploration.npz').exists()
 
 
 def test_a_users_own_strategy_explores(graph):

@@ -34,7 +34,7 @@ class ObservationBuffer:
         self._mapped_scan_matcher: StampMatcher[tuple[Scan, Array], bool] = StampMatcher()
 
     def replace_map(self, patch: GridPatch) -> None:
-        """Take a whole map in place of the present one."""
+        """Replace the whole map."""
         self._map.replace(patch)
 
     def add_local_map(self, stamp_ns: int, patch: GridPatch) -> Observation | None:

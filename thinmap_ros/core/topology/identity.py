@@ -118,8 +118,8 @@ class Registry:
     def refresh(self, atlas: Atlas) -> bool:
         """Follow the changes of the atlas since the last call; returns whether there were any.
 
-        A new node takes over the id of one that is gone and lay within node_match_radius_m: nearest
-        pairs first, and one of another kind counts as farther away unless it was in the same cell.
+        A new node gets the id of a removed one that lay within node_match_radius_m: nearest pairs
+        first, and one of another kind counts as farther away unless it was in the same cell.
         An edge between two nodes keeps its id.
         """
         spots, chains = atlas.take_changes()

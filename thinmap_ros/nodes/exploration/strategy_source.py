@@ -54,7 +54,7 @@ class StrategySource:
 
         Raises OSError where writing fails.
         """
-        if isinstance(strategy, Explorer):
+        if self._name == DEFAULT and isinstance(strategy, Explorer):
             return f'saved {sessions.EXPLORATION.save(path, strategy)}'
         archived = sessions.EXPLORATION.archive(path)
         nothing = f'strategy {self._name} has nothing to save'
