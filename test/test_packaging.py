@@ -63,6 +63,8 @@ KNOWN_PACKAGES = {
     'diagnostic_msgs',
     'geometry_msgs',
     'lifecycle_msgs',
+    'map_msgs',
+    'nav2_msgs',
     'nav_msgs',
     'rcl_interfaces',
     'rclpy',
