@@ -9,7 +9,7 @@ from geometry_msgs.msg import TransformStamped
 from thinmap_ros.core import se2
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.ros import messages
-from thinmap_ros.ros.transform_listener import TransformBuffer
+from thinmap_ros.ros.tf.transform_listener import TransformBuffer
 
 SECOND_NS = 10**9
 

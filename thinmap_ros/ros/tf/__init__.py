@@ -1,0 +1,1 @@
+"""Transforms between the frames of the robot (TF)."""
