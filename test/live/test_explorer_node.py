@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav2_msgs.action import NavigateToPose
 from nav_msgs.msg import OccupancyGrid
 from rclpy.action import ActionClient, ActionServer
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
 
-from thinmap_msgs.action import Explore, NavigateToPose
+from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import EndNodeArray, ExplorationStatus, SlamStatus, TopologicalMap
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.core.exploration.mission import MissionState
@@ -93,7 +94,7 @@ class Robot:
 
         def refuse(handle):
             handle.abort()
-            return NavigateToPose.Result(success=False, reason='the wheels are chained')
+            return NavigateToPose.Result(error_code=9000, error_msg='the wheels are chained')
 
         self.driver = ActionServer(self.node, NavigateToPose, 'navigate_to_pose', refuse)
 

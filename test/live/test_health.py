@@ -6,13 +6,13 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from nav2_msgs.action import NavigateToPose
 from nav_msgs.msg import OccupancyGrid
 from rclpy.action import ActionClient
 from sensor_msgs.msg import LaserScan
 from std_srvs.srv import SetBool, Trigger
 from support.doctor import Doctor
 
-from thinmap_msgs.action import NavigateToPose
 from thinmap_msgs.msg import TopologicalMap
 from thinmap_ros.ros import diagnostics, qos
 

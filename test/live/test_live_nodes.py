@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
+from nav2_msgs.action import NavigateToPose
 from nav_msgs.msg import OccupancyGrid, Odometry
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
-from thinmap_msgs.action import NavigateToPose
 from thinmap_msgs.msg import SlamStatus, TopologicalMap
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.files import occupancy_maps

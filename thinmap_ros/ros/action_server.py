@@ -18,6 +18,14 @@ class Outcome(Enum):
     CANCELED = 'canceled'
 
 
+class InvalidGoalError(Exception):
+    """A goal that cannot be followed, with the result that its client receives."""
+
+    def __init__(self, result: Any) -> None:
+        super().__init__(str(result))
+        self.result = result
+
+
 class SingleGoalServer:
     """Accepts a goal, and returns its result when the node calls `finish`.
 
@@ -25,7 +33,7 @@ class SingleGoalServer:
     with the result of `preempted`. rclpy runs a goal in a coroutine, and one that waits keeps the
     executor busy; here the coroutine starts when the result is known. `on_cancel` records the
     request: the node calls `finish` later, from another callback, when the goal's state has
-    changed.
+    changed. One server may serve several actions: there is one goal at a time among all of them.
     """
 
     def __init__(
@@ -36,23 +44,36 @@ class SingleGoalServer:
         on_goal: Callable[[Any], None],
         on_cancel: Callable[[], None],
         preempted: Callable[[], Any],
+        read: Callable[[Any], Any] = lambda request: request,
     ) -> None:
+        """on_goal: receives what `read` returns for the goal of a request.
+
+        read: raises InvalidGoalError for a goal that is aborted at once; the old goal continues.
+        preempted: returns the result of the old goal, before `on_goal` is called.
+        """
+        self._node = node
         self._on_goal = on_goal
         self._on_cancel = on_cancel
         self._preempted = preempted
         self._handle: ServerGoalHandle | None = None
         self._endings: dict[bytes, tuple[Outcome, Any]] = {}
-        self._server = ActionServer(
-            node,
+        self._servers: list[ActionServer] = []
+        self.add_action(action, name, read)
+
+    def add_action(self, action: Any, name: str, read: Callable[[Any], Any]) -> None:
+        """Serve another action; read: as for the first one."""
+        server = ActionServer(
+            self._node,
             action,
             name,
             execute_callback=self._end,
             goal_callback=lambda request: (
-                GoalResponse.ACCEPT if node.is_active else GoalResponse.REJECT
+                GoalResponse.ACCEPT if self._node.is_active else GoalResponse.REJECT
             ),
             cancel_callback=self._cancel,
-            handle_accepted_callback=self._accept,
+            handle_accepted_callback=lambda handle: self._accept(handle, read),
         )
+        self._servers.append(server)
 
     @property
     def active(self) -> bool:
@@ -69,13 +90,22 @@ class SingleGoalServer:
         handle = self._handle
         self._handle = None
         if handle is not None:
-            self._endings[bytes(handle.goal_id.uuid)] = (outcome, result)
-            handle.execute()
+            self._execute(handle, outcome, result)
 
-    def _accept(self, handle: ServerGoalHandle) -> None:
+    def _execute(self, handle: ServerGoalHandle, outcome: Outcome, result: Any) -> None:
+        """Run the coroutine of a goal, which ends at once."""
+        self._endings[bytes(handle.goal_id.uuid)] = (outcome, result)
+        handle.execute()
+
+    def _accept(self, handle: ServerGoalHandle, read: Callable[[Any], Any]) -> None:
+        try:
+            goal = read(handle.request)
+        except InvalidGoalError as invalid:
+            self._execute(handle, Outcome.ABORTED, invalid.result)
+            return
         self.finish(Outcome.ABORTED, self._preempted())
         self._handle = handle
-        self._on_goal(handle.request)
+        self._on_goal(goal)
 
     def _cancel(self, handle: ServerGoalHandle) -> CancelResponse:
         if self._handle is None or handle.goal_id != self._handle.goal_id:

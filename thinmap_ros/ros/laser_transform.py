@@ -20,10 +20,11 @@ class LaserTransform:
 
     It is looked up in the static transforms, as for bags. For a robot that does not publish them,
     the parameter `laser_pose` [x m, y m, yaw rad] is used for every frame. There is no default.
+    base_frame: value of the parameter of this name.
     """
 
     def __init__(self, node: Node) -> None:
-        self._base_frame = str(
+        self.base_frame = str(
             parameters.declare_parameter(
                 node, 'base_frame', 'base_link', 'Frame of the robot (REP 105).'
             )
@@ -60,7 +61,7 @@ class LaserTransform:
         if mount is None:
             raise InputError(
                 f'scan in frame {quoted(message.header.frame_id)}: no static transform from '
-                f'"{self._base_frame}" to it; publish one on /tf_static or set the parameter '
+                f'"{self.base_frame}" to it; publish one on /tf_static or set the parameter '
                 'laser_pose'
             )
         scan = messages.scan_from_msg(message, mount.T_base_laser, self._zero_is_no_return)
@@ -75,7 +76,7 @@ class LaserTransform:
         if self._fixed is not None:
             return self._fixed
         if frame_id not in self._mounts:
-            found = self._transforms.laser_mount(frame_id, self._base_frame)
+            found = self._transforms.laser_mount(frame_id, self.base_frame)
             if found is None:
                 return None
             self._mounts[frame_id] = found

@@ -7,6 +7,7 @@ import time
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
+from nav2_msgs.action import NavigateToPose
 from nav_msgs.msg import OccupancyGrid, Odometry
 from rclpy.action import ActionClient
 from rosgraph_msgs.msg import Clock
@@ -15,7 +16,7 @@ from support.doctor import Doctor
 from support.halls import AT_START, START, empty_hall
 from support.slam_room import ROOM, scan_in
 
-from thinmap_msgs.action import Explore, NavigateToPose
+from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import ExplorationStatus, TopologicalMap
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.files.snapshots import write_snapshot

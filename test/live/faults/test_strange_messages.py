@@ -11,13 +11,14 @@ from action_msgs.msg import GoalStatus
 from fuzz.strange_messages import CHECKS, made, numbers
 from geometry_msgs.msg import Point32, PoseWithCovarianceStamped, Twist
 from lifecycle_msgs.srv import GetState
+from nav2_msgs.action import NavigateToPose
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from rclpy.action import ActionClient
 from sensor_msgs.msg import LaserScan
 from support.doctor import Doctor
 from tf2_msgs.msg import TFMessage
 
-from thinmap_msgs.action import Explore, NavigateToPose
+from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import (
     EndNodeArray,
     ExplorationStatus,
@@ -213,7 +214,7 @@ def test_goals_that_are_no_goals_end_with_a_reason(graph):
         goal = NavigateToPose.Goal()
         goal.pose.pose.position.x = wrong
         ended = graph.act(NavigateToPose, 'navigate_to_pose', goal)
-        assert ended.status == GoalStatus.STATUS_ABORTED and 'position' in ended.result.reason
+        assert ended.status == GoalStatus.STATUS_ABORTED and 'position' in ended.result.error_msg
     for name in ('explorer', 'navigator'):
         assert graph.stop(name) == 0, graph.log(name)
 
