@@ -1,11 +1,13 @@
 """An action server with one goal at a time, driven by callbacks without blocking."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
+from rclpy.impl.implementation_singleton import rclpy_implementation
 
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 
@@ -26,12 +28,21 @@ class InvalidGoalError(Exception):
         self.result = result
 
 
+@dataclass(frozen=True)
+class _Goal:
+    """An accepted goal, and the server that accepted it."""
+
+    server: ActionServer
+    handle: ServerGoalHandle
+
+
 class SingleGoalServer:
     """Accepts a goal, and returns its result when the node calls `finish`.
 
     Goals are accepted while the node is active. A new goal preempts the old one, which is aborted
     with the result of `preempted`. rclpy runs a goal in a coroutine, and one that waits keeps the
-    executor busy; here the coroutine starts when the result is known. `on_cancel` records the
+    executor busy; here the coroutine starts when the result is known, although the goal's status
+    is EXECUTING from its acceptance on, as clients of Nav2 expect. `on_cancel` records the
     request: the node calls `finish` later, from another callback, when the goal's state has
     changed. One server may serve several actions: there is one goal at a time among all of them.
     """
@@ -55,14 +66,13 @@ class SingleGoalServer:
         self._on_goal = on_goal
         self._on_cancel = on_cancel
         self._preempted = preempted
-        self._handle: ServerGoalHandle | None = None
+        self._goal: _Goal | None = None
         self._endings: dict[bytes, tuple[Outcome, Any]] = {}
-        self._servers: list[ActionServer] = []
         self.add_action(action, name, read)
 
     def add_action(self, action: Any, name: str, read: Callable[[Any], Any]) -> None:
         """Serve another action; read: as for the first one."""
-        server = ActionServer(
+        server: ActionServer = ActionServer(
             self._node,
             action,
             name,
@@ -71,44 +81,45 @@ class SingleGoalServer:
                 GoalResponse.ACCEPT if self._node.is_active else GoalResponse.REJECT
             ),
             cancel_callback=self._cancel,
-            handle_accepted_callback=lambda handle: self._accept(handle, read),
+            handle_accepted_callback=lambda handle: self._accept(_Goal(server, handle), read),
         )
-        self._servers.append(server)
 
     @property
     def active(self) -> bool:
         """Whether there is a goal."""
-        return self._handle is not None
+        return self._goal is not None
 
     def feedback(self, message: Any) -> None:
         """Publish feedback on the goal, if there is one."""
-        if self._handle is not None:
-            self._handle.publish_feedback(message)
+        if self._goal is not None:
+            self._goal.handle.publish_feedback(message)
 
     def finish(self, outcome: Outcome, result: Any) -> None:
         """End the goal, if there is one, with a result."""
-        handle = self._handle
-        self._handle = None
-        if handle is not None:
-            self._execute(handle, outcome, result)
+        goal = self._goal
+        self._goal = None
+        if goal is not None:
+            self._run(goal, outcome, result)
 
-    def _execute(self, handle: ServerGoalHandle, outcome: Outcome, result: Any) -> None:
+    def _run(self, goal: _Goal, outcome: Outcome, result: Any) -> None:
         """Run the coroutine of a goal, which ends at once."""
-        self._endings[bytes(handle.goal_id.uuid)] = (outcome, result)
-        handle.execute()
+        self._endings[bytes(goal.handle.goal_id.uuid)] = (outcome, result)
+        goal.server.notify_execute(goal.handle, None)
 
-    def _accept(self, handle: ServerGoalHandle, read: Callable[[Any], Any]) -> None:
+    def _accept(self, goal: _Goal, read: Callable[[Any], Any]) -> None:
+        # What the handle's `execute` does, without the coroutine.
+        goal.handle._update_state(rclpy_implementation.GoalEvent.EXECUTE)
         try:
-            goal = read(handle.request)
+            request = read(goal.handle.request)
         except InvalidGoalError as invalid:
-            self._execute(handle, Outcome.ABORTED, invalid.result)
+            self._run(goal, Outcome.ABORTED, invalid.result)
             return
         self.finish(Outcome.ABORTED, self._preempted())
-        self._handle = handle
-        self._on_goal(goal)
+        self._goal = goal
+        self._on_goal(request)
 
     def _cancel(self, handle: ServerGoalHandle) -> CancelResponse:
-        if self._handle is None or handle.goal_id != self._handle.goal_id:
+        if self._goal is None or handle.goal_id != self._goal.handle.goal_id:
             return CancelResponse.REJECT
         self._on_cancel()
         return CancelResponse.ACCEPT
