@@ -17,6 +17,7 @@ from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.core.topology.rebuild import Rebuilding
 from thinmap_ros.files.sessions import TOPOLOGY, load_topology
 from thinmap_ros.kernels import warm_up
+from thinmap_ros.nodes.routing.route_graph import RouteGraphUpdates
 from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.checkpoint import StateStamp
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
@@ -31,23 +32,24 @@ class _TopologyPublishers:
     """Publishes the topological map, and the part of it near the robot."""
 
     def __init__(self, node: Node) -> None:
-        self._frame = parameters.declare_map_frame(node)
+        self.frame_id = parameters.declare_map_frame(node)
         self._local = node.create_publisher(TopologicalMapMsg, 'local_topology', qos.LATCHED)
         self._global = node.create_publisher(TopologicalMapMsg, 'topology', qos.LATCHED)
         self.has_published = False
 
     def publish_map(self, topology: TopologicalMap, stamp_ns: int) -> None:
         self.has_published = True
-        self._global.publish(messages.topology_msg(topology, self._frame, stamp_ns))
+        self._global.publish(messages.topology_msg(topology, self.frame_id, stamp_ns))
 
     def publish_local_map(self, topology: TopologicalMap, stamp_ns: int) -> None:
-        self._local.publish(messages.topology_msg(topology, self._frame, stamp_ns))
+        self._local.publish(messages.topology_msg(topology, self.frame_id, stamp_ns))
 
 
 class TopologyBuilderNode(ThinmapNode):
     """/local_map and /pose in; /local_topology and /topology out.
 
-    Services save_topology and load_topology.
+    Services save_topology and load_topology. Where Nav2's route server runs, it is given the graph
+    when it has changed, and when it is saved: client of route_server/set_route_graph.
     After a /trajectory the graph is rebuilt from the /map that has undergone that correction; until
     it comes the graph stays as it is. Nodes keep their ids.
     """
@@ -58,6 +60,9 @@ class TopologyBuilderNode(ThinmapNode):
         self._output = _TopologyPublishers(self)
         self._session = parameters.declare_session(self)
         self._save_directory = SaveDirectory(self)
+        self._route_graph = RouteGraphUpdates(
+            self, self._output.frame_id, lambda: self._builder.map
+        )
         parameters.reject_unknown(self)
         warm_up.topology_builder()
         subscribe_guarded(self, Path, 'trajectory', self._on_trajectory, qos.LATCHED)
@@ -141,6 +146,7 @@ class TopologyBuilderNode(ThinmapNode):
     def _publish(self, stamp_ns: int) -> None:
         self._checkpoint_new_ids()
         self._output.publish_map(self._builder.map, stamp_ns)
+        self._route_graph.graph_changed()
 
     def _checkpoint_new_ids(self) -> None:
         """Save a checkpoint before new ids are published: other nodes may rely on them."""
@@ -151,7 +157,9 @@ class TopologyBuilderNode(ThinmapNode):
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         def save() -> str:
             path = self._save_directory.resolve(request.path)
-            return f'saved {TOPOLOGY.save(path, self._builder)}'
+            saved = TOPOLOGY.save(path, self._builder)
+            self._route_graph.graph_saved()
+            return f'saved {saved}'
 
         return fill_response(response, save)
 
