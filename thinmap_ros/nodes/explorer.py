@@ -1,11 +1,16 @@
 """Exploration node: visits end nodes until all are reliable."""
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import OccupancyGrid
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.action import Explore
-from thinmap_msgs.msg import EndNodeArray, ExplorationStatus, SlamStatus, TopologicalMap
+from thinmap_msgs.msg import (
+    EndNodeArray,
+    ExplorationStatus,
+    ProbabilityGrid,
+    SlamStatus,
+    TopologicalMap,
+)
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.core.errors import InputError
 from thinmap_ros.core.exploration.mission import (
@@ -74,8 +79,8 @@ class ExplorerNode(ThinmapNode):
         self._end_nodes = self.create_publisher(EndNodeArray, 'end_nodes', qos.LATCHED)
         self._status = self.create_publisher(ExplorationStatus, 'exploration_status', qos.LATCHED)
         subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
-        subscribe_guarded(self, OccupancyGrid, 'map', self._on_map, qos.LATCHED)
-        subscribe_guarded(self, OccupancyGrid, 'local_map', self._on_local_map, qos.LATCHED)
+        subscribe_guarded(self, ProbabilityGrid, 'grid', self._on_grid, qos.LATCHED)
+        subscribe_guarded(self, ProbabilityGrid, 'local_grid', self._on_local_grid, qos.LATCHED)
         subscribe_guarded(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
         subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
         subscribe_guarded(self, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
@@ -112,10 +117,10 @@ class ExplorerNode(ThinmapNode):
     def _on_topology(self, message: TopologicalMap) -> None:
         self._buffer.topology = messages.topology_from_msg(message)
 
-    def _on_map(self, message: OccupancyGrid) -> None:
+    def _on_grid(self, message: ProbabilityGrid) -> None:
         self._buffer.replace_map(messages.grid_from_msg(message))
 
-    def _on_local_map(self, message: OccupancyGrid) -> None:
+    def _on_local_grid(self, message: ProbabilityGrid) -> None:
         stamp_ns = messages.stamp_ns(message.header.stamp)
         self._process(self._buffer.add_local_map(stamp_ns, messages.grid_from_msg(message)))
 

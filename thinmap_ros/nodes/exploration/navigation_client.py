@@ -2,11 +2,12 @@
 
 from collections.abc import Callable
 
+from action_msgs.msg import GoalStatus
+from nav2_msgs.action import NavigateToPose
 from rclpy.action import ActionClient
 from rclpy.action.client import ClientGoalHandle
 from rclpy.task import Future
 
-from thinmap_msgs.action import NavigateToPose
 from thinmap_ros.core.exploration.mission import DriveRequest
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.ros import messages
@@ -58,7 +59,7 @@ class NavigationClient:
 
     def _send(self, request: DriveRequest) -> None:
         self._request = request
-        goal = NavigateToPose.Goal(use_heading=True)
+        goal = NavigateToPose.Goal()
         now_ns = self._node.get_clock().now().nanoseconds
         goal.pose = messages.pose_stamped_msg(request.goal, self._frame_id, now_ns)
         sent = self._client.send_goal_async(goal, self._on_feedback)
@@ -84,10 +85,11 @@ class NavigationClient:
     def _on_done(self, future: Future, request: DriveRequest) -> None:
         if request is not self._request:
             return  # the result of a goal that was replaced
-        result: NavigateToPose.Result = future.result().result
+        ended = future.result()
         self._request = None
         self._handle = None
-        self._on_result(bool(result.success), str(result.reason))
+        is_success = ended.status == GoalStatus.STATUS_SUCCEEDED
+        self._on_result(is_success, str(ended.result.error_msg))
 
     def _now_s(self) -> float:
         return float(self._node.get_clock().now().nanoseconds) / 1e9
