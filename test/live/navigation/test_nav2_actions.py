@@ -11,7 +11,7 @@ from nav2_msgs.action import NavigateThroughPoses, NavigateToPose
 from nav_msgs.msg import Odometry, Path
 from rclpy.action import ActionClient
 from support.doctor import Doctor
-from support.still_robot import StillRobot
+from support.nav2.still_robot import StillRobot
 
 from thinmap_ros.ros import messages, qos
 
