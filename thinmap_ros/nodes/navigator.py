@@ -2,7 +2,7 @@
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav2_msgs.action import NavigateThroughPoses, NavigateToPose
-from nav_msgs.msg import OccupancyGrid, Odometry, Path
+from nav_msgs.msg import OccupancyGrid, Path
 from rclpy.action import ActionClient
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
@@ -25,6 +25,7 @@ from thinmap_ros.ros.diagnostics import OK, WARN
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
+from thinmap_ros.ros.tf.odometry_source import NONE, OdometrySource
 from thinmap_ros.ros.velocity.commands import VelocityPublisher, declare_stamped
 
 # As in Nav2, there is no estimate of the remaining time below this speed or distance.
@@ -55,7 +56,7 @@ class _NavigatorPublishers:
 
 
 class NavigatorNode(ThinmapNode):
-    """/pose, /odom, /scan, /tf and the maps in; /cmd_vel and /plan out.
+    """/pose, /scan, odometry, /tf and the maps in; /cmd_vel and /plan out.
 
     Actions navigate_to_pose and navigate_through_poses, as Nav2's: one goal at a time, a newer one
     replaces it. /goal_pose sends a goal to navigate_to_pose. Goals in other frames than the map's
@@ -67,12 +68,16 @@ class NavigatorNode(ThinmapNode):
         self._config = parameters.declare_config(self, NavigatorConfig, self._on_config)
         map_frame = parameters.declare_map_frame(self)
         self._laser_transform = LaserTransform(self)
-        self._output = _NavigatorPublishers(self, map_frame, self._laser_transform.base_frame)
+        base_frame = self._laser_transform.base_frame
+        self._output = _NavigatorPublishers(self, map_frame, base_frame)
         self._tasks = TaskReader(self, map_frame)
+        self._odometry = OdometrySource(
+            self, base_frame, lambda ns, T_odom_base: self._robot.add_odometry(ns, T_odom_base)
+        )
         parameters.reject_unknown(self)
         warm_up.navigator()
         self.reset_state()
-        subscribe_guarded(self, Odometry, 'odom', self._on_odometry, qos.STREAM)
+        self._odometry.subscribe()
         subscribe_guarded(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
         subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
         subscribe_guarded(self, OccupancyGrid, 'map', self._on_map, qos.LATCHED)
@@ -96,9 +101,11 @@ class NavigatorNode(ThinmapNode):
 
     def reset_state(self) -> None:
         """Discard the map and the pose of the robot."""
+        self._odometry.reset()
+        self._tasks.reset()
         self._navigator = Navigator(self._config)
         self._map = MapMirror()
-        self._robot = RobotState(self.get_clock())
+        self._robot = RobotState(self.get_clock(), self._odometry.source != NONE)
         self._task = NavigationTask(NavigateToPose, (), 0)
         self._is_canceled = False
 
@@ -119,16 +126,14 @@ class NavigatorNode(ThinmapNode):
         self._output.command(0.0, 0.0)
         super().close()
 
-    def _on_odometry(self, message: Odometry) -> None:
-        T_odom_base = messages.pose_from_msg(message.pose.pose)
-        self._robot.add_odometry(messages.stamp_ns(message.header.stamp), T_odom_base)
-
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         T_map_base = messages.pose_from_msg(message.pose.pose)
         self._robot.add_pose(messages.stamp_ns(message.header.stamp), T_map_base)
 
     def _on_scan(self, message: LaserScan) -> None:
-        self._robot.add_scan(self._laser_transform.to_scan(message))
+        scan = self._laser_transform.to_scan(message)
+        self._odometry.add_scan_stamp(scan.stamp_ns)
+        self._robot.add_scan(scan)
 
     def _on_map(self, message: OccupancyGrid) -> None:
         self._map.replace(messages.grid_from_msg(message))

@@ -26,6 +26,7 @@ ROBOT = (
     'zero_is_no_return',
     'map_frame',
     'odom_frame',
+    'odom_source',
     'base_frame',
 )
 
