@@ -78,11 +78,20 @@ def read_map(path: Path, folder: Path | None = None) -> GridPatch:
     """
     content = read_mapping(path, 'a map_server YAML file')
     image = _image_of(path, content, folder)
-    resolution = _number(path, content, 'resolution', 1e-3, 10.0)
+    resolution = _resolution(path, content)
     origin = _origin(path, content)
     shades = _Shades.of(path, content)
     cells = _cells(path, image, shades)
     return aligned_patch(origin, resolution, np.ascontiguousarray(cells[::-1]))
+
+
+def read_resolution(path: Path) -> float:
+    """Edge of a cell (m) of a map, from its YAML file. Raises InputError as `read_map`."""
+    return _resolution(path, read_mapping(path, 'a map_server YAML file'))
+
+
+def _resolution(path: Path, content: dict[str, Any]) -> float:
+    return _number(path, content, 'resolution', 1e-3, 10.0)
 
 
 def _image_of(path: Path, content: dict[str, Any], folder: Path | None) -> Path:

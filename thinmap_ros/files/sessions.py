@@ -15,10 +15,10 @@ from thinmap_ros.core.grid.occupancy import OccupancyConfig, OccupancyGrid
 from thinmap_ros.core.slam.localizer import LocalizerConfig
 from thinmap_ros.core.slam.localizers import AnyLocalizer, localizer_class
 from thinmap_ros.core.snapshot import State
-from thinmap_ros.core.topology.builder import TopologyBuilder
+from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
 from thinmap_ros.files.atomic import atomic_write
 from thinmap_ros.files.npz import open_regular_file
-from thinmap_ros.files.occupancy_maps import read_map, write_map
+from thinmap_ros.files.occupancy_maps import read_map, read_resolution, write_map
 from thinmap_ros.files.snapshots import read_snapshot, write_snapshot
 
 _MAP_ENDING = '.yaml'
@@ -155,6 +155,23 @@ def load_grid(
     if not _exists(description):
         raise InputError(f'{stem}: neither {GRID.file(path).name} nor {description.name} exists')
     return OccupancyGrid.from_patch(read_map(description, folder), config)
+
+
+def load_topology(path: str, config: TopologyConfig | None = None) -> TopologyBuilder:
+    """Read STEM.topology.npz.
+
+    Raises InputError as `SessionPart.load`, and where the map beside it has another resolution.
+    """
+    builder = TOPOLOGY.load(path, config)
+    description = _with_ending(stem_of(path), _MAP_ENDING)
+    own_m = builder.resolution_m
+    if own_m is None or not _exists(description):
+        return builder
+    map_m = read_resolution(description)
+    if abs(map_m - own_m) > 1e-6:
+        file = TOPOLOGY.file(path)
+        raise InputError(f'{file}: made from {own_m} m a cell: expected {map_m} m as the map')
+    return builder
 
 
 def _with_ending(stem: Path, ending: str) -> Path:

@@ -25,7 +25,7 @@ from thinmap_ros.ros.diagnostics import OK, WARN
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
-from thinmap_ros.ros.tf.odometry_source import OdometrySource
+from thinmap_ros.ros.tf.odometry_source import NONE, OdometrySource
 from thinmap_ros.ros.velocity.commands import VelocityPublisher, declare_stamped
 
 # As in Nav2, there is no estimate of the remaining time below this speed or distance.
@@ -56,7 +56,7 @@ class _NavigatorPublishers:
 
 
 class NavigatorNode(ThinmapNode):
-    """/pose, /odom, /scan, /tf and the maps in; /cmd_vel and /plan out.
+    """/pose, /scan, odometry, /tf and the maps in; /cmd_vel and /plan out.
 
     Actions navigate_to_pose and navigate_through_poses, as Nav2's: one goal at a time, a newer one
     replaces it. /goal_pose sends a goal to navigate_to_pose. Goals in other frames than the map's
@@ -70,8 +70,10 @@ class NavigatorNode(ThinmapNode):
         self._laser_transform = LaserTransform(self)
         base_frame = self._laser_transform.base_frame
         self._output = _NavigatorPublishers(self, map_frame, base_frame)
-        self._odometry = OdometrySource(self, base_frame, self._on_odometry)
         self._tasks = TaskReader(self, map_frame)
+        self._odometry = OdometrySource(
+            self, base_frame, lambda ns, T_odom_base: self._robot.add_odometry(ns, T_odom_base)
+        )
         self._map = MapInput()
         parameters.reject_unknown(self)
         warm_up.navigator()
@@ -99,10 +101,11 @@ class NavigatorNode(ThinmapNode):
 
     def reset_state(self) -> None:
         """Discard the map and the pose of the robot."""
+        self._odometry.reset()
+        self._tasks.reset()
         self._navigator = Navigator(self._config)
         self._map.reset()
-        self._robot = RobotState(self.get_clock())
-        self._odometry.reset()
+        self._robot = RobotState(self.get_clock(), self._odometry.source != NONE)
         self._task = NavigationTask(NavigateToPose, (), 0)
         self._is_canceled = False
 
@@ -122,9 +125,6 @@ class NavigatorNode(ThinmapNode):
         """Stop the robot: the last thing the node does."""
         self._output.command(0.0, 0.0)
         super().close()
-
-    def _on_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
-        self._robot.add_odometry(stamp_ns, T_odom_base)
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         T_map_base = messages.pose_from_msg(message.pose.pose)

@@ -16,7 +16,7 @@ from thinmap_ros.core.stamp_matcher import StampMatcher
 from thinmap_ros.core.topology.builder import TopologyBuilder, TopologyConfig
 from thinmap_ros.core.topology.graph import TopologicalMap
 from thinmap_ros.core.topology.rebuild import Rebuilding
-from thinmap_ros.files.sessions import TOPOLOGY
+from thinmap_ros.files.sessions import TOPOLOGY, load_topology
 from thinmap_ros.kernels import warm_up
 from thinmap_ros.nodes.routing.route_graph import RouteGraphUpdates
 from thinmap_ros.ros import messages, node_main, parameters, qos
@@ -98,7 +98,7 @@ class TopologyBuilderNode(ThinmapNode):
         self._newest_saved_id = 0
         self._rebuilding = Rebuilding(from_the_start=not self._session)
         if self._session:
-            self._builder = TOPOLOGY.load(self._session, self._config)
+            self._builder = load_topology(self._session, self._config)
         else:
             self._builder = TopologyBuilder(self._config)
         if self._session or self._output.has_published:
@@ -172,7 +172,7 @@ class TopologyBuilderNode(ThinmapNode):
         loaded = TopologyBuilder(self._config)
         if path:
             inside = self._save_directory.resolve(path)
-            loaded = TOPOLOGY.load(inside, self._config)
+            loaded = load_topology(inside, self._config)
         self._builder = loaded
         self._matcher = StampMatcher()
         self._rebuilding = Rebuilding(from_the_start=not path)

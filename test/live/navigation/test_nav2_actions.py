@@ -11,7 +11,8 @@ from nav2_msgs.action import NavigateThroughPoses, NavigateToPose
 from nav_msgs.msg import Odometry, Path
 from rclpy.action import ActionClient
 from support.doctor import Doctor
-from support.peers.still_robot import StillRobot
+from support.halls import AT_START, START
+from support.nav2.still_robot import StillRobot
 
 from thinmap_ros.ros import messages, qos
 
@@ -256,3 +257,25 @@ def test_the_simulated_robot_obeys_commands_of_both_types(graph):
     twist.publish(messages.twist_msg(math.nan, 0.0))
     graph.until(lambda: doctor.number('sim', 'cmd_vel: rejected') == 1, 'NaN is counted')
     assert graph.stop('sim') == 0, graph.log('sim')
+
+
+@pytest.mark.parametrize('source', ['tf', 'none'])
+def test_the_robot_reaches_its_goal_with_odometry_by_tf_and_without_any(graph, source):
+    truth = graph.heard('ground_truth', PoseStamped)
+    graph.start('localizer', use_sim_time=True, odom_source=source, **AT_START)
+    graph.start('grid_mapper', use_sim_time=True)
+    graph.start('navigator', use_sim_time=True, odom_source=source)
+    graph.start(
+        'sim',
+        remap=('odom:=unheard', '/tf:=/tf' if source == 'tf' else '/tf:=/unheard_tf'),
+        start=START,
+        wait_for_subscribers=3,
+        real_time_factor=2.0,
+    )
+    goal = pose_at(3.0, 2.6)
+    client = ActionClient(graph.node, NavigateToPose, 'navigate_to_pose')
+    ended = graph.send_goal(client, NavigateToPose.Goal(pose=goal)).get_result_async()
+    graph.until(ended.done, 'the goal ends')
+    assert ended.result().status == GoalStatus.STATUS_SUCCEEDED, ended.result()
+    place = truth[-1].pose.position
+    assert math.dist((place.x, place.y), (3.0, 2.6)) < 0.3

@@ -8,12 +8,10 @@ from thinmap_ros.core.planning.navigator import SENSOR_TIMEOUT_NS
 from thinmap_ros.core.scan import Scan
 from thinmap_ros.core.se2 import Array
 
-# Without a new pose the last correction of the odometry holds for a while.
-_TIMEOUTS_NS = {
-    'laser': SENSOR_TIMEOUT_NS,
-    'odometry': SENSOR_TIMEOUT_NS,
-    'localizer': 3_000_000_000,
-}
+# Without a new pose the last correction of the odometry holds for a while; without odometry, the
+# robot does not know its pose meanwhile.
+_POSE_TIMEOUT_NS = 3_000_000_000
+_POSE_ONLY_TIMEOUT_NS = 1_000_000_000
 
 
 class RobotState:
@@ -22,9 +20,15 @@ class RobotState:
     scan: the last one that is not blind.
     """
 
-    def __init__(self, clock: Clock) -> None:
+    def __init__(self, clock: Clock, has_odometry: bool) -> None:
+        """has_odometry: False where the odometry says that the robot never moves."""
         self.scan: Scan | None = None
         self._clock = clock
+        self._timeouts_ns = {
+            'laser': SENSOR_TIMEOUT_NS,
+            'odometry': SENSOR_TIMEOUT_NS,
+            'localizer': _POSE_TIMEOUT_NS if has_odometry else _POSE_ONLY_TIMEOUT_NS,
+        }
         self._is_blind = False
         self._odometry = OdometryBuffer()
         self._T_map_odom: Array | None = None
@@ -64,7 +68,7 @@ class RobotState:
         if self._scan_age_ns() > SENSOR_TIMEOUT_NS:
             return 'laser silent'
         now_ns = self._clock.now().nanoseconds
-        for source, limit_ns in _TIMEOUTS_NS.items():
+        for source, limit_ns in self._timeouts_ns.items():
             if now_ns - self._received_ns.get(source, now_ns) > limit_ns:
                 return f'{source} silent'
         return ''

@@ -69,6 +69,10 @@ class TaskReader:
         )
         self._tolerance_ns = round(float(tolerance_s) * SECOND_NS)
 
+    def reset(self) -> None:
+        """Forget the transforms that are not static: the time was set back."""
+        self._transforms.clear()
+
     def to_pose(self, request: NavigateToPose.Goal) -> NavigationTask:
         """Task of a goal of navigate_to_pose. Raises InvalidGoalError."""
         return self._read(NavigateToPose, request, lambda: (self.pose(request.pose),))

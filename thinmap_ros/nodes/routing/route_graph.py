@@ -36,7 +36,7 @@ class RouteGraphConfig(Config):
     )
     route_graph_path: str = parameter(
         '',
-        'GeoJSON file that the route server is told to load; with a name it is written without a '
+        'GeoJSON file that the route server is asked to load; with a name it is written without a '
         'route server, too. Empty: a file of this user among the temporary files, written while '
         'there is a route server. Set it if the route server runs as another user or on another '
         'machine with a shared disk.',

@@ -1,4 +1,4 @@
-"""Stand-in for Nav2's route server: it loads a route graph by the rules of Jazzy's GeoJSON loader.
+"""A substitute for Nav2's route server: it loads graphs by the rules of Jazzy's GeoJSON loader.
 
 Node: Point with properties.id (unsigned), optional frame, coordinates [x, y]. Edge: LineString or
 MultiLineString with properties id, startid, endid of nodes that exist. Metadata: numbers, booleans,
