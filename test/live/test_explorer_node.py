@@ -13,13 +13,18 @@ import pytest
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav2_msgs.action import NavigateToPose
-from nav_msgs.msg import OccupancyGrid
 from rclpy.action import ActionClient, ActionServer
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
 
 from thinmap_msgs.action import Explore
-from thinmap_msgs.msg import EndNodeArray, ExplorationStatus, SlamStatus, TopologicalMap
+from thinmap_msgs.msg import (
+    EndNodeArray,
+    ExplorationStatus,
+    ProbabilityGrid,
+    SlamStatus,
+    TopologicalMap,
+)
 from thinmap_msgs.srv import SaveMap
 from thinmap_ros.core.exploration.mission import MissionState
 from thinmap_ros.core.exploration.strategy import FinishCode
@@ -77,7 +82,7 @@ class Robot:
         self.numbers = count(1)
         self.hears_scans = self.is_tracked = True
         self.end_nodes = graph.heard('end_nodes', EndNodeArray, qos.LATCHED)
-        self.map = self.node.create_publisher(OccupancyGrid, 'map', qos.LATCHED)
+        self.map = self.node.create_publisher(ProbabilityGrid, 'grid', qos.LATCHED)
         self.graph_map = self.node.create_publisher(TopologicalMap, 'topology', qos.LATCHED)
         self.pose = self.node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
         self.scan = self.node.create_publisher(LaserScan, 'scan', qos.STREAM)
@@ -100,7 +105,10 @@ class Robot:
 
     def knows(self, cols):
         patch = room(cols)
-        self.map.publish(messages.grid_msg(patch, 'map', 0))
+        message = messages.grid_msg(patch, 'map', 0)
+        self.map.publish(
+            ProbabilityGrid(header=message.header, info=message.info, data=message.data)
+        )
         self.graph_map.publish(
             messages.topology_msg(build(patch, (2.0, 2.0), TopologyConfig()), 'map', 0)
         )

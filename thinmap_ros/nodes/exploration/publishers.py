@@ -1,0 +1,42 @@
+"""Whether somebody publishes a topic."""
+
+from time import monotonic
+
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+
+_PERIOD_S = 1.0
+
+
+class PublisherCheck:
+    """Whether somebody publishes one of some topics; looked up once a second."""
+
+    def __init__(self, node: Node, *topics: str) -> None:
+        self._node = node
+        self._topics = topics
+        self._is_found = False
+        self._checked_s = -_PERIOD_S
+
+    def is_found(self) -> bool:
+        """Whether there is a publisher."""
+        if monotonic() - self._checked_s >= _PERIOD_S:
+            found = any(self._node.count_publishers(topic) for topic in self._topics)
+            self._set(bool(found))
+        return self._is_found
+
+    def message_received(self) -> None:
+        """Register a message: its publisher may not be discovered yet."""
+        self._set(True)
+
+    def _set(self, is_found: bool) -> None:
+        self._is_found = is_found
+        self._checked_s = monotonic()
+
+
+def is_unlatched(node: Node, topic: str) -> bool:
+    """Whether a publisher of a topic offers less than a reliable, latched subscription needs."""
+    return any(
+        info.qos_profile.durability == DurabilityPolicy.VOLATILE
+        or info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+        for info in node.get_publishers_info_by_topic(topic)
+    )
