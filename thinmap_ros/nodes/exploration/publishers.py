@@ -20,13 +20,16 @@ class PublisherCheck:
     def is_found(self) -> bool:
         """Whether there is a publisher."""
         if monotonic() - self._checked_s >= _PERIOD_S:
-            found = any(self._node.count_publishers(topic) for topic in self._topics)
-            self._set(bool(found))
+            self._set(any(self._count(topic) > 0 for topic in self._topics))
         return self._is_found
 
     def message_received(self) -> None:
         """Register a message: its publisher may not be discovered yet."""
         self._set(True)
+
+    def _count(self, topic: str) -> int:
+        # rclpy counts the publishers of a name as it is, without the node's remapping rules.
+        return int(self._node.count_publishers(self._node.resolve_topic_name(topic)))
 
     def _set(self, is_found: bool) -> None:
         self._is_found = is_found
