@@ -208,8 +208,8 @@ def test_a_navigator_that_lost_the_goal_is_sent_to_the_start_again():
 
 
 def test_a_budget_that_ends_before_the_first_pose_returns_nowhere():
-    mission = mission_of(Scripted(), budget=Budget(time_s=1.0), return_to_start=True)
-    assert mission.check(1.0, False) == Finish(FinishCode.BUDGET_EXHAUSTED, 'time limit of 1 s')
+    mission = mission_of(Scripted(), now_s=1.0, budget=Budget(time_s=1.0), return_to_start=True)
+    assert mission.check(2.0, False) == Finish(FinishCode.BUDGET_EXHAUSTED, 'time limit of 1 s')
 
 
 def test_scans_that_stay_away_end_a_mission():
@@ -312,9 +312,9 @@ def test_a_paused_mission_can_be_cancelled():
 
 def test_what_is_missing_is_named_when_a_mission_ends_for_want_of_it():
     watchdog = InputWatchdog()
-    mission = mission_of(Scripted(GOAL), watchdog=watchdog)
+    mission = mission_of(Scripted(GOAL), now_s=1.0, watchdog=watchdog)
     watchdog.awaited = 'map on map'
-    end = mission.check(60.1, False)
+    end = mission.check(61.1, False)
     assert end == Finish(FinishCode.SENSOR_TIMEOUT, 'no map on map for 60 s')
 
 
@@ -325,3 +325,12 @@ def test_it_is_known_whether_the_robot_is_back_at_its_start():
     mission.drive_ended(True, '')
     assert not mission.is_running
     assert mission.has_returned
+
+
+def test_the_time_begins_with_a_simulated_clock_that_stands_at_zero_before():
+    mission = mission_of(Scripted(), budget=Budget(time_s=30.0))
+    assert mission.check(500.0, is_driving=False) is None
+    assert mission.elapsed_s(510.0) == 10.0
+    assert mission.check(529.0, is_driving=False) is None
+    end = mission.check(530.0, is_driving=False)
+    assert isinstance(end, Finish) and end.code == FinishCode.BUDGET_EXHAUSTED

@@ -225,6 +225,7 @@ class Mission:
 
         is_driving: whether the navigator reports on the goal that it was given.
         """
+        self._start_clock(now_s)
         if self._is_cancel_requested:
             return self.cancel('cancelled')
         if self.is_paused:
@@ -264,6 +265,12 @@ class Mission:
     def cancel(self, reason: str) -> Finish:
         """End the mission before it is done."""
         return self._finish(Finish(FinishCode.CANCELLED, reason))
+
+    def _start_clock(self, now_s: float) -> None:
+        """Start with the first message of a simulated clock, which stands at 0 before it."""
+        if self._started_s == 0.0:
+            self._started_s = now_s
+            self._watchdog.restart(now_s)
 
     def _finish_exploring(self, end: Finish) -> Action:
         """Return to the start if that was asked for, else finish."""
