@@ -1,16 +1,11 @@
 """The explorer with the navigation and the SLAM of others, on a live graph."""
 
-import signal
-from pathlib import Path
-
 import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped
-from nav2_msgs.action import NavigateToPose
 from nav_msgs.msg import OccupancyGrid
-from rclpy.action import ActionClient
-from std_msgs.msg import Bool, String, UInt32
+from std_msgs.msg import String, UInt32
 
 from thinmap_msgs.action import Explore
 from thinmap_msgs.msg import ExplorationStatus

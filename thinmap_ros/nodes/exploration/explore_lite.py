@@ -13,7 +13,6 @@ from thinmap_ros.core.exploration.strategy import EndNode, ShowsFrontiers
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
-from thinmap_ros.ros.subscription import subscribe_guarded
 
 STARTED = 'exploration_started'
 IN_PROGRESS = 'exploration_in_progress'
@@ -62,9 +61,14 @@ class ExploreLiteTopics:
         )
         self._last_status = ''
         self._is_complete = False
-        subscribe_guarded(
-            node, Bool, 'explore/resume', lambda message: on_resume(message.data), qos.STREAM
-        )
+        self._on_resume = on_resume
+        node.diagnostics.expect_topic('explore/resume')
+        node.create_subscription(Bool, 'explore/resume', self._on_message, qos.STREAM)
+
+    def _on_message(self, message: Bool) -> None:
+        self._node.diagnostics.message_received('explore/resume')
+        if self._node.is_active:
+            self._on_resume(bool(message.data))
 
     def publish_status(self, mission: Mission, is_yielding: bool) -> None:
         """Publish the status where it has changed; none is left out between two calls."""
