@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
-from nav_msgs.msg import OccupancyGrid, Odometry
+from nav_msgs.msg import OccupancyGrid
 from rclpy.clock import Clock
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
@@ -40,6 +40,7 @@ from thinmap_ros.ros import messages, node_main, parameters, qos
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
+from thinmap_ros.ros.tf.odometry_source import OdometrySource
 from thinmap_ros.ros.velocity.commands import VelocityPublisher, declare_stamped
 
 _SAMPLES_PERIOD_NS = 1_000_000_000
@@ -250,6 +251,8 @@ class GlobalLocalizerNode(ThinmapNode):
         super().__init__('global_localizer')
         self._settings = _Settings.declare(self)
         self._laser_transform = LaserTransform(self)
+        base_frame = self._laser_transform.base_frame
+        self._odometry = OdometrySource(self, base_frame, self._on_odometry)
         parameters.reject_unknown(self)
         self._patch: GridPatch | None = None
         self._topology: Topology | None = None
@@ -264,7 +267,7 @@ class GlobalLocalizerNode(ThinmapNode):
             subscribe_guarded(self, OccupancyGrid, 'map', self._on_map, qos.LATCHED)
             subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
         subscribe_guarded(self, SlamStatus, 'slam_status', self._on_slam_status, qos.STREAM)
-        subscribe_guarded(self, Odometry, 'odom', self._on_odometry, qos.STREAM)
+        self._odometry.subscribe()
         subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
         self.create_service(LocalizeGlobally, 'localize_globally', self._on_request)
         self.create_active_timer(1.0, self._report_missing_inputs)
@@ -283,6 +286,7 @@ class GlobalLocalizerNode(ThinmapNode):
         self._is_requested = self._settings.node.start_automatically
         self._lost = _LostDetector(round(1e9 * self._settings.node.lost_timeout_s))
         self._pairing = ScanOdometrySynchronizer()
+        self._odometry.reset()
         self._received: set[str] = set()
         self._driver.reset()
 
@@ -328,16 +332,15 @@ class GlobalLocalizerNode(ThinmapNode):
         self._localization = None
         self._driver.search = None
 
-    def _on_odometry(self, message: Odometry) -> None:
+    def _on_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
         self._received.add('odom')
-        stamp_ns = messages.stamp_ns(message.header.stamp)
-        T_odom_base = messages.pose_from_msg(message.pose.pose)
         self._driver.add_odometry(stamp_ns, T_odom_base)
         self._process(self._pairing.add_odometry(stamp_ns, T_odom_base))
 
     def _on_scan(self, message: LaserScan) -> None:
         scan = self._laser_transform.to_scan(message)
         self._received.add('scan')
+        self._odometry.add_scan_stamp(scan.stamp_ns)
         self._driver.add_scan(scan)
         self._process(self._pairing.add_scan(scan))
 

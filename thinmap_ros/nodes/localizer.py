@@ -4,12 +4,11 @@ from dataclasses import replace
 from time import monotonic, perf_counter
 
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped
-from nav_msgs.msg import OccupancyGrid, Odometry, Path
+from nav_msgs.msg import OccupancyGrid, Path
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import LaserScan
-from tf2_msgs.msg import TFMessage
 
 from thinmap_msgs.msg import LineFeature, LineFeatureArray, SlamStatus, TopologicalMap
 from thinmap_msgs.srv import LoadMap, SaveMap
@@ -39,6 +38,8 @@ from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.save_directory import SaveDirectory
 from thinmap_ros.ros.services import fill_response
 from thinmap_ros.ros.subscription import subscribe_guarded
+from thinmap_ros.ros.tf.map_broadcaster import MapBroadcaster
+from thinmap_ros.ros.tf.odometry_source import NONE, OdometrySource
 
 _MAP_WAIT_S = 3.0  # after a restart; the navigator drives for so long without a new pose
 _HEALTH = {
@@ -49,17 +50,11 @@ _HEALTH = {
 
 
 class _PosePublishers:
-    """Publishes poses with their transform, status, line features, and corrected trajectories."""
+    """Publishes poses with their status, line features, and corrected trajectories."""
 
     def __init__(self, node: Node) -> None:
-        self._map_frame = parameters.declare_map_frame(node)
-        self._odom_frame = str(
-            parameters.declare_parameter(
-                node, 'odom_frame', 'odom', 'Frame of the odometry (REP 105).'
-            )
-        )
-        self._pose = node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.STREAM)
-        self._tf = node.create_publisher(TFMessage, '/tf', qos.STREAM)
+        self.map_frame = parameters.declare_map_frame(node)
+        self._pose = node.create_publisher(PoseWithCovarianceStamped, 'pose', qos.LATCHED)
         self._features = node.create_publisher(LineFeatureArray, 'line_features', qos.LATCHED)
         self._status = node.create_publisher(SlamStatus, 'slam_status', qos.STREAM)
         self._trajectory = node.create_publisher(Path, 'trajectory', qos.LATCHED)
@@ -68,14 +63,12 @@ class _PosePublishers:
         self, stamp_ns: int, estimate: Estimate, localizer: AnyLocalizer, status: SlamStatus
     ) -> None:
         """Publish an estimate; status: with its state and step time, the rest is filled in."""
-        frame = self._map_frame
+        frame = self.map_frame
         self._pose.publish(
             messages.pose_with_covariance_msg(
                 estimate.T_map_base, estimate.covariance, frame, stamp_ns
             )
         )
-        transform = messages.transform_msg(estimate.T_map_odom, frame, self._odom_frame, stamp_ns)
-        self._tf.publish(TFMessage(transforms=[transform]))
         header = messages.header(frame, stamp_ns)
         features = [_feature_msg(feature) for feature in line_features(localizer)]
         self._features.publish(LineFeatureArray(header=header, features=features))
@@ -91,7 +84,7 @@ class _PosePublishers:
     def publish_trajectory(self, stamp_ns: int, stamps_ns: list[int], poses: Array) -> None:
         """Publish the corrected poses (N, 3) of the keyframes, with their stamps."""
         self._trajectory.publish(
-            messages.trajectory_msg(stamps_ns, poses, self._map_frame, stamp_ns)
+            messages.trajectory_msg(stamps_ns, poses, self.map_frame, stamp_ns)
         )
 
 
@@ -142,6 +135,14 @@ class LocalizerNode(ThinmapNode):
         self._config = parameters.declare_config(self, LocalizerConfig)
         self._output = _PosePublishers(self)
         self._laser_transform = LaserTransform(self)
+        base_frame = self._laser_transform.base_frame
+        self._odometry = OdometrySource(self, base_frame, self._on_odometry)
+        self._broadcaster = MapBroadcaster(
+            self,
+            self._output.map_frame,
+            self._odometry.odom_frame,
+            base_frame if self._odometry.source == NONE else '',
+        )
         self._session = parameters.declare_session(self)
         self._save_directory = SaveDirectory(self)
         parameters.reject_unknown(self)
@@ -153,7 +154,7 @@ class LocalizerNode(ThinmapNode):
         # Before the scans: of messages that wait together, the executor processes the graph of the
         # last scan first.
         subscribe_guarded(self, TopologicalMap, 'topology', self._on_topology, qos.LATCHED)
-        subscribe_guarded(self, Odometry, 'odom', self._on_odometry, qos.STREAM)
+        self._odometry.subscribe()
         subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
         subscribe_guarded(
             self, PoseWithCovarianceStamped, 'initialpose', self._on_initial_pose, qos.STREAM
@@ -167,6 +168,8 @@ class LocalizerNode(ThinmapNode):
         The robot is at the start pose.
         """
         self._localizer = self._create_localizer(self._config)
+        self._broadcaster.reset()
+        self._odometry.reset()
         self._pairing = ScanOdometrySynchronizer()
         self._last: OdometryAnchor | None = None
         self._topology: Graph | None = None
@@ -190,13 +193,13 @@ class LocalizerNode(ThinmapNode):
         x, y, yaw = T_map_base.tolist()
         return replace(self._config, initial_x_m=x, initial_y_m=y, initial_yaw_rad=yaw)
 
-    def _on_odometry(self, message: Odometry) -> None:
-        stamp_ns = messages.stamp_ns(message.header.stamp)
-        ready = self._pairing.add_odometry(stamp_ns, messages.pose_from_msg(message.pose.pose))
-        self._process(ready)
+    def _on_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
+        self._process(self._pairing.add_odometry(stamp_ns, T_odom_base))
 
     def _on_scan(self, message: LaserScan) -> None:
-        self._process(self._pairing.add_scan(self._laser_transform.to_scan(message)))
+        scan = self._laser_transform.to_scan(message)
+        self._odometry.add_scan_stamp(scan.stamp_ns)
+        self._process(self._pairing.add_scan(scan))
 
     def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
         self._localizer.set_pose(
@@ -305,6 +308,7 @@ class LocalizerNode(ThinmapNode):
             stamps, poses = self._localizer.keyframe_trajectory()
             self._output.publish_trajectory(scan.stamp_ns, stamps.tolist(), poses)
             self.get_logger().info(f'loop closed: {len(poses)} keyframe poses corrected')
+        self._broadcaster.update(estimate.T_map_odom)
         status = SlamStatus(state=state, step_time_ms=step_ms)
         self._output.publish_estimate(scan.stamp_ns, estimate, self._localizer, status)
 

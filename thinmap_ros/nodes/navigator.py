@@ -2,12 +2,11 @@
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav2_msgs.action import NavigateThroughPoses, NavigateToPose
-from nav_msgs.msg import OccupancyGrid, Odometry, Path
+from nav_msgs.msg import Path
 from rclpy.action import ActionClient
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
-from thinmap_ros.core.grid.map_mirror import MapMirror
 from thinmap_ros.core.planning.navigator import (
     CONTROL_PERIOD_S,
     Command,
@@ -17,6 +16,7 @@ from thinmap_ros.core.planning.navigator import (
 from thinmap_ros.core.se2 import Array
 from thinmap_ros.core.stamps import SECOND_NS
 from thinmap_ros.kernels import warm_up
+from thinmap_ros.nodes.navigation.map_input import MapInput
 from thinmap_ros.nodes.navigation.robot_state import RobotState
 from thinmap_ros.nodes.navigation.tasks import ErrorCode, NavigationTask, TaskReader
 from thinmap_ros.ros import messages, node_main, parameters, qos
@@ -25,6 +25,7 @@ from thinmap_ros.ros.diagnostics import OK, WARN
 from thinmap_ros.ros.laser_transform import LaserTransform
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
 from thinmap_ros.ros.subscription import WARN_PERIOD_S, subscribe_guarded
+from thinmap_ros.ros.tf.odometry_source import OdometrySource
 from thinmap_ros.ros.velocity.commands import VelocityPublisher, declare_stamped
 
 # As in Nav2, there is no estimate of the remaining time below this speed or distance.
@@ -67,16 +68,18 @@ class NavigatorNode(ThinmapNode):
         self._config = parameters.declare_config(self, NavigatorConfig, self._on_config)
         map_frame = parameters.declare_map_frame(self)
         self._laser_transform = LaserTransform(self)
-        self._output = _NavigatorPublishers(self, map_frame, self._laser_transform.base_frame)
+        base_frame = self._laser_transform.base_frame
+        self._output = _NavigatorPublishers(self, map_frame, base_frame)
+        self._odometry = OdometrySource(self, base_frame, self._on_odometry)
         self._tasks = TaskReader(self, map_frame)
+        self._map = MapInput()
         parameters.reject_unknown(self)
         warm_up.navigator()
         self.reset_state()
-        subscribe_guarded(self, Odometry, 'odom', self._on_odometry, qos.STREAM)
+        self._odometry.subscribe()
         subscribe_guarded(self, PoseWithCovarianceStamped, 'pose', self._on_pose, qos.STREAM)
         subscribe_guarded(self, LaserScan, 'scan', self._on_scan, qos.SENSOR)
-        subscribe_guarded(self, OccupancyGrid, 'map', self._on_map, qos.LATCHED)
-        subscribe_guarded(self, OccupancyGrid, 'local_map', self._on_window, qos.LATCHED)
+        self._map.subscribe(self)
         subscribe_guarded(self, PoseStamped, 'goal_pose', self._on_goal_pose, qos.STREAM)
         self._goals = SingleGoalServer(
             self,
@@ -97,8 +100,9 @@ class NavigatorNode(ThinmapNode):
     def reset_state(self) -> None:
         """Discard the map and the pose of the robot."""
         self._navigator = Navigator(self._config)
-        self._map = MapMirror()
+        self._map.reset()
         self._robot = RobotState(self.get_clock())
+        self._odometry.reset()
         self._task = NavigationTask(NavigateToPose, (), 0)
         self._is_canceled = False
 
@@ -119,22 +123,17 @@ class NavigatorNode(ThinmapNode):
         self._output.command(0.0, 0.0)
         super().close()
 
-    def _on_odometry(self, message: Odometry) -> None:
-        T_odom_base = messages.pose_from_msg(message.pose.pose)
-        self._robot.add_odometry(messages.stamp_ns(message.header.stamp), T_odom_base)
+    def _on_odometry(self, stamp_ns: int, T_odom_base: Array) -> None:
+        self._robot.add_odometry(stamp_ns, T_odom_base)
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         T_map_base = messages.pose_from_msg(message.pose.pose)
         self._robot.add_pose(messages.stamp_ns(message.header.stamp), T_map_base)
 
     def _on_scan(self, message: LaserScan) -> None:
-        self._robot.add_scan(self._laser_transform.to_scan(message))
-
-    def _on_map(self, message: OccupancyGrid) -> None:
-        self._map.replace(messages.grid_from_msg(message))
-
-    def _on_window(self, message: OccupancyGrid) -> None:
-        self._map.paste(messages.grid_from_msg(message))
+        scan = self._laser_transform.to_scan(message)
+        self._odometry.add_scan_stamp(scan.stamp_ns)
+        self._robot.add_scan(scan)
 
     def _on_goal_pose(self, message: PoseStamped) -> None:
         self._tasks.pose(message)  # raises for an invalid one, which is counted

@@ -8,7 +8,17 @@ from collections.abc import Callable
 from time import monotonic
 from typing import Any
 
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo, SubscriptionEventCallbacks
+from rclpy.qos import (
+    DurabilityPolicy,
+    QoSPolicyKind,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_policy_name_from_kind,
+)
+from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 from sensor_msgs.msg import LaserScan
 
 from thinmap_ros.core.errors import InputError
@@ -25,7 +35,8 @@ def subscribe_guarded(
 ) -> None:
     """Subscribe to a topic.
 
-    A message for which `process` raises InputError is dropped with a throttled warning.
+    A message for which `process` raises InputError is dropped with a throttled warning. Where a
+    publisher offers less than the profile requests (best effort, volatile), less is requested.
     """
     _GuardedSubscription(node, kind, topic, process, profile)
 
@@ -52,7 +63,7 @@ class _GuardedSubscription:
         self._time_jumps = 0
         self._losses = MessageLossCounter()
         node.diagnostics.expect_topic(topic)
-        node.create_subscription(kind, topic, self._on_message, profile)
+        self._adaptive = _AdaptiveSubscription(node, kind, topic, self._on_message, profile)
         if self._is_scan:
             node.diagnostics.add_timeout_check(topic, _TIMEOUT_S)
         if self._is_latched:
@@ -108,6 +119,73 @@ class _GuardedSubscription:
         self._latched_message = None
         if message is not None:
             self._guarded(message)
+
+
+class _AdaptiveSubscription:
+    """A subscription that is replaced by one with lower requests where a publisher offers less.
+
+    The odometry of many robots is best effort, and a map may be volatile: with the requests of the
+    profile no message would arrive. Lower requests fit all publishers.
+    """
+
+    def __init__(
+        self,
+        node: ThinmapNode,
+        kind: type,
+        topic: str,
+        on_message: Callable[[Any, dict[str, Any]], None],
+        profile: QoSProfile,
+    ) -> None:
+        self._node = node
+        self._kind = kind
+        self._topic = topic
+        self._on_message = on_message
+        self._profile = profile
+        self._timer: Timer | None = None
+        self._subscription = self._subscribe()
+
+    def _subscribe(self) -> Subscription:
+        events = SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible_qos)
+        return self._node.create_subscription(
+            self._kind, self._topic, self._on_message, self._profile, event_callbacks=events
+        )
+
+    def _on_incompatible_qos(self, event: QoSRequestedIncompatibleQoSInfo) -> None:
+        kind = QoSPolicyKind(event.last_policy_kind)
+        profile = lowered(self._profile, kind)
+        if profile is None:
+            policy = qos_policy_name_from_kind(kind)
+            self._node.diagnostics.set_value(
+                f'{self._topic}: incompatible QoS', f'{event.total_count} publishers: {policy}'
+            )
+        elif self._timer is None:
+            self._profile = profile
+            # Not now: the event belongs to the subscription that is destroyed.
+            clock = Clock(clock_type=ClockType.STEADY_TIME)
+            self._timer = self._node.create_timer(0.0, self._replace, clock=clock)
+
+    def _replace(self) -> None:
+        self._node.destroy_timer(self._timer)
+        self._timer = None
+        self._node.destroy_subscription(self._subscription)
+        self._subscription = self._subscribe()
+        reliability = self._profile.reliability.name.lower()
+        durability = self._profile.durability.name.lower()
+        text = f'{reliability}, {durability}, as a publisher offers no more'
+        self._node.diagnostics.set_value(f'{self._topic}: subscribed', text)
+        self._node.get_logger().info(f'{self._topic}: subscribed {text}')
+
+
+def lowered(profile: QoSProfile, kind: QoSPolicyKind) -> QoSProfile | None:
+    """Profile that requests less of an incompatible policy; None where it cannot request less."""
+    requests = {'reliability': profile.reliability, 'durability': profile.durability}
+    if kind == QoSPolicyKind.RELIABILITY:
+        requests['reliability'] = ReliabilityPolicy.BEST_EFFORT
+    elif kind == QoSPolicyKind.DURABILITY:
+        requests['durability'] = DurabilityPolicy.VOLATILE
+    else:
+        return None
+    return QoSProfile(depth=profile.depth, history=profile.history, **requests)
 
 
 class MessageLossCounter:

@@ -105,10 +105,7 @@ class Robot:
 
     def knows(self, cols):
         patch = room(cols)
-        message = messages.grid_msg(patch, 'map', 0)
-        self.map.publish(
-            ProbabilityGrid(header=message.header, info=message.info, data=message.data)
-        )
+        self.map.publish(messages.probability_grid_msg(patch, 'map', 0))
         self.graph_map.publish(
             messages.topology_msg(build(patch, (2.0, 2.0), TopologyConfig()), 'map', 0)
         )

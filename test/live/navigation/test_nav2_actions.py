@@ -11,7 +11,7 @@ from nav2_msgs.action import NavigateThroughPoses, NavigateToPose
 from nav_msgs.msg import Odometry, Path
 from rclpy.action import ActionClient
 from support.doctor import Doctor
-from support.still_robot import StillRobot
+from support.peers.still_robot import StillRobot
 
 from thinmap_ros.ros import messages, qos
 
@@ -147,11 +147,16 @@ def test_a_newer_goal_replaces_the_running_one_across_both_actions(client):
     client.graph.until(cancel.done, 'an answer to the cancellation')
     assert len(cancel.result().goals_canceling) == 1
     assert client.ended(old)[:2] == (GoalStatus.STATUS_CANCELED, 0)
+    client.graph.until(lambda: is_stopped(client.commands[-1]), 'the robot is stopped')
     client.commands.clear()
     status, code, reason = client.ended(client.to(30.0, 1.0))
     assert (status, code) == (GoalStatus.STATUS_ABORTED, 9000)
     assert reason == 'no path to (30.00, 1.00)'
-    assert all(c.linear.x == c.angular.z == 0.0 for c in client.commands)
+    assert all(is_stopped(command) for command in client.commands)
+
+
+def is_stopped(command):
+    return command.linear.x == command.angular.z == 0.0
 
 
 def test_feedback_has_the_fields_of_nav2_several_times_a_second(client):

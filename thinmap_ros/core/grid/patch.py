@@ -50,6 +50,18 @@ class GridPatch:
         """Cells that are neither free nor occupied, (H, W)."""
         return ~(self.free | self.occupied)
 
+    def trinary(
+        self, free_at_most: float = FREE_AT_MOST, occupied_at_least: float = OCCUPIED_AT_LEAST
+    ) -> NDArray[np.int8]:
+        """Cells (H, W) as map_server publishes them: -1 unknown, 0 free, 100 occupied.
+
+        Thresholds in %.
+        """
+        cells = np.full(self.shape, UNKNOWN, dtype=np.int8)
+        cells[(self.cells >= 0) & (self.cells <= free_at_most)] = 0
+        cells[self.cells >= occupied_at_least] = 100
+        return cells
+
     def contains(self, points: Array) -> NDArray[np.bool_]:
         """Which of the points (N, 2) lie inside, (N,)."""
         cells = self.frame.cells_of(points)

@@ -11,7 +11,6 @@ from thinmap_ros.core import validation
 from thinmap_ros.core.errors import InputError, quoted
 from thinmap_ros.core.exploration.live.map_view import occupancy_from_costs, with_update
 from thinmap_ros.core.grid.patch import GridPatch
-from thinmap_ros.nodes.exploration.publishers import is_unlatched
 from thinmap_ros.nodes.exploration.settings import ExplorationSettings
 from thinmap_ros.ros import messages, qos
 from thinmap_ros.ros.lifecycle_node import ThinmapNode
@@ -33,13 +32,11 @@ class ForeignMap:
     ) -> None:
         """is_used: whether this map is needed; else its messages are only kept."""
         self.is_changed = False
-        self._node = node
         self._settings = settings
         self._map_frame = map_frame
         self._is_used = is_used
         self._unread: OccupancyGrid | None = None
         self._patch: GridPatch | None = None
-        self._hears_unlatched = False
         updates = settings.costmap_updates_topic
         subscribe_guarded(node, OccupancyGrid, self.topic, self._on_map, qos.LATCHED)
         subscribe_guarded(node, OccupancyGridUpdate, updates, self._on_update, qos.STREAM)
@@ -54,13 +51,6 @@ class ForeignMap:
         self._unread = None
         self._patch = None
         self.is_changed = False
-
-    def subscribe_unlatched(self) -> None:
-        """Subscribe to a publisher that is not latched, where there is one now."""
-        if self._hears_unlatched or not is_unlatched(self._node, self.topic):
-            return
-        self._hears_unlatched = True
-        subscribe_guarded(self._node, OccupancyGrid, self.topic, self._on_map, qos.SENSOR)
 
     def patch(self) -> GridPatch | None:
         """The map as occupancy; None before the first. Raises InputError where it is invalid."""

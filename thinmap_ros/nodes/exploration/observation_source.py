@@ -136,7 +136,6 @@ class ObservationSource:
         """Make an observation of a new map; of an old one if there is none for a long time."""
         if not self._uses_foreign_map():
             return
-        self._map.subscribe_unlatched()
         now_ns = self._now_ns()
         is_due = not 0 <= now_ns - self._looked_ns < _UNCHANGED_NS
         if not (self._map.is_changed or is_due):

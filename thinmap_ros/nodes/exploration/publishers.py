@@ -3,7 +3,6 @@
 from time import monotonic
 
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
 _PERIOD_S = 1.0
 
@@ -34,12 +33,3 @@ class PublisherCheck:
     def _set(self, is_found: bool) -> None:
         self._is_found = is_found
         self._checked_s = monotonic()
-
-
-def is_unlatched(node: Node, topic: str) -> bool:
-    """Whether a publisher of a topic offers less than a reliable, latched subscription needs."""
-    return any(
-        info.qos_profile.durability == DurabilityPolicy.VOLATILE
-        or info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
-        for info in node.get_publishers_info_by_topic(topic)
-    )

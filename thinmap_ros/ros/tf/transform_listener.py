@@ -52,6 +52,12 @@ class TransformBuffer:
     def __init__(self) -> None:
         self._edges: dict[str, _Edge] = {}
 
+    def clear(self) -> None:
+        """Forget all but the static transforms: the time was set back."""
+        self._edges = {
+            child: edge for child, edge in self._edges.items() if edge.latest_stamp_ns is None
+        }
+
     def add(self, transform: Any, is_static: bool) -> None:
         """Add a geometry_msgs/TransformStamped. Raises InputError where it is invalid."""
         child = _frame_name(transform.child_frame_id)
@@ -71,6 +77,20 @@ class TransformBuffer:
         stamp_ns: None for the newest time at which all transforms between them are known.
         Raises InputError where the frames are not connected, or not at that time.
         """
+        up, down = self._path(target_frame, source_frame)
+        ns = self._latest_common_ns(up + down) if stamp_ns is None else stamp_ns
+        return se2.compose(se2.invert(self._chain(up, ns)), self._chain(down, ns))
+
+    def latest_common_ns(self, target_frame: str, source_frame: str) -> int | None:
+        """Newest stamp at which all transforms between two frames are known; None: never."""
+        try:
+            up, down = self._path(target_frame, source_frame)
+        except InputError:
+            return None
+        return self._latest_common_ns(up + down) or None
+
+    def _path(self, target_frame: str, source_frame: str) -> tuple[list[str], list[str]]:
+        """Frames from the target, and from the source, up to below their common ancestor."""
         target = self._path_to_root(_frame_name(target_frame))
         source = self._path_to_root(_frame_name(source_frame))
         common = next((frame for frame in source if frame in target), None)
@@ -79,10 +99,7 @@ class TransformBuffer:
                 f'no transform from {quoted(source_frame)} to {quoted(target_frame)}: '
                 f'{self._missing(target_frame, source_frame)}'
             )
-        down = source[: source.index(common)]
-        up = target[: target.index(common)]
-        ns = self._latest_common_ns(up + down) if stamp_ns is None else stamp_ns
-        return se2.compose(se2.invert(self._chain(up, ns)), self._chain(down, ns))
+        return target[: target.index(common)], source[: source.index(common)]
 
     def _path_to_root(self, frame: str) -> list[str]:
         """The frame, its parent, and so on; a cycle ends where it closes."""

@@ -1,0 +1,115 @@
+"""Odometry of the robot: from its topic, from TF, or none."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from nav_msgs.msg import Odometry
+from tf2_msgs.msg import TFMessage
+
+from thinmap_ros.core.config import Config, parameter
+from thinmap_ros.core.errors import InputError
+from thinmap_ros.core.se2 import Array
+from thinmap_ros.ros import messages, parameters, qos
+from thinmap_ros.ros.lifecycle_node import ThinmapNode
+from thinmap_ros.ros.subscription import subscribe_guarded
+from thinmap_ros.ros.tf.transform_listener import TransformBuffer
+
+TOPIC = 'topic'
+TF = 'tf'
+NONE = 'none'
+
+
+@dataclass(frozen=True)
+class OdometryInputConfig(Config):
+    """Where odometry comes from."""
+
+    odom_source: str = parameter(
+        TOPIC,
+        'Source of the odometry. topic: nav_msgs/Odometry on odom. tf: the transform from '
+        'odom_frame to base_frame. none: the robot has no odometry; the localizer follows it by '
+        'scan matching alone and publishes odom_frame -> base_frame as identity.',
+        choices=(TOPIC, TF, NONE),
+    )
+
+
+class OdometrySource:
+    """Calls `process` with the stamp in ns and T_odom_base (3,) of each sample of the odometry.
+
+    Without odometry the robot never moves in the odometry frame: there is a sample at the stamp of
+    each scan, which the node reports by `add_scan_stamp`.
+    """
+
+    def __init__(
+        self, node: ThinmapNode, base_frame: str, process: Callable[[int, Array], None]
+    ) -> None:
+        self._node = node
+        self._process = process
+        self._base_frame = base_frame
+        self.odom_frame = str(
+            parameters.declare_parameter(
+                node, 'odom_frame', 'odom', 'Frame of the odometry (REP 105).'
+            )
+        )
+        self.source = parameters.declare_config(node, OdometryInputConfig).odom_source
+        self._transforms = TransformBuffer()
+        self._last_ns = 0
+
+    def subscribe(self) -> None:
+        """Start to receive samples."""
+        node = self._node
+        if self.source == TOPIC:
+            subscribe_guarded(node, Odometry, 'odom', self._on_odometry, qos.STREAM)
+        elif self.source == TF:
+            node.create_subscription(
+                TFMessage, '/tf_static', self._on_static, qos.STATIC_TRANSFORMS
+            )
+            node.create_subscription(TFMessage, '/tf', self._on_transforms, qos.TRANSFORMS)
+            node.diagnostics.add_update_callback(self._report)
+
+    def reset(self) -> None:
+        """Forget the samples: the time was set back."""
+        self._transforms.clear()
+        self._last_ns = 0
+
+    def add_scan_stamp(self, stamp_ns: int) -> None:
+        """A scan was made: without odometry, the robot is where it was."""
+        if self.source == NONE:
+            self._process(stamp_ns, np.zeros(3))
+
+    def _on_odometry(self, message: Odometry) -> None:
+        stamp_ns = messages.stamp_ns(message.header.stamp)
+        self._process(stamp_ns, messages.pose_from_msg(message.pose.pose))
+
+    def _on_static(self, message: TFMessage) -> None:
+        self._add(message, is_static=True)
+
+    def _on_transforms(self, message: TFMessage) -> None:
+        """Add transforms; the sample is that of the newest time at which all of them are known."""
+        self._node.handle_time_jump()
+        self._add(message, is_static=False)
+        stamp_ns = self._transforms.latest_common_ns(self.odom_frame, self._base_frame)
+        if not self._node.is_active or stamp_ns is None or stamp_ns == self._last_ns:
+            return
+        self._last_ns = stamp_ns
+        try:
+            T_odom_base = self._transforms.lookup(self.odom_frame, self._base_frame, stamp_ns)
+            self._process(stamp_ns, T_odom_base)
+        except InputError as error:
+            self._node.diagnostics.message_rejected('/tf', str(error))
+
+    def _add(self, message: TFMessage, is_static: bool) -> None:
+        for transform in message.transforms:
+            try:
+                self._transforms.add(transform, is_static)
+            except InputError as error:
+                self._node.diagnostics.message_rejected('/tf', str(error))
+
+    def _report(self) -> None:
+        """Report on /diagnostics what is missing of the chain of transforms."""
+        try:
+            self._transforms.lookup(self.odom_frame, self._base_frame)
+        except InputError as error:
+            self._node.diagnostics.set_value('odometry by TF', error)
+        else:
+            self._node.diagnostics.set_value('odometry by TF', 'received')
