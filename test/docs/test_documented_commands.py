@@ -100,6 +100,7 @@ SECTIONS = {
     ('tutorials.md', 'Your bag in 5 minutes'): Section(),
     ('tutorials.md', 'Your map to a Nav2 route graph in 2 minutes'): Section(),
     ('tutorials.md', "Nav2's clients drive the robot"): Section(SIM),
+    ('tutorials.md', 'Explore with Nav2 and your own SLAM'): Section(SIM),
     ('tutorials.md', 'Two robots'): Section(),
     ('tutorials.md', 'Left running'): Section({'localizer': {}}),
 }

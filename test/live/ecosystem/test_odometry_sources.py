@@ -9,7 +9,7 @@ from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import LaserScan
 from support.doctor import Doctor
-from support.nav2.transform_client import TransformClient
+from support.peers.transform_client import TransformClient
 
 from thinmap_ros.core import se2
 from thinmap_ros.ros import messages, qos

@@ -12,7 +12,7 @@ from nav_msgs.msg import Odometry, Path
 from rclpy.action import ActionClient
 from support.doctor import Doctor
 from support.halls import AT_START, START
-from support.nav2.still_robot import StillRobot
+from support.peers.still_robot import StillRobot
 
 from thinmap_ros.ros import messages, qos
 

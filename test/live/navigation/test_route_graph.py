@@ -3,7 +3,7 @@
 import pytest
 from geometry_msgs.msg import PoseStamped, Twist
 from support.halls import AT_START, START
-from support.nav2.route_server import RouteServer
+from support.peers.route_server import RouteServer
 
 from thinmap_msgs.msg import TopologicalMap
 from thinmap_msgs.srv import SaveMap

@@ -22,10 +22,13 @@ class GridPatch:
     Row 0 has the lowest y.
 
     A cell up to 25 % is free, from 65 % occupied; values in between count as unknown.
+    is_replaced: of a map that is received again and again, whether any cell may differ from the
+    last one, and not only those that the last scan can have changed.
     """
 
     frame: GridFrame
     cells: NDArray[np.int8]
+    is_replaced: bool = False
 
     @property
     def shape(self) -> tuple[int, int]:
