@@ -118,8 +118,11 @@ def test_unknown_key_of_a_file_is_an_error(declared, tmp_path):
     (tmp_path / 'given.yaml').write_text(
         yaml.safe_dump({'/**': {'ros__parameters': {'windwo_m': 3.0}}})
     )
+    arguments = ('--params-file', str(tmp_path / 'given.yaml'), '-p', 'strict_parameters:=true')
     with pytest.raises(ConfigError, match=r'no parameter windwo_m; it has: .*local_map_size_m'):
-        declared('grid_mapper', '--params-file', str(tmp_path / 'given.yaml'))
+        declared('grid_mapper', *arguments)
+    with pytest.raises(ConfigError, match='no parameter windwo_m'):
+        declared('sim', *arguments[:2])  # nobody gives it the file of another package
 
 
 @pytest.mark.parametrize(
@@ -133,7 +136,7 @@ def test_an_unknown_parameter_comes_with_what_was_probably_meant(declared, name,
     with pytest.raises(
         ConfigError, match=rf'no parameter {name} \(did you mean {meant}\?\); it has'
     ):
-        declared('navigator', '-p', f'{name}:=0.5')
+        declared('navigator', '-p', f'{name}:=0.5', '-p', 'strict_parameters:=true')
 
 
 def test_there_is_a_file_for_each_node_and_no_other():

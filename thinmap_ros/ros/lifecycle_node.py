@@ -15,6 +15,7 @@ from thinmap_ros.core.snapshot import State
 from thinmap_ros.ros import parameters
 from thinmap_ros.ros.checkpoint import Checkpoint, PeriodicCheckpoint
 from thinmap_ros.ros.diagnostics import OK, NodeDiagnostics
+from thinmap_ros.ros.foreign.translation import translate
 from thinmap_ros.ros.services import fill_response
 
 _CHECKPOINT_PERIOD_S = 0.5
@@ -68,6 +69,8 @@ class ThinmapNode(LifecycleNode):
     def __init__(self, name: str, recovers: bool = False) -> None:
         """Create a node; one that recovers calls `enable_checkpoint` at the end of its own."""
         super().__init__(name)
+        translate(self, name)
+        parameters.declare_strict(self)
         self._autostart = bool(
             parameters.declare_parameter(
                 self, 'autostart', True, 'Become active at once. false: wait for transitions.'

@@ -18,7 +18,9 @@ from rclpy.parameter import Parameter
 
 from thinmap_ros.core.config import Config, parameters_of, with_values
 from thinmap_ros.core.errors import ConfigError
+from thinmap_ros.ros.foreign.translation import is_known
 
+STRICT = 'strict_parameters'
 # What describes the robot: one file may give it to all nodes, also to those that do not need it.
 ROBOT = (
     'robot_radius_m',
@@ -56,6 +58,7 @@ def declare_config(
     values = {}
     for name, field, default in declared:
         descriptor = _descriptor(field, read_only=name not in free)
+        _accept_integer(node, name, default)
         try:
             values[name] = node.declare_parameter(name, default, descriptor).value
         except Exception as error:
@@ -105,10 +108,32 @@ class _Changes(Generic[AnyConfig]):
 def declare_parameter(node: Node, name: str, default: Any, description: str) -> Any:
     """Declare a read-only parameter of the node, and return its value."""
     descriptor = ParameterDescriptor(description=description, read_only=True)
+    _accept_integer(node, name, default)
     try:
         return node.declare_parameter(name, default, descriptor).value
     except Exception as error:
         raise ConfigError(f'parameter {name} of node {node.get_name()}: {error}') from error
+
+
+def _accept_integer(node: Node, name: str, default: Any) -> None:
+    """Take an integer that was given for a float as that float, as in many parameter files."""
+    given = node._parameter_overrides.get(name)
+    is_integer = given is not None and given.type_ == Parameter.Type.INTEGER
+    if isinstance(default, float) and is_integer:
+        node._parameter_overrides[name] = Parameter(name, value=float(given.value))
+
+
+def declare_strict(node: Node) -> bool:
+    """Declare the parameter `strict_parameters` and return its value."""
+    return bool(
+        declare_parameter(
+            node,
+            STRICT,
+            False,
+            'Refuse to start with a parameter that the node does not have. false: it is ignored '
+            'with a warning, so that parameter files of other packages can be used.',
+        )
+    )
 
 
 def declare_map_frame(node: Node) -> str:
@@ -142,13 +167,19 @@ def declare_recovery(node: Node) -> float:
 
 
 def reject_unknown(node: Node) -> None:
-    """Raise ConfigError where a parameter was given that the node does not have: a typo.
+    """Warn of parameters that were given and that the node does not have.
 
-    Parameters of the robot are accepted by every node. Where several
-    nodes share a process, a parameter may be meant for another one: the last of them raises.
+    With `strict_parameters`, and in nodes without it, they are an error. Parameters of the robot
+    are accepted by every node, and so are those of other packages that another node takes. Where
+    several nodes share a process, a parameter may be meant for another one: the last of them
+    decides. Raises ConfigError.
     """
     # rclpy has no public way to see what was given but never declared.
-    given = set(node._parameter_overrides).difference(ROBOT)
+    given = {
+        name
+        for name in set(node._parameter_overrides).difference(ROBOT)
+        if not name.startswith('qos_overrides.') and not is_known(name)
+    }
     known = {name for name in node._parameters if not name.startswith('qos_overrides')}
     shared = _SHARED.get()
     if shared is not None:
@@ -162,11 +193,17 @@ def reject_unknown(node: Node) -> None:
         names = ', '.join(shared.names)
     else:
         names = str(node.get_name())
-    if unknown := sorted(given - known):
-        wrong = ', '.join(name + _suggestion(name, known) for name in unknown)
-        raise ConfigError(
-            f'node {names} has no parameter {wrong}; it has: {", ".join(sorted(known))}'
+    unknown = sorted(given - known)
+    if not unknown:
+        return
+    wrong = ', '.join(name + _suggestion(name, known) for name in unknown)
+    if node.has_parameter(STRICT) and not node.get_parameter(STRICT).value:
+        node.get_logger().warning(
+            f'ignored parameters that node {names} does not have: {wrong}; '
+            f'{STRICT}: true makes them an error'
         )
+        return
+    raise ConfigError(f'node {names} has no parameter {wrong}; it has: {", ".join(sorted(known))}')
 
 
 def _suggestion(name: str, known: set[str]) -> str:

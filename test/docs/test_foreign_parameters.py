@@ -1,0 +1,129 @@
+"""Parameter files of other packages start thinmap's nodes; docs/coming_from.md lists their names.
+
+THINMAP_WRITE_CONFIG=1 rewrites the tables of the page.
+"""
+
+import os
+import re
+
+import pytest
+import rclpy
+import yaml
+from support.node_list import ROOT, node_class
+
+from thinmap_ros.core.errors import ConfigError
+from thinmap_ros.ros.foreign.tables import PACKAGES
+
+PAGE = ROOT / 'docs' / 'coming_from.md'
+ROWS = [(package, row) for package in PACKAGES for row in package.parameters]
+TARGETS = sorted({target for _, row in ROWS for target in row.targets})
+FILES = ROOT / 'test' / 'docs' / 'foreign'
+
+
+@pytest.fixture
+def start(ros_domain, tmp_path, monkeypatch):
+    """Values of a node's parameters, and what it warned of, when started with some arguments."""
+    monkeypatch.chdir(tmp_path)
+
+    def started(name, *arguments):
+        rclpy.init(args=['--ros-args', *arguments])
+        warnings = []
+        try:
+            kind = node_class(name)
+            logger = rclpy.logging.get_logger(name)
+            monkeypatch.setattr(type(logger), 'warning', lambda _, text, **k: warnings.append(text))
+            node = kind()
+            values = {n: p.value for n, p in node._parameters.items()}
+            node.close()
+            node.destroy_node()
+            return values, [text for text in warnings if 'ignored parameters' in text]
+        finally:
+            rclpy.shutdown()
+            monkeypatch.undo()
+            monkeypatch.chdir(tmp_path)
+
+    return started
+
+
+@pytest.mark.parametrize('node', sorted({owner for owner, _ in TARGETS}))
+def test_every_target_is_a_parameter_of_its_node(start, node):
+    declared, _ = start(node)
+    named = {name for owner, name in TARGETS if owner == node}
+    assert named <= declared.keys(), named - declared.keys()
+
+
+def test_every_name_has_a_target_or_a_reason():
+    for package, row in ROWS:
+        assert row.targets or row.note, (package.name, row.name)
+        assert {owner for owner, _ in row.targets} <= set(package.nodes), row.name
+
+
+CASES = [
+    ('slam_toolbox', 'localizer', {'transform_tolerance': 0.3, 'keyframes.distance_m': 0.4,
+     'initial_x_m': 1.0, 'initial_y_m': 2.0, 'initial_yaw_rad': 0.5,
+     'base_frame': 'base_footprint'}, 43),
+    ('slam_toolbox', 'grid_mapper', {'resolution_m': 0.05, 'map_update_interval': 5.0,
+     'max_range_m': 20.0, 'base_frame': 'base_footprint'}, 43),
+    ('amcl', 'localizer', {'map_frame': 'map', 'publish_tf': True, 'transform_tolerance': 1.0,
+     'base_frame': 'base_footprint'}, 30),
+    ('amcl', 'global_localizer', {'samples': 3000, 'base_frame': 'base_footprint'}, 30),
+    ('explore_lite', 'explorer', {'min_frontier_size': 0.75, 'progress_timeout': 30.0,
+     'transform_tolerance': 0.3, 'costmap_topic': 'map'}, 5),
+    ('nav2', 'navigator', {'controller.max_speed_m_s': 0.26, 'robot_radius_m': 0.22,
+     'base_frame': 'base_footprint'}, 6),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(('file', 'node', 'expected', 'ignored'), CASES)
+def test_a_file_of_another_package_starts_the_node(start, file, node, expected, ignored):
+    path = FILES / f'{file}.yaml'
+    values, warnings = start(node, '--params-file', str(path))
+    assert {name: values[name] for name in expected} == expected
+    (warning,) = warnings
+    given = yaml.safe_load(path.read_text())['/**']['ros__parameters']
+    named = re.findall(r'[\w.]+(?= \(did|, |;)', warning.split(': ', 1)[1])
+    assert len(named) == ignored, (len(named), named)
+    assert {name.split('.')[0] for name in named} <= given.keys()
+    with pytest.raises(ConfigError, match='has no parameter'):
+        start(node, '--params-file', str(path), '-p', 'strict_parameters:=true')
+
+
+def test_the_own_name_wins_over_that_of_another_package(start):
+    arguments = ('-p', 'transform_timeout:=0.7', '-p', 'transform_tolerance:=0.1')
+    assert start('localizer', *arguments)[0]['transform_tolerance'] == 0.1
+
+
+def test_an_integer_is_accepted_for_a_float(start):
+    values, _ = start('grid_mapper', '-p', 'map_update_interval:=5', '-p', 'resolution:=1')
+    assert (values['map_update_interval'], values['resolution_m']) == (5.0, 1.0)
+
+
+def test_quality_of_service_can_be_overridden(start):
+    assert start('grid_mapper', '-p', 'qos_overrides./map.publisher.depth:=3')[1] == []
+
+
+def test_a_value_that_does_not_fit_is_an_error_with_our_name(start):
+    with pytest.raises(ConfigError, match='resolution_m'):
+        start('grid_mapper', '-p', 'resolution:=-1.0')
+
+
+def table(package):
+    lines = ['| parameter | default | thinmap | |', '|---|---|---|---|']
+    for row in package.parameters:
+        targets = ', '.join(f'`{owner}` `{name}`' for owner, name in row.targets)
+        lines.append(f'| `{row.name}` | {row.default or "(empty)"} | {targets} | {row.note} |')
+    return '\n'.join(lines)
+
+
+def test_the_page_lists_what_is_translated():
+    text = PAGE.read_text()
+    for package in PACKAGES:
+        start = f'<!-- parameters of {package.name} -->\n'
+        end = f'<!-- end of {package.name} -->'
+        assert start in text and end in text, package.name
+        before, rest = text.split(start)
+        _, after = rest.split(end)
+        text = before + start + table(package) + '\n' + end + after
+    if 'THINMAP_WRITE_CONFIG' in os.environ:
+        PAGE.write_text(text)
+    assert PAGE.read_text() == text, f'coming_from.md: see the top of {__file__}'
